@@ -1,0 +1,43 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Build description; colcon and pip both read it."""
+
+from glob import glob
+import re
+
+from setuptools import find_packages, setup
+
+NAME = 't3mpc_ros'
+
+with open(f'{NAME}/__init__.py', encoding='utf-8') as source:
+    VERSION = re.search(r"^__version__ = '([^']+)'", source.read(), re.MULTILINE).group(1)
+
+setup(
+    name=NAME,
+    version=VERSION,
+    packages=find_packages(include=[NAME, f'{NAME}.*']),
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml']),
+        (f'share/{NAME}/config', sorted(glob('config/*.yaml'))),
+        (f'share/{NAME}/launch', sorted(glob('launch/*.launch.py'))),
+    ],
+    install_requires=['setuptools', 'numpy', 'numba', 'mcap', 'rosbags', 'PyYAML', 'matplotlib'],
+    python_requires='>=3.11',
+    zip_safe=False,
+    maintainer='The t3mpc_ros developers',
+    maintainer_email='developers@t3mpc.example',
+    description='Type-3 fuzzy, Boltzmann-machine predictive control of a two-wheeled robot '
+    'along fractional-order chaotic references.',
+    license='Apache-2.0',
+    entry_points={
+        'console_scripts': [
+            f'reference = {NAME}.nodes.start:reference',
+            f'controller = {NAME}.nodes.start:controller',
+            f'sim_robot = {NAME}.nodes.start:sim_robot',
+            f'recorder = {NAME}.nodes.start:recorder',
+            f'all_in_one = {NAME}.nodes.start:all_in_one',
+            f'lab = {NAME}.lab.program:main',
+        ],
+    },
+)

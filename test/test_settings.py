@@ -1,0 +1,78 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The one table of settings: what it accepts, what it refuses, and how it says so."""
+
+from dataclasses import dataclass, replace
+
+import pytest
+
+from t3mpc_ros.settings import SettingError, Settings, nested, setting
+
+
+@dataclass(frozen=True)
+class Inner(Settings):
+    gain: float = setting(8.0, 'gain', unit='1/s', low=0.1, high=100.0, live=True)
+    kind: str = setting('a', 'kind', choices=('a', 'b'))
+
+
+@dataclass(frozen=True)
+class Outer(Settings):
+    low: float = setting(1.0, 'lower end')
+    high: float = setting(2.0, 'upper end')
+    count: int = setting(3, 'how many', low=1)
+    levels: tuple[float, ...] = setting((0.1, 0.2), 'levels', low=0.0)
+    on: bool = setting(True, 'switch')
+    inner: Inner = nested(Inner)
+
+    def check_together(self) -> None:
+        if self.low >= self.high:
+            raise SettingError(f'low must be below high: got {self.low} and {self.high}')
+
+
+def test_rows_carry_everything_a_person_needs():
+    rows = {row.name: row for row in Outer.rows()}
+    assert list(rows) == ['low', 'high', 'count', 'levels', 'on', 'inner.gain', 'inner.kind']
+    gain = rows['inner.gain']
+    assert (gain.kind, gain.many, gain.default, gain.unit, gain.live) == (
+        float, False, 8.0, '1/s', True,
+    )  # fmt: skip
+    assert gain.bounds() == 'from 0.1 to 100 1/s'
+    assert rows['inner.kind'].bounds() == 'one of a, b'
+    assert rows['count'].bounds() == 'at least 1'
+
+
+def test_flat_and_back_is_the_identity():
+    table = Outer.from_flat({'inner.gain': 5, 'levels': [1, 2.5], 'count': 7})
+    assert table.inner.gain == 5.0
+    assert isinstance(table.inner.gain, float)
+    assert table.levels == (1.0, 2.5)
+    assert Outer.from_flat(table.flat()) == table
+
+
+@pytest.mark.parametrize(
+    'values, words',
+    [
+        ({'inner.gain': -1.0}, ['inner.gain', 'from 0.1 to 100', '-1']),
+        ({'inner.gain': float('nan')}, ['inner.gain', 'finite', 'nan']),
+        ({'inner.gain': 'fast'}, ['inner.gain', 'a number', 'fast']),
+        ({'inner.gain': True}, ['inner.gain', 'a number', 'True']),
+        ({'inner.kind': 'c'}, ['inner.kind', 'one of a, b', 'c']),
+        ({'count': 2.5}, ['count', 'a whole number', '2.5']),
+        ({'levels': [0.1, -2.0]}, ['levels', 'at least 0', '-2']),
+        ({'levels': 3.0}, ['levels', 'a list', '3.0']),
+        ({'inner.gian': 1.0}, ['inner.gian', 'did you mean inner.gain']),
+        ({'low': 3.0}, ['low must be below high', '3.0', '2.0']),
+    ],
+)
+def test_wrong_values_are_refused_with_name_bound_and_value(values, words):
+    with pytest.raises(SettingError) as caught:
+        Outer.from_flat(values)
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_direct_construction_is_checked_too():
+    with pytest.raises(SettingError):
+        Inner(gain=0.0)
+    with pytest.raises(SettingError):
+        replace(Outer(), high=0.5)
