@@ -1,0 +1,69 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Unicycle kinematics of a differential drive, equations (1)-(3) with E1."""
+
+from dataclasses import dataclass
+import math
+
+from t3mpc_ros.motion.words import BodyTwist, Pose, WheelSpeeds, wrap_angle
+from t3mpc_ros.settings import Settings, setting
+
+
+@dataclass(frozen=True)
+class Geometry(Settings):
+    """The two lengths that turn wheel speeds into body speeds."""
+
+    wheel_radius: float = setting(
+        0.035, 'wheel radius R', unit='m', low=0.005, high=1.0, source='paper: 7 cm wheels'
+    )
+    wheel_separation: float = setting(
+        0.147, 'distance between the wheels, 2b', unit='m', low=0.01, high=5.0
+    )
+
+    @property
+    def half_separation(self) -> float:
+        """The paper's iota, b (m). E1: it is *half* the separation, or omega comes out halved."""
+        return 0.5 * self.wheel_separation
+
+
+def body_from_wheels(wheels: WheelSpeeds, geometry: Geometry) -> BodyTwist:
+    r"""Return the body twist of two wheel speeds, equation (1) with E1.
+
+    .. math:: v = R(\dot\theta_R + \dot\theta_L)/2, \qquad
+              \omega = R(\dot\theta_R - \dot\theta_L)/(2b)
+    """
+    radius = geometry.wheel_radius
+    return BodyTwist(
+        0.5 * radius * (wheels.right + wheels.left),
+        0.5 * radius * (wheels.right - wheels.left) / geometry.half_separation,
+    )
+
+
+def wheels_from_body(twist: BodyTwist, geometry: Geometry) -> WheelSpeeds:
+    """Return the wheel speeds of a body twist, the inverse of equation (1)."""
+    turn = twist.angular * geometry.half_separation
+    return WheelSpeeds(
+        (twist.linear + turn) / geometry.wheel_radius,
+        (twist.linear - turn) / geometry.wheel_radius,
+    )
+
+
+def pose_rate(heading: float, wheels: WheelSpeeds, geometry: Geometry) -> Pose:
+    """Return (x', y', P') in m/s, m/s and rad/s, equations (2)-(3) with E1."""
+    twist = body_from_wheels(wheels, geometry)
+    return Pose(twist.linear * math.cos(heading), twist.linear * math.sin(heading), twist.angular)
+
+
+def advance_pose(pose: Pose, twist: BodyTwist, dt: float) -> Pose:
+    """Return the pose after ``dt`` seconds of constant twist: the exact arc of (2).
+
+    The chord formula with sin(x)/x keeps full accuracy through straight motion.
+    """
+    half_turn = 0.5 * twist.angular * dt
+    chord = twist.linear * dt * (math.sin(half_turn) / half_turn if half_turn else 1.0)
+    direction = pose.heading + half_turn
+    return Pose(
+        pose.x + chord * math.cos(direction),
+        pose.y + chord * math.sin(direction),
+        wrap_angle(pose.heading + 2.0 * half_turn),
+    )
