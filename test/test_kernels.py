@@ -24,13 +24,14 @@ def test_division_by_zero_gives_infinity_not_an_exception():
     assert np.isposinf(out[0])
 
 
-def test_the_fingerprint_changes_with_any_source_file(tmp_path):
+def test_the_fingerprint_changes_with_any_file_that_holds_a_kernel_and_with_no_other(tmp_path):
     (tmp_path / 'a').mkdir()
-    file = tmp_path / 'a' / 'x.py'
-    file.write_text('one = 1\n')
+    file, other = tmp_path / 'a' / 'x.py', tmp_path / 'a' / 'y.py'
+    file.write_text('@kernel\ndef f(): return 1\n')
     before = fingerprint(tmp_path)
+    other.write_text('nothing = "compiled"\n')
     assert fingerprint(tmp_path) == before
-    file.write_text('one = 2\n')
+    file.write_text('@kernel\ndef f(): return 2\n')
     assert fingerprint(tmp_path) != before
 
 

@@ -102,6 +102,14 @@ def test_a_source_that_starts_again_replaces_what_it_had_said():
     assert track.at(30 * MS) is None
 
 
+def test_a_sample_that_is_repeated_takes_the_place_of_the_one_before():
+    track = filled(sample(0.0, 0.1), sample(10.0, 0.1), sample(20.0, 0.1), capacity=4)
+    for speed in (0.11, 0.12, 0.13, 0.12):
+        track.add(sample(20.0, speed))
+    assert track.at(0).twist.linear == 0.1  # nothing was pushed out
+    assert track.at(15 * MS).twist.linear == pytest.approx(0.11)
+
+
 def test_a_stamp_far_in_the_future_does_not_shut_out_what_follows():
     track = filled(sample(0.0, 0.1), sample(3_600_000.0, 0.4))
     track.add(sample(10.0, 0.12))

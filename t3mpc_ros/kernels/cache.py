@@ -16,7 +16,7 @@ def cache_directory(environment: Mapping[str, str], sources: Path = PACKAGE) -> 
 
     The compiler's own cache looks only at the file a kernel stands in, so a kernel kept from
     yesterday would go on calling yesterday's version of a kernel in another file. The folder's
-    name therefore carries a fingerprint of every source file of the package.
+    name therefore carries a fingerprint of every source file that holds a kernel.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ def cache_directory(environment: Mapping[str, str], sources: Path = PACKAGE) -> 
         folder; the first one that can be written to is taken. An installed package is often
         read-only, so nothing is written beside the sources.
     sources
-        The folder whose ``*.py`` files are fingerprinted.
+        The folder whose ``*.py`` files with kernels are fingerprinted.
 
     Raises
     ------
@@ -49,11 +49,13 @@ def cache_directory(environment: Mapping[str, str], sources: Path = PACKAGE) -> 
 
 
 def fingerprint(sources: Path) -> str:
-    """Return 16 hexadecimal digits that change whenever a Python file below ``sources`` does."""
+    """Return 16 hexadecimal digits that change with any file below ``sources`` with a kernel."""
     digest = hashlib.sha256()
     for path in sorted(sources.rglob('*.py')):
-        digest.update(str(path.relative_to(sources)).encode())
-        digest.update(path.read_bytes())
+        content = path.read_bytes()
+        if b'@kernel' in content or path.parent.name == 'kernels':
+            digest.update(str(path.relative_to(sources)).encode())
+            digest.update(content)
     return digest.hexdigest()[:16]
 
 

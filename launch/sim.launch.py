@@ -1,0 +1,50 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""ros2 launch t3mpc_ros sim.launch.py: the whole loop with the simulated robot."""
+
+from pathlib import Path
+
+from ament_index_python.packages import get_package_share_directory
+from launch.actions import DeclareLaunchArgument
+from launch.conditions import IfCondition
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+from launch import LaunchDescription
+
+NODES = ('sim_robot', 'controller', 'reference')
+
+
+def generate_launch_description():
+    share = Path(get_package_share_directory('t3mpc_ros'))
+    namespace = LaunchConfiguration('namespace')
+    use_sim_time = {'use_sim_time': LaunchConfiguration('use_sim_time')}
+    nodes = [
+        Node(
+            package='t3mpc_ros',
+            executable=name,
+            name=name,
+            namespace=namespace,
+            output='screen',
+            parameters=[str(share / 'config' / f'{name}.yaml'), use_sim_time],
+        )
+        for name in NODES
+    ]
+    recorder = Node(
+        package='t3mpc_ros',
+        executable='recorder',
+        name='recorder',
+        namespace=namespace,
+        output='screen',
+        condition=IfCondition(LaunchConfiguration('record')),
+        parameters=[str(share / 'config' / 'recorder.yaml'), use_sim_time],
+    )
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument('namespace', default_value='', description='of every node'),
+            DeclareLaunchArgument('use_sim_time', default_value='false', description='use /clock'),
+            DeclareLaunchArgument('record', default_value='true', description='write a bag'),
+            *nodes,
+            recorder,
+        ]
+    )

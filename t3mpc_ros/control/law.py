@@ -1,0 +1,192 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The control law (66)-(67), its compensator (81)-(82) and its certificate (74)-(84)."""
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.kernels import kernel
+from t3mpc_ros.settings import Settings, setting
+
+Array = NDArray[np.float64]
+
+TERMS = ('fuzzy', 'feedback', 'feedforward', 'compensator', 'predictive')
+"""What the law adds up, in the order of the rows of ``terms``."""
+
+TANH_GAP = 0.2785
+"""E14: the largest value of |x| - x tanh(x), rounded up (0.27846, taken at x = 0.6392)."""
+
+
+@dataclass(frozen=True)
+class LawSettings(Settings):
+    """Gains of the law and of the compensator."""
+
+    gain: float = setting(
+        8.0,
+        'feedback K on the tracking error (66)-(67)',
+        unit='1/s',
+        low=0.1,
+        high=100.0,
+        live=True,
+    )
+    compensator: bool = setting(
+        True, 'whether the compensator (81)-(82) is part of the command', live=True
+    )
+    error_bound: float = setting(
+        1.0,
+        'bound of the estimation error per wheel that the compensator outweighs, omega-bar (80)',
+        unit='rad/s²',
+        low=0.0,
+        high=100.0,
+        live=True,
+    )
+    smoothing: float = setting(
+        1.5,
+        'width of the compensator about zero error, epsilon in tanh(delta/epsilon): E14 pays '
+        '0.2785 epsilon for it, small values chatter under noise',
+        unit='rad/s',
+        low=1e-3,
+        high=100.0,
+        live=True,
+    )
+
+
+@kernel
+def law_terms(
+    speeds: Array,
+    wanted: Array,
+    wanted_rate: Array,
+    estimate: Array,
+    predictive: Array,
+    gain: float,
+    bound: float,
+    smoothing: float,
+    terms: Array,
+    command: Array,
+) -> None:
+    r"""Write the law's terms and their sum, equations (66)-(67) with E12.
+
+    .. math:: u_i = -g_i(\chi|\alpha_i) - K\delta_i + \dot r_i + v_{c,i} + v_{p,i}, \qquad
+              \delta = \chi - r
+
+    E12: the printed :math:`+\omega_i` is the unknown estimation error and cannot be applied; it
+    is :math:`\dot r_i`, and with it (68)-(69) follow. The compensator is (81)-(82),
+    :math:`v_c = -(\bar\omega + \bar v_p)\tanh(\delta/\epsilon)`.
+
+    speeds, wanted : shape (n,), chi and r, rad/s
+    wanted_rate, estimate, predictive : shape (n,), r', g and v_p, rad/s²
+    gain, bound, smoothing : K (1/s), omega-bar + v_p-bar (rad/s²), epsilon (rad/s)
+    terms : shape (5, n), overwritten, rows as in ``TERMS``, rad/s²
+    command : shape (n,), overwritten, u, rad/s²
+    """
+    for i in range(speeds.size):
+        error = speeds[i] - wanted[i]
+        terms[0, i] = -estimate[i]
+        terms[1, i] = -gain * error
+        terms[2, i] = wanted_rate[i]
+        terms[3, i] = -bound * math.tanh(error / smoothing)
+        terms[4, i] = predictive[i]
+        command[i] = terms[0, i] + terms[1, i] + terms[2, i] + terms[3, i] + terms[4, i]
+
+
+def compensator(error: float, bound: float, smoothing: float) -> float:
+    """Return v_c (rad/s²) for one wheel, equations (81)-(82) with the width of E14.
+
+    Parameters
+    ----------
+    error
+        delta, rad/s.
+    bound
+        omega-bar + v_p-bar, rad/s².
+    smoothing
+        epsilon, rad/s; the paper's tanh(delta) is epsilon = 1 rad/s.
+    """
+    return -bound * math.tanh(error / smoothing)
+
+
+def lyapunov_value(errors: Array, coefficient_errors: Array, adaptation_gain: float) -> float:
+    """Return V of equation (74), rad²/s²: half of |delta|² plus |alpha* - alpha|²/(2 gamma)."""
+    squares = float(np.sum(coefficient_errors**2))
+    return 0.5 * float(errors @ errors) + squares / (2.0 * adaptation_gain)
+
+
+def lyapunov_rate_bound(errors: Array, gain: float, bound: float, smoothing: float) -> float:
+    r"""Return the largest V' that the law allows, rad²/s³: (83) as corrected by E14.
+
+    .. math:: \dot V \le -K\|\delta\|^2 + 0.2785\,\epsilon \sum_i(\bar\omega_i + \bar v_{p,i})
+
+    E14: tanh is not the sign function, so (83)-(84) do not hold as printed. Since
+    :math:`|x| - x\tanh(x/\epsilon) \le 0.2785\,\epsilon` (Polycarpou and Ioannou 1996), the
+    compensator outweighs the bounded terms of (79)-(80) up to that amount, and the error is
+    ultimately bounded by :func:`ultimate_bound` instead of vanishing. E13: the last cross term
+    of (76) and (79) is delta_2 v_p2.
+    """
+    return -gain * float(errors @ errors) + TANH_GAP * smoothing * bound * errors.size
+
+
+def ultimate_bound(gain: float, bound: float, smoothing: float, wheels: int = 2) -> float:
+    """Return the radius (rad/s) outside which V of (74) must fall: the ball of E14."""
+    return math.sqrt(TANH_GAP * smoothing * bound * wheels / gain)
+
+
+@dataclass(frozen=True, slots=True)
+class CertificateReading:
+    """What the run-time certificate says at one step."""
+
+    value: float
+    """Half of |delta|², rad²/s²: the part of V (74) that can be measured."""
+    rate: float
+    """Its measured rate of change, averaged over the window, rad²/s³."""
+    bound: float
+    """The largest rate E14 allows, averaged alike, rad²/s³."""
+
+    @property
+    def margin(self) -> float:
+        """Return bound minus rate: the certificate holds while this is not negative."""
+        return self.bound - self.rate
+
+    @property
+    def holds(self) -> bool:
+        """Whether the measured decrease respects the bound of E14."""
+        return self.margin >= 0.0
+
+
+class Certificate:
+    """Checks at run time that the error falls as E14 promises.
+
+    The ideal coefficients alpha* in (74) are unknown while the robot runs, so the certificate
+    watches the measurable part V = |delta|²/2. Its rate obeys the same bound (83)/E14 as long as
+    the *whole* estimation error, g* - g plus disturbance, stays within omega-bar; a negative
+    margin says that it did not, or that the reference has just jumped.
+
+    Parameters
+    ----------
+    window
+        Time constant (s) of the averages: single differences are mostly measurement noise.
+    """
+
+    def __init__(self, window: float = 0.5) -> None:
+        self._window = window
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past."""
+        self._last: float | None = None
+        self._rate = 0.0
+        self._bound = 0.0
+
+    def update(
+        self, errors: Array, settings: LawSettings, bound: float, dt: float
+    ) -> CertificateReading:
+        """Return the reading after an error sample (rad/s) that came ``dt`` seconds later."""
+        value = 0.5 * float(errors @ errors)
+        rate = 0.0 if self._last is None else (value - self._last) / dt
+        allowed = lyapunov_rate_bound(errors, settings.gain, bound, settings.smoothing)
+        share = min(1.0, dt / self._window)
+        self._rate += share * (rate - self._rate)
+        self._bound += share * (allowed - self._bound)
+        self._last = value
+        return CertificateReading(value, self._rate, self._bound)

@@ -1,0 +1,291 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Inference of the non-singleton type-3 fuzzy system, equations (16)-(33) with E7 and E8.
+
+Arrays over sets have shape (n, M, lambda, 2, 2): input, set, slice, level, bound; arrays over
+rules (r, lambda, 2, 2). On the last two axes 0 is lower and 1 is upper, as in
+:mod:`t3mpc_ros.fuzzy.sets`, where the tables come from.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.fuzzy.sets import LOWER, UPPER, FuzzySets
+from t3mpc_ros.kernels import kernel
+
+Array = NDArray[np.float64]
+
+
+@kernel
+def fuzzify(inputs: Array, centres: Array, pull: Array, found: Array) -> None:
+    r"""Write where each fuzzy input meets each set, equations (16)-(19).
+
+    .. math:: x^* = \frac{U\beta^2 + o\beta_U^2}{\beta^2 + \beta_U^2}
+                  = U + (o - U)\frac{\beta_U^2}{\beta^2 + \beta_U^2}
+
+    This is where the product of the input's Gaussian about U and the set's Gaussian about o is
+    largest. The second form is U itself, to the last bit, when the input is not fuzzy.
+
+    inputs : shape (n,), U, rad/s
+    centres : shape (n, M), o, rad/s
+    pull : shape (n, M, lambda, 2, 2), the last fraction
+    found : shape as pull, overwritten, x*, rad/s
+    """
+    for i in range(centres.shape[0]):
+        # From 1e9 rad/s on, the nearest rule has long taken all of the weight: the bound changes
+        # nothing there, and keeps squares finite for any finite input.
+        value = min(max(inputs[i], -1e9), 1e9)
+        for h in range(centres.shape[1]):
+            offset = centres[i, h] - value
+            for j in range(pull.shape[2]):
+                for level in range(2):
+                    for bound in range(2):
+                        found[i, h, j, level, bound] = value + offset * pull[i, h, j, level, bound]
+
+
+@kernel
+def square_distances(found: Array, centres: Array, sharpness: Array, squares: Array) -> None:
+    r"""Write the exponents :math:`((x^* - o)/\beta)^2` of the memberships (20)-(23) with E7.
+
+    E7: the exponent is squared in a Gaussian; the printed one is linear, and lets grades grow
+    beyond one on one side of the centre.
+
+    found, sharpness : shape (n, M, lambda, 2, 2), x* (rad/s) and 1/beta (s/rad)
+    centres : shape (n, M), rad/s
+    squares : shape as found, overwritten; may be found itself
+    """
+    for i in range(centres.shape[0]):
+        for h in range(centres.shape[1]):
+            centre = centres[i, h]
+            for j in range(found.shape[2]):
+                for level in range(2):
+                    for bound in range(2):
+                        apart = found[i, h, j, level, bound] - centre
+                        apart *= sharpness[i, h, j, level, bound]
+                        squares[i, h, j, level, bound] = apart * apart
+
+
+@kernel
+def memberships(
+    inputs: Array, centres: Array, pull: Array, sharpness: Array, grades: Array
+) -> None:
+    r"""Write the grades :math:`\zeta = \exp(-((x^* - o)/\beta)^2)`, (16)-(23) with E7.
+
+    Arguments as in :func:`fuzzify` and :func:`square_distances`; ``grades`` is overwritten.
+    """
+    fuzzify(inputs, centres, pull, grades)
+    square_distances(grades, centres, sharpness, grades)
+    flat = grades.reshape(-1)
+    for k in range(flat.size):
+        flat[k] = math.exp(-flat[k])
+
+
+@kernel
+def relative_memberships(squares: Array) -> None:
+    """Turn exponents into grades whose products are the firings over the strongest firing.
+
+    (33) divides each firing by their sum over the rules, so a factor that all rules of a slice
+    and level share changes nothing. Taking out the strongest one before the exponential leaves
+    it at exactly one: the sum cannot underflow, however far the inputs are from all centres.
+    Lower and upper bound keep their ratio, which goes to the grades of the first input.
+
+    squares : shape (n, M, lambda, 2, 2), exponents from :func:`square_distances`, overwritten
+        with the relative grades
+    """
+    for j in range(squares.shape[2]):
+        for level in range(2):
+            lower = _subtract_nearest(squares, j, level, 0)
+            upper = _subtract_nearest(squares, j, level, 1)
+            # The difference first: a small square must not be lost beside a large sum.
+            strongest = min(lower, upper)
+            for h in range(squares.shape[1]):
+                squares[0, h, j, level, 0] += lower - strongest
+                squares[0, h, j, level, 1] += upper - strongest
+    flat = squares.reshape(-1)
+    for k in range(flat.size):
+        flat[k] = math.exp(-flat[k])
+
+
+@kernel
+def _subtract_nearest(squares: Array, j: int, level: int, bound: int) -> float:
+    """Make each input's smallest square zero; return the sum of what was taken off."""
+    total = 0.0
+    for i in range(squares.shape[0]):
+        nearest = squares[i, 0, j, level, bound]
+        for h in range(1, squares.shape[1]):
+            nearest = min(nearest, squares[i, h, j, level, bound])
+        for h in range(squares.shape[1]):
+            squares[i, h, j, level, bound] -= nearest
+        total += nearest
+    return total
+
+
+@kernel
+def fire(grades: Array, firings: Array) -> None:
+    r"""Write the firing of every rule, :math:`\Omega^l = \prod_i \zeta_i`, (24)-(27).
+
+    grades : shape (n, M, lambda, 2, 2)
+    firings : shape (r, lambda, 2, 2) with r = M**n, overwritten; the last input's set changes
+        fastest from rule to rule
+    """
+    inputs, sets, slices = grades.shape[0], grades.shape[1], grades.shape[2]
+    for j in range(slices):
+        for level in range(2):
+            for bound in range(2):
+                firings[0, j, level, bound] = 1.0
+                count = 1
+                for i in range(inputs):
+                    # Each product so far becomes M products. Going down, none is overwritten
+                    # before it has been used: its children's places are not below its own.
+                    for rule in range(count - 1, -1, -1):
+                        parent = firings[rule, j, level, bound]
+                        for h in range(sets - 1, -1, -1):
+                            firings[rule * sets + h, j, level, bound] = (
+                                parent * grades[i, h, j, level, bound]
+                            )
+                    count *= sets
+
+
+@kernel
+def weigh(firings: Array, shares: Array, phi: Array) -> None:
+    r"""Write the basis, equation (33) with E8.
+
+    .. math:: \Phi = \frac{\varsigma_j}{\sum_j(\underline\varsigma_j + \bar\varsigma_j)}
+                     \frac{\bar\Omega^l + \underline\Omega^l}
+                          {\sum_l(\bar\Omega^l + \underline\Omega^l)}
+
+    E8: the printed factor 0.5 / (sum of upper levels) makes the basis add up to less than one
+    and draws the output towards zero; over the sum of all levels it is a convex combination.
+    The sums run over the rules, where the printed (33) repeats rule one.
+
+    firings : shape (r, lambda, 2, 2), up to a factor common to the rules
+    shares : shape (lambda, 2), levels over the sum of all levels
+    phi : shape (2 r lambda,), overwritten, in the order of (32): lower levels first, element
+        l lambda + j is rule l, slice j; then the same for the upper levels, (32)'s last block
+        running to rule r
+    """
+    rules, slices = firings.shape[0], firings.shape[1]
+    for level in range(2):
+        block = level * rules * slices
+        for j in range(slices):
+            total = 0.0
+            for rule in range(rules):
+                total += firings[rule, j, level, 0] + firings[rule, j, level, 1]
+            factor = shares[j, level] / total
+            for rule in range(rules):
+                phi[block + rule * slices + j] = factor * (
+                    firings[rule, j, level, 0] + firings[rule, j, level, 1]
+                )
+
+
+@kernel
+def basis(
+    inputs: Array,
+    centres: Array,
+    pull: Array,
+    sharpness: Array,
+    shares: Array,
+    grades: Array,
+    firings: Array,
+    phi: Array,
+) -> None:
+    """Write the basis Phi of the inputs: (16)-(27), (33) with E7 and E8 in one call.
+
+    Exponentials are taken per input and set, not per rule. For any finite inputs the basis is
+    not negative and adds up to one; ``grades`` and ``firings`` are relative to the strongest.
+
+    inputs : shape (n,), U, rad/s, finite
+    centres, pull, sharpness, shares : tables of :class:`FuzzySets`
+    grades, firings : shapes (n, M, lambda, 2, 2) and (r, lambda, 2, 2), overwritten
+    phi : shape (2 r lambda,), overwritten, order of (32)
+    """
+    fuzzify(inputs, centres, pull, grades)
+    square_distances(grades, centres, sharpness, grades)
+    relative_memberships(grades)
+    fire(grades, firings)
+    weigh(firings, shares, phi)
+
+
+@kernel
+def combine(coefficients: Array, phi: Array, outputs: Array) -> None:
+    r"""Write the outputs :math:`g = \alpha^T\Phi`, equation (31).
+
+    coefficients : shape (m, 2 r lambda), alpha, rad/s²
+    phi : shape (2 r lambda,)
+    outputs : shape (m,), overwritten, g, rad/s²
+    """
+    for z in range(outputs.size):
+        total = 0.0
+        for k in range(phi.size):
+            total += coefficients[z, k] * phi[k]
+        outputs[z] = total
+
+
+def basis_of(inputs: Array, sets: FuzzySets) -> Array:
+    """Return the basis Phi of one input vector, shape (2 r lambda,), equation (33) with E8.
+
+    For experiments and figures: it allocates, which a control step does not.
+
+    Raises
+    ------
+    ValueError
+        The inputs are not ``sets.inputs`` finite numbers.
+    """
+    values = np.ascontiguousarray(inputs, dtype=np.float64)
+    if values.shape != (sets.inputs,) or not np.isfinite(values).all():
+        raise ValueError(f'inputs must be {sets.inputs} finite numbers: got {inputs}')
+    grades = np.empty(sets.widths.shape)
+    firings = np.empty((sets.rules, sets.slices, 2, 2))
+    phi = np.empty(sets.size)
+    basis(values, sets.centres, sets.pull, sets.sharpness, sets.shares, grades, firings, phi)
+    return phi
+
+
+def output_by_double_sum(inputs: Array, sets: FuzzySets, lower: Array, upper: Array) -> float:
+    r"""Return the output as the double sum over slices and rules, equation (29) with E7 and E8.
+
+    .. math:: y = \frac{1}{\sum_j(\underline\varsigma_j + \bar\varsigma_j)}
+        \sum_j\left(\bar\varsigma_j
+        \frac{\sum_l(\bar\Omega^l_{\bar\varsigma_j} + \underline\Omega^l_{\bar\varsigma_j})
+        \bar\alpha_{l,j}}{\sum_l(\bar\Omega^l_{\bar\varsigma_j} +
+        \underline\Omega^l_{\bar\varsigma_j})} + \underline\varsigma_j\frac{\cdots}{\cdots}\right)
+
+    E8: each slice is a mean of the coefficients weighted by the firings, hence without the
+    printed 1/2, and the slices are averaged with their own levels as weights. Written as it
+    reads, one number at a time, as a check of (31)-(33); too slow for a control step, and it
+    divides 0 by 0 far outside the centres, where every firing underflows.
+
+    Parameters
+    ----------
+    inputs
+        U, shape (n,), rad/s.
+    sets
+        The tables; only centres, widths, levels and the fuzziness of the inputs are used.
+    lower, upper
+        Rule coefficients at the lower and upper levels, shape (r, lambda) each, rad/s².
+    """
+    n, per_input = sets.centres.shape
+
+    def firing(rule: int, j: int, level: int, bound: int) -> float:
+        product = 1.0
+        for i in range(n):
+            h = rule // per_input ** (n - 1 - i) % per_input
+            o = float(sets.centres[i, h])
+            beta = float(sets.widths[i, h, j, level, bound])
+            beta_u = sets.input_fuzziness
+            x = (float(inputs[i]) * beta**2 + o * beta_u**2) / (beta**2 + beta_u**2)  # (16)-(19)
+            product *= math.exp(-(((x - o) / beta) ** 2))  # (20)-(23) with E7, (24)-(27)
+        return product
+
+    numerator = 0.0
+    for j in range(sets.slices):
+        for level, alpha in ((UPPER, upper), (LOWER, lower)):
+            weighted = total = 0.0
+            for rule in range(sets.rules):
+                both = firing(rule, j, level, UPPER) + firing(rule, j, level, LOWER)
+                weighted += both * float(alpha[rule, j])
+                total += both
+            numerator += float(sets.levels[j, level]) * weighted / total
+    return numerator / float(sets.levels.sum())

@@ -1,0 +1,242 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Gaussian fuzzy sets of type 3, and of type 2 and 1 as their special cases, as tables.
+
+A type-3 set is, at each slice level, an interval type-2 set: one centre, two widths (Fig. 4).
+Everything that tells one kind of fuzzy system from another is in the numbers of these tables;
+the inference that reads them is the same, so that comparisons differ in nothing else.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.settings import SettingError, Settings, setting
+
+Array = NDArray[np.float64]
+
+LOWER, UPPER = 0, 1
+"""Places on the last two axes of the tables: lower and upper level, lower and upper width."""
+
+LARGEST = 100_000
+"""Most coefficients per output that are accepted: M**n grows fast with the inputs n."""
+
+
+@dataclass(frozen=True)
+class FuzzySettings(Settings):
+    """The shape of the fuzzy system; the same for all its inputs."""
+
+    kind: str = setting(
+        'type3',
+        'what the sets are; type1 and interval_type2 are single slices at level one, the latter '
+        'with the footprint set below',
+        choices=('type3', 'interval_type2', 'type1'),
+        source='paper: NT3FS, compared with the others',
+    )
+    sets: int = setting(3, 'Gaussian sets per input, M', low=1, high=15)
+    centre_low: float = setting(
+        -10.0, 'centre of the first set', unit='rad/s', low=-1000.0, high=1000.0
+    )
+    centre_high: float = setting(
+        10.0,
+        'centre of the last set; the others are evenly spaced between',
+        unit='rad/s',
+        low=-1000.0,
+        high=1000.0,
+    )
+    spread: float = setting(
+        0.6,
+        'width sigma of the sets as a fraction of the centre spacing, in exp(-((x - o)/sigma)²); '
+        'at 0.6 neighbours cross at grade one half (a single set has the range as its spacing)',
+        low=0.05,
+        high=10.0,
+    )
+    slices: int = setting(4, 'slices lambda of the type-3 sets', low=1, high=32)
+    footprint: float = setting(
+        0.23,
+        'interval_type2 only: widths are (1 - footprint) sigma and (1 + footprint) sigma; at '
+        '0.23 as wide as the type-3 default is on average, weighted by level',
+        low=0.0,
+        high=0.95,
+    )
+    input_fuzziness: float = setting(
+        0.283,
+        'fuzziness of the inputs beta_U, in exp(-((x - U)/beta_U)²): sqrt(2) times the standard '
+        'deviation of the noise (0.2 rad/s); zero makes the fuzzifier a singleton',
+        unit='rad/s',
+        low=0.0,
+        high=100.0,
+        source='paper: noise variance 0.04',
+    )
+
+    def check_together(self) -> None:
+        """Raise SettingError unless the centres ascend."""
+        if self.centre_high <= self.centre_low:
+            raise SettingError(
+                f'centre_high must be above centre_low ({self.centre_low:g} rad/s): '
+                f'got {self.centre_high:g}'
+            )
+
+    @property
+    def width(self) -> float:
+        """Width sigma of the sets at level one, rad/s."""
+        return self.spread * (self.centre_high - self.centre_low) / max(self.sets - 1, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class FuzzySets:
+    """The tables that inference reads; checked when made and read-only from then on.
+
+    n inputs, M sets per input, lambda slices. The rules are all M**n combinations, the last
+    input's set changing fastest.
+
+    Raises
+    ------
+    ValueError
+        A table has the wrong shape or a value out of range; the message names it.
+    """
+
+    centres: Array
+    """Centres o, shape (n, M), rad/s."""
+    widths: Array
+    """Widths beta, shape (n, M, lambda, 2, 2), rad/s; the last two axes are the level
+    (lower, upper) and the bound (lower, upper width)."""
+    levels: Array
+    """Slice levels, shape (lambda, 2): lower and upper level of each slice, in (0, 1]. The paper
+    has the lower one strictly below; equality is the limit in which a slice is one level."""
+    input_fuzziness: float
+    """beta_U, rad/s."""
+    pull: Array = field(init=False)
+    """beta_U² / (beta² + beta_U²): how far (16)-(19) draw the input to the centre; as widths."""
+    sharpness: Array = field(init=False)
+    """1/beta, s/rad, shape as widths."""
+    shares: Array = field(init=False)
+    """Levels over their sum, shape (lambda, 2). E8: the sum runs over lower *and* upper levels,
+    so that the shares add up to one and the output stays within the hull of the coefficients."""
+
+    def __post_init__(self) -> None:
+        centres, widths, levels = (
+            np.array(table, dtype=np.float64, order='C')
+            for table in (self.centres, self.widths, self.levels)
+        )
+        fuzziness = float(self.input_fuzziness)
+        _check(centres, widths, levels, fuzziness)
+        tables = {
+            'centres': centres,
+            'widths': widths,
+            'levels': levels,
+            'pull': fuzziness**2 / (widths**2 + fuzziness**2),
+            'sharpness': 1.0 / widths,
+            'shares': levels / levels.sum(),
+        }
+        for name, table in tables.items():
+            table.setflags(write=False)
+            object.__setattr__(self, name, table)
+        object.__setattr__(self, 'input_fuzziness', fuzziness)
+
+    @property
+    def inputs(self) -> int:
+        """Number of inputs, n."""
+        return int(self.centres.shape[0])
+
+    @property
+    def rules(self) -> int:
+        """Number of rules, r = M**n."""
+        return int(self.centres.shape[1] ** self.centres.shape[0])
+
+    @property
+    def slices(self) -> int:
+        """Number of slices, lambda."""
+        return int(self.levels.shape[0])
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients per output, 2 r lambda (32)."""
+        return 2 * self.rules * self.slices
+
+
+def _check(centres: Array, widths: Array, levels: Array, fuzziness: float) -> None:
+    if centres.ndim != 2 or centres.size == 0:
+        raise ValueError(f'centres must have shape (inputs, sets): got {centres.shape}')
+    if levels.ndim != 2 or levels.shape[0] == 0 or levels.shape[1] != 2:
+        raise ValueError(f'levels must have shape (slices, 2): got {levels.shape}')
+    shape = (*centres.shape, levels.shape[0], 2, 2)
+    if widths.shape != shape:
+        raise ValueError(f'widths must have shape {shape}: got {widths.shape}')
+    if not np.isfinite(centres).all():
+        raise ValueError(f'centres must be finite: got {centres.tolist()}')
+    if not (np.isfinite(widths).all() and (widths > 0.0).all()):
+        raise ValueError(f'widths must be positive and finite: got {widths.min():g} at least')
+    excess = (widths[..., LOWER] - widths[..., UPPER]).max()
+    if excess > 0.0:
+        raise ValueError(f'widths must not be larger below than above: got {excess:g} rad/s more')
+    low, high = levels[:, LOWER], levels[:, UPPER]
+    if not ((low > 0.0) & (low <= high) & (high <= 1.0)).all():
+        raise ValueError(f'levels must be 0 < lower <= upper <= 1: got {levels.tolist()}')
+    if not (np.isfinite(fuzziness) and fuzziness >= 0.0):
+        raise ValueError(f'input_fuzziness must be at least 0 rad/s: got {fuzziness}')
+    inputs, sets = centres.shape
+    _check_size(inputs, sets, levels.shape[0])
+
+
+def _check_size(inputs: int, sets: int, slices: int) -> None:
+    size = 2 * sets**inputs * slices
+    if size > LARGEST:
+        raise ValueError(
+            f'inputs must leave at most {LARGEST} coefficients: got {inputs} inputs of {sets} '
+            f'sets with {slices} slices, which make {size}'
+        )
+
+
+def slice_levels(slices: int) -> Array:
+    """Return the lower and upper level of each slice, shape (slices, 2).
+
+    Both kinds of level are evenly spaced and interleave up to one: with four slices the lower
+    levels are 1/8, 3/8, 5/8, 7/8 and the upper ones 2/8, 4/8, 6/8, 8/8.
+    """
+    return np.arange(1, 2 * slices + 1, dtype=np.float64).reshape(slices, 2) / (2 * slices)
+
+
+def type3_widths(width: float, levels: Array) -> Array:
+    r"""Return the widths of a type-3 Gaussian at each level, rad/s, shape (slices, 2, 2).
+
+    .. math:: \bar\beta(\varsigma) = \sigma\varsigma^{-1/2}, \qquad
+              \underline\beta(\varsigma) = \sigma\varsigma^{+1/2}
+
+    Raising the grade exp(-((x - o)/sigma)²) to the power of the level gives a Gaussian of the
+    first width, raising it to the inverse of the level one of the second. At level one both are
+    sigma, which is type-1; the lower the level, the wider the footprint.
+    """
+    root = np.sqrt(levels)
+    return np.stack([width * root, width / root], axis=-1)
+
+
+def build_sets(settings: FuzzySettings, inputs: int = 2) -> FuzzySets:
+    """Return the tables of ``inputs`` equal inputs.
+
+    Raises
+    ------
+    ValueError
+        There is no input, or the combinations of sets are too many.
+    """
+    if inputs < 1:
+        raise ValueError(f'inputs must be at least 1: got {inputs}')
+    if settings.kind == 'type3':
+        levels = slice_levels(settings.slices)
+    else:
+        levels = np.ones((1, 2))  # one slice, at level one: secondary grades are all one
+    _check_size(inputs, settings.sets, len(levels))
+    one = type3_widths(settings.width, levels)
+    if settings.kind == 'interval_type2':
+        one = one * np.array([1.0 - settings.footprint, 1.0 + settings.footprint])
+    if settings.sets == 1:
+        line = np.array([0.5 * (settings.centre_low + settings.centre_high)])
+    else:
+        line = np.linspace(settings.centre_low, settings.centre_high, settings.sets)
+    return FuzzySets(
+        centres=np.tile(line, (inputs, 1)),
+        widths=np.broadcast_to(one, (inputs, settings.sets, *one.shape)),
+        levels=levels,
+        input_fuzziness=settings.input_fuzziness,
+    )

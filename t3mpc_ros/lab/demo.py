@@ -1,0 +1,111 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The demonstration: four processes over DDS, recorded, and a report made from the bag."""
+
+from dataclasses import dataclass
+from pathlib import Path
+import shutil
+import sys
+import time
+
+from t3mpc_ros.lab.processes import Fleet, ProcessError, private_graph
+from t3mpc_ros.lab.report import ReportFigures, write_report
+
+STARTED = ('recorder', 'controller', 'sim_robot', 'reference')
+PAPER_NOISE = 0.04
+"""Variance of the measured wheel speeds, (rad/s)², as in the paper's simulations."""
+FOLLOWS = 'tracking'
+"""What the controller says when it follows the reference; finding each other takes seconds."""
+STOPPED = ('reference', 'controller', 'sim_robot', 'recorder')
+
+
+@dataclass(frozen=True, slots=True)
+class DemoOptions:
+    """What the command line of ``scripts/demo`` says."""
+
+    duration: float = 60.0
+    output: Path = Path('runs/demo')
+    headless: bool = False
+    seed: int | None = None
+
+
+class Progress:
+    """A bar with the time left on a terminal, a line now and then elsewhere."""
+
+    def __init__(self, seconds: float, *, live: bool) -> None:
+        self._seconds = seconds
+        self._live = live
+        self._next_line = 0.0
+
+    def show(self, elapsed: float) -> None:
+        """Show that ``elapsed`` seconds have passed."""
+        share = min(1.0, elapsed / self._seconds)
+        left = max(0.0, self._seconds - elapsed)
+        if self._live:
+            width = max(10, min(40, shutil.get_terminal_size().columns - 40))
+            bar = '█' * round(width * share)
+            print(
+                f'\r  running  {bar:░<{width}} {100 * share:3.0f} %  {left:4.0f} s left ',
+                end='' if share < 1.0 else '\n',
+                file=sys.stderr,
+                flush=True,
+            )
+        elif elapsed >= self._next_line:
+            print(
+                f'  running: {elapsed:.0f} of {self._seconds:.0f} s', file=sys.stderr, flush=True
+            )
+            self._next_line += max(10.0, self._seconds / 6)
+
+
+def run_demo(options: DemoOptions) -> ReportFigures:
+    """Run reference, controller, simulated robot and recorder, and return the main figures.
+
+    The bag is in ``output/bag``, the nodes' logs in ``output/log``, the report beside them.
+
+    Raises
+    ------
+    ProcessError
+        A node did not start, ended during the run, or did not end cleanly; all are stopped.
+    OSError
+        The output folder cannot be made.
+    """
+    options.output.mkdir(parents=True, exist_ok=True)
+    bag = options.output / 'bag'
+    if bag.exists() and any(bag.iterdir()):
+        raise ProcessError(f'{bag} already holds a recording; choose another folder with --output')
+    fleet = Fleet(options.output / 'log', private_graph())
+    parameters: dict[str, dict[str, object]] = {
+        'recorder': {'folder': str(bag.resolve())},
+        'sim_robot': {'noise.variance': PAPER_NOISE},
+    }
+    if options.seed is not None:
+        parameters['reference'] = {'seed': options.seed}
+        parameters['sim_robot']['seed'] = options.seed
+    try:
+        for name in STARTED:
+            print(f'  starting {name}', file=sys.stderr, flush=True)
+            fleet.start(name, parameters=parameters.get(name))
+            fleet.wait_ready(name)
+        print('  waiting until they have found each other', file=sys.stderr, flush=True)
+        fleet.wait_for('controller', FOLLOWS)
+        _watch(fleet, options)
+    finally:
+        codes = fleet.stop_all(STOPPED)
+    if wrong := {name: code for name, code in codes.items() if code}:
+        raise ProcessError(
+            'not every node ended cleanly: '
+            + ', '.join(f'{name} with code {code}' for name, code in wrong.items())
+            + f'; see {options.output / "log"}'
+        )
+    print('  drawing the report from the bag', file=sys.stderr, flush=True)
+    return write_report(bag, options.output)
+
+
+def _watch(fleet: Fleet, options: DemoOptions) -> None:
+    progress = Progress(options.duration, live=not options.headless and sys.stderr.isatty())
+    start = time.monotonic()
+    while (elapsed := time.monotonic() - start) < options.duration:
+        fleet.check()
+        progress.show(elapsed)
+        time.sleep(min(0.2, options.duration - elapsed))
+    progress.show(options.duration)

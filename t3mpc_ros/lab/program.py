@@ -1,0 +1,124 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``lab``: what can be done without a ROS graph, as a command-line program."""
+
+import argparse
+from collections.abc import Sequence
+from datetime import datetime
+import json
+from pathlib import Path
+import sys
+import webbrowser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Return the exit code: 0 done, 1 failed with a reason, 2 wrong command line."""
+    options = _parser().parse_args(arguments)
+    try:
+        code: int = options.run(options)
+    except KeyboardInterrupt:
+        print('stopped', file=sys.stderr)
+        return 130
+    except (OSError, RuntimeError, ValueError) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 1
+    return code
+
+
+def _demo(options: argparse.Namespace) -> int:
+    from t3mpc_ros.lab.demo import DemoOptions, run_demo
+
+    output = options.output or Path('runs') / f'{datetime.now():%Y%m%d-%H%M%S}'
+    figures = run_demo(DemoOptions(options.duration, output, options.headless, options.seed))
+    print(figures.summary())
+    if not options.headless:
+        webbrowser.open(figures.report.resolve().as_uri())
+    return 0
+
+
+def _report(options: argparse.Namespace) -> int:
+    from t3mpc_ros.lab.report import write_report
+
+    print(write_report(options.bag, options.output or options.bag.parent).summary())
+    return 0
+
+
+def _ablation(options: argparse.Namespace) -> int:
+    from t3mpc_ros.lab.ablation import paper_setting, table
+
+    results = paper_setting(seeds=options.seeds, duration=options.duration, progress=True)
+    print(table(results))
+    if options.json:
+        options.json.write_text(
+            json.dumps([result.record() for result in results], indent=1) + '\n'
+        )
+    return 0
+
+
+def _exponents(options: argparse.Namespace) -> int:
+    from t3mpc_ros.chaos.system import hyperchaotic
+    from t3mpc_ros.lab.exponents import lyapunov_exponents
+
+    values = lyapunov_exponents(hyperchaotic(orders=(1.0,) * 4), duration=options.duration)
+    print('Lyapunov exponents of (85) at q = 1: ' + ', '.join(f'{v:.3f}' for v in values))
+    print(f'their sum: {sum(values):.3f} (trace of the Jacobian: -38)')
+    return 0
+
+
+def _warm(options: argparse.Namespace) -> int:
+    from t3mpc_ros.lab.ablation import warm_up
+
+    warm_up()
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog='lab', description=__doc__)
+    commands = parser.add_subparsers(dest='command', required=True)
+
+    demo = commands.add_parser('demo', help='run all nodes as processes, record, report')
+    demo.add_argument('--duration', type=_seconds, default=60.0, help='seconds (default 60)')
+    demo.add_argument('--output', type=Path, help='folder (default runs/<time>)')
+    demo.add_argument('--headless', action='store_true', help='no bar, no browser')
+    demo.add_argument('--seed', type=int, help='seed of reference and robot')
+    demo.add_argument('--robot', choices=('sim',), default='sim', help='which robot to drive')
+    demo.set_defaults(run=_demo)
+
+    report = commands.add_parser('report', help='draw the report of a bag')
+    report.add_argument('bag', type=Path, help='folder of the bag')
+    report.add_argument('--output', type=Path, help='folder for the report (default: beside it)')
+    report.set_defaults(run=_report)
+
+    ablation = commands.add_parser(
+        'ablation', help="the paper's setting, with and without each part of the controller"
+    )
+    ablation.add_argument('--seeds', type=_count, default=5, help='runs each (default 5)')
+    ablation.add_argument('--duration', type=_seconds, default=60.0, help='seconds (default 60)')
+    ablation.add_argument('--json', type=Path, help='also write the numbers to this file')
+    ablation.set_defaults(run=_ablation)
+
+    exponents = commands.add_parser('exponents', help='Lyapunov exponents of the generator')
+    exponents.add_argument('--duration', type=_seconds, default=200.0, help='system seconds')
+    exponents.set_defaults(run=_exponents)
+
+    warm = commands.add_parser('warm', help='compile every kernel into the cache')
+    warm.set_defaults(run=_warm)
+    return parser
+
+
+def _seconds(text: str) -> float:
+    value = float(text)
+    if not 1.0 <= value <= 86_400.0:
+        raise argparse.ArgumentTypeError(f'must be from 1 to 86400 seconds: got {text}')
+    return value
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if not 1 <= value <= 10_000:
+        raise argparse.ArgumentTypeError(f'must be from 1 to 10000: got {text}')
+    return value
+
+
+if __name__ == '__main__':
+    sys.exit(main())

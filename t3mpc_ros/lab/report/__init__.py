@@ -1,0 +1,8 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""From a bag alone: figures, figures of merit, and a page that shows them."""
+
+from t3mpc_ros.lab.report.merit import ReportFigures
+from t3mpc_ros.lab.report.page import write_report
+
+__all__ = ['ReportFigures', 'write_report']

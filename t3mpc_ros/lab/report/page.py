@@ -1,0 +1,274 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""One self-contained page about a recorded run."""
+
+import base64
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime
+from html import escape
+import math
+from pathlib import Path
+
+from t3mpc_ros.lab.report.canvas import LABELS, png_of
+from t3mpc_ros.lab.report.drawings import DRAWINGS
+from t3mpc_ros.lab.report.measures import SETTLING
+from t3mpc_ros.lab.report.merit import ReportFigures, errors_of, figures_of, in_words
+from t3mpc_ros.lab.report.recorded import ODOMETRY, REFERENCE, TRUTH, WHEELS, Run, load_run
+from t3mpc_ros.motion.words import NANOSECONDS
+from t3mpc_ros.record.reader import Recording, open_recording
+
+
+def write_report(
+    folder: Path | str, output: Path | str | None = None, namespace: str | None = None
+) -> ReportFigures:
+    """Return the main figures of a bag, after writing ``report.html`` and its pictures.
+
+    Parameters
+    ----------
+    folder
+        The bag.
+    output
+        Where ``report.html`` and ``figures/*.png`` go; beside the bag by default.
+    namespace
+        Which robot's; by default the one with the most topics.
+
+    Raises
+    ------
+    RecordError
+        There is no bag, or it cannot be read.
+    OSError
+        The output cannot be written.
+    """
+    folder = Path(folder)
+    output = folder.parent if output is None else Path(output)
+    with open_recording(folder) as recording:
+        run = load_run(recording, namespace)
+        pictures = {item.stem: png_of(item.draw, run) for item in DRAWINGS}
+        (output / 'figures').mkdir(parents=True, exist_ok=True)
+        paths = []
+        for stem, png in pictures.items():
+            if png is not None:
+                paths.append(output / 'figures' / f'{stem}.png')
+                paths[-1].write_bytes(png)
+        figures = figures_of(run, output / 'report.html', tuple(paths), recording.message_count)
+        figures.report.write_text(_page(recording, run, figures, pictures), encoding='utf-8')
+    return figures
+
+
+_CSS = """
+:root { color-scheme: light; }
+* { box-sizing: border-box; }
+body { margin: 0 auto; max-width: 60rem; padding: 1.2rem 1rem 4rem; color: #1f2937;
+  background: #fff; font: 1rem/1.5 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
+h1 { font-size: 1.5rem; margin: 0 0 .2rem; overflow-wrap: anywhere; }
+h2 { font-size: 1.1rem; margin: 2.4rem 0 .4rem; }
+p { margin: .3rem 0; }
+.quiet { color: #6b7280; font-size: .9rem; }
+.tiles { display: grid; grid-template-columns: repeat(3, 1fr); gap: .6rem; margin: 1.2rem 0;
+  padding: 0; list-style: none; }
+@media (max-width: 40rem) { .tiles { grid-template-columns: repeat(2, 1fr); } }
+.tiles li { border: 1px solid #e5e7eb; border-radius: .5rem; padding: .6rem .8rem; }
+.tiles b { display: block; font-size: 1.15rem; font-variant-numeric: tabular-nums; }
+.tiles span { color: #6b7280; font-size: .82rem; }
+.notes { border-left: 3px solid #d97706; background: #fffbeb; padding: .5rem 1rem;
+  margin: 1rem 0; }
+.notes ul { margin: .2rem 0; padding-left: 1.1rem; }
+figure { margin: .4rem 0 0; }
+figure img { display: block; width: 100%; height: auto; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; width: 100%; font-size: .92rem; }
+th, td { text-align: right; padding: .25rem .7rem; border-bottom: 1px solid #e5e7eb;
+  white-space: nowrap; font-variant-numeric: tabular-nums; }
+th { color: #6b7280; font-weight: 600; }
+th.text, td.text { text-align: left; }
+td.long { white-space: normal; overflow-wrap: anywhere; min-width: 8rem; }
+details { margin: .6rem 0; }
+summary { cursor: pointer; font-weight: 600; }
+"""
+
+
+def _page(
+    recording: Recording, run: Run, figures: ReportFigures, pictures: Mapping[str, bytes | None]
+) -> str:
+    name = recording.folder.resolve().name
+    if name == 'bag':  # says nothing: the folder above tells which run it is
+        name = f'{recording.folder.resolve().parent.name}/bag'
+    parts = [
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f'<title>{escape(name)}</title>\n<style>{_CSS}</style>\n</head>\n<body>',
+        f'<h1>{escape(name)}</h1>',
+        f'<p class="quiet">{escape(_origin(recording, run))}</p>',
+        _tiles(figures),
+        _notes(recording, run),
+        '<h2>Tracking error</h2>',
+        _error_table(run),
+        _pictures(run, pictures),
+        '<h2>Timing by topic</h2>',
+        _timing_table(run),
+        _complaint_table(run),
+        '<h2>What the bag holds</h2>',
+        _topic_table(recording),
+        *(_details(title, table) for title, table in sorted(recording.details.items())),
+        '</body>\n</html>\n',
+    ]
+    return '\n'.join(part for part in parts if part)
+
+
+def _origin(recording: Recording, run: Run) -> str:
+    words = []
+    if recording.start_ns:
+        when = datetime.fromtimestamp(recording.start_ns / NANOSECONDS, UTC)
+        words.append(f'{when:%Y-%m-%d %H:%M:%S} UTC')
+    source = recording.details.get('provenance', {})
+    words += [f'{key} {source[key]}' for key in ('version', 'commit') if key in source]
+    if run.namespaces[0]:
+        words.append(f'namespace {run.namespaces[0]}')
+    words.append(
+        f'wheels of {run.geometry.wheel_radius:g} m radius, '
+        f'{run.geometry.wheel_separation:g} m apart'
+    )
+    return ' · '.join(words)
+
+
+def _tiles(figures: ReportFigures) -> str:
+    right, left = (figures.wheels[wheel] for wheel in WHEELS)
+    tiles = [
+        (f'{figures.duration:.1f} s', f'{figures.messages} messages, {figures.switches} switches'),
+        (_pair(right.overall.rmse, left.overall.rmse, 'rad/s'), 'error RMSE, right / left'),
+        (
+            _pair(right.settled.rmse, left.settled.rmse, 'rad/s'),
+            f'RMSE beyond {SETTLING:g} s after start and switches',
+        ),
+        (
+            _pair(right.chatter, left.chatter, 'rad/s²'),
+            'variation of the command per second; the reference has '
+            f'{_pair(right.demand, left.demand, "")}',
+        ),
+        (
+            f'{in_words(1e3 * figures.latency)} ms',
+            f'odometry to command; 99 % below {in_words(1e3 * figures.latency_99)} ms',
+        ),
+        (
+            f'{in_words(100.0 * figures.missing.get(ODOMETRY, math.nan))} %',
+            'of the odometry missing',
+        ),
+    ]
+    items = (f'<li><b>{escape(b)}</b><span>{escape(text)}</span></li>' for b, text in tiles)
+    return f'<ul class="tiles">{"".join(items)}</ul>'
+
+
+def _notes(recording: Recording, run: Run) -> str:
+    notes = list(run.notes)
+    if run.absent:
+        notes.append(f'Not in the bag, or without a message: {", ".join(run.absent)}.')
+    if recording.unfinished:
+        notes.append(f'Files that broke off and are not read: {", ".join(recording.unfinished)}.')
+    if len(run.namespaces) > 1:
+        others = ', '.join(space or '/' for space in run.namespaces[1:])
+        notes.append(f'The bag also holds topics of {others}.')
+    items = ''.join(f'<li>{escape(note)}</li>' for note in notes)
+    return f'<div class="notes"><ul>{items}</ul></div>' if items else ''
+
+
+def _error_table(run: Run) -> str:
+    rows = []
+    for source in (TRUTH, ODOMETRY):
+        if source not in run.motions or REFERENCE not in run.motions:
+            continue
+        for wheel, both in errors_of(run, source).items():
+            for extent, values in zip(('whole run', 'settled'), both, strict=True):
+                numbers = (values.rmse, values.mae, values.largest)
+                cells = [in_words(number) for number in numbers]
+                rows.append([LABELS[source], wheel, extent, *cells, str(values.count)])
+    if not rows:
+        return '<p>The bag lacks a reference, or odometry to compare with it.</p>'
+    head = ['motion', 'wheel', 'extent', 'RMSE / rad/s', 'MAE / rad/s', 'max / rad/s', 'samples']
+    note = (
+        f'<p class="quiet">Settled: without the {SETTLING:g} s after the start and after each of '
+        f'the {run.switches.size} switches.</p>'
+    )
+    return _table(head, rows, text=3, wrap=False) + note
+
+
+def _pictures(run: Run, pictures: Mapping[str, bytes | None]) -> str:
+    parts = []
+    for item in DRAWINGS:
+        png = pictures[item.stem]
+        title = escape(item.title)
+        parts.append(f'<h2>{title}</h2>')
+        if png is None:
+            lacking = [name for name in item.needs if name in run.absent]
+            why = (
+                f'the bag lacks {", ".join(lacking)}' if lacking else 'there are too few messages'
+            )
+            parts.append(f'<p class="quiet">Left out: {escape(why)}.</p>')
+            continue
+        data = base64.b64encode(png).decode()
+        parts.append(
+            f'<figure><img alt="{title}" src="data:image/png;base64,{data}">'
+            f'<figcaption class="quiet">{escape(item.caption)}</figcaption></figure>'
+        )
+    return '\n'.join(parts)
+
+
+def _timing_table(run: Run) -> str:
+    head = ['topic', 'messages', 'rate / Hz', 'jitter / ms', 'missing / %']
+    rows: dict[bool, list[list[str]]] = {True: [], False: []}
+    for name, timing in run.timing.items():
+        rate = in_words(1.0 / timing.period if timing.period > 0.0 else math.nan)
+        jitter, missing = in_words(1e3 * timing.jitter), in_words(100.0 * timing.missing)
+        rows[name in run.motions].append(
+            [run.topics[name], str(timing.count), rate, jitter, missing]
+        )
+    note = (
+        '<p class="quiet">Rate: from the median time between receipts. Jitter: 99 % of these '
+        'times are closer to the median than this. Missing: against that rate, by stamp where '
+        'there is one.</p>'
+    )
+    parts = [_table(head, rows[True], text=1)] if rows[True] else []
+    if rows[False]:
+        summary = f'<summary>Plain numbers, {len(rows[False])} topics</summary>'
+        parts.append(f'<details>{summary}{_table(head, rows[False], text=1)}</details>')
+    return '\n'.join([*parts, note]) if parts else '<p>No topic has enough messages.</p>'
+
+
+def _complaint_table(run: Run) -> str:
+    if not run.complaints:
+        return ''
+    rows = [[level, who, what, in_words(when)] for when, level, who, what in run.complaints]
+    head = ['level', 'who', 'what', 'first at / s']
+    return '<h2>Warnings and errors of the nodes</h2>' + _table(head, rows, text=3)
+
+
+def _topic_table(recording: Recording) -> str:
+    rows = [[t.name, t.type_name, str(t.message_count)] for t in recording.topics.values()]
+    if not rows:
+        return '<p>No topic.</p>'
+    summary = f'<summary>Topics, {len(rows)}</summary>'
+    return f'<details>{summary}{_table(["topic", "type", "messages"], rows, text=2)}</details>'
+
+
+def _details(title: str, table: Mapping[str, str]) -> str:
+    rows = [[key, value] for key, value in table.items()]
+    summary = f'<summary>{escape(title)}, {len(rows)} values</summary>'
+    return f'<details>{summary}{_table(["name", "value"], rows, text=2)}</details>'
+
+
+def _table(
+    head: Sequence[str], rows: Iterable[Sequence[str]], text: int, wrap: bool = True
+) -> str:
+    """Return a table whose first ``text`` columns are words, the others numbers."""
+    words = ' class="text long"' if wrap else ' class="text"'
+    kinds = [words if i < text else '' for i in range(len(head))]
+    top = ''.join(f'<th{k}>{escape(word)}</th>' for k, word in zip(kinds, head, strict=True))
+    body = ''.join(
+        '<tr>' + ''.join(f'<td{k}>{escape(c)}</td>' for k, c in zip(kinds, row, strict=True))
+        + '</tr>\n'
+        for row in rows
+    )  # fmt: skip
+    return f'<div class="wide"><table><tr>{top}</tr>\n{body}</table></div>'
+
+
+def _pair(right: float, left: float, unit: str) -> str:
+    return f'{in_words(right)} / {in_words(left)} {unit}'.rstrip()

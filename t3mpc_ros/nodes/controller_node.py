@@ -1,0 +1,188 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 run t3mpc_ros controller``: makes the robot follow the reference."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from geometry_msgs.msg import Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from rclpy.publisher import Publisher
+from std_msgs.msg import Float64
+from std_srvs.srv import SetBool, Trigger
+
+from t3mpc_ros.control.controller import Controller, Status
+from t3mpc_ros.control.law import TERMS
+from t3mpc_ros.motion import BodyTwist
+from t3mpc_ros.motion.words import STANDSTILL
+from t3mpc_ros.nodes.plumbing import convert, graph, quality
+from t3mpc_ros.nodes.plumbing.package_node import ERROR, OK, WARN, PackageNode, send_last
+from t3mpc_ros.nodes.tables import ControllerNodeSettings
+from t3mpc_ros.record.model import ModelError, load_model, save_model
+
+WHEELS = ('right', 'left')
+
+
+class ControllerNode(PackageNode[ControllerNodeSettings]):
+    """Publishes the controller's command each time the robot reports its motion."""
+
+    def __init__(self) -> None:
+        super().__init__('controller', ControllerNodeSettings)
+        self._controller = Controller(self.settings)
+        self._controller.warm_up()  # compile and pre-train now, never inside a step
+        self._load_model()
+        self._heard_ns: int | None = None
+        self._steps = 0
+        self._refused = 0
+        self._said = self._controller.status.reason
+        self._type = TwistStamped if self.settings.stamped else Twist
+        self._command = self.create_publisher(self._type, 'cmd_vel', quality.COMMAND)
+        self._numbers = self._number_publishers() if self.settings.terms_rate else {}
+        self.create_subscription(Odometry, 'reference', self._on_reference, quality.STREAM)
+        self.create_subscription(Odometry, 'odom', self._on_odometry, quality.STREAM)
+        self.create_service(SetBool, '~/enable', self._on_enable)
+        self.create_service(Trigger, '~/reset', self._on_reset)
+        self.create_service(Trigger, '~/save_model', self._on_save_model)
+        self.every(0.05, self._on_watch)
+
+    def _load_model(self) -> None:
+        path = self.settings.model
+        if not path:
+            return
+        try:
+            self._controller.law.restore(load_model(Path(path)))
+        except ValueError as error:
+            raise ModelError(f'{path} does not fit these settings: {error}') from error
+
+    def configure(self, settings: ControllerNodeSettings) -> None:
+        """Hand live settings on to the controller."""
+        self._controller.configure(settings)
+
+    def _on_reference(self, message: Odometry) -> None:
+        if not self._controller.add_reference(convert.motion_from_odometry(message)):
+            self._refused += 1
+
+    def _on_odometry(self, message: Odometry) -> None:
+        self._heard_ns = self.steady_ns()
+        command, status = self._controller.step(convert.motion_from_odometry(message))
+        self._publish(command, status.stamp_ns)
+        self._steps += 1
+        if self._numbers and self._steps % self._every_step() == 0:
+            self._publish_numbers(status)
+        self._tell(status)
+
+    def _on_watch(self) -> None:
+        if self._heard_ns is None:
+            return
+        if self._controller.silent(self._heard_ns, self.steady_ns()):
+            self._publish(STANDSTILL, self.now_ns())
+            self._tell(self._controller.status)
+
+    def _publish(self, command: BodyTwist, stamp_ns: int) -> None:
+        if self.settings.stamped:
+            message = convert.stamped_twist(command, stamp_ns, self.settings.frame_id)
+        else:
+            message = convert.twist_from_body(command)
+        self._command.publish(message)
+
+    def _tell(self, status: Status) -> None:
+        if status.reason is not self._said:
+            self._said = status.reason
+            self.get_logger().info(status.reason.value)
+
+    def _every_step(self) -> int:
+        return max(1, round(self.settings.rate / self.settings.terms_rate))
+
+    def _number_publishers(self) -> dict[str, Publisher]:
+        wheels = [
+            f'{name}/{wheel}'
+            for name in (
+                'error',
+                'estimate',
+                'skill',
+                'terms/applied',
+                *map('terms/{}'.format, TERMS),
+            )
+            for wheel in WHEELS
+        ]
+        names = [*wheels, 'lyapunov/value', 'lyapunov/margin']
+        return {
+            name: self.create_publisher(Float64, f'~/{name}', quality.SCALARS) for name in names
+        }
+
+    def _publish_numbers(self, status: Status) -> None:
+        for i, wheel in enumerate(WHEELS):
+            self._number(f'error/{wheel}', status.error[i])
+            self._number(f'estimate/{wheel}', status.estimate[i])
+            self._number(f'skill/{wheel}', status.skill[i])
+            self._number(f'terms/applied/{wheel}', status.applied[i])
+            for row, term in enumerate(TERMS):
+                self._number(f'terms/{term}/{wheel}', status.terms[row, i])
+        self._number('lyapunov/value', status.certificate.value)
+        self._number('lyapunov/margin', status.certificate.margin)
+
+    def _number(self, name: str, value: float) -> None:
+        self._numbers[name].publish(Float64(data=float(value)))
+
+    def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self._controller.enable(request.data)
+        response.success = True
+        response.message = 'the robot may move' if request.data else 'the robot is stopped'
+        return response
+
+    def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._controller.reset()
+        response.success = True
+        response.message = 'everything learnt in this run is forgotten'
+        return response
+
+    def _on_save_model(
+        self, request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        path = Path(self.settings.model_output)
+        try:
+            save_model(path, self._controller.law.learnt(), self.settings.flat())
+        except ModelError as error:
+            response.success = False
+            response.message = str(error)
+        else:
+            response.success = True
+            response.message = f'saved {path.resolve()}'
+        return response
+
+    def health(self) -> tuple[bytes, str, Mapping[str, object]]:
+        """Return whether the robot may move, and if not why not."""
+        status = self._controller.status
+        values = {
+            'reason': status.reason.value,
+            'steps': self._steps,
+            'limited': status.limited,
+            'certificate_margin': status.certificate.margin,
+            'certificate_holds': status.certificate.holds,
+            'ultimate_bound_rad_s': self._controller.law.ball,
+            'skill_right': float(status.skill[0]),
+            'skill_left': float(status.skill[1]),
+            'references_refused': self._refused,
+        }
+        if other := graph.other_types(self, 'cmd_vel', self._type, subscribers=True):
+            return WARN, f'cmd_vel is taken as {other} by another node: set stamped', values
+        if not status.reason.moves:
+            waiting = self._steps == 0
+            return (WARN if waiting else ERROR), f'stopped: {status.reason.value}', values
+        if self._refused:
+            return WARN, 'references that are not finite were ignored', values
+        return OK, status.reason.value, values
+
+    def finish(self) -> None:
+        """Stop the robot."""
+        send_last(self._command, self._stop_message())
+
+    def _stop_message(self) -> Twist | TwistStamped:
+        if self.settings.stamped:
+            return convert.stamped_twist(STANDSTILL, self.now_ns(), self.settings.frame_id)
+        return convert.twist_from_body(STANDSTILL)
+
+
+def make() -> list[ControllerNode]:
+    """Return the nodes of this process."""
+    return [ControllerNode()]

@@ -1,0 +1,70 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Files of what a controller has learnt: arrays with their format, version and settings."""
+
+from collections.abc import Mapping
+import json
+from pathlib import Path
+from typing import Any
+import zipfile
+
+import numpy as np
+from numpy.typing import NDArray
+
+import t3mpc_ros
+
+FORMAT = 1
+"""Raised whenever the meaning of an array changes."""
+
+_HEADER = 'header'
+
+
+class ModelError(RuntimeError):
+    """A model file that cannot be written, read or used."""
+
+
+def save_model(
+    path: Path, arrays: Mapping[str, NDArray[np.float64]], settings: Mapping[str, object]
+) -> None:
+    """Write what was learnt, with the settings it was learnt under.
+
+    Raises
+    ------
+    ModelError
+        The file cannot be written; the text names it and the reason.
+    """
+    header = json.dumps(
+        {'format': FORMAT, 'version': t3mpc_ros.__version__, 'settings': dict(settings)}
+    )
+    try:
+        with path.open('wb') as target:
+            content: dict[str, Any] = {_HEADER: np.array(header), **arrays}
+            np.savez_compressed(target, **content)
+    except OSError as error:
+        raise ModelError(f'cannot write the model file {path}: {error.strerror}') from error
+
+
+def load_model(path: Path) -> dict[str, NDArray[np.float64]]:
+    """Return the arrays of a model file.
+
+    Raises
+    ------
+    ModelError
+        The file cannot be read, is no model, or is of another format; the text says which.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as content:
+            header = json.loads(str(content[_HEADER]))
+            arrays = {name: np.array(content[name]) for name in content.files if name != _HEADER}
+    except OSError as error:
+        raise ModelError(
+            f'cannot read the model file {path}: {error.strerror or error}'
+        ) from error
+    except (KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise ModelError(f'{path} is not a model file of t3mpc_ros') from error
+    found = header.get('format') if isinstance(header, dict) else None
+    if found != FORMAT:
+        raise ModelError(
+            f'{path} has model format {found}, this is format {FORMAT}: train or save it anew'
+        )
+    return arrays

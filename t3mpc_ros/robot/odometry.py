@@ -1,0 +1,166 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Where the wheels say the robot is, and how sure that is."""
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from t3mpc_ros.kernels import kernel
+from t3mpc_ros.motion import Geometry, Pose, WheelSpeeds
+from t3mpc_ros.motion.words import ORIGIN
+from t3mpc_ros.settings import Settings, setting
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class OdometrySettings(Settings):
+    """How fast dead reckoning loses its certainty."""
+
+    variance_per_metre: float = setting(
+        1e-5,
+        'variance that each metre of wheel travel adds to what the wheel is thought to have run',
+        unit='m²/m',
+        low=0.0,
+        high=1.0,
+        live=True,
+    )
+
+
+@kernel
+def dead_reckon(
+    pose: Array,
+    covariance: Array,
+    right: float,
+    left: float,
+    radius: float,
+    half: float,
+    per_metre: float,
+    jitter: float,
+) -> None:
+    """Move ``pose`` by two wheel angles along the exact arc of (1)-(3), and its covariance.
+
+    The wheels' distances are taken as independent, each with variance
+    ``per_metre |distance| + radius² jitter``; the covariance follows as F C F' + G V G' with the
+    exact derivatives F by the pose and G by the distances.
+
+    pose : shape (3,), x, y (m), heading (rad, kept in (-pi, pi]); changed in place
+    covariance : shape (3, 3); changed in place
+    right, left : angles turned since last time, rad; jitter : variance of each, rad²
+    radius, half : R and b (E1: half the separation), m
+    """
+    run_right, run_left = radius * right, radius * left
+    run = 0.5 * (run_right + run_left)
+    half_turn = 0.25 * (run_right - run_left) / half
+    if abs(half_turn) > 1e-4:
+        ratio = math.sin(half_turn) / half_turn
+        ratio_rate = (math.cos(half_turn) - ratio) / half_turn
+    else:
+        ratio = 1.0 - half_turn * half_turn / 6.0
+        ratio_rate = -half_turn / 3.0
+    direction = pose[2] + half_turn
+    cosine, sine = math.cos(direction), math.sin(direction)
+
+    # C <- F C F', with F the identity but for its third column, (across_x, across_y, 1).
+    across_x, across_y = -run * ratio * sine, run * ratio * cosine
+    for column in range(3):
+        covariance[0, column] += across_x * covariance[2, column]
+        covariance[1, column] += across_y * covariance[2, column]
+    for row in range(3):
+        covariance[row, 0] += across_x * covariance[row, 2]
+        covariance[row, 1] += across_y * covariance[row, 2]
+
+    for side in (1.0, -1.0):
+        distance = run_right if side > 0.0 else run_left
+        variance = per_metre * abs(distance) + radius * radius * jitter
+        bend = 0.25 * side / half
+        slope = 0.5 * ratio, run * ratio_rate * bend, run * ratio * bend
+        effect_x = (slope[0] + slope[1]) * cosine - slope[2] * sine
+        effect_y = (slope[0] + slope[1]) * sine + slope[2] * cosine
+        effect_heading = 2.0 * bend
+        effect = (effect_x, effect_y, effect_heading)
+        for row in range(3):
+            for column in range(3):
+                covariance[row, column] += variance * effect[row] * effect[column]
+
+    pose[0] += run * ratio * cosine
+    pose[1] += run * ratio * sine
+    heading = pose[2] + 2.0 * half_turn
+    if heading > math.pi or heading <= -math.pi:
+        heading -= 2.0 * math.pi * math.ceil((heading - math.pi) / (2.0 * math.pi))
+    pose[2] = heading
+
+
+class DeadReckoning:
+    """Keeps a pose and its covariance from what the wheels report, and from nothing else.
+
+    It never integrates commands: after a timeout a robot stands while its last command goes on.
+
+    Parameters
+    ----------
+    settings
+        Replaceable while running.
+    geometry
+        R and 2b as the odometry believes them.
+    """
+
+    def __init__(self, settings: OdometrySettings, geometry: Geometry) -> None:
+        self.settings = settings
+        self._geometry = geometry
+        self._pose: Array = np.zeros(3)
+        self._covariance: Array = np.zeros((3, 3))
+
+    @property
+    def pose(self) -> Pose:
+        """Where the robot is thought to be."""
+        return Pose(float(self._pose[0]), float(self._pose[1]), float(self._pose[2]))
+
+    @property
+    def covariance(self) -> Array:
+        """A copy of the covariance of (x, y, heading), shape (3, 3), m², m rad, rad²."""
+        return self._covariance.copy()
+
+    def reset(self, pose: Pose = ORIGIN) -> None:
+        """Start again at ``pose`` with full certainty.
+
+        Raises
+        ------
+        ValueError
+            The pose is not finite.
+        """
+        if not all(map(math.isfinite, pose)):
+            raise ValueError(f'pose must be finite: got {pose}')
+        self._pose[:] = pose
+        self._covariance[:] = 0.0
+
+    def turn(self, right: float, left: float, jitter: float = 0.0) -> None:
+        """Add the angles (rad) that the wheels have turned since the last call.
+
+        ``jitter`` is a variance (rad²) of each angle that does not depend on the distance.
+        Step counters are used this way: a report that got lost costs nothing.
+
+        Raises
+        ------
+        ValueError
+            A number is not finite; nothing has changed then.
+        """
+        if not (math.isfinite(right) and math.isfinite(left) and math.isfinite(jitter)):
+            raise ValueError(f'wheel angles must be finite: got {right}, {left}, {jitter}')
+        geometry = self._geometry
+        dead_reckon(
+            self._pose,
+            self._covariance,
+            float(right),
+            float(left),
+            geometry.wheel_radius,
+            geometry.half_separation,
+            self.settings.variance_per_metre,
+            float(jitter),
+        )
+
+    def drive(self, wheels: WheelSpeeds, dt: float, variance: float = 0.0) -> None:
+        """Add ``dt`` seconds at constant measured speeds, each with ``variance`` ((rad/s)²)."""
+        self.turn(wheels.right * dt, wheels.left * dt, variance * dt * dt)

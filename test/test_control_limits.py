@@ -1,0 +1,189 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Velocity command, limits and anti-windup; the state estimate; freshness."""
+
+import math
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.control.estimate import EstimateSettings, SpeedEstimator, stationary_gain
+from t3mpc_ros.control.freshness import Freshness, FreshnessSettings, Reason
+from t3mpc_ros.control.limits import LimitSettings, VelocityCommand, limit_change, limit_twist
+from t3mpc_ros.motion import BodyTwist, Geometry, WheelSpeeds
+from t3mpc_ros.motion.kinematics import wheels_from_body
+
+LIMITS = LimitSettings()
+GEOMETRY = Geometry()
+MS = 1_000_000
+
+
+def test_limited_twist_keeps_curvature_and_stays_within_the_limits():
+    rng = np.random.default_rng(3)
+    for _ in range(2000):
+        twist = BodyTwist(*rng.normal(scale=(2.0, 20.0)))
+        limited = limit_twist(twist, LIMITS, GEOMETRY)
+        assert abs(limited.linear) <= LIMITS.linear * (1 + 1e-12)
+        assert abs(limited.angular) <= LIMITS.angular * (1 + 1e-12)
+        assert limited.linear * twist.angular == pytest.approx(limited.angular * twist.linear)
+        wheels = wheels_from_body(limited, GEOMETRY)
+        assert max(map(abs, wheels)) <= LIMITS.wheel_speed * (1 + 1e-12)
+        free = max(map(abs, wheels_from_body(twist, GEOMETRY))) <= LIMITS.wheel_speed
+        if free and abs(twist.linear) <= LIMITS.linear and abs(twist.angular) <= LIMITS.angular:
+            assert limited == twist
+
+
+def test_change_never_exceeds_the_acceleration_limits():
+    rng = np.random.default_rng(4)
+    for _ in range(2000):
+        a, b = (BodyTwist(*rng.normal(scale=(0.5, 8.0))) for _ in range(2))
+        c = limit_change(a, b, LIMITS, GEOMETRY, 0.01)
+        assert abs(c.linear - b.linear) <= LIMITS.linear_acceleration * 0.01 * (1 + 1e-9)
+        assert abs(c.angular - b.angular) <= LIMITS.angular_acceleration * 0.01 * (1 + 1e-9)
+        change = wheels_from_body(BodyTwist(c.linear - b.linear, c.angular - b.angular), GEOMETRY)
+        assert max(map(abs, change)) <= LIMITS.wheel_acceleration * 0.01 * (1 + 1e-9)
+
+
+def test_an_infinite_wish_does_not_break_the_command():
+    assert all(map(math.isfinite, limit_twist(BodyTwist(1e300, -1e300), LIMITS, GEOMETRY)))
+
+
+def test_integrating_within_the_limits_applies_exactly_what_was_asked():
+    command = VelocityCommand(LIMITS, Geometry())
+    asked = WheelSpeeds(2.0, -3.0)
+    applied = command.step(asked, 0.01)
+    assert not command.limited
+    assert applied == pytest.approx(asked)
+    assert command.wheels == pytest.approx((0.02, -0.03))
+
+
+def test_nothing_winds_up_behind_a_limit():
+    """Full throttle for ten seconds, then full brake: the command must turn round at once.
+
+    An integral that had gone on growing behind the limit would need as long to come back.
+    """
+    command = VelocityCommand(LIMITS, Geometry())
+    for _ in range(1000):
+        command.step(WheelSpeeds(30.0, 30.0), 0.01)
+    assert command.twist.linear == pytest.approx(LIMITS.linear)
+    assert command.limited
+    top = command.twist.linear
+    for _ in range(6):  # three times the tracking time
+        command.step(WheelSpeeds(-30.0, -30.0), 0.01)
+    assert command.twist.linear < top - 2 * LIMITS.linear_acceleration * 0.01
+
+
+def test_applied_acceleration_is_the_derivative_of_what_was_sent():
+    rng = np.random.default_rng(5)
+    command = VelocityCommand(LIMITS, Geometry())
+    before = np.array(command.wheels)
+    for _ in range(500):
+        applied = np.array(command.step(WheelSpeeds(*rng.normal(scale=60.0, size=2)), 0.01))
+        after = np.array(command.wheels)
+        np.testing.assert_allclose(applied, (after - before) / 0.01, atol=1e-9)
+        before = after
+
+
+@pytest.mark.parametrize('drive', ['velocity', 'torque'])
+def test_the_estimate_beats_the_measurement_and_finds_the_unexplained(drive):
+    settings = EstimateSettings(noise_variance=0.04, disturbance=10.0)
+    estimator = SpeedEstimator(settings, drive, 0.01)
+    rng = np.random.default_rng(6)
+    chi = np.zeros(2)
+    push = np.array([4.0, -2.0])  # what the model does not know of, rad/s²
+    raw, filtered, unexplained = [], [], []
+    late = [np.zeros(2)] * 2
+    for k in range(3000):
+        command = 3.0 * np.array([math.sin(0.02 * k), math.cos(0.015 * k)])
+        if drive == 'velocity':
+            late = [late[1], command]  # dead time of one period
+            decay = math.exp(-0.01 / settings.lag)
+            chi = decay * chi + (1 - decay) * (late[0] + settings.lag * push)
+        else:
+            chi = chi + 0.01 * (command + push)
+        estimator.predict(command, 0.01)
+        measured = chi + rng.normal(scale=0.2, size=2)
+        estimate = estimator.correct(measured)
+        if k > 500:
+            raw.append(measured - chi)
+            filtered.append(estimate - chi)
+            unexplained.append(estimator.unexplained)
+    ratio = np.std(filtered) / np.std(raw)
+    assert ratio < 0.6
+    np.testing.assert_allclose(np.mean(unexplained, axis=0), push, atol=0.6)  # three sigma
+
+
+def test_the_gain_is_the_fixed_point_of_the_riccati_equation():
+    from scipy.linalg import solve_discrete_are
+
+    settings = EstimateSettings()
+    transition = np.array([[1.0, 0.01], [0.0, 1.0]])
+    process = np.diag([0.0, settings.disturbance**2 * 0.01])
+    ahead = solve_discrete_are(
+        transition.T, np.array([[1.0], [0.0]]), process, np.array([[settings.noise_variance]])
+    )
+    expected = ahead[:, 0] / (ahead[0, 0] + settings.noise_variance)
+    np.testing.assert_allclose(stationary_gain(transition, settings, 0.01), expected, rtol=1e-6)
+
+
+def test_without_noise_or_switched_off_the_measurement_is_believed():
+    for settings in (EstimateSettings(enabled=False), EstimateSettings(noise_variance=0.0)):
+        estimator = SpeedEstimator(settings, 'torque', 0.01)
+        estimator.predict(np.array([5.0, 5.0]), 0.01)
+        np.testing.assert_allclose(estimator.correct(np.array([1.0, 2.0])), [1.0, 2.0], rtol=1e-3)
+
+
+def test_an_unknown_drive_is_refused():
+    with pytest.raises(ValueError, match='drive'):
+        SpeedEstimator(EstimateSettings(), 'warp', 0.01)
+
+
+def _decide(freshness, stamp_ms, **changes):
+    facts = {'finite': True, 'known': True, 'speed': 1.0, 'error': 0.1} | changes
+    return freshness.decide(stamp_ms * MS, **facts)
+
+
+def test_every_reason_to_stop_is_found_and_the_good_case_moves():
+    freshness = Freshness(FreshnessSettings())
+    assert _decide(freshness, 0) is Reason.NO_REFERENCE
+    freshness.reference_arrived()
+    assert _decide(freshness, 10) is Reason.TRACKING
+    assert _decide(freshness, 20, finite=False) is Reason.ODOMETRY_BAD
+    assert _decide(freshness, 30, known=False) is Reason.NO_REFERENCE
+    assert _decide(freshness, 150) is Reason.TRACKING
+    assert _decide(freshness, 170) is Reason.REFERENCE_STALE
+    freshness.reference_arrived()
+    assert _decide(freshness, 180) is Reason.TRACKING
+    freshness.enabled = False
+    freshness.reference_arrived()
+    assert _decide(freshness, 190) is Reason.DISABLED
+    freshness.enabled = True
+    assert _decide(freshness, 200) is Reason.TRACKING
+
+
+@pytest.mark.parametrize('fault', [{'speed': 41.0}, {'error': 26.0}])
+def test_a_diverging_state_stops_the_robot_for_the_hold_time(fault):
+    freshness = Freshness(FreshnessSettings())
+    reasons = []
+    for k in range(100):
+        freshness.reference_arrived()
+        reasons.append(_decide(freshness, 10 * k, **(fault if k == 10 else {})))
+    assert reasons[9] is Reason.TRACKING
+    assert all(reason is Reason.DIVERGING for reason in reasons[10:61])
+    assert all(reason is Reason.TRACKING for reason in reasons[61:])
+
+
+def test_elapsed_refuses_gaps_first_messages_and_time_running_backwards():
+    freshness = Freshness(FreshnessSettings())
+    assert freshness.elapsed(1000 * MS) is None
+    assert freshness.elapsed(1010 * MS) == pytest.approx(0.01)
+    assert freshness.elapsed(1300 * MS) is None
+    assert freshness.elapsed(1310 * MS) == pytest.approx(0.01)
+    assert freshness.elapsed(500 * MS) is None
+
+
+def test_silence_is_judged_by_one_clock():
+    freshness = Freshness(FreshnessSettings(odometry_timeout=0.2))
+    assert freshness.silent(None, 0)
+    assert not freshness.silent(1000 * MS, 1199 * MS)
+    assert freshness.silent(1000 * MS, 1201 * MS)
