@@ -59,7 +59,7 @@ class CompositionSettings(Settings):
         live=True,
     )
     handover: float = setting(
-        0.05,
+        0.2,
         'how strongly a lasting v_p teaches the fuzzy systems, which then take it over: they '
         'learn from delta - handover v_p; 0 is (77)-(78) as printed',
         unit='s',

@@ -28,7 +28,7 @@ class EstimateSettings(Settings):
         source='paper: noise of the simulations',
     )
     disturbance: float = setting(
-        30.0,
+        15.0,
         'how fast the unknown acceleration wanders, as the square root of its spectral density',
         unit='rad/s²/√s',
         low=1e-3,

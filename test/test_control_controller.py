@@ -1,0 +1,332 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The controller as the node uses it: stops with reasons, switches, learning, models."""
+
+from dataclasses import replace
+import math
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.control.composition import ComposedLaw, CompositionSettings
+from t3mpc_ros.control.controller import Controller, ControllerSettings
+from t3mpc_ros.control.freshness import Reason
+from t3mpc_ros.motion import BodyTwist, Geometry, Motion, WheelSpeeds
+from t3mpc_ros.motion.kinematics import body_from_wheels, wheels_from_body
+from t3mpc_ros.motion.words import ORIGIN
+
+MS = 1_000_000
+PERIOD = 10 * MS
+LEAD = 200 * MS
+GEOMETRY = Geometry()
+
+
+def _motion(stamp_ns, linear=0.0, angular=0.0):
+    return Motion(stamp_ns, ORIGIN, BodyTwist(linear, angular))
+
+
+class Loop:
+    """A controller around an ideal robot: its speed is the last command."""
+
+    def __init__(self, wanted=lambda t: (0.1, 0.5), **changes):
+        self.controller = Controller(ControllerSettings.from_flat(changes))
+        self.wanted = wanted
+        self.now = 0
+        self.twist = BodyTwist(0.0, 0.0)
+        self.reference_alive = True
+
+    def step(self, measured=None):
+        if self.reference_alive:
+            stamp = self.now + LEAD
+            self.controller.add_reference(_motion(stamp, *self.wanted(stamp / 1e9)))
+        motion = measured or Motion(self.now, ORIGIN, self.twist)
+        self.twist, status = self.controller.step(motion)
+        self.now += PERIOD
+        return status
+
+    def run(self, steps):
+        return [self.step() for _ in range(steps)]
+
+
+@pytest.fixture(scope='module')
+def tracking():
+    loop = Loop()
+    statuses = loop.run(300)
+    return loop, statuses
+
+
+def test_it_waits_for_a_reference_then_tracks_it(tracking):
+    loop, statuses = tracking
+    assert statuses[0].reason is Reason.NO_REFERENCE
+    assert statuses[-1].reason is Reason.TRACKING
+    assert loop.twist.linear == pytest.approx(0.1, abs=2e-3)
+    assert loop.twist.angular == pytest.approx(0.5, abs=2e-2)
+
+
+def test_the_command_never_exceeds_the_limits():
+    loop = Loop(lambda t: (5.0 * math.sin(9 * t), 60.0 * math.cos(7 * t)))
+    limits = loop.controller.settings.limits
+    before = None
+    for _ in range(400):
+        status = loop.step()
+        wheels = wheels_from_body(loop.twist, GEOMETRY)
+        assert abs(loop.twist.linear) <= limits.linear * (1 + 1e-9)
+        assert abs(loop.twist.angular) <= limits.angular * (1 + 1e-9)
+        assert max(map(abs, wheels)) <= limits.wheel_speed * (1 + 1e-9)
+        if before is not None and status.reason is Reason.TRACKING:
+            change = np.subtract(wheels, before)
+            assert np.max(np.abs(change)) <= limits.wheel_acceleration * 0.01 * (1 + 1e-9)
+        before = wheels if status.reason is Reason.TRACKING else None
+
+
+def test_a_silent_reference_stops_the_robot_although_it_is_known_ahead():
+    """The reference is stamped 0.2 s ahead: a dead generator must not be followed so long."""
+    loop = Loop()
+    loop.run(100)
+    loop.reference_alive = False
+    statuses = loop.run(40)
+    moving = [status.reason is Reason.TRACKING for status in statuses]
+    assert sum(moving) * 10 <= 160
+    assert statuses[-1].reason is Reason.REFERENCE_STALE
+    assert loop.twist == BodyTwist(0.0, 0.0)
+    loop.reference_alive = True
+    assert loop.run(30)[-1].reason is Reason.TRACKING
+
+
+@pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf])
+def test_odometry_that_is_not_finite_stops_and_a_good_one_resumes(value):
+    loop = Loop()
+    loop.run(100)
+    status = loop.step(_motion(loop.now, value, 0.0))
+    assert status.reason is Reason.ODOMETRY_BAD
+    assert loop.twist == BodyTwist(0.0, 0.0)
+    statuses = loop.run(50)
+    assert statuses[-1].reason is Reason.TRACKING
+    assert all(np.isfinite(status.applied).all() for status in statuses)
+    assert np.isfinite(loop.controller.law.fuzzy.coefficients).all()
+
+
+def test_a_reference_that_is_not_finite_is_ignored_and_said_so():
+    loop = Loop()
+    assert not loop.controller.add_reference(_motion(0, math.nan, 0.0))
+    assert loop.controller.add_reference(_motion(0, 0.1, 0.0))
+
+
+def test_odometry_that_jumps_back_in_time_stops_and_starts_anew():
+    loop = Loop()
+    loop.run(200)
+    loop.now = 0  # the robot, or a simulated clock, has started again
+    statuses = loop.run(60)
+    assert statuses[0].reason is not Reason.TRACKING
+    assert statuses[-1].reason is Reason.TRACKING
+
+
+def test_a_gap_in_the_odometry_starts_the_law_anew_without_a_jump():
+    loop = Loop()
+    loop.run(200)
+    loop.now += 1000 * MS
+    for k in range(30):  # the reference went on meanwhile
+        stamp = loop.now + LEAD - (30 - k) * PERIOD
+        loop.controller.add_reference(_motion(stamp, *loop.wanted(stamp / 1e9)))
+    before = loop.twist
+    status = loop.step()
+    assert status.reason is Reason.TRACKING
+    assert loop.twist.linear == pytest.approx(before.linear, abs=0.02)
+
+
+def test_the_same_message_twice_changes_nothing():
+    loop = Loop()
+    loop.run(100)
+    motion = Motion(loop.now, ORIGIN, loop.twist)
+    first = loop.controller.step(motion)
+    again = loop.controller.step(motion)
+    assert again == first
+
+
+def test_disabling_stops_and_enabling_resumes():
+    loop = Loop()
+    loop.run(100)
+    loop.controller.enable(False)
+    assert loop.step().reason is Reason.DISABLED
+    assert loop.twist == BodyTwist(0.0, 0.0)
+    loop.controller.enable(True)
+    assert loop.run(20)[-1].reason is Reason.TRACKING
+
+
+def test_a_diverging_robot_is_stopped():
+    loop = Loop()
+    loop.run(100)
+    status = loop.step(_motion(loop.now, 3.0, 0.0))  # 86 rad/s at the wheels
+    assert status.reason is Reason.DIVERGING
+    assert loop.twist == BodyTwist(0.0, 0.0)
+
+
+def test_silence_is_told_by_the_clock_of_the_caller():
+    loop = Loop()
+    loop.run(100)
+    assert not loop.controller.silent(1000 * MS, 1100 * MS)
+    assert loop.controller.silent(1000 * MS, 1300 * MS)
+    assert loop.controller.status.reason is Reason.NO_ODOMETRY
+
+
+def test_the_output_is_a_function_of_the_messages():
+    first, second = Loop(), Loop()
+    for loop in (first, second):
+        rng = np.random.default_rng(7)
+        loop.record = []
+        for _ in range(300):
+            noisy = BodyTwist(*(np.array(loop.twist) + rng.normal(scale=(0.01, 0.1))))
+            loop.step(Motion(loop.now, ORIGIN, noisy))
+            loop.record.append(loop.twist)
+    assert first.record == second.record
+
+
+def test_live_settings_reach_every_part():
+    loop = Loop()
+    loop.run(50)
+    changed = loop.controller.settings.changed(
+        {'law.gain': 3.0, 'adaptation.gamma': 0.0, 'predictive.v_max': 0.0, 'limits.linear': 0.05}
+    )
+    loop.controller.configure(changed)
+    before = loop.controller.law.fuzzy.coefficients.copy()
+    statuses = loop.run(200)
+    np.testing.assert_array_equal(loop.controller.law.fuzzy.coefficients, before)
+    assert abs(loop.twist.linear) <= 0.05 + 1e-12
+    assert statuses[-1].terms[4].tolist() == [0.0, 0.0]
+    error = statuses[-1].error - loop.controller.law.closing
+    np.testing.assert_allclose(statuses[-1].terms[1], -3.0 * error, atol=1e-9)
+
+
+def test_reset_forgets_what_was_learnt():
+    loop = Loop()
+    loop.run(200)
+    assert np.any(loop.controller.law.fuzzy.coefficients)
+    loop.controller.reset()
+    assert not np.any(loop.controller.law.fuzzy.coefficients)
+    assert loop.run(40)[-1].reason is Reason.TRACKING
+
+
+# --- the law underneath --------------------------------------------------------------------------
+
+
+def _ideal_run(steps, reference, settings, push=(0.0, 0.0), jump_at=None):
+    """Torque drive on chi' = u + push without noise; returns errors and the law."""
+    law = ComposedLaw(settings, 'torque')
+    law.warm_up()
+    chi = np.zeros(2)
+    errors, learning = [], []
+    for k in range(steps):
+        r, rate = reference(k * 0.01)
+        u = law.step(chi, r, rate, 0.01).copy()
+        law.applied(u, np.zeros(2), limited=False)
+        errors.append(chi - r)
+        learning.append(law.fuzzy.coefficients.copy())
+        chi = chi + 0.01 * (u + np.array(push))
+    return np.array(errors), learning, law
+
+
+QUIET = CompositionSettings.from_flat({'estimate.noise_variance': 0.0})
+
+
+def test_a_switch_is_followed_within_its_acceleration_and_teaches_nothing():
+    """A jump of r is no estimation error; taken for one it left a wrong g behind for seconds."""
+
+    def reference(t):
+        return np.array([1.0, -1.0]) + (3.0 if t >= 1.0 else 0.0), np.zeros(2)
+
+    errors, learning, _ = _ideal_run(300, reference, QUIET)
+    before = errors[99]
+    np.testing.assert_allclose(before, 0.0, atol=0.02)
+    assert errors[100] == pytest.approx([-3.0, -3.0], abs=0.05)
+    # Closing up: as fast as switch_acceleration and switch_rate allow, and without overshoot.
+    assert errors[100:].max() < 0.05
+    limit = QUIET.switch_acceleration
+    arrival = 1.0 + 3.0 / limit + 5.0 / QUIET.switch_rate
+    assert np.abs(errors[round(100 * arrival) :]).max() < 0.1
+    drift = np.linalg.norm(learning[-1] - learning[99]) / (1.0 + np.linalg.norm(learning[99]))
+    assert drift < 0.2
+
+
+def test_a_lasting_disturbance_ends_up_in_the_fuzzy_estimate_not_in_a_tug_of_war():
+    """Adaptation and MPC both integrate: without handover g and v_p shared a push at random.
+
+    In the first run of the demo g and -v_p stood at 2 rad/s² against each other for ever.
+    """
+
+    def reference(t):
+        return np.array([2.0, 1.0]), np.zeros(2)
+
+    push = np.array([3.0, -2.0])
+    errors, _, law = _ideal_run(3000, reference, QUIET, push)
+    assert np.abs(errors[-100:]).max() < 0.08
+    np.testing.assert_allclose(-law.terms[0], push, atol=0.35)  # g is the push
+    np.testing.assert_allclose(law.terms[4], 0.0, atol=0.35)  # v_p has gone
+    without = replace(QUIET, handover=0.0)
+    _, _, tug = _ideal_run(3000, reference, without, push)
+    assert np.abs(tug.terms[4]).max() > np.abs(law.terms[4]).max()
+
+
+def test_the_certificate_holds_along_a_noise_free_run_of_the_whole_law():
+    """E14 at run time: |delta|²/2 falls as promised while the push stays within its bound."""
+
+    def reference(t):
+        return (
+            np.array([2.0 * math.sin(2 * t), 1.5 * math.cos(t)]),
+            np.array([4.0 * math.cos(2 * t), -1.5 * math.sin(t)]),
+        )
+
+    law = ComposedLaw(QUIET, 'torque')
+    law.warm_up()
+    chi = np.array([0.0, 1.5])
+    margins = []
+    for k in range(2000):
+        r, rate = reference(k * 0.01)
+        u = law.step(chi, r, rate, 0.01).copy()
+        law.applied(u, np.zeros(2), limited=False)
+        margins.append(law.reading.margin)
+        push = 0.9 * np.array([math.sin(5.0 * k * 0.01), math.cos(3.0 * k * 0.01)])
+        chi = chi + 0.01 * (u + push)
+    assert min(margins[100:]) > 0.0
+    assert np.linalg.norm(chi - r) < law.ball
+
+
+def test_what_was_learnt_survives_saving_and_restoring(tmp_path):
+    from t3mpc_ros.record.model import ModelError, load_model, save_model
+
+    def reference(t):
+        return np.array([2.0 * math.sin(t), 1.0]), np.array([2.0 * math.cos(t), 0.0])
+
+    _, _, law = _ideal_run(500, reference, QUIET, (2.0, -1.0))
+    path = tmp_path / 'model.npz'
+    save_model(path, law.learnt(), QUIET.flat())
+    other = ComposedLaw(QUIET, 'torque')
+    other.restore(load_model(path))
+    for name, value in law.learnt().items():
+        np.testing.assert_array_equal(other.learnt()[name], value, err_msg=name)
+
+    with pytest.raises(ModelError, match='cannot read'):
+        load_model(tmp_path / 'none.npz')
+    (tmp_path / 'text.npz').write_text('no model')
+    with pytest.raises(ModelError, match='not a model file'):
+        load_model(tmp_path / 'text.npz')
+    with pytest.raises(ModelError, match='cannot write'):
+        save_model(tmp_path / 'none' / 'x.npz', law.learnt(), {})
+    smaller = ComposedLaw(replace(QUIET, fuzzy=replace(QUIET.fuzzy, sets=2)), 'torque')
+    with pytest.raises(ValueError, match='coefficients must have shape'):
+        smaller.restore(load_model(path))
+
+
+def test_a_model_of_another_format_is_refused_by_number(tmp_path, monkeypatch):
+    from t3mpc_ros.record import model
+
+    path = tmp_path / 'old.npz'
+    monkeypatch.setattr(model, 'FORMAT', 0)
+    model.save_model(path, {'x': np.zeros(1)}, {})
+    monkeypatch.undo()
+    with pytest.raises(model.ModelError, match='format 0, this is format 1'):
+        model.load_model(path)
+
+
+def test_a_round_trip_of_the_ideal_robot_uses_the_same_geometry():
+    wheels = WheelSpeeds(3.0, -1.0)
+    assert wheels_from_body(body_from_wheels(wheels, GEOMETRY), GEOMETRY) == pytest.approx(wheels)
