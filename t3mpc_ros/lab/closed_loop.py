@@ -47,10 +47,20 @@ class LoopRecord:
         """True tracking error chi - r, rad/s, shape (n, 2)."""
         return self.speeds - self.wanted
 
-    def rmse(self, after: float = 3.0) -> float:
-        """Return the tracking RMSE over both wheels, rad/s, without the first ``after`` s."""
-        late = self.time >= after
-        return float(np.sqrt(np.mean(self.error[late] ** 2)))
+    def rmse(self, after: float = 3.0, *, cut: float = 0.0) -> float:
+        """Return the tracking RMSE over both wheels, rad/s.
+
+        Parameters
+        ----------
+        after
+            Seconds left out at the start, while the reference grows.
+        cut
+            Seconds left out after each switch.
+        """
+        counted = self.time >= after
+        for switch in self.time[1:][np.diff(self.modes) != 0]:
+            counted &= (self.time < switch) | (self.time >= switch + cut)
+        return float(np.sqrt(np.mean(self.error[counted] ** 2)))
 
     def chatter(self) -> float:
         """Return the total variation of u per second and wheel, rad/s³."""

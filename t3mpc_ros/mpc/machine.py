@@ -1,0 +1,274 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The Boltzmann machine that predicts one wheel's tracking error, equations (35)-(42) with E9.
+
+Inside the machine everything is O(1): errors are divided by ``delta_scale``, predictive signals
+by ``move_scale``. Time runs in predictive periods; histories are stored newest first.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.kernels import kernel
+
+Array = NDArray[np.float64]
+
+
+class Shape(NamedTuple):
+    """How many past values the machine sees, and how many hidden units it has."""
+
+    delta_lags: int
+    """The paper's tau: past tracking errors in (35)."""
+    move_lags: int
+    """Past predictive signals; (35) has one, which cannot cover a dead time."""
+    hidden: int
+
+    @property
+    def visible(self) -> int:
+        """Length of the visible vector (35)."""
+        return self.delta_lags + self.move_lags
+
+
+class Machine(NamedTuple):
+    """Weights of one machine and its working memory; kernels change the arrays in place."""
+
+    visible_weights: Array
+    """X_v, shape (visible, hidden)."""
+    output_weights: Array
+    """X_o, shape (hidden,)."""
+    delta_lags: int
+    """How many of the visible units are tracking errors; the rest are predictive signals."""
+    scales: Array
+    """(delta_scale in rad/s, move_scale in rad/s²)."""
+    lags: Array
+    """Shape (visible,): eta_0 of the latest pass, (35)."""
+    mu0: Array
+    """Shape (hidden,): (39)."""
+    eta1: Array
+    """Shape (visible,): (38), the reconstruction of eta_0."""
+    mu1: Array
+    """Shape (hidden,): (37), the features the output layer sees."""
+
+
+class Past(NamedTuple):
+    """What one output has seen, newest first, and how it was predicted; kernels change it."""
+
+    errors: Array
+    """Tracking errors (rad/s): errors[0] is the latest."""
+    moves: Array
+    """Applied v_p (rad/s²): moves[i] was held from errors[i] on; moves[0] is not known yet."""
+    offsets: Array
+    """Offsets e (rad/s) in force after each instant, shape (middle,)."""
+    misses: Array
+    """Latest errors (rad/s) of machine and persistence: one step, then middle of the horizon."""
+    predicted: Array
+    """Mean squares of the machine's errors, (rad/s)²: one step, middle."""
+    persisted: Array
+    """The same of persistence, which predicts that nothing changes."""
+    recent: Array
+    """The same over a second or so: tells whether there is anything to predict."""
+    planned: Array
+    """Working memory, shape (n_p,); the next are delta_lags, move_lags and middle long."""
+    seen_errors: Array
+    seen_moves: Array
+    ahead: Array
+
+
+def make_machine(
+    shape: Shape,
+    delta_scale: float,
+    move_scale: float,
+    spread: float,
+    generator: np.random.Generator,
+) -> Machine:
+    """Return a machine with small, well-conditioned random weights and a zero output layer.
+
+    The rows of X_v are orthogonal and of length ``spread``: X_v X_vᵀ = spread² I. In the linear
+    range mu_1 = X_vᵀ X_v X_vᵀ eta_0 / 8, so the three passes keep all of eta_0 and favour no
+    direction of it. Independent random weights would raise their condition number to the third
+    power. This needs as many hidden as visible units.
+
+    Parameters
+    ----------
+    shape
+        Sizes of the layers.
+    delta_scale, move_scale
+        What counts as 1 inside the machine: rad/s and rad/s².
+    spread
+        Length of each row of X_v; at 2 an eta_0 in the linear range is reconstructed whole.
+    generator
+        Source of the random directions.
+
+    Raises
+    ------
+    ValueError
+        Fewer hidden than visible units, a lag count below one, or a scale that is not positive.
+    """
+    if shape.delta_lags < 1 or shape.move_lags < 1:
+        raise ValueError(f'shape must have at least one lag of each kind: got {shape}')
+    if shape.hidden < shape.visible:
+        raise ValueError(
+            f'hidden must be at least the {shape.visible} visible units: got {shape.hidden}'
+        )
+    if not (delta_scale > 0.0 and move_scale > 0.0 and spread > 0.0):
+        raise ValueError(
+            f'scales and spread must be positive: got {delta_scale}, {move_scale}, {spread}'
+        )
+    square, _ = np.linalg.qr(generator.standard_normal((shape.hidden, shape.visible)))
+    return Machine(
+        visible_weights=np.ascontiguousarray(spread * square.T),
+        output_weights=np.zeros(shape.hidden),
+        delta_lags=shape.delta_lags,
+        scales=np.array([delta_scale, move_scale]),
+        lags=np.zeros(shape.visible),
+        mu0=np.zeros(shape.hidden),
+        eta1=np.zeros(shape.visible),
+        mu1=np.zeros(shape.hidden),
+    )
+
+
+def make_past(delta_lags: int, move_lags: int, horizon: int) -> Past:
+    """Return an empty past that is long enough to predict from half a horizon ago."""
+    middle = max(horizon // 2, 1)
+    length = max(delta_lags, move_lags) + middle
+    return Past(
+        errors=np.zeros(length),
+        moves=np.zeros(length),
+        offsets=np.zeros(middle),
+        misses=np.zeros(4),
+        predicted=np.ones(2),
+        persisted=np.ones(2),
+        recent=np.zeros(2),
+        planned=np.zeros(max(horizon, middle)),
+        seen_errors=np.zeros(delta_lags),
+        seen_moves=np.zeros(move_lags),
+        ahead=np.zeros(middle),
+    )
+
+
+def begin(past: Past, error: float) -> None:
+    """Make the past as if ``error`` (rad/s) had always been measured, and nothing done."""
+    past.errors[:] = error
+    past.moves[:] = 0.0
+    past.offsets[:] = 0.0
+    past.misses[:] = 0.0
+    past.recent[:] = 0.0
+
+
+@kernel
+def squash(y: float) -> float:
+    """Return Xi(y) = (1 - exp(-y))/(1 + exp(-y)) = tanh(y/2), equation (40).
+
+    The second form cannot overflow.
+    """
+    return math.tanh(0.5 * y)
+
+
+@kernel
+def infer_hidden(visible_weights: Array, eta: Array, mu: Array) -> None:
+    """Write mu = Xi(X_vᵀ eta), equations (37) and (39), into ``mu``, shape (hidden,)."""
+    for j in range(mu.size):
+        mu[j] = 0.0
+    # Along the rows, which lie together in memory.
+    for i in range(eta.size):
+        for j in range(mu.size):
+            mu[j] += visible_weights[i, j] * eta[i]
+    for j in range(mu.size):
+        mu[j] = squash(mu[j])
+
+
+@kernel
+def infer_visible(visible_weights: Array, mu: Array, eta: Array) -> None:
+    """Write eta = Xi(X_v mu), equation (38), into ``eta``, shape (visible,)."""
+    for i in range(eta.size):
+        total = 0.0
+        for j in range(mu.size):
+            total += visible_weights[i, j] * mu[j]
+        eta[i] = squash(total)
+
+
+@kernel
+def look(machine: Machine, errors: Array, moves: Array, first: int) -> None:
+    """Write the scaled visible vector (35) into ``machine.lags``.
+
+    The paper's vector holds one v_p only. Further lags are needed because a move that left one
+    dead time ago acts only now.
+
+    errors : delta, newest first (rad/s), at least first + delta_lags values
+    moves  : v_p, newest first (rad/s²), at least first + move_lags values; moves[first] is held
+             from the instant of errors[first] on
+    first  : where the newest lag stands: 0 to predict the future, more to predict the past again
+
+    Values beyond ten scales are cut to ten: there every hidden unit is saturated anyway, and
+    (43) must stay finite whatever is measured.
+    """
+    n_errors = machine.delta_lags
+    for i in range(n_errors):
+        machine.lags[i] = min(max(errors[first + i] / machine.scales[0], -10.0), 10.0)
+    for i in range(machine.lags.size - n_errors):
+        value = moves[first + i] / machine.scales[1]
+        machine.lags[n_errors + i] = min(max(value, -10.0), 10.0)
+
+
+@kernel
+def predict(machine: Machine) -> float:
+    """Return delta_hat = X_oᵀ mu_1 (36) in rad/s, from ``machine.lags``.
+
+    The passes run (39), (38), (37): the paper prints them in the reverse order of computing.
+    They stay in ``machine.mu0``, ``.eta1`` and ``.mu1`` for learning.
+    """
+    infer_hidden(machine.visible_weights, machine.lags, machine.mu0)
+    infer_visible(machine.visible_weights, machine.mu0, machine.eta1)
+    infer_hidden(machine.visible_weights, machine.eta1, machine.mu1)
+    total: float = 0.0
+    for j in range(machine.mu1.size):
+        total += machine.output_weights[j] * machine.mu1[j]
+    total *= machine.scales[0]
+    return total
+
+
+@kernel
+def energy(visible_weights: Array, eta: Array, mu: Array) -> float:
+    """Return E(eta, mu) = -etaᵀ X_v mu, equation (42); dimensionless."""
+    total = 0.0
+    for i in range(eta.size):
+        for j in range(mu.size):
+            total -= eta[i] * visible_weights[i, j] * mu[j]
+    return total
+
+
+@kernel
+def free_energy(visible_weights: Array, eta: Array) -> float:
+    """Return F(eta) = -ln of the sum of exp(-E/2) over every mu in {-1, 1}^hidden.
+
+    The hidden units of (42) do not meet, so the sum is a product of 2 cosh(X_vᵀ eta / 2).
+    """
+    total = 0.0
+    for j in range(visible_weights.shape[1]):
+        y = 0.0
+        for i in range(eta.size):
+            y += visible_weights[i, j] * eta[i]
+        # ln(2 cosh(y/2)) without overflow.
+        total -= 0.5 * abs(y) + math.log1p(math.exp(-abs(y)))
+    return total
+
+
+def distribution(energies: Array) -> Array:
+    """Return the Boltzmann probability of each state, exp(-E/2) / sum exp(-E/2), (41) with E9.
+
+    E9: the printed J' = delta^E / E is no distribution. The temperature is 2 because Xi (40),
+    the tanh of *half* its argument, is the mean of a unit in {-1, 1} at exactly that
+    temperature; at temperature 1 the passes (36)-(39) would not sample from (41). It only
+    scales X_v, and its gradient only scales gamma in (43).
+
+    Parameters
+    ----------
+    energies
+        E of every state that can occur, equation (42).
+    """
+    weights: Array = np.exp(-0.5 * (energies - energies.min()))
+    weights /= weights.sum()
+    return weights

@@ -1,0 +1,147 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The skill against persistence, and how it fades v_p out."""
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.mpc.machine import Shape, begin, make_machine, make_past
+from t3mpc_ros.mpc.settings import Excitation, NominalLoop
+from t3mpc_ros.mpc.skill import (
+    Learning,
+    Predictor,
+    fade,
+    observe,
+    rehearse,
+    skill,
+    smooth_step,
+    tally,
+)
+from t3mpc_ros.mpc.training import Timing, excite, make_memory
+
+TIMING = Timing(0.01, 5, 5)
+HOW = Learning(True, 1e-4, 0.05, 0.9975, 0.975, 0.99, 0.03, 0.05)
+
+
+def _predictor(seed=0):
+    generator = np.random.default_rng(seed)
+    machine = make_machine(Shape(4, 4, 12), 3.0, 20.0, 1.0, generator)
+    runs = [excite(NominalLoop(), Excitation(), TIMING, 20.0, generator) for _ in range(2)]
+    return Predictor(machine, 10, runs[1]), runs[0]
+
+
+def _feed(past, missed, persisted, count):
+    for _ in range(count):
+        past.misses[0], past.misses[1] = missed, persisted
+        tally(past, 0, 0.99, 0.05)
+
+
+def test_skill_is_one_less_the_ratio_of_mean_squares():
+    past = make_past(4, 4, 10)
+    _feed(past, 0.5, 1.0, 5000)
+    assert skill(past, 0) == pytest.approx(0.75, abs=1e-3)
+    _feed(past, 1.0, 1.0, 5000)
+    assert skill(past, 0) == pytest.approx(0.0, abs=1e-3)
+    _feed(past, 2.0, 1.0, 5000)
+    assert skill(past, 0) == pytest.approx(-3.0, abs=1e-2)
+
+
+def test_in_quiet_times_the_skill_stays_what_it_was():
+    """Without the floor, mere noise on a well-controlled robot would rate the machine."""
+    past = make_past(4, 4, 10)
+    _feed(past, 0.5, 1.0, 5000)
+    _feed(past, 1e-4, 1e-5, 5000)
+    assert skill(past, 0) > 0.6
+    _feed(past, 0.0, 0.0, 5000)
+    assert skill(past, 0) > 0.6
+
+
+def test_no_evidence_at_all_gives_a_finite_skill():
+    past = make_past(4, 4, 10)
+    past.predicted[:] = past.persisted[:] = 0.0
+    _feed(past, 0.0, 0.0, 10)
+    assert np.isfinite(skill(past, 0))
+
+
+def test_fade_is_smooth_rises_with_skill_and_needs_the_right_sign():
+    x = np.linspace(-2.0, 1.0, 301)
+    values = np.array([fade(v, 1.0, -1.0, 0.0, 0.1, 0.4) for v in x])
+    assert values[0] == 0.0
+    assert values[-1] == 1.0
+    assert np.all(np.diff(values) >= 0.0)
+    assert np.max(np.diff(values)) < 1.6 * 0.01
+    assert np.max(np.abs(np.diff(values, 2))) < 0.01  # no kink
+    for gain in (-1.0, 0.0, 0.1):
+        assert fade(0.9, gain, -1.0, 0.0, 0.1, 0.4) == 0.0
+    assert 0.0 < fade(0.9, 0.25, -1.0, 0.0, 0.1, 0.4) < 1.0
+    assert fade(0.9, 5.0, -1.0, 0.0, 0.1, 0.4) == 1.0
+    assert smooth_step(0.5, 0.0, 1.0) == 0.5
+
+
+def test_a_taught_machine_is_skilled_on_a_run_it_has_not_seen():
+    predictor, run = _predictor()
+    predictor.teach(*run, Excitation(), 600.0, HOW)
+    assert skill(predictor.past, 0) > 0.5
+    assert skill(predictor.past, 1) > 0.8
+
+
+def test_an_untaught_machine_is_not():
+    predictor, _ = _predictor()
+    predictor.machine.output_weights[:] = np.random.default_rng(1).standard_normal(12)
+    predictor.try_out(HOW)
+    assert skill(predictor.past, 0) < 0.0
+    assert skill(predictor.past, 1) < 0.3
+
+
+def test_rehearsal_scores_by_definition_and_changes_no_weights():
+    predictor, run = _predictor()
+    predictor.teach(*run, Excitation(), 600.0, HOW)
+    weights = predictor.weights()
+    machine, past = predictor.machine, make_past(4, 4, 10)
+    errors, moves = run
+    rehearse(machine, predictor.memory, past, errors, moves, HOW)
+    for name, before in weights.items():
+        np.testing.assert_array_equal(before, predictor.weights()[name])
+    count = errors.size - 1 - past.errors.size
+    stayed = np.mean((errors[:count] - errors[1 : count + 1]) ** 2)
+    assert past.persisted[0] == pytest.approx(stayed, rel=1e-10)
+    stayed = np.mean((errors[:count] - errors[5 : count + 5]) ** 2)
+    assert past.persisted[1] == pytest.approx(stayed, rel=1e-10)
+
+
+def test_observing_keeps_what_was_predicted_against_what_came():
+    """The middle prediction uses the moves really made since, or a good plan would look bad."""
+    predictor, run = _predictor()
+    predictor.teach(*run, Excitation(noise=0.0, disturbance=0.0), 600.0, HOW)
+    generator = np.random.default_rng(3)
+    quiet = Excitation(noise=0.0, disturbance=0.0, move_hold=0.05)
+    errors, moves = excite(NominalLoop(), quiet, TIMING, 20.0, generator)
+    past = predictor.past
+    begin(past, 0.0)
+    missed, stayed = [], []
+    for i in range(errors.size - 2, -1, -1):
+        observe(
+            predictor.machine, predictor.memory, past, errors[i], moves[i + 1], True, False, HOW
+        )
+        if i < errors.size - 20:
+            missed.append(past.misses[2])
+            stayed.append(errors[i] - errors[i + 5])
+            assert past.misses[3] == pytest.approx(stayed[-1])
+    assert np.mean(np.square(missed)) < 0.05 * np.mean(np.square(stayed))
+
+
+def test_a_blow_beyond_the_range_of_the_machine_teaches_nothing():
+    predictor, run = _predictor()
+    predictor.teach(*run, Excitation(), 600.0, HOW)
+    before = predictor.weights()
+    observe(predictor.machine, predictor.memory, predictor.past, 1e200, 0.0, True, True, HOW)
+    for name, array in predictor.weights().items():
+        np.testing.assert_array_equal(array, before[name])
+    assert np.isfinite([skill(predictor.past, 0), skill(predictor.past, 1)]).all()
+
+
+def test_a_trial_too_short_to_predict_in_is_refused():
+    machine = make_machine(Shape(4, 4, 12), 3.0, 20.0, 1.0, np.random.default_rng(0))
+    with pytest.raises(ValueError, match='trial must be longer'):
+        Predictor(machine, 10, (np.zeros(5), np.zeros(5)))
+    assert make_memory(12).power.size == 3
