@@ -1,13 +1,14 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
 # Sourced by every script: makes or renews the local environment .venv, then offers $PYTHON.
-# Nothing but Python 3.11+ and a reachable package index is needed; no system ROS.
+# Nothing but Python 3.11 to 3.14 and a reachable package index is needed; no system ROS.
 
 set -euo pipefail
 
-ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
+ROOT="$(CDPATH='' cd -- "$(dirname -- "${BASH_SOURCE[0]}")/.." && pwd)"
 VENV="$ROOT/.venv"
 PYTHON="$VENV/bin/python"
+LOG="$ROOT/.venv.log"
 
 say() { printf '%s\n' "$*" >&2; }
 fail() {
@@ -16,64 +17,119 @@ fail() {
   exit 1
 }
 
-find_python() {
-  local candidate
-  for candidate in ${T3MPC_PYTHON:-} python3 python3.14 python3.13 python3.12 python3.11; do
-    if command -v "$candidate" >/dev/null 2>&1 &&
-      "$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then
-      command -v "$candidate"
+usable() {
+  "$1" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))' >/dev/null 2>&1
+}
+
+# What an environment made here with Python $1 belongs to: when it changes, .venv is made anew.
+origin_of() {
+  printf '%s ' "$ROOT"
+  "$1" -c 'import sys; from os.path import realpath as r; print(r(sys.base_prefix), *sys.version_info[:2])' 2>/dev/null
+}
+
+choose_python() {
+  local candidate found=''
+  if [ -n "${T3MPC_PYTHON:-}" ]; then
+    if usable "$T3MPC_PYTHON"; then
+      printf '%s\n' "$T3MPC_PYTHON"
       return
     fi
+    fail "T3MPC_PYTHON=$T3MPC_PYTHON is not a Python from 3.11 to 3.14 ($(version_of "$T3MPC_PYTHON"))" \
+      "set it to one that is, such as T3MPC_PYTHON=/usr/bin/python3.12, or unset it to have one looked for"
+  fi
+  # The one that .venv was made with stays: no need to name it again at every call.
+  if [ -x "$PYTHON" ] && [ "$(origin_of "$PYTHON")" = "$(cat "$VENV/origin" 2>/dev/null)" ]; then
+    printf '%s\n' "$PYTHON"
+    return
+  fi
+  for candidate in python3 python3.14 python3.13 python3.12 python3.11; do
+    # Not the one of .venv itself, which may be about to be deleted.
+    candidate="$(PATH="${PATH//"$VENV/bin:"/}" command -v "$candidate")" || continue
+    if usable "$candidate"; then
+      printf '%s\n' "$candidate"
+      return
+    fi
+    found="${found:+$found, }$candidate ($(version_of "$candidate"))"
   done
-  fail "no Python 3.11 or newer was found (python3 is $(python3 --version 2>&1 || echo missing))" \
+  fail "no Python from 3.11 to 3.14 was found on PATH; found: ${found:-none at all}" \
     "install python3.11 or newer with its venv module, or name one: T3MPC_PYTHON=/usr/bin/python3.12 $0"
 }
 
-# What the environment is made from: when any of it changes, the environment is stale.
-wanted_stamp() {
-  (cd "$ROOT" && cat requirements.txt requirements-dev.txt setup.py setup.cfg package.xml \
-    t3mpc_ros/__init__.py config/* launch/* && echo "$ROOT" && "$1" --version) | sha256sum | cut -d' ' -f1
+version_of() {
+  if command -v "$1" >/dev/null; then "$1" --version 2>&1 | tail -n 1 || true; else echo 'not found'; fi
 }
 
+# What is installed into the environment: when any of it changes, the environment is stale.
+wanted_stamp() {
+  {
+    origin_of "$BASE_PYTHON"
+    cat "$ROOT"/{requirements*.txt,setup.py,setup.cfg,package.xml,t3mpc_ros/__init__.py} \
+      "$ROOT"/{config/*.yaml,launch/*.launch.py}
+  } | sha256sum | cut -d' ' -f1
+}
+
+is_current() { [ "$(cat "$VENV/stamp" 2>/dev/null)" = "$(wanted_stamp)" ]; }
+
 make_environment() {
-  local base="$1" log="$VENV.log"
-  say "making the local environment .venv (once, about a minute; log: ${log#"$ROOT"/})"
-  if ! "$base" -m venv "$VENV" >"$log" 2>&1; then
-    fail "the environment could not be made: $(tail -n 1 "$log")" \
-      "install Python's venv module (Debian and Ubuntu: apt install python3-venv)"
+  local origin
+  [ -w "$ROOT" ] || fail "$ROOT cannot be written to, and .venv is made there" \
+    "copy the folder to a place of your own and run $0 there"
+  rm -f "$VENV/stamp"
+  : >"$LOG"
+  origin="$(origin_of "$BASE_PYTHON")"
+  if [ "$(cat "$VENV/origin" 2>/dev/null)" = "$origin" ]; then
+    say "bringing the local environment .venv up to date (log: $LOG)"
+  else
+    say "making the local environment .venv (once, about a minute; log: $LOG)"
+    "$BASE_PYTHON" -m venv --clear "$VENV" >>"$LOG" 2>&1 ||
+      fail "the environment could not be made with $BASE_PYTHON: $(tail -n 1 "$LOG")" \
+        "install Python's venv module (Debian and Ubuntu: apt install python3-venv), then run $0 again"
+    printf '%s\n' "$origin" >"$VENV/origin"
   fi
   say "  installing ROS 2 Jazzy and the libraries from the package index"
   if ! "$PYTHON" -m pip install --disable-pip-version-check \
-    -r "$ROOT/requirements.txt" -r "$ROOT/requirements-dev.txt" >>"$log" 2>&1; then
-    rm -f "$VENV/stamp"
-    say "$(grep -iE 'error|could not|no matching' "$log" | tail -n 3)"
-    fail "the libraries could not be installed" \
-      "check the network and the package index (pip config list; proxies: HTTPS_PROXY), then run this again"
+    -r "$ROOT/requirements.txt" -r "$ROOT/requirements-dev.txt" >>"$LOG" 2>&1; then
+    say "$(grep -iE 'error|could not|no matching' "$LOG" | tail -n 3)"
+    fail "the libraries could not be installed with $("$PYTHON" --version) on $(uname -sm)" \
+      "check the network and the package index (\"$PYTHON -m pip config list\"; proxies: HTTPS_PROXY), then run $0 again; the wheels of ROS 2 exist for Linux on x86_64"
   fi
   say "  installing t3mpc_ros itself, as colcon would"
-  # develop puts the executables into lib/t3mpc_ros, where \`ros2 run\` looks for them.
-  if ! (cd "$ROOT" && AMENT_PREFIX_PATH="$VENV" "$PYTHON" -W ignore setup.py -q develop --no-deps \
-    install_data --install-dir "$VENV") >>"$log" 2>&1; then
-    fail "the package could not be installed: $(tail -n 1 "$log")" "see ${log#"$ROOT"/}"
-  fi
+  # develop puts the executables into lib/t3mpc_ros, where ros2 run looks for them.
+  (cd -- "$ROOT" && "$PYTHON" -W ignore setup.py -q develop --no-deps \
+    install_data --install-dir "$VENV") >>"$LOG" 2>&1 ||
+    fail "the package could not be installed: $(tail -n 1 "$LOG")" "see $LOG"
   say "  compiling the kernels"
-  if ! (cd "$ROOT" && "$PYTHON" -m t3mpc_ros.lab.program warm) >>"$log" 2>&1; then
-    fail "the kernels could not be compiled: $(tail -n 1 "$log")" "see ${log#"$ROOT"/}"
-  fi
+  (cd -- "$ROOT" && "$PYTHON" -m t3mpc_ros.lab.program warm) >>"$LOG" 2>&1 ||
+    fail "the kernels could not be compiled: $(tail -n 1 "$LOG")" "see $LOG"
+  wanted_stamp >"$VENV/stamp"
 }
 
-BASE_PYTHON="$(find_python)"
-(
-  # One script at a time may set up; the others wait for it.
-  flock 9
-  STAMP="$(wanted_stamp "$BASE_PYTHON")"
-  if [ "$(cat "$VENV/stamp" 2>/dev/null)" != "$STAMP" ]; then
-    make_environment "$BASE_PYTHON"
-    echo "$STAMP" >"$VENV/stamp"
-  fi
-) 9>"$ROOT/.venv.lock"
+# A ROS 2 or a workspace that happens to be sourced would be mixed with this environment: its
+# modules and libraries stay outside, and so does its middleware (only Fast DDS is installed here).
+leave_other_ros() {
+  local folder kept='' folders
+  unset PYTHONPATH PYTHONHOME RMW_IMPLEMENTATION _ROS_WHEELS_BOOTSTRAP_COMPLETE
+  IFS=: read -r -a folders <<<"${LD_LIBRARY_PATH:-}"
+  for folder in "${folders[@]}"; do
+    if [ -n "$folder" ] && [ ! -e "$folder/librcl.so" ] && [[ "$folder" != */ros_*.libs ]]; then
+      kept="${kept:+$kept:}$folder"
+    fi
+  done
+  if [ -n "$kept" ]; then export LD_LIBRARY_PATH="$kept"; else unset LD_LIBRARY_PATH; fi
+  export AMENT_PREFIX_PATH="$VENV"
+}
 
-# A child of this environment must not inherit another one's idea of where ROS is.
-unset _ROS_WHEELS_BOOTSTRAP_COMPLETE
-export AMENT_PREFIX_PATH="$VENV${AMENT_PREFIX_PATH:+:$AMENT_PREFIX_PATH}"
+leave_other_ros
+BASE_PYTHON="$(choose_python)"
+if ! is_current; then
+  (
+    # One script at a time may set up; the others wait for it.
+    flock --nonblock 9 || {
+      say "waiting for another script that is making the local environment"
+      flock 9
+    }
+    is_current || make_environment
+  ) 9>"$ROOT/.venv.lock"
+fi
+
 export PATH="$VENV/bin:$PATH"

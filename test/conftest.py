@@ -7,6 +7,8 @@ import os
 
 import pytest
 
+from t3mpc_ros.lab.processes import Fleet, private_graph
+
 _DOMAINS = itertools.count(os.getpid())
 
 
@@ -15,8 +17,8 @@ def graph(monkeypatch):
     """Return a ``ROS_DOMAIN_ID`` nobody else uses, set for this process and its children."""
     domain = 102 + next(_DOMAINS) % 120  # the demo draws from 1 to 101
     monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
-    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    monkeypatch.setenv('RCUTILS_COLORIZED_OUTPUT', '0')
+    for name, value in private_graph().items():
+        monkeypatch.setenv(name, value)
     return domain
 
 
@@ -33,8 +35,6 @@ def ros(graph):
 @pytest.fixture
 def fleet(graph, tmp_path):
     """Return a fleet of executables; whatever still runs at the end is killed."""
-    from t3mpc_ros.lab.processes import Fleet, private_graph
-
     started = Fleet(tmp_path / 'log', private_graph())
     yield started
     for name in list(started.running()):

@@ -62,3 +62,13 @@ def test_lateness_counts_from_the_newest_sample():
     pace.due(0)
     pace.due(13 * MS)
     assert pace.lateness(14 * MS) == pytest.approx(0.004)
+
+
+def test_with_slack_a_timer_that_jitters_finds_exactly_one_sample_each_time():
+    """Without it a timer a little early found nothing, and the next call two samples."""
+    rng = np.random.default_rng(9)
+    ticks = [round(k * 10 * MS + rng.uniform(-0.9, 0.9) * MS) for k in range(1, 1000)]
+    loose, tight = Pace(100.0, slack=0.002), Pace(100.0)
+    counts = [len(loose.due(tick)) for tick in ticks]
+    assert set(counts[1:]) == {1}
+    assert [len(tight.due(tick)) for tick in ticks].count(1) < 900

@@ -20,7 +20,7 @@ from t3mpc_ros.settings import nested
 
 Array = NDArray[np.float64]
 
-JUMP_FACTOR = 4.0
+JUMP_FACTOR = 2.2
 """A reference that changes this many times faster than the robot may is taken as a switch."""
 
 

@@ -11,8 +11,9 @@ import numpy as np
 
 from t3mpc_ros.chaos.reference import ReferenceSettings
 from t3mpc_ros.control.composition import CompositionSettings
-from t3mpc_ros.lab.closed_loop import run_torque
-from t3mpc_ros.robot.simulated import SimulatedRobotSettings
+from t3mpc_ros.control.controller import Controller, ControllerSettings
+from t3mpc_ros.lab.closed_loop import LoopRecord, run_torque, run_velocity
+from t3mpc_ros.robot.simulated import SimulatedRobot, SimulatedRobotSettings
 
 VARIANTS: dict[str, dict[str, object]] = {
     'full': {},
@@ -115,15 +116,18 @@ def paper_setting(
     seeds: int = 5,
     duration: float = 60.0,
     noise_variance: float = 0.04,
+    drive: str = 'torque',
     progress: bool = False,
 ) -> list[VariantResult]:
-    """Return each variant's tracking in the paper's setting, over ``seeds`` seeds from 1."""
+    """Return each variant's tracking in the paper's setting, over ``seeds`` seeds from 1.
+
+    ``drive`` is ``'torque'`` as in the paper, or ``'velocity'`` as the nodes close the loop.
+    """
     results = []
     for name, changes in _with_progress(seeds, progress):
         rmse, settled, chatter, largest, finite = [], [], [], 0.0, True
         for seed in range(1, seeds + 1):
-            reference, robot = paper_settings(noise_variance, seed)
-            run = run_torque(law_settings(noise_variance, changes), reference, robot, duration)
+            run = _run(drive, noise_variance, changes, seed, duration)
             rmse.append(run.rmse())
             settled.append(run.rmse(cut=1.0))
             chatter.append(run.chatter())
@@ -144,6 +148,17 @@ def paper_setting(
             )
         )
     return results
+
+
+def _run(
+    drive: str, noise_variance: float, changes: dict[str, object], seed: int, duration: float
+) -> LoopRecord:
+    reference, robot = paper_settings(noise_variance, seed)
+    if drive == 'torque':
+        return run_torque(law_settings(noise_variance, changes), reference, robot, duration)
+    told = {'estimate.noise_variance': noise_variance} | changes
+    stepper = robot.changed({'drive.kind': 'velocity'})
+    return run_velocity(ControllerSettings.from_flat(told), reference, stepper, duration)
 
 
 def table(results: Sequence[VariantResult]) -> str:
@@ -174,9 +189,6 @@ def _spread(values: Sequence[float], sign: str = '') -> str:
 
 def warm_up() -> None:
     """Compile every kernel of a closed loop, of both drives, into the cache."""
-    from t3mpc_ros.control.controller import Controller, ControllerSettings
-    from t3mpc_ros.robot.simulated import SimulatedRobot
-
     reference, robot = paper_settings(0.04, 1)
     run_torque(law_settings(0.04, {}), reference, robot, 0.2)
     Controller(ControllerSettings()).warm_up()

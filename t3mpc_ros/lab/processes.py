@@ -24,28 +24,44 @@ def executable(name: str) -> Path:
     ProcessError
         It is not installed; the text says how to install it.
     """
-    places = [sys.prefix, *os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)]
-    for prefix in places:
-        path = Path(prefix) / 'lib' / 't3mpc_ros' / name
-        if prefix and os.access(path, os.X_OK):
-            return path
-    raise ProcessError(
-        f'the executable {name} is not installed below any of {", ".join(filter(None, places))}; '
-        'run it through scripts/run, or build the workspace and source its setup file'
-    )
+    path = _installed(Path('lib') / 't3mpc_ros' / name)
+    if path is None or not os.access(path, os.X_OK):
+        raise ProcessError(
+            f'the executable {name} is not installed below any of '
+            f'{", ".join(map(str, _prefixes()))}; run it through scripts/run, or build the '
+            'workspace and source its setup file'
+        )
+    return path
 
 
 def private_graph() -> dict[str, str]:
     """Return environment variables that keep a run to itself, on this machine only.
 
-    A ``ROS_DOMAIN_ID`` that is already set stays; otherwise one is drawn, so that two runs at
-    once do not hear each other.
+    What is set already stays. Otherwise a ``ROS_DOMAIN_ID`` is drawn, so that two runs at once
+    do not hear each other, and Fast DDS is kept to UDP on loopback: its shared memory may stop a
+    publisher for a third of a second when somebody new subscribes (Fast-DDS issue 6535).
     """
     environment = dict(os.environ)
     environment.setdefault('ROS_DOMAIN_ID', str(random.SystemRandom().randint(1, 101)))
-    environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     environment.setdefault('RCUTILS_COLORIZED_OUTPUT', '0')
+    profile = _installed(Path('share') / 't3mpc_ros' / 'config' / 'fastdds_loopback.xml')
+    chosen = {'ROS_AUTOMATIC_DISCOVERY_RANGE', 'FASTRTPS_DEFAULT_PROFILES_FILE'} & set(environment)
+    if not chosen:
+        if profile is None:
+            environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+        else:
+            environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'SYSTEM_DEFAULT'
+            environment['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(profile)
     return environment
+
+
+def _prefixes() -> list[Path]:
+    found = [sys.prefix, *os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)]
+    return [Path(prefix) for prefix in dict.fromkeys(found) if prefix]
+
+
+def _installed(path: Path) -> Path | None:
+    return next((prefix / path for prefix in _prefixes() if (prefix / path).exists()), None)
 
 
 class Fleet:

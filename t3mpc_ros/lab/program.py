@@ -46,7 +46,13 @@ def _report(options: argparse.Namespace) -> int:
 def _ablation(options: argparse.Namespace) -> int:
     from t3mpc_ros.lab.ablation import paper_setting, table
 
-    results = paper_setting(seeds=options.seeds, duration=options.duration, progress=True)
+    results = paper_setting(
+        seeds=options.seeds,
+        duration=options.duration,
+        noise_variance=options.noise,
+        drive=options.drive,
+        progress=True,
+    )
     print(table(results))
     if options.json:
         options.json.write_text(
@@ -94,6 +100,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     ablation.add_argument('--seeds', type=_count, default=5, help='runs each (default 5)')
     ablation.add_argument('--duration', type=_seconds, default=60.0, help='seconds (default 60)')
+    ablation.add_argument('--noise', type=float, default=0.04, help='variance (default 0.04)')
+    ablation.add_argument(
+        '--drive', choices=('torque', 'velocity'), default='torque', help='(default torque)'
+    )
     ablation.add_argument('--json', type=Path, help='also write the numbers to this file')
     ablation.set_defaults(run=_ablation)
 

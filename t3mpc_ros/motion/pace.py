@@ -17,10 +17,15 @@ class Pace:
         Samples a second.
     burst
         Longest time (s) that is caught up with; what is older is skipped and counted.
+    slack
+        How long (s) before the first call the grid begins. A timer of the same period then
+        finds each sample due although it sometimes comes a little early; without slack such a
+        call finds none, and the next one two.
     """
 
-    def __init__(self, rate: float, burst: float = 0.5) -> None:
+    def __init__(self, rate: float, burst: float = 0.5, slack: float = 0.0) -> None:
         self._period_ns = NANOSECONDS / rate
+        self._slack_ns = round(slack * NANOSECONDS)
         self._most = max(1, int(burst * rate))
         self.reset()
 
@@ -38,7 +43,7 @@ class Pace:
         """
         if self._start_ns is None or now_ns < self._stamp(self._next - 1):
             self.reset()
-            self._start_ns = now_ns
+            self._start_ns = now_ns - self._slack_ns
         last = int((now_ns - self._start_ns) / self._period_ns)
         if self._stamp(last + 1) <= now_ns:  # the division may have rounded down
             last += 1

@@ -3,7 +3,9 @@
 """``ros2 run t3mpc_ros controller``: makes the robot follow the reference."""
 
 from collections.abc import Mapping
+import math
 from pathlib import Path
+from typing import Any
 
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
@@ -26,8 +28,9 @@ WHEELS = ('right', 'left')
 class ControllerNode(PackageNode[ControllerNodeSettings]):
     """Publishes the controller's command each time the robot reports its motion."""
 
-    def __init__(self) -> None:
-        super().__init__('controller', ControllerNodeSettings)
+    def __init__(self, **given: Any) -> None:
+        super().__init__('controller', ControllerNodeSettings, **given)
+        self.get_logger().info('preparing (the first start compiles, for half a minute)')
         self._controller = Controller(self.settings)
         self._controller.warm_up()  # compile and pre-train now, never inside a step
         self._load_model()
@@ -122,7 +125,8 @@ class ControllerNode(PackageNode[ControllerNodeSettings]):
         self._number('lyapunov/margin', status.certificate.margin)
 
     def _number(self, name: str, value: float) -> None:
-        self._numbers[name].publish(Float64(data=float(value)))
+        if math.isfinite(value):  # an error without a reference is no number to plot
+            self._numbers[name].publish(Float64(data=float(value)))
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._controller.enable(request.data)
@@ -164,11 +168,14 @@ class ControllerNode(PackageNode[ControllerNodeSettings]):
             'skill_left': float(status.skill[1]),
             'references_refused': self._refused,
         }
+        waiting = self._steps == 0
+        stopped = f'stopped: {status.reason.value}'
+        if not status.reason.moves and not waiting:
+            return ERROR, stopped, values
         if other := graph.other_types(self, 'cmd_vel', self._type, subscribers=True):
             return WARN, f'cmd_vel is taken as {other} by another node: set stamped', values
-        if not status.reason.moves:
-            waiting = self._steps == 0
-            return (WARN if waiting else ERROR), f'stopped: {status.reason.value}', values
+        if waiting:
+            return WARN, stopped, values
         if self._refused:
             return WARN, 'references that are not finite were ignored', values
         return OK, status.reason.value, values

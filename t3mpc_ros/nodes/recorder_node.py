@@ -7,25 +7,23 @@ from datetime import datetime
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.client import Client
 from rclpy.parameter import parameter_value_to_python
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_srvs.srv import Trigger
 
-from t3mpc_ros.nodes.plumbing import graph
+from t3mpc_ros.nodes.plumbing import graph, quality
 from t3mpc_ros.nodes.plumbing.package_node import ERROR, OK, PackageNode
 from t3mpc_ros.nodes.tables import TABLES, RecorderSettings
 from t3mpc_ros.record.quality import QualityProfile
 from t3mpc_ros.record.schema import RecordError, UnknownTypeError
-from t3mpc_ros.record.writer import BagWriter
+from t3mpc_ros.record.writer import BagWriter, DataError
 from t3mpc_ros.settings.provenance import provenance
-
-DEPTH = 1000
-"""Messages of one topic that may wait while the disk is busy."""
 
 EXPECTED = {
     'reference': 'nav_msgs/msg/Odometry',
@@ -36,27 +34,35 @@ EXPECTED = {
 """Topics subscribed to before anybody publishes them, so that their first message is kept."""
 
 
+class Listening(NamedTuple):
+    """How a topic is listened to."""
+
+    kind: str
+    quality: QoSProfile
+    subscription: Subscription
+
+
 class RecorderNode(PackageNode[RecorderSettings]):
     """Subscribes to what is published under the wanted names and writes it down unopened."""
 
-    def __init__(self) -> None:
-        super().__init__('recorder', RecorderSettings)
+    def __init__(self, **given: Any) -> None:
+        super().__init__('recorder', RecorderSettings, **given)
         self._folder = Path(
             self.settings.folder or f'bag_{datetime.now():%Y_%m_%d-%H_%M_%S}'
         ).resolve()
         self._details: dict[str, dict[str, str]] = {'provenance': provenance()}
         self._writer = self._open()
         self._wanted = [self.resolve_topic_name(name) for name in self._plain_names()]
-        self._subscribed: set[str] = set()
-        self._unknown: set[str] = set()
-        self._added: set[str] = set()
+        self._listening: dict[str, Listening] = {}
+        self._left_out: set[str] = set()
+        self._added: dict[str, str] = {}
         self._asked: set[str] = set()
         self._received = 0
         self._failure = ''
         for name, kind in EXPECTED.items():
             topic = self.resolve_topic_name(name)
             if self._is_wanted(topic):
-                self._subscribe(topic, kind, ())
+                self._expect(topic, kind)
         self.create_service(Trigger, '~/split', self._on_split)
         self.every(0.2, self._discover)
         self.every(1.0, self._flush)
@@ -80,37 +86,48 @@ class RecorderNode(PackageNode[RecorderSettings]):
         return topic in self._wanted or any(fnmatchcase(topic, pattern) for pattern in patterns)
 
     def _discover(self) -> None:
-        for topic, kinds in self.get_topic_names_and_types():
-            if topic in self._subscribed or topic in self._unknown or not self._is_wanted(topic):
+        for topic, _ in self.get_topic_names_and_types():
+            if topic in self._left_out or not self._is_wanted(topic):
                 continue
             if publishers := self.get_publishers_info_by_topic(topic):
-                self._subscribe(topic, kinds[0], publishers)
+                self._attend(topic, publishers)
         self._ask_for_settings()
 
-    def _subscribe(
-        self, topic: str, kind: str, publishers: tuple[()] | list[TopicEndpointInfo]
-    ) -> None:
+    def _expect(self, topic: str, kind: str) -> None:
         try:
-            message = graph.message_class(kind)
-        except ImportError as error:
-            self._leave_out(topic, str(error))
+            self._listen(topic, kind, quality.RECORDED)
+        except graph.RCLError:
+            # A node of this process has it with another type: the publisher will tell.
             return
-        # A reliable or latched subscription does not hear a publisher that offers less.
+
+    def _attend(self, topic: str, publishers: list[TopicEndpointInfo]) -> None:
+        """Listen to a topic in such a way that its publishers are heard."""
+        kinds = [info.topic_type for info in publishers]
         profiles = [info.qos_profile for info in publishers]
-        reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
-        latched = profiles and all(
-            p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles
+        held = self._listening.get(topic)
+        if held and held.kind in kinds and quality.hears_all(held.quality, profiles):
+            return
+        kind = held.kind if held and held.kind in kinds else kinds[0]
+        try:
+            self._listen(topic, kind, quality.to_hear_all(profiles))
+        except (ImportError, graph.RCLError) as error:
+            self._leave_out(topic, str(error))
+
+    def _listen(self, topic: str, kind: str, profile: QoSProfile) -> None:
+        message = graph.message_class(kind)
+        self._stop_listening(topic)
+        subscription = self.create_subscription(
+            message, topic, self._taker(topic, kind), profile, raw=True
         )
-        quality = QoSProfile(
-            depth=DEPTH,
-            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-        )
-        self.create_subscription(message, topic, self._taker(topic, kind), quality, raw=True)
-        self._subscribed.add(topic)
+        self._listening[topic] = Listening(kind, profile, subscription)
+
+    def _stop_listening(self, topic: str) -> None:
+        if held := self._listening.pop(topic, None):
+            self.destroy_subscription(held.subscription)
 
     def _leave_out(self, topic: str, why: str) -> None:
-        self._unknown.add(topic)
+        self._stop_listening(topic)
+        self._left_out.add(topic)
         self.get_logger().warning(f'{topic} is not recorded: {why}')
 
     def _taker(self, topic: str, kind: str) -> Callable[[bytes, Mapping[str, Any]], None]:
@@ -120,15 +137,15 @@ class RecorderNode(PackageNode[RecorderSettings]):
         return take
 
     def _write(self, topic: str, kind: str, data: bytes, info: Mapping[str, Any]) -> None:
-        if self._failure or topic in self._unknown:
+        if self._failure or topic in self._left_out:
             return
         try:
-            if topic not in self._added:
+            if self._added.get(topic) != kind:
                 self._add(topic, kind)
             self._writer.write(
                 topic, int(info['received_timestamp']), int(info['source_timestamp']), data
             )
-        except UnknownTypeError as error:
+        except (UnknownTypeError, DataError) as error:
             self._leave_out(topic, str(error))
             return
         except RecordError as error:
@@ -155,7 +172,7 @@ class RecorderNode(PackageNode[RecorderSettings]):
             profiles.append(_profile(info.qos_profile))
             type_hash = str(info.topic_type_hash)
         self._writer.add_topic(topic, kind, profiles, type_hash)
-        self._added.add(topic)
+        self._added[topic] = kind
 
     def _ask_for_settings(self) -> None:
         """Ask each of the package's nodes for its settings, once: they belong into the bag."""
@@ -168,40 +185,41 @@ class RecorderNode(PackageNode[RecorderSettings]):
             if lister.service_is_ready() and getter.service_is_ready():
                 self._asked.add(full)
                 future = lister.call_async(ListParameters.Request())
-                future.add_done_callback(partial(self._on_names, name, lister, getter))
+                # One of another namespace has the same name but is another robot's.
+                title = name if namespace == self.get_namespace() else full
+                future.add_done_callback(partial(self._on_names, title, lister, getter))
             else:
                 self.destroy_client(lister)
                 self.destroy_client(getter)
 
-    def _on_names(self, name: str, lister: Client, getter: Client, future: Any) -> None:
+    def _on_names(self, title: str, lister: Client, getter: Client, future: Any) -> None:
         names = list(future.result().result.names)
         self.destroy_client(lister)
         asked = getter.call_async(GetParameters.Request(names=names))
-        asked.add_done_callback(partial(self._on_values, name, names, getter))
+        asked.add_done_callback(partial(self._on_values, title, names, getter))
 
-    def _on_values(self, name: str, names: list[str], getter: Client, future: Any) -> None:
+    def _on_values(self, title: str, names: list[str], getter: Client, future: Any) -> None:
         values = {
             key: str(parameter_value_to_python(value))
             for key, value in zip(names, future.result().values, strict=True)
         }
         self.destroy_client(getter)
-        self._details[name] = values
+        self._details[title] = values
         try:
-            self._writer.add_details(name, values)
+            self._writer.add_details(title, values)
         except RecordError as error:
             self._fail(error)
 
     def _on_split(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         try:
-            self._writer.close()
-            self._writer = self._open()
-            self._added.clear()
+            if not self._failure:
+                self._writer.close()
+                self._writer = self._open()
+                self._added.clear()
         except RecordError as error:
-            response.success = False
-            response.message = str(error)
-            return response
-        response.success = True
-        response.message = f'goes on in {self._writer.path.name}'
+            self._fail(error)
+        response.success = not self._failure
+        response.message = self._failure or f'goes on in {self._writer.path.name}'
         return response
 
     def health(self) -> tuple[bytes, str, Mapping[str, object]]:

@@ -3,6 +3,7 @@
 """``ros2 run t3mpc_ros reference``: publishes the switching chaotic reference."""
 
 from collections.abc import Mapping
+from typing import Any
 
 from nav_msgs.msg import Odometry, Path
 from std_msgs.msg import Int32MultiArray
@@ -14,7 +15,7 @@ from t3mpc_ros.motion.kinematics import advance_pose
 from t3mpc_ros.motion.pace import Pace
 from t3mpc_ros.motion.words import NANOSECONDS, ORIGIN, STANDSTILL
 from t3mpc_ros.nodes.plumbing import convert, quality
-from t3mpc_ros.nodes.plumbing.package_node import OK, WARN, PackageNode
+from t3mpc_ros.nodes.plumbing.package_node import NO_TIME, OK, WARN, PackageNode
 from t3mpc_ros.nodes.tables import ReferenceNodeSettings
 
 PATH_STEP = 0.1
@@ -24,14 +25,14 @@ PATH_STEP = 0.1
 class ReferenceNode(PackageNode[ReferenceNodeSettings]):
     """Publishes the wanted motion on an exact grid of time, stamped ahead by the lead time."""
 
-    def __init__(self) -> None:
-        super().__init__('reference', ReferenceNodeSettings)
+    def __init__(self, **given: Any) -> None:
+        super().__init__('reference', ReferenceNodeSettings, **given)
         settings = self.settings
         self._seed = settings.seed
         self._generator = ChaoticReference(settings, settings.geometry)
         self._generator.advance()  # compile now, never inside a step
         self._generator.reset(self._seed)
-        self._pace = Pace(settings.rate)
+        self._pace = Pace(settings.rate, slack=0.2 / settings.rate)
         self._lead_ns = round(settings.lead * NANOSECONDS)
         self._paused = False
         self._pose = ORIGIN
@@ -49,6 +50,8 @@ class ReferenceNode(PackageNode[ReferenceNodeSettings]):
         self.every(1.0, self._publish_path)
 
     def _on_tick(self) -> None:
+        if not self.knows_time():
+            return
         for stamp_ns in self._pace.due(self.now_ns()):
             self._publish(stamp_ns + self._lead_ns)
 
@@ -83,7 +86,8 @@ class ReferenceNode(PackageNode[ReferenceNodeSettings]):
         self._seed += 1
         self._generator.reset(self._seed)
         response.success = True
-        response.message = f'the reference starts anew with seed {self._seed}'
+        # Never the seed itself: who knows it knows where the robot will go.
+        response.message = 'the reference starts anew with another seed'
         return response
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
@@ -101,6 +105,8 @@ class ReferenceNode(PackageNode[ReferenceNodeSettings]):
             'skipped_samples': self._pace.skipped,
             'mode': self._shown[0] if self._shown else 'none',
         }
+        if not self.knows_time():
+            return WARN, NO_TIME, values
         if self._pace.skipped:
             return WARN, 'the machine is too slow: samples were given up', values
         return OK, 'paused' if self._paused else 'running', values

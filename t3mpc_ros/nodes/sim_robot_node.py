@@ -14,7 +14,7 @@ from std_srvs.srv import SetBool, Trigger
 from t3mpc_ros.motion import Pose
 from t3mpc_ros.motion.pace import Pace
 from t3mpc_ros.nodes.plumbing import convert, graph, quality
-from t3mpc_ros.nodes.plumbing.package_node import ERROR, OK, WARN, PackageNode
+from t3mpc_ros.nodes.plumbing.package_node import ERROR, NO_TIME, OK, WARN, PackageNode
 from t3mpc_ros.nodes.tables import SimRobotNodeSettings
 from t3mpc_ros.robot.backend import RobotCommand, RobotState
 from t3mpc_ros.robot.simulated import SimulatedRobot
@@ -23,12 +23,12 @@ from t3mpc_ros.robot.simulated import SimulatedRobot
 class SimRobotNode(PackageNode[SimRobotNodeSettings]):
     """Moves the simulated robot on an exact grid of time and publishes what it measures."""
 
-    def __init__(self) -> None:
-        super().__init__('sim_robot', SimRobotNodeSettings)
+    def __init__(self, **given: Any) -> None:
+        super().__init__('sim_robot', SimRobotNodeSettings, **given)
         settings = self.settings
         self._robot = SimulatedRobot(settings)
         self._robot.warm_up()  # compile now, never inside a step
-        self._pace = Pace(settings.rate)
+        self._pace = Pace(settings.rate, slack=0.2 / settings.rate)
         self._state: RobotState | None = None
         self._steps = 0
         self._refused = 0
@@ -57,16 +57,19 @@ class SimRobotNode(PackageNode[SimRobotNodeSettings]):
         self._robot.configure(settings)
 
     def _on_command(self, message: Twist | TwistStamped) -> None:
-        twist = convert.body_twist(message.twist if self.settings.stamped else message)
         now_ns = self._robot_now_ns()
-        command = RobotCommand.from_twist(twist, self.settings.geometry, now_ns)
+        twist, stamp_ns = convert.command(message, now_ns)
+        command = RobotCommand.from_twist(twist, self.settings.geometry, stamp_ns)
         if problem := self._robot.apply(command, now_ns):
             self._refused += 1
             if problem != self._problem:
-                self.get_logger().warning(f'cmd_vel refused: {problem}')
+                # Texts that hold an age differ every time.
+                self.get_logger().warning(f'cmd_vel refused: {problem}', throttle_duration_sec=1.0)
         self._problem = problem
 
     def _on_tick(self) -> None:
+        if self._ticker is None and not self.knows_time():
+            return
         for stamp_ns in self._pace.due(self._robot_now_ns()):
             self._publish(self._robot.advance(stamp_ns))
 
@@ -155,10 +158,10 @@ class SimRobotNode(PackageNode[SimRobotNodeSettings]):
         }
         if state is not None:
             values |= state.status._asdict()
+        if state is None or state.status.estop:
+            return ERROR, state.reason if state else NO_TIME, values
         if other := graph.other_types(self, 'cmd_vel', self._type, subscribers=False):
             return WARN, f'cmd_vel is published as {other} by another node: set stamped', values
-        if state is None or state.status.estop:
-            return ERROR, state.reason if state else 'not started', values
         if self._pace.skipped:
             return WARN, 'the machine is too slow: samples were given up', values
         return (WARN, state.reason, values) if state.reason else (OK, 'following commands', values)

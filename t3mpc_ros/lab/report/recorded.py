@@ -68,7 +68,7 @@ class Timing:
     jitter: float
     """99th percentile (s) of how far one such time is from the median."""
     missing: float
-    """Share of samples missing at the median rate, see :func:`missing_share`."""
+    """Share of samples missing at the median rate of the stamps, see :func:`missing_share`."""
 
 
 @dataclass(frozen=True)
@@ -237,7 +237,10 @@ def _motion(time: Array, table: Mapping[str, Array], geometry: Geometry) -> Seri
 def _timing(table: Mapping[str, Array]) -> Timing:
     gaps = np.diff(table['received'])
     period = float(np.median(gaps))
-    missing = missing_share(table['stamp'], 1.0 / period) if period > 0.0 else math.nan
+    # The stamps know the rate better than the receipts, which jitter.
+    steps = np.diff(np.unique(table['stamp'][np.isfinite(table['stamp'])]))
+    grid = float(np.median(steps)) if steps.size else 0.0
+    missing = missing_share(table['stamp'], 1.0 / grid) if grid > 0.0 else math.nan
     jitter = round(float(np.percentile(np.abs(gaps - period), 99.0)), 9)  # receipts are in ns
     return Timing(int(table['received'].size), period, jitter, missing)
 

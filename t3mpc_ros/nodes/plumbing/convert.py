@@ -87,6 +87,16 @@ def body_twist(message: Twist) -> BodyTwist:
     return BodyTwist(message.linear.x, message.angular.z)
 
 
+def command(message: Twist | TwistStamped, now_ns: int) -> tuple[BodyTwist, int]:
+    """Return a command and when it was wanted (ns): now, unless its header says otherwise.
+
+    A stamp of zero is one that nobody has set, as is usual for teleoperation.
+    """
+    if isinstance(message, TwistStamped):
+        return body_twist(message.twist), ns_from_time(message.header.stamp) or now_ns
+    return body_twist(message), now_ns
+
+
 def twist_from_body(twist: BodyTwist) -> Twist:
     """Return a command message."""
     message = Twist()

@@ -4,8 +4,12 @@
 
 import importlib
 
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+RCLError: type[Exception] = rclpy_implementation.RCLError
+"""What rclpy raises, among others, for a topic that this process knows with another type."""
 
 
 def type_name(message: type) -> str:

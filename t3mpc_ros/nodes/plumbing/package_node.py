@@ -20,6 +20,8 @@ OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
 ERROR = DiagnosticStatus.ERROR
 
+NO_TIME = 'the simulated clock has not been heard yet'
+
 
 class PackageNode(Node, Generic[S]):
     """A node whose parameters are one table of settings, and that says how it is at 1 Hz.
@@ -43,6 +45,10 @@ class PackageNode(Node, Generic[S]):
     def now_ns(self) -> int:
         """Return the node's time: of the machine, or simulated if ``use_sim_time`` is set."""
         return int(self.get_clock().now().nanoseconds)
+
+    def knows_time(self) -> bool:
+        """Whether the node's time means anything: a simulated clock not yet heard says 0."""
+        return self.now_ns() != 0
 
     def steady_ns(self) -> int:
         """Return a time that only ever runs forward, for measuring silence."""

@@ -2,7 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Quality of service of every topic, in one place."""
 
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from collections.abc import Sequence
+
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    QoSCompatibility,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_check_compatible,
+)
 
 
 def _profile(depth: int, durability: DurabilityPolicy = DurabilityPolicy.VOLATILE) -> QoSProfile:
@@ -31,3 +40,25 @@ LATCHED = _profile(1, DurabilityPolicy.TRANSIENT_LOCAL)
 
 DIAGNOSTICS = _profile(10)
 """Health of the nodes."""
+
+RECORDED = _profile(1000)
+"""A topic as the recorder takes it: so much may wait while the disk is busy."""
+
+
+def hears_all(subscription: QoSProfile, publishers: Sequence[QoSProfile]) -> bool:
+    """Whether a subscription hears every publisher: none of them offers less than it asks for."""
+    return all(
+        qos_check_compatible(offered, subscription)[0] != QoSCompatibility.ERROR
+        for offered in publishers
+    )
+
+
+def to_hear_all(publishers: Sequence[QoSProfile]) -> QoSProfile:
+    """Return the best profile for the recorder's subscription that hears every publisher."""
+    reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in publishers)
+    latched = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers)
+    return QoSProfile(
+        depth=RECORDED.depth,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
