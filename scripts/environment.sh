@@ -64,7 +64,7 @@ wanted_stamp() {
   {
     origin_of "$BASE_PYTHON"
     cat "$ROOT"/{requirements*.txt,setup.py,setup.cfg,package.xml,t3mpc_ros/__init__.py} \
-      "$ROOT"/{config/*.yaml,launch/*.launch.py}
+      "$ROOT"/{config/*.*,launch/*.launch.py}
   } | sha256sum | cut -d' ' -f1
 }
 
@@ -72,8 +72,6 @@ is_current() { [ "$(cat "$VENV/stamp" 2>/dev/null)" = "$(wanted_stamp)" ]; }
 
 make_environment() {
   local origin
-  [ -w "$ROOT" ] || fail "$ROOT cannot be written to, and .venv is made there" \
-    "copy the folder to a place of your own and run $0 there"
   rm -f "$VENV/stamp"
   : >"$LOG"
   origin="$(origin_of "$BASE_PYTHON")"
@@ -122,6 +120,8 @@ leave_other_ros() {
 leave_other_ros
 BASE_PYTHON="$(choose_python)"
 if ! is_current; then
+  [ -w "$ROOT" ] || fail "$ROOT cannot be written to, and .venv is made there" \
+    "copy the folder to a place of your own and run $0 there"
   (
     # One script at a time may set up; the others wait for it.
     flock --nonblock 9 || {

@@ -56,7 +56,8 @@ def private_graph() -> dict[str, str]:
 
 
 def _prefixes() -> list[Path]:
-    found = [sys.prefix, *os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)]
+    # A workspace that was sourced comes before the environment it runs in, as for `ros2 run`.
+    found = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
     return [Path(prefix) for prefix in dict.fromkeys(found) if prefix]
 
 

@@ -1,0 +1,588 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The package as users get it: built with colcon, run from there, or through scripts/."""
+
+from fnmatch import fnmatch
+import functools
+import os
+from pathlib import Path
+import re
+import runpy
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import types
+
+import pytest
+import yaml
+
+from t3mpc_ros.nodes.tables import TABLES
+
+ROOT = Path(__file__).resolve().parent.parent
+EXECUTABLES = set(re.findall(r"f'(\w+) = \{NAME\}", (ROOT / 'setup.py').read_text()))
+NODES = tuple(TABLES)
+# Not the user's own ROS, workspace or pip: what these tests build and run is theirs alone.
+FOREIGN = ('PYTHONPATH', 'AMENT_PREFIX_PATH', 'COLCON_', 'PIP_', 'T3MPC_')
+
+
+def clean_environment(**extra):
+    """Return this process's environment without what belongs to somebody else's set-up."""
+    kept = {key: value for key, value in os.environ.items() if not key.startswith(FOREIGN)}
+    return kept | {key: str(value) for key, value in extra.items()}
+
+
+def copy_package(destination):
+    """Copy what the version control system would hand to a user: nothing that is ignored."""
+    ignored = [line.rstrip('/') for line in (ROOT / '.gitignore').read_text().split()]
+    shutil.copytree(ROOT, destination, ignore=shutil.ignore_patterns('.git', *ignored))
+    return destination
+
+
+# --- colcon -------------------------------------------------------------------------------------
+
+
+class Tree:
+    """A colcon workspace with the package built into it."""
+
+    def __init__(self, folder, *options):
+        self.source = copy_package(folder / 'src' / 't3mpc_ros')
+        self.symlinked = '--symlink-install' in options
+        self.prefix = folder / 'install' / 't3mpc_ros'
+        self.share = self.prefix / 'share' / 't3mpc_ros'
+        colcon = Path(sys.prefix) / 'bin' / 'colcon'
+        assert colcon.exists(), 'colcon is missing: pip install -r requirements-colcon.txt'
+        self.environment = clean_environment(
+            AMENT_PREFIX_PATH=sys.prefix,
+            COLCON_HOME=folder / 'colcon',
+            # Kernels are cached by the path of their source: not in the user's own cache.
+            T3MPC_CACHE_DIR=folder / 'kernels',
+        )
+        built = subprocess.run(
+            [colcon, 'build', *options],
+            cwd=folder,
+            env=self.environment,
+            capture_output=True,
+            text=True,
+        )
+        assert built.returncode == 0, built.stdout + built.stderr
+        self.environment = self._sourced(folder / 'install' / 'setup.bash')
+        self.scratch = folder / 'scratch'
+        self.scratch.mkdir()
+
+    def _sourced(self, setup):
+        """Return the environment of a shell that has sourced the workspace."""
+        said = subprocess.run(
+            ['bash', '-c', 'source "$1" && env -0', 'bash', setup],
+            env=self.environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        return dict(line.split('=', 1) for line in said.stdout.split('\0') if line)
+
+    def start(self, name, *arguments):
+        """Start one executable as ``ros2 run`` does, in the graph of the current test."""
+        graph = {k: v for k, v in os.environ.items() if k.startswith(('ROS_', 'FASTRTPS_'))}
+        return Process(self, name, arguments, self.environment | graph)
+
+    def run(self, name, *arguments):
+        return subprocess.run(
+            [self.prefix / 'lib' / 't3mpc_ros' / name, *arguments],
+            cwd=self.scratch,
+            env=self.environment,
+            capture_output=True,
+            text=True,
+        )
+
+
+class Process:
+    """A running executable; as a context manager it is gone at the end, whatever happens."""
+
+    def __init__(self, tree, name, arguments, environment):
+        self._name = name
+        self._log = tree.scratch / f'{name}-{time.monotonic_ns()}.log'
+        with self._log.open('wb') as output:
+            self._process = subprocess.Popen(
+                [tree.prefix / 'lib' / 't3mpc_ros' / name, *arguments],
+                cwd=tree.scratch,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+            )
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        if self._process.poll() is None:
+            self._process.kill()
+        self._process.wait()
+
+    def said(self):
+        return self._log.read_text(errors='replace')
+
+    def wait_ready(self, seconds=180.0):
+        deadline = time.monotonic() + seconds
+        while f'{self._name} ready' not in self.said():
+            assert self._process.poll() is None, f'{self._name} ended early:\n{self.said()}'
+            assert time.monotonic() < deadline, f'{self._name} is not ready:\n{self.said()}'
+            time.sleep(0.05)
+
+    def interrupt(self):
+        """Return the exit code after SIGINT."""
+        self._process.send_signal(signal.SIGINT)
+        return self._process.wait(15.0)
+
+
+@pytest.fixture(scope='module')
+def build(tmp_path_factory):
+    """Return a function that builds the package, once for each set of options."""
+
+    @functools.cache
+    def built(*options):
+        return Tree(tmp_path_factory.mktemp('workspace'), *options)
+
+    return built
+
+
+@pytest.fixture(scope='module', params=['copied', 'symlinked'])
+def tree(request, build):
+    """Return the package built by ``colcon build``, and again with ``--symlink-install``."""
+    return build() if request.param == 'copied' else build('--symlink-install')
+
+
+@pytest.fixture(scope='module')
+def copied(build):
+    """Return the package built by a plain ``colcon build``."""
+    return build()
+
+
+def test_a_workspace_holds_everything_ros_looks_for(tree):
+    assert (tree.prefix / 'share/ament_index/resource_index/packages/t3mpc_ros').is_file()
+    executables = {path.name for path in (tree.prefix / 'lib' / 't3mpc_ros').iterdir()}
+    assert executables == EXECUTABLES == {*NODES, 'lab'}
+    assert all(os.access(tree.prefix / 'lib/t3mpc_ros' / name, os.X_OK) for name in executables)
+    for pattern in ('package.xml', 'config/*', 'launch/*.launch.py'):
+        wanted = {path.relative_to(tree.source) for path in tree.source.glob(pattern)}
+        there = {path.relative_to(tree.share) for path in tree.share.glob(pattern)}
+        assert wanted == there != set()
+    for path in tree.share.glob('config/*'):
+        # Symlinked: an edited YAML counts at once. Copied: the source may go.
+        assert path.is_relative_to(tree.prefix)
+        assert path.resolve().is_relative_to(tree.source.resolve()) == tree.symlinked
+
+
+def test_a_sourced_workspace_runs_its_own_code_and_all_of_it(tree):
+    """``packages=[name]`` in setup.py would drop every room, and .venv would hide that."""
+    code = 'import t3mpc_ros; print(t3mpc_ros.__path__[0])'
+    said = subprocess.check_output(
+        [sys.executable, '-c', code], cwd=tree.scratch, env=tree.environment, text=True
+    )
+    installed = Path(said.strip())
+    assert installed.is_relative_to(tree.prefix.parent.parent)
+    source = tree.source / 't3mpc_ros'
+    assert {path.relative_to(installed) for path in installed.rglob('*.py')} == {
+        path.relative_to(source) for path in source.rglob('*.py')
+    }
+    prefixes = tree.environment['AMENT_PREFIX_PATH'].split(os.pathsep)
+    assert prefixes == [str(tree.prefix), sys.prefix]
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+def test_every_installed_node_gets_ready_and_ends_with_0(tree, graph):
+    for name in NODES:
+        with tree.start(name) as node:
+            node.wait_ready()
+            assert node.interrupt() == 0, node.said()
+            assert 'Traceback' not in node.said()
+
+
+@pytest.mark.slow
+def test_the_installed_lab_computes_lyapunov_exponents(tree):
+    done = tree.run('lab', 'exponents', '--duration', '20')
+    assert done.returncode == 0, done.stderr
+    # The sum is the trace of the Jacobian, whatever the duration.
+    assert float(re.search(r'sum: (-?[\d.]+)', done.stdout).group(1)) == pytest.approx(
+        -38, abs=0.1
+    )
+
+
+# --- configuration and launch -------------------------------------------------------------------
+
+CHANGED = {
+    'controller': ('terms_rate', 12.5),
+    'recorder': ('chunk_bytes', 4096),
+    'reference': ('seed', 77),
+    'sim_robot': ('noise.variance', 0.0625),
+}
+"""One parameter of each node, and a value that is not its default."""
+
+
+def _read_parameter(node, name, wanted):
+    """Return a parameter of a running node, over its own service."""
+    from rcl_interfaces.srv import GetParameters
+    import rclpy
+    from rclpy.parameter import parameter_value_to_python
+
+    client = node.create_client(GetParameters, f'{name}/get_parameters')
+    assert client.wait_for_service(30.0), f'{name} is not in the graph'
+    future = client.call_async(GetParameters.Request(names=[wanted]))
+    rclpy.spin_until_future_complete(node, future, timeout_sec=30.0)
+    return parameter_value_to_python(future.result().values[0])
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+@pytest.mark.parametrize('name', CHANGED)
+def test_each_yaml_reaches_its_node_with_and_without_a_namespace(name, copied, ros, tmp_path):
+    """The key must match ``/controller`` as well as ``/robot_1/controller``.
+
+    The installed file is loaded, then a copy of it in which one value differs from the default,
+    so that a key which matches nothing cannot pass.
+    """
+    import rclpy
+
+    installed = copied.share / 'config' / f'{name}.yaml'
+    parameter, value = CHANGED[name]
+    assert TABLES[name].from_flat({}).flat()[parameter] != value
+    content = yaml.safe_load(installed.read_text())
+    (entry,) = content.values()
+    *parents, leaf = parameter.split('.')
+    branch = entry['ros__parameters']
+    for parent in parents:
+        branch = branch.setdefault(parent, {})
+    branch[leaf] = value
+    changed = tmp_path / 'changed.yaml'
+    changed.write_text(yaml.safe_dump(content))
+
+    files = ['--params-file', str(installed), '--params-file', str(changed)]
+    reader = rclpy.create_node('reader')
+    try:
+        for namespace in ('', '/robot_1'):
+            remap = ['-r', f'__ns:={namespace}'] if namespace else []
+            with copied.start(name, '--ros-args', *remap, *files) as node:
+                node.wait_ready()
+                assert _read_parameter(reader, f'{namespace}/{name}', parameter) == value
+                assert node.interrupt() == 0, node.said()
+    finally:
+        reader.destroy_node()
+
+
+def test_every_yaml_is_tried():
+    assert {path.stem for path in (ROOT / 'config').glob('*.yaml')} == set(CHANGED)
+
+
+class _Recorded:
+    """Stands in for what launch files are written with; remembers the arguments."""
+
+    def __init__(self, *arguments, **named):
+        self.arguments = arguments
+        self.named = named
+
+
+def test_the_launch_file_names_only_what_is_installed(copied, monkeypatch):
+    """The package ``launch`` comes with apt only, so the file runs against stand-ins here."""
+    words = {
+        'launch': ['LaunchDescription'],
+        'launch.actions': ['DeclareLaunchArgument'],
+        'launch.conditions': ['IfCondition'],
+        'launch.substitutions': ['LaunchConfiguration'],
+        'launch_ros': [],
+        'launch_ros.actions': ['Node'],
+    }
+    for name, classes in words.items():
+        module = types.ModuleType(name)
+        for word in classes:
+            setattr(module, word, type(word, (_Recorded,), {}))
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.setenv('AMENT_PREFIX_PATH', copied.environment['AMENT_PREFIX_PATH'])
+
+    file = runpy.run_path(str(copied.share / 'launch' / 'sim.launch.py'))
+    items = file['generate_launch_description']().arguments[0]
+    nodes = [item.named for item in items if type(item).__name__ == 'Node']
+    declared = {
+        item.arguments[0] for item in items if type(item).__name__ == 'DeclareLaunchArgument'
+    }
+    assert {node['executable'] for node in nodes} == set(CHANGED) <= EXECUTABLES
+    used = set()
+    for node in nodes:
+        assert node['package'] == 't3mpc_ros'
+        path, given = node['parameters']
+        assert Path(path).is_relative_to(copied.share)
+        (key,) = yaml.safe_load(Path(path).read_text())
+        assert fnmatch(f'/{node["name"]}', key.replace('/**', '*'))
+        used |= {value.arguments[0] for value in (node['namespace'], *given.values())}
+        if 'condition' in node:
+            used.add(node['condition'].arguments[0].arguments[0])
+    assert used == declared
+
+
+# --- scripts ------------------------------------------------------------------------------------
+
+# Stands in for a Python and its environment: pretends a version, notes what is asked of it, and
+# fails to install while a file `no_index` lies beside the notes.
+FAKE_PYTHON = r"""#!/usr/bin/env bash
+notes="$FAKE_NOTES"
+here="$(cat "$(dirname "$0")/version")"
+case "$*" in
+--version) echo "Python $here" ;;
+-c*)
+  exec "$REAL_PYTHON" -c 'import sys
+sys.version_info = tuple(map(int, sys.argv[1].split(".")))
+exec(sys.argv[2])' "$here" "$2" ;;
+'-m venv'*)
+  echo venv >>"$notes"
+  target="${!#}"
+  [[ "$*" != *--clear* ]] || rm -rf "$target"
+  mkdir -p "$target/bin"
+  cp "$0" "$target/bin/python"
+  echo "$here" >"$target/bin/version" ;;
+*'pip install'*)
+  echo pip >>"$notes"
+  if [ -e "$(dirname "$notes")/no_index" ]; then
+    echo 'ERROR: Could not find a version that satisfies the requirement numpy'
+    exit 1
+  fi ;;
+*'setup.py'*)
+  echo setup >>"$notes"
+  mkdir -p "${!#}/lib/t3mpc_ros"
+  printf '#!/bin/sh\necho "lab got $*"\n' >"${!#}/lib/t3mpc_ros/lab"
+  chmod +x "${!#}/lib/t3mpc_ros/lab" ;;
+*program\ warm) echo warm >>"$notes" ;;
+*) echo "unexpected: $*" >&2; exit 99 ;;
+esac
+"""
+SET_UP = ['venv', 'pip', 'setup', 'warm']
+
+
+class Checkout:
+    """A fresh copy of the package, on a machine whose only Python is a stand-in."""
+
+    def __init__(self, folder):
+        self.root = copy_package(folder / 'a checkout')
+        self.notes = folder / 'notes'
+        self.bin = folder / 'bin'
+        self.python(self.bin, '3.12.3')
+        tools = 'bash cat chmod cp cut dirname env flock grep mkdir rm sha256sum tail uname'
+        for tool in tools.split():
+            (self.bin / tool).symlink_to(shutil.which(tool))
+
+    def python(self, folder, version):
+        """Put a ``python3`` that says it is this version into a folder."""
+        folder.mkdir(exist_ok=True)
+        path = folder / 'python3'
+        path.write_text(FAKE_PYTHON)
+        path.chmod(0o755)
+        (folder / 'version').write_text(version)
+        return path
+
+    def command(self, *arguments, **extra):
+        environment = clean_environment(
+            PATH=self.bin, FAKE_NOTES=self.notes, REAL_PYTHON=sys.executable
+        )
+        return {
+            'args': [self.root / 'scripts' / 'run', *arguments],
+            'env': environment | {key: str(value) for key, value in extra.items()},
+            'stdout': subprocess.PIPE,
+            'stderr': subprocess.PIPE,
+            'text': True,
+        }
+
+    def run(self, *arguments, **extra):
+        return subprocess.run(**self.command(*arguments, **extra))
+
+    def done(self):
+        """Return what was asked of the stand-in since the last call."""
+        steps = self.notes.read_text().split() if self.notes.exists() else []
+        self.notes.unlink(missing_ok=True)
+        return steps
+
+    @property
+    def stamped(self):
+        return (self.root / '.venv' / 'stamp').exists()
+
+
+@pytest.fixture
+def checkout(tmp_path):
+    """Return a fresh copy of the package with a stand-in for Python."""
+    return Checkout(tmp_path)
+
+
+def test_run_sets_up_once_and_passes_arguments_on(checkout):
+    first = checkout.run('lab', 'two words', '-x')
+    assert (first.returncode, first.stdout) == (0, 'lab got two words -x\n'), first.stderr
+    assert checkout.done() == SET_UP
+    again = checkout.run('lab')
+    assert (again.returncode, again.stdout, again.stderr) == (0, 'lab got \n', '')
+    assert checkout.done() == []
+
+
+@pytest.mark.parametrize('arguments', [(), ('laboratory',), ('.',), ('../lab',)])
+def test_run_without_a_known_name_lists_the_names_and_exits_with_2(arguments, checkout):
+    checkout.run('lab')
+    told = checkout.run(*arguments)
+    assert told.returncode == 2
+    assert 'NAME one of: lab\n' in told.stderr
+    assert all(f'no executable {name}\n' in told.stderr for name in arguments)
+
+
+@pytest.mark.parametrize(
+    'file',
+    ['requirements.txt', 'requirements-colcon.txt', 'setup.py', 'config/fastdds_loopback.xml'],
+)
+def test_a_stale_environment_is_brought_up_to_date(file, checkout):
+    checkout.run('lab')
+    checkout.done()
+    with (checkout.root / file).open('a') as text:
+        text.write('# changed\n')
+    assert checkout.run('lab').returncode == 0
+    assert checkout.done() == ['pip', 'setup', 'warm']
+    checkout.run('lab')
+    assert checkout.done() == []
+
+
+def test_compiled_files_beside_the_launch_file_do_no_harm(checkout):
+    """A folder launch/__pycache__ once ended every script without a word."""
+    (checkout.root / 'launch' / '__pycache__').mkdir()
+    assert checkout.run('lab').returncode == 0
+
+
+def test_a_moved_checkout_or_another_python_gets_a_new_environment(checkout, tmp_path):
+    checkout.run('lab')
+    checkout.root = checkout.root.rename(tmp_path / 'moved')
+    checkout.done()
+    assert checkout.run('lab').returncode == 0
+    assert checkout.done() == SET_UP
+    newer = checkout.python(tmp_path / 'newer', '3.13.1')
+    assert checkout.run('lab', T3MPC_PYTHON=newer).returncode == 0
+    assert checkout.done() == SET_UP
+    # It stays the one in use without being named again.
+    assert checkout.run('lab').returncode == 0
+    assert checkout.done() == []
+
+
+def test_two_scripts_at_once_set_up_once(checkout):
+    both = [subprocess.Popen(**checkout.command('lab')) for _ in range(2)]
+    for process in both:
+        said, errors = process.communicate(timeout=30)
+        assert (process.returncode, said) == (0, 'lab got \n'), errors
+    assert checkout.done() == SET_UP
+
+
+def test_a_python_that_is_too_old_is_named_with_a_remedy(checkout):
+    checkout.python(checkout.bin, '3.9.2')
+    told = checkout.run('lab')
+    assert told.returncode == 1
+    assert re.search(r'^error: .*3\.11.*Python 3\.9\.2', told.stderr, re.MULTILINE)
+    assert re.search(r'^remedy: .*T3MPC_PYTHON=', told.stderr, re.MULTILINE)
+    assert not (checkout.root / '.venv').exists()
+
+
+@pytest.mark.parametrize('version, named', [('3.9.2', 'Python 3.9.2'), (None, 'not found')])
+def test_a_python_that_was_asked_for_is_not_silently_replaced(version, named, checkout, tmp_path):
+    asked = tmp_path / 'asked' / 'python3'
+    if version:
+        checkout.python(asked.parent, version)
+    told = checkout.run('lab', T3MPC_PYTHON=asked)
+    assert told.returncode == 1
+    assert f'error: T3MPC_PYTHON={asked}' in told.stderr
+    assert named in told.stderr
+    assert 'remedy: ' in told.stderr
+    assert checkout.done() == []
+
+
+def test_an_interrupted_set_up_is_repaired_by_the_next_run(checkout):
+    (checkout.notes.parent / 'no_index').touch()
+    told = checkout.run('lab')
+    assert told.returncode == 1
+    assert 'ERROR: Could not find a version' in told.stderr
+    assert 'error: the libraries could not be installed' in told.stderr
+    assert 'remedy: check the network' in told.stderr
+    assert checkout.done() == ['venv', 'pip']
+    assert not checkout.stamped
+    (checkout.notes.parent / 'no_index').unlink()
+    assert checkout.run('lab').returncode == 0
+    assert checkout.done() == ['pip', 'setup', 'warm']
+
+
+def test_a_failed_renewal_does_not_pass_for_an_environment(checkout):
+    checkout.run('lab')
+    with (checkout.root / 'requirements.txt').open('a') as text:
+        text.write('# changed\n')
+    (checkout.notes.parent / 'no_index').touch()
+    assert checkout.run('lab').returncode == 1
+    assert not checkout.stamped
+    assert checkout.run('lab').returncode == 1
+
+
+@pytest.mark.slow
+def test_an_unreachable_index_is_an_error_with_a_remedy(tmp_path):
+    """With the real Python and the real pip: nobody listens on the index's port."""
+    root = copy_package(tmp_path / 'checkout')
+    with socket.socket() as listener:
+        listener.bind(('127.0.0.1', 0))
+        port = listener.getsockname()[1]
+    offline = {
+        'T3MPC_PYTHON': getattr(sys, '_base_executable', sys.executable),
+        'PIP_CONFIG_FILE': os.devnull,
+        'PIP_NO_CACHE_DIR': 1,
+        'PIP_RETRIES': 0,
+    }
+    for index in (
+        {'PIP_INDEX_URL': f'http://127.0.0.1:{port}/simple', 'no_proxy': '127.0.0.1'},
+        {'PIP_NO_INDEX': 1},
+    ):
+        told = subprocess.run(
+            [root / 'scripts' / 'run', 'lab', 'exponents'],
+            env=clean_environment(**offline, **index),
+            capture_output=True,
+            text=True,
+        )
+        assert told.returncode == 1
+        assert 'error: the libraries could not be installed' in told.stderr
+        assert 'remedy: check the network and the package index' in told.stderr
+        assert not (root / '.venv' / 'stamp').exists()
+
+
+def test_a_sourced_ros_is_kept_out_of_the_local_environment(checkout, tmp_path):
+    """Modules of a system ROS for another Python, and its libraries, once came first."""
+    libraries = tmp_path / 'ros' / 'lib'
+    libraries.mkdir(parents=True)
+    (libraries / 'librcl.so').touch()
+    checkout.run('lab')
+    lab = checkout.root / '.venv' / 'lib' / 't3mpc_ros' / 'lab'
+    lab.write_text('#!/bin/sh\nenv\n')
+    said = checkout.run(
+        'lab',
+        PYTHONPATH=tmp_path / 'ros',
+        AMENT_PREFIX_PATH=tmp_path / 'ros',
+        LD_LIBRARY_PATH=f'{libraries}:{tmp_path / "own"}',
+        RMW_IMPLEMENTATION='rmw_cyclonedds_cpp',
+        ROS_DOMAIN_ID='7',
+    ).stdout
+    seen = dict(line.split('=', 1) for line in said.splitlines() if '=' in line)
+    assert seen['AMENT_PREFIX_PATH'] == str(checkout.root / '.venv')
+    assert seen['LD_LIBRARY_PATH'] == str(tmp_path / 'own')
+    assert seen['ROS_DOMAIN_ID'] == '7'
+    assert not {'PYTHONPATH', 'RMW_IMPLEMENTATION'} & set(seen)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    Path(sys.prefix) != ROOT / '.venv', reason='not run through scripts/check: no .venv in use'
+)
+def test_run_starts_the_real_lab():
+    run = [ROOT / 'scripts' / 'run']
+    done = subprocess.run(
+        [*run, 'lab', 'exponents', '--duration', '5'], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert 'trace of the Jacobian: -38' in done.stdout
+    told = subprocess.run(run, capture_output=True, text=True)
+    assert told.returncode == 2
+    assert told.stderr.endswith(f'NAME one of: {" ".join(sorted(EXECUTABLES))}\n')
