@@ -43,7 +43,7 @@ class Pace:
         """
         if self._start_ns is None or now_ns < self._stamp(self._next - 1):
             self.reset()
-            self._start_ns = now_ns - self._slack_ns
+            self._start_ns = max(now_ns - self._slack_ns, min(now_ns, 0))
         last = int((now_ns - self._start_ns) / self._period_ns)
         if self._stamp(last + 1) <= now_ns:  # the division may have rounded down
             last += 1

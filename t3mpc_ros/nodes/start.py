@@ -7,28 +7,9 @@ program as quietly as one that comes later, so nothing heavy stands at the top o
 """
 
 import importlib
-import signal
 import sys
-from types import FrameType
 
-
-class StopRequest:
-    """Whether somebody has asked this process to end."""
-
-    def __init__(self) -> None:
-        self.wanted = False
-        self.starting = True
-        """While True a signal ends the process at once: there is nothing to stop yet."""
-
-    def install(self) -> None:
-        """Take over SIGINT and SIGTERM."""
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._handle)
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        self.wanted = True
-        if self.starting:
-            raise SystemExit(0)
+from t3mpc_ros.nodes.plumbing.stop_request import StopRequest
 
 
 def _main(name: str) -> int:

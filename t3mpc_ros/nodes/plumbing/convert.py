@@ -31,11 +31,14 @@ def quaternion_from_heading(heading: float) -> Quaternion:
 
 
 def heading_from_quaternion(rotation: Quaternion) -> float:
-    """Return the heading (rad) of a rotation, whatever its roll and pitch."""
-    return math.atan2(
-        2.0 * (rotation.w * rotation.z + rotation.x * rotation.y),
-        1.0 - 2.0 * (rotation.y**2 + rotation.z**2),
-    )
+    """Return the heading (rad) of a rotation, whatever its roll and pitch; NaN if not finite."""
+    # Products, not powers: those raise OverflowError.
+    sine = 2.0 * (rotation.w * rotation.z + rotation.x * rotation.y)
+    cosine = 1.0 - 2.0 * (rotation.y * rotation.y + rotation.z * rotation.z)
+    # The angle of an infinite vector would be finite.
+    if not (math.isfinite(sine) and math.isfinite(cosine)):
+        return math.nan
+    return math.atan2(sine, cosine)
 
 
 def motion_from_odometry(message: Odometry) -> Motion:

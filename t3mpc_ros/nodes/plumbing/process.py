@@ -13,13 +13,13 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 import yaml
 
+from t3mpc_ros.nodes.plumbing.stop_request import StopRequest
 from t3mpc_ros.record.model import ModelError
 from t3mpc_ros.record.schema import RecordError
 from t3mpc_ros.settings import SettingError
 
 if TYPE_CHECKING:
     from t3mpc_ros.nodes.plumbing.package_node import PackageNode
-    from t3mpc_ros.nodes.start import StopRequest
 
 Make = Callable[[], Sequence['PackageNode']]
 
@@ -35,7 +35,7 @@ UNUSABLE = (
 """What a node raises while it is made when it was given something it cannot use."""
 
 
-def run(name: str, make: Make, request: 'StopRequest', argv: Sequence[str]) -> int:
+def run(name: str, make: Make, request: StopRequest, argv: Sequence[str]) -> int:
     """Return the exit code of a process that spins the nodes of ``make`` until asked to stop.
 
     0 after SIGINT or SIGTERM, with the robot stopped; 2 when a setting, a parameter file or the
@@ -86,7 +86,7 @@ def parameter_file_problem(argv: Sequence[str]) -> str:
     return ''
 
 
-def _spin(nodes: Sequence['PackageNode'], request: 'StopRequest') -> None:
+def _spin(nodes: Sequence['PackageNode'], request: StopRequest) -> None:
     executor = SingleThreadedExecutor()
     for node in nodes:
         executor.add_node(node)

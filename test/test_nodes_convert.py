@@ -1,0 +1,164 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Between messages and the package's words nothing is lost, and nothing bad gets through."""
+
+import math
+
+from geometry_msgs.msg import Quaternion, Twist, TwistStamped
+from nav_msgs.msg import Odometry
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from t3mpc_ros.motion import BodyTwist, Motion, Pose
+from t3mpc_ros.motion.words import NANOSECONDS, wrap_angle
+from t3mpc_ros.nodes.plumbing import convert
+
+HEADINGS = [*np.linspace(-math.pi, math.pi, 41)[1:], 1e-9, -1e-9, math.pi - 1e-9, 1e-9 - math.pi]
+STAMPS = [0, 1, NANOSECONDS - 1, NANOSECONDS, 1_795_240_567_146_950_308, (2**31 - 1) * NANOSECONDS]
+
+
+def motions(count=200):
+    generator = np.random.default_rng(5)
+    for stamp_ns in generator.integers(0, 2 * 10**18, count):
+        x, y, v, w = generator.uniform(-1e3, 1e3, 4)
+        yield Motion(
+            int(stamp_ns), Pose(x, y, generator.uniform(-math.pi, math.pi)), BodyTwist(v, w)
+        )
+
+
+@pytest.mark.parametrize('stamp_ns', STAMPS)
+def test_a_stamp_survives_to_the_nanosecond(stamp_ns):
+    stamp = convert.time_from_ns(stamp_ns)
+    assert 0 <= stamp.nanosec < NANOSECONDS
+    assert convert.ns_from_time(stamp) == stamp_ns
+
+
+def test_a_motion_survives_odometry_and_the_message_may_be_used_again():
+    message = Odometry()
+    for motion in motions():
+        back = convert.motion_from_odometry(convert.fill_odometry(message, motion))
+        assert back.stamp_ns == motion.stamp_ns
+        assert back.twist == motion.twist
+        assert back.pose[:2] == motion.pose[:2]
+        assert abs(wrap_angle(back.pose.heading - motion.pose.heading)) < 1e-14
+
+
+@pytest.mark.parametrize('heading', HEADINGS)
+def test_a_heading_is_a_unit_quaternion_about_z_and_comes_back(heading):
+    rotation = convert.quaternion_from_heading(heading)
+    assert (rotation.x, rotation.y) == (0.0, 0.0)
+    assert math.hypot(rotation.z, rotation.w) == pytest.approx(1.0, abs=1e-15)
+    back = convert.heading_from_quaternion(rotation)
+    assert abs(wrap_angle(back - heading)) < 1e-15 * 4
+    # q and -q are one rotation.
+    opposite = Quaternion(z=-rotation.z, w=-rotation.w)
+    assert abs(wrap_angle(convert.heading_from_quaternion(opposite) - heading)) < 1e-15 * 4
+
+
+def test_a_heading_beyond_a_turn_comes_back_wrapped():
+    for heading in np.linspace(-30.0, 30.0, 61):
+        back = convert.heading_from_quaternion(convert.quaternion_from_heading(heading))
+        assert abs(wrap_angle(back - heading)) < 1e-13
+
+
+def test_roll_and_pitch_do_not_change_the_heading():
+    generator = np.random.default_rng(6)
+    for _ in range(100):
+        yaw = generator.uniform(-math.pi, math.pi)
+        pitch, roll = generator.uniform(-1.4, 1.4), generator.uniform(-math.pi, math.pi)
+        x, y, z, w = Rotation.from_euler('ZYX', [yaw, pitch, roll]).as_quat()
+        assert convert.heading_from_quaternion(Quaternion(x=x, y=y, z=z, w=w)) == pytest.approx(
+            yaw, abs=1e-12
+        )
+
+
+@pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf, 1e200])
+@pytest.mark.parametrize('axis', ['x', 'y', 'z', 'w'])
+def test_a_rotation_that_is_none_has_no_heading(axis, value):
+    """An infinite z once had the heading 3/4 pi, and 1e200 ended the node with OverflowError."""
+    rotation = Quaternion(x=0.5, y=0.5, z=0.5, w=0.5)
+    setattr(rotation, axis, value)
+    heading = convert.heading_from_quaternion(rotation)
+    assert math.isnan(heading) or (value == 1e200 and axis in 'xw')
+
+
+def test_poses_in_all_their_messages_agree():
+    for motion in motions(20):
+        odometry = convert.fill_odometry(Odometry(), motion)
+        posed = convert.pose_stamped(motion, 'odom')
+        moved = convert.transform(motion, 'odom', 'base_link')
+        assert posed.pose == odometry.pose.pose
+        assert posed.header.stamp == moved.header.stamp == odometry.header.stamp
+        assert (posed.header.frame_id, moved.header.frame_id) == ('odom', 'odom')
+        assert moved.child_frame_id == 'base_link'
+        assert moved.transform.rotation == odometry.pose.pose.orientation
+        offset = moved.transform.translation
+        assert (offset.x, offset.y, offset.z) == (*motion.pose[:2], 0.0)
+
+
+def test_a_planar_covariance_lands_at_x_y_and_yaw():
+    """ROS orders the rows x, y, z, roll, pitch, yaw (REP 103, geometry_msgs)."""
+    generator = np.random.default_rng(7)
+    root = generator.normal(size=(3, 3))
+    planar = root @ root.T
+    full = np.array(convert.planar_covariance(planar)).reshape(6, 6)
+    known = [0, 1, 5]
+    np.testing.assert_array_equal(full[np.ix_(known, known)], planar)
+    np.testing.assert_array_equal(full, full.T)
+    assert np.linalg.eigvalsh(full).min() > 0.0
+    for unknown in (2, 3, 4):
+        assert full[unknown, unknown] == 1e6
+        assert np.count_nonzero(full[unknown]) == 1
+    message = Odometry()
+    message.pose.covariance = full.ravel().tolist()
+    np.testing.assert_array_equal(message.pose.covariance.reshape(6, 6), full)
+
+
+def test_a_command_survives_a_twist():
+    for motion in motions(20):
+        assert convert.body_twist(convert.twist_from_body(motion.twist)) == motion.twist
+        stamped = convert.stamped_twist(motion.twist, motion.stamp_ns, 'base_link')
+        assert stamped.header.frame_id == 'base_link'
+        assert convert.command(stamped, 5) == (motion.twist, motion.stamp_ns)
+
+
+@pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize('part', ['linear', 'angular'])
+@pytest.mark.parametrize('axis', ['x', 'y', 'z'])
+def test_one_bad_number_anywhere_spoils_a_command(part, axis, value):
+    message = convert.twist_from_body(BodyTwist(0.5, 1.0))
+    setattr(getattr(message, part), axis, value)
+    assert not all(map(math.isfinite, convert.body_twist(message)))
+    twist, _ = convert.command(TwistStamped(twist=message), 5)
+    assert not all(map(math.isfinite, twist))
+
+
+def test_a_command_without_a_stamp_is_wanted_now():
+    assert convert.command(Twist(), 5) == (BodyTwist(0.0, 0.0), 5)
+    assert convert.command(TwistStamped(), 5) == (BodyTwist(0.0, 0.0), 5)
+
+
+@pytest.mark.parametrize('place', ['x', 'y', 'heading', 'linear', 'angular'])
+@pytest.mark.parametrize('value', [math.nan, math.inf])
+def test_a_bad_number_in_odometry_is_seen(place, value):
+    message = convert.fill_odometry(Odometry(), Motion(0, Pose(1, 2, 3), BodyTwist(4, 5)))
+    assert convert.motion_from_odometry(message).is_finite()
+    pose, twist = message.pose.pose, message.twist.twist
+    owner, name = {
+        'x': (pose.position, 'x'),
+        'y': (pose.position, 'y'),
+        'heading': (pose.orientation, 'z'),
+        'linear': (twist.linear, 'x'),
+        'angular': (twist.angular, 'z'),
+    }[place]
+    setattr(owner, name, value)
+    assert not convert.motion_from_odometry(message).is_finite()
+
+
+def test_wheel_joints_keep_their_order():
+    message = convert.wheel_joints(('right', 'left'), (1.0, 2.0), np.array((3.0, 4.0)), 7)
+    assert message.name == ['right', 'left']
+    assert list(message.position) == [1.0, 2.0]
+    assert list(message.velocity) == [3.0, 4.0]
+    assert convert.ns_from_time(message.header.stamp) == 7
