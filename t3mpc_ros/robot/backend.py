@@ -119,8 +119,8 @@ class GuardSettings(Settings):
     )
     wheel_speed: float = setting(
         10.0,
-        'largest wheel speed that is passed on; from here silence brings the wheels to rest within '
-        '0.5 s. The board steps at up to 19.6 rad/s (10 000 microsteps a second)',
+        'largest wheel speed that is passed on; from here silence brings the wheels to rest '
+        'within 0.5 s. The board steps at up to 19.6 rad/s (10 000 microsteps a second)',
         unit='rad/s',
         low=0.0,
         high=200.0,

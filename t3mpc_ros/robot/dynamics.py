@@ -6,7 +6,7 @@ The generalised coordinates are q = (x, y, P, theta_R, theta_L): (x, y) is the m
 wheel axle in the world frame (m), P the heading (rad), and the thetas are the angles the wheels
 have turned (rad). chi = (theta_R', theta_L') are the wheel speeds (rad/s), right first.
 
-Only the body stands off the axle, the wheels do not: every first moment of mass is m_c d. The
+E16: only the body stands off the axle, the wheels do not: every first moment of mass is m_c d. The
 printed (5) and (6) say m d, which is the same number when d there means the distance to the
 centre of mass of the *whole* robot; with the d of (14) it must be m_c d, and only then does the
 reduction give (12).
@@ -72,7 +72,8 @@ class BodySettings(Settings):
 def inertia_matrix(heading: float, body: BodySettings, geometry: Geometry) -> Array:
     """Return theta(q) of (5) with E2: shape (5, 5), symmetric, positive definite.
 
-    E2: entry (2, 2) is m, not 0: the robot has mass along y as well as along x.
+    E2: entry (2, 2) is m, not 0: the robot has mass along y as well as along x. E16: the offset
+    terms carry m_c, not m.
     """
     mass, moment = body.total_mass, body.body_mass * body.com_offset
     result = np.zeros((5, 5))
@@ -87,7 +88,8 @@ def inertia_matrix(heading: float, body: BodySettings, geometry: Geometry) -> Ar
 def coriolis_matrix(heading: float, heading_rate: float, body: BodySettings) -> Array:
     """Return eta(q, q') of (6) with E2: shape (5, 5), so that eta q' is the centrifugal force.
 
-    E2: the terms stand in the third column and carry P', because they come from P'^2.
+    E2: the terms stand in the third column and carry P', because they come from P'^2. E16: they
+    carry m_c, not m.
     """
     pull = body.body_mass * body.com_offset * heading_rate
     result = np.zeros((5, 5))
@@ -106,7 +108,7 @@ def input_matrix() -> Array:
 def constraint_matrix(heading: float, geometry: Geometry) -> Array:
     """Return Q of (7), shape (3, 5): Q q' = 0 says no side slip, right and left wheel roll.
 
-    The printed first column holds -d in its third row, which belongs to coordinates at the
+    E15: the printed first column holds -d in its third row, which belongs to coordinates at the
     centre of mass. Here (x, y) is on the axle, as (5) and (8) have it, so that entry is 0; with
     -d the null space (8) would not be one.
     """
@@ -156,7 +158,7 @@ def reduce_to_wheels(
     """Return (theta_bar, eta_bar, W_bar) of (10), each (2, 2), by projecting (4) as (9) says.
 
     E3: in (9) it is eta varsigma chi; print lost the chi. The multipliers vanish because
-    varsigma^T Q^T = 0.
+    varsigma^T Q^T = 0. The last one is the identity (13).
     """
     basis = null_space(heading, geometry)
     basis_rate = null_space_rate(heading, heading_rate, geometry)
