@@ -274,6 +274,23 @@ def test_far_outside_where_firings_underflow_the_basis_is_still_exact():
         )
 
 
+def test_a_rule_28_that_fires_alone_answers_between_its_two_consequents():
+    """'If chi_1 is ... and chi_2 is ... then y in [lower alpha, upper alpha]', rule by rule.
+
+    At the centres of narrow sets one rule fires and the others do not. With one slice its two
+    consequents are weighed by the two levels.
+    """
+    rng = np.random.default_rng(13)
+    levels = np.array([[0.3, 0.9]])
+    centres = np.array([[-6.0, 1.0, 8.0], [-9.0, -2.0, 5.0]])
+    sets = FuzzySets(centres, np.full((2, 3, 1, 2, 2), 0.5), levels, 0.1)
+    lower, upper = np.sort(rng.uniform(-5.0, 5.0, (2, 9)), axis=0)
+    for rule, u in enumerate(itertools.product(*centres)):
+        y = np.concatenate([lower, upper]) @ basis_of(np.array(u), sets)
+        assert lower[rule] < y < upper[rule]
+        assert y == pytest.approx((0.3 * lower[rule] + 0.9 * upper[rule]) / 1.2, rel=1e-12)
+
+
 @pytest.mark.parametrize('distance', FAR[2:])
 def test_far_outside_the_nearest_rule_takes_all(distance):
     sets = build_sets(FuzzySettings())

@@ -212,6 +212,28 @@ def test_v_p_keeps_its_bounds_whatever_the_errors():
     assert np.max(np.abs(v)) > 0.3  # it did something
 
 
+def test_v_p_goes_on_by_the_first_of_the_optimal_changes_63():
+    """Where no bound is met, (61) says pi dv_0 = -mu sum of s_j Psi_j, with the plan's own Psi."""
+    settings = DEFAULT.changed({'v_max': 1e3, 'dv_max': 1e3, 'learning': False})
+    term, loop = PredictiveTerm(settings, PERIOD, GAIN), Loop()
+    before, changes = np.zeros(2), []
+    for w in _waves(1000):
+        due = term.due
+        v_p = term.step(loop.error)
+        if due:
+            assert np.all(term.status == OPTIMAL)
+            np.testing.assert_allclose(term.fade, 1.0)
+            first = -settings.error_weight * np.sum(term.step_response * term.prediction, axis=1)
+            np.testing.assert_allclose(v_p - before, first / settings.move_weight, atol=1e-9)
+            changes.append(v_p - before)
+        else:
+            np.testing.assert_array_equal(v_p, before)
+        before = v_p
+        loop.step(v_p, w, np.zeros(2))
+    assert len(changes) == 200
+    assert np.max(np.abs(changes)) > 0.1
+
+
 def test_v_p_is_held_between_the_predictive_steps():
     term = PredictiveTerm(DEFAULT, PERIOD, GAIN)
     generator = np.random.default_rng(5)

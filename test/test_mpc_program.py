@@ -7,7 +7,14 @@ import pytest
 from scipy.optimize import LinearConstraint, lsq_linear, minimize
 
 from t3mpc_ros.mpc.active_set import INFEASIBLE, NOT_POSITIVE, OPTIMAL, UNFINISHED, depends, solve
-from t3mpc_ros.mpc.program import cost, make_space, residual
+from t3mpc_ros.mpc.program import (
+    cost,
+    factor,
+    make_space,
+    normal_equations,
+    residual,
+    unconstrained,
+)
 from t3mpc_ros.mpc.response import toeplitz
 
 
@@ -162,6 +169,23 @@ def test_without_active_bounds_it_is_the_closed_form_with_its_minus_sign():
     rest = cost(matrix, free, np.zeros(4), 1.5, 0.2)
     assert cost(matrix, free, closed, 1.5, 0.2) < rest
     assert cost(matrix, free, -closed, 1.5, 0.2) > rest
+
+
+def test_closed_form_62_is_where_the_gradient_61_vanishes_and_where_the_solver_begins():
+    generator = np.random.default_rng(8)
+    for moves in (1, 4, 9):
+        matrix, free = _matrix(generator.standard_normal(9), moves), generator.standard_normal(9)
+        hessian, lower = np.zeros((moves, moves)), np.zeros((moves, moves))
+        slope, closed = np.zeros(moves), np.zeros(moves)
+        normal_equations(matrix, free, 1.5, 0.2, hessian, slope)
+        np.testing.assert_allclose(hessian, 1.5 * matrix.T @ matrix + 0.2 * np.eye(moves))
+        np.testing.assert_allclose(slope, 1.5 * matrix.T @ free, atol=1e-14)
+        assert factor(hessian, lower)
+        unconstrained(lower, slope, closed)
+        np.testing.assert_allclose(hessian @ closed + slope, 0.0, atol=1e-12)
+        space = make_space(moves)
+        assert solve(matrix, free, 1.5, 0.2, 0.0, 1e6, 1e6, 100, space) == OPTIMAL
+        np.testing.assert_allclose(space.changes, closed, rtol=1e-10, atol=1e-13)
 
 
 def test_cost_has_the_gradient_61():

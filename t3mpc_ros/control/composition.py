@@ -83,6 +83,7 @@ class CompositionSettings(Settings):
 class ComposedLaw:
     """Computes the wheel accelerations that make two wheels follow a reference.
 
+    The plant it expects is (64)-(65): chi' = g*(chi) + u + omega for each wheel, g* unknown.
     It holds the estimator of state, the fuzzy estimates of the dynamics and the predictive term,
     and knows neither poses nor clocks: speeds in, accelerations out, per period. What the drive
     makes of the acceleration comes back through :meth:`applied`, because estimates must use the

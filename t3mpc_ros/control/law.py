@@ -73,7 +73,10 @@ def law_terms(
               \delta = \chi - r
 
     E12: the printed :math:`+\omega_i` is the unknown estimation error and cannot be applied; it
-    is :math:`\dot r_i`, and with it (68)-(69) follow. The compensator is (81)-(82),
+    is :math:`\dot r_i`, and with it (68)-(69) follow from (64)-(65), and by (70)-(71) the error
+    system (72)-(73) of each wheel,
+    :math:`\dot\delta = \tilde\alpha^T\Phi - K\delta + \omega + v_c + v_p`. The compensator is
+    (81)-(82),
     :math:`v_c = -(\bar\omega + \bar v_p)\tanh(\delta/\epsilon)`.
 
     speeds, wanted : shape (n,), chi and r, rad/s
@@ -108,7 +111,20 @@ def compensator(error: float, bound: float, smoothing: float) -> float:
 
 
 def lyapunov_value(errors: Array, coefficient_errors: Array, adaptation_gain: float) -> float:
-    """Return V of equation (74), rad²/s²: half of |delta|² plus |alpha* - alpha|²/(2 gamma)."""
+    """Return V of equation (74), rad²/s²: half of |delta|² plus |alpha* - alpha|²/(2 gamma).
+
+    Along the loop V' is (75), the sum of delta delta' - alpha~ alpha'/gamma. With the law in it
+    that is (76), and (79) when the coefficients follow (77)-(78).
+
+    Parameters
+    ----------
+    errors
+        delta, shape (n,), rad/s.
+    coefficient_errors
+        alpha~ = alpha* - alpha of all outputs, rad/s².
+    adaptation_gain
+        gamma, 1/s².
+    """
     squares = float(np.sum(coefficient_errors**2))
     return 0.5 * float(errors @ errors) + squares / (2.0 * adaptation_gain)
 
@@ -123,6 +139,10 @@ def lyapunov_rate_bound(errors: Array, gain: float, bound: float, smoothing: flo
     compensator outweighs the bounded terms of (79)-(80) up to that amount, and the error is
     ultimately bounded by :func:`ultimate_bound` instead of vanishing. E13: the last cross term
     of (76) and (79) is delta_2 v_p2.
+
+    E17: (84) also lost V(0); its integral is negative, V is not. Integrated, the bound says
+    :math:`V(t) \le V(0) - K\int\|\delta\|^2 + 0.2785\,\epsilon\, t
+    \sum_i(\bar\omega_i + \bar v_{p,i})`.
     """
     return -gain * float(errors @ errors) + TANH_GAP * smoothing * bound * errors.size
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The fuzzy estimator of unknown dynamics, g(U|alpha) of (30)-(31), with its adaptation."""
+"""The fuzzy estimator of unknown dynamics, g(U|alpha) of (30), (31), with its adaptation."""
 
 import math
 
@@ -38,9 +38,10 @@ def _evaluate(
 
 
 class FuzzyEstimator:
-    """Estimates the unknown part of the dynamics from the wheel speeds, and learns it.
+    """Estimates g of chi' = g(U|alpha) + u (30) from the wheel speeds, and learns it.
 
-    All outputs share one basis, as in (70)-(71): the inputs and the sets are the same. Work
+    All outputs share one basis, as in (70)-(71): the inputs and the sets are the same, and an
+    error of the coefficients alpha* - alpha makes the error (alpha* - alpha)ᵀ Phi of g. Work
     space belongs to the object, so that a call costs one kernel and no allocation but the result.
 
     Parameters
@@ -166,6 +167,9 @@ class FuzzyEstimator:
     @property
     def coefficients(self) -> Array:
         """A copy of alpha, shape (m, 2 r lambda), rad/s², in the order of (32).
+
+        They are the consequents of the rules (28), one at the lower and one at the upper level
+        of each slice.
 
         Setting it checks it; coefficients outside the ball are brought back by the next step
         of adaptation.

@@ -26,7 +26,9 @@ def fuzzify(inputs: Array, centres: Array, pull: Array, found: Array) -> None:
                   = U + (o - U)\frac{\beta_U^2}{\beta^2 + \beta_U^2}
 
     This is where the product of the input's Gaussian about U and the set's Gaussian about o is
-    largest. The second form is U itself, to the last bit, when the input is not fuzzy.
+    largest. The second form is U itself, to the last bit, when the input is not fuzzy. With the
+    upper width it is (16) at the upper level of a slice and (17) at the lower one, with the lower
+    width (18) and (19).
 
     inputs : shape (n,), U, rad/s
     centres : shape (n, M), o, rad/s
@@ -48,6 +50,9 @@ def fuzzify(inputs: Array, centres: Array, pull: Array, found: Array) -> None:
 @kernel
 def square_distances(found: Array, centres: Array, sharpness: Array, squares: Array) -> None:
     r"""Write the exponents :math:`((x^* - o)/\beta)^2` of the memberships (20)-(23) with E7.
+
+    With the upper width it is that of (20) at the upper level of a slice and of (21) at the lower
+    one, with the lower width of (22) and (23).
 
     E7: the exponent is squared in a Gaussian; the printed one is linear, and lets grades grow
     beyond one on one side of the centre.
@@ -73,6 +78,8 @@ def memberships(
 ) -> None:
     r"""Write the grades :math:`\zeta = \exp(-((x^* - o)/\beta)^2)`, (16)-(23) with E7.
 
+    They are (20), (21), (22) and (23) for upper and lower width, upper and lower level each. A
+    control step takes :func:`relative_memberships` instead, which cannot underflow.
     Arguments as in :func:`fuzzify` and :func:`square_distances`; ``grades`` is overwritten.
     """
     fuzzify(inputs, centres, pull, grades)
@@ -125,6 +132,9 @@ def _subtract_nearest(squares: Array, j: int, level: int, bound: int) -> float:
 @kernel
 def fire(grades: Array, firings: Array) -> None:
     r"""Write the firing of every rule, :math:`\Omega^l = \prod_i \zeta_i`, (24)-(27).
+
+    A rule (28) takes one set of each input. Upper grades make (24) at the upper level of a slice
+    and (25) at the lower one, lower grades (26) and (27).
 
     grades : shape (n, M, lambda, 2, 2)
     firings : shape (r, lambda, 2, 2) with r = M**n, overwritten; the last input's set changes

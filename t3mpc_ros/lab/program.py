@@ -61,6 +61,23 @@ def _ablation(options: argparse.Namespace) -> int:
     return 0
 
 
+def _estimation(options: argparse.Namespace) -> int:
+    from t3mpc_ros.lab.estimation import compare, table
+
+    results = compare(
+        seeds=options.seeds,
+        duration=options.duration,
+        normalised_gain=options.gain,
+        progress=lambda text: print(f'  {text}', file=sys.stderr, flush=True),
+    )
+    print(table(results))
+    if options.json:
+        options.json.write_text(
+            json.dumps([result.record() for result in results], indent=1) + '\n'
+        )
+    return 0
+
+
 def _exponents(options: argparse.Namespace) -> int:
     from t3mpc_ros.chaos.system import hyperchaotic
     from t3mpc_ros.lab.exponents import lyapunov_exponents
@@ -107,6 +124,17 @@ def _parser() -> argparse.ArgumentParser:
     ablation.add_argument('--json', type=Path, help='also write the numbers to this file')
     ablation.set_defaults(run=_ablation)
 
+    estimation = commands.add_parser(
+        'estimation', help='the kinds of fuzzy systems as estimators, without a controller (86)'
+    )
+    estimation.add_argument('--seeds', type=_count, default=5, help='runs each (default 5)')
+    estimation.add_argument('--duration', type=_seconds, default=60.0, help='seconds (default 60)')
+    estimation.add_argument(
+        '--gain', type=_gain, default=40.0, help='normalised gain of all kinds, 1/s² (default 40)'
+    )
+    estimation.add_argument('--json', type=Path, help='also write the numbers to this file')
+    estimation.set_defaults(run=_estimation)
+
     exponents = commands.add_parser('exponents', help='Lyapunov exponents of the generator')
     exponents.add_argument('--duration', type=_seconds, default=200.0, help='system seconds')
     exponents.set_defaults(run=_exponents)
@@ -120,6 +148,13 @@ def _seconds(text: str) -> float:
     value = float(text)
     if not 1.0 <= value <= 86_400.0:
         raise argparse.ArgumentTypeError(f'must be from 1 to 86400 seconds: got {text}')
+    return value
+
+
+def _gain(text: str) -> float:
+    value = float(text)
+    if not 0.0 <= value <= 1e6:
+        raise argparse.ArgumentTypeError(f'must be from 0 to 1000000 1/s²: got {text}')
     return value
 
 

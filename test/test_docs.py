@@ -1,0 +1,164 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The pages in docs/ say what is true: every equation has a function and a test that exist."""
+
+import ast
+from functools import cache, reduce
+import importlib
+from pathlib import Path
+import re
+
+import pytest
+
+from t3mpc_ros.nodes.tables import settings_page
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGE = ROOT / 'docs' / 'equations.md'
+FUNCTION = re.compile(r'`(t3mpc_ros/[\w/]+\.py)::([\w.]+)`(\\\*)?')
+TEST = re.compile(r'`(test/test_\w+\.py)::(test_\w+)`')
+NUMBER = re.compile(r'\((\d+)\)|(E\d+)')
+
+
+def _rows():
+    """Return the cells of every row of every table; the functions and tests stand last."""
+    rows = []
+    for line in PAGE.read_text().splitlines():
+        if line.startswith('| ') and 'implemented by' not in line:
+            rows.append([cell.strip() for cell in line.strip().strip('|').split('|')])
+    return rows
+
+
+ROWS = _rows()
+NUMBERED = [row for row in ROWS if NUMBER.fullmatch(row[0])]
+
+
+def _named(row):
+    """Return the functions of a row as (path, name, starred)."""
+    return [(path, name, bool(star)) for path, name, star in FUNCTION.findall(row[-2])]
+
+
+FUNCTIONS = sorted({one for row in ROWS for one in _named(row)})
+TESTS = sorted({one for row in ROWS for one in TEST.findall(row[-1])})
+
+
+@cache
+def _tree(path):
+    return ast.parse((ROOT / path).read_text())
+
+
+def _module(path):
+    return importlib.import_module(path.removesuffix('.py').replace('/', '.'))
+
+
+def test_every_equation_and_every_correction_has_exactly_one_row():
+    expected = [f'({n})' for n in range(1, 87)] + [f'E{n}' for n in range(1, len(NUMBERED) - 85)]
+    assert [row[0] for row in NUMBERED] == expected
+    assert len(NUMBERED) >= 86 + 14
+
+
+@pytest.mark.parametrize('row', ROWS, ids=lambda row: row[0][:30])
+def test_no_cell_is_empty_and_the_last_two_hold_functions_and_tests_only(row):
+    assert len(row) == (4 if row in NUMBERED else 3)
+    assert all(row)
+    assert row[-2] == ', '.join(
+        f'`{path}::{name}`' + star for path, name, star in FUNCTION.findall(row[-2])
+    )
+    assert row[-1] == ', '.join(f'`{path}::{name}`' for path, name in TEST.findall(row[-1]))
+    assert _named(row)
+    assert TEST.search(row[-1])
+
+
+@pytest.mark.parametrize('path, name, starred', FUNCTIONS, ids=lambda value: str(value))
+def test_every_function_named_exists(path, name, starred):
+    found = reduce(getattr, name.split('.'), _module(path))
+    assert found.__doc__
+
+
+@pytest.mark.parametrize('row', NUMBERED, ids=lambda row: row[0])
+def test_the_docstring_of_each_function_its_class_or_module_carries_the_number(row):
+    """A range such as (16)-(19) carries its ends only: a search for what is between finds none."""
+    for path, name, _ in _named(row):
+        module = _module(path)
+        texts = [module.__doc__]
+        for part in name.split('.'):
+            module = getattr(module, part)
+            texts.append(module.__doc__)
+        number = rf'(?<![\w]){re.escape(row[0])}(?!\d)'
+        assert any(re.search(number, text) for text in texts if text), f'{path}::{name}'
+
+
+def test_a_search_for_a_number_finds_a_docstring_that_is_not_only_a_module_s():
+    for row in NUMBERED:
+        own = [reduce(getattr, name.split('.'), _module(path)) for path, name, _ in _named(row)]
+        assert any(row[0] in one.__doc__ for one in own), row[0]
+
+
+@pytest.mark.parametrize('path, name', TESTS, ids=lambda value: value.split('/')[-1])
+def test_every_test_named_exists(path, name):
+    assert name in {node.name for node in _tree(path).body if isinstance(node, ast.FunctionDef)}
+
+
+@pytest.mark.parametrize('row', ROWS, ids=lambda row: row[0][:30])
+def test_a_test_of_each_row_reaches_a_function_of_that_row(row):
+    """The test's file imports the function's module, or a module that imports it."""
+    reached = set()
+    for path, _ in TEST.findall(row[-1]):
+        direct = _imported(path)
+        reached |= direct.union(*(_imported(file) for file in direct))
+    assert reached & {path for path, _, _ in _named(row)}
+
+
+@cache
+def _imported(path):
+    found = set()
+    for node in ast.walk(_tree(path)):
+        if isinstance(node, ast.ImportFrom) and (node.module or '').startswith('t3mpc_ros'):
+            source = node.module.replace('.', '/')
+            found |= {f'{source}.py', *(f'{source}/{name.name}.py' for name in node.names)}
+    return {file for file in found if (ROOT / file).exists()}
+
+
+def test_a_star_marks_exactly_the_functions_that_nothing_running_calls():
+    marked = {(path, name) for path, name, star in FUNCTIONS if star}
+    plain = {(path, name) for path, name, star in FUNCTIONS if not star}
+    assert not marked & plain
+    for path, name in marked:
+        assert not _called(path, name, marked), f'{path}::{name} is called: no star'
+    for path, name in plain:
+        if '.' not in name and name[0].islower():  # methods and classes are not looked for
+            assert _called(path, name, marked), f'{path}::{name} is called by nothing: a star'
+
+
+def _called(path, name, marked):
+    """Whether the package refers to a function other than in itself and in marked ones."""
+    module = path.removesuffix('.py').replace('/', '.')
+    for source in (ROOT / 't3mpc_ros').rglob('*.py'):
+        file = str(source.relative_to(ROOT))
+        tree = _tree(file)
+        imported = file == path or any(
+            isinstance(node, ast.ImportFrom)
+            and node.module == module
+            and name in {one.name for one in node.names}
+            for node in ast.walk(tree)
+        )
+        if not imported:
+            continue
+        for top in tree.body:
+            own = getattr(top, 'name', None)
+            if (file, own) in marked or (file == path and own == name):
+                continue
+            for node in ast.walk(top):
+                if isinstance(node, ast.Name) and node.id == name and _is_read(node):
+                    return True
+    return False
+
+
+def _is_read(node):
+    return isinstance(node.ctx, ast.Load)
+
+
+def test_the_page_of_settings_is_up_to_date():
+    assert (ROOT / 'docs' / 'settings.md').read_text() == settings_page(), (
+        'docs/settings.md is out of date: run '
+        '`.venv/bin/python -m t3mpc_ros.nodes.tables > docs/settings.md`'
+    )
