@@ -171,9 +171,9 @@ def solve(
     """Write the optimal changes and multipliers into ``space``; return a status.
 
     Goldfarb and Idnani (1983), a dual active-set method: it starts at the unconstrained optimum
-    (62) and adds the bound that is violated most, dropping active bounds whose multiplier would
-    turn negative. When (62) keeps the bounds nothing more is done, which is the usual case; so
-    there is nothing to gain from remembering the last active set.
+    (62), with E10, and adds the bound that is violated most, dropping active bounds whose
+    multiplier would turn negative. When (62) keeps the bounds nothing more is done, which is the
+    usual case; so there is nothing to gain from remembering the last active set.
 
     matrix, free              : S, shape (n_p, n_c); Psi_free, shape (n_p,)
     error_weight, move_weight : mu and pi (> 0)
