@@ -45,7 +45,7 @@ def output(tmp_path_factory):
 
 
 @pytest.mark.parametrize('command', list(SHORTENED))
-def test_the_command_works(command, output, tmp_path):
+def test_the_command_works(command, output, tmp_path, graph):
     extra, endless = SHORTENED[command]
     words = command.replace('runs/<time>', f'{output}/run').split()
     words += [word.replace('OUTPUT', str(output)) for word in extra]
@@ -59,10 +59,14 @@ def test_the_command_works(command, output, tmp_path):
             stdout=target,
             stderr=subprocess.STDOUT,
         )
-    if endless:
-        _wait_until_ready(process, said, f'{words[1]} ready')
-        process.send_signal(signal.SIGINT)
-    assert process.wait(timeout=240) == 0, said.read_text()
+    try:
+        if endless:
+            _wait_until_ready(process, said, f'{words[1]} ready')
+            process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=240) == 0, said.read_text()
+    finally:
+        process.kill()  # a node left behind would be heard by other tests
+        process.wait()
     assert 'Traceback' not in said.read_text()
     if command == 'scripts/demo':
         assert (output / 'run' / 'report.html').stat().st_size > 100_000
