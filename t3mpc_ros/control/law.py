@@ -55,6 +55,22 @@ class LawSettings(Settings):
 
 
 @kernel
+def compensator(error: float, bound: float, smoothing: float) -> float:
+    """Return v_c (rad/s²) for one wheel, equations (81)-(82) with the width of E14.
+
+    Parameters
+    ----------
+    error
+        delta, rad/s.
+    bound
+        omega-bar + v_p-bar, rad/s².
+    smoothing
+        epsilon, rad/s; the paper's tanh(delta) is epsilon = 1 rad/s.
+    """
+    return -bound * math.tanh(error / smoothing)
+
+
+@kernel
 def law_terms(
     speeds: Array,
     wanted: Array,
@@ -90,24 +106,9 @@ def law_terms(
         terms[0, i] = -estimate[i]
         terms[1, i] = -gain * error
         terms[2, i] = wanted_rate[i]
-        terms[3, i] = -bound * math.tanh(error / smoothing)
+        terms[3, i] = compensator(error, bound, smoothing)
         terms[4, i] = predictive[i]
         command[i] = terms[0, i] + terms[1, i] + terms[2, i] + terms[3, i] + terms[4, i]
-
-
-def compensator(error: float, bound: float, smoothing: float) -> float:
-    """Return v_c (rad/s²) for one wheel, equations (81)-(82) with the width of E14.
-
-    Parameters
-    ----------
-    error
-        delta, rad/s.
-    bound
-        omega-bar + v_p-bar, rad/s².
-    smoothing
-        epsilon, rad/s; the paper's tanh(delta) is epsilon = 1 rad/s.
-    """
-    return -bound * math.tanh(error / smoothing)
 
 
 def lyapunov_value(errors: Array, coefficient_errors: Array, adaptation_gain: float) -> float:

@@ -3,7 +3,7 @@
 """``lab``: what can be done without a ROS graph, as a command-line program."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 import json
 from pathlib import Path
@@ -54,11 +54,7 @@ def _ablation(options: argparse.Namespace) -> int:
         progress=True,
     )
     print(table(results))
-    if options.json:
-        options.json.write_text(
-            json.dumps([result.record() for result in results], indent=1) + '\n'
-        )
-    return 0
+    return _keep([result.record() for result in results], options.json)
 
 
 def _estimation(options: argparse.Namespace) -> int:
@@ -71,10 +67,13 @@ def _estimation(options: argparse.Namespace) -> int:
         progress=lambda text: print(f'  {text}', file=sys.stderr, flush=True),
     )
     print(table(results))
-    if options.json:
-        options.json.write_text(
-            json.dumps([result.record() for result in results], indent=1) + '\n'
-        )
+    return _keep([result.record() for result in results], options.json)
+
+
+def _keep(records: Sequence[Mapping[str, object]], path: Path | None) -> int:
+    """Write the records to the file that was asked for, if one was, and return 0."""
+    if path:
+        path.write_text(json.dumps(records, indent=1) + '\n')
     return 0
 
 
