@@ -11,7 +11,6 @@ from t3mpc_ros.fuzzy.adaptation import AdaptationSettings
 from t3mpc_ros.fuzzy.estimator import FuzzyEstimator
 from t3mpc_ros.fuzzy.inference import basis_of
 from t3mpc_ros.fuzzy.sets import FuzzySettings
-from t3mpc_ros.lab.ablation import interval, mean, paper_settings
 from t3mpc_ros.lab.estimation import (
     KINDS,
     NOTHING,
@@ -24,8 +23,10 @@ from t3mpc_ros.lab.estimation import (
     estimator,
     excitation,
     table,
+    torque_robot,
 )
 from t3mpc_ros.lab.program import main
+from t3mpc_ros.lab.trial.statistics import interval, mean
 from t3mpc_ros.motion import WheelSpeeds
 from t3mpc_ros.robot.dynamics import wheel_coriolis, wheel_inertia
 from t3mpc_ros.robot.loads import friction_torque
@@ -107,7 +108,7 @@ def test_excitation_is_bounded_seeded_and_pushes_the_speeds_about_a_mean():
 
 def test_target_is_the_friction_and_coriolis_of_the_robot():
     """Without disturbance, chi' - u is theta_bar^-1 (-eta_bar chi - f), (10), (30)."""
-    settings = paper_settings(0.04, 1)[1].changed({'disturbance.bound': 0.0})
+    settings = torque_robot(0.04, 1).changed({'disturbance.bound': 0.0})
     run = drive(settings, 20.0, 1)
     body, geometry, friction = settings.body, settings.geometry, settings.friction
     inertia = wheel_inertia(body, geometry)
@@ -125,7 +126,7 @@ def test_target_is_the_friction_and_coriolis_of_the_robot():
 
 
 def test_noise_is_in_the_measurement_only():
-    quiet, noisy = (drive(paper_settings(v, 2)[1], 20.0, 2) for v in (0.0, 0.09))
+    quiet, noisy = (drive(torque_robot(v, 2), 20.0, 2) for v in (0.0, 0.09))
     np.testing.assert_array_equal(quiet.measured, quiet.speeds)
     np.testing.assert_array_equal(quiet.speeds, noisy.speeds)
     assert np.var(noisy.measured - noisy.speeds) == pytest.approx(0.09, rel=0.1)
@@ -177,7 +178,7 @@ def test_the_program_prints_the_table_and_writes_the_numbers(tmp_path, capsys):
 
 
 def test_what_cannot_be_driven_is_refused():
-    settings = paper_settings(0.0, 1)[1]
+    settings = torque_robot(0.0, 1)
     with pytest.raises(ValueError, match='duration'):
         drive(settings, 0.01, 1)
     with pytest.raises(ValueError, match='torque'):

@@ -23,7 +23,6 @@ SHORTENED = {
     'scripts/run sim_robot': ([], True),
     'scripts/run controller --ros-args -p law.gain:=6.0': ([], True),
     'scripts/run all_in_one': (['--ros-args', '-p', 'folder:=OUTPUT/bag'], True),
-    'scripts/run lab ablation': (['--seeds', '1', '--duration', '5'], False),
     'scripts/run lab exponents': (['--duration', '20'], False),
     'scripts/run lab estimation': (['--seeds', '2'], False),
     'scripts/run lab report runs/<time>/bag': (['--output', 'OUTPUT/report'], False),

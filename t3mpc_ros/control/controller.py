@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.control.composition import ComposedLaw, CompositionSettings
+from t3mpc_ros.control.drive import Drive, LimitSettings
 from t3mpc_ros.control.freshness import Freshness, FreshnessSettings, Reason
 from t3mpc_ros.control.law import CertificateReading
-from t3mpc_ros.control.limits import LimitSettings, VelocityCommand
+from t3mpc_ros.control.pursuit import Pursuit
 from t3mpc_ros.motion import BodyTwist, Geometry, Motion, WheelSpeeds
 from t3mpc_ros.motion.kinematics import wheels_from_body
-from t3mpc_ros.motion.track import Track, TrackPoint
+from t3mpc_ros.motion.track import Jump, Track, TrackPoint
 from t3mpc_ros.motion.words import NANOSECONDS, STANDSTILL
 from t3mpc_ros.settings import nested
 
@@ -60,8 +61,11 @@ class Controller:
 
     def __init__(self, settings: ControllerSettings) -> None:
         self.settings = settings
-        self.law = ComposedLaw(settings, 'velocity')
-        self._command = VelocityCommand(settings.limits, settings.geometry)
+        self._pursuit = Pursuit(settings, 'velocity')
+        self._period = 1.0 / settings.rate
+        self._drive = Drive(
+            settings.estimate, settings.limits, settings.geometry, 'velocity', self._period
+        )
         self._freshness = Freshness(settings.freshness)
         limits = settings.limits
         self._track = Track(
@@ -69,9 +73,16 @@ class Controller:
                 JUMP_FACTOR * limits.linear_acceleration, JUMP_FACTOR * limits.angular_acceleration
             )
         )
+        self._jumps: list[Jump] = []
+        self._told: set[int] = set()
         self._moving = False
         self._last_stamp_ns: int | None = None
         self.status = self._status(0, Reason.NO_ODOMETRY, np.full(2, math.nan))
+
+    @property
+    def law(self) -> ComposedLaw:
+        """The law, with everything it has learnt."""
+        return self._pursuit.law
 
     def warm_up(self) -> None:
         """Compile and pre-train now, never inside a step."""
@@ -80,8 +91,8 @@ class Controller:
     def configure(self, settings: ControllerSettings) -> None:
         """Use other live settings from the next step on."""
         self.settings = settings
-        self.law.configure(settings)
-        self._command.configure(settings.limits)
+        self._pursuit.configure(settings)
+        self._drive.configure(settings.limits)
 
     def enable(self, on: bool) -> None:
         """Let the robot move, or stop it until it is let again."""
@@ -92,16 +103,22 @@ class Controller:
         enabled = self._freshness.enabled
         self._freshness.reset()
         self._freshness.enabled = enabled
-        self._track.clear()
+        self._forget_reference()
         self.law.fuzzy.reset()
         self.law.predictive.relearn()
-        self._stop(np.zeros(2))
+        self._stop()
         self._last_stamp_ns = None
 
     def add_reference(self, motion: Motion) -> bool:
         """Keep a wanted motion; return False when it is not finite and therefore ignored."""
+        newest = self._track.newest_ns
         if not self._track.add(motion):
             return False
+        if newest is not None and motion.stamp_ns <= newest:
+            # The source has started again: what it said of later is no longer so.
+            self._jumps = [jump for jump in self._jumps if jump.stamp_ns < motion.stamp_ns]
+            self._pursuit.plan.withdraw(motion.stamp_ns)
+        self._jumps += self._track.take_jumps()
         self._freshness.reference_arrived()
         return True
 
@@ -116,12 +133,12 @@ class Controller:
         """
         stamp = measured.stamp_ns
         if stamp == self._last_stamp_ns:
-            return self._command.twist, self.status
+            return self._drive.twist, self.status
         restarted = self._last_stamp_ns is not None and stamp < self._last_stamp_ns
         self._last_stamp_ns = stamp
         elapsed = self._freshness.elapsed(stamp)
         if restarted:
-            self._track.clear()
+            self._forget_reference()
 
         finite = measured.is_finite()
         speeds = _array(wheels_from_body(measured.twist, self.settings.geometry))
@@ -142,21 +159,30 @@ class Controller:
         if reason.moves and restarted:
             reason = Reason.ODOMETRY_RESTARTED
         if not reason.moves or point is None:
-            self._stop(speeds if finite else np.zeros(2))
+            self._stop()
             self.status = self._status(stamp, reason, error)
             return STANDSTILL, self.status
 
-        if elapsed is None or not self._moving:
-            self._start(speeds)
-            elapsed = 1.0 / self.settings.rate
-        rate = _array(wheels_from_body(point.rate, self.settings.geometry))
-        command = self.law.step(speeds, wanted, rate, elapsed)
-        applied = _array(
-            self._command.step(WheelSpeeds(*map(float, command)), 1.0 / self.settings.rate)
+        fresh = elapsed is None or not self._moving
+        if fresh:
+            self._drive.reset(speeds)
+        self._drive.observe(speeds, elapsed or self._period)
+        acts_ns = stamp + round(self._drive.dead_time * NANOSECONDS)
+        begin, end = self._coming(stamp, acts_ns, point)
+        if fresh:
+            self._pursuit.begin(acts_ns, self._drive.ahead, begin)
+            self._moving = True
+            self._told.clear()
+            known_ns = acts_ns if self.settings.switches.preview else stamp
+            self._jumps = [jump for jump in self._jumps if jump.stamp_ns > known_ns]
+        self._announce(stamp, acts_ns)
+        command = self._pursuit.step(
+            acts_ns, self._drive.ahead, begin, end, elapsed or self._period
         )
-        self.law.applied(applied, _array(self._command.wheels), limited=self._command.limited)
-        self.status = self._status(stamp, reason, self.law.speeds - wanted, applied)
-        return self._command.twist, self.status
+        applied = self._drive.send(command).copy()
+        self._pursuit.applied(applied, limited=self._drive.limited)
+        self.status = self._status(stamp, reason, self._drive.speeds - wanted, applied)
+        return self._drive.twist, self.status
 
     def silent(self, last_heard_ns: int | None, now_ns: int) -> bool:
         """Whether the odometry has gone silent, so that a stop must be commanded.
@@ -166,7 +192,7 @@ class Controller:
         """
         if not self._freshness.silent(last_heard_ns, now_ns):
             return False
-        self._stop(np.zeros(2))
+        self._stop()
         self.status = self._status(
             self._last_stamp_ns or 0, Reason.NO_ODOMETRY, np.full(2, math.nan)
         )
@@ -182,15 +208,54 @@ class Controller:
             return self._track.at(newest)
         return self._track.at(stamp_ns)
 
-    def _start(self, speeds: Array) -> None:
-        self.law.reset(speeds)
-        self._command.reset(WheelSpeeds(*map(float, speeds)))
-        self._moving = True
+    def _coming(self, stamp_ns: int, acts_ns: int, point: TrackPoint) -> tuple[Array, Array]:
+        """Return the wheel reference when the command begins to act, and a period later."""
+        geometry = self.settings.geometry
+        if self.settings.switches.preview:
+            end_ns = acts_ns + round(self._period * NANOSECONDS)
+            begin, end = self._wanted(acts_ns), self._wanted(end_ns)
+            if begin is not None and end is not None:
+                return (
+                    _array(wheels_from_body(begin.twist, geometry)),
+                    _array(wheels_from_body(end.twist, geometry)),
+                )
+        now = _array(wheels_from_body(point.twist, geometry))
+        slope = _array(wheels_from_body(point.rate, geometry))
+        ahead = (acts_ns - stamp_ns) / NANOSECONDS
+        return now + ahead * slope, now + (ahead + self._period) * slope
 
-    def _stop(self, speeds: Array) -> None:
-        if self._moving or np.any(self._command.wheels):
-            self.law.reset(speeds)
-            self._command.reset(WheelSpeeds(0.0, 0.0))
+    def _announce(self, stamp_ns: int, acts_ns: int) -> None:
+        """Tell the plan of jumps: when they are seen, or before if that is wanted."""
+        newest = self._track.newest_ns or 0
+        preview, geometry = self.settings.switches.preview, self.settings.geometry
+        soon_ns = acts_ns + round(self._period * NANOSECONDS) if preview else stamp_ns
+        for jump in self._jumps:
+            # Beforehand, wait for the sample after it: then the slope after it is known too.
+            known = jump.stamp_ns <= soon_ns or (preview and newest > jump.stamp_ns)
+            if known and jump.stamp_ns not in self._told:
+                self._told.add(jump.stamp_ns)
+                after = self._track.at(jump.stamp_ns)
+                slope = BodyTwist(0.0, 0.0) if after is None else after.rate
+                self._pursuit.plan.announce(
+                    jump.stamp_ns,
+                    _array(wheels_from_body(jump.change, geometry)),
+                    _array(wheels_from_body(slope, geometry)),
+                )
+        self._jumps = [
+            jump
+            for jump in self._jumps
+            if jump.stamp_ns > acts_ns or jump.stamp_ns not in self._told
+        ]
+        self._told.intersection_update(jump.stamp_ns for jump in self._jumps)
+
+    def _forget_reference(self) -> None:
+        self._track.clear()
+        self._jumps.clear()
+
+    def _stop(self) -> None:
+        if self._moving or np.any(self._drive.command):
+            self._pursuit.reset()
+            self._drive.reset(np.zeros(2))
         self._moving = False
 
     def _status(
@@ -207,7 +272,7 @@ class Controller:
             np.zeros(2) if applied is None else applied,
             law.reading,
             law.predictive.skill.copy(),
-            self._command.limited if moves else False,
+            self._drive.limited if moves else False,
         )
 
 

@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """A state estimate in front of the law: a Kalman filter that knows what was commanded."""
 
-from collections import deque
 from dataclasses import dataclass
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.kernels import kernel
 from t3mpc_ros.settings import Settings, setting
 
 Array = NDArray[np.float64]
@@ -42,6 +42,60 @@ class EstimateSettings(Settings):
     )
 
 
+@kernel
+def follow(
+    speeds: Array, command: Array, unexplained: Array, decay: float, lag: float, out: Array
+) -> None:
+    """Write the speeds (rad/s) that a lagging servo reaches, (2,): exact for constant inputs.
+
+    chi' = (command - chi)/lag + unexplained, over a time t with decay = exp(-t/lag).
+    """
+    for i in range(speeds.size):
+        goal = command[i] + lag * unexplained[i]
+        out[i] = goal + decay * (speeds[i] - goal)
+
+
+@kernel
+def follow_late(
+    speeds: Array,
+    commands: Array,
+    row: int,
+    late: float,
+    unexplained: Array,
+    lag: float,
+    dt: float,
+    out: Array,
+) -> None:
+    """Write the speeds after ``dt`` s, the command changing from a row to the next in between.
+
+    late : share of ``dt`` for which the older command, ``commands[row]``, still acts
+    """
+    follow(speeds, commands[row], unexplained, math.exp(-late * dt / lag), lag, out)
+    follow(out, commands[row + 1], unexplained, math.exp(-(1.0 - late) * dt / lag), lag, out)
+
+
+@kernel
+def look_ahead(
+    speeds: Array,
+    commands: Array,
+    unexplained: Array,
+    late: float,
+    lag: float,
+    period: float,
+    out: Array,
+) -> None:
+    """Write the speeds (rad/s) when a command sent now begins to act, shape (2,).
+
+    commands : shape (n + 2, 2), newest last, rad/s; n whole periods of dead time
+    late     : what the dead time has beyond them, as a share of a period
+    """
+    out[:] = speeds
+    whole = commands.shape[0] - 2
+    for j in range(whole):
+        follow_late(out, commands, j + 1, late, unexplained, lag, period, out)
+    follow(out, commands[whole + 1], unexplained, math.exp(-late * period / lag), lag, out)
+
+
 class SpeedEstimator:
     """Estimates each wheel's speed and the acceleration that the model does not explain.
 
@@ -66,25 +120,35 @@ class SpeedEstimator:
             raise ValueError(f"drive must be 'velocity' or 'torque': got {drive!r}")
         self._settings = settings
         self._velocity = drive == 'velocity'
+        self._period = period
         self._gain = stationary_gain(self._transition(period), settings, period)
-        steps, self._fraction = divmod(settings.dead_time / period, 1.0)
-        self._commands: deque[Array] = deque(maxlen=int(steps) + 2)
-        self.reset(np.zeros(2))
+        # Rounded, or a dead time of exactly one period may count as 0.999... periods.
+        periods = round(settings.dead_time / period, 9)
+        self._late = periods % 1.0
+        self._commands: Array = np.zeros((int(periods) + 2, 2))
+        self.speeds: Array = np.zeros(2)
+        """Estimated wheel speeds, rad/s, shape (2,)."""
+        self.unexplained: Array = np.zeros(2)
+        """Estimated acceleration that the model does not explain, rad/s², shape (2,)."""
+        self.ahead: Array = np.zeros(2)
+        """Estimated wheel speeds when what is commanded now begins to act, rad/s, (2,)."""
 
     @property
     def gain(self) -> Array:
         """Stationary Kalman gain: share of the innovation given to chi (1) and to d (1/s)."""
         return self._gain
 
+    @property
+    def dead_time(self) -> float:
+        """Time before a command acts, s; none with a torque drive."""
+        return self._settings.dead_time if self._velocity else 0.0
+
     def reset(self, speeds: Array) -> None:
         """Start again from measured wheel speeds (rad/s), at rest relative to the command."""
-        self.speeds: Array = speeds.copy()
-        """Estimated wheel speeds, rad/s, shape (2,)."""
-        self.unexplained: Array = np.zeros_like(speeds)
-        """Estimated acceleration that the model does not explain, rad/s², shape (2,)."""
-        self._commands.clear()
-        for _ in range(self._commands.maxlen or 1):
-            self._commands.append(speeds.copy())
+        self.speeds[:] = speeds
+        self.unexplained[:] = 0.0
+        self._commands[:] = speeds
+        self.ahead[:] = speeds
 
     def predict(self, applied: Array, dt: float) -> None:
         """Move ``dt`` seconds on, under what was applied meanwhile.
@@ -98,26 +162,40 @@ class SpeedEstimator:
             Seconds since the last step.
         """
         if self._velocity:
-            self._commands.append(applied.copy())
-            late = self._fraction
-            effective = (1.0 - late) * self._commands[1] + late * self._commands[0]
-            decay = math.exp(-dt / self._settings.lag)
-            self.speeds = (
-                decay * self.speeds
-                + (1.0 - decay) * effective
-                + self._settings.lag * (1.0 - decay) * self.unexplained
+            self._commands[:-1] = self._commands[1:]
+            self._commands[-1] = applied
+            follow_late(
+                self.speeds,
+                self._commands,
+                0,
+                self._late,
+                self.unexplained,
+                self._settings.lag,
+                dt,
+                self.speeds,
             )
         else:
-            self.speeds = self.speeds + dt * (applied + self.unexplained)
+            self.speeds += dt * (applied + self.unexplained)
 
     def correct(self, measured: Array) -> Array:
         """Return the estimate after seeing measured wheel speeds (rad/s), shape (2,)."""
-        if not self._settings.enabled:
-            self.speeds = measured.copy()
-            return self.speeds
-        innovation = measured - self.speeds
-        self.speeds = self.speeds + self._gain[0] * innovation
-        self.unexplained = self.unexplained + self._gain[1] * innovation
+        if self._settings.enabled:
+            innovation = measured - self.speeds
+            self.speeds += self._gain[0] * innovation
+            self.unexplained += self._gain[1] * innovation
+        else:
+            self.speeds[:] = measured
+        self.ahead[:] = self.speeds
+        if self._velocity:
+            look_ahead(
+                self.speeds,
+                self._commands,
+                self.unexplained,
+                self._late,
+                self._settings.lag,
+                self._period,
+                self.ahead,
+            )
         return self.speeds
 
     def _transition(self, period: float) -> Array:

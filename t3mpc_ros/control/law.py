@@ -25,8 +25,9 @@ class LawSettings(Settings):
     """Gains of the law and of the compensator."""
 
     gain: float = setting(
-        8.0,
-        'feedback K on the tracking error (66)-(67)',
+        39.3,
+        'feedback K on the tracking error (66)-(67); with the velocity drive (1 - exp(-T/lag))/T, '
+        '39.3 by default, lets the servo do the feedback, and no measured noise reach the command',
         unit='1/s',
         low=0.1,
         high=100.0,

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from t3mpc_ros.fuzzy.adaptation import AdaptationSettings
 from t3mpc_ros.fuzzy.estimator import FuzzyEstimator, gamma_for
 from t3mpc_ros.fuzzy.sets import FuzzySettings
-from t3mpc_ros.lab.ablation import interval, mean, paper_settings
+from t3mpc_ros.lab.trial.statistics import interval, mean
 from t3mpc_ros.robot.dynamics import wheel_inertia
 from t3mpc_ros.robot.simulated import SimulatedRobot, SimulatedRobotSettings
 
@@ -103,6 +103,16 @@ def excitation(time: Array, seed: int) -> Array:
     angles = time[:, np.newaxis, np.newaxis] * rates + phases
     push: Array = np.sum(2.0 * rates * np.cos(angles), axis=-1)
     return push
+
+
+def torque_robot(variance: float, seed: int) -> SimulatedRobotSettings:
+    """Return the robot of the paper's simulation: torque drive, noise of this variance.
+
+    Friction and disturbance are the robot's defaults: the paper folds them into the unknown part.
+    """
+    return SimulatedRobotSettings.from_flat(
+        {'drive.kind': 'torque', 'noise.variance': variance, 'seed': seed}
+    )
 
 
 def drive(settings: SimulatedRobotSettings, duration: float, seed: int) -> OpenLoopRun:
@@ -216,7 +226,7 @@ def compare(
             progress(f'noise variance {variance:g}, {seeds} seeds')
         figures: dict[str, list[tuple[float, float]]] = {name: [] for name in (*KINDS, NOTHING)}
         for seed in range(1, seeds + 1):
-            run = drive(paper_settings(variance, seed)[1], duration, seed)
+            run = drive(torque_robot(variance, seed), duration, seed)
             first = round(SETTLE / run.period)
             for name, found in figures.items():
                 fuzzy = None if name == NOTHING else estimator(name, variance, normalised_gain)

@@ -43,20 +43,6 @@ def _report(options: argparse.Namespace) -> int:
     return 0
 
 
-def _ablation(options: argparse.Namespace) -> int:
-    from t3mpc_ros.lab.ablation import paper_setting, table
-
-    results = paper_setting(
-        seeds=options.seeds,
-        duration=options.duration,
-        noise_variance=options.noise,
-        drive=options.drive,
-        progress=True,
-    )
-    print(table(results))
-    return _keep([result.record() for result in results], options.json)
-
-
 def _estimation(options: argparse.Namespace) -> int:
     from t3mpc_ros.lab.estimation import compare, table
 
@@ -88,9 +74,17 @@ def _exponents(options: argparse.Namespace) -> int:
 
 
 def _warm(options: argparse.Namespace) -> int:
-    from t3mpc_ros.lab.ablation import warm_up
+    from t3mpc_ros.control.controller import Controller, ControllerSettings
+    from t3mpc_ros.lab.rivals.composed import Composed, ComposedSettings
+    from t3mpc_ros.lab.trial.loop import MethodSpec, run
+    from t3mpc_ros.lab.trial.scenario import DRIVES, Scenario
+    from t3mpc_ros.robot.simulated import SimulatedRobot, SimulatedRobotSettings
 
-    warm_up()
+    for drive in DRIVES:
+        spec = MethodSpec('full', Composed, ComposedSettings())
+        run(Scenario(drive, 0.04, 'nominal', 1, 1.0), spec)
+    Controller(ControllerSettings()).warm_up()
+    SimulatedRobot(SimulatedRobotSettings()).warm_up()
     return 0
 
 
@@ -110,18 +104,6 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument('bag', type=Path, help='folder of the bag')
     report.add_argument('--output', type=Path, help='folder for the report (default: beside it)')
     report.set_defaults(run=_report)
-
-    ablation = commands.add_parser(
-        'ablation', help="the paper's setting, with and without each part of the controller"
-    )
-    ablation.add_argument('--seeds', type=_count, default=5, help='runs each (default 5)')
-    ablation.add_argument('--duration', type=_seconds, default=60.0, help='seconds (default 60)')
-    ablation.add_argument('--noise', type=float, default=0.04, help='variance (default 0.04)')
-    ablation.add_argument(
-        '--drive', choices=('torque', 'velocity'), default='torque', help='(default torque)'
-    )
-    ablation.add_argument('--json', type=Path, help='also write the numbers to this file')
-    ablation.set_defaults(run=_ablation)
 
     estimation = commands.add_parser(
         'estimation', help='the kinds of fuzzy systems as estimators, without a controller (86)'

@@ -18,6 +18,16 @@ class TrackPoint:
     """Time derivative of the twist (m/s², rad/s²); a switch counts as rate zero."""
 
 
+@dataclass(frozen=True, slots=True)
+class Jump:
+    """A sudden change of what is wanted."""
+
+    stamp_ns: int
+    """First instant of the new motion."""
+    change: BodyTwist
+    """New twist minus the old one carried on by its slope."""
+
+
 class Track:
     """Interpolates a wanted motion between stamped samples, and sees its jumps.
 
@@ -37,11 +47,13 @@ class Track:
         self._jump = jump
         self._samples: deque[Motion] = deque(maxlen=capacity)
         self._stamps: deque[int] = deque(maxlen=capacity)
+        self._jumps: deque[Jump] = deque(maxlen=capacity)
 
     def clear(self) -> None:
         """Forget every sample."""
         self._samples.clear()
         self._stamps.clear()
+        self._jumps.clear()
 
     def add(self, sample: Motion) -> bool:
         """Keep ``sample``; return False, and keep nothing, when it is not finite.
@@ -54,9 +66,44 @@ class Track:
         while self._stamps and self._stamps[-1] >= sample.stamp_ns:
             self._stamps.pop()
             self._samples.pop()
+        while self._jumps and self._jumps[-1].stamp_ns >= sample.stamp_ns:
+            self._jumps.pop()
         self._stamps.append(sample.stamp_ns)
         self._samples.append(sample)
+        self._note_jump()
         return True
+
+    def take_jumps(self) -> list[Jump]:
+        """Return the jumps added since the last call, oldest first."""
+        jumps = list(self._jumps)
+        self._jumps.clear()
+        return jumps
+
+    def _note_jump(self) -> None:
+        """Remember it when the last sample lies a jump away from the one before."""
+        last = len(self._samples) - 1
+        if last < 1 or not self._sudden(rate := self._rate(last)):
+            return
+        span = (self._stamps[-1] - self._stamps[-2]) / NANOSECONDS
+        slope = BodyTwist(0.0, 0.0)
+        if last > 1 and not self._sudden(before := self._rate(last - 1)):
+            slope = before
+        change = BodyTwist(
+            span * (rate.linear - slope.linear), span * (rate.angular - slope.angular)
+        )
+        self._jumps.append(Jump(self._stamps[-1], change))
+
+    def _rate(self, index: int) -> BodyTwist:
+        """Return the rate of change from the sample before ``index`` to it."""
+        before, after = self._samples[index - 1], self._samples[index]
+        span = (after.stamp_ns - before.stamp_ns) / NANOSECONDS
+        return BodyTwist(
+            (after.twist.linear - before.twist.linear) / span,
+            (after.twist.angular - before.twist.angular) / span,
+        )
+
+    def _sudden(self, rate: BodyTwist) -> bool:
+        return abs(rate.linear) > self._jump.linear or abs(rate.angular) > self._jump.angular
 
     @property
     def newest_ns(self) -> int | None:
@@ -73,13 +120,8 @@ class Track:
         index = bisect_right(self._stamps, now_ns)
         if index == len(self._stamps):
             return TrackPoint(self._samples[-1].twist, BodyTwist(0.0, 0.0))
-        before, after = self._samples[index - 1], self._samples[index]
-        span = (after.stamp_ns - before.stamp_ns) / NANOSECONDS
-        rate = BodyTwist(
-            (after.twist.linear - before.twist.linear) / span,
-            (after.twist.angular - before.twist.angular) / span,
-        )
-        if abs(rate.linear) > self._jump.linear or abs(rate.angular) > self._jump.angular:
+        before, rate = self._samples[index - 1], self._rate(index)
+        if self._sudden(rate):
             return TrackPoint(before.twist, BodyTwist(0.0, 0.0))
         elapsed = (now_ns - before.stamp_ns) / NANOSECONDS
         twist = BodyTwist(

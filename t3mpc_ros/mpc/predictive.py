@@ -9,34 +9,18 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.kernels import kernel
 from t3mpc_ros.mpc.active_set import OPTIMAL
 from t3mpc_ros.mpc.machine import Shape, begin, make_machine
 from t3mpc_ros.mpc.program import make_space
 from t3mpc_ros.mpc.response import foresee, plan
 from t3mpc_ros.mpc.settings import PredictiveSettings
-from t3mpc_ros.mpc.skill import Learning, Predictor, fade, observe, skill
+from t3mpc_ros.mpc.skill import Learning, Predictor, fade, gather, observe, skill
 from t3mpc_ros.mpc.training import Timing, excite, nominal_step, split_runs
 from t3mpc_ros.settings import SettingError
 
 __all__ = ['PredictiveSettings', 'PredictiveTerm']
 
 Array = NDArray[np.float64]
-
-
-@kernel
-def gather(
-    errors: Array, jumps: Array, applied: Array, sampled: bool, sums: Array, applied_sums: Array
-) -> bool:
-    """Add a control period to the sums of a sample; return False if an error is not finite."""
-    for z in range(errors.size):
-        if not math.isfinite(errors[z]):
-            return False
-    for z in range(errors.size):
-        applied_sums[z] += applied[z]
-        if sampled:
-            sums[z] += errors[z] - jumps[z]
-    return True
 
 
 class PredictiveTerm:
@@ -319,6 +303,16 @@ class PredictiveTerm:
         self._jumps *= self._decay
         self._applied[:] = self._v
         return self._v.copy()
+
+    @property
+    def known_error(self) -> Array:
+        """What is left of the jumps told by :meth:`shift`, rad/s, shape (outputs,)."""
+        return self._jumps
+
+    @property
+    def span(self) -> float:
+        """Predictive period T, s."""
+        return self._timing.span
 
     @property
     def due(self) -> bool:

@@ -3,6 +3,7 @@
 """How well the machine predicts while it runs, and how much of v_p that is worth."""
 
 from collections.abc import Mapping
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -41,6 +42,21 @@ class Learning(NamedTuple):
     """Share of the latest miss that the offset e takes in."""
     noise: float
     """Standard deviation of an error that is mere noise (rad/s)."""
+
+
+@kernel
+def gather(
+    errors: Array, jumps: Array, applied: Array, sampled: bool, sums: Array, applied_sums: Array
+) -> bool:
+    """Add a control period to the sums of a sample; return False if an error is not finite."""
+    for z in range(errors.size):
+        if not math.isfinite(errors[z]):
+            return False
+    for z in range(errors.size):
+        applied_sums[z] += applied[z]
+        if sampled:
+            sums[z] += errors[z] - jumps[z]
+    return True
 
 
 @kernel

@@ -16,7 +16,7 @@ class ReferenceNodeSettings(ReferenceSettings):
     """The reference generator as a node."""
 
     lead: float = setting(
-        0.2,
+        0.4,
         'how far ahead of now the reference is stamped, so that its value now never depends on '
         'when a message arrives',
         unit='s',

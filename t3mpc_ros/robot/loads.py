@@ -150,6 +150,20 @@ class Disturbance:
         for wheel in (0, 1):
             self.walk[wheel] = reflect(float(self.walk[wheel] + step * self._drawn[wheel]))
 
+    def draw_ahead(self, dt: float, count: int) -> Array:
+        """Return the walks after each of ``count`` draws in turn, shape (count, 2).
+
+        The numbers are those that as many calls of :meth:`draw` would leave, one after the other.
+        """
+        walks: Array = np.empty((count, 2))
+        step = self.settings.walk_rate * math.sqrt(dt)
+        right, left = self.walk.tolist()
+        for row, drawn in enumerate((step * self._generator.standard_normal((count, 2))).tolist()):
+            right, left = reflect(right + drawn[0]), reflect(left + drawn[1])
+            walks[row] = right, left
+        self.walk[:] = right, left
+        return walks
+
     def torque(self, time: float) -> tuple[float, float]:
         """Return the torques (N m) on the right and left wheel at ``time`` (s)."""
         load = self.load
@@ -157,6 +171,12 @@ class Disturbance:
             disturbance_torque(0, time, load, self.angular, self.phases, self.walk),
             disturbance_torque(1, time, load, self.angular, self.phases, self.walk),
         )
+
+
+def generators(seed: int) -> tuple[np.random.Generator, np.random.Generator]:
+    """Return the random numbers of one robot: those of its disturbance, those of its noise."""
+    for_disturbance, for_noise = np.random.SeedSequence(seed).spawn(2)
+    return np.random.default_rng(for_disturbance), np.random.default_rng(for_noise)
 
 
 def reflect(value: float) -> float:
@@ -179,3 +199,10 @@ class SpeedNoise:
         spread = math.sqrt(self.settings.variance)
         right, left = self._drawn.tolist()
         return WheelSpeeds(wheels.right + spread * right, wheels.left + spread * left)
+
+    def draw_ahead(self, count: int) -> Array:
+        """Return what the next ``count`` measurements would add, rad/s, shape (count, 2)."""
+        noise: Array = math.sqrt(self.settings.variance) * self._generator.standard_normal(
+            (count, 2)
+        )
+        return noise

@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 import math
 
-import numpy as np
-
 from t3mpc_ros.motion import Geometry, Motion, Pose, WheelSpeeds
 from t3mpc_ros.motion.kinematics import body_from_wheels
 from t3mpc_ros.motion.words import NANOSECONDS
@@ -31,6 +29,7 @@ from t3mpc_ros.robot.loads import (
     FrictionSettings,
     NoiseSettings,
     SpeedNoise,
+    generators,
 )
 from t3mpc_ros.robot.odometry import DeadReckoning, OdometrySettings
 from t3mpc_ros.settings import SettingError, Settings, nested, setting
@@ -136,9 +135,7 @@ class SimulatedRobot(RobotBackend):
 
     def __init__(self, settings: SimulatedRobotSettings) -> None:
         self._settings = settings
-        for_disturbance, for_noise = map(
-            np.random.default_rng, np.random.SeedSequence(settings.seed).spawn(2)
-        )
+        for_disturbance, for_noise = generators(settings.seed)
         self._guard = CommandGuard(settings.guard, settings.geometry)
         self._odometry = DeadReckoning(settings.odometry, settings.geometry)
         self._disturbance = Disturbance(settings.disturbance, for_disturbance)

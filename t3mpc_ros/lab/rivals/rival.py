@@ -99,5 +99,5 @@ class Rival(ABC):
     def step(self, view: View) -> Array:
         """Return u, the wanted wheel accelerations, rad/s², shape (2,)."""
 
-    def applied(self, acceleration: Array, *, limited: bool) -> None:
+    def applied(self, acceleration: Array, *, limited: bool) -> None:  # noqa: B027
         """Take note of the u that the drive's limits let through (anti-windup)."""

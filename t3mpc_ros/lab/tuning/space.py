@@ -1,0 +1,204 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+r"""Which settings of a method are tuned, between which bounds, and how a search sees them.
+
+A search works in the unit cube. A setting x in [a, b] and its coordinate p in [0, 1] are
+
+.. math:: x = a\,(b/a)^p \quad\text{(logarithmic)}, \qquad x = a + p\,(b - a) \quad\text{(linear)}
+
+so that equal steps are equal factors for gains and weights, whose size is what is unknown. A
+whole number has a cell of its own around each value: a and b are moved out by one half.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+import difflib
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from t3mpc_ros.settings import Row, SettingError, Settings
+
+Array = NDArray[np.float64]
+Values = dict[str, int | float]
+"""Tuned settings by their dotted names."""
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """Where one setting is searched.
+
+    Parameters
+    ----------
+    name
+        Dotted name of a setting that holds a number.
+    low, high
+        Bounds, both included, in the setting's own unit.
+    log
+        Whether equal steps are equal factors; ``low`` must then be above 0.
+
+    Raises
+    ------
+    SettingError
+        Bounds that are not finite, not in order, or not above 0 where they must be.
+    """
+
+    name: str
+    low: float
+    high: float
+    log: bool = True
+
+    def __post_init__(self) -> None:
+        for bound in (self.low, self.high):
+            if not math.isfinite(bound):
+                raise SettingError(f'{self.name}: bounds of a range must be finite: got {bound}')
+        if not self.low < self.high:
+            raise SettingError(
+                f'{self.name}: a range must end above its begin: got {self.low:g} to {self.high:g}'
+            )
+        if self.log and not self.low > 0.0:
+            raise SettingError(
+                f'{self.name}: a logarithmic range must begin above 0: got {self.low:g}'
+            )
+
+
+class Space:
+    """The tuned settings of one table, as the unit cube.
+
+    Parameters
+    ----------
+    table
+        The table that the settings belong to.
+    ranges
+        What is tuned, at least one; their order is that of the coordinates.
+
+    Raises
+    ------
+    SettingError
+        No range at all, a name twice, a name that the table does not have, a setting that is
+        not a number, or a range that goes beyond the setting's own bounds.
+    """
+
+    def __init__(self, table: type[Settings], ranges: Sequence[Range]) -> None:
+        if not ranges:
+            raise SettingError(f'{table.__name__}: at least one setting must be tuned')
+        known = {row.name: row for row in table.rows()}
+        self.table = table
+        self.ranges = tuple(ranges)
+        self._whole: list[bool] = []
+        seen: set[str] = set()
+        for each in self.ranges:
+            if each.name in seen:
+                raise SettingError(f'{each.name} must be tuned once: it has two ranges')
+            seen.add(each.name)
+            self._whole.append(_check(each, _row(each.name, known, table)))
+        self._ends = [_ends(*pair) for pair in zip(self.ranges, self._whole, strict=True)]
+
+    def __len__(self) -> int:
+        return len(self.ranges)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the tuned settings, in the order of the coordinates."""
+        return tuple(each.name for each in self.ranges)
+
+    def values(self, point: ArrayLike) -> Values:
+        """Return the settings at a point of the unit cube, exactly within their ranges.
+
+        Raises
+        ------
+        ValueError
+            The point has another number of coordinates, or one outside 0 to 1.
+        """
+        where = np.asarray(point, dtype=np.float64)
+        if where.shape != (len(self),):
+            raise ValueError(f'point must have shape ({len(self)},): got {where.shape}')
+        if not ((where >= 0.0) & (where <= 1.0)).all():
+            raise ValueError(f'point must lie in the unit cube: got {where}')
+        result: Values = {}
+        for each, whole, (low, high), p in zip(
+            self.ranges, self._whole, self._ends, where.tolist(), strict=True
+        ):
+            x = low + p * (high - low)
+            if each.log:
+                x = math.exp(x)
+            # Rounding may leave the last digit of an end outside.
+            x = min(max(x, each.low), each.high)
+            result[each.name] = round(x) if whole else x
+        return result
+
+    def point(self, values: Mapping[str, object]) -> Array:
+        """Return the point of the unit cube that stands for ``values``, shape (n,).
+
+        Names that are not tuned are passed over, so a whole flat table may be given.
+
+        Raises
+        ------
+        SettingError
+            A tuned setting is missing, not a number, or outside its range.
+        """
+        result = np.empty(len(self))
+        for i, (each, (low, high)) in enumerate(zip(self.ranges, self._ends, strict=True)):
+            if each.name not in values:
+                raise SettingError(f'{each.name} is tuned, but has no value')
+            x = values[each.name]
+            if isinstance(x, bool) or not isinstance(x, int | float):
+                raise SettingError(f'{each.name} must be a number: got {x!r}')
+            if not each.low <= x <= each.high:
+                raise SettingError(
+                    f'{each.name} must be in its range from {each.low:g} to {each.high:g}: '
+                    f'got {x:g}'
+                )
+            p = ((math.log(x) if each.log else x) - low) / (high - low)
+            result[i] = min(max(p, 0.0), 1.0)
+        return result
+
+    def of(self, settings: Settings) -> Values:
+        """Return the tuned settings of a table as they are, checked to be in their ranges.
+
+        Raises
+        ------
+        SettingError
+            Another table, or a setting outside its range.
+        """
+        if not isinstance(settings, self.table):
+            raise SettingError(
+                f'settings must be {self.table.__name__}: got {type(settings).__name__}'
+            )
+        flat = settings.flat()
+        self.point(flat)
+        return {name: flat[name] for name in self.names}  # type: ignore[misc]
+
+    def describe(self) -> list[dict[str, object]]:
+        """Return the ranges as plain data: two searches are of one space when it is equal."""
+        return [
+            {'name': each.name, 'low': float(each.low), 'high': float(each.high), 'log': each.log}
+            for each in self.ranges
+        ]
+
+
+def _row(name: str, known: Mapping[str, Row], table: type[Settings]) -> Row:
+    if name not in known:
+        near = difflib.get_close_matches(name, known, n=1)
+        hint = f'; did you mean {near[0]}?' if near else ''
+        raise SettingError(f'{table.__name__} has no setting {name}{hint}')
+    return known[name]
+
+
+def _check(each: Range, row: Row) -> bool:
+    """Return whether the setting is a whole number, or raise why it cannot be tuned so."""
+    if row.many or row.kind not in (int, float) or row.choices:
+        kind = f'a list of {row.kind.__name__}' if row.many else row.kind.__name__
+        raise SettingError(f'{each.name} cannot be tuned: it must be one number, and is {kind}')
+    for bound in (each.low, each.high):
+        if row.kind is int and bound == int(bound):
+            bound = int(bound)
+        row.check(bound)
+    return row.kind is int
+
+
+def _ends(each: Range, whole: bool) -> tuple[float, float]:
+    """Return what p = 0 and p = 1 stand for, before exp where the range is logarithmic."""
+    low, high = (each.low - 0.5, each.high + 0.5) if whole else (each.low, each.high)
+    return (math.log(low), math.log(high)) if each.log else (float(low), float(high))

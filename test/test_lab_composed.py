@@ -1,0 +1,120 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Our controller in the offline loop: the same as the node's, and better with each part."""
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.control.controller import Controller, ControllerSettings
+from t3mpc_ros.lab.rivals.composed import Composed, ComposedSettings
+from t3mpc_ros.lab.trial.loop import MethodSpec, run
+from t3mpc_ros.lab.trial.scenario import RATE, Scenario
+from t3mpc_ros.lab.trial.statistics import paired
+from t3mpc_ros.motion import Motion, WheelSpeeds
+from t3mpc_ros.motion.kinematics import body_from_wheels, wheels_from_body
+from t3mpc_ros.motion.words import ORIGIN
+from t3mpc_ros.robot.simulated import SimulatedRobot
+
+NS = 10_000_000
+
+
+def _spec(**changes):
+    return MethodSpec('full', Composed, ComposedSettings.from_flat(changes))
+
+
+def _as_the_nodes_close_it(scenario):
+    """Return the wheel speeds of the loop of stamped motions in and limited twists out."""
+    robot = SimulatedRobot(scenario.robot())
+    geometry = scenario.robot().geometry
+    controller = Controller(
+        ControllerSettings.from_flat({'estimate.noise_variance': scenario.noise})
+    )
+    controller.warm_up()
+    wanted = scenario.reference().wanted
+    lead = round(scenario.lead * RATE)
+
+    def tell(k):
+        twist = body_from_wheels(WheelSpeeds(*wanted[k].tolist()), geometry)
+        controller.add_reference(Motion(k * NS, ORIGIN, twist))
+
+    for k in range(lead):
+        tell(k)
+    state = robot.advance(0)
+    speeds = []
+    for k in range(scenario.steps):
+        tell(k + lead)
+        twist, status = controller.step(state.odometry)
+        assert status.reason.moves
+        speeds.append(state.true_wheels)
+        state = robot.step(wheels_from_body(twist, geometry))
+    return np.array(speeds)
+
+
+@pytest.mark.parametrize('noise', [0.0, 0.04])
+def test_the_offline_loop_is_the_loop_of_the_nodes(noise):
+    """What the lab reports of the full controller is what the node does, jump for jump."""
+    scenario = Scenario('velocity', noise, 'nominal', 2, 30.0)
+    record = run(scenario, _spec(**{'estimate.noise_variance': noise}))
+    assert np.abs(np.diff(record.wanted, axis=0)).max() > 2.0  # there is a real jump in it
+    np.testing.assert_allclose(record.speeds, _as_the_nodes_close_it(scenario), atol=1e-6)
+
+
+SEEDS = (1, 2, 3, 4, 5)
+
+
+def _errors(drive, noise, case='nominal', **changes):
+    given = {'estimate.noise_variance': noise}
+    if drive == 'torque':
+        given |= {'law.gain': 8.0, 'switches.acceleration': 100.0}
+    return [
+        run(Scenario(drive, noise, case, seed, 30.0), _spec(**(given | changes))).rmse()
+        for seed in SEEDS
+    ]
+
+
+PARTS = {
+    'NT3FS': {'use_fuzzy': False},
+    'compensator': {'law.compensator': False},
+    'MPC': {'predictive.enabled': False},
+    'preview': {'switches.preview': False},
+}
+
+
+@pytest.mark.parametrize('drive', ['torque', 'velocity'])
+@pytest.mark.parametrize('part', PARTS)
+def test_leaving_out_a_part_costs_accuracy_on_the_same_seeds(part, drive):
+    more = paired(_errors(drive, 0.0, **PARTS[part]), _errors(drive, 0.0))
+    assert more.mean > 0.0
+    assert more.certain
+
+
+def test_jumps_left_to_the_program_alone_cost_more_than_a_ramp():
+    """Psi_free knows the jump beforehand, but v_p is bounded and K works against it."""
+    more = paired(
+        _errors('velocity', 0.0, **{'switches.crossing': 'program'}), _errors('velocity', 0.0)
+    )
+    assert more.mean > 0.02
+    assert more.certain
+
+
+def test_a_random_predictor_has_no_skill_and_the_taught_one_has():
+    scenario = Scenario('velocity', 0.04, 'nominal', 101, 20.0)
+    skills = {}
+    for random in (False, True):
+        method = Composed(
+            ComposedSettings.from_flat(
+                {'random_predictor': random, 'predictive.learning': not random}
+            ),
+            scenario.knowledge(),
+        )
+        run(scenario, lambda _, method=method: method)
+        skills[random] = method.skill
+    assert skills[False].min() > 0.5
+    assert skills[True].max() < 0.0
+
+
+def test_the_same_seed_gives_the_same_run_bit_for_bit():
+    scenario = Scenario('torque', 0.04, 'nominal', 3, 5.0)
+    first, second = (run(scenario, _spec()) for _ in range(2))
+    np.testing.assert_array_equal(first.speeds, second.speeds)
+    np.testing.assert_array_equal(first.command, second.command)
