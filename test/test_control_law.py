@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The law (64)-(84): its sum, E12-E14, and the bound along simulated runs."""
 
+from functools import partial
 import math
 
 import numpy as np
@@ -29,6 +30,8 @@ from t3mpc_ros.robot.dynamics import (
     wheel_coriolis,
     wheel_inertia,
 )
+
+Sets = partial(FuzzySettings, sets=3, crowding=1.0)
 
 
 def _law(speeds, wanted, rate, estimate, predictive, gain=8.0, bound=2.0, smoothing=0.5):
@@ -94,7 +97,7 @@ def _matched_pair(rng, gamma=600.0):
     adaptation = AdaptationSettings(gamma=gamma, dead_zone=0.0, radius=1e4)
     pair = []
     for _ in range(2):
-        estimator = FuzzyEstimator(FuzzySettings(), adaptation)
+        estimator = FuzzyEstimator(Sets(), adaptation)
         estimator.coefficients = rng.uniform(-5.0, 5.0, estimator.coefficients.shape)
         pair.append(estimator)
     return pair
@@ -284,8 +287,8 @@ def test_e14_bound_holds_at_every_step_of_a_noise_free_run(seed):
     """
     rng = np.random.default_rng(seed)
     adaptation = AdaptationSettings(sigma_modification=0.0, dead_zone=0.0)
-    learner = FuzzyEstimator(FuzzySettings(), adaptation, outputs=2)
-    plant = FuzzyEstimator(FuzzySettings(), adaptation, outputs=2)
+    learner = FuzzyEstimator(Sets(), adaptation, outputs=2)
+    plant = FuzzyEstimator(Sets(), adaptation, outputs=2)
     plant.coefficients = rng.uniform(-3.0, 3.0, plant.coefficients.shape)
     gamma = adaptation.gamma
     law = LawSettings(gain=6.0, error_bound=2.0, smoothing=0.4)

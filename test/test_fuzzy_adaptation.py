@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Adaptation (77)-(78): the Lyapunov argument of the law and of each of its modifications."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.stats import norm
@@ -10,6 +12,8 @@ from t3mpc_ros.fuzzy.adaptation import AdaptationSettings, adapt, beyond_dead_zo
 from t3mpc_ros.fuzzy.estimator import FuzzyEstimator
 from t3mpc_ros.fuzzy.inference import basis_of
 from t3mpc_ros.fuzzy.sets import FuzzySettings, build_sets
+
+Sets = partial(FuzzySettings, sets=3, crowding=1.0)
 
 GAIN = 8.0
 """K, 1/s."""
@@ -20,7 +24,7 @@ PLAIN = {'radius': 1e12, 'leakage': 0.0, 'dead_zone': 0.0, 'step_limit': 1e9}
 
 def _bases(count, seed):
     rng = np.random.default_rng(seed)
-    sets = build_sets(FuzzySettings())
+    sets = build_sets(Sets())
     return np.array([basis_of(u, sets) for u in rng.uniform(-10.0, 10.0, (count, 2))])
 
 
@@ -30,8 +34,8 @@ def _matched_run(dt, settings, disturbance=0.0, duration=2.0):
     Returns delta, shape (steps, 2), and |alpha~|² over gamma, shape (steps,), before each step.
     """
     rng = np.random.default_rng(21)
-    learner = FuzzyEstimator(FuzzySettings(), settings)
-    plant = FuzzyEstimator(FuzzySettings(), settings)
+    learner = FuzzyEstimator(Sets(), settings)
+    plant = FuzzyEstimator(Sets(), settings)
     truth = rng.uniform(-15.0, 15.0, learner.coefficients.shape)
     plant.coefficients = truth
     chi = np.array([2.0, -1.0])

@@ -3,6 +3,7 @@
 """The estimator as the controller uses it: in a closed loop, and against wrong input."""
 
 import dataclasses
+from functools import partial
 import math
 
 import numpy as np
@@ -12,6 +13,8 @@ from t3mpc_ros.fuzzy.adaptation import AdaptationSettings
 from t3mpc_ros.fuzzy.estimator import FuzzyEstimator, gamma_for
 from t3mpc_ros.fuzzy.inference import basis_of
 from t3mpc_ros.fuzzy.sets import FuzzySettings, build_sets
+
+Sets = partial(FuzzySettings, sets=3, crowding=1.0)
 
 KINDS = ('type3', 'interval_type2', 'type1')
 GAIN, DT = 8.0, 0.01
@@ -69,7 +72,7 @@ def _rms(values):
 @pytest.mark.parametrize('kind', KINDS)
 def test_adaptation_lowers_the_tracking_error_and_the_estimate_nears_its_target(kind):
     """K = 8 1/s at 100 Hz, friction unknown: 0.79 rad/s RMS without adaptation, 0.21 with."""
-    sets = FuzzySettings(kind=kind)
+    sets = Sets(kind=kind)
     settings = AdaptationSettings(gamma=gamma_for(sets, 40.0))
     without, unknown = _closed_loop(sets, dataclasses.replace(settings, enabled=False))
     tracking, estimation = _closed_loop(sets, settings)
@@ -80,7 +83,7 @@ def test_adaptation_lowers_the_tracking_error_and_the_estimate_nears_its_target(
 
 @pytest.mark.parametrize('noise', [0.1, 0.2])
 def test_adaptation_still_helps_on_noisy_speeds(noise):
-    sets = FuzzySettings()
+    sets = Sets()
     without, _ = _closed_loop(sets, AdaptationSettings(enabled=False), noise=noise)
     tracking, _ = _closed_loop(sets, AdaptationSettings(), noise=noise)
     half = len(tracking) // 2
@@ -89,7 +92,7 @@ def test_adaptation_still_helps_on_noisy_speeds(noise):
 
 def test_a_target_of_the_same_family_is_learnt_under_excitation():
     """With a plant that some alpha* describes exactly, the estimate goes on improving."""
-    sets = FuzzySettings()
+    sets = Sets()
     plant = FuzzyEstimator(sets, AdaptationSettings())
     plant.coefficients = np.random.default_rng(31).uniform(-15.0, 15.0, plant.coefficients.shape)
     settings = AdaptationSettings(gamma=2000.0, dead_zone=0.0)
@@ -101,7 +104,7 @@ def test_a_target_of_the_same_family_is_learnt_under_excitation():
 
 def test_an_absurd_gamma_does_not_destabilise_the_sampled_loop():
     """Without the step limit the same gamma throws the coefficients from wall to wall."""
-    sets = FuzzySettings()
+    sets = Sets()
     limited = AdaptationSettings(gamma=1e6, radius=1e4)
     limits = (limited, dataclasses.replace(limited, step_limit=1000.0))
     safe, unsafe = (_rms(_closed_loop(sets, limit, duration=5.0)[0][100:]) for limit in limits)
@@ -110,19 +113,19 @@ def test_an_absurd_gamma_does_not_destabilise_the_sampled_loop():
 
 
 def test_outputs_share_one_basis_and_equal_alpha_times_phi():
-    estimator = FuzzyEstimator(FuzzySettings(), AdaptationSettings(), outputs=3)
+    estimator = FuzzyEstimator(Sets(), AdaptationSettings(), outputs=3)
     rng = np.random.default_rng(32)
     alpha = rng.normal(size=(3, 72))
     estimator.coefficients = alpha
     u = np.array([1.0, -4.0])
     g = estimator.evaluate(u)
     assert g.shape == (3,)
-    np.testing.assert_array_equal(estimator.basis, basis_of(u, build_sets(FuzzySettings())))
+    np.testing.assert_array_equal(estimator.basis, basis_of(u, build_sets(Sets())))
     np.testing.assert_allclose(g, alpha @ estimator.basis, rtol=1e-13)
 
 
 def test_adaptation_uses_the_basis_of_the_last_evaluation():
-    estimator = FuzzyEstimator(FuzzySettings(), AdaptationSettings(dead_zone=0.0))
+    estimator = FuzzyEstimator(Sets(), AdaptationSettings(dead_zone=0.0))
     estimator.evaluate(np.array([9.0, 9.0]))
     estimator.evaluate(np.array([1.0, -4.0]))
     estimator.adapt(np.array([1.0, -0.5]), DT)
@@ -131,14 +134,14 @@ def test_adaptation_uses_the_basis_of_the_last_evaluation():
 
 
 def test_before_any_evaluation_nothing_is_learnt():
-    estimator = FuzzyEstimator(FuzzySettings(), AdaptationSettings())
+    estimator = FuzzyEstimator(Sets(), AdaptationSettings())
     estimator.adapt(np.array([5.0, 5.0]), DT)
     assert not estimator.coefficients.any()
 
 
 def test_radius_is_the_root_mean_square_of_the_coefficients():
     for kind in KINDS:
-        estimator = FuzzyEstimator(FuzzySettings(kind=kind), AdaptationSettings(radius=7.0))
+        estimator = FuzzyEstimator(Sets(kind=kind), AdaptationSettings(radius=7.0))
         estimator.coefficients = np.full(estimator.coefficients.shape, 6.99)
         estimator.evaluate(np.zeros(2))
         estimator.adapt(np.zeros(2), DT)
@@ -151,7 +154,7 @@ def test_radius_is_the_root_mean_square_of_the_coefficients():
 def test_gamma_for_equalises_what_is_learnt_per_step_on_average():
     drawn = np.random.default_rng(33).uniform(-10.0, 10.0, (500, 2))
     for kind in KINDS:
-        settings = FuzzySettings(kind=kind)
+        settings = Sets(kind=kind)
         sets = build_sets(settings)
         power = np.mean([np.sum(basis_of(u, sets) ** 2) for u in drawn])
         assert gamma_for(settings, 40.0) * power == pytest.approx(40.0, rel=0.05)
@@ -159,7 +162,7 @@ def test_gamma_for_equalises_what_is_learnt_per_step_on_average():
 
 def test_default_gamma_is_an_adaptation_bandwidth_that_fits_the_feedback():
     """A normalised gain of 20 to 60 1/s² beside K = 8 1/s, over all of the input range."""
-    sets = build_sets(FuzzySettings())
+    sets = build_sets(Sets())
     drawn = np.random.default_rng(34).uniform(-10.0, 10.0, (500, 2))
     gains = AdaptationSettings().gamma * np.array([np.sum(basis_of(u, sets) ** 2) for u in drawn])
     assert gains.min() > 20.0
@@ -168,7 +171,7 @@ def test_default_gamma_is_an_adaptation_bandwidth_that_fits_the_feedback():
 
 
 def test_configure_takes_effect_and_keeps_what_was_learnt():
-    estimator = FuzzyEstimator(FuzzySettings(), AdaptationSettings())
+    estimator = FuzzyEstimator(Sets(), AdaptationSettings())
     estimator.evaluate(np.zeros(2))
     estimator.adapt(np.ones(2), DT)
     learnt = estimator.coefficients
@@ -181,7 +184,7 @@ def test_configure_takes_effect_and_keeps_what_was_learnt():
 
 
 def test_reset_forgets_and_warm_up_changes_nothing():
-    estimator = FuzzyEstimator(FuzzySettings(), AdaptationSettings(sigma_modification=1.0))
+    estimator = FuzzyEstimator(Sets(), AdaptationSettings(sigma_modification=1.0))
     estimator.evaluate(np.array([1.0, 2.0]))
     estimator.adapt(np.ones(2), DT)
     phi, alpha = estimator.basis, estimator.coefficients
@@ -194,7 +197,7 @@ def test_reset_forgets_and_warm_up_changes_nothing():
 
 
 def test_coefficients_and_basis_are_copies():
-    estimator = FuzzyEstimator(FuzzySettings(), AdaptationSettings())
+    estimator = FuzzyEstimator(Sets(), AdaptationSettings())
     estimator.evaluate(np.zeros(2))
     estimator.coefficients[:] = 1.0
     estimator.basis[:] = 0.0
@@ -206,7 +209,7 @@ def test_coefficients_and_basis_are_copies():
     'wrong', [[0.0], [0.0, math.nan], [math.inf, 0.0], [[0.0, 0.0]], [0.0, 0.0, 0.0]]
 )
 def test_wrong_inputs_and_errors_are_refused_and_change_nothing(wrong):
-    estimator = FuzzyEstimator(FuzzySettings(), AdaptationSettings())
+    estimator = FuzzyEstimator(Sets(), AdaptationSettings())
     estimator.evaluate(np.array([1.0, 2.0]))
     estimator.adapt(np.ones(2), DT)
     phi, alpha = estimator.basis, estimator.coefficients
@@ -220,13 +223,13 @@ def test_wrong_inputs_and_errors_are_refused_and_change_nothing(wrong):
 
 @pytest.mark.parametrize('dt', [-0.01, math.nan, math.inf])
 def test_a_step_that_is_no_duration_is_refused(dt):
-    estimator = FuzzyEstimator(FuzzySettings(), AdaptationSettings())
+    estimator = FuzzyEstimator(Sets(), AdaptationSettings())
     with pytest.raises(ValueError, match='dt must be finite and not negative'):
         estimator.adapt(np.zeros(2), dt)
 
 
 def test_wrong_coefficients_are_refused():
-    estimator = FuzzyEstimator(FuzzySettings(), AdaptationSettings())
+    estimator = FuzzyEstimator(Sets(), AdaptationSettings())
     with pytest.raises(ValueError, match=r'coefficients must have shape \(2, 72\)'):
         estimator.coefficients = np.zeros((2, 71))
     table = np.zeros((2, 72))
@@ -234,18 +237,18 @@ def test_wrong_coefficients_are_refused():
     with pytest.raises(ValueError, match='coefficients must be finite: got 1 not'):
         estimator.coefficients = table
     with pytest.raises(ValueError, match='outputs must be at least 1'):
-        FuzzyEstimator(FuzzySettings(), AdaptationSettings(), outputs=0)
+        FuzzyEstimator(Sets(), AdaptationSettings(), outputs=0)
 
 
 def test_other_numbers_of_inputs_work_alike():
     for inputs in (1, 3):
-        estimator = FuzzyEstimator(FuzzySettings(), AdaptationSettings(), 1, inputs)
+        estimator = FuzzyEstimator(Sets(), AdaptationSettings(), 1, inputs)
         estimator.coefficients = np.full(estimator.coefficients.shape, 2.5)
         assert estimator.evaluate(np.zeros(inputs))[0] == pytest.approx(2.5)
 
 
 def test_non_contiguous_and_whole_number_inputs_are_read_correctly():
-    estimator = FuzzyEstimator(FuzzySettings(), AdaptationSettings())
+    estimator = FuzzyEstimator(Sets(), AdaptationSettings())
     estimator.coefficients = np.random.default_rng(35).normal(size=(2, 72))
     expected = estimator.evaluate(np.array([1.0, -4.0]))
     strided = np.array([1.0, 99.0, -4.0, 99.0])[::2]

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Inference (16)-(33) with E7 and E8: the hull, the special cases, the limits."""
 
+from functools import partial
 import itertools
 import math
 
@@ -18,6 +19,8 @@ from t3mpc_ros.fuzzy.inference import (
     output_by_double_sum,
 )
 from t3mpc_ros.fuzzy.sets import FuzzySets, FuzzySettings, build_sets, slice_levels, type3_widths
+
+Sets = partial(FuzzySettings, sets=3, crowding=1.0)
 
 KINDS = ('type3', 'interval_type2', 'type1')
 FAR = [40.0, -80.0, 1e3, -1e5, 1e9, -1e12, 1e200, -1.7e308]
@@ -57,7 +60,7 @@ def _reference_basis(u, sets):
 @pytest.mark.parametrize('kind', KINDS)
 def test_output_stays_in_the_hull_of_the_coefficients_anywhere(kind):
     rng = np.random.default_rng(1)
-    sets = build_sets(FuzzySettings(kind=kind))
+    sets = build_sets(Sets(kind=kind))
     near = rng.uniform(-15.0, 15.0, (200, 2))
     far = np.array(list(itertools.product([0.3, *FAR], repeat=2)))
     for u in np.concatenate([near, far]):
@@ -112,11 +115,11 @@ def test_type1_is_a_textbook_weighted_average(fuzziness):
     For the non-singleton fuzzifier the grade at the best match of input and set is
     exp(-((U - o) beta / (beta² + beta_U²))²).
     """
-    settings = FuzzySettings(kind='type1', sets=4, input_fuzziness=fuzziness)
+    settings = Sets(kind='type1', sets=4, input_fuzziness=fuzziness)
     sets = build_sets(settings)
     rng = np.random.default_rng(5)
     constants = rng.normal(size=(4, 4))
-    centres, beta = np.linspace(-10.0, 10.0, 4), settings.width
+    centres, beta = np.linspace(-10.0, 10.0, 4), settings.widths[0]
 
     def textbook(u1, u2):
         total = weighted = 0.0
@@ -136,12 +139,12 @@ def test_type1_is_a_textbook_weighted_average(fuzziness):
 
 def test_interval_type2_is_a_nie_tan_system():
     """Nie-Tan: the mean of upper and lower firing is the weight of the rule's constant."""
-    settings = FuzzySettings(kind='interval_type2', footprint=0.4, input_fuzziness=0.0)
+    settings = Sets(kind='interval_type2', footprint=0.4, input_fuzziness=0.0)
     sets = build_sets(settings)
     rng = np.random.default_rng(6)
     constants = rng.normal(size=9)
     centres = np.array([-10.0, 0.0, 10.0])
-    sigma = settings.width
+    sigma = settings.widths[0]
     for u in rng.uniform(-14.0, 14.0, (50, 2)):
         upper = np.exp(-(((u[:, None] - centres) / (1.4 * sigma)) ** 2))
         lower = np.exp(-(((u[:, None] - centres) / (0.6 * sigma)) ** 2))
@@ -151,14 +154,14 @@ def test_interval_type2_is_a_nie_tan_system():
 
 
 def test_type3_of_one_slice_at_level_one_is_type1():
-    settings = FuzzySettings()
-    type1 = build_sets(FuzzySettings(kind='type1'))
+    settings = Sets()
+    type1 = build_sets(Sets(kind='type1'))
     rng = np.random.default_rng(7)
     points = rng.uniform(-14.0, 14.0, (20, 2))
 
     def at(level):
         levels = np.array([[level, 1.0]])
-        widths = np.broadcast_to(type3_widths(settings.width, levels), (2, 3, 1, 2, 2))
+        widths = np.broadcast_to(type3_widths(settings.widths[0], levels), (2, 3, 1, 2, 2))
         return FuzzySets(type1.centres, widths, levels, settings.input_fuzziness)
 
     gaps = []
@@ -171,8 +174,8 @@ def test_type3_of_one_slice_at_level_one_is_type1():
 
 def test_slices_without_footprint_change_nothing():
     """Equal widths at every level make every slice the same type-1 system."""
-    type1 = build_sets(FuzzySettings(kind='type1'))
-    widths = np.full((2, 3, 5, 2, 2), FuzzySettings().width)
+    type1 = build_sets(Sets(kind='type1'))
+    widths = np.full((2, 3, 5, 2, 2), Sets().widths[0])
     sliced = FuzzySets(type1.centres, widths, slice_levels(5), type1.input_fuzziness)
     rng = np.random.default_rng(8)
     constants = rng.normal(size=9)
@@ -182,7 +185,7 @@ def test_slices_without_footprint_change_nothing():
 
 
 def test_singleton_limit_the_input_is_met_where_it_is():
-    sets = build_sets(FuzzySettings(input_fuzziness=0.0))
+    sets = build_sets(Sets(input_fuzziness=0.0))
     u = np.array([3.3, -7.1])
     found = np.empty(sets.widths.shape)
     fuzzify(u, sets.centres, sets.pull, found)
@@ -192,7 +195,7 @@ def test_singleton_limit_the_input_is_met_where_it_is():
 
 
 def test_wide_input_limit_is_met_at_the_centres():
-    sets = build_sets(FuzzySettings(input_fuzziness=100.0))
+    sets = build_sets(Sets(input_fuzziness=100.0))
     found = np.empty(sets.widths.shape)
     fuzzify(np.array([3.3, -7.1]), sets.centres, sets.pull, found)
     assert np.abs(found - sets.centres[:, :, None, None, None]).max() < 1.0
@@ -242,7 +245,7 @@ def test_e7_grades_are_even_about_the_centre_and_at_most_one():
 
 def test_e8_printed_normalisation_leaves_the_hull():
     """With 0.5 / (sum of upper levels) a constant 1 on every rule comes out as 0.9."""
-    sets = build_sets(FuzzySettings())
+    sets = build_sets(Sets())
     phi = basis_of(np.array([1.0, 2.0]), sets)
     printed = phi * sets.levels.sum() * 0.5 / sets.levels[:, 1].sum()
     assert np.ones(sets.size) @ phi == pytest.approx(1.0, abs=1e-14)
@@ -265,7 +268,7 @@ def test_memberships_and_firings_are_the_printed_products():
 
 def test_far_outside_where_firings_underflow_the_basis_is_still_exact():
     """Plain firings are all zero here and (33) would be 0/0; logarithms know better."""
-    sets = build_sets(FuzzySettings())
+    sets = build_sets(Sets())
     for u in ([80.0, -90.0], [-300.0, 2.0], [1e4, 1e4]):
         at_lowest_width = np.exp(_log_firings(u, sets))[..., 0, 0, 0]
         assert at_lowest_width.max() == 0.0
@@ -293,7 +296,7 @@ def test_a_rule_28_that_fires_alone_answers_between_its_two_consequents():
 
 @pytest.mark.parametrize('distance', FAR[2:])
 def test_far_outside_the_nearest_rule_takes_all(distance):
-    sets = build_sets(FuzzySettings())
+    sets = build_sets(Sets())
     phi = basis_of(np.array([distance, distance]), sets).reshape(2, 9, 4)
     nearest = 8 if distance > 0.0 else 0
     np.testing.assert_allclose(phi[:, nearest].T, sets.shares, rtol=1e-12)
@@ -304,7 +307,7 @@ def test_output_is_smooth_where_the_nearest_rule_changes():
 
     A kink would make the second difference double when its step is halved.
     """
-    sets = build_sets(FuzzySettings())
+    sets = build_sets(Sets())
     rng = np.random.default_rng(12)
     alpha = rng.normal(size=sets.size)
     places = [*itertools.product([-5.0, 5.0], repeat=2), (-5.0, 1.0), (30.0, 5.0)]
@@ -322,7 +325,7 @@ def test_output_is_smooth_where_the_nearest_rule_changes():
 
 
 def test_inputs_that_are_no_numbers_are_refused():
-    sets = build_sets(FuzzySettings())
+    sets = build_sets(Sets())
     for wrong in ([0.0], [0.0, math.nan], [math.inf, 0.0], [0.0, 0.0, 0.0]):
         with pytest.raises(ValueError, match='inputs must be 2 finite numbers'):
             basis_of(np.array(wrong), sets)

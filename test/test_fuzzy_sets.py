@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tables of fuzzy sets: what they say, and what they refuse."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -16,6 +18,8 @@ from t3mpc_ros.fuzzy.sets import (
     type3_widths,
 )
 from t3mpc_ros.settings import SettingError
+
+Sets = partial(FuzzySettings, sets=3, crowding=1.0)
 
 
 @pytest.mark.parametrize('slices', [1, 2, 4, 7])
@@ -46,27 +50,25 @@ def test_type3_footprint_widens_as_the_level_falls_and_closes_at_one():
 
 
 def test_default_sets_cross_at_one_half():
-    settings = FuzzySettings()
+    settings = Sets()
     half_spacing = 0.5 * (settings.centre_high - settings.centre_low) / (settings.sets - 1)
-    assert np.exp(-((half_spacing / settings.width) ** 2)) == pytest.approx(0.5, abs=0.002)
+    assert np.exp(-((half_spacing / settings.widths[0]) ** 2)) == pytest.approx(0.5, abs=0.002)
 
 
 def test_default_interval_footprint_is_the_mean_type3_footprint_weighted_by_level():
-    levels = slice_levels(FuzzySettings().slices)
+    levels = slice_levels(Sets().slices)
     half = 0.5 * np.diff(type3_widths(1.0, levels), axis=-1)[..., 0]
     mean = float(np.sum(levels * half) / np.sum(levels))
-    assert FuzzySettings().footprint == pytest.approx(mean, abs=0.005)
+    assert Sets().footprint == pytest.approx(mean, abs=0.005)
 
 
 def test_input_fuzziness_is_matched_to_the_noise_of_variance_0_04():
     """The Gaussians here have no 1/2 in the exponent: beta is sqrt(2) standard deviations."""
-    assert FuzzySettings().input_fuzziness == pytest.approx(np.sqrt(2.0 * 0.04), abs=0.001)
+    assert Sets().input_fuzziness == pytest.approx(np.sqrt(2.0 * 0.04), abs=0.001)
 
 
 def test_kinds_differ_only_in_the_numbers_of_the_tables():
-    tables = {
-        kind: build_sets(FuzzySettings(kind=kind)) for kind in ('type3', 'interval_type2', 'type1')
-    }
+    tables = {kind: build_sets(Sets(kind=kind)) for kind in ('type3', 'interval_type2', 'type1')}
     for sets in tables.values():
         np.testing.assert_array_equal(sets.centres, tables['type3'].centres)
         assert sets.input_fuzziness == tables['type3'].input_fuzziness
@@ -75,19 +77,19 @@ def test_kinds_differ_only_in_the_numbers_of_the_tables():
     np.testing.assert_array_equal(
         tables['type1'].widths[..., LOWER], tables['type1'].widths[..., UPPER]
     )
-    widths, sigma = tables['interval_type2'].widths, FuzzySettings().width
+    widths, sigma = tables['interval_type2'].widths, Sets().widths[0]
     np.testing.assert_allclose(widths[..., LOWER], 0.77 * sigma)
     np.testing.assert_allclose(widths[..., UPPER], 1.23 * sigma)
 
 
 def test_interval_type2_without_footprint_has_the_tables_of_type1():
-    interval = build_sets(FuzzySettings(kind='interval_type2', footprint=0.0))
-    np.testing.assert_array_equal(interval.widths, build_sets(FuzzySettings(kind='type1')).widths)
+    interval = build_sets(Sets(kind='interval_type2', footprint=0.0))
+    np.testing.assert_array_equal(interval.widths, build_sets(Sets(kind='type1')).widths)
 
 
 @pytest.mark.parametrize('inputs', [1, 2, 3])
 def test_tables_have_the_stated_shapes_for_any_number_of_inputs(inputs):
-    sets = build_sets(FuzzySettings(sets=4, slices=5), inputs)
+    sets = build_sets(Sets(sets=4, slices=5), inputs)
     assert sets.centres.shape == (inputs, 4)
     assert sets.widths.shape == (inputs, 4, 5, 2, 2)
     assert sets.levels.shape == (5, 2)
@@ -96,16 +98,16 @@ def test_tables_have_the_stated_shapes_for_any_number_of_inputs(inputs):
 
 
 def test_a_single_set_stands_in_the_middle_of_the_range():
-    sets = build_sets(FuzzySettings(sets=1, centre_low=-2.0, centre_high=6.0))
+    sets = build_sets(Sets(sets=1, centre_low=-2.0, centre_high=6.0))
     np.testing.assert_array_equal(sets.centres, [[2.0], [2.0]])
 
 
 def test_shares_add_up_to_one_e8():
-    assert build_sets(FuzzySettings(slices=7)).shares.sum() == pytest.approx(1.0, abs=1e-15)
+    assert build_sets(Sets(slices=7)).shares.sum() == pytest.approx(1.0, abs=1e-15)
 
 
 def test_tables_are_read_only_and_do_not_alias_their_source():
-    sets = build_sets(FuzzySettings())
+    sets = build_sets(Sets())
     with pytest.raises(ValueError, match='read-only'):
         sets.centres[0, 0] = 1.0
     centres = np.array(sets.centres)
@@ -146,10 +148,10 @@ def test_tables_out_of_range_are_refused_by_name(change, message):
 
 def test_settings_out_of_order_or_too_large_are_refused():
     with pytest.raises(SettingError, match='centre_high must be above centre_low'):
-        FuzzySettings(centre_low=1.0, centre_high=1.0)
+        Sets(centre_low=1.0, centre_high=1.0)
     with pytest.raises(SettingError, match='kind must be one of'):
-        FuzzySettings(kind='type4')
+        Sets(kind='type4')
     with pytest.raises(ValueError, match='inputs must be at least 1: got 0'):
-        build_sets(FuzzySettings(), 0)
+        build_sets(Sets(), 0)
     with pytest.raises(ValueError, match=f'at most {LARGEST}'):
-        build_sets(FuzzySettings(), 40)
+        build_sets(Sets(), 40)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from t3mpc_ros.control.controller import Controller, ControllerSettings
-from t3mpc_ros.lab.rivals.composed import Composed, ComposedSettings
+from t3mpc_ros.lab.composed import Composed, ComposedSettings
 from t3mpc_ros.lab.trial.loop import MethodSpec, run
 from t3mpc_ros.lab.trial.scenario import RATE, Scenario
 from t3mpc_ros.lab.trial.statistics import paired

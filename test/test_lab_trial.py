@@ -29,6 +29,7 @@ from t3mpc_ros.lab.trial.scenario import (
     CASES,
     DRIVES,
     HELD_OUT,
+    PRACTICE,
     RATE,
     TRAINING,
     Scenario,
@@ -201,9 +202,9 @@ def test_a_scenario_names_what_is_wrong_with_it(changes, text):
 
 
 def test_training_and_held_out_seeds_are_strangers_and_robots_have_seeds_of_their_own():
-    assert len(TRAINING) == 12
+    assert len(TRAINING) == 9
     assert len(HELD_OUT) == 20
-    seeds = [*TRAINING, *HELD_OUT]
+    seeds = [*TRAINING, *PRACTICE, *HELD_OUT]
     robots = [Scenario('torque', 0.0, 'nominal', seed).robot().seed for seed in seeds]
     assert len({*seeds, *robots}) == 2 * len(seeds)
 
@@ -608,3 +609,41 @@ def test_pairing_takes_out_what_both_have():
     assert np.mean([paired(*draw).certain for draw in noise]) == pytest.approx(0.05, abs=0.015)
     with pytest.raises(ValueError, match='equally many: got 20 and 19'):
         paired(a, b[1:])
+
+
+# -- practice ---------------------------------------------------------------------------------
+
+
+class Counting(Rival):
+    """Learns how many steps it has done."""
+
+    settings_type = ProportionalSettings
+
+    def __init__(self, settings, knowledge):
+        self.steps = np.zeros(1)
+
+    def step(self, view):
+        self.steps += 1.0
+        return np.zeros(2)
+
+    def learnt(self):
+        return {'steps': self.steps.copy()}
+
+    def restore(self, learnt):
+        self.steps = learnt['steps'].copy()
+
+
+def test_what_practises_begins_with_what_it_learnt_run_after_run():
+    knowledge = Scenario('torque', 0.0, 'nominal', 101).knowledge()
+    fresh = MethodSpec('count', Counting, ProportionalSettings())(knowledge)
+    practised = MethodSpec('count', Counting, ProportionalSettings(), practised=True)
+    assert fresh.steps[0] == 0.0
+    for _ in range(2):  # the second is the first's equal: nothing of a run is carried over
+        controller = practised(knowledge)
+        assert controller.steps[0] == len(PRACTICE) * 4000
+        controller.step(None)
+
+
+def test_a_method_that_does_not_learn_needs_no_practice():
+    knowledge = Scenario('torque', 0.0, 'nominal', 101).knowledge()
+    assert MethodSpec('P', Proportional, ProportionalSettings(), True)(knowledge).learnt() == {}

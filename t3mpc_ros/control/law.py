@@ -37,7 +37,7 @@ class LawSettings(Settings):
         True, 'whether the compensator (81)-(82) is part of the command', live=True
     )
     error_bound: float = setting(
-        1.0,
+        6.0,
         'bound of the estimation error per wheel that the compensator outweighs, omega-bar (80)',
         unit='rad/s²',
         low=0.0,

@@ -50,7 +50,7 @@ class AdaptationSettings(Settings):
         live=True,
     )
     dead_zone: float = setting(
-        0.05,
+        0.0,
         'error from which on coefficients adapt; a smaller one counts as noise. At least the '
         'disturbance that no coefficients can explain divided by K; noise about as wide already '
         'drifts little',

@@ -34,7 +34,7 @@ class FuzzySettings(Settings):
         choices=('type3', 'interval_type2', 'type1'),
         source='paper: NT3FS, compared with the others',
     )
-    sets: int = setting(3, 'Gaussian sets per input, M', low=1, high=15)
+    sets: int = setting(7, 'Gaussian sets per input, M', low=1, high=15)
     centre_low: float = setting(
         -10.0, 'centre of the first set', unit='rad/s', low=-1000.0, high=1000.0
     )
@@ -44,6 +44,13 @@ class FuzzySettings(Settings):
         unit='rad/s',
         low=-1000.0,
         high=1000.0,
+    )
+    crowding: float = setting(
+        2.0,
+        'how much closer together the centres are in the middle, where Coulomb friction changes '
+        'its sign: their places in [-1, 1] are raised to this power; 1 is even',
+        low=0.2,
+        high=5.0,
     )
     spread: float = setting(
         0.6,
@@ -79,9 +86,21 @@ class FuzzySettings(Settings):
             )
 
     @property
-    def width(self) -> float:
-        """Width sigma of the sets at level one, rad/s."""
-        return self.spread * (self.centre_high - self.centre_low) / max(self.sets - 1, 1)
+    def centres(self) -> Array:
+        """Centres o of the sets, ascending, rad/s, shape (M,)."""
+        middle = 0.5 * (self.centre_low + self.centre_high)
+        if self.sets == 1:
+            return np.array([middle])
+        places = np.linspace(-1.0, 1.0, self.sets)
+        crowded = np.sign(places) * np.abs(places) ** self.crowding
+        return middle + 0.5 * (self.centre_high - self.centre_low) * crowded
+
+    @property
+    def widths(self) -> Array:
+        """Widths sigma of the sets at level one, rad/s, shape (M,): by the spacing around each."""
+        if self.sets == 1:
+            return np.array([self.spread * (self.centre_high - self.centre_low)])
+        return self.spread * np.gradient(self.centres)
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,16 +246,12 @@ def build_sets(settings: FuzzySettings, inputs: int = 2) -> FuzzySets:
     else:
         levels = np.ones((1, 2))  # one slice, at level one: secondary grades are all one
     _check_size(inputs, settings.sets, len(levels))
-    one = type3_widths(settings.width, levels)
+    each = np.stack([type3_widths(width, levels) for width in settings.widths.tolist()])
     if settings.kind == 'interval_type2':
-        one = one * np.array([1.0 - settings.footprint, 1.0 + settings.footprint])
-    if settings.sets == 1:
-        line = np.array([0.5 * (settings.centre_low + settings.centre_high)])
-    else:
-        line = np.linspace(settings.centre_low, settings.centre_high, settings.sets)
+        each = each * np.array([1.0 - settings.footprint, 1.0 + settings.footprint])
     return FuzzySets(
-        centres=np.tile(line, (inputs, 1)),
-        widths=np.broadcast_to(one, (inputs, settings.sets, *one.shape)),
+        centres=np.tile(settings.centres, (inputs, 1)),
+        widths=np.broadcast_to(each, (inputs, *each.shape)),
         levels=levels,
         input_fuzziness=settings.input_fuzziness,
     )

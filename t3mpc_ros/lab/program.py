@@ -8,7 +8,13 @@ from datetime import datetime
 import json
 from pathlib import Path
 import sys
+from typing import TYPE_CHECKING
 import webbrowser
+
+from t3mpc_ros.lab.tuning.command import add_parser as add_tune
+
+if TYPE_CHECKING:
+    from t3mpc_ros.lab.tuning.contestant import Contestant
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -75,7 +81,7 @@ def _exponents(options: argparse.Namespace) -> int:
 
 def _warm(options: argparse.Namespace) -> int:
     from t3mpc_ros.control.controller import Controller, ControllerSettings
-    from t3mpc_ros.lab.rivals.composed import Composed, ComposedSettings
+    from t3mpc_ros.lab.composed import Composed, ComposedSettings
     from t3mpc_ros.lab.trial.loop import MethodSpec, run
     from t3mpc_ros.lab.trial.scenario import DRIVES, Scenario
     from t3mpc_ros.robot.simulated import SimulatedRobot, SimulatedRobotSettings
@@ -86,6 +92,12 @@ def _warm(options: argparse.Namespace) -> int:
     Controller(ControllerSettings()).warm_up()
     SimulatedRobot(SimulatedRobotSettings()).warm_up()
     return 0
+
+
+def _contestants() -> 'Sequence[Contestant]':
+    from t3mpc_ros.lab.contestants import contestants
+
+    return contestants()
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -119,6 +131,8 @@ def _parser() -> argparse.ArgumentParser:
     exponents = commands.add_parser('exponents', help='Lyapunov exponents of the generator')
     exponents.add_argument('--duration', type=_seconds, default=200.0, help='system seconds')
     exponents.set_defaults(run=_exponents)
+
+    add_tune(commands, _contestants)
 
     warm = commands.add_parser('warm', help='compile every kernel into the cache')
     warm.set_defaults(run=_warm)

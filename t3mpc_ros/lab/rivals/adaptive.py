@@ -6,6 +6,7 @@ Both act on e, the error that neither jumps of the reference nor limits of the d
 :mod:`.linear`.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import ClassVar
@@ -72,11 +73,20 @@ class AdaptiveSettings(Settings):
     spread: float = setting(
         0.6, 'width of the sets as a fraction of their spacing', low=0.2, high=3.0
     )
+    crowding: float = setting(
+        2.0, 'how much closer together the centres are in the middle', low=0.2, high=5.0
+    )
     crossing: CrossingSettings = nested(CrossingSettings)
 
     def fuzzy(self) -> FuzzySettings:
         """Return the shape of the fuzzy system, type-1; the fuzzifier is a singleton."""
-        return FuzzySettings(kind='type1', sets=self.sets, spread=self.spread, input_fuzziness=0.0)
+        return FuzzySettings(
+            kind='type1',
+            sets=self.sets,
+            spread=self.spread,
+            crowding=self.crowding,
+            input_fuzziness=0.0,
+        )
 
 
 @dataclass(frozen=True)
@@ -193,6 +203,14 @@ class _Adaptive(Tracing):
         """Take note of the u that was applied; adaptation pauses while the drive is limited."""
         super().applied(acceleration, limited=limited)
         self._limited = limited
+
+    def learnt(self) -> dict[str, Array]:
+        """Return the coefficients."""
+        return {'coefficients': self.fuzzy.coefficients}
+
+    def restore(self, learnt: Mapping[str, Array]) -> None:
+        """Begin with other coefficients."""
+        self.fuzzy.coefficients = learnt['coefficients']
 
 
 class AdaptiveType1(_Adaptive):

@@ -13,6 +13,7 @@ begins to act, and the drive turns u_k into the wheel speed command that the lag
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 import math
 from typing import ClassVar
@@ -101,3 +102,10 @@ class Rival(ABC):
 
     def applied(self, acceleration: Array, *, limited: bool) -> None:  # noqa: B027
         """Take note of the u that the drive's limits let through (anti-windup)."""
+
+    def learnt(self) -> dict[str, Array]:
+        """Return what was learnt so far, by name; nothing for a method that does not learn."""
+        return {}
+
+    def restore(self, learnt: Mapping[str, Array]) -> None:  # noqa: B027
+        """Begin with what :meth:`learnt` returned after another run."""

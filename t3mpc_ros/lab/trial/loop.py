@@ -6,10 +6,11 @@ What a program starts in other processes imports its main module again, so a scr
 more than one worker has its work behind ``if __name__ == '__main__':``.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import lru_cache
 import math
 import multiprocessing
 from types import TracebackType
@@ -22,7 +23,14 @@ from t3mpc_ros.control.drive import Drive
 from t3mpc_ros.lab.rivals.rival import Knowledge, Rival, View
 from t3mpc_ros.lab.trial.plant import FastPlant
 from t3mpc_ros.lab.trial.record import LoopRecord
-from t3mpc_ros.lab.trial.scenario import DRIVES, RATE, Scenario
+from t3mpc_ros.lab.trial.scenario import (
+    DRIVES,
+    PRACTICE,
+    PRACTICE_DURATION,
+    PRACTICE_NOISE,
+    RATE,
+    Scenario,
+)
 from t3mpc_ros.robot.dynamics import wheel_inertia
 from t3mpc_ros.settings import Settings
 
@@ -40,6 +48,8 @@ class MethodSpec:
     name: str
     rival_type: type[Rival]
     settings: Settings
+    practised: bool = False
+    """Whether it comes with what it learnt in :data:`PRACTICE`, if it is one that learns."""
 
     def __post_init__(self) -> None:
         wanted = self.rival_type.settings_type
@@ -50,8 +60,25 @@ class MethodSpec:
             )
 
     def __call__(self, knowledge: Knowledge) -> Rival:
-        """Return a new controller that knows nothing of runs before."""
-        return self.rival_type(self.settings, knowledge)
+        """Return a new controller that knows of no runs before, but of its practice."""
+        controller = self.rival_type(self.settings, knowledge)
+        if self.practised and controller.learnt():
+            controller.restore(practise(self.rival_type, self.settings, knowledge.drive))
+        return controller
+
+
+@lru_cache(maxsize=32)
+def practise(rival_type: type[Rival], settings: Settings, drive: str) -> Mapping[str, Array]:
+    """Return what a method learns in the runs of :data:`PRACTICE`, one after the other."""
+    learnt: Mapping[str, Array] = {}
+    for seed in PRACTICE:
+        scenario = Scenario(drive, PRACTICE_NOISE, 'nominal', seed, PRACTICE_DURATION)
+        controller = rival_type(settings, scenario.knowledge())
+        if learnt:
+            controller.restore(learnt)
+        run(scenario, lambda _, controller=controller: controller)  # type: ignore[misc]
+        learnt = controller.learnt()
+    return learnt
 
 
 Job = tuple[Scenario, MethodSpec]

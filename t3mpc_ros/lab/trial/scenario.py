@@ -24,8 +24,12 @@ DRIVES = ('torque', 'velocity')
 """torque: u is applied as the torque theta_bar u, the paper's way; velocity: the wheels follow
 commanded speeds, late and lagging, as the robot's board does it."""
 
-TRAINING = tuple(range(1, 13))
+TRAINING = tuple(range(1, 10))
 """Seeds on which gains are chosen."""
+PRACTICE = (10, 11, 12)
+"""Seeds of the runs that a method which learns may have behind it: the same for all of them."""
+PRACTICE_NOISE, PRACTICE_DURATION = 0.04, 40.0
+"""Noise ((rad/s)²) and length (s) of those runs; the robot is the nominal one."""
 HELD_OUT = tuple(range(101, 121))
 """Seeds on which results are reported. No gain was ever chosen on one of them."""
 

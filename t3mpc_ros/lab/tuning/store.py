@@ -182,6 +182,20 @@ class TunedStore:
         except SettingError as error:
             raise StoreError(f'{where}: {error}') from error
 
+    def applied(self, method: str, drive: str, start: T) -> T:
+        """Return ``start`` with the settings that were tuned; all others stay as they are.
+
+        Raises
+        ------
+        StoreError
+            It was not tuned, or what is stored does not fit the table; names the setting.
+        """
+        entry = self.entry(method, drive)
+        try:
+            return start.changed({name: entry.values[name] for name in entry.tuned})
+        except SettingError as error:
+            raise StoreError(f'{method}, {drive}: {error}') from error
+
     def check(self, types: Mapping[str, type[Settings]]) -> None:
         """Raise :class:`StoreError` unless every entry fits the table of its method."""
         for method, drive in self:

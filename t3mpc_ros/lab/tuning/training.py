@@ -23,7 +23,7 @@ settings that track alike; it is too small to make any method track worse to be 
 """
 NOISE_LEVELS = (0.0, 0.04, 0.1)
 """Variances of the measured wheel speeds met in training, (rad/s)²: one setting for them all."""
-DURATION = 30.0
+DURATION = 26.0
 """Length of a training run, s: the reference switches twice in it."""
 
 
@@ -157,7 +157,7 @@ class ClosedLoop:
     ) -> list[float]:
         scenarios = self._training.scenarios(drive)
         jobs: list[Job] = [
-            (scenario, MethodSpec(method.name, method.rival_type, candidate))
+            (scenario, MethodSpec(method.name, method.rival_type, candidate, practised=True))
             for candidate in candidates
             for scenario in scenarios
         ]

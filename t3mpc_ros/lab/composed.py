@@ -43,8 +43,9 @@ class Composed(Rival):
         self._period = knowledge.period
         self._period_ns = round(knowledge.period * NANOSECONDS)
         self._pursuit = Pursuit(settings, knowledge.drive)
-        if settings.random_predictor:
-            self._forget(settings.predictive.seed)
+        self._random = settings.predictive.seed if settings.random_predictor else None
+        if self._random is not None:
+            self._forget(self._random)
         self._steps = 0
         self._expected: Array = np.zeros(2)
         self._slope: Array = np.zeros(2)
@@ -56,9 +57,15 @@ class Composed(Rival):
         """Skill of the predictor in the middle of its horizon, shape (2,)."""
         return self._pursuit.law.predictive.skill
 
-    def learnt(self) -> Mapping[str, Array]:
-        """Return everything learnt, by name."""
+    def learnt(self) -> dict[str, Array]:
+        """Return fuzzy coefficients and predictor weights, as a model file keeps them."""
         return self._pursuit.law.learnt()
+
+    def restore(self, learnt: Mapping[str, Array]) -> None:
+        """Begin with another run's; random output weights stay random."""
+        self._pursuit.law.restore(learnt)
+        if self._random is not None:
+            self._forget(self._random)
 
     def step(self, view: View) -> Array:
         """Return u (rad/s²) of (66)-(67) on the reference with its switches crossed."""
