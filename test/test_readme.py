@@ -21,7 +21,7 @@ SHORTENED = {
     'scripts/demo': (['--duration', '5', '--headless', '--output', 'OUTPUT/run'], False),
     'scripts/check': (['--version'], False),  # this very test is part of it
     'scripts/run sim_robot': ([], True),
-    'scripts/run controller --ros-args -p law.gain:=6.0': ([], True),
+    'scripts/run controller --ros-args -p law.gain:=30.0': ([], True),
     'scripts/run all_in_one': (['--ros-args', '-p', 'folder:=OUTPUT/bag'], True),
     'scripts/run lab exponents': (['--duration', '20'], False),
     'scripts/run lab estimation': (['--seeds', '2'], False),

@@ -122,7 +122,7 @@ def limit_command(
 
 
 class Drive:
-    """Estimates what the wheels do, and makes them accelerate as the law wants, within limits.
+    """Estimates what the wheels do, and makes them accelerate as the law wants (E19).
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ class Drive:
         self._estimator.correct(measured)
 
     def send(self, acceleration: Array) -> Array:
-        """Return the accelerations (rad/s²) that will really be applied, shape (2,).
+        """Return the accelerations (rad/s²) that will really be applied, shape (2,), by E19.
 
         Parameters
         ----------
