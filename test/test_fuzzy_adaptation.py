@@ -97,7 +97,7 @@ def test_with_a_dead_zone_v_never_rises_for_disturbances_up_to_k_times_its_width
     width = 0.1
     rises = {}
     for zone in (width, 0.0):
-        settings = AdaptationSettings(dead_zone=zone, radius=1e4)
+        settings = AdaptationSettings(gamma=600.0, dead_zone=zone, radius=1e4)
         delta, distance = _matched_run(5e-4, settings, GAIN * width, duration=3.0)
         d = delta - np.clip(delta, -zone, zone)
         v = 0.5 * np.sum(d**2, axis=1) + 0.5 * distance

@@ -36,7 +36,7 @@ class CompositionSettings(Settings):
         True, 'whether the fuzzy estimate g is learnt and cancelled (NT3FS)', live=True
     )
     handover: float = setting(
-        0.05,
+        0.025,
         'how strongly a lasting v_p teaches the fuzzy systems, which then take it over: they '
         'learn from delta - handover v_p; 0 is (77)-(78) as printed',
         unit='s',

@@ -25,9 +25,10 @@ class LawSettings(Settings):
     """Gains of the law and of the compensator."""
 
     gain: float = setting(
-        39.3,
-        'feedback K on the tracking error (66)-(67); with the velocity drive (1 - exp(-T/lag))/T, '
-        '39.3 by default, lets the servo do the feedback, and no measured noise reach the command',
+        15.2,
+        'feedback K on the tracking error (66)-(67), found by lab tune for the velocity drive; K '
+        'and the slope of the compensator, (omega-bar + v_p-bar)/epsilon, make 41 together, close '
+        'to (1 - exp(-T/lag))/T = 39.3, where measured noise does not reach the command by itself',
         unit='1/s',
         low=0.1,
         high=100.0,
@@ -45,7 +46,7 @@ class LawSettings(Settings):
         live=True,
     )
     smoothing: float = setting(
-        1.5,
+        0.62,
         'width of the compensator about zero error, epsilon in tanh(delta/epsilon): E14 pays '
         '0.2785 epsilon for it, small values chatter under noise',
         unit='rad/s',

@@ -32,9 +32,9 @@ class SwitchSettings(Settings):
         choices=('ramp', 'program'),
     )
     acceleration: float = setting(
-        28.0,
-        'acceleration with which a jump is crossed, a little below what the limits allow; for the '
-        'torque drive the lab uses more',
+        30.0,
+        'acceleration with which a jump is crossed: what the limits allow one wheel; for the '
+        'torque drive, which is not limited so, the lab uses more',
         unit='rad/s²',
         low=0.1,
         high=1e4,

@@ -20,10 +20,10 @@ class AdaptationSettings(Settings):
 
     enabled: bool = setting(True, 'whether the coefficients are adapted at all', live=True)
     gamma: float = setting(
-        600.0,
+        240.0,
         'adaptation gain gamma of (77)-(78). What is felt is the normalised gain gamma |Phi|² '
         '(1/s²): the error then obeys s² + K s + gamma |Phi|² = 0. With the default type-3 sets '
-        '|Phi|² is 0.04 to 0.12, so 600 makes about 40; with type1 or interval_type2 it is about '
+        '|Phi|² is 0.015 to 0.14, so 240 makes about 15; with type1 or interval_type2 it is about '
         'three times larger, so a third of gamma does the same',
         unit='1/s²',
         low=0.0,

@@ -71,10 +71,15 @@ WITHOUT: Mapping[str, Mapping[str, object]] = {
     'full without NT3FS': {'use_fuzzy': False},
     'full without compensator': {'law.compensator': False},
     'full without MPC': {'predictive.enabled': False},
+    'full without MPC, equal bound': {
+        'predictive.enabled': False,
+        'law.error_bound': ComposedSettings().compensated_bound,
+    },
     'full without preview': {'switches.preview': False},
     'full with random predictor': {'random_predictor': True, 'predictive.learning': False},
 }
-"""The full controller with one part left out."""
+"""The full controller with one part left out. Without v_p the bound (80) of the compensator is
+lower too; with equal bound it stays, which shows what v_p is worth by itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,13 +111,14 @@ def contestants() -> list[Contestant]:
     )
     mpc = (
         Range('move_time', 0.001, 0.1),
-        Range('disturbance_share', 0.02, 1.5),
-        Range('integral_time', 0.05, 20.0),
+        Range('disturbance_share', 0.01, 1.5),
+        Range('integral_time', 0.1, 40.0),
+        Range('filter_time', 0.003, 2.0),
     )
     dmc = (
         Range('move_time', 0.001, 0.1),
-        Range('bias_time', 0.011, 1.0),
-        Range('disturbance_share', 0.02, 1.5),
+        Range('bias_time', 0.005, 15.0),
+        Range('disturbance_share', 0.01, 1.5),
     )
     nonlinear = []
     if find_spec('casadi') is not None:
@@ -160,11 +166,18 @@ def contestants() -> list[Contestant]:
             _both(AdaptiveIntervalType2Settings()),
             adaptive,
         ),
-        Contestant('DMC', DynamicMatrix, _both(DynamicMatrixSettings(load_share=0.0)), dmc),
+        Contestant(
+            'DMC',
+            DynamicMatrix,
+            _both(DynamicMatrixSettings(load_share=0.0, inner_gain=15.0)),
+            dmc,
+        ),
         Contestant(
             'DMC preview',
             DynamicMatrixPreview,
-            _both(DynamicMatrixPreviewSettings(load_share=0.0, model_error=WRONG)),
+            _both(
+                DynamicMatrixPreviewSettings(load_share=0.0, inner_gain=15.0, model_error=WRONG)
+            ),
             dmc,
         ),
         Contestant('linear MPC', LinearMpc, _both(LinearMpcSettings(load_share=0.0)), mpc),

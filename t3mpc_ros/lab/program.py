@@ -11,6 +11,7 @@ import sys
 from typing import TYPE_CHECKING
 import webbrowser
 
+from t3mpc_ros.lab.paper.program import add_parser as add_paper
 from t3mpc_ros.lab.tuning.command import add_parser as add_tune
 
 if TYPE_CHECKING:
@@ -132,6 +133,7 @@ def _parser() -> argparse.ArgumentParser:
     exponents.add_argument('--duration', type=_seconds, default=200.0, help='system seconds')
     exponents.set_defaults(run=_exponents)
 
+    add_paper(commands)
     add_tune(commands, _contestants)
 
     warm = commands.add_parser('warm', help='compile every kernel into the cache')

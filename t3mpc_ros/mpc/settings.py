@@ -74,7 +74,9 @@ class PredictiveSettings(Settings):
     horizon: int = setting(10, 'n_p', low=1, high=50)
     control_horizon: int = setting(5, 'n_c: later moves are zero', low=1, high=50)
     error_weight: float = setting(1.0, 'mu of (60)', unit='s²/rad²', low=0.0, high=1e6, live=True)
-    move_weight: float = setting(0.02, 'pi of (60)', unit='s⁴/rad²', low=1e-9, high=1e6, live=True)
+    move_weight: float = setting(
+        0.029, 'pi of (60)', unit='s⁴/rad²', low=1e-9, high=1e6, live=True
+    )
     v_max: float = setting(
         10.0, 'bound of v_p, v_p-bar of (80)', unit='rad/s²', low=0.0, high=1e4, live=True
     )
@@ -107,7 +109,7 @@ class PredictiveSettings(Settings):
     output_rate: float = setting(0.05, 'gamma of (44), normalised', low=0.0, high=1.0)
     contrast_rate: float = setting(1e-4, 'gamma of (43) while running', low=0.0, high=1.0)
     offset_gain: float = setting(
-        0.03, 'share of the latest miss that the offset e takes in', low=0.0, high=1.0
+        0.0032, 'share of the latest miss that the offset e takes in', low=0.0, high=1.0
     )
     noise: float = setting(
         0.05,

@@ -4,7 +4,7 @@
 
 from collections.abc import Callable
 import io
-from typing import Any, TypeGuard
+from typing import Any, TypeGuard, TypeVar
 
 import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from t3mpc_ros.lab.report.recorded import COMMAND, ODOMETRY, REFERENCE, TRUTH, WHEELS, Run, Series
 
 Array = NDArray[np.float64]
+Subject = TypeVar('Subject')
 
 WIDTH = 6.2
 """Inches: narrow enough for 9-point text to be read where a phone shows it at half the size."""
@@ -63,10 +64,10 @@ _STYLE = {
 }
 
 
-def png_of(draw: Callable[[Run], Any], run: Run) -> bytes | None:
-    """Return what ``draw`` makes of ``run`` as a PNG file; None when it makes nothing."""
+def png_of(draw: Callable[[Subject], Any], subject: Subject) -> bytes | None:
+    """Return what ``draw`` makes of ``subject`` as a PNG file; None when it makes nothing."""
     with matplotlib.rc_context(_STYLE):
-        figure = draw(run)
+        figure = draw(subject)
         if figure is None:
             return None
         buffer = io.BytesIO()

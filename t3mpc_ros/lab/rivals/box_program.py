@@ -40,6 +40,8 @@ CLOSE = 1e-13
 """Slope of a free move, relative to its terms, or step, relative to the moves, that is none."""
 FIRM = 1e-4
 """Share of the decrease that the slope promises which a step must reach (Armijo)."""
+BOLD = 20
+"""Steps that may change many bounds at once; they nearly always do."""
 
 
 class Space(NamedTuple):
@@ -65,6 +67,8 @@ class Space(NamedTuple):
     """Cholesky factor of the rows and columns of H that belong to free moves, shape (n, n)."""
     free: Indices
     """Shape (n,): moves that are not held at a bound, ascending."""
+    held: Indices
+    """Shape (n,): 1 for a move held at its bound."""
     factored: Indices
     """Shape (n + 1,): how many moves ``lower`` is made for (-1: none), and which."""
 
@@ -87,6 +91,7 @@ def make_space(moves: int) -> Space:
         product=np.zeros(moves),
         lower=np.zeros((moves, moves)),
         free=np.zeros(moves, dtype=np.int64),
+        held=np.zeros(moves, dtype=np.int64),
         factored=factored,
     )
 
@@ -207,17 +212,78 @@ def advance(space: Space, length: float) -> tuple[bool, bool]:
 
 
 @kernel
+def slopes(space: Space) -> float:
+    """Write Hx + g into ``gradient`` and return the largest of its terms."""
+    multiply(space.hessian, space.moves, space.gradient)
+    terms = 0.0
+    for i in range(space.moves.size):
+        terms = max(terms, max(abs(space.gradient[i]), abs(space.slope[i])))
+        space.gradient[i] += space.slope[i]
+    return terms
+
+
+@kernel
+def finish(space: Space, most: int) -> int:
+    """Go on to the optimum by changing one bound at a time, and return a status.
+
+    The primal active-set method (Nocedal and Wright 2006, section 16.5), which cannot fail to
+    end: straight to the optimum of the free moves or to the first bound on the way, which then
+    holds; at that optimum the bound that the slope pulls from most is given up.
+    """
+    moves, low, high, held = space.moves, space.low, space.high, space.held
+    n = moves.size
+    for i in range(n):
+        held[i] = 1 if moves[i] <= low[i] or moves[i] >= high[i] else 0
+    for _ in range(most):
+        slopes(space)
+        count = 0
+        for i in range(n):
+            if held[i] == 0:
+                space.free[count] = i
+                count += 1
+        if not factor_free(space, count):
+            return NOT_POSITIVE
+        newton(space, count)
+        length, first = 1.0, -1
+        for i in range(n):
+            towards = space.direction[i]
+            end = high[i] if towards > 0.0 else low[i]
+            if towards != 0.0 and moves[i] + towards * length > high[i]:
+                length, first = max(end - moves[i], 0.0) / towards, i
+            elif towards != 0.0 and moves[i] + towards * length < low[i]:
+                length, first = min(end - moves[i], 0.0) / towards, i
+        for i in range(n):
+            moves[i] = min(max(moves[i] + length * space.direction[i], low[i]), high[i])
+        if first >= 0:
+            moves[first] = high[first] if space.direction[first] > 0.0 else low[first]
+            held[first] = 1
+            continue
+        terms = slopes(space)
+        worst, pull = -1, CLOSE * terms
+        for i in range(n):
+            if held[i] == 1 and low[i] < high[i]:
+                away = -space.gradient[i] if moves[i] <= low[i] else space.gradient[i]
+                if away > pull:
+                    worst, pull = i, away
+        if worst < 0:
+            return OPTIMAL
+        held[worst] = 0
+    return UNFINISHED
+
+
+@kernel
 def solve(space: Space, most: int) -> int:
     """Write the best moves into ``space.moves`` and return a status.
 
     Projected Newton steps (Bertsekas 1982, doi 10.1137/0320018): moves at a bound that the slope
     presses against it are held, the others go to their common optimum along a path bent at the
-    bounds, and so on until no free move has a slope left. For a quadratic that ends after
-    finitely many steps at the optimum. The moves keep their bounds whatever the status.
+    bounds, and so on until no free move has a slope left. From a good start that takes two or
+    three steps; should it take more than BOLD, or a step not pay, :func:`finish` goes on. The
+    moves keep their bounds whatever the status.
 
     Whoever changes H must set ``space.factored[0] = -1``.
 
-    most : cap on steps
+    most : cap on the steps of :func:`finish`
     returned : OPTIMAL, NOT_POSITIVE (H is not, or something is not finite) or UNFINISHED
     """
     moves, low, high, gradient = space.moves, space.low, space.high, space.gradient
@@ -228,12 +294,10 @@ def solve(space: Space, most: int) -> int:
         start = moves[i] if math.isfinite(moves[i]) else 0.0
         moves[i] = min(max(start, low[i]), high[i])
     whole = False
-    for _ in range(most):
-        multiply(space.hessian, moves, gradient)
-        count, steepest, terms = 0, 0.0, 0.0
+    for _ in range(BOLD):
+        terms = slopes(space)
+        count, steepest = 0, 0.0
         for i in range(n):
-            terms = max(terms, max(abs(gradient[i]), abs(space.slope[i])))
-            gradient[i] += space.slope[i]
             pressed = (moves[i] <= low[i] and gradient[i] > 0.0) or (
                 moves[i] >= high[i] and gradient[i] < 0.0
             )
@@ -249,20 +313,9 @@ def solve(space: Space, most: int) -> int:
         newton(space, count)
         length = 1.0
         paid, whole = advance(space, length)
-        while not paid and length > 1e-6:
+        while not paid and length > 1e-3:
             length *= 0.5
             paid, whole = advance(space, length)
         if not paid:
-            # The bent path may go astray; the straight slope never does when short enough.
-            bound = 0.0
-            for i in range(n):
-                total = 0.0
-                for k in range(n):
-                    total += abs(space.hessian[i, k])
-                bound = max(bound, total)
-            space.direction[:] = 0.0
-            for i in range(count):
-                space.direction[space.free[i]] = -gradient[space.free[i]]
-            if not advance(space, 1.0 / bound)[0]:
-                return UNFINISHED
-    return UNFINISHED
+            break
+    return finish(space, most)

@@ -8,7 +8,7 @@ The model is (10) with the nominal friction and with mass and inertia of the bod
 .. math:: \bar\theta \dot\chi + \bar\eta(\chi)\chi + f(\chi)
           = \bar\theta_{nom}\,(c - \chi)/\ell \quad\text{or}\quad \bar\theta_{nom}\,u,
 
-plus an additive acceleration, the disturbance estimate. Cost and bounds are those of
+plus an additive acceleration, the disturbance estimate. Cost, bounds and observer are those of
 :mod:`t3mpc_ros.lab.rivals.linear_mpc`. A period is integrated by an exponential Runge-Kutta
 method of second order (Cox and Matthews 2002, doi 10.1006/jcph.2002.6995): the servo, which is
 the stiff part, exactly.
@@ -38,7 +38,7 @@ from t3mpc_ros.lab.rivals.linear_mpc import (
     torque_units,
 )
 from t3mpc_ros.lab.rivals.rival import Knowledge, Rival, View
-from t3mpc_ros.robot.dynamics import coriolis_factor, dynamics_vector, wheel_inertia
+from t3mpc_ros.robot.dynamics import BodySettings, coriolis_factor, dynamics_vector, wheel_inertia
 from t3mpc_ros.settings import Settings, setting
 
 Array = NDArray[np.float64]
@@ -76,6 +76,14 @@ class CasadiNmpcSettings(Settings):
         unit='s',
         low=0.02,
         high=50.0,
+    )
+    filter_time: float = setting(
+        0.1,
+        'time constant with which its own prediction of the speed is drawn to the estimate; the '
+        'least takes the estimate as it is',
+        unit='s',
+        low=0.001,
+        high=5.0,
     )
 
 
@@ -126,13 +134,11 @@ def wheel_dynamics(knowledge: Knowledge, model_error: float, casadi: Any) -> Any
     return casadi.Function('wheels', [chi, command, d], [after, *slopes])
 
 
-def believed_body(knowledge: Knowledge, model_error: float) -> Any:
-    """Return the nominal body with mass and inertia ``model_error`` times as large."""
+def believed_body(knowledge: Knowledge, factor: float) -> BodySettings:
+    """Return the nominal body with mass and inertia ``factor`` times as large."""
     body = knowledge.robot.body
     return replace(
-        body,
-        body_mass=model_error * body.body_mass,
-        body_inertia=model_error * body.body_inertia,
+        body, body_mass=factor * body.body_mass, body_inertia=factor * body.body_inertia
     )
 
 
@@ -246,8 +252,6 @@ class CasadiNmpc(Rival):
     ------
     ImportError
         CasADi is not installed.
-    ValueError
-        A view without a future.
     """
 
     settings_type: ClassVar[type[Settings]] = CasadiNmpcSettings
@@ -275,13 +279,14 @@ class CasadiNmpc(Rival):
             # As in the linear one: unknowns are torques, shares of their limit.
             self._units = torque_units(knowledge)
             changes = np.eye(n) - np.eye(n, k=-1)
-            self._damping = weight * np.kron(changes.T @ changes, self._units.T @ self._units)
+            squares = np.kron(changes.T @ changes, self._units.T @ self._units)
+            self._damping: Array = np.asarray(weight * squares, dtype=np.float64)
             reach = 1.0
         else:
             self._units = np.eye(2)
             self._damping = weight * np.eye(2 * n)
             reach = knowledge.acceleration * knowledge.period
-        self._first = weight * self._units if self._torque else np.zeros((2, 2))
+        self._first: Array = weight * self._units if self._torque else np.zeros((2, 2))
         self._space.low[:], self._space.high[:] = -reach, reach
 
         self._speeds = np.zeros((n + 1, 2))
@@ -301,7 +306,10 @@ class CasadiNmpc(Rival):
         self._errors = np.zeros(2 * n)
         self._response = np.zeros((2 * n, 2 * n))
         self._integral = np.zeros(2)
-        self._share = -math.expm1(-knowledge.period / settings.integral_time)
+        self._shares = tuple(
+            -math.expm1(-knowledge.period / time)
+            for time in (settings.integral_time, settings.filter_time)
+        )
         self._give = knowledge.period
         if not self._torque:
             self._give = knowledge.share * knowledge.lag
@@ -319,16 +327,16 @@ class CasadiNmpc(Rival):
         future = future_of(view, self.preview)
         expect_reference(view.wanted, view.wanted_next, future, 1.0, self._reference)
         before = self._answer if self._torque else view.command
-        self._learn(view, before)
+        speeds = self._learn(view, before)
         moves = self._space.moves
         moves[:-2] = moves[2:]
         if not self._torque:
             moves[-2:] = 0.0
         self._speeds[:-1] = self._speeds[1:]
         if not self._begun:
-            self._speeds[:] = view.speeds
+            self._speeds[:] = speeds
             self._begun = True
-        self._speeds[0] = view.speeds
+        self._speeds[0] = speeds
         np.clip(moves, self._space.low, self._space.high, out=moves)
         self._command(before)
         for _ in range(self.settings.iterations):
@@ -343,17 +351,21 @@ class CasadiNmpc(Rival):
         if self._torque:
             self._answer[:] = acceleration
 
-    def _learn(self, view: View, before: Array) -> None:
-        """Renew the disturbance: what the estimate holds beyond the model, and own misses."""
+    def _learn(self, view: View, before: Array) -> Array:
+        """Renew the disturbance and return the speeds the horizon starts from, rad/s."""
+        speeds = view.speeds
         if self._begun:
-            missed = before - self._commands[0]
-            expected = self._speeds[1] + missed @ self._by_command[0]
-            self._integral += self._share * (view.speeds - expected) / self._give
+            unlike = before - self._commands[0]
+            expected = self._speeds[1] + unlike @ self._by_command[0]
+            missed = view.speeds - expected
+            self._integral += self._shares[0] * missed / self._give
+            speeds = expected + self._shares[1] * missed
         explained = load_acceleration(
-            float(view.speeds[0]), float(view.speeds[1]), self._friction, self._dynamics
+            float(speeds[0]), float(speeds[1]), self._friction, self._dynamics
         )
         share = self.settings.disturbance_share
         self._loads[:] = self._integral + share * (view.unexplained - explained)
+        return speeds
 
     def _command(self, before: Array) -> None:
         """Write the commands that the moves mean."""

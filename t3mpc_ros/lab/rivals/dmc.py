@@ -37,6 +37,7 @@ from t3mpc_ros.lab.rivals.linear_mpc import (
     future_of,
     known_loads,
     load_acceleration,
+    torque_units,
     wheel_model,
 )
 from t3mpc_ros.lab.rivals.rival import Knowledge, Rival, View
@@ -69,11 +70,11 @@ class DynamicMatrixPreviewSettings(Settings):
         high=0.5,
     )
     bias_time: float = setting(
-        0.02,
+        0.3,
         'time constant of the bias b; the least makes it the latest miss, as first published',
         unit='s',
         low=0.001,
-        high=5.0,
+        high=20.0,
     )
     disturbance_share: float = setting(
         0.3, 'share of the shared disturbance estimate fed forward', low=0.01, high=2.0
@@ -149,12 +150,17 @@ def identify(model: WheelModel, inner_gain: float, least: int) -> Responses:
             run.append(speed)
         runs.append(run)
     steps, loads = np.array(runs)
-    away = np.flatnonzero(np.abs(steps - steps[-1]) > SETTLED * abs(steps[-1]))
-    if not np.isfinite(steps[-1]) or (away.size and away[-1] > 0.9 * LONGEST):
+    last = 0
+    settled = bool(np.isfinite(steps).all())
+    if settled:
+        away = np.flatnonzero(np.abs(steps - steps[-1]) > SETTLED * abs(steps[-1]))
+        last = int(away[-1]) if away.size else 0
+        settled = last < 0.9 * LONGEST
+    if not settled:
         raise ValueError(
             f'step response must settle within {LONGEST} periods: inner_gain is {inner_gain}'
         )
-    length = max(least, int(away[-1]) + 2 if away.size else 1)
+    length = max(least, last + 2)
     return Responses(steps[:length].copy(), loads[:length].copy())
 
 
@@ -278,7 +284,10 @@ class DynamicMatrix(Rival):
         """What it believes of a wheel."""
         response = response_matrix(self.responses.steps[:n], settings.moves)
         weight = (settings.move_time / period) ** 2
-        reach = np.inf if self._inner_gain else knowledge.acceleration * period
+        reach = knowledge.acceleration * period
+        if self._inner_gain and self.preview:
+            # A set point that is planned ahead should not outrun the motors, going straight on.
+            reach = float(torque_units(knowledge)[0].sum()) * period
         self._wheels = (make_space(settings.moves), make_space(settings.moves))
         for space in self._wheels:
             space.hessian[:] = response.T @ response + weight * np.eye(settings.moves)

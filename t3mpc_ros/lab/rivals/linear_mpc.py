@@ -10,12 +10,15 @@ Each wheel follows its command c (velocity drive) or integrates its input u (tor
 with the lag l or the gain b as ``model_error`` makes them. The moves x, changes of c or u from
 one period to the next, minimise
 
-.. math:: \sum_{j=1}^{N} (\chi_j - r_j)^2 + \rho \sum_{j=0}^{N-1} x_j^2, \qquad |x_j| \le a T,
+.. math:: \sum_{j=1}^{N} (\chi_j - r_j)^2 + \rho \sum_{j=0}^{N-1} x_j^2
 
-and the first of them is made. The disturbance d is the shared estimate and, so that no offset is
-left by a wrong model, an integral of the model's own prediction errors (Pannocchia and Rawlings
-2003, doi 10.1002/aic.690490213). What friction and turning will do along the reference is known
-of the nominal robot and enters as a measured disturbance.
+with |x_j| <= a T (velocity) or within the torque that the motors have (torque), and the first of
+them is made. The disturbance d is the shared estimate and, so that no offset is left by a wrong
+model, an integral of the model's own prediction errors (Pannocchia and Rawlings 2003,
+doi 10.1002/aic.690490213). The horizon starts from the model's
+prediction, drawn to the shared estimate by an observer: how hard noise is fed back and how
+sharply the reference is followed are then two choices. What friction and turning will do along
+the reference is known of the nominal robot and enters as a measured disturbance.
 """
 
 from dataclasses import dataclass
@@ -34,8 +37,8 @@ from t3mpc_ros.settings import Settings, setting
 
 Array = NDArray[np.float64]
 
-MOST = 100
-"""Cap on the steps of the solver; fewer than ten are needed."""
+MOST = 1000
+"""Cap on the steps of the solver; fewer than ten are usual."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,14 @@ class LinearMpcPreviewSettings(Settings):
         unit='s',
         low=0.02,
         high=50.0,
+    )
+    filter_time: float = setting(
+        0.1,
+        'time constant with which its own prediction of the speed is drawn to the estimate; the '
+        'least takes the estimate as it is',
+        unit='s',
+        low=0.001,
+        high=5.0,
     )
 
 
@@ -124,13 +135,7 @@ def torque_units(knowledge: Knowledge) -> Array:
 
 
 def future_of(view: View, preview: bool) -> Array:
-    """Return the known rows of the future, shape (n, 2), none without preview.
-
-    Raises
-    ------
-    ValueError
-        There should be a future, and there is none.
-    """
+    """Return the known rows of the future, (n, 2), none without preview; or raise ValueError."""
     if not preview:
         return np.zeros((0, 2))
     if view.future is None:
@@ -211,7 +216,8 @@ class Tuning(NamedTuple):
     first: float
     """Weight of the product of the first command and the one before it."""
     shares: Array
-    """Shape (3,): of the shared estimate, of the loads, of a prediction error (per period)."""
+    """Shape (4,): of the shared disturbance estimate, of the loads, and of a prediction error
+    what goes into the disturbance and into the speed (per period)."""
     friction: Array
     """Shape (3,), see :func:`load_acceleration`, as ``dynamics``."""
     dynamics: Array
@@ -223,7 +229,7 @@ class Past(NamedTuple):
     integral: Array
     """Disturbance from its own prediction errors, rad/s², shape (2,)."""
     speeds: Array
-    """chi of the last step, rad/s, shape (2,)."""
+    """chi that the last horizon started from, rad/s, shape (2,)."""
     disturbance: Array
     """What was expected to act after it, rad/s², shape (2,)."""
     begun: Array
@@ -258,15 +264,17 @@ def advise(
             reference[0, j], reference[1, j], tuning.friction, tuning.dynamics
         )
     for z in range(2):
+        speed = speeds[z]
         if past.begun[0] > 0.0:
-            expected = pole * past.speeds[z] + push * before[z] + give * past.disturbance[z]
-            past.integral[z] += shares[2] * (speeds[z] - expected) / give
+            speed = pole * past.speeds[z] + push * before[z] + give * past.disturbance[z]
+            missed = speeds[z] - speed
+            past.integral[z] += shares[2] * missed / give
+            speed += shares[3] * missed
         # The estimate holds the loads of now; those to come differ from them.
         steady = shares[0] * (unexplained[z] - shares[1] * errors[z, 0]) + past.integral[z]
-        past.speeds[z] = speeds[z]
+        past.speeds[z] = speed
         past.disturbance[z] = steady + shares[1] * errors[z, 0]
         # Free response: ``errors`` turns from loads to chi - r of the next N periods.
-        speed = speeds[z]
         for j in range(n):
             load = steady + shares[1] * errors[z, j]
             speed = pole * speed + push * lasting * before[z] + give * load
@@ -290,13 +298,7 @@ def advise(
 
 
 class LinearMpc(Rival):
-    """Linear predictive control that expects the reference to go on as it does now.
-
-    Raises
-    ------
-    ValueError
-        With preview: a view without a future.
-    """
+    """Linear predictive control that expects the reference to go on as it does now."""
 
     settings_type: ClassVar[type[Settings]] = LinearMpcSettings
 
@@ -338,6 +340,7 @@ class LinearMpc(Rival):
                     settings.disturbance_share,
                     settings.load_share,
                     -math.expm1(-knowledge.period / settings.integral_time),
+                    -math.expm1(-knowledge.period / settings.filter_time),
                 ]
             ),
             friction=friction,
