@@ -84,6 +84,11 @@ class Controller:
         """The law, with everything it has learnt."""
         return self._pursuit.law
 
+    @property
+    def drive(self) -> Drive:
+        """The seam to the robot: what is estimated and sent. A replay tells it what was sent."""
+        return self._drive
+
     def warm_up(self) -> None:
         """Compile and pre-train now, never inside a step."""
         self.law.warm_up()

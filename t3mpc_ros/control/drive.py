@@ -234,3 +234,25 @@ class Drive:
         )
         self.applied[:] = (self.command - self.ahead) / stretch
         return self.applied
+
+    def tell(self, wheels: Array) -> None:
+        """Take note of what was sent in the place of :meth:`send`'s answer, in a recorded run say.
+
+        Parameters
+        ----------
+        wheels
+            Commanded wheel speeds, rad/s, shape (2,); no limit is applied.
+
+        Raises
+        ------
+        ValueError
+            The drive takes torques, or these are not two finite numbers.
+        """
+        if not self._velocity:
+            raise ValueError('only a velocity drive can be told wheel speeds')
+        if np.shape(wheels) != (2,) or not np.isfinite(wheels).all():
+            raise ValueError(f'wheels must be two finite numbers: got {wheels}')
+        self._sent = True
+        self.limited = False
+        self.command[:] = wheels
+        self.applied[:] = (self.command - self.ahead) * (self._share / self._period)

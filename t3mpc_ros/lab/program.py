@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import webbrowser
 
 from t3mpc_ros.lab.paper.program import add_parser as add_paper
+from t3mpc_ros.lab.training.command import add_parser as add_train
 from t3mpc_ros.lab.tuning.command import add_parser as add_tune
 
 if TYPE_CHECKING:
@@ -135,6 +136,7 @@ def _parser() -> argparse.ArgumentParser:
 
     add_paper(commands)
     add_tune(commands, _contestants)
+    add_train(commands)
 
     warm = commands.add_parser('warm', help='compile every kernel into the cache')
     warm.set_defaults(run=_warm)

@@ -76,6 +76,7 @@ class PredictiveTerm:
         self._applied_sums = np.zeros(outputs)
         self._applied = np.zeros(outputs)
         self._v = np.zeros(outputs)
+        self._dither = np.zeros(outputs)
         self._jumps = np.zeros(outputs)
         self._fades = np.zeros(outputs)
         self.status: NDArray[np.int64] = np.zeros(outputs, dtype=np.int64)
@@ -135,17 +136,7 @@ class PredictiveTerm:
             )
             self._nominal_steps = nominal_step(self._loop, self._timing, settings.horizon)
         self.settings = settings
-        span = self._timing.span
-        self._how = Learning(
-            recursive=settings.learner == 'recursive',
-            contrast_rate=settings.contrast_rate,
-            output_rate=settings.output_rate,
-            keep=math.exp(-span / settings.memory),
-            smooth=math.exp(-span / 2.0),
-            skill_keep=math.exp(-span / settings.skill_memory),
-            offset_gain=settings.offset_gain,
-            noise=settings.noise,
-        )
+        self._how = Learning.of(settings, self._timing.span)
 
     def relearn(self, errors: Array | None = None, moves: Array | None = None) -> None:
         """Make new machines and teach them from the beginning, then :meth:`reset`.
@@ -154,13 +145,15 @@ class PredictiveTerm:
         ----------
         errors, moves
             A recorded run, oldest first, one row per predictive period, shape (N, outputs):
-            errors (rad/s) and the v_p applied after each (rad/s²). The last quarter is kept to
-            measure the skill. Without them the nominal loop is simulated, and so is the trial.
+            errors (rad/s) and the v_p applied after each (rad/s²), NaN where they are not known,
+            and in a row between two runs. Of the last quarter the longest stretch without a gap
+            is kept to measure the skill. Without them the nominal loop is simulated, and so is
+            the trial.
 
         Raises
         ------
         ValueError
-            The two do not have one shape (N, outputs), are not finite, or are too short.
+            The two do not have one shape (N, outputs), are infinite, or too little is known.
         """
         settings, outputs = self.settings, self._v.size
         recorded = None
@@ -194,9 +187,9 @@ class PredictiveTerm:
         """Forget the past, and start from v_p = 0; weights and skill are kept."""
         for array in (self._sums, self._applied_sums, self._applied, self._v, self._jumps):
             array[:] = 0.0
-        for table in (self._steps, self._free, self._prediction):
+        for table in (self._steps, self._free, self._prediction, self._fades, self._dither):
             table[:] = 0.0
-        self._fades[:] = 0.0
+        self._generator = np.random.default_rng((self.settings.seed, 1))
         self.status[:] = OPTIMAL
         self._phase = 0
         self._samples = 0
@@ -346,10 +339,11 @@ class PredictiveTerm:
             known_enough and calm and settings.learning,
             self._how,
         )
-        # (62) starts from v_p(t-1) as applied. A bound that has just been lowered is kept at
-        # once, because the compensator (81) counts on it: the change is then no part of dv_max.
-        v = self._v[z]
-        held = min(max(self._applied[z], min(v, 0.0)), max(v, 0.0))
+        # (62) starts from v_p(t-1) as applied, less the dither. A bound that has just been lowered
+        # is kept at once, because the compensator (81) counts on it: that is no part of dv_max.
+        dither = self._dither[z]
+        v = self._v[z] - dither
+        held = min(max(self._applied[z] - dither, min(v, 0.0)), max(v, 0.0))
         held = min(max(held, -settings.v_max), settings.v_max)
         foresee(
             predictor.machine,
@@ -387,4 +381,9 @@ class PredictiveTerm:
             self._prediction[z],
         )
         # Rounding must not carry v_p over its bound, nor leave dust when it is zero.
-        self._v[z] = min(max(held + self._space.changes[0], -bound), bound)
+        v = min(max(held + self._space.changes[0], -bound), bound)
+        self._v[z] = v
+        if settings.dither > 0.0 and settings.enabled:
+            level = v + settings.dither * self._generator.uniform(-1.0, 1.0)
+            self._v[z] = min(max(level, -settings.v_max), settings.v_max)
+        self._dither[z] = self._v[z] - v

@@ -83,6 +83,16 @@ class PredictiveSettings(Settings):
     dv_max: float = setting(
         4.0, 'bound of its change in a period T', unit='rad/s²', low=0.0, high=1e4, live=True
     )
+    dither: float = setting(
+        0.0,
+        'largest random level added to v_p, a new one each period: switch it on while a bag is '
+        'recorded that the predictor is to learn from, because feedback alone moves v_p too '
+        'little to show what it does',
+        unit='rad/s²',
+        low=0.0,
+        high=1e3,
+        live=True,
+    )
     probe: float = setting(
         1.0, 'dv of the step response (48), (51)', unit='rad/s²', low=1e-3, high=1e3
     )

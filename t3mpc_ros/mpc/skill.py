@@ -4,7 +4,7 @@
 
 from collections.abc import Mapping
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.mpc.machine import Machine, Past, begin, look, make_past, predict
 from t3mpc_ros.mpc.response import roll_forward
-from t3mpc_ros.mpc.settings import Excitation
+from t3mpc_ros.mpc.settings import Excitation, PredictiveSettings
 from t3mpc_ros.mpc.training import (
     Memory,
     contrast,
@@ -42,6 +42,20 @@ class Learning(NamedTuple):
     """Share of the latest miss that the offset e takes in."""
     noise: float
     """Standard deviation of an error that is mere noise (rad/s)."""
+
+    @classmethod
+    def of(cls, settings: PredictiveSettings, span: float) -> Self:
+        """Return what the settings mean for a predictive period of ``span`` s."""
+        return cls(
+            recursive=settings.learner == 'recursive',
+            contrast_rate=settings.contrast_rate,
+            output_rate=settings.output_rate,
+            keep=math.exp(-span / settings.memory),
+            smooth=math.exp(-span / 2.0),
+            skill_keep=math.exp(-span / settings.skill_memory),
+            offset_gain=settings.offset_gain,
+            noise=settings.noise,
+        )
 
 
 @kernel

@@ -147,11 +147,15 @@ def ridge(features: Array, targets: Array, penalty: float) -> Array:
 def study(machine: Machine, errors: Array, moves: Array, rate: float, features: Array) -> None:
     """Pass once through a run, oldest first; learn by (43), and write each mu_1.
 
-    errors, moves : newest first, length N
+    errors, moves : newest first, length N; NaN where they are not known
     rate          : gamma of (43), 0 to only look
-    features      : row i belongs to errors[i], shape (N - lags, hidden)
+    features      : row i belongs to errors[i], shape (N - lags, hidden); NaN if a lag is unknown
     """
+    n_errors, n_moves = machine.delta_lags, machine.lags.size - machine.delta_lags
     for i in range(features.shape[0] - 1, -1, -1):
+        features[i] = errors[i : i + 1 + n_errors].sum() + moves[i + 1 : i + 1 + n_moves].sum()
+        if math.isnan(features[i, 0]):
+            continue
         look(machine, errors, moves, i + 1)
         predict(machine)
         features[i] = machine.mu1
@@ -174,7 +178,7 @@ def pretrain(
     machine, memory
         Changed in place; the memory then holds the run as its prior.
     errors, moves
-        The run, *newest first*, in rad/s and rad/s²: simulated or recorded.
+        The run, *newest first*, in rad/s and rad/s²: simulated or recorded, NaN in its gaps.
     how
         Epochs, rate and ridge penalty.
     trust
@@ -185,32 +189,30 @@ def pretrain(
     Raises
     ------
     ValueError
-        The arrays differ in length, are not finite, or are too short to fit the output layer.
+        The arrays differ in length, are infinite, or hold too little to fit the output layer.
     """
     lags = max(machine.delta_lags, machine.lags.size - machine.delta_lags)
-    count = errors.size - lags
+    count, hidden = max(errors.size - lags, 0), machine.output_weights.size
     if errors.shape != moves.shape or errors.ndim != 1:
         raise ValueError(
             f'errors and moves must be of one length: got {errors.shape}, {moves.shape}'
         )
-    if count <= machine.output_weights.size:
-        raise ValueError(
-            f'errors must hold more than {machine.output_weights.size + lags} values: '
-            f'got {errors.size}'
-        )
-    if not (np.isfinite(errors).all() and np.isfinite(moves).all()):
-        raise ValueError('errors and moves must be finite: got inf or nan')
-    features = np.zeros((count, machine.output_weights.size))
-    for _ in range(how.epochs):
-        study(machine, errors, moves, how.contrast_rate, features)
-    study(machine, errors, moves, 0.0, features)
-    machine.output_weights[:] = ridge(features, errors[:count] / machine.scales[0], how.ridge)
-    square = features.T @ features / count
+    if np.isinf((errors, moves)).any():
+        raise ValueError('errors and moves must be finite, or NaN in gaps: got inf')
+    features = np.zeros((count, hidden))
+    for rate in (*[how.contrast_rate] * how.epochs, 0.0):
+        study(machine, errors, moves, rate, features)
+    known = ~np.isnan(features[:, 0])
+    features, targets = features[known], errors[:count][known] / machine.scales[0]
+    if targets.size <= hidden:
+        raise ValueError(f'errors must hold more than {hidden} finite values: got {targets.size}')
+    machine.output_weights[:] = ridge(features, targets, how.ridge)
+    square = features.T @ features / targets.size
     mean = float(np.trace(square))
     memory.information[:] = 0.0
     memory.prior[:] = trust * (square + how.ridge * mean / square.shape[0] * np.eye(len(square)))
     memory.anchor[:] = machine.output_weights
-    quiet = noise**2 / max(float(np.mean(errors**2)), noise**2)
+    quiet = noise**2 / max(float(np.nanmean(errors**2)), noise**2)
     memory.power[:] = (mean, mean, mean * quiet)
 
 
@@ -365,10 +367,12 @@ def _run(
 def split_runs(errors: Array, moves: Array, outputs: int) -> list[list[tuple[Array, Array]]]:
     """Return for each output the first three quarters and the rest of a run, *newest first*.
 
+    Of the rest it is the longest stretch without a gap: a trial goes through it step by step.
+
     Parameters
     ----------
     errors, moves
-        A recorded run, oldest first, shape (N, outputs).
+        A recorded run, oldest first, shape (N, outputs); NaN where it is not known.
 
     Raises
     ------
@@ -380,13 +384,17 @@ def split_runs(errors: Array, moves: Array, outputs: int) -> list[list[tuple[Arr
             f'errors and moves must be (N, {outputs}): got {errors.shape}, {moves.shape}'
         )
     cut = (3 * len(errors)) // 4
+    gaps = cut + np.flatnonzero(np.isnan(errors[cut:] + moves[cut:]).any(axis=1))
+    edges = [cut - 1, *gaps.tolist(), len(errors)]
+    longest = int(np.argmax(np.diff(edges)))
+    rest = slice(edges[longest] + 1, edges[longest + 1])
     return [
         [
             (
                 np.ascontiguousarray(errors[part, z][::-1]),
                 np.ascontiguousarray(moves[part, z][::-1]),
             )
-            for part in (slice(None, cut), slice(cut, None))
+            for part in (slice(None, cut), rest)
         ]
         for z in range(outputs)
     ]

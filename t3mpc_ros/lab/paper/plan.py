@@ -126,7 +126,15 @@ class Bench:
 DURATION = 59.5
 """Length of a run, s: four switches, and an end before the fifth, which methods with preview would
 begin to cross without the run seeing what it is good for."""
-RIVAL_CASES = ('mass +30 %', 'mass -30 %', 'friction x3')
+RIVAL_CASES = ('mass +30 %', 'mass -30 %')
+MEANT_FOR = {
+    WITHOUT['NT3FS']: ('mass +30 %', 'friction x3'),
+    WITHOUT['compensator']: ('disturbance',),
+    WITHOUT['MPC']: (DEAD_TIME, 'friction x3'),
+    WITHOUT['MPC, equal bound']: (DEAD_TIME, 'friction x3'),
+    WITHOUT['trained predictor']: (DEAD_TIME,),
+}
+"""The cases beside the nominal one in which the controller runs without a part."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +153,7 @@ class Extent:
     rival_noises: tuple[float, ...] = (PAPER_NOISE,)
     """The same of the rivals."""
     rival_cases: tuple[str, ...] = RIVAL_CASES
-    """The cases beside the nominal one that rivals run."""
+    """The cases beside the nominal one that rivals with preview run."""
     drives: tuple[str, ...] = DRIVES
 
     def __post_init__(self) -> None:
@@ -194,9 +202,10 @@ def extent(bench: Bench, *, quick: bool = False, seeds: int | None = None) -> Ex
 def cells(bench: Bench, extent: Extent) -> tuple[Cell, ...]:
     """Return every cell that is needed, each once, by drive, case, noise and method.
 
-    Every method in the nominal case at every noise; the stages of the controller in every case
-    at ``perturbed_noises``, and it with one part left out at ``missing_noises``; rivals in
-    ``rival_cases`` at ``rival_noises``.
+    Every rival and every stage of the controller in the nominal case at every noise; the stages
+    in every other case at ``perturbed_noises``; the controller with one part left out in the
+    cases that part is for, at ``missing_noises``; rivals with preview in ``rival_cases`` at
+    ``rival_noises``.
 
     Raises
     ------
@@ -219,17 +228,20 @@ def cells(bench: Bench, extent: Extent) -> tuple[Cell, ...]:
                 continue
             for noise in extent.noises:
                 for name, method in methods.items():
-                    if case == NOMINAL or noise in _perturbed(extent, method, case):
+                    if noise in _noises(extent, method, case):
                         found.append(Cell(name, drive, noise, case))
     return tuple(found)
 
 
-def _perturbed(extent: Extent, method: Method, case: str) -> tuple[float, ...]:
-    """Return the noises at which a method runs a case that is not the nominal one."""
-    if method.rival:
-        return extent.rival_noises if case in extent.rival_cases else ()
+def _noises(extent: Extent, method: Method, case: str) -> tuple[float, ...]:
+    """Return the noises at which a method runs a case."""
     if method.name in WITHOUT.values():
-        return extent.missing_noises
+        wanted = case == NOMINAL or case in MEANT_FOR.get(method.name, ())
+        return extent.missing_noises if wanted else ()
+    if case == NOMINAL:
+        return extent.noises
+    if method.rival:
+        return extent.rival_noises if method.preview and case in extent.rival_cases else ()
     return extent.perturbed_noises
 
 

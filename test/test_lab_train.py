@@ -1,0 +1,769 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Models from bags and from practice: the run rebuilt exactly, and what is learnt from it."""
+
+from dataclasses import replace
+import math
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from t3mpc_ros.control.controller import Controller, ControllerSettings
+from t3mpc_ros.control.drive import Drive, LimitSettings
+from t3mpc_ros.control.estimate import EstimateSettings
+from t3mpc_ros.control.law import TERMS
+from t3mpc_ros.fuzzy.estimator import FuzzyEstimator
+from t3mpc_ros.lab.program import main
+from t3mpc_ros.lab.training.bags import learn_from_bags
+from t3mpc_ros.lab.training.lessons import (
+    UNCERTAIN,
+    effect,
+    feedback_slope,
+    periods,
+    skills,
+    teach_coefficients,
+    teach_predictor,
+)
+from t3mpc_ros.lab.training.practice import (
+    assess,
+    full_settings,
+    held_out_seeds,
+    learn_from_practice,
+)
+from t3mpc_ros.lab.training.replay import NEEDED, Replay, TrainingError, answers, replay_bag
+from t3mpc_ros.lab.trial.scenario import HELD_OUT, PRACTICE, RATE, Scenario
+from t3mpc_ros.motion import Geometry, Motion, WheelSpeeds
+from t3mpc_ros.motion.kinematics import body_from_wheels, wheels_from_body
+from t3mpc_ros.motion.words import ORIGIN
+from t3mpc_ros.mpc.machine import Shape, look, make_machine, predict
+from t3mpc_ros.mpc.predictive import PredictiveTerm
+from t3mpc_ros.mpc.settings import Excitation, PredictiveSettings
+from t3mpc_ros.mpc.training import make_memory, pretrain, ridge, split_runs
+from t3mpc_ros.record import model
+from t3mpc_ros.record.model import ModelError, load_model, save_model
+from t3mpc_ros.record.reader import open_recording
+from t3mpc_ros.record.schema import RecordError
+from t3mpc_ros.record.writer import BagWriter
+from t3mpc_ros.robot.dynamics import wheel_inertia
+from t3mpc_ros.robot.loads import friction_torque
+from t3mpc_ros.robot.simulated import SimulatedRobot, SimulatedRobotSettings
+from t3mpc_ros.settings import SettingError
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+TYPES = STORE.types
+START = 1_700_000_000_000_000_000
+STEP = 10_000_000
+LEAD = 40
+WHEELS = ('right', 'left')
+GEOMETRY = Geometry()
+
+
+# -- a run as the nodes make it, and the bag of it --------------------------------------------
+
+
+def twist_message(twist):
+    vector = TYPES['geometry_msgs/msg/Vector3']
+    return TYPES['geometry_msgs/msg/Twist'](
+        vector(float(twist.linear), 0.0, 0.0), vector(0.0, 0.0, float(twist.angular))
+    )
+
+
+def odometry_message(motion):
+    stamp = TYPES['builtin_interfaces/msg/Time'](motion.stamp_ns // 10**9, motion.stamp_ns % 10**9)
+    place = TYPES['geometry_msgs/msg/Pose'](
+        TYPES['geometry_msgs/msg/Point'](0.0, 0.0, 0.0),
+        TYPES['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0),
+    )
+    return TYPES['nav_msgs/msg/Odometry'](
+        TYPES['std_msgs/msg/Header'](stamp, 'odom'),
+        'base_link',
+        TYPES['geometry_msgs/msg/PoseWithCovariance'](place, np.zeros(36)),
+        TYPES['geometry_msgs/msg/TwistWithCovariance'](twist_message(motion.twist), np.zeros(36)),
+    )
+
+
+class Tape:
+    """Messages by time of receipt; copies of it are damaged on purpose, then written as bags."""
+
+    def __init__(self, details, rows=()):
+        self.details = details
+        self.rows = list(rows)
+
+    def add(self, topic, received_ns, message):
+        data = bytes(STORE.serialize_cdr(message, message.__msgtype__))
+        self.rows.append((received_ns, topic, message.__msgtype__, data))
+
+    def where(self, keep):
+        """Return the messages for which ``keep(seconds, topic, count on its topic)`` is true."""
+        counts = {}
+        kept = []
+        for row in self.rows:
+            counts[row[1]] = counts.get(row[1], -1) + 1
+            if keep((row[0] - START) / 1e9, row[1], counts[row[1]]):
+                kept.append(row)
+        return Tape(self.details, kept)
+
+    def changed(self, **settings):
+        """Return the same messages beside other settings; None takes one away."""
+        table = {**self.details['controller'], **settings}
+        table = {name: value for name, value in table.items() if value is not None}
+        return Tape({'controller': table}, self.rows)
+
+    def write(self, folder):
+        with BagWriter(folder, details=self.details) as bag:
+            for topic, kind in {row[1]: row[2] for row in self.rows}.items():
+                bag.add_topic(topic, kind)
+            for received_ns, topic, _, data in sorted(self.rows, key=lambda row: row[0]):
+                bag.write(topic, received_ns, received_ns, data)
+        return folder
+
+
+class ClosedLoop:
+    """Runs the controller on the simulated robot, as the nodes close the loop."""
+
+    def __init__(self, seed, duration, learnt=None, tape=False, off=(), **changes):
+        scenario = Scenario('velocity', 0.04, 'nominal', seed, duration)
+        robot = SimulatedRobot(scenario.robot())
+        self.controller = Controller(ControllerSettings.from_flat(changes))
+        if learnt is not None:
+            self.controller.law.restore(learnt)
+        settings = {name: str(value) for name, value in self.controller.settings.flat().items()}
+        self.tape = Tape(
+            {'controller': {**settings, 'terms_rate': '20.0', 'use_sim_time': 'False'}}
+        )
+        self.taped = tape
+        self.wanted = scenario.reference().wanted
+        self.statuses, self.speeds, self.estimates, self.unexplained = [], [], [], []
+        for k in range(LEAD):
+            self._tell(k, 0)
+        state = robot.advance(START)
+        for k in range(scenario.steps):
+            heard_ns = START + k * STEP + 1_000_000
+            self._tell(k + LEAD, heard_ns - 500_000)
+            if off:
+                self.controller.enable(not off[0] <= k < off[1])
+            twist, status = self.controller.step(state.odometry)
+            self.statuses.append(status)
+            self.speeds.append(state.true_wheels)
+            self.estimates.append(self.controller.drive.speeds.copy())
+            self.unexplained.append(self.controller.drive.unexplained.copy())
+            if tape:
+                self._record(k, heard_ns, state.odometry, twist, status)
+            state = robot.step(wheels_from_body(twist, GEOMETRY))
+        self.terms = np.array([status.terms for status in self.statuses])
+        self.errors = -self.terms[:, 1] / self.controller.settings.law.gain
+
+    def _tell(self, k, heard_ns):
+        twist = body_from_wheels(WheelSpeeds(*self.wanted[k].tolist()), GEOMETRY)
+        motion = Motion(START + k * STEP, ORIGIN, twist)
+        self.controller.add_reference(motion)
+        if self.taped:
+            self.tape.add('/reference', heard_ns or START, odometry_message(motion))
+
+    def _record(self, k, heard_ns, odometry, twist, status):
+        self.tape.add('/odom', heard_ns, odometry_message(odometry))
+        self.tape.add('/cmd_vel', heard_ns + 1_000_000, twist_message(twist))
+        if (k + 1) % 5:
+            return
+        for row, term in enumerate(TERMS):
+            for z, wheel in enumerate(WHEELS):
+                self.tape.add(
+                    f'/controller/terms/{term}/{wheel}',
+                    heard_ns + 2_000_000,
+                    TYPES['std_msgs/msg/Float64'](float(status.terms[row, z])),
+                )
+
+    def rmse(self, seconds):
+        n = round(100 * seconds)
+        return float(np.sqrt(np.mean((np.array(self.speeds[:n]) - self.wanted[:n]) ** 2)))
+
+
+@pytest.fixture(scope='module')
+def run():
+    return ClosedLoop(3, 40.0, tape=True, **{'predictive.dither': 4.0})
+
+
+@pytest.fixture(scope='module')
+def bag(run, tmp_path_factory):
+    return run.tape.write(tmp_path_factory.mktemp('whole') / 'bag')
+
+
+@pytest.fixture(scope='module')
+def replayed(bag):
+    return replay_bag(bag)
+
+
+@pytest.fixture(scope='module')
+def sampled(replayed):
+    replay, settings, _ = replayed
+    return periods(replay, settings.predictive, settings.rate)
+
+
+@pytest.fixture(scope='module')
+def trained(bag):
+    return learn_from_bags([bag])
+
+
+@pytest.fixture(scope='module')
+def calm(tmp_path_factory):
+    """Return the bag of an ordinary run, in which nothing but feedback moves v_p."""
+    return ClosedLoop(5, 16.0, tape=True).tape.write(tmp_path_factory.mktemp('calm') / 'bag')
+
+
+# -- rebuilding ---------------------------------------------------------------------------------
+
+
+def test_the_replay_is_the_run(run, replayed):
+    replay, settings, notes = replayed
+    assert notes == []
+    assert settings == run.controller.settings
+    assert len(replay) == len(run.statuses)
+    np.testing.assert_allclose(replay.errors, run.errors, atol=1e-9)
+    np.testing.assert_allclose(replay.speeds, run.estimates, atol=1e-9)
+    np.testing.assert_allclose(replay.unexplained, run.unexplained, atol=1e-7)
+    published = np.flatnonzero(np.isfinite(replay.moves[:, 0]))
+    np.testing.assert_array_equal(published, np.arange(4, 4000, 5))
+    np.testing.assert_array_equal(replay.moves[published], run.terms[published, 4])
+    limited = [status.limited for status in run.statuses]
+    assert np.mean(replay.limited == limited) > 0.999
+    assert np.flatnonzero(replay.begins).tolist() == [0]
+
+
+def test_periods_are_sampled_as_the_machine_samples_them(run, sampled):
+    """Errors as means of five, v_p as held from then on: whatever the step of publishing."""
+    errors, moves = sampled
+    inner = np.flatnonzero(np.isfinite(errors[:, 0]))
+    np.testing.assert_array_equal(np.diff(inner), 1)
+    last = 3995
+    for back, row in enumerate(inner[::-1]):
+        step = last - 5 * back
+        np.testing.assert_allclose(errors[row], run.errors[step - 4 : step + 1].mean(axis=0))
+        if np.isfinite(moves[row]).all():
+            np.testing.assert_array_equal(moves[row], run.terms[step, 4])
+    assert inner.size > 790
+    # v_p is not what acted where limits cut u for most of a period, at switches.
+    cut = [np.mean([s.limited for s in run.statuses[k : k + 5]]) > 0.5 for k in range(0, 4000, 5)]
+    assert np.count_nonzero(np.isnan(moves[inner, 0])) <= np.count_nonzero(cut) + 5
+
+
+def test_a_recording_may_begin_in_mid_run(run, sampled, tmp_path):
+    """Which step v_p changes at is then seen in u alone."""
+    late = run.tape.where(lambda t, topic, i: 7.033 < t < 22.0).write(tmp_path / 'bag')
+    replay, settings, _ = replay_bag(late)
+    errors, moves = periods(replay, settings.predictive, settings.rate)
+    errors, moves = errors[-202:-2], moves[-202:-2]
+    first = int(np.flatnonzero(np.isfinite(moves[:, 0]))[0])
+    start = int(np.nanargmin(np.abs(sampled[1][:, 0] - moves[first, 0]))) - first
+    np.testing.assert_allclose(errors, sampled[0][start : start + 200], atol=1e-3)
+    np.testing.assert_array_equal(moves, sampled[1][start : start + 200])
+
+
+def test_what_is_lost_leaves_gaps_and_spoils_nothing_else(run, sampled, tmp_path):
+    def keep(t, topic, i):
+        if topic.startswith('/controller'):
+            return i % 40 != 7
+        return not (topic == '/cmd_vel' and i % 301 == 150) and t < 20.0
+
+    replay, settings, notes = replay_bag(run.tape.where(keep).write(tmp_path / 'bag'))
+    assert any('have no cmd_vel after them' in note for note in notes)
+    errors, moves = periods(replay, settings.predictive, settings.rate)
+    whole = {tuple(move): error for error, move in zip(*sampled, strict=True)}
+    known = np.flatnonzero(np.isfinite(errors + moves).all(axis=1))
+    assert 330 < known.size < 392
+    found = np.array([whole[tuple(moves[row])] for row in known])
+    missed = np.abs(found - errors[known]).max(axis=1)
+    assert np.percentile(missed, 95) < 1e-6
+    assert missed.max() < 0.02
+    # No two runs were joined: neighbours in the table were neighbours in time.
+    order = {tuple(move): i for i, move in enumerate(sampled[1])}
+    places = np.array([order[tuple(moves[row])] for row in known])
+    np.testing.assert_array_equal(np.diff(places)[np.diff(known) == 1], 1)
+
+
+def test_a_stretch_in_which_the_robot_was_stopped_is_left_out(tmp_path):
+    stopped = ClosedLoop(3, 14.0, tape=True, off=(600, 803), **{'predictive.dither': 4.0})
+    replay, settings, _ = replay_bag(stopped.tape.write(tmp_path / 'bag'))
+    errors, moves = periods(replay, settings.predictive, settings.rate)
+    known = np.isfinite(errors + moves).all(axis=1)
+    held = {tuple(status.terms[4]) for status in stopped.statuses if status.reason.moves}
+    assert all(tuple(move) in held for move in moves[known])
+    samples = {
+        tuple(stopped.terms[step, 4]): stopped.errors[step - 4 : step + 1].mean(axis=0)
+        for part in (range(5, 600, 5), range(808, 1400, 5))
+        for step in part
+    }
+    assert np.count_nonzero(known) > 200
+    missed = [np.abs(samples[tuple(moves[k])] - errors[k]).max() for k in np.flatnonzero(known)]
+    assert np.percentile(missed, 90) < 1e-6
+
+
+def test_jumps_that_the_law_is_told_of_are_no_errors(tmp_path):
+    """Left to the program, a switch makes the error jump; the machine does not see that part."""
+    jumping = ClosedLoop(3, 14.0, tape=True, **{'switches.crossing': 'program'})
+    replay, _, _ = replay_bag(jumping.tape.write(tmp_path / 'bag'))
+    part = slice(1150, 1400)
+    assert np.abs(jumping.errors[part]).max() > 1.0
+    assert np.abs(replay.errors[part]).max() < 0.5 * np.abs(jumping.errors[part]).max()
+    quiet = slice(300, 1150)
+    np.testing.assert_allclose(replay.errors[quiet], jumping.errors[quiet], atol=1e-3)
+
+
+def test_each_command_answers_its_own_message_however_they_were_received():
+    rng = np.random.default_rng(1)
+    asked = 0.01 * np.arange(3000)
+    given = asked + rng.exponential(0.004, asked.size)  # now and then behind the next message
+    given[::50] -= 0.006  # or even heard before its own
+    order = np.argsort(given)
+    np.testing.assert_array_equal(answers(asked, given[order]), np.arange(3000))
+    lost = np.delete(np.arange(3000), [500, 1300, 1301, 2200])
+    found = answers(asked, np.sort(given[lost]))
+    assert np.mean(found == lost) > 0.99
+    late = answers(asked, given[order][700:])  # the first commands are not in the bag
+    np.testing.assert_array_equal(late, np.arange(700, 3000))
+    # When messages stop, the watchdog says stop: that answers none.
+    silent = answers(asked[:500], np.append(given[:500], [5.3, 5.35, 5.4]))
+    assert silent[-3:].tolist() == [-1, -1, -1]
+
+
+# -- what is learnt -----------------------------------------------------------------------------
+
+
+def test_the_predictor_of_a_bag_is_at_least_as_good_as_that_of_the_lab(run, sampled, trained):
+    """On the quarter that it has not seen; the practice is 120 s of three other runs."""
+    learnt, settings, text = trained
+    last_quarter = [each[1] for each in split_runs(*sampled, 2)]
+    practised = learn_from_practice('velocity')[0]
+    own, lab = (
+        skills(
+            settings.predictive,
+            0.05,
+            {k.removeprefix('predictive.'): v for k, v in each.items() if k.startswith('pred')},
+            last_quarter,
+        )
+        for each in (learnt, practised)
+    )
+    assert own.min() > 0.5
+    assert np.all(own > 0.9 * lab)
+    lesson = teach_predictor(settings, *sampled)
+    np.testing.assert_array_equal(lesson.after, own)
+    assert np.all(lesson.after > lesson.before)
+    assert f'predictor: learnt from {lesson.taught:.1f} s' in text
+    assert 28.0 < lesson.taught <= 30.0
+    for value in own.ravel():
+        assert f'{value:.2f}' in text
+
+
+def test_the_effect_of_v_p_is_that_of_the_loop(run, sampled):
+    """A lasting v_p leaves v_p over the slope of all that works against a small error."""
+    expected = 1.0 / feedback_slope(run.controller.settings)
+    for errors, moves in (each[0] for each in split_runs(*sampled, 2)):
+        found = effect(errors, moves, 4, 4, 5)
+        assert found.response == pytest.approx(expected, abs=3.0 * found.error)
+        assert found.error < 0.25 * expected
+
+
+def test_the_coefficients_are_the_friction(replayed):
+    """What the servo feels of it, on speeds that were kept back."""
+    replay, settings, _ = replayed
+    lesson = teach_coefficients(settings, replay)
+    robot = SimulatedRobotSettings()
+    inverse = np.linalg.inv(wheel_inertia(robot.body, robot.geometry))
+    table = robot.friction
+    felt = 0.02 / 0.01 * (1.0 - math.exp(-0.01 / 0.02))
+    estimator = FuzzyEstimator(settings.fuzzy, settings.adaptation)
+    estimator.coefficients = lesson.coefficients
+    speeds = replay.speeds[3000::10]
+    found = np.array([estimator.evaluate(chi) for chi in speeds])
+    torque = [
+        [friction_torque(w, table.viscous, table.coulomb, table.coulomb_width) for w in chi]
+        for chi in speeds
+    ]
+    true = -felt * np.array(torque) @ inverse.T
+    share = 1.0 - np.mean((found - true) ** 2, axis=0) / np.var(true, axis=0)
+    assert share.min() > 0.7
+    # Of the acceleration itself it is less: disturbance and noise are no function of chi.
+    assert 0.15 < lesson.explained.min() < lesson.explained.max() < 0.7
+
+
+def test_the_first_seconds_are_better_with_the_model_than_without(trained, tmp_path):
+    learnt, settings, _ = trained
+    save_model(tmp_path / 'm.npz', learnt, settings.flat())
+    loaded = load_model(tmp_path / 'm.npz')
+    for seed in (103, 104):
+        fresh, taught = ClosedLoop(seed, 6.0), ClosedLoop(seed, 6.0, learnt=loaded)
+        assert taught.rmse(6.0) < 0.85 * fresh.rmse(6.0)
+    assert np.all(taught.statuses[0].skill > 0.0)
+
+
+def test_equal_bags_give_equal_models(bag, trained):
+    again, settings, text = learn_from_bags([bag])
+    assert (settings, text) == trained[1:]
+    assert set(again) == set(trained[0])
+    for name, values in again.items():
+        np.testing.assert_array_equal(values, trained[0][name])
+
+
+def test_several_bags_teach_together(run, trained, tmp_path):
+    halves = [
+        run.tape.where(lambda t, topic, i, a=a: a <= t < a + 20.0).write(tmp_path / f'bag{a:g}')
+        for a in (0.0, 20.0)
+    ]
+    both, settings, text = learn_from_bags(halves)
+    assert 'from 2 bags' in text
+    replay = Replay.joined([replay_bag(half)[0] for half in halves])
+    errors, moves = periods(replay, settings.predictive, settings.rate)
+    assert np.flatnonzero(replay.begins).tolist() == [0, 2000]
+    lesson = teach_predictor(settings, errors, moves)
+    assert lesson.after.min() > 0.5
+    assert np.max(lesson.uncertainty) < 0.3
+    np.testing.assert_array_equal(
+        both['predictive.output_weights'], lesson.weights['output_weights']
+    )
+
+
+def test_the_effect_is_found_within_its_standard_error():
+    """delta_t = 0.6 delta_(t-1) + 0.03 v_(t-1) + w: 5 steps on it is 0.03 (1 - 0.6^5)/0.4."""
+    rng = np.random.default_rng(4)
+    true = 0.03 * (1.0 - 0.6**5) / 0.4
+    misses, claimed = [], {400: [], 1600: []}
+    for count in claimed:
+        for _ in range(15):
+            moves, errors = rng.uniform(-4.0, 4.0, count), np.zeros(count)
+            for t in range(1, count):
+                errors[t] = 0.6 * errors[t - 1] + 0.03 * moves[t - 1] + 0.05 * rng.normal()
+            errors[count // 2] = math.nan
+            found = effect(errors[::-1], moves[::-1], 4, 4, 5)
+            misses.append((found.response - true) / found.error)
+            claimed[count].append(found.error)
+            assert found.own == pytest.approx(4.0 / math.sqrt(3.0), rel=0.1)
+    assert np.std(misses) == pytest.approx(1.0, abs=0.3)
+    assert np.mean(claimed[400]) == pytest.approx(2.0 * np.mean(claimed[1600]), rel=0.15)
+
+
+def test_feedback_alone_does_not_show_the_effect():
+    rng = np.random.default_rng(5)
+    errors = rng.normal(size=500)
+    assert effect(errors, -2.0 * errors, 4, 4, 5).error == math.inf
+    assert effect(errors, np.zeros(500), 4, 4, 5).own == 0.0
+    assert effect(errors[:12], errors[:12], 4, 4, 5).error == math.inf
+
+
+# -- what cannot be learnt ----------------------------------------------------------------------
+
+
+def test_too_little_movement_of_v_p_is_refused_with_its_size(calm):
+    with pytest.raises(TrainingError, match=r'moved by 0\.0\d+ rad/s².*predictive\.dither'):
+        learn_from_bags([calm])
+
+
+def test_the_coefficients_can_be_learnt_without_the_predictor(calm):
+    learnt, settings, text = learn_from_bags([calm], keep_predictor=True)
+    assert 'kept as the nominal loop has taught it' in text
+    law = Controller(settings).law
+    for name, values in law.learnt().items():
+        if name != 'fuzzy.coefficients':
+            np.testing.assert_array_equal(learnt[name], values)
+    assert np.abs(learnt['fuzzy.coefficients']).max() > 1.0
+    law.restore(learnt)
+
+
+@pytest.mark.parametrize('gone', NEEDED)
+def test_missing_topics_are_named(run, tmp_path, gone):
+    folder = run.tape.where(lambda t, topic, i: t < 0.5 and topic != f'/{gone}').write(
+        tmp_path / 'bag'
+    )
+    with pytest.raises(TrainingError, match=f'missing, or have no message: {gone}'):
+        replay_bag(folder)
+
+
+def test_all_missing_topics_are_named_at_once(run, tmp_path):
+    folder = run.tape.where(lambda t, topic, i: t < 0.5 and topic == '/odom').write(
+        tmp_path / 'bag'
+    )
+    with pytest.raises(TrainingError) as caught:
+        replay_bag(folder)
+    assert all((name in str(caught.value)) == (name != 'odom') for name in NEEDED)
+
+
+def test_too_short_a_run_is_refused_with_its_length(run, tmp_path):
+    folder = run.tape.where(lambda t, topic, i: t < 12.0).write(tmp_path / 'bag')
+    with pytest.raises(TrainingError, match=r'at least 10 s .* got 9\.0 s and [23]\.\d s'):
+        learn_from_bags([folder])
+    shorter = run.tape.where(lambda t, topic, i: t < 3.0).write(tmp_path / 'short')
+    with pytest.raises(TrainingError, match=r'at least 10 s of motion: got 2\.\d s'):
+        learn_from_bags([shorter], keep_predictor=True)
+
+
+def test_v_p_that_is_published_too_seldom_is_refused(run, tmp_path):
+    folder = run.tape.where(
+        lambda t, topic, i: t < 15.0 and not (topic.startswith('/controller') and i % 2)
+    ).write(tmp_path / 'bag')
+    with pytest.raises(TrainingError, match='terms_rate to 20 Hz'):
+        learn_from_bags([folder])
+
+
+def nan_tape(tape, topic, share, seed=1):
+    """Return the tape with a share of the messages of a topic not a number."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for received_ns, name, kind, data in tape.rows:
+        if name == topic and rng.random() < share:
+            message = STORE.deserialize_cdr(data, kind)
+            if kind.endswith('Odometry'):
+                message.twist.twist.linear.x = math.nan
+            elif kind.endswith('Twist'):
+                message.linear.x = math.nan
+            else:
+                message.data = math.nan
+            data = bytes(STORE.serialize_cdr(message, kind))
+        rows.append((received_ns, name, kind, data))
+    return Tape(tape.details, rows)
+
+
+@pytest.mark.parametrize(
+    'topic', ['/odom', '/reference', '/cmd_vel', '/controller/terms/feedback/left']
+)
+def test_nothing_but_nan_is_an_error(run, tmp_path, topic):
+    short = run.tape.where(lambda t, name, i: t < 1.0)
+    folder = nan_tape(short, topic, 1.1).write(tmp_path / 'bag')
+    with pytest.raises(TrainingError, match='finite'):
+        replay_bag(folder)
+
+
+def test_a_few_nan_leave_gaps_and_are_told(run, tmp_path):
+    tape = run.tape.where(lambda t, name, i: t < 20.0)
+    for topic in ('/cmd_vel', '/controller/terms/predictive/right'):
+        tape = nan_tape(tape, topic, 0.01)
+    learnt, _, text = learn_from_bags([tape.write(tmp_path / 'bag')])
+    assert 'messages of /cmd_vel are not finite' in text
+    assert all(np.isfinite(values).all() for values in learnt.values())
+
+
+@pytest.mark.parametrize(
+    'settings, complaint',
+    [
+        ({'law.gain': '20.0'}, 'other settings'),
+        ({'estimate.noise_variance': '1.0'}, 'other settings'),
+        ({'law.gain': 'much'}, "law.gain must be a number: got 'much'"),
+        ({'predictive.every': '0'}, 'predictive.every must be'),
+        ({'predictive.horizon': 'None'}, 'predictive.horizon must be a whole number'),
+    ],
+    ids=str,
+)
+def test_wrong_settings_are_refused(run, tmp_path, settings, complaint):
+    tape = run.tape.where(lambda t, topic, i: t < 4.0).changed(**settings)
+    with pytest.raises(TrainingError, match=complaint):
+        replay_bag(tape.write(tmp_path / 'bag'))
+
+
+def test_settings_that_are_not_in_the_bag(run, tmp_path):
+    tape = run.tape.where(lambda t, topic, i: t < 4.0)
+    _, settings, notes = replay_bag(tape.changed(handover=None).write(tmp_path / 'one'))
+    assert settings.handover == ControllerSettings().handover
+    assert any('taken at their defaults: handover' in note for note in notes)
+    with pytest.raises(TrainingError, match='settings are not in the bag'):
+        replay_bag(Tape({}, tape.rows).write(tmp_path / 'none'))
+
+
+def test_bags_made_under_different_settings_are_not_mixed(run, calm, tmp_path):
+    tape = run.tape.where(lambda t, topic, i: t < 4.0)
+    one = tape.write(tmp_path / 'one')
+    other = tape.changed(**{'adaptation.radius': '30.0', 'predictive.dither': '1.0'})
+    with pytest.raises(TrainingError, match=r'differ in adaptation\.radius \(40\.0, 30\.0\)$'):
+        learn_from_bags([one, other.write(tmp_path / 'other')])
+    with pytest.raises(TrainingError, match='at least one bag'):
+        learn_from_bags([])
+    with pytest.raises(RecordError, match='no finished bag file'):
+        learn_from_bags([tmp_path / 'nowhere'])
+
+
+# -- the pieces it rests on ---------------------------------------------------------------------
+
+
+def _drive(kind='velocity'):
+    estimate = EstimateSettings(noise_variance=0.04)
+    return Drive(estimate, LimitSettings(), GEOMETRY, kind, 0.01)
+
+
+def test_a_drive_that_is_told_goes_on_as_the_one_that_sent():
+    rng = np.random.default_rng(6)
+    sender, told = _drive(), _drive()
+    for _ in range(200):
+        measured = rng.normal(size=2)
+        for drive in (sender, told):
+            drive.observe(measured, 0.01)
+        np.testing.assert_allclose(told.ahead, sender.ahead, atol=1e-12)
+        u = rng.uniform(-40.0, 40.0, 2)
+        applied = sender.send(u).copy()
+        told.send(rng.uniform(-40.0, 40.0, 2))
+        told.tell(sender.command)
+        np.testing.assert_allclose(told.applied, applied, atol=1e-9)
+        np.testing.assert_array_equal(told.command, sender.command)
+        assert not told.limited
+
+
+def test_a_drive_is_told_two_finite_wheel_speeds_or_nothing():
+    drive = _drive()
+    before = drive.command.copy()
+    for wrong in (np.array([1.0, math.nan]), np.ones(3)):
+        with pytest.raises(ValueError, match='two finite numbers'):
+            drive.tell(wrong)
+    np.testing.assert_array_equal(drive.command, before)
+    with pytest.raises(ValueError, match='velocity drive'):
+        _drive('torque').tell(np.zeros(2))
+
+
+def test_runs_with_a_gap_between_them_are_learnt_as_two_runs():
+    """X_o is the ridge regression on the instants of both whose lags are all known."""
+    rng = np.random.default_rng(7)
+    runs = [(rng.normal(size=n), rng.normal(size=n)) for n in (60, 45)]
+    how = Excitation(epochs=0)
+
+    def machine():
+        return make_machine(Shape(4, 4, 12), 3.0, 20.0, 1.0, np.random.default_rng(8))
+
+    features, targets = [], []
+    for errors, moves in runs:
+        seen = machine()
+        for i in range(errors.size - 4):
+            look(seen, errors, moves, i + 1)
+            predict(seen)
+            features.append(seen.mu1.copy())
+            targets.append(errors[i] / 3.0)
+    joined = [np.concatenate([a, [math.nan], b]) for a, b in zip(*runs, strict=True)]
+    taught = machine()
+    pretrain(taught, make_memory(12), *joined, how, 20.0, 0.05)
+    expected = ridge(np.array(features), np.array(targets), how.ridge)
+    np.testing.assert_allclose(taught.output_weights, expected, rtol=1e-9)
+    with pytest.raises(ValueError, match='got inf'):
+        pretrain(machine(), make_memory(12), joined[0], np.full(106, np.inf), how, 20.0, 0.05)
+
+
+def test_the_trial_is_the_longest_stretch_without_a_gap_in_the_last_quarter():
+    errors = np.arange(80.0).reshape(40, 2)
+    errors[[3, 33, 38]] = math.nan
+    moves = -np.arange(80.0).reshape(40, 2)
+    taught, trial = split_runs(errors, moves, 2)[0]
+    np.testing.assert_array_equal(trial[0], errors[34:38, 0][::-1])
+    np.testing.assert_array_equal(trial[1], moves[34:38, 0][::-1])
+    assert taught[0].size == 30
+
+
+def _stepped(**changes):
+    term = PredictiveTerm(PredictiveSettings().changed(changes), 0.01, 39.3)
+    errors = 0.3 * np.random.default_rng(9).normal(size=(600, 2))
+    return np.array([term.step(error) for error in errors]), term.settings
+
+
+def test_dither_moves_v_p_by_itself_and_keeps_its_bound():
+    calm, _ = _stepped()
+    again, _ = _stepped(dither=0.0)
+    np.testing.assert_array_equal(calm, again)
+    moved, settings = _stepped(dither=5.0)
+    twice, _ = _stepped(dither=5.0)
+    np.testing.assert_array_equal(moved, twice)
+    assert np.abs(moved).max() <= settings.v_max
+    assert np.all(np.diff(moved, axis=0)[np.arange(599) % 5 != 4] == 0.0)
+    levels = np.diff(moved[::5], axis=0)
+    assert np.std(levels) == pytest.approx(5.0 * math.sqrt(2.0 / 3.0), rel=0.15)
+    assert abs(np.corrcoef(moved[::5].T)[0, 1]) < 0.3
+    np.testing.assert_array_equal(_stepped(dither=5.0, enabled=False)[0], 0.0)
+    with pytest.raises(SettingError, match='dither must be'):
+        PredictiveSettings(dither=-1.0)
+
+
+# -- practice, and the command line -------------------------------------------------------------
+
+
+def test_practice_on_the_command_line(tmp_path, capsys):
+    path = tmp_path / 'model.npz'
+    assert main(['train', '--drive', 'torque', '--seeds', '2', '--output', str(path)]) == 0
+    said = capsys.readouterr().out
+    practised, settings = learn_from_practice('torque')
+    loaded = load_model(path)
+    assert set(loaded) == set(practised)
+    for name, values in practised.items():
+        np.testing.assert_array_equal(loaded[name], values)
+    assert settings == full_settings('torque')
+    for word in (
+        f'seeds {", ".join(map(str, PRACTICE))}',
+        'next step',
+        'without model',
+        'with model',
+        '±',
+        f'on seeds {HELD_OUT[0]} to {HELD_OUT[1]}',
+        f'saved {path}',
+    ):
+        assert word in said
+    assert not set(held_out_seeds(20)) & set(PRACTICE)
+
+
+def test_practice_makes_the_first_seconds_better():
+    learnt, settings = learn_from_practice('velocity')
+    text = assess('velocity', settings, learnt, (103, 104))
+    rows = {line[:15].strip(): line[15:].split() for line in text.splitlines()}
+    assert float(rows['with model'][0]) < float(rows['without model'][0])
+    assert float(rows['difference'][0]) < 0.0
+
+
+def test_bags_on_the_command_line(bag, trained, tmp_path, capsys):
+    path = tmp_path / 'model.npz'
+    assert main(['train', str(bag), '--output', str(path)]) == 0
+    assert trained[2] in capsys.readouterr().out
+    loaded = load_model(path)
+    for name, values in trained[0].items():
+        np.testing.assert_array_equal(loaded[name], values)
+
+
+@pytest.mark.parametrize(
+    'arguments, complaint',
+    [
+        (['--seeds', '21'], 'seeds must be from 1 to 20: got 21'),
+        (['--seeds', '0'], 'seeds must be from 1 to 20: got 0'),
+        (['--keep-predictor'], 'is for bags'),
+        (['bag', '--drive', 'torque'], 'drive must be velocity for bags'),
+        (['nowhere'], 'no finished bag file'),
+    ],
+    ids=str,
+)
+def test_what_cannot_be_done_is_said_and_nothing_is_written(
+    arguments, complaint, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    assert main(['train', *arguments]) == 1
+    assert complaint in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_model_that_cannot_be_written_is_an_error(calm, tmp_path, capsys):
+    path = tmp_path / 'none' / 'model.npz'
+    assert main(['train', str(calm), '--keep-predictor', '--output', str(path)]) == 1
+    assert f'cannot write the model file {path}' in capsys.readouterr().err
+
+
+def test_a_model_of_another_format_is_refused_by_name(trained, tmp_path, monkeypatch):
+    path = tmp_path / 'old.npz'
+    monkeypatch.setattr(model, 'FORMAT', model.FORMAT + 1)
+    save_model(path, trained[0], {})
+    monkeypatch.undo()
+    with pytest.raises(ModelError, match=rf'{path} has model format 2, this is format 1'):
+        load_model(path)
+    (tmp_path / 'text.npz').write_text('no model')
+    with pytest.raises(ModelError, match='text.npz is not a model file'):
+        load_model(tmp_path / 'text.npz')
+
+
+def test_a_model_for_other_shapes_is_refused_when_it_is_loaded(trained):
+    settings = ControllerSettings()
+    other = replace(settings, predictive=replace(settings.predictive, hidden=16))
+    with pytest.raises(ValueError, match='must have shape'):
+        Controller(other).law.restore(trained[0])
+
+
+def test_the_bag_carries_the_settings_it_was_made_under(bag, run):
+    with open_recording(bag) as recording:
+        table = recording.details['controller']
+    assert table['predictive.dither'] == '4.0'
+    assert run.controller.settings.rate == RATE
+    assert UNCERTAIN < 1.0
