@@ -23,6 +23,12 @@ SHORTENED = {
     'scripts/run sim_robot': ([], True),
     'scripts/run controller --ros-args -p law.gain:=30.0': ([], True),
     'scripts/run all_in_one': (['--ros-args', '-p', 'folder:=OUTPUT/bag'], True),
+    'scripts/run lab paper --quick': (['--seeds', '1', '--output', 'OUTPUT/paper'], False),
+    'scripts/run lab tune': (
+        ['PI + feed-forward', '--evaluations', '2', '--output', 'OUTPUT/tuned.json'],
+        False,
+    ),
+    'scripts/run lab train': (['--seeds', '1', '--output', 'OUTPUT/model.npz'], False),
     'scripts/run lab exponents': (['--duration', '20'], False),
     'scripts/run lab estimation': (['--seeds', '2'], False),
     'scripts/run lab report runs/<time>/bag': (['--output', 'OUTPUT/report'], False),

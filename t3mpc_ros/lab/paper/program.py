@@ -158,7 +158,7 @@ def reproduce(bench: Bench, options: PaperOptions, progress: Any = None) -> str:
         if path is not None:
             write_json(path, content)
     write_csv(output / 'results.csv', [*compared, *exact])
-    (output / 'tables.md').write_text(markdown(tables), encoding='utf-8')
+    (output / 'tables.md').write_text(markdown(tables, claims), encoding='utf-8')
     (output / 'figures').mkdir(exist_ok=True)
     for stem, png in drawn.items():
         (output / 'figures' / f'{stem}.png').write_bytes(png)

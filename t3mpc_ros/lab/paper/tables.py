@@ -8,6 +8,7 @@ from html import escape
 import math
 
 from t3mpc_ros.lab.estimation import EstimationResult, difference
+from t3mpc_ros.lab.paper.claims import Claim
 from t3mpc_ros.lab.paper.plan import FULL, NOMINAL, PAPER_NOISE, STAGES, WITHOUT
 from t3mpc_ros.lab.paper.results import Paired, Results, Row
 from t3mpc_ros.lab.trial.statistics import interval, mean
@@ -198,14 +199,24 @@ def all_tables(results: Results, estimated: Sequence[EstimationResult]) -> dict[
     return {heading: [t for t in tables if t is not None] for heading, tables in found.items()}
 
 
-def markdown(tables: dict[str, list[Table]]) -> str:
-    """Return all tables as one Markdown text."""
+def claims_table(claims: Sequence[Claim], origin: str) -> Table:
+    """Return the claims of one origin, ``'ours'`` or ``'paper'``, with what was found."""
+    title = 'What this package is to show' if origin == 'ours' else 'What the paper says'
+    rows = [(claim.text, claim.found, claim.verdict) for claim in claims if claim.origin == origin]
+    return Table(title, ('claim', 'found', 'verdict'), tuple(rows))
+
+
+def markdown(tables: dict[str, list[Table]], claims: Sequence[Claim] = ()) -> str:
+    """Return all tables, and claims if there are any, as one Markdown text."""
     parts = [
         'Means over held-out seeds ± half the 95 % interval (Student\'s t). RMSE: true wheel '
         'speeds less reference, both wheels, without the first 3 s. Noise: variance of the '
         'measured wheel speeds, (rad/s)². An asterisk: the interval of a paired difference '
         'excludes zero.'
     ]  # fmt: skip
+    if claims:
+        judged = [claims_table(claims, origin) for origin in ('ours', 'paper')]
+        parts += ['## Claims', *(table.markdown() for table in judged)]
     for heading, group in tables.items():
         if group:
             parts += [f'## {heading}', *(table.markdown() for table in group)]
