@@ -2,14 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Our controller in the offline loop: the same as the node's, and better with each part."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from t3mpc_ros.control.controller import Controller, ControllerSettings
 from t3mpc_ros.lab.composed import Composed, ComposedSettings
+from t3mpc_ros.lab.contestants import methods
 from t3mpc_ros.lab.trial.loop import MethodSpec, run
 from t3mpc_ros.lab.trial.scenario import RATE, Scenario
 from t3mpc_ros.lab.trial.statistics import paired
+from t3mpc_ros.lab.tuning.store import StoreError, TunedStore
 from t3mpc_ros.motion import Motion, WheelSpeeds
 from t3mpc_ros.motion.kinematics import body_from_wheels, wheels_from_body
 from t3mpc_ros.motion.words import ORIGIN
@@ -118,3 +122,13 @@ def test_the_same_seed_gives_the_same_run_bit_for_bit():
     first, second = (run(scenario, _spec()) for _ in range(2))
     np.testing.assert_array_equal(first.speeds, second.speeds)
     np.testing.assert_array_equal(first.command, second.command)
+
+
+def test_methods_tuned_with_unequal_effort_are_not_compared():
+    store = TunedStore.load()
+    assert set(methods('velocity', store)) >= {'full', 'PI + feed-forward'}
+    entry = store.entry('full', 'velocity')
+    more = replace(entry.budget, evaluations=2 * entry.budget.evaluations)
+    store.put('full', 'velocity', replace(entry, budget=more))
+    with pytest.raises(StoreError, match='was tuned with'):
+        methods('velocity', store)

@@ -222,9 +222,11 @@ def methods(drive: str, store: TunedStore | None = None) -> dict[str, Entrant]:
     Raises
     ------
     StoreError
-        A method was not tuned in this drive, or what is stored does not fit it any more.
+        A method was not tuned in this drive, what is stored does not fit it any more, or the
+        methods were not tuned with equal effort.
     """
     tuned = TunedStore.load(SHIPPED) if store is None else store
+    tuned.check_equal()
     found: dict[str, Entrant] = {}
     for each in contestants():
         settings = tuned.applied(each.name, drive, each.start[drive])
