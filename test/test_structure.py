@@ -52,6 +52,7 @@ ROOMS = {
 }
 LIBRARIES = {
     'kernels': {'numba'},
+    'robot': {'yaml'},
     'record': {'mcap', 'rosbags', 'yaml'},
     'lab': {'matplotlib', 'yaml', 'cma', 'casadi'},
     'nodes': {'yaml'},

@@ -22,6 +22,18 @@ from t3mpc_ros.settings import SettingError, Settings, setting
 
 STILL = WheelSpeeds(0.0, 0.0)
 
+RANGE_SENSORS = (
+    'front_left',
+    'front_right',
+    'left_front',
+    'left_back',
+    'rear_left',
+    'rear_right',
+    'right_front',
+    'right_back',
+)
+"""The eight distance sensors, two on each side, in the order of every list of them."""
+
 
 class RobotCommand(NamedTuple):
     """Wheel speeds that are wanted, and when they were."""
@@ -57,6 +69,34 @@ class RobotStatus(NamedTuple):
     """The last command is too old to follow."""
     limited: bool
     """The command was larger than the limits allow; curvature was kept."""
+    slipping: bool = False
+    """Gyro and steps disagree: a wheel slips, is blocked, or its motor has lost steps."""
+    imu_fault: bool = False
+    """The inertial sensor does not answer."""
+    low_battery: bool = False
+    """The supply is so low that it should be charged."""
+
+
+class ImuSample(NamedTuple):
+    """What a planar robot needs of its inertial sensor, in the frame of the body."""
+
+    angular: float
+    """rad/s about the vertical, counter-clockwise, bias and all"""
+    forward: float
+    """m/s²"""
+    sideways: float
+    """m/s², to the left"""
+
+
+class BatteryReading(NamedTuple):
+    """The supply of motors and board."""
+
+    voltage: float
+    """V"""
+    current: float
+    """A, drawn; NaN where nobody measures it"""
+    charge: float
+    """What is left, 0 to 1; NaN where nobody knows"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +120,15 @@ class RobotState:
     """Known only in simulation."""
     truth: Motion | None = None
     """Known only in simulation."""
+    imu: ImuSample | None = None
+    """None where there is no such sensor, or it does not answer."""
+    ranges: tuple[float, ...] = ()
+    """m, one for each sensor in :data:`RANGE_SENSORS`: -inf nearer than the sensor can tell, inf
+    beyond its range, NaN not measured; empty where there are none."""
+    battery: BatteryReading | None = None
+    """None where it is not measured."""
+    lost_steps: tuple[int, int] | None = None
+    """Full steps the rotors are behind their fields, right first: known only in simulation."""
 
 
 class RobotBackend(Protocol):
