@@ -9,7 +9,8 @@ import pytest
 
 from t3mpc_ros.motion import BodyTwist, Geometry, WheelSpeeds
 from t3mpc_ros.motion.kinematics import body_from_wheels
-from t3mpc_ros.robot.backend import CommandGuard, GuardSettings, RobotCommand
+from t3mpc_ros.robot.backend import RobotCommand
+from t3mpc_ros.robot.guard import CommandGuard, GuardSettings
 from t3mpc_ros.settings import SettingError
 
 MS = 1_000_000

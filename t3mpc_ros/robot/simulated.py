@@ -11,10 +11,7 @@ from t3mpc_ros.motion import Geometry, Motion, Pose, WheelSpeeds
 from t3mpc_ros.motion.kinematics import body_from_wheels
 from t3mpc_ros.motion.words import NANOSECONDS
 from t3mpc_ros.robot.backend import (
-    CLOCK_WENT_BACK,
     STILL,
-    CommandGuard,
-    GuardSettings,
     RobotBackend,
     RobotCommand,
     RobotState,
@@ -23,6 +20,7 @@ from t3mpc_ros.robot.backend import (
 )
 from t3mpc_ros.robot.drive import STABLE, DriveSettings, Plant, fastest_rate
 from t3mpc_ros.robot.dynamics import BodySettings
+from t3mpc_ros.robot.guard import CLOCK_WENT_BACK, CommandGuard, GuardSettings
 from t3mpc_ros.robot.loads import (
     Disturbance,
     DisturbanceSettings,
