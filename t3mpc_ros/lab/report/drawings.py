@@ -43,7 +43,8 @@ DRAWINGS = (
     Drawing(
         'error',
         'Tracking error over time',
-        'Speed minus reference, at the stamps of the measurement.',
+        'Speed minus reference, at the stamps of the measurement: of the whole recording, though '
+        'only the time the robot was being driven is counted.',
         figures.error,
         (REFERENCE, ODOMETRY, TRUTH),
     ),

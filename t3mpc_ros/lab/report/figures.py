@@ -23,12 +23,14 @@ from t3mpc_ros.lab.report.canvas import (
     over_time,
 )
 from t3mpc_ros.lab.report.measures import (
+    driven,
     estimation_target,
     latencies,
     path_of,
     statistics,
     tracking_error,
 )
+from t3mpc_ros.lab.report.merit import UNMEASURED
 from t3mpc_ros.lab.report.recorded import (
     COMMAND,
     ODOMETRY,
@@ -64,10 +66,12 @@ def error(run: Run) -> Any:
     if not is_long(series):
         return None
     figure, axes = new_panels(2, 1.8)
+    moving = driven(series.time, run)
     for axis, wheel in zip(axes, WHEELS, strict=True):
         draw_line(axis, series, wheel, COLOURS['error'], 'speed minus reference')
-        rmse = statistics(series[wheel]).rmse
-        axis.set_title(f'{wheel} wheel, root mean square {rmse:.3g} rad/s')
+        rmse = statistics(series[wheel][moving]).rmse
+        size = f'{rmse:.3g} rad/s while driven' if moving.any() else UNMEASURED
+        axis.set_title(f'{wheel} wheel, RMSE {size}')
         axis.set_ylabel('error / rad/s')
     return over_time(figure, axes, run)
 

@@ -13,7 +13,8 @@ from t3mpc_ros.lab.report.recorded import COMMAND, ODOMETRY, REFERENCE, WHEELS, 
 Array = NDArray[np.float64]
 
 SETTLING = 1.0
-"""Seconds after the start and each switch that the second error statistic leaves out."""
+"""Seconds in which the robot catches up: left out after the start of the drive, and after each
+switch where it is to have settled; also the longest time left out before a switch."""
 WINDOW = 0.2
 """Width (s) over which the target of the estimate is smoothed."""
 
@@ -26,15 +27,24 @@ class ErrorStatistics:
     mae: float
     largest: float
     count: int
+    seconds: float
+    """How much time the samples stand for, s."""
 
 
-def statistics(error: Array) -> ErrorStatistics:
-    """Return root mean square, mean and largest of the absolute error."""
+def statistics(error: Array, period: float = math.nan) -> ErrorStatistics:
+    """Return root mean square, mean and largest of the absolute error.
+
+    Each sample of ``error`` (rad/s) stands for ``period`` seconds.
+    """
     size = np.abs(error[np.isfinite(error)])
     if not size.size:
-        return ErrorStatistics(math.nan, math.nan, math.nan, 0)
+        return ErrorStatistics(math.nan, math.nan, math.nan, 0, 0.0)
     return ErrorStatistics(
-        float(np.sqrt(np.mean(size**2))), float(size.mean()), float(size.max()), int(size.size)
+        float(np.sqrt(np.mean(size**2))),
+        float(size.mean()),
+        float(size.max()),
+        int(size.size),
+        size.size * period,
     )
 
 
@@ -60,15 +70,49 @@ def tracking_error(run: Run, measured: str) -> Series | None:
     return Series(time, errors)
 
 
-def settled(time: Array, switches: Array) -> NDArray[np.bool_]:
-    """Return which of ``time`` are not within :data:`SETTLING` seconds after a switch.
+def driving(run: Run) -> tuple[float, float]:
+    """Return from when to when the robot was being driven, s: first and last command but zero.
 
-    The first instant counts as a switch: the robot has yet to catch up with the reference.
+    Before, the controller did not follow the reference yet; after, it had stopped, though the
+    reference is stamped ahead and goes on. A stop in between belongs to the drive. From infinity
+    to minus infinity when every command was zero; the other way round when the bag has none.
     """
-    starts = np.unique(np.concatenate([time[:1], switches]))
-    last = np.searchsorted(starts, time, 'right') - 1
-    since: Array = time - starts[last]
-    return since >= SETTLING
+    command = run.motions.get(COMMAND)
+    if command is None:
+        return -math.inf, math.inf
+    moving = command.time[(command['linear'] != 0.0) | (command['angular'] != 0.0)]
+    return (float(moving[0]), float(moving[-1])) if moving.size else (math.inf, -math.inf)
+
+
+def driven(time: Array, run: Run) -> NDArray[np.bool_]:
+    """Return at which of ``time``, the stamps of an error, the robot was being driven (s).
+
+    The first :data:`SETTLING` seconds with a command and a reference are left out: the robot
+    has yet to catch up.
+    """
+    first, last = driving(run)
+    since: Array = time - np.maximum(first, time[:1])
+    return (since >= SETTLING) & (time <= last)
+
+
+def foreseen(run: Run) -> float:
+    """Return how long before a switch a controller may already be leaving the old reference, s.
+
+    A switch is known as long before as the reference is stamped ahead. No controller needs
+    longer for it than :data:`SETTLING`, however far ahead the stamps are.
+    """
+    return min(run.lead, SETTLING)
+
+
+def settled(time: Array, switches: Array, before: float) -> NDArray[np.bool_]:
+    """Return which of ``time`` are not about a switch, all in seconds.
+
+    About a switch is from ``before`` seconds before it until :data:`SETTLING` seconds after it.
+    """
+    following = np.searchsorted(switches, time, 'right')
+    since: Array = time - np.concatenate([[-math.inf], switches])[following]
+    until: Array = np.concatenate([switches, [math.inf]])[following] - time
+    return (since >= SETTLING) & (until > before)
 
 
 def variation(series: Series, name: str) -> float:

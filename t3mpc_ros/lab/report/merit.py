@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from t3mpc_ros.lab.report.measures import (
-    SETTLING,
     ErrorStatistics,
+    driven,
+    foreseen,
     latencies,
     settled,
     statistics,
@@ -20,14 +21,18 @@ from t3mpc_ros.lab.report.measures import (
 )
 from t3mpc_ros.lab.report.recorded import COMMAND, ODOMETRY, REFERENCE, WHEELS, Run
 
+UNMEASURED = 'not measured'
+"""Said where there is nothing to count, which a number would hide."""
+
 
 @dataclass(frozen=True)
 class WheelFigures:
     """How well one wheel followed; NaN where the bag does not tell."""
 
     overall: ErrorStatistics
+    """While the robot was being driven, but for the second in which it caught up."""
     settled: ErrorStatistics
-    """Without the second after the start and each switch."""
+    """Also without the time about each switch."""
     chatter: float
     """Total variation of the commanded speed per second, rad/s²."""
     demand: float
@@ -59,14 +64,18 @@ class ReportFigures:
     def summary(self) -> str:
         """Return the figures in one line."""
         right, left = (self.wheels[wheel] for wheel in WHEELS)
-        overall = f'{in_words(right.overall.rmse)}/{in_words(left.overall.rmse)}'
-        calm = f'{in_words(right.settled.rmse)}/{in_words(left.settled.rmse)}'
+        overall, calm = (
+            f'{in_words(one.rmse)}/{in_words(other.rmse)} rad/s in {one.seconds:.1f} s'
+            if one.count
+            else UNMEASURED
+            for one, other in ((right.overall, left.overall), (right.settled, left.settled))
+        )
         chatter = f'{in_words(right.chatter)}/{in_words(left.chatter)}'
         missing = in_words(100.0 * self.missing.get(ODOMETRY, math.nan))
         return (
-            f'{self.duration:.1f} s, {self.switches} switches; RMSE right/left {overall} rad/s, '
-            f'beyond {SETTLING:g} s after a switch {calm} rad/s; command varies by {chatter} '
-            f'rad/s²; loop {in_words(1e3 * self.latency)} ms, 99 % below '
+            f'{self.duration:.1f} s, {self.switches} switches; RMSE right/left while driven '
+            f'{overall}, settled {calm}; command varies by {chatter} rad/s²; '
+            f'loop {in_words(1e3 * self.latency)} ms, 99 % below '
             f'{in_words(1e3 * self.latency_99)} ms; {missing} % of odom missing: {self.report}'
         )
 
@@ -101,13 +110,21 @@ def figures_of(run: Run, report: Path, pictures: tuple[Path, ...], messages: int
 
 
 def errors_of(run: Run, measured: str) -> dict[str, tuple[ErrorStatistics, ErrorStatistics]]:
-    """Return overall and settled statistics by wheel."""
+    """Return the statistics while driven, and those where settled, by wheel."""
     error = tracking_error(run, measured)
     if error is None:
         nothing = statistics(np.empty(0))
         return dict.fromkeys(WHEELS, (nothing, nothing))
-    calm = settled(error.time, run.switches)
-    return {wheel: (statistics(error[wheel]), statistics(error[wheel][calm])) for wheel in WHEELS}
+    moving = driven(error.time, run)
+    calm = moving & settled(error.time, run.switches, foreseen(run))
+    period = float(np.median(np.diff(error.time))) if len(error) > 1 else math.nan
+    return {
+        wheel: (
+            statistics(error[wheel][moving], period),
+            statistics(error[wheel][calm], period),
+        )
+        for wheel in WHEELS
+    }
 
 
 def in_words(value: float) -> str:

@@ -11,9 +11,23 @@ from pathlib import Path
 
 from t3mpc_ros.lab.report.canvas import LABELS, png_of
 from t3mpc_ros.lab.report.drawings import DRAWINGS
-from t3mpc_ros.lab.report.measures import SETTLING
-from t3mpc_ros.lab.report.merit import ReportFigures, errors_of, figures_of, in_words
-from t3mpc_ros.lab.report.recorded import ODOMETRY, REFERENCE, TRUTH, WHEELS, Run, load_run
+from t3mpc_ros.lab.report.measures import SETTLING, ErrorStatistics, driving, foreseen
+from t3mpc_ros.lab.report.merit import (
+    UNMEASURED,
+    ReportFigures,
+    errors_of,
+    figures_of,
+    in_words,
+)
+from t3mpc_ros.lab.report.recorded import (
+    COMMAND,
+    ODOMETRY,
+    REFERENCE,
+    TRUTH,
+    WHEELS,
+    Run,
+    load_run,
+)
 from t3mpc_ros.motion.words import NANOSECONDS
 from t3mpc_ros.record.reader import Recording, open_recording
 
@@ -135,10 +149,14 @@ def _tiles(figures: ReportFigures) -> str:
     right, left = (figures.wheels[wheel] for wheel in WHEELS)
     tiles = [
         (f'{figures.duration:.1f} s', f'{figures.messages} messages, {figures.switches} switches'),
-        (_pair(right.overall.rmse, left.overall.rmse, 'rad/s'), 'error RMSE, right / left'),
         (
-            _pair(right.settled.rmse, left.settled.rmse, 'rad/s'),
-            f'RMSE beyond {SETTLING:g} s after start and switches',
+            _rmse(right.overall, left.overall),
+            'error RMSE while the robot was being driven, right / left; '
+            f'{right.overall.seconds:.1f} s counted',
+        ),
+        (
+            _rmse(right.settled, left.settled),
+            f'RMSE settled, away from switches; {right.settled.seconds:.1f} s counted',
         ),
         (
             _pair(right.chatter, left.chatter, 'rad/s²'),
@@ -177,18 +195,43 @@ def _error_table(run: Run) -> str:
         if source not in run.motions or REFERENCE not in run.motions:
             continue
         for wheel, both in errors_of(run, source).items():
-            for extent, values in zip(('whole run', 'settled'), both, strict=True):
+            for extent, values in zip(('driven', 'settled'), both, strict=True):
                 numbers = (values.rmse, values.mae, values.largest)
-                cells = [in_words(number) for number in numbers]
-                rows.append([LABELS[source], wheel, extent, *cells, str(values.count)])
+                cells = [in_words(number) if values.count else UNMEASURED for number in numbers]
+                cells += [f'{values.seconds:.1f}', str(values.count)]
+                rows.append([LABELS[source], wheel, extent, *cells])
     if not rows:
         return '<p>The bag lacks a reference, or odometry to compare with it.</p>'
-    head = ['motion', 'wheel', 'extent', 'RMSE / rad/s', 'MAE / rad/s', 'max / rad/s', 'samples']
-    note = (
-        f'<p class="quiet">Settled: without the {SETTLING:g} s after the start and after each of '
-        f'the {run.switches.size} switches.</p>'
-    )
+    head = ['motion', 'wheel', 'extent', 'RMSE / rad/s', 'MAE / rad/s', 'max / rad/s']
+    head += ['counted / s', 'samples']
+    note = f'<p class="quiet">{escape(_extents(run))}</p>'
     return _table(head, rows, text=3, wrap=False) + note
+
+
+def _extents(run: Run) -> str:
+    """Return which time the errors are counted over, and what is left out."""
+    first, last = driving(run)
+    if COMMAND not in run.motions:
+        extent = (
+            f'Driven: the whole reference but for its first {SETTLING:g} s, since the bag holds '
+            'no command that tells when the robot was being driven.'
+        )
+    elif first > last:
+        return 'Every command was zero: the robot was not being driven, and no error is counted.'
+    else:
+        extent = (
+            f'Driven: from the first command that is not zero, at {first:.1f} s, to the last, at '
+            f'{last:.1f} s. Left out are the time the robot stood before and after, and the '
+            f'first {SETTLING:g} s with a command and a reference, in which it catches up.'
+        )
+    before = foreseen(run)
+    ahead = (
+        f'the {before:.2g} s before each switch, in which a controller may already be leaving the '
+        'old reference because it was told so far ahead, and without '
+        if before > 0.0
+        else ''
+    )
+    return f'{extent} Settled: also without {ahead}the {SETTLING:g} s after each switch.'
 
 
 def _pictures(run: Run, pictures: Mapping[str, bytes | None]) -> str:
@@ -268,6 +311,10 @@ def _table(
         for row in rows
     )  # fmt: skip
     return f'<div class="wide"><table><tr>{top}</tr>\n{body}</table></div>'
+
+
+def _rmse(right: ErrorStatistics, left: ErrorStatistics) -> str:
+    return _pair(right.rmse, left.rmse, 'rad/s') if right.count else UNMEASURED
 
 
 def _pair(right: float, left: float, unit: str) -> str:

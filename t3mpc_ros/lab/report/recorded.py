@@ -93,6 +93,8 @@ class Run:
     timing: Mapping[str, Timing]
     switches: Array
     """When the reference switched."""
+    lead: float
+    """Median (s) of how far ahead of their receipt the stamps of the reference are."""
     complaints: tuple[tuple[float, str, str, str], ...]
     """From diagnostics: when first, level, who, what."""
     notes: tuple[str, ...]
@@ -141,6 +143,7 @@ def load_run(recording: Recording, namespace: str | None = None) -> Run:
             if table['stamp'].size > 2 and name != 'reference/signals'  # sent when it changes
         },
         switches=_switches(numbers, motions.get(REFERENCE)),
+        lead=clock.lead,
         complaints=_complaints(recording, namespaces[0]),
         notes=tuple(notes),
     )
@@ -189,10 +192,10 @@ class _Clock:
                     'The stamps are of another clock than the receipts (simulated time?); '
                     'messages without a stamp were placed through the odometry.'
                 )
-        self._lead = 0.0
+        self.lead = 0.0
         if REFERENCE in raw:
             ahead = raw[REFERENCE]['stamp'] - self.origin - self.local(raw[REFERENCE]['received'])
-            self._lead = max(0.0, float(np.median(ahead)))
+            self.lead = max(0.0, float(np.median(ahead)))
 
     def local(self, received: Array) -> Array:
         """Return the time of what was received then."""
@@ -200,7 +203,7 @@ class _Clock:
 
     def applies(self, received: Array) -> Array:
         """Return the time for which the reference node said something it sent then."""
-        return self.local(received) + self._lead
+        return self.local(received) + self.lead
 
 
 def _read(recording: Recording, name: str, topic: str, notes: list[str]) -> dict[str, Array]:
