@@ -22,7 +22,11 @@ setup(
         (f'share/{NAME}/config', sorted(glob('config/*'))),
         (f'share/{NAME}/launch', sorted(glob('launch/*.launch.py'))),
     ],
-    package_data={f'{NAME}.lab.tuning': ['*.json']},
+    package_data={
+        f'{NAME}.lab.tuning': ['*.json'],
+        f'{NAME}.robot.arena': ['worlds/*.yaml'],
+        f'{NAME}.robot.twin': ['schedules/*.yaml'],
+    },
     install_requires=[
         'setuptools',
         'numpy',

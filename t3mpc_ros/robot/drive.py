@@ -35,9 +35,9 @@ class DriveSettings(Settings):
 
     kind: str = setting(
         'velocity',
-        'velocity: wheels follow commanded speeds, as the board does it; torque: the command is '
-        'the torque itself, as in the paper',
-        choices=('velocity', 'torque'),
+        'stepper: the digital twin, whose motors turn in steps; velocity: wheels follow commanded '
+        'speeds by a servo; torque: the command is the torque itself, as in the paper',
+        choices=('velocity', 'torque', 'stepper'),
     )
     dead_time: float = setting(
         0.010,

@@ -31,6 +31,65 @@ class OdometrySettings(Settings):
 
 
 @kernel
+def wrapped(angle: float) -> float:
+    """Return ``angle`` (rad) brought into (-pi, pi]; one that lies there keeps every bit."""
+    if angle > math.pi or angle <= -math.pi:
+        angle -= 2.0 * math.pi * math.ceil((angle - math.pi) / (2.0 * math.pi))
+    return angle
+
+
+@kernel
+def follow_arc(
+    pose: Array, run_right: float, run_left: float, half: float
+) -> tuple[float, float, float, float, float, float, float]:
+    """Move ``pose`` along the exact arc of (1)-(3); return the derivatives of where it ends.
+
+    pose : shape (3,), x, y (m), heading (rad, kept in (-pi, pi]); changed in place
+    run_right, run_left : paths of the wheels, m; half : b (E1: half the separation), m
+    returns : d(x, y) by the heading at the start (m); d(x, y) by the right path, by the left
+        path; d heading by the right path (1/m), the negative of that by the left one
+    """
+    run = 0.5 * (run_right + run_left)
+    half_turn = 0.25 * (run_right - run_left) / half
+    if abs(half_turn) > 1e-4:
+        ratio = math.sin(half_turn) / half_turn
+        ratio_rate = (math.cos(half_turn) - ratio) / half_turn
+    else:
+        ratio = 1.0 - half_turn * half_turn / 6.0
+        ratio_rate = -half_turn / 3.0
+    direction = pose[2] + half_turn
+    cosine, sine = math.cos(direction), math.sin(direction)
+
+    pose[0] += run * ratio * cosine
+    pose[1] += run * ratio * sine
+    pose[2] = wrapped(pose[2] + 2.0 * half_turn)
+
+    bend = 0.25 / half
+    along, aside = run * ratio_rate * bend, run * ratio * bend
+    return (
+        -run * ratio * sine,
+        run * ratio * cosine,
+        (0.5 * ratio + along) * cosine - aside * sine,
+        (0.5 * ratio + along) * sine + aside * cosine,
+        (0.5 * ratio - along) * cosine + aside * sine,
+        (0.5 * ratio - along) * sine - aside * cosine,
+        2.0 * bend,
+    )
+
+
+@kernel
+def add_noise(covariance: Array, variance: float, x: float, y: float, heading: float) -> None:
+    """Add to ``covariance`` a noise of ``variance`` that moves the pose by these factors.
+
+    covariance : shape (n, n), n at least 3, the pose first; changed in place
+    """
+    effect = (x, y, heading)
+    for row in range(3):
+        for column in range(3):
+            covariance[row, column] += variance * effect[row] * effect[column]
+
+
+@kernel
 def dead_reckon(
     pose: Array,
     covariance: Array,
@@ -53,19 +112,10 @@ def dead_reckon(
     radius, half : R and b (E1: half the separation), m
     """
     run_right, run_left = radius * right, radius * left
-    run = 0.5 * (run_right + run_left)
-    half_turn = 0.25 * (run_right - run_left) / half
-    if abs(half_turn) > 1e-4:
-        ratio = math.sin(half_turn) / half_turn
-        ratio_rate = (math.cos(half_turn) - ratio) / half_turn
-    else:
-        ratio = 1.0 - half_turn * half_turn / 6.0
-        ratio_rate = -half_turn / 3.0
-    direction = pose[2] + half_turn
-    cosine, sine = math.cos(direction), math.sin(direction)
-
+    across_x, across_y, right_x, right_y, left_x, left_y, bend = follow_arc(
+        pose, run_right, run_left, half
+    )
     # C <- F C F', with F the identity but for its third column, (across_x, across_y, 1).
-    across_x, across_y = -run * ratio * sine, run * ratio * cosine
     for column in range(3):
         covariance[0, column] += across_x * covariance[2, column]
         covariance[1, column] += across_y * covariance[2, column]
@@ -73,25 +123,9 @@ def dead_reckon(
         covariance[row, 0] += across_x * covariance[row, 2]
         covariance[row, 1] += across_y * covariance[row, 2]
 
-    for side in (1.0, -1.0):
-        distance = run_right if side > 0.0 else run_left
-        variance = per_metre * abs(distance) + radius * radius * jitter
-        bend = 0.25 * side / half
-        slope = 0.5 * ratio, run * ratio_rate * bend, run * ratio * bend
-        effect_x = (slope[0] + slope[1]) * cosine - slope[2] * sine
-        effect_y = (slope[0] + slope[1]) * sine + slope[2] * cosine
-        effect_heading = 2.0 * bend
-        effect = (effect_x, effect_y, effect_heading)
-        for row in range(3):
-            for column in range(3):
-                covariance[row, column] += variance * effect[row] * effect[column]
-
-    pose[0] += run * ratio * cosine
-    pose[1] += run * ratio * sine
-    heading = pose[2] + 2.0 * half_turn
-    if heading > math.pi or heading <= -math.pi:
-        heading -= 2.0 * math.pi * math.ceil((heading - math.pi) / (2.0 * math.pi))
-    pose[2] = heading
+    constant = radius * radius * jitter
+    add_noise(covariance, per_metre * abs(run_right) + constant, right_x, right_y, bend)
+    add_noise(covariance, per_metre * abs(run_left) + constant, left_x, left_y, -bend)
 
 
 class DeadReckoning:

@@ -10,6 +10,7 @@ with :func:`nested` holds another table, and its rows get dotted names (``law.ga
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 import difflib
+from functools import partial
 import math
 from typing import Any, Self, get_args, get_origin, get_type_hints
 
@@ -119,9 +120,9 @@ def setting(
     return field(default=default, metadata={'row': details})
 
 
-def nested(table: type['Settings']) -> Any:
-    """Return a dataclass field that holds another table, at its defaults."""
-    return field(default_factory=table)
+def nested(table: type['Settings'], **changed: Value) -> Any:
+    """Return a dataclass field that holds another table, at its defaults but for ``changed``."""
+    return field(default_factory=partial(table, **changed))
 
 
 @dataclass(frozen=True)
@@ -211,4 +212,8 @@ class Settings:
                 row = own[item.name]
                 yield replace(row, name=prefix + row.name)
             elif is_dataclass(hints[item.name]) and issubclass(hints[item.name], Settings):
-                yield from hints[item.name]._walk(f'{prefix}{item.name}.')
+                defaults = item.default_factory().flat()  # type: ignore[operator]
+                for row in hints[item.name]._walk(''):
+                    yield replace(
+                        row, name=f'{prefix}{item.name}.{row.name}', default=defaults[row.name]
+                    )

@@ -1,0 +1,282 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+r"""Eight Sharp GP2Y0A21YK0F distance sensors, and how the board reads them.
+
+Figures are those of Sharp's data sheet E4-A00201EN (1 December 2006). Its figure 2 is met within
+2 % from 1 to 80 cm by
+
+.. math:: V(d) = \left(\frac{a}{d + k} + c\right)
+                 \left(1 + (w/d)^{p n}\right)^{-1/n}:
+
+triangulation (the spot moves on the detector as the inverse of the distance), times a factor that
+takes over nearer than w, where the spot leaves the detector. So the voltage *falls* again there,
+from 3.2 V at 5.7 cm to nothing at contact, and the board cannot know: at 3 cm it reads 13 cm, at
+2 cm 23 cm, and touching looks like nothing at all. From 3.6 to 10 cm it says "too near".
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from t3mpc_ros.robot.backend import RANGE_SENSORS
+from t3mpc_ros.settings import SettingError, Settings, setting
+
+Array = npt.NDArray[np.float64]
+
+CODE_STEP = 0.005
+"""m in one step of the code that the radio carries."""
+NOT_MEASURED, TOO_NEAR, BEYOND, FAULT = 0, 1, 254, 255
+"""Codes that are no distance."""
+
+_SHEET = 'Sharp E4-A00201EN'
+# Least squares through figure 2, in relative errors.
+_SLOPE, _SHIFT, _FLOOR = 0.282, 0.0257, 0.061  # V m, m, V: from 10 to 80 cm
+_EDGE, _POWER, _SHARPNESS = 0.0558, 1.63, 7.0  # m, 1, 1: from 1 to 8 cm
+
+
+@dataclass(frozen=True)
+class SharpSettings(Settings):
+    """The distance sensors, their mounting, and the converter behind them."""
+
+    type: str = setting(
+        'GP2Y0A21YK0F', 'the sensor that is mounted', choices=('GP2Y0A21YK0F',), source=_SHEET
+    )
+    minimum: float = setting(
+        0.10,
+        'nearer than this the board says too near',
+        unit='m',
+        low=0.07,
+        high=0.5,
+        source=f'{_SHEET}, distance measuring range',
+    )
+    maximum: float = setting(
+        0.80,
+        'farther than this the board says nothing there',
+        unit='m',
+        low=0.2,
+        high=1.2,
+        source=f'{_SHEET}, distance measuring range',
+    )
+    update_period: float = setting(
+        0.0383,
+        'mean time of a measurement; sensors are not synchronised',
+        unit='s',
+        low=0.001,
+        high=1.0,
+        source=f'{_SHEET}, figure 1',
+    )
+    period_spread: float = setting(
+        0.0096,
+        'the period of each sensor lies within plus or minus this',
+        unit='s',
+        low=0.0,
+        high=0.5,
+        source=f'{_SHEET}, figure 1',
+    )
+    voltage_noise: float = setting(
+        0.01, 'spread of the voltage that is converted', unit='V', low=0.0, high=1.0, live=True
+    )
+    voltage_offset: float = setting(
+        0.01,
+        'offset of each sensor, drawn within plus or minus this: what calibration leaves '
+        '(data sheet: 0.15 V at 80 cm as delivered)',
+        unit='V',
+        low=0.0,
+        high=0.5,
+        live=True,
+    )
+    adc_bits: int = setting(
+        10, 'resolution of the converter', unit='bit', low=6, high=16, source='ATmega: 10 bit'
+    )
+    adc_reference: float = setting(
+        5.0, 'voltage the converter reaches its end at', unit='V', low=1.0, high=10.0
+    )
+    field_of_view: float = setting(
+        0.1,
+        'opening of the beam, which the data sheet does not give',
+        unit='rad',
+        low=0.0,
+        high=1.0,
+    )
+    half_length: float = setting(
+        0.10, 'from the axle to the faces in front and behind', unit='m', low=0.01, high=1.0
+    )
+    half_width: float = setting(
+        0.09, 'from the middle line to the faces at the sides', unit='m', low=0.01, high=1.0
+    )
+    offset: float = setting(
+        0.05, 'of the two on each side from the middle of that side', unit='m', low=0.0, high=1.0
+    )
+
+    def check_together(self) -> None:
+        """Raise SettingError when bounds cross, or sensors would hang in the air."""
+        if self.maximum <= self.minimum:
+            raise SettingError(
+                f'maximum must be more than minimum ({self.minimum:g} m): got {self.maximum:g}'
+            )
+        if self.period_spread >= self.update_period:
+            raise SettingError(
+                f'period_spread must be less than update_period ({self.update_period:g} s): '
+                f'got {self.period_spread:g}'
+            )
+        side = min(self.half_length, self.half_width)
+        if self.offset > side:
+            raise SettingError(
+                f'offset must be at most half_length and half_width ({side:g} m): '
+                f'got {self.offset:g}'
+            )
+
+    def convert(self, volts: float) -> float:
+        """Return the voltage the board believes in: the middle of the converter's step."""
+        steps = 1 << self.adc_bits
+        step = self.adc_reference / steps
+        return (min(max(int(volts / step), 0), steps - 1) + 0.5) * step
+
+
+def voltage(true_distance: float) -> float:
+    """Return the typical output (V) for white paper at a distance (m) from the sensor's face.
+
+    Inf is nothing there; zero and less is contact.
+    """
+    if true_distance <= 0.0:
+        return 0.0
+    ratio = true_distance / _EDGE
+    # What the formula says, turned round nearer than the edge so that no power overflows.
+    rise = 1.0 if ratio >= 1.0 else float(ratio**_POWER)
+    small = 1.0 / ratio if ratio >= 1.0 else ratio
+    rise *= float((1.0 + small ** (_POWER * _SHARPNESS)) ** (-1.0 / _SHARPNESS))
+    return rise * (_SLOPE / (true_distance + _SHIFT) + _FLOOR)
+
+
+def distance(volts: float, minimum: float = 0.10, maximum: float = 0.80) -> float:
+    """Return the distance (m) the board makes of a voltage; REP 117 beyond what it can tell.
+
+    Above the voltage of ``minimum`` it is -inf, too near: the far branch is never extrapolated.
+    Below that of ``maximum`` it is inf. The near branch is out of the board's sight.
+    """
+    if volts <= _FLOOR:
+        return math.inf
+    found = _SLOPE / (volts - _FLOOR) - _SHIFT
+    if found < minimum:
+        return -math.inf
+    return found if found <= maximum else math.inf
+
+
+def code(distance_reading: float) -> int:
+    """Return the byte that stands for a reading (m, REP 117) on the radio: half centimetres.
+
+    NaN is 0, -inf is 1, inf is 254. A fault, 255, is for whoever knows of one.
+    """
+    steps = distance_reading / CODE_STEP
+    if TOO_NEAR < steps < BEYOND:
+        return round(steps)
+    if math.isnan(steps):
+        return NOT_MEASURED
+    return BEYOND if steps >= BEYOND else TOO_NEAR
+
+
+def reading(code: int) -> float:
+    """Return the reading (m, REP 117) a byte stands for; a fault is NaN, as not measured is.
+
+    Raises
+    ------
+    ValueError
+        It is no byte.
+    """
+    if not 0 <= code <= 255:
+        raise ValueError(f'code must be from 0 to 255: got {code}')
+    if code in (NOT_MEASURED, FAULT):
+        return math.nan
+    if code in (TOO_NEAR, BEYOND):
+        return math.inf if code == BEYOND else -math.inf
+    return CODE_STEP * code
+
+
+_READINGS = tuple(map(reading, range(256)))
+
+
+def mounts(settings: SharpSettings) -> Array:
+    """Return x, y (m) and direction (rad) of each sensor's face in the body frame, shape (8, 3).
+
+    x is forward and y to the left of the middle of the axle; in the order of RANGE_SENSORS.
+    """
+    ahead, aside, offset = settings.half_length, settings.half_width, settings.offset
+    quarter = 0.5 * math.pi
+    return np.array(
+        [
+            [ahead, offset, 0.0],
+            [ahead, -offset, 0.0],
+            [offset, aside, quarter],
+            [-offset, aside, quarter],
+            [-ahead, offset, math.pi],
+            [-ahead, -offset, math.pi],
+            [offset, -aside, -quarter],
+            [-offset, -aside, -quarter],
+        ]
+    )
+
+
+class RangeFinders:
+    """Keeps when each of the eight sensors measures, and what the board last read of it.
+
+    Parameters
+    ----------
+    settings
+        Replaceable while running; periods stay as they were drawn.
+    generator
+        Used for nothing else: 24 numbers at the start, one at each measurement.
+    """
+
+    def __init__(self, settings: SharpSettings, generator: np.random.Generator) -> None:
+        self.settings = settings
+        self._generator = generator
+        periods, phases, self._offsets = generator.uniform(
+            -1.0, 1.0, (3, len(RANGE_SENSORS))
+        ).tolist()
+        self._periods = [
+            settings.update_period + settings.period_spread * drawn for drawn in periods
+        ]
+        self._left = [
+            0.5 * (1.0 + drawn) * period
+            for drawn, period in zip(phases, self._periods, strict=True)
+        ]
+        self._readings = [math.nan] * len(RANGE_SENSORS)
+
+    @property
+    def periods(self) -> tuple[float, ...]:
+        """How long each sensor takes for a measurement, s."""
+        return tuple(self._periods)
+
+    @property
+    def readings(self) -> tuple[float, ...]:
+        """m, as the radio tells them (half centimetres, REP 117); NaN until first measured."""
+        return tuple(self._readings)
+
+    def due(self, elapsed: float) -> Sequence[int]:
+        """Return the sensors that have finished a measurement within the last ``elapsed`` seconds.
+
+        ``elapsed`` is the time since the last call. Each is named once, however long that is.
+        """
+        finished = []
+        left = self._left
+        for index, period in enumerate(self._periods):
+            remaining = left[index] - elapsed
+            if remaining <= 0.0:
+                finished.append(index)
+                remaining = period - (-remaining) % period
+            left[index] = remaining
+        return finished
+
+    def measure(self, index: int, true_distance: float) -> None:
+        """Keep what the board reads of sensor ``index`` when something is at ``true_distance``.
+
+        The distance (m) is from the sensor's face; inf is nothing there.
+        """
+        settings = self.settings
+        volts = voltage(true_distance) + settings.voltage_offset * self._offsets[index]
+        volts += settings.voltage_noise * self._generator.standard_normal()
+        seen = distance(settings.convert(volts), settings.minimum, settings.maximum)
+        self._readings[index] = _READINGS[code(seen)]
