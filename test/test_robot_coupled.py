@@ -19,7 +19,15 @@ from t3mpc_ros.robot.dynamics import (
 )
 from t3mpc_ros.robot.loads import Disturbance, DisturbanceSettings, FrictionSettings
 from t3mpc_ros.robot.stepper.chassis import Chassis, Load, TyreSettings, body_vector
-from t3mpc_ros.robot.stepper.coupled import ROLLS, let_go, motion_rates, slid_out, take_hold
+from t3mpc_ros.robot.stepper.coupled import (
+    ROLLS,
+    let_go,
+    mean_pulses,
+    mean_rate,
+    motion_rates,
+    slid_out,
+    take_hold,
+)
 from t3mpc_ros.robot.stepper.motor import MotorSettings
 
 GEOMETRY = Geometry()
@@ -108,6 +116,28 @@ def swinging(motor: MotorSettings, step: float) -> Chassis:
         robot.run(WheelSpeeds(2.0, -1.2), 0.0, VOLTS, calm(), 1)
     robot.run(WheelSpeeds(0.0, 0.0), 0.0, VOLTS, calm(), 2)
     return robot
+
+
+# -- pulses ---------------------------------------------------------------------------------------
+
+
+def test_the_mean_place_of_a_field_is_that_of_the_staircase():
+    generator = np.random.default_rng(8)
+    for _ in range(200):
+        start, way = generator.uniform(-5.0, 5.0), generator.uniform(-7.0, 7.0)
+        fine = np.floor(start + way * (np.arange(200_000) + 0.5) / 200_000)
+        assert mean_pulses(start, start + way) == pytest.approx(fine.mean(), abs=2e-4)
+    assert mean_pulses(2.3, 2.3) == 2.0
+    assert mean_pulses(-2.3, -2.3) == -3.0
+
+
+def test_a_rate_that_gets_where_it_should_stays_there():
+    """A ramp that ends within a step: counted as a whole one, pulses would depend on the step."""
+    for rate, target, reach in ((0.0, 10.0, 40.0), (3.0, -5.0, 16.0), (2.0, 50.0, 12.0)):
+        times = (np.arange(100_000) + 0.5) / 100_000
+        way = target - rate
+        courses = rate + np.sign(way) * np.minimum(reach * times, abs(way))
+        assert mean_rate(rate, target, abs(way) / reach) == pytest.approx(courses.mean(), abs=1e-4)
 
 
 # -- Newton ---------------------------------------------------------------------------------------

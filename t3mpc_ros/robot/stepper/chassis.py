@@ -250,14 +250,19 @@ class Chassis:
     ) -> None:
         """Integrate ``count`` steps while the pulse generator goes for ``wheels`` (rad/s).
 
-        ``acceleration`` limits it (rad/s², 0 = not at all); without ``volts`` nothing pulls.
+        It goes there evenly, to arrive with the last step, unless ``acceleration`` (rad/s², 0 =
+        no limit) lets it not; without ``volts`` nothing pulls.
         """
+        now = self.pulse_speeds
+        gap = max(abs(wheels.right - now.right), abs(wheels.left - now.left))
+        even = max(gap / (count * self.step), 1e-6)
+        reach = min(even, acceleration) if acceleration > 0.0 else even
         x, y, _ = self._state[:3].tolist()
         world = self._world
         segments, circles = _NO_SEGMENTS, _NO_CIRCLES
         if world.segments.size or world.circles.size:
-            reach = self._bumper[0] + 2.0 * self.step * count  # 2 m/s: no wheel is as fast
-            if clearance(x, y, world.segments, world.circles) < reach:
+            near = self._bumper[0] + 2.0 * self.step * count  # 2 m/s: no wheel is as fast
+            if clearance(x, y, world.segments, world.circles) < near:
                 segments, circles = world.segments, world.circles
         if world.patches.size:
             self._tyres[2:] = self._grip * grip_at(x, y, world.patches)
@@ -267,7 +272,7 @@ class Chassis:
             self._field,
             wheels.right / self._microstep,
             wheels.left / self._microstep,
-            acceleration / self._microstep if acceleration > 0.0 else math.inf,
+            reach / self._microstep,
             volts,
             self._microstep,
             self._motor,

@@ -145,6 +145,31 @@ def let_go(modes: Integers, pushed: Array, body: Array, tyres: Array) -> bool:
 
 
 @kernel
+def mean_pulses(start: float, end: float) -> float:
+    """Return the mean of floor(phase) while the phase (pulses) goes evenly from start to end.
+
+    The integral of floor is n (n - 1)/2 + n (p - n) with n = floor(p).
+    """
+    whole_start, whole_end = math.floor(start), math.floor(end)
+    if whole_start == whole_end:
+        return float(whole_start)
+    below_start = whole_start * (start - 0.5 * (whole_start + 1))
+    below_end = whole_end * (end - 0.5 * (whole_end + 1))
+    return float((below_end - below_start) / (end - start))
+
+
+@kernel
+def mean_rate(rate: float, target: float, reached: float) -> float:
+    """Return the mean of a rate that goes evenly to its target within ``reached`` of a step.
+
+    reached : share of the step after which the target is kept; more than 1 if it is not reached
+    """
+    if reached >= 1.0:
+        return rate + 0.5 * (target - rate) / reached
+    return target - 0.5 * reached * (target - rate)
+
+
+@kernel
 def run_coupled(
     state: Array,
     modes: Integers,
@@ -176,8 +201,10 @@ def run_coupled(
     """Integrate rotors, tyres and body over ``count`` steps by the classical Runge-Kutta method.
 
     The field stands still between two pulses and jumps with each: its place is the whole number
-    of pulses that the phase has passed. Tyres change between rolling and sliding at the end of a
-    step.
+    of pulses that the phase has passed. Seen at the stages alone, the jumps would be late by up
+    to half a step, an error of first order; so the staircase is replaced, within a step, by the
+    straight line that has its mean and its slope. Tyres change between rolling and sliding at the
+    end of a step.
 
     state : shape (9,), see motion_rates; modes : shape (2,); both changed in place
     field : shape (6,), phase (pulses), rate (pulses/s), place of pulse 0 (rad); each right, left
@@ -193,14 +220,19 @@ def run_coupled(
     work : shape (4, 9), overwritten
     """
     trial, slope, total = work[0], work[1], work[2]
-    torque, pushed, phase = work[3, 0:2], work[3, 2:5], work[3, 5:7]
+    torque, pushed = work[3, 0:2], work[3, 2:5]
     for index in range(first, first + count):
         rate_right, rate_left = field[2], field[3]
         slip_right, slip_left = state[5] - state[7], state[6] - state[8]
         next_right, next_left = approach(
             rate_right, rate_left, target_right, target_left, reach * step
         )
-        mean_right, mean_left = 0.5 * (rate_right + next_right), 0.5 * (rate_left + next_left)
+        widest = max(abs(target_right - rate_right), abs(target_left - rate_left))
+        reached = widest / (reach * step)
+        mean_right = mean_rate(rate_right, target_right, reached)
+        mean_left = mean_rate(rate_left, target_left, reached)
+        end_right, end_left = field[0] + step * mean_right, field[1] + step * mean_left
+        place_right, place_left = mean_pulses(field[0], end_right), mean_pulses(field[1], end_left)
         peak_right = pull_out_torque(mean_right * microstep, volts, motor)
         peak_left = pull_out_torque(mean_left * microstep, volts, motor)
         time = (index + 0.5) * step
@@ -214,23 +246,20 @@ def run_coupled(
             weight = 1.0 / 3.0 if stage in (1, 2) else 1.0 / 6.0
             for item in range(9):
                 trial[item] = state[item] + part * step * slope[item]
-            now_right = rate_right + part * (next_right - rate_right)
-            now_left = rate_left + part * (next_left - rate_left)
-            phase[0] = field[0] + 0.5 * part * step * (rate_right + now_right)
-            phase[1] = field[1] + 0.5 * part * step * (rate_left + now_left)
+            since = (part - 0.5) * step
             pull_right = rotor_torque(
-                field[4] + microstep * math.floor(phase[0]) - trial[3],
-                microstep * now_right - trial[5],
+                field[4] + microstep * (place_right + since * mean_right) - trial[3],
+                microstep * mean_right - trial[5],
                 peak_right,
                 motor,
             )
             pull_left = rotor_torque(
-                field[5] + microstep * math.floor(phase[1]) - trial[4],
-                microstep * now_left - trial[6],
+                field[5] + microstep * (place_left + since * mean_left) - trial[4],
+                microstep * mean_left - trial[6],
                 peak_left,
                 motor,
             )
-            done += weight * microstep * (pull_right * now_right + pull_left * now_left)
+            done += weight * microstep * (pull_right * mean_right + pull_left * mean_left)
             torque[0] = pull_right - against_right
             torque[1] = pull_left - against_left
             torque[0] -= friction_torque(trial[5], friction[0], friction[1], friction[2])
@@ -242,7 +271,7 @@ def run_coupled(
                 total[item] += weight * slope[item]
         for item in range(9):
             state[item] += step * total[item]
-        field[0], field[1] = phase[0], phase[1]
+        field[0], field[1] = end_right, end_left
         field[2], field[3] = next_right, next_left
         # The last stage stood at the end of the step: its torques serve to see what the tyres do.
         held = slid_out(state, modes)
