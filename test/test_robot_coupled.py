@@ -225,6 +225,7 @@ def test_free_swings_keep_their_energy_to_the_order_of_the_method():
         robot = swinging(motor, 0.0005)
         coarse = chassis(motor=motor, step=step)
         coarse._state[:], coarse._field[:] = robot._state, robot._field
+        coarse._read()
         start = kinetic(coarse) + magnetic(coarse)
         assert start > 1e-5
         for _ in range(round(0.4 / step)):

@@ -91,7 +91,7 @@ def test_board_inverts_the_curve_within_what_its_converter_resolves():
     settings = SharpSettings()
     for place in np.linspace(0.1005, 0.79, 1500):
         slope = (voltage(place - 1e-4) - voltage(place + 1e-4)) / 2e-4
-        found = distance(settings.convert(voltage(place)))
+        found = distance(settings.volts(settings.count(voltage(place))))
         # Half a step, and a tenth for what the formula leaves out near 10 cm.
         assert abs(found - place) <= 0.6 * STEP / slope + 0.002 * place
 

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Poses, twists, wheel speeds and stamped motions, in SI units."""
 
-from dataclasses import dataclass
 import math
 from typing import NamedTuple
 
@@ -43,8 +42,7 @@ ORIGIN = Pose(0.0, 0.0, 0.0)
 STANDSTILL = BodyTwist(0.0, 0.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Motion:
+class Motion(NamedTuple):
     """A pose and a twist at one instant: measured, true or wanted."""
 
     stamp_ns: int

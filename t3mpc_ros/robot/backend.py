@@ -7,7 +7,6 @@ a :class:`RobotCommand` goes in, a :class:`RobotState` comes out, and whatever c
 robot says why.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple, Protocol, Self
 
 import numpy as np
@@ -95,8 +94,7 @@ class BatteryReading(NamedTuple):
     """What is left, 0 to 1; NaN where nobody knows"""
 
 
-@dataclass(frozen=True, slots=True)
-class RobotState:
+class RobotState(NamedTuple):
     """What a robot knows at one instant."""
 
     stamp_ns: int

@@ -50,11 +50,12 @@ class GridRobot(RobotBackend, ABC):
         self._substeps = substeps
         self._longest_gap_ns = round(longest_gap * NANOSECONDS)
         # A ratio of whole numbers: stamps stay exact however long the robot runs.
-        self._frequency = Fraction(rate) * substeps / NANOSECONDS
-        self._top, self._bottom = self._frequency.as_integer_ratio()
+        frequency = Fraction(rate) * substeps / NANOSECONDS
+        self._top, self._bottom = frequency.as_integer_ratio()
         self._origin_ns: int | None = None
         self._since_origin = 0
         """Integration steps since the origin of the grid."""
+        self._reached_ns = 0
         self._reports: deque[RobotState] = deque(maxlen=1024)
         """The newest, and older ones that nobody has asked for."""
 
@@ -141,12 +142,16 @@ class GridRobot(RobotBackend, ABC):
 
     def _now_ns(self) -> int:
         """Return the time of the last finished substep."""
-        return self._after(self._since_origin)
+        return self._reached_ns
 
     def _after(self, steps: int) -> int:
         """Return the instant (ns) that lies ``steps`` integration steps after the origin."""
         top = self._top
         return (self._origin_ns or 0) + (2 * steps * self._bottom + top) // (2 * top)
+
+    def _steps_until(self, wait_ns: int) -> int:
+        """Return how many integration steps cover ``wait_ns``."""
+        return -(-wait_ns * self._top // self._bottom)
 
     def _run_to(self, now_ns: int, whole_periods: bool = False) -> int:
         """Integrate up to ``now_ns`` and return the instant reached, within a step before it.
@@ -155,7 +160,9 @@ class GridRobot(RobotBackend, ABC):
         or that left the longest gap behind, starts a new grid. One that went back by less is a
         late question for a report that was made already.
         """
-        latest_ns = self._now_ns() + self._longest_gap_ns
+        if now_ns == self._reached_ns and self._origin_ns is not None:
+            return now_ns
+        latest_ns = self._reached_ns + self._longest_gap_ns
         if self._origin_ns is None:
             self._reports.clear()
             self._start_grid(now_ns)
@@ -168,11 +175,12 @@ class GridRobot(RobotBackend, ABC):
             self._start_grid(now_ns)
         else:
             self._integrate_to(now_ns, whole_periods)
-        return self._now_ns()
+        return self._reached_ns
 
     def _start_grid(self, now_ns: int) -> None:
         self._origin_ns = now_ns
         self._since_origin = 0
+        self._reached_ns = now_ns
         self._make_report()
 
     def _integrate_to(self, now_ns: int, whole_periods: bool) -> None:
@@ -186,9 +194,10 @@ class GridRobot(RobotBackend, ABC):
             count = min(substeps - self._since_origin % substeps, goal - self._since_origin)
             self._integrate(count)
             self._since_origin += count
+            self._reached_ns = self._after(self._since_origin)
             if self._since_origin % substeps == 0:
                 self._make_report()
 
     def _make_report(self) -> None:
         self._measure()
-        self._reports.append(self._describe(self._now_ns()))
+        self._reports.append(self._describe(self._reached_ns))

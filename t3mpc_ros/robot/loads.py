@@ -128,6 +128,8 @@ class Disturbance:
 
     def __init__(self, settings: DisturbanceSettings, generator: np.random.Generator) -> None:
         self.settings = settings
+        self._of = settings
+        self._load: Array = np.array([settings.bound, settings.walk_share])
         self.angular: Array = 2.0 * np.pi * np.array(settings.frequencies, dtype=np.float64)
         self.phases: Array = generator.uniform(0.0, 2.0 * np.pi, (2, self.angular.size))
         self.walk: Array = np.zeros(2)
@@ -137,7 +139,10 @@ class Disturbance:
     @property
     def load(self) -> Array:
         """The bound (N m) and the walk's part of it, as :func:`disturbance_torque` wants them."""
-        return np.array([self.settings.bound, self.settings.walk_share])
+        if self.settings is not self._of:
+            self._of = self.settings
+            self._load = np.array([self._of.bound, self._of.walk_share])
+        return self._load
 
     def draw(self, dt: float) -> None:
         """Move the walk of both wheels by ``dt`` seconds; it is reflected at -1 and 1.

@@ -212,7 +212,7 @@ class FusedOdometry:
     @property
     def pose(self) -> Pose:
         """Where the robot is thought to be; a measured bias may move it at a standstill."""
-        return Pose(float(self._pose[0]), float(self._pose[1]), float(self._pose[2]))
+        return Pose(*self._pose.tolist())
 
     @property
     def covariance(self) -> Array:

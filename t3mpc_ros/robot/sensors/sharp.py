@@ -129,11 +129,19 @@ class SharpSettings(Settings):
                 f'got {self.offset:g}'
             )
 
-    def convert(self, volts: float) -> float:
+    @property
+    def adc_steps(self) -> int:
+        """How many steps the converter has."""
+        return 1 << self.adc_bits
+
+    def count(self, volts: float) -> int:
+        """Return what the converter makes of a voltage."""
+        steps = self.adc_steps
+        return min(max(int(volts * steps / self.adc_reference), 0), steps - 1)
+
+    def volts(self, count: int) -> float:
         """Return the voltage the board believes in: the middle of the converter's step."""
-        steps = 1 << self.adc_bits
-        step = self.adc_reference / steps
-        return (min(max(int(volts / step), 0), steps - 1) + 0.5) * step
+        return (count + 0.5) * self.adc_reference / self.adc_steps
 
 
 def voltage(true_distance: float) -> float:
@@ -231,8 +239,8 @@ class RangeFinders:
     """
 
     def __init__(self, settings: SharpSettings, generator: np.random.Generator) -> None:
-        self.settings = settings
         self._generator = generator
+        self.settings = settings
         periods, phases, self._offsets = generator.uniform(
             -1.0, 1.0, (3, len(RANGE_SENSORS))
         ).tolist()
@@ -244,6 +252,16 @@ class RangeFinders:
             for drawn, period in zip(phases, self._periods, strict=True)
         ]
         self._readings = [math.nan] * len(RANGE_SENSORS)
+
+    @property
+    def settings(self) -> SharpSettings:
+        """The table in use."""
+        return self._settings
+
+    @settings.setter
+    def settings(self, settings: SharpSettings) -> None:
+        self._settings = settings
+        self._table = self._read_all()
 
     @property
     def periods(self) -> tuple[float, ...]:
@@ -275,8 +293,16 @@ class RangeFinders:
 
         The distance (m) is from the sensor's face; inf is nothing there.
         """
-        settings = self.settings
+        settings = self._settings
         volts = voltage(true_distance) + settings.voltage_offset * self._offsets[index]
         volts += settings.voltage_noise * self._generator.standard_normal()
-        seen = distance(settings.convert(volts), settings.minimum, settings.maximum)
-        self._readings[index] = _READINGS[code(seen)]
+        self._readings[index] = self._table[settings.count(volts)]
+
+    def _read_all(self) -> list[float]:
+        """Return what the board reads (m) at every count of its converter."""
+        settings = self._settings
+        lowest, highest = settings.minimum, settings.maximum
+        return [
+            _READINGS[code(distance(settings.volts(count), lowest, highest))]
+            for count in range(settings.adc_steps)
+        ]

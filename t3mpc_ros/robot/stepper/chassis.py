@@ -75,6 +75,28 @@ def body_vector(body: BodySettings, geometry: Geometry) -> Array:
     )
 
 
+def robot_vector(
+    motor: MotorSettings, load: Load, bumper: BumperSettings, share: float, step: float
+) -> Array:
+    """Return all constants of :func:`run_coupled` in one row, shape (22,): fewer to hand over.
+
+    body_vector (6); viscous (N m s/rad) and Coulomb friction (N m), its width (rad/s);
+    BumperSettings.vector (3); MotorSettings.vector (7); microstep (rad), share of the inertial
+    sensor's filter, length of a step (s).
+    """
+    friction, factor = load.friction, load.friction_factor
+    rubs = [factor * friction.viscous, factor * friction.coulomb, friction.coulomb_width]
+    return np.concatenate(
+        [
+            body_vector(load.body, load.geometry),
+            rubs,
+            bumper.vector(),
+            motor.vector(),
+            [motor.microstep, share, step],
+        ]
+    )
+
+
 def fastest_rate(
     motor: MotorSettings, load: Load, bumper: BumperSettings, factor: float = 1.0
 ) -> float:
@@ -122,7 +144,8 @@ class Chassis:
         """Both stages of the inertial sensor's filter for yaw rate, forward, sideways."""
         self._microstep = motor.microstep
         self._cycle = 2.0 * math.pi / motor.teeth
-        self._bumper = bumper.vector()
+        self._bumper = bumper
+        self._radius = bumper.radius
         self._world = world
         self._share = share
         self._state: Array = np.zeros(9)
@@ -131,47 +154,44 @@ class Chassis:
         self._tally: Array = np.zeros(4)
         self._work: Array = np.zeros((4, 9))
         self._blocked = (False, False)
+        self._read()
 
     # -- what is so -------------------------------------------------------------------------------
 
     @property
     def pose(self) -> Pose:
         """The true pose."""
-        x, y, heading = self._state[:3].tolist()
-        return Pose(x, y, heading)
+        return Pose(self._now[0], self._now[1], self._now[2])
 
     @pose.setter
     def pose(self, pose: Pose) -> None:
         self._state[:3] = pose.x, pose.y, wrap_angle(pose.heading)
+        self._read()
 
     @property
     def wheels(self) -> WheelSpeeds:
         """How fast the rotors turn, chi."""
-        right, left = self._state[5:7].tolist()
-        return WheelSpeeds(right, left)
+        return WheelSpeeds(self._now[5], self._now[6])
 
     @property
     def ground(self) -> WheelSpeeds:
         """How fast wheels that roll would turn, psi: what the body really does."""
-        right, left = self._state[7:9].tolist()
-        return WheelSpeeds(right, left)
+        return WheelSpeeds(self._now[7], self._now[8])
 
     @property
     def counters(self) -> tuple[int, int]:
         """Pulses issued since the board was started, right first."""
-        right, left = self._field[:2].tolist()
-        return math.floor(right), math.floor(left)
+        return math.floor(self._pulses[0]), math.floor(self._pulses[1])
 
     @property
     def pulse_speeds(self) -> WheelSpeeds:
         """How fast the fields turn, rad/s."""
-        right, left = self._field[2:4].tolist()
-        return WheelSpeeds(right * self._microstep, left * self._microstep)
+        return WheelSpeeds(self._pulses[2] * self._microstep, self._pulses[3] * self._microstep)
 
     @property
     def load_angles(self) -> tuple[float, float]:
         """How far (rad) the fields are ahead of the rotors, whole lost pitches included."""
-        state, field = self._state.tolist(), self._field.tolist()
+        state, field = self._now, self._pulses
         return (
             field[4] + self._microstep * math.floor(field[0]) - state[3],
             field[5] + self._microstep * math.floor(field[1]) - state[4],
@@ -209,15 +229,7 @@ class Chassis:
 
     def load(self, motor: MotorSettings, load: Load) -> None:
         """Take what acts from now on."""
-        self._motor = motor.vector()
-        self._body = body_vector(load.body, load.geometry)
-        self._friction: Array = np.array(
-            [
-                load.friction_factor * load.friction.viscous,
-                load.friction_factor * load.friction.coulomb,
-                load.friction.coulomb_width,
-            ]
-        )
+        self._robot = robot_vector(motor, load, self._bumper, self._share, self.step)
         weight = GRAVITY * load.body.total_mass * load.tyres.load_share
         self._grip = 0.5 * load.tyres.grip * weight * load.grip_factor
         own = load.body.wheel_inertia + motor.rotor_inertia
@@ -239,6 +251,7 @@ class Chassis:
             self._field[wheel] = 0.0
             self._field[2 + wheel] = 0.0
             self._field[4 + wheel] = cycles * self._cycle
+        self._read()
 
     def run(
         self,
@@ -257,11 +270,11 @@ class Chassis:
         gap = max(abs(wheels.right - now.right), abs(wheels.left - now.left))
         even = max(gap / (count * self.step), 1e-6)
         reach = min(even, acceleration) if acceleration > 0.0 else even
-        x, y, _ = self._state[:3].tolist()
+        x, y = self._now[0], self._now[1]
         world = self._world
         segments, circles = _NO_SEGMENTS, _NO_CIRCLES
         if world.segments.size or world.circles.size:
-            near = self._bumper[0] + 2.0 * self.step * count  # 2 m/s: no wheel is as fast
+            near = self._radius + 2.0 * self.step * count  # 2 m/s: no wheel is as fast
             if clearance(x, y, world.segments, world.circles) < near:
                 segments, circles = world.segments, world.circles
         if world.patches.size:
@@ -274,27 +287,21 @@ class Chassis:
             wheels.left / self._microstep,
             reach / self._microstep,
             volts,
-            self._microstep,
-            self._motor,
-            self._body,
+            self._robot,
             self._tyres,
-            self._friction,
             disturbance.load,
             disturbance.angular,
             disturbance.phases,
             disturbance.walk,
-            self._bumper,
             segments,
             circles,
             self.filtered,
-            self._share,
             self.steps_done,
             count,
-            self.step,
             self._tally,
             self._work,
         )
-        self._state[2] = wrap_angle(float(self._state[2]))
+        self._read()
         self.steps_done += count
 
     def _hold(self, wheel: int) -> None:
@@ -302,3 +309,11 @@ class Chassis:
         self._state[5 + wheel] = 0.0
         passing = float(self._state[7 + wheel])
         self._modes[wheel] = ROLLS if passing == 0.0 else (-1 if passing > 0.0 else 1)
+        self._read()
+
+    def _read(self) -> None:
+        """Take the numbers out of the arrays: reading them there one by one is slow."""
+        self._now = self._state.tolist()
+        self._pulses = self._field.tolist()
+        if abs(self._now[2]) > math.pi:
+            self._now[2] = self._state[2] = wrap_angle(self._now[2])

@@ -178,23 +178,17 @@ def run_coupled(
     target_left: float,
     reach: float,
     volts: float,
-    microstep: float,
-    motor: Array,
-    body: Array,
+    robot: Array,
     tyres: Array,
-    friction: Array,
     load: Array,
     angular: Array,
     phases: Array,
     walk: Array,
-    bumper: Array,
     segments: Array,
     circles: Array,
     filtered: Array,
-    share: float,
     first: int,
     count: int,
-    step: float,
     tally: Array,
     work: Array,
 ) -> None:
@@ -210,15 +204,17 @@ def run_coupled(
     field : shape (6,), phase (pulses), rate (pulses/s), place of pulse 0 (rad); each right, left
     target_* : pulse rates to reach (pulses/s); reach : most change of a rate (pulses/s²)
     volts : supply; 0 = no power, the rotors turn freely
-    motor : see MotorSettings.vector
-    friction : shape (3,), viscous (N m s/rad), Coulomb (N m), width (rad/s)
+    robot : shape (22,), see ``chassis.robot_vector``
+    tyres, segments, circles : see motion_rates
     load, angular, phases, walk : see disturbance_torque
-    filtered, share : the inertial sensor's filter, see low_pass; changed in place
+    filtered : shape (3, 2), the inertial sensor's filter, see low_pass; changed in place
     first : number of the first step since the run began; the time is first times step
     tally : shape (4,), added to: way (m) each tyre slid, work (J) of the fields; largest force (N)
         of a wall
     work : shape (4, 9), overwritten
     """
+    body, friction, bumper, motor = robot[0:6], robot[6:9], robot[9:12], robot[12:19]
+    microstep, share, step = robot[19], robot[20], robot[21]
     trial, slope, total = work[0], work[1], work[2]
     torque, pushed = work[3, 0:2], work[3, 2:5]
     for index in range(first, first + count):

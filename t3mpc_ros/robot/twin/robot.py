@@ -12,6 +12,7 @@ from t3mpc_ros.motion.kinematics import body_from_wheels
 from t3mpc_ros.robot.arena.rays import cast_rays, clearance, grip_at
 from t3mpc_ros.robot.arena.world import load_world
 from t3mpc_ros.robot.backend import (
+    RANGE_SENSORS,
     STILL,
     ImuSample,
     RobotCommand,
@@ -33,6 +34,7 @@ from t3mpc_ros.robot.twin.faults import active, load_schedule
 from t3mpc_ros.robot.twin.settings import TwinSettings
 
 RESTARTING = 'brown-out: the board restarts'
+_NOTHING_THERE = (math.inf,) * len(RANGE_SENSORS)
 SLIPPING = 'gyro and steps disagree: a wheel slips, is blocked, or has lost steps'
 
 
@@ -78,7 +80,7 @@ class TwinRobot(GridRobot):
         self._odometry = FusedOdometry(settings.odometry, settings.geometry)
         self._world = load_world(settings.world)
         self._mounts = mounts(settings.sharp)
-        self._distances = np.empty(self._mounts.shape[0])
+        self._distances = np.full(self._mounts.shape[0], math.inf)
         self._chassis = Chassis(
             settings.motor,
             settings.bumper,
@@ -245,8 +247,7 @@ class TwinRobot(GridRobot):
             part = count - done
             arrival_ns = self._channel.next_ns
             if arrival_ns is not None:
-                wait = (arrival_ns - now_ns) * self._frequency
-                part = min(part, max(1, math.ceil(wait)))
+                part = min(part, max(1, self._steps_until(arrival_ns - now_ns)))
             self._drive(part, now_ns)
             done += part
 
@@ -295,13 +296,20 @@ class TwinRobot(GridRobot):
 
     def _look(self, dt: float) -> None:
         """Let those distance sensors see whose time has come."""
-        chassis = self._chassis
+        world = self._world
+        empty = not (world.segments.size or world.circles.size)
+        if empty and self._ranges.readings == _NOTHING_THERE:
+            return  # and nothing will ever be
         due = self._ranges.due(dt)
-        if not due:
-            return
-        world, pose = self._world, chassis.pose
-        which = np.array(due)
-        cast_rays(*pose, self._mounts, which, world.segments, world.circles, self._distances)
+        if due and not empty:
+            cast_rays(
+                *self._chassis.pose,
+                self._mounts,
+                np.array(due),
+                world.segments,
+                world.circles,
+                self._distances,
+            )
         for sensor in due:
             self._ranges.measure(sensor, float(self._distances[sensor]))
 
@@ -321,13 +329,14 @@ class TwinRobot(GridRobot):
 
     def _describe(self, stamp_ns: int) -> RobotState:
         geometry, guard, chassis = self._settings.geometry, self._guard, self._chassis
+        odometry, guarded = self._odometry, self._guarded
         status = RobotStatus(
             enabled=not guard.estop and not self._restarting,
             moving=self._moving(),
             estop=guard.estop,
             timed_out=guard.timed_out,
-            limited=self._guarded.limited,
-            slipping=self._odometry.slipping,
+            limited=guarded.limited,
+            slipping=odometry.slipping,
             imu_fault=self._sample is None,
             low_battery=self._battery.low,
         )
@@ -335,11 +344,9 @@ class TwinRobot(GridRobot):
             stamp_ns=stamp_ns,
             wheels=self._measured,
             angles=WheelAngles(*self._turned),
-            odometry=Motion(
-                stamp_ns, self._odometry.pose, body_from_wheels(self._measured, geometry)
-            ),
-            covariance=self._odometry.covariance,
-            commanded=self._guarded.wheels,
+            odometry=Motion(stamp_ns, odometry.pose, body_from_wheels(self._measured, geometry)),
+            covariance=odometry.covariance,
+            commanded=guarded.wheels,
             status=status,
             reason=guard.reason,
             true_wheels=chassis.wheels,
@@ -351,7 +358,8 @@ class TwinRobot(GridRobot):
         )
 
     def _moving(self) -> bool:
-        return max(map(abs, self._chassis.pulse_speeds)) > self._settings.rest_speed
+        right, left = self._chassis.pulse_speeds
+        return max(abs(right), abs(left)) > self._settings.rest_speed
 
     def _reset_reckoning(self) -> None:
         self._odometry.reset()
