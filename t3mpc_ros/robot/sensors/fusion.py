@@ -54,13 +54,13 @@ class FusedOdometrySettings(OdometrySettings):
         8.7e-5,
         'noise of the rate: a turn summed for a time t gets the variance noise² t',
         unit='rad/s/√Hz',
-        low=0.0,
+        low=1e-7,
         high=1.0,
         live=True,
         source=f'{MPU6050}: 0.005 deg/s/√Hz',
     )
     gyro_scale_tolerance: float = setting(
-        0.003,
+        0.001,
         'spread of the relative error of scale, after calibration by ten turns; 0.03 without',
         low=0.0,
         high=0.5,
@@ -84,7 +84,7 @@ class FusedOdometrySettings(OdometrySettings):
     )
     gyro_delay: float = setting(
         0.0048,
-        'delay of the low-pass filter in the gyro, here two equal poles',
+        'delay of the low-pass filter in the gyro, here two equal poles (which then pass 43 Hz)',
         unit='s',
         low=1e-4,
         high=0.1,
@@ -117,7 +117,7 @@ class FusedOdometrySettings(OdometrySettings):
         live=True,
     )
     slip_inflation: float = setting(
-        1000.0,
+        3000.0,
         'factor on the variance of the paths of the wheels while they disagree',
         low=1.0,
         high=1e6,
@@ -159,7 +159,8 @@ class FusedOdometry:
     What it cannot see: wheels that slip alike (the gyro sees turns only); a bias that jumps
     while the robot drives: the heading then drifts at that rate, unflagged below
     ``slip_threshold``, until the next standstill, where about half of the drift is taken back
-    and the covariance says what is left; and a standing robot turned as evenly as by a machine.
+    and the covariance says what is left; a standing robot that is turned as evenly as by a
+    machine, or more slowly than three times ``standstill_spread``.
 
     Parameters
     ----------

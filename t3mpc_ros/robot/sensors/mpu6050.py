@@ -98,9 +98,9 @@ class ImuSettings(Settings):
         live=True,
     )
     gyro_scale_error: float = setting(
-        0.003,
+        0.001,
         'scale error: drawn for each sensor within plus or minus this; what a calibration over '
-        'ten turns leaves (data sheet: 0.03 as delivered)',
+        'ten turns leaves that is read to 3 degrees (data sheet: 0.03 as delivered)',
         low=0.0,
         high=0.5,
         live=True,

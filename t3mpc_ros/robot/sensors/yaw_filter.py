@@ -21,10 +21,10 @@ Array = npt.NDArray[np.float64]
     BIAS, CALIBRATED,
     FIRST_POLE, SECOND_POLE, LAST_RATE, LAST_DT,
     DISAGREEMENT, DISAGREES_FOR, SLIPPING,
-    STANDS_FOR, COUNT, TIME, SUM, SQUARES,
+    STANDS_FOR, PUSHED, COUNT, TIME, SUM, SQUARES,
     SUSPECT, SUSPECT_VARIANCE,
-) = range(16)  # fmt: skip
-MEMORY = 16
+) = range(17)  # fmt: skip
+MEMORY = 17
 """How many these are."""
 STILL_RATE = 1e-4
 """rad/s, far below the gyro's noise: what is left of a turn in its filter is over."""
@@ -37,13 +37,13 @@ def delayed_rate(memory: Array, rate: float, dt: float, delay: float) -> float:
     """Return the rate (rad/s) that a gyro of this ``delay`` (s) shows at the end of ``dt``.
 
     ``rate`` is the mean over ``dt``. Within it the rate is taken to change evenly, by what the
-    means tell: a filter fed with steps would be wrong by a period's change at 50 Hz. The two
-    poles have half the delay each and are integrated exactly.
+    means tell: taken as constant, it would be wrong by half a period's change. The two poles
+    have half the delay each and are integrated exactly.
     """
     slope = 0.0
     if memory[LAST_DT] > 0.0:
         slope = 2.0 * (rate - memory[LAST_RATE]) / (dt + memory[LAST_DT])
-    else:  # the first of all: no past is better than a made-up one
+    else:  # the first call: as if it had always been so
         memory[FIRST_POLE] = memory[SECOND_POLE] = rate
     memory[LAST_RATE], memory[LAST_DT] = rate, dt
     pole, start = 0.5 * delay, rate - 0.5 * slope * dt
@@ -123,7 +123,8 @@ def learn_bias(
     hand does not turn a robot so evenly. It is then a jump that may have come at any time since
     the last standstill, which is what ``drift``, grown to its size, stands for.
 
-    variance : of the mean, by the noise alone, (rad/s)²
+    covariance : shape (5, 5); drift, memory : see :func:`fuse`
+    variance : of the mean, by the noise alone, above 0, (rad/s)²
     spread : largest standard deviation of the samples; limit : largest bias, rad/s
     """
     count = memory[COUNT]
@@ -135,10 +136,9 @@ def learn_bias(
         return
     variance = max(variance, scatter / count)
     if memory[CALIBRATED] > 0.0 and surprise**2 > 25.0 * (covariance[3, 3] + variance):
+        alone = memory[SUSPECT_VARIANCE] == 0.0
         apart = (surprise - memory[SUSPECT]) ** 2
-        if apart >= 25.0 * (memory[SUSPECT_VARIANCE] + variance) or (
-            memory[SUSPECT_VARIANCE] == 0.0
-        ):
+        if alone or apart > 25.0 * (memory[SUSPECT_VARIANCE] + variance):
             memory[SUSPECT], memory[SUSPECT_VARIANCE] = surprise, variance
             return
         factor = surprise * surprise / drift[3, 3]
@@ -150,8 +150,6 @@ def learn_bias(
     drift[:] = 0.0
 
     total = covariance[3, 3] + variance
-    if total <= 0.0:
-        return
     for row in range(3):
         pose[row] += covariance[row, 3] / total * surprise
     pose[2] = wrapped(pose[2])
@@ -183,7 +181,7 @@ def fuse(
     pose : shape (3,), m, m, rad; covariance : shape (5, 5); both changed in place
     drift : shape (5, 5), what a random walk of the bias by 1 rad/s/√s would have added to
         the covariance since the bias was last measured
-    memory : shape (MEMORY,); values : shape (14,), see :class:`FusedOdometry`
+    memory : shape (MEMORY,); values : shape (14,), see ``FusedOdometry.settings``
     right, left : rad; gyro : rad/s, NaN without one; dt : s; jitter : rad², of each angle
     """
     radius, half, per_metre, inflation = values[0], values[1], values[2], values[3]
@@ -205,7 +203,11 @@ def fuse(
         disagrees = watch_slip(
             memory, excess, brief, limit + 3.0 * tolerance * abs(rate), slip_time
         )
-        pushed = memory[STANDS_FOR] > slip_time and abs(memory[DISAGREEMENT]) > 3.0 * spread
+        # A hand that pushes back and forth passes through zero: it is heard to the end.
+        memory[PUSHED] = max(memory[PUSHED] - dt, 0.0)
+        if memory[STANDS_FOR] > slip_time and abs(memory[DISAGREEMENT]) > 3.0 * spread:
+            memory[PUSHED] = window
+        pushed = still and memory[PUSHED] > 0.0
         if disagrees or pushed:  # the path that the steps know nothing of is one as well
             rough *= inflation
             path_right += half * abs(excess) * dt
@@ -224,6 +226,7 @@ def fuse(
         told, turn = excess * dt, tolerance * rate * dt
     else:
         memory[DISAGREEMENT] = memory[DISAGREES_FOR] = memory[SLIPPING] = 0.0
+        memory[PUSHED] = 0.0
         noise_right, noise_left = rough * path_right + constant, rough * path_left + constant
 
     across_x, across_y, right_x, right_y, left_x, left_y, bend = follow_arc(
