@@ -237,12 +237,13 @@ def test_slip_turns_the_heading_a_fifth_as_much_with_a_gyro(course):
 
 
 def test_ten_turns_one_way_cost_the_tolerance_of_the_scale_and_turning_back_returns_it():
-    robots, odometries = Robots(1, 6), fused()
+    tolerance = 0.003
+    robots, odometries = Robots(1, 6), fused(gyro_scale_tolerance=tolerance)
     robots.stand(odometries, 2.0)
     for _ in robots.drive(odometries, ten_turns(1.0)[:, :, None]):
         pass
     sure = math.sqrt(odometries[0].covariance[2, 2])
-    assert sure == pytest.approx(20.0 * math.pi * SETTINGS.gyro_scale_tolerance, rel=0.02)
+    assert sure == pytest.approx(20.0 * math.pi * tolerance, rel=0.02)
     for _ in robots.drive(odometries, ten_turns(-1.0)[:, :, None]):
         pass
     assert math.sqrt(odometries[0].covariance[2, 2]) < 0.05 * sure
