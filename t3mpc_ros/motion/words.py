@@ -38,6 +38,12 @@ class WheelSpeeds(NamedTuple):
     """rad/s"""
 
 
+def check_pose(pose: Pose) -> None:
+    """Raise ValueError when a pose is not finite."""
+    if not all(map(math.isfinite, pose)):
+        raise ValueError(f'pose must be finite: got {pose}')
+
+
 ORIGIN = Pose(0.0, 0.0, 0.0)
 STANDSTILL = BodyTwist(0.0, 0.0)
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.motion import Geometry, Pose, WheelSpeeds
-from t3mpc_ros.motion.words import ORIGIN
+from t3mpc_ros.motion.words import ORIGIN, check_pose
 from t3mpc_ros.settings import Settings, setting
 
 Array = npt.NDArray[np.float64]
@@ -165,8 +165,7 @@ class DeadReckoning:
         ValueError
             The pose is not finite.
         """
-        if not all(map(math.isfinite, pose)):
-            raise ValueError(f'pose must be finite: got {pose}')
+        check_pose(pose)
         self._pose[:] = pose
         self._covariance[:] = 0.0
 

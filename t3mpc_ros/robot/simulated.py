@@ -7,6 +7,7 @@ import math
 
 from t3mpc_ros.motion import Geometry, Motion, Pose, WheelSpeeds
 from t3mpc_ros.motion.kinematics import body_from_wheels
+from t3mpc_ros.motion.words import check_pose
 from t3mpc_ros.robot.backend import (
     STILL,
     RobotCommand,
@@ -195,8 +196,7 @@ class SimulatedRobot(GridRobot):
         ValueError
             The pose is not finite.
         """
-        if not all(map(math.isfinite, pose)):
-            raise ValueError(f'pose must be finite: got {pose}')
+        check_pose(pose)
         self._plant.pose = pose
         self._describe_again()
 

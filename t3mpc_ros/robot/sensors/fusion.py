@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from t3mpc_ros.motion import Geometry, Pose
-from t3mpc_ros.motion.words import ORIGIN
+from t3mpc_ros.motion.words import ORIGIN, check_pose
 from t3mpc_ros.robot.odometry import OdometrySettings
 from t3mpc_ros.robot.sensors.yaw_filter import (
     BIAS,
@@ -253,8 +253,7 @@ class FusedOdometry:
         ValueError
             The pose is not finite.
         """
-        if not all(map(math.isfinite, pose)):
-            raise ValueError(f'pose must be finite: got {pose}')
+        check_pose(pose)
         self._pose[:] = pose
         for matrix in (self._covariance, self._drift):
             matrix[:3, :] = 0.0

@@ -9,6 +9,7 @@ import numpy as np
 
 from t3mpc_ros.motion import Motion, Pose, WheelSpeeds
 from t3mpc_ros.motion.kinematics import body_from_wheels
+from t3mpc_ros.motion.words import check_pose
 from t3mpc_ros.robot.arena.rays import cast_rays, clearance, grip_at
 from t3mpc_ros.robot.arena.world import load_world
 from t3mpc_ros.robot.backend import (
@@ -154,8 +155,7 @@ class TwinRobot(GridRobot):
         ValueError
             The pose is not finite, or the robot would stand in a wall.
         """
-        if not all(map(math.isfinite, pose)):
-            raise ValueError(f'pose must be finite: got {pose}')
+        check_pose(pose)
         radius = self._settings.bumper.radius
         if not self._world.is_free(pose.x, pose.y, radius):
             raise ValueError(
