@@ -169,3 +169,15 @@ def test_numbers_that_cannot_be_are_refused_and_change_nothing(power, dt):
 def test_settings_that_do_not_fit_are_refused_by_name(changes, name):
     with pytest.raises(SettingError, match=f'^{name} '):
         BatterySettings.from_flat(changes)
+
+
+def test_a_sagging_cell_shows_in_the_voltage_and_takes_the_board_down():
+    """Taken from the motors alone, a sag was seen by no reading, no warning and no board."""
+    battery = Battery(BatterySettings())
+    healthy = battery.draw(5.0, 0.01).voltage
+    assert battery.draw(5.0, 0.01, sag=2.0).voltage == pytest.approx(healthy - 2.0, abs=0.05)
+    assert not battery.collapsed
+    assert battery.draw(5.0, 0.01, sag=20.0).voltage == 0.0
+    assert battery.collapsed
+    assert battery.draw(5.0, 0.01).voltage == pytest.approx(healthy, abs=0.01)
+    assert not battery.collapsed

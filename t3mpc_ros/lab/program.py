@@ -14,6 +14,7 @@ import webbrowser
 from t3mpc_ros.lab.paper.program import add_parser as add_paper
 from t3mpc_ros.lab.training.command import add_parser as add_train
 from t3mpc_ros.lab.tuning.command import add_parser as add_tune
+from t3mpc_ros.lab.twin.faults_command import add_outcomes_parser
 
 if TYPE_CHECKING:
     from t3mpc_ros.lab.tuning.contestant import Contestant
@@ -137,6 +138,7 @@ def _parser() -> argparse.ArgumentParser:
     add_paper(commands)
     add_tune(commands, _contestants)
     add_train(commands)
+    add_outcomes_parser(commands)
 
     warm = commands.add_parser('warm', help='compile every kernel into the cache')
     warm.set_defaults(run=_warm)

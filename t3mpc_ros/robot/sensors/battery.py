@@ -116,10 +116,11 @@ class Battery:
         """Whether the voltage is too low for drivers and board, or was and has not come back."""
         return self._collapsed
 
-    def draw(self, power: float, dt: float) -> BatteryReading:
+    def draw(self, power: float, dt: float, sag: float = 0.0) -> BatteryReading:
         r"""Return voltage, current and charge after ``dt`` seconds of ``power`` (W) to the motors.
 
-        With E the open-circuit voltage less what the idle current I takes, the voltage solves
+        With E the open-circuit voltage less ``sag`` (V, a fault of the cells) and what the idle
+        current I takes, the voltage solves
 
         .. math:: V = E - R P / V, \qquad V = E/2 + \sqrt{E^2/4 - R P}.
 
@@ -132,21 +133,22 @@ class Battery:
         ValueError
             A number is not finite, or ``dt`` is negative; nothing has changed then.
         """
-        if not (math.isfinite(power) and 0.0 <= dt < math.inf):
+        if not (math.isfinite(power + sag) and 0.0 <= dt < math.inf):
             raise ValueError(
-                f'power must be finite, dt finite and at least 0 s: got {power} W, {dt} s'
+                'power and sag must be finite, dt finite and at least 0 s: '
+                f'got {power} W, {sag} V, {dt} s'
             )
         settings = self.settings
         beyond = self._charge <= 0.0
         volts = current = 0.0
         if not beyond:
             inner, idle = settings.resistance, settings.idle_current
-            open_circuit = open_circuit_voltage(self._charge, settings.cells)
+            open_circuit = open_circuit_voltage(self._charge, settings.cells) - sag
             half = 0.5 * (open_circuit - inner * idle)
             left = half * half - inner * max(power, 0.0)
             beyond = left < 0.0 or half <= 0.0
-            volts = max(half, 0.0) + math.sqrt(max(left, 0.0))
-            current = (open_circuit - volts) / inner
+            volts = half + math.sqrt(max(left, 0.0)) if half > 0.0 else 0.0
+            current = max(open_circuit - volts, 0.0) / inner
             full = settings.capacity * _SECONDS_PER_HOUR
             if current * dt < self._charge * full:
                 self._charge -= current * dt / full

@@ -31,12 +31,12 @@ from t3mpc_ros.robot.sensors.sharp import RangeFinders, mounts
 from t3mpc_ros.robot.simulated import SimulatedRobot
 from t3mpc_ros.robot.stepper.chassis import Chassis
 from t3mpc_ros.robot.twin.channel import CommandChannel
-from t3mpc_ros.robot.twin.faults import active, load_schedule
+from t3mpc_ros.robot.twin.faults import FaultSchedule, active, load_schedule
 from t3mpc_ros.robot.twin.settings import TwinSettings
+from t3mpc_ros.robot.twin.slip_stop import SLIPPING, SlipStop
 
 RESTARTING = 'brown-out: the board restarts'
 _NOTHING_THERE = (math.inf,) * len(RANGE_SENSORS)
-SLIPPING = 'gyro and steps disagree: a wheel slips, is blocked, or has lost steps'
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,9 +63,16 @@ class TwinRobot(GridRobot):
     Step counters count pulses, so odometry is wrong exactly when steps are lost or a tyre slides;
     the gyro shows what of it turns the robot. Every random part draws from a generator of its own,
     the same numbers whatever the settings: changing one does not shift the others.
+
+    Parameters
+    ----------
+    settings
+        Replaceable while running, as far as they are live.
+    schedule
+        The faults to play; without one, those that ``faults.schedule`` names.
     """
 
-    def __init__(self, settings: TwinSettings) -> None:
+    def __init__(self, settings: TwinSettings, schedule: FaultSchedule | None = None) -> None:
         guard = CommandGuard(settings.guard, settings.geometry)
         super().__init__(settings.rate, settings.substeps, settings.longest_gap, guard)
         self._settings = settings
@@ -89,10 +96,11 @@ class TwinRobot(GridRobot):
             settings.step,
             settings.imu.share(settings.step),
         )
-        self._schedule = load_schedule(settings.faults.schedule)
+        self._schedule = load_schedule(settings.faults.schedule) if schedule is None else schedule
         self._faults = settings.faults
         self._boots_until = 0
         """Integration step at which the board is back."""
+        self._slip_stop = SlipStop()
         self._measured = STILL
         self._measured_at = 0
         self._counters = (0, 0)
@@ -201,6 +209,11 @@ class TwinRobot(GridRobot):
     def _restarting(self) -> bool:
         return self._chassis.steps_done < self._boots_until
 
+    @property
+    def _elapsed(self) -> float:
+        """Time since the robot was made, s: it never goes back."""
+        return self._chassis.steps_done * self._chassis.step
+
     def _take_settings(self) -> None:
         settings = self._settings
         self._guard.settings = settings.guard
@@ -213,10 +226,8 @@ class TwinRobot(GridRobot):
 
     def _take_faults(self) -> None:
         """Look which faults are at work now, and let those that begin or end do so."""
-        chassis = self._chassis
         before = self._faults
-        elapsed = chassis.steps_done * chassis.step
-        self._faults = self._schedule.at(elapsed, self._settings.faults)
+        self._faults = self._schedule.at(self._elapsed, self._settings.faults)
         if self._faults is before:
             return
         if self._faults.brown_out and not before.brown_out:
@@ -230,6 +241,7 @@ class TwinRobot(GridRobot):
         """Let the board start anew: counters at zero, sensors too, and no command."""
         chassis = self._chassis
         self._boots_until = chassis.steps_done + round(self._settings.boot_time / chassis.step)
+        self._slip_stop.forget()
         self._channel.clear()
         self._guard.stop(RESTARTING, self._now_ns())
         self._imu.restart()
@@ -243,7 +255,8 @@ class TwinRobot(GridRobot):
         while done < count:
             now_ns = self._after(self._since_origin + done)
             for command in self._channel.arrived(now_ns):
-                self._guard.accept(command, now_ns)
+                if not self._slip_stop.refuses(command, self._elapsed):
+                    self._guard.accept(command, now_ns)
             part = count - done
             arrival_ns = self._channel.next_ns
             if arrival_ns is not None:
@@ -255,7 +268,7 @@ class TwinRobot(GridRobot):
         """Run ``count`` steps under one command."""
         chassis = self._chassis
         self._guarded = self._guard.advance(now_ns, count * chassis.step)
-        volts = 0.0 if self._restarting else self._supply.voltage - self._faults.supply_sag
+        volts = 0.0 if self._restarting else self._supply.voltage
         chassis.run(
             self._guarded.wheels,
             self._settings.drive.acceleration,
@@ -290,8 +303,8 @@ class TwinRobot(GridRobot):
             gyro = None if absent else sample.angular
             self._odometry.update(turned.right, turned.left, gyro, dt)
             self._measured = self._noise.measure(WheelSpeeds(turned.right / dt, turned.left / dt))
-        limit = self._settings.slip_stop
-        if limit > 0.0 and self._odometry.slipping_for > limit:
+        slipping_for = self._odometry.slipping_for
+        if self._slip_stop.decide(slipping_for, self._settings.slip_stop, self._elapsed):
             self._guard.stop(SLIPPING, self._now_ns())
 
     def _look(self, dt: float) -> None:
@@ -323,7 +336,7 @@ class TwinRobot(GridRobot):
             copper = 2.0 * motor.phase_current**2 * motor.resistance
             power = copper + max(0.0, done - self._field_work) / dt
         self._field_work = done
-        self._supply = self._battery.draw(power, dt)
+        self._supply = self._battery.draw(power, dt, self._faults.supply_sag)
         if self._battery.collapsed and not self._restarting:
             self._lose_power()
 

@@ -43,7 +43,8 @@ class TwinSettings(SimulatedRobotSettings):
     )
     slip_stop: float = setting(
         1.0,
-        'gyro and steps may disagree for so long, then the robot stops; 0 = it never does',
+        'gyro and steps may disagree for so long, then the robot stops until no motion was '
+        'commanded for 0.5 s; 0 = it never does',
         unit='s',
         low=0.0,
         high=60.0,

@@ -1,0 +1,35 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``lab faults``: what becomes of the closed loop under each fault, and the page that says so."""
+
+import argparse
+from dataclasses import asdict
+import json
+from pathlib import Path
+import sys
+
+
+def add_outcomes_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
+    """Add ``faults`` to the commands of ``lab``; :func:`run` carries it out."""
+    parser = commands.add_parser(
+        'faults', help='drive the digital twin under every named fault, and say what comes of it'
+    )
+    parser.add_argument(
+        '--output', type=Path, help='page whose table is to be replaced, docs/faults.md say'
+    )
+    parser.add_argument('--json', type=Path, help='also write the numbers to this file')
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Return 0 when no loop got out of bounds, 1 when one did; prints what became of each."""
+    from t3mpc_ros.lab.twin.outcome_table import console, rewrite
+    from t3mpc_ros.lab.twin.outcomes import outcomes
+
+    results = outcomes(lambda text: print(f'  {text}', file=sys.stderr, flush=True))
+    print(console(results))
+    if options.output:
+        rewrite(options.output, results)
+    if options.json:
+        options.json.write_text(json.dumps([asdict(one) for one in results], indent=1) + '\n')
+    return 1 if any(one.verdict == 'unbounded' for one in results) else 0
