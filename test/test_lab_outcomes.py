@@ -117,7 +117,7 @@ def test_what_cannot_be_run_is_refused():
 # --- what becomes of it -------------------------------------------------------------------------
 
 EXPECTED = {
-    'command_delay 0.1 s': ('bounded', '', ''),
+    'command_delay 0.1 s': ('impaired', '', ''),
     'command_jitter 0.05 s': ('bounded', '', ''),
     'command_loss 1': ('stops', 'no command for 0.25 s', 'by itself'),
     'gyro_bias_jump 0.35 rad/s': ('stops', SLIPPING, 'after a pause'),

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The controller of one robot: stamped motions in, a limited twist and its reason out."""
 
+from collections import deque
 from dataclasses import dataclass
 import math
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.control.composition import ComposedLaw, CompositionSettings
 from t3mpc_ros.control.drive import Drive, LimitSettings
-from t3mpc_ros.control.freshness import Freshness, FreshnessSettings, Reason
+from t3mpc_ros.control.freshness import Following, Freshness, FreshnessSettings, Reason
 from t3mpc_ros.control.law import CertificateReading
 from t3mpc_ros.control.pursuit import Pursuit
 from t3mpc_ros.motion import BodyTwist, Geometry, Motion, WheelSpeeds
@@ -23,6 +24,12 @@ Array = NDArray[np.float64]
 
 JUMP_FACTOR = 2.2
 """A reference that changes this many times faster than the robot may is taken as a switch."""
+
+
+KEPT = 0.25
+"""s between two copies of what is learnt."""
+COPIES = 3
+"""The oldest of so many is from before a robot stopped following; doubt takes some time."""
 
 
 @dataclass(frozen=True)
@@ -67,12 +74,16 @@ class Controller:
             settings.estimate, settings.limits, settings.geometry, 'velocity', self._period
         )
         self._freshness = Freshness(settings.freshness)
+        self._following = Following(settings.freshness, self._period)
         limits = settings.limits
         self._track = Track(
             BodyTwist(
                 JUMP_FACTOR * limits.linear_acceleration, JUMP_FACTOR * limits.angular_acceleration
             )
         )
+        self._before: deque[dict[str, Array]] = deque(maxlen=COPIES)
+        """What had been learnt, from oldest to newest."""
+        self._since_copy = 0
         self._jumps: list[Jump] = []
         self._told: set[int] = set()
         self._moving = False
@@ -171,6 +182,13 @@ class Controller:
         fresh = elapsed is None or not self._moving
         if fresh:
             self._drive.reset(speeds)
+            self._following.reset()
+            self._before.clear()
+        elif not self._following.heard(*speeds.tolist()):
+            return self._insist(stamp, wanted, error)
+        elif self.status.reason is Reason.NOT_FOLLOWING:
+            fresh = True
+            self._drive.reset(speeds)
         self._drive.observe(speeds, elapsed or self._period)
         acts_ns = stamp + round(self._drive.dead_time * NANOSECONDS)
         begin, end = self._coming(stamp, acts_ns, point)
@@ -186,8 +204,34 @@ class Controller:
         )
         applied = self._drive.send(command).copy()
         self._pursuit.applied(applied, limited=self._drive.limited)
+        self._following.told(*self._drive.command.tolist())
+        self._keep()
         self.status = self._status(stamp, reason, self._drive.speeds - wanted, applied)
         return self._drive.twist, self.status
+
+    def _insist(self, stamp_ns: int, wanted: Array, error: Array) -> tuple[BodyTwist, Status]:
+        """Go on commanding the reference to a robot that does not follow, and learn nothing.
+
+        A stop would be for ever: a board that has restarted waits for commands. What was learnt
+        until this was noticed is taken back. When the robot follows again, the law starts as
+        after a stop, with what it knew before.
+        """
+        if self.status.reason is not Reason.NOT_FOLLOWING:
+            self._pursuit.reset()
+            if self._before:
+                self.law.restore(self._before[0])
+                self._before.clear()
+        self._drive.aim(wanted)
+        self._following.told(*self._drive.command.tolist())
+        self.status = self._status(stamp_ns, Reason.NOT_FOLLOWING, error)
+        return self._drive.twist, self.status
+
+    def _keep(self) -> None:
+        """Copy what is learnt, now and then."""
+        self._since_copy += 1
+        if self._since_copy * self._period >= KEPT:
+            self._since_copy = 0
+            self._before.append(self.law.learnt())
 
     def silent(self, last_heard_ns: int | None, now_ns: int) -> bool:
         """Whether the odometry has gone silent, so that a stop must be commanded.

@@ -235,6 +235,15 @@ class Drive:
         self.applied[:] = (self.command - self.ahead) / stretch
         return self.applied
 
+    def aim(self, wheels: Array) -> None:
+        """Command wheel speeds (rad/s), shape (2,), within the limits, whatever the robot does."""
+        self._sent = True
+        right, left = wheels.tolist()
+        self.limited = limit_command(
+            right, left, self.command, self._limits, self._period, self.command
+        )
+        self.applied[:] = 0.0
+
     def tell(self, wheels: Array) -> None:
         """Take note of what was sent in the place of :meth:`send`'s answer, in a recorded run say.
 

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether the robot may move: freshness of what the controller is told, and when it stops."""
 
+from collections import deque
 from dataclasses import dataclass
 import enum
 
@@ -43,6 +44,29 @@ class FreshnessSettings(Settings):
         high=60.0,
     )
 
+    following_bound: float = setting(
+        1.5,
+        'how far a measured wheel speed may lie outside the commands of following_window before '
+        'the robot counts as not following; 0 = it always follows',
+        unit='rad/s',
+        low=0.0,
+        high=100.0,
+    )
+    following_window: float = setting(
+        0.15,
+        'how long a command may take to be seen in the odometry',
+        unit='s',
+        low=0.01,
+        high=2.0,
+    )
+    following_patience: float = setting(
+        0.1,
+        'for how long it must, or must no longer, lie outside',
+        unit='s',
+        low=0.0,
+        high=5.0,
+    )
+
 
 class Reason(enum.Enum):
     """Why the robot is stopped, or that it is not."""
@@ -55,11 +79,12 @@ class Reason(enum.Enum):
     NO_REFERENCE = 'no reference yet'
     REFERENCE_STALE = 'reference is stale'
     DIVERGING = 'state is diverging'
+    NOT_FOLLOWING = 'the robot does not do what it is told'
 
     @property
     def moves(self) -> bool:
         """Whether the robot may move."""
-        return self is Reason.TRACKING
+        return self in (Reason.TRACKING, Reason.NOT_FOLLOWING)
 
 
 class Freshness:
@@ -144,3 +169,56 @@ class Freshness:
         if last_heard_ns is None:
             return True
         return now_ns - last_heard_ns > self._settings.odometry_timeout * NANOSECONDS
+
+
+PROOF = 20
+"""So much more a sample counts, for trust in the robot, that one that stands could not give."""
+
+
+class Following:
+    """Decides whether the robot does what it is told: else its errors say nothing of the law.
+
+    A robot that hears nothing, restarts, or whose wheel is held, is no plant to learn from. Its
+    wheel speeds lie outside everything that was commanded lately, however late a command acts.
+    Commands near zero prove nothing: a robot that stands obeys them too.
+    """
+
+    def __init__(self, settings: FreshnessSettings, period: float) -> None:
+        self._settings = settings
+        self._commands: deque[tuple[float, float]] = deque(
+            maxlen=max(1, round(settings.following_window / period))
+        )
+        self._patience = max(1, round(settings.following_patience / period))
+        self._against = 0
+        self.holds = True
+        """Whether the robot follows."""
+
+    def reset(self) -> None:
+        """Trust the robot again, and forget what it was told."""
+        self._commands.clear()
+        self._against = 0
+        self.holds = True
+
+    def told(self, right: float, left: float) -> None:
+        """Note what is commanded now, rad/s."""
+        self._commands.append((right, left))
+
+    def heard(self, right: float, left: float) -> bool:
+        """Decide whether the robot follows, from its measured wheel speeds (rad/s)."""
+        bound, commands = self._settings.following_bound, self._commands
+        if bound == 0.0 or len(commands) < (commands.maxlen or 0):
+            return self.holds
+        outside = asleep = 0.0
+        for measured, given in zip((right, left), zip(*commands, strict=True), strict=True):
+            lowest, highest = min(given), max(given)
+            outside = max(outside, measured - highest, lowest - measured)
+            asleep = max(asleep, -highest, lowest)
+        if (outside > bound) != self.holds:
+            self._against = 0
+        elif self.holds or asleep > bound:
+            self._against += PROOF
+        else:
+            self._against += 1  # one that hears nothing would do the same
+        if self._against >= PROOF * self._patience:
+            self.holds, self._against = not self.holds, 0
+        return self.holds

@@ -14,6 +14,7 @@ from std_msgs.msg import Float64
 from std_srvs.srv import SetBool, Trigger
 
 from t3mpc_ros.control.controller import Controller, Status
+from t3mpc_ros.control.freshness import Reason
 from t3mpc_ros.control.law import TERMS
 from t3mpc_ros.motion import BodyTwist
 from t3mpc_ros.motion.words import STANDSTILL
@@ -176,6 +177,8 @@ class ControllerNode(PackageNode[ControllerNodeSettings]):
             return WARN, f'cmd_vel is taken as {other} by another node: set stamped', values
         if waiting:
             return WARN, stopped, values
+        if status.reason is Reason.NOT_FOLLOWING:
+            return WARN, status.reason.value, values
         if self._refused:
             return WARN, 'references that are not finite were ignored', values
         return OK, status.reason.value, values
