@@ -778,7 +778,7 @@ def test_settings_that_do_not_fit_together_are_refused_with_the_reason(world):
     both = [Parameter('guard.acceleration', value=5.0), slow]
     assert robot.set_parameters_atomically(both).successful, 'together they fit'
     assert robot.settings.guard.stop_deceleration == 10.0
-    with pytest.raises(SettingError, match='drive.kind must be velocity'):
+    with pytest.raises(SettingError, match='drive.kind must be stepper or velocity'):
         world.add(SimRobotNode, namespace='other', drive__kind='torque')
 
 

@@ -2,17 +2,37 @@
 # SPDX-License-Identifier: Apache-2.0
 """Between messages and the package's words nothing is lost, and nothing bad gets through."""
 
+from dataclasses import replace
 import math
 
 from geometry_msgs.msg import Quaternion, Twist, TwistStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
+from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import Range
 
-from t3mpc_ros.motion import BodyTwist, Motion, Pose
+from t3mpc_ros.motion import BodyTwist, Geometry, Motion, Pose, WheelSpeeds
+from t3mpc_ros.motion.kinematics import body_from_wheels
 from t3mpc_ros.motion.words import NANOSECONDS, wrap_angle
 from t3mpc_ros.nodes.plumbing import convert
+from t3mpc_ros.nodes.robot import sensors
+from t3mpc_ros.nodes.robot.condition import complaints, measures, staleness
+from t3mpc_ros.robot.backend import (
+    STILL,
+    BatteryReading,
+    ImuSample,
+    RobotCommand,
+    RobotState,
+    RobotStatus,
+    WheelAngles,
+)
+from t3mpc_ros.robot.guard import GuardSettings
+from t3mpc_ros.robot.sensors.battery import BatterySettings
+from t3mpc_ros.robot.sensors.mpu6050 import ImuSettings, Mpu6050
+from t3mpc_ros.robot.sensors.sharp import SharpSettings
+from t3mpc_ros.robot.twin.robot import SLIPPING, Inside
 
 HEADINGS = [*np.linspace(-math.pi, math.pi, 41)[1:], 1e-9, -1e-9, math.pi - 1e-9, 1e-9 - math.pi]
 STAMPS = [0, 1, NANOSECONDS - 1, NANOSECONDS, 1_795_240_567_146_950_308, (2**31 - 1) * NANOSECONDS]
@@ -162,3 +182,159 @@ def test_wheel_joints_keep_their_order():
     assert list(message.position) == [1.0, 2.0]
     assert list(message.velocity) == [3.0, 4.0]
     assert convert.ns_from_time(message.header.stamp) == 7
+
+
+# -- sensors --------------------------------------------------------------------------------------
+
+
+def test_the_spread_claimed_of_the_inertial_sensor_is_that_of_its_samples():
+    """Standing still, for as long as the bias walks less than the noise."""
+    settings = ImuSettings(gyro_drift=0.0)
+    sensor = Mpu6050(settings, np.random.default_rng(3))
+    still = np.zeros((3, 2))
+    samples = np.array([sensor.measure(still, 0.01) for _ in range(20_000)])
+    message = sensors.imu_message(settings, 'imu_link')
+    turn, push = message.angular_velocity_covariance, message.linear_acceleration_covariance
+    claimed = (turn[8], push[0], push[4])
+    np.testing.assert_allclose(samples.var(axis=0), claimed, rtol=0.1)
+    assert message.orientation_covariance[0] == -1.0
+    for covariance, unknown in ((turn, (0, 4)), (push, (8,))):
+        matrix = np.array(covariance).reshape(3, 3)
+        np.testing.assert_array_equal(matrix, np.diag(np.diag(matrix)))
+        assert all(covariance[place] == 1e6 for place in unknown)
+    noisier = sensors.imu_message(ImuSettings(gyro_noise=0.05), 'imu_link')
+    assert noisier.angular_velocity_covariance[8] > 50.0 * turn[8]
+
+
+def test_a_sample_keeps_its_axes_and_leaves_the_others_alone():
+    message = sensors.imu_message(ImuSettings(), 'a/imu')
+    sensors.fill_imu(message, ImuSample(0.5, 1.0, -2.0), 7)
+    assert convert.ns_from_time(message.header.stamp) == 7
+    assert message.header.frame_id == 'a/imu'
+    turn, push = message.angular_velocity, message.linear_acceleration
+    assert (turn.x, turn.y, turn.z) == (0.0, 0.0, 0.5)
+    assert (push.x, push.y, push.z) == (1.0, -2.0, 0.0)
+
+
+FLOATS = np.float32
+
+
+@pytest.mark.parametrize(
+    'distance, infinity, expected',
+    [
+        (0.345, True, FLOATS(0.345)),
+        (0.10, True, FLOATS(0.10)),
+        (-math.inf, True, -math.inf),
+        (math.inf, True, math.inf),
+        (0.345, False, FLOATS(0.345)),
+        (-math.inf, False, -math.inf),
+        (math.inf, False, FLOATS(0.80)),
+    ],
+)
+def test_a_distance_follows_rep_117_after_the_wire(distance, infinity, expected):
+    """Numbers are single on the wire: what lies on a bound must not fall beyond it there."""
+    message = sensors.range_message(SharpSettings(), 'left_front_range_link')
+    sensors.fill_range(message, distance, 7, infinity=infinity)
+    heard = deserialize_message(serialize_message(message), Range)
+    assert heard.range == expected
+    assert heard.radiation_type == Range.INFRARED
+    assert heard.field_of_view == FLOATS(0.1)
+    if math.isfinite(expected):
+        assert heard.min_range <= heard.range <= heard.max_range
+        assert (heard.range == heard.max_range) == (expected == FLOATS(0.8))
+
+
+def test_a_battery_that_gives_current_has_a_negative_one():
+    settings = BatterySettings(cells=4, capacity=2.0)
+    message = sensors.battery_message(settings)
+    sensors.fill_battery(message, BatteryReading(15.0, 0.5, 0.75), 7)
+    assert (message.voltage, message.current, message.percentage) == (15.0, -0.5, 0.75)
+    assert message.charge == 1.5
+    assert message.design_capacity == 2.0
+    assert len(message.cell_voltage) == 4
+    assert np.isnan([*message.cell_voltage, message.temperature, message.capacity]).all()
+    sensors.fill_battery(message, BatteryReading(15.0, math.nan, math.nan), 8)
+    assert np.isnan([message.current, message.charge, message.percentage]).all()
+
+
+def test_the_covariance_of_a_twist_is_that_of_its_wheels():
+    geometry, variance = Geometry(), 0.04
+    rng = np.random.default_rng(9)
+    wheels = rng.normal(scale=math.sqrt(variance), size=(20_000, 2))
+    twists = np.array([body_from_wheels(WheelSpeeds(*pair), geometry) for pair in wheels])
+    told = np.array(sensors.twist_covariance(geometry, variance)).reshape(6, 6)
+    np.testing.assert_allclose([told[0, 0], told[5, 5]], twists.var(axis=0), rtol=0.05)
+    assert told[1, 1] == 1e6
+    misled = np.array(sensors.twist_covariance(geometry, math.inf)).reshape(6, 6)
+    np.testing.assert_array_equal(misled, 1e6 * np.eye(6))
+
+
+def test_the_variance_of_a_counted_speed_is_that_of_counting():
+    step, period = 0.002, 0.01
+    rng = np.random.default_rng(10)
+    angles = np.cumsum(rng.uniform(0.01, 0.05, 20_000))
+    counted = np.diff(np.floor(angles / step) * step) / period
+    error = counted - np.diff(angles) / period
+    assert sensors.count_variance(step, period) == pytest.approx(error.var(), rel=0.05)
+
+
+# -- what is wrong --------------------------------------------------------------------------------
+
+
+def _state(reason='', lost=(0, 0), **status):
+    flags = {'enabled': True, 'moving': False, 'estop': False, 'timed_out': False} | status
+    return RobotState(
+        stamp_ns=0,
+        wheels=STILL,
+        angles=WheelAngles(0.0, 0.0),
+        odometry=Motion(0, Pose(0, 0, 0), BodyTwist(0, 0)),
+        covariance=np.zeros((3, 3)),
+        commanded=STILL,
+        status=RobotStatus(limited=False, **flags),
+        reason=reason,
+        battery=BatteryReading(9.87, 0.5, 0.1),
+        lost_steps=lost,
+    )
+
+
+INSIDE = Inside((), (0.1, 0.2), (0.0, 0.0), 0.05, 0.04, 0.0)
+
+
+@pytest.mark.parametrize(
+    'state, inside, words',
+    [
+        (_state(), INSIDE, []),
+        (_state(), None, []),
+        (_state('no command yet'), INSIDE, ['no command yet']),
+        (_state(slipping=True), INSIDE, ['a wheel slips']),
+        (_state(SLIPPING, slipping=True), INSIDE, ['gyro and steps disagree']),
+        (_state(imu_fault=True), INSIDE, ['inertial sensor does not answer']),
+        (_state(low_battery=True), INSIDE, ['battery is low: 9.9 V']),
+        (_state(lost=(4, -8)), INSIDE, ['steps lost: 4 right, -8 left']),
+        (_state('why', imu_fault=True), INSIDE, ['why', 'inertial sensor']),
+    ],
+)
+def test_a_robot_complains_of_what_is_wrong_and_of_nothing_else(state, inside, words):
+    found = complaints(state, inside)
+    assert len(found) == len(words)
+    for text, word in zip(found, words, strict=True):
+        assert word in text
+
+
+def test_faults_at_work_are_named():
+    inside = replace(INSIDE, faults=('gyro_dead', 'command_delay 0.1 s'))
+    (text,) = complaints(_state(), inside)
+    assert text == 'faults: gyro_dead, command_delay 0.1 s'
+    assert measures(_state(), inside)['faults'] == 'gyro_dead, command_delay 0.1 s'
+    values = measures(_state(), INSIDE)
+    assert values['faults'] == 'none'
+    assert (values['gyro_bias_rad_s'], values['gyro_bias_learnt_rad_s']) == (0.05, 0.04)
+    assert (values['slid_right_m'], values['slid_left_m']) == (0.1, 0.2)
+    assert values['battery_v'] == 9.87
+
+
+def test_a_stale_command_is_told_before_it_is_sent():
+    guard = GuardSettings(command_timeout=0.25)
+    for age, stale in ((0.0, False), (0.249, False), (0.25, True), (2.0, True), (-1.0, False)):
+        command = RobotCommand(STILL, round((10.0 - age) * NANOSECONDS))
+        assert bool(staleness(command, 10 * NANOSECONDS, guard)) == stale, age

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The demonstration: four processes over DDS, recorded, and a report made from the bag."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 import shutil
@@ -14,6 +15,15 @@ from t3mpc_ros.lab.report import ReportFigures, write_report
 STARTED = ('recorder', 'controller', 'sim_robot', 'reference')
 PAPER_NOISE = 0.04
 """Variance of the measured wheel speeds, (rad/s)², as in the paper's simulations."""
+ROBOTS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
+    'twin': {
+        'sim_robot': {'drive.kind': 'stepper'},
+        # A rotor follows its field at once; the default belongs to the servo.
+        'controller': {'estimate.lag': 0.003},
+    },
+    'servo': {'sim_robot': {'drive.kind': 'velocity'}},
+}
+"""Robots there are, and what each node is told of them: the digital twin, the paper's plant."""
 FOLLOWS = 'tracking'
 """What the controller says when it follows the reference; finding each other takes seconds."""
 STOPPED = ('reference', 'controller', 'sim_robot', 'recorder')
@@ -27,6 +37,19 @@ class DemoOptions:
     output: Path = Path('runs/demo')
     headless: bool = False
     seed: int | None = None
+    robot: str = 'twin'
+    """One of :data:`ROBOTS`."""
+
+    def parameters(self) -> dict[str, dict[str, object]]:
+        """Return the parameters of each node."""
+        given: dict[str, dict[str, object]] = {
+            name: dict(ROBOTS[self.robot].get(name, {})) for name in STARTED
+        }
+        given['sim_robot']['noise.variance'] = PAPER_NOISE
+        if self.seed is not None:
+            given['reference']['seed'] = self.seed
+            given['sim_robot']['seed'] = self.seed
+        return given
 
 
 class Progress:
@@ -74,17 +97,12 @@ def run_demo(options: DemoOptions) -> ReportFigures:
     if bag.exists() and any(bag.iterdir()):
         raise ProcessError(f'{bag} already holds a recording; choose another folder with --output')
     fleet = Fleet(options.output / 'log', private_graph())
-    parameters: dict[str, dict[str, object]] = {
-        'recorder': {'folder': str(bag.resolve())},
-        'sim_robot': {'noise.variance': PAPER_NOISE},
-    }
-    if options.seed is not None:
-        parameters['reference'] = {'seed': options.seed}
-        parameters['sim_robot']['seed'] = options.seed
+    parameters = options.parameters()
+    parameters['recorder']['folder'] = str(bag.resolve())
     try:
         for name in STARTED:
             print(f'  starting {name}', file=sys.stderr, flush=True)
-            fleet.start(name, parameters=parameters.get(name))
+            fleet.start(name, parameters=parameters[name])
             fleet.wait_ready(name)
         print('  waiting until they have found each other', file=sys.stderr, flush=True)
         fleet.wait_for('controller', FOLLOWS)

@@ -38,7 +38,9 @@ def _demo(options: argparse.Namespace) -> int:
     from t3mpc_ros.lab.demo import DemoOptions, run_demo
 
     output = options.output or Path('runs') / f'{datetime.now():%Y%m%d-%H%M%S}'
-    figures = run_demo(DemoOptions(options.duration, output, options.headless, options.seed))
+    figures = run_demo(
+        DemoOptions(options.duration, output, options.headless, options.seed, options.robot)
+    )
     print(figures.summary())
     if not options.headless:
         webbrowser.open(figures.report.resolve().as_uri())
@@ -87,13 +89,15 @@ def _warm(options: argparse.Namespace) -> int:
     from t3mpc_ros.lab.composed import Composed, ComposedSettings
     from t3mpc_ros.lab.trial.loop import MethodSpec, run
     from t3mpc_ros.lab.trial.scenario import DRIVES, Scenario
-    from t3mpc_ros.robot.simulated import SimulatedRobot, SimulatedRobotSettings
+    from t3mpc_ros.robot.twin.robot import make_robot
+    from t3mpc_ros.robot.twin.settings import TwinSettings
 
     for drive in DRIVES:
         spec = MethodSpec('full', Composed, ComposedSettings())
         run(Scenario(drive, 0.04, 'nominal', 1, 1.0), spec)
     Controller(ControllerSettings()).warm_up()
-    SimulatedRobot(SimulatedRobotSettings()).warm_up()
+    for kind in ('velocity', 'stepper'):
+        make_robot(TwinSettings.from_flat({'drive.kind': kind})).warm_up()
     return 0
 
 
@@ -112,7 +116,14 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument('--output', type=Path, help='folder (default runs/<time>)')
     demo.add_argument('--headless', action='store_true', help='no bar, no browser')
     demo.add_argument('--seed', type=int, help='seed of reference and robot')
-    demo.add_argument('--robot', choices=('sim',), default='sim', help='which robot to drive')
+    demo.add_argument(
+        '--robot',
+        type=lambda name: 'twin' if name == 'sim' else name,
+        choices=('twin', 'servo'),
+        default='twin',
+        help='twin: the stepper robot with all its parts (default; also called sim); '
+        "servo: the paper's plant",
+    )
     demo.set_defaults(run=_demo)
 
     report = commands.add_parser('report', help='draw the report of a bag')

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 from t3mpc_ros.chaos.reference import ReferenceSettings
 from t3mpc_ros.control.controller import ControllerSettings
-from t3mpc_ros.motion import Geometry
-from t3mpc_ros.robot.simulated import SimulatedRobotSettings
+from t3mpc_ros.motion import Geometry, Pose
+from t3mpc_ros.robot.twin.faults import active
+from t3mpc_ros.robot.twin.settings import TwinSettings
 from t3mpc_ros.settings import SettingError, Settings, nested, setting
 
 
@@ -50,30 +51,96 @@ class ControllerNodeSettings(ControllerSettings):
 
 
 @dataclass(frozen=True)
-class SimRobotNodeSettings(SimulatedRobotSettings):
+class SimRobotNodeSettings(TwinSettings):
     """The simulated robot as a node."""
 
     stamped: bool = setting(False, 'expect cmd_vel as TwistStamped instead of Twist')
     odom_frame: str = setting('odom', 'frame of the odometry')
     base_frame: str = setting('base_link', 'frame of the robot')
+    world_frame: str = setting('odom', 'frame of ground_truth/odom')
+    imu_frame: str = setting('imu_link', 'frame of imu/data_raw')
+    range_frame_prefix: str = setting(
+        '', 'put in front of the frames of range/*, which are called <sensor>_range_link'
+    )
     right_joint: str = setting('right_wheel_joint', 'name of the right wheel in joint_states')
     left_joint: str = setting('left_wheel_joint', 'name of the left wheel in joint_states')
     joint_rate: float = setting(
         20.0, 'how often joint_states is published; 0 = never', unit='Hz', low=0.0, high=1000.0
     )
-    publish_clock: bool = setting(False, 'publish /clock')
+    range_rate: float = setting(
+        20.0, 'how often each of range/* is published; 0 = never', unit='Hz', low=0.0, high=1000.0
+    )
+    range_infinity: bool = setting(
+        True,
+        'tell inf where a distance sensor sees nothing (REP 117); false: max_range, which some '
+        'take for a free view (clear_on_max_reading of the range sensor layer)',
+        live=True,
+    )
+    publish_clock: bool = setting(
+        False, 'make the time, and publish it as /clock, instead of following the machine'
+    )
+    speed: float = setting(
+        1.0,
+        'simulated seconds per second; 0 = time stands, and ~/step moves it. Other than 1 with '
+        'publish_clock only',
+        low=0.0,
+        high=100.0,
+        live=True,
+    )
+    step_time: float = setting(
+        0.01,
+        'time that ~/step lets pass: whole periods, at least one',
+        unit='s',
+        low=0.001,
+        # Streams are made up for, and queues hold, no more than this at once.
+        high=0.5,
+        live=True,
+    )
     publish_tf: bool = setting(True, 'publish the transform, where tf2_ros is installed')
-    start_x: float = setting(0.0, 'where ~/set_pose puts the robot', unit='m', live=True)
-    start_y: float = setting(0.0, 'where ~/set_pose puts the robot', unit='m', live=True)
-    start_heading: float = setting(0.0, 'where ~/set_pose points it', unit='rad', live=True)
+    start_x: float = setting(
+        0.0, 'where the robot stands at first, and ~/set_pose puts it', unit='m', live=True
+    )
+    start_y: float = setting(
+        0.0, 'where the robot stands at first, and ~/set_pose puts it', unit='m', live=True
+    )
+    start_heading: float = setting(
+        0.0, 'where it looks at first, and ~/set_pose points it', unit='rad', live=True
+    )
+
+    @property
+    def start(self) -> Pose:
+        """Where the robot stands at first, in the world."""
+        return Pose(self.start_x, self.start_y, self.start_heading)
+
+    @property
+    def step_periods(self) -> int:
+        """How many periods ``~/step`` lets pass."""
+        return max(1, round(self.step_time * self.rate))
 
     def check_together(self) -> None:
-        """Raise :class:`SettingError` for a drive that takes no velocities."""
+        """Raise :class:`SettingError` for a drive that takes no velocities, or has not the parts.
+
+        And for a time of its own that nobody would hear of.
+        """
         super().check_together()
-        if self.drive.kind != 'velocity':
+        kind = self.drive.kind
+        if kind == 'torque':
             raise SettingError(
-                f'drive.kind must be velocity, because cmd_vel is one: got {self.drive.kind}; '
-                'torques are for the lab'
+                'drive.kind must be stepper or velocity, because cmd_vel is a velocity: '
+                'got torque, which is for the lab'
+            )
+        if kind == 'velocity':
+            faults = {'faults': active(self.faults), 'faults.schedule': self.faults.schedule}
+            for name, value in {'world': self.world, **faults}.items():
+                if value:
+                    raise SettingError(
+                        f'drive.kind must be stepper for {name} to have an effect: '
+                        f'got velocity with {value if isinstance(value, str) else value[0]}'
+                    )
+        if self.speed != 1.0 and not self.publish_clock:
+            raise SettingError(
+                'publish_clock must be true at start for a speed other than 1, or nobody hears '
+                f'what time it is: got speed {self.speed:g} without it'
             )
 
 
@@ -91,6 +158,9 @@ class RecorderSettings(Settings):
             'odom',
             'ground_truth/*',
             'joint_states',
+            'imu/*',
+            'range/*',
+            'battery_state',
             'cmd_vel',
             'controller/*',
             '/diagnostics',

@@ -16,6 +16,8 @@ import yaml
 from t3mpc_ros.nodes.plumbing.stop_request import StopRequest
 from t3mpc_ros.record.model import ModelError
 from t3mpc_ros.record.schema import RecordError
+from t3mpc_ros.robot.arena.world import WorldError
+from t3mpc_ros.robot.twin.faults import ScheduleError
 from t3mpc_ros.settings import SettingError
 
 if TYPE_CHECKING:
@@ -31,6 +33,8 @@ UNUSABLE = (
     InvalidParameterValueException,
     ModelError,
     RecordError,
+    WorldError,
+    ScheduleError,
 )
 """What a node raises while it is made when it was given something it cannot use."""
 

@@ -1,0 +1,59 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""What is wrong with a robot or a command, in words and numbers for diagnostics."""
+
+from collections.abc import Mapping
+
+from t3mpc_ros.motion.words import NANOSECONDS
+from t3mpc_ros.robot.backend import RobotCommand, RobotState
+from t3mpc_ros.robot.guard import GuardSettings
+from t3mpc_ros.robot.twin.robot import SLIPPING, Inside
+
+
+def staleness(command: RobotCommand, now_ns: int, guard: GuardSettings) -> str:
+    """Return why a command is not worth sending to the board: it is too old; empty when it is not.
+
+    The board would refuse it as well, but has no way to say so.
+    """
+    age = (now_ns - command.stamp_ns) / NANOSECONDS
+    return f'command is too old: {age:.3f} s' if age >= guard.command_timeout else ''
+
+
+def complaints(state: RobotState, inside: Inside | None) -> tuple[str, ...]:
+    """Return what a user should know of, most important first; empty when all is well.
+
+    ``inside`` is what only a simulation knows.
+    """
+    status = state.status
+    found = [state.reason] if state.reason else []
+    if status.slipping and state.reason != SLIPPING:
+        found.append('a wheel slips, is blocked, or has lost steps')
+    if status.imu_fault:
+        found.append('the inertial sensor does not answer')
+    if status.low_battery:
+        volts = f': {state.battery.voltage:.1f} V' if state.battery else ''
+        found.append(f'the battery is low{volts}')
+    if inside is not None and inside.faults:
+        found.append(f'faults: {", ".join(inside.faults)}')
+    if state.lost_steps is not None and any(state.lost_steps):
+        right, left = state.lost_steps
+        found.append(f'steps lost: {right} right, {left} left')
+    return tuple(found)
+
+
+def measures(state: RobotState, inside: Inside | None) -> Mapping[str, object]:
+    """Return the status, and what else is known in numbers."""
+    values: dict[str, object] = {**state.status._asdict()}
+    if state.battery is not None:
+        values['battery_v'] = state.battery.voltage
+    if state.lost_steps is not None:
+        values['lost_steps_right'], values['lost_steps_left'] = state.lost_steps
+    if inside is not None:
+        values |= {
+            'slid_right_m': inside.slid[0],
+            'slid_left_m': inside.slid[1],
+            'gyro_bias_rad_s': inside.gyro_bias,
+            'gyro_bias_learnt_rad_s': inside.learnt_bias,
+            'faults': ', '.join(inside.faults) or 'none',
+        }
+    return values
