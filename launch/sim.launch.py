@@ -19,8 +19,6 @@ def generate_launch_description():
     share = Path(get_package_share_directory('t3mpc_ros'))
     namespace = LaunchConfiguration('namespace')
     use_sim_time = {'use_sim_time': LaunchConfiguration('use_sim_time')}
-    # What a node is told besides its file: the drive of the default robot has hardly any lag.
-    more = {'controller': {'estimate.lag': LaunchConfiguration('lag')}}
     nodes = [
         Node(
             package='t3mpc_ros',
@@ -28,10 +26,7 @@ def generate_launch_description():
             name=name,
             namespace=namespace,
             output='screen',
-            parameters=[
-                str(share / 'config' / f'{name}.yaml'),
-                {**use_sim_time, **more.get(name, {})},
-            ],
+            parameters=[str(share / 'config' / f'{name}.yaml'), use_sim_time],
         )
         for name in NODES
     ]
@@ -48,12 +43,6 @@ def generate_launch_description():
         [
             DeclareLaunchArgument('namespace', default_value='', description='of every node'),
             DeclareLaunchArgument('use_sim_time', default_value='false', description='use /clock'),
-            DeclareLaunchArgument(
-                'lag',
-                default_value='0.003',
-                description='s, of the drive as the controller sees it; 0.02 for drive.kind '
-                'velocity',
-            ),
             DeclareLaunchArgument('record', default_value='true', description='write a bag'),
             *nodes,
             recorder,

@@ -27,7 +27,6 @@ def generate_launch_description():
     # As text, whatever it looks like: an empty one is no world at all.
     world = ParameterValue(LaunchConfiguration('world'), value_type=str)
     use_sim_time = LaunchConfiguration('use_sim_time')
-    lag = LaunchConfiguration('lag')
     nodes = []
     for name, robot in ROBOTS.items():
         odom, base = f'{name}/odom', f'{name}/base_link'
@@ -45,7 +44,7 @@ def generate_launch_description():
                 **robot,
                 **makes_time,
             },
-            'controller': {'frame_id': base, 'estimate.lag': lag},
+            'controller': {'frame_id': base},
             'reference': {'frame_id': odom, 'child_frame_id': base, 'seed': robot['seed']},
         }
         nodes += [
@@ -67,9 +66,6 @@ def generate_launch_description():
             DeclareLaunchArgument('world', default_value='room', description='world of both'),
             DeclareLaunchArgument(
                 'use_sim_time', default_value='false', description='the first robot makes time'
-            ),
-            DeclareLaunchArgument(
-                'lag', default_value='0.003', description='s, of the drive as controllers see it'
             ),
             *nodes,
         ]

@@ -18,17 +18,15 @@ from t3mpc_ros.motion.kinematics import body_from_wheels
 from t3mpc_ros.motion.words import NANOSECONDS, wrap_angle
 from t3mpc_ros.nodes.plumbing import convert
 from t3mpc_ros.nodes.robot import sensors
-from t3mpc_ros.nodes.robot.condition import complaints, measures, staleness
+from t3mpc_ros.nodes.robot.condition import complaints, measures
 from t3mpc_ros.robot.backend import (
     STILL,
     BatteryReading,
     ImuSample,
-    RobotCommand,
     RobotState,
     RobotStatus,
     WheelAngles,
 )
-from t3mpc_ros.robot.guard import GuardSettings
 from t3mpc_ros.robot.sensors.battery import BatterySettings
 from t3mpc_ros.robot.sensors.mpu6050 import ImuSettings, Mpu6050
 from t3mpc_ros.robot.sensors.sharp import SharpSettings
@@ -331,10 +329,3 @@ def test_faults_at_work_are_named():
     assert (values['gyro_bias_rad_s'], values['gyro_bias_learnt_rad_s']) == (0.05, 0.04)
     assert (values['slid_right_m'], values['slid_left_m']) == (0.1, 0.2)
     assert values['battery_v'] == 9.87
-
-
-def test_a_stale_command_is_told_before_it_is_sent():
-    guard = GuardSettings(command_timeout=0.25)
-    for age, stale in ((0.0, False), (0.249, False), (0.25, True), (2.0, True), (-1.0, False)):
-        command = RobotCommand(STILL, round((10.0 - age) * NANOSECONDS))
-        assert bool(staleness(command, 10 * NANOSECONDS, guard)) == stale, age

@@ -21,7 +21,7 @@ from std_srvs.srv import Trigger
 from test_nodes_behaviour import Driver, World, on_grid, reason, speed, stamp, twist
 import yaml
 
-from t3mpc_ros.lab.demo import ROBOTS, DemoOptions
+from t3mpc_ros.lab.demo import DemoOptions
 from t3mpc_ros.lab.processes import ProcessError
 from t3mpc_ros.lab.program import _parser
 from t3mpc_ros.motion.words import NANOSECONDS
@@ -497,7 +497,7 @@ def test_what_a_launch_file_says_fits_its_nodes(file, launched):
         given = {key: value for key, value in values.items() if key != 'use_sim_time'}
         settings = TABLES[name].from_flat(given)
         if name == 'controller':
-            assert settings.estimate.lag == ROBOTS['twin']['controller']['estimate.lag']
+            assert settings.estimate.lag == 0.003  # what a stepper needs
 
 
 def test_the_two_robots_of_the_launch_file_do_not_hear_each_other(world, launched):
@@ -536,9 +536,9 @@ def test_the_two_robots_of_the_launch_file_do_not_hear_each_other(world, launche
 def test_the_demonstration_drives_the_robot_that_was_asked_for():
     asked = {
         words: _parser().parse_args(['demo', *words.split()]).robot
-        for words in ('', '--robot twin', '--robot sim', '--robot servo')
+        for words in ('', '--robot twin', '--robot servo')
     }
-    assert list(asked.values()) == ['twin', 'twin', 'twin', 'servo']
+    assert list(asked.values()) == ['twin', 'twin', 'servo']
     for robot, kind, lag in (('twin', 'stepper', 0.003), ('servo', 'velocity', 0.02)):
         given = DemoOptions(robot=robot, seed=7).parameters()
         tables = {name: TABLES[name].from_flat(values) for name, values in given.items()}

@@ -161,6 +161,15 @@ def test_a_command_reaches_the_wheels_after_the_dead_time():
     assert speeds[4] > 0.2
 
 
+def test_a_stale_command_is_refused_before_it_is_sent():
+    """Sent, it would reach a board that drops it and has no way to say so."""
+    robot = TwinRobot(settings())
+    now_ns = robot.advance(10**10).stamp_ns
+    for age, stale in ((0.0, False), (0.249, False), (0.25, True), (2.0, True), (-1.0, False)):
+        command = RobotCommand(WheelSpeeds(1.0, 1.0), now_ns - round(age * 1e9))
+        assert ('too old' in robot.apply(command, now_ns)) == stale, age
+
+
 def test_a_brown_out_resets_the_board_and_new_commands_bring_it_back():
     robot = TwinRobot(settings(boot_time=0.5))
     drive(robot, [WheelSpeeds(4.0, 4.0)] * 100)

@@ -321,7 +321,7 @@ class Controller:
             np.zeros(2) if applied is None else applied,
             law.reading,
             law.predictive.skill.copy(),
-            self._drive.limited if moves else False,
+            reason.moves and self._drive.limited,
         )
 
 

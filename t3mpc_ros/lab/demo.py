@@ -16,12 +16,11 @@ STARTED = ('recorder', 'controller', 'sim_robot', 'reference')
 PAPER_NOISE = 0.04
 """Variance of the measured wheel speeds, (rad/s)², as in the paper's simulations."""
 ROBOTS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
-    'twin': {
-        'sim_robot': {'drive.kind': 'stepper'},
-        # A rotor follows its field at once; the default belongs to the servo.
-        'controller': {'estimate.lag': 0.003},
+    'twin': {'sim_robot': {'drive.kind': 'stepper'}},
+    'servo': {
+        'sim_robot': {'drive.kind': 'velocity'},
+        'controller': {'estimate.lag': 0.02},
     },
-    'servo': {'sim_robot': {'drive.kind': 'velocity'}},
 }
 """Robots there are, and what each node is told of them: the digital twin, the paper's plant."""
 FOLLOWS = 'tracking'

@@ -118,11 +118,9 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument('--seed', type=int, help='seed of reference and robot')
     demo.add_argument(
         '--robot',
-        type=lambda name: 'twin' if name == 'sim' else name,
         choices=('twin', 'servo'),
         default='twin',
-        help='twin: the stepper robot with all its parts (default; also called sim); '
-        "servo: the paper's plant",
+        help="twin: the stepper robot with all its parts (default); servo: the paper's plant",
     )
     demo.set_defaults(run=_demo)
 

@@ -13,7 +13,7 @@ from t3mpc_ros.motion.pace import Pace, RealTimeFactor, SimulatedTime
 from t3mpc_ros.motion.words import NANOSECONDS
 from t3mpc_ros.nodes.plumbing import convert, graph, quality
 from t3mpc_ros.nodes.plumbing.package_node import ERROR, NO_TIME, OK, WARN, PackageNode
-from t3mpc_ros.nodes.robot.condition import complaints, measures, staleness
+from t3mpc_ros.nodes.robot.condition import complaints, measures
 from t3mpc_ros.nodes.robot.topics import RobotTopics
 from t3mpc_ros.nodes.tables import SimRobotNodeSettings
 from t3mpc_ros.robot.backend import RobotCommand, RobotState
@@ -80,8 +80,7 @@ class SimRobotNode(PackageNode[SimRobotNodeSettings]):
         now_ns = self._robot_now_ns()
         twist, stamp_ns = convert.command(message, now_ns)
         command = RobotCommand.from_twist(twist, self.settings.geometry, stamp_ns)
-        stale = staleness(command, now_ns, self.settings.guard)
-        if problem := stale or self._robot.apply(command, now_ns):
+        if problem := self._robot.apply(command, now_ns):
             self._refused += 1
             if problem != self._problem:
                 # Texts that hold an age differ every time.

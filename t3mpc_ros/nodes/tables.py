@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from t3mpc_ros.chaos.reference import ReferenceSettings
 from t3mpc_ros.control.controller import ControllerSettings
+from t3mpc_ros.control.estimate import EstimateSettings
 from t3mpc_ros.motion import Geometry, Pose
 from t3mpc_ros.robot.twin.faults import active
 from t3mpc_ros.robot.twin.settings import TwinSettings
@@ -36,6 +37,8 @@ class ReferenceNodeSettings(ReferenceSettings):
 class ControllerNodeSettings(ControllerSettings):
     """The controller as a node."""
 
+    # A stepper's rotor follows its field at once; the lag of 0.02 s is that of the servo.
+    estimate: EstimateSettings = nested(EstimateSettings, lag=0.003)
     stamped: bool = setting(False, 'publish cmd_vel as TwistStamped instead of Twist')
     frame_id: str = setting('base_link', 'frame of a stamped command')
     terms_rate: float = setting(

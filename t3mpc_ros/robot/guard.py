@@ -156,16 +156,20 @@ class CommandGuard:
             return self._reason
         if self._estop:
             return self._estop
+        if stale := self.staleness(command, now_ns):
+            return stale
         stamp_ns = min(command.stamp_ns, now_ns)
-        age = (now_ns - stamp_ns) / NANOSECONDS
-        if age >= self.settings.command_timeout:
-            return f'command is too old: {age:.3f} s'
         if self._command is not None and stamp_ns < self._command.stamp_ns:
             return 'command is older than the one before it'
         self._command = RobotCommand(wheels, stamp_ns)
         self._timed_out = False
         self._reason = ''
         return ''
+
+    def staleness(self, command: RobotCommand, now_ns: int) -> str:
+        """Return that a command is too old to be followed, empty when it is not."""
+        age = (now_ns - command.stamp_ns) / NANOSECONDS
+        return f'command is too old: {age:.3f} s' if age >= self.settings.command_timeout else ''
 
     def accept_twist(self, twist: BodyTwist, now_ns: int) -> str:
         """Take a body twist that is wanted now, or return why not."""

@@ -4,19 +4,8 @@
 
 from collections.abc import Mapping
 
-from t3mpc_ros.motion.words import NANOSECONDS
-from t3mpc_ros.robot.backend import RobotCommand, RobotState
-from t3mpc_ros.robot.guard import GuardSettings
+from t3mpc_ros.robot.backend import RobotState
 from t3mpc_ros.robot.twin.robot import SLIPPING, Inside
-
-
-def staleness(command: RobotCommand, now_ns: int, guard: GuardSettings) -> str:
-    """Return why a command is not worth sending to the board: it is too old; empty when it is not.
-
-    The board would refuse it as well, but has no way to say so.
-    """
-    age = (now_ns - command.stamp_ns) / NANOSECONDS
-    return f'command is too old: {age:.3f} s' if age >= guard.command_timeout else ''
 
 
 def complaints(state: RobotState, inside: Inside | None) -> tuple[str, ...]:

@@ -125,6 +125,8 @@ class TwinRobot(GridRobot):
             return RESTARTING
         if self._guard.estop or not all(map(math.isfinite, command.wheels)):
             return self._guard.accept(command, now_ns)
+        if stale := self._guard.staleness(command, now_ns):
+            return stale
         faults = self._faults
         self._channel.send(
             command,
