@@ -10,9 +10,8 @@ import re
 import numpy as np
 import pytest
 
-from t3mpc_ros.lab.program import main
-from t3mpc_ros.lab.twin import outcomes as trials
-from t3mpc_ros.lab.twin.closed_loop import (
+from t3mpc_ros.lab.faults import outcomes as trials
+from t3mpc_ros.lab.faults.closed_loop import (
     STAND,
     chaotic_course,
     loop_controller,
@@ -20,7 +19,8 @@ from t3mpc_ros.lab.twin.closed_loop import (
     run_twin,
     straight_course,
 )
-from t3mpc_ros.lab.twin.outcome_table import (
+from t3mpc_ros.lab.faults.outcomes import TRIALS, Trial, outcome, undisturbed
+from t3mpc_ros.lab.faults.table import (
     BEGIN_MARK,
     END_MARK,
     TITLES,
@@ -32,8 +32,8 @@ from t3mpc_ros.lab.twin.outcome_table import (
     row,
     section,
 )
-from t3mpc_ros.lab.twin.outcomes import TRIALS, Trial, outcome, undisturbed
-from t3mpc_ros.lab.twin.verdict import judge
+from t3mpc_ros.lab.faults.verdict import judge
+from t3mpc_ros.lab.program import main
 from t3mpc_ros.robot.twin.faults import FAULTS, FaultEvent, FaultSchedule
 from t3mpc_ros.robot.twin.robot import RESTARTING
 from t3mpc_ros.robot.twin.slip_stop import SLIPPING

@@ -8,13 +8,15 @@ from datetime import datetime
 import json
 from pathlib import Path
 import sys
+import time
 from typing import TYPE_CHECKING
 import webbrowser
 
+from t3mpc_ros.lab.faults.command import add_outcomes_parser
 from t3mpc_ros.lab.paper.program import add_parser as add_paper
 from t3mpc_ros.lab.training.command import add_parser as add_train
 from t3mpc_ros.lab.tuning.command import add_parser as add_tune
-from t3mpc_ros.lab.twin.faults_command import add_outcomes_parser
+from t3mpc_ros.lab.twin.command import add_parser as add_twin
 
 if TYPE_CHECKING:
     from t3mpc_ros.lab.tuning.contestant import Contestant
@@ -147,6 +149,7 @@ def _parser() -> argparse.ArgumentParser:
     add_paper(commands)
     add_tune(commands, _contestants)
     add_train(commands)
+    add_twin(commands, time.monotonic)
     add_outcomes_parser(commands)
 
     warm = commands.add_parser('warm', help='compile every kernel into the cache')

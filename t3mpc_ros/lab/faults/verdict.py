@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.lab.twin.closed_loop import FLAGS, STAND, TwinRecord
+from t3mpc_ros.lab.faults.closed_loop import FLAGS, STAND, TwinRecord
 from t3mpc_ros.motion import WheelSpeeds
 from t3mpc_ros.motion.kinematics import body_from_wheels
 from t3mpc_ros.motion.words import wrap_angle

@@ -14,7 +14,7 @@ from functools import cache, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.lab.twin.closed_loop import (
+from t3mpc_ros.lab.faults.closed_loop import (
     TwinRecord,
     chaotic_course,
     loop_controller,
@@ -22,7 +22,7 @@ from t3mpc_ros.lab.twin.closed_loop import (
     run_twin,
     straight_course,
 )
-from t3mpc_ros.lab.twin.verdict import (
+from t3mpc_ros.lab.faults.verdict import (
     AFTER,
     BEGIN,
     Outcome,

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import math
 from pathlib import Path
 
-from t3mpc_ros.lab.twin.outcomes import DURATION, PAUSE
-from t3mpc_ros.lab.twin.verdict import ALLOWED, BEGIN, Outcome
+from t3mpc_ros.lab.faults.outcomes import DURATION, PAUSE
+from t3mpc_ros.lab.faults.verdict import ALLOWED, BEGIN, Outcome
 
 BEGIN_MARK = '<!-- outcomes: written by `lab faults`, do not edit by hand -->'
 END_MARK = '<!-- end of outcomes -->'

@@ -23,8 +23,8 @@ def add_outcomes_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentP
 
 def run(options: argparse.Namespace) -> int:
     """Return 0 when no loop got out of bounds, 1 when one did; prints what became of each."""
-    from t3mpc_ros.lab.twin.outcome_table import console, rewrite
-    from t3mpc_ros.lab.twin.outcomes import outcomes
+    from t3mpc_ros.lab.faults.outcomes import outcomes
+    from t3mpc_ros.lab.faults.table import console, rewrite
 
     results = outcomes(lambda text: print(f'  {text}', file=sys.stderr, flush=True))
     print(console(results))
