@@ -249,7 +249,7 @@ def test_the_command_writes_table_and_numbers_and_only_between_the_marks(two, tm
     assert main(['faults', '--output', str(page), '--json', str(numbers)]) == 0
     shown = capsys.readouterr()
     assert 'gyro_dead' in shown.out
-    assert '2/2' in shown.err
+    assert '2 of 2 runs' in shown.err
     text = page.read_text()
     assert text.startswith(f'before\n{BEGIN_MARK}\n')
     assert text.endswith(f'{END_MARK}\nafter\n')

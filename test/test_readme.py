@@ -21,6 +21,13 @@ SHORTENED = {
     'scripts/demo': (['--duration', '5', '--headless', '--output', 'OUTPUT/run'], False),
     'scripts/check': (['--version'], False),  # this very test is part of it
     'scripts/run sim_robot': ([], True),
+    'scripts/run sim_robot --ros-args -p world:=room -p faults.schedule:=rough_ride': ([], True),
+    'scripts/run lab twin --quick': (['--output', 'OUTPUT/twin'], False),
+    'scripts/run lab faults': (['brown_out', 'collision'], False),
+    'scripts/demo --robot servo': (
+        ['--duration', '5', '--headless', '--output', 'OUTPUT/servo'],
+        False,
+    ),
     'scripts/run controller --ros-args -p law.gain:=30.0': ([], True),
     'scripts/run all_in_one': (['--ros-args', '-p', 'folder:=OUTPUT/bag'], True),
     'scripts/run lab paper --quick': (['--seeds', '1', '--output', 'OUTPUT/paper'], False),

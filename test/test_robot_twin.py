@@ -3,6 +3,8 @@
 """The digital twin as a whole: it repeats itself, converges, and goes wrong as a robot does."""
 
 import math
+from pathlib import Path
+import re
 
 import numpy as np
 import pytest
@@ -311,3 +313,15 @@ def test_what_is_built_in_stays_while_the_robot_runs():
     robot = TwinRobot(settings())
     with pytest.raises(SettingError, match='motor.microsteps is fixed while the robot runs'):
         robot.configure(settings(motor__microsteps=8))
+
+
+# -- the page -------------------------------------------------------------------------------------
+
+
+def test_the_example_on_the_page_runs(capsys):
+    page = (Path(__file__).resolve().parent.parent / 'docs' / 'twin.md').read_text()
+    (example,) = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
+    exec(example, {})
+    headings = eval(capsys.readouterr().out)
+    assert len(headings) == 8
+    assert all(math.isfinite(heading) for heading in headings)

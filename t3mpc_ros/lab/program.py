@@ -150,7 +150,7 @@ def _parser() -> argparse.ArgumentParser:
     add_tune(commands, _contestants)
     add_train(commands)
     add_twin(commands, time.monotonic)
-    add_outcomes_parser(commands)
+    add_outcomes_parser(commands, time.monotonic)
 
     warm = commands.add_parser('warm', help='compile every kernel into the cache')
     warm.set_defaults(run=_warm)

@@ -3,30 +3,46 @@
 """``lab faults``: what becomes of the closed loop under each fault, and the page that says so."""
 
 import argparse
+from collections.abc import Callable
 from dataclasses import asdict
 import json
 from pathlib import Path
-import sys
 
 
-def add_outcomes_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
-    """Add ``faults`` to the commands of ``lab``; :func:`run` carries it out."""
+def add_outcomes_parser(
+    commands: 'argparse._SubParsersAction[argparse.ArgumentParser]', clock: Callable[[], float]
+) -> None:
+    """Add ``faults`` to the commands of ``lab``; :func:`run` carries it out.
+
+    ``clock`` tells seconds from any origin, for the time that is left.
+    """
     parser = commands.add_parser(
         'faults', help='drive the digital twin under every named fault, and say what comes of it'
+    )
+    parser.add_argument(
+        'names', nargs='*', metavar='FAULT', help='only these, brown_out say (default: all)'
     )
     parser.add_argument(
         '--output', type=Path, help='page whose table is to be replaced, docs/faults.md say'
     )
     parser.add_argument('--json', type=Path, help='also write the numbers to this file')
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, clock=clock)
 
 
 def run(options: argparse.Namespace) -> int:
     """Return 0 when no loop got out of bounds, 1 when one did; prints what became of each."""
-    from t3mpc_ros.lab.faults.outcomes import outcomes
+    from t3mpc_ros.lab.faults.outcomes import TRIALS, outcomes
     from t3mpc_ros.lab.faults.table import console, rewrite
+    from t3mpc_ros.lab.paper.campaign import Progress
 
-    results = outcomes(lambda text: print(f'  {text}', file=sys.stderr, flush=True))
+    known = dict.fromkeys(trial.fault for trial in TRIALS)
+    for name in options.names:
+        if name not in known:
+            raise ValueError(f'FAULT must be one of {", ".join(known)}: got {name}')
+    if options.names and options.output:
+        raise ValueError('--output replaces the whole table: give no FAULT with it')
+    trials = [trial for trial in TRIALS if not options.names or trial.fault in options.names]
+    results = outcomes(trials, Progress(options.clock))
     print(console(results))
     if options.output:
         rewrite(options.output, results)

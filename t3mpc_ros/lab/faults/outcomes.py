@@ -7,7 +7,7 @@ is what its errors are compared with. What the robot can know of the fault is ke
 what only ground truth shows.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 
@@ -31,6 +31,7 @@ from t3mpc_ros.lab.faults.verdict import (
     time_to_return,
     wheel_error,
 )
+from t3mpc_ros.lab.paper.campaign import Progress
 from t3mpc_ros.robot.twin.faults import FaultEvent, FaultSchedule, FaultSettings, active
 from t3mpc_ros.robot.twin.settings import TwinSettings
 from t3mpc_ros.settings.table import Value
@@ -61,6 +62,11 @@ class Trial:
     """None: what goes wrong is the world."""
     world: str = ''
     duration: float = DURATION
+
+    @property
+    def fault(self) -> str:
+        """The name of the fault, ``collision`` for a wall."""
+        return 'collision' if self.event is None else self.event.fault
 
     @property
     def schedule(self) -> FaultSchedule:
@@ -97,12 +103,15 @@ TRIALS = _trials()
 """Every run, those of one course together."""
 
 
-def outcomes(progress: Callable[[str], None] = lambda text: None) -> list[Outcome]:
-    """Return what becomes of every trial; ``progress`` is told what is done."""
+def outcomes(trials: Sequence[Trial], progress: Progress | None = None) -> list[Outcome]:
+    """Return what becomes of each trial; ``progress`` is told how far it is."""
+    if progress is not None:
+        progress.begin(len(trials))
     results = []
-    for number, trial in enumerate(TRIALS, 1):
+    for trial in trials:
         results.append(outcome(trial))
-        progress(f'{number}/{len(TRIALS)} {trial.course}, {trial.name}: {results[-1].verdict}')
+        if progress is not None:
+            progress.done(len(results))
     return results
 
 
