@@ -122,10 +122,11 @@ def test_a_field_that_turns_evenly_takes_the_wheels_exactly_as_far_as_its_pulses
 
 
 def test_ordinary_commands_within_the_torque_never_lose_a_step():
-    """Random speeds, random ramps that need at most 0.35 of the torque there is at that speed.
+    """Random speeds, random ramps that need at most 0.35 of the torque there is.
 
-    A rotor on a ramp swings to twice its load angle, and the end of one ramp may add to the swing
-    of the next: 0.35 leaves room for that.
+    A rotor swings to twice its load angle when a ramp begins, and to three times when a ramp is
+    turned round, so about a third of the torque is what can always be used; damping leaves some
+    room. Of 200 programmes at 0.45 none lost a step, at 0.5 three did, at 0.9 all.
     """
     motor = MotorSettings()
     generator = np.random.default_rng(4)
