@@ -34,6 +34,7 @@ setup(
         'mcap',
         'rosbags',
         'PyYAML',
+        'pyserial',
         'matplotlib',
         'cma',
     ],

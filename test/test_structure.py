@@ -25,6 +25,7 @@ ROOMS = {
     'fuzzy': {'settings', 'kernels', 'motion'},
     'mpc': {'settings', 'kernels', 'motion'},
     'robot': {'settings', 'kernels', 'motion'},
+    'radio': {'settings', 'kernels', 'motion', 'robot'},
     'record': {'settings', 'motion'},
     'control': {'settings', 'kernels', 'motion', 'fuzzy', 'mpc'},
     'lab': {
@@ -46,6 +47,7 @@ ROOMS = {
         'fuzzy',
         'mpc',
         'robot',
+        'radio',
         'record',
         'control',
     },
@@ -53,6 +55,7 @@ ROOMS = {
 LIBRARIES = {
     'kernels': {'numba'},
     'robot': {'yaml'},
+    'radio': {'serial'},
     'record': {'mcap', 'rosbags', 'yaml'},
     'lab': {'matplotlib', 'yaml', 'cma', 'casadi'},
     'nodes': {'yaml'},
@@ -95,6 +98,11 @@ def test_imports_follow_the_rules_of_the_rooms(path):
         else:
             allowed = set(sys.stdlib_module_names) | {'numpy'} | LIBRARIES.get(room, set())
             assert top in allowed, f'{path} imports {name}'
+
+
+def test_only_the_port_of_the_radio_knows_pyserial():
+    users = [path for path in SOURCES if 'serial' in _imports(path)]
+    assert users == [PACKAGE / 'radio' / 'port.py']
 
 
 def test_the_room_table_is_complete():

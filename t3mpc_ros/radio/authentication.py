@@ -1,0 +1,209 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Who may command the robot: session keys, tags, and what the robot accepts.
+
+The nRF24 has no protection of its own. With a key of 16 bytes at both ends, HELLO is signed under
+that key, both ends add a nonce, and every CMD, PARAM_SET and ACTION is signed under the key of the
+session with SipHash-2-4. ``host_us`` is signed, strictly increases, and so serves as a counter;
+how often it has wrapped since HELLO (the epoch) is signed too, but not sent. What a robot sends
+is not signed: docs/radio.md says what a forger of it can do.
+"""
+
+import hmac
+import os
+from pathlib import Path
+import stat
+from typing import TypeVar
+
+from t3mpc_ros.radio.codec import encode
+from t3mpc_ros.radio.frames import Action, Command, Flag, Hello, ParamSet
+from t3mpc_ros.radio.siphash import KEY_SIZE, TAG_SIZE, siphash
+
+NONCE_SIZE = 8
+"""bytes"""
+
+Signed = Command | ParamSet | Action
+"""Kinds that change something, and are signed under the key of the session."""
+
+AnySigned = TypeVar('AnySigned', Command, ParamSet, Action)
+_UNSIGNED = bytes(TAG_SIZE)
+
+
+class KeyFileError(ValueError):
+    """A key file that must not or cannot be used; the text says what to do."""
+
+
+def read_key(path: Path) -> bytes:
+    """Return the key in a file of 32 hexadecimal digits that nobody but its owner may read.
+
+    Raises
+    ------
+    KeyFileError
+        It cannot be read, others may read it, or it holds no key. The text never quotes it.
+    """
+    try:
+        with path.open('rb') as source:
+            # Of the open file: the path may lead elsewhere by the time it is read.
+            mode = stat.S_IMODE(os.fstat(source.fileno()).st_mode)
+            content = source.read(1024)
+    except OSError as error:
+        raise KeyFileError(f'key file {path} cannot be read: {error.strerror}') from error
+    if mode & 0o077:
+        raise KeyFileError(
+            f'key file {path} must be closed to all but its owner: got mode {mode:04o}; '
+            f'chmod 600 {path}'
+        )
+    try:
+        key = bytes.fromhex(content.decode('ascii'))
+    except ValueError:  # a UnicodeDecodeError is one; its text would show the content
+        raise KeyFileError(f'key file {path} must hold hexadecimal digits only') from None
+    if len(key) != KEY_SIZE:
+        raise KeyFileError(
+            f'key file {path} must hold {2 * KEY_SIZE} hexadecimal digits: got {2 * len(key)}'
+        )
+    return key
+
+
+def session_key(key: bytes, host_nonce: bytes, robot_nonce: bytes) -> bytes:
+    """Return the key (16 bytes) of a session from the long-term key and both nonces."""
+    for name, nonce in (('host_nonce', host_nonce), ('robot_nonce', robot_nonce)):
+        if len(nonce) != NONCE_SIZE:
+            raise ValueError(f'{name} must be {NONCE_SIZE} bytes long: got {len(nonce)}')
+    nonces = host_nonce + robot_nonce
+    return siphash(key, nonces + b'\x00') + siphash(key, nonces + b'\x01')
+
+
+def sign_hello(key: bytes, session: int, seq: int, host_us: int, nonce: bytes) -> Hello:
+    """Return a HELLO signed under the long-term key."""
+    hello = Hello(session, seq, host_us, nonce, _UNSIGNED)
+    return hello._replace(tag=siphash(key, encode(hello)[:-TAG_SIZE]))
+
+
+def is_hello_signed(key: bytes, hello: Hello) -> bool:
+    """Return whether a HELLO carries the tag of the long-term key."""
+    return bool(hello.tag) and _is_same(siphash(key, encode(hello)[:-TAG_SIZE]), hello.tag)
+
+
+def tag_of(frame: Signed, key: bytes, epoch: int) -> bytes:
+    """Return the tag of a frame under a session's key; whatever tag it carries plays no part."""
+    body = encode(frame._replace(tag=_UNSIGNED))[:-TAG_SIZE]
+    return siphash(key, body + epoch.to_bytes(4, 'little'))
+
+
+class Signer:
+    """The host's end of a session: signs, and knows the epoch.
+
+    Parameters
+    ----------
+    key
+        Of the session.
+    host_us
+        That of the HELLO.
+    """
+
+    def __init__(self, key: bytes, host_us: int) -> None:
+        self._key = key
+        self._last = host_us
+        self._epoch = 0
+
+    @property
+    def epoch(self) -> int:
+        """How often host_us has wrapped since HELLO."""
+        return self._epoch
+
+    def sign(self, frame: AnySigned) -> AnySigned:
+        """Return the frame with its tag.
+
+        A lower ``host_us`` than before is taken as a wrap, so frames must be signed in the order
+        of their times, and all within 71 minutes of the one before.
+
+        Raises
+        ------
+        ValueError
+            ``host_us`` is that of the frame before: the robot would take it for a replay.
+        """
+        if frame.host_us == self._last:
+            raise ValueError(f'host_us must increase: got {frame.host_us} twice')
+        if frame.host_us < self._last:
+            self._epoch += 1
+        self._last = frame.host_us
+        return frame._replace(tag=tag_of(frame, self._key, self._epoch))
+
+
+class Gate:
+    """The robot's end: decides which frames count. Every refusal is a text; empty is yes.
+
+    Emulators and tests use it; the firmware has the same rules in C.
+
+    Parameters
+    ----------
+    key
+        The long-term key; empty for a robot without one.
+    """
+
+    def __init__(self, key: bytes = b'') -> None:
+        if key and len(key) != KEY_SIZE:
+            raise ValueError(f'key must be {KEY_SIZE} bytes long: got {len(key)}')
+        self._key = key
+        self._session = 0
+        self._session_key = b''
+        self._host_nonce = b''
+        self._robot_nonce = bytes(NONCE_SIZE) if key else b''
+        self._last = (0, 0)
+
+    @property
+    def session(self) -> int:
+        """The session the robot is in; 0 before the first HELLO."""
+        return self._session
+
+    @property
+    def nonce(self) -> bytes:
+        """The robot's nonce, for INFO: zeros before the first HELLO; empty without a key."""
+        return self._robot_nonce
+
+    def greet(self, hello: Hello, fresh_nonce: bytes) -> str:
+        """Start the session a HELLO asks for, or return why not.
+
+        ``fresh_nonce`` (8 bytes nobody can foresee) becomes the robot's, unless this HELLO repeats
+        the last one: the host has not heard the answer, and nothing changes.
+        """
+        if bool(self._key) != bool(hello.tag):
+            return 'no key to check the HELLO with' if hello.tag else 'HELLO is not signed'
+        if self._key:
+            if not is_hello_signed(self._key, hello):
+                return 'HELLO has a bad tag'
+            if hello.nonce == self._host_nonce:
+                return ''
+            self._session_key = session_key(self._key, hello.nonce, fresh_nonce)
+            self._host_nonce, self._robot_nonce = hello.nonce, fresh_nonce
+            self._last = (0, hello.host_us)
+        self._session = hello.session
+        return ''
+
+    def check(self, frame: Signed) -> str:
+        """Return why a frame does not count; when it does, none like it or older counts again.
+
+        A CMD with ESTOP always counts, and takes no part in the order of the others.
+        """
+        if isinstance(frame, Command) and frame.flags & Flag.ESTOP:
+            return ''
+        if not self._session or frame.session != self._session:
+            return f'session is {self._session}: got {frame.session}'
+        if not self._key:
+            return 'no key to check the tag with' if frame.tag else ''
+        if not frame.tag:
+            return 'frame is not signed'
+        epoch, last = self._last
+        if frame.host_us == last:
+            return 'frame is a replay'
+        if frame.host_us < last:
+            epoch += 1
+        if not _is_same(tag_of(frame, self._session_key, epoch), frame.tag):
+            return 'frame has a bad tag, or is a replay'
+        self._last = (epoch, frame.host_us)
+        return ''
+
+
+def _is_same(expected: bytes, got: bytes) -> bool:
+    # In a time that does not tell how many bytes are right.
+    return hmac.compare_digest(expected, got)

@@ -1,0 +1,171 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""What the robot measures, from the numbers on the wire to SI units and host time."""
+
+import math
+from typing import NamedTuple
+
+from t3mpc_ros.motion import WheelSpeeds
+from t3mpc_ros.radio.clock import ClockModel, Unwrapped, move
+from t3mpc_ros.radio.frames import AGE_NONE, State, Status
+from t3mpc_ros.robot.backend import ImuSample, RobotStatus, WheelAngles
+from t3mpc_ros.robot.sensors.mpu6050 import ImuSettings
+from t3mpc_ros.robot.sensors.sharp import reading
+
+_MICROSECOND = 1000
+"""ns"""
+_REBOOT = 1.0
+"""s by which host and robot may disagree on how much time has passed, besides the share below."""
+_REBOOT_SHARE = 0.02
+_OLDEST_US = 200_000
+"""A robot that hears nothing loads a new state twice as often as this."""
+_LONGEST_SPEED_GAP = 0.5
+"""s; over a longer gap the mean of the speed is not the speed"""
+STEPS_PER_REV, MICROSTEPS, GYRO_RANGE = 200, 16, 500
+
+
+class Telemetry(NamedTuple):
+    """One measurement of the robot: what a RobotState is made of."""
+
+    stamp_ns: int
+    """Host time of the sample."""
+    angles: WheelAngles
+    """Goes on over wraps of the counters and restarts of the robot."""
+    wheels: WheelSpeeds
+    """Mean since the measurement before."""
+    imu: ImuSample | None
+    """None when the sensor does not answer."""
+    ranges: tuple[float, ...]
+    """m, in the order of RANGE_SENSORS: -inf too near, inf beyond, NaN not measured or faulty."""
+    status: RobotStatus
+    raw: State
+    """As it came."""
+
+
+class Sending(NamedTuple):
+    """When the host sent the CMD that a state answers; only of one that needed no second try."""
+
+    sent_ns: int
+    travel_ns: int
+    """To the robot, at least: ``clock.forward_ns``."""
+
+
+class TelemetryReader:
+    """Turns STATE after STATE into measurements; notices when the robot has started anew."""
+
+    def __init__(self) -> None:
+        self._clock = ClockModel()
+        self._time = Unwrapped()
+        self._left = Unwrapped()
+        self._right = Unwrapped()
+        self._base = WheelAngles(0.0, 0.0)
+        self._wheels = WheelSpeeds(0.0, 0.0)
+        self._last: State | None = None
+        self._last_ns = 0
+        self._rebooted = False
+        self._step = math.tau / (STEPS_PER_REV * MICROSTEPS)
+        self.configure(STEPS_PER_REV * MICROSTEPS, GYRO_RANGE)
+
+    @property
+    def rebooted(self) -> bool:
+        """Whether the robot had started anew before the last measurement."""
+        return self._rebooted
+
+    @property
+    def skew(self) -> float:
+        """By how much a second of the robot is longer than one of the host."""
+        return self._clock.skew
+
+    @property
+    def angles(self) -> WheelAngles:
+        """How far the wheels have turned since the first measurement."""
+        return WheelAngles(
+            self._base.right + self._right.total * self._step,
+            self._base.left + self._left.total * self._step,
+        )
+
+    def configure(self, steps: int, gyro_range: int) -> None:
+        """Take the microsteps of a wheel's turn, and the full scale of the gyro (deg/s).
+
+        Raises
+        ------
+        ValueError
+            There are no such steps, or the MPU6050 has no such range.
+        """
+        if steps < 1:
+            raise ValueError(f'steps of a turn must be at least 1: got {steps}')
+        imu = ImuSettings(gyro_range=str(gyro_range))
+        self._rate_step, self._acceleration_step = imu.rate_step, imu.acceleration_step
+        step = math.tau / steps
+        if step != self._step:
+            self._base, self._step = self.angles, step
+            self._left, self._right = Unwrapped(), Unwrapped()
+
+    def read(self, state: State, now_ns: int, sending: Sending | None = None) -> Telemetry | None:
+        """Return the measurement; None if it is not newer than the last one."""
+        self._rebooted = self._has_restarted(state, now_ns)
+        if self._rebooted:
+            for counter in (self._time, self._left, self._right):
+                counter.rebase()
+            self._clock.reset()
+        elif self._last is not None and move(self._last.time_us, state.time_us) <= 0:
+            return None
+        before_us, right, left = self._time.total, self._right.total, self._left.total
+        time_us = self._time.add(state.time_us)
+        right = self._right.add(state.right) - right
+        left = self._left.add(state.left) - left
+        self._last, self._last_ns = state, now_ns
+        if sending is not None and state.age != AGE_NONE:
+            self._clock.add(time_us - 10 * state.age, sending.sent_ns, now_ns, sending.travel_ns)
+        self._speed(time_us - before_us, right, left)
+        return Telemetry(
+            min(self._clock.to_host_ns(time_us), now_ns) if self._clock.is_set else now_ns,
+            self.angles,
+            self._wheels,
+            self._imu(state),
+            tuple(map(reading, state.ranges)),
+            _status(state.status),
+            state,
+        )
+
+    def _has_restarted(self, state: State, now_ns: int) -> bool:
+        """Return whether host and robot differ on how much time has passed.
+
+        A lost session alone is no sign: a robot that hears nothing for long ends it and counts on.
+        """
+        last = self._last
+        if last is None:
+            return False
+        back_us = move(state.time_us, last.time_us)
+        if state.status & Status.NO_SESSION and back_us > _OLDEST_US:
+            return True
+        passed_us = (now_ns - self._last_ns) // _MICROSECOND
+        off = move((last.time_us + passed_us) % (1 << 32), state.time_us) / 1e6
+        return abs(off) > _REBOOT + _REBOOT_SHARE * passed_us / 1e6
+
+    def _speed(self, elapsed_us: int, right: int, left: int) -> None:
+        if self._rebooted:
+            self._wheels = WheelSpeeds(0.0, 0.0)
+        elapsed = elapsed_us / 1e6 * (1.0 + self._clock.skew)
+        if 0.0 < elapsed <= _LONGEST_SPEED_GAP:
+            self._wheels = WheelSpeeds(right * self._step / elapsed, left * self._step / elapsed)
+
+    def _imu(self, state: State) -> ImuSample | None:
+        if state.status & Status.IMU_FAULT:
+            return None
+        step = self._acceleration_step
+        return ImuSample(
+            state.gyro_z * self._rate_step, state.accel_x * step, state.accel_y * step
+        )
+
+
+def _status(bits: int) -> RobotStatus:
+    return RobotStatus(
+        enabled=bool(bits & Status.ENABLED),
+        moving=bool(bits & Status.MOVING),
+        estop=bool(bits & Status.ESTOP),
+        timed_out=bool(bits & Status.TTL_EXPIRED),
+        limited=bool(bits & Status.LIMITED),
+        imu_fault=bool(bits & Status.IMU_FAULT),
+        low_battery=bool(bits & Status.LOW_BATTERY),
+    )

@@ -1,0 +1,124 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The serial port of the dongle: the only place that knows pyserial.
+
+pyserial lets four kinds of errors through: ``OSError`` (``SerialException`` is one),
+``termios.error`` (which is none), ``ValueError`` and ``TypeError`` (use after close). All of them
+mean the same here, and leave as :class:`PortError` with what to do about it.
+"""
+
+from contextlib import suppress
+import errno
+import os
+import termios
+from typing import NoReturn
+
+import serial
+
+BAUD = 500_000
+"""Exact on a 16 MHz AVR, and a rate Linux knows."""
+_WRITE_TIMEOUT = 0.1
+"""s; a whole transaction is on the line within 2 ms"""
+_FAILURES = (OSError, termios.error, ValueError, TypeError)
+
+
+class PortError(Exception):
+    """The port cannot be used; the text says why and what to do."""
+
+    def __init__(self, text: str, absent: bool) -> None:
+        super().__init__(text)
+        self.absent = absent
+        """There is no such device: looking again costs nothing."""
+
+
+class Port:
+    """An open serial port that never blocks for long.
+
+    Parameters
+    ----------
+    path
+        Such as ``/dev/serial/by-id/…``: it stays the same when the dongle is plugged in anew.
+
+    Raises
+    ------
+    PortError
+        It cannot be opened; an error at any later call closes it first.
+    """
+
+    def __init__(self, path: str) -> None:
+        self._path = path
+        try:
+            self._serial = serial.Serial(
+                path, BAUD, timeout=0, write_timeout=_WRITE_TIMEOUT, exclusive=True
+            )
+        except _FAILURES as error:
+            raise _explained(path, error) from error
+        self.low_latency = self._ask_for_low_latency()
+        """Whether the driver took the request; CDC-ACM needs none, FTDI 16 ms without."""
+
+    def fileno(self) -> int:
+        """Return the file descriptor, to wait for bytes with.
+
+        Raises
+        ------
+        PortError
+            The port is closed.
+        """
+        try:
+            return int(self._serial.fileno())
+        except _FAILURES as error:
+            self._give_up(error)
+
+    def read(self) -> bytes:
+        """Return what has arrived, maybe nothing; raise PortError when the dongle is gone."""
+        try:
+            # With timeout 0 this takes what is there; the size only bounds it.
+            return bytes(self._serial.read(4096))
+        except _FAILURES as error:
+            self._give_up(error)
+
+    def write(self, data: bytes) -> None:
+        """Send ``data``; raise PortError when it cannot be done at once."""
+        try:
+            written = self._serial.write(data)
+        except _FAILURES as error:
+            self._give_up(error)
+        if written != len(data):
+            self._give_up(OSError(errno.EIO, f'{written} of {len(data)} bytes written'))
+
+    def close(self) -> None:
+        """Close the port; what goes wrong with it no longer matters."""
+        with suppress(*_FAILURES):
+            self._serial.close()
+
+    def _ask_for_low_latency(self) -> bool:
+        try:
+            self._serial.set_low_latency_mode(True)
+        except (*_FAILURES, NotImplementedError):  # only some drivers know it
+            return False
+        return True
+
+    def _give_up(self, error: Exception) -> NoReturn:
+        # At once: while the dead device is held, the dongle comes back under another name.
+        self.close()
+        raise _explained(self._path, error) from error
+
+
+def _explained(path: str, error: Exception) -> PortError:
+    """Return the error in words, with the remedy."""
+    code = getattr(error, 'errno', None)
+    if isinstance(error, termios.error) and error.args:
+        code = error.args[0]
+    if code in (errno.ENOENT, errno.ENXIO, errno.ENODEV) or not os.path.exists(path):
+        return PortError(f'{path} is not there: is the dongle plugged in?', True)
+    if code in (errno.EACCES, errno.EPERM):
+        return PortError(
+            f'{path} may not be opened: permission denied; sudo usermod -aG dialout $USER, '
+            'log in again',
+            False,
+        )
+    if code in (errno.EAGAIN, errno.EBUSY):
+        return PortError(
+            f'{path} is busy: another program has it open; lsof {path} names it', False
+        )
+    return PortError(f'{path} failed: {error}', False)
