@@ -1,0 +1,286 @@
+// Copyright 2026 The t3mpc_ros developers
+// SPDX-License-Identifier: Apache-2.0
+#include "t3_protocol.h"
+
+#include <string.h>
+
+#include "t3_bytes.h"
+
+// -- radio payloads ------------------------------------------------------------------------------
+
+// Sizes by kind; a signed one ends with a tag, and has its clock before it where the unsigned one
+// carries none. 0: there is no signed form.
+struct form {
+    uint8_t plain, tagged;
+};
+
+static const struct form FORMS[] = {
+    [T3_CMD] = {14, 22},
+    [T3_PARAM_GET] = {4, 0},
+    [T3_PARAM_SET] = {8, 20},
+    [T3_HELLO] = {8, 24},
+    [T3_POLL] = {4, 0},
+    [T3_ACTION] = {6, 18},
+};
+
+static uint8_t header(uint8_t kind)
+{
+    return (uint8_t)(T3_VERSION << 4 | kind);
+}
+
+// Return whether every value is one that the protocol knows.
+static bool read_command(const uint8_t *data, struct t3_packet *packet)
+{
+    packet->ttl = data[4];
+    packet->left = t3_signed16(t3_get16(data + 6));
+    packet->right = t3_signed16(t3_get16(data + 8));
+    packet->host_us = t3_get32(data + 10);
+    return packet->what <= (T3_FLAG_ENABLE | T3_FLAG_ESTOP | T3_FLAG_ESTOP_CLEAR) && !data[5];
+}
+
+static bool read_param_set(const uint8_t *data, struct t3_packet *packet)
+{
+    packet->value = t3_signed32(t3_get32(data + 4));
+    if (packet->tag)
+        packet->host_us = t3_get32(data + 8);
+    return true;
+}
+
+static bool read_hello(const uint8_t *data, struct t3_packet *packet)
+{
+    packet->host_us = t3_get32(data + 4);
+    if (packet->tag)
+        packet->nonce = data + 8;
+    // The flag says what the length says; session 0 means none, nobody can start it.
+    return packet->session && packet->what == (packet->tag ? 1 : 0);
+}
+
+static bool read_action(const uint8_t *data, struct t3_packet *packet)
+{
+    if (packet->tag)
+        packet->host_us = t3_get32(data + 6);
+    return !t3_get16(data + 4);
+}
+
+static bool read_body(const uint8_t *data, struct t3_packet *packet)
+{
+    switch (packet->kind) {
+    case T3_CMD:
+        return read_command(data, packet);
+    case T3_PARAM_SET:
+        return read_param_set(data, packet);
+    case T3_HELLO:
+        return read_hello(data, packet);
+    case T3_POLL:
+        return packet->what <= T3_POLL_INFO;
+    case T3_ACTION:
+        return read_action(data, packet);
+    default:
+        return true;  // PARAM_GET: any id may be asked for
+    }
+}
+
+enum t3_fault t3_decode(const uint8_t *data, uint8_t size, struct t3_packet *packet)
+{
+    memset(packet, 0, sizeof *packet);
+    if (size < 1 || size > T3_RADIO_LIMIT)
+        return T3_BAD_LENGTH;
+    packet->kind = data[0] & 0x0F;
+    if (data[0] >> 4 != T3_VERSION || packet->kind < T3_CMD || packet->kind > T3_ACTION)
+        return T3_BAD_VERSION;
+    const struct form form = FORMS[packet->kind];
+    if (size != form.plain && (size != form.tagged || !form.tagged))
+        return T3_BAD_LENGTH;
+    packet->session = data[1];
+    packet->seq = data[2];
+    packet->what = data[3];
+    if (size == form.tagged)
+        packet->tag = data + size - T3_TAG_SIZE;
+    return read_body(data, packet) ? T3_GOOD : T3_BAD_LENGTH;
+}
+
+bool t3_asks_to_stop(const uint8_t *data, uint8_t size)
+{
+    return (size == FORMS[T3_CMD].plain || size == FORMS[T3_CMD].tagged) &&
+           data[0] == header(T3_CMD) && (data[3] & T3_FLAG_ESTOP);
+}
+
+// Write what every payload begins with.
+static uint8_t *put_header(uint8_t *to, uint8_t kind, uint8_t session, uint8_t seq)
+{
+    to = t3_put8(to, header(kind));
+    to = t3_put8(to, session);
+    return t3_put8(to, seq);
+}
+
+uint8_t t3_encode_state(const struct t3_state *state, uint8_t *to)
+{
+    to = put_header(to, T3_STATE, state->session, state->seq);
+    to = t3_put8(to, state->status);
+    to = t3_put32(to, state->time_us);
+    to = t3_put32(to, (uint32_t)state->left);
+    to = t3_put32(to, (uint32_t)state->right);
+    to = t3_put16(to, (uint16_t)state->gyro_z);
+    to = t3_put16(to, (uint16_t)state->accel_x);
+    to = t3_put16(to, (uint16_t)state->accel_y);
+    to = t3_put16(to, state->age);
+    for (uint8_t i = 0; i < sizeof state->ranges; i++)
+        to = t3_put8(to, state->ranges[i]);
+    return T3_STATE_SIZE;
+}
+
+uint8_t t3_encode_param(const struct t3_param *param, uint8_t *to)
+{
+    to = put_header(to, T3_PARAM, param->session, param->seq);
+    to = t3_put8(to, param->id);
+    to = t3_put8(to, param->rc);
+    to = t3_put32(to, (uint32_t)param->value);
+    to = t3_put32(to, (uint32_t)param->low);
+    t3_put32(to, (uint32_t)param->high);
+    return T3_PARAM_SIZE;
+}
+
+uint8_t t3_encode_info(const struct t3_info *info, uint8_t *to)
+{
+    to = put_header(to, T3_INFO, info->session, info->seq);
+    to = t3_put8(to, info->protocol);
+    to = t3_put8(to, info->major);
+    to = t3_put8(to, info->minor);
+    to = t3_put8(to, info->reset_cause);
+    to = t3_put8(to, info->parameters);
+    to = t3_put16(to, info->steps_per_rev);
+    to = t3_put16(to, info->microsteps);
+    to = t3_put32(to, info->time_us);
+    to = t3_put8(to, info->status);
+    if (!info->nonce)
+        return T3_INFO_SIZE;
+    for (uint8_t i = 0; i < T3_NONCE_SIZE; i++)
+        to = t3_put8(to, info->nonce[i]);
+    return T3_INFO_SIZE + T3_NONCE_SIZE;
+}
+
+uint8_t t3_encode_ack(uint8_t session, uint8_t seq, uint8_t verb, uint8_t rc, uint8_t *to)
+{
+    to = put_header(to, T3_ACK, session, seq);
+    to = t3_put8(to, verb);
+    t3_put8(to, rc);
+    return T3_ACK_SIZE;
+}
+
+uint8_t t3_encode_aux(const struct t3_aux *aux, uint8_t *to)
+{
+    to = put_header(to, T3_AUX, aux->session, aux->seq);
+    to = t3_put8(to, aux->status);
+    to = t3_put16(to, aux->battery);
+    to = t3_put16(to, (uint16_t)aux->temperature);
+    to = t3_put16(to, (uint16_t)aux->accel_z);
+    to = t3_put16(to, (uint16_t)aux->gyro_x);
+    to = t3_put16(to, (uint16_t)aux->gyro_y);
+    to = t3_put16(to, aux->counters.received);
+    to = t3_put16(to, aux->counters.duplicates);
+    to = t3_put16(to, aux->counters.bad_session);
+    to = t3_put16(to, aux->counters.stale);
+    to = t3_put16(to, aux->counters.expired);
+    to = t3_put32(to, aux->time_us);
+    to = t3_put16(to, aux->counters.bad_version);
+    t3_put16(to, aux->counters.bad_length);
+    return T3_AUX_SIZE;
+}
+
+// -- serial line ---------------------------------------------------------------------------------
+
+uint16_t t3_crc16(const uint8_t *data, uint8_t size)
+{
+    uint16_t crc = 0xFFFF;
+    while (size--) {
+        // Eight steps of the polynomial 0x1021 at once, without a table.
+        crc = (uint16_t)((uint16_t)(crc << 8) | (uint16_t)(crc >> 8));
+        crc = (uint16_t)(crc ^ *data++);
+        crc = (uint16_t)(crc ^ (uint8_t)((uint8_t)crc >> 4));
+        crc = (uint16_t)(crc ^ (uint16_t)((uint16_t)(crc & 0x0F) << 12));
+        crc = (uint16_t)(crc ^ (uint16_t)((uint16_t)(crc & 0xFF) << 5));
+    }
+    return crc;
+}
+
+uint8_t t3_to_wire(const uint8_t *frame, uint8_t size, uint8_t *wire)
+{
+    if (size < 1 || size > T3_FRAME_LIMIT)
+        return 0;
+    uint8_t crc[T3_CRC_SIZE];
+    t3_put16(crc, t3_crc16(frame, size));
+    // No run reaches 254 bytes here, so COBS needs no case for that.
+    uint8_t run = 0, at = 1;  // where the run's length goes, and where the next byte does
+    for (uint8_t i = 0; i < size + T3_CRC_SIZE; i++) {
+        const uint8_t byte = i < size ? frame[i] : crc[i - size];
+        if (byte) {
+            wire[at++] = byte;
+        } else {
+            wire[run] = (uint8_t)(at - run);
+            run = at++;
+        }
+    }
+    wire[run] = (uint8_t)(at - run);
+    wire[at++] = 0;
+    return at;
+}
+
+static void begin_frame(struct t3_splitter *splitter)
+{
+    splitter->size = splitter->left = 0;
+    splitter->begun = splitter->bad = false;
+}
+
+void t3_splitter_start(struct t3_splitter *splitter)
+{
+    begin_frame(splitter);
+    splitter->frames = splitter->crc_errors = splitter->frame_errors = 0;
+}
+
+static void keep(struct t3_splitter *splitter, uint8_t byte)
+{
+    if (splitter->size < sizeof splitter->frame)
+        splitter->frame[splitter->size++] = byte;
+    else
+        splitter->bad = true;
+}
+
+static uint8_t end_frame(struct t3_splitter *splitter)
+{
+    const uint8_t size = splitter->size;
+    const bool begun = splitter->begun;
+    const bool bad = splitter->bad || splitter->left || size <= T3_CRC_SIZE;
+    begin_frame(splitter);
+    if (!begun)
+        return 0;  // zeros in a row: whoever is unsure of the line may send one first
+    if (bad) {
+        splitter->frame_errors++;
+        return 0;
+    }
+    const uint8_t body = (uint8_t)(size - T3_CRC_SIZE);
+    if (t3_crc16(splitter->frame, body) != t3_get16(splitter->frame + body)) {
+        splitter->crc_errors++;
+        return 0;
+    }
+    splitter->frames++;
+    return body;
+}
+
+uint8_t t3_splitter_byte(struct t3_splitter *splitter, uint8_t byte)
+{
+    if (!byte)
+        return end_frame(splitter);
+    if (splitter->bad)
+        return 0;
+    if (splitter->left) {
+        splitter->left--;
+        keep(splitter, byte);
+        return 0;
+    }
+    // A run begins: between two runs there was a zero.
+    if (splitter->begun)
+        keep(splitter, 0);
+    splitter->begun = true;
+    splitter->left = (uint8_t)(byte - 1);
+    return 0;
+}

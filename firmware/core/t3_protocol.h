@@ -1,0 +1,151 @@
+// Copyright 2026 The t3mpc_ros developers
+// SPDX-License-Identifier: Apache-2.0
+// Protocol 1 byte by byte: radio payloads, and the frames of the serial line around them. All
+// numbers are little endian. docs/radio.md has the byte tables.
+#ifndef T3_PROTOCOL_H
+#define T3_PROTOCOL_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#define T3_VERSION 1u
+#define T3_FIRMWARE_MAJOR 1u
+#define T3_FIRMWARE_MINOR 0u
+
+#define T3_RADIO_LIMIT 32u  // bytes: the chip takes no more, and a wider claim is an attack
+#define T3_FRAME_LIMIT 78u  // bytes of a serial frame without CRC: a TX with two payloads has 68
+#define T3_CRC_SIZE 2u
+#define T3_WIRE_LIMIT (T3_FRAME_LIMIT + T3_CRC_SIZE + 2u)  // COBS adds one byte and the end one
+#define T3_TAG_SIZE 8u
+#define T3_NONCE_SIZE 8u
+
+// -- radio payloads ------------------------------------------------------------------------------
+
+// Kinds, host to robot.
+enum { T3_CMD = 1, T3_PARAM_GET, T3_PARAM_SET, T3_HELLO, T3_POLL, T3_ACTION };
+// Kinds, robot to host.
+enum { T3_STATE = 1, T3_PARAM, T3_INFO, T3_ACK, T3_AUX };
+
+#define T3_CMD_SIZE 14u
+#define T3_STATE_SIZE 32u
+#define T3_PARAM_SIZE 17u
+#define T3_INFO_SIZE 17u  // and a nonce from a keyed robot
+#define T3_ACK_SIZE 5u
+#define T3_AUX_SIZE 32u
+
+// Flags of a CMD.
+#define T3_FLAG_ENABLE 1u
+#define T3_FLAG_ESTOP 2u
+#define T3_FLAG_ESTOP_CLEAR 4u
+
+// Status bits of STATE, INFO and AUX.
+#define T3_STATUS_ENABLED 1u
+#define T3_STATUS_MOVING 2u
+#define T3_STATUS_ESTOP 4u
+#define T3_STATUS_TTL_EXPIRED 8u
+#define T3_STATUS_IMU_FAULT 16u
+#define T3_STATUS_LOW_BATTERY 32u
+#define T3_STATUS_NO_SESSION 64u
+#define T3_STATUS_LIMITED 128u
+
+// What a POLL asks for.
+enum { T3_POLL_STATE, T3_POLL_AUX, T3_POLL_INFO };
+// Verbs of an ACTION.
+enum { T3_RESET_ODOMETRY = 1, T3_CLEAR_COUNTERS };
+// Results in PARAM and ACK.
+enum { T3_RC_OK, T3_RC_UNKNOWN, T3_RC_RANGE, T3_RC_READ_ONLY, T3_RC_BUSY };
+
+#define T3_AGE_NONE 0xFFFFu
+#define T3_RANGES 8u
+
+// Why a payload is none; the robot counts them apart.
+enum t3_fault { T3_GOOD, T3_BAD_VERSION, T3_BAD_LENGTH };
+
+// A radio payload from the host. Which fields mean something depends on the kind.
+struct t3_packet {
+    uint8_t kind, session, seq;
+    uint8_t what;  // CMD, HELLO: flags; PARAM_*: id; POLL: what; ACTION: verb
+    uint8_t ttl;   // 10 ms
+    int16_t left, right;  // mrad/s
+    int32_t value;
+    uint32_t host_us;
+    const uint8_t *nonce;  // a signed HELLO's, else NULL
+    const uint8_t *tag;    // behind everything it signs, NULL if there is none
+};
+
+// Read a payload whole or not at all: a wrong length, or a value that no frame may have, is
+// T3_BAD_LENGTH; another version or an unknown kind T3_BAD_VERSION.
+enum t3_fault t3_decode(const uint8_t *data, uint8_t size, struct t3_packet *packet);
+
+// True for a CMD that asks for an emergency stop, whatever else is wrong with it: stopping is
+// always allowed.
+bool t3_asks_to_stop(const uint8_t *data, uint8_t size);
+
+struct t3_state {
+    uint8_t session, seq, status;
+    uint32_t time_us;
+    int32_t left, right;  // microsteps
+    int16_t gyro_z, accel_x, accel_y;
+    uint16_t age;  // 10 us
+    uint8_t ranges[T3_RANGES];
+};
+
+struct t3_param {
+    uint8_t session, seq, id, rc;
+    int32_t value, low, high;
+};
+
+struct t3_info {
+    uint8_t session, seq, protocol, major, minor, reset_cause, parameters;
+    uint16_t steps_per_rev, microsteps;
+    uint32_t time_us;
+    uint8_t status;
+    const uint8_t *nonce;  // NULL from a robot without a key
+};
+
+// What a robot counts, in the order of AUX; all modulo 2**16.
+struct t3_counters {
+    uint16_t received, duplicates, bad_session, stale, expired, bad_version, bad_length;
+};
+
+struct t3_aux {
+    uint8_t session, seq, status;
+    uint16_t battery;  // mV
+    int16_t temperature, accel_z, gyro_x, gyro_y;
+    uint32_t time_us;
+    struct t3_counters counters;
+};
+
+// Each writes one payload and returns its size.
+uint8_t t3_encode_state(const struct t3_state *state, uint8_t *to);
+uint8_t t3_encode_param(const struct t3_param *param, uint8_t *to);
+uint8_t t3_encode_info(const struct t3_info *info, uint8_t *to);
+uint8_t t3_encode_ack(uint8_t session, uint8_t seq, uint8_t verb, uint8_t rc, uint8_t *to);
+uint8_t t3_encode_aux(const struct t3_aux *aux, uint8_t *to);
+
+// -- serial line: COBS( frame | CRC-16 ), then a zero byte ---------------------------------------
+
+// CRC-16/IBM-3740, starting at 0xFFFF: 0x29B1 of "123456789".
+uint16_t t3_crc16(const uint8_t *data, uint8_t size);
+
+// Write a frame of 1 to T3_FRAME_LIMIT bytes as it goes over the line; return how many bytes that
+// are (at most T3_WIRE_LIMIT), 0 if the size is out of bounds.
+uint8_t t3_to_wire(const uint8_t *frame, uint8_t size, uint8_t *wire);
+
+// Cuts frames out of a byte stream, however it is damaged: in step again at the next zero byte.
+struct t3_splitter {
+    uint8_t frame[T3_FRAME_LIMIT + T3_CRC_SIZE];
+    uint8_t size;  // of what is in `frame`
+    uint8_t left;  // bytes left in the run
+    bool begun, bad;
+    uint16_t frames;        // good ones
+    uint16_t crc_errors;    // well-formed, but another CRC
+    uint16_t frame_errors;  // too long, too short, or no COBS
+};
+
+void t3_splitter_start(struct t3_splitter *splitter);
+// Take a byte. When it completes a good frame, return the frame's size without CRC; the bytes are
+// in `frame` until the next call. Else return 0.
+uint8_t t3_splitter_byte(struct t3_splitter *splitter, uint8_t byte);
+
+#endif

@@ -1,0 +1,90 @@
+// Copyright 2026 The t3mpc_ros developers
+// SPDX-License-Identifier: Apache-2.0
+#include "t3_requests.h"
+
+#include <string.h>
+
+#include "t3_bytes.h"
+#include "t3_store.h"
+
+static void store_microsteps(const struct t3_robot *robot)
+{
+    uint8_t wanted[2], stored[2];
+    t3_put16(wanted, (uint16_t)robot->parameters.values[T3_MICROSTEPS]);
+    // Written only if it changes: the host repeats its settings at each connection.
+    if (t3_store_read(robot->port, T3_STORE_MICROSTEPS, stored, sizeof stored) !=
+            T3_RECORD_GOOD ||
+        t3_get16(stored) != t3_get16(wanted))
+        t3_store_write(robot->port, T3_STORE_MICROSTEPS, wanted, sizeof wanted);
+}
+
+static void set_inverted(struct t3_robot *robot)
+{
+    robot->port->lock(robot->port->context);
+    robot->steps.inverted = (uint8_t)robot->parameters.values[T3_INVERT_WHEELS];
+    robot->port->unlock(robot->port->context);
+}
+
+static void get_parameter(struct t3_robot *robot, const struct t3_packet *packet)
+{
+    const bool known = t3_parameter_bounds(packet->what) != 0;
+    t3_answer_with(robot, T3_PARAM, packet->seq, packet->what, known ? T3_RC_OK : T3_RC_UNKNOWN);
+}
+
+static void set_parameter(struct t3_robot *robot, const struct t3_packet *packet)
+{
+    const uint8_t id = packet->what;
+    const uint8_t rc =
+        t3_parameter_set(&robot->parameters, id, packet->value, t3_ramp_busy(&robot->ramp));
+    if (rc == T3_RC_OK && id == T3_MICROSTEPS)
+        store_microsteps(robot);
+    if (rc == T3_RC_OK && id == T3_INVERT_WHEELS)
+        set_inverted(robot);
+    t3_answer_with(robot, T3_PARAM, packet->seq, id, rc);
+}
+
+static uint8_t reset_odometry(struct t3_robot *robot)
+{
+    if (t3_ramp_busy(&robot->ramp))
+        return T3_RC_BUSY;
+    robot->port->lock(robot->port->context);
+    robot->steps.wheels[T3_LEFT].count = robot->steps.wheels[T3_RIGHT].count = 0;
+    robot->port->unlock(robot->port->context);
+    return T3_RC_OK;
+}
+
+static uint8_t act(struct t3_robot *robot, uint8_t verb)
+{
+    switch (verb) {
+    case T3_RESET_ODOMETRY:
+        return reset_odometry(robot);
+    case T3_CLEAR_COUNTERS:
+        memset(&robot->counters, 0, sizeof robot->counters);
+        return T3_RC_OK;
+    default:
+        return T3_RC_UNKNOWN;
+    }
+}
+
+static void take_action(struct t3_robot *robot, const struct t3_packet *packet)
+{
+    // A host that missed the answer asks again: it hears what became of it, nothing is done twice.
+    if (!robot->action_done || packet->seq != robot->action_seq ||
+        packet->what != robot->action_verb) {
+        robot->action_rc = act(robot, packet->what);
+        robot->action_done = true;
+        robot->action_seq = packet->seq;
+        robot->action_verb = packet->what;
+    }
+    t3_answer_with(robot, T3_ACK, packet->seq, packet->what, robot->action_rc);
+}
+
+void t3_request(struct t3_robot *robot, const struct t3_packet *packet)
+{
+    if (packet->kind == T3_PARAM_GET)
+        get_parameter(robot, packet);
+    else if (packet->kind == T3_PARAM_SET)
+        set_parameter(robot, packet);
+    else
+        take_action(robot, packet);
+}

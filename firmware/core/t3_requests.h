@@ -1,0 +1,12 @@
+// Copyright 2026 The t3mpc_ros developers
+// SPDX-License-Identifier: Apache-2.0
+// PARAM_GET, PARAM_SET and ACTION: all may be repeated until their answer is heard.
+#ifndef T3_REQUESTS_H
+#define T3_REQUESTS_H
+
+#include "t3_robot.h"
+
+// Do what a request of the session asks for, and answer it.
+void t3_request(struct t3_robot *robot, const struct t3_packet *packet);
+
+#endif

@@ -1,0 +1,332 @@
+// Copyright 2026 The t3mpc_ros developers
+// SPDX-License-Identifier: Apache-2.0
+#include "t3_robot.h"
+
+#include <string.h>
+
+#include "t3_bytes.h"
+#include "t3_requests.h"
+#include "t3_sensors.h"
+#include "t3_store.h"
+#include "t3_telemetry.h"
+
+#define TTL_UNIT_US UINT32_C(10000)
+
+void t3_answer_with(struct t3_robot *robot, uint8_t kind, uint8_t seq, uint8_t id, uint8_t rc)
+{
+    const struct t3_answer wanted = {kind, seq, id, rc};
+    robot->answer = wanted;
+}
+
+static int32_t parameter(const struct t3_robot *robot, uint8_t id)
+{
+    return robot->parameters.values[id];
+}
+
+// Come to rest, and stay there until a command allows otherwise.
+static void disable(struct t3_robot *robot)
+{
+    robot->enabled = false;
+    robot->ttl_runs = false;
+    t3_ramp_halt(&robot->ramp);
+}
+
+static void latch_estop(struct t3_robot *robot)
+{
+    robot->estop = true;
+    disable(robot);
+}
+
+static bool button(const struct t3_robot *robot)
+{
+    return robot->port->estop_pressed(robot->port->context);
+}
+
+// -- packets -------------------------------------------------------------------------------------
+
+static void take_hello(struct t3_robot *robot, const struct t3_packet *packet,
+                       const uint8_t *data, uint32_t received_us)
+{
+    // Refused or not, INFO tells the host which session holds and whether the robot is keyed.
+    t3_answer_with(robot, T3_INFO, packet->seq, 0, 0);
+    switch (t3_session_greet(&robot->session, robot->port, packet, data)) {
+    case T3_GREETING_REFUSED:
+        robot->counters.bad_session++;
+        return;
+    case T3_GREETING_REPEATED:
+        return;
+    case T3_GREETING_NEW:
+        break;
+    }
+    disable(robot);
+    robot->expired = robot->limited = false;
+    robot->seq_known = robot->command_seen = robot->action_done = false;
+    robot->seq = 0;
+    robot->heard_us = received_us;
+    t3_freshness_start(&robot->freshness);
+    // HELLO's own delay is the first one known: a burst held back right behind it is found.
+    t3_freshness_stale(&robot->freshness, received_us, packet->host_us, 0);
+}
+
+static bool clears_estop(const struct t3_robot *robot, const struct t3_packet *packet)
+{
+    return packet->what == T3_FLAG_ESTOP_CLEAR && !packet->left && !packet->right &&
+           !button(robot);
+}
+
+static void follow(struct t3_robot *robot, const struct t3_packet *packet, uint32_t received_us,
+                   uint32_t ttl_us)
+{
+    robot->expired = robot->limited = false;
+    if (clears_estop(robot, packet))
+        robot->estop = false;
+    if (robot->estop || !(packet->what & T3_FLAG_ENABLE)) {
+        disable(robot);
+        return;
+    }
+    robot->enabled = true;
+    robot->ttl_runs = ttl_us != 0;
+    robot->ttl_from_us = received_us;
+    robot->ttl_us = ttl_us;
+    if (!ttl_us) {
+        t3_ramp_halt(&robot->ramp);  // a TTL of 0 is a wish to stop, not an accident
+        return;
+    }
+    int32_t limit = parameter(robot, T3_MAX_SPEED);
+    if (limit > robot->top_speed)
+        limit = robot->top_speed;
+    robot->limited = t3_ramp_aim(&robot->ramp, packet->left, packet->right, limit);
+}
+
+static bool wants_to_stand(const struct t3_packet *packet)
+{
+    return !(packet->what & T3_FLAG_ENABLE) || !packet->ttl || (!packet->left && !packet->right);
+}
+
+static void take_command(struct t3_robot *robot, const struct t3_packet *packet,
+                         uint32_t received_us)
+{
+    const uint8_t ahead = (uint8_t)(packet->seq - robot->seq);
+    if (robot->seq_known && (ahead == 0 || ahead >= 0x80)) {
+        robot->counters.duplicates++;
+        return;
+    }
+    robot->seq_known = robot->command_seen = true;
+    robot->seq = packet->seq;
+    robot->command_us = received_us;
+    uint32_t ttl_us = packet->ttl * TTL_UNIT_US;
+    const uint32_t longest = (uint32_t)parameter(robot, T3_TTL_MAX) * 1000u;
+    if (ttl_us > longest)
+        ttl_us = longest;
+    if (t3_freshness_stale(&robot->freshness, received_us, packet->host_us, ttl_us)) {
+        robot->counters.stale++;
+        // A wish to stand is never too late; it does not count as a command otherwise.
+        if (wants_to_stand(packet))
+            t3_ramp_halt(&robot->ramp);
+        return;
+    }
+    follow(robot, packet, received_us, ttl_us);
+}
+
+static void take_poll(struct t3_robot *robot, const struct t3_packet *packet)
+{
+    static const uint8_t KINDS[] = {
+        [T3_POLL_STATE] = T3_STATE, [T3_POLL_AUX] = T3_AUX, [T3_POLL_INFO] = T3_INFO};
+    t3_answer_with(robot, KINDS[packet->what], packet->seq, 0, 0);
+}
+
+// What only the host of the session may do. PARAM_GET changes nothing, so it needs no tag.
+static bool admitted(struct t3_robot *robot, const struct t3_packet *packet, const uint8_t *data,
+                     uint8_t size, uint32_t received_us)
+{
+    const bool mine =
+        packet->kind == T3_PARAM_GET
+            ? robot->session.id && packet->session == robot->session.id
+            : t3_session_admits(&robot->session, packet, data, size);
+    if (!mine)
+        robot->counters.bad_session++;
+    else
+        robot->heard_us = received_us;
+    return mine;
+}
+
+static void take(struct t3_robot *robot, const uint8_t *data, uint8_t size, uint32_t received_us)
+{
+    struct t3_packet packet;
+    switch (t3_decode(data, size, &packet)) {
+    case T3_BAD_VERSION:
+        robot->counters.bad_version++;
+        return;
+    case T3_BAD_LENGTH:
+        robot->counters.bad_length++;
+        return;
+    case T3_GOOD:
+        break;
+    }
+    if (packet.kind == T3_HELLO) {
+        take_hello(robot, &packet, data, received_us);
+    } else if (packet.kind == T3_POLL) {
+        take_poll(robot, &packet);
+    } else if (admitted(robot, &packet, data, size, received_us)) {
+        if (packet.kind == T3_CMD)
+            take_command(robot, &packet, received_us);
+        else
+            t3_request(robot, &packet);
+    }
+}
+
+void t3_robot_packet(struct t3_robot *robot, const uint8_t *data, uint8_t size,
+                     uint32_t received_us)
+{
+    robot->counters.received++;
+    if (size > T3_RADIO_LIMIT) {
+        // The chip never gives more; whatever claims to be wider is not even looked at.
+        robot->counters.bad_length++;
+        return;
+    }
+    if (t3_asks_to_stop(data, size))
+        latch_estop(robot);
+    // Whatever is wrong with a packet, the next one fetches a state that says so.
+    t3_answer_with(robot, T3_STATE, 0, 0, 0);
+    robot->answer_waits = true;
+    robot->answer_from_us = received_us;
+    take(robot, data, size, received_us);
+}
+
+// -- time ----------------------------------------------------------------------------------------
+
+static void watch_ttl(struct t3_robot *robot, uint32_t now_us)
+{
+    // Signed: a command may have come after this tick read the clock.
+    if (!robot->ttl_runs ||
+        t3_later_by(now_us, robot->ttl_from_us) < (int32_t)robot->ttl_us)
+        return;
+    robot->ttl_runs = false;
+    robot->expired = true;
+    robot->counters.expired++;
+    t3_ramp_halt(&robot->ramp);
+}
+
+static void watch_clock(struct t3_robot *robot, uint32_t now_us)
+{
+    // An age beyond its field is none, also when the clock has come round.
+    if (robot->command_seen && t3_later_by(now_us, robot->command_us) > INT32_C(1000000))
+        robot->command_seen = false;
+    if (robot->session.id &&
+        t3_later_by(now_us, robot->heard_us) > (int32_t)T3_SESSION_SILENCE_US) {
+        t3_session_end(&robot->session);
+        disable(robot);
+    }
+}
+
+static void move_on(struct t3_robot *robot, uint32_t elapsed_us)
+{
+    if (t3_ramp_settled(&robot->ramp))
+        return;  // and the increments are what they were: most periods cost nothing
+    t3_ramp_step(&robot->ramp, parameter(robot, T3_ACCELERATION),
+                 parameter(robot, T3_DECELERATION), elapsed_us);
+    int32_t increments[T3_WHEELS];
+    for (uint8_t i = 0; i < T3_WHEELS; i++)
+        increments[i] = t3_steps_increment(&robot->steps, robot->ramp.speed[i]);
+    robot->port->lock(robot->port->context);
+    for (uint8_t i = 0; i < T3_WHEELS; i++)
+        robot->steps.wheels[i].increment = increments[i];
+    robot->port->unlock(robot->port->context);
+}
+
+// One at a time: eight at once, just when a state is due, would make it late. The sensors measure
+// every 38 ms.
+static void read_range(struct t3_robot *robot)
+{
+    const uint8_t channel = robot->next_range;
+    robot->ranges[channel] = t3_range_code(robot->port->adc(robot->port->context, channel));
+    robot->next_range = (uint8_t)((channel + 1u) % T3_RANGES);
+}
+
+static void keep_period(struct t3_robot *robot, uint32_t now_us)
+{
+    const uint32_t elapsed_us = now_us - robot->period_us;
+    if (elapsed_us < T3_PERIOD_US)
+        return;
+    robot->period_us = now_us;
+    move_on(robot, elapsed_us);
+    read_range(robot);
+}
+
+static void watch_idleness(struct t3_robot *robot, uint32_t now_us)
+{
+    if (t3_ramp_busy(&robot->ramp)) {
+        robot->resting = robot->idle = false;
+        return;
+    }
+    if (!robot->resting) {
+        robot->resting = true;
+        robot->rest_us = now_us;
+    }
+    // Kept once it is so: the clock comes round while a robot stands for hours.
+    const uint32_t allowed = (uint32_t)parameter(robot, T3_IDLE_OFF) * 1000u;
+    robot->idle = allowed && (robot->idle || now_us - robot->rest_us >= allowed);
+}
+
+static void power(struct t3_robot *robot, uint32_t now_us)
+{
+    watch_idleness(robot, now_us);
+    // A motor without power rolls on: the drivers keep it until the ramp has ended.
+    const bool on = t3_ramp_moving(&robot->ramp) || (robot->enabled && !robot->idle);
+    if (on != robot->powered)
+        robot->port->drivers(robot->port->context, on);
+    robot->powered = on;
+}
+
+static void load(struct t3_robot *robot, uint32_t now_us)
+{
+    if (robot->answer_waits) {
+        if (t3_later_by(now_us, robot->answer_from_us) < (int32_t)robot->settle_us)
+            return;
+    } else if (now_us - robot->loaded_us < T3_REFRESH_US) {
+        return;
+    } else {
+        t3_answer_with(robot, T3_STATE, 0, 0, 0);
+    }
+    uint8_t payload[T3_RADIO_LIMIT];
+    const uint8_t size = t3_telemetry(robot, now_us, payload);
+    robot->answer_waits = false;
+    robot->loaded_us = now_us;
+    robot->port->load_ack(robot->port->context, payload, size);
+}
+
+void t3_robot_tick(struct t3_robot *robot)
+{
+    const uint32_t now_us = robot->port->time_us(robot->port->context);
+    if (button(robot))
+        latch_estop(robot);
+    watch_ttl(robot, now_us);
+    watch_clock(robot, now_us);
+    power(robot, now_us);  // before the ramp: no step reaches a driver without power
+    keep_period(robot, now_us);
+    load(robot, now_us);
+}
+
+void t3_robot_boot(struct t3_robot *robot, const struct t3_port *port, uint8_t reset_cause,
+                   uint16_t settle_us)
+{
+    memset(robot, 0, sizeof *robot);
+    robot->port = port;
+    port->drivers(port->context, false);
+    robot->reset_cause = reset_cause;
+    robot->settle_us = settle_us;
+    robot->period_us = robot->loaded_us = port->time_us(port->context);
+    t3_parameters_start(&robot->parameters);
+    uint8_t stored[2];
+    if (t3_store_read(port, T3_STORE_MICROSTEPS, stored, sizeof stored) == T3_RECORD_GOOD)
+        t3_parameter_set(&robot->parameters, T3_MICROSTEPS, t3_get16(stored), false);
+    robot->microsteps = (uint16_t)parameter(robot, T3_MICROSTEPS);
+    const uint32_t steps_per_rev = (uint32_t)parameter(robot, T3_STEPS_PER_REV);
+    t3_steps_start(&robot->steps, steps_per_rev * robot->microsteps);
+    robot->top_speed = (int32_t)(robot->steps.top_speed / 1000u);
+    t3_session_boot(&robot->session, port);
+    // The first packet fetches a state too.
+    t3_answer_with(robot, T3_STATE, 0, 0, 0);
+    robot->answer_waits = true;
+    robot->answer_from_us = robot->loaded_us - settle_us;
+}

@@ -1,0 +1,125 @@
+// Copyright 2026 The t3mpc_ros developers
+// SPDX-License-Identifier: Apache-2.0
+#include "t3_session.h"
+
+#include <string.h>
+
+#include "t3_bytes.h"
+#include "t3_store.h"
+
+#define HELLO_SIGNED_SIZE 16u  // a signed HELLO without its tag
+#define EPOCH_SIZE 4u
+
+static void count_boot(struct t3_session *session, const struct t3_port *port)
+{
+    uint8_t bytes[4];
+    // A count that was lost in mid-write starts anywhere: not where it has been before.
+    if (t3_store_read(port, T3_STORE_BOOTS, bytes, sizeof bytes) == T3_RECORD_GOOD)
+        session->boots = t3_get32(bytes) + 1;
+    else
+        session->boots = port->noise(port->context);
+    t3_put32(bytes, session->boots);
+    t3_store_write(port, T3_STORE_BOOTS, bytes, sizeof bytes);
+}
+
+void t3_session_boot(struct t3_session *session, const struct t3_port *port)
+{
+    memset(session, 0, sizeof *session);
+    const enum t3_record record = t3_store_read(port, T3_STORE_KEY, session->key, T3_KEY_SIZE);
+    session->keyed = record != T3_RECORD_BLANK;
+    // A link that was keyed must not open because a cell of the memory died: a key nobody knows.
+    if (record == T3_RECORD_DAMAGED)
+        for (uint8_t i = 0; i < T3_KEY_SIZE; i = (uint8_t)(i + 4))
+            t3_put32(session->key + i, port->noise(port->context));
+    if (session->keyed)
+        count_boot(session, port);  // an unkeyed board spares its EEPROM
+}
+
+void t3_session_end(struct t3_session *session)
+{
+    session->id = 0;
+}
+
+// In the same time wherever they differ, so that nobody learns a tag byte by byte.
+static bool same(const uint8_t *a, const uint8_t *b, uint8_t size)
+{
+    uint8_t difference = 0;
+    while (size--)
+        difference |= (uint8_t)(*a++ ^ *b++);
+    return !difference;
+}
+
+static void draw_nonce(struct t3_session *session, const struct t3_port *port)
+{
+    uint8_t seed[16];
+    uint8_t *to = t3_put32(seed, session->boots);
+    to = t3_put32(to, ++session->greetings);
+    to = t3_put32(to, port->time_us(port->context));
+    t3_put32(to, port->noise(port->context));
+    t3_siphash(session->key, seed, sizeof seed, session->robot_nonce);
+}
+
+void t3_session_derive_key(struct t3_session *session)
+{
+    uint8_t text[2 * T3_NONCE_SIZE + 1];
+    memcpy(text, session->host_nonce, T3_NONCE_SIZE);
+    memcpy(text + T3_NONCE_SIZE, session->robot_nonce, T3_NONCE_SIZE);
+    for (uint8_t half = 0; half < 2; half++) {
+        text[2 * T3_NONCE_SIZE] = half;
+        t3_siphash(session->key, text, sizeof text, session->session_key + 8 * half);
+    }
+}
+
+enum t3_greeting t3_session_greet(struct t3_session *session, const struct t3_port *port,
+                                  const struct t3_packet *packet, const uint8_t *data)
+{
+    // An unkeyed robot cannot check a signature, so it does not pretend to.
+    if (session->keyed != (packet->tag != NULL))
+        return T3_GREETING_REFUSED;
+    if (session->keyed) {
+        uint8_t tag[T3_TAG_SIZE];
+        t3_siphash(session->key, data, HELLO_SIGNED_SIZE, tag);
+        if (!same(tag, packet->tag, T3_TAG_SIZE))
+            return T3_GREETING_REFUSED;
+        if (session->id && same(session->host_nonce, packet->nonce, T3_NONCE_SIZE))
+            return T3_GREETING_REPEATED;
+        memcpy(session->host_nonce, packet->nonce, T3_NONCE_SIZE);
+        draw_nonce(session, port);
+        t3_session_derive_key(session);
+        session->epoch = 0;
+        session->last_us = packet->host_us;
+    }
+    session->id = packet->session;
+    return T3_GREETING_NEW;
+}
+
+bool t3_session_admits(struct t3_session *session, const struct t3_packet *packet,
+                       const uint8_t *data, uint8_t size)
+{
+    if (!session->id || packet->session != session->id)
+        return false;
+    if (!session->keyed)
+        return packet->tag == NULL;
+    if (!packet->tag || packet->host_us == session->last_us)
+        return false;
+    // A clock that reads less than before has wrapped; if it has not, the tag will not fit.
+    const uint32_t epoch = session->epoch + (packet->host_us < session->last_us);
+    uint8_t text[T3_RADIO_LIMIT + EPOCH_SIZE], tag[T3_TAG_SIZE];
+    const uint8_t body = (uint8_t)(size - T3_TAG_SIZE);
+    memcpy(text, data, body);
+    t3_put32(text + body, epoch);
+    t3_siphash(session->session_key, text, (uint8_t)(body + EPOCH_SIZE), tag);
+    if (!same(tag, packet->tag, T3_TAG_SIZE))
+        return false;
+    session->epoch = epoch;
+    session->last_us = packet->host_us;
+    return true;
+}
+
+void t3_session_store_key(const struct t3_port *port, const uint8_t *key)
+{
+    if (key)
+        t3_store_write(port, T3_STORE_KEY, key, T3_KEY_SIZE);
+    else
+        t3_store_erase(port, T3_STORE_KEY, T3_KEY_SIZE);
+}

@@ -1,0 +1,25 @@
+// Copyright 2026 The t3mpc_ros developers
+// SPDX-License-Identifier: Apache-2.0
+// Records in the EEPROM, each with a CRC: a board that never stored anything, or lost its supply
+// while it did, is told from one that has.
+#ifndef T3_STORE_H
+#define T3_STORE_H
+
+#include "t3_port.h"
+
+#define T3_STORE_MICROSTEPS 0u  // u16
+#define T3_STORE_KEY 8u         // 16 bytes
+#define T3_STORE_BOOTS 32u      // u32
+#define T3_STORE_END 40u
+#define T3_STORE_RECORD_LIMIT 16u
+
+enum t3_record { T3_RECORD_BLANK, T3_RECORD_DAMAGED, T3_RECORD_GOOD };
+
+enum t3_record t3_store_read(const struct t3_port *port, uint8_t address, uint8_t *data,
+                             uint8_t size);
+void t3_store_write(const struct t3_port *port, uint8_t address, const uint8_t *data,
+                    uint8_t size);
+// Make a record blank again.
+void t3_store_erase(const struct t3_port *port, uint8_t address, uint8_t size);
+
+#endif

@@ -1,0 +1,155 @@
+// Copyright 2026 The t3mpc_ros developers
+// SPDX-License-Identifier: Apache-2.0
+#include "t3_telemetry.h"
+
+#include <string.h>
+
+#include "t3_bytes.h"
+#include "t3_sensors.h"
+
+#define AGE_UNIT_US 10u
+
+static uint16_t battery(const struct t3_robot *robot)
+{
+    return t3_battery_mv(robot->port->adc(robot->port->context, T3_ADC_BATTERY));
+}
+
+uint8_t t3_robot_status(const struct t3_robot *robot)
+{
+    const uint16_t supply = battery(robot);
+    uint8_t status = 0;
+    if (robot->enabled)
+        status |= T3_STATUS_ENABLED;
+    if (t3_ramp_moving(&robot->ramp))
+        status |= T3_STATUS_MOVING;
+    if (robot->estop)
+        status |= T3_STATUS_ESTOP;
+    if (robot->expired)
+        status |= T3_STATUS_TTL_EXPIRED;
+    if (robot->imu_fault)
+        status |= T3_STATUS_IMU_FAULT;
+    // 0: nothing is wired to it
+    if (supply && supply < robot->parameters.values[T3_BATTERY_LOW])
+        status |= T3_STATUS_LOW_BATTERY;
+    if (!robot->session.id)
+        status |= T3_STATUS_NO_SESSION;
+    if (robot->limited)
+        status |= T3_STATUS_LIMITED;
+    return status;
+}
+
+static struct t3_imu sample_imu(struct t3_robot *robot)
+{
+    struct t3_imu imu;
+    memset(&imu, 0, sizeof imu);
+    robot->imu_fault = !robot->port->imu(robot->port->context, &imu);
+    // What a sensor left behind when it failed is no measurement.
+    if (robot->imu_fault)
+        memset(&imu, 0, sizeof imu);
+    return imu;
+}
+
+static void count_steps(const struct t3_robot *robot, int32_t *left, int32_t *right)
+{
+    const struct t3_port *port = robot->port;
+    port->lock(port->context);
+    *left = robot->steps.wheels[T3_LEFT].count;
+    *right = robot->steps.wheels[T3_RIGHT].count;
+    port->unlock(port->context);
+}
+
+static uint16_t age(const struct t3_robot *robot, uint32_t now_us)
+{
+    const uint32_t units = (now_us - robot->command_us) / AGE_UNIT_US;
+    return robot->command_seen && units < T3_AGE_NONE ? (uint16_t)units : T3_AGE_NONE;
+}
+
+static uint8_t tell_state(struct t3_robot *robot, uint32_t now_us, uint8_t *to)
+{
+    const struct t3_imu imu = sample_imu(robot);
+    struct t3_state state = {
+        .session = robot->session.id,
+        .seq = robot->seq,
+        .status = t3_robot_status(robot),
+        .time_us = now_us,
+        .gyro_z = imu.gyro_z,
+        .accel_x = imu.accel_x,
+        .accel_y = imu.accel_y,
+        .age = age(robot, now_us),
+    };
+    count_steps(robot, &state.left, &state.right);
+    memcpy(state.ranges, robot->ranges, T3_RANGES);
+    return t3_encode_state(&state, to);
+}
+
+static uint8_t tell_aux(struct t3_robot *robot, uint32_t now_us, uint8_t *to)
+{
+    const struct t3_imu imu = sample_imu(robot);
+    const struct t3_aux aux = {
+        .session = robot->session.id,
+        .seq = robot->answer.seq,
+        .status = t3_robot_status(robot),
+        .battery = battery(robot),
+        .temperature = imu.temperature,
+        .accel_z = imu.accel_z,
+        .gyro_x = imu.gyro_x,
+        .gyro_y = imu.gyro_y,
+        .time_us = now_us,
+        .counters = robot->counters,
+    };
+    return t3_encode_aux(&aux, to);
+}
+
+static uint8_t tell_info(const struct t3_robot *robot, uint32_t now_us, uint8_t *to)
+{
+    const struct t3_info info = {
+        .session = robot->session.id,
+        .seq = robot->answer.seq,
+        .protocol = T3_VERSION,
+        .major = T3_FIRMWARE_MAJOR,
+        .minor = T3_FIRMWARE_MINOR,
+        .reset_cause = robot->reset_cause,
+        .parameters = T3_PARAMETERS,
+        .steps_per_rev = (uint16_t)robot->parameters.values[T3_STEPS_PER_REV],
+        .microsteps = robot->microsteps,
+        .time_us = now_us,
+        .status = t3_robot_status(robot),
+        .nonce = robot->session.keyed ? robot->session.robot_nonce : NULL,
+    };
+    return t3_encode_info(&info, to);
+}
+
+static uint8_t tell_param(const struct t3_robot *robot, uint8_t *to)
+{
+    const uint8_t id = robot->answer.id;
+    const struct t3_bounds *bounds = t3_parameter_bounds(id);
+    struct t3_param param = {
+        .session = robot->session.id,
+        .seq = robot->answer.seq,
+        .id = id,
+        .rc = robot->answer.rc,
+    };
+    if (bounds) {
+        param.value = robot->parameters.values[id];
+        param.low = bounds->low;
+        param.high = bounds->high;
+    }
+    return t3_encode_param(&param, to);
+}
+
+uint8_t t3_telemetry(struct t3_robot *robot, uint32_t now_us, uint8_t *to)
+{
+    const struct t3_answer *answer = &robot->answer;
+    switch (answer->kind) {
+    case T3_AUX:
+        return tell_aux(robot, now_us, to);
+    case T3_INFO:
+        return tell_info(robot, now_us, to);
+    case T3_PARAM:
+        return tell_param(robot, to);
+    case T3_ACK:
+        return t3_encode_ack(robot->session.id, answer->seq, answer->id, answer->rc, to);
+    default:
+        return tell_state(robot, now_us, to);
+    }
+}

@@ -1,0 +1,12 @@
+// Copyright 2026 The t3mpc_ros developers
+// SPDX-License-Identifier: Apache-2.0
+// What the robot tells.
+#ifndef T3_TELEMETRY_H
+#define T3_TELEMETRY_H
+
+#include "t3_robot.h"
+
+// Write the payload the robot's answer asks for, sampled now; return its size.
+uint8_t t3_telemetry(struct t3_robot *robot, uint32_t now_us, uint8_t *to);
+
+#endif

@@ -1,0 +1,332 @@
+// Copyright 2026 The t3mpc_ros developers
+// SPDX-License-Identifier: Apache-2.0
+#include <stdlib.h>
+#include <string.h>
+
+#include "t3_host.h"
+#include "t3_robot.h"
+#include "t3_store.h"
+
+#define CHANNELS 9u
+#define NEVER 0xFFFFFFFFu
+
+struct t3_host_robot {
+    struct t3_robot robot;
+    struct t3_port port;
+    uint32_t time_us, since_tick_us, noise;
+    uint8_t eeprom[T3_STORE_END];
+    uint32_t eeprom_writes;
+    uint8_t ack[T3_RADIO_LIMIT], ack_size;
+    uint32_t loads;
+    bool powered, pressed, imu_answers;
+    struct t3_imu imu;
+    uint16_t adc[CHANNELS];
+    bool nonce_forced;
+    uint8_t nonce[T3_NONCE_SIZE];
+    // Outside, what a driver sees of the pins.
+    uint8_t pins;
+    int32_t pulses[T3_WHEELS];
+    uint32_t ticks, last_pulse[T3_WHEELS], closest, unpowered, hasty;
+    int locked;
+};
+
+static uint32_t time_us(void *context)
+{
+    const struct t3_host_robot *host = context;
+    return host->time_us;
+}
+
+static void load_ack(void *context, const uint8_t *payload, uint8_t size)
+{
+    struct t3_host_robot *host = context;
+    if (!size || size > T3_RADIO_LIMIT)
+        abort();
+    memcpy(host->ack, payload, size);
+    host->ack_size = size;
+    host->loads++;
+}
+
+static void drivers(void *context, bool on)
+{
+    struct t3_host_robot *host = context;
+    host->powered = on;
+}
+
+static bool estop_pressed(void *context)
+{
+    const struct t3_host_robot *host = context;
+    return host->pressed;
+}
+
+static bool imu(void *context, struct t3_imu *sample)
+{
+    const struct t3_host_robot *host = context;
+    *sample = host->imu;
+    return host->imu_answers;
+}
+
+static uint16_t adc(void *context, uint8_t channel)
+{
+    const struct t3_host_robot *host = context;
+    if (channel >= CHANNELS)
+        abort();
+    return host->adc[channel];
+}
+
+static void eeprom_read(void *context, uint8_t address, uint8_t *data, uint8_t size)
+{
+    const struct t3_host_robot *host = context;
+    if (address + size > (int)sizeof host->eeprom)
+        abort();
+    memcpy(data, host->eeprom + address, size);
+}
+
+static void eeprom_write(void *context, uint8_t address, const uint8_t *data, uint8_t size)
+{
+    struct t3_host_robot *host = context;
+    if (address + size > (int)sizeof host->eeprom)
+        abort();
+    memcpy(host->eeprom + address, data, size);
+    host->eeprom_writes++;
+}
+
+static uint32_t noise(void *context)
+{
+    struct t3_host_robot *host = context;
+    host->noise = host->noise * 1664525u + 1013904223u;
+    return host->noise;
+}
+
+// Locks may not nest: the second unlock would let the interrupt in too early.
+static void lock(void *context)
+{
+    struct t3_host_robot *host = context;
+    if (host->locked++)
+        abort();
+}
+
+static void unlock(void *context)
+{
+    struct t3_host_robot *host = context;
+    if (--host->locked)
+        abort();
+}
+
+struct t3_host_robot *t3_host_robot_new(void)
+{
+    struct t3_host_robot *host = calloc(1, sizeof *host);
+    if (!host)
+        return NULL;
+    const struct t3_port port = {
+        host, time_us, load_ack, drivers, estop_pressed, imu, adc, eeprom_read, eeprom_write,
+        noise, lock, unlock,
+    };
+    host->port = port;
+    memset(host->eeprom, 0xFF, sizeof host->eeprom);
+    for (uint8_t i = 0; i < CHANNELS; i++)
+        host->adc[i] = T3_ADC_NOT_MEASURED;
+    host->imu_answers = true;
+    host->closest = NEVER;
+    return host;
+}
+
+void t3_host_robot_free(struct t3_host_robot *host)
+{
+    free(host);
+}
+
+void t3_host_robot_store_key(struct t3_host_robot *host, const uint8_t *key)
+{
+    t3_session_store_key(&host->port, key);
+}
+
+void t3_host_robot_boot(struct t3_host_robot *host, uint8_t reset_cause, uint32_t start_us)
+{
+    host->time_us = start_us;
+    host->since_tick_us = 0;
+    host->ack_size = 0;
+    host->noise = 0;  // a board without any: what hangs on it must still hold
+    host->powered = true;  // pins float until the firmware says otherwise
+    t3_robot_boot(&host->robot, &host->port, reset_cause, T3_SETTLE_US);
+    host->robot.steps.time_us = start_us;
+}
+
+void t3_host_robot_packet(struct t3_host_robot *host, const uint8_t *data, uint8_t size)
+{
+    const uint32_t greetings = host->robot.session.greetings;
+    t3_robot_packet(&host->robot, data, size, host->time_us);
+    if (host->nonce_forced && host->robot.session.greetings != greetings) {
+        memcpy(host->robot.session.robot_nonce, host->nonce, T3_NONCE_SIZE);
+        t3_session_derive_key(&host->robot.session);
+        host->nonce_forced = false;
+    }
+}
+
+static void watch_wheel(struct t3_host_robot *host, uint8_t wheel, uint8_t pins, uint8_t step,
+                        uint8_t back)
+{
+    if (!(pins & step))
+        return;
+    // A level that stays high is no second pulse.
+    if (host->pins & step)
+        return;
+    host->hasty += (pins ^ host->pins) & back ? 1 : 0;
+    host->unpowered += host->powered ? 0 : 1;
+    host->pulses[wheel] += pins & back ? -1 : 1;
+    const uint32_t since = (host->ticks - host->last_pulse[wheel]) * T3_TICK_US;
+    if (host->last_pulse[wheel] && since < host->closest)
+        host->closest = since;
+    host->last_pulse[wheel] = host->ticks;
+}
+
+static void tick(struct t3_host_robot *host)
+{
+    const uint8_t pins = t3_steps_tick(&host->robot.steps);
+    host->ticks++;
+    watch_wheel(host, T3_LEFT, pins, T3_PIN_STEP_LEFT, T3_PIN_BACK_LEFT);
+    watch_wheel(host, T3_RIGHT, pins, T3_PIN_STEP_RIGHT, T3_PIN_BACK_RIGHT);
+    host->pins = pins;
+}
+
+static void pass(struct t3_host_robot *host, uint32_t us, bool stalled)
+{
+    while (us) {
+        // On to the next tick, 50 us after the last, whatever the clock reads.
+        const uint32_t to_tick = T3_TICK_US - host->since_tick_us;
+        const uint32_t step = us < to_tick ? us : to_tick;
+        us -= step;
+        host->time_us += step;
+        host->since_tick_us = (host->since_tick_us + step) % T3_TICK_US;
+        if (host->since_tick_us)
+            continue;
+        tick(host);
+        if (!stalled && host->ticks % (T3_HOST_LOOP_US / T3_TICK_US) == 0)
+            t3_robot_tick(&host->robot);
+    }
+}
+
+void t3_host_robot_run(struct t3_host_robot *host, uint32_t us)
+{
+    pass(host, us, false);
+}
+
+void t3_host_robot_stall(struct t3_host_robot *host, uint32_t us)
+{
+    pass(host, us, true);
+}
+
+void t3_host_robot_poke_time(struct t3_host_robot *host, uint32_t to_us)
+{
+    struct t3_robot *robot = &host->robot;
+    const uint32_t by = to_us - host->time_us;
+    host->time_us = to_us;
+    robot->steps.time_us += by;
+    robot->period_us += by;
+    robot->rest_us += by;
+    robot->ttl_from_us += by;
+    robot->command_us += by;
+    robot->heard_us += by;
+    robot->answer_from_us += by;
+    robot->loaded_us += by;
+    robot->freshness.since += by;
+    robot->freshness.before_since += by;
+    robot->freshness.least += by;
+    robot->freshness.before_least += by;
+}
+
+uint32_t t3_host_robot_time(const struct t3_host_robot *host)
+{
+    return host->time_us;
+}
+
+uint8_t t3_host_robot_ack(const struct t3_host_robot *host, uint8_t *to)
+{
+    memcpy(to, host->ack, host->ack_size);
+    return host->ack_size;
+}
+
+uint32_t t3_host_robot_loads(const struct t3_host_robot *host)
+{
+    return host->loads;
+}
+
+uint8_t t3_host_robot_status(const struct t3_host_robot *host)
+{
+    return t3_robot_status(&host->robot);
+}
+
+bool t3_host_robot_powered(const struct t3_host_robot *host)
+{
+    return host->powered;
+}
+
+int32_t t3_host_robot_pulses(const struct t3_host_robot *host, uint8_t wheel)
+{
+    return host->pulses[wheel];
+}
+
+int32_t t3_host_robot_steps(const struct t3_host_robot *host, uint8_t wheel)
+{
+    return host->robot.steps.wheels[wheel].count;
+}
+
+void t3_host_robot_poke_steps(struct t3_host_robot *host, uint8_t wheel, int32_t count)
+{
+    host->robot.steps.wheels[wheel].count = count;
+}
+
+int32_t t3_host_robot_speed(const struct t3_host_robot *host, uint8_t wheel)
+{
+    return host->robot.ramp.speed[wheel];
+}
+
+uint32_t t3_host_robot_closest_pulses(const struct t3_host_robot *host)
+{
+    return host->closest;
+}
+
+uint32_t t3_host_robot_unpowered_pulses(const struct t3_host_robot *host)
+{
+    return host->unpowered;
+}
+
+uint32_t t3_host_robot_hasty_pulses(const struct t3_host_robot *host)
+{
+    return host->hasty;
+}
+
+uint32_t t3_host_robot_eeprom_writes(const struct t3_host_robot *host)
+{
+    return host->eeprom_writes;
+}
+
+void t3_host_robot_poke_eeprom(struct t3_host_robot *host, uint8_t address, uint8_t value)
+{
+    if (address < sizeof host->eeprom)
+        host->eeprom[address] = value;
+}
+
+void t3_host_robot_press(struct t3_host_robot *host, bool pressed)
+{
+    host->pressed = pressed;
+}
+
+void t3_host_robot_set_imu(struct t3_host_robot *host, bool answers, const int16_t *seven)
+{
+    const struct t3_imu sample = {seven[0], seven[1], seven[2], seven[3],
+                                  seven[4], seven[5], seven[6]};
+    host->imu_answers = answers;
+    host->imu = sample;
+}
+
+void t3_host_robot_set_adc(struct t3_host_robot *host, uint8_t channel, uint16_t count)
+{
+    if (channel < CHANNELS)
+        host->adc[channel] = count;
+}
+
+void t3_host_robot_force_nonce(struct t3_host_robot *host, const uint8_t *nonce)
+{
+    memcpy(host->nonce, nonce, T3_NONCE_SIZE);
+    host->nonce_forced = true;
+}
