@@ -246,7 +246,7 @@ def test_a_parameter_that_is_refused_is_named_with_its_bounds_and_keeps_the_robo
     bench.run(3.0)
     assert bench.link.phase is Phase.PARAMS
     assert bench.link.reason(bench.now_ns) == (
-        'parameter acceleration = 15000 was refused: the robot allows 100 to 100000'
+        'parameter acceleration = 30000 was refused: the robot allows 100 to 100000'
     )
     assert commands(bench) == []
     bench.robot.refuses.clear()
@@ -264,7 +264,7 @@ def test_a_parameter_that_does_not_stay_is_named():
     bench.robot.set = forgetful
     bench.run(3.0)
     assert bench.link.reason(bench.now_ns) == (
-        'parameter deceleration must be 30000: the robot keeps 4711'
+        'parameter deceleration must be 60000: the robot keeps 4711'
     )
     assert Phase.RUN not in bench.phases
 

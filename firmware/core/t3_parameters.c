@@ -11,8 +11,8 @@
 // longest TTL.
 static const struct t3_bounds BOUNDS[T3_PARAMETERS] = {
     [T3_MAX_SPEED] = {10000, 0, 19600, false, false},
-    [T3_ACCELERATION] = {15000, 100, 100000, false, false},
-    [T3_DECELERATION] = {30000, 100, 200000, false, false},
+    [T3_ACCELERATION] = {30000, 100, 100000, false, false},
+    [T3_DECELERATION] = {60000, 100, 200000, false, false},
     [T3_TTL_MAX] = {250, 20, 500, false, false},
     [T3_MICROSTEPS] = {16, 1, 256, false, true},
     [T3_STEPS_PER_REV] = {200, 200, 200, true, false},

@@ -337,8 +337,8 @@ class Parameter(NamedTuple):
 
 PARAMETERS = (
     Parameter('max_speed', 'mrad/s', 10000, 0, 19600, 'of a wheel; the faster one sets the scale'),
-    Parameter('acceleration', 'mrad/s2', 15000, 100, 100000, 'of the faster changing wheel'),
-    Parameter('deceleration', 'mrad/s2', 30000, 100, 200000, 'the same when it is to stand'),
+    Parameter('acceleration', 'mrad/s2', 30000, 100, 100000, 'of the faster changing wheel'),
+    Parameter('deceleration', 'mrad/s2', 60000, 100, 200000, 'the same when it is to stand'),
     Parameter('ttl_max', 'ms', 250, 20, 500, 'no command is followed longer than this'),
     Parameter('microsteps', '', 16, 1, 256, 'takes effect at the next start; only at rest'),
     Parameter('steps_per_rev', '', 200, 200, 200, 'full steps of the motor'),

@@ -29,10 +29,14 @@ class RobotParameters(Settings):
         source='10 000 microsteps a second at 16 microsteps are 19.6 rad/s',
     )
     acceleration: float = setting(
-        15.0, 'how fast the faster changing wheel may', unit='rad/s²', low=0.1, high=100.0
+        30.0, 'how fast the faster changing wheel may', unit='rad/s²', low=0.1, high=100.0
     )
     deceleration: float = setting(
-        30.0, 'the same when it is to stand', unit='rad/s²', low=0.1, high=200.0
+        60.0,
+        'the same when it is to stand: from 10 rad/s within 0.37 s of the last command',
+        unit='rad/s²',
+        low=0.1,
+        high=200.0,
     )
     ttl_max: float = setting(
         0.25, 'no command is followed for longer than this', unit='s', low=0.02, high=0.5
