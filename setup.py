@@ -51,6 +51,7 @@ setup(
             f'reference = {NAME}.nodes.start:reference',
             f'controller = {NAME}.nodes.start:controller',
             f'sim_robot = {NAME}.nodes.start:sim_robot',
+            f'radio_bridge = {NAME}.nodes.start:radio_bridge',
             f'recorder = {NAME}.nodes.start:recorder',
             f'all_in_one = {NAME}.nodes.start:all_in_one',
             f'lab = {NAME}.lab.program:main',

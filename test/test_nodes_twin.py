@@ -469,7 +469,7 @@ def launched(monkeypatch):
         file = runpy.run_path(str(ROOT / 'launch' / name))
         items = file['generate_launch_description']().arguments[0]
         defaults = {
-            item.arguments[0]: yaml.safe_load(item.named['default_value'])
+            item.arguments[0]: yaml.safe_load(item.named['default_value'] or '""')
             for item in items
             if type(item).__name__ == 'DeclareLaunchArgument'
         }
@@ -485,13 +485,15 @@ def launched(monkeypatch):
                 file, given = item.named['parameters']
                 assert Path(file).is_file()
                 values = {key: value(one) for key, one in given.items()}
-                found.append((value(item.named['namespace']), item.named['executable'], values))
+                found.append(
+                    (value(item.named.get('namespace', '')), item.named['executable'], values)
+                )
         return found
 
     return nodes
 
 
-@pytest.mark.parametrize('file', ['sim.launch.py', 'two_robots.launch.py'])
+@pytest.mark.parametrize('file', ['sim.launch.py', 'two_robots.launch.py', 'robot.launch.py'])
 def test_what_a_launch_file_says_fits_its_nodes(file, launched):
     for _, name, values in launched(file):
         given = {key: value for key, value in values.items() if key != 'use_sim_time'}

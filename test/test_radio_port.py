@@ -10,8 +10,8 @@ import tty
 
 import pytest
 
-from t3mpc_ros.radio import port as module
-from t3mpc_ros.radio.port import Port, PortError
+from t3mpc_ros.radio.host import port as module
+from t3mpc_ros.radio.host.port import Port, PortError
 
 
 @pytest.fixture

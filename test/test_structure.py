@@ -102,7 +102,7 @@ def test_imports_follow_the_rules_of_the_rooms(path):
 
 def test_only_the_port_of_the_radio_knows_pyserial():
     users = [path for path in SOURCES if 'serial' in _imports(path)]
-    assert users == [PACKAGE / 'radio' / 'port.py']
+    assert users == [PACKAGE / 'radio' / 'host' / 'port.py']
 
 
 def test_the_room_table_is_complete():

@@ -14,7 +14,8 @@ from t3mpc_ros.motion.words import NANOSECONDS
 from t3mpc_ros.nodes.plumbing import convert, graph, quality
 from t3mpc_ros.nodes.plumbing.package_node import ERROR, NO_TIME, OK, WARN, PackageNode
 from t3mpc_ros.nodes.robot.condition import complaints, measures
-from t3mpc_ros.nodes.robot.topics import RobotTopics
+from t3mpc_ros.nodes.robot.sensors import count_variance
+from t3mpc_ros.nodes.robot.topics import Facts, RobotTopics
 from t3mpc_ros.nodes.tables import SimRobotNodeSettings
 from t3mpc_ros.robot.backend import RobotCommand, RobotState
 from t3mpc_ros.robot.twin.robot import Inside, TwinRobot, make_robot
@@ -25,6 +26,16 @@ SHORTEST_TICK, LONGEST_TICK = 0.001, 0.05
 
 KEPT_UP = 0.9
 """Share of the asked-for speed from which on nobody needs to hear that it is not reached."""
+
+
+def _facts(settings: SimRobotNodeSettings) -> Facts:
+    """Return what the robot of these settings is like."""
+    rate, variance = settings.rate, settings.noise.variance
+    if settings.drive.kind != 'stepper':
+        return Facts(rate, settings.geometry, variance, None, settings.world_frame)
+    variance += count_variance(settings.motor.microstep, 1.0 / rate)
+    sensors = settings.imu, settings.sharp, settings.battery
+    return Facts(rate, settings.geometry, variance, sensors, settings.world_frame)
 
 
 class SimRobotNode(PackageNode[SimRobotNodeSettings]):
@@ -50,7 +61,7 @@ class SimRobotNode(PackageNode[SimRobotNodeSettings]):
         self._commands = self._refused = 0
         self._said = ''
         self._problem = ''
-        self._topics = RobotTopics(self, settings)
+        self._topics = RobotTopics(self, settings, _facts(settings))
         if settings.publish_clock:
             self._clock_topic = self.create_publisher(Clock, '/clock', quality.NEWEST)
         self._type = TwistStamped if settings.stamped else Twist
@@ -64,7 +75,7 @@ class SimRobotNode(PackageNode[SimRobotNodeSettings]):
     def configure(self, settings: SimRobotNodeSettings) -> None:
         """Hand live settings on to the robot."""
         self._robot.configure(settings)
-        self._topics.configure(settings)
+        self._topics.configure(settings, _facts(settings))
         if self._own_time is not None and settings.speed != self._own_time.speed:
             self._own_time.change_speed(settings.speed, self.steady_ns())
             self._factor.restart()

@@ -35,6 +35,11 @@ def sim_robot() -> int:
     return _main('sim_robot')
 
 
+def radio_bridge() -> int:
+    """Run the bridge to the real robot."""
+    return _main('radio_bridge')
+
+
 def recorder() -> int:
     """Run the MCAP recorder."""
     return _main('recorder')

@@ -8,6 +8,10 @@ from t3mpc_ros.chaos.reference import ReferenceSettings
 from t3mpc_ros.control.controller import ControllerSettings
 from t3mpc_ros.control.estimate import EstimateSettings
 from t3mpc_ros.motion import Geometry, Pose
+from t3mpc_ros.radio.host.robot import RadioRobotSettings
+from t3mpc_ros.robot.sensors.battery import BatterySettings
+from t3mpc_ros.robot.sensors.mpu6050 import ImuSettings
+from t3mpc_ros.robot.sensors.sharp import SharpSettings
 from t3mpc_ros.robot.twin.faults import active
 from t3mpc_ros.robot.twin.settings import TwinSettings
 from t3mpc_ros.settings import SettingError, Settings, nested, setting
@@ -54,13 +58,12 @@ class ControllerNodeSettings(ControllerSettings):
 
 
 @dataclass(frozen=True)
-class SimRobotNodeSettings(TwinSettings):
-    """The simulated robot as a node."""
+class RobotTopicSettings(Settings):
+    """Names, frames and rates of what every robot tells, simulated or real."""
 
     stamped: bool = setting(False, 'expect cmd_vel as TwistStamped instead of Twist')
     odom_frame: str = setting('odom', 'frame of the odometry')
     base_frame: str = setting('base_link', 'frame of the robot')
-    world_frame: str = setting('odom', 'frame of ground_truth/odom')
     imu_frame: str = setting('imu_link', 'frame of imu/data_raw')
     range_frame_prefix: str = setting(
         '', 'put in front of the frames of range/*, which are called <sensor>_range_link'
@@ -79,6 +82,14 @@ class SimRobotNodeSettings(TwinSettings):
         'take for a free view (clear_on_max_reading of the range sensor layer)',
         live=True,
     )
+    publish_tf: bool = setting(True, 'publish the transform, where tf2_ros is installed')
+
+
+@dataclass(frozen=True)
+class SimRobotNodeSettings(RobotTopicSettings, TwinSettings):
+    """The simulated robot as a node."""
+
+    world_frame: str = setting('odom', 'frame of ground_truth/odom')
     publish_clock: bool = setting(
         False, 'make the time, and publish it as /clock, instead of following the machine'
     )
@@ -99,7 +110,6 @@ class SimRobotNodeSettings(TwinSettings):
         high=0.5,
         live=True,
     )
-    publish_tf: bool = setting(True, 'publish the transform, where tf2_ros is installed')
     start_x: float = setting(
         0.0, 'where the robot stands at first, and ~/set_pose puts it', unit='m', live=True
     )
@@ -148,6 +158,23 @@ class SimRobotNodeSettings(TwinSettings):
 
 
 @dataclass(frozen=True)
+class RadioBridgeSettings(RobotTopicSettings, RadioRobotSettings):
+    """The real robot, over the radio, as a node."""
+
+    port: str = setting(
+        '/dev/t3mpc_dongle',
+        'serial port of the dongle; the udev rule of the package gives it this name, otherwise '
+        'one of /dev/serial/by-id',
+    )
+    key_file: str = setting(
+        '', 'file with the key of the robot (32 hexadecimal digits, yours alone); empty = open'
+    )
+    imu: ImuSettings = nested(ImuSettings)
+    sharp: SharpSettings = nested(SharpSettings)
+    battery: BatterySettings = nested(BatterySettings)
+
+
+@dataclass(frozen=True)
 class RecorderSettings(Settings):
     """The recorder as a node."""
 
@@ -190,6 +217,7 @@ TABLES: dict[str, type[Settings]] = {
     'reference': ReferenceNodeSettings,
     'controller': ControllerNodeSettings,
     'sim_robot': SimRobotNodeSettings,
+    'radio_bridge': RadioBridgeSettings,
     'recorder': RecorderSettings,
     'all_in_one': AllInOneSettings,
 }

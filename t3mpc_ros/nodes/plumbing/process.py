@@ -14,6 +14,7 @@ from rclpy.signals import SignalHandlerOptions
 import yaml
 
 from t3mpc_ros.nodes.plumbing.stop_request import StopRequest
+from t3mpc_ros.radio.authentication import KeyFileError
 from t3mpc_ros.record.model import ModelError
 from t3mpc_ros.record.schema import RecordError
 from t3mpc_ros.robot.arena.world import WorldError
@@ -35,6 +36,7 @@ UNUSABLE = (
     RecordError,
     WorldError,
     ScheduleError,
+    KeyFileError,
 )
 """What a node raises while it is made when it was given something it cannot use."""
 

@@ -3,19 +3,37 @@
 """The topics on which a robot tells its state."""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from sensor_msgs.msg import BatteryState, Imu, JointState, Range
 
+from t3mpc_ros.motion import Geometry
 from t3mpc_ros.nodes.plumbing import convert, quality
 from t3mpc_ros.nodes.robot import sensors
-from t3mpc_ros.nodes.tables import SimRobotNodeSettings
+from t3mpc_ros.nodes.tables import RobotTopicSettings
 from t3mpc_ros.robot.backend import RANGE_SENSORS, RobotState
+from t3mpc_ros.robot.sensors.battery import BatterySettings
+from t3mpc_ros.robot.sensors.mpu6050 import ImuSettings
+from t3mpc_ros.robot.sensors.sharp import SharpSettings
 
 BATTERY_RATE = 1.0
 """Hz"""
+
+
+class Facts(NamedTuple):
+    """What a robot is like, for whoever reads its topics."""
+
+    rate: float
+    """States per second."""
+    geometry: Geometry
+    variance: float
+    """Of a measured wheel speed, (rad/s)²."""
+    sensors: tuple[ImuSettings, SharpSettings, BatterySettings] | None = None
+    """None: it has none, but the wheels."""
+    truth_frame: str = ''
+    """Frame of ground_truth/odom; empty: nobody knows the truth."""
 
 
 class RobotTopics:
@@ -26,44 +44,46 @@ class RobotTopics:
     node
         Whose topics they are.
     settings
-        Rates, frames, and what the sensors are like.
+        Rates and frames.
+    facts
+        What the robot is like.
     """
 
-    def __init__(self, node: Node, settings: SimRobotNodeSettings) -> None:
+    def __init__(self, node: Node, settings: RobotTopicSettings, facts: Facts) -> None:
         self._node = node
         self._published = 0
         self._odometry = self._motion(settings.odom_frame, settings)
-        self._truth = self._motion(settings.world_frame, settings)
         self._odom = node.create_publisher(Odometry, 'odom', quality.STREAM)
-        self._true_odom = node.create_publisher(Odometry, 'ground_truth/odom', quality.STREAM)
+        if facts.truth_frame:
+            self._truth = self._motion(facts.truth_frame, settings)
+            self._true_odom = node.create_publisher(Odometry, 'ground_truth/odom', quality.STREAM)
         self._joints = node.create_publisher(JointState, 'joint_states', quality.SCALARS)
         self._broadcaster = self._transforms() if settings.publish_tf else None
-        self._has_sensors = settings.drive.kind == 'stepper'
-        if self._has_sensors:
+        self._has_sensors = facts.sensors is not None
+        if facts.sensors is not None:
+            imu, sharp, battery = facts.sensors
             self._imu = node.create_publisher(Imu, 'imu/data_raw', quality.STREAM)
             self._battery = node.create_publisher(BatteryState, 'battery_state', quality.SCALARS)
-            self._reading = sensors.battery_message(settings.battery)
+            self._reading = sensors.battery_message(battery)
             self._ranges = [
                 (
                     node.create_publisher(Range, f'range/{name}', quality.SCALARS),
                     sensors.range_message(
-                        settings.sharp, f'{settings.range_frame_prefix}{name}_range_link'
+                        sharp, f'{settings.range_frame_prefix}{name}_range_link'
                     ),
                 )
                 for name in (RANGE_SENSORS if settings.range_rate else ())
             ]
-        self.configure(settings)
+        self.configure(settings, facts)
 
-    def configure(self, settings: SimRobotNodeSettings) -> None:
+    def configure(self, settings: RobotTopicSettings, facts: Facts) -> None:
         """Take over settings, and work out how well what is told is known."""
-        self._settings = settings
-        variance = settings.noise.variance
-        if self._has_sensors:
-            variance += sensors.count_variance(settings.motor.microstep, 1.0 / settings.rate)
-            self._sample = sensors.imu_message(settings.imu, settings.imu_frame)
+        self._settings, self._rate = settings, facts.rate
+        if facts.sensors is not None:
+            self._sample = sensors.imu_message(facts.sensors[0], settings.imu_frame)
         self._twist_covariances = {
             misleading: sensors.twist_covariance(
-                settings.geometry, math.inf if misleading else variance
+                facts.geometry, math.inf if misleading else facts.variance
             )
             for misleading in (False, True)
         }
@@ -112,9 +132,9 @@ class RobotTopics:
 
     def _is_time_for(self, rate: float) -> bool:
         """Return whether something told ``rate`` times a second comes with this state."""
-        return rate > 0.0 and self._published % max(1, round(self._settings.rate / rate)) == 0
+        return rate > 0.0 and self._published % max(1, round(self._rate / rate)) == 0
 
-    def _motion(self, frame: str, settings: SimRobotNodeSettings) -> Odometry:
+    def _motion(self, frame: str, settings: RobotTopicSettings) -> Odometry:
         message = Odometry(child_frame_id=settings.base_frame)
         message.header.frame_id = frame
         return message

@@ -134,6 +134,11 @@ class Link:
         aux = self._statistics.robot
         return BatteryReading(aux.battery / 1000.0, math.nan, math.nan) if aux else None
 
+    @property
+    def robot_resets(self) -> int:
+        """How often the robot was seen to start anew."""
+        return self._statistics.robot_resets
+
     def answer(self, verb: int) -> str | None:
         """Return what became of the last request: None not known yet, empty done, or why not."""
         return self._orders.answers.get(verb)

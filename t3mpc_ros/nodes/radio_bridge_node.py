@@ -1,0 +1,247 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 run t3mpc_ros radio_bridge``: the real robot, over the radio, behind the robot's topics.
+
+The port has a thread of its own: an answer of the robot is read when it comes, whatever ROS does
+at that moment, and the next command goes out on time. Everything that decides is in
+:mod:`t3mpc_ros.radio.host.robot`; the thread only carries bytes.
+"""
+
+from collections.abc import Mapping
+import math
+import os
+from pathlib import Path
+import select
+import threading
+from typing import Any
+
+from geometry_msgs.msg import Twist, TwistStamped
+from std_srvs.srv import SetBool, Trigger
+
+from t3mpc_ros.motion.words import NANOSECONDS
+from t3mpc_ros.nodes.plumbing import convert, graph, quality
+from t3mpc_ros.nodes.plumbing.package_node import ERROR, OK, WARN, PackageNode
+from t3mpc_ros.nodes.robot.condition import complaints, measures
+from t3mpc_ros.nodes.robot.sensors import count_variance
+from t3mpc_ros.nodes.robot.topics import Facts, RobotTopics
+from t3mpc_ros.nodes.tables import RadioBridgeSettings
+from t3mpc_ros.radio.authentication import read_key
+from t3mpc_ros.radio.host.port import Port, PortError
+from t3mpc_ros.radio.host.robot import RadioRobot
+from t3mpc_ros.radio.link.telemetry import MICROSTEPS, STEPS_PER_REV
+from t3mpc_ros.radio.link.words import Close, Open, Phase, Wait, Write
+from t3mpc_ros.radio.statistics import Level, Quality
+from t3mpc_ros.robot.backend import RobotCommand, RobotState
+
+GOODBYE = 2.0
+"""s that the robot is given to come to rest, and its drives to be taken out, at the end."""
+
+
+class RadioBridgeNode(PackageNode[RadioBridgeSettings]):
+    """Carries commands to the robot and its measurements back, and says why it does not move."""
+
+    def __init__(self, **given: Any) -> None:
+        super().__init__('radio_bridge', RadioBridgeSettings, **given)
+        settings = self.settings
+        key = read_key(Path(settings.key_file)) if settings.key_file else b''
+        self._lock = threading.Lock()
+        self._robot = RadioRobot(settings, key)
+        self._port: Port | None = None
+        self._commands = self._refused = 0
+        self._problem = ''
+        self._said = 'starting'
+        self._topics = RobotTopics(self, settings, _facts(settings))
+        self._type = TwistStamped if settings.stamped else Twist
+        self.create_subscription(self._type, 'cmd_vel', self._on_command, quality.NEWEST)
+        self.create_service(Trigger, 'reset_odometry', self._on_reset_odometry)
+        self.create_service(SetBool, 'e_stop', self._on_e_stop)
+        self._waker, self._wake = os.pipe()
+        self._courier = threading.Thread(target=self._carry, name='radio', daemon=True)
+        self._courier.start()
+        if not key:
+            self.get_logger().warning('no key_file: anyone with such a radio can drive the robot')
+
+    def configure(self, settings: RadioBridgeSettings) -> None:
+        """Hand live settings on to the robot."""
+        with self._lock:
+            self._robot.configure(settings)
+        self._topics.configure(settings, _facts(settings))
+
+    # -- from ROS ---------------------------------------------------------------------------------
+
+    def _on_command(self, message: Twist | TwistStamped) -> None:
+        self._commands += 1
+        now_ns, steady_ns = self.now_ns(), self.steady_ns()
+        twist, stamp_ns = convert.command(message, now_ns)
+        # The link knows the steady clock only: what counts is how old the command is.
+        command = RobotCommand.from_twist(
+            twist, self.settings.geometry, steady_ns - (now_ns - stamp_ns)
+        )
+        with self._lock:
+            problem = self._robot.apply(command, steady_ns)
+        if problem:
+            self._refused += 1
+            if problem != self._problem:
+                self.get_logger().warning(f'cmd_vel refused: {problem}', throttle_duration_sec=1.0)
+        self._problem = problem
+
+    def _on_reset_odometry(
+        self, request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        with self._lock:
+            problem = self._robot.reset_odometry(self.steady_ns())
+        response.success = not problem
+        response.message = problem or 'odometry starts at the origin'
+        return response
+
+    def _on_e_stop(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        problem = ''
+        with self._lock:
+            if request.data:
+                self._robot.latch_estop('asked for by service e_stop', self.steady_ns())
+            else:
+                problem = self._robot.release_estop(self.steady_ns())
+        response.success = not problem
+        response.message = problem or ('latched' if request.data else 'released')
+        return response
+
+    # -- the port's thread ------------------------------------------------------------------------
+
+    def _carry(self) -> None:
+        try:
+            received = b''
+            while True:
+                with self._lock:
+                    deeds = self._robot.step(self.steady_ns(), received)
+                    states = self._robot.take_states()
+                    done = self._robot.link.phase is Phase.DONE
+                    reason = self._robot.reason(self.steady_ns())
+                self._say(reason)
+                until_ns = self.steady_ns()
+                for deed in deeds:
+                    if isinstance(deed, Wait):
+                        until_ns = deed.until_ns
+                    else:
+                        self._do(deed)
+                for state in states:
+                    self._tell(state)
+                if done:
+                    return
+                received = self._listen(until_ns)
+        except Exception as error:  # a dead thread must not look like a robot that stands
+            self.get_logger().error(f'the link has failed: {type(error).__name__}: {error}')
+            self.exit_code = 1
+        finally:
+            if self._port is not None:
+                self._port.close()
+
+    def _do(self, deed: Open | Write | Close) -> None:
+        try:
+            if isinstance(deed, Open):
+                self._port = Port(self.settings.port)
+                with self._lock:
+                    self._robot.link.opened(self.steady_ns())
+            elif isinstance(deed, Write) and self._port is not None:
+                self._port.write(deed.data)
+            elif isinstance(deed, Close) and self._port is not None:
+                self._port.close()
+                self._port = None
+        except PortError as error:
+            self._lose(error)
+
+    def _listen(self, until_ns: int) -> bytes:
+        """Return what arrives before the link wants to be asked again."""
+        wait = max(0.0, (until_ns - self.steady_ns()) / NANOSECONDS)
+        try:
+            sources = [self._waker] if self._port is None else [self._waker, self._port]
+            ready, _, _ = select.select(sources, [], [], min(wait, 0.5))
+            if self._waker in ready:
+                os.read(self._waker, 64)
+            return self._port.read() if self._port is not None and self._port in ready else b''
+        except PortError as error:
+            self._lose(error)
+            return b''
+
+    def _lose(self, error: PortError) -> None:
+        self._port = None
+        with self._lock:
+            self._robot.link.failed(str(error), error.absent, self.steady_ns())
+
+    def _tell(self, state: RobotState) -> None:
+        """Publish a state with stamps of ROS's clock instead of the link's."""
+        stamp_ns = state.stamp_ns + self.now_ns() - self.steady_ns()
+        motion = state.odometry._replace(stamp_ns=stamp_ns)
+        self._topics.publish(state._replace(stamp_ns=stamp_ns, odometry=motion))
+
+    def _say(self, reason: str) -> None:
+        if reason != self._said:
+            self._said = reason
+            self.get_logger().info(reason or 'following commands')
+
+    # -- how it is --------------------------------------------------------------------------------
+
+    def health(self) -> tuple[bytes, str, Mapping[str, object]]:
+        """Return whether the robot follows commands, how well the link works, and if not why."""
+        now_ns = self.steady_ns()
+        with self._lock:
+            state, link = self._robot.advance(now_ns), self._robot.link
+            well = self._robot.quality(now_ns)
+            phase, signed = link.phase, link.authenticated
+        values: dict[str, object] = {
+            'port': self.settings.port,
+            'link': phase.value,
+            'authenticated': signed,
+            'commands': self._commands,
+            'commands_refused': self._refused,
+            **_figures(well),
+            **measures(state, None),
+        }
+        if phase is not Phase.RUN or state.status.estop:
+            return ERROR, state.reason or phase.value, values
+        if well.level is Level.ERROR:
+            return ERROR, well.text, values
+        if other := graph.other_types(self, 'cmd_vel', self._type, subscribers=False):
+            return WARN, f'cmd_vel is published as {other} by another node: set stamped', values
+        found = [*complaints(state, None), *([well.text] if well.text else [])]
+        if found:
+            return WARN, '; '.join(found), values
+        open_link = '' if signed else ', unauthenticated'
+        return OK, f'following commands{open_link}', values
+
+    def finish(self) -> None:
+        """Stop the robot: standstill three times, then its drives are taken out."""
+        with self._lock:
+            self._robot.shut_down()
+        os.write(self._wake, b'.')
+        self._courier.join(GOODBYE)
+
+
+def _facts(settings: RadioBridgeSettings) -> Facts:
+    """Return what the robot of these settings is like."""
+    rate = settings.link.cycle_rate
+    variance = count_variance(math.tau / (STEPS_PER_REV * MICROSTEPS), 1.0 / rate)
+    sensors = settings.imu, settings.sharp, settings.battery
+    return Facts(rate, settings.geometry, variance, sensors)
+
+
+def _figures(well: Quality) -> Mapping[str, object]:
+    """Return the link in numbers."""
+    return {
+        'cycles': well.cycles,
+        'cycles_lost': well.lost,
+        'lost_share': well.lost_share,
+        'round_trip_median_ms': 1e3 * well.round_trip_median,
+        'round_trip_p99_ms': 1e3 * well.round_trip_p99,
+        'telemetry_age_s': well.age,
+        'robot_resets': well.robot_resets,
+        'dongle_resets': well.dongle_resets,
+        'sessions': well.sessions,
+        'port_failures': well.port_failures,
+        'crc_errors': well.host.crc_errors,
+        'frame_errors': well.host.frame_errors,
+    }
+
+
+def make() -> list[RadioBridgeNode]:
+    """Return the nodes of this process."""
+    return [RadioBridgeNode()]
