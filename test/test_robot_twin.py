@@ -304,6 +304,13 @@ def test_speeds_that_the_pulses_cannot_make_are_refused():
     settings(motor__microsteps=256, guard__wheel_speed=1.2)
 
 
+def test_odometry_must_know_how_late_the_gyro_is():
+    with pytest.raises(SettingError, match=r'odometry.gyro_delay must be about 0.041 s'):
+        settings(imu__low_pass='6')
+    settings(imu__low_pass='6', odometry__gyro_delay=0.041)
+    settings(imu__low_pass='6', odometry__use_gyro=False)
+
+
 def test_a_step_too_long_for_the_rotor_is_refused_with_the_longest():
     with pytest.raises(SettingError, match=r'substep must be at most 0\.0018 s'):
         settings(substep=0.002)

@@ -87,4 +87,10 @@ class TwinSettings(SimulatedRobotSettings):
                 f'{self.motor.step_rate:g} pulses a second with {self.motor.microsteps} '
                 f'microsteps: got {self.guard.wheel_speed:g}'
             )
+        delay, told = self.imu.delay, self.odometry.gyro_delay
+        if self.odometry.use_gyro and abs(told - delay) > 0.25 * delay:
+            raise SettingError(
+                f'odometry.gyro_delay must be about {delay:.2g} s with imu.low_pass '
+                f'{self.imu.low_pass}, or quick turns look like slip: got {told:g}'
+            )
         self.check_ramp()
