@@ -12,7 +12,8 @@ import time
 from t3mpc_ros.lab.processes import Fleet, ProcessError, private_graph
 from t3mpc_ros.lab.report import ReportFigures, write_report
 
-STARTED = ('recorder', 'controller', 'sim_robot', 'reference')
+BOARD = 'board_emulator'
+"""No node: it has no parameters, and says that it is ready in words of its own."""
 PAPER_NOISE = 0.04
 """Variance of the measured wheel speeds, (rad/s)², as in the paper's simulations."""
 ROBOTS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
@@ -21,11 +22,16 @@ ROBOTS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
         'sim_robot': {'drive.kind': 'velocity'},
         'controller': {'estimate.lag': 0.02},
     },
+    'emulator': {
+        'radio_bridge': {},
+        # Fifty measurements a second, and a command waits for the next cycle.
+        'controller': {'rate': 50.0, 'estimate.dead_time': 0.02},
+    },
 }
-"""Robots there are, and what each node is told of them: the digital twin, the paper's plant."""
+"""Robots there are, and what each node is told of them: the digital twin, the paper's plant, and
+the twin on a board of its own that is reached over a serial port and a radio."""
 FOLLOWS = 'tracking'
 """What the controller says when it follows the reference; finding each other takes seconds."""
-STOPPED = ('reference', 'controller', 'sim_robot', 'recorder')
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,17 +44,41 @@ class DemoOptions:
     seed: int | None = None
     robot: str = 'twin'
     """One of :data:`ROBOTS`."""
+    loss: float = 0.0
+    """Share of the radio packets that are lost each way; for the emulator only."""
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """The nodes, in the order in which they are started."""
+        robot = 'radio_bridge' if self.robot == 'emulator' else 'sim_robot'
+        return 'recorder', 'controller', robot, 'reference'
+
+    @property
+    def port(self) -> Path:
+        """Where the dongle of the emulator is plugged in."""
+        return self.output.resolve() / 'dongle'
 
     def parameters(self) -> dict[str, dict[str, object]]:
         """Return the parameters of each node."""
         given: dict[str, dict[str, object]] = {
-            name: dict(ROBOTS[self.robot].get(name, {})) for name in STARTED
+            name: dict(ROBOTS[self.robot].get(name, {})) for name in self.nodes
         }
-        given['sim_robot']['noise.variance'] = PAPER_NOISE
+        if self.robot == 'emulator':
+            given['radio_bridge']['port'] = str(self.port)
+        else:
+            given['sim_robot']['noise.variance'] = PAPER_NOISE
         if self.seed is not None:
             given['reference']['seed'] = self.seed
-            given['sim_robot']['seed'] = self.seed
+            if self.robot != 'emulator':
+                given['sim_robot']['seed'] = self.seed
         return given
+
+    def board(self) -> tuple[str, ...]:
+        """Return the command line of the emulated board; empty when there is none."""
+        if self.robot != 'emulator':
+            return ()
+        words = ['--link', str(self.port), '--loss', str(self.loss)]
+        return tuple(words if self.seed is None else [*words, '--seed', str(self.seed)])
 
 
 class Progress:
@@ -98,8 +128,14 @@ def run_demo(options: DemoOptions) -> ReportFigures:
     fleet = Fleet(options.output / 'log', private_graph())
     parameters = options.parameters()
     parameters['recorder']['folder'] = str(bag.resolve())
+    # The robot stops last but for the recorder, and its board after it.
+    stopped: tuple[str, ...] = ('reference', 'controller', options.nodes[2], 'recorder')
     try:
-        for name in STARTED:
+        if board := options.board():
+            fleet.start(BOARD, *board)
+            fleet.wait_for(BOARD, 'stop with Ctrl-C', 120.0)
+            stopped = (*stopped, BOARD)
+        for name in options.nodes:
             print(f'  starting {name}', file=sys.stderr, flush=True)
             fleet.start(name, parameters=parameters[name])
             fleet.wait_ready(name)
@@ -107,7 +143,7 @@ def run_demo(options: DemoOptions) -> ReportFigures:
         fleet.wait_for('controller', FOLLOWS)
         _watch(fleet, options)
     finally:
-        codes = fleet.stop_all(STOPPED)
+        codes = fleet.stop_all(stopped)
     if wrong := {name: code for name, code in codes.items() if code}:
         raise ProcessError(
             'not every node ended cleanly: '

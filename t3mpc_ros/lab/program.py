@@ -41,7 +41,14 @@ def _demo(options: argparse.Namespace) -> int:
 
     output = options.output or Path('runs') / f'{datetime.now():%Y%m%d-%H%M%S}'
     figures = run_demo(
-        DemoOptions(options.duration, output, options.headless, options.seed, options.robot)
+        DemoOptions(
+            options.duration,
+            output,
+            options.headless,
+            options.seed,
+            options.robot,
+            options.loss,
+        )
     )
     print(figures.summary())
     if not options.headless:
@@ -120,9 +127,16 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument('--seed', type=int, help='seed of reference and robot')
     demo.add_argument(
         '--robot',
-        choices=('twin', 'servo'),
+        choices=('twin', 'servo', 'emulator'),
         default='twin',
-        help="twin: the stepper robot with all its parts (default); servo: the paper's plant",
+        help="twin: the stepper robot with all its parts (default); servo: the paper's plant; "
+        'emulator: the twin on an emulated board, driven over a serial port and a radio',
+    )
+    demo.add_argument(
+        '--loss',
+        type=_share,
+        default=0.0,
+        help='share of radio packets lost each way, with --robot emulator (default 0)',
     )
     demo.set_defaults(run=_demo)
 
@@ -155,6 +169,13 @@ def _parser() -> argparse.ArgumentParser:
     warm = commands.add_parser('warm', help='compile every kernel into the cache')
     warm.set_defaults(run=_warm)
     return parser
+
+
+def _share(text: str) -> float:
+    value = float(text)
+    if not 0.0 <= value < 1.0:
+        raise argparse.ArgumentTypeError(f'must be from 0 to below 1: got {text}')
+    return value
 
 
 def _seconds(text: str) -> float:

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Signals as a flag; imports nothing slow, so that it can be in place before anything else."""
 
+import os
 import signal
 from types import FrameType
 
@@ -22,4 +23,6 @@ class StopRequest:
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self.wanted = True
         if self.starting:
-            raise SystemExit(0)
+            # Raised as an exception it would be lost, with a traceback, where Python happens to
+            # be in a __del__; and there is nothing to clean up.
+            os._exit(0)
