@@ -28,6 +28,10 @@ SHORTENED = {
         ['--duration', '5', '--headless', '--output', 'OUTPUT/servo'],
         False,
     ),
+    'scripts/demo --robot emulator --loss 0.1': (
+        ['--duration', '5', '--headless', '--output', 'OUTPUT/emulator'],
+        False,
+    ),
     'scripts/run controller --ros-args -p law.gain:=30.0': ([], True),
     'scripts/run all_in_one': (['--ros-args', '-p', 'folder:=OUTPUT/bag'], True),
     'scripts/run lab paper --quick': (['--seeds', '1', '--output', 'OUTPUT/paper'], False),

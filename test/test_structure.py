@@ -26,6 +26,7 @@ ROOMS = {
     'mpc': {'settings', 'kernels', 'motion'},
     'robot': {'settings', 'kernels', 'motion'},
     'radio': {'settings', 'kernels', 'motion', 'robot'},
+    'emulator': {'settings', 'kernels', 'motion', 'robot', 'radio'},
     'record': {'settings', 'motion'},
     'control': {'settings', 'kernels', 'motion', 'fuzzy', 'mpc'},
     'lab': {
@@ -157,6 +158,7 @@ def test_no_global_random_numbers_and_no_clock_outside_nodes():
         'lab/program.py',
         'lab/tuning/command.py',
         'lab/paper/program.py',
+        'emulator/serial_end.py',
     }
     for path in SOURCES:
         name = str(path.relative_to(PACKAGE))

@@ -1,0 +1,39 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+#
+# make avr        both boards' firmware, build/dongle.elf and build/robot.elf, and their sizes
+# make simavr     both in a simulator, with the world around them, as a library for ctypes
+
+AVR_OBJCOPY ?= avr-objcopy
+AVR_BOARD_FLAGS := $(AVR_FLAGS) -DF_CPU=16000000UL -Icore -Iavr -Wl,--gc-sections
+AVR_HEADERS := $(wildcard core/*.h avr/*.h)
+
+DONGLE_FILES := avr/dongle_main.c avr/reset.c avr/nrf24.c avr/serial.c avr/clock.c \
+                $(DONGLE_PARTS:%=core/t3_%.c)
+ROBOT_FILES := avr/robot_main.c avr/reset.c avr/nrf24.c avr/stepping.c avr/analog.c avr/imu.c \
+               avr/memory.c $(ROBOT_PARTS:%=core/t3_%.c)
+
+.PHONY: simavr
+
+avr: $(BUILD)/dongle.elf $(BUILD)/robot.elf $(BUILD)/dongle.hex $(BUILD)/robot.hex
+	$(AVR_SIZE) $(BUILD)/dongle.elf $(BUILD)/robot.elf
+
+$(BUILD)/dongle.elf: $(DONGLE_FILES) $(AVR_HEADERS)
+	@mkdir -p $(BUILD)
+	$(AVR_CC) -mmcu=$(DONGLE_MCU) $(AVR_BOARD_FLAGS) -o $@ $(DONGLE_FILES)
+
+$(BUILD)/robot.elf: $(ROBOT_FILES) $(AVR_HEADERS)
+	@mkdir -p $(BUILD)
+	$(AVR_CC) -mmcu=$(ROBOT_MCU) $(AVR_BOARD_FLAGS) -o $@ $(ROBOT_FILES)
+
+$(BUILD)/%.hex: $(BUILD)/%.elf
+	$(AVR_OBJCOPY) -O ihex -R .eeprom $< $@
+
+SIMAVR_FILES := $(sort $(wildcard simavr/*.c))
+
+simavr: $(BUILD)/libt3simavr.so
+
+$(BUILD)/libt3simavr.so: $(SIMAVR_FILES) $(wildcard simavr/*.h)
+	@mkdir -p $(BUILD)
+	$(CC) -std=gnu11 -O2 -Wall -Wextra -Werror -fPIC -shared -isystem /usr/include/simavr -o $@ \
+	    $(SIMAVR_FILES) -lsimavr -lelf

@@ -1,0 +1,37 @@
+// Copyright 2026 The t3mpc_ros developers
+// SPDX-License-Identifier: Apache-2.0
+#include "clock.h"
+
+#include <avr/interrupt.h>
+#include <avr/io.h>
+#include <util/atomic.h>
+
+// Timer 1 counts half microseconds and overflows every 32.768 ms; 17 bits of overflows make the
+// 32 bits of microseconds, so they need more than 16 bits of room.
+static volatile uint32_t overflows;
+
+ISR(TIMER1_OVF_vect)
+{
+    overflows++;
+}
+
+void clock_start(void)
+{
+    TCCR1B = _BV(CS11);
+    TIMSK1 = _BV(TOIE1);
+}
+
+uint32_t clock_us(void)
+{
+    uint32_t high = 0;
+    uint16_t low = 0;
+    ATOMIC_BLOCK(ATOMIC_RESTORESTATE)
+    {
+        high = overflows;
+        low = TCNT1;
+        // An overflow that waits, and was not just after the timer was read.
+        if ((TIFR1 & _BV(TOV1)) && low < 0x8000u)
+            high++;
+    }
+    return (high << 15) + (low >> 1);
+}

@@ -1,0 +1,186 @@
+// Copyright 2026 The t3mpc_ros developers
+// SPDX-License-Identifier: Apache-2.0
+#include "imu.h"
+
+#include <avr/interrupt.h>
+#include <avr/io.h>
+#include <util/delay.h>
+
+#include "board.h"
+
+#define ADDRESS 0x68u
+#define FIRST_REGISTER 0x3Bu
+#define SAMPLE_SIZE 14u
+
+#define PERIOD_US 2000u
+#define PATIENCE_US 3000u  // a transfer takes 0.4 ms
+#define RETRY_US 20000u
+
+// Status codes of the TWI.
+#define STARTED 0x08u
+#define STARTED_AGAIN 0x10u
+#define WRITE_HEARD 0x18u
+#define BYTE_HEARD 0x28u
+#define READ_HEARD 0x40u
+#define BYTE_CAME 0x50u
+#define LAST_BYTE_CAME 0x58u
+
+#define GO (_BV(TWINT) | _BV(TWEN) | _BV(TWIE))
+
+static const uint8_t SETTINGS[][2] = {
+    {0x6B, 0x01},  // awake, clocked by the gyro's PLL
+    {0x19, 0x04},  // 200 Hz
+    {0x1A, 0x03},  // 44 Hz low pass
+    {0x1B, 0x08},  // +-500 deg/s
+    {0x1C, 0x00},  // +-2 g
+};
+#define SETTINGS_COUNT ((uint8_t)(sizeof SETTINGS / sizeof SETTINGS[0]))
+
+static volatile enum { IDLE, BUSY, DONE, FAILED } transfer;
+static volatile uint8_t at;  // in the transfer
+static uint8_t reg, value;   // of it
+static bool reading;
+static volatile uint8_t bytes[SAMPLE_SIZE];
+
+static uint8_t settled;  // how many of SETTINGS are written
+static bool answers;
+static struct t3_imu newest;
+static uint32_t begun_us, wait_us;
+
+static void stop(uint8_t how)
+{
+    TWCR = _BV(TWINT) | _BV(TWEN) | _BV(TWSTO);
+    transfer = how;
+}
+
+static void send(uint8_t byte)
+{
+    TWDR = byte;
+    TWCR = GO;
+}
+
+static void receive(void)
+{
+    // The last byte is not acknowledged.
+    TWCR = at + 1u < SAMPLE_SIZE ? GO | _BV(TWEA) : GO;
+}
+
+ISR(TWI_vect)
+{
+    switch (TWSR & 0xF8u) {
+    case STARTED:
+        send(ADDRESS << 1);
+        break;
+    case WRITE_HEARD:
+        send(reg);
+        break;
+    case BYTE_HEARD:
+        if (reading)
+            TWCR = GO | _BV(TWSTA);
+        else if (at++ == 0)
+            send(value);
+        else
+            stop(DONE);
+        break;
+    case STARTED_AGAIN:
+        send(ADDRESS << 1 | 1u);
+        break;
+    case READ_HEARD:
+        receive();
+        break;
+    case BYTE_CAME:
+        bytes[at] = TWDR;
+        at++;
+        receive();
+        break;
+    case LAST_BYTE_CAME:
+        bytes[at] = TWDR;
+        stop(DONE);
+        break;
+    default:
+        stop(FAILED);
+    }
+}
+
+static void begin(uint32_t now_us)
+{
+    reading = settled == SETTINGS_COUNT;
+    reg = reading ? FIRST_REGISTER : SETTINGS[settled][0];
+    value = reading ? 0 : SETTINGS[settled][1];
+    at = 0;
+    begun_us = now_us;
+    transfer = BUSY;
+    TWCR = GO | _BV(TWSTA);
+}
+
+static int16_t number(uint8_t index)
+{
+    return (int16_t)((uint16_t)bytes[index] << 8 | bytes[index + 1u]);
+}
+
+static void take_sample(void)
+{
+    const struct t3_imu sample = {number(0), number(2), number(4), number(6),
+                                  number(8), number(10), number(12)};
+    newest = sample;
+    answers = true;
+}
+
+// A sensor that lost count in the middle of a byte holds the data line until it gets its clocks.
+static void free_the_bus(void)
+{
+    TWCR = 0;
+    for (uint8_t i = 0; i < 9 && !TWI_SDA_HIGH; i++) {
+        TWI_DDR |= _BV(TWI_SCL);
+        _delay_us(5);
+        TWI_DDR &= (uint8_t)~_BV(TWI_SCL);
+        _delay_us(5);
+    }
+}
+
+static void give_up(void)
+{
+    free_the_bus();
+    transfer = IDLE;
+    answers = false;
+    settled = 0;  // whoever comes back has forgotten its settings
+    wait_us = RETRY_US;
+}
+
+void imu_start(void)
+{
+    TWSR = 0;
+    TWBR = 12;  // 400 kHz
+    // The sensor's own pull-ups go to its 3.3 V, so the pins' stay off.
+}
+
+void imu_work(uint32_t now_us)
+{
+    const uint32_t elapsed_us = now_us - begun_us;
+    switch (transfer) {
+    case IDLE:
+        if (elapsed_us >= wait_us)
+            begin(now_us);
+        return;
+    case BUSY:
+        if (elapsed_us >= PATIENCE_US)
+            give_up();
+        return;
+    case FAILED:
+        give_up();
+        return;
+    case DONE:
+        transfer = IDLE;
+        wait_us = PERIOD_US;
+        if (reading)
+            take_sample();
+        else
+            settled++;
+    }
+}
+
+bool imu_sample(struct t3_imu *sample)
+{
+    *sample = newest;
+    return answers;
+}

@@ -1,0 +1,21 @@
+// Copyright 2026 The t3mpc_ros developers
+// SPDX-License-Identifier: Apache-2.0
+// MPU6050 (PS-MPU-6000A): +-500 deg/s, +-2 g, 44 Hz low pass, read every 2 ms by interrupts. It may
+// be absent, and come back.
+#ifndef IMU_H
+#define IMU_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "t3_port.h"
+
+void imu_start(void);
+
+// Take what is ready and begin the next transfer when it is time. Never waits.
+void imu_work(uint32_t now_us);
+
+// The newest sample; false while the sensor does not answer.
+bool imu_sample(struct t3_imu *sample);
+
+#endif

@@ -1,0 +1,17 @@
+// Copyright 2026 The t3mpc_ros developers
+// SPDX-License-Identifier: Apache-2.0
+// What the core stores, in the EEPROM: read from a copy, written back a byte at a time whenever
+// the EEPROM is ready, because a byte takes it 3.4 ms.
+#ifndef MEMORY_H
+#define MEMORY_H
+
+#include <stdint.h>
+
+void memory_start(void);
+void memory_read(uint8_t address, uint8_t *data, uint8_t size);
+void memory_write(uint8_t address, const uint8_t *data, uint8_t size);
+
+// Write the next byte that differs, if there is one. Never waits.
+void memory_work(void);
+
+#endif

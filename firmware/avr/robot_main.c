@@ -1,0 +1,256 @@
+// Copyright 2026 The t3mpc_ros developers
+// SPDX-License-Identifier: Apache-2.0
+// The robot: t3_robot.c between the radio chip, two stepper drivers and the sensors.
+#include <avr/interrupt.h>
+#include <avr/sleep.h>
+#include <avr/wdt.h>
+#include <string.h>
+#include <util/atomic.h>
+#include <util/delay.h>
+
+#include "analog.h"
+#include "board.h"
+#include "imu.h"
+#include "memory.h"
+#include "nrf24.h"
+#include "reset.h"
+#include "stepping.h"
+#include "t3_robot.h"
+
+// Nobody sends for so long: look whether the chip has lost its settings.
+#define RADIO_CHECK_US UINT32_C(500000)
+
+// The answer is sampled at once; then it waits for a quiet moment of the radio.
+#define SETTLE_US 0u
+// At 1 Mbit/s an acknowledgement of 32 bytes is over so long after its packet. When it was lost,
+// the dongle sends the packet again 500 us after it, and so on: each copy of n bytes ends
+// 573 + 8 n us after the one before. The robot sees only the first.
+#define ACK_US 462u
+#define COPY_US(n) (573u + 8u * (n))
+#define COPIES 4u
+#define WAIT_US 200u  // for this long the main loop stands still rather than miss the moment
+#define FLUSH_US 110u // what the flush takes, with the interrupts that may come meanwhile
+
+static const struct t3_radio_settings radio = T3_RADIO_DEFAULTS;
+static volatile bool heard;  // the radio's interrupt came
+static volatile uint32_t heard_us;
+static uint32_t checked_us;
+static bool waking;
+static uint8_t packet_size;  // of the last packet, and when it came
+static uint32_t packet_us;
+static uint8_t answer[T3_RADIO_LIMIT], answer_size;  // waits for its moment
+
+ISR(RADIO_IRQ_VECTOR)
+{
+    if (!heard)
+        heard_us = stepping_time_us();
+    heard = true;
+}
+
+// -- the core's port -----------------------------------------------------------------------------
+
+static uint32_t time_us(void *context)
+{
+    (void)context;
+    return stepping_time_us();
+}
+
+static void load_ack(void *context, const uint8_t *payload, uint8_t size)
+{
+    (void)context;
+    memcpy(answer, payload, size);
+    answer_size = size;
+}
+
+static void drivers(void *context, bool on)
+{
+    (void)context;
+    stepping_power(on);
+}
+
+static bool estop_pressed(void *context)
+{
+    (void)context;
+    return ESTOP_PRESSED;
+}
+
+static bool imu(void *context, struct t3_imu *sample)
+{
+    (void)context;
+    return imu_sample(sample);
+}
+
+static uint16_t adc(void *context, uint8_t channel)
+{
+    (void)context;
+    return analog_count(channel);
+}
+
+static void eeprom_read(void *context, uint8_t address, uint8_t *data, uint8_t size)
+{
+    (void)context;
+    memory_read(address, data, size);
+}
+
+static void eeprom_write(void *context, uint8_t address, const uint8_t *data, uint8_t size)
+{
+    (void)context;
+    memory_write(address, data, size);
+}
+
+static uint32_t noise(void *context)
+{
+    (void)context;
+    return analog_noise();
+}
+
+static void lock(void *context)
+{
+    (void)context;
+    stepping_lock();
+}
+
+static void unlock(void *context)
+{
+    (void)context;
+    stepping_unlock();
+}
+
+// -- radio ---------------------------------------------------------------------------------------
+
+static void configure_radio(uint32_t now_us)
+{
+    nrf24_configure(&radio, NRF24_ROBOT, &waking);
+    if (!waking)
+        nrf24_listen();
+    checked_us = now_us;
+}
+
+static void receive(void)
+{
+    uint32_t at_us = stepping_time_us();
+    ATOMIC_BLOCK(ATOMIC_RESTORESTATE)
+    {
+        if (heard)
+            at_us = heard_us;
+        heard = false;
+    }
+    // Flags first: a packet that comes while the FIFO is read raises them again.
+    nrf24_take_flags();
+    uint8_t payload[T3_RADIO_LIMIT];
+    for (uint8_t i = 0; i < NRF24_DEPTH; i++) {
+        const uint8_t size = nrf24_read(payload);
+        if (!size)
+            return;
+        answer_size = 0;  // the packet asks for a newer one
+        packet_size = size;
+        packet_us = checked_us = at_us;
+        t3_robot_packet(&robot, payload, size, at_us);
+    }
+}
+
+// Return how long the last packet, or the copy of it that may have come since, is past.
+static uint16_t since_copy_us(uint16_t copy_us)
+{
+    uint32_t since_us = stepping_time_us() - packet_us;
+    for (uint8_t i = 0; i < COPIES && since_us > copy_us; i++)
+        since_us -= copy_us;
+    return since_us < UINT16_MAX ? (uint16_t)since_us : UINT16_MAX;
+}
+
+// Return whether no acknowledgement is on the air that takes its bytes from what is loaded.
+static bool is_quiet(void)
+{
+    const uint16_t copy_us = (uint16_t)COPY_US(packet_size);
+    uint16_t since_us = since_copy_us(copy_us);
+    while (since_us >= ACK_US - WAIT_US && since_us < ACK_US)
+        since_us = since_copy_us(copy_us);
+    return since_us > copy_us || (since_us >= ACK_US && since_us + FLUSH_US <= copy_us);
+}
+
+static void load_answer(void)
+{
+    if (!answer_size || !is_quiet())
+        return;
+    nrf24_answer(answer, answer_size);
+    answer_size = 0;
+}
+
+static void watch_radio(void)
+{
+    // The pin too: an edge that was missed must not silence the robot for ever.
+    if (heard || !RADIO_IRQ_HIGH)
+        receive();
+    const uint32_t now_us = stepping_time_us();
+    const uint32_t since_us = now_us - checked_us;
+    if (waking && since_us >= NRF24_WAKE_US) {
+        waking = false;
+        nrf24_listen();
+    } else if (since_us >= RADIO_CHECK_US) {
+        checked_us = now_us;
+        if (!nrf24_holds(&radio, NRF24_ROBOT))
+            configure_radio(now_us);
+    }
+}
+
+// -- main ----------------------------------------------------------------------------------------
+
+// Any interrupt is reason enough to go round while an answer has to be made or loaded in time.
+static bool hurries(void)
+{
+    return robot.answer_waits || answer_size;
+}
+
+// Return whether it is time for more than the radio.
+static bool sleep_until_due(void)
+{
+    for (bool slept = false;; slept = true) {
+        cli();
+        const bool due = stepping_due();
+        if (due || heard || (slept && hurries())) {
+            sei();
+            return due;
+        }
+        sleep_enable();
+        sei();  // the next instruction is executed before any interrupt: none is slept through
+        sleep_cpu();
+        sleep_disable();
+    }
+}
+
+int main(void)
+{
+    static const struct t3_port port = {
+        0,   time_us,     load_ack,     drivers, estop_pressed, imu,
+        adc, eeprom_read, eeprom_write, noise,   lock,          unlock,
+    };
+    stepping_pins();
+    wdt_enable(WDTO_120MS);
+    memory_start();
+    nrf24_start();
+    analog_start();
+    imu_start();
+    // The radio needs this after power; the converter gathers its first counts, and noise.
+    for (uint16_t waits = 0; waits < NRF24_POWER_ON_MS * 10u; waits++) {
+        wdt_reset();
+        analog_work();
+        _delay_us(100);
+    }
+    t3_robot_boot(&robot, &port, reset_cause, SETTLE_US);
+    stepping_start();
+    sei();
+    configure_radio(stepping_time_us());
+    for (;;) {
+        const bool due = sleep_until_due();
+        watch_radio();
+        load_answer();
+        if (due || robot.answer_waits)
+            t3_robot_tick(&robot);
+        if (!due)
+            continue;
+        wdt_reset();
+        analog_work();
+        memory_work();
+        imu_work(stepping_time_us());
+    }
+}

@@ -1,0 +1,90 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""What the board answers: the frames it loads for the next packet to fetch."""
+
+from typing import NamedTuple
+
+from t3mpc_ros.emulator.board.hardware import Registers
+from t3mpc_ros.emulator.board.parameters import Parameters
+from t3mpc_ros.radio.frames import PARAMETERS, Aux, Param, State, Status, Uplink
+
+_COUNTERS = (
+    'received',
+    'duplicates',
+    'bad_session',
+    'stale',
+    'expired',
+    'bad_version',
+    'short',
+)
+
+
+class Answer(NamedTuple):
+    """What is loaded next, and for which request."""
+
+    kind: type[Uplink] = State
+    seq: int = 0
+    id: int = 0
+    rc: int = 0
+
+
+class Counters:
+    """What the board counts, modulo 2**16."""
+
+    def __init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """Start at zero."""
+        self._counts = dict.fromkeys(_COUNTERS, 0)
+
+    def __getitem__(self, name: str) -> int:
+        return self._counts[name]
+
+    def add(self, name: str) -> None:
+        """Count one more of what has a field of that name in AUX."""
+        self._counts[name] = self._counts[name] + 1 & 0xFFFF
+
+
+def tell_parameter(session: int, answer: Answer, values: Parameters) -> Param:
+    """Return the PARAM for a request; zeros of a parameter that does not exist."""
+    if answer.id >= len(PARAMETERS):
+        return Param(session, answer.seq, answer.id, answer.rc, 0, 0, 0)
+    row = PARAMETERS[answer.id]
+    value = values[answer.id]
+    return Param(session, answer.seq, answer.id, answer.rc, value, row.low, row.high)
+
+
+def tell_aux(
+    session: int,
+    seq: int,
+    status: Status,
+    battery: int,
+    sample: Registers,
+    counts: Counters,
+    time_us: int,
+) -> Aux:
+    """Return the AUX of this instant; battery in mV."""
+    return Aux(
+        session,
+        seq,
+        status,
+        battery,
+        sample.temperature,
+        sample.accel_z,
+        sample.gyro_x,
+        sample.gyro_y,
+        counts['received'],
+        counts['duplicates'],
+        counts['bad_session'],
+        counts['stale'],
+        counts['expired'],
+        time_us,
+        counts['bad_version'],
+        counts['short'],
+    )
+
+
+def signed(counter: int) -> int:
+    """Return a counter as it wraps in 32 bits."""
+    return (counter + (1 << 31)) % (1 << 32) - (1 << 31)

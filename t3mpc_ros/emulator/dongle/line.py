@@ -1,0 +1,100 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""One direction of the serial line: its pace, and what goes wrong on it."""
+
+from collections.abc import Callable
+
+from t3mpc_ros.emulator.agenda import Agenda
+from t3mpc_ros.emulator.faults import Faults
+from t3mpc_ros.motion.words import NANOSECONDS
+
+BYTE_NS = 20_000
+"""Ten bits at 500 000 baud."""
+_SPLIT_NS = 2_000_000
+
+
+class Line:
+    """Brings pieces of data to the other end: in order, at the pace of the line.
+
+    A piece arrives as a whole when its last byte does.
+
+    Parameters
+    ----------
+    agenda
+        Where arrivals are noted.
+    faults
+        Of the line.
+    arrive
+        Takes each piece at its time.
+    """
+
+    def __init__(self, agenda: Agenda, faults: Faults, arrive: Callable[[bytes], None]) -> None:
+        self._agenda = agenda
+        self._faults = faults
+        self._arrive = arrive
+        self._busy_ns = 0
+        """Until when there are bytes on the line."""
+        self._held = b''
+        self._generation = 0
+
+    def clear(self) -> None:
+        """Lose what is on its way."""
+        self._generation += 1
+        self._held = b''
+        self._busy_ns = 0
+
+    def send(self, data: bytes) -> None:
+        """Put a piece of data on the line now."""
+        faults = self._faults
+        data = self._damaged(data)
+        if not data or faults.active('silence'):
+            return
+        if self._held:
+            data, self._held = data + self._held, b''
+        elif faults.strikes('reorder'):
+            self._held = data
+            return
+        if len(data) > 1 and faults.strikes('split'):
+            at = faults.dice['split'].randrange(1, len(data))
+            self._put(data[:at], 0)
+            self._put(data[at:], _SPLIT_NS)
+        else:
+            self._put(data, 0)
+
+    def _put(self, data: bytes, later_ns: int) -> None:
+        now = self._agenda.now_ns
+        start = now + later_ns + round(self._faults.value('delay') * NANOSECONDS)
+        stall = self._faults.span('stall')
+        if stall is not None:
+            start = max(start, round(min(stall.end_ns, now + 1e15)))
+        end = max(start, self._busy_ns) + BYTE_NS * len(data)
+        self._busy_ns = end
+        generation = self._generation
+
+        def arrive() -> None:
+            if generation == self._generation:
+                self._arrive(data)
+
+        self._agenda.at(end, arrive)
+
+    def _damaged(self, data: bytes) -> bytes:
+        faults = self._faults
+        shares = {
+            name: share
+            for name in ('drop_bytes', 'flip_bits', 'duplicate_bytes', 'insert_bytes')
+            if (share := faults.value(name)) > 0.0
+        }
+        if not shares:
+            return data
+        damaged = bytearray()
+        for value in data:
+            byte = value
+            if faults.strikes('insert_bytes'):
+                damaged.append(faults.dice['insert_bytes'].randrange(256))
+            if faults.strikes('flip_bits'):
+                byte ^= 1 << faults.dice['flip_bits'].randrange(8)
+            if not faults.strikes('drop_bytes'):
+                damaged.append(byte)
+            if faults.strikes('duplicate_bytes'):
+                damaged.append(byte)
+        return bytes(damaged)

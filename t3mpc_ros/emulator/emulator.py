@@ -1,0 +1,254 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Dongle and robot in one piece: bytes with their time of arrival in, bytes with theirs out."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import math
+import random
+
+from t3mpc_ros.emulator.agenda import MICROSECOND, Agenda
+from t3mpc_ros.emulator.board import Board
+from t3mpc_ros.emulator.dongle.ether import Ether, RadioSettings
+from t3mpc_ros.emulator.dongle.firmware import Dongle
+from t3mpc_ros.emulator.dongle.line import Line
+from t3mpc_ros.emulator.faults import Fault, Faults
+from t3mpc_ros.emulator.plant import Plant
+from t3mpc_ros.motion.words import NANOSECONDS
+from t3mpc_ros.robot.twin.settings import TwinSettings
+from t3mpc_ros.settings import SettingError, Settings, nested, setting
+
+_POWER_ON, _EXTERNAL, _BROWN_OUT = 1, 2, 4
+"""Causes of a reset, as the MCUSR of an AVR has them."""
+
+
+@dataclass(frozen=True)
+class EmulatorSettings(Settings):
+    """What can be set of dongle, radio and robot."""
+
+    twin: TwinSettings = nested(TwinSettings)
+    robot_clock: float = setting(
+        0.0,
+        "by how much the robot's clock is fast; the resonator of a small board may be off by this",
+        low=-0.02,
+        high=0.02,
+        source='ceramic resonators: 0.5 %',
+    )
+    dongle_start: float = setting(
+        1.5, 'how long the boot loader of the dongle takes', unit='s', low=0.0, high=10.0
+    )
+    channel: int = setting(82, 'of the robot: 2400 MHz plus this', unit='MHz', low=0, high=125)
+
+    def check_together(self) -> None:
+        """Raise SettingError when the robot would not be the one the board is made for."""
+        twin = self.twin
+        if twin.drive.kind != 'stepper':
+            raise SettingError(f'twin.drive.kind must be stepper: got {twin.drive.kind}')
+        if twin.motor.microsteps != 16 or twin.motor.full_steps != 200:
+            raise SettingError(
+                'twin.motor must have 16 microsteps and 200 full steps, which is what the board '
+                f'starts with: got {twin.motor.microsteps} and {twin.motor.full_steps}'
+            )
+
+
+class Emulator:
+    """A dongle on a serial line, and a robot that hears it, in virtual time.
+
+    Parameters
+    ----------
+    settings
+        Fixed for its life.
+    key
+        Of the robot, 16 bytes; empty for an open link.
+    seed
+        Of all dice but those of the twin.
+    now_ns
+        The start: both boards are ready, the robot stands.
+    """
+
+    def __init__(
+        self,
+        settings: EmulatorSettings,
+        key: bytes = b'',
+        seed: int = 1,
+        now_ns: int = 0,
+    ) -> None:
+        self._settings = settings
+        self._start_ns = now_ns
+        self._agenda = Agenda(now_ns)
+        self.faults = Faults(lambda: self._agenda.now_ns, seed)
+        self._rate = 1.0 + settings.robot_clock
+        self.plant = Plant(settings.twin, self._rate)
+        nonces = random.Random(f'nonces {seed}')
+        self._ether = Ether(
+            self._agenda,
+            RadioSettings(channel=settings.channel),
+            self._wake_robot,
+            lambda payload: self.board.packet(payload),
+            self.faults,
+            random.Random(f'air {seed}'),
+        )
+        self.board = Board(self.plant, key, nonces.randbytes, self._ether.load)
+        self._boot_ns = now_ns
+        self._away = False
+        """The robot has no power."""
+        self.dongle = Dongle(
+            self._agenda, self._ether, self._chip_ok, lambda data: self._to_host.send(data)
+        )
+        self._from_host = Line(self._agenda, self.faults, self.dongle.feed)
+        self._to_host = Line(self._agenda, self.faults, self._arrive)
+        self._arrived: list[tuple[int, bytes]] = []
+        self.port_open = True
+        """Whether there is a dongle to open."""
+        self.port_name = 0
+        """Counts up when the device comes back under another name."""
+
+    @property
+    def now_ns(self) -> int:
+        """Up to when everything has happened."""
+        return self._agenda.now_ns
+
+    @property
+    def next_ns(self) -> int | None:
+        """When something happens next; None: nothing will."""
+        return self._agenda.next_ns
+
+    @property
+    def powered(self) -> bool:
+        """Whether the robot is on."""
+        return not self._away
+
+    # -- the line ---------------------------------------------------------------------------------
+
+    def feed(self, data: bytes, now_ns: int) -> None:
+        """Take what the host writes at this time."""
+        self._agenda.run_to(now_ns)
+        if self.port_open:
+            self._from_host.send(data)
+
+    def run_to(self, now_ns: int) -> list[tuple[int, bytes]]:
+        """Return what has come to the host by then, each piece with its time of arrival."""
+        self._agenda.run_to(now_ns)
+        self._wake_robot()
+        arrived, self._arrived = self._arrived, []
+        return arrived
+
+    def _arrive(self, data: bytes) -> None:
+        if self.port_open:
+            self._arrived.append((self._agenda.now_ns, data))
+
+    # -- what goes wrong --------------------------------------------------------------------------
+
+    def play(self, fault: Fault) -> None:
+        """Let a fault happen; its time counts from the start of the emulator.
+
+        Raises
+        ------
+        FaultError
+            There is no such fault, or a number is out of range.
+        """
+        self._play(fault, self._start_ns)
+
+    def inject(self, name: str, duration: float = math.nan, value: float = math.nan) -> None:
+        """Let a fault begin now."""
+        self._play(Fault(name, 0.0, duration, value), self._agenda.now_ns)
+        self._agenda.run_to(self._agenda.now_ns)
+
+    def end(self, name: str) -> None:
+        """End a fault now, however long it was meant to last."""
+        self.faults.clear(name)
+        self._effects(name)[1]()
+
+    def _play(self, fault: Fault, start_ns: int) -> None:
+        span = self.faults.add(fault, start_ns)
+        begins, ends = self._effects(fault.name)
+        self._agenda.at(span.start_ns, begins)
+        if math.isfinite(span.end_ns):
+            self._agenda.at(round(span.end_ns), ends)
+
+    def _effects(self, name: str) -> tuple[Callable[[], None], Callable[[], None]]:
+        """Return what the begin and the end of a fault do at once."""
+        effects = {
+            'robot_reset': (self._cut_power, lambda: self._boot_robot(_EXTERNAL)),
+            'imu_absent': (lambda: self._imu(True), lambda: self._imu(False)),
+            'button': (lambda: self._press(True), lambda: self._press(False)),
+            'dongle_reset': (self.restart_dongle, _nothing),
+            'close_port': (self._pull_out, self._plug_in),
+            'move_link': (self._move_link, _nothing),
+        }
+        return effects.get(name, (_nothing, _nothing))
+
+    def restart_dongle(self) -> None:
+        """Start the dongle anew, as opening its port does to many boards."""
+        self._from_host.clear()
+        self._to_host.clear()
+        self.dongle.boot(_EXTERNAL, round(self._settings.dongle_start * NANOSECONDS))
+
+    def _pull_out(self) -> None:
+        self.port_open = False
+        self._arrived.clear()
+        self.restart_dongle()
+
+    def _plug_in(self) -> None:
+        self.port_open = True
+        self.restart_dongle()
+
+    def _move_link(self) -> None:
+        self.port_name += 1
+        self.restart_dongle()
+
+    def _imu(self, absent: bool) -> None:
+        self._wake_robot()
+        self.plant.imu_absent = absent
+
+    def _press(self, pressed: bool) -> None:
+        self._wake_robot()
+        self.board.press(pressed)
+
+    def _chip_ok(self) -> bool:
+        return not self.faults.active('radio_dead')
+
+    # -- the robot --------------------------------------------------------------------------------
+
+    def _wake_robot(self) -> bool:
+        """Bring the robot to this instant; return whether it listens."""
+        elapsed = self._agenda.now_ns - self._boot_ns
+        time_us = int(elapsed * self._rate) // MICROSECOND
+        if self._away:
+            self.plant.run(time_us)
+            self._boot_ns = self._agenda.now_ns
+            return False
+        self.board.run_to(time_us)
+        if self.plant.collapsed:
+            self._lose_power()
+            away = round(self._settings.twin.boot_time * NANOSECONDS)
+            self._agenda.at(self._agenda.now_ns + away, lambda: self._boot_robot(_BROWN_OUT))
+            return False
+        return True
+
+    def _cut_power(self) -> None:
+        self._wake_robot()
+        self._lose_power()
+
+    def _lose_power(self) -> None:
+        self._away = True
+        self._boot_ns = self._agenda.now_ns
+        self._ether.clear()
+        self.plant.turn(0, 0)
+        self.plant.power(False)
+
+    def _boot_robot(self, cause: int) -> None:
+        if not self._away:
+            return
+        self._wake_robot()
+        if self.plant.collapsed:
+            again = self._agenda.now_ns + round(self._settings.twin.boot_time * NANOSECONDS)
+            self._agenda.at(again, lambda: self._boot_robot(cause))
+            return
+        self._away = False
+        self._boot_ns = self._agenda.now_ns
+        self.board.boot(cause)
+
+
+def _nothing() -> None:
+    """Do nothing: most faults are looked up when they matter."""

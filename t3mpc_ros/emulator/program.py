@@ -1,0 +1,158 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``board_emulator``: dongle and robot behind a serial port, as a command-line program."""
+
+import argparse
+from collections.abc import Sequence
+import math
+import os
+from pathlib import Path
+import signal
+import sys
+from types import FrameType
+from typing import Self
+
+from t3mpc_ros.emulator.emulator import Emulator, EmulatorSettings
+from t3mpc_ros.emulator.faults import KINDS, Fault, FaultError, parse_fault
+from t3mpc_ros.emulator.serial_end import LinkError, PseudoPort, serve
+from t3mpc_ros.radio.authentication import KeyFileError, read_key
+from t3mpc_ros.robot.arena.world import WorldError
+from t3mpc_ros.settings import SettingError
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the emulator until it is told to stop; return the exit code."""
+    options = _parser().parse_args(arguments)
+    try:
+        key = read_key(options.key) if options.key is not None else b''
+        emulator = Emulator(_settings(options), key, options.seed)
+        if options.loss:
+            emulator.play(Fault('loss', 0.0, math.inf, options.loss))
+        for text in options.fault:
+            emulator.play(parse_fault(text))
+    except (FaultError, KeyFileError, SettingError, WorldError) as error:
+        print(f'board_emulator: {error}', file=sys.stderr)
+        return 2
+    with _Stop() as stop:
+        print('board_emulator: getting ready', flush=True)
+        emulator.plant.warm_up()
+        try:
+            port = PseudoPort(options.link)
+        except LinkError as error:
+            print(f'board_emulator: {error}', file=sys.stderr)
+            return 2
+        try:
+            secured = 'signed commands only' if key else 'no key'
+            print(
+                f'board_emulator: dongle and robot at {options.link.absolute()} ({secured}); '
+                f'stop with Ctrl-C or kill {os.getpid()}',
+                flush=True,
+            )
+            serve(emulator, port, options.speed, stop, options.restart_on_open)
+        finally:
+            port.close()
+    print('board_emulator: stopped', flush=True)
+    return 0
+
+
+class _Stop:
+    """Becomes true when the process is asked to end."""
+
+    def __init__(self) -> None:
+        self._asked = False
+
+    def __call__(self) -> bool:
+        return self._asked
+
+    def __enter__(self) -> Self:
+        self._before = [signal.signal(number, self._take) for number in _SIGNALS]
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for number, handler in zip(_SIGNALS, self._before, strict=True):
+            signal.signal(number, handler)
+
+    def _take(self, number: int, frame: FrameType | None) -> None:
+        self._asked = True
+
+
+def _settings(options: argparse.Namespace) -> EmulatorSettings:
+    flat: dict[str, object] = {'twin.world': options.world, 'twin.seed': options.seed}
+    for text in options.set:
+        name, equals, value = text.partition('=')
+        if not equals:
+            raise SettingError(f'--set must be NAME=VALUE: got {text}')
+        flat[name] = _value(value)
+    return EmulatorSettings.from_flat(flat)
+
+
+def _value(text: str) -> object:
+    """Return the number or truth that a text stands for, else the text."""
+    if text in ('true', 'false'):
+        return text == 'true'
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            pass
+    return text
+
+
+def _share(text: str) -> float:
+    value = float(text)
+    if not 0.0 <= value <= 1.0:
+        raise argparse.ArgumentTypeError(f'must be from 0 to 1: got {text}')
+    return value
+
+
+def _speed(text: str) -> float:
+    value = float(text)
+    if not 0.01 <= value <= 100.0:
+        raise argparse.ArgumentTypeError(f'must be from 0.01 to 100: got {text}')
+    return value
+
+
+def _parser() -> argparse.ArgumentParser:
+    faults = '\n'.join(
+        f'  {kind.name:<16} {kind.text}' + ('' if math.isnan(kind.value) else f' ({kind.value:g})')
+        for kind in KINDS
+    )
+    parser = argparse.ArgumentParser(
+        prog='board_emulator',
+        description='Dongle and robot behind a serial port, for the radio bridge to drive.',
+        epilog=f'faults, with the value that is meant when none is given:\n{faults}',
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add('--link', type=Path, required=True, help='path of the port: a symbolic link is put there')
+    add('--world', default='', help='world to drive in; empty: an endless plain')
+    add('--loss', type=_share, default=0.0, help='share of lost packets, each way')
+    add(
+        '--fault',
+        action='append',
+        default=[],
+        metavar='NAME:AT[:FOR[:VALUE]]',
+        help='what goes wrong when (s), for how long (s); more than once',
+    )
+    add('--key', type=Path, help='file with the key of the robot; without: an open link')
+    add('--seed', type=int, default=1, help='of everything that is drawn')
+    add('--speed', type=_speed, default=1.0, help='seconds of the robot in a second')
+    add(
+        '--restart-on-open',
+        action='store_true',
+        help='opening the port restarts the dongle, as it does with many boards',
+    )
+    add(
+        '--set',
+        action='append',
+        default=[],
+        metavar='NAME=VALUE',
+        help='a setting, twin.load_change or robot_clock say; more than once',
+    )
+    return parser
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,159 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The emulator behind a pseudo terminal that looks like the dongle's port; reads the clock.
+
+A path that stays the same leads to it, as those below /dev/serial/by-id do.
+"""
+
+from collections.abc import Callable
+from contextlib import suppress
+import errno
+import os
+from pathlib import Path
+import pty
+import select
+import time
+import tty
+
+from t3mpc_ros.emulator.emulator import Emulator
+from t3mpc_ros.motion.words import NANOSECONDS
+
+_LOOK_NS = NANOSECONDS // 50
+"""Longest time between two looks at the emulator, and for a client where there is none."""
+_LONGEST_SLEEP = 0.1
+"""s: after a longer sleep of this process its time is not made up for."""
+
+
+class LinkError(Exception):
+    """The path cannot lead to the emulator; the text says why and what to do."""
+
+
+class PseudoPort:
+    """A pseudo terminal and the symbolic link that leads to it.
+
+    Parameters
+    ----------
+    link
+        Where clients look for the port; a symbolic link that is there already is replaced.
+
+    Raises
+    ------
+    LinkError
+        Something else is there, or the folder cannot be written to.
+    """
+
+    def __init__(self, link: Path) -> None:
+        self._link = link
+        self._master: int | None = None
+        self._target = ''
+        self.open()
+
+    def open(self) -> None:
+        """Make a new terminal, and let the path lead to it; the old one hangs up afterwards."""
+        before = self._master
+        self._master, slave = pty.openpty()
+        try:
+            # Before anybody can open it: a cooked terminal would echo what the host writes.
+            tty.setraw(slave)
+            self._target = os.ttyname(slave)
+        finally:
+            # While we held it open, we could not see a client leave.
+            os.close(slave)
+        os.set_blocking(self._master, False)
+        self._publish()
+        if before is not None:
+            os.close(before)
+
+    def close(self) -> None:
+        """Hang up, and take the path away if it still leads here."""
+        with suppress(OSError):
+            if os.readlink(self._link) == self._target:
+                self._link.unlink()
+        if self._master is not None:
+            os.close(self._master)
+            self._master = None
+
+    def wait(self, seconds: float) -> bytes | None:
+        """Return what the client has written, at the latest after so long; None: there is none."""
+        if self._master is None:
+            time.sleep(seconds)
+            return None
+        select.select([self._master], [], [], max(seconds, 0.0))
+        try:
+            return os.read(self._master, 4096)
+        except BlockingIOError:
+            return b''
+        except OSError as error:
+            if error.errno != errno.EIO:
+                raise
+            # Nobody has the other end open: the terminal is readable all the time.
+            time.sleep(max(seconds, 0.0))
+            return None
+
+    def write(self, data: bytes) -> None:
+        """Send to the client; what it does not read in time is lost, as on a serial line."""
+        if self._master is not None:
+            with suppress(BlockingIOError):
+                os.write(self._master, data)
+
+    def _publish(self) -> None:
+        link = self._link
+        try:
+            if link.exists() and not link.is_symlink():
+                raise LinkError(f'{link} is no symbolic link: choose another path, or move it')
+            # In one piece: nobody ever finds the path missing.
+            new = link.with_name(f'{link.name}.{os.getpid()}')
+            new.unlink(missing_ok=True)
+            new.symlink_to(self._target)
+            new.replace(link)
+        except OSError as error:
+            raise LinkError(f'{link} cannot be made: {error.strerror}') from error
+
+
+def serve(
+    emulator: Emulator,
+    port: PseudoPort,
+    speed: float,
+    stopped: Callable[[], bool],
+    restarts: bool = False,
+) -> None:
+    """Let the emulator run on the wall clock until ``stopped()``.
+
+    Parameters
+    ----------
+    emulator
+        Its time goes on from where it is.
+    port
+        Where the host is.
+    speed
+        Seconds of the emulator in a second.
+    stopped
+        Asked 50 times a second at least.
+    restarts
+        Opening the port restarts the dongle, as DTR does with many boards.
+    """
+    now_ns, clock = emulator.now_ns, time.monotonic()
+    name, there, connected = emulator.port_name, emulator.port_open, False
+    while not stopped():
+        next_ns = emulator.next_ns
+        until_ns = now_ns + _LOOK_NS if next_ns is None else min(next_ns, now_ns + _LOOK_NS)
+        received = port.wait(max(until_ns - now_ns, 0) / NANOSECONDS / speed)
+        passed = time.monotonic() - clock
+        clock += passed
+        now_ns += round(min(passed, _LONGEST_SLEEP) * speed * NANOSECONDS)
+        if received is not None and not connected and restarts:
+            emulator.restart_dongle()
+        connected = received is not None
+        # What is due came before what has just arrived.
+        arrived = emulator.run_to(now_ns)
+        if received:
+            emulator.feed(received, now_ns)
+        if connected:
+            for _, data in arrived:
+                port.write(data)
+        if emulator.port_open != there:
+            there = emulator.port_open
+            port.open() if there else port.close()
+        if emulator.port_name != name:
+            name = emulator.port_name
+            port.open()
