@@ -193,6 +193,7 @@ class FakeDongle:
         self.drop_replies = 0
         self.busy = 0
         self.jitter_ns = 0
+        self.asked = []
         self.boot_delay_ns = 0
         self.restart(0)
 
@@ -246,6 +247,7 @@ class FakeDongle:
 
     def transact(self, frame, now_ns):
         clock = self.time_us(now_ns + 4 * MS)
+        self.asked.append((now_ns, decode_down(frame.first)))
         if not self.hears(now_ns):
             return now_ns + 3 * MS, frames.Result(frame.id, 0x34, 0x08, clock)
         robot = self.robot

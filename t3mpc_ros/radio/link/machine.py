@@ -34,12 +34,10 @@ from t3mpc_ros.radio.link.words import Close, Deed, Open, Phase, Wait, Write
 from t3mpc_ros.radio.statistics import LinkStatistics, Quality
 from t3mpc_ros.robot.backend import BatteryReading, RobotCommand
 
-_BACK_OFF_NS = NANOSECONDS // 5
-_LONGEST_BACK_OFF_NS = 2 * NANOSECONDS
-_PING_NS = NANOSECONDS // 10
+_BACK_OFF_NS, _LONGEST_BACK_OFF_NS = NANOSECONDS // 5, 2 * NANOSECONDS
+_PING_NS = _CFG_NS = NANOSECONDS // 10
 _PING_PATIENCE_NS = 5 * NANOSECONDS
 """For the boot loader of a dongle that opening the port has reset: 1.5 s."""
-_CFG_NS = NANOSECONDS // 10
 _NO_CHIP_NS = NANOSECONDS
 _LOOK_PATIENCE_NS = NANOSECONDS // 20
 """While the link runs: the next command must not wait."""
@@ -273,7 +271,9 @@ class Link:
     def _transact(self, first: Downlink, now_ns: int, fetch: int = frames.STATE) -> None:
         if self._session is not None:
             poll = self._session.poll(fetch)
-            self._write(self._dialogue.transact(first, poll, self._settings.gap, now_ns))
+            self._write(
+                self._dialogue.transact(first, poll, self._settings.gap_after(first), now_ns)
+            )
 
     def _write(self, data: bytes) -> None:
         self._deeds.append(Write(data))

@@ -76,24 +76,25 @@ class Session:
         self._seq = 0
         self._request = 0
         self._signer: Signer | None = None
-        host_us = self._last_us & _WORD
-        # The same bytes at every try: the robot knows a repeated nonce, and both count the wraps
-        # of host_us from here.
-        self._hello = (
-            sign_hello(key, self._number, 0, host_us, entropy(NONCE_SIZE))
-            if key
-            else Hello(self._number, 0, host_us)
-        )
+        # The same at every try, so that the robot knows a repeated one.
+        self._nonce = entropy(NONCE_SIZE) if key else b''
+        self._hello_us = self._last_us & _WORD
 
     @property
     def number(self) -> int:
         """1 to 255."""
         return self._number
 
-    @property
-    def hello(self) -> Hello:
-        """The frame that starts this session."""
-        return self._hello
+    def hello(self, now_ns: int) -> Hello:
+        """Return the frame that starts this session, stamped anew at every try.
+
+        It is the first the robot learns of the host's clock: with the stamp of an earlier try, a
+        command as old as that would pass for a prompt one.
+        """
+        self._hello_us = host_us = self._stamp(now_ns)
+        if not self._key:
+            return Hello(self._number, 0, host_us)
+        return sign_hello(self._key, self._number, 0, host_us, self._nonce)
 
     def accept(self, info: Info) -> str:
         """Begin the session if the robot is in it; return what is wrong if not."""
@@ -106,8 +107,8 @@ class Session:
         if info.session != self._number:
             return words.WRONG_KEY if self._key else words.NO_SESSION
         if self._key:
-            key = session_key(self._key, self._hello.nonce, info.nonce)
-            self._signer = Signer(key, self._hello.host_us)
+            key = session_key(self._key, self._nonce, info.nonce)
+            self._signer = Signer(key, self._hello_us)
         return ''
 
     def command(self, flags: int, ttl: int, left: int, right: int, now_ns: int) -> Command:
@@ -199,7 +200,7 @@ class Greeting:
     def next(self, now_ns: int) -> tuple[Downlink, int]:
         """Return what to send now, and what to POLL after it."""
         if self._phase is Phase.HELLO:
-            return self._session.hello, frames.INFO
+            return self._session.hello(now_ns), frames.INFO
         if self._phase is Phase.INFO:
             return self._session.poll(frames.INFO), frames.INFO
         number, value = self._todo[0]

@@ -4,12 +4,14 @@
 
 from dataclasses import dataclass
 
-from t3mpc_ros.radio.frames import PARAMETERS, Configure
+from t3mpc_ros.radio.frames import PARAMETERS, Configure, Downlink, Hello
 from t3mpc_ros.settings import SettingError, Settings, nested, setting
 
 _RATES = ('250k', '1M', '2M')
 _POWERS = ('-18', '-12', '-6', '0')
 _GAP_UNIT = 250e-6
+_GREETING_GAP = 5e-3
+"""s; four hashes on a 16 MHz AVR"""
 _TTL_UNIT = 0.01
 
 
@@ -132,6 +134,11 @@ class LinkSettings(Settings):
     def gap(self) -> int:
         """Between CMD and POLL, in steps of 250 us: the answer must be off the air before."""
         return round((2.75e-3 if self.rate == '250k' else 1.5e-3) / _GAP_UNIT)
+
+    def gap_after(self, first: Downlink) -> int:
+        """Return the gap after a first packet: a board with a key hashes long over a HELLO."""
+        signed = isinstance(first, Hello) and first.tag
+        return max(self.gap, round(_GREETING_GAP / _GAP_UNIT)) if signed else self.gap
 
     @property
     def ttl_units(self) -> int:
