@@ -48,10 +48,14 @@ class DemoOptions:
     """Share of the radio packets that are lost each way; for the emulator only."""
 
     @property
+    def robot_node(self) -> str:
+        """The node that stands for the robot."""
+        return 'radio_bridge' if self.robot == 'emulator' else 'sim_robot'
+
+    @property
     def nodes(self) -> tuple[str, ...]:
         """The nodes, in the order in which they are started."""
-        robot = 'radio_bridge' if self.robot == 'emulator' else 'sim_robot'
-        return 'recorder', 'controller', robot, 'reference'
+        return 'recorder', 'controller', self.robot_node, 'reference'
 
     @property
     def port(self) -> Path:
@@ -129,7 +133,12 @@ def run_demo(options: DemoOptions) -> ReportFigures:
     parameters = options.parameters()
     parameters['recorder']['folder'] = str(bag.resolve())
     # The robot stops last but for the recorder, and its board after it.
-    stopped: tuple[str, ...] = ('reference', 'controller', options.nodes[2], 'recorder')
+    stopped: tuple[str, ...] = (
+        'reference',
+        'controller',
+        options.robot_node,
+        'recorder',
+    )
     try:
         if board := options.board():
             fleet.start(BOARD, *board)

@@ -5,12 +5,15 @@
 from abc import ABC, abstractmethod
 from collections import deque
 from fractions import Fraction
+from typing import Generic, TypeVar
 
 from t3mpc_ros.motion import WheelSpeeds
 from t3mpc_ros.motion.words import NANOSECONDS
 from t3mpc_ros.robot.backend import STILL, RobotBackend, RobotCommand, RobotState
 from t3mpc_ros.robot.guard import CLOCK_WENT_BACK, CommandGuard
 from t3mpc_ros.settings import SettingError, Settings
+
+S = TypeVar('S', bound=Settings)
 
 
 def check_fixed(before: Settings, after: Settings) -> None:
@@ -24,7 +27,7 @@ def check_fixed(before: Settings, after: Settings) -> None:
             )
 
 
-class GridRobot(RobotBackend, ABC):
+class GridRobot(RobotBackend, ABC, Generic[S]):
     """What every robot that is computed has in common: its grid of time, its guard, its reports.
 
     Time runs on a fixed grid that starts at the first instant it hears of. States are reported
@@ -33,6 +36,8 @@ class GridRobot(RobotBackend, ABC):
 
     Parameters
     ----------
+    settings
+        The whole table of the robot.
     rate
         Reports per second.
     substeps
@@ -44,8 +49,9 @@ class GridRobot(RobotBackend, ABC):
     """
 
     def __init__(
-        self, rate: float, substeps: int, longest_gap: float, guard: CommandGuard
+        self, settings: S, rate: float, substeps: int, longest_gap: float, guard: CommandGuard
     ) -> None:
+        self._settings = settings
         self._guard = guard
         self._substeps = substeps
         self._longest_gap_ns = round(longest_gap * NANOSECONDS)
@@ -60,6 +66,10 @@ class GridRobot(RobotBackend, ABC):
         """The newest, and older ones that nobody has asked for."""
 
     # -- what a robot has of its own --------------------------------------------------------------
+
+    @abstractmethod
+    def _take_settings(self) -> None:
+        """Let every part use the settings in force."""
 
     @abstractmethod
     def _integrate(self, count: int) -> None:
@@ -117,6 +127,23 @@ class GridRobot(RobotBackend, ABC):
         return self._guard.release(self._run_to(now_ns))
 
     # -- only where time is computed --------------------------------------------------------------
+
+    @property
+    def settings(self) -> S:
+        """The table in force."""
+        return self._settings
+
+    def configure(self, settings: S) -> None:
+        """Go on with other settings, a heavier load say.
+
+        Raises
+        ------
+        SettingError
+            A setting differs that is fixed once the robot is made.
+        """
+        check_fixed(self._settings, settings)
+        self._settings = settings
+        self._take_settings()
 
     @property
     def state(self) -> RobotState:

@@ -17,7 +17,7 @@ from t3mpc_ros.robot.backend import (
 )
 from t3mpc_ros.robot.drive import STABLE, DriveSettings, Plant, fastest_rate
 from t3mpc_ros.robot.dynamics import BodySettings
-from t3mpc_ros.robot.grid import GridRobot, check_fixed
+from t3mpc_ros.robot.grid import GridRobot
 from t3mpc_ros.robot.guard import CommandGuard, GuardSettings
 from t3mpc_ros.robot.loads import (
     Disturbance,
@@ -123,7 +123,7 @@ class SimulatedRobotSettings(Settings):
             )
 
 
-class SimulatedRobot(GridRobot):
+class SimulatedRobot(GridRobot[SimulatedRobotSettings]):
     """A robot that exists in numbers only: the paper's plant, on a :class:`GridRobot`'s time.
 
     Disturbance and noise come from generators of their own, and draw the same numbers whatever
@@ -136,8 +136,7 @@ class SimulatedRobot(GridRobot):
                 'drive.kind must be velocity or torque here: stepper is for TwinRobot'
             )
         guard = CommandGuard(settings.guard, settings.geometry)
-        super().__init__(settings.rate, settings.substeps, settings.longest_gap, guard)
-        self._settings = settings
+        super().__init__(settings, settings.rate, settings.substeps, settings.longest_gap, guard)
         for_disturbance, for_noise = generators(settings.seed)
         self._odometry = DeadReckoning(settings.odometry, settings.geometry)
         self._disturbance = Disturbance(settings.disturbance, for_disturbance)
@@ -162,11 +161,6 @@ class SimulatedRobot(GridRobot):
         if self._settings.drive.kind == 'torque':
             raise ValueError('drive.kind must be velocity to take wheel speeds: got torque')
         return super().apply(command, now_ns)
-
-    @property
-    def settings(self) -> SimulatedRobotSettings:
-        """The table in force."""
-        return self._settings
 
     def step_torque(self, right: float, left: float) -> RobotState:
         """Apply torques (N m) for one control period and return the state at its end.
@@ -199,18 +193,6 @@ class SimulatedRobot(GridRobot):
         check_pose(pose)
         self._plant.pose = pose
         self._describe_again()
-
-    def configure(self, settings: SimulatedRobotSettings) -> None:
-        """Go on with other settings, a heavier load say.
-
-        Raises
-        ------
-        SettingError
-            A setting differs that is fixed once the robot is made.
-        """
-        check_fixed(self._settings, settings)
-        self._settings = settings
-        self._take_settings()
 
     def warm_up(self) -> None:
         """Compile everything that a step needs, on a robot of its own."""

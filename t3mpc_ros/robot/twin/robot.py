@@ -21,7 +21,7 @@ from t3mpc_ros.robot.backend import (
     RobotStatus,
     WheelAngles,
 )
-from t3mpc_ros.robot.grid import GridRobot, check_fixed
+from t3mpc_ros.robot.grid import GridRobot
 from t3mpc_ros.robot.guard import CommandGuard
 from t3mpc_ros.robot.loads import Disturbance, SpeedNoise
 from t3mpc_ros.robot.sensors.battery import Battery
@@ -57,7 +57,7 @@ class Inside:
     """N, of a wall, so far"""
 
 
-class TwinRobot(GridRobot):
+class TwinRobot(GridRobot[TwinSettings]):
     """A robot that is computed part by part, so that it goes wrong as the real one does.
 
     Step counters count pulses, so odometry is wrong exactly when steps are lost or a tyre slides;
@@ -74,8 +74,7 @@ class TwinRobot(GridRobot):
 
     def __init__(self, settings: TwinSettings, schedule: FaultSchedule | None = None) -> None:
         guard = CommandGuard(settings.guard, settings.geometry)
-        super().__init__(settings.rate, settings.substeps, settings.longest_gap, guard)
-        self._settings = settings
+        super().__init__(settings, settings.rate, settings.substeps, settings.longest_gap, guard)
         disturbance, noise, imu, ranges, channel = (
             np.random.default_rng(part) for part in np.random.SeedSequence(settings.seed).spawn(5)
         )
@@ -140,11 +139,6 @@ class TwinRobot(GridRobot):
     # -- only in simulation -----------------------------------------------------------------------
 
     @property
-    def settings(self) -> TwinSettings:
-        """The table in force."""
-        return self._settings
-
-    @property
     def inside(self) -> Inside:
         """What nobody outside a simulation can see."""
         chassis = self._chassis
@@ -174,18 +168,6 @@ class TwinRobot(GridRobot):
             )
         self._chassis.pose = pose
         self._describe_again()
-
-    def configure(self, settings: TwinSettings) -> None:
-        """Go on with other settings, another fault say.
-
-        Raises
-        ------
-        SettingError
-            A setting differs that is fixed once the robot is made.
-        """
-        check_fixed(self._settings, settings)
-        self._settings = settings
-        self._take_settings()
 
     def warm_up(self) -> None:
         """Compile everything that a step needs, on a robot of its own."""
