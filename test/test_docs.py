@@ -5,11 +5,13 @@
 import ast
 from functools import cache, reduce
 import importlib
+import math
 from pathlib import Path
 import re
 
 import pytest
 
+from t3mpc_ros.emulator.faults import KINDS
 from t3mpc_ros.nodes.tables import settings_page
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -162,3 +164,12 @@ def test_the_page_of_settings_is_up_to_date():
         'docs/settings.md is out of date: run '
         '`.venv/bin/python -m t3mpc_ros.nodes.tables > docs/settings.md`'
     )
+
+
+def test_every_fault_of_the_boards_is_explained_with_its_usual_value():
+    page = (ROOT / 'docs' / 'emulator.md').read_text()
+    rows = dict(re.findall(r'^\| `(\w+)` \| (.*) \| [^|]* \|$', page, re.MULTILINE))
+    assert list(rows) == [kind.name for kind in KINDS]
+    for kind in KINDS:
+        value = '' if math.isnan(kind.value) else f'{kind.value:g}'
+        assert rows[kind.name] == f'{kind.text} | {value}'
