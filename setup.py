@@ -55,6 +55,7 @@ setup(
             f'recorder = {NAME}.nodes.start:recorder',
             f'all_in_one = {NAME}.nodes.start:all_in_one',
             f'lab = {NAME}.lab.program:main',
+            f'bag = {NAME}.lab.bag.program:main',
             f'board_emulator = {NAME}.emulator.program:main',
         ],
     },

@@ -57,7 +57,7 @@ LIBRARIES = {
     'kernels': {'numba'},
     'robot': {'yaml'},
     'radio': {'serial'},
-    'record': {'mcap', 'rosbags', 'yaml'},
+    'record': {'mcap', 'rosbags', 'yaml', 'zstandard', 'lz4'},
     'lab': {'matplotlib', 'yaml', 'cma', 'casadi'},
     'nodes': {'yaml'},
 }
@@ -156,6 +156,7 @@ def test_no_global_random_numbers_and_no_clock_outside_nodes():
         'lab/processes.py',
         'lab/demo.py',
         'lab/program.py',
+        'lab/bag/program.py',
         'lab/tuning/command.py',
         'lab/paper/program.py',
         'emulator/serial_end.py',

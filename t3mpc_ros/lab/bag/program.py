@@ -1,0 +1,40 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``bag``: what can be done with a recording without a ROS graph, as a command-line program."""
+
+import argparse
+from collections.abc import Sequence
+import sys
+import time
+
+from t3mpc_ros.lab.bag.info import add_info_parser
+from t3mpc_ros.lab.bag.recover import add_recover_parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Return the exit code: 0 done, 1 failed with a reason, 2 wrong command line.
+
+    3 is the command's own: done, but not all is well with the bag.
+    """
+    options = _parser().parse_args(arguments)
+    try:
+        code: int = options.run(options)
+    except KeyboardInterrupt:
+        print('stopped', file=sys.stderr)
+        return 130
+    except (OSError, RuntimeError, ValueError) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 1
+    return code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog='bag', description=__doc__)
+    commands = parser.add_subparsers(dest='command', required=True)
+    add_info_parser(commands)
+    add_recover_parser(commands, time.monotonic)
+    return parser
+
+
+if __name__ == '__main__':
+    sys.exit(main())

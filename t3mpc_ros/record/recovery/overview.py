@@ -1,0 +1,186 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""What a bag holds, from the ends of its files alone, and which of them have none."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.rosbag2 import ReaderError
+from rosbags.typesys import Stores, get_typestore
+
+from t3mpc_ros.motion.words import NANOSECONDS
+from t3mpc_ros.record.mcap_file import MAGIC, SUFFIX, ChannelSummary, FileSummary, summarise
+from t3mpc_ros.record.quality import QualityError, profiles_from_yaml
+from t3mpc_ros.record.schema import RecordError
+
+_SQLITE_SUFFIX = '.db3'
+
+
+@dataclass
+class TopicOverview:
+    """One topic of a bag."""
+
+    name: str
+    type_name: str
+    message_count: int = 0
+    qualities: list[str] = field(default_factory=list)
+    """What publishers offered, each different one once."""
+
+
+@dataclass(frozen=True)
+class Attachment:
+    """A file inside a bag."""
+
+    file: str
+    name: str
+    media_type: str
+    size: int
+    """Bytes."""
+
+
+@dataclass(frozen=True)
+class Overview:
+    """What a bag holds; times of receipt in nanoseconds since 1970."""
+
+    path: str
+    storage: str
+    files: Mapping[str, int]
+    """Size of each finished file in bytes."""
+    unfinished: Mapping[str, int]
+    """Size of each MCAP file without a sound end in bytes: recovery makes a whole one of it."""
+    message_count: int
+    start_ns: int
+    """0 when there is no message."""
+    duration_ns: int
+    topics: tuple[TopicOverview, ...]
+    details: Mapping[str, Mapping[str, str]]
+    """Tables of text by title; of one title the newest."""
+    attachments: tuple[Attachment, ...]
+
+    def rate(self, topic: TopicOverview) -> float:
+        """Return messages per second over the whole bag; 0 for a bag without duration."""
+        seconds = self.duration_ns / NANOSECONDS
+        return topic.message_count / seconds if seconds > 0.0 else 0.0
+
+
+def overview(path: Path | str) -> Overview:
+    """Return what the bag at ``path`` holds: an MCAP file, a folder of such, or an sqlite3 bag.
+
+    Raises
+    ------
+    RecordError
+        There is no bag, or no file of it can be read without recovery.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise RecordError(f'{path} does not exist')
+    files = sorted(path.glob(f'*{SUFFIX}')) if path.is_dir() else [path]
+    if path.is_file() and path.suffix == _SQLITE_SUFFIX:
+        files = []
+    if not files:
+        return _through_rosbags(path)
+    summaries = {file: summarise(file) for file in files}
+    finished = {file: summary for file, summary in summaries.items() if summary}
+    broken = [file for file, summary in summaries.items() if summary is None]
+    if not finished:
+        if not any(_begins_well(file) for file in broken):
+            raise RecordError(f'{path} holds no MCAP file and no sqlite3 bag')
+        names = ', '.join(file.name for file in broken)
+        raise RecordError(
+            f'no file of {path} has a sound end ({names}): `bag recover {path}` writes what is '
+            'in them into a new bag'
+        )
+    return _overview(path, finished, broken)
+
+
+def _overview(path: Path, files: Mapping[Path, FileSummary], broken: Iterable[Path]) -> Overview:
+    spans = [(s.start_ns, s.end_ns) for s in files.values() if s.message_count]
+    start = min((first for first, _ in spans), default=0)
+    topics: dict[str, TopicOverview] = {}
+    details: dict[str, Mapping[str, str]] = {}
+    for summary in sorted(files.values(), key=lambda summary: summary.start_ns):
+        for channel in summary.channels:
+            topic = topics.setdefault(
+                channel.topic, TopicOverview(channel.topic, channel.type_name)
+            )
+            topic.message_count += channel.message_count
+            topic.qualities += [q for q in _qualities(channel) if q not in topic.qualities]
+        details |= {title: table for title, table in summary.details.items() if title != 'rosbag2'}
+    return Overview(
+        path=str(path),
+        storage='mcap',
+        files={file.name: file.stat().st_size for file in files},
+        unfinished={file.name: file.stat().st_size for file in broken},
+        message_count=sum(summary.message_count for summary in files.values()),
+        start_ns=start,
+        duration_ns=max((last for _, last in spans), default=0) - start,
+        topics=tuple(topics[name] for name in sorted(topics)),
+        details=details,
+        attachments=tuple(item for file in files for item in _attachments(file)),
+    )
+
+
+def _begins_well(path: Path) -> bool:
+    with path.open('rb') as file:
+        return file.read(len(MAGIC)) == MAGIC
+
+
+def _attachments(path: Path) -> list[Attachment]:
+    with path.open('rb') as file:
+        summary = make_reader(file).get_summary()
+        return [
+            Attachment(path.name, item.name, item.media_type, item.data_size)
+            for item in (summary.attachment_indexes if summary else ())
+        ]
+
+
+def _qualities(channel: ChannelSummary) -> list[str]:
+    try:
+        profiles = profiles_from_yaml(channel.profiles_text)
+    except QualityError:
+        return ['not understood']
+    return [_quality(profile) for profile in profiles]
+
+
+def _quality(profile: Any) -> str:
+    """Return the words that matter of a profile, ours or that of rosbags."""
+    words = [
+        getattr(value, 'name', str(value)).lower()
+        for value in (profile.reliability, profile.durability, profile.history)
+    ]
+    return f'{", ".join(words)} {profile.depth}'
+
+
+def _through_rosbags(path: Path) -> Overview:
+    try:
+        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
+        reader.open()
+    except (AnyReaderError, ReaderError, OSError, ValueError) as error:
+        raise RecordError(f'{path} cannot be read: {error}') from error
+    topics: dict[str, TopicOverview] = {}
+    try:
+        for item in reader.connections:
+            topic = topics.setdefault(item.topic, TopicOverview(item.topic, item.msgtype))
+            topic.message_count += item.msgcount
+            offers = [_quality(one) for one in getattr(item.ext, 'offered_qos_profiles', ())]
+            topic.qualities += [offer for offer in offers if offer not in topic.qualities]
+        some = reader.message_count > 0
+        paths = sorted(path.glob(f'*{_SQLITE_SUFFIX}')) if path.is_dir() else [path]
+        return Overview(
+            path=str(path),
+            storage='sqlite3' if any(file.suffix == _SQLITE_SUFFIX for file in paths) else 'other',
+            files={file.name: file.stat().st_size for file in paths},
+            unfinished={},
+            message_count=reader.message_count,
+            start_ns=reader.start_time if some else 0,
+            duration_ns=reader.end_time - 1 - reader.start_time if some else 0,
+            topics=tuple(topics[name] for name in sorted(topics)),
+            details={},
+            attachments=(),
+        )
+    finally:
+        reader.close()
