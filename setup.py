@@ -32,6 +32,8 @@ setup(
         'numpy',
         'numba',
         'mcap',
+        'zstandard',
+        'lz4',
         'rosbags',
         'PyYAML',
         'pyserial',
