@@ -92,6 +92,8 @@ make_environment() {
       "check the network and the package index (\"$PYTHON -m pip config list\"; proxies: HTTPS_PROXY), then run $0 again; the wheels of ROS 2 exist for Linux on x86_64"
   fi
   say "  installing t3mpc_ros itself, as colcon would"
+  # What somebody's own "pip install" left there would hide the executables that are new.
+  "$PYTHON" -m pip uninstall --disable-pip-version-check -q -y t3mpc_ros >>"$LOG" 2>&1 || true
   # develop puts the executables into lib/t3mpc_ros, where ros2 run looks for them.
   (cd -- "$ROOT" && "$PYTHON" -W ignore setup.py -q develop --no-deps \
     install_data --install-dir "$VENV") >>"$LOG" 2>&1 ||
