@@ -3,6 +3,7 @@
 """``ros2 run t3mpc_ros reference``: publishes the switching chaotic reference."""
 
 from collections.abc import Mapping
+import secrets
 from typing import Any
 
 from nav_msgs.msg import Odometry, Path
@@ -17,9 +18,11 @@ from t3mpc_ros.motion.words import NANOSECONDS, ORIGIN, STANDSTILL
 from t3mpc_ros.nodes.plumbing import convert, quality
 from t3mpc_ros.nodes.plumbing.package_node import NO_TIME, OK, WARN, PackageNode
 from t3mpc_ros.nodes.tables import ReferenceNodeSettings
+from t3mpc_ros.settings.fingerprint import KEY, SALT_BYTES, fingerprint
 
 PATH_STEP = 0.1
 """Seconds between the poses of ``reference/path``."""
+SEED_BITS = 128
 
 
 class ReferenceNode(PackageNode[ReferenceNodeSettings]):
@@ -28,7 +31,10 @@ class ReferenceNode(PackageNode[ReferenceNodeSettings]):
     def __init__(self, **given: Any) -> None:
         super().__init__('reference', ReferenceNodeSettings, **given)
         settings = self.settings
-        self._seed = settings.seed
+        # Never a parameter, a log line or a diagnosis when it is secret: who knows it knows where
+        # the robot will go. The fingerprint is in the diagnostics, where the recorder finds it.
+        self._seed = _draw() if settings.secret_seed else settings.seed
+        self._fingerprint = fingerprint(self._seed, secrets.token_bytes(SALT_BYTES))
         self._generator = ChaoticReference(settings, settings.geometry)
         self._generator.advance()  # compile now, never inside a step
         self._generator.reset(self._seed)
@@ -83,10 +89,10 @@ class ReferenceNode(PackageNode[ReferenceNodeSettings]):
             self._trail.publish(self._path)
 
     def _on_reseed(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._seed += 1
+        self._seed = _draw() if self.settings.secret_seed else self._seed + 1
+        self._fingerprint = fingerprint(self._seed, secrets.token_bytes(SALT_BYTES))
         self._generator.reset(self._seed)
         response.success = True
-        # Never the seed itself: who knows it knows where the robot will go.
         response.message = 'the reference starts anew with another seed'
         return response
 
@@ -104,12 +110,18 @@ class ReferenceNode(PackageNode[ReferenceNodeSettings]):
             'lateness_s': self._pace.lateness(self.now_ns()),
             'skipped_samples': self._pace.skipped,
             'mode': self._shown[0] if self._shown else 'none',
+            KEY: self._fingerprint,
         }
         if not self.knows_time():
             return WARN, NO_TIME, values
         if self._pace.skipped:
             return WARN, 'the machine is too slow: samples were given up', values
         return OK, 'paused' if self._paused else 'running', values
+
+
+def _draw() -> int:
+    """Return a seed from the operating system that cannot be guessed."""
+    return secrets.randbits(SEED_BITS)
 
 
 def make() -> list[ReferenceNode]:

@@ -9,6 +9,7 @@ from t3mpc_ros.control.controller import ControllerSettings
 from t3mpc_ros.control.estimate import EstimateSettings
 from t3mpc_ros.motion import Geometry, Pose
 from t3mpc_ros.radio.host.robot import RadioRobotSettings
+from t3mpc_ros.record.writing.settings import RecordingSettings
 from t3mpc_ros.robot.sensors.battery import BatterySettings
 from t3mpc_ros.robot.sensors.mpu6050 import ImuSettings
 from t3mpc_ros.robot.sensors.sharp import SharpSettings
@@ -29,12 +30,23 @@ class ReferenceNodeSettings(ReferenceSettings):
         low=0.0,
         high=10.0,
     )
+    secret_seed: bool = setting(
+        False,
+        'draw the seed from the operating system, so that nobody can know beforehand where the '
+        'robot will go; it is told nowhere, only a fingerprint of it is',
+    )
     frame_id: str = setting('odom', 'frame of the reference pose')
     child_frame_id: str = setting('base_link', 'frame of the reference twist')
     path_points: int = setting(
         600, 'most poses in reference/path (one every 0.1 s); 0 = no path', low=0, high=100_000
     )
     geometry: Geometry = nested(Geometry)
+
+    def check_together(self) -> None:
+        """Raise :class:`SettingError` for a secret seed beside one that all can read."""
+        super().check_together()
+        if self.secret_seed and self.seed:
+            raise SettingError(f'seed must be 0 with secret_seed: got {self.seed}')
 
 
 @dataclass(frozen=True)
@@ -175,31 +187,8 @@ class RadioBridgeSettings(RobotTopicSettings, RadioRobotSettings):
 
 
 @dataclass(frozen=True)
-class RecorderSettings(Settings):
+class RecorderSettings(RecordingSettings):
     """The recorder as a node."""
-
-    folder: str = setting(
-        '', 'folder of the bag; empty = bag_<time> here; one that exists is continued'
-    )
-    topics: tuple[str, ...] = setting(
-        (
-            'reference',
-            'reference/*',
-            'odom',
-            'ground_truth/*',
-            'joint_states',
-            'imu/*',
-            'range/*',
-            'battery_state',
-            'cmd_vel',
-            'controller/*',
-            '/diagnostics',
-        ),
-        'topics to record; * stands for anything; relative names are of this namespace',
-    )
-    chunk_bytes: int = setting(
-        262_144, 'size at which a compressed chunk is closed', unit='B', low=1024, high=2**26
-    )
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,8 @@ from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import (
+    Attachment,
+    AttachmentIndex,
     Channel,
     Chunk,
     ChunkIndex,
@@ -162,7 +164,7 @@ def _schema_name(schema: Any) -> str:
 
 @dataclass
 class _Part:
-    """A stretch of the file that is sound up to ``end``: the head, a metadata record, a chunk."""
+    """A stretch of the file that is sound up to ``end``: head, metadata, attachment, or chunk."""
 
     end: int
     schemas: list[Any] = field(default_factory=list)
@@ -170,6 +172,7 @@ class _Part:
     counts: dict[int, int] = field(default_factory=dict)
     chunk: Any = None
     metadata: Any = None
+    attachment: Any = None
 
 
 def _has_sound_end(file: Any) -> bool:
@@ -228,6 +231,11 @@ def _whole_parts(file: Any) -> Iterator[_Part]:
         elif opcode == Opcode.METADATA:
             name = Metadata.read(stream).name
             yield _Part(end, metadata=MetadataIndex(start, end - start, name))
+        elif opcode == Opcode.ATTACHMENT:
+            try:
+                yield _Part(end, attachment=_attachment_index(start, end, content))
+            except Exception:  # torn bytes can fail anywhere in the library's parser
+                return
         elif opcode == Opcode.CHUNK:
             try:
                 waiting = _open_chunk(start, end, Chunk.read(stream))
@@ -270,18 +278,35 @@ def _open_chunk(start: int, end: int, chunk: Any) -> _Part:
     return part
 
 
+def _attachment_index(start: int, end: int, content: bytes) -> AttachmentIndex:
+    """Return the index of an attachment, or raise ValueError when its checksum is wrong."""
+    if zlib.crc32(content[:-4]) != int.from_bytes(content[-4:], 'little'):
+        raise ValueError('an attachment is damaged')
+    item = Attachment.read(ReadDataStream(io.BytesIO(content)))
+    return AttachmentIndex(
+        create_time=item.create_time,
+        data_size=len(item.data),
+        length=end - start,
+        log_time=item.log_time,
+        media_type=item.media_type,
+        name=item.name,
+        offset=start,
+    )
+
+
 def _end_of_file(parts: list[_Part], start: int) -> bytes:
     """Return the bytes from the end of the data to the end of the file."""
     chunks = [part.chunk for part in parts if part.chunk]
     schemas = [schema for part in parts for schema in part.schemas]
     channels = [channel for part in parts for channel in part.channels]
     metadata = [part.metadata for part in parts if part.metadata]
+    attachments = [part.attachment for part in parts if part.attachment]
     counts: dict[int, int] = {}
     for part in parts:
         for channel, count in part.counts.items():
             counts[channel] = counts.get(channel, 0) + count
     statistics = Statistics(
-        attachment_count=0,
+        attachment_count=len(attachments),
         channel_count=len(channels),
         channel_message_counts=counts,
         chunk_count=len(chunks),
@@ -296,7 +321,7 @@ def _end_of_file(parts: list[_Part], start: int) -> bytes:
     head_bytes = head.end()
     summary_start = start + len(head_bytes)
     offsets = []
-    for group in (schemas, channels, [statistics], chunks, metadata):
+    for group in (schemas, channels, [statistics], chunks, attachments, metadata):
         before = body.count
         for record in group:
             record.write(body)
@@ -314,11 +339,12 @@ def _end_of_file(parts: list[_Part], start: int) -> bytes:
     return bytes(head_bytes + body_bytes + tail.end() + MAGIC)
 
 
-_FOREIGN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.ATTACHMENT)
+_FOREIGN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 _OPCODES = {
     Schema: Opcode.SCHEMA,
     Channel: Opcode.CHANNEL,
     Statistics: Opcode.STATISTICS,
     ChunkIndex: Opcode.CHUNK_INDEX,
+    AttachmentIndex: Opcode.ATTACHMENT_INDEX,
     MetadataIndex: Opcode.METADATA_INDEX,
 }

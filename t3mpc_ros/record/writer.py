@@ -17,6 +17,7 @@ from t3mpc_ros.record.mcap_file import SUFFIX, finish, open_unbuffered, write_al
 from t3mpc_ros.record.metadata import BagMetadata, FileEntry, contents, write_metadata
 from t3mpc_ros.record.quality import QualityProfile, dump_yaml, profiles_to_yaml
 from t3mpc_ros.record.schema import Definitions, RecordError
+from t3mpc_ros.record.writing.attachment import Attachment
 
 # Publishers older than the hashes report "INVALID".
 _HASH = re.compile(r'RIHS\d\d_[0-9a-f]{64}')
@@ -83,7 +84,7 @@ class BagWriter:
         *,
         details: Mapping[str, Mapping[str, str]],
         chunk_bytes: int = 256 * 1024,
-        chunk_ns: int = 2_000_000_000,
+        chunk_ns: int = 1_000_000_000,
         definitions: Definitions | None = None,
     ) -> None:
         self.folder = Path(folder).absolute()
@@ -138,6 +139,25 @@ class BagWriter:
             return
         with self._writing():
             self._writer.add_metadata(title, dict(table))
+
+    def add_attachment(self, attachment: Attachment, now_ns: int) -> None:
+        """Put a file into the bag; ``now_ns`` is when it was read (nanoseconds since 1970).
+
+        Raises
+        ------
+        DiskError
+            As :meth:`write`.
+        """
+        if not self._is_open():
+            return
+        with self._writing():
+            self._writer.add_attachment(
+                attachment.changed_ns,
+                now_ns,
+                attachment.name,
+                attachment.media_type,
+                attachment.data,
+            )
 
     def add_topic(
         self,
@@ -237,6 +257,26 @@ class BagWriter:
             self._writer.flush()
             self._chunk_start = None
 
+    def sync(self) -> None:
+        """Wait until the disk has what was handed to the system, if anything is new.
+
+        A process that dies loses nothing of it anyway; a machine without power does.
+
+        Raises
+        ------
+        DiskError
+            As :meth:`write`.
+        """
+        if not self._is_open():
+            return
+        with self._writing():
+            self._output.sync()
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file so far; the chunk that is being filled does not count."""
+        return self._output.size
+
     def close(self) -> None:
         """Finish the file and count it into ``metadata.yaml``; again, do nothing.
 
@@ -313,6 +353,7 @@ class _Output:
     def __init__(self, path: Path) -> None:
         self._file = open_unbuffered(path, 'xb')  # FileExistsError when another was faster
         self.size = 0
+        self._synced = 0
 
     def write(self, data: bytes) -> int:
         write_all(self._file, data)
@@ -325,8 +366,13 @@ class _Output:
     def flush(self) -> None:
         """Nothing is held back."""
 
+    def sync(self) -> None:
+        if self._synced != self.size:
+            os.fsync(self._file.fileno())
+            self._synced = self.size
+
     def close(self) -> None:
-        os.fsync(self._file.fileno())
+        self.sync()
         self._file.close()
 
     def abandon(self) -> None:

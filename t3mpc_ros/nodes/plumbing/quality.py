@@ -45,6 +45,11 @@ RECORDED = _profile(1000)
 """A topic as the recorder takes it: so much may wait while the disk is busy."""
 
 
+def is_latched(profile: QoSProfile) -> bool:
+    """Whether it is about messages that late subscribers still get."""
+    return bool(profile.durability == DurabilityPolicy.TRANSIENT_LOCAL)
+
+
 def hears_all(subscription: QoSProfile, publishers: Sequence[QoSProfile]) -> bool:
     """Whether a subscription hears every publisher: none of them offers less than it asks for."""
     return all(
