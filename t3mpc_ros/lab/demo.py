@@ -132,6 +132,8 @@ def run_demo(options: DemoOptions) -> ReportFigures:
     fleet = Fleet(options.output / 'log', private_graph())
     parameters = options.parameters()
     parameters['recorder']['folder'] = str(bag.resolve())
+    # The nodes are stopped one after the other: that is no fault to keep a snapshot of.
+    parameters['recorder']['snapshot_time'] = 0.0
     # The robot stops last but for the recorder, and its board after it.
     stopped: tuple[str, ...] = (
         'reference',
