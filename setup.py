@@ -55,6 +55,7 @@ setup(
             f'sim_robot = {NAME}.nodes.start:sim_robot',
             f'radio_bridge = {NAME}.nodes.start:radio_bridge',
             f'recorder = {NAME}.nodes.start:recorder',
+            f'replayer = {NAME}.nodes.start:replayer',
             f'all_in_one = {NAME}.nodes.start:all_in_one',
             f'lab = {NAME}.lab.program:main',
             f'bag = {NAME}.lab.bag.program:main',

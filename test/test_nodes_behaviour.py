@@ -34,6 +34,7 @@ from t3mpc_ros.nodes.plumbing.package_node import ERROR, OK, WARN
 from t3mpc_ros.nodes.radio_bridge_node import RadioBridgeNode
 from t3mpc_ros.nodes.recorder_node import RecorderNode
 from t3mpc_ros.nodes.reference_node import ReferenceNode
+from t3mpc_ros.nodes.replaying.replayer_node import ReplayerNode
 from t3mpc_ros.nodes.sim_robot_node import SimRobotNode
 from t3mpc_ros.nodes.tables import TABLES
 from t3mpc_ros.record.model import ModelError, load_model
@@ -52,6 +53,7 @@ NODES = {
     'sim_robot': SimRobotNode,
     'radio_bridge': RadioBridgeNode,
     'recorder': RecorderNode,
+    'replayer': ReplayerNode,
     'all_in_one': AllInOneNode,
 }
 
@@ -904,8 +906,9 @@ def test_every_node_says_how_it_is_once_a_second(world, tmp_path):
         lambda m: stamps.setdefault(m.status[0].name, []).append(time.monotonic()),
         100,
     )
-    for kind in (ReferenceNode, ControllerNode, SimRobotNode, AllInOneNode, RadioBridgeNode):
-        world.add(kind)
+    for name, kind in NODES.items():
+        if name != 'recorder':
+            world.add(kind)
     world.add(RecorderNode, folder=str(tmp_path / 'bag'))
     world.add(AllInOneNode, namespace='two')
     world.until(lambda: stamps.keys() == {*TABLES, 'two/all_in_one'})
@@ -1029,7 +1032,7 @@ def together(graph, tmp_path):
 def test_all_in_one_runs_with_stamped_commands_in_any_order(order, together, tmp_path):
     """The recorder expected a Twist, and ROS refuses a second type in one process."""
     nodes = together('stamped:=true', *filter(None, [order]))
-    assert nodes.keys() == TABLES.keys() - {'radio_bridge'}  # one robot is enough
+    assert nodes.keys() == TABLES.keys() - {'radio_bridge', 'replayer'}
     executor = SingleThreadedExecutor()
     for node in nodes.values():
         executor.add_node(node)

@@ -12,11 +12,11 @@ import sys
 from t3mpc_ros.nodes.plumbing.stop_request import StopRequest
 
 
-def _main(name: str) -> int:
+def _main(name: str, room: str = '') -> int:
     request = StopRequest()
     request.install()
     process = importlib.import_module('t3mpc_ros.nodes.plumbing.process')
-    module = importlib.import_module(f't3mpc_ros.nodes.{name}_node')
+    module = importlib.import_module(f't3mpc_ros.nodes.{room}{name}_node')
     return process.run(name, module.make, request, sys.argv)
 
 
@@ -43,6 +43,11 @@ def radio_bridge() -> int:
 def recorder() -> int:
     """Run the MCAP recorder."""
     return _main('recorder')
+
+
+def replayer() -> int:
+    """Run the player of bags."""
+    return _main('replayer', 'replaying.')
 
 
 def all_in_one() -> int:

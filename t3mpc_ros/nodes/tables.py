@@ -9,6 +9,7 @@ from t3mpc_ros.control.controller import ControllerSettings
 from t3mpc_ros.control.estimate import EstimateSettings
 from t3mpc_ros.motion import Geometry, Pose
 from t3mpc_ros.radio.host.robot import RadioRobotSettings
+from t3mpc_ros.record.playback.settings import PlaybackSettings
 from t3mpc_ros.record.writing.settings import RecordingSettings
 from t3mpc_ros.robot.sensors.battery import BatterySettings
 from t3mpc_ros.robot.sensors.mpu6050 import ImuSettings
@@ -192,6 +193,36 @@ class RecorderSettings(RecordingSettings):
 
 
 @dataclass(frozen=True)
+class ReplayerSettings(PlaybackSettings):
+    """The replayer as a node."""
+
+    allow_commands: bool = setting(
+        False, 'publish cmd_vel and other velocities under their own name: a robot may move'
+    )
+    quality_overrides: str = setting(
+        '', 'YAML file with the quality of service of some topics, as ros2 bag play takes it'
+    )
+    wait_for_subscribers: float = setting(
+        0.5, 'how long to wait at most until every topic is listened to', unit='s', low=0.0
+    )
+    delay: float = setting(0.0, 'how long to wait at least', unit='s', low=0.0)
+    realtime_priority: int = setting(
+        0,
+        'priority of the thread that publishes before everything that has none (SCHED_FIFO), for '
+        'punctuality on a busy machine; 0 = none. Needs the right to it: rtprio in limits.conf',
+        low=0,
+        high=99,
+    )
+    keyboard: bool = setting(
+        True,
+        'in a terminal: space pauses, right plays the next message, left goes back 5 s, up and '
+        'down (+ and -) change the rate',
+    )
+    progress: bool = setting(True, 'in a terminal: show how far it is')
+    exit_at_end: bool = setting(True, 'end the process at the end of the bag')
+
+
+@dataclass(frozen=True)
 class AllInOneSettings(Settings):
     """Which nodes share the one process."""
 
@@ -208,6 +239,7 @@ TABLES: dict[str, type[Settings]] = {
     'sim_robot': SimRobotNodeSettings,
     'radio_bridge': RadioBridgeSettings,
     'recorder': RecorderSettings,
+    'replayer': ReplayerSettings,
     'all_in_one': AllInOneSettings,
 }
 """Every node's table, by the name of its executable."""

@@ -34,6 +34,8 @@ class PackageNode(Node, Generic[S]):
         super().__init__(name, **kwargs)
         self.exit_code = 0
         """Set to something else to end the process."""
+        self.done = False
+        """Set to end the process with this exit code."""
         self.settings: S = parameters.declare(self, table, self._on_change)
         self._diagnostics = self.create_publisher(
             DiagnosticArray, '/diagnostics', quality.DIAGNOSTICS

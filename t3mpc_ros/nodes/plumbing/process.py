@@ -44,8 +44,9 @@ UNUSABLE = (
 def run(name: str, make: Make, request: StopRequest, argv: Sequence[str]) -> int:
     """Return the exit code of a process that spins the nodes of ``make`` until asked to stop.
 
-    0 after SIGINT or SIGTERM, with the robot stopped; 2 when a setting, a parameter file or the
-    command line cannot be used, after one line on standard error that says which and why.
+    0 after SIGINT or SIGTERM, with the robot stopped, or when a node is done; 2 when a setting, a
+    parameter file or the command line cannot be used, after one line on standard error that says
+    which and why.
     """
     if problem := parameter_file_problem(argv):
         return _refuse(name, problem)
@@ -99,7 +100,7 @@ def _spin(nodes: Sequence['PackageNode'], request: StopRequest) -> None:
         node.get_logger().info(f'{node.get_name()} ready')
     try:
         # A Python signal handler runs only between two calls: wake up often enough for it.
-        while not request.wanted and not any(node.exit_code for node in nodes):
+        while not request.wanted and not any(node.exit_code or node.done for node in nodes):
             executor.spin_once(timeout_sec=0.1)
     finally:
         for node in nodes:
