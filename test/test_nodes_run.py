@@ -14,7 +14,7 @@ from t3mpc_ros.record.reader import missing_share, open_recording
 
 pytestmark = pytest.mark.ros
 
-EXECUTABLES = ('reference', 'controller', 'sim_robot', 'recorder', 'all_in_one')
+EXECUTABLES = ('reference', 'controller', 'sim_robot', 'recorder', 'replayer', 'all_in_one')
 LOOP = ('recorder', 'controller', 'sim_robot', 'reference')
 
 
