@@ -60,6 +60,7 @@ setup(
             f'lab = {NAME}.lab.program:main',
             f'bag = {NAME}.lab.bag.program:main',
             f'board_emulator = {NAME}.emulator.program:main',
+            f'radio_tool = {NAME}.radio.bench.program:main',
         ],
     },
 )

@@ -12,9 +12,31 @@ from emulator_bench import SAMPLE, PulseCounter
 import pytest
 
 from t3mpc_ros.emulator.board import Board
-from t3mpc_ros.radio.authentication import session_key, sign_hello, tag_of
-from t3mpc_ros.radio.codec import encode
-from t3mpc_ros.radio.frames import Action, Command, Flag, Hello, ParamGet, ParamSet, Poll
+from t3mpc_ros.emulator.board.console import CELL_US
+from t3mpc_ros.radio.authentication import key_check, session_key, sign_hello, tag_of
+from t3mpc_ros.radio.codec import decode_from_board, encode
+from t3mpc_ros.radio.frames import (
+    BUSY,
+    FAILED,
+    KEY_DAMAGED,
+    KEY_HELD,
+    NO_KEY,
+    OK,
+    Action,
+    Command,
+    Flag,
+    Hello,
+    Key,
+    KeyState,
+    ParamGet,
+    ParamSet,
+    Ping,
+    Poll,
+    Pong,
+    Refusal,
+    Status,
+)
+from t3mpc_ros.radio.splitter import Splitter, to_wire
 
 FIRMWARE = Path(__file__).resolve().parent.parent / 'firmware'
 KEY = bytes(range(0x80, 0x90))
@@ -35,6 +57,8 @@ def library(tmp_path_factory):
     core = ctypes.CDLL(str(target))
     core.t3_host_robot_new.restype = ctypes.c_void_p
     core.t3_host_robot_ack.restype = ctypes.c_uint8
+    core.t3_host_robot_usb_take.restype = ctypes.c_uint32
+    core.t3_host_robot_writing.restype = ctypes.c_bool
     core.t3_host_robot_powered.restype = ctypes.c_bool
     core.t3_host_robot_speed.restype = ctypes.c_int32
     core.t3_host_robot_steps.restype = ctypes.c_int32
@@ -53,12 +77,37 @@ class Pair:
         self.board = Board(self.hardware, key, lambda size: self.nonce, self._load)
         if key:
             self.call('store_key', key)
+        self.call('set_cell_us', ctypes.c_uint32(CELL_US))
+        self.said = b''
+        self.board.console.reply = self._say
         self.call('boot', ctypes.c_uint8(1), ctypes.c_uint32(0))
         self.call('set_imu', ctypes.c_bool(True), (ctypes.c_int16 * 7)(*SAMPLE))
         self.now = 0
 
     def _load(self, payload):
         self.loaded = payload
+
+    def _say(self, data):
+        self.said += data
+
+    def usb(self, data):
+        """Send bytes over the cable."""
+        self.call('usb', bytes(data), ctypes.c_uint32(len(data)))
+        self.board.console.feed(bytes(data))
+
+    def ask(self, frame, us=1000):
+        """Return what both answer over the cable within a time: the same, or nothing."""
+        self.usb(to_wire(encode(frame)))
+        self.run(us)
+        return [decode_from_board(data) for data in Splitter().feed(self.heard())]
+
+    def heard(self):
+        """Return what both have said over the cable since the last call."""
+        room = ctypes.create_string_buffer(4096)
+        size = self.call('usb_take', room, ctypes.c_uint32(4096))
+        said, self.said = self.said, b''
+        assert said.hex() == room.raw[:size].hex()
+        return said
 
     def __del__(self):
         self.call('free')
@@ -145,7 +194,7 @@ class Driver:
 
     def command(self):
         dice = self.dice
-        flags = dice.choices((1, 0, 2, 4, 5, 3), (90, 3, 0 if self.key else 1, 4, 1, 0))[0]
+        flags = dice.choices((1, 0, 2, 4, 5, 3), (90, 3, 1, 4, 1, 1))[0]
         self.seq = (self.seq + dice.choices((1, 0, -1, 2, 100, 200), (90, 2, 2, 3, 2, 1))[0]) % 256
         session = dice.choices((self.session, dice.randrange(256)), (60, 1))[0]
         top = dice.choice((1000, 8000, 32767))
@@ -180,8 +229,6 @@ class Driver:
             case 1:
                 bit = dice.randrange(8 * len(data))
                 data[bit // 8] ^= 1 << bit % 8
-                if self.key and data[0] & 15 == 1 and len(data) > 3:
-                    data[3] &= ~Flag.ESTOP
             case 2:
                 del data[dice.randrange(len(data)) :]
                 data = data or bytearray(1)
@@ -233,3 +280,168 @@ def test_board_and_firmware_answer_alike(library, key, seed):
     pair.compare()
     assert moved
     assert kinds >= {b'\x11', b'\x12', b'\x13', b'\x14', b'\x15'}
+
+
+def test_a_session_that_silence_has_ended_leaves_the_same_behind(library):
+    """The emulator once told a nonce of zeros then, as if nobody had ever greeted it."""
+    pair = Pair(library, KEY)
+    pair.run(1000)
+    driver = Driver(pair, KEY, 1)
+    driver.greet()
+    pair.run(1_801_000_000)
+    assert pair.board.session == 0
+    pair.packet(encode(Poll(0, 0, 2)))
+    pair.run(1000)
+    pair.compare()
+    assert pair.loaded[-8:] != bytes(8)
+    driver.greet()
+    pair.run(1000)
+    pair.compare()
+    assert pair.board.session == driver.session
+
+
+# -- the robot's own USB --------------------------------------------------------------------------
+
+OTHER = bytes(range(0x20, 0x30))
+WRITTEN_US = 25 * CELL_US
+"""A key, both marks, and the count of starts that goes with a key."""
+
+
+@pytest.fixture
+def pair(library):
+    made = Pair(library)
+    made.run(1000)
+    return made
+
+
+def test_a_key_that_came_over_the_cable_keeps_strangers_out_at_once(pair):
+    assert pair.ask(Key(1)) == [KeyState(1, OK, NO_KEY, 0)]
+    assert pair.ask(Key(2, KEY)) == []
+    assert pair.call('writing')
+    assert pair.ask(Key(3, OTHER)) == [KeyState(3, BUSY, KEY_DAMAGED, 0)]
+    pair.packet(encode(Hello(0x5A, 0, pair.now)))
+    pair.run(WRITTEN_US)
+    (told,) = [decode_from_board(data) for data in Splitter().feed(pair.heard())]
+    assert told == KeyState(2, OK, KEY_HELD, key_check(KEY))
+    pair.packet(encode(Hello(0x5A, 0, pair.now)))  # unsigned
+    pair.run(1000)
+    pair.compare()
+    assert pair.board.session == 0
+    driver = Driver(pair, KEY, 1)
+    driver.greet()
+    assert pair.board.session == driver.session
+    pair.reset()
+    pair.run(1000)
+    assert pair.ask(Key(4)) == [KeyState(4, OK, KEY_HELD, key_check(KEY))]
+    assert pair.ask(Key(5, bytes(16)), WRITTEN_US) == [KeyState(5, OK, NO_KEY, 0)]
+    driver = Driver(pair, b'', 1)
+    driver.greet()
+    pair.run(1000)
+    pair.compare()
+    assert pair.board.session == driver.session
+
+
+def test_no_key_is_taken_while_the_robot_moves_or_its_drivers_have_power(pair):
+    driver = Driver(pair, b'', 1)
+    driver.greet()
+    drive = Command(driver.session, 1, Flag.ENABLE, 5, 3000, 3000, driver.host_us)
+    pair.packet(encode(drive))
+    assert pair.ask(Key(1, KEY), 10) == [KeyState(1, BUSY, NO_KEY, 0)]
+    pair.run(20_000)
+    assert pair.ask(Key(2, KEY)) == [KeyState(2, BUSY, NO_KEY, 0)]
+    pair.run(1_000_000)  # the time to live is over, the drivers hold the wheels
+    assert pair.board.speeds == (0, 0)
+    assert pair.ask(Key(3, KEY)) == [KeyState(3, BUSY, NO_KEY, 0)]
+    pair.packet(encode(Command(driver.session, 2, 0, 0, 0, 0, driver.host_us)))
+    pair.run(1000)
+    assert pair.ask(Key(4, KEY), WRITTEN_US) == [KeyState(4, OK, KEY_HELD, key_check(KEY))]
+    assert pair.board.session == 0
+    pair.compare()
+
+
+@pytest.mark.parametrize('before', [b'', KEY], ids=['none', 'another'])
+@pytest.mark.parametrize('after', [bytes(16), OTHER], ids=['none', 'one'])
+def test_a_supply_that_fails_leaves_the_old_key_the_new_one_or_a_locked_robot(
+    library, before, after
+):
+    """Power is cut at every cell; a robot that is locked moves nothing, and can be given a key."""
+    states = set()
+    for cut_us in range(CELL_US // 2, 22 * CELL_US, CELL_US):
+        pair = Pair(library, before)
+        pair.run(50_000)  # a robot with a key has counted its start
+        pair.ask(Key(1, after), cut_us)
+        pair.heard()
+        pair.reset()
+        pair.run(1000)
+        ((number, rc, state, check),) = pair.ask(Key(2))
+        assert (number, rc) == (2, OK)
+        kept = check == key_check(before) if before else state == NO_KEY
+        changed = check == key_check(after) if any(after) else state == NO_KEY
+        assert kept or changed or state == KEY_DAMAGED
+        states.add('kept' if kept else 'changed' if changed else 'damaged')
+        if state == KEY_DAMAGED:
+            driver = Driver(pair, OTHER, 1)
+            driver.greet()
+            pair.run(1000)
+            pair.compare()
+            assert pair.board.session == 0
+            pair.packet(encode(Command(0, 0, Flag.ESTOP, 0, 0, 0, 0)))
+            pair.run(1000)
+            pair.compare()
+            assert pair.board.status & Status.ESTOP
+            told = KeyState(3, OK, KEY_HELD, key_check(KEY))
+            assert pair.ask(Key(3, KEY), WRITTEN_US) == [told]
+    assert states == (
+        {'kept', 'damaged', 'changed'} if before or any(after) else {'kept'} | states
+    )
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_no_damaged_frame_over_the_cable_changes_the_key(pair, seed):
+    dice = random.Random(seed)
+    whole = to_wire(encode(Key(7, OTHER)))
+    for _ in range(300):
+        wire = bytearray(whole)
+        match dice.randrange(4):
+            case 0:
+                bit = dice.randrange(8 * len(wire))
+                wire[bit // 8] ^= 1 << bit % 8
+            case 1:
+                del wire[dice.randrange(len(wire) - 1)]
+            case 2:
+                wire.insert(dice.randrange(len(wire)), dice.randrange(256))
+            case 3:
+                wire = bytearray(to_wire(encode(Key(7, OTHER))[: dice.randrange(3, 18)]))
+        if bytes(wire).strip(b'\0') == whole.strip(b'\0'):
+            continue
+        pair.usb(wire + b'\0')
+        pair.run(200)
+        pair.heard()
+    assert not pair.call('writing')
+    assert pair.ask(Key(1)) == [KeyState(1, OK, NO_KEY, 0)]
+    (pong,) = pair.ask(Ping(2, b'ping'))
+    assert isinstance(pong, Pong)
+    assert pong.crc_errors > 50
+
+
+def test_what_belongs_to_a_dongle_is_refused(pair):
+    for frame in (b'\x01\x00\x00\x01\x15', b'\x02\x00', b'\x05'):
+        pair.usb(to_wire(frame))
+        (told,) = Splitter().feed(pair.heard())
+        assert decode_from_board(told) == Refusal(1, frame[0])
+    pair.usb(to_wire(b'\x04'))
+    assert decode_from_board(Splitter().feed(pair.heard())[0]) == Refusal(2, 4)
+
+
+def test_a_cell_that_does_not_hold_is_told_and_locks_the_robot(library):
+    """The emulator's memory does not wear out: this is the firmware alone."""
+    for address in (8, 20, 25, 26):
+        pair = Pair(library)
+        pair.run(1000)
+        pair.call('wear', ctypes.c_uint8(address), ctypes.c_bool(True))
+        pair.call('usb', to_wire(encode(Key(1, KEY))), ctypes.c_uint32(22))
+        pair.call('run', ctypes.c_uint32(WRITTEN_US))
+        room = ctypes.create_string_buffer(64)
+        size = pair.call('usb_take', room, ctypes.c_uint32(64))
+        (told,) = Splitter().feed(room.raw[:size])
+        assert decode_from_board(told) == KeyState(1, FAILED, KEY_DAMAGED, 0)

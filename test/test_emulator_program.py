@@ -242,6 +242,15 @@ def test_what_cannot_be_done_is_said_before_anything_starts(arguments, words, tm
     assert not path.is_symlink()
 
 
+def test_a_robot_link_that_cannot_be_made_takes_the_other_one_away(tmp_path, capsys):
+    thesis, path = tmp_path / 'thesis', tmp_path / 'dongle'
+    thesis.write_text('chapter 1')
+    assert program.main(['--link', str(path), '--robot-link', str(thesis)]) == 2
+    assert 'no symbolic link' in capsys.readouterr().err
+    assert not path.is_symlink()
+    assert thesis.read_text() == 'chapter 1'
+
+
 @pytest.mark.parametrize('arguments', [['--loss', '2'], ['--speed', '0'], ['--seed', 'x']])
 def test_a_number_out_of_range_is_a_usage_error(arguments, tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:

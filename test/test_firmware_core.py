@@ -69,6 +69,7 @@ def library(tmp_path_factory):
         'robot_unpowered_pulses',
         'robot_hasty_pulses',
         'robot_eeprom_writes',
+        'robot_usb_take',
         'dongle_take',
         'dongle_time',
         'dongle_configured',
@@ -219,6 +220,15 @@ class Robot(Part):
         assert answer[0] == 0x12
         assert len(answer) == 17
         return answer[4], struct.unpack_from('<i', answer, 5)[0]
+
+    def cable(self, frame, us=1000):
+        """Return what the robot says over its own USB to a frame."""
+        wire = to_wire(frame)
+        self.call('usb', wire, ctypes.c_uint32(len(wire)))
+        self.run(us)
+        room = ctypes.create_string_buffer(4096)
+        size = self.call('usb_take', room, ctypes.c_uint32(4096))
+        return [unwire(piece) for piece in room.raw[:size].split(b'\0')[:-1]]
 
     def act(self, verb, seq, session=SESSION):
         body = struct.pack('<BBBBH', 0x16, session, seq, verb, 0)
@@ -600,6 +610,45 @@ def test_a_keyed_robot_takes_and_refuses_what_the_golden_session_says(library, g
         info = robot.ask(b'\x15\0\0\2')
         assert info[1] == event['session'], event['name']
         assert info[17:].hex() == event['robot_nonce'], event['name']
+
+
+def test_golden_stops_are_counted_here_as_there(library, golden):
+    story = golden['authentication']['stops']
+    robot = Robot(library, bytes.fromhex(golden['authentication']['key']))
+    robot.run(1000)
+    robot.call('force_nonce', bytes.fromhex(story['fresh_nonce']))
+    robot.send(bytes.fromhex(story['hello']))
+    refused = 0
+    for row in story['frames']:
+        data = bytes.fromhex(row['bytes'])
+        robot.send(data)
+        refused += not row['counted']
+        assert robot.counters()['bad_session'] == refused, row['name']
+        assert robot.status & LATCHED
+        if row['counted']:
+            assert robot.ask(b'\x15\0\0\0')[2] == data[2], row['name']
+    assert 0 < refused < len(story['frames'])
+
+
+def test_golden_frames_of_the_robots_own_usb_are_met(library, golden):
+    for vector in golden['to_board']:
+        robot = Robot(library)
+        robot.run(1000)
+        (told,) = robot.cable(bytes.fromhex(vector['bytes']))
+        frame = bytes.fromhex(vector['bytes'])
+        assert c_wire(library, frame).hex() == vector['wire']
+        if frame[0] == 3:
+            assert told[:6] == b'\x83' + frame[1:]
+        else:
+            assert told[:3] == bytes([0x84, frame[1], OK])
+    for row in golden['key_checks']:
+        robot = Robot(library, bytes.fromhex(row['key']))
+        assert robot.cable(b'\x04\x09') == [b'\x84\x09\0\1' + struct.pack('<I', row['check'])]
+    for vector in golden['rejected']:
+        data = bytes.fromhex(vector['bytes'])
+        if vector['direction'] == 'to_board':
+            code = 1 if vector['fault'] == 'kind' else 2
+            assert Robot(library).cable(data) == [bytes([0x8F, code, data[0]])], vector
 
 
 # -- when the robot moves -------------------------------------------------------------------------

@@ -164,7 +164,7 @@ def copied(build):
 def test_a_workspace_holds_everything_ros_looks_for(tree):
     assert (tree.prefix / 'share/ament_index/resource_index/packages/t3mpc_ros').is_file()
     executables = {path.name for path in (tree.prefix / 'lib' / 't3mpc_ros').iterdir()}
-    assert executables == EXECUTABLES == {*NODES, 'lab', 'bag', 'board_emulator'}
+    assert executables == EXECUTABLES == {*NODES, 'lab', 'bag', 'board_emulator', 'radio_tool'}
     assert all(os.access(tree.prefix / 'lib/t3mpc_ros' / name, os.X_OK) for name in executables)
     for pattern in ('package.xml', 'config/*', 'launch/*.launch.py'):
         wanted = {path.relative_to(tree.source) for path in tree.source.glob(pattern)}

@@ -14,6 +14,7 @@ from t3mpc_ros.radio.authentication import (
     KeyFileError,
     Signer,
     is_hello_signed,
+    key_check,
     read_key,
     session_key,
     sign_hello,
@@ -21,6 +22,7 @@ from t3mpc_ros.radio.authentication import (
 )
 from t3mpc_ros.radio.codec import decode_down, encode
 from t3mpc_ros.radio.frames import Flag, FrameError
+from t3mpc_ros.radio.siphash import siphash
 
 GOLDEN = json.loads((Path(__file__).parent / 'golden' / 'radio_vectors.json').read_text())
 VECTORS = GOLDEN['authentication']
@@ -54,6 +56,55 @@ def test_golden_session_step_by_step():
     for row in VECTORS['robot_without_key']:
         frame = decode_down(bytes.fromhex(row['bytes']))
         assert (Gate().greet(frame, bytes(8)) == '') == row['accepted']
+
+
+def test_golden_stops_are_obeyed_all_and_counted_like_any_command():
+    """The gate once let every stop pass without a look; the firmware counted those of the host."""
+    story = VECTORS['stops']
+    gates = [Gate(bytes.fromhex(VECTORS['key'])) for _ in range(2)]
+    for gate in gates:
+        hello = decode_down(bytes.fromhex(story['hello']))
+        assert gate.greet(hello, bytes.fromhex(story['fresh_nonce'])) == ''
+    counted = []
+    for row in story['frames']:
+        frame = decode_down(bytes.fromhex(row['bytes']))
+        counted.append(gates[0].admit(frame) == '')
+        assert counted[-1] == row['counted'], row['name']
+        stops = bool(frame.flags & Flag.ESTOP)
+        assert (gates[1].check(frame) == '') == (stops or counted[-1]), row['name']
+    assert len(set(counted)) == 2
+
+
+def test_a_stop_that_is_held_for_hours_keeps_the_epoch():
+    """Both ends count wraps of the host's clock: also while nothing but stops is sent."""
+    signer, gate = meet(host_us=1000)
+    stop = frames.Command(9, 0, Flag.ESTOP, 0, 0, 0, 0)
+    for number in range(1, 7):
+        host_us = (1000 + number * 0x80000001) % (1 << 32)
+        assert gate.admit(signer.sign(stop._replace(seq=number, host_us=host_us))) == ''
+    clear = frames.Command(9, 7, Flag.ESTOP_CLEAR, 0, 0, 0, (host_us + 1) % (1 << 32))
+    assert gate.check(signer.sign(clear)) == ''
+    assert signer.epoch == 3
+
+
+def test_nobody_passes_a_gate_with_a_damaged_key_but_stops_do():
+    gate = Gate(locked=True)
+    assert gate.nonce == bytes(8)
+    for hello in (frames.Hello(1, 0, 0), sign_hello(bytes(16), 1, 0, 0, bytes(8))):
+        assert gate.greet(hello, bytes(8)) == 'the key is damaged'
+    assert gate.session == 0
+    assert gate.check(frames.Command(1, 0, frames.Flag.ENABLE, 1, 0, 0, 0)) != ''
+    assert gate.check(frames.Command(1, 0, Flag.ESTOP, 1, 0, 0, 0)) == ''
+
+
+def test_the_check_value_tells_keys_apart_and_is_the_published_hash():
+    assert {row['check'] for row in GOLDEN['key_checks']} == {
+        int.from_bytes(siphash(bytes.fromhex(row['key']), b't3mpc')[:4], 'little')
+        for row in GOLDEN['key_checks']
+    }
+    assert all(
+        key_check(bytes.fromhex(row['key'])) == row['check'] for row in GOLDEN['key_checks']
+    )
 
 
 def test_golden_session_keys_and_tags():

@@ -12,7 +12,9 @@ import pytest
 from t3mpc_ros.radio import codec, frames
 from t3mpc_ros.radio.codec import (
     decode_down,
+    decode_from_board,
     decode_from_dongle,
+    decode_to_board,
     decode_to_dongle,
     decode_up,
     encode,
@@ -27,6 +29,8 @@ DECODERS = {
     'up': decode_up,
     'to_dongle': decode_to_dongle,
     'from_dongle': decode_from_dongle,
+    'to_board': decode_to_board,
+    'from_board': decode_from_board,
 }
 ROWS = [(way, row) for way in DECODERS for row in VECTORS[way]]
 WAYS = {
@@ -41,16 +45,19 @@ WAYS = {
     decode_up: (frames.State, frames.Param, frames.Info, frames.Ack, frames.Aux),
     decode_to_dongle: (frames.Transmit, frames.Configure, frames.Ping),
     decode_from_dongle: (frames.Result, frames.Configured, frames.Pong, frames.Refusal),
+    decode_to_board: (frames.Ping, frames.Key),
+    decode_from_board: (frames.Pong, frames.KeyState, frames.Refusal),
 }
 KINDS = [(kind, decode) for decode, kinds in WAYS.items() for kind in kinds]
 
-# Without their optional end these are frames, too: unsigned, or the question for the settings.
+# Without their optional end these are frames, too: unsigned, or a question.
 SHORTER = {
     frames.Command: 14,
     frames.ParamSet: 8,
     frames.Action: 6,
     frames.Info: 17,
     frames.Configure: 2,
+    frames.Key: 2,
 }
 
 
@@ -214,12 +221,15 @@ def test_every_bit_flip_is_rejected_or_read_whole(kind, decode):
 @pytest.mark.parametrize('decode', list(WAYS))
 def test_random_bytes_are_rejected_or_read_whole(decode):
     source = random.Random(11)
-    heads = [encode(some(kind, source))[0] for kind in WAYS[decode]]
+    whole = [encode(some(kind, source)) for kind in WAYS[decode]]
     read = 0
     for _ in range(4000):
         data = source.randbytes(source.randint(0, 80))
         if source.random() < 0.8:
-            data = bytes([source.choice(heads)]) + data[1:]
+            frame = source.choice(whole)
+            # Of the right length, half of the time, and with a few bytes that are right.
+            size = source.choice((len(data), len(frame)))
+            data = (frame[: source.randint(1, 4)] + source.randbytes(80))[:size]
         try:
             frame = decode(data)
         except FrameError:

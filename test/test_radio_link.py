@@ -170,6 +170,28 @@ def test_a_port_in_use_is_tried_less_and_less_often_and_the_reason_is_the_ports(
     np.testing.assert_allclose(np.diff(bench.opens[since : since + 3]) / 1e9, [0.4, 0.8])
 
 
+def test_a_busy_port_that_is_pulled_out_is_tried_at_once_when_it_comes_back():
+    """The long waits were kept over an absence: a device that came back free had to wait 2 s."""
+    bench = Bench()
+    bench.problem = ('/dev/ttyUSB0 is busy', False)
+    bench.run(8.0)
+    assert np.diff(bench.opens)[-1] / 1e9 == pytest.approx(2.0)
+    bench.problem = ('/dev/ttyUSB0 is not there', True)
+    bench.plugged = False
+    bench.run(6.0)
+    np.testing.assert_allclose(np.diff(bench.opens[-10:]) / 1e9, 0.2)
+    assert bench.link.reason(bench.now_ns) == '/dev/ttyUSB0 is not there'
+    # Back, but held again: not less and less often from where it was, but from the start.
+    bench.problem = ('/dev/ttyUSB0 is busy', False)
+    since = len(bench.opens)
+    bench.run(4.0)
+    gaps = np.diff(bench.opens[since : since + 4]) / 1e9
+    np.testing.assert_allclose(gaps, [0.2, 0.4, 0.8])
+    bench.problem = ('', True)
+    bench.plug()
+    assert bench.connect() < 2.2
+
+
 def test_a_device_that_is_absent_is_looked_for_five_times_a_second_however_long():
     """However long it was away, the robot drives within a second of the dongle's return."""
     bench = Bench()

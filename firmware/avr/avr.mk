@@ -1,17 +1,20 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
 #
-# make avr        both boards' firmware, build/dongle.elf and build/robot.elf, and their sizes
+# make avr        both boards' firmware, build/dongle.elf and build/robot.elf, and their sizes;
+#                 RADIO_CHANNEL=0…125 and RADIO_RATE=0|1|2 (250 kbit/s, 1, 2 Mbit/s) make it others
 # make simavr     both in a simulator, with the world around them, as a library for ctypes
 
 AVR_OBJCOPY ?= avr-objcopy
-AVR_BOARD_FLAGS := $(AVR_FLAGS) -DF_CPU=16000000UL -Icore -Iavr -Wl,--gc-sections
+AVR_BOARD_FLAGS := $(AVR_FLAGS) -DF_CPU=16000000UL -Icore -Iavr -Wl,--gc-sections \
+                   $(if $(RADIO_CHANNEL),-DT3_RADIO_CHANNEL=$(RADIO_CHANNEL)) \
+                   $(if $(RADIO_RATE),-DT3_RADIO_RATE=$(RADIO_RATE))
 AVR_HEADERS := $(wildcard core/*.h avr/*.h)
 
 DONGLE_FILES := avr/dongle_main.c avr/reset.c avr/nrf24.c avr/serial.c avr/clock.c \
                 $(DONGLE_PARTS:%=core/t3_%.c)
 ROBOT_FILES := avr/robot_main.c avr/reset.c avr/nrf24.c avr/stepping.c avr/analog.c avr/imu.c \
-               avr/memory.c $(ROBOT_PARTS:%=core/t3_%.c)
+               avr/memory.c avr/serial.c $(ROBOT_PARTS:%=core/t3_%.c)
 
 .PHONY: simavr
 

@@ -9,6 +9,9 @@
 #if defined(__AVR_ATmega328P__)
 
 // Dongle: Arduino Nano or Uno, radio at D9 to D13 and D2.
+#define SERIAL_RX_VECTOR USART_RX_vect
+#define SERIAL_EMPTY_VECTOR USART_UDRE_vect
+#define SERIAL_ROOM 255u  // bytes that wait at most
 #define SPI_DDR DDRB
 #define SPI_PORT PORTB
 #define SPI_SCK PB5
@@ -27,6 +30,9 @@
 #elif defined(__AVR_ATmega2560__)
 
 // Robot: Arduino Mega, radio at 50 to 53, 10 and 2.
+#define SERIAL_RX_VECTOR USART0_RX_vect
+#define SERIAL_EMPTY_VECTOR USART0_UDRE_vect
+#define SERIAL_ROOM 32u  // one frame and a half: it has more to do than listen to its USB
 #define SPI_DDR DDRB
 #define SPI_PORT PORTB
 #define SPI_SCK PB1

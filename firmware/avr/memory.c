@@ -28,6 +28,17 @@ void memory_write(uint8_t address, const uint8_t *data, uint8_t size)
     memcpy(copy + address, data, size);
 }
 
+bool memory_settled(void)
+{
+    return !(EECR & _BV(EEPE)) && !memcmp(copy, stored, sizeof copy);
+}
+
+void memory_cells(uint8_t address, uint8_t *data, uint8_t size)
+{
+    eeprom_read_block(stored + address, (const uint8_t *)(uint16_t)address, size);
+    memcpy(data, stored + address, size);
+}
+
 void memory_work(void)
 {
     if (EECR & _BV(EEPE))

@@ -5,11 +5,18 @@
 #ifndef MEMORY_H
 #define MEMORY_H
 
+#include <stdbool.h>
 #include <stdint.h>
 
 void memory_start(void);
 void memory_read(uint8_t address, uint8_t *data, uint8_t size);
 void memory_write(uint8_t address, const uint8_t *data, uint8_t size);
+
+// Return whether nothing is left to be written.
+bool memory_settled(void);
+
+// Read the cells themselves. Waits if one is being written.
+void memory_cells(uint8_t address, uint8_t *data, uint8_t size);
 
 // Write the next byte that differs, if there is one. Never waits.
 void memory_work(void);

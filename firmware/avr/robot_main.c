@@ -1,6 +1,7 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
-// The robot: t3_robot.c between the radio chip, two stepper drivers and the sensors.
+// The robot: t3_robot.c between the radio chip, two stepper drivers and the sensors; t3_console.c
+// on its USB.
 #include <avr/interrupt.h>
 #include <avr/sleep.h>
 #include <avr/wdt.h>
@@ -14,7 +15,9 @@
 #include "memory.h"
 #include "nrf24.h"
 #include "reset.h"
+#include "serial.h"
 #include "stepping.h"
+#include "t3_console.h"
 #include "t3_robot.h"
 
 // Nobody sends for so long: look whether the chip has lost its settings.
@@ -22,11 +25,13 @@
 
 // The answer is sampled at once; then it waits for a quiet moment of the radio.
 #define SETTLE_US 0u
-// At 1 Mbit/s an acknowledgement of 32 bytes is over so long after its packet. When it was lost,
-// the dongle sends the packet again 500 us after it, and so on: each copy of n bytes ends
-// 573 + 8 n us after the one before. The robot sees only the first.
-#define ACK_US 462u
-#define COPY_US(n) (573u + 8u * (n))
+// What n bytes take in the air: preamble 1, address 5, CRC 2, control 9 bit.
+#define AIR_US(n) ((8u * (8u + (n)) + 9u) * 4u >> (T3_RADIO_RATE == 0 ? 0 : 1 + T3_RADIO_RATE))
+// An acknowledgement of 32 bytes is over so long after its packet (settling 130 us, and 3 for the
+// clocks). When it was lost, the dongle sends the packet again one retry delay after it, and so on:
+// so far lie the ends of two copies. The robot sees only the first.
+#define ACK_US (130u + AIR_US(T3_RADIO_LIMIT) + 3u)
+#define COPY_US(n) (250u * (T3_RETRY_DELAY + 1u) + AIR_US(n))
 #define COPIES 4u
 #define WAIT_US 200u  // for this long the main loop stands still rather than miss the moment
 #define FLUSH_US 110u // what the flush takes, with the interrupts that may come meanwhile
@@ -39,6 +44,12 @@ static bool waking;
 static uint8_t packet_size;  // of the last packet, and when it came
 static uint32_t packet_us;
 static uint8_t answer[T3_RADIO_LIMIT], answer_size;  // waits for its moment
+static bool chip_held;  // the radio chip, its settings, at the last look
+static struct t3_console console;
+
+// Of the bytes from USB no more are looked at in one round, and of frames one. The line can bring
+// more: of a flood most is lost, and nothing else is late.
+#define SERIAL_SHARE 8u
 
 ISR(RADIO_IRQ_VECTOR)
 {
@@ -116,11 +127,48 @@ static void unlock(void *context)
     stepping_unlock();
 }
 
+// -- the console's port --------------------------------------------------------------------------
+
+static void reply(void *context, const uint8_t *wire, uint8_t size)
+{
+    (void)context;
+    serial_write(wire, size);
+}
+
+static bool chip_ok(void *context)
+{
+    (void)context;
+    return chip_held;
+}
+
+static bool eeprom_settled(void *context)
+{
+    (void)context;
+    return memory_settled();
+}
+
+static void eeprom_cells(void *context, uint8_t address, uint8_t *data, uint8_t size)
+{
+    (void)context;
+    memory_cells(address, data, size);
+}
+
+static void serve_console(void)
+{
+    uint8_t byte;
+    for (uint8_t i = 0; i < SERIAL_SHARE && serial_take(&byte); i++)
+        if (t3_console_byte(&console, byte))
+            break;
+    for (uint8_t count = serial_lost(); count; count--)
+        t3_console_overrun(&console);
+    t3_console_tick(&console);
+}
+
 // -- radio ---------------------------------------------------------------------------------------
 
 static void configure_radio(uint32_t now_us)
 {
-    nrf24_configure(&radio, NRF24_ROBOT, &waking);
+    chip_held = nrf24_configure(&radio, NRF24_ROBOT, &waking);
     if (!waking)
         nrf24_listen();
     checked_us = now_us;
@@ -188,7 +236,8 @@ static void watch_radio(void)
         nrf24_listen();
     } else if (since_us >= RADIO_CHECK_US) {
         checked_us = now_us;
-        if (!nrf24_holds(&radio, NRF24_ROBOT))
+        chip_held = nrf24_holds(&radio, NRF24_ROBOT);
+        if (!chip_held)
             configure_radio(now_us);
     }
 }
@@ -224,6 +273,7 @@ int main(void)
         0,   time_us,     load_ack,     drivers, estop_pressed, imu,
         adc, eeprom_read, eeprom_write, noise,   lock,          unlock,
     };
+    static const struct t3_console_port usb = {0, reply, chip_ok, eeprom_settled, eeprom_cells};
     stepping_pins();
     wdt_enable(WDTO_120MS);
     memory_start();
@@ -237,6 +287,8 @@ int main(void)
         _delay_us(100);
     }
     t3_robot_boot(&robot, &port, reset_cause, SETTLE_US);
+    t3_console_boot(&console, &usb, &robot);
+    serial_start();
     stepping_start();
     sei();
     configure_radio(stepping_time_us());
@@ -252,5 +304,7 @@ int main(void)
         analog_work();
         memory_work();
         imu_work(stepping_time_us());
+        if (!hurries() && (serial_waits() || console.step != T3_KEY_RESTS))
+            serve_console();
     }
 }

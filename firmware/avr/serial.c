@@ -6,25 +6,28 @@
 #include <avr/io.h>
 #include <util/atomic.h>
 
+#include "board.h"
+
 // Rings of 256 bytes: their indices wrap by themselves.
 static volatile uint8_t in[256], out[256];
 static volatile uint8_t in_head, in_tail, out_head, out_tail;
 static volatile uint8_t lost;
 
-ISR(USART_RX_vect)
+ISR(SERIAL_RX_VECTOR)
 {
     const bool overrun = UCSR0A & _BV(DOR0);  // before the data: reading them clears it
     const uint8_t byte = UDR0;
     const uint8_t next = (uint8_t)(in_head + 1);
-    if ((overrun || next == in_tail) && lost < UINT8_MAX)
+    if (overrun && lost < UINT8_MAX)
         lost++;
-    if (next == in_tail)
-        return;
     in[in_head] = byte;
     in_head = next;
+    // Nobody takes them fast enough: what else comes is lost, and costs no time.
+    if ((uint8_t)(next - in_tail) >= SERIAL_ROOM)
+        UCSR0B &= (uint8_t)~_BV(RXCIE0);
 }
 
-ISR(USART_UDRE_vect)
+ISR(SERIAL_EMPTY_VECTOR)
 {
     if (out_head == out_tail) {
         UCSR0B &= (uint8_t)~_BV(UDRIE0);
@@ -53,6 +56,12 @@ bool serial_take(uint8_t *byte)
         return false;
     *byte = in[in_tail];
     in_tail = (uint8_t)(in_tail + 1);
+    if (!(UCSR0B & _BV(RXCIE0))) {
+        ATOMIC_BLOCK(ATOMIC_RESTORESTATE)
+        {
+            UCSR0B |= _BV(RXCIE0);
+        }
+    }
     return true;
 }
 

@@ -1,6 +1,6 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
-// The dongle's serial line to the USB chip: 500000 baud, 8N1, which 16 MHz divides without rest.
+// The serial line to the board's USB chip: 500000 baud, 8N1, which 16 MHz divides without rest.
 #ifndef SERIAL_H
 #define SERIAL_H
 
@@ -18,7 +18,7 @@ bool serial_waits(void);
 // Send a frame, whole or not at all.
 void serial_write(const uint8_t *data, uint8_t size);
 
-// Return how many bytes were lost since the last call (at most 255).
+// Return how often bytes were lost since the last call (at most 255).
 uint8_t serial_lost(void);
 
 #endif

@@ -9,8 +9,6 @@
 #define TX_HEAD 4u
 #define CFG_SIZE 12u
 #define CFG_READ_SIZE 2u
-#define PING_SIZE 6u
-#define PONG_SIZE 21u
 #define RESULT_HEAD 8u
 #define RETRANSMITS_LIMIT 15u
 
@@ -152,23 +150,20 @@ static void take_cfg(struct t3_dongle *dongle, const uint8_t *frame, uint8_t siz
 
 static void take_ping(struct t3_dongle *dongle, const uint8_t *frame, uint8_t size)
 {
-    if (size != PING_SIZE) {
+    if (size != T3_PING_SIZE) {
         refuse(dongle, T3_ERR_MALFORMED, T3_PING);
         return;
     }
-    uint8_t pong[PONG_SIZE];
-    memcpy(pong, frame, PING_SIZE);
-    pong[0] = T3_PONG;
-    uint8_t *to = t3_put32(pong + PING_SIZE, now(dongle));
-    to = t3_put8(to, T3_VERSION);
-    to = t3_put8(to, T3_FIRMWARE_MAJOR);
-    to = t3_put8(to, T3_FIRMWARE_MINOR);
-    to = t3_put8(to, dongle->chip_ok);
-    to = t3_put16(to, dongle->splitter.crc_errors);
-    to = t3_put16(to, dongle->splitter.frame_errors);
-    to = t3_put16(to, dongle->overruns);
-    t3_put8(to, dongle->reset_cause);
-    reply(dongle, pong, sizeof pong);
+    const struct t3_pong pong = {
+        .time_us = now(dongle),
+        .chip_ok = dongle->chip_ok,
+        .crc_errors = dongle->splitter.crc_errors,
+        .frame_errors = dongle->splitter.frame_errors,
+        .overruns = dongle->overruns,
+        .reset_cause = dongle->reset_cause,
+    };
+    uint8_t answer[T3_PONG_SIZE];
+    reply(dongle, answer, t3_encode_pong(frame, &pong, answer));
 }
 
 void t3_dongle_byte(struct t3_dongle *dongle, uint8_t byte)

@@ -8,12 +8,6 @@
 #include "t3_port.h"
 #include "t3_protocol.h"
 
-// Frames of the serial line.
-enum { T3_TX = 0x01, T3_CFG = 0x02, T3_PING = 0x03 };
-enum { T3_RESULT = 0x81, T3_CFG_IS = 0x82, T3_PONG = 0x83, T3_ERR = 0x8F };
-// Codes of ERR, whose argument is the first byte of the frame, or for BUSY its id.
-enum { T3_ERR_UNKNOWN = 1, T3_ERR_MALFORMED, T3_ERR_BUSY };
-
 // Status bits of an exchange in RESULT; the upper four bits count retransmits.
 #define T3_EXCHANGE_ACK 1u
 #define T3_EXCHANGE_PAYLOAD 2u

@@ -45,6 +45,20 @@ struct t3_port {
     void (*unlock)(void *context);
 };
 
+// The robot's own USB. Of the EEPROM it sees what t3_port's eeprom_write has asked for become true,
+// a cell at a time.
+struct t3_console_port {
+    void *context;
+    // Bytes for the USB side, a whole frame at a time.
+    void (*reply)(void *context, const uint8_t *wire, uint8_t size);
+    // Whether the radio chip holds what was set.
+    bool (*chip_ok)(void *context);
+    // Whether all that was to be written has been.
+    bool (*eeprom_settled)(void *context);
+    // Read the cells themselves, not what they ought to hold.
+    void (*eeprom_cells)(void *context, uint8_t address, uint8_t *data, uint8_t size);
+};
+
 // How the radio chip is set, as a CFG frame says it.
 struct t3_radio_settings {
     uint8_t channel;      // 2400 MHz + this
@@ -55,8 +69,19 @@ struct t3_radio_settings {
     uint8_t address[5];  // lowest first
 };
 
+// Channel and rate may be others at build time (make avr RADIO_CHANNEL=100 RADIO_RATE=0): a robot
+// keeps them for good.
+#ifndef T3_RADIO_CHANNEL
+#define T3_RADIO_CHANNEL 82
+#endif
+#ifndef T3_RADIO_RATE
+#define T3_RADIO_RATE 1
+#endif
+// Shorter at 250 kbit/s, acknowledgements of 32 bytes would be cut off (data sheet 7.4.2).
+#define T3_RETRY_DELAY (T3_RADIO_RATE == 0 ? 5 : 1)
 // Both ends start with these; the host's CFG may change the dongle's.
-#define T3_RADIO_DEFAULTS {82, 1, 3, 1, 3, {'T', '3', 'M', 'P', 'C'}}
+#define T3_RADIO_DEFAULTS                                                                         \
+    {T3_RADIO_CHANNEL, T3_RADIO_RATE, 3, T3_RETRY_DELAY, 3, {'T', '3', 'M', 'P', 'C'}}
 
 // The dongle's hardware. A radio answers each `send` by one call of t3_dongle_exchange.
 struct t3_dongle_port {

@@ -189,6 +189,22 @@ uint8_t t3_encode_aux(const struct t3_aux *aux, uint8_t *to)
 
 // -- serial line ---------------------------------------------------------------------------------
 
+uint8_t t3_encode_pong(const uint8_t *ping, const struct t3_pong *pong, uint8_t *to)
+{
+    memcpy(to, ping, T3_PING_SIZE);
+    to[0] = T3_PONG;
+    to = t3_put32(to + T3_PING_SIZE, pong->time_us);
+    to = t3_put8(to, T3_VERSION);
+    to = t3_put8(to, T3_FIRMWARE_MAJOR);
+    to = t3_put8(to, T3_FIRMWARE_MINOR);
+    to = t3_put8(to, pong->chip_ok);
+    to = t3_put16(to, pong->crc_errors);
+    to = t3_put16(to, pong->frame_errors);
+    to = t3_put16(to, pong->overruns);
+    t3_put8(to, pong->reset_cause);
+    return T3_PONG_SIZE;
+}
+
 uint16_t t3_crc16(const uint8_t *data, uint8_t size)
 {
     uint16_t crc = 0xFFFF;

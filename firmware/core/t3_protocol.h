@@ -52,8 +52,8 @@ enum { T3_STATE = 1, T3_PARAM, T3_INFO, T3_ACK, T3_AUX };
 enum { T3_POLL_STATE, T3_POLL_AUX, T3_POLL_INFO };
 // Verbs of an ACTION.
 enum { T3_RESET_ODOMETRY = 1, T3_CLEAR_COUNTERS };
-// Results in PARAM and ACK.
-enum { T3_RC_OK, T3_RC_UNKNOWN, T3_RC_RANGE, T3_RC_READ_ONLY, T3_RC_BUSY };
+// Results in PARAM, ACK and, the last only there, KEY.
+enum { T3_RC_OK, T3_RC_UNKNOWN, T3_RC_RANGE, T3_RC_READ_ONLY, T3_RC_BUSY, T3_RC_FAILED };
 
 #define T3_AGE_NONE 0xFFFFu
 #define T3_RANGES 8u
@@ -124,6 +124,27 @@ uint8_t t3_encode_ack(uint8_t session, uint8_t seq, uint8_t verb, uint8_t rc, ui
 uint8_t t3_encode_aux(const struct t3_aux *aux, uint8_t *to);
 
 // -- serial line: COBS( frame | CRC-16 ), then a zero byte ---------------------------------------
+
+// Frames from the host: TX and CFG to a dongle only, KEY to a robot only.
+enum { T3_TX = 0x01, T3_CFG = 0x02, T3_PING = 0x03, T3_KEY = 0x04 };
+// Frames to the host.
+enum { T3_RESULT = 0x81, T3_CFG_IS = 0x82, T3_PONG = 0x83, T3_KEY_IS = 0x84, T3_ERR = 0x8F };
+// Codes of ERR, whose argument is the first byte of the frame, or for BUSY its id.
+enum { T3_ERR_UNKNOWN = 1, T3_ERR_MALFORMED, T3_ERR_BUSY };
+
+#define T3_PING_SIZE 6u
+#define T3_PONG_SIZE 21u
+
+// What a board says of itself in PONG, behind the PING's id and echo.
+struct t3_pong {
+    uint32_t time_us;
+    bool chip_ok;
+    uint16_t crc_errors, frame_errors, overruns;
+    uint8_t reset_cause;
+};
+
+// Write the answer to a PING of T3_PING_SIZE bytes; return its size.
+uint8_t t3_encode_pong(const uint8_t *ping, const struct t3_pong *pong, uint8_t *to);
 
 // CRC-16/IBM-3740, starting at 0xFFFF: 0x29B1 of "123456789".
 uint16_t t3_crc16(const uint8_t *data, uint8_t size);

@@ -193,6 +193,12 @@ void t3_robot_packet(struct t3_robot *robot, const uint8_t *data, uint8_t size,
     take(robot, data, size, received_us);
 }
 
+bool t3_robot_rests(const struct t3_robot *robot)
+{
+    // Enabled, but its drivers not yet powered: the tick in between has not come.
+    return !robot->enabled && !robot->powered && !t3_ramp_busy(&robot->ramp);
+}
+
 // -- time ----------------------------------------------------------------------------------------
 
 static void watch_ttl(struct t3_robot *robot, uint32_t now_us)

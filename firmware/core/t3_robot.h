@@ -16,7 +16,9 @@
 #include "t3_session.h"
 #include "t3_steps.h"
 
-// The answer is loaded when the acknowledgement of the packet before is off the air.
+// `settle_us` of a port whose load_ack goes to the radio at once: an answer is made when the
+// acknowledgement of the packet before is off the air. The AVR's port waits by itself, to the
+// microsecond and for repetitions too (avr/robot_main.c): it has its answers made at once, with 0.
 #define T3_SETTLE_US 600u        // at 1 and 2 Mbit/s
 #define T3_SETTLE_SLOW_US 1600u  // at 250 kbit/s
 // Nobody asks: what waits in the radio is made anew so often.
@@ -83,6 +85,9 @@ void t3_robot_packet(struct t3_robot *robot, const uint8_t *data, uint8_t size,
 
 // Call as often as the main loop runs, at least every millisecond or two.
 void t3_robot_tick(struct t3_robot *robot);
+
+// Return whether the robot stands and its drivers have no power.
+bool t3_robot_rests(const struct t3_robot *robot);
 
 // What the next packet fetches: a kind of payload, and the request it answers.
 void t3_answer_with(struct t3_robot *robot, uint8_t kind, uint8_t seq, uint8_t id, uint8_t rc);

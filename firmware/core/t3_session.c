@@ -9,6 +9,7 @@
 
 #define HELLO_SIGNED_SIZE 16u  // a signed HELLO without its tag
 #define EPOCH_SIZE 4u
+#define NO_MARK 0xFFu
 
 static void count_boot(struct t3_session *session, const struct t3_port *port)
 {
@@ -22,17 +23,37 @@ static void count_boot(struct t3_session *session, const struct t3_port *port)
     t3_store_write(port, T3_STORE_BOOTS, bytes, sizeof bytes);
 }
 
+void t3_session_lock(struct t3_session *session)
+{
+    memset(session, 0, sizeof *session);
+    session->keyed = session->locked = true;
+}
+
 void t3_session_boot(struct t3_session *session, const struct t3_port *port)
 {
     memset(session, 0, sizeof *session);
-    const enum t3_record record = t3_store_read(port, T3_STORE_KEY, session->key, T3_KEY_SIZE);
-    session->keyed = record != T3_RECORD_BLANK;
-    // A link that was keyed must not open because a cell of the memory died: a key nobody knows.
-    if (record == T3_RECORD_DAMAGED)
-        for (uint8_t i = 0; i < T3_KEY_SIZE; i = (uint8_t)(i + 4))
-            t3_put32(session->key + i, port->noise(port->context));
-    if (session->keyed)
-        count_boot(session, port);  // an unkeyed board spares its EEPROM
+    uint8_t mark;
+    port->eeprom_read(port->context, T3_STORE_KEY_MARK, &mark, 1);
+    if (mark != NO_MARK) {
+        t3_session_lock(session);
+        return;
+    }
+    switch (t3_store_read(port, T3_STORE_KEY, session->key, T3_KEY_SIZE)) {
+    case T3_RECORD_BLANK:
+        return;  // an unkeyed board spares its EEPROM the count
+    case T3_RECORD_DAMAGED:
+        // A link that was keyed must not open because a cell of the memory died.
+        t3_session_lock(session);
+        return;
+    case T3_RECORD_GOOD:
+        break;
+    }
+    uint8_t hash[T3_TAG_SIZE];
+    static const uint8_t NAME[] = {'t', '3', 'm', 'p', 'c'};
+    t3_siphash(session->key, NAME, sizeof NAME, hash);
+    session->check = t3_get32(hash);
+    session->keyed = true;
+    count_boot(session, port);
 }
 
 void t3_session_end(struct t3_session *session)
@@ -74,7 +95,7 @@ enum t3_greeting t3_session_greet(struct t3_session *session, const struct t3_po
                                   const struct t3_packet *packet, const uint8_t *data)
 {
     // An unkeyed robot cannot check a signature, so it does not pretend to.
-    if (session->keyed != (packet->tag != NULL))
+    if (session->locked || session->keyed != (packet->tag != NULL))
         return T3_GREETING_REFUSED;
     if (session->keyed) {
         uint8_t tag[T3_TAG_SIZE];
@@ -122,4 +143,10 @@ void t3_session_store_key(const struct t3_port *port, const uint8_t *key)
         t3_store_write(port, T3_STORE_KEY, key, T3_KEY_SIZE);
     else
         t3_store_erase(port, T3_STORE_KEY, T3_KEY_SIZE);
+}
+
+void t3_session_mark_key(const struct t3_port *port, bool changing)
+{
+    const uint8_t mark = changing ? 0 : NO_MARK;
+    port->eeprom_write(port->context, T3_STORE_KEY_MARK, &mark, 1);
 }

@@ -20,6 +20,8 @@
 struct t3_session {
     uint8_t id;  // 0: none
     bool keyed;
+    bool locked;  // the key is damaged, or about to change: nobody gets in
+    uint32_t check;  // of the key, for people to compare both ends by
     uint8_t key[T3_KEY_SIZE];
     uint8_t session_key[T3_KEY_SIZE];
     uint8_t host_nonce[T3_NONCE_SIZE], robot_nonce[T3_NONCE_SIZE];
@@ -29,8 +31,12 @@ struct t3_session {
 
 enum t3_greeting { T3_GREETING_REFUSED, T3_GREETING_NEW, T3_GREETING_REPEATED };
 
-// Read the key, if there is one. One that is damaged lets nobody in: the robot then only stops.
+// Read the key, if there is one; no session. A key that is damaged lets nobody in: the robot then
+// only stops.
 void t3_session_boot(struct t3_session *session, const struct t3_port *port);
+
+// End the session and let nobody in until t3_session_boot.
+void t3_session_lock(struct t3_session *session);
 
 // Take a HELLO whose bytes are `data`. A repeated one changes nothing.
 enum t3_greeting t3_session_greet(struct t3_session *session, const struct t3_port *port,
@@ -47,7 +53,11 @@ void t3_session_derive_key(struct t3_session *session);
 // Forget the session; only a new HELLO starts another.
 void t3_session_end(struct t3_session *session);
 
-// Store a key, or none (NULL), in the EEPROM; it holds from the next boot on.
+// Store a key, or none (NULL), in the EEPROM; it holds from the next t3_session_boot on.
 void t3_session_store_key(const struct t3_port *port, const uint8_t *key);
+
+// Say in the EEPROM that the key is about to change, or has. A supply that fails in between leaves a
+// mixture of two keys; one in 65536 has the right CRC, so that alone does not tell.
+void t3_session_mark_key(const struct t3_port *port, bool changing);
 
 #endif

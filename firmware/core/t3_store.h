@@ -9,6 +9,8 @@
 
 #define T3_STORE_MICROSTEPS 0u  // u16
 #define T3_STORE_KEY 8u         // 16 bytes
+#define T3_STORE_KEY_MARK 26u   // a byte: 0xFF, or something else from before a key is written
+                                // until it is verified
 #define T3_STORE_BOOTS 32u      // u32
 #define T3_STORE_END 40u
 #define T3_STORE_RECORD_LIMIT 16u

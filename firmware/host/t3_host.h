@@ -43,6 +43,16 @@ uint32_t t3_host_robot_unpowered_pulses(const struct t3_host_robot *host);
 uint32_t t3_host_robot_hasty_pulses(const struct t3_host_robot *host);  // DIR changed with STEP
 uint32_t t3_host_robot_eeprom_writes(const struct t3_host_robot *host);
 void t3_host_robot_poke_eeprom(struct t3_host_robot *host, uint8_t address, uint8_t value);
+// What a reset finds: a write changes the cells one by one, each takes so long (0: no time).
+uint8_t t3_host_robot_cell(const struct t3_host_robot *host, uint8_t address);
+void t3_host_robot_set_cell_us(struct t3_host_robot *host, uint32_t us);
+void t3_host_robot_wear(struct t3_host_robot *host, uint8_t address, bool worn);
+// Its own USB: bytes in; take what it said (at most `room`).
+void t3_host_robot_usb(struct t3_host_robot *host, const uint8_t *data, uint32_t size);
+uint32_t t3_host_robot_usb_take(struct t3_host_robot *host, uint8_t *to, uint32_t room);
+bool t3_host_robot_writing(const struct t3_host_robot *host);  // a key, that came over USB
+void t3_host_robot_usb_overrun(struct t3_host_robot *host);
+void t3_host_robot_set_chip(struct t3_host_robot *host, bool ok);
 // What the hardware gives.
 void t3_host_robot_press(struct t3_host_robot *host, bool pressed);
 void t3_host_robot_set_imu(struct t3_host_robot *host, bool answers, const int16_t *seven);

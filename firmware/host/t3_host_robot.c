@@ -3,19 +3,28 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "t3_console.h"
 #include "t3_host.h"
 #include "t3_robot.h"
 #include "t3_store.h"
 
 #define CHANNELS 9u
 #define NEVER 0xFFFFFFFFu
+#define USB_ROOM 4096u
 
 struct t3_host_robot {
     struct t3_robot robot;
     struct t3_port port;
     uint32_t time_us, since_tick_us, noise;
-    uint8_t eeprom[T3_STORE_END];
-    uint32_t eeprom_writes;
+    // The copy that the core reads and writes, and the cells that follow it one by one.
+    uint8_t eeprom[T3_STORE_END], cells[T3_STORE_END];
+    bool worn[T3_STORE_END];  // cells that keep what they hold
+    uint32_t eeprom_writes, cell_us, since_cell_us;
+    struct t3_console console;
+    struct t3_console_port usb;
+    bool chip_ok;
+    uint8_t said[USB_ROOM];
+    uint32_t said_size;
     uint8_t ack[T3_RADIO_LIMIT], ack_size;
     uint32_t loads;
     bool powered, pressed, imu_answers;
@@ -73,6 +82,25 @@ static uint16_t adc(void *context, uint8_t channel)
     return host->adc[channel];
 }
 
+// Return the first cell that is still to be written.
+static uint8_t unwritten(const struct t3_host_robot *host)
+{
+    uint8_t i = 0;
+    while (i < T3_STORE_END && (host->worn[i] || host->eeprom[i] == host->cells[i]))
+        i++;
+    return i;
+}
+
+static void work_eeprom(struct t3_host_robot *host, uint32_t passed_us)
+{
+    uint8_t next = unwritten(host);
+    host->since_cell_us = next < T3_STORE_END ? host->since_cell_us + passed_us : 0;
+    for (; next < T3_STORE_END && host->since_cell_us >= host->cell_us; next = unwritten(host)) {
+        host->since_cell_us -= host->cell_us;
+        host->cells[next] = host->eeprom[next];
+    }
+}
+
 static void eeprom_read(void *context, uint8_t address, uint8_t *data, uint8_t size)
 {
     const struct t3_host_robot *host = context;
@@ -88,6 +116,34 @@ static void eeprom_write(void *context, uint8_t address, const uint8_t *data, ui
         abort();
     memcpy(host->eeprom + address, data, size);
     host->eeprom_writes++;
+    if (!host->cell_us)
+        work_eeprom(host, 0);
+}
+
+static void reply(void *context, const uint8_t *wire, uint8_t size)
+{
+    struct t3_host_robot *host = context;
+    if (host->said_size + size > USB_ROOM)
+        return;  // nobody reads: lost, as on a serial line
+    memcpy(host->said + host->said_size, wire, size);
+    host->said_size += size;
+}
+
+static bool chip_ok(void *context)
+{
+    const struct t3_host_robot *host = context;
+    return host->chip_ok;
+}
+
+static bool eeprom_settled(void *context)
+{
+    return unwritten(context) == T3_STORE_END;
+}
+
+static void eeprom_cells(void *context, uint8_t address, uint8_t *data, uint8_t size)
+{
+    const struct t3_host_robot *host = context;
+    memcpy(data, host->cells + address, size);
 }
 
 static uint32_t noise(void *context)
@@ -121,8 +177,12 @@ struct t3_host_robot *t3_host_robot_new(void)
         host, time_us, load_ack, drivers, estop_pressed, imu, adc, eeprom_read, eeprom_write,
         noise, lock, unlock,
     };
+    const struct t3_console_port usb = {host, reply, chip_ok, eeprom_settled, eeprom_cells};
     host->port = port;
+    host->usb = usb;
+    host->chip_ok = true;
     memset(host->eeprom, 0xFF, sizeof host->eeprom);
+    memset(host->cells, 0xFF, sizeof host->cells);
     for (uint8_t i = 0; i < CHANNELS; i++)
         host->adc[i] = T3_ADC_NOT_MEASURED;
     host->imu_answers = true;
@@ -138,6 +198,7 @@ void t3_host_robot_free(struct t3_host_robot *host)
 void t3_host_robot_store_key(struct t3_host_robot *host, const uint8_t *key)
 {
     t3_session_store_key(&host->port, key);
+    memcpy(host->cells, host->eeprom, sizeof host->cells);
 }
 
 void t3_host_robot_boot(struct t3_host_robot *host, uint8_t reset_cause, uint32_t start_us)
@@ -147,7 +208,10 @@ void t3_host_robot_boot(struct t3_host_robot *host, uint8_t reset_cause, uint32_
     host->ack_size = 0;
     host->noise = 0;  // a board without any: what hangs on it must still hold
     host->powered = true;  // pins float until the firmware says otherwise
+    memcpy(host->eeprom, host->cells, sizeof host->eeprom);
+    host->since_cell_us = 0;
     t3_robot_boot(&host->robot, &host->port, reset_cause, T3_SETTLE_US);
+    t3_console_boot(&host->console, &host->usb, &host->robot);
     host->robot.steps.time_us = start_us;
 }
 
@@ -200,8 +264,11 @@ static void pass(struct t3_host_robot *host, uint32_t us, bool stalled)
         if (host->since_tick_us)
             continue;
         tick(host);
-        if (!stalled && host->ticks % (T3_HOST_LOOP_US / T3_TICK_US) == 0)
+        work_eeprom(host, T3_TICK_US);
+        if (!stalled && host->ticks % (T3_HOST_LOOP_US / T3_TICK_US) == 0) {
             t3_robot_tick(&host->robot);
+            t3_console_tick(&host->console);
+        }
     }
 }
 
@@ -303,7 +370,53 @@ uint32_t t3_host_robot_eeprom_writes(const struct t3_host_robot *host)
 void t3_host_robot_poke_eeprom(struct t3_host_robot *host, uint8_t address, uint8_t value)
 {
     if (address < sizeof host->eeprom)
-        host->eeprom[address] = value;
+        host->eeprom[address] = host->cells[address] = value;
+}
+
+uint8_t t3_host_robot_cell(const struct t3_host_robot *host, uint8_t address)
+{
+    return address < sizeof host->cells ? host->cells[address] : 0;
+}
+
+void t3_host_robot_set_cell_us(struct t3_host_robot *host, uint32_t us)
+{
+    host->cell_us = us;
+}
+
+void t3_host_robot_wear(struct t3_host_robot *host, uint8_t address, bool worn)
+{
+    if (address < sizeof host->worn)
+        host->worn[address] = worn;
+}
+
+void t3_host_robot_usb(struct t3_host_robot *host, const uint8_t *data, uint32_t size)
+{
+    for (uint32_t i = 0; i < size; i++)
+        t3_console_byte(&host->console, data[i]);
+}
+
+uint32_t t3_host_robot_usb_take(struct t3_host_robot *host, uint8_t *to, uint32_t room)
+{
+    const uint32_t size = host->said_size < room ? host->said_size : room;
+    memcpy(to, host->said, size);
+    host->said_size -= size;
+    memmove(host->said, host->said + size, host->said_size);
+    return size;
+}
+
+bool t3_host_robot_writing(const struct t3_host_robot *host)
+{
+    return host->console.step != T3_KEY_RESTS;
+}
+
+void t3_host_robot_usb_overrun(struct t3_host_robot *host)
+{
+    t3_console_overrun(&host->console);
+}
+
+void t3_host_robot_set_chip(struct t3_host_robot *host, bool ok)
+{
+    host->chip_ok = ok;
 }
 
 void t3_host_robot_press(struct t3_host_robot *host, bool pressed)

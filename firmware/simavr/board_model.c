@@ -237,10 +237,19 @@ static uint8_t read_udr(avr_t *avr, avr_io_addr_t address, void *param)
     return value;
 }
 
+// Return UART 0: the larger chip has four.
+static avr_uart_t *first_uart(struct board *board)
+{
+    for (avr_io_t *part = board->avr->io_port; part; part = part->next)
+        if (!strcmp(part->kind, "uart") && ((avr_uart_t *)part)->name == '0')
+            return (avr_uart_t *)part;
+    return NULL;
+}
+
 void board_attach_uart(struct board *board)
 {
     avr_t *avr = board->avr;
-    avr_uart_t *uart = (avr_uart_t *)board_part(board, "uart");
+    avr_uart_t *uart = first_uart(board);
     board->serial.uart = uart;
     const avr_io_addr_t udr = AVR_DATA_TO_IO(uart->r_udr);
     avr->io[udr].w.c = write_udr;
@@ -262,6 +271,8 @@ void board_run_uart(struct board *board, uint64_t now)
         if (serial->unread == 2) {
             avr_regbit_set(board->avr, serial->uart->dor);
             serial->overruns++;
+            // The flag is a level: it asks again as soon as its interrupt is allowed.
+            avr_raise_interrupt(board->avr, &serial->uart->rxc);
             continue;
         }
         serial->received[serial->unread++] = byte;

@@ -126,6 +126,7 @@ struct simulation *t3_sim_new(const char *dongle_elf, const char *robot_elf, uin
         }
     }
     board_attach_uart(&sim->boards[DONGLE]);
+    board_attach_uart(&sim->boards[ROBOT]);
     board_attach_twi(&sim->boards[ROBOT]);
     sim->boards[ROBOT].restored = restored;
     sim->boards[ROBOT].imu.present = true;
@@ -148,9 +149,10 @@ void t3_sim_free(struct simulation *sim)
 
 static void step(struct simulation *sim, uint64_t until)
 {
-    board_run_uart(&sim->boards[DONGLE], sim->now);
-    for (int i = 0; i < BOARDS; i++)
+    for (int i = 0; i < BOARDS; i++) {
+        board_run_uart(&sim->boards[i], sim->now);
         board_run(&sim->boards[i], until);
+    }
     ether_run(&sim->ether, until);
     sim->now = until;
 }
@@ -184,9 +186,8 @@ uint64_t t3_sim_cycles(const struct simulation *sim)
 
 // -- serial line ---------------------------------------------------------------------------------
 
-void t3_sim_write(struct simulation *sim, const uint8_t *data, uint32_t size)
+static void put(const struct simulation *sim, struct line *in, const uint8_t *data, uint32_t size)
 {
-    struct line *in = &sim->boards[DONGLE].serial.in;
     uint64_t at = sim->now;
     if (in->head != in->tail && in->at[(in->head - 1) % LINE_ROOM] > at)
         at = in->at[(in->head - 1) % LINE_ROOM];
@@ -197,9 +198,9 @@ void t3_sim_write(struct simulation *sim, const uint8_t *data, uint32_t size)
     }
 }
 
-uint32_t t3_sim_read(struct simulation *sim, uint8_t *data, uint64_t *at, uint32_t room)
+static uint32_t take(const struct simulation *sim, struct line *out, uint8_t *data, uint64_t *at,
+                     uint32_t room)
 {
-    struct line *out = &sim->boards[DONGLE].serial.out;
     uint32_t count = 0;
     for (; count < room && out->tail != out->head; count++) {
         const uint32_t i = out->tail % LINE_ROOM;
@@ -210,6 +211,31 @@ uint32_t t3_sim_read(struct simulation *sim, uint8_t *data, uint64_t *at, uint32
         out->tail++;
     }
     return count;
+}
+
+void t3_sim_write(struct simulation *sim, const uint8_t *data, uint32_t size)
+{
+    put(sim, &sim->boards[DONGLE].serial.in, data, size);
+}
+
+uint32_t t3_sim_read(struct simulation *sim, uint8_t *data, uint64_t *at, uint32_t room)
+{
+    return take(sim, &sim->boards[DONGLE].serial.out, data, at, room);
+}
+
+void t3_sim_usb_write(struct simulation *sim, const uint8_t *data, uint32_t size)
+{
+    put(sim, &sim->boards[ROBOT].serial.in, data, size);
+}
+
+uint32_t t3_sim_usb_read(struct simulation *sim, uint8_t *data, uint64_t *at, uint32_t room)
+{
+    return take(sim, &sim->boards[ROBOT].serial.out, data, at, room);
+}
+
+uint32_t t3_sim_usb_overruns(const struct simulation *sim)
+{
+    return sim->boards[ROBOT].serial.overruns;
 }
 
 uint32_t t3_sim_overruns(const struct simulation *sim)

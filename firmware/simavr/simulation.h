@@ -21,6 +21,10 @@ uint64_t t3_sim_cycles(const struct simulation *sim);  // 16 to a microsecond
 void t3_sim_write(struct simulation *sim, const uint8_t *data, uint32_t size);
 uint32_t t3_sim_read(struct simulation *sim, uint8_t *data, uint64_t *at, uint32_t room);
 uint32_t t3_sim_overruns(const struct simulation *sim);
+// The same for the robot's own USB.
+void t3_sim_usb_write(struct simulation *sim, const uint8_t *data, uint32_t size);
+uint32_t t3_sim_usb_read(struct simulation *sim, uint8_t *data, uint64_t *at, uint32_t room);
+uint32_t t3_sim_usb_overruns(const struct simulation *sim);
 
 // Air.
 void t3_sim_loss(struct simulation *sim, double down, double up);

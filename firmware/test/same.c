@@ -8,6 +8,7 @@
 #include <string.h>
 
 #include "t3_bytes.h"
+#include "t3_console.h"
 #include "t3_dongle.h"
 #include "t3_robot.h"
 #include "t3_sensors.h"
@@ -217,6 +218,20 @@ static bool configure(void *context, const struct t3_radio_settings *settings)
     return true;
 }
 
+static bool chip_ok(void *context)
+{
+    (void)context;
+    return true;
+}
+
+static bool eeprom_settled(void *context)
+{
+    (void)context;
+    return draw() % 3 == 0;
+}
+
+static const struct t3_console_port CONSOLE_PORT = {NULL, reply, chip_ok, eeprom_settled,
+                                                    eeprom_read};
 static const struct t3_dongle_port DONGLE_PORT = {NULL, time_us, reply, send, configure};
 
 // -- the story -----------------------------------------------------------------------------------
@@ -355,11 +370,35 @@ static void relay(void)
     say("good frames", dongle.splitter.frames);
 }
 
+// Pings, questions, keys and nonsense over the robot's own USB.
+static void wire_up(void)
+{
+    static struct t3_console console;
+    memset(eeprom, 0xFF, sizeof eeprom);
+    t3_robot_boot(&robot, &PORT, 1, T3_SETTLE_US);
+    t3_console_boot(&console, &CONSOLE_PORT, &robot);
+    for (uint16_t i = 0; i < PACKETS; i++) {
+        static const uint8_t SIZES[] = {6, 2, 18, 5};
+        uint8_t frame[T3_FRAME_LIMIT], wire[T3_WIRE_LIMIT];
+        for (uint8_t j = 0; j < sizeof frame; j++)
+            frame[j] = (uint8_t)draw();
+        frame[0] = (uint8_t)(3 + draw() % 3);
+        const uint8_t length = t3_to_wire(frame, SIZES[draw() % 4], wire);
+        for (uint8_t j = 0; j < length; j++)
+            t3_console_byte(&console, wire[j]);
+        now_us += 200;
+        t3_robot_tick(&robot);
+        t3_console_tick(&console);
+        note_bytes(eeprom, sizeof eeprom);
+    }
+    say("frames over USB", console.splitter.frames);
+}
+
 // Zeros on the host: it counts no cycles.
 static void measure(void)
 {
     uint8_t data[T3_RADIO_LIMIT + T3_TAG_SIZE], tag[T3_TAG_SIZE];
-    uint32_t signing, taking, idling, moving, loading, stepping;
+    uint32_t signing, taking, idling, moving, loading, stepping, standing;
     drawn = 1;
     live(true);
     t3_robot_packet(&robot, data, hello(data), now_us);
@@ -392,12 +431,18 @@ static void measure(void)
     for (uint8_t i = 0; i < 100; i++)
         t3_steps_tick(&robot.steps);
     stepping = cycles() / 100;
+    robot.steps.wheels[T3_LEFT].increment = robot.steps.wheels[T3_RIGHT].increment = 0;
+    start_clock();
+    for (uint8_t i = 0; i < 100; i++)
+        t3_steps_tick(&robot.steps);
+    standing = cycles() / 100;
     say("cycles of a tag", signing);
     say("cycles of a signed CMD", taking);
     say("cycles of an idle round", idling);
     say("cycles of a round with ramp", moving);
     say("cycles of a round with STATE", loading);
     say("cycles of a stepping tick", stepping);
+    say("cycles of a tick at rest", standing);
 }
 
 int main(void)
@@ -406,6 +451,7 @@ int main(void)
     live(false);
     live(true);
     relay();
+    wire_up();
     for (uint16_t count = 0; count < 1030; count++)
         note(t3_range_code(count) + t3_battery_mv(count));
     say("checksum", checksum);

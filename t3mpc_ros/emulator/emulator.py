@@ -9,6 +9,7 @@ import random
 
 from t3mpc_ros.emulator.agenda import MICROSECOND, Agenda
 from t3mpc_ros.emulator.board import Board
+from t3mpc_ros.emulator.board.rules import LOOP_US, SETTLE_SLOW_US, SETTLE_US
 from t3mpc_ros.emulator.dongle.ether import Ether, RadioSettings
 from t3mpc_ros.emulator.dongle.firmware import Dongle
 from t3mpc_ros.emulator.dongle.line import Line
@@ -18,8 +19,11 @@ from t3mpc_ros.motion.words import NANOSECONDS
 from t3mpc_ros.robot.twin.settings import TwinSettings
 from t3mpc_ros.settings import SettingError, Settings, nested, setting
 
+_RATES = ('250k', '1M', '2M')
 _POWER_ON, _EXTERNAL, _BROWN_OUT = 1, 2, 4
 """Causes of a reset, as the MCUSR of an AVR has them."""
+_BOOT_LOADER_NS = NANOSECONDS
+"""Of the robot's board."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,7 @@ class EmulatorSettings(Settings):
         1.5, 'how long the boot loader of the dongle takes', unit='s', low=0.0, high=10.0
     )
     channel: int = setting(82, 'of the robot: 2400 MHz plus this', unit='MHz', low=0, high=125)
+    rate: str = setting('1M', 'bits per second of the robot in the air', choices=_RATES)
 
     def check_together(self) -> None:
         """Raise SettingError when the robot would not be the one the board is made for."""
@@ -82,13 +87,14 @@ class Emulator:
         nonces = random.Random(f'nonces {seed}')
         self._ether = Ether(
             self._agenda,
-            RadioSettings(channel=settings.channel),
+            RadioSettings(channel=settings.channel, rate=_RATES.index(settings.rate)),
             self._wake_robot,
             lambda payload: self.board.packet(payload),
             self.faults,
             random.Random(f'air {seed}'),
         )
-        self.board = Board(self.plant, key, nonces.randbytes, self._ether.load)
+        settle_us = SETTLE_SLOW_US if settings.rate == '250k' else SETTLE_US
+        self.board = Board(self.plant, key, nonces.randbytes, self._ether.load, settle_us)
         self._boot_ns = now_ns
         self._away = False
         """The robot has no power."""
@@ -98,6 +104,12 @@ class Emulator:
         self._from_host = Line(self._agenda, self.faults, self.dongle.feed)
         self._to_host = Line(self._agenda, self.faults, self._arrive)
         self._arrived: list[tuple[int, bytes]] = []
+        # The faults of the line are those of the dongle's.
+        sound = Faults(lambda: self._agenda.now_ns, seed)
+        self._from_cable = Line(self._agenda, sound, self._tell_console)
+        self._to_cable = Line(self._agenda, sound, self._arrive_by_cable)
+        self._said: list[tuple[int, bytes]] = []
+        self.board.console.reply = self._to_cable.send
         self.port_open = True
         """Whether there is a dongle to open."""
         self.port_name = 0
@@ -136,6 +148,40 @@ class Emulator:
     def _arrive(self, data: bytes) -> None:
         if self.port_open:
             self._arrived.append((self._agenda.now_ns, data))
+
+    # -- the USB of the robot ---------------------------------------------------------------------
+
+    def feed_robot(self, data: bytes, now_ns: int) -> None:
+        """Take what somebody writes to the robot's own USB at this time."""
+        self._agenda.run_to(now_ns)
+        self._from_cable.send(data)
+
+    def take_robot(self) -> list[tuple[int, bytes]]:
+        """Return what has come from the robot's own USB by now, each piece with its time."""
+        said, self._said = self._said, []
+        return said
+
+    def restart_robot(self) -> None:
+        """Start the robot anew, as opening its own port does to many boards."""
+        if not self._away:
+            self._from_cable.clear()
+            self._to_cable.clear()
+            self._cut_power()
+            self._agenda.at(
+                self._agenda.now_ns + _BOOT_LOADER_NS, lambda: self._boot_robot(_EXTERNAL)
+            )
+
+    def _tell_console(self, data: bytes) -> None:
+        if not self._wake_robot():
+            return
+        self.board.console.feed(data)
+        if (written_us := self.board.slot.due_us) is not None:
+            # A loop of the board later, by a clock that may be slow.
+            later_us = 1.02 * (written_us - self.board.now_us) + LOOP_US
+            self._agenda.after_us(later_us, lambda: _ignore(self._wake_robot()))
+
+    def _arrive_by_cable(self, data: bytes) -> None:
+        self._said.append((self._agenda.now_ns, data))
 
     # -- what goes wrong --------------------------------------------------------------------------
 
@@ -248,6 +294,10 @@ class Emulator:
         self._away = False
         self._boot_ns = self._agenda.now_ns
         self.board.boot(cause)
+
+
+def _ignore(awake: bool) -> None:
+    """Take no notice of whether the robot is awake."""
 
 
 def _nothing() -> None:

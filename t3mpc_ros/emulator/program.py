@@ -4,6 +4,7 @@
 
 import argparse
 from collections.abc import Sequence
+from contextlib import ExitStack
 import math
 import os
 from pathlib import Path
@@ -38,21 +39,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with _Stop() as stop:
         print('board_emulator: getting ready', flush=True)
         emulator.plant.warm_up()
-        try:
-            port = PseudoPort(options.link)
-        except LinkError as error:
-            print(f'board_emulator: {error}', file=sys.stderr)
-            return 2
-        try:
+        with ExitStack() as ends:
+            try:
+                port = PseudoPort(options.link)
+                ends.callback(port.close)
+                cable = None
+                if options.robot_link is not None:
+                    cable = PseudoPort(options.robot_link)
+                    ends.callback(cable.close)
+            except LinkError as error:
+                print(f'board_emulator: {error}', file=sys.stderr)
+                return 2
             secured = 'signed commands only' if key else 'no key'
+            usb = f", the robot's own USB at {options.robot_link.absolute()}" if cable else ''
             print(
-                f'board_emulator: dongle and robot at {options.link.absolute()} ({secured}); '
+                f'board_emulator: dongle and robot at {options.link.absolute()}{usb} ({secured}); '
                 f'stop with Ctrl-C or kill {os.getpid()}',
                 flush=True,
             )
-            serve(emulator, port, options.speed, stop, options.restart_on_open)
-        finally:
-            port.close()
+            serve(emulator, port, options.speed, stop, options.restart_on_open, cable)
     print('board_emulator: stopped', flush=True)
     return 0
 
@@ -127,6 +132,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add('--link', type=Path, required=True, help='path of the port: a symbolic link is put there')
+    add('--robot-link', type=Path, help="the same for the USB of the robot's own board: its key")
     add('--world', default='', help='world to drive in; empty: an endless plain')
     add('--loss', type=_share, default=0.0, help='share of lost packets, each way')
     add(
@@ -142,7 +148,7 @@ def _parser() -> argparse.ArgumentParser:
     add(
         '--restart-on-open',
         action='store_true',
-        help='opening the port restarts the dongle, as it does with many boards',
+        help='opening a port restarts its board, as it does with many',
     )
     add(
         '--set',

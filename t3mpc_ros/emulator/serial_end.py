@@ -116,6 +116,7 @@ def serve(
     speed: float,
     stopped: Callable[[], bool],
     restarts: bool = False,
+    cable: PseudoPort | None = None,
 ) -> None:
     """Let the emulator run on the wall clock until ``stopped()``.
 
@@ -130,10 +131,13 @@ def serve(
     stopped
         Asked 50 times a second at least.
     restarts
-        Opening the port restarts the dongle, as DTR does with many boards.
+        Opening a port restarts its board, as DTR does with many.
+    cable
+        Where the robot's own USB is, if anywhere.
     """
     now_ns, clock = emulator.now_ns, time.monotonic()
     name, there, connected = emulator.port_name, emulator.port_open, False
+    robot = None if cable is None else _RobotEnd(emulator, cable, restarts)
     while not stopped():
         next_ns = emulator.next_ns
         until_ns = now_ns + _LOOK_NS if next_ns is None else min(next_ns, now_ns + _LOOK_NS)
@@ -151,9 +155,32 @@ def serve(
         if connected:
             for _, data in arrived:
                 port.write(data)
+        if robot is not None:
+            robot.look(now_ns)
         if emulator.port_open != there:
             there = emulator.port_open
             port.open() if there else port.close()
         if emulator.port_name != name:
             name = emulator.port_name
             port.open()
+
+
+class _RobotEnd:
+    """The USB of the robot, looked at whenever the dongle's is: 50 times a second at least."""
+
+    def __init__(self, emulator: Emulator, port: PseudoPort, restarts: bool) -> None:
+        self._emulator = emulator
+        self._port = port
+        self._restarts = restarts
+        self._connected = False
+
+    def look(self, now_ns: int) -> None:
+        received = self._port.wait(0.0)
+        if received is not None and not self._connected and self._restarts:
+            self._emulator.restart_robot()
+        self._connected = received is not None
+        if received:
+            self._emulator.feed_robot(received, now_ns)
+        for _, data in self._emulator.take_robot():
+            if self._connected:
+                self._port.write(data)

@@ -64,6 +64,14 @@ def read_key(path: Path) -> bytes:
     return key
 
 
+def key_check(key: bytes) -> int:
+    """Return 32 bits by which two people can tell whether their keys are the same.
+
+    They say no more of the key than how one may be tried: it must have been drawn, not thought of.
+    """
+    return int.from_bytes(siphash(key, b't3mpc')[:4], 'little')
+
+
 def session_key(key: bytes, host_nonce: bytes, robot_nonce: bytes) -> bytes:
     """Return the key (16 bytes) of a session from the long-term key and both nonces."""
     for name, nonce in (('host_nonce', host_nonce), ('robot_nonce', robot_nonce)):
@@ -139,17 +147,30 @@ class Gate:
     ----------
     key
         The long-term key; empty for a robot without one.
+    locked
+        The key is damaged, or about to change: nobody gets in, everybody may stop the robot.
     """
 
-    def __init__(self, key: bytes = b'') -> None:
+    def __init__(self, key: bytes = b'', locked: bool = False) -> None:
         if key and len(key) != KEY_SIZE:
             raise ValueError(f'key must be {KEY_SIZE} bytes long: got {len(key)}')
         self._key = key
+        self._locked = locked
         self._session = 0
         self._session_key = b''
         self._host_nonce = b''
-        self._robot_nonce = bytes(NONCE_SIZE) if key else b''
+        self._robot_nonce = bytes(NONCE_SIZE) if key or locked else b''
         self._last = (0, 0)
+
+    @property
+    def key(self) -> bytes:
+        """The long-term key; empty if there is none, or none that can be used."""
+        return self._key
+
+    @property
+    def locked(self) -> bool:
+        """Whether nobody gets in."""
+        return self._locked
 
     @property
     def session(self) -> int:
@@ -167,6 +188,8 @@ class Gate:
         ``fresh_nonce`` (8 bytes nobody can foresee) becomes the robot's, unless this HELLO repeats
         the last one: the host has not heard the answer, and nothing changes.
         """
+        if self._locked:
+            return 'the key is damaged'
         if bool(self._key) != bool(hello.tag):
             return 'no key to check the HELLO with' if hello.tag else 'HELLO is not signed'
         if self._key:
@@ -180,13 +203,25 @@ class Gate:
         self._session = hello.session
         return ''
 
+    def end(self) -> None:
+        """Forget the session: the HELLO that began it may begin another, with a new nonce."""
+        self._session = 0
+        self._host_nonce = b''
+
     def check(self, frame: Signed) -> str:
         """Return why a frame does not count; when it does, none like it or older counts again.
 
-        A CMD with ESTOP always counts, and takes no part in the order of the others.
+        A CMD with ESTOP always counts; what else it says does only if :meth:`admit` takes it.
         """
-        if isinstance(frame, Command) and frame.flags & Flag.ESTOP:
-            return ''
+        why = self.admit(frame)
+        return '' if isinstance(frame, Command) and frame.flags & Flag.ESTOP else why
+
+    def admit(self, frame: Signed) -> str:
+        """Return why a frame is none of the session's; when it is, it is part of the order.
+
+        So is a well-signed ESTOP: one that is repeated for hours keeps the epoch known. One that
+        is not well signed leaves no trace in it.
+        """
         if not self._session or frame.session != self._session:
             return f'session is {self._session}: got {frame.session}'
         if not self._key:

@@ -20,10 +20,14 @@ from t3mpc_ros.radio.frames import (
     Configured,
     Downlink,
     Fault,
+    Flag,
     FrameError,
+    FromBoard,
     FromDongle,
     Hello,
     Info,
+    Key,
+    KeyState,
     Param,
     ParamGet,
     ParamSet,
@@ -33,6 +37,7 @@ from t3mpc_ros.radio.frames import (
     Refusal,
     Result,
     State,
+    ToBoard,
     ToDongle,
     Transmit,
     Uplink,
@@ -71,7 +76,9 @@ def exchange(status: int) -> Exchange:
     return said
 
 
-def encode(frame: Downlink | Uplink | ToDongle | FromDongle) -> bytes:
+def encode(
+    frame: Downlink | Uplink | ToDongle | FromDongle | ToBoard | FromBoard,
+) -> bytes:
     """Return the bytes of a frame, without the CRC of the serial line.
 
     Raises
@@ -94,6 +101,12 @@ def encode(frame: Downlink | Uplink | ToDongle | FromDongle) -> bytes:
 def decode_down(data: bytes) -> Downlink:
     """Return the radio payload a host sends, or raise FrameError."""
     return _decode(data, _DOWN)  # type: ignore[no-any-return]
+
+
+def asks_to_stop(data: bytes) -> bool:
+    """Return whether this is a CMD that asks for an emergency stop, whatever else is wrong."""
+    sizes = [form.size for form in _DOWN[0x11].forms]
+    return len(data) in sizes and data[0] == 0x11 and bool(data[3] & Flag.ESTOP)
 
 
 def decode_up(data: bytes) -> Uplink:
@@ -125,6 +138,16 @@ def decode_from_dongle(data: bytes) -> FromDongle:
     frame: Result = form.unpack(data[: form.size])._replace(payload=data[form.size :])
     _check_answer(frame)
     return frame
+
+
+def decode_to_board(data: bytes) -> ToBoard:
+    """Return the frame a host sends over the robot's own USB, or raise FrameError."""
+    return _decode(data, _TO_BOARD)  # type: ignore[no-any-return]
+
+
+def decode_from_board(data: bytes) -> FromBoard:
+    """Return the frame a robot sends over its own USB, or raise FrameError."""
+    return _decode(data, _FROM_BOARD)  # type: ignore[no-any-return]
 
 
 class _Column(NamedTuple):
@@ -321,4 +344,13 @@ _FROM_DONGLE = {
         'crc_errors H, frame_errors H, overruns H, reset_cause B',
     ),
     0x8F: _layout(Refusal, 'ERR', 0x8F, 'code B 1 3, argument B'),
+}
+_TO_BOARD = {
+    0x03: _TO_DONGLE[0x03],
+    0x04: _layout(Key, 'KEY', 0x04, 'id B', 'id B, key 16s'),
+}
+_FROM_BOARD = {
+    0x83: _FROM_DONGLE[0x83],
+    0x84: _layout(KeyState, 'KEY', 0x84, 'id B, rc B 0 5, state B 0 2, check I'),
+    0x8F: _FROM_DONGLE[0x8F],
 }

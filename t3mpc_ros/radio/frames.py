@@ -56,8 +56,10 @@ STATE, AUX, INFO = 0, 1, 2
 """What a POLL asks for."""
 RESET_ODOMETRY, CLEAR_COUNTERS = 1, 2
 """Verbs of an ACTION; the first is refused while the robot moves."""
-OK, UNKNOWN, OUT_OF_RANGE, READ_ONLY, BUSY = range(5)
-"""Results in PARAM and ACK."""
+OK, UNKNOWN, OUT_OF_RANGE, READ_ONLY, BUSY, FAILED = range(6)
+"""Results in PARAM, ACK and, the last only there, KEY."""
+NO_KEY, KEY_HELD, KEY_DAMAGED = range(3)
+"""What a robot tells of its key."""
 AGE_NONE = 0xFFFF
 """Age in a STATE before the first CMD of a session."""
 
@@ -315,10 +317,33 @@ class Refusal(NamedTuple):
     """First byte of that frame; for 3, its id."""
 
 
+class Key(NamedTuple):
+    """KEY, host to the robot's own USB: store a key, or forget it; without one: only ask."""
+
+    id: int
+    key: bytes = b''
+    """16 bytes; all zero: forget it."""
+
+
+class KeyState(NamedTuple):
+    """KEY, robot to host over its own USB: what became of it, and what there is now."""
+
+    id: int
+    rc: int
+    """OK, BUSY: it moves, its drivers are on, or it is writing one; FAILED: it did not hold."""
+    state: int
+    """NO_KEY, KEY_HELD or KEY_DAMAGED."""
+    check: int
+    """``authentication.key_check`` of a key that is held, else 0."""
+
+
 Downlink = Command | ParamGet | ParamSet | Hello | Poll | Action
 Uplink = State | Param | Info | Ack | Aux
 ToDongle = Transmit | Configure | Ping
 FromDongle = Result | Configured | Pong | Refusal
+ToBoard = Ping | Key
+"""Over the USB of the robot's own board, as the next."""
+FromBoard = Pong | KeyState | Refusal
 
 
 # -- parameters of the robot ----------------------------------------------------------------------

@@ -109,6 +109,24 @@ FROM_DONGLE = {
     'busy': frames.Refusal(3, 0x2A),
 }
 
+TO_BOARD = {
+    'ask for the key': frames.Key(1),
+    'store a key': frames.Key(2, bytes(range(0x80, 0x90))),
+    'forget the key': frames.Key(3, bytes(16)),
+    'ping': frames.Ping(4, b'\x00\x11\x22\x33'),
+}
+FROM_BOARD = {
+    'no key': frames.KeyState(1, frames.OK, frames.NO_KEY, 0),
+    'a key': frames.KeyState(
+        2, frames.OK, frames.KEY_HELD, authentication.key_check(bytes(range(0x80, 0x90)))
+    ),
+    'busy': frames.KeyState(3, frames.BUSY, frames.KEY_HELD, 0xFFFFFFFF),
+    'it did not hold': frames.KeyState(4, frames.FAILED, frames.KEY_DAMAGED, 0),
+    'pong': frames.Pong(4, b'\x00\x11\x22\x33', 4711, 1, 1, 2, 1, 10, 20, 65535, 0x02),
+    'not for a robot': frames.Refusal(1, 0x01),
+}
+KEYS = (bytes(range(0x80, 0x90)), bytes(range(16)), b'\xff' * 16)
+
 ONE_OF_EACH = codec.encode(GOLDEN_COMMAND).hex()
 REJECTED = (
     ('down', '', 'length'),
@@ -139,6 +157,15 @@ REJECTED = (
     ('from dongle', '8100050000000000', 'value'),
     ('from dongle', '8100020000000000', 'value'),
     ('from dongle', '8f0000', 'value'),
+    ('to board', '04', 'length'),
+    ('to board', '0401' + 15 * '11', 'length'),
+    ('to board', '0401' + 17 * '11', 'length'),
+    ('to board', '0200', 'kind'),
+    ('to board', '0100000115', 'kind'),
+    ('from board', '84010000000000', 'length'),
+    ('from board', '8401060000000000', 'value'),
+    ('from board', '8401000300000000', 'value'),
+    ('from board', '8100010000000000', 'kind'),
 )
 
 
@@ -267,12 +294,53 @@ def _session() -> dict:
             )
         ],
         'robot': rows,
+        'stops': _stops(key),
         'robot_without_key': [
             {
                 'name': 'a signed HELLO cannot be checked',
                 'bytes': codec.encode(first).hex(),
                 'accepted': not keyless.greet(first, bytes(8)),
             },
+        ],
+    }
+
+
+def _stops(key: bytes) -> dict:
+    """Return what becomes of emergency stops: all are obeyed, `counted` are those in the order."""
+    start = 0xFFFFF000
+    host, fresh = bytes.fromhex('2122232425262728'), bytes.fromhex('c1c2c3c4c5c6c7c8')
+    gate = authentication.Gate(key)
+    hello = authentication.sign_hello(key, 0x5B, 1, start, host)
+    if why := gate.greet(hello, fresh):
+        raise ValueError(f'HELLO must be accepted: got {why}')
+    signer = authentication.Signer(authentication.session_key(key, host, fresh), start)
+    stop = frames.Command(0x5B, 1, Flag.ESTOP, 0, 0, 0, 0)
+    before = signer.sign(GOLDEN_COMMAND._replace(session=0x5B, seq=2, host_us=start + 10))
+    signed = signer.sign(stop._replace(seq=3, host_us=start + 20))
+    wrapped = signer.sign(stop._replace(seq=4, host_us=5))
+    later = signer.sign(GOLDEN_COMMAND._replace(session=0x5B, seq=5, host_us=30))
+    story = (
+        ('ESTOP of nobody', stop._replace(session=0)),
+        ('ESTOP without a tag', stop),
+        ('ESTOP with a bad tag, of a time to come', stop._replace(host_us=start + 999, tag=TAG)),
+        ('ESTOP', signed),
+        ('CMD that was overtaken by it', before),
+        ('ESTOP again', signed),
+        ('ESTOP after the wrap of host_us', wrapped),
+        ('ESTOP of before the wrap', signed),
+        ('CMD after it', later),
+    )
+    return {
+        'hello': codec.encode(hello).hex(),
+        'fresh_nonce': fresh.hex(),
+        'frames': [
+            {
+                'name': name,
+                'kind': 'Command',
+                'bytes': codec.encode(frame).hex(),
+                'counted': not gate.admit(frame),
+            }
+            for name, frame in story
         ],
     }
 
@@ -321,6 +389,9 @@ def vectors() -> dict:
         'up': _frames(UP, False),
         'to_dongle': _frames(TO_DONGLE, True),
         'from_dongle': _frames(FROM_DONGLE, True),
+        'to_board': _frames(TO_BOARD, True),
+        'from_board': _frames(FROM_BOARD, True),
+        'key_checks': [{'key': key.hex(), 'check': authentication.key_check(key)} for key in KEYS],
         'wire': _random_wires(),
         'rejected': [
             {'direction': direction.replace(' ', '_'), 'bytes': data, 'fault': fault}

@@ -6,7 +6,21 @@ from typing import NamedTuple
 
 from t3mpc_ros.emulator.board.hardware import Registers
 from t3mpc_ros.emulator.board.parameters import Parameters
-from t3mpc_ros.radio.frames import PARAMETERS, Aux, Param, State, Status, Uplink
+from t3mpc_ros.radio.authentication import Gate
+from t3mpc_ros.radio.frames import (
+    AGE_NONE,
+    PARAMETERS,
+    VERSION,
+    Aux,
+    Info,
+    Param,
+    State,
+    Status,
+    Uplink,
+)
+
+MAJOR, MINOR = 1, 0
+"""Of the firmware."""
 
 _COUNTERS = (
     'received',
@@ -44,6 +58,31 @@ class Counters:
     def add(self, name: str) -> None:
         """Count one more of what has a field of that name in AUX."""
         self._counts[name] = self._counts[name] + 1 & 0xFFFF
+
+
+def tell_info(
+    gate: Gate, seq: int, reset_cause: int, steps: tuple[int, int], time_us: int, status: Status
+) -> Info:
+    """Return the INFO of this instant; ``steps`` of a turn and microsteps of a step."""
+    who = VERSION, MAJOR, MINOR, reset_cause, len(PARAMETERS)
+    return Info(gate.session, seq, *who, *steps, time_us, status, gate.nonce)
+
+
+def tell_state(
+    session: int,
+    seq: int,
+    status: Status,
+    time_us: int,
+    counters: tuple[int, int],
+    sample: Registers,
+    age_us: int | None,
+    ranges: bytes,
+) -> State:
+    """Return the STATE of this instant; ``age_us`` of the last command, None: there was none."""
+    age = AGE_NONE if age_us is None else min(age_us // 10, AGE_NONE)
+    left, right = map(signed, counters)
+    axes = sample.gyro_z, sample.accel_x, sample.accel_y
+    return State(session, seq, status, time_us, left, right, *axes, age, ranges)
 
 
 def tell_parameter(session: int, answer: Answer, values: Parameters) -> Param:

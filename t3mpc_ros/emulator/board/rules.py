@@ -9,13 +9,9 @@ The main loop comes round every 200 us, as that of the firmware's core does on a
 
 from collections.abc import Callable
 
-from t3mpc_ros.emulator.board.answers import (
-    Answer,
-    Counters,
-    signed,
-    tell_aux,
-    tell_parameter,
-)
+from t3mpc_ros.emulator.board import answers
+from t3mpc_ros.emulator.board.answers import Answer, Counters
+from t3mpc_ros.emulator.board.console import Console, KeySlot
 from t3mpc_ros.emulator.board.freshness import Freshness
 from t3mpc_ros.emulator.board.hardware import Hardware, Registers
 from t3mpc_ros.emulator.board.parameters import (
@@ -29,10 +25,9 @@ from t3mpc_ros.emulator.board.parameters import (
 )
 from t3mpc_ros.emulator.board.wheels import Wheels
 from t3mpc_ros.radio import frames
-from t3mpc_ros.radio.authentication import NONCE_SIZE, Gate
-from t3mpc_ros.radio.codec import decode_down, encode
+from t3mpc_ros.radio.authentication import NONCE_SIZE
+from t3mpc_ros.radio.codec import asks_to_stop, decode_down, encode
 from t3mpc_ros.radio.frames import (
-    AGE_NONE,
     PARAMETERS,
     PAYLOAD_LIMIT,
     Action,
@@ -49,13 +44,12 @@ from t3mpc_ros.radio.frames import (
 )
 
 LOOP_US = 200
-SETTLE_US = 600
-"""The answer is loaded when the acknowledgement of the packet before is off the air."""
+SETTLE_US, SETTLE_SLOW_US = 600, 1600
+"""Until the acknowledgement of the packet before is off the air; the second at 250 kbit/s."""
 REFRESH_US = 100_000
 """Nobody asks: what waits in the radio is made anew so often."""
 SILENCE_US = 1_800_000_000
 """A session ends after so long: beyond it, clocks of 32 bits become ambiguous."""
-MAJOR, MINOR = 1, 0
 STEP_RATE = 10_000
 """Most microsteps a second of a wheel: one for two ticks of a 20 kHz interrupt."""
 _TURN = 6_283_185.3071795865
@@ -75,6 +69,8 @@ class Board:
         Returns that many bytes nobody can foresee, for nonces.
     load
         Puts a payload where the next packet fetches it.
+    settle_us
+        From a packet to its answer.
     """
 
     def __init__(
@@ -83,23 +79,32 @@ class Board:
         key: bytes,
         entropy: Callable[[int], bytes],
         load: Callable[[bytes], None],
+        settle_us: int = SETTLE_US,
     ) -> None:
         self._hardware = hardware
-        self._key = key
+        self.slot = KeySlot(key)
+        """Where the key is kept."""
         self._entropy = entropy
         self._load_payload = load
+        self._settle_us = settle_us
         self._values = Parameters()
         self.button = False
         """Whether the emergency stop is pressed."""
         self.followed: Callable[[int, Command], None] = lambda now_us, command: None
         """Told of each command that the wheels are to follow, and when; for tests and traces."""
+        self.console = Console(self)
+        """What answers on the USB of the board."""
+        self._now = 0
         self.boot(1)
 
     def boot(self, reset_cause: int, time_us: int = 0) -> None:
         """Start at rest, drivers without power, no session; what was in RAM is gone."""
+        self.slot.cut(self._now)
         self._now = self._booted = time_us
-        self._reset_cause = reset_cause
-        self._gate = Gate(self._key)
+        self.reset_cause = reset_cause
+        """As the MCUSR of an AVR has it."""
+        self.gate = self.slot.gate()
+        self.console.restart()
         self._values.restart()
         self._microsteps = self._values[MICROSTEPS]
         steps = self._values[STEPS_PER_REV] * self._microsteps
@@ -113,11 +118,10 @@ class Board:
         self._ttl_end: int | None = None
         self._seq: int | None = None
         self._command_us: int | None = None
-        self._heard_us = time_us
+        self._heard_us = self._loaded_us = time_us
         self._acted: tuple[int, int, int] | None = None
         self._answer = Answer()
         self._answer_due: int | None = time_us
-        self._loaded_us = time_us
         self._stirred = True
         """Something has happened that the next round of the main loop must look at."""
         self._hardware.boot(self._microsteps)
@@ -132,7 +136,12 @@ class Board:
     @property
     def session(self) -> int:
         """The session it is in; 0: none."""
-        return self._gate.session
+        return self.gate.session
+
+    @property
+    def rests(self) -> bool:
+        """Whether the robot stands and its drivers have no power."""
+        return not (self._enabled or self._wheels.powered or self._ramp.busy)
 
     @property
     def speeds(self) -> tuple[int, int]:
@@ -161,7 +170,7 @@ class Board:
             (Status.TTL_EXPIRED, self._expired),
             (Status.IMU_FAULT, self._imu_fault),
             (Status.LOW_BATTERY, 0 < supply < self._values[BATTERY_LOW]),
-            (Status.NO_SESSION, not self._gate.session),
+            (Status.NO_SESSION, not self.gate.session),
             (Status.LIMITED, self._limited),
         )
         return Status(sum(bit for bit, holds in bits if holds))
@@ -189,13 +198,15 @@ class Board:
         after = self._now - (self._now - self._booted) % LOOP_US + LOOP_US
         if self._stirred:
             return after
-        times = [self._heard_us + SILENCE_US] if self._gate.session else []
+        times = [self._heard_us + SILENCE_US] if self.gate.session else []
         times.append(
             self._loaded_us + REFRESH_US if self._answer_due is None else self._answer_due
         )
         if self._ttl_end is not None:
             times.append(self._ttl_end)
         times += self._wheels.due_us()
+        if (written_us := self.slot.due_us) is not None:
+            times.append(written_us)
         return max(after, min(times) + (self._booted - min(times)) % LOOP_US)
 
     def _round(self) -> None:
@@ -207,12 +218,13 @@ class Board:
             self._ttl_end, self._expired = None, True
             self._counts.add('expired')
             self._ramp.halt()
-        if self._gate.session and now - self._heard_us > SILENCE_US:
-            self._gate = Gate(self._key)
+        if self.gate.session and now - self._heard_us > SILENCE_US:
+            self.gate.end()
             self._disable()
         self._wheels.switch_power(self._enabled, now)
         self._stirred = self._wheels.move_on(now)
         self._load()
+        self.console.tick()
 
     def _load(self) -> None:
         if self._answer_due is not None:
@@ -237,11 +249,11 @@ class Board:
             self._counts.add('short')
             return
         self._stirred = True
-        if _asks_to_stop(data):
+        if asks_to_stop(data):
             self._latch()
         # Whatever is wrong with a packet, the next one fetches a state that says so.
         self._answer = Answer()
-        self._answer_due = self._now + SETTLE_US
+        self._answer_due = self._now + self._settle_us
         try:
             frame = decode_down(data)
         except FrameError as error:
@@ -259,23 +271,21 @@ class Board:
             self._obey(frame)
 
     def _admits(self, frame: Command | ParamGet | ParamSet | Action) -> bool:
-        session = self._gate.session
+        session = self.gate.session
         if isinstance(frame, ParamGet):
             return bool(session) and frame.session == session
-        if isinstance(frame, Command) and frame.flags & Flag.ESTOP:
-            # It is obeyed already. The gate lets every stop pass: of whom nobody knows, nothing
-            # else is believed, or a stranger's number would make the host's next ones look old.
-            return not self._key and not frame.tag and 0 < session == frame.session
-        return self._gate.check(frame) == ''
+        # An ESTOP is obeyed already. Of whom nobody knows, nothing else is believed, or a
+        # stranger's number would make the host's next ones look old.
+        return self.gate.admit(frame) == ''
 
     def _greet(self, hello: Hello) -> None:
         # Refused or not, INFO tells the host which session holds and whether there is a key.
         self._answer = Answer(frames.Info, hello.seq)
-        before = self._gate.nonce
-        if self._gate.greet(hello, self._entropy(NONCE_SIZE)):
+        before = self.gate.nonce
+        if self.gate.greet(hello, self._entropy(NONCE_SIZE)):
             self._counts.add('bad_session')
             return
-        if self._key and self._gate.nonce == before:
+        if self.gate.key and self.gate.nonce == before:
             return  # the host has not heard the answer
         self._disable()
         self._expired = self._limited = False
@@ -368,15 +378,13 @@ class Board:
     # -- answers ----------------------------------------------------------------------------------
 
     def _tell(self, answer: Answer) -> Uplink:
-        session, seq = self._gate.session, answer.seq
+        session, seq = self.gate.session, answer.seq
         time_us = self._now & 0xFFFFFFFF
         if answer.kind is frames.Info:
-            who = frames.VERSION, MAJOR, MINOR, self._reset_cause, len(PARAMETERS)
             steps = self._values[STEPS_PER_REV], self._microsteps
-            nonce = self._gate.nonce
-            return frames.Info(session, seq, *who, *steps, time_us, self.status, nonce)
+            return answers.tell_info(self.gate, seq, self.reset_cause, steps, time_us, self.status)
         if answer.kind is frames.Param:
-            return tell_parameter(session, answer, self._values)
+            return answers.tell_parameter(session, answer, self._values)
         if answer.kind is frames.Ack:
             return frames.Ack(session, seq, answer.id, answer.rc)
         sample = self._hardware.registers
@@ -384,17 +392,9 @@ class Board:
         sample = sample or Registers()
         if answer.kind is frames.Aux:
             battery, counts = self._hardware.battery, self._counts
-            return tell_aux(session, seq, self.status, battery, sample, counts, time_us)
-        age = AGE_NONE
-        if self._command_us is not None:
-            age = min((self._now - self._command_us) // 10, AGE_NONE)
-        left, right = self.counters
-        steps = signed(left), signed(right)
-        axes = sample.gyro_z, sample.accel_x, sample.accel_y
+            return answers.tell_aux(session, seq, self.status, battery, sample, counts, time_us)
+        age_us = None if self._command_us is None else self._now - self._command_us
         seq, ranges = self._seq or 0, self._hardware.ranges
-        return frames.State(session, seq, self.status, time_us, *steps, *axes, age, ranges)
-
-
-def _asks_to_stop(data: bytes) -> bool:
-    """Return whether this is a CMD that asks for an emergency stop, whatever else is wrong."""
-    return len(data) in (14, 22) and data[0] == 0x11 and bool(data[3] & Flag.ESTOP)
+        return answers.tell_state(
+            session, seq, self.status, time_us, self.counters, sample, age_us, ranges
+        )

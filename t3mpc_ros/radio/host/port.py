@@ -38,6 +38,8 @@ class Port:
     ----------
     path
         Such as ``/dev/serial/by-id/…``: it stays the same when the dongle is plugged in anew.
+    device
+        What ought to be there, for the words of errors.
 
     Raises
     ------
@@ -45,14 +47,15 @@ class Port:
         It cannot be opened; an error at any later call closes it first.
     """
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: str, device: str = 'the dongle') -> None:
         self._path = path
+        self._device = device
         try:
             self._serial = serial.Serial(
                 path, BAUD, timeout=0, write_timeout=_WRITE_TIMEOUT, exclusive=True
             )
         except _FAILURES as error:
-            raise _explained(path, error) from error
+            raise _explained(path, device, error) from error
         self.low_latency = self._ask_for_low_latency()
         """Whether the driver took the request; CDC-ACM needs none, FTDI 16 ms without."""
 
@@ -101,16 +104,16 @@ class Port:
     def _give_up(self, error: Exception) -> NoReturn:
         # At once: while the dead device is held, the dongle comes back under another name.
         self.close()
-        raise _explained(self._path, error) from error
+        raise _explained(self._path, self._device, error) from error
 
 
-def _explained(path: str, error: Exception) -> PortError:
+def _explained(path: str, device: str, error: Exception) -> PortError:
     """Return the error in words, with the remedy."""
     code = getattr(error, 'errno', None)
     if isinstance(error, termios.error) and error.args:
         code = error.args[0]
     if code in (errno.ENOENT, errno.ENXIO, errno.ENODEV) or not os.path.exists(path):
-        return PortError(f'{path} is not there: is the dongle plugged in?', True)
+        return PortError(f'{path} is not there: is {device} plugged in?', True)
     if code in (errno.EACCES, errno.EPERM):
         return PortError(
             f'{path} may not be opened: permission denied; sudo usermod -aG dialout $USER, '

@@ -34,7 +34,7 @@ from t3mpc_ros.radio.link.words import Close, Deed, Open, Phase, Wait, Write
 from t3mpc_ros.radio.statistics import LinkStatistics, Quality
 from t3mpc_ros.robot.backend import BatteryReading, RobotCommand
 
-_BACK_OFF_NS, _LONGEST_BACK_OFF_NS = NANOSECONDS // 5, 2 * NANOSECONDS
+_BACK_OFF_NS, _LONGEST_NS = NANOSECONDS // 5, 2 * NANOSECONDS
 _PING_NS = _CFG_NS = NANOSECONDS // 10
 _PING_PATIENCE_NS = 5 * NANOSECONDS
 """For the boot loader of a dongle that opening the port has reset: 1.5 s."""
@@ -207,8 +207,8 @@ class Link:
             self._statistics.port_failures += 1
         self._close(Phase.CLOSED, text)
         self._due_ns = now_ns + (_BACK_OFF_NS if absent else self._back_off_ns)
-        if not absent:
-            self._back_off_ns = min(2 * self._back_off_ns, _LONGEST_BACK_OFF_NS)
+        # One that went away may come back free: whoever held it has lost it, too.
+        self._back_off_ns = min(_BACK_OFF_NS if absent else 2 * self._back_off_ns, _LONGEST_NS)
 
     def step(self, now_ns: int, received: bytes = b'') -> list[Deed]:
         """Return what to do now; the last deed says until when there is nothing more to do."""

@@ -10,6 +10,8 @@ from t3mpc_ros.settings import SettingError, Settings, nested, setting
 _RATES = ('250k', '1M', '2M')
 _POWERS = ('-18', '-12', '-6', '0')
 _GAP_UNIT = 250e-6
+_GAPS = {'250k': 2.75e-3, '1M': 1.5e-3, '2M': 1.75e-3}
+"""s; at 250k acknowledgements take long, at 2M the POLL would come before a tag is checked."""
 _GREETING_GAP = 5e-3
 """s; four hashes on a 16 MHz AVR"""
 _TTL_UNIT = 0.01
@@ -133,7 +135,7 @@ class LinkSettings(Settings):
     @property
     def gap(self) -> int:
         """Between CMD and POLL, in steps of 250 us: the answer must be off the air before."""
-        return round((2.75e-3 if self.rate == '250k' else 1.5e-3) / _GAP_UNIT)
+        return round(_GAPS[self.rate] / _GAP_UNIT)
 
     def gap_after(self, first: Downlink) -> int:
         """Return the gap after a first packet: a board with a key hashes long over a HELLO."""

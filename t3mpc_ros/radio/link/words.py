@@ -52,7 +52,10 @@ NO_CHIP = 'the radio chip of the dongle does not answer: check its wiring and su
 NOT_SET = 'the dongle does not take the settings of the radio'
 NO_KEY_HERE = 'the robot wants signed commands: give the host the key'
 NO_KEY_THERE = 'the robot has no key to check our signature with: store it there, or use none here'
-WRONG_KEY = 'the robot does not accept our HELLO: the keys differ'
+WRONG_KEY = (
+    'the robot does not accept our HELLO: the keys differ, or its own is damaged '
+    '(radio_tool key state)'
+)
 NO_SESSION = 'the robot does not accept our HELLO'
 NOT_TAKEN = 'the robot hears commands but takes none of them'
 DISABLED = 'the drives of the robot are not enabled yet'

@@ -1,0 +1,601 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``radio_tool`` against the emulator: in virtual time, and once over pseudo terminals."""
+
+import math
+import os
+import random
+import signal
+import stat
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+from t3mpc_ros.emulator.emulator import Emulator, EmulatorSettings
+from t3mpc_ros.radio import frames
+from t3mpc_ros.radio.authentication import KeyFileError, key_check, read_key
+from t3mpc_ros.radio.bench import keys, probe, program, reading, search, turn
+from t3mpc_ros.radio.bench.errand import Errand, ErrandError
+from t3mpc_ros.radio.codec import decode_from_board, decode_from_dongle
+from t3mpc_ros.radio.frames import Flag, Status
+from t3mpc_ros.radio.link import LinkSettings
+from t3mpc_ros.radio.link.words import Close, Open, Wait, Write
+
+KEY, OTHER = bytes(range(16)), bytes(range(1, 17))
+START_NS = 5_000_000_000
+TURN = 3200
+
+
+class Bench:
+    """An emulator, and whoever holds one of its two ports, in virtual time."""
+
+    def __init__(self, key=b'', seed=1, **flat):
+        self.emulator = Emulator(EmulatorSettings.from_flat(flat), key, seed, START_NS)
+        self.now_ns = START_NS
+        self.each = None
+
+    @property
+    def board(self):
+        return self.emulator.board
+
+    def carry(self, task, robot=False, seconds=120.0):
+        """Carry a task out at the port of the dongle, or of the robot; return it."""
+        end, self.is_open, received = self.now_ns + round(seconds * 1e9), False, b''
+        while not task.done:
+            wake = self._do(task, task.step(self.now_ns, received), robot)
+            received = b''
+            while self.now_ns < wake and not received:
+                following = self.emulator.next_ns
+                self.now_ns = min(wake, max(following or wake, self.now_ns + 1000))
+                arrived = self.emulator.run_to(self.now_ns)
+                cable = self.emulator.take_robot()
+                if self.is_open:
+                    received = b''.join(data for _, data in (cable if robot else arrived))
+                if self.is_open and not robot and not self.emulator.port_open:
+                    self.is_open = False
+                    task.failed('dongle is not there', True, self.now_ns)
+                    break
+            if self.each is not None:
+                self.each(self)
+            assert self.now_ns < end, 'it must come to an end'
+        self._do(task, task.step(self.now_ns), robot)
+        assert not self.is_open
+        return task
+
+    def _do(self, task, deeds, robot):
+        wake = self.now_ns
+        for deed in deeds:
+            if isinstance(deed, Wait):
+                wake = deed.until_ns
+            elif isinstance(deed, Open):
+                self.is_open = True
+                task.opened(self.now_ns)
+                return self.now_ns
+            elif isinstance(deed, Write) and self.is_open and robot:
+                self.emulator.feed_robot(deed.data, self.now_ns)
+            elif isinstance(deed, Write) and self.is_open:
+                self.emulator.feed(deed.data, self.now_ns)
+            elif isinstance(deed, Close):
+                self.is_open = False
+        return wake
+
+    def at_dongle(self, talk):
+        """Return what a talk with the dongle comes to."""
+        return self._result(self.carry(Errand(talk, decode_from_dongle)))
+
+    def at_robot(self, talk):
+        """Return what a talk with the robot's own USB comes to."""
+        return self._result(self.carry(Errand(talk, decode_from_board), robot=True))
+
+    def _result(self, errand):
+        if errand.error:
+            raise ErrandError(errand.error)
+        return errand.result
+
+    def radio(self):
+        """Return how the radio of the dongle is set."""
+        return self.emulator.dongle._radio
+
+    def turn(self, wheel, revolutions, key=b'', speed=2.0, link=None):
+        said = []
+        task = turn.Turn(
+            link or LinkSettings(),
+            key,
+            random.Random(1).randbytes,
+            wheel,
+            revolutions,
+            speed,
+            said.append,
+        )
+        self.carry(task)
+        return task, said
+
+
+# -- key ------------------------------------------------------------------------------------------
+
+
+def test_a_new_key_is_closed_to_others_and_never_overwrites(tmp_path):
+    path = tmp_path / 'key'
+    drawn = iter([bytes(16), KEY])  # zeros mean something else: drawn again
+    assert keys.new_key_file(path, lambda size: next(drawn)) == key_check(KEY)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert read_key(path) == KEY
+    with pytest.raises(KeyFileError, match='never overwritten'):
+        keys.new_key_file(path, os.urandom)
+    link = tmp_path / 'link'
+    link.symlink_to(tmp_path / 'elsewhere')
+    with pytest.raises(KeyFileError, match='there already'):
+        keys.new_key_file(link, os.urandom)
+    with pytest.raises(KeyFileError, match='No such file'):
+        keys.new_key_file(tmp_path / 'nowhere' / 'key', os.urandom)
+    assert read_key(path) == KEY
+
+
+def test_a_key_goes_over_the_cable_and_is_told_apart_at_both_ends():
+    bench = Bench()
+    assert 'no key' in keys.describe(bench.at_robot(keys.ask_key()))
+    told = bench.at_robot(keys.write_key(KEY))
+    assert f'{key_check(KEY):08x}' in keys.describe(told)
+    assert keys.is_kept(told, KEY)
+    assert not keys.is_kept(told, OTHER)
+    assert bench.board.slot.gate().key == KEY
+    assert keys.is_kept(bench.at_robot(keys.write_key(OTHER)), OTHER)
+    assert keys.is_kept(bench.at_robot(keys.write_key(keys.FORGET)), keys.FORGET)
+    assert not bench.board.slot.gate().key
+
+
+def test_a_board_that_opening_its_port_has_reset_is_waited_for():
+    bench = Bench()
+    bench.emulator.restart_robot()
+    assert keys.is_kept(bench.at_robot(keys.write_key(KEY)), KEY)
+    assert bench.now_ns - START_NS > 1e9
+
+
+def test_a_damaged_key_is_told_and_put_right():
+    bench = Bench(KEY)
+    bench.board.slot._cells[3] ^= 1
+    bench.emulator.restart_robot()
+    assert 'damaged' in keys.describe(bench.at_robot(keys.ask_key()))
+    assert keys.is_kept(bench.at_robot(keys.write_key(KEY)), KEY)
+
+
+def test_the_dongle_never_hears_a_key():
+    bench = Bench()
+    heard = []
+    take = bench.emulator.dongle._take
+    bench.emulator.dongle._take = lambda data: (heard.append(data), take(data))
+    with pytest.raises(ErrandError, match='this is the dongle'):
+        bench.at_dongle(keys.write_key(KEY))
+    assert heard
+    assert not any(KEY in data for data in heard)
+
+
+def test_a_moving_robot_takes_no_key_and_says_what_to_do():
+    bench = Bench()
+    bench.each = lambda bench: bench.board.packet(
+        bytes([0x14, 9, 0, 0]) + bytes(4)
+        if bench.board.session != 9
+        else bytes([0x11, 9, bench.now_ns // 1000 & 0x7F, Flag.ENABLE, 20]) + bytes(9)
+    )
+    bench.emulator.run_to(START_NS + 1_000_000)
+    bench.each(bench)
+    bench.each(bench)
+    with pytest.raises(ErrandError, match='stop the bridge'):
+        bench.at_robot(keys.write_key(KEY))
+
+
+def test_a_port_where_nobody_answers_is_given_up_with_advice():
+    bench = Bench()
+    bench.emulator.inject('silence', math.inf)
+    with pytest.raises(ErrandError, match='right port'):
+        bench.at_dongle(probe.probe(LinkSettings(), 1))
+    assert 4e9 < bench.now_ns - START_NS < 7e9
+
+
+# -- ping -----------------------------------------------------------------------------------------
+
+
+def test_a_good_link_is_called_good_in_every_row():
+    bench = Bench()
+    seen = bench.at_dongle(probe.probe(LinkSettings(), 100))
+    rows = probe.judge(seen, LinkSettings())
+    assert [row.verdict for row in rows] == [probe.GOOD] * 6
+    assert len(seen.pings) == len(seen.cycles) == 100
+    assert seen.retransmissions[0] == 200
+    assert max(seen.cycles) < 0.01
+    assert not bench.board.session
+    assert not bench.board.powered
+    assert probe.is_good(rows)
+
+
+def test_losses_show_as_tries_and_at_last_as_a_bad_link():
+    bench = Bench()
+    bench.emulator.inject('loss', math.inf, 0.4)
+    seen = bench.at_dongle(probe.probe(LinkSettings(), 300))
+    assert len(seen.cycles) / 300 == pytest.approx(1 - (1 - 0.6**2) ** 4, abs=0.07)
+    assert seen.retransmissions[1] > 40
+    rows = {row.name: row for row in probe.judge(seen, LinkSettings())}
+    assert rows['robot answers by radio'].verdict == probe.BAD
+    assert rows['tries more per packet'].verdict == probe.POOR
+    text = probe.table(list(rows.values()))
+    assert '10 uF' in text
+    assert text.count('try: ') == 2
+
+
+def test_a_robot_that_is_off_says_where_to_look():
+    bench = Bench()
+    bench.emulator.inject('robot_reset', 1000.0)
+    rows = probe.judge(bench.at_dongle(probe.probe(LinkSettings(), 10)), LinkSettings())
+    text = probe.table(rows)
+    assert 'radio_tool find' in text
+    assert not probe.is_good(rows)
+
+
+def test_a_slow_cable_and_a_damaged_one_are_seen():
+    bench = Bench()
+    bench.emulator.inject('delay', math.inf, 0.016)
+    seen = bench.at_dongle(probe.probe(LinkSettings(), 20))
+    rows = {row.name: row for row in probe.judge(seen, LinkSettings())}
+    assert rows['dongle answers over USB'].verdict == probe.POOR
+    assert rows['round trip to the robot'].verdict != probe.GOOD
+    bench = Bench()
+    bench.emulator.inject('flip_bits', math.inf, 0.004)
+    seen = bench.at_dongle(probe.probe(LinkSettings(), 200))
+    rows = {row.name: row for row in probe.judge(seen, LinkSettings())}
+    assert seen.line_errors > 0
+    assert rows['frames damaged on the cable'].verdict == probe.POOR
+
+
+def test_the_robots_own_port_and_a_dead_chip_are_named():
+    bench = Bench()
+    with pytest.raises(ErrandError, match='USB of the robot'):
+        bench.at_robot(probe.probe(LinkSettings(), 1))
+    bench = Bench()
+    bench.emulator.inject('radio_dead', math.inf)
+    with pytest.raises(ErrandError, match='radio chip'):
+        bench.at_dongle(probe.probe(LinkSettings(), 1))
+
+
+# -- find -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('channel, rate', [(0, '1M'), (100, '250k'), (125, '2M')])
+def test_the_robot_is_found_wherever_it_is_and_the_radio_left_as_it_was(channel, rate):
+    bench = Bench(channel=channel, rate=rate)
+    before, seen = bench.radio(), []
+    talk = search.find_robot(LinkSettings(), ('250k', '1M', '2M'), lambda *told: seen.append(told))
+    (place,) = bench.at_dongle(talk)
+    assert (place.channel, place.rate) == (channel, rate)
+    assert place.answered == place.asked == 20
+    assert [told[:2] for told in seen] == [(number + 1, 378) for number in range(378)]
+    assert [text for _, _, text in seen if text] == [search.describe(place)]
+    assert bench.radio() == before
+    good, advice = search.advise([place], LinkSettings())
+    assert not good
+    assert f'link.channel to {channel} and' in advice
+    assert search.advise([place], LinkSettings(channel=channel, rate=rate))[0]
+
+
+def test_a_search_that_is_interrupted_leaves_the_radio_as_it_was():
+    bench = Bench(channel=120)
+    before = bench.radio()
+
+    def interrupt(bench):
+        if bench.radio().channel == 40:
+            errand.interrupt(bench.now_ns)
+
+    bench.each = interrupt
+    talk = search.find_robot(LinkSettings(), ('2M',), lambda *told: None)
+    errand = Errand(talk, decode_from_dongle)
+    bench.carry(errand)
+    assert errand.error == 'interrupted'
+    assert bench.radio() == before
+
+
+def test_a_dongle_that_is_pulled_out_in_mid_search_ends_it():
+    bench = Bench(channel=120)
+
+    def pull(bench):
+        if bench.radio().channel == 40 and bench.emulator.port_open:
+            bench.emulator.inject('close_port', 100.0)
+
+    bench.each = pull
+    with pytest.raises(ErrandError, match='not there'):
+        bench.at_dongle(search.find_robot(LinkSettings(), ('1M',), lambda *told: None))
+
+
+def test_a_robot_that_is_nowhere_gets_advice():
+    bench = Bench()
+    bench.emulator.inject('jam', math.inf)
+    found = bench.at_dongle(search.find_robot(LinkSettings(), ('1M',), lambda *told: None))
+    good, advice = search.advise(found, LinkSettings())
+    assert found == []
+    assert not good
+    assert 'is it on' in advice
+
+
+# -- parameters -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('key', [b'', KEY], ids=['open', 'keyed'])
+def test_all_parameters_are_read_and_none_is_changed(key):
+    bench = Bench(key)
+    bench.emulator.inject('loss', math.inf, 0.2)
+    talk = reading.read_parameters(LinkSettings(), key, random.Random(1).randbytes)
+    inventory = bench.at_dongle(talk)
+    told = [(value.value, value.low, value.high) for value in inventory.values]
+    assert told == [(row.default, row.low, row.high) for row in frames.PARAMETERS]
+    assert not bench.board.powered
+    lines = reading.table(inventory, LinkSettings.from_flat({'robot.max_speed': 5.0}))
+    row = next(line for line in lines.splitlines() if line.startswith('max_speed'))
+    assert row.split() == ['max_speed', '10000', 'mrad/s', '0', 'to', '19600', '5000']
+
+
+def test_a_session_of_somebody_else_goes_on_while_parameters_are_read():
+    bench = Bench(KEY)
+    bench.at_dongle(reading.read_parameters(LinkSettings(), KEY, random.Random(1).randbytes))
+    session = bench.board.session
+    talk = reading.read_parameters(LinkSettings(), b'', random.Random(2).randbytes)
+    assert len(bench.at_dongle(talk).values) == len(frames.PARAMETERS)
+    assert bench.board.session == session != 0
+
+
+@pytest.mark.parametrize(
+    'here, there, words',
+    [(b'', KEY, 'give the host the key'), (KEY, OTHER, 'keys differ'), (KEY, b'', 'no key')],
+)
+def test_keys_that_do_not_fit_are_named(here, there, words):
+    bench = Bench(there)
+    with pytest.raises(ErrandError, match=words):
+        bench.at_dongle(reading.read_parameters(LinkSettings(), here, random.Random(1).randbytes))
+
+
+# -- turn -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('key', [b'', KEY], ids=['open', 'keyed'])
+@pytest.mark.parametrize('wheel', [turn.LEFT, turn.RIGHT])
+@pytest.mark.parametrize('revolutions', [1.0, -0.3])
+def test_one_wheel_turns_as_far_as_it_should_and_the_drives_are_out_after_it(
+    key, wheel, revolutions
+):
+    bench = Bench(key)
+    task, said = bench.turn(wheel, revolutions, key)
+    assert task.error == ''
+    turned = task.result
+    assert turned.wanted == revolutions * TURN
+    assert abs(turned.counted - turned.wanted) <= 10
+    assert turned.other == 0
+    counters = dict(zip((turn.LEFT, turn.RIGHT), bench.board.counters, strict=True))
+    assert counters.pop(wheel) == turned.counted
+    assert list(counters.values()) == [0]
+    assert not bench.board.powered
+    assert said == []
+    text = turn.describe(turned, wheel, revolutions)
+    assert ('forward' in text) == (revolutions > 0)
+
+
+def test_the_wheel_never_turns_faster_or_changes_faster_than_it_may():
+    bench, speeds = Bench(), []
+    bench.each = lambda bench: speeds.append((bench.now_ns, bench.board.speeds[0] / 1e6))
+    task, _ = bench.turn(turn.LEFT, 1.0, speed=1.5)
+    assert task.error == ''
+    assert max(speed for _, speed in speeds) == pytest.approx(1.5, abs=0.001)
+    for (before_ns, before), (after_ns, after) in zip(speeds, speeds[1:], strict=False):
+        assert abs(after - before) <= 8.0 * ((after_ns - before_ns) / 1e9 + 2e-3)
+
+
+def test_an_interruption_brings_the_wheel_to_rest_and_the_drives_out():
+    bench = Bench()
+    task = turn.Turn(
+        LinkSettings(), b'', random.Random(1).randbytes, turn.LEFT, 5.0, 3.0, lambda text: None
+    )
+
+    def interrupt(bench):
+        if bench.board.counters[0] > 2000:
+            task.interrupt(bench.now_ns)
+
+    bench.each = interrupt
+    bench.carry(task)
+    assert task.error == 'interrupted'
+    assert 2000 < task.result.counted < 3000
+    assert task.result.counted == bench.board.counters[0]
+    assert bench.board.speeds == (0, 0)
+    assert not bench.board.powered
+
+
+@pytest.mark.parametrize(
+    'fault, words', [('button', 'emergency stop'), ('jam', 'does not answer')]
+)
+def test_what_hinders_the_wheel_ends_it_with_its_reason(fault, words):
+    bench = Bench()
+
+    def hinder(bench):
+        if bench.board.counters[0] > 1000 and not bench.emulator.faults.active(fault):
+            bench.emulator.inject(fault, 1000.0)
+
+    bench.each = hinder
+    task, _ = bench.turn(turn.LEFT, 5.0)
+    assert words in task.error
+    bench.emulator.run_to(bench.now_ns + 1_000_000_000)
+    assert bench.board.speeds == (0, 0)
+
+
+def test_a_robot_that_does_not_answer_is_waited_for_and_said():
+    bench = Bench()
+    bench.emulator.inject('jam', math.inf)
+    task, said = bench.turn(turn.LEFT, 1.0)
+    assert 'does not answer' in task.error
+    assert said == [task.error]
+    assert task.result is None
+
+
+def test_a_dongle_that_is_pulled_out_ends_it_and_the_robot_stops_by_itself():
+    bench = Bench()
+
+    def pull(bench):
+        if bench.board.counters[1] > 1000 and bench.emulator.port_open:
+            bench.emulator.inject('close_port', 1000.0)
+
+    bench.each = pull
+    task, _ = bench.turn(turn.RIGHT, 5.0)
+    assert 'not there' in task.error
+    bench.emulator.run_to(bench.now_ns + 1_000_000_000)
+    assert bench.board.speeds == (0, 0)
+    assert bench.board.status & Status.TTL_EXPIRED
+
+
+# -- the program ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def ports(tmp_path):
+    """Yield the paths of both ports of an emulator that runs as a process."""
+    dongle, robot = tmp_path / 'dongle', tmp_path / 'robot'
+    command = [sys.executable, '-m', 't3mpc_ros.emulator.program', '--link', str(dongle)]
+    child = subprocess.Popen(
+        [*command, '--robot-link', str(robot)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)},
+    )
+    assert any('own USB' in line for line in child.stdout)
+    yield str(dongle), str(robot)
+    child.send_signal(signal.SIGTERM)
+    said, _ = child.communicate(timeout=20)
+    assert said == 'board_emulator: stopped\n'
+    assert not dongle.is_symlink()
+    assert not robot.is_symlink()
+
+
+@pytest.mark.slow
+def test_a_new_robot_on_the_bench_from_key_to_wheel(ports, tmp_path, capsys):
+    """Over pseudo terminals on the wall clock, as a person would do it."""
+    dongle, robot = ports
+    key = str(tmp_path / 'key')
+
+    def run(*arguments):
+        code = program.main(arguments)
+        said = capsys.readouterr()
+        return code, said.out + said.err
+
+    assert run('key', 'new', key)[0] == 0
+    assert run('key', 'new', key)[0] == 2
+    check = f'{key_check(read_key(tmp_path / "key")):08x}'
+    assert check in run('key', 'check', key)[1]
+    assert 'no key' in run('key', 'state', '--port', robot)[1]
+    code, said = run('key', 'write', key, '--port', robot)
+    assert (code, check in said) == (0, True)
+    assert run('key', 'state', '--port', robot, '--key', key)[0] == 0
+    code, said = run('key', 'write', key, '--port', dongle)
+    assert (code, 'this is the dongle' in said) == (2, True)
+    code, said = run('parameters', '--port', dongle)
+    assert (code, 'give the host the key' in said) == (2, True)
+    code, said = run('parameters', '--port', dongle, '--key', key, '--set', 'robot.idle_off=5')
+    assert (code, 'ttl_max' in said, '5000' in said) == (0, True, True)
+    assert 'robot answers by radio' in run('ping', '--port', dongle, '--count', '20')[1]
+    code, said = run('find', '--port', dongle)
+    assert (code, 'channel 82 at 1M' in said) == (0, True)
+    code, said = run('turn', 'left', '0.2', '--port', dongle, '--key', key, '--yes')
+    assert (code, '640 wanted' in said) == (0, True)
+
+    # Ctrl-C in mid-turn: the robot stands, then the program ends.
+    threading.Timer(4.0, os.kill, (os.getpid(), signal.SIGINT)).start()
+    begun = time.monotonic()
+    code, said = run('turn', 'left', '90', '--port', dongle, '--key', key, '--yes')
+    assert code == 130
+    assert time.monotonic() - begun < 60.0
+    assert 'interrupted' in said
+    assert run('key', 'forget', '--port', robot)[0] == 0
+
+
+def test_errors_of_the_port_are_words_with_a_remedy(tmp_path, capsys):
+    missing = str(tmp_path / 'nothing')
+    for command in (['ping'], ['find'], ['parameters'], ['turn', 'left', '1', '--yes']):
+        assert program.main([*command, '--port', missing]) == 2
+        assert 'is the dongle plugged in?' in capsys.readouterr().err
+    assert program.main(['key', 'state', '--port', missing]) == 2
+    assert "is the robot's board plugged in?" in capsys.readouterr().err
+    master, slave = os.openpty()
+    path = os.ttyname(slave)
+    holder = program.carry_out.__globals__['Port'](path)
+    assert program.main(['ping', '--port', path]) == 2
+    assert 'another program has it open' in capsys.readouterr().err
+    holder.close()
+    os.close(master)
+    os.close(slave)
+
+
+@pytest.mark.parametrize(
+    'arguments, words',
+    [
+        (['ping', '--port', 'x', '--set', 'channel=126'], 'channel'),
+        (['ping', '--port', 'x', '--set', 'chanel=12'], 'chanel'),
+        (['find', '--port', 'x', '--set', 'rate'], 'NAME=VALUE'),
+        (['turn', 'left', '1', '--port', 'x', '--key', 'no/such/file', '--yes'], 'no/such/file'),
+        (['turn', 'left', '1', '--port', 'x'], '--yes'),
+        (['key', 'check', 'no/such/file'], 'no/such/file'),
+    ],
+)
+def test_what_cannot_be_done_is_said_before_a_port_is_opened(
+    arguments, words, capsys, monkeypatch
+):
+    with open(os.devnull) as nobody:
+        monkeypatch.setattr(sys, 'stdin', nobody)
+        assert program.main(arguments) == 2
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('answer', ['no', '', 'yeah', 'ctrl-c'])
+def test_a_wheel_turns_only_if_a_person_says_yes(answer, capsys, monkeypatch):
+    """Reading a line goes on after a signal: the question must hear Ctrl-C by itself."""
+    opened = []
+    monkeypatch.setattr(program, 'carry_out', lambda *arguments: opened.append(arguments))
+    master, slave = os.openpty()
+    with open(slave) as terminal:
+        monkeypatch.setattr(sys, 'stdin', terminal)
+        if answer == 'ctrl-c':
+            threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+        else:
+            os.write(master, answer.encode() + b'\n')
+        code = program.main(['turn', 'left', '1', '--port', 'x'])
+        assert code == (130 if answer == 'ctrl-c' else 2)
+        assert opened == []
+        os.write(master, b'yes\n')
+        assert program.main(['turn', 'left', '1', '--port', 'x']) == 0
+    os.close(master)
+    assert len(opened) == 1
+    said = capsys.readouterr()
+    assert 'in the air' in said.out
+    assert 'nothing was moved' in said.err
+
+
+def test_a_file_of_zeros_is_no_key(tmp_path, capsys):
+    path = tmp_path / 'key'
+    path.write_text(32 * '0')
+    path.chmod(0o600)
+    assert program.main(['key', 'write', str(path), '--port', 'x']) == 2
+    assert 'zeros' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    'arguments',
+    [
+        ['turn', 'left', '0', '--port', 'x'],
+        ['turn', 'middle', '1', '--port', 'x'],
+        ['turn', 'left', '1', '--speed', '11', '--port', 'x'],
+        ['ping', '--count', '0', '--port', 'x'],
+        ['ping'],
+        ['key'],
+        [],
+    ],
+)
+def test_wrong_arguments_are_usage_errors(arguments, capsys):
+    with pytest.raises(SystemExit) as ended:
+        program.main(arguments)
+    assert ended.value.code == 2
+    capsys.readouterr()
