@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A bag read by the JavaScript libraries that web viewers use, in ``mcap_check/check.mjs``."""
 
+import base64
 import json
 from pathlib import Path
 import shutil
@@ -14,6 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 from t3mpc_ros.record.mcap_file import finish
 from t3mpc_ros.record.quality import QualityProfile, profiles_to_yaml
 from t3mpc_ros.record.writer import BagWriter
+from t3mpc_ros.record.writing.attachment import Attachment
 
 SOURCES = Path(__file__).parent / 'mcap_check'
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -37,8 +39,8 @@ def check(tmp_path_factory):
     options = ['--no-package-lock', '--no-audit', '--no-fund', '--ignore-scripts']
     subprocess.run(['npm', 'install', *options], cwd=folder, check=True, timeout=300)
 
-    def run(path):
-        command = ['node', 'check.mjs', str(path)]
+    def run(*paths):
+        command = ['node', 'check.mjs', *map(str, paths)]
         return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120)
 
     return run
@@ -65,10 +67,10 @@ def odometry(i):
     )
 
 
-def fill(bag, count):
+def fill(bag, count, first=0):
     bag.add_topic('/odom', ODOM, [QualityProfile()])
     bag.add_topic('/number', NUMBER)
-    for i in range(count):
+    for i in range(first, first + count):
         now = START + i * 10_000_000
         bag.write('/odom', now, now, bytes(STORE.serialize_cdr(odometry(i), ODOM)))
         number = STORE.types[NUMBER](data=float(i))
@@ -80,7 +82,7 @@ def test_web_viewers_read_the_whole_bag(tmp_path, check):
         fill(bag, 300)
     result = check(bag.path)
     assert result.returncode == 0, result.stderr
-    found = json.loads(result.stdout)
+    (found,) = json.loads(result.stdout)
     assert found['profile'] == 'ros2'
     assert found['streamed'] == 600
     assert found['statistics'] == '600'
@@ -110,11 +112,44 @@ def test_web_viewers_read_a_file_that_was_finished_later(tmp_path, check):
     bag.path.write_bytes(bag.path.read_bytes()[: bag.path.stat().st_size // 2])
     kept = finish(bag.path)
     assert 0 < kept < 600
-    found = json.loads(check(bag.path).stdout)
+    (found,) = json.loads(check(bag.path).stdout)
     assert found['streamed'] == kept
     assert found['statistics'] == str(kept)
     assert found['footerCrc'] != 0
     assert found['metadata']['settings'] == DETAILS['settings']
+
+
+def test_web_viewers_read_every_file_of_a_bag(tmp_path, check):
+    paths = []
+    for part in range(3):
+        with BagWriter(tmp_path / 'run', details=DETAILS) as bag:
+            fill(bag, 40, 40 * part)
+        paths.append(bag.path)
+    every = json.loads(check(*paths).stdout)
+    assert [each['last']['/number']['data'] for each in every] == [39, 79, 119]
+    for each in every:
+        assert each['topics'] == {'/odom': 40, '/number': 40}
+        assert each['metadata']['settings'] == DETAILS['settings']
+
+
+def test_attachments_are_read_and_their_checksums_verified(tmp_path, check):
+    content = b'a model file \x00\xff' * 50
+    with BagWriter(tmp_path / 'run', details=DETAILS) as bag:
+        fill(bag, 20)
+        bag.add_attachment(Attachment('model.npz', 'application/zip', content, START), START)
+        fill(bag, 20, 20)
+    path = bag.path
+    (found,) = json.loads(check(path).stdout)
+    (attached,) = found['attachments']
+    assert attached['mediaType'] == 'application/zip'
+    assert attached['name'] == 'model.npz'
+    assert base64.b64decode(attached['content']) == content
+    damaged = bytearray(path.read_bytes())
+    damaged[damaged.index(content) + 100] ^= 1
+    path.write_bytes(damaged)
+    result = check(path)
+    assert result.returncode != 0
+    assert 'CRC' in result.stderr or 'crc' in result.stderr
 
 
 @pytest.mark.parametrize('part', ['chunk', 'summary'])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from t3mpc_ros.lab.report import ReportFigures, write_report
+from t3mpc_ros.lab.report import ReportFigures, Wanted, write_report
 from t3mpc_ros.lab.report.canvas import thinned
 from t3mpc_ros.lab.report.drawings import DRAWINGS
 from t3mpc_ros.lab.report.measures import (
@@ -29,16 +29,15 @@ from t3mpc_ros.lab.report.measures import (
     variation,
 )
 from t3mpc_ros.lab.report.merit import errors_of
-from t3mpc_ros.lab.report.recorded import (
+from t3mpc_ros.lab.report.recorded import Series, load_run
+from t3mpc_ros.lab.report.topics import (
     COMMAND,
     NAMES,
     ODOMETRY,
     REFERENCE,
     TRUTH,
     WHEELS,
-    Series,
     find_topics,
-    load_run,
 )
 from t3mpc_ros.motion.kinematics import Geometry, advance_pose, body_from_wheels
 from t3mpc_ros.motion.words import BodyTwist, Pose, WheelSpeeds
@@ -163,9 +162,14 @@ def signals(mode, chosen):
     return TYPES['std_msgs/msg/Int32MultiArray'](layout, data)
 
 
-def diagnostics(stamp_ns, level, text):
+def diagnostics(stamp_ns, level, text, name='controller: loop', **values):
+    entry = TYPES['diagnostic_msgs/msg/KeyValue']
     status = TYPES['diagnostic_msgs/msg/DiagnosticStatus'](
-        level=level, name='controller: loop', message=text, hardware_id='', values=[]
+        level=level,
+        name=name,
+        message=text,
+        hardware_id='',
+        values=[entry(key=key, value=str(value)) for key, value in values.items()],
     )
     return TYPES['diagnostic_msgs/msg/DiagnosticArray'](header(stamp_ns), [status])
 
@@ -228,6 +232,10 @@ def sheet_of(rows, namespace='', epoch_ns=START, announce='signals', terms=True,
         value = 0.5 * row['error'] @ row['error']
         sheet.add('controller/lyapunov/value', told, number(value))
         sheet.add('controller/lyapunov/margin', told, number(8.0 * value + 0.2 - 0.3 * (i < 50)))
+    for second in range(len(rows) // 100 if terms else 0):
+        link = {'cycles': 50 * second, 'cycles_lost': 2 * (second // 5), 'crc_errors': second // 9}
+        link |= {'round_trip_median_ms': 6.0, 'round_trip_p99_ms': 9.0 + second, 'link': 'running'}
+        sheet.add('/diagnostics', 1.0 + second, diagnostics(START, 0, '', 'radio_bridge', **link))
     sheet.add('/diagnostics', 1.0, diagnostics(START, 0, 'fine'))
     sheet.add('/diagnostics', 5.0, diagnostics(START, 1, 'late <b>& later</b>'))
     sheet.add('/diagnostics', 6.0, diagnostics(START, 1, 'late <b>& later</b>'))
@@ -575,11 +583,12 @@ def test_a_foreign_bag_of_odometry_and_commands_has_a_report_without_errors(rows
     sheet.rows = [row for row in sheet.rows if row[1] in ('/odom', '/cmd_vel')]
     sheet.topics = {name: sheet.topics[name] for name in ('/odom', '/cmd_vel')}
     figures = write_report(sheet.write(tmp_path / 'bag'))
-    assert {path.stem for path in figures.pictures} == {'control', 'path', 'timing'}
+    stems = {'control', 'response', 'acceleration', 'path', 'timing'}
+    assert {path.stem for path in figures.pictures} == stems
     assert 'RMSE right/left while driven not measured' in figures.summary()
     text = page_of(figures).text()
     assert 'The bag lacks a reference, or odometry to compare with it.' in text
-    assert text.count('not measured') == 2
+    assert 'Left out' not in text
 
 
 def test_a_long_line_keeps_its_extremes():
@@ -620,7 +629,7 @@ def test_another_namespace_gives_the_same_report_and_is_named(rows, report, tmp_
     assert 'The bag also holds topics of /fleet/robot2' in text
     assert figures.wheels['right'].overall.count == 499  # six seconds without the first
     with open_recording(tmp_path / 'bag') as recording:
-        second = load_run(recording, namespace='fleet/robot2')
+        second = load_run(recording, Wanted(namespace='fleet/robot2'))
     assert len(tracking_error(second, TRUTH)) == 100
 
 
@@ -745,7 +754,8 @@ def test_the_report_goes_beside_the_bag_unless_told_otherwise(tmp_path):
 def test_an_absent_topic_leaves_out_its_figures_and_is_named(rows, tmp_path):
     figures = write_report(sheet_of(rows[:300], announce='', terms=False).write(tmp_path / 'bag'))
     stems = {path.stem for path in figures.pictures}
-    assert stems == {'tracking', 'error', 'control', 'portrait', 'path', 'timing'}
+    own = {'tracking', 'error', 'control', 'portrait', 'path', 'timing'}
+    assert stems == {*own, 'response', 'acceleration'}
     assert 'controller/estimate/right' in figures.absent
     text = page_of(figures).text()
     assert 'Not in the bag, or without a message: reference/signals, controller/' in text
@@ -777,7 +787,7 @@ def test_an_empty_topic_counts_as_absent(rows, tmp_path):
     page_of(figures)
 
 
-@pytest.mark.parametrize('count', [0, 1, 2])
+@pytest.mark.parametrize('count', [1, 2, 3])
 def test_a_handful_of_messages_does_no_harm(rows, tmp_path, count):
     """Every series has ``count`` samples: no line, no median, no percentile may need more."""
     sheet = sheet_of(rows[:20])

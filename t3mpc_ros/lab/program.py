@@ -12,6 +12,7 @@ import time
 from typing import TYPE_CHECKING
 import webbrowser
 
+from t3mpc_ros.lab.bag.report import add_report_parser
 from t3mpc_ros.lab.faults.command import add_outcomes_parser
 from t3mpc_ros.lab.paper.program import add_parser as add_paper
 from t3mpc_ros.lab.training.command import add_parser as add_train
@@ -53,13 +54,6 @@ def _demo(options: argparse.Namespace) -> int:
     print(figures.summary())
     if not options.headless:
         webbrowser.open(figures.report.resolve().as_uri())
-    return 0
-
-
-def _report(options: argparse.Namespace) -> int:
-    from t3mpc_ros.lab.report import write_report
-
-    print(write_report(options.bag, options.output or options.bag.parent).summary())
     return 0
 
 
@@ -140,10 +134,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     demo.set_defaults(run=_demo)
 
-    report = commands.add_parser('report', help='draw the report of a bag')
-    report.add_argument('bag', type=Path, help='folder of the bag')
-    report.add_argument('--output', type=Path, help='folder for the report (default: beside it)')
-    report.set_defaults(run=_report)
+    add_report_parser(commands)
 
     estimation = commands.add_parser(
         'estimation', help='the kinds of fuzzy systems as estimators, without a controller (86)'

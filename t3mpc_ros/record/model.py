@@ -24,9 +24,23 @@ class ModelError(RuntimeError):
 
 
 def save_model(
-    path: Path, arrays: Mapping[str, NDArray[np.float64]], settings: Mapping[str, object]
+    path: Path,
+    arrays: Mapping[str, NDArray[np.float64]],
+    settings: Mapping[str, object],
+    origin: Mapping[str, object] | None = None,
 ) -> None:
     """Write what was learnt, with the settings it was learnt under.
+
+    Parameters
+    ----------
+    path
+        The file.
+    arrays
+        What was learnt.
+    settings
+        By flat name.
+    origin
+        Where it comes from, as plain data for JSON: bags and their hashes, say.
 
     Raises
     ------
@@ -34,7 +48,12 @@ def save_model(
         The file cannot be written; the text names it and the reason.
     """
     header = json.dumps(
-        {'format': FORMAT, 'version': t3mpc_ros.__version__, 'settings': dict(settings)}
+        {
+            'format': FORMAT,
+            'version': t3mpc_ros.__version__,
+            'settings': dict(settings),
+            'origin': dict(origin or {}),
+        }
     )
     try:
         with path.open('wb') as target:
@@ -52,6 +71,21 @@ def load_model(path: Path) -> dict[str, NDArray[np.float64]]:
     ModelError
         The file cannot be read, is no model, or is of another format; the text says which.
     """
+    return _read(path)[1]
+
+
+def model_header(path: Path) -> dict[str, Any]:
+    """Return what a model file says of itself: format, version, settings, and its origin.
+
+    Raises
+    ------
+    ModelError
+        As :func:`load_model`.
+    """
+    return _read(path)[0]
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
     try:
         with np.load(path, allow_pickle=False) as content:
             header = json.loads(str(content[_HEADER]))
@@ -67,4 +101,4 @@ def load_model(path: Path) -> dict[str, NDArray[np.float64]]:
         raise ModelError(
             f'{path} has model format {found}, this is format {FORMAT}: train or save it anew'
         )
-    return arrays
+    return header, arrays

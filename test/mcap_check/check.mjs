@@ -1,9 +1,10 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
 //
-// node check.mjs FILE.mcap: reads a bag through the libraries of web viewers and prints what was
-// found as JSON. Everything is verified on the way: the checksums of the summary, of every chunk
-// and of the data section, the index, and that each message decodes with the bag's own schema.
+// node check.mjs FILE.mcap ...: reads files of a bag through the libraries of web viewers and
+// prints what was found as JSON, one entry a file. Everything is verified on the way: the
+// checksums of the summary, of every chunk, of the attachments and of the data section, the
+// index, and that each message decodes with the bag's own schema.
 
 import { readFile } from 'node:fs/promises';
 
@@ -12,75 +13,87 @@ import { MessageReader } from '@foxglove/rosmsg2-serialization';
 import { McapIndexedReader, McapStreamReader } from '@mcap/core';
 import { decompress } from 'fzstd';
 
-const content = await readFile(process.argv[2]);
 const decompressHandlers = {
   zstd: (data, size) => decompress(data, new Uint8Array(Number(size))),
 };
 
-// Front to back: McapStreamReader checks chunk checksums and that of the data section.
-const streamReader = new McapStreamReader({ decompressHandlers, validateCrcs: true });
-streamReader.append(content);
-let streamed = 0;
-let dataSectionCrc = 0;
-let footerCrc = 0;
-for (let record; (record = streamReader.nextRecord()) != undefined; ) {
-  if (record.type === 'Message') streamed += 1;
-  if (record.type === 'DataEnd') dataSectionCrc = record.dataSectionCrc;
-  if (record.type === 'Footer') footerCrc = record.summaryCrc;
-}
-if (!streamReader.done()) throw new Error('the file does not end where it should');
+async function look(path) {
+  const content = await readFile(path);
 
-// Through the index: McapIndexedReader checks the summary's checksum when it opens the file.
-const readable = {
-  size: async () => BigInt(content.length),
-  read: async (offset, size) =>
-    new Uint8Array(content.buffer, content.byteOffset + Number(offset), Number(size)),
-};
-const reader = await McapIndexedReader.Initialize({ readable, decompressHandlers });
-const decoders = new Map();
-for (const [id, schema] of reader.schemasById) {
-  if (schema.encoding !== 'ros2msg') throw new Error(`schema encoding ${schema.encoding}`);
-  const definition = parse(new TextDecoder().decode(schema.data), { ros2: true });
-  decoders.set(id, new MessageReader(definition));
-}
-const topics = {};
-const last = {};
-let previous = 0n;
-for await (const message of reader.readMessages({ validateCrcs: true })) {
-  if (message.logTime < previous) throw new Error('the index is out of order');
-  previous = message.logTime;
-  const channel = reader.channelsById.get(message.channelId);
-  topics[channel.topic] = (topics[channel.topic] ?? 0) + 1;
-  last[channel.topic] = decoders.get(channel.schemaId).readMessage(message.data);
-}
-const metadata = {};
-for await (const record of reader.readMetadata()) {
-  metadata[record.name] = Object.fromEntries(record.metadata);
+  // Front to back: McapStreamReader checks chunk checksums and that of the data section.
+  const streamReader = new McapStreamReader({ decompressHandlers, validateCrcs: true });
+  streamReader.append(content);
+  let streamed = 0;
+  const attachments = [];
+  let dataSectionCrc = 0;
+  let footerCrc = 0;
+  for (let record; (record = streamReader.nextRecord()) != undefined; ) {
+    if (record.type === 'Message') streamed += 1;
+    if (record.type === 'Attachment') {
+      const { name, mediaType, data } = record;
+      attachments.push({ name, mediaType, content: Buffer.from(data).toString('base64') });
+    }
+    if (record.type === 'DataEnd') dataSectionCrc = record.dataSectionCrc;
+    if (record.type === 'Footer') footerCrc = record.summaryCrc;
+  }
+  if (!streamReader.done()) throw new Error('the file does not end where it should');
+
+  // Through the index: McapIndexedReader checks the summary's checksum when it opens the file.
+  const readable = {
+    size: async () => BigInt(content.length),
+    read: async (offset, size) =>
+      new Uint8Array(content.buffer, content.byteOffset + Number(offset), Number(size)),
+  };
+  const reader = await McapIndexedReader.Initialize({ readable, decompressHandlers });
+  const decoders = new Map();
+  for (const [id, schema] of reader.schemasById) {
+    if (schema.encoding !== 'ros2msg') throw new Error(`schema encoding ${schema.encoding}`);
+    const definition = parse(new TextDecoder().decode(schema.data), { ros2: true });
+    decoders.set(id, new MessageReader(definition));
+  }
+  const topics = {};
+  const last = {};
+  let previous = 0n;
+  for await (const message of reader.readMessages({ validateCrcs: true })) {
+    if (message.logTime < previous) throw new Error('the index is out of order');
+    previous = message.logTime;
+    const channel = reader.channelsById.get(message.channelId);
+    topics[channel.topic] = (topics[channel.topic] ?? 0) + 1;
+    last[channel.topic] = decoders.get(channel.schemaId).readMessage(message.data);
+  }
+  const indexed = [];
+  for await (const record of reader.readAttachments({ validateCrcs: true })) {
+    indexed.push(record.name);
+  }
+  if (indexed.length !== attachments.length) throw new Error('an attachment is not indexed');
+  const metadata = {};
+  for await (const record of reader.readMetadata()) {
+    metadata[record.name] = Object.fromEntries(record.metadata);
+  }
+  return {
+    profile: reader.header.profile,
+    streamed,
+    attachments,
+    dataSectionCrc,
+    footerCrc,
+    chunks: reader.chunkIndexes.length,
+    compression: [...new Set(reader.chunkIndexes.map((chunk) => chunk.compression))],
+    statistics: reader.statistics.messageCount,
+    topics,
+    last,
+    metadata,
+    channels: [...reader.channelsById.values()].map((channel) => ({
+      topic: channel.topic,
+      encoding: channel.messageEncoding,
+      ...Object.fromEntries(channel.metadata),
+    })),
+  };
 }
 
 const plain = (_, value) => {
   if (typeof value === 'bigint') return String(value);
   return ArrayBuffer.isView(value) ? Array.from(value) : value;
 };
-console.log(
-  JSON.stringify(
-    {
-      profile: reader.header.profile,
-      streamed,
-      dataSectionCrc,
-      footerCrc,
-      chunks: reader.chunkIndexes.length,
-      compression: [...new Set(reader.chunkIndexes.map((chunk) => chunk.compression))],
-      statistics: reader.statistics.messageCount,
-      topics,
-      last,
-      metadata,
-      channels: [...reader.channelsById.values()].map((channel) => ({
-        topic: channel.topic,
-        encoding: channel.messageEncoding,
-        ...Object.fromEntries(channel.metadata),
-      })),
-    },
-    plain,
-  ),
-);
+const found = [];
+for (const path of process.argv.slice(2)) found.push(await look(path));
+console.log(JSON.stringify(found, plain));

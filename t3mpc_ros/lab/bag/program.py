@@ -9,6 +9,8 @@ import time
 
 from t3mpc_ros.lab.bag.info import add_info_parser
 from t3mpc_ros.lab.bag.recover import add_recover_parser
+from t3mpc_ros.lab.bag.report import add_report_parser
+from t3mpc_ros.lab.bag.train import add_train_parser
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -33,6 +35,8 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest='command', required=True)
     add_info_parser(commands)
     add_recover_parser(commands, time.monotonic)
+    add_train_parser(commands)
+    add_report_parser(commands)
     return parser
 
 

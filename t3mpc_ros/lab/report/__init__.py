@@ -4,5 +4,6 @@
 
 from t3mpc_ros.lab.report.merit import ReportFigures
 from t3mpc_ros.lab.report.page import write_report
+from t3mpc_ros.lab.report.topics import ReportError, Wanted
 
-__all__ = ['ReportFigures', 'write_report']
+__all__ = ['ReportError', 'ReportFigures', 'Wanted', 'write_report']

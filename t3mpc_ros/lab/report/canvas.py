@@ -13,7 +13,8 @@ from matplotlib.ticker import MaxNLocator
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.lab.report.recorded import COMMAND, ODOMETRY, REFERENCE, TRUTH, WHEELS, Run, Series
+from t3mpc_ros.lab.report.recorded import Run, Series
+from t3mpc_ros.lab.report.topics import COMMAND, ODOMETRY, REFERENCE, TRUTH, WHEELS
 
 Array = NDArray[np.float64]
 Subject = TypeVar('Subject')
@@ -39,6 +40,10 @@ COLOURS = {
     'margin': '#0891b2',
     'skill': '#db2777',
     'latency': '#4338ca',
+    'fit': '#ea580c',
+    'answered': '#0f766e',
+    'round trip': '#4338ca',
+    'resets': '#be123c',
     'switch': '#d97706',
 }
 """By quantity, the same in every figure."""
@@ -82,10 +87,13 @@ def new_figure(height: float) -> Any:
     return figure
 
 
-def new_panels(count: int, height: float) -> tuple[Any, list[Any]]:
-    """Return a figure and ``count`` panels below each other, each ``height`` inches."""
+def new_panels(count: int, height: float, *, shared: bool = True) -> tuple[Any, list[Any]]:
+    """Return a figure and ``count`` panels below each other, each ``height`` inches.
+
+    ``shared`` says whether they have one axis of time.
+    """
     figure = new_figure(0.7 + height * count)
-    return figure, list(figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0])
+    return figure, list(figure.subplots(count, 1, sharex=shared, squeeze=False)[:, 0])
 
 
 def over_time(figure: Any, axes: list[Any], run: Run) -> Any:
@@ -140,6 +148,11 @@ def thinned(time: Array, value: Array, most: int = 6000) -> tuple[Array, Array]:
     starts = np.arange(0, time.size, stretch)
     low, high = np.fmin.reduceat(value, starts), np.fmax.reduceat(value, starts)
     return np.repeat(time[starts], 2), np.column_stack([low, high]).ravel()
+
+
+def every_nth(values: Array, most: int = 20_000) -> Array:
+    """Return a line in the plane by so few of its points that it can be drawn."""
+    return values[:: max(1, -(-values.size // most))]
 
 
 def is_long(series: Series | None) -> TypeGuard[Series]:

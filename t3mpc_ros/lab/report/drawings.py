@@ -7,17 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from t3mpc_ros.lab.report import figures
+from t3mpc_ros.lab.report.link.figure import link
 from t3mpc_ros.lab.report.measures import WINDOW
-from t3mpc_ros.lab.report.recorded import (
-    COMMAND,
-    ODOMETRY,
-    REFERENCE,
-    SIGNALS,
-    TERMS,
-    TRUTH,
-    WHEELS,
-    Run,
-)
+from t3mpc_ros.lab.report.recorded import Run
+from t3mpc_ros.lab.report.response.figures import acceleration, response
+from t3mpc_ros.lab.report.topics import COMMAND, ODOMETRY, REFERENCE, SIGNALS, TERMS, TRUTH, WHEELS
+
+LINK = 'diagnostics of a radio link'
 
 
 @dataclass(frozen=True)
@@ -35,7 +31,7 @@ class Drawing:
 DRAWINGS = (
     Drawing(
         'tracking',
-        'Wheel speeds and their references (Fig. 11)',
+        'Speeds and their references (Fig. 11)',
         'Wheel speeds are computed from the body twists by (1). Dashed lines are switches.',
         figures.tracking,
         (REFERENCE, ODOMETRY, TRUTH),
@@ -64,6 +60,22 @@ DRAWINGS = (
         (COMMAND, *(f'controller/terms/applied/{wheel}' for wheel in WHEELS)),
     ),
     Drawing(
+        'response',
+        'How the robot answers its commands',
+        'The fit is the command, delayed, behind a first-order lag and scaled, chosen so that it '
+        'explains most of the measured speed. Commands are placed by their receipt, odometry by '
+        'its stamps, so the delay is what an observer beside the recorder sees.',
+        response,
+        (COMMAND, ODOMETRY),
+    ),
+    Drawing(
+        'acceleration',
+        'How hard the robot moves',
+        'Derivatives of the measured speeds, of parabolas fitted to short windows.',
+        acceleration,
+        (ODOMETRY, TRUTH),
+    ),
+    Drawing(
         'terms',
         'What each term of the law adds (Fig. 12)',
         'The terms of (66)-(67) with E12, and the acceleration applied in the end.',
@@ -81,7 +93,7 @@ DRAWINGS = (
     ),
     Drawing(
         'portrait',
-        'Phase portrait, right wheel against left (Figs. 9 and 14)',
+        'Phase portrait, one speed against the other (Figs. 9 and 14)',
         'Both panels have the same axes.',
         figures.portrait,
         (REFERENCE, ODOMETRY, TRUTH),
@@ -108,6 +120,15 @@ DRAWINGS = (
         ),
     ),
     Drawing(
+        'link',
+        'The radio link',
+        'From the diagnostics of the bridge. A cycle is a command with its question for '
+        'telemetry; it is answered when a measurement comes back. Round trips are over the last '
+        '500 cycles.',
+        link,
+        (LINK,),
+    ),
+    Drawing(
         'timing',
         'Punctuality of the loop',
         'By the times at which the recorder received the messages.',
@@ -116,3 +137,5 @@ DRAWINGS = (
     ),
 )
 """In the order of the report."""
+OWN = ('tracking', 'error', 'switching', 'terms', 'estimates', 'portrait', 'certificate')
+"""Stems of those that nobody expects of a robot without this package's nodes."""

@@ -16,11 +16,13 @@ from t3mpc_ros.lab.report.canvas import (
     STRENGTH,
     add_legend,
     draw_line,
+    every_nth,
     is_long,
     name_time,
     new_figure,
     new_panels,
     over_time,
+    thinned,
 )
 from t3mpc_ros.lab.report.measures import (
     driven,
@@ -31,48 +33,39 @@ from t3mpc_ros.lab.report.measures import (
     tracking_error,
 )
 from t3mpc_ros.lab.report.merit import UNMEASURED
-from t3mpc_ros.lab.report.recorded import (
-    COMMAND,
-    ODOMETRY,
-    REFERENCE,
-    SIGNALS,
-    TERMS,
-    TRUTH,
-    WHEELS,
-    Run,
-    Series,
-)
+from t3mpc_ros.lab.report.recorded import Run, Series
+from t3mpc_ros.lab.report.topics import COMMAND, ODOMETRY, REFERENCE, SIGNALS, TERMS, TRUTH, WHEELS
 
 
 def tracking(run: Run) -> Any:
-    """Return each wheel's reference and speed over time, the paper's Fig. 11."""
+    """Return the reference and the speed of both channels over time, the paper's Fig. 11."""
     reference = run.motions.get(REFERENCE)
     shown = _motions(run, ODOMETRY, TRUTH)
     if not is_long(reference) or not shown:
         return None
     figure, axes = new_panels(2, 2.1)
-    for axis, wheel in zip(axes, WHEELS, strict=True):
+    for axis, (wheel, title, _, unit) in zip(axes, run.channels, strict=True):
         for name, motion in shown.items():
             draw_line(axis, motion, wheel, COLOURS[name], LABELS[name])
         draw_line(axis, reference, wheel, COLOURS[REFERENCE], LABELS[REFERENCE], width=0.8)
-        axis.set_title(f'{wheel} wheel')
-        axis.set_ylabel('speed / rad/s')
+        axis.set_title(title)
+        axis.set_ylabel(f'speed / {unit}')
     return over_time(figure, axes, run)
 
 
 def error(run: Run) -> Any:
-    """Return the tracking error of each wheel over time."""
+    """Return the tracking error of both channels over time."""
     series = tracking_error(run, run.measured)
     if not is_long(series):
         return None
     figure, axes = new_panels(2, 1.8)
     moving = driven(series.time, run)
-    for axis, wheel in zip(axes, WHEELS, strict=True):
+    for axis, (wheel, title, _, unit) in zip(axes, run.channels, strict=True):
         draw_line(axis, series, wheel, COLOURS['error'], 'speed minus reference')
         rmse = statistics(series[wheel][moving]).rmse
-        size = f'{rmse:.3g} rad/s while driven' if moving.any() else UNMEASURED
-        axis.set_title(f'{wheel} wheel, RMSE {size}')
-        axis.set_ylabel('error / rad/s')
+        size = f'{rmse:.3g} {unit} while driven' if moving.any() else UNMEASURED
+        axis.set_title(f'{title}, RMSE {size}')
+        axis.set_ylabel(f'error / {unit}')
     return over_time(figure, axes, run)
 
 
@@ -107,10 +100,10 @@ def control(run: Run) -> Any:
         return None
     applied = {w: series for w in WHEELS if is_long(series := _term(run, 'applied', w))}
     figure, axes = new_panels(len(WHEELS) + len(applied), 1.5)
-    for axis, wheel in zip(axes, WHEELS, strict=False):
+    for axis, (wheel, title, _, unit) in zip(axes, run.channels, strict=False):
         draw_line(axis, command, wheel, COLOURS[COMMAND], 'command')
-        axis.set_title(f'speed commanded to the {wheel} wheel')
-        axis.set_ylabel('rad/s')
+        axis.set_title(f'commanded: {title}')
+        axis.set_ylabel(unit)
     for axis, (wheel, series) in zip(axes[len(WHEELS) :], applied.items(), strict=True):
         draw_line(axis, series, 'value', COLOURS['applied'])
         axis.set_title(f'acceleration u applied to the {wheel} wheel')
@@ -158,21 +151,21 @@ def estimates(run: Run) -> Any:
 
 
 def portrait(run: Run) -> Any:
-    """Return the right wheel against the left, wanted and driven, the paper's Figs. 9 and 14."""
+    """Return one channel against the other, wanted and driven, the paper's Figs. 9 and 14."""
     shown = _motions(run, REFERENCE, run.measured)
     if len(shown) < 2:
         return None
     figure = new_figure(3.9)
     axes = figure.subplots(1, 2, sharex=True, sharey=True)
     for axis, (name, motion) in zip(axes, shown.items(), strict=True):
-        right, left = motion['right'], motion['left']
+        right, left = (motion[each.name] for each in run.channels)
         if name == REFERENCE:  # a jump is no line in the portrait
             jumps = np.flatnonzero(np.isin(motion.time, run.switches))
             right, left = np.insert(right, jumps, np.nan), np.insert(left, jumps, np.nan)
-        axis.plot(left, right, color=COLOURS[name], linewidth=0.8)
+        axis.plot(every_nth(left), every_nth(right), color=COLOURS[name], linewidth=0.8)
         axis.set_title(LABELS[name])
-        axis.set_xlabel('left wheel / rad/s')
-    axes[0].set_ylabel('right wheel / rad/s')
+        axis.set_xlabel(f'{run.channels[1].title} / {run.channels[1].unit}')
+    axes[0].set_ylabel(f'{run.channels[0].title} / {run.channels[0].unit}')
     return figure
 
 
@@ -189,10 +182,12 @@ def path(run: Run) -> Any:
         first = min(int(np.searchsorted(driven.time, reference.time[0])), len(driven) - 1)
         start = (driven['x'][first], driven['y'][first], driven['heading'][first])
         x, y = path_of(reference, start)
-        axis.plot(x, y, color=COLOURS[REFERENCE], linewidth=0.8, label=LABELS[REFERENCE])
+        style = {'color': COLOURS[REFERENCE], 'linewidth': 0.8, 'label': LABELS[REFERENCE]}
+        axis.plot(every_nth(x), every_nth(y), **style)
     for name, motion in shown.items():
         width = 2.6 if name == ODOMETRY else 1.1  # seen on both sides where they coincide
-        axis.plot(motion['x'], motion['y'], color=COLOURS[name], lw=width, label=LABELS[name])
+        x, y = every_nth(motion['x']), every_nth(motion['y'])
+        axis.plot(x, y, color=COLOURS[name], lw=width, label=LABELS[name])
     axis.plot(driven['x'][0], driven['y'][0], 'o', color=COLOURS[REFERENCE], label='start')
     axis.set_aspect('equal', adjustable='datalim')
     axis.set_xlabel('x / m')
@@ -248,7 +243,8 @@ def timing(run: Run) -> Any:
         received = run.receipts[name]
         rows.append((received[1:], np.diff(received), f'between two messages of {name}', name))
     for axis, (time, gap, title, quantity) in zip(axes, rows, strict=True):
-        axis.plot(time, 1e3 * gap, '.', color=COLOURS[quantity], markersize=2)
+        few, some = thinned(time, gap)
+        axis.plot(few, 1e3 * some, '.', color=COLOURS[quantity], markersize=2)
         axis.set_title(title)
         axis.set_ylabel('ms')
         axis.set_ylim(0.0, 1.1e3 * max(float(gap.max()), 1e-6))

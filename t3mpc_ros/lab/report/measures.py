@@ -8,7 +8,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.lab.report.recorded import COMMAND, ODOMETRY, REFERENCE, WHEELS, Run, Series
+from t3mpc_ros.lab.report.recorded import Run, Series
+from t3mpc_ros.lab.report.topics import COMMAND, ODOMETRY, REFERENCE
 
 Array = NDArray[np.float64]
 
@@ -21,7 +22,7 @@ WINDOW = 0.2
 
 @dataclass(frozen=True)
 class ErrorStatistics:
-    """Of one wheel's tracking error, rad/s; NaN without a sample."""
+    """Of the tracking error of one channel, in its unit; NaN without a sample."""
 
     rmse: float
     mae: float
@@ -34,7 +35,7 @@ class ErrorStatistics:
 def statistics(error: Array, period: float = math.nan) -> ErrorStatistics:
     """Return root mean square, mean and largest of the absolute error.
 
-    Each sample of ``error`` (rad/s) stands for ``period`` seconds.
+    Each sample of ``error`` stands for ``period`` seconds.
     """
     size = np.abs(error[np.isfinite(error)])
     if not size.size:
@@ -49,7 +50,7 @@ def statistics(error: Array, period: float = math.nan) -> ErrorStatistics:
 
 
 def tracking_error(run: Run, measured: str) -> Series | None:
-    """Return delta = chi - r of both wheels (rad/s) at the stamps of the ``measured`` motion.
+    """Return measured less wanted of both channels at the stamps of the ``measured`` motion.
 
     The reference is interpolated, but over a switch its earlier sample holds; outside the
     reference there is no error. None when either is absent.
@@ -63,7 +64,7 @@ def tracking_error(run: Run, measured: str) -> Series | None:
     following = np.minimum(before + 1, len(reference) - 1)
     held = np.isin(reference.time[following], run.switches)
     errors = {}
-    for wheel in WHEELS:
+    for wheel, *_ in run.channels:
         wanted = np.interp(time, reference.time, reference[wheel])
         wanted = np.where(held, reference[wheel][before], wanted)
         errors[wheel] = motion[wheel][inside] - wanted

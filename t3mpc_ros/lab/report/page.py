@@ -10,30 +10,31 @@ import math
 from pathlib import Path
 
 from t3mpc_ros.lab.report.canvas import LABELS, png_of
-from t3mpc_ros.lab.report.drawings import DRAWINGS
+from t3mpc_ros.lab.report.drawings import DRAWINGS, OWN
 from t3mpc_ros.lab.report.measures import SETTLING, ErrorStatistics, driving, foreseen
 from t3mpc_ros.lab.report.merit import (
     UNMEASURED,
     ReportFigures,
+    both,
     errors_of,
     figures_of,
     in_words,
 )
-from t3mpc_ros.lab.report.recorded import (
-    COMMAND,
-    ODOMETRY,
-    REFERENCE,
-    TRUTH,
-    WHEELS,
-    Run,
-    load_run,
+from t3mpc_ros.lab.report.recorded import Channel, Run, load_run
+from t3mpc_ros.lab.report.response.tables import (
+    Table,
+    answer_table,
+    journey_table,
+    link_table,
+    roughness_table,
 )
+from t3mpc_ros.lab.report.topics import COMMAND, ODOMETRY, REFERENCE, TRUTH, Wanted, bag_name
 from t3mpc_ros.motion.words import NANOSECONDS
 from t3mpc_ros.record.reader import Recording, open_recording
 
 
 def write_report(
-    folder: Path | str, output: Path | str | None = None, namespace: str | None = None
+    folder: Path | str, output: Path | str | None = None, wanted: Wanted | None = None
 ) -> ReportFigures:
     """Return the main figures of a bag, after writing ``report.html`` and its pictures.
 
@@ -43,20 +44,22 @@ def write_report(
         The bag.
     output
         Where ``report.html`` and ``figures/*.png`` go; beside the bag by default.
-    namespace
-        Which robot's; by default the one with the most topics.
+    wanted
+        Whose topics, which, and what the robot is like; by default what the bag suggests.
 
     Raises
     ------
     RecordError
         There is no bag, or it cannot be read.
+    ReportError
+        There is nothing in it to report, or a topic that was asked for cannot be used.
     OSError
         The output cannot be written.
     """
     folder = Path(folder)
     output = folder.parent if output is None else Path(output)
     with open_recording(folder) as recording:
-        run = load_run(recording, namespace)
+        run = load_run(recording, wanted)
         pictures = {item.stem: png_of(item.draw, run) for item in DRAWINGS}
         (output / 'figures').mkdir(parents=True, exist_ok=True)
         paths = []
@@ -104,9 +107,7 @@ summary { cursor: pointer; font-weight: 600; }
 def _page(
     recording: Recording, run: Run, figures: ReportFigures, pictures: Mapping[str, bytes | None]
 ) -> str:
-    name = recording.folder.resolve().name
-    if name == 'bag':  # says nothing: the folder above tells which run it is
-        name = f'{recording.folder.resolve().parent.name}/bag'
+    name = bag_name(recording.folder)
     parts = [
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
@@ -115,8 +116,8 @@ def _page(
         f'<p class="quiet">{escape(_origin(recording, run))}</p>',
         _tiles(figures),
         _notes(recording, run),
-        '<h2>Tracking error</h2>',
-        _error_table(run),
+        *(['<h2>Tracking error</h2>', _error_table(run)] if run.ours or figures.measured else []),
+        *_response(run, figures),
         _pictures(run, pictures),
         '<h2>Timing by topic</h2>',
         _timing_table(run),
@@ -138,30 +139,56 @@ def _origin(recording: Recording, run: Run) -> str:
     words += [f'{key} {source[key]}' for key in ('version', 'commit') if key in source]
     if run.namespaces[0]:
         words.append(f'namespace {run.namespaces[0]}')
-    words.append(
-        f'wheels of {run.geometry.wheel_radius:g} m radius, '
-        f'{run.geometry.wheel_separation:g} m apart'
-    )
+    if run.geometry is not None:
+        words.append(
+            f'wheels of {run.geometry.wheel_radius:g} m radius, '
+            f'{run.geometry.wheel_separation:g} m apart'
+        )
     return ' · '.join(words)
 
 
 def _tiles(figures: ReportFigures) -> str:
-    right, left = (figures.wheels[wheel] for wheel in WHEELS)
+    channels = figures.channels
+    right, left = (figures.wheels[each.name] for each in channels)
+    names = ' / '.join(each.short for each in channels)
     tiles = [
-        (f'{figures.duration:.1f} s', f'{figures.messages} messages, {figures.switches} switches'),
+        (f'{figures.duration:.1f} s', f'{figures.messages} messages, {figures.switches} switches')
+    ]
+    if right.overall.count or REFERENCE not in figures.absent:
+        tiles += [
+            (
+                _rmse(right.overall, left.overall, channels),
+                f'error RMSE while the robot was being driven, {names}; '
+                f'{right.overall.seconds:.1f} s counted',
+            ),
+            (
+                _rmse(right.settled, left.settled, channels),
+                f'RMSE settled, away from switches; {right.settled.seconds:.1f} s counted',
+            ),
+        ]
+    fits = [figures.responses.get(each.name) for each in channels]
+    if any(fit is not None and fit.clear for fit in fits):
+        delays = [
+            f'{1e3 * (fit.dead_time + fit.lag):.0f}' if fit is not None and fit.clear else '–'
+            for fit in fits
+        ]
+        tiles.append((f'{" / ".join(delays)} ms', f'from command to motion, {names}'))
+    for name, link in figures.links.items():
+        tiles.append(
+            (
+                f'{in_words(100.0 * link.answered)} %',
+                f'of the cycles answered, {name}; round trip {in_words(1e3 * link.round_trip)} ms',
+            )
+        )
+    tiles += [
         (
-            _rmse(right.overall, left.overall),
-            'error RMSE while the robot was being driven, right / left; '
-            f'{right.overall.seconds:.1f} s counted',
-        ),
-        (
-            _rmse(right.settled, left.settled),
-            f'RMSE settled, away from switches; {right.settled.seconds:.1f} s counted',
-        ),
-        (
-            _pair(right.chatter, left.chatter, 'rad/s²'),
-            'variation of the command per second; the reference has '
-            f'{_pair(right.demand, left.demand, "")}',
+            both(right.chatter, left.chatter, channels, '²'),
+            'variation of the command per second'
+            + (
+                f'; the reference has {in_words(right.demand)} / {in_words(left.demand)}'
+                if REFERENCE not in figures.absent
+                else ''
+            ),
         ),
         (
             f'{in_words(1e3 * figures.latency)} ms',
@@ -194,16 +221,15 @@ def _error_table(run: Run) -> str:
     for source in (TRUTH, ODOMETRY):
         if source not in run.motions or REFERENCE not in run.motions:
             continue
-        for wheel, both in errors_of(run, source).items():
-            for extent, values in zip(('driven', 'settled'), both, strict=True):
+        for channel, pair in zip(run.channels, errors_of(run, source).values(), strict=True):
+            for extent, values in zip(('driven', 'settled'), pair, strict=True):
                 numbers = (values.rmse, values.mae, values.largest)
                 cells = [in_words(number) if values.count else UNMEASURED for number in numbers]
                 cells += [f'{values.seconds:.1f}', str(values.count)]
-                rows.append([LABELS[source], wheel, extent, *cells])
+                rows.append([LABELS[source], channel.title, extent, *cells, channel.unit])
     if not rows:
         return '<p>The bag lacks a reference, or odometry to compare with it.</p>'
-    head = ['motion', 'wheel', 'extent', 'RMSE / rad/s', 'MAE / rad/s', 'max / rad/s']
-    head += ['counted / s', 'samples']
+    head = ['motion', 'speed', 'extent', 'RMSE', 'MAE', 'max', 'counted / s', 'samples', 'unit']
     note = f'<p class="quiet">{escape(_extents(run))}</p>'
     return _table(head, rows, text=3, wrap=False) + note
 
@@ -234,10 +260,39 @@ def _extents(run: Run) -> str:
     return f'{extent} Settled: also without {ahead}the {SETTLING:g} s after each switch.'
 
 
+def _response(run: Run, figures: ReportFigures) -> list[str]:
+    """Return the tables of how the robot answers, moves and is reached, with their titles."""
+    parts = []
+
+    def add(title: str, table: Table, text: int, note: str = '') -> None:
+        if table[1]:
+            parts.append(f'<h2>{escape(title)}</h2>')
+            parts.append(_table(*table, text=text, wrap=False))
+            if note:
+                parts.append(f'<p class="quiet">{escape(note)}</p>')
+
+    if figures.responses:
+        add(
+            'From command to motion',
+            answer_table(run, figures.responses),
+            1,
+            'A dead time, a first-order lag and a gain that explain most of the measured speed; '
+            'their sum is known better than either. A dash: no clear answer to the command.',
+        )
+    add('How hard the robot is moved', roughness_table(run), 2)
+    add('Way and stops', journey_table(run), 1)
+    add('How well the radio link worked', link_table(figures.links), 1)
+    return parts
+
+
 def _pictures(run: Run, pictures: Mapping[str, bytes | None]) -> str:
     parts = []
     for item in DRAWINGS:
         png = pictures[item.stem]
+        if png is None and item.stem in OWN and not run.ours:
+            continue  # nobody expects them of another robot
+        if png is None and item.stem == 'link' and not run.links:
+            continue
         title = escape(item.title)
         parts.append(f'<h2>{title}</h2>')
         if png is None:
@@ -313,9 +368,5 @@ def _table(
     return f'<div class="wide"><table><tr>{top}</tr>\n{body}</table></div>'
 
 
-def _rmse(right: ErrorStatistics, left: ErrorStatistics) -> str:
-    return _pair(right.rmse, left.rmse, 'rad/s') if right.count else UNMEASURED
-
-
-def _pair(right: float, left: float, unit: str) -> str:
-    return f'{in_words(right)} / {in_words(left)} {unit}'.rstrip()
+def _rmse(right: ErrorStatistics, left: ErrorStatistics, channels: tuple[Channel, Channel]) -> str:
+    return both(right.rmse, left.rmse, channels) if right.count else UNMEASURED

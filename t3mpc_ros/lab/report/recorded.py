@@ -2,37 +2,36 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a bag says of a run: motions, commands and terms over one time.
 
-Topics are known by their names relative to a namespace; any of them may be absent, empty, or
-hold numbers that are not finite.
+Any topic may be absent or empty, hold numbers that are not finite, or stamps of no clock at all.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.lab.report.link.history import Complaint, Link, read_diagnostics
+from t3mpc_ros.lab.report.topics import (
+    COMMAND,
+    NAMES,
+    NUMBERS,
+    ODOMETRY,
+    REFERENCE,
+    SIGNALS,
+    TRUTH,
+    WHEELS,
+    Wanted,
+    choose_topics,
+)
 from t3mpc_ros.motion.kinematics import Geometry, wheels_from_body
 from t3mpc_ros.motion.words import BodyTwist
 from t3mpc_ros.record.reader import Recording, missing_share
 from t3mpc_ros.settings import SettingError
 
 Array = NDArray[np.float64]
-
-WHEELS = ('right', 'left')
-TERMS = ('fuzzy', 'feedback', 'feedforward', 'compensator', 'predictive')
-TRUTH, ODOMETRY, REFERENCE, COMMAND = 'ground_truth/odom', 'odom', 'reference', 'cmd_vel'
-SIGNALS = ('reference/mode', 'reference/signal/right', 'reference/signal/left')
-NUMBERS = (
-    *SIGNALS,
-    *(f'controller/{name}/{w}' for name in ('error', 'estimate', 'skill') for w in WHEELS),
-    *(f'controller/terms/{name}/{w}' for name in (*TERMS, 'applied') for w in WHEELS),
-    'controller/lyapunov/value',
-    'controller/lyapunov/margin',
-)
-NAMES = (REFERENCE, ODOMETRY, TRUTH, COMMAND, 'reference/signals', *NUMBERS)
 
 _ODOMETRY_FIELDS = {
     'x': 'pose.pose.position.x',
@@ -42,6 +41,32 @@ _ODOMETRY_FIELDS = {
     'linear': 'twist.twist.linear.x',
     'angular': 'twist.twist.angular.z',
 }
+
+
+_TWIST_FIELDS = {'linear': 'linear.x', 'angular': 'angular.z'}
+JUMP = 10.0
+"""Seconds by which stamps leap against the receipts when a clock was set, not merely late."""
+
+
+class Channel(NamedTuple):
+    """One of the two numbers that a motion is shown by."""
+
+    name: str
+    """In :attr:`Run.motions`."""
+    title: str
+    short: str
+    unit: str
+
+
+BY_WHEEL = (
+    Channel('right', 'right wheel', 'right', 'rad/s'),
+    Channel('left', 'left wheel', 'left', 'rad/s'),
+)
+BY_BODY = (
+    Channel('linear', 'forward speed', 'forward', 'm/s'),
+    Channel('angular', 'turn rate', 'turning', 'rad/s'),
+)
+"""Of a robot whose wheels are not known."""
 
 
 @dataclass(frozen=True)
@@ -82,10 +107,15 @@ class Run:
     """Relative names that are not in the bag, or have no message."""
     namespaces: tuple[str, ...]
     """The namespace shown, then others that the bag holds."""
-    geometry: Geometry
+    ours: bool
+    """Whether more is expected of the bag than of any robot's."""
+    geometry: Geometry | None
+    """None when the wheels are not known."""
+    channels: tuple[Channel, Channel]
+    """By what motions are shown: wheels where they are known, else forward speed and turn rate."""
     motions: Mapping[str, Series]
     """``reference``, ``odom``, ``ground_truth/odom``, ``cmd_vel``: linear, angular (m/s, rad/s),
-    right, left (rad/s), and but for the command x, y (m), heading (rad)."""
+    right, left (rad/s) where the wheels are known, and of odometry x, y (m), heading (rad)."""
     numbers: Mapping[str, Series]
     """Plain numbers by relative name, as ``value``."""
     receipts: Mapping[str, Array]
@@ -95,8 +125,10 @@ class Run:
     """When the reference switched."""
     lead: float
     """Median (s) of how far ahead of their receipt the stamps of the reference are."""
-    complaints: tuple[tuple[float, str, str, str], ...]
+    complaints: tuple[Complaint, ...]
     """From diagnostics: when first, level, who, what."""
+    links: tuple[Link, ...]
+    """Radio links that diagnostics tell of."""
     notes: tuple[str, ...]
 
     @property
@@ -105,12 +137,23 @@ class Run:
         return next((name for name in (TRUTH, ODOMETRY) if name in self.motions), '')
 
 
-def load_run(recording: Recording, namespace: str | None = None) -> Run:
-    """Return the run in ``recording``; of the fullest namespace unless one is named."""
-    topics, namespaces = find_topics(recording.topics, namespace)
-    topics = {name: t for name, t in topics.items() if recording.topics[t].message_count}
-    notes: list[str] = []
-    geometry = _geometry(recording.details, notes)
+def load_run(recording: Recording, wanted: Wanted | None = None) -> Run:
+    """Return the run in ``recording``; of the fullest namespace unless one is named.
+
+    Raises
+    ------
+    ReportError
+        There is nothing to report, or what was asked for cannot be used.
+    DataError
+        A message cannot be read.
+    SettingError
+        The wheels that were given cannot be.
+    """
+    wanted = wanted or Wanted()
+    choice = choose_topics(recording, wanted)
+    topics = choice.topics
+    notes = [*choice.notes]
+    geometry = _geometry(recording.details, wanted, choice.ours, notes)
     raw = {name: _read(recording, name, topic, notes) for name, topic in topics.items()}
     raw = {name: table for name, table in raw.items() if table['stamp'].size}
     clock = _Clock(raw, notes)
@@ -124,16 +167,19 @@ def load_run(recording: Recording, namespace: str | None = None) -> Run:
         elif name in NUMBERS:
             time = clock.applies if name in SIGNALS else clock.local
             numbers[name] = Series(time(table['received']), {'value': table['value']})
-        elif name == COMMAND:
+        elif name == COMMAND or 'x' not in table:
             motions[name] = _motion(clock.local(table['received']), table, geometry)
         else:
             motions[name] = _motion(table['stamp'] - clock.origin, table, geometry)
+    complaints, links = read_diagnostics(recording, choice.namespaces[0])
     return Run(
         duration=recording.duration,
         topics=topics,
-        absent=_absent(topics),
-        namespaces=namespaces,
+        absent=_absent(topics, choice.ours),
+        namespaces=choice.namespaces,
+        ours=choice.ours,
         geometry=geometry,
+        channels=BY_BODY if geometry is None else BY_WHEEL,
         motions=motions,
         numbers=numbers,
         receipts={name: table['received'] for name, table in raw.items()},
@@ -144,32 +190,10 @@ def load_run(recording: Recording, namespace: str | None = None) -> Run:
         },
         switches=_switches(numbers, motions.get(REFERENCE)),
         lead=clock.lead,
-        complaints=_complaints(recording, namespaces[0]),
+        complaints=complaints,
+        links=links,
         notes=tuple(notes),
     )
-
-
-def find_topics(
-    names: Iterable[str], namespace: str | None = None
-) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Return full names by relative names, and the namespaces there are, the chosen one first.
-
-    A topic belongs to the longest known name it ends with, so ``/a/ground_truth/odom`` is never
-    taken for the ``odom`` of ``/a/ground_truth``. Without ``namespace`` the one with the most
-    known topics is chosen.
-    """
-    found: dict[str, dict[str, str]] = {}
-    for full in names:
-        known = [name for name in NAMES if full.endswith(f'/{name}')]
-        if known:
-            name = max(known, key=len)
-            found.setdefault(full[: -len(name) - 1], {})[name] = full
-    order = sorted(found, key=lambda space: (-len(found[space]), space))
-    if namespace is not None:
-        chosen = '/' + namespace.strip('/') if namespace.strip('/') else ''
-        order = [chosen, *(space for space in order if space != chosen)]
-    order = order or ['']
-    return found.get(order[0], {}), tuple(order)
 
 
 class _Clock:
@@ -185,7 +209,7 @@ class _Clock:
         table = raw.get(ODOMETRY) or raw.get(TRUTH)
         if table:
             offset = table['stamp'] - table['received']
-            if abs(float(np.median(offset))) > 1.0:
+            if abs(float(np.median(offset))) > 1.0 or np.ptp(offset) > JUMP:
                 self._received, self._offset = table['received'], offset
                 self.origin = float(table['stamp'].min())
                 notes.append(
@@ -208,9 +232,10 @@ class _Clock:
 
 def _read(recording: Recording, name: str, topic: str, notes: list[str]) -> dict[str, Array]:
     """Return the arrays of one topic, without the rows that are not finite."""
-    if name == COMMAND:
-        inner = 'twist.' if recording.topics[topic].type_name.endswith('Stamped') else ''
-        fields = {'linear': f'{inner}linear.x', 'angular': f'{inner}angular.z'}
+    kind = recording.topics[topic].type_name
+    if kind.endswith(('/Twist', '/TwistStamped')):
+        inner = 'twist.' if kind.endswith('Stamped') else ''
+        fields = {key: inner + field for key, field in _TWIST_FIELDS.items()}
     elif name == 'reference/signals':
         fields = {f'{i}': f'data[{i}]' for i in range(3)}
     else:
@@ -220,17 +245,46 @@ def _read(recording: Recording, name: str, topic: str, notes: list[str]) -> dict
     if not sound.all():
         notes.append(f'{np.count_nonzero(~sound)} messages of {topic} held a number that is not '
                      'finite; they are left out.')  # fmt: skip
-    return {key: column[sound] for key, column in table.items()}
+    table = {key: column[sound] for key, column in table.items()}
+    if fields is _ODOMETRY_FIELDS:
+        _mend_stamps(table, topic, notes)
+    return table
 
 
-def _motion(time: Array, table: Mapping[str, Array], geometry: Geometry) -> Series:
+def _mend_stamps(table: dict[str, Array], topic: str, notes: list[str]) -> None:
+    """Put the receipts in the place of stamps that do not tell the time."""
+    received, stamps = table['received'], table['stamp']
+    if stamps.size > 2 and np.unique(stamps).size < 0.5 * np.unique(received).size:
+        table['stamp'] = received
+        notes.append(f'The stamps of {topic} stand still; its messages were placed by receipt.')
+        return
+    steps, gaps = np.diff(stamps), np.diff(received)
+    if leaps := np.flatnonzero((steps < -JUMP) | (steps > gaps + JUMP)).tolist():
+        table['stamp'] = received
+        notes.append(
+            f'The stamps of {topic} leap {len(leaps)} times, first by {steps[leaps[0]]:.1f} s at '
+            f'{received[leaps[0]]:.1f} s: a clock was set; its messages were placed by receipt.'
+        )
+    elif leaps := np.flatnonzero(gaps > steps + JUMP).tolist():
+        notes.append(
+            f'From {received[leaps[0]]:.1f} s on nothing of {topic} was received for '
+            f'{gaps[leaps[0]]:.1f} s, but by its stamps that was {steps[leaps[0]]:.1f} s: the '
+            "recorder's clock was set, or the recording was paused."
+        )
+    if late := np.count_nonzero((steps < 0.0) & (steps >= -JUMP)):
+        notes.append(f'{late} messages of {topic} came behind later ones; they were sorted.')
+
+
+def _motion(time: Array, table: Mapping[str, Array], geometry: Geometry | None) -> Series:
     """Return a motion in order of time; of two at one instant the one that came last."""
     time, back = np.unique(time[::-1], return_index=True)
     order = table['linear'].size - 1 - back
     linear: Any = table['linear'][order]
     angular: Any = table['angular'][order]
-    wheels: Any = wheels_from_body(BodyTwist(linear, angular), geometry)
-    values = {'linear': linear, 'angular': angular, 'right': wheels.right, 'left': wheels.left}
+    values = {'linear': linear, 'angular': angular}
+    if geometry is not None:
+        wheels: Any = wheels_from_body(BodyTwist(linear, angular), geometry)
+        values |= {'right': wheels.right, 'left': wheels.left}
     if 'x' in table:
         heading = 2.0 * np.arctan2(table['z'], table['w'])
         values |= {'x': table['x'][order], 'y': table['y'][order], 'heading': heading[order]}
@@ -271,32 +325,51 @@ def _switches(numbers: Mapping[str, Series], reference: Series | None) -> Array:
     return np.array(sorted(found), dtype=np.float64)
 
 
-def _geometry(details: Mapping[str, Mapping[str, str]], notes: list[str]) -> Geometry:
-    """Return the lengths the recorded settings give; the robot's own word first."""
+def _geometry(
+    details: Mapping[str, Mapping[str, str]], wanted: Wanted, ours: bool, notes: list[str]
+) -> Geometry | None:
+    """Return the lengths that were given, else those of the recorded settings, else None.
+
+    Of the settings the robot's own word comes first. A bag of this package's nodes that does not
+    tell is taken to be of the robot they are made for.
+    """
     order = sorted(details, key=lambda title: title not in ('sim_robot', 'radio_bridge', 'robot'))
-    values: dict[str, object] = {}
+    given = {'wheel_radius': wanted.wheel_radius, 'wheel_separation': wanted.track}
+    values: dict[str, object] = {key: value for key, value in given.items() if value is not None}
     for title in order:
         for key, text in details[title].items():
             name = key.rpartition('.')[2]
-            if name in ('wheel_radius', 'wheel_separation') and name not in values:
+            if name in given and name not in values:
                 try:
                     values[name] = float(text)
                 except ValueError:
                     notes.append(f'The recorded {key} is no number: {text!r}.')
+    said = wanted.wheel_radius is not None or wanted.track is not None
     try:
         geometry = Geometry.from_flat(values)
     except SettingError as error:
+        if said:
+            raise
         notes.append(f'The recorded geometry cannot be used: {error}.')
         values, geometry = {}, Geometry()
-    if len(values) < 2:
+    if len(values) == len(given):
+        return geometry
+    if not ours:
         notes.append(
-            f'The bag does not say how large the wheels are; {geometry.wheel_radius:g} m radius '
-            f'and {geometry.wheel_separation:g} m apart are assumed.'
+            'The bag does not say how large the wheels are and how far apart: speeds are those of '
+            'the robot, in m/s and rad/s (--wheel-radius and --track give those of the wheels).'
         )
+        return None
+    notes.append(
+        f'The bag does not say how large the wheels are; {geometry.wheel_radius:g} m radius '
+        f'and {geometry.wheel_separation:g} m apart are assumed.'
+    )
     return geometry
 
 
-def _absent(topics: Mapping[str, str]) -> tuple[str, ...]:
+def _absent(topics: Mapping[str, str], ours: bool) -> tuple[str, ...]:
+    if not ours:
+        return tuple(name for name in (REFERENCE, ODOMETRY, COMMAND) if name not in topics)
     names = set(NAMES) - set(topics)
     # One topic announces the signals, or three do; of the three the bag may hold a part.
     names -= (
@@ -305,18 +378,3 @@ def _absent(topics: Mapping[str, str]) -> tuple[str, ...]:
         else {'reference/signals'}
     )
     return tuple(name for name in NAMES if name in names)
-
-
-def _complaints(recording: Recording, namespace: str) -> tuple[tuple[float, str, str, str], ...]:
-    """Return each distinct warning or error of the diagnostics, when it came first."""
-    found: dict[tuple[str, str, str], float] = {}
-    for topic in {'/diagnostics', f'{namespace}/diagnostics'} & set(recording.topics):
-        if not recording.topics[topic].type_name.endswith('DiagnosticArray'):
-            continue
-        for received, message in recording.messages(topic):
-            for status in message.status:
-                level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
-                if level:
-                    word = {1: 'warning', 2: 'error', 3: 'stale'}.get(level, str(level))
-                    found.setdefault((word, status.name, status.message), received)
-    return tuple((when, *key) for key, when in sorted(found.items(), key=lambda item: item[1]))

@@ -1,8 +1,10 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""``lab train BAG ...``: a model from recorded runs, of a simulated robot or of a real one."""
+"""``bag train BAG ...``: a model from recorded runs, of a simulated robot or of a real one."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -10,27 +12,63 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.control.composition import ComposedLaw, CompositionSettings
 from t3mpc_ros.control.controller import ControllerSettings
+from t3mpc_ros.lab.report.topics import bag_name
+from t3mpc_ros.lab.training.folds import (
+    NOMINAL,
+    TAUGHT,
+    Fold,
+    blocks,
+    cross_validate,
+    fold_table,
+    mean_and_spread,
+    pair,
+)
 from t3mpc_ros.lab.training.lessons import periods, teach_coefficients, teach_predictor
 from t3mpc_ros.lab.training.replay import Replay, TrainingError, replay_bag
+from t3mpc_ros.record.reader import open_recording
+from t3mpc_ros.settings.provenance import provenance
 
 Array = NDArray[np.float64]
 
 FREE = ('predictive.dither',)
 """What may differ between the bags of one model, of all that shapes what is learnt."""
+FOLDS = 5
+"""Into how many blocks a bag is cut that is alone."""
+STORAGE = ('.mcap', '.db3')
+
+
+@dataclass(frozen=True)
+class BagModel:
+    """What bags teach."""
+
+    learnt: Mapping[str, Array]
+    """As a model file keeps it."""
+    settings: ControllerSettings
+    """Under which the bags were made."""
+    origin: Mapping[str, object]
+    """For the header of the model file: the bags, this program, and what the model is worth."""
+    folds: Sequence[Fold]
+    text: str
+    """What there is to say, in lines."""
 
 
 def learn_from_bags(
-    folders: Sequence[Path], *, keep_predictor: bool = False
-) -> tuple[dict[str, Array], ControllerSettings, str]:
-    """Return what bags teach as a model file keeps it, their settings, and what there is to say.
+    folders: Sequence[Path], *, keep_predictor: bool = False, count: int = FOLDS
+) -> BagModel:
+    """Return what all the bags teach, and what that is worth by cross-validation.
+
+    Of several bags each is a fold. One alone is cut into blocks, one after the other: they are
+    less independent than bags, so the skill found is a little too good.
 
     Parameters
     ----------
     folders
-        Bags made under the same settings; the end of the last is kept back to judge by.
+        Bags made under the same settings.
     keep_predictor
         Learn the coefficients only. The predictor stays as the nominal loop has taught it: for
         bags in which v_p moved too little.
+    count
+        Number of blocks of a bag that is alone, at least 2.
 
     Raises
     ------
@@ -39,42 +77,109 @@ def learn_from_bags(
     RecordError
         A bag cannot be read.
     """
-    replays, lines = [], []
+    runs: dict[str, Replay] = {}
+    origins, lines = [], []
     settings: ControllerSettings | None = None
     for folder in folders:
         replay, found, notes = replay_bag(folder)
         lines += [f'note: {note}' for note in notes]
         settings = settings or found
         check_alike(settings, found, folders[0], folder)
-        replays.append(replay)
+        name = bag_name(folder)
+        while name in runs:
+            name += "'"
+        runs[name] = replay
+        origins.append({'name': name, **origin_of(folder)})
     if settings is None:
         raise TrainingError('at least one bag must be given')
-    replay = Replay.joined(replays)
+    if len({str(each['files']) for each in origins}) < len(origins):
+        raise TrainingError('each bag must be given once: two have the same content')
+    replay = Replay.joined(list(runs.values()))
     lines.append(
         f'rebuilt {len(replay) / settings.rate:.1f} s of control from {len(folders)} bag'
-        f'{"s" if len(folders) > 1 else ""}; skills and shares are of the last quarter, which is '
-        'not learnt'
+        f'{"s" if len(folders) > 1 else ""}'
     )
-    coefficients = teach_coefficients(settings, replay)
-    lines.append(
-        f'fuzzy systems: g explains {_pair(100.0 * coefficients.explained, ".0f")} % of the '
-        'variance of the acceleration that the estimate could not explain (right/left)'
-    )
+    # Taught by all: what cannot be done at all is said before folds are tried.
     learnt = ComposedLaw(settings).learnt()
-    learnt['fuzzy.coefficients'] = coefficients.coefficients
-    if keep_predictor:
-        lines.append('predictor: kept as the nominal loop has taught it')
-        return learnt, settings, '\n'.join(lines)
-    lesson = teach_predictor(settings, *periods(replay, settings.predictive, settings.rate))
-    learnt |= {f'predictive.{name}': value for name, value in lesson.weights.items()}
+    learnt['fuzzy.coefficients'] = teach_coefficients(settings, replay)
+    said = 'predictor: kept as the nominal loop has taught it'
+    if not keep_predictor:
+        lesson = teach_predictor(settings, *periods(replay, settings.predictive, settings.rate))
+        learnt |= {f'predictive.{name}': value for name, value in lesson.weights.items()}
+        said = (
+            f'predictor: learnt from {lesson.taught:.1f} s; the effect of v_p is known to '
+            f'{pair(100.0 * lesson.uncertainty, ".0f")} % of the nominal one (standard error)'
+        )
+    parts = runs
+    if len(runs) == 1:
+        parts = {f'block {i + 1}': part for i, part in enumerate(blocks(replay, count))}
+    folds = cross_validate(settings, parts, keep_predictor=keep_predictor)
     lines += [
-        f'predictor: learnt from {lesson.taught:.1f} s, judged by {lesson.kept_back:.1f} s '
-        '(right/left)',
-        skill_table({'nominal loop': lesson.before, 'bag': lesson.after}),
-        f'  the effect of v_p is known to {_pair(100.0 * lesson.uncertainty, ".0f")} % of the '
-        'nominal one (standard error)',
+        f'cross-validated in {len(folds)} folds: each {"bag" if len(runs) > 1 else "block"} is '
+        'judged by what the others teach (right/left); 0 is no prediction',
+        fold_table(folds),
+        said + '; the model is learnt from all',
+        *_warnings(folds),
     ]
-    return learnt, settings, '\n'.join(lines)
+    return BagModel(learnt, settings, _origin(origins, folds), folds, '\n'.join(lines))
+
+
+def _warnings(folds: Sequence[Fold]) -> list[str]:
+    """Return what speaks against using the model."""
+    found = []
+    if folds[0].skills:
+        taught, nominal = (
+            mean_and_spread([fold.skills[name] for fold in folds])[0] for name in (TAUGHT, NOMINAL)
+        )
+        if (taught <= 0.0).any():
+            found.append(
+                'warning: in part the taught predictor is no better than none; record for longer, '
+                'or with more predictive.dither'
+            )
+        elif (taught <= nominal).any():
+            found.append(
+                'warning: in part the nominal loop predicts as well; --keep-predictor keeps it'
+            )
+    share = mean_and_spread([fold.explained for fold in folds])[0]
+    if (share <= 0.0).any():
+        found.append('warning: the coefficients explain nothing that they were not taught')
+    return found
+
+
+def _origin(bags: Sequence[Mapping[str, object]], folds: Sequence[Fold]) -> dict[str, object]:
+    """Return what the header of the model file says of where the model comes from."""
+    worth: dict[str, object] = {
+        'folds': len(folds),
+        'explained': _both([fold.explained for fold in folds]),
+    }
+    if folds[0].skills:
+        worth['skill'] = _both([fold.skills[TAUGHT] for fold in folds])
+    return {'bags': list(bags), 'program': provenance(), 'cross_validation': worth}
+
+
+def _both(values: Sequence[Array]) -> dict[str, list[float] | list[list[float]]]:
+    mean, spread = mean_and_spread(values)
+    return {'mean': np.round(mean, 4).tolist(), 'spread': np.round(spread, 4).tolist()}
+
+
+def origin_of(folder: Path) -> dict[str, object]:
+    """Return which files a bag is made of (SHA-256 by name), and what made it, as plain data.
+
+    Raises
+    ------
+    RecordError
+        The bag cannot be read.
+    """
+    paths = [folder] if folder.is_file() else sorted(folder.iterdir())
+    files = {}
+    for path in paths:
+        if path.suffix in STORAGE:
+            with path.open('rb') as file:
+                files[path.name] = hashlib.file_digest(file, 'sha256').hexdigest()
+    with open_recording(folder) as recording:
+        made_by = dict(recording.details.get('provenance', {}))
+        start, duration = recording.start_ns, recording.duration
+    return {'files': files, 'start_ns': start, 'duration_s': duration, 'made_by': made_by}
 
 
 def check_alike(
@@ -89,18 +194,3 @@ def check_alike(
             f'{path} and {other_path} must have the same settings; they differ in '
             + ', '.join(f'{name} ({mine[name]}, {its[name]})' for name in differing)
         )
-
-
-def skill_table(skills: Mapping[str, Array]) -> str:
-    """Return skills of both wheels as lines; each is (next step, middle) by (right, left)."""
-    width = max(map(len, skills))
-    lines = [f'  {"skill after":<{max(width, 11)}}  next step     middle of the horizon']
-    for name, values in skills.items():
-        lines.append(
-            f'  {name:<{max(width, 11)}}  {_pair(values[0], ".2f"):<12}  {_pair(values[1], ".2f")}'
-        )
-    return '\n'.join(lines)
-
-
-def _pair(values: Array, form: str) -> str:
-    return '/'.join(f'{value:{form}}' for value in values)

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from t3mpc_ros.control.composition import CompositionSettings
 from t3mpc_ros.fuzzy.adaptation import AdaptationSettings
 from t3mpc_ros.fuzzy.estimator import FuzzyEstimator
+from t3mpc_ros.lab.training.effect import effect
 from t3mpc_ros.lab.training.replay import Replay, TrainingError
-from t3mpc_ros.mpc.machine import Shape, make_machine
-from t3mpc_ros.mpc.predictive import PredictiveTerm
+from t3mpc_ros.mpc.machine import Machine, Shape, make_machine
 from t3mpc_ros.mpc.settings import PredictiveSettings
-from t3mpc_ros.mpc.skill import Learning, Predictor, skill
-from t3mpc_ros.mpc.training import Timing, nominal_step, split_runs
+from t3mpc_ros.mpc.skill import Learning, Predictor
+from t3mpc_ros.mpc.training import Timing, nominal_step
 
 Array = NDArray[np.float64]
 
@@ -25,6 +25,8 @@ ENOUGH = 10.0
 """Least length of what can be learnt from, s."""
 SHORTEST = 40
 """Least predictive periods of a stretch without a gap: shorter ones do not show their phase."""
+JUDGED = 20
+"""Least predictive periods without a gap that a predictor is judged by."""
 UNCERTAIN = 0.5
 """Largest standard error of the effect of v_p, as a share of the nominal one: twice this, and an
 effect could not be told from none."""
@@ -36,18 +38,13 @@ SETTLING = 0.5
 
 @dataclass(frozen=True)
 class PredictorLesson:
-    """What the predictor learnt; rows of skills: next step, middle of the horizon."""
+    """What the predictor learnt."""
 
     weights: dict[str, Array]
-    before: Array
-    """Skill on the run kept back, of a predictor that knows the nominal loop only, (2, 2)."""
-    after: Array
-    """That of ``weights``, shape (2, 2)."""
+    """As :meth:`PredictiveTerm.weights` returns them."""
     uncertainty: Array
     """Standard error of the effect of v_p over the nominal effect, shape (2,)."""
     taught: float
-    """s"""
-    kept_back: float
     """s"""
 
 
@@ -123,7 +120,7 @@ def _one_each(replay: Replay, rows: NDArray[np.int64], span: float) -> NDArray[n
 
 
 def teach_predictor(settings: CompositionSettings, errors: Array, moves: Array) -> PredictorLesson:
-    """Return what the predictor learns from a run in periods, see :func:`periods`.
+    """Return what the predictor learns from all of a run in periods, see :func:`periods`.
 
     Raises
     ------
@@ -132,46 +129,86 @@ def teach_predictor(settings: CompositionSettings, errors: Array, moves: Array) 
     """
     predictive, period = settings.predictive, 1.0 / settings.rate
     timing = Timing(period, predictive.every, predictive.average)
-    runs = split_runs(errors, moves, 2)
-    first, last = (
-        min(np.count_nonzero(np.isfinite(run[part][0] + run[part][1])) for run in runs)
-        * timing.span
-        for part in (0, 1)
-    )
-    if first < ENOUGH or last < 0.1 * ENOUGH:
+    taught = np.count_nonzero(np.isfinite(errors + moves).all(axis=1)) * timing.span
+    parts = stretches(errors, moves)
+    if taught < ENOUGH or not parts:
         raise TrainingError(
-            f'the run must hold at least {ENOUGH:g} s with known errors and v_p, and after that '
-            f'a quarter to judge by with {0.1 * ENOUGH:g} s without a gap, in stretches of at '
-            f'least {SHORTEST * timing.span:g} s: got {first:.1f} s and {last:.1f} s'
+            f'the run must hold at least {ENOUGH:g} s with known errors and v_p, and of these '
+            f'{JUDGED * timing.span:g} s without a gap: got {taught:.1f} s, the longest stretch '
+            f'{_longest(errors + moves) * timing.span:.1f} s'
         )
     loop = replace(predictive.nominal, feedback_gain=min(feedback_slope(settings), 100.0))
     middle = max(predictive.horizon // 2, 1)
     nominal = nominal_step(loop, timing, middle)[-1]
-    effects = [
-        effect(*run[0], predictive.delta_lags, predictive.move_lags, middle) for run in runs
+    # Newest first, as everything in the machine's room.
+    runs = [
+        (np.ascontiguousarray(errors[::-1, z]), np.ascontiguousarray(moves[::-1, z]))
+        for z in range(2)
     ]
+    effects = [effect(*run, predictive.delta_lags, predictive.move_lags, middle) for run in runs]
     uncertainty = np.array([each.error for each in effects]) / nominal
     if not np.max(uncertainty) <= UNCERTAIN:
         worst = int(np.argmax(uncertainty))
         raise TrainingError(
             'v_p must move more to show what it does: by itself, apart from what errors and older '
             f'v_p foretell, it moved by {effects[worst].own:.2g} rad/s² (standard deviation), so '
-            f'in {first:.0f} s its effect is known to {100.0 * uncertainty[worst]:.0f} % of the '
+            f'in {taught:.0f} s its effect is known to {100.0 * uncertainty[worst]:.0f} % of the '
             f'nominal one, and {100.0 * UNCERTAIN:.0f} % are needed. Set predictive.dither of the '
             'controller while recording (a few rad/s²), record for longer, or keep the predictor '
             'as it is (--keep-predictor)'
         )
-    term = PredictiveTerm(predictive, period, settings.law.gain)
-    before = skills(predictive, timing.span, term.weights(), [run[1] for run in runs])
-    term.relearn(errors, moves)
-    return PredictorLesson(
-        weights=term.weights(),
-        before=before,
-        after=np.stack([term.skill_next, term.skill]),
-        uncertainty=uncertainty,
-        taught=first,
-        kept_back=last,
-    )
+    learning = Learning.of(predictive, timing.span)
+    generator = np.random.default_rng(predictive.seed)
+    longest = max(parts, key=lambda part: part[0][0].size)
+    each = []
+    for z, run in enumerate(runs):
+        predictor = Predictor(_machine(predictive, generator), predictive.horizon, longest[z])
+        trust = predictive.trust / timing.span
+        predictor.teach(*run, predictive.excitation, trust, learning)
+        each.append(predictor.weights())
+    weights = {name: np.stack([one[name] for one in each]) for name in each[0]}
+    return PredictorLesson(weights, uncertainty, float(taught))
+
+
+def _machine(settings: PredictiveSettings, generator: np.random.Generator) -> Machine:
+    """Return a machine with first weights."""
+    shape = Shape(settings.delta_lags, settings.move_lags, settings.hidden)
+    scales = settings.delta_scale, settings.move_scale
+    return make_machine(shape, *scales, settings.spread, generator)
+
+
+def stretches(errors: Array, moves: Array) -> list[list[tuple[Array, Array]]]:
+    """Return the parts of a run without a gap, of at least :data:`JUDGED` periods.
+
+    Parameters
+    ----------
+    errors, moves
+        As :func:`periods` returns them, shape (N, 2).
+
+    Returns
+    -------
+    list
+        For each part (errors, moves) of each wheel, *newest first*.
+    """
+    gaps = np.flatnonzero(np.isnan(errors + moves).any(axis=1))
+    edges = [-1, *gaps.tolist(), len(errors)]
+    return [
+        [
+            (
+                np.ascontiguousarray(errors[low + 1 : high, z][::-1]),
+                np.ascontiguousarray(moves[low + 1 : high, z][::-1]),
+            )
+            for z in range(errors.shape[1])
+        ]
+        for low, high in pairwise(edges)
+        if high - low > JUDGED
+    ]
+
+
+def _longest(table: Array) -> int:
+    """Return how many rows in a row are known."""
+    gaps = np.flatnonzero(np.isnan(table).any(axis=1))
+    return int(np.diff([-1, *gaps.tolist(), len(table)]).max()) - 1
 
 
 def feedback_slope(settings: CompositionSettings) -> float:
@@ -184,9 +221,12 @@ def skills(
     settings: PredictiveSettings,
     span: float,
     weights: dict[str, Array],
-    runs: list[tuple[Array, Array]],
+    parts: list[list[tuple[Array, Array]]],
 ) -> Array:
     """Return the skill of saved weights on a run: next step and middle of the horizon, (2, m).
+
+    1 is perfect; 0 is no better than no prediction, which is that the error stays what it is. The
+    squares of all stretches are put together. NaN when there is none.
 
     Parameters
     ----------
@@ -194,113 +234,26 @@ def skills(
         Of the predictive term, and its period, s.
     weights
         As :meth:`PredictiveTerm.weights` returns them.
-    runs
-        (errors, moves) of each output, *newest first*, without a gap.
+    parts
+        As :func:`stretches` returns them.
     """
-    shape = Shape(settings.delta_lags, settings.move_lags, settings.hidden)
     learning = Learning.of(settings, span)
-    found = np.empty((2, len(runs)))
-    for z, run in enumerate(runs):
-        machine = make_machine(
-            shape,
-            settings.delta_scale,
-            settings.move_scale,
-            settings.spread,
-            np.random.default_rng(settings.seed),
-        )
-        predictor = Predictor(machine, settings.horizon, run)
-        predictor.set_weights({name: value[z] for name, value in weights.items()}, learning)
-        found[:, z] = skill(predictor.past, 0), skill(predictor.past, 1)
-    return found
+    outputs = len(weights['scales'])
+    missed, persisted = np.zeros((2, outputs)), np.zeros((2, outputs))
+    for part in parts:
+        for z, run in enumerate(part):
+            machine = _machine(settings, np.random.default_rng(settings.seed))
+            predictor = Predictor(machine, settings.horizon, run)
+            predictor.set_weights({name: value[z] for name, value in weights.items()}, learning)
+            weight = run[0].size - 1 - predictor.past.errors.size
+            missed[:, z] += weight * predictor.past.predicted
+            persisted[:, z] += weight * predictor.past.persisted
+    with np.errstate(invalid='ignore'):
+        return 1.0 - missed / persisted
 
 
-@dataclass(frozen=True)
-class Effect:
-    """What a run tells of the effect of v_p."""
-
-    response: float
-    """Change of the error per change of v_p that is held, (rad/s)/(rad/s²)."""
-    error: float
-    """Standard error of it; infinite when the run tells nothing."""
-    own: float
-    """Standard deviation of the v_p that neither errors nor older v_p foretell, rad/s²."""
-
-
-def effect(errors: Array, moves: Array, delta_lags: int, move_lags: int, ahead: int) -> Effect:
-    r"""Return the effect of v_p ``ahead`` periods on, by least squares on the lags of (35).
-
-    .. math:: \delta_t = \sum_{i=1}^{n_a} a_i \delta_{t-i} + \sum_{i=1}^{n_b} b_i v_{p,t-i} + w_t
-
-    The standard error is that of the step response of this model, by its gradient (the delta
-    method) and the covariance s² (XᵀX)^-1 of the coefficients (Ljung, System Identification,
-    1999, chapter 9). In a closed loop v_p is nearly a function of the errors, so XᵀX is nearly
-    singular unless something else moves it.
-
-    Parameters
-    ----------
-    errors, moves
-        *Newest first*, NaN where they are not known, shape (N,).
-    delta_lags, move_lags
-        n_a and n_b.
-    ahead
-        Periods.
-    """
-    count = errors.size - max(delta_lags, move_lags)
-    nothing = Effect(math.nan, math.inf, 0.0)
-    if count < 1:
-        return nothing
-    lags = [errors[i : i + count] for i in range(1, delta_lags + 1)]
-    lags += [moves[i : i + count] for i in range(1, move_lags + 1)]
-    table = np.stack([errors[:count], *lags], axis=1)
-    table = table[np.isfinite(table).all(axis=1)]
-    known, target = table[:, 1:], table[:, 0]
-    if len(table) <= 2 * known.shape[1]:
-        return nothing
-    newest, others = known[:, delta_lags], np.delete(known, delta_lags, axis=1)
-    own = newest - others @ np.linalg.lstsq(others, newest, rcond=None)[0]
-    spread = math.sqrt(float(own @ own) / len(table))
-    if np.linalg.matrix_rank(known) < known.shape[1]:
-        return replace(nothing, own=spread)
-    values = np.linalg.lstsq(known, target, rcond=None)[0]
-    missed = target - known @ values
-    variance = float(missed @ missed) / (len(table) - values.size)
-    covariance = variance * np.linalg.inv(known.T @ known)
-    response = _response(values, delta_lags, ahead)
-    slope = np.empty(values.size)
-    for i, value in enumerate(values):
-        step = 1e-6 * max(abs(value), 1e-3)
-        moved = values.copy()
-        moved[i] += step
-        slope[i] = (_response(moved, delta_lags, ahead) - response) / step
-    return Effect(response, math.sqrt(float(slope @ covariance @ slope)), spread)
-
-
-def _response(values: Array, delta_lags: int, ahead: int) -> float:
-    """Return the error ``ahead`` periods after v_p has stepped from 0 to 1."""
-    a, b = values[:delta_lags], values[delta_lags:]
-    errors, moves = np.zeros(a.size), np.zeros(b.size)
-    for _ in range(ahead):
-        moves[1:] = moves[:-1].copy()
-        moves[0] = 1.0
-        new = float(a @ errors + b @ moves)
-        errors[1:] = errors[:-1].copy()
-        errors[0] = new
-    return float(errors[0])
-
-
-@dataclass(frozen=True)
-class CoefficientLesson:
-    """What the fuzzy systems learnt."""
-
-    coefficients: Array
-    """alpha, shape (2, 2 r lambda), rad/s²."""
-    explained: Array
-    """Share of the variance of the unexplained acceleration, kept back, that g accounts for."""
-    samples: int
-
-
-def teach_coefficients(settings: CompositionSettings, replay: Replay) -> CoefficientLesson:
-    r"""Return the coefficients with which g explains what the estimate could not.
+def teach_coefficients(settings: CompositionSettings, replay: Replay) -> Array:
+    r"""Return the coefficients with which g explains what the estimate could not, (2, 2 r lambda).
 
     .. math:: \alpha \leftarrow P\left[\alpha + \gamma_n \Phi(\chi)
               \left(\hat d - \Phi(\chi)^T\alpha\right)\right], \qquad
@@ -316,28 +269,45 @@ def teach_coefficients(settings: CompositionSettings, replay: Replay) -> Coeffic
     TrainingError
         The run is too short.
     """
+    rows = _telling(settings, replay)
     every = settings.predictive.every
-    settling = round(SETTLING * settings.rate)
-    since = np.arange(len(replay))
-    since -= np.maximum.accumulate(np.where(replay.begins, since, 0))
-    rows = np.flatnonzero(np.isfinite(replay.errors).all(axis=1) & (since >= settling))[::every]
     if rows.size * every < ENOUGH * settings.rate:
         raise TrainingError(
             f'the run must hold at least {ENOUGH:g} s of motion: '
             f'got {rows.size * every / settings.rate:.1f} s'
         )
-    taught, kept_back = np.split(rows, [3 * rows.size // 4])
     # So large a gamma is cut to the step limit: a share mu / |Phi|² of each miss.
     how = AdaptationSettings(gamma=1e6, radius=settings.adaptation.radius)
     estimator = FuzzyEstimator(settings.fuzzy, how)
     for number in range(PASSES):
         estimator.configure(replace(how, step_limit=SHARE / (1.0 + number)))
-        for row in taught:
+        for row in rows:
             estimate = estimator.evaluate(replay.speeds[row])
             estimator.adapt(replay.unexplained[row] - estimate, 1.0)
-    wanted = replay.unexplained[kept_back]
-    estimates = np.array([estimator.evaluate(replay.speeds[row]) for row in kept_back])
+    return estimator.coefficients.copy()
+
+
+def explained(settings: CompositionSettings, coefficients: Array, replay: Replay) -> Array:
+    """Return which share of the variance of the unexplained acceleration g accounts for, (2,).
+
+    Negative where g is worse than nothing; NaN when the run does not tell.
+    """
+    rows = _telling(settings, replay)
+    if rows.size < 2:
+        return np.full(2, math.nan)
+    estimator = FuzzyEstimator(settings.fuzzy, settings.adaptation)
+    estimator.coefficients = coefficients
+    wanted = replay.unexplained[rows]
+    estimates = np.array([estimator.evaluate(replay.speeds[row]) for row in rows])
     missed = np.mean((wanted - estimates) ** 2, axis=0)
-    return CoefficientLesson(
-        estimator.coefficients, 1.0 - missed / np.maximum(wanted.var(axis=0), 1e-12), rows.size
-    )
+    share: Array = 1.0 - missed / np.maximum(wanted.var(axis=0), 1e-12)
+    return share
+
+
+def _telling(settings: CompositionSettings, replay: Replay) -> NDArray[np.int64]:
+    """Return the rows that tell of the unexplained acceleration, one in each predictive period."""
+    settling = round(SETTLING * settings.rate)
+    since = np.arange(len(replay))
+    since -= np.maximum.accumulate(np.where(replay.begins, since, 0))
+    known = np.isfinite(replay.errors).all(axis=1) & (since >= settling)
+    return np.flatnonzero(known)[:: settings.predictive.every]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from t3mpc_ros.control.law import TERMS
 from t3mpc_ros.lab.composed import Composed, ComposedSettings
 from t3mpc_ros.lab.contestants import FULL, methods, ours
-from t3mpc_ros.lab.training.bags import skill_table
+from t3mpc_ros.lab.training.folds import MIDDLE, NEXT_STEP, pair
 from t3mpc_ros.lab.training.lessons import periods, skills
 from t3mpc_ros.lab.training.replay import Replay
 from t3mpc_ros.lab.trial.loop import MethodSpec, practise, run
@@ -123,11 +123,20 @@ def held_out_skills(
     prefix = 'predictive.'
     after = {key[len(prefix) :]: value for key, value in learnt.items() if key.startswith(prefix)}
     errors, moves = periods(lived(record, settings), predictive, RATE)
-    last_quarter = [trial for _, trial in split_runs(errors, moves, 2)]
+    last_quarter = [[trial for _, trial in split_runs(errors, moves, 2)]]
     return {
         name: skills(predictive, term.span, weights, last_quarter)
         for name, weights in (('before', term.weights()), ('after', after))
     }
+
+
+def skill_table(skills: Mapping[str, Array]) -> str:
+    """Return skills of both wheels as lines; each is (next step, middle) by (right, left)."""
+    width = max(11, *map(len, skills))
+    lines = [f'  {"skill after":<{width}}  {NEXT_STEP}     {MIDDLE}']
+    for name, values in skills.items():
+        lines.append(f'  {name:<{width}}  {pair(values[0], ".2f"):<12}  {pair(values[1], ".2f")}')
+    return '\n'.join(lines)
 
 
 def lived(record: LoopRecord, settings: ComposedSettings) -> Replay:

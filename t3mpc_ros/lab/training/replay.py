@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from t3mpc_ros.control.controller import Controller, ControllerSettings
 from t3mpc_ros.control.drive import limit_vector
 from t3mpc_ros.control.law import TERMS
-from t3mpc_ros.lab.report.recorded import COMMAND, ODOMETRY, REFERENCE, WHEELS, find_topics
+from t3mpc_ros.lab.report.topics import COMMAND, ODOMETRY, REFERENCE, WHEELS, find_topics
 from t3mpc_ros.motion import BodyTwist, Geometry, Motion
 from t3mpc_ros.motion.kinematics import wheels_from_body
 from t3mpc_ros.motion.words import NANOSECONDS, ORIGIN

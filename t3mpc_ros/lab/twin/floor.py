@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from t3mpc_ros.lab.report.canvas import COLOURS, new_figure
-from t3mpc_ros.lab.report.recorded import REFERENCE, TRUTH
+from t3mpc_ros.lab.report.topics import REFERENCE, TRUTH
 from t3mpc_ros.lab.twin.courses import Course, Patrol
 from t3mpc_ros.lab.twin.drift import NO_SLIP, PART, Drift, group, spread
 from t3mpc_ros.robot.arena.world import World, load_world

@@ -21,7 +21,7 @@ from t3mpc_ros.lab.paper.figures.showcase import (
 from t3mpc_ros.lab.paper.plan import Loop
 from t3mpc_ros.lab.paper.store import SETTLING
 from t3mpc_ros.lab.report.canvas import COLOURS, new_figure, new_panels, thinned
-from t3mpc_ros.lab.report.recorded import ODOMETRY, REFERENCE, TRUTH, WHEELS
+from t3mpc_ros.lab.report.topics import ODOMETRY, REFERENCE, TRUTH, WHEELS
 from t3mpc_ros.motion.kinematics import Geometry, advance_pose, body_from_wheels
 from t3mpc_ros.motion.words import ORIGIN, WheelSpeeds
 
