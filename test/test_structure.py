@@ -157,6 +157,7 @@ def test_no_global_random_numbers_and_no_clock_outside_nodes():
         'lab/demo.py',
         'lab/program.py',
         'lab/bag/program.py',
+        'lab/bag/rerun.py',
         'lab/tuning/command.py',
         'lab/paper/program.py',
         'emulator/serial_end.py',

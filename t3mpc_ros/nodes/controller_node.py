@@ -2,15 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ros2 run t3mpc_ros controller``: makes the robot follow the reference."""
 
+from array import array
 from collections.abc import Mapping
 import math
 from pathlib import Path
 from typing import Any
+import zlib
 
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.publisher import Publisher
-from std_msgs.msg import Float64
+from std_msgs.msg import Float64, Int64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
 from t3mpc_ros.control.controller import Controller, Status
@@ -22,6 +24,7 @@ from t3mpc_ros.nodes.plumbing import convert, graph, quality
 from t3mpc_ros.nodes.plumbing.package_node import ERROR, OK, WARN, PackageNode, send_last
 from t3mpc_ros.nodes.tables import ControllerNodeSettings
 from t3mpc_ros.record.model import ModelError, load_model, save_model
+from t3mpc_ros.record.run.journal import Journal, settings_text
 
 WHEELS = ('right', 'left')
 
@@ -34,6 +37,11 @@ class ControllerNode(PackageNode[ControllerNodeSettings]):
         self.get_logger().info('preparing (the first start compiles, for half a minute)')
         self._controller = Controller(self.settings)
         self._controller.warm_up()  # compile and pre-train now, never inside a step
+        self._journal = Journal()
+        self._rows = self.create_publisher(Int64MultiArray, '~/journal', quality.JOURNAL)
+        self._row = Int64MultiArray(data=self._journal.row)
+        self._revisions = self.create_publisher(String, '~/settings', quality.REVISIONS)
+        self._tell_settings()
         self._load_model()
         self._heard_ns: int | None = None
         self._steps = 0
@@ -57,19 +65,36 @@ class ControllerNode(PackageNode[ControllerNodeSettings]):
             self._controller.law.restore(load_model(Path(path)))
         except ValueError as error:
             raise ModelError(f'{path} does not fit these settings: {error}') from error
+        self._note(self._journal.model(zlib.crc32(Path(path).read_bytes())))
 
     def configure(self, settings: ControllerNodeSettings) -> None:
         """Hand live settings on to the controller."""
         self._controller.configure(settings)
+        row = self._journal.configure()
+        self._tell_settings()
+        self._note(row)
+
+    def _tell_settings(self) -> None:
+        text = settings_text(self._journal.revision, self.settings.flat())
+        self._revisions.publish(String(data=text))
+
+    def _note(self, row: 'array[int]') -> None:
+        """Publish a row of the journal: after the command, which cannot wait."""
+        self._row.data = row
+        self._rows.publish(self._row)
 
     def _on_reference(self, message: Odometry) -> None:
-        if not self._controller.add_reference(convert.motion_from_odometry(message)):
+        motion = convert.motion_from_odometry(message)
+        self._journal.reference(motion.stamp_ns)
+        if not self._controller.add_reference(motion):
             self._refused += 1
 
     def _on_odometry(self, message: Odometry) -> None:
         self._heard_ns = self.steady_ns()
-        command, status = self._controller.step(convert.motion_from_odometry(message))
+        measured = convert.motion_from_odometry(message)
+        command, status = self._controller.step(measured)
         self._publish(command, status.stamp_ns)
+        self._note(self._journal.step(measured.stamp_ns))
         self._steps += 1
         if self._numbers and self._steps % self._every_step() == 0:
             self._publish_numbers(status)
@@ -80,6 +105,7 @@ class ControllerNode(PackageNode[ControllerNodeSettings]):
             return
         if self._controller.silent(self._heard_ns, self.steady_ns()):
             self._publish(STANDSTILL, self.now_ns())
+            self._note(self._journal.silent(self._controller.status.stamp_ns))
             self._tell(self._controller.status)
 
     def _publish(self, command: BodyTwist, stamp_ns: int) -> None:
@@ -131,12 +157,14 @@ class ControllerNode(PackageNode[ControllerNodeSettings]):
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._controller.enable(request.data)
+        self._note(self._journal.enable(request.data))
         response.success = True
         response.message = 'the robot may move' if request.data else 'the robot is stopped'
         return response
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._controller.reset()
+        self._note(self._journal.reset())
         response.success = True
         response.message = 'everything learnt in this run is forgotten'
         return response
@@ -186,6 +214,8 @@ class ControllerNode(PackageNode[ControllerNodeSettings]):
     def finish(self) -> None:
         """Stop the robot."""
         send_last(self._command, self._stop_message())
+        self._row.data = self._journal.finish()
+        send_last(self._rows, self._row)
 
     def _stop_message(self) -> Twist | TwistStamped:
         if self.settings.stamped:

@@ -7,9 +7,11 @@ from collections.abc import Sequence
 import sys
 import time
 
+from t3mpc_ros.lab.bag.compare import add_compare_parser
 from t3mpc_ros.lab.bag.info import add_info_parser
 from t3mpc_ros.lab.bag.recover import add_recover_parser
 from t3mpc_ros.lab.bag.report import add_report_parser
+from t3mpc_ros.lab.bag.rerun import add_rerun_parser
 from t3mpc_ros.lab.bag.train import add_train_parser
 
 
@@ -35,8 +37,10 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest='command', required=True)
     add_info_parser(commands)
     add_recover_parser(commands, time.monotonic)
-    add_train_parser(commands)
     add_report_parser(commands)
+    add_rerun_parser(commands)
+    add_compare_parser(commands)
+    add_train_parser(commands)
     return parser
 
 

@@ -38,6 +38,12 @@ SCALARS = _profile(20)
 LATCHED = _profile(1, DurabilityPolicy.TRANSIENT_LOCAL)
 """What a late subscriber should still see."""
 
+JOURNAL = _profile(500, DurabilityPolicy.TRANSIENT_LOCAL)
+"""The journal of the controller: a recorder that is slow to find it misses nothing of 5 s."""
+
+REVISIONS = _profile(20, DurabilityPolicy.TRANSIENT_LOCAL)
+"""Settings of the controller as they change: the journal speaks of each of them."""
+
 DIAGNOSTICS = _profile(10)
 """Health of the nodes."""
 

@@ -1,0 +1,109 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``bag rerun``: the recorded inputs through the controller of today, or through another one."""
+
+import argparse
+import ast
+from collections.abc import Sequence
+from pathlib import Path
+import time
+
+
+def add_rerun_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
+    """Add ``rerun`` to the commands of ``bag``; :func:`run` carries it out."""
+    parser = commands.add_parser(
+        'rerun',
+        help='compute a recorded run again',
+        description='Gives the recorded odometry and reference to the controller of today, '
+        'offline and as fast as it goes, in the order in which the recorded controller took them. '
+        'With other settings, or with another method of the lab, it says what would have been '
+        'commanded; the robot does not answer to that.',
+    )
+    parser.add_argument('bag', type=Path, metavar='BAG', help='folder of the bag, or its file')
+    parser.add_argument(
+        '--output', type=Path, metavar='DIR', help='write a bag of what was computed'
+    )
+    parser.add_argument(
+        '--set',
+        dest='settings',
+        action='append',
+        default=[],
+        metavar='NAME=VALUE',
+        help='another setting than the recorded one, law.gain=30 say; may be given again',
+    )
+    parser.add_argument(
+        '--rival', metavar='NAME', help="a method of the lab in the controller's place"
+    )
+    add_input_options(parser)
+    parser.set_defaults(run=run)
+
+
+def add_input_options(parser: argparse.ArgumentParser) -> None:
+    """Add what says how a bag is taken as the inputs of a controller."""
+    parser.add_argument(
+        '--model', type=Path, metavar='FILE', help='model file to begin with (default: as the bag)'
+    )
+    parser.add_argument('--namespace', help='of the robot, where the bag holds several')
+
+
+def run(options: argparse.Namespace) -> int:
+    """Return 0 when the run was computed; prints what became of it, and how fast.
+
+    Raises
+    ------
+    RerunError
+        The bag cannot be computed again.
+    RecordError
+        A bag cannot be read or written.
+    SettingError
+        A setting is unknown or cannot be used.
+    """
+    from t3mpc_ros.lab.rerun.compare import compare
+    from t3mpc_ros.lab.rerun.inputs import load_inputs
+    from t3mpc_ros.lab.rerun.rerun import OPEN_LOOP, rerun
+    from t3mpc_ros.lab.rerun.tape import write_rerun
+    from t3mpc_ros.lab.rerun.what_if import rerun_rival
+    from t3mpc_ros.record.model import load_model
+
+    changes = settings_from(options.settings)
+    model = load_model(options.model) if options.model else None
+    begin = time.perf_counter()
+    inputs = load_inputs(options.bag, options.namespace, model)
+    read = time.perf_counter()
+    if options.rival:
+        again = rerun_rival(inputs, options.rival, changes)
+    else:
+        again = rerun(inputs, changes)
+    end = time.perf_counter()
+    span = again.steps / again.settings.rate
+    print(
+        f'{again.steps} steps, {span:.1f} s of control, in {end - begin:.2f} s: '
+        f'{span / (end - begin):.0f} x real time, {span / (end - read):.0f} x without reading'
+    )
+    print(compare(inputs, again).table())
+    if options.rival or changes or options.model:
+        print(OPEN_LOOP)
+    if options.output:
+        print(f'written to {write_rerun(inputs, again, options.output)}')
+    return 0
+
+
+def settings_from(texts: Sequence[str]) -> dict[str, object]:
+    """Return settings by name from ``NAME=VALUE``; :class:`Settings` checks them.
+
+    Raises
+    ------
+    ValueError
+        A text has no ``=``.
+    """
+    found: dict[str, object] = {}
+    for text in texts:
+        name, sign, value = text.partition('=')
+        if not sign or not name:
+            raise ValueError(f'--set must be NAME=VALUE: got {text!r}')
+        try:
+            # Parameters are written so elsewhere, and Python writes them otherwise.
+            found[name] = ast.literal_eval({'true': 'True', 'false': 'False'}.get(value, value))
+        except (SyntaxError, ValueError):
+            found[name] = value
+    return found

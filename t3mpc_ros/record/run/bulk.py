@@ -1,0 +1,286 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers out of thousands of messages at once, without an object for each of them.
+
+The few types that a controller hears and says are, serialised as CDR, at most a stamp, some texts
+and then 8-byte numbers, so where a number stands in a message is known from the lengths of the
+texts. Those are checked, not assumed.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.motion.words import NANOSECONDS
+from t3mpc_ros.record.run.catalogue import Catalogue, blocks
+from t3mpc_ros.record.writer import DataError
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Bytes = NDArray[np.uint8]
+
+GROUP = 2**21
+"""Bytes that are gathered before numbers are taken out of them: so many as a cache holds."""
+
+SPARE = 64
+"""Bytes behind a buffer that are read before the length of its last message is known."""
+
+_BEGIN = 4  # after the four bytes that say how a message is encoded
+_HEAD = 31  # opcode, length, channel, counter and two stamps in front of a message
+_LITTLE = 1
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the numbers of a message type are."""
+
+    stamped: bool
+    """Whether it begins with a stamp."""
+    texts: int
+    """How many texts follow then; aligned to 8 bytes, the numbers come after them."""
+    numbers: tuple[int, ...]
+    """Which of the 8-byte numbers are wanted."""
+    skipped: int = 0
+    """Bytes of other things, before the texts."""
+    whole: bool = False
+    """Whether the numbers are integers."""
+
+
+ODOMETRY = Layout(True, 2, (0, 1, 3, 4, 5, 6, 43, 48))
+"""x, y, quaternion x, y, z, w, linear x, angular z of ``nav_msgs/msg/Odometry``."""
+TWIST = Layout(False, 0, (0, 5))
+"""Linear x and angular z of ``geometry_msgs/msg/Twist``."""
+TWIST_STAMPED = Layout(True, 1, (0, 5))
+FLOAT64 = Layout(False, 0, (0,))
+JOURNAL = Layout(False, 0, (0, 1, 2, 3, 4), skipped=12, whole=True)
+"""A ``std_msgs/msg/Int64MultiArray`` of five numbers without named dimensions."""
+
+LAYOUTS: Mapping[str, Layout] = {
+    'nav_msgs/msg/Odometry': ODOMETRY,
+    'geometry_msgs/msg/Twist': TWIST,
+    'geometry_msgs/msg/TwistStamped': TWIST_STAMPED,
+    'std_msgs/msg/Float64': FLOAT64,
+    'std_msgs/msg/Int64MultiArray': JOURNAL,
+}
+
+
+@dataclass(frozen=True)
+class Column:
+    """The messages of one topic, in order of receipt."""
+
+    received_ns: Integers
+    """By the recorder, shape (n,)."""
+    published_ns: Integers
+    """By the clock of the publisher, shape (n,); the same as received where nobody noted it."""
+    stamps_ns: Integers
+    """What the headers say, zeros without one, shape (n,)."""
+    numbers: Array
+    """As :class:`Layout` has them, shape (n, wanted)."""
+    integers: Integers
+    """The same, of a layout with whole numbers; else empty."""
+
+    def __len__(self) -> int:
+        return int(self.received_ns.size)
+
+
+@dataclass
+class _Gathered:
+    """The messages of one topic that wait in the buffer."""
+
+    layout: Layout
+    received: list[Integers] = field(default_factory=list)
+    starts: list[Integers] = field(default_factory=list)
+    """Of the records in the buffer."""
+    parts: list[tuple[Integers, Integers, Integers, NDArray[Any]]] = field(default_factory=list)
+
+
+def read_columns(held: Catalogue, topics: Iterable[str]) -> dict[str, Column]:
+    """Return the numbers of several topics of a bag.
+
+    Parameters
+    ----------
+    held
+        What the bag holds.
+    topics
+        Full names of topics with a type of :data:`LAYOUTS`.
+
+    Raises
+    ------
+    DataError
+        A type that has no layout here, or a message that is not laid out as its type is.
+    RecordError
+        The bag cannot be read.
+    """
+    waiting: dict[str, _Gathered] = {}
+    for name in topics:
+        kind = held.types.get(name, 'missing')
+        if kind not in LAYOUTS:
+            raise DataError(f'{name} must be of {", ".join(LAYOUTS)}: got {kind}')
+        waiting[name] = _Gathered(LAYOUTS[kind])
+    for data in _gathered(held, waiting):
+        for layout in LAYOUTS.values():
+            alike = {
+                k: each for k, each in waiting.items() if each.layout is layout and each.starts
+            }
+            if alike:
+                _take(alike, layout, data)
+    columns = {name: _column(gathered) for name, gathered in waiting.items()}
+    for name, column in columns.items():
+        if len(column) != held.counts[name]:
+            raise DataError(
+                f'{name} must have {held.counts[name]} messages, as the end of the bag says: '
+                f'its indexes lead to {len(column)}'
+            )
+    return columns
+
+
+def read_texts(held: Catalogue, topic: str) -> list[tuple[int, str]]:
+    """Return (received, text) of the ``std_msgs/msg/String`` messages of a topic, times in ns.
+
+    Raises
+    ------
+    DataError
+        A message is no text.
+    RecordError
+        The bag cannot be read.
+    """
+    waiting = {topic: _Gathered(FLOAT64)}
+    found = []
+    for data in _gathered(held, waiting):
+        gathered = waiting[topic]
+        for received, starts in zip(gathered.received, gathered.starts, strict=True):
+            sizes = _words(data, starts + _HEAD + _BEGIN, '<u4').tolist()
+            limits = (starts + 9 + _words(data, starts + 1, '<i8')).tolist()
+            begins = (starts + _HEAD + _BEGIN + 4).tolist()
+            for when, begin, size, limit in zip(
+                received.tolist(), begins, sizes, limits, strict=True
+            ):
+                _check(topic, begin + size <= limit)
+                found.append((when, bytes(data[begin : begin + size - 1]).decode()))
+        gathered.received.clear()
+        gathered.starts.clear()
+    return sorted(found, key=lambda item: item[0])
+
+
+def _gathered(held: Catalogue, waiting: Mapping[str, _Gathered]) -> Iterator[Bytes]:
+    """Yield buffers of messages, after noting in ``waiting`` where in them each topic's are."""
+    for path, summary in held.files:
+        buffers: list[bytes] = []
+        size = 0
+        for data, found in blocks(path, summary, waiting.keys()):
+            for name, received, starts in found:
+                waiting[name].received.append(received)
+                waiting[name].starts.append(starts + size)
+            buffers.append(data)
+            size += len(data)
+            if size >= GROUP:
+                yield _joined(path, buffers, waiting)
+                buffers, size = [], 0
+        if buffers:
+            yield _joined(path, buffers, waiting)
+
+
+def _joined(path: Path, buffers: list[bytes], waiting: Mapping[str, _Gathered]) -> Bytes:
+    """Return one buffer, after looking whether messages begin where the indexes say so."""
+    size = sum(map(len, buffers))
+    # What is read beyond the end of the last message, before its length is checked.
+    data = np.frombuffer(b''.join([*buffers, bytes(SPARE)]), dtype=np.uint8)
+    starts = _all(each.starts for each in waiting.values())
+    received = _all(each.received for each in waiting.values())
+    # An index has no checksum of its own; what it leads to must be what it says.
+    within = starts.size == 0 or 0 <= starts.min() <= starts.max() < size
+    if not within or (_words(data, starts + 15, '<i8') != received).any():
+        raise DataError(f'{path}: an index of messages is damaged')
+    return data
+
+
+def _all(parts: Iterable[list[Integers]]) -> Integers:
+    return np.concatenate(
+        [np.zeros(0, dtype=np.int64), *(each for part in parts for each in part)]
+    )
+
+
+def _take(alike: Mapping[str, _Gathered], layout: Layout, data: Bytes) -> None:
+    """Take the numbers of topics of one type out of a buffer; together, for there are many."""
+    starts = [np.concatenate(gathered.starts) for gathered in alike.values()]
+    parts = _numbers(', '.join(alike), layout, data, np.concatenate(starts))
+    first = 0
+    for gathered, own in zip(alike.values(), starts, strict=True):
+        rows = slice(first, first + own.size)
+        published, stamps, numbers = (part[rows] for part in parts)
+        received = np.concatenate(gathered.received)
+        gathered.parts.append((received, published, stamps, numbers))
+        gathered.received.clear()
+        gathered.starts.clear()
+        first += own.size
+
+
+def _numbers(
+    name: str, layout: Layout, data: Bytes, records: Integers
+) -> tuple[Integers, Integers, NDArray[Any]]:
+    """Return when the messages were published, their stamps, and their numbers."""
+    lengths = _words(data, records + 1, '<i8') - 22
+    published = _words(data, records + 23, '<i8')
+    starts = records + _HEAD
+    _check(name, bool(((lengths >= _BEGIN) & (starts + lengths <= data.size - SPARE)).all()))
+    if np.any(data[starts + 1] != _LITTLE):
+        raise DataError(f'{name} holds a message that is not little-endian CDR')
+    # One number for all as long as no text comes before.
+    at: Any = _BEGIN + 8 * layout.stamped + layout.skipped
+    for _ in range(layout.texts):
+        at = (at + 3) // 4 * 4
+        sizes = _words(data, starts + at, '<u4').astype(np.int64)
+        at = at + 4 + sizes
+        _check(name, bool((at <= lengths).all()))
+    at = (at - _BEGIN + 7) // 8 * 8 + _BEGIN
+    _check(name, bool((at + 8 * max(layout.numbers) + 8 <= lengths).all()))
+    if layout is JOURNAL:
+        # No named dimensions, no offset, and five numbers.
+        for k, said in enumerate((0, 0, len(layout.numbers))):
+            _check(name, bool((_words(data, starts + _BEGIN + 4 * k, '<u4') == said).all()))
+    stamps = np.zeros(starts.shape, dtype=np.int64)
+    if layout.stamped:
+        seconds = _words(data, starts + _BEGIN, '<i4').astype(np.int64)
+        rest = _words(data, starts + _BEGIN + 4, '<u4').astype(np.int64)
+        stamps = seconds * NANOSECONDS + rest
+    kind = '<i8' if layout.whole else '<f8'
+    first = starts + at
+    numbers = np.empty((starts.size, len(layout.numbers)), kind)
+    for column, k in enumerate(layout.numbers):
+        numbers[:, column] = _words(data, first + 8 * k, kind)
+    return published, stamps, numbers
+
+
+def _words(data: Bytes, starts: Integers, kind: str) -> NDArray[Any]:
+    """Return the number at each start, wherever it is aligned, shape (n,)."""
+    size = np.dtype(kind).itemsize
+    everywhere = np.ndarray((data.size - size + 1,), kind, data.data, strides=(1,))
+    return everywhere[starts]
+
+
+def _check(name: str, sound: bool) -> None:
+    if not sound:
+        raise DataError(f'{name} holds a message that is not laid out as its type is')
+
+
+def _column(gathered: _Gathered) -> Column:
+    none = np.zeros(0, dtype=np.int64)
+    wanted = len(gathered.layout.numbers)
+    empty = (none, none, none, np.zeros((0, wanted), np.int64 if gathered.layout.whole else float))
+    parts = gathered.parts or [empty]
+    received, published, stamps, numbers = (
+        np.concatenate([part[i] for part in parts]) for i in range(4)
+    )
+    if (np.diff(received) < 0).any():  # several files, or a recorder that sorted otherwise
+        order = np.argsort(received, kind='stable')
+        received, published, stamps, numbers = (
+            each[order] for each in (received, published, stamps, numbers)
+        )
+    nothing = np.zeros((len(received), 0))
+    if gathered.layout.whole:
+        return Column(received, published, stamps, nothing, numbers)
+    return Column(received, published, stamps, numbers, nothing.astype(np.int64))
