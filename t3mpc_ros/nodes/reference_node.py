@@ -7,6 +7,7 @@ import secrets
 from typing import Any
 
 from nav_msgs.msg import Odometry, Path
+from rclpy.duration import Duration
 from std_msgs.msg import Int32MultiArray
 from std_srvs.srv import SetBool, Trigger
 
@@ -46,7 +47,7 @@ class ReferenceNode(PackageNode[ReferenceNodeSettings]):
         self._path.header.frame_id = settings.frame_id
         self._message = Odometry(child_frame_id=settings.child_frame_id)
         self._message.header.frame_id = settings.frame_id
-        self._reference = self.create_publisher(Odometry, 'reference', quality.STREAM)
+        self._reference = self.create_publisher(Odometry, 'reference', quality.REFERENCE)
         self._trail = self.create_publisher(Path, 'reference/path', quality.LATCHED)
         self._signals = self.create_publisher(Int32MultiArray, '~/signals', quality.LATCHED)
         self._shown: tuple[int, ...] = ()
@@ -117,6 +118,10 @@ class ReferenceNode(PackageNode[ReferenceNodeSettings]):
         if self._pace.skipped:
             return WARN, 'the machine is too slow: samples were given up', values
         return OK, 'paused' if self._paused else 'running', values
+
+    def finish(self) -> None:
+        """Wait until everybody has the last sample."""
+        self._reference.wait_for_all_acked(Duration(nanoseconds=200_000_000))
 
 
 def _draw() -> int:

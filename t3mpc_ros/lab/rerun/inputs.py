@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.control.controller import ControllerSettings
 from t3mpc_ros.control.law import TERMS
-from t3mpc_ros.lab.report.recorded import COMMAND, ODOMETRY, REFERENCE, WHEELS, find_topics
+from t3mpc_ros.lab.report.topics import COMMAND, ODOMETRY, REFERENCE, WHEELS, find_topics
 from t3mpc_ros.lab.rerun.alignment import Taken, by_receipt, commands_of, match, rows_of
 from t3mpc_ros.lab.training.replay import recorded_settings
 from t3mpc_ros.motion import BodyTwist, Motion, Pose

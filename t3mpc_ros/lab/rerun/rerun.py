@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from t3mpc_ros.control.controller import Controller, ControllerSettings, Status
 from t3mpc_ros.control.freshness import Reason
 from t3mpc_ros.control.law import TERMS
-from t3mpc_ros.lab.report.recorded import WHEELS
+from t3mpc_ros.lab.report.topics import WHEELS
 from t3mpc_ros.lab.rerun.inputs import FIELDS, PAIRS, SPEEDS, Inputs, Life, motions
 from t3mpc_ros.motion import BodyTwist, Motion
 from t3mpc_ros.motion.words import STANDSTILL

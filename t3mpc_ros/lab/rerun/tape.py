@@ -13,7 +13,7 @@ import numpy as np
 
 from t3mpc_ros.control.controller import Controller, ControllerSettings, Status
 from t3mpc_ros.control.law import TERMS
-from t3mpc_ros.lab.report.recorded import COMMAND, ODOMETRY, REFERENCE, WHEELS
+from t3mpc_ros.lab.report.topics import COMMAND, ODOMETRY, REFERENCE, WHEELS
 from t3mpc_ros.lab.rerun.inputs import CONTROLLER, NUMBERS, SPEEDS, Inputs, motions
 from t3mpc_ros.lab.rerun.rerun import Rerun
 from t3mpc_ros.motion import BodyTwist, Motion
