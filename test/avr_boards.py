@@ -185,6 +185,12 @@ class Boards:
             ]
         return frames
 
+    def read_bytes(self) -> list[bytes]:
+        """Return the bytes that came, one by one."""
+        data, at = (c_uint8 * 4096)(), (c_uint64 * 4096)()
+        count = self.call('read', data, at, 4096)
+        return [bytes(data[i : i + 1]) for i in range(count)]
+
     def wait(self, limit_us: float = 20000.0) -> tuple[bytes, float] | None:
         """Return the next frame and when it was through; None after so long."""
         end = self.now_us + limit_us

@@ -8,26 +8,36 @@ import random
 from t3mpc_ros.emulator.board import Registers
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorSettings
 from t3mpc_ros.motion import WheelSpeeds
+from t3mpc_ros.radio.codec import decode_down, decode_to_dongle
+from t3mpc_ros.radio.frames import Command, Transmit
+from t3mpc_ros.radio.host.robot import RadioRobot, RadioRobotSettings
 from t3mpc_ros.radio.link import Link, LinkSettings
 from t3mpc_ros.radio.link.words import Close, Open, Phase, Wait, Write
+from t3mpc_ros.radio.splitter import Splitter
 from t3mpc_ros.robot.backend import RobotCommand
 
 MS = 1_000_000
 START_NS = 5_000_000_000
+TTL_AND_SLACK = 0.25
+"""s"""
 SAMPLE = Registers(164, -5, 8192, -4000, -12, 13, -131)
 
 
 class Bench:
     """Runs a link and an emulator; whoever wants a fault injects it by name."""
 
-    def __init__(self, flat=None, key=b'', robot_key=None, link=None, seed=1):
-        settings = EmulatorSettings.from_flat(flat or {})
+    def __init__(self, flat=None, key=b'', robot_key=None, link=None, seed=1, emulator=None):
         robot_key = key if robot_key is None else robot_key
-        self.emulator = Emulator(settings, robot_key, seed, START_NS)
+        if emulator is None:
+            settings = EmulatorSettings.from_flat(flat or {})
+            emulator = Emulator(settings, robot_key, seed, START_NS)
+        self.emulator = emulator
+        """Or whatever behaves like one: ``avr_bench.AvrEmulator`` does."""
         self.link = Link(link or LinkSettings(), key, random.Random(seed).randbytes)
-        self.now_ns = START_NS
+        self.now_ns = emulator.now_ns
         self.is_open = False
-        self.wake_ns = START_NS
+        self.killed = False
+        self.wake_ns = self.now_ns
         self.wheels = None
         self.commanded_ns = 0
         self.written = []
@@ -87,7 +97,10 @@ class Bench:
                 return
 
     def _step(self, received):
-        deeds = self.link.step(self.now_ns, received)
+        if self.killed:
+            self.wake_ns = self.now_ns + 1000 * MS
+            return
+        deeds = self._ask(received)
         while deeds:
             deed = deeds.pop(0)
             if isinstance(deed, Wait):
@@ -109,7 +122,13 @@ class Bench:
     def _command(self):
         if self.wheels is not None and self.now_ns >= self.commanded_ns + 20 * MS:
             self.commanded_ns = self.now_ns
-            self.link.command(RobotCommand(self.wheels, self.now_ns), self.now_ns)
+            self._order(RobotCommand(self.wheels, self.now_ns))
+
+    def _ask(self, received):
+        return self.link.step(self.now_ns, received)
+
+    def _order(self, command):
+        self.link.command(command, self.now_ns)
 
     def drive(self, right, left):
         """Command these wheel speeds fifty times a second from now on."""
@@ -119,9 +138,61 @@ class Bench:
         """Command nothing any more."""
         self.wheels = None
 
+    def kill(self):
+        """Let the host be gone in the middle of whatever it does, as SIGKILL does."""
+        self.killed = True
+        self.wheels = None
+
     def connect(self):
         """Run until the link runs."""
         return self.run(10.0, lambda: self.link.phase is Phase.RUN)
+
+
+class RobotBench(Bench):
+    """A bench whose host is the bridge's: guard, odometry and slip stop around the link."""
+
+    def __init__(self, settings=None, **given):
+        super().__init__(**given)
+        key = given.get('key', b'')
+        self.robot = RadioRobot(RadioRobotSettings.from_flat(settings or {}), key)
+        self.link = self.robot.link
+        self.states = []
+
+    def _ask(self, received):
+        deeds = self.robot.step(self.now_ns, received)
+        self.states += self.robot.take_states()
+        return deeds
+
+    def _order(self, command):
+        self.robot.apply(command, self.now_ns)
+
+
+def sent_commands(*benches):
+    """Return every command in what the hosts have written; of one host in order."""
+    found = []
+    for bench in benches:
+        splitter = Splitter()
+        for _, data in bench.written:
+            for frame in map(decode_to_dongle, splitter.feed(data)):
+                if isinstance(frame, Transmit):
+                    payload = decode_down(frame.first)
+                    if isinstance(payload, Command):
+                        found.append(payload)
+    return found
+
+
+def check_followed(bench, *others):
+    """Every command that was followed was sent, once, in the order of its host, and is not old."""
+    sent = sent_commands(bench, *others)
+    position = {command: index for index, command in enumerate(sent)}
+    assert len(position) == len(sent)
+    order = {}
+    for now_ns, command in bench.followed:
+        order.setdefault(command.session, []).append(position[command])
+        age = (now_ns // 1000 - command.host_us) % (1 << 32) / 1e6
+        assert age <= TTL_AND_SLACK, f'{command} was followed after {age} s'
+    for followed in order.values():
+        assert followed == sorted(set(followed))
 
 
 class PulseCounter:

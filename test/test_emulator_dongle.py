@@ -117,14 +117,14 @@ def test_a_lost_acknowledgement_brings_the_packet_again_but_not_to_the_robot():
     assert at == pytest.approx(140 + 130 + 3 * 185 + 2 * 500 + 130 + 113 + 330, abs=1)
 
 
-def test_nobody_there_is_given_up_after_three_more_tries_and_the_poll_skipped():
+def test_nobody_there_is_given_up_after_four_more_tries_and_the_poll_skipped():
     station = Station()
     station.faults.add(Fault('jam', 0.0), 0)
     station.write(Transmit(9, 6, CMD, POLL))
     station.run(10_000)
     at, result = station.answer()
-    assert result == Result(9, 0x34, 0x08, result.dongle_us, b'')
-    assert at == pytest.approx(140 + 130 + 4 * 685 + 330)
+    assert result == Result(9, 0x44, 0x08, result.dongle_us, b'')
+    assert at == pytest.approx(140 + 130 + 5 * 685 + 330)
     assert not station.heard
 
 
@@ -140,7 +140,7 @@ def test_a_radio_set_otherwise_is_not_answered(changed):
     assert station.answer()[1] == Configured(1, *settings, 1)
     station.write(Transmit(9, 6, CMD))
     station.run(20_000)
-    assert station.answer()[1][1] == 0x34
+    assert station.answer()[1][1] == 0x44
     assert len(station.heard) == ('retry_delay' in changed)
 
 

@@ -5,44 +5,17 @@
 import math
 import random
 
-from emulator_bench import Bench
+from emulator_bench import Bench, check_followed, sent_commands
 import pytest
 
 from t3mpc_ros.emulator.faults import KINDS
-from t3mpc_ros.radio.codec import decode_down, decode_to_dongle, encode
-from t3mpc_ros.radio.frames import Command, Flag, Transmit
+from t3mpc_ros.radio.codec import encode
+from t3mpc_ros.radio.frames import Command, Flag
 from t3mpc_ros.radio.link import LinkSettings
 from t3mpc_ros.radio.link.words import Phase
-from t3mpc_ros.radio.splitter import Splitter
 
 KEY = bytes(range(16))
 STEP = math.tau / 3200
-TTL_AND_SLACK = 0.25
-
-
-def sent_commands(bench):
-    """Return every command in what the host has written."""
-    found = []
-    splitter = Splitter()
-    for _, data in bench.written:
-        for frame in map(decode_to_dongle, splitter.feed(data)):
-            if isinstance(frame, Transmit):
-                payload = decode_down(frame.first)
-                if isinstance(payload, Command):
-                    found.append(payload)
-    return found
-
-
-def check_followed(bench):
-    """Every command that was followed was sent, in that order, once, and is not old."""
-    sent = sent_commands(bench)
-    position = {command: index for index, command in enumerate(sent)}
-    assert len(position) == len(sent)
-    order = [position[command] for _, command in bench.followed]
-    assert order == sorted(set(order))
-    for now_ns, command in bench.followed:
-        age = (now_ns // 1000 - command.host_us) % (1 << 32) / 1e6
-        assert age <= TTL_AND_SLACK, f'{command} was followed after {age} s'
 
 
 def at_rest(bench):
@@ -85,18 +58,24 @@ def test_a_round_trip_takes_as_long_as_line_radio_and_gap_do():
     assert 60 <= bench.link.telemetry.raw.age <= 80
 
 
-@pytest.mark.parametrize('loss, most', [(0.1, 0.005), (0.3, 0.10), (0.5, 0.40)])
-def test_a_whole_cycle_is_lost_as_seldom_as_three_retries_allow(loss, most):
+@pytest.mark.parametrize('loss, most', [(0.1, 0.005), (0.3, 0.10), (0.5, 0.45)])
+def test_a_whole_cycle_is_lost_as_seldom_as_four_retries_allow(loss, most):
+    """Whole: the command was taken, and the state that it led to came back with it."""
     bench = Bench()
     bench.inject('loss', math.inf, loss)
     bench.run(20.0, lambda: bench.link.phase is Phase.RUN)
     bench.drive(4.0, 4.0)
-    bench.run(30.0)
+    bench.run(60.0)
     quality = bench.link.quality(bench.now_ns)
-    expected = (1.0 - (1.0 - loss) ** 2) ** 4
-    spread = 4.0 * math.sqrt(expected * (1.0 - expected) / quality.cycles)
-    assert abs(quality.lost / quality.cycles - expected) <= spread
-    assert quality.lost / quality.cycles <= most
+    # Either exchange fails with its fifth try; a CMD that came twice may have fetched the state.
+    one = (1.0 - (1.0 - loss) ** 2) ** 5
+    either = 1.0 - (1.0 - one) ** 2
+    spread = 4.0 * math.sqrt(either * (1.0 - either) / quality.cycles)
+    share = quality.lost / quality.cycles
+    print(f'\nloss {loss}: {share:.2%} of {quality.cycles} cycles ({one:.2%} to {either:.2%})')
+    print(f'round trip 99 %: {1e3 * quality.round_trip_p99:.1f} ms')
+    assert one - spread <= share <= either + spread
+    assert share <= most
     assert quality.round_trip_p99 < 0.0115
     check_followed(bench)
 

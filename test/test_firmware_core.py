@@ -1590,7 +1590,7 @@ def test_the_radio_is_set_and_read_back(library):
     dongle = Dongle(library)
     dongle.write(b'\x02\x01')
     (standard,) = dongle.frames()
-    assert standard[:7] == bytes([0x82, 1, 82, 1, 3, 1, 3])
+    assert standard[:7] == bytes([0x82, 1, 82, 1, 3, 1, 4])
     assert (len(standard), standard[12]) == (13, 1)
     wanted = bytes([2, 5, 100, 2, 1, 5, 15]) + b'nodes'
     dongle.write(wanted)

@@ -81,7 +81,7 @@ struct t3_radio_settings {
 #define T3_RETRY_DELAY (T3_RADIO_RATE == 0 ? 5 : 1)
 // Both ends start with these; the host's CFG may change the dongle's.
 #define T3_RADIO_DEFAULTS                                                                         \
-    {T3_RADIO_CHANNEL, T3_RADIO_RATE, 3, T3_RETRY_DELAY, 3, {'T', '3', 'M', 'P', 'C'}}
+    {T3_RADIO_CHANNEL, T3_RADIO_RATE, 3, T3_RETRY_DELAY, 4, {'T', '3', 'M', 'P', 'C'}}
 
 // The dongle's hardware. A radio answers each `send` by one call of t3_dongle_exchange.
 struct t3_dongle_port {

@@ -62,6 +62,10 @@ class Plant:
         self._powered = False
         self._field_work = 0.0
         self._measured_at = 0
+        self.elapsed = 0.0
+        """s that have passed, by a true clock."""
+        self.stopped_at: float | None = None
+        """When, by :attr:`elapsed`, the motors last got their last pulse; None while they turn."""
         self.imu_absent = False
         """Whether the inertial sensor does not answer."""
         self._make_chassis(settings.motor, None)
@@ -81,7 +85,9 @@ class Plant:
 
     def run(self, elapsed_us: int) -> None:
         """Let time pass, by the board's clock."""
-        self._owed += elapsed_us / (1e6 * self._clock_rate * self._chassis.step)
+        seconds = elapsed_us / (1e6 * self._clock_rate)
+        self.elapsed += seconds
+        self._owed += seconds / self._chassis.step
         count = math.floor(self._owed + 1e-9)
         self._owed -= count
         while count:
@@ -95,6 +101,10 @@ class Plant:
 
     def turn(self, left: int, right: int) -> None:
         """Step both motors at these speeds (urad/s) from now on."""
+        if left or right:
+            self.stopped_at = None
+        elif self.stopped_at is None:
+            self.stopped_at = self.elapsed
         scale = 1e-6 * self._clock_rate
         top = self._motor.top_speed
         self._wheels = WheelSpeeds(

@@ -15,6 +15,7 @@ from typing import Self
 
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorSettings
 from t3mpc_ros.emulator.faults import KINDS, Fault, FaultError, parse_fault
+from t3mpc_ros.emulator.rest import RestWatch
 from t3mpc_ros.emulator.serial_end import LinkError, PseudoPort, serve
 from t3mpc_ros.radio.authentication import KeyFileError, read_key
 from t3mpc_ros.robot.arena.world import WorldError
@@ -57,9 +58,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 f'stop with Ctrl-C or kill {os.getpid()}',
                 flush=True,
             )
-            serve(emulator, port, options.speed, stop, options.restart_on_open, cable)
+            watch = RestWatch(emulator)
+            serve(
+                emulator,
+                port,
+                options.speed,
+                stop,
+                options.restart_on_open,
+                cable,
+                lambda: _tell(watch.news()),
+            )
     print('board_emulator: stopped', flush=True)
     return 0
+
+
+def _tell(news: str) -> None:
+    if news:
+        print(f'board_emulator: {news}', flush=True)
 
 
 class _Stop:

@@ -117,6 +117,7 @@ def serve(
     stopped: Callable[[], bool],
     restarts: bool = False,
     cable: PseudoPort | None = None,
+    look: Callable[[], None] = lambda: None,
 ) -> None:
     """Let the emulator run on the wall clock until ``stopped()``.
 
@@ -134,6 +135,8 @@ def serve(
         Opening a port restarts its board, as DTR does with many.
     cable
         Where the robot's own USB is, if anywhere.
+    look
+        Called whenever the emulator has moved on.
     """
     now_ns, clock = emulator.now_ns, time.monotonic()
     name, there, connected = emulator.port_name, emulator.port_open, False
@@ -157,6 +160,7 @@ def serve(
                 port.write(data)
         if robot is not None:
             robot.look(now_ns)
+        look()
         if emulator.port_open != there:
             there = emulator.port_open
             port.open() if there else port.close()

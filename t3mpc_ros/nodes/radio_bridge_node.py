@@ -123,6 +123,8 @@ class RadioBridgeNode(PackageNode[RadioBridgeSettings]):
                         until_ns = deed.until_ns
                     else:
                         self._do(deed)
+                if any(isinstance(deed, Open) for deed in deeds):
+                    until_ns = self.steady_ns()  # it knows by now whether the port is open
                 for state in states:
                     self._tell(state)
                 if done:

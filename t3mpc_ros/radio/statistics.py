@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """How well the link works: losses, retransmissions, round trips, counters of both ends.
 
-A cycle is one CMD with its POLL. It is lost when no measurement of the robot came back, for
-whatever reason: then the robot may or may not have heard the command.
+A cycle is one CMD with its POLL. It is lost when no measurement of its own came back, for whatever
+reason: then the robot may or may not have heard the command.
 """
 
 from collections import deque

@@ -31,7 +31,7 @@ class RadioSettings(NamedTuple):
     rate: int = 1
     power: int = 3
     retry_delay: int = 1
-    retries: int = 3
+    retries: int = 4
     address: bytes = b'T3MPC'
 
     def air_us(self, size: int) -> float:

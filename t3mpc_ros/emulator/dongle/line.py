@@ -26,12 +26,21 @@ class Line:
         Of the line.
     arrive
         Takes each piece at its time.
+    byte_ns
+        Time of a byte; 0 where somebody else keeps the pace of the line.
     """
 
-    def __init__(self, agenda: Agenda, faults: Faults, arrive: Callable[[bytes], None]) -> None:
+    def __init__(
+        self,
+        agenda: Agenda,
+        faults: Faults,
+        arrive: Callable[[bytes], None],
+        byte_ns: int = BYTE_NS,
+    ) -> None:
         self._agenda = agenda
         self._faults = faults
         self._arrive = arrive
+        self._byte_ns = byte_ns
         self._busy_ns = 0
         """Until when there are bytes on the line."""
         self._held = b''
@@ -67,7 +76,7 @@ class Line:
         stall = self._faults.span('stall')
         if stall is not None:
             start = max(start, round(min(stall.end_ns, now + 1e15)))
-        end = max(start, self._busy_ns) + BYTE_NS * len(data)
+        end = max(start, self._busy_ns) + self._byte_ns * len(data)
         self._busy_ns = end
         generation = self._generation
 

@@ -96,7 +96,7 @@ class RadioRobot(RobotBackend):
         self._odometry = FusedOdometry(settings.odometry, settings.geometry)
         self._slip_stop = SlipStop()
         self._period_ns = round(NANOSECONDS / settings.link.cycle_rate)
-        self._next_ns: int | None = None
+        self._next_ns = 0
         self._now_ns = 0
         self._seen: Telemetry | None = None
         self._resets = 0
@@ -110,7 +110,10 @@ class RadioRobot(RobotBackend):
     def step(self, now_ns: int, received: bytes = b'') -> list[Deed]:
         """Return what to do with the port now, see :meth:`Link.step`."""
         self._now_ns = now_ns
-        if self._next_ns is None or now_ns >= self._next_ns:
+        # With the cycle, not beside it: by a clock of its own it would fall behind, and every
+        # command would wait for the cycle after the next.
+        due_ns = self.link.cycle_ns
+        if now_ns >= (self._next_ns if due_ns is None else due_ns):
             self._next_ns = now_ns + self._period_ns
             self._order(now_ns)
         deeds = self.link.step(now_ns, received)

@@ -27,7 +27,7 @@ from t3mpc_ros.radio.splitter import Splitter, to_wire
 from t3mpc_ros.radio.statistics import LinkStatistics
 
 _PATIENCE_NS = 50_000_000
-"""For an answer; the longest transaction takes 9 ms, an FTDI at its default 16 ms each way."""
+"""For an answer; the longest transaction takes 10.3 ms, an FTDI at its default 16 ms each way."""
 _CLOCK_SLIP_US = 1_000_000
 """By which the dongle's clock may differ from the host's between two results."""
 

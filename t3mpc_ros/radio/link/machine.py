@@ -13,16 +13,7 @@ import secrets
 from t3mpc_ros.motion import WheelSpeeds
 from t3mpc_ros.motion.words import NANOSECONDS
 from t3mpc_ros.radio import frames
-from t3mpc_ros.radio.frames import (
-    PARAMETERS,
-    Configured,
-    Downlink,
-    Flag,
-    Info,
-    Pong,
-    State,
-    Status,
-)
+from t3mpc_ros.radio.frames import PARAMETERS, Configured, Downlink, Flag, Info, State, Status
 from t3mpc_ros.radio.link import words
 from t3mpc_ros.radio.link.dialogue import Dialogue, Heard
 from t3mpc_ros.radio.link.orders import Orders
@@ -112,6 +103,11 @@ class Link:
         return self._telemetry
 
     @property
+    def cycle_ns(self) -> int | None:
+        """When the next command is to be sent: what is ordered then is not late; None: never."""
+        return None if self._running is None else self._running.due_ns
+
+    @property
     def sent(self) -> WheelSpeeds:
         """The wheel speeds that were last ordered, after every limit of the host."""
         return self._orders.sent
@@ -193,7 +189,9 @@ class Link:
     def opened(self, now_ns: int) -> None:
         """Take notice that the port is open."""
         self._dialogue.reset()
-        self._look_for_dongle(words.STARTING, now_ns)
+        # What was found at the last try is said until there is something newer to say.
+        why = self._why if self._why == words.NO_DONGLE else words.STARTING
+        self._look_for_dongle(why, now_ns)
 
     def failed(self, text: str, absent: bool, now_ns: int) -> None:
         """Take notice that the port could not be opened or used; ``text`` says why.
@@ -280,7 +278,7 @@ class Link:
 
     def _hear(self, heard: Heard, now_ns: int) -> None:
         self._statistics.dongle_resets += heard.dongle_restarted
-        if isinstance(heard.reply, Pong):
+        if isinstance(heard.reply, frames.Pong):
             self._statistics.dongle = heard.reply
         if isinstance(heard.uplink, frames.Aux):
             self._statistics.robot = heard.uplink
@@ -318,7 +316,7 @@ class Link:
 
     def _hear_pong(self, heard: Heard, now_ns: int) -> None:
         pong = heard.reply
-        if not isinstance(pong, Pong):
+        if not isinstance(pong, frames.Pong):
             return
         self._back_off_ns = _BACK_OFF_NS
         if pong.protocol != frames.VERSION:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from t3mpc_ros.motion.words import NANOSECONDS
 from t3mpc_ros.radio import frames
+from t3mpc_ros.radio.codec import exchange
 from t3mpc_ros.radio.frames import Action, Command, Downlink, Flag, Result, State, Status
 from t3mpc_ros.radio.link import words
 from t3mpc_ros.radio.link.dialogue import Heard
@@ -109,7 +110,8 @@ class Running:
             self._orders.hear(heard.asked, heard.uplink)
         if isinstance(heard.asked, Command):
             answered = isinstance(heard.uplink, State)
-            self._statistics.add_cycle(heard.round_trip if answered else None)
+            whole = answered and _own(heard, heard.asked)
+            self._statistics.add_cycle(heard.round_trip if whole else None)
             self._lost = 0 if answered else self._lost + 1
             self._say_goodbye(heard)
         if isinstance(heard.uplink, State):
@@ -161,3 +163,12 @@ class Running:
             elif heard.returned_ns - self._taken_ns > _UNTAKEN_NS:
                 return words.NOT_TAKEN
         return ''
+
+
+def _own(heard: Heard, asked: Command) -> bool:
+    """Return whether a state is this cycle's own: a CMD alone fetches what was loaded before.
+
+    Unless it was sent again: then it may fetch the answer to itself, and leave the POLL none.
+    """
+    fetched = isinstance(heard.reply, Result) and exchange(heard.reply.second).answered
+    return fetched or getattr(heard.uplink, 'seq', None) == asked.seq

@@ -94,7 +94,10 @@ class LinkSettings(Settings):
     )
     power: str = setting('0', 'transmitter output, dBm', choices=_POWERS)
     retries: int = setting(
-        3, 'tries more when nobody acknowledges: a late command is worthless', low=0, high=15
+        4,
+        'tries more when nobody acknowledges, 0.7 ms each: a late command is worthless',
+        low=0,
+        high=15,
     )
     address: str = setting(
         '54334d5043',
