@@ -21,6 +21,9 @@ import yaml
 
 from t3mpc_ros.nodes.tables import TABLES
 
+# One build serves them all.
+pytestmark = pytest.mark.ros
+
 ROOT = Path(__file__).resolve().parent.parent
 EXECUTABLES = set(re.findall(r"f'(\w+) = \{NAME\}", (ROOT / 'setup.py').read_text()))
 NODES = tuple(TABLES)
@@ -192,7 +195,6 @@ def test_a_sourced_workspace_runs_its_own_code_and_all_of_it(tree):
     assert prefixes == [str(tree.prefix), sys.prefix]
 
 
-@pytest.mark.ros
 @pytest.mark.slow
 def test_every_installed_node_gets_ready_and_ends_with_0(tree, graph):
     for name in NODES:
@@ -238,7 +240,6 @@ def _read_parameter(node, name, wanted):
     return parameter_value_to_python(future.result().values[0])
 
 
-@pytest.mark.ros
 @pytest.mark.slow
 @pytest.mark.parametrize('name', CHANGED)
 def test_each_yaml_reaches_its_node_with_and_without_a_namespace(name, copied, ros, tmp_path):

@@ -42,7 +42,19 @@ SHORTENED = {
     'scripts/run lab train': (['--seeds', '1', '--output', 'OUTPUT/model.npz'], False),
     'scripts/run lab exponents': (['--duration', '20'], False),
     'scripts/run lab estimation': (['--seeds', '2'], False),
-    'scripts/run lab report runs/<time>/bag': (['--output', 'OUTPUT/report'], False),
+    'scripts/run board_emulator --link dongle --robot-link robot_usb': ([], True),
+    'scripts/run radio_tool key new robot.key': ([], False),
+    'scripts/run radio_tool key write robot.key --port robot_usb': ([], False),
+    'scripts/run radio_tool ping --port dongle': ([], False),
+    'scripts/run radio_tool turn left 1 --port dongle --key robot.key --yes': ([], False),
+    'scripts/run radio_bridge --ros-args -p port:=dongle -p key_file:=robot.key': ([], True),
+    'scripts/run bag info runs/<time>/bag': ([], False),
+    'scripts/run bag report runs/<time>/bag': (['--output', 'OUTPUT/report'], False),
+    'scripts/run bag rerun runs/<time>/bag --set law.gain=30.0': ([], False),
+    'scripts/run bag compare runs/<time>/bag --picture divergence.png': ([], False),
+    'scripts/run bag recover runs/<time>/bag --output recovered': ([], False),
+    'scripts/run bag train runs/<time>/bag --output model.npz': ([], False),
+    'scripts/run replayer --ros-args -p bags:=[runs/<time>/bag]': ([], False),
 }
 
 

@@ -54,6 +54,9 @@ DIAGNOSTICS = _profile(10)
 RECORDED = _profile(1000)
 """A topic as the recorder takes it: so much may wait while the disk is busy."""
 
+RECORDED_LATCHED = _profile(RECORDED.depth, DurabilityPolicy.TRANSIENT_LOCAL)
+"""The same of a topic whose publishers keep what was said before they were found."""
+
 
 def is_latched(profile: QoSProfile) -> bool:
     """Whether it is about messages that late subscribers still get."""

@@ -19,6 +19,9 @@ EXPECTED = {
     'controller/journal': 'std_msgs/msg/Int64MultiArray',
 }
 """Topics subscribed to before anybody publishes them, so that their first message is kept."""
+LATCHED = ('reference', 'controller/journal')
+"""Those of them whose publishers, ours, keep what they have said. A recorder that finds them a
+moment after the controller did would otherwise lose what the run cannot be computed again from."""
 
 
 class Attention:
@@ -61,7 +64,10 @@ class Attention:
             if not self._selection.wants(topic, [kind]):
                 continue
             try:
-                self._ears.listen(topic, kind, quality.RECORDED)
+                latched = name in LATCHED
+                self._ears.listen(
+                    topic, kind, quality.RECORDED_LATCHED if latched else quality.RECORDED
+                )
             except graph.RCLError:
                 # A node of this process has it with another type: the publisher will tell.
                 continue
