@@ -35,10 +35,10 @@ from t3mpc_ros.lab.training.practice import (
 )
 from t3mpc_ros.lab.training.replay import NEEDED, Replay, TrainingError, answers, replay_bag
 from t3mpc_ros.lab.trial.scenario import HELD_OUT, PRACTICE, RATE
-from t3mpc_ros.mpc.machine import Shape, look, make_machine, predict
+from t3mpc_ros.mpc.machine import Shape, look, make_machine, make_memory, predict
 from t3mpc_ros.mpc.predictive import PredictiveTerm
 from t3mpc_ros.mpc.settings import Excitation, PredictiveSettings
-from t3mpc_ros.mpc.training import make_memory, pretrain, ridge, split_runs
+from t3mpc_ros.mpc.training import pretrain, ridge, split_runs
 from t3mpc_ros.record import model
 from t3mpc_ros.record.model import ModelError, load_model, save_model
 from t3mpc_ros.record.reader import open_recording

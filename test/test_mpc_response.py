@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from t3mpc_ros.mpc.machine import Shape, begin, look, make_machine, make_past, predict
+from t3mpc_ros.mpc.machine import Shape, begin, look, make_machine, make_memory, make_past, predict
 from t3mpc_ros.mpc.response import (
     forced_response,
     foresee,
@@ -16,7 +16,7 @@ from t3mpc_ros.mpc.response import (
     toeplitz,
 )
 from t3mpc_ros.mpc.settings import Excitation, NominalLoop
-from t3mpc_ros.mpc.training import Timing, excite, make_memory, nominal_step, pretrain
+from t3mpc_ros.mpc.training import Timing, excite, nominal_step, pretrain
 
 TIMING = Timing(0.01, 5, 5)
 SHAPE = Shape(4, 4, 12)

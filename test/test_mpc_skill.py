@@ -5,10 +5,9 @@
 import numpy as np
 import pytest
 
-from t3mpc_ros.mpc.machine import Shape, begin, make_machine, make_past
-from t3mpc_ros.mpc.settings import Excitation, NominalLoop
+from t3mpc_ros.mpc.machine import Shape, begin, make_machine, make_memory, make_past
+from t3mpc_ros.mpc.settings import Excitation, Learning, NominalLoop
 from t3mpc_ros.mpc.skill import (
-    Learning,
     Predictor,
     fade,
     observe,
@@ -17,7 +16,7 @@ from t3mpc_ros.mpc.skill import (
     smooth_step,
     tally,
 )
-from t3mpc_ros.mpc.training import Timing, excite, make_memory
+from t3mpc_ros.mpc.training import Timing, excite
 
 TIMING = Timing(0.01, 5, 5)
 HOW = Learning(True, 1e-4, 0.05, 0.9975, 0.975, 0.99, 0.03, 0.05)

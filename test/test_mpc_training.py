@@ -9,14 +9,21 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from t3mpc_ros.mpc.machine import Shape, distribution, energy, free_energy, make_machine, predict
+from t3mpc_ros.mpc.machine import (
+    Shape,
+    distribution,
+    energy,
+    free_energy,
+    make_machine,
+    make_memory,
+    predict,
+)
 from t3mpc_ros.mpc.settings import Excitation, NominalLoop
 from t3mpc_ros.mpc.training import (
     Timing,
     contrast,
     excite,
     gradient_step,
-    make_memory,
     nominal_step,
     pretrain,
     random_levels,

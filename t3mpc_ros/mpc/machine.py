@@ -77,6 +77,111 @@ class Past(NamedTuple):
     ahead: Array
 
 
+class Memory(NamedTuple):
+    """What the output layer remembers, see ``training.recall``; kernels change it in place."""
+
+    information: Array
+    """Shape (hidden, hidden): weighted sum of mu_1 mu_1ᵀ over the recent past."""
+    prior: Array
+    """Shape (hidden, hidden): the same of the pre-training, R_0."""
+    anchor: Array
+    """Shape (hidden,): the pre-trained output weights."""
+    total: Array
+    """Working memory, shape (hidden, hidden), then (hidden, hidden) and (hidden,)."""
+    lower: Array
+    move: Array
+    power: Array
+    """Shape (3,): running mean of |mu_1|², its mean in pre-training, and that of mere noise."""
+
+
+@kernel
+def cut(store: Array, first: int, rows: int, columns: int) -> Array:
+    """Return a part of a flat store as a table, shape (rows, columns): a view, no copy."""
+    return store[first : first + rows * columns].reshape((rows, columns))
+
+
+@kernel
+def machine_size(delta_lags: int, move_lags: int, hidden: int) -> int:
+    """Return how many numbers make a machine."""
+    return (delta_lags + move_lags) * (hidden + 2) + 3 * hidden + 2
+
+
+@kernel
+def machine_in(store: Array, delta_lags: int, move_lags: int, hidden: int) -> Machine:
+    """Return the views of a flat store that are a machine.
+
+    A call from Python costs time for every array, so whoever calls kernels often hands them one
+    store in place of a dozen arrays.
+    """
+    visible = delta_lags + move_lags
+    hidden_rows = cut(store, visible * hidden, 3, hidden)
+    visible_rows = cut(store, (visible + 3) * hidden, 2, visible)
+    return Machine(
+        cut(store, 0, visible, hidden),
+        hidden_rows[0],
+        delta_lags,
+        store[store.size - 2 :],
+        visible_rows[0],
+        hidden_rows[1],
+        visible_rows[1],
+        hidden_rows[2],
+    )
+
+
+@kernel
+def memory_size(hidden: int) -> int:
+    """Return how many numbers make a memory."""
+    return 4 * hidden * hidden + 2 * hidden + 3
+
+
+@kernel
+def memory_in(store: Array, hidden: int) -> Memory:
+    """Return the views of a flat store that are a memory."""
+    square = hidden * hidden
+    rows = cut(store, 4 * square, 2, hidden)
+    return Memory(
+        cut(store, 0, hidden, hidden),
+        cut(store, square, hidden, hidden),
+        rows[0],
+        cut(store, 2 * square, hidden, hidden),
+        cut(store, 3 * square, hidden, hidden),
+        rows[1],
+        store[store.size - 3 :],
+    )
+
+
+@kernel
+def past_size(delta_lags: int, move_lags: int, horizon: int) -> int:
+    """Return how many numbers make a past."""
+    middle = max(horizon // 2, 1)
+    length = max(delta_lags, move_lags) + middle
+    return 2 * length + 2 * middle + max(horizon, middle) + delta_lags + move_lags + 10
+
+
+@kernel
+def past_in(store: Array, delta_lags: int, move_lags: int, horizon: int) -> Past:
+    """Return the views of a flat store that are a past, long enough to predict half a horizon."""
+    middle = max(horizon // 2, 1)
+    length = max(delta_lags, move_lags) + middle
+    lengths = cut(store, 0, 2, length)
+    middles = cut(store, 2 * length, 2, middle)
+    pairs = cut(store, 2 * (length + middle), 5, 2)
+    rest = store[2 * (length + middle) + 10 :]
+    return Past(
+        lengths[0],
+        lengths[1],
+        middles[0],
+        store[2 * (length + middle) : 2 * (length + middle) + 4],
+        pairs[2],
+        pairs[3],
+        pairs[4],
+        rest[delta_lags + move_lags :],
+        rest[:delta_lags],
+        rest[delta_lags : delta_lags + move_lags],
+        middles[1],
+    )
+
+
 def make_machine(
     shape: Shape,
     delta_scale: float,
@@ -118,37 +223,31 @@ def make_machine(
             f'scales and spread must be positive: got {delta_scale}, {move_scale}, {spread}'
         )
     square, _ = np.linalg.qr(generator.standard_normal((shape.hidden, shape.visible)))
-    return Machine(
-        visible_weights=np.ascontiguousarray(spread * square.T),
-        output_weights=np.zeros(shape.hidden),
-        delta_lags=shape.delta_lags,
-        scales=np.array([delta_scale, move_scale]),
-        lags=np.zeros(shape.visible),
-        mu0=np.zeros(shape.hidden),
-        eta1=np.zeros(shape.visible),
-        mu1=np.zeros(shape.hidden),
-    )
+    size = machine_size(shape.delta_lags, shape.move_lags, shape.hidden)
+    machine = machine_in(np.zeros(size), shape.delta_lags, shape.move_lags, shape.hidden)
+    machine.visible_weights[:] = spread * square.T
+    machine.scales[:] = (delta_scale, move_scale)
+    return machine
+
+
+def make_memory(hidden: int) -> Memory:
+    """Return an empty memory; its prior is filled by ``training.pretrain``."""
+    memory = memory_in(np.zeros(memory_size(hidden)), hidden)
+    memory.prior[:] = np.eye(hidden)
+    memory.power[:] = 1.0
+    return memory
 
 
 def make_past(delta_lags: int, move_lags: int, horizon: int) -> Past:
     """Return an empty past that is long enough to predict from half a horizon ago."""
-    middle = max(horizon // 2, 1)
-    length = max(delta_lags, move_lags) + middle
-    return Past(
-        errors=np.zeros(length),
-        moves=np.zeros(length),
-        offsets=np.zeros(middle),
-        misses=np.zeros(4),
-        predicted=np.ones(2),
-        persisted=np.ones(2),
-        recent=np.zeros(2),
-        planned=np.zeros(max(horizon, middle)),
-        seen_errors=np.zeros(delta_lags),
-        seen_moves=np.zeros(move_lags),
-        ahead=np.zeros(middle),
-    )
+    size = past_size(delta_lags, move_lags, horizon)
+    past = past_in(np.zeros(size), delta_lags, move_lags, horizon)
+    past.predicted[:] = 1.0
+    past.persisted[:] = 1.0
+    return past
 
 
+@kernel
 def begin(past: Past, error: float) -> None:
     """Make the past as if ``error`` (rad/s) had always been measured, and nothing done."""
     past.errors[:] = error

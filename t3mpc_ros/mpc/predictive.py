@@ -11,16 +11,18 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.mpc.active_set import OPTIMAL
 from t3mpc_ros.mpc.machine import Shape, begin, make_machine
-from t3mpc_ros.mpc.program import make_space
-from t3mpc_ros.mpc.response import foresee, plan
-from t3mpc_ros.mpc.settings import PredictiveSettings
-from t3mpc_ros.mpc.skill import Learning, Predictor, fade, gather, observe, skill
+from t3mpc_ros.mpc.program import space_size
+from t3mpc_ros.mpc.response import Signals, gather, signals_in
+from t3mpc_ros.mpc.settings import Learning, PredictiveSettings, Rules
+from t3mpc_ros.mpc.skill import Predictor, renew, skill
 from t3mpc_ros.mpc.training import Timing, excite, nominal_step, split_runs
 from t3mpc_ros.settings import SettingError
 
 __all__ = ['PredictiveSettings', 'PredictiveTerm']
 
 Array = NDArray[np.float64]
+
+_V, _JUMPS, _SKILLS = map(Signals._fields.index, ('v', 'jumps', 'skills'))
 
 
 class PredictiveTerm:
@@ -65,30 +67,28 @@ class PredictiveTerm:
                 f'move_lags must cover the dead time of {settings.nominal.dead_time} s and one '
                 f'period of {span:g} s: got {settings.move_lags}'
             )
-        shape = (outputs, settings.horizon)
-        self._steps = np.zeros(shape)
-        self._free = np.zeros(shape)
-        self._prediction = np.zeros(shape)
-        self._known = np.zeros(shape)
-        self._matrix = np.zeros((settings.horizon, settings.control_horizon))
-        self._space = make_space(settings.control_horizon)
-        self._sums = np.zeros(outputs)
-        self._applied_sums = np.zeros(outputs)
-        self._applied = np.zeros(outputs)
-        self._v = np.zeros(outputs)
-        self._dither = np.zeros(outputs)
-        self._jumps = np.zeros(outputs)
-        self._fades = np.zeros(outputs)
+        self._rows: Array = np.zeros((len(Signals._fields), outputs))
+        self._tables: Array = np.zeros((4, outputs, settings.horizon))
+        self._no_change = np.zeros((settings.horizon, outputs))
+        moves = settings.control_horizon
+        self._numbers = np.zeros(settings.horizon * moves + space_size(moves))
+        self._whole = np.zeros((2, moves + 1), dtype=np.int64)
         self.status: NDArray[np.int64] = np.zeros(outputs, dtype=np.int64)
         """How each output's last program ended, see :mod:`t3mpc_ros.mpc.active_set`."""
         self.settings = settings
         self.configure(settings, feedback_gain)
         self.relearn()
 
+    # Made when asked for: a deep copy of views would no longer be views of the copied rows.
+    @property
+    def _signals(self) -> Signals:
+        return signals_in(self._rows)
+
     @property
     def skill(self) -> Array:
         """Skill against persistence in the middle of the horizon, shape (outputs,)."""
-        return np.array([skill(wheel.past, 1) for wheel in self._predictors])
+        found: Array = self._rows[_SKILLS]
+        return found.copy()
 
     @property
     def skill_next(self) -> Array:
@@ -98,17 +98,19 @@ class PredictiveTerm:
     @property
     def fade(self) -> Array:
         """Share of v_p's bound in force, in [0, 1], shape (outputs,)."""
-        return self._fades.copy()
+        return self._signals.fades.copy()
 
     @property
     def prediction(self) -> Array:
         """Predicted errors Psi (52) under the planned moves, rad/s, shape (outputs, n_p)."""
-        return self._prediction.copy()
+        found: Array = self._tables[2]
+        return found.copy()
 
     @property
     def step_response(self) -> Array:
         """Latest s_0 ... s_{n_p-1} (48), (rad/s)/(rad/s²), shape (outputs, n_p)."""
-        return self._steps.copy()
+        found: Array = self._tables[0]
+        return found.copy()
 
     def configure(self, settings: PredictiveSettings, feedback_gain: float | None = None) -> None:
         """Use other live settings, and another K (1/s), from the next step on.
@@ -137,6 +139,7 @@ class PredictiveTerm:
             self._nominal_steps = nominal_step(self._loop, self._timing, settings.horizon)
         self.settings = settings
         self._how = Learning.of(settings, self._timing.span)
+        self._rules = Rules.of(settings)
 
     def relearn(self, errors: Array | None = None, moves: Array | None = None) -> None:
         """Make new machines and teach them from the beginning, then :meth:`reset`.
@@ -155,7 +158,7 @@ class PredictiveTerm:
         ValueError
             The two do not have one shape (N, outputs), are infinite, or too little is known.
         """
-        settings, outputs = self.settings, self._v.size
+        settings, outputs = self.settings, self.status.size
         recorded = None
         if errors is not None or moves is not None:
             recorded = split_runs(np.asarray(errors), np.asarray(moves), outputs)
@@ -181,25 +184,25 @@ class PredictiveTerm:
             )
             predictors.append(predictor)
         self._predictors = predictors
+        self._stores = tuple(predictor.store for predictor in predictors)
         self.reset()
 
     def reset(self) -> None:
         """Forget the past, and start from v_p = 0; weights and skill are kept."""
-        for array in (self._sums, self._applied_sums, self._applied, self._v, self._jumps):
-            array[:] = 0.0
-        for table in (self._steps, self._free, self._prediction, self._fades, self._dither):
-            table[:] = 0.0
+        self._rows[:] = 0.0
+        self._tables[:] = 0.0
         self._generator = np.random.default_rng((self.settings.seed, 1))
         self.status[:] = OPTIMAL
         self._phase = 0
         self._samples = 0
         for predictor in self._predictors:
             begin(predictor.past, 0.0)
+        self._rows[_SKILLS] = [skill(predictor.past, 1) for predictor in self._predictors]
 
     def warm_up(self) -> None:
         """Compile every kernel now, never inside a step; nothing is remembered of it."""
         for _ in range(2 * self._timing.every):
-            self.step(np.zeros(self._v.size))
+            self.step(np.zeros(self.status.size))
         self.reset()
 
     def weights(self) -> dict[str, Array]:
@@ -240,18 +243,18 @@ class PredictiveTerm:
         The machine must learn from what really acted. What goes beyond v_p, or against it, acts
         too, but is no start for the next change: that starts between zero and v_p.
         """
-        if np.shape(v_p) != self._v.shape or not np.isfinite(v_p).all():
-            raise ValueError(f'v_p must be {self._v.size} finite numbers: got {v_p}')
-        self._applied[:] = v_p
+        if np.shape(v_p) != self.status.shape or not np.isfinite(v_p).all():
+            raise ValueError(f'v_p must be {self.status.size} finite numbers: got {v_p}')
+        self._signals.applied[:] = v_p
 
     def shift(self, jump: Array) -> None:
         """Tell that the error jumps by ``jump`` (rad/s) at the coming step, because r jumps.
 
         Call it before :meth:`step` of the same period; jumps add up.
         """
-        if np.shape(jump) != self._v.shape or not np.isfinite(jump).all():
-            raise ValueError(f'jump must be {self._v.size} finite numbers: got {jump}')
-        self._jumps += jump
+        if np.shape(jump) != self.status.shape or not np.isfinite(jump).all():
+            raise ValueError(f'jump must be {self.status.size} finite numbers: got {jump}')
+        self._rows[_JUMPS] += jump
 
     def step(self, errors: Array, known_change: Array | None = None) -> Array:
         """Return v_p (rad/s²), shape (outputs,), equation (63).
@@ -271,36 +274,33 @@ class PredictiveTerm:
         ValueError
             A shape is wrong or an error is not finite; nothing is changed then.
         """
-        every, phase = self._timing.every, self._phase
-        errors = np.asarray(errors, dtype=np.float64)
-        if errors.shape != self._v.shape:
-            raise ValueError(f'errors must have shape {self._v.shape}: got {errors.shape}')
-        if phase == 0 and known_change is not None:
-            shape = (self.settings.horizon, self._v.size)
-            if np.shape(known_change) != shape or not np.isfinite(known_change).all():
-                raise ValueError(
-                    f'known_change must be {shape[0]} by {shape[1]} finite numbers: '
-                    f'got {known_change}'
-                )
-        sampled = phase == 0 or phase > every - self._timing.average
-        if not gather(errors, self._jumps, self._applied, sampled, self._sums, self._applied_sums):
+        timing, phase = self._timing, self._phase
+        if not isinstance(errors, np.ndarray) or errors.dtype != np.float64:
+            errors = np.asarray(errors, dtype=np.float64)
+        if errors.shape != self.status.shape:
+            raise ValueError(f'errors must have shape {self.status.shape}: got {errors.shape}')
+        change = self._no_change if phase or known_change is None else known_change
+        if change is not self._no_change and (
+            np.shape(change) != self._no_change.shape or not np.isfinite(change).all()
+        ):
+            rows, columns = self._no_change.shape
+            raise ValueError(
+                f'known_change must be {rows} by {columns} finite numbers: got {known_change}'
+            )
+        sampled = phase == 0 or phase > timing.every - timing.average
+        if not gather(errors, sampled, phase == 0, self._decay, self._rows):
             raise ValueError(f'errors must be finite: got {errors}')
         if phase == 0:
-            self._set_known(known_change)
-            for z, predictor in enumerate(self._predictors):
-                self._advance(z, predictor)
-            self._sums[:] = 0.0
-            self._applied_sums[:] = 0.0
-            self._samples += 1
-        self._phase = (phase + 1) % every
-        self._jumps *= self._decay
-        self._applied[:] = self._v
-        return self._v.copy()
+            self._renew(change)
+        self._phase = (phase + 1) % timing.every
+        v_p: Array = self._rows[_V]
+        return v_p.copy()
 
     @property
     def known_error(self) -> Array:
         """What is left of the jumps told by :meth:`shift`, rad/s, shape (outputs,)."""
-        return self._jumps
+        left: Array = self._rows[_JUMPS]
+        return left
 
     @property
     def span(self) -> float:
@@ -312,78 +312,28 @@ class PredictiveTerm:
         """Whether the next :meth:`step` solves the program, and reads ``known_change``."""
         return self._phase == 0
 
-    def _set_known(self, known_change: Array | None) -> None:
-        """Write the known part of the future error: jumps past and to come, dying away by K."""
-        self._known[:] = np.outer(self._jumps, self._decays[1:])
-        if known_change is not None:
-            for j, row in enumerate(known_change):
-                self._known[:, j:] += np.outer(row, self._decays[: self._decays.size - 1 - j])
-
-    def _advance(self, z: int, predictor: Predictor) -> None:
-        """Take the sample of one output, and renew its v_p."""
-        settings, past = self.settings, predictor.past
-        # The first sample has one measurement; nothing was before it.
-        sample = self._sums[z] / (self._timing.average if self._samples else 1)
-        if not self._samples:
-            begin(past, sample)
-        known_enough = self._samples > past.errors.size
-        # What is left of a large jump is mostly how the robot's limits spoilt its decay.
-        calm = abs(self._jumps[z]) < 0.1 * settings.delta_scale
-        observe(
-            predictor.machine,
-            predictor.memory,
-            past,
-            sample,
-            self._applied_sums[z] / self._timing.every,
-            known_enough,
-            known_enough and calm and settings.learning,
-            self._how,
+    def _renew(self, change: Array) -> None:
+        """Take the sample of each output, and renew its v_p."""
+        if self._rules.dithered:
+            drawn = self._generator.uniform(-1.0, 1.0, self.status.size)
+            self._signals.drawn[:] = self.settings.dither * drawn
+        timing = self._timing
+        renew(
+            self._stores,
+            self._predictors[0].sizes,
+            self._rows,
+            self._tables,
+            self._nominal_steps[max(self.settings.horizon // 2, 1) - 1],
+            self._decays,
+            change,
+            self._samples,
+            timing.average,
+            timing.every,
+            self._decay,
+            tuple(self._rules),
+            tuple(self._how),
+            self._numbers,
+            self._whole,
+            self.status,
         )
-        # (62) starts from v_p(t-1) as applied, less the dither. A bound that has just been lowered
-        # is kept at once, because the compensator (81) counts on it: that is no part of dv_max.
-        dither = self._dither[z]
-        v = self._v[z] - dither
-        held = min(max(self._applied[z] - dither, min(v, 0.0)), max(v, 0.0))
-        held = min(max(held, -settings.v_max), settings.v_max)
-        foresee(
-            predictor.machine,
-            past,
-            held,
-            settings.probe,
-            self._known[z],
-            self._steps[z],
-            self._free[z],
-        )
-        middle = past.offsets.size - 1
-        # Whichever is worse: a response that goes to zero is hard to beat half a horizon ahead,
-        # but an untaught machine misses the very next error by far.
-        share = fade(
-            min(skill(past, 0), skill(past, 1)),
-            self._steps[z, middle] / self._nominal_steps[middle],
-            settings.fade_low,
-            settings.fade_high,
-            settings.gain_low,
-            settings.gain_high,
-        )
-        self._fades[z] = share if settings.enabled else 0.0
-        # A share that falls takes v_p out no faster than dv_max, so that no step is made of it.
-        bound = max(self._fades[z] * settings.v_max, abs(held) - settings.dv_max)
-        self.status[z] = plan(
-            self._steps[z],
-            self._free[z],
-            held,
-            settings.error_weight,
-            settings.move_weight,
-            settings.dv_max,
-            bound,
-            self._matrix,
-            self._space,
-            self._prediction[z],
-        )
-        # Rounding must not carry v_p over its bound, nor leave dust when it is zero.
-        v = min(max(held + self._space.changes[0], -bound), bound)
-        self._v[z] = v
-        if settings.dither > 0.0 and settings.enabled:
-            level = v + settings.dither * self._generator.uniform(-1.0, 1.0)
-            self._v[z] = min(max(level, -settings.v_max), settings.v_max)
-        self._dither[z] = self._v[z] - v
+        self._samples += 1

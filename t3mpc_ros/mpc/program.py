@@ -58,22 +58,35 @@ def make_space(moves: int) -> Space:
     """Return the working memory of a program with ``moves`` (n_c) unknowns."""
     if moves < 1:
         raise ValueError(f'moves must be at least 1: got {moves}')
-    square = (moves, moves)
+    return space_in(np.zeros(space_size(moves)), np.zeros((2, moves + 1), dtype=np.int64), moves)
+
+
+@kernel
+def space_size(moves: int) -> int:
+    """Return how many numbers make the space of a program, whole numbers not counted."""
+    return 4 * moves * moves + 11 * moves
+
+
+@kernel
+def space_in(store: Array, whole: Indices, moves: int) -> Space:
+    """Return the views of a flat store, and of whole numbers (2, n + 1), that are a space."""
+    tables = store[: 4 * moves * moves].reshape((4, moves, moves))
+    rows = store[4 * moves * moves :].reshape((11, moves))
     return Space(
-        hessian=np.zeros(square),
-        slope=np.zeros(moves),
-        lower=np.zeros(square),
-        changes=np.zeros(moves),
-        multipliers=np.zeros((2, 2 * moves)),
-        active=np.zeros(moves, dtype=np.int64),
-        sides=np.zeros(moves),
-        weights=np.zeros(moves),
-        basis=np.zeros(square),
-        triangle=np.zeros(square),
-        normal=np.zeros(moves),
-        share=np.zeros(moves),
-        start=np.zeros(moves),
-        islands=np.zeros(moves + 1, dtype=np.int64),
+        tables[0],
+        rows[0],
+        tables[1],
+        rows[1],
+        rows[7:].reshape((2, 2 * moves)),
+        whole[0, :moves],
+        rows[2],
+        rows[3],
+        tables[2],
+        tables[3],
+        rows[4],
+        rows[5],
+        rows[6],
+        whole[1],
     )
 
 

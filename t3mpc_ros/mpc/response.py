@@ -2,8 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the machine expects of the next n_p periods, equations (45)-(59) with E11.
 
-And, from that, the moves (60)-(63): :func:`plan`.
+And, from that, the moves (60)-(63): :func:`plan`. Before it the samples are gathered that the
+machine sees.
 """
+
+import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +18,66 @@ from t3mpc_ros.mpc.machine import Machine, Past, look, predict
 from t3mpc_ros.mpc.program import Space
 
 Array = NDArray[np.float64]
+
+
+class Signals(NamedTuple):
+    """What each output's v_p is made of from step to step, shape (outputs,) each."""
+
+    sums: Array
+    """Sum of the errors of this sample so far, rad/s."""
+    applied_sums: Array
+    """Sum of the v_p applied since the last sample, rad/s²."""
+    applied: Array
+    """v_p as applied in this control period, rad/s²."""
+    v: Array
+    """v_p (63), held between samples, rad/s²."""
+    dither: Array
+    """Its random part, rad/s²."""
+    drawn: Array
+    """The random level to be added to the next one, rad/s²."""
+    jumps: Array
+    """What is left of the known jumps of the error, rad/s."""
+    fades: Array
+    """Share of the bound of v_p in force."""
+    skills: Array
+    """Skill in the middle of the horizon."""
+
+
+@kernel
+def signals_in(rows: Array) -> Signals:
+    """Return the rows of a table, shape (9, outputs), as signals."""
+    return Signals(rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], rows[6], rows[7], rows[8])
+
+
+@kernel
+def hold(signals: Signals, decay: float) -> None:
+    """End a control period: known jumps die away, and v_p is taken to be applied as it is."""
+    for z in range(signals.v.size):
+        signals.jumps[z] *= decay
+        signals.applied[z] = signals.v[z]
+
+
+@kernel
+def gather(errors: Array, sampled: bool, due: bool, decay: float, rows: Array) -> bool:
+    """Add a control period to the sums of a sample; return False if an error is not finite.
+
+    errors  : shape (outputs,), rad/s
+    sampled : whether this period's errors belong to the sample
+    due     : whether the sample is complete; :func:`renew` ends the period then
+    decay   : share of a known jump that is left after a period
+    rows    : the :class:`Signals`
+    """
+    signals = signals_in(rows)
+    for z in range(errors.size):
+        if not math.isfinite(errors[z]):
+            return False
+    for z in range(errors.size):
+        signals.applied_sums[z] += signals.applied[z]
+        if sampled:
+            signals.sums[z] += errors[z] - signals.jumps[z]
+    if not due:
+        hold(signals, decay)
+    return True
 
 
 @kernel
@@ -143,6 +207,22 @@ def foresee(
     step_response(machine, past, held, probe, free, steps)
     for j in range(free.size):
         free[j] += known[j]
+
+
+@kernel
+def foretell(jump: float, decays: Array, change: Array, known: Array) -> None:
+    """Write the known part of the errors to come: jumps past and to come, dying away by K.
+
+    jump   : what is left of the past ones, rad/s
+    decays : shape (n_p + 1,), share of a jump that is left 0, 1, ... periods T later
+    change : shape (n_p,), jumps in each period T to come, rad/s
+    known  : shape (n_p,), overwritten, rad/s
+    """
+    for j in range(known.size):
+        known[j] = jump * decays[j + 1]
+    for j in range(change.size):
+        for i in range(j, known.size):
+            known[i] += change[j] * decays[i - j]
 
 
 @kernel

@@ -1,8 +1,10 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""What can be chosen about the predictive term."""
+"""What can be chosen about the predictive term, and what kernels are told of it."""
 
 from dataclasses import dataclass
+import math
+from typing import NamedTuple, Self
 
 from t3mpc_ros.settings import SettingError, Settings, nested, setting
 
@@ -163,3 +165,75 @@ class PredictiveSettings(Settings):
                 raise SettingError(
                     f'{low} must be below {high} = {getattr(self, high)}: got {getattr(self, low)}'
                 )
+
+
+class Learning(NamedTuple):
+    """How a machine learns and is scored while it runs: plain numbers, for kernels."""
+
+    recursive: bool
+    """Whether by least squares (:func:`recall`) or else by the normalised gradient (44)."""
+    contrast_rate: float
+    """gamma of (43)."""
+    output_rate: float
+    """gamma of (44), normalised."""
+    keep: float
+    """lambda of :func:`recall`, per predictive period, as the next two."""
+    smooth: float
+    skill_keep: float
+    offset_gain: float
+    """Share of the latest miss that the offset e takes in."""
+    noise: float
+    """Standard deviation of an error that is mere noise (rad/s)."""
+
+    @classmethod
+    def of(cls, settings: PredictiveSettings, span: float) -> Self:
+        """Return what the settings mean for a predictive period of ``span`` s."""
+        return cls(
+            recursive=settings.learner == 'recursive',
+            contrast_rate=settings.contrast_rate,
+            output_rate=settings.output_rate,
+            keep=math.exp(-span / settings.memory),
+            smooth=math.exp(-span / 2.0),
+            skill_keep=math.exp(-span / settings.skill_memory),
+            offset_gain=settings.offset_gain,
+            noise=settings.noise,
+        )
+
+
+class Rules(NamedTuple):
+    """How v_p is made of what the machine foresees: plain numbers, for kernels."""
+
+    enabled: bool
+    learning: bool
+    dithered: bool
+    calm: float
+    """Rest of a jump (rad/s) from which on the machine learns nothing: what is left of a large
+    one is mostly how the robot's limits spoilt its decay."""
+    probe: float
+    error_weight: float
+    move_weight: float
+    v_max: float
+    dv_max: float
+    fade_low: float
+    fade_high: float
+    gain_low: float
+    gain_high: float
+
+    @classmethod
+    def of(cls, settings: PredictiveSettings) -> Self:
+        """Return what the settings say."""
+        return cls(
+            settings.enabled,
+            settings.learning,
+            settings.enabled and settings.dither > 0.0,
+            0.1 * settings.delta_scale,
+            settings.probe,
+            settings.error_weight,
+            settings.move_weight,
+            settings.v_max,
+            settings.dv_max,
+            settings.fade_low,
+            settings.fade_high,
+            settings.gain_low,
+            settings.gain_high,
+        )

@@ -1,76 +1,36 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""How well the machine predicts while it runs, and how much of v_p that is worth."""
+"""How well the machine predicts while it runs, how much of v_p that is worth, and that v_p."""
 
 from collections.abc import Mapping
-import math
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.kernels import kernel
-from t3mpc_ros.mpc.machine import Machine, Past, begin, look, make_past, predict
-from t3mpc_ros.mpc.response import roll_forward
-from t3mpc_ros.mpc.settings import Excitation, PredictiveSettings
-from t3mpc_ros.mpc.training import (
+from t3mpc_ros.mpc.machine import (
+    Machine,
     Memory,
-    contrast,
-    gradient_step,
+    Past,
+    begin,
+    look,
+    machine_in,
+    machine_size,
     make_memory,
-    pretrain,
-    recall,
+    make_past,
+    memory_in,
+    memory_size,
+    past_in,
+    past_size,
+    predict,
 )
+from t3mpc_ros.mpc.program import Indices, space_in
+from t3mpc_ros.mpc.response import foresee, foretell, hold, plan, roll_forward, signals_in
+from t3mpc_ros.mpc.settings import Excitation, Learning, Rules
+from t3mpc_ros.mpc.training import contrast, gradient_step, pretrain, recall
 
 Array = NDArray[np.float64]
-
-
-class Learning(NamedTuple):
-    """How a machine learns and is scored while it runs: plain numbers, for kernels."""
-
-    recursive: bool
-    """Whether by least squares (:func:`recall`) or else by the normalised gradient (44)."""
-    contrast_rate: float
-    """gamma of (43)."""
-    output_rate: float
-    """gamma of (44), normalised."""
-    keep: float
-    """lambda of :func:`recall`, per predictive period, as the next two."""
-    smooth: float
-    skill_keep: float
-    offset_gain: float
-    """Share of the latest miss that the offset e takes in."""
-    noise: float
-    """Standard deviation of an error that is mere noise (rad/s)."""
-
-    @classmethod
-    def of(cls, settings: PredictiveSettings, span: float) -> Self:
-        """Return what the settings mean for a predictive period of ``span`` s."""
-        return cls(
-            recursive=settings.learner == 'recursive',
-            contrast_rate=settings.contrast_rate,
-            output_rate=settings.output_rate,
-            keep=math.exp(-span / settings.memory),
-            smooth=math.exp(-span / 2.0),
-            skill_keep=math.exp(-span / settings.skill_memory),
-            offset_gain=settings.offset_gain,
-            noise=settings.noise,
-        )
-
-
-@kernel
-def gather(
-    errors: Array, jumps: Array, applied: Array, sampled: bool, sums: Array, applied_sums: Array
-) -> bool:
-    """Add a control period to the sums of a sample; return False if an error is not finite."""
-    for z in range(errors.size):
-        if not math.isfinite(errors[z]):
-            return False
-    for z in range(errors.size):
-        applied_sums[z] += applied[z]
-        if sampled:
-            sums[z] += errors[z] - jumps[z]
-    return True
 
 
 @kernel
@@ -203,6 +163,137 @@ def rehearse(
                 past.persisted[which] += persisted * persisted / count
 
 
+class Wheel(NamedTuple):
+    """One output's machine with its memory and its past."""
+
+    machine: Machine
+    memory: Memory
+    past: Past
+
+
+@kernel
+def wheel_size(delta_lags: int, move_lags: int, hidden: int, horizon: int) -> int:
+    """Return how many numbers make a wheel."""
+    machine = machine_size(delta_lags, move_lags, hidden)
+    return machine + memory_size(hidden) + past_size(delta_lags, move_lags, horizon)
+
+
+@kernel
+def wheel_in(store: Array, delta_lags: int, move_lags: int, hidden: int, horizon: int) -> Wheel:
+    """Return the views of a flat store that are a wheel."""
+    first = machine_size(delta_lags, move_lags, hidden)
+    second = first + memory_size(hidden)
+    return Wheel(
+        machine_in(store[:first], delta_lags, move_lags, hidden),
+        memory_in(store[first:second], hidden),
+        past_in(store[second:], delta_lags, move_lags, horizon),
+    )
+
+
+@kernel
+def renew(
+    stores: tuple[Array, ...],
+    sizes: tuple[int, int, int, int],
+    rows: Array,
+    tables: Array,
+    nominal: float,
+    decays: Array,
+    change: Array,
+    samples: int,
+    average: int,
+    every: int,
+    decay: float,
+    rules_given: tuple[Any, ...],
+    how_given: tuple[Any, ...],
+    numbers: Array,
+    whole: Indices,
+    status: Indices,
+) -> None:
+    """Take the sample of each output, and renew its v_p: (34)-(63) in one call.
+
+    stores        : the :class:`Wheel` of each output, with their ``sizes``
+    rows          : the :class:`Signals`
+    tables        : shape (4, outputs, n_p), overwritten: step responses (48), Psi_free (56),
+                    predictions Psi (52), and the part of the errors to come that is known
+    nominal       : nominal step response in the middle of the horizon
+    decays        : shape (n_p + 1,), share of a known jump that is left 0, 1, ... periods T later
+    change        : shape (n_p, outputs), jumps to come in each period T, rad/s
+    samples       : how many were taken before
+    average, every: control periods in a sample's mean, and in a period T
+    decay         : share of a known jump that is left after a control period
+    rules_given, how_given : :class:`Rules` and :class:`Learning` as plain tuples
+    numbers, whole : working memory: S and the :class:`Space` of the program
+    status        : shape (outputs,), overwritten, how each program ended
+    """
+    rules, how = Rules(*rules_given), Learning(*how_given)
+    signals = signals_in(rows)
+    horizon = decays.size - 1
+    moves = whole.shape[1] - 1
+    matrix = numbers[: horizon * moves].reshape((horizon, moves))
+    space = space_in(numbers[horizon * moves :], whole, moves)
+    for z in range(len(stores)):
+        wheel = wheel_in(stores[z], sizes[0], sizes[1], sizes[2], sizes[3])
+        machine, past = wheel.machine, wheel.past
+        steps, free, known = tables[0, z], tables[1, z], tables[3, z]
+        foretell(signals.jumps[z], decays, change[:, z], known)
+        # The first sample has one measurement; nothing was before it.
+        sample = signals.sums[z] / (average if samples > 0 else 1)
+        if samples == 0:
+            begin(past, sample)
+        enough = samples > past.errors.size
+        observe(
+            machine,
+            wheel.memory,
+            past,
+            sample,
+            signals.applied_sums[z] / every,
+            enough,
+            enough and abs(signals.jumps[z]) < rules.calm and rules.learning,
+            how,
+        )
+        # (62) starts from v_p(t-1) as applied, less the dither. A bound that has just been lowered
+        # is kept at once, because the compensator (81) counts on it: that is no part of dv_max.
+        v = signals.v[z] - signals.dither[z]
+        held = min(max(signals.applied[z] - signals.dither[z], min(v, 0.0)), max(v, 0.0))
+        held = min(max(held, -rules.v_max), rules.v_max)
+        foresee(machine, past, held, rules.probe, known, steps, free)
+        # Whichever skill is worse: a response that goes to zero is hard to beat half a horizon
+        # ahead, but an untaught machine misses the very next error by far.
+        signals.skills[z] = skill(past, 1)
+        share = fade(
+            min(skill(past, 0), signals.skills[z]),
+            steps[past.offsets.size - 1] / nominal,
+            rules.fade_low,
+            rules.fade_high,
+            rules.gain_low,
+            rules.gain_high,
+        )
+        signals.fades[z] = share if rules.enabled else 0.0
+        # A share that falls takes v_p out no faster than dv_max, so that no step is made of it.
+        bound = max(signals.fades[z] * rules.v_max, abs(held) - rules.dv_max)
+        status[z] = plan(
+            steps,
+            free,
+            held,
+            rules.error_weight,
+            rules.move_weight,
+            rules.dv_max,
+            bound,
+            matrix,
+            space,
+            tables[2, z],
+        )
+        # Rounding must not carry v_p over its bound, nor leave dust when it is zero.
+        v = min(max(held + space.changes[0], -bound), bound)
+        signals.v[z] = v
+        if rules.dithered:
+            signals.v[z] = min(max(v + signals.drawn[z], -rules.v_max), rules.v_max)
+        signals.dither[z] = signals.v[z] - v
+        signals.sums[z] = 0.0
+        signals.applied_sums[z] = 0.0
+    hold(signals, decay)
+
+
 class Predictor:
     """One output's machine, with its memory, its past and a run to try it on.
 
@@ -222,15 +313,37 @@ class Predictor:
     """
 
     def __init__(self, machine: Machine, horizon: int, trial: tuple[Array, Array]) -> None:
-        self.machine = machine
-        self.memory = make_memory(machine.output_weights.size)
-        delta_lags = machine.delta_lags
-        self.past = make_past(delta_lags, machine.lags.size - delta_lags, horizon)
+        delta_lags, hidden = machine.delta_lags, machine.output_weights.size
+        self.sizes = (delta_lags, machine.lags.size - delta_lags, hidden, horizon)
+        """Lags of the error and of v_p, hidden units and n_p."""
+        self.store: Array = np.zeros(wheel_size(*self.sizes))
+        """Everything the kernels change, as :func:`wheel_in` takes it apart."""
+        given = Wheel(machine, make_memory(hidden), make_past(*self.sizes[:2], horizon))
+        for mine, other in zip(wheel_in(self.store, *self.sizes), given, strict=True):
+            for here, there in zip(mine, other, strict=True):
+                if isinstance(here, np.ndarray):
+                    here[:] = there
         if trial[0].size <= self.past.errors.size + 1:
             raise ValueError(
                 f'trial must be longer than {self.past.errors.size + 1}: got {trial[0].size}'
             )
         self._trial = trial
+
+    # Made when asked for: a deep copy of views would no longer be views of the copied store.
+    @property
+    def machine(self) -> Machine:
+        """The machine, as views of ``store``; so are the next two."""
+        return wheel_in(self.store, *self.sizes).machine
+
+    @property
+    def memory(self) -> Memory:
+        """What its output layer remembers."""
+        return wheel_in(self.store, *self.sizes).memory
+
+    @property
+    def past(self) -> Past:
+        """What it has seen."""
+        return wheel_in(self.store, *self.sizes).past
 
     def teach(
         self, errors: Array, moves: Array, how: Excitation, trust: float, learning: Learning
@@ -256,12 +369,13 @@ class Predictor:
         self.try_out(learning)
 
     def _arrays(self) -> dict[str, Array]:
+        machine, memory, _ = wheel_in(self.store, *self.sizes)
         return {
-            'visible_weights': self.machine.visible_weights,
-            'output_weights': self.machine.output_weights,
-            'scales': self.machine.scales,
-            'anchor': self.memory.anchor,
-            'prior': self.memory.prior,
-            'information': self.memory.information,
-            'power': self.memory.power,
+            'visible_weights': machine.visible_weights,
+            'output_weights': machine.output_weights,
+            'scales': machine.scales,
+            'anchor': memory.anchor,
+            'prior': memory.prior,
+            'information': memory.information,
+            'power': memory.power,
         }

@@ -9,42 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.kernels import kernel
-from t3mpc_ros.mpc.machine import Machine, look, predict
+from t3mpc_ros.mpc.machine import Machine, Memory, look, predict
 from t3mpc_ros.mpc.program import factor, solve_lower, solve_upper
 from t3mpc_ros.mpc.settings import Excitation, NominalLoop
 
 Array = NDArray[np.float64]
-
-
-class Memory(NamedTuple):
-    """What the output layer remembers, see :func:`recall`; kernels change it in place."""
-
-    information: Array
-    """Shape (hidden, hidden): weighted sum of mu_1 mu_1ᵀ over the recent past."""
-    prior: Array
-    """Shape (hidden, hidden): the same of the pre-training, R_0."""
-    anchor: Array
-    """Shape (hidden,): the pre-trained output weights."""
-    total: Array
-    """Working memory, shape (hidden, hidden), then (hidden, hidden) and (hidden,)."""
-    lower: Array
-    move: Array
-    power: Array
-    """Shape (3,): running mean of |mu_1|², its mean in pre-training, and that of mere noise."""
-
-
-def make_memory(hidden: int) -> Memory:
-    """Return an empty memory; its prior is filled by :func:`pretrain`."""
-    square = (hidden, hidden)
-    return Memory(
-        np.zeros(square),
-        np.eye(hidden),
-        np.zeros(hidden),
-        np.zeros(square),
-        np.zeros(square),
-        np.zeros(hidden),
-        np.ones(3),
-    )
 
 
 @kernel

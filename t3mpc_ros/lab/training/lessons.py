@@ -15,8 +15,8 @@ from t3mpc_ros.fuzzy.estimator import FuzzyEstimator
 from t3mpc_ros.lab.training.effect import effect
 from t3mpc_ros.lab.training.replay import Replay, TrainingError
 from t3mpc_ros.mpc.machine import Machine, Shape, make_machine
-from t3mpc_ros.mpc.settings import PredictiveSettings
-from t3mpc_ros.mpc.skill import Learning, Predictor
+from t3mpc_ros.mpc.settings import Learning, PredictiveSettings
+from t3mpc_ros.mpc.skill import Predictor
 from t3mpc_ros.mpc.training import Timing, nominal_step
 
 Array = NDArray[np.float64]
