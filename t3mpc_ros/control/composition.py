@@ -4,6 +4,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +17,13 @@ from t3mpc_ros.control.law import (
     LawSettings,
     law_terms,
     ultimate_bound,
+    update_certificate,
 )
 from t3mpc_ros.control.switches import SwitchSettings
-from t3mpc_ros.fuzzy.adaptation import AdaptationSettings
-from t3mpc_ros.fuzzy.estimator import FuzzyEstimator
+from t3mpc_ros.fuzzy.adaptation import AdaptationSettings, adapt
+from t3mpc_ros.fuzzy.estimator import FuzzyEstimator, estimate
 from t3mpc_ros.fuzzy.sets import FuzzySettings
+from t3mpc_ros.kernels import kernel
 from t3mpc_ros.mpc.predictive import PredictiveSettings, PredictiveTerm
 from t3mpc_ros.settings import Settings, nested, setting
 
@@ -58,6 +61,102 @@ class CompositionSettings(Settings):
         return self.law.error_bound + predictive
 
 
+class Gains(NamedTuple):
+    """What :func:`compose` is told of the settings: plain numbers, for kernels."""
+
+    use_fuzzy: bool
+    adapted: bool
+    handover: float
+    gain: float
+    bound: float
+    smoothing: float
+    window: float
+    gamma: float
+    radius: float
+    leakage: float
+    dead_zone: float
+    step_limit: float
+
+
+@kernel
+def compose(
+    errors: Array,
+    speeds: Array,
+    wanted: Array,
+    wanted_rate: Array,
+    predictive: Array,
+    unforeseen: Array,
+    dt: float,
+    frozen: bool,
+    gains_given: tuple[Any, ...],
+    centres: Array,
+    pull: Array,
+    sharpness: Array,
+    shares: Array,
+    grades: Array,
+    firings: Array,
+    phi: Array,
+    coefficients: Array,
+    work: Array,
+    terms: Array,
+    command: Array,
+    remembered: Array,
+) -> bool:
+    """Write terms and command of the law, adapt, and renew the certificate.
+
+    Returns False, and changes nothing, when a speed is not finite.
+
+    errors         : shape (n,), delta, rad/s
+    speeds ... predictive : as in :func:`t3mpc_ros.control.law.law_terms`
+    unforeseen     : shape (n,), delta less what is left of announced jumps, rad/s: that is
+        nobody's fault, and teaches nothing
+    dt             : s since the last step
+    frozen         : whether a limit cut the last command
+    gains_given    : :class:`Gains` as a plain tuple
+    centres ... coefficients : as in :func:`t3mpc_ros.fuzzy.estimator.estimate`
+    work           : shape (2, n), overwritten: g, and what the coefficients learn from
+    terms, command : overwritten
+    remembered     : as in :func:`t3mpc_ros.control.law.update_certificate`
+    """
+    gains = Gains(*gains_given)
+    guess, blame = work[0], work[1]
+    guess[:] = 0.0
+    if gains.use_fuzzy and not estimate(
+        speeds, centres, pull, sharpness, shares, grades, firings, phi, coefficients, guess
+    ):
+        return False
+    law_terms(
+        speeds,
+        wanted,
+        wanted_rate,
+        guess,
+        predictive,
+        gains.gain,
+        gains.bound,
+        gains.smoothing,
+        terms,
+        command,
+    )
+    if gains.adapted and not frozen:
+        for i in range(blame.size):
+            blame[i] = unforeseen[i] - gains.handover * predictive[i]
+        adapt(
+            coefficients,
+            phi,
+            blame,
+            dt,
+            gains.gamma,
+            gains.radius,
+            gains.leakage,
+            gains.dead_zone,
+            gains.step_limit,
+        )
+    update_certificate(
+        errors, gains.gain, gains.bound, gains.smoothing, dt, gains.window, remembered
+    )
+    return True
+
+
 class ComposedLaw:
     """Computes the wheel accelerations that make two wheels follow a reference.
 
@@ -85,19 +184,24 @@ class ComposedLaw:
             settings.predictive, self._period, settings.law.gain, outputs=2
         )
         self._certificate = Certificate()
-        self._none: Array = np.zeros(2)
+        self._errors: Array = np.zeros(2)
+        self._work: Array = np.zeros((2, 2))
         self.terms: Array = np.zeros((len(TERMS), 2))
         """The law's terms of the last step, rows as in ``law.TERMS``, rad/s²."""
         self.command: Array = np.zeros(2)
         """Their sum u, rad/s²."""
+        self._gains = self._make_gains()
         self.reset()
 
     def warm_up(self) -> None:
         """Compile every kernel and pre-train the predictor now, never inside a step."""
         self.fuzzy.warm_up()
         self.predictive.warm_up()
-        zero = np.zeros(2)
-        law_terms(zero, zero, zero, zero, zero, 1.0, 1.0, 1.0, self.terms, self.command)
+        coefficients = self.fuzzy.coefficients
+        self.step(np.zeros(2), np.zeros(2), np.zeros(2), self._period)
+        self.fuzzy.reset()
+        self.fuzzy.coefficients = coefficients
+        self.reset()
         self.terms[:] = 0.0
         self.command[:] = 0.0
 
@@ -106,6 +210,7 @@ class ComposedLaw:
         self._settings = settings
         self.fuzzy.configure(settings.adaptation)
         self.predictive.configure(settings.predictive, settings.law.gain)
+        self._gains = self._make_gains()
 
     def learnt(self) -> dict[str, Array]:
         """Return everything learnt, by name, to be saved: coefficients and predictor weights."""
@@ -133,12 +238,26 @@ class ComposedLaw:
         self.fuzzy.coefficients = learnt['fuzzy.coefficients']
         self.predictive.set_weights(weights)
 
+    def copies(self) -> tuple[Array, list[Array]]:
+        """Return what is learnt as it is now, for :meth:`go_back`: much faster than learnt."""
+        return self.fuzzy.coefficients, self.predictive.copies()
+
+    def go_back(self, copies: tuple[Array, list[Array]]) -> None:
+        """Use what :meth:`copies` returned, as :meth:`restore` does."""
+        coefficients, predictors = copies
+        self.fuzzy.coefficients = coefficients
+        self.predictive.go_back(predictors)
+
     def reset(self) -> None:
         """Start a new run; what was learnt is kept."""
         self.predictive.reset()
         self._certificate.reset()
         self._frozen = False
-        self.reading = CertificateReading(0.0, 0.0, 0.0)
+
+    @property
+    def reading(self) -> CertificateReading:
+        """What the certificate says."""
+        return self._certificate.reading
 
     @property
     def ball(self) -> float:
@@ -168,27 +287,25 @@ class ComposedLaw:
         known_change
             Jumps of the error still to come, see :meth:`PredictiveTerm.step`.
         """
-        settings = self._settings
-        errors = speeds - wanted
-        estimate = self.fuzzy.evaluate(speeds) if settings.use_fuzzy else self._none
-        # What is left of a jump that was announced is nobody's fault, and teaches nothing.
-        blame = errors - self.predictive.known_error
-        predictive = self.predictive.step(errors, known_change)
-        if settings.use_fuzzy and not self._frozen:
-            self.fuzzy.adapt(blame - settings.handover * predictive, dt)
-        law_terms(
+        np.subtract(speeds, wanted, out=self._errors)
+        predictive = self.predictive.step(self._errors, known_change)
+        if not compose(
+            self._errors,
             speeds,
             wanted,
             wanted_rate,
-            estimate,
             predictive,
-            settings.law.gain,
-            self._bound(),
-            settings.law.smoothing,
+            self.predictive.unforeseen,
+            dt,
+            self._frozen,
+            self._gains,
+            *self.fuzzy.tables,
+            self._work,
             self.terms,
             self.command,
-        )
-        self.reading = self._certificate.update(errors, settings.law, self._bound(), dt)
+            self._certificate.remembered,
+        ):
+            raise ValueError(f'speeds must be finite: got {speeds}')
         return self.command
 
     def applied(self, acceleration: Array, *, limited: bool) -> None:
@@ -206,6 +323,25 @@ class ComposedLaw:
         if limited:
             wanted = self.terms[4]
             self.predictive.notify_applied(wanted + (acceleration - self.command))
+
+    def _make_gains(self) -> tuple[Any, ...]:
+        settings, law, adaptation = self._settings, self._settings.law, self._settings.adaptation
+        return tuple(
+            Gains(
+                use_fuzzy=settings.use_fuzzy,
+                adapted=settings.use_fuzzy and adaptation.enabled,
+                handover=settings.handover,
+                gain=law.gain,
+                bound=self._bound(),
+                smoothing=law.smoothing,
+                window=self._certificate.window,
+                gamma=adaptation.gamma,
+                radius=self.fuzzy.radius,
+                leakage=adaptation.sigma_modification,
+                dead_zone=adaptation.dead_zone,
+                step_limit=adaptation.step_limit,
+            )
+        )
 
     def _bound(self) -> float:
         return self._settings.compensated_bound if self._settings.law.compensator else 0.0

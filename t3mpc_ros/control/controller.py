@@ -5,6 +5,7 @@
 from collections import deque
 from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +15,16 @@ from t3mpc_ros.control.drive import Drive, LimitSettings
 from t3mpc_ros.control.freshness import Following, Freshness, FreshnessSettings, Reason
 from t3mpc_ros.control.law import CertificateReading
 from t3mpc_ros.control.pursuit import Pursuit
-from t3mpc_ros.motion import BodyTwist, Geometry, Motion, WheelSpeeds
+from t3mpc_ros.kernels import kernel
+from t3mpc_ros.motion import BodyTwist, Geometry, Motion, WheelSpeeds, kinematics
 from t3mpc_ros.motion.kinematics import wheels_from_body
-from t3mpc_ros.motion.track import Jump, Track, TrackPoint
+from t3mpc_ros.motion.track import Jump, Stamps, Track, interpolate
 from t3mpc_ros.motion.words import NANOSECONDS, STANDSTILL
 from t3mpc_ros.settings import nested
 
 Array = NDArray[np.float64]
+
+wheel_speeds = kernel(kinematics.wheel_speeds)
 
 JUMP_FACTOR = 2.2
 """A reference that changes this many times faster than the robot may is taken as a switch."""
@@ -41,16 +45,13 @@ class ControllerSettings(CompositionSettings):
     freshness: FreshnessSettings = nested(FreshnessSettings)
 
 
-@dataclass(frozen=True, slots=True)
-class Status:
+class Status(NamedTuple):
     """What the controller decided at one step, and why; arrays are right wheel first."""
 
     stamp_ns: int
     reason: Reason
     error: Array
     """delta = chi - r, rad/s; NaN while no reference is known."""
-    estimate: Array
-    """g of the fuzzy systems, rad/s²."""
     terms: Array
     """Shape (5, 2), rows as in ``law.TERMS``, rad/s²."""
     applied: Array
@@ -58,6 +59,79 @@ class Status:
     certificate: CertificateReading
     skill: Array
     limited: bool
+
+    @property
+    def estimate(self) -> Array:
+        """G of the fuzzy systems, rad/s², shape (2,)."""
+        estimate: Array = 0.0 - self.terms[0]
+        return estimate
+
+
+@kernel
+def look(
+    stamps: Stamps,
+    samples: Array,
+    first: int,
+    end: int,
+    jump: Array,
+    stamp_ns: int,
+    acts_ns: int,
+    period: float,
+    hold_ns: float,
+    preview: bool,
+    radius: float,
+    half: float,
+    linear: float,
+    angular: float,
+    speeds: Array,
+    wanted: Array,
+    begin: Array,
+    finish: Array,
+) -> tuple[bool, float, float]:
+    """Write measured and wanted wheel speeds (rad/s); return whether the latter are known.
+
+    Also returned: the largest magnitude of the speeds and of the tracking error.
+
+    stamps ... jump   : a track, as in :func:`t3mpc_ros.motion.track.interpolate`
+    stamp_ns          : of the odometry, whose twist is ``linear``, ``angular``
+    acts_ns           : when the next command begins to act
+    period            : control period, s
+    hold_ns           : how long the newest sample is held
+    preview           : whether the reference is known ahead; else its slope carries it on
+    radius, half      : wheel radius and half of the wheel separation, m
+    speeds, wanted    : shape (2,), overwritten, at ``stamp_ns``
+    begin, finish     : shape (2,), overwritten, wanted at ``acts_ns`` and a period later
+    """
+    speeds[0], speeds[1] = wheel_speeds(linear, angular, radius, half)
+    speed = max(abs(speeds[0]), abs(speeds[1]))
+    newest = stamps[end - 1] if end > first else 0
+    track = (stamps, samples, first, end, jump)
+    known, v, w, v_rate, w_rate = interpolate(*track, held(stamp_ns, newest, hold_ns))
+    if not known:
+        wanted[:] = math.nan
+        return False, speed, 0.0
+    wanted[0], wanted[1] = wheel_speeds(v, w, radius, half)
+    error = max(abs(speeds[0] - wanted[0]), abs(speeds[1] - wanted[1]))
+    if preview:
+        until_ns = acts_ns + round(period * NANOSECONDS)
+        soon, v_soon, w_soon, _, _ = interpolate(*track, held(acts_ns, newest, hold_ns))
+        later, v_later, w_later, _, _ = interpolate(*track, held(until_ns, newest, hold_ns))
+        if soon and later:
+            begin[0], begin[1] = wheel_speeds(v_soon, w_soon, radius, half)
+            finish[0], finish[1] = wheel_speeds(v_later, w_later, radius, half)
+            return True, speed, error
+    slopes = wheel_speeds(v_rate, w_rate, radius, half)
+    ahead = (acts_ns - stamp_ns) / NANOSECONDS
+    for i in range(2):
+        begin[i] = wanted[i] + ahead * slopes[i]
+        finish[i] = wanted[i] + (ahead + period) * slopes[i]
+    return True, speed, error
+
+
+@kernel
+def held(stamp_ns: int, newest_ns: int, hold_ns: float) -> int:
+    """Return the instant whose reference holds at a stamp: the newest one for the time-out."""
+    return newest_ns if 0 < stamp_ns - newest_ns <= hold_ns else stamp_ns
 
 
 class Controller:
@@ -70,9 +144,12 @@ class Controller:
         self.settings = settings
         self._pursuit = Pursuit(settings, 'velocity')
         self._period = 1.0 / settings.rate
+        self._period_ns = round(self._period * NANOSECONDS)
         self._drive = Drive(
             settings.estimate, settings.limits, settings.geometry, 'velocity', self._period
         )
+        self._dead_ns = round(self._drive.dead_time * NANOSECONDS)
+        self._speeds, self._wanted, self._begin, self._end = np.zeros((4, 2))
         self._freshness = Freshness(settings.freshness)
         self._following = Following(settings.freshness, self._period)
         limits = settings.limits
@@ -81,7 +158,7 @@ class Controller:
                 JUMP_FACTOR * limits.linear_acceleration, JUMP_FACTOR * limits.angular_acceleration
             )
         )
-        self._before: deque[dict[str, Array]] = deque(maxlen=COPIES)
+        self._before: deque[tuple[Array, list[Array]]] = deque(maxlen=COPIES)
         """What had been learnt, from oldest to newest."""
         self._since_copy = 0
         self._jumps: list[Jump] = []
@@ -127,14 +204,16 @@ class Controller:
 
     def add_reference(self, motion: Motion) -> bool:
         """Keep a wanted motion; return False when it is not finite and therefore ignored."""
-        newest = self._track.newest_ns
-        if not self._track.add(motion):
+        track = self._track
+        newest = track.newest_ns
+        if not track.add(motion):
             return False
         if newest is not None and motion.stamp_ns <= newest:
             # The source has started again: what it said of later is no longer so.
             self._jumps = [jump for jump in self._jumps if jump.stamp_ns < motion.stamp_ns]
             self._pursuit.plan.withdraw(motion.stamp_ns)
-        self._jumps += self._track.take_jumps()
+        if track.jumped:
+            self._jumps += track.take_jumps()
         self._freshness.reference_arrived()
         return True
 
@@ -157,26 +236,37 @@ class Controller:
             self._forget_reference()
 
         finite = measured.is_finite()
-        speeds = _array(wheels_from_body(measured.twist, self.settings.geometry))
-        point = self._wanted(stamp)
-        wanted = (
-            np.full(2, math.nan)
-            if point is None
-            else _array(wheels_from_body(point.twist, self.settings.geometry))
-        )
-        error = speeds - wanted
-        reason = self._freshness.decide(
+        acts_ns = stamp + self._dead_ns
+        speeds, wanted, begin, end = self._speeds, self._wanted, self._begin, self._end
+        settings, track, twist = self.settings, self._track, measured.twist
+        known, speed, error = look(
+            track.stamps,
+            track.samples,
+            track.first,
+            track.end,
+            track.jump,
             stamp,
-            finite=finite,
-            known=point is not None,
-            speed=float(np.max(np.abs(speeds))) if finite else math.inf,
-            error=float(np.max(np.abs(error))) if point is not None and finite else 0.0,
+            acts_ns,
+            self._period,
+            settings.freshness.reference_timeout * NANOSECONDS,
+            settings.switches.preview,
+            settings.geometry.wheel_radius,
+            settings.geometry.half_separation,
+            twist.linear,
+            twist.angular,
+            speeds,
+            wanted,
+            begin,
+            end,
+        )
+        reason = self._freshness.decide(
+            stamp, finite=finite, known=known, speed=speed, error=error if finite else 0.0
         )
         if reason.moves and restarted:
             reason = Reason.ODOMETRY_RESTARTED
-        if not reason.moves or point is None:
+        if not reason.moves:
             self._stop()
-            self.status = self._status(stamp, reason, error)
+            self.status = self._status(stamp, reason, speeds - wanted)
             return STANDSTILL, self.status
 
         fresh = elapsed is None or not self._moving
@@ -185,31 +275,29 @@ class Controller:
             self._following.reset()
             self._before.clear()
         elif not self._following.heard(*speeds.tolist()):
-            return self._insist(stamp, wanted, error)
+            return self._insist(stamp)
         elif self.status.reason is Reason.NOT_FOLLOWING:
             fresh = True
             self._drive.reset(speeds)
-        self._drive.observe(speeds, elapsed or self._period)
-        acts_ns = stamp + round(self._drive.dead_time * NANOSECONDS)
-        begin, end = self._coming(stamp, acts_ns, point)
+        drive = self._drive
+        drive.observe(speeds, elapsed or self._period)
         if fresh:
             self._pursuit.begin(acts_ns, self._drive.ahead, begin)
             self._moving = True
             self._told.clear()
             known_ns = acts_ns if self.settings.switches.preview else stamp
             self._jumps = [jump for jump in self._jumps if jump.stamp_ns > known_ns]
-        self._announce(stamp, acts_ns)
-        command = self._pursuit.step(
-            acts_ns, self._drive.ahead, begin, end, elapsed or self._period
-        )
-        applied = self._drive.send(command).copy()
-        self._pursuit.applied(applied, limited=self._drive.limited)
-        self._following.told(*self._drive.command.tolist())
+        if self._jumps or self._told:
+            self._announce(stamp, acts_ns)
+        command = self._pursuit.step(acts_ns, drive.ahead, begin, end, elapsed or self._period)
+        applied = drive.send(command).copy()
+        self._pursuit.applied(applied, limited=drive.limited)
+        self._following.told(*drive.command.tolist())
         self._keep()
-        self.status = self._status(stamp, reason, self._drive.speeds - wanted, applied)
-        return self._drive.twist, self.status
+        self.status = self._status(stamp, reason, drive.speeds - wanted, applied)
+        return drive.twist, self.status
 
-    def _insist(self, stamp_ns: int, wanted: Array, error: Array) -> tuple[BodyTwist, Status]:
+    def _insist(self, stamp_ns: int) -> tuple[BodyTwist, Status]:
         """Go on commanding the reference to a robot that does not follow, and learn nothing.
 
         A stop would be for ever: a board that has restarted waits for commands. What was learnt
@@ -219,10 +307,11 @@ class Controller:
         if self.status.reason is not Reason.NOT_FOLLOWING:
             self._pursuit.reset()
             if self._before:
-                self.law.restore(self._before[0])
+                self.law.go_back(self._before[0])
                 self._before.clear()
-        self._drive.aim(wanted)
+        self._drive.aim(self._wanted)
         self._following.told(*self._drive.command.tolist())
+        error = self._speeds - self._wanted
         self.status = self._status(stamp_ns, Reason.NOT_FOLLOWING, error)
         return self._drive.twist, self.status
 
@@ -231,7 +320,7 @@ class Controller:
         self._since_copy += 1
         if self._since_copy * self._period >= KEPT:
             self._since_copy = 0
-            self._before.append(self.law.learnt())
+            self._before.append(self.law.copies())
 
     def silent(self, last_heard_ns: int | None, now_ns: int) -> bool:
         """Whether the odometry has gone silent, so that a stop must be commanded.
@@ -247,37 +336,11 @@ class Controller:
         )
         return True
 
-    def _wanted(self, stamp_ns: int) -> TrackPoint | None:
-        """Return the reference for this stamp, holding the newest one for the time-out."""
-        newest = self._track.newest_ns
-        if newest is None:
-            return None
-        age = stamp_ns - newest
-        if 0 < age <= self.settings.freshness.reference_timeout * NANOSECONDS:
-            return self._track.at(newest)
-        return self._track.at(stamp_ns)
-
-    def _coming(self, stamp_ns: int, acts_ns: int, point: TrackPoint) -> tuple[Array, Array]:
-        """Return the wheel reference when the command begins to act, and a period later."""
-        geometry = self.settings.geometry
-        if self.settings.switches.preview:
-            end_ns = acts_ns + round(self._period * NANOSECONDS)
-            begin, end = self._wanted(acts_ns), self._wanted(end_ns)
-            if begin is not None and end is not None:
-                return (
-                    _array(wheels_from_body(begin.twist, geometry)),
-                    _array(wheels_from_body(end.twist, geometry)),
-                )
-        now = _array(wheels_from_body(point.twist, geometry))
-        slope = _array(wheels_from_body(point.rate, geometry))
-        ahead = (acts_ns - stamp_ns) / NANOSECONDS
-        return now + ahead * slope, now + (ahead + self._period) * slope
-
     def _announce(self, stamp_ns: int, acts_ns: int) -> None:
         """Tell the plan of jumps: when they are seen, or before if that is wanted."""
         newest = self._track.newest_ns or 0
         preview, geometry = self.settings.switches.preview, self.settings.geometry
-        soon_ns = acts_ns + round(self._period * NANOSECONDS) if preview else stamp_ns
+        soon_ns = acts_ns + self._period_ns if preview else stamp_ns
         for jump in self._jumps:
             # Beforehand, wait for the sample after it: then the slope after it is known too.
             known = jump.stamp_ns <= soon_ns or (preview and newest > jump.stamp_ns)
@@ -316,11 +379,10 @@ class Controller:
             stamp_ns,
             reason,
             error,
-            -law.terms[0] if moves else np.zeros(2),
             law.terms.copy() if moves else np.zeros_like(law.terms),
             np.zeros(2) if applied is None else applied,
             law.reading,
-            law.predictive.skill.copy(),
+            law.predictive.skill,
             reason.moves and self._drive.limited,
         )
 

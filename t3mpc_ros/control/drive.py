@@ -121,6 +121,33 @@ def limit_command(
     return bool(abs(out[0] - right) > 1e-8 or abs(out[1] - left) > 1e-8)
 
 
+@kernel
+def choose_command(
+    acceleration: Array,
+    ahead: Array,
+    command: Array,
+    limits: Array,
+    period: float,
+    stretch: float,
+    applied: Array,
+) -> bool:
+    """Write the command of E19 and what it really means; decide whether a limit cut it.
+
+    acceleration : shape (2,), wanted u, rad/s²
+    ahead        : shape (2,), speeds when the command begins to act, rad/s
+    command      : shape (2,), the last one, overwritten by the next, rad/s
+    limits       : shape (2, 3), see :func:`limit_vector`
+    stretch      : T / (1 - exp(-T/lag)), s
+    applied      : shape (2,), overwritten, the u that the command means, rad/s²
+    """
+    right = ahead[0] + stretch * acceleration[0]
+    left = ahead[1] + stretch * acceleration[1]
+    limited = limit_command(right, left, command, limits, period, command)
+    for i in range(applied.size):
+        applied[i] = (command[i] - ahead[i]) / stretch
+    return limited
+
+
 class Drive:
     """Estimates what the wheels do, and makes them accelerate as the law wants (E19).
 
@@ -211,9 +238,8 @@ class Drive:
 
     def observe(self, measured: Array, dt: float) -> None:
         """Take in measured wheel speeds (rad/s), ``dt`` seconds after the last ones."""
-        if self._sent:
-            self._estimator.predict(self.command if self._velocity else self.applied, dt)
-        self._estimator.correct(measured)
+        acted = self.command if self._velocity else self.applied
+        self._estimator.observe(acted, measured, dt, sent=self._sent)
 
     def send(self, acceleration: Array) -> Array:
         """Return the accelerations (rad/s²) that will really be applied, shape (2,), by E19.
@@ -227,12 +253,15 @@ class Drive:
         if not self._velocity:
             self.applied[:] = acceleration
             return self.applied
-        stretch = self._period / self._share
-        right, left = (self.ahead + stretch * acceleration).tolist()
-        self.limited = limit_command(
-            right, left, self.command, self._limits, self._period, self.command
+        self.limited = choose_command(
+            acceleration,
+            self.ahead,
+            self.command,
+            self._limits,
+            self._period,
+            self._period / self._share,
+            self.applied,
         )
-        self.applied[:] = (self.command - self.ahead) / stretch
         return self.applied
 
     def aim(self, wheels: Array) -> None:

@@ -96,6 +96,92 @@ def look_ahead(
     follow(out, commands[whole + 1], unexplained, math.exp(-late * period / lag), lag, out)
 
 
+SPEEDS, UNEXPLAINED, AHEAD = range(3)
+"""Rows of what the filter knows."""
+
+
+@kernel
+def predict(
+    known: Array,
+    commands: Array,
+    applied: Array,
+    dt: float,
+    velocity: bool,
+    late: float,
+    lag: float,
+) -> None:
+    """Move the speeds ``dt`` seconds on, under what was applied meanwhile.
+
+    known    : shape (3, 2), rows SPEEDS (rad/s), UNEXPLAINED (rad/s²), AHEAD (rad/s)
+    commands : shape (n + 2, 2), newest last, rad/s; with a velocity drive ``applied`` joins them
+    applied  : shape (2,), rad/s with a velocity drive, rad/s² with a torque drive
+    late, lag: as in :func:`look_ahead`
+    """
+    speeds, unexplained = known[SPEEDS], known[UNEXPLAINED]
+    if velocity:
+        for j in range(commands.shape[0] - 1):
+            for i in range(speeds.size):
+                commands[j, i] = commands[j + 1, i]
+        commands[-1] = applied
+        follow_late(speeds, commands, 0, late, unexplained, lag, dt, speeds)
+    else:
+        for i in range(speeds.size):
+            speeds[i] += dt * (applied[i] + unexplained[i])
+
+
+@kernel
+def correct(
+    known: Array,
+    commands: Array,
+    measured: Array,
+    enabled: bool,
+    gain: Array,
+    velocity: bool,
+    late: float,
+    lag: float,
+    period: float,
+) -> None:
+    """Take in measured speeds, and foresee those at which the next command begins to act.
+
+    known, commands   : as in :func:`predict`
+    measured          : shape (2,), rad/s
+    enabled, gain     : whether to filter, and the stationary gain, shape (2,)
+    late, lag, period : as in :func:`look_ahead`
+    """
+    speeds, unexplained, ahead = known[SPEEDS], known[UNEXPLAINED], known[AHEAD]
+    for i in range(speeds.size):
+        if enabled:
+            innovation = measured[i] - speeds[i]
+            speeds[i] += gain[0] * innovation
+            unexplained[i] += gain[1] * innovation
+        else:
+            speeds[i] = measured[i]
+        ahead[i] = speeds[i]
+    if velocity:
+        look_ahead(speeds, commands, unexplained, late, lag, period, ahead)
+
+
+@kernel
+def observe(
+    known: Array,
+    commands: Array,
+    applied: Array,
+    measured: Array,
+    sent: bool,
+    dt: float,
+    enabled: bool,
+    gain: Array,
+    velocity: bool,
+    late: float,
+    lag: float,
+    period: float,
+) -> None:
+    """Do :func:`predict`, when something was ``sent``, and :func:`correct` in one call."""
+    if sent:
+        predict(known, commands, applied, dt, velocity, late, lag)
+    correct(known, commands, measured, enabled, gain, velocity, late, lag, period)
+
+
 class SpeedEstimator:
     """Estimates each wheel's speed and the acceleration that the model does not explain.
 
@@ -126,12 +212,26 @@ class SpeedEstimator:
         periods = round(settings.dead_time / period, 9)
         self._late = periods % 1.0
         self._commands: Array = np.zeros((int(periods) + 2, 2))
-        self.speeds: Array = np.zeros(2)
+        self._known: Array = np.zeros((3, 2))
+
+    # Made when asked for: a deep copy of views would no longer be views of the copied array.
+    @property
+    def speeds(self) -> Array:
         """Estimated wheel speeds, rad/s, shape (2,)."""
-        self.unexplained: Array = np.zeros(2)
+        row: Array = self._known[SPEEDS]
+        return row
+
+    @property
+    def unexplained(self) -> Array:
         """Estimated acceleration that the model does not explain, rad/s², shape (2,)."""
-        self.ahead: Array = np.zeros(2)
+        row: Array = self._known[UNEXPLAINED]
+        return row
+
+    @property
+    def ahead(self) -> Array:
         """Estimated wheel speeds when what is commanded now begins to act, rad/s, (2,)."""
+        row: Array = self._known[AHEAD]
+        return row
 
     @property
     def gain(self) -> Array:
@@ -145,10 +245,9 @@ class SpeedEstimator:
 
     def reset(self, speeds: Array) -> None:
         """Start again from measured wheel speeds (rad/s), at rest relative to the command."""
-        self.speeds[:] = speeds
-        self.unexplained[:] = 0.0
+        self._known[:] = speeds
+        self._known[UNEXPLAINED] = 0.0
         self._commands[:] = speeds
-        self.ahead[:] = speeds
 
     def predict(self, applied: Array, dt: float) -> None:
         """Move ``dt`` seconds on, under what was applied meanwhile.
@@ -161,42 +260,31 @@ class SpeedEstimator:
         dt
             Seconds since the last step.
         """
-        if self._velocity:
-            self._commands[:-1] = self._commands[1:]
-            self._commands[-1] = applied
-            follow_late(
-                self.speeds,
-                self._commands,
-                0,
-                self._late,
-                self.unexplained,
-                self._settings.lag,
-                dt,
-                self.speeds,
-            )
-        else:
-            self.speeds += dt * (applied + self.unexplained)
+        how = self._settings
+        predict(self._known, self._commands, applied, dt, self._velocity, self._late, how.lag)
 
     def correct(self, measured: Array) -> Array:
         """Return the estimate after seeing measured wheel speeds (rad/s), shape (2,)."""
-        if self._settings.enabled:
-            innovation = measured - self.speeds
-            self.speeds += self._gain[0] * innovation
-            self.unexplained += self._gain[1] * innovation
-        else:
-            self.speeds[:] = measured
-        self.ahead[:] = self.speeds
-        if self._velocity:
-            look_ahead(
-                self.speeds,
-                self._commands,
-                self.unexplained,
-                self._late,
-                self._settings.lag,
-                self._period,
-                self.ahead,
-            )
+        self.observe(self.speeds, measured, self._period, sent=False)
         return self.speeds
+
+    def observe(self, applied: Array, measured: Array, dt: float, *, sent: bool) -> None:
+        """Do :meth:`predict`, when something was ``sent``, and :meth:`correct`."""
+        how = self._settings
+        observe(
+            self._known,
+            self._commands,
+            applied,
+            measured,
+            sent,
+            dt,
+            how.enabled,
+            self._gain,
+            self._velocity,
+            self._late,
+            how.lag,
+            self._period,
+        )
 
     def _transition(self, period: float) -> Array:
         if not self._velocity:

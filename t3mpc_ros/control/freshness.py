@@ -81,10 +81,9 @@ class Reason(enum.Enum):
     DIVERGING = 'state is diverging'
     NOT_FOLLOWING = 'the robot does not do what it is told'
 
-    @property
-    def moves(self) -> bool:
+    def __init__(self, text: str) -> None:
+        self.moves = text in ('tracking', 'the robot does not do what it is told')
         """Whether the robot may move."""
-        return self in (Reason.TRACKING, Reason.NOT_FOLLOWING)
 
 
 class Freshness:
@@ -208,6 +207,11 @@ class Following:
         bound, commands = self._settings.following_bound, self._commands
         if bound == 0.0 or len(commands) < (commands.maxlen or 0):
             return self.holds
+        newest = commands[-1]
+        if self.holds and max(abs(right - newest[0]), abs(left - newest[1])) <= bound:
+            # So close to one of the commands it cannot lie further outside all of them.
+            self._against = 0
+            return True
         outside = asleep = 0.0
         for measured, given in zip((right, left), zip(*commands, strict=True), strict=True):
             lowest, highest = min(given), max(given)

@@ -4,6 +4,7 @@
 
 from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,6 +133,7 @@ def lyapunov_value(errors: Array, coefficient_errors: Array, adaptation_gain: fl
     return 0.5 * float(errors @ errors) + squares / (2.0 * adaptation_gain)
 
 
+@kernel
 def lyapunov_rate_bound(errors: Array, gain: float, bound: float, smoothing: float) -> float:
     r"""Return the largest V' that the law allows, rad²/s³: (83) as corrected by E14.
 
@@ -147,7 +149,16 @@ def lyapunov_rate_bound(errors: Array, gain: float, bound: float, smoothing: flo
     :math:`V(t) \le V(0) - K\int\|\delta\|^2 + 0.2785\,\epsilon\, t
     \sum_i(\bar\omega_i + \bar v_{p,i})`.
     """
-    return -gain * float(errors @ errors) + TANH_GAP * smoothing * bound * errors.size
+    return -gain * square_length(errors) + TANH_GAP * smoothing * bound * errors.size
+
+
+@kernel
+def square_length(errors: Array) -> float:
+    """Return |delta|², rad²/s²."""
+    total: float = 0.0
+    for i in range(errors.size):
+        total += errors[i] * errors[i]
+    return total
 
 
 def ultimate_bound(gain: float, bound: float, smoothing: float, wheels: int = 2) -> float:
@@ -155,8 +166,7 @@ def ultimate_bound(gain: float, bound: float, smoothing: float, wheels: int = 2)
     return math.sqrt(TANH_GAP * smoothing * bound * wheels / gain)
 
 
-@dataclass(frozen=True, slots=True)
-class CertificateReading:
+class CertificateReading(NamedTuple):
     """What the run-time certificate says at one step."""
 
     value: float
@@ -177,6 +187,39 @@ class CertificateReading:
         return self.margin >= 0.0
 
 
+LAST, VALUE, RATE, BOUND = range(4)
+"""Places of what a certificate remembers: V of the last step, NaN before the first, then the
+numbers of a :class:`CertificateReading`."""
+
+
+@kernel
+def update_certificate(
+    errors: Array,
+    gain: float,
+    bound: float,
+    smoothing: float,
+    dt: float,
+    window: float,
+    remembered: Array,
+) -> None:
+    """Compare the rate of V with the bound of E14, both averaged over the window.
+
+    errors     : shape (n,), rad/s
+    gain, bound, smoothing : as in :func:`law_terms`
+    dt, window : s
+    remembered : shape (4,), at LAST, VALUE, RATE, BOUND
+    """
+    remembered[VALUE] = 0.5 * square_length(errors)
+    rate = 0.0
+    if not math.isnan(remembered[LAST]):
+        rate = (remembered[VALUE] - remembered[LAST]) / dt
+    allowed = lyapunov_rate_bound(errors, gain, bound, smoothing)
+    share = min(1.0, dt / window)
+    remembered[RATE] += share * (rate - remembered[RATE])
+    remembered[BOUND] += share * (allowed - remembered[BOUND])
+    remembered[LAST] = remembered[VALUE]
+
+
 class Certificate:
     """Checks at run time that the error falls as E14 promises.
 
@@ -192,24 +235,26 @@ class Certificate:
     """
 
     def __init__(self, window: float = 0.5) -> None:
-        self._window = window
+        self.window = window
+        self.remembered: Array = np.zeros(4)
+        """What :func:`update_certificate` remembers."""
         self.reset()
 
     def reset(self) -> None:
         """Forget the past."""
-        self._last: float | None = None
-        self._rate = 0.0
-        self._bound = 0.0
+        self.remembered[:] = 0.0
+        self.remembered[LAST] = math.nan
+
+    @property
+    def reading(self) -> CertificateReading:
+        """What the certificate says now."""
+        return CertificateReading(*self.remembered[VALUE:].tolist())
 
     def update(
         self, errors: Array, settings: LawSettings, bound: float, dt: float
     ) -> CertificateReading:
         """Return the reading after an error sample (rad/s) that came ``dt`` seconds later."""
-        value = 0.5 * float(errors @ errors)
-        rate = 0.0 if self._last is None else (value - self._last) / dt
-        allowed = lyapunov_rate_bound(errors, settings.gain, bound, settings.smoothing)
-        share = min(1.0, dt / self._window)
-        self._rate += share * (rate - self._rate)
-        self._bound += share * (allowed - self._bound)
-        self._last = value
-        return CertificateReading(value, self._rate, self._bound)
+        update_certificate(
+            errors, settings.gain, bound, settings.smoothing, dt, self.window, self.remembered
+        )
+        return self.reading

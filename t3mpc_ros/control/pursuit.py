@@ -67,9 +67,7 @@ class Pursuit:
         if self._settings.switches.crossing == 'program':
             return self._step_program(now_ns, speeds, wanted, wanted_next, dt)
         plan.step(now_ns, wanted, wanted_next)
-        followed = wanted + plan.offset
-        rate = (wanted_next + plan.offset_next - followed) / self._period
-        return self.law.step(speeds, followed, rate, dt)
+        return self.law.step(speeds, plan.followed, plan.rate, dt)
 
     def _step_program(
         self, now_ns: int, speeds: Array, wanted: Array, wanted_next: Array, dt: float

@@ -8,9 +8,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.kernels import kernel
 from t3mpc_ros.settings import Settings, setting
 
 Array = NDArray[np.float64]
+Stamps = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 NANOSECONDS = 1e9
 
@@ -42,15 +45,135 @@ class SwitchSettings(Settings):
     )
 
 
-class _Crossing:
-    """One jump on its way: how far each wheel has come."""
+JUMP, SLOPE_AFTER, DONE = range(3)
+"""Rows of a crossing: the jump (rad/s), r' after it (rad/s²), how far each wheel has come."""
+FOLLOWED, PASSED, OFFSET, OFFSET_NEXT = range(4)
+"""Rows of the sums over all crossings (rad/s): what the servo has made of the way, the jumps that
+r has made, and h now and a period later."""
 
-    def __init__(self, instant_ns: int, jump: Array, slope_after: Array) -> None:
-        self.instant_ns = instant_ns
-        self.jump = jump
-        self.slope_after = slope_after
-        self.done: Array = np.zeros_like(jump)
-        self.passed = False
+
+@kernel
+def step_plan(
+    crossings: Array,
+    instants: Stamps,
+    passed: Flags,
+    count: int,
+    sums: Array,
+    now_ns: int,
+    wanted: Array,
+    wanted_next: Array,
+    period: float,
+    lag: float,
+    most: float,
+    followed: Array,
+    rate: Array,
+) -> int:
+    """Renew h for the period that begins at ``now_ns``; return how many crossings are left.
+
+    crossings    : shape (n, 3, 2), rows JUMP, SLOPE_AFTER, DONE; the first ``count`` count
+    instants     : shape (n,), when r jumps, ns
+    passed       : shape (n,), whether it has
+    sums         : shape (4, 2), rows FOLLOWED, PASSED, OFFSET, OFFSET_NEXT
+    wanted, wanted_next : r now and a period later, with its jumps, rad/s, shape (2,)
+    period, lag  : of control and of the servo, s
+    most         : acceleration with which a jump is crossed, rad/s²
+    followed     : shape (2,), overwritten, rbar now, rad/s
+    rate         : shape (2,), overwritten, its derivative until the next step, rad/s²
+    """
+    if count > 0:
+        keep = math.exp(-period / lag) if lag > 0.0 else 0.0
+        until_ns = now_ns + round(period * NANOSECONDS)
+        # The command acts before the servo follows; and r, which is sampled, jumps somewhere in
+        # the period before the instant: in its middle, as far as the squared error goes.
+        early = period * (keep / (1.0 - keep) + 0.5)
+        for k in range(count):
+            pass_by(crossings, instants, passed, k, sums, now_ns)
+        for i in range(2):
+            sums[OFFSET, i] = sums[FOLLOWED, i] - sums[PASSED, i]
+            rise = wanted_next[i] - wanted[i]
+            for k in range(count):
+                if not passed[k] and until_ns >= instants[k]:
+                    rise -= crossings[k, JUMP, i]
+            told = 0.0
+            for k in range(count):
+                left = (instants[k] - now_ns) / NANOSECONDS - early
+                cross(crossings[k], i, passed[k], left, rise / period, period, most)
+                told += crossings[k, DONE, i]
+            sums[FOLLOWED, i] += (1.0 - keep) * (told - sums[FOLLOWED, i])
+        for k in range(count):
+            pass_by(crossings, instants, passed, k, sums, until_ns)
+        for i in range(2):
+            sums[OFFSET_NEXT, i] = sums[FOLLOWED, i] - sums[PASSED, i]
+        # What is left of an old crossing is less than rounding.
+        over_ns = now_ns - round(30.0 * lag * NANOSECONDS)
+        count = forget(crossings, instants, passed, count, sums, over_ns)
+    else:
+        sums[OFFSET] = 0.0
+        sums[OFFSET_NEXT] = 0.0
+    for i in range(2):
+        followed[i] = wanted[i] + sums[OFFSET, i]
+        rate[i] = (wanted_next[i] + sums[OFFSET_NEXT, i] - followed[i]) / period
+    return count
+
+
+@kernel
+def pass_by(
+    crossings: Array, instants: Stamps, passed: Flags, k: int, sums: Array, now_ns: int
+) -> None:
+    """Note that r has jumped when it has, see :func:`step_plan`."""
+    if not passed[k] and now_ns >= instants[k]:
+        passed[k] = True
+        for i in range(2):
+            sums[PASSED, i] += crossings[k, JUMP, i]
+
+
+@kernel
+def cross(
+    crossing: Array, i: int, passed: bool, left: float, slope: float, period: float, most: float
+) -> None:
+    """Move wheel ``i`` on by one period, at its closing speed, once its time has come.
+
+    crossing : shape (3, 2), rows JUMP, SLOPE_AFTER, DONE
+    passed   : whether r has jumped
+    left     : time until the jump, less that by which a command must come before, s
+    slope    : r' without the jump, rad/s²
+    """
+    size = abs(crossing[JUMP, i])
+    rest = crossing[JUMP, i] - crossing[DONE, i]
+    if rest == 0.0:
+        return
+    sign = math.copysign(1.0, rest)
+    after = max(most - sign * crossing[SLOPE_AFTER, i], 0.2 * most)
+    before = after
+    if not passed:
+        before = max(most - sign * slope, 0.2 * most)
+    share = math.sqrt(before) / (math.sqrt(before) + math.sqrt(after))
+    # The first step is a part of a period, so that the crossing is not early or late.
+    time = min(share * size / before - left + period, period)
+    if time > 0.0:
+        crossing[DONE, i] += sign * min(before * time, abs(rest))
+
+
+@kernel
+def forget(
+    crossings: Array, instants: Stamps, passed: Flags, count: int, sums: Array, over_ns: int
+) -> int:
+    """Drop the crossings that are over since ``over_ns``; return how many are left."""
+    kept = 0
+    for k in range(count):
+        done = passed[k] and instants[k] <= over_ns
+        for i in range(2):
+            done = done and crossings[k, DONE, i] == crossings[k, JUMP, i]
+        if done:
+            for i in range(2):
+                sums[FOLLOWED, i] -= crossings[k, JUMP, i]
+                sums[PASSED, i] -= crossings[k, JUMP, i]
+        else:
+            crossings[kept] = crossings[k]
+            instants[kept] = instants[k]
+            passed[kept] = passed[k]
+            kept += 1
+    return kept
 
 
 class SwitchPlan:
@@ -85,8 +208,15 @@ class SwitchPlan:
         self._settings = settings
         self._lag = lag
         self._period = period
-        self._keep = math.exp(-period / lag) if lag > 0.0 else 0.0
-        self.reset()
+        self._count = 0
+        self._crossings: Array = np.zeros((8, 3, 2))
+        self._instants: Stamps = np.zeros(8, dtype=np.int64)
+        self._has_passed: Flags = np.zeros(8, dtype=np.bool_)
+        self._sums: Array = np.zeros((4, 2))
+        self.followed: Array = np.zeros(2)
+        """rbar now, rad/s, shape (2,)."""
+        self.rate: Array = np.zeros(2)
+        """Its derivative until the next step, rad/s², shape (2,)."""
 
     def configure(self, settings: SwitchSettings) -> None:
         """Use other live settings from the next step on."""
@@ -94,18 +224,25 @@ class SwitchPlan:
 
     def reset(self) -> None:
         """Forget every jump: rbar is r."""
-        self._crossings: list[_Crossing] = []
-        self._followed: Array = np.zeros(2)
-        self._passed: Array = np.zeros(2)
-        self.offset: Array = np.zeros(2)
-        """h now, rad/s, shape (2,)."""
-        self.offset_next: Array = np.zeros(2)
-        """h one period later, rad/s, shape (2,)."""
+        self._count = 0
+        self._sums[:] = 0.0
+
+    @property
+    def offset(self) -> Array:
+        """H now, rad/s, shape (2,)."""
+        row: Array = self._sums[OFFSET]
+        return row
+
+    @property
+    def offset_next(self) -> Array:
+        """H one period later, rad/s, shape (2,)."""
+        row: Array = self._sums[OFFSET_NEXT]
+        return row
 
     @property
     def crossing(self) -> bool:
         """Whether rbar differs from r."""
-        return bool(self._crossings)
+        return self._count > 0
 
     def known_change(self, now_ns: int, span: float, rows: int) -> Array:
         """Return the jumps of delta = chi - r still to come, shape (rows, 2), rad/s.
@@ -114,20 +251,22 @@ class SwitchPlan:
         :meth:`t3mpc_ros.mpc.predictive.PredictiveTerm.step` takes them into Psi_free (56).
         """
         change = np.zeros((rows, 2))
-        for crossing in self._crossings:
-            ahead = (crossing.instant_ns - now_ns) / NANOSECONDS
+        for k in range(self._count):
+            ahead = (int(self._instants[k]) - now_ns) / NANOSECONDS
             row = math.ceil(ahead / span - 1e-9) - 1
             if 0 <= row < rows:
-                change[row] -= crossing.jump
+                change[row] -= self._crossings[k, JUMP]
         return change
 
     def take_passed(self, now_ns: int) -> Array:
         """Return the sum of the jumps up to ``now_ns`` (rad/s), shape (2,), and forget them."""
         total = np.zeros(2)
-        for crossing in self._crossings:
-            if crossing.instant_ns <= now_ns:
-                total += crossing.jump
-        self._crossings = [one for one in self._crossings if one.instant_ns > now_ns]
+        for k in reversed(range(self._count)):
+            if self._instants[k] <= now_ns:
+                total += self._crossings[k, JUMP]
+                for table in (self._crossings, self._instants, self._has_passed):
+                    table[k : self._count - 1] = table[k + 1 : self._count].copy()
+                self._count -= 1
         return total
 
     def announce(self, instant_ns: int, jump: Array, slope_after: Array) -> None:
@@ -142,18 +281,26 @@ class SwitchPlan:
         slope_after
             r' after it, rad/s², shape (2,).
         """
-        self._crossings.append(_Crossing(instant_ns, jump.copy(), slope_after.copy()))
+        k = self._count
+        if k == len(self._instants):
+            self._crossings = np.concatenate((self._crossings, np.zeros_like(self._crossings)))
+            self._instants = np.concatenate((self._instants, np.zeros_like(self._instants)))
+            self._has_passed = np.concatenate((self._has_passed, np.zeros_like(self._has_passed)))
+        self._crossings[k] = (jump, slope_after, (0.0, 0.0))
+        self._instants[k] = instant_ns
+        self._has_passed[k] = False
+        self._count += 1
 
     def withdraw(self, instant_ns: int) -> None:
         """Take back the jumps announced for ``instant_ns`` or later: r will not jump after all."""
-        for crossing in self._crossings:
-            if not crossing.passed and crossing.instant_ns >= instant_ns:
-                crossing.jump = np.zeros(2)
-                crossing.instant_ns = instant_ns
-                crossing.passed = True
+        for k in range(self._count):
+            if not self._has_passed[k] and self._instants[k] >= instant_ns:
+                self._crossings[k, JUMP] = 0.0
+                self._instants[k] = instant_ns
+                self._has_passed[k] = True
 
     def step(self, now_ns: int, wanted: Array, wanted_next: Array) -> None:
-        """Renew ``offset`` and ``offset_next`` for the period that begins at ``now_ns``.
+        """Renew ``followed``, ``rate`` and the offsets h for the period from ``now_ns`` on.
 
         Parameters
         ----------
@@ -162,65 +309,18 @@ class SwitchPlan:
         wanted, wanted_next
             r at that instant and a period later, with its jumps, rad/s, shape (2,).
         """
-        if not self._crossings:
-            self.offset[:] = 0.0
-            self.offset_next[:] = 0.0
-            return
-        for crossing in self._crossings:
-            self._pass(crossing, now_ns)
-        self.offset[:] = self._followed - self._passed
-        until_ns = now_ns + round(self._period * NANOSECONDS)
-        rise = wanted_next - wanted
-        for crossing in self._crossings:
-            if not crossing.passed and until_ns >= crossing.instant_ns:
-                rise = rise - crossing.jump
-        slope = rise / self._period
-        told = np.zeros(2)
-        for crossing in self._crossings:
-            self._cross(crossing, now_ns, slope)
-            told += crossing.done
-            self._pass(crossing, until_ns)
-        self._followed += (1.0 - self._keep) * (told - self._followed)
-        self.offset_next[:] = self._followed - self._passed
-        self._forget(now_ns)
-
-    def _pass(self, crossing: _Crossing, now_ns: int) -> None:
-        if not crossing.passed and now_ns >= crossing.instant_ns:
-            crossing.passed = True
-            self._passed += crossing.jump
-
-    def _cross(self, crossing: _Crossing, now_ns: int, slope: Array) -> None:
-        """Move on by one period: each wheel at its closing speed once its time has come."""
-        most = self._settings.acceleration
-        # The command acts before the servo follows; and r, which is sampled, jumps somewhere in
-        # the period before the instant: in its middle, as far as the squared error goes.
-        ahead = self._period * (self._keep / (1.0 - self._keep) + 0.5)
-        left = (crossing.instant_ns - now_ns) / NANOSECONDS - ahead
-        for i in range(2):
-            size = abs(crossing.jump[i])
-            rest = crossing.jump[i] - crossing.done[i]
-            if rest == 0.0:
-                continue
-            sign = math.copysign(1.0, rest)
-            after = max(most - sign * crossing.slope_after[i], 0.2 * most)
-            before = after
-            if not crossing.passed:
-                before = max(most - sign * slope[i], 0.2 * most)
-            share = math.sqrt(before) / (math.sqrt(before) + math.sqrt(after))
-            # The first step is a part of a period, so that the crossing is not early or late.
-            time = min(share * size / before - left + self._period, self._period)
-            if time > 0.0:
-                crossing.done[i] += sign * min(before * time, abs(rest))
-
-    def _forget(self, now_ns: int) -> None:
-        """Drop crossings that are over, and what is left of them is less than rounding."""
-        over = now_ns - round(30.0 * self._lag * NANOSECONDS)
-        kept = []
-        for crossing in self._crossings:
-            finished = crossing.passed and np.array_equal(crossing.done, crossing.jump)
-            if finished and crossing.instant_ns <= over:
-                self._followed -= crossing.jump
-                self._passed -= crossing.jump
-            else:
-                kept.append(crossing)
-        self._crossings = kept
+        self._count = step_plan(
+            self._crossings,
+            self._instants,
+            self._has_passed,
+            self._count,
+            self._sums,
+            now_ns,
+            wanted,
+            wanted_next,
+            self._period,
+            self._lag,
+            self._settings.acceleration,
+            self.followed,
+            self.rate,
+        )

@@ -13,10 +13,11 @@ from t3mpc_ros.fuzzy.sets import FuzzySets, FuzzySettings, build_sets
 from t3mpc_ros.kernels import kernel
 
 Array = NDArray[np.float64]
+Tables = tuple[Array, Array, Array, Array, Array, Array, Array, Array]
 
 
 @kernel
-def _evaluate(
+def estimate(
     inputs: Array,
     centres: Array,
     pull: Array,
@@ -28,7 +29,12 @@ def _evaluate(
     coefficients: Array,
     outputs: Array,
 ) -> bool:
-    """Write basis and outputs; return False, and change nothing, unless inputs are finite."""
+    """Write basis and outputs (31); return False, and change nothing, unless inputs are finite.
+
+    inputs        : shape (n,), U, rad/s
+    centres ... phi : as in :func:`t3mpc_ros.fuzzy.inference.basis`
+    coefficients, outputs : as in :func:`t3mpc_ros.fuzzy.inference.combine`
+    """
     for i in range(inputs.size):
         if not math.isfinite(inputs[i]):
             return False
@@ -75,6 +81,17 @@ class FuzzyEstimator:
         self._firings = np.empty((self._sets.rules, self._sets.slices, 2, 2))
         self._phi: Array = np.zeros(self._sets.size)
         self._coefficients: Array = np.zeros((outputs, self._sets.size))
+        self.tables: Tables = (
+            self._sets.centres,
+            self._sets.pull,
+            self._sets.sharpness,
+            self._sets.shares,
+            self._grades,
+            self._firings,
+            self._phi,
+            self._coefficients,
+        )
+        """What :func:`estimate` reads and writes between inputs and outputs, in its order."""
         self.configure(adaptation)
 
     def configure(self, adaptation: AdaptationSettings) -> None:
@@ -110,18 +127,7 @@ class FuzzyEstimator:
         values = np.ascontiguousarray(inputs, dtype=np.float64)
         sets = self._sets
         outputs = np.empty(self._coefficients.shape[0])
-        if values.shape != (sets.inputs,) or not _evaluate(
-            values,
-            sets.centres,
-            sets.pull,
-            sets.sharpness,
-            sets.shares,
-            self._grades,
-            self._firings,
-            self._phi,
-            self._coefficients,
-            outputs,
-        ):
+        if values.shape != (sets.inputs,) or not estimate(values, *self.tables, outputs):
             raise ValueError(f'inputs must be {sets.inputs} finite numbers: got {inputs}')
         return outputs
 
@@ -148,6 +154,11 @@ class FuzzyEstimator:
             raise ValueError(f'dt must be finite and not negative: got {dt} s')
         if self._adaptation.enabled:
             self._adapt(errors, dt)
+
+    @property
+    def radius(self) -> float:
+        """Radius of the ball that each output's coefficients stay in, rad/s²."""
+        return self._radius
 
     @property
     def sets(self) -> FuzzySets:

@@ -39,12 +39,19 @@ def body_from_wheels(wheels: WheelSpeeds, geometry: Geometry) -> BodyTwist:
     )
 
 
+# Plain, because who only reads a bag needs no compiler; the controller makes an @kernel of it.
+def wheel_speeds(
+    linear: float, angular: float, radius: float, half_separation: float
+) -> tuple[float, float]:
+    """Return right and left wheel speed (rad/s) of a body twist, the inverse of equation (1)."""
+    turn = angular * half_separation
+    return (linear + turn) / radius, (linear - turn) / radius
+
+
 def wheels_from_body(twist: BodyTwist, geometry: Geometry) -> WheelSpeeds:
     """Return the wheel speeds of a body twist, the inverse of equation (1)."""
-    turn = twist.angular * geometry.half_separation
     return WheelSpeeds(
-        (twist.linear + turn) / geometry.wheel_radius,
-        (twist.linear - turn) / geometry.wheel_radius,
+        *wheel_speeds(twist.linear, twist.angular, geometry.wheel_radius, geometry.half_separation)
     )
 
 

@@ -57,7 +57,11 @@ class Motion(NamedTuple):
 
     def is_finite(self) -> bool:
         """Whether every number is finite, so that it may be used at all."""
-        return all(map(math.isfinite, (*self.pose, *self.twist)))
+        (x, y, heading), (linear, angular) = self.pose, self.twist
+        # A finite sum has finite terms; huge ones may overflow in it, and are looked at singly.
+        return math.isfinite(x + y + heading + linear + angular) or all(
+            map(math.isfinite, (*self.pose, *self.twist))
+        )
 
 
 def wrap_angle(angle: float) -> float:

@@ -22,7 +22,9 @@ __all__ = ['PredictiveSettings', 'PredictiveTerm']
 
 Array = NDArray[np.float64]
 
-_V, _JUMPS, _SKILLS = map(Signals._fields.index, ('v', 'jumps', 'skills'))
+_V, _JUMPS, _SKILLS, _UNFORESEEN = map(
+    Signals._fields.index, ('v', 'jumps', 'skills', 'unforeseen')
+)
 
 
 class PredictiveTerm:
@@ -237,6 +239,17 @@ class PredictiveTerm:
             predictor.set_weights({name: value[z] for name, value in weights.items()}, self._how)
         self.reset()
 
+    def copies(self) -> list[Array]:
+        """Return what is learnt as it is now, for :meth:`go_back`: much faster than weights."""
+        return [store.copy() for store in self._stores]
+
+    def go_back(self, copies: list[Array]) -> None:
+        """Use what :meth:`copies` returned; its skill is measured anew on a trial run."""
+        for predictor, copy in zip(self._predictors, copies, strict=True):
+            predictor.store[:] = copy
+            predictor.try_out(self._how)
+        self.reset()
+
     def notify_applied(self, v_p: Array) -> None:
         """Tell what was applied of the v_p last returned (rad/s²), when it was not all of it.
 
@@ -301,6 +314,12 @@ class PredictiveTerm:
         """What is left of the jumps told by :meth:`shift`, rad/s, shape (outputs,)."""
         left: Array = self._rows[_JUMPS]
         return left
+
+    @property
+    def unforeseen(self) -> Array:
+        """The last errors less what was left of those jumps then, rad/s, shape (outputs,)."""
+        row: Array = self._rows[_UNFORESEEN]
+        return row
 
     @property
     def span(self) -> float:

@@ -41,12 +41,25 @@ class Signals(NamedTuple):
     """Share of the bound of v_p in force."""
     skills: Array
     """Skill in the middle of the horizon."""
+    unforeseen: Array
+    """The last errors less what was left of the known jumps, rad/s."""
 
 
 @kernel
 def signals_in(rows: Array) -> Signals:
-    """Return the rows of a table, shape (9, outputs), as signals."""
-    return Signals(rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], rows[6], rows[7], rows[8])
+    """Return the rows of a table, shape (10, outputs), as signals."""
+    return Signals(
+        rows[0],
+        rows[1],
+        rows[2],
+        rows[3],
+        rows[4],
+        rows[5],
+        rows[6],
+        rows[7],
+        rows[8],
+        rows[9],
+    )
 
 
 @kernel
@@ -73,8 +86,9 @@ def gather(errors: Array, sampled: bool, due: bool, decay: float, rows: Array) -
             return False
     for z in range(errors.size):
         signals.applied_sums[z] += signals.applied[z]
+        signals.unforeseen[z] = errors[z] - signals.jumps[z]
         if sampled:
-            signals.sums[z] += errors[z] - signals.jumps[z]
+            signals.sums[z] += signals.unforeseen[z]
     if not due:
         hold(signals, decay)
     return True
