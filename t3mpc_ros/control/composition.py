@@ -4,7 +4,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from t3mpc_ros.fuzzy.estimator import FuzzyEstimator, estimate
 from t3mpc_ros.fuzzy.sets import FuzzySettings
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.mpc.predictive import PredictiveSettings, PredictiveTerm
+from t3mpc_ros.mpc.response import signals_in
 from t3mpc_ros.settings import Settings, nested, setting
 
 Array = NDArray[np.float64]
@@ -79,16 +80,34 @@ class Gains(NamedTuple):
 
 
 @kernel
+def gains_in(told: Array) -> Gains:
+    """Return the numbers of a row by name."""
+    return Gains(
+        told[0] != 0.0,
+        told[1] != 0.0,
+        told[2],
+        told[3],
+        told[4],
+        told[5],
+        told[6],
+        told[7],
+        told[8],
+        told[9],
+        told[10],
+        told[11],
+    )
+
+
+@kernel
 def compose(
     errors: Array,
     speeds: Array,
     wanted: Array,
     wanted_rate: Array,
-    predictive: Array,
-    unforeseen: Array,
+    rows: Array,
     dt: float,
     frozen: bool,
-    gains_given: tuple[Any, ...],
+    gains_told: Array,
     centres: Array,
     pull: Array,
     sharpness: Array,
@@ -107,18 +126,17 @@ def compose(
     Returns False, and changes nothing, when a speed is not finite.
 
     errors         : shape (n,), delta, rad/s
-    speeds ... predictive : as in :func:`t3mpc_ros.control.law.law_terms`
-    unforeseen     : shape (n,), delta less what is left of announced jumps, rad/s: that is
-        nobody's fault, and teaches nothing
+    speeds ... wanted_rate : as in :func:`t3mpc_ros.control.law.law_terms`
+    rows           : :class:`t3mpc_ros.mpc.response.Signals` of the predictive term
     dt             : s since the last step
     frozen         : whether a limit cut the last command
-    gains_given    : :class:`Gains` as a plain tuple
+    gains_told     : the numbers of :class:`Gains`
     centres ... coefficients : as in :func:`t3mpc_ros.fuzzy.estimator.estimate`
     work           : shape (2, n), overwritten: g, and what the coefficients learn from
     terms, command : overwritten
     remembered     : as in :func:`t3mpc_ros.control.law.update_certificate`
     """
-    gains = Gains(*gains_given)
+    gains, predictive = gains_in(gains_told), signals_in(rows)
     guess, blame = work[0], work[1]
     guess[:] = 0.0
     if gains.use_fuzzy and not estimate(
@@ -130,7 +148,7 @@ def compose(
         wanted,
         wanted_rate,
         guess,
-        predictive,
+        predictive.v,
         gains.gain,
         gains.bound,
         gains.smoothing,
@@ -138,8 +156,9 @@ def compose(
         command,
     )
     if gains.adapted and not frozen:
+        # What is left of a jump that was announced is nobody's fault, and teaches nothing.
         for i in range(blame.size):
-            blame[i] = unforeseen[i] - gains.handover * predictive[i]
+            blame[i] = predictive.unforeseen[i] - gains.handover * predictive.v[i]
         adapt(
             coefficients,
             phi,
@@ -288,14 +307,13 @@ class ComposedLaw:
             Jumps of the error still to come, see :meth:`PredictiveTerm.step`.
         """
         np.subtract(speeds, wanted, out=self._errors)
-        predictive = self.predictive.step(self._errors, known_change)
+        self.predictive.advance(self._errors, known_change)
         if not compose(
             self._errors,
             speeds,
             wanted,
             wanted_rate,
-            predictive,
-            self.predictive.unforeseen,
+            self.predictive.rows,
             dt,
             self._frozen,
             self._gains,
@@ -324,9 +342,9 @@ class ComposedLaw:
             wanted = self.terms[4]
             self.predictive.notify_applied(wanted + (acceleration - self.command))
 
-    def _make_gains(self) -> tuple[Any, ...]:
+    def _make_gains(self) -> Array:
         settings, law, adaptation = self._settings, self._settings.law, self._settings.adaptation
-        return tuple(
+        return np.array(
             Gains(
                 use_fuzzy=settings.use_fuzzy,
                 adapted=settings.use_fuzzy and adaptation.enabled,
@@ -340,7 +358,8 @@ class ComposedLaw:
                 leakage=adaptation.sigma_modification,
                 dead_zone=adaptation.dead_zone,
                 step_limit=adaptation.step_limit,
-            )
+            ),
+            dtype=np.float64,
         )
 
     def _bound(self) -> float:

@@ -149,6 +149,7 @@ class Controller:
             settings.estimate, settings.limits, settings.geometry, 'velocity', self._period
         )
         self._dead_ns = round(self._drive.dead_time * NANOSECONDS)
+        self._looking = self._how_to_look()
         self._speeds, self._wanted, self._begin, self._end = np.zeros((4, 2))
         self._freshness = Freshness(settings.freshness)
         self._following = Following(settings.freshness, self._period)
@@ -186,6 +187,7 @@ class Controller:
         self.settings = settings
         self._pursuit.configure(settings)
         self._drive.configure(settings.limits)
+        self._looking = self._how_to_look()
 
     def enable(self, on: bool) -> None:
         """Let the robot move, or stop it until it is let again."""
@@ -238,7 +240,7 @@ class Controller:
         finite = measured.is_finite()
         acts_ns = stamp + self._dead_ns
         speeds, wanted, begin, end = self._speeds, self._wanted, self._begin, self._end
-        settings, track, twist = self.settings, self._track, measured.twist
+        track, twist = self._track, measured.twist
         known, speed, error = look(
             track.stamps,
             track.samples,
@@ -247,11 +249,7 @@ class Controller:
             track.jump,
             stamp,
             acts_ns,
-            self._period,
-            settings.freshness.reference_timeout * NANOSECONDS,
-            settings.switches.preview,
-            settings.geometry.wheel_radius,
-            settings.geometry.half_separation,
+            *self._looking,
             twist.linear,
             twist.angular,
             speeds,
@@ -335,6 +333,17 @@ class Controller:
             self._last_stamp_ns or 0, Reason.NO_ODOMETRY, np.full(2, math.nan)
         )
         return True
+
+    def _how_to_look(self) -> tuple[float, float, bool, float, float]:
+        """Return what :func:`look` is told of the settings."""
+        settings, geometry = self.settings, self.settings.geometry
+        return (
+            self._period,
+            settings.freshness.reference_timeout * NANOSECONDS,
+            settings.switches.preview,
+            geometry.wheel_radius,
+            geometry.half_separation,
+        )
 
     def _announce(self, stamp_ns: int, acts_ns: int) -> None:
         """Tell the plan of jumps: when they are seen, or before if that is wanted."""

@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.control.estimate import EstimateSettings, SpeedEstimator
 from t3mpc_ros.kernels import kernel
-from t3mpc_ros.motion import BodyTwist, Geometry, WheelSpeeds
-from t3mpc_ros.motion.kinematics import body_from_wheels
+from t3mpc_ros.motion import BodyTwist, Geometry
+from t3mpc_ros.motion.kinematics import body_speeds
 from t3mpc_ros.settings import Settings, setting
 
 Array = NDArray[np.float64]
@@ -181,6 +181,7 @@ class Drive:
         self._estimator = SpeedEstimator(estimate, kind, period)
         self._limits = limit_vector(limits, geometry)
         self._geometry = geometry
+        self._lengths = geometry.wheel_radius, geometry.half_separation
         self._velocity = kind == 'velocity'
         self._period = period
         self._share = 1.0 - math.exp(-period / estimate.lag)
@@ -218,7 +219,8 @@ class Drive:
     @property
     def twist(self) -> BodyTwist:
         """The command as a body twist: limited, as sent."""
-        return body_from_wheels(WheelSpeeds(*self.command.tolist()), self._geometry)
+        right, left = self.command.tolist()
+        return BodyTwist(*body_speeds(right, left, *self._lengths))
 
     def configure(self, limits: LimitSettings) -> None:
         """Use other limits from the next command on."""

@@ -248,7 +248,7 @@ class Certificate:
     @property
     def reading(self) -> CertificateReading:
         """What the certificate says now."""
-        return CertificateReading(*self.remembered[VALUE:].tolist())
+        return CertificateReading(*self.remembered.tolist()[VALUE:])
 
     def update(
         self, errors: Array, settings: LawSettings, bound: float, dt: float

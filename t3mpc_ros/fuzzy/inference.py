@@ -140,22 +140,20 @@ def fire(grades: Array, firings: Array) -> None:
     firings : shape (r, lambda, 2, 2) with r = M**n, overwritten; the last input's set changes
         fastest from rule to rule
     """
-    inputs, sets, slices = grades.shape[0], grades.shape[1], grades.shape[2]
-    for j in range(slices):
-        for level in range(2):
-            for bound in range(2):
-                firings[0, j, level, bound] = 1.0
-                count = 1
-                for i in range(inputs):
-                    # Each product so far becomes M products. Going down, none is overwritten
-                    # before it has been used: its children's places are not below its own.
-                    for rule in range(count - 1, -1, -1):
-                        parent = firings[rule, j, level, bound]
-                        for h in range(sets - 1, -1, -1):
-                            firings[rule * sets + h, j, level, bound] = (
-                                parent * grades[i, h, j, level, bound]
-                            )
-                    count *= sets
+    inputs, sets = grades.shape[0], grades.shape[1]
+    # Slices, levels and bounds lie together in memory, and are all treated alike.
+    each = grades.reshape((inputs, sets, -1))
+    products = firings.reshape((firings.shape[0], -1))
+    products[0] = 1.0
+    count = 1
+    for i in range(inputs):
+        # Each product so far becomes M products. Going down, none is overwritten before it has
+        # been used: its children's places are not below its own.
+        for rule in range(count - 1, -1, -1):
+            for h in range(sets - 1, -1, -1):
+                for k in range(products.shape[1]):
+                    products[rule * sets + h, k] = products[rule, k] * each[i, h, k]
+        count *= sets
 
 
 @kernel
@@ -177,17 +175,17 @@ def weigh(firings: Array, shares: Array, phi: Array) -> None:
         running to rule r
     """
     rules, slices = firings.shape[0], firings.shape[1]
-    for level in range(2):
-        block = level * rules * slices
-        for j in range(slices):
-            total = 0.0
-            for rule in range(rules):
-                total += firings[rule, j, level, 0] + firings[rule, j, level, 1]
-            factor = shares[j, level] / total
-            for rule in range(rules):
-                phi[block + rule * slices + j] = factor * (
-                    firings[rule, j, level, 0] + firings[rule, j, level, 1]
-                )
+    block = rules * slices
+    for j in range(slices):
+        low = high = 0.0
+        for rule in range(rules):
+            low += firings[rule, j, 0, 0] + firings[rule, j, 0, 1]
+            high += firings[rule, j, 1, 0] + firings[rule, j, 1, 1]
+        low, high = shares[j, 0] / low, shares[j, 1] / high
+        for rule in range(rules):
+            place = rule * slices + j
+            phi[place] = low * (firings[rule, j, 0, 0] + firings[rule, j, 0, 1])
+            phi[block + place] = high * (firings[rule, j, 1, 0] + firings[rule, j, 1, 1])
 
 
 @kernel

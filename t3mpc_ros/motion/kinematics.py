@@ -26,20 +26,18 @@ class Geometry(Settings):
         return 0.5 * self.wheel_separation
 
 
-def body_from_wheels(wheels: WheelSpeeds, geometry: Geometry) -> BodyTwist:
-    r"""Return the body twist of two wheel speeds, equation (1) with E1.
+# Plain, because who only reads a bag needs no compiler; the controller makes an @kernel of one.
+def body_speeds(
+    right: float, left: float, radius: float, half_separation: float
+) -> tuple[float, float]:
+    r"""Return v (m/s) and omega (rad/s) of two wheel speeds (rad/s), equation (1) with E1.
 
     .. math:: v = R(\dot\theta_R + \dot\theta_L)/2, \qquad
               \omega = R(\dot\theta_R - \dot\theta_L)/(2b)
     """
-    radius = geometry.wheel_radius
-    return BodyTwist(
-        0.5 * radius * (wheels.right + wheels.left),
-        0.5 * radius * (wheels.right - wheels.left) / geometry.half_separation,
-    )
+    return 0.5 * radius * (right + left), 0.5 * radius * (right - left) / half_separation
 
 
-# Plain, because who only reads a bag needs no compiler; the controller makes an @kernel of it.
 def wheel_speeds(
     linear: float, angular: float, radius: float, half_separation: float
 ) -> tuple[float, float]:
@@ -48,11 +46,16 @@ def wheel_speeds(
     return (linear + turn) / radius, (linear - turn) / radius
 
 
+def body_from_wheels(wheels: WheelSpeeds, geometry: Geometry) -> BodyTwist:
+    """Return the body twist of two wheel speeds, equation (1) with E1."""
+    half = geometry.half_separation
+    return BodyTwist(*body_speeds(wheels.right, wheels.left, geometry.wheel_radius, half))
+
+
 def wheels_from_body(twist: BodyTwist, geometry: Geometry) -> WheelSpeeds:
     """Return the wheel speeds of a body twist, the inverse of equation (1)."""
-    return WheelSpeeds(
-        *wheel_speeds(twist.linear, twist.angular, geometry.wheel_radius, geometry.half_separation)
-    )
+    half = geometry.half_separation
+    return WheelSpeeds(*wheel_speeds(twist.linear, twist.angular, geometry.wheel_radius, half))
 
 
 def pose_rate(heading: float, wheels: WheelSpeeds, geometry: Geometry) -> Pose:

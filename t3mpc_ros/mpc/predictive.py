@@ -22,9 +22,7 @@ __all__ = ['PredictiveSettings', 'PredictiveTerm']
 
 Array = NDArray[np.float64]
 
-_V, _JUMPS, _SKILLS, _UNFORESEEN = map(
-    Signals._fields.index, ('v', 'jumps', 'skills', 'unforeseen')
-)
+_V, _JUMPS, _SKILLS = map(Signals._fields.index, ('v', 'jumps', 'skills'))
 
 
 class PredictiveTerm:
@@ -69,7 +67,8 @@ class PredictiveTerm:
                 f'move_lags must cover the dead time of {settings.nominal.dead_time} s and one '
                 f'period of {span:g} s: got {settings.move_lags}'
             )
-        self._rows: Array = np.zeros((len(Signals._fields), outputs))
+        self.rows: Array = np.zeros((len(Signals._fields), outputs))
+        """The :class:`Signals`, for kernels."""
         self._tables: Array = np.zeros((4, outputs, settings.horizon))
         self._no_change = np.zeros((settings.horizon, outputs))
         moves = settings.control_horizon
@@ -84,13 +83,12 @@ class PredictiveTerm:
     # Made when asked for: a deep copy of views would no longer be views of the copied rows.
     @property
     def _signals(self) -> Signals:
-        return signals_in(self._rows)
+        return signals_in(self.rows)
 
     @property
     def skill(self) -> Array:
-        """Skill against persistence in the middle of the horizon, shape (outputs,)."""
-        found: Array = self._rows[_SKILLS]
-        return found.copy()
+        """Skill against persistence in the middle of the horizon, shape (outputs,): read only."""
+        return self._skill
 
     @property
     def skill_next(self) -> Array:
@@ -141,7 +139,9 @@ class PredictiveTerm:
             self._nominal_steps = nominal_step(self._loop, self._timing, settings.horizon)
         self.settings = settings
         self._how = Learning.of(settings, self._timing.span)
-        self._rules = Rules.of(settings)
+        self._how_told = np.array(self._how, dtype=np.float64)
+        self._rules = np.array(Rules.of(settings), dtype=np.float64)
+        self._dithered = settings.enabled and settings.dither > 0.0
 
     def relearn(self, errors: Array | None = None, moves: Array | None = None) -> None:
         """Make new machines and teach them from the beginning, then :meth:`reset`.
@@ -191,7 +191,7 @@ class PredictiveTerm:
 
     def reset(self) -> None:
         """Forget the past, and start from v_p = 0; weights and skill are kept."""
-        self._rows[:] = 0.0
+        self.rows[:] = 0.0
         self._tables[:] = 0.0
         self._generator = np.random.default_rng((self.settings.seed, 1))
         self.status[:] = OPTIMAL
@@ -199,7 +199,8 @@ class PredictiveTerm:
         self._samples = 0
         for predictor in self._predictors:
             begin(predictor.past, 0.0)
-        self._rows[_SKILLS] = [skill(predictor.past, 1) for predictor in self._predictors]
+        self._skill = np.array([skill(predictor.past, 1) for predictor in self._predictors])
+        self.rows[_SKILLS] = self._skill
 
     def warm_up(self) -> None:
         """Compile every kernel now, never inside a step; nothing is remembered of it."""
@@ -267,7 +268,7 @@ class PredictiveTerm:
         """
         if np.shape(jump) != self.status.shape or not np.isfinite(jump).all():
             raise ValueError(f'jump must be {self.status.size} finite numbers: got {jump}')
-        self._rows[_JUMPS] += jump
+        self.rows[_JUMPS] += jump
 
     def step(self, errors: Array, known_change: Array | None = None) -> Array:
         """Return v_p (rad/s²), shape (outputs,), equation (63).
@@ -287,39 +288,34 @@ class PredictiveTerm:
         ValueError
             A shape is wrong or an error is not finite; nothing is changed then.
         """
-        timing, phase = self._timing, self._phase
-        if not isinstance(errors, np.ndarray) or errors.dtype != np.float64:
-            errors = np.asarray(errors, dtype=np.float64)
+        errors = np.asarray(errors, dtype=np.float64)
         if errors.shape != self.status.shape:
             raise ValueError(f'errors must have shape {self.status.shape}: got {errors.shape}')
-        change = self._no_change if phase or known_change is None else known_change
-        if change is not self._no_change and (
-            np.shape(change) != self._no_change.shape or not np.isfinite(change).all()
-        ):
+        if self.due and known_change is not None:
             rows, columns = self._no_change.shape
-            raise ValueError(
-                f'known_change must be {rows} by {columns} finite numbers: got {known_change}'
-            )
+            if np.shape(known_change) != (rows, columns) or not np.isfinite(known_change).all():
+                raise ValueError(
+                    f'known_change must be {rows} by {columns} finite numbers: got {known_change}'
+                )
+        self.advance(errors, known_change)
+        v_p: Array = self.rows[_V]
+        return v_p.copy()
+
+    def advance(self, errors: Array, known_change: Array | None = None) -> None:
+        """Renew ``rows`` as :meth:`step` does; shapes and ``known_change`` are not checked."""
+        timing, phase = self._timing, self._phase
         sampled = phase == 0 or phase > timing.every - timing.average
-        if not gather(errors, sampled, phase == 0, self._decay, self._rows):
+        if not gather(errors, sampled, phase == 0, self._decay, self.rows):
             raise ValueError(f'errors must be finite: got {errors}')
         if phase == 0:
-            self._renew(change)
+            self._renew(self._no_change if known_change is None else known_change)
         self._phase = (phase + 1) % timing.every
-        v_p: Array = self._rows[_V]
-        return v_p.copy()
 
     @property
     def known_error(self) -> Array:
         """What is left of the jumps told by :meth:`shift`, rad/s, shape (outputs,)."""
-        left: Array = self._rows[_JUMPS]
+        left: Array = self.rows[_JUMPS]
         return left
-
-    @property
-    def unforeseen(self) -> Array:
-        """The last errors less what was left of those jumps then, rad/s, shape (outputs,)."""
-        row: Array = self._rows[_UNFORESEEN]
-        return row
 
     @property
     def span(self) -> float:
@@ -333,14 +329,14 @@ class PredictiveTerm:
 
     def _renew(self, change: Array) -> None:
         """Take the sample of each output, and renew its v_p."""
-        if self._rules.dithered:
+        if self._dithered:
             drawn = self._generator.uniform(-1.0, 1.0, self.status.size)
             self._signals.drawn[:] = self.settings.dither * drawn
         timing = self._timing
         renew(
             self._stores,
             self._predictors[0].sizes,
-            self._rows,
+            self.rows,
             self._tables,
             self._nominal_steps[max(self.settings.horizon // 2, 1) - 1],
             self._decays,
@@ -349,10 +345,11 @@ class PredictiveTerm:
             timing.average,
             timing.every,
             self._decay,
-            tuple(self._rules),
-            tuple(self._how),
+            self._rules,
+            self._how_told,
             self._numbers,
             self._whole,
             self.status,
         )
+        self._skill = self.rows[_SKILLS].copy()
         self._samples += 1

@@ -6,7 +6,13 @@ from dataclasses import dataclass
 import math
 from typing import NamedTuple, Self
 
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.kernels import kernel
 from t3mpc_ros.settings import SettingError, Settings, nested, setting
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -200,6 +206,12 @@ class Learning(NamedTuple):
         )
 
 
+@kernel
+def learning_in(told: Array) -> Learning:
+    """Return the numbers of a row, as plain calls from Python hand them on best, by name."""
+    return Learning(told[0] != 0.0, told[1], told[2], told[3], told[4], told[5], told[6], told[7])
+
+
 class Rules(NamedTuple):
     """How v_p is made of what the machine foresees: plain numbers, for kernels."""
 
@@ -237,3 +249,23 @@ class Rules(NamedTuple):
             settings.gain_low,
             settings.gain_high,
         )
+
+
+@kernel
+def rules_in(told: Array) -> Rules:
+    """Return the numbers of a row by name, see :func:`learning_in`."""
+    return Rules(
+        told[0] != 0.0,
+        told[1] != 0.0,
+        told[2] != 0.0,
+        told[3],
+        told[4],
+        told[5],
+        told[6],
+        told[7],
+        told[8],
+        told[9],
+        told[10],
+        told[11],
+        told[12],
+    )

@@ -3,7 +3,7 @@
 """How well the machine predicts while it runs, how much of v_p that is worth, and that v_p."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ from t3mpc_ros.mpc.machine import (
 )
 from t3mpc_ros.mpc.program import Indices, space_in
 from t3mpc_ros.mpc.response import foresee, foretell, hold, plan, roll_forward, signals_in
-from t3mpc_ros.mpc.settings import Excitation, Learning, Rules
+from t3mpc_ros.mpc.settings import Excitation, Learning, learning_in, rules_in
 from t3mpc_ros.mpc.training import contrast, gradient_step, pretrain, recall
 
 Array = NDArray[np.float64]
@@ -203,8 +203,8 @@ def renew(
     average: int,
     every: int,
     decay: float,
-    rules_given: tuple[Any, ...],
-    how_given: tuple[Any, ...],
+    rules_told: Array,
+    how_told: Array,
     numbers: Array,
     whole: Indices,
     status: Indices,
@@ -221,11 +221,11 @@ def renew(
     samples       : how many were taken before
     average, every: control periods in a sample's mean, and in a period T
     decay         : share of a known jump that is left after a control period
-    rules_given, how_given : :class:`Rules` and :class:`Learning` as plain tuples
+    rules_told, how_told : the numbers of :class:`Rules` and :class:`Learning`
     numbers, whole : working memory: S and the :class:`Space` of the program
     status        : shape (outputs,), overwritten, how each program ended
     """
-    rules, how = Rules(*rules_given), Learning(*how_given)
+    rules, how = rules_in(rules_told), learning_in(how_told)
     signals = signals_in(rows)
     horizon = decays.size - 1
     moves = whole.shape[1] - 1
