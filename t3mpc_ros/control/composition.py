@@ -100,7 +100,6 @@ def gains_in(told: Array) -> Gains:
 
 @kernel
 def compose(
-    errors: Array,
     speeds: Array,
     wanted: Array,
     wanted_rate: Array,
@@ -125,7 +124,6 @@ def compose(
 
     Returns False, and changes nothing, when a speed is not finite.
 
-    errors         : shape (n,), delta, rad/s
     speeds ... wanted_rate : as in :func:`t3mpc_ros.control.law.law_terms`
     rows           : :class:`t3mpc_ros.mpc.response.Signals` of the predictive term
     dt             : s since the last step
@@ -171,7 +169,7 @@ def compose(
             gains.step_limit,
         )
     update_certificate(
-        errors, gains.gain, gains.bound, gains.smoothing, dt, gains.window, remembered
+        predictive.errors, gains.gain, gains.bound, gains.smoothing, dt, gains.window, remembered
     )
     return True
 
@@ -203,7 +201,6 @@ class ComposedLaw:
             settings.predictive, self._period, settings.law.gain, outputs=2
         )
         self._certificate = Certificate()
-        self._errors: Array = np.zeros(2)
         self._work: Array = np.zeros((2, 2))
         self.terms: Array = np.zeros((len(TERMS), 2))
         """The law's terms of the last step, rows as in ``law.TERMS``, rad/s²."""
@@ -274,6 +271,11 @@ class ComposedLaw:
         self._frozen = False
 
     @property
+    def watched(self) -> Array:
+        """What the certificate remembers, see :func:`update_certificate`."""
+        return self._certificate.remembered
+
+    @property
     def reading(self) -> CertificateReading:
         """What the certificate says."""
         return self._certificate.reading
@@ -306,10 +308,8 @@ class ComposedLaw:
         known_change
             Jumps of the error still to come, see :meth:`PredictiveTerm.step`.
         """
-        np.subtract(speeds, wanted, out=self._errors)
-        self.predictive.advance(self._errors, known_change)
+        self.predictive.advance(speeds, wanted, known_change)
         if not compose(
-            self._errors,
             speeds,
             wanted,
             wanted_rate,

@@ -14,17 +14,14 @@ from t3mpc_ros.control.composition import ComposedLaw, CompositionSettings
 from t3mpc_ros.control.drive import Drive, LimitSettings
 from t3mpc_ros.control.freshness import Following, Freshness, FreshnessSettings, Reason
 from t3mpc_ros.control.law import CertificateReading
-from t3mpc_ros.control.pursuit import Pursuit
-from t3mpc_ros.kernels import kernel
-from t3mpc_ros.motion import BodyTwist, Geometry, Motion, WheelSpeeds, kinematics
+from t3mpc_ros.control.pursuit import Pursuit, look
+from t3mpc_ros.motion import BodyTwist, Geometry, Motion, WheelSpeeds
 from t3mpc_ros.motion.kinematics import wheels_from_body
-from t3mpc_ros.motion.track import Jump, Stamps, Track, interpolate
+from t3mpc_ros.motion.track import Jump, Track
 from t3mpc_ros.motion.words import NANOSECONDS, STANDSTILL
 from t3mpc_ros.settings import nested
 
 Array = NDArray[np.float64]
-
-wheel_speeds = kernel(kinematics.wheel_speeds)
 
 JUMP_FACTOR = 2.2
 """A reference that changes this many times faster than the robot may is taken as a switch."""
@@ -56,7 +53,8 @@ class Status(NamedTuple):
     """Shape (5, 2), rows as in ``law.TERMS``, rad/s²."""
     applied: Array
     """Wheel accelerations after the limits, rad/s²."""
-    certificate: CertificateReading
+    watched: Array
+    """What the certificate remembers, see :func:`t3mpc_ros.control.law.update_certificate`."""
     skill: Array
     limited: bool
 
@@ -66,72 +64,10 @@ class Status(NamedTuple):
         estimate: Array = 0.0 - self.terms[0]
         return estimate
 
-
-@kernel
-def look(
-    stamps: Stamps,
-    samples: Array,
-    first: int,
-    end: int,
-    jump: Array,
-    stamp_ns: int,
-    acts_ns: int,
-    period: float,
-    hold_ns: float,
-    preview: bool,
-    radius: float,
-    half: float,
-    linear: float,
-    angular: float,
-    speeds: Array,
-    wanted: Array,
-    begin: Array,
-    finish: Array,
-) -> tuple[bool, float, float]:
-    """Write measured and wanted wheel speeds (rad/s); return whether the latter are known.
-
-    Also returned: the largest magnitude of the speeds and of the tracking error.
-
-    stamps ... jump   : a track, as in :func:`t3mpc_ros.motion.track.interpolate`
-    stamp_ns          : of the odometry, whose twist is ``linear``, ``angular``
-    acts_ns           : when the next command begins to act
-    period            : control period, s
-    hold_ns           : how long the newest sample is held
-    preview           : whether the reference is known ahead; else its slope carries it on
-    radius, half      : wheel radius and half of the wheel separation, m
-    speeds, wanted    : shape (2,), overwritten, at ``stamp_ns``
-    begin, finish     : shape (2,), overwritten, wanted at ``acts_ns`` and a period later
-    """
-    speeds[0], speeds[1] = wheel_speeds(linear, angular, radius, half)
-    speed = max(abs(speeds[0]), abs(speeds[1]))
-    newest = stamps[end - 1] if end > first else 0
-    track = (stamps, samples, first, end, jump)
-    known, v, w, v_rate, w_rate = interpolate(*track, held(stamp_ns, newest, hold_ns))
-    if not known:
-        wanted[:] = math.nan
-        return False, speed, 0.0
-    wanted[0], wanted[1] = wheel_speeds(v, w, radius, half)
-    error = max(abs(speeds[0] - wanted[0]), abs(speeds[1] - wanted[1]))
-    if preview:
-        until_ns = acts_ns + round(period * NANOSECONDS)
-        soon, v_soon, w_soon, _, _ = interpolate(*track, held(acts_ns, newest, hold_ns))
-        later, v_later, w_later, _, _ = interpolate(*track, held(until_ns, newest, hold_ns))
-        if soon and later:
-            begin[0], begin[1] = wheel_speeds(v_soon, w_soon, radius, half)
-            finish[0], finish[1] = wheel_speeds(v_later, w_later, radius, half)
-            return True, speed, error
-    slopes = wheel_speeds(v_rate, w_rate, radius, half)
-    ahead = (acts_ns - stamp_ns) / NANOSECONDS
-    for i in range(2):
-        begin[i] = wanted[i] + ahead * slopes[i]
-        finish[i] = wanted[i] + (ahead + period) * slopes[i]
-    return True, speed, error
-
-
-@kernel
-def held(stamp_ns: int, newest_ns: int, hold_ns: float) -> int:
-    """Return the instant whose reference holds at a stamp: the newest one for the time-out."""
-    return newest_ns if 0 < stamp_ns - newest_ns <= hold_ns else stamp_ns
+    @property
+    def certificate(self) -> CertificateReading:
+        """What the run-time certificate says."""
+        return CertificateReading.of(self.watched)
 
 
 class Controller:
@@ -390,7 +326,7 @@ class Controller:
             error,
             law.terms.copy() if moves else np.zeros_like(law.terms),
             np.zeros(2) if applied is None else applied,
-            law.reading,
+            law.watched.copy(),
             law.predictive.skill,
             reason.moves and self._drive.limited,
         )

@@ -24,7 +24,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.control.estimate import EstimateSettings, SpeedEstimator
+from t3mpc_ros.control.estimate import AHEAD, EstimateSettings, SpeedEstimator
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.motion import BodyTwist, Geometry
 from t3mpc_ros.motion.kinematics import body_speeds
@@ -124,7 +124,7 @@ def limit_command(
 @kernel
 def choose_command(
     acceleration: Array,
-    ahead: Array,
+    known: Array,
     command: Array,
     limits: Array,
     period: float,
@@ -134,12 +134,13 @@ def choose_command(
     """Write the command of E19 and what it really means; decide whether a limit cut it.
 
     acceleration : shape (2,), wanted u, rad/s²
-    ahead        : shape (2,), speeds when the command begins to act, rad/s
+    known        : shape (3, 2), row AHEAD: speeds when the command begins to act, rad/s
     command      : shape (2,), the last one, overwritten by the next, rad/s
     limits       : shape (2, 3), see :func:`limit_vector`
     stretch      : T / (1 - exp(-T/lag)), s
     applied      : shape (2,), overwritten, the u that the command means, rad/s²
     """
+    ahead = known[AHEAD]
     right = ahead[0] + stretch * acceleration[0]
     left = ahead[1] + stretch * acceleration[1]
     limited = limit_command(right, left, command, limits, period, command)
@@ -257,7 +258,7 @@ class Drive:
             return self.applied
         self.limited = choose_command(
             acceleration,
-            self.ahead,
+            self._estimator.known,
             self.command,
             self._limits,
             self._period,

@@ -212,25 +212,26 @@ class SpeedEstimator:
         periods = round(settings.dead_time / period, 9)
         self._late = periods % 1.0
         self._commands: Array = np.zeros((int(periods) + 2, 2))
-        self._known: Array = np.zeros((3, 2))
+        self.known: Array = np.zeros((3, 2))
+        """All that is estimated, rows SPEEDS, UNEXPLAINED and AHEAD."""
 
     # Made when asked for: a deep copy of views would no longer be views of the copied array.
     @property
     def speeds(self) -> Array:
         """Estimated wheel speeds, rad/s, shape (2,)."""
-        row: Array = self._known[SPEEDS]
+        row: Array = self.known[SPEEDS]
         return row
 
     @property
     def unexplained(self) -> Array:
         """Estimated acceleration that the model does not explain, rad/s², shape (2,)."""
-        row: Array = self._known[UNEXPLAINED]
+        row: Array = self.known[UNEXPLAINED]
         return row
 
     @property
     def ahead(self) -> Array:
         """Estimated wheel speeds when what is commanded now begins to act, rad/s, (2,)."""
-        row: Array = self._known[AHEAD]
+        row: Array = self.known[AHEAD]
         return row
 
     @property
@@ -245,8 +246,8 @@ class SpeedEstimator:
 
     def reset(self, speeds: Array) -> None:
         """Start again from measured wheel speeds (rad/s), at rest relative to the command."""
-        self._known[:] = speeds
-        self._known[UNEXPLAINED] = 0.0
+        self.known[:] = speeds
+        self.known[UNEXPLAINED] = 0.0
         self._commands[:] = speeds
 
     def predict(self, applied: Array, dt: float) -> None:
@@ -261,7 +262,7 @@ class SpeedEstimator:
             Seconds since the last step.
         """
         how = self._settings
-        predict(self._known, self._commands, applied, dt, self._velocity, self._late, how.lag)
+        predict(self.known, self._commands, applied, dt, self._velocity, self._late, how.lag)
 
     def correct(self, measured: Array) -> Array:
         """Return the estimate after seeing measured wheel speeds (rad/s), shape (2,)."""
@@ -270,19 +271,18 @@ class SpeedEstimator:
 
     def observe(self, applied: Array, measured: Array, dt: float, *, sent: bool) -> None:
         """Do :meth:`predict`, when something was ``sent``, and :meth:`correct`."""
-        how = self._settings
         observe(
-            self._known,
+            self.known,
             self._commands,
             applied,
             measured,
             sent,
             dt,
-            how.enabled,
+            self._settings.enabled,
             self._gain,
             self._velocity,
             self._late,
-            how.lag,
+            self._settings.lag,
             self._period,
         )
 

@@ -4,7 +4,7 @@
 
 from dataclasses import dataclass
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -176,6 +176,11 @@ class CertificateReading(NamedTuple):
     bound: float
     """The largest rate E14 allows, averaged alike, rad²/s³."""
 
+    @classmethod
+    def of(cls, remembered: Array) -> Self:
+        """Return what :func:`update_certificate` has written."""
+        return cls(*remembered[:BEGUN].tolist())
+
     @property
     def margin(self) -> float:
         """Return bound minus rate: the certificate holds while this is not negative."""
@@ -187,9 +192,9 @@ class CertificateReading(NamedTuple):
         return self.margin >= 0.0
 
 
-LAST, VALUE, RATE, BOUND = range(4)
-"""Places of what a certificate remembers: V of the last step, NaN before the first, then the
-numbers of a :class:`CertificateReading`."""
+VALUE, RATE, BOUND, BEGUN = range(4)
+"""Places of what a certificate remembers: the numbers of a :class:`CertificateReading`, and
+whether there was a step before, 0 or 1."""
 
 
 @kernel
@@ -207,17 +212,16 @@ def update_certificate(
     errors     : shape (n,), rad/s
     gain, bound, smoothing : as in :func:`law_terms`
     dt, window : s
-    remembered : shape (4,), at LAST, VALUE, RATE, BOUND
+    remembered : shape (4,), at VALUE, RATE, BOUND, BEGUN
     """
-    remembered[VALUE] = 0.5 * square_length(errors)
-    rate = 0.0
-    if not math.isnan(remembered[LAST]):
-        rate = (remembered[VALUE] - remembered[LAST]) / dt
+    value = 0.5 * square_length(errors)
+    rate = (value - remembered[VALUE]) / dt if remembered[BEGUN] > 0.0 else 0.0
     allowed = lyapunov_rate_bound(errors, gain, bound, smoothing)
     share = min(1.0, dt / window)
     remembered[RATE] += share * (rate - remembered[RATE])
     remembered[BOUND] += share * (allowed - remembered[BOUND])
-    remembered[LAST] = remembered[VALUE]
+    remembered[VALUE] = value
+    remembered[BEGUN] = 1.0
 
 
 class Certificate:
@@ -243,12 +247,11 @@ class Certificate:
     def reset(self) -> None:
         """Forget the past."""
         self.remembered[:] = 0.0
-        self.remembered[LAST] = math.nan
 
     @property
     def reading(self) -> CertificateReading:
         """What the certificate says now."""
-        return CertificateReading(*self.remembered.tolist()[VALUE:])
+        return CertificateReading.of(self.remembered)
 
     def update(
         self, errors: Array, settings: LawSettings, bound: float, dt: float

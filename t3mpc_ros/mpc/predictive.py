@@ -70,6 +70,7 @@ class PredictiveTerm:
         self.rows: Array = np.zeros((len(Signals._fields), outputs))
         """The :class:`Signals`, for kernels."""
         self._tables: Array = np.zeros((4, outputs, settings.horizon))
+        self._zeros = np.zeros(outputs)
         self._no_change = np.zeros((settings.horizon, outputs))
         moves = settings.control_horizon
         self._numbers = np.zeros(settings.horizon * moves + space_size(moves))
@@ -136,7 +137,8 @@ class PredictiveTerm:
             self._decays = np.exp(
                 -feedback_gain * self._timing.span * np.arange(settings.horizon + 1)
             )
-            self._nominal_steps = nominal_step(self._loop, self._timing, settings.horizon)
+            steps = nominal_step(self._loop, self._timing, settings.horizon)
+            self._nominal_response = float(steps[max(settings.horizon // 2, 1) - 1])
         self.settings = settings
         self._how = Learning.of(settings, self._timing.span)
         self._how_told = np.array(self._how, dtype=np.float64)
@@ -187,6 +189,7 @@ class PredictiveTerm:
             predictors.append(predictor)
         self._predictors = predictors
         self._stores = tuple(predictor.store for predictor in predictors)
+        self._sizes = np.array(predictors[0].sizes)
         self.reset()
 
     def reset(self) -> None:
@@ -297,16 +300,16 @@ class PredictiveTerm:
                 raise ValueError(
                     f'known_change must be {rows} by {columns} finite numbers: got {known_change}'
                 )
-        self.advance(errors, known_change)
+        self.advance(errors, self._zeros, known_change)
         v_p: Array = self.rows[_V]
         return v_p.copy()
 
-    def advance(self, errors: Array, known_change: Array | None = None) -> None:
-        """Renew ``rows`` as :meth:`step` does; shapes and ``known_change`` are not checked."""
+    def advance(self, speeds: Array, wanted: Array, known_change: Array | None = None) -> None:
+        """Renew ``rows`` as :meth:`step` does with speeds - wanted; shapes are not checked."""
         timing, phase = self._timing, self._phase
         sampled = phase == 0 or phase > timing.every - timing.average
-        if not gather(errors, sampled, phase == 0, self._decay, self.rows):
-            raise ValueError(f'errors must be finite: got {errors}')
+        if not gather(speeds, wanted, sampled, phase == 0, self._decay, self.rows):
+            raise ValueError(f'errors must be finite: got {speeds - wanted}')
         if phase == 0:
             self._renew(self._no_change if known_change is None else known_change)
         self._phase = (phase + 1) % timing.every
@@ -335,10 +338,10 @@ class PredictiveTerm:
         timing = self._timing
         renew(
             self._stores,
-            self._predictors[0].sizes,
+            self._sizes,
             self.rows,
             self._tables,
-            self._nominal_steps[max(self.settings.horizon // 2, 1) - 1],
+            self._nominal_response,
             self._decays,
             change,
             self._samples,

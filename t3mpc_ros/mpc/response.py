@@ -41,13 +41,15 @@ class Signals(NamedTuple):
     """Share of the bound of v_p in force."""
     skills: Array
     """Skill in the middle of the horizon."""
+    errors: Array
+    """The last errors delta = chi - r, rad/s."""
     unforeseen: Array
-    """The last errors less what was left of the known jumps, rad/s."""
+    """The same less what was left of the known jumps, rad/s."""
 
 
 @kernel
 def signals_in(rows: Array) -> Signals:
-    """Return the rows of a table, shape (10, outputs), as signals."""
+    """Return the rows of a table, shape (11, outputs), as signals."""
     return Signals(
         rows[0],
         rows[1],
@@ -59,6 +61,7 @@ def signals_in(rows: Array) -> Signals:
         rows[7],
         rows[8],
         rows[9],
+        rows[10],
     )
 
 
@@ -71,22 +74,25 @@ def hold(signals: Signals, decay: float) -> None:
 
 
 @kernel
-def gather(errors: Array, sampled: bool, due: bool, decay: float, rows: Array) -> bool:
+def gather(
+    speeds: Array, wanted: Array, sampled: bool, due: bool, decay: float, rows: Array
+) -> bool:
     """Add a control period to the sums of a sample; return False if an error is not finite.
 
-    errors  : shape (outputs,), rad/s
+    speeds, wanted : shape (outputs,), chi and r, rad/s
     sampled : whether this period's errors belong to the sample
     due     : whether the sample is complete; :func:`renew` ends the period then
     decay   : share of a known jump that is left after a period
     rows    : the :class:`Signals`
     """
     signals = signals_in(rows)
-    for z in range(errors.size):
-        if not math.isfinite(errors[z]):
+    for z in range(speeds.size):
+        if not math.isfinite(speeds[z] - wanted[z]):
             return False
-    for z in range(errors.size):
+    for z in range(speeds.size):
+        signals.errors[z] = speeds[z] - wanted[z]
         signals.applied_sums[z] += signals.applied[z]
-        signals.unforeseen[z] = errors[z] - signals.jumps[z]
+        signals.unforeseen[z] = signals.errors[z] - signals.jumps[z]
         if sampled:
             signals.sums[z] += signals.unforeseen[z]
     if not due:

@@ -193,7 +193,7 @@ def wheel_in(store: Array, delta_lags: int, move_lags: int, hidden: int, horizon
 @kernel
 def renew(
     stores: tuple[Array, ...],
-    sizes: tuple[int, int, int, int],
+    sizes: Indices,
     rows: Array,
     tables: Array,
     nominal: float,
@@ -211,7 +211,7 @@ def renew(
 ) -> None:
     """Take the sample of each output, and renew its v_p: (34)-(63) in one call.
 
-    stores        : the :class:`Wheel` of each output, with their ``sizes``
+    stores, sizes : the :class:`Wheel` of each output, and :attr:`Predictor.sizes`
     rows          : the :class:`Signals`
     tables        : shape (4, outputs, n_p), overwritten: step responses (48), Psi_free (56),
                     predictions Psi (52), and the part of the errors to come that is known
