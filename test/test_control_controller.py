@@ -4,6 +4,8 @@
 
 from dataclasses import replace
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -407,3 +409,37 @@ def test_a_model_of_another_format_is_refused_by_number(tmp_path, monkeypatch):
 def test_a_round_trip_of_the_ideal_robot_uses_the_same_geometry():
     wheels = WheelSpeeds(3.0, -1.0)
     assert wheels_from_body(body_from_wheels(wheels, GEOMETRY), GEOMETRY) == pytest.approx(wheels)
+
+
+COMPILES = """
+import sys
+from t3mpc_ros.control.controller import Controller, ControllerSettings
+from t3mpc_ros.motion import BodyTwist, Motion
+from t3mpc_ros.motion.words import ORIGIN
+
+def signatures():
+    modules = [module for name, module in sys.modules.items() if name.startswith('t3mpc_ros')]
+    kernels = {one for module in modules for one in vars(module).values()
+               if hasattr(one, 'signatures')}
+    return {(one.__module__, one.__name__): len(one.signatures) for one in kernels}
+
+controller = Controller(ControllerSettings())
+controller.warm_up()
+before = signatures()
+twist = BodyTwist(0.0, 0.0)
+for k in range(100):
+    jumped = 0.2 if k > 50 else 0.0
+    controller.add_reference(Motion((k + 40) * 10_000_000, ORIGIN, BodyTwist(jumped, 0.1)))
+    twist, status = controller.step(Motion(k * 10_000_000, ORIGIN, twist))
+assert status.reason.name == 'TRACKING', status
+after = signatures()
+print({name for name in after if after[name] != before[name]} or 'nothing')
+"""
+
+
+def test_after_the_warm_up_no_step_compiles_anything():
+    """In a process of its own: in this one other tests have compiled all there is."""
+    done = subprocess.run(
+        [sys.executable, '-c', COMPILES], capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.stdout.strip() == 'nothing', done.stdout + done.stderr

@@ -149,3 +149,30 @@ def test_while_it_does_not_follow_the_reference_itself_is_commanded_and_nothing_
     sent = wheels_from_body(robot.late, GEOMETRY)
     wanted = wheels_from_body(robot.wanted(robot.now - STEP), GEOMETRY)
     assert sent == pytest.approx(wanted, abs=0.05)
+
+
+def test_a_speed_near_the_newest_command_is_judged_as_by_the_whole_window():
+    """The newest command is looked at first, to save the search: the verdict is the same."""
+    generator = np.random.default_rng(4)
+    watch, whole = following(), following()
+    verdicts = []
+    for k in range(3000):
+        told = 3.0 * np.sin(0.02 * k) + generator.normal(size=2)
+        off = 5.0 if k % 700 > 600 else 0.0
+        seen = told + off + generator.normal(scale=0.8, size=2)
+        verdicts.append(watch.heard(*seen))
+        # The same commands in another order are the same window: the nearest comes first.
+        if len(whole._commands) == whole._commands.maxlen:
+            far = max(whole._commands, key=lambda one: abs(one[0] - seen[0]))
+            kept = list(whole._commands)
+            whole._commands.remove(far)
+            whole._commands.append(far)
+            assert whole.heard(*seen) == verdicts[-1]
+            whole._commands.clear()
+            whole._commands.extend(kept)
+        else:
+            assert whole.heard(*seen) == verdicts[-1]
+        watch.told(*told)
+        whole.told(*told)
+    assert True in verdicts
+    assert False in verdicts

@@ -163,3 +163,19 @@ def test_numbers_near_the_largest_one_make_a_jump_and_never_nan():
     point = track.at(5 * MS)
     assert point.twist.linear == -1.7e308
     assert point.rate == (0.0, 0.0)
+
+
+def test_the_newest_samples_are_kept_however_many_come():
+    """They move to the front of their array now and then; nothing may change by that."""
+    small, large = Track(JUMP, 16), Track(JUMP, 4096)
+    generator = np.random.default_rng(3)
+    for n in range(1000):
+        item = sample(10.0 * n, math.sin(0.02 * n), math.cos(0.3 * n) + (n // 50) % 2)
+        assert small.add(item)
+        assert large.add(item)
+        assert small.take_jumps() == large.take_jumps()
+        for now_ms in (10.0 * n, 10.0 * n - generator.uniform(0.0, 149.0)):
+            if n >= 15:
+                assert small.at(int(now_ms * MS)) == large.at(int(now_ms * MS))
+        if n >= 16:
+            assert small.at(int((10.0 * n - 150.1) * MS)) is None

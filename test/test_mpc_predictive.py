@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The predictive term in a nominal loop that shares no code with it, and what it is worth."""
 
+from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 
@@ -455,3 +456,35 @@ def test_lags_that_do_not_cover_the_dead_time_are_refused():
     PredictiveTerm(settings.changed({'move_lags': 5}), PERIOD, GAIN)
     with pytest.raises(ValueError, match='positive'):
         PredictiveTerm(DEFAULT, PERIOD, 0.0)
+
+
+def test_a_copy_of_the_term_goes_its_own_way():
+    """Nobody may keep views of a flat store: in a deep copy they are views of it no longer."""
+    term, errors = PredictiveTerm(DEFAULT, PERIOD, GAIN), np.array([0.3, -0.2])
+    for k in range(60):
+        term.step(errors * np.sin(0.1 * k))
+    twin, other = deepcopy(term), deepcopy(term)
+    for _ in range(20):
+        other.step(-errors)
+    for k in range(60, 160):
+        sample = errors * np.sin(0.1 * k)
+        np.testing.assert_array_equal(twin.step(sample), term.step(sample))
+    np.testing.assert_array_equal(twin.skill, term.skill)
+    for name, value in term.weights().items():
+        np.testing.assert_array_equal(twin.weights()[name], value)
+
+
+def test_going_back_is_what_restoring_the_weights_is():
+    term, errors = PredictiveTerm(DEFAULT, PERIOD, GAIN), np.array([0.3, -0.2])
+    for k in range(400):
+        term.step(errors * np.sin(0.1 * k))
+    copies, weights = term.copies(), term.weights()
+    for k in range(400):
+        term.step(errors * np.cos(0.3 * k))
+    restored = deepcopy(term)
+    restored.set_weights(weights)
+    term.go_back(copies)
+    np.testing.assert_array_equal(term.skill, restored.skill)
+    for k in range(100):
+        sample = errors * np.sin(0.2 * k)
+        np.testing.assert_array_equal(term.step(sample), restored.step(sample))

@@ -13,6 +13,8 @@ from t3mpc_ros.mpc.program import (
     make_space,
     normal_equations,
     residual,
+    space_in,
+    space_size,
     unconstrained,
 )
 from t3mpc_ros.mpc.response import toeplitz
@@ -250,3 +252,15 @@ def test_v_outside_its_bound_but_within_one_change_is_brought_back():
     assert solve(matrix, free, 1.0, 0.01, 1.05, 0.1, 1.0, 100, space) == OPTIMAL
     assert space.changes[0] == pytest.approx(-0.05)
     assert residual(space, 1.05, 0.1, 1.0, out) < 1e-10
+
+
+@pytest.mark.parametrize('moves', [1, 2, 5, 11])
+def test_the_parts_of_a_space_fill_its_stores_and_none_lies_on_another(moves):
+    store, whole = np.zeros(space_size(moves)), np.zeros((2, moves + 1), dtype=np.int64)
+    space = space_in(store, whole, moves)
+    for array in space:
+        array += 1
+    np.testing.assert_array_equal(store, 1.0)
+    assert whole.sum() == 2 * moves + 1
+    assert space.multipliers.shape == (2, 2 * moves)
+    assert space.basis.shape == (moves, moves)

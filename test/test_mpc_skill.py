@@ -15,6 +15,8 @@ from t3mpc_ros.mpc.skill import (
     skill,
     smooth_step,
     tally,
+    wheel_in,
+    wheel_size,
 )
 from t3mpc_ros.mpc.training import Timing, excite
 
@@ -144,3 +146,30 @@ def test_a_trial_too_short_to_predict_in_is_refused():
     with pytest.raises(ValueError, match='trial must be longer'):
         Predictor(machine, 10, (np.zeros(5), np.zeros(5)))
     assert make_memory(12).power.size == 3
+
+
+def _arrays(parts):
+    """Return every array of named tuples, however deep."""
+    if isinstance(parts, np.ndarray):
+        return [parts]
+    return [array for part in parts for array in _arrays(part)] if isinstance(parts, tuple) else []
+
+
+@pytest.mark.parametrize('sizes', [(4, 4, 12, 10), (1, 1, 2, 1), (6, 3, 9, 7), (2, 5, 8, 2)])
+def test_the_parts_of_a_wheel_fill_its_store_and_none_lies_on_another(sizes):
+    store = np.zeros(wheel_size(*sizes))
+    for array in _arrays(wheel_in(store, *sizes)):
+        assert array.size
+        array += 1.0
+    np.testing.assert_array_equal(store, 1.0)
+
+
+def test_a_wheel_has_the_shapes_that_its_kernels_expect():
+    wheel = wheel_in(np.zeros(wheel_size(4, 3, 9, 10)), 4, 3, 9, 10)
+    assert wheel.machine.visible_weights.shape == (7, 9)
+    assert wheel.machine.lags.shape == wheel.machine.eta1.shape == (7,)
+    assert wheel.machine.mu0.shape == wheel.machine.output_weights.shape == (9,)
+    assert wheel.memory.prior.shape == wheel.memory.information.shape == (9, 9)
+    assert wheel.past.errors.shape == wheel.past.moves.shape == (4 + 5,)
+    assert wheel.past.offsets.shape == wheel.past.ahead.shape == (5,)
+    assert wheel.past.planned.shape == (10,)

@@ -18,7 +18,7 @@ from t3mpc_ros.control.pursuit import Pursuit, look
 from t3mpc_ros.motion import BodyTwist, Geometry, Motion, WheelSpeeds
 from t3mpc_ros.motion.kinematics import wheels_from_body
 from t3mpc_ros.motion.track import Jump, Track
-from t3mpc_ros.motion.words import NANOSECONDS, STANDSTILL
+from t3mpc_ros.motion.words import NANOSECONDS, ORIGIN, STANDSTILL
 from t3mpc_ros.settings import nested
 
 Array = NDArray[np.float64]
@@ -115,8 +115,15 @@ class Controller:
         return self._drive
 
     def warm_up(self) -> None:
-        """Compile and pre-train now, never inside a step."""
+        """Compile and pre-train now, never inside a step; nothing is remembered of it."""
         self.law.warm_up()
+        other, jump = Controller(self.settings), 2.0 * JUMP_FACTOR * self._period
+        jumped = BodyTwist(jump * self.settings.limits.linear_acceleration, 0.0)
+        for k in range(10):
+            wanted = STANDSTILL if k < 4 else jumped
+            other.add_reference(Motion(k * self._period_ns, ORIGIN, wanted))
+        for k in range(6):
+            other.step(Motion(k * self._period_ns, ORIGIN, STANDSTILL))
 
     def configure(self, settings: ControllerSettings) -> None:
         """Use other live settings from the next step on."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from t3mpc_ros.mpc.active_set import OPTIMAL
 from t3mpc_ros.mpc.machine import Shape, begin, make_machine
 from t3mpc_ros.mpc.program import space_size
-from t3mpc_ros.mpc.response import Signals, gather, signals_in
+from t3mpc_ros.mpc.response import Signals, gather
 from t3mpc_ros.mpc.settings import Learning, PredictiveSettings, Rules
 from t3mpc_ros.mpc.skill import Predictor, renew, skill
 from t3mpc_ros.mpc.training import Timing, excite, nominal_step, split_runs
@@ -22,7 +22,9 @@ __all__ = ['PredictiveSettings', 'PredictiveTerm']
 
 Array = NDArray[np.float64]
 
-_V, _JUMPS, _SKILLS = map(Signals._fields.index, ('v', 'jumps', 'skills'))
+_APPLIED, _V, _DRAWN, _JUMPS, _FADES, _SKILLS = map(
+    Signals._fields.index, ('applied', 'v', 'drawn', 'jumps', 'fades', 'skills')
+)
 
 
 class PredictiveTerm:
@@ -81,11 +83,6 @@ class PredictiveTerm:
         self.configure(settings, feedback_gain)
         self.relearn()
 
-    # Made when asked for: a deep copy of views would no longer be views of the copied rows.
-    @property
-    def _signals(self) -> Signals:
-        return signals_in(self.rows)
-
     @property
     def skill(self) -> Array:
         """Skill against persistence in the middle of the horizon, shape (outputs,): read only."""
@@ -99,7 +96,8 @@ class PredictiveTerm:
     @property
     def fade(self) -> Array:
         """Share of v_p's bound in force, in [0, 1], shape (outputs,)."""
-        return self._signals.fades.copy()
+        found: Array = self.rows[_FADES]
+        return found.copy()
 
     @property
     def prediction(self) -> Array:
@@ -262,7 +260,7 @@ class PredictiveTerm:
         """
         if np.shape(v_p) != self.status.shape or not np.isfinite(v_p).all():
             raise ValueError(f'v_p must be {self.status.size} finite numbers: got {v_p}')
-        self._signals.applied[:] = v_p
+        self.rows[_APPLIED] = v_p
 
     def shift(self, jump: Array) -> None:
         """Tell that the error jumps by ``jump`` (rad/s) at the coming step, because r jumps.
@@ -300,6 +298,7 @@ class PredictiveTerm:
                 raise ValueError(
                     f'known_change must be {rows} by {columns} finite numbers: got {known_change}'
                 )
+            known_change = np.asarray(known_change, dtype=np.float64)
         self.advance(errors, self._zeros, known_change)
         v_p: Array = self.rows[_V]
         return v_p.copy()
@@ -334,7 +333,7 @@ class PredictiveTerm:
         """Take the sample of each output, and renew its v_p."""
         if self._dithered:
             drawn = self._generator.uniform(-1.0, 1.0, self.status.size)
-            self._signals.drawn[:] = self.settings.dither * drawn
+            self.rows[_DRAWN] = self.settings.dither * drawn
         timing = self._timing
         renew(
             self._stores,
