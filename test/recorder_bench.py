@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How much the recorder loses, and what it costs, at many messages a second.
 
-    scripts/run python test/recorder_bench.py [--seconds 60] [--topics 20] [--rate 100]
+    PYTHONPATH=. .venv/bin/python test/recorder_bench.py [--seconds 60] [--topics 20] [--rate 100]
 
 A publisher and the recorder run as processes of their own over DDS on loopback. Half of the
 topics are Odometry (about 0.7 kB), half Float64; each message carries its number. Printed are the

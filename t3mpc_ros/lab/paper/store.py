@@ -28,7 +28,8 @@ START = 3.0
 # Sources that cannot change the numbers of a run given the method's settings. Everything else
 # counts as able to: to run again what need not be is better than to keep what no longer holds.
 _HARMLESS = (
-    'nodes/', 'record/', 'lab/report/', 'lab/paper/', 'lab/program.py', 'lab/demo.py',
+    'nodes/', 'record/', 'radio/', 'emulator/', 'lab/bag/', 'lab/rerun/',
+    'lab/report/', 'lab/paper/', 'lab/program.py', 'lab/demo.py',
     'lab/processes.py', 'lab/exponents.py', 'lab/estimation.py', 'lab/contestants.py',
     'lab/timing', 'lab/tuning',
 )  # fmt: skip
