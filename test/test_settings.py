@@ -6,7 +6,9 @@ from dataclasses import dataclass, replace
 
 import pytest
 
+from t3mpc_ros.radio.link.settings import LinkSettings
 from t3mpc_ros.settings import SettingError, Settings, nested, setting
+from t3mpc_ros.settings.words import from_words
 
 
 @dataclass(frozen=True)
@@ -76,3 +78,20 @@ def test_direct_construction_is_checked_too():
         Inner(gain=0.0)
     with pytest.raises(SettingError):
         replace(Outer(), high=0.5)
+
+
+def test_words_of_a_command_line_become_what_the_table_asks_for():
+    """``link.rate=2M`` and the address 5433 must stay text, true must not."""
+    words = ['address=5433', 'retries=3', 'cycle_rate=25', 'robot.invert_left=true', 'rate=2M']
+    found = from_words(LinkSettings, words)
+    assert found == {
+        'address': '5433',
+        'retries': 3,
+        'cycle_rate': 25,
+        'robot.invert_left': True,
+        'rate': '2M',
+    }
+    with pytest.raises(SettingError, match="NAME=VALUE: got 'retries'"):
+        from_words(LinkSettings, ['retries'])
+    with pytest.raises(SettingError, match='nothing_such'):
+        LinkSettings.from_flat(from_words(LinkSettings, ['nothing_such=1']))

@@ -8,20 +8,17 @@ from contextlib import ExitStack
 import math
 import os
 from pathlib import Path
-import signal
 import sys
-from types import FrameType
-from typing import Self
 
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorSettings
 from t3mpc_ros.emulator.faults import KINDS, Fault, FaultError, parse_fault
 from t3mpc_ros.emulator.rest import RestWatch
 from t3mpc_ros.emulator.serial_end import LinkError, PseudoPort, serve
 from t3mpc_ros.radio.authentication import KeyFileError, read_key
+from t3mpc_ros.radio.host.stop import Stop
 from t3mpc_ros.robot.arena.world import WorldError
 from t3mpc_ros.settings import SettingError
-
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+from t3mpc_ros.settings.words import from_words
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -37,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (FaultError, KeyFileError, SettingError, WorldError) as error:
         print(f'board_emulator: {error}', file=sys.stderr)
         return 2
-    with _Stop() as stop:
+    with Stop() as stop:
         print('board_emulator: getting ready', flush=True)
         emulator.plant.warm_up()
         with ExitStack() as ends:
@@ -77,47 +74,9 @@ def _tell(news: str) -> None:
         print(f'board_emulator: {news}', flush=True)
 
 
-class _Stop:
-    """Becomes true when the process is asked to end."""
-
-    def __init__(self) -> None:
-        self._asked = False
-
-    def __call__(self) -> bool:
-        return self._asked
-
-    def __enter__(self) -> Self:
-        self._before = [signal.signal(number, self._take) for number in _SIGNALS]
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        for number, handler in zip(_SIGNALS, self._before, strict=True):
-            signal.signal(number, handler)
-
-    def _take(self, number: int, frame: FrameType | None) -> None:
-        self._asked = True
-
-
 def _settings(options: argparse.Namespace) -> EmulatorSettings:
     flat: dict[str, object] = {'twin.world': options.world, 'twin.seed': options.seed}
-    for text in options.set:
-        name, equals, value = text.partition('=')
-        if not equals:
-            raise SettingError(f'--set must be NAME=VALUE: got {text}')
-        flat[name] = _value(value)
-    return EmulatorSettings.from_flat(flat)
-
-
-def _value(text: str) -> object:
-    """Return the number or truth that a text stands for, else the text."""
-    if text in ('true', 'false'):
-        return text == 'true'
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            pass
-    return text
+    return EmulatorSettings.from_flat(flat | from_words(EmulatorSettings, options.set))
 
 
 def _share(text: str) -> float:

@@ -8,22 +8,21 @@ import math
 import os
 from pathlib import Path
 import select
-import signal
 import sys
-from types import FrameType
-from typing import Self, TypeVar
+from typing import TypeVar
 
 from t3mpc_ros.radio.authentication import KeyFileError, key_check, read_key
 from t3mpc_ros.radio.bench import keys, probe, reading, search, turn
 from t3mpc_ros.radio.bench.carrier import carry_out
 from t3mpc_ros.radio.bench.errand import Errand, ErrandError, Talk
 from t3mpc_ros.radio.codec import decode_from_board, decode_from_dongle
+from t3mpc_ros.radio.host.stop import Stop
 from t3mpc_ros.radio.link.settings import LinkSettings
 from t3mpc_ros.settings import SettingError
+from t3mpc_ros.settings.words import from_words
 
 DONE, NOT_GOOD, CANNOT, INTERRUPTED = 0, 1, 2, 130
 _RATES = ('250k', '1M', '2M')
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 Value = TypeVar('Value')
 
 
@@ -34,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     130: interrupted.
     """
     options = _parser().parse_args(arguments)
-    with _Stop() as stop:
+    with Stop() as stop:
         try:
             return int(options.run(options, stop))
         except (ErrandError, KeyFileError, SettingError) as error:
@@ -45,31 +44,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return CANNOT
 
 
-class _Stop:
-    """Becomes true when the process is asked to end."""
-
-    def __init__(self) -> None:
-        self._asked = False
-
-    def __call__(self) -> bool:
-        return self._asked
-
-    def __enter__(self) -> Self:
-        self._before = [signal.signal(number, self._take) for number in _SIGNALS]
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        for number, handler in zip(_SIGNALS, self._before, strict=True):
-            signal.signal(number, handler)
-
-    def _take(self, number: int, frame: FrameType | None) -> None:
-        self._asked = True
-
-
 # -- the key --------------------------------------------------------------------------------------
 
 
-def _key_new(options: argparse.Namespace, stop: _Stop) -> int:
+def _key_new(options: argparse.Namespace, stop: Stop) -> int:
     check = keys.new_key_file(options.file, os.urandom)
     print(
         f'{options.file}: a new key, check value {check:08x}, readable by you only. Keep it: '
@@ -78,12 +56,12 @@ def _key_new(options: argparse.Namespace, stop: _Stop) -> int:
     return DONE
 
 
-def _key_check(options: argparse.Namespace, stop: _Stop) -> int:
+def _key_check(options: argparse.Namespace, stop: Stop) -> int:
     print(f'{options.file}: a key, check value {key_check(read_key(options.file)):08x}')
     return DONE
 
 
-def _key_write(options: argparse.Namespace, stop: _Stop) -> int:
+def _key_write(options: argparse.Namespace, stop: Stop) -> int:
     key = read_key(options.file)
     if key == keys.FORGET:
         raise KeyFileError(f'{options.file} holds zeros only: that is no key')
@@ -92,12 +70,12 @@ def _key_write(options: argparse.Namespace, stop: _Stop) -> int:
     return DONE
 
 
-def _key_forget(options: argparse.Namespace, stop: _Stop) -> int:
+def _key_forget(options: argparse.Namespace, stop: Stop) -> int:
     print(keys.describe(_at_robot(keys.write_key(keys.FORGET), options, stop)))
     return DONE
 
 
-def _key_state(options: argparse.Namespace, stop: _Stop) -> int:
+def _key_state(options: argparse.Namespace, stop: Stop) -> int:
     told = _at_robot(keys.ask_key(), options, stop)
     print(keys.describe(told))
     if options.key is None:
@@ -110,7 +88,7 @@ def _key_state(options: argparse.Namespace, stop: _Stop) -> int:
 # -- the link -------------------------------------------------------------------------------------
 
 
-def _ping(options: argparse.Namespace, stop: _Stop) -> int:
+def _ping(options: argparse.Namespace, stop: Stop) -> int:
     settings = _settings(options)
     seen = _at_dongle(probe.probe(settings, options.count), options, stop)
     rows = probe.judge(seen, settings)
@@ -118,7 +96,7 @@ def _ping(options: argparse.Namespace, stop: _Stop) -> int:
     return DONE if probe.is_good(rows) else NOT_GOOD
 
 
-def _find(options: argparse.Namespace, stop: _Stop) -> int:
+def _find(options: argparse.Namespace, stop: Stop) -> int:
     settings = _settings(options)
     rates = _RATES if options.all_rates else (settings.rate,)
     live = sys.stderr.isatty()
@@ -137,14 +115,14 @@ def _find(options: argparse.Namespace, stop: _Stop) -> int:
     return DONE if good else NOT_GOOD
 
 
-def _parameters(options: argparse.Namespace, stop: _Stop) -> int:
+def _parameters(options: argparse.Namespace, stop: Stop) -> int:
     settings = _settings(options)
     talk = reading.read_parameters(settings, _key(options), os.urandom)
     print(reading.table(_at_dongle(talk, options, stop), settings))
     return DONE
 
 
-def _turn(options: argparse.Namespace, stop: _Stop) -> int:
+def _turn(options: argparse.Namespace, stop: Stop) -> int:
     settings = _settings(options)
     if not options.yes and not _agreed(options, stop):
         print('radio_tool: nothing was moved', file=sys.stderr)
@@ -166,7 +144,7 @@ def _turn(options: argparse.Namespace, stop: _Stop) -> int:
     return DONE
 
 
-def _agreed(options: argparse.Namespace, stop: _Stop) -> bool:
+def _agreed(options: argparse.Namespace, stop: Stop) -> bool:
     """Return whether a person at a terminal says that the wheels are in the air."""
     if not sys.stdin.isatty():
         raise ErrandError('turning a wheel asks first, at a terminal: or say --yes')
@@ -184,15 +162,15 @@ def _agreed(options: argparse.Namespace, stop: _Stop) -> bool:
     return False
 
 
-def _at_dongle(talk: Talk[Value], options: argparse.Namespace, stop: _Stop) -> Value:
+def _at_dongle(talk: Talk[Value], options: argparse.Namespace, stop: Stop) -> Value:
     return _carry(Errand(talk, decode_from_dongle), options, stop, 'the dongle')
 
 
-def _at_robot(talk: Talk[Value], options: argparse.Namespace, stop: _Stop) -> Value:
+def _at_robot(talk: Talk[Value], options: argparse.Namespace, stop: Stop) -> Value:
     return _carry(Errand(talk, decode_from_board), options, stop, "the robot's board")
 
 
-def _carry(errand: Errand[Value], options: argparse.Namespace, stop: _Stop, device: str) -> Value:
+def _carry(errand: Errand[Value], options: argparse.Namespace, stop: Stop, device: str) -> Value:
     carry_out(errand, options.port, stop, device)
     if errand.error or errand.result is None:
         raise ErrandError(errand.error or 'interrupted')
@@ -207,27 +185,8 @@ def _key(options: argparse.Namespace) -> bytes:
 
 
 def _settings(options: argparse.Namespace) -> LinkSettings:
-    flat: dict[str, object] = {}
-    for text in options.set:
-        name, equals, value = text.partition('=')
-        if not equals:
-            raise SettingError(f'--set must be NAME=VALUE: got {text}')
-        flat[name.removeprefix('link.')] = _value(name, value)
-    return LinkSettings.from_flat(flat)
-
-
-def _value(name: str, text: str) -> object:
-    """Return the number or truth that a text stands for, else the text."""
-    if text in ('true', 'false'):
-        return text == 'true'
-    if name.removeprefix('link.') in ('rate', 'power', 'address'):
-        return text  # of digits, but no numbers
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            pass
-    return text
+    texts = [text.removeprefix('link.') for text in options.set]
+    return LinkSettings.from_flat(from_words(LinkSettings, texts))
 
 
 def _number(low: float, high: float) -> Callable[[str], float]:

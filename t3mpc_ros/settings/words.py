@@ -1,0 +1,40 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Settings as they are written on a command line: ``NAME=VALUE``."""
+
+import ast
+from collections.abc import Iterable
+
+from t3mpc_ros.settings.table import SettingError, Settings
+
+_TRUTHS = {'true': 'True', 'false': 'False'}
+"""Parameters are written so elsewhere, and Python writes them otherwise."""
+
+
+def from_words(table: type[Settings], texts: Iterable[str]) -> dict[str, object]:
+    """Return values by name for :meth:`Settings.from_flat`, which checks them.
+
+    What the table has as text stays text, even if it looks like a number; an unknown name is left
+    to be refused.
+
+    Raises
+    ------
+    SettingError
+        A text is not ``NAME=VALUE``.
+    """
+    texts_only = {row.name for row in table.rows() if row.kind is str and not row.many}
+    found: dict[str, object] = {}
+    for text in texts:
+        name, sign, value = text.partition('=')
+        if not sign or not name:
+            raise SettingError(f'--set must be NAME=VALUE: got {text!r}')
+        found[name] = value if name in texts_only else _value(value)
+    return found
+
+
+def _value(text: str) -> object:
+    """Return what a text stands for, else the text."""
+    try:
+        return ast.literal_eval(_TRUTHS.get(text, text))
+    except (SyntaxError, ValueError):
+        return text
