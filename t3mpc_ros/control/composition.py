@@ -4,6 +4,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -174,6 +175,22 @@ def compose(
     return True
 
 
+@kernel
+def note_applied(terms: Array, acceleration: Array, command: Array, rows: Array) -> bool:
+    """Write the v_p that was applied where a limit cut u; return False if it is not finite.
+
+    terms, command : of :func:`compose`
+    acceleration   : shape (2,), what the limits made of the command, rad/s²
+    rows           : :class:`t3mpc_ros.mpc.response.Signals` of the predictive term
+    """
+    predictive = signals_in(rows)
+    for i in range(acceleration.size):
+        predictive.applied[i] = terms[4, i] + (acceleration[i] - command[i])
+        if not math.isfinite(predictive.applied[i]):
+            return False
+    return True
+
+
 class ComposedLaw:
     """Computes the wheel accelerations that make two wheels follow a reference.
 
@@ -206,6 +223,8 @@ class ComposedLaw:
         """The law's terms of the last step, rows as in ``law.TERMS``, rad/s²."""
         self.command: Array = np.zeros(2)
         """Their sum u, rad/s²."""
+        self.frozen = False
+        """Whether a limit cut the last command."""
         self._gains = self._make_gains()
         self.reset()
 
@@ -215,6 +234,7 @@ class ComposedLaw:
         self.predictive.warm_up()
         coefficients = self.fuzzy.coefficients
         self.step(np.zeros(2), np.zeros(2), np.zeros(2), self._period)
+        self.applied(self.command, limited=True)
         self.fuzzy.reset()
         self.fuzzy.coefficients = coefficients
         self.reset()
@@ -268,7 +288,13 @@ class ComposedLaw:
         """Start a new run; what was learnt is kept."""
         self.predictive.reset()
         self._certificate.reset()
-        self._frozen = False
+        self.frozen = False
+
+    @property
+    def tables(self) -> tuple[Array, ...]:
+        """What :func:`compose` reads and writes beside its inputs, in its order."""
+        remembered = self._certificate.remembered
+        return self._gains, *self.fuzzy.tables, self._work, self.terms, self.command, remembered
 
     @property
     def watched(self) -> Array:
@@ -315,7 +341,7 @@ class ComposedLaw:
             wanted_rate,
             self.predictive.rows,
             dt,
-            self._frozen,
+            self.frozen,
             self._gains,
             *self.fuzzy.tables,
             self._work,
@@ -337,10 +363,11 @@ class ComposedLaw:
             Whether a limit cut the command: the error is then not the estimate's fault, so
             adaptation pauses, and the predictor is told that less of v_p arrived.
         """
-        self._frozen = limited
-        if limited:
-            wanted = self.terms[4]
-            self.predictive.notify_applied(wanted + (acceleration - self.command))
+        self.frozen = limited
+        if limited and not note_applied(
+            self.terms, acceleration, self.command, self.predictive.rows
+        ):
+            raise ValueError(f'acceleration must be finite: got {acceleration}')
 
     def _make_gains(self) -> Array:
         settings, law, adaptation = self._settings, self._settings.law, self._settings.adaptation

@@ -4,8 +4,8 @@
 
 from collections import deque
 from dataclasses import dataclass
+from itertools import count
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +13,18 @@ from numpy.typing import NDArray
 from t3mpc_ros.control.composition import ComposedLaw, CompositionSettings
 from t3mpc_ros.control.drive import Drive, LimitSettings
 from t3mpc_ros.control.freshness import Following, Freshness, FreshnessSettings, Reason
-from t3mpc_ros.control.law import CertificateReading
+from t3mpc_ros.control.march.answers import Answers, Status
+from t3mpc_ros.control.march.plain import NEVER, Parts, PlainSteps
+from t3mpc_ros.control.march.stretch import APPLIED, ERROR
 from t3mpc_ros.control.pursuit import Pursuit, look
 from t3mpc_ros.motion import BodyTwist, Geometry, Motion, WheelSpeeds
 from t3mpc_ros.motion.kinematics import wheels_from_body
-from t3mpc_ros.motion.track import Jump, Track
+from t3mpc_ros.motion.sequence import Motions
+from t3mpc_ros.motion.track import Jump, Stamps, Track
 from t3mpc_ros.motion.words import NANOSECONDS, ORIGIN, STANDSTILL
 from t3mpc_ros.settings import nested
+
+__all__ = ['Controller', 'ControllerSettings', 'Status']
 
 Array = NDArray[np.float64]
 
@@ -40,34 +45,6 @@ class ControllerSettings(CompositionSettings):
     geometry: Geometry = nested(Geometry)
     limits: LimitSettings = nested(LimitSettings)
     freshness: FreshnessSettings = nested(FreshnessSettings)
-
-
-class Status(NamedTuple):
-    """What the controller decided at one step, and why; arrays are right wheel first."""
-
-    stamp_ns: int
-    reason: Reason
-    error: Array
-    """delta = chi - r, rad/s; NaN while no reference is known."""
-    terms: Array
-    """Shape (5, 2), rows as in ``law.TERMS``, rad/s²."""
-    applied: Array
-    """Wheel accelerations after the limits, rad/s²."""
-    watched: Array
-    """What the certificate remembers, see :func:`t3mpc_ros.control.law.update_certificate`."""
-    skill: Array
-    limited: bool
-
-    @property
-    def estimate(self) -> Array:
-        """G of the fuzzy systems, rad/s², shape (2,)."""
-        estimate: Array = 0.0 - self.terms[0]
-        return estimate
-
-    @property
-    def certificate(self) -> CertificateReading:
-        """What the run-time certificate says."""
-        return CertificateReading.of(self.watched)
 
 
 class Controller:
@@ -98,6 +75,7 @@ class Controller:
         self._before: deque[tuple[Array, list[Array]]] = deque(maxlen=COPIES)
         """What had been learnt, from oldest to newest."""
         self._since_copy = 0
+        self._copy_after = next(n for n in count(1) if n * self._period >= KEPT)
         self._jumps: list[Jump] = []
         self._told: set[int] = set()
         self._moving = False
@@ -238,6 +216,41 @@ class Controller:
         self.status = self._status(stamp, reason, drive.speeds - wanted, applied)
         return drive.twist, self.status
 
+    def march(self, measured: Motions, references: Motions, rows: Stamps, answers: Answers) -> int:
+        """Do many steps of a recorded run; return how many of them were plain.
+
+        The same as :meth:`add_reference` and :meth:`step` one after the other, to the last bit.
+        Plain steps, at which a robot follows a reference that does not jump, are done in compiled
+        stretches; the first stretch ever is compiled before.
+
+        Parameters
+        ----------
+        measured, references
+            Odometry and wanted motions.
+        rows
+            For each step its odometry message, and from where to where references are handed
+            over before it, shape (n, 3).
+        answers
+            Its n rows are overwritten.
+
+        Raises
+        ------
+        ValueError
+            A number has come to be infinite or NaN; the controller cannot be used further.
+        """
+        k = plain = 0
+        while k < len(rows):
+            taken, handed = self._go_on(measured, references, rows, k, answers)
+            k, plain = k + taken, plain + taken
+            if k == len(rows):
+                break
+            heard, begin, end = rows[k].tolist()
+            for j in range(max(begin, handed), end):
+                self.add_reference(references[j])
+            answers.note(k, *self.step(measured[heard]))
+            k += 1
+        return plain
+
     def _insist(self, stamp_ns: int) -> tuple[BodyTwist, Status]:
         """Go on commanding the reference to a robot that does not follow, and learn nothing.
 
@@ -256,10 +269,49 @@ class Controller:
         self.status = self._status(stamp_ns, Reason.NOT_FOLLOWING, error)
         return self._drive.twist, self.status
 
-    def _keep(self) -> None:
+    def _go_on(
+        self, measured: Motions, references: Motions, rows: Stamps, first: int, answers: Answers
+    ) -> tuple[int, int]:
+        """Do plain steps from a row on; return how many, and up to where references are kept."""
+        handed, switches = int(rows[first, 1]), self.settings.switches
+        jumps = {jump.stamp_ns for jump in self._jumps}
+        seen = self._speeds, self._wanted, self._begin, self._end
+        acting = self._track, self._pursuit, self._drive, self._freshness, self._following
+        parts = Parts(*acting, seen, self._looking)
+        if not (
+            self._moving
+            and self.status.reason is Reason.TRACKING
+            and self._last_stamp_ns is not None
+            and switches.crossing == 'ramp'
+            and self._told <= jumps
+            # What is to be seen beforehand waits for the sample after it.
+            and (self._told == jumps or not switches.preview)
+            and parts.are_plain
+        ):
+            return 0, handed
+        # One that is told of is forgotten when a command acts after it, another is told when seen.
+        due_ns = min((t + self._dead_ns * (t not in self._told) for t in jumps), default=NEVER)
+        when = self._last_stamp_ns, self._dead_ns, due_ns
+        steps = PlainSteps(parts, self.settings.freshness, measured, references, handed, *when)
+        k = until = first
+        while k == until < len(rows):
+            until = min(len(rows), k + self._copy_after - self._since_copy)
+            taken = steps.run(rows, k, until, answers.numbers)
+            k += taken
+            self._keep(taken)
+        done = answers.numbers[first:k]
+        steps.finish(done)
+        if len(done):
+            answers.follows(first, k)
+            self._last_stamp_ns = steps.last_ns
+            error, applied = done[-1, ERROR:][:2].copy(), done[-1, APPLIED:][:2].copy()
+            self.status = self._status(steps.last_ns, Reason.TRACKING, error, applied)
+        return len(done), steps.handed
+
+    def _keep(self, steps: int = 1) -> None:
         """Copy what is learnt, now and then."""
-        self._since_copy += 1
-        if self._since_copy * self._period >= KEPT:
+        self._since_copy += steps
+        if self._since_copy >= self._copy_after:
             self._since_copy = 0
             self._before.append(self.law.copies())
 

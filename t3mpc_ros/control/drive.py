@@ -213,6 +213,22 @@ class Drive:
         return self._felt * self._estimator.unexplained
 
     @property
+    def estimator(self) -> SpeedEstimator:
+        """What estimates the wheel speeds."""
+        return self._estimator
+
+    @property
+    def tables(self) -> tuple[Array, Array, float, float, Array]:
+        """What :func:`choose_command` reads and writes beside its inputs, in its order."""
+        return (
+            self.command,
+            self._limits,
+            self._period,
+            self._period / self._share,
+            self.applied,
+        )
+
+    @property
     def dead_time(self) -> float:
         """Time until the next command begins to act, s."""
         return self._estimator.dead_time

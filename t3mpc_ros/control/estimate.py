@@ -235,6 +235,13 @@ class SpeedEstimator:
         return row
 
     @property
+    def tables(self) -> tuple[Array, Array, bool, Array, bool, float, float, float]:
+        """What :func:`observe` reads and writes beside its inputs, in its order."""
+        how, velocity = self._settings, self._velocity
+        filtered = self.known, self._commands, how.enabled, self._gain
+        return *filtered, velocity, self._late, how.lag, self._period
+
+    @property
     def gain(self) -> Array:
         """Stationary Kalman gain: share of the innovation given to chi (1) and to d (1/s)."""
         return self._gain

@@ -6,8 +6,13 @@ from collections import deque
 from dataclasses import dataclass
 import enum
 
+import numpy as np
+from numpy.typing import NDArray
+
 from t3mpc_ros.motion.words import NANOSECONDS
 from t3mpc_ros.settings import Settings, setting
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -163,6 +168,21 @@ class Freshness:
         self._held_until_ns = None
         return Reason.TRACKING
 
+    @property
+    def held(self) -> bool:
+        """Whether the robot is stopped by request or after a diverging state."""
+        return not self.enabled or self._held_until_ns is not None
+
+    @property
+    def reference_seen(self) -> tuple[int | None, bool]:
+        """At which odometry stamp the last reference counted (ns), and whether one waits."""
+        return self._reference_seen_ns, self._reference_waiting
+
+    def went_on(self, stamp_ns: int, seen_ns: int, *, waiting: bool) -> None:
+        """Take note of odometry at which all was well, and of :attr:`reference_seen`."""
+        self._odometry_ns = stamp_ns
+        self._reference_seen_ns, self._reference_waiting = seen_ns, waiting
+
     def silent(self, last_heard_ns: int | None, now_ns: int) -> bool:
         """Whether the odometry has gone silent, both times from one and the same clock."""
         if last_heard_ns is None:
@@ -197,6 +217,26 @@ class Following:
         self._commands.clear()
         self._against = 0
         self.holds = True
+
+    @property
+    def newest(self) -> tuple[float, float] | None:
+        """What was commanded last, rad/s; None when that is forgotten."""
+        return self._commands[-1] if self._commands else None
+
+    @property
+    def window(self) -> int:
+        """How many commands are remembered at most."""
+        return self._commands.maxlen or 0
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """How many commands are remembered, and how much speaks against what holds."""
+        return len(self._commands), self._against
+
+    def went_on(self, commands: Array, against: int) -> None:
+        """Take note of commands (rad/s, shape (n, 2)) that the robot was seen to follow."""
+        self._commands.extend(map(tuple, commands[-self.window :].tolist()))
+        self._against = against
 
     def told(self, right: float, left: float) -> None:
         """Note what is commanded now, rad/s."""

@@ -208,7 +208,8 @@ class SwitchPlan:
         self._settings = settings
         self._lag = lag
         self._period = period
-        self._count = 0
+        self.count = 0
+        """Crossings that are not over."""
         self._crossings: Array = np.zeros((8, 3, 2))
         self._instants: Stamps = np.zeros(8, dtype=np.int64)
         self._has_passed: Flags = np.zeros(8, dtype=np.bool_)
@@ -224,8 +225,23 @@ class SwitchPlan:
 
     def reset(self) -> None:
         """Forget every jump: rbar is r."""
-        self._count = 0
+        self.count = 0
         self._sums[:] = 0.0
+
+    @property
+    def tables(self) -> tuple[Array, Stamps, Flags, Array, float, float, float, Array, Array]:
+        """What :func:`step_plan` reads and writes but its inputs and the count, in its order."""
+        return (
+            self._crossings,
+            self._instants,
+            self._has_passed,
+            self._sums,
+            self._period,
+            self._lag,
+            self._settings.acceleration,
+            self.followed,
+            self.rate,
+        )
 
     @property
     def offset(self) -> Array:
@@ -242,7 +258,7 @@ class SwitchPlan:
     @property
     def crossing(self) -> bool:
         """Whether rbar differs from r."""
-        return self._count > 0
+        return self.count > 0
 
     def known_change(self, now_ns: int, span: float, rows: int) -> Array:
         """Return the jumps of delta = chi - r still to come, shape (rows, 2), rad/s.
@@ -251,7 +267,7 @@ class SwitchPlan:
         :meth:`t3mpc_ros.mpc.predictive.PredictiveTerm.step` takes them into Psi_free (56).
         """
         change = np.zeros((rows, 2))
-        for k in range(self._count):
+        for k in range(self.count):
             ahead = (int(self._instants[k]) - now_ns) / NANOSECONDS
             row = math.ceil(ahead / span - 1e-9) - 1
             if 0 <= row < rows:
@@ -261,12 +277,12 @@ class SwitchPlan:
     def take_passed(self, now_ns: int) -> Array:
         """Return the sum of the jumps up to ``now_ns`` (rad/s), shape (2,), and forget them."""
         total = np.zeros(2)
-        for k in reversed(range(self._count)):
+        for k in reversed(range(self.count)):
             if self._instants[k] <= now_ns:
                 total += self._crossings[k, JUMP]
                 for table in (self._crossings, self._instants, self._has_passed):
-                    table[k : self._count - 1] = table[k + 1 : self._count].copy()
-                self._count -= 1
+                    table[k : self.count - 1] = table[k + 1 : self.count].copy()
+                self.count -= 1
         return total
 
     def announce(self, instant_ns: int, jump: Array, slope_after: Array) -> None:
@@ -281,7 +297,7 @@ class SwitchPlan:
         slope_after
             r' after it, rad/s², shape (2,).
         """
-        k = self._count
+        k = self.count
         if k == len(self._instants):
             self._crossings = np.concatenate((self._crossings, np.zeros_like(self._crossings)))
             self._instants = np.concatenate((self._instants, np.zeros_like(self._instants)))
@@ -289,11 +305,11 @@ class SwitchPlan:
         self._crossings[k] = (jump, slope_after, (0.0, 0.0))
         self._instants[k] = instant_ns
         self._has_passed[k] = False
-        self._count += 1
+        self.count += 1
 
     def withdraw(self, instant_ns: int) -> None:
         """Take back the jumps announced for ``instant_ns`` or later: r will not jump after all."""
-        for k in range(self._count):
+        for k in range(self.count):
             if not self._has_passed[k] and self._instants[k] >= instant_ns:
                 self._crossings[k, JUMP] = 0.0
                 self._instants[k] = instant_ns
@@ -309,11 +325,11 @@ class SwitchPlan:
         wanted, wanted_next
             r at that instant and a period later, with its jumps, rad/s, shape (2,).
         """
-        self._count = step_plan(
+        self.count = step_plan(
             self._crossings,
             self._instants,
             self._has_passed,
-            self._count,
+            self.count,
             self._sums,
             now_ns,
             wanted,

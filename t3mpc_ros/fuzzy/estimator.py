@@ -77,8 +77,8 @@ class FuzzyEstimator:
         if outputs < 1:
             raise ValueError(f'outputs must be at least 1: got {outputs}')
         self._sets = build_sets(settings, inputs)
-        self._grades = np.empty(self._sets.widths.shape)
-        self._firings = np.empty((self._sets.rules, self._sets.slices, 2, 2))
+        self._grades = np.zeros(self._sets.widths.shape)
+        self._firings = np.zeros((self._sets.rules, self._sets.slices, 2, 2))
         self._phi: Array = np.zeros(self._sets.size)
         self._coefficients: Array = np.zeros((outputs, self._sets.size))
         self.tables: Tables = (

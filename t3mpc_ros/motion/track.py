@@ -168,6 +168,16 @@ class Track:
         return True
 
     @property
+    def capacity(self) -> int:
+        """Most samples kept."""
+        return self._capacity
+
+    def went_on(self, first: int, end: int) -> None:
+        """Take note that a kernel has added samples, none of them a jump."""
+        self.first, self.end = first, end
+        self.newest_ns = int(self.stamps[end - 1])
+
+    @property
     def jumped(self) -> bool:
         """Whether :meth:`take_jumps` has any to return."""
         return bool(self._jumps)

@@ -5,6 +5,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,9 +85,26 @@ class PredictiveTerm:
         self.relearn()
 
     @property
+    def tables(self) -> tuple[Any, ...]:
+        """What :func:`renew` reads and writes but the count of samples, in its order.
+
+        No jump of the error is known in it.
+        """
+        timing, change = self._timing, self._no_change
+        seen = self._stores, self._sizes, self.rows, self._tables, self._nominal_response
+        how = timing.average, timing.every, self._decay, self._rules, self._how_told
+        return *seen, self._decays, change, *how, self._numbers, self._whole, self.status
+
+    def went_on(self, phase: int, samples: int) -> None:
+        """Take note that kernels have gone on with :attr:`tables`: up to where."""
+        self.phase, self.samples = phase, samples
+        self._skill = self.rows[_SKILLS].copy()
+
+    @property
     def skill(self) -> Array:
         """Skill against persistence in the middle of the horizon, shape (outputs,): read only."""
-        return self._skill
+        skill: Array = self._skill
+        return skill
 
     @property
     def skill_next(self) -> Array:
@@ -141,7 +159,7 @@ class PredictiveTerm:
         self._how = Learning.of(settings, self._timing.span)
         self._how_told = np.array(self._how, dtype=np.float64)
         self._rules = np.array(Rules.of(settings), dtype=np.float64)
-        self._dithered = settings.enabled and settings.dither > 0.0
+        self.dithered = settings.enabled and settings.dither > 0.0
 
     def relearn(self, errors: Array | None = None, moves: Array | None = None) -> None:
         """Make new machines and teach them from the beginning, then :meth:`reset`.
@@ -196,8 +214,10 @@ class PredictiveTerm:
         self._tables[:] = 0.0
         self._generator = np.random.default_rng((self.settings.seed, 1))
         self.status[:] = OPTIMAL
-        self._phase = 0
-        self._samples = 0
+        self.phase = 0
+        """Control periods since the last sample, below ``settings.every``."""
+        self.samples = 0
+        """Samples taken."""
         for predictor in self._predictors:
             begin(predictor.past, 0.0)
         self._skill = np.array([skill(predictor.past, 1) for predictor in self._predictors])
@@ -305,13 +325,13 @@ class PredictiveTerm:
 
     def advance(self, speeds: Array, wanted: Array, known_change: Array | None = None) -> None:
         """Renew ``rows`` as :meth:`step` does with speeds - wanted; shapes are not checked."""
-        timing, phase = self._timing, self._phase
+        timing, phase = self._timing, self.phase
         sampled = phase == 0 or phase > timing.every - timing.average
         if not gather(speeds, wanted, sampled, phase == 0, self._decay, self.rows):
             raise ValueError(f'errors must be finite: got {speeds - wanted}')
         if phase == 0:
             self._renew(self._no_change if known_change is None else known_change)
-        self._phase = (phase + 1) % timing.every
+        self.phase = (phase + 1) % timing.every
 
     @property
     def known_error(self) -> Array:
@@ -327,11 +347,11 @@ class PredictiveTerm:
     @property
     def due(self) -> bool:
         """Whether the next :meth:`step` solves the program, and reads ``known_change``."""
-        return self._phase == 0
+        return self.phase == 0
 
     def _renew(self, change: Array) -> None:
         """Take the sample of each output, and renew its v_p."""
-        if self._dithered:
+        if self.dithered:
             drawn = self._generator.uniform(-1.0, 1.0, self.status.size)
             self.rows[_DRAWN] = self.settings.dither * drawn
         timing = self._timing
@@ -343,7 +363,7 @@ class PredictiveTerm:
             self._nominal_response,
             self._decays,
             change,
-            self._samples,
+            self.samples,
             timing.average,
             timing.every,
             self._decay,
@@ -354,4 +374,4 @@ class PredictiveTerm:
             self.status,
         )
         self._skill = self.rows[_SKILLS].copy()
-        self._samples += 1
+        self.samples += 1

@@ -60,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
     """
     from t3mpc_ros.lab.rerun.compare import compare
     from t3mpc_ros.lab.rerun.inputs import load_inputs
-    from t3mpc_ros.lab.rerun.rerun import OPEN_LOOP, rerun
+    from t3mpc_ros.lab.rerun.rerun import OPEN_LOOP, rerun, start
     from t3mpc_ros.lab.rerun.tape import write_rerun
     from t3mpc_ros.lab.rerun.what_if import rerun_rival
     from t3mpc_ros.record.model import load_model
@@ -71,14 +71,20 @@ def run(options: argparse.Namespace) -> int:
     inputs = load_inputs(options.bag, options.namespace, model)
     read = time.perf_counter()
     if options.rival:
+        ready = read
         again = rerun_rival(inputs, options.rival, changes)
     else:
-        again = rerun(inputs, changes)
+        controllers = start(inputs, changes)
+        ready = time.perf_counter()
+        again = rerun(inputs, changes, controllers)
     end = time.perf_counter()
+    reading, starting, running = read - begin, ready - read, end - ready
     span = again.steps / again.settings.rate
+    whole, alone = span / (reading + running), span / running
     print(
-        f'{again.steps} steps, {span:.1f} s of control, in {end - begin:.2f} s: '
-        f'{span / (end - begin):.0f} x real time, {span / (end - read):.0f} x without reading'
+        f'{again.steps} steps, {span:.1f} s of control, in {reading + running:.2f} s: '
+        f'{whole:.0f} x real time, {alone:.0f} x without reading'
+        + (f'; {starting:.2f} s to compile and to warm up are not counted' if starting else '')
     )
     print(compare(inputs, again).table())
     if options.rival or changes or options.model:

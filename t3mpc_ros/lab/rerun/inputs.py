@@ -5,7 +5,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from itertools import repeat
 from pathlib import Path
 import tempfile
 import zlib
@@ -18,7 +17,7 @@ from t3mpc_ros.control.law import TERMS
 from t3mpc_ros.lab.report.topics import COMMAND, ODOMETRY, REFERENCE, WHEELS, find_topics
 from t3mpc_ros.lab.rerun.alignment import Taken, by_receipt, commands_of, match, rows_of
 from t3mpc_ros.lab.training.replay import recorded_settings
-from t3mpc_ros.motion import BodyTwist, Motion, Pose
+from t3mpc_ros.motion.sequence import Motions
 from t3mpc_ros.motion.words import NANOSECONDS
 from t3mpc_ros.record.model import load_model
 from t3mpc_ros.record.reader import open_recording
@@ -168,7 +167,7 @@ def load_inputs(
     )
 
 
-def motions(column: Column) -> list[Motion]:
+def motions(column: Column) -> Motions:
     """Return odometry messages in the controller's own words."""
     x, y, qx, qy, qz, qw, linear, angular = column.numbers.T
     with np.errstate(over='ignore', invalid='ignore'):
@@ -176,12 +175,8 @@ def motions(column: Column) -> list[Motion]:
         cosine = 1.0 - 2.0 * (qy * qy + qz * qz)
         heading = np.arctan2(sine, cosine)
     heading[~(np.isfinite(sine) & np.isfinite(cosine))] = np.nan
-    # As the named tuples make themselves, without a call of Python for each.
-    make = tuple.__new__
-    poses = map(make, repeat(Pose), zip(x.tolist(), y.tolist(), heading.tolist(), strict=True))
-    twists = map(make, repeat(BodyTwist), zip(linear.tolist(), angular.tolist(), strict=True))
-    table = zip(column.stamps_ns.tolist(), poses, twists, strict=True)
-    return list(map(make, repeat(Motion), table))
+    poses, twists = np.stack([x, y, heading], axis=1), np.stack([linear, angular], axis=1)
+    return Motions(column.stamps_ns, poses, twists)
 
 
 Revision = tuple[int, int, Mapping[str, object]]

@@ -24,6 +24,7 @@ from t3mpc_ros.lab.rivals.rival import Knowledge, Rival, View
 from t3mpc_ros.lab.trial.loop import MethodSpec
 from t3mpc_ros.motion import BodyTwist, Motion
 from t3mpc_ros.motion.kinematics import wheels_from_body
+from t3mpc_ros.motion.sequence import Motions
 from t3mpc_ros.motion.track import Track
 from t3mpc_ros.motion.words import NANOSECONDS
 from t3mpc_ros.robot.simulated import SimulatedRobotSettings
@@ -61,8 +62,8 @@ def _live(
     life: Life,
     method: MethodSpec,
     ours: Rerun,
-    odometry: list[Motion],
-    references: list[Motion],
+    odometry: Motions,
+    references: Motions,
     answers: Mapping[str, Array],
 ) -> None:
     """Write the answers of one life."""

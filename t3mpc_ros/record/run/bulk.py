@@ -92,10 +92,25 @@ class _Gathered:
     """The messages of one topic that wait in the buffer."""
 
     layout: Layout
+    pairs: list[bytes] = field(default_factory=list)
+    """As :func:`~t3mpc_ros.record.run.catalogue.blocks` yields them; then the next two."""
+    blocks: list[int] = field(default_factory=list)
+    """Where in the buffer their blocks begin."""
     received: list[Integers] = field(default_factory=list)
     starts: list[Integers] = field(default_factory=list)
     """Of the records in the buffer."""
     parts: list[tuple[Integers, Integers, Integers, NDArray[Any]]] = field(default_factory=list)
+
+    def settle(self) -> None:
+        """Turn pairs into times of receipt and starts, all at once: most are a few messages."""
+        if not self.pairs:
+            return
+        table = np.frombuffer(b''.join(self.pairs), '<i8').reshape(-1, 2)
+        counts = [len(each) // 16 for each in self.pairs]
+        self.received.append(table[:, 0])
+        self.starts.append(table[:, 1] + np.repeat(self.blocks, counts))
+        self.pairs.clear()
+        self.blocks.clear()
 
 
 def read_columns(held: Catalogue, topics: Iterable[str]) -> dict[str, Column]:
@@ -172,9 +187,9 @@ def _gathered(held: Catalogue, waiting: Mapping[str, _Gathered]) -> Iterator[Byt
         buffers: list[bytes] = []
         size = 0
         for data, found in blocks(path, summary, waiting.keys()):
-            for name, received, starts in found:
-                waiting[name].received.append(received)
-                waiting[name].starts.append(starts + size)
+            for name, pairs in found:
+                waiting[name].pairs.append(pairs)
+                waiting[name].blocks.append(size)
             buffers.append(data)
             size += len(data)
             if size >= GROUP:
@@ -187,6 +202,8 @@ def _gathered(held: Catalogue, waiting: Mapping[str, _Gathered]) -> Iterator[Byt
 def _joined(path: Path, buffers: list[bytes], waiting: Mapping[str, _Gathered]) -> Bytes:
     """Return one buffer, after looking whether messages begin where the indexes say so."""
     size = sum(map(len, buffers))
+    for each in waiting.values():
+        each.settle()
     # What is read beyond the end of the last message, before its length is checked.
     data = np.frombuffer(b''.join([*buffers, bytes(SPARE)]), dtype=np.uint8)
     starts = _all(each.starts for each in waiting.values())

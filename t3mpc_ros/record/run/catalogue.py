@@ -19,20 +19,19 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Chunk
 from mcap.stream_reader import get_chunk_data_stream
-import numpy as np
-from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from t3mpc_ros.record.mcap_file import SUFFIX
 from t3mpc_ros.record.reader import open_recording
+from t3mpc_ros.record.run.summary import read_summary, read_tables
 from t3mpc_ros.record.schema import RecordError
 from t3mpc_ros.record.writer import DataError
 
-Integers = NDArray[np.int64]
-Found = list[tuple[str, Integers, Integers]]
-"""Topic, times of receipt (ns), and where in a block its messages begin: opcode and length
-(9 bytes), channel and counter (6), receipt and publication (16), then what was serialised."""
+Found = list[tuple[str, bytes]]
+"""Topic, and of each of its messages two numbers of 8 bytes, little-endian, as they are in the
+file: time of receipt (ns), and where in a block it begins: opcode and length (9 bytes), channel
+and counter (6), receipt and publication (16), then what was serialised."""
 Blocks = Iterator[tuple[bytes, Found]]
 
 _INDEX = struct.Struct('<BQHI')
@@ -66,26 +65,24 @@ def catalogue(bag: Path) -> Catalogue:
         There is no bag, or one that is damaged.
     """
     paths = [bag] if bag.is_file() else sorted(bag.glob(f'*{SUFFIX}'))
-    summaries = [(path, _summary(path, alone=bag.is_file())) for path in paths]
-    files = tuple((path, summary) for path, summary in summaries if summary is not None)
+    tables: dict[str, Mapping[str, str]] = {}
+    found = [(path, *_summary(path, alone=bag.is_file())) for path in paths]
+    found = [each for each in found if each[1] is not None]
+    files = tuple((path, summary) for path, summary, _ in found)
     if not files or not all(_indexed(summary) for _, summary in files):
         return _slow_catalogue(bag)
     types: dict[str, str] = {}
     counts: dict[str, int] = {}
-    details: dict[str, dict[str, str]] = {}
     starts = []
-    for path, summary in sorted(files, key=lambda file: _start(file[1])):
+    for _, summary, own in sorted(found, key=lambda file: _start(file[1])):
         if summary.statistics.message_count:
             starts.append(_start(summary))
         for channel in summary.channels.values():
             types[channel.topic] = summary.schemas[channel.schema_id].name
             count = summary.statistics.channel_message_counts.get(channel.id, 0)
             counts[channel.topic] = counts.get(channel.topic, 0) + count
-        with path.open('rb') as file, _readable(path):
-            for item in make_reader(file).iter_metadata():
-                if item.name != 'rosbag2':
-                    details[item.name] = dict(item.metadata)
-    return Catalogue(types, counts, details, min(starts, default=0), files)
+        tables |= own
+    return Catalogue(types, counts, tables, min(starts, default=0), files)
 
 
 def blocks(path: Path, summary: Any, topics: Collection[str]) -> Blocks:
@@ -110,17 +107,27 @@ def attachments(held: Catalogue) -> dict[str, bytes]:
     return found
 
 
-def _summary(path: Path, *, alone: bool) -> Any:
-    """Return the summary of a file; None for one of a folder that has none: it broke off."""
+def _summary(path: Path, *, alone: bool) -> tuple[Any, dict[str, Mapping[str, str]]]:
+    """Return the summary of a file, and its tables of text by title.
+
+    The summary is None for a file of a folder that has none: it broke off.
+    """
+    tables: dict[str, Mapping[str, str]] = {}
     if path.suffix != SUFFIX:
-        return None
-    try:
-        with path.open('rb') as file, _readable(path):
-            return make_reader(file).get_summary()
-    except RecordError:
-        if alone:
-            raise
-        return None
+        return None, tables
+    with path.open('rb') as file:
+        try:
+            with _readable(path):
+                summary = read_summary(file)
+        except RecordError:
+            if alone:
+                raise
+            return None, tables
+        if summary is not None:
+            with _readable(path):
+                tables |= read_tables(file, summary)
+                tables.pop('rosbag2', None)
+    return summary, tables
 
 
 def _slow_catalogue(bag: Path) -> Catalogue:
@@ -158,10 +165,11 @@ def _chunks(path: Path, summary: Any, topics: Collection[str]) -> Blocks:
                 if channel in names:
                     at = offset - index.chunk_start_offset
                     opcode, _, owner, size = _INDEX.unpack_from(raw, at)
-                    if opcode != Opcode.MESSAGE_INDEX or owner != channel:
+                    pairs = raw[at + _INDEX.size : at + _INDEX.size + size]
+                    whole = len(pairs) == size and size % 16 == 0
+                    if opcode != Opcode.MESSAGE_INDEX or owner != channel or not whole:
                         raise DataError(f'{path}: the index of {names[channel]} is damaged')
-                    pairs = np.frombuffer(raw, '<i8', size // 8, at + _INDEX.size)
-                    found.append((names[channel], pairs[::2], pairs[1::2]))
+                    found.append((names[channel], pairs))
             yield _opened(raw[: index.chunk_length]), found
 
 
@@ -176,18 +184,19 @@ def _opened(record: bytes) -> bytes:
 
 def _slowly(path: Path, topics: Collection[str]) -> Blocks:
     """Yield one block in the form of a chunk from whatever ``rosbags`` can read."""
-    rows: dict[str, list[tuple[int, int]]] = {}
+    rows: dict[str, bytearray] = {}
     data = bytearray()
     with _readable(path):
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
         with reader:
             chosen = [item for item in reader.connections if item.topic in topics]
             for connection, received_ns, message in reader.messages(chosen):
-                rows.setdefault(connection.topic, []).append((received_ns, len(data)))
+                pair = struct.pack('<qq', received_ns, len(data))
+                rows.setdefault(connection.topic, bytearray()).extend(pair)
                 # When it was published nobody says.
                 head = (Opcode.MESSAGE, 22 + len(message), 0, 0, received_ns, received_ns)
                 data += struct.pack('<BQHIQQ', *head) + message
-    yield bytes(data), [(name, *np.array(pairs).T) for name, pairs in rows.items()]
+    yield bytes(data), [(name, bytes(pairs)) for name, pairs in rows.items()]
 
 
 @contextmanager
