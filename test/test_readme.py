@@ -58,7 +58,7 @@ SHORTENED = {
     'scripts/run bag compare runs/<time>/bag --picture divergence.png': ([], False),
     'scripts/run bag recover runs/<time>/bag --output recovered': ([], False),
     'scripts/run bag train runs/<time>/bag --keep-predictor --output model.npz': ([], False),
-    'scripts/run replayer --ros-args -p bags:=[runs/<time>/bag]': ([], False),
+    'scripts/run replayer --ros-args -p bags:=[runs/<time>/bag]': (['-p', 'rate:=10.0'], False),
 }
 
 

@@ -26,9 +26,10 @@ def _profile(depth: int, durability: DurabilityPolicy = DurabilityPolicy.VOLATIL
 STREAM = _profile(100)
 """Odometry and reference: every sample counts, and one second of them may pile up."""
 
-REFERENCE = _profile(200, DurabilityPolicy.TRANSIENT_LOCAL)
+REFERENCE = _profile(1000, DurabilityPolicy.TRANSIENT_LOCAL)
 """The reference as it is published: a recorder that finds it later than the controller did must
-miss nothing that the controller knew, or the run cannot be computed again."""
+miss nothing that the controller knew, or the run cannot be computed again. On a busy machine
+discovery has taken more than two seconds."""
 
 COMMAND = _profile(50)
 """Published commands: kept long enough for a recorder to get each one."""
@@ -42,8 +43,8 @@ SCALARS = _profile(20)
 LATCHED = _profile(1, DurabilityPolicy.TRANSIENT_LOCAL)
 """What a late subscriber should still see."""
 
-JOURNAL = _profile(500, DurabilityPolicy.TRANSIENT_LOCAL)
-"""The journal of the controller: a recorder that is slow to find it misses nothing of 5 s."""
+JOURNAL = _profile(1000, DurabilityPolicy.TRANSIENT_LOCAL)
+"""The journal of the controller: a recorder that is slow to find it misses nothing of 10 s."""
 
 REVISIONS = _profile(20, DurabilityPolicy.TRANSIENT_LOCAL)
 """Settings of the controller as they change: the journal speaks of each of them."""
