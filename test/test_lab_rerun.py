@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 from t3mpc_ros.control.controller import ControllerSettings
 from t3mpc_ros.control.freshness import Reason
 from t3mpc_ros.lab.bag.compare import add_compare_parser
-from t3mpc_ros.lab.bag.rerun import add_rerun_parser, settings_from
+from t3mpc_ros.lab.bag.rerun import add_rerun_parser
 from t3mpc_ros.lab.faults.closed_loop import loop_controller
 from t3mpc_ros.lab.rerun.alignment import match
 from t3mpc_ros.lab.rerun.compare import (
@@ -632,13 +632,6 @@ def test_a_rerun_under_other_settings_differs_and_says_that_the_loop_is_open(
 def test_a_picture_is_drawn_of_two_runs_that_agree(inputs, again, tmp_path):
     write_picture(compare(inputs, again), tmp_path / 'same.png')
     assert (tmp_path / 'same.png').read_bytes().startswith(b'\x89PNG')
-
-
-def test_settings_of_the_command_line_are_values():
-    found = settings_from(['a=1', 'b=2.5', 'c=true', 'd=ramp', 'e=(1, 2)'])
-    assert found == {'a': 1, 'b': 2.5, 'c': True, 'd': 'ramp', 'e': (1, 2)}
-    with pytest.raises(ValueError, match="NAME=VALUE: got 'law.gain'"):
-        settings_from(['law.gain'])
 
 
 def test_wrong_tolerances_and_a_missing_bag_are_refused(bag):

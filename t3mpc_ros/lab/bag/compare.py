@@ -8,7 +8,8 @@ from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
-from t3mpc_ros.lab.bag.rerun import add_input_options, settings_from
+from t3mpc_ros.lab.bag.rerun import add_input_options
+from t3mpc_ros.settings.words import from_words
 
 if TYPE_CHECKING:
     from t3mpc_ros.lab.rerun.compare import Tolerances
@@ -49,14 +50,6 @@ def add_compare_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPa
         help='absolute tolerance of one field, or of several by a name with *; may be given again',
     )
     parser.add_argument(
-        '--set',
-        dest='settings',
-        action='append',
-        default=[],
-        metavar='NAME=VALUE',
-        help='compute with another setting than the recorded one',
-    )
-    parser.add_argument(
         '--picture', type=Path, metavar='FILE', help='draw the first divergence as PNG'
     )
     parser.add_argument(
@@ -81,6 +74,7 @@ def run(options: argparse.Namespace) -> int:
     ValueError
         A tolerance or setting cannot be used, or there is no bag.
     """
+    from t3mpc_ros.control.controller import ControllerSettings
     from t3mpc_ros.lab.rerun.compare import compare, compare_bags
     from t3mpc_ros.lab.rerun.golden import write_golden
     from t3mpc_ros.lab.rerun.inputs import load_inputs
@@ -94,7 +88,7 @@ def run(options: argparse.Namespace) -> int:
     if options.bag is None:
         raise ValueError('BAG must be given, or --update-golden')
     tolerances = tolerances_from(options.abs, options.rel, options.fields)
-    changes = settings_from(options.settings)
+    changes = from_words(ControllerSettings, options.settings)
     model = load_model(options.model) if options.model else None
     inputs = load_inputs(options.bag, options.namespace, model)
     if options.other is not None:

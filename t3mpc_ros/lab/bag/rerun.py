@@ -3,10 +3,10 @@
 """``bag rerun``: the recorded inputs through the controller of today, or through another one."""
 
 import argparse
-import ast
-from collections.abc import Sequence
 from pathlib import Path
 import time
+
+from t3mpc_ros.settings.words import from_words
 
 
 def add_rerun_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
@@ -24,14 +24,6 @@ def add_rerun_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPars
         '--output', type=Path, metavar='DIR', help='write a bag of what was computed'
     )
     parser.add_argument(
-        '--set',
-        dest='settings',
-        action='append',
-        default=[],
-        metavar='NAME=VALUE',
-        help='another setting than the recorded one, law.gain=30 say; may be given again',
-    )
-    parser.add_argument(
         '--rival', metavar='NAME', help="a method of the lab in the controller's place"
     )
     add_input_options(parser)
@@ -40,6 +32,14 @@ def add_rerun_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPars
 
 def add_input_options(parser: argparse.ArgumentParser) -> None:
     """Add what says how a bag is taken as the inputs of a controller."""
+    parser.add_argument(
+        '--set',
+        dest='settings',
+        action='append',
+        default=[],
+        metavar='NAME=VALUE',
+        help='another setting than the recorded one, law.gain=30 say; may be given again',
+    )
     parser.add_argument(
         '--model', type=Path, metavar='FILE', help='model file to begin with (default: as the bag)'
     )
@@ -58,6 +58,7 @@ def run(options: argparse.Namespace) -> int:
     SettingError
         A setting is unknown or cannot be used.
     """
+    from t3mpc_ros.control.controller import ControllerSettings
     from t3mpc_ros.lab.rerun.compare import compare
     from t3mpc_ros.lab.rerun.inputs import load_inputs
     from t3mpc_ros.lab.rerun.rerun import OPEN_LOOP, rerun, start
@@ -65,7 +66,7 @@ def run(options: argparse.Namespace) -> int:
     from t3mpc_ros.lab.rerun.what_if import rerun_rival
     from t3mpc_ros.record.model import load_model
 
-    changes = settings_from(options.settings)
+    changes = from_words(ControllerSettings, options.settings)
     model = load_model(options.model) if options.model else None
     begin = time.perf_counter()
     inputs = load_inputs(options.bag, options.namespace, model)
@@ -92,24 +93,3 @@ def run(options: argparse.Namespace) -> int:
     if options.output:
         print(f'written to {write_rerun(inputs, again, options.output)}')
     return 0
-
-
-def settings_from(texts: Sequence[str]) -> dict[str, object]:
-    """Return settings by name from ``NAME=VALUE``; :class:`Settings` checks them.
-
-    Raises
-    ------
-    ValueError
-        A text has no ``=``.
-    """
-    found: dict[str, object] = {}
-    for text in texts:
-        name, sign, value = text.partition('=')
-        if not sign or not name:
-            raise ValueError(f'--set must be NAME=VALUE: got {text!r}')
-        try:
-            # Parameters are written so elsewhere, and Python writes them otherwise.
-            found[name] = ast.literal_eval({'true': 'True', 'false': 'False'}.get(value, value))
-        except (SyntaxError, ValueError):
-            found[name] = value
-    return found
