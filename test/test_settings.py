@@ -2,13 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The one table of settings: what it accepts, what it refuses, and how it says so."""
 
+from argparse import ArgumentTypeError
 from dataclasses import dataclass, replace
 
 import pytest
 
 from t3mpc_ros.radio.link.settings import LinkSettings
 from t3mpc_ros.settings import SettingError, Settings, nested, setting
-from t3mpc_ros.settings.words import from_words
+from t3mpc_ros.settings.words import from_words, number, whole
 
 
 @dataclass(frozen=True)
@@ -95,3 +96,14 @@ def test_words_of_a_command_line_become_what_the_table_asks_for():
         from_words(LinkSettings, ['retries'])
     with pytest.raises(SettingError, match='nothing_such'):
         LinkSettings.from_flat(from_words(LinkSettings, ['nothing_such=1']))
+
+
+def test_numbers_of_a_command_line_are_kept_within_their_bounds():
+    read = number(0.0, 1e6, '1/s²')
+    assert (read('0'), read('1e6'), whole(1, 5)('5')) == (0.0, 1e6, 5)
+    for text in ('-1', '1000001', 'nan', 'inf'):
+        with pytest.raises(ArgumentTypeError, match=f'must be from 0 to 1000000 1/s²: got {text}'):
+            read(text)
+    for text in ('x', '1.5', ''):
+        with pytest.raises(ValueError, match='invalid literal'):
+            whole(1, 5)(text)

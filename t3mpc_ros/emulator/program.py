@@ -18,7 +18,7 @@ from t3mpc_ros.radio.authentication import KeyFileError, read_key
 from t3mpc_ros.radio.host.stop import Stop
 from t3mpc_ros.robot.arena.world import WorldError
 from t3mpc_ros.settings import SettingError
-from t3mpc_ros.settings.words import from_words
+from t3mpc_ros.settings.words import from_words, number
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -79,20 +79,6 @@ def _settings(options: argparse.Namespace) -> EmulatorSettings:
     return EmulatorSettings.from_flat(flat | from_words(EmulatorSettings, options.set))
 
 
-def _share(text: str) -> float:
-    value = float(text)
-    if not 0.0 <= value <= 1.0:
-        raise argparse.ArgumentTypeError(f'must be from 0 to 1: got {text}')
-    return value
-
-
-def _speed(text: str) -> float:
-    value = float(text)
-    if not 0.01 <= value <= 100.0:
-        raise argparse.ArgumentTypeError(f'must be from 0.01 to 100: got {text}')
-    return value
-
-
 def _parser() -> argparse.ArgumentParser:
     faults = '\n'.join(
         f'  {kind.name:<16} {kind.text}' + ('' if math.isnan(kind.value) else f' ({kind.value:g})')
@@ -108,7 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--link', type=Path, required=True, help='path of the port: a symbolic link is put there')
     add('--robot-link', type=Path, help="the same for the USB of the robot's own board: its key")
     add('--world', default='', help='world to drive in; empty: an endless plain')
-    add('--loss', type=_share, default=0.0, help='share of lost packets, each way')
+    add('--loss', type=number(0.0, 1.0), default=0.0, help='share of lost packets, each way')
     add(
         '--fault',
         action='append',
@@ -118,7 +104,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     add('--key', type=Path, help='file with the key of the robot; without: an open link')
     add('--seed', type=int, default=1, help='of everything that is drawn')
-    add('--speed', type=_speed, default=1.0, help='seconds of the robot in a second')
+    add('--speed', type=number(0.01, 100.0), default=1.0, help='seconds of the robot in a second')
     add(
         '--restart-on-open',
         action='store_true',

@@ -13,28 +13,23 @@ from typing import TYPE_CHECKING
 import webbrowser
 
 from t3mpc_ros.lab.bag.report import add_report_parser
+from t3mpc_ros.lab.commands import carry_out
 from t3mpc_ros.lab.faults.command import add_outcomes_parser
 from t3mpc_ros.lab.paper.program import add_parser as add_paper
 from t3mpc_ros.lab.training.command import add_parser as add_train
 from t3mpc_ros.lab.tuning.command import add_parser as add_tune
 from t3mpc_ros.lab.twin.command import add_parser as add_twin
+from t3mpc_ros.settings.words import number, whole
 
 if TYPE_CHECKING:
     from t3mpc_ros.lab.tuning.contestant import Contestant
 
+SECONDS = number(1.0, 86_400.0, 'seconds')
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Return the exit code: 0 done, 1 failed with a reason, 2 wrong command line."""
-    options = _parser().parse_args(arguments)
-    try:
-        code: int = options.run(options)
-    except KeyboardInterrupt:
-        print('stopped', file=sys.stderr)
-        return 130
-    except (OSError, RuntimeError, ValueError) as error:
-        print(f'error: {error}', file=sys.stderr)
-        return 1
-    return code
+    return carry_out(_parser(), arguments)
 
 
 def _demo(options: argparse.Namespace) -> int:
@@ -115,7 +110,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest='command', required=True)
 
     demo = commands.add_parser('demo', help='run all nodes as processes, record, report')
-    demo.add_argument('--duration', type=_seconds, default=60.0, help='seconds (default 60)')
+    demo.add_argument('--duration', type=SECONDS, default=60.0, help='seconds (default 60)')
     demo.add_argument('--output', type=Path, help='folder (default runs/<time>)')
     demo.add_argument('--headless', action='store_true', help='no bar, no browser')
     demo.add_argument('--seed', type=int, help='seed of reference and robot')
@@ -139,16 +134,21 @@ def _parser() -> argparse.ArgumentParser:
     estimation = commands.add_parser(
         'estimation', help='the kinds of fuzzy systems as estimators, without a controller (86)'
     )
-    estimation.add_argument('--seeds', type=_count, default=5, help='runs each (default 5)')
-    estimation.add_argument('--duration', type=_seconds, default=60.0, help='seconds (default 60)')
     estimation.add_argument(
-        '--gain', type=_gain, default=40.0, help='normalised gain of all kinds, 1/s² (default 40)'
+        '--seeds', type=whole(1, 10_000), default=5, help='runs each (default 5)'
+    )
+    estimation.add_argument('--duration', type=SECONDS, default=60.0, help='seconds (default 60)')
+    estimation.add_argument(
+        '--gain',
+        type=number(0.0, 1e6, '1/s²'),
+        default=40.0,
+        help='normalised gain of all kinds, 1/s² (default 40)',
     )
     estimation.add_argument('--json', type=Path, help='also write the numbers to this file')
     estimation.set_defaults(run=_estimation)
 
     exponents = commands.add_parser('exponents', help='Lyapunov exponents of the generator')
-    exponents.add_argument('--duration', type=_seconds, default=200.0, help='system seconds')
+    exponents.add_argument('--duration', type=SECONDS, default=200.0, help='system seconds')
     exponents.set_defaults(run=_exponents)
 
     add_paper(commands)
@@ -166,27 +166,6 @@ def _share(text: str) -> float:
     value = float(text)
     if not 0.0 <= value < 1.0:
         raise argparse.ArgumentTypeError(f'must be from 0 to below 1: got {text}')
-    return value
-
-
-def _seconds(text: str) -> float:
-    value = float(text)
-    if not 1.0 <= value <= 86_400.0:
-        raise argparse.ArgumentTypeError(f'must be from 1 to 86400 seconds: got {text}')
-    return value
-
-
-def _gain(text: str) -> float:
-    value = float(text)
-    if not 0.0 <= value <= 1e6:
-        raise argparse.ArgumentTypeError(f'must be from 0 to 1000000 1/s²: got {text}')
-    return value
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if not 1 <= value <= 10_000:
-        raise argparse.ArgumentTypeError(f'must be from 1 to 10000: got {text}')
     return value
 
 

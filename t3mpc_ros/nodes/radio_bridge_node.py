@@ -16,13 +16,13 @@ import threading
 from typing import Any
 
 from geometry_msgs.msg import Twist, TwistStamped
-from std_srvs.srv import SetBool, Trigger
 
 from t3mpc_ros.motion.words import NANOSECONDS
 from t3mpc_ros.nodes.plumbing import convert, graph, quality
 from t3mpc_ros.nodes.plumbing.package_node import ERROR, OK, WARN, PackageNode
 from t3mpc_ros.nodes.robot.condition import complaints, measures
 from t3mpc_ros.nodes.robot.sensors import count_variance
+from t3mpc_ros.nodes.robot.services import RobotServices
 from t3mpc_ros.nodes.robot.topics import Facts, RobotTopics
 from t3mpc_ros.nodes.tables import RadioBridgeSettings
 from t3mpc_ros.radio.authentication import read_key
@@ -53,8 +53,7 @@ class RadioBridgeNode(PackageNode[RadioBridgeSettings]):
         self._topics = RobotTopics(self, settings, _facts(settings))
         self._type = TwistStamped if settings.stamped else Twist
         self.create_subscription(self._type, 'cmd_vel', self._on_command, quality.NEWEST)
-        self.create_service(Trigger, 'reset_odometry', self._on_reset_odometry)
-        self.create_service(SetBool, 'e_stop', self._on_e_stop)
+        RobotServices(self, self._robot, self.steady_ns, self._lock)
         self._waker, self._wake = os.pipe()
         self._courier = threading.Thread(target=self._carry, name='radio', daemon=True)
         self._courier.start()
@@ -84,26 +83,6 @@ class RadioBridgeNode(PackageNode[RadioBridgeSettings]):
             if problem != self._problem:
                 self.get_logger().warning(f'cmd_vel refused: {problem}', throttle_duration_sec=1.0)
         self._problem = problem
-
-    def _on_reset_odometry(
-        self, request: Trigger.Request, response: Trigger.Response
-    ) -> Trigger.Response:
-        with self._lock:
-            problem = self._robot.reset_odometry(self.steady_ns())
-        response.success = not problem
-        response.message = problem or 'odometry starts at the origin'
-        return response
-
-    def _on_e_stop(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        problem = ''
-        with self._lock:
-            if request.data:
-                self._robot.latch_estop('asked for by service e_stop', self.steady_ns())
-            else:
-                problem = self._robot.release_estop(self.steady_ns())
-        response.success = not problem
-        response.message = problem or ('latched' if request.data else 'released')
-        return response
 
     # -- the port's thread ------------------------------------------------------------------------
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from geometry_msgs.msg import Twist, TwistStamped
 from rosgraph_msgs.msg import Clock
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import Trigger
 
 from t3mpc_ros.motion.pace import Pace, RealTimeFactor, SimulatedTime
 from t3mpc_ros.motion.words import NANOSECONDS
@@ -15,6 +15,7 @@ from t3mpc_ros.nodes.plumbing import convert, graph, quality
 from t3mpc_ros.nodes.plumbing.package_node import ERROR, NO_TIME, OK, WARN, PackageNode
 from t3mpc_ros.nodes.robot.condition import complaints, measures
 from t3mpc_ros.nodes.robot.sensors import count_variance
+from t3mpc_ros.nodes.robot.services import RobotServices
 from t3mpc_ros.nodes.robot.topics import Facts, RobotTopics
 from t3mpc_ros.nodes.tables import SimRobotNodeSettings
 from t3mpc_ros.robot.backend import RobotCommand, RobotState
@@ -66,8 +67,7 @@ class SimRobotNode(PackageNode[SimRobotNodeSettings]):
             self._clock_topic = self.create_publisher(Clock, '/clock', quality.NEWEST)
         self._type = TwistStamped if settings.stamped else Twist
         self.create_subscription(self._type, 'cmd_vel', self._on_command, quality.NEWEST)
-        self.create_service(Trigger, 'reset_odometry', self._on_reset_odometry)
-        self.create_service(SetBool, 'e_stop', self._on_e_stop)
+        RobotServices(self, self._robot, self._robot_now_ns)
         self.create_service(Trigger, '~/set_pose', self._on_set_pose)
         self.create_service(Trigger, '~/step', self._on_step)
         self._ticks = self.create_timer(self._tick_period(), self._on_tick, clock=self._steady)
@@ -139,24 +139,6 @@ class SimRobotNode(PackageNode[SimRobotNodeSettings]):
         except ValueError as error:
             return str(error)
         return ''
-
-    def _on_reset_odometry(
-        self, request: Trigger.Request, response: Trigger.Response
-    ) -> Trigger.Response:
-        problem = self._robot.reset_odometry(self._robot_now_ns())
-        response.success = not problem
-        response.message = problem or 'odometry starts at the origin'
-        return response
-
-    def _on_e_stop(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        problem = ''
-        if request.data:
-            self._robot.latch_estop('asked for by service e_stop', self._robot_now_ns())
-        else:
-            problem = self._robot.release_estop(self._robot_now_ns())
-        response.success = not problem
-        response.message = problem or ('latched' if request.data else 'released')
-        return response
 
     def _on_set_pose(
         self, request: Trigger.Request, response: Trigger.Response

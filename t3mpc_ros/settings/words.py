@@ -1,11 +1,15 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Settings as they are written on a command line: ``NAME=VALUE``."""
+"""What is written on a command line: settings as ``NAME=VALUE``, numbers within bounds."""
 
+from argparse import ArgumentTypeError
 import ast
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from typing import TypeVar
 
 from t3mpc_ros.settings.table import SettingError, Settings
+
+N = TypeVar('N', int, float)
 
 _TRUTHS = {'true': 'True', 'false': 'False'}
 """Parameters are written so elsewhere, and Python writes them otherwise."""
@@ -38,3 +42,26 @@ def _value(text: str) -> object:
         return ast.literal_eval(_TRUTHS.get(text, text))
     except (SyntaxError, ValueError):
         return text
+
+
+def number(low: float, high: float, unit: str = '') -> Callable[[str], float]:
+    """Return what reads a number from ``low`` to ``high`` off a command line, for argparse."""
+    return _within(float, low, high, unit)
+
+
+def whole(low: int, high: int) -> Callable[[str], int]:
+    """Return what reads a whole number from ``low`` to ``high`` off a command line."""
+    return _within(int, low, high, '')
+
+
+def _within(kind: type[N], low: float, high: float, unit: str) -> Callable[[str], N]:
+    bounds = f'from {low:.10g} to {high:.10g}' + (f' {unit}' if unit else '')
+
+    def read(text: str) -> N:
+        value = kind(text)
+        if not low <= value <= high:
+            raise ArgumentTypeError(f'must be {bounds}: got {text}')
+        return value
+
+    read.__name__ = 'number'  # argparse: "invalid number value: 'x'"
+    return read

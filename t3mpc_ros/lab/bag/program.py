@@ -13,6 +13,7 @@ from t3mpc_ros.lab.bag.recover import add_recover_parser
 from t3mpc_ros.lab.bag.report import add_report_parser
 from t3mpc_ros.lab.bag.rerun import add_rerun_parser
 from t3mpc_ros.lab.bag.train import add_train_parser
+from t3mpc_ros.lab.commands import carry_out
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -20,16 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     3 is the command's own: done, but not all is well with the bag.
     """
-    options = _parser().parse_args(arguments)
-    try:
-        code: int = options.run(options)
-    except KeyboardInterrupt:
-        print('stopped', file=sys.stderr)
-        return 130
-    except (OSError, RuntimeError, ValueError) as error:
-        print(f'error: {error}', file=sys.stderr)
-        return 1
-    return code
+    return carry_out(_parser(), arguments)
 
 
 def _parser() -> argparse.ArgumentParser:

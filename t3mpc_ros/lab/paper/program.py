@@ -11,6 +11,7 @@ import time
 from typing import Any
 
 from t3mpc_ros.lab.paper.plan import EXACT, Bench, Extent, cells, extent
+from t3mpc_ros.settings.words import whole
 
 RUNS = 'runs.jsonl'
 """Finished runs, in the folder of the output."""
@@ -41,12 +42,19 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
     parser.add_argument(
         '--quick', action='store_true', help='few seeds and short runs: shows that all works'
     )
-    parser.add_argument('--seeds', type=_count, help='held-out seeds (default: all, quick: 3)')
     parser.add_argument(
-        '--estimation-seeds', type=_count, help='of the comparison without a controller (86)'
+        '--seeds', type=whole(1, 10_000), help='held-out seeds (default: all, quick: 3)'
     )
     parser.add_argument(
-        '--workers', type=_count, default=_processors(), help='processes (default: processors)'
+        '--estimation-seeds',
+        type=whole(1, 10_000),
+        help='of the comparison without a controller (86)',
+    )
+    parser.add_argument(
+        '--workers',
+        type=whole(1, 10_000),
+        default=_processors(),
+        help='processes (default: processors)',
     )
     parser.add_argument(
         '--output', type=Path, help='folder (default runs/paper, or runs/paper-quick)'
@@ -212,10 +220,3 @@ def _origin(scope: Extent, options: PaperOptions, sources: str) -> str:
 
 def _processors() -> int:
     return max(1, len(os.sched_getaffinity(0)))
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if not 1 <= value <= 10_000:
-        raise argparse.ArgumentTypeError(f'must be from 1 to 10000: got {text}')
-    return value

@@ -11,6 +11,8 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
+from t3mpc_ros.settings.words import whole
+
 if TYPE_CHECKING:
     from t3mpc_ros.lab.tuning.contestant import Contestant
 
@@ -33,12 +35,15 @@ def add_parser(
     parser.add_argument('--drive', choices=DRIVES, help='(default both)')
     parser.add_argument(
         '--evaluations',
-        type=_count,
+        type=whole(1, 100_000),
         default=EVALUATIONS,
         help=f'of each method in each drive (default {EVALUATIONS})',
     )
     parser.add_argument(
-        '--workers', type=_count, default=os.cpu_count() or 1, help='processes (default all cores)'
+        '--workers',
+        type=whole(1, 100_000),
+        default=os.cpu_count() or 1,
+        help='processes (default all cores)',
     )
     parser.add_argument(
         '--output', type=Path, default=OUTPUT, help=f'file to write (default {OUTPUT})'
@@ -94,10 +99,3 @@ def chosen(known: 'Sequence[Contestant]', names: Sequence[str]) -> 'list[Contest
             raise ValueError(f'there is no method {name!r}; {hint}')
     wanted = {short_name(name) for name in names} or set(by_name)
     return [method for method in known if method.short in wanted]
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if not 1 <= value <= 100_000:
-        raise argparse.ArgumentTypeError(f'must be from 1 to 100000: got {text}')
-    return value

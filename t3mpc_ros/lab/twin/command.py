@@ -9,6 +9,8 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from t3mpc_ros.settings.words import whole
+
 if TYPE_CHECKING:
     from t3mpc_ros.lab.paper.tables import Table
     from t3mpc_ros.lab.twin.drawings import Evidence
@@ -67,7 +69,10 @@ def add_parser(commands: Any, clock: Callable[[], float]) -> argparse.ArgumentPa
         '--quick', action='store_true', help='one seed and short runs: shows that all works'
     )
     parser.add_argument(
-        '--seed', type=_seed, default=SEED, help=f'of the first of the robots (default {SEED})'
+        '--seed',
+        type=whole(0, 2**31 - 1),
+        default=SEED,
+        help=f'of the first of the robots (default {SEED})',
     )
     parser.set_defaults(run=run, clock=clock)
     return parser
@@ -265,10 +270,3 @@ class _Counter:
         self._count += 1
         if self._progress is not None:
             self._progress.done(self._count)
-
-
-def _seed(text: str) -> int:
-    value = int(text)
-    if not 0 <= value < 2**31:
-        raise argparse.ArgumentTypeError(f'must be from 0 to 2147483647: got {text}')
-    return value

@@ -3,7 +3,7 @@
 """``radio_tool``: key, link and wheels of the real robot at the bench, without ROS."""
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 import math
 import os
 from pathlib import Path
@@ -19,7 +19,7 @@ from t3mpc_ros.radio.codec import decode_from_board, decode_from_dongle
 from t3mpc_ros.radio.host.stop import Stop
 from t3mpc_ros.radio.link.settings import LinkSettings
 from t3mpc_ros.settings import SettingError
-from t3mpc_ros.settings.words import from_words
+from t3mpc_ros.settings.words import from_words, number, whole
 
 DONE, NOT_GOOD, CANNOT, INTERRUPTED = 0, 1, 2, 130
 _RATES = ('250k', '1M', '2M')
@@ -189,23 +189,6 @@ def _settings(options: argparse.Namespace) -> LinkSettings:
     return LinkSettings.from_flat(from_words(LinkSettings, texts))
 
 
-def _number(low: float, high: float) -> Callable[[str], float]:
-    def read(text: str) -> float:
-        value = float(text)
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f'must be from {low:g} to {high:g}: got {text}')
-        return value
-
-    return read
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if not 1 <= value <= 100_000:
-        raise argparse.ArgumentTypeError(f'must be from 1 to 100000: got {text}')
-    return value
-
-
 def _revolutions(text: str) -> float:
     value = float(text)
     if not 0.01 <= math.fabs(value) <= 100.0:
@@ -223,7 +206,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_key(commands)
 
     ping = commands.add_parser('ping', help='how well dongle and robot hear each other')
-    ping.add_argument('--count', type=_count, default=200, help='times each is asked')
+    ping.add_argument('--count', type=whole(1, 100_000), default=200, help='times each is asked')
     find = commands.add_parser('find', help='on which channels the robot answers')
     find.add_argument('--all-rates', action='store_true', help='at 250k, 1M and 2M')
     turning = commands.add_parser('turn', help='turn one wheel, with both in the air')
@@ -232,7 +215,7 @@ def _parser() -> argparse.ArgumentParser:
         'revolutions', type=_revolutions, metavar='REVOLUTIONS', help='below 0: backward'
     )
     turning.add_argument(
-        '--speed', type=_number(0.2, 10.0), default=2.0, help='of the wheel, rad/s'
+        '--speed', type=number(0.2, 10.0), default=2.0, help='of the wheel, rad/s'
     )
     turning.add_argument(
         '--yes', action='store_true', help='do not ask: the wheels are in the air'

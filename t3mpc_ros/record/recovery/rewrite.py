@@ -74,10 +74,6 @@ class Rewriter:
         self._channels[record.id] = (record, number)
         return True
 
-    def has_channel(self, number: int) -> bool:
-        """Return whether the channel was announced."""
-        return number in self._channels
-
     def type_of(self, record: Channel) -> str:
         """Return the type that messages of a channel have; empty for a channel without one."""
         if record.schema_id == 0:
