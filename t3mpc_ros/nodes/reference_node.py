@@ -47,7 +47,7 @@ class ReferenceNode(PackageNode[ReferenceNodeSettings]):
         self._path.header.frame_id = settings.frame_id
         self._message = Odometry(child_frame_id=settings.child_frame_id)
         self._message.header.frame_id = settings.frame_id
-        self._reference = self.create_publisher(Odometry, 'reference', quality.REFERENCE)
+        self._reference = self.create_publisher(Odometry, 'reference', quality.INPUT)
         self._trail = self.create_publisher(Path, 'reference/path', quality.LATCHED)
         self._signals = self.create_publisher(Int32MultiArray, '~/signals', quality.LATCHED)
         self._shown: tuple[int, ...] = ()

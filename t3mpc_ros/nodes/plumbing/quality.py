@@ -26,10 +26,10 @@ def _profile(depth: int, durability: DurabilityPolicy = DurabilityPolicy.VOLATIL
 STREAM = _profile(100)
 """Odometry and reference: every sample counts, and one second of them may pile up."""
 
-REFERENCE = _profile(1000, DurabilityPolicy.TRANSIENT_LOCAL)
-"""The reference as it is published: a recorder that finds it later than the controller did must
-miss nothing that the controller knew, or the run cannot be computed again. On a busy machine
-discovery has taken more than two seconds."""
+INPUT = _profile(1000, DurabilityPolicy.TRANSIENT_LOCAL)
+"""Reference and odometry as they are published: a recorder that finds them later than the
+controller did must miss nothing that the controller knew, or the run cannot be computed again. On
+a busy machine discovery has taken more than two seconds."""
 
 COMMAND = _profile(50)
 """Published commands: kept long enough for a recorder to get each one."""

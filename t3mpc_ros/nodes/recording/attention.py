@@ -19,7 +19,7 @@ EXPECTED = {
     'controller/journal': 'std_msgs/msg/Int64MultiArray',
 }
 """Topics subscribed to before anybody publishes them, so that their first message is kept."""
-LATCHED = ('reference', 'controller/journal')
+LATCHED = ('reference', 'odom', 'controller/journal')
 """Those of them whose publishers, ours, keep what they have said. A recorder that finds them a
 moment after the controller did would otherwise lose what the run cannot be computed again from."""
 

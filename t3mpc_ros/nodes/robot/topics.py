@@ -53,7 +53,7 @@ class RobotTopics:
         self._node = node
         self._published = 0
         self._odometry = self._motion(settings.odom_frame, settings)
-        self._odom = node.create_publisher(Odometry, 'odom', quality.STREAM)
+        self._odom = node.create_publisher(Odometry, 'odom', quality.INPUT)
         if facts.truth_frame:
             self._truth = self._motion(facts.truth_frame, settings)
             self._true_odom = node.create_publisher(Odometry, 'ground_truth/odom', quality.STREAM)
