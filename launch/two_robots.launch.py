@@ -34,13 +34,13 @@ def generate_launch_description():
         given = {
             'sim_robot': {
                 'world': world,
-                'odom_frame': odom,
-                'base_frame': base,
+                'odom_frame_id': odom,
+                'base_frame_id': base,
                 'world_frame': 'world',
                 'imu_frame': f'{name}/imu_link',
                 'range_frame_prefix': f'{name}/',
-                'right_joint': f'{name}/right_wheel_joint',
-                'left_joint': f'{name}/left_wheel_joint',
+                'right_wheel_name': f'{name}/right_wheel_joint',
+                'left_wheel_name': f'{name}/left_wheel_joint',
                 **robot,
                 **makes_time,
             },

@@ -9,7 +9,7 @@ import tempfile
 
 import pytest
 
-from t3mpc_ros.lab.processes import Fleet, private_graph
+from t3mpc_ros.cli.process_group import ProcessGroup, private_graph
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def ros(graph):
 @pytest.fixture
 def fleet(graph, tmp_path):
     """Return a fleet of executables; whatever still runs at the end is killed."""
-    started = Fleet(tmp_path / 'log', private_graph())
+    started = ProcessGroup(tmp_path / 'log', private_graph())
     yield started
     for name in list(started.running()):
         started.kill(name)

@@ -11,8 +11,8 @@ import re
 
 import pytest
 
-from t3mpc_ros.emulator.faults import KINDS
-from t3mpc_ros.nodes.tables import settings_page
+from t3mpc_ros.emulator.fault_injection import FAULT_KINDS
+from t3mpc_ros.nodes.node_parameters import parameters_page
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / 'docs' / 'equations.md'
@@ -160,16 +160,16 @@ def _is_read(node):
 
 
 def test_the_page_of_settings_is_up_to_date():
-    assert (ROOT / 'docs' / 'settings.md').read_text() == settings_page(), (
+    assert (ROOT / 'docs' / 'settings.md').read_text() == parameters_page(), (
         'docs/settings.md is out of date: run '
-        '`.venv/bin/python -m t3mpc_ros.nodes.tables > docs/settings.md`'
+        '`.venv/bin/python -m t3mpc_ros.nodes.node_parameters > docs/settings.md`'
     )
 
 
 def test_every_fault_of_the_boards_is_explained_with_its_usual_value():
     page = (ROOT / 'docs' / 'emulator.md').read_text()
     rows = dict(re.findall(r'^\| `(\w+)` \| (.*) \| [^|]* \|$', page, re.MULTILINE))
-    assert list(rows) == [kind.name for kind in KINDS]
-    for kind in KINDS:
+    assert list(rows) == [kind.name for kind in FAULT_KINDS]
+    for kind in FAULT_KINDS:
         value = '' if math.isnan(kind.value) else f'{kind.value:g}'
         assert rows[kind.name] == f'{kind.text} | {value}'

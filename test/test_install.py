@@ -19,14 +19,14 @@ import types
 import pytest
 import yaml
 
-from t3mpc_ros.nodes.tables import TABLES
+from t3mpc_ros.nodes.node_parameters import PARAMETER_CLASSES
 
 # One build serves them all.
 pytestmark = pytest.mark.ros
 
 ROOT = Path(__file__).resolve().parent.parent
 EXECUTABLES = set(re.findall(r"f'(\w+) = \{NAME\}", (ROOT / 'setup.py').read_text()))
-NODES = tuple(TABLES)
+NODES = tuple(PARAMETER_CLASSES)
 # Not the user's own ROS, workspace or pip: what these tests build and run is theirs alone.
 FOREIGN = ('PYTHONPATH', 'AMENT_PREFIX_PATH', 'COLCON_', 'PIP_', 'T3MPC_')
 
@@ -252,7 +252,7 @@ def test_each_yaml_reaches_its_node_with_and_without_a_namespace(name, copied, r
 
     installed = copied.share / 'config' / f'{name}.yaml'
     parameter, value = CHANGED[name]
-    assert TABLES[name].from_flat({}).flat()[parameter] != value
+    assert PARAMETER_CLASSES[name].from_dict({}).to_dict()[parameter] != value
     content = yaml.safe_load(installed.read_text())
     (entry,) = content.values()
     *parents, leaf = parameter.split('.')

@@ -10,8 +10,7 @@ import sys
 import numpy as np
 import pytest
 
-from t3mpc_ros.kernels import kernel
-from t3mpc_ros.kernels.cache import cache_directory, fingerprint
+from t3mpc_ros.kernels import cache_directory, kernel, source_fingerprint
 
 
 def test_division_by_zero_gives_infinity_not_an_exception():
@@ -28,11 +27,11 @@ def test_the_fingerprint_changes_with_any_file_that_holds_a_kernel_and_with_no_o
     (tmp_path / 'a').mkdir()
     file, other = tmp_path / 'a' / 'x.py', tmp_path / 'a' / 'y.py'
     file.write_text('@kernel\ndef f(): return 1\n')
-    before = fingerprint(tmp_path)
+    before = source_fingerprint(tmp_path)
     other.write_text('nothing = "compiled"\n')
-    assert fingerprint(tmp_path) == before
+    assert source_fingerprint(tmp_path) == before
     file.write_text('@kernel\ndef f(): return 2\n')
-    assert fingerprint(tmp_path) != before
+    assert source_fingerprint(tmp_path) != before
 
 
 def test_an_unwritable_place_is_passed_over(tmp_path):
@@ -64,7 +63,7 @@ def test_a_package_installed_read_only_still_compiles_and_caches(tmp_path):
     environment = dict(os.environ, T3MPC_CACHE_DIR=str(tmp_path))
     code = (
         'import numpy as np\n'
-        'from t3mpc_ros.control.law import law_terms\n'
+        'from t3mpc_ros.control.control_law import law_terms\n'
         'z = np.zeros(2); law_terms(z, z, z, z, z, 1.0, 1.0, 1.0, np.zeros((5, 2)), np.zeros(2))\n'
     )
     subprocess.run([sys.executable, '-c', code], env=environment, check=True, cwd=package.parent)

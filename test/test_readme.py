@@ -11,13 +11,13 @@ import time
 
 import pytest
 
-from t3mpc_ros.lab.processes import private_graph
+from t3mpc_ros.cli.process_group import private_graph
 
 pytestmark = pytest.mark.ros
 
 ROOT = Path(__file__).resolve().parent.parent
 
-BOARDS = 'scripts/run board_emulator --link dongle --robot-link robot_usb'
+BOARDS = 'scripts/run t3mpc emulator --link dongle --robot-link robot_usb'
 
 # How each command is run here: what is added to it, and whether it runs until it is told to stop.
 SHORTENED = {
@@ -47,10 +47,10 @@ SHORTENED = {
     'scripts/run lab exponents': (['--duration', '20'], False),
     'scripts/run lab estimation': (['--seeds', '2'], False),
     BOARDS: ([], True),
-    'scripts/run radio_tool key new robot.key': ([], False),
-    'scripts/run radio_tool key write robot.key --port robot_usb': ([], False),
-    'scripts/run radio_tool ping --port dongle': ([], False),
-    'scripts/run radio_tool turn left 1 --port dongle --key robot.key --yes': ([], False),
+    'scripts/run t3mpc robot key create robot.key': ([], False),
+    'scripts/run t3mpc robot key write robot.key --port robot_usb': ([], False),
+    'scripts/run t3mpc robot ping --port dongle': ([], False),
+    'scripts/run t3mpc robot jog left 1 --port dongle --key robot.key --yes': ([], False),
     'scripts/run radio_bridge --ros-args -p port:=dongle -p key_file:=robot.key': ([], True),
     'scripts/run bag info runs/<time>/bag': ([], False),
     'scripts/run bag report runs/<time>/bag': (['--output', 'OUTPUT/report'], False),

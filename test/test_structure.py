@@ -172,14 +172,14 @@ def test_no_global_random_numbers_and_no_clock_outside_nodes():
 
 
 def test_every_yaml_of_config_fits_its_node():
-    from t3mpc_ros.nodes.tables import TABLES
+    from t3mpc_ros.nodes.node_parameters import PARAMETER_CLASSES
 
     files = sorted((ROOT / 'config').glob('*.yaml'))
     assert files
     for path in files:
         for node, content in yaml.safe_load(path.read_text()).items():
-            table = TABLES[node.rsplit('/', 1)[-1]]
-            table.from_flat(_flat(content['ros__parameters']))
+            table = PARAMETER_CLASSES[node.rsplit('/', 1)[-1]]
+            table.from_dict(_flat(content['ros__parameters']))
 
 
 def _flat(tree: dict, prefix: str = '') -> dict:

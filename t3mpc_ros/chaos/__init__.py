@@ -1,3 +1,3 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Fractional-order hyperchaos, its memory, and the switching reference it drives."""
+"""Fractional-order hyperchaotic system, its solvers, and the switched reference."""

@@ -1,11 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The wheel speeds wanted from the robot: scaled, slowed and switched hyperchaos, (85) with E6.
-
-The raw states of (85) move by some 25 standard deviations a second, which no wheel follows. So
-the reference is y(kappa t) with a time scale kappa much below 1, times an amplitude per signal;
-only then can Assumption 3 of the paper, a reference the outputs can reach, hold.
-"""
+"""Reference wheel speeds: scaled, slowed and switched hyperchaos, equation (85) with E6."""
 
 from dataclasses import dataclass
 import math
@@ -13,34 +8,34 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.chaos.schedule import SwitchingSchedule, SwitchingSettings
 from t3mpc_ros.chaos.solver import FractionalSolver
-from t3mpc_ros.chaos.system import hyperchaotic
-from t3mpc_ros.motion import BodyTwist, Geometry, WheelSpeeds
-from t3mpc_ros.motion.kinematics import body_from_wheels, wheels_from_body
-from t3mpc_ros.settings import SettingError, Settings, nested, setting
+from t3mpc_ros.chaos.switching import SwitchingParameters, SwitchingSchedule
+from t3mpc_ros.chaos.system import hyperchaotic_system
+from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
+from t3mpc_ros.geometry.types import BodyTwist, WheelSpeeds
+from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
 
 
 @dataclass(frozen=True)
-class ReferenceSettings(Settings):
+class ReferenceParameters(Parameters):
     """How system (85) becomes wheel speeds."""
 
-    rate: float = setting(100.0, 'samples per second', unit='Hz', low=1.0, high=10000.0)
-    output: str = setting(
+    rate: float = parameter(100.0, 'samples per second', unit='Hz', low=1.0, high=10000.0)
+    output: str = parameter(
         'wheels',
         'wheels: the two signals are the speeds of right and left wheel; '
         'body: they drive v and omega through the two scales',
         choices=('wheels', 'body'),
         source='paper: wheels',
     )
-    orders: tuple[float, ...] = setting(
+    orders: tuple[float, ...] = parameter(
         (0.98, 0.98, 0.98, 0.98),
         'Caputo order q of each state',
         low=0.5,
         high=1.0,
         source='paper (85)',
     )
-    time_scale: float = setting(
+    time_scale: float = parameter(
         0.05,
         'kappa: seconds of system time per second. States 1 to 4 move 25, 29, 31 and 11 standard '
         'deviations per system second (measured at q = 0.98); with the default amplitudes 0.05 '
@@ -49,52 +44,52 @@ class ReferenceSettings(Settings):
         low=1e-4,
         high=1.0,
     )
-    amplitude: tuple[float, ...] = setting(
+    amplitude: tuple[float, ...] = parameter(
         (0.26, 1.25, 3.0, 0.125),
         'wheel speed per unit of each state. Standard deviations measured at q = 0.98 over '
         '10 000 s: 10.6, 2.22, 0.937, 22.2; so each signal has 2.8 rad/s, peaks of 8 rad/s in a '
         'minute and of 13 rad/s in a day',
         unit='rad/s',
     )
-    offset: tuple[float, ...] = setting(
+    offset: tuple[float, ...] = parameter(
         (0.0, 0.0, 4.79, 0.0),
         'subtracted from each state first: its mean, measured at q = 0.98; states 1, 2 and 4 '
         'have mean 0 by the symmetry of (85)',
     )
-    linear_scale: float = setting(
+    linear_scale: float = parameter(
         0.025,
         'output body: v per rad/s of the first signal',
         unit='m',
         low=-1.0,
         high=1.0,
     )
-    angular_scale: float = setting(
+    angular_scale: float = parameter(
         0.33, 'output body: omega per rad/s of the second signal', low=-20.0, high=20.0
     )
-    initial: tuple[float, ...] = setting(
+    initial: tuple[float, ...] = parameter(
         (1.0, 1.0, 1.0, 1.0), 'state of (85) at which its memory begins', low=-30.0, high=30.0
     )
-    seed: int = setting(
+    seed: int = parameter(
         0, 'perturbs the initial state and draws random switching; 0: initial as given', low=0
     )
-    perturbation: float = setting(
+    perturbation: float = parameter(
         0.5, 'largest change of each initial state by the seed', low=1e-9, high=5.0
     )
-    settle: float = setting(
+    settle: float = parameter(
         20.0,
         'system time run before the first sample, to land on the attractor',
         unit='s',
         low=0.1,
         high=10000.0,
     )
-    solver_step: float = setting(
+    solver_step: float = parameter(
         1e-3,
         'longest solver step in system time; a whole number of steps makes one sample',
         unit='s',
         low=1e-6,
         high=2e-3,
     )
-    memory_horizon: float = setting(
+    memory_horizon: float = parameter(
         1e5,
         'system time over which the memory kernel keeps its tolerance; '
         'divided by the time scale, 23 days at the defaults',
@@ -102,24 +97,24 @@ class ReferenceSettings(Settings):
         low=10.0,
         high=1e9,
     )
-    memory_tolerance: float = setting(
+    memory_tolerance: float = parameter(
         1e-8, 'relative error of the memory kernel', low=1e-12, high=1e-3
     )
-    ramp: float = setting(
+    ramp: float = parameter(
         3.0,
         'time over which the reference grows smoothly from zero, for a robot at rest',
         unit='s',
         low=0.0,
         high=600.0,
     )
-    switching: SwitchingSettings = nested(SwitchingSettings)
+    switching: SwitchingParameters = group(SwitchingParameters)
 
-    def check_together(self) -> None:
-        """Raise :class:`SettingError` when a list does not have one value per state."""
+    def check_consistency(self) -> None:
+        """Raise :class:`ParameterError` when a list does not have one value per state."""
         for name in ('orders', 'amplitude', 'offset', 'initial'):
             values = getattr(self, name)
             if len(values) != 4:
-                raise SettingError(f'{name} must have four values: got {len(values)}')
+                raise ParameterError(f'{name} must have four values: got {len(values)}')
 
     @property
     def steps_per_sample(self) -> int:
@@ -168,16 +163,16 @@ class ChaoticReference:
         Turns wheel speeds into the body twist and back.
     """
 
-    def __init__(self, settings: ReferenceSettings, geometry: Geometry) -> None:
-        self._settings = settings
+    def __init__(self, parameters: ReferenceParameters, geometry: WheelGeometry) -> None:
+        self._parameters = parameters
         self._geometry = geometry
-        self._seed = settings.seed
+        self._seed = parameters.seed
         self._solver = FractionalSolver(
-            hyperchaotic(orders=settings.orders),
-            settings.step,
-            np.array(settings.initial),
-            settings.memory_horizon,
-            settings.memory_tolerance,
+            hyperchaotic_system(orders=parameters.orders),
+            parameters.step,
+            np.array(parameters.initial),
+            parameters.memory_horizon,
+            parameters.memory_tolerance,
         )
         self.reset()
 
@@ -195,15 +190,15 @@ class ChaoticReference:
         if seed is not None and seed < 0:
             raise ValueError('seed must not be negative')  # and must not be printed either
         self._seed = self._seed if seed is None else seed
-        initial = np.array(self._settings.initial)
+        initial = np.array(self._parameters.initial)
         if self._seed:
-            bound = self._settings.perturbation
+            bound = self._parameters.perturbation
             # A stream apart from the schedule's: dwells that all can see must not tell this.
             generator = np.random.default_rng((self._seed, 1))
             initial += generator.uniform(-bound, bound, initial.size)
-        self._schedule = SwitchingSchedule(self._settings.switching, self._seed)
+        self._schedule = SwitchingSchedule(self._parameters.switching, self._seed)
         self._solver.reset(initial)
-        self._solver.advance(math.ceil(self._settings.settle / self._settings.step))
+        self._solver.advance(math.ceil(self._parameters.settle / self._parameters.step))
         self._index = 0
         self._switches = 0
 
@@ -215,14 +210,14 @@ class ChaoticReference:
         FloatingPointError
             The solution of (85) has left the finite numbers.
         """
-        settings = self._settings
+        parameters = self._parameters
         if self._index:
-            self._solver.advance(settings.steps_per_sample)
-        elapsed = self._index / settings.rate
+            self._solver.advance(parameters.steps_per_sample)
+        elapsed = self._index / parameters.rate
         states = self._solver.state
-        signals = np.array(settings.amplitude) * (states - np.array(settings.offset))
+        signals = np.array(parameters.amplitude) * (states - np.array(parameters.offset))
         # reference(t) = y(kappa t), so d/dt is kappa times the rate in system time.
-        rates = settings.time_scale * np.array(settings.amplitude) * self._solver.rate
+        rates = parameters.time_scale * np.array(parameters.amplitude) * self._solver.rate
         selection = self._schedule.at(elapsed)
         selected = self._schedule.pairs[selection.mode]
         active = np.array(selected) - 1
@@ -238,7 +233,7 @@ class ChaoticReference:
             elapsed,
             wheels,
             self._wheels(grown * slope + growth * value),
-            body_from_wheels(wheels, self._geometry),
+            twist_from_wheels(wheels, self._geometry),
             selection.mode,
             selected,
             selection.switches != self._switches,
@@ -250,17 +245,19 @@ class ChaoticReference:
 
     def _growth(self, elapsed: float) -> tuple[float, float]:
         """Return the ramp's share of the full reference and its derivative (1/s)."""
-        if elapsed >= self._settings.ramp:
+        if elapsed >= self._parameters.ramp:
             return 1.0, 0.0
-        x = elapsed / self._settings.ramp
-        return x * x * (3.0 - 2.0 * x), 6.0 * x * (1.0 - x) / self._settings.ramp
+        x = elapsed / self._parameters.ramp
+        return x * x * (3.0 - 2.0 * x), 6.0 * x * (1.0 - x) / self._parameters.ramp
 
     def _wheels(self, outputs: NDArray[np.float64]) -> WheelSpeeds:
         """Return wheel speeds (or their rates) of the two outputs; linear, so it serves both."""
         first, second = outputs.tolist()
-        if self._settings.output == 'wheels':
+        if self._parameters.output == 'wheels':
             return WheelSpeeds(first, second)
-        return wheels_from_body(
-            BodyTwist(self._settings.linear_scale * first, self._settings.angular_scale * second),
+        return wheels_from_twist(
+            BodyTwist(
+                self._parameters.linear_scale * first, self._parameters.angular_scale * second
+            ),
             self._geometry,
         )

@@ -1,30 +1,133 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-r"""Fractional systems solved at constant cost and constant memory, for as long as one likes.
-
-The scheme is that of :mod:`t3mpc_ros.chaos.full_memory`, with one thing replaced: over the newest
-step the kernel is the true one, integrated exactly; over everything before it the kernel is the
-sum of exponentials of :mod:`t3mpc_ros.chaos.memory`, valid from a lag of one step on. A mode
-
-.. math:: z(t) = \int_0^t e^{-\lambda (t - s)} g(s)\,ds
-
-of slopes g that are linear over each step advances exactly:
-
-.. math:: z(t + h) = e^{-a} z(t) + h\,\phi_o(a)\,g(t^+) + h\,\phi_n(a)\,g(t + h^-), \qquad
-          a = \lambda h.
-
-The only new error is thus the kernel's, a stated fraction of the integral. Cost and memory are
-two numbers per mode and state, whatever the number of steps.
-"""
+"""Solvers of fractional-order systems: constant memory for nodes, full memory as their check."""
 
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.chaos.memory import exponential_sum
-from t3mpc_ros.chaos.system import QuadraticSystem, Terms, slope
+from t3mpc_ros.chaos.sum_of_exponentials import fit_sum_of_exponentials
+from t3mpc_ros.chaos.system import QuadraticSystem, Terms, right_hand_side
 from t3mpc_ros.kernels import kernel
+
+
+def interval_weights(order: float, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    r"""Return the product-trapezoid weights of the older and the newer end of past intervals.
+
+    Entry m belongs to the interval of lags [m, m + 1], in units of the step:
+
+    .. math:: \text{older}_m = \frac{1}{\Gamma(q)} \int_m^{m+1} u^{q-1} (u - m)\,du, \qquad
+              \text{newer}_m = \frac{1}{\Gamma(q)} \int_m^{m+1} u^{q-1} (m + 1 - u)\,du
+
+    The closed form is a difference of powers that loses digits like m^2; beyond the first interval
+    the integrand is smooth, and 14 Gauss points give it to rounding instead.
+
+    Returns
+    -------
+    older, newer
+        Shape (count,) each; multiply by step**order.
+    """
+    older = np.empty(count)
+    newer = np.empty(count)
+    older[:1] = order / math.gamma(order + 2.0)
+    newer[:1] = 1.0 / math.gamma(order + 2.0)
+    if count > 1:
+        nodes, shares = np.polynomial.legendre.leggauss(14)
+        nodes = 0.5 * (nodes + 1.0)
+        shares = 0.5 * shares / math.gamma(order)
+        lag = np.arange(1.0, count)[:, None] + nodes
+        older[1:] = (lag ** (order - 1.0) * nodes) @ shares
+        newer[1:] = (lag ** (order - 1.0) * (1.0 - nodes)) @ shares
+    return older, newer
+
+
+def solve_full_memory(
+    system: QuadraticSystem, step: float, initial: NDArray[np.float64], steps: int
+) -> NDArray[np.float64]:
+    """Return the states at 0, step, ... , steps * step, remembering every slope.
+
+    Parameters
+    ----------
+    system
+        Each state may have its own order.
+    step
+        s, positive.
+    initial
+        Shape (d,).
+    steps
+        How many, not negative.
+
+    Returns
+    -------
+    states
+        Shape (steps + 1, d).
+
+    Raises
+    ------
+    ValueError
+        A step that is not positive, an initial state of the wrong size.
+    """
+    if not 0.0 < step < math.inf:
+        raise ValueError(f'step must be positive and finite: got {step}')
+    if np.shape(initial) != (system.size,):
+        raise ValueError(f'initial must have shape ({system.size},): got {np.shape(initial)}')
+    if steps < 0:
+        raise ValueError(f'steps must not be negative: got {steps}')
+    older = np.empty((steps, system.size))
+    newer = np.empty((steps, system.size))
+    rectangle = np.empty(system.size)
+    for state, order in enumerate(system.orders):
+        ends = interval_weights(order, steps)
+        older[:, state] = step**order * ends[0]
+        newer[:, state] = step**order * ends[1]
+        rectangle[state] = step**order / math.gamma(order + 1.0)
+    states = np.empty((steps + 1, system.size))
+    states[0] = initial
+    _integrate_full_memory(
+        system.terms(),
+        older,
+        newer,
+        rectangle,
+        np.empty((steps + 1, system.size)),
+        np.empty((steps + 1, system.size)),
+        states,
+        np.empty(system.size),
+    )
+    return states
+
+
+@kernel
+def _integrate_full_memory(
+    terms: Terms,
+    older: NDArray[np.float64],
+    newer: NDArray[np.float64],
+    rectangle: NDArray[np.float64],
+    slopes: NDArray[np.float64],
+    predicted: NDArray[np.float64],
+    states: NDArray[np.float64],
+    guess: NDArray[np.float64],
+) -> None:
+    """Fill ``states`` from its first row on.
+
+    older, newer      : shape (N, d), weights by lag, scaled by the step
+    rectangle         : shape (d,), the predictor's weight of the newest slope
+    slopes, predicted : shape (N + 1, d), work; f at the corrected and at the predicted state
+    states            : shape (N + 1, d), first row given
+    guess             : shape (d,), work
+    """
+    right_hand_side(terms, states[0], slopes[0])
+    for n in range(states.shape[0] - 1):
+        for i in range(guess.size):
+            past = 0.0
+            for j in range(n):
+                past += older[n - j, i] * slopes[j, i] + newer[n - j, i] * predicted[j + 1, i]
+            guess[i] = states[0, i] + past + rectangle[i] * slopes[n, i]
+            states[n + 1, i] = states[0, i] + past + older[0, i] * slopes[n, i]
+        right_hand_side(terms, guess, predicted[n + 1])
+        for i in range(guess.size):
+            states[n + 1, i] += newer[0, i] * predicted[n + 1, i]
+        right_hand_side(terms, states[n + 1], slopes[n + 1])
 
 
 def mode_weights(
@@ -58,7 +161,7 @@ def mode_weights(
 
 
 @kernel
-def advance(
+def advance_solution(
     steps: int,
     terms: Terms,
     local: NDArray[np.float64],
@@ -91,7 +194,7 @@ def advance(
             base = initial[i] + history[i]
             guess[i] = base + local[0, i] * current[i]
             state[i] = base + local[1, i] * current[i]
-        slope(terms, guess, predicted)
+        right_hand_side(terms, guess, predicted)
         if n == steps - 1:
             # d/dt of the Volterra equation at the new time; needs the modes before their update.
             for i in range(size):
@@ -111,7 +214,7 @@ def advance(
                 modes[i, k] = mode
                 total += decays[i, k] * mode
             history[i] = total
-        slope(terms, state, current)
+        right_hand_side(terms, state, current)
         if n == steps - 1:
             for i in range(size):
                 derivative[i] += local[3, i] * current[i]
@@ -147,7 +250,9 @@ class FractionalSolver:
         horizon: float = 1e5,
         tolerance: float = 1e-8,
     ) -> None:
-        memories = [exponential_sum(order, step, horizon, tolerance) for order in system.orders]
+        memories = [
+            fit_sum_of_exponentials(order, step, horizon, tolerance) for order in system.orders
+        ]
         shape = (system.size, max(memory.rates.size for memory in memories))
         self.step = step
         self.kernel_error = max(memory.error for memory in memories)
@@ -198,7 +303,7 @@ class FractionalSolver:
         self._modes[:] = 0.0
         self._vectors[:] = 0.0
         self._vectors[0] = self._initial
-        slope(self._terms, self._vectors[0], self._vectors[1])
+        right_hand_side(self._terms, self._vectors[0], self._vectors[1])
         self._vectors[2] = np.where(self._orders == 1.0, self._vectors[1], np.nan)
 
     @property
@@ -243,7 +348,7 @@ class FractionalSolver:
         """
         if steps < 0:
             raise ValueError(f'steps must not be negative: got {steps}')
-        advance(
+        advance_solution(
             steps,
             self._terms,
             self._local,

@@ -84,7 +84,7 @@ class QuadraticSystem:
 
 
 @kernel
-def slope(terms: Terms, state: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+def right_hand_side(terms: Terms, state: NDArray[np.float64], out: NDArray[np.float64]) -> None:
     """Write the right-hand side D^q y at ``state`` into ``out``.
 
     state, out : shape (d,); ``out`` is overwritten and must not be ``state``
@@ -118,7 +118,7 @@ def jacobian(terms: Terms, state: NDArray[np.float64], out: NDArray[np.float64])
         out[row, second] += terms.quadratic_gain[n] * state[first]
 
 
-def hyperchaotic(
+def hyperchaotic_system(
     a: float = 35.0,
     b: float = 4.0,
     c: float = 25.0,
@@ -155,6 +155,6 @@ def hyperchaotic(
     )
 
 
-def linear_decay(order: float) -> QuadraticSystem:
+def linear_decay_system(order: float) -> QuadraticSystem:
     """Return D^q y = -y, whose solution from 1 is the Mittag-Leffler function E_q(-t^q)."""
     return QuadraticSystem((order,), linear=((0, 0, -1.0),))

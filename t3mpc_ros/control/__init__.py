@@ -1,3 +1,3 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The control law: composition, certificate, limits and per-tick decisions."""
+"""The controller: control law, state estimate, actuation, watchdogs."""

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The controller of one robot: stamped motions in, a limited twist and its reason out."""
+"""Controller of one robot: odometry and reference in, limited twist and status out."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -10,41 +10,53 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.control.composition import ComposedLaw, CompositionSettings
-from t3mpc_ros.control.drive import Drive, LimitSettings
-from t3mpc_ros.control.freshness import Following, Freshness, FreshnessSettings, Reason
-from t3mpc_ros.control.march.answers import Answers, Status
-from t3mpc_ros.control.march.plain import NEVER, Parts, PlainSteps
-from t3mpc_ros.control.march.stretch import APPLIED, ERROR
-from t3mpc_ros.control.pursuit import Pursuit, look
-from t3mpc_ros.motion import BodyTwist, Geometry, Motion, WheelSpeeds
-from t3mpc_ros.motion.kinematics import wheels_from_body
-from t3mpc_ros.motion.sequence import Motions
-from t3mpc_ros.motion.track import Jump, Stamps, Track
-from t3mpc_ros.motion.words import NANOSECONDS, ORIGIN, STANDSTILL
-from t3mpc_ros.settings import nested
+from t3mpc_ros.control.actuation import LimitParameters, VelocityActuation
+from t3mpc_ros.control.batch_replay import (
+    APPLIED,
+    ERROR,
+    NEVER,
+    BatchStepper,
+    ControllerParts,
+    Status,
+    StepResults,
+)
+from t3mpc_ros.control.control_law import Nt3fsMpcController, Nt3fsMpcParameters
+from t3mpc_ros.control.switching_tracker import SwitchingTracker, sample_reference
+from t3mpc_ros.control.watchdog import InputWatchdog, Reason, ResponseMonitor, WatchdogParameters
+from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
+from t3mpc_ros.geometry.trajectory import Jump, ReferenceTrajectory, Stamps
+from t3mpc_ros.geometry.types import (
+    NANOSECONDS,
+    ORIGIN,
+    STANDSTILL,
+    BodyTwist,
+    State,
+    StateArray,
+    WheelSpeeds,
+)
+from t3mpc_ros.parameters.table import group
 
-__all__ = ['Controller', 'ControllerSettings', 'Status']
+__all__ = ['Controller', 'ControllerParameters', 'Status']
 
 Array = NDArray[np.float64]
 
-JUMP_FACTOR = 2.2
+JUMP_DETECTION_FACTOR = 2.2
 """A reference that changes this many times faster than the robot may is taken as a switch."""
 
 
-KEPT = 0.25
+SNAPSHOT_PERIOD = 0.25
 """s between two copies of what is learnt."""
-COPIES = 3
+SNAPSHOT_COUNT = 3
 """The oldest of so many is from before a robot stopped following; doubt takes some time."""
 
 
 @dataclass(frozen=True)
-class ControllerSettings(CompositionSettings):
+class ControllerParameters(Nt3fsMpcParameters):
     """The whole controller: the law, the robot's lengths, limits and time-outs."""
 
-    geometry: Geometry = nested(Geometry)
-    limits: LimitSettings = nested(LimitSettings)
-    freshness: FreshnessSettings = nested(FreshnessSettings)
+    geometry: WheelGeometry = group(WheelGeometry)
+    limits: LimitParameters = group(LimitParameters)
+    watchdog: WatchdogParameters = group(WatchdogParameters)
 
 
 class Controller:
@@ -53,29 +65,30 @@ class Controller:
     Its output is a function of the messages it was given, in their order: it reads no clock.
     """
 
-    def __init__(self, settings: ControllerSettings) -> None:
-        self.settings = settings
-        self._pursuit = Pursuit(settings, 'velocity')
-        self._period = 1.0 / settings.rate
+    def __init__(self, parameters: ControllerParameters) -> None:
+        self.parameters = parameters
+        self._pursuit = SwitchingTracker(parameters, 'velocity')
+        self._period = 1.0 / parameters.rate
         self._period_ns = round(self._period * NANOSECONDS)
-        self._drive = Drive(
-            settings.estimate, settings.limits, settings.geometry, 'velocity', self._period
+        self._drive = VelocityActuation(
+            parameters.estimate, parameters.limits, parameters.geometry, 'velocity', self._period
         )
         self._dead_ns = round(self._drive.dead_time * NANOSECONDS)
         self._looking = self._how_to_look()
         self._speeds, self._wanted, self._begin, self._end = np.zeros((4, 2))
-        self._freshness = Freshness(settings.freshness)
-        self._following = Following(settings.freshness, self._period)
-        limits = settings.limits
-        self._track = Track(
+        self._freshness = InputWatchdog(parameters.watchdog)
+        self._following = ResponseMonitor(parameters.watchdog, self._period)
+        limits = parameters.limits
+        self._track = ReferenceTrajectory(
             BodyTwist(
-                JUMP_FACTOR * limits.linear_acceleration, JUMP_FACTOR * limits.angular_acceleration
+                JUMP_DETECTION_FACTOR * limits.linear_acceleration,
+                JUMP_DETECTION_FACTOR * limits.angular_acceleration,
             )
         )
-        self._before: deque[tuple[Array, list[Array]]] = deque(maxlen=COPIES)
+        self._before: deque[tuple[Array, list[Array]]] = deque(maxlen=SNAPSHOT_COUNT)
         """What had been learnt, from oldest to newest."""
         self._since_copy = 0
-        self._copy_after = next(n for n in count(1) if n * self._period >= KEPT)
+        self._copy_after = next(n for n in count(1) if n * self._period >= SNAPSHOT_PERIOD)
         self._jumps: list[Jump] = []
         self._told: set[int] = set()
         self._moving = False
@@ -83,31 +96,31 @@ class Controller:
         self.status = self._status(0, Reason.NO_ODOMETRY, np.full(2, math.nan))
 
     @property
-    def law(self) -> ComposedLaw:
+    def law(self) -> Nt3fsMpcController:
         """The law, with everything it has learnt."""
         return self._pursuit.law
 
     @property
-    def drive(self) -> Drive:
+    def drive(self) -> VelocityActuation:
         """The seam to the robot: what is estimated and sent. A replay tells it what was sent."""
         return self._drive
 
     def warm_up(self) -> None:
         """Compile and pre-train now, never inside a step; nothing is remembered of it."""
         self.law.warm_up()
-        other, jump = Controller(self.settings), 2.0 * JUMP_FACTOR * self._period
-        jumped = BodyTwist(jump * self.settings.limits.linear_acceleration, 0.0)
+        other, jump = Controller(self.parameters), 2.0 * JUMP_DETECTION_FACTOR * self._period
+        jumped = BodyTwist(jump * self.parameters.limits.linear_acceleration, 0.0)
         for k in range(10):
             wanted = STANDSTILL if k < 4 else jumped
-            other.add_reference(Motion(k * self._period_ns, ORIGIN, wanted))
+            other.add_reference(State(k * self._period_ns, ORIGIN, wanted))
         for k in range(6):
-            other.step(Motion(k * self._period_ns, ORIGIN, STANDSTILL))
+            other.step(State(k * self._period_ns, ORIGIN, STANDSTILL))
 
-    def configure(self, settings: ControllerSettings) -> None:
+    def configure(self, parameters: ControllerParameters) -> None:
         """Use other live settings from the next step on."""
-        self.settings = settings
-        self._pursuit.configure(settings)
-        self._drive.configure(settings.limits)
+        self.parameters = parameters
+        self._pursuit.configure(parameters)
+        self._drive.configure(parameters.limits)
         self._looking = self._how_to_look()
 
     def enable(self, on: bool) -> None:
@@ -121,11 +134,11 @@ class Controller:
         self._freshness.enabled = enabled
         self._forget_reference()
         self.law.fuzzy.reset()
-        self.law.predictive.relearn()
+        self.law.predictive.pretrain()
         self._stop()
         self._last_stamp_ns = None
 
-    def add_reference(self, motion: Motion) -> bool:
+    def add_reference(self, motion: State) -> bool:
         """Keep a wanted motion; return False when it is not finite and therefore ignored."""
         track = self._track
         newest = track.newest_ns
@@ -136,11 +149,11 @@ class Controller:
             self._jumps = [jump for jump in self._jumps if jump.stamp_ns < motion.stamp_ns]
             self._pursuit.plan.withdraw(motion.stamp_ns)
         if track.jumped:
-            self._jumps += track.take_jumps()
+            self._jumps += track.pop_jumps()
         self._freshness.reference_arrived()
         return True
 
-    def step(self, measured: Motion) -> tuple[BodyTwist, Status]:
+    def step(self, measured: State) -> tuple[BodyTwist, Status]:
         """Return the twist to command now, and why.
 
         Parameters
@@ -162,7 +175,7 @@ class Controller:
         acts_ns = stamp + self._dead_ns
         speeds, wanted, begin, end = self._speeds, self._wanted, self._begin, self._end
         track, twist = self._track, measured.twist
-        known, speed, error = look(
+        known, speed, error = sample_reference(
             track.stamps,
             track.samples,
             track.first,
@@ -194,7 +207,7 @@ class Controller:
             self._following.reset()
             self._before.clear()
         elif not self._following.heard(*speeds.tolist()):
-            return self._insist(stamp)
+            return self._command_unresponsive(stamp)
         elif self.status.reason is Reason.NOT_FOLLOWING:
             fresh = True
             self._drive.reset(speeds)
@@ -204,7 +217,7 @@ class Controller:
             self._pursuit.begin(acts_ns, self._drive.ahead, begin)
             self._moving = True
             self._told.clear()
-            known_ns = acts_ns if self.settings.switches.preview else stamp
+            known_ns = acts_ns if self.parameters.switches.preview else stamp
             self._jumps = [jump for jump in self._jumps if jump.stamp_ns > known_ns]
         if self._jumps or self._told:
             self._announce(stamp, acts_ns)
@@ -216,7 +229,9 @@ class Controller:
         self.status = self._status(stamp, reason, drive.speeds - wanted, applied)
         return drive.twist, self.status
 
-    def march(self, measured: Motions, references: Motions, rows: Stamps, answers: Answers) -> int:
+    def march(
+        self, measured: StateArray, references: StateArray, rows: Stamps, answers: StepResults
+    ) -> int:
         """Do many steps of a recorded run; return how many of them were plain.
 
         The same as :meth:`add_reference` and :meth:`step` one after the other, to the last bit.
@@ -251,7 +266,7 @@ class Controller:
             k += 1
         return plain
 
-    def _insist(self, stamp_ns: int) -> tuple[BodyTwist, Status]:
+    def _command_unresponsive(self, stamp_ns: int) -> tuple[BodyTwist, Status]:
         """Go on commanding the reference to a robot that does not follow, and learn nothing.
 
         A stop would be for ever: a board that has restarted waits for commands. What was learnt
@@ -261,7 +276,7 @@ class Controller:
         if self.status.reason is not Reason.NOT_FOLLOWING:
             self._pursuit.reset()
             if self._before:
-                self.law.go_back(self._before[0])
+                self.law.rollback(self._before[0])
                 self._before.clear()
         self._drive.aim(self._wanted)
         self._following.told(*self._drive.command.tolist())
@@ -270,14 +285,19 @@ class Controller:
         return self._drive.twist, self.status
 
     def _go_on(
-        self, measured: Motions, references: Motions, rows: Stamps, first: int, answers: Answers
+        self,
+        measured: StateArray,
+        references: StateArray,
+        rows: Stamps,
+        first: int,
+        answers: StepResults,
     ) -> tuple[int, int]:
         """Do plain steps from a row on; return how many, and up to where references are kept."""
-        handed, switches = int(rows[first, 1]), self.settings.switches
+        handed, switches = int(rows[first, 1]), self.parameters.switches
         jumps = {jump.stamp_ns for jump in self._jumps}
         seen = self._speeds, self._wanted, self._begin, self._end
         acting = self._track, self._pursuit, self._drive, self._freshness, self._following
-        parts = Parts(*acting, seen, self._looking)
+        parts = ControllerParts(*acting, seen, self._looking)
         if not (
             self._moving
             and self.status.reason is Reason.TRACKING
@@ -292,7 +312,7 @@ class Controller:
         # One that is told of is forgotten when a command acts after it, another is told when seen.
         due_ns = min((t + self._dead_ns * (t not in self._told) for t in jumps), default=NEVER)
         when = self._last_stamp_ns, self._dead_ns, due_ns
-        steps = PlainSteps(parts, self.settings.freshness, measured, references, handed, *when)
+        steps = BatchStepper(parts, self.parameters.watchdog, measured, references, handed, *when)
         k = until = first
         while k == until < len(rows):
             until = min(len(rows), k + self._copy_after - self._since_copy)
@@ -313,7 +333,7 @@ class Controller:
         self._since_copy += steps
         if self._since_copy >= self._copy_after:
             self._since_copy = 0
-            self._before.append(self.law.copies())
+            self._before.append(self.law.snapshot())
 
     def silent(self, last_heard_ns: int | None, now_ns: int) -> bool:
         """Whether the odometry has gone silent, so that a stop must be commanded.
@@ -331,11 +351,11 @@ class Controller:
 
     def _how_to_look(self) -> tuple[float, float, bool, float, float]:
         """Return what :func:`look` is told of the settings."""
-        settings, geometry = self.settings, self.settings.geometry
+        parameters, geometry = self.parameters, self.parameters.geometry
         return (
             self._period,
-            settings.freshness.reference_timeout * NANOSECONDS,
-            settings.switches.preview,
+            parameters.watchdog.reference_timeout * NANOSECONDS,
+            parameters.switches.preview,
             geometry.wheel_radius,
             geometry.half_separation,
         )
@@ -343,7 +363,7 @@ class Controller:
     def _announce(self, stamp_ns: int, acts_ns: int) -> None:
         """Tell the plan of jumps: when they are seen, or before if that is wanted."""
         newest = self._track.newest_ns or 0
-        preview, geometry = self.settings.switches.preview, self.settings.geometry
+        preview, geometry = self.parameters.switches.preview, self.parameters.geometry
         soon_ns = acts_ns + self._period_ns if preview else stamp_ns
         for jump in self._jumps:
             # Beforehand, wait for the sample after it: then the slope after it is known too.
@@ -354,8 +374,8 @@ class Controller:
                 slope = BodyTwist(0.0, 0.0) if after is None else after.rate
                 self._pursuit.plan.announce(
                     jump.stamp_ns,
-                    _array(wheels_from_body(jump.change, geometry)),
-                    _array(wheels_from_body(slope, geometry)),
+                    _array(wheels_from_twist(jump.change, geometry)),
+                    _array(wheels_from_twist(slope, geometry)),
                 )
         self._jumps = [
             jump

@@ -1,23 +1,23 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Dongle and robot in one piece: bytes with their time of arrival in, bytes with theirs out."""
+"""Emulator of dongle, radio channel, robot board and plant: timed bytes in, timed bytes out."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 import math
 import random
 
-from t3mpc_ros.emulator.agenda import MICROSECOND, Agenda
-from t3mpc_ros.emulator.board import Board
-from t3mpc_ros.emulator.board.rules import LOOP_US, SETTLE_SLOW_US, SETTLE_US
-from t3mpc_ros.emulator.dongle.ether import Ether, RadioSettings
-from t3mpc_ros.emulator.dongle.firmware import Dongle
-from t3mpc_ros.emulator.dongle.line import Line
-from t3mpc_ros.emulator.faults import Fault, Faults
+from t3mpc_ros.emulator.board.robot_board import LOOP_US, SETTLE_SLOW_US, SETTLE_US, RobotBoard
+from t3mpc_ros.emulator.event_queue import MICROSECOND, EventQueue
+from t3mpc_ros.emulator.fault_injection import Fault, FaultInjection
+from t3mpc_ros.emulator.link.dongle import Dongle
+from t3mpc_ros.emulator.link.radio_channel import RadioChannel, RadioParameters
+from t3mpc_ros.emulator.link.serial_line import SerialLine
 from t3mpc_ros.emulator.plant import Plant
-from t3mpc_ros.motion.words import NANOSECONDS
-from t3mpc_ros.robot.twin.settings import TwinSettings
-from t3mpc_ros.settings import SettingError, Settings, nested, setting
+from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
+from t3mpc_ros.radio.protocol.frames import Command
+from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 
 _RATES = ('250k', '1M', '2M')
 _POWER_ON, _EXTERNAL, _BROWN_OUT = 1, 2, 4
@@ -27,30 +27,30 @@ _BOOT_LOADER_NS = NANOSECONDS
 
 
 @dataclass(frozen=True)
-class EmulatorSettings(Settings):
+class EmulatorParameters(Parameters):
     """What can be set of dongle, radio and robot."""
 
-    twin: TwinSettings = nested(TwinSettings)
-    robot_clock: float = setting(
+    twin: DigitalTwinParameters = group(DigitalTwinParameters)
+    robot_clock: float = parameter(
         0.0,
         "by how much the robot's clock is fast; the resonator of a small board may be off by this",
         low=-0.02,
         high=0.02,
         source='ceramic resonators: 0.5 %',
     )
-    dongle_start: float = setting(
+    dongle_start: float = parameter(
         1.5, 'how long the boot loader of the dongle takes', unit='s', low=0.0, high=10.0
     )
-    channel: int = setting(82, 'of the robot: 2400 MHz plus this', unit='MHz', low=0, high=125)
-    rate: str = setting('1M', 'bits per second of the robot in the air', choices=_RATES)
+    channel: int = parameter(82, 'of the robot: 2400 MHz plus this', unit='MHz', low=0, high=125)
+    rate: str = parameter('1M', 'bits per second of the robot in the air', choices=_RATES)
 
-    def check_together(self) -> None:
-        """Raise SettingError when the robot would not be the one the board is made for."""
+    def check_consistency(self) -> None:
+        """Raise ParameterError when the robot would not be the one the board is made for."""
         twin = self.twin
         if twin.drive.kind != 'stepper':
-            raise SettingError(f'twin.drive.kind must be stepper: got {twin.drive.kind}')
+            raise ParameterError(f'twin.drive.kind must be stepper: got {twin.drive.kind}')
         if twin.motor.microsteps != 16 or twin.motor.full_steps != 200:
-            raise SettingError(
+            raise ParameterError(
                 'twin.motor must have 16 microsteps and 200 full steps, which is what the board '
                 f'starts with: got {twin.motor.microsteps} and {twin.motor.full_steps}'
             )
@@ -73,41 +73,41 @@ class Emulator:
 
     def __init__(
         self,
-        settings: EmulatorSettings,
+        parameters: EmulatorParameters,
         key: bytes = b'',
         seed: int = 1,
         now_ns: int = 0,
     ) -> None:
-        self._settings = settings
+        self._parameters = parameters
         self._start_ns = now_ns
-        self._agenda = Agenda(now_ns)
-        self.faults = Faults(lambda: self._agenda.now_ns, seed)
-        self._rate = 1.0 + settings.robot_clock
-        self.plant = Plant(settings.twin, self._rate)
+        self._events = EventQueue(now_ns)
+        self.faults = FaultInjection(lambda: self._events.now_ns, seed)
+        self._rate = 1.0 + parameters.robot_clock
+        self.plant = Plant(parameters.twin, self._rate)
         nonces = random.Random(f'nonces {seed}')
-        self._ether = Ether(
-            self._agenda,
-            RadioSettings(channel=settings.channel, rate=_RATES.index(settings.rate)),
+        self._channel = RadioChannel(
+            self._events,
+            RadioParameters(channel=parameters.channel, rate=_RATES.index(parameters.rate)),
             self._wake_robot,
             lambda payload: self.board.packet(payload),
             self.faults,
             random.Random(f'air {seed}'),
         )
-        settle_us = SETTLE_SLOW_US if settings.rate == '250k' else SETTLE_US
-        self.board = Board(self.plant, key, nonces.randbytes, self._ether.load, settle_us)
+        settle_us = SETTLE_SLOW_US if parameters.rate == '250k' else SETTLE_US
+        self.board = RobotBoard(self.plant, key, nonces.randbytes, self._channel.load, settle_us)
         self._boot_ns = now_ns
         self._away = False
         """The robot has no power."""
         self.dongle = Dongle(
-            self._agenda, self._ether, self._chip_ok, lambda data: self._to_host.send(data)
+            self._events, self._channel, self._chip_ok, lambda data: self._to_host.send(data)
         )
-        self._from_host = Line(self._agenda, self.faults, self.dongle.feed)
-        self._to_host = Line(self._agenda, self.faults, self._arrive)
+        self._from_host = SerialLine(self._events, self.faults, self.dongle.feed)
+        self._to_host = SerialLine(self._events, self.faults, self._arrive)
         self._arrived: list[tuple[int, bytes]] = []
         # The faults of the line are those of the dongle's.
-        sound = Faults(lambda: self._agenda.now_ns, seed)
-        self._from_cable = Line(self._agenda, sound, self._tell_console)
-        self._to_cable = Line(self._agenda, sound, self._arrive_by_cable)
+        sound = FaultInjection(lambda: self._events.now_ns, seed)
+        self._from_cable = SerialLine(self._events, sound, self._tell_console)
+        self._to_cable = SerialLine(self._events, sound, self._arrive_by_cable)
         self._said: list[tuple[int, bytes]] = []
         self.board.console.reply = self._to_cable.send
         self.port_open = True
@@ -118,12 +118,12 @@ class Emulator:
     @property
     def now_ns(self) -> int:
         """Up to when everything has happened."""
-        return self._agenda.now_ns
+        return self._events.now_ns
 
     @property
     def next_ns(self) -> int | None:
         """When something happens next; None: nothing will."""
-        return self._agenda.next_ns
+        return self._events.next_ns
 
     @property
     def powered(self) -> bool:
@@ -134,29 +134,29 @@ class Emulator:
 
     def feed(self, data: bytes, now_ns: int) -> None:
         """Take what the host writes at this time."""
-        self._agenda.run_to(now_ns)
+        self._events.run_to(now_ns)
         if self.port_open:
             self._from_host.send(data)
 
     def run_to(self, now_ns: int) -> list[tuple[int, bytes]]:
         """Return what has come to the host by then, each piece with its time of arrival."""
-        self._agenda.run_to(now_ns)
+        self._events.run_to(now_ns)
         self._wake_robot()
         arrived, self._arrived = self._arrived, []
         return arrived
 
     def _arrive(self, data: bytes) -> None:
         if self.port_open:
-            self._arrived.append((self._agenda.now_ns, data))
+            self._arrived.append((self._events.now_ns, data))
 
     # -- the USB of the robot ---------------------------------------------------------------------
 
-    def feed_robot(self, data: bytes, now_ns: int) -> None:
+    def feed_console(self, data: bytes, now_ns: int) -> None:
         """Take what somebody writes to the robot's own USB at this time."""
-        self._agenda.run_to(now_ns)
+        self._events.run_to(now_ns)
         self._from_cable.send(data)
 
-    def take_robot(self) -> list[tuple[int, bytes]]:
+    def take_console(self) -> list[tuple[int, bytes]]:
         """Return what has come from the robot's own USB by now, each piece with its time."""
         said, self._said = self._said, []
         return said
@@ -167,8 +167,8 @@ class Emulator:
             self._from_cable.clear()
             self._to_cable.clear()
             self._cut_power()
-            self._agenda.at(
-                self._agenda.now_ns + _BOOT_LOADER_NS, lambda: self._boot_robot(_EXTERNAL)
+            self._events.at(
+                self._events.now_ns + _BOOT_LOADER_NS, lambda: self._boot_robot(_EXTERNAL)
             )
 
     def _tell_console(self, data: bytes) -> None:
@@ -178,10 +178,10 @@ class Emulator:
         if (written_us := self.board.slot.due_us) is not None:
             # A loop of the board later, by a clock that may be slow.
             later_us = 1.02 * (written_us - self.board.now_us) + LOOP_US
-            self._agenda.after_us(later_us, lambda: _ignore(self._wake_robot()))
+            self._events.after_us(later_us, lambda: _ignore(self._wake_robot()))
 
     def _arrive_by_cable(self, data: bytes) -> None:
-        self._said.append((self._agenda.now_ns, data))
+        self._said.append((self._events.now_ns, data))
 
     # -- what goes wrong --------------------------------------------------------------------------
 
@@ -197,8 +197,8 @@ class Emulator:
 
     def inject(self, name: str, duration: float = math.nan, value: float = math.nan) -> None:
         """Let a fault begin now."""
-        self._play(Fault(name, 0.0, duration, value), self._agenda.now_ns)
-        self._agenda.run_to(self._agenda.now_ns)
+        self._play(Fault(name, 0.0, duration, value), self._events.now_ns)
+        self._events.run_to(self._events.now_ns)
 
     def end(self, name: str) -> None:
         """End a fault now, however long it was meant to last."""
@@ -208,9 +208,9 @@ class Emulator:
     def _play(self, fault: Fault, start_ns: int) -> None:
         span = self.faults.add(fault, start_ns)
         begins, ends = self._effects(fault.name)
-        self._agenda.at(span.start_ns, begins)
+        self._events.at(span.start_ns, begins)
         if math.isfinite(span.end_ns):
-            self._agenda.at(round(span.end_ns), ends)
+            self._events.at(round(span.end_ns), ends)
 
     def _effects(self, name: str) -> tuple[Callable[[], None], Callable[[], None]]:
         """Return what the begin and the end of a fault do at once."""
@@ -228,7 +228,7 @@ class Emulator:
         """Start the dongle anew, as opening its port does to many boards."""
         self._from_host.clear()
         self._to_host.clear()
-        self.dongle.boot(_EXTERNAL, round(self._settings.dongle_start * NANOSECONDS))
+        self.dongle.boot(_EXTERNAL, round(self._parameters.dongle_start * NANOSECONDS))
 
     def _pull_out(self) -> None:
         self.port_open = False
@@ -258,17 +258,17 @@ class Emulator:
 
     def _wake_robot(self) -> bool:
         """Bring the robot to this instant; return whether it listens."""
-        elapsed = self._agenda.now_ns - self._boot_ns
+        elapsed = self._events.now_ns - self._boot_ns
         time_us = int(elapsed * self._rate) // MICROSECOND
         if self._away:
             self.plant.run(time_us)
-            self._boot_ns = self._agenda.now_ns
+            self._boot_ns = self._events.now_ns
             return False
         self.board.run_to(time_us)
         if self.plant.collapsed:
             self._lose_power()
-            away = round(self._settings.twin.boot_time * NANOSECONDS)
-            self._agenda.at(self._agenda.now_ns + away, lambda: self._boot_robot(_BROWN_OUT))
+            away = round(self._parameters.twin.boot_time * NANOSECONDS)
+            self._events.at(self._events.now_ns + away, lambda: self._boot_robot(_BROWN_OUT))
             return False
         return True
 
@@ -278,8 +278,8 @@ class Emulator:
 
     def _lose_power(self) -> None:
         self._away = True
-        self._boot_ns = self._agenda.now_ns
-        self._ether.clear()
+        self._boot_ns = self._events.now_ns
+        self._channel.clear()
         self.plant.turn(0, 0)
         self.plant.power(False)
 
@@ -288,11 +288,11 @@ class Emulator:
             return
         self._wake_robot()
         if self.plant.collapsed:
-            again = self._agenda.now_ns + round(self._settings.twin.boot_time * NANOSECONDS)
-            self._agenda.at(again, lambda: self._boot_robot(cause))
+            again = self._events.now_ns + round(self._parameters.twin.boot_time * NANOSECONDS)
+            self._events.at(again, lambda: self._boot_robot(cause))
             return
         self._away = False
-        self._boot_ns = self._agenda.now_ns
+        self._boot_ns = self._events.now_ns
         self.board.boot(cause)
 
 
@@ -302,3 +302,38 @@ def _ignore(awake: bool) -> None:
 
 def _nothing() -> None:
     """Do nothing: most faults are looked up when they matter."""
+
+
+class StopTimeMonitor:
+    """Tells each stop but those for which a speed of zero was commanded.
+
+    So after silence, a reset, an emergency stop, and when a host takes its leave.
+
+    Parameters
+    ----------
+    emulator
+        Its board tells of each command that it follows.
+    """
+
+    def __init__(self, emulator: Emulator) -> None:
+        self._plant = emulator.plant
+        self._command: Command | None = None
+        self._followed = 0.0
+        emulator.board.followed = self._follow
+
+    def news(self) -> str:
+        """Return a line when the wheels have come to rest since the last call, else nothing."""
+        command, stopped = self._command, self._plant.stopped_at
+        if command is None or stopped is None or stopped < self._followed:
+            return ''
+        self._command = None
+        if not command.left and not command.right:
+            return ''
+        right, left = command.right / 1000.0, command.left / 1000.0
+        return (
+            f'wheels at rest {stopped - self._followed:.3f} s after the last command '
+            f'(right {right:g}, left {left:g} rad/s)'
+        )
+
+    def _follow(self, now_us: int, command: Command) -> None:
+        self._command, self._followed = command, self._plant.elapsed

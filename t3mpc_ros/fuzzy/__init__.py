@@ -1,3 +1,3 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Non-singleton type-3 fuzzy systems and their Lyapunov adaptation."""
+"""Non-singleton type-3 fuzzy sets, inference and adaptive estimators."""

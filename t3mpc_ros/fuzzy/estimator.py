@@ -1,18 +1,159 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The fuzzy estimator of unknown dynamics, g(U|alpha) of (30), (31), with its adaptation."""
+"""Fuzzy estimator of the unknown dynamics, (30)-(31), with its adaptation law (77)-(78)."""
 
+from dataclasses import dataclass
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.fuzzy.adaptation import AdaptationSettings, adapt
 from t3mpc_ros.fuzzy.inference import basis, basis_of, combine
-from t3mpc_ros.fuzzy.sets import FuzzySets, FuzzySettings, build_sets
+from t3mpc_ros.fuzzy.sets import FuzzyParameters, FuzzySets, build_sets
 from t3mpc_ros.kernels import kernel
+from t3mpc_ros.parameters.table import Parameters, parameter
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class AdaptationParameters(Parameters):
+    """How fast the coefficients learn, and what they must not do."""
+
+    enabled: bool = parameter(True, 'whether the coefficients are adapted at all', dynamic=True)
+    gamma: float = parameter(
+        240.0,
+        'adaptation gain gamma of (77)-(78). What is felt is the normalised gain gamma |Phi|² '
+        '(1/s²): the error then obeys s² + K s + gamma |Phi|² = 0. With the default type-3 sets '
+        '|Phi|² is 0.015 to 0.14, so 240 makes about 15; with type1 or interval_type2 it is about '
+        'three times larger, so a third of gamma does the same',
+        unit='1/s²',
+        low=0.0,
+        high=1e6,
+        dynamic=True,
+    )
+    radius: float = parameter(
+        40.0,
+        'root mean square of the coefficients of an output at the surface of the ball they are '
+        'projected onto, |alpha| <= radius sqrt(2 r lambda): a constant estimate of this size '
+        'just fits in, whatever the number of rules',
+        unit='rad/s²',
+        low=0.0,
+        high=1e4,
+        dynamic=True,
+    )
+    sigma_modification: float = parameter(
+        0.0,
+        'rate at which coefficients leak towards zero (gamma times the usual sigma); bounds them '
+        'without a known ball, at the price of a bias',
+        unit='1/s',
+        low=0.0,
+        high=10.0,
+        dynamic=True,
+    )
+    dead_zone: float = parameter(
+        0.0,
+        'error from which on coefficients adapt; a smaller one counts as noise. At least the '
+        'disturbance that no coefficients can explain divided by K; noise about as wide already '
+        'drifts little',
+        unit='rad/s',
+        low=0.0,
+        high=10.0,
+        dynamic=True,
+    )
+    step_limit: float = parameter(
+        2.0,
+        'largest gamma |Phi|² dt of one step, beyond which gamma is reduced; the sampled loop is '
+        'stable only while it stays below K',
+        unit='1/s',
+        low=0.001,
+        high=1000.0,
+        dynamic=True,
+    )
+
+
+@kernel
+def beyond_dead_zone(error: float, width: float) -> float:
+    """Return the part of ``error`` outside the dead zone, delta - sat(delta), rad/s.
+
+    It is continuous: a switch at the edge would let noise adapt in full steps.
+    """
+    return error - min(max(error, -width), width)
+
+
+@kernel
+def adapt(
+    coefficients: Array,
+    phi: Array,
+    errors: Array,
+    dt: float,
+    gamma: float,
+    radius: float,
+    leakage: float,
+    dead_zone: float,
+    step_limit: float,
+) -> bool:
+    r"""Adapt the coefficients over ``dt`` and decide whether the errors could be used.
+
+    .. math:: \dot\alpha = \gamma\Phi\,(\delta - \mathrm{sat}(\delta)) - \sigma\alpha,
+              \qquad \|\alpha\| \le \rho
+
+    (77)-(78) alone make V of (74) decrease only while estimation errors omega are absent. Under
+    noise alpha is a sum of random steps and drifts without bound. With
+    alpha~ = alpha* - alpha, each addition has its own argument (Ioannou and Sun, Robust Adaptive
+    Control, 1996, chapter 8; Narendra and Annaswamy, Stable Adaptive Systems, 1989, chapter 8):
+
+    - *Dead zone.* Take V with d = delta - sat(delta) in the place of delta. Outside the zone
+      d delta = |d|(|d| + width), so V' <= -K d² - |d|(K width - |omega|): V decreases whenever
+      the width is at least |omega|/K. Inside, d = 0 and V rests: nothing drifts.
+    - *sigma-modification.* The leakage adds (sigma/gamma) alpha~'alpha to V', which is at most
+      (sigma/2 gamma)(|alpha*|² - |alpha~|²): negative once alpha~ is larger than alpha*, so
+      alpha is bounded for any omega. Its decay is taken exactly, hence stable at any dt.
+    - *Projection.* The nearest point of a convex set is no farther from any member than the
+      point was: while alpha* lies in the ball, |alpha~| and so V can only shrink by it. This
+      holds for whole steps too, unlike the usual projection of the derivative.
+    - *Step limit.* With sampling, delta and the estimate follow the matrix
+      [[1 - K dt, dt], [-gamma |Phi|² dt, 1]]. By Jury's conditions it is stable, for K dt < 2,
+      exactly when its determinant is below one: gamma |Phi|² dt² < K dt. So the step's
+      gamma |Phi|² dt is capped at a rate below K, whatever gamma and however long the step.
+
+    coefficients : shape (m, p), alpha, updated, rad/s²
+    phi : shape (p,), basis at which the errors arose
+    errors : shape (m,), delta, rad/s
+    dt : s, not negative
+    gamma : 1/s²
+    radius : rho, largest Euclidean norm of each output's coefficients, rad/s²
+    leakage : sigma, 1/s
+    dead_zone : width, rad/s
+    step_limit : largest gamma |Phi|² dt, 1/s
+
+    Returns False, and changes nothing, when an error is not finite.
+    """
+    for z in range(errors.size):
+        if not math.isfinite(errors[z]):
+            return False
+    power = 0.0
+    for k in range(phi.size):
+        power += phi[k] * phi[k]
+    # Without a basis no coefficient bears any blame; any finite gain then does nothing.
+    gain = gamma * dt if power > 0.0 else 0.0
+    if gain * power > step_limit:
+        gain = step_limit / power
+    keep = math.exp(-leakage * dt)
+    for z in range(errors.size):
+        # Errors beyond 1e9 end on the ball's surface like that one, without overflow.
+        step = gain * beyond_dead_zone(min(max(errors[z], -1e9), 1e9), dead_zone)
+        square = 0.0
+        for k in range(phi.size):
+            coefficients[z, k] = keep * coefficients[z, k] + step * phi[k]
+            square += coefficients[z, k] * coefficients[z, k]
+        norm = math.sqrt(square)
+        if norm > radius:
+            for k in range(phi.size):
+                coefficients[z, k] *= radius / norm
+    return True
+
+
 Tables = tuple[Array, Array, Array, Array, Array, Array, Array, Array]
 
 
@@ -20,7 +161,7 @@ Tables = tuple[Array, Array, Array, Array, Array, Array, Array, Array]
 def estimate(
     inputs: Array,
     centres: Array,
-    pull: Array,
+    nonsingleton_gain: Array,
     sharpness: Array,
     shares: Array,
     grades: Array,
@@ -38,7 +179,7 @@ def estimate(
     for i in range(inputs.size):
         if not math.isfinite(inputs[i]):
             return False
-    basis(inputs, centres, pull, sharpness, shares, grades, firings, phi)
+    basis(inputs, centres, nonsingleton_gain, sharpness, shares, grades, firings, phi)
     combine(coefficients, phi, outputs)
     return True
 
@@ -69,21 +210,21 @@ class FuzzyEstimator:
 
     def __init__(
         self,
-        settings: FuzzySettings,
-        adaptation: AdaptationSettings,
+        parameters: FuzzyParameters,
+        adaptation: AdaptationParameters,
         outputs: int = 2,
         inputs: int = 2,
     ) -> None:
         if outputs < 1:
             raise ValueError(f'outputs must be at least 1: got {outputs}')
-        self._sets = build_sets(settings, inputs)
+        self._sets = build_sets(parameters, inputs)
         self._grades = np.zeros(self._sets.widths.shape)
         self._firings = np.zeros((self._sets.rules, self._sets.slices, 2, 2))
         self._phi: Array = np.zeros(self._sets.size)
         self._coefficients: Array = np.zeros((outputs, self._sets.size))
         self.tables: Tables = (
             self._sets.centres,
-            self._sets.pull,
+            self._sets.nonsingleton_gain,
             self._sets.sharpness,
             self._sets.shares,
             self._grades,
@@ -94,7 +235,7 @@ class FuzzyEstimator:
         """What :func:`estimate` reads and writes between inputs and outputs, in its order."""
         self.configure(adaptation)
 
-    def configure(self, adaptation: AdaptationSettings) -> None:
+    def configure(self, adaptation: AdaptationParameters) -> None:
         """Learn differently from the next step on; what was learnt is kept."""
         self._adaptation = adaptation
         self._radius = adaptation.radius * math.sqrt(self._sets.size)
@@ -166,7 +307,7 @@ class FuzzyEstimator:
         return self._sets
 
     @property
-    def adaptation(self) -> AdaptationSettings:
+    def adaptation(self) -> AdaptationParameters:
         """How it learns at present."""
         return self._adaptation
 
@@ -207,17 +348,17 @@ class FuzzyEstimator:
 
     def _adapt(self, errors: Array, dt: float) -> None:
         values = np.ascontiguousarray(errors, dtype=np.float64)
-        settings = self._adaptation
+        parameters = self._adaptation
         if values.shape != self._coefficients.shape[:1] or not adapt(
             self._coefficients,
             self._phi,
             values,
             dt,
-            settings.gamma,
+            parameters.gamma,
             self._radius,
-            settings.sigma_modification,
-            settings.dead_zone,
-            settings.step_limit,
+            parameters.sigma_modification,
+            parameters.dead_zone,
+            parameters.step_limit,
         ):
             raise ValueError(
                 f'errors must be {len(self._coefficients)} finite numbers: got {errors}'
@@ -225,7 +366,7 @@ class FuzzyEstimator:
 
 
 def gamma_for(
-    settings: FuzzySettings, normalised_gain: float, inputs: int = 2, samples: int = 400
+    parameters: FuzzyParameters, normalised_gain: float, inputs: int = 2, samples: int = 400
 ) -> float:
     """Return the gamma (1/s²) whose normalised gain gamma |Phi|² is this on average.
 
@@ -243,9 +384,9 @@ def gamma_for(
     samples
         Inputs averaged over, uniform between the first and last centre, from a fixed seed.
     """
-    sets = build_sets(settings, inputs)
+    sets = build_sets(parameters, inputs)
     drawn = np.random.default_rng(0).uniform(
-        settings.centre_low, settings.centre_high, (samples, inputs)
+        parameters.centre_low, parameters.centre_high, (samples, inputs)
     )
     power = np.mean([np.sum(basis_of(point, sets) ** 2) for point in drawn])
     return float(normalised_gain / power)

@@ -1,11 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Inference of the non-singleton type-3 fuzzy system, equations (16)-(33) with E7 and E8.
-
-Arrays over sets have shape (n, M, lambda, 2, 2): input, set, slice, level, bound; arrays over
-rules (r, lambda, 2, 2). On the last two axes 0 is lower and 1 is upper, as in
-:mod:`t3mpc_ros.fuzzy.sets`, where the tables come from.
-"""
+"""Inference of the non-singleton type-3 fuzzy system, equations (16)-(33) with E7 and E8."""
 
 import math
 
@@ -19,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 @kernel
-def fuzzify(inputs: Array, centres: Array, pull: Array, found: Array) -> None:
+def fuzzify(inputs: Array, centres: Array, nonsingleton_gain: Array, found: Array) -> None:
     r"""Write where each fuzzy input meets each set, equations (16)-(19).
 
     .. math:: x^* = \frac{U\beta^2 + o\beta_U^2}{\beta^2 + \beta_U^2}
@@ -41,10 +36,12 @@ def fuzzify(inputs: Array, centres: Array, pull: Array, found: Array) -> None:
         value = min(max(inputs[i], -1e9), 1e9)
         for h in range(centres.shape[1]):
             offset = centres[i, h] - value
-            for j in range(pull.shape[2]):
+            for j in range(nonsingleton_gain.shape[2]):
                 for level in range(2):
                     for bound in range(2):
-                        found[i, h, j, level, bound] = value + offset * pull[i, h, j, level, bound]
+                        found[i, h, j, level, bound] = (
+                            value + offset * nonsingleton_gain[i, h, j, level, bound]
+                        )
 
 
 @kernel
@@ -74,7 +71,7 @@ def square_distances(found: Array, centres: Array, sharpness: Array, squares: Ar
 
 @kernel
 def memberships(
-    inputs: Array, centres: Array, pull: Array, sharpness: Array, grades: Array
+    inputs: Array, centres: Array, nonsingleton_gain: Array, sharpness: Array, grades: Array
 ) -> None:
     r"""Write the grades :math:`\zeta = \exp(-((x^* - o)/\beta)^2)`, (16)-(23) with E7.
 
@@ -82,7 +79,7 @@ def memberships(
     control step takes :func:`relative_memberships` instead, which cannot underflow.
     Arguments as in :func:`fuzzify` and :func:`square_distances`; ``grades`` is overwritten.
     """
-    fuzzify(inputs, centres, pull, grades)
+    fuzzify(inputs, centres, nonsingleton_gain, grades)
     square_distances(grades, centres, sharpness, grades)
     flat = grades.reshape(-1)
     for k in range(flat.size):
@@ -130,7 +127,7 @@ def _subtract_nearest(squares: Array, j: int, level: int, bound: int) -> float:
 
 
 @kernel
-def fire(grades: Array, firings: Array) -> None:
+def firing_strengths(grades: Array, firings: Array) -> None:
     r"""Write the firing of every rule, :math:`\Omega^l = \prod_i \zeta_i`, (24)-(27).
 
     A rule (28) takes one set of each input. Upper grades make (24) at the upper level of a slice
@@ -192,7 +189,7 @@ def weigh(firings: Array, shares: Array, phi: Array) -> None:
 def basis(
     inputs: Array,
     centres: Array,
-    pull: Array,
+    nonsingleton_gain: Array,
     sharpness: Array,
     shares: Array,
     grades: Array,
@@ -209,10 +206,10 @@ def basis(
     grades, firings : shapes (n, M, lambda, 2, 2) and (r, lambda, 2, 2), overwritten
     phi : shape (2 r lambda,), overwritten, order of (32)
     """
-    fuzzify(inputs, centres, pull, grades)
+    fuzzify(inputs, centres, nonsingleton_gain, grades)
     square_distances(grades, centres, sharpness, grades)
     relative_memberships(grades)
-    fire(grades, firings)
+    firing_strengths(grades, firings)
     weigh(firings, shares, phi)
 
 
@@ -247,7 +244,16 @@ def basis_of(inputs: Array, sets: FuzzySets) -> Array:
     grades = np.empty(sets.widths.shape)
     firings = np.empty((sets.rules, sets.slices, 2, 2))
     phi = np.empty(sets.size)
-    basis(values, sets.centres, sets.pull, sets.sharpness, sets.shares, grades, firings, phi)
+    basis(
+        values,
+        sets.centres,
+        sets.nonsingleton_gain,
+        sets.sharpness,
+        sets.shares,
+        grades,
+        firings,
+        phi,
+    )
     return phi
 
 

@@ -1,73 +1,68 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Gaussian fuzzy sets of type 3, and of type 2 and 1 as their special cases, as tables.
-
-A type-3 set is, at each slice level, an interval type-2 set: one centre, two widths (Fig. 4).
-Everything that tells one kind of fuzzy system from another is in the numbers of these tables;
-the inference that reads them is the same, so that comparisons differ in nothing else.
-"""
+"""Gaussian fuzzy sets of type 3, and of type 2 and 1 as special cases, as tables."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.settings import SettingError, Settings, setting
+from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 
 Array = NDArray[np.float64]
 
 LOWER, UPPER = 0, 1
 """Places on the last two axes of the tables: lower and upper level, lower and upper width."""
 
-LARGEST = 100_000
+MAX_COEFFICIENTS = 100_000
 """Most coefficients per output that are accepted: M**n grows fast with the inputs n."""
 
 
 @dataclass(frozen=True)
-class FuzzySettings(Settings):
+class FuzzyParameters(Parameters):
     """The shape of the fuzzy system; the same for all its inputs."""
 
-    kind: str = setting(
+    kind: str = parameter(
         'type3',
         'what the sets are; type1 and interval_type2 are single slices at level one, the latter '
         'with the footprint set below',
         choices=('type3', 'interval_type2', 'type1'),
         source='paper: NT3FS, compared with the others',
     )
-    sets: int = setting(7, 'Gaussian sets per input, M', low=1, high=15)
-    centre_low: float = setting(
+    sets: int = parameter(7, 'Gaussian sets per input, M', low=1, high=15)
+    centre_low: float = parameter(
         -10.0, 'centre of the first set', unit='rad/s', low=-1000.0, high=1000.0
     )
-    centre_high: float = setting(
+    centre_high: float = parameter(
         10.0,
         'centre of the last set; the others are evenly spaced between',
         unit='rad/s',
         low=-1000.0,
         high=1000.0,
     )
-    crowding: float = setting(
+    centre_exponent: float = parameter(
         2.0,
         'how much closer together the centres are in the middle, where Coulomb friction changes '
         'its sign: their places in [-1, 1] are raised to this power; 1 is even',
         low=0.2,
         high=5.0,
     )
-    spread: float = setting(
+    spread: float = parameter(
         0.6,
         'width sigma of the sets as a fraction of the centre spacing, in exp(-((x - o)/sigma)²); '
         'at 0.6 neighbours cross at grade one half (a single set has the range as its spacing)',
         low=0.05,
         high=10.0,
     )
-    slices: int = setting(4, 'slices lambda of the type-3 sets', low=1, high=32)
-    footprint: float = setting(
+    slices: int = parameter(4, 'slices lambda of the type-3 sets', low=1, high=32)
+    footprint_of_uncertainty: float = parameter(
         0.23,
         'interval_type2 only: widths are (1 - footprint) sigma and (1 + footprint) sigma; at '
         '0.23 as wide as the type-3 default is on average, weighted by level',
         low=0.0,
         high=0.95,
     )
-    input_fuzziness: float = setting(
+    input_fuzziness: float = parameter(
         0.283,
         'fuzziness of the inputs beta_U, in exp(-((x - U)/beta_U)²): sqrt(2) times the standard '
         'deviation of the noise (0.2 rad/s); zero makes the fuzzifier a singleton',
@@ -77,10 +72,10 @@ class FuzzySettings(Settings):
         source='paper: noise variance 0.04',
     )
 
-    def check_together(self) -> None:
-        """Raise SettingError unless the centres ascend."""
+    def check_consistency(self) -> None:
+        """Raise ParameterError unless the centres ascend."""
         if self.centre_high <= self.centre_low:
-            raise SettingError(
+            raise ParameterError(
                 f'centre_high must be above centre_low ({self.centre_low:g} rad/s): '
                 f'got {self.centre_high:g}'
             )
@@ -92,7 +87,7 @@ class FuzzySettings(Settings):
         if self.sets == 1:
             return np.array([middle])
         places = np.linspace(-1.0, 1.0, self.sets)
-        crowded = np.sign(places) * np.abs(places) ** self.crowding
+        crowded = np.sign(places) * np.abs(places) ** self.centre_exponent
         return middle + 0.5 * (self.centre_high - self.centre_low) * crowded
 
     @property
@@ -126,7 +121,7 @@ class FuzzySets:
     has the lower one strictly below; equality is the limit in which a slice is one level."""
     input_fuzziness: float
     """beta_U, rad/s."""
-    pull: Array = field(init=False)
+    nonsingleton_gain: Array = field(init=False)
     """beta_U² / (beta² + beta_U²): how far (16)-(19) draw the input to the centre; as widths."""
     sharpness: Array = field(init=False)
     """1/beta, s/rad, shape as widths."""
@@ -140,7 +135,7 @@ class FuzzySets:
             for table in (self.centres, self.widths, self.levels)
         )
         fuzziness = float(self.input_fuzziness)
-        _check(centres, widths, levels, fuzziness)
+        _check_tables(centres, widths, levels, fuzziness)
         tables = {
             'centres': centres,
             'widths': widths,
@@ -175,7 +170,7 @@ class FuzzySets:
         return 2 * self.rules * self.slices
 
 
-def _check(centres: Array, widths: Array, levels: Array, fuzziness: float) -> None:
+def _check_tables(centres: Array, widths: Array, levels: Array, fuzziness: float) -> None:
     if centres.ndim != 2 or centres.size == 0:
         raise ValueError(f'centres must have shape (inputs, sets): got {centres.shape}')
     if levels.ndim != 2 or levels.shape[0] == 0 or levels.shape[1] != 2:
@@ -201,9 +196,9 @@ def _check(centres: Array, widths: Array, levels: Array, fuzziness: float) -> No
 
 def _check_size(inputs: int, sets: int, slices: int) -> None:
     size = 2 * sets**inputs * slices
-    if size > LARGEST:
+    if size > MAX_COEFFICIENTS:
         raise ValueError(
-            f'inputs must leave at most {LARGEST} coefficients: got {inputs} inputs of {sets} '
+            f'inputs must leave at most {MAX_COEFFICIENTS} coefficients: got {inputs} inputs of {sets} '
             f'sets with {slices} slices, which make {size}'
         )
 
@@ -231,7 +226,7 @@ def type3_widths(width: float, levels: Array) -> Array:
     return np.stack([width * root, width / root], axis=-1)
 
 
-def build_sets(settings: FuzzySettings, inputs: int = 2) -> FuzzySets:
+def build_sets(parameters: FuzzyParameters, inputs: int = 2) -> FuzzySets:
     """Return the tables of ``inputs`` equal inputs.
 
     Raises
@@ -241,17 +236,19 @@ def build_sets(settings: FuzzySettings, inputs: int = 2) -> FuzzySets:
     """
     if inputs < 1:
         raise ValueError(f'inputs must be at least 1: got {inputs}')
-    if settings.kind == 'type3':
-        levels = slice_levels(settings.slices)
+    if parameters.kind == 'type3':
+        levels = slice_levels(parameters.slices)
     else:
         levels = np.ones((1, 2))  # one slice, at level one: secondary grades are all one
-    _check_size(inputs, settings.sets, len(levels))
-    each = np.stack([type3_widths(width, levels) for width in settings.widths.tolist()])
-    if settings.kind == 'interval_type2':
-        each = each * np.array([1.0 - settings.footprint, 1.0 + settings.footprint])
+    _check_size(inputs, parameters.sets, len(levels))
+    each = np.stack([type3_widths(width, levels) for width in parameters.widths.tolist()])
+    if parameters.kind == 'interval_type2':
+        each = each * np.array(
+            [1.0 - parameters.footprint_of_uncertainty, 1.0 + parameters.footprint_of_uncertainty]
+        )
     return FuzzySets(
-        centres=np.tile(settings.centres, (inputs, 1)),
+        centres=np.tile(parameters.centres, (inputs, 1)),
         widths=np.broadcast_to(each, (inputs, *each.shape)),
         levels=levels,
-        input_fuzziness=settings.input_fuzziness,
+        input_fuzziness=parameters.input_fuzziness,
     )

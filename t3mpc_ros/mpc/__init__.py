@@ -1,3 +1,3 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Boltzmann-machine predictor, its training, and the constrained predictive step."""
+"""Boltzmann-machine predictive control."""

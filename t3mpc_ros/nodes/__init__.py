@@ -1,3 +1,3 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The only room that knows ROS."""
+"""ROS 2 nodes: the only part of the package that imports rclpy."""

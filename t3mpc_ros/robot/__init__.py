@@ -1,3 +1,3 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated robot: Lagrangian dynamics, drives, guard and odometry."""
+"""What simulated and real robots share: interface, command limiter, odometry."""

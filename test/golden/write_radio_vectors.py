@@ -12,9 +12,9 @@ import json
 from pathlib import Path
 import random
 
-from t3mpc_ros.radio import authentication, codec, frames
-from t3mpc_ros.radio.frames import Flag
-from t3mpc_ros.radio.splitter import crc16, stuff, to_wire
+from t3mpc_ros.radio.protocol import authentication, codec, frames
+from t3mpc_ros.radio.protocol.frames import CommandFlag
+from t3mpc_ros.radio.protocol.framing import cobs_encode, crc16, encode_frame
 
 TARGET = Path(__file__).with_name('radio_vectors.json')
 
@@ -39,7 +39,7 @@ b78dbfaf3a8d83bd ea1ad565322a1a0b 60e61c23a3795013 6606d7e446282b93
 6ca4ecb15c5f91e1 9f626da15c9625f3 e51b38608ef25f57 958a324ceb064572
 """
 
-GOLDEN_COMMAND = frames.Command(0x5A, 7, Flag.ENABLE, 20, 5000, -2500, 0x01020304)
+GOLDEN_COMMAND = frames.Command(0x5A, 7, CommandFlag.ENABLE, 20, 5000, -2500, 0x01020304)
 GOLDEN_STATE = frames.State(
     0x5A, 7, 3, 123456789, 1000, -1000, -131, 164, 0, 76, bytes.fromhex('a0fe013c00145078')
 )
@@ -51,8 +51,8 @@ DOWN = {
     'all at their least': frames.Command(0, 0, 0, 0, -32768, -32768, 0),
     'all at their most': frames.Command(255, 255, 7, 255, 32767, 32767, 0xFFFFFFFF),
     'stop': frames.Command(0x5A, 8, 0, 0, 0, 0, 0x01020305),
-    'emergency stop of nobody': frames.Command(0, 0, Flag.ESTOP, 0, 0, 0, 0),
-    'release': frames.Command(0x5A, 9, Flag.ESTOP_CLEAR, 0, 0, 0, 0x01020306),
+    'emergency stop of nobody': frames.Command(0, 0, CommandFlag.ESTOP, 0, 0, 0, 0),
+    'release': frames.Command(0x5A, 9, CommandFlag.ESTOP_CLEAR, 0, 0, 0, 0x01020306),
     'with a tag that is none': GOLDEN_COMMAND._replace(tag=TAG),
     'get': frames.ParamGet(0x5A, 10, 3),
     'set': frames.ParamSet(0x5A, 11, 0, 12345678),
@@ -183,7 +183,7 @@ def _frames(table: dict, on_wire: bool) -> list[dict]:
         data = codec.encode(frame)
         row = {'kind': type(frame).__name__, 'name': name, 'bytes': data.hex()}
         if on_wire:
-            row['wire'] = to_wire(data).hex()
+            row['wire'] = encode_frame(data).hex()
         rows.append(row | {'fields': _plain(frame)})
     return rows
 
@@ -193,7 +193,7 @@ def _random_wires() -> list[dict]:
     rows = []
     for length in range(1, 79):
         data = bytes(source.choice((0, 0, 1, 255, source.randrange(256))) for _ in range(length))
-        rows.append({'bytes': data.hex(), 'wire': to_wire(data).hex()})
+        rows.append({'bytes': data.hex(), 'wire': encode_frame(data).hex()})
     return rows
 
 
@@ -204,13 +204,13 @@ def _session() -> dict:
     nonces = bytes.fromhex('0102030405060708'), bytes.fromhex('1112131415161718')
     fresh = bytes.fromhex('a1a2a3a4a5a6a7a8'), bytes.fromhex('b1b2b3b4b5b6b7b8')
     start = 0xFFFFF000
-    gate = authentication.Gate(key)
+    gate = authentication.CommandVerifier(key)
     rows: list[dict] = []
 
     def hello(name: str, frame: frames.Hello, drawn: bytes = bytes(8)) -> None:
         _add(name, frame, lambda: gate.greet(frame, drawn), {'fresh_nonce': drawn.hex()})
 
-    def other_kind(name: str, frame: authentication.Signed) -> None:
+    def other_kind(name: str, frame: authentication.SignedFrame) -> None:
         _add(name, frame, lambda: gate.check(frame), {})
 
     def _add(name: str, frame: tuple, judge: Callable[[], str], more: dict) -> None:
@@ -233,11 +233,11 @@ def _session() -> dict:
     setting = signer.sign(frames.ParamSet(0x5A, 8, 0, 12000, start + 20))
     reset = signer.sign(frames.Action(0x5A, 9, frames.RESET_ODOMETRY, start + 30))
     late = signer.sign(command._replace(seq=10, host_us=start + 40))
-    clear = signer.sign(frames.Command(0x5A, 11, Flag.ESTOP_CLEAR, 0, 0, 0, start + 50))
+    clear = signer.sign(frames.Command(0x5A, 11, CommandFlag.ESTOP_CLEAR, 0, 0, 0, start + 50))
     wrapped = signer.sign(command._replace(seq=12, host_us=5))
     after = signer.sign(frames.ParamSet(0x5A, 13, 1, -1, 0xFFFFFFFF))
     twice = signer.sign(command._replace(seq=14, host_us=0))
-    stop = frames.Command(0, 0, Flag.ESTOP, 0, 0, 0, 0)
+    stop = frames.Command(0, 0, CommandFlag.ESTOP, 0, 0, 0, 0)
     other_kind('CMD', early)
     other_kind('the same CMD again', early)
     other_kind('CMD without a tag', command._replace(host_us=start + 15))
@@ -266,7 +266,7 @@ def _session() -> dict:
     hello('the first HELLO again: a session nobody has the key of', first, bytes(8))
     other_kind('CMD of the first session', early)
 
-    keyless = authentication.Gate()
+    keyless = authentication.CommandVerifier()
     return {
         'key': key.hex(),
         'session_keys': [
@@ -309,12 +309,12 @@ def _stops(key: bytes) -> dict:
     """Return what becomes of emergency stops: all are obeyed, `counted` are those in the order."""
     start = 0xFFFFF000
     host, fresh = bytes.fromhex('2122232425262728'), bytes.fromhex('c1c2c3c4c5c6c7c8')
-    gate = authentication.Gate(key)
+    gate = authentication.CommandVerifier(key)
     hello = authentication.sign_hello(key, 0x5B, 1, start, host)
     if why := gate.greet(hello, fresh):
         raise ValueError(f'HELLO must be accepted: got {why}')
     signer = authentication.Signer(authentication.session_key(key, host, fresh), start)
-    stop = frames.Command(0x5B, 1, Flag.ESTOP, 0, 0, 0, 0)
+    stop = frames.Command(0x5B, 1, CommandFlag.ESTOP, 0, 0, 0, 0)
     before = signer.sign(GOLDEN_COMMAND._replace(session=0x5B, seq=2, host_us=start + 10))
     signed = signer.sign(stop._replace(seq=3, host_us=start + 20))
     wrapped = signer.sign(stop._replace(seq=4, host_us=5))
@@ -349,7 +349,7 @@ def _second(key: bytes, nonce: bytes) -> frames.Hello:
     return authentication.sign_hello(key, 0x5A, 2, 100, nonce)
 
 
-def _flip(frame: authentication.AnySigned) -> authentication.AnySigned:
+def _flip(frame: authentication.AnySignedFrame) -> authentication.AnySignedFrame:
     return frame._replace(tag=bytes([frame.tag[0] ^ 1]) + frame.tag[1:])
 
 
@@ -361,8 +361,8 @@ def vectors() -> dict:
         'constants': {
             'version': frames.VERSION,
             'payload_limit': frames.PAYLOAD_LIMIT,
-            'flags': {flag.name: flag.value for flag in Flag},
-            'status': {status.name: status.value for status in frames.Status},
+            'flags': {flag.name: flag.value for flag in CommandFlag},
+            'status': {status.name: status.value for status in frames.StatusFlag},
             'results': {name: getattr(frames, name) for name in codes},
             'actions': {
                 name: getattr(frames, name) for name in ('RESET_ODOMETRY', 'CLEAR_COUNTERS')
@@ -370,7 +370,7 @@ def vectors() -> dict:
             'polls': {name: getattr(frames, name) for name in ('STATE', 'AUX', 'INFO')},
             'parameters': [
                 {'id': number} | parameter._asdict()
-                for number, parameter in enumerate(frames.PARAMETERS)
+                for number, parameter in enumerate(frames.BOARD_PARAMETERS)
             ],
         },
         'crc16': [
@@ -378,7 +378,7 @@ def vectors() -> dict:
             for data in (b'', b'123456789', bytes(1), b'\xff' * 78)
         ],
         'cobs': [
-            {'bytes': data.hex(), 'stuffed': stuff(data).hex()}
+            {'bytes': data.hex(), 'stuffed': cobs_encode(data).hex()}
             for data in (b'', b'\0', b'\0\0', b'\1', b'\1\0', b'\0\1', b'11\x000', b'\xff' * 80)
         ],
         'siphash': {

@@ -1,16 +1,16 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The USB of the robot's own board: how it fares, and its key, a cell of the EEPROM at a time."""
+"""USB console of the robot board: status, and the key in EEPROM, written cell by cell."""
 
 from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
-from t3mpc_ros.emulator.board.answers import MAJOR, MINOR
-from t3mpc_ros.radio import frames
-from t3mpc_ros.radio.authentication import Gate, key_check
-from t3mpc_ros.radio.codec import decode_to_board, encode
-from t3mpc_ros.radio.frames import (
+from t3mpc_ros.emulator.board.uplink import FIRMWARE_MAJOR, FIRMWARE_MINOR
+from t3mpc_ros.radio.protocol import frames
+from t3mpc_ros.radio.protocol.authentication import KEY_SIZE, CommandVerifier, key_check
+from t3mpc_ros.radio.protocol.codec import decode_to_board, encode
+from t3mpc_ros.radio.protocol.frames import (
     VERSION,
     FrameError,
     FromBoard,
@@ -19,8 +19,7 @@ from t3mpc_ros.radio.frames import (
     Pong,
     Refusal,
 )
-from t3mpc_ros.radio.siphash import KEY_SIZE
-from t3mpc_ros.radio.splitter import Splitter, crc16, to_wire
+from t3mpc_ros.radio.protocol.framing import FrameDecoder, crc16, encode_frame
 
 CELL_US = 3_400
 """A cell of an AVR's EEPROM takes so long to be erased and written."""
@@ -31,7 +30,7 @@ _BLANK, _MARK = 0xFF, 0
 _HALF, _WORD = 0xFFFF, 0xFFFFFFFF
 
 
-class KeySlot:
+class KeyStore:
     """Where the key is kept: a record with a CRC, and a mark while it is being changed.
 
     Parameters
@@ -69,22 +68,22 @@ class KeySlot:
         self.work(now_us)
         self._plan.clear()
 
-    def gate(self) -> Gate:
+    def gate(self) -> CommandVerifier:
         """Return who decides which frames count, with the key that is stored."""
         *record, mark = self._cells
         key, crc = bytes(record[:KEY_SIZE]), bytes(record[KEY_SIZE:])
         if mark != _BLANK:
-            return Gate(locked=True)
+            return CommandVerifier(locked=True)
         if bytes(record) == _record(b''):
-            return Gate()
-        return Gate(key) if crc == _crc(key) else Gate(locked=True)
+            return CommandVerifier()
+        return CommandVerifier(key) if crc == _crc(key) else CommandVerifier(locked=True)
 
 
 class _Board(Protocol):
     """What the console needs of its board."""
 
-    slot: KeySlot
-    gate: Gate
+    slot: KeyStore
+    gate: CommandVerifier
 
     @property
     def now_us(self) -> int: ...
@@ -113,7 +112,7 @@ class Console:
 
     def restart(self) -> None:
         """Forget what has come and what is under way."""
-        self._splitter = Splitter()
+        self._splitter = FrameDecoder()
         self._writing: int | None = None
 
     def feed(self, data: bytes) -> None:
@@ -148,7 +147,7 @@ class Console:
             self._tell_key(frame.id, frames.BUSY)
         else:
             self._writing = frame.id
-            self._board.gate = Gate(locked=True)
+            self._board.gate = CommandVerifier(locked=True)
             key = b'' if frame.key == _FORGET else frame.key
             self._board.slot.store(key, self._board.now_us)
 
@@ -163,13 +162,13 @@ class Console:
 
     def _tell_state(self, ping: Ping) -> None:
         board, counts = self._board, self._splitter.counts
-        who = VERSION, MAJOR, MINOR, 1
+        who = VERSION, FIRMWARE_MAJOR, FIRMWARE_MINOR, 1
         faults = counts.crc_errors & _HALF, counts.frame_errors & _HALF, 0
         now = board.now_us & _WORD
         self._answer(Pong(ping.id, ping.echo, now, *who, *faults, board.reset_cause))
 
     def _answer(self, frame: FromBoard) -> None:
-        self.reply(to_wire(encode(frame)))
+        self.reply(encode_frame(encode(frame)))
 
 
 def _crc(key: bytes) -> bytes:

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""What the board drives and reads: a plant in the emulator, anything in a test."""
+"""Hardware interface of the robot board; the plant implements it, and so do test doubles."""
 
 from typing import NamedTuple, Protocol
 

@@ -1,25 +1,25 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""What the robot measures, from the numbers on the wire to SI units and host time."""
+"""Telemetry of the robot: STATE frames converted to SI units and host time."""
 
 import math
 from typing import NamedTuple
 
-from t3mpc_ros.motion import WheelSpeeds
-from t3mpc_ros.radio.clock import ClockModel, Unwrapped, move
-from t3mpc_ros.radio.frames import AGE_NONE, State, Status
-from t3mpc_ros.robot.backend import ImuSample, RobotStatus, WheelAngles
-from t3mpc_ros.robot.sensors.mpu6050 import ImuSettings
-from t3mpc_ros.robot.sensors.sharp import reading
+from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.radio.protocol.clock_sync import ClockModel, CounterUnwrapper, wrapped_difference
+from t3mpc_ros.radio.protocol.frames import AGE_NONE, State, StatusFlag
+from t3mpc_ros.robot.interface import ImuSample, RobotStatus, WheelAngles
+from t3mpc_ros.simulation.sensors.imu import ImuParameters
+from t3mpc_ros.simulation.sensors.range_sensor import decode_range
 
 _MICROSECOND = 1000
 """ns"""
-_REBOOT = 1.0
+_MAX_CLOCK_ERROR = 1.0
 """s by which host and robot may disagree on how much time has passed, besides the share below."""
-_REBOOT_SHARE = 0.02
-_OLDEST_US = 200_000
+_MAX_CLOCK_ERROR_RATIO = 0.02
+_MAX_STATE_AGE_US = 200_000
 """A robot that hears nothing loads a new state twice as often as this."""
-_LONGEST_SPEED_GAP = 0.5
+_MAX_SPEED_INTERVAL = 0.5
 """s; over a longer gap the mean of the speed is not the speed"""
 STEPS_PER_REV, MICROSTEPS, GYRO_RANGE = 200, 16, 500
 
@@ -42,7 +42,7 @@ class Telemetry(NamedTuple):
     """As it came."""
 
 
-class Sending(NamedTuple):
+class CommandTiming(NamedTuple):
     """When the host sent the CMD that a state answers; only of one that needed no second try."""
 
     sent_ns: int
@@ -50,14 +50,14 @@ class Sending(NamedTuple):
     """To the robot, at least: ``clock.forward_ns``."""
 
 
-class TelemetryReader:
+class TelemetryDecoder:
     """Turns STATE after STATE into measurements; notices when the robot has started anew."""
 
     def __init__(self) -> None:
         self._clock = ClockModel()
-        self._time = Unwrapped()
-        self._left = Unwrapped()
-        self._right = Unwrapped()
+        self._time = CounterUnwrapper()
+        self._left = CounterUnwrapper()
+        self._right = CounterUnwrapper()
         self._base = WheelAngles(0.0, 0.0)
         self._wheels = WheelSpeeds(0.0, 0.0)
         self._last: State | None = None
@@ -94,21 +94,23 @@ class TelemetryReader:
         """
         if steps < 1:
             raise ValueError(f'steps of a turn must be at least 1: got {steps}')
-        imu = ImuSettings(gyro_range=str(gyro_range))
+        imu = ImuParameters(gyro_range=str(gyro_range))
         self._rate_step, self._acceleration_step = imu.rate_step, imu.acceleration_step
         step = math.tau / steps
         if step != self._step:
             self._base, self._step = self.angles, step
-            self._left, self._right = Unwrapped(), Unwrapped()
+            self._left, self._right = CounterUnwrapper(), CounterUnwrapper()
 
-    def read(self, state: State, now_ns: int, sending: Sending | None = None) -> Telemetry | None:
+    def read(
+        self, state: State, now_ns: int, sending: CommandTiming | None = None
+    ) -> Telemetry | None:
         """Return the measurement; None if it is not newer than the last one."""
         self._rebooted = self._has_restarted(state, now_ns)
         if self._rebooted:
             for counter in (self._time, self._left, self._right):
                 counter.rebase()
             self._clock.reset()
-        elif self._last is not None and move(self._last.time_us, state.time_us) <= 0:
+        elif self._last is not None and wrapped_difference(self._last.time_us, state.time_us) <= 0:
             return None
         before_us, right, left = self._time.total, self._right.total, self._left.total
         time_us = self._time.add(state.time_us)
@@ -123,7 +125,7 @@ class TelemetryReader:
             self.angles,
             self._wheels,
             self._imu(state),
-            tuple(map(reading, state.ranges)),
+            tuple(map(decode_range, state.ranges)),
             _status(state.status),
             state,
         )
@@ -136,22 +138,22 @@ class TelemetryReader:
         last = self._last
         if last is None:
             return False
-        back_us = move(state.time_us, last.time_us)
-        if state.status & Status.NO_SESSION and back_us > _OLDEST_US:
+        back_us = wrapped_difference(state.time_us, last.time_us)
+        if state.status & StatusFlag.NO_SESSION and back_us > _MAX_STATE_AGE_US:
             return True
         passed_us = (now_ns - self._last_ns) // _MICROSECOND
-        off = move((last.time_us + passed_us) % (1 << 32), state.time_us) / 1e6
-        return abs(off) > _REBOOT + _REBOOT_SHARE * passed_us / 1e6
+        off = wrapped_difference((last.time_us + passed_us) % (1 << 32), state.time_us) / 1e6
+        return abs(off) > _MAX_CLOCK_ERROR + _MAX_CLOCK_ERROR_RATIO * passed_us / 1e6
 
     def _speed(self, elapsed_us: int, right: int, left: int) -> None:
         if self._rebooted:
             self._wheels = WheelSpeeds(0.0, 0.0)
         elapsed = elapsed_us / 1e6 * (1.0 + self._clock.skew)
-        if 0.0 < elapsed <= _LONGEST_SPEED_GAP:
+        if 0.0 < elapsed <= _MAX_SPEED_INTERVAL:
             self._wheels = WheelSpeeds(right * self._step / elapsed, left * self._step / elapsed)
 
     def _imu(self, state: State) -> ImuSample | None:
-        if state.status & Status.IMU_FAULT:
+        if state.status & StatusFlag.IMU_FAULT:
             return None
         step = self._acceleration_step
         return ImuSample(
@@ -161,11 +163,11 @@ class TelemetryReader:
 
 def _status(bits: int) -> RobotStatus:
     return RobotStatus(
-        enabled=bool(bits & Status.ENABLED),
-        moving=bool(bits & Status.MOVING),
-        estop=bool(bits & Status.ESTOP),
-        timed_out=bool(bits & Status.TTL_EXPIRED),
-        limited=bool(bits & Status.LIMITED),
-        imu_fault=bool(bits & Status.IMU_FAULT),
-        low_battery=bool(bits & Status.LOW_BATTERY),
+        enabled=bool(bits & StatusFlag.ENABLED),
+        moving=bool(bits & StatusFlag.MOVING),
+        estop=bool(bits & StatusFlag.ESTOP),
+        timed_out=bool(bits & StatusFlag.TTL_EXPIRED),
+        limited=bool(bits & StatusFlag.LIMITED),
+        imu_fault=bool(bits & StatusFlag.IMU_FAULT),
+        low_battery=bool(bits & StatusFlag.LOW_BATTERY),
     )

@@ -1,0 +1,247 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The metadata.yaml of a bag in the format of rosbag2, version 9."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+import os
+from pathlib import Path
+import re
+from typing import Any
+
+import yaml
+
+from t3mpc_ros.bag.mcap_file import MCAP_SUFFIX, FileSummary, read_file_summary
+from t3mpc_ros.bag.qos import QosError, QosProfile, dump_yaml, profiles_from_yaml
+from t3mpc_ros.bag.schema import BagError
+
+METADATA_FILE_NAME = 'metadata.yaml'
+METADATA_VERSION = 9
+NO_START_NS = 2**63 - 1
+"""Starting time of what holds no message, as rosbag2 writes it (nanoseconds since 1970)."""
+
+_ROOT = 'rosbag2_bagfile_information'
+
+
+class MetadataError(BagError):
+    """A ``metadata.yaml`` that is missing, damaged or of another version."""
+
+
+@dataclass(frozen=True)
+class TopicInformation:
+    """One topic and how many messages of it there are."""
+
+    name: str
+    type_name: str
+    profiles: tuple[QosProfile, ...]
+    type_hash: str
+    message_count: int
+    serialization_format: str = 'cdr'
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the entry of ``topics_with_message_count``."""
+        return {
+            'topic_metadata': {
+                'name': self.name,
+                'type': self.type_name,
+                'serialization_format': self.serialization_format,
+                'offered_qos_profiles': [profile.to_mapping() for profile in self.profiles],
+                'type_description_hash': self.type_hash,
+            },
+            'message_count': self.message_count,
+        }
+
+    @classmethod
+    def from_mapping(cls, mapping: Mapping[str, Any]) -> 'TopicInformation':
+        """Return the topic of one entry of ``topics_with_message_count``."""
+        topic = mapping['topic_metadata']
+        return cls(
+            name=str(topic['name']),
+            type_name=str(topic['type']),
+            profiles=tuple(
+                QosProfile.from_mapping(item) for item in topic['offered_qos_profiles']
+            ),
+            type_hash=str(topic['type_description_hash']),
+            message_count=int(mapping['message_count']),
+            serialization_format=str(topic['serialization_format']),
+        )
+
+
+@dataclass(frozen=True)
+class FileInformation:
+    """One file of the bag; times of receipt in nanoseconds."""
+
+    path: str
+    """Relative to the bag's folder."""
+    start_ns: int = NO_START_NS
+    duration_ns: int = 0
+    message_count: int = 0
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the entry of ``files``."""
+        return {
+            'path': self.path,
+            'starting_time': {'nanoseconds_since_epoch': self.start_ns},
+            'duration': {'nanoseconds': self.duration_ns},
+            'message_count': self.message_count,
+        }
+
+    @classmethod
+    def from_mapping(cls, mapping: Mapping[str, Any]) -> 'FileInformation':
+        """Return the file of one entry of ``files``."""
+        return cls(
+            path=str(mapping['path']),
+            start_ns=int(mapping['starting_time']['nanoseconds_since_epoch']),
+            duration_ns=int(mapping['duration']['nanoseconds']),
+            message_count=int(mapping['message_count']),
+        )
+
+
+@dataclass(frozen=True)
+class BagMetadata:
+    """The files and topics of a bag; totals follow from them."""
+
+    files: tuple[FileInformation, ...] = ()
+    topics: tuple[TopicInformation, ...] = ()
+    custom_data: Mapping[str, str] = field(default_factory=dict)
+    ros_distro: str = 'jazzy'
+
+    @property
+    def start_ns(self) -> int:
+        """When the first message came; :data:`NEVER` when none did."""
+        return min(
+            (file.start_ns for file in self.files if file.message_count), default=NO_START_NS
+        )
+
+    @property
+    def duration_ns(self) -> int:
+        """Time from the first message to the last, across all files."""
+        ends = [file.start_ns + file.duration_ns for file in self.files if file.message_count]
+        return max(ends) - self.start_ns if ends else 0
+
+    @property
+    def message_count(self) -> int:
+        """Messages in all files."""
+        return sum(file.message_count for file in self.files)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return what rosbag2 encodes, in its order, without the root key."""
+        return {
+            'version': METADATA_VERSION,
+            'storage_identifier': 'mcap',
+            'duration': {'nanoseconds': self.duration_ns},
+            'starting_time': {'nanoseconds_since_epoch': self.start_ns},
+            'message_count': self.message_count,
+            'topics_with_message_count': [topic.to_mapping() for topic in self.topics],
+            # Chunks are compressed inside the MCAP file; rosbag2's own compression stays off.
+            'compression_format': '',
+            'compression_mode': '',
+            'relative_file_paths': [file.path for file in self.files],
+            'files': [file.to_mapping() for file in self.files],
+            'custom_data': dict(self.custom_data),
+            'ros_distro': self.ros_distro,
+        }
+
+
+def write_metadata(folder: Path, metadata: BagMetadata) -> None:
+    """Replace the folder's ``metadata.yaml`` in one go: a reader sees the old or the new one.
+
+    Raises
+    ------
+    OSError
+        The folder cannot be written to; the old file, if any, is untouched.
+    """
+    target = folder / METADATA_FILE_NAME
+    temporary = folder / f'.{METADATA_FILE_NAME}.{os.getpid()}'
+    try:
+        with temporary.open('w', encoding='utf-8') as file:
+            file.write(dump_yaml({_ROOT: metadata.to_mapping()}))
+            file.flush()
+            os.fsync(file.fileno())  # or a power cut leaves an empty file under the new name
+        temporary.replace(target)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def read_metadata(folder: Path) -> BagMetadata:
+    """Return what the folder's ``metadata.yaml`` says.
+
+    Raises
+    ------
+    MetadataError
+        There is none, or it is not one of version 9.
+    """
+    path = folder / METADATA_FILE_NAME
+    try:
+        root = yaml.safe_load(path.read_text(encoding='utf-8'))[_ROOT]
+        if root['version'] != METADATA_VERSION:
+            raise MetadataError(f'{path} is version {root["version"]}, not {METADATA_VERSION}')
+        return BagMetadata(
+            files=tuple(FileInformation.from_mapping(item) for item in root['files']),
+            topics=tuple(
+                TopicInformation.from_mapping(item) for item in root['topics_with_message_count']
+            ),
+            custom_data={str(key): str(v) for key, v in (root['custom_data'] or {}).items()},
+            ros_distro=str(root['ros_distro']),
+        )
+    except OSError as error:
+        raise MetadataError(f'{path} cannot be read: {error.strerror}') from error
+    except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise MetadataError(f'{path} is damaged: {error!r}') from error
+
+
+def collect_metadata(folder: Path) -> tuple[BagMetadata, tuple[str, ...]]:
+    """Return what the finished MCAP files of ``folder`` hold, and the names of the others.
+
+    Files are ordered by their first message, as players expect. A topic stands once for each
+    different offer: rosbags only finds a file's messages under the very profiles in that file.
+    """
+    finished: list[tuple[str, FileSummary]] = []
+    unfinished = []
+    for path in sorted(
+        folder.glob(f'*{MCAP_SUFFIX}'), key=lambda path: _natural_sort_key(path.name)
+    ):
+        summary = read_file_summary(path)
+        if summary is None:
+            unfinished.append(path.name)
+        else:
+            finished.append((path.name, summary))
+    finished.sort(key=lambda item: item[1].start_ns if item[1].message_count else NO_START_NS)
+    files = []
+    topics: dict[tuple[str, ...], TopicInformation] = {}
+    for name, summary in finished:
+        span = summary.end_ns - summary.start_ns
+        count = summary.message_count
+        files.append(
+            FileInformation(name, summary.start_ns, span, count)
+            if count
+            else FileInformation(name)
+        )
+        for channel in summary.channels:
+            key = (channel.topic, channel.type_name, channel.profiles_text, channel.type_hash)
+            before = topics[key].message_count if key in topics else 0
+            topics[key] = TopicInformation(
+                channel.topic,
+                channel.type_name,
+                _profiles(channel.profiles_text),
+                channel.type_hash,
+                before + channel.message_count,
+                channel.encoding,
+            )
+    return BagMetadata(tuple(files), tuple(topics.values())), tuple(unfinished)
+
+
+def _profiles(text: str) -> tuple[QosProfile, ...]:
+    """Return the profiles of a channel, none when another program wrote what nobody knows."""
+    try:
+        return profiles_from_yaml(text)
+    except QosError:
+        return ()
+
+
+def _natural_sort_key(name: str) -> list[tuple[int, str]]:
+    """Return a key that sorts ``run_10`` after ``run_9``."""
+    return [
+        (int(part), '') if part.isdecimal() else (-1, part) for part in re.split(r'(\d+)', name)
+    ]

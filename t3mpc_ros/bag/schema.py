@@ -1,0 +1,165 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Message definitions, schema texts and type hashes of ROS 2 message types."""
+
+from collections.abc import Iterable, Mapping
+from functools import cache
+import json
+import os
+from pathlib import Path
+import re
+import sys
+from typing import Any
+
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+SEPARATOR = '=' * 80
+"""The line in front of each dependency in ``ros2msg`` text."""
+
+_TYPE = re.compile(r'(?P<package>[A-Za-z]\w*)/(?:msg/)?(?P<name>[A-Za-z]\w*)')
+_PRIMITIVES = re.compile(r'bool|byte|char|float(32|64)|u?int(8|16|32|64)|w?string')
+
+
+class BagError(RuntimeError):
+    """Root of everything that can go wrong with a bag."""
+
+
+class UnknownTypeError(BagError):
+    """A message type nobody here has a definition of."""
+
+
+class MessageDefinitions:
+    """Finds the definitions of message types and keeps what it found.
+
+    Parameters
+    ----------
+    prefixes
+        Installation prefixes, first one wins; a type lies at ``share/PACKAGE/msg/NAME.msg``
+        below them. The default is :func:`installation_prefixes` of the process environment.
+    """
+
+    def __init__(self, prefixes: Iterable[Path] | None = None) -> None:
+        self._prefixes = tuple(installation_prefixes(os.environ) if prefixes is None else prefixes)
+        self._schemas: dict[str, str] = {}
+        self._hashes: dict[str, str] = {}
+
+    def schema(self, type_name: str) -> str:
+        """Return the ``ros2msg`` text of ``type_name``, such as ``geometry_msgs/msg/Twist``.
+
+        The type's own definition comes first, then each type it needs, directly or not, once,
+        after a line of 80 ``=`` and a line ``MSG: package/Type``.
+
+        Raises
+        ------
+        UnknownTypeError
+            The type, or one it needs, is neither installed nor part of Jazzy.
+        """
+        if type_name not in self._schemas:
+            own = _full_name(type_name)
+            texts: dict[str, str] = {}
+            self._collect(own, texts, needed_by='')
+            parts = [_with_newline(texts.pop(own))]
+            for name, text in texts.items():
+                parts.append(f'{SEPARATOR}\nMSG: {_short_name(name)}\n{_with_newline(text)}')
+            self._schemas[type_name] = ''.join(parts)
+        return self._schemas[type_name]
+
+    def type_hash(self, type_name: str) -> str:
+        """Return the RIHS01 hash that Jazzy compares when two nodes meet (REP 2016).
+
+        Taken from the ``.json`` beside the ``.msg``; computed from the schema when there is none.
+
+        Raises
+        ------
+        UnknownTypeError
+            As :meth:`schema`.
+        """
+        if type_name not in self._hashes:
+            own = _full_name(type_name)
+            self._hashes[type_name] = self._installed_hash(own) or self._computed_hash(own)
+        return self._hashes[type_name]
+
+    def _collect(self, name: str, texts: dict[str, str], needed_by: str) -> None:
+        texts[name] = text = self._own_text(name, needed_by)
+        for dependency in _dependencies(text, name.partition('/')[0]):
+            if dependency not in texts:
+                self._collect(dependency, texts, needed_by=name)
+
+    def _own_text(self, name: str, needed_by: str) -> str:
+        if path := self._installed(name, '.msg'):
+            return path.read_text(encoding='utf-8')
+        store = _jazzy()
+        if name in store.fielddefs:
+            text, _ = store.generate_msgdef(name, ros_version=2)
+            return str(text).partition(SEPARATOR)[0]
+        looked = ', '.join(str(self._path(prefix, name, '.msg')) for prefix in self._prefixes)
+        because = f' (needed by {needed_by})' if needed_by else ''
+        raise UnknownTypeError(
+            f'no definition of {name}{because}; looked for {looked or "no file"} '
+            "and in the rosbags library's Jazzy types"
+        )
+
+    def _installed_hash(self, name: str) -> str:
+        # Only a hash beside the text that is used counts: an overlay may redefine a type.
+        text, description = self._installed(name, '.msg'), self._installed(name, '.json')
+        if not text or not description or text.parent != description.parent:
+            return ''
+        try:
+            hashes = json.loads(description.read_text(encoding='utf-8'))['type_hashes']
+            return next(
+                (str(item['hash_string']) for item in hashes if item['type_name'] == name), ''
+            )
+        except (ValueError, KeyError, TypeError):
+            return ''
+
+    def _computed_hash(self, name: str) -> str:
+        store = get_typestore(Stores.EMPTY)
+        store.register(get_types_from_msg(self.schema(name), name))
+        return str(store.hash_rihs01(name))
+
+    def _installed(self, name: str, suffix: str) -> Path | None:
+        candidates = (self._path(prefix, name, suffix) for prefix in self._prefixes)
+        return next((path for path in candidates if path.is_file()), None)
+
+    @staticmethod
+    def _path(prefix: Path, name: str, suffix: str) -> Path:
+        package, _, own = name.partition('/msg/')
+        return prefix / 'share' / package / 'msg' / f'{own}{suffix}'
+
+
+def installation_prefixes(environment: Mapping[str, str]) -> tuple[Path, ...]:
+    """Return where ROS packages may be installed: ``AMENT_PREFIX_PATH``, then this Python's."""
+    listed = environment.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
+    return tuple(Path(entry) for entry in [*listed, sys.prefix] if entry)
+
+
+def _full_name(type_name: str) -> str:
+    match = _TYPE.fullmatch(type_name)
+    if not match:
+        raise UnknownTypeError(f'a message type looks like package/msg/Name: got {type_name!r}')
+    return f'{match["package"]}/msg/{match["name"]}'
+
+
+def _short_name(name: str) -> str:
+    return name.replace('/msg/', '/')
+
+
+def _with_newline(text: str) -> str:
+    return text if text.endswith('\n') else text + '\n'
+
+
+def _dependencies(text: str, package: str) -> list[str]:
+    """Return the full names of the message types that fields of ``text`` have, in order."""
+    found = []
+    for line in text.splitlines():
+        words = line.partition('#')[0].split()
+        # 'geometry_msgs/Point32[<=4] corners', 'string<=10 name', 'byte OK=0'
+        kind = re.split(r'[\[<]', words[0])[0] if words else ''
+        if kind and not _PRIMITIVES.fullmatch(kind):
+            found.append(_full_name(kind if '/' in kind else f'{package}/{kind}'))
+    return found
+
+
+@cache
+def _jazzy() -> Any:
+    return get_typestore(Stores.ROS2_JAZZY)

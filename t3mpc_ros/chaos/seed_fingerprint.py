@@ -1,0 +1,50 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Salted hash of a seed: proves knowledge of the seed without publishing it."""
+
+import hashlib
+import hmac
+import re
+
+SALT_BYTES = 16
+FINGERPRINT_KEY = 'seed_fingerprint'
+"""Under which a node tells it in its diagnostics."""
+
+_PATTERN = re.compile(r'([0-9a-f]{32,}):([0-9a-f]{64})')
+
+
+def fingerprint_seed(seed: int, salt: bytes) -> str:
+    """Return the fingerprint of ``seed``: salt and digest as hexadecimal digits, a colon between.
+
+    Parameters
+    ----------
+    seed
+        Not negative, of any length.
+    salt
+        At least :data:`SALT_BYTES` random bytes, new ones for each fingerprint.
+
+    Raises
+    ------
+    ValueError
+        The salt is too short, or the seed negative.
+    """
+    if len(salt) < SALT_BYTES:
+        raise ValueError(f'salt must have at least {SALT_BYTES} bytes: got {len(salt)}')
+    if seed < 0:
+        raise ValueError('seed must not be negative')  # and must not be printed either
+    digest = hashlib.sha256(salt + str(seed).encode('ascii')).hexdigest()
+    return f'{salt.hex()}:{digest}'
+
+
+def matches_fingerprint(text: str, seed: int) -> bool:
+    """Return whether ``text`` is a fingerprint of ``seed``.
+
+    Raises
+    ------
+    ValueError
+        ``text`` is no fingerprint at all.
+    """
+    match = _PATTERN.fullmatch(text)
+    if not match or len(match[1]) % 2:
+        raise ValueError(f'a fingerprint must look like salt:digest in hexadecimal: got {text!r}')
+    return hmac.compare_digest(fingerprint_seed(seed, bytes.fromhex(match[1])), text)

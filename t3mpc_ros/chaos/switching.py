@@ -1,0 +1,189 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Switching signal sigma(t): which two of the four chaotic signals drive the two outputs."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import count, pairwise
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
+
+
+@dataclass(frozen=True)
+class SwitchingParameters(Parameters):
+    """When the outputs change signals, to which, and how abruptly."""
+
+    kind: str = parameter(
+        'fixed',
+        'fixed: at the times listed; random: dwells and next modes drawn from the seed',
+        choices=('fixed', 'random'),
+    )
+    modes: tuple[int, ...] = parameter(
+        (1, 2, 2, 3, 3, 4, 4, 1),
+        'signal numbers in pairs, one pair per mode: the first drives the first output',
+        low=1,
+        high=4,
+    )
+    times: tuple[float, ...] = parameter(
+        (12.0, 24.0, 36.0, 48.0),
+        'switch times of kind fixed, ascending; after the last one switching goes on, modes in '
+        'turn, with the last dwell repeated; empty: never. The paper switches four times, at '
+        'times its text does not give',
+        unit='s',
+        low=0.01,
+    )
+    shortest_dwell: float = parameter(
+        8.0, 'least time in a mode, kind random', unit='s', low=0.1, high=86400.0
+    )
+    longest_dwell: float = parameter(
+        16.0, 'most time in a mode, kind random', unit='s', low=0.1, high=86400.0
+    )
+    blend: float = parameter(
+        0.0,
+        'time over which one mode passes smoothly into the next; 0 jumps, as the paper does',
+        unit='s',
+        low=0.0,
+        high=3600.0,
+        source='paper: sudden changes',
+    )
+
+    def check_consistency(self) -> None:
+        """Raise :class:`ParameterError` for odd pairs, times out of order, a blend too long."""
+        if not self.modes or len(self.modes) % 2:
+            raise ParameterError(f'modes must be one or more pairs: got {len(self.modes)} numbers')
+        dwells = [after - before for before, after in pairwise((0.0, *self.times))]
+        if any(dwell <= 0.0 for dwell in dwells):
+            raise ParameterError(f'times must ascend from above 0 s: got {self.times}')
+        if self.longest_dwell < self.shortest_dwell:
+            raise ParameterError(
+                f'longest_dwell must be at least shortest_dwell, {self.shortest_dwell:g} s: '
+                f'got {self.longest_dwell:g}'
+            )
+        # A blend fills a dwell at most, or the signal before the previous one would be cut off.
+        least = min(dwells[1:] or dwells, default=math.inf)
+        if self.kind == 'random':
+            least = self.shortest_dwell
+        if self.blend > least:
+            raise ParameterError(
+                f'blend must be at most the shortest dwell, {least:g} s: got {self.blend:g}'
+            )
+
+    @property
+    def pairs(self) -> tuple[tuple[int, int], ...]:
+        """The modes: (signal of the first output, signal of the second), counted from 1."""
+        return tuple(zip(self.modes[::2], self.modes[1::2], strict=True))
+
+
+class SwitchingMode(NamedTuple):
+    """What drives the outputs at one instant."""
+
+    mode: int
+    """Index of the active pair, from 0."""
+    previous: int
+    """Index of the pair before it; the active one before the first switch."""
+    blend: float
+    """Share of the active mode in the outputs, from 0 to 1; the previous one has the rest."""
+    blend_rate: float
+    """Time derivative of the share (1/s); 0 at a sudden jump, which has none."""
+    switches: int
+    """How many switches have happened so far."""
+    since: float
+    """When the active mode began (s)."""
+    until: float
+    """When the next switch comes (s), inf when none will."""
+
+
+class SwitchingSchedule:
+    """Answers for any time what drives the outputs, the same whatever was asked before.
+
+    At a switch time itself the new mode is active. Kind *fixed* takes the modes in turn; kind
+    *random* draws each dwell uniformly between its bounds and each next mode uniformly among the
+    others, so that neither can be foretold without the seed. With one mode nothing ever switches.
+
+    Only the current dwell is kept: memory is constant, going forward costs one draw per switch
+    passed, and a question about an earlier dwell starts over from time zero.
+
+    Parameters
+    ----------
+    settings
+        Kind, modes and times.
+    seed
+        Not negative, of any length; without effect on kind *fixed*.
+    """
+
+    def __init__(self, parameters: SwitchingParameters, seed: int = 0) -> None:
+        self.pairs = parameters.pairs
+        self._parameters = parameters
+        self._seed = seed
+        self._dwells: Iterator[SwitchingMode]
+        self._dwell: SwitchingMode
+        self._restart()
+
+    def at(self, time: float) -> SwitchingMode:
+        """Return the selection at ``time`` (s since the run began).
+
+        Raises
+        ------
+        ValueError
+            A time that is negative or not finite.
+        """
+        if not 0.0 <= time < math.inf:
+            raise ValueError(f'time must be finite and not negative: got {time}')
+        if time < self._dwell.since:
+            self._restart()
+        while time >= self._dwell.until:
+            self._dwell = next(self._dwells)
+        dwell, span = self._dwell, self._parameters.blend
+        if dwell.switches == 0 or time - dwell.since >= span:
+            return dwell
+        share = (time - dwell.since) / span
+        return dwell._replace(
+            blend=share * share * (3.0 - 2.0 * share),
+            blend_rate=6.0 * share * (1.0 - share) / span,
+        )
+
+    def switches_until(self, time: float) -> list[float]:
+        """Return the times (s) of all switches up to and including ``time``, ascending."""
+        result = []
+        for dwell in self._walk():
+            if dwell.until > time:
+                break
+            result.append(dwell.until)
+        return result
+
+    def _restart(self) -> None:
+        self._dwells = self._walk()
+        self._dwell = next(self._dwells)
+
+    def _walk(self) -> Iterator[SwitchingMode]:
+        """Yield dwell after dwell, each with its blend completed, the last one endless."""
+        generator = np.random.default_rng(self._seed)
+        mode = previous = 0
+        since = 0.0
+        for switches in count():
+            until = self._end(switches, since, generator)
+            yield SwitchingMode(mode, previous, 1.0, 0.0, switches, since, until)
+            previous, since = mode, until
+            step = 1
+            if self._parameters.kind == 'random':
+                step = int(generator.integers(1, len(self.pairs)))
+            mode = (mode + step) % len(self.pairs)
+
+    def _end(self, switches: int, since: float, generator: np.random.Generator) -> float:
+        """Return when the dwell after ``switches`` switches ends."""
+        if len(self.pairs) == 1:
+            return math.inf
+        if self._parameters.kind == 'random':
+            return since + float(
+                generator.uniform(self._parameters.shortest_dwell, self._parameters.longest_dwell)
+            )
+        times = (0.0, *self._parameters.times)
+        if len(times) == 1:
+            return math.inf
+        beyond = switches - (len(times) - 2)
+        # A product, not a running sum: the thousandth switch falls on the grid like the first.
+        return times[switches + 1] if beyond <= 0 else times[-1] + beyond * (times[-1] - times[-2])

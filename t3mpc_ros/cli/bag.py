@@ -1,0 +1,549 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``t3mpc bag``: info, recover, report, replay, compare and train."""
+
+import argparse
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from datetime import UTC, datetime
+import json
+from pathlib import Path
+import sys
+import time
+from typing import TYPE_CHECKING
+
+from t3mpc_ros.bag.bag_info import BagInfo, read_bag_info
+from t3mpc_ros.bag.recovery.recover_bag import RecoveryOutputError, default_output, recover_bag
+from t3mpc_ros.bag.recovery.result import Damage, FileResult, RecoveryResult
+from t3mpc_ros.cli.command import run_command
+from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.parameters.command_line import parse_assignments
+
+if TYPE_CHECKING:
+    from t3mpc_ros.evaluation.process_replay.comparison import Tolerances
+
+
+from t3mpc_ros.cli.train import add_bag_options, run_bags
+
+
+def columns(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
+    """Return the rows below each other; columns whose numbers are in ``right`` end flush."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for row in rows:
+        cells = [
+            cell.rjust(width) if i in right else cell.ljust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append('  '.join(cells).rstrip())
+    return '\n'.join(lines)
+
+
+def size_text(count: int) -> str:
+    """Return a number of bytes in the unit that suits it."""
+    if count < 1000:
+        return f'{count} B'
+    value = float(count)
+    for unit in ('kB', 'MB', 'GB'):
+        value /= 1000.0
+        if value < 999.5:
+            return f'{value:.3g} {unit}'
+    return f'{value:.0f} GB'
+
+
+_MAX_LISTED_ENTRIES = 6  # rows of a table that are written out; longer ones are only counted
+
+
+def add_info_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
+    """Add ``info`` to the commands of ``bag``."""
+    parser = commands.add_parser(
+        'info',
+        help='files, time, topics, settings of a bag',
+        description='Says what a bag holds. Exit code 0, or 1 when nothing of it can be read.',
+    )
+    parser.add_argument('bag', type=Path, help='an MCAP file, or the folder of a bag')
+    parser.add_argument('--json', action='store_true', help='everything, as JSON')
+    parser.set_defaults(run=_run_info)
+
+
+def _run_info(options: argparse.Namespace) -> int:
+    held = read_bag_info(options.bag)
+    if options.json:
+        rates = {topic.name: held.rate(topic) for topic in held.topics}
+        print(json.dumps(asdict(held) | {'rates': rates}, indent=1, ensure_ascii=False))
+    else:
+        print(_info_text(held))
+    return 0
+
+
+def _info_text(held: BagInfo) -> str:
+    size = size_text(sum(held.files.values()))
+    rows = [
+        ('bag', held.path),
+        ('storage', f'{held.storage}, {size} in {len(held.files)} file(s)'),
+        ('start', _date(held.start_ns) if held.message_count else 'no message'),
+        ('duration', f'{held.duration_ns / NANOSECONDS:.3f} s'),
+        ('messages', str(held.message_count)),
+    ]
+    rows += [(f'file {name}', size_text(size)) for name, size in held.files.items()]
+    rows += [
+        (f'UNFINISHED {name}', f'{size_text(size)}, not counted above')
+        for name, size in held.unfinished.items()
+    ]
+    parts = [columns(rows)]
+    if held.unfinished:
+        parts.append(
+            f'A file without its end is still being written, or its writer broke off: '
+            f'`bag recover {held.path}` writes what is in it into a new bag.'
+        )
+    if held.topics:
+        parts.append(_topic_table(held))
+    for title, table in held.metadata_records.items():
+        parts.append(_info_table(title, table))
+    if held.attachments:
+        items = [(item.name, item.media_type, size_text(item.size)) for item in held.attachments]
+        parts.append('attachments\n' + columns(items, right=(2,)))
+    return '\n\n'.join(parts)
+
+
+def _topic_table(held: BagInfo) -> str:
+    rows = [('topic', 'type', 'messages', 'Hz', 'quality of service')]
+    for topic in held.topics:
+        quality = '; '.join(topic.qos_profiles) or '-'
+        rate = f'{held.rate(topic):.2f}'
+        rows.append((topic.name, topic.type_name, str(topic.message_count), rate, quality))
+    return columns(rows, right=(2, 3))
+
+
+def _info_table(title: str, table: Mapping[str, str]) -> str:
+    if len(table) > _MAX_LISTED_ENTRIES:
+        return f'{title}: {len(table)} entries (--json shows them)'
+    return f'{title}\n' + columns([(f'  {key}', value) for key, value in table.items()])
+
+
+def _date(time_ns: int) -> str:
+    return f'{datetime.fromtimestamp(time_ns // NANOSECONDS, UTC):%Y-%m-%d %H:%M:%S} UTC'
+
+
+EXIT_LOSS = 3
+"""Exit code: a bag was written, but something was lost or may have been."""
+
+EXIT_USAGE = 2
+"""Exit code: the output folder that was asked for cannot be written into."""
+
+_MAX_LISTED_DAMAGES = 20  # damaged stretches of a file that are named one by one
+
+
+def add_recover_parser(
+    commands: 'argparse._SubParsersAction[argparse.ArgumentParser]', clock: Callable[[], float]
+) -> None:
+    """Add ``recover`` to the commands of ``bag``.
+
+    ``clock`` tells seconds from any origin, for the time that is left.
+    """
+    parser = commands.add_parser(
+        'recover',
+        help='write what a damaged bag still holds into a new one',
+        description='Writes what an MCAP file, or every MCAP file of a folder, still holds into '
+        'a new folder, with index and metadata.yaml, and says what was kept and lost. The input '
+        'is only read. Exit code 0: nothing was lost; 3: something was, or a file has no end, so '
+        'that its writer may have held more; 1: nothing can be read, or the output cannot be '
+        'written.',
+    )
+    parser.add_argument('bag', type=Path, metavar='FILE', help='an MCAP file, or a folder of such')
+    parser.add_argument(
+        '--output', type=Path, help='new or empty folder (default: FILE_recovered beside FILE)'
+    )
+    parser.set_defaults(run=_run_recover, clock=clock)
+
+
+def _run_recover(options: argparse.Namespace) -> int:
+    output = options.output or default_output(options.bag)
+    try:
+        result = recover_bag(options.bag, output, _RecoveryProgress(options.clock))
+    except RecoveryOutputError as error:
+        print(f'error: {error}', file=sys.stderr)
+        return EXIT_USAGE
+    print(_recovery_text(result))
+    return 0 if result.clean else EXIT_LOSS
+
+
+def _recovery_text(result: RecoveryResult) -> str:
+    least = '' if result.exact else '>= '
+    rows = [('topic', 'type', 'kept', 'unchecked', 'lost')]
+    for topic in result.topics.values():
+        lost = f'{least}{topic.lost}' if topic.lost else ('0' if result.exact else '?')
+        rows.append((topic.name, topic.type_name, str(topic.kept), str(topic.unchecked), lost))
+    parts = [columns(rows, right=(2, 3, 4))]
+    parts += [_file(file) for file in result.files]
+    if any(topic.unchecked for topic in result.topics.values()):
+        parts.append('unchecked: no checksum of the file vouches for these messages')
+    parts.append(_verdict(result, least))
+    return '\n\n'.join(parts)
+
+
+def _file(file: FileResult) -> str:
+    if file.copied:
+        return f'{file.name}: sound, copied'
+    lines = [f'{file.name}: written anew']
+    lines += [f'  {note}' for note in file.notes]
+    lines += [f'  {_damage(damage)}' for damage in file.damages[:_MAX_LISTED_DAMAGES]]
+    if len(file.damages) > _MAX_LISTED_DAMAGES:
+        lines.append(f'  and {len(file.damages) - _MAX_LISTED_DAMAGES} more')
+    return '\n'.join(lines)
+
+
+def _damage(damage: Damage) -> str:
+    where = f'bytes {damage.start} to {damage.end}: ' if damage.size else ''
+    text = where + damage.reason
+    if damage.harmless:
+        return f'{text} (nothing is lost with it)'
+    if damage.messages:
+        text += f'; {damage.messages} messages lost'
+    if damage.span_ns:
+        text += f'; within {(damage.span_ns[1] - damage.span_ns[0]) / NANOSECONDS:.3f} s'
+    return text
+
+
+def _verdict(result: RecoveryResult, least: str) -> str:
+    kept = f'{result.kept} messages are kept in {result.output}'
+    if result.clean:
+        return f'{kept}; nothing is lost'
+    seconds = result.lost_seconds
+    during = '' if seconds is None else f', within {seconds:.3f} s'
+    number = f'{least}{result.lost}' if result.lost or result.exact else 'nobody knows how many'
+    return (
+        f'{kept}; lost: {number} messages{during}, '
+        f'{size_text(result.lost_bytes)} of the input not usable'
+    )
+
+
+class _RecoveryProgress:
+    """Says on stderr how far a large file is, about once a second."""
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._name = ''
+        self._start = self._next = 0.0
+
+    def __call__(self, name: str, done: int, size: int) -> None:
+        now = self._clock()
+        if name != self._name or done == 0:
+            self._name, self._start, self._next = name, now, now + 1.0
+        if now < self._next or not done:
+            return
+        self._next = now + 1.0
+        left = (now - self._start) * (size - done) / done
+        text = f'{name}: {100.0 * done / size:.0f} % of {size_text(size)}, {left:.0f} s left'
+        print(text, file=sys.stderr, flush=True)
+
+
+def add_report_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
+    """Add ``report`` to the commands of ``bag``; ``options.run(options)`` carries it out."""
+    parser = commands.add_parser(
+        'report',
+        help='draw the report of a bag',
+        description='Writes report.html and its pictures. The bag may be of any robot: MCAP or '
+        'sqlite3, with a topic of odometry (nav_msgs/Odometry), of commands (geometry_msgs/Twist '
+        'or TwistStamped), or both; they are found by name, else by type.',
+    )
+    parser.add_argument('bag', type=Path, metavar='BAG', help='folder of the bag, or its one file')
+    parser.add_argument('--output', type=Path, help='folder for the report (default: beside it)')
+    parser.add_argument('--namespace', help='whose topics (default: those of most known topics)')
+    parser.add_argument('--odom', default='', metavar='TOPIC', help='odometry')
+    parser.add_argument('--cmd-vel', default='', metavar='TOPIC', help='commands')
+    parser.add_argument(
+        '--reference',
+        default='',
+        metavar='TOPIC',
+        help='what the robot was to follow: odometry or a twist',
+    )
+    parser.add_argument(
+        '--wheel-radius',
+        type=float,
+        metavar='M',
+        help='radius of the wheels in m (default: as recorded), to show speeds of wheels',
+    )
+    parser.add_argument(
+        '--track', type=float, metavar='M', help='distance between the wheels in m, likewise'
+    )
+    parser.set_defaults(run=run_report)
+
+
+def run_report(options: argparse.Namespace) -> int:
+    """Return 0 when the report was written; prints its main figures.
+
+    Raises
+    ------
+    BagError
+        There is no bag, or it cannot be read.
+    ReportError
+        There is nothing in it to report, or a topic that was asked for cannot be used.
+    OSError
+        The output cannot be written.
+    ValueError
+        One length of the wheels without the other, or one that cannot be.
+    """
+    from t3mpc_ros.evaluation.bag_report.report_page import write_report
+    from t3mpc_ros.evaluation.bag_report.topic_roles import ReportOptions
+
+    if (options.wheel_radius is None) != (options.track is None):
+        raise ValueError('--wheel-radius and --track must be given together')
+    wanted = ReportOptions(
+        namespace=options.namespace,
+        odom=options.odom,
+        cmd_vel=options.cmd_vel,
+        reference=options.reference,
+        wheel_radius=options.wheel_radius,
+        track=options.track,
+    )
+    output = options.output or options.bag.resolve().parent
+    print(write_report(options.bag, output, wanted).summary())
+    return 0
+
+
+def add_replay_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
+    """Add ``rerun`` to the commands of ``bag``; :func:`run` carries it out."""
+    parser = commands.add_parser(
+        'rerun',
+        help='compute a recorded run again',
+        description='Gives the recorded odometry and reference to the controller of today, '
+        'offline and as fast as it goes, in the order in which the recorded controller took them. '
+        'With other settings, or with another method of the lab, it says what would have been '
+        'commanded; the robot does not answer to that.',
+    )
+    parser.add_argument('bag', type=Path, metavar='BAG', help='folder of the bag, or its file')
+    parser.add_argument(
+        '--output', type=Path, metavar='DIR', help='write a bag of what was computed'
+    )
+    parser.add_argument(
+        '--rival', metavar='NAME', help="a method of the lab in the controller's place"
+    )
+    add_input_options(parser)
+    parser.set_defaults(run=run_replay)
+
+
+def add_input_options(parser: argparse.ArgumentParser) -> None:
+    """Add what says how a bag is taken as the inputs of a controller."""
+    parser.add_argument(
+        '--set',
+        dest='settings',
+        action='append',
+        default=[],
+        metavar='NAME=VALUE',
+        help='another setting than the recorded one, law.gain=30 say; may be given again',
+    )
+    parser.add_argument(
+        '--model', type=Path, metavar='FILE', help='model file to begin with (default: as the bag)'
+    )
+    parser.add_argument('--namespace', help='of the robot, where the bag holds several')
+
+
+def run_replay(options: argparse.Namespace) -> int:
+    """Return 0 when the run was computed; prints what became of it, and how fast.
+
+    Raises
+    ------
+    ReplayError
+        The bag cannot be computed again.
+    BagError
+        A bag cannot be read or written.
+    ParameterError
+        A setting is unknown or cannot be used.
+    """
+    from t3mpc_ros.bag.run.model_file import load_model
+    from t3mpc_ros.control.controller import ControllerParameters
+    from t3mpc_ros.evaluation.process_replay.comparison import compare
+    from t3mpc_ros.evaluation.process_replay.controller_bag import write_replay
+    from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
+    from t3mpc_ros.evaluation.process_replay.controller_replay import (
+        OPEN_LOOP,
+        make_controllers,
+        replay_controller,
+    )
+    from t3mpc_ros.evaluation.process_replay.method_replay import replay_method
+
+    changes = parse_assignments(ControllerParameters, options.parameters)
+    model = load_model(options.model) if options.model else None
+    begin = time.perf_counter()
+    inputs = load_inputs(options.bag, options.namespace, model)
+    read = time.perf_counter()
+    if options.rival:
+        ready = read
+        again = replay_method(inputs, options.rival, changes)
+    else:
+        controllers = make_controllers(inputs, changes)
+        ready = time.perf_counter()
+        again = replay_controller(inputs, changes, controllers)
+    end = time.perf_counter()
+    reading, starting, running = read - begin, ready - read, end - ready
+    span = again.steps / again.parameters.rate
+    whole, alone = span / (reading + running), span / running
+    print(
+        f'{again.steps} steps, {span:.1f} s of control, in {reading + running:.2f} s: '
+        f'{whole:.0f} x real time, {alone:.0f} x without reading'
+        + (f'; {starting:.2f} s to compile and to warm up are not counted' if starting else '')
+    )
+    print(compare(inputs, again).table())
+    if options.rival or changes or options.model:
+        print(OPEN_LOOP)
+    if options.output:
+        print(f'written to {write_replay(inputs, again, options.output)}')
+    return 0
+
+
+SAME, DIFFERS = 0, 3
+"""Exit codes; an error is 1, as for every command."""
+
+
+def add_compare_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
+    """Add ``compare`` to the commands of ``bag``; :func:`run` carries it out."""
+    parser = commands.add_parser(
+        'compare',
+        help='compare a recorded run with its rerun, or with another bag',
+        description='With one bag: it is computed again, see bag rerun, and each field compared. '
+        'With two: what they hold of one run. Exit code 0: all within the tolerances; 3: '
+        'something differs; 1: it cannot be compared.',
+    )
+    parser.add_argument(
+        'bag', type=Path, nargs='?', metavar='BAG', help='folder of the bag, or its file'
+    )
+    parser.add_argument('other', type=Path, nargs='?', metavar='OTHER', help='another bag')
+    parser.add_argument(
+        '--abs',
+        type=float,
+        metavar='TOL',
+        help='absolute tolerance, SI units (default 1e-9; elsewhere than where it was recorded '
+        'take 1e-6)',
+    )
+    parser.add_argument(
+        '--rel', type=float, metavar='TOL', help='share of the recorded number (default 1e-9)'
+    )
+    parser.add_argument(
+        '--field',
+        dest='fields',
+        action='append',
+        default=[],
+        metavar='F=TOL',
+        help='absolute tolerance of one field, or of several by a name with *; may be given again',
+    )
+    parser.add_argument(
+        '--picture', type=Path, metavar='FILE', help='draw the first divergence as PNG'
+    )
+    parser.add_argument(
+        '--update-golden',
+        type=Path,
+        metavar='FOLDER',
+        help='compare nothing: make the golden bags anew, test/golden say, on purpose',
+    )
+    add_input_options(parser)
+    parser.set_defaults(run=run_compare)
+
+
+def run_compare(options: argparse.Namespace) -> int:
+    """Return 0 when all is within the tolerances, 3 when something differs; prints the table.
+
+    Raises
+    ------
+    ReplayError
+        Nothing can be compared.
+    BagError
+        A bag cannot be read.
+    ValueError
+        A tolerance or setting cannot be used, or there is no bag.
+    """
+    from t3mpc_ros.bag.run.model_file import load_model
+    from t3mpc_ros.control.controller import ControllerParameters
+    from t3mpc_ros.evaluation.process_replay.comparison import compare, compare_bags
+    from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
+    from t3mpc_ros.evaluation.process_replay.controller_replay import OPEN_LOOP, replay_controller
+    from t3mpc_ros.evaluation.process_replay.divergence_figure import write_divergence_figure
+    from t3mpc_ros.evaluation.process_replay.golden_bags import write_golden
+
+    if options.update_golden:
+        write_golden(options.update_golden)
+        return SAME
+    if options.bag is None:
+        raise ValueError('BAG must be given, or --update-golden')
+    tolerances = tolerances_from(options.abs, options.rel, options.fields)
+    changes = parse_assignments(ControllerParameters, options.parameters)
+    model = load_model(options.model) if options.model else None
+    inputs = load_inputs(options.bag, options.namespace, model)
+    if options.other is not None:
+        if changes or model:
+            raise ValueError('--set and --model are for a rerun: give one bag only')
+        other = load_inputs(options.other, options.namespace)
+        outcome = compare_bags(inputs, other, tolerances)
+    else:
+        outcome = compare(inputs, replay_controller(inputs, changes), tolerances)
+    print(outcome.table())
+    if changes or model:
+        print(OPEN_LOOP)
+    if options.picture:
+        write_divergence_figure(outcome, options.picture)
+        print(f'drawn to {options.picture}', file=sys.stderr)
+    return SAME if outcome.same else DIFFERS
+
+
+def tolerances_from(
+    absolute: float | None, relative: float | None, fields: Sequence[str]
+) -> 'Tolerances':
+    """Return the tolerances that a command line asks for.
+
+    Raises
+    ------
+    ValueError
+        A text is not ``FIELD=NUMBER``, or a tolerance cannot be used.
+    """
+    from t3mpc_ros.evaluation.process_replay.comparison import ABSOLUTE, RELATIVE, Tolerances
+
+    own = {}
+    for text in fields:
+        name, _, value = text.rpartition('=')
+        try:
+            own[name] = float(value)
+        except ValueError:
+            raise ValueError(f'--field must be FIELD=NUMBER: got {text!r}') from None
+    return Tolerances(
+        ABSOLUTE if absolute is None else absolute, RELATIVE if relative is None else relative, own
+    )
+
+
+def add_train_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
+    """Add ``train`` to the commands of ``bag``; ``options.run(options)`` carries it out."""
+    parser = commands.add_parser(
+        'train',
+        help='learn a model file that the controller starts from',
+        description='Learns the weights of the predictor and the first fuzzy coefficients from '
+        "one or more bags that were recorded with this package's controller, and tells by "
+        'cross-validation what they are worth on runs that they were not learnt from. The '
+        'controller loads the file by its parameter model. While the bags are recorded, '
+        "the controller's predictive.dither should be a few rad/s².",
+    )
+    parser.add_argument('bags', nargs='+', type=Path, metavar='BAG', help='folder of a bag')
+    add_bag_options(parser)
+    parser.set_defaults(run=run_bags)
+
+
+def bag_main(arguments: Sequence[str] | None = None) -> int:
+    """Return the exit code: 0 done, 1 failed with a reason, 2 wrong command line.
+
+    3 is the command's own: done, but not all is well with the bag.
+    """
+    return run_command(_bag_parser(), arguments)
+
+
+def _bag_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog='bag', description=__doc__)
+    commands = parser.add_subparsers(dest='command', required=True)
+    add_info_parser(commands)
+    add_recover_parser(commands, time.monotonic)
+    add_report_parser(commands)
+    add_replay_parser(commands)
+    add_compare_parser(commands)
+    add_train_parser(commands)
+    return parser
+
+
+if __name__ == '__main__':
+    sys.exit(bag_main())

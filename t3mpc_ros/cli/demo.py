@@ -1,0 +1,177 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``t3mpc demo``: runs the nodes as processes, records them and writes the report."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+import shutil
+import sys
+import time
+
+from t3mpc_ros.cli.process_group import ProcessError, ProcessGroup, private_graph
+from t3mpc_ros.evaluation.bag_report.metrics import ReportMetrics
+from t3mpc_ros.evaluation.bag_report.report_page import write_report
+
+BOARD = 'board_emulator'
+"""No node: it has no parameters, and says that it is ready in words of its own."""
+PAPER_NOISE = 0.04
+"""Variance of the measured wheel speeds, (rad/s)², as in the paper's simulations."""
+ROBOTS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
+    'twin': {'sim_robot': {'drive.kind': 'stepper'}},
+    'servo': {
+        'sim_robot': {'drive.kind': 'velocity'},
+        'controller': {'estimate.lag': 0.02},
+    },
+    'emulator': {
+        'radio_bridge': {},
+        # Fifty measurements a second; a command goes with the cycle after the one it answers,
+        # 19 ms after the sample: test_radio_delay.py.
+        'controller': {'rate': 50.0, 'estimate.dead_time': 0.02},
+    },
+}
+"""Robots there are, and what each node is told of them: the digital twin, the paper's plant, and
+the twin on a board of its own that is reached over a serial port and a radio."""
+FOLLOWS = 'tracking'
+"""What the controller says when it follows the reference; finding each other takes seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class DemoOptions:
+    """What the command line of ``scripts/demo`` says."""
+
+    duration: float = 60.0
+    output: Path = Path('runs/demo')
+    headless: bool = False
+    seed: int | None = None
+    robot: str = 'twin'
+    """One of :data:`ROBOTS`."""
+    loss: float = 0.0
+    """Share of the radio packets that are lost each way; for the emulator only."""
+
+    @property
+    def robot_node(self) -> str:
+        """The node that stands for the robot."""
+        return 'radio_bridge' if self.robot == 'emulator' else 'sim_robot'
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """The nodes, in the order in which they are started."""
+        return 'recorder', 'controller', self.robot_node, 'reference'
+
+    @property
+    def port(self) -> Path:
+        """Where the dongle of the emulator is plugged in."""
+        return self.output.resolve() / 'dongle'
+
+    def parameters(self) -> dict[str, dict[str, object]]:
+        """Return the parameters of each node."""
+        given: dict[str, dict[str, object]] = {
+            name: dict(ROBOTS[self.robot].get(name, {})) for name in self.nodes
+        }
+        if self.robot == 'emulator':
+            given['radio_bridge']['port'] = str(self.port)
+        else:
+            given['sim_robot']['noise.variance'] = PAPER_NOISE
+        if self.seed is not None:
+            given['reference']['seed'] = self.seed
+            if self.robot != 'emulator':
+                given['sim_robot']['seed'] = self.seed
+        return given
+
+    def board(self) -> tuple[str, ...]:
+        """Return the command line of the emulated board; empty when there is none."""
+        if self.robot != 'emulator':
+            return ()
+        words = ['--link', str(self.port), '--loss', str(self.loss)]
+        return tuple(words if self.seed is None else [*words, '--seed', str(self.seed)])
+
+
+class Progress:
+    """A bar with the time left on a terminal, a line now and then elsewhere."""
+
+    def __init__(self, seconds: float, *, live: bool) -> None:
+        self._seconds = seconds
+        self._live = live
+        self._next_line = 0.0
+
+    def show(self, elapsed: float) -> None:
+        """Show that ``elapsed`` seconds have passed."""
+        share = min(1.0, elapsed / self._seconds)
+        left = max(0.0, self._seconds - elapsed)
+        if self._live:
+            width = max(10, min(40, shutil.get_terminal_size().columns - 40))
+            bar = '█' * round(width * share)
+            print(
+                f'\r  running  {bar:░<{width}} {100 * share:3.0f} %  {left:4.0f} s left ',
+                end='' if share < 1.0 else '\n',
+                file=sys.stderr,
+                flush=True,
+            )
+        elif elapsed >= self._next_line:
+            print(
+                f'  running: {elapsed:.0f} of {self._seconds:.0f} s', file=sys.stderr, flush=True
+            )
+            self._next_line += max(10.0, self._seconds / 6)
+
+
+def run_demo(options: DemoOptions) -> ReportMetrics:
+    """Run reference, controller, simulated robot and recorder, and return the main figures.
+
+    The bag is in ``output/bag``, the nodes' logs in ``output/log``, the report beside them.
+
+    Raises
+    ------
+    ProcessError
+        A node did not start, ended during the run, or did not end cleanly; all are stopped.
+    OSError
+        The output folder cannot be made.
+    """
+    options.output.mkdir(parents=True, exist_ok=True)
+    bag = options.output / 'bag'
+    if bag.exists() and any(bag.iterdir()):
+        raise ProcessError(f'{bag} already holds a recording; choose another folder with --output')
+    fleet = ProcessGroup(options.output / 'log', private_graph())
+    parameters = options.parameters()
+    parameters['recorder']['folder'] = str(bag.resolve())
+    # The nodes are stopped one after the other: that is no fault to keep a snapshot of.
+    parameters['recorder']['snapshot_time'] = 0.0
+    # The robot stops last but for the recorder, and its board after it.
+    stopped: tuple[str, ...] = (
+        'reference',
+        'controller',
+        options.robot_node,
+        'recorder',
+    )
+    try:
+        if board := options.board():
+            fleet.start(BOARD, *board)
+            fleet.wait_for(BOARD, 'stop with Ctrl-C', 120.0)
+            stopped = (*stopped, BOARD)
+        for name in options.nodes:
+            print(f'  starting {name}', file=sys.stderr, flush=True)
+            fleet.start(name, parameters=parameters[name])
+            fleet.wait_ready(name)
+        print('  waiting until they have found each other', file=sys.stderr, flush=True)
+        fleet.wait_for('controller', FOLLOWS)
+        _watch(fleet, options)
+    finally:
+        codes = fleet.stop_all(stopped)
+    if wrong := {name: code for name, code in codes.items() if code}:
+        raise ProcessError(
+            'not every node ended cleanly: '
+            + ', '.join(f'{name} with code {code}' for name, code in wrong.items())
+            + f'; see {options.output / "log"}'
+        )
+    print('  drawing the report from the bag', file=sys.stderr, flush=True)
+    return write_report(bag, options.output)
+
+
+def _watch(fleet: ProcessGroup, options: DemoOptions) -> None:
+    progress = Progress(options.duration, live=not options.headless and sys.stderr.isatty())
+    start = time.monotonic()
+    while (elapsed := time.monotonic() - start) < options.duration:
+        fleet.check()
+        progress.show(elapsed)
+        time.sleep(min(0.2, options.duration - elapsed))
+    progress.show(options.duration)

@@ -1,0 +1,55 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``t3mpc faults``: fault study of the closed loop."""
+
+import argparse
+from collections.abc import Callable
+from dataclasses import asdict
+import json
+from pathlib import Path
+
+
+def add_outcomes_parser(
+    commands: 'argparse._SubParsersAction[argparse.ArgumentParser]', clock: Callable[[], float]
+) -> None:
+    """Add ``faults`` to the commands of ``lab``; :func:`run` carries it out.
+
+    ``clock`` tells seconds from any origin, for the time that is left.
+    """
+    parser = commands.add_parser(
+        'faults', help='drive the digital twin under every named fault, and say what comes of it'
+    )
+    parser.add_argument(
+        'names', nargs='*', metavar='FAULT', help='only these, brown_out say (default: all)'
+    )
+    parser.add_argument(
+        '--output', type=Path, help='page whose table is to be replaced, docs/faults.md say'
+    )
+    parser.add_argument('--json', type=Path, help='also write the numbers to this file')
+    parser.set_defaults(run=run, clock=clock)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Return 0 when no loop got out of bounds, 1 when one did; prints what became of each."""
+    from t3mpc_ros.evaluation.fault_study import (
+        FAULT_RUNS,
+        console_text,
+        study_faults,
+        update_page,
+    )
+    from t3mpc_ros.evaluation.reporting import Progress
+
+    known = dict.fromkeys(trial.fault for trial in FAULT_RUNS)
+    for name in options.names:
+        if name not in known:
+            raise ValueError(f'FAULT must be one of {", ".join(known)}: got {name}')
+    if options.names and options.output:
+        raise ValueError('--output replaces the whole table: give no FAULT with it')
+    trials = [trial for trial in FAULT_RUNS if not options.names or trial.fault in options.names]
+    results = study_faults(trials, Progress(options.clock))
+    print(console_text(results))
+    if options.output:
+        update_page(options.output, results)
+    if options.json:
+        options.json.write_text(json.dumps([asdict(one) for one in results], indent=1) + '\n')
+    return 1 if any(one.verdict == 'unbounded' for one in results) else 0

@@ -1,0 +1,173 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``t3mpc``: command-line program of everything without a ROS graph."""
+
+import argparse
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+import json
+from pathlib import Path
+import sys
+import time
+from typing import TYPE_CHECKING
+import webbrowser
+
+from t3mpc_ros.cli.bag import add_report_parser
+from t3mpc_ros.cli.command import run_command
+from t3mpc_ros.cli.faults import add_outcomes_parser
+from t3mpc_ros.cli.paper import add_parser as add_paper
+from t3mpc_ros.cli.train import add_parser as add_train
+from t3mpc_ros.cli.tune import add_parser as add_tune
+from t3mpc_ros.cli.twin import add_parser as add_twin
+from t3mpc_ros.parameters.command_line import bounded_float, bounded_int
+
+if TYPE_CHECKING:
+    from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition
+
+
+SECONDS = bounded_float(1.0, 86_400.0, 'seconds')
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Return the exit code: 0 done, 1 failed with a reason, 2 wrong command line."""
+    return run_command(_parser(), arguments)
+
+
+def _demo(options: argparse.Namespace) -> int:
+    from t3mpc_ros.cli.demo import DemoOptions, run_demo
+
+    output = options.output or Path('runs') / f'{datetime.now():%Y%m%d-%H%M%S}'
+    figures = run_demo(
+        DemoOptions(
+            options.duration,
+            output,
+            options.headless,
+            options.seed,
+            options.robot,
+            options.loss,
+        )
+    )
+    print(figures.summary())
+    if not options.headless:
+        webbrowser.open(figures.report.resolve().as_uri())
+    return 0
+
+
+def _estimation(options: argparse.Namespace) -> int:
+    from t3mpc_ros.evaluation.open_loop_estimation import compare, table
+
+    results = compare(
+        seeds=options.seeds,
+        duration=options.duration,
+        normalised_gain=options.gain,
+        progress=lambda text: print(f'  {text}', file=sys.stderr, flush=True),
+    )
+    print(table(results))
+    return _keep([result.record() for result in results], options.json)
+
+
+def _keep(records: Sequence[Mapping[str, object]], path: Path | None) -> int:
+    """Write the records to the file that was asked for, if one was, and return 0."""
+    if path:
+        path.write_text(json.dumps(records, indent=1) + '\n')
+    return 0
+
+
+def _exponents(options: argparse.Namespace) -> int:
+    from t3mpc_ros.chaos.system import hyperchaotic_system
+    from t3mpc_ros.evaluation.lyapunov_exponents import lyapunov_exponents
+
+    values = lyapunov_exponents(hyperchaotic_system(orders=(1.0,) * 4), duration=options.duration)
+    print('Lyapunov exponents of (85) at q = 1: ' + ', '.join(f'{v:.3f}' for v in values))
+    print(f'their sum: {sum(values):.3f} (trace of the Jacobian: -38)')
+    return 0
+
+
+def _warm(options: argparse.Namespace) -> int:
+    from t3mpc_ros.control.controller import Controller, ControllerParameters
+    from t3mpc_ros.evaluation.closed_loop import MethodSpec, run
+    from t3mpc_ros.evaluation.proposed_method import ComposedParameters, ProposedController
+    from t3mpc_ros.evaluation.scenario import DRIVES, Scenario
+    from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters, make_robot
+
+    for drive in DRIVES:
+        spec = MethodSpec('full', ProposedController, ComposedParameters())
+        run(Scenario(drive, 0.04, 'nominal', 1, 1.0), spec)
+    Controller(ControllerParameters()).warm_up()
+    for kind in ('velocity', 'stepper'):
+        make_robot(DigitalTwinParameters.from_dict({'drive.kind': kind})).warm_up()
+    return 0
+
+
+def _contestants() -> 'Sequence[MethodDefinition]':
+    from t3mpc_ros.evaluation.methods import method_definitions
+
+    return method_definitions()
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog='lab', description=__doc__)
+    commands = parser.add_subparsers(dest='command', required=True)
+
+    demo = commands.add_parser('demo', help='run all nodes as processes, record, report')
+    demo.add_argument('--duration', type=SECONDS, default=60.0, help='seconds (default 60)')
+    demo.add_argument('--output', type=Path, help='folder (default runs/<time>)')
+    demo.add_argument('--headless', action='store_true', help='no bar, no browser')
+    demo.add_argument('--seed', type=int, help='seed of reference and robot')
+    demo.add_argument(
+        '--robot',
+        choices=('twin', 'servo', 'emulator'),
+        default='twin',
+        help="twin: the stepper robot with all its parts (default); servo: the paper's plant; "
+        'emulator: the twin on an emulated board, driven over a serial port and a radio',
+    )
+    demo.add_argument(
+        '--loss',
+        type=_share,
+        default=0.0,
+        help='share of radio packets lost each way, with --robot emulator (default 0)',
+    )
+    demo.set_defaults(run=_demo)
+
+    add_report_parser(commands)
+
+    estimation = commands.add_parser(
+        'estimation', help='the kinds of fuzzy systems as estimators, without a controller (86)'
+    )
+    estimation.add_argument(
+        '--seeds', type=bounded_int(1, 10_000), default=5, help='runs each (default 5)'
+    )
+    estimation.add_argument('--duration', type=SECONDS, default=60.0, help='seconds (default 60)')
+    estimation.add_argument(
+        '--gain',
+        type=bounded_float(0.0, 1e6, '1/s²'),
+        default=40.0,
+        help='normalised gain of all kinds, 1/s² (default 40)',
+    )
+    estimation.add_argument('--json', type=Path, help='also write the numbers to this file')
+    estimation.set_defaults(run=_estimation)
+
+    exponents = commands.add_parser('exponents', help='Lyapunov exponents of the generator')
+    exponents.add_argument('--duration', type=SECONDS, default=200.0, help='system seconds')
+    exponents.set_defaults(run=_exponents)
+
+    add_paper(commands)
+    add_tune(commands, _contestants)
+    add_train(commands)
+    add_twin(commands, time.monotonic)
+    add_outcomes_parser(commands, time.monotonic)
+
+    warm = commands.add_parser('warm', help='compile every kernel into the cache')
+    warm.set_defaults(run=_warm)
+    return parser
+
+
+def _share(text: str) -> float:
+    value = float(text)
+    if not 0.0 <= value < 1.0:
+        raise argparse.ArgumentTypeError(f'must be from 0 to below 1: got {text}')
+    return value
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,67 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``t3mpc paper``: reproduces figures, tables and claims of the paper."""
+
+import argparse
+import os
+from pathlib import Path
+import time
+from typing import Any
+
+from t3mpc_ros.evaluation.paper.reproduce import PaperOptions, default_setup, reproduce
+from t3mpc_ros.parameters.command_line import bounded_int
+
+
+def add_parser(commands: Any) -> argparse.ArgumentParser:
+    """Return the parser of ``paper``, added to the sub-parsers of a program."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        'paper', help='every figure and table of the paper, and what became of its claims'
+    )
+    parser.add_argument(
+        '--quick', action='store_true', help='few seeds and short runs: shows that all works'
+    )
+    parser.add_argument(
+        '--seeds', type=bounded_int(1, 10_000), help='held-out seeds (default: all, quick: 3)'
+    )
+    parser.add_argument(
+        '--estimation-seeds',
+        type=bounded_int(1, 10_000),
+        help='of the comparison without a controller (86)',
+    )
+    parser.add_argument(
+        '--workers',
+        type=bounded_int(1, 10_000),
+        default=_processors(),
+        help='processes (default: processors)',
+    )
+    parser.add_argument(
+        '--output', type=Path, help='folder (default runs/paper, or runs/paper-quick)'
+    )
+    parser.add_argument('--json', type=Path, help='also write the results to this file')
+    parser.add_argument(
+        '--fresh', action='store_true', help='throw away the runs that the folder holds'
+    )
+    parser.set_defaults(run=run)
+    return parser
+
+
+def run(options: argparse.Namespace) -> int:
+    """Return 0 after everything was written; the command line's entry."""
+    from t3mpc_ros.evaluation.reporting import Progress
+
+    output = options.output or Path('runs') / ('paper-quick' if options.quick else 'paper')
+    chosen = PaperOptions(
+        output=output,
+        quick=options.quick,
+        seeds=options.seeds,
+        estimation_seeds=options.estimation_seeds,
+        workers=options.workers,
+        json=options.json,
+        fresh=options.fresh,
+    )
+    print(reproduce(default_setup(), chosen, Progress(time.monotonic)))
+    return 0
+
+
+def _processors() -> int:
+    return max(1, len(os.sched_getaffinity(0)))

@@ -1,0 +1,205 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Starts, monitors and stops the package's executables as processes."""
+
+from collections.abc import Mapping, Sequence
+import os
+from pathlib import Path
+import random
+import signal
+import subprocess
+import sys
+import time
+
+
+class ProcessError(RuntimeError):
+    """An executable that did not start, or ended when it should not have."""
+
+
+def executable(name: str) -> Path:
+    """Return the file that ``ros2 run t3mpc_ros NAME`` would start.
+
+    Raises
+    ------
+    ProcessError
+        It is not installed; the text says how to install it.
+    """
+    path = _installed(Path('lib') / 't3mpc_ros' / name)
+    if path is None or not os.access(path, os.X_OK):
+        raise ProcessError(
+            f'the executable {name} is not installed below any of '
+            f'{", ".join(map(str, _prefixes()))}; run it through scripts/run, or build the '
+            'workspace and source its setup file'
+        )
+    return path
+
+
+def private_graph() -> dict[str, str]:
+    """Return environment variables that keep a run to itself, on this machine only.
+
+    What is set already stays. Otherwise a ``ROS_DOMAIN_ID`` is drawn, so that two runs at once
+    do not hear each other, and Fast DDS is kept to UDP on loopback: its shared memory may stop a
+    publisher for a third of a second when somebody new subscribes (Fast-DDS issue 6535).
+    """
+    environment = dict(os.environ)
+    environment.setdefault('ROS_DOMAIN_ID', str(random.SystemRandom().randint(1, 101)))
+    environment.setdefault('RCUTILS_COLORIZED_OUTPUT', '0')
+    profile = _installed(Path('share') / 't3mpc_ros' / 'config' / 'fastdds_loopback.xml')
+    chosen = {'ROS_AUTOMATIC_DISCOVERY_RANGE', 'FASTRTPS_DEFAULT_PROFILES_FILE'} & set(environment)
+    if not chosen:
+        if profile is None:
+            environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+        else:
+            environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'SYSTEM_DEFAULT'
+            environment['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(profile)
+    return environment
+
+
+def _prefixes() -> list[Path]:
+    # A workspace that was sourced comes before the environment it runs in, as for `ros2 run`.
+    found = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
+    return [Path(prefix) for prefix in dict.fromkeys(found) if prefix]
+
+
+def _installed(path: Path) -> Path | None:
+    return next((prefix / path for prefix in _prefixes() if (prefix / path).exists()), None)
+
+
+class ProcessGroup:
+    """The executables of one run, each a process of its own with a log file.
+
+    Parameters
+    ----------
+    logs
+        Folder for the log files, made if missing.
+    environment
+        Environment of the processes, see :func:`private_graph`.
+    """
+
+    def __init__(self, logs: Path, environment: Mapping[str, str]) -> None:
+        logs.mkdir(parents=True, exist_ok=True)
+        self._logs = logs
+        self._environment = dict(environment)
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._log_start: dict[str, int] = {}
+
+    def start(
+        self, name: str, *arguments: str, parameters: Mapping[str, object] | None = None
+    ) -> None:
+        """Start one executable with ROS parameters; its output is appended to its log."""
+        command = [str(executable(name)), *arguments]
+        given = dict(parameters or {})
+        if given:
+            command.append('--ros-args')
+            for key, value in given.items():
+                command += ['-p', f'{key}:={yaml_value(value)}']
+        with self.log(name).open('ab') as output:
+            self._log_start[name] = output.tell()
+            self._processes[name] = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=self._environment,
+                # Ctrl-C in a terminal goes to the whole group: the fleet is stopped in order
+                # instead, so that the recorder is the last to go.
+                start_new_session=True,
+            )
+
+    def log(self, name: str) -> Path:
+        """Return the log file of one executable."""
+        return self._logs / f'{name}.log'
+
+    def wait_ready(self, name: str, seconds: float = 120.0) -> None:
+        """Wait until the executable says that it is ready, see :meth:`wait_for`."""
+        self.wait_for(name, f'{name} ready', seconds)
+
+    def wait_for(self, name: str, words: str, seconds: float = 30.0) -> None:
+        """Wait until the executable has said certain words since it was started.
+
+        Raises
+        ------
+        ProcessError
+            It ended, or did not say so within ``seconds``; the text ends with its last lines.
+        """
+        deadline = time.monotonic() + seconds
+        process = self._processes[name]
+        while words not in self._fresh_output(name):
+            if process.poll() is not None:
+                raise ProcessError(
+                    f'{name} ended with code {process.returncode} before it said '
+                    f'"{words}":\n' + self._tail(name)
+                )
+            if time.monotonic() > deadline:
+                raise ProcessError(
+                    f'{name} did not say "{words}" within {seconds:g} s:\n' + self._tail(name)
+                )
+            time.sleep(0.05)
+
+    def check(self) -> None:
+        """Raise :class:`ProcessError` when one of the processes has ended by itself."""
+        for name, process in self._processes.items():
+            if process.poll() is not None:
+                raise ProcessError(
+                    f'{name} ended with code {process.returncode} during the run:\n'
+                    + self._tail(name)
+                )
+
+    def running(self) -> tuple[str, ...]:
+        """Return the names of the executables that were started and not stopped."""
+        return tuple(self._processes)
+
+    def pid(self, name: str) -> int:
+        """Return the process id of one executable."""
+        return self._processes[name].pid
+
+    def kill(self, name: str) -> None:
+        """End one executable at once, as a crash would."""
+        process = self._processes.pop(name)
+        process.kill()
+        process.wait()
+
+    def stop(self, name: str, number: int = signal.SIGINT, seconds: float = 10.0) -> int:
+        """Ask one executable to end and return its exit code.
+
+        Raises
+        ------
+        ProcessError
+            It did not end in time; it is killed then.
+        """
+        process = self._processes.pop(name)
+        process.send_signal(number)
+        try:
+            return process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+            raise ProcessError(
+                f'{name} did not end within {seconds:g} s of signal {number}:\n' + self._tail(name)
+            ) from None
+
+    def stop_all(self, order: Sequence[str] = ()) -> dict[str, int]:
+        """Stop what still runs, first in the given order, then the rest; return exit codes."""
+        names = [name for name in order if name in self._processes]
+        names += [name for name in self._processes if name not in names]
+        return {name: self.stop(name) for name in names}
+
+    def _fresh_output(self, name: str) -> str:
+        with self.log(name).open('rb') as source:
+            source.seek(self._log_start[name])
+            return source.read().decode(errors='replace')
+
+    def _tail(self, name: str) -> str:
+        lines = self._fresh_output(name).splitlines()[-12:]
+        return '\n'.join(f'  {line}' for line in lines)
+
+
+def yaml_value(value: object) -> str:
+    """Return a parameter value as ``-p name:=value`` takes it."""
+    if isinstance(value, bool):
+        return 'true' if value else 'false'
+    if isinstance(value, list | tuple):
+        return '[' + ', '.join(map(yaml_value, value)) + ']'
+    if isinstance(value, str):
+        return '"' + value.replace('\\', '\\\\').replace('"', '\\"') + '"'
+    return repr(value)

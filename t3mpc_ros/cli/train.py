@@ -1,0 +1,107 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``t3mpc train``: fits a model file to simulated runs."""
+
+import argparse
+from pathlib import Path
+import sys
+
+DRIVES = ('velocity', 'torque')
+OUTPUT = Path('model.npz')
+SEEDS = 5
+FOLDS = 5
+
+
+def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
+    """Add ``train`` to the commands of ``lab``; :func:`run` carries it out."""
+    parser = commands.add_parser(
+        'train',
+        help='make a model file that the controller starts from',
+        description='Without a bag: what the full controller learns in simulated practice, and '
+        'what that is worth on other seeds. With bags: the same as bag train. The controller '
+        'loads the file by its parameter model.',
+    )
+    parser.add_argument('bags', nargs='*', type=Path, metavar='BAG', help='folder of a bag')
+    parser.add_argument(
+        '--drive', choices=DRIVES, default='velocity', help='of the practice (default velocity)'
+    )
+    parser.add_argument(
+        '--seeds',
+        type=int,
+        default=SEEDS,
+        help=f'runs with and without the model after the practice (default {SEEDS})',
+    )
+    add_bag_options(parser)
+    parser.set_defaults(run=run)
+
+
+def add_bag_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of learning from bags, see :func:`run_bags`."""
+    parser.add_argument(
+        '--output', type=Path, default=OUTPUT, help=f'model file to write (default {OUTPUT})'
+    )
+    parser.add_argument(
+        '--keep-predictor',
+        action='store_true',
+        help='learn only the fuzzy coefficients from the bags, because v_p moved too little',
+    )
+    parser.add_argument(
+        '--folds',
+        type=int,
+        default=FOLDS,
+        help='blocks into which one bag alone is cut to be cross-validated; of several bags '
+        f'each is a fold (default {FOLDS})',
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """Return 0 when the model was written; prints what it is worth.
+
+    Raises
+    ------
+    TrainingError
+        The bags do not teach anything.
+    ModelError
+        The file cannot be written.
+    ValueError
+        Options that do not go together.
+    """
+    from t3mpc_ros.bag.run.model_file import save_model
+
+    if options.bags:
+        if options.drive != 'velocity':
+            raise ValueError(f'drive must be velocity for bags: got {options.drive}')
+        return run_bags(options)
+    from t3mpc_ros.evaluation.training.simulated_runs import (
+        assess,
+        fit_simulated_runs,
+        held_out_seeds,
+    )
+
+    if options.keep_predictor:
+        raise ValueError('--keep-predictor is for bags')
+    seeds = held_out_seeds(options.seeds)
+    pretrained, used = fit_simulated_runs(options.drive)
+    save_model(options.output, pretrained, {**used.to_dict(), 'drive': options.drive})
+    print(assess(options.drive, used, pretrained, seeds, _print_progress))
+    print(f'saved {options.output.resolve()}')
+    return 0
+
+
+def run_bags(options: argparse.Namespace) -> int:
+    """Return 0 when the model of ``options.bags`` was written; prints what it is worth.
+
+    Raises as :func:`run`.
+    """
+    from t3mpc_ros.bag.run.model_file import save_model
+    from t3mpc_ros.evaluation.training.recorded_runs import fit_bags
+
+    model = fit_bags(options.bags, keep_predictor=options.keep_predictor, count=options.folds)
+    print(model.text)
+    save_model(options.output, model.learnt, model.parameters.to_dict(), model.origin)
+    print(f'saved {options.output.resolve()}')
+    return 0
+
+
+def _print_progress(text: str) -> None:
+    print(f'  {text}', file=sys.stderr, flush=True)

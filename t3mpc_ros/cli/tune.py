@@ -1,0 +1,102 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``t3mpc tune``: tunes the compared methods."""
+
+import argparse
+from collections.abc import Callable, Sequence
+import difflib
+import os
+from pathlib import Path
+import sys
+import time
+from typing import TYPE_CHECKING
+
+from t3mpc_ros.parameters.command_line import bounded_int
+
+if TYPE_CHECKING:
+    from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition
+
+
+DRIVES = ('torque', 'velocity')
+EVALUATIONS = 120
+OUTPUT = Path('runs') / 'tuned.json'
+
+Table = Callable[[], 'Sequence[MethodDefinition]']
+"""Returns the methods that can be tuned. A function, so that ``lab --help`` need not load them."""
+
+
+def add_parser(
+    commands: 'argparse._SubParsersAction[argparse.ArgumentParser]', table: Table
+) -> None:
+    """Add ``tune`` to the commands of ``lab``; :func:`run` carries it out."""
+    parser = commands.add_parser(
+        'tune', help='search the settings of every method, with equally many evaluations'
+    )
+    parser.add_argument('methods', nargs='*', metavar='METHOD', help='by name (default all)')
+    parser.add_argument('--drive', choices=DRIVES, help='(default both)')
+    parser.add_argument(
+        '--evaluations',
+        type=bounded_int(1, 100_000),
+        default=EVALUATIONS,
+        help=f'of each method in each drive (default {EVALUATIONS})',
+    )
+    parser.add_argument(
+        '--workers',
+        type=bounded_int(1, 100_000),
+        default=os.cpu_count() or 1,
+        help='processes (default all cores)',
+    )
+    parser.add_argument(
+        '--output', type=Path, default=OUTPUT, help=f'file to write (default {OUTPUT})'
+    )
+    parser.add_argument(
+        '--resume', action='store_true', help='go on where the last tuning was interrupted'
+    )
+    parser.set_defaults(run=run, table=table)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Return 0 when every method was tuned; prints what was gained.
+
+    Raises
+    ------
+    ValueError
+        A method that is not in the table.
+    """
+    from t3mpc_ros.evaluation.tuning.tune_methods import tune_methods
+
+    known = options.table()
+    drives = (options.drive,) if options.drive else DRIVES
+    methods = chosen(known, options.methods)
+    store = tune_methods(
+        methods,
+        [drive for drive in drives if options.drive or any(drive in m.start for m in methods)],
+        options.evaluations,
+        options.workers,
+        options.output,
+        lambda line: print(line, file=sys.stderr, flush=True),
+        clock=time.monotonic,
+        resume=options.resume,
+    )
+    print(store.table())
+    return 0
+
+
+def chosen(known: 'Sequence[MethodDefinition]', names: Sequence[str]) -> 'list[MethodDefinition]':
+    """Return the methods that were named, all when none was; case and punctuation are free.
+
+    Raises
+    ------
+    ValueError
+        A name that is not known; tells the nearest one, or all.
+    """
+    from t3mpc_ros.evaluation.tuning.search_space import short_name
+
+    by_name = {method.short: method for method in known}
+    for name in names:
+        if short_name(name) not in by_name:
+            near = difflib.get_close_matches(short_name(name), by_name, n=1)
+            hint = f'did you mean {near[0]}?' if near else f'known are {", ".join(by_name)}'
+            raise ValueError(f'there is no method {name!r}; {hint}')
+    wanted = {short_name(name) for name in names} or set(by_name)
+    return [method for method in known if method.short in wanted]

@@ -1,0 +1,229 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Adaptive fuzzy control with a type-1 or an interval type-2 system."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.control.control_law import compensator
+from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
+from t3mpc_ros.evaluation.baselines.feedback_baseline import (
+    CLOSING,
+    OWN,
+    CrossingParameters,
+    FeedbackBaseline,
+    checked_parameters,
+    disturbance_error,
+    write_acceleration,
+)
+from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, gamma_for
+from t3mpc_ros.fuzzy.sets import FuzzyParameters
+from t3mpc_ros.kernels import kernel
+from t3mpc_ros.parameters.table import Parameters, group, parameter
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class AdaptiveParameters(Parameters):
+    """What both adaptive fuzzy controllers have; the sets cover -10 to 10 rad/s."""
+
+    gain: float = parameter(30.0, 'feedback K on the error', unit='1/s', low=0.5, high=100.0)
+    normalised_gain: float = parameter(
+        100.0,
+        'adaptation gain gamma |Phi|², averaged over the inputs: the error obeys '
+        's² + K s + gamma |Phi|² = 0',
+        unit='1/s²',
+        low=0.1,
+        high=5000.0,
+    )
+    dead_zone: float = parameter(
+        0.01,
+        'error from which on coefficients adapt; a smaller one counts as noise',
+        unit='rad/s',
+        low=0.0,
+        high=2.0,
+    )
+    error_bound: float = parameter(
+        0.5,
+        'bound of what the fuzzy system cannot explain, outweighed by the robust term; 0 leaves '
+        'the term out',
+        unit='rad/s²',
+        low=0.0,
+        high=30.0,
+    )
+    smoothing: float = parameter(
+        0.5,
+        'width of the robust term, epsilon in tanh(e/epsilon)',
+        unit='rad/s',
+        low=0.01,
+        high=10.0,
+    )
+    sets: int = parameter(7, 'Gaussian sets per input', low=2, high=9)
+    spread: float = parameter(
+        0.6, 'width of the sets as a fraction of their spacing', low=0.2, high=3.0
+    )
+    centre_exponent: float = parameter(
+        2.0, 'how much closer together the centres are in the middle', low=0.2, high=5.0
+    )
+    crossing: CrossingParameters = group(CrossingParameters)
+
+    def fuzzy(self) -> FuzzyParameters:
+        """Return the shape of the fuzzy system, type-1; the fuzzifier is a singleton."""
+        return FuzzyParameters(
+            kind='type1',
+            sets=self.sets,
+            spread=self.spread,
+            centre_exponent=self.centre_exponent,
+            input_fuzziness=0.0,
+        )
+
+
+@dataclass(frozen=True)
+class AdaptiveType1Parameters(AdaptiveParameters):
+    """Gains and sets of the type-1 controller."""
+
+
+@dataclass(frozen=True)
+class AdaptiveIntervalType2Parameters(AdaptiveParameters):
+    """Gains and sets of the interval type-2 controller."""
+
+    footprint_of_uncertainty: float = parameter(
+        0.23,
+        'uncertainty of the sets: widths are (1 - footprint) and (1 + footprint) times the middle',
+        low=0.0,
+        high=0.9,
+    )
+
+    def fuzzy(self) -> FuzzyParameters:
+        """Return the shape of the fuzzy system, interval type-2; the fuzzifier is a singleton."""
+        return replace(
+            super().fuzzy(),
+            kind='interval_type2',
+            footprint_of_uncertainty=self.footprint_of_uncertainty,
+        )
+
+
+@lru_cache(maxsize=64)
+def _unit_gamma(fuzzy: FuzzyParameters) -> float:
+    """Return the gamma whose normalised gain is 1 1/s²; many runs share one shape."""
+    return gamma_for(fuzzy, 1.0)
+
+
+@kernel
+def _find_errors(speeds: Array, wanted: Array, period: float, gains: Array, memory: Array) -> None:
+    """Write e into the first own row of memory. gains : as in :func:`_oppose`."""
+    for i in range(2):
+        memory[OWN, i] = disturbance_error(
+            i, speeds, wanted, period, 1.0, gains[3], gains[4], memory
+        )
+
+
+@kernel
+def _oppose(
+    estimate: Array,
+    wanted: Array,
+    wanted_next: Array,
+    period: float,
+    gains: Array,
+    memory: Array,
+    command: Array,
+) -> None:
+    """Write the answer. gains : K, bound, smoothing, closing share and acceleration."""
+    for i in range(2):
+        error = memory[OWN, i]
+        feedforward = (wanted_next[i] - wanted[i]) / period + memory[CLOSING, i]
+        u = feedforward - estimate[i] - gains[0] * error
+        u += compensator(error, gains[1], gains[2])
+        write_acceleration(i, u, wanted_next, memory, command)
+
+
+class _Adaptive(FeedbackBaseline):
+    r"""The law both share: u = r' + v(h) - g(chi|alpha) - K e - bound tanh(e/epsilon).
+
+    The coefficients learn by alpha' = gamma Phi e from the error that their own estimate has
+    caused, that is with the basis of the step before:
+
+    .. math:: \alpha_{k+1} = \alpha_k + \gamma T \Phi_k e_{k+1}.
+
+    With an exact alpha* and no robust term, V = e²/2 + |alpha* - alpha|²/(2 gamma) then changes by
+    -(e_k² - 2(1 - KT) e_k e_(k+1) + (1 - gamma |Phi|² T²) e_(k+1)²)/2, which is negative for any
+    errors while gamma |Phi|² T < K (2 - KT): not only in continuous time. The step limit of the
+    adaptation is put there.
+    """
+
+    _table: ClassVar[type[AdaptiveParameters]]
+
+    def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None:
+        table = checked_parameters(parameters, self._table)
+        super().__init__(nominal_model, table.crossing, own=1)
+        fuzzy = table.fuzzy()
+        steps = table.gain * nominal_model.period
+        self.fuzzy = FuzzyEstimator(
+            fuzzy,
+            AdaptationParameters(
+                gamma=table.normalised_gain * _unit_gamma(fuzzy),
+                dead_zone=table.dead_zone,
+                step_limit=max(0.001, table.gain * min(1.0, 2.0 - steps)),
+            ),
+        )
+        self._gains: Array = np.array(
+            [table.gain, table.error_bound, table.smoothing, *self._closing]
+        )
+        self._limited = False
+
+    @property
+    def error(self) -> Array:
+        """e, the error that is learnt from, rad/s, shape (2,)."""
+        error: Array = self._memory[OWN].copy()
+        return error
+
+    def step(self, observation: Observation) -> Array:
+        """Return u, rad/s², shape (2,)."""
+        memory = self._memory
+        _find_errors(observation.speeds, observation.wanted, self._period, self._gains, memory)
+        if not self._limited:
+            self.fuzzy.adapt(memory[OWN], self._period)
+        _oppose(
+            self.fuzzy.evaluate(observation.speeds),
+            observation.wanted,
+            observation.wanted_next,
+            self._period,
+            self._gains,
+            memory,
+            self._command,
+        )
+        return self._command
+
+    def applied(self, acceleration: Array, *, limited: bool) -> None:
+        """Take note of the u that was applied; adaptation pauses while the drive is limited."""
+        super().applied(acceleration, limited=limited)
+        self._limited = limited
+
+    def learnt(self) -> dict[str, Array]:
+        """Return the coefficients."""
+        return {'coefficients': self.fuzzy.coefficients}
+
+    def restore(self, learnt: Mapping[str, Array]) -> None:
+        """Begin with other coefficients."""
+        self.fuzzy.coefficients = learnt['coefficients']
+
+
+class AdaptiveType1(_Adaptive):
+    """Adaptive control with a type-1 fuzzy system (Wang 1993), see :class:`_Adaptive`."""
+
+    parameters_type = _table = AdaptiveType1Parameters
+
+
+class AdaptiveIntervalType2(_Adaptive):
+    """Adaptive control with an interval type-2 fuzzy system (Liang and Mendel 2000).
+
+    See :class:`_Adaptive`.
+    """
+
+    parameters_type = _table = AdaptiveIntervalType2Parameters

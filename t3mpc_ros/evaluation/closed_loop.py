@@ -1,0 +1,597 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Closed loop of plant and controller without ROS; runs scenarios, in several processes if asked."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import lru_cache
+import math
+import multiprocessing
+from types import TracebackType
+from typing import Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.control.actuation import VelocityActuation
+from t3mpc_ros.control.control_law import TERM_NAMES
+from t3mpc_ros.evaluation.baselines.baseline_controller import (
+    BaselineController,
+    NominalModel,
+    Observation,
+)
+from t3mpc_ros.evaluation.scenario import (
+    DRIVES,
+    PRETRAINING_DURATION,
+    PRETRAINING_NOISE,
+    PRETRAINING_SEEDS,
+    RATE,
+    Scenario,
+)
+from t3mpc_ros.parameters.table import ParameterError, Parameters
+from t3mpc_ros.simulation.plant.disturbances import Disturbance, SpeedNoise, make_generators
+from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
+from t3mpc_ros.simulation.plant.paper_plant import PaperPlant, PaperRobotParameters
+
+Array = NDArray[np.float64]
+
+DRAWN = ('noise.variance', 'disturbance.walk_rate')
+"""Live settings of the robot that are fixed here, because they shape numbers drawn beforehand."""
+
+
+class FastPlant:
+    """The physics of :class:`~t3mpc_ros.robot.simulated.PaperRobot`, bit for bit.
+
+    It has the same plant, the same random numbers and the same time grid from 0 s on. What is
+    left out: the guard, so commands must be within what the guard would pass; odometry; reports.
+
+    Parameters
+    ----------
+    settings
+        The robot, its drive of either kind.
+    steps
+        How many control periods it will run at most: the random numbers of all are drawn now.
+
+    Raises
+    ------
+    ValueError
+        Fewer than one step.
+    """
+
+    def __init__(self, parameters: PaperRobotParameters, steps: int) -> None:
+        if steps < 1:
+            raise ValueError(f'steps must be at least 1: got {steps}')
+        for_disturbance, for_noise = make_generators(parameters.seed)
+        self._parameters = parameters
+        self._substeps = parameters.substeps
+        self._plant = PaperPlant(parameters.drive, parameters.step)
+        self._disturbance = Disturbance(parameters.disturbance, for_disturbance)
+        self._disturbance.draw(0.0)  # as the robot does when its grid starts
+        first = self._disturbance.walk.copy()
+        later = self._disturbance.draw_ahead(self._substeps * self._plant.step, steps - 1)
+        self._walks: Array = np.vstack([first, later])
+        self._noise = SpeedNoise(parameters.noise, for_noise).draw_ahead(steps + 1)
+        self._steps = steps
+        self.steps_done = 0
+        """Control periods run so far."""
+        self.speeds: Array = np.zeros(2)
+        """True chi, rad/s, right wheel first, shape (2,); overwritten by each step."""
+        self.measured: Array = self._noise[0].copy()
+        """chi with its noise, rad/s, shape (2,); overwritten by each step."""
+        self._load()
+
+    @property
+    def plant(self) -> PaperPlant:
+        """Pose, wheel angles and wheel speeds, for who needs more than :attr:`speeds`."""
+        return self._plant
+
+    def configure(self, parameters: PaperRobotParameters) -> None:
+        """Go on with other settings from the next period on, a heavier load say.
+
+        Raises
+        ------
+        ParameterError
+            A setting differs that is fixed: those of the robot, and :data:`DRAWN`.
+        """
+        before, after = self._parameters.to_dict(), parameters.to_dict()
+        for row in PaperRobotParameters.rows():
+            fixed = not row.dynamic or row.name in DRAWN
+            if fixed and before[row.name] != after[row.name]:
+                raise ParameterError(
+                    f'{row.name} is fixed while the plant runs '
+                    f'(it is {before[row.name]}): got {after[row.name]}'
+                )
+        self._parameters = parameters
+        self._load()
+
+    def step(self, right: float, left: float) -> None:
+        """Run one control period under one command, and measure at its end.
+
+        Parameters
+        ----------
+        right, left
+            Torques (N m) with a torque drive, wheel speeds (rad/s) with a velocity drive.
+
+        Raises
+        ------
+        ValueError
+            There are no random numbers left.
+        """
+        done = self.steps_done
+        if done == self._steps:
+            raise ValueError(f'steps must be at least {done + 1} to go on: got {self._steps}')
+        self._disturbance.walk[:] = self._walks[done]
+        self._plant.run((right, left), False, self._disturbance, self._substeps)
+        self.speeds[0], self.speeds[1] = self._plant.wheels
+        self.steps_done = done + 1
+        np.add(self.speeds, self._noise[done + 1], out=self.measured)
+
+    def _load(self) -> None:
+        parameters = self._parameters
+        self._disturbance.parameters = parameters.disturbance
+        self._plant.load(
+            parameters.drive,
+            (parameters.body, parameters.true_body),
+            parameters.geometry,
+            parameters.friction,
+            parameters.friction_factor,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class LoopRecord:
+    """What happened in one run, one row a control period, right wheel first.
+
+    Row k holds what was known and decided at ``time[k]``, and the state of the robot then. From
+    a row on at which the method answered with a number that is not finite, all is NaN but time,
+    reference and mode: the run ended there.
+    """
+
+    time: Array
+    """s, shape (n,)"""
+    wanted: Array
+    """r, rad/s, shape (n, 2)"""
+    measured: Array
+    """chi with its noise, rad/s, shape (n, 2)"""
+    speeds: Array
+    """True chi, rad/s, shape (n, 2)"""
+    estimated: Array
+    """Estimated chi, rad/s, shape (n, 2)"""
+    unexplained: Array
+    """Estimated acceleration that chi' = u does not explain, rad/s², shape (n, 2)"""
+    command: Array
+    """u as the drive's limits let it through, rad/s², shape (n, 2)"""
+    sent: Array
+    """What the robot was told, shape (n, 2): torques (N m) or wheel speeds (rad/s)"""
+    effort: Array
+    """Acceleration asked of the robot, rad/s², shape (n, 2): u with the torque drive, the rate of
+    change of the commanded wheel speeds with the velocity drive"""
+    limited: NDArray[np.bool_]
+    """Whether a limit changed u, shape (n,)"""
+    terms: Array
+    """Terms of u, rows as in ``law.TERMS``, rad/s², shape (n, 5, 2); zeros for a method that
+    has none. The fuzzy estimate is the first one negated."""
+    modes: NDArray[np.int64]
+    """Active switching mode, shape (n,)"""
+
+    @classmethod
+    def empty(cls, steps: int) -> Self:
+        """Return a record of ``steps`` rows of zeros, to be filled."""
+        return cls(
+            time=np.zeros(steps),
+            wanted=np.zeros((steps, 2)),
+            measured=np.zeros((steps, 2)),
+            speeds=np.zeros((steps, 2)),
+            estimated=np.zeros((steps, 2)),
+            unexplained=np.zeros((steps, 2)),
+            command=np.zeros((steps, 2)),
+            sent=np.zeros((steps, 2)),
+            effort=np.zeros((steps, 2)),
+            limited=np.zeros(steps, dtype=np.bool_),
+            terms=np.zeros((steps, len(TERM_NAMES), 2)),
+            modes=np.zeros(steps, dtype=np.int64),
+        )
+
+    @property
+    def error(self) -> Array:
+        """True tracking error chi - r, rad/s, shape (n, 2)."""
+        return self.speeds - self.wanted
+
+    @property
+    def finite(self) -> bool:
+        """Whether the run went to its end: every number is finite."""
+        return bool(np.isfinite(self.speeds).all() and np.isfinite(self.command).all())
+
+    def rmse(self, after: float = 3.0, *, cut: float = 0.0) -> float:
+        """Return the tracking RMSE over both wheels, rad/s; NaN when the run broke off.
+
+        Parameters
+        ----------
+        after
+            Seconds left out at the start, while the reference grows.
+        cut
+            Seconds left out at each switch: 40 % of them before it, where methods with preview
+            have already left the old reference, the rest after it.
+
+        Raises
+        ------
+        ValueError
+            Nothing is left to be counted.
+        """
+        return float(np.sqrt(np.mean(self.error[self._counted(after, cut)] ** 2)))
+
+    def largest_error(self, after: float = 3.0, *, cut: float = 0.0) -> float:
+        """Return the largest tracking error of a wheel, rad/s; arguments as :meth:`rmse`."""
+        return float(np.max(np.abs(self.error[self._counted(after, cut)])))
+
+    def chatter(self) -> float:
+        """Return the total variation of the effort per second and wheel, rad/s³.
+
+        Raises
+        ------
+        ValueError
+            The record has fewer than two rows.
+        """
+        if self.time.size < 2:
+            raise ValueError(f'a record must have at least 2 rows: got {self.time.size}')
+        span = self.time[-1] - self.time[0]
+        return float(np.abs(np.diff(self.effort, axis=0)).sum() / (2.0 * span))
+
+    def _counted(self, after: float, cut: float) -> NDArray[np.bool_]:
+        counted: NDArray[np.bool_] = self.time >= after
+        for switch in self.time[1:][np.diff(self.modes) != 0]:
+            counted &= (self.time < switch - 0.4 * cut) | (self.time >= switch + 0.6 * cut)
+        if not counted.any():
+            end = self.time[-1] if self.time.size else 0.0
+            raise ValueError(
+                f'after and cut must leave rows of a run that ends at {end:g} s: '
+                f'got {after:g} s and {cut:g} s'
+            )
+        return counted
+
+
+T = TypeVar('T')
+
+
+@dataclass(frozen=True, slots=True)
+class MethodSpec:
+    """A method to be compared, as plain data that can be sent to another process.
+
+    Calling it makes the method: ``spec(knowledge)``.
+    """
+
+    name: str
+    controller_type: type[BaselineController]
+    parameters: Parameters
+    pretrained: bool = False
+    """Whether it comes with what it learnt in :data:`PRACTICE`, if it is one that learns."""
+
+    def __post_init__(self) -> None:
+        wanted = self.controller_type.parameters_type
+        if not isinstance(self.parameters, wanted):
+            raise ValueError(
+                f'settings of {self.name} must be {wanted.__name__}: '
+                f'got {type(self.parameters).__name__}'
+            )
+
+    def __call__(self, nominal_model: NominalModel) -> BaselineController:
+        """Return a new controller that knows of no runs before, but of its practice."""
+        controller = self.controller_type(self.parameters, nominal_model)
+        if self.pretrained and controller.learnt():
+            controller.restore(
+                pretrain(self.controller_type, self.parameters, nominal_model.drive)
+            )
+        return controller
+
+
+@lru_cache(maxsize=32)
+def pretrain(
+    controller_type: type[BaselineController], parameters: Parameters, drive: str
+) -> Mapping[str, Array]:
+    """Return what a method learns in the runs of :data:`PRACTICE`, one after the other."""
+    learnt: Mapping[str, Array] = {}
+    for seed in PRETRAINING_SEEDS:
+        scenario = Scenario(drive, PRETRAINING_NOISE, 'nominal', seed, PRETRAINING_DURATION)
+        controller = controller_type(parameters, scenario.nominal_model())
+        if learnt:
+            controller.restore(learnt)
+        run(scenario, lambda _, controller=controller: controller)  # type: ignore[misc]
+        learnt = controller.learnt()
+    return learnt
+
+
+Job = tuple[Scenario, MethodSpec]
+
+
+class JobError(RuntimeError):
+    """A run that failed; the text names method and scenario."""
+
+
+def drive_for(scenario: Scenario) -> VelocityActuation:
+    """Return the estimator and drive seam that every method has in a scenario."""
+    geometry = scenario.nominal_model().robot.geometry
+    return VelocityActuation(
+        scenario.estimate(), scenario.limits, geometry, scenario.drive, 1.0 / RATE
+    )
+
+
+def run(
+    scenario: Scenario,
+    method: Callable[[NominalModel], BaselineController],
+    *,
+    drive: VelocityActuation | None = None,
+) -> LoopRecord:
+    """Return what happened when a new ``method`` followed the reference of a scenario.
+
+    Each period k: measure, estimate, show the method its :class:`View`, send what it answers.
+    The robot stands at the start, and the estimator begins with what is measured then. With a
+    torque drive, u is cut where its torque would be beyond what the motors have, so that
+    estimator and method are told the u that acts. Equal arguments give equal runs, bit for bit.
+
+    Parameters
+    ----------
+    scenario
+        Drive, noise, case and seed.
+    method
+        Makes the controller from what it is told, a :class:`MethodSpec` say.
+    drive
+        A drive seam in place of :func:`drive_for`, of the same kind; it is reset first.
+
+    Raises
+    ------
+    ValueError
+        The dead time is not a whole number of periods, or longer than the reference reaches; or
+        the method answers with anything but two numbers.
+    """
+    nominal_model = scenario.nominal_model()
+    controller = method(nominal_model)
+    seam = drive_for(scenario) if drive is None else drive
+    plant = FastPlant(scenario.robot(), scenario.steps)
+    seam.reset(plant.measured)
+    changed_robot, change_step = scenario.changed_robot(), scenario.change_step
+    inertia = wheel_inertia(nominal_model.robot.body, nominal_model.robot.geometry)
+    torque_drive = scenario.drive == 'torque'
+    diagonal, beside = inertia[0].tolist()
+    torque_limit = nominal_model.robot.drive.torque_limit if torque_drive else math.inf
+    period = nominal_model.period
+    record = _prepare(scenario)
+    now, following, rows = _observed_reference(scenario, seam.dead_time, controller.preview)
+    terms: object = getattr(controller, 'terms', None)
+    has_terms = isinstance(terms, np.ndarray) and terms.shape == record.terms.shape[1:]
+    observation = Observation(
+        seam.ahead, seam.unexplained, now[0], following[0], seam.command, None
+    )
+
+    last: Array = np.zeros(2)
+    for k in range(scenario.steps):
+        if k == change_step and changed_robot is not None:
+            plant.configure(changed_robot)
+        seam.observe(plant.measured, period)
+        record.measured[k] = plant.measured
+        record.speeds[k] = plant.speeds
+        record.estimated[k] = seam.speeds
+        record.unexplained[k] = seam.unexplained
+        observation.speeds = seam.ahead
+        observation.unexplained = seam.unexplained
+        observation.wanted = now[k]
+        observation.wanted_next = following[k]
+        observation.command = seam.command
+        if rows:
+            observation.future = now[k : k + rows]
+        asked = controller.step(observation)
+        if k == 0 and np.shape(asked) != (2,):
+            raise ValueError(f'a method must answer with shape (2,): got {np.shape(asked)}')
+        right, left = asked.tolist()
+        if not (math.isfinite(right) and math.isfinite(left)):
+            _break_off(record, k)
+            break
+        cut = torque_limit < max(
+            abs(diagonal * right + beside * left), abs(beside * right + diagonal * left)
+        )
+        if cut:
+            torque = np.clip(inertia @ asked, -torque_limit, torque_limit)
+            asked = np.asarray(np.linalg.solve(inertia, torque), dtype=np.float64)
+        command = record.command[k]
+        command[:] = seam.send(asked)
+        limited = seam.limited or cut
+        record.limited[k] = limited
+        controller.applied(command, limited=limited)
+        if has_terms:
+            record.terms[k] = controller.terms  # type: ignore[attr-defined]
+        sent = record.sent[k]
+        if torque_drive:
+            np.dot(inertia, command, out=sent)
+            record.effort[k] = command
+        else:
+            sent[:] = seam.command
+            record.effort[k] = (seam.command - last) / period
+            last[:] = seam.command
+        right, left = sent.tolist()
+        plant.step(right, left)
+    return record
+
+
+def _prepare(scenario: Scenario) -> LoopRecord:
+    """Return a record with all that is known before the run."""
+    record, reference = LoopRecord.empty(scenario.steps), scenario.reference()
+    record.time[:] = reference.time[: scenario.steps]
+    record.wanted[:] = reference.wanted[: scenario.steps]
+    record.modes[:] = reference.modes[: scenario.steps]
+    return record
+
+
+def _observed_reference(
+    scenario: Scenario, dead_time: float, preview: bool
+) -> tuple[Array, Array, int]:
+    """Return ``View.wanted`` and ``View.wanted_next`` of each period, and how long ``future`` is.
+
+    With preview they are rows of the reference after the dead time, and go on beyond the run.
+    Without, r is extrapolated over the dead time by the slope it has now: a switch is seen when
+    it happens, and not before. These are copies that can be written to, because compiled
+    functions take an array that cannot for another type.
+    """
+    late = round(dead_time * RATE)
+    if not math.isclose(dead_time * RATE, late, abs_tol=1e-6):
+        raise ValueError(f'dead time must be whole periods of {1.0 / RATE:g} s: got {dead_time} s')
+    reference, steps = scenario.reference(), scenario.steps
+    rows = max(2, round(scenario.lead * RATE))
+    if steps + late + rows > reference.time.size:
+        raise ValueError(
+            f'dead time must be at most {(reference.time.size - steps - rows) / RATE:g} s, '
+            f'as far as the reference reaches: got {dead_time} s'
+        )
+    if preview:
+        return reference.wanted[late:].copy(), reference.wanted[late + 1 :].copy(), rows
+    wanted, slope = reference.wanted[:steps], reference.rate[:steps] / RATE
+    return wanted + late * slope, wanted + (late + 1) * slope, 0
+
+
+def _break_off(record: LoopRecord, k: int) -> None:
+    """Mark rows from ``k`` on as never run."""
+    record.terms[k:] = math.nan
+    for values in (
+        record.measured,
+        record.speeds,
+        record.estimated,
+        record.unexplained,
+        record.command,
+        record.sent,
+        record.effort,
+    ):
+        values[k:] = math.nan
+
+
+def warm_up() -> None:
+    """Load, or compile, every kernel of the loop itself, in both drives."""
+    for drive in DRIVES:
+        scenario = Scenario(drive, 0.0, 'nominal', 1)
+        seam = drive_for(scenario)
+        seam.observe(np.zeros(2), 1.0 / RATE)
+        seam.send(np.zeros(2))
+        seam.observe(np.zeros(2), 1.0 / RATE)
+        FastPlant(scenario.robot(), 1).step(0.0, 0.0)
+
+
+class WorkerPool:
+    """Processes that run jobs, kept warm from one batch to the next.
+
+    Jobs share nothing, so results do not depend on how many workers there are. One worker is
+    this process itself. To be used in a ``with`` statement.
+
+    Parameters
+    ----------
+    count
+        How many, at least 1.
+
+    Raises
+    ------
+    ValueError
+        ``count`` is below 1.
+    """
+
+    def __init__(self, count: int) -> None:
+        if count < 1:
+            raise ValueError(f'workers must be at least 1: got {count}')
+        self._count = count
+        self._pool: ProcessPoolExecutor | None = None
+
+    def __enter__(self) -> Self:
+        if self._count > 1:
+            # Spawned, not forked: a fork would copy whatever threads and locks this process has.
+            self._pool = ProcessPoolExecutor(
+                self._count, multiprocessing.get_context('spawn'), initializer=warm_up
+            )
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+            self._pool = None
+
+    def run(
+        self, jobs: Iterable[Job], measure: Callable[[LoopRecord], T]
+    ) -> Iterator[tuple[int, T]]:
+        """Yield (index of the job, measure of its record) as the jobs are finished.
+
+        Jobs are taken from ``jobs`` only as workers become free.
+
+        Parameters
+        ----------
+        jobs
+            Scenario and method of each run.
+        measure
+            Applied in the worker, so that whole records need not travel; a function of a module,
+            or ``operator.methodcaller('rmse')``.
+
+        Raises
+        ------
+        JobError
+            A run raised an exception; the jobs not begun are dropped.
+        """
+        if self._pool is None:
+            for index, job in enumerate(jobs):
+                try:
+                    result = run_job(job, measure)
+                except Exception as error:
+                    raise _job_error(job, error) from error
+                yield index, result
+            return
+        waiting = iter(enumerate(jobs))
+        begun: dict[Future[T], tuple[int, Job]] = {}
+        try:
+            while True:
+                while len(begun) < 2 * self._count and (entry := next(waiting, None)):
+                    begun[self._pool.submit(run_job, entry[1], measure)] = entry
+                if not begun:
+                    return
+                finished, _ = wait(begun, return_when=FIRST_COMPLETED)
+                for future in sorted(finished, key=lambda each: begun[each][0]):
+                    index, job = begun.pop(future)
+                    failure = future.exception()
+                    if failure is not None:
+                        raise _job_error(job, failure) from failure
+                    yield index, future.result()
+        finally:
+            for future in begun:
+                future.cancel()
+
+
+def run_many(
+    jobs: Iterable[Job], workers: int | WorkerPool = 1
+) -> Iterator[tuple[int, LoopRecord]]:
+    """Yield (index of the job, its record) as the jobs are finished, see :meth:`Workers.run`."""
+    return measure_many(jobs, full_record, workers)
+
+
+def measure_many(
+    jobs: Iterable[Job], measure: Callable[[LoopRecord], T], workers: int | WorkerPool = 1
+) -> Iterator[tuple[int, T]]:
+    """Yield (index of the job, measure of its record) as the jobs are finished.
+
+    ``workers`` is how many processes, for this batch alone, or :class:`Workers` that are running.
+    """
+    team = nullcontext(workers) if isinstance(workers, WorkerPool) else WorkerPool(workers)
+    with team as running:
+        yield from running.run(jobs, measure)
+
+
+def run_job(job: Job, measure: Callable[[LoopRecord], T]) -> T:
+    """Return the measure of one job's record."""
+    return measure(run(*job))
+
+
+def full_record(record: LoopRecord) -> LoopRecord:
+    """Return the record itself: the measure that leaves nothing out."""
+    return record
+
+
+def _job_error(job: Job, error: BaseException) -> JobError:
+    scenario, method = job
+    return JobError(f'{method.name} on {scenario} failed: {error!r}')

@@ -1,0 +1,117 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Means over seeds with Student's confidence intervals, and paired differences."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Difference(NamedTuple):
+    """How much one method differs from another on the same seeds."""
+
+    mean: float
+    half: float
+    """Half the width of the confidence interval of the mean."""
+
+    @property
+    def certain(self) -> bool:
+        """Whether the interval leaves zero out."""
+        return abs(self.mean) > self.half
+
+
+def mean(values: Sequence[float]) -> float:
+    """Return the mean.
+
+    Raises
+    ------
+    ValueError
+        There are no values.
+    """
+    if len(values) == 0:
+        raise ValueError('values must not be empty')
+    return float(np.mean(values))
+
+
+def interval(values: Sequence[float], confidence: float = 0.95) -> float:
+    """Return half the width of the confidence interval of the mean, by Student's t.
+
+    It is infinite for fewer than two values: one value does not tell how they scatter.
+    """
+    n = len(values)
+    if n < 2:
+        return math.inf
+    return float(student_quantile(n - 1, confidence) * np.std(values, ddof=1) / math.sqrt(n))
+
+
+def paired(a: Sequence[float], b: Sequence[float], confidence: float = 0.95) -> Difference:
+    """Return how much larger ``a`` is than ``b``, value by value.
+
+    What both have from a seed, an easy reference say, drops out of the difference.
+
+    Raises
+    ------
+    ValueError
+        The two have different lengths, or none.
+    """
+    if len(a) != len(b):
+        raise ValueError(f'paired values must be equally many: got {len(a)} and {len(b)}')
+    differences = [x - y for x, y in zip(a, b, strict=True)]
+    return Difference(mean(differences), interval(differences, confidence))
+
+
+@lru_cache(maxsize=1024)
+def student_quantile(degrees: int, confidence: float = 0.95) -> float:
+    r"""Return the t that Student's variable exceeds in size with probability 1 - confidence.
+
+    With t = sqrt(n) tan(theta) the probability A of being within is a finite sum (Abramowitz and
+    Stegun 1964, 26.7.3 and 26.7.4), and
+
+    .. math:: \frac{dA}{d\theta} = \frac{2\,\Gamma((n + 1)/2)}{\sqrt{\pi}\,\Gamma(n/2)}
+              \cos^{n-1}\theta
+
+    falls with theta: A is concave, so Newton's steps from zero rise to the root and never
+    pass it.
+
+    Parameters
+    ----------
+    degrees
+        Degrees of freedom n, at least 1.
+    confidence
+        Above 0 and below 1.
+
+    Raises
+    ------
+    ValueError
+        An argument out of its range.
+    """
+    if degrees < 1:
+        raise ValueError(f'degrees must be at least 1: got {degrees}')
+    if not 0.0 < confidence < 1.0:
+        raise ValueError(f'confidence must be above 0 and below 1: got {confidence}')
+    log_slope = math.lgamma(0.5 * (degrees + 1)) - math.lgamma(0.5 * degrees)
+    slope = 2.0 / math.sqrt(math.pi) * math.exp(log_slope)
+    theta = 0.0
+    while True:
+        missing = confidence - _within(theta, degrees)
+        change = missing / (slope * math.cos(theta) ** (degrees - 1))
+        theta += change
+        # Below rounding a step may go either way.
+        if change <= 1e-15 * theta:
+            return math.sqrt(degrees) * math.tan(theta)
+
+
+def _within(theta: float, degrees: int) -> float:
+    """Return A(t | n) for t = sqrt(n) tan(theta)."""
+    square = math.cos(theta) ** 2
+    odd = degrees % 2
+    term = math.cos(theta) if odd else 1.0
+    total = 0.0
+    for order in range(1 + odd, degrees, 2):
+        total += term
+        term *= square * order / (order + 1)
+    total *= math.sin(theta)
+    return 2.0 / math.pi * (theta + total) if odd else total

@@ -1,0 +1,263 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Table of compared methods: the baselines, and the proposed controller with its ablations."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.util import find_spec
+
+from t3mpc_ros.evaluation.baselines.adaptive_fuzzy import (
+    AdaptiveIntervalType2,
+    AdaptiveIntervalType2Parameters,
+    AdaptiveType1,
+    AdaptiveType1Parameters,
+)
+from t3mpc_ros.evaluation.baselines.dynamic_matrix_control import (
+    DynamicMatrix,
+    DynamicMatrixParameters,
+    DynamicMatrixPreview,
+    DynamicMatrixPreviewParameters,
+)
+from t3mpc_ros.evaluation.baselines.feedback_baseline import (
+    DisturbanceRejection,
+    DisturbanceRejectionParameters,
+    ProportionalIntegral,
+    ProportionalIntegralParameters,
+)
+from t3mpc_ros.evaluation.baselines.linear_mpc import (
+    LinearMpc,
+    LinearMpcParameters,
+    LinearMpcPreview,
+    LinearMpcPreviewParameters,
+)
+from t3mpc_ros.evaluation.baselines.model_based_feedback import (
+    ComputedTorque,
+    ComputedTorqueParameters,
+    SlidingMode,
+    SlidingModeParameters,
+)
+from t3mpc_ros.evaluation.baselines.nonlinear_mpc import CasadiNmpc, CasadiNmpcParameters
+from t3mpc_ros.evaluation.closed_loop import MethodSpec
+from t3mpc_ros.evaluation.proposed_method import ComposedParameters, ProposedController
+from t3mpc_ros.evaluation.scenario import DRIVES
+from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition, SearchRange
+from t3mpc_ros.evaluation.tuning.tuned_parameters import PACKAGED_FILE, TunedParameters
+from t3mpc_ros.parameters.table import Parameters
+
+FULL = 'full'
+MODEL_ERROR = 1.3
+"""Inertia that the models of the predictive rivals with preview believe in, over the true one."""
+
+STAGES: Mapping[str, Mapping[str, object]] = {
+    'feedback': {
+        'use_fuzzy': False,
+        'law.compensator': False,
+        'predictive.enabled': False,
+        'switches.preview': False,
+    },
+    '+NT3FS': {
+        'law.compensator': False,
+        'predictive.enabled': False,
+        'switches.preview': False,
+    },
+    '+compensator': {'predictive.enabled': False, 'switches.preview': False},
+    '+MPC': {'switches.preview': False},
+    FULL: {},
+}
+"""The controller as it grows, as changes of the full one; the last step adds preview."""
+
+WITHOUT: Mapping[str, Mapping[str, object]] = {
+    'full without NT3FS': {'use_fuzzy': False},
+    'full without compensator': {'law.compensator': False},
+    'full without MPC': {'predictive.enabled': False},
+    'full without MPC, equal bound': {
+        'predictive.enabled': False,
+        'law.error_bound': ComposedParameters().compensated_bound,
+    },
+    'full without preview': {'switches.preview': False},
+    'full with random predictor': {'random_predictor': True, 'predictive.learning': False},
+}
+"""The full controller with one part left out. Without v_p the bound (80) of the compensator is
+lower too; with equal bound it stays, which shows what v_p is worth by itself."""
+
+
+@dataclass(frozen=True, slots=True)
+class ComparedMethod(MethodSpec):
+    """A method as it is run, and how tables sort it."""
+
+    rival: bool = True
+    """Whether it is somebody else's method, not a stage of ours."""
+    preview: bool = False
+    """Whether it is told the future of the reference."""
+
+
+def _both(parameters: Parameters) -> dict[str, Parameters]:
+    return dict.fromkeys(DRIVES, parameters)
+
+
+def method_definitions() -> list[MethodDefinition]:
+    """Return every method that is tuned, each with a handful of settings to search.
+
+    A switch is the same for all methods without preview: they cross it as fast as the drive
+    allows, and what is left to choose there is fixed at values that do not matter (1 %).
+    """
+    gain = SearchRange('gain', 5.0, 80.0)
+    adaptive = (
+        gain,
+        SearchRange('normalised_gain', 1.0, 2000.0),
+        SearchRange('dead_zone', 0.003, 0.3),
+        SearchRange('error_bound', 0.0, 8.0, log=False),
+    )
+    mpc = (
+        SearchRange('move_time', 0.001, 0.1),
+        SearchRange('disturbance_share', 0.01, 1.5),
+        SearchRange('integral_time', 0.1, 40.0),
+        SearchRange('filter_time', 0.003, 2.0),
+    )
+    dmc = (
+        SearchRange('move_time', 0.001, 0.1),
+        SearchRange('bias_time', 0.005, 15.0),
+        SearchRange('disturbance_share', 0.01, 1.5),
+    )
+    nonlinear = []
+    if find_spec('casadi') is not None:
+        start = _both(CasadiNmpcParameters(model_error=MODEL_ERROR))
+        nonlinear = [MethodDefinition('CasADi NMPC', CasadiNmpc, start, mpc)]
+    return [
+        MethodDefinition(
+            'PI + feed-forward',
+            ProportionalIntegral,
+            _both(ProportionalIntegralParameters()),
+            (gain, SearchRange('integral', 0.3, 3000.0)),
+        ),
+        MethodDefinition(
+            'ADRC',
+            DisturbanceRejection,
+            _both(DisturbanceRejectionParameters()),
+            (
+                gain,
+                SearchRange('observer_bandwidth', 1.0, 150.0),
+                SearchRange('shared_disturbance', 0.0, 1.0, log=False),
+                SearchRange('shared_speed', 0.0, 1.0, log=False),
+            ),
+        ),
+        MethodDefinition(
+            'sliding mode',
+            SlidingMode,
+            _both(SlidingModeParameters()),
+            (
+                SearchRange('surface', 0.3, 60.0),
+                SearchRange('reaching', 1.0, 80.0),
+                SearchRange('switching', 0.3, 30.0),
+                SearchRange('boundary', 0.03, 3.0),
+            ),
+        ),
+        MethodDefinition(
+            'computed torque',
+            ComputedTorque,
+            _both(ComputedTorqueParameters()),
+            (
+                gain,
+                SearchRange('integral', 0.3, 3000.0),
+                SearchRange('belief', 0.0, 1.3, log=False),
+            ),
+        ),
+        MethodDefinition(
+            'adaptive T1-FLS', AdaptiveType1, _both(AdaptiveType1Parameters()), adaptive
+        ),
+        MethodDefinition(
+            'adaptive IT2-FLS',
+            AdaptiveIntervalType2,
+            _both(AdaptiveIntervalType2Parameters()),
+            adaptive,
+        ),
+        MethodDefinition(
+            'DMC',
+            DynamicMatrix,
+            _both(DynamicMatrixParameters(load_share=0.0, inner_gain=15.0)),
+            dmc,
+        ),
+        MethodDefinition(
+            'DMC preview',
+            DynamicMatrixPreview,
+            _both(
+                DynamicMatrixPreviewParameters(
+                    load_share=0.0, inner_gain=15.0, model_error=MODEL_ERROR
+                )
+            ),
+            dmc,
+        ),
+        MethodDefinition('linear MPC', LinearMpc, _both(LinearMpcParameters(load_share=0.0)), mpc),
+        MethodDefinition(
+            'linear MPC preview',
+            LinearMpcPreview,
+            _both(LinearMpcPreviewParameters(load_share=0.0, model_error=MODEL_ERROR)),
+            mpc,
+        ),
+        *nonlinear,
+        MethodDefinition(
+            FULL,
+            ProposedController,
+            proposed_parameters(),
+            (
+                SearchRange('law.gain', 5.0, 80.0),
+                SearchRange('law.smoothing', 0.1, 10.0),
+                SearchRange('adaptation.gamma', 30.0, 30000.0),
+                SearchRange('integral_transfer', 0.01, 1.0),
+                SearchRange('predictive.move_weight', 1e-4, 1.0),
+                SearchRange('predictive.offset_gain', 0.003, 0.5),
+            ),
+        ),
+    ]
+
+
+def proposed_parameters() -> dict[str, Parameters]:
+    """Return our settings for each drive before tuning.
+
+    Torques are not limited as a stepper's acceleration is: switches are crossed faster.
+    """
+    velocity = ComposedParameters()
+    torque = velocity.with_values({'law.gain': 12.0, 'switches.acceleration': 200.0})
+    return {'torque': torque, 'velocity': velocity}
+
+
+def methods(drive: str, store: TunedParameters | None = None) -> dict[str, ComparedMethod]:
+    """Return every method of a comparison by name, with the settings that tuning found.
+
+    CasADi's nonlinear MPC is among them if CasADi is installed.
+
+    Raises
+    ------
+    StoreError
+        A method was not tuned in this drive, what is stored does not fit it any more, or the
+        methods were not tuned with equal effort.
+    """
+    tuned = TunedParameters.load(PACKAGED_FILE) if store is None else store
+    tuned.check_equal()
+    found: dict[str, ComparedMethod] = {}
+    for each in method_definitions():
+        parameters = tuned.applied(each.name, drive, each.start[drive])
+        if each.name == FULL:
+            found |= _proposed_methods(parameters)
+            continue
+        previews = bool(each.controller_type.preview)
+        found[each.name] = ComparedMethod(
+            each.name, each.controller_type, parameters, True, True, previews
+        )
+    for name in ('linear MPC preview', 'CasADi NMPC'):
+        if name in found:
+            wrong, exact = found[name], f'{name}, exact model'
+            parameters = wrong.parameters.with_values({'model_error': 1.0})
+            found[exact] = ComparedMethod(
+                exact, wrong.controller_type, parameters, True, True, True
+            )
+    return found
+
+
+def _proposed_methods(full: Parameters) -> dict[str, ComparedMethod]:
+    found = {}
+    for name, changes in {**STAGES, **WITHOUT}.items():
+        parameters = full.with_values(changes)
+        previews = parameters.to_dict()['switches.preview'] is True
+        found[name] = ComparedMethod(name, ProposedController, parameters, True, False, previews)
+    return found

@@ -1,0 +1,285 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Open-loop estimation error of each kind of fuzzy system, equation (86)."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.evaluation.confidence_intervals import interval, mean
+from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, gamma_for
+from t3mpc_ros.fuzzy.sets import FuzzyParameters
+from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
+from t3mpc_ros.simulation.plant.paper_plant import PaperRobot, PaperRobotParameters
+
+Array = NDArray[np.float64]
+
+KINDS = ('type3', 'interval_type2', 'type1')
+"""Fuzzy systems compared; the sets, centres, widths and what is learnt per second are equal."""
+NO_FUZZY_SYSTEM = 'no fuzzy system'
+"""Name of the estimator with g = 0: what output error alone is worth."""
+VARIANCES = (0.0, 0.04, 0.07, 0.1)
+"""Noise of the measured wheel speeds, (rad/s)²: the paper's range."""
+NORMALISED_GAIN = 40.0
+"""Mean of gamma |Phi|² for every kind (1/s²): that of the controller's defaults."""
+OUTPUT_ERROR_GAIN = 8.0
+"""The gain a (1/s): the controller's K."""
+SETTLE = 10.0
+"""Seconds at the start that do not count: all kinds begin with nothing learnt."""
+
+
+@dataclass(frozen=True, slots=True)
+class OpenLoopRun:
+    """A robot driven by a known torque, one row a period, right wheel first."""
+
+    period: float
+    """s"""
+    push: Array
+    """u, known; its torque is theta_bar u. rad/s², shape (n, 2)"""
+    speeds: Array
+    """True chi, rad/s, shape (n, 2)"""
+    measured: Array
+    """chi with its noise, rad/s, shape (n, 2)"""
+
+    @property
+    def target(self) -> Array:
+        """What g should be, chi' - u of (30) over each period, rad/s², shape (n - 1, 2)."""
+        return np.diff(self.speeds, axis=0) / self.period - self.push[:-1]
+
+
+@dataclass(frozen=True, slots=True)
+class EstimationResult:
+    """How one kind fared at one noise over several seeds, after :data:`SETTLE`, both wheels."""
+
+    kind: str
+    noise_variance: float
+    speed: tuple[float, ...]
+    """RMSE of chi_hat against the true chi, one per seed, rad/s."""
+    unknown: tuple[float, ...]
+    """RMSE of g against chi' - u, one per seed, rad/s²."""
+
+    def record(self) -> dict[str, object]:
+        """Return the result as plain data."""
+        return {
+            'kind': self.kind,
+            'noise_variance': self.noise_variance,
+            'speed_mean': mean(self.speed),
+            'speed_ci95': interval(self.speed),
+            'speed': list(self.speed),
+            'unknown_mean': mean(self.unknown),
+            'unknown_ci95': interval(self.unknown),
+            'unknown': list(self.unknown),
+            'seeds': len(self.speed),
+        }
+
+
+def excitation(time: Array, seed: int) -> Array:
+    """Return a bounded push u (rad/s²) of both wheels, shape (n, 2), at ``time`` (s).
+
+    The derivative of five sines of 2 rad/s with random frequencies of 0.03 to 0.4 Hz, evenly
+    spread in their logarithm, and random phases: without friction the wheels would turn at
+    3 rad/s rms, as the chaotic reference makes them, and never beyond 10 rad/s from their mean.
+    """
+    generator = np.random.default_rng((seed, 86))
+    rates = 2.0 * np.pi * np.exp(generator.uniform(math.log(0.03), math.log(0.4), (2, 5)))
+    phases = generator.uniform(0.0, 2.0 * np.pi, (2, 5))
+    angles = time[:, np.newaxis, np.newaxis] * rates + phases
+    push: Array = np.sum(2.0 * rates * np.cos(angles), axis=-1)
+    return push
+
+
+def torque_robot(variance: float, seed: int) -> PaperRobotParameters:
+    """Return the robot of the paper's simulation: torque drive, noise of this variance.
+
+    Friction and disturbance are the robot's defaults: the paper folds them into the unknown part.
+    """
+    return PaperRobotParameters.from_dict(
+        {'drive.kind': 'torque', 'noise.variance': variance, 'seed': seed}
+    )
+
+
+def simulate_open_loop(
+    parameters: PaperRobotParameters, duration: float, seed: int
+) -> OpenLoopRun:
+    """Return a run of the robot (10) under the torque theta_bar u, with no controller.
+
+    Parameters
+    ----------
+    settings
+        The robot; ``drive.kind`` must be ``'torque'``. theta_bar is the nominal (11).
+    duration
+        s
+    seed
+        Of the excitation; the robot's disturbance and noise have the seed in ``settings``.
+
+    Raises
+    ------
+    ValueError
+        The robot takes velocities, or the run is not longer than a period.
+    """
+    period = 1.0 / parameters.rate
+    steps = round(duration / period)
+    if steps < 2:
+        raise ValueError(f'duration must be at least {2 * period:g} s: got {duration}')
+    inertia = wheel_inertia(parameters.body, parameters.geometry)
+    # The push is held over a period: its middle is what a held value stands for.
+    middles: Array = period * (np.arange(steps, dtype=np.float64) + 0.5)
+    push = excitation(middles, seed)
+    torques = push @ inertia
+    speeds, measured = np.empty((steps, 2)), np.empty((steps, 2))
+    robot = PaperRobot(parameters)
+    state = robot.state
+    for k in range(steps):
+        assert state.true_wheels is not None
+        speeds[k], measured[k] = state.true_wheels, state.wheels
+        state = robot.step_torque(float(torques[k, 0]), float(torques[k, 1]))
+    return OpenLoopRun(period, push, speeds, measured)
+
+
+def estimate(
+    run: OpenLoopRun, fuzzy: FuzzyEstimator | None, gain: float = OUTPUT_ERROR_GAIN
+) -> tuple[Array, Array]:
+    """Return (chi_hat, g) of (86) with E18 along a run, rad/s and rad/s², shape (n, 2) each.
+
+    chi_hat[k] has seen measurements up to k - 1 only: it is a prediction of one period.
+
+    Parameters
+    ----------
+    run
+        Only its push and its measured speeds are used.
+    fuzzy
+        The fuzzy system; it learns on the way. None is g = 0.
+    gain
+        a of the output error, 1/s.
+    """
+    found = run.measured[0].copy()
+    speeds, unknown = np.empty_like(run.measured), np.zeros_like(run.measured)
+    for k, measured in enumerate(run.measured):
+        speeds[k] = found
+        error = measured - found
+        if fuzzy is not None:
+            unknown[k] = fuzzy.evaluate(measured)
+            fuzzy.adapt(error, run.period)
+        found = found + run.period * (unknown[k] + run.push[k] + gain * error)
+    return speeds, unknown
+
+
+def estimator(kind: str, noise_variance: float, normalised_gain: float) -> FuzzyEstimator:
+    """Return a fuzzy system of one kind that has learnt nothing yet.
+
+    Whatever the kind, its inputs are as fuzzy as the noise is wide, and gamma |Phi|² is
+    ``normalised_gain`` (1/s²) on average: at equal gamma the kinds would learn at different
+    speeds, and nothing else would be compared.
+    """
+    parameters = FuzzyParameters(kind=kind, input_fuzziness=math.sqrt(2.0 * noise_variance))
+    return FuzzyEstimator(
+        parameters, replace(AdaptationParameters(), gamma=gamma_for(parameters, normalised_gain))
+    )
+
+
+def compare(
+    *,
+    seeds: int = 5,
+    duration: float = 60.0,
+    variances: Sequence[float] = VARIANCES,
+    normalised_gain: float = NORMALISED_GAIN,
+    progress: Callable[[str], None] | None = None,
+) -> list[EstimationResult]:
+    """Return how every kind fares in (86), over ``seeds`` seeds from 1; all see the same runs.
+
+    Parameters
+    ----------
+    seeds, duration
+        Runs each, and their length (s).
+    variances
+        Noise of the measured wheel speeds, (rad/s)².
+    normalised_gain
+        Mean of gamma |Phi|² for every kind, 1/s².
+    progress
+        Called with a line of text before each noise.
+
+    Raises
+    ------
+    ValueError
+        The duration leaves nothing after :data:`SETTLE`.
+    """
+    if duration <= SETTLE:
+        raise ValueError(f'duration must be more than {SETTLE:g} s: got {duration}')
+    results = []
+    for variance in variances:
+        if progress is not None:
+            progress(f'noise variance {variance:g}, {seeds} seeds')
+        figures: dict[str, list[tuple[float, float]]] = {
+            name: [] for name in (*KINDS, NO_FUZZY_SYSTEM)
+        }
+        for seed in range(1, seeds + 1):
+            run = simulate_open_loop(torque_robot(variance, seed), duration, seed)
+            first = round(SETTLE / run.period)
+            for name, found in figures.items():
+                fuzzy = (
+                    None if name == NO_FUZZY_SYSTEM else estimator(name, variance, normalised_gain)
+                )
+                speeds, unknown = estimate(run, fuzzy)
+                found.append(
+                    (
+                        _rms((speeds - run.speeds)[first:]),
+                        _rms((unknown[:-1] - run.target)[first:]),
+                    )
+                )
+        for name, found in figures.items():
+            speed, unknown_part = zip(*found, strict=True)
+            results.append(EstimationResult(name, variance, speed, unknown_part))
+    return results
+
+
+def table(results: Sequence[EstimationResult]) -> str:
+    """Return the comparison in Markdown: mean ± half the 95 % interval over seeds.
+
+    Three tables: RMSE of chi_hat, how much more that is than type 3's with the same seeds, and
+    RMSE of g. The last column is the growth of the mean from the first to the last noise.
+    """
+    variances = list(dict.fromkeys(result.noise_variance for result in results))
+    kinds = list(dict.fromkeys(result.kind for result in results))
+    by = {(result.kind, result.noise_variance): result for result in results}
+    head = ''.join(f' noise {variance:g} |' for variance in variances)
+    rule = '|---' * (len(variances) + 1)
+    measured = ''.join(f' {math.sqrt(variance):.4f} |' for variance in variances)
+    lines = [f'| RMSE of chi_hat (rad/s) |{head} growth |', f'{rule}|---|']
+    for kind in kinds:
+        row = [by[kind, variance].speed for variance in variances]
+        cells = ''.join(f' {_spread(values)} |' for values in row)
+        lines.append(f'| {kind} |{cells} {_growth(row)} |')
+    lines += [f'| the measurement itself |{measured} |', '']
+    lines += [f'| more than type3, same seeds (rad/s) |{head}', f'{rule}|']
+    for kind in kinds:
+        if kind == 'type3':
+            continue
+        pairs = [(by[kind, variance], by['type3', variance]) for variance in variances]
+        cells = ''.join(f' {_spread(difference(one, base), "+")} |' for one, base in pairs)
+        lines.append(f'| {kind} |{cells}')
+    lines += ['', f"| RMSE of g against chi' - u (rad/s²) |{head} growth |", f'{rule}|---|']
+    for kind in kinds:
+        row = [by[kind, variance].unknown for variance in variances]
+        cells = ''.join(f' {_spread(values)} |' for values in row)
+        lines.append(f'| {kind} |{cells} {_growth(row)} |')
+    return '\n'.join(lines)
+
+
+def difference(result: EstimationResult, base: EstimationResult) -> tuple[float, ...]:
+    """Return how much more RMSE of chi_hat ``result`` has than ``base``, seed by seed, rad/s."""
+    return tuple(a - b for a, b in zip(result.speed, base.speed, strict=True))
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _spread(values: Sequence[float], sign: str = '') -> str:
+    return f'{mean(values):{sign}.4f} ± {interval(values):.4f}'
+
+
+def _growth(row: Sequence[Sequence[float]]) -> str:
+    return f'{100.0 * (mean(row[-1]) / mean(row[0]) - 1.0):+.0f} %'

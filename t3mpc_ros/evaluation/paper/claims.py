@@ -1,0 +1,404 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Claims of the paper and of this package, decided from the results."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+import math
+import re
+from statistics import median
+
+from t3mpc_ros.evaluation.bag_report.metrics import format_number
+from t3mpc_ros.evaluation.open_loop_estimation import KINDS, EstimationResult
+from t3mpc_ros.evaluation.paper.experiment_grid import (
+    DRIVES,
+    EXACT,
+    FULL,
+    NOMINAL,
+    PAPER_NOISE,
+    WITHOUT,
+)
+from t3mpc_ros.evaluation.paper.experiment_runs import finite_or_none
+from t3mpc_ros.evaluation.paper.results import PairedDifference, ResultRow, Results, step_to
+
+SLIGHTLY = 0.10
+"""Relative growth of an RMSE that still is "only slightly"; the paper gives no number."""
+REFERENCE_SPREAD = 3.0
+"""Standard deviation of the reference of a wheel, rad/s."""
+WRONG_INERTIA = ('mass +30 %', 'mass -30 %')
+LOUDEST = 0.1
+"""The largest noise variance of the paper, (rad/s)²."""
+INTENDED = (
+    ('NT3FS', 'mass +30 %', DRIVES),
+    ('NT3FS', 'friction x3', DRIVES),
+    ('compensator', 'disturbance', DRIVES),
+    ('MPC', 'dead time', ('velocity',)),
+    ('preview', NOMINAL, ('velocity',)),
+)
+"""Each part with the case and the drives it is meant for."""
+_EQUAL = 'MPC, equal bound'
+ALONE = ((_EQUAL, 'dead time'), (_EQUAL, 'friction x3'), ('trained predictor', 'dead time'))
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """One claim and what came of it."""
+
+    name: str
+    origin: str
+    """``'ours'`` or ``'paper'``."""
+    text: str
+    """What is claimed, with how it is decided."""
+    found: str = 'not measured'
+    held: bool | None = None
+    """None: not measured."""
+    numbers: dict[str, object] = field(default_factory=dict)
+
+    @property
+    def verdict(self) -> str:
+        """``'held'``, ``'not held'`` or ``'not measured'``."""
+        return 'not measured' if self.held is None else 'held' if self.held else 'not held'
+
+    def record(self) -> dict[str, object]:
+        """Return the claim as plain data."""
+        numbers = {
+            name: finite_or_none(value) if isinstance(value, float) else value
+            for name, value in self.numbers.items()
+        }
+        return {
+            'name': self.name,
+            'origin': self.origin,
+            'text': self.text,
+            'found': self.found,
+            'held': self.held,
+            'verdict': self.verdict,
+            'numbers': numbers,
+        }
+
+
+def all_claims(results: Results, estimated: Sequence[EstimationResult]) -> list[Claim]:
+    """Return every claim, ours first, then the paper's."""
+    found = [
+        share_of_best(results, 'velocity', PAPER_NOISE, 0.60),
+        share_of_best(results, 'velocity', 0.0, 0.50),
+        *(no_worse_than_preview(results, drive) for drive in DRIVES),
+        *(no_worse_than_exact_model(results, drive) for drive in DRIVES),
+    ]
+    for part, case, drives in INTENDED:
+        found += [part_helps(results, part, case, drive) for drive in drives]
+    for part, case, drives in INTENDED:
+        found += [part_is_missed(results, part, case, drive) for drive in drives]
+    found += [part_is_missed(results, part, case, 'velocity') for part, case in ALONE]
+    found += [no_larger_than_pi(results, drive) for drive in DRIVES]
+    found += [smallest_growth(results, drive) for drive in DRIVES]
+    found += [settled(results, drive) for drive in DRIVES]
+    found += [share_of_best(results, drive, PAPER_NOISE, 0.50, paper=True) for drive in DRIVES]
+    found += [grows_slightly(results, drive) for drive in DRIVES]
+    found += [others_grow(results, drive) for drive in DRIVES]
+    found += [calm_control(results, drive) for drive in DRIVES]
+    return found + estimation_claims(estimated)
+
+
+def share_of_best(
+    results: Results, drive: str, noise: float, limit: float, *, paper: bool = False
+) -> Claim:
+    """Decide whether the full controller's RMSE is at most ``limit`` of the best rival's.
+
+    Ours leaves rivals with preview to :func:`no_worse_than_preview`; the paper's, that it is
+    better by half, is against all of them.
+    """
+    kind = 'rival' if paper else 'rival without preview'
+    words = 'About 50 % more accurate than other methods: RMSE' if paper else 'RMSE'
+    claim = Claim(
+        f'{"half of the best rival" if paper else "share of the best rival without preview"}, '
+        f'{drive}, noise {noise:g}',
+        'paper' if paper else 'ours',
+        f'{words} at most {limit:.2f} of that of the best {kind} ({drive} drive, nominal, noise '
+        f'{noise:g})',
+    )
+    full = results.row(FULL, drive, noise)
+    rivals = results.rows_of(drive, noise, rival=True, preview=None if paper else False)
+    rivals = [row for row in rivals if EXACT not in row.controller]
+    best = _best(rivals)
+    if full is None or best is None:
+        return claim
+    share = full.rmse_mean / best.rmse_mean
+    return _answer(
+        claim,
+        share <= limit,
+        f'{_rmse(full)} against {_rmse(best)} of {best.controller}, the best of {len(rivals)}: '
+        f'{share:.2f} of it',
+        {
+            'full': full.rmse_mean,
+            'best_rival': best.controller,
+            'best': best.rmse_mean,
+            'share': share,
+            'limit': limit,
+        },
+    )
+
+
+def no_worse_than_preview(results: Results, drive: str) -> Claim:
+    """Decide whether RMSE is no larger than any rival's that plans with a wrong inertia."""
+    claim = Claim(
+        f'rivals with preview, wrong inertia in their models, {drive}',
+        'ours',
+        'RMSE no larger than that of any predictive rival with preview whose model is 30 % off '
+        f'in its inertia, or within the paired interval ({drive} drive, noise {PAPER_NOISE:g})',
+    )
+    return _against_preview(claim, results, drive, (NOMINAL,), exact=False)
+
+
+def no_worse_than_exact_model(results: Results, drive: str) -> Claim:
+    """Decide the same of rivals that know the nominal inertia, where the robot has another."""
+    claim = Claim(
+        f'rivals with preview, wrong inertia of the robot, {drive}',
+        'ours',
+        'RMSE no larger than that of any predictive rival with preview and the nominal model when '
+        f'mass and inertia of the robot are 30 % more or less ({drive} drive, noise '
+        f'{PAPER_NOISE:g})',
+    )
+    return _against_preview(claim, results, drive, WRONG_INERTIA, exact=True)
+
+
+def part_helps(results: Results, part: str, case: str, drive: str) -> Claim:
+    """Decide whether adding a part to the stage before it lowers RMSE, interval below zero."""
+    more, less = step_to(part)
+    claim = Claim(
+        f'{part} lowers RMSE, {case}, {drive}',
+        'ours',
+        f'Adding {part} lowers RMSE in the case {case} ({drive} drive, noise {PAPER_NOISE:g}; '
+        f'{more} less {less}, same seeds, 95 % interval below zero)',
+    )
+    return _paired(claim, results.paired(more, less, drive, PAPER_NOISE, case))
+
+
+def part_is_missed(results: Results, part: str, case: str, drive: str) -> Claim:
+    """Decide whether the full controller beats itself without one part, interval below zero."""
+    less = WITHOUT[part]
+    claim = Claim(
+        f'{part} is missed, {case}, {drive}',
+        'ours',
+        f'Leaving {part} out of the full controller costs RMSE in the case {case} ({drive} '
+        f'drive, noise {PAPER_NOISE:g}; {FULL} less {less}, same seeds, interval below zero)',
+    )
+    return _paired(claim, results.paired(FULL, less, drive, PAPER_NOISE, case))
+
+
+def no_larger_than_pi(results: Results, drive: str) -> Claim:
+    """Decide whether noise-free RMSE is no larger than that of PI with feed-forward."""
+    claim = Claim(
+        f'noise-free against PI, {drive}',
+        'ours',
+        f'RMSE no larger than that of PI with feed-forward ({drive} drive, nominal, no noise)',
+    )
+    full = results.row(FULL, drive, 0.0)
+    pi = _best([row for row in results.rows_of(drive, 0.0, rival=True) if _is_pi(row.controller)])
+    if full is None or pi is None:
+        return claim
+    return _answer(
+        claim,
+        full.rmse_mean <= pi.rmse_mean,
+        f'{_rmse(full)} against {_rmse(pi)} of {pi.controller}',
+        {'full': full.rmse_mean, 'pi': pi.rmse_mean},
+    )
+
+
+def smallest_growth(results: Results, drive: str) -> Claim:
+    """Decide whether RMSE grows by no more rad/s with the noise than that of any rival."""
+    claim = Claim(
+        f'smallest growth with noise, {drive}',
+        'ours',
+        f'RMSE grows by no more than that of any rival from no noise to {LOUDEST:g} ({drive} '
+        'drive, nominal, in rad/s)',
+    )
+    grown = _growths(results, drive)
+    others = {name: last - first for name, (first, last) in grown.items() if name != FULL}
+    if FULL not in grown or not others:
+        return claim
+    own = grown[FULL][1] - grown[FULL][0]
+    least = min(others, key=lambda name: others[name])
+    return _answer(
+        claim,
+        math.isfinite(own) and own <= others[least],
+        f'{own:+.3f} rad/s against {others[least]:+.3f} of {least}, the least of {len(others)}',
+        {'full': own, 'least_rival': least, 'least': others[least]},
+    )
+
+
+def settled(results: Results, drive: str) -> Claim:
+    """Decide whether the settled RMSE without noise is at most 2 % of the reference's spread."""
+    limit = 0.02 * REFERENCE_SPREAD
+    claim = Claim(
+        f'settled, {drive}',
+        'ours',
+        f'Settled RMSE, without 1 s about each switch, at most 2 % of {REFERENCE_SPREAD:g} rad/s '
+        f'({drive} drive, nominal, no noise)',
+    )
+    full = results.row(FULL, drive, 0.0)
+    if full is None:
+        return claim
+    share = full.settled_mean / REFERENCE_SPREAD
+    found = f'{format_number(full.settled_mean)} rad/s, {100.0 * share:.1f} %'
+    numbers: dict[str, object] = {'settled': full.settled_mean, 'limit': limit}
+    return _answer(claim, full.settled_mean <= limit, found, numbers)
+
+
+def grows_slightly(results: Results, drive: str) -> Claim:
+    """Decide the paper's claim that RMSE grows only slightly with the noise."""
+    claim = Claim(
+        f'grows only slightly, {drive}',
+        'paper',
+        f'RMSE grows only slightly from no noise to {LOUDEST:g} (here: by at most '
+        f'{100 * SLIGHTLY:.0f} %; {drive} drive, nominal)',
+    )
+    grown = _growths(results, drive)
+    if FULL not in grown:
+        return claim
+    share = grown[FULL][1] / grown[FULL][0] - 1.0
+    return _answer(claim, share <= SLIGHTLY, f'{100 * share:+.0f} %', {'growth': share})
+
+
+def others_grow(results: Results, drive: str) -> Claim:
+    """Decide the paper's claim that the RMSE of every other method grows by more than half."""
+    claim = Claim(
+        f'others grow by half, {drive}',
+        'paper',
+        f'RMSE of every other method grows by more than 50 % from no noise to {LOUDEST:g} '
+        f'({drive} drive, nominal)',
+    )
+    shares = {
+        name: last / first - 1.0
+        for name, (first, last) in _growths(results, drive).items()
+        if name != FULL
+    }
+    if not shares:
+        return claim
+    low, high = (f(shares, key=lambda name: shares[name]) for f in (min, max))
+    found = f'from {100 * shares[low]:+.0f} % ({low}) to {100 * shares[high]:+.0f} % ({high})'
+    return _answer(claim, min(shares.values()) > 0.5, found, {**shares})
+
+
+def calm_control(results: Results, drive: str) -> Claim:
+    """Decide whether what is asked of the robot varies no more than the middle rival's."""
+    claim = Claim(
+        f'no chatter, {drive}',
+        'paper',
+        'Control signals without high-frequency fluctuation (here: total variation of what is '
+        f'asked of the robot no more than the median of the rivals; {drive} drive, nominal, '
+        f'noise {PAPER_NOISE:g})',
+    )
+    full = results.row(FULL, drive, PAPER_NOISE)
+    others = [row.chatter_mean for row in results.rows_of(drive, PAPER_NOISE, rival=True)]
+    others = [value for value in others if math.isfinite(value)]
+    if full is None or not others:
+        return claim
+    middle = median(others)
+    return _answer(
+        claim,
+        full.chatter_mean <= middle,
+        f'{full.chatter_mean:.0f} rad/s³ against a median of {middle:.0f}, from '
+        f'{min(others):.0f} to {max(others):.0f}',
+        {'full': full.chatter_mean, 'median': middle},
+    )
+
+
+def estimation_claims(estimated: Sequence[EstimationResult]) -> list[Claim]:
+    """Decide what the paper says of its fuzzy system without a controller, (86)."""
+    ours, *others = KINDS
+    half = Claim(
+        'estimation, half of the others',
+        'paper',
+        'Without a controller (86), type 3 estimates the speeds about 50 % better than type 1 '
+        f'and type 2 (RMSE at most half of the best, noise {PAPER_NOISE:g})',
+    )
+    slight = Claim(
+        'estimation, grows only slightly',
+        'paper',
+        'Without a controller (86), the RMSE of type 3 grows only slightly with noise up to '
+        f'{LOUDEST:g} (here: by at most {100 * SLIGHTLY:.0f} %), that of the others by over 50 %',
+    )
+    records = {(result.kind, result.noise_variance): result.record() for result in estimated}
+    means = {key: float(str(record['speed_mean'])) for key, record in records.items()}
+    if all((kind, PAPER_NOISE) in means for kind in KINDS):
+        best = min(others, key=lambda kind: means[kind, PAPER_NOISE])
+        own, other = means[ours, PAPER_NOISE], means[best, PAPER_NOISE]
+        half = _answer(
+            half,
+            own <= 0.5 * other,
+            f'{own:.4f} rad/s against {other:.4f} of {best}: {own / other:.2f} of it',
+            {'type3': own, 'best': best, 'share': own / other},
+        )
+    if all((kind, noise) in means for kind in KINDS for noise in (0.0, LOUDEST)):
+        grown = {kind: means[kind, LOUDEST] / means[kind, 0.0] - 1.0 for kind in KINDS}
+        slight = _answer(
+            slight,
+            grown[ours] <= SLIGHTLY and all(grown[kind] > 0.5 for kind in others),
+            ', '.join(f'{kind} {100 * share:+.0f} %' for kind, share in grown.items()),
+            {**grown},
+        )
+    return [half, slight]
+
+
+def _against_preview(
+    claim: Claim, results: Results, drive: str, cases: Sequence[str], *, exact: bool
+) -> Claim:
+    held, words, numbers = True, [], {}
+    for case in cases:
+        full = results.row(FULL, drive, PAPER_NOISE, case)
+        rivals = results.rows_of(drive, PAPER_NOISE, case, rival=True, preview=True)
+        best = _best([row for row in rivals if (EXACT in row.controller) is exact])
+        if full is None or best is None:
+            return claim
+        gap = results.paired(FULL, best.controller, drive, PAPER_NOISE, case)
+        half = gap.ci95 if gap is not None and math.isfinite(gap.ci95) else 0.0
+        held &= full.rmse_mean <= best.rmse_mean + half
+        words.append(
+            f'{case}: {_rmse(full)} against {_rmse(best)} of {best.controller} (± {half:.4f})'
+        )
+        numbers[f'{case}, full'] = full.rmse_mean
+        numbers[f'{case}, best'] = best.rmse_mean
+    return _answer(claim, held, '; '.join(words), {**numbers})
+
+
+def _best(rows: Sequence[ResultRow]) -> ResultRow | None:
+    finite = [row for row in rows if math.isfinite(row.rmse_mean)]
+    return min(finite, key=lambda row: row.rmse_mean, default=None)
+
+
+def _is_pi(name: str) -> bool:
+    return re.match(r'pi\b', name, re.IGNORECASE) is not None
+
+
+def _growths(results: Results, drive: str) -> dict[str, tuple[float, float]]:
+    """Return RMSE without and with the most noise; endless for what diverges under it."""
+    found = {}
+    for name, (rival, _) in results.kinds.items():
+        first, last = (results.row(name, drive, noise) for noise in (0.0, LOUDEST))
+        if not (rival or name == FULL) or EXACT in name or first is None or last is None:
+            continue
+        if math.isfinite(first.rmse_mean):
+            end = last.rmse_mean if math.isfinite(last.rmse_mean) else math.inf
+            found[name] = (first.rmse_mean, end)
+    return found
+
+
+def _paired(claim: Claim, pair: PairedDifference | None) -> Claim:
+    if pair is None or pair.seeds < 2:
+        return claim
+    if not math.isfinite(pair.difference):
+        return _answer(claim, False, 'a run left the finite numbers', {'seeds': pair.seeds})
+    return _answer(
+        claim,
+        pair.below,
+        f'{pair.difference:+.4f} ± {pair.ci95:.4f} rad/s over {pair.seeds} seeds',
+        {'difference': pair.difference, 'ci95': pair.ci95, 'seeds': pair.seeds},
+    )
+
+
+def _rmse(row: ResultRow) -> str:
+    return f'{format_number(row.rmse_mean)} rad/s'
+
+
+def _answer(claim: Claim, held: bool, found: str, numbers: dict[str, object]) -> Claim:
+    return Claim(claim.name, claim.origin, claim.text, found, bool(held), numbers)

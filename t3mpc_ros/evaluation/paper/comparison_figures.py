@@ -1,0 +1,282 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Figure 15 and the comparison of methods: bars, growth with noise, ablation."""
+
+from collections.abc import Sequence
+import math
+from textwrap import wrap
+from typing import Any
+
+from matplotlib.ticker import MaxNLocator
+import numpy as np
+
+from t3mpc_ros.evaluation.paper.experiment_grid import (
+    FULL,
+    NOMINAL,
+    PAPER_NOISE,
+    PARTS,
+    STAGES,
+    WITHOUT,
+)
+from t3mpc_ros.evaluation.paper.experiment_runs import SETTLING, START
+from t3mpc_ros.evaluation.paper.figure_runs import FigureRuns, broken_at_switches
+from t3mpc_ros.evaluation.paper.results import PairedDifference, ResultRow, Results
+from t3mpc_ros.evaluation.paper.single_run_figures import WANTED, legend_above
+from t3mpc_ros.evaluation.plotting import COLOURS, new_figure
+
+OURS = '#be123c'
+"""The full controller, in every figure."""
+_RIVALS = (
+    '#0284c7', '#ea580c', '#15803d', '#7c3aed', '#a16207', '#0891b2',
+    '#4338ca', '#db2777', '#65a30d', '#6b7280', '#92400e', '#0f766e', '#38bdf8', '#a78bfa',
+    '#1f2937', '#f59e0b',
+)  # fmt: skip
+_MARKS = 'sD^vPX<>*hd'
+_STAGE_COLOURS = ('#cbd5e1', '#94a3b8', '#fbbf24', '#f97316', OURS)
+_PART_COLOURS = dict(zip(PARTS, ('#7c3aed', '#a16207', '#db2777', '#0284c7'), strict=True))
+KIND_NAMES = {'type3': 'type 3', 'interval_type2': 'interval type 2', 'type1': 'type 1'}
+
+
+def colours_of(results: Results) -> dict[str, str]:
+    """Return one colour per method, the same in every figure."""
+    rivals = [name for name, (rival, _) in results.kinds.items() if rival]
+    found = {name: _RIVALS[i % len(_RIVALS)] for i, name in enumerate(rivals)}
+    return dict.fromkeys(results.kinds, '#9ca3af') | found | {FULL: OURS}
+
+
+def rmse_bars(results: Results) -> Any:
+    """Return the RMSE of every rival and of ours at the paper's noise, with their intervals."""
+    shown = {drive: _ranked(results, drive) for drive in results.drives}
+    shown = {drive: rows for drive, rows in shown.items() if rows}
+    if not shown:
+        return None
+    colours = colours_of(results)
+    longest = max(map(len, shown.values()))
+    figure = new_figure(0.9 + len(shown) * (0.5 + 0.23 * longest))
+    axes = figure.subplots(len(shown), 1, squeeze=False)[:, 0]
+    for axis, (drive, rows) in zip(axes, shown.items(), strict=True):
+        places = np.arange(len(rows))
+        means = [row.rmse_mean for row in rows]
+        bounds = [_whisker(row.rmse_ci95) for row in rows]
+        bar_colours = [colours[row.controller] for row in rows]
+        axis.barh(places, means, xerr=bounds, color=bar_colours, height=0.7, ecolor='#1f2937')
+        for place, mean, bound in zip(places, means, bounds, strict=True):
+            axis.text(mean + bound, place, f'  {mean:.3f}', va='center', fontsize=8)
+        axis.set_yticks(places, [_label(row) for row in rows])
+        axis.invert_yaxis()
+        axis.grid(axis='y', visible=False)
+        axis.margins(x=0.12)
+        axis.set_xlim(left=0.0)
+        axis.set_axisbelow(True)
+        axis.set_title(f'{drive} drive, noise {PAPER_NOISE:g}')
+    axes[-1].set_xlabel('RMSE / rad/s')
+    return figure
+
+
+def noise_growth(results: Results) -> Any:
+    """Return RMSE against noise of every rival and of ours, and how much it grows."""
+    noises = results.noises
+    if len(noises) < 2:
+        return None
+    colours = colours_of(results)
+    rivals = [name for name, (rival, _) in results.kinds.items() if rival]
+    figure = new_figure(5.6 + 0.16 * len(rivals) / 3)
+    drives = results.drives
+    axes = figure.subplots(2, len(drives), sharex=True, sharey='row', squeeze=False)
+    for column, drive in zip(axes.T, drives, strict=True):
+        for i, name in enumerate([*rivals, FULL]):
+            rows = [results.row(name, drive, noise) for noise in noises]
+            points = [(row.noise, row.rmse_mean, row.rmse_ci95) for row in rows if row is not None]
+            if not points:
+                continue
+            x, y, bound = np.array(points).T
+            # Beside each other, or the intervals of equal methods hide one another.
+            beside = x + 0.006 * noises[-1] * (i - 0.5 * len(rivals))
+            bound = np.where(np.isfinite(bound), bound, 0.0)
+            own = name == FULL
+            style = {
+                'color': colours[name],
+                'linewidth': 2.2 if own else 1.0,
+                'marker': 'o' if own else _MARKS[i % len(_MARKS)],
+                'markersize': 6 if own else 4.5,
+                'zorder': 5 if own else 2,
+            }
+            column[0].errorbar(
+                beside, y, bound, label=_name(results, name), elinewidth=0.8, **style
+            )
+            if x[0] == noises[0]:
+                column[1].plot(beside, y - y[0], **style)
+        column[0].set_title(f'{drive} drive')
+        column[1].set_xlabel('noise variance / (rad/s)²')
+    axes[0, 0].set_ylim(bottom=0.0)  # not before every line is there: it fixes the top, too
+    axes[0, 0].set_ylabel('RMSE / rad/s')
+    axes[1, 0].set_ylabel('RMSE less that without noise / rad/s')
+    _shared_legend(figure, axes[0])
+    return figure
+
+
+def ablation_bars(results: Results) -> Any:
+    """Return the RMSE of the controller's stages in every case at the paper's noise."""
+    drives = [
+        drive
+        for drive in results.drives
+        if any(results.row(stage, drive, PAPER_NOISE) for stage in STAGES)
+    ]
+    if not drives:
+        return None
+    figure = new_figure(0.6 + 2.3 * len(drives))
+    panels = figure.subplots(len(drives), 1, squeeze=False)[:, 0]
+    width = 0.85 / len(STAGES)
+    for axis, drive in zip(panels, drives, strict=True):
+        cases = results.cases(drive)
+        for i, (stage, colour) in enumerate(zip(STAGES, _STAGE_COLOURS, strict=True)):
+            rows = [results.row(stage, drive, PAPER_NOISE, case) for case in cases]
+            found = [(k, row) for k, row in enumerate(rows) if row is not None]
+            places = [k + (i - 2) * width for k, _ in found]
+            means = [row.rmse_mean for _, row in found]
+            bounds = [_whisker(row.rmse_ci95) for _, row in found]
+            axis.bar(
+                places, means, width, yerr=bounds, color=colour, ecolor='#1f2937',
+                error_kw={'elinewidth': 0.8}, label=f'{stage} (+preview)' if i == 4 else stage,
+            )  # fmt: skip
+        axis.set_xticks(range(len(cases)), [case.replace(' ', '\n', 1) for case in cases])
+        axis.grid(axis='x', visible=False)
+        axis.set_axisbelow(True)
+        axis.set_ylim(bottom=0.0)
+        axis.set_title(f'{drive} drive, noise {PAPER_NOISE:g}')
+        axis.set_ylabel('RMSE / rad/s')
+    legend_above(figure, panels[0])
+    return figure
+
+
+def parts(results: Results) -> Any:
+    """Return what adding each part and what leaving it out changes, with 95 % intervals."""
+    by_name = {name: part for part, name in WITHOUT.items()}
+    added = [(PARTS[STAGES.index(p.first) - 1], p, 1.0) for p in results.stage_differences()]
+    left_out = [(by_name[p.first], p, -1.0) for p in results.losses()]
+    drives = [d for d in results.drives if any(p.drive == d for _, p, _ in added)]
+    if not drives:
+        return None
+    most = max(len(results.cases(drive)) for drive in drives)
+    figure = new_figure(1.0 + len(drives) * (0.5 + 0.3 * most))
+    axes = figure.subplots(len(drives), len(PARTS), squeeze=False, sharey='row')
+    ways = (
+        ('added to the stage before', added, -0.13),
+        ('kept, against left out', left_out, 0.13),
+    )
+    for row, drive in zip(axes, drives, strict=True):
+        cases = results.cases(drive)
+        for axis, part in zip(row, PARTS, strict=True):
+            axis.axvline(0.0, color='#6b7280', linewidth=0.8)
+            for (label, pairs, beside), face in zip(
+                ways, (_PART_COLOURS[part], 'white'), strict=True
+            ):
+                _differences(axis, pairs, part, drive, cases, label, beside, face)
+            axis.xaxis.set_major_locator(MaxNLocator(nbins=2))
+            axis.grid(axis='y', visible=False)
+            axis.set_title(part)
+        row[0].set_yticks(range(len(cases)), cases)
+        row[0].set_ylim(len(cases) - 0.5, -0.5)
+        row[0].set_ylabel(f'{drive} drive')
+    figure.supxlabel('paired difference of RMSE / rad/s; left of zero: better with it', fontsize=9)
+    legend_above(figure, axes[0, 0])
+    return figure
+
+
+def _differences(
+    axis: Any,
+    pairs: Sequence[tuple[str, PairedDifference, float]],
+    part: str,
+    drive: str,
+    cases: Sequence[str],
+    label: str,
+    beside: float,
+    face: str,
+) -> None:
+    """Draw the paired differences of one part by case, each with its interval."""
+    shown = [
+        (sign * pair.difference, cases.index(pair.case) + beside, _whisker(pair.ci95))
+        for name, pair, sign in pairs
+        if (name, pair.drive, pair.noise) == (part, drive, PAPER_NOISE)
+    ]
+    if shown:
+        means, places, bounds = zip(*shown, strict=True)
+        axis.errorbar(
+            means, places, xerr=bounds, fmt='o', markersize=4, elinewidth=1.4, label=label,
+            color=_PART_COLOURS[part], markerfacecolor=face,
+        )  # fmt: skip
+
+
+def portraits(showcase: FigureRuns, results: Results) -> Any:
+    """Return phase portraits of several methods beside ours, in closed loop (Fig. 15)."""
+    colours = colours_of(results)
+    shown = showcase.portraits
+    columns = min(3, len(shown))
+    rows = math.ceil(len(shown) / columns)
+    figure = new_figure(0.6 + 2.2 * rows)
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    for axis in axes.flat[len(shown) :]:
+        axis.set_visible(False)
+    for axis, (name, run) in zip(axes.flat, shown.items(), strict=False):
+        counted = run.time >= START
+        wanted = broken_at_switches(run, run.wanted)
+        axis.plot(wanted[:, 1], wanted[:, 0], color=WANTED, linewidth=0.7)
+        speeds = run.speeds[counted]
+        axis.plot(speeds[:, 1], speeds[:, 0], color=colours[name], linewidth=0.8, alpha=0.9)
+        title = '\n'.join(wrap(name, 24)[:2])
+        axis.set_title(f'{title}\nRMSE {run.rmse():.3f}, settled {run.rmse(cut=SETTLING):.3f}')
+    _name_wheels(axes)
+    return figure
+
+
+def estimation_portraits(showcase: FigureRuns) -> Any:
+    """Return phase portraits of (86) by kind of fuzzy system, the paper's Fig. 15."""
+    shown = showcase.estimated
+    figure = new_figure(2.7)
+    axes = figure.subplots(1, len(shown), sharex=True, sharey=True, squeeze=False)
+    true = showcase.driven
+    palette = (OURS, COLOURS['estimate'], COLOURS['feedforward'])
+    for axis, (kind, found), colour in zip(axes.flat, shown.items(), palette, strict=False):
+        miss = float(np.sqrt(np.mean((found - true) ** 2)))
+        axis.plot(found[:, 1], found[:, 0], color=colour, linewidth=0.7, label='estimated')
+        axis.plot(true[:, 1], true[:, 0], color=WANTED, linewidth=0.8, label='true')
+        axis.set_title(f'{KIND_NAMES.get(kind, kind)}\nRMSE {miss:.3f} rad/s')
+    _name_wheels(axes)
+    return figure
+
+
+def _name_wheels(axes: Any) -> None:
+    for axis in axes[-1]:
+        axis.set_xlabel('left wheel / rad/s')
+    for axis in axes[:, 0]:
+        axis.set_ylabel('right wheel / rad/s')
+
+
+def _ranked(results: Results, drive: str) -> list[ResultRow]:
+    rows = results.rows_of(drive, PAPER_NOISE, NOMINAL)
+    rows = [row for row in rows if row.rival or row.controller == FULL]
+    return sorted((r for r in rows if math.isfinite(r.rmse_mean)), key=lambda r: r.rmse_mean)
+
+
+def _label(row: ResultRow) -> str:
+    return _with_mark(row.controller, row.rival, row.preview)
+
+
+def _name(results: Results, name: str) -> str:
+    return _with_mark(name, *results.kinds[name])
+
+
+def _with_mark(name: str, rival: bool, preview: bool) -> str:
+    return f'{name} (preview)' if rival and preview and 'preview' not in name else name
+
+
+def _whisker(ci95: float) -> float:
+    return ci95 if math.isfinite(ci95) else 0.0
+
+
+def _shared_legend(figure: Any, axes: Sequence[Any]) -> None:
+    entries: dict[str, Any] = {}
+    for axis in axes:
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    figure.legend(entries.values(), entries.keys(), loc='outside upper center', ncols=3)

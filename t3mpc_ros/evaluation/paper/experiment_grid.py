@@ -1,0 +1,251 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Experiments that the paper's tables and figures need: method, drive, noise and case."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+DRIVES = ('torque', 'velocity')
+"""How u reaches the wheels: as a torque, the paper's way, or as a wheel speed command."""
+NOISES = (0.0, 0.01, 0.04, 0.1)
+"""Noise variance of the measured wheel speeds, (rad/s)²: the paper's range."""
+PAPER_NOISE = 0.04
+"""The paper's own noise variance, (rad/s)²."""
+NOMINAL = 'nominal'
+EXACT = 'exact model'
+"""In the name of a rival whose model has the nominal inertia; the models of all other rivals
+with preview believe in one that is 30 % off."""
+DEAD_TIME = 'dead time'
+"""The case that only the velocity drive has."""
+FULL = 'full'
+"""The controller with every part."""
+
+STAGES = ('feedback', '+NT3FS', '+compensator', '+MPC', FULL)
+"""The controller as it grows; the last step, to :data:`FULL`, adds preview."""
+PARTS = ('NT3FS', 'compensator', 'MPC', 'preview')
+"""What each step from one stage to the next adds."""
+WITHOUT = {
+    'NT3FS': 'full without NT3FS',
+    'compensator': 'full without compensator',
+    'MPC': 'full without MPC',
+    'MPC, equal bound': 'full without MPC, equal bound',
+    'preview': 'full without preview',
+    'trained predictor': 'full with random predictor',
+}
+"""The full controller with one part left out, by that part."""
+
+
+class Method(Protocol):
+    """A contestant, as plain data: what tables and results read of it; runs may read more."""
+
+    @property
+    def name(self) -> str:
+        """Its name in tables and results."""
+
+    @property
+    def rival(self) -> bool:
+        """Whether it is somebody else's method, not a stage of ours."""
+
+    @property
+    def preview(self) -> bool:
+        """Whether it reads the future of the reference."""
+
+    @property
+    def parameters(self) -> Any:
+        """What it is made with."""
+
+
+class RunRecord(Protocol):
+    """What is read of the record of a run; one row a control period, right wheel first."""
+
+    @property
+    def time(self) -> Array:
+        """s, shape (n,)."""
+
+    @property
+    def wanted(self) -> Array:
+        """r, rad/s, shape (n, 2)."""
+
+    @property
+    def measured(self) -> Array:
+        """The measured chi with its noise, rad/s, shape (n, 2)."""
+
+    @property
+    def speeds(self) -> Array:
+        """True chi, rad/s, shape (n, 2)."""
+
+    @property
+    def command(self) -> Array:
+        """u, rad/s², shape (n, 2)."""
+
+    @property
+    def terms(self) -> Array:
+        """Terms of u, rad/s², shape (n, 5, 2), rows as in ``law.TERMS``."""
+
+    @property
+    def modes(self) -> Array:
+        """Active switching mode, shape (n,)."""
+
+    def rmse(self, after: float = 3.0, *, cut: float = 0.0) -> float:
+        """Return the tracking RMSE over both wheels, rad/s."""
+
+    def chatter(self) -> float:
+        """Return the total variation of what is asked, per second and wheel, rad/s³."""
+
+
+Jobs = Sequence[tuple[Any, Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class ExperimentSetup:
+    """Where methods and runs come from."""
+
+    methods: Callable[[str], Mapping[str, Method]]
+    """The contestants of a drive by name."""
+    scenario: Callable[..., Any]
+    """Called with drive, noise, case, seed and duration, by name; what
+    ``measure_many`` takes."""
+    measure_many: Callable[[Jobs, Callable[[Any], Any], Any], Iterable[tuple[int, Any]]]
+    """Called with (scenario, method) pairs, what to make of the record of each run, and the team
+    that works; yields (index, what was made) in any order."""
+    cases: tuple[str, ...]
+    """Every case there is, :data:`NOMINAL` first."""
+    seeds: tuple[int, ...]
+    """Held-out seeds, none of which has tuned anything."""
+    team: Callable[[int], AbstractContextManager[Any]] = nullcontext
+    """Called with how many processes; what it enters is the team. By default the number itself."""
+
+
+DURATION = 59.5
+"""Length of a run, s: four switches, and an end before the fifth, which methods with preview would
+begin to cross without the run seeing what it is good for."""
+RIVAL_CASES = ('mass +30 %', 'mass -30 %')
+INTENDED_CASES = {
+    WITHOUT['NT3FS']: ('mass +30 %', 'friction x3'),
+    WITHOUT['compensator']: ('disturbance',),
+    WITHOUT['MPC']: (DEAD_TIME, 'friction x3'),
+    WITHOUT['MPC, equal bound']: (DEAD_TIME, 'friction x3'),
+    WITHOUT['trained predictor']: (DEAD_TIME,),
+}
+"""The cases beside the nominal one in which the controller runs without a part."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExperimentGrid:
+    """How much is run."""
+
+    seeds: tuple[int, ...]
+    duration: float
+    """s"""
+    cases: tuple[str, ...]
+    noises: tuple[float, ...] = NOISES
+    perturbed_noises: tuple[float, ...] = NOISES
+    """Noises at which the stages of the controller run the cases beside the nominal one."""
+    missing_noises: tuple[float, ...] = (PAPER_NOISE,)
+    """The same of the controller with one part left out."""
+    rival_noises: tuple[float, ...] = (PAPER_NOISE,)
+    """The same of the rivals."""
+    rival_cases: tuple[str, ...] = RIVAL_CASES
+    """The cases beside the nominal one that rivals with preview run."""
+    drives: tuple[str, ...] = DRIVES
+
+    def __post_init__(self) -> None:
+        if not self.seeds or len(set(self.seeds)) != len(self.seeds):
+            raise ValueError(f'seeds must be one or more, each once: got {self.seeds}')
+        if not self.duration >= 5.0:
+            raise ValueError(f'duration must be at least 5 s, 3 do not count: got {self.duration}')
+        if NOMINAL not in self.cases:
+            raise ValueError(f'cases must hold {NOMINAL}: got {self.cases}')
+
+
+@dataclass(frozen=True, slots=True)
+class Experiment:
+    """One method in one situation: what a row of the results is about."""
+
+    method: str
+    drive: str
+    noise: float
+    case: str
+
+
+QUICK_CASES = (NOMINAL, 'mass +30 %', 'friction x3', 'disturbance', DEAD_TIME)
+
+
+def make_grid(
+    bench: ExperimentSetup, *, quick: bool = False, seeds: int | None = None
+) -> ExperimentGrid:
+    """Return how much is run: everything, or with ``quick`` enough to see that all works.
+
+    Raises
+    ------
+    ValueError
+        More seeds are asked for than are held out.
+    """
+    count = (3 if quick else len(bench.seeds)) if seeds is None else seeds
+    if not 1 <= count <= len(bench.seeds):
+        raise ValueError(f'seeds must be from 1 to {len(bench.seeds)}: got {count}')
+    if not quick:
+        return ExperimentGrid(
+            bench.seeds[:count], DURATION, bench.cases, perturbed_noises=(0.0, PAPER_NOISE)
+        )
+    cases = tuple(case for case in QUICK_CASES if case in bench.cases)
+    return ExperimentGrid(
+        bench.seeds[:count], 26.0, cases, (0.0, PAPER_NOISE), (PAPER_NOISE,), (PAPER_NOISE,), ()
+    )
+
+
+def needed_experiments(bench: ExperimentSetup, extent: ExperimentGrid) -> tuple[Experiment, ...]:
+    """Return every cell that is needed, each once, by drive, case, noise and method.
+
+    Every rival and every stage of the controller in the nominal case at every noise; the stages
+    in every other case at ``perturbed_noises``; the controller with one part left out in the
+    cases that part is for, at ``missing_noises``; rivals with preview in ``rival_cases`` at
+    ``rival_noises``.
+
+    Raises
+    ------
+    ValueError
+        A drive has no controller named :data:`FULL`, a method another name than its key, or a
+        stage of the controller is called a rival.
+    """
+    found = []
+    for drive in extent.drives:
+        methods = bench.methods(drive)
+        if FULL not in methods or any(name != method.name for name, method in methods.items()):
+            names = ', '.join(methods)
+            raise ValueError(f'methods of {drive} must hold {FULL}, by their names: got {names}')
+        if wrong := [name for name in (*STAGES, *WITHOUT.values()) if _is_rival(methods, name)]:
+            raise ValueError(
+                f'stages of the controller must not be rivals: got {", ".join(wrong)}'
+            )
+        for case in extent.cases:
+            if case == DEAD_TIME and drive != 'velocity':
+                continue
+            for noise in extent.noises:
+                for name, method in methods.items():
+                    if noise in _noises(extent, method, case):
+                        found.append(Experiment(name, drive, noise, case))
+    return tuple(found)
+
+
+def _noises(extent: ExperimentGrid, method: Method, case: str) -> tuple[float, ...]:
+    """Return the noises at which a method runs a case."""
+    if method.name in WITHOUT.values():
+        wanted = case == NOMINAL or case in INTENDED_CASES.get(method.name, ())
+        return extent.missing_noises if wanted else ()
+    if case == NOMINAL:
+        return extent.noises
+    if method.rival:
+        return extent.rival_noises if method.preview and case in extent.rival_cases else ()
+    return extent.perturbed_noises
+
+
+def _is_rival(methods: Mapping[str, Method], name: str) -> bool:
+    return name in methods and methods[name].rival

@@ -1,0 +1,228 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The single runs that the figures show, and the claims decided from them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+import math
+import re
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.chaos.reference import ReferenceParameters
+from t3mpc_ros.control.control_law import TERM_NAMES
+from t3mpc_ros.evaluation.open_loop_estimation import (
+    KINDS,
+    NORMALISED_GAIN,
+    SETTLE,
+    estimate,
+    estimator,
+    simulate_open_loop,
+    torque_robot,
+)
+from t3mpc_ros.evaluation.paper.claims import REFERENCE_SPREAD, Claim
+from t3mpc_ros.evaluation.paper.experiment_grid import (
+    FULL,
+    NOMINAL,
+    PAPER_NOISE,
+    WITHOUT,
+    ExperimentGrid,
+    ExperimentSetup,
+    RunRecord,
+)
+from t3mpc_ros.evaluation.paper.experiment_runs import SETTLING, START
+from t3mpc_ros.evaluation.paper.results import Results
+
+Array = NDArray[np.float64]
+
+NO_PREVIEW = WITHOUT['preview']
+PORTRAITS = 6
+"""How many phase portraits are compared, the full controller's among them."""
+FOLLOWS = 0.10
+"""Settled RMSE over the reference's spread that counts as following under noise."""
+EXPLAINS = 0.5
+"""Share of the unknown acceleration's variance that an estimate must explain to follow it."""
+
+
+@dataclass(frozen=True, slots=True)
+class FigureRuns:
+    """One run of each kind, all with the same seed and the paper's noise."""
+
+    seed: int
+    torque: RunRecord
+    """The full controller in the paper's setting."""
+    velocity: RunRecord
+    """The full controller as the nodes close the loop."""
+    blind: RunRecord | None
+    """The same without preview."""
+    portraits: Mapping[str, RunRecord]
+    """Of several methods in the paper's setting, the full controller first."""
+    pairs: tuple[tuple[int, int], ...]
+    """Signals, from 1, that drive right and left wheel in each mode."""
+    driven: Array
+    """True speeds of a robot without a controller (86) after it has settled, rad/s, shape
+    (n, 2)."""
+    estimated: Mapping[str, Array]
+    """What each kind of fuzzy system makes of them, alike."""
+
+    def claims(self) -> list[Claim]:
+        """Return what the paper says of such runs, decided for these."""
+        return [switches_claim(self.torque), follows_claim(self.torque), estimate_claim(self)]
+
+
+def simulate_figure_runs(
+    bench: ExperimentSetup, extent: ExperimentGrid, results: Results, team: Any
+) -> FigureRuns:
+    """Return the runs that are drawn, with the first held-out seed.
+
+    Raises
+    ------
+    RuntimeError
+        The runner gave fewer runs than it was asked for.
+    """
+    seed = extent.seeds[0]
+    shown = portrait_methods(results)
+    wanted = [('torque', name) for name in shown] + [('velocity', FULL)]
+    if NO_PREVIEW in bench.methods('velocity'):
+        wanted.append(('velocity', NO_PREVIEW))
+    methods = {kind: bench.methods(kind) for kind in ('torque', 'velocity')}
+    jobs = [
+        (
+            bench.scenario(
+                drive=kind, noise=PAPER_NOISE, case=NOMINAL, seed=seed, duration=extent.duration
+            ),
+            methods[kind][name],
+        )
+        for kind, name in wanted
+    ]
+    found: dict[tuple[str, str], RunRecord] = {}
+    for index, run in bench.measure_many(jobs, full_record, team):
+        found[wanted[index]] = run
+    if len(found) != len(wanted):
+        raise RuntimeError(f'{len(wanted) - len(found)} runs never came back')
+    alone = simulate_open_loop(torque_robot(PAPER_NOISE, seed), SETTLE + extent.duration, seed)
+    first = round(SETTLE / alone.period)
+    return FigureRuns(
+        seed=seed,
+        torque=found['torque', FULL],
+        velocity=found['velocity', FULL],
+        blind=found.get(('velocity', NO_PREVIEW)),
+        portraits={name: found['torque', name] for name in shown},
+        pairs=ReferenceParameters().switching.pairs,
+        driven=alone.speeds[first:],
+        estimated={
+            kind: estimate(alone, estimator(kind, PAPER_NOISE, NORMALISED_GAIN))[0][first:]
+            for kind in KINDS
+        },
+    )
+
+
+def full_record(run: RunRecord) -> RunRecord:
+    """Return the record itself: what a figure needs of a run."""
+    return run
+
+
+def portrait_methods(results: Results) -> list[str]:
+    """Return whose phase portraits are compared: ours, other fuzzy kinds, then the best rivals."""
+    rows = results.rows_of('torque', PAPER_NOISE, rival=True)
+    rows.sort(key=lambda row: math.inf if math.isnan(row.rmse_mean) else row.rmse_mean)
+    names = [row.controller for row in rows]
+    kinds = re.compile(r'fuzzy|type.?[12]\b|\bi?t[12]\b', re.IGNORECASE)
+    fuzzy = [name for name in results.kinds if kinds.search(name)]
+    measured = [name for name in fuzzy if results.row(name, 'torque', PAPER_NOISE)]
+    return list(dict.fromkeys([FULL, *measured, *names]))[:PORTRAITS]
+
+
+def switches_of(run: RunRecord) -> Array:
+    """Return the times (s) at which the reference switches."""
+    times: Array = run.time[1:][np.diff(run.modes) != 0]
+    return times
+
+
+def largest_switch(run: RunRecord) -> int | None:
+    """Return the row of the switch with the largest jump, None when there is none.
+
+    Switches so near the end that nothing of what follows could be shown do not count, unless
+    there are no others.
+    """
+    rows = np.flatnonzero(np.diff(run.modes) != 0) + 1
+    early = rows[run.time[rows] < run.time[-1] - 3.0]
+    rows = early if early.size else rows
+    if not rows.size:
+        return None
+    jumps = np.abs(run.wanted[rows] - run.wanted[rows - 1]).sum(axis=1)
+    return int(rows[int(np.argmax(jumps))])
+
+
+def estimated_unknown(run: RunRecord) -> Array:
+    """Return g of (31) as the law used it, rad/s², shape (n, 2): its term in (66) is -g."""
+    found: Array = -run.terms[:, TERM_NAMES.index('fuzzy')]
+    return found
+
+
+def true_unknown(run: RunRecord) -> Array:
+    """Return chi' - u of (30), from the true speeds over each period, rad/s², shape (n - 1, 2)."""
+    period = (run.time[-1] - run.time[0]) / (run.time.size - 1)
+    found: Array = np.diff(run.speeds, axis=0) / period - run.command[:-1]
+    return found
+
+
+def explained(run: RunRecord) -> tuple[float, float]:
+    """Return the share of the unknown acceleration that g explains, of right and left wheel.
+
+    1 - mean((unknown - g)²)/var(unknown) after the start: 1 is perfect, 0 no better than the
+    mean, negative worse than that.
+    """
+    counted = run.time[:-1] >= START
+    target = true_unknown(run)[counted]
+    miss = target - estimated_unknown(run)[:-1][counted]
+    shares = 1.0 - np.mean(miss**2, axis=0) / np.var(target, axis=0)
+    return float(shares[0]), float(shares[1])
+
+
+def switches_claim(run: RunRecord) -> Claim:
+    """Decide whether the reference changes its signals as often as in the paper's run."""
+    count = switches_of(run).size
+    text = 'The reference changes its signals four times in a run, suddenly (60 s here)'
+    long_enough = run.time[-1] > 59.0
+    return Claim(
+        'four switches',
+        'paper',
+        text,
+        f'{count} switches in {run.time[-1]:.0f} s',
+        count == 4 if long_enough else None,
+        {'switches': count},
+    )
+
+
+def follows_claim(run: RunRecord) -> Claim:
+    """Decide whether the outputs follow between switches, in the run that is drawn."""
+    text = (
+        'The outputs track the switching references very well (here: settled RMSE at most '
+        f'{100 * FOLLOWS:.0f} % of the reference, torque drive, noise {PAPER_NOISE:g}, run shown)'
+    )
+    settled = run.rmse(START, cut=SETTLING)
+    found = f'settled RMSE {settled:.3f} rad/s, {100 * settled / REFERENCE_SPREAD:.1f} %'
+    held = bool(settled <= FOLLOWS * REFERENCE_SPREAD)
+    return Claim('outputs follow', 'paper', text, found, held, {'settled': settled})
+
+
+def estimate_claim(showcase: FigureRuns) -> Claim:
+    """Decide whether the fuzzy systems' estimates follow the true unknown acceleration."""
+    text = (
+        'The estimated signals follow their targets (here: they explain at least '
+        f'{100 * EXPLAINS:.0f} % of the variance on both wheels, run shown)'
+    )
+    right, left = explained(showcase.torque)
+    found = f'{100 * right:.0f} % of the variance explained on the right, {100 * left:.0f} % left'
+    held = bool(min(right, left) >= EXPLAINS)
+    return Claim('estimates follow', 'paper', text, found, held, {'right': right, 'left': left})
+
+
+def broken_at_switches(run: RunRecord, values: Sequence[Array] | Array) -> Array:
+    """Return ``values`` (n, 2) with a gap before each switch: a jump is no line in a portrait."""
+    rows = np.flatnonzero(np.diff(run.modes) != 0) + 1
+    broken: Array = np.insert(np.asarray(values, dtype=np.float64), rows, np.nan, axis=0)
+    return broken

@@ -1,0 +1,172 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Reproduction of the paper: runs experiments, writes results, tables, figures and the page."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from t3mpc_ros.evaluation.paper.experiment_grid import (
+    EXACT,
+    ExperimentGrid,
+    ExperimentSetup,
+    make_grid,
+    needed_experiments,
+)
+
+RUNS = 'runs.jsonl'
+"""Finished runs, in the folder of the output."""
+
+
+@dataclass(frozen=True, slots=True)
+class PaperOptions:
+    """What is asked for."""
+
+    output: Path
+    quick: bool = False
+    seeds: int | None = None
+    """Held-out seeds of each cell; None for all, or three when quick."""
+    estimation_seeds: int | None = None
+    """The same of the comparison (86)."""
+    workers: int = 1
+    json: Path | None = None
+    """Where a second copy of the results goes."""
+    fresh: bool = False
+    """Whether runs that are there already are thrown away."""
+
+
+def default_setup() -> ExperimentSetup:
+    """Return the contestants and the closed loop of this package."""
+    from t3mpc_ros.evaluation.closed_loop import WorkerPool, measure_many
+    from t3mpc_ros.evaluation.methods import methods
+    from t3mpc_ros.evaluation.scenario import CASES, HELD_OUT_SEEDS, Scenario
+
+    return ExperimentSetup(
+        methods, Scenario, measure_many, tuple(CASES), HELD_OUT_SEEDS, WorkerPool
+    )
+
+
+def reproduce(bench: ExperimentSetup, options: PaperOptions, progress: Any = None) -> str:
+    """Return a summary in a few lines, after writing everything into the output folder.
+
+    ``results.json``, ``results.csv``, ``tables.md``, ``paper.html`` and ``figures/*.png``. None
+    of them depends on how many processes worked, or on which runs were there already.
+
+    Parameters
+    ----------
+    bench
+        Where methods and runs come from.
+    options
+        What is asked for.
+    progress
+        A :class:`t3mpc_ros.evaluation.reporting.Progress`; None keeps silent.
+
+    Raises
+    ------
+    OSError
+        The output cannot be written.
+    RuntimeError
+        Another campaign is writing to the same folder.
+    ValueError
+        More seeds are asked for than there are.
+    """
+    from t3mpc_ros.evaluation import open_loop_estimation
+    from t3mpc_ros.evaluation.paper.claims import all_claims
+    from t3mpc_ros.evaluation.paper.exhibits import ExhibitData, findings, pictures
+    from t3mpc_ros.evaluation.paper.experiment_runs import RunFile, run_missing, source_digest
+    from t3mpc_ros.evaluation.paper.figure_runs import simulate_figure_runs
+    from t3mpc_ros.evaluation.paper.paper_page import counted, page
+    from t3mpc_ros.evaluation.paper.result_tables import all_tables, markdown
+    from t3mpc_ros.evaluation.paper.results import results_of, write_csv, write_json
+
+    say = progress.say if progress is not None else lambda text: None
+    scope = make_grid(bench, quick=options.quick, seeds=options.seeds)
+    file = RunFile(options.output / RUNS, fresh=options.fresh)
+    sources = source_digest()
+    with bench.team(options.workers) as team:
+        needed = needed_experiments(bench, scope)
+        numbers = run_missing(bench, scope, needed, file, sources, team=team, progress=progress)
+        results = results_of(bench, scope, numbers)
+        say('  runs for the figures')
+        showcase = simulate_figure_runs(bench, scope, results, team)
+    say('  estimation without a controller (86)')
+    count = options.estimation_seeds or (2 if options.quick else 20)
+    variances = (0.0, 0.04) if options.quick else open_loop_estimation.VARIANCES
+    estimated = open_loop_estimation.compare(
+        seeds=count, duration=scope.duration, variances=variances
+    )
+    say('  figures and page')
+    claims = (*all_claims(results, estimated), *showcase.claims())
+    tables = all_tables(results, estimated)
+    material = ExhibitData(results, showcase, claims)
+    drawn = pictures(material)
+
+    parameters = _parameters(bench, scope, options, count, variances)
+    compared = [row for row in results.rows if EXACT not in row.controller]
+    exact = [row for row in results.rows if EXACT in row.controller]
+    content = {
+        'version': _version(),
+        'settings': parameters | {'sources': sources},
+        'results': [row.record() for row in compared],
+        'exact_models': [row.record() for row in exact],
+        'stage_differences': [pair.record() for pair in results.stage_differences()],
+        'losses': [pair.record() for pair in results.losses()],
+        'estimation': [result.record() for result in estimated],
+        'claims': [claim.record() for claim in claims],
+    }
+    output = options.output
+    for path in (output / 'results.json', options.json):
+        if path is not None:
+            write_json(path, content)
+    write_csv(output / 'results.csv', [*compared, *exact])
+    (output / 'tables.md').write_text(markdown(tables, claims), encoding='utf-8')
+    (output / 'figures').mkdir(exist_ok=True)
+    for stem, png in drawn.items():
+        (output / 'figures' / f'{stem}.png').write_bytes(png)
+    title = "The paper's figures and tables, reproduced"
+    html = page(title, _origin(scope, options, sources), claims, tables, drawn, findings(material))
+    (output / 'paper.html').write_text(html, encoding='utf-8')
+    return f'claims: {counted(claims)}\n{output / "paper.html"}'
+
+
+def _parameters(
+    bench: ExperimentSetup,
+    scope: ExperimentGrid,
+    options: PaperOptions,
+    estimation_seeds: int,
+    variances: tuple[float, ...],
+) -> dict[str, object]:
+    from t3mpc_ros.evaluation.paper.experiment_runs import plain
+
+    methods: dict[str, Mapping[str, object]] = {
+        drive: {name: plain(method.parameters) for name, method in bench.methods(drive).items()}
+        for drive in scope.drives
+    }
+    return {
+        'quick': options.quick,
+        'seeds': list(scope.seeds),
+        'duration': scope.duration,
+        'noises': list(scope.noises),
+        'cases': list(scope.cases),
+        'estimation_seeds': estimation_seeds,
+        'estimation_noises': list(variances),
+        'methods': methods,
+    }
+
+
+def _version() -> str:
+    import t3mpc_ros
+
+    return t3mpc_ros.__version__
+
+
+def _origin(scope: ExperimentGrid, options: PaperOptions, sources: str) -> str:
+    words = [
+        f'version {_version()}, sources {sources}',
+        f'{len(scope.seeds)} held-out seeds, runs of {scope.duration:g} s at 100 Hz',
+        'RMSE of true wheel speeds, both wheels, first 3 s left out',
+    ]
+    if options.quick:
+        words.insert(0, 'a quick look: too few seeds and too short runs to conclude from')
+    return ' · '.join(words)

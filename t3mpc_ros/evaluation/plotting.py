@@ -1,0 +1,160 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Style and layout of all figures."""
+
+from collections.abc import Callable
+import io
+from typing import Any, TypeGuard, TypeVar
+
+import matplotlib
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
+from t3mpc_ros.evaluation.bag_report.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH, WHEELS
+
+Array = NDArray[np.float64]
+Subject = TypeVar('Subject')
+
+WIDTH = 6.2
+"""Inches: narrow enough for 9-point text to be read where a phone shows it at half the size."""
+
+COLOURS = {
+    REFERENCE: '#1f2937',
+    TRUTH: '#0284c7',
+    ODOMETRY: '#7dd3fc',
+    COMMAND: '#0f766e',
+    'error': '#be123c',
+    'estimate': '#7c3aed',
+    'target': '#9ca3af',
+    'fuzzy': '#7c3aed',
+    'feedback': '#ea580c',
+    'feedforward': '#15803d',
+    'compensator': '#a16207',
+    'predictive': '#db2777',
+    'applied': '#0f766e',
+    'value': '#4338ca',
+    'margin': '#0891b2',
+    'skill': '#db2777',
+    'latency': '#4338ca',
+    'fit': '#ea580c',
+    'answered': '#0f766e',
+    'round trip': '#4338ca',
+    'resets': '#be123c',
+    'switch': '#d97706',
+}
+"""By quantity, the same in every figure."""
+LABELS = {TRUTH: 'robot (ground truth)', ODOMETRY: 'robot (odometry)', REFERENCE: 'reference'}
+STRENGTH = dict(zip(WHEELS, (1.0, 0.45), strict=True))
+"""Where both wheels share a panel, the left one is paler."""
+
+_STYLE = {
+    'font.size': 9,
+    'axes.titlesize': 9,
+    'axes.titlelocation': 'left',
+    'axes.spines.top': False,
+    'axes.spines.right': False,
+    'axes.edgecolor': '#9ca3af',
+    'axes.labelcolor': '#374151',
+    'axes.grid': True,
+    'grid.color': '#e5e7eb',
+    'grid.linewidth': 0.6,
+    'xtick.color': '#374151',
+    'ytick.color': '#374151',
+    'legend.frameon': False,
+    'legend.fontsize': 8,
+}
+
+
+def png_of(draw: Callable[[Subject], Any], subject: Subject) -> bytes | None:
+    """Return what ``draw`` makes of ``subject`` as a PNG file; None when it makes nothing."""
+    with matplotlib.rc_context(_STYLE):
+        figure = draw(subject)
+        if figure is None:
+            return None
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format='png', dpi=150)
+        return buffer.getvalue()
+
+
+def new_figure(height: float) -> Any:
+    """Return an empty figure of ``height`` inches, independent of pyplot."""
+    figure = Figure(figsize=(WIDTH, height), layout='constrained')
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def new_panels(count: int, height: float, *, shared: bool = True) -> tuple[Any, list[Any]]:
+    """Return a figure and ``count`` panels below each other, each ``height`` inches.
+
+    ``shared`` says whether they have one axis of time.
+    """
+    figure = new_figure(0.7 + height * count)
+    return figure, list(figure.subplots(count, 1, sharex=shared, squeeze=False)[:, 0])
+
+
+def over_time(figure: Any, axes: list[Any], run: Run) -> Any:
+    """Return ``figure`` with the switches marked, the time named and one legend on top."""
+    for axis in axes:
+        for i, switch in enumerate(run.switches):
+            label = 'switch' if i == 0 else None
+            style = {'color': COLOURS['switch'], 'linewidth': 0.8, 'linestyle': (0, (4, 3))}
+            axis.axvline(switch, label=label, zorder=1.5, **style)
+    name_time(axes)
+    add_legend(axes[0])
+    return figure
+
+
+def name_time(axes: list[Any], name: str = 'time') -> None:
+    """Label the axis of time that the panels share, with ticks at round numbers."""
+    for axis in axes:
+        axis.margins(x=0.01)
+        axis.xaxis.set_major_locator(MaxNLocator(steps=(1, 2, 5, 10)))
+    axes[-1].set_xlabel(f'{name} / s')
+
+
+def add_legend(axis: Any) -> None:
+    """Put the legend above the axis, to the right of its title, where it covers nothing."""
+    handles, labels = axis.get_legend_handles_labels()
+    if handles:
+        place = {'loc': 'lower right', 'bbox_to_anchor': (1.0, 1.0), 'ncols': len(labels)}
+        spacing = {'borderaxespad': 0.1, 'handlelength': 1.6, 'columnspacing': 1.2}
+        axis.legend(handles, labels, **place, **spacing)
+
+
+def draw_line(
+    axis: Any,
+    series: Series,
+    name: str,
+    colour: str,
+    label: str | None = None,
+    *,
+    width: float = 1.1,
+    strength: float = 1.0,
+) -> None:
+    """Draw one quantity over time."""
+    time, value = thinned(series.time, series[name])
+    axis.plot(time, value, color=colour, label=label, linewidth=width, alpha=strength)
+
+
+def thinned(time: Array, value: Array, most: int = 6000) -> tuple[Array, Array]:
+    """Return the extremes of stretches of a long line: the same picture from fewer points."""
+    if time.size <= most:
+        return time, value
+    stretch = -(-time.size // (most // 2))
+    starts = np.arange(0, time.size, stretch)
+    low, high = np.fmin.reduceat(value, starts), np.fmax.reduceat(value, starts)
+    return np.repeat(time[starts], 2), np.column_stack([low, high]).ravel()
+
+
+def every_nth(values: Array, most: int = 20_000) -> Array:
+    """Return a line in the plane by so few of its points that it can be drawn."""
+    return values[:: max(1, -(-values.size // most))]
+
+
+def is_long(series: Series | None) -> TypeGuard[Series]:
+    """Return whether there is anything to draw a line through."""
+    return series is not None and len(series) > 1

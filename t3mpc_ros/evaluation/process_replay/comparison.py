@@ -1,0 +1,322 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Recorded and recomputed outputs, field by field, each with its tolerance."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.bag.run.journal import Event
+from t3mpc_ros.control.controller import ControllerParameters
+from t3mpc_ros.evaluation.process_replay.controller_inputs import (
+    FIELDS,
+    ControllerInputs,
+    ReplayError,
+)
+from t3mpc_ros.evaluation.process_replay.controller_replay import ReplayResult
+from t3mpc_ros.geometry.types import NANOSECONDS
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+ABSOLUTE, RELATIVE = 1e-9, 1e-9
+"""Tolerances on the machine that made the recording: there it comes out to the last bit."""
+ELSEWHERE = 1e-6
+"""Both tolerances for other processors, compilers and libraries of linear algebra, which round
+in other ways; what is learnt carries their differences on."""
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """How far two numbers may be apart: absolute + relative |recorded|, in SI units.
+
+    Raises
+    ------
+    ValueError
+        A tolerance is negative or not finite, or a name fits no field.
+    """
+
+    absolute: float = ABSOLUTE
+    relative: float = RELATIVE
+    fields: Mapping[str, float] = field(default_factory=dict)
+    """Absolute ones by name of a field, ``*`` standing for anything; the last that fits counts,
+    and the relative tolerance is then zero."""
+
+    def __post_init__(self) -> None:
+        given = {'absolute': self.absolute, 'relative': self.relative, **self.fields}
+        for name, value in given.items():
+            if not 0.0 <= value < math.inf:
+                raise ValueError(f'the tolerance {name} must be from 0 to below inf: got {value}')
+        for name in self.fields:
+            if not any(fnmatchcase(each, name) for each in FIELDS):
+                raise ValueError(f'{name} is none of the fields {", ".join(FIELDS)}')
+
+    def of(self, name: str) -> tuple[float, float]:
+        """Return the absolute and the relative tolerance of a field."""
+        own = [value for pattern, value in self.fields.items() if fnmatchcase(name, pattern)]
+        return (own[-1], 0.0) if own else (self.absolute, self.relative)
+
+
+@dataclass(frozen=True)
+class FieldComparison:
+    """How one field compares."""
+
+    field: str
+    count: int
+    """Numbers that were compared."""
+    absolute: float
+    """Largest difference; infinite where one of both is no number."""
+    relative: float
+    """Largest difference over |recorded|, of those recorded as zero none."""
+    differing: int
+    """How many are beyond the tolerance."""
+    first: float
+    """When the first of them was, s since the start of the bag; NaN without one."""
+    first_step: int
+    """And at which row of the journal; -1 without one."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How a whole run compares."""
+
+    rows: tuple[FieldComparison, ...]
+    """Of the fields that are in the recording, in the order of :data:`FIELDS`."""
+    tolerances: Tolerances
+    time: Array
+    recorded: Mapping[str, Array]
+    computed: Mapping[str, Array]
+    compared: Flags
+    """Which rows of the journal were compared, shape (n,)."""
+    remarks: tuple[str, ...]
+    parameters: tuple[str, ...]
+    """Settings that are not those of the recorded run, with both values."""
+
+    @property
+    def same(self) -> bool:
+        """Whether every number is within its tolerance."""
+        return not any(row.differing for row in self.rows)
+
+    @property
+    def first(self) -> FieldComparison | None:
+        """The field that diverges first; of several at once the one first in the table."""
+        differing = [row for row in self.rows if row.differing]
+        return min(differing, key=lambda row: row.first_step, default=None)
+
+    def beyond(self, name: str) -> Flags:
+        """Return at which rows a field is beyond its tolerance, shape (n,)."""
+        return self.compared & _beyond(
+            self.recorded[name], self.computed[name], *self.tolerances.of(name)
+        )
+
+    def table(self) -> str:
+        """Return the comparison as text, what is to be known of it first."""
+        lines = [f'note: {remark}' for remark in self.remarks]
+        lines += [f'setting: {text}' for text in self.parameters]
+        count, total = int(np.count_nonzero(self.compared)), self.compared.size
+        lines.append(f'{count} of {total} events compared')
+        wide = max(len(row.field) for row in self.rows)
+        lines.append(
+            f'{"field":<{wide}}  {"n":>7}  {"max abs":>9}  {"max rel":>9}  {"differ":>7}  '
+            f'{"first at":>10}'
+        )
+        for row in self.rows:
+            when = f'{row.first:9.3f} s' if row.differing else '         -'
+            lines.append(
+                f'{row.field:<{wide}}  {row.count:7d}  {row.absolute:9.2e}  {row.relative:9.2e}  '
+                f'{row.differing:7d}  {when}'
+            )
+        lines.append(self.verdict())
+        return '\n'.join(lines)
+
+    def verdict(self) -> str:
+        """Return the outcome in one sentence."""
+        first = self.first
+        if first is None:
+            absolute, relative = self.tolerances.absolute, self.tolerances.relative
+            return f'same: all within {absolute:g} + {relative:g} |recorded|' + (
+                ' or their own tolerance' if self.tolerances.fields else ''
+            )
+        others = [row.field for row in self.rows if row.differing and row is not first]
+        return (
+            f'differs: {first.field} first, at {first.first:.3f} s (event {first.first_step})'
+            + (f'; then {", ".join(others)}' if others else '')
+        )
+
+
+def compare(
+    inputs: ControllerInputs, again: ReplayResult, tolerances: Tolerances | None = None
+) -> Comparison:
+    """Return how a rerun compares with the recorded run.
+
+    Only those events count at which all is known that the answer depends on. Where there is none,
+    as in a bag without a journal, all are compared, and the outcome says so.
+
+    Raises
+    ------
+    ReplayError
+        Nothing was recorded that could be compared.
+    """
+    remarks = list(inputs.notes)
+    compared = inputs.exact
+    if not compared.any():
+        compared = np.ones_like(compared)
+        remarks.append(
+            'approximate: the state of the controller is not known at any step, so small '
+            'differences say nothing'
+        )
+    elif not compared.all():
+        first = inputs.time[np.flatnonzero(~compared)[0]]
+        remarks.append(
+            f'{np.count_nonzero(~compared)} events, the first at {first:.3f} s, are left out: '
+            'what the controller knew then is not all in the bag'
+        )
+    differing = [
+        f'{name} is {again.changed[name]}, recorded {_format_values(values)}'
+        for name, values in _recorded_values(inputs, again.changed).items()
+        if set(values) != {_plain(again.parameters.to_dict()[name])}
+    ]
+    return compare_columns(
+        inputs.time, inputs.recorded, again.fields, compared, tolerances, remarks, differing
+    )
+
+
+def compare_bags(
+    one: ControllerInputs, other: ControllerInputs, tolerances: Tolerances | None = None
+) -> Comparison:
+    """Return how what two bags hold of one run compares, a bag and its rerun say.
+
+    Events are matched by their number where both have a journal, else by the stamp of the
+    odometry.
+
+    Raises
+    ------
+    ReplayError
+        They have no event in common.
+    """
+    keys = [_keys(inputs, one.journalled and other.journalled) for inputs in (one, other)]
+    places = {key: row for row, key in enumerate(keys[1])}
+    rows = np.array([places.get(key, -1) for key in keys[0]], dtype=np.int64)
+    there = rows >= 0
+    if not there.any():
+        raise ReplayError(f'{one.bag} and {other.bag} have no step of the controller in common')
+    computed = {}
+    for name in FIELDS:
+        computed[name] = np.full(rows.size, np.nan)
+        computed[name][there] = other.recorded[name][rows[there]]
+    # A topic that only one of both has cannot be compared.
+    recorded = {
+        name: np.where(np.isnan(computed[name]), np.nan, one.recorded[name]) for name in FIELDS
+    }
+    remarks = [f'{each.bag}: {note}' for each in (one, other) for note in each.notes]
+    if missing := int(np.count_nonzero(~there)):
+        remarks.append(f'{missing} of {rows.size} events of {one.bag} are not in {other.bag}')
+    return compare_columns(
+        one.time, recorded, computed, there, tolerances, remarks, _differing(one, other)
+    )
+
+
+def compare_columns(
+    time: Array,
+    recorded: Mapping[str, Array],
+    computed: Mapping[str, Array],
+    compared: Flags,
+    tolerances: Tolerances | None = None,
+    remarks: Sequence[str] = (),
+    parameters: Sequence[str] = (),
+) -> Comparison:
+    """Return how columns of numbers compare where they were recorded; arrays are shape (n,)."""
+    tolerances = tolerances or Tolerances()
+    rows = []
+    for name in (name for name in FIELDS if name in computed):
+        chosen = compared & ~np.isnan(recorded[name])
+        if not chosen.any():
+            continue
+        was, now = recorded[name], computed[name]
+        with np.errstate(invalid='ignore'):
+            far = np.abs(now - was)[chosen]
+        far[np.isnan(far)] = math.inf
+        share = far[was[chosen] != 0.0] / np.abs(was[chosen][was[chosen] != 0.0])
+        beyond = np.flatnonzero(chosen & _beyond(was, now, *tolerances.of(name)))
+        rows.append(
+            FieldComparison(
+                name,
+                int(np.count_nonzero(chosen)),
+                float(far.max()),
+                float(share.max()) if share.size else 0.0,
+                int(beyond.size),
+                float(time[beyond[0]]) if beyond.size else math.nan,
+                int(beyond[0]) if beyond.size else -1,
+            )
+        )
+    if not rows:
+        raise ReplayError('nothing was recorded that could be compared')
+    return Comparison(
+        tuple(rows),
+        tolerances,
+        time,
+        recorded,
+        computed,
+        compared,
+        tuple(remarks),
+        tuple(parameters),
+    )
+
+
+def _beyond(was: Array, now: Array, absolute: float, relative: float) -> Flags:
+    """Return where two columns are further apart than they may; no number is far from any."""
+    with np.errstate(invalid='ignore'):
+        near = np.abs(now - was) <= absolute + relative * np.abs(was)
+    return np.asarray(~near & ~np.isnan(was))
+
+
+def _keys(inputs: ControllerInputs, numbered: bool) -> list[tuple[int, int]]:
+    if numbered:
+        return [
+            (start, number)
+            for start, life in enumerate(inputs.lives)
+            for number in life.rows[:, 0].tolist()
+        ]
+    # A stamp may come twice: the robot's clock has started again.
+    seen: dict[int, int] = {}
+    keys = []
+    for stamp, event in zip(inputs.stamps_ns.tolist(), inputs.events.tolist(), strict=True):
+        if event == Event.STEP:
+            seen[stamp] = seen.get(stamp, 0) + 1
+            keys.append((stamp, seen[stamp]))
+        else:
+            keys.append((-NANOSECONDS, len(keys)))
+    return keys
+
+
+def _recorded_values(
+    inputs: ControllerInputs, names: Mapping[str, object]
+) -> dict[str, list[object]]:
+    """Return the values that settings had in the run, in their order."""
+    tables = [parameters for life in inputs.lives for parameters in life.parameters.values()]
+    found: dict[str, list[object]] = {}
+    for name in names:
+        found[name] = list(dict.fromkeys(_plain(table.to_dict()[name]) for table in tables))
+    return found
+
+
+def _differing(one: ControllerInputs, other: ControllerInputs) -> list[str]:
+    names = {row.name: None for row in ControllerParameters.rows()}
+    mine, its = _recorded_values(one, names), _recorded_values(other, names)
+    return [
+        f'{name} is {_format_values(its[name])} in {other.bag}, {_format_values(mine[name])} in {one.bag}'
+        for name in names
+        if mine[name] != its[name]
+    ]
+
+
+def _plain(value: object) -> object:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _format_values(values: Sequence[object]) -> str:
+    return ', then '.join(map(str, values))

@@ -1,0 +1,390 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Inputs and recorded outputs of a bag's controller, in the order of processing."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+import tempfile
+import zlib
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.bag.chunk_reader import BagIndex, read_attachment_data, read_bag_index
+from t3mpc_ros.bag.columns import TopicColumns, read_columns, read_strings
+from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.bag.run.journal import COMMAND_EVENTS, JOURNAL_COLUMNS, Event, parameters_from_json
+from t3mpc_ros.bag.run.model_file import load_model
+from t3mpc_ros.control.control_law import TERM_NAMES
+from t3mpc_ros.control.controller import ControllerParameters
+from t3mpc_ros.evaluation.bag_report.topic_roles import (
+    COMMAND,
+    ODOMETRY,
+    REFERENCE,
+    WHEELS,
+    find_topics,
+)
+from t3mpc_ros.evaluation.process_replay.message_alignment import (
+    ConsumedMessages,
+    by_receipt,
+    commands_of,
+    match,
+    rows_of,
+)
+from t3mpc_ros.evaluation.training.training_data import recorded_parameters
+from t3mpc_ros.geometry.types import NANOSECONDS, StateArray
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+CONTROLLER = 'controller'
+PAIRS = ('error', 'estimate', 'skill', *(f'terms/{name}' for name in (*TERM_NAMES, 'applied')))
+"""What the controller tells of both wheels."""
+SPEEDS = ('cmd_vel.linear.x', 'cmd_vel.angular.z')
+NUMBERS = (
+    *(f'{name}/{wheel}' for name in PAIRS for wheel in WHEELS),
+    'lyapunov/value',
+    'lyapunov/margin',
+)
+FIELDS = (*SPEEDS, *NUMBERS)
+"""What is compared, as columns of plain numbers."""
+
+
+class ReplayError(RuntimeError):
+    """A bag that cannot be computed again, or not be compared; the text says which and why."""
+
+
+@dataclass(frozen=True)
+class ControllerSession:
+    """What happened to a controller from one start of its node to the next, a row an event."""
+
+    first: int
+    """Its first row, counted over all lives."""
+    rows: Integers
+    """The journal, as in :data:`~t3mpc_ros.bag.run.journal.JOURNAL_COLUMNS`, shape (n, 5)."""
+    taken: ConsumedMessages
+    exact: Flags
+    """Whether all that the controller knew is in the bag: then its answer must come out, (n,)."""
+    parameters: Mapping[int, ControllerParameters]
+    """By revision."""
+    start: int
+    """The revision it began with."""
+    model: Mapping[str, Array] | None
+
+    @property
+    def events(self) -> Integers:
+        """What happened, shape (n,)."""
+        return self.rows[:, 1]
+
+
+@dataclass(frozen=True)
+class ControllerInputs:
+    """What a controller was given, and what it answered in the recorded run."""
+
+    bag: Path
+    odometry: TopicColumns
+    references: TopicColumns
+    lives: tuple[ControllerSession, ...]
+    time: Array
+    """When each row was, s since the first message of the bag, shape (n,)."""
+    recorded: Mapping[str, Array]
+    """By :data:`FIELDS`, NaN where nothing was recorded, shape (n,) each."""
+    journalled: bool
+    """Whether the order is that of the journal, and not of receipt."""
+    start_ns: int
+    notes: tuple[str, ...] = field(default=())
+    """What a person should know of them."""
+
+    @property
+    def stamps_ns(self) -> Integers:
+        """Stamp of the odometry of each row, shape (n,)."""
+        return np.concatenate([life.rows[:, 2] for life in self.lives])
+
+    @property
+    def events(self) -> Integers:
+        """Event of each row, shape (n,)."""
+        return np.concatenate([life.events for life in self.lives])
+
+    @property
+    def exact(self) -> Flags:
+        """Whether all is known that the answer of each row depends on, shape (n,)."""
+        return np.concatenate([life.exact for life in self.lives])
+
+    @property
+    def commanding(self) -> Flags:
+        """Whether a command was sent at each row, shape (n,)."""
+        return np.isin(self.events, COMMAND_EVENTS)
+
+
+def load_inputs(
+    bag: Path, namespace: str | None = None, model: Mapping[str, Array] | None = None
+) -> ControllerInputs:
+    """Return what the controller of a bag was given and answered.
+
+    Parameters
+    ----------
+    bag
+        Its folder, or a file of it.
+    namespace
+        Of the robot; the one with most topics by default.
+    model
+        What the controller began with, in place of what the bag says.
+
+    Raises
+    ------
+    ReplayError
+        Topics or settings are missing.
+    TrainingError
+        The recorded settings cannot be used.
+    BagError
+        The bag cannot be read.
+    """
+    notes: list[str] = []
+    held = read_bag_index(bag)
+    known, namespaces = find_topics(held.types, namespace)
+    prefix = namespaces[0]
+    names = (f'{CONTROLLER}/{name}' for name in ('journal', *NUMBERS))
+    wanted = {name: f'{prefix}/{name}' for name in (REFERENCE, ODOMETRY, COMMAND, *names)}
+    topics = {
+        name: full
+        for name, full in (wanted | known).items()
+        if name in wanted and held.counts.get(full)
+    }
+    if missing := [name for name in (REFERENCE, ODOMETRY, COMMAND) if name not in topics]:
+        raise ReplayError(f'{bag}: these topics are not in the bag: {", ".join(missing)}')
+    revisions = _revisions(held, f'{prefix}/{CONTROLLER}/settings')
+    default = None
+    if not revisions:
+        with open_bag(bag) as recording:
+            default = recorded_parameters(recording, prefix, notes)
+    columns = read_columns(held, topics.values())
+    by_name = {name: columns[full] for name, full in topics.items()}
+    reader = _Reader(bag, held, by_name, revisions, default, model, notes)
+    lives, time_ns, commands = reader.lives()
+    recorded = reader.answers(lives, commands)
+    return ControllerInputs(
+        bag=bag,
+        odometry=by_name[ODOMETRY],
+        references=by_name[REFERENCE],
+        lives=tuple(lives),
+        time=(time_ns - held.start_ns) / NANOSECONDS,
+        recorded=recorded,
+        journalled=reader.journalled,
+        start_ns=held.start_ns,
+        notes=tuple(notes),
+    )
+
+
+def motions(column: TopicColumns) -> StateArray:
+    """Return odometry messages in the controller's own words."""
+    x, y, qx, qy, qz, qw, linear, angular = column.numbers.T
+    with np.errstate(over='ignore', invalid='ignore'):
+        sine = 2.0 * (qw * qz + qx * qy)
+        cosine = 1.0 - 2.0 * (qy * qy + qz * qz)
+        yaw = np.arctan2(sine, cosine)
+    yaw[~(np.isfinite(sine) & np.isfinite(cosine))] = np.nan
+    poses, twists = np.stack([x, y, yaw], axis=1), np.stack([linear, angular], axis=1)
+    return StateArray(column.stamps_ns, poses, twists)
+
+
+Revision = tuple[int, int, Mapping[str, object]]
+
+
+def _revisions(held: BagIndex, topic: str) -> list[Revision]:
+    """Return (received, revision, flat settings) in order of receipt."""
+    if not held.counts.get(topic):
+        return []
+    try:
+        return [(when, *parameters_from_json(text)) for when, text in read_strings(held, topic)]
+    except ValueError as error:
+        raise ReplayError(f'{topic}: {error}') from error
+
+
+def _parameters(values: Mapping[str, object]) -> ControllerParameters:
+    """Return the controller's part of its node's settings."""
+    names = _names()
+    return ControllerParameters.from_dict({k: v for k, v in values.items() if k in names})
+
+
+@cache
+def _names() -> frozenset[str]:
+    return frozenset(row.name for row in ControllerParameters.rows())
+
+
+class _Reader:
+    """Puts together the lives of the controller of one bag, and says what is lost."""
+
+    def __init__(
+        self,
+        bag: Path,
+        held: BagIndex,
+        columns: Mapping[str, TopicColumns],
+        revisions: Sequence[Revision],
+        default: ControllerParameters | None,
+        model: Mapping[str, Array] | None,
+        notes: list[str],
+    ) -> None:
+        self._bag, self._held, self._columns, self._notes = bag, held, columns, notes
+        self._revisions, self._default = list(revisions), default
+        self._model = model
+        journal = columns.get(f'{CONTROLLER}/journal')
+        self.journalled = journal is not None and len(journal) > 0
+        self._published: Integers = np.zeros(0, dtype=np.int64)
+
+    def lives(self) -> tuple[list[ControllerSession], Integers, Integers]:
+        """Return the lives, when their rows were published, and the command of each row."""
+        if not self.journalled:
+            return self._one_life()
+        journal = self._columns[f'{CONTROLLER}/journal']
+        # Of an older start, kept by the publisher for whoever comes late: in order of sending.
+        order = np.argsort(journal.published_ns, kind='stable')
+        rows, published = journal.integers[order], journal.published_ns[order]
+        fresh = np.concatenate([[True], np.diff(rows[:, 0]) != 0])  # heard twice after a restart
+        rows, published, received = (
+            rows[fresh],
+            published[fresh],
+            journal.received_ns[order][fresh],
+        )
+        self._published = published
+        bounds = [0, *(np.flatnonzero(np.diff(rows[:, 0]) < 0) + 1).tolist(), len(rows)]
+        lives = []
+        for first, last in zip(bounds, bounds[1:], strict=False):
+            lives.append(self._life(rows[first:last], received[first:last], first))
+        commands = self._columns[COMMAND]
+        return lives, published, commands_of(rows, published, commands.published_ns)
+
+    def answers(self, lives: Sequence[ControllerSession], commands: Integers) -> dict[str, Array]:
+        """Return what was recorded of each field, by row."""
+        events = np.concatenate([life.events for life in lives])
+        recorded = {name: np.full(len(events), np.nan) for name in FIELDS}
+        there = commands >= 0
+        for i, name in enumerate(SPEEDS):
+            recorded[name][there] = self._columns[COMMAND].numbers[commands[there], i]
+        steps = events == Event.STEP
+        for name in NUMBERS:
+            column = self._columns.get(f'{CONTROLLER}/{name}')
+            if column is None or not len(column):
+                continue
+            rows = rows_of(self._published, column.published_ns, steps)
+            recorded[name][rows[rows >= 0]] = column.numbers[rows >= 0, 0]
+        without = np.count_nonzero(np.isin(events, COMMAND_EVENTS) & ~there)
+        if without:
+            self._notes.append(f'{without} commands are not in the bag')
+        return recorded
+
+    def _one_life(self) -> tuple[list[ControllerSession], Integers, Integers]:
+        """Return the only life there is to see without a journal: one that does not end."""
+        odometry, commands = self._columns[ODOMETRY], self._columns[COMMAND]
+        taken, found = by_receipt(
+            odometry.received_ns, self._columns[REFERENCE].received_ns, commands.received_ns
+        )
+        if not found.size:
+            raise ReplayError(f'{self._bag}: no command answers an odometry message')
+        self._notes.append(
+            'the bag has no journal of the controller: the order in which messages were received '
+            'stands in for the one in which they were taken'
+        )
+        rows = np.zeros((found.size, len(JOURNAL_COLUMNS)), dtype=np.int64)
+        rows[:, 0] = np.arange(found.size)
+        rows[:, 2] = odometry.stamps_ns[taken.odometry]
+        received = odometry.received_ns[taken.odometry]
+        # Numbers are told right after the command of their step.
+        self._published = np.where(found >= 0, commands.published_ns[found], received)
+        life = self._made(rows, taken, np.zeros(found.size, dtype=np.bool_), 0, received)
+        return [life], received, found
+
+    def _life(self, rows: Integers, received: Integers, first: int) -> ControllerSession:
+        taken = match(rows, self._columns[ODOMETRY].stamps_ns, self._columns[REFERENCE].stamps_ns)
+        for count, what in (
+            (int(rows[0, 0]), 'events of the controller were before the recording'),
+            (taken.lost_events, 'events are missing in the journal of the controller'),
+            (taken.lost_odometry, 'odometry messages that the controller had are not in the bag'),
+            (taken.lost_references, 'references that the controller had are not in the bag'),
+        ):
+            if count:
+                self._notes.append(f'{count} {what}')
+        exact = np.zeros(len(rows), dtype=np.bool_)
+        sound = rows[0, 0] == 0
+        marks = np.flatnonzero(taken.broken | taken.restarts).tolist()
+        for k, until in zip([0, *marks], [*marks, len(rows)], strict=True):
+            if taken.restarts[k]:
+                sound = True
+            elif taken.broken[k]:
+                sound = False
+            exact[k:until] = sound
+        exact[(rows[:, 1] == Event.STEP) & (taken.odometry < 0)] = False
+        return self._made(rows, taken, exact, first, received)
+
+    def _made(
+        self, rows: Integers, taken: ConsumedMessages, exact: Flags, first: int, received: Integers
+    ) -> ControllerSession:
+        parameters, start = self._parameters_of(rows, received)
+        if start not in parameters:
+            start = min(parameters)
+            self._notes.append('the settings at the start are not in the bag, later ones are used')
+            exact[:] = False
+        known = np.isin(rows[:, 4], list(parameters))
+        unknown = (rows[:, 1] == Event.CONFIGURE) & ~known
+        if unknown.any():
+            self._notes.append(
+                f'{np.count_nonzero(unknown)} changes of settings are not in the bag'
+            )
+            exact[np.flatnonzero(unknown)[0] :] = False
+        model = self._model_of(rows)
+        if model is None and (rows[:, 1] == Event.MODEL).any():
+            exact[: next(iter(np.flatnonzero(taken.restarts).tolist()), len(rows))] = False
+        return ControllerSession(first, rows, taken, exact, parameters, start, model)
+
+    def _parameters_of(
+        self, rows: Integers, received: Integers
+    ) -> tuple[dict[int, ControllerParameters], int]:
+        """Return the settings of one life by revision, and the revision it begins with."""
+        if self._default is not None:
+            return {0: self._default}, 0
+        # The start is told before the first event.
+        starts = [i for i, entry in enumerate(self._revisions) if entry[1] == 0]
+        before = [i for i in starts if self._revisions[i][0] <= received[-1]]
+        begin = before[-1] if before else 0
+        later = [i for i in starts if i > begin]
+        own = self._revisions[begin : later[0] if later else len(self._revisions)]
+        found = {revision: _parameters(values) for _, revision, values in own}
+        changes = rows[rows[:, 1] == Event.CONFIGURE, 4]
+        start = 0
+        if rows[0, 0] > 0:  # what was in force before the first change that is in the bag
+            start = int(changes[0]) - 1 if changes.size else max(found)
+        return found, start
+
+    def _model_name(self) -> str:
+        """Return the path that the controller was given, as far as it is recorded."""
+        if self._revisions:
+            return str(self._revisions[0][2].get('model', ''))
+        tables = (
+            table for title, table in self._held.metadata_records.items() if CONTROLLER in title
+        )
+        return next((table['model'] for table in tables if 'model' in table), '')
+
+    def _model_of(self, rows: Integers) -> Mapping[str, Array] | None:
+        """Return what the controller began with; None for nothing, or where it is lost."""
+        if self._model is not None:
+            return self._model
+        wanted = rows[rows[:, 1] == Event.MODEL, 4]
+        name = self._model_name()
+        if not wanted.size and (self.journalled or not name):
+            return None
+        kept = list(read_attachment_data(self._held).values())
+        if name and Path(name).is_file():
+            kept.append(Path(name).read_bytes())
+        for content in kept:
+            if not wanted.size or zlib.crc32(content) == wanted[0]:
+                with tempfile.NamedTemporaryFile(suffix='.npz') as file:
+                    file.write(content)
+                    file.flush()
+                    return load_model(Path(file.name))
+        self._notes.append(
+            f'the model {name or "file"} that the controller began with is not in the bag: '
+            'give it by --model'
+        )
+        return None

@@ -1,0 +1,172 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Recomputes recorded inputs with the current controller, offline."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.bag.run.journal import Event
+from t3mpc_ros.control.batch_replay import StepResults
+from t3mpc_ros.control.control_law import TERM_NAMES
+from t3mpc_ros.control.controller import Controller, ControllerParameters
+from t3mpc_ros.control.watchdog import Reason
+from t3mpc_ros.evaluation.bag_report.topic_roles import WHEELS
+from t3mpc_ros.evaluation.process_replay.controller_inputs import (
+    FIELDS,
+    PAIRS,
+    ControllerInputs,
+    ControllerSession,
+    motions,
+)
+from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, StateArray
+
+Array = NDArray[np.float64]
+
+_STEP = int(Event.STEP)  # an enumeration is slower to compare
+OPEN_LOOP = (
+    'open loop: the robot is the recorded one, which was driven by the recorded commands; it does '
+    'not answer to other ones'
+)
+"""What has to be said of every rerun that is not made as the run was."""
+
+
+@dataclass(frozen=True)
+class ReplayResult:
+    """What the controller answered, a row an event as in :class:`Inputs`; NaN where nothing."""
+
+    fields: Mapping[str, Array]
+    """By :data:`~t3mpc_ros.evaluation.process_replay.controller_inputs.FIELDS`, or some of them, shape (n,) each."""
+    reasons: tuple[Reason | None, ...]
+    """Why the robot moved or did not; None at rows that are no step and no silence."""
+    steps: int
+    plain: int
+    """How many of the steps were done in compiled stretches, see :meth:`Controller.march`."""
+    parameters: ControllerParameters
+    """At the end."""
+    changed: Mapping[str, object]
+    """Settings that were given in place of the recorded ones."""
+
+
+def replay_controller(
+    inputs: ControllerInputs,
+    changes: Mapping[str, object] | None = None,
+    controllers: Sequence[Controller] | None = None,
+) -> ReplayResult:
+    """Return what today's controller makes of recorded inputs.
+
+    Parameters
+    ----------
+    inputs
+        Of the run.
+    changes
+        Settings by flat name that differ from the recorded ones, all through the run.
+    controllers
+        What :func:`start` has returned for these; they are used up.
+
+    Raises
+    ------
+    ParameterError
+        A changed setting is unknown or cannot be used.
+    ValueError
+        A model does not fit the settings.
+    """
+    changes = changes or {}
+    controllers = make_controllers(inputs, changes) if controllers is None else controllers
+    answers = StepResults.empty(inputs.events.size)
+    odometry, references = motions(inputs.odometry), motions(inputs.references)
+    parameters = ControllerParameters()
+    plain = 0
+    for life, controller in zip(inputs.lives, controllers, strict=True):
+        own = answers.part(life.first, life.first + len(life.rows))
+        plain += _replay_session(controller, life, changes, odometry, references, own)
+        parameters = controller.parameters
+    reasons = tuple(answers.reasons.tolist())
+    steps = len(reasons) - reasons.count(None)
+    return ReplayResult(_fields(answers), reasons, steps, plain, parameters, dict(changes))
+
+
+def make_controllers(
+    inputs: ControllerInputs, changes: Mapping[str, object] | None = None
+) -> list[Controller]:
+    """Return a controller for each life of the recorded one, compiled and as its node made it.
+
+    Raises
+    ------
+    ParameterError, ValueError
+        As :func:`rerun` does.
+    """
+    controllers = []
+    for life in inputs.lives:
+        controller = Controller(life.parameters[life.start].with_values(changes or {}))
+        controller.warm_up()
+        if life.model is not None:
+            controller.law.restore(life.model)
+        controllers.append(controller)
+    if controllers:
+        _compile_march(controllers[0].parameters)
+    return controllers
+
+
+def _compile_march(parameters: ControllerParameters) -> None:
+    """Compile the plain stretches too, with a robot that stands and shall stand."""
+    count = 20
+    stamps = np.arange(1, count + 1) * round(NANOSECONDS / parameters.rate)
+    standing = StateArray(stamps, np.zeros((count, 3)), np.zeros((count, 2)))
+    rows = np.zeros((count, 3), dtype=np.int64)
+    rows[:, 0] = np.arange(count)
+    rows[0, 2], rows[1:, 1:] = count, count
+    Controller(parameters).march(standing, standing, rows, StepResults.empty(count))
+
+
+def _replay_session(
+    controller: Controller,
+    life: ControllerSession,
+    changes: Mapping[str, object],
+    odometry: StateArray,
+    references: StateArray,
+    answers: StepResults,
+) -> int:
+    """Let the events of one life happen; return how many steps were plain."""
+    taken, events = life.taken, life.events
+    rows = np.stack([taken.odometry, taken.begin, taken.end], axis=1)
+    steps = (events == _STEP) & (taken.odometry >= 0)
+    plain = done = 0
+    for k in [*np.flatnonzero(~steps).tolist(), len(events)]:
+        if done < k:
+            part = rows[done:k]
+            plain += controller.march(odometry, references, part, answers.part(done, k))
+        done = k + 1
+        if k == len(events):
+            break
+        for j in range(int(taken.begin[k]), int(taken.end[k])):
+            controller.add_reference(references[j])
+        event, value = int(events[k]), int(life.rows[k, 4])
+        if event == Event.ODOMETRY_TIMEOUT:
+            controller.silent(None, 0)
+            answers.note(k, STANDSTILL, controller.status)
+        elif event == Event.FINISH:
+            answers.note(k, STANDSTILL, controller.status)
+        elif event == Event.CONFIGURE:
+            if value in life.parameters:
+                controller.configure(life.parameters[value].with_values(changes))
+        elif event == Event.RESET:
+            controller.enable(bool(value))
+            controller.reset()
+        elif event == Event.ENABLE:
+            controller.enable(bool(value))
+    return plain
+
+
+def _fields(answers: StepResults) -> dict[str, Array]:
+    """Return the answers by :data:`~t3mpc_ros.evaluation.process_replay.controller_inputs.FIELDS`."""
+    pairs = answers.pairs
+    pairs |= {f'terms/{name}': pairs[name] for name in (*TERM_NAMES, 'applied')}
+    columns = [*answers.twists.T]
+    columns += [pairs[name][:, z] for name in PAIRS for z in range(len(WHEELS))]
+    columns += [*answers.certificate.T]
+    return {
+        name: np.ascontiguousarray(column) for name, column in zip(FIELDS, columns, strict=True)
+    }

@@ -1,0 +1,212 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Matches recorded messages with the events of the controller journal."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.bag.run.journal import COMMAND_EVENTS, Event
+from t3mpc_ros.evaluation.training.training_data import match_commands
+from t3mpc_ros.geometry.types import NANOSECONDS
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class ConsumedMessages:
+    """Messages by event: rows of what was recorded."""
+
+    odometry: Integers
+    """The message of each step; -1 at other events, and where it is not in the bag, shape (n,)."""
+    begin: Integers
+    """First of the references that were handed over since the event before, shape (n,)."""
+    end: Integers
+    """One beyond the last of them."""
+    broken: Flags
+    """Whether something is lost between the event before and this one, shape (n,)."""
+    restarts: Flags
+    """Whether this is a reset after which nothing of before matters, shape (n,)."""
+    lost_odometry: int
+    lost_references: int
+    lost_events: int
+
+
+def match(rows: Integers, odometry_ns: Integers, reference_ns: Integers) -> ConsumedMessages:
+    """Return what the controller had, by its journal.
+
+    Parameters
+    ----------
+    rows
+        The journal of one life of the controller, shape (n, 5), see :mod:`record.run.journal`.
+    odometry_ns, reference_ns
+        Stamps of the recorded messages, in order of receipt.
+    """
+    number, event, stamp, handed, value = rows.T
+    steps = event == Event.STEP
+    odometry = np.full(len(rows), -1, dtype=np.int64)
+    odometry[steps] = _in_turn(stamp[steps], odometry_ns)
+    gaps = np.diff(number, prepend=number[:1] - 1) - 1
+    begin, end, lost, late = _reference_ranges(handed, np.where(steps, value, 0), reference_ns)
+    missing = steps & (odometry < 0)
+    reset = event == Event.RESET
+    return ConsumedMessages(
+        odometry,
+        begin,
+        end,
+        # Without a reference the robot stands, and all that is kept of odometry is its last stamp.
+        (missing & (handed > 0)) | (gaps > 0) | (lost > 0) | (reset & late),
+        reset & ~late,
+        int(np.count_nonzero(missing)),
+        int(lost.sum()),
+        int(gaps.sum()),
+    )
+
+
+def by_receipt(
+    odometry: Integers, references: Integers, commands: Integers
+) -> tuple[ConsumedMessages, Integers]:
+    """Return what the controller probably had, from when everything was received.
+
+    Of the odometry the messages that a command answers count as steps, and those between them.
+    The second answer is the command of each step, -1 where none is known, shape (n,).
+
+    Parameters
+    ----------
+    odometry, references, commands
+        When the messages were received, ns, ascending; at least one of each.
+    """
+    first = min(int(odometry[0]), int(commands[0]))
+    answered = match_commands((odometry - first) / NANOSECONDS, (commands - first) / NANOSECONDS)
+    sound = np.flatnonzero(answered >= 0)
+    rows = answered[sound]
+    steps = np.arange(rows.min(), rows.max() + 1) if rows.size else rows
+    found = np.full(steps.size, -1, dtype=np.int64)
+    found[rows - steps[:1]] = sound
+    end = np.searchsorted(references, odometry[steps], side='right').astype(np.int64)
+    begin = np.concatenate([np.zeros(1, dtype=np.int64), end])[: end.size]
+    unknown = np.ones(steps.size, dtype=np.bool_)
+    return ConsumedMessages(steps, begin, end, unknown, ~unknown, 0, 0, 0), found
+
+
+def commands_of(rows: Integers, published: Integers, sent: Integers) -> Integers:
+    """Return which recorded command belongs to each row, -1 where none does, shape (n,).
+
+    The controller sends a command, and then its row of the journal.
+
+    Parameters
+    ----------
+    rows
+        The journal, shape (n, 5).
+    published, sent
+        When rows and commands were published, by the clock of the controller, ns.
+    """
+    found = np.full(len(rows), -1, dtype=np.int64)
+    commanding = np.isin(rows[:, 1], COMMAND_EVENTS)
+    last = np.searchsorted(sent, published, side='right') - 1
+    before = np.concatenate([[np.iinfo(np.int64).min], published[:-1]])
+    fits = commanding & (last >= 0)
+    fits[fits] = sent[last[fits]] > before[fits]
+    found[fits] = last[fits]
+    if np.count_nonzero(fits) < np.count_nonzero(commanding) == sent.size:
+        # Nobody noted when they were published: as none is lost, their order will do.
+        found[commanding] = np.arange(sent.size)
+    return found
+
+
+def rows_of(published: Integers, told: Integers, steps: Flags) -> Integers:
+    """Return the row of the journal that each number was told after, -1 without one, shape (m,).
+
+    Parameters
+    ----------
+    published, told
+        When rows and numbers were published, ns.
+    steps
+        Whether a row is a step: only those are followed by numbers.
+    """
+    rows = np.searchsorted(published, told, side='right') - 1
+    rows[(rows >= 0) & ~steps[rows]] = -1
+    return np.asarray(rows, dtype=np.int64)
+
+
+def _in_turn(wanted: Integers, recorded: Integers) -> Integers:
+    """Return where each stamp is in the recording, one after the other; -1 where it is not."""
+    if not wanted.size or not recorded.size:
+        return np.full(wanted.size, -1, dtype=np.int64)
+    for first in np.flatnonzero(recorded == wanted[0]).tolist():
+        if np.array_equal(recorded[first : first + wanted.size], wanted):
+            return np.arange(first, first + wanted.size)
+    places: dict[int, list[int]] = {}
+    for place, stamp in enumerate(recorded.tolist()):
+        places.setdefault(stamp, []).append(place)
+    found = np.full(wanted.size, -1, dtype=np.int64)
+    now = 0
+    for k, stamp in enumerate(wanted.tolist()):
+        row = next((each for each in places.get(stamp, ()) if each >= now), None)
+        if row is not None:
+            found[k], now = row, row + 1
+    return found
+
+
+def _reference_ranges(
+    handed: Integers, newest: Integers, recorded: Integers
+) -> tuple[Integers, Integers, Integers, Flags]:
+    """Return from where to where references were handed over before each row, and lost ones.
+
+    ``newest`` is the stamp of the last of them, 0 where the row does not tell. The last answer is
+    whether some that came before a row are handed over after it, because it does not.
+    """
+    end = np.zeros(len(handed), dtype=np.int64)
+    tells = (newest != 0) & (handed > 0)
+    for last in np.flatnonzero(recorded == newest[tells][-1]).tolist() if tells.any() else ():
+        shift = last + 1 - int(handed[tells][-1])
+        if handed[tells][0] + shift <= 0:
+            continue
+        if np.array_equal(recorded[handed[tells] + shift - 1], newest[tells]):
+            # References that a row without a stamp tells of are handed over just as well.
+            end = np.where(handed > 0, np.maximum(handed + shift, 0), max(shift, 0))
+            end = np.minimum(end, recorded.size)
+            begin = np.concatenate([[max(shift, 0)], end[:-1]])
+            lost = np.zeros(len(handed), dtype=np.int64)
+            lost[np.flatnonzero(handed > 0)[0]] = max(-shift, 0)
+            return begin, end, lost, np.zeros(len(handed), dtype=np.bool_)
+    return _reference_ranges_with_gaps(handed, newest, recorded)
+
+
+def _reference_ranges_with_gaps(
+    handed: Integers, newest: Integers, recorded: Integers
+) -> tuple[Integers, Integers, Integers, Flags]:
+    """Return the same where references were lost, or heard by the recorder alone."""
+    places: dict[int, list[int]] = {}
+    for row, stamp in enumerate(recorded.tolist()):
+        places.setdefault(stamp, []).append(row)
+    begin, end, lost = np.zeros((3, len(handed)), dtype=np.int64)
+    late = np.zeros(len(handed), dtype=np.bool_)
+    told, now = 0, 0
+    guessed: list[int] = []
+    for k, (count, stamp) in enumerate(zip(handed.tolist(), newest.tolist(), strict=True)):
+        new = count - told
+        begin[k] = end[k] = now
+        if stamp == 0:  # a row that does not tell: none is lost, as far as is known
+            begin[k], end[k] = (
+                (end[guessed[-1]] if guessed else now),
+                min(now + new, len(recorded)),
+            )
+            guessed.append(k)
+            continue
+        if now + new <= len(recorded) and recorded[now + new - 1] == stamp:
+            begin[k], end[k] = (end[guessed[-1]] if guessed else now), now + new
+        else:
+            # Then those before rows that do not tell are not known: all come before this one.
+            for guess in guessed:
+                late[guess] = end[guess] > begin[guess]
+                begin[guess] = end[guess] = now
+            last = min((row for row in places.get(stamp, ()) if row >= now), default=now - 1)
+            lost[k] = new - min(new, last + 1 - now)
+            begin[k], end[k] = max(now, last + 1 - new), last + 1
+        told, now = count, int(end[k])
+        guessed.clear()
+    return begin, end, lost, late

@@ -1,0 +1,139 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The NT3FS-BM-MPC controller behind the interface of the baselines."""
+
+from collections.abc import Mapping
+from copy import deepcopy
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.control.control_law import Nt3fsMpcParameters
+from t3mpc_ros.control.switching_tracker import SwitchingTracker
+from t3mpc_ros.evaluation.baselines.baseline_controller import (
+    BaselineController,
+    NominalModel,
+    Observation,
+)
+from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.parameters.table import Parameters, parameter
+
+Array = NDArray[np.float64]
+
+JUMP = 0.3
+"""A change of r in one period (rad/s), beyond its slope, that is taken as a switch."""
+
+
+@dataclass(frozen=True)
+class ComposedParameters(Nt3fsMpcParameters):
+    """The controller's settings, and what a study may change about its predictor."""
+
+    random_predictor: bool = parameter(
+        False,
+        'replace what the predictor was taught by random output weights, and let it not learn: '
+        'to show what the teaching is worth',
+    )
+
+
+@lru_cache(maxsize=8)
+def _untouched(parameters: ComposedParameters, drive: str) -> SwitchingTracker:
+    """Return a controller to be copied: teaching its predictor takes a tenth of a second."""
+    return SwitchingTracker(parameters, drive)
+
+
+class ProposedController(BaselineController):
+    """The law of :mod:`t3mpc_ros.control`, with its plan across switches."""
+
+    parameters_type = ComposedParameters
+
+    def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None:
+        if not isinstance(parameters, ComposedParameters):
+            raise ValueError(
+                f'settings must be ComposedParameters: got {type(parameters).__name__}'
+            )
+        self.preview: bool = parameters.switches.preview  # type: ignore[misc]
+        self._period = nominal_model.period
+        self._period_ns = round(nominal_model.period * NANOSECONDS)
+        self._pursuit = deepcopy(_untouched(parameters, nominal_model.drive))
+        self._random = parameters.predictive.seed if parameters.random_predictor else None
+        if self._random is not None:
+            self._forget(self._random)
+        self._steps = 0
+        self._expected: Array = np.zeros(2)
+        self._slope: Array = np.zeros(2)
+        self.terms = self._pursuit.law.terms
+        """The law's terms of the last step, rows as in ``law.TERMS``, rad/s², shape (5, 2)."""
+
+    @property
+    def skill(self) -> Array:
+        """Skill of the predictor in the middle of its horizon, shape (2,)."""
+        return self._pursuit.law.predictive.skill
+
+    def learnt(self) -> dict[str, Array]:
+        """Return fuzzy coefficients and predictor weights, as a model file keeps them."""
+        return self._pursuit.law.learnt()
+
+    def restore(self, learnt: Mapping[str, Array]) -> None:
+        """Begin with another run's; random output weights stay random."""
+        self._pursuit.law.restore(learnt)
+        if self._random is not None:
+            self._forget(self._random)
+
+    def step(self, observation: Observation) -> Array:
+        """Return u (rad/s²) of (66)-(67) on the reference with its switches crossed."""
+        now_ns = self._steps * self._period_ns
+        if self._steps == 0:
+            self._pursuit.begin(now_ns, observation.speeds, observation.wanted)
+            if observation.future is not None:
+                for j in range(1, len(observation.future) - 1):
+                    self._look(now_ns + j * self._period_ns, observation.future, j)
+        elif observation.future is None:
+            self._notice(now_ns, observation)
+        else:
+            j = len(observation.future) - 2
+            self._look(now_ns + j * self._period_ns, observation.future, j)
+        self._expected = observation.wanted_next.copy()
+        self._slope = (observation.wanted_next - observation.wanted) / self._period
+        self._steps += 1
+        return self._pursuit.step(
+            now_ns, observation.speeds, observation.wanted, observation.wanted_next, self._period
+        )
+
+    def applied(self, acceleration: Array, *, limited: bool) -> None:
+        """Take note of the u that the drive's limits let through."""
+        self._pursuit.applied(acceleration, limited=limited)
+
+    def _look(self, instant_ns: int, future: Array, j: int) -> None:
+        """Announce a jump at row j of the future, seen by the rows around it."""
+        for i in range(2):
+            here, was = float(future[j, i]), float(future[j - 1, i])
+            slope = was - float(future[j - 2, i]) if j > 1 else 0.0
+            if abs(here - was - slope) > JUMP and abs(slope) <= JUMP:
+                break
+        else:
+            return
+        before = future[j - 1] - future[j - 2] if j > 1 else np.zeros(2)
+        if np.max(np.abs(before)) <= JUMP:
+            jump = future[j] - future[j - 1] - before
+            after = (future[j + 1] - future[j]) / self._period
+            self._pursuit.plan.announce(instant_ns, jump, after)
+
+    def _notice(self, now_ns: int, observation: Observation) -> None:
+        """Announce a jump that has just happened."""
+        jump = observation.wanted - self._expected
+        if np.max(np.abs(jump)) > JUMP:
+            slope = (observation.wanted_next - observation.wanted) / self._period
+            self._pursuit.plan.announce(now_ns, jump, slope)
+
+    def _forget(self, seed: int) -> None:
+        """Give the predictor random output weights of the size of the taught ones."""
+        predictive = self._pursuit.law.predictive
+        weights = predictive.weights()
+        generator = np.random.default_rng((seed, 7))
+        for name in ('output_weights', 'anchor'):
+            taught = weights[name]
+            size = float(np.sqrt(np.mean(taught**2)))
+            weights[name] = generator.normal(scale=size, size=taught.shape)
+        predictive.set_weights(weights)

@@ -1,0 +1,271 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Scenario of one simulated run: drive, noise, case, seed and reference."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceParameters
+from t3mpc_ros.control.actuation import LimitParameters
+from t3mpc_ros.control.speed_filter import SpeedFilterParameters
+from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel
+from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.simulation.plant.disturbances import DisturbanceParameters
+from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
+
+Array = NDArray[np.float64]
+
+DRIVES = ('torque', 'velocity')
+"""torque: u is applied as the torque theta_bar u, the paper's way; velocity: the wheels follow
+commanded speeds, late and lagging, as the robot's board does it."""
+
+TUNING_SEEDS = tuple(range(1, 10))
+"""Seeds on which gains are chosen."""
+PRETRAINING_SEEDS = (10, 11, 12)
+"""Seeds of the runs that a method which learns may have behind it: the same for all of them."""
+PRETRAINING_NOISE, PRETRAINING_DURATION = 0.04, 40.0
+"""Noise ((rad/s)²) and length (s) of those runs; the robot is the nominal one."""
+HELD_OUT_SEEDS = tuple(range(101, 121))
+"""Seeds on which results are reported. No gain was ever chosen on one of them."""
+
+RATE = 100.0
+"""Control periods a second in every run."""
+REFERENCE_DEVIATION = 3.0
+"""Standard deviation of every signal of the reference, rad/s."""
+STATE_DEVIATIONS = (10.6, 2.22, 0.937, 22.2)
+"""Those of the raw states of (85), measured at q = 0.98 over 10 000 s."""
+LONGEST_DEAD_TIME = 0.05
+"""Dead time up to which a reference is computed beyond the end of a run, s."""
+_ROBOT_SEEDS = 10_000  # robot seeds start here: no reference has one of them by accident
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """How the true robot of a run differs from the nominal one."""
+
+    text: str
+    changes: Mapping[str, float] = field(default_factory=dict)
+    """Settings of the robot from the start, by their flat names."""
+    later: Mapping[str, float] = field(default_factory=dict)
+    """Settings that change once more in mid-run."""
+    when: float = 0.5
+    """The instant of that change, as a share of the run."""
+    told: bool = False
+    """Whether the estimator and the methods know of ``changes``."""
+    drives: tuple[str, ...] = DRIVES
+    """The drives in which the case means something."""
+
+
+CASES: Mapping[str, Case] = {
+    'nominal': Case('the robot that everyone was told of, with its friction and disturbance'),
+    'mass +30 %': Case(
+        'body mass and inertia 30 % above nominal', {'mass_factor': 1.3, 'inertia_factor': 1.3}
+    ),
+    'mass -30 %': Case(
+        'body mass and inertia 30 % below nominal', {'mass_factor': 0.7, 'inertia_factor': 0.7}
+    ),
+    'friction x3': Case('three times the friction', {'friction_factor': 3.0}),
+    'load change': Case(
+        'at half of the run body mass and inertia rise by 30 % and friction doubles',
+        later={'mass_factor': 1.3, 'inertia_factor': 1.3, 'friction_factor': 2.0},
+    ),
+    'disturbance': Case(
+        'three times the bound of the disturbance torque',
+        {'disturbance.bound': 3.0 * DisturbanceParameters().bound},
+    ),
+    'dead time': Case(
+        'a command takes 30 ms instead of 10 ms to reach the wheels, and everyone knows it',
+        {'drive.dead_time': 0.03},
+        told=True,
+        drives=('velocity',),
+    ),
+}
+"""Every case by name, in the order of the tables."""
+
+
+@dataclass(frozen=True, slots=True)
+class SampledReference:
+    """A reference sampled once a control period, and on beyond the end of the run.
+
+    The arrays are shared by all runs that have it, and cannot be written to.
+    """
+
+    time: Array
+    """s, shape (n + m,)"""
+    wanted: Array
+    """r, rad/s, right wheel first, shape (n + m, 2)"""
+    rate: Array
+    """r' without the jumps, rad/s², shape (n + m, 2); at a jump that of the new signal"""
+    modes: NDArray[np.int64]
+    """Active switching mode, shape (n + m,)"""
+    switched: NDArray[np.bool_]
+    """Whether this is the first sample of a new mode, shape (n + m,)"""
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One run to be: everything but the method.
+
+    Two scenarios with the same seed have the same reference, and the same numbers drawn for
+    disturbance and noise, whatever else differs: methods and cases are compared pair by pair.
+
+    Parameters
+    ----------
+    drive
+        One of :data:`DRIVES`.
+    noise
+        Variance of the measured wheel speeds, (rad/s)².
+    case
+        One of :data:`CASES`.
+    seed
+        Of the reference; the robot's own is derived from it.
+    duration
+        s
+    lead
+        How far ahead methods with preview see the reference, s.
+
+    Raises
+    ------
+    ValueError
+        A value out of its range, or a case that the drive does not have.
+    """
+
+    drive: str
+    noise: float
+    case: str
+    seed: int
+    duration: float = 60.0
+    lead: float = 0.4
+
+    def __post_init__(self) -> None:
+        if self.drive not in DRIVES:
+            raise ValueError(f'drive must be one of {", ".join(DRIVES)}: got {self.drive!r}')
+        if self.case not in CASES:
+            raise ValueError(f'case must be one of {", ".join(CASES)}: got {self.case!r}')
+        drives = CASES[self.case].drives
+        if self.drive not in drives:
+            raise ValueError(
+                f'drive must be {" or ".join(drives)} in case {self.case!r}: got {self.drive!r}'
+            )
+        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
+            raise ValueError(f'seed must be a whole number of at least 0: got {self.seed!r}')
+        for name, low, high, unit in (
+            ('noise', 0.0, 100.0, '(rad/s)²'),
+            ('duration', 1.0 / RATE, 3600.0, 's'),
+            ('lead', 0.0, 10.0, 's'),
+        ):
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ValueError(f'{name} must be from {low:g} to {high:g} {unit}: got {value}')
+
+    def __str__(self) -> str:
+        return f'{self.drive}, noise {self.noise:g}, {self.case}, seed {self.seed}'
+
+    @property
+    def steps(self) -> int:
+        """How many control periods the run has."""
+        return round(self.duration * RATE)
+
+    @property
+    def change_step(self) -> int:
+        """The period at whose start :meth:`changed_robot` takes over."""
+        return round(CASES[self.case].when * self.steps)
+
+    @property
+    def limits(self) -> LimitParameters:
+        """What a velocity command may ask; the same in every run."""
+        return LimitParameters()
+
+    def reference(self) -> SampledReference:
+        """Return the wanted wheel speeds over the run and what preview may see beyond it."""
+        beyond = math.ceil((self.lead + LONGEST_DEAD_TIME) * RATE) + 3
+        return _reference(self.seed, self.steps + beyond)
+
+    def robot(self) -> PaperRobotParameters:
+        """Return the true robot, as it is when the run begins."""
+        return self._nominal().with_values(
+            {
+                'noise.variance': float(self.noise),
+                'seed': _ROBOT_SEEDS + self.seed,
+                **CASES[self.case].changes,
+            }
+        )
+
+    def changed_robot(self) -> PaperRobotParameters | None:
+        """Return the true robot from :attr:`change_step` on; None when it stays as it was."""
+        later = CASES[self.case].later
+        return self.robot().with_values(later) if later else None
+
+    def nominal_model(self, rate: float = RATE) -> NominalModel:
+        """Return what a method is told that answers ``rate`` times a second."""
+        robot = self._told()
+        velocity = self.drive == 'velocity'
+        return NominalModel(
+            drive=self.drive,
+            period=1.0 / rate,
+            lag=robot.drive.lag,
+            acceleration=_isotropic_acceleration(self.limits, robot.geometry)
+            if velocity
+            else math.inf,
+            robot=robot,
+        )
+
+    def estimate(self) -> SpeedFilterParameters:
+        """Return what the state estimator of every method is told.
+
+        The true variance of the noise, and the lag and dead time that everyone knows.
+        """
+        drive = self._told().drive
+        return SpeedFilterParameters.from_dict(
+            {
+                'noise_variance': float(self.noise),
+                'lag': drive.lag,
+                'dead_time': drive.dead_time,
+            }
+        )
+
+    def _nominal(self) -> PaperRobotParameters:
+        return PaperRobotParameters.from_dict({'drive.kind': self.drive, 'rate': RATE})
+
+    def _told(self) -> PaperRobotParameters:
+        case, nominal = CASES[self.case], self._nominal()
+        return nominal.with_values(case.changes) if case.told else nominal
+
+
+def reference_parameters(seed: int) -> ReferenceParameters:
+    """Return the defaults with every signal scaled to :data:`DEVIATION`."""
+    amplitude = tuple(REFERENCE_DEVIATION / deviation for deviation in STATE_DEVIATIONS)
+    return ReferenceParameters.from_dict({'rate': RATE, 'amplitude': amplitude, 'seed': seed})
+
+
+@lru_cache(maxsize=128)  # about 0.3 MB for a run of a minute
+def _reference(seed: int, rows: int) -> SampledReference:
+    chaos = ChaoticReference(reference_parameters(seed), WheelGeometry())
+    run = SampledReference(
+        time=np.arange(rows) / RATE,
+        wanted=np.empty((rows, 2)),
+        rate=np.empty((rows, 2)),
+        modes=np.empty(rows, dtype=np.int64),
+        switched=np.empty(rows, dtype=np.bool_),
+    )
+    for k in range(rows):
+        sample = chaos.advance()
+        run.wanted[k] = sample.wheels
+        run.rate[k] = sample.rate
+        run.modes[k] = sample.mode
+        run.switched[k] = sample.switched
+    for values in (run.time, run.wanted, run.rate, run.modes, run.switched):
+        values.setflags(write=False)
+    return run
+
+
+def _isotropic_acceleration(limits: LimitParameters, geometry: WheelGeometry) -> float:
+    """Return the acceleration (rad/s²) that both wheels may have at once, in any direction."""
+    straight = limits.linear_acceleration / geometry.wheel_radius
+    turning = limits.angular_acceleration * geometry.half_separation / geometry.wheel_radius
+    return min(straight, turning, limits.wheel_acceleration)

@@ -1,0 +1,396 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Fit of the predictor (35)-(44) and the fuzzy coefficients (31) to training data."""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.control.control_law import Nt3fsMpcParameters
+from t3mpc_ros.evaluation.training.training_data import TrainingData, TrainingError
+from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator
+from t3mpc_ros.mpc.boltzmann_machine import BoltzmannMachine, LayerSizes, make_machine
+from t3mpc_ros.mpc.predictor import LearningConstants, PredictiveParameters, Predictor
+from t3mpc_ros.mpc.pretraining import SampleTiming, nominal_step_response
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MoveEffect:
+    """What a run tells of the effect of v_p."""
+
+    response: float
+    """Change of the error per change of v_p that is held, (rad/s)/(rad/s²)."""
+    error: float
+    """Standard error of it; infinite when the run tells nothing."""
+    own: float
+    """Standard deviation of the v_p that neither errors nor older v_p foretell, rad/s²."""
+
+
+def estimate_move_effect(
+    errors: Array, moves: Array, delta_lags: int, move_lags: int, ahead: int
+) -> MoveEffect:
+    r"""Return the effect of v_p ``ahead`` periods on, by least squares on the lags of (35).
+
+    .. math:: \delta_t = \sum_{i=1}^{n_a} a_i \delta_{t-i} + \sum_{i=1}^{n_b} b_i v_{p,t-i} + w_t
+
+    The standard error is that of the step response of this model, by its gradient (the delta
+    method) and the covariance s² (XᵀX)^-1 of the coefficients (Ljung, System Identification,
+    1999, chapter 9). In a closed loop v_p is nearly a function of the errors, so XᵀX is nearly
+    singular unless something else moves it.
+
+    Parameters
+    ----------
+    errors, moves
+        *Newest first*, NaN where they are not known, shape (N,).
+    delta_lags, move_lags
+        n_a and n_b.
+    ahead
+        Periods.
+    """
+    count = errors.size - max(delta_lags, move_lags)
+    nothing = MoveEffect(math.nan, math.inf, 0.0)
+    if count < 1:
+        return nothing
+    lags = [errors[i : i + count] for i in range(1, delta_lags + 1)]
+    lags += [moves[i : i + count] for i in range(1, move_lags + 1)]
+    table = np.stack([errors[:count], *lags], axis=1)
+    table = table[np.isfinite(table).all(axis=1)]
+    known, target = table[:, 1:], table[:, 0]
+    if len(table) <= 2 * known.shape[1]:
+        return nothing
+    newest, others = known[:, delta_lags], np.delete(known, delta_lags, axis=1)
+    own = newest - others @ np.linalg.lstsq(others, newest, rcond=None)[0]
+    spread = math.sqrt(float(own @ own) / len(table))
+    if np.linalg.matrix_rank(known) < known.shape[1]:
+        return replace(nothing, own=spread)
+    values = np.linalg.lstsq(known, target, rcond=None)[0]
+    missed = target - known @ values
+    variance = float(missed @ missed) / (len(table) - values.size)
+    covariance = variance * np.linalg.inv(known.T @ known)
+    response = _response(values, delta_lags, ahead)
+    slope = np.empty(values.size)
+    for i, value in enumerate(values):
+        step = 1e-6 * max(abs(value), 1e-3)
+        moved = values.copy()
+        moved[i] += step
+        slope[i] = (_response(moved, delta_lags, ahead) - response) / step
+    return MoveEffect(response, math.sqrt(float(slope @ covariance @ slope)), spread)
+
+
+def _response(values: Array, delta_lags: int, ahead: int) -> float:
+    """Return the error ``ahead`` periods after v_p has stepped from 0 to 1."""
+    a, b = values[:delta_lags], values[delta_lags:]
+    errors, moves = np.zeros(a.size), np.zeros(b.size)
+    for _ in range(ahead):
+        moves[1:] = moves[:-1].copy()
+        moves[0] = 1.0
+        new = float(a @ errors + b @ moves)
+        errors[1:] = errors[:-1].copy()
+        errors[0] = new
+    return float(errors[0])
+
+
+MIN_EXCITATION = 10.0
+"""Least length of what can be learnt from, s."""
+MIN_PERIODS = 40
+"""Least predictive periods of a stretch without a gap: shorter ones do not show their phase."""
+JUDGED = 20
+"""Least predictive periods without a gap that a predictor is judged by."""
+UNCERTAIN = 0.5
+"""Largest standard error of the effect of v_p, as a share of the nominal one: twice this, and an
+effect could not be told from none."""
+PASSES, SHARE = 12, 0.1
+"""How often the coefficients go through a run, and mu of the first time."""
+SETTLING = 0.5
+"""Start of every stretch that the coefficients do not learn from, s: the estimate settles."""
+
+
+@dataclass(frozen=True)
+class PredictorFit:
+    """What the predictor learnt."""
+
+    weights: dict[str, Array]
+    """As :meth:`PredictiveController.weights` returns them."""
+    uncertainty: Array
+    """Standard error of the effect of v_p over the nominal effect, shape (2,)."""
+    taught: float
+    """s"""
+
+
+def periods(
+    replay: TrainingData, parameters: PredictiveParameters, rate: float
+) -> tuple[Array, Array]:
+    """Return errors (rad/s) and moves (rad/s²) of each predictive period, oldest first, (N, 2).
+
+    They are sampled as :func:`t3mpc_ros.mpc.skill.gather` does: an error is the mean of the newest
+    ``average`` ones at the step that takes the sample, and v_p holds from that step on. How long
+    before a published v_p that was is seen in u, which jumps with v_p: so a recording may begin
+    at any time.
+
+    Messages may be missing. What is not known is NaN: errors that were rebuilt wrongly or not at
+    all, v_p in periods most of which limits cut u, and a whole row wherever a period is without a
+    message, or runs do not follow each other. Nothing is learnt across such a gap, nor from an
+    error whose lags reach into one; all the rest counts.
+
+    Parameters
+    ----------
+    replay
+        One or several runs.
+    settings
+        Of the predictive term.
+    rate
+        Control periods a second.
+
+    Raises
+    ------
+    TrainingError
+        v_p was published too seldom.
+    """
+    decimation, average, span = (
+        parameters.decimation,
+        parameters.average,
+        parameters.decimation / rate,
+    )
+    gap = np.full((1, 2), math.nan)
+    errors, moves = [gap], [gap]
+    jumps = np.abs(np.diff(replay.rest, axis=0, prepend=replay.rest[:1])).sum(axis=1)
+    edges = [*np.flatnonzero(replay.begins).tolist(), len(replay)]
+    for first, last in pairwise(edges):
+        said = first + np.flatnonzero(np.isfinite(replay.moves[first:last]).all(axis=1))
+        said = _one_each(replay, said, span)
+        said = said[said >= first + decimation + average]
+        if said.size < MIN_PERIODS:
+            continue
+        interval = float(np.median(np.diff(replay.time[said])))
+        if interval > 1.5 * span:
+            raise TrainingError(
+                f'v_p must be published in each predictive period of {span:g} s: it was every '
+                f"{interval:.2g} s; set the controller's terms_rate to {1.0 / span:g} Hz"
+            )
+        # The median, because limits make u jump too, but seldom.
+        starts = said - np.argmax([np.median(jumps[said - late]) for late in range(decimation)])
+        seen = starts[:, None] - np.arange(average)
+        held = np.minimum(starts[:, None] + np.arange(decimation), last - 1)
+        error, move = replay.errors[seen].mean(axis=1), replay.moves[said]
+        whole = (average - 0.5) / rate > replay.time[starts] - replay.time[seen[:, -1]]
+        error[~whole] = math.nan
+        move[replay.limited[held].mean(axis=1) > 0.5] = math.nan
+        torn = 1 + np.flatnonzero(np.abs(np.diff(replay.time[starts]) / span - 1.0) > 0.5)
+        errors += [np.insert(error, torn, math.nan, axis=0), gap]
+        moves += [np.insert(move, torn, math.nan, axis=0), gap]
+    return np.concatenate(errors), np.concatenate(moves)
+
+
+def _one_each(replay: TrainingData, rows: NDArray[np.int64], span: float) -> NDArray[np.int64]:
+    """Return one of the rows per predictive period: the first of those with the same v_p."""
+    kept: list[int] = []
+    for row in rows.tolist():
+        if (
+            not kept
+            or replay.time[row] - replay.time[kept[-1]] > 0.9 * span
+            or not np.array_equal(replay.moves[row], replay.moves[kept[-1]])
+        ):
+            kept.append(row)
+    return np.array(kept, dtype=np.int64)
+
+
+def fit_predictor(parameters: Nt3fsMpcParameters, errors: Array, moves: Array) -> PredictorFit:
+    """Return what the predictor learns from all of a run in periods, see :func:`periods`.
+
+    Raises
+    ------
+    TrainingError
+        Too little is known, or v_p moved too little to show what it does.
+    """
+    predictive, period = parameters.predictive, 1.0 / parameters.rate
+    timing = SampleTiming(period, predictive.decimation, predictive.average)
+    taught = np.count_nonzero(np.isfinite(errors + moves).all(axis=1)) * timing.span
+    parts = stretches(errors, moves)
+    if taught < MIN_EXCITATION or not parts:
+        raise TrainingError(
+            f'the run must hold at least {MIN_EXCITATION:g} s with known errors and v_p, and of these '
+            f'{JUDGED * timing.span:g} s without a gap: got {taught:.1f} s, the longest stretch '
+            f'{_longest(errors + moves) * timing.span:.1f} s'
+        )
+    loop = replace(predictive.nominal, feedback_gain=min(feedback_slope(parameters), 100.0))
+    middle = max(predictive.horizon // 2, 1)
+    nominal = nominal_step_response(loop, timing, middle)[-1]
+    # Newest first, as everything in the machine's room.
+    runs = [
+        (np.ascontiguousarray(errors[::-1, z]), np.ascontiguousarray(moves[::-1, z]))
+        for z in range(2)
+    ]
+    effects = [
+        estimate_move_effect(*run, predictive.delta_lags, predictive.move_lags, middle)
+        for run in runs
+    ]
+    uncertainty = np.array([each.error for each in effects]) / nominal
+    if not np.max(uncertainty) <= UNCERTAIN:
+        worst = int(np.argmax(uncertainty))
+        raise TrainingError(
+            'v_p must move more to show what it does: by itself, apart from what errors and older '
+            f'v_p foretell, it moved by {effects[worst].own:.2g} rad/s² (standard deviation), so '
+            f'in {taught:.0f} s its effect is known to {100.0 * uncertainty[worst]:.0f} % of the '
+            f'nominal one, and {100.0 * UNCERTAIN:.0f} % are needed. Set predictive.dither of the '
+            'controller while recording (a few rad/s²), record for longer, or keep the predictor '
+            'as it is (--keep-predictor)'
+        )
+    learning = LearningConstants.of(predictive, timing.span)
+    generator = np.random.default_rng(predictive.seed)
+    longest = max(parts, key=lambda part: part[0][0].size)
+    each = []
+    for z, run in enumerate(runs):
+        predictor = Predictor(_machine(predictive, generator), predictive.horizon, longest[z])
+        trust = predictive.trust / timing.span
+        predictor.fit(*run, predictive.excitation, trust, learning)
+        each.append(predictor.weights())
+    weights = {name: np.stack([one[name] for one in each]) for name in each[0]}
+    return PredictorFit(weights, uncertainty, float(taught))
+
+
+def _machine(parameters: PredictiveParameters, generator: np.random.Generator) -> BoltzmannMachine:
+    """Return a machine with first weights."""
+    shape = LayerSizes(parameters.delta_lags, parameters.move_lags, parameters.hidden)
+    scales = parameters.delta_scale, parameters.move_scale
+    return make_machine(shape, *scales, parameters.spread, generator)
+
+
+def stretches(errors: Array, moves: Array) -> list[list[tuple[Array, Array]]]:
+    """Return the parts of a run without a gap, of at least :data:`JUDGED` periods.
+
+    Parameters
+    ----------
+    errors, moves
+        As :func:`periods` returns them, shape (N, 2).
+
+    Returns
+    -------
+    list
+        For each part (errors, moves) of each wheel, *newest first*.
+    """
+    gaps = np.flatnonzero(np.isnan(errors + moves).any(axis=1))
+    edges = [-1, *gaps.tolist(), len(errors)]
+    return [
+        [
+            (
+                np.ascontiguousarray(errors[low + 1 : high, z][::-1]),
+                np.ascontiguousarray(moves[low + 1 : high, z][::-1]),
+            )
+            for z in range(errors.shape[1])
+        ]
+        for low, high in pairwise(edges)
+        if high - low > JUDGED
+    ]
+
+
+def _longest(table: Array) -> int:
+    """Return how many rows in a row are known."""
+    gaps = np.flatnonzero(np.isnan(table).any(axis=1))
+    return int(np.diff([-1, *gaps.tolist(), len(table)]).max()) - 1
+
+
+def feedback_slope(parameters: Nt3fsMpcParameters) -> float:
+    """Return what the law does against a small error, 1/s: K, and the slope of (81)-(82)."""
+    law = parameters.law
+    return law.gain + (parameters.compensated_bound / law.smoothing if law.compensator else 0.0)
+
+
+def skills(
+    parameters: PredictiveParameters,
+    span: float,
+    weights: dict[str, Array],
+    parts: list[list[tuple[Array, Array]]],
+) -> Array:
+    """Return the skill of saved weights on a run: next step and middle of the horizon, (2, m).
+
+    1 is perfect; 0 is no better than no prediction, which is that the error stays what it is. The
+    squares of all stretches are put together. NaN when there is none.
+
+    Parameters
+    ----------
+    settings, span
+        Of the predictive term, and its period, s.
+    weights
+        As :meth:`PredictiveController.weights` returns them.
+    parts
+        As :func:`stretches` returns them.
+    """
+    learning = LearningConstants.of(parameters, span)
+    outputs = len(weights['scales'])
+    missed, persistence_mse = np.zeros((2, outputs)), np.zeros((2, outputs))
+    for part in parts:
+        for z, run in enumerate(part):
+            machine = _machine(parameters, np.random.default_rng(parameters.seed))
+            predictor = Predictor(machine, parameters.horizon, run)
+            predictor.set_weights({name: value[z] for name, value in weights.items()}, learning)
+            weight = run[0].size - 1 - predictor.past.errors.size
+            missed[:, z] += weight * predictor.past.predicted
+            persistence_mse[:, z] += weight * predictor.past.persistence_mse
+    with np.errstate(invalid='ignore'):
+        return 1.0 - missed / persistence_mse
+
+
+def fit_coefficients(parameters: Nt3fsMpcParameters, replay: TrainingData) -> Array:
+    r"""Return the coefficients with which g explains what the estimate could not, (2, 2 r lambda).
+
+    .. math:: \alpha \leftarrow P\left[\alpha + \gamma_n \Phi(\chi)
+              \left(\hat d - \Phi(\chi)^T\alpha\right)\right], \qquad
+              \gamma_n = \frac{\mu}{\|\Phi\|^2}
+
+    This is (77)-(78) with the estimate's own error in the place of delta, per sample and
+    normalised (Nagumo and Noda 1967, doi 10.1109/TAC.1967.1098599): any mu below 2 is stable. mu
+    falls with the passes, so that what is not a function of chi averages out. P is the projection
+    of the adaptation. d is the estimator's, as the law feels it; what g is to cancel.
+
+    Raises
+    ------
+    TrainingError
+        The run is too short.
+    """
+    rows = _informative_rows(parameters, replay)
+    decimation = parameters.predictive.decimation
+    if rows.size * decimation < MIN_EXCITATION * parameters.rate:
+        raise TrainingError(
+            f'the run must hold at least {MIN_EXCITATION:g} s of motion: '
+            f'got {rows.size * decimation / parameters.rate:.1f} s'
+        )
+    # So large a gamma is cut to the step limit: a share mu / |Phi|² of each miss.
+    how = AdaptationParameters(gamma=1e6, radius=parameters.adaptation.radius)
+    estimator = FuzzyEstimator(parameters.fuzzy, how)
+    for number in range(PASSES):
+        estimator.configure(replace(how, step_limit=SHARE / (1.0 + number)))
+        for row in rows:
+            estimate = estimator.evaluate(replay.speeds[row])
+            estimator.adapt(replay.unexplained[row] - estimate, 1.0)
+    return estimator.coefficients.copy()
+
+
+def explained(parameters: Nt3fsMpcParameters, coefficients: Array, replay: TrainingData) -> Array:
+    """Return which share of the variance of the unexplained acceleration g accounts for, (2,).
+
+    Negative where g is worse than nothing; NaN when the run does not tell.
+    """
+    rows = _informative_rows(parameters, replay)
+    if rows.size < 2:
+        return np.full(2, math.nan)
+    estimator = FuzzyEstimator(parameters.fuzzy, parameters.adaptation)
+    estimator.coefficients = coefficients
+    wanted = replay.unexplained[rows]
+    estimates = np.array([estimator.evaluate(replay.speeds[row]) for row in rows])
+    missed = np.mean((wanted - estimates) ** 2, axis=0)
+    share: Array = 1.0 - missed / np.maximum(wanted.var(axis=0), 1e-12)
+    return share
+
+
+def _informative_rows(parameters: Nt3fsMpcParameters, replay: TrainingData) -> NDArray[np.int64]:
+    """Return the rows that tell of the unexplained acceleration, one in each predictive period."""
+    settling = round(SETTLING * parameters.rate)
+    since = np.arange(len(replay))
+    since -= np.maximum.accumulate(np.where(replay.begins, since, 0))
+    known = np.isfinite(replay.errors).all(axis=1) & (since >= settling)
+    return np.flatnonzero(known)[:: parameters.predictive.decimation]

@@ -1,0 +1,172 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Model fitted to simulated runs, assessed on held-out seeds."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.control.control_law import TERM_NAMES
+from t3mpc_ros.evaluation.closed_loop import LoopRecord, MethodSpec, pretrain, run
+from t3mpc_ros.evaluation.confidence_intervals import interval, mean, paired
+from t3mpc_ros.evaluation.methods import FULL, methods, proposed_parameters
+from t3mpc_ros.evaluation.proposed_method import ComposedParameters, ProposedController
+from t3mpc_ros.evaluation.scenario import (
+    HELD_OUT_SEEDS,
+    PRETRAINING_DURATION,
+    PRETRAINING_NOISE,
+    PRETRAINING_SEEDS,
+    RATE,
+    Scenario,
+)
+from t3mpc_ros.evaluation.training.cross_validation import MIDDLE, NEXT_STEP, pair
+from t3mpc_ros.evaluation.training.fit import periods, skills
+from t3mpc_ros.evaluation.training.training_data import TrainingData
+from t3mpc_ros.evaluation.tuning.tuned_parameters import PACKAGED_FILE
+from t3mpc_ros.mpc.predictive_controller import PredictiveController
+from t3mpc_ros.mpc.pretraining import split_runs
+
+Array = NDArray[np.float64]
+
+EARLY = 10.0
+"""The first seconds, in which a model shows most."""
+_FOLLOWED = [TERM_NAMES.index(name) for name in ('feedback', 'feedforward', 'compensator')]
+
+
+def full_parameters(drive: str) -> ComposedParameters:
+    """Return the settings of our full controller: tuned, where tuned ones come with the package.
+
+    Raises
+    ------
+    StoreError
+        What is stored does not fit this version.
+    """
+    parameters = (
+        methods(drive)[FULL].parameters
+        if PACKAGED_FILE.is_file()
+        else proposed_parameters()[drive]
+    )
+    if not isinstance(parameters, ComposedParameters):
+        raise TypeError(f'{FULL} must have ComposedParameters: got {type(parameters).__name__}')
+    return parameters
+
+
+def fit_simulated_runs(drive: str) -> tuple[Mapping[str, Array], ComposedParameters]:
+    """Return what the full controller learns in the practice runs, and its settings."""
+    parameters = full_parameters(drive)
+    return pretrain(ProposedController, parameters, drive), parameters
+
+
+def assess(
+    drive: str,
+    parameters: ComposedParameters,
+    learnt: Mapping[str, Array],
+    seeds: Sequence[int],
+    progress: Callable[[str], None] = lambda text: None,
+) -> str:
+    """Return in words what a model is worth on seeds that it was not learnt on.
+
+    Parameters
+    ----------
+    drive
+        One of ``scenario.DRIVES``.
+    settings, learnt
+        Of the controller, and what it starts with.
+    seeds
+        Runs with the model and without it.
+    progress
+        Told what is done.
+    """
+    without = MethodSpec(FULL, ProposedController, parameters)
+
+    def with_model(*given: object) -> ProposedController:
+        controller = ProposedController(parameters, *given)  # type: ignore[arg-type]
+        controller.restore(learnt)
+        return controller
+
+    fresh, taught = [], []
+    for seed in seeds:
+        scenario = Scenario(drive, PRETRAINING_NOISE, 'nominal', seed, PRETRAINING_DURATION)
+        fresh.append(run(scenario, without))
+        taught.append(run(scenario, with_model))
+        progress(f'seed {seed} of {seeds[0]} to {seeds[-1]}')
+    early, late = (
+        [[measure(record) for record in records] for records in (fresh, taught)]
+        for measure in (early_rmse, LoopRecord.rmse)
+    )
+    lines = [
+        f'practice: {len(PRETRAINING_SEEDS)} runs of {PRETRAINING_DURATION:g} s, drive {drive}, noise '
+        f'{PRETRAINING_NOISE:g} (rad/s)², seeds {", ".join(map(str, PRETRAINING_SEEDS))}',
+        f'predictor: judged by errors and v_p in the last quarter of seed {seeds[0]} (right/left)',
+        skill_table(held_out_skills(parameters, learnt, fresh[0])),
+        f'RMSE (rad/s) on seeds {seeds[0]} to {seeds[-1]}, mean ± 95 %',
+        f'                 first {EARLY:g} s         from 3 s on',
+    ]
+    for row, name in enumerate(('without model', 'with model')):
+        cells = [f'{mean(part[row]):.4f} ± {interval(part[row]):.4f}' for part in (early, late)]
+        lines.append(f'  {name:<13}  {cells[0]}    {cells[1]}')
+    gains = [paired(part[1], part[0]) for part in (early, late)]
+    cells = [f'{gain.mean:+.4f} ± {gain.half:.4f}' for gain in gains]
+    lines.append(f'  {"difference":<13} {cells[0]}   {cells[1]}')
+    return '\n'.join(lines)
+
+
+def early_rmse(record: LoopRecord) -> float:
+    """Return the tracking RMSE over both wheels in the first seconds, rad/s."""
+    return float(np.sqrt(np.mean(record.error[record.time < EARLY] ** 2)))
+
+
+def held_out_skills(
+    parameters: ComposedParameters, learnt: Mapping[str, Array], record: LoopRecord
+) -> dict[str, Array]:
+    """Return the skills before and after on the last quarter of a run, as :func:`skills` does."""
+    predictive = parameters.predictive
+    term = PredictiveController(predictive, 1.0 / RATE, parameters.law.gain)
+    prefix = 'predictive.'
+    after = {key[len(prefix) :]: value for key, value in learnt.items() if key.startswith(prefix)}
+    errors, moves = periods(training_data_of(record, parameters), predictive, RATE)
+    last_quarter = [[trial for _, trial in split_runs(errors, moves, 2)]]
+    return {
+        name: skills(predictive, term.span, weights, last_quarter)
+        for name, weights in (('before', term.weights()), ('after', after))
+    }
+
+
+def skill_table(skills: Mapping[str, Array]) -> str:
+    """Return skills of both wheels as lines; each is (next step, middle) by (right, left)."""
+    width = max(11, *map(len, skills))
+    lines = [f'  {"skill after":<{width}}  {NEXT_STEP}     {MIDDLE}']
+    for name, values in skills.items():
+        lines.append(f'  {name:<{width}}  {pair(values[0], ".2f"):<12}  {pair(values[1], ".2f")}')
+    return '\n'.join(lines)
+
+
+def training_data_of(record: LoopRecord, parameters: ComposedParameters) -> TrainingData:
+    """Return a run of the lab as the replay of a bag would have it."""
+    terms = record.terms
+    begins = np.zeros(record.time.size, dtype=np.bool_)
+    begins[0] = True
+    return TrainingData(
+        time=record.time,
+        errors=-terms[:, TERM_NAMES.index('feedback')] / parameters.law.gain,
+        moves=terms[:, TERM_NAMES.index('predictive')],
+        rest=record.command - terms[:, _FOLLOWED].sum(axis=1),
+        speeds=record.estimated,
+        unexplained=record.unexplained,
+        limited=record.limited,
+        begins=begins,
+    )
+
+
+def held_out_seeds(count: int) -> Sequence[int]:
+    """Return the first seeds of those on which results are reported.
+
+    Raises
+    ------
+    ValueError
+        There are not as many.
+    """
+    if not 1 <= count <= len(HELD_OUT_SEEDS):
+        raise ValueError(f'seeds must be from 1 to {len(HELD_OUT_SEEDS)}: got {count}')
+    return HELD_OUT_SEEDS[:count]

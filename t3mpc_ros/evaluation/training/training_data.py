@@ -1,0 +1,304 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Training data from a recorded run: errors, moves and residuals of each controller step."""
+
+import ast
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.bag.reader import BagReader, open_bag
+from t3mpc_ros.control.actuation import wheel_limits
+from t3mpc_ros.control.control_law import TERM_NAMES
+from t3mpc_ros.control.controller import Controller, ControllerParameters
+from t3mpc_ros.evaluation.bag_report.topic_roles import (
+    COMMAND,
+    ODOMETRY,
+    REFERENCE,
+    WHEELS,
+    find_topics,
+)
+from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
+from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, BodyTwist, State
+from t3mpc_ros.parameters.table import ParameterError, ParameterSpec
+
+Array = NDArray[np.float64]
+
+MOVES, FEEDBACK = 'controller/terms/predictive', 'controller/terms/feedback'
+NEEDED = (
+    REFERENCE,
+    ODOMETRY,
+    COMMAND,
+    *(f'{name}/{wheel}' for name in (MOVES, FEEDBACK) for wheel in WHEELS),
+)
+"""Topics without which nothing can be learnt from a bag."""
+
+ALIKE = 100
+"""Commands to each side that tell which message one of them answers."""
+DISAGREES = 0.2
+"""Difference between a rebuilt error and the published one that is one, as a share of the error
+that counts as mere noise. Where nothing was lost they agree to rounding."""
+
+_TWIST = {'linear': 'twist.twist.linear.x', 'angular': 'twist.twist.angular.z'}
+_FEEDBACK = TERM_NAMES.index('feedback')
+_FOLLOWED = [TERM_NAMES.index(name) for name in ('feedback', 'feedforward', 'compensator')]
+
+
+class TrainingError(RuntimeError):
+    """A bag that nothing can be learnt from; the text says which and why."""
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """One row for each step at which the controller moved the robot, right wheel first.
+
+    Several bags can be one replay: rows that follow each other in time are told by ``begins``.
+    """
+
+    time: Array
+    """Stamp, s, shape (n,)."""
+    errors: Array
+    """delta-bar = chi - (r + h) at the instant of acting, rad/s, (n, 2): what the law acted on.
+    NaN where what was published proves that it was another."""
+    moves: Array
+    """v_p where it was published, else NaN, rad/s², shape (n, 2)."""
+    rest: Array
+    """u as sent, less what the law adds of errors and reference alone: v_p - g, rad/s², (n, 2)."""
+    speeds: Array
+    """Estimated chi, rad/s, shape (n, 2)."""
+    unexplained: Array
+    """Estimated acceleration that u does not explain, rad/s², shape (n, 2)."""
+    limited: NDArray[np.bool_]
+    """Whether u as sent lies on a limit: then it was not all of what the law wanted, (n,)."""
+    begins: NDArray[np.bool_]
+    """Whether nothing of the run is known before this row, shape (n,)."""
+
+    def __len__(self) -> int:
+        return len(self.begins)
+
+    @classmethod
+    def joined(cls, parts: list['TrainingData']) -> 'TrainingData':
+        """Return several replays as one."""
+        each = [[getattr(part, item.name) for part in parts] for item in fields(cls)]
+        return cls(*map(np.concatenate, each))
+
+
+def load_training_data(folder: Path) -> tuple[TrainingData, ControllerParameters, list[str]]:
+    """Return the run of a bag, the settings it was made under, and what a person should know.
+
+    Raises
+    ------
+    TrainingError
+        Topics or settings are missing, or these settings do not lead to what was published.
+    BagError
+        The bag cannot be read.
+    """
+    with open_bag(folder) as recording:
+        topics, namespaces = find_topics(recording.topics)
+        topics = {name: t for name, t in topics.items() if recording.topics[t].message_count}
+        missing = [name for name in NEEDED if name not in topics]
+        if missing:
+            raise TrainingError(
+                f'{folder}: these topics are missing, or have no message: {", ".join(missing)}'
+            )
+        notes: list[str] = []
+        parameters = recorded_parameters(recording, namespaces[0], notes)
+        messages = {name: _read(recording, name, topics[name], notes) for name in NEEDED}
+    if empty := [name for name, table in messages.items() if not table['received'].size]:
+        raise TrainingError(f'{folder}: no message of {", ".join(empty)} is finite')
+    replay = _rebuild(parameters, messages, notes)
+    if not len(replay):
+        reasons = '; '.join(['at no message was the controller moving the robot', *notes])
+        raise TrainingError(f'{folder}: {reasons}')
+    published = np.isfinite(replay.moves).all(axis=1)
+    sound = published & np.isfinite(replay.errors).all(axis=1)
+    if np.count_nonzero(sound) < 0.5 * np.count_nonzero(published):
+        raise TrainingError(
+            f'{folder}: with the settings in the bag only {np.count_nonzero(sound)} of '
+            f'{np.count_nonzero(published)} numbers of {FEEDBACK} come out as they were '
+            'published: the run was made under other settings, or by another version'
+        )
+    return replay, parameters, [f'{folder}: {note}' for note in notes]
+
+
+def recorded_parameters(
+    recording: BagReader, namespace: str, notes: list[str]
+) -> ControllerParameters:
+    """Return the controller's settings as the recorder asked for them.
+
+    Raises
+    ------
+    TrainingError
+        They are not in the bag, or cannot be used.
+    """
+    own = f'{namespace}/controller'
+    table = recording.metadata_records.get(
+        'controller' if own not in recording.metadata_records else own
+    )
+    if table is None:
+        raise TrainingError(f"{recording.folder}: the controller's settings are not in the bag")
+    values: dict[str, object] = {}
+    for row in ControllerParameters.rows():
+        if row.name in table:
+            values[row.name] = _value(row, table[row.name])
+    absent = [row.name for row in ControllerParameters.rows() if row.name not in values]
+    if absent:
+        notes.append(f'not in the bag, taken at their defaults: {", ".join(absent)}')
+    try:
+        return ControllerParameters.from_dict(values)
+    except ParameterError as error:
+        raise TrainingError(
+            f'{recording.folder}: the recorded settings cannot be used: {error}'
+        ) from error
+
+
+def _value(row: ParameterSpec, text: str) -> object:
+    """Return what the recorder wrote with ``str``; text that is no value is left to be refused."""
+    if row.kind is str:
+        return text
+    try:
+        return ast.literal_eval(text)
+    except (SyntaxError, ValueError):
+        return text
+
+
+def _read(recording: BagReader, name: str, topic: str, notes: list[str]) -> Mapping[str, Array]:
+    """Return the messages of one topic in order of receipt."""
+    if name == COMMAND:
+        inner = 'twist.' if recording.topics[topic].type_name.endswith('Stamped') else ''
+        table = {'linear': f'{inner}linear.x', 'angular': f'{inner}angular.z'}
+    else:
+        table = _TWIST if name in (REFERENCE, ODOMETRY) else {'value': 'data'}
+    columns = recording.series(topic, table)
+    bad = ~np.all([np.isfinite(column) for column in columns.values()], axis=0)
+    if bad.any():
+        notes.append(f'{np.count_nonzero(bad)} messages of {topic} are not finite')
+    if name in (REFERENCE, ODOMETRY):
+        return columns  # the controller refuses them itself, as it did then
+    return {key: column[~bad] for key, column in columns.items()}
+
+
+def match_commands(asked: Array, answered: Array) -> NDArray[np.int64]:
+    """Return for each command which odometry message it answers, -1 where none does, shape (m,).
+
+    The controller answers each message it takes, in their order: command j answers message j + s,
+    where s is how many before it are without an answer, from before the first command or lost.
+    By their receipt alone commands would be mistaken: while the processor is busy the next message
+    comes before the answer, and of two publishers the second may even be heard first. Both pass,
+    so s is the median over two seconds.
+
+    Parameters
+    ----------
+    asked, answered
+        Times of receipt, ascending, s.
+    """
+    numbers = np.arange(answered.size)
+    behind = np.searchsorted(asked, answered, side='right') - 1 - numbers
+    padded = np.pad(behind, ALIKE, mode='symmetric')
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * ALIKE + 1)
+    found: NDArray[np.int64] = numbers + np.median(windows, axis=1).astype(np.int64)
+    found[(found < 0) | (found >= asked.size)] = -1
+    return found
+
+
+def _rebuild(
+    parameters: ControllerParameters, messages: Mapping[str, Mapping[str, Array]], notes: list[str]
+) -> TrainingData:
+    """Return what the controller knew and did at each step, from the messages it was given."""
+    controller = Controller(parameters)
+    odometry, reference, sent = messages[ODOMETRY], messages[REFERENCE], messages[COMMAND]
+    motions, times = _motions(odometry), odometry['received']
+    answer = match_commands(times, sent['received'])
+    commands = np.full((times.size, 2), math.nan)
+    commands[answer[answer >= 0]] = _wheels(sent, parameters.geometry)[answer >= 0]
+    if lost := np.count_nonzero(np.isnan(commands[:, 0])):
+        notes.append(f'{lost} of {times.size} messages of {ODOMETRY} have no {COMMAND} after them')
+    coming = deque(zip(reference['received'].tolist(), _motions(reference), strict=True))
+    gain, patience = parameters.law.gain, parameters.watchdog.odometry_timeout * NANOSECONDS
+    # What is left of jumps that the law was told of is read when it has died away for a period.
+    revive = math.exp(gain / parameters.rate)
+    errors, feedback, rest, speeds, unexplained = np.full((5, times.size, 2), math.nan)
+    begins = np.zeros(times.size, dtype=np.bool_)
+    last_ns: int | None = None
+    for i, motion in enumerate(motions):
+        while coming and coming[0][0] <= times[i]:
+            controller.add_reference(coming.popleft()[1])
+        if motion.stamp_ns == last_ns:  # the controller knows it already
+            continue
+        _, status = controller.step(motion)
+        if not status.reason.moves:
+            last_ns = None
+            continue
+        drive, terms = controller.drive, status.terms
+        if math.isfinite(commands[i, 0]):  # else its own answer is the best guess
+            drive.tell(commands[i])
+        commands[i] = drive.command
+        begins[i] = last_ns is None or motion.stamp_ns - last_ns > patience
+        last_ns = motion.stamp_ns
+        feedback[i] = terms[_FEEDBACK]
+        errors[i] = -terms[_FEEDBACK] / gain - revive * controller.law.predictive.known_error
+        rest[i] = drive.applied - terms[_FOLLOWED].sum(axis=0)
+        speeds[i], unexplained[i] = drive.speeds, drive.unexplained
+    moves, said = (
+        _published(messages, name, sent['received'], answer, times.size)
+        for name in (MOVES, FEEDBACK)
+    )
+    # A controller that stands still publishes zeros, and begins anew after them.
+    still = (said == 0.0).any(axis=1)
+    begins[1:] |= still[:-1]
+    tolerance = gain * DISAGREES * parameters.predictive.noise
+    wrong = still | (np.abs(said - feedback) > tolerance).any(axis=1)
+    reach = parameters.predictive.decimation - 1
+    for i in np.flatnonzero(wrong).tolist():
+        errors[max(i - reach, 0) : i + reach + 1] = math.nan
+    limits = wheel_limits(parameters.limits, parameters.geometry)
+    changes = np.diff(commands, axis=0, prepend=commands[:1]) * parameters.rate
+    limited = _at_limit(commands, limits[0]) | (_at_limit(changes, limits[1]) & ~begins)
+    arrays = (odometry['stamp'], errors, moves, rest, speeds, unexplained, limited, begins)
+    return TrainingData(*(array[np.isfinite(speeds[:, 0])] for array in arrays))
+
+
+def _at_limit(wheels: Array, limits: Array) -> NDArray[np.bool_]:
+    """Return whether pairs of wheels are as fast as :func:`share_within` lets them, shape (n,)."""
+    mean, half = np.abs(wheels @ [0.5, 0.5]), np.abs(wheels @ [0.5, -0.5])
+    used = np.stack([mean, half, np.abs(wheels).max(axis=1)], axis=1) / limits
+    return np.asarray(used.max(axis=1) > 1.0 - 1e-6)
+
+
+def _published(
+    messages: Mapping[str, Mapping[str, Array]],
+    name: str,
+    sent: Array,
+    answer: NDArray[np.int64],
+    count: int,
+) -> Array:
+    """Return both wheels' numbers in the rows of the steps they tell of, (count, 2).
+
+    They are published right after the command of the same step.
+    """
+    table = np.full((count, 2), math.nan)
+    for z, wheel in enumerate(WHEELS):
+        numbers = messages[f'{name}/{wheel}']
+        last = np.searchsorted(sent, numbers['received'], side='right') - 1
+        rows = np.where(last >= 0, answer[last], -1)
+        table[rows[rows >= 0], z] = numbers['value'][rows >= 0]
+    return table
+
+
+def _motions(table: Mapping[str, Array]) -> list[State]:
+    stamps = np.round(table['stamp'] * NANOSECONDS).astype(np.int64).tolist()
+    twists = zip(table['linear'].tolist(), table['angular'].tolist(), strict=True)
+    return [
+        State(stamp, ORIGIN, BodyTwist(*twist))
+        for stamp, twist in zip(stamps, twists, strict=True)
+    ]
+
+
+def _wheels(table: Mapping[str, Array], geometry: WheelGeometry) -> Array:
+    twists = zip(table['linear'].tolist(), table['angular'].tolist(), strict=True)
+    return np.array([wheels_from_twist(BodyTwist(*twist), geometry) for twist in twists])

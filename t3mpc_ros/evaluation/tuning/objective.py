@@ -1,0 +1,192 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Tuning objective: mean RMSE plus weighted chatter of closed-loop runs on the tuning seeds."""
+
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import BrokenExecutor
+from dataclasses import dataclass
+import math
+from types import TracebackType
+from typing import Protocol, Self
+
+from t3mpc_ros.evaluation.closed_loop import Job, JobError, MethodSpec, WorkerPool
+from t3mpc_ros.evaluation.scenario import TUNING_SEEDS, Scenario
+from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition
+from t3mpc_ros.parameters.table import Parameters
+
+SMOOTHNESS = 1e-5
+"""rho, s²: what a unit of chatter (rad/s³) costs in tracking error (rad/s).
+
+Small: 1000 rad/s³ of total variation of u per second cost 0.01 rad/s. It keeps a method from
+buying the last percent of tracking with a command that shakes the motors, and decides between
+settings that track alike; it is too small to make any method track worse to be smooth.
+"""
+NOISE_LEVELS = (0.0, 0.04, 0.1)
+"""Variances of the measured wheel speeds met in training, (rad/s)²: one setting for them all."""
+DURATION = 26.0
+"""Length of a training run, s: the reference switches twice in it."""
+
+
+class Measurable(Protocol):
+    """What a price needs of a run."""
+
+    def rmse(self) -> float:
+        """Return the tracking RMSE, rad/s."""
+
+    def chatter(self) -> float:
+        """Return the total variation of u per second and wheel, rad/s³."""
+
+
+def objective(record: Measurable) -> float:
+    """Return RMSE + rho chatter of a run, rad/s; infinite for a run that broke off."""
+    value = record.rmse() + SMOOTHNESS * record.chatter()
+    return value if math.isfinite(value) else math.inf
+
+
+@dataclass(frozen=True, slots=True)
+class TuningScenarios:
+    """The runs of one evaluation.
+
+    Parameters
+    ----------
+    seeds
+        One run each; a seed is never one on which results are reported.
+    noise_levels
+        Run i has level i, counted round; there are seeds enough for each.
+    duration
+        s
+    """
+
+    seeds: tuple[int, ...] = TUNING_SEEDS
+    noise_levels: tuple[float, ...] = NOISE_LEVELS
+    duration: float = DURATION
+
+    def __post_init__(self) -> None:
+        if len(set(self.seeds)) != len(self.seeds):
+            raise ValueError(f'training seeds must differ: got {self.seeds}')
+        if not 1 <= len(self.noise_levels) <= len(self.seeds):
+            raise ValueError(
+                f'there must be noise levels, and a seed for each: got {len(self.noise_levels)} '
+                f'levels and {len(self.seeds)} seeds'
+            )
+
+    def runs(self) -> tuple[tuple[int, float], ...]:
+        """Return (seed, noise variance) of each run."""
+        return tuple(
+            (seed, self.noise_levels[i % len(self.noise_levels)])
+            for i, seed in enumerate(self.seeds)
+        )
+
+    def scenarios(self, drive: str) -> tuple[Scenario, ...]:
+        """Return the runs with the nominal robot in a drive."""
+        return tuple(
+            Scenario(drive, noise, 'nominal', seed, self.duration) for seed, noise in self.runs()
+        )
+
+
+class ClosedLoopObjective:
+    """Mean price of settings in the closed loop; several are evaluated at the same time.
+
+    To be used in a ``with`` statement: the processes stay warm between generations.
+
+    Parameters
+    ----------
+    training
+        The runs of one evaluation.
+    workers
+        How many processes.
+    report
+        Told of settings with which a run raised an exception.
+    """
+
+    def __init__(
+        self, training: TuningScenarios, workers: int, report: Callable[[str], None] | None = None
+    ) -> None:
+        self._training = training
+        self._workers = WorkerPool(workers)
+        self._report = report
+        self._ran: set[tuple[str, str]] = set()
+
+    def __enter__(self) -> Self:
+        self._workers.__enter__()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._workers.__exit__(kind, error, trace)
+
+    def __call__(
+        self, method: MethodDefinition, drive: str, candidates: Sequence[Parameters]
+    ) -> list[float]:
+        """Return the mean price of each candidate, infinite where a run broke off or failed.
+
+        Raises
+        ------
+        JobError
+            Runs failed with every candidate of a method that never ran before: it is at fault
+            then, not the settings. Or a process was lost.
+        """
+        try:
+            prices: list[float | None] = [*self._prices(method, drive, candidates)]
+        except JobError as error:
+            if isinstance(error.__cause__, BrokenExecutor):
+                raise
+            prices = [self._alone(method, drive, candidate) for candidate in candidates]
+            if (method.name, drive) not in self._ran and all(each is None for each in prices):
+                raise
+        self._ran.add((method.name, drive))
+        return [math.inf if each is None else each for each in prices]
+
+    def _alone(self, method: MethodDefinition, drive: str, candidate: Parameters) -> float | None:
+        """Return the price of one candidate, None when a run raised an exception."""
+        try:
+            return self._prices(method, drive, [candidate])[0]
+        except JobError as error:
+            if isinstance(error.__cause__, BrokenExecutor):
+                raise
+            if self._report is not None:
+                self._report(f'  counted as worst: {error}')
+            return None
+
+    def _prices(
+        self, method: MethodDefinition, drive: str, candidates: Sequence[Parameters]
+    ) -> list[float]:
+        scenarios = self._training.scenarios(drive)
+        jobs: list[Job] = [
+            (scenario, MethodSpec(method.name, method.controller_type, candidate, pretrained=True))
+            for candidate in candidates
+            for scenario in scenarios
+        ]
+        return mean_objectives(len(candidates), len(scenarios), self._workers.run(jobs, objective))
+
+
+def mean_objectives(
+    candidates: int, runs: int, priced: Iterable[tuple[int, float]]
+) -> list[float]:
+    """Return the mean over the runs of each candidate; the same in whatever order they come.
+
+    Parameters
+    ----------
+    candidates, runs
+        Run j of candidate i has index ``i * runs + j``.
+    priced
+        (index, price), each index once.
+
+    Raises
+    ------
+    ValueError
+        An index is missing, comes twice, or is none.
+    """
+    prices: dict[int, float] = {}
+    for index, value in priced:
+        if index in prices or not 0 <= index < candidates * runs:
+            raise ValueError(f'each run must be priced once: got run {index} once more')
+        prices[index] = value
+    if len(prices) != candidates * runs:
+        raise ValueError(f'{candidates * runs} runs must be priced: got {len(prices)}')
+    # math.fsum has no order; infinities add to infinity.
+    return [math.fsum(prices[i * runs + j] for j in range(runs)) / runs for i in range(candidates)]

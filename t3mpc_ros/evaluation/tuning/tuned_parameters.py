@@ -1,0 +1,346 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Tuned parameters of all methods in one JSON file of the package."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+import difflib
+import json
+import math
+import os
+from pathlib import Path
+import tempfile
+from types import MappingProxyType
+from typing import Any, Self, TypeVar
+
+from t3mpc_ros.parameters.table import ParameterError, Parameters
+
+PACKAGED_FILE = Path(__file__).resolve().parent / 'tuned.json'
+"""The file that comes with the package."""
+
+_FORMAT = 1
+T = TypeVar('T', bound=Parameters)
+
+
+class StoreError(ValueError):
+    """A file of tuned settings that cannot be used; says where in it and why."""
+
+
+@dataclass(frozen=True, slots=True)
+class TuningBudget:
+    """What a tuning was given: a comparison is fair when it is equal for all."""
+
+    evaluations: int
+    search_seed: int
+    training_seeds: tuple[int, ...]
+    """Runs of one evaluation; run i has noise level i, counted round."""
+    noise_levels: tuple[float, ...]
+    """Variances of the measured wheel speeds, (rad/s)²."""
+    duration: float
+    """Of each run, s."""
+    smoothness: float
+    """rho of the price, s²."""
+
+    def __str__(self) -> str:
+        seeds = ', '.join(map(str, self.training_seeds))
+        levels = ', '.join(f'{level:g}' for level in self.noise_levels)
+        return (
+            f'{self.evaluations} evaluations (search seed {self.search_seed}) of '
+            f'{self.duration:g} s on seeds {seeds} at noise {levels}, '
+            f'rho = {self.smoothness:g} s²'
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class TunedEntry:
+    """What was found for one method in one drive."""
+
+    values: Mapping[str, object]
+    """Every setting of the method by its dotted name."""
+    tuned: tuple[str, ...]
+    """The names among them that were searched."""
+    objective: float
+    """Mean price of ``values``, rad/s."""
+    start_objective: float | None
+    """That of the settings the search began with, rad/s; None when they did not even run."""
+    budget: TuningBudget
+    version: str
+    """Of this package, when it was found."""
+
+
+class TunedParameters:
+    """Tuned settings by method and drive.
+
+    Parameters
+    ----------
+    entries
+        By (method, drive).
+    """
+
+    def __init__(self, entries: Mapping[tuple[str, str], TunedEntry] | None = None) -> None:
+        self._entries = dict(entries or {})
+
+    def __iter__(self) -> Iterator[tuple[str, str]]:
+        """Return every (method, drive), in order."""
+        return iter(sorted(self._entries))
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def __contains__(self, key: object) -> bool:
+        return key in self._entries
+
+    @classmethod
+    def load(
+        cls, path: Path = PACKAGED_FILE, types: Mapping[str, type[Parameters]] | None = None
+    ) -> Self:
+        """Return what a file holds.
+
+        Parameters
+        ----------
+        path
+            The file.
+        types
+            The table of each method. When given, every value is checked, and a method that is
+            not in it is refused.
+
+        Raises
+        ------
+        StoreError
+            What it holds is not what :meth:`save` writes, or does not fit the tables.
+        OSError
+            It cannot be read.
+        """
+        try:
+            content = json.loads(
+                path.read_text(encoding='utf-8'),
+                parse_constant=_refuse_constant,
+                object_pairs_hook=_refuse_twice,
+            )
+            store = cls(_entries(content))
+            if types is not None:
+                store.check(types)
+        except (StoreError, ValueError) as error:
+            raise StoreError(f'{path}: {error}') from error
+        return store
+
+    def save(self, path: Path) -> None:
+        """Write the file, whole or not at all."""
+        methods: dict[str, dict[str, Any]] = {}
+        for method, drive in self:
+            entry = self._entries[method, drive]
+            methods.setdefault(method, {})[drive] = {
+                **{each.name: getattr(entry, each.name) for each in fields(TunedEntry)},
+                'values': dict(entry.values),
+                'budget': {
+                    each.name: getattr(entry.budget, each.name) for each in fields(TuningBudget)
+                },
+            }
+        content = {'format': _FORMAT, 'methods': methods}
+        text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
+        write_atomically(path, text + '\n')
+
+    def put(self, method: str, drive: str, entry: TunedEntry) -> None:
+        """Add what was found, in place of what was there."""
+        self._entries[method, drive] = entry
+
+    def entry(self, method: str, drive: str) -> TunedEntry:
+        """Return what was found for a method in a drive.
+
+        Raises
+        ------
+        StoreError
+            Nothing was.
+        """
+        try:
+            return self._entries[method, drive]
+        except KeyError:
+            known = ', '.join(' in '.join(key) for key in self) or 'nothing'
+            raise StoreError(
+                f'{method} was not tuned in drive {drive}; what was: {known}'
+            ) from None
+
+    def parameters(self, method: str, drive: str, table: type[T]) -> T:
+        """Return the tuned settings of a method as its table.
+
+        Raises
+        ------
+        StoreError
+            It was not tuned, or what is stored does not fit the table; names the setting.
+        """
+        entry = self.entry(method, drive)
+        known = [row.name for row in table.rows()]
+        where = f'{method}, {drive}'
+        for name in [*entry.values, *entry.tuned]:
+            if name not in known:
+                raise StoreError(f'{where}: there is no setting {name}{_near(name, known)}')
+        missing = [name for name in known if name not in entry.values]
+        if missing:
+            raise StoreError(f'{where}: settings are missing: {", ".join(missing)}')
+        try:
+            return table.from_dict(entry.values)
+        except ParameterError as error:
+            raise StoreError(f'{where}: {error}') from error
+
+    def applied(self, method: str, drive: str, start: T) -> T:
+        """Return ``start`` with the settings that were tuned; all others stay as they are.
+
+        Raises
+        ------
+        StoreError
+            It was not tuned, or what is stored does not fit the table; names the setting.
+        """
+        entry = self.entry(method, drive)
+        try:
+            return start.with_values({name: entry.values[name] for name in entry.tuned})
+        except ParameterError as error:
+            raise StoreError(f'{method}, {drive}: {error}') from error
+
+    def check(self, types: Mapping[str, type[Parameters]]) -> None:
+        """Raise :class:`StoreError` unless every entry fits the table of its method."""
+        for method, drive in self:
+            if method not in types:
+                raise StoreError(f'there is no method {method}{_near(method, list(types))}')
+            self.parameters(method, drive, types[method])
+
+    def check_equal(self) -> None:
+        """Raise :class:`StoreError` unless all that is stored was given the same budget."""
+        keys = list(self)
+        for key in keys[1:]:
+            ours, others = self._entries[key].budget, self._entries[keys[0]].budget
+            if ours != others:
+                raise StoreError(
+                    f'{key[0]}, {key[1]} was tuned with {ours}; '
+                    f'{keys[0][0]}, {keys[0][1]} with {others}'
+                )
+
+    def table(self) -> str:
+        """Return what was gained, as a table in Markdown."""
+        lines = [
+            '| method | drive | price at start (rad/s) | tuned | settings tuned | evaluations |',
+            '|---|---|---|---|---|---|',
+        ]
+        for method, drive in self:
+            entry = self._entries[method, drive]
+            start = entry.start_objective
+            lines.append(
+                f'| {method} | {drive} | {"none" if start is None else f"{start:.4f}"} '
+                f'| {entry.objective:.4f} | {len(entry.tuned)} | {entry.budget.evaluations} |'
+            )
+        return '\n'.join(lines)
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Write a file so that a reader, or a power cut, finds the old content or the new."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
+    try:
+        with os.fdopen(handle, 'w', encoding='utf-8') as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        # A temporary file is its owner's alone; this one is to be read like any other.
+        os.chmod(name, path.stat().st_mode & 0o777 if path.exists() else 0o644)
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+def _entries(content: object) -> dict[tuple[str, str], TunedEntry]:
+    top = _object(content, 'the file', {'format', 'methods'})
+    if top['format'] != _FORMAT:
+        raise StoreError(f'format must be {_FORMAT}: got {top["format"]!r}')
+    return {
+        (method, drive): _entry(entry, f'{method}, {drive}')
+        for method, drives in _object(top['methods'], 'methods').items()
+        for drive, entry in _object(drives, method).items()
+    }
+
+
+def _entry(content: object, where: str) -> TunedEntry:
+    read = _object(content, where, {each.name for each in fields(TunedEntry)})
+    start = read['start_objective']
+    values = _object(read['values'], f'{where}: values')
+    tuned = tuple(
+        _text(name, f'{where}: tuned') for name in _list(read['tuned'], f'{where}: tuned')
+    )
+    for name in tuned:
+        if name not in values:
+            raise StoreError(f'{where}: {name} was tuned, but has no value')
+    return TunedEntry(
+        values=MappingProxyType(values),
+        tuned=tuned,
+        objective=_number(read['objective'], f'{where}: objective'),
+        start_objective=None if start is None else _number(start, f'{where}: start_objective'),
+        budget=_budget(read['budget'], f'{where}: budget'),
+        version=_text(read['version'], f'{where}: version'),
+    )
+
+
+def _budget(content: object, where: str) -> TuningBudget:
+    read = _object(content, where, {each.name for each in fields(TuningBudget)})
+    seeds = _list(read['training_seeds'], f'{where}: training_seeds')
+    levels = _list(read['noise_levels'], f'{where}: noise_levels')
+    return TuningBudget(
+        evaluations=_count(read['evaluations'], f'{where}: evaluations', 1),
+        search_seed=_count(read['search_seed'], f'{where}: search_seed', 0),
+        training_seeds=tuple(_count(seed, f'{where}: training_seeds', 0) for seed in seeds),
+        noise_levels=tuple(_number(level, f'{where}: noise_levels') for level in levels),
+        duration=_number(read['duration'], f'{where}: duration'),
+        smoothness=_number(read['smoothness'], f'{where}: smoothness'),
+    )
+
+
+def _object(content: object, where: str, names: set[str] | None = None) -> dict[str, Any]:
+    if not isinstance(content, dict):
+        raise StoreError(f'{where} must be an object: got {type(content).__name__}')
+    if names is not None:
+        for problem, found in (('lacks', names - set(content)), ('has', set(content) - names)):
+            if found:
+                raise StoreError(f'{where} {problem} {", ".join(sorted(found))}')
+    return content
+
+
+def _list(content: object, where: str) -> list[Any]:
+    if not isinstance(content, list) or not content:
+        raise StoreError(f'{where} must be a list that is not empty: got {content!r}')
+    return content
+
+
+def _number(content: object, where: str) -> float:
+    if isinstance(content, bool) or not isinstance(content, int | float):
+        raise StoreError(f'{where} must be a number: got {content!r}')
+    if not (math.isfinite(content) and content >= 0.0):
+        raise StoreError(f'{where} must be at least 0 and finite: got {content}')
+    return float(content)
+
+
+def _count(content: object, where: str, low: int) -> int:
+    if isinstance(content, bool) or not isinstance(content, int) or content < low:
+        raise StoreError(f'{where} must be a whole number of at least {low}: got {content!r}')
+    return content
+
+
+def _text(content: object, where: str) -> str:
+    if not isinstance(content, str) or not content:
+        raise StoreError(f'{where} must be a text: got {content!r}')
+    return content
+
+
+def _near(name: str, known: list[str]) -> str:
+    near = difflib.get_close_matches(name, known, n=1)
+    return f'; did you mean {near[0]}?' if near else ''
+
+
+def _refuse_constant(text: str) -> float:
+    raise StoreError(f'every number must be finite: got {text}')
+
+
+def _refuse_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in result:
+            raise StoreError(f'{name} is given twice')
+        result[name] = value
+    return result

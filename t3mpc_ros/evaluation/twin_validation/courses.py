@@ -1,0 +1,328 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Test courses of the digital twin: UMBmark square, turns on the spot, patrol."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+import math
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+
+from t3mpc_ros.geometry.types import NANOSECONDS, WheelSpeeds
+from t3mpc_ros.robot.interface import RANGE_SENSORS, ZERO_WHEEL_SPEEDS, RobotState
+from t3mpc_ros.robot.wheel_odometry import WheelOdometry
+from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
+from t3mpc_ros.simulation.fault_injection import FaultEvent
+from t3mpc_ros.simulation.world import load_world
+
+Array = npt.NDArray[np.float64]
+
+SIDE = 4.0
+"""m, of the square of UMBmark."""
+STANDING = 1.5
+"""s that the robot stands before the first leg and after the last one."""
+PAUSE = 0.3
+"""s between two legs; too short for the gyro's bias to be measured again."""
+TOP_SPEED = 8.0
+"""rad/s of a wheel on a leg: 0.28 m/s, or a turn of the robot in 1.7 s."""
+DECELERATION_ANGLE = 0.4
+"""Part of the guard's acceleration with which a leg is brought to its end."""
+
+
+class Slip(NamedTuple):
+    """Spells of one fault, at random times and independent of what the robot does just then."""
+
+    name: str
+    fault: str
+    """``slippery`` or ``wheel_blocked``; which wheel is held is drawn each time."""
+    grip: float
+    """Part of the tyres' grip that is left during a spell; 1 when a wheel is held."""
+    pause: float
+    """s from the end of a spell to the next one, on average (exponential)"""
+    length: float
+    """s a spell lasts: on average (exponential) for grip, always for a held wheel"""
+
+    def spells(self, generator: np.random.Generator, until: float) -> tuple[FaultEvent, ...]:
+        """Return the spells that start within ``until`` seconds after the robot has stood."""
+        events = []
+        at = STANDING + generator.exponential(self.pause)
+        while at < STANDING + until:
+            length, side = generator.exponential(self.length), int(generator.integers(2))
+            if self.fault == 'wheel_blocked':
+                event = FaultEvent(at, self.fault, ('right', 'left')[side], self.length)
+            else:
+                event = FaultEvent(at, self.fault, self.grip, max(length, 0.02))
+            events.append(event)
+            at = event.until + generator.exponential(self.pause)
+        return tuple(events)
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """What became of a drive, once a period; headings are unwrapped."""
+
+    name: str
+    time: Array
+    """s, shape (n,)"""
+    truth: Array
+    """x, y (m), heading (rad) of the body, shape (n, 3)"""
+    odometry: Array
+    """What the robot reported, shape (n, 3)."""
+    steps: Array
+    """What the step counters alone say, shape (n, 3)."""
+    slid: tuple[float, float]
+    """m each tyre has slid, right first"""
+    lost_steps: tuple[int, int]
+    """Full steps the rotors are behind at the end."""
+    noticed: float
+    """s for which the robot said that gyro and steps disagree"""
+
+
+@dataclass(frozen=True, eq=False)
+class Patrol:
+    """A drive by the distance sensors, until they fail and after."""
+
+    course: Course
+    ranges: Array
+    """m, readings of the sensors, shape (n, 8), REP 117; NaN: not measured"""
+    blind_from: float
+    """s; from then on no sensor is measured"""
+    hit_at: float
+    """s at which it first touched a wall after that; NaN if it did not"""
+    touched_before: bool
+    """Whether it touched one before."""
+    max_contact_force: float
+    """N"""
+
+
+def umbmark(
+    parameters: DigitalTwinParameters,
+    clockwise: bool,
+    spells: Iterable[FaultEvent] = (),
+    side: float = SIDE,
+) -> Course:
+    """Return the course of a square of ``side`` metres, back to where it started.
+
+    Raises
+    ------
+    RuntimeError
+        The robot does not get to the end of a leg.
+    """
+    geometry = parameters.geometry
+    along = side / geometry.wheel_radius
+    corner = 0.5 * math.pi * geometry.half_separation / geometry.wheel_radius
+    corner *= -1.0 if clockwise else 1.0
+    legs = [(along, along), (corner, -corner)] * 4
+    return _driven('square cw' if clockwise else 'square ccw', parameters, legs, spells)
+
+
+def spin(
+    parameters: DigitalTwinParameters, turns: int, spells: Iterable[FaultEvent] = ()
+) -> Course:
+    """Return the course of ``turns`` turns on the spot, counter-clockwise, with a stop after each.
+
+    Raises
+    ------
+    RuntimeError
+        The robot does not get to the end of a leg.
+    """
+    geometry = parameters.geometry
+    turn = 2.0 * math.pi * geometry.half_separation / geometry.wheel_radius
+    return _driven(f'{turns} turns', parameters, [(turn, -turn)] * turns, spells)
+
+
+def yaw_drift(course: Course, by_steps: bool = False) -> float:
+    """Return by how much (rad) the heading is wrong in the end; not wrapped.
+
+    That of the robot's odometry, or that of the step counters alone.
+    """
+    believed = course.steps if by_steps else course.odometry
+    return float(believed[-1, 2] - course.truth[-1, 2])
+
+
+def place_error(course: Course, by_steps: bool = False) -> float:
+    """Return how far (m) the robot thinks it is from where it is, in the end."""
+    believed = course.steps if by_steps else course.odometry
+    return math.dist(believed[-1, :2].tolist(), course.truth[-1, :2].tolist())
+
+
+def gyro_limit(parameters: DigitalTwinParameters, course: Course) -> float:
+    """Return how far off (rad) a heading from this gyro alone may be at the end of a course.
+
+    Its error of scale at the largest, three standard deviations of what its bias wanders from
+    one standstill to the other, sigma t^1.5 / sqrt 3, and of what its noise leaves in the bias
+    that is measured within the last second before the start.
+    """
+    imu = parameters.imu
+    turned = abs(course.truth[-1, 2] - course.truth[0, 2])
+    moving = float(course.time[-1] - course.time[0]) - 2.0 * STANDING
+    wandered = imu.gyro_drift * moving**1.5 / math.sqrt(3.0)
+    unsure = imu.gyro_noise * moving / math.sqrt(2.0)
+    scale = imu.gyro_scale_error * float(turned)
+    return scale + 3.0 * math.radians(math.hypot(wandered, unsure))
+
+
+def patrol(
+    parameters: DigitalTwinParameters, blind_from: float, longest: float, speed: float = 6.0
+) -> Patrol:
+    """Return a drive through the world of ``settings`` that turns away from what it sees.
+
+    It turns to the freer side when something is nearer than 0.3 m in front or 0.15 m beside it,
+    until that is 0.4 or 0.2 m away. From ``blind_from`` (s) on no sensor answers, and it drives
+    straight on, until it has been at a wall for a second, or for ``longest`` seconds.
+
+    Parameters
+    ----------
+    speed
+        Of the wheels, rad/s.
+    """
+    log = _Log('patrol', parameters, [FaultEvent(blind_from, 'ranges_dead', True)])
+    world, radius = load_world(parameters.world), parameters.bumper.radius
+    ranges = []
+    turn, hit_at, touched_before = 0.0, math.nan, False
+    while log.elapsed < blind_from + longest and not log.elapsed > hit_at + 1.0:
+        turn = _turn_away(log.state.ranges, turn)
+        wheels = WheelSpeeds(speed, speed)
+        if turn != 0.0:
+            wheels = WheelSpeeds(0.5 * speed * turn, -0.5 * speed * turn)
+        log.step(wheels if log.elapsed >= STANDING else ZERO_WHEEL_SPEEDS)
+        ranges.append(log.state.ranges or (math.nan,) * len(RANGE_SENSORS))
+        touches = not world.is_free(*log.place, radius)
+        if touches and log.elapsed < blind_from:
+            touched_before = True
+        elif touches and math.isnan(hit_at):
+            hit_at = log.elapsed
+    push = log.robot.inside.max_contact_force
+    return Patrol(log.course(), np.array(ranges), blind_from, hit_at, touched_before, push)
+
+
+def _turn_away(ranges: Sequence[float], turn: float) -> float:
+    """Return 1 to turn to the left, -1 to the right, 0 to go on; ``turn`` is what it does now."""
+    if not ranges:
+        return 0.0
+    by_name = dict(zip(RANGE_SENSORS, ranges, strict=True))
+    ahead = min(by_name['front_left'], by_name['front_right'])
+    left = min(by_name['left_front'], by_name['left_back'])
+    right = min(by_name['right_front'], by_name['right_back'])
+    if turn != 0.0:
+        behind = right if turn > 0.0 else left
+        return turn if ahead < 0.4 or behind < 0.2 else 0.0
+    if ahead < 0.3:
+        return 1.0 if left >= right else -1.0
+    if min(left, right) < 0.15:
+        return 1.0 if right < left else -1.0
+    return 0.0
+
+
+class _Log:
+    """A robot that is driven under a schedule of faults, and what was seen of it."""
+
+    def __init__(
+        self, name: str, parameters: DigitalTwinParameters, spells: Iterable[FaultEvent]
+    ) -> None:
+        self.robot = _troubled(parameters, tuple(spells))
+        self.state: RobotState = self.robot.advance(0)
+        self._name = name
+        self._parameters = parameters
+        self._reckoning = WheelOdometry(parameters.odometry, parameters.geometry)
+        self._rows: list[tuple[float, ...]] = []
+        self._noticed = 0
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the start."""
+        return self.state.stamp_ns / NANOSECONDS
+
+    @property
+    def place(self) -> tuple[float, float]:
+        """Where the robot is, m."""
+        truth = self.state.truth
+        return (0.0, 0.0) if truth is None else (truth.pose.x, truth.pose.y)
+
+    def step(self, wheels: WheelSpeeds) -> None:
+        """Drive for one period."""
+        before = self.state.angles
+        self.state = state = self.robot.step(wheels)
+        now = state.angles
+        self._reckoning.turn(now.right - before.right, now.left - before.left)
+        truth = (0.0, 0.0, 0.0) if state.truth is None else state.truth.pose
+        self._rows.append((self.elapsed, *truth, *state.odometry.pose, *self._reckoning.pose))
+        self._noticed += state.status.slipping
+
+    def stand(self, seconds: float) -> None:
+        """Let the robot stand."""
+        for _ in range(round(seconds * self._parameters.rate)):
+            self.step(ZERO_WHEEL_SPEEDS)
+
+    def course(self) -> Course:
+        """Return what was seen so far."""
+        rows = np.array(self._rows)
+        for yaw in (3, 6, 9):
+            rows[:, yaw] = np.unwrap(rows[:, yaw])
+        inside = self.robot.inside
+        return Course(
+            name=self._name,
+            time=rows[:, 0],
+            truth=rows[:, 1:4],
+            odometry=rows[:, 4:7],
+            steps=rows[:, 7:10],
+            slid=inside.slid,
+            lost_steps=self.state.lost_steps or (0, 0),
+            noticed=self._noticed / self._parameters.rate,
+        )
+
+
+def _troubled(parameters: DigitalTwinParameters, spells: Sequence[FaultEvent]) -> DigitalTwin:
+    """Return a robot that plays ``spells`` instead of the schedule of ``settings``, if any."""
+    if not spells:
+        return DigitalTwin(parameters)
+    entries = []
+    for spell in spells:
+        entry = {'at': spell.at, 'fault': spell.fault, 'value': spell.value}
+        entries.append(entry | ({'for': spell.duration} if spell.duration < math.inf else {}))
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / 'spells.yaml'
+        path.write_text(yaml.safe_dump({'events': entries}), encoding='utf-8')
+        return DigitalTwin(parameters.with_values({'faults.schedule': str(path)}))
+
+
+def _driven(
+    name: str,
+    parameters: DigitalTwinParameters,
+    legs: Iterable[tuple[float, float]],
+    spells: Iterable[FaultEvent],
+) -> Course:
+    """Drive legs, each a pair of angles (rad, right first) that the wheels shall turn."""
+    log = _Log(name, parameters, spells)
+    log.stand(STANDING)
+    exact = 0.5 * parameters.motor.microstep
+    slowing = 2.0 * DECELERATION_ANGLE * parameters.guard.acceleration
+    goal = np.array(log.state.angles)
+    for number, leg in enumerate(legs, 1):
+        goal += leg
+        patience = log.elapsed + 10.0 + 4.0 * max(map(abs, leg)) / TOP_SPEED
+        while (far := float(np.abs(goal - log.state.angles).max())) > exact:
+            if log.elapsed > patience:
+                raise RuntimeError(
+                    f'{name}: leg {number} did not end within {patience:.0f} s, the wheels have '
+                    f'{far:.3g} rad to go: {log.state.reason or "no reason is known"}'
+                )
+            # So slow at the end that a command which is two periods late does not overshoot.
+            speed = min(TOP_SPEED, math.sqrt(slowing * far), far * parameters.rate / 6.0)
+            log.step(_towards(goal - log.state.angles, speed, exact))
+        log.stand(PAUSE)
+    log.stand(STANDING - PAUSE)
+    return log.course()
+
+
+def _towards(remaining: Array, speed: float, exact: float) -> WheelSpeeds:
+    """Return wheel speeds towards what remains (rad, right first); 0 for a wheel at its goal."""
+    right, left = (
+        math.copysign(speed, angle) if abs(angle) > exact else 0.0 for angle in remaining.tolist()
+    )
+    return WheelSpeeds(right, left)

@@ -1,0 +1,246 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Twin validation: runs all tests and writes page, figures and tables."""
+
+import base64
+from collections.abc import Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from t3mpc_ros.evaluation.reporting import Table
+    from t3mpc_ros.evaluation.twin_validation.validation_figures import Evidence
+
+
+SEED = 1
+OUTPUT = Path('runs') / 'twin'
+PAGE = 'twin.html'
+TITLE = 'The digital twin, put to the test'
+
+_CSS = """
+:root { color-scheme: light; }
+body { margin: 0 auto; max-width: 60rem; padding: 1.2rem 1rem 4rem; color: #1f2937;
+  background: #fff; font: 1rem/1.5 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
+h1 { font-size: 1.5rem; margin: 0 0 .2rem; }
+h2 { font-size: 1.1rem; margin: 2.4rem 0 .4rem; }
+p { margin: .3rem 0; }
+.quiet { color: #6b7280; font-size: .9rem; }
+figure { margin: .4rem 0 0; max-width: 50rem; }
+figure img { display: block; width: 100%; height: auto; }
+.wide { overflow-x: auto; margin: 1rem 0; }
+table { border-collapse: collapse; width: 100%; font-size: .88rem; }
+caption { text-align: left; font-weight: 600; padding: .2rem 0; }
+th, td { text-align: right; padding: .22rem .6rem; border-bottom: 1px solid #e5e7eb;
+  font-variant-numeric: tabular-nums; }
+th:first-child, td:first-child { text-align: left; }
+th { color: #6b7280; font-weight: 600; }
+"""
+
+
+class ValidationSize(NamedTuple):
+    """How much is run."""
+
+    seeds: int
+    strengths: int
+    """Of each of the two kinds of slip, the strongest."""
+    standing: float
+    """s for which the gyro stands"""
+    patrol: float
+    """s of driving through the room until the distance sensors die"""
+
+
+FULL = ValidationSize(seeds=8, strengths=3, standing=600.0, patrol=60.0)
+QUICK = ValidationSize(seeds=1, strengths=1, standing=60.0, patrol=14.0)
+
+
+def write_validation(output: Path, seed: int, amount: ValidationSize, progress: Any = None) -> str:
+    """Return the tables in words and where the page is, after writing it and its pictures.
+
+    Raises
+    ------
+    OSError
+        The output cannot be written.
+    """
+    from t3mpc_ros.evaluation.plotting import png_of
+    from t3mpc_ros.evaluation.reporting import Table
+    from t3mpc_ros.evaluation.twin_validation import yaw_drift
+    from t3mpc_ros.evaluation.twin_validation.validation_figures import VALIDATION_FIGURES
+
+    evidence = run_validation(seed, amount, progress)
+    tables: list[Table] = [yaw_drift.drift_table(evidence.drifts), bench_table(evidence)]
+    # Outcomes of driving the twin in a closed loop, as one more Table, belong here.
+    pictures = {
+        drawing.stem: png_of(drawing.draw, evidence) or b'' for drawing in VALIDATION_FIGURES
+    }
+    output.mkdir(parents=True, exist_ok=True)
+    for stem, png in pictures.items():
+        (output / f'{stem}.png').write_bytes(png)
+    origin = f'seeds {seed} to {seed + amount.seeds - 1}; simulation only'
+    if amount == QUICK:
+        origin = f'a quick look, {origin}'
+    findings = _findings(evidence)
+    page = _page(origin, findings, tables, pictures)
+    (output / PAGE).write_text(page, encoding='utf-8')
+    said = [table.markdown() for table in tables]
+    return '\n\n'.join([*said, '\n'.join(findings), str(output / PAGE)])
+
+
+def run_validation(seed: int, amount: ValidationSize, progress: Any = None) -> 'Evidence':
+    """Return everything that is measured; ``progress`` is told how far it is."""
+    import numpy as np
+
+    from t3mpc_ros.evaluation.twin_validation import component_tests, courses, yaw_drift
+    from t3mpc_ros.evaluation.twin_validation.validation_figures import Evidence
+    from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
+
+    parameters = DigitalTwinParameters.from_dict({'seed': seed, 'world': 'room'})
+    seeds = range(seed, seed + amount.seeds)
+    kinds = [
+        [slip for slip in yaw_drift.SLIPS if slip.fault == kind][-amount.strengths :]
+        for kind in dict.fromkeys(slip.fault for slip in yaw_drift.SLIPS)
+    ]
+    slips = [yaw_drift.NO_SLIP, *(slip for kind in kinds for slip in kind)]
+    shown = yaw_drift.SLIPS[1]
+    count = _ProgressCounter(progress, len(seeds) * len(slips) * len(yaw_drift.COURSES) + 4)
+
+    fastest, motor = 140.0, parameters.motor
+    torque = [
+        component_tests.torque_curve(motor, volts, current, fastest)
+        for current in (motor.phase_current, motor.rated_current)
+        for volts in (9.0, 12.0, 24.0)
+    ]
+    limit = component_tests.breaking_acceleration(parameters)
+    ramps = tuple(component_tests.ramp(parameters, part * limit, 10.0) for part in (0.5, 1.5))
+    near = np.linspace(0.0, 1.0, 401)
+    places = np.concatenate([np.arange(0.0, 0.1, 0.001), np.arange(0.1, 1.0, 0.005)])
+    readings = component_tests.sharp_readings(parameters.sharp, places, seed)
+    rate = parameters.rate
+    told = component_tests.standing_gyro(parameters.imu, amount.standing, rate, seed)
+    low_pass = [component_tests.low_pass_response(number) for number in range(7)]
+    count()
+    found = yaw_drift.measure_drifts(seeds, slips, count)
+    squares = tuple(
+        yaw_drift.drive_course(name, shown, seed) for name in ('square ccw', 'square cw')
+    )
+    count()
+    turns, spells = (
+        yaw_drift.drive_course('10 turns', shown, seed),
+        yaw_drift.slip_events('10 turns', shown, seed),
+    )
+    count()
+    patrol = courses.patrol(parameters, amount.patrol, 30.0)
+    count()
+    return Evidence(
+        parameters=parameters,
+        torque=torque,
+        needed=component_tests.needed_torque(parameters),
+        ramps=(ramps[0], ramps[1]),
+        sharp=np.column_stack([near, component_tests.sharp_curve(near)]),
+        readings=np.column_stack([places, readings]),
+        low_pass=low_pass,
+        allan=component_tests.allan_deviation(told, rate),
+        squares=(squares[0], squares[1]),
+        slip_shown=shown.name,
+        turns=turns,
+        spells=spells,
+        drifts=found,
+        patrol=patrol,
+    )
+
+
+def bench_table(evidence: 'Evidence') -> 'Table':
+    """Return what was measured of the parts beside what the data sheets say."""
+    import numpy as np
+
+    from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table
+    from t3mpc_ros.evaluation.twin_validation.component_tests import GYRO_SHEET, sharp_deviation
+
+    parameters, patrol = evidence.parameters, evidence.patrol
+    rows = []
+    for curve in evidence.torque:
+        pull = np.interp((parameters.guard.wheel_speed, curve.ceiling), curve.speed, curve.torque)
+        name = f'torque at {curve.volts:g} V, {curve.current:g} A'
+        at = f'at {parameters.guard.wheel_speed:g} rad/s {pull[0]:.3f} N m'
+        at += f', at {curve.ceiling:.1f} rad/s {pull[1]:.3f}'
+        rows.append((name, at, f'needed {evidence.needed:.3f} N m'))
+    for ramp in evidence.ramps:
+        wrong = 100.0 * abs(ramp.believed[-1] - ramp.driven[-1])
+        found = f'{ramp.lost_steps[0]} and {ramp.lost_steps[1]} steps lost, {wrong:.1f} cm wrong'
+        rows.append((f'ramp of {ramp.acceleration:.0f} rad/s²', found, EMPTY_CELL))
+    deviation = f'at most {100.0 * sharp_deviation():.1f} % off'
+    rows.append(('voltage from 10 to 80 cm', deviation, "data sheet's figure 2"))
+    own = int(parameters.imu.low_pass)
+    response, (cutoff, delay) = evidence.low_pass[own], GYRO_SHEET[own]
+    rows.append(('gyro at -3 dB', f'{response.cutoff:.1f} Hz', f'{cutoff:g} Hz'))
+    rows.append(('delay of the gyro', f'{response.delay:.2f} ms', f'{delay:g} ms'))
+    brief = evidence.allan.span < 0.3
+    density = evidence.allan.deviation[brief] * np.sqrt(2.0 * evidence.allan.span[brief])
+    told = f'{density[-1]:.4f} deg/s/√Hz'
+    rows.append(('noise of the gyro', told, f'{parameters.imu.gyro_noise:g} deg/s/√Hz'))
+    rows.append(('hardest push of a wall', f'{patrol.max_contact_force:.0f} N', EMPTY_CELL))
+    return Table('Parts', ('what', 'twin', 'to compare'), tuple(rows))
+
+
+def _findings(evidence: 'Evidence') -> list[str]:
+    """Return in sentences from where on the gyro leaves a fifth of the drift."""
+    import numpy as np
+
+    from t3mpc_ros.evaluation.twin_validation.yaw_drift import NO_SLIP, holds_from
+
+    said = []
+    for course in dict.fromkeys(item.course for item in evidence.drifts):
+        slipped = [
+            item for item in evidence.drifts if item.course == course and item.slip != NO_SLIP.name
+        ]
+        bound = np.degrees(max(item.limit for item in slipped))
+        least = np.degrees(holds_from(slipped))
+        kept = sum(item.holds for item in slipped)
+        said.append(
+            f'{course}: with slip the gyro leaves at most a fifth of the heading error in {kept} '
+            f'of {len(slipped)} runs, in all where the steps are wrong by more than {least:.1f} '
+            f'deg; its own errors may come to {bound:.1f} deg.'
+        )
+    return said
+
+
+def _page(
+    origin: str,
+    findings: Sequence[str],
+    tables: 'Sequence[Table]',
+    pictures: Mapping[str, bytes],
+) -> str:
+    """Return the page as HTML that loads nothing from anywhere."""
+    from t3mpc_ros.evaluation.twin_validation.validation_figures import VALIDATION_FIGURES
+
+    parts = [
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f'<title>{TITLE}</title>\n<style>{_CSS}</style>\n</head>\n<body>',
+        f'<h1>{TITLE}</h1>\n<p class="quiet">{escape(origin)}</p>',
+        *(f'<p>{escape(finding)}</p>' for finding in findings),
+        *(table.html() for table in tables),
+    ]
+    for drawing in VALIDATION_FIGURES[:-1]:
+        data = base64.b64encode(pictures[drawing.stem]).decode()
+        parts.append(
+            f'<h2>{escape(drawing.title)}</h2>\n<figure><img alt="{escape(drawing.title)}" '
+            f'src="data:image/png;base64,{data}">'
+            f'<figcaption class="quiet">{escape(drawing.caption)}</figcaption></figure>'
+        )
+    return '\n'.join([*parts, '</body>\n</html>\n'])
+
+
+class _ProgressCounter:
+    """Counts what is done, for whoever shows progress."""
+
+    def __init__(self, progress: Any, total: int) -> None:
+        self._progress = progress
+        self._count = 0
+        if progress is not None:
+            progress.begin(total)
+
+    def __call__(self) -> None:
+        self._count += 1
+        if self._progress is not None:
+            self._progress.done(self._count)

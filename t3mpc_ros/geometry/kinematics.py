@@ -1,0 +1,79 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Unicycle kinematics of a differential drive, equations (1)-(3) with E1."""
+
+from dataclasses import dataclass
+import math
+
+from t3mpc_ros.geometry.types import BodyTwist, Pose, WheelSpeeds, wrap_angle
+from t3mpc_ros.parameters.table import Parameters, parameter
+
+
+@dataclass(frozen=True)
+class WheelGeometry(Parameters):
+    """The two lengths that turn wheel speeds into body speeds."""
+
+    wheel_radius: float = parameter(
+        0.035, 'wheel radius R', unit='m', low=0.005, high=1.0, source='paper: 7 cm wheels'
+    )
+    wheel_separation: float = parameter(
+        0.147, 'distance between the wheels, 2b', unit='m', low=0.01, high=5.0
+    )
+
+    @property
+    def half_separation(self) -> float:
+        """The paper's iota, b (m). E1: it is *half* the separation, or omega comes out halved."""
+        return 0.5 * self.wheel_separation
+
+
+# Plain, because who only reads a bag needs no compiler; the controller makes an @kernel of one.
+def body_speeds(
+    right: float, left: float, radius: float, half_separation: float
+) -> tuple[float, float]:
+    r"""Return v (m/s) and omega (rad/s) of two wheel speeds (rad/s), equation (1) with E1.
+
+    .. math:: v = R(\dot\theta_R + \dot\theta_L)/2, \qquad
+              \omega = R(\dot\theta_R - \dot\theta_L)/(2b)
+    """
+    return 0.5 * radius * (right + left), 0.5 * radius * (right - left) / half_separation
+
+
+def wheel_speeds(
+    linear: float, angular: float, radius: float, half_separation: float
+) -> tuple[float, float]:
+    """Return right and left wheel speed (rad/s) of a body twist, the inverse of equation (1)."""
+    turn = angular * half_separation
+    return (linear + turn) / radius, (linear - turn) / radius
+
+
+def twist_from_wheels(wheels: WheelSpeeds, geometry: WheelGeometry) -> BodyTwist:
+    """Return the body twist of two wheel speeds, equation (1) with E1."""
+    half = geometry.half_separation
+    return BodyTwist(*body_speeds(wheels.right, wheels.left, geometry.wheel_radius, half))
+
+
+def wheels_from_twist(twist: BodyTwist, geometry: WheelGeometry) -> WheelSpeeds:
+    """Return the wheel speeds of a body twist, the inverse of equation (1)."""
+    half = geometry.half_separation
+    return WheelSpeeds(*wheel_speeds(twist.linear, twist.angular, geometry.wheel_radius, half))
+
+
+def pose_rate(yaw: float, wheels: WheelSpeeds, geometry: WheelGeometry) -> Pose:
+    """Return (x', y', P') in m/s, m/s and rad/s, equations (2)-(3) with E1."""
+    twist = twist_from_wheels(wheels, geometry)
+    return Pose(twist.linear * math.cos(yaw), twist.linear * math.sin(yaw), twist.angular)
+
+
+def advance_pose(pose: Pose, twist: BodyTwist, dt: float) -> Pose:
+    """Return the pose after ``dt`` seconds of constant twist: the exact arc of (2).
+
+    The chord formula with sin(x)/x keeps full accuracy through straight motion.
+    """
+    half_turn = 0.5 * twist.angular * dt
+    chord = twist.linear * dt * (math.sin(half_turn) / half_turn if half_turn else 1.0)
+    direction = pose.yaw + half_turn
+    return Pose(
+        pose.x + chord * math.cos(direction),
+        pose.y + chord * math.sin(direction),
+        wrap_angle(pose.yaw + 2.0 * half_turn),
+    )

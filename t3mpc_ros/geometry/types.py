@@ -1,0 +1,129 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Pose, twist, wheel speeds, and stamped states of the robot, in SI units."""
+
+from collections.abc import Iterator
+from itertools import repeat
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+NANOSECONDS = 1_000_000_000
+"""Nanoseconds in a second: stamps are ``int`` nanoseconds, durations ``float`` seconds."""
+
+
+class Pose(NamedTuple):
+    """Where the middle of the wheel axle is in the world frame, and where it points."""
+
+    x: float
+    """m"""
+    y: float
+    """m"""
+    yaw: float
+    """rad, counter-clockwise from the x axis; the paper's P"""
+
+
+class BodyTwist(NamedTuple):
+    """Speeds in the robot's own frame."""
+
+    linear: float
+    """m/s, forward; the paper's v"""
+    angular: float
+    """rad/s, counter-clockwise; the paper's omega"""
+
+
+class WheelSpeeds(NamedTuple):
+    """Wheel speeds, the paper's chi: right first, forward positive."""
+
+    right: float
+    """rad/s"""
+    left: float
+    """rad/s"""
+
+
+def check_pose(pose: Pose) -> None:
+    """Raise ValueError when a pose is not finite."""
+    if not all(map(math.isfinite, pose)):
+        raise ValueError(f'pose must be finite: got {pose}')
+
+
+ORIGIN = Pose(0.0, 0.0, 0.0)
+STANDSTILL = BodyTwist(0.0, 0.0)
+
+
+class State(NamedTuple):
+    """A pose and a twist at one instant: measured, true or wanted."""
+
+    stamp_ns: int
+    pose: Pose
+    twist: BodyTwist
+
+    def is_finite(self) -> bool:
+        """Whether every number is finite, so that it may be used at all."""
+        (x, y, yaw), (linear, angular) = self.pose, self.twist
+        # A finite sum has finite terms; huge ones may overflow in it, and are looked at singly.
+        return math.isfinite(x + y + yaw + linear + angular) or all(
+            map(math.isfinite, (*self.pose, *self.twist))
+        )
+
+
+def wrap_angle(angle: float) -> float:
+    """Return ``angle`` (rad) brought into (-pi, pi]."""
+    wrapped = math.remainder(angle, math.tau)
+    return math.pi if wrapped == -math.pi else wrapped
+
+
+Array = NDArray[np.float64]
+
+
+class StateArray:
+    """A sequence of :class:`Motion`.
+
+    Parameters
+    ----------
+    stamps_ns
+        Shape (n,).
+    poses
+        x, y (m) and heading (rad), shape (n, 3).
+    twists
+        Forward (m/s) and turning speed (rad/s), shape (n, 2).
+
+    Raises
+    ------
+    ValueError
+        The shapes do not fit together.
+    """
+
+    def __init__(self, stamps_ns: NDArray[np.int64], poses: Array, twists: Array) -> None:
+        count = len(stamps_ns)
+        if np.shape(poses) != (count, 3) or np.shape(twists) != (count, 2):
+            raise ValueError(
+                f'poses must be ({count}, 3) and twists ({count}, 2): got {np.shape(poses)} and '
+                f'{np.shape(twists)}'
+            )
+        self.stamps_ns = np.ascontiguousarray(stamps_ns, dtype=np.int64)
+        self.poses: Array = np.ascontiguousarray(poses, dtype=np.float64)
+        self.twists: Array = np.ascontiguousarray(twists, dtype=np.float64)
+        numbers = np.concatenate([self.poses, self.twists], axis=1)
+        self.finite: NDArray[np.bool_] = np.all(np.isfinite(numbers), axis=1)
+        """Whether every number of each is finite, as ``Motion.is_finite`` says, shape (n,)."""
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def __getitem__(self, k: int) -> State:
+        return State(
+            int(self.stamps_ns[k]),
+            Pose(*self.poses[k].tolist()),
+            BodyTwist(*self.twists[k].tolist()),
+        )
+
+    def __iter__(self) -> Iterator[State]:
+        # As the named tuples make themselves, without a call of Python for each.
+        make = tuple.__new__
+        poses = map(make, repeat(Pose), self.poses.tolist())
+        twists = map(make, repeat(BodyTwist), self.twists.tolist())
+        table = zip(self.stamps_ns.tolist(), poses, twists, strict=True)
+        return map(make, repeat(State), table)

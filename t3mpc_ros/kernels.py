@@ -1,0 +1,94 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Decorator for compiled functions, and the folder that holds the compiled code."""
+
+from collections.abc import Callable, Iterator, Mapping
+import hashlib
+import os
+from pathlib import Path
+import tempfile
+from typing import ParamSpec, TypeVar, cast
+
+import numba
+import numba.core.config
+
+PACKAGE_DIRECTORY = Path(__file__).resolve().parent.parent
+
+
+def cache_directory(environment: Mapping[str, str], sources: Path = PACKAGE_DIRECTORY) -> Path:
+    """Return a writable folder for the kernels compiled from these very sources.
+
+    The compiler's own cache looks only at the file a kernel stands in, so a kernel kept from
+    yesterday would go on calling yesterday's version of a kernel in another file. The folder's
+    name therefore carries a fingerprint of every source file that holds a kernel.
+
+    Parameters
+    ----------
+    environment
+        ``T3MPC_CACHE_DIR`` wins, then ``XDG_CACHE_HOME``, then ``HOME``, then the temporary
+        folder; the first one that can be written to is taken. An installed package is often
+        read-only, so nothing is written beside the sources.
+    sources
+        The folder whose ``*.py`` files with kernels are fingerprinted.
+
+    Raises
+    ------
+    OSError
+        No candidate can be written to; the message names them all.
+    """
+    leaf = source_fingerprint(sources)
+    tried = []
+    for base in _base_directories(environment):
+        folder = base / leaf
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                return folder
+        except OSError as error:
+            tried.append(f'{folder} ({error.strerror})')
+    raise OSError(
+        'no writable folder for compiled kernels; set T3MPC_CACHE_DIR to one. Tried: '
+        + ', '.join(tried)
+    )
+
+
+def source_fingerprint(sources: Path) -> str:
+    """Return 16 hexadecimal digits that change with any file below ``sources`` with a kernel."""
+    digest = hashlib.sha256()
+    for path in sorted(sources.rglob('*.py')):
+        content = path.read_bytes()
+        if b'@kernel' in content or path.parent.name == 'kernels':
+            digest.update(str(path.relative_to(sources)).encode())
+            digest.update(content)
+    return digest.hexdigest()[:16]
+
+
+def _base_directories(environment: Mapping[str, str]) -> Iterator[Path]:
+    if chosen := environment.get('T3MPC_CACHE_DIR'):
+        yield Path(chosen)
+    if base := environment.get('XDG_CACHE_HOME'):
+        yield Path(base) / 't3mpc_ros'
+    if home := environment.get('HOME'):
+        yield Path(home) / '.cache' / 't3mpc_ros'
+    yield Path(tempfile.gettempdir()) / f't3mpc_ros-{os.getuid()}'
+
+
+P = ParamSpec('P')
+R = TypeVar('R')
+
+# Set once, before any kernel is made: numba asks for the folder when it decorates.
+if not numba.core.config.CACHE_DIR:
+    numba.core.config.CACHE_DIR = str(cache_directory(os.environ))
+
+
+def kernel(function: Callable[P, R]) -> Callable[P, R]:
+    """Return ``function`` compiled to machine code on its first call, and kept on disk.
+
+    A kernel takes arrays and numbers only. Division by zero gives inf or NaN as in IEEE 754
+    instead of an exception: arguments are checked once, above the kernel. Constants that may
+    change are passed as arguments, because the cache does not notice a changed global.
+    """
+    return cast(
+        'Callable[P, R]',
+        numba.njit(cache=True, nogil=True, error_model='numpy', fastmath=False)(function),
+    )

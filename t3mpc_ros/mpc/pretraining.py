@@ -1,0 +1,356 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Pretraining of the Boltzmann machine on a simulated or recorded run."""
+
+from dataclasses import dataclass
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.kernels import kernel
+from t3mpc_ros.mpc.boltzmann_machine import (
+    BoltzmannMachine,
+    RlsState,
+    contrastive_divergence_step,
+    predict_error,
+    set_visible,
+)
+from t3mpc_ros.parameters.table import Parameters, parameter
+
+
+@dataclass(frozen=True)
+class NominalLoopParameters(Parameters):
+    """The error dynamics the machine is trained on before it meets the robot.
+
+    delta' = -K (delta + noise) + a + w,   lag a' = v_p(t - dead_time) - a.
+    """
+
+    feedback_gain: float = parameter(
+        8.0,
+        'feedback K; the controller puts its own in its place',
+        unit='1/s',
+        low=0.1,
+        high=100.0,
+    )
+    lag: float = parameter(
+        0.02, 'time constant from v_p to acceleration', unit='s', low=1e-3, high=1.0
+    )
+    dead_time: float = parameter(0.01, 'delay before v_p acts', unit='s', low=0.0, high=1.0)
+
+
+@dataclass(frozen=True)
+class ExcitationParameters(Parameters):
+    """The simulated run, and how the machine learns from it beforehand."""
+
+    duration: float = parameter(240.0, 'length of the run', unit='s', low=10.0, high=3600.0)
+    move: float = parameter(
+        0.5, 'largest v_p of the random levels, as a share of its scale', low=0.01, high=2.0
+    )
+    move_hold: float = parameter(
+        0.3, 'mean time a level of v_p lasts', unit='s', low=0.01, high=100.0
+    )
+    disturbance: float = parameter(
+        2.0, 'standard deviation of the disturbance w', unit='rad/s²', low=0.0, high=1000.0
+    )
+    disturbance_hold: float = parameter(
+        2.0,
+        'mean time a level of w lasts: the machine expects disturbances to last as long',
+        unit='s',
+        low=0.01,
+        high=1000.0,
+    )
+    noise: float = parameter(
+        0.15, 'standard deviation of the measured error', unit='rad/s', low=0.0, high=10.0
+    )
+    epochs: int = parameter(2, 'passes of CD-1 (43) over the run', low=0, high=100)
+    contrast_rate: float = parameter(0.002, 'gamma of (43) during the run', low=0.0, high=1.0)
+    ridge: float = parameter(
+        1e-6, 'ridge penalty, as a share of the mean square of the features', low=1e-12, high=1.0
+    )
+
+
+Array = NDArray[np.float64]
+
+
+def ridge_regression(features: Array, targets: Array, penalty: float) -> Array:
+    """Return the X_o that minimises |targets - features X_o|² + p |X_o|².
+
+    Parameters
+    ----------
+    features
+        mu_1 of each instant, shape (N, hidden).
+    targets
+        delta of each instant over its scale, shape (N,).
+    penalty
+        p as a share of the mean of the diagonal of featuresᵀ features.
+    """
+    square = features.T @ features
+    weight = penalty * np.trace(square) / square.shape[0] + np.finfo(np.float64).tiny
+    return np.linalg.solve(square + weight * np.eye(square.shape[0]), features.T @ targets)
+
+
+@kernel
+def contrastive_divergence_epoch(
+    machine: BoltzmannMachine, errors: Array, moves: Array, rate: float, features: Array
+) -> None:
+    """Pass once through a run, oldest first; learn by (43), and write each mu_1.
+
+    errors, moves : newest first, length N; NaN where they are not known
+    rate          : gamma of (43), 0 to only look
+    features      : row i belongs to errors[i], shape (N - lags, hidden); NaN if a lag is unknown
+    """
+    n_errors, n_moves = machine.delta_lags, machine.lags.size - machine.delta_lags
+    for i in range(features.shape[0] - 1, -1, -1):
+        features[i] = errors[i : i + 1 + n_errors].sum() + moves[i + 1 : i + 1 + n_moves].sum()
+        if math.isnan(features[i, 0]):
+            continue
+        set_visible(machine, errors, moves, i + 1)
+        predict_error(machine)
+        features[i] = machine.mu1
+        contrastive_divergence_step(machine, rate)
+
+
+def pretrain(
+    machine: BoltzmannMachine,
+    memory: RlsState,
+    errors: Array,
+    moves: Array,
+    how: ExcitationParameters,
+    trust: float,
+    noise: float,
+) -> None:
+    """Teach the machine a run: CD-1 epochs for X_v (43), then ridge regression for X_o.
+
+    Parameters
+    ----------
+    machine, memory
+        Changed in place; the memory then holds the run as its prior.
+    errors, moves
+        The run, *newest first*, in rad/s and rad/s²: simulated or recorded, NaN in its gaps.
+    how
+        Epochs, rate and ridge penalty.
+    trust
+        How many instants of later experience the prior is worth.
+    noise
+        Standard deviation of an error that is mere noise, rad/s.
+
+    Raises
+    ------
+    ValueError
+        The arrays differ in length, are infinite, or hold too little to fit the output layer.
+    """
+    lags = max(machine.delta_lags, machine.lags.size - machine.delta_lags)
+    count, hidden = max(errors.size - lags, 0), machine.output_weights.size
+    if errors.shape != moves.shape or errors.ndim != 1:
+        raise ValueError(
+            f'errors and moves must be of one length: got {errors.shape}, {moves.shape}'
+        )
+    if np.isinf((errors, moves)).any():
+        raise ValueError('errors and moves must be finite, or NaN in gaps: got inf')
+    features = np.zeros((count, hidden))
+    for rate in (*[how.contrast_rate] * how.epochs, 0.0):
+        contrastive_divergence_epoch(machine, errors, moves, rate, features)
+    known = ~np.isnan(features[:, 0])
+    features, targets = features[known], errors[:count][known] / machine.scales[0]
+    if targets.size <= hidden:
+        raise ValueError(f'errors must hold more than {hidden} finite values: got {targets.size}')
+    machine.output_weights[:] = ridge_regression(features, targets, how.ridge)
+    square = features.T @ features / targets.size
+    mean = float(np.trace(square))
+    memory.information[:] = 0.0
+    memory.prior[:] = trust * (square + how.ridge * mean / square.shape[0] * np.eye(len(square)))
+    memory.anchor[:] = machine.output_weights
+    quiet = noise**2 / max(float(np.nanmean(errors**2)), noise**2)
+    memory.power[:] = (mean, mean, mean * quiet)
+
+
+class SampleTiming(NamedTuple):
+    """How predictive periods are made of control periods."""
+
+    period: float
+    """Control period, s."""
+    decimation: int
+    """Control periods per predictive period."""
+    average: int
+    """Newest control periods, 1 to ``every``, whose errors are averaged to one sample."""
+
+    @property
+    def span(self) -> float:
+        """Predictive period T, s."""
+        return self.period * self.decimation
+
+
+def nominal_transition(loop: NominalLoopParameters, duration: float) -> Array:
+    """Return the exact map of (delta, a, v_p, w, noise) to (delta, a) after ``duration`` s.
+
+    Rows (delta, a), shape (2, 5). The matrix exponential by Taylor series on a scaled-down
+    matrix, squared back up.
+    """
+    gain, lag = loop.feedback_gain, loop.lag
+    rates = np.zeros((5, 5))
+    rates[0] = (-gain, 1.0, 0.0, 1.0, -gain)
+    rates[1] = (0.0, -1.0 / lag, 1.0 / lag, 0.0, 0.0)
+    halvings = max(0, math.ceil(math.log2(max(np.abs(rates).sum() * duration, 1e-9))) + 2)
+    small = rates * (duration / 2.0**halvings)
+    total, term = np.eye(5), np.eye(5)
+    for order in range(1, 16):
+        term = term @ small / order
+        total = total + term
+    for _ in range(halvings):
+        total = total @ total
+    return np.ascontiguousarray(total[:2])
+
+
+@kernel
+def simulate_nominal_loop(
+    step_matrix: Array,
+    late_matrix: Array,
+    whole_delay: int,
+    decimation: int,
+    average: int,
+    moves: Array,
+    disturbance: Array,
+    noise: Array,
+    errors: Array,
+) -> None:
+    """Write the measured errors of the nominal loop, one per predictive period.
+
+    step_matrix, late_matrix : shape (2, 5), transitions of (delta, a) over the first part of a
+        control period, where the older v_p still acts, and over the rest; inputs v_p, w, noise
+    whole_delay              : whole control periods of dead time
+    every, average           : control periods per sample, and measurements in its mean
+    moves                    : v_p of each predictive period
+    disturbance, noise       : of each control period
+    """
+    delta, actuator = 0.0, 0.0
+    errors[:] = 0.0
+    for k in range(errors.size * decimation):
+        # The sample at a predictive instant is the mean of the newest ``average`` measurements.
+        if k % decimation == 0 or k % decimation > decimation - average:
+            sample = (k + decimation - 1) // decimation
+            if sample < errors.size:
+                errors[sample] += (delta + noise[k]) / average
+        for part in range(2):
+            sent = k - whole_delay - (1 - part)
+            move = moves[sent // decimation] if sent >= 0 else 0.0
+            m = step_matrix if part == 0 else late_matrix
+            new = (
+                m[0, 0] * delta
+                + m[0, 1] * actuator
+                + m[0, 2] * move
+                + m[0, 3] * disturbance[k]
+                + m[0, 4] * noise[k]
+            )
+            actuator = m[1, 1] * actuator + m[1, 2] * move
+            delta = new
+
+
+def random_levels(generator: np.random.Generator, count: int, mean_hold: float) -> Array:
+    """Return ``count`` levels in [-1, 1], each lasting ``mean_hold`` values on average."""
+    fresh = generator.random(count) < 1.0 / max(mean_hold, 1.0)
+    fresh[0] = True
+    levels = generator.uniform(-1.0, 1.0, count)
+    held: Array = levels[fresh][np.cumsum(fresh) - 1]
+    return held
+
+
+def simulate_excitation(
+    loop: NominalLoopParameters,
+    excitation: ExcitationParameters,
+    timing: SampleTiming,
+    move_scale: float,
+    generator: np.random.Generator,
+) -> tuple[Array, Array]:
+    """Return (errors, moves) of a simulated run, *newest first*, one per predictive period.
+
+    v_p and the disturbance w jump between random levels that last a while on average; v_p
+    changes only with the predictive period. The feedback acts on the noisy error.
+
+    Parameters
+    ----------
+    loop, excitation, timing
+        The nominal dynamics, the signals and the periods.
+    move_scale
+        v_p (rad/s²) of which ``excitation.move`` is a share.
+    generator
+        Source of every random number.
+    """
+    count = max(round(excitation.duration / timing.span), 2)
+    fine = count * timing.decimation
+    moves = random_levels(generator, count, excitation.move_hold / timing.span)
+    moves *= excitation.move * move_scale
+    # Levels uniform in [-1, 1] have a standard deviation of 1/sqrt(3).
+    disturbance = random_levels(generator, fine, excitation.disturbance_hold / timing.period)
+    disturbance *= excitation.disturbance * math.sqrt(3.0)
+    noise = excitation.noise * generator.standard_normal(fine)
+    errors = _simulate(loop, timing, moves, disturbance, noise)
+    return np.ascontiguousarray(errors[::-1]), np.ascontiguousarray(moves[::-1])
+
+
+def nominal_step_response(
+    loop: NominalLoopParameters, timing: SampleTiming, horizon: int
+) -> Array:
+    """Return the true s_0 ... s_{n_p-1} of the nominal loop, in (rad/s)/(rad/s²)."""
+    none = np.zeros((horizon + 1) * timing.decimation)
+    return _simulate(loop, timing, np.ones(horizon + 1), none, none)[1:]
+
+
+def _simulate(
+    loop: NominalLoopParameters,
+    timing: SampleTiming,
+    moves: Array,
+    disturbance: Array,
+    noise: Array,
+) -> Array:
+    whole, part = divmod(loop.dead_time / timing.period, 1.0)
+    errors = np.zeros(moves.size)
+    simulate_nominal_loop(
+        nominal_transition(loop, part * timing.period),
+        nominal_transition(loop, (1.0 - part) * timing.period),
+        int(whole),
+        timing.decimation,
+        timing.average,
+        moves,
+        disturbance,
+        noise,
+        errors,
+    )
+    return errors
+
+
+def split_runs(errors: Array, moves: Array, outputs: int) -> list[list[tuple[Array, Array]]]:
+    """Return for each output the first three quarters and the rest of a run, *newest first*.
+
+    Of the rest it is the longest stretch without a gap: a trial goes through it step by step.
+
+    Parameters
+    ----------
+    errors, moves
+        A recorded run, oldest first, shape (N, outputs); NaN where it is not known.
+
+    Raises
+    ------
+    ValueError
+        The two do not have one shape, or not as many columns as there are outputs.
+    """
+    if errors.shape != moves.shape or errors.shape[1:] != (outputs,):
+        raise ValueError(
+            f'errors and moves must be (N, {outputs}): got {errors.shape}, {moves.shape}'
+        )
+    cut = (3 * len(errors)) // 4
+    gaps = cut + np.flatnonzero(np.isnan(errors[cut:] + moves[cut:]).any(axis=1))
+    edges = [cut - 1, *gaps.tolist(), len(errors)]
+    longest = int(np.argmax(np.diff(edges)))
+    rest = slice(edges[longest] + 1, edges[longest + 1])
+    return [
+        [
+            (
+                np.ascontiguousarray(errors[part, z][::-1]),
+                np.ascontiguousarray(moves[part, z][::-1]),
+            )
+            for part in (slice(None, cut), rest)
+        ]
+        for z in range(outputs)
+    ]

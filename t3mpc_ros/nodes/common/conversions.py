@@ -1,0 +1,149 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Conversions between ROS messages and the types of the package."""
+
+from collections.abc import Sequence
+import math
+
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseStamped, Quaternion, TransformStamped, Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import JointState
+
+from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose, State
+
+
+def time_from_ns(stamp_ns: int) -> Time:
+    """Return a stamp as a message."""
+    seconds, rest = divmod(stamp_ns, NANOSECONDS)
+    return Time(sec=seconds, nanosec=rest)
+
+
+def ns_from_time(stamp: Time) -> int:
+    """Return a message's stamp in nanoseconds."""
+    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+
+
+def quaternion_from_yaw(yaw: float) -> Quaternion:
+    """Return the rotation by ``heading`` (rad) about z."""
+    return Quaternion(z=math.sin(0.5 * yaw), w=math.cos(0.5 * yaw))
+
+
+def yaw_from_quaternion(rotation: Quaternion) -> float:
+    """Return the heading (rad) of a rotation, whatever its roll and pitch; NaN if not finite."""
+    # Products, not powers: those raise OverflowError.
+    sine = 2.0 * (rotation.w * rotation.z + rotation.x * rotation.y)
+    cosine = 1.0 - 2.0 * (rotation.y * rotation.y + rotation.z * rotation.z)
+    # The angle of an infinite vector would be finite.
+    if not (math.isfinite(sine) and math.isfinite(cosine)):
+        return math.nan
+    return math.atan2(sine, cosine)
+
+
+def state_from_odometry(message: Odometry) -> State:
+    """Return the planar motion in an odometry message."""
+    position = message.pose.pose.position
+    twist = message.twist.twist
+    return State(
+        ns_from_time(message.header.stamp),
+        Pose(position.x, position.y, yaw_from_quaternion(message.pose.pose.orientation)),
+        BodyTwist(twist.linear.x, twist.angular.z),
+    )
+
+
+def fill_odometry(message: Odometry, motion: State) -> Odometry:
+    """Write a motion into ``message``, which is used again and again: making one is slow."""
+    message.header.stamp = time_from_ns(motion.stamp_ns)
+    message.pose.pose.position.x = motion.pose.x
+    message.pose.pose.position.y = motion.pose.y
+    message.pose.pose.orientation.z = math.sin(0.5 * motion.pose.yaw)
+    message.pose.pose.orientation.w = math.cos(0.5 * motion.pose.yaw)
+    message.twist.twist.linear.x = motion.twist.linear
+    message.twist.twist.angular.z = motion.twist.angular
+    return message
+
+
+def planar_covariance(pose: Sequence[Sequence[float]]) -> list[float]:
+    """Return the 36 numbers of a message for a covariance (3, 3) of x, y, heading.
+
+    What a planar robot cannot know (z, roll, pitch) gets the large variance 1e6.
+    """
+    full = [0.0] * 36
+    places = (0, 1, 5)
+    for row, i in enumerate(places):
+        for column, j in enumerate(places):
+            full[6 * i + j] = float(pose[row][column])
+    for i in (2, 3, 4):
+        full[7 * i] = 1e6
+    return full
+
+
+def body_twist(message: Twist) -> BodyTwist:
+    """Return forward and turning speed of a command; NaN when any of its numbers is not finite.
+
+    What a differential drive cannot do (sideways, up, roll, pitch) is left out, as is usual.
+    """
+    others = (message.linear.y, message.linear.z, message.angular.x, message.angular.y)
+    if not all(map(math.isfinite, others)):
+        return BodyTwist(math.nan, math.nan)
+    return BodyTwist(message.linear.x, message.angular.z)
+
+
+def twist_and_stamp(message: Twist | TwistStamped, now_ns: int) -> tuple[BodyTwist, int]:
+    """Return a command and when it was wanted (ns): now, unless its header says otherwise.
+
+    A stamp of zero is one that nobody has set, as is usual for teleoperation.
+    """
+    if isinstance(message, TwistStamped):
+        return body_twist(message.twist), ns_from_time(message.header.stamp) or now_ns
+    return body_twist(message), now_ns
+
+
+def twist_from_body(twist: BodyTwist) -> Twist:
+    """Return a command message."""
+    message = Twist()
+    message.linear.x = float(twist.linear)
+    message.angular.z = float(twist.angular)
+    return message
+
+
+def stamped_twist(twist: BodyTwist, stamp_ns: int, frame: str) -> TwistStamped:
+    """Return a command message with a header."""
+    message = TwistStamped(twist=twist_from_body(twist))
+    message.header.stamp = time_from_ns(stamp_ns)
+    message.header.frame_id = frame
+    return message
+
+
+def pose_stamped(motion: State, frame: str) -> PoseStamped:
+    """Return the pose of a motion as a message."""
+    message = PoseStamped()
+    message.header.stamp = time_from_ns(motion.stamp_ns)
+    message.header.frame_id = frame
+    message.pose.position.x = motion.pose.x
+    message.pose.position.y = motion.pose.y
+    message.pose.orientation = quaternion_from_yaw(motion.pose.yaw)
+    return message
+
+
+def transform(motion: State, frame: str, child: str) -> TransformStamped:
+    """Return the pose of a motion as a transform from ``frame`` to ``child``."""
+    message = TransformStamped()
+    message.header.stamp = time_from_ns(motion.stamp_ns)
+    message.header.frame_id = frame
+    message.child_frame_id = child
+    message.transform.translation.x = motion.pose.x
+    message.transform.translation.y = motion.pose.y
+    message.transform.rotation = quaternion_from_yaw(motion.pose.yaw)
+    return message
+
+
+def joint_state(
+    names: Sequence[str], angles: Sequence[float], speeds: Sequence[float], stamp_ns: int
+) -> JointState:
+    """Return wheel angles (rad) and speeds (rad/s) as a message."""
+    message = JointState(
+        name=list(names), position=list(map(float, angles)), velocity=list(map(float, speeds))
+    )
+    message.header.stamp = time_from_ns(stamp_ns)
+    return message

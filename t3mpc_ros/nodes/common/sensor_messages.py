@@ -1,0 +1,126 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Imu, Range and BatteryState messages with covariances from the sensor parameters."""
+
+import math
+
+from sensor_msgs.msg import BatteryState, Imu, Range
+
+from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.nodes.common import conversions
+from t3mpc_ros.robot.interface import BatteryReading, ImuSample
+from t3mpc_ros.simulation.sensors.battery import BatteryParameters
+from t3mpc_ros.simulation.sensors.imu import GRAVITY, ImuParameters
+from t3mpc_ros.simulation.sensors.range_sensor import RangeSensorParameters
+
+UNKNOWN_VARIANCE = 1e6
+"""Variance of what is not measured, in whatever unit."""
+
+
+def imu_message(parameters: ImuParameters, frame: str) -> Imu:
+    """Return a message that says how well an inertial sensor measures, and holds no sample yet.
+
+    Orientation is not measured (its covariance begins with -1, REP 145), nor is anything out of
+    the plane. Variances are those of noise and counts; bias and scale error are no noise.
+    """
+    message = Imu()
+    message.header.frame_id = frame
+    message.orientation_covariance[0] = -1.0
+    turn = _noise_variance(math.radians(parameters.gyro_noise), parameters.rate_step, parameters)
+    push = _noise_variance(
+        1e-6 * GRAVITY * parameters.accel_noise, parameters.acceleration_step, parameters
+    )
+    message.angular_velocity_covariance = _diagonal(UNKNOWN_VARIANCE, UNKNOWN_VARIANCE, turn)
+    message.linear_acceleration_covariance = _diagonal(push, push, UNKNOWN_VARIANCE)
+    return message
+
+
+def fill_imu(message: Imu, sample: ImuSample, stamp_ns: int) -> Imu:
+    """Write a sample into ``message``, which is used again and again."""
+    message.header.stamp = conversions.time_from_ns(stamp_ns)
+    message.angular_velocity.z = sample.angular
+    message.linear_acceleration.x = sample.forward
+    message.linear_acceleration.y = sample.sideways
+    return message
+
+
+def range_message(parameters: RangeSensorParameters, frame: str) -> Range:
+    """Return a message that says what a distance sensor can see, and holds no distance yet."""
+    message = Range(
+        radiation_type=Range.INFRARED,
+        field_of_view=parameters.field_of_view,
+        min_range=parameters.minimum,
+        max_range=parameters.maximum,
+        range=math.nan,
+    )
+    message.header.frame_id = frame
+    return message
+
+
+def fill_range(message: Range, distance: float, stamp_ns: int, *, infinity: bool) -> Range:
+    """Write a distance (m) into ``message``, which is used again and again.
+
+    REP 117: -inf is nearer than the sensor can tell, inf beyond its range. Without ``infinity``
+    the latter becomes ``max_range``, for those who take that for a free view.
+    """
+    message.header.stamp = conversions.time_from_ns(stamp_ns)
+    message.range = message.max_range if distance == math.inf and not infinity else distance
+    return message
+
+
+def battery_message(parameters: BatteryParameters) -> BatteryState:
+    """Return a message that says what battery it is, and holds no reading yet."""
+    return BatteryState(
+        temperature=math.nan,
+        capacity=math.nan,
+        design_capacity=parameters.capacity,
+        power_supply_status=BatteryState.POWER_SUPPLY_STATUS_DISCHARGING,
+        power_supply_technology=BatteryState.POWER_SUPPLY_TECHNOLOGY_LION,
+        present=True,
+        cell_voltage=[math.nan] * parameters.cells,
+        cell_temperature=[math.nan] * parameters.cells,
+    )
+
+
+def fill_battery(message: BatteryState, reading: BatteryReading, stamp_ns: int) -> BatteryState:
+    """Write a reading into ``message``; what flows out of a battery is negative there."""
+    message.header.stamp = conversions.time_from_ns(stamp_ns)
+    message.voltage = reading.voltage
+    message.current = -reading.current
+    message.percentage = reading.charge
+    message.charge = reading.charge * message.design_capacity
+    return message
+
+
+def twist_covariance(geometry: WheelGeometry, variance: float) -> list[float]:
+    """Return the 36 numbers for the twist of two wheels measured with ``variance`` ((rad/s)²).
+
+    By (1), v and omega are their mean and difference. How fast the robot slides sideways is not
+    measured, and nothing is if the variance is infinite: the wheels are known to mislead.
+    """
+    forward = 0.5 * variance * geometry.wheel_radius**2
+    turn = forward / geometry.half_separation**2
+    return conversions.planar_covariance(
+        (
+            (min(forward, UNKNOWN_VARIANCE), 0.0, 0.0),
+            (0.0, UNKNOWN_VARIANCE, 0.0),
+            (0.0, 0.0, min(turn, UNKNOWN_VARIANCE)),
+        )
+    )
+
+
+def count_variance(step: float, period: float) -> float:
+    """Return the variance ((rad/s)²) of a speed read from a counter once per ``period`` seconds.
+
+    Each of the two readings is off by up to one ``step`` (rad), evenly spread.
+    """
+    return (step / period) ** 2 / 6.0
+
+
+def _noise_variance(density: float, step: float, parameters: ImuParameters) -> float:
+    """Return the variance of a noise density behind the low-pass, rounded to whole counts."""
+    return density**2 * parameters.noise_bandwidth + step**2 / 12.0
+
+
+def _diagonal(x: float, y: float, z: float) -> list[float]:
+    return [x, 0.0, 0.0, 0.0, y, 0.0, 0.0, 0.0, z]

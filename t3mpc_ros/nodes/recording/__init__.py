@@ -1,3 +1,0 @@
-# Copyright 2026 The t3mpc_ros developers
-# SPDX-License-Identifier: Apache-2.0
-"""The parts of the recorder that know ROS or a thread: subscriptions, questions, the writer."""

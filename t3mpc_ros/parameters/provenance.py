@@ -1,0 +1,41 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Version and commit of the running package, for bags and reports."""
+
+from pathlib import Path
+import platform
+import subprocess
+
+import t3mpc_ros
+
+PACKAGE_DIRECTORY = Path(t3mpc_ros.__file__).resolve().parent
+
+
+def provenance(package: Path = PACKAGE_DIRECTORY) -> dict[str, str]:
+    """Return version, commit and Python version, for bags and reports.
+
+    The commit is that of the checkout the package is imported from, with ``-dirty`` behind it
+    when files differ; ``unknown`` when it is not imported from a checkout of its own.
+    """
+    return {
+        'version': t3mpc_ros.__version__,
+        'commit': _commit(package),
+        'python': platform.python_version(),
+    }
+
+
+def _commit(package: Path) -> str:
+    root = package.parent
+    if not (root / '.git').exists():  # installed somewhere below another project's checkout?
+        return 'unknown'
+    try:
+        result = subprocess.run(
+            ['git', '-C', str(root), 'describe', '--always', '--dirty', '--abbrev=40', '--match='],
+            capture_output=True,
+            text=True,
+            timeout=5.0,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return 'unknown'
+    return result.stdout.strip() or 'unknown'

@@ -1,0 +1,167 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of the link: radio, cycle rate, and the parameters of the robot board."""
+
+from dataclasses import dataclass
+
+from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
+from t3mpc_ros.radio.protocol.frames import BOARD_PARAMETERS, Configure, Downlink, Hello
+
+_RATES = ('250k', '1M', '2M')
+_POWERS = ('-18', '-12', '-6', '0')
+_GAP_UNIT = 250e-6
+_GAPS = {'250k': 2.75e-3, '1M': 1.5e-3, '2M': 1.75e-3}
+"""s; at 250k acknowledgements take long, at 2M the POLL would come before a tag is checked."""
+_HELLO_GAP = 5e-3
+"""s; four hashes on a 16 MHz AVR"""
+_TTL_UNIT = 0.01
+
+
+@dataclass(frozen=True)
+class RobotParameters(Parameters):
+    """Parameters that are written into the robot at the start of every session.
+
+    Microsteps, steps per revolution and the range of the gyro are the board's; the host asks.
+    """
+
+    max_speed: float = parameter(
+        10.0,
+        'largest wheel speed; the faster wheel sets the scale of both',
+        unit='rad/s',
+        low=0.0,
+        high=19.6,
+        source='10 000 microsteps a second at 16 microsteps are 19.6 rad/s',
+    )
+    acceleration: float = parameter(
+        30.0, 'how fast the faster changing wheel may', unit='rad/s²', low=0.1, high=100.0
+    )
+    deceleration: float = parameter(
+        60.0,
+        'the same when it is to stand: from 10 rad/s within 0.37 s of the last command',
+        unit='rad/s²',
+        low=0.1,
+        high=200.0,
+    )
+    ttl_max: float = parameter(
+        0.25, 'no command is followed for longer than this', unit='s', low=0.02, high=0.5
+    )
+    battery_low: float = parameter(
+        10.2, 'below this the robot warns', unit='V', low=0.0, high=30.0
+    )
+    idle_off: float = parameter(
+        0.0,
+        'at rest for this long the drivers go off, and hold nothing; 0: never',
+        unit='s',
+        low=0.0,
+        high=600.0,
+    )
+    invert_left: bool = parameter(False, 'the left motor is mounted or wired the other way round')
+    invert_right: bool = parameter(False, 'the right motor is')
+
+    def on_wire(self) -> dict[int, int]:
+        """Return the numbers to write, by id of the parameter."""
+        values = {
+            name: round(1000.0 * getattr(self, name))
+            for name in (
+                'max_speed',
+                'acceleration',
+                'deceleration',
+                'ttl_max',
+                'battery_low',
+                'idle_off',
+            )
+        }
+        values['invert_wheels'] = self.invert_left + 2 * self.invert_right
+        return {
+            number: values[parameter.name]
+            for number, parameter in enumerate(BOARD_PARAMETERS)
+            if parameter.name in values
+        }
+
+
+@dataclass(frozen=True)
+class LinkParameters(Parameters):
+    """The radio link from the host's side."""
+
+    channel: int = parameter(
+        82,
+        '2400 MHz plus this; 82 is in the band, above Bluetooth advertising, at the edge of Wi-Fi',
+        unit='MHz',
+        low=0,
+        high=125,
+        source='nRF24L01+ data sheet 1.0, 6.3',
+    )
+    rate: str = parameter(
+        '1M', 'bits per second in the air; 250k only with plus parts', choices=_RATES
+    )
+    power: str = parameter('0', 'transmitter output, dBm', choices=_POWERS)
+    retries: int = parameter(
+        4,
+        'tries more when nobody acknowledges, 0.7 ms each: a late command is worthless',
+        low=0,
+        high=15,
+    )
+    address: str = parameter(
+        '54334d5043',
+        'of the robot: 10 hexadecimal digits, the byte sent last first; this is T3MPC',
+    )
+    cycle_rate: float = parameter(
+        50.0, 'commands and measurements per second', unit='Hz', low=1.0, high=100.0
+    )
+    ttl: float = parameter(
+        0.2,
+        'how long the robot follows a command when no other comes',
+        unit='s',
+        low=0.02,
+        high=0.5,
+    )
+    cmd_vel_timeout: float = parameter(
+        0.25,
+        'age at which the host commands standstill instead',
+        unit='s',
+        low=0.02,
+        high=0.5,
+    )
+    robot: RobotParameters = group(RobotParameters)
+
+    def check_consistency(self) -> None:
+        """Raise ParameterError when the address is none, or the robot would cut the TTL short."""
+        try:
+            size = len(bytes.fromhex(self.address))
+        except ValueError:
+            size = 0
+        if size != 5 or len(self.address) != 10:
+            raise ParameterError(f'address must be 10 hexadecimal digits: got {self.address!r}')
+        if self.ttl > self.robot.ttl_max:
+            raise ParameterError(
+                f'ttl must be at most robot.ttl_max ({self.robot.ttl_max:g} s): got {self.ttl:g}'
+            )
+
+    @property
+    def gap(self) -> int:
+        """Between CMD and POLL, in steps of 250 us: the answer must be off the air before."""
+        return round(_GAPS[self.rate] / _GAP_UNIT)
+
+    def gap_after(self, first: Downlink) -> int:
+        """Return the gap after a first packet: a board with a key hashes long over a HELLO."""
+        signed = isinstance(first, Hello) and first.tag
+        return max(self.gap, round(_HELLO_GAP / _GAP_UNIT)) if signed else self.gap
+
+    @property
+    def ttl_units(self) -> int:
+        """The TTL as it goes into a CMD."""
+        return round(self.ttl / _TTL_UNIT)
+
+    def configure(self, number: int) -> Configure:
+        """Return the frame that sets the dongle's radio."""
+        # Shorter, and acknowledgements of 32 bytes would be cut off (data sheet 7.4.2).
+        delay = 5 if self.rate == '250k' else 1
+        return Configure(
+            number,
+            self.channel,
+            _RATES.index(self.rate),
+            _POWERS.index(self.power),
+            delay,
+            self.retries,
+            bytes.fromhex(self.address),
+        )

@@ -1,0 +1,370 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Encoding and decoding of every frame of protocol 1; the layouts are one table at the end.
+
+A frame is decoded completely or rejected, and a value that does not fit is not encoded: FrameError
+names the frame, the field, the bound and the value. All numbers are little endian.
+"""
+
+import struct
+from typing import Any, NamedTuple
+
+from t3mpc_ros.radio.protocol.frames import (
+    PAYLOAD_LIMIT,
+    VERSION,
+    Ack,
+    Action,
+    Aux,
+    Command,
+    CommandFlag,
+    Configure,
+    Configured,
+    Downlink,
+    FrameError,
+    FrameErrorKind,
+    FromBoard,
+    FromDongle,
+    Hello,
+    Info,
+    Key,
+    KeyState,
+    Param,
+    ParamGet,
+    ParamSet,
+    Ping,
+    Poll,
+    Pong,
+    Refusal,
+    Result,
+    State,
+    ToBoard,
+    ToDongle,
+    Transmit,
+    Uplink,
+)
+
+
+class ExchangeStatus(NamedTuple):
+    """What became of one radio payload."""
+
+    acknowledged: bool
+    answered: bool
+    """With a payload."""
+    given_up: bool
+    """Nobody acknowledged any try (MAX_RT)."""
+    skipped: bool
+    """Not sent, because the one before it was given up."""
+    retransmissions: int
+
+
+def decode_exchange_status(status: int) -> ExchangeStatus:
+    """Return what a status byte of a RESULT says.
+
+    Raises
+    ------
+    FrameError
+        It contradicts itself.
+    """
+    acknowledged, answered, given_up, skipped = (bool(status & bit) for bit in (1, 2, 4, 8))
+    said = ExchangeStatus(acknowledged, answered, given_up, skipped, status >> 4)
+    if (
+        said.acknowledged + said.given_up + said.skipped > 1
+        or (said.answered and not said.acknowledged)
+        or (said.skipped and said.retransmissions)
+    ):
+        raise FrameError(FrameErrorKind.VALUE, f'RESULT.status must make sense: got {status:#04x}')
+    return said
+
+
+def encode(
+    frame: Downlink | Uplink | ToDongle | FromDongle | ToBoard | FromBoard,
+) -> bytes:
+    """Return the bytes of a frame, without the CRC of the serial line.
+
+    Raises
+    ------
+    FrameError
+        Something does not fit; the text names frame, field, bound and value.
+    """
+    layout = _LAYOUTS[type(frame)]
+    # An optional end (nonce, tag, address) is there or not; which, its last field tells.
+    fixed = layout.forms[-1 if frame[-1] != b'' else 0].pack(frame)
+    if isinstance(frame, Transmit):
+        _check_payloads(frame)
+        return fixed + bytes([len(frame.first)]) + frame.first + frame.second
+    if isinstance(frame, Result):
+        _check_result_payload(frame)
+        return fixed + frame.payload
+    return fixed
+
+
+def decode_downlink(data: bytes) -> Downlink:
+    """Return the radio payload a host sends, or raise FrameError."""
+    return _decode(data, _DOWNLINK)  # type: ignore[no-any-return]
+
+
+def is_estop_command(data: bytes) -> bool:
+    """Return whether this is a CMD that asks for an emergency stop, whatever else is wrong."""
+    sizes = [form.size for form in _DOWNLINK[0x11].forms]
+    return len(data) in sizes and data[0] == 0x11 and bool(data[3] & CommandFlag.ESTOP)
+
+
+def decode_uplink(data: bytes) -> Uplink:
+    """Return the radio payload a robot sends, or raise FrameError."""
+    return _decode(data, _UPLINK)  # type: ignore[no-any-return]
+
+
+def decode_to_dongle(data: bytes) -> ToDongle:
+    """Return the frame a host sends over USB, or raise FrameError."""
+    if data[:1] != b'\x01':
+        return _decode(data, _TO_DONGLE)  # type: ignore[no-any-return]
+    if len(data) < 4:
+        raise FrameError(
+            FrameErrorKind.LENGTH, f'TX must be at least 4 bytes long: got {len(data)}'
+        )
+    end = 4 + data[3]
+    frame = Transmit(data[1], data[2], data[4:end], data[end:])
+    if len(frame.first) != data[3]:
+        raise FrameError(
+            FrameErrorKind.LENGTH,
+            f'TX must have {data[3]} bytes of payload: got {len(frame.first)}',
+        )
+    _check_payloads(frame)
+    return frame
+
+
+def decode_from_dongle(data: bytes) -> FromDongle:
+    """Return the frame a dongle sends over USB, or raise FrameError."""
+    if data[:1] != b'\x81':
+        return _decode(data, _FROM_DONGLE)  # type: ignore[no-any-return]
+    form = _LAYOUTS[Result].forms[0]
+    frame: Result = form.unpack(data[: form.size])._replace(payload=data[form.size :])
+    _check_result_payload(frame)
+    return frame
+
+
+def decode_to_board(data: bytes) -> ToBoard:
+    """Return the frame a host sends over the robot's own USB, or raise FrameError."""
+    return _decode(data, _TO_BOARD)  # type: ignore[no-any-return]
+
+
+def decode_from_board(data: bytes) -> FromBoard:
+    """Return the frame a robot sends over its own USB, or raise FrameError."""
+    return _decode(data, _FROM_BOARD)  # type: ignore[no-any-return]
+
+
+class _Field(NamedTuple):
+    name: str
+    code: str
+    low: int
+    high: int
+    """Of a number; a text of bytes has its length here twice."""
+
+    def check(self, kind: str, value: object) -> None:
+        if self.code.endswith('s'):
+            if not isinstance(value, bytes) or len(value) != self.high:
+                raise FrameError(
+                    FrameErrorKind.VALUE,
+                    f'{kind}.{self.name} must be {self.high} bytes: got {value!r}',
+                )
+        elif not isinstance(value, int) or not self.low <= value <= self.high:
+            bound = f'from {self.low} to {self.high}' if self.low < self.high else f'{self.low}'
+            raise FrameError(
+                FrameErrorKind.VALUE, f'{kind}.{self.name} must be {bound}: got {value!r}'
+            )
+
+
+_RANGES = {
+    'B': (0, 0xFF),
+    'H': (0, 0xFFFF),
+    'I': (0, 0xFFFFFFFF),
+    'h': (-0x8000, 0x7FFF),
+    'i': (-0x80000000, 0x7FFFFFFF),
+}
+
+
+class _Form:
+    """One layout of a frame: its first byte, then columns ``name code [low high]``.
+
+    A column that is no field of the frame's type always holds its one allowed value.
+    """
+
+    def __init__(self, kind: Any, name: str, head: int, columns: str) -> None:
+        self._kind, self._name, self._head = kind, name, head
+        self._columns = []
+        for text in columns.split(', '):
+            column, code, *bounds = text.split()
+            low, high = map(int, bounds) if bounds else _RANGES.get(code) or 2 * (int(code[:-1]),)
+            self._columns.append(_Field(column, code, low, high))
+        self._struct = struct.Struct('<B' + ''.join(column.code for column in self._columns))
+        self.size = self._struct.size
+        self._given = {column.name for column in self._columns}
+
+    def pack(self, frame: Any) -> bytes:
+        values = []
+        for column in self._columns:
+            value = getattr(frame, column.name, column.low)
+            column.check(self._name, value)
+            values.append(value)
+        for field, default in self._kind._field_defaults.items():
+            # What is not in this form would be lost.
+            if field not in self._given and field not in _VARIABLE_FIELDS:
+                value = getattr(frame, field)
+                if value != default:
+                    raise FrameError(
+                        FrameErrorKind.VALUE,
+                        f'{self._name}.{field} must be {default!r} without '
+                        f'{self._kind._fields[-1]}: got {value!r}',
+                    )
+        return self._struct.pack(self._head, *values)
+
+    def unpack(self, data: bytes) -> Any:
+        if len(data) != self.size:
+            raise FrameError(
+                FrameErrorKind.LENGTH,
+                f'{self._name} must be at least {self.size} bytes long: got {len(data)}',
+            )
+        values = {}
+        for column, value in zip(self._columns, self._struct.unpack(data)[1:], strict=True):
+            column.check(self._name, value)
+            if column.name in self._kind._fields:
+                values[column.name] = value
+        return self._kind(**values)
+
+
+class _Layout(NamedTuple):
+    name: str
+    forms: tuple[_Form, ...]
+
+
+_VARIABLE_FIELDS = ('first', 'second', 'payload')
+"""Fields of TX and RESULT whose length is not fixed."""
+
+
+def _layout(kind: Any, name: str, head: int, columns: str, *longer: str) -> _Layout:
+    forms = tuple(_Form(kind, name, head, text) for text in (columns, *longer))
+    layout = _Layout(name, forms)
+    _LAYOUTS[kind] = layout
+    return layout
+
+
+def _decode(data: bytes, table: dict[int, _Layout]) -> Any:
+    if not data or len(data) > PAYLOAD_LIMIT:
+        raise FrameError(
+            FrameErrorKind.LENGTH, f'a frame must have 1 to {PAYLOAD_LIMIT} bytes: got {len(data)}'
+        )
+    layout = table.get(data[0])
+    if layout is None:
+        if table in (_DOWNLINK, _UPLINK) and data[0] >> 4 != VERSION:
+            raise FrameError(
+                FrameErrorKind.VERSION, f'version must be {VERSION}: got {data[0] >> 4}'
+            )
+        raise FrameError(FrameErrorKind.KIND, f'kind of frame must be known: got {data[0]:#04x}')
+    for form in layout.forms:
+        if form.size == len(data):
+            return form.unpack(data)
+    sizes = ' or '.join(str(form.size) for form in layout.forms)
+    raise FrameError(
+        FrameErrorKind.LENGTH, f'{layout.name} must be {sizes} bytes long: got {len(data)}'
+    )
+
+
+def _check_payloads(frame: Transmit) -> None:
+    for name, payload, least in (('first', frame.first, 1), ('second', frame.second, 0)):
+        if not least <= len(payload) <= PAYLOAD_LIMIT:
+            raise FrameError(
+                FrameErrorKind.LENGTH,
+                f'TX.{name} must have {least} to {PAYLOAD_LIMIT} bytes: got {len(payload)}',
+            )
+
+
+def _check_result_payload(frame: Result) -> None:
+    answered = (
+        decode_exchange_status(frame.first).answered
+        or decode_exchange_status(frame.second).answered
+    )
+    if len(frame.payload) > PAYLOAD_LIMIT or bool(frame.payload) != answered:
+        bound = f'1 to {PAYLOAD_LIMIT}' if answered else 'no'
+        raise FrameError(
+            FrameErrorKind.LENGTH,
+            f'RESULT.payload must have {bound} bytes: got {len(frame.payload)}',
+        )
+
+
+# -- the table ------------------------------------------------------------------------------------
+
+_LAYOUTS: dict[Any, _Layout] = {}
+_COMMAND = 'session B, seq B, flags B 0 7, ttl B, reserved B 0 0, left h, right h, host_us I'
+_PARAM_SET, _ACTION = 'session B, seq B, id B, value i', 'session B, seq B, verb B, reserved H 0 0'
+_INFO = (
+    'session B, seq B, protocol B, major B, minor B, reset_cause B, parameters B, '
+    'steps_per_rev H, microsteps H, time_us I, status B'
+)
+_RADIO_SETUP = (
+    'id B, channel B 0 125, rate B 0 2, power B 0 3, retry_delay B 0 15, retries B 0 15, '
+    'address 5s'
+)
+_SIGNATURE = ', host_us I, tag 8s'
+
+_DOWNLINK = {
+    0x11: _layout(Command, 'CMD', 0x11, _COMMAND, _COMMAND + ', tag 8s'),
+    0x12: _layout(ParamGet, 'PARAM_GET', 0x12, 'session B, seq B, id B'),
+    0x13: _layout(ParamSet, 'PARAM_SET', 0x13, _PARAM_SET, _PARAM_SET + _SIGNATURE),
+    0x14: _layout(
+        Hello,
+        'HELLO',
+        0x14,
+        'session B 1 255, seq B, flags B 0 0, host_us I',
+        'session B 1 255, seq B, flags B 1 1, host_us I, nonce 8s, tag 8s',
+    ),
+    0x15: _layout(Poll, 'POLL', 0x15, 'session B, seq B, what B 0 2'),
+    0x16: _layout(Action, 'ACTION', 0x16, _ACTION, _ACTION + _SIGNATURE),
+}
+_UPLINK = {
+    0x11: _layout(
+        State,
+        'STATE',
+        0x11,
+        'session B, seq B, status B, time_us I, left i, right i, gyro_z h, accel_x h, '
+        'accel_y h, age H, ranges 8s',
+    ),
+    0x12: _layout(
+        Param, 'PARAM', 0x12, 'session B, seq B, id B, rc B 0 4, value i, low i, high i'
+    ),
+    0x13: _layout(Info, 'INFO', 0x13, _INFO, _INFO + ', nonce 8s'),
+    0x14: _layout(Ack, 'ACK', 0x14, 'session B, seq B, verb B, rc B 0 4'),
+    0x15: _layout(
+        Aux,
+        'AUX',
+        0x15,
+        'session B, seq B, status B, battery H, temperature h, accel_z h, gyro_x h, gyro_y h, '
+        'received H, duplicates H, bad_session H, stale H, expired H, time_us I, '
+        'bad_version H, short H',
+    ),
+}
+_TO_DONGLE = {
+    0x01: _layout(Transmit, 'TX', 0x01, 'id B, gap B'),
+    0x02: _layout(Configure, 'CFG', 0x02, 'id B', _RADIO_SETUP),
+    0x03: _layout(Ping, 'PING', 0x03, 'id B, echo 4s'),
+}
+_FROM_DONGLE = {
+    0x81: _layout(Result, 'RESULT', 0x81, 'id B, first B, second B, dongle_us I'),
+    0x82: _layout(Configured, 'CFG', 0x82, _RADIO_SETUP + ', chip_ok B 0 1'),
+    0x83: _layout(
+        Pong,
+        'PONG',
+        0x83,
+        'id B, echo 4s, time_us I, protocol B, major B, minor B, chip_ok B 0 1, '
+        'crc_errors H, frame_errors H, overruns H, reset_cause B',
+    ),
+    0x8F: _layout(Refusal, 'ERR', 0x8F, 'code B 1 3, argument B'),
+}
+_TO_BOARD = {
+    0x03: _TO_DONGLE[0x03],
+    0x04: _layout(Key, 'KEY', 0x04, 'id B', 'id B, key 16s'),
+}
+_FROM_BOARD = {
+    0x83: _FROM_DONGLE[0x83],
+    0x84: _layout(KeyState, 'KEY', 0x84, 'id B, rc B 0 5, state B 0 2, check I'),
+    0x8F: _FROM_DONGLE[0x8F],
+}

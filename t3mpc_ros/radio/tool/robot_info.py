@@ -1,0 +1,135 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Robot information and parameters, read only, in any session."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from t3mpc_ros.radio.link import port_actions
+from t3mpc_ros.radio.link.handshake import Session, robot_absent
+from t3mpc_ros.radio.link.link_parameters import LinkParameters
+from t3mpc_ros.radio.protocol import frames
+from t3mpc_ros.radio.protocol.codec import decode_uplink, encode
+from t3mpc_ros.radio.protocol.frames import (
+    BOARD_PARAMETERS,
+    VERSION,
+    Downlink,
+    FrameError,
+    Info,
+    Param,
+    ParamGet,
+    Poll,
+    Result,
+    Transmit,
+    Uplink,
+)
+from t3mpc_ros.radio.tool.procedure import (
+    ProcedureError,
+    Request,
+    Script,
+    configure_radio,
+    read_radio_setup,
+    wait_for_dongle,
+)
+
+_REPLY_TIMEOUT = 0.25
+_MAX_ATTEMPTS = 20
+
+
+class RobotInfo(NamedTuple):
+    """What the robot is, and its parameters."""
+
+    info: Info
+    values: tuple[Param, ...]
+
+
+def read_robot_info(
+    parameters: LinkParameters, key: bytes, entropy: Callable[[int], bytes]
+) -> Script[RobotInfo]:
+    """Return all parameters of the robot.
+
+    One that is in a session is read in that, and goes on undisturbed. One that is in none is
+    greeted, which needs the key if it has one.
+    """
+    yield from wait_for_dongle()
+    before = yield from read_radio_setup()
+    try:
+        yield from configure_radio(parameters.configure(0))
+        info = yield from _request_info(parameters)
+        if not info.session:
+            info = yield from _start_session(parameters, Session(key, entropy, 0, 0))
+        values = []
+        for number in range(info.parameters):
+            values.append((yield from _read_parameter(parameters, info.session, number)))
+    finally:
+        yield from configure_radio(before)
+    return RobotInfo(info, tuple(values))
+
+
+def _transact(parameters: LinkParameters, first: Downlink, fetch: int) -> Script[Uplink | None]:
+    payloads = encode(first), encode(Poll(0, 0, fetch))
+    heard = yield Request(Transmit(0, parameters.gap_after(first), *payloads), _REPLY_TIMEOUT)
+    if isinstance(heard.reply, Result) and heard.reply.payload:
+        try:
+            return decode_uplink(heard.reply.payload)
+        except FrameError:
+            return None
+    return None
+
+
+def _request_info(parameters: LinkParameters) -> Script[Info]:
+    for _ in range(_MAX_ATTEMPTS):
+        told = yield from _transact(parameters, Poll(0, 0, frames.INFO), frames.INFO)
+        if isinstance(told, Info):
+            if told.protocol != VERSION:
+                raise ProcedureError(
+                    f'the robot must speak protocol {VERSION}: it speaks {told.protocol}'
+                )
+            return told
+    raise ProcedureError(robot_absent(parameters.channel))
+
+
+def _start_session(parameters: LinkParameters, session: Session) -> Script[Info]:
+    problem = port_actions.HELLO_REJECTED
+    for number in range(_MAX_ATTEMPTS):
+        # A clock of its own: nobody commands in this session, it only has to go on.
+        hello = session.hello(1000 * number)
+        told = yield from _transact(parameters, hello, frames.INFO)
+        if isinstance(told, Info):
+            problem = session.accept(told)
+            if not problem:
+                return told
+    raise ProcedureError(problem)
+
+
+def _read_parameter(parameters: LinkParameters, session: int, number: int) -> Script[Param]:
+    for seq in range(_MAX_ATTEMPTS):
+        told = yield from _transact(parameters, ParamGet(session, seq, number), frames.STATE)
+        if isinstance(told, Param) and (told.id, told.seq) == (number, seq):
+            return told
+    raise ProcedureError('the robot was there, and no longer answers: has it another host?')
+
+
+def format_robot_info(inventory: RobotInfo, parameters: LinkParameters) -> str:
+    """Return the parameters as text: value, bounds, and what a bridge with these settings sets."""
+    info, wanted = inventory.info, parameters.robot.on_wire()
+    signed = 'signed commands only' if info.nonce else 'no key'
+    lines = [
+        f'firmware {info.major}.{info.minor}, {info.steps_per_rev} steps of {info.microsteps} '
+        f'microsteps, {signed}',
+        '',
+        f'{"parameter":<14}  {"value":>7}  {"unit":<7}  {"allowed":<16}  {"bridge sets":>11}',
+    ]
+    for value in inventory.values:
+        lines.append(_format_parameter(value, wanted.get(value.id)))
+    return '\n'.join(lines)
+
+
+def _format_parameter(value: Param, wanted: int | None) -> str:
+    known: Sequence[frames.BoardParameter] = BOARD_PARAMETERS
+    row = known[value.id] if value.id < len(known) else None
+    name, unit = (row.name, row.unit) if row else (f'number {value.id}', '')
+    bounds = 'fixed' if value.low == value.high else f'{value.low} to {value.high}'
+    sets = '' if wanted is None else str(wanted)
+    text = f'{name:<14}  {value.value:>7}  {unit:<7}  {bounds:<16}  {sets:>11}'
+    return text.rstrip()

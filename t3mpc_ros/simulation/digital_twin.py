@@ -1,0 +1,474 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Digital twin: board, motors, body, sensors, world and faults behind the robot interface."""
+
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+
+from t3mpc_ros.geometry.kinematics import twist_from_wheels
+from t3mpc_ros.geometry.types import Pose, State, WheelSpeeds, check_pose
+from t3mpc_ros.parameters.table import ParameterError, group, parameter
+from t3mpc_ros.robot.command_limiter import CommandLimiter
+from t3mpc_ros.robot.gyro_odometry import GyroOdometry, GyroOdometryParameters
+from t3mpc_ros.robot.interface import (
+    RANGE_SENSORS,
+    ZERO_WHEEL_SPEEDS,
+    ImuSample,
+    RobotCommand,
+    RobotState,
+    RobotStatus,
+    WheelAngles,
+)
+from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON, SlipMonitor
+from t3mpc_ros.simulation.fault_injection import (
+    FaultParameters,
+    FaultSchedule,
+    active_faults,
+    load_schedule,
+)
+from t3mpc_ros.simulation.fixed_step import FixedStepRobot
+from t3mpc_ros.simulation.plant.contact import BumperParameters
+from t3mpc_ros.simulation.plant.disturbances import Disturbance, SpeedNoise
+from t3mpc_ros.simulation.plant.drivetrain import Drivetrain, Load, TyreParameters, max_rate
+from t3mpc_ros.simulation.plant.dynamics import BodyParameters
+from t3mpc_ros.simulation.plant.paper_plant import (
+    STABILITY_LIMIT,
+    DriveParameters,
+    PaperRobot,
+    PaperRobotParameters,
+)
+from t3mpc_ros.simulation.plant.stepper_motor import StepperMotorParameters
+from t3mpc_ros.simulation.sensors.battery import BatteryParameters, SimulatedBattery
+from t3mpc_ros.simulation.sensors.imu import ImuParameters, SimulatedImu
+from t3mpc_ros.simulation.sensors.range_sensor import (
+    RangeSensorParameters,
+    SimulatedRangeSensors,
+    sensor_mounts,
+)
+from t3mpc_ros.simulation.transport_delay import TransportDelay
+from t3mpc_ros.simulation.world import cast_rays, clearance, grip_at, load_world
+
+
+@dataclass(frozen=True)
+class DigitalTwinParameters(PaperRobotParameters):
+    """A simulated robot with stepper motors, tyres, sensors, a world and faults.
+
+    ``drive.kind`` says which parts are at work: ``stepper`` uses all of them, the others are the
+    paper's plant and know none.
+    """
+
+    drive: DriveParameters = group(DriveParameters, kind='stepper')
+    motor: StepperMotorParameters = group(StepperMotorParameters)
+    tyres: TyreParameters = group(TyreParameters)
+    bumper: BumperParameters = group(BumperParameters)
+    imu: ImuParameters = group(ImuParameters)
+    sharp: RangeSensorParameters = group(RangeSensorParameters)
+    battery: BatteryParameters = group(BatteryParameters)
+    odometry: GyroOdometryParameters = group(GyroOdometryParameters)
+    faults: FaultParameters = group(FaultParameters)
+    world: str = parameter(
+        '', 'world to drive in: the name of a shipped one or a YAML file; empty = an endless plain'
+    )
+    boot_time: float = parameter(
+        0.5, 'how long the board is away after a loss of power', unit='s', low=0.0, high=10.0
+    )
+    slip_stop: float = parameter(
+        1.0,
+        'gyro and steps may disagree for so long, then the robot stops until no motion was '
+        'commanded for 0.5 s; 0 = it never does',
+        unit='s',
+        low=0.0,
+        high=60.0,
+        dynamic=True,
+    )
+
+    def body_with_faults(self, faults: FaultParameters) -> BodyParameters:
+        """Return the body that moves, with what a fault has put on it."""
+        true = self.true_body
+        return replace(true, body_mass=max(true.body_mass + faults.load_change, 0.01))
+
+    def load_with_faults(self, faults: FaultParameters) -> Load:
+        """Return what the motors move, and what holds it back."""
+        held = faults.wheel_blocked
+        return Load(
+            self.body_with_faults(faults),
+            self.geometry,
+            self.friction,
+            self.friction_factor,
+            self.tyres,
+            faults.slippery,
+            (held in ('right', 'both'), held in ('left', 'both')),
+        )
+
+    def check_consistency(self) -> None:
+        """Raise ParameterError when the integration would be unstable, or a speed cannot be made."""
+        if self.drive.kind != 'stepper':
+            super().check_consistency()
+            return
+        load = self.load_with_faults(self.faults)
+        fastest = max_rate(self.motor, load, self.bumper, self.friction_factor)
+        if self.step * fastest > STABILITY_LIMIT:
+            raise ParameterError(
+                f'substep must be at most {STABILITY_LIMIT / fastest:.2g} s with this motor, body, bumper '
+                f'and friction (fastest rate {fastest:.4g} 1/s): got {self.substep:g}'
+            )
+        if self.guard.wheel_speed > self.motor.top_speed:
+            raise ParameterError(
+                f'guard.wheel_speed must be at most {self.motor.top_speed:.4g} rad/s, which is '
+                f'{self.motor.step_rate:g} pulses a second with {self.motor.microsteps} '
+                f'microsteps: got {self.guard.wheel_speed:g}'
+            )
+        delay, told = self.imu.delay, self.odometry.gyro_delay
+        if self.odometry.use_gyro and abs(told - delay) > 0.25 * delay:
+            raise ParameterError(
+                f'odometry.gyro_delay must be about {delay:.2g} s with imu.low_pass '
+                f'{self.imu.low_pass}, or quick turns look like slip: got {told:g}'
+            )
+        self.check_ramp()
+
+
+BROWN_OUT_REASON = 'brown-out: the board restarts'
+_NO_OBSTACLE = (math.inf,) * len(RANGE_SENSORS)
+
+
+@dataclass(frozen=True, slots=True)
+class TwinDiagnostics:
+    """What only a simulation knows of its robot, for diagnostics and pictures."""
+
+    faults: tuple[str, ...]
+    """Faults at work, in words."""
+    slid: tuple[float, float]
+    """m each tyre has slid, right first"""
+    load_angles: tuple[float, float]
+    """rad the fields are ahead of the rotors"""
+    gyro_bias: float
+    """rad/s, true"""
+    estimated_bias: float
+    """rad/s, as the odometry believes"""
+    max_contact_force: float
+    """N, of a wall, so far"""
+
+
+class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
+    """A robot that is computed part by part, so that it goes wrong as the real one does.
+
+    Step counters count pulses, so odometry is wrong exactly when steps are lost or a tyre slides;
+    the gyro shows what of it turns the robot. Every random part draws from a generator of its own,
+    the same numbers whatever the settings: changing one does not shift the others.
+
+    Parameters
+    ----------
+    settings
+        Replaceable while running, as far as they are live.
+    schedule
+        The faults to play; without one, those that ``faults.schedule`` names.
+    """
+
+    def __init__(
+        self, parameters: DigitalTwinParameters, schedule: FaultSchedule | None = None
+    ) -> None:
+        guard = CommandLimiter(parameters.guard, parameters.geometry)
+        super().__init__(
+            parameters, parameters.rate, parameters.substeps, parameters.longest_gap, guard
+        )
+        disturbance, noise, imu, ranges, channel = (
+            np.random.default_rng(part)
+            for part in np.random.SeedSequence(parameters.seed).spawn(5)
+        )
+        self._disturbance = Disturbance(parameters.disturbance, disturbance)
+        self._noise = SpeedNoise(parameters.noise, noise)
+        self._imu = SimulatedImu(parameters.imu, imu)
+        self._ranges = SimulatedRangeSensors(parameters.sharp, ranges)
+        self._channel = TransportDelay(channel)
+        self._battery = SimulatedBattery(parameters.battery)
+        self._odometry = GyroOdometry(parameters.odometry, parameters.geometry)
+        self._world = load_world(parameters.world)
+        self._mounts = sensor_mounts(parameters.sharp)
+        self._distances = np.full(self._mounts.shape[0], math.inf)
+        self._drivetrain = Drivetrain(
+            parameters.motor,
+            parameters.bumper,
+            self._world,
+            parameters.step,
+            parameters.imu.share(parameters.step),
+        )
+        self._schedule = (
+            load_schedule(parameters.faults.schedule) if schedule is None else schedule
+        )
+        self._faults = parameters.faults
+        self._boots_until = 0
+        """Integration step at which the board is back."""
+        self._slip_monitor = SlipMonitor()
+        self._measured = ZERO_WHEEL_SPEEDS
+        self._measured_at = 0
+        self._counters = (0, 0)
+        self._turned = (0.0, 0.0)
+        """Angles (rad) by the pulses of all boards since the start."""
+        self._field_work = 0.0
+        self._sample: ImuSample | None = None
+        self._supply = self._battery.draw(0.0, 0.0)
+        self._limited_command = self._limiter.advance(0, 0.0)
+        self._apply_parameters()
+        self._reports.append(self._make_state(0))
+
+    # -- the seam ---------------------------------------------------------------------------------
+
+    def apply(self, command: RobotCommand, now_ns: int) -> str:
+        """Send ``command`` on its way to the board; return why not if it is refused here.
+
+        What the board makes of it when it arrives shows in the state's reason.
+        """
+        now_ns = self._run_to(now_ns)
+        if self._restarting:
+            return BROWN_OUT_REASON
+        if self._limiter.estop or not all(map(math.isfinite, command.wheels)):
+            return self._limiter.accept(command, now_ns)
+        if stale := self._limiter.staleness(command, now_ns):
+            return stale
+        faults = self._faults
+        self._channel.send(
+            command,
+            now_ns,
+            self._parameters.drive.dead_time + faults.command_delay,
+            faults.command_jitter,
+            faults.command_loss,
+        )
+        return ''
+
+    # -- only in simulation -----------------------------------------------------------------------
+
+    @property
+    def inside(self) -> TwinDiagnostics:
+        """What nobody outside a simulation can see."""
+        drivetrain = self._drivetrain
+        return TwinDiagnostics(
+            faults=active_faults(self._faults),
+            slid=drivetrain.slid,
+            load_angles=drivetrain.load_angles,
+            gyro_bias=self._imu.bias,
+            estimated_bias=self._odometry.bias,
+            max_contact_force=drivetrain.max_contact_force,
+        )
+
+    def set_pose(self, pose: Pose) -> None:
+        """Put the robot elsewhere, its wheels turning as before; odometry does not notice.
+
+        Raises
+        ------
+        ValueError
+            The pose is not finite, or the robot would stand in a wall.
+        """
+        check_pose(pose)
+        radius = self._parameters.bumper.radius
+        if not self._world.is_free(pose.x, pose.y, radius):
+            raise ValueError(
+                f'pose must be at least {radius:g} m away from what stands in the world '
+                f'{self._world.name}: got x {pose.x:g} m, y {pose.y:g} m'
+            )
+        self._drivetrain.pose = pose
+        self._refresh_state()
+
+    def warm_up(self) -> None:
+        """Compile everything that a step needs, on a robot of its own."""
+        DigitalTwin(self._parameters).step(ZERO_WHEEL_SPEEDS)
+        world = load_world('room')
+        clearance(0.0, 0.0, world.segments, world.circles)
+        grip_at(0.0, 0.0, world.patches)
+        which = np.arange(self._mounts.shape[0])
+        cast_rays(
+            0.0,
+            0.0,
+            0.0,
+            self._mounts,
+            which,
+            world.segments,
+            world.circles,
+            np.empty(self._mounts.shape[0]),
+        )
+
+    # -- inside -----------------------------------------------------------------------------------
+
+    @property
+    def _restarting(self) -> bool:
+        return self._drivetrain.steps_done < self._boots_until
+
+    @property
+    def _elapsed(self) -> float:
+        """Time since the robot was made, s: it never goes back."""
+        return self._drivetrain.steps_done * self._drivetrain.step
+
+    def _apply_parameters(self) -> None:
+        parameters = self._parameters
+        self._limiter.parameters = parameters.guard
+        self._odometry.parameters = parameters.odometry
+        self._disturbance.parameters = parameters.disturbance
+        self._noise.parameters = parameters.noise
+        self._imu.parameters = parameters.imu
+        self._update_faults()
+        self._update_load()
+
+    def _update_faults(self) -> None:
+        """Look which faults are at work now, and let those that begin or end do so."""
+        before = self._faults
+        self._faults = self._schedule.at(self._elapsed, self._parameters.faults)
+        if self._faults is before:
+            return
+        if self._faults.brown_out and not before.brown_out:
+            self._lose_power()
+        self._update_load()
+
+    def _update_load(self) -> None:
+        self._drivetrain.load(
+            self._parameters.motor, self._parameters.load_with_faults(self._faults)
+        )
+
+    def _lose_power(self) -> None:
+        """Let the board start anew: counters at zero, sensors too, and no command."""
+        drivetrain = self._drivetrain
+        self._boots_until = drivetrain.steps_done + round(
+            self._parameters.boot_time / drivetrain.step
+        )
+        self._slip_monitor.forget()
+        self._channel.clear()
+        self._limiter.stop(BROWN_OUT_REASON, self._now_ns())
+        self._imu.restart()
+        drivetrain.filtered[:] = 0.0
+        self._odometry.forget_bias()
+        drivetrain.restart_board()
+        self._counters = (0, 0)
+
+    def _integrate(self, count: int) -> None:
+        done = 0
+        while done < count:
+            now_ns = self._after(self._steps_since_origin + done)
+            for command in self._channel.arrived(now_ns):
+                if not self._slip_monitor.refuses(command, self._elapsed):
+                    self._limiter.accept(command, now_ns)
+            part = count - done
+            arrival_ns = self._channel.next_ns
+            if arrival_ns is not None:
+                part = min(part, max(1, self._steps_until(arrival_ns - now_ns)))
+            self._drive(part, now_ns)
+            done += part
+
+    def _drive(self, count: int, now_ns: int) -> None:
+        """Run ``count`` steps under one command."""
+        drivetrain = self._drivetrain
+        self._limited_command = self._limiter.advance(now_ns, count * drivetrain.step)
+        volts = 0.0 if self._restarting else self._supply.voltage
+        drivetrain.run(
+            self._limited_command.wheels,
+            self._parameters.drive.acceleration,
+            volts,
+            self._disturbance,
+            count,
+        )
+
+    def _measure(self) -> None:
+        drivetrain = self._drivetrain
+        dt = (drivetrain.steps_done - self._measured_at) * drivetrain.step
+        self._measured_at = drivetrain.steps_done
+        self._update_faults()
+        self._count(dt)
+        self._look(dt)
+        self._feed(dt)
+        self._disturbance.draw(dt)
+
+    def _count(self, dt: float) -> None:
+        """Read step counters and gyro, and reckon where they say the robot is."""
+        microstep = self._parameters.motor.microstep
+        right, left = self._drivetrain.counters
+        turned = WheelSpeeds(
+            (right - self._counters[0]) * microstep, (left - self._counters[1]) * microstep
+        )
+        self._counters = right, left
+        self._turned = self._turned[0] + turned.right, self._turned[1] + turned.left
+        sample = self._imu.measure(self._drivetrain.filtered, dt, self._faults.gyro_bias_jump)
+        absent = self._faults.gyro_dead or self._restarting
+        self._sample = None if absent else sample
+        if dt > 0.0:
+            gyro = None if absent else sample.angular
+            self._odometry.update(turned.right, turned.left, gyro, dt)
+            self._measured = self._noise.measure(WheelSpeeds(turned.right / dt, turned.left / dt))
+        slipping_for = self._odometry.slipping_for
+        if self._slip_monitor.decide(slipping_for, self._parameters.slip_stop, self._elapsed):
+            self._limiter.stop(SLIP_STOP_REASON, self._now_ns())
+
+    def _look(self, dt: float) -> None:
+        """Let those distance sensors see whose time has come."""
+        world = self._world
+        empty = not (world.segments.size or world.circles.size)
+        if empty and self._ranges.readings == _NO_OBSTACLE:
+            return  # and nothing will ever be
+        due = self._ranges.due(dt)
+        if due and not empty:
+            cast_rays(
+                *self._drivetrain.pose,
+                self._mounts,
+                np.array(due),
+                world.segments,
+                world.circles,
+                self._distances,
+            )
+        for sensor in due:
+            self._ranges.measure(sensor, float(self._distances[sensor]))
+
+    def _feed(self, dt: float) -> None:
+        """Take from the battery what motors and board need; too much of it, and the board goes."""
+        motor = self._parameters.motor
+        done = self._drivetrain.field_work
+        power = 0.0
+        if dt > 0.0 and not self._restarting:
+            # A phase carries I cos or I sin of the field: two of each heat with I²R a motor.
+            copper = 2.0 * motor.phase_current**2 * motor.resistance
+            power = copper + max(0.0, done - self._field_work) / dt
+        self._field_work = done
+        self._supply = self._battery.draw(power, dt, self._faults.supply_sag)
+        if self._battery.collapsed and not self._restarting:
+            self._lose_power()
+
+    def _make_state(self, stamp_ns: int) -> RobotState:
+        geometry, guard, drivetrain = self._parameters.geometry, self._limiter, self._drivetrain
+        odometry, limited_command = self._odometry, self._limited_command
+        status = RobotStatus(
+            enabled=not guard.estop and not self._restarting,
+            moving=self._moving(),
+            estop=guard.estop,
+            timed_out=guard.timed_out,
+            limited=limited_command.limited,
+            slipping=odometry.slipping,
+            imu_fault=self._sample is None,
+            low_battery=self._battery.low,
+        )
+        return RobotState(
+            stamp_ns=stamp_ns,
+            wheels=self._measured,
+            angles=WheelAngles(*self._turned),
+            odometry=State(stamp_ns, odometry.pose, twist_from_wheels(self._measured, geometry)),
+            covariance=odometry.covariance,
+            commanded=limited_command.wheels,
+            status=status,
+            reason=guard.reason,
+            true_wheels=drivetrain.wheels,
+            truth=State(stamp_ns, drivetrain.pose, twist_from_wheels(drivetrain.ground, geometry)),
+            imu=self._sample,
+            ranges=() if self._faults.ranges_dead else self._ranges.readings,
+            battery=self._supply,
+            lost_steps=drivetrain.lost_steps,
+        )
+
+    def _moving(self) -> bool:
+        right, left = self._drivetrain.pulse_speeds
+        return max(abs(right), abs(left)) > self._parameters.rest_speed
+
+    def _reset_odometry(self) -> None:
+        self._odometry.reset()
+
+
+def make_robot(parameters: DigitalTwinParameters) -> PaperRobot | DigitalTwin:
+    """Return the robot that ``drive.kind`` asks for, standing at the origin."""
+    if parameters.drive.kind == 'stepper':
+        return DigitalTwin(parameters)
+    return PaperRobot(parameters)

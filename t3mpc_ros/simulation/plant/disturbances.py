@@ -1,0 +1,218 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Friction, disturbance torque and wheel speed noise: f and tau_d of (10)."""
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.kernels import kernel
+from t3mpc_ros.parameters.table import Parameters, parameter
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FrictionParameters(Parameters):
+    """Friction of each wheel: f of (10), which the paper counts among the disturbances."""
+
+    viscous: float = parameter(
+        2e-4,
+        'friction torque per wheel speed',
+        unit='N m s/rad',
+        low=0.0,
+        high=10.0,
+        dynamic=True,
+    )
+    coulomb: float = parameter(
+        0.004,
+        'friction torque that does not depend on speed',
+        unit='N m',
+        low=0.0,
+        high=10.0,
+        dynamic=True,
+    )
+    coulomb_width: float = parameter(
+        0.2,
+        'wheel speed within which the Coulomb torque changes sign (76 % of it at the width)',
+        unit='rad/s',
+        low=1e-3,
+        high=100.0,
+        dynamic=True,
+    )
+
+
+@dataclass(frozen=True)
+class DisturbanceParameters(Parameters):
+    """A bounded torque on each wheel, tau_d of (10): assumption 2 of the paper."""
+
+    bound: float = parameter(
+        0.002,
+        'largest disturbance torque of a wheel',
+        unit='N m',
+        low=0.0,
+        high=10.0,
+        dynamic=True,
+    )
+    frequencies: tuple[float, ...] = parameter(
+        (0.11, 0.37, 1.3),
+        'frequencies of the sines, which share their part of the bound evenly',
+        unit='Hz',
+        low=0.0,
+        high=100.0,
+    )
+    walk_share: float = parameter(
+        0.3, 'part of the bound given to a random walk', low=0.0, high=1.0, dynamic=True
+    )
+    walk_rate: float = parameter(
+        0.5,
+        'spread of the walk after one second, relative to its part of the bound',
+        unit='1/√s',
+        low=0.0,
+        high=100.0,
+        dynamic=True,
+    )
+
+
+@dataclass(frozen=True)
+class NoiseParameters(Parameters):
+    """White noise on the measured wheel speeds."""
+
+    variance: float = parameter(
+        0.0,
+        'variance of a measured wheel speed; the paper adds 0.04 and sweeps 0 to 0.1',
+        unit='(rad/s)²',
+        low=0.0,
+        high=100.0,
+        dynamic=True,
+    )
+
+
+@kernel
+def friction_torque(speed: float, viscous: float, coulomb: float, width: float) -> float:
+    """Return the friction torque (N m) that opposes a wheel speed (rad/s): f of (10).
+
+    tanh in place of the sign keeps the dynamics smooth; it always takes energy out.
+    """
+    return viscous * speed + coulomb * math.tanh(speed / width)
+
+
+@kernel
+def disturbance_torque(
+    wheel: int, time: float, load: Array, angular: Array, phases: Array, walk: Array
+) -> float:
+    """Return tau_d of one wheel (N m) at ``time`` (s); never more than the bound in size.
+
+    load : shape (2,), the bound (N m) and the part of it given to the walk (1)
+    angular : shape (n,), rad/s; phases : shape (2, n), rad
+    walk : shape (2,), each in [-1, 1]
+    """
+    sines = 0.0
+    for index in range(angular.size):
+        sines += math.sin(angular[index] * time + phases[wheel, index])
+    sines /= max(angular.size, 1)
+    share = load[1]
+    # The clamp only takes off what rounding may add.
+    level = min(max((1.0 - share) * sines + share * walk[wheel], -1.0), 1.0)
+    return float(load[0] * level)
+
+
+class Disturbance:
+    """Draws and holds what the disturbance torque of a run depends on.
+
+    Parameters
+    ----------
+    settings
+        The table; a live change takes effect at the next :meth:`draw`.
+    generator
+        Used for nothing else, so that other random numbers do not shift these.
+    """
+
+    def __init__(self, parameters: DisturbanceParameters, generator: np.random.Generator) -> None:
+        self.parameters = parameters
+        self._of = parameters
+        self._load: Array = np.array([parameters.bound, parameters.walk_share])
+        self.angular: Array = 2.0 * np.pi * np.array(parameters.frequencies, dtype=np.float64)
+        self.phases: Array = generator.uniform(0.0, 2.0 * np.pi, (2, self.angular.size))
+        self.walk: Array = np.zeros(2)
+        self._generator = generator
+        self._drawn: Array = np.zeros(2)
+
+    @property
+    def load(self) -> Array:
+        """The bound (N m) and the walk's part of it, as :func:`disturbance_torque` wants them."""
+        if self.parameters is not self._of:
+            self._of = self.parameters
+            self._load = np.array([self._of.bound, self._of.walk_share])
+        return self._load
+
+    def draw(self, dt: float) -> None:
+        """Move the walk of both wheels by ``dt`` seconds; it is reflected at -1 and 1.
+
+        Two numbers are drawn whatever the settings say, so that a live change does not shift
+        the numbers that come after it.
+        """
+        self._generator.standard_normal(out=self._drawn)
+        step = self.parameters.walk_rate * math.sqrt(dt)
+        for wheel in (0, 1):
+            self.walk[wheel] = reflect(float(self.walk[wheel] + step * self._drawn[wheel]))
+
+    def draw_ahead(self, dt: float, count: int) -> Array:
+        """Return the walks after each of ``count`` draws in turn, shape (count, 2).
+
+        The numbers are those that as many calls of :meth:`draw` would leave, one after the other.
+        """
+        walks: Array = np.empty((count, 2))
+        step = self.parameters.walk_rate * math.sqrt(dt)
+        right, left = self.walk.tolist()
+        for row, drawn in enumerate((step * self._generator.standard_normal((count, 2))).tolist()):
+            right, left = reflect(right + drawn[0]), reflect(left + drawn[1])
+            walks[row] = right, left
+        self.walk[:] = right, left
+        return walks
+
+    def torque(self, time: float) -> tuple[float, float]:
+        """Return the torques (N m) on the right and left wheel at ``time`` (s)."""
+        load = self.load
+        return (
+            disturbance_torque(0, time, load, self.angular, self.phases, self.walk),
+            disturbance_torque(1, time, load, self.angular, self.phases, self.walk),
+        )
+
+
+def make_generators(seed: int) -> tuple[np.random.Generator, np.random.Generator]:
+    """Return the random numbers of one robot: those of its disturbance, those of its noise."""
+    for_disturbance, for_noise = np.random.SeedSequence(seed).spawn(2)
+    return np.random.default_rng(for_disturbance), np.random.default_rng(for_noise)
+
+
+def reflect(value: float) -> float:
+    """Return ``value`` folded into [-1, 1] as if by mirrors at both ends."""
+    unfolded = (value + 1.0) % 4.0
+    return 1.0 - abs(unfolded - 2.0)
+
+
+class SpeedNoise:
+    """Blurs wheel speeds as a sensor does; same arguments as :class:`Disturbance`."""
+
+    def __init__(self, parameters: NoiseParameters, generator: np.random.Generator) -> None:
+        self.parameters = parameters
+        self._generator = generator
+        self._drawn: Array = np.zeros(2)
+
+    def measure(self, wheels: WheelSpeeds) -> WheelSpeeds:
+        """Return what is measured of ``wheels``. Two numbers are drawn, even without noise."""
+        self._generator.standard_normal(out=self._drawn)
+        spread = math.sqrt(self.parameters.variance)
+        right, left = self._drawn.tolist()
+        return WheelSpeeds(wheels.right + spread * right, wheels.left + spread * left)
+
+    def draw_ahead(self, count: int) -> Array:
+        """Return what the next ``count`` measurements would add, rad/s, shape (count, 2)."""
+        noise: Array = math.sqrt(self.parameters.variance) * self._generator.standard_normal(
+            (count, 2)
+        )
+        return noise

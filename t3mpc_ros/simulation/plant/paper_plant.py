@@ -1,0 +1,613 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's plant (10) with velocity or torque drive, and the simulated robot built on it."""
+
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
+from t3mpc_ros.geometry.types import Pose, State, WheelSpeeds, check_pose, wrap_angle
+from t3mpc_ros.kernels import kernel
+from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
+from t3mpc_ros.robot.command_limiter import CommandLimiter, CommandLimiterParameters, ramp_towards
+from t3mpc_ros.robot.interface import (
+    ZERO_WHEEL_SPEEDS,
+    RobotCommand,
+    RobotState,
+    RobotStatus,
+    WheelAngles,
+)
+from t3mpc_ros.robot.wheel_odometry import WheelOdometry, WheelOdometryParameters
+from t3mpc_ros.simulation.fixed_step import FixedStepRobot
+from t3mpc_ros.simulation.plant.disturbances import (
+    Disturbance,
+    DisturbanceParameters,
+    FrictionParameters,
+    NoiseParameters,
+    SpeedNoise,
+    disturbance_torque,
+    friction_torque,
+    make_generators,
+)
+from t3mpc_ros.simulation.plant.dynamics import (
+    BodyParameters,
+    coriolis_factor,
+    dynamics_vector,
+    wheel_acceleration,
+    wheel_inertia,
+)
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class DriveParameters(Parameters):
+    """How the wheels are driven."""
+
+    kind: str = parameter(
+        'velocity',
+        'stepper: the digital twin, whose motors turn in steps; velocity: wheels follow commanded '
+        'speeds by a servo; torque: the command is the torque itself, as in the paper',
+        choices=('velocity', 'torque', 'stepper'),
+    )
+    dead_time: float = parameter(
+        0.010,
+        'time before a velocity command reaches the wheels (radio, decoding)',
+        unit='s',
+        low=0.0,
+        high=1.0,
+    )
+    acceleration: float = parameter(
+        60.0,
+        'largest wheel acceleration the drive is asked for; 0 means no limit',
+        unit='rad/s²',
+        low=0.0,
+        high=1e5,
+        dynamic=True,
+    )
+    lag: float = parameter(
+        0.020,
+        'time constant with which the wheels of the nominal body follow',
+        unit='s',
+        low=1e-3,
+        high=2.0,
+        dynamic=True,
+    )
+    torque_limit: float = parameter(
+        0.4,
+        'largest torque on one wheel',
+        unit='N m',
+        low=1e-3,
+        high=100.0,
+        dynamic=True,
+        source='holding torque of a common NEMA 17 stepper',
+    )
+    speed_ceiling: float = parameter(
+        39.6,
+        'wheel speed that the motors cannot exceed whatever the torque',
+        unit='rad/s',
+        low=1.0,
+        high=1000.0,
+        dynamic=True,
+        source='stepper, V/(2 L I steps) with 12 V, 2.8 mH, 1.7 A, 200 steps per turn',
+    )
+
+
+def drive_vector(
+    parameters: DriveParameters, body: BodyParameters, geometry: WheelGeometry
+) -> Array:
+    """Return what the kernels here need, shape (6,).
+
+    Diagonal and off-diagonal entry of the nominal (11) (kg m²), lag (s), acceleration (rad/s²),
+    torque limit (N m), speed ceiling (rad/s).
+    """
+    nominal = wheel_inertia(body, geometry)
+    return np.array(
+        [
+            nominal[0, 0],
+            nominal[0, 1],
+            parameters.lag,
+            parameters.acceleration,
+            parameters.torque_limit,
+            parameters.speed_ceiling,
+        ]
+    )
+
+
+STABILITY_LIMIT = 2.0
+"""Largest product of step and fastest rate that is allowed; Runge-Kutta is stable up to 2.78."""
+
+
+def max_rate(
+    parameters: DriveParameters,
+    bodies: tuple[BodyParameters, BodyParameters],
+    geometry: WheelGeometry,
+    friction: FrictionParameters,
+    friction_factor: float,
+) -> float:
+    """Return an upper bound (1/s) of how fast errors of chi die out; see :meth:`Plant.load`."""
+    nominal, true = (wheel_inertia(body, geometry) for body in bodies)
+    damping = friction_factor * (friction.viscous + friction.coulomb / friction.coulomb_width)
+    turning = geometry.wheel_radius / geometry.half_separation
+    coupling = 2.0 * turning * parameters.speed_ceiling * abs(coriolis_factor(bodies[1], geometry))
+    # Both matrices have the eigenvectors (1, 1) and (1, -1): straight on, and on the spot.
+    rates = [
+        ((nominal[0, 0] + sign * nominal[0, 1]) / parameters.lag + damping + coupling)
+        / (true[0, 0] + sign * true[0, 1])
+        for sign in (1.0, -1.0)
+    ]
+    return float(max(rates))
+
+
+@kernel
+def servo_torque(
+    right: float, left: float, wanted_right: float, wanted_left: float, drive: Array
+) -> tuple[float, float]:
+    """Return the torques (N m) that bring chi to the wanted speeds with the nominal lag.
+
+    theta_bar_nominal (wanted - chi)/lag: with the nominal body, and nothing else acting, (10)
+    becomes chi' = (wanted - chi)/lag. Any other mass, friction or disturbance shows.
+
+    drive : shape (6,), see :func:`drive_vector`
+    """
+    pull_right = (wanted_right - right) / drive[2]
+    pull_left = (wanted_left - left) / drive[2]
+    return (
+        clamp(drive[0] * pull_right + drive[1] * pull_left, drive[4]),
+        clamp(drive[0] * pull_left + drive[1] * pull_right, drive[4]),
+    )
+
+
+@kernel
+def clamp(value: float, bound: float) -> float:
+    """Return ``value`` brought into [-bound, bound]."""
+    return min(max(value, -bound), bound)
+
+
+@kernel
+def delay_command(
+    right: float, left: float, commands: Array, cursor: npt.NDArray[np.int64]
+) -> tuple[float, float]:
+    """Return the command (rad/s) given n steps ago, and put this one in its place.
+
+    commands : shape (n, 2), a ring; n = 0 means no dead time
+    cursor : shape (1,), the row that is next; both are changed in place
+    """
+    if commands.shape[0] == 0:
+        return right, left
+    row = cursor[0]
+    delayed = commands[row, 0], commands[row, 1]
+    commands[row, 0] = right
+    commands[row, 1] = left
+    cursor[0] = (row + 1) % commands.shape[0]
+    return delayed
+
+
+@kernel
+def integrate_plant(
+    state: Array,
+    torque_mode: bool,
+    right: float,
+    left: float,
+    commands: Array,
+    cursor: npt.NDArray[np.int64],
+    limited: Array,
+    drive: Array,
+    dynamics: Array,
+    friction: Array,
+    load: Array,
+    angular: Array,
+    phases: Array,
+    walk: Array,
+    first: int,
+    count: int,
+    step: float,
+    work: Array,
+) -> None:
+    r"""Integrate (3), (8) and (10) over ``count`` substeps by the classical Runge-Kutta method.
+
+    .. math:: \dot q = \varsigma(q) \chi, \qquad
+              \bar\theta \dot\chi = \tau - \bar\eta \chi - f(\chi) - \tau_d(t)
+
+    state : shape (7,), x, y (m), P, theta_R, theta_L (rad), chi (rad/s); changed in place
+    torque_mode : whether (right, left) are torques (N m) or wheel speeds for the servo (rad/s)
+    commands : shape (n, 2), wheel speeds on their way to the wheels, see pass_command
+    cursor : shape (1,), the row that comes out next; changed in place
+    limited : shape (2,), what has come out, after the acceleration limit; changed in place
+    drive, dynamics : see drive_vector, dynamics_vector
+    friction : shape (3,), viscous (N m s/rad), Coulomb (N m), width (rad/s)
+    load, angular, phases, walk : see disturbance_torque
+    first : number of the first substep since the run began; the time is first times step
+    step : s
+    work : shape (3, 7), overwritten
+    """
+    trial, slope, total = work[0], work[1], work[2]
+    radius, turn = dynamics[0], dynamics[1]
+    for index in range(first, first + count):
+        target_right, target_left = right, left
+        if torque_mode:
+            limited[0], limited[1] = state[5], state[6]
+        else:
+            target_right, target_left = delay_command(right, left, commands, cursor)
+        slope[:] = 0.0
+        total[:] = 0.0
+        for stage in range(4):
+            part = 0.5 if stage in (1, 2) else (1.0 if stage == 3 else 0.0)
+            weight = 1.0 / 3.0 if stage in (1, 2) else 1.0 / 6.0
+            time = (index + part) * step
+            for item in range(7):
+                trial[item] = state[item] + part * step * slope[item]
+            chi_right, chi_left = trial[5], trial[6]
+            if torque_mode:
+                torque_right = clamp(right, drive[4])
+                torque_left = clamp(left, drive[4])
+            else:
+                # The limit is a ramp inside the substep too, not a staircase.
+                reach = drive[3] * part * step if drive[3] > 0.0 else -1.0
+                wanted_right, wanted_left = ramp_towards(
+                    limited[0], limited[1], target_right, target_left, reach
+                )
+                torque_right, torque_left = servo_torque(
+                    chi_right, chi_left, wanted_right, wanted_left, drive
+                )
+            torque_right -= friction_torque(chi_right, friction[0], friction[1], friction[2])
+            torque_left -= friction_torque(chi_left, friction[0], friction[1], friction[2])
+            torque_right -= disturbance_torque(0, time, load, angular, phases, walk)
+            torque_left -= disturbance_torque(1, time, load, angular, phases, walk)
+            along = 0.5 * radius * (chi_right + chi_left)
+            slope[0] = along * math.cos(trial[2])
+            slope[1] = along * math.sin(trial[2])
+            slope[2] = turn * (chi_right - chi_left)
+            slope[3] = chi_right
+            slope[4] = chi_left
+            slope[5], slope[6] = wheel_acceleration(
+                chi_right, chi_left, torque_right, torque_left, dynamics
+            )
+            for item in range(7):
+                total[item] += weight * slope[item]
+        for item in range(7):
+            state[item] += step * total[item]
+        state[5] = clamp(state[5], drive[5])
+        state[6] = clamp(state[6], drive[5])
+        if not torque_mode:
+            reach = drive[3] * step if drive[3] > 0.0 else -1.0
+            limited[0], limited[1] = ramp_towards(
+                limited[0], limited[1], target_right, target_left, reach
+            )
+
+
+class PaperPlant:
+    """Wheels, body and drive in motion: the numbers that :func:`simulate` works on.
+
+    Parameters
+    ----------
+    settings
+        Only the kind and the dead time are fixed here; the rest comes with :meth:`load`.
+    step
+        Length of an integration step, s. The dead time becomes a whole number of them.
+    """
+
+    def __init__(self, parameters: DriveParameters, step: float) -> None:
+        self.step = step
+        self.steps_done = 0
+        """Integration steps since the plant was made: the time that its disturbances know."""
+        self._torque_mode = parameters.kind == 'torque'
+        self._commands: Array = np.zeros((round(parameters.dead_time / step), 2))
+        self._cursor = np.zeros(1, dtype=np.int64)
+        self._limited: Array = np.zeros(2)
+        self._state: Array = np.zeros(7)
+        self._work: Array = np.zeros((3, 7))
+
+    @property
+    def pose(self) -> Pose:
+        """The true pose."""
+        x, y, yaw = self._state[:3].tolist()
+        return Pose(x, y, yaw)
+
+    @pose.setter
+    def pose(self, pose: Pose) -> None:
+        self._state[:3] = pose.x, pose.y, wrap_angle(pose.yaw)
+
+    @property
+    def angles(self) -> tuple[float, float]:
+        """The angles (rad) the wheels have turned, right first."""
+        return float(self._state[3]), float(self._state[4])
+
+    @property
+    def wheels(self) -> WheelSpeeds:
+        """The true wheel speeds chi."""
+        return WheelSpeeds(float(self._state[5]), float(self._state[6]))
+
+    def load(
+        self,
+        parameters: DriveParameters,
+        bodies: tuple[BodyParameters, BodyParameters],
+        geometry: WheelGeometry,
+        friction: FrictionParameters,
+        friction_factor: float,
+    ) -> None:
+        """Take what acts from now on; ``bodies`` are the nominal one and the true one."""
+        nominal, true = bodies
+        self._drive = drive_vector(parameters, nominal, geometry)
+        self._dynamics = dynamics_vector(true, geometry)
+        self._friction: Array = np.array(
+            [
+                friction_factor * friction.viscous,
+                friction_factor * friction.coulomb,
+                friction.coulomb_width,
+            ]
+        )
+
+    def run(
+        self,
+        command: tuple[float, float],
+        braking: bool,
+        disturbance: Disturbance,
+        count: int,
+    ) -> None:
+        """Integrate ``count`` steps under one command, right first.
+
+        It is a torque (N m) for a torque drive unless ``braking``, else wheel speeds (rad/s).
+        """
+        integrate_plant(
+            self._state,
+            self._torque_mode and not braking,
+            command[0],
+            command[1],
+            self._commands,
+            self._cursor,
+            self._limited,
+            self._drive,
+            self._dynamics,
+            self._friction,
+            disturbance.load,
+            disturbance.angular,
+            disturbance.phases,
+            disturbance.walk,
+            self.steps_done,
+            count,
+            self.step,
+            self._work,
+        )
+        self._state[2] = wrap_angle(self._state[2])
+        self.steps_done += count
+
+
+@dataclass(frozen=True)
+class PaperRobotParameters(Parameters):
+    """Everything that can be set of a simulated robot."""
+
+    geometry: WheelGeometry = group(WheelGeometry)
+    body: BodyParameters = group(BodyParameters)
+    friction: FrictionParameters = group(FrictionParameters)
+    disturbance: DisturbanceParameters = group(DisturbanceParameters)
+    noise: NoiseParameters = group(NoiseParameters)
+    drive: DriveParameters = group(DriveParameters)
+    guard: CommandLimiterParameters = group(CommandLimiterParameters)
+    odometry: WheelOdometryParameters = group(WheelOdometryParameters)
+    mass_factor: float = parameter(
+        1.0,
+        'true over nominal body mass; the drive knows the nominal one',
+        low=0.1,
+        high=10.0,
+        dynamic=True,
+    )
+    inertia_factor: float = parameter(
+        1.0, 'true over nominal body inertia', low=0.1, high=10.0, dynamic=True
+    )
+    friction_factor: float = parameter(
+        1.0, 'true over nominal friction, both kinds', low=0.0, high=10.0, dynamic=True
+    )
+    rate: float = parameter(
+        100.0, 'how often the state is reported', unit='Hz', low=50.0, high=1e3
+    )
+    substep: float = parameter(
+        0.001,
+        'longest step of the integration; a control period is cut into equal ones',
+        unit='s',
+        low=1e-5,
+        high=0.01,
+    )
+    rest_speed: float = parameter(
+        0.1,
+        'true wheel speed below which the robot counts as standing',
+        unit='rad/s',
+        low=0.0,
+        high=1.0,
+    )
+    longest_gap: float = parameter(
+        1.0,
+        'time that is made up for when nobody asked for the state; what is longer is skipped',
+        unit='s',
+        low=0.5,
+        high=60.0,
+    )
+    seed: int = parameter(1, 'seed of disturbance and noise', low=0)
+
+    @property
+    def substeps(self) -> int:
+        """How many integration steps a control period takes."""
+        return max(1, math.ceil(1.0 / (self.rate * self.substep) - 1e-9))
+
+    @property
+    def step(self) -> float:
+        """Length of an integration step, s."""
+        return 1.0 / (self.rate * self.substeps)
+
+    @property
+    def true_body(self) -> BodyParameters:
+        """The body with its factors: what moves, as opposed to what the drive believes."""
+        return replace(
+            self.body,
+            body_mass=self.body.body_mass * self.mass_factor,
+            body_inertia=self.body.body_inertia * self.inertia_factor,
+        )
+
+    def check_consistency(self) -> None:
+        """Raise ParameterError when the integration would be unstable, or stops be cut short."""
+        bodies = self.body, self.true_body
+        fastest = max_rate(self.drive, bodies, self.geometry, self.friction, self.friction_factor)
+        if self.step * fastest > STABILITY_LIMIT:
+            raise ParameterError(
+                f'substep must be at most {STABILITY_LIMIT / fastest:.2g} s with this body, drive and '
+                f'friction (fastest rate {fastest:.4g} 1/s): got {self.substep:g}'
+            )
+        if self.drive.kind == 'velocity':
+            self.check_ramp()
+
+    def check_ramp(self) -> None:
+        """Raise ParameterError when the drive would cut stops short."""
+        drive, guard = self.drive, self.guard
+        if 0.0 < drive.acceleration < guard.stop_deceleration:
+            raise ParameterError(
+                'drive.acceleration must be at least guard.stop_deceleration '
+                f'({guard.stop_deceleration:g} rad/s²), or 0: got {drive.acceleration:g}'
+            )
+
+
+class PaperRobot(FixedStepRobot[PaperRobotParameters]):
+    """A robot that exists in numbers only: the paper's plant, on a :class:`FixedStepRobot`'s time.
+
+    Disturbance and noise come from generators of their own, and draw the same numbers whatever
+    their settings: changing one does not shift the other.
+    """
+
+    def __init__(self, parameters: PaperRobotParameters) -> None:
+        if parameters.drive.kind == 'stepper':
+            raise ValueError(
+                'drive.kind must be velocity or torque here: stepper is for DigitalTwin'
+            )
+        guard = CommandLimiter(parameters.guard, parameters.geometry)
+        super().__init__(
+            parameters, parameters.rate, parameters.substeps, parameters.longest_gap, guard
+        )
+        for_disturbance, for_noise = make_generators(parameters.seed)
+        self._odometry = WheelOdometry(parameters.odometry, parameters.geometry)
+        self._disturbance = Disturbance(parameters.disturbance, for_disturbance)
+        self._noise = SpeedNoise(parameters.noise, for_noise)
+        self._plant = PaperPlant(parameters.drive, parameters.step)
+        self._measured = ZERO_WHEEL_SPEEDS
+        self._torque = (0.0, 0.0)
+        self._limited_command = self._limiter.advance(0, 0.0)
+        self._measured_at = 0
+        """Integration steps the plant had done at the last measurement."""
+        self._apply_parameters()
+        self._reports.append(self._make_state(0))
+
+    def apply(self, command: RobotCommand, now_ns: int) -> str:
+        """Follow ``command`` from now on; return why not if it is refused.
+
+        Raises
+        ------
+        ValueError
+            The drive takes torques; then see :meth:`step_torque`.
+        """
+        if self._parameters.drive.kind == 'torque':
+            raise ValueError('drive.kind must be velocity to take wheel speeds: got torque')
+        return super().apply(command, now_ns)
+
+    def step_torque(self, right: float, left: float) -> RobotState:
+        """Apply torques (N m) for one control period and return the state at its end.
+
+        Torques that are not finite brake the wheels, as an emergency stop does.
+
+        Raises
+        ------
+        ValueError
+            The drive takes wheel speeds.
+        """
+        if self._parameters.drive.kind != 'torque':
+            raise ValueError('drive.kind must be torque to take torques: got velocity')
+        # A torque is no wheel speed: the guard only says whether it may act at all.
+        finite = math.isfinite(right) and math.isfinite(left)
+        wheels = ZERO_WHEEL_SPEEDS if finite else WheelSpeeds(math.nan, math.nan)
+        now_ns = self._run_to(self._now_ns())
+        self._limiter.accept(RobotCommand(wheels, now_ns), now_ns)
+        self._torque = (float(right), float(left))
+        return self._advance_period()
+
+    def set_pose(self, pose: Pose) -> None:
+        """Put the robot elsewhere, its wheels turning as before; odometry does not notice.
+
+        Raises
+        ------
+        ValueError
+            The pose is not finite.
+        """
+        check_pose(pose)
+        self._plant.pose = pose
+        self._refresh_state()
+
+    def warm_up(self) -> None:
+        """Compile everything that a step needs, on a robot of its own."""
+        robot = PaperRobot(self._parameters)
+        if self._parameters.drive.kind == 'torque':
+            robot.step_torque(0.0, 0.0)
+        else:
+            robot.step(ZERO_WHEEL_SPEEDS)
+
+    # -- inside -----------------------------------------------------------------------------------
+
+    def _apply_parameters(self) -> None:
+        parameters = self._parameters
+        self._limiter.parameters = parameters.guard
+        self._odometry.parameters = parameters.odometry
+        self._disturbance.parameters = parameters.disturbance
+        self._noise.parameters = parameters.noise
+        self._plant.load(
+            parameters.drive,
+            (parameters.body, parameters.true_body),
+            parameters.geometry,
+            parameters.friction,
+            parameters.friction_factor,
+        )
+
+    def _integrate(self, count: int) -> None:
+        """Run ``count`` steps under one command."""
+        self._limited_command = self._limiter.advance(self._now_ns(), count * self._plant.step)
+        braking = bool(self._limited_command.reason)
+        torque_mode = self._parameters.drive.kind == 'torque' and not braking
+        command = self._torque if torque_mode else self._limited_command.wheels
+        self._plant.run(command, braking, self._disturbance, count)
+
+    def _measure(self) -> None:
+        dt = (self._plant.steps_done - self._measured_at) * self._plant.step
+        self._measured_at = self._plant.steps_done
+        before, now = self._measured, self._noise.measure(self._plant.wheels)
+        mean = WheelSpeeds(0.5 * (before.right + now.right), 0.5 * (before.left + now.left))
+        self._odometry.drive(mean, dt, self._parameters.noise.variance)
+        self._measured = now
+        self._disturbance.draw(dt)
+
+    def _make_state(self, stamp_ns: int) -> RobotState:
+        geometry, guard, plant = self._parameters.geometry, self._limiter, self._plant
+        status = RobotStatus(
+            enabled=not guard.estop,
+            moving=self._moving(),
+            estop=guard.estop,
+            timed_out=guard.timed_out,
+            limited=self._limited_command.limited,
+        )
+        return RobotState(
+            stamp_ns=stamp_ns,
+            wheels=self._measured,
+            angles=WheelAngles(*plant.angles),
+            odometry=State(
+                stamp_ns, self._odometry.pose, twist_from_wheels(self._measured, geometry)
+            ),
+            covariance=self._odometry.covariance,
+            commanded=self._limited_command.wheels,
+            status=status,
+            reason=guard.reason,
+            true_wheels=plant.wheels,
+            truth=State(stamp_ns, plant.pose, twist_from_wheels(plant.wheels, geometry)),
+        )
+
+    def _moving(self) -> bool:
+        return max(map(abs, self._plant.wheels)) > self._parameters.rest_speed
+
+    def _reset_odometry(self) -> None:
+        self._odometry.reset()

@@ -1,0 +1,162 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Hybrid stepper motor driven in microsteps: pull-out torque and rotor torque."""
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from t3mpc_ros.kernels import kernel
+from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
+
+Array = npt.NDArray[np.float64]
+
+_MOTOR = '17HS4401 data sheet'
+
+
+@dataclass(frozen=True)
+class StepperMotorParameters(Parameters):
+    """Motor, driver and pulse generator of one wheel; both wheels have the same."""
+
+    full_steps: int = parameter(
+        200, 'full steps per turn', low=4, high=1000, source='paper: 1.8 degrees'
+    )
+    microsteps: int = parameter(16, 'microsteps per full step', low=1, high=256)
+    holding_torque: float = parameter(
+        0.40,
+        'torque at standstill with both phases at rated current',
+        unit='N m',
+        low=1e-3,
+        high=100.0,
+        source=_MOTOR,
+    )
+    rated_current: float = parameter(
+        1.7, 'rated current of a phase', unit='A', low=0.01, high=50.0, source=_MOTOR
+    )
+    resistance: float = parameter(
+        1.5, 'resistance of a phase', unit='Ohm', low=0.01, high=1000.0, source=_MOTOR
+    )
+    inductance: float = parameter(
+        2.8e-3, 'inductance of a phase', unit='H', low=1e-6, high=1.0, source=_MOTOR
+    )
+    rotor_inertia: float = parameter(
+        5.4e-6, 'inertia of the rotor', unit='kg m²', low=1e-9, high=1.0, source=_MOTOR
+    )
+    phase_current: float = parameter(
+        1.0, 'peak current that the driver is set to', unit='A', low=0.01, high=50.0, dynamic=True
+    )
+    damping: float = parameter(
+        0.01,
+        'torque per speed of the rotor against its field, near synchronism',
+        unit='N m s/rad',
+        low=0.0,
+        high=1.0,
+    )
+    damping_width: float = parameter(
+        2.0,
+        'speed against the field at which the damping has fallen to a quarter: a rotor that has '
+        'lost its field is not dragged along',
+        unit='rad/s',
+        low=0.01,
+        high=1000.0,
+    )
+    step_rate: float = parameter(
+        10_000.0,
+        'most pulses a second for each wheel',
+        unit='1/s',
+        low=1.0,
+        high=1e6,
+        source='one step for two ticks of a 20 kHz interrupt',
+    )
+
+    @property
+    def microstep(self) -> float:
+        """Angle (rad) of one pulse."""
+        return 2.0 * math.pi / (self.full_steps * self.microsteps)
+
+    @property
+    def teeth(self) -> float:
+        """Stable places of the rotor per turn, N."""
+        return 0.25 * self.full_steps
+
+    @property
+    def torque_constant(self) -> float:
+        """Torque per ampere (N m/A) of the field.
+
+        Holding torque is measured with rated current in both phases, a field sqrt(2) times as
+        strong as the one that microstepping turns, whose peak is the current of one phase.
+        """
+        return self.holding_torque / (math.sqrt(2.0) * self.rated_current)
+
+    @property
+    def top_speed(self) -> float:
+        """Fastest wheel speed (rad/s) that the pulse generator can ask for."""
+        return self.step_rate * self.microstep
+
+    def vector(self) -> Array:
+        """Return what the kernels need, shape (7,).
+
+        N (1), torque constant (N m/A), resistance (Ohm), inductance (H), current (A),
+        damping (N m s/rad), its width (rad/s).
+        """
+        return np.array(
+            [
+                self.teeth,
+                self.torque_constant,
+                self.resistance,
+                self.inductance,
+                self.phase_current,
+                self.damping,
+                self.damping_width,
+            ]
+        )
+
+    def check_consistency(self) -> None:
+        """Raise ParameterError when the driver would burn the motor."""
+        if self.phase_current > self.rated_current:
+            raise ParameterError(
+                'phase_current must be at most rated_current '
+                f'({self.rated_current:g} A): got {self.phase_current:g}'
+            )
+
+
+@kernel
+def pull_out_torque(field_speed: float, volts: float, motor: Array) -> float:
+    r"""Return the largest torque (N m) at a speed of the field (rad/s), 0 where none is left.
+
+    At pull-out the current is in phase with the back-EMF, so the supply has to carry
+
+    .. math:: V^2 = (R I + k \Omega)^2 + (N \Omega L I)^2
+
+    with the torque constant k. The current is what this leaves, or what the driver is set to if
+    that is less. Source: Acarnley, Stepping Motors, 4th ed., chapter on pull-out torque.
+
+    volts : supply (V)
+    motor : shape (7,), see :meth:`StepperMotorParameters.vector`
+    """
+    speed = abs(field_speed)
+    teeth, constant, resistance, inductance = motor[0], motor[1], motor[2], motor[3]
+    emf = constant * speed
+    if emf >= volts:
+        return 0.0
+    reactance = teeth * speed * inductance
+    impedance = resistance * resistance + reactance * reactance
+    drop = resistance * emf
+    room = drop * drop + impedance * (volts * volts - emf * emf)
+    current = (math.sqrt(room) - drop) / impedance
+    return float(constant * min(current, motor[4]))
+
+
+@kernel
+def rotor_torque(ahead: float, faster: float, peak: float, motor: Array) -> float:
+    """Return the torque (N m) on a rotor whose field is ``ahead`` (rad) and ``faster`` (rad/s).
+
+    peak : the pull-out torque at this speed, 0 without power
+    motor : shape (7,), see :meth:`StepperMotorParameters.vector`
+    """
+    if peak <= 0.0:
+        return 0.0
+    fade = 1.0 + (faster / motor[6]) * (faster / motor[6])
+    return float(peak * math.sin(motor[0] * ahead) + motor[5] * faster / (fade * fade))

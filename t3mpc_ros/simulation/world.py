@@ -1,0 +1,516 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""World: walls, boxes, pillars and slippery patches from a YAML file, and ray casting in them."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+import difflib
+import math
+from pathlib import Path
+import re
+import reprlib
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+
+from t3mpc_ros.kernels import kernel
+
+Array = npt.NDArray[np.float64]
+
+WORLDS_FOLDER = Path(__file__).resolve().parent / 'worlds'
+"""Where the worlds are that come with the package."""
+MAX_COORDINATE = 1000.0
+"""m: bound of every coordinate and size."""
+MIN_SIZE = 0.01
+"""m: bound of every size. What is thinner than a bumper gives way would push it on both sides."""
+MAX_SEGMENTS = 2000
+"""Straight pieces of wall, those of boxes included: each is looked at by each ray and step."""
+MAX_CIRCLES = 500
+MAX_PATCHES = 100
+MAX_FILE_SIZE = 1_000_000
+"""Bytes."""
+_NUMBER_PATTERN = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?', re.IGNORECASE)
+
+
+class WorldError(ValueError):
+    """A world that cannot be used; the text names the file, the entry, the bound and the value."""
+
+
+class BoundingBox(NamedTuple):
+    """The smallest upright rectangle around everything there is."""
+
+    left: float
+    """m"""
+    bottom: float
+    """m"""
+    right: float
+    """m"""
+    top: float
+    """m"""
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """What stands around the robot, as the arrays that the kernels read; not to be written to.
+
+    They are not locked against that: the compiler would build every kernel once more for arrays
+    that are.
+    """
+
+    name: str
+    segments: Array
+    """Straight pieces of wall, shape (n, 4): ax, ay, bx, by, m; those of boxes too."""
+    circles: Array
+    """Pillars, shape (m, 3): x, y, radius, m."""
+    patches: Array
+    """Slippery floor, shape (k, 4): x, y, radius (m), grip (part of the tyres' own, 0 to 1)."""
+    boxes: Array
+    """For the inside, shape (b, 5): x, y, length, width (m), yaw of the length (rad)."""
+
+    def is_free(self, x: float, y: float, radius: float) -> bool:
+        """Decide whether a disc at (x, y) touches no wall and is in no box or circle, all in m.
+
+        What is not finite is not free.
+
+        Raises
+        ------
+        ValueError
+            The radius is negative.
+        """
+        if radius < 0.0:
+            raise ValueError(f'radius must be at least 0 m: got {radius:g}')
+        if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(radius)):
+            return False
+        x, y = float(x), float(y)  # an int would make the compiler build the kernel once more
+        if clearance(x, y, self.segments, self.circles) < radius:
+            return False
+        if np.any(np.hypot(x - self.circles[:, 0], y - self.circles[:, 1]) <= self.circles[:, 2]):
+            return False
+        away_x, away_y = x - self.boxes[:, 0], y - self.boxes[:, 1]
+        cosine, sine = np.cos(self.boxes[:, 4]), np.sin(self.boxes[:, 4])
+        along, across = cosine * away_x + sine * away_y, cosine * away_y - sine * away_x
+        inside = (2.0 * abs(along) <= self.boxes[:, 2]) & (2.0 * abs(across) <= self.boxes[:, 3])
+        return not inside.any()
+
+    @property
+    def extent(self) -> BoundingBox:
+        """What a picture has to show; all zero where there is nothing."""
+        discs = np.vstack([self.circles, self.patches[:, :3]])
+        corners = [self.segments.reshape(-1, 2)]
+        corners += [discs[:, :2] + side * discs[:, 2:] for side in (-1.0, 1.0)]
+        points = np.vstack(corners)
+        if not len(points):
+            return BoundingBox(0.0, 0.0, 0.0, 0.0)
+        return BoundingBox(*points.min(axis=0).tolist(), *points.max(axis=0).tolist())
+
+
+def bundled_worlds() -> tuple[str, ...]:
+    """Return the names of the worlds that come with the package."""
+    return tuple(sorted(path.stem for path in WORLDS_FOLDER.glob('*.yaml')))
+
+
+def load_world(path_or_name: str | Path) -> World:
+    """Return a world by the name of a shipped one, else by the path of a file.
+
+    An empty name is the empty plain. A file of your own that has the name of a shipped world is
+    reached with its folder: ``./room``.
+
+    Raises
+    ------
+    WorldError
+        There is no such world, or the file does not hold one.
+    """
+    if path_or_name == '':
+        return parse_world('name: plain', 'plain')
+    names = bundled_worlds()
+    path = Path(path_or_name)
+    if path_or_name in names:
+        path = WORLDS_FOLDER / f'{path_or_name}.yaml'
+    try:
+        with path.open('rb') as file:
+            content = file.read(MAX_FILE_SIZE + 1)
+        if len(content) > MAX_FILE_SIZE:
+            raise WorldError(f'{path} must have at most {MAX_FILE_SIZE} bytes: it has more')
+        text = content.decode('utf-8')
+    except FileNotFoundError:
+        raise WorldError(
+            f'there is no world {path_or_name}, neither a file nor one of '
+            f'{", ".join(names)}{_near(str(path_or_name), names)}'
+        ) from None
+    except OSError as error:
+        raise WorldError(f'{path} cannot be read: {error.strerror}') from error
+    except UnicodeDecodeError as error:
+        raise WorldError(f'{path} must be UTF-8 text: {error}') from error
+    return parse_world(text, str(path))
+
+
+def parse_world(text: str, source: str) -> World:
+    """Return the world that a YAML text describes.
+
+    Parameters
+    ----------
+    text
+        See ``docs/worlds.md``.
+    source
+        What the errors call it; without ``name`` in the text, its stem is the world's name.
+
+    Raises
+    ------
+    WorldError
+        Names ``source``, the entry, the bound and the value.
+    """
+    try:
+        return _world(_parsed(text), Path(source).stem)
+    except WorldError as error:
+        raise WorldError(f'{source}: {error}') from error.__cause__
+
+
+class _Loader(yaml.SafeLoader):
+    """Refuses a key that is given twice, where YAML would keep the last one in silence."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        pairs = node.value if isinstance(node, yaml.MappingNode) else []
+        seen: set[str] = set()
+        for key in (key for key, _ in pairs if isinstance(key, yaml.ScalarNode)):
+            if key.value in seen:
+                line = key.start_mark.line + 1
+                raise WorldError(f'{key.value} is given twice in one entry, at line {line}')
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+def _parsed(text: str) -> object:
+    try:
+        return yaml.load(text, Loader=_Loader)
+    except WorldError:
+        raise
+    except yaml.YAMLError as error:
+        mark = getattr(error, 'problem_mark', None)
+        line = f'line {mark.line + 1}: ' if mark else ''
+        problem = getattr(error, 'problem', None) or str(error)
+        raise WorldError(f'not YAML: {line}{problem}') from error
+    except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
+        # What the parser lets through: a date that is none, brackets without end, !!int without
+        # digits.
+        raise WorldError(f'not YAML that can be read: {error}') from error
+
+
+def _world(content: object, stem: str) -> World:
+    read = _entry(content, 'the world', (), ('name', 'walls', 'boxes', 'circles', 'patches'))
+    name = read.get('name', stem)
+    if not isinstance(name, str) or not name:
+        raise WorldError(f'name must be a text: got {reprlib.repr(name)}')
+    pieces: list[tuple[float, ...]] = []
+    for where, wall in _entries(read, 'walls', MAX_SEGMENTS):
+        pieces += _wall(wall, where)
+        _check_count(len(pieces))
+    boxes = []
+    for where, box in _entries(read, 'boxes', MAX_SEGMENTS // 4):
+        boxes.append(_box(box, where))
+        pieces += _sides(*boxes[-1])
+        _check_count(len(pieces))
+    segments = join_walls(_rows(pieces, 4))
+    _check_count(len(segments))
+    circles = [_circle(*each, ()) for each in _entries(read, 'circles', MAX_CIRCLES)]
+    patches = [_circle(*each, ('grip',)) for each in _entries(read, 'patches', MAX_PATCHES)]
+    return World(name, segments, _rows(circles, 3), _rows(patches, 4), _rows(boxes, 5))
+
+
+def _wall(content: object, where: str) -> Iterator[tuple[float, ...]]:
+    read = _entry(content, where, ('points',), ('closed',))
+    closed = read.get('closed', False)
+    if not isinstance(closed, bool):
+        raise WorldError(f'{where}.closed must be true or false: got {reprlib.repr(closed)}')
+    least = 3 if closed else 2
+    given = _list(read['points'], f'{where}.points', least, MAX_SEGMENTS + 1)
+    points = [_point(point, f'{where}.points[{index}]') for index, point in enumerate(given)]
+    for index in range(0 if closed else 1, len(points)):
+        length = math.dist(points[index - 1], points[index])
+        if length < MIN_SIZE:
+            last = '; leave the last point out, closed adds it' if index == 0 else ''
+            raise WorldError(
+                f'{where}.points[{index}] must be at least {MIN_SIZE:g} m from the point before '
+                f'it: got {length:g} m{last}'
+            )
+        yield *points[index - 1], *points[index]
+
+
+def _box(content: object, where: str) -> tuple[float, ...]:
+    read = _entry(content, where, ('center', 'size'), ('yaw',))
+    size = _list(read['size'], f'{where}.size', 2, 2)
+    # More than a full turn is a yaw in degrees.
+    return (
+        *_point(read['center'], f'{where}.center'),
+        *(_number(size[i], f'{where}.size[{i}]', MIN_SIZE, MAX_COORDINATE, ' m') for i in (0, 1)),
+        _number(read.get('yaw', 0.0), f'{where}.heading', -math.tau, math.tau, ' rad'),
+    )
+
+
+def _sides(
+    x: float, y: float, length: float, width: float, yaw: float
+) -> Iterator[tuple[float, ...]]:
+    """Return the four sides of a box, counter-clockwise."""
+    cosine, sine = 0.5 * math.cos(yaw), 0.5 * math.sin(yaw)
+    corners = [
+        (x + cosine * length * p - sine * width * q, y + sine * length * p + cosine * width * q)
+        for p, q in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+    ]
+    for index in range(4):
+        yield *corners[index - 1], *corners[index]
+
+
+def _circle(where: str, content: object, more: tuple[str, ...]) -> tuple[float, ...]:
+    read = _entry(content, where, ('center', 'radius', *more), ())
+    return (
+        *_point(read['center'], f'{where}.center'),
+        _number(read['radius'], f'{where}.radius', MIN_SIZE, MAX_COORDINATE, ' m'),
+        *(_number(read[name], f'{where}.{name}', 0.0, 1.0, '') for name in more),
+    )
+
+
+def _entry(
+    content: object, where: str, needed: tuple[str, ...], optional: tuple[str, ...]
+) -> dict[str, Any]:
+    known = (*needed, *optional)
+    if not isinstance(content, dict):
+        raise WorldError(
+            f'{where} must hold {", ".join(known)} by name: got {reprlib.repr(content)}'
+        )
+    for name in content:
+        if name not in known:
+            near = _near(str(name), known) or f'; known are {", ".join(known)}'
+            raise WorldError(f'{where} has no {reprlib.repr(name)}{near}')
+    for name in needed:
+        if name not in content:
+            raise WorldError(f'{where} must have a {name}')
+    return content
+
+
+def _entries(read: dict[str, Any], name: str, most: int) -> Iterator[tuple[str, object]]:
+    for index, entry in enumerate(_list(read.get(name, []), name, 0, most)):
+        yield f'{name}[{index}]', entry
+
+
+def _list(content: object, where: str, least: int, most: int) -> list[Any]:
+    if not isinstance(content, list):
+        raise WorldError(f'{where} must be a list: got {reprlib.repr(content)}')
+    if not least <= len(content) <= most:
+        span = f'{least}' if least == most else f'from {least} to {most}'
+        raise WorldError(f'{where} must have {span} entries: got {len(content)}')
+    return content
+
+
+def _point(content: object, where: str) -> tuple[float, float]:
+    x, y = _list(content, where, 2, 2)
+    return (
+        _number(x, f'{where}[0]', -MAX_COORDINATE, MAX_COORDINATE, ' m'),
+        _number(y, f'{where}[1]', -MAX_COORDINATE, MAX_COORDINATE, ' m'),
+    )
+
+
+def _number(content: object, where: str, low: float, high: float, unit: str) -> float:
+    bounds = f'{where} must be a number from {low:g} to {high:g}{unit}'
+    if isinstance(content, bool) or not isinstance(content, int | float):
+        # PyYAML wants a digit between sign and point, and an exponent with point and sign.
+        like_one = isinstance(content, str) and _NUMBER_PATTERN.fullmatch(content)
+        hint = ', a text to YAML; write numbers like -0.9 or 1.0e-3' if like_one else ''
+        raise WorldError(f'{bounds}: got {reprlib.repr(content)}{hint}')
+    if not low <= content <= high:  # false for NaN, too
+        raise WorldError(f'{bounds}: got {reprlib.repr(content)}')
+    return float(content)
+
+
+def _check_count(count: int) -> None:
+    if count > MAX_SEGMENTS:
+        raise WorldError(
+            f'walls and boxes must have at most {MAX_SEGMENTS} straight pieces together: '
+            f'got {count} or more'
+        )
+
+
+def _rows(rows: list[tuple[float, ...]], width: int) -> Array:
+    return np.array(rows, dtype=np.float64).reshape(-1, width)
+
+
+def _near(name: str, known: tuple[str, ...]) -> str:
+    near = difflib.get_close_matches(name, known, n=1)
+    return f'; did you mean {near[0]}?' if near else ''
+
+
+JOIN_TOLERANCE = 1e-4
+"""m: ends nearer to each other, or to a wall, than this are meant to touch."""
+
+
+def join_walls(segments: Array) -> Array:
+    """Return the walls with every meeting point an end of all walls there, shape (n', 4).
+
+    Ends within :data:`JOIN` of one another become one; a wall on which another one ends is cut
+    there, and of what then stands twice one is kept. Walls that cross are left alone: at a
+    crossing the bumper is always in a corner.
+
+    Parameters
+    ----------
+    segments
+        Shape (n, 4), m; each longer than twice :data:`JOIN`.
+    """
+    points: Array = segments.reshape(-1, 2).copy()
+    for index in range(1, len(points)):
+        near = np.hypot(*(points[:index] - points[index]).T) <= JOIN_TOLERANCE
+        if near.any():
+            points[index] = points[int(near.argmax())]
+    joined: dict[tuple[tuple[float, ...], ...], tuple[float, ...]] = {}
+    for start, end in points.reshape(-1, 2, 2):
+        stops = [start, *_ends_between(start, end, points), end]
+        for here, there in zip(stops, stops[1:], strict=False):
+            ends = tuple(here.tolist()), tuple(there.tolist())
+            joined.setdefault(tuple(sorted(ends)), (*ends[0], *ends[1]))
+    return np.array(list(joined.values()), dtype=np.float64).reshape(-1, 4)
+
+
+def _ends_between(start: Array, end: Array, points: Array) -> list[Array]:
+    """Return the points that lie on a wall between its ends, in order from its start."""
+    length = float(np.hypot(*(end - start)))
+    direction = (end - start) / length
+    away = points - start
+    along = away @ direction
+    off = np.abs(away @ np.array([-direction[1], direction[0]]))
+    # Ends nearer than JOIN to those of this wall are one with them by now.
+    on = np.flatnonzero(
+        (off <= JOIN_TOLERANCE)
+        & (along > 0.5 * JOIN_TOLERANCE)
+        & (along < length - 0.5 * JOIN_TOLERANCE)
+    )
+    between = {tuple(points[index].tolist()): index for index in on[np.argsort(along[on])]}
+    return [points[index] for index in between.values()]
+
+
+@kernel
+def cast_ray(x: float, y: float, direction: float, segments: Array, circles: Array) -> float:
+    """Return the distance (m) from (x, y) to the first wall in a direction; inf if there is none.
+
+    From inside a circle that is its wall, seen from within. Touching an end point is a hit; a
+    wall has no thickness, so whether one seen exactly edge-on is hit is left to rounding.
+
+    x, y : m; direction : rad from the x axis of the world
+    """
+    cosine, sine = math.cos(direction), math.sin(direction)
+    nearest = math.inf
+    for row in range(segments.shape[0]):
+        start_x, start_y = segments[row, 0] - x, segments[row, 1] - y
+        end_x, end_y = segments[row, 2] - x, segments[row, 3] - y
+        # On which side of the ray an end lies depends on that end alone. Two walls that share it
+        # get the same sign, however it is rounded, so no ray slips through between them.
+        start_off = cosine * start_y - sine * start_x
+        end_off = cosine * end_y - sine * end_x
+        if (start_off > 0.0 and end_off > 0.0) or (start_off < 0.0 and end_off < 0.0):
+            continue
+        start_on = cosine * start_x + sine * start_y
+        end_on = cosine * end_x + sine * end_y
+        if start_off != end_off:
+            distance = (start_on * end_off - end_on * start_off) / (end_off - start_off)
+        elif start_on * end_on <= 0.0:
+            distance = 0.0  # both are on the ray's line, and it starts between them
+        else:
+            distance = min(start_on, end_on)
+        if 0.0 <= distance < nearest:
+            nearest = distance
+    for row in range(circles.shape[0]):
+        to_x, to_y = circles[row, 0] - x, circles[row, 1] - y
+        off = cosine * to_y - sine * to_x
+        square = (circles[row, 2] - off) * (circles[row, 2] + off)
+        if square < 0.0:
+            continue
+        middle, half = cosine * to_x + sine * to_y, math.sqrt(square)
+        distance = middle - half
+        if distance < 0.0:
+            distance = middle + half
+        if 0.0 <= distance < nearest:
+            nearest = distance
+    return nearest
+
+
+@kernel
+def cast_rays(
+    x: float,
+    y: float,
+    yaw: float,
+    mounts: Array,
+    which: npt.NDArray[np.int64],
+    segments: Array,
+    circles: Array,
+    out: Array,
+) -> None:
+    """Write what some of the sensors on the body see into ``out``, as :func:`cast_ray` does.
+
+    x, y, yaw : pose of the body, m, m, rad
+    mounts : shape (s, 3), of each sensor x (m, forward), y (m, to the left), direction (rad),
+        in the frame of the body
+    which : int64, the rows of ``mounts`` to look from
+    out : shape (s,), m; ``out[row]`` is written for each row in ``which``, the others are kept
+    """
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    for index in range(which.size):
+        row = which[index]
+        forward, left = mounts[row, 0], mounts[row, 1]
+        out[row] = cast_ray(
+            x + cosine * forward - sine * left,
+            y + sine * forward + cosine * left,
+            yaw + mounts[row, 2],
+            segments,
+            circles,
+        )
+
+
+@kernel
+def nearest_on_segment(
+    x: float, y: float, ax: float, ay: float, bx: float, by: float
+) -> tuple[float, float]:
+    """Return the point of the segment from a to b that is nearest to (x, y), all in m.
+
+    Where that is an end, it is that end to the last bit.
+    """
+    run_x, run_y = bx - ax, by - ay
+    along = (x - ax) * run_x + (y - ay) * run_y
+    length_squared = run_x * run_x + run_y * run_y
+    if along <= 0.0:
+        return ax, ay
+    if along >= length_squared:
+        return bx, by
+    share = along / length_squared
+    return ax + share * run_x, ay + share * run_y
+
+
+@kernel
+def clearance(x: float, y: float, segments: Array, circles: Array) -> float:
+    """Return the distance (m) from (x, y) to the nearest wall, on either side; inf without walls.
+
+    Inside a box or circle that is the distance to its wall:
+    :meth:`~t3mpc_ros.simulation.world.World.is_free` tells inside from outside.
+    """
+    least = math.inf
+    for row in range(segments.shape[0]):
+        near_x, near_y = nearest_on_segment(
+            x, y, segments[row, 0], segments[row, 1], segments[row, 2], segments[row, 3]
+        )
+        least = min(least, (x - near_x) * (x - near_x) + (y - near_y) * (y - near_y))
+    least = math.sqrt(least)
+    for row in range(circles.shape[0]):
+        centre = math.hypot(x - circles[row, 0], y - circles[row, 1])
+        least = min(least, abs(centre - circles[row, 2]))
+    return least
+
+
+@kernel
+def grip_at(x: float, y: float, patches: Array) -> float:
+    """Return which part of their grip tyres keep at (x, y): 1 outside all patches.
+
+    Where patches overlap the most slippery one counts: the same oil twice is no worse.
+    """
+    grip = 1.0
+    for row in range(patches.shape[0]):
+        to_x, to_y = x - patches[row, 0], y - patches[row, 1]
+        if to_x * to_x + to_y * to_y <= patches[row, 2] * patches[row, 2]:
+            grip = min(grip, patches[row, 3])
+    return grip

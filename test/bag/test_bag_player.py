@@ -1,0 +1,787 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Bags played back in virtual time: nothing skipped, nothing twice, everything in its order."""
+
+from itertools import pairwise
+import random
+import threading
+
+import pytest
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from t3mpc_ros.bag.merged_reader import (
+    MIN_LOOP_NS,
+    MergedReader,
+    ScheduledMessage,
+    StoredMessage,
+    alignment_offsets_ns,
+    open_serialized_bag,
+)
+from t3mpc_ros.bag.player import (
+    LatencyHistogram,
+    PlaybackTimeline,
+    ReadAheadQueue,
+    velocity_command_risk,
+)
+from t3mpc_ros.bag.qos import (
+    PUBLISHER_DEPTH,
+    UNLIMITED,
+    QosError,
+    QosProfile,
+    adapt_offer_to_recorded_offers,
+    read_qos_overrides,
+)
+from t3mpc_ros.bag.schema import BagError
+from t3mpc_ros.bag.topic_filter import PlayTopicFilter, PlayTopicFilterError, parse_remappings
+from t3mpc_ros.bag.writer import BagWriter
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+TEXT, NUMBER = 'std_msgs/msg/String', 'std_msgs/msg/Float64'
+SECOND = 10**9
+START = 1_700_000_000 * SECOND
+LATCHED = QosProfile(depth=1, durability='transient_local')
+ENDLESS = QosTime(9223372036, 854775807)
+
+
+def text(words):
+    return bytes(STORE.serialize_cdr(STORE.types[TEXT](data=words), TEXT))
+
+
+def write_mcap(folder, messages, chunk_bytes=2000, latched=('/map',)):
+    """Record ``(topic, received_ns)``; the data say which message it is."""
+    topics = {topic for topic, _ in messages}
+    with BagWriter(folder, metadata_records={}, chunk_bytes=chunk_bytes) as bag:
+        for topic in sorted(topics):
+            bag.add_topic(topic, TEXT, [LATCHED if topic in latched else QosProfile()])
+        for number, (topic, stamp_ns) in enumerate(messages):
+            bag.write(topic, stamp_ns, stamp_ns, text(f'{topic} {number}'))
+    return folder
+
+
+def write_sqlite(folder, messages, latched=('/map',), **compression):
+    bag = Writer(folder, version=9, storage_plugin=StoragePlugin.SQLITE3)
+    if compression:
+        bag.set_compression(**compression)
+    with bag:
+        connections = {}
+        for topic in sorted({topic for topic, _ in messages}):
+            durability = QosDurability.TRANSIENT_LOCAL if topic in latched else 2
+            offered = Qos(
+                QosHistory.KEEP_LAST,
+                1,
+                QosReliability.RELIABLE,
+                QosDurability(durability),
+                ENDLESS,
+                ENDLESS,
+                QosLiveliness.AUTOMATIC,
+                ENDLESS,
+                False,
+            )
+            connections[topic] = bag.add_connection(
+                topic, TEXT, typestore=STORE, offered_qos_profiles=[offered]
+            )
+        for number, (topic, stamp_ns) in enumerate(messages):
+            bag.write(connections[topic], stamp_ns, text(f'{topic} {number}'))
+    return folder
+
+
+def ticks(count=200, step=SECOND // 100):
+    """Two topics at one time each tick, and a latched one now and then."""
+    messages = []
+    for i in range(count):
+        now = START + i * step
+        messages += [('/a', now), ('/b', now)]
+        if i % 50 == 0:
+            messages.append(('/map', now + 1))
+    return messages
+
+
+def expected(messages):
+    return [
+        StoredMessage(at, topic, text(f'{topic} {n}')) for n, (topic, at) in enumerate(messages)
+    ]
+
+
+FORMATS = {
+    'mcap': write_mcap,
+    'sqlite3': write_sqlite,
+    'sqlite3, files compressed': lambda folder, messages: write_sqlite(
+        folder, messages, mode=CompressionMode.FILE, fmt=CompressionFormat.ZSTD
+    ),
+    'sqlite3, messages compressed': lambda folder, messages: write_sqlite(
+        folder, messages, mode=CompressionMode.MESSAGE, fmt=CompressionFormat.ZSTD
+    ),
+}
+
+
+@pytest.fixture(params=FORMATS)
+def write(request):
+    return FORMATS[request.param]
+
+
+@pytest.fixture
+def tape(tmp_path):
+    """Return a function that opens bags as one tape."""
+    opened = []
+
+    def make(*folders, offsets_ns=(), **choice):
+        opened.append(
+            MergedReader(
+                [open_serialized_bag(f) for f in folders], offsets_ns, PlayTopicFilter(**choice)
+            )
+        )
+        return opened[-1]
+
+    yield make
+    for each in opened:
+        each.close()
+
+
+# -- sources --------------------------------------------------------------------------------------
+
+
+def test_every_byte_of_every_format_comes_back_in_the_order_of_the_file(write, tape, tmp_path):
+    written = expected(ticks())
+    made = tape(write(tmp_path / 'bag', ticks()))
+    assert list(made.messages(START)) == written
+    assert (made.start_ns, made.end_ns) == (START, written[-1].stamp_ns)
+    assert {name: track.message_count for name, track in made.tracks.items()} == {
+        '/a': 200,
+        '/b': 200,
+        '/map': 4,
+    }
+    assert made.tracks['/map'].latched == 1
+    assert made.tracks['/a'].profiles[0].durability == 'volatile'
+    assert made.tracks['/a'].type_name == TEXT
+
+
+def test_reading_from_any_time_on_gives_the_same_messages(write, tape, tmp_path):
+    written = expected(ticks())
+    made = tape(write(tmp_path / 'bag', ticks()))
+    rng = random.Random(1)
+    for start in [START - 5, START, made.end_ns, made.end_ns + 1] + [
+        START + rng.randrange(2 * SECOND) for _ in range(10)
+    ]:
+        assert list(made.messages(start)) == [m for m in written if m.stamp_ns >= start]
+
+
+def test_a_single_file_is_a_bag_too(tape, tmp_path):
+    for folder, pattern in (
+        (write_mcap(tmp_path / 'm', ticks(5)), '*.mcap'),
+        (write_sqlite(tmp_path / 's', ticks(5)), '*.db3'),
+    ):
+        (file,) = folder.glob(pattern)
+        assert list(tape(file).messages(0)) == expected(ticks(5))
+        (folder / 'metadata.yaml').unlink()
+        assert list(tape(folder).messages(0)) == expected(ticks(5))
+
+
+def test_a_continued_bag_is_one_sequence(tape, tmp_path):
+    """Files of a split may overlap: the recorder stamps by receipt, writes in the order heard."""
+    one, two = ticks(60), [(topic, at + 55 * SECOND // 100) for topic, at in ticks(60)]
+    write_mcap(tmp_path / 'bag', one)
+    write_mcap(tmp_path / 'bag', two)
+    both = [*expected(one), *expected(two)]
+    assert list(tape(tmp_path / 'bag').messages(0)) == sorted(both, key=lambda m: m.stamp_ns)
+
+
+def test_a_file_that_broke_off_is_named_and_the_finished_ones_are_played(tmp_path):
+    write_mcap(tmp_path / 'bag', ticks(5))
+    write_mcap(tmp_path / 'bag', ticks(9))
+    torn = tmp_path / 'bag' / 'bag_1.mcap'
+    torn.write_bytes(torn.read_bytes()[:-50])
+    bag = open_serialized_bag(tmp_path / 'bag')
+    assert bag.unfinished == ('bag_1.mcap',)
+    assert bag.end_ns == ticks(5)[-1][1]
+    bag.close()
+    with pytest.raises(BagError, match='bag_1.mcap: bag recover'):
+        open_serialized_bag(torn)
+
+
+def test_what_is_no_bag_is_refused(tmp_path):
+    (tmp_path / 'notes.txt').write_text('hello')
+    (tmp_path / 'empty').mkdir()
+    (tmp_path / 'broken.db3').write_bytes(b'no database' * 100)
+    for path, words in (
+        ('nowhere', 'there is no bag'),
+        ('notes.txt', 'cannot be read'),
+        ('empty', 'no finished bag file'),
+        ('broken.db3', 'cannot be read'),
+    ):
+        with pytest.raises(BagError, match=words):
+            open_serialized_bag(tmp_path / path)
+
+
+def test_a_damaged_chunk_ends_playing_with_an_error(tape, tmp_path):
+    folder = write_mcap(tmp_path / 'bag', ticks())
+    (file,) = folder.glob('*.mcap')
+    content = bytearray(file.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 40] = bytes(40)
+    file.write_bytes(content)
+    with pytest.raises(BagError, match='bag_0.mcap cannot be read'):
+        list(tape(folder).messages(0))
+
+
+# -- several bags ---------------------------------------------------------------------------------
+
+
+def test_bags_are_merged_by_time_of_receipt(tape, tmp_path):
+    one = write_mcap(tmp_path / 'one', [('/a', START + i * 1000) for i in range(0, 50, 2)])
+    two = write_sqlite(tmp_path / 'two', [('/b', START + i * 1000) for i in range(0, 50, 5)])
+    merged = list(tape(one, two).messages(0))
+    assert len(merged) == 25 + 10
+    # Equal times: the bag that was named first comes first.
+    assert merged == sorted(merged, key=lambda m: (m.stamp_ns, m.topic))
+    turned = list(tape(two, one).messages(0))
+    assert [m.topic for m in turned[:2]] == ['/b', '/a']
+
+
+def test_a_bag_can_be_shifted_in_time(tape, tmp_path):
+    one = write_mcap(tmp_path / 'one', [('/a', START + i * SECOND) for i in range(3)])
+    two = write_mcap(tmp_path / 'two', [('/b', 5 * START + i * SECOND) for i in range(3)])
+    bags = [open_serialized_bag(one), open_serialized_bag(two)]
+    offsets = alignment_offsets_ns(bags)
+    for bag in bags:
+        bag.close()
+    made = tape(one, two, offsets_ns=[offsets[0], offsets[1] + 1])
+    assert [(m.stamp_ns - START, m.topic) for m in made.messages(0)] == [
+        (i * SECOND + shift, topic) for i in range(3) for shift, topic in ((0, '/a'), (1, '/b'))
+    ]
+    assert (made.start_ns, made.end_ns) == (START, START + 2 * SECOND + 1)
+
+
+def test_one_name_with_two_types_is_refused(tmp_path):
+    folders = []
+    for kind in (TEXT, NUMBER):
+        folders.append(tmp_path / kind.rsplit('/', 1)[-1])
+        with BagWriter(folders[-1], metadata_records={}) as bag:
+            bag.add_topic('/x', kind)
+            bag.write('/x', START, START, b'\0\1\0\0')
+    bags = [open_serialized_bag(folder) for folder in folders]
+    with pytest.raises(BagError, match='/x is std_msgs/msg/String and std_msgs/msg/Float64'):
+        MergedReader(bags)
+    MergedReader(bags, selection=PlayTopicFilter(exclude=('x',))).close()
+
+
+# -- choosing and renaming ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    'choice, played',
+    [
+        ({}, ['/cmd_vel', '/odom', '/range/left', '/range/right', '/tf']),
+        ({'topics': ('range/*', 'tf')}, ['/range/left', '/range/right', '/tf']),
+        ({'topics': ('*',), 'exclude': ('/range/*',)}, ['/cmd_vel', '/odom', '/tf']),
+        ({'regex': '/(odom|range/l.*)'}, ['/odom', '/range/left']),
+        ({'regex': '/odo'}, []),
+        ({'regex': '/tf', 'topics': ('odom',)}, ['/odom', '/tf']),
+        ({'exclude_regex': '.*range.*|/tf', 'exclude': ('cmd_vel',)}, ['/odom']),
+    ],
+)
+def test_topics_are_chosen_by_name_pattern_and_expression(choice, played):
+    names = ['/cmd_vel', '/odom', '/range/left', '/range/right', '/tf']
+    assert list(filter(PlayTopicFilter(**choice).selects, names)) == played
+
+
+def test_renamed_topics_come_under_their_new_name_and_may_meet(tape, tmp_path):
+    folder = write_mcap(tmp_path / 'bag', ticks(3))
+    made = tape(folder, remap=parse_remappings(['a:=/x/y', '/b := x/y']))
+    assert [m.topic for m in made.messages(0)] == ['/x/y'] * 2 + ['/map'] + ['/x/y'] * 4
+    assert [m.data for m in made.messages(0)] == [m.data for m in expected(ticks(3))]
+    assert made.recorded['/x/y'] == {'/a', '/b'}
+    assert made.tracks['/x/y'].message_count == 6
+    made.exclude_topic('/x/y')
+    assert [m.topic for m in made.messages(0)] == ['/map']
+
+
+@pytest.mark.parametrize('items', [['a'], ['a:='], [':=b'], ['a:=b', '/a:=c']])
+def test_a_renaming_that_says_nothing_is_refused(items):
+    with pytest.raises(PlayTopicFilterError, match='remap must'):
+        parse_remappings(items)
+
+
+def test_a_bad_expression_is_named():
+    with pytest.raises(PlayTopicFilterError, match='exclude_regex must be a regular expression'):
+        PlayTopicFilter(exclude_regex='(')
+
+
+@pytest.mark.parametrize(
+    'recorded, name, kind, dangerous',
+    [
+        ('/cmd_vel', '/cmd_vel', 'geometry_msgs/msg/Twist', True),
+        ('/robot_1/cmd_vel', '/robot_1/cmd_vel', 'geometry_msgs/msg/TwistStamped', True),
+        ('/x', '/cmd_vel', 'geometry_msgs/msg/Twist', True),
+        ('/cmd_vel', '/other/cmd_vel', 'geometry_msgs/msg/Twist', True),
+        ('/cmd_vel', '/cmd_vel', 'my_msgs/msg/Drive', True),
+        ('/steer', '/steer', 'geometry_msgs/msg/Twist', True),
+        ('/cmd_vel', '/recorded/velocity', 'geometry_msgs/msg/Twist', False),
+        ('/odom', '/odom', 'nav_msgs/msg/Odometry', False),
+    ],
+)
+def test_what_could_drive_a_robot_is_known(recorded, name, kind, dangerous):
+    assert bool(velocity_command_risk(recorded, name, kind)) == dangerous
+
+
+# -- quality of service ---------------------------------------------------------------------------
+
+WEAK = QosProfile(reliability='best_effort')
+
+
+@pytest.mark.parametrize(
+    'recorded, reliability, durability, depth',
+    [
+        ([], 'reliable', 'volatile', PUBLISHER_DEPTH),
+        ([WEAK], 'best_effort', 'volatile', PUBLISHER_DEPTH),
+        ([WEAK, QosProfile()], 'reliable', 'volatile', PUBLISHER_DEPTH),
+        ([LATCHED], 'reliable', 'transient_local', 1),
+        ([LATCHED, WEAK, LATCHED], 'reliable', 'transient_local', 2),
+        # What Fast DDS reports of a latched publisher in another process.
+        ([QosProfile('unknown', 0, 'reliable', LATCHED.durability)],)
+        + ('reliable', 'transient_local', 1),
+        ([QosProfile(reliability='unknown')], 'reliable', 'volatile', PUBLISHER_DEPTH),
+    ],
+)
+def test_the_offer_satisfies_whoever_heard_the_recorded_publishers(
+    recorded, reliability, durability, depth
+):
+    offer = adapt_offer_to_recorded_offers(recorded)
+    assert (offer.reliability, offer.durability, offer.depth) == (reliability, durability, depth)
+    assert offer.history == 'keep_last'
+
+
+def test_of_different_deadlines_the_strictest_is_offered():
+    offer = adapt_offer_to_recorded_offers(
+        [
+            QosProfile(deadline_ns=5, liveliness='automatic', liveliness_lease_ns=9),
+            QosProfile(deadline_ns=3, liveliness='manual_by_topic', lifespan_ns=7),
+            QosProfile(deadline_ns=0, liveliness='unknown'),
+        ]
+    )
+    assert (offer.deadline_ns, offer.liveliness, offer.liveliness_lease_ns) == (
+        3,
+        'manual_by_topic',
+        9,
+    )
+    assert offer.lifespan_ns == UNLIMITED
+
+
+def test_overrides_are_read_as_ros2_bag_reads_them(tmp_path):
+    path = tmp_path / 'overrides.yaml'
+    path.write_text(
+        '/talker:\n  reliability: best_effort\n  history: keep_all\n'
+        '/map:\n  durability: transient_local\n  depth: 3\n  deadline: {sec: 1, nsec: 5}\n'
+    )
+    overrides = read_qos_overrides(path)
+    assert overrides == {
+        '/talker': QosProfile(reliability='best_effort', history='keep_all'),
+        '/map': QosProfile(durability=LATCHED.durability, depth=3, deadline_ns=SECOND + 5),
+    }
+
+
+@pytest.mark.parametrize(
+    'content, words',
+    [
+        ('[1, 2]', 'profiles by topic: got list'),
+        ('/a: {reliabilty: reliable}', "/a: 'reliabilty' is none of history"),
+        ('/a: {reliability: strong}', '/a: reliability must be one of'),
+        ('/a: {deadline: 5}', '/a: deadline must have sec and nsec'),
+        ('/a: reliable', '/a must have policies'),
+        ('{', 'is not YAML'),
+    ],
+)
+def test_overrides_that_ros2_bag_would_refuse_are_refused(content, words, tmp_path):
+    path = tmp_path / 'overrides.yaml'
+    path.write_text(content)
+    with pytest.raises(QosError, match=words):
+        read_qos_overrides(path)
+
+
+# -- latched topics -------------------------------------------------------------------------------
+
+
+def test_what_latched_topics_hold_comes_before_any_later_start(write, tape, tmp_path):
+    made = tape(write(tmp_path / 'bag', ticks()))
+    written = [m for m in expected(ticks()) if m.topic == '/map']
+    for start in (START, START + 1, START + 2, START + SECOND // 2 + 1, made.end_ns, 2 * START):
+        earlier = [m for m in written if m.stamp_ns < start]
+        assert made.latched_messages_before(start) == earlier[-1:]
+
+
+def test_several_latched_topics_come_in_the_order_in_which_they_were_received(tape, tmp_path):
+    """A message hours back is found, too: /old was said once, at the very beginning."""
+    messages = [('/old', START), ('/map', START + 2)]
+    messages += [('/a', START + 10 * i * SECOND) for i in range(1, 400)]
+    messages += [('/robot', START + 3000 * SECOND + 1), ('/map', START + 3990 * SECOND + 1)]
+    messages.sort(key=lambda m: m[1])
+    names = ('/old', '/map', '/robot')
+    made = tape(write_mcap(tmp_path / 'bag', messages, latched=names))
+    last = made.latched_messages_before(START + 3990 * SECOND)
+    assert [m.topic for m in last] == ['/old', '/map', '/robot']
+    assert [m.topic for m in made.latched_messages_before(2 * START)] == ['/old', '/robot', '/map']
+
+
+def test_a_topic_with_two_latched_publishers_keeps_a_message_of_each(tape, tmp_path):
+    """Of /tf_static one message was restored once, and half of the robot had no frame."""
+    with BagWriter(tmp_path / 'bag', metadata_records={}) as bag:
+        bag.add_topic('/tf_static', TEXT, [LATCHED, LATCHED])
+        for i in range(3):
+            bag.write('/tf_static', START + i, START, text(str(i)))
+    held = tape(tmp_path / 'bag').latched_messages_before(START + 10)
+    assert [m.data for m in held] == [text('1'), text('2')]
+
+
+# -- playing --------------------------------------------------------------------------------------
+
+
+class Player:
+    """A playback, the time it is driven with, and everything it has said."""
+
+    def __init__(self, tape, begin_ns=None, end_ns=None, loop=False, **more):
+        begin_ns = tape.start_ns if begin_ns is None else begin_ns
+        end_ns = tape.end_ns if end_ns is None else end_ns
+        self.made = PlaybackTimeline(
+            lambda at: tape.plan(at, begin_ns, end_ns, loop), begin_ns, end_ns, loop=loop, **more
+        )
+        self.now = 7 * SECOND
+        self.wake = self.now
+        self.out = []
+
+    @property
+    def messages(self):
+        return [e.message for _, e in self.out if e.message is not None]
+
+    @property
+    def errors(self):
+        return [now - e.due_ns for now, e in self.out if e.message is not None]
+
+    def ask(self, most=20):
+        emissions, self.wake = self.made.due(self.now, most)
+        assert len([e for e in emissions if e.message]) <= most
+        self.out += [(self.now, e) for e in emissions]
+
+    def run(self, until_ns=None):
+        """Ask whenever told to, as a caller that is never late; return when nothing is left."""
+        while self.wake is not None and (until_ns is None or self.wake <= until_ns):
+            self.now = max(self.now, self.wake)
+            self.ask()
+        if until_ns is not None:
+            self.now = max(self.now, until_ns)
+        return self
+
+
+@pytest.fixture
+def bag(tape, tmp_path):
+    return tape(write_mcap(tmp_path / 'bag', ticks()))
+
+
+def test_each_message_comes_at_its_time(bag):
+    player = Player(bag).run()
+    assert player.messages == expected(ticks())
+    assert player.made.finished
+    assert set(player.errors) == {0}
+    first = player.out[0][0]
+    assert all(now - first == e.message.stamp_ns - START for now, e in player.out)
+
+
+@pytest.mark.parametrize('rate', [0.01, 0.3, 1.0, 1.1**7, 100.0])
+def test_the_rate_stretches_time_exactly(bag, rate):
+    player = Player(bag, rate=rate).run()
+    first = player.out[0][0]
+    for now, emission in player.out:
+        assert (now - first) * rate == pytest.approx(emission.stamp_ns - START, abs=1 + rate)
+    assert player.messages == expected(ticks())
+
+
+def test_late_messages_come_at_once_and_in_order(bag):
+    player = Player(bag)
+    player.ask()
+    player.ask()
+    player.now += SECOND
+    while player.wake is not None and player.wake <= player.now:
+        player.ask(most=7)
+    assert player.messages == [m for m in expected(ticks()) if m.stamp_ns <= START + SECOND]
+    assert max(player.errors) == SECOND - 1, 'the map, 1 ns after the first tick'
+    assert player.errors[-1] == 0
+
+
+def test_start_offset_and_end_cut_the_bag_and_the_map_comes_first(bag):
+    begin, end = START + SECOND // 2 + 2, START + SECOND
+    player = Player(bag, begin, end).run()
+    inside = [m for m in expected(ticks()) if begin <= m.stamp_ns <= end]
+    (held,) = bag.latched_messages_before(begin)
+    assert player.messages == [held, *inside]
+    assert inside[-1].stamp_ns == end
+    assert player.out[0][1].stamp_ns == begin, 'the clock does not tell an earlier time'
+
+
+def test_laps_follow_each_other_without_a_gap_or_drift(bag):
+    begin, end = START + SECOND // 2 + 2, START + SECOND + 5_000_000
+    player = Player(bag, begin, end, loop=True, rate=0.7)
+    player.run(player.now + int(100.5 * (end - begin) / 0.7))
+    lap = [e.message for e in (e for _, e in Player(bag, begin, end).run().out)]
+    assert player.messages[: 100 * len(lap)] == lap * 100
+    whole = (end - begin) / 0.7
+    # The first of each lap is what the latched topic held before it.
+    for first in range(2):
+        times = [now for now, _ in player.out[first :: len(lap)]]
+        assert len(times) == 101
+        for number, now in enumerate(times):
+            assert now - times[0] == pytest.approx(number * whole, abs=2)
+    assert player.made.loops(player.now) == 100
+
+
+def test_a_single_message_in_a_loop_does_not_play_without_end_at_once(tape, tmp_path):
+    made = tape(write_mcap(tmp_path / 'bag', [('/a', START)]))
+    player = Player(made, loop=True)
+    player.run(player.now + 10 * MIN_LOOP_NS)
+    assert len(player.messages) == 11
+    nothing = tape(tmp_path / 'bag', topics=('/none',))
+    player = Player(nothing, loop=True).run()
+    assert player.made.finished
+    assert player.messages == []
+
+
+def test_a_seek_goes_on_there_with_what_latched_topics_held(bag):
+    player = Player(bag)
+    player.run(player.now + SECOND // 4)
+    count = len(player.messages)
+    target = START + SECOND + SECOND // 10
+    assert player.made.seek(player.now, target) == ''
+    player.wake = player.now
+    player.run()
+    written = expected(ticks())
+    after = [m for m in written if m.stamp_ns >= target]
+    assert player.messages[count:] == [*bag.latched_messages_before(target), *after]
+    assert player.made.finished
+    assert player.made.seek(player.now, START) == ''
+    assert not player.made.finished, 'it can be played again'
+    for stamp, words in ((START - 1, 'got -0.000 s'), (bag.end_ns + SECOND, 'got 2.990 s')):
+        assert words in player.made.seek(player.now, stamp)
+
+
+def test_a_seek_while_paused_shows_the_latched_topics_and_waits(bag):
+    player = Player(bag, paused=True)
+    player.made.seek(player.now, START + SECOND)
+    player.run()
+    assert player.messages == bag.latched_messages_before(START + SECOND)
+    assert player.wake is None
+    assert player.made.stamp_ns(player.now + SECOND) == START + SECOND
+
+
+def test_steps_take_one_message_each_and_only_while_paused(bag):
+    player = Player(bag, paused=True).run()
+    assert player.messages == []
+    for count in (1, 2, 30):
+        assert player.made.step(player.now, count) == ''
+        before = len(player.messages)
+        player.wake = player.now
+        player.run()
+        assert len(player.messages) == before + count
+        assert player.made.stamp_ns(player.now) == player.messages[-1].stamp_ns
+        assert player.wake is None
+    assert 'from 1' in player.made.step(player.now, 0)
+    player.made.resume(player.now)
+    assert 'paused' in player.made.step(player.now)
+    player.wake = player.now
+    player.run()
+    assert player.messages == expected(ticks())
+    player.made.pause(player.now)
+    assert 'no next message' in player.made.step(player.now)
+
+
+def test_stepping_across_the_end_of_a_lap_does_not_show_the_map_too_early(bag):
+    begin = START + 2
+    player = Player(bag, begin, START + SECOND // 100 + 1000, loop=True, paused=True).run()
+    heard = ['/map']
+    assert [m.topic for m in player.messages] == heard
+    for more in (['/a'], ['/b'], ['/map', '/a']):
+        player.made.step(player.now)
+        player.wake = player.now
+        player.run()
+        heard += more
+        assert [m.topic for m in player.messages] == heard
+
+
+def test_a_seek_forgets_steps_that_were_not_taken(bag):
+    player = Player(bag, paused=True).run()
+    player.made.step(player.now, 5)
+    player.made.seek(player.now, START)
+    player.wake = player.now
+    assert player.run().messages == []
+
+
+@pytest.mark.parametrize('seed', range(40))
+def test_no_programme_of_pauses_rates_and_steps_skips_or_repeats_a_message(bag, seed):
+    """Whatever is asked for, and however late the caller: between seeks the order is the bag's."""
+    rng = random.Random(seed)
+    loop = seed % 4 == 0
+    player = Player(bag, loop=loop, paused=seed % 3 == 0, clock_rate=rng.choice([0.0, 40.0]))
+    made, now = player.made, player.now
+    written, heard, sought = expected(ticks()), [], False
+    sequences = []
+    for _ in range(150):
+        action = rng.randrange(8)
+        if action == 0:
+            made.pause(player.now)
+        elif action == 1:
+            made.resume(player.now)
+        elif action == 2:
+            made.set_rate(player.now, rng.choice([0.01, 0.5, 1.0, 3.7, 100.0, rng.random() + 0.1]))
+        elif action == 3:
+            made.step(player.now, rng.randrange(1, 6))
+        elif action == 4 and rng.random() < 0.2:
+            sequences.append((sought, player.messages))
+            player.out.clear()
+            sought = START + rng.randrange(2 * SECOND - SECOND // 50)
+            assert made.seek(player.now, sought) == ''
+        elif action == 5 and player.wake is not None:
+            player.now = max(player.now, player.wake)
+        else:
+            player.now += rng.randrange(SECOND // 5)
+        for _ in range(rng.randrange(4)):
+            player.ask(most=rng.randrange(1, 9))
+    assert player.now > now
+    made.resume(player.now)
+    player.wake = player.now
+    if not loop:
+        player.run()
+        assert made.finished
+    sequences.append((sought, player.messages))
+    for sought, heard in sequences:
+        whole = written
+        if sought is not False:
+            rest = [m for m in written if m.stamp_ns >= sought]
+            whole = [*bag.latched_messages_before(sought), *rest]
+        if loop:
+            whole = whole + written * 50
+        assert heard == whole[: len(heard)]
+    if not loop:
+        assert len(heard) == len(whole)
+
+
+def test_place_and_time_left_follow_the_rate(bag):
+    player = Player(bag, rate=2.0)
+    player.run(player.now + SECOND // 4)
+    assert player.made.stamp_ns(player.now) == START + SECOND // 2
+    assert player.made.remaining_ns(player.now) == (bag.end_ns - START - SECOND // 2) // 2
+    player.made.set_rate(player.now, 0.5)
+    assert player.made.stamp_ns(player.now) == START + SECOND // 2
+    assert player.made.remaining_ns(player.now) == (bag.end_ns - START - SECOND // 2) * 2
+    player.made.pause(player.now)
+    assert player.made.stamp_ns(player.now + SECOND) == START + SECOND // 2
+    for rate in (0.0, -1.0, float('nan'), float('inf')):
+        with pytest.raises(ValueError, match='rate must be a positive number'):
+            player.made.set_rate(player.now, rate)
+
+
+def test_the_clock_is_told_at_its_rate_and_never_runs_backwards(bag):
+    player = Player(bag, clock_rate=40.0, rate=0.5).run()
+    clock = [(now, e.stamp_ns) for now, e in player.out if e.message is None]
+    assert {b - a for (a, _), (b, _) in pairwise(clock)} == {SECOND // 40}
+    stamps = [e.stamp_ns for _, e in player.out]
+    assert stamps == sorted(stamps)
+    first = clock[0][0]
+    assert all(stamp == START + (now - first) // 2 for now, stamp in clock)
+
+
+def test_the_clock_is_told_while_time_stands(bag):
+    player = Player(bag, clock_rate=10.0, paused=True)
+    player.run(player.now + SECOND)
+    assert [e.stamp_ns for _, e in player.out] == [START] * 11
+
+
+def test_reading_the_first_message_does_not_make_it_late(bag):
+    player = Player(bag)
+    player.ask()
+    assert player.out == []
+    player.now += SECOND // 2  # so long it took to find the first message
+    player.run()
+    assert set(player.errors) == {0}
+
+
+# -- reading ahead --------------------------------------------------------------------------------
+
+
+def test_reading_ahead_changes_nothing_and_ends_when_closed(bag):
+    before = threading.active_count()
+    player = Player(bag)
+    made = PlaybackTimeline(
+        lambda at: ReadAheadQueue(bag.plan(at, bag.start_ns, bag.end_ns, True), 100),
+        bag.start_ns,
+        bag.end_ns,
+        loop=True,
+    )
+    player.made = made
+    player.run(player.now + 3 * SECOND)
+    for target in range(0, SECOND, SECOND // 20):
+        made.seek(player.now, START + target)
+    player.wake = player.now
+    count = len(player.messages)
+    player.run(player.now + SECOND)
+    loops = expected(ticks()) * 3
+    assert player.messages[:count] == loops[:count]
+    assert player.messages[count + 1].stamp_ns == START + SECOND // 20 * 19
+    made.close()
+    assert threading.active_count() == before
+
+
+def test_reading_ahead_is_bounded_and_hands_an_error_over_in_its_place():
+    taken = []
+
+    def source():
+        for number in range(1000):
+            taken.append(number)
+            if number == 600:
+                raise BagError('torn here')
+            yield number
+
+    stream = ReadAheadQueue(source(), 200)
+    assert next(stream) == 0
+    assert len(taken) <= 1 + 200 + 3 * 50
+    assert [next(stream) for _ in range(599)] == list(range(1, 600)), 'all before the error'
+    with pytest.raises(BagError, match='torn here'):
+        next(stream)
+    with pytest.raises(StopIteration):
+        next(stream)
+    stream.close()
+
+
+# -- lateness -------------------------------------------------------------------------------------
+
+
+def test_percentiles_of_lateness_are_right_within_two_percent():
+    rng = random.Random(3)
+    values = [round(rng.lognormvariate(11.0, 1.5)) for _ in range(5000)]
+    statistics = LatencyHistogram()
+    for value in values:
+        statistics.note(value)
+    ranked = sorted(max(value, 1000) for value in values)
+    for percent in (1, 50, 90, 99, 100):
+        exact = ranked[max(0, -(-percent * len(ranked) // 100) - 1)]
+        assert exact <= statistics.percentile_ns(percent) * 1.0001
+        assert statistics.percentile_ns(percent) <= exact * 1.021
+    assert statistics.max_ns == ranked[-1]
+    assert statistics.count == 5000
+    assert LatencyHistogram().percentile_ns(99) == 0
+
+
+def test_planned_messages_keep_their_place_when_a_seek_starts_a_loop(bag):
+    begin, end = bag.start_ns, bag.end_ns
+    stream = bag.plan(START + SECOND, begin, end, loop=True)
+    planned = [next(stream) for _ in range(700)]
+    assert planned[0] == ScheduledMessage(
+        SECOND, START + SECOND, bag.latched_messages_before(START + SECOND)[0], restored=True
+    )
+    assert [p.at_ns for p in planned] == sorted(p.at_ns for p in planned)
+    lap = end - begin
+    assert next(p for p in planned if p.at_ns == lap and p.stamp_ns == begin).message.topic == '/a'

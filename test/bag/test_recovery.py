@@ -1,0 +1,572 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Bags cut off anywhere, with flipped bits, of any writer: what is sound comes back, no more."""
+
+from dataclasses import dataclass
+import io
+import itertools
+import json
+import random
+import sqlite3
+import struct
+
+from mcap.data_stream import ReadDataStream
+from mcap.reader import make_reader
+from mcap.records import Attachment, Channel, Chunk, Message, Metadata
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import CompressionType, IndexType, Writer
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Writer as RosbagsWriter
+from rosbags.typesys import Stores, get_typestore
+
+from t3mpc_ros.bag.mcap_file import read_file_summary
+from t3mpc_ros.bag.metadata import read_metadata
+from t3mpc_ros.bag.qos import QosProfile
+from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.bag.recovery.recover_bag import RecoveryOutputError, default_output, recover_bag
+from t3mpc_ros.bag.recovery.recover_file import UnreadableError, recover_file
+from t3mpc_ros.bag.schema import MessageDefinitions
+from t3mpc_ros.bag.writer import BagWriter
+from t3mpc_ros.cli.bag import bag_main
+
+START = 1_700_000_000_000_000_000
+TEXT, NUMBER = 'std_msgs/msg/String', 'std_msgs/msg/Float64'
+TOPICS = {'/a': TEXT, '/b/c': TEXT, '/n': NUMBER}
+DETAILS = {'settings': {'law.gain': '8.0'}, 'provenance': {'commit': 'abc', 'note': 'µ ∞'}}
+
+
+def payload(kind, rng):
+    """Return a message in CDR; random, so that every one differs and none compresses away."""
+    if kind == NUMBER:
+        return b'\0\1\0\0' + rng.randbytes(8)
+    text = rng.randbytes(rng.randrange(20, 200)).hex().encode() + b'\0'
+    return b'\0\1\0\0' + len(text).to_bytes(4, 'little') + text
+
+
+def messages(count, seed=1):
+    """Return ``count`` messages as (topic, log time, publish time, sequence, data)."""
+    rng = random.Random(seed)
+    sequence = dict.fromkeys(TOPICS, 0)
+    result = []
+    for i in range(count):
+        topic = rng.choice(list(TOPICS))
+        now = START + i * 10_000_000
+        result.append((topic, now, now - 123, sequence[topic], payload(TOPICS[topic], rng)))
+        sequence[topic] += 1
+    return result
+
+
+def own_bag(folder, count=800, chunk_bytes=4_000):
+    """Return the file of a finished bag by our writer."""
+    with BagWriter(folder, metadata_records=DETAILS, chunk_bytes=chunk_bytes) as bag:
+        for topic, kind in TOPICS.items():
+            bag.add_topic(topic, kind, [QosProfile(depth=7)])
+        bag.add_topic('/quiet', NUMBER)
+        for topic, log_time, publish_time, _, data in messages(count):
+            bag.write(topic, log_time, publish_time, data)
+    return bag.path
+
+
+def foreign_file(count=200, extras=True, **options):
+    """Return the bytes of a file by the mcap library, with attachments and metadata inside."""
+    output = io.BytesIO()
+    writer = Writer(output, **{'chunk_size': 3_000} | options)
+    writer.start('ros2', 'somebody')
+    definitions = MessageDefinitions()
+    channels = {}
+    for i, (topic, log_time, publish_time, sequence, data) in enumerate(messages(count)):
+        if topic not in channels:
+            schema = writer.register_schema(
+                TOPICS[topic], 'ros2msg', definitions.schema(TOPICS[topic]).encode()
+            )
+            about = {'offered_qos_profiles': '', 'who': 'µ'}
+            channels[topic] = writer.register_channel(topic, 'cdr', schema, about)
+        writer.add_message(channels[topic], log_time, data, publish_time, sequence)
+        if extras and i % 50 == 20:
+            writer.add_metadata(f'note {i}', {'at': str(i)})
+            writer.add_attachment(log_time, log_time, f'{i}.bin', 'application/x', bytes(i))
+    writer.finish()
+    return output.getvalue()
+
+
+@dataclass
+class Inside:
+    """What a whole file holds, in the order of the file."""
+
+    items: list
+    """Messages as in :func:`messages`, between them attachments and metadata records."""
+    channels: dict
+
+    @property
+    def messages(self):
+        return [item for item in self.items if isinstance(item, tuple)]
+
+
+def inside(content):
+    """Return what is in ``content``, every checksum looked at by the mcap library."""
+    held = Inside([], {})
+    for record in StreamReader(io.BytesIO(content), validate_crcs=True).records:
+        if isinstance(record, Channel):
+            held.channels[record.id] = record
+        elif isinstance(record, Message):
+            topic = held.channels[record.channel_id].topic
+            held.items.append(
+                (topic, record.log_time, record.publish_time, record.sequence, record.data)
+            )
+        elif isinstance(record, Metadata | Attachment):
+            held.items.append(record)
+    return held
+
+
+def chunk_ends(content):
+    """Return (end of the chunk in the file, messages up to there) of each chunk."""
+    ends = [(0, 0)]
+    for entry in make_reader(io.BytesIO(content)).get_summary().chunk_indexes:
+        start, end = entry.chunk_start_offset, entry.chunk_start_offset + entry.chunk_length
+        chunk = Chunk.read(ReadDataStream(io.BytesIO(content[start + 9 : end])))
+        count = sum(isinstance(record, Message) for record in breakup_chunk(chunk))
+        ends.append((end, ends[-1][1] + count))
+    return ends
+
+
+def end_of_data(content):
+    """Return where the record that ends the data begins; 13 bytes later comes the summary."""
+    return int.from_bytes(content[-28:-20], 'little') - 13
+
+
+def salvaged(content):
+    """Return the outcome, and the bytes that were written."""
+    output = io.BytesIO()
+    outcome = recover_file(io.BytesIO(content), output, 'file')
+    return outcome, output.getvalue()
+
+
+@pytest.fixture(scope='module')
+def own(tmp_path_factory):
+    return own_bag(tmp_path_factory.mktemp('own') / 'run').read_bytes()
+
+
+# -- cut off ------------------------------------------------------------------------------------
+
+
+def test_a_bag_cut_off_at_1000_places_keeps_every_complete_chunk_and_invents_nothing(own):
+    whole, ends, end = inside(own).items, chunk_ends(own), end_of_data(own)
+    assert len(ends) > 30
+    rng = random.Random(6)
+    for cut in [8, len(own) - 1, *(rng.randrange(8, len(own)) for _ in range(998))]:
+        outcome, content = salvaged(own[:cut])
+        held = inside(content)
+        assert held.items == whole[: len(held.items)], cut
+        complete = max(count for place, count in ends if place <= cut)
+        assert len(held.messages) >= complete, cut
+        assert len(held.messages) == sum(topic.kept for topic in outcome.topics.values())
+        assert outcome.clean == (cut > end), cut
+        assert make_reader(io.BytesIO(content)).get_summary().statistics is not None
+
+
+@pytest.mark.parametrize(
+    'options',
+    [
+        {'compression': CompressionType.LZ4},
+        {'compression': CompressionType.NONE},
+        {'use_chunking': False},
+        {'enable_crcs': False, 'index_types': IndexType.NONE, 'use_statistics': False},
+    ],
+    ids=['lz4', 'none', 'unchunked', 'no_checksum'],
+)
+def test_a_file_of_another_writer_cut_off_keeps_all_that_is_whole(options):
+    content = foreign_file(**options)
+    whole, end = inside(content).items, end_of_data(content)
+    rng = random.Random(7)
+    for cut in [8, *(rng.randrange(8, len(content)) for _ in range(99))]:
+        outcome, result = salvaged(content[:cut])
+        held = inside(result)
+        assert held.items == whole[: len(held.items)], cut
+        if options.get('compression') is CompressionType.NONE or 'use_chunking' in options:
+            # Whatever ends before the cut is there, chunk or not.
+            missing = whole[len(held.items) :]
+            bodies = [item[4] if isinstance(item, tuple) else None for item in missing]
+            assert not any(body and body in content[:cut] for body in bodies), cut
+        assert outcome.clean == (cut > end), cut
+
+
+@pytest.mark.parametrize('compression', [CompressionType.ZSTD, CompressionType.LZ4])
+def test_of_a_compressed_chunk_cut_off_what_comes_out_is_kept_and_called_unchecked(compression):
+    content = foreign_file(3_000, extras=False, compression=compression, chunk_size=2**20)
+    whole = inside(content).messages
+    (first, end) = chunk_ends(content)[1:][0]
+    assert end == len(whole)  # one chunk
+    outcome, result = salvaged(content[: first * 3 // 4])
+    kept = inside(result).messages
+    assert kept == whole[: len(kept)]
+    assert len(kept) > len(whole) // 4
+    assert sum(topic.unchecked for topic in outcome.topics.values()) == len(kept)
+    assert not outcome.clean
+
+
+def test_a_recovered_file_recovered_again_stays_as_it_is(own):
+    for content in (own, own[:40_000], foreign_file(use_chunking=False)[:30_000]):
+        _, once = salvaged(content)
+        outcome, twice = salvaged(once)
+        assert once == twice
+        assert outcome.clean
+        assert not outcome.damages
+
+
+def test_headers_channels_and_schemas_come_back_as_they_were():
+    for options in ({}, {'use_chunking': False}):
+        content = foreign_file(**options)
+        before, after = inside(content), inside(salvaged(content)[1])
+        assert list(after.channels.values()) == list(before.channels.values())
+        summary = make_reader(io.BytesIO(salvaged(content)[1])).get_summary()
+        assert summary.schemas == make_reader(io.BytesIO(content)).get_summary().schemas
+    header = make_reader(io.BytesIO(salvaged(content)[1])).get_header()
+    assert (header.profile, header.library) == ('ros2', 'somebody; recovered by t3mpc_ros')
+
+
+# -- damaged in the middle ----------------------------------------------------------------------
+
+
+def flipped(content, rng, count=1):
+    damaged = bytearray(content)
+    for _ in range(count):
+        damaged[rng.randrange(len(damaged))] ^= 1 << rng.randrange(8)
+    return bytes(damaged)
+
+
+def is_subsequence(part, whole):
+    remaining = iter(whole)
+    return all(item in remaining for item in part)
+
+
+@pytest.mark.parametrize('kind', ['own', 'lz4', 'none'])
+def test_flipped_bits_never_change_a_message_that_a_checksum_covers(own, kind):
+    compression = CompressionType.LZ4 if kind == 'lz4' else CompressionType.NONE
+    content = own if kind == 'own' else foreign_file(extras=False, compression=compression)
+    whole = inside(content).messages
+    largest = max(b[1] - a[1] for a, b in itertools.pairwise(chunk_ends(content)))
+    rng = random.Random(8)
+    for trial in range(200):
+        outcome, result = salvaged(flipped(content, rng))
+        kept = inside(result).messages
+        assert is_subsequence(kept, whole), trial
+        assert len(kept) >= len(whole) - largest, trial  # one bit costs one chunk at most
+        lost = sum(topic.lost for topic in outcome.topics.values())
+        assert len(kept) + lost == len(whole), trial
+        assert lost == 0 or not outcome.clean
+
+
+def test_many_flipped_bits_and_files_without_chunks_never_crash_it(own):
+    rng = random.Random(9)
+    unchunked = foreign_file(use_chunking=False)
+    for trial in range(100):
+        for content, covered in ((own, True), (unchunked, False)):
+            _, result = salvaged(flipped(content, rng, 1 + trial % 20))
+            kept = inside(result).messages
+            assert not covered or is_subsequence(kept, inside(own).messages), trial
+
+
+def test_a_record_length_that_is_garbage_costs_only_that_record(own):
+    """The chunk after it was lost, too, when the walk went on where the length said."""
+    ends = chunk_ends(own)
+    start = make_reader(io.BytesIO(own)).get_summary().chunk_indexes[9].chunk_start_offset
+    for length in (0, 5, 2**20, 2**40, 2**64 - 1):
+        damaged = bytearray(own)
+        damaged[start + 1 : start + 9] = length.to_bytes(8, 'little')
+        outcome, result = salvaged(bytes(damaged))
+        assert inside(result).messages == inside(own).messages  # its own fields tell its length
+        # Without those either: the inner length of the data, and with it the whole chunk.
+        damaged[start + 45 : start + 53] = (2**50).to_bytes(8, 'little')
+        outcome, result = salvaged(bytes(damaged))
+        lost = ends[10][1] - ends[9][1]
+        assert len(inside(result).messages) == len(inside(own).messages) - lost
+        assert sum(topic.lost for topic in outcome.topics.values()) == lost
+        (damage,) = outcome.damages
+        assert damage.start == start
+
+
+def test_a_lost_chunk_is_counted_per_topic_with_its_time(own):
+    entry = make_reader(io.BytesIO(own)).get_summary().chunk_indexes[4]
+    damaged = bytearray(own)
+    damaged[entry.chunk_start_offset + entry.chunk_length - 1] ^= 1
+    before = inside(own).messages
+    for content in (damaged, damaged[: end_of_data(own)]):  # with statistics, and without
+        outcome, result = salvaged(bytes(content))
+        there = set(inside(result).messages)
+        missing = [item for item in before if item not in there]
+        for topic in outcome.topics.values():
+            assert topic.lost == sum(item[0] == topic.name for item in missing)
+        (damage,) = outcome.damages
+        assert damage.span_ns == (entry.message_start_time, entry.message_end_time)
+        assert damage.messages == len(missing)
+        assert damage.size == outcome.lost_bytes == entry.chunk_length
+
+
+def test_with_the_first_chunk_the_names_are_lost_but_the_summary_has_them(own):
+    entry = make_reader(io.BytesIO(own)).get_summary().chunk_indexes[0]
+    damaged = bytearray(own)
+    damaged[entry.chunk_start_offset + entry.chunk_length - 1] ^= 1
+    first = chunk_ends(own)[1][1]
+    _, result = salvaged(bytes(damaged))
+    assert inside(result).messages == inside(own).messages[first:]
+    # Cut off as well, nobody knows what the messages are; that is said, not guessed.
+    outcome, result = salvaged(bytes(damaged[:100_000]))
+    assert inside(result).messages == []
+    assert any('names are lost' in damage.reason for damage in outcome.damages)
+
+
+def test_messages_whose_type_is_lost_are_kept_and_the_bag_still_opens(tmp_path):
+    content = bytearray(foreign_file(extras=False, use_chunking=False))
+    place = content.index(b'std_msgs/msg/String') - 4  # the length of the name, in the schema
+    content[place : place + 4] = b'\xff' * 4
+    outcome, result = salvaged(bytes(content[: end_of_data(content)]))
+    assert any('the type of /' in note for note in outcome.notes)
+    assert inside(result).messages == inside(foreign_file(extras=False)).messages
+    (tmp_path / 'x.mcap').write_bytes(result)
+    assert len(read_anyhow(tmp_path / 'x.mcap')) == 200
+
+
+def test_a_file_without_header_or_mark_is_read(own):
+    header_end = 8 + 9 + int.from_bytes(own[9:17], 'little')
+    rest = own[header_end:]
+    for content in (own[:8] + rest, b'?' * 8 + own[8:], rest, b'?' * 100 + own):
+        _, result = salvaged(content)
+        assert inside(result).items == inside(own).items
+
+
+def test_the_way_back_is_found_in_files_without_chunks_or_checksums():
+    for options in ({'use_chunking': False}, {'enable_crcs': False}):
+        content = foreign_file(extras=False, **options)
+        whole = inside(content).messages
+        rng = random.Random(4)
+        for place in range(5_000, 24_000, 1_000):
+            damaged = content[:place] + rng.randbytes(300) + content[place + 300 :]
+            outcome, result = salvaged(damaged)
+            kept = inside(result).messages
+            assert whole[-1] in kept, place
+            assert len(kept) >= len(whole) - 30, place
+            assert len(kept) == len(whole) or not outcome.clean, place
+            unchecked = sum(topic.unchecked for topic in outcome.topics.values())
+            assert unchecked == len(kept), place
+            if options == {'use_chunking': False}:
+                # The message that was hit inside is kept as it is: nothing tells. No other.
+                assert len([item for item in kept if item not in whole]) <= 1, place
+
+
+def test_a_chunk_length_that_leads_to_the_summary_does_not_swallow_what_lies_between(own):
+    """What stood there looked like the head of a record that the end of the file had torn."""
+    place = make_reader(io.BytesIO(own)).get_summary().chunk_indexes[-3].chunk_start_offset
+    (length,) = struct.unpack_from('<Q', own, place + 1)
+    for target in range(len(own) - 2_500, len(own), 29):
+        damaged = bytearray(own)
+        struct.pack_into('<Q', damaged, place + 1, target - place - 9)
+        assert length != target - place - 9
+        _, result = salvaged(bytes(damaged))
+        assert inside(result).messages == inside(own).messages, target
+
+
+def test_zeros_where_the_end_should_be_are_no_records(own):
+    """A power cut leaves a file with its size but without its last blocks."""
+    outcome, result = salvaged(own[:30_000] + bytes(40_000))
+    kept = inside(result).messages
+    assert kept == inside(own).messages[: len(kept)]
+    assert len(kept) >= max(count for place, count in chunk_ends(own) if place <= 30_000)
+    assert not outcome.clean
+
+
+def test_bytes_of_something_else_are_refused():
+    for content in (b'', b'\x89PNG\r\n' + bytes(500), random.Random(2).randbytes(20_000)):
+        with pytest.raises(UnreadableError, match='nothing of an MCAP file'):
+            salvaged(content)
+
+
+def test_a_message_that_holds_an_mcap_file_is_not_taken_for_one(own):
+    """Found between damaged bytes, the inner file's messages once passed for the outer's."""
+    output = io.BytesIO()
+    writer = Writer(output, compression=CompressionType.NONE, chunk_size=10_000)
+    writer.start('', '')
+    channel = writer.register_channel('/file', 'x', 0)
+    for i in range(4):
+        writer.add_message(channel, i, foreign_file(50, use_chunking=False), i)
+    writer.finish()
+    content = bytearray(output.getvalue())
+    start = make_reader(io.BytesIO(bytes(content))).get_summary().chunk_indexes[1]
+    content[start.chunk_start_offset + 1] ^= 0xFF  # its length ...
+    content[start.chunk_start_offset + 45 - 4] ^= 0xFF  # ... and that of its data
+    _, result = salvaged(bytes(content))
+    kept = inside(result).messages
+    assert [item[1] for item in kept] == [0, 2, 3]
+
+
+# -- bags and the program -----------------------------------------------------------------------
+
+
+def torn_bag(folder, cut=-20_000):
+    path = own_bag(folder)
+    path.write_bytes(path.read_bytes()[:cut])
+    return path
+
+
+def read_anyhow(folder):
+    with AnyReader([folder]) as reader:
+        return [(item.topic, stamp, bytes(data)) for item, stamp, data in reader.messages()]
+
+
+def test_a_recovered_bag_opens_everywhere_and_the_input_is_untouched(tmp_path, own):
+    path = torn_bag(tmp_path / 'run')
+    before = {item: item.read_bytes() for item in path.parent.iterdir()}
+    result = recover_bag(path.parent, tmp_path / 'new')
+    assert {item: item.read_bytes() for item in path.parent.iterdir()} == before
+    target = tmp_path / 'new' / path.name
+    kept = inside(target.read_bytes())
+    assert [(m[0], m[1], m[4]) for m in kept.messages] == read_anyhow(tmp_path / 'new')
+    assert read_file_summary(target).message_count == len(kept.messages) == result.kept > 300
+    metadata = read_metadata(tmp_path / 'new')
+    assert metadata.message_count == result.kept
+    assert metadata.topics[0].profiles == (QosProfile(depth=7),)
+    with open_bag(tmp_path / 'new') as recording:
+        assert recording.metadata_records == DETAILS
+        assert recording.topics['/n'].message_count == result.topics['/n'].kept
+        assert recording.series('/n', {'n': 'data'})['n'].size == result.topics['/n'].kept
+    assert not result.clean
+
+
+def test_of_a_folder_sound_files_are_copied_and_broken_ones_written_anew(tmp_path):
+    folder = tmp_path / 'run'
+    torn_bag(folder)
+    sound = own_bag(folder)
+    (folder / 'run_2.mcap').write_bytes(b'')
+    own_bag(folder / 'snapshots' / 'one')
+    result = recover_bag(folder, tmp_path / 'new')
+    assert [(file.name, file.copied) for file in result.files] == [
+        ('run_0.mcap', False),
+        ('run_1.mcap', True),
+        ('run_2.mcap', False),
+    ]
+    assert (tmp_path / 'new' / sound.name).read_bytes() == sound.read_bytes()
+    names = {item.name for item in (tmp_path / 'new').iterdir()}
+    assert names == {'run_0.mcap', 'run_1.mcap', 'metadata.yaml'}
+    again = recover_bag(tmp_path / 'new', tmp_path / 'again')
+    assert again.clean
+    for item in (tmp_path / 'new').iterdir():
+        assert (tmp_path / 'again' / item.name).read_bytes() == item.read_bytes()
+
+
+def test_a_finished_file_with_a_bad_chunk_is_not_copied_blindly(tmp_path):
+    path = own_bag(tmp_path / 'run')
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 4
+    path.write_bytes(content)
+    assert read_file_summary(path) is not None  # its end is sound
+    result = recover_bag(path, tmp_path / 'new')
+    assert not result.files[0].copied
+    assert not result.clean
+    assert result.lost + result.kept == 800
+    assert result.lost_seconds < 1.0
+    assert len(read_anyhow(tmp_path / 'new')) == result.kept
+
+
+def test_an_output_that_could_harm_the_input_is_refused(tmp_path):
+    path = torn_bag(tmp_path / 'run')
+    (tmp_path / 'full').mkdir()
+    (tmp_path / 'full' / 'x').write_text('')
+    refused = [
+        (path, path.parent),
+        (path.parent, path.parent),
+        (path.parent, path.parent / 'inside'),
+        (path, tmp_path / 'full'),
+        (path, path),
+    ]
+    for source, output in refused:
+        with pytest.raises(RecoveryOutputError, match='choose'):
+            recover_bag(source, output)
+    assert {item.name for item in path.parent.iterdir()} == {'run_0.mcap', 'metadata.yaml'}
+
+
+def test_a_full_disk_leaves_no_half_file(tmp_path, monkeypatch):
+    path = torn_bag(tmp_path / 'run')
+
+    def fail(number):
+        raise OSError(28, 'No space left on device')
+
+    monkeypatch.setattr('os.fsync', fail)
+    with pytest.raises(OSError, match='No space'):
+        recover_bag(path, tmp_path / 'new')
+    assert list((tmp_path / 'new').iterdir()) == []
+
+
+def test_the_program_says_what_was_kept_and_answers_with_its_exit_code(tmp_path, capsys):
+    path = own_bag(tmp_path / 'run')
+    assert bag_main(['recover', str(path), '--output', str(tmp_path / 'clean')]) == 0
+    assert 'sound, copied' in capsys.readouterr().out
+    path.write_bytes(path.read_bytes()[:-20_000])
+    assert bag_main(['recover', str(path.parent)]) == 3
+    said = capsys.readouterr().out
+    assert default_output(path.parent) == tmp_path / 'run_recovered'
+    assert len(read_anyhow(tmp_path / 'run_recovered')) > 300
+    assert 'the file has no end' in said
+    assert 'std_msgs/msg/String' in said
+    assert bag_main(['recover', str(path.parent)]) == 2  # it is there now
+    assert 'not empty' in capsys.readouterr().err
+    (tmp_path / 'text').write_text('hello')
+    assert bag_main(['recover', str(tmp_path / 'text')]) == 1
+    assert not (tmp_path / 'text_recovered').exists()
+    assert bag_main(['recover', str(tmp_path / 'nothing')]) == 1
+    with pytest.raises(SystemExit, match='2'):
+        bag_main(['recover'])
+
+
+def test_an_sqlite_bag_is_explained_not_recovered(tmp_path, capsys):
+    (tmp_path / 'bag').mkdir()
+    with sqlite3.connect(tmp_path / 'bag' / 'x.db3') as base:
+        base.execute('create table topics (id integer)')
+    for source in (tmp_path / 'bag', tmp_path / 'bag' / 'x.db3'):
+        assert bag_main(['recover', str(source), '--output', str(tmp_path / 'new')]) == 1
+        assert 'recovered by sqlite itself' in capsys.readouterr().err
+    assert not (tmp_path / 'new').exists()
+
+
+def test_info_tells_files_topics_settings_and_what_is_unfinished(tmp_path, capsys):
+    torn = torn_bag(tmp_path / 'run')
+    own_bag(tmp_path / 'run')
+    assert bag_main(['info', str(tmp_path / 'run')]) == 0
+    said = capsys.readouterr().out
+    for words in (
+        'UNFINISHED run_0.mcap',
+        f'bag recover {tmp_path / "run"}',
+        'run_1.mcap',
+        '7.990 s',
+        'reliable, volatile, keep_last 7',
+        'law.gain',
+        '2023-11-14 22:13:20 UTC',
+    ):
+        assert words in said, words
+    assert bag_main(['info', str(tmp_path / 'run'), '--json']) == 0
+    held = json.loads(capsys.readouterr().out)
+    assert held['message_count'] == 800
+    assert held['details'] == DETAILS
+    counts = {topic['name']: topic['message_count'] for topic in held['topics']}
+    assert sum(counts.values()) == 800
+    assert held['rates']['/n'] == pytest.approx(counts['/n'] / 7.99)
+    assert bag_main(['info', str(torn)]) == 1
+    assert 'bag recover' in capsys.readouterr().err
+    assert bag_main(['info', str(tmp_path / 'nothing')]) == 1
+    (tmp_path / 'text').write_text('hello')
+    assert bag_main(['info', str(tmp_path / 'text')]) == 1
+    assert 'no MCAP file' in capsys.readouterr().err
+
+
+def test_info_reads_files_of_other_writers_and_sqlite_bags(tmp_path, capsys):
+    (tmp_path / 'x.mcap').write_bytes(foreign_file())
+    assert bag_main(['info', str(tmp_path / 'x.mcap')]) == 0
+    assert '120.bin' in capsys.readouterr().out
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with RosbagsWriter(tmp_path / 'old', version=9) as writer:
+        connection = writer.add_connection('/n', NUMBER, typestore=store)
+        for i in range(5):
+            writer.write(connection, START + i * 10**9, payload(NUMBER, random.Random(i)))
+    assert bag_main(['info', str(tmp_path / 'old')]) == 0
+    said = capsys.readouterr().out
+    assert 'sqlite3' in said
+    assert '4.000 s' in said

@@ -1,0 +1,152 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Schema texts and type hashes, from installed files and without them."""
+
+import json
+from pathlib import Path
+
+import pytest
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from t3mpc_ros.bag.schema import (
+    SEPARATOR,
+    BagError,
+    MessageDefinitions,
+    UnknownTypeError,
+    installation_prefixes,
+)
+
+JAZZY = get_typestore(Stores.ROS2_JAZZY)
+RECORDED = (
+    'nav_msgs/msg/Odometry',
+    'nav_msgs/msg/Path',
+    'geometry_msgs/msg/Twist',
+    'geometry_msgs/msg/TwistStamped',
+    'std_msgs/msg/Float64',
+    'std_msgs/msg/Int32MultiArray',
+    'sensor_msgs/msg/JointState',
+    'sensor_msgs/msg/Imu',
+    'diagnostic_msgs/msg/DiagnosticArray',
+    'rosgraph_msgs/msg/Clock',
+)
+
+
+def install(prefix: Path, name: str, text: str, type_hash: str = '') -> None:
+    package, _, own = name.partition('/msg/')
+    folder = prefix / 'share' / package / 'msg'
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f'{own}.msg').write_text(text)
+    if type_hash:
+        content = {'type_hashes': [{'type_name': name, 'hash_string': type_hash}]}
+        (folder / f'{own}.json').write_text(json.dumps(content))
+
+
+@pytest.fixture(params=['installed', 'nothing installed'])
+def definitions(request):
+    return MessageDefinitions() if request.param == 'installed' else MessageDefinitions([])
+
+
+@pytest.mark.parametrize('name', RECORDED)
+def test_the_text_defines_the_type_as_jazzy_does(definitions, name):
+    types = get_types_from_msg(definitions.schema(name), name)
+    for key, (_, fields) in types.items():
+        assert fields == JAZZY.fielddefs[key][1], key
+    assert JAZZY.generate_msgdef(name, ros_version=2)[0].count('MSG: ') == len(types) - 1
+
+
+@pytest.mark.parametrize('name', RECORDED)
+def test_the_hash_is_that_of_jazzy(definitions, name):
+    assert definitions.type_hash(name) == JAZZY.hash_rihs01(name)
+
+
+def test_each_dependency_stands_once_after_a_line_of_eighty_equal_signs(definitions):
+    lines = definitions.schema('nav_msgs/msg/Odometry').splitlines()
+    marks = [i for i, line in enumerate(lines) if line.startswith('=')]
+    assert all(lines[i] == SEPARATOR == '=' * 80 for i in marks)
+    names = [lines[i + 1] for i in marks]
+    assert sorted(names) == [
+        'MSG: builtin_interfaces/Time',
+        'MSG: geometry_msgs/Point',
+        'MSG: geometry_msgs/Pose',
+        'MSG: geometry_msgs/PoseWithCovariance',
+        'MSG: geometry_msgs/Quaternion',
+        'MSG: geometry_msgs/Twist',
+        'MSG: geometry_msgs/TwistWithCovariance',
+        'MSG: geometry_msgs/Vector3',
+        'MSG: std_msgs/Header',
+    ]
+
+
+def test_an_installed_definition_wins_over_the_library_and_the_first_prefix_over_the_second(
+    tmp_path,
+):
+    install(tmp_path / 'overlay', 'std_msgs/msg/Float64', 'float64 data\nfloat64 more\n')
+    install(tmp_path / 'underlay', 'std_msgs/msg/Float64', 'float64 other\n')
+    found = MessageDefinitions([tmp_path / 'overlay', tmp_path / 'underlay'])
+    assert found.schema('std_msgs/msg/Float64') == 'float64 data\nfloat64 more\n'
+
+
+def test_the_hash_beside_another_prefix_s_text_does_not_count(tmp_path):
+    """An overlay that redefines a type must not inherit the hash of what it replaces."""
+    install(tmp_path / 'overlay', 'own_msgs/msg/Pair', 'float64 a\nfloat64 b\n')
+    install(tmp_path / 'underlay', 'own_msgs/msg/Pair', 'float64 a\n', 'RIHS01_old')
+    found = MessageDefinitions([tmp_path / 'overlay', tmp_path / 'underlay'])
+    assert found.type_hash('own_msgs/msg/Pair').startswith('RIHS01_')
+    assert found.type_hash('own_msgs/msg/Pair') != 'RIHS01_old'
+
+
+def test_a_type_of_one_s_own_mixes_files_and_library(tmp_path):
+    text = (
+        '# a comment with a Type in it\n'
+        'byte OK=0   # a constant\n'
+        'string<=10 name "none # of these"\n'
+        'Part[<=4] parts\n'
+        'geometry_msgs/Point[2] ends\n'
+        'float64[] free\n'
+    )
+    install(tmp_path, 'own_msgs/msg/Whole', text)
+    install(tmp_path, 'own_msgs/msg/Part', 'std_msgs/Header header\nwstring word')
+    found = MessageDefinitions([tmp_path])
+    schema = found.schema('own_msgs/msg/Whole')
+    assert schema.startswith(text)
+    names = [line for line in schema.splitlines() if line.startswith('MSG: ')]
+    assert names == [
+        'MSG: own_msgs/Part',
+        'MSG: std_msgs/Header',
+        'MSG: builtin_interfaces/Time',
+        'MSG: geometry_msgs/Point',
+    ]
+
+
+def test_a_hash_is_computed_where_none_is_installed(tmp_path):
+    own_text = MessageDefinitions([]).schema('nav_msgs/msg/Odometry').partition(SEPARATOR)[0]
+    install(tmp_path, 'nav_msgs/msg/Odometry', own_text)
+    (tmp_path / 'share/nav_msgs/msg/Odometry.json').write_text('not json')
+    found = MessageDefinitions([tmp_path])
+    assert found.type_hash('nav_msgs/msg/Odometry') == JAZZY.hash_rihs01('nav_msgs/msg/Odometry')
+
+
+def test_an_unknown_type_names_itself_and_where_it_was_looked_for(tmp_path):
+    install(tmp_path, 'own_msgs/msg/Whole', 'gone_msgs/Lost lost\n')
+    with pytest.raises(UnknownTypeError) as caught:
+        MessageDefinitions([tmp_path]).schema('own_msgs/msg/Whole')
+    assert 'gone_msgs/msg/Lost' in str(caught.value)
+    assert 'needed by own_msgs/msg/Whole' in str(caught.value)
+    assert str(tmp_path / 'share/gone_msgs/msg/Lost.msg') in str(caught.value)
+    assert isinstance(caught.value, BagError)
+
+
+@pytest.mark.parametrize('name', ['', 'Twist', 'a/b/c/d', '../../etc/passwd', 'a b/msg/C'])
+def test_what_is_no_type_name_is_refused(name):
+    with pytest.raises(UnknownTypeError, match='looks like package/msg/Name'):
+        MessageDefinitions([]).schema(name)
+
+
+def test_prefixes_come_from_the_ament_path_and_then_from_python(monkeypatch):
+    monkeypatch.setattr('sys.prefix', '/python')
+    assert installation_prefixes({'AMENT_PREFIX_PATH': '/one::/two'}) == (
+        Path('/one'),
+        Path('/two'),
+        Path('/python'),
+    )
+    assert installation_prefixes({}) == (Path('/python'),)

@@ -1,0 +1,586 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Bags written, restarted, broken off, and read by three independent libraries."""
+
+import errno
+import io
+from pathlib import Path
+
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.records import DataEnd
+from mcap.stream_reader import StreamReader
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+import yaml
+
+from t3mpc_ros.bag import mcap_file, writer
+from t3mpc_ros.bag.mcap_file import finalize_file, read_file_summary
+from t3mpc_ros.bag.metadata import read_metadata
+from t3mpc_ros.bag.qos import QosProfile, profiles_from_yaml
+from t3mpc_ros.bag.reader import missing_sample_ratio, open_bag
+from t3mpc_ros.bag.schema import BagError, UnknownTypeError
+from t3mpc_ros.bag.writer import BagWriter, DataError, DiskError, FolderError, UnknownTopicError
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+TYPES = STORE.types
+START = 1_700_000_000_000_000_000
+STEP = 10_000_000
+ODOM, TWIST, NUMBER = 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/Twist', 'std_msgs/msg/Float64'
+DETAILS = {
+    'settings': {'robot.geometry.wheel_radius': '0.035', 'law.gain': '8.0'},
+    'provenance': {'version': '1.2.3', 'commit': 'abc-dirty', 'note': 'µ: "x" # ∞'},
+}
+
+
+def vector(x=0.0, y=0.0, z=0.0):
+    return TYPES['geometry_msgs/msg/Vector3'](x=x, y=y, z=z)
+
+
+def twist(linear, angular):
+    return TYPES[TWIST](linear=vector(linear), angular=vector(z=angular))
+
+
+def odometry(stamp_ns, linear, angular):
+    header = TYPES['std_msgs/msg/Header'](
+        stamp=TYPES['builtin_interfaces/msg/Time'](
+            sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9
+        ),
+        frame_id='odom',
+    )
+    pose = TYPES['geometry_msgs/msg/Pose'](
+        position=TYPES['geometry_msgs/msg/Point'](x=1.0, y=2.0, z=3.0),
+        orientation=TYPES['geometry_msgs/msg/Quaternion'](x=0.0, y=0.0, z=0.6, w=0.8),
+    )
+    covariance = np.arange(36.0)
+    return TYPES[ODOM](
+        header=header,
+        child_frame_id='base_link',
+        pose=TYPES['geometry_msgs/msg/PoseWithCovariance'](pose=pose, covariance=covariance),
+        twist=TYPES['geometry_msgs/msg/TwistWithCovariance'](
+            twist=twist(linear, angular), covariance=covariance
+        ),
+    )
+
+
+def serialised(message):
+    return bytes(STORE.serialize_cdr(message, message.__msgtype__))
+
+
+def fill(bag, count=200, start=START, step=STEP):
+    """Record ``count`` ticks of three topics; return every (topic, received, data)."""
+    bag.add_topic('/robot/odom', ODOM, [QosProfile()])
+    bag.add_topic('/robot/cmd_vel', TWIST, [QosProfile(depth=1)])
+    bag.add_topic('/quiet', NUMBER)
+    written = []
+    for i in range(count):
+        now = start + i * step
+        for topic, data in (
+            ('/robot/odom', serialised(odometry(now - 3_000_000, 0.01 * i, -0.02 * i))),
+            ('/robot/cmd_vel', serialised(twist(0.1 * i, float(np.sin(i))))),
+        ):
+            bag.write(topic, now, now - 1_000_000, data)
+            written.append((topic, now, data))
+    return written
+
+
+def read_with_rosbags(folder):
+    with Reader(folder) as reader:
+        return [(item.topic, stamp, bytes(data)) for item, stamp, data in reader.messages()]
+
+
+def read_with_mcap(path):
+    with path.open('rb') as file:
+        reader = make_reader(file, validate_crcs=True)
+        return [(channel.topic, m.log_time, m.data) for _, channel, m in reader.iter_messages()]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / 'run'
+
+
+# -- what is written comes back -----------------------------------------------------------------
+
+
+def test_every_byte_comes_back_through_rosbags_and_through_mcap(folder):
+    with BagWriter(folder, metadata_records=DETAILS) as bag:
+        written = fill(bag)
+    assert bag.path == folder / 'run_0.mcap'
+    assert read_with_rosbags(folder) == written
+    assert read_with_mcap(bag.path) == written
+
+
+def test_the_data_section_has_a_checksum_and_it_is_right(folder):
+    with BagWriter(folder, metadata_records=DETAILS) as bag:
+        written = fill(bag)
+    content = bag.path.read_bytes()
+    reader = NonSeekingReader(io.BytesIO(content), validate_crcs=True)
+    assert sum(1 for _ in reader.iter_messages()) == len(written)
+    (end,) = (item for item in StreamReader(io.BytesIO(content)).records if type(item) is DataEnd)
+    assert end.data_section_crc != 0
+    # The same bytes with one bit of the first chunk flipped are noticed.
+    with bag.path.open('rb') as file:
+        chunk = make_reader(file).get_summary().chunk_indexes[0]
+    damaged = bytearray(content)
+    damaged[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
+    with pytest.raises(Exception):  # noqa: B017 - the decompressor or the checksum, either will do
+        list(NonSeekingReader(io.BytesIO(bytes(damaged)), validate_crcs=True).iter_messages())
+
+
+def test_messages_can_be_decoded_from_the_bag_s_own_definitions(folder):
+    with BagWriter(folder, metadata_records={}) as bag:
+        fill(bag, 5)
+    with AnyReader([folder]) as reader:  # compares the type hashes of metadata.yaml, too
+        chosen = [item for item in reader.connections if item.topic == '/robot/odom']
+        for i, (item, _, data) in enumerate(reader.messages(chosen)):
+            message = reader.deserialize(data, item.msgtype)
+            assert message.twist.twist.linear.x == 0.01 * i
+            assert message.header.frame_id == 'odom'
+            assert message.pose.covariance.tolist() == list(range(36))
+
+
+def test_channel_and_header_are_what_rosbag2_s_storage_plugin_writes(folder):
+    with BagWriter(folder, metadata_records=DETAILS) as bag:
+        fill(bag)
+    with bag.path.open('rb') as file:
+        reader = make_reader(file)
+        assert reader.get_header().profile == 'ros2'
+        summary = reader.get_summary()
+        records = {item.name: item.metadata for item in reader.iter_metadata()}
+    channels = {channel.topic: channel for channel in summary.channels.values()}
+    schemas = {schema.name: schema for schema in summary.schemas.values()}
+    assert set(schemas) == {ODOM, TWIST, NUMBER}
+    assert {schema.encoding for schema in schemas.values()} == {'ros2msg'}
+    for topic, type_name in (('/robot/odom', ODOM), ('/quiet', NUMBER)):
+        channel = channels[topic]
+        assert channel.message_encoding == 'cdr'
+        assert summary.schemas[channel.schema_id].name == type_name
+        assert channel.metadata['topic_type_hash'] == STORE.hash_rihs01(type_name)
+    profiles = channels['/robot/cmd_vel'].metadata['offered_qos_profiles']
+    assert profiles_from_yaml(profiles) == (QosProfile(depth=1),)
+    inside = yaml.safe_load(records['rosbag2']['serialized_metadata'])
+    assert inside['version'] == 9
+    assert inside['ros_distro'] == 'jazzy'
+
+
+def test_statistics_index_and_metadata_yaml_agree(folder):
+    with BagWriter(folder, metadata_records=DETAILS, chunk_bytes=16 * 1024) as bag:
+        written = fill(bag)
+    with bag.path.open('rb') as file:
+        summary = make_reader(file).get_summary()
+    statistics = summary.statistics
+    assert statistics.message_count == len(written)
+    assert statistics.chunk_count == len(summary.chunk_indexes) > 3
+    assert statistics.message_start_time == START
+    assert statistics.message_end_time == written[-1][1]
+    assert {chunk.compression for chunk in summary.chunk_indexes} == {'zstd'}
+    assert all(chunk.message_index_length > 0 for chunk in summary.chunk_indexes)
+    metadata = read_metadata(folder)
+    assert metadata.message_count == len(written)
+    assert metadata.start_ns == START
+    assert metadata.duration_ns == written[-1][1] - START
+    assert {topic.name: topic.message_count for topic in metadata.topics} == {
+        '/robot/odom': 200,
+        '/robot/cmd_vel': 200,
+        '/quiet': 0,
+    }
+    with Reader(folder) as reader:
+        assert reader.message_count == len(written)
+        assert (reader.start_time, reader.end_time) == (START, written[-1][1] + 1)
+        assert reader.ros_distro == 'jazzy'
+
+
+def test_an_invalid_hash_from_the_graph_is_replaced(folder):
+    """A publisher older than type hashes reports INVALID; rosbags refused such a bag."""
+    with BagWriter(folder, metadata_records={}) as bag:
+        bag.add_topic('/a', NUMBER, type_hash='INVALID')
+        bag.add_topic('/b', NUMBER, type_hash='RIHS01_' + 'a' * 64)
+    hashes = {topic.name: topic.type_hash for topic in read_metadata(folder).topics}
+    assert hashes == {'/a': STORE.hash_rihs01(NUMBER), '/b': 'RIHS01_' + 'a' * 64}
+
+
+def test_details_survive_and_newer_ones_win(folder):
+    with BagWriter(folder, metadata_records=DETAILS) as bag:
+        fill(bag, 3)
+        bag.add_metadata_record('controller', {'law.gain': '9.5'})
+        bag.add_metadata_record('settings', {'law.gain': '10.0'})
+        fill(bag, 3, START + 10**9)
+    with open_bag(folder) as recording:
+        assert recording.metadata_records == {
+            'settings': {'law.gain': '10.0'},
+            'provenance': DETAILS['provenance'],
+            'controller': {'law.gain': '9.5'},
+        }
+        assert recording.message_count == 12
+
+
+# -- files, folders, restarts -------------------------------------------------------------------
+
+
+def test_a_recorder_that_starts_again_continues_beside_what_is_there(folder):
+    with BagWriter(folder, metadata_records={'run': {'n': '1'}}) as first:
+        one = fill(first, 20)
+    with BagWriter(folder, metadata_records={'run': {'n': '2'}}) as second:
+        assert read_metadata(folder).message_count == len(one)  # counted from the start
+        two = fill(second, 30, START + 10**10)
+    assert (first.path.name, second.path.name) == ('run_0.mcap', 'run_1.mcap')
+    metadata = read_metadata(folder)
+    assert [file.path for file in metadata.files] == ['run_0.mcap', 'run_1.mcap']
+    assert metadata.message_count == len(one) + len(two)
+    assert len(metadata.topics) == 3
+    assert read_with_rosbags(folder) == one + two
+    with open_bag(folder) as recording:
+        assert recording.topics['/robot/odom'].message_count == 50
+        assert recording.metadata_records == {'run': {'n': '2'}}
+
+
+def test_a_topic_offered_differently_after_a_restart_keeps_all_its_messages(folder):
+    """A channel whose profile is not in metadata.yaml is dropped by rosbags without a word."""
+    for depth in (1, 5):
+        with BagWriter(folder, metadata_records={}) as bag:
+            bag.add_topic('/n', NUMBER, [QosProfile(depth=depth)])
+            bag.write('/n', START + depth, START, serialised(TYPES[NUMBER](data=float(depth))))
+    assert [topic.message_count for topic in read_metadata(folder).topics] == [1, 1]
+    assert len(read_with_rosbags(folder)) == 2
+    with open_bag(folder) as recording:
+        assert recording.series('/n', {'n': 'data'})['n'].tolist() == [1.0, 5.0]
+
+
+def test_the_next_free_number_comes_after_the_highest(folder):
+    folder.mkdir()
+    for name in ('run_2.mcap', 'run_10.mcap', 'other_40.mcap', 'run_x.mcap'):
+        (folder / name).write_bytes(b'')
+    with BagWriter(folder, metadata_records={}) as bag:
+        assert bag.path.name == 'run_11.mcap'
+    with BagWriter(folder, 'own', metadata_records={}) as bag:
+        assert bag.path.name == 'own_0.mcap'
+    assert bag.unfinished == ('other_40.mcap', 'run_2.mcap', 'run_10.mcap', 'run_x.mcap')
+
+
+def test_a_truncated_earlier_file_is_named_and_left_alone(folder):
+    with BagWriter(folder, metadata_records={}) as bag:
+        fill(bag)
+    torn = bag.path.read_bytes()[:-100]
+    bag.path.write_bytes(torn)
+    with BagWriter(folder, metadata_records={}) as again:
+        assert again.unfinished == ('run_0.mcap',)
+        written = fill(again, 10)
+    assert bag.path.read_bytes() == torn
+    assert [file.path for file in read_metadata(folder).files] == ['run_1.mcap']
+    assert read_with_rosbags(folder) == written
+    with open_bag(folder) as recording:
+        assert recording.unfinished == ('run_0.mcap',)
+        assert recording.message_count == len(written)
+
+
+def test_a_killed_recorder_leaves_a_folder_that_can_be_read(folder):
+    """metadata.yaml once listed the file being written: every reader then refused the folder."""
+    with BagWriter(folder, metadata_records={}) as first:
+        one = fill(first, 20)
+    killed = BagWriter(folder, metadata_records={})
+    fill(killed, 20, START + 10**10)
+    killed.flush()
+    assert read_with_rosbags(folder) == one  # and the second never gets closed
+
+
+def test_a_bag_without_messages_is_readable(folder):
+    with BagWriter(folder, metadata_records=DETAILS) as bag:
+        bag.add_topic('/quiet', NUMBER)
+    assert read_with_rosbags(folder) == []
+    assert read_metadata(folder).duration_ns == 0
+    with open_bag(folder) as recording:
+        assert (recording.start_ns, recording.end_ns, recording.duration) == (0, 0, 0.0)
+        assert recording.series('/quiet', {'n': 'data'})['n'].shape == (0,)
+        assert recording.metadata_records == DETAILS
+
+
+def test_a_chunk_is_closed_by_time_as_well_as_by_size(folder):
+    bag = BagWriter(folder, metadata_records={}, chunk_bytes=2**30, chunk_ns=500_000_000)
+    written = fill(bag, 200)  # two seconds
+    torn = folder.parent / 'torn.mcap'
+    torn.write_bytes(bag.path.read_bytes())  # what is on the disk if the process died now
+    assert finalize_file(torn) == 300
+    assert read_with_mcap(torn) == written[:300]
+    bag.close()
+
+
+# -- errors -------------------------------------------------------------------------------------
+
+
+def test_a_folder_below_a_file_is_refused(tmp_path):
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(FolderError, match='cannot record into'):
+        BagWriter(tmp_path / 'file' / 'run', metadata_records={})
+
+
+def test_a_read_only_disk_is_refused_and_nothing_is_left(folder, monkeypatch):
+    def refuse(path, mode):
+        raise OSError(errno.EROFS, 'Read-only file system')
+
+    monkeypatch.setattr(writer, 'open_unbuffered', refuse)
+    with pytest.raises(FolderError, match='Read-only file system'):
+        BagWriter(folder, metadata_records={})
+    assert list(folder.glob('*.mcap')) == []
+
+
+class FullDisk:
+    """A file on a disk of so many bytes: takes what fits, then fails, as the kernel does."""
+
+    room = 0
+
+    def __init__(self, path: Path, mode: str) -> None:
+        self._file = path.open(mode, buffering=0)
+
+    def write(self, data):
+        free = FullDisk.room - self._file.tell()
+        if free <= 0:
+            raise OSError(errno.ENOSPC, 'No space left on device')
+        return self._file.write(data[:free])
+
+    def __getattr__(self, name):
+        return getattr(self._file, name)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._file.close()
+
+
+@pytest.fixture
+def disk(monkeypatch):
+    for module in (writer, mcap_file):
+        monkeypatch.setattr(module, 'open_unbuffered', FullDisk)
+    monkeypatch.setattr(mcap_file, 'SPARE', 2_000)
+    return FullDisk
+
+
+@pytest.mark.parametrize('room', [20_000, 20_500, 21_000, 23_000, 26_000, 32_000])
+def test_a_full_disk_is_reported_once_and_whole_chunks_are_kept(folder, disk, room):
+    disk.room = room
+    bag = BagWriter(folder, metadata_records=DETAILS, chunk_bytes=8 * 1024)
+    with pytest.raises(DiskError, match=r'No space left.*messages are kept'):
+        fill(bag, 2000)
+    bag.write('/robot/odom', START, START, b'\0\1\0\0')
+    bag.write('/robot/odom', START, START, b'\0\1\0\0')
+    bag.flush()
+    bag.add_metadata_record('late', {'a': 'b'})
+    bag.close()
+    assert bag.lost == 2
+    assert bag.path.stat().st_size <= room
+    kept = read_with_mcap(bag.path)
+    assert len(kept) > 20
+    assert sorted(kept) == sorted(read_with_rosbags(folder))  # equal stamps in any order
+    assert [stamp for _, stamp, _ in kept] == [START + (i // 2) * STEP for i in range(len(kept))]
+    with open_bag(folder) as recording:
+        assert recording.metadata_records == DETAILS
+        assert recording.message_count == len(kept)
+
+
+def test_a_disk_that_is_full_at_once_is_refused(folder, disk):
+    disk.room = 100
+    with pytest.raises(FolderError, match='No space left'):
+        BagWriter(folder, metadata_records=DETAILS)
+    assert list(folder.glob('*.mcap')) == []
+
+
+def test_a_disk_that_fills_at_the_very_end_is_reported_by_close(folder, disk):
+    disk.room = 2**40
+    bag = BagWriter(folder, metadata_records={})
+    fill(bag, 20)
+    disk.room = bag.path.stat().st_size + 500
+    with pytest.raises(DiskError, match='0 messages are kept'):
+        bag.close()
+    bag.close()
+    assert read_with_rosbags(folder) == []
+
+
+def test_wrong_use_is_told_apart(folder):
+    bag = BagWriter(folder, metadata_records={})
+    bag.add_topic('/n', NUMBER)
+    bag.add_topic('/n', NUMBER)
+    with pytest.raises(DataError, match='recorded as std_msgs'):
+        bag.add_topic('/n', TWIST)
+    with pytest.raises(UnknownTypeError, match='no_msgs/msg/None'):
+        bag.add_topic('/x', 'no_msgs/msg/None')
+    with pytest.raises(UnknownTopicError, match='/x was not added'):
+        bag.write('/x', START, START, b'')
+    for data in (bytearray(b'a'), memoryview(b'a'), 'a', None):
+        with pytest.raises(DataError, match='must be bytes'):
+            bag.write('/n', START, START, data)
+    for stamp in (-1, 2**63):
+        with pytest.raises(DataError, match='stamp'):
+            bag.write('/n', stamp, START, b'')
+    for metadata_records in ({'a': {'b': 1}}, {'rosbag2': {}}):
+        with pytest.raises(DataError):
+            bag.add_metadata_record(
+                'a', metadata_records['a']
+            ) if 'a' in metadata_records else bag.add_metadata_record('rosbag2', {})
+    bag.close()
+    bag.close()
+    with pytest.raises(BagError, match='closed'):
+        bag.write('/n', START, START, b'')
+    assert read_metadata(folder).message_count == 0
+
+
+# -- files that broke off -----------------------------------------------------------------------
+
+
+def test_a_file_torn_anywhere_keeps_its_whole_chunks(folder, tmp_path):
+    with BagWriter(folder, metadata_records=DETAILS, chunk_bytes=8 * 1024) as bag:
+        written = fill(bag, 60)
+    content = bag.path.read_bytes()
+    torn = tmp_path / 'torn.mcap'
+    before = 0
+    for size in range(400, len(content), 997):
+        torn.write_bytes(content[:size])
+        kept = finalize_file(torn)
+        assert read_with_mcap(torn) == written[:kept]
+        assert kept >= before
+        assert read_file_summary(torn).message_count == kept
+        before = kept
+    assert before == len(written)
+
+
+def test_one_flipped_bit_at_the_end_of_a_file_is_noticed(folder):
+    with BagWriter(folder, metadata_records={}) as bag:
+        fill(bag, 10)
+    content = bag.path.read_bytes()
+    with bag.path.open('rb') as file:
+        start = make_reader(file).get_summary().chunk_indexes[0].chunk_length + 3000
+    for place in range(start, len(content), 131):
+        damaged = bytearray(content)
+        damaged[place] ^= 1 << place % 8
+        bag.path.write_bytes(bytes(damaged))
+        assert read_file_summary(bag.path) is None, place
+
+
+def test_finishing_a_finished_file_changes_nothing(folder):
+    with BagWriter(folder, metadata_records=DETAILS) as bag:
+        written = fill(bag, 10)
+    content = bag.path.read_bytes()
+    assert finalize_file(bag.path) == len(written)
+    assert bag.path.read_bytes() == content
+
+
+def test_a_tail_of_zeros_as_after_a_power_cut_is_cut_off(folder):
+    bag = BagWriter(folder, metadata_records={})
+    written = fill(bag, 10)
+    bag.flush()
+    with bag.path.open('ab') as file:
+        file.write(bytes(5000))
+    assert finalize_file(bag.path) == len(written)
+    assert read_with_mcap(bag.path) == written
+
+
+def test_files_laid_out_by_others_are_not_cut(tmp_path):
+    """Cutting at the last part we know would throw away what other writers put behind it."""
+    from mcap.writer import IndexType, Writer
+
+    path = tmp_path / 'foreign.mcap'
+    for options in ({'use_chunking': False}, {'index_types': IndexType.CHUNK, 'chunk_size': 10}):
+        with path.open('wb') as file:
+            foreign = Writer(file, **options)
+            foreign.start()
+            channel = foreign.register_channel('/n', 'cdr', 0)
+            for i in range(5):
+                foreign.add_message(channel, i, bytes(20), i)
+        content = path.read_bytes()
+        with pytest.raises(BagError, match='BagWriter'):
+            finalize_file(path)
+        assert path.read_bytes() == content
+    path.write_bytes(b'not mcap at all')
+    with pytest.raises(BagError, match='does not begin'):
+        finalize_file(path)
+
+
+# -- reading ------------------------------------------------------------------------------------
+
+
+def test_series_are_arrays_over_time(folder):
+    with BagWriter(folder, metadata_records={}) as bag:
+        fill(bag, 50)
+    with open_bag(folder) as recording:
+        assert recording.duration == pytest.approx(0.49)
+        found = recording.series(
+            '/robot/odom',
+            {'v': 'twist.twist.linear.x', 'w': 'twist.twist.angular.z', 'c': 'pose.covariance[7]'},
+        )
+        np.testing.assert_allclose(found['received'], 0.01 * np.arange(50), atol=1e-12)
+        np.testing.assert_allclose(found['stamp'], found['received'] - 0.003, atol=1e-12)
+        np.testing.assert_array_equal(found['v'], 0.01 * np.arange(50))
+        np.testing.assert_array_equal(found['w'], -0.02 * np.arange(50))
+        assert set(found['c']) == {7.0}
+        bare = recording.series('/robot/cmd_vel', {'v': 'linear.x'})
+        np.testing.assert_array_equal(bare['stamp'], bare['received'])  # a Twist has no header
+
+
+def test_an_element_beyond_an_array_is_nan_and_a_wrong_field_an_error(folder):
+    with BagWriter(folder, metadata_records={}) as bag:
+        fill(bag, 2)
+    with open_bag(folder) as recording:
+        found = recording.series('/robot/odom', {'c': 'pose.covariance[99]'})
+        assert np.isnan(found['c']).all()
+        for path in ('twist.speed', 'header.frame_id', 'pose.covariance', 'twist[0]'):
+            with pytest.raises(DataError, match='/robot/odom'):
+                recording.series('/robot/odom', {'x': path})
+        with pytest.raises(UnknownTopicError, match=r'/gone is not in .*/robot/odom'):
+            recording.series('/gone', {'x': 'data'})
+
+
+def test_a_message_that_cannot_be_decoded_is_a_clear_error(folder):
+    with BagWriter(folder, metadata_records={}) as bag:
+        bag.add_topic('/n', NUMBER)
+        bag.write('/n', START, START, b'\0\1\0\0\0')
+    with open_bag(folder) as recording, pytest.raises(DataError, match='/n cannot be read'):
+        recording.series('/n', {'x': 'data'})
+
+
+def test_no_bag_is_a_clear_error(tmp_path):
+    with pytest.raises(BagError, match='no finished bag file'):
+        open_bag(tmp_path)
+    (tmp_path / 'a.mcap').write_bytes(b'')
+    with pytest.raises(BagError, match='unfinished: a.mcap'):
+        open_bag(tmp_path)
+
+
+def test_one_file_can_be_opened_without_its_folder(folder):
+    with BagWriter(folder, metadata_records=DETAILS) as bag:
+        fill(bag, 5)
+    with open_bag(bag.path) as recording:
+        assert recording.message_count == 10
+        assert recording.metadata_records == DETAILS
+
+
+# -- missing samples ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('lost', [0, 1, 17, 250])
+def test_missing_share_is_exact_for_lost_samples(lost):
+    generator = np.random.default_rng(5)
+    stamps = np.arange(1000) / 100.0
+    inner = generator.permutation(np.arange(1, 999))[:lost]
+    left = np.delete(stamps, inner)
+    assert missing_sample_ratio(left, 100.0) == pytest.approx(lost / 1000)
+    assert missing_sample_ratio(generator.permutation(left), 100.0) == pytest.approx(lost / 1000)
+
+
+def test_lateness_is_no_loss_and_repetition_hides_none():
+    generator = np.random.default_rng(6)
+    stamps = np.arange(500) / 50.0
+    late = stamps.copy()
+    late[1:480] += generator.uniform(0.0, 0.3, 479)
+    assert missing_sample_ratio(late, 50.0) == 0.0
+    holed = np.delete(stamps, np.arange(100, 200))
+    assert missing_sample_ratio(np.concatenate([holed, holed]), 50.0) == pytest.approx(0.2)
+
+
+def test_too_few_stamps_or_none_miss_nothing():
+    for stamps in ([], [1.0], [np.nan, 1.0], [2.0, 2.0]):
+        assert missing_sample_ratio(np.array(stamps), 10.0) == 0.0
+    for rate in (0.0, -1.0, float('nan')):
+        with pytest.raises(ValueError, match='rate must be positive'):
+            missing_sample_ratio(np.arange(3.0), rate)

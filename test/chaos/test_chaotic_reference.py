@@ -1,0 +1,197 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The switching chaotic reference: scale, derivative, switches, seeds."""
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceParameters
+from t3mpc_ros.chaos.solver import FractionalSolver
+from t3mpc_ros.chaos.switching import SwitchingSchedule
+from t3mpc_ros.chaos.system import hyperchaotic_system
+from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
+from t3mpc_ros.parameters.table import ParameterError
+
+GEOMETRY = WheelGeometry()
+
+
+def samples(count, geometry=GEOMETRY, **values):
+    reference = ChaoticReference(ReferenceParameters.from_dict(values), geometry)
+    return [reference.advance() for _ in range(count)]
+
+
+def wheels_of(run):
+    return np.array([sample.wheels for sample in run])
+
+
+def rates_of(run):
+    return np.array([sample.rate for sample in run])
+
+
+def states_of(run):
+    return np.array([sample.states for sample in run])
+
+
+def derivative(values, rate):
+    """Return the five-point derivative, shape (n - 4, 2), of samples 2 ... n - 3."""
+    inner = 8.0 * (values[3:-1] - values[1:-3]) - (values[4:] - values[:-4])
+    return inner * rate / 12.0
+
+
+def test_samples_lie_on_the_grid_and_a_robot_at_rest_can_follow_from_the_first():
+    run = samples(400)
+    assert [sample.index for sample in run] == list(range(400))
+    assert [sample.elapsed for sample in run] == [n / 100.0 for n in range(400)]
+    assert run[0].wheels == (0.0, 0.0)
+    assert run[0].rate == (0.0, 0.0)
+    assert run[0].twist == (0.0, 0.0)
+    assert np.abs(wheels_of(run)[:30]).max() < 0.3
+
+
+def test_wheels_are_the_scaled_states_that_are_selected():
+    parameters = ReferenceParameters(ramp=0.0)
+    for sample in samples(2600, ramp=0.0):
+        signals = np.array(parameters.amplitude) * (np.array(sample.states) - parameters.offset)
+        expected = signals[np.array(sample.selected) - 1]
+        np.testing.assert_allclose(sample.wheels, expected, rtol=1e-14)
+        assert sample.selected == parameters.switching.pairs[sample.mode]
+
+
+@pytest.mark.parametrize('output', ['wheels', 'body'])
+@pytest.mark.parametrize('blend', [0.0, 4.0])
+def test_rate_is_the_derivative_of_the_wheels_away_from_jumps(output, blend):
+    """Finite differences over 60 s: ramp, blends and plain stretches; jumps are left out."""
+    run = samples(6000, **{'output': output, 'switching.blend': blend})
+    difference = derivative(wheels_of(run), 100.0)
+    error = np.abs(difference - rates_of(run)[2:-2]).max(axis=1)
+    jump = np.array([sample.switched for sample in run])
+    near = np.convolve(jump, np.ones(5), 'same')[2:-2] > 0  # kinks in the second derivative too
+    assert near.sum() == 20
+    assert error[~near].max() < 0.02
+    assert rates_of(run).std() > 3.0  # what the error is to be compared with
+    if blend:
+        assert error.max() < 0.2
+
+
+def test_rate_has_no_impulse_at_a_sudden_jump():
+    run = samples(6000)
+    wheels, rates = wheels_of(run), rates_of(run)
+    jumps = [sample.index for sample in run if sample.switched]
+    assert jumps == [1200, 2400, 3600, 4800]
+    steps = np.abs(wheels[jumps] - wheels[np.array(jumps) - 1]).max(axis=1)
+    assert steps.max() > 1.0  # truly sudden
+    parameters = ReferenceParameters()
+    scale = np.array(parameters.amplitude)
+    for jump in jumps:
+        # Central difference of the new signal alone, from the raw states around the jump.
+        slope = scale * (states_of(run)[jump + 1] - states_of(run)[jump - 1]) * 50.0
+        np.testing.assert_allclose(rates[jump], slope[np.array(run[jump].selected) - 1], atol=0.1)
+
+
+def test_blended_reference_is_continuous():
+    run = samples(6000, **{'switching.blend': 2.0})
+    assert np.abs(np.diff(wheels_of(run), axis=0)).max() < 0.01 * 60.0
+
+
+def test_defaults_are_what_a_small_robot_can_follow():
+    """Standard deviation near 3 rad/s, accelerations of 1 to 6 rad/s², peaks near 10 rad/s."""
+    run = samples(40_000)
+    states, wheels, rates = states_of(run), wheels_of(run), rates_of(run)
+    signals = (states - ReferenceParameters().offset) * ReferenceParameters().amplitude
+    assert np.all(np.abs(signals.std(axis=0) - 2.8) < [0.2, 0.2, 0.6, 0.9])
+    assert np.all(np.abs(wheels).max(axis=0) < 14.0)
+    assert np.all(np.abs(wheels).max(axis=0) > 5.0)
+    assert np.all(rates.std(axis=0) < 6.0)
+    assert np.all(rates.std(axis=0) > 2.0)
+
+
+def test_twist_is_equation_1_of_the_wheels_and_body_output_its_inverse():
+    geometry = WheelGeometry(wheel_radius=0.05, wheel_separation=0.3)
+    wheels, body = (
+        samples(200, geometry, output=output, ramp=0.0) for output in ('wheels', 'body')
+    )
+    parameters = ReferenceParameters()
+    for left, right in zip(wheels, body, strict=True):
+        assert left.twist == twist_from_wheels(left.wheels, geometry)
+        assert right.twist.linear == pytest.approx(parameters.linear_scale * left.wheels.right)
+        assert right.twist.angular == pytest.approx(parameters.angular_scale * left.wheels.left)
+
+
+def test_time_scale_only_slows_the_same_states_down():
+    """reference(t) = y(kappa t): half the scale at half the rate gives the very same states."""
+    fast = samples(300, rate=100.0, time_scale=0.05, ramp=0.0)
+    slow = samples(300, rate=50.0, time_scale=0.025, ramp=0.0)
+    assert states_of(fast).tolist() == states_of(slow).tolist()
+    np.testing.assert_allclose(rates_of(slow), 0.5 * rates_of(fast), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    'rate, time_scale, steps',
+    [(100.0, 0.05, 1), (100.0, 0.1, 1), (100.0, 0.11, 2), (10.0, 0.05, 5), (1000.0, 0.05, 1)],
+)
+def test_a_whole_number_of_solver_steps_makes_one_sample(rate, time_scale, steps):
+    parameters = ReferenceParameters(rate=rate, time_scale=time_scale)
+    assert parameters.steps_per_sample == steps
+    assert parameters.step <= parameters.solver_step * (1.0 + 1e-9)
+    assert parameters.step * steps * rate == pytest.approx(time_scale)
+
+
+def test_seed_zero_begins_exactly_at_the_initial_state_and_others_near_it():
+    parameters = ReferenceParameters(settle=0.1)
+    solver = FractionalSolver(hyperchaotic_system(), parameters.step, np.array(parameters.initial))
+    start = solver.advance(round(0.1 / parameters.step))
+    small = {'settle': 0.1, 'perturbation': 1e-7}
+    exact, near, again, other = (samples(1, seed=seed, **small)[0].states for seed in (0, 1, 1, 2))
+    assert list(exact) == start.tolist()
+    assert near == again
+    assert len({exact, near, other}) == 3
+    np.testing.assert_allclose(near, exact, atol=1e-4)
+    np.testing.assert_allclose(other, exact, atol=1e-4)
+
+
+def test_visible_switch_times_do_not_give_the_perturbation_away():
+    """Both once came from one stream: the first dwell was the perturbation of y1, rescaled."""
+    parameters = ReferenceParameters.from_dict(
+        {'settle': 0.1, 'perturbation': 1e-6, 'switching.kind': 'random'}
+    )
+    dwells, shifts = [], []
+    reference = ChaoticReference(parameters, GEOMETRY)
+    base = np.array(reference.advance().states)
+    for seed in range(1, 200):
+        reference.reset(seed)
+        # Over 0.1 s the perturbation only grows, linearly: the shift is a mix of four draws.
+        shifts.append(np.array(reference.advance().states) - base)
+        dwells.append(SwitchingSchedule(parameters.switching, seed).switches_until(20.0)[0])
+    # Solve for the part of the dwell that any linear mix of the shifts explains.
+    design = np.column_stack([np.ones(len(shifts)), np.array(shifts) * 1e6])
+    centred = np.array(dwells) - np.mean(dwells)
+    left = centred - design @ np.linalg.lstsq(design, centred, rcond=None)[0]
+    assert left.var() > 0.8 * centred.var()
+
+
+def test_reset_repeats_a_run_and_another_seed_gives_another_one():
+    reference = ChaoticReference(
+        ReferenceParameters.from_dict({'seed': 7, 'switching.kind': 'random'}), GEOMETRY
+    )
+    first = [reference.advance() for _ in range(2500)]
+    reference.reset()
+    assert [reference.advance() for _ in range(2500)] == first
+    reference.reset(2**127 + 5)
+    other = [reference.advance() for _ in range(2500)]
+    assert abs(np.corrcoef(wheels_of(first)[:, 0], wheels_of(other)[:, 0])[0, 1]) < 0.8
+    assert [s.switched for s in first] != [s.switched for s in other]
+    reference.reset(7)
+    assert [reference.advance() for _ in range(2500)] == first
+
+
+def test_settings_need_one_value_per_state():
+    for name in ('orders', 'amplitude', 'offset', 'initial'):
+        with pytest.raises(ParameterError, match=name):
+            ReferenceParameters(**{name: (1.0, 1.0)})
+
+
+def test_a_seed_that_cannot_be_used_is_refused_without_being_told():
+    reference = ChaoticReference(ReferenceParameters(settle=0.1), GEOMETRY)
+    with pytest.raises(ValueError, match='seed must not be negative') as caught:
+        reference.reset(-123456)
+    assert '123456' not in str(caught.value)

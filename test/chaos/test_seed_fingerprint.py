@@ -1,0 +1,54 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Fingerprints prove a seed to who knows it, and tell nobody else anything."""
+
+import hashlib
+import random
+
+import pytest
+
+from t3mpc_ros.chaos.seed_fingerprint import fingerprint_seed, matches_fingerprint
+
+SALT = bytes(range(16))
+
+
+@pytest.mark.parametrize('seed', [0, 1, 42, 2**63, 2**127 + 12345])
+def test_the_right_seed_is_recognised_and_others_are_not(seed):
+    text = fingerprint_seed(seed, SALT)
+    assert matches_fingerprint(text, seed)
+    for other in (seed + 1, seed ^ 2**64, seed * 10):
+        assert matches_fingerprint(text, other) == (other == seed)
+
+
+def test_it_is_what_any_other_program_computes_from_salt_and_seed():
+    salt, digest = fingerprint_seed(42, SALT).split(':')
+    assert bytes.fromhex(salt) == SALT
+    assert digest == hashlib.sha256(SALT + b'42').hexdigest()
+
+
+def test_two_fingerprints_of_one_seed_have_nothing_in_common_that_tells_so():
+    generator = random.Random(1)
+    texts = {fingerprint_seed(7, generator.randbytes(16)) for _ in range(100)}
+    assert len({text.split(':')[1] for text in texts}) == 100
+    assert all(matches_fingerprint(text, 7) for text in texts)
+
+
+def test_neither_the_seed_nor_a_part_of_it_stands_in_the_text():
+    seed = random.Random(2).getrandbits(128)
+    text = fingerprint_seed(seed, SALT)
+    assert str(seed) not in text
+    assert seed.to_bytes(16, 'big').hex() not in text
+
+
+@pytest.mark.parametrize('text', ['', 'a:b', '00' * 16, f'{"00" * 16}:{"g" * 64}', '0' * 97])
+def test_what_is_no_fingerprint_is_an_error_and_not_a_no(text):
+    with pytest.raises(ValueError, match='salt:digest'):
+        matches_fingerprint(text, 1)
+
+
+def test_a_short_salt_and_a_negative_seed_are_refused_without_telling_the_seed():
+    with pytest.raises(ValueError, match='at least 16 bytes: got 15'):
+        fingerprint_seed(123456789, SALT[:15])
+    with pytest.raises(ValueError, match='negative') as error:
+        fingerprint_seed(-123456789, SALT)
+    assert '123456789' not in str(error.value)

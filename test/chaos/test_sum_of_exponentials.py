@@ -1,0 +1,92 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The memory kernel as a sum of exponentials keeps the error it states."""
+
+import math
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.chaos.sum_of_exponentials import fit_sum_of_exponentials
+
+ORDERS = (0.05, 0.3, 0.5, 0.8, 0.9, 0.98, 0.999, 1.0 - 1e-9, 1.0)
+
+
+def relative_error(memory, order, time):
+    return memory.at(time) * math.gamma(order) * time ** (1.0 - order) - 1.0
+
+
+@pytest.mark.parametrize('order', ORDERS)
+@pytest.mark.parametrize('tolerance', [1e-3, 1e-6, 1e-8, 1e-11])
+def test_stated_error_bounds_the_error_on_a_dense_logarithmic_grid(order, tolerance):
+    memory = fit_sum_of_exponentials(order, 1e-3, 1e5, tolerance)
+    error = np.abs(relative_error(memory, order, np.geomspace(1e-3, 1e5, 40_009)))
+    assert memory.error <= tolerance
+    # 1e-14: at order 1 the stated error is zero, and so is the true one but for rounding here.
+    assert error.max() <= memory.error + 1e-14
+
+
+@pytest.mark.parametrize('order', [0.5, 0.98])
+def test_stated_error_is_not_an_empty_promise(order):
+    memory = fit_sum_of_exponentials(order, 1e-3, 1e5, 1e-8)
+    error = np.abs(relative_error(memory, order, np.geomspace(1e-3, 1e5, 40_009)))
+    assert error.max() > 0.9 * memory.error
+    assert memory.error > 1e-9  # nor is it bought with far more modes than the tolerance asks
+
+
+def test_order_one_is_exactly_one_mode_that_never_forgets():
+    memory = fit_sum_of_exponentials(1.0, 1e-3, 1e5, 1e-8)
+    assert memory.rates.tolist() == [0.0]
+    assert memory.weights.tolist() == [1.0]
+    assert memory.error == 0.0
+
+
+def test_memory_tends_to_that_single_mode_as_the_order_tends_to_one():
+    """The weight s^-q is almost not integrable at s = 0 for q near 1.
+
+    Cutting the integral there, as for q = 0.5, would lose nearly the whole kernel; the lumped
+    slow mode is what carries it.
+    """
+    for distance in (1e-4, 1e-8, 1e-12):
+        memory = fit_sum_of_exponentials(1.0 - distance, 1e-3, 1e5, 1e-8)
+        assert memory.weights[0] == pytest.approx(1.0, abs=40.0 * distance)
+        assert memory.weights[1:].sum() < 40.0 * distance
+        assert memory.rates[0] < distance
+
+
+def test_modes_are_positive_and_the_kernel_therefore_completely_monotone():
+    for order in ORDERS:
+        memory = fit_sum_of_exponentials(order, 1e-3, 1e5, 1e-8)
+        assert np.all(memory.weights > 0.0)
+        assert np.all(memory.rates >= 0.0)
+        assert np.all(np.diff(memory.rates) > 0.0)
+
+
+def test_number_of_modes_grows_like_the_logarithm_of_the_horizon():
+    sizes = [fit_sum_of_exponentials(0.98, 1e-3, 10.0**n, 1e-8).rates.size for n in (2, 4, 6, 8)]
+    growth = np.diff(sizes)
+    assert growth.max() - growth.min() <= 1
+    assert sizes[-1] < 70
+
+
+def test_error_grows_slowly_beyond_the_horizon():
+    memory = fit_sum_of_exponentials(0.98, 1e-3, 1e3, 1e-8)
+    assert abs(relative_error(memory, 0.98, np.array([1e4]))[0]) < 2e-7
+    assert abs(relative_error(memory, 0.98, np.array([1e5]))[0]) < 2e-5
+
+
+@pytest.mark.parametrize(
+    'arguments, name',
+    [
+        ((0.0, 1e-3, 1.0, 1e-8), 'order'),
+        ((1.1, 1e-3, 1.0, 1e-8), 'order'),
+        ((0.9, 0.0, 1.0, 1e-8), 'lags'),
+        ((0.9, 1.0, 1.0, 1e-8), 'lags'),
+        ((0.9, 1e-3, math.inf, 1e-8), 'lags'),
+        ((0.9, 1e-3, 1.0, 1e-14), 'tolerance'),
+        ((math.nan, 1e-3, 1.0, 1e-8), 'order'),
+    ],
+)
+def test_arguments_out_of_range_are_refused_by_name(arguments, name):
+    with pytest.raises(ValueError, match=name):
+        fit_sum_of_exponentials(*arguments)

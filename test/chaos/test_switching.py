@@ -1,0 +1,147 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Switching sigma(t): deterministic, unbounded in time, smooth where a blend asks for it."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import kstest
+
+from t3mpc_ros.chaos.switching import SwitchingParameters, SwitchingSchedule
+from t3mpc_ros.parameters.table import ParameterError
+
+RANDOM = SwitchingParameters(kind='random', shortest_dwell=2.0, longest_dwell=5.0)
+
+
+def test_default_switches_four_times_in_the_papers_run():
+    schedule = SwitchingSchedule(SwitchingParameters())
+    assert schedule.switches_until(59.99) == [12.0, 24.0, 36.0, 48.0]
+    modes = [schedule.at(time).mode for time in (0.0, 11.99, 12.0, 24.0, 36.0, 47.99, 48.0)]
+    assert modes == [0, 0, 1, 2, 3, 3, 0]
+
+
+def test_every_signal_drives_each_output_once_by_default():
+    pairs = SwitchingSchedule(SwitchingParameters()).pairs
+    assert sorted(pair[0] for pair in pairs) == [1, 2, 3, 4]
+    assert sorted(pair[1] for pair in pairs) == [1, 2, 3, 4]
+
+
+def test_fixed_switching_goes_on_with_the_last_dwell_and_stays_on_its_grid():
+    schedule = SwitchingSchedule(SwitchingParameters(times=(3.0, 10.0, 10.5)))
+    assert schedule.switches_until(12.0) == [3.0, 10.0, 10.5, 11.0, 11.5, 12.0]
+    late = schedule.at(5010.5)  # 10 000 half seconds after the last listed time
+    assert (late.switches, late.since, late.until) == (10_003, 5010.5, 5011.0)
+    assert late.mode == 10_003 % 4
+
+
+def test_a_single_switch_time_is_a_period_and_none_is_for_ever():
+    once = SwitchingSchedule(SwitchingParameters(times=(7.0,)))
+    assert once.switches_until(30.0) == [7.0, 14.0, 21.0, 28.0]
+    never = SwitchingSchedule(SwitchingParameters(times=()))
+    assert never.at(1e9).until == math.inf
+    assert never.switches_until(1e9) == []
+
+
+@pytest.mark.parametrize('kind', ['fixed', 'random'])
+def test_one_mode_never_switches(kind):
+    schedule = SwitchingSchedule(SwitchingParameters(kind=kind, modes=(2, 4)))
+    assert schedule.at(1e7) == (0, 0, 1.0, 0.0, 0, 0.0, math.inf)
+
+
+@pytest.mark.parametrize('parameters', [SwitchingParameters(blend=1.0), RANDOM])
+def test_answers_do_not_depend_on_what_was_asked_before(parameters):
+    times = np.random.default_rng(1).uniform(0.0, 300.0, 200)
+    asked = SwitchingSchedule(parameters, seed=5)
+    for time in times:
+        assert asked.at(time) == SwitchingSchedule(parameters, seed=5).at(time)
+    assert asked.switches_until(300.0) == SwitchingSchedule(parameters, seed=5).switches_until(
+        300.0
+    )
+
+
+def test_random_dwells_are_uniform_between_their_bounds():
+    switches = SwitchingSchedule(RANDOM, seed=2).switches_until(7000.0)
+    dwells = np.diff([0.0, *switches])
+    assert dwells.size > 1900
+    assert dwells.min() >= 2.0
+    assert dwells.max() <= 5.0
+    assert kstest(dwells, 'uniform', args=(2.0, 3.0)).pvalue > 0.01
+
+
+def test_random_modes_change_at_every_switch_and_reach_each_other_mode_equally():
+    schedule = SwitchingSchedule(RANDOM, seed=3)
+    modes = [0] + [schedule.at(time).mode for time in schedule.switches_until(14_000.0)]
+    changes = np.diff(modes) % 4
+    shares = np.bincount(changes, minlength=4) / changes.size
+    assert shares[0] == 0.0
+    np.testing.assert_allclose(shares[1:], 1.0 / 3.0, atol=0.03)
+
+
+def test_seeds_give_different_runs_and_may_be_of_any_length():
+    runs = [
+        tuple(SwitchingSchedule(RANDOM, seed=seed).switches_until(50.0))
+        for seed in (0, 1, 2**128 - 1)
+    ]
+    assert len(set(runs)) == 3
+
+
+def test_switch_times_and_answers_tell_the_same_story():
+    schedule = SwitchingSchedule(RANDOM, seed=4)
+    for number, time in enumerate(schedule.switches_until(200.0), start=1):
+        before, after = schedule.at(np.nextafter(time, 0.0)), schedule.at(time)
+        assert (before.switches, after.switches) == (number - 1, number)
+        assert before.until == after.since == time
+        assert after.previous == before.mode != after.mode
+
+
+def test_a_sudden_jump_is_a_jump():
+    schedule = SwitchingSchedule(SwitchingParameters())
+    for time in (0.0, 5.0, 12.0, 12.001, 30.0):
+        selection = schedule.at(time)
+        assert (selection.blend, selection.blend_rate) == (1.0, 0.0)
+
+
+def test_blend_is_continuous_with_a_continuous_derivative():
+    schedule = SwitchingSchedule(SwitchingParameters(blend=2.0))
+    times = np.linspace(11.0, 15.0, 40_001)
+    selections = [schedule.at(time) for time in times]
+    # The new mode takes over at 12 s, so its share counts from there; before, nothing has begun.
+    share = np.array([s.blend if s.switches else 0.0 for s in selections])
+    rate = np.array([s.blend_rate for s in selections])
+    step = times[1] - times[0]
+    np.testing.assert_allclose(np.gradient(share, step)[1:-1], rate[1:-1], atol=1e-4)
+    assert np.abs(np.diff(rate)).max() < 2.0 * 6.0 / 2.0**2 * step
+    assert np.all(np.diff(share) >= 0.0)
+    assert (share[0], share[-1]) == (0.0, 1.0)
+    assert schedule.at(12.0).previous == 0
+    assert schedule.at(13.0).blend == 0.5
+
+
+def test_nothing_is_blended_in_before_the_first_switch():
+    assert SwitchingSchedule(SwitchingParameters(blend=5.0)).at(0.0).blend == 1.0
+
+
+@pytest.mark.parametrize(
+    'values, name',
+    [
+        ({'modes': ()}, 'modes'),
+        ({'modes': (1, 2, 3)}, 'modes'),
+        ({'modes': (1, 5)}, 'modes'),
+        ({'times': (3.0, 2.0)}, 'times'),
+        ({'times': (0.0,)}, 'times'),
+        ({'times': (5.0, 6.0), 'blend': 2.0}, 'blend'),
+        ({'kind': 'random', 'blend': 9.0}, 'blend'),
+        ({'shortest_dwell': 20.0}, 'longest_dwell'),
+        ({'kind': 'sometimes'}, 'kind'),
+    ],
+)
+def test_settings_that_do_not_fit_together_are_refused_by_name(values, name):
+    with pytest.raises(ParameterError, match=name):
+        SwitchingParameters(**values)
+
+
+@pytest.mark.parametrize('time', [-1.0, math.nan, math.inf])
+def test_only_times_of_the_run_can_be_asked_for(time):
+    with pytest.raises(ValueError, match='time'):
+        SwitchingSchedule(SwitchingParameters()).at(time)

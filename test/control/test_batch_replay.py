@@ -1,0 +1,306 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Many steps in compiled stretches are the same steps as one by one, to the last bit."""
+
+from collections import deque
+import copy
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.control.batch_replay import StepResults
+from t3mpc_ros.control.controller import SNAPSHOT_PERIOD, Controller, ControllerParameters
+from t3mpc_ros.control.watchdog import Reason
+from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
+from t3mpc_ros.evaluation.process_replay.controller_replay import (
+    make_controllers,
+    replay_controller,
+)
+from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
+from t3mpc_ros.geometry.types import BodyTwist, Pose, State, StateArray, WheelSpeeds
+
+GOLDEN = sorted((Path(__file__).parents[1] / 'golden').glob('*.mcap'))
+STEP = 10_000_000
+LEAD = 40
+GEOMETRY = WheelGeometry()
+
+
+def bits(thing):
+    """Return everything that a thing is made of, so that equal lists mean equal bits."""
+    if isinstance(thing, np.ndarray):
+        if thing.dtype == object:
+            return [bits(each) for each in thing.tolist()]
+        return [str(thing.dtype), thing.shape, thing.tobytes()]
+    if isinstance(thing, float):
+        return thing.hex()
+    if isinstance(thing, dict):
+        return {key: bits(value) for key, value in thing.items()}
+    if isinstance(thing, (list, tuple, deque)):
+        return [bits(each) for each in thing]
+    if isinstance(thing, set):
+        return sorted(thing)
+    if isinstance(thing, np.random.Generator):
+        return thing.bit_generator.state
+    if type(thing).__module__.startswith('t3mpc_ros') and hasattr(thing, '__dict__'):
+        return {name: bits(value) for name, value in vars(thing).items()}
+    return thing
+
+
+def one_by_one(self, measured, references, rows, answers):
+    """Do what ``Controller.march`` says it does, by its own words."""
+    for k, (heard, begin, end) in enumerate(rows.tolist()):
+        for j in range(begin, end):
+            self.add_reference(references[j])
+        answers.note(k, *self.step(measured[heard]))
+    return 0
+
+
+def same_answers(one, other):
+    """Whether two tables are equal to the last bit, but for what only a march writes down."""
+    numbers = [np.delete(each.numbers, (22, 23), axis=1).tobytes() for each in (one, other)]
+    return numbers[0] == numbers[1] and one.reasons.tolist() == other.reasons.tolist()
+
+
+def test_motions_are_those_that_they_were_made_of():
+    items = [
+        State(5, Pose(1.0, -2.0, 0.5), BodyTwist(0.1, -0.2)),
+        State(-7, Pose(math.nan, 0.0, 0.0), BodyTwist(0.0, 0.0)),
+        State(2**62, Pose(0.0, 1e308, 1e308), BodyTwist(0.0, 0.0)),
+        State(9, Pose(0.0, 0.0, 0.0), BodyTwist(0.0, math.inf)),
+    ]
+    motions = as_motions(items)
+    assert bits(list(motions)) == bits(items)
+    assert bits([motions[k] for k in range(len(motions))]) == bits(items)
+    assert motions.finite.tolist() == [item.is_finite() for item in items]
+    with pytest.raises(ValueError, match='poses must be'):
+        StateArray(motions.stamps_ns[1:], motions.poses, motions.twists)
+
+
+# -- recorded runs --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('path', GOLDEN, ids=lambda path: path.stem)
+def test_recorded_runs_come_out_the_same_to_the_last_bit(path, monkeypatch):
+    """Stops, restarts, silence, live settings, jumps and a robot that does not follow."""
+    inputs = load_inputs(path)
+    marched, stepped = make_controllers(inputs), make_controllers(inputs)
+    fast = replay_controller(inputs, controllers=marched)
+    monkeypatch.setattr(Controller, 'march', one_by_one)
+    slow = replay_controller(inputs, controllers=stepped)
+    assert slow.plain == 0
+    assert fast.plain > 0.7 * fast.steps
+    assert fast.reasons == slow.reasons
+    assert bits(fast.fields) == bits(slow.fields)
+    for one, other in zip(marched, stepped, strict=True):
+        assert bits(one) == bits(other)
+
+
+# -- made-up runs ---------------------------------------------------------------------------------
+
+
+class Run:
+    """A servo robot that is driven, and what the controller was told on the way."""
+
+    def __init__(self, seed, count, wanted, trouble=None, **changes):
+        generator = np.random.default_rng(seed)
+        self.parameters = ControllerParameters.from_dict(changes)
+        controller = Controller(self.parameters)
+        self.deeds = {}
+        trouble = trouble or (lambda k, odometry, coming: (odometry, coming))
+        speeds, late = np.zeros(2), BodyTwist(0.0, 0.0)
+        odometry, references, rows = [], [], []
+        for k in range(count):
+            # Odometry that comes at uneven times, and one that is half a period late.
+            stamp = k * STEP + int(generator.integers(-400_000, 400_000)) + STEP
+            noisy = speeds + 0.1 * generator.standard_normal(2)
+            twist = twist_from_wheels(WheelSpeeds(*noisy.tolist()), GEOMETRY)
+            ahead = (k + 1 + LEAD) * STEP
+            coming = [State(ahead, Pose(0.0, 0.0, 0.0), BodyTwist(*wanted(ahead / 1e9)))]
+            if generator.uniform() < 0.1:
+                coming = []  # the next step then hears of two
+            elif references and rows and rows[-1][1] == rows[-1][2]:
+                before = ahead - STEP
+                coming.insert(0, coming[0]._replace(stamp_ns=before))
+            message, coming = trouble(k, State(stamp, Pose(0.0, 0.0, 0.0), twist), coming)
+            rows.append((k, len(references), len(references) + len(coming)))
+            references += coming
+            odometry.append(message)
+            for motion in coming:
+                controller.add_reference(motion)
+            sent, _ = controller.step(message)
+            told = np.array(wheels_from_twist(late, GEOMETRY))
+            speeds = told + math.exp(-0.5) * (speeds - told)
+            if self.deaf(k):
+                speeds = speeds * 0.5
+            late = sent
+        self.odometry, self.references = as_motions(odometry), as_motions(references)
+        self.rows = np.array(rows, dtype=np.int64)
+
+    def deaf(self, k):
+        return 700 <= k < 760
+
+    def outcome(self, march, cuts=(), deeds=None):
+        """Return the controller, its answers, and how many steps were plain."""
+        controller = Controller(self.parameters)
+        answers = StepResults.empty(len(self.rows))
+        plain = 0
+        edges = [0, *cuts, len(self.rows)]
+        for first, until in zip(edges, edges[1:], strict=False):
+            if deeds and first in deeds:
+                deeds[first](controller)
+            part = answers.part(first, until)
+            messages = self.odometry, self.references, self.rows[first:until], part
+            plain += march(controller, *messages)
+        return controller, answers, plain
+
+    def check(self, cuts=(), deeds=None):
+        """Compare march on with march off; return the answers and how many were plain."""
+        marched, fast, plain = self.outcome(Controller.march, cuts, deeds)
+        stepped, slow, _ = self.outcome(one_by_one, cuts, deeds)
+        assert same_answers(fast, slow)
+        assert bits(marched) == bits(stepped)
+        assert bits(marched.law.learnt()) == bits(stepped.law.learnt())
+        return fast, plain
+
+
+def as_motions(items):
+    return StateArray(
+        np.array([item.stamp_ns for item in items]),
+        np.array([item.pose for item in items]),
+        np.array([item.twist for item in items]),
+    )
+
+
+def winding(time):
+    return 0.12 + 0.05 * math.sin(0.9 * time), 1.2 * math.sin(0.7 * time)
+
+
+def switching(time):
+    """Jumps every 0.7 s, some 30 ms apart, so that several are known at once."""
+    side = 1.0 if int(time / 0.7) % 2 else -0.6
+    also = 0.05 if 0.03 < time % 1.4 < 0.5 else 0.0
+    return 0.1 * side + also, 1.5 * side
+
+
+@pytest.mark.parametrize('seed', [1, 2])
+def test_a_winding_run_with_jitter_and_a_deaf_robot(seed):
+    run = Run(seed, 1200, winding)
+    answers, plain = run.check()
+    assert plain > 900
+    assert Reason.NOT_FOLLOWING in answers.reasons.tolist()
+    assert answers.limited.any()
+    # To stop and go on anywhere makes no difference either.
+    cuts = sorted(np.random.default_rng(seed).choice(np.arange(1, 1200), 40, replace=False))
+    again, _ = run.check(cuts)
+    assert same_answers(answers, again)
+
+
+@pytest.mark.parametrize(
+    'changes',
+    [
+        {},
+        {'switches.preview': False},
+        {'switches.crossing': 'program'},
+        {'predictive.dither': 0.2},
+        {'predictive.enabled': False},
+        {'estimate.enabled': False},
+        {'estimate.dead_time': 0.025},
+        {'use_fuzzy': False, 'predictive.algorithm': 'gradient'},
+        {'watchdog.response_bound': 0.0},
+        {'limits.wheel_acceleration': 3.0},
+    ],
+    ids=str,
+)
+def test_switches_with_other_settings(changes):
+    run = Run(3, 500, switching, **changes)
+    answers, plain = run.check()
+    never = 'predictive.dither' in changes or changes.get('switches.crossing') == 'program'
+    assert plain == 0 if never else plain > 250
+    assert answers.reasons.tolist().count(Reason.TRACKING) > 300
+
+
+def troubled(k, odometry, coming):
+    """Spoil messages in many ways."""
+    if k == 120:
+        return odometry._replace(twist=BodyTwist(math.nan, 0.0)), coming
+    if k == 150:
+        return odometry._replace(pose=Pose(math.inf, 0.0, 0.0)), coming
+    if k == 180:
+        return odometry._replace(stamp_ns=k * STEP - 50_000_000), coming  # goes back
+    if k == 220:
+        return odometry._replace(twist=BodyTwist(5.0, 0.0)), coming  # diverging
+    if 320 <= k < 345:
+        return odometry, []  # the reference is stale
+    if k >= 400:  # a gap in the odometry
+        odometry = odometry._replace(stamp_ns=odometry.stamp_ns + 30 * STEP)
+        coming = [each._replace(stamp_ns=each.stamp_ns + 30 * STEP) for each in coming]
+    if k in (450, 451):  # twice the same stamp
+        odometry = odometry._replace(stamp_ns=452 * STEP + 30 * STEP)
+    if k == 500:  # the source starts again, a little before
+        coming = [State((k + 60) * STEP, Pose(0.0, 0.0, 0.0), BodyTwist(0.1, 0.0))]
+    if k == 550:
+        coming = [each._replace(twist=BodyTwist(math.nan, 0.0)) for each in coming]
+    if k in (685, 686):  # doubted for a moment, which is forgotten when it follows again
+        return odometry._replace(twist=BodyTwist(odometry.twist.linear + 0.2, 0.0)), coming
+    if k == 600:
+        odometry = odometry._replace(twist=BodyTwist(1e300, 1e300))
+    return odometry, coming
+
+
+@pytest.mark.parametrize('wanted', [winding, switching])
+def test_messages_spoilt_in_every_way(wanted):
+    answers, plain = Run(5, 700, wanted, troubled).check()
+    assert plain > 300
+    assert {
+        Reason.NO_REFERENCE,
+        Reason.ODOMETRY_BAD,
+        Reason.REFERENCE_STALE,
+        Reason.DIVERGING,
+        Reason.TRACKING,
+    } <= set(answers.reasons.tolist())
+
+
+def test_live_changes_stops_and_resets_between_marches():
+    deeds = {
+        100: lambda c: c.configure(c.parameters.with_values({'law.gain': 20.0})),
+        200: lambda c: c.configure(c.parameters.with_values({'limits.linear': 0.1})),
+        300: lambda c: c.enable(False),
+        320: lambda c: c.enable(True),
+        400: lambda c: c.reset(),
+        450: lambda c: c.silent(None, 0),
+        500: lambda c: c.configure(c.parameters.with_values({'switches.preview': False})),
+        510: lambda c: c.drive.tell(np.array([1.0, 2.0])),
+        560: lambda c: c.configure(c.parameters.with_values({'predictive.dither': 0.1})),
+    }
+    answers, plain = Run(6, 650, switching).check(sorted(deeds), deeds)
+    assert 200 < plain < 550
+    assert Reason.DISABLED in answers.reasons.tolist()
+
+
+def test_stretches_end_where_what_is_learnt_is_copied():
+    """The oldest copy is what a robot that stops following goes back to."""
+    run = Run(7, 400, winding)
+    controller, _, plain = run.outcome(Controller.march)
+    assert plain > 350
+    ages = []
+    for coefficients, _ in controller._before:
+        distance = np.abs(controller.law.fuzzy.coefficients - coefficients).max()
+        ages.append(distance)
+    assert len(ages) == 3
+    assert ages[0] > ages[-1] > 0.0
+    assert controller._copy_after * 0.01 == pytest.approx(SNAPSHOT_PERIOD)
+
+
+def test_a_march_that_is_refused_a_number_says_so():
+    run = Run(8, 300, winding)
+    controller, _, _ = run.outcome(Controller.march)
+    controller.law.fuzzy.tables[-1][:] = math.nan
+    more = Run(8, 400, winding)
+    rows = more.rows[300:]
+    slow, fast = copy.deepcopy(controller), controller
+    with pytest.raises(ValueError, match='must be finite'):
+        one_by_one(slow, more.odometry, more.references, rows, StepResults.empty(100))
+    with pytest.raises(ValueError, match='must be finite'):
+        fast.march(more.odometry, more.references, rows, StepResults.empty(100))

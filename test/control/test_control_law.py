@@ -1,0 +1,338 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The law (64)-(84): its sum, E12-E14, and the bound along simulated runs."""
+
+from functools import partial
+import math
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.control.control_law import (
+    TANH_GAP,
+    Certificate,
+    LawParameters,
+    Nt3fsMpcParameters,
+    compensator,
+    law_terms,
+    lyapunov_rate_bound,
+    lyapunov_value,
+    ultimate_bound,
+)
+from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator
+from t3mpc_ros.fuzzy.sets import FuzzyParameters
+from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.simulation.plant.dynamics import (
+    BodyParameters,
+    dynamics_vector,
+    wheel_acceleration,
+    wheel_coriolis,
+    wheel_inertia,
+)
+
+Sets = partial(FuzzyParameters, sets=3, centre_exponent=1.0)
+
+
+def _law(speeds, wanted, rate, estimate, predictive, gain=8.0, bound=2.0, smoothing=0.5):
+    terms, command = np.zeros((5, 2)), np.zeros(2)
+    law_terms(speeds, wanted, rate, estimate, predictive, gain, bound, smoothing, terms, command)
+    return terms, command
+
+
+def test_command_is_the_sum_of_the_terms_of_66_and_67():
+    rng = np.random.default_rng(1)
+    chi, r, rate, g, v_p = rng.normal(size=(5, 2))
+    terms, u = _law(chi, r, rate, g, v_p)
+    delta = chi - r
+    expected = -g - 8.0 * delta + rate - 2.0 * np.tanh(delta / 0.5) + v_p
+    np.testing.assert_allclose(u, expected, rtol=1e-14)
+    np.testing.assert_allclose(terms.sum(axis=0), u, rtol=1e-14)
+
+
+def test_e12_with_the_reference_rate_the_error_obeys_68():
+    """The printed +omega_i cannot be applied, and without r' a moving reference leaves an error.
+
+    With exact g and no disturbance, (68) says delta' = -K delta + v_c + v_p: the derivative of
+    the reference must drop out. It does with r' in the law, and only then.
+    """
+    chi, r, rate = np.array([1.0, -2.0]), np.array([0.5, -1.0]), np.array([3.0, -4.0])
+    g = np.array([0.7, -0.3])
+    terms, u = _law(chi, r, rate, g, np.zeros(2))
+    delta_rate = g + u - rate  # chi' = g + u (64), delta' = chi' - r'
+    np.testing.assert_allclose(delta_rate, terms[1] + terms[3] + terms[4], atol=1e-14)
+    _, printed = _law(chi, r, np.zeros(2), g, np.zeros(2))
+    assert np.all(np.abs(g + printed - rate - (terms[1] + terms[3] + terms[4])) > 1.0)
+
+
+def test_the_robot_under_the_torque_theta_bar_u_is_the_plant_of_30_and_64_65():
+    """What u leaves of chi' depends on chi alone: one g(chi) can stand for it, u has gain one.
+
+    With an inertia that is not the robot's neither is true: what the law then calls unknown
+    would depend on its own command.
+    """
+    body, geometry = BodyParameters(), WheelGeometry()
+    nominal, heavy = wheel_inertia(body, geometry), BodyParameters(body_mass=1.5 * body.body_mass)
+    rng = np.random.default_rng(3)
+
+    def left_over(chi, u, true):
+        friction = 0.002 * chi + 0.004 * np.tanh(chi / 0.2)
+        torque = nominal @ u - friction
+        return np.array(wheel_acceleration(*chi, *torque, dynamics_vector(true, geometry))) - u
+
+    for _ in range(20):
+        chi = rng.uniform(-10.0, 10.0, 2)
+        friction = 0.002 * chi + 0.004 * np.tanh(chi / 0.2)
+        coriolis = wheel_coriolis(WheelSpeeds(*chi), body, geometry) @ chi
+        g = np.linalg.solve(nominal, -coriolis - friction)
+        pushes = rng.uniform(-30.0, 30.0, (5, 2))
+        for u in pushes:
+            np.testing.assert_allclose(left_over(chi, u, body), g, atol=1e-10)
+        spread = np.ptp([left_over(chi, u, heavy) for u in pushes], axis=0)
+        assert spread.max() > 1.0
+
+
+def _matched_pair(rng, gamma=600.0):
+    """Return a learner and a plant of the same fuzzy family with other coefficients."""
+    adaptation = AdaptationParameters(gamma=gamma, dead_zone=0.0, radius=1e4)
+    pair = []
+    for _ in range(2):
+        estimator = FuzzyEstimator(Sets(), adaptation)
+        estimator.coefficients = rng.uniform(-5.0, 5.0, estimator.coefficients.shape)
+        pair.append(estimator)
+    return pair
+
+
+def test_error_of_g_70_71_makes_the_error_system_72_73_under_the_law():
+    """Plant (64)-(65), law (66)-(67): what is left is (68)-(69), and in alpha~ (72)-(73)."""
+    rng = np.random.default_rng(4)
+    learner, plant = _matched_pair(rng)
+    for _ in range(50):
+        chi, r, rate, omega, v_p = rng.uniform(-5.0, 5.0, (5, 2))
+        truth, g = plant.evaluate(chi), learner.evaluate(chi)
+        alpha_error = plant.coefficients - learner.coefficients
+        np.testing.assert_allclose(truth - g, alpha_error @ learner.basis, atol=1e-12)
+        terms, u = _law(chi, r, rate, g, v_p)
+        delta, v_c = chi - r, terms[3]
+        delta_rate = truth + u + omega - rate
+        np.testing.assert_allclose(
+            delta_rate, truth - g - 8.0 * delta + omega + v_c + v_p, atol=1e-12
+        )
+        np.testing.assert_allclose(
+            delta_rate, alpha_error @ learner.basis - 8.0 * delta + omega + v_c + v_p, atol=1e-11
+        )
+
+
+def test_v_is_the_sum_74_and_falls_to_zero_only_with_both_its_parts():
+    delta, alpha_error = np.array([3.0, -4.0]), np.array([[1.0, 2.0], [0.0, -2.0]])
+    assert lyapunov_value(delta, alpha_error, 0.5) == pytest.approx(12.5 + 9.0)
+    assert lyapunov_value(delta, 0.0 * alpha_error, 0.5) == pytest.approx(12.5)
+    assert lyapunov_value(0.0 * delta, alpha_error, 0.5) == pytest.approx(9.0)
+    assert lyapunov_value(0.0 * delta, 0.0 * alpha_error, 0.5) == 0.0
+
+
+def _slope_of_v(delta, delta_rate, alpha_error, alpha_rate, gamma):
+    """Return V' of (74) by central differences, which are exact for a quadratic."""
+    step = 1e-4
+    ahead, behind = (
+        lyapunov_value(
+            delta + sign * step * delta_rate, alpha_error - sign * step * alpha_rate, gamma
+        )
+        for sign in (1.0, -1.0)
+    )
+    return (ahead - behind) / (2.0 * step)
+
+
+@pytest.mark.parametrize('tuned', [False, True], ids=['any alpha rate', 'rate of (77)-(78)'])
+def test_v_rate_is_75_then_76_and_79_once_the_coefficients_follow_77_78(tuned):
+    """The terms in alpha~ cancel by the rates that ``adapt`` makes, and by no other."""
+    rng = np.random.default_rng(5)
+    gamma, dt = 600.0, 1e-7
+    for _ in range(20):
+        learner, plant = _matched_pair(rng, gamma)
+        chi, r, rate, omega, v_p = rng.uniform(-5.0, 5.0, (5, 2))
+        truth, g = plant.evaluate(chi), learner.evaluate(chi)
+        phi, alpha = learner.basis, learner.coefficients
+        alpha_error = plant.coefficients - alpha
+        terms, u = _law(chi, r, rate, g, v_p)
+        delta, delta_rate = chi - r, truth + u + omega - rate
+        alpha_rate = rng.normal(size=alpha.shape)
+        if tuned:
+            learner.adapt(delta, dt)
+            alpha_rate = (learner.coefficients - alpha) / dt
+        slope = _slope_of_v(delta, delta_rate, alpha_error, alpha_rate, gamma)
+        by_75 = delta @ delta_rate - np.sum(alpha_error * alpha_rate) / gamma
+        by_79 = -8.0 * delta @ delta + delta @ (omega + terms[3] + v_p)
+        crossed = delta @ (alpha_error @ phi) - np.sum(alpha_error * alpha_rate) / gamma
+        assert slope == pytest.approx(by_75, rel=1e-6, abs=1e-6)
+        assert slope == pytest.approx(by_79 + crossed, rel=1e-6, abs=1e-6)  # (76)
+        if tuned:
+            assert slope == pytest.approx(by_79, rel=1e-4, abs=1e-4)
+        else:
+            assert abs(slope - by_79) > 1e-3
+
+
+def test_the_compensated_bound_is_the_least_that_80_allows():
+    """Whatever omega and v_p do within their bounds, (79) stays below (80); and it gets there.
+
+    A compensator for omega-bar alone, without v_p-bar, would be outweighed.
+    """
+    parameters = Nt3fsMpcParameters()
+    omega_bar, v_bar = parameters.law.error_bound, parameters.predictive.v_max
+    bound, gain = parameters.compensated_bound, parameters.law.gain
+    rng = np.random.default_rng(6)
+    gaps = []
+    for k in range(500):
+        delta = rng.uniform(-3.0, 3.0, 2)
+        worst = k % 10 == 0
+        omega = omega_bar * (np.sign(delta) if worst else rng.uniform(-1.0, 1.0, 2))
+        v_p = v_bar * (np.sign(delta) if worst else rng.uniform(-1.0, 1.0, 2))
+        v_c = np.array([compensator(float(e), bound, parameters.law.smoothing) for e in delta])
+        by_79 = -gain * delta @ delta + delta @ (omega + v_c + v_p)
+        by_80 = -gain * delta @ delta + bound * np.abs(delta).sum() + delta @ v_c
+        gaps.append(by_80 - by_79)
+        assert gaps[-1] >= -1e-12
+        assert worst == (gaps[-1] < 1e-9)
+        assert by_79 <= lyapunov_rate_bound(delta, gain, bound, parameters.law.smoothing) + 1e-12
+    off = Nt3fsMpcParameters.from_dict({'predictive.enabled': False})
+    assert off.compensated_bound == omega_bar < bound
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_e17_the_integral_of_84_holds_with_v_at_the_start_and_not_as_printed(seed):
+    """V(t) - V(0) is at most the integral of the bound; print leaves V(0) out.
+
+    Without it the printed (84) puts V, which is never negative, below a negative integral.
+    """
+    rng = np.random.default_rng(seed)
+    gamma, gain, bound, smoothing, dt = 600.0, 6.0, 3.5, 0.4, 1e-4
+    learner, plant = _matched_pair(rng, gamma)
+    chi, terms, u = rng.uniform(-3.0, 3.0, 2), np.zeros((5, 2)), np.zeros(2)
+    values, squares = [], []
+    for k in range(20_000):
+        t = k * dt
+        r = np.array([3.0 * math.sin(2.0 * t), 2.0 * math.cos(3.0 * t)])
+        rate = np.array([6.0 * math.cos(2.0 * t), -6.0 * math.sin(3.0 * t)])
+        delta = chi - r
+        alpha_error = plant.coefficients - learner.coefficients
+        values.append(lyapunov_value(delta, alpha_error, gamma))
+        squares.append(float(delta @ delta))
+        omega = 2.0 * np.sin(np.array([7.0, 11.0]) * t)
+        v_p = 1.5 * np.sign(delta)
+        truth, g = plant.evaluate(chi).copy(), learner.evaluate(chi)
+        law_terms(chi, r, rate, g, v_p, gain, bound, smoothing, terms, u)
+        learner.adapt(delta, dt)
+        chi = chi + dt * (truth + u + omega)
+    value, spent = np.array(values), gain * dt * np.cumsum(squares)
+    time = dt * np.arange(1, value.size)
+    allowed = value[0] - spent[:-1] + TANH_GAP * smoothing * 2.0 * bound * time
+    assert np.all(value[1:] <= allowed + 1e-3 * value[0])
+    assert value[-1] < 0.9 * value[0]
+    assert np.all(value[1:] > -spent[:-1])  # the printed (84), violated throughout
+
+
+def test_compensator_81_82_opposes_the_error_and_never_exceeds_its_bound():
+    for error in np.linspace(-20.0, 20.0, 4001):
+        value = compensator(float(error), 3.0, 0.5)
+        assert abs(value) <= 3.0
+        assert value * error <= 0.0
+    assert compensator(1.0, 2.0, 1.0) == pytest.approx(-2.0 * math.tanh(1.0))
+
+
+def test_e14_the_gap_between_absolute_value_and_tanh_is_0_2785_epsilon():
+    """(83) treats tanh as the sign function; the gap it forgets is exactly this large."""
+    for epsilon in (0.05, 1.0, 7.0):
+        x = np.linspace(-10 * epsilon, 10 * epsilon, 200_001)
+        gap = np.abs(x) - x * np.tanh(x / epsilon)
+        assert gap.max() <= TANH_GAP * epsilon
+        assert gap.max() > 0.999 * TANH_GAP * epsilon
+
+
+def test_e14_the_printed_claim_83_is_violated_where_the_corrected_one_holds():
+    """A constant disturbance at its bound: V rises inside the ball although (83) forbids it."""
+    law = LawParameters(gain=2.0, error_bound=1.0, smoothing=1.0)
+    delta = np.array([0.3, 0.0])
+    disturbance = np.array([1.0, 0.0])
+    rate = float(
+        delta
+        @ (-law.gain * delta + disturbance - law.error_bound * np.tanh(delta / law.smoothing))
+    )
+    assert rate > -law.gain * float(delta @ delta)
+    assert rate <= lyapunov_rate_bound(delta, law.gain, law.error_bound, law.smoothing)
+
+
+def test_e13_each_wheels_predictive_term_works_on_its_own_error():
+    """(76) and (79) print delta_1 v_p2; the derivative of (74) along (73) holds delta_2 v_p2."""
+    rng = np.random.default_rng(2)
+    delta, v_p, residual = rng.normal(size=(3, 2))
+    gain = 4.0
+    delta_rate = residual - gain * delta + v_p  # (72)-(73) with v_c = 0
+    step = 1e-6
+    value = lyapunov_value(delta, np.zeros(1), 1.0)
+    moved = lyapunov_value(delta + step * delta_rate, np.zeros(1), 1.0)
+    right = -gain * delta @ delta + delta @ residual + delta[0] * v_p[0] + delta[1] * v_p[1]
+    wrong = -gain * delta @ delta + delta @ residual + delta[0] * v_p[0] + delta[0] * v_p[1]
+    measured = (moved - value) / step
+    assert measured == pytest.approx(right, abs=1e-4)
+    assert abs(measured - wrong) > 1e-2
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_e14_bound_holds_at_every_step_of_a_noise_free_run(seed):
+    """Plant (64)-(65) with known alpha*, bounded disturbance and bounded v_p, law and adaptation.
+
+    Everything of the proof is real here: V is (74) with the true alpha*, the fuzzy system is the
+    package's, the plant's own fuzzy system has other coefficients, the disturbance reaches its
+    bound, v_p is as bad as its bound allows. Small steps, so that V' is the derivative.
+    """
+    rng = np.random.default_rng(seed)
+    adaptation = AdaptationParameters(sigma_modification=0.0, dead_zone=0.0)
+    learner = FuzzyEstimator(Sets(), adaptation, outputs=2)
+    plant = FuzzyEstimator(Sets(), adaptation, outputs=2)
+    plant.coefficients = rng.uniform(-3.0, 3.0, plant.coefficients.shape)
+    gamma = adaptation.gamma
+    law = LawParameters(gain=6.0, error_bound=2.0, smoothing=0.4)
+    v_bound = 1.5
+    bound = law.error_bound + v_bound
+    dt = 2e-5
+    chi = rng.uniform(-3.0, 3.0, 2)
+    terms, u = np.zeros((5, 2)), np.zeros(2)
+    phases = rng.uniform(0.0, 2.0 * math.pi, 6)
+    worst, ball = -math.inf, ultimate_bound(law.gain, bound, law.smoothing)
+    previous = None
+    largest_late = 0.0
+    for k in range(150_000):
+        t = k * dt
+        r = np.array([3.0 * math.sin(2 * t + phases[0]), 2.0 * math.cos(3 * t + phases[1])])
+        rate = np.array([6.0 * math.cos(2 * t + phases[0]), -6.0 * math.sin(3 * t + phases[1])])
+        delta = chi - r
+        coefficient_errors = plant.coefficients - learner.coefficients
+        value = lyapunov_value(delta, coefficient_errors, gamma)
+        if previous is not None:
+            worst = max(worst, (value - previous[0]) / dt - previous[1])
+        previous = value, lyapunov_rate_bound(delta, law.gain, bound, law.smoothing)
+        w = law.error_bound * np.sin(np.array([7.0, 11.0]) * t + phases[2:4])
+        v_p = v_bound * np.sign(delta)  # pushes the wrong way, as hard as it may
+        truth = plant.evaluate(chi).copy()
+        g = learner.evaluate(chi)
+        law_terms(chi, r, rate, g, v_p, law.gain, bound, law.smoothing, terms, u)
+        learner.adapt(delta, dt)
+        chi = chi + dt * (truth + u + w)
+        if t > 2.0:
+            largest_late = max(largest_late, float(np.linalg.norm(delta)))
+    assert worst < 0.05, 'V rose faster than E14 allows'
+    assert largest_late < 3.0 * ball
+
+
+def test_certificate_holds_on_a_decaying_error_and_names_a_rising_one():
+    law = LawParameters(gain=5.0, error_bound=0.0, smoothing=1.0)
+    watch = Certificate(window=0.2)
+    for k in range(200):
+        reading = watch.update(np.array([1.0, -1.0]) * math.exp(-5.0 * 0.01 * k), law, 0.0, 0.01)
+    assert reading.holds
+    assert reading.value < 1e-7
+    watch.reset()
+    for k in range(50):
+        reading = watch.update(np.array([1.0, 1.0]) * (1.0 + 0.05 * k), law, 0.0, 0.01)
+    assert not reading.holds
+    assert reading.margin < 0.0

@@ -1,0 +1,446 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The controller as the node uses it: stops with reasons, switches, learning, models."""
+
+from dataclasses import replace
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.control.control_law import Nt3fsMpcController, Nt3fsMpcParameters
+from t3mpc_ros.control.controller import Controller, ControllerParameters
+from t3mpc_ros.control.jump_transition import JumpTransitionParameters
+from t3mpc_ros.control.switching_tracker import SwitchingTracker
+from t3mpc_ros.control.watchdog import Reason
+from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
+from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, State, WheelSpeeds
+
+MS = 1_000_000
+PERIOD = 10 * MS
+LEAD = 400 * MS
+GEOMETRY = WheelGeometry()
+
+
+def _motion(stamp_ns, linear=0.0, angular=0.0):
+    return State(stamp_ns, ORIGIN, BodyTwist(linear, angular))
+
+
+class Loop:
+    """A controller around an ideal robot: its speed is the last command."""
+
+    def __init__(self, wanted=lambda t: (0.1, 0.5), **changes):
+        self.controller = Controller(ControllerParameters.from_dict(changes))
+        self.wanted = wanted
+        self.now = 0
+        self.twist = BodyTwist(0.0, 0.0)
+        self.reference_alive = True
+
+    def step(self, measured=None):
+        if self.reference_alive:
+            stamp = self.now + LEAD
+            self.controller.add_reference(_motion(stamp, *self.wanted(stamp / 1e9)))
+        motion = measured or State(self.now, ORIGIN, self.twist)
+        self.twist, status = self.controller.step(motion)
+        self.now += PERIOD
+        return status
+
+    def run(self, steps):
+        return [self.step() for _ in range(steps)]
+
+
+class ServoLoop(Loop):
+    """The same around wheels that lag 20 ms behind a command that is 10 ms late."""
+
+    def __init__(self, wanted, **changes):
+        super().__init__(wanted, **({'estimate.noise_variance': 0.0} | changes))
+        self.speeds = np.zeros(2)
+        self.late = BodyTwist(0.0, 0.0)
+
+    def step(self, measured=None):
+        motion = State(self.now, ORIGIN, twist_from_wheels(WheelSpeeds(*self.speeds), GEOMETRY))
+        status = super().step(motion)
+        told = np.array(wheels_from_twist(self.late, GEOMETRY))
+        self.speeds = told + math.exp(-0.5) * (self.speeds - told)
+        self.late = self.twist
+        return status
+
+    def run(self, seconds):
+        """Return the wheel speeds, shape (n, 2)."""
+        speeds = []
+        for _ in range(round(100 * seconds)):
+            speeds.append(self.speeds.copy())
+            self.step()
+        return np.array(speeds)
+
+    def squared_error(self, seconds, after):
+        speeds = self.run(seconds)
+        twists = [BodyTwist(*self.wanted(0.01 * k)) for k in range(len(speeds))]
+        r = np.array([wheels_from_twist(twist, GEOMETRY) for twist in twists])
+        return 0.01 * np.sum((speeds - r)[round(100 * after) :, 0] ** 2)
+
+
+@pytest.fixture(scope='module')
+def tracking():
+    loop = Loop()
+    statuses = loop.run(300)
+    return loop, statuses
+
+
+def test_it_waits_for_a_reference_then_tracks_it(tracking):
+    loop, statuses = tracking
+    assert statuses[0].reason is Reason.NO_REFERENCE
+    assert statuses[-1].reason is Reason.TRACKING
+    assert loop.twist.linear == pytest.approx(0.1, abs=2e-3)
+    assert loop.twist.angular == pytest.approx(0.5, abs=2e-2)
+
+
+def test_the_command_never_exceeds_the_limits():
+    loop = Loop(lambda t: (5.0 * math.sin(9 * t), 60.0 * math.cos(7 * t)))
+    limits = loop.controller.parameters.limits
+    before = None
+    for _ in range(400):
+        status = loop.step()
+        wheels = wheels_from_twist(loop.twist, GEOMETRY)
+        assert abs(loop.twist.linear) <= limits.linear * (1 + 1e-9)
+        assert abs(loop.twist.angular) <= limits.angular * (1 + 1e-9)
+        assert max(map(abs, wheels)) <= limits.wheel_speed * (1 + 1e-9)
+        if before is not None and status.reason is Reason.TRACKING:
+            change = np.subtract(wheels, before)
+            assert np.max(np.abs(change)) <= limits.wheel_acceleration * 0.01 * (1 + 1e-9)
+        before = wheels if status.reason is Reason.TRACKING else None
+
+
+def test_a_silent_reference_stops_the_robot_although_it_is_known_ahead():
+    """The reference is stamped 0.2 s ahead: a dead generator must not be followed so long."""
+    loop = Loop()
+    loop.run(100)
+    loop.reference_alive = False
+    statuses = loop.run(40)
+    moving = [status.reason is Reason.TRACKING for status in statuses]
+    assert sum(moving) * 10 <= 160
+    assert statuses[-1].reason is Reason.REFERENCE_STALE
+    assert loop.twist == BodyTwist(0.0, 0.0)
+    loop.reference_alive = True
+    assert loop.run(30)[-1].reason is Reason.TRACKING
+
+
+@pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf])
+def test_odometry_that_is_not_finite_stops_and_a_good_one_resumes(value):
+    loop = Loop()
+    loop.run(100)
+    status = loop.step(_motion(loop.now, value, 0.0))
+    assert status.reason is Reason.ODOMETRY_BAD
+    assert loop.twist == BodyTwist(0.0, 0.0)
+    statuses = loop.run(50)
+    assert statuses[-1].reason is Reason.TRACKING
+    assert all(np.isfinite(status.applied).all() for status in statuses)
+    assert np.isfinite(loop.controller.law.fuzzy.coefficients).all()
+
+
+def test_a_reference_that_is_not_finite_is_ignored_and_said_so():
+    loop = Loop()
+    assert not loop.controller.add_reference(_motion(0, math.nan, 0.0))
+    assert loop.controller.add_reference(_motion(0, 0.1, 0.0))
+
+
+def test_odometry_that_jumps_back_in_time_stops_and_starts_anew():
+    loop = Loop()
+    loop.run(200)
+    loop.now = 0  # the robot, or a simulated clock, has started again
+    statuses = loop.run(60)
+    assert statuses[0].reason is not Reason.TRACKING
+    assert statuses[-1].reason is Reason.TRACKING
+
+
+def test_a_gap_in_the_odometry_starts_the_law_anew_without_a_jump():
+    loop = Loop()
+    loop.run(200)
+    loop.now += 1000 * MS
+    for k in range(30):  # the reference went on meanwhile
+        stamp = loop.now + LEAD - (30 - k) * PERIOD
+        loop.controller.add_reference(_motion(stamp, *loop.wanted(stamp / 1e9)))
+    before = loop.twist
+    status = loop.step()
+    assert status.reason is Reason.TRACKING
+    assert loop.twist.linear == pytest.approx(before.linear, abs=0.02)
+
+
+def test_the_same_message_twice_changes_nothing():
+    loop = Loop()
+    loop.run(100)
+    motion = State(loop.now, ORIGIN, loop.twist)
+    first = loop.controller.step(motion)
+    again = loop.controller.step(motion)
+    assert again == first
+
+
+def test_disabling_stops_and_enabling_resumes():
+    loop = Loop()
+    loop.run(100)
+    loop.controller.enable(False)
+    assert loop.step().reason is Reason.DISABLED
+    assert loop.twist == BodyTwist(0.0, 0.0)
+    loop.controller.enable(True)
+    assert loop.run(20)[-1].reason is Reason.TRACKING
+
+
+def test_a_diverging_robot_is_stopped():
+    loop = Loop()
+    loop.run(100)
+    status = loop.step(_motion(loop.now, 3.0, 0.0))  # 86 rad/s at the wheels
+    assert status.reason is Reason.DIVERGING
+    assert loop.twist == BodyTwist(0.0, 0.0)
+
+
+def test_silence_is_told_by_the_clock_of_the_caller():
+    loop = Loop()
+    loop.run(100)
+    assert not loop.controller.silent(1000 * MS, 1100 * MS)
+    assert loop.controller.silent(1000 * MS, 1300 * MS)
+    assert loop.controller.status.reason is Reason.NO_ODOMETRY
+
+
+def test_the_output_is_a_function_of_the_messages():
+    first, second = Loop(), Loop()
+    for loop in (first, second):
+        rng = np.random.default_rng(7)
+        loop.record = []
+        for _ in range(300):
+            noisy = BodyTwist(*(np.array(loop.twist) + rng.normal(scale=(0.01, 0.1))))
+            loop.step(State(loop.now, ORIGIN, noisy))
+            loop.record.append(loop.twist)
+    assert first.record == second.record
+
+
+def test_live_settings_reach_every_part():
+    loop = Loop()
+    loop.run(50)
+    changed = loop.controller.parameters.with_values(
+        {'law.gain': 3.0, 'adaptation.gamma': 0.0, 'predictive.v_max': 0.0, 'limits.linear': 0.05}
+    )
+    loop.controller.configure(changed)
+    before = loop.controller.law.fuzzy.coefficients.copy()
+    statuses = loop.run(200)
+    np.testing.assert_array_equal(loop.controller.law.fuzzy.coefficients, before)
+    assert abs(loop.twist.linear) <= 0.05 + 1e-12
+    assert statuses[-1].terms[4].tolist() == [0.0, 0.0]
+    np.testing.assert_allclose(statuses[-1].terms[1], -3.0 * statuses[-1].error, atol=0.02)
+
+
+def test_reset_forgets_what_was_learnt():
+    loop = Loop()
+    loop.run(200)
+    assert np.any(loop.controller.law.fuzzy.coefficients)
+    loop.controller.reset()
+    assert not np.any(loop.controller.law.fuzzy.coefficients)
+    assert loop.run(60)[-1].reason is Reason.TRACKING
+
+
+# --- the law underneath --------------------------------------------------------------------------
+
+
+def _ideal_run(steps, reference, parameters, push=(0.0, 0.0), jumps=()):
+    """Torque drive on chi' = u + push without noise; returns errors, coefficients and the law.
+
+    ``jumps`` are (instant, size of the jump) that the reference takes.
+    """
+    pursuit = SwitchingTracker(parameters, 'torque')
+    law = pursuit.law
+    law.warm_up()
+    chi = np.zeros(2)
+    errors, learning = [], []
+    for k in range(steps):
+        (r, _), (later, _) = reference(k * 0.01), reference(k * 0.01 + 0.01)
+        if k == 0:
+            pursuit.begin(0, chi, r)
+        for instant, size in jumps:
+            if k == round(100 * instant):
+                pursuit.plan.announce(k * PERIOD, np.full(2, size), np.zeros(2))
+                later = reference(k * 0.01 + 0.01)[0]
+        if any(k == round(100 * instant) - 1 for instant, _ in jumps):
+            later = r  # nobody knows of it yet
+        u = pursuit.step(k * PERIOD, chi, r, later, 0.01).copy()
+        pursuit.applied(u, limited=False)
+        errors.append(chi - r)
+        learning.append(law.fuzzy.coefficients.copy())
+        chi = chi + 0.01 * (u + np.array(push))
+    return np.array(errors), learning, law
+
+
+QUIET = Nt3fsMpcParameters.from_dict({'estimate.noise_variance': 0.0})
+
+
+@pytest.mark.parametrize('crossing', ['ramp', 'program'])
+def test_a_switch_is_followed_without_a_lasting_error(crossing):
+    """A jump of r is no estimation error; taken for one it left a wrong g behind for seconds."""
+
+    def reference(t):
+        return np.array([1.0, -1.0]) + (3.0 if t >= 0.999 else 0.0), np.zeros(2)
+
+    parameters = QUIET.with_values({'switches.crossing': crossing})
+    errors, learning, _ = _ideal_run(300, reference, parameters, jumps=[(1.0, 3.0)])
+    before = errors[99]
+    np.testing.assert_allclose(before, 0.0, atol=0.02)
+    assert errors[100] == pytest.approx([-3.0, -3.0], abs=0.05)
+    if crossing == 'ramp':  # arrives in time and without overshoot
+        assert errors[100:].max() < 0.05
+        arrival = 1.0 + 3.0 / parameters.switches.acceleration + 0.03
+        drift = np.linalg.norm(learning[-1] - learning[99])
+        assert drift < 0.4, 'the jump has taught the fuzzy systems something'
+    else:  # feedback closes up, and v_p, which takes the compensator for a push, overshoots a bit
+        assert errors[100:].max() < 0.2
+        arrival = 1.0 + 5.0 / parameters.law.gain
+    assert np.abs(errors[round(100 * arrival) :]).max() < 0.1
+
+
+def test_known_beforehand_a_switch_costs_a_quarter_of_the_squared_error():
+    """The whole controller on a robot with lag and dead time, with and without preview."""
+    energy = []
+    for preview in (True, False):
+        loop = ServoLoop(
+            lambda t: (0.1, 0.0) if t < 1.5 else (-0.1, 0.0), **{'switches.preview': preview}
+        )
+        energy.append(loop.squared_error(3.0, after=1.0))
+    jump = 0.2 / GEOMETRY.wheel_radius
+    a = JumpTransitionParameters().acceleration
+    # Late by dead time and servo as well: 10 ms + 15.4 ms (20 ms less half a period, sampled).
+    assert energy[0] == pytest.approx(jump**3 / (12 * a), rel=0.1)
+    assert energy[1] == pytest.approx(jump**3 / (3 * a) + (0.0254 + 0.005) * jump**2, rel=0.1)
+
+
+def test_the_source_may_start_again_while_a_jump_is_expected():
+    """A jump was announced 0.4 s ahead; then the generator starts anew and never jumps."""
+    loop = ServoLoop(lambda t: (0.1, 0.0) if t < 1.5 else (-0.1, 0.0))
+    loop.run(1.3)
+    loop.wanted = lambda t: (0.1, 0.0)
+    stamp = loop.now - PERIOD
+    while stamp <= loop.now + LEAD:  # what had been said of later is said anew
+        loop.controller.add_reference(_motion(stamp, 0.1, 0.0))
+        stamp += PERIOD
+    speeds = loop.run(1.0)
+    np.testing.assert_allclose(speeds[-1], 0.1 / GEOMETRY.wheel_radius, rtol=0.02)
+    assert np.min(speeds) > 0.0  # it never followed the jump that did not come
+
+
+def test_a_lasting_disturbance_ends_up_in_the_fuzzy_estimate_not_in_a_tug_of_war():
+    """Adaptation and MPC both integrate: without integral_transfer g and v_p shared a push at random.
+
+    In the first run of the demo g and -v_p stood at 2 rad/s² against each other for ever.
+    """
+
+    def reference(t):
+        return np.array([2.0, 1.0]), np.zeros(2)
+
+    push = np.array([3.0, -2.0])
+    errors, _, law = _ideal_run(3000, reference, QUIET, push)
+    assert np.abs(errors[-100:]).max() < 0.08
+    np.testing.assert_allclose(-law.terms[0], push, atol=0.35)  # g is the push
+    np.testing.assert_allclose(law.terms[4], 0.0, atol=0.35)  # v_p has gone
+    without = replace(QUIET, integral_transfer=0.0)
+    _, _, tug = _ideal_run(3000, reference, without, push)
+    assert np.abs(tug.terms[4]).max() > np.abs(law.terms[4]).max()
+
+
+def test_the_certificate_holds_along_a_noise_free_run_of_the_whole_law():
+    """E14 at run time: |delta|²/2 falls as promised while the push stays within its bound."""
+
+    def reference(t):
+        return (
+            np.array([2.0 * math.sin(2 * t), 1.5 * math.cos(t)]),
+            np.array([4.0 * math.cos(2 * t), -1.5 * math.sin(t)]),
+        )
+
+    law = Nt3fsMpcController(QUIET)
+    law.warm_up()
+    chi = np.array([0.0, 1.5])
+    margins = []
+    for k in range(2000):
+        r, rate = reference(k * 0.01)
+        u = law.step(chi, r, rate, 0.01).copy()
+        law.applied(u, limited=False)
+        margins.append(law.reading.margin)
+        push = 0.9 * np.array([math.sin(5.0 * k * 0.01), math.cos(3.0 * k * 0.01)])
+        chi = chi + 0.01 * (u + push)
+    assert min(margins[100:]) > 0.0
+    assert np.linalg.norm(chi - r) < law.ball
+
+
+def test_what_was_learnt_survives_saving_and_restoring(tmp_path):
+    from t3mpc_ros.bag.run.model_file import ModelError, load_model, save_model
+
+    def reference(t):
+        return np.array([2.0 * math.sin(t), 1.0]), np.array([2.0 * math.cos(t), 0.0])
+
+    _, _, law = _ideal_run(500, reference, QUIET, (2.0, -1.0))
+    path = tmp_path / 'model.npz'
+    save_model(path, law.learnt(), QUIET.to_dict())
+    other = Nt3fsMpcController(QUIET)
+    other.restore(load_model(path))
+    for name, value in law.learnt().items():
+        np.testing.assert_array_equal(other.learnt()[name], value, err_msg=name)
+
+    with pytest.raises(ModelError, match='cannot read'):
+        load_model(tmp_path / 'none.npz')
+    (tmp_path / 'text.npz').write_text('no model')
+    with pytest.raises(ModelError, match='not a model file'):
+        load_model(tmp_path / 'text.npz')
+    with pytest.raises(ModelError, match='cannot write'):
+        save_model(tmp_path / 'none' / 'x.npz', law.learnt(), {})
+    smaller = Nt3fsMpcController(replace(QUIET, fuzzy=replace(QUIET.fuzzy, sets=2)))
+    with pytest.raises(ValueError, match='coefficients must have shape'):
+        smaller.restore(load_model(path))
+
+
+def test_a_model_of_another_format_is_refused_by_number(tmp_path, monkeypatch):
+    from t3mpc_ros.bag.run import model_file
+
+    path = tmp_path / 'old.npz'
+    monkeypatch.setattr(model_file, 'FORMAT', 0)
+    model_file.save_model(path, {'x': np.zeros(1)}, {})
+    monkeypatch.undo()
+    with pytest.raises(model_file.ModelError, match='format 0, this is format 1'):
+        model_file.load_model(path)
+
+
+def test_a_round_trip_of_the_ideal_robot_uses_the_same_geometry():
+    wheels = WheelSpeeds(3.0, -1.0)
+    assert wheels_from_twist(twist_from_wheels(wheels, GEOMETRY), GEOMETRY) == pytest.approx(
+        wheels
+    )
+
+
+COMPILES = """
+import sys
+from t3mpc_ros.control.controller import (Controller, ControllerParameters)
+from t3mpc_ros.geometry.types import (BodyTwist, State)
+from t3mpc_ros.geometry.types import ORIGIN
+
+def signatures():
+    modules = [module for name, module in sys.modules.items() if name.startswith('t3mpc_ros')]
+    kernels = {one for module in modules for one in vars(module).values()
+               if hasattr(one, 'signatures')}
+    return {(one.__module__, one.__name__): len(one.signatures) for one in kernels}
+
+controller = Controller(ControllerParameters())
+controller.warm_up()
+before = signatures()
+twist = BodyTwist(0.0, 0.0)
+for k in range(100):
+    jumped = 0.2 if k > 50 else 0.0
+    controller.add_reference(Motion((k + 40) * 10_000_000, ORIGIN, BodyTwist(jumped, 0.1)))
+    twist, status = controller.step(Motion(k * 10_000_000, ORIGIN, twist))
+assert status.reason.name == 'TRACKING', status
+after = signatures()
+print({name for name in after if after[name] != before[name]} or 'nothing')
+"""
+
+
+def test_after_the_warm_up_no_step_compiles_anything():
+    """In a process of its own: in this one other tests have compiled all there is."""
+    done = subprocess.run(
+        [sys.executable, '-c', COMPILES], capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.stdout.strip() == 'nothing', done.stdout + done.stderr

@@ -1,0 +1,447 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The emulated board against the firmware's core: the same packets, the same answers."""
+
+import ctypes
+from pathlib import Path
+import random
+import shutil
+import subprocess
+
+import pytest
+from support.emulator_bench import SAMPLE, PulseCounter
+
+from t3mpc_ros.emulator.board.console import CELL_US
+from t3mpc_ros.emulator.board.robot_board import RobotBoard
+from t3mpc_ros.radio.protocol.authentication import frame_tag, key_check, session_key, sign_hello
+from t3mpc_ros.radio.protocol.codec import decode_from_board, encode
+from t3mpc_ros.radio.protocol.frames import (
+    BUSY,
+    FAILED,
+    KEY_DAMAGED,
+    KEY_HELD,
+    NO_KEY,
+    OK,
+    Action,
+    Command,
+    CommandFlag,
+    Hello,
+    Key,
+    KeyState,
+    ParamGet,
+    ParamSet,
+    Ping,
+    Poll,
+    Pong,
+    Refusal,
+    StatusFlag,
+)
+from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
+
+FIRMWARE = Path(__file__).resolve().parents[2] / 'firmware'
+KEY = bytes(range(0x80, 0x90))
+WRAP = 1 << 32
+
+pytestmark = pytest.mark.skipif(
+    not shutil.which('gcc') or not (FIRMWARE / 'host').is_dir(), reason='needs gcc and firmware'
+)
+
+
+@pytest.fixture(scope='module')
+def library(tmp_path_factory):
+    target = tmp_path_factory.mktemp('firmware') / 'libt3core.so'
+    sources = sorted(map(str, [*FIRMWARE.glob('core/*.c'), *FIRMWARE.glob('host/*.c')]))
+    folders = [f'-I{FIRMWARE / "core"}', f'-I{FIRMWARE / "host"}']
+    flags = ['-std=c99', '-O2', '-fPIC', '-shared']
+    subprocess.run(['gcc', *flags, *folders, '-o', target, *sources], check=True)
+    core = ctypes.CDLL(str(target))
+    core.t3_host_robot_new.restype = ctypes.c_void_p
+    core.t3_host_robot_ack.restype = ctypes.c_uint8
+    core.t3_host_robot_usb_take.restype = ctypes.c_uint32
+    core.t3_host_robot_writing.restype = ctypes.c_bool
+    core.t3_host_robot_powered.restype = ctypes.c_bool
+    core.t3_host_robot_speed.restype = ctypes.c_int32
+    core.t3_host_robot_steps.restype = ctypes.c_int32
+    return core
+
+
+class Pair:
+    """The C core and the emulated board, told the same."""
+
+    def __init__(self, library, key=b''):
+        self.library = library
+        self.robot = ctypes.c_void_p(library.t3_host_robot_new())
+        self.hardware = PulseCounter()
+        self.nonce = bytes(8)
+        self.loaded = b''
+        self.board = RobotBoard(self.hardware, key, lambda size: self.nonce, self._load)
+        if key:
+            self.call('store_key', key)
+        self.call('set_cell_us', ctypes.c_uint32(CELL_US))
+        self.said = b''
+        self.board.console.reply = self._say
+        self.call('boot', ctypes.c_uint8(1), ctypes.c_uint32(0))
+        self.call('set_imu', ctypes.c_bool(True), (ctypes.c_int16 * 7)(*SAMPLE))
+        self.now = 0
+
+    def _load(self, payload):
+        self.loaded = payload
+
+    def _say(self, data):
+        self.said += data
+
+    def usb(self, data):
+        """Send bytes over the cable."""
+        self.call('usb', bytes(data), ctypes.c_uint32(len(data)))
+        self.board.console.feed(bytes(data))
+
+    def ask(self, frame, us=1000):
+        """Return what both answer over the cable within a time: the same, or nothing."""
+        self.usb(encode_frame(encode(frame)))
+        self.run(us)
+        return [decode_from_board(data) for data in FrameDecoder().feed(self.heard())]
+
+    def heard(self):
+        """Return what both have said over the cable since the last call."""
+        room = ctypes.create_string_buffer(4096)
+        size = self.call('usb_take', room, ctypes.c_uint32(4096))
+        said, self.said = self.said, b''
+        assert said.hex() == room.raw[:size].hex()
+        return said
+
+    def __del__(self):
+        self.call('free')
+
+    def call(self, name, *arguments):
+        return getattr(self.library, f't3_host_robot_{name}')(self.robot, *arguments)
+
+    def packet(self, data):
+        self.call('packet', bytes(data), ctypes.c_uint8(len(data)))
+        self.board.packet(bytes(data))
+
+    def hello(self, frame, nonce):
+        self.nonce = nonce
+        self.call('force_nonce', nonce)
+        self.packet(encode(frame))
+
+    def run(self, us):
+        self.call('run', ctypes.c_uint32(us))
+        self.now += us
+        self.board.run_to(self.now)
+
+    def press(self, pressed):
+        self.call('press', ctypes.c_bool(pressed))
+        self.board.press(pressed)
+
+    def imu(self, answers):
+        self.call('set_imu', ctypes.c_bool(answers), (ctypes.c_int16 * 7)(*SAMPLE))
+        self.hardware.registers = SAMPLE if answers else None
+
+    def reset(self):
+        self.run(-self.now % 1000)
+        self.call('boot', ctypes.c_uint8(4), ctypes.c_uint32(0))
+        self.board.boot(4)
+        self.now = 0
+        self.loaded = b''
+
+    def compare(self):
+        room = ctypes.create_string_buffer(32)
+        size = self.call('ack', room)
+        ours, theirs = self.loaded, room.raw[:size]
+        speeds = self.call('speed', 0), self.call('speed', 1)
+        assert self.board.speeds == speeds
+        assert self.board.powered == self.call('powered')
+        steps = self.call('steps', 0), self.call('steps', 1)
+        for mine, its in zip(self.board.counters, steps, strict=True):
+            # A pulse generator in 50 us ticks rounds otherwise than one without.
+            assert abs(mine - its) <= 3 + abs(its) * 1e-5
+        if ours[:1] == b'\x11' and len(ours) == len(theirs) == 32:
+            ours, theirs = ours[:8] + ours[16:], theirs[:8] + theirs[16:]
+        assert ours.hex() == theirs.hex()
+
+
+class Driver:
+    """A host that errs in every way, by dice."""
+
+    def __init__(self, pair, key, seed):
+        self.pair, self.key = pair, key
+        self.dice = random.Random(seed)
+        self.session, self.seq, self.epoch = 0, 0, 0
+        self.travel = 1000
+        self.session_key = b''
+        self.sent = [bytes(14)]
+
+    @property
+    def host_us(self):
+        return (self.pair.now - self.travel) % WRAP
+
+    def greet(self):
+        self.session = self.dice.randint(1, 255)
+        self.seq = 0
+        nonce, theirs = self.dice.randbytes(8), self.dice.randbytes(8)
+        if self.key:
+            hello = sign_hello(self.key, self.session, 0, self.host_us, nonce)
+            self.session_key = session_key(self.key, nonce, theirs)
+        else:
+            hello = Hello(self.session, 0, self.host_us)
+        self.pair.hello(hello, theirs)
+
+    def signed(self, frame):
+        if not self.key:
+            return encode(frame)
+        frame = frame._replace(host_us=self.host_us)
+        return encode(frame._replace(tag=frame_tag(frame, self.session_key, 0)))
+
+    def command(self):
+        dice = self.dice
+        flags = dice.choices((1, 0, 2, 4, 5, 3), (90, 3, 1, 4, 1, 1))[0]
+        self.seq = (self.seq + dice.choices((1, 0, -1, 2, 100, 200), (90, 2, 2, 3, 2, 1))[0]) % 256
+        session = dice.choices((self.session, dice.randrange(256)), (60, 1))[0]
+        top = dice.choice((1000, 8000, 32767))
+        still = dice.random() < 0.2 or flags == 4
+        left, right = (0 if still else dice.randint(-top, top) for _ in range(2))
+        ttl = dice.choice((20, 20, 20, 5, 0, 255))
+        stamp = self.host_us - dice.choices((0, 400_000, 90_000), (30, 1, 2))[0]
+        return self.signed(Command(session, self.seq, flags, ttl, left, right, stamp % WRAP))
+
+    def request(self):
+        dice = self.dice
+        number = dice.randrange(12)
+        session = dice.choices((self.session, dice.randrange(256)), (20, 1))[0]
+        match dice.randrange(6):
+            case 0:
+                return encode(ParamGet(session, dice.randrange(256), number))
+            case 1 | 2:
+                # Far enough from 1 that the microsteps of the next start are usual ones.
+                value = dice.choice((0, 1, 3, 16, 32, 100, 250, 5000, 9000, 30000, 10**6))
+                return self.signed(ParamSet(session, dice.randrange(256), number, value))
+            case 3:
+                return self.signed(Action(session, dice.randrange(4), dice.randrange(4)))
+            case _:
+                return encode(Poll(dice.randrange(256), dice.randrange(256), dice.randrange(3)))
+
+    def damaged(self):
+        dice = self.dice
+        data = bytearray(dice.choice(self.sent))
+        match dice.randrange(4):
+            case 0:
+                pass
+            case 1:
+                bit = dice.randrange(8 * len(data))
+                data[bit // 8] ^= 1 << bit % 8
+            case 2:
+                del data[dice.randrange(len(data)) :]
+                data = data or bytearray(1)
+            case 3:
+                data += dice.randbytes(dice.randrange(20))
+        return bytes(data)
+
+    def act(self):
+        pair, dice = self.pair, self.dice
+        match dice.choices(range(8), (60, 15, 6, 1, 1, 1, 1, 0.4))[0]:
+            case 0:
+                self.send(self.command())
+            case 1:
+                self.send(self.request())
+            case 2:
+                pair.packet(self.damaged())
+            case 3:
+                pair.press(dice.random() < 0.5)
+            case 4:
+                pair.imu(dice.random() < 0.7)
+            case 5:
+                self.greet()
+            case 6:
+                pair.run(dice.choice((300_000, 1_000_000, 6_000_000)))
+            case 7:
+                pair.reset()
+
+    def send(self, data):
+        self.sent.append(data)
+        self.pair.packet(data)
+
+
+@pytest.mark.parametrize('key', [b'', KEY], ids=['open', 'keyed'])
+@pytest.mark.parametrize('seed', range(12))
+def test_board_and_firmware_answer_alike(library, key, seed):
+    """600 random packets, requests, resets and silences; every answer and every ramp compared."""
+    pair = Pair(library, key)
+    driver = Driver(pair, key, seed)
+    pair.run(1000)
+    driver.greet()
+    moved, kinds = False, set()
+    for _ in range(600):
+        pair.run(driver.dice.choice((700, 1500, 5000, 20_000, 19_950)))
+        pair.compare()
+        driver.act()
+        moved |= any(pair.board.speeds)
+        kinds.add(pair.loaded[:1])
+    pair.run(1000)
+    pair.compare()
+    assert moved
+    assert kinds >= {b'\x11', b'\x12', b'\x13', b'\x14', b'\x15'}
+
+
+def test_a_session_that_silence_has_ended_leaves_the_same_behind(library):
+    """The emulator once told a nonce of zeros then, as if nobody had ever greeted it."""
+    pair = Pair(library, KEY)
+    pair.run(1000)
+    driver = Driver(pair, KEY, 1)
+    driver.greet()
+    pair.run(1_801_000_000)
+    assert pair.board.session == 0
+    pair.packet(encode(Poll(0, 0, 2)))
+    pair.run(1000)
+    pair.compare()
+    assert pair.loaded[-8:] != bytes(8)
+    driver.greet()
+    pair.run(1000)
+    pair.compare()
+    assert pair.board.session == driver.session
+
+
+# -- the robot's own USB --------------------------------------------------------------------------
+
+OTHER = bytes(range(0x20, 0x30))
+WRITTEN_US = 25 * CELL_US
+"""A key, both marks, and the count of starts that goes with a key."""
+
+
+@pytest.fixture
+def pair(library):
+    made = Pair(library)
+    made.run(1000)
+    return made
+
+
+def test_a_key_that_came_over_the_cable_keeps_strangers_out_at_once(pair):
+    assert pair.ask(Key(1)) == [KeyState(1, OK, NO_KEY, 0)]
+    assert pair.ask(Key(2, KEY)) == []
+    assert pair.call('writing')
+    assert pair.ask(Key(3, OTHER)) == [KeyState(3, BUSY, KEY_DAMAGED, 0)]
+    pair.packet(encode(Hello(0x5A, 0, pair.now)))
+    pair.run(WRITTEN_US)
+    (told,) = [decode_from_board(data) for data in FrameDecoder().feed(pair.heard())]
+    assert told == KeyState(2, OK, KEY_HELD, key_check(KEY))
+    pair.packet(encode(Hello(0x5A, 0, pair.now)))  # unsigned
+    pair.run(1000)
+    pair.compare()
+    assert pair.board.session == 0
+    driver = Driver(pair, KEY, 1)
+    driver.greet()
+    assert pair.board.session == driver.session
+    pair.reset()
+    pair.run(1000)
+    assert pair.ask(Key(4)) == [KeyState(4, OK, KEY_HELD, key_check(KEY))]
+    assert pair.ask(Key(5, bytes(16)), WRITTEN_US) == [KeyState(5, OK, NO_KEY, 0)]
+    driver = Driver(pair, b'', 1)
+    driver.greet()
+    pair.run(1000)
+    pair.compare()
+    assert pair.board.session == driver.session
+
+
+def test_no_key_is_taken_while_the_robot_moves_or_its_drivers_have_power(pair):
+    driver = Driver(pair, b'', 1)
+    driver.greet()
+    drive = Command(driver.session, 1, CommandFlag.ENABLE, 5, 3000, 3000, driver.host_us)
+    pair.packet(encode(drive))
+    assert pair.ask(Key(1, KEY), 10) == [KeyState(1, BUSY, NO_KEY, 0)]
+    pair.run(20_000)
+    assert pair.ask(Key(2, KEY)) == [KeyState(2, BUSY, NO_KEY, 0)]
+    pair.run(1_000_000)  # the time to live is over, the drivers hold the wheels
+    assert pair.board.speeds == (0, 0)
+    assert pair.ask(Key(3, KEY)) == [KeyState(3, BUSY, NO_KEY, 0)]
+    pair.packet(encode(Command(driver.session, 2, 0, 0, 0, 0, driver.host_us)))
+    pair.run(1000)
+    assert pair.ask(Key(4, KEY), WRITTEN_US) == [KeyState(4, OK, KEY_HELD, key_check(KEY))]
+    assert pair.board.session == 0
+    pair.compare()
+
+
+@pytest.mark.parametrize('before', [b'', KEY], ids=['none', 'another'])
+@pytest.mark.parametrize('after', [bytes(16), OTHER], ids=['none', 'one'])
+def test_a_supply_that_fails_leaves_the_old_key_the_new_one_or_a_locked_robot(
+    library, before, after
+):
+    """Power is cut at every cell; a robot that is locked moves nothing, and can be given a key."""
+    states = set()
+    for cut_us in range(CELL_US // 2, 22 * CELL_US, CELL_US):
+        pair = Pair(library, before)
+        pair.run(50_000)  # a robot with a key has counted its start
+        pair.ask(Key(1, after), cut_us)
+        pair.heard()
+        pair.reset()
+        pair.run(1000)
+        ((number, rc, state, check),) = pair.ask(Key(2))
+        assert (number, rc) == (2, OK)
+        kept = check == key_check(before) if before else state == NO_KEY
+        changed = check == key_check(after) if any(after) else state == NO_KEY
+        assert kept or changed or state == KEY_DAMAGED
+        states.add('kept' if kept else 'changed' if changed else 'damaged')
+        if state == KEY_DAMAGED:
+            driver = Driver(pair, OTHER, 1)
+            driver.greet()
+            pair.run(1000)
+            pair.compare()
+            assert pair.board.session == 0
+            pair.packet(encode(Command(0, 0, CommandFlag.ESTOP, 0, 0, 0, 0)))
+            pair.run(1000)
+            pair.compare()
+            assert pair.board.status & StatusFlag.ESTOP
+            told = KeyState(3, OK, KEY_HELD, key_check(KEY))
+            assert pair.ask(Key(3, KEY), WRITTEN_US) == [told]
+    assert states == (
+        {'kept', 'damaged', 'changed'} if before or any(after) else {'kept'} | states
+    )
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_no_damaged_frame_over_the_cable_changes_the_key(pair, seed):
+    dice = random.Random(seed)
+    whole = encode_frame(encode(Key(7, OTHER)))
+    for _ in range(300):
+        wire = bytearray(whole)
+        match dice.randrange(4):
+            case 0:
+                bit = dice.randrange(8 * len(wire))
+                wire[bit // 8] ^= 1 << bit % 8
+            case 1:
+                del wire[dice.randrange(len(wire) - 1)]
+            case 2:
+                wire.insert(dice.randrange(len(wire)), dice.randrange(256))
+            case 3:
+                wire = bytearray(encode_frame(encode(Key(7, OTHER))[: dice.randrange(3, 18)]))
+        if bytes(wire).strip(b'\0') == whole.strip(b'\0'):
+            continue
+        pair.usb(wire + b'\0')
+        pair.run(200)
+        pair.heard()
+    assert not pair.call('writing')
+    assert pair.ask(Key(1)) == [KeyState(1, OK, NO_KEY, 0)]
+    (pong,) = pair.ask(Ping(2, b'ping'))
+    assert isinstance(pong, Pong)
+    assert pong.crc_errors > 50
+
+
+def test_what_belongs_to_a_dongle_is_refused(pair):
+    for frame in (b'\x01\x00\x00\x01\x15', b'\x02\x00', b'\x05'):
+        pair.usb(encode_frame(frame))
+        (told,) = FrameDecoder().feed(pair.heard())
+        assert decode_from_board(told) == Refusal(1, frame[0])
+    pair.usb(encode_frame(b'\x04'))
+    assert decode_from_board(FrameDecoder().feed(pair.heard())[0]) == Refusal(2, 4)
+
+
+def test_a_cell_that_does_not_hold_is_told_and_locks_the_robot(library):
+    """The emulator's memory does not wear out: this is the firmware alone."""
+    for address in (8, 20, 25, 26):
+        pair = Pair(library)
+        pair.run(1000)
+        pair.call('wear', ctypes.c_uint8(address), ctypes.c_bool(True))
+        pair.call('usb', encode_frame(encode(Key(1, KEY))), ctypes.c_uint32(22))
+        pair.call('run', ctypes.c_uint32(WRITTEN_US))
+        room = ctypes.create_string_buffer(64)
+        size = pair.call('usb_take', room, ctypes.c_uint32(64))
+        (told,) = FrameDecoder().feed(room.raw[:size])
+        assert decode_from_board(told) == KeyState(1, FAILED, KEY_DAMAGED, 0)

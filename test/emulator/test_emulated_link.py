@@ -1,0 +1,410 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The link of the host against the emulated dongle and robot: driving, losing, stopping."""
+
+import math
+import random
+
+import pytest
+from support.emulator_bench import Bench, check_followed, sent_commands
+
+from t3mpc_ros.emulator.fault_injection import FAULT_KINDS
+from t3mpc_ros.radio.link.link_parameters import LinkParameters
+from t3mpc_ros.radio.link.port_actions import LinkState
+from t3mpc_ros.radio.protocol.codec import encode
+from t3mpc_ros.radio.protocol.frames import Command, CommandFlag
+
+KEY = bytes(range(16))
+STEP = math.tau / 3200
+
+
+def at_rest(bench):
+    """Let everything come to rest, and its measurement arrive."""
+    bench.release_controls()
+    bench.run(2.0)
+
+
+def test_sixty_seconds_at_fifty_hertz_the_counters_are_the_pulses_of_the_plant():
+    bench = Bench({'robot_clock': 0.005})
+    assert bench.connect() < 0.2
+    for second in range(60):
+        bench.drive(5.0 * math.sin(0.7 * second), 6.0 * math.cos(0.4 * second))
+        bench.run(1.0)
+        assert bench.link.reason(bench.now_ns) == ''
+    at_rest(bench)
+    right, left = bench.link.telemetry.angles
+    pulses = bench.plant.pulses
+    assert (round(left / STEP), round(right / STEP)) == pulses
+    assert bench.board.counters == pulses
+    assert min(map(abs, pulses)) > 1000
+    quality = bench.link.quality(bench.now_ns)
+    assert (quality.lost, quality.malformed, quality.sessions) == (0, 0, 1)
+    assert quality.cycles >= 3000
+    assert quality.robot.stale == quality.robot.duplicates == quality.robot.bad_session == 0
+    check_followed(bench)
+
+
+def test_a_round_trip_takes_as_long_as_line_radio_and_gap_do():
+    """26 and 44 bytes at 20 us, 0.77 and 0.69 ms of radio, 1.7 ms of gap, 0.47 ms of firmware."""
+    bench = Bench()
+    bench.connect()
+    bench.drive(3.0, 3.0)
+    bench.run(5.0)
+    quality = bench.link.quality(bench.now_ns)
+    # COBS may need no byte more than one, so the length never varies.
+    assert quality.round_trip_median == pytest.approx(5.04e-3, abs=0.02e-3)
+    assert quality.round_trip_p99 == pytest.approx(quality.round_trip_median, abs=1e-6)
+    # Sampled when the answer to the CMD of the same cycle is loaded, not one cycle before.
+    assert 60 <= bench.link.telemetry.raw.age <= 80
+
+
+@pytest.mark.parametrize('loss, most', [(0.1, 0.005), (0.3, 0.10), (0.5, 0.45)])
+def test_a_whole_cycle_is_lost_as_seldom_as_four_retries_allow(loss, most):
+    """Whole: the command was taken, and the state that it led to came back with it."""
+    bench = Bench()
+    bench.inject('loss', math.inf, loss)
+    bench.run(20.0, lambda: bench.link.phase is LinkState.RUN)
+    bench.drive(4.0, 4.0)
+    bench.run(60.0)
+    quality = bench.link.quality(bench.now_ns)
+    # Either exchange fails with its fifth try; a CMD that came twice may have fetched the state.
+    one = (1.0 - (1.0 - loss) ** 2) ** 5
+    either = 1.0 - (1.0 - one) ** 2
+    spread = 4.0 * math.sqrt(either * (1.0 - either) / quality.cycles)
+    share = quality.lost / quality.cycles
+    print(f'\nloss {loss}: {share:.2%} of {quality.cycles} cycles ({one:.2%} to {either:.2%})')
+    print(f'round trip 99 %: {1e3 * quality.round_trip_p99:.1f} ms')
+    assert one - spread <= share <= either + spread
+    assert share <= most
+    assert quality.round_trip_p99 < 0.0115
+    check_followed(bench)
+
+
+def test_only_up_or_only_down_loses_less():
+    lost = {}
+    for name in ('loss_down', 'loss_up'):
+        bench = Bench()
+        bench.connect()
+        bench.inject(name, math.inf, 0.3)
+        bench.drive(4.0, 4.0)
+        bench.run(20.0)
+        quality = bench.link.quality(bench.now_ns)
+        lost[name] = quality.lost
+        assert quality.lost / quality.cycles < 0.03
+        # What came again because its acknowledgement was lost is acknowledged, not obeyed twice.
+        assert quality.robot.duplicates == 0
+        check_followed(bench)
+
+
+# -- stopping -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    'fault', ['silence', 'jam', 'stall', 'radio_dead', 'dongle_reset', 'close_port', 'button']
+)
+@pytest.mark.parametrize('speed, deceleration', [(7.0, 30.0), (10.0, 50.0)])
+def test_wheels_rest_within_045_s_of_the_last_command(fault, speed, deceleration):
+    """Whatever keeps commands away; silence is also what a killed host leaves behind."""
+    link = LinkParameters.from_dict({'robot.deceleration': deceleration})
+    bench = Bench(link=link)
+    bench.connect()
+    bench.drive(speed, speed)
+    bench.run(2.0)
+    assert bench.plant.wheels.right == pytest.approx(speed, abs=0.3)
+    bench.inject(fault, 3.0)
+    rest_ns = []
+
+    def watch():
+        still = bench.board.speeds == (0, 0)
+        if still and max(map(abs, bench.plant.wheels)) < 0.2:
+            rest_ns.append(bench.now_ns)
+
+    bench.each = watch
+    bench.run(1.0)
+    last_ns = bench.followed[-1][0]
+    assert rest_ns, 'the wheels never came to rest'
+    assert rest_ns[0] - last_ns <= 0.45e9
+    assert rest_ns[-1] == bench.now_ns
+
+
+def test_a_reset_stops_the_pulses_at_once_and_the_wheels_roll_out():
+    bench = Bench()
+    bench.connect()
+    bench.drive(7.0, 7.0)
+    bench.run(2.0)
+    bench.inject('robot_reset')
+    bench.run(0.01)
+    assert not bench.emulator.powered
+    bench.release_controls()
+    bench.run(1.0)
+    assert bench.board.speeds == (0, 0)
+    assert not bench.board.powered or bench.board.session
+    bench.run(1.0)
+    assert max(map(abs, bench.plant.wheels)) < 0.2
+
+
+def test_a_shut_down_link_leaves_the_robot_at_rest_without_drives():
+    bench = Bench()
+    bench.connect()
+    bench.drive(7.0, -7.0)
+    bench.run(1.0)
+    bench.link.shut_down()
+    bench.run(2.0, lambda: bench.link.phase is LinkState.DONE)
+    bench.run(0.1)
+    assert bench.board.speeds == (0, 0)
+    assert not bench.board.powered
+
+
+def test_a_burst_that_was_held_for_a_second_moves_nothing():
+    """Fifteen commands on their way for 1 s, all at once: each is refused, the wheels stand."""
+    bench = Bench()
+    bench.connect()
+    bench.run(1.0)
+    session = bench.board.session
+    held_us = bench.now_ns // 1000
+    bench.run(1.0)
+    bench.inject('silence')  # so that no prompt command comes between
+    bench.run(1.0)
+    before = bench.board.counters
+    assert not bench.followed or bench.followed[-1][1].left == 0
+    for index in range(15):
+        seq = (bench.link.telemetry.raw.seq + 1 + index) % 256
+        host_us = (held_us + 1_000_000 + 20_000 * index) % (1 << 32)
+        bench.board.packet(encode(Command(session, seq, 1, 20, 8000, 8000, host_us)))
+        bench.run(0.001)
+    bench.run(0.5)
+    assert bench.board.counters == before
+    bench.emulator.end('silence')
+    bench.run(2.0, lambda: bench.link.phase is LinkState.RUN)
+    bench.run(2.0)
+    assert bench.link.quality(bench.now_ns).robot.stale == 15
+
+
+def test_a_line_that_stalls_for_a_second_lets_nothing_old_through():
+    for begin in (0.5, 0.503, 0.507, 0.511, 0.515):
+        bench = Bench()
+        bench.connect()
+        bench.drive(6.0, 6.0)
+        bench.run(begin)
+        bench.inject('stall', 1.0)
+        bench.run(6.0)
+        check_followed(bench)
+        assert bench.link.reason(bench.now_ns) == ''
+        assert bench.now_ns - bench.followed[-1][0] < 30_000_000
+
+
+# -- every fault ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('key', [b'', KEY], ids=['open', 'keyed'])
+@pytest.mark.parametrize('name', [kind.name for kind in FAULT_KINDS])
+def test_the_link_recovers_from_every_fault(name, key):
+    bench = Bench(key=key)
+    bench.connect()
+    bench.drive(4.0, 4.0)
+    bench.run(1.0)
+    bench.inject(name, 1.5)
+    bench.run(1.6)
+    if bench.link.telemetry.status.estop:
+        bench.link.release_estop(bench.now_ns)
+    bench.run(8.0)
+    assert bench.link.reason(bench.now_ns) == ''
+    assert bench.plant.wheels.right == pytest.approx(4.0, abs=0.3)
+    check_followed(bench)
+
+
+@pytest.mark.parametrize('key', [b'', KEY], ids=['open', 'keyed'])
+@pytest.mark.parametrize('seed', range(8))
+def test_no_wrong_and_no_old_command_is_ever_followed(seed, key):
+    """A fault every half second for half a minute, most of them overlapping others."""
+    dice = random.Random(seed)
+    bench = Bench({'robot_clock': dice.uniform(-0.005, 0.005)}, key=key, seed=seed)
+    bench.connect()
+    names = [kind.name for kind in FAULT_KINDS]
+    # After these it takes seconds until there are commands again that could be wrong.
+    slow = ('dongle_reset', 'close_port', 'move_link', 'radio_dead', 'robot_reset', 'button')
+    weights = [0.1 if name in slow else 1.0 for name in names]
+    for _ in range(60):
+        bench.drive(dice.uniform(-9.0, 9.0), dice.uniform(-9.0, 9.0))
+        bench.inject(dice.choices(names, weights)[0], dice.uniform(0.02, 0.8))
+        bench.run(0.5)
+        bench.link.release_estop(bench.now_ns)
+    check_followed(bench)
+    assert len(bench.followed) > 200
+    bench.run(3.0)
+    bench.link.release_estop(bench.now_ns)
+    bench.run(8.0)
+    assert bench.link.reason(bench.now_ns) == ''
+
+
+# -- what the robot tells -------------------------------------------------------------------------
+
+
+def test_counters_go_on_over_a_restart_of_the_robot():
+    bench = Bench()
+    bench.connect()
+    bench.drive(5.0, 5.0)
+    bench.run(2.0)
+    at_rest(bench)
+    before = bench.link.telemetry.angles
+    bench.inject('robot_reset')
+    bench.run(3.0)
+    bench.drive(5.0, 5.0)
+    bench.run(2.0)
+    at_rest(bench)
+    assert bench.link.quality(bench.now_ns).robot_resets == 1
+    turned = bench.link.telemetry.angles.right - before.right
+    assert round(turned / STEP) == bench.plant.pulses[1] > 3000
+
+
+def test_an_inertial_sensor_that_is_gone_is_told_and_comes_back():
+    bench = Bench()
+    bench.connect()
+    bench.run(1.0)
+    assert bench.link.telemetry.imu is not None
+    bench.inject('imu_absent', 1.0)
+    bench.run(0.5)
+    assert bench.link.telemetry.imu is None
+    assert bench.link.telemetry.status.imu_fault
+    bench.run(1.0)
+    assert bench.link.telemetry.imu is not None
+
+
+def test_gyro_ranges_and_battery_are_those_of_the_plant():
+    bench = Bench({'twin.world': 'corridor', 'twin.imu.gyro_offset': 0.0})
+    bench.connect()
+    bench.drive(3.0, -3.0)
+    bench.run(3.0)
+    telemetry = bench.link.telemetry
+    # Turning on the spot: 6 rad/s between wheels of 35 mm on a track of 147 mm.
+    assert telemetry.imu.angular == pytest.approx(6.0 * 0.035 / 0.147, rel=0.05)
+    assert any(math.isfinite(distance) for distance in telemetry.ranges)
+    assert 11.0 < bench.link.battery.voltage < 13.0
+    plain = Bench()
+    plain.connect()
+    plain.run(1.0)
+    assert plain.link.telemetry.ranges == (math.inf,) * 8
+
+
+def test_a_robot_on_another_channel_is_not_found():
+    bench = Bench({'channel': 83})
+    bench.run(2.0)
+    assert 'does not answer' in bench.link.reason(bench.now_ns)
+    assert bench.link.phase is LinkState.HELLO
+
+
+def test_an_empty_battery_takes_the_board_down():
+    bench = Bench({'twin.battery.charge': 0.0})
+    bench.run(2.0)
+    assert not bench.emulator.powered
+    assert 'does not answer' in bench.link.reason(bench.now_ns)
+
+
+def test_the_same_seed_gives_the_same_bytes():
+    def bytes_heard():
+        bench = Bench({'twin.world': 'room'}, seed=4)
+        bench.inject('loss', math.inf, 0.2)
+        bench.inject('flip_bits')
+        bench.run(2.0)
+        bench.drive(4.0, 2.0)
+        bench.run(3.0)
+        return bench.written, bench.followed, bench.link.telemetry
+
+    assert bytes_heard() == bytes_heard()
+
+
+def test_wheels_mounted_the_other_way_are_turned_back_and_still_count_forward():
+    parameters = LinkParameters.from_dict({'robot.invert_left': True, 'robot.invert_right': True})
+    bench = Bench(link=parameters)
+    bench.connect()
+    bench.drive(4.0, 4.0)
+    bench.run(2.0)
+    assert bench.plant.wheels.right == pytest.approx(-4.0, abs=0.3)
+    at_rest(bench)
+    right = round(bench.link.telemetry.angles.right / STEP)
+    assert right == -bench.plant.pulses[1] > 3000
+
+
+# -- emergency stop -------------------------------------------------------------------------------
+
+
+def test_the_button_latches_until_the_host_releases_and_it_is_let_go():
+    bench = Bench()
+    bench.connect()
+    bench.drive(5.0, 5.0)
+    bench.run(1.0)
+    bench.inject('button')
+    bench.run(1.0)
+    assert bench.link.telemetry.status.estop
+    bench.link.release_estop(bench.now_ns)
+    bench.run(2.0)
+    assert 'button' in bench.link.reason(bench.now_ns)
+    bench.emulator.end('button')
+    bench.link.release_estop(bench.now_ns)
+    bench.run(2.0)
+    assert bench.link.reason(bench.now_ns) == ''
+
+
+def test_a_host_with_another_key_cannot_drive_but_can_stop():
+    bench = Bench(key=KEY, robot_key=bytes(16))
+    bench.drive(5.0, 5.0)
+    bench.run(1.0)
+    assert 'keys differ' in bench.link.reason(bench.now_ns)
+    assert bench.plant.pulses == (0, 0)
+    bench.link.latch_estop('stop it')
+    bench.run(0.2)
+    assert bench.board.status & 4
+    assert not bench.followed
+
+
+def test_a_stranger_without_the_key_can_stop_a_robot_that_drives():
+    bench = Bench(key=KEY)
+    bench.connect()
+    bench.drive(5.0, 5.0)
+    bench.run(1.0)
+    for flags in (CommandFlag.ENABLE, CommandFlag.ESTOP_CLEAR):
+        bench.board.packet(encode(Command(9, 200, flags, 20, -5000, -5000, 0)))
+    bench.run(0.5)
+    assert bench.link.reason(bench.now_ns) == ''
+    bench.board.packet(encode(Command(9, 200, CommandFlag.ESTOP, 0, 0, 0, 0)))
+    bench.run(0.5)
+    assert bench.board.speeds == (0, 0)
+    assert bench.link.telemetry.status.estop
+    bench.link.release_estop(bench.now_ns)
+    bench.run(1.0)
+    assert bench.link.reason(bench.now_ns) == ''
+    check_followed(bench)
+
+
+def test_who_has_heard_everything_but_the_key_moves_nothing():
+    """Replays, flipped bits, forged tags and stamps, between the packets of the host."""
+    dice = random.Random(3)
+    bench = Bench(key=KEY)
+    bench.connect()
+    bench.drive(4.0, -3.0)
+    tried = 0
+    for _ in range(100):
+        bench.run(0.05)
+        heard = [encode(command) for command in sent_commands(bench)]
+        for _ in range(30):
+            data = bytearray(dice.choice(heard))
+            match dice.randrange(5):
+                case 1 | 2:
+                    for _ in range(dice.choice((1, 1, 2, 3))):
+                        bit = dice.randrange(8 * len(data))
+                        data[bit // 8] ^= 1 << bit % 8
+                case 3:
+                    data[-8:] = dice.randbytes(8)
+                case 4:
+                    data[10:14] = ((bench.now_ns // 1000) & 0xFFFFFFFF).to_bytes(4, 'little')
+                    data[2] = (data[2] + dice.randrange(128)) % 256
+            if data[0] == 0x11 and data[3] & CommandFlag.ESTOP:
+                continue  # stopping is always allowed
+            bench.board.packet(bytes(data))
+            tried += 1
+    bench.run(0.1)
+    assert tried > 2000
+    check_followed(bench)
+    assert bench.link.reason(bench.now_ns) == ''
+    # Those of the host were all taken in spite of it.
+    assert len(bench.followed) > 0.95 * len(sent_commands(bench))

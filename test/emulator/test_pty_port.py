@@ -1,0 +1,275 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``board_emulator`` as a process on the wall clock, and the pseudo terminal it stands behind."""
+
+import os
+from pathlib import Path
+import re
+import select
+import signal
+import subprocess
+import sys
+import termios
+import time
+
+import pytest
+
+from t3mpc_ros.cli import emulator
+from t3mpc_ros.emulator.pty_port import PtyPort, PtyPortError
+from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.radio.link.link import Link
+from t3mpc_ros.radio.link.link_parameters import LinkParameters
+from t3mpc_ros.radio.link.port_actions import Close, LinkState, Open, Wait, Write
+from t3mpc_ros.radio.serial_port import PortError, SerialPort
+from t3mpc_ros.robot.interface import RobotCommand
+
+ROOT = Path(__file__).resolve().parents[2]
+KEY = bytes(range(16))
+
+
+class Host:
+    """The link over the real port on the wall clock."""
+
+    def __init__(self, path, key=b''):
+        self.path = str(path)
+        self.link = Link(LinkParameters(), key)
+        self.port = None
+        self.wheels = None
+
+    def run(self, seconds, until=None):
+        """Let time pass; return whether ``until`` held."""
+        end = time.monotonic() + seconds
+        received = b''
+        while time.monotonic() < end:
+            now = time.monotonic_ns()
+            if self.wheels is not None:
+                self.link.command(RobotCommand(self.wheels, now), now)
+            wake = now
+            deeds = self.link.step(now, received)
+            received = b''
+            for deed in deeds:
+                wake = self._do(deed, wake)
+            if until is not None and until():
+                return True
+            received = self._read(min((wake - time.monotonic_ns()) / 1e9, 0.02))
+        return until is None
+
+    def _do(self, deed, wake):
+        now = time.monotonic_ns()
+        try:
+            if isinstance(deed, Wait):
+                return deed.until_ns
+            if isinstance(deed, Open):
+                self.port = SerialPort(self.path)
+                self.link.opened(now)
+            elif isinstance(deed, Close):
+                self.close()
+            elif isinstance(deed, Write) and self.port is not None:
+                self.port.write(deed.data)
+        except PortError as error:
+            self.port = None
+            self.link.failed(str(error), error.absent, now)
+        return now
+
+    def _read(self, seconds):
+        if self.port is None:
+            time.sleep(max(seconds, 0.001))
+            return b''
+        try:
+            select.select([self.port.fileno()], [], [], max(seconds, 0.0))
+            return self.port.read()
+        except PortError as error:
+            self.port = None
+            self.link.failed(str(error), error.absent, time.monotonic_ns())
+            return b''
+
+    def close(self):
+        if self.port is not None:
+            self.port.close()
+            self.port = None
+
+
+class Process:
+    def __init__(self, *arguments):
+        command = [sys.executable, '-m', 't3mpc_ros.cli.emulator', *map(str, arguments)]
+        environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
+        self.child = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+        )
+
+    def ready(self):
+        """Return the line that says where it is."""
+        for line in self.child.stdout:
+            if 'dongle and robot' in line:
+                return line
+        raise AssertionError(self.child.stderr.read())
+
+    def stop(self, number):
+        """Return the exit code and what it said last."""
+        self.child.send_signal(number)
+        said, wrong = self.child.communicate(timeout=20)
+        assert wrong == ''
+        return self.child.returncode, said
+
+
+@pytest.fixture
+def start():
+    started = []
+
+    def run(*arguments):
+        started.append(Process(*arguments))
+        return started[-1]
+
+    yield run
+    for process in started:
+        if process.child.poll() is None:
+            process.child.kill()
+            process.child.communicate()
+
+
+@pytest.mark.slow
+def test_a_host_drives_the_process_over_the_real_port_with_a_key_and_a_replug(start, tmp_path):
+    key_file = tmp_path / 'key'
+    key_file.write_text(KEY.hex())
+    key_file.chmod(0o600)
+    path = tmp_path / 'dongle'
+    # On a busy machine a second of the host need not be one of the emulator: faults by its clock.
+    process = start('--link', path, '--key', key_file, '--loss', '0.05', '--fault', 'close_port:4')
+    said = process.ready()
+    assert str(path) in said
+    assert f'kill {process.child.pid}' in said
+    host = Host(path, KEY)
+    link = host.link
+    assert host.run(10.0, lambda: link.phase is LinkState.RUN)
+    host.wheels = WheelSpeeds(4.0, 4.0)
+    assert host.run(5.0, lambda: link.telemetry is not None and link.telemetry.wheels.right > 3.5)
+    assert link.authenticated
+    assert host.run(10.0, lambda: link.phase is LinkState.CLOSED)
+    assert host.run(15.0, lambda: link.phase is LinkState.RUN)
+    link.shut_down()
+    assert host.run(5.0, lambda: link.phase is LinkState.DONE)
+    host.close()
+    code, said = process.stop(signal.SIGTERM)
+    assert code == 0
+    *news, last = said.splitlines()
+    assert last == 'board_emulator: stopped'
+    # Once when the dongle was pulled out, and for the end if the wheels had begun to turn again.
+    took = [re.search('at rest ([0-9.]+) s after the last command', line)[1] for line in news]
+    assert max(map(float, took)) <= 0.45
+    assert not path.is_symlink()
+
+
+@pytest.mark.slow
+def test_ctrl_c_takes_the_path_away(start, tmp_path):
+    path = tmp_path / 'dongle'
+    process = start('--link', path)
+    process.ready()
+    assert path.is_symlink()
+    assert process.stop(signal.SIGINT)[0] == 0
+    assert not path.is_symlink()
+
+
+def test_the_terminal_is_raw_before_the_path_leads_to_it(tmp_path):
+    """A cooked one would send back what the host writes, and turn carriage returns."""
+    port = PtyPort(tmp_path / 'dongle')
+    assert port.wait(0.0) is None
+    client = os.open(tmp_path / 'dongle', os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    assert not termios.tcgetattr(client)[3] & (termios.ECHO | termios.ICANON)
+    everything = bytes(range(256))
+    os.write(client, everything)
+    assert port.wait(1.0) == everything
+    port.write(everything)
+    select.select([client], [], [], 1.0)
+    assert os.read(client, 1000) == everything
+    os.close(client)
+    assert port.wait(0.0) is None
+    port.close()
+    assert not (tmp_path / 'dongle').is_symlink()
+
+
+def test_a_new_terminal_hangs_up_the_old_one_and_moves_the_path(tmp_path):
+    path = tmp_path / 'dongle'
+    port = PtyPort(path)
+    old = SerialPort(str(path))
+    before = os.readlink(path)
+    port.open()
+    assert os.readlink(path) != before
+    with pytest.raises(PortError):
+        old.write(b'x')
+    new = SerialPort(str(path))
+    new.write(b'hello')
+    assert port.wait(1.0) == b'hello'
+    new.close()
+    port.close()
+
+
+def test_a_client_that_does_not_read_blocks_nothing(tmp_path):
+    port = PtyPort(tmp_path / 'dongle')
+    client = SerialPort(str(tmp_path / 'dongle'))
+    for _ in range(100):
+        port.write(bytes(4096))
+    client.close()
+    port.close()
+
+
+def test_a_path_that_leads_elsewhere_by_now_is_left_alone(tmp_path):
+    path = tmp_path / 'dongle'
+    first, second = PtyPort(path), PtyPort(path)
+    first.close()
+    assert path.is_symlink()
+    second.close()
+    assert not path.is_symlink()
+
+
+def test_no_file_is_ever_replaced(tmp_path):
+    path = tmp_path / 'thesis'
+    path.write_text('chapter 1')
+    with pytest.raises(PtyPortError, match='no symbolic link'):
+        PtyPort(path)
+    assert path.read_text() == 'chapter 1'
+    with pytest.raises(PtyPortError, match='No such file'):
+        PtyPort(tmp_path / 'nowhere' / 'dongle')
+
+
+@pytest.mark.parametrize(
+    'arguments, words',
+    [
+        (['--fault', 'jamm:1'], 'did you mean jam'),
+        (['--set', 'twin.nothing=1'], 'twin.nothing'),
+        (['--set', 'robot_clock'], 'NAME=VALUE'),
+        (['--set', 'robot_clock=0.5'], 'robot_clock'),
+        (['--set', 'twin.motor.microsteps=32'], 'microsteps'),
+        (['--world', 'atlantis'], 'atlantis'),
+        (['--key', 'no/such/file'], 'no/such/file'),
+    ],
+)
+def test_what_cannot_be_done_is_said_before_anything_starts(arguments, words, tmp_path, capsys):
+    path = tmp_path / 'dongle'
+    assert emulator.main(['--link', str(path), *arguments]) == 2
+    assert words in capsys.readouterr().err
+    assert not path.is_symlink()
+
+
+def test_a_robot_link_that_cannot_be_made_takes_the_other_one_away(tmp_path, capsys):
+    thesis, path = tmp_path / 'thesis', tmp_path / 'dongle'
+    thesis.write_text('chapter 1')
+    assert emulator.main(['--link', str(path), '--robot-link', str(thesis)]) == 2
+    assert 'no symbolic link' in capsys.readouterr().err
+    assert not path.is_symlink()
+    assert thesis.read_text() == 'chapter 1'
+
+
+@pytest.mark.parametrize('arguments', [['--loss', '2'], ['--speed', '0'], ['--seed', 'x']])
+def test_a_number_out_of_range_is_a_usage_error(arguments, tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        emulator.main(['--link', str(tmp_path / 'dongle'), *arguments])
+    assert ended.value.code == 2
+    capsys.readouterr()
+
+
+def test_help_names_every_fault(capsys):
+    with pytest.raises(SystemExit):
+        emulator.main(['--help'])
+    said = capsys.readouterr().out
+    for kind in emulator.FAULT_KINDS:
+        assert f'  {kind.name} ' in said

@@ -1,0 +1,554 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``bag report`` of bags that this package did not make, and of links, delays and long runs."""
+
+from dataclasses import astuple
+import math
+import re
+import sqlite3
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+import yaml
+
+from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.cli.bag import bag_main
+from t3mpc_ros.cli.main import main as lab
+from t3mpc_ros.evaluation.bag_report.link_history import link_metrics
+from t3mpc_ros.evaluation.bag_report.report_page import write_report
+from t3mpc_ros.evaluation.bag_report.response import (
+    fit_response,
+    motion_summary,
+    predicted,
+    roughness,
+    smooth,
+)
+from t3mpc_ros.evaluation.bag_report.run_data import BY_BODY, BY_WHEEL, Series, load_run
+from t3mpc_ros.evaluation.bag_report.topic_roles import (
+    COMMAND,
+    ODOMETRY,
+    REFERENCE,
+    ReportError,
+    ReportOptions,
+)
+from t3mpc_ros.evaluation.plotting import every_nth
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+TYPES = STORE.types
+START = 1_700_000_000_000_000_000
+ODOM, TWIST = 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/Twist'
+STAMPED, SCAN = 'geometry_msgs/msg/TwistStamped', 'std_msgs/msg/String'
+DEAD_TIME, LAG, GAIN = 0.12, 0.18, 0.9
+
+
+# -- bags of other robots -----------------------------------------------------------------------
+
+
+def header(stamp_ns, frame):
+    stamp = TYPES['builtin_interfaces/msg/Time'](stamp_ns // 10**9, stamp_ns % 10**9)
+    return TYPES['std_msgs/msg/Header'](stamp, frame)
+
+
+def twist(linear, angular):
+    vector = TYPES['geometry_msgs/msg/Vector3']
+    return TYPES[TWIST](vector(linear, 0.0, 0.0), vector(0.0, 0.0, angular))
+
+
+def odometry(stamp_ns, linear, angular, pose):
+    x, y, yaw = pose
+    place = TYPES['geometry_msgs/msg/Pose'](
+        TYPES['geometry_msgs/msg/Point'](x, y, 0.0),
+        TYPES['geometry_msgs/msg/Quaternion'](0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)),
+    )
+    return TYPES[ODOM](
+        header(stamp_ns, 'odom'),
+        'base_footprint',
+        TYPES['geometry_msgs/msg/PoseWithCovariance'](place, np.zeros(36)),
+        TYPES['geometry_msgs/msg/TwistWithCovariance'](twist(linear, angular), np.zeros(36)),
+    )
+
+
+def drive(duration=40.0, command_rate=10.0, odom_rate=25.0, seed=0):
+    """Return (time, command) and (time, speed, pose) of a robot that is slow to answer."""
+    rng = np.random.default_rng(seed)
+    step = 0.002
+    count = round(duration / step)
+    told = np.zeros((count, 2))
+    for row in range(0, count, round(2.0 / step)):
+        told[row : row + round(2.0 / step)] = rng.uniform(-1.0, 1.0, 2) * (0.22, 1.2)
+    told[: round(1.0 / step)] = 0.0
+    told[round(20.0 / step) : round(23.0 / step)] = 0.0
+    every = round(1.0 / command_rate / step)
+    held = told[np.arange(count) // every * every]
+    late = round(DEAD_TIME / step)
+    acting = np.vstack([np.zeros((late, 2)), held])[:count]
+    keep = math.exp(-step / LAG)
+    speed, pose = np.zeros((count, 2)), np.zeros((count, 3))
+    for k in range(1, count):
+        speed[k] = keep * speed[k - 1] + (1.0 - keep) * GAIN * acting[k - 1]
+        x, y, yaw = pose[k - 1]
+        v, w = speed[k] * step
+        pose[k] = x + v * math.cos(yaw), y + v * math.sin(yaw), yaw + w
+    time = step * np.arange(count)
+    odom = np.arange(0, count, round(1.0 / odom_rate / step))
+    return (time[::every], held[::every]), (time[odom], speed[odom], pose[odom])
+
+
+def rows_of(names=('/odom', '/cmd_vel'), stamped=False, space='', **given):
+    """Return (receipt in s, topic, message) of a drive, under a robot's own names."""
+    (told_at, told), (seen_at, seen, poses) = drive(**given)
+    rows = []
+    for t, speed, pose in zip(seen_at, seen, poses, strict=True):
+        stamp = START + round(t * 1e9)
+        message = odometry(stamp, *map(float, speed), tuple(map(float, pose)))
+        rows.append((t + 0.001, space + names[0], message))
+    for t, command in zip(told_at, told, strict=True):
+        message = twist(*map(float, command))
+        if stamped:
+            message = TYPES[STAMPED](header(START + round(t * 1e9), 'base_link'), message)
+        rows.append((t, space + names[1], message))
+    return sorted(rows, key=lambda row: row[0])
+
+
+def write(folder, rows, plugin=StoragePlugin.MCAP):
+    writer = Writer(folder, version=8, storage_plugin=plugin)
+    writer.open()
+    connections = {}
+    for received, topic, message in rows:
+        kind = message.__msgtype__
+        if topic not in connections:
+            connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
+        data = STORE.serialize_cdr(message, kind)
+        writer.write(connections[topic], START + round(received * 1e9), data)
+    writer.close()
+    return folder
+
+
+def humble(folder, rows):
+    """Write a bag as ROS 2 Humble does: sqlite3 without definitions, metadata of version 5."""
+    folder.mkdir()
+    kinds = {topic: message.__msgtype__ for _, topic, message in rows}
+    base = sqlite3.connect(folder / 'run_0.db3')
+    base.executescript(
+        'CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL);'
+        "INSERT INTO schema VALUES (3, 'humble');"
+        'CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL,'
+        ' serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL);'
+        'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL,'
+        ' timestamp INTEGER NOT NULL, data BLOB NOT NULL);'
+    )
+    numbers = {topic: i + 1 for i, topic in enumerate(kinds)}
+    for topic, number in numbers.items():
+        row = (number, topic, kinds[topic], 'cdr', '')
+        base.execute('INSERT INTO topics VALUES (?, ?, ?, ?, ?)', row)
+    for received, topic, message in rows:
+        data = bytes(STORE.serialize_cdr(message, kinds[topic]))
+        row = (numbers[topic], START + round(received * 1e9), data)
+        base.execute('INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)', row)
+    base.commit()
+    base.close()
+    write_old_metadata(folder, rows, kinds, 'sqlite3', 'run_0.db3')
+    return folder
+
+
+def write_old_metadata(folder, rows, kinds, storage, file):
+    times = [START + round(row[0] * 1e9) for row in rows]
+    span = {'nanoseconds': max(times) - min(times)}
+    start = {'nanoseconds_since_epoch': min(times)}
+    topics = [
+        {
+            'topic_metadata': {
+                'name': topic,
+                'type': kind,
+                'serialization_format': 'cdr',
+                'offered_qos_profiles': '',
+            },
+            'message_count': sum(row[1] == topic for row in rows),
+        }
+        for topic, kind in kinds.items()
+    ]
+    entry = {'path': file, 'starting_time': start, 'duration': span, 'message_count': len(rows)}
+    content = {
+        'version': 5,
+        'storage_identifier': storage,
+        'duration': span,
+        'starting_time': start,
+        'message_count': len(rows),
+        'topics_with_message_count': topics,
+        'compression_format': '',
+        'compression_mode': '',
+        'relative_file_paths': [file],
+        'files': [entry],
+    }
+    text = yaml.safe_dump({'rosbag2_bagfile_information': content})
+    (folder / 'metadata.yaml').write_text(text)
+
+
+@pytest.fixture(scope='module')
+def rows():
+    return rows_of()
+
+
+def run_of(folder, wanted=None):
+    with open_bag(folder) as recording:
+        return load_run(recording, wanted)
+
+
+def text_of(folder, capsys, *options):
+    """Return what the program prints and the page says."""
+    assert bag_main(['report', str(folder), '--output', str(folder.parent / 'out'), *options]) == 0
+    page = (folder.parent / 'out' / 'report.html').read_text(encoding='utf-8')
+    return capsys.readouterr().out, page
+
+
+# -- robots that are not ours -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'humble', 'humble mcap'])
+def test_a_bag_of_another_robot_has_a_report(rows, tmp_path, capsys, kind):
+    """As a TurtleBot's: m/s and rad/s, since nobody says how large its wheels are."""
+    folder = tmp_path / 'bag'
+    if kind == 'humble':
+        humble(folder, rows)
+    else:
+        plugin = StoragePlugin.SQLITE3 if kind == 'sqlite3' else StoragePlugin.MCAP
+        write(folder, rows, plugin)
+    if kind == 'humble mcap':
+        kinds = {topic: message.__msgtype__ for _, topic, message in rows}
+        (file,) = folder.glob('*.mcap')
+        write_old_metadata(folder, rows, kinds, 'mcap', file.name)
+    said, page = text_of(folder, capsys)
+    assert 'RMSE forward/turning while driven not measured' in said
+    assert re.search(r'answers after forward (29|30|31)\d ms, turning (29|30|31)\d ms;', said)
+    found = {path.stem for path in (tmp_path / 'out' / 'figures').iterdir()}
+    assert found == {'control', 'response', 'acceleration', 'path', 'timing'}
+    assert 'does not say how large the wheels are' in page
+    assert 'Not in the bag, or without a message: reference.' in page
+    assert 'controller/' not in page
+    assert 'wheel' not in page.split('<h2>From command')[1].split('<figure>')[0]
+
+
+def test_one_file_is_a_bag_too(rows, tmp_path, capsys):
+    folder = write(tmp_path / 'bag', rows[:300])
+    (file,) = folder.glob('*.mcap')
+    assert bag_main(['report', str(file), '--output', str(tmp_path / 'out')]) == 0
+    assert 'out/report.html' in capsys.readouterr().out
+
+
+def test_dead_time_lag_and_gain_of_the_robot_are_found(rows, tmp_path):
+    run = run_of(write(tmp_path / 'bag', rows))
+    assert run.channels == BY_BODY
+    for channel in run.channels:
+        fit = fit_response(run.motions[COMMAND], run.motions[ODOMETRY], channel.name)
+        assert fit.dead_time == pytest.approx(DEAD_TIME, abs=0.03)
+        assert fit.lag == pytest.approx(LAG, abs=0.04)
+        assert fit.dead_time + fit.lag == pytest.approx(DEAD_TIME + LAG, abs=0.02)
+        assert fit.gain == pytest.approx(GAIN, rel=0.02)
+        assert fit.explained > 0.99
+        time = np.arange(5.0, 15.0, 0.005)
+        measured = np.interp(time, run.motions[ODOMETRY].time, run.motions[ODOMETRY][channel.name])
+        missed = predicted(fit, run.motions[COMMAND], channel.name, time) - measured
+        assert np.std(missed[200:]) < 0.1 * np.std(measured)
+
+
+def test_a_robot_that_does_not_answer_has_no_delay(tmp_path):
+    rng = np.random.default_rng(1)
+    time = np.arange(0.0, 30.0, 0.05)
+    command = Series(time, {'linear': rng.uniform(-1.0, 1.0, time.size)})
+    motion = Series(time + 0.01, {'linear': rng.normal(size=time.size)})
+    fit = fit_response(command, motion, 'linear')
+    assert fit is None or not fit.clear
+    still = Series(time, {'linear': np.zeros(time.size)})
+    assert fit_response(command, still, 'linear') is None
+    assert fit_response(still, motion, 'linear') is None
+    short = Series(time[:10], {'linear': motion['linear'][:10]})
+    assert fit_response(command, short, 'linear') is None
+
+
+def test_the_wheels_may_be_told(rows, tmp_path, capsys):
+    folder = write(tmp_path / 'bag', rows)
+    said, page = text_of(folder, capsys, '--wheel-radius', '0.033', '--track', '0.16')
+    assert 'RMSE right/left' in said
+    assert 'wheels of 0.033 m radius, 0.16 m apart' in page
+    run = run_of(folder, ReportOptions(wheel_radius=0.033, track=0.16))
+    assert run.channels == BY_WHEEL
+    motion = run.motions[ODOMETRY]
+    np.testing.assert_allclose(0.033 * (motion['right'] + motion['left']) / 2, motion['linear'])
+    for wrong, words in (
+        (['--wheel-radius', '0.03'], 'must be given together'),
+        (['--wheel-radius', '-1', '--track', '0.2'], 'wheel_radius must be'),
+    ):
+        assert bag_main(['report', str(folder), '--output', str(tmp_path / 'no'), *wrong]) == 1
+        assert words in capsys.readouterr().err
+    assert not (tmp_path / 'no').exists()
+
+
+def test_topics_of_other_names_are_found_by_type_and_named(tmp_path, capsys):
+    names = ('/diff_drive_controller/odometry', '/diff_drive_controller/command')
+    rows = rows_of(names, stamped=True, duration=10.0)
+    _, page = text_of(write(tmp_path / 'bag', rows), capsys)
+    assert f'Odometry is taken from {names[0]}.' in page
+    assert f'The command is taken from {names[1]}.' in page
+
+
+def test_of_several_candidates_the_likeliest_is_taken_and_the_others_are_named(tmp_path, capsys):
+    rows = rows_of(('/wheels/odometry', '/base/cmd_vel'), duration=10.0)
+    extra = rows_of(('/gps/odom_map', '/joy/velocity'), duration=5.0, seed=3)
+    folder = write(tmp_path / 'bag', sorted(rows + extra, key=lambda row: row[0]))
+    _, page = text_of(folder, capsys)
+    assert 'taken from /wheels/odometry; there is also /gps/odom_map (--odom chooses).' in page
+    assert 'taken from /base/cmd_vel; there is also /joy/velocity (--cmd-vel chooses).' in page
+    run = run_of(folder, ReportOptions(odom='/gps/odom_map', cmd_vel='/joy/velocity'))
+    assert not any('taken from' in note for note in run.notes)
+    assert run.topics[ODOMETRY] == '/gps/odom_map'
+    assert run.motions[ODOMETRY].time[-1] < 6.0
+
+
+def test_a_reference_may_be_named(rows, tmp_path, capsys):
+    """Any odometry or twist: then there is a tracking error."""
+    wanted = [(t, '/plan/twist', message) for t, topic, message in rows if topic == '/cmd_vel']
+    folder = write(tmp_path / 'bag', sorted([*rows, *wanted], key=lambda row: row[0]))
+    said, page = text_of(folder, capsys, '--cmd-vel', '/cmd_vel', '--reference', '/plan/twist')
+    assert 'forward/turning while driven 0.' in said
+    assert {'tracking.png', 'error.png', 'portrait.png'} <= {
+        path.name for path in (tmp_path / 'out' / 'figures').iterdir()
+    }
+    run = run_of(folder, ReportOptions(reference='/plan/twist'))
+    np.testing.assert_allclose(
+        run.motions[REFERENCE]['linear'], run.motions[COMMAND]['linear'], atol=1e-12
+    )
+
+
+# -- what cannot be reported --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    'options, words',
+    [
+        ([], 'nothing to report'),
+        (['--odom', '/odom'], 'there is no topic /odom; found: /chatter (std_msgs/msg/String, 5'),
+        (['--odom', '/chatter'], '/chatter must be nav_msgs/msg/Odometry: it is std_msgs'),
+    ],
+)
+def test_a_bag_without_motion_is_an_error_that_says_what_it_holds(
+    tmp_path, capsys, options, words
+):
+    text = TYPES[SCAN](data='hello')
+    folder = write(tmp_path / 'bag', [(0.1 * i, '/chatter', text) for i in range(5)])
+    output = tmp_path / 'out'
+    for program in (bag_main, lab):
+        assert program(['report', str(folder), '--output', str(output), *options]) == 1
+        said = capsys.readouterr().err
+        assert words in said
+        assert '/chatter' in said
+    assert not output.exists()
+
+
+def test_an_empty_bag_and_no_bag_are_errors(tmp_path, capsys):
+    folder = write(tmp_path / 'bag', [])
+    assert bag_main(['report', str(folder)]) == 1
+    assert 'nothing to report' in capsys.readouterr().err
+    assert bag_main(['report', str(tmp_path / 'gone')]) == 1
+    assert 'no finished bag file' in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['bag']
+
+
+@pytest.mark.parametrize('count', [1, 2, 3])
+@pytest.mark.parametrize('gone', ['', '/odom', '/cmd_vel'])
+def test_a_message_or_two_do_no_harm(rows, tmp_path, count, gone):
+    few, seen = [], {}
+    for row in rows:
+        seen[row[1]] = seen.get(row[1], 0) + 1
+        if seen[row[1]] <= count and row[1] != gone:
+            few.append(row)
+    figures = write_report(write(tmp_path / 'bag', few), tmp_path / 'out')
+    assert figures.messages == len(few)
+    assert '\n' not in figures.summary()
+
+
+# -- clocks -------------------------------------------------------------------------------------
+
+
+def restamped(rows, stamp):
+    """Return the rows with what ``stamp(i, ns)`` says in each odometry's header, on copies."""
+    made, i = [], 0
+    for received, topic, message in rows:
+        if message.__msgtype__ == ODOM:
+            data = STORE.serialize_cdr(message, ODOM)
+            message = STORE.deserialize_cdr(data, ODOM)
+            now = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+            changed = stamp(i, now)
+            message.header.stamp.sec = changed // 10**9
+            message.header.stamp.nanosec = changed % 10**9
+            i += 1
+        made.append((received, topic, message))
+    return made
+
+
+@pytest.mark.parametrize(
+    'stamp, words',
+    [
+        (lambda i, ns: 0, 'The stamps of /odom stand still'),
+        (lambda i, ns: ns + (10**15 if i > 500 else 0), 'leap 1 times, first by 1000000.0 s at'),
+        (lambda i, ns: ns - (10**12 if i > 500 else 0), 'leap 1 times, first by -1000.0 s at'),
+        (lambda i, ns: ns + 80_000_000 * (i % 40 == 7), 'came behind later ones'),
+        (lambda i, ns: ns - START + 10**9, 'another clock'),
+    ],
+    ids=['none', 'forward', 'back', 'out of order', 'simulated'],
+)
+def test_stamps_that_do_not_tell_the_time_do_no_harm(rows, tmp_path, stamp, words):
+    run = run_of(write(tmp_path / 'bag', restamped(rows, stamp)))
+    assert any(words in note for note in run.notes)
+    motion = run.motions[ODOMETRY]
+    assert np.all(np.diff(motion.time) > 0.0)
+    assert motion.time[-1] - motion.time[0] == pytest.approx(39.96, abs=0.2)
+    fit = fit_response(run.motions[COMMAND], motion, 'linear')
+    assert fit.dead_time + fit.lag == pytest.approx(DEAD_TIME + LAG, abs=0.03)
+
+
+def test_a_recorder_whose_clock_was_set_is_told(rows, tmp_path):
+    later = [(t + (3600.0 if t > 20.0 else 0.0), topic, message) for t, topic, message in rows]
+    figures = write_report(write(tmp_path / 'bag', later), tmp_path / 'out')
+    page = (tmp_path / 'out' / 'report.html').read_text(encoding='utf-8')
+    assert 'the recorder&#x27;s clock was set, or the recording was paused' in page
+    assert figures.responses['linear'].clear
+
+
+def test_numbers_that_are_not_finite_are_left_out(rows, tmp_path):
+    made = restamped(rows, lambda i, ns: ns)
+    bad = [message for _, topic, message in made if topic == '/odom'][10:15]
+    for message in bad:
+        message.twist.twist.linear.x = math.nan
+    run = run_of(write(tmp_path / 'bag', made))
+    assert any('5 messages of /odom held a number that is not finite' in n for n in run.notes)
+
+
+# -- way, stops, roughness ----------------------------------------------------------------------
+
+
+def test_way_and_stops_are_those_of_the_drive(rows, tmp_path):
+    run = run_of(write(tmp_path / 'bag', rows))
+    _, (seen_at, seen, _) = drive()
+    found = motion_summary(run)
+    way = np.trapezoid(np.abs(seen[:, 0]), seen_at)
+    assert found.distance == pytest.approx(way, rel=0.03)
+    assert found.fastest == pytest.approx(np.abs(seen[:, 0]).max(), rel=0.05)
+    pause = [stop for stop in found.stops if 19.0 < stop[0] < 23.0]
+    assert len(pause) == 1
+    assert pause[0][1] - pause[0][0] == pytest.approx(2.3, abs=0.5)
+    assert found.disobeyed < 0.6
+
+
+def test_a_robot_that_stands_though_told_to_move_is_seen(rows, tmp_path):
+    made = []
+    for received, topic, message in restamped(rows, lambda i, ns: ns):
+        if topic == '/odom' and 25.0 < received < 30.0:
+            message.twist.twist.linear.x = message.twist.twist.angular.z = 0.0
+        made.append((received, topic, message))
+    assert motion_summary(run_of(write(tmp_path / 'bag', made))).disobeyed == pytest.approx(
+        4.9, abs=0.5
+    )
+
+
+def test_acceleration_and_jerk_are_the_derivatives():
+    time = np.arange(0.0, 20.0, 0.01)
+    series = Series(time, {'a': np.sin(2.0 * time)})
+    at, value, rate, bend = smooth(series, 'a')
+    np.testing.assert_allclose(value, np.sin(2.0 * at), atol=0.01)
+    np.testing.assert_allclose(rate, 2.0 * np.cos(2.0 * at), atol=0.02)
+    np.testing.assert_allclose(bend, -4.0 * np.sin(2.0 * at), atol=0.1)
+    found = roughness(series, 'a')
+    assert found.acceleration == pytest.approx(2.0 / math.sqrt(2.0), rel=0.02)
+    assert found.jerk == pytest.approx(4.0 / math.sqrt(2.0), rel=0.03)
+    torn = Series(np.delete(time, slice(500, 900)), {'a': np.delete(series['a'], slice(500, 900))})
+    at, value, _, _ = smooth(torn, 'a')
+    assert np.isnan(value[(at > 5.2) & (at < 8.8)]).all()
+    assert all(math.isnan(x) for x in astuple(roughness(Series(time[:2], {'a': time[:2]}), 'a')))
+
+
+# -- the link -----------------------------------------------------------------------------------
+
+
+def status(second, name='radio_bridge', **values):
+    entry = TYPES['diagnostic_msgs/msg/KeyValue']
+    pairs = [entry(key=key, value=str(value)) for key, value in values.items()]
+    one = TYPES['diagnostic_msgs/msg/DiagnosticStatus'](
+        level=0, name=name, message='', hardware_id='', values=pairs
+    )
+    stamp = START + round(second * 1e9)
+    message = TYPES['diagnostic_msgs/msg/DiagnosticArray'](header(stamp, ''), [one])
+    return second, '/diagnostics', message
+
+
+def test_the_link_s_figures_come_from_its_diagnostics(rows, tmp_path, capsys):
+    """Counters of a bridge that is started anew begin at zero again."""
+    said = []
+    for second in range(40):
+        again = second >= 25
+        cycles = 50 * (second - 25 if again else second)
+        lost = (second - 25 if again else second) * 3
+        said.append(
+            status(
+                second + 0.5,
+                cycles=cycles,
+                cycles_lost=lost,
+                round_trip_median_ms=6.0,
+                round_trip_p99_ms=20.0 if second == 9 else 9.0,
+                telemetry_age_s='inf' if second == 0 else 0.01,
+                robot_resets=1 if second >= 30 else 0,
+                port_failures='none',
+            )
+        )
+    other = [status(t + 0.7, 'battery', voltage=12.0, cycles=3) for t in range(3)]
+    made = sorted([*rows, *said, *other], key=lambda row: row[0])
+    folder = write(tmp_path / 'bag', made)
+    (link,) = run_of(folder).links
+    assert link.name == 'radio_bridge'
+    found = link_metrics(link)
+    assert (found.cycles, found.lost) == (50 * 24 + 50 * 14, 3 * 24 + 3 * 14)
+    assert found.answered == pytest.approx(0.94)
+    assert found.round_trip == pytest.approx(0.006)
+    assert found.round_trip_99 == pytest.approx(0.02)
+    assert found.oldest == pytest.approx(0.01)
+    assert found.resets == 1
+    assert math.isnan(found.port_failures)
+    share = link.answered()
+    assert np.isnan(share[[0, 25]]).all()
+    np.testing.assert_allclose(np.delete(share, [0, 25]), 0.94)
+    printed, page = text_of(folder, capsys)
+    assert 'radio_bridge: 94.0 % of cycles answered' in printed
+    assert 'How well the radio link worked' in page
+    assert (tmp_path / 'out' / 'figures' / 'link.png').is_file()
+
+
+# -- long runs ----------------------------------------------------------------------------------
+
+
+def test_lines_in_the_plane_are_drawn_from_few_points():
+    values = np.arange(1_000_001.0)
+    few = every_nth(values)
+    assert few.size <= 20_000
+    assert few[0] == 0.0
+    assert every_nth(values[:100]).size == 100
+
+
+def test_the_fit_of_a_long_run_is_made_on_its_liveliest_part():
+    """Hours of standing still must neither take long nor hide how the robot answers."""
+    (told_at, told), (seen_at, seen, _) = drive()
+    hours = 3.0 * 3600.0
+    before = np.arange(0.0, hours, 0.1)
+    command = Series(
+        np.append(before, hours + told_at), {'linear': np.append(0.0 * before, told[:, 0])}
+    )
+    motion = Series(
+        np.append(before, hours + seen_at), {'linear': np.append(0.0 * before, seen[:, 0])}
+    )
+    fit = fit_response(command, motion, 'linear')
+    assert fit.dead_time + fit.lag == pytest.approx(DEAD_TIME + LAG, abs=0.1)
+    assert fit.gain == pytest.approx(GAIN, rel=0.05)
+
+
+def test_nothing_to_report_is_an_error_of_its_own():
+    assert issubclass(ReportError, RuntimeError)

@@ -1,0 +1,854 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The report of a bag: right numbers from whole bags, and no crash from broken ones."""
+
+import base64
+from dataclasses import astuple, replace
+from html.parser import HTMLParser
+import re
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.bag.schema import BagError
+from t3mpc_ros.bag.writer import BagWriter
+from t3mpc_ros.evaluation.bag_report.metrics import (
+    SETTLING,
+    WINDOW,
+    ReportMetrics,
+    driven,
+    driving,
+    errors_of,
+    estimation_target,
+    latencies,
+    path_of,
+    preview_before_switch,
+    settled,
+    statistics,
+    tracking_error,
+    variation,
+)
+from t3mpc_ros.evaluation.bag_report.report_figures import REPORT_FIGURES
+from t3mpc_ros.evaluation.bag_report.report_page import write_report
+from t3mpc_ros.evaluation.bag_report.run_data import Series, load_run
+from t3mpc_ros.evaluation.bag_report.topic_roles import (
+    COMMAND,
+    NAMES,
+    ODOMETRY,
+    REFERENCE,
+    TRUTH,
+    WHEELS,
+    ReportOptions,
+    find_topics,
+)
+from t3mpc_ros.evaluation.plotting import thinned
+from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, twist_from_wheels
+from t3mpc_ros.geometry.types import BodyTwist, Pose, WheelSpeeds
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+TYPES = STORE.types
+START = 1_700_000_000_000_000_000
+GEOMETRY = WheelGeometry(wheel_radius=0.04, wheel_separation=0.16)
+LEAD = 0.2
+SWITCHES = (4.0, 8.0, 12.0, 16.0)
+DETAILS = {
+    'provenance': {'version': '0.1.0', 'commit': '<script>alert(1)</script>'},
+    'sim_robot': {'geometry.wheel_radius': '0.04', 'geometry.wheel_separation': '0.16'},
+    'controller': {'law.gain': '8.0'},
+}
+TERMS = ('fuzzy', 'feedback', 'feedforward', 'compensator', 'predictive', 'applied')
+
+
+# -- a run made up ------------------------------------------------------------------------------
+
+
+def wanted(t, selected):
+    """Return one of four smooth signals (rad/s) and its derivative (rad/s²)."""
+    a, b, c = (0.5, 0.9, 1.3, 0.7)[selected - 1], (1.9, 1.2, 2.3, 1.6)[selected - 1], selected
+    offset = (3.0, 5.0, 1.5, 4.0)[selected - 1]
+    value = offset + 1.5 * np.sin(2 * a * t + c) + 0.8 * np.sin(2 * b * t)
+    return value, 3.0 * a * np.cos(2 * a * t + c) + 1.6 * b * np.cos(2 * b * t)
+
+
+def dynamics(speeds):
+    """Return the unknown g of both wheels, rad/s²."""
+    return np.array(
+        [-0.8 * speeds[0] + 0.5 * np.sin(speeds[1]), -0.9 * speeds[1] + 0.4 * speeds[0]]
+    )
+
+
+def selection(t):
+    mode = sum(t >= switch for switch in SWITCHES)
+    return mode, ((1, 2), (3, 4), (2, 1), (4, 4), (1, 3))[mode]
+
+
+def simulate(duration=20.0, rate=100.0, seed=0):
+    """Return what the paper's law without its refinements does: rows by name."""
+    generator = np.random.default_rng(seed)
+    period = 1.0 / rate
+    speeds, estimate, pose = np.array([1.0, 1.0]), np.zeros(2), Pose(0.0, 0.0, 0.3)
+    rows = []
+    for i in range(round(duration * rate)):
+        t = i * period
+        mode, chosen = selection(t)
+        r, rate_r = np.array([wanted(t, one) for one in chosen]).T
+        error = speeds - r
+        estimate = estimate + period * 2.0 * (dynamics(speeds) - estimate)
+        parts = {
+            'fuzzy': -estimate,
+            'feedback': -6.0 * error,
+            'feedforward': rate_r,
+            'compensator': -0.8 * np.tanh(error / 0.5),
+            'predictive': 0.2 * np.sin([t, 2 * t]),
+        }
+        applied = np.clip(sum(parts.values()), -25.0, 25.0)
+        rows.append(
+            {
+                't': t,
+                'mode': mode,
+                'chosen': chosen,
+                'r': r,
+                'speeds': speeds.copy(),
+                'measured': speeds + generator.normal(0.0, 0.05, 2),
+                'pose': pose,
+                'error': error,
+                'estimate': estimate.copy(),
+                'terms': {**parts, 'applied': applied},
+                'command': speeds + applied * period,
+            }
+        )
+        twist = twist_from_wheels(WheelSpeeds(*speeds), GEOMETRY)
+        pose = advance_pose(pose, twist, period)
+        speeds = speeds + period * (dynamics(speeds) + applied)
+    return rows
+
+
+def vector(x=0.0, y=0.0, z=0.0):
+    return TYPES['geometry_msgs/msg/Vector3'](x=x, y=y, z=z)
+
+
+def twist_of(wheels):
+    body = twist_from_wheels(WheelSpeeds(*map(float, wheels)), GEOMETRY)
+    return TYPES['geometry_msgs/msg/Twist'](vector(body.linear), vector(z=body.angular))
+
+
+def header(stamp_ns):
+    stamp = TYPES['builtin_interfaces/msg/Time'](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    return TYPES['std_msgs/msg/Header'](stamp=stamp, frame_id='odom')
+
+
+def odometry(stamp_ns, wheels, pose=Pose(0.0, 0.0, 0.0)):  # noqa: B008 - a tuple
+    half = 0.5 * pose.yaw
+    place = TYPES['geometry_msgs/msg/Pose'](
+        TYPES['geometry_msgs/msg/Point'](x=pose.x, y=pose.y, z=0.0),
+        TYPES['geometry_msgs/msg/Quaternion'](0.0, 0.0, float(np.sin(half)), float(np.cos(half))),
+    )
+    none = np.zeros(36)
+    return TYPES['nav_msgs/msg/Odometry'](
+        header(stamp_ns),
+        'base_link',
+        TYPES['geometry_msgs/msg/PoseWithCovariance'](place, none),
+        TYPES['geometry_msgs/msg/TwistWithCovariance'](twist_of(wheels), none),
+    )
+
+
+def number(value):
+    return TYPES['std_msgs/msg/Float64'](data=float(value))
+
+
+def signals(mode, chosen):
+    layout = TYPES['std_msgs/msg/MultiArrayLayout'](dim=[], data_offset=0)
+    data = np.array([mode, *chosen], dtype=np.int32)
+    return TYPES['std_msgs/msg/Int32MultiArray'](layout, data)
+
+
+def diagnostics(stamp_ns, level, text, name='controller: loop', **values):
+    entry = TYPES['diagnostic_msgs/msg/KeyValue']
+    status = TYPES['diagnostic_msgs/msg/DiagnosticStatus'](
+        level=level,
+        name=name,
+        message=text,
+        hardware_id='',
+        values=[entry(key=key, value=str(value)) for key, value in values.items()],
+    )
+    return TYPES['diagnostic_msgs/msg/DiagnosticArray'](header(stamp_ns), [status])
+
+
+class Sheet:
+    """Collects messages by time of receipt, then writes them as one bag."""
+
+    def __init__(self, namespace='', epoch_ns=START):
+        self.rows = []
+        self.topics = {}
+        self.namespace = namespace
+        self.epoch_ns = epoch_ns
+
+    def add(self, name, received, message):
+        topic = name if name.startswith('/') else f'{self.namespace}/{name}'
+        self.topics.setdefault(topic, message.__msgtype__)
+        self.rows.append((received, topic, message))
+
+    def write(self, folder, metadata_records=DETAILS, empty=()):
+        with BagWriter(folder, metadata_records=metadata_records) as bag:
+            for name, kind in empty:
+                bag.add_topic(name, kind)
+            for topic, kind in self.topics.items():
+                bag.add_topic(topic, kind)
+            for received, topic, message in sorted(self.rows, key=lambda row: row[0]):
+                stamp = START + round(received * 1e9)
+                data = bytes(STORE.serialize_cdr(message, message.__msgtype__))
+                bag.write(topic, stamp, stamp, data)
+        return folder
+
+
+def sheet_of(rows, namespace='', epoch_ns=START, announce='signals', terms=True, lead=LEAD):
+    """Return a run as the nodes would publish it; stamps count from ``epoch_ns``."""
+    sheet = Sheet(namespace, epoch_ns)
+    generator = np.random.default_rng(1)
+    said = None
+    for i, row in enumerate(rows):
+        t, stamp = row['t'] + 0.5, epoch_ns + round((row['t'] + 0.5) * 1e9)
+        heard = t + 0.001
+        sheet.add('reference', t - lead + 0.001, odometry(stamp, row['r']))
+        if announce == 'signals' and said != (said := (row['mode'], row['chosen'])):
+            sheet.add('reference/signals', t - lead, signals(*said))
+        sheet.add('ground_truth/odom', heard, odometry(stamp, row['speeds'], row['pose']))
+        sheet.add('odom', heard, odometry(stamp, row['measured'], row['pose']))
+        told = heard + 0.002 + 0.001 * generator.random()
+        sheet.add('cmd_vel', told, twist_of(row['command']))
+        if i % 5 or not terms:
+            continue
+        if announce == 'mode':
+            sheet.add('reference/mode', t - lead, number(row['mode']))
+            for wheel, one in zip(WHEELS, row['chosen'], strict=True):
+                sheet.add(f'reference/signal/{wheel}', t - lead, number(one))
+        for k, wheel in enumerate(WHEELS):
+            sheet.add(f'controller/error/{wheel}', told, number(row['error'][k]))
+            sheet.add(f'controller/estimate/{wheel}', told, number(row['estimate'][k]))
+            sheet.add(f'controller/skill/{wheel}', told, number(0.4 + 0.1 * np.sin(t + k)))
+            for name in TERMS:
+                value = row['terms'][name][k]
+                sheet.add(f'controller/terms/{name}/{wheel}', told, number(value))
+        value = 0.5 * row['error'] @ row['error']
+        sheet.add('controller/lyapunov/value', told, number(value))
+        sheet.add('controller/lyapunov/margin', told, number(8.0 * value + 0.2 - 0.3 * (i < 50)))
+    for second in range(len(rows) // 100 if terms else 0):
+        link = {'cycles': 50 * second, 'cycles_lost': 2 * (second // 5), 'crc_errors': second // 9}
+        link |= {'round_trip_median_ms': 6.0, 'round_trip_p99_ms': 9.0 + second, 'link': 'running'}
+        sheet.add('/diagnostics', 1.0 + second, diagnostics(START, 0, '', 'radio_bridge', **link))
+    sheet.add('/diagnostics', 1.0, diagnostics(START, 0, 'fine'))
+    sheet.add('/diagnostics', 5.0, diagnostics(START, 1, 'late <b>& later</b>'))
+    sheet.add('/diagnostics', 6.0, diagnostics(START, 1, 'late <b>& later</b>'))
+    return sheet
+
+
+def add_standing(sheet, row, times, command):
+    """Add a robot that stands while the reference goes on: stamps at ``times``, s."""
+    for t in times:
+        stamp = sheet.epoch_ns + round(t * 1e9)
+        sheet.add('reference', t - LEAD + 0.001, odometry(stamp, row['r']))
+        for name in ('ground_truth/odom', 'odom'):
+            sheet.add(name, t + 0.001, odometry(stamp, (0.0, 0.0), row['pose']))
+        if command:
+            sheet.add('cmd_vel', t + 0.004, twist_of((0.0, 0.0)))
+
+
+@pytest.fixture(scope='module')
+def rows():
+    return simulate()
+
+
+@pytest.fixture(scope='module')
+def bag(rows, tmp_path_factory):
+    return sheet_of(rows).write(tmp_path_factory.mktemp('whole') / 'bag')
+
+
+@pytest.fixture(scope='module')
+def run(bag):
+    with open_bag(bag) as recording:
+        return load_run(recording)
+
+
+@pytest.fixture(scope='module')
+def report(bag, tmp_path_factory):
+    return write_report(bag, tmp_path_factory.mktemp('report'))
+
+
+class Page(HTMLParser):
+    """What a browser would make of the page, and whether its tags are closed."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.stack, self.images, self.texts, self.external = [], [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        attrs = dict(attrs)
+        if tag not in ('meta', 'img'):
+            self.stack.append(tag)
+        if tag == 'img':
+            assert attrs['alt']
+            self.images.append(attrs['src'])
+        self.external += [attrs[key] for key in ('href', 'src') if key in attrs]
+
+    def handle_endtag(self, tag):
+        assert self.stack.pop() == tag
+
+    def handle_data(self, data):
+        self.texts.append(data)
+
+    def text(self):
+        return ' '.join(' '.join(self.texts).split())
+
+
+def page_of(figures):
+    page = Page(figures.report.read_text(encoding='utf-8'))
+    assert page.stack == []
+    return page
+
+
+# -- numbers ------------------------------------------------------------------------------------
+
+
+def test_the_error_statistics_are_those_of_the_run(rows, report):
+    """Computed here from what was simulated, there from bytes, twists and interpolation."""
+    error = np.array([row['error'] for row in rows])
+    times = np.array([row['t'] for row in rows])
+    # The first command comes 3 to 4 ms after the first odometry, and a second later the robot
+    # has caught up. The reference is received 199 ms ahead.
+    moving = times > 1.005
+    calm = moving.copy()
+    for switch in SWITCHES:
+        calm &= (times < switch - 0.195) | (times >= switch + 1.0)
+    assert (np.count_nonzero(moving), np.count_nonzero(calm)) == (1899, 1423)
+    for k, wheel in enumerate(WHEELS):
+        found = report.wheels[wheel]
+        for part, expected in ((found.overall, error[moving, k]), (found.settled, error[calm, k])):
+            assert part.seconds == pytest.approx(0.01 * expected.size)
+            assert part.rmse == pytest.approx(np.sqrt(np.mean(expected**2)), rel=1e-6)
+            assert part.mae == pytest.approx(np.mean(np.abs(expected)), rel=1e-6)
+            assert part.largest == pytest.approx(np.max(np.abs(expected)), rel=1e-6)
+            assert part.count == expected.size
+
+
+def test_over_a_switch_the_reference_is_not_interpolated(run):
+    """A sample between the last of the old and the first of the new reference is no half."""
+    reference = Series(
+        np.array([0.0, 1.0, 2.0, 3.0]), {w: np.array([0.0, 1, 8, 9]) for w in WHEELS}
+    )
+    motion = Series(
+        np.array([-1.0, 0.5, 1.5, 2.0, 2.5, 4.0]), {w: np.full(6, 10.0) for w in WHEELS}
+    )
+    made = {'motions': {REFERENCE: reference, TRUTH: motion}, 'switches': np.array([2.0])}
+    error = tracking_error(type(run)(**{**vars(run), **made}), TRUTH)
+    assert error.time.tolist() == [0.5, 1.5, 2.0, 2.5]
+    assert error['left'].tolist() == [9.5, 9.0, 2.0, 1.5]
+
+
+def test_noise_of_the_odometry_is_seen_in_its_error_only(run):
+    noise = statistics(
+        tracking_error(run, ODOMETRY)['right'] - tracking_error(run, TRUTH)['right']
+    )
+    assert noise.rmse == pytest.approx(0.05, rel=0.1)
+    assert run.measured == TRUTH
+
+
+def test_switches_are_found_where_the_reference_jumps(run):
+    start = run.motions[REFERENCE].time[0]
+    np.testing.assert_allclose(run.switches - start, SWITCHES, atol=1e-6)
+
+
+@pytest.mark.parametrize('announce', ['mode', 'signals'])
+def test_both_ways_to_announce_the_mode_give_the_same_switches(rows, tmp_path, announce):
+    """Numbers at 20 Hz come up to 50 ms late: the error statistics must not see that."""
+    bag = sheet_of(rows, announce=announce).write(tmp_path / 'bag')
+    with open_bag(bag) as recording:
+        run = load_run(recording)
+    assert (run.switches - run.motions[REFERENCE].time[0]).tolist() == pytest.approx(SWITCHES)
+    for name in ('reference/mode', 'reference/signal/right', 'reference/signal/left'):
+        value = run.numbers[name]['value']
+        assert np.count_nonzero(np.diff(value)) == 4
+    # Announced a lead time ahead, like the reference itself, and drawn where it applies.
+    mode = run.numbers['reference/mode']
+    changed = mode.time[1:][np.diff(mode['value']) != 0] - run.motions[REFERENCE].time[0]
+    np.testing.assert_allclose(changed, SWITCHES, atol=0.01)
+    assert run.absent == ()
+
+
+def test_chatter_is_total_variation_per_second():
+    time = np.linspace(0.0, 4.0, 401)
+    ramp = Series(time, {'a': 3.0 * time, 'b': np.where(np.arange(401) % 2, 0.5, -0.5)})
+    assert variation(ramp, 'a') == pytest.approx(3.0)
+    assert variation(ramp, 'b') == pytest.approx(100.0)
+    assert np.isnan(variation(Series(time[:1], {'a': time[:1]}), 'a'))
+
+
+def test_the_command_s_chatter_and_the_demand_are_reported(rows, report):
+    for k, wheel in enumerate(WHEELS):
+        for found, name in (
+            (report.wheels[wheel].chatter, 'command'),
+            (report.wheels[wheel].demand, 'r'),
+        ):
+            values = np.array([row[name][k] for row in rows])
+            expected = np.abs(np.diff(values)).sum() / 19.99
+            assert found == pytest.approx(expected, rel=1e-3)
+
+
+def test_latency_is_from_odometry_to_the_command_after_it(run, report):
+    delay = latencies(run)['value']
+    assert delay.size == 2000
+    assert 0.002 - 1e-6 <= delay.min() <= delay.max() <= 0.003 + 1e-6
+    assert report.latency == pytest.approx(np.median(delay))
+    assert report.latency < report.latency_99 <= delay.max()
+
+
+def test_lost_messages_are_counted(rows, tmp_path):
+    sheet = sheet_of(rows, terms=False)
+    dropped = {0.5 + 0.001 + 0.01 * i for i in range(300, 400)}
+    sheet.rows = [
+        row
+        for row in sheet.rows
+        if not (row[1] == '/odom' and any(abs(row[0] - t) < 1e-6 for t in dropped))
+    ]
+    with open_bag(sheet.write(tmp_path / 'bag')) as recording:
+        timing = load_run(recording).timing
+    assert timing[ODOMETRY].missing == pytest.approx(0.05)
+    assert timing[TRUTH].missing == timing[COMMAND].missing == 0.0
+
+
+def test_the_target_of_the_estimate_is_the_unknown_part_of_the_dynamics(run, rows):
+    """The target is made from speeds and u alone, and must come out as g of the simulation."""
+    times = np.array([row['t'] for row in rows]) + run.motions[TRUTH].time[0]
+    true = np.array([dynamics(row['speeds']) for row in rows])
+    for k, wheel in enumerate(WHEELS):
+        target = estimation_target(run, wheel)
+        sound = np.isfinite(target['value']) & (target.time > times[0] + 1.0)
+        expected = np.interp(target.time[sound], times, true[:, k])
+        difference = target['value'][sound] - expected
+        assert np.sqrt(np.mean(difference**2)) < 0.1 * np.std(expected)
+        gaps = np.isnan(target['value'])
+        reach = WINDOW / 2 + 0.06
+        assert np.abs(target.time[gaps, np.newaxis] - run.switches).min(axis=1).max() < reach
+
+
+def test_slope_and_average_of_the_target_see_the_same_smoothing(run):
+    """For a cubic speed and u = dchi/dt the target vanishes, however curved both are."""
+    time = np.arange(0.0, 5.0, 0.01)
+    speed, rate = 0.3 * time**3 - time**2, 0.9 * time**2 - 2.0 * time
+    made = {TRUTH: Series(time, {'right': speed})}
+    control = {'controller/terms/applied/right': Series(time, {'value': rate})}
+    changed = type(run)(
+        **{**vars(run), 'motions': made, 'numbers': control, 'switches': np.empty(0)}
+    )
+    target = estimation_target(changed, 'right')
+    np.testing.assert_allclose(target['value'], 0.0, atol=2e-4)
+
+
+def test_the_path_is_the_exact_arc_of_each_twist():
+    generator = np.random.default_rng(2)
+    time = np.cumsum(generator.uniform(0.005, 0.05, 200))
+    motion = Series(
+        time, {'linear': generator.normal(0.3, 0.2, 200), 'angular': generator.normal(0, 2.0, 200)}
+    )
+    pose = Pose(0.5, -1.0, 2.0)
+    x, y = path_of(motion, pose)
+    for i in range(199):
+        assert (x[i], y[i]) == pytest.approx((pose.x, pose.y))
+        twist = BodyTwist(motion['linear'][i], motion['angular'][i])
+        pose = advance_pose(pose, twist, time[i + 1] - time[i])
+
+
+def test_settled_leaves_out_a_second_after_switches_and_what_is_foreseen_before():
+    """The start is no longer its business: whether the robot is driven is asked apart."""
+    time, switches = np.arange(0.0, 10.0, 0.5), np.array([3.0, 3.2, 9.9])
+    late = np.arange(4.5, 10.0, 0.5).tolist()
+    assert time[settled(time, switches, 0.0)].tolist() == [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, *late]
+    assert time[settled(time, switches, 0.45)].tolist() == [
+        0.0,
+        0.5,
+        1.0,
+        1.5,
+        2.0,
+        2.5,
+        *late[:-1],
+    ]
+    assert time[settled(time, switches, 0.6)].tolist() == [0.0, 0.5, 1.0, 1.5, 2.0, *late[:-1]]
+    assert settled(np.empty(0), switches, 0.45).size == 0
+    assert settled(time, np.empty(0), 0.45).all()
+
+
+# -- which errors count -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('command', [True, False])
+def test_standing_before_and_after_the_drive_changes_no_error_statistic(rows, tmp_path, command):
+    """A robot that followed within 0.04 rad/s was once said to miss by 0.2.
+
+    The report also counted the seconds in which the nodes found each other, and those after the
+    controller had stopped, while the reference went on because it is stamped ahead.
+    """
+    plain = write_report(sheet_of(rows[:600], terms=False).write(tmp_path / 'plain' / 'bag'))
+    sheet = sheet_of(rows[:600], terms=False)
+    add_standing(sheet, rows[0], 0.5 - 0.01 * np.arange(300, 0, -1), command)
+    add_standing(sheet, rows[599], 6.5 + 0.01 * np.arange(100), command)
+    longer = write_report(sheet.write(tmp_path / 'longer' / 'bag'))
+    assert longer.duration == pytest.approx(plain.duration + 4.0, abs=0.01)
+    assert longer.switches == plain.switches == 1
+    for wheel in WHEELS:
+        one, other = plain.wheels[wheel], longer.wheels[wheel]
+        assert (one.overall.count, one.settled.count) == (499, 380)
+        assert astuple(other.overall) == pytest.approx(astuple(one.overall), rel=1e-6)
+        assert astuple(other.settled) == pytest.approx(astuple(one.settled), rel=1e-6)
+    text = page_of(longer).text()
+    assert 'from the first command that is not zero, at 3.2 s, to the last, at 9.2 s' in text
+    assert '5.0 s counted' in text
+    assert 'in 5.0 s, settled ' in longer.summary()
+
+
+def test_leaving_for_a_switch_that_is_known_is_no_settled_error(rows, tmp_path):
+    """The controller meets a jump half-way: the better it did, the worse the settled error."""
+    switch = SWITCHES[0]
+    change = np.subtract(*(rows[round(100 * switch) - back]['r'] for back in (0, 1)))
+    early = []
+    for row in rows[:600]:
+        share = (row['t'] - switch + 0.15) / 0.15 if switch - 0.15 < row['t'] < switch else 0.0
+        early.append({**row, 'speeds': row['speeds'] + 0.5 * share * change})
+    found = {}
+    for lead in (LEAD, 0.0):
+        for name, driven_rows in (('plain', rows[:600]), ('early', early)):
+            bag = sheet_of(driven_rows, terms=False, lead=lead).write(tmp_path / f'{name}{lead}')
+            with open_bag(bag) as recording:
+                found[name, lead] = errors_of(load_run(recording), TRUTH)['left']
+    (plain, calm), (early, settled_early) = found['plain', LEAD], found['early', LEAD]
+    assert astuple(settled_early) == astuple(calm)
+    assert early.rmse > plain.rmse
+    # Without a lead nobody can have known: it is an error like any other.
+    (_, unforeseen), (_, settled_early) = found['plain', 0.0], found['early', 0.0]
+    assert settled_early.largest > 2.0 * unforeseen.largest
+    assert unforeseen.seconds == pytest.approx(calm.seconds + 0.19)
+
+
+def test_no_more_is_left_out_before_a_switch_than_after_it(run):
+    """A reference may be stamped ten seconds ahead: then nothing would be left."""
+    assert run.lead == pytest.approx(LEAD - 0.001)
+    assert preview_before_switch(run) == run.lead
+    assert preview_before_switch(replace(run, lead=10.0)) == SETTLING
+
+
+def test_the_drive_is_from_the_first_to_the_last_command_but_zero(run):
+    """A stop in between, by a time-out say, is not excused."""
+    time = np.arange(8.0)
+    linear = np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
+    angular = np.array([0.0, -0.0, 0.0, 0.0, 0.0, -0.2, 0.0, 0.0])
+    made = replace(run, motions={COMMAND: Series(time, {'linear': linear, 'angular': angular})})
+    assert driving(made) == (2.0, 5.0)
+    assert time[driven(time, made)].tolist() == [3.0, 4.0, 5.0]
+    # Where the reference comes later than the command, the robot has to catch up then.
+    late = time[2:] + 0.5
+    assert late[driven(late, made)].tolist() == [3.5, 4.5]
+    assert not driven(np.empty(0), made).size
+
+
+@pytest.mark.parametrize('why', ['every command is zero', 'driven for less than a second'])
+def test_where_nothing_is_left_to_count_no_number_is_given(rows, tmp_path, why):
+    idle = why == 'every command is zero'
+    sheet = sheet_of(rows[: 300 if idle else 90], terms=False)
+    for _, topic, message in sheet.rows:
+        if topic == '/cmd_vel' and idle:
+            message.linear.x = message.angular.z = 0.0
+    add_standing(sheet, rows[0], 0.5 - 0.01 * np.arange(200, 0, -1), True)
+    figures = write_report(sheet.write(tmp_path / 'bag'))
+    for wheel in WHEELS:
+        for part in (figures.wheels[wheel].overall, figures.wheels[wheel].settled):
+            assert (part.count, part.seconds) == (0, 0.0)
+            assert np.isnan(part.rmse)
+    text = page_of(figures).text()
+    assert 'RMSE right/left while driven not measured, settled not measured;' in figures.summary()
+    assert text.count('not measured') == 2 + 3 * 8  # two tiles; three cells of eight rows
+    assert ('Every command was zero' in text) == idle
+
+
+def test_without_commands_the_whole_reference_counts_but_its_first_second(rows, tmp_path):
+    sheet = sheet_of(rows[:300], terms=False)
+    sheet.rows = [row for row in sheet.rows if row[1] != '/cmd_vel']
+    sheet.topics.pop('/cmd_vel')
+    figures = write_report(sheet.write(tmp_path / 'bag'))
+    assert figures.wheels['left'].overall.count == 200
+    assert figures.wheels['left'].settled.count == 200
+    assert 'the bag holds no command that tells when' in page_of(figures).text()
+
+
+def test_a_foreign_bag_of_odometry_and_commands_has_a_report_without_errors(rows, tmp_path):
+    sheet = sheet_of(rows[:200], terms=False, announce='')
+    sheet.rows = [row for row in sheet.rows if row[1] in ('/odom', '/cmd_vel')]
+    sheet.topics = {name: sheet.topics[name] for name in ('/odom', '/cmd_vel')}
+    figures = write_report(sheet.write(tmp_path / 'bag'))
+    stems = {'control', 'response', 'acceleration', 'path', 'timing'}
+    assert {path.stem for path in figures.pictures} == stems
+    assert 'RMSE right/left while driven not measured' in figures.summary()
+    text = page_of(figures).text()
+    assert 'The bag lacks a reference, or odometry to compare with it.' in text
+    assert 'Left out' not in text
+
+
+def test_a_long_line_keeps_its_extremes():
+    generator = np.random.default_rng(3)
+    time, value = np.arange(1e5), generator.normal(size=100_000)
+    value[12_345], value[500:800] = 99.0, np.nan
+    few, thin = thinned(time, value)
+    assert few.size <= 6000
+    assert np.nanmax(thin) == 99.0
+    assert np.nanmin(thin) == np.nanmin(value)
+
+
+# -- names and clocks ---------------------------------------------------------------------------
+
+
+def test_topics_are_found_in_any_namespace_by_their_longest_name():
+    """The truth was once taken for the odometry of a robot called ground_truth."""
+    names = ['/a/ground_truth/odom', '/a/cmd_vel', '/a/reference', '/odom', '/other']
+    found, spaces = find_topics(names)
+    assert found == {TRUTH: names[0], COMMAND: '/a/cmd_vel', REFERENCE: '/a/reference'}
+    assert spaces == ('/a', '')
+    assert find_topics(names, '')[0] == {ODOMETRY: '/odom'}
+    assert find_topics(names, 'a')[0] == find_topics(names, '/a/')[0] == found
+    assert find_topics(names, 'b') == ({}, ('/b', '/a', ''))
+    assert find_topics([]) == ({}, ('',))
+    assert all(find_topics([f'/x/y/{name}'])[0] == {name: f'/x/y/{name}'} for name in NAMES)
+
+
+def test_another_namespace_gives_the_same_report_and_is_named(rows, report, tmp_path):
+    bag = sheet_of(rows[:600], '/fleet/robot1', terms=False)
+    for received, topic, message in sheet_of(rows[:100], '/fleet/robot2', terms=False).rows:
+        bag.add(topic, received, message)
+    bag.add('/fleet/robot1/controller/skill/right', 1.0, number(1.0))
+    bag.add('/fleet/robot1/controller/skill/left', 1.0, number(1.0))
+    figures = write_report(bag.write(tmp_path / 'bag'))
+    text = page_of(figures).text()
+    assert 'namespace /fleet/robot1' in text
+    assert 'The bag also holds topics of /fleet/robot2' in text
+    assert figures.wheels['right'].overall.count == 499  # six seconds without the first
+    with open_bag(tmp_path / 'bag') as recording:
+        second = load_run(recording, ReportOptions(namespace='fleet/robot2'))
+    assert len(tracking_error(second, TRUTH)) == 100
+
+
+def test_simulated_time_gives_the_same_report(rows, report, tmp_path):
+    """Stamps that count from zero lie half a century before the receipts.
+
+    The lead is measured through the odometry then, which is a millisecond late itself: one
+    sample more before each switch is left out of the settled error.
+    """
+    figures = write_report(sheet_of(rows, epoch_ns=0).write(tmp_path / 'bag'))
+    assert figures.switches == 4
+    for wheel in WHEELS:
+        assert figures.wheels[wheel].overall.rmse == pytest.approx(
+            report.wheels[wheel].overall.rmse
+        )
+        one, other = report.wheels[wheel].settled, figures.wheels[wheel].settled
+        assert one.count - 4 <= other.count <= one.count
+        assert other.rmse == pytest.approx(one.rmse, rel=5e-3)
+    assert 'another clock' in page_of(figures).text()
+    assert len(figures.pictures) == len(REPORT_FIGURES)
+
+
+def test_a_stamped_command_is_read_too(rows, tmp_path):
+    sheet = Sheet()
+    for row in rows[:50]:
+        stamp = START + round(row['t'] * 1e9)
+        stamped = TYPES['geometry_msgs/msg/TwistStamped'](header(stamp), twist_of(row['command']))
+        sheet.add('cmd_vel', row['t'], stamped)
+    with open_bag(sheet.write(tmp_path / 'bag')) as recording:
+        command = load_run(recording).motions[COMMAND]
+    np.testing.assert_allclose(command['right'], [row['command'][0] for row in rows[:50]])
+
+
+def test_the_recorded_geometry_is_used(run, report):
+    assert run.geometry == GEOMETRY
+    assert 'wheels of 0.04 m radius, 0.16 m apart' in page_of(report).text()
+    assert not any('are assumed' in note for note in run.notes)
+
+
+@pytest.mark.parametrize(
+    'metadata_records, complaint',
+    [
+        ({}, 'are assumed'),
+        ({'robot': {'a.wheel_radius': 'big'}}, 'is no number'),
+        ({'robot': {'a.wheel_radius': '-1.0', 'a.wheel_separation': '0.2'}}, 'cannot be used'),
+    ],
+)
+def test_a_geometry_that_cannot_be_used_is_told(rows, tmp_path, metadata_records, complaint):
+    bag = sheet_of(rows[:20], terms=False).write(tmp_path / 'bag', metadata_records)
+    with open_bag(bag) as recording:
+        run = load_run(recording)
+    assert run.geometry == WheelGeometry()
+    assert any(complaint in note for note in run.notes)
+    assert any('0.035 m radius and 0.147 m apart are assumed' in note for note in run.notes)
+
+
+def test_the_robot_s_own_word_on_its_wheels_comes_first(rows, tmp_path):
+    """The reference node has a geometry of its own, at its default unless somebody set it."""
+    metadata_records = {
+        'reference': {'geometry.wheel_radius': '0.035', 'geometry.wheel_separation': '0.147'},
+        **DETAILS,
+    }
+    bag = sheet_of(rows[:20], terms=False).write(tmp_path / 'bag', metadata_records)
+    with open_bag(bag) as recording:
+        assert load_run(recording).geometry == GEOMETRY
+
+
+# -- the page -----------------------------------------------------------------------------------
+
+
+def test_the_page_is_whole_and_needs_nothing_from_outside(report):
+    page = page_of(report)
+    assert len(page.images) == len(report.pictures) == len(REPORT_FIGURES)
+    assert page.external == page.images
+    for source, path in zip(page.images, report.pictures, strict=True):
+        kind, data = source.split(',')
+        assert kind == 'data:image/png;base64'
+        assert base64.b64decode(data) == path.read_bytes()
+        assert path.read_bytes().startswith(b'\x89PNG')
+    text = report.report.read_text()
+    assert 'width=device-width' in text
+    assert not re.search(r'url\(|@import|https?:', text)
+
+
+def test_words_from_the_bag_cannot_become_markup(report):
+    text = report.report.read_text()
+    assert '<script' not in text
+    assert '&lt;script&gt;alert(1)&lt;/script&gt;' in text
+    assert 'late &lt;b&gt;&amp; later&lt;/b&gt;' in text
+
+
+def test_a_complaint_is_shown_once_with_the_time_it_began(run):
+    ((when, level, who, what),) = run.complaints
+    assert (level, who, what) == ('warning', 'controller: loop', 'late <b>& later</b>')
+    assert when == pytest.approx(5.0 - 0.3)  # the bag begins with the reference, at 0.3 s
+
+
+def test_the_summary_is_one_line_of_the_main_figures(report):
+    line = report.summary()
+    assert '\n' not in line
+    assert line.startswith('20.2 s, 4 switches; RMSE right/left ')
+    assert f'{report.wheels["right"].overall.rmse:.3g}' in line
+    assert str(report.report) in line
+
+
+def test_the_report_goes_beside_the_bag_unless_told_otherwise(tmp_path):
+    sheet = Sheet()
+    for i in range(5):
+        sheet.add('reference/mode', 0.1 * i, number(i))
+    bag = sheet.write(tmp_path / 'bag')
+    figures = write_report(bag)
+    assert figures.report == tmp_path / 'report.html'
+    assert figures.pictures == (tmp_path / 'figures' / 'switching.png',)
+    other = write_report(str(bag), str(tmp_path / 'deep' / 'er'))
+    assert other.report == tmp_path / 'deep' / 'er' / 'report.html'
+    assert other.report.is_file()
+
+
+# -- bags that lack something -------------------------------------------------------------------
+
+
+def test_an_absent_topic_leaves_out_its_figures_and_is_named(rows, tmp_path):
+    figures = write_report(sheet_of(rows[:300], announce='', terms=False).write(tmp_path / 'bag'))
+    stems = {path.stem for path in figures.pictures}
+    own = {'tracking', 'error', 'control', 'portrait', 'path', 'timing'}
+    assert stems == {*own, 'response', 'acceleration'}
+    assert 'controller/estimate/right' in figures.absent
+    text = page_of(figures).text()
+    assert 'Not in the bag, or without a message: reference/signals, controller/' in text
+    assert 'Left out: the bag lacks reference/signals.' in text
+    assert 'Left out: the bag lacks controller/estimate/right, controller/estimate/left.' in text
+
+
+@pytest.mark.parametrize('gone', [REFERENCE, ODOMETRY, TRUTH, COMMAND, 'reference/signals'])
+def test_any_topic_may_be_missing(rows, tmp_path, gone):
+    sheet = sheet_of(rows[:150])
+    sheet.rows = [row for row in sheet.rows if row[1] != f'/{gone}']
+    sheet.topics.pop(f'/{gone}')
+    figures = write_report(sheet.write(tmp_path / 'bag'))
+    assert figures.absent == (gone,)
+    page_of(figures)
+    assert isinstance(figures, ReportMetrics)
+    assert np.isfinite(figures.wheels['right'].overall.rmse) == (gone != REFERENCE)
+    if gone == TRUTH:
+        assert figures.measured == ODOMETRY
+    if gone == REFERENCE:
+        assert 'RMSE right/left while driven not measured' in figures.summary()
+
+
+def test_an_empty_topic_counts_as_absent(rows, tmp_path):
+    sheet = sheet_of(rows[:100], terms=False)
+    sheet.rows = [row for row in sheet.rows if row[1] != '/odom']
+    figures = write_report(sheet.write(tmp_path / 'bag'))
+    assert ODOMETRY in figures.absent
+    page_of(figures)
+
+
+@pytest.mark.parametrize('count', [1, 2, 3])
+def test_a_handful_of_messages_does_no_harm(rows, tmp_path, count):
+    """Every series has ``count`` samples: no line, no median, no percentile may need more."""
+    sheet = sheet_of(rows[:20])
+    seen = dict.fromkeys(sheet.topics, 0)
+    few = []
+    for row in sorted(sheet.rows, key=lambda row: row[0]):
+        seen[row[1]] += 1
+        if seen[row[1]] <= count:
+            few.append(row)
+    sheet.rows = few
+    figures = write_report(sheet.write(tmp_path / 'bag'))
+    page_of(figures)
+    assert figures.messages == len(few)
+    assert '\n' not in figures.summary()
+
+
+def test_numbers_that_are_not_finite_are_left_out_and_told(rows, tmp_path):
+    sheet = sheet_of(rows[:200])
+    bad = {'reference': np.nan, 'odom': np.inf, 'ground_truth/odom': -np.inf, 'cmd_vel': np.nan}
+    for name, value in bad.items():
+        hit = [row[2] for row in sheet.rows if row[1] == f'/{name}'][:7]
+        for message in hit:
+            twist = message if name == 'cmd_vel' else message.twist.twist
+            twist.linear.x = float(value)
+    sheet.add('controller/skill/right', 0.7, number(np.nan))
+    figures = write_report(sheet.write(tmp_path / 'bag'))
+    text = page_of(figures).text()
+    for name in bad:
+        assert f'7 messages of /{name} held a number that is not finite' in text
+    assert '1 messages of /controller/skill/right' in text
+    assert np.isfinite(figures.wheels['right'].overall.rmse)
+    # Driven from the eighth command on, at 0.074 s, and counted from a second later.
+    assert figures.wheels['right'].overall.count == 92
+
+
+def test_only_nonsense_is_reported_as_nothing(rows, tmp_path):
+    sheet = sheet_of(rows[:50], terms=False)
+    for _, topic, message in sheet.rows:
+        if topic in ('/odom', '/ground_truth/odom', '/reference'):
+            message.twist.twist.angular.z = float('nan')
+    figures = write_report(sheet.write(tmp_path / 'bag'))
+    assert [path.stem for path in figures.pictures] == ['switching', 'control']
+    page_of(figures)
+
+
+def test_a_reference_that_starts_again_does_no_harm(rows, tmp_path):
+    """Stamps that go back: of two samples for one instant the later message counts."""
+    sheet = sheet_of(rows[:300], terms=False)
+    for row in rows[100:200]:
+        stamp = START + round((row['t'] + 0.5) * 1e9)
+        sheet.add('reference', 4.0 + row['t'], odometry(stamp, row['r'] + 1.0))
+    with open_bag(sheet.write(tmp_path / 'bag')) as recording:
+        reference = load_run(recording).motions[REFERENCE]
+    assert np.all(np.diff(reference.time) > 0.0)
+    changed = [row['r'][0] + (1.0 if 100 <= i < 200 else 0.0) for i, row in enumerate(rows[:300])]
+    np.testing.assert_allclose(reference['right'], changed, atol=1e-9)
+
+
+def test_no_bag_is_an_error_and_writes_nothing(tmp_path):
+    with pytest.raises(BagError, match='no finished bag file'):
+        write_report(tmp_path / 'gone')
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,683 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The predictive rivals: optimal, within bounds, free of offset, and as good as theory allows."""
+
+import math
+import sys
+
+import numpy as np
+import pytest
+from scipy.optimize import lsq_linear
+
+from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
+from t3mpc_ros.evaluation.baselines.box_qp import make_workspace, solve
+from t3mpc_ros.evaluation.baselines.dynamic_matrix_control import (
+    DynamicMatrix,
+    DynamicMatrixParameters,
+    DynamicMatrixPreview,
+    DynamicMatrixPreviewParameters,
+    identify_step_responses,
+)
+from t3mpc_ros.evaluation.baselines.linear_mpc import (
+    LinearMpc,
+    LinearMpcParameters,
+    LinearMpcPreview,
+    LinearMpcPreviewParameters,
+    load_acceleration,
+    predict_reference,
+    wheel_model,
+)
+from t3mpc_ros.evaluation.baselines.nonlinear_mpc import (
+    CasadiNmpc,
+    CasadiNmpcParameters,
+    condense,
+    wheel_dynamics,
+)
+from t3mpc_ros.mpc.quadratic_program import NOT_POSITIVE, OPTIMAL
+from t3mpc_ros.simulation.plant.disturbances import Disturbance, DisturbanceParameters
+from t3mpc_ros.simulation.plant.dynamics import dynamics_vector, wheel_inertia
+from t3mpc_ros.simulation.plant.paper_plant import PaperPlant, PaperRobotParameters
+
+PERIOD, LAG, REACH = 0.01, 0.02, 28.0
+KEPT = math.exp(-PERIOD / LAG)
+AHEAD = 40
+"""Rows of the future that preview gives."""
+DRIVES = ('velocity', 'torque')
+FREE = {'friction.viscous': 0.0, 'friction.coulomb': 0.0, 'body.com_offset': 0.0}
+"""A robot whose wheels are exactly what the linear model says."""
+LINEAR = (LinearMpc, LinearMpcPreview, DynamicMatrix, DynamicMatrixPreview)
+EVERY = (*LINEAR, CasadiNmpc)
+
+
+def _knowledge(drive, robot=FREE):
+    reach = REACH if drive == 'velocity' else math.inf
+    parameters = PaperRobotParameters().with_values(robot)
+    return NominalModel(drive, PERIOD, LAG, reach, parameters)
+
+
+def _make(kind, drive, robot=FREE, **parameters):
+    if kind is CasadiNmpc:
+        pytest.importorskip('casadi')
+    rows = {row.name for row in kind.parameters_type.rows()}
+    chosen = {name: value for name, value in parameters.items() if name in rows}
+    return kind(kind.parameters_type().with_values(chosen), _knowledge(drive, robot))
+
+
+def _run(rival, drive, wanted, load=None, seen=None, noise=0.0):
+    """Close the loop with the plant of the interface; return chi, c (or u) and the answers.
+
+    wanted : shape (n + AHEAD + 1, 2); load : chi -> true acceleration; seen : shape (n, 2), the
+    estimate of it that the rival is given
+    """
+    steps = len(wanted) - AHEAD - 1
+    generator = np.random.default_rng(5)
+    speeds, command = np.zeros(2), np.zeros(2)
+    record = np.zeros((3, steps, 2))
+    for k in range(steps):
+        observation = Observation(
+            speeds + noise * generator.standard_normal(2),
+            np.zeros(2) if seen is None else seen[k].copy(),
+            wanted[k].copy(),
+            # Its slope is known at any rate, its jumps are not.
+            wanted[k] + np.where(np.abs(step := wanted[k + 1] - wanted[k]) < 0.3, step, 0.0),
+            command.copy(),
+            wanted[k : k + AHEAD].copy() if rival.preview else None,
+        )
+        u = rival.step(observation)
+        record[0, k], record[2, k] = speeds, u
+        acting = np.zeros(2) if load is None else load(speeds)
+        if drive == 'velocity':
+            command = observation.speeds + PERIOD * u / (1.0 - KEPT)
+            speeds = KEPT * speeds + (1.0 - KEPT) * command + LAG * (1.0 - KEPT) * acting
+        else:
+            command = u
+            speeds = speeds + PERIOD * (u + acting)
+        rival.applied(u, limited=False)
+        record[1, k] = command
+    return record
+
+
+def _jump(size, steps=200, at=100):
+    """Return a reference that jumps up right and down left."""
+    wanted = np.zeros((steps + AHEAD + 1, 2))
+    wanted[at:] = size, -size
+    return wanted
+
+
+def _energy(speeds, wanted):
+    """Return the integral of the squared error of one wheel, rad²/s."""
+    return float(np.sum((speeds - wanted[: len(speeds)]) ** 2) * PERIOD / 2.0)
+
+
+def _wander(steps, seed=3):
+    """Return a smooth reference with jumps, shape (steps + AHEAD + 1, 2)."""
+    generator = np.random.default_rng(seed)
+    time = PERIOD * np.arange(steps + AHEAD + 1)[:, None]
+    wanted = np.zeros((time.size, 2))
+    for rate in (0.3, 0.7, 1.1):
+        wanted += 1.5 * np.sin(2 * np.pi * rate * time + generator.uniform(0, 6, 2))
+    for at in range(60, steps, 90):
+        wanted[at:] += generator.uniform(-5, 5, 2)
+    return wanted
+
+
+# -- the program ----------------------------------------------------------------------------------
+
+
+def _random_program(generator):
+    """Return H, g, low, high: sizes, scales and the degenerate cases of the field."""
+    n = int(generator.integers(1, 41))
+    steps = generator.standard_normal(n)
+    kind = generator.integers(0, 3)
+    if kind == 0:
+        steps = 1.0 - KEPT ** np.arange(1, n + 1)
+    elif kind == 1:
+        steps = np.full(n, PERIOD)
+    matrix = np.array([[steps[j - i] if j >= i else 0.0 for i in range(n)] for j in range(n)])
+    hessian = matrix.T @ matrix + 10 ** generator.uniform(-5, 1) * np.eye(n)
+    slope = matrix.T @ (generator.standard_normal(n).cumsum() * 10 ** generator.uniform(-2, 2))
+    reach = 10 ** generator.uniform(-2, 2, n)
+    high = np.where(generator.random(n) < 0.1, np.inf, reach)
+    low = np.where(generator.random(n) < 0.1, -np.inf, -reach)
+    fixed = generator.random(n) < 0.05
+    low[fixed] = high[fixed] = 0.01
+    return hessian, slope, low, high
+
+
+def _fill(space, hessian, slope, low, high):
+    space.hessian[:], space.slope[:], space.low[:], space.high[:] = hessian, slope, low, high
+    space.factored[0] = -1
+
+
+def test_three_thousand_programs_satisfy_karush_kuhn_tucker():
+    generator = np.random.default_rng(8)
+    for _ in range(3000):
+        hessian, slope, low, high = _random_program(generator)
+        space = make_workspace(slope.size)
+        _fill(space, hessian, slope, low, high)
+        space.moves[:] = generator.standard_normal(slope.size)
+        assert solve(space, 1000) == OPTIMAL
+        x = space.moves
+        assert np.all(x >= low)
+        assert np.all(x <= high)
+        scale = np.abs(slope).max() + (np.abs(hessian) @ np.abs(x)).max()
+        gradient = (hessian @ x + slope) / scale
+        inside = (x > low) & (x < high)
+        assert np.abs(gradient[inside]).max(initial=0.0) < 1e-11
+        assert gradient[(x == low) & (x < high)].min(initial=0.0) > -1e-11
+        assert gradient[(x == high) & (x > low)].max(initial=0.0) < 1e-11
+
+
+def test_programs_agree_with_an_independent_solver_from_any_start():
+    generator = np.random.default_rng(4)
+    for _ in range(40):
+        hessian, slope, low, high = _random_program(generator)
+        high = np.maximum(high, low + 1e-3)  # the other solver wants some room
+        root = np.linalg.cholesky(hessian).T
+        target = -np.linalg.solve(root.T, slope)
+        other = lsq_linear(root, target, (low, high), 'bvls', tol=1e-14, max_iter=500)
+        for start in (0.0, 1.0, math.nan):
+            space = make_workspace(slope.size)
+            _fill(space, hessian, slope, low, high)
+            space.moves[:] = start
+            assert solve(space, 1000) == OPTIMAL
+            gap = root @ (space.moves - other.x)
+            assert np.linalg.norm(gap) < 1e-6 * max(np.linalg.norm(target), 1e-6)
+
+
+def test_programs_without_an_optimum_are_refused_and_keep_the_bounds():
+    for hessian, slope in (
+        (np.diag([1.0, -1.0]), np.ones(2)),
+        (np.eye(2), np.array([1.0, math.nan])),
+    ):
+        space = make_workspace(2)
+        _fill(space, hessian, slope, -np.ones(2), np.ones(2))
+        assert solve(space, 1000) == NOT_POSITIVE
+        assert np.all(np.abs(space.moves) <= 1.0)
+
+
+# -- what is expected of the reference ------------------------------------------------------------
+
+
+def test_future_goes_on_by_its_slope_but_a_jump_is_no_slope():
+    out = np.zeros((2, 8))
+    ramp = np.array([[0.0, 5.0], [1.0, 5.0], [2.0, 5.0], [3.0, 9.0]])
+    predict_reference(np.zeros(2), np.zeros(2), ramp, 1.0, out)
+    assert np.array_equal(out[0], np.arange(8.0))
+    assert np.array_equal(out[1], [5, 5, 5, 9, 9, 9, 9, 9])
+    predict_reference(np.zeros(2), np.zeros(2), np.outer(np.arange(20.0), [1, 2]), 1.0, out)
+    assert np.array_equal(out[1], 2 * np.arange(8.0))
+
+
+def test_slope_dies_away_without_preview():
+    out = np.zeros((2, 400))
+    fade = math.exp(-PERIOD / 0.2)
+    nothing = np.zeros((0, 2))
+    predict_reference(np.array([1.0, 0.0]), np.array([1.1, 0.0]), nothing, fade, out)
+    assert out[0, 1] == 1.1
+    assert out[0, -1] == pytest.approx(1.0 + 0.1 / (1.0 - fade), rel=1e-6)
+    assert not out[1].any()
+
+
+# -- optimality -----------------------------------------------------------------------------------
+
+
+def _dense(drive, before, speeds, wanted, weight, nominal_model):
+    """Return the best commands, shape (2, N), by simulating every unit input and least squares.
+
+    wanted : shape (N, 2), for periods 1 ... N
+    """
+    n = len(wanted)
+    pole, push = (KEPT, 1.0 - KEPT) if drive == 'velocity' else (1.0, PERIOD)
+
+    def outputs(start, commands):
+        result, chi = [], start
+        for command in commands:
+            chi = pole * chi + push * command
+            result.append(chi)
+        return np.array(result)
+
+    by_command = np.array([outputs(0.0, row) for row in np.eye(n)]).T
+    changes = np.eye(n) - np.eye(n, k=-1)
+    free = [outputs(speeds[z], np.zeros(n)) for z in range(2)]
+    first = np.zeros((2, n))
+    first[:, 0] = before
+    if drive == 'velocity':
+        answer = []
+        for z in range(2):
+            # unknown: changes of c
+            sums = np.linalg.inv(changes)
+            matrix = np.vstack((by_command @ sums, math.sqrt(weight) * np.eye(n)))
+            held = by_command @ np.full(n, before[z])
+            target = np.r_[wanted[:, z] - free[z] - held, np.zeros(n)]
+            reach = nominal_model.acceleration * PERIOD
+            best = lsq_linear(matrix, target, (-reach, reach), 'bvls', tol=1e-15, max_iter=1000)
+            answer.append(before[z] + sums @ best.x)
+        return np.array(answer)
+    inertia = wheel_inertia(nominal_model.robot.body, nominal_model.robot.geometry)
+    one = np.vstack((by_command, math.sqrt(weight) * changes))
+    target = [np.r_[wanted[:, z] - free[z], math.sqrt(weight) * first[z]] for z in range(2)]
+    limit = nominal_model.robot.drive.torque_limit
+    best = lsq_linear(
+        np.kron(np.linalg.inv(inertia), one),
+        np.concatenate(target),
+        (-limit, limit),
+        'bvls',
+        tol=1e-15,
+        max_iter=1000,
+    )
+    return np.linalg.inv(inertia) @ best.x.reshape(2, n)
+
+
+@pytest.mark.parametrize('drive', DRIVES)
+@pytest.mark.parametrize('size', [0.02, 2.0, 9.0])
+def test_linear_plan_is_the_optimum_of_the_dense_program(drive, size):
+    """Small: no bound is met. Large: some are, in the torque drive those of both motors."""
+    nominal_model = _knowledge(drive)
+    move_time = 0.01
+    weight = (move_time / PERIOD) ** 2 if drive == 'velocity' else (move_time**2 / PERIOD) ** 2
+    rival = _make(LinearMpcPreview, drive, move_time=move_time)
+    future = size * np.sin(0.2 * np.arange(41))[:, None] * [1.0, -0.4] + 0.1
+    future[12:] += size, -size
+    speeds, command = np.array([0.3, 0.1]), np.array([0.2, -0.1])
+    rival.applied(command, limited=False)
+    u = rival.step(Observation(speeds, np.zeros(2), future[0], future[1], command, future))
+    best = _dense(drive, command, speeds, future[1:], weight, nominal_model)
+    assert rival.plan == pytest.approx(best, rel=1e-6, abs=1e-7 * max(1.0, np.abs(best).max()))
+    first = u if drive == 'torque' else speeds + PERIOD * u / (1.0 - KEPT)
+    assert first == pytest.approx(best[:, 0], rel=1e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize('size', [1.0, 3.0, 10.0])
+def test_preview_is_within_two_percent_of_knowing_everything(size):
+    """Forty rows of future against one program over the whole run."""
+    wanted = _jump(size, 90, 45)
+    best = _dense('velocity', np.zeros(2), np.zeros(2), wanted[1:90], 1e-3, _knowledge('velocity'))
+    chi = np.zeros((90, 2))
+    for k in range(89):
+        chi[k + 1] = KEPT * chi[k] + (1.0 - KEPT) * best[:, k]
+    least = math.sqrt(_energy(chi, wanted))
+    for kind in (LinearMpcPreview, DynamicMatrixPreview):
+        rival = _make(kind, 'velocity', move_time=0.002)
+        speeds, *_ = _run(rival, 'velocity', wanted)
+        assert least * (1.0 - 1e-9) <= math.sqrt(_energy(speeds, wanted)) < 1.02 * least
+
+
+@pytest.mark.parametrize('size', [6.0, 10.0])
+def test_jump_costs_what_theory_says_with_and_without_preview(size):
+    """Under a rate limit a, for a jump J.
+
+    Without preview the command sets out when the jump comes: its ramp is J/a long, and the wheel
+    is behind by a lag more. With preview the ramp is centred on the jump: a quarter of J³/(3a).
+    """
+    wanted = _jump(size)
+    ramp = size**3 / (3.0 * REACH)
+    for late, early in ((LinearMpc, LinearMpcPreview), (DynamicMatrix, DynamicMatrixPreview)):
+        costs = []
+        for kind in (late, early):
+            rival = _make(kind, 'velocity', move_time=0.002)
+            costs.append(_energy(_run(rival, 'velocity', wanted)[0], wanted))
+        assert costs[0] == pytest.approx(ramp + LAG * size**2, rel=0.02)
+        assert costs[1] == pytest.approx(ramp / 4.0, rel=0.01)
+
+
+@pytest.mark.parametrize('drive', DRIVES)
+def test_smoothing_is_the_symmetric_filter_that_the_setting_promises(drive):
+    """Gain 1/(1 + (w t)²(1 + (w lag)²)) with the servo, 1/(1 + (w t)⁴) with the integrator."""
+    rate, move_time = 12.0, 0.05
+    time = PERIOD * np.arange(460 + AHEAD + 1)
+    wanted = np.column_stack((np.cos(rate * time), np.sin(rate * time)))
+    speeds, *_ = _run(_make(LinearMpcPreview, drive, move_time=move_time), drive, wanted)
+    late = slice(200, 460)
+    gains = [np.mean(np.sum(wave[late] * wanted[late], 1)) for wave in (speeds, wanted)]
+    turned = wanted[:, ::-1] * [1.0, -1.0]
+    gain = gains[0] / gains[1]
+    through = (rate * move_time) ** 2 * (1.0 + (rate * LAG) ** 2)
+    if drive == 'torque':
+        through = (rate * move_time) ** 4
+    assert gain == pytest.approx(1.0 / (1.0 + through), rel=0.02)
+    # No delay: nothing of the quadrature is left.
+    assert abs(np.mean(np.sum(speeds[late] * turned[late], 1))) < 0.02
+
+
+@pytest.mark.parametrize('drive', DRIVES)
+@pytest.mark.parametrize('kind', EVERY)
+def test_bounds_are_never_left(kind, drive):
+    rival = _make(kind, drive, robot={}, move_time=0.003)
+    inertia = wheel_inertia(rival._knowledge.robot.body, rival._knowledge.robot.geometry)
+    _, command, u = _run(rival, drive, _wander(300), noise=0.3)
+    if drive == 'velocity':
+        moves = np.diff(command, axis=0, prepend=0.0)
+        assert np.abs(moves).max() <= REACH * PERIOD + 1e-9
+        assert np.abs(moves).max() > 0.99 * REACH * PERIOD
+    elif kind not in (DynamicMatrix, DynamicMatrixPreview):
+        torque = np.abs(u @ inertia)
+        assert torque.max() <= 0.4 + 1e-9
+        assert torque.max() > 0.39
+
+
+# -- disturbances, wrong models -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('drive', DRIVES)
+@pytest.mark.parametrize('kind', EVERY)
+@pytest.mark.parametrize('seen', [0.0, 0.5])
+def test_no_offset_is_left_by_a_constant_disturbance_and_a_wrong_model(kind, drive, seen):
+    """Whatever share of the disturbance the shared estimate sees."""
+    push = np.array([5.0, -3.0])
+    times = {'integral_time': 0.1, 'bias_time': 0.1, 'filter_time': 0.02}
+    rival = _make(kind, drive, model_error=1.3, disturbance_share=1.0, **times)
+    wanted = np.tile([2.0, 1.0], (500 + AHEAD + 1, 1))
+    speeds, *_ = _run(rival, drive, wanted, lambda chi: push, np.tile(seen * push, (500, 1)))
+    assert np.abs(speeds[150] - wanted[0]).max() < 0.5
+    assert np.abs(speeds[-1] - wanted[0]).max() < 1e-6
+
+
+@pytest.mark.parametrize('kind', EVERY)
+def test_offset_stays_while_its_own_errors_are_ignored(kind):
+    """The counterpart: it is the integral, or the bias, that removes the offset."""
+    push = np.array([5.0, -3.0])
+    rival = _make(kind, 'velocity', integral_time=50.0, bias_time=5.0, model_error=1.3)
+    wanted = np.tile([2.0, 1.0], (60 + AHEAD + 1, 1))
+    speeds, *_ = _run(rival, 'velocity', wanted, lambda chi: push)
+    assert np.abs(speeds[-1] - wanted[0]).min() > 0.5 * LAG * 3.0
+
+
+@pytest.mark.parametrize('drive', DRIVES)
+@pytest.mark.parametrize('kind', EVERY)
+def test_knowing_the_friction_helps_where_the_estimate_is_late(kind, drive):
+    """The estimate of a filter comes late by a tenth of a second, the sign of r does not."""
+    robot = {'body.com_offset': 0.0}
+    parameters = PaperRobotParameters().with_values(robot)
+    friction = parameters.friction
+    table = np.array([friction.viscous, friction.coulomb, friction.coulomb_width])
+    dynamics = dynamics_vector(parameters.body, parameters.geometry)
+    wanted = _wander(500, seed=1)
+    wanted[:] = 3.0 * np.sin(6.0 * PERIOD * np.arange(len(wanted)))[:, None] * [1.0, -0.7]
+    late = np.array(
+        [load_acceleration(*wanted[max(k - 10, 0)], table, dynamics) for k in range(500)]
+    )
+    errors = []
+    for known in (robot, {**robot, 'friction.coulomb': 0.0, 'friction.viscous': 0.0}):
+        rival = _make(kind, drive, robot=known, disturbance_share=0.3 if known is robot else 1.0)
+        speeds, *_ = _run(
+            rival,
+            drive,
+            wanted,
+            lambda chi: np.array(load_acceleration(*chi, table, dynamics)),
+            late,
+        )
+        errors.append(np.sqrt(np.mean((speeds - wanted[:500])[100:] ** 2)))
+    assert errors[0] < 0.7 * errors[1]
+
+
+@pytest.mark.parametrize('drive', DRIVES)
+@pytest.mark.parametrize('kind', [LinearMpc, LinearMpcPreview, CasadiNmpc])
+def test_observer_parts_noise_from_following(kind, drive):
+    """With a true model a slow observer follows as sharply, and feeds back far less noise."""
+    wanted = _wander(400)
+    quiet, noisy = [], []
+    for filter_time in (0.001, 0.5):
+        how = {'filter_time': filter_time, 'integral_time': 20.0, 'disturbance_share': 0.01}
+        quiet.append(_run(_make(kind, drive, **how), drive, wanted)[0])
+        noisy.append(_run(_make(kind, drive, **how), drive, wanted, noise=0.2)[0])
+    assert np.abs(quiet[0] - quiet[1]).max() < 1e-3
+    # It starts from a single noisy estimate, which takes its time to be forgotten.
+    spread = [np.std((with_noise - quiet[0])[200:]) for with_noise in noisy]
+    assert spread[1] < 0.6 * spread[0]
+
+
+# -- dynamic matrix control -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('error', [1.0, 1.3])
+def test_identified_responses_are_those_of_theory(error):
+    nominal_model = _knowledge('velocity')
+    steps, loads = identify_step_responses(wheel_model(nominal_model, error), 0.0, 41)
+    passed = 1.0 - np.exp(-PERIOD * np.arange(1, len(steps) + 1) / (error * LAG))
+    assert steps == pytest.approx(passed, abs=1e-12)
+    assert loads == pytest.approx(error * LAG * passed, abs=1e-12)
+    gain = 20.0
+    steps, loads = identify_step_responses(wheel_model(_knowledge('torque'), error), gain, 41)
+    passed = 1.0 - (1.0 - PERIOD * gain / error) ** np.arange(1, len(steps) + 1)
+    assert steps == pytest.approx(passed, abs=1e-12)
+    assert loads == pytest.approx(error / gain * passed, abs=1e-12)
+
+
+def test_what_does_not_settle_cannot_be_identified():
+    with pytest.raises(ValueError, match='settle'):
+        identify_step_responses(wheel_model(_knowledge('torque'), 1.0), 0.0, 41)
+    with pytest.raises(ValueError, match='settle'):
+        _make(DynamicMatrix, 'torque', inner_gain=50.0, model_error=0.2)
+
+
+@pytest.mark.parametrize('drive', DRIVES)
+def test_convolution_of_moves_and_loads_is_the_wheel_itself(drive):
+    """With a true model nothing is ever missed, however command and known disturbance move."""
+    rival = _make(DynamicMatrixPreview, drive, disturbance_share=1.0)
+    seen = 4.0 * np.sign(np.sin(0.11 * np.arange(300)))[:, None] * [1.0, 0.5]
+    missed, now, original = [], iter(seen), rival.step
+
+    def step(observation):
+        u = original(observation)
+        missed.append(np.abs(rival.bias).max())
+        return u
+
+    rival.step = step
+    speeds, *_ = _run(rival, drive, _wander(300), lambda chi: next(now), seen)
+    assert np.abs(speeds).max() > 3.0
+    assert max(missed) < 2e-3  # what of the responses is cut off
+
+
+def test_known_loads_are_compensated_by_a_shift_of_the_command():
+    """Friction that is known, and therefore not fed forward again, changes nothing but that."""
+    wanted = 2.0 * np.sin(0.05 * np.arange(100))[:, None] * [1.0, -0.5]
+    rough = _make(DynamicMatrixPreview, 'velocity', robot={})
+    smooth = _make(DynamicMatrixPreview, 'velocity')
+    robot = PaperRobotParameters()
+    friction = robot.friction
+    table = np.array([friction.viscous, friction.coulomb, friction.coulomb_width])
+    dynamics = dynamics_vector(robot.body, robot.geometry)
+    first = np.array(load_acceleration(*wanted[1], table, dynamics))
+    commands = np.array([-LAG * first, np.zeros(2)])
+    for k in range(55):
+        load = np.array(load_acceleration(*wanted[k + 1], table, dynamics))
+        future = wanted[k : k + AHEAD]
+        for i, (rival, seen) in enumerate(((rough, load), (smooth, np.zeros(2)))):
+            observation = Observation(
+                wanted[k], seen, wanted[k], wanted[k + 1], commands[i].copy(), future
+            )
+            u = rival.step(observation)
+            commands[i] = wanted[k] + PERIOD * u / (1.0 - KEPT)
+        assert commands[0] + LAG * load == pytest.approx(commands[1], abs=2e-4)
+    assert np.abs(commands).max() > 0.5
+
+
+def test_dynamic_matrix_and_state_space_agree_on_a_true_model():
+    """Peers with one model, one cost and one disturbance give one answer."""
+    wanted = _wander(300)
+    same = {'move_time': 0.02, 'disturbance_share': 1.0}
+    answers = [
+        _run(_make(kind, 'velocity', **same), 'velocity', wanted)[2]
+        for kind in (LinearMpcPreview, DynamicMatrixPreview)
+    ]
+    assert np.abs(answers[0]).max() > 10.0
+    assert np.abs(answers[0] - answers[1]).max() < 0.05
+
+
+# -- nonlinear ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('drive', DRIVES)
+def test_nonlinear_agrees_with_linear_where_the_wheels_are_linear(drive):
+    wanted = _wander(250)
+    seen = np.tile([2.0, -1.0], (250, 1))
+    same = {'disturbance_share': 1.0, 'integral_time': 1.0}
+    linear, nonlinear = (
+        _run(_make(kind, drive, **same), drive, wanted, lambda chi: seen[0], seen)[2]
+        for kind in (LinearMpcPreview, CasadiNmpc)
+    )
+    assert np.abs(linear).max() > 20.0
+    assert nonlinear == pytest.approx(linear, abs=1e-6)
+
+
+@pytest.mark.parametrize('drive', DRIVES)
+@pytest.mark.parametrize('factor', [1.0, 1.3])
+def test_period_of_the_model_is_that_of_the_simulated_robot(drive, factor):
+    """Friction, turning, and a body heavier than the nominal one that the servo knows."""
+    casadi = pytest.importorskip('casadi')
+    robot = PaperRobotParameters().with_values(
+        {
+            'mass_factor': factor,
+            'inertia_factor': factor,
+            'drive.kind': drive,
+            'drive.dead_time': 0.0,
+            'drive.acceleration': 0.0,
+            'disturbance.bound': 0.0,
+        }
+    )
+    model = wheel_dynamics(_knowledge(drive, {}), factor, casadi)
+    nominal = wheel_inertia(robot.body, robot.geometry)
+    generator = np.random.default_rng(2)
+    disturbance = Disturbance(DisturbanceParameters(bound=0.0), generator)
+    for _ in range(20):
+        chi = generator.uniform(-6, 6, 2)
+        command = generator.uniform(-30, 30, 2)
+        told = nominal @ command if drive == 'torque' else chi + LAG * command
+        plant = PaperPlant(robot.drive, PERIOD / 50)
+        plant.load(
+            robot.drive,
+            (robot.body, robot.true_body),
+            robot.geometry,
+            robot.friction,
+            robot.friction_factor,
+        )
+        plant._state[5:] = chi
+        plant._limited[:] = told
+        plant.run(tuple(told), False, disturbance, 50)
+        given = command if drive == 'torque' else told
+        reached = np.array(model(chi, given, np.zeros(2))[0]).ravel()
+        assert reached == pytest.approx(np.array(plant.wheels), abs=5e-3)
+        assert np.abs(reached - chi).max() > 5e-3
+
+
+@pytest.mark.parametrize('lasting', [0.0, 1.0])
+def test_condensing_closes_the_gaps_and_superposes(lasting):
+    """Against a run of the linearised model, with commands changed at will."""
+    generator = np.random.default_rng(6)
+    n = 7
+    guess, reached = generator.standard_normal((2, n + 1, 2))
+    by_speed, by_command = generator.standard_normal((2, n, 2, 2))
+    units, reference = generator.standard_normal((2, 2)), generator.standard_normal((2, n + 1))
+    errors, response = np.zeros(2 * n), np.zeros((2 * n, 2 * n))
+    condense(guess, reached[:n], by_speed, by_command, reference, units, lasting, errors, response)
+    moves = generator.standard_normal((n, 2))
+    change, speeds = np.zeros(2), guess[0].copy()
+    for j in range(n):
+        change = lasting * change + units @ moves[j]
+        speeds = reached[j] + (speeds - guess[j]) @ by_speed[j] + change @ by_command[j]
+        there = errors[2 * j : 2 * j + 2] + response[2 * j : 2 * j + 2] @ moves.ravel()
+        assert there == pytest.approx(speeds - reference[:, j + 1], rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize('drive', DRIVES)
+def test_derivatives_of_the_model_are_its_differences(drive):
+    casadi = pytest.importorskip('casadi')
+    model = wheel_dynamics(_knowledge(drive, {}), 1.3, casadi)
+    at = [np.array([0.1, -2.0]), np.array([1.0, 3.0]), np.array([0.5, -1.0])]
+    for which in (0, 1):
+        slopes = np.array(model(*at)[1 + which])
+        for entry in range(2):
+            ends = []
+            for side in (1e-6, -1e-6):
+                moved = [value.copy() for value in at]
+                moved[which][entry] += side
+                ends.append(np.array(model(*moved)[0]).ravel())
+            assert slopes[:, entry] == pytest.approx((ends[0] - ends[1]) / 2e-6, abs=1e-7)
+
+
+def test_one_linearisation_a_step_follows_the_converged_plan():
+    """Real-time iterations: what one leaves over, the next step takes up."""
+    wanted = _wander(200)
+    once, often = (
+        _run(_make(CasadiNmpc, 'velocity', robot={}, iterations=count), 'velocity', wanted)[0]
+        for count in (1, 5)
+    )
+    assert np.abs(once - often).max() < 0.02
+
+
+def test_without_casadi_only_making_one_fails(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'casadi', None)
+    with pytest.raises(ImportError, match='pip install casadi'):
+        CasadiNmpc(CasadiNmpcParameters(), _knowledge('velocity'))
+
+
+# -- all ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('drive', DRIVES)
+@pytest.mark.parametrize('kind', EVERY)
+def test_equal_runs_are_equal_bit_for_bit_and_lent_arrays_stay(kind, drive):
+    wanted = _wander(120)
+    kept = wanted.copy()
+    one, two = (_run(_make(kind, drive, robot={}), drive, wanted, noise=0.2)[2] for _ in range(2))
+    assert np.array_equal(one, two)
+    assert np.array_equal(wanted, kept)
+    rival = _make(kind, drive, robot={})
+    lent = [np.array([0.1 * i, -0.2]) for i in range(1, 6)]
+    copies = [array.copy() for array in lent]
+    answer = rival.step(Observation(*lent, wanted[:AHEAD] if kind.preview else None))
+    for array, copy in zip(lent, copies, strict=True):
+        assert np.array_equal(array, copy)
+    before = answer.copy()
+    rival.step(Observation(*lent, wanted[:AHEAD] if kind.preview else None))
+    assert np.array_equal(answer, before), 'the answer must not be overwritten by the next step'
+
+
+@pytest.mark.parametrize('kind', [LinearMpcPreview, DynamicMatrixPreview, CasadiNmpc])
+def test_preview_without_a_future_is_refused(kind):
+    rival = _make(kind, 'velocity')
+    with pytest.raises(ValueError, match='future'):
+        rival.step(Observation(*(np.zeros(2) for _ in range(5)), None))
+
+
+@pytest.mark.parametrize(
+    'kind, wrong',
+    [
+        (LinearMpc, LinearMpcPreviewParameters()),
+        (LinearMpcPreview, LinearMpcParameters()),
+        (DynamicMatrix, DynamicMatrixPreviewParameters()),
+        (DynamicMatrixPreview, DynamicMatrixParameters()),
+        (CasadiNmpc, LinearMpcParameters()),
+    ],
+)
+def test_settings_of_another_method_are_refused(kind, wrong):
+    with pytest.raises(ValueError, match='settings'):
+        kind(wrong, _knowledge('velocity'))
+
+
+@pytest.mark.parametrize('drive', DRIVES)
+@pytest.mark.parametrize('kind', LINEAR)
+def test_cut_answers_leave_no_wind_up(kind, drive):
+    """A drive that lets only a tenth through for a while; afterwards all is as before."""
+    rival = _make(kind, drive)
+    nominal_model = _knowledge(drive)
+    speeds, command, far = np.zeros(2), np.zeros(2), np.array([6.0, -6.0])
+    highest = 0.0
+    for k in range(600):
+        wanted = far if k < 50 else 0.1 * far
+        future = np.tile(wanted, (AHEAD, 1)) if kind.preview else None
+        u = rival.step(
+            Observation(speeds.copy(), np.zeros(2), wanted, wanted, command.copy(), future)
+        )
+        allowed = np.clip(u, -10.0, 10.0) if k < 200 else u
+        if drive == 'velocity':
+            command = speeds + PERIOD * allowed / nominal_model.share
+            speeds = KEPT * speeds + (1.0 - KEPT) * command
+        else:
+            speeds = speeds + PERIOD * allowed
+        rival.applied(allowed, limited=bool(np.any(allowed != u)))
+        if k > 100:
+            highest = max(highest, float(np.abs(speeds - 0.1 * far).max()))
+    assert highest < 4.5  # how far it had come when it was called back
+    assert np.abs(speeds - 0.1 * far).max() < 1e-3

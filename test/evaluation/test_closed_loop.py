@@ -1,0 +1,662 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The closed loop at kernel speed: same physics, same runs, honest cases and statistics."""
+
+from dataclasses import dataclass, fields
+from functools import partial
+import math
+from operator import methodcaller
+import pickle
+
+import numpy as np
+import pytest
+from scipy.stats import t as student_of_scipy
+
+from t3mpc_ros.control.actuation import VelocityActuation
+from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController
+from t3mpc_ros.evaluation.closed_loop import (
+    FastPlant,
+    JobError,
+    LoopRecord,
+    MethodSpec,
+    WorkerPool,
+    drive_for,
+    measure_many,
+    run,
+    run_many,
+)
+from t3mpc_ros.evaluation.confidence_intervals import interval, mean, paired, student_quantile
+from t3mpc_ros.evaluation.scenario import (
+    CASES,
+    DRIVES,
+    HELD_OUT_SEEDS,
+    PRETRAINING_SEEDS,
+    RATE,
+    TUNING_SEEDS,
+    Scenario,
+)
+from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
+from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
+from t3mpc_ros.simulation.plant.paper_plant import PaperRobot, PaperRobotParameters
+
+# -- methods to run ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ProportionalParameters(Parameters):
+    gain: float = parameter(8.0, 'feedback gain', unit='1/s')
+    broken_from: int = parameter(-1, 'step from which the answer is not a number')
+    fails: bool = parameter(False, 'whether it raises an exception')
+
+
+class Proportional(BaselineController):
+    """Feed-forward, proportional feedback, and the unexplained acceleration cancelled."""
+
+    parameters_type = ProportionalParameters
+
+    def __init__(self, parameters, nominal_model):
+        self.parameters, self.nominal_model, self.steps = parameters, nominal_model, 0
+
+    def step(self, observation):
+        if self.parameters.fails:
+            raise ZeroDivisionError('on purpose')
+        self.steps += 1
+        if 0 <= self.parameters.broken_from < self.steps:
+            return np.full(2, math.nan)
+        slope = (observation.wanted_next - observation.wanted) / self.nominal_model.period
+        return (
+            slope
+            - self.parameters.gain * (observation.speeds - observation.wanted)
+            - observation.unexplained
+        )
+
+
+class Foreseeing(Proportional):
+    preview = True
+
+
+class Noting(Proportional):
+    """Notes what it is shown and told, and publishes terms."""
+
+    def __init__(self, parameters, nominal_model):
+        super().__init__(parameters, nominal_model)
+        self.seen, self.told, self.terms = [], [], np.zeros((5, 2))
+
+    def step(self, observation):
+        u = super().step(observation)
+        future = None if observation.future is None else observation.future.copy()
+        self.seen.append(
+            [
+                *(
+                    np.array(getattr(observation, name))
+                    for name in ('speeds', 'unexplained', 'command')
+                ),
+                observation.wanted.copy(),
+                observation.wanted_next.copy(),
+                future,
+            ]
+        )
+        self.terms = np.zeros((5, 2))
+        self.terms[2] = u
+        return u
+
+    def applied(self, acceleration, *, limited):
+        self.told.append((acceleration.copy(), limited))
+
+
+class ForeseeingNoting(Noting):
+    preview = True
+
+
+P = MethodSpec('P', Proportional, ProportionalParameters())
+
+
+def noted(kind, scenario, drive=None):
+    """Return a run, and the method that noted it."""
+    made = []
+
+    def method(nominal_model):
+        made.append(kind(ProportionalParameters(), nominal_model))
+        return made[0]
+
+    return run(scenario, method, drive=drive), made[0]
+
+
+def assert_equal_records(first, second):
+    for item in fields(LoopRecord):
+        np.testing.assert_array_equal(getattr(first, item.name), getattr(second, item.name))
+
+
+# -- the plant --------------------------------------------------------------------------------
+
+HEAVY = {'mass_factor': 1.3, 'inertia_factor': 0.8, 'friction_factor': 2.0}
+
+
+@pytest.mark.parametrize('drive', DRIVES)
+@pytest.mark.parametrize(
+    'changes',
+    [
+        {},
+        {'noise.variance': 0.04, **HEAVY},
+        {'noise.variance': 0.1, 'drive.dead_time': 0.03, 'disturbance.walk_rate': 20.0},
+        {'disturbance.bound': 0.006, 'substep': 0.0007, 'rate': 200.0},
+    ],
+    ids=['nominal', 'heavy', 'late, wild walk', 'other grid'],
+)
+def test_the_fast_plant_is_the_simulated_robot_bit_for_bit(drive, changes):
+    parameters = PaperRobotParameters.from_dict({'drive.kind': drive, 'seed': 7, **changes})
+    later = parameters.with_values({'mass_factor': 1.7, 'friction_factor': 0.5})
+    steps, generator = 300, np.random.default_rng(1)
+    robot, fast = PaperRobot(parameters), FastPlant(parameters, steps)
+    state = robot.advance(0)
+    command = np.zeros(2)
+    for k in range(steps):
+        assert tuple(fast.measured) == state.wheels
+        if k == steps // 2:
+            robot.configure(later)
+            fast.configure(later)
+        if drive == 'torque':
+            # Beyond the torque limit of 0.4 N m now and then.
+            command = generator.normal(0.0, 0.2, 2)
+            state = robot.step_torque(*command.tolist())
+        else:
+            # Within what the guard passes: 30 rad/s² and 10 rad/s.
+            reach = 28.0 / parameters.rate
+            command = np.clip(command + generator.uniform(-reach, reach, 2), -7.0, 7.0)
+            state = robot.step(WheelSpeeds(*command.tolist()))
+        fast.step(*command.tolist())
+        assert tuple(fast.speeds) == state.true_wheels
+        assert fast.plant.pose == state.truth.pose
+        assert fast.plant.angles == state.angles
+    assert fast.measured == pytest.approx(state.wheels, abs=0.0)
+    assert np.abs(fast.speeds).max() > 0.1  # it did move
+
+
+def test_the_fast_plant_refuses_what_it_cannot_do():
+    parameters = PaperRobotParameters()
+    with pytest.raises(ValueError, match='steps must be at least 1: got 0'):
+        FastPlant(parameters, 0)
+    fast = FastPlant(parameters, 1)
+    for name, value in (('noise.variance', 0.1), ('drive.dead_time', 0.02), ('seed', 5)):
+        with pytest.raises(ParameterError, match=f'{name} is fixed'):
+            fast.configure(parameters.with_values({name: value}))
+    fast.step(0.0, 0.0)
+    with pytest.raises(ValueError, match='steps must be at least 2'):
+        fast.step(0.0, 0.0)
+
+
+# -- scenarios --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    'changes, text',
+    [
+        ({'drive': 'belt'}, "drive must be one of torque, velocity: got 'belt'"),
+        ({'case': 'windy'}, "case must be one of nominal, .*: got 'windy'"),
+        ({'case': 'dead time'}, "drive must be velocity in case 'dead time': got 'torque'"),
+        ({'noise': -0.1}, r'noise must be from 0 to 100 \(rad/s\)²: got -0.1'),
+        ({'noise': math.nan}, 'noise must be from 0 to 100 .*: got nan'),
+        ({'seed': -1}, 'seed must be a whole number of at least 0: got -1'),
+        ({'seed': 1.5}, 'seed must be a whole number of at least 0: got 1.5'),
+        ({'duration': 0.0}, 'duration must be from 0.01 to 3600 s: got 0.0'),
+        ({'lead': -1.0}, 'lead must be from 0 to 10 s: got -1.0'),
+    ],
+)
+def test_a_scenario_names_what_is_wrong_with_it(changes, text):
+    with pytest.raises(ValueError, match=text):
+        Scenario(**({'drive': 'torque', 'noise': 0.04, 'case': 'nominal', 'seed': 1} | changes))
+
+
+def test_training_and_held_out_seeds_are_strangers_and_robots_have_seeds_of_their_own():
+    assert len(TUNING_SEEDS) == 9
+    assert len(HELD_OUT_SEEDS) == 20
+    seeds = [*TUNING_SEEDS, *PRETRAINING_SEEDS, *HELD_OUT_SEEDS]
+    robots = [Scenario('torque', 0.0, 'nominal', seed).robot().seed for seed in seeds]
+    assert len({*seeds, *robots}) == 2 * len(seeds)
+
+
+EXPECTED = {
+    'nominal': {},
+    'mass +30 %': {'mass_factor': 1.3, 'inertia_factor': 1.3},
+    'mass -30 %': {'mass_factor': 0.7, 'inertia_factor': 0.7},
+    'friction x3': {'friction_factor': 3.0},
+    'load change': {},
+    'disturbance': {'disturbance.bound': 0.006},
+    'dead time': {'drive.dead_time': 0.03},
+}
+
+
+@pytest.mark.parametrize(
+    'case, drive', [(name, drive) for name, case in CASES.items() for drive in case.drives]
+)
+def test_every_case_changes_what_it_says_and_nobody_is_told_but_of_the_dead_time(case, drive):
+    scenario = Scenario(drive, 0.07, case, 3)
+    plain = PaperRobotParameters.from_dict(
+        {'drive.kind': drive, 'noise.variance': 0.07, 'seed': scenario.robot().seed}
+    ).to_dict()
+    true = scenario.robot().to_dict()
+    assert {name: true[name] for name in true if true[name] != plain[name]} == pytest.approx(
+        EXPECTED[case]
+    )
+    told = scenario.nominal_model().robot
+    nominal = PaperRobotParameters.from_dict({'drive.kind': drive}).to_dict()
+    known = {name: value for name, value in told.to_dict().items() if value != nominal[name]}
+    assert known == (EXPECTED[case] if case == 'dead time' else {})
+    estimate = scenario.estimate()
+    assert estimate.noise_variance == 0.07
+    assert estimate.lag == told.drive.lag
+    assert estimate.dead_time == (0.03 if case == 'dead time' else 0.01)
+
+
+@pytest.mark.parametrize('drive', DRIVES)
+def test_every_case_shows_in_the_run_and_the_load_change_from_half_of_it_on(drive):
+    runs = {
+        case: run(Scenario(drive, 0.04, case, 2, 2.0), P)
+        for case in CASES
+        if drive in CASES[case].drives
+    }
+    nominal = runs.pop('nominal')
+    for case, changed in runs.items():
+        differs = np.flatnonzero((changed.speeds != nominal.speeds).any(axis=1))
+        assert differs.size > 50, case
+        np.testing.assert_array_equal(changed.wanted, nominal.wanted)
+        np.testing.assert_allclose(
+            changed.measured - changed.speeds, nominal.measured - nominal.speeds, atol=1e-12
+        )
+        assert differs[0] == 101 if case == 'load change' else differs[0] < 10
+
+
+def test_the_load_change_makes_the_robot_heavier_and_rougher():
+    scenario = Scenario('torque', 0.0, 'load change', 2)
+    before, after = scenario.robot().to_dict(), scenario.changed_robot().to_dict()
+    assert {name: after[name] for name in after if after[name] != before[name]} == {
+        'mass_factor': 1.3,
+        'inertia_factor': 1.3,
+        'friction_factor': 2.0,
+    }
+    assert scenario.change_step == 3000
+    assert Scenario('torque', 0.0, 'nominal', 2).changed_robot() is None
+
+
+def test_a_method_knows_how_fast_both_wheels_may_change_at_once():
+    known = Scenario('velocity', 0.0, 'nominal', 1).nominal_model()
+    geometry, limits = known.robot.geometry, Scenario('velocity', 0.0, 'nominal', 1).limits
+    for right, left in ((1, 1), (1, -1), (1, 0)):
+        linear = 0.5 * geometry.wheel_radius * (right + left) * known.acceleration
+        angular = 0.5 * geometry.wheel_radius * (right - left) / geometry.half_separation
+        assert abs(linear) <= limits.linear_acceleration * (1 + 1e-12)
+        assert abs(angular * known.acceleration) <= limits.angular_acceleration * (1 + 1e-12)
+    assert 28.0 < known.acceleration <= limits.wheel_acceleration
+    assert Scenario('torque', 0.0, 'nominal', 1).nominal_model().acceleration == math.inf
+    assert known.period == 0.01
+    assert Scenario('torque', 0.0, 'nominal', 1).nominal_model(200.0).period == 0.005
+
+
+# -- the reference ----------------------------------------------------------------------------
+
+
+def test_the_reference_has_three_rad_per_second_on_every_wheel_over_seeds():
+    values = np.array(
+        [Scenario('torque', 0.0, 'nominal', s).reference().wanted[300:6000] for s in TUNING_SEEDS]
+    )
+    assert values.std(axis=(0, 1)) == pytest.approx([3.0, 3.0], rel=0.08)
+    assert np.abs(values.mean(axis=(0, 1))).max() < 0.5
+
+
+@pytest.mark.parametrize('seed', [1, 101])
+def test_the_reference_jumps_at_the_switch_times_alone_and_its_slope_does_not_jump(seed):
+    reference = Scenario('velocity', 0.0, 'nominal', seed).reference()
+    switches = [1200, 2400, 3600, 4800, 6000]  # the last one lies in the preview
+    assert np.flatnonzero(reference.switched).tolist() == switches
+    assert (np.flatnonzero(np.diff(reference.modes)) + 1).tolist() == switches
+    # Between switches r is the integral of its slope (trapezoid).
+    jump = np.diff(reference.wanted, axis=0) - 0.5 / RATE * (
+        reference.rate[1:] + reference.rate[:-1]
+    )
+    size = np.abs(jump).max(axis=1)
+    assert (np.flatnonzero(size > 0.1) + 1).tolist() == switches
+    assert np.delete(size, np.array(switches) - 1).max() < 0.005
+    assert np.abs(reference.rate).max() < 80.0
+    assert reference.time[-1] > 60.0 + 0.4 + 0.03
+
+
+def test_a_reference_is_computed_once_and_cannot_be_written_to():
+    first = Scenario('torque', 0.0, 'nominal', 5, 3.0).reference()
+    assert Scenario('velocity', 0.1, 'friction x3', 5, 3.0).reference() is first
+    assert Scenario('torque', 0.0, 'nominal', 6, 3.0).reference() is not first
+    with pytest.raises(ValueError, match='read-only'):
+        first.wanted[0] = 1.0
+
+
+# -- the loop ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('drive', DRIVES)
+def test_equal_runs_are_equal_bit_for_bit_whatever_ran_between(drive):
+    scenario = Scenario(drive, 0.04, 'mass +30 %', 4, 3.0)
+    first = run(scenario, P)
+    run(Scenario(drive, 0.1, 'nominal', 5, 1.0), MethodSpec('F', Foreseeing, P.parameters))
+    assert_equal_records(first, run(scenario, P))
+    other = run(Scenario(drive, 0.04, 'mass +30 %', 5, 3.0), P)
+    assert not np.array_equal(first.speeds, other.speeds)
+
+
+@pytest.mark.parametrize('drive, limit', [('torque', 0.3), ('velocity', 0.3)])
+def test_a_simple_controller_tracks_in_both_drives(drive, limit):
+    record = run(Scenario(drive, 0.0, 'nominal', 1, 20.0), P)
+    assert record.finite
+    assert record.rmse() < limit
+    assert record.rmse(cut=1.0) < 0.15
+    # Twice the gain takes the error away faster after the jump at 12 s.
+    faster = MethodSpec('2 P', Proportional, ProportionalParameters(gain=16.0))
+    assert run(Scenario(drive, 0.0, 'nominal', 1, 20.0), faster).rmse() < record.rmse()
+
+
+@pytest.mark.parametrize('drive', DRIVES)
+def test_what_is_recorded_fits_together(drive):
+    scenario = Scenario(drive, 0.04, 'nominal', 9, 14.0)
+    record, method = noted(Noting, scenario)
+    reference = scenario.reference()
+    np.testing.assert_array_equal(record.wanted, reference.wanted[:1400])
+    assert record.time[-1] == 13.99
+    noise = record.measured - record.speeds
+    assert np.var(noise) == pytest.approx(0.04, rel=0.1)
+    np.testing.assert_array_equal(record.terms[:, 2], [entry[0] for entry in method_u(method)])
+    np.testing.assert_array_equal(record.command, [told[0] for told in method.told])
+    np.testing.assert_array_equal(record.limited, [told[1] for told in method.told])
+    np.testing.assert_array_equal(record.unexplained, [seen[1] for seen in method.seen])
+    if drive == 'torque':
+        inertia = wheel_inertia(scenario.robot().body, scenario.robot().geometry)
+        np.testing.assert_allclose(record.sent, record.command @ inertia, atol=1e-15)
+        np.testing.assert_array_equal(record.estimated, [seen[0] for seen in method.seen])
+        assert not record.limited.any()
+    else:
+        commands = np.array([seen[2] for seen in method.seen])
+        np.testing.assert_array_equal(record.sent[:-1], commands[1:])
+        change = np.abs(np.diff(record.sent, axis=0)).max() * RATE
+        assert change <= scenario.limits.wheel_acceleration * (1 + 1e-9)
+        assert record.limited.any()  # the jump at 12 s cannot be followed at once
+
+
+def method_u(method):
+    """Return what the method answered, from what it saw."""
+    for speeds, unexplained, _, wanted, following, _ in method.seen:
+        slope = (following - wanted) / method.nominal_model.period
+        yield (slope - 8.0 * (speeds - wanted) - unexplained,)
+
+
+@pytest.mark.parametrize(
+    'drive, case, late',
+    [('torque', 'nominal', 0), ('velocity', 'nominal', 1), ('velocity', 'dead time', 3)],
+)
+def test_a_method_sees_the_reference_of_the_instant_at_which_it_acts(drive, case, late):
+    scenario = Scenario(drive, 0.04, case, 6, 12.5, 0.2)
+    reference = scenario.reference()
+    _, blind = noted(Noting, scenario)
+    _, seer = noted(ForeseeingNoting, scenario)
+    for k in (0, 500, 1200 - late - 1, 1200 - late, 1199, 1200, 1249):
+        *_, wanted, following, future = seer.seen[k]
+        assert future.shape == (20, 2)
+        np.testing.assert_array_equal(future, reference.wanted[k + late : k + late + 20])
+        np.testing.assert_array_equal([wanted, following], future[:2])
+        *_, wanted, following, future = blind.seen[k]
+        assert future is None
+        r, slope = reference.wanted[k], reference.rate[k]
+        np.testing.assert_allclose(wanted, r + late * 0.01 * slope, atol=1e-12)
+        np.testing.assert_allclose(following, r + (late + 1) * 0.01 * slope, atol=1e-12)
+
+
+class NotingDrive(VelocityActuation):
+    """Notes what it is fed."""
+
+    def __init__(self, *arguments):
+        self.log = []
+        super().__init__(*arguments)
+
+    def reset(self, speeds):
+        self.log.append(('reset', speeds.copy()))
+        super().reset(speeds)
+
+    def observe(self, measured, dt):
+        assert dt == 0.01
+        self.log.append(('observe', measured.copy()))
+        super().observe(measured, dt)
+
+    def send(self, acceleration, *rest):
+        self.log.append(('send', acceleration.copy()))
+        return super().send(acceleration, *rest)
+
+
+@pytest.mark.parametrize('drive', DRIVES)
+def test_the_estimator_is_fed_every_measurement_once_and_in_order(drive):
+    scenario = Scenario(drive, 0.04, 'nominal', 6, 1.0)
+    geometry = scenario.nominal_model().robot.geometry
+    seam = NotingDrive(scenario.estimate(), scenario.limits, geometry, drive, 0.01)
+    del seam.log[:]
+    record = run(scenario, P, drive=seam)
+    assert [entry[0] for entry in seam.log] == ['reset', *['observe', 'send'] * 100]
+    np.testing.assert_array_equal(seam.log[0][1], record.measured[0])
+    np.testing.assert_array_equal([entry[1] for entry in seam.log[1::2]], record.measured)
+    assert_equal_records(record, run(scenario, P))
+    assert_equal_records(record, run(scenario, P, drive=drive_for(scenario)))
+
+
+@pytest.mark.parametrize('drive', DRIVES)
+def test_the_estimate_is_better_than_the_measurement_and_knows_friction(drive):
+    record = run(Scenario(drive, 0.04, 'nominal', 8, 12.0), P)
+    error = np.sqrt(np.mean((record.estimated - record.speeds)[300:] ** 2))
+    assert error < 0.7 * 0.2
+    # What chi' = u leaves over is mostly Coulomb friction, against the motion.
+    moving = np.abs(record.speeds) > 1.0
+    against = record.unexplained * np.sign(record.speeds) < 0.0
+    assert against[moving].mean() > 0.8
+
+
+def test_without_being_told_the_dead_time_the_estimator_looks_ahead_wrongly():
+    scenario = Scenario('velocity', 0.04, 'dead time', 3, 15.0)
+    nominal = drive_for(Scenario('velocity', 0.04, 'nominal', 3))
+    missed = []
+    for seam in (None, nominal):
+        record, method = noted(Noting, scenario, seam)
+        shown = np.array([seen[0] for seen in method.seen])
+        missed.append(np.sqrt(np.mean((shown[300:-3] - record.speeds[303:]) ** 2)))
+    assert missed[0] < 0.75 * missed[1]
+
+
+def test_estimator_and_method_are_told_what_the_motors_make_of_too_large_a_u():
+    scenario = Scenario('torque', 0.0, 'nominal', 9, 14.0)
+    method = MethodSpec('steep', Proportional, ProportionalParameters(gain=80.0))
+    record = run(scenario, method)
+    limit = scenario.robot().drive.torque_limit
+    inertia = wheel_inertia(scenario.robot().body, scenario.robot().geometry)
+    np.testing.assert_allclose(record.sent, record.command @ inertia, atol=1e-12)
+    assert np.abs(record.sent).max() == pytest.approx(limit, rel=1e-12)
+    cut = np.abs(record.sent).max(axis=1) > limit * (1 - 1e-9)
+    np.testing.assert_array_equal(record.limited, cut)
+    # Else the estimate would be off by whole rad/s after the jump.
+    assert np.abs(record.estimated - record.speeds).max() < 0.3
+
+
+def test_an_answer_that_is_no_number_ends_the_run_and_shows():
+    method = MethodSpec('broken', Proportional, ProportionalParameters(broken_from=50))
+    record = run(Scenario('torque', 0.04, 'nominal', 1, 4.0), method)
+    whole = run(Scenario('torque', 0.04, 'nominal', 1, 4.0), P)
+    assert not record.finite
+    assert math.isnan(record.rmse())
+    np.testing.assert_array_equal(record.speeds[:50], whole.speeds[:50])
+    for name in ('measured', 'speeds', 'estimated', 'command', 'sent', 'unexplained'):
+        assert np.isnan(getattr(record, name)[50:]).all(), name
+    np.testing.assert_array_equal(record.wanted, whole.wanted)
+
+
+def test_what_does_not_fit_the_loop_is_refused():
+    scenario = Scenario('velocity', 0.0, 'nominal', 1, 1.0)
+    geometry = scenario.nominal_model().robot.geometry
+    for dead_time, text in ((0.013, 'dead time must be whole periods'), (0.2, 'at most 0.0')):
+        estimate = scenario.estimate().with_values({'dead_time': dead_time})
+        seam = VelocityActuation(estimate, scenario.limits, geometry, 'velocity', 0.01)
+        with pytest.raises(ValueError, match=text):
+            run(scenario, P, drive=seam)
+    with pytest.raises(
+        ValueError, match='settings of P must be ProportionalParameters: got Limit'
+    ):
+        MethodSpec('P', Proportional, scenario.limits)
+
+    class Scalar(Proportional):
+        def step(self, observation):
+            return np.zeros(3)
+
+    with pytest.raises(ValueError, match=r'shape \(2,\): got \(3,\)'):
+        run(scenario, partial(Scalar, ProportionalParameters()))
+
+
+# -- many runs --------------------------------------------------------------------------------
+
+
+def test_many_runs_are_the_same_in_one_process_and_in_two():
+    gains = [
+        MethodSpec(f'P {g}', Proportional, ProportionalParameters(gain=g)) for g in (4.0, 9.0)
+    ]
+    jobs = [
+        (Scenario(drive, 0.04, 'load change', seed, 4.0), method)
+        for drive in DRIVES
+        for seed in (1, 2)
+        for method in gains
+    ]
+    alone = dict(run_many(jobs, 1))
+    assert sorted(alone) == list(range(len(jobs)))
+    bad = (jobs[0][0], MethodSpec('bad', Proportional, ProportionalParameters(fails=True)))
+    with WorkerPool(2) as workers:
+        together = dict(run_many(iter(jobs), workers))
+        assert sorted(together) == sorted(alone)
+        for index, record in together.items():
+            assert_equal_records(record, alone[index])
+        # The same processes serve the next batch, and outlive a failed one.
+        rmse = methodcaller('rmse', 1.0)
+        assert dict(measure_many(jobs, rmse, workers)) == {
+            index: record.rmse(1.0) for index, record in alone.items()
+        }
+        with pytest.raises(JobError, match=r'bad on torque, .*, load change, seed 1 failed: Zero'):
+            list(run_many([jobs[1], bad, *jobs], workers))
+        assert len(dict(run_many(jobs[:3], workers))) == 3
+    with pytest.raises(JobError, match=r'bad on torque.*on purpose'):
+        list(run_many([jobs[1], bad]))
+    with pytest.raises(ValueError, match='workers must be at least 1: got 0'):
+        list(run_many(jobs, 0))
+
+
+def test_a_record_and_a_method_survive_being_sent():
+    record = run(Scenario('torque', 0.04, 'nominal', 1, 0.5), P)
+    assert_equal_records(pickle.loads(pickle.dumps(record)), record)
+    assert pickle.loads(pickle.dumps(P)) == P
+
+
+# -- records ----------------------------------------------------------------------------------
+
+
+def test_rmse_leaves_out_the_start_and_what_follows_a_switch():
+    record = LoopRecord.empty(10)
+    record.time[:] = np.arange(10.0)
+    record.modes[6:] = 1
+    record.speeds[:, 0] = [9, 9, 9, 1, 1, 1, 7, 7, 1, 1]
+    record.wanted[:, 1] = [9, 9, 9, 1, 1, 1, 7, 7, 1, 1]
+    assert record.rmse(cut=2.0) == 1.0
+    assert record.rmse() == pytest.approx(math.sqrt((5 + 2 * 49) / 7))
+    assert record.largest_error() == 7.0
+    assert record.largest_error(cut=2.0) == 1.0
+    with pytest.raises(ValueError, match='must leave rows of a run that ends at 9 s: got 20 s'):
+        record.rmse(20.0)
+
+
+def test_chatter_is_the_variation_of_the_effort_per_second_and_wheel():
+    record = LoopRecord.empty(101)
+    record.time[:] = np.arange(101) * 0.01
+    record.effort[:, 0] = np.arange(101)  # rises by 100 in a second
+    record.effort[1::2, 1] = 1.0  # to and fro: 100 as well
+    assert record.chatter() == pytest.approx(100.0)
+    with pytest.raises(ValueError, match='at least 2 rows: got 1'):
+        LoopRecord.empty(1).chatter()
+
+
+# -- statistics -------------------------------------------------------------------------------
+
+
+def test_quantiles_are_students():
+    for degrees in [*range(1, 60), 99, 100, 999, 1000, 20_001]:
+        for confidence in (0.5, 0.95, 0.999):
+            expected = student_of_scipy.ppf(0.5 + 0.5 * confidence, degrees)
+            assert student_quantile(degrees, confidence) == pytest.approx(expected, rel=1e-10)
+    assert student_quantile(1) == pytest.approx(12.706, abs=5e-4)
+    assert student_quantile(19) == pytest.approx(2.093, abs=5e-4)
+    with pytest.raises(ValueError, match='degrees must be at least 1: got 0'):
+        student_quantile(0)
+    with pytest.raises(ValueError, match='confidence must be above 0 and below 1: got 1.0'):
+        student_quantile(3, 1.0)
+
+
+def test_the_interval_holds_the_true_mean_as_often_as_it_says():
+    generator = np.random.default_rng(3)
+    draws = generator.normal(5.0, 2.0, (4000, 5))
+    held = [abs(mean(values) - 5.0) <= interval(values) for values in draws]
+    assert np.mean(held) == pytest.approx(0.95, abs=0.015)
+    assert interval([1.0, 2.0, 3.0]) == pytest.approx(4.3026527 / math.sqrt(3.0))
+    assert interval([1.0]) == math.inf
+    with pytest.raises(ValueError, match='must not be empty'):
+        mean([])
+
+
+def test_pairing_takes_out_what_both_have():
+    generator = np.random.default_rng(4)
+    seeds = generator.normal(0.0, 10.0, 20)
+    a = seeds + 1.0 + generator.normal(0.0, 0.1, 20)
+    b = seeds + generator.normal(0.0, 0.1, 20)
+    difference = paired(a, b)
+    assert difference.mean == pytest.approx(mean(a) - mean(b))
+    assert difference.half == pytest.approx(interval(a - b))
+    assert difference.certain
+    assert difference.half < 0.1 < 1.0 < interval(a)
+    noise = generator.normal(size=(2000, 2, 8))
+    assert np.mean([paired(*draw).certain for draw in noise]) == pytest.approx(0.05, abs=0.015)
+    with pytest.raises(ValueError, match='equally many: got 20 and 19'):
+        paired(a, b[1:])
+
+
+# -- practice ---------------------------------------------------------------------------------
+
+
+class Counting(BaselineController):
+    """Learns how many steps it has done."""
+
+    parameters_type = ProportionalParameters
+
+    def __init__(self, parameters, nominal_model):
+        self.steps = np.zeros(1)
+
+    def step(self, observation):
+        self.steps += 1.0
+        return np.zeros(2)
+
+    def learnt(self):
+        return {'steps': self.steps.copy()}
+
+    def restore(self, learnt):
+        self.steps = learnt['steps'].copy()
+
+
+def test_what_practises_begins_with_what_it_learnt_run_after_run():
+    nominal_model = Scenario('torque', 0.0, 'nominal', 101).nominal_model()
+    fresh = MethodSpec('count', Counting, ProportionalParameters())(nominal_model)
+    pretrained = MethodSpec('count', Counting, ProportionalParameters(), pretrained=True)
+    assert fresh.steps[0] == 0.0
+    for _ in range(2):  # the second is the first's equal: nothing of a run is carried over
+        controller = pretrained(nominal_model)
+        assert controller.steps[0] == len(PRETRAINING_SEEDS) * 4000
+        controller.step(None)
+
+
+def test_a_method_that_does_not_learn_needs_no_practice():
+    nominal_model = Scenario('torque', 0.0, 'nominal', 101).nominal_model()
+    assert (
+        MethodSpec('P', Proportional, ProportionalParameters(), True)(nominal_model).learnt() == {}
+    )

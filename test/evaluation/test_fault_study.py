@@ -1,0 +1,281 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Under each named fault the closed loop stays bounded, or stops with a reason, as docs say."""
+
+from dataclasses import replace
+import json
+from pathlib import Path
+import re
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.cli.main import main
+from t3mpc_ros.evaluation import fault_study as trials
+from t3mpc_ros.evaluation.fault_study import (
+    BEGIN_MARK,
+    END_MARK,
+    FAULT_RUNS,
+    TITLES,
+    UNDETECTED,
+    UNREPORTED,
+    FaultRun,
+    console_text,
+    evaluate_outcome,
+    markdown_tables,
+    page_section,
+    run_fault,
+    table_row,
+    undisturbed,
+    update_page,
+)
+from t3mpc_ros.evaluation.twin_closed_loop import (
+    FINAL_STANDSTILL,
+    chaotic_course,
+    loop_controller,
+    loop_robot,
+    run_twin,
+    straight_course,
+)
+from t3mpc_ros.parameters.table import ParameterError
+from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON
+from t3mpc_ros.simulation.digital_twin import BROWN_OUT_REASON
+from t3mpc_ros.simulation.fault_injection import FAULTS, FaultEvent, FaultSchedule
+
+PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'faults.md'
+NUMBER = re.compile(r'(?<![\w.])\d+(?:\.\d+)?')
+
+
+def short_run(schedule=None, pauses=(), **changes):
+    robot = loop_robot().with_values(changes)
+    return run_twin(robot, loop_controller(), chaotic_course(6.0), 6.0, schedule, pauses)
+
+
+def trial(course, name):
+    (found,) = (one for one in FAULT_RUNS if (one.course, one.name) == (course, name))
+    return found
+
+
+def page_rows():
+    """Return the rows of the page's outcome tables by (course, fault)."""
+    text = PAGE.read_text().partition(BEGIN_MARK)[2].partition(END_MARK)[0]
+    rows = {}
+    for course, title in TITLES.items():
+        part = text.partition(f'### {title}\n')[2].partition('###')[0]
+        for line in part.splitlines():
+            if line.startswith('| `'):
+                rows[course, line.split('`')[1]] = line + '\n'
+    return rows
+
+
+def assert_same(line, other):
+    """The words are the same, and the numbers but for what another processor rounds."""
+    assert NUMBER.sub('#', line) == NUMBER.sub('#', other)
+    for mine, yours in zip(NUMBER.findall(line), NUMBER.findall(other), strict=True):
+        assert float(mine) == pytest.approx(float(yours), rel=0.1, abs=0.1), f'{line}{other}'
+
+
+# --- the loop -----------------------------------------------------------------------------------
+
+
+def test_equal_runs_are_equal_bit_for_bit_and_faults_come_as_from_a_file(tmp_path):
+    event = FaultEvent(3.0, 'command_delay', 0.1, 1.0)
+    first = short_run(FaultSchedule([event]))
+    path = tmp_path / 'ride.yaml'
+    path.write_text('- {at: 3.0, fault: command_delay, value: 0.1, for: 1.0}\n')
+    second = short_run(**{'faults.schedule': str(path)})
+    for name in ('asked', 'measured', 'rotors', 'odometry', 'truth', 'flags'):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+    assert first.robot_says == second.robot_says
+    assert not np.array_equal(first.rotors, short_run().rotors)
+
+
+def test_the_robot_stands_until_its_gyro_is_calibrated_and_then_follows_closely():
+    record = short_run()
+    standing = record.time < FINAL_STANDSTILL
+    assert not record.asked[standing].any()
+    assert set(np.array(record.controller_says)[standing]) == {'disabled by request'}
+    assert not any(np.array(record.controller_says)[~standing])
+    error = (record.rotors - record.wanted)[record.rows(3.0, 6.0)]
+    assert np.sqrt(np.mean(error**2)) < 0.06
+
+
+def test_a_person_can_pause_the_controller():
+    record = short_run(pauses=[(3.0, 4.0)])
+    assert not record.asked[record.rows(3.0, 4.0)].any()
+    assert record.asked[record.rows(4.0, 6.0)].any()
+
+
+def test_what_cannot_be_run_is_refused():
+    robot, controller = loop_robot(), loop_controller()
+    with pytest.raises(ValueError, match='course must have the shape'):
+        run_twin(robot, controller, straight_course(5.0), 6.0)
+    servo = robot.with_values({'drive.kind': 'velocity'})
+    with pytest.raises(ParameterError, match='drive.kind must be stepper'):
+        run_twin(servo, controller, straight_course(5.0), 5.0)
+    with pytest.raises(ParameterError, match='rate of the controller'):
+        run_twin(robot, controller.with_values({'rate': 50.0}), straight_course(5.0), 5.0)
+
+
+# --- what becomes of it -------------------------------------------------------------------------
+
+EXPECTED = {
+    'command_delay 0.1 s': ('impaired', '', ''),
+    'command_jitter 0.05 s': ('bounded', '', ''),
+    'command_loss 1': ('stops', 'no command for 0.25 s', 'by itself'),
+    'gyro_bias_jump 0.35 rad/s': ('stops', SLIP_STOP_REASON, 'after a pause'),
+    'gyro_dead': ('bounded', '', ''),
+    'ranges_dead': ('bounded', '', ''),
+    'wheel_blocked right': ('stops', SLIP_STOP_REASON, 'after a pause'),
+    'load_change 3 kg': ('bounded', '', ''),
+    'slippery 0.05': ('stops', SLIP_STOP_REASON, 'after a pause'),
+    'supply_sag 5 V': ('stops', BROWN_OUT_REASON, 'by itself'),
+    'brown_out': ('stops', BROWN_OUT_REASON, 'by itself'),
+}
+
+
+@pytest.mark.parametrize('name', EXPECTED)
+def test_the_loop_stays_bounded_or_stops_with_a_reason(name):
+    """One strength of each fault, and the page says of it what comes out here."""
+    result = run_fault(trial('chaotic', name))
+    assert (result.verdict, result.reason, result.goes_on) == EXPECTED[name]
+    assert_same(table_row(result), page_rows()['chaotic', name])
+
+
+def test_every_fault_is_among_those_expected():
+    assert [name.split()[0] for name in EXPECTED] == [fault.name for fault in FAULTS]
+
+
+@pytest.mark.parametrize(
+    'course, name',
+    [
+        ('straight', 'wheel_blocked both'),
+        ('straight', 'gyro_bias_jump 0.02 rad/s'),
+        ('straight', 'collision, head-on'),
+        ('arc', 'collision, at a slant'),
+    ],
+)
+def test_what_the_robot_cannot_see_is_said_plainly(course, name):
+    result = run_fault(trial(course, name))
+    assert not result.noticed
+    assert 'odometry is wrong' in result.unseen
+    line = table_row(result)
+    assert (UNREPORTED if 'collision' in name else UNDETECTED) in line
+    assert 'not noticed' in console_text([result])
+    assert_same(line, page_rows()[course, name])
+
+
+def test_the_page_has_a_row_for_every_trial_and_no_other():
+    assert list(page_rows()) == [(one.course, one.name) for one in FAULT_RUNS]
+    names = {name.split()[0] for _, name in page_rows()}
+    assert names >= {fault.name for fault in FAULTS}
+    assert page_section([]).partition('\n###')[0].split(END_MARK)[0].strip() in PAGE.read_text()
+
+
+def test_a_delay_that_the_controller_is_told_costs_little():
+    """What hurts is not the delay but not to know of it."""
+    robot = loop_robot().with_values({'faults.command_delay': 0.1})
+    errors = []
+    for dead_time in (0.01, 0.11):
+        controller = loop_controller().with_values({'estimate.dead_time': dead_time})
+        record = run_twin(robot, controller, chaotic_course(15.0), 15.0)
+        rows = record.rows(5.0, 15.0)
+        errors.append(np.sqrt(np.mean((record.rotors - record.wanted)[rows] ** 2)))
+    assert errors[0] > 0.5
+    assert errors[1] < 0.2
+
+
+# --- the judge ----------------------------------------------------------------------------------
+
+AT = trial('chaotic', 'gyro_dead')
+
+
+def judged(record):
+    healthy = undisturbed('chaotic', AT.duration)
+    return evaluate_outcome(AT.name, AT.course, record, healthy, 10.0, 15.0, loop_robot())
+
+
+def test_a_run_without_fault_is_bounded_and_notices_nothing():
+    result = judged(undisturbed('chaotic', AT.duration))
+    assert (result.verdict, result.back, result.noticed, result.unseen) == ('bounded', 0.0, (), ())
+
+
+def test_a_robot_that_says_it_stands_and_drives_is_not_taken_at_its_word():
+    """A slip stop once lasted for no more than a period, and only the reason stayed."""
+    record = undisturbed('chaotic', AT.duration)
+    says = tuple(SLIP_STOP_REASON if 11.0 <= time < 15.0 else '' for time in record.time)
+    result = judged(replace(record, robot_says=says))
+    assert result.verdict == 'unbounded'
+    assert 'drives' in result.reason
+
+
+@pytest.mark.parametrize(
+    'field, value', [('commanded', (10.1, 10.1)), ('commanded', (-9.9, 9.9)), ('rotors', (0, 11))]
+)
+def test_speeds_beyond_the_limits_are_unbounded(field, value):
+    record = undisturbed('chaotic', AT.duration)
+    values = getattr(record, field).copy()
+    values[1200] = value
+    parameters = loop_robot().with_values({'guard.angular_speed': 4.0})
+    healthy = undisturbed('chaotic', AT.duration)
+    result = evaluate_outcome(
+        AT.name, AT.course, replace(record, **{field: values}), healthy, 10.0, 15.0, parameters
+    )
+    assert result.verdict == 'unbounded'
+
+
+def test_an_error_that_stays_is_impaired_and_one_that_goes_is_back_in_time():
+    record = undisturbed('chaotic', AT.duration)
+    rotors = record.rotors.copy()
+    rotors[1500:] += 0.2
+    assert judged(replace(record, rotors=rotors)).verdict == 'impaired'
+    rotors[2000:] -= 0.2
+    result = judged(replace(record, rotors=rotors))
+    assert result.verdict == 'bounded'
+    assert 3.0 <= result.back <= 5.0
+
+
+# --- the page and the command -------------------------------------------------------------------
+
+
+@pytest.fixture
+def two(monkeypatch):
+    """Let the command make two short trials only."""
+    event = FaultEvent(10.0, 'gyro_dead', True, 2.0)
+    made = tuple(
+        FaultRun('gyro_dead', course, event, '', 17.0) for course in ('chaotic', 'straight')
+    )
+    monkeypatch.setattr(trials, 'TRIALS', made)
+
+
+def test_the_command_writes_table_and_numbers_and_only_between_the_marks(two, tmp_path, capsys):
+    page, numbers = tmp_path / 'page.md', tmp_path / 'numbers.json'
+    page.write_text(f'before\n{BEGIN_MARK}\nold\n{END_MARK}\nafter\n')
+    assert main(['faults', '--output', str(page), '--json', str(numbers)]) == 0
+    shown = capsys.readouterr()
+    assert 'gyro_dead' in shown.out
+    assert '2 of 2 runs' in shown.err
+    text = page.read_text()
+    assert text.startswith(f'before\n{BEGIN_MARK}\n')
+    assert text.endswith(f'{END_MARK}\nafter\n')
+    assert 'old' not in text
+    assert text.count('| `gyro_dead` |') == 2
+    assert [one['course'] for one in json.loads(numbers.read_text())] == ['chaotic', 'straight']
+    assert main(['faults', '--output', str(page)]) == 0
+    assert page.read_text() == text
+
+
+@pytest.mark.parametrize('text', ['', BEGIN_MARK, f'{END_MARK}{BEGIN_MARK}', 2 * BEGIN_MARK])
+def test_a_page_without_the_marks_is_left_alone(text, tmp_path):
+    page = tmp_path / 'page.md'
+    page.write_text(text)
+    with pytest.raises(ValueError, match='must hold the lines'):
+        update_page(page, [])
+    assert page.read_text() == text
+
+
+def test_every_row_of_the_table_has_as_many_cells_as_its_head():
+    result = judged(undisturbed('chaotic', AT.duration))
+    lines = markdown_tables([result, replace(result, course='arc')]).splitlines()
+    assert {line.count('|') for line in lines if line.startswith('|')} == {7}
+    assert {line.count('|') for line in page_rows().values()} == {7}

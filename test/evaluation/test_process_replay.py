@@ -1,0 +1,669 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Recorded runs computed again: exactly where all is known, and saying so where it is not."""
+
+import argparse
+import json
+import math
+from pathlib import Path
+
+from mcap.reader import make_reader
+from mcap.writer import Writer
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from t3mpc_ros.bag.chunk_reader import read_bag_index, read_metadata_records, read_summary
+from t3mpc_ros.bag.columns import read_columns
+from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.bag.run.journal import Event, Journal, parameters_from_json, parameters_to_json
+from t3mpc_ros.bag.run.model_file import save_model
+from t3mpc_ros.bag.schema import BagError
+from t3mpc_ros.bag.writer import BagWriter, DataError
+from t3mpc_ros.cli.bag import add_compare_parser, add_replay_parser
+from t3mpc_ros.control.controller import ControllerParameters
+from t3mpc_ros.control.watchdog import Reason
+from t3mpc_ros.evaluation.process_replay.comparison import (
+    ELSEWHERE,
+    Tolerances,
+    compare,
+    compare_bags,
+    compare_columns,
+)
+from t3mpc_ros.evaluation.process_replay.controller_bag import ControllerBag, RecordedController
+from t3mpc_ros.evaluation.process_replay.controller_inputs import (
+    FIELDS,
+    SPEEDS,
+    ReplayError,
+    load_inputs,
+)
+from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller
+from t3mpc_ros.evaluation.process_replay.divergence_figure import write_divergence_figure
+from t3mpc_ros.evaluation.process_replay.golden_bags import GOLDEN_SCENARIOS, run_golden_scenario
+from t3mpc_ros.evaluation.process_replay.message_alignment import match
+from t3mpc_ros.evaluation.process_replay.method_replay import replay_method
+from t3mpc_ros.evaluation.twin_closed_loop import loop_controller
+from t3mpc_ros.geometry.types import BodyTwist, Pose, State
+from t3mpc_ros.parameters.table import ParameterError
+
+GOLDEN = sorted((Path(__file__).parents[1] / 'golden').glob('*.mcap'))
+JOURNAL = '/controller/journal'
+STORE = get_typestore(Stores.ROS2_JAZZY)
+
+
+def bag_program(*arguments):
+    """Run a command of ``bag`` as its program does; return the exit code."""
+    parser = argparse.ArgumentParser(prog='bag')
+    commands = parser.add_subparsers(required=True)
+    add_replay_parser(commands)
+    add_compare_parser(commands)
+    options = parser.parse_args([str(argument) for argument in arguments])
+    return options.run(options)
+
+
+@pytest.fixture(scope='module')
+def bag():
+    [path] = [path for path in GOLDEN if path.stem == 'stops']
+    return path
+
+
+@pytest.fixture(scope='module')
+def inputs(bag):
+    return load_inputs(bag)
+
+
+@pytest.fixture(scope='module')
+def again(inputs):
+    return replay_controller(inputs)
+
+
+def without(bag, folder, drop):
+    """Write a copy of a bag without the messages for which ``drop(topic, count)`` is true."""
+    counts = {}
+    with bag.open('rb') as file:
+        reader = make_reader(file)
+        metadata_records = {item.name: dict(item.metadata) for item in reader.iter_metadata()}
+        metadata_records.pop('rosbag2')
+        with BagWriter(folder, metadata_records=metadata_records) as writer:
+            for schema, channel, message in reader.iter_messages():
+                counts[channel.topic] = counts.get(channel.topic, -1) + 1
+                if drop(channel.topic, counts[channel.topic]):
+                    continue
+                writer.add_topic(channel.topic, schema.name)
+                writer.write(channel.topic, message.log_time, message.publish_time, message.data)
+    return folder
+
+
+# -- golden bags ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('path', GOLDEN, ids=lambda path: path.stem)
+def test_golden_runs_come_out_as_they_were_recorded(path):
+    """If this fails on purpose: ``bag compare --update-golden test/golden``, and say why."""
+    inputs = load_inputs(path)
+    assert inputs.notes == ()
+    assert inputs.exact.all()
+    outcome = compare(inputs, replay_controller(inputs), Tolerances(ELSEWHERE, ELSEWHERE))
+    assert outcome.same, outcome.table()
+    assert {row.field for row in outcome.rows} == set(FIELDS)
+
+
+def test_golden_bags_are_there_and_small():
+    assert {path.stem for path in GOLDEN} == set(GOLDEN_SCENARIOS)
+    assert all(path.stat().st_size < 300_000 for path in GOLDEN)
+
+
+def test_the_golden_runs_have_all_that_they_are_for(inputs, again):
+    assert {Reason.TRACKING, Reason.DISABLED, Reason.REFERENCE_STALE, Reason.NO_ODOMETRY} <= set(
+        again.reasons
+    )
+    assert {Reason.NO_REFERENCE, Reason.ODOMETRY_BAD} <= set(again.reasons)
+    [changes] = [path for path in GOLDEN if path.stem == 'changes']
+    changed = load_inputs(changes)
+    assert list(changed.events).count(Event.CONFIGURE) == 5
+    assert Reason.NOT_FOLLOWING in replay_controller(changed).reasons
+    [switches] = [path for path in GOLDEN if path.stem == 'switches']
+    linear, angular = np.abs(np.diff(load_inputs(switches).references.numbers[:, 6:], axis=0)).T
+    assert np.count_nonzero((linear > 0.022) | (angular > 0.31)) >= 3, 'jumps as the track has it'
+
+
+def test_equal_recipes_give_equal_bags(tmp_path):
+    recipe = GOLDEN_SCENARIOS['stops']
+    columns = [
+        read_columns(read_bag_index(run_golden_scenario(recipe, tmp_path / name)), ['/cmd_vel'])
+        for name in ('one', 'other')
+    ]
+    one, other = (each['/cmd_vel'] for each in columns)
+    np.testing.assert_array_equal(one.numbers, other.numbers)
+    assert len(one) > 800
+
+
+@pytest.mark.parametrize('path', GOLDEN, ids=lambda path: path.stem)
+def test_a_summary_read_at_once_is_that_of_the_library(path):
+    with path.open('rb') as file:
+        summary = read_summary(file)
+        tables = read_metadata_records(file, summary)
+    with path.open('rb') as file:
+        reader = make_reader(file)
+        assert vars(summary) == vars(reader.get_summary())
+        assert tables == {item.name: dict(item.metadata) for item in reader.iter_metadata()}
+
+
+def test_a_file_that_breaks_off_in_its_summary_is_refused(bag, tmp_path):
+    whole = bag.read_bytes()
+    for name, content in {'end': whole[:-1], 'magic': b'x' + whole[1:], 'short': b''}.items():
+        copy = tmp_path / f'{name}.mcap'
+        copy.write_bytes(content)
+        with pytest.raises(BagError, match=f'{name}.mcap cannot be read'):
+            read_bag_index(copy)
+
+
+# -- what is detected -----------------------------------------------------------------------------
+
+
+def test_a_gain_one_percent_off_is_found_and_field_and_setting_are_named(inputs):
+    gain = inputs.lives[0].parameters[0].law.gain
+    outcome = compare(
+        inputs, replay_controller(inputs, {'law.gain': 1.01 * gain}), Tolerances(1e-6, 1e-6)
+    )
+    assert not outcome.same
+    differing = {row.field for row in outcome.rows if row.differing}
+    assert {'cmd_vel.linear.x', 'cmd_vel.angular.z', 'terms/feedback/right'} <= differing
+    assert 'terms/feedforward/right' not in {
+        row.field for row in outcome.rows if row.absolute > 0.5
+    }
+    assert any('law.gain' in text and str(gain) in text for text in outcome.parameters)
+    assert outcome.first.field.startswith('cmd_vel')
+    assert outcome.first.field in outcome.verdict()
+
+
+def test_the_same_settings_named_again_change_nothing(inputs):
+    gain = inputs.lives[0].parameters[0].law.gain
+    outcome = compare(inputs, replay_controller(inputs, {'law.gain': gain}))
+    assert outcome.same
+    assert outcome.parameters == ()
+
+
+def test_a_setting_that_does_not_exist_is_refused(inputs):
+    with pytest.raises(ParameterError, match='law.gian.*did you mean law.gain'):
+        replay_controller(inputs, {'law.gian': 1.0})
+
+
+def test_live_settings_are_those_of_their_time():
+    [path] = [path for path in GOLDEN if path.stem == 'changes']
+    inputs = load_inputs(path)
+    found = {name: table.law.gain for name, table in inputs.lives[0].parameters.items()}
+    assert found[0] != 20.0
+    assert found[1] == found[5] == 20.0
+
+
+# -- tolerances -----------------------------------------------------------------------------------
+
+
+def columns_of(was, now, tolerances):
+    recorded, computed = ({SPEEDS[0]: np.array(values)} for values in (was, now))
+    everywhere = np.full(len(was), math.nan)
+    recorded |= {name: everywhere for name in FIELDS if name != SPEEDS[0]}
+    computed |= {name: everywhere for name in FIELDS if name != SPEEDS[0]}
+    time = np.arange(float(len(was)))
+    outcome = compare_columns(time, recorded, computed, np.ones(len(was), dtype=bool), tolerances)
+    [row] = outcome.rows
+    return row
+
+
+def test_a_difference_counts_from_the_absolute_and_the_relative_tolerance_together():
+    was, now = [0.0, 1.0, 100.0], [0.01, 1.02, 101.1]
+    assert columns_of(was, now, Tolerances(0.01, 0.011)).differing == 0
+    row = columns_of(was, now, Tolerances(0.01, 0.0105))
+    assert (row.differing, row.first, row.first_step) == (1, 2.0, 2)
+    assert columns_of(was, now, Tolerances(0.009, 0.011)).first == 0.0
+    assert row.absolute == pytest.approx(1.1)
+    assert row.relative == pytest.approx(0.02)
+
+
+def test_no_number_is_infinitely_far_from_one_and_what_was_not_recorded_is_not_compared():
+    row = columns_of([math.nan, 1.0, 1.0], [5.0, 1.0, math.nan], Tolerances(1e9, 1e9))
+    assert (row.count, row.differing, row.first_step, row.absolute) == (2, 1, 2, math.inf)
+
+
+def test_a_field_may_have_a_tolerance_of_its_own_and_the_last_that_fits_counts():
+    tolerances = Tolerances(1.0, 0.5, {'cmd_vel.*': 0.1, 'cmd_vel.angular.z': 0.2})
+    assert tolerances.of('cmd_vel.linear.x') == (0.1, 0.0)
+    assert tolerances.of('cmd_vel.angular.z') == (0.2, 0.0)
+    assert tolerances.of('error/left') == (1.0, 0.5)
+
+
+@pytest.mark.parametrize(
+    'arguments, words',
+    [
+        ({'absolute': -1.0}, 'absolute must be from 0'),
+        ({'relative': math.nan}, 'relative must be from 0'),
+        ({'fields': {'cmd_vel.x': 1.0}}, 'cmd_vel.x is none of the fields cmd_vel.linear.x'),
+    ],
+)
+def test_a_tolerance_that_cannot_be_used_is_refused(arguments, words):
+    with pytest.raises(ValueError, match=words):
+        Tolerances(**arguments)
+
+
+# -- bags from which something is missing --------------------------------------------------------
+
+
+def test_without_a_journal_the_order_of_receipt_stands_in_and_is_said(bag, tmp_path):
+    copy = without(bag, tmp_path / 'copy', lambda topic, _: topic == JOURNAL)
+    inputs = load_inputs(copy)
+    assert not inputs.journalled
+    assert any('no journal' in note for note in inputs.notes)
+    outcome = compare(inputs, replay_controller(inputs))
+    assert any('approximate' in remark for remark in outcome.remarks)
+    # Until the robot is disabled nothing happened that only the journal tells.
+    row = next(row for row in outcome.rows if row.field == 'cmd_vel.linear.x')
+    assert row.count > 800
+    assert row.first >= 1.49
+
+
+def test_a_run_without_events_is_the_same_without_its_journal(tmp_path):
+    [path] = [path for path in GOLDEN if path.stem == 'switches']
+    inputs = load_inputs(without(path, tmp_path / 'copy', lambda topic, _: topic == JOURNAL))
+    outcome = compare(inputs, replay_controller(inputs), Tolerances(ELSEWHERE, ELSEWHERE))
+    assert outcome.same, outcome.table()
+
+
+def test_a_recorder_that_came_late_is_said_and_from_the_reset_on_all_is_compared(bag, tmp_path):
+    late = without(
+        bag, tmp_path / 'late', lambda topic, n: topic != '/controller/settings' and n < 100
+    )
+    inputs = load_inputs(late)
+    assert any('100 events of the controller were before' in note for note in inputs.notes)
+    assert not inputs.exact.all()
+    assert inputs.exact.any()
+    first = int(np.flatnonzero(inputs.exact)[0])
+    assert inputs.events[first] == Event.RESET
+    outcome = compare(inputs, replay_controller(inputs))
+    assert any('left out' in remark for remark in outcome.remarks)
+    assert outcome.same, outcome.table()
+    assert 200 < next(row.count for row in outcome.rows) < 300
+
+
+@pytest.mark.parametrize(
+    'topic, words',
+    [
+        ('/odom', '1 odometry messages that the controller had are not in the bag'),
+        ('/reference', '1 references that the controller had are not in the bag'),
+        (JOURNAL, '1 events are missing in the journal'),
+    ],
+)
+def test_a_lost_message_is_counted_and_what_follows_until_a_reset_is_left_out(
+    topic, words, bag, tmp_path
+):
+    inputs = load_inputs(without(bag, tmp_path / 'copy', lambda *it: it == (topic, 120)))
+    assert any(words in note for note in inputs.notes), inputs.notes
+    reset = int(np.flatnonzero(inputs.events == Event.RESET)[0])
+    gap = np.flatnonzero(~inputs.exact)
+    assert 60 < gap[0] < 125  # of the references 40 are ahead
+    assert gap[-1] == reset - 1
+    assert inputs.exact[reset:].all()
+    outcome = compare(inputs, replay_controller(inputs))
+    assert outcome.same, outcome.table()
+    assert int(np.count_nonzero(outcome.compared)) == inputs.events.size - gap.size
+
+
+def test_odometry_lost_before_the_first_reference_harms_nothing_else(tmp_path):
+    """The robot has not moved yet, as when the nodes have not all found each other."""
+    parameters = loop_controller()
+    start = 1_700_000_000_000_000_000
+    with ControllerBag(tmp_path / 'bag', parameters) as tape:
+        taped = RecordedController(parameters, tape, start)
+        for k in range(200):
+            now = start + 10_000_000 * k
+            twist = BodyTwist(0.1, 0.2)
+            if k > 50:
+                taped.add_reference(now, State(now + 400_000_000, Pose(0.0, 0.0, 0.0), twist))
+            taped.step(now + 1000, State(now, Pose(0.0, 0.0, 0.0), twist))
+    lost = without(tmp_path / 'bag/bag_0.mcap', tmp_path / 'copy', lambda *it: it == ('/odom', 20))
+    inputs = load_inputs(lost)
+    assert any('1 odometry messages' in note for note in inputs.notes)
+    assert np.flatnonzero(~inputs.exact).tolist() == [20]
+    assert compare(inputs, replay_controller(inputs)).same
+
+
+def test_a_lost_command_is_counted_and_harms_nothing_else(bag, tmp_path):
+    inputs = load_inputs(without(bag, tmp_path / 'copy', lambda *it: it == ('/cmd_vel', 120)))
+    assert any('1 commands are not in the bag' in note for note in inputs.notes)
+    assert inputs.exact.all()
+    assert compare(inputs, replay_controller(inputs)).same
+
+
+def test_settings_lost_at_the_start_are_said(tmp_path):
+    [path] = [path for path in GOLDEN if path.stem == 'changes']
+    lost = without(path, tmp_path / 'copy', lambda *it: it == ('/controller/settings', 0))
+    inputs = load_inputs(lost)
+    assert any('settings at the start are not in the bag' in note for note in inputs.notes)
+    assert not inputs.exact.any()
+
+
+def test_a_recorder_that_notes_no_time_of_publication_will_do(bag, tmp_path):
+    """Heard after its row of the journal, a command is still the one of that row."""
+    moved = tmp_path / 'moved'
+    with bag.open('rb') as file, BagWriter(moved, metadata_records={}) as writer:
+        for schema, channel, message in make_reader(file).iter_messages():
+            writer.add_topic(channel.topic, schema.name)
+            late = 300_000 if channel.topic == '/cmd_vel' else 0
+            late += 1_000_000 if channel.topic.startswith('/controller/l') else 0
+            when = message.log_time + late
+            writer.write(channel.topic, when, when, message.data)
+    inputs = load_inputs(moved)
+    assert inputs.notes == ()
+    outcome = compare(inputs, replay_controller(inputs))
+    assert not any(row.differing for row in outcome.rows[:2]), outcome.table()
+
+
+def test_a_lost_change_of_settings_is_said(tmp_path):
+    [path] = [path for path in GOLDEN if path.stem == 'changes']
+    lost = without(path, tmp_path / 'copy', lambda *it: it == ('/controller/settings', 3))
+    inputs = load_inputs(lost)
+    assert any('1 changes of settings are not in the bag' in note for note in inputs.notes)
+    third = np.flatnonzero(inputs.events == Event.CONFIGURE)[2]
+    assert inputs.exact[:third].all()
+    assert not inputs.exact[third:].any()
+
+
+def test_settings_that_were_only_asked_for_by_the_recorder_do(bag, tmp_path):
+    inputs = load_inputs(
+        without(bag, tmp_path / 'copy', lambda topic, _: topic == '/controller/settings')
+    )
+    assert compare(inputs, replay_controller(inputs)).same
+
+
+def test_a_bag_without_commands_is_refused(bag, tmp_path):
+    copy = without(bag, tmp_path / 'copy', lambda topic, _: topic == '/cmd_vel')
+    with pytest.raises(ReplayError, match='not in the bag: cmd_vel'):
+        load_inputs(copy)
+
+
+# -- the journal and the model --------------------------------------------------------------------
+
+
+def test_the_journal_numbers_events_and_counts_references():
+    journal = Journal()
+    journal.reference(7)
+    journal.reference(9)
+    assert list(journal.step(5)) == [0, Event.STEP, 5, 2, 9]
+    assert list(journal.enable(False)) == [1, Event.ENABLE, 0, 2, 0]
+    assert list(journal.reset()) == [2, Event.RESET, 0, 2, 0]
+    assert list(journal.configure()) == [3, Event.CONFIGURE, 0, 2, 1]
+    assert list(journal.silent(5)) == [4, Event.ODOMETRY_TIMEOUT, 5, 2, 0]
+
+
+def test_settings_survive_their_topic_to_the_last_bit():
+    parameters = ControllerParameters.from_dict({'law.gain': 0.1 + 0.2})
+    revision, values = parameters_from_json(parameters_to_json(3, parameters.to_dict()))
+    assert revision == 3
+    assert ControllerParameters.from_dict(values) == parameters
+    for text in ('', '{}', '[1]', '{"revision": null, "settings": {}}'):
+        with pytest.raises(ValueError, match='no revision of settings'):
+            parameters_from_json(text)
+
+
+def short_run(folder, model=None, steps=120):
+    """Drive along a gentle course, open loop: enough to see whether a model was loaded."""
+    parameters = loop_controller()
+    start = 1_700_000_000_000_000_000
+    with ControllerBag(folder, parameters) as tape:
+        taped = RecordedController(parameters, tape, start, model=model)
+        for k in range(steps + 40):
+            now = start + 10_000_000 * k
+            twist = BodyTwist(0.1 * math.sin(0.05 * k), 0.5)
+            taped.add_reference(now, State(now + 400_000_000, Pose(0.0, 0.0, 0.0), twist))
+            if k >= 40:
+                lagging = BodyTwist(0.09 * math.sin(0.05 * (k - 41)), 0.45)
+                taped.step(now + 500_000, State(now, Pose(0.0, 0.0, 0.0), lagging))
+        learnt = taped.controller.law.learnt()
+    return folder, learnt
+
+
+def test_a_model_is_found_by_its_checksum_or_missed_and_said(tmp_path):
+    _, learnt = short_run(tmp_path / 'first')
+    learnt['fuzzy.coefficients'] = learnt['fuzzy.coefficients'] + 0.3
+    model = tmp_path / 'model.npz'
+    save_model(model, learnt, {})
+    folder, _ = short_run(tmp_path / 'second', model)
+    lost = load_inputs(folder)
+    assert any('give it by --model' in note for note in lost.notes)
+    assert not lost.exact.any()
+    assert not compare(lost, replay_controller(lost)).same
+    given = load_inputs(folder, model=learnt)
+    assert given.exact.all()
+    assert compare(given, replay_controller(given)).same
+
+
+def test_a_node_that_was_started_again_is_another_life(tmp_path):
+    """Both are in one bag, and the second knows nothing of the first."""
+    parameters = loop_controller()
+    start = 1_700_000_000_000_000_000
+    with ControllerBag(tmp_path / 'bag', parameters) as tape:
+        for begin in (start, start + 2_000_000_000):
+            taped = RecordedController(parameters, tape, begin)
+            for k in range(100):
+                now = begin + 10_000_000 * k
+                still = BodyTwist(0.1, 0.2)
+                taped.add_reference(now, State(now + 400_000_000, Pose(0.0, 0.0, 0.0), still))
+                taped.step(now + 1000, State(now, Pose(0.0, 0.0, 0.0), still))
+    inputs = load_inputs(tmp_path / 'bag')
+    assert [len(life.events) for life in inputs.lives] == [100, 100]
+    assert inputs.notes == ()
+    assert inputs.exact.all()
+    assert compare(inputs, replay_controller(inputs)).same
+
+
+# -- which message was when -----------------------------------------------------------------------
+
+
+def journal_of(steps):
+    """Return rows for (stamp, references, newest)."""
+    return np.array([(k, 0, *step) for k, step in enumerate(steps)], dtype=np.int64)
+
+
+def test_references_that_only_the_recorder_heard_are_not_handed_over():
+    taken = match(
+        journal_of([(1, 0, 0), (2, 2, 40), (3, 3, 50)]), np.arange(4), np.arange(0, 60, 10)
+    )
+    assert list(zip(taken.begin, taken.end, strict=True))[1:] == [(3, 5), (5, 6)]
+    assert not taken.broken.any()
+
+
+def test_a_reference_source_that_starts_again_is_followed():
+    """Stamps go back: the newest message is not the one with the latest stamp."""
+    stamps = np.array([10, 20, 30, 10, 20, 30])
+    taken = match(journal_of([(1, 3, 30), (2, 4, 10), (3, 6, 30)]), np.arange(4), stamps)
+    assert taken.end.tolist() == [3, 4, 6]
+    assert not taken.broken.any()
+
+
+def test_the_controller_may_hear_of_a_reference_after_the_recorder():
+    taken = match(
+        journal_of([(1, 1, 10), (2, 1, 10), (3, 3, 30)]), np.arange(4), np.array([10, 20, 30])
+    )
+    assert taken.begin.tolist() == [0, 1, 1]
+    assert taken.end.tolist() == [1, 1, 3]
+
+
+# -- reading in bulk ------------------------------------------------------------------------------
+
+
+def test_bulk_reading_gives_what_a_deserialiser_gives(bag, tmp_path):
+    fields = {
+        0: 'pose.pose.position.x',
+        5: 'pose.pose.orientation.w',
+        6: 'twist.twist.linear.x',
+        7: 'twist.twist.angular.z',
+    }
+    columns = read_columns(read_bag_index(bag), ['/odom', '/controller/error/right', JOURNAL])
+    with open_bag(bag) as recording:
+        slow = recording.series('/odom', {str(k): path for k, path in fields.items()})
+        numbers = recording.series('/controller/error/right', {'value': 'data'})
+        rows = [message.data for _, message in recording.messages(JOURNAL)]
+        start_ns = recording.start_ns
+    for k in fields:
+        np.testing.assert_array_equal(columns['/odom'].numbers[:, k], slow[str(k)])
+    received = (columns['/odom'].received_ns - start_ns) / 1e9
+    np.testing.assert_array_equal(received, slow['received'])
+    np.testing.assert_array_equal(
+        columns['/controller/error/right'].numbers[:, 0], numbers['value']
+    )
+    np.testing.assert_array_equal(columns[JOURNAL].integers, rows)
+
+
+def test_frames_of_any_length_are_read(tmp_path):
+    types = STORE.types
+    point, turn = types['geometry_msgs/msg/Point'], types['geometry_msgs/msg/Quaternion']
+    vector = types['geometry_msgs/msg/Vector3']
+    with BagWriter(tmp_path / 'bag', metadata_records={}) as writer:
+        writer.add_topic('/odom', 'nav_msgs/msg/Odometry')
+        for k in range(12):
+            message = types['nav_msgs/msg/Odometry'](
+                types['std_msgs/msg/Header'](
+                    types['builtin_interfaces/msg/Time'](k, 5), 'o' * (k % 7)
+                ),
+                'b' * (k % 5),
+                types['geometry_msgs/msg/PoseWithCovariance'](
+                    types['geometry_msgs/msg/Pose'](
+                        point(1.0 + k, 2.0, 3.0), turn(0.1, 0.2, 0.3, 0.4)
+                    ),
+                    np.arange(36.0),
+                ),
+                types['geometry_msgs/msg/TwistWithCovariance'](
+                    types['geometry_msgs/msg/Twist'](
+                        vector(5.0 + k, 6.0, 7.0), vector(8.0, 9.0, 10.0 + k)
+                    ),
+                    np.arange(36.0),
+                ),
+            )
+            data = bytes(STORE.serialize_cdr(message, message.__msgtype__))
+            writer.write('/odom', 100 + k, 50 + k, data)
+    column = read_columns(read_bag_index(tmp_path / 'bag'), ['/odom'])['/odom']
+    assert column.stamps_ns.tolist() == [k * 10**9 + 5 for k in range(12)]
+    assert column.published_ns.tolist() == list(range(50, 62))
+    wanted = [(1.0 + k, 2.0, 0.1, 0.2, 0.3, 0.4, 5.0 + k, 10.0 + k) for k in range(12)]
+    np.testing.assert_array_equal(column.numbers, wanted)
+
+
+@pytest.mark.parametrize('length', [3, 4, 30, 400])
+def test_a_message_that_is_cut_short_is_refused(length, tmp_path):
+    with BagWriter(tmp_path / 'bag', metadata_records={}) as writer:
+        writer.add_topic('/odom', 'nav_msgs/msg/Odometry')
+        writer.write('/odom', 1, 1, (b'\x00\x01\x00\x00' + bytes(800))[:length])
+    with pytest.raises(DataError, match='not laid out'):
+        read_columns(read_bag_index(tmp_path / 'bag'), ['/odom'])
+
+
+def test_a_bag_without_chunks_is_read_by_the_slow_way_to_the_same_numbers(bag, tmp_path):
+    copy = tmp_path / 'flat.mcap'
+    with bag.open('rb') as source, copy.open('wb') as target:
+        writer = Writer(target, use_chunking=False)
+        writer.start(profile='ros2', library='test')
+        channels = {}
+        for schema, channel, message in make_reader(source).iter_messages():
+            if channel.topic not in channels:
+                kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(
+                    channel.topic, 'cdr', kind, dict(channel.metadata)
+                )
+            writer.add_message(
+                channels[channel.topic], message.log_time, message.data, message.publish_time
+            )
+        writer.finish()
+    names = ['/odom', '/cmd_vel', JOURNAL]
+    quick, slow = (read_columns(read_bag_index(path), names) for path in (bag, copy))
+    for name in names:
+        np.testing.assert_array_equal(quick[name].received_ns, slow[name].received_ns)
+        np.testing.assert_array_equal(quick[name].stamps_ns, slow[name].stamps_ns)
+        np.testing.assert_array_equal(quick[name].numbers, slow[name].numbers)
+        np.testing.assert_array_equal(quick[name].integers, slow[name].integers)
+
+
+def test_a_damaged_bag_is_refused_or_read_never_more(bag, tmp_path):
+    """Where the damage does no harm to what is asked for, the numbers are those of the run."""
+    whole = bag.read_bytes()
+    sound = read_columns(read_bag_index(bag), ['/odom', JOURNAL])
+    generator = np.random.default_rng(5)
+    copy = tmp_path / 'damaged.mcap'
+    refused = 0
+    for k in range(60):
+        content = bytearray(whole)
+        if k % 3:
+            content[int(generator.integers(len(whole)))] ^= 1 << int(generator.integers(8))
+        else:
+            del content[int(generator.integers(len(whole))) :]
+        copy.write_bytes(content)
+        try:
+            read = read_columns(read_bag_index(copy), ['/odom', JOURNAL])
+        except BagError:
+            refused += 1
+            continue
+        for name, column in read.items():
+            np.testing.assert_array_equal(column.numbers, sound[name].numbers)
+            np.testing.assert_array_equal(column.integers, sound[name].integers)
+    assert refused > 30
+
+
+# -- the commands ---------------------------------------------------------------------------------
+
+
+def test_a_rerun_written_as_a_bag_compares_with_its_source(bag, tmp_path, capsys):
+    assert bag_program('rerun', bag, '--output', tmp_path / 'again') == 0
+    said = capsys.readouterr().out
+    assert 'x real time' in said
+    assert 's to compile and to warm up are not counted' in said
+    assert bag_program('compare', bag, tmp_path / 'again', '--abs', '1e-6', '--rel', '1e-6') == 0
+    assert bag_program('compare', tmp_path / 'again', '--abs', '1e-6', '--rel', '1e-6') == 0
+
+
+def test_a_rerun_under_other_settings_differs_and_says_that_the_loop_is_open(
+    bag, tmp_path, capsys
+):
+    assert bag_program('rerun', bag, '--output', tmp_path / 'what', '--set', 'law.gain=30') == 0
+    assert 'open loop' in capsys.readouterr().out
+    one, other = load_inputs(bag), load_inputs(tmp_path / 'what')
+    outcome = compare_bags(one, other)
+    assert not outcome.same
+    assert any('law.gain is 30.0' in text for text in outcome.parameters)
+    picture = tmp_path / 'picture.png'
+    assert bag_program('compare', bag, tmp_path / 'what', '--picture', picture) == 3
+    assert picture.read_bytes().startswith(b'\x89PNG')
+    assert 'law.gain' in capsys.readouterr().out
+
+
+def test_a_picture_is_drawn_of_two_runs_that_agree(inputs, again, tmp_path):
+    write_divergence_figure(compare(inputs, again), tmp_path / 'same.png')
+    assert (tmp_path / 'same.png').read_bytes().startswith(b'\x89PNG')
+
+
+def test_wrong_tolerances_and_a_missing_bag_are_refused(bag):
+    with pytest.raises(ValueError, match='FIELD=NUMBER'):
+        bag_program('compare', bag, '--field', 'cmd_vel.linear.x=little')
+    with pytest.raises(ValueError, match='BAG must be given'):
+        bag_program('compare')
+
+
+def test_a_rival_answers_where_the_controller_let_the_robot_move(inputs, again):
+    there = replay_method(inputs, 'PI + feed-forward').fields
+    assert set(there) == set(SPEEDS)
+    tracking = np.array([reason is Reason.TRACKING for reason in again.reasons])
+    for name in SPEEDS:
+        was = inputs.recorded[name]
+        assert np.isfinite(there[name][tracking]).mean() > 0.98
+        assert np.nanstd((there[name] - was)[tracking]) < 0.5 * np.nanstd(was[tracking])
+        assert np.nanmax(np.abs((there[name] - was)[tracking])) > 1e-4, 'it is another method'
+        stopped = inputs.commanding & ~tracking
+        np.testing.assert_array_equal(there[name][stopped], 0.0)
+    with pytest.raises(ReplayError, match='there is no method'):
+        replay_method(inputs, 'nobody')
+
+
+def test_the_settings_topic_is_json(bag):
+    with open_bag(bag) as recording:
+        [(_, message)] = recording.messages('/controller/settings')
+    content = json.loads(message.data)
+    assert content['revision'] == 0
+    assert content['settings']['law.gain'] == loop_controller().law.gain

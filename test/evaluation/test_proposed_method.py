@@ -1,0 +1,133 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Our controller in the offline loop: the same as the node's, and better with each part."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.control.controller import Controller, ControllerParameters
+from t3mpc_ros.evaluation.closed_loop import MethodSpec, run
+from t3mpc_ros.evaluation.confidence_intervals import paired
+from t3mpc_ros.evaluation.methods import methods
+from t3mpc_ros.evaluation.proposed_method import ComposedParameters, ProposedController
+from t3mpc_ros.evaluation.scenario import RATE, Scenario
+from t3mpc_ros.evaluation.tuning.tuned_parameters import StoreError, TunedParameters
+from t3mpc_ros.geometry.kinematics import twist_from_wheels, wheels_from_twist
+from t3mpc_ros.geometry.types import ORIGIN, State, WheelSpeeds
+from t3mpc_ros.simulation.plant.paper_plant import PaperRobot
+
+NS = 10_000_000
+
+
+def _spec(**changes):
+    return MethodSpec('full', ProposedController, ComposedParameters.from_dict(changes))
+
+
+def _as_the_nodes_close_it(scenario):
+    """Return the wheel speeds of the loop of stamped motions in and limited twists out."""
+    robot = PaperRobot(scenario.robot())
+    geometry = scenario.robot().geometry
+    controller = Controller(
+        ControllerParameters.from_dict({'estimate.noise_variance': scenario.noise})
+    )
+    controller.warm_up()
+    wanted = scenario.reference().wanted
+    lead = round(scenario.lead * RATE)
+
+    def tell(k):
+        twist = twist_from_wheels(WheelSpeeds(*wanted[k].tolist()), geometry)
+        controller.add_reference(State(k * NS, ORIGIN, twist))
+
+    for k in range(lead):
+        tell(k)
+    state = robot.advance(0)
+    speeds = []
+    for k in range(scenario.steps):
+        tell(k + lead)
+        twist, status = controller.step(state.odometry)
+        assert status.reason.moves
+        speeds.append(state.true_wheels)
+        state = robot.step(wheels_from_twist(twist, geometry))
+    return np.array(speeds)
+
+
+@pytest.mark.parametrize('noise', [0.0, 0.04])
+def test_the_offline_loop_is_the_loop_of_the_nodes(noise):
+    """What the lab reports of the full controller is what the node does, jump for jump."""
+    scenario = Scenario('velocity', noise, 'nominal', 2, 30.0)
+    record = run(scenario, _spec(**{'estimate.noise_variance': noise}))
+    assert np.abs(np.diff(record.wanted, axis=0)).max() > 2.0  # there is a real jump in it
+    np.testing.assert_allclose(record.speeds, _as_the_nodes_close_it(scenario), atol=1e-6)
+
+
+SEEDS = (1, 2, 3, 4, 5)
+
+
+def _errors(drive, noise, case='nominal', **changes):
+    given = {'estimate.noise_variance': noise}
+    if drive == 'torque':
+        given |= {'law.gain': 8.0, 'switches.acceleration': 100.0}
+    return [
+        run(Scenario(drive, noise, case, seed, 30.0), _spec(**(given | changes))).rmse()
+        for seed in SEEDS
+    ]
+
+
+PARTS = {
+    'NT3FS': {'use_fuzzy': False},
+    'compensator': {'law.compensator': False},
+    'MPC': {'predictive.enabled': False},
+    'preview': {'switches.preview': False},
+}
+
+
+@pytest.mark.parametrize('drive', ['torque', 'velocity'])
+@pytest.mark.parametrize('part', PARTS)
+def test_leaving_out_a_part_costs_accuracy_on_the_same_seeds(part, drive):
+    more = paired(_errors(drive, 0.0, **PARTS[part]), _errors(drive, 0.0))
+    assert more.mean > 0.0
+    assert more.certain
+
+
+def test_jumps_left_to_the_program_alone_cost_more_than_a_ramp():
+    """Psi_free knows the jump beforehand, but v_p is bounded and K works against it."""
+    more = paired(
+        _errors('velocity', 0.0, **{'switches.crossing': 'program'}), _errors('velocity', 0.0)
+    )
+    assert more.mean > 0.02
+    assert more.certain
+
+
+def test_a_random_predictor_has_no_skill_and_the_taught_one_has():
+    scenario = Scenario('velocity', 0.04, 'nominal', 101, 20.0)
+    skills = {}
+    for random in (False, True):
+        method = ProposedController(
+            ComposedParameters.from_dict(
+                {'random_predictor': random, 'predictive.learning': not random}
+            ),
+            scenario.nominal_model(),
+        )
+        run(scenario, lambda _, method=method: method)
+        skills[random] = method.skill
+    assert skills[False].min() > 0.5
+    assert skills[True].max() < 0.0
+
+
+def test_the_same_seed_gives_the_same_run_bit_for_bit():
+    scenario = Scenario('torque', 0.04, 'nominal', 3, 5.0)
+    first, second = (run(scenario, _spec()) for _ in range(2))
+    np.testing.assert_array_equal(first.speeds, second.speeds)
+    np.testing.assert_array_equal(first.command, second.command)
+
+
+def test_methods_tuned_with_unequal_effort_are_not_compared():
+    store = TunedParameters.load()
+    assert set(methods('velocity', store)) >= {'full', 'PI + feed-forward'}
+    entry = store.entry('full', 'velocity')
+    more = replace(entry.budget, evaluations=2 * entry.budget.evaluations)
+    store.put('full', 'velocity', replace(entry, budget=more))
+    with pytest.raises(StoreError, match='was tuned with'):
+        methods('velocity', store)

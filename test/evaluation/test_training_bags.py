@@ -1,0 +1,162 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``bag train``: recorded bags teach what the lab teaches, and the file says where it is from."""
+
+import argparse
+import hashlib
+
+import numpy as np
+import pytest
+from support.training_runs import START, STEP, ClosedLoopObjective
+
+from t3mpc_ros.bag.run.model_file import load_model, read_model_header
+from t3mpc_ros.cli.bag import add_train_parser
+from t3mpc_ros.control.controller import Controller
+from t3mpc_ros.evaluation.closed_loop import MethodSpec, run
+from t3mpc_ros.evaluation.proposed_method import ComposedParameters, ProposedController
+from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, Scenario
+from t3mpc_ros.evaluation.training.cross_validation import mean_and_spread, spread_in_words
+from t3mpc_ros.evaluation.training.fit import (
+    explained,
+    fit_coefficients,
+    fit_predictor,
+    periods,
+    skills,
+    stretches,
+)
+from t3mpc_ros.evaluation.training.recorded_runs import fit_bags
+from t3mpc_ros.evaluation.training.simulated_runs import full_parameters, training_data_of
+from t3mpc_ros.evaluation.training.training_data import TrainingData, TrainingError
+
+SECONDS, DITHER = 30.0, 4.0
+RECORDED = (21, 22, 23)
+
+
+def lossy(tape, seed):
+    """Return the messages as a busy machine records them: late by turns, and some not at all."""
+    rng = np.random.default_rng(seed)
+    kept = tape.where(lambda t, topic, i: t < 1.0 or rng.random() > 0.002)
+    late = rng.exponential(5e5, round(SECONDS * 1e9 / STEP) + 1).astype(int).tolist()
+    kept.rows = [(row[0] + late[(row[0] - START) // STEP], *row[1:]) for row in kept.rows]
+    return kept
+
+
+@pytest.fixture(scope='module')
+def bags(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('recorded')
+    loops = {
+        seed: ClosedLoopObjective(seed, SECONDS, tape=True, **{'predictive.dither': DITHER})
+        for seed in RECORDED
+    }
+    return [
+        lossy(loop.tape, seed).write(folder / f'run{seed}' / 'bag') for seed, loop in loops.items()
+    ]
+
+
+@pytest.fixture(scope='module')
+def model(bags):
+    return fit_bags(bags)
+
+
+def lab_run(seed):
+    changes = {**full_parameters('velocity').to_dict(), 'predictive.dither': DITHER}
+    parameters = ComposedParameters.from_dict(changes)
+    scenario = Scenario('velocity', 0.04, 'nominal', seed, SECONDS)
+    return training_data_of(
+        run(scenario, MethodSpec('full', ProposedController, parameters)), parameters
+    )
+
+
+def test_three_recorded_bags_teach_as_much_as_three_runs_of_the_lab(model):
+    """The same lesson, its runs once rebuilt from lossy bags and once known exactly.
+
+    Judged on runs of the lab that neither has seen: skill within 5 %, and as much explained.
+    """
+    parameters = model.parameters
+    predictive = parameters.predictive
+    lab = TrainingData.joined([lab_run(seed) for seed in PRETRAINING_SEEDS])
+    exact = fit_predictor(parameters, *periods(lab, predictive, parameters.rate)).weights
+    prefix = 'predictive.'
+    recorded = {
+        name.removeprefix(prefix): values
+        for name, values in model.learnt.items()
+        if name.startswith(prefix)
+    }
+    nominal = Controller(parameters).law.predictive.weights()
+    coefficients = fit_coefficients(parameters, lab), model.learnt['fuzzy.coefficients']
+    found, shares = [], []
+    for seed in HELD_OUT_SEEDS[:5]:
+        judge = lab_run(seed)
+        parts = stretches(*periods(judge, predictive, parameters.rate))
+        found.append([skills(predictive, 0.05, w, parts) for w in (exact, recorded, nominal)])
+        shares.append([explained(parameters, each, judge) for each in coefficients])
+    of_lab, of_bags, of_nominal = np.mean(found, axis=0)
+    assert of_lab.min() > 0.5
+    assert np.all(of_bags > 0.95 * of_lab)
+    assert np.all(of_bags < 1.05 * of_lab)
+    assert np.all(of_nominal < 0.3 * of_lab)
+    lab_share, bag_share = np.mean(shares, axis=0)
+    assert lab_share.min() > 0.4
+    assert np.all(bag_share > 0.9 * lab_share)
+
+
+def test_every_bag_is_judged_by_the_others(model):
+    assert [fold.name for fold in model.folds] == [f'run{seed}/bag' for seed in RECORDED]
+    for fold in model.folds:
+        assert fold.judged > 0.7 * SECONDS
+        assert fold.skills['taught'].min() > 0.4
+        assert fold.explained.min() > 0.2
+    for word in ('cross-validated in 3 folds', 'nominal loop', 'random', 'mean ± spread'):
+        assert word in model.text
+    means, spread = mean_and_spread([fold.skills['taught'] for fold in model.folds])
+    assert spread.max() < 0.15
+    np.testing.assert_allclose(means, model.origin['cross_validation']['skill']['mean'], atol=1e-4)
+
+
+def program(*arguments):
+    parser = argparse.ArgumentParser(prog='bag')
+    add_train_parser(parser.add_subparsers(required=True))
+    options = parser.parse_args([str(argument) for argument in arguments])
+    return options.run(options)
+
+
+def test_the_model_file_is_loaded_and_says_where_it_is_from(bags, model, tmp_path, capsys):
+    path = tmp_path / 'model.npz'
+    assert program('train', *bags, '--output', path) == 0
+    said = capsys.readouterr().out
+    assert model.text in said
+    assert f'saved {path}' in said
+    loaded = load_model(path)
+    Controller(model.parameters).law.restore(loaded)
+    for name, values in model.learnt.items():
+        np.testing.assert_array_equal(loaded[name], values)
+    header = read_model_header(path)
+    assert header['settings']['predictive.dither'] == DITHER
+    origin = header['origin']
+    assert [bag['name'] for bag in origin['bags']] == [f'run{seed}/bag' for seed in RECORDED]
+    for bag, folder in zip(origin['bags'], bags, strict=True):
+        ((name, digest),) = bag['files'].items()
+        assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == digest
+        assert bag['duration_s'] == pytest.approx(SECONDS, abs=0.1)
+    assert {'version', 'commit'} <= set(origin['program'])
+    assert str(tmp_path.parent) not in str(origin)
+
+
+def test_one_bag_is_cut_into_as_many_blocks_as_asked_for(bags, tmp_path, capsys):
+    path = tmp_path / 'model.npz'
+    assert program('train', bags[0], '--folds', '3', '--output', path) == 0
+    assert 'cross-validated in 3 folds: each block' in capsys.readouterr().out
+    assert read_model_header(path)['origin']['cross_validation']['folds'] == 3
+    with pytest.raises(ValueError, match='folds must be at least 2: got 1'):
+        program('train', bags[0], '--folds', '1', '--output', path)
+    with pytest.raises(TrainingError, match=r'without block \d+ to learn from|stretch'):
+        program('train', bags[0], '--folds', '60', '--output', path)
+
+
+def test_mean_and_spread_leave_out_what_is_not_known():
+    values = [np.array([1.0, np.nan]), np.array([3.0, 5.0]), np.array([2.0, np.nan])]
+    mean, spread = mean_and_spread(values)
+    np.testing.assert_allclose(mean, [2.0, 5.0])
+    assert spread[0] == pytest.approx(1.0)
+    assert np.isnan(spread[1])
+    assert spread_in_words(values, 1.0) == '2.00 ± 1.00 / 5.00'

@@ -1,0 +1,989 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Tuning: equal budgets, a search that finds known optima, and a store that refuses bad files."""
+
+import argparse
+from dataclasses import dataclass, replace
+import itertools
+import json
+import math
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.cli import tune
+from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController
+from t3mpc_ros.evaluation.closed_loop import JobError, MethodSpec
+from t3mpc_ros.evaluation.closed_loop import run as closed_loop_run
+from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, TUNING_SEEDS, Scenario
+from t3mpc_ros.evaluation.tuning.cma_search import SearchProgress, search_best
+from t3mpc_ros.evaluation.tuning.objective import (
+    SMOOTHNESS,
+    ClosedLoopObjective,
+    TuningScenarios,
+    mean_objectives,
+    objective,
+)
+from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition, SearchRange, SearchSpace
+import t3mpc_ros.evaluation.tuning.tune_methods as tune_module
+from t3mpc_ros.evaluation.tuning.tune_methods import history_path, time_left, tune_methods
+from t3mpc_ros.evaluation.tuning.tuned_parameters import (
+    StoreError,
+    TunedEntry,
+    TunedParameters,
+    TuningBudget,
+    write_atomically,
+)
+from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
+
+
+@dataclass(frozen=True)
+class Inner(Parameters):
+    weight: float = parameter(1.0, 'weight', unit='s', low=1e-6, high=1e6)
+
+
+@dataclass(frozen=True)
+class Gains(Parameters):
+    """Settings of every kind, for searches of every size."""
+
+    a: float = parameter(2.0, 'a', unit='1/s', low=0.0, high=1e3)
+    b: float = parameter(2.0, 'b', low=-5.0, high=1e3)
+    c: float = parameter(2.0, 'c', low=0.0, high=1e3)
+    d: float = parameter(2.0, 'd', low=0.0, high=1e3)
+    e: float = parameter(2.0, 'e', low=0.0, high=1e3)
+    f: float = parameter(2.0, 'f', low=0.0, high=1e3)
+    g: float = parameter(2.0, 'g', low=0.0, high=1e3)
+    h: float = parameter(2.0, 'h', low=0.0, high=1e3)
+    count: int = parameter(10, 'count', low=1, high=40)
+    on: bool = parameter(True, 'on')
+    kind: str = parameter('x', 'kind', choices=('x', 'y'))
+    levels: tuple[float, ...] = parameter((0.1, 0.2), 'levels', low=0.0)
+    inner: Inner = group(Inner)
+
+    def check_consistency(self) -> None:
+        if self.a + self.c > 1500.0:
+            raise ParameterError(f'a and c must not exceed 1500 together: got {self.a + self.c}')
+
+
+LETTERS = 'abcdefgh'
+
+
+def linear(n, low=0.0, high=4.0):
+    return SearchSpace(Gains, [SearchRange(name, low, high, log=False) for name in LETTERS[:n]])
+
+
+def each(function):
+    """Return an objective that evaluates points one by one, as arrays."""
+    return lambda points: [function(np.array(list(point.values()))) for point in points]
+
+
+def sphere(x):
+    return float(np.sum((x - 1.2) ** 2))
+
+
+def rosenbrock(x):
+    return float(np.sum(100.0 * (x[1:] - x[:-1] ** 2) ** 2 + (1.0 - x[:-1]) ** 2))
+
+
+# The unit cube
+
+
+def test_settings_and_cube_map_onto_each_other():
+    space = SearchSpace(
+        Gains,
+        [
+            SearchRange('inner.weight', 1e-4, 1e2),
+            SearchRange('b', -3.0, 5.0, log=False),
+            SearchRange('count', 1, 40),
+            SearchRange('a', 0.1, 1000),
+        ],
+    )
+    for point in np.random.default_rng(1).uniform(size=(200, 4)):
+        values = space.values(point)
+        again = space.values(space.point(values))
+        assert again == pytest.approx(values, rel=1e-12)
+        assert again['count'] == values['count']
+        np.testing.assert_allclose(np.delete(space.point(values) - point, 2), 0.0, atol=1e-12)
+        assert space.of(Gains().with_values(values)) == values
+        assert space.point(Gains().with_values(values).to_dict()) == pytest.approx(
+            space.point(values)
+        )
+
+
+@pytest.mark.parametrize('low, high', [(0.1, 1e3), (1e-6, 3.3), (0.7, 0.9)])
+@pytest.mark.parametrize('log', [True, False])
+def test_ends_of_the_cube_are_the_bounds_and_the_middle_their_mean(low, high, log):
+    space = SearchSpace(Gains, [SearchRange('a', low, high, log)])
+    assert space.values([0.0])['a'] == pytest.approx(low, rel=1e-12)
+    assert space.values([1.0])['a'] == pytest.approx(high, rel=1e-12)
+    assert low <= space.values([0.0])['a'] < space.values([1.0])['a'] <= high
+    middle = math.sqrt(low * high) if log else 0.5 * (low + high)
+    assert space.values([0.5])['a'] == pytest.approx(middle, rel=1e-12)
+
+
+def test_whole_numbers_have_equal_cells_and_stay_whole():
+    space = SearchSpace(Gains, [SearchRange('count', 3, 7, log=False)])
+    counts = [space.values([p])['count'] for p in np.linspace(0.0005, 0.9995, 1000)]
+    assert {type(count) for count in counts} == {int}
+    assert [counts.count(n) for n in range(3, 8)] == [200] * 5
+    widened = SearchSpace(Gains, [SearchRange('count', 1, 40)])
+    for n in range(1, 41):
+        assert widened.values(widened.point({'count': n})) == {'count': n}
+
+
+@pytest.mark.parametrize(
+    'ranges, words',
+    [
+        ([], ['Gains', 'at least one']),
+        ([('a', 1.0, 2e3)], ['a must be', 'from 0 to 1000 1/s', '2000']),
+        ([('b', -6.0, 1.0, False)], ['b must be', 'from -5 to 1000', '-6']),
+        ([('inner.weight', 1e-7, 1.0)], ['inner.weight', 'from 1e-06', '1e-07']),
+        ([('count', 1, 41)], ['count', 'from 1 to 40', '41']),
+        ([('count', 1.5, 4.0)], ['count', 'whole number', '1.5']),
+        ([('on', 0.0, 1.0, False)], ['on cannot be tuned', 'bool']),
+        ([('kind', 0.0, 1.0, False)], ['kind cannot be tuned', 'str']),
+        ([('levels', 0.0, 1.0, False)], ['levels cannot be tuned', 'list of float']),
+        ([('inner.wieght', 0.1, 1.0)], ['Gains', 'inner.wieght', 'inner.weight?']),
+        ([('a', 1.0, 2.0), ('a', 3.0, 4.0)], ['a must be tuned once']),
+        ([('a', 0.0, 1.0)], ['a', 'above 0', '0']),
+        ([('b', -1.0, 1.0)], ['b', 'above 0', '-1']),
+        ([('a', 2.0, 2.0)], ['a', 'end above', '2 to 2']),
+        ([('a', 2.0, math.inf)], ['a', 'finite', 'inf']),
+        ([('a', math.nan, 1.0)], ['a', 'finite', 'nan']),
+    ],
+)
+def test_ranges_that_do_not_fit_are_refused_by_name_bound_and_value(ranges, words):
+    with pytest.raises(ParameterError) as refusal:
+        SearchSpace(Gains, [SearchRange(*each) for each in ranges])
+    for word in words:
+        assert word in str(refusal.value)
+
+
+def test_points_and_values_outside_are_refused():
+    space = linear(2)
+    with pytest.raises(ValueError, match='shape'):
+        space.values([0.5])
+    for bad in (-1e-9, 1.0 + 1e-9, math.nan):
+        with pytest.raises(ValueError, match='unit cube'):
+            space.values([0.5, bad])
+    with pytest.raises(ParameterError, match='a must be in its range from 0 to 4: got 5'):
+        space.of(Gains(a=5.0))
+    with pytest.raises(ParameterError, match='b is tuned, but has no value'):
+        space.point({'a': 1.0})
+    with pytest.raises(ParameterError, match='a must be a number'):
+        space.point({'a': True, 'b': 1.0})
+    with pytest.raises(ParameterError, match='must be Gains: got Inner'):
+        space.of(Inner())
+
+
+# The search
+
+
+@pytest.mark.parametrize('n', [1, 2, 5, 8])
+@pytest.mark.parametrize('evaluations', [1, 2, 9, 10, 11, 61])
+def test_every_method_gets_exactly_its_evaluations(n, evaluations):
+    seen, told = [], []
+
+    def objective(points):
+        seen.extend(points)
+        return each(sphere)(points)
+
+    found = search_best(objective, linear(n), Gains(), evaluations, 1, told.append)
+    assert len(seen) == evaluations
+    assert [point.values for point in found.history] == seen
+    assert seen[0] == dict.fromkeys(LETTERS[:n], 2.0)
+    assert found.value == min(point.value for point in found.history)
+    assert sphere(np.array(list(found.values.values()))) == found.value
+    assert told[-1] == SearchProgress(evaluations, evaluations, found.value, evaluations)
+    assert [one.done for one in told] == sorted({one.done for one in told})
+
+
+def test_a_sphere_is_solved_in_any_dimension():
+    for n in (1, 2, 5, 8):
+        found = search_best(each(sphere), linear(n), Gains(), 120 * n, 3)
+        assert found.value < 1e-4
+        assert list(found.values.values()) == pytest.approx([1.2] * n, abs=1e-2)
+
+
+def test_rosenbrocks_valley_is_followed_to_its_end():
+    start = Gains(a=0.2, b=3.0)
+    found = search_best(each(rosenbrock), linear(2), start, 500, 1)
+    assert found.start_value > 100.0
+    assert list(found.values.values()) == pytest.approx([1.0, 1.0], abs=0.02)
+
+
+def test_badly_scaled_gains_are_found_by_their_logarithms():
+    """Optima and sensitivities apart by factors of thousands, as gains of a controller are."""
+    optimum = np.array([3e-5, 400.0, 0.5, 30.0])
+    weights = np.array([1.0, 1e3, 1e1, 1e-1])
+    space = SearchSpace(
+        Gains,
+        [
+            SearchRange('inner.weight', 1e-6, 1e-1),
+            SearchRange('a', 1e-2, 1e3),
+            SearchRange('c', 1e-3, 1e3),
+            SearchRange('d', 1e-1, 1e3),
+        ],
+    )
+
+    def bowl(x):
+        return float(np.sum(weights * np.log(x / optimum) ** 2))
+
+    start = Gains().with_values({'inner.weight': 1e-2, 'a': 1.0, 'c': 100.0, 'd': 1.0})
+    found = search_best(each(bowl), space, start, 700, 1)
+    assert list(found.values.values()) == pytest.approx(optimum.tolist(), rel=0.01)
+    assert found.value < 1e-5 * found.start_value
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_a_start_that_is_the_optimum_is_returned_to_the_last_digit(seed):
+    start = Gains(a=1.0 / 3.0, b=math.pi, c=1e-7)
+    space = SearchSpace(Gains, [SearchRange(name, 1e-9, 1e2) for name in 'abc'])
+    best = np.array([start.a, start.b, start.c])
+    found = search_best(each(lambda x: float(np.sum((x - best) ** 2))), space, start, 50, seed)
+    assert found.values == {'a': start.a, 'b': start.b, 'c': start.c}
+    assert found.value == found.start_value == 0.0
+
+
+@pytest.mark.parametrize('evaluations', [2, 20, 60])
+def test_the_start_is_never_made_worse(evaluations):
+    for seed in range(5):
+        rough = np.random.default_rng(seed)
+        found = search_best(
+            each(lambda x, rough=rough: sphere(x) + rough.normal()),
+            linear(3),
+            Gains(a=1.3, b=1.1, c=1.2),
+            evaluations,
+            seed,
+        )
+        assert found.value <= found.start_value
+
+
+def test_the_same_seed_gives_the_same_search_and_leaves_global_numbers_alone():
+    before = np.random.get_state()  # noqa: NPY002
+    first, second, other = (
+        search_best(each(rosenbrock), linear(4), Gains(), 90, seed) for seed in (5, 5, 6)
+    )
+    assert first == second
+    assert other.history[1:] != first.history[1:]
+    after = np.random.get_state()  # noqa: NPY002
+    np.testing.assert_array_equal(before[1], after[1])
+    assert before[2:] == after[2:]
+
+
+def test_only_the_order_of_values_matters():
+    """Rank-based: a growing function of the objective is searched by the same points."""
+    plain = search_best(each(rosenbrock), linear(4), Gains(), 120, 2)
+    bent = search_best(each(lambda x: 1e6 * rosenbrock(x) ** 3 - 1e9), linear(4), Gains(), 120, 2)
+    assert [one.values for one in bent.history] == [one.values for one in plain.history]
+
+
+def test_the_last_point_is_where_the_search_believes_the_optimum():
+    """The mean of the distribution is nearer than its samples are."""
+    better = 0
+    for seed in range(20):
+        found = search_best(each(sphere), linear(5), Gains(), 81, seed)
+        values = [point.value for point in found.history]
+        better += values[-1] < np.median(values[-9:-1])
+    assert better >= 18
+
+
+def test_a_search_that_converged_begins_again_and_leaves_a_trap():
+    """Two basins of equal size; the start is beside the bottom of the lesser one."""
+
+    def traps(x):
+        return float(min(0.1 + abs(x[0] - 3.9), abs(x[0] - 0.3)))
+
+    for seed in range(5):
+        first = search_best(each(traps), linear(1), Gains(a=3.8), 60, seed)
+        assert first.values['a'] == pytest.approx(3.9, abs=0.01)
+    found = [search_best(each(traps), linear(1), Gains(a=3.8), 900, seed) for seed in range(5)]
+    assert [one.values['a'] for one in found] == pytest.approx([0.3] * 5, abs=0.01)
+
+
+@pytest.mark.parametrize('bad', [math.nan, math.inf, -math.inf, 1e300])
+def test_values_that_are_not_numbers_count_as_worst(bad):
+    """Half of the cube fails, next to the optimum."""
+
+    def objective(x):
+        return bad if x[0] > 1.5 else sphere(x)
+
+    start = Gains(a=1.4)
+    with np.errstate(all='raise'):
+        found = search_best(each(objective), linear(3), start, 300, 1)
+    failed = [one for one in found.history if one.values['a'] > 1.5]
+    assert failed
+    assert all(one.value >= 1e300 for one in failed)
+    assert found.value < 1e-3
+    assert found.values['a'] <= 1.5
+
+
+def test_a_method_that_never_works_costs_no_more_than_others_and_says_so():
+    found = search_best(each(lambda x: math.nan), linear(3), Gains(), 70, 1)
+    assert len(found.history) == 70
+    assert found.value == found.start_value == math.inf
+    assert found.values == {'a': 2.0, 'b': 2.0, 'c': 2.0}
+
+
+@pytest.mark.parametrize('n', [1, 2, 6])
+@pytest.mark.parametrize('log', [True, False])
+def test_bounds_are_never_exceeded_and_a_corner_is_reached(n, log):
+    """The optimum lies outside, beyond every upper bound."""
+    space = SearchSpace(Gains, [SearchRange(name, 0.5, 4.0, log) for name in LETTERS[:n]])
+    found = search_best(
+        each(lambda x: float(np.sum((x - 9.0) ** 2))), space, Gains(), 60 * n + 60, 1
+    )
+    tried = np.array([list(one.values.values()) for one in found.history])
+    assert tried.min() >= 0.5
+    assert tried.max() <= 4.0
+    assert tried[found.history.index(min(found.history, key=lambda one: one.value))] == (
+        pytest.approx([4.0] * n, rel=0.02)
+    )
+
+
+def test_whole_numbers_are_searched_too():
+    space = SearchSpace(Gains, [SearchRange('count', 1, 40), SearchRange('a', 0.1, 100.0)])
+
+    def objective(points):
+        return [abs(one['count'] - 23) + (one['a'] - 7.0) ** 2 for one in points]
+
+    found = search_best(objective, space, Gains(), 250, 1)
+    assert found.values['count'] == 23
+    assert found.values['a'] == pytest.approx(7.0, rel=1e-2)
+
+
+def test_batch_sets_how_many_points_are_asked_for_at_once():
+    sizes = []
+
+    def objective(points):
+        sizes.append(len(points))
+        return each(sphere)(points)
+
+    search_best(objective, linear(3), Gains(), 50, 1, batch=12)
+    assert sizes == [1, 12, 12, 12, 12, 1]
+
+
+def test_what_cannot_be_searched_is_refused():
+    for count in (0, -3):
+        with pytest.raises(ValueError, match=f'evaluations must be at least 1: got {count}'):
+            search_best(each(sphere), linear(2), Gains(), count, 1)
+    with pytest.raises(ValueError, match='batch must be at least 2: got 1'):
+        search_best(each(sphere), linear(2), Gains(), 10, 1, batch=1)
+    with pytest.raises(ParameterError, match='a must be in its range'):
+        search_best(each(sphere), linear(2), Gains(a=5.0), 10, 1)
+    with pytest.raises(ValueError, match='one value a point, 1: got 2'):
+        search_best(lambda points: [1.0, 2.0], linear(2), Gains(), 10, 1)
+
+
+# Interrupted and resumed
+
+
+class Interrupted(Exception):
+    pass
+
+
+def interrupted_after(generations):
+    calls = itertools.count()
+
+    def objective(points):
+        if next(calls) == generations:
+            raise Interrupted
+        return each(lambda x: math.nan if x[0] > 3.0 else rosenbrock(x))(points)
+
+    return objective
+
+
+@pytest.mark.parametrize('generations', [0, 1, 2, 7, 13])
+def test_a_resumed_search_is_the_uninterrupted_one(tmp_path, generations):
+    whole, cut = tmp_path / 'whole.json', tmp_path / 'cut.json'
+    space, start = linear(4), Gains()
+    expected = search_best(interrupted_after(-1), space, start, 107, 4, path=whole)
+    with pytest.raises(Interrupted):
+        search_best(interrupted_after(generations), space, start, 107, 4, path=cut)
+    told = []
+    found = search_best(
+        interrupted_after(-1), space, start, 107, 4, told.append, path=cut, resume=True
+    )
+    assert found == expected
+    assert cut.read_bytes() == whole.read_bytes()
+    known = 0 if generations == 0 else 1 + 8 * (generations - 1)
+    assert told[-1].fresh == 107 - known
+    assert list(tmp_path.iterdir()) == [whole, cut] or set(tmp_path.iterdir()) == {whole, cut}
+
+
+def test_a_finished_search_is_recalled_without_an_evaluation(tmp_path):
+    path = tmp_path / 'history.json'
+    expected = search_best(each(sphere), linear(1), Gains(), 200, 4, path=path)
+    found = search_best(interrupted_after(0), linear(1), Gains(), 200, 4, path=path, resume=True)
+    assert found == expected
+    with pytest.raises(Interrupted):  # not asked to resume: it begins anew
+        search_best(interrupted_after(0), linear(1), Gains(), 200, 4, path=path)
+
+
+@pytest.mark.parametrize(
+    'change, name',
+    [
+        ({'seed': 5}, 'seed'),
+        ({'evaluations': 41}, 'evaluations'),
+        ({'batch': 9}, 'batch'),
+        ({'space': linear(2, high=5.0)}, 'space'),
+        ({'start': Gains(h=3.0)}, 'start'),
+        ({'about': {'drive': 'velocity'}}, 'about'),
+    ],
+)
+def test_the_history_of_another_search_is_refused_by_what_differs(tmp_path, change, name):
+    path = tmp_path / 'history.json'
+    arguments = {
+        'objective': each(sphere),
+        'space': linear(2),
+        'start': Gains(),
+        'evaluations': 40,
+        'seed': 4,
+        'about': {'drive': 'torque'},
+        'path': path,
+    }
+    search_best(**arguments)
+    with pytest.raises(ValueError, match=f'another search: its {name} is'):
+        search_best(**(arguments | change), resume=True)
+
+
+def test_a_damaged_history_is_refused(tmp_path):
+    path = tmp_path / 'history.json'
+
+    def resume(text):
+        path.write_text(text)
+        search_best(interrupted_after(0), linear(2), Gains(), 40, 4, path=path, resume=True)
+
+    search_best(each(sphere), linear(2), Gains(), 40, 4, path=path)
+    content = json.loads(path.read_text())
+    for text in (path.read_text()[:-10], '[]', '', '{}', json.dumps(content | {'format': 2})):
+        with pytest.raises(ValueError, match='is no history'):
+            resume(text)
+    for broken in ({'point': [0.5, 0.5], 'value': math.nan}, {'point': 3, 'value': 1}, {}):
+        with pytest.raises(ValueError, match='is no history'):
+            resume(json.dumps(content | {'history': [broken]}))
+    with pytest.raises(ValueError, match='within a generation'):
+        resume(json.dumps(content | {'history': content['history'][:4]}))
+    content['history'][9]['point'][0] = 0.5
+    with pytest.raises(ValueError, match='other points than this search asks for'):
+        resume(json.dumps(content))
+
+
+# The price of a run
+
+
+@dataclass
+class Measured:
+    error: float
+    variation: float
+
+    def rmse(self):
+        return self.error
+
+    def chatter(self):
+        return self.variation
+
+
+def test_a_thousand_of_chatter_costs_a_hundredth():
+    assert objective(Measured(0.2, 0.0)) == 0.2
+    assert objective(Measured(0.2, 1000.0)) == pytest.approx(0.21)
+    for broken in (Measured(math.nan, 1.0), Measured(1.0, math.nan), Measured(math.inf, 1.0)):
+        assert objective(broken) == math.inf
+
+
+def test_training_mixes_every_noise_and_never_uses_a_held_out_seed():
+    training = TuningScenarios()
+    assert not set(training.seeds) & set(HELD_OUT_SEEDS)
+    counts = [[noise for _, noise in training.runs()].count(x) for x in (0.0, 0.04, 0.1)]
+    assert len(set(counts)) == 1
+    assert sum(counts) == len(TUNING_SEEDS)
+    for scenario in training.scenarios('torque'):
+        modes = scenario.reference().modes[: scenario.steps]
+        assert np.count_nonzero(np.diff(modes)) >= 1
+        assert scenario.case == 'nominal'
+    with pytest.raises(ValueError, match='differ'):
+        TuningScenarios(seeds=(1, 1), noise_levels=(0.0,))
+    with pytest.raises(ValueError, match='a seed for each'):
+        TuningScenarios(seeds=(1, 2))
+
+
+def test_the_mean_price_does_not_depend_on_the_order_of_the_runs():
+    prices = np.random.default_rng(1).uniform(size=12)
+    expected = prices.reshape(3, 4).mean(axis=1)
+    pairs = list(enumerate(prices.tolist()))
+    first = mean_objectives(3, 4, pairs)
+    assert first == pytest.approx(expected)
+    assert mean_objectives(3, 4, pairs[::-1]) == first
+    assert mean_objectives(3, 4, [*pairs[:-1], (11, math.inf)])[:2] == first[:2]
+    assert mean_objectives(3, 4, [*pairs[:-1], (11, math.inf)])[2] == math.inf
+    for wrong in (pairs[:-1], [*pairs, pairs[0]], [*pairs[:-1], (12, 0.0)]):
+        with pytest.raises(ValueError, match='priced'):
+            mean_objectives(3, 4, wrong)
+
+
+@dataclass(frozen=True)
+class FeedbackParameters(Parameters):
+    gain: float = parameter(5.0, 'gain', unit='1/s', low=0.0, high=1e3)
+    fault: float = parameter(0.0, 'above 0 it fails', low=0.0, high=1.0)
+
+
+class Feedback(BaselineController):
+    """Feed-forward and proportional feedback: the least that tracks."""
+
+    parameters_type = FeedbackParameters
+
+    def __init__(self, parameters, nominal_model):
+        if parameters.fault > 0.0:
+            raise RuntimeError('asked to fail')
+        self._gain, self._period = parameters.gain, nominal_model.period
+
+    def step(self, view):
+        forward = (view.wanted_next - view.wanted) / self._period
+        return forward - view.unexplained - self._gain * (view.speeds - view.wanted)
+
+
+FEEDBACK = MethodDefinition(
+    'P feedback',
+    Feedback,
+    {'torque': FeedbackParameters(), 'velocity': FeedbackParameters(gain=4.0)},
+    (SearchRange('gain', 0.5, 50.0),),
+)
+SHORT = TuningScenarios(seeds=(1, 2), noise_levels=(0.0, 0.1), duration=5.0)
+
+
+def test_the_closed_loop_is_priced_run_by_run():
+    candidates = [FeedbackParameters(gain=gain) for gain in (1.0, 8.0)]
+    with ClosedLoopObjective(SHORT, 1) as evaluate:
+        found = evaluate(FEEDBACK, 'torque', candidates)
+    for candidate, value in zip(candidates, found, strict=True):
+        spec = MethodSpec('P feedback', Feedback, candidate)
+        records = [
+            closed_loop_run(Scenario('torque', noise, 'nominal', seed, 5.0), spec)
+            for seed, noise in ((1, 0.0), (2, 0.1))
+        ]
+        prices = [record.rmse() + SMOOTHNESS * record.chatter() for record in records]
+        assert value == pytest.approx(np.mean(prices), rel=1e-12)
+    assert found[1] < found[0]
+
+
+def test_settings_that_fail_are_worst_and_named_but_a_method_that_fails_is_an_error():
+    good, bad = FeedbackParameters(), FeedbackParameters(fault=1.0)
+    said = []
+    with ClosedLoopObjective(SHORT, 1, said.append) as evaluate:
+        with pytest.raises(JobError, match='asked to fail'):
+            evaluate(FEEDBACK, 'torque', [bad])
+        said.clear()
+        found = evaluate(FEEDBACK, 'torque', [bad, good])
+        assert found[0] == math.inf
+        assert found[1] < 10.0
+        assert evaluate(FEEDBACK, 'torque', [bad]) == [math.inf]
+    assert len(said) == 2
+    assert all('asked to fail' in line for line in said)
+
+
+# Many methods
+
+
+def lag_plant(method, drive, candidates):
+    """A first-order plant and a step: a squared error that is known without a simulation."""
+    lag = {'torque': 0.1, 'velocity': 0.3}[drive]
+    return [
+        1.0 / (2.0 * (values.to_dict()['gain'] + lag)) + 0.01 * values.to_dict()['gain']
+        for values in candidates
+    ]
+
+
+@dataclass(frozen=True)
+class PlantParameters(FeedbackParameters):
+    other: float = parameter(1.0, 'no effect', low=0.1, high=10.0)
+    third: float = parameter(1.0, 'no effect', low=0.1, high=10.0)
+
+
+class Wider(Feedback):
+    parameters_type = PlantParameters
+
+
+WIDER = MethodDefinition(
+    'wider, 2nd',
+    Wider,
+    {'velocity': PlantParameters(gain=40.0)},
+    (
+        SearchRange('gain', 0.5, 50.0),
+        SearchRange('other', 0.1, 10.0),
+        SearchRange('third', 0.1, 10.0),
+    ),
+)
+
+
+def counted(evaluate):
+    counts = {}
+
+    def counting(method, drive, candidates):
+        counts[method.name, drive] = counts.get((method.name, drive), 0) + len(candidates)
+        return evaluate(method, drive, candidates)
+
+    return counting, counts
+
+
+def tune_both(path, evaluate=lag_plant, evaluations=80, **more):
+    return tune_methods(
+        [FEEDBACK, WIDER],
+        ['torque', 'velocity'],
+        evaluations,
+        1,
+        path,
+        evaluate=evaluate,
+        **more,
+    )
+
+
+def test_methods_of_any_size_get_the_same_budget_and_their_optimum(tmp_path):
+    path = tmp_path / 'sub' / 'tuned.json'
+    evaluate, counts = counted(lag_plant)
+    store = tune_both(path, evaluate)
+    keys = [('P feedback', 'torque'), ('P feedback', 'velocity'), ('wider, 2nd', 'velocity')]
+    assert counts == dict.fromkeys(keys, 80)
+    assert list(store) == keys
+    store.check_equal()
+    types = {'P feedback': FeedbackParameters, 'wider, 2nd': PlantParameters}
+    loaded = TunedParameters.load(path, types)
+    for key in keys:
+        assert loaded.entry(*key) == store.entry(*key)
+        entry = loaded.entry(*key)
+        assert entry.objective <= entry.start_objective
+        lag = {'torque': 0.1, 'velocity': 0.3}[key[1]]
+        parameters = loaded.parameters(*key, types[key[0]])
+        assert parameters.gain == pytest.approx(math.sqrt(50.0) - lag, rel=0.1)
+        assert lag_plant(None, key[1], [parameters]) == [entry.objective]
+        assert f'| {key[0]} | {key[1]} | {entry.start_objective:.4f} ' in store.table()
+
+
+def test_tuning_many_is_resumed_where_it_stopped(tmp_path):
+    expected = tmp_path / 'whole.json'
+    tune_both(expected)
+    path = tmp_path / 'cut.json'
+
+    def stopping(method, drive, candidates):
+        if method is FEEDBACK and drive == 'velocity' and len(counts) > 1:
+            calls.append(1)
+            if len(calls) == 4:
+                raise KeyboardInterrupt
+        return lag_plant(method, drive, candidates)
+
+    calls = []
+    evaluate, counts = counted(stopping)
+    with pytest.raises(KeyboardInterrupt):
+        tune_both(path, evaluate)
+    again, counts = counted(lag_plant)
+    tune_both(path, again, resume=True)
+    assert path.read_bytes() == expected.read_bytes()
+    assert ('P feedback', 'torque') not in counts
+    assert 0 < counts['P feedback', 'velocity'] < 80
+    assert counts['wider, 2nd', 'velocity'] == 80
+    history = history_path(path, FEEDBACK, 'velocity')
+    assert history == tmp_path / 'cut.history' / 'p-feedback.velocity.json'
+    assert len(json.loads(history.read_text())['history']) == 80
+
+
+def test_progress_names_method_count_best_and_the_time_left(tmp_path):
+    now = [0.0]
+
+    def slow(method, drive, candidates):
+        now[0] += 6.0 * len(candidates)
+        return lag_plant(method, drive, candidates)
+
+    said = []
+    tune_methods(
+        [WIDER], ['velocity'], 40, 1, tmp_path / 'a.json', said.append,
+        clock=lambda: now[0], evaluate=slow,
+    )  # fmt: skip
+    assert said[0].startswith('  wider, 2nd, velocity: 1 of 40 evaluations, best 0.4124, about 4 ')
+    assert said[1].startswith('  wider, 2nd, velocity: 8 of 40 evaluations, best 0.')
+    assert said[1].endswith(', about 3 min left')
+    assert said[-2].endswith(', about 20 s left') or said[-2].endswith(' s left')
+    assert said[-1].endswith(f'40 of 40 evaluations, best {_last(said)}')
+    again = []
+    tune_methods(
+        [WIDER], ['velocity'], 40, 1, tmp_path / 'a.json', again.append,
+        clock=lambda: now[0], evaluate=slow, resume=True,
+    )  # fmt: skip
+    assert again == said[-1:]
+
+
+def _last(said):
+    return said[-1].rsplit(' ', 1)[1]
+
+
+@pytest.mark.parametrize(
+    'seconds, words',
+    [(0.0, '10 s'), (44.0, '40 s'), (180.0, '3 min'), (5399.0, '90 min'), (9000.0, '2.5 h')],
+)
+def test_time_left_is_rounded(seconds, words):
+    assert time_left(seconds) == words
+
+
+def test_settings_that_do_not_fit_together_cost_an_evaluation_and_no_run(tmp_path):
+    """The table refuses a + c beyond 1500, though each is in range."""
+    contestant = MethodDefinition(
+        'pair',
+        _rival_of(Gains),
+        {'torque': Gains(a=500.0, c=500.0)},
+        (SearchRange('a', 1.0, 1000.0, log=False), SearchRange('c', 1.0, 1000.0, log=False)),
+    )
+    evaluate, counts = counted(
+        lambda method, drive, candidates: [1e4 - each.a - each.c for each in candidates]
+    )
+    store = tune_methods([contestant], ['torque'], 150, 1, tmp_path / 'a.json', evaluate=evaluate)
+    assert counts['pair', 'torque'] < 150
+    found = store.parameters('pair', 'torque', Gains)
+    assert 1400.0 < found.a + found.c <= 1500.0
+
+
+def _rival_of(table):
+    return type('Made', (Feedback,), {'settings_type': table})
+
+
+def test_a_method_without_a_finite_price_is_named_and_the_others_are_kept(tmp_path):
+    def hopeless(method, drive, candidates):
+        if method is FEEDBACK:
+            return [math.nan] * len(candidates)
+        return lag_plant(method, drive, candidates)
+
+    path = tmp_path / 'tuned.json'
+    with pytest.raises(RuntimeError, match='P feedback, torque; P feedback, velocity'):
+        tune_both(path, hopeless)
+    assert list(TunedParameters.load(path)) == [('wider, 2nd', 'velocity')]
+
+
+def test_results_of_unequal_budgets_do_not_share_a_file(tmp_path):
+    path = tmp_path / 'tuned.json'
+    tune_both(path, evaluations=20)
+    with pytest.raises(StoreError, match='20 evaluations.*this would be 30 evaluations'):
+        tune_methods([WIDER], ['velocity'], 30, 1, path, evaluate=lag_plant)
+    tune_methods([WIDER], ['velocity'], 20, 1, path, evaluate=lag_plant)
+    tune_both(path, evaluations=30)
+    assert {
+        TunedParameters.load(path).entry(*key).budget.evaluations
+        for key in TunedParameters.load(path)
+    } == {30}
+
+
+def test_methods_that_cannot_be_tuned_are_refused(tmp_path):
+    path = tmp_path / 'tuned.json'
+    twin = replace(WIDER, name='P-Feedback')
+    with pytest.raises(ValueError, match="'P feedback' and 'P-Feedback'"):
+        tune_methods([FEEDBACK, twin], ['torque'], 5, 1, path, evaluate=lag_plant)
+    with pytest.raises(ValueError, match="drive 'torque'"):
+        tune_methods([WIDER], ['torque'], 5, 1, path, evaluate=lag_plant)
+    with pytest.raises(ParameterError, match='no hope, torque: gain must be in its range'):
+        MethodDefinition(
+            'no hope', Feedback, {'torque': FeedbackParameters(gain=0.1)}, FEEDBACK.ranges
+        )
+    with pytest.raises(ParameterError, match='no hope: FeedbackParameters has no setting gian'):
+        MethodDefinition('no hope', Feedback, FEEDBACK.start, (SearchRange('gian', 1.0, 2.0),))
+    with pytest.raises(
+        ParameterError, match='no hope, torque: settings must be FeedbackParameters'
+    ):
+        MethodDefinition('no hope', Feedback, {'torque': Gains()}, FEEDBACK.ranges)
+    with pytest.raises(ParameterError, match='no hope: there must be start settings'):
+        MethodDefinition('no hope', Feedback, {}, FEEDBACK.ranges)
+    with pytest.raises(ParameterError, match='must have a name'):
+        replace(FEEDBACK, name=' - ')
+
+
+# The file of tuned settings
+
+BUDGET = TuningBudget(80, 1, (1, 2, 3), (0.0, 0.04), 30.0, 1e-5)
+ENTRY = TunedEntry(Gains(a=1.0 / 3.0).to_dict(), ('a', 'inner.weight'), 0.2, 0.3, BUDGET, '0.1.0')
+
+
+@pytest.fixture
+def stored(tmp_path):
+    """Return a function that damages a good file and gives its path back."""
+    path = tmp_path / 'tuned.json'
+    store = TunedParameters({('one', 'torque'): ENTRY, ('two', 'velocity'): ENTRY})
+    store.save(path)
+
+    def damage(change):
+        content = json.loads(path.read_text())
+        change(content)
+        path.write_text(json.dumps(content))
+        return path
+
+    return damage
+
+
+TYPES = {'one': Gains, 'two': Gains}
+
+
+def test_store_and_file_are_one(stored, tmp_path):
+    path = stored(lambda content: None)
+    loaded = TunedParameters.load(path, TYPES)
+    assert list(loaded) == [('one', 'torque'), ('two', 'velocity')]
+    assert loaded.parameters('one', 'torque', Gains) == Gains(a=1.0 / 3.0)
+    assert loaded.entry('one', 'torque').budget == BUDGET
+    loaded.check_equal()
+    again = tmp_path / 'again.json'
+    loaded.save(again)
+    second = TunedParameters.load(again, TYPES)
+    assert all(second.entry(*key) == loaded.entry(*key) for key in loaded)
+    assert ('one', 'torque') in loaded
+    assert ('one', 'velocity') not in loaded
+    with pytest.raises(StoreError, match='one was not tuned in drive velocity.*two in velocity'):
+        loaded.entry('one', 'velocity')
+
+
+def _one(content):
+    return content['methods']['one']['torque']
+
+
+@pytest.mark.parametrize(
+    'change, words',
+    [
+        (lambda c: _one(c)['values'].update(aa=1.0), ['one, torque', 'no setting aa', 'a?']),
+        (lambda c: _one(c)['values'].pop('count'), ['one, torque', 'missing', 'count']),
+        (
+            lambda c: _one(c)['values'].update(a=2000.0),
+            ['one, torque', 'a must be from 0 to 1000 1/s', '2000'],
+        ),
+        (
+            lambda c: _one(c)['values'].update({'inner.weight': 1e-9}),
+            ['one, torque', 'inner.weight', '1e-06', '1e-09'],
+        ),
+        (lambda c: _one(c)['values'].update(count=2.5), ['count', 'whole number', '2.5']),
+        (lambda c: _one(c)['values'].update(on='yes'), ['on', 'true or false', 'yes']),
+        (lambda c: _one(c)['values'].update(kind='z'), ['kind', 'x, y', 'z']),
+        (lambda c: _one(c)['values'].update(a=900.0, c=900.0), ['together', '1800']),
+        (lambda c: _one(c)['values'].update(a=math.nan), ['finite', 'NaN']),
+        (lambda c: _one(c).update(tuned=['z']), ['one, torque', 'z was tuned']),
+        (lambda c: _one(c).update(tuned=[]), ['one, torque: tuned', 'not empty']),
+        (lambda c: _one(c).update(tuned='a'), ['one, torque: tuned', 'list']),
+        (lambda c: _one(c).update(objective='0.2'), ['objective', 'number', '0.2']),
+        (lambda c: _one(c).update(objective=-0.2), ['objective', 'at least 0', '-0.2']),
+        (lambda c: _one(c).update(objective=math.inf), ['finite', 'Infinity']),
+        (lambda c: _one(c).pop('version'), ['one, torque', 'lacks version']),
+        (lambda c: _one(c).update(version=3), ['version', 'text', '3']),
+        (lambda c: _one(c).update(note='x'), ['one, torque', 'has note']),
+        (lambda c: _one(c).update(values=[1.0]), ['values', 'object', 'list']),
+        (lambda c: _one(c)['budget'].update(evaluations=0), ['evaluations', 'at least 1', '0']),
+        (lambda c: _one(c)['budget'].update(evaluations=True), ['evaluations', 'True']),
+        (lambda c: _one(c)['budget'].update(training_seeds=[1.5]), ['training_seeds', '1.5']),
+        (lambda c: _one(c)['budget'].update(noise_levels=[]), ['noise_levels', 'not empty']),
+        (lambda c: _one(c)['budget'].pop('duration'), ['budget', 'lacks duration']),
+        (lambda c: c.update(format=2), ['format must be 1', '2']),
+        (lambda c: c.pop('methods'), ['lacks methods']),
+        (lambda c: c.update(methods=[]), ['methods must be an object']),
+        (lambda c: c['methods'].update(one=3), ['one must be an object']),
+        (
+            lambda c: c['methods'].update(on=c['methods'].pop('one')),
+            ['no method on', 'did you mean one?'],
+        ),
+    ],
+)
+def test_a_file_that_does_not_fit_is_refused_by_where_and_why(stored, change, words):
+    path = stored(change)
+    with pytest.raises(StoreError) as refusal:
+        TunedParameters.load(path, TYPES)
+    for word in [str(path), *words]:
+        assert word in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    'text', ['', '{', '[]', 'null', '{"format": 1, "format": 1, "methods": {}}', '\udcff']
+)
+def test_what_is_no_such_file_is_refused(tmp_path, text):
+    path = tmp_path / 'tuned.json'
+    path.write_bytes(text.encode(errors='surrogateescape'))
+    with pytest.raises(StoreError, match='tuned.json'):
+        TunedParameters.load(path)
+    with pytest.raises(OSError):
+        TunedParameters.load(tmp_path / 'missing.json')
+
+
+def test_unequal_budgets_are_told_apart():
+    other = replace(ENTRY, budget=replace(BUDGET, evaluations=90))
+    store = TunedParameters({('one', 'torque'): ENTRY, ('two', 'torque'): other})
+    with pytest.raises(
+        StoreError, match='two, torque was tuned with 90 eval.*one, torque with 80'
+    ):
+        store.check_equal()
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    path = tmp_path / 'tuned.json'
+    write_atomically(path, 'old')
+
+    def full(*_):
+        raise OSError('no space left')
+
+    with monkeypatch.context() as patch:
+        patch.setattr('os.fsync', full)
+        with pytest.raises(OSError, match='no space'):
+            write_atomically(path, 'new')
+    with pytest.raises(UnicodeEncodeError):
+        write_atomically(path, '\udcff')
+    assert path.read_text() == 'old'
+    assert list(tmp_path.iterdir()) == [path]
+    write_atomically(path, 'new')
+    assert path.read_text() == 'new'
+
+
+# The command line
+
+
+def parser():
+    made = argparse.ArgumentParser(prog='lab')
+    commands = made.add_subparsers(required=True)
+    tune.add_parser(commands, lambda: [FEEDBACK, WIDER])
+    return made
+
+
+def test_the_command_tunes_what_was_named(tmp_path, monkeypatch, capsys):
+    asked = {}
+
+    def instead(training, workers, report):
+        asked['workers'] = workers
+        return _Instead()
+
+    monkeypatch.setattr(tune_module, 'ClosedLoopObjective', instead)
+    path = tmp_path / 'tuned.json'
+    line = ['tune', 'P-feedback', '--evaluations', '12', '--workers', '3', '--output', str(path)]
+    options = parser().parse_args([*line, '--drive', 'velocity'])
+    assert options.run(options) == 0
+    store = TunedParameters.load(path)
+    assert list(store) == [('P feedback', 'velocity')]
+    assert store.entry('P feedback', 'velocity').budget.evaluations == 12
+    assert store.entry('P feedback', 'velocity').budget.training_seeds == TUNING_SEEDS
+    assert asked == {'workers': 3}
+    said = capsys.readouterr()
+    assert said.out == store.table() + '\n'
+    assert '  P feedback, velocity: 12 of 12 evaluations, best ' in said.err
+    options = parser().parse_args(['tune', *line[2:], '--resume'])
+    assert options.run(options) == 0
+    assert len(TunedParameters.load(path)) == 3
+
+
+class _Instead:
+    def __enter__(self):
+        return lag_plant
+
+    def __exit__(self, *_):
+        return None
+
+
+def test_names_that_are_not_known_are_refused_with_the_nearest():
+    with pytest.raises(ValueError, match="no method 'p fedback'; did you mean p-feedback"):
+        tune.chosen([FEEDBACK, WIDER], ['p fedback'])
+    with pytest.raises(ValueError, match="no method 'xyz'; known are p-feedback, wider-2nd"):
+        tune.chosen([FEEDBACK, WIDER], ['xyz'])
+    assert tune.chosen([FEEDBACK, WIDER], []) == [FEEDBACK, WIDER]
+    assert tune.chosen([FEEDBACK, WIDER], ['wider-2nd', 'Wider 2nd']) == [WIDER]
+
+
+@pytest.mark.parametrize(
+    'line', [['--evaluations', '0'], ['--workers', '-1'], ['--drive', 'wheels']]
+)
+def test_wrong_command_lines_are_refused(line, capsys):
+    with pytest.raises(SystemExit):
+        parser().parse_args(['tune', *line])
+    assert line[1] in capsys.readouterr().err

@@ -1,0 +1,239 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The boards' real programs, run instruction by instruction: link, stops, odometry, failures.
+
+Nothing here has touched silicon: simavr executes both programs, a register-level model of the
+nRF24L01+ joins them. Time is virtual, all losses are seeded.
+"""
+
+from collections.abc import Iterator
+import json
+from pathlib import Path
+import statistics
+
+import pytest
+from support.avr_bench import Ram
+from support.avr_boards import (
+    DONGLE,
+    ROBOT,
+    Boards,
+    booted,
+    build,
+    drive,
+    missing_tools,
+    odometry_agrees,
+)
+
+from t3mpc_ros.radio.link.link_parameters import LinkParameters
+from t3mpc_ros.radio.protocol import codec
+from t3mpc_ros.radio.protocol.frames import Configure, Ping, Poll, Pong, Transmit
+from t3mpc_ros.radio.protocol.framing import encode_frame
+
+pytestmark = pytest.mark.skipif(bool(missing_tools()), reason=f'not installed: {missing_tools()}')
+
+FIRST_PHASE = 1700
+"""us; the next command reaches the robot 2.7 ms after its last state was sampled"""
+VECTORS = json.loads((Path(__file__).parents[1] / 'golden' / 'radio_vectors.json').read_text())
+
+
+@pytest.fixture
+def boards() -> Iterator[Boards]:
+    yield from booted()
+
+
+# -- bytes ----------------------------------------------------------------------------------------
+
+
+def test_golden_transmission_reaches_the_robot_byte_by_byte(boards: Boards) -> None:
+    boards.run(0.13)
+    for vector in VECTORS['to_dongle']:
+        if vector['kind'] != 'Transmit':
+            continue
+        fields = vector['fields']
+        boards.write(bytes.fromhex(vector['wire']))
+        found = boards.wait(200000)
+        assert found is not None
+        result = codec.decode_from_dongle(found[0])
+        assert result.id == fields['id']
+        assert result.first & 1
+        assert boards.heard().hex() == (fields['second'] or fields['first'])
+
+
+def test_golden_answers_pass_the_dongle_byte_by_byte(boards: Boards) -> None:
+    boards.run(0.13)
+    for number, vector in enumerate(VECTORS['up']):
+        data = bytes.fromhex(vector['bytes'])
+        boards.call('answer', data, len(data))
+        result = boards.ask(Transmit(number, 0, b'\x15\x00\x00\x00'))
+        assert result.payload == data, vector['name']
+        assert result.second == 8  # skipped
+        boards.run(0.002)
+
+
+def test_golden_settings_and_pings_come_back(boards: Boards) -> None:
+    boards.run(0.13)
+    for vector in VECTORS['to_dongle']:
+        boards.write(bytes.fromhex(vector['wire']))
+        found = boards.wait(200000)
+        assert found is not None
+        frame = codec.decode_to_dongle(bytes.fromhex(vector['bytes']))
+        answer = codec.decode_from_dongle(found[0])
+        if isinstance(frame, Ping):
+            assert isinstance(answer, Pong)
+            assert answer.echo == frame.echo
+        if isinstance(frame, Configure) and frame.address:
+            assert answer[:-1] == frame
+            assert answer.chip_ok
+
+
+def test_robot_refuses_every_rejected_vector_and_counts_it(boards: Boards) -> None:
+    boards.start()
+    wrong = [
+        (bytes.fromhex(vector['bytes']), vector['fault'])
+        for vector in VECTORS['rejected']
+        if vector['direction'] == 'down' and 0 < len(vector['bytes']) <= 64
+    ]
+    assert len(wrong) > 5
+    before = boards.request(Poll(0, 0, 1), Poll(0, 0, 1))
+    for data, _ in wrong:
+        assert boards.call('inject', data, len(data), len(data))
+        boards.run(0.002)
+    after = boards.request(Poll(0, 0, 1), Poll(0, 0, 1))
+    unknown = sum(fault in ('version', 'kind') for _, fault in wrong)
+    assert after.bad_version - before.bad_version == unknown
+    assert after.short - before.short == len(wrong) - unknown
+
+
+def test_a_packet_that_claims_more_than_the_fifo_holds_is_thrown_away(boards: Boards) -> None:
+    """Such a width stops firmware that trusts it, or lets it write beyond its buffer."""
+    boards.start()
+    before = boards.request(Poll(0, 0, 1), Poll(0, 0, 1))
+    boards.call('inject', bytes(32), 32, 200)
+    boards.run(0.002)
+    after = boards.request(Poll(0, 0, 1), Poll(0, 0, 1))
+    assert after.short == before.short + 1
+    assert boards.drive().seq == boards.seq
+
+
+def test_serial_line_survives_rubbish_and_bursts(boards: Boards) -> None:
+    boards.run(0.13)
+    boards.write(b'\x05rubbish\x00' + encode_frame(b'\x03\x01abcd')[:-4] + b'\x00')
+    pings = [encode_frame(codec.encode(Ping(i, b'ping'))) for i in range(20)]
+    boards.write(b''.join(pings))
+    boards.run(0.03)
+    pongs = [codec.decode_from_dongle(frame) for frame, _ in boards.read()]
+    assert [pong.id for pong in pongs] == list(range(20))
+    assert pongs[-1].crc_errors + pongs[-1].frame_errors == 2
+    assert pongs[-1].overruns == 0
+
+
+# -- times ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('rate', [50, 100])
+def test_every_cycle_is_answered_within_six_milliseconds(boards: Boards, rate: int) -> None:
+    boards.start()
+    times, states, clocks = [], [], []
+    for number in range(500):
+        begun = boards.now_us
+        speed = 4000 if number % 100 < 50 else -4000
+        state = boards.drive(speed, speed // 2)
+        times.append((boards.now_us - begun) / 1000)
+        states.append(state is not None and state.seq == boards.seq)
+        clocks.append(state.time_us - begun)
+        boards.run_until(begun + 1e6 / rate)
+    middle, worst = statistics.median(times), max(times)
+    print(f'\n{rate} Hz: round trip {middle:.2f} ms (median), {worst:.2f} ms (longest)')
+    assert all(states)
+    # A stepping interrupt that is missed costs the robot's clock 50 us.
+    assert abs(min(clocks[:250]) - min(clocks[250:])) < 50
+    assert middle <= 6.0
+    assert worst <= 1000 / rate
+    drive(boards, 0.6, 0, 0)
+    odometry_agrees(boards)
+
+
+@pytest.mark.parametrize(('p', 'limit'), [(0.1, 0.005), (0.3, 0.1)])
+def test_few_whole_cycles_are_lost_in_a_bad_air(boards: Boards, p: float, limit: float) -> None:
+    """Whole: the command was taken, and the state that it led to came back with it."""
+    boards.start()
+    assert boards.ask(LinkParameters().configure(1)).chip_ok
+    boards.call('loss', p, p)
+    lost = unheard = 0
+    for _ in range(500):
+        end = boards.now_us + 14000
+        command = boards.command()
+        result = boards.exchange(command)
+        unheard += not result.first & 1
+        state = codec.decode_uplink(result.payload) if result.payload else None
+        whole = state is not None and state.seq == command.seq
+        # A state that the POLL has fetched is the cycle's own, never the one before.
+        assert whole or not result.second & 2
+        lost += not whole
+        boards.run_until(end)
+    one = (1 - (1 - p) ** 2) ** 5
+    print(f'\np = {p}: {unheard / 5:.1f} % of commands without ACK ({100 * one:.1f} % expected)')
+    print(
+        f'{lost / 5:.1f} % of whole cycles ({100 * (1 - (1 - one) ** 2):.1f} % expected at most)'
+    )
+    assert lost / 500 <= limit
+    assert boards.radio(ROBOT).duplicates > 0
+    assert boards.radio(ROBOT).ack_damaged == 0
+
+
+@pytest.mark.slow
+def test_telemetry_never_lags_by_an_exchange(boards: Boards) -> None:
+    """A refresh that met a packet once left two payloads queued: every later state was old.
+
+    After 100 ms of silence the robot loads a newer state; commands arrive at 2000 phases of that,
+    a microsecond apart. The silence is told to the program, not waited for: 3 minutes else.
+    """
+    boards.start()
+    ram = Ram(boards)
+    for phase in range(2000):
+        state = boards.drive()
+        assert state.seq == boards.seq, f'phase {phase} us'
+        assert boards.call('waiting_acks') <= 1
+        loaded = ram.get('loaded_us', 4) - 100_000 + FIRST_PHASE + phase
+        ram.put('loaded_us', loaded % 2**32)
+        if phase in (0, 1999):  # the first refresh comes before the command, the last one behind
+            boards.run(0.0009)
+            assert (ram.get('loaded_us', 4) != loaded % 2**32) is (phase == 0)
+    assert boards.radio(ROBOT).queued_acks == 0
+
+
+def test_dongle_clock_passes_half_of_its_range(boards: Boards) -> None:
+    """A counter of overflows with 16 bits made it come round after 35.8 minutes."""
+    boards.run(0.13)
+    address = boards.symbol(DONGLE, 'overflows')
+    for i, byte in enumerate((0xFFFE).to_bytes(4, 'little')):
+        boards.call('poke', DONGLE, address + i, byte)
+    before = boards.ask(Ping(1, b'ping')).time_us
+    boards.run(0.1)
+    after = boards.ask(Ping(2, b'ping')).time_us
+    assert before < 2**31 < after
+    assert after - before == pytest.approx(100_000, abs=2000)
+
+
+# -- what it takes --------------------------------------------------------------------------------
+
+
+def test_programs_fit_and_leave_the_processors_time(boards: Boards) -> None:
+    sizes = build()
+    print('\n' + sizes)
+    rows = [[int(word) for word in line.split()[:3]] for line in sizes.splitlines()[1:]]
+    (text, data, bss), (robot_text, robot_data, robot_bss) = rows
+    assert text + data < 32768 // 2
+    assert data + bss < 2048 * 3 // 4
+    assert robot_text + robot_data < 262144 // 4
+    assert robot_data + robot_bss < 8192 // 2
+    boards.start()
+    begun, busy = boards.now_us, [boards.call('busy_cycles', i) for i in (DONGLE, ROBOT)]
+    boards.run(0.2)
+    idle = [
+        (boards.call('busy_cycles', i) - busy[i]) / 16 / (boards.now_us - begun)
+        for i in (DONGLE, ROBOT)
+    ]
+    print(f'load without traffic: dongle {idle[0]:.1%}, robot {idle[1]:.1%}')
+    assert idle[DONGLE] < 0.05
+    assert idle[ROBOT] < 0.75

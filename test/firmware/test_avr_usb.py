@@ -1,0 +1,348 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The robot's real program: its own USB with its key, and the radio at its other rates.
+
+Nothing here has touched silicon: simavr executes the programs of both boards.
+"""
+
+from collections.abc import Iterator
+from ctypes import c_uint8, c_uint64
+from functools import cache
+from pathlib import Path
+import random
+import statistics
+import subprocess
+from typing import Any
+
+import pytest
+from support import avr_boards
+from support.avr_boards import (
+    FIRMWARE,
+    ROBOT,
+    Boards,
+    booted,
+    cycle,
+    drive,
+    missing_tools,
+    odometry_agrees,
+)
+
+from t3mpc_ros.radio.link.link_parameters import LinkParameters
+from t3mpc_ros.radio.protocol import codec
+from t3mpc_ros.radio.protocol.authentication import Signer, key_check, session_key, sign_hello
+from t3mpc_ros.radio.protocol.frames import (
+    BUSY,
+    KEY_DAMAGED,
+    KEY_HELD,
+    NO_KEY,
+    OK,
+    CommandFlag,
+    Hello,
+    Info,
+    Key,
+    KeyState,
+    Ping,
+    Poll,
+    Pong,
+    Refusal,
+    StatusFlag,
+)
+from t3mpc_ros.radio.protocol.framing import FrameDecoder, crc16, encode_frame
+
+pytestmark = pytest.mark.skipif(bool(missing_tools()), reason=f'not installed: {missing_tools()}')
+
+KEY, OTHER = bytes(range(0x80, 0x90)), bytes(range(0x30, 0x40))
+KEY_PLACE, MARK_PLACE = 8, 26
+WRITING = 0.3
+"""s that are enough for a key: some 25 cells of 3.4 ms, each sought in rounds of 0.4 ms."""
+HOST_NONCE = b'hostnonc'
+
+
+@pytest.fixture
+def boards() -> Iterator[Boards]:
+    yield from booted()
+
+
+def hear(boards: Boards) -> list[Any]:
+    """Return the frames that the robot has said over its USB."""
+    data, at = (c_uint8 * 4096)(), (c_uint64 * 4096)()
+    count = boards.call('usb_read', data, at, 4096)
+    return [codec.decode_from_board(frame) for frame in FrameDecoder().feed(bytes(data[:count]))]
+
+
+def tell(boards: Boards, frame: Any, seconds: float = 0.005) -> list[Any]:
+    """Return what the robot answers over its USB to a frame."""
+    wire = encode_frame(codec.encode(frame))
+    boards.call('usb_write', wire, len(wire))
+    boards.run(seconds)
+    return hear(boards)
+
+
+def meet(boards: Boards, key: bytes, gap: int = 20) -> Signer | None:
+    """Return the host's end of a signed session, None if the robot does not accept it."""
+    host_us = round(boards.now_us)
+    hello = sign_hello(key, boards.session, 0, host_us, HOST_NONCE)
+    info = boards.request(hello, Poll(0, 1, 2), gap)
+    assert isinstance(info, Info)
+    boards.seq = 0
+    if info.session != boards.session:
+        return None
+    return Signer(session_key(key, HOST_NONCE, info.nonce), host_us)
+
+
+def signed(boards: Boards, signer: Signer, left: int, right: int) -> Any:
+    """Return the state after one signed command."""
+    return boards.request(signer.sign(boards.command(left, right)._replace(tag=bytes(8))))
+
+
+# -- the key --------------------------------------------------------------------------------------
+
+
+def test_a_key_that_came_over_the_robots_usb_makes_a_keyed_link(boards: Boards) -> None:
+    boards.start()
+    assert tell(boards, Key(1)) == [KeyState(1, OK, NO_KEY, 0)]
+    assert tell(boards, Key(2, KEY)) == []
+    assert tell(boards, Key(3, OTHER)) == [KeyState(3, BUSY, KEY_DAMAGED, 0)]
+    assert boards.hello().session == 0  # nobody gets in meanwhile
+    begun = boards.now_us
+    told: list[Any] = []
+    while not told:
+        boards.run(0.005)
+        told = hear(boards)
+    print(f'\nwritten and verified after {(boards.now_us - begun) / 1000 + 10:.0f} ms')
+    assert told == [KeyState(2, OK, KEY_HELD, key_check(KEY))]
+    assert boards.eeprom(KEY_PLACE, 18) == KEY + crc16(KEY).to_bytes(2, 'little')
+    assert boards.eeprom(MARK_PLACE, 1) == b'\xff'
+    assert boards.hello().session == 0  # unsigned
+    assert meet(boards, OTHER) is None
+    signer = meet(boards, KEY)
+    assert signer is not None
+    for _ in range(30):
+        assert signed(boards, signer, 4000, 4000).seq == boards.seq
+        boards.run(0.015)
+    assert min(boards.pulses()) > 100
+    assert tell(boards, Key(4, OTHER)) == [KeyState(4, BUSY, KEY_HELD, key_check(KEY))]
+    boards.call('reset', ROBOT)
+    boards.run(0.15)
+    assert tell(boards, Key(5)) == [KeyState(5, OK, KEY_HELD, key_check(KEY))]
+    assert meet(boards, KEY) is not None
+    assert tell(boards, Key(6, bytes(16)), WRITING) == [KeyState(6, OK, NO_KEY, 0)]
+    assert boards.hello().session == boards.session
+    assert boards.eeprom(KEY_PLACE, 18) == b'\xff' * 18
+    assert boards.call('usb_overruns') == 0
+
+
+def test_the_board_says_how_it_fares_and_what_it_does_not_know(boards: Boards) -> None:
+    boards.start()
+    (pong,) = tell(boards, Ping(7, b'ping'))
+    assert isinstance(pong, Pong)
+    assert (pong.id, pong.echo, pong.chip_ok) == (7, b'ping', 1)
+    boards.call('usb_write', encode_frame(b'\x01\x00\x00\x01\x15'), 9)
+    boards.run(0.002)
+    assert hear(boards) == [Refusal(1, 1)]
+    (later,) = tell(boards, Ping(8, b'ping'), 0.01)
+    assert 3_000 < later.time_us - pong.time_us < 12_000
+
+
+def test_no_key_is_taken_from_a_robot_whose_drivers_have_power(boards: Boards) -> None:
+    boards.start()
+    drive(boards, 0.2, 4000, 4000)
+    assert tell(boards, Key(1, KEY)) == [KeyState(1, BUSY, NO_KEY, 0)]
+    drive(boards, 0.4, 0, 0)
+    assert boards.call('powered')
+    assert tell(boards, Key(2, KEY)) == [KeyState(2, BUSY, NO_KEY, 0)]
+    boards.drive(flags=0)
+    boards.run(0.002)
+    assert not boards.call('powered')
+    assert tell(boards, Key(3, KEY), WRITING) == [KeyState(3, OK, KEY_HELD, key_check(KEY))]
+    odometry_agrees(boards)
+
+
+def test_no_flipped_bit_on_the_cable_changes_anything(boards: Boards) -> None:
+    boards.start()
+    wire = encode_frame(codec.encode(Key(1, KEY)))
+    before = boards.eeprom(0, 40)
+    for bit in range(8 * (len(wire) - 1)):
+        flipped = bytearray(wire)
+        flipped[bit // 8] ^= 1 << bit % 8
+        boards.call('usb_write', bytes(flipped), len(flipped))
+        boards.run(0.002)
+    boards.run(0.02)
+    assert boards.eeprom(0, 40) == before
+    hear(boards)
+    assert tell(boards, Key(2)) == [KeyState(2, OK, NO_KEY, 0)]
+    (pong,) = tell(boards, Ping(3, b'ping'))
+    assert pong.overruns == 0
+    assert pong.crc_errors + pong.frame_errors >= 8 * (len(wire) - 1)
+    assert boards.drive().session == boards.session  # nor has the session ended
+
+
+@pytest.mark.parametrize('before', [b'', OTHER], ids=['first key', 'another key'])
+def test_power_that_fails_while_a_key_is_written_opens_nothing(before: bytes) -> None:
+    """Cut at five places: the robot has what it had, the new key, or moves for nobody."""
+    avr_boards.build()
+    states = []
+    for cut in (0.001, 0.008, 0.03, 0.07, WRITING):
+        boards = Boards()
+        if before:
+            boards.store(KEY_PLACE, before + crc16(before).to_bytes(2, 'little'))
+        boards.run(0.2)
+        told = tell(boards, Key(1, KEY), cut)
+        boards.call('reset', ROBOT)
+        boards.run(0.15)
+        ((_, rc, state, check),) = tell(boards, Key(2))
+        assert rc == OK
+        states.append(state)
+        if state == KEY_HELD:
+            assert check in (key_check(KEY), key_check(before or KEY))
+            assert not told or check == key_check(KEY)
+        elif state == KEY_DAMAGED:
+            assert boards.hello().session == 0
+            assert meet(boards, KEY) is None
+            assert meet(boards, OTHER) is None
+            stop = codec.encode(boards.command(flags=CommandFlag.ESTOP))
+            assert boards.call('inject', stop, len(stop), len(stop))
+            assert boards.request(Poll(0, 0, 0)).status & StatusFlag.ESTOP
+            wanted = KeyState(3, OK, KEY_HELD, key_check(KEY))
+            assert tell(boards, Key(3, KEY), WRITING) == [wanted]
+        else:
+            assert not before
+        boards.close()
+    assert KEY_DAMAGED in states
+    assert states[-1] == KEY_HELD
+
+
+def test_a_flood_on_the_cable_delays_nothing(boards: Boards) -> None:
+    """50 000 bytes a second, frames and rubbish, while the robot checks tags and drives.
+
+    The POLL finds the answer to its own CMD; in one run of several, one of a hundred was a cycle
+    old.
+    """
+    boards.store(KEY_PLACE, KEY + crc16(KEY).to_bytes(2, 'little'))
+    boards.run(0.13)
+    signer = meet(boards, KEY)
+    assert signer is not None
+    source = random.Random(1)
+    ping = encode_frame(codec.encode(Ping(1, b'ping')))
+    times, late = [], 0
+    for number in range(100):
+        flood = b''.join(
+            ping if source.random() < 0.5 else source.randbytes(12) for _ in range(70)
+        )
+        boards.call('usb_write', flood[:1000], 1000)
+        begun = boards.now_us
+        state = signed(boards, signer, 5000, -5000)
+        assert state is not None, number
+        late += state.seq != boards.seq
+        times.append((boards.now_us - begun) / 1000)
+        boards.run_until(begun + 20000)
+    print(f'\nflood: round trip {statistics.median(times):.2f} ms, {max(times):.2f} ms (longest)')
+    assert max(times) <= 7.0
+    assert late <= 1
+    assert boards.call('resets', ROBOT) == 0
+    hear(boards)
+    boards.run(0.01)
+    hear(boards)
+    boards.call('usb_write', b'\0', 1)  # ends what was cut off
+    (pong,) = tell(boards, Ping(9, b'ping'))
+    print(
+        f'robot counts {pong.overruns} losses on the cable of {boards.call("usb_overruns")} bytes'
+    )
+    assert pong.overruns > 0
+    boards.run(1.0)
+    odometry_agrees(boards)
+
+
+# -- other rates ----------------------------------------------------------------------------------
+
+
+@cache
+def build_at(folder: Path, rate: int) -> Path:
+    """Return where both programs stand, made for another rate of the radio."""
+    command = ['make', '-C', str(FIRMWARE), 'avr', 'simavr', f'BUILD={folder}']
+    subprocess.run([*command, f'RADIO_RATE={rate}'], check=True, capture_output=True)
+    return folder
+
+
+@pytest.fixture(params=['250k', '1M', '2M'])
+def slow_or_fast(
+    request: pytest.FixtureRequest,
+    tmp_path_factory: pytest.TempPathFactory,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Iterator[tuple[Boards, LinkParameters]]:
+    """Yield both boards at one rate, set by the frame with which a host sets the dongle."""
+    parameters = LinkParameters(rate=request.param)
+    wanted = parameters.configure(1)
+    folder = tmp_path_factory.getbasetemp() / f'firmware_{request.param}'
+    monkeypatch.setattr(avr_boards, 'BUILD', build_at(folder, wanted.rate))
+    pair = Boards()
+    pair.run(0.13)
+    told = pair.ask(wanted)
+    assert told[:-1] == tuple(wanted)
+    assert told.chip_ok
+    yield pair, parameters
+    counts = pair.radio(ROBOT)
+    assert counts.queued_acks == counts.overfull == 0
+    pair.close()
+
+
+def test_cycles_work_at_every_rate(slow_or_fast: tuple[Boards, LinkParameters]) -> None:
+    boards, parameters = slow_or_fast
+    greeting = Hello(boards.session, 0, round(boards.now_us))
+    assert boards.request(greeting, Poll(0, 0, 2), parameters.gap).session == boards.session
+    times, ages = [], []
+    for _ in range(100):
+        begun = boards.now_us
+        command = boards.command(4000, 4000)
+        state = boards.request(command, None, parameters.gap)
+        assert state.seq == command.seq
+        times.append((boards.now_us - begun) / 1000)
+        ages.append(10 * state.age)
+        boards.run_until(begun + 20000)
+    print(
+        f'\n{parameters.rate}: round trip {statistics.median(times):.2f} ms, {max(times):.2f} ms'
+    )
+    print(f'state sampled {statistics.median(ages)} us after its command')
+    assert max(times) < 12.0
+    assert max(ages) < 4000
+
+
+@pytest.mark.slow
+def test_telemetry_never_lags_at_any_rate(slow_or_fast: tuple[Boards, LinkParameters]) -> None:
+    """Losses make the dongle repeat packets; silence makes the robot refresh what waits."""
+    boards, parameters = slow_or_fast
+    boards.request(Hello(boards.session, 0, round(boards.now_us)), Poll(0, 0, 2), parameters.gap)
+    for phase in range(0, 4000, 160):
+        command = boards.command()
+        assert boards.request(command, None, parameters.gap).seq == command.seq, (
+            f'phase {phase} us'
+        )
+        assert boards.call('waiting_acks') <= 1
+        boards.run(0.0956 + phase / 1e6)
+    # A refresh may meet a packet that nobody foresaw: its acknowledgement is then repeated.
+    before = boards.radio(ROBOT).ack_damaged
+    boards.call('loss', 0.2, 0.2)
+    for _ in range(120):
+        command = boards.command()
+        result = boards.exchange(command, None, parameters.gap)
+        if result.second & 2:
+            assert codec.decode_uplink(result.payload).seq == command.seq
+        boards.run(0.005)
+    assert boards.radio(ROBOT).duplicates > 10
+    assert boards.radio(ROBOT).ack_damaged == before <= 1
+
+
+def test_signed_commands_are_answered_in_time_at_every_rate(
+    slow_or_fast: tuple[Boards, LinkParameters],
+) -> None:
+    boards, parameters = slow_or_fast
+    assert tell(boards, Key(1, KEY), WRITING)[0].rc == OK
+    signer = meet(boards, KEY, parameters.gap_after(Hello(1, 0, 0, bytes(8), bytes(8))))
+    assert signer is not None
+    for _ in range(40):
+        command = signer.sign(boards.command(3000, 3000)._replace(tag=bytes(8)))
+        state = boards.request(command, None, parameters.gap)
+        assert state.seq == command.seq
+        assert state.age != 0xFFFF
+        boards.run(0.012)
+    assert cycle(boards, 0.01) is not None

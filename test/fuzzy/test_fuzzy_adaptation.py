@@ -1,0 +1,248 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Adaptation (77)-(78): the Lyapunov argument of the law and of each of its modifications."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, adapt, beyond_dead_zone
+from t3mpc_ros.fuzzy.inference import basis_of
+from t3mpc_ros.fuzzy.sets import FuzzyParameters, build_sets
+
+Sets = partial(FuzzyParameters, sets=3, centre_exponent=1.0)
+
+GAIN = 8.0
+"""K, 1/s."""
+
+PLAIN = {'radius': 1e12, 'leakage': 0.0, 'dead_zone': 0.0, 'step_limit': 1e9}
+"""Every modification off."""
+
+
+def _bases(count, seed):
+    rng = np.random.default_rng(seed)
+    sets = build_sets(Sets())
+    return np.array([basis_of(u, sets) for u in rng.uniform(-10.0, 10.0, (count, 2))])
+
+
+def _matched_run(dt, parameters, disturbance=0.0, duration=2.0):
+    """(64)-(65) with a plant inside the fuzzy family, by Euler steps of dt.
+
+    Returns delta, shape (steps, 2), and |alpha~|² over gamma, shape (steps,), before each step.
+    """
+    rng = np.random.default_rng(21)
+    learner = FuzzyEstimator(Sets(), parameters)
+    plant = FuzzyEstimator(Sets(), parameters)
+    truth = rng.uniform(-15.0, 15.0, learner.coefficients.shape)
+    plant.coefficients = truth
+    chi = np.array([2.0, -1.0])
+    errors, distances = [], []
+    for k in range(round(duration / dt)):
+        t = k * dt
+        r = np.array([4.0 * np.sin(2.0 * t), 5.0 * np.cos(1.3 * t)])
+        rate = np.array([8.0 * np.cos(2.0 * t), -6.5 * np.sin(1.3 * t)])
+        delta = chi - r
+        errors.append(delta)
+        distances.append(np.sum((truth - learner.coefficients) ** 2) / parameters.gamma)
+        g = learner.evaluate(chi)
+        omega = disturbance * np.array([np.sin(37.0 * t), np.cos(23.0 * t)])
+        chi = chi + dt * (plant.evaluate(chi) - g - GAIN * delta + rate + omega)
+        learner.adapt(delta, dt)
+    return np.array(errors), np.array(distances)
+
+
+def test_the_law_is_77_and_78():
+    rng = np.random.default_rng(20)
+    phi = _bases(1, 20)[0]
+    alpha = rng.normal(size=(2, phi.size))
+    delta = np.array([0.3, -1.2])
+    expected = alpha + 0.01 * 600.0 * np.outer(delta, phi)
+    assert adapt(alpha, phi, delta, 0.01, 600.0, **PLAIN)
+    np.testing.assert_allclose(alpha, expected, rtol=1e-14)
+
+
+def test_v_falls_by_exactly_the_integral_of_k_delta_squared():
+    """Without noise and disturbance, (79) is an equality: V(0) - V(T) = K int |delta|² dt.
+
+    Cross terms left over by a wrong sign or factor in (77)-(78) would break it. Euler steps of
+    the plant keep it to first order only: the gap must halve with the step.
+    """
+    parameters = AdaptationParameters(dead_zone=0.0, radius=1e4)
+    gaps = []
+    for dt in (1e-3, 5e-4):
+        delta, distance = _matched_run(dt, parameters)
+        v = 0.5 * np.sum(delta**2, axis=1) + 0.5 * distance
+        used = GAIN * dt * np.sum(delta[:-1] ** 2)
+        gaps.append((v[0] - v[-1] - used) / used)
+    assert abs(gaps[1]) < 0.02
+    assert gaps[0] / gaps[1] == pytest.approx(2.0, rel=0.1)
+
+
+def test_v_never_rises_in_a_step():
+    """And it does fall: the run ends with a fraction of the V it began with."""
+    delta, distance = _matched_run(1e-3, AdaptationParameters(dead_zone=0.0, radius=1e4))
+    v = 0.5 * np.sum(delta**2, axis=1) + 0.5 * distance
+    assert np.diff(v).max() <= 1e-12 * v[0]
+    assert v[-1] < 0.8 * v[0]
+
+
+def test_with_a_dead_zone_v_never_rises_for_disturbances_up_to_k_times_its_width():
+    """The disturbance has amplitude K * width per wheel, the largest the argument allows.
+
+    Without the dead zone the same V, taken with delta itself, does rise.
+    """
+    width = 0.1
+    rises = {}
+    for zone in (width, 0.0):
+        parameters = AdaptationParameters(gamma=600.0, dead_zone=zone, radius=1e4)
+        delta, distance = _matched_run(5e-4, parameters, GAIN * width, duration=3.0)
+        d = delta - np.clip(delta, -zone, zone)
+        v = 0.5 * np.sum(d**2, axis=1) + 0.5 * distance
+        rises[zone] = np.maximum(np.diff(v), 0.0).sum() / v[0]
+    assert rises[width] < 1e-6
+    assert rises[0.0] > 1e-4
+
+
+def test_dead_zone_is_continuous_odd_and_zero_inside():
+    errors = np.linspace(-1.0, 1.0, 2001)
+    beyond = np.array([beyond_dead_zone(float(e), 0.3) for e in errors])
+    assert np.all(beyond[np.abs(errors) <= 0.3] == 0.0)
+    np.testing.assert_allclose(beyond, -beyond[::-1], atol=1e-15)
+    assert np.abs(np.diff(beyond)).max() <= np.diff(errors).max() * (1.0 + 1e-9)
+    np.testing.assert_allclose(
+        beyond[errors > 0.3], errors[errors > 0.3] - 0.3, rtol=0.0, atol=1e-15
+    )
+
+
+def _drift(noise, dead_zone):
+    """Return the RMS of |alpha| over the columns after a quarter and after all of a run.
+
+    Every error is noise; each column of ``noise`` is an output, so an independent repetition.
+    """
+    phi = _bases(len(noise), 22)
+    alpha = np.zeros((noise.shape[1], phi.shape[1]))
+    norms = []
+    for k, values in enumerate(noise):
+        adapt(alpha, phi[k], values, 0.01, 600.0, **{**PLAIN, 'dead_zone': dead_zone})
+        if k + 1 in (len(noise) // 4, len(noise)):
+            norms.append(float(np.sqrt(np.mean(np.sum(alpha**2, axis=1)))))
+    return norms
+
+
+def test_pure_noise_makes_the_plain_law_drift_and_a_dead_zone_stops_it():
+    """Noise of 0.2 rad/s for 20 s takes |alpha| to 14 rad/s², and on with the root of time.
+
+    A dead zone of two standard deviations leaves a ninth of the drift of Gaussian noise, 1.5
+    rad/s², as theory has it; one as wide as bounded noise leaves none.
+    """
+    rng = np.random.default_rng(23)
+    gaussian = 0.2 * rng.normal(size=(2000, 100))
+    quarter, whole = _drift(gaussian, 0.0)
+    steps = 0.01 * 600.0 * 0.2 * np.linalg.norm(_bases(2000, 22), axis=1)
+    assert whole == pytest.approx(np.sqrt(np.sum(steps**2)), rel=0.15)
+    assert whole / quarter == pytest.approx(2.0, rel=0.15)
+    outside = 2.0 * (5.0 * norm.sf(2.0) - 2.0 * norm.pdf(2.0))  # variance left, of one
+    assert _drift(gaussian, 0.4)[1] == pytest.approx(np.sqrt(outside) * whole, rel=0.15)
+    bounded = rng.uniform(-0.2, 0.2, (2000, 20))
+    assert _drift(bounded, 0.0)[1] > 5.0
+    assert _drift(bounded, 0.2)[1] == 0.0
+
+
+def test_leakage_bounds_what_noise_makes_of_the_coefficients():
+    """With -sigma alpha in (77), |alpha| stays below gamma |Phi||delta| / sigma for ever."""
+    rng = np.random.default_rng(24)
+    phi = _bases(200, 24)
+    alpha = np.zeros((1, phi.shape[1]))
+    limits = {**PLAIN, 'leakage': 0.5}
+    bound = 0.01 * 600.0 * np.linalg.norm(phi, axis=1).max() * 0.2 / -np.expm1(-0.5 * 0.01)
+    largest = 0.0
+    for k in range(20_000):
+        # Errors of one sign: the worst there is, not just noise.
+        error = np.array([rng.uniform(0.0, 0.2)])
+        adapt(alpha, phi[k % 200], error, 0.01, 600.0, **limits)
+        largest = max(largest, float(np.linalg.norm(alpha)))
+    assert largest < bound
+    unlimited = 0.01 * 600.0 * 20_000 * 0.1 * phi.mean(axis=0)
+    assert np.linalg.norm(unlimited) > 10.0 * bound
+
+
+@pytest.mark.parametrize('dt', [1e-3, 0.1, 10.0, 1e4])
+def test_leakage_decays_exactly_at_any_step(dt):
+    alpha = np.full((2, 6), 3.0)
+    adapt(alpha, np.full(6, 1.0 / 6.0), np.zeros(2), dt, 600.0, **{**PLAIN, 'leakage': 2.0})
+    np.testing.assert_allclose(alpha, 3.0 * np.exp(-2.0 * dt), rtol=1e-13)
+
+
+def test_leakage_draws_a_distance_larger_than_the_truth_in():
+    """Since alpha~'alpha <= (|alpha*|² - |alpha~|²)/2, leakage helps where alpha~ > alpha*."""
+    rng = np.random.default_rng(25)
+    phi = _bases(1, 25)[0]
+    for _ in range(200):
+        truth = rng.normal(size=phi.size)
+        alpha = (truth + rng.normal(scale=rng.uniform(0.1, 5.0), size=phi.size))[None]
+        before = np.linalg.norm(truth - alpha)
+        adapt(alpha, phi, np.zeros(1), 1e-3, 600.0, **{**PLAIN, 'leakage': 1.0})
+        if before > np.linalg.norm(truth):
+            assert np.linalg.norm(truth - alpha) < before
+
+
+def test_projection_keeps_the_ball_and_never_goes_away_from_a_truth_inside():
+    rng = np.random.default_rng(26)
+    phi = _bases(300, 26)
+    radius, outside = 10.0, 0
+    alpha = np.zeros((2, phi.shape[1]))
+    for k in range(300):
+        delta = rng.normal(scale=20.0, size=2)
+        free = alpha.copy()
+        adapt(free, phi[k], delta, 0.01, 600.0, **PLAIN)
+        adapt(alpha, phi[k], delta, 0.01, 600.0, **{**PLAIN, 'radius': radius})
+        norms = np.linalg.norm(alpha, axis=1)
+        assert np.all(norms <= radius * (1.0 + 1e-14))
+        for z in range(2):
+            outside += np.linalg.norm(free[z]) > radius
+            truth = rng.normal(size=phi.shape[1])
+            truth *= radius * rng.uniform() / np.linalg.norm(truth)
+            without = np.linalg.norm(truth - free[z])
+            assert np.linalg.norm(truth - alpha[z]) <= without * (1.0 + 1e-14)
+    assert outside > 100  # the ball was really met
+
+
+def test_step_limit_argument_the_sampled_loop_is_stable_exactly_below_k():
+    """Eigenvalues of the sampled loop against the condition gamma |Phi|² dt < K in the text."""
+    for k in (0.5, 2.0, 8.0, 30.0):
+        for dt in (1e-3, 0.01, 0.05):
+            if k * dt >= 2.0:
+                continue
+            for ratio in (0.1, 0.9, 0.999, 1.001, 1.1, 5.0):
+                stiffness = ratio * k / dt
+                loop = np.array([[1.0 - k * dt, dt], [-stiffness * dt, 1.0]])
+                assert (np.abs(np.linalg.eigvals(loop)).max() < 1.0) == (ratio < 1.0)
+
+
+def test_step_limit_caps_the_change_of_the_estimate():
+    """One step changes g by gamma |Phi|² dt delta; that is at most limit * delta, at any dt."""
+    phi = _bases(1, 27)[0]
+    for gamma, dt in ((600.0, 0.01), (600.0, 1.0), (1e6, 0.01), (1e6, 1e6), (1e6, 1e300)):
+        alpha = np.zeros((1, phi.size))
+        adapt(alpha, phi, np.array([0.5]), dt, gamma, **{**PLAIN, 'step_limit': 2.0})
+        wanted = min(gamma * (phi @ phi) * dt, 2.0) * 0.5
+        assert alpha[0] @ phi == pytest.approx(wanted, rel=1e-12)
+
+
+def test_absurd_but_finite_errors_end_on_the_ball():
+    phi = _bases(1, 28)[0]
+    alpha = np.zeros((2, phi.size))
+    limits = {**PLAIN, 'radius': 5.0, 'step_limit': 1000.0}
+    assert adapt(alpha, phi, np.array([1.7e308, -1e300]), 1e300, 1e6, **limits)
+    np.testing.assert_allclose(np.linalg.norm(alpha, axis=1), 5.0, rtol=1e-12)
+    np.testing.assert_allclose(alpha[0] / 5.0, phi / np.linalg.norm(phi), rtol=1e-12)
+
+
+@pytest.mark.parametrize('wrong', [np.nan, np.inf, -np.inf])
+def test_an_error_that_is_not_finite_changes_no_output(wrong):
+    phi = _bases(1, 29)[0]
+    alpha = np.ones((2, phi.size))
+    assert not adapt(alpha, phi, np.array([0.5, wrong]), 0.01, 600.0, **PLAIN)
+    assert np.all(alpha == 1.0)

@@ -1,0 +1,331 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Inference (16)-(33) with E7 and E8: the hull, the special cases, the limits."""
+
+from functools import partial
+import itertools
+import math
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+from scipy.special import logsumexp
+
+from t3mpc_ros.fuzzy.inference import (
+    basis_of,
+    firing_strengths,
+    fuzzify,
+    memberships,
+    output_by_double_sum,
+)
+from t3mpc_ros.fuzzy.sets import FuzzyParameters, FuzzySets, build_sets, slice_levels, type3_widths
+
+Sets = partial(FuzzyParameters, sets=3, centre_exponent=1.0)
+
+KINDS = ('type3', 'interval_type2', 'type1')
+FAR = [40.0, -80.0, 1e3, -1e5, 1e9, -1e12, 1e200, -1.7e308]
+
+
+def _random_sets(rng, inputs=2, sets=3, slices=4):
+    """Tables without any regularity: a slip in an index cannot hide behind a symmetry."""
+    lower = rng.uniform(0.5, 4.0, (inputs, sets, slices, 2))
+    upper = lower + rng.uniform(0.0, 3.0, lower.shape)
+    return FuzzySets(
+        centres=np.sort(rng.uniform(-10.0, 10.0, (inputs, sets)), axis=1),
+        widths=np.stack([lower, upper], axis=-1),
+        levels=np.sort(rng.uniform(0.05, 1.0, (slices, 2)), axis=1),
+        input_fuzziness=float(rng.uniform(0.1, 2.0)),
+    )
+
+
+def _log_firings(u, sets):
+    """Logarithms of (24)-(27), shape (r, lambda, 2, 2), from the equations with whole arrays."""
+    square, own = sets.widths**2, sets.input_fuzziness**2
+    o = sets.centres[:, :, None, None, None]
+    x = (np.asarray(u)[:, None, None, None, None] * square + o * own) / (square + own)
+    logs = -((x - o) ** 2) / square
+    n, per_input = sets.centres.shape
+    rules = itertools.product(range(per_input), repeat=n)
+    return np.array([sum(logs[i, h] for i, h in enumerate(rule)) for rule in rules])
+
+
+def _reference_basis(u, sets):
+    """(33) with E8, by logarithms: valid at any distance."""
+    logs = _log_firings(u, sets)
+    both = logsumexp(logs, axis=-1)  # r, lambda, level
+    part = np.exp(both - logsumexp(both, axis=0)) * sets.levels / sets.levels.sum()
+    return np.concatenate([part[:, :, 0].ravel(), part[:, :, 1].ravel()])
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_output_stays_in_the_hull_of_the_coefficients_anywhere(kind):
+    rng = np.random.default_rng(1)
+    sets = build_sets(Sets(kind=kind))
+    near = rng.uniform(-15.0, 15.0, (200, 2))
+    far = np.array(list(itertools.product([0.3, *FAR], repeat=2)))
+    for u in np.concatenate([near, far]):
+        phi = basis_of(u, sets)
+        assert np.all(phi >= 0.0)
+        assert phi.sum() == pytest.approx(1.0, abs=1e-13)
+        alpha = rng.normal(scale=100.0, size=(20, sets.size))
+        g = alpha @ phi
+        slack = 1e-12 * np.abs(alpha).max()
+        assert np.all(g >= alpha.min(axis=1) - slack)
+        assert np.all(g <= alpha.max(axis=1) + slack)
+
+
+@pytest.mark.parametrize('inputs, per_input, slices', [(1, 5, 3), (2, 3, 4), (2, 4, 1), (3, 2, 2)])
+def test_the_double_sum_29_equals_31_to_33(inputs, per_input, slices):
+    rng = np.random.default_rng(2)
+    for _ in range(10):
+        sets = _random_sets(rng, inputs, per_input, slices)
+        lower, upper = rng.normal(size=(2, sets.rules, slices))
+        alpha = np.concatenate([lower.ravel(), upper.ravel()])  # the order of (32)
+        u = rng.uniform(-12.0, 12.0, inputs)
+        expected = output_by_double_sum(u, sets, lower, upper)
+        assert alpha @ basis_of(u, sets) == pytest.approx(expected, rel=1e-11, abs=1e-13)
+
+
+@pytest.mark.parametrize('inputs, per_input, slices', [(1, 6, 2), (2, 3, 4), (3, 3, 3), (4, 2, 1)])
+def test_kernel_equals_whole_array_reference(inputs, per_input, slices):
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        sets = _random_sets(rng, inputs, per_input, slices)
+        u = rng.uniform(-15.0, 15.0, inputs)
+        np.testing.assert_allclose(
+            basis_of(u, sets), _reference_basis(u, sets), rtol=1e-11, atol=1e-300
+        )
+
+
+def test_order_of_32_each_coefficient_speaks_for_its_rule_slice_and_level():
+    sets = _random_sets(np.random.default_rng(4))
+    u = np.array([1.0, -2.0])
+    phi = basis_of(u, sets)
+    for rule, j, level in itertools.product(range(9), range(4), range(2)):
+        one = np.zeros((2, 9, 4))
+        one[level, rule, j] = 1.0
+        expected = output_by_double_sum(u, sets, one[0], one[1])
+        assert phi[level * 36 + rule * 4 + j] == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize('fuzziness', [0.0, 0.283, 3.0])
+def test_type1_is_a_textbook_weighted_average(fuzziness):
+    """Written from the textbook: product of grades, weighted average of one constant per rule.
+
+    For the non-singleton fuzzifier the grade at the best match of input and set is
+    exp(-((U - o) beta / (beta² + beta_U²))²).
+    """
+    parameters = Sets(kind='type1', sets=4, input_fuzziness=fuzziness)
+    sets = build_sets(parameters)
+    rng = np.random.default_rng(5)
+    constants = rng.normal(size=(4, 4))
+    centres, beta = np.linspace(-10.0, 10.0, 4), parameters.widths[0]
+
+    def textbook(u1, u2):
+        total = weighted = 0.0
+        for h1, o1 in enumerate(centres):
+            for h2, o2 in enumerate(centres):
+                w = 1.0
+                for u, o in ((u1, o1), (u2, o2)):
+                    w *= math.exp(-(((u - o) * beta / (beta**2 + fuzziness**2)) ** 2))
+                total += w
+                weighted += w * constants[h1, h2]
+        return weighted / total
+
+    alpha = np.tile(constants.ravel(), 2)
+    for u in rng.uniform(-14.0, 14.0, (50, 2)):
+        assert alpha @ basis_of(u, sets) == pytest.approx(textbook(*u), rel=1e-12)
+
+
+def test_interval_type2_is_a_nie_tan_system():
+    """Nie-Tan: the mean of upper and lower firing is the weight of the rule's constant."""
+    parameters = Sets(kind='interval_type2', footprint_of_uncertainty=0.4, input_fuzziness=0.0)
+    sets = build_sets(parameters)
+    rng = np.random.default_rng(6)
+    constants = rng.normal(size=9)
+    centres = np.array([-10.0, 0.0, 10.0])
+    sigma = parameters.widths[0]
+    for u in rng.uniform(-14.0, 14.0, (50, 2)):
+        upper = np.exp(-(((u[:, None] - centres) / (1.4 * sigma)) ** 2))
+        lower = np.exp(-(((u[:, None] - centres) / (0.6 * sigma)) ** 2))
+        weights = 0.5 * (np.outer(*upper) + np.outer(*lower)).ravel()
+        nie_tan = weights @ constants / weights.sum()
+        assert np.tile(constants, 2) @ basis_of(u, sets) == pytest.approx(nie_tan, rel=1e-12)
+
+
+def test_type3_of_one_slice_at_level_one_is_type1():
+    parameters = Sets()
+    type1 = build_sets(Sets(kind='type1'))
+    rng = np.random.default_rng(7)
+    points = rng.uniform(-14.0, 14.0, (20, 2))
+
+    def at(level):
+        levels = np.array([[level, 1.0]])
+        widths = np.broadcast_to(type3_widths(parameters.widths[0], levels), (2, 3, 1, 2, 2))
+        return FuzzySets(type1.centres, widths, levels, parameters.input_fuzziness)
+
+    gaps = []
+    for level in (1.0, 1.0 - 1e-3, 1.0 - 5e-4):
+        sets = at(level)
+        gaps.append(max(np.abs(basis_of(u, sets) - basis_of(u, type1)).max() for u in points))
+    assert gaps[0] == 0.0
+    assert gaps[1] == pytest.approx(2.0 * gaps[2], rel=0.02)  # and it is approached linearly
+
+
+def test_slices_without_footprint_change_nothing():
+    """Equal widths at every level make every slice the same type-1 system."""
+    type1 = build_sets(Sets(kind='type1'))
+    widths = np.full((2, 3, 5, 2, 2), Sets().widths[0])
+    sliced = FuzzySets(type1.centres, widths, slice_levels(5), type1.input_fuzziness)
+    rng = np.random.default_rng(8)
+    constants = rng.normal(size=9)
+    for u in rng.uniform(-14.0, 14.0, (20, 2)):
+        full = np.tile(np.repeat(constants, 5), 2) @ basis_of(u, sliced)
+        assert full == pytest.approx(np.tile(constants, 2) @ basis_of(u, type1), rel=1e-12)
+
+
+def test_singleton_limit_the_input_is_met_where_it_is():
+    sets = build_sets(Sets(input_fuzziness=0.0))
+    u = np.array([3.3, -7.1])
+    found = np.empty(sets.widths.shape)
+    fuzzify(u, sets.centres, sets.nonsingleton_gain, found)
+    np.testing.assert_array_equal(
+        found, np.broadcast_to(u[:, None, None, None, None], found.shape)
+    )
+
+
+def test_wide_input_limit_is_met_at_the_centres():
+    sets = build_sets(Sets(input_fuzziness=100.0))
+    found = np.empty(sets.widths.shape)
+    fuzzify(np.array([3.3, -7.1]), sets.centres, sets.nonsingleton_gain, found)
+    assert np.abs(found - sets.centres[:, :, None, None, None]).max() < 1.0
+
+
+def test_fuzzification_finds_the_largest_product_of_input_and_set():
+    """(16)-(19) are where the product of the two Gaussians peaks, whatever their widths."""
+    rng = np.random.default_rng(9)
+    sets = _random_sets(rng, slices=2)
+    u = np.array([2.0, -3.0])
+    found = np.empty(sets.widths.shape)
+    fuzzify(u, sets.centres, sets.nonsingleton_gain, found)
+    for i, h, j, level, bound in np.ndindex(found.shape):
+        o, beta = sets.centres[i, h], sets.widths[i, h, j, level, bound]
+
+        def minus_log_product(x, u=u[i], o=o, beta=beta):
+            return ((x - u) / sets.input_fuzziness) ** 2 + ((x - o) / beta) ** 2
+
+        best = minimize_scalar(
+            minus_log_product, bounds=(-30.0, 30.0), method='bounded', options={'xatol': 1e-10}
+        )
+        x = found[i, h, j, level, bound]
+        assert x == pytest.approx(best.x, abs=1e-5)
+        assert minus_log_product(x) <= best.fun + 1e-12
+        # The height of the peak, known in closed form: it is nowhere exceeded.
+        height = (u[i] - o) ** 2 / (beta**2 + sets.input_fuzziness**2)
+        assert minus_log_product(x) == pytest.approx(height, rel=1e-12)
+
+
+def test_e7_grades_are_even_about_the_centre_and_at_most_one():
+    """The printed exponent of (20)-(23) is linear: its "grade" exceeds one below the centre."""
+    sets = _random_sets(np.random.default_rng(10))
+    right, left = np.empty(sets.widths.shape), np.empty(sets.widths.shape)
+    for offset in (0.0, 0.7, 5.0):
+        for h in range(3):
+            u = sets.centres[:, h]
+            memberships(u + offset, sets.centres, sets.nonsingleton_gain, sets.sharpness, right)
+            memberships(u - offset, sets.centres, sets.nonsingleton_gain, sets.sharpness, left)
+            np.testing.assert_allclose(right[:, h], left[:, h], rtol=1e-11)
+            assert right.max() <= 1.0
+            assert left.max() <= 1.0
+    found = np.empty(sets.widths.shape)
+    fuzzify(sets.centres[:, 0] - 5.0, sets.centres, sets.nonsingleton_gain, found)
+    printed = np.exp(-(found - sets.centres[:, :, None, None, None]) / sets.widths**2)
+    assert printed.max() > 1.0
+
+
+def test_e8_printed_normalisation_leaves_the_hull():
+    """With 0.5 / (sum of upper levels) a constant 1 on every rule comes out as 0.9."""
+    sets = build_sets(Sets())
+    phi = basis_of(np.array([1.0, 2.0]), sets)
+    printed = phi * sets.levels.sum() * 0.5 / sets.levels[:, 1].sum()
+    assert np.ones(sets.size) @ phi == pytest.approx(1.0, abs=1e-14)
+    assert np.ones(sets.size) @ printed == pytest.approx(0.9, abs=1e-14)
+
+
+def test_memberships_and_firings_are_the_printed_products():
+    sets = _random_sets(np.random.default_rng(11), inputs=3)
+    u = np.array([1.0, -2.0, 4.0])
+    grades = np.empty(sets.widths.shape)
+    firings = np.empty((27, 4, 2, 2))
+    memberships(u, sets.centres, sets.nonsingleton_gain, sets.sharpness, grades)
+    firing_strengths(grades, firings)
+    for rule, (h1, h2, h3) in enumerate(itertools.product(range(3), repeat=3)):
+        np.testing.assert_allclose(
+            firings[rule], grades[0, h1] * grades[1, h2] * grades[2, h3], rtol=1e-14
+        )
+    np.testing.assert_allclose(firings, np.exp(_log_firings(u, sets)), rtol=1e-11)
+
+
+def test_far_outside_where_firings_underflow_the_basis_is_still_exact():
+    """Plain firings are all zero here and (33) would be 0/0; logarithms know better."""
+    sets = build_sets(Sets())
+    for u in ([80.0, -90.0], [-300.0, 2.0], [1e4, 1e4]):
+        at_lowest_width = np.exp(_log_firings(u, sets))[..., 0, 0, 0]
+        assert at_lowest_width.max() == 0.0
+        np.testing.assert_allclose(
+            basis_of(np.array(u), sets), _reference_basis(u, sets), rtol=1e-6, atol=1e-300
+        )
+
+
+def test_a_rule_28_that_fires_alone_answers_between_its_two_consequents():
+    """'If chi_1 is ... and chi_2 is ... then y in [lower alpha, upper alpha]', rule by rule.
+
+    At the centres of narrow sets one rule fires and the others do not. With one slice its two
+    consequents are weighed by the two levels.
+    """
+    rng = np.random.default_rng(13)
+    levels = np.array([[0.3, 0.9]])
+    centres = np.array([[-6.0, 1.0, 8.0], [-9.0, -2.0, 5.0]])
+    sets = FuzzySets(centres, np.full((2, 3, 1, 2, 2), 0.5), levels, 0.1)
+    lower, upper = np.sort(rng.uniform(-5.0, 5.0, (2, 9)), axis=0)
+    for rule, u in enumerate(itertools.product(*centres)):
+        y = np.concatenate([lower, upper]) @ basis_of(np.array(u), sets)
+        assert lower[rule] < y < upper[rule]
+        assert y == pytest.approx((0.3 * lower[rule] + 0.9 * upper[rule]) / 1.2, rel=1e-12)
+
+
+@pytest.mark.parametrize('distance', FAR[2:])
+def test_far_outside_the_nearest_rule_takes_all(distance):
+    sets = build_sets(Sets())
+    phi = basis_of(np.array([distance, distance]), sets).reshape(2, 9, 4)
+    nearest = 8 if distance > 0.0 else 0
+    np.testing.assert_allclose(phi[:, nearest].T, sets.shares, rtol=1e-12)
+
+
+def test_output_is_smooth_where_the_nearest_rule_changes():
+    """The strongest rule is taken out of the exponents; its change must leave no kink.
+
+    A kink would make the second difference double when its step is halved.
+    """
+    sets = build_sets(Sets())
+    rng = np.random.default_rng(12)
+    alpha = rng.normal(size=sets.size)
+    places = [*itertools.product([-5.0, 5.0], repeat=2), (-5.0, 1.0), (30.0, 5.0)]
+    for place in np.concatenate([places, rng.uniform(-12.0, 12.0, (10, 2))]):
+        direction = rng.normal(size=2)
+        direction /= np.linalg.norm(direction)
+
+        def second(step, place=place, direction=direction):
+            values = [
+                alpha @ basis_of(place + k * step * direction, sets) for k in (-1.0, 0.0, 1.0)
+            ]
+            return (values[0] - 2.0 * values[1] + values[2]) / step**2
+
+        assert second(2e-3) == pytest.approx(second(1e-3), rel=1e-3, abs=1e-6)
+
+
+def test_inputs_that_are_no_numbers_are_refused():
+    sets = build_sets(Sets())
+    for wrong in ([0.0], [0.0, math.nan], [math.inf, 0.0], [0.0, 0.0, 0.0]):
+        with pytest.raises(ValueError, match='inputs must be 2 finite numbers'):
+            basis_of(np.array(wrong), sets)

@@ -1,0 +1,132 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Unicycle kinematics (1)-(3) and the words they speak in."""
+
+import math
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.geometry.kinematics import (
+    WheelGeometry,
+    advance_pose,
+    pose_rate,
+    twist_from_wheels,
+    wheels_from_twist,
+)
+from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, Pose, State, WheelSpeeds, wrap_angle
+from t3mpc_ros.parameters.table import ParameterError
+
+GEOMETRY = WheelGeometry()
+
+
+def test_wheel_speeds_to_body_twist_and_back_is_the_identity():
+    generator = np.random.default_rng(1)
+    for _ in range(100):
+        geometry = WheelGeometry(generator.uniform(0.01, 0.2), generator.uniform(0.05, 1.0))
+        wheels = WheelSpeeds(*generator.uniform(-30.0, 30.0, 2))
+        back = wheels_from_twist(twist_from_wheels(wheels, geometry), geometry)
+        assert back == pytest.approx(wheels, rel=1e-12, abs=1e-12)
+
+
+def test_equal_wheels_drive_straight_and_opposite_wheels_turn_on_the_spot():
+    straight = twist_from_wheels(WheelSpeeds(4.0, 4.0), GEOMETRY)
+    assert straight == (pytest.approx(4.0 * GEOMETRY.wheel_radius), 0.0)
+    spot = twist_from_wheels(WheelSpeeds(4.0, -4.0), GEOMETRY)
+    assert spot.linear == 0.0
+    assert spot.angular > 0.0  # the right wheel forward turns to the left
+
+
+def test_a_circle_driven_for_one_turn_of_the_wheel_tracks_closes():
+    """E1: the printed (1) divides by twice the *separation* and closes after two turns only.
+
+    The tracks are measured here without (1): on a circle of radius r the right wheel runs
+    2 pi (r + b), the left one 2 pi (r - b).
+    """
+    radius, duration = 0.6, 7.0
+    half = 0.5 * GEOMETRY.wheel_separation
+    wheels = WheelSpeeds(
+        math.tau * (radius + half) / GEOMETRY.wheel_radius / duration,
+        math.tau * (radius - half) / GEOMETRY.wheel_radius / duration,
+    )
+    twist = twist_from_wheels(wheels, GEOMETRY)
+    assert twist.angular * duration == pytest.approx(math.tau, rel=1e-12)
+    assert twist.linear * duration == pytest.approx(math.tau * radius, rel=1e-12)
+    end = advance_pose(ORIGIN, twist, duration)
+    assert end == pytest.approx(ORIGIN, abs=1e-12)
+    middle = advance_pose(ORIGIN, twist, 0.5 * duration)
+    assert (middle.x, middle.y) == pytest.approx((0.0, 2.0 * radius), abs=1e-12)
+    assert abs(middle.yaw) == pytest.approx(math.pi)
+
+
+def test_the_wheel_hubs_move_with_the_rim_speed_of_their_wheels():
+    wheels = WheelSpeeds(7.0, -2.5)
+    twist = twist_from_wheels(wheels, GEOMETRY)
+    half = GEOMETRY.half_separation
+    assert twist.linear + half * twist.angular == pytest.approx(
+        GEOMETRY.wheel_radius * wheels.right
+    )
+    assert twist.linear - half * twist.angular == pytest.approx(
+        GEOMETRY.wheel_radius * wheels.left
+    )
+
+
+def test_pose_rate_is_the_derivative_of_the_exact_arc():
+    generator = np.random.default_rng(2)
+    small = 1e-6
+    for _ in range(50):
+        wheels = WheelSpeeds(*generator.uniform(-10.0, 10.0, 2))
+        pose = Pose(*generator.uniform(-1.0, 1.0, 2), generator.uniform(-3.0, 3.0))
+        twist = twist_from_wheels(wheels, GEOMETRY)
+        ahead, behind = advance_pose(pose, twist, small), advance_pose(pose, twist, -small)
+        slope = (np.array(ahead) - np.array(behind)) / (2.0 * small)
+        assert slope == pytest.approx(pose_rate(pose.yaw, wheels, GEOMETRY), abs=1e-8)
+
+
+def test_arcs_add_up_whatever_they_are_cut_into():
+    generator = np.random.default_rng(3)
+    for _ in range(50):
+        pose = Pose(*generator.uniform(-2.0, 2.0, 3))
+        twist = BodyTwist(*generator.uniform(-3.0, 3.0, 2))
+        cuts = np.diff(np.concatenate([[0.0], np.sort(generator.uniform(0.0, 2.0, 6)), [2.0]]))
+        walked = pose
+        for cut in cuts:
+            walked = advance_pose(walked, twist, float(cut))
+        whole = advance_pose(pose, twist, 2.0)
+        assert walked[:2] == pytest.approx(whole[:2], abs=1e-12)
+        assert wrap_angle(walked.yaw - whole.yaw) == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize('angular', [0.0, 1e-300, 1e-18, 1e-12, 1e-9, 1e-6, 1e-3, -1e-7])
+def test_nearly_straight_motion_keeps_full_accuracy(angular):
+    # The textbook form r (sin(P + w t) - sin P) loses all digits here.
+    end = advance_pose(ORIGIN, BodyTwist(2.0, angular), 1.5)
+    turn = 1.5 * angular
+    assert end.x == pytest.approx(3.0 * (1.0 - turn**2 / 6.0), rel=1e-12)
+    assert end.y == pytest.approx(3.0 * (turn / 2.0 - turn**3 / 24.0), rel=1e-12, abs=1e-300)
+
+
+def test_wrapped_angles_lie_in_the_half_open_turn_and_point_the_same_way():
+    generator = np.random.default_rng(4)
+    for angle in [*generator.uniform(-1e3, 1e3, 200), math.pi, -math.pi, 3.0 * math.pi, 0.0]:
+        wrapped = wrap_angle(float(angle))
+        assert -math.pi < wrapped <= math.pi
+        assert math.cos(wrapped) == pytest.approx(math.cos(angle), abs=1e-9)
+        assert math.sin(wrapped) == pytest.approx(math.sin(angle), abs=1e-9)
+    assert wrap_angle(-math.pi) == math.pi
+
+
+@pytest.mark.parametrize('bad', [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize('place', range(5))
+def test_a_motion_with_one_number_that_is_not_finite_says_so(bad, place):
+    numbers = [0.1, 0.2, 0.3, 0.4, 0.5]
+    assert State(0, Pose(*numbers[:3]), BodyTwist(*numbers[3:])).is_finite()
+    numbers[place] = bad
+    assert not State(0, Pose(*numbers[:3]), BodyTwist(*numbers[3:])).is_finite()
+
+
+def test_a_geometry_without_size_is_refused():
+    with pytest.raises(ParameterError, match='wheel_radius'):
+        WheelGeometry(wheel_radius=0.0)
+    with pytest.raises(ParameterError, match='wheel_separation'):
+        WheelGeometry(wheel_separation=-0.1)

@@ -1,0 +1,142 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The Boltzmann machine: its passes, its energy and the distribution they belong to."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.mpc.boltzmann_machine import (
+    LayerSizes,
+    bipolar_sigmoid,
+    boltzmann_distribution,
+    energy,
+    free_energy,
+    make_machine,
+    predict_error,
+    set_visible,
+)
+
+SHAPE = LayerSizes(3, 2, 7)
+
+
+def _machine(seed=0, shape=SHAPE, spread=1.0):
+    return make_machine(shape, 3.0, 20.0, spread, np.random.default_rng(seed))
+
+
+def _states(count):
+    return [np.array(state) for state in itertools.product((-1.0, 1.0), repeat=count)]
+
+
+def test_squash_is_the_printed_fraction_and_never_overflows():
+    for y in (-30.0, -2.0, -1e-9, 0.0, 0.3, 5.0, 30.0):
+        printed = (1.0 - np.exp(-y)) / (1.0 + np.exp(-y))
+        assert bipolar_sigmoid(y) == pytest.approx(printed, rel=1e-7, abs=1e-15)
+    assert bipolar_sigmoid(-1e6) == -1.0
+    assert bipolar_sigmoid(1e6) == 1.0
+
+
+def test_passes_run_in_the_order_39_38_37_36():
+    machine = _machine()
+    generator = np.random.default_rng(1)
+    machine.output_weights[:] = generator.standard_normal(7)
+    machine.lags[:] = generator.uniform(-1.0, 1.0, 5)
+    weights = machine.visible_weights
+    mu0 = np.tanh(0.5 * weights.T @ machine.lags)
+    eta1 = np.tanh(0.5 * weights @ mu0)
+    mu1 = np.tanh(0.5 * weights.T @ eta1)
+    assert predict_error(machine) == pytest.approx(3.0 * machine.output_weights @ mu1, rel=1e-13)
+    np.testing.assert_allclose(machine.mu0, mu0, rtol=1e-13)
+    np.testing.assert_allclose(machine.eta1, eta1, rtol=1e-13)
+    np.testing.assert_allclose(machine.mu1, mu1, rtol=1e-13)
+
+
+def test_visible_vector_holds_lags_of_the_error_and_of_the_move_in_scales():
+    machine = _machine()
+    errors, moves = np.arange(1.0, 7.0), 10.0 * np.arange(1.0, 7.0)
+    set_visible(machine, errors, moves, 1)
+    np.testing.assert_allclose(machine.lags, [2 / 3, 3 / 3, 4 / 3, 20 / 20, 30 / 20])
+
+
+def test_absurd_inputs_are_cut_and_predictions_stay_finite():
+    machine = _machine()
+    machine.output_weights[:] = 1.0
+    set_visible(machine, np.array([1e300, -1e300, 0.0]), np.array([1e308, -1e308]), 0)
+    assert np.max(np.abs(machine.lags)) == 10.0
+    assert np.isfinite(predict_error(machine))
+
+
+def test_first_weights_have_orthogonal_rows_so_that_the_passes_keep_every_direction():
+    """Independent random weights raise their condition number to the third power in mu_1."""
+    for spread in (0.3, 1.0, 2.0):
+        weights = _machine(spread=spread).visible_weights
+        np.testing.assert_allclose(weights @ weights.T, spread**2 * np.eye(5), atol=1e-13)
+
+
+def test_small_signals_pass_linearly_as_one_eighth_of_the_weights_cubed():
+    machine = _machine(spread=0.8)
+    generator = np.random.default_rng(2)
+    gaps = []
+    for size in (0.1, 0.05):
+        machine.lags[:] = size * generator.uniform(-1.0, 1.0, 5)
+        predict_error(machine)
+        weights = machine.visible_weights
+        linear = weights.T @ weights @ weights.T @ machine.lags / 8.0
+        gaps.append(np.max(np.abs(machine.mu1 - linear)) / np.max(np.abs(linear)))
+    assert gaps[0] < 2e-3
+    assert gaps[1] < 0.5 * gaps[0]  # the remainder is of second order
+
+
+def test_same_seed_same_machine():
+    np.testing.assert_array_equal(_machine(4).visible_weights, _machine(4).visible_weights)
+    assert np.any(_machine(4).visible_weights != _machine(5).visible_weights)
+
+
+def test_shapes_and_scales_that_cannot_work_are_refused():
+    generator = np.random.default_rng(0)
+    with pytest.raises(ValueError, match='hidden must be at least'):
+        make_machine(LayerSizes(3, 3, 5), 1.0, 1.0, 1.0, generator)
+    with pytest.raises(ValueError, match='at least one lag'):
+        make_machine(LayerSizes(3, 0, 5), 1.0, 1.0, 1.0, generator)
+    with pytest.raises(ValueError, match='positive'):
+        make_machine(LayerSizes(3, 2, 5), 0.0, 1.0, 1.0, generator)
+
+
+def test_energy_is_minus_the_bilinear_form_42():
+    machine = _machine()
+    generator = np.random.default_rng(3)
+    eta, mu = generator.standard_normal(5), generator.standard_normal(7)
+    assert energy(machine.visible_weights, eta, mu) == pytest.approx(
+        -eta @ machine.visible_weights @ mu, rel=1e-13
+    )
+
+
+def test_the_squash_is_the_mean_of_a_hidden_unit_under_the_boltzmann_distribution():
+    """E9: only at temperature 2 do the passes (37), (39) belong to the distribution (41)."""
+    machine = _machine(shape=LayerSizes(2, 2, 4), spread=1.5)
+    for eta in _states(4):
+        states = _states(4)
+        energies = np.array([energy(machine.visible_weights, eta, mu) for mu in states])
+        probability = boltzmann_distribution(energies)
+        assert probability.sum() == pytest.approx(1.0, abs=1e-14)
+        mean = probability @ np.array(states)
+        machine.lags[:] = eta
+        predict_error(machine)
+        np.testing.assert_allclose(machine.mu0, mean, atol=1e-13)
+
+
+def test_ratio_of_probabilities_is_that_of_boltzmann_and_absurd_energies_are_no_trouble():
+    """E9: the printed J' = delta^E / E is not even positive."""
+    probability = boltzmann_distribution(np.array([1.0, 3.0, -2.0]))
+    assert probability[0] / probability[1] == pytest.approx(np.exp(1.0), rel=1e-13)
+    np.testing.assert_array_equal(boltzmann_distribution(np.array([-1e5, 1e5])), [1.0, 0.0])
+
+
+def test_free_energy_sums_over_every_hidden_state():
+    machine = _machine(shape=LayerSizes(2, 2, 5), spread=1.7)
+    eta = np.array([0.3, -0.9, 1.0, 0.1])
+    energies = np.array([energy(machine.visible_weights, eta, mu) for mu in _states(5)])
+    assert free_energy(machine.visible_weights, eta) == pytest.approx(
+        -np.log(np.sum(np.exp(-0.5 * energies))), rel=1e-13
+    )

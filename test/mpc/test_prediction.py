@@ -1,0 +1,172 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Free, step and forced responses: superposition, indices, and the offset at rest."""
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.mpc.boltzmann_machine import (
+    LayerSizes,
+    make_history,
+    make_machine,
+    make_rls_state,
+    predict_error,
+    reset_history,
+    set_visible,
+)
+from t3mpc_ros.mpc.prediction import (
+    forced_response,
+    free_response,
+    predict_responses,
+    predicted_errors,
+    roll_forward,
+    step_response,
+    toeplitz,
+)
+from t3mpc_ros.mpc.pretraining import (
+    ExcitationParameters,
+    NominalLoopParameters,
+    SampleTiming,
+    nominal_step_response,
+    pretrain,
+    simulate_excitation,
+)
+
+TIMING = SampleTiming(0.01, 5, 5)
+SHAPE = LayerSizes(4, 4, 12)
+
+
+@pytest.fixture(scope='module')
+def taught():
+    """Return a machine taught a simulated run."""
+    generator = np.random.default_rng(1)
+    machine = make_machine(SHAPE, 3.0, 20.0, 1.0, generator)
+    run = simulate_excitation(
+        NominalLoopParameters(), ExcitationParameters(), TIMING, 20.0, generator
+    )
+    pretrain(machine, make_rls_state(12), *run, ExcitationParameters(), 600.0, 0.05)
+    return machine
+
+
+def _linear_machine():
+    """Return a machine so near to linear that superposition holds to rounding."""
+    machine = make_machine(SHAPE, 1e5, 1e5, 1.0, np.random.default_rng(2))
+    machine.output_weights[:] = np.random.default_rng(3).standard_normal(12)
+    return machine
+
+
+def _past(generator, horizon=10):
+    past = make_history(4, 4, horizon)
+    past.errors[:] = generator.standard_normal(past.errors.size)
+    past.moves[:] = 3.0 * generator.standard_normal(past.moves.size)
+    return past
+
+
+def test_rolling_forward_feeds_the_machine_with_its_own_outputs(taught):
+    past = _past(np.random.default_rng(4))
+    past.planned[:] = np.linspace(-2.0, 2.0, 10)
+    out = np.zeros(10)
+    roll_forward(taught, past, 0, 0.03, out)
+    errors, moves = list(past.errors), list(past.moves[1:])
+    for j in range(10):
+        moves.insert(0, past.planned[j])
+        set_visible(taught, np.array(errors), np.array(moves), 0)
+        errors.insert(0, predict_error(taught) + 0.03)
+        assert out[j] == pytest.approx(errors[0], rel=1e-12)
+
+
+def test_free_response_holds_the_last_move_and_step_response_one_probe_more(taught):
+    past, out = _past(np.random.default_rng(5)), np.zeros(10)
+    past.offsets[0] = 0.02
+    free, steps = np.zeros(10), np.zeros(10)
+    free_response(taught, past, 1.5, free)
+    step_response(taught, past, 1.5, 0.5, free, steps)
+    past.planned[:] = 1.5
+    roll_forward(taught, past, 0, 0.02, out)
+    np.testing.assert_allclose(free, out)
+    past.planned[:] = 2.0
+    roll_forward(taught, past, 0, 0.02, out)
+    np.testing.assert_allclose(steps, (out - free) / 0.5)
+
+
+def test_step_response_of_the_taught_machine_is_the_nominal_one(taught):
+    """A naive machine's step response has a random sign and size."""
+    past, free, steps = make_history(4, 4, 10), np.zeros(10), np.zeros(10)
+    free_response(taught, past, 0.0, free)
+    step_response(taught, past, 0.0, 1.0, free, steps)
+    true = nominal_step_response(NominalLoopParameters(), TIMING, 10)
+    assert np.all(steps > 0.0)
+    np.testing.assert_allclose(steps[2:], true[2:], rtol=0.2)
+    assert steps[4] == pytest.approx(true[4], rel=0.1)
+
+
+def test_toeplitz_shifts_the_step_response_down_the_columns():
+    """E11: the printed last row repeats s_(n_p-1); it must run down to s_0."""
+    steps = np.array([1.0, 2.0, 3.0, 4.0])
+    matrix = np.zeros((4, 4))
+    toeplitz(steps, matrix)
+    np.testing.assert_array_equal(matrix, [[1, 0, 0, 0], [2, 1, 0, 0], [3, 2, 1, 0], [4, 3, 2, 1]])
+    short = np.zeros((4, 2))
+    toeplitz(steps, short)
+    np.testing.assert_array_equal(short, matrix[:, :2])
+
+
+def test_forced_response_is_the_matrix_form_and_moves_act_only_after_they_are_made():
+    """E11: with the printed index t + j - i + 1 a move would act two periods early."""
+    generator = np.random.default_rng(6)
+    steps, changes = generator.standard_normal(8), generator.standard_normal(5)
+    matrix, out = np.zeros((8, 5)), np.zeros(8)
+    toeplitz(steps, matrix)
+    predicted_errors(matrix, changes, np.zeros(8), out)
+    for ahead in range(1, 9):
+        assert forced_response(steps, changes, ahead) == pytest.approx(out[ahead - 1], rel=1e-12)
+    late = np.zeros(5)
+    late[3] = 1.0
+    assert [forced_response(steps, late, ahead) for ahead in (1, 2, 3)] == [0.0, 0.0, 0.0]
+    assert forced_response(steps, late, 4) == steps[0]
+
+
+def test_free_plus_forced_is_what_a_linear_machine_does_under_any_moves():
+    """(45), (52): this fixes every index of (47)-(54) at once."""
+    generator = np.random.default_rng(7)
+    machine, past = _linear_machine(), _past(generator)
+    held, changes = 2.0, generator.standard_normal(6)
+    free, steps, psi, true = (np.zeros(10) for _ in range(4))
+    predict_responses(machine, past, held, 1.0, np.zeros(10), steps, free)
+    matrix = np.zeros((10, 6))
+    toeplitz(steps, matrix)
+    predicted_errors(matrix, changes, free, psi)
+    past.planned[:] = held + np.cumsum(np.r_[changes, np.zeros(4)])
+    roll_forward(machine, past, 0, past.offsets[0], true)
+    np.testing.assert_allclose(psi, true, atol=1e-6)
+    assert np.max(np.abs(psi - free)) > 0.01
+
+
+def test_a_steady_error_is_predicted_to_stay_so_that_the_program_removes_it(taught):
+    """Offset-free: the prediction error runs through the roll-out.
+
+    Added once to the finished response it leaves a rest that the program takes for progress:
+    v_p would stop at a steady error.
+    """
+    past, out = make_history(4, 4, 10), np.zeros(10)
+    reset_history(past, 0.7)
+    past.moves[:] = -2.0
+    set_visible(taught, past.errors, past.moves, 1)
+    past.offsets[0] = 0.7 - predict_error(taught)
+    free_response(taught, past, -2.0, out)
+    np.testing.assert_allclose(out, 0.7, rtol=1e-12)
+    past.planned[:] = -2.0
+    once = np.zeros(10)
+    roll_forward(taught, past, 0, 0.0, once)
+    once += past.offsets[0]
+    assert np.max(np.abs(once - 0.7)) > 0.05
+
+
+def test_the_known_future_is_added_to_the_free_response_and_not_to_the_steps(taught):
+    past = _past(np.random.default_rng(8))
+    plain, known = (np.zeros(10), np.zeros(10)), (np.zeros(10), np.zeros(10))
+    coming = np.linspace(0.0, 5.0, 10)
+    predict_responses(taught, past, 1.0, 1.0, np.zeros(10), *plain)
+    predict_responses(taught, past, 1.0, 1.0, coming, *known)
+    np.testing.assert_array_equal(plain[0], known[0])
+    np.testing.assert_allclose(known[1] - plain[1], coming, atol=1e-12)

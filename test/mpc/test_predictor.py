@@ -1,0 +1,191 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The skill against persistence, and how it fades v_p out."""
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.mpc.boltzmann_machine import (
+    LayerSizes,
+    make_history,
+    make_machine,
+    make_rls_state,
+    reset_history,
+)
+from t3mpc_ros.mpc.predictor import (
+    LearningConstants,
+    Predictor,
+    authority,
+    evaluate_offline,
+    observe,
+    skill_score,
+    smooth_step,
+    update_mse,
+    wheel_state_size,
+    wheel_state_view,
+)
+from t3mpc_ros.mpc.pretraining import (
+    ExcitationParameters,
+    NominalLoopParameters,
+    SampleTiming,
+    simulate_excitation,
+)
+
+TIMING = SampleTiming(0.01, 5, 5)
+HOW = LearningConstants(True, 1e-4, 0.05, 0.9975, 0.975, 0.99, 0.03, 0.05)
+
+
+def _predictor(seed=0):
+    generator = np.random.default_rng(seed)
+    machine = make_machine(LayerSizes(4, 4, 12), 3.0, 20.0, 1.0, generator)
+    runs = [
+        simulate_excitation(
+            NominalLoopParameters(), ExcitationParameters(), TIMING, 20.0, generator
+        )
+        for _ in range(2)
+    ]
+    return Predictor(machine, 10, runs[1]), runs[0]
+
+
+def _feed(past, missed, persistence_mse, count):
+    for _ in range(count):
+        past.misses[0], past.misses[1] = missed, persistence_mse
+        update_mse(past, 0, 0.99, 0.05)
+
+
+def test_skill_is_one_less_the_ratio_of_mean_squares():
+    past = make_history(4, 4, 10)
+    _feed(past, 0.5, 1.0, 5000)
+    assert skill_score(past, 0) == pytest.approx(0.75, abs=1e-3)
+    _feed(past, 1.0, 1.0, 5000)
+    assert skill_score(past, 0) == pytest.approx(0.0, abs=1e-3)
+    _feed(past, 2.0, 1.0, 5000)
+    assert skill_score(past, 0) == pytest.approx(-3.0, abs=1e-2)
+
+
+def test_in_quiet_times_the_skill_stays_what_it_was():
+    """Without the floor, mere noise on a well-controlled robot would rate the machine."""
+    past = make_history(4, 4, 10)
+    _feed(past, 0.5, 1.0, 5000)
+    _feed(past, 1e-4, 1e-5, 5000)
+    assert skill_score(past, 0) > 0.6
+    _feed(past, 0.0, 0.0, 5000)
+    assert skill_score(past, 0) > 0.6
+
+
+def test_no_evidence_at_all_gives_a_finite_skill():
+    past = make_history(4, 4, 10)
+    past.predicted[:] = past.persistence_mse[:] = 0.0
+    _feed(past, 0.0, 0.0, 10)
+    assert np.isfinite(skill_score(past, 0))
+
+
+def test_fade_is_smooth_rises_with_skill_and_needs_the_right_sign():
+    x = np.linspace(-2.0, 1.0, 301)
+    values = np.array([authority(v, 1.0, -1.0, 0.0, 0.1, 0.4) for v in x])
+    assert values[0] == 0.0
+    assert values[-1] == 1.0
+    assert np.all(np.diff(values) >= 0.0)
+    assert np.max(np.diff(values)) < 1.6 * 0.01
+    assert np.max(np.abs(np.diff(values, 2))) < 0.01  # no kink
+    for gain in (-1.0, 0.0, 0.1):
+        assert authority(0.9, gain, -1.0, 0.0, 0.1, 0.4) == 0.0
+    assert 0.0 < authority(0.9, 0.25, -1.0, 0.0, 0.1, 0.4) < 1.0
+    assert authority(0.9, 5.0, -1.0, 0.0, 0.1, 0.4) == 1.0
+    assert smooth_step(0.5, 0.0, 1.0) == 0.5
+
+
+def test_a_taught_machine_is_skilled_on_a_run_it_has_not_seen():
+    predictor, run = _predictor()
+    predictor.fit(*run, ExcitationParameters(), 600.0, HOW)
+    assert skill_score(predictor.past, 0) > 0.5
+    assert skill_score(predictor.past, 1) > 0.8
+
+
+def test_an_untaught_machine_is_not():
+    predictor, _ = _predictor()
+    predictor.machine.output_weights[:] = np.random.default_rng(1).standard_normal(12)
+    predictor.evaluate(HOW)
+    assert skill_score(predictor.past, 0) < 0.0
+    assert skill_score(predictor.past, 1) < 0.3
+
+
+def test_rehearsal_scores_by_definition_and_changes_no_weights():
+    predictor, run = _predictor()
+    predictor.fit(*run, ExcitationParameters(), 600.0, HOW)
+    weights = predictor.weights()
+    machine, past = predictor.machine, make_history(4, 4, 10)
+    errors, moves = run
+    evaluate_offline(machine, predictor.memory, past, errors, moves, HOW)
+    for name, before in weights.items():
+        np.testing.assert_array_equal(before, predictor.weights()[name])
+    count = errors.size - 1 - past.errors.size
+    stayed = np.mean((errors[:count] - errors[1 : count + 1]) ** 2)
+    assert past.persistence_mse[0] == pytest.approx(stayed, rel=1e-10)
+    stayed = np.mean((errors[:count] - errors[5 : count + 5]) ** 2)
+    assert past.persistence_mse[1] == pytest.approx(stayed, rel=1e-10)
+
+
+def test_observing_keeps_what_was_predicted_against_what_came():
+    """The middle prediction uses the moves really made since, or a good plan would look bad."""
+    predictor, run = _predictor()
+    predictor.fit(*run, ExcitationParameters(noise=0.0, disturbance=0.0), 600.0, HOW)
+    generator = np.random.default_rng(3)
+    quiet = ExcitationParameters(noise=0.0, disturbance=0.0, move_hold=0.05)
+    errors, moves = simulate_excitation(NominalLoopParameters(), quiet, TIMING, 20.0, generator)
+    past = predictor.past
+    reset_history(past, 0.0)
+    missed, stayed = [], []
+    for i in range(errors.size - 2, -1, -1):
+        observe(
+            predictor.machine, predictor.memory, past, errors[i], moves[i + 1], True, False, HOW
+        )
+        if i < errors.size - 20:
+            missed.append(past.misses[2])
+            stayed.append(errors[i] - errors[i + 5])
+            assert past.misses[3] == pytest.approx(stayed[-1])
+    assert np.mean(np.square(missed)) < 0.05 * np.mean(np.square(stayed))
+
+
+def test_a_blow_beyond_the_range_of_the_machine_teaches_nothing():
+    predictor, run = _predictor()
+    predictor.fit(*run, ExcitationParameters(), 600.0, HOW)
+    before = predictor.weights()
+    observe(predictor.machine, predictor.memory, predictor.past, 1e200, 0.0, True, True, HOW)
+    for name, array in predictor.weights().items():
+        np.testing.assert_array_equal(array, before[name])
+    assert np.isfinite([skill_score(predictor.past, 0), skill_score(predictor.past, 1)]).all()
+
+
+def test_a_trial_too_short_to_predict_in_is_refused():
+    machine = make_machine(LayerSizes(4, 4, 12), 3.0, 20.0, 1.0, np.random.default_rng(0))
+    with pytest.raises(ValueError, match='trial must be longer'):
+        Predictor(machine, 10, (np.zeros(5), np.zeros(5)))
+    assert make_rls_state(12).power.size == 3
+
+
+def _arrays(parts):
+    """Return every array of named tuples, however deep."""
+    if isinstance(parts, np.ndarray):
+        return [parts]
+    return [array for part in parts for array in _arrays(part)] if isinstance(parts, tuple) else []
+
+
+@pytest.mark.parametrize('sizes', [(4, 4, 12, 10), (1, 1, 2, 1), (6, 3, 9, 7), (2, 5, 8, 2)])
+def test_the_parts_of_a_wheel_fill_its_store_and_none_lies_on_another(sizes):
+    store = np.zeros(wheel_state_size(*sizes))
+    for array in _arrays(wheel_state_view(store, *sizes)):
+        assert array.size
+        array += 1.0
+    np.testing.assert_array_equal(store, 1.0)
+
+
+def test_a_wheel_has_the_shapes_that_its_kernels_expect():
+    wheel = wheel_state_view(np.zeros(wheel_state_size(4, 3, 9, 10)), 4, 3, 9, 10)
+    assert wheel.machine.visible_weights.shape == (7, 9)
+    assert wheel.machine.lags.shape == wheel.machine.eta1.shape == (7,)
+    assert wheel.machine.mu0.shape == wheel.machine.output_weights.shape == (9,)
+    assert wheel.memory.prior.shape == wheel.memory.information.shape == (9, 9)
+    assert wheel.past.errors.shape == wheel.past.moves.shape == (4 + 5,)
+    assert wheel.past.offsets.shape == wheel.past.ahead.shape == (5,)
+    assert wheel.past.planned.shape == (10,)

@@ -1,0 +1,396 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""How the machine learns: contrastive divergence, its output layer, and the nominal run."""
+
+from dataclasses import replace
+import itertools
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from t3mpc_ros.mpc.boltzmann_machine import (
+    LayerSizes,
+    boltzmann_distribution,
+    contrastive_divergence_step,
+    energy,
+    free_energy,
+    gradient_step,
+    make_machine,
+    make_rls_state,
+    predict_error,
+    rls_step,
+)
+from t3mpc_ros.mpc.pretraining import (
+    ExcitationParameters,
+    NominalLoopParameters,
+    SampleTiming,
+    contrastive_divergence_epoch,
+    nominal_step_response,
+    nominal_transition,
+    pretrain,
+    random_levels,
+    ridge_regression,
+    simulate_excitation,
+    split_runs,
+)
+
+TIMING = SampleTiming(0.01, 5, 5)
+
+
+SHAPE = LayerSizes(4, 4, 12)
+
+
+def _machine(seed=0, shape=SHAPE, spread=1.0):
+    return make_machine(shape, 3.0, 20.0, spread, np.random.default_rng(seed))
+
+
+def _slope(function, weights, step=1e-6):
+    """Return the gradient of a function of X_v by central differences."""
+    out = np.zeros_like(weights)
+    for index in np.ndindex(weights.shape):
+        for sign in (1.0, -1.0):
+            moved = weights.copy()
+            moved[index] += sign * step
+            out[index] += sign * function(moved) / (2.0 * step)
+    return out
+
+
+def test_contrast_is_the_slope_of_the_energy_between_data_and_reconstruction():
+    """E9: (43) is E(eta_1, mu_1) - E(eta_0, mu_0) differentiated at fixed states."""
+    machine = _machine(spread=1.5)
+    machine.lags[:] = np.random.default_rng(1).uniform(-1.0, 1.0, 8)
+    predict_error(machine)
+    before = machine.visible_weights.copy()
+    expected = _slope(
+        lambda weights: (
+            energy(weights, machine.eta1, machine.mu1) - energy(weights, machine.lags, machine.mu0)
+        ),
+        before,
+    )
+    contrastive_divergence_step(machine, 1e-3)
+    np.testing.assert_allclose(
+        (machine.visible_weights - before) / 1e-3, expected, rtol=1e-6, atol=1e-9
+    )
+
+
+def test_contrast_is_the_contrastive_divergence_estimate_of_the_likelihood_gradient():
+    """E9: ln J' of (41) has the slope -F(eta_0)' + <F'>; CD-1 puts eta_1 for the average.
+
+    The hidden units are summed out exactly; at temperature 2 the slope is half of (43).
+    """
+    machine = _machine(seed=3, spread=1.5)
+    machine.lags[:] = np.random.default_rng(4).uniform(-1.0, 1.0, 8)
+    predict_error(machine)
+    before = machine.visible_weights.copy()
+    expected = _slope(
+        lambda weights: free_energy(weights, machine.eta1) - free_energy(weights, machine.lags),
+        before,
+    )
+    contrastive_divergence_step(machine, 1e-3)
+    np.testing.assert_allclose(
+        0.5 * (machine.visible_weights - before) / 1e-3, expected, rtol=1e-6, atol=1e-9
+    )
+
+
+def _likelihood(weights, data):
+    """Return the mean ln J' of visible states, with every state of (41) counted out."""
+    visible = [np.array(s) for s in itertools.product((-1.0, 1.0), repeat=weights.shape[0])]
+    hidden = [np.array(s) for s in itertools.product((-1.0, 1.0), repeat=weights.shape[1])]
+    energies = np.array([[energy(weights, eta, mu) for mu in hidden] for eta in visible])
+    probability = boltzmann_distribution(energies).sum(axis=1)
+    index = {tuple(eta): i for i, eta in enumerate(visible)}
+    return np.mean([np.log(probability[index[tuple(eta)]]) for eta in data])
+
+
+def test_contrast_climbs_the_exact_likelihood_of_the_data():
+    """On a machine small enough to count every state, CD-1 agrees with the true gradient."""
+    machine = _machine(seed=5, shape=LayerSizes(2, 2, 4), spread=0.5)
+    data = [np.array(s) for s in ((1.0, 1.0, -1.0, 1.0), (-1.0, -1.0, 1.0, 1.0))]
+    start = machine.visible_weights.copy()
+    true_slope = _slope(lambda weights: _likelihood(weights, data), start, 1e-5)
+    for eta in data:
+        machine.lags[:] = eta
+        predict_error(machine)
+        contrastive_divergence_step(
+            machine, 1e-6
+        )  # so small that both patterns see the same weights
+    moved = machine.visible_weights - start
+    cosine = np.sum(moved * true_slope) / np.linalg.norm(moved) / np.linalg.norm(true_slope)
+    assert cosine > 0.7  # one step of a chain is a biased estimate
+    figures = [_likelihood(start, data)]
+    for _ in range(4):
+        for _ in range(25):
+            for eta in data:
+                machine.lags[:] = eta
+                predict_error(machine)
+                contrastive_divergence_step(machine, 0.02)
+        figures.append(_likelihood(machine.visible_weights, data))
+    assert all(later > earlier for earlier, later in itertools.pairwise(figures))
+    assert figures[-1] > figures[0] + 0.5
+
+
+def test_contrast_lowers_the_reconstruction_error_on_the_excitation_run():
+    machine = _machine()
+    errors, moves = simulate_excitation(
+        NominalLoopParameters(), ExcitationParameters(), TIMING, 20.0, np.random.default_rng(0)
+    )
+    features = np.zeros((errors.size - 4, 12))
+
+    def missed():
+        total = 0.0
+        for i in range(1, 2000, 7):
+            machine.lags[:4] = errors[i : i + 4] / 3.0
+            machine.lags[4:] = moves[i : i + 4] / 20.0
+            predict_error(machine)
+            total += np.sum((machine.lags - machine.eta1) ** 2)
+        return total
+
+    figures = [missed()]
+    for _ in range(3):
+        contrastive_divergence_epoch(machine, errors, moves, 0.002, features)
+        figures.append(missed())
+    assert all(later < earlier for earlier, later in itertools.pairwise(figures))
+    assert figures[-1] < 0.7 * figures[0]
+
+
+def test_contrast_stays_bounded_for_ever():
+    """Met on the way: data outside [-1, 1] cannot be reconstructed, and X_v grew without end."""
+    machine = _machine()
+    generator = np.random.default_rng(6)
+    for _ in range(20_000):
+        machine.lags[:] = np.clip(2.0 * generator.standard_normal() + np.zeros(8), -10.0, 10.0)
+        predict_error(machine)
+        contrastive_divergence_step(machine, 0.01)
+    assert np.max(np.abs(machine.visible_weights)) < 20.0
+
+
+def test_gradient_step_is_the_plain_form_where_the_features_have_unit_length():
+    machine = _machine()
+    machine.lags[:] = np.random.default_rng(7).uniform(-1.0, 1.0, 8)
+    predict_error(machine)
+    gradient_step(machine, 0.6, 0.1, 1.0 - float(machine.mu1 @ machine.mu1))
+    np.testing.assert_allclose(machine.output_weights, 0.1 * 0.6 / 3.0 * machine.mu1, rtol=1e-13)
+
+
+def test_gradient_step_removes_its_share_of_the_error_at_any_amplitude():
+    """The plain form (44) at a fixed gamma is stable at one amplitude and useless at another."""
+    for size in (1e-3, 1.0):
+        machine = _machine()
+        machine.lags[:] = size
+        gradient_step(machine, 1.5 - predict_error(machine), 0.3, 0.0)
+        assert predict_error(machine) == pytest.approx(0.45, rel=1e-10)
+
+
+def test_recall_is_the_weighted_least_squares_fit_anchored_at_the_pre_training():
+    generator = np.random.default_rng(8)
+    machine, memory = _machine(), make_rls_state(12)
+    root = generator.standard_normal((12, 12))
+    memory.prior[:] = root @ root.T + np.eye(12)
+    memory.anchor[:] = generator.standard_normal(12)
+    machine.output_weights[:] = memory.anchor
+    memory.power[:] = (1.0, 2.0, 0.0)
+    keep, rows, targets, weights = 0.9, [], [], []
+    for _ in range(30):
+        machine.lags[:] = generator.uniform(-1.0, 1.0, 8)
+        error = generator.standard_normal() - predict_error(machine)
+        targets.append((error + predict_error(machine)) / 3.0)
+        rows.append(machine.mu1.copy())
+        assert rls_step(machine, memory, error, keep, 0.95)
+        weights.append(memory.power[1] / memory.power[0])
+    share = np.array(weights) * keep ** np.arange(29, -1, -1)
+    rows = np.array(rows)
+    square = rows.T @ (share[:, None] * rows) + memory.prior
+    right = rows.T @ (share * np.array(targets)) + memory.prior @ memory.anchor
+    np.testing.assert_allclose(machine.output_weights, np.linalg.solve(square, right), rtol=1e-8)
+
+
+def test_recall_falls_back_to_the_pre_training_when_nothing_happens():
+    """Forgetting without a prior would keep the last weights, and wind up its gain to a burst."""
+    machine, memory = _machine(), make_rls_state(12)
+    memory.anchor[:] = 0.5
+    machine.output_weights[:] = -2.0
+    memory.power[:] = (1.0, 1.0, 1e-3)
+    machine.lags[:] = 0.0
+    for _ in range(2000):
+        predict_error(machine)
+        rls_step(machine, memory, 0.0, 0.99, 0.95)
+    np.testing.assert_allclose(machine.output_weights, 0.5, atol=1e-6)
+    assert np.max(memory.information) < 1e-6
+
+
+def test_recall_learns_a_changed_robot_faster_than_any_gradient_rate():
+    """Lags of one slow signal are nearly parallel: the reason for the matrix in place of gamma."""
+    excitation = ExcitationParameters()
+    before = simulate_excitation(
+        NominalLoopParameters(), excitation, TIMING, 20.0, np.random.default_rng(9)
+    )
+    after = simulate_excitation(
+        NominalLoopParameters(feedback_gain=3.0, lag=0.1),
+        excitation,
+        TIMING,
+        20.0,
+        np.random.default_rng(9),
+    )
+
+    def missed(rule):
+        machine, memory = _machine(), make_rls_state(12)
+        pretrain(machine, memory, *before, excitation, 20.0, 0.05)
+        total = 0.0
+        for i in range(1000, 0, -1):
+            machine.lags[:4] = after[0][i : i + 4] / 3.0
+            machine.lags[4:] = after[1][i : i + 4] / 20.0
+            error = after[0][i - 1] - predict_error(machine)
+            total += error * error if i > 500 else 0.0
+            rule(machine, memory, error)
+        return total
+
+    best = min(
+        missed(lambda m, _, e, r=rate: gradient_step(m, e, r, 0.01))
+        for rate in (0.01, 0.03, 0.1, 0.3, 1.0)
+    )
+    recalled = missed(lambda m, memory, e: rls_step(m, memory, e, 0.9975, 0.95))
+    assert recalled < 0.75 * best
+    assert recalled < 0.2 * missed(lambda *_: None)
+
+
+def test_ridge_solves_its_normal_equations_and_shrinks_with_the_penalty():
+    generator = np.random.default_rng(10)
+    features, targets = generator.standard_normal((50, 6)), generator.standard_normal(50)
+    free = ridge_regression(features, targets, 1e-12)
+    np.testing.assert_allclose(features.T @ (features @ free - targets), 0.0, atol=1e-9)
+    sizes = [
+        np.linalg.norm(ridge_regression(features, targets, p)) for p in (1e-12, 0.1, 1.0, 10.0)
+    ]
+    assert sizes == sorted(sizes, reverse=True)
+    parallel = np.repeat(features[:, :1], 6, axis=1)
+    assert np.isfinite(ridge_regression(parallel, targets, 1e-6)).all()
+
+
+@pytest.mark.parametrize('duration', [0.0, 0.003, 0.01, 0.4])
+def test_transition_is_the_matrix_exponential(duration):
+    loop = NominalLoopParameters(feedback_gain=8.0, lag=0.02)
+    rates = np.zeros((5, 5))
+    rates[0] = (-8.0, 1.0, 0.0, 1.0, -8.0)
+    rates[1] = (0.0, -50.0, 50.0, 0.0, 0.0)
+    expected = expm(rates * duration)[:2]
+    np.testing.assert_allclose(
+        nominal_transition(loop, duration), expected, rtol=1e-11, atol=1e-14
+    )
+
+
+@pytest.mark.parametrize('dead_time', [0.0, 0.004, 0.01, 0.037, 0.12])
+def test_nominal_step_is_the_analytic_response_whatever_the_dead_time(dead_time):
+    gain, lag = 8.0, 0.02
+    loop = NominalLoopParameters(gain, lag, dead_time)
+    t = np.maximum(0.05 * np.arange(1, 9) - dead_time, 0.0)
+    expected = 1.0 - (np.exp(-gain * t) - gain * lag * np.exp(-t / lag)) / (1.0 - gain * lag)
+    np.testing.assert_allclose(
+        nominal_step_response(loop, SampleTiming(0.01, 5, 1), 8),
+        expected / gain,
+        rtol=1e-9,
+        atol=1e-15,
+    )
+
+
+def test_averaged_samples_are_the_mean_of_the_newest_measurements():
+    fine = nominal_step_response(NominalLoopParameters(), SampleTiming(0.01, 1, 1), 40)
+    coarse = nominal_step_response(NominalLoopParameters(), SampleTiming(0.01, 5, 3), 8)
+    expected = [fine[5 * j - 3 : 5 * j].mean() for j in range(1, 9)]
+    np.testing.assert_allclose(coarse, expected, rtol=1e-9)
+
+
+def test_random_levels_hold_as_long_as_asked_and_stay_in_range():
+    levels = random_levels(np.random.default_rng(11), 20_000, 8.0)
+    changes = np.count_nonzero(np.diff(levels))
+    assert 20_000 / changes == pytest.approx(8.0, rel=0.1)
+    assert np.max(np.abs(levels)) <= 1.0
+    assert abs(levels.mean()) < 0.05
+
+
+def test_the_run_is_the_same_for_the_same_seed_and_obeys_the_nominal_loop_at_rest():
+    first = simulate_excitation(
+        NominalLoopParameters(), ExcitationParameters(), TIMING, 20.0, np.random.default_rng(1)
+    )
+    again = simulate_excitation(
+        NominalLoopParameters(), ExcitationParameters(), TIMING, 20.0, np.random.default_rng(1)
+    )
+    np.testing.assert_array_equal(first[0], again[0])
+    quiet = ExcitationParameters(disturbance=0.0, noise=0.0, move_hold=3.0)
+    errors, moves = simulate_excitation(
+        NominalLoopParameters(), quiet, TIMING, 20.0, np.random.default_rng(2)
+    )
+    held = np.array([np.ptp(moves[i + 1 : i + 41]) == 0.0 for i in range(moves.size - 41)])
+    assert np.count_nonzero(held) > 100
+    np.testing.assert_allclose(
+        errors[: held.size][held], moves[1 : held.size + 1][held] / 8.0, atol=1e-5
+    )
+
+
+def test_pre_training_predicts_the_next_error_of_a_run_it_has_not_seen():
+    machine, memory = _machine(), make_rls_state(12)
+    generator = np.random.default_rng(12)
+    excitation = ExcitationParameters(noise=0.0, disturbance=0.0)
+    pretrain(
+        machine,
+        memory,
+        *simulate_excitation(NominalLoopParameters(), excitation, TIMING, 20.0, generator),
+        excitation,
+        100.0,
+        0.05,
+    )
+    errors, moves = simulate_excitation(
+        NominalLoopParameters(), excitation, TIMING, 20.0, generator
+    )
+    missed, stayed = [], []
+    for i in range(errors.size - 5):
+        machine.lags[:4] = errors[i + 1 : i + 5] / 3.0
+        machine.lags[4:] = moves[i + 1 : i + 5] / 20.0
+        missed.append(errors[i] - predict_error(machine))
+        stayed.append(errors[i] - errors[i + 1])
+    assert np.var(missed) < 0.01 * np.var(stayed)
+    np.testing.assert_allclose(memory.anchor, machine.output_weights)
+    np.testing.assert_allclose(memory.prior, memory.prior.T)
+    assert np.all(np.linalg.eigvalsh(memory.prior) > 0.0)
+
+
+def test_runs_that_cannot_be_learnt_are_refused():
+    machine, memory = _machine(), make_rls_state(12)
+    with pytest.raises(ValueError, match='one length'):
+        pretrain(machine, memory, np.zeros(50), np.zeros(40), ExcitationParameters(), 1.0, 0.1)
+    with pytest.raises(ValueError, match='must hold more'):
+        pretrain(machine, memory, np.zeros(16), np.zeros(16), ExcitationParameters(), 1.0, 0.1)
+    with pytest.raises(ValueError, match='finite'):
+        pretrain(
+            machine, memory, np.full(50, np.nan), np.zeros(50), ExcitationParameters(), 1.0, 0.1
+        )
+    with pytest.raises(ValueError, match='must be'):
+        split_runs(np.zeros((50, 3)), np.zeros((50, 3)), 2)
+
+
+def test_a_recorded_run_is_split_in_time_and_turned_newest_first():
+    errors = np.arange(16.0).reshape(8, 2)
+    runs = split_runs(errors, -errors, 2)
+    np.testing.assert_array_equal(runs[1][0][0], [11.0, 9.0, 7.0, 5.0, 3.0, 1.0])
+    np.testing.assert_array_equal(runs[1][1][1], [-15.0, -13.0])
+
+
+def test_more_noise_than_taught_makes_prediction_worse_but_never_absurd():
+    machine, memory = _machine(), make_rls_state(12)
+    generator = np.random.default_rng(13)
+    excitation = ExcitationParameters()
+    run = simulate_excitation(NominalLoopParameters(), excitation, TIMING, 20.0, generator)
+    pretrain(machine, memory, *run, excitation, 100.0, 0.05)
+    figures = []
+    for noise in (0.0, 0.15, 1.0):
+        errors, moves = simulate_excitation(
+            NominalLoopParameters(), replace(excitation, noise=noise), TIMING, 20.0, generator
+        )
+        missed = []
+        for i in range(errors.size - 5):
+            machine.lags[:4] = errors[i + 1 : i + 5] / 3.0
+            machine.lags[4:] = moves[i + 1 : i + 5] / 20.0
+            missed.append(errors[i] - predict_error(machine))
+        figures.append(np.var(missed))
+    assert figures == sorted(figures)
+    assert figures[-1] < 4.0 / 5.0 + figures[0]  # four times the variance of the sampled noise

@@ -1,0 +1,283 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The bounded program: its optimum, certified by the Karush-Kuhn-Tucker conditions."""
+
+import numpy as np
+import pytest
+from scipy.optimize import LinearConstraint, lsq_linear, minimize
+
+from t3mpc_ros.mpc.prediction import toeplitz
+from t3mpc_ros.mpc.quadratic_program import (
+    INFEASIBLE,
+    NOT_POSITIVE,
+    OPTIMAL,
+    UNFINISHED,
+    cholesky,
+    cost,
+    is_dependent,
+    kkt_residuals,
+    make_workspace,
+    normal_equations,
+    solve_quadratic_program,
+    unconstrained_optimum,
+    workspace_size,
+    workspace_view,
+)
+
+
+def _matrix(steps, moves):
+    matrix = np.zeros((len(steps), moves))
+    toeplitz(np.asarray(steps, dtype=float), matrix)
+    return matrix
+
+
+def _random(generator):
+    """Return a random program: sizes, scales, and the degenerate cases of the field."""
+    moves = int(generator.integers(1, 21))
+    horizon = int(generator.integers(moves, 22))
+    kind = generator.integers(0, 8)
+    steps = 0.12 * (1.0 - np.exp(-0.4 * np.arange(1, horizon + 1)))
+    if kind < 2:
+        steps = generator.standard_normal(horizon)
+    elif kind == 2:
+        steps = np.zeros(horizon)  # a machine that does not know v_p
+    free = generator.standard_normal(horizon) * 10 ** generator.uniform(-3, 3)
+    mu, pi = 10 ** generator.uniform(-2, 2), 10 ** generator.uniform(-6, 1)
+    dv_max, v_max = 10 ** generator.uniform(-2, 2), 10 ** generator.uniform(-2, 2)
+    draw = generator.random()
+    if draw < 0.05:
+        v_max = 0.0  # faded out
+    elif draw < 0.10:
+        dv_max = 0.0
+    elif draw < 0.11:
+        dv_max = v_max = 0.0
+    elif draw < 0.3:
+        dv_max = v_max / generator.integers(1, 5)  # bounds that meet in corners
+    before = generator.uniform(-v_max, v_max)
+    if generator.random() < 0.3:
+        before = v_max * generator.choice((-1.0, 1.0))  # at its bound: row n_c starts active
+    return _matrix(steps, moves), free, mu, pi, before, dv_max, v_max
+
+
+def _kkt(matrix, free, mu, pi, before, dv_max, v_max, space):
+    """Return the four residuals once more, in plain NumPy and from the definition."""
+    moves = matrix.shape[1]
+    rows = np.vstack((np.eye(moves), np.tril(np.ones((moves, moves)))))
+    upper = np.r_[np.full(moves, dv_max), np.full(moves, v_max - before)]
+    lower = np.r_[np.full(moves, -dv_max), np.full(moves, -v_max - before)]
+    hessian = mu * matrix.T @ matrix + pi * np.eye(moves)
+    slope = mu * matrix.T @ free
+    dv, (down, up) = space.changes, space.multipliers
+    scale = max(np.abs(slope).max(), np.abs(hessian).max() * np.abs(dv).max()) or 1.0
+    width = max(dv_max, v_max) or 1.0
+    value = rows @ dv
+    return (
+        np.abs(hessian @ dv + slope + rows.T @ (up - down)).max() / scale,
+        max((value - upper).max(), (lower - value).max(), 0.0) / width,
+        max(-up.min(), -down.min(), 0.0) / scale,
+        max(np.abs(up * (value - upper)).max(), np.abs(down * (value - lower)).max())
+        / (scale * width),
+    )
+
+
+def test_ten_thousand_programs_satisfy_karush_kuhn_tucker():
+    """Met on the way: zero bounds, and optima 10⁶ times the bounds, cycled on rounding."""
+    generator = np.random.default_rng(20)
+    out = np.zeros(4)
+    worst = 0.0
+    for _ in range(10_000):
+        program = _random(generator)
+        space = make_workspace(program[0].shape[1])
+        assert solve_quadratic_program(*program, 50 * space.slope.size, space) == OPTIMAL
+        ours = kkt_residuals(space, *program[4:], out)
+        worst = max(worst, ours, *_kkt(*program, space))
+    assert worst < 1e-10
+
+
+def test_residual_sees_every_kind_of_wrong_answer():
+    matrix, free = _matrix(np.linspace(0.1, 0.5, 6), 3), np.ones(6)
+    space, out = make_workspace(3), np.zeros(4)
+    problem = (0.0, 0.2, 0.3)
+    assert solve_quadratic_program(matrix, free, 1.0, 0.01, *problem, 100, space) == OPTIMAL
+    assert kkt_residuals(space, *problem, out) < 1e-12
+    right = space.changes.copy(), space.multipliers.copy()
+    space.changes[1] += 0.05
+    kkt_residuals(space, *problem, out)
+    assert out[0] > 1e-3
+    space.changes[:] = right[0]
+    space.changes[0] -= 1.0
+    kkt_residuals(space, *problem, out)
+    assert out[1] > 0.1
+    space.changes[:] = right[0]
+    space.multipliers[0, 0] -= 2.0 * space.multipliers[0].max()
+    kkt_residuals(space, *problem, out)
+    assert out[2] > 0.1
+    space.multipliers[:] = right[1]
+    space.multipliers[1, 2] += 1.0
+    kkt_residuals(space, *problem, out)
+    assert out[3] > 0.01
+
+
+def test_forty_programs_agree_with_an_independent_solver():
+    generator = np.random.default_rng(3)
+    compared = agreed = 0
+    while compared < 40:
+        matrix, free, mu, pi, before, dv_max, v_max = _random(generator)
+        moves = matrix.shape[1]
+        if moves > 8 or min(dv_max, v_max) < 0.05 or np.abs(free).max() > 20.0 or pi < 1e-3:
+            continue
+        space = make_workspace(moves)
+        solve_quadratic_program(matrix, free, mu, pi, before, dv_max, v_max, 500, space)
+        hessian = mu * matrix.T @ matrix + pi * np.eye(moves)
+        scale = max(mu * np.abs(matrix.T @ free).max(), 1e-9)
+        sums = np.tril(np.ones((moves, moves)))
+        found = minimize(
+            lambda x, h=hessian, f=matrix.T @ free * mu, s=scale: (0.5 * x @ h @ x + f @ x) / s,
+            np.zeros(moves),
+            jac=lambda x, h=hessian, f=matrix.T @ free * mu, s=scale: (h @ x + f) / s,
+            method='SLSQP',
+            bounds=[(-dv_max, dv_max)] * moves,
+            constraints=LinearConstraint(sums, -v_max - before, v_max - before),
+            options={'ftol': 1e-15, 'maxiter': 1000},
+        )
+        ours = cost(matrix, free, space.changes, mu, pi)
+        theirs = cost(matrix, free, found.x, mu, pi)
+        assert ours <= theirs + 1e-9 * abs(theirs)
+        if found.success:
+            assert ours == pytest.approx(theirs, rel=1e-5)
+            agreed += 1
+        compared += 1
+    assert agreed > 30
+
+
+def test_with_bounds_on_the_changes_only_it_is_bounded_least_squares():
+    generator = np.random.default_rng(4)
+    for _ in range(40):
+        moves = int(generator.integers(1, 11))
+        matrix = _matrix(generator.standard_normal(12), moves)
+        free = generator.standard_normal(12)
+        space = make_workspace(moves)
+        assert (
+            solve_quadratic_program(matrix, free, 2.0, 0.1, 0.0, 0.1, 1e3, 500, space) == OPTIMAL
+        )
+        tall = np.vstack((np.sqrt(2.0) * matrix, np.sqrt(0.1) * np.eye(moves)))
+        target = np.r_[-np.sqrt(2.0) * free, np.zeros(moves)]
+        found = lsq_linear(tall, target, (-0.1, 0.1), method='bvls', tol=1e-14)
+        np.testing.assert_allclose(space.changes, found.x, atol=1e-9)
+
+
+def test_without_active_bounds_it_is_the_closed_form_with_its_minus_sign():
+    """E10: as printed, (62) climbs: the error would grow instead of falling."""
+    generator = np.random.default_rng(5)
+    matrix, free = _matrix(generator.standard_normal(8), 4), generator.standard_normal(8)
+    space = make_workspace(4)
+    assert solve_quadratic_program(matrix, free, 1.5, 0.2, 0.0, 1e6, 1e6, 100, space) == OPTIMAL
+    square = 1.5 * matrix.T @ matrix + 0.2 * np.eye(4)
+    closed = -1.5 * np.linalg.solve(square, matrix.T @ free)
+    np.testing.assert_allclose(space.changes, closed, rtol=1e-11)
+    rest = cost(matrix, free, np.zeros(4), 1.5, 0.2)
+    assert cost(matrix, free, closed, 1.5, 0.2) < rest
+    assert cost(matrix, free, -closed, 1.5, 0.2) > rest
+
+
+def test_closed_form_62_is_where_the_gradient_61_vanishes_and_where_the_solver_begins():
+    generator = np.random.default_rng(8)
+    for moves in (1, 4, 9):
+        matrix, free = _matrix(generator.standard_normal(9), moves), generator.standard_normal(9)
+        hessian, lower = np.zeros((moves, moves)), np.zeros((moves, moves))
+        slope, closed = np.zeros(moves), np.zeros(moves)
+        normal_equations(matrix, free, 1.5, 0.2, hessian, slope)
+        np.testing.assert_allclose(hessian, 1.5 * matrix.T @ matrix + 0.2 * np.eye(moves))
+        np.testing.assert_allclose(slope, 1.5 * matrix.T @ free, atol=1e-14)
+        assert cholesky(hessian, lower)
+        unconstrained_optimum(lower, slope, closed)
+        np.testing.assert_allclose(hessian @ closed + slope, 0.0, atol=1e-12)
+        space = make_workspace(moves)
+        assert (
+            solve_quadratic_program(matrix, free, 1.5, 0.2, 0.0, 1e6, 1e6, 100, space) == OPTIMAL
+        )
+        np.testing.assert_allclose(space.changes, closed, rtol=1e-10, atol=1e-13)
+
+
+def test_cost_has_the_gradient_61():
+    generator = np.random.default_rng(6)
+    matrix, free = _matrix(generator.standard_normal(6), 3), generator.standard_normal(6)
+    changes = generator.standard_normal(3)
+    square = 1.5 * matrix.T @ matrix + 0.2 * np.eye(3)
+    gradient = 2.0 * (square @ changes + 1.5 * matrix.T @ free)
+    for i, direction in enumerate(np.eye(3)):
+        ahead = cost(matrix, free, changes + 1e-5 * direction, 1.5, 0.2)
+        behind = cost(matrix, free, changes - 1e-5 * direction, 1.5, 0.2)
+        assert (ahead - behind) / 2e-5 == pytest.approx(gradient[i], rel=1e-7, abs=1e-8)
+
+
+def test_clipping_the_closed_form_is_worse_than_the_optimum():
+    """Why the program is solved: "closed form, then clip" wastes moves that the bounds forbid."""
+    steps = 0.12 * (1.0 - np.exp(-0.4 * np.arange(1, 11)))
+    matrix, free = _matrix(steps, 5), np.full(10, 1.0)
+    space = make_workspace(5)
+    solve_quadratic_program(matrix, free, 1.0, 0.001, 0.0, 3.0, 10.0, 100, space)
+    square = matrix.T @ matrix + 0.001 * np.eye(5)
+    closed = -np.linalg.solve(square, matrix.T @ free)
+    v = np.clip(np.cumsum(np.clip(closed, -3.0, 3.0)), -10.0, 10.0)
+    clipped = np.diff(v, prepend=0.0)
+    ours = cost(matrix, free, space.changes, 1.0, 0.001)
+    assert ours < 0.98 * cost(matrix, free, clipped, 1.0, 0.001)
+
+
+def test_dependence_of_rows_is_decided_as_by_their_rank():
+    generator = np.random.default_rng(7)
+    for _ in range(300):
+        moves = int(generator.integers(1, 7))
+        rows = np.vstack((np.eye(moves), np.tril(np.ones((moves, moves)))))
+        order = generator.permutation(2 * moves)
+        active: list[int] = []
+        for row in order:
+            joined = np.array([*active, 0], dtype=np.int64)
+            answer = is_dependent(row, joined, len(active), np.zeros(moves + 1, dtype=np.int64))
+            rank = np.linalg.matrix_rank(rows[[*active, row]])
+            assert answer == (rank == len(active))
+            if not answer:
+                active.append(int(row))
+
+
+def test_every_status_is_reached_and_then_nothing_moves():
+    matrix, free = _matrix(np.linspace(0.1, 0.5, 6), 3), np.ones(6)
+    space = make_workspace(3)
+    assert (
+        solve_quadratic_program(matrix, free, 1.0, 0.01, 5.0, 0.1, 1.0, 100, space) == INFEASIBLE
+    )
+    np.testing.assert_array_equal(space.changes, 0.0)
+    assert solve_quadratic_program(matrix, free, 1.0, 0.01, 0.0, 0.1, 0.15, 1, space) == UNFINISHED
+    np.testing.assert_array_equal(space.changes, 0.0)
+    assert (
+        solve_quadratic_program(matrix, np.full(6, np.nan), 1.0, 0.01, 0.0, 1.0, 1.0, 9, space)
+        == NOT_POSITIVE
+    )
+    assert (
+        solve_quadratic_program(0.0 * matrix, free, 1.0, 0.0, 0.0, 1.0, 1.0, 9, space)
+        == NOT_POSITIVE
+    )
+    np.testing.assert_array_equal(space.changes, 0.0)
+    with pytest.raises(ValueError, match='moves'):
+        make_workspace(0)
+
+
+def test_v_outside_its_bound_but_within_one_change_is_brought_back():
+    matrix, free = _matrix(np.linspace(0.1, 0.5, 6), 3), np.zeros(6)
+    space, out = make_workspace(3), np.zeros(4)
+    assert solve_quadratic_program(matrix, free, 1.0, 0.01, 1.05, 0.1, 1.0, 100, space) == OPTIMAL
+    assert space.changes[0] == pytest.approx(-0.05)
+    assert kkt_residuals(space, 1.05, 0.1, 1.0, out) < 1e-10
+
+
+@pytest.mark.parametrize('moves', [1, 2, 5, 11])
+def test_the_parts_of_a_space_fill_its_stores_and_none_lies_on_another(moves):
+    store, whole = np.zeros(workspace_size(moves)), np.zeros((2, moves + 1), dtype=np.int64)
+    space = workspace_view(store, whole, moves)
+    for array in space:
+        array += 1
+    np.testing.assert_array_equal(store, 1.0)
+    assert whole.sum() == 2 * moves + 1
+    assert space.multipliers.shape == (2, 2 * moves)
+    assert space.basis.shape == (moves, moves)

@@ -1,0 +1,330 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Between messages and the package's words nothing is lost, and nothing bad gets through."""
+
+from dataclasses import replace
+import math
+
+from geometry_msgs.msg import Quaternion, Twist, TwistStamped
+from nav_msgs.msg import Odometry
+import numpy as np
+import pytest
+from rclpy.serialization import deserialize_message, serialize_message
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import Range
+
+from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
+from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose, State, WheelSpeeds, wrap_angle
+from t3mpc_ros.nodes.common import conversions, sensor_messages
+from t3mpc_ros.nodes.common.diagnostics import complaints, measures
+from t3mpc_ros.robot.interface import (
+    ZERO_WHEEL_SPEEDS,
+    BatteryReading,
+    ImuSample,
+    RobotState,
+    RobotStatus,
+    WheelAngles,
+)
+from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON
+from t3mpc_ros.simulation.digital_twin import TwinDiagnostics
+from t3mpc_ros.simulation.sensors.battery import BatteryParameters
+from t3mpc_ros.simulation.sensors.imu import ImuParameters, SimulatedImu
+from t3mpc_ros.simulation.sensors.range_sensor import RangeSensorParameters
+
+YAWS = [*np.linspace(-math.pi, math.pi, 41)[1:], 1e-9, -1e-9, math.pi - 1e-9, 1e-9 - math.pi]
+STAMPS = [0, 1, NANOSECONDS - 1, NANOSECONDS, 1_795_240_567_146_950_308, (2**31 - 1) * NANOSECONDS]
+
+
+def motions(count=200):
+    generator = np.random.default_rng(5)
+    for stamp_ns in generator.integers(0, 2 * 10**18, count):
+        x, y, v, w = generator.uniform(-1e3, 1e3, 4)
+        yield State(
+            int(stamp_ns), Pose(x, y, generator.uniform(-math.pi, math.pi)), BodyTwist(v, w)
+        )
+
+
+@pytest.mark.parametrize('stamp_ns', STAMPS)
+def test_a_stamp_survives_to_the_nanosecond(stamp_ns):
+    stamp = conversions.time_from_ns(stamp_ns)
+    assert 0 <= stamp.nanosec < NANOSECONDS
+    assert conversions.ns_from_time(stamp) == stamp_ns
+
+
+def test_a_motion_survives_odometry_and_the_message_may_be_used_again():
+    message = Odometry()
+    for motion in motions():
+        back = conversions.state_from_odometry(conversions.fill_odometry(message, motion))
+        assert back.stamp_ns == motion.stamp_ns
+        assert back.twist == motion.twist
+        assert back.pose[:2] == motion.pose[:2]
+        assert abs(wrap_angle(back.pose.yaw - motion.pose.yaw)) < 1e-14
+
+
+@pytest.mark.parametrize('yaw', YAWS)
+def test_a_heading_is_a_unit_quaternion_about_z_and_comes_back(yaw):
+    rotation = conversions.quaternion_from_yaw(yaw)
+    assert (rotation.x, rotation.y) == (0.0, 0.0)
+    assert math.hypot(rotation.z, rotation.w) == pytest.approx(1.0, abs=1e-15)
+    back = conversions.yaw_from_quaternion(rotation)
+    assert abs(wrap_angle(back - yaw)) < 1e-15 * 4
+    # q and -q are one rotation.
+    opposite = Quaternion(z=-rotation.z, w=-rotation.w)
+    assert abs(wrap_angle(conversions.yaw_from_quaternion(opposite) - yaw)) < 1e-15 * 4
+
+
+def test_a_heading_beyond_a_turn_comes_back_wrapped():
+    for yaw in np.linspace(-30.0, 30.0, 61):
+        back = conversions.yaw_from_quaternion(conversions.quaternion_from_yaw(yaw))
+        assert abs(wrap_angle(back - yaw)) < 1e-13
+
+
+def test_roll_and_pitch_do_not_change_the_heading():
+    generator = np.random.default_rng(6)
+    for _ in range(100):
+        yaw = generator.uniform(-math.pi, math.pi)
+        pitch, roll = generator.uniform(-1.4, 1.4), generator.uniform(-math.pi, math.pi)
+        x, y, z, w = Rotation.from_euler('ZYX', [yaw, pitch, roll]).as_quat()
+        assert conversions.yaw_from_quaternion(Quaternion(x=x, y=y, z=z, w=w)) == pytest.approx(
+            yaw, abs=1e-12
+        )
+
+
+@pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf, 1e200])
+@pytest.mark.parametrize('axis', ['x', 'y', 'z', 'w'])
+def test_a_rotation_that_is_none_has_no_heading(axis, value):
+    """An infinite z once had the yaw 3/4 pi, and 1e200 ended the node with OverflowError."""
+    rotation = Quaternion(x=0.5, y=0.5, z=0.5, w=0.5)
+    setattr(rotation, axis, value)
+    yaw = conversions.yaw_from_quaternion(rotation)
+    assert math.isnan(yaw) or (value == 1e200 and axis in 'xw')
+
+
+def test_poses_in_all_their_messages_agree():
+    for motion in motions(20):
+        odometry = conversions.fill_odometry(Odometry(), motion)
+        posed = conversions.pose_stamped(motion, 'odom')
+        moved = conversions.transform(motion, 'odom', 'base_link')
+        assert posed.pose == odometry.pose.pose
+        assert posed.header.stamp == moved.header.stamp == odometry.header.stamp
+        assert (posed.header.frame_id, moved.header.frame_id) == ('odom', 'odom')
+        assert moved.child_frame_id == 'base_link'
+        assert moved.transform.rotation == odometry.pose.pose.orientation
+        offset = moved.transform.translation
+        assert (offset.x, offset.y, offset.z) == (*motion.pose[:2], 0.0)
+
+
+def test_a_planar_covariance_lands_at_x_y_and_yaw():
+    """ROS orders the rows x, y, z, roll, pitch, yaw (REP 103, geometry_msgs)."""
+    generator = np.random.default_rng(7)
+    root = generator.normal(size=(3, 3))
+    planar = root @ root.T
+    full = np.array(conversions.planar_covariance(planar)).reshape(6, 6)
+    known = [0, 1, 5]
+    np.testing.assert_array_equal(full[np.ix_(known, known)], planar)
+    np.testing.assert_array_equal(full, full.T)
+    assert np.linalg.eigvalsh(full).min() > 0.0
+    for unknown in (2, 3, 4):
+        assert full[unknown, unknown] == 1e6
+        assert np.count_nonzero(full[unknown]) == 1
+    message = Odometry()
+    message.pose.covariance = full.ravel().tolist()
+    np.testing.assert_array_equal(message.pose.covariance.reshape(6, 6), full)
+
+
+def test_a_command_survives_a_twist():
+    for motion in motions(20):
+        assert conversions.body_twist(conversions.twist_from_body(motion.twist)) == motion.twist
+        stamped = conversions.stamped_twist(motion.twist, motion.stamp_ns, 'base_link')
+        assert stamped.header.frame_id == 'base_link'
+        assert conversions.twist_and_stamp(stamped, 5) == (motion.twist, motion.stamp_ns)
+
+
+@pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize('part', ['linear', 'angular'])
+@pytest.mark.parametrize('axis', ['x', 'y', 'z'])
+def test_one_bad_number_anywhere_spoils_a_command(part, axis, value):
+    message = conversions.twist_from_body(BodyTwist(0.5, 1.0))
+    setattr(getattr(message, part), axis, value)
+    assert not all(map(math.isfinite, conversions.body_twist(message)))
+    twist, _ = conversions.twist_and_stamp(TwistStamped(twist=message), 5)
+    assert not all(map(math.isfinite, twist))
+
+
+def test_a_command_without_a_stamp_is_wanted_now():
+    assert conversions.twist_and_stamp(Twist(), 5) == (BodyTwist(0.0, 0.0), 5)
+    assert conversions.twist_and_stamp(TwistStamped(), 5) == (BodyTwist(0.0, 0.0), 5)
+
+
+@pytest.mark.parametrize('place', ['x', 'y', 'yaw', 'linear', 'angular'])
+@pytest.mark.parametrize('value', [math.nan, math.inf])
+def test_a_bad_number_in_odometry_is_seen(place, value):
+    message = conversions.fill_odometry(Odometry(), State(0, Pose(1, 2, 3), BodyTwist(4, 5)))
+    assert conversions.state_from_odometry(message).is_finite()
+    pose, twist = message.pose.pose, message.twist.twist
+    owner, name = {
+        'x': (pose.position, 'x'),
+        'y': (pose.position, 'y'),
+        'yaw': (pose.orientation, 'z'),
+        'linear': (twist.linear, 'x'),
+        'angular': (twist.angular, 'z'),
+    }[place]
+    setattr(owner, name, value)
+    assert not conversions.state_from_odometry(message).is_finite()
+
+
+def test_wheel_joints_keep_their_order():
+    message = conversions.joint_state(('right', 'left'), (1.0, 2.0), np.array((3.0, 4.0)), 7)
+    assert message.name == ['right', 'left']
+    assert list(message.position) == [1.0, 2.0]
+    assert list(message.velocity) == [3.0, 4.0]
+    assert conversions.ns_from_time(message.header.stamp) == 7
+
+
+# -- sensors --------------------------------------------------------------------------------------
+
+
+def test_the_spread_claimed_of_the_inertial_sensor_is_that_of_its_samples():
+    """Standing still, for as long as the bias walks less than the noise."""
+    parameters = ImuParameters(gyro_drift=0.0)
+    sensor = SimulatedImu(parameters, np.random.default_rng(3))
+    still = np.zeros((3, 2))
+    samples = np.array([sensor.measure(still, 0.01) for _ in range(20_000)])
+    message = sensor_messages.imu_message(parameters, 'imu_link')
+    turn, push = message.angular_velocity_covariance, message.linear_acceleration_covariance
+    claimed = (turn[8], push[0], push[4])
+    np.testing.assert_allclose(samples.var(axis=0), claimed, rtol=0.1)
+    assert message.orientation_covariance[0] == -1.0
+    for covariance, unknown in ((turn, (0, 4)), (push, (8,))):
+        matrix = np.array(covariance).reshape(3, 3)
+        np.testing.assert_array_equal(matrix, np.diag(np.diag(matrix)))
+        assert all(covariance[place] == 1e6 for place in unknown)
+    noisier = sensor_messages.imu_message(ImuParameters(gyro_noise=0.05), 'imu_link')
+    assert noisier.angular_velocity_covariance[8] > 50.0 * turn[8]
+
+
+def test_a_sample_keeps_its_axes_and_leaves_the_others_alone():
+    message = sensor_messages.imu_message(ImuParameters(), 'a/imu')
+    sensor_messages.fill_imu(message, ImuSample(0.5, 1.0, -2.0), 7)
+    assert conversions.ns_from_time(message.header.stamp) == 7
+    assert message.header.frame_id == 'a/imu'
+    turn, push = message.angular_velocity, message.linear_acceleration
+    assert (turn.x, turn.y, turn.z) == (0.0, 0.0, 0.5)
+    assert (push.x, push.y, push.z) == (1.0, -2.0, 0.0)
+
+
+FLOATS = np.float32
+
+
+@pytest.mark.parametrize(
+    'distance, infinity, expected',
+    [
+        (0.345, True, FLOATS(0.345)),
+        (0.10, True, FLOATS(0.10)),
+        (-math.inf, True, -math.inf),
+        (math.inf, True, math.inf),
+        (0.345, False, FLOATS(0.345)),
+        (-math.inf, False, -math.inf),
+        (math.inf, False, FLOATS(0.80)),
+    ],
+)
+def test_a_distance_follows_rep_117_after_the_wire(distance, infinity, expected):
+    """Numbers are single on the wire: what lies on a bound must not fall beyond it there."""
+    message = sensor_messages.range_message(RangeSensorParameters(), 'left_front_range_link')
+    sensor_messages.fill_range(message, distance, 7, infinity=infinity)
+    heard = deserialize_message(serialize_message(message), Range)
+    assert heard.range == expected
+    assert heard.radiation_type == Range.INFRARED
+    assert heard.field_of_view == FLOATS(0.1)
+    if math.isfinite(expected):
+        assert heard.min_range <= heard.range <= heard.max_range
+        assert (heard.range == heard.max_range) == (expected == FLOATS(0.8))
+
+
+def test_a_battery_that_gives_current_has_a_negative_one():
+    parameters = BatteryParameters(cells=4, capacity=2.0)
+    message = sensor_messages.battery_message(parameters)
+    sensor_messages.fill_battery(message, BatteryReading(15.0, 0.5, 0.75), 7)
+    assert (message.voltage, message.current, message.percentage) == (15.0, -0.5, 0.75)
+    assert message.charge == 1.5
+    assert message.design_capacity == 2.0
+    assert len(message.cell_voltage) == 4
+    assert np.isnan([*message.cell_voltage, message.temperature, message.capacity]).all()
+    sensor_messages.fill_battery(message, BatteryReading(15.0, math.nan, math.nan), 8)
+    assert np.isnan([message.current, message.charge, message.percentage]).all()
+
+
+def test_the_covariance_of_a_twist_is_that_of_its_wheels():
+    geometry, variance = WheelGeometry(), 0.04
+    rng = np.random.default_rng(9)
+    wheels = rng.normal(scale=math.sqrt(variance), size=(20_000, 2))
+    twists = np.array([twist_from_wheels(WheelSpeeds(*pair), geometry) for pair in wheels])
+    told = np.array(sensor_messages.twist_covariance(geometry, variance)).reshape(6, 6)
+    np.testing.assert_allclose([told[0, 0], told[5, 5]], twists.var(axis=0), rtol=0.05)
+    assert told[1, 1] == 1e6
+    misled = np.array(sensor_messages.twist_covariance(geometry, math.inf)).reshape(6, 6)
+    np.testing.assert_array_equal(misled, 1e6 * np.eye(6))
+
+
+def test_the_variance_of_a_counted_speed_is_that_of_counting():
+    step, period = 0.002, 0.01
+    rng = np.random.default_rng(10)
+    angles = np.cumsum(rng.uniform(0.01, 0.05, 20_000))
+    counted = np.diff(np.floor(angles / step) * step) / period
+    error = counted - np.diff(angles) / period
+    assert sensor_messages.count_variance(step, period) == pytest.approx(error.var(), rel=0.05)
+
+
+# -- what is wrong --------------------------------------------------------------------------------
+
+
+def _state(reason='', lost=(0, 0), **status):
+    flags = {'enabled': True, 'moving': False, 'estop': False, 'timed_out': False} | status
+    return RobotState(
+        stamp_ns=0,
+        wheels=ZERO_WHEEL_SPEEDS,
+        angles=WheelAngles(0.0, 0.0),
+        odometry=State(0, Pose(0, 0, 0), BodyTwist(0, 0)),
+        covariance=np.zeros((3, 3)),
+        commanded=ZERO_WHEEL_SPEEDS,
+        status=RobotStatus(limited=False, **flags),
+        reason=reason,
+        battery=BatteryReading(9.87, 0.5, 0.1),
+        lost_steps=lost,
+    )
+
+
+INSIDE = TwinDiagnostics((), (0.1, 0.2), (0.0, 0.0), 0.05, 0.04, 0.0)
+
+
+@pytest.mark.parametrize(
+    'state, inside, words',
+    [
+        (_state(), INSIDE, []),
+        (_state(), None, []),
+        (_state('no command yet'), INSIDE, ['no command yet']),
+        (_state(slipping=True), INSIDE, ['a wheel slips']),
+        (_state(SLIP_STOP_REASON, slipping=True), INSIDE, ['gyro and steps disagree']),
+        (_state(imu_fault=True), INSIDE, ['inertial sensor does not answer']),
+        (_state(low_battery=True), INSIDE, ['battery is low: 9.9 V']),
+        (_state(lost=(4, -8)), INSIDE, ['steps lost: 4 right, -8 left']),
+        (_state('why', imu_fault=True), INSIDE, ['why', 'inertial sensor']),
+    ],
+)
+def test_a_robot_complains_of_what_is_wrong_and_of_nothing_else(state, inside, words):
+    found = complaints(state, inside)
+    assert len(found) == len(words)
+    for text, word in zip(found, words, strict=True):
+        assert word in text
+
+
+def test_faults_at_work_are_named():
+    inside = replace(INSIDE, faults=('gyro_dead', 'command_delay 0.1 s'))
+    (text,) = complaints(_state(), inside)
+    assert text == 'faults: gyro_dead, command_delay 0.1 s'
+    assert measures(_state(), inside)['faults'] == 'gyro_dead, command_delay 0.1 s'
+    values = measures(_state(), INSIDE)
+    assert values['faults'] == 'none'
+    assert (values['gyro_bias_rad_s'], values['gyro_bias_learnt_rad_s']) == (0.05, 0.04)
+    assert (values['slid_right_m'], values['slid_left_m']) == (0.1, 0.2)
+    assert values['battery_v'] == 9.87

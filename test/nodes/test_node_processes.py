@@ -1,0 +1,224 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Real processes over real DDS: they start, loop, survive each other's death, and end with 0."""
+
+import signal
+import time
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.bag.reader import missing_sample_ratio, open_bag
+from t3mpc_ros.cli.process_group import ProcessError
+from t3mpc_ros.geometry.types import NANOSECONDS
+
+pytestmark = pytest.mark.ros
+
+EXECUTABLES = ('reference', 'controller', 'sim_robot', 'recorder', 'replayer', 'all_in_one')
+LOOP = ('recorder', 'controller', 'sim_robot', 'reference')
+
+
+def _start_loop(fleet, bag):
+    for name in LOOP:
+        _start(fleet, name, bag)
+    fleet.wait_for('controller', 'tracking')
+
+
+def _start(fleet, name, bag):
+    fleet.start(name, parameters={'folder': str(bag)} if name == 'recorder' else None)
+    fleet.wait_ready(name)
+
+
+@pytest.mark.parametrize('name', EXECUTABLES)
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_each_executable_starts_without_arguments_and_ends_with_0(
+    name, number, fleet, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    fleet.start(name)
+    fleet.wait_ready(name)
+    assert fleet.stop(name, number) == 0
+    assert 'Traceback' not in fleet.log(name).read_text()
+
+
+@pytest.mark.parametrize('delay', [0.4, 0.9, 1.6])
+def test_a_signal_during_start_up_ends_quietly_with_0(delay, fleet):
+    """Importing ROS and the compiler takes a while; Ctrl-C must not need luck."""
+    fleet.start('controller')
+    time.sleep(delay)
+    assert fleet.stop('controller', signal.SIGINT) == 0
+    assert 'Traceback' not in fleet.log('controller').read_text()
+
+
+def test_the_loop_runs_at_100_hz_over_four_processes(fleet, tmp_path):
+    bag = tmp_path / 'bag'
+    _start_loop(fleet, bag)
+    time.sleep(8.0)
+    fleet.check()
+    codes = fleet.stop_all(('reference', 'controller', 'sim_robot', 'recorder'))
+    assert set(codes.values()) == {0}
+    with open_bag(bag) as recording:
+        for topic in ('/reference', '/odom'):
+            stamps = recording.series(topic, {})['stamp']
+            assert missing_sample_ratio(stamps, 100.0) < 0.01, topic
+        received = recording.series('/cmd_vel', {'v': 'linear.x', 'w': 'angular.z'})
+        odometry = recording.series('/odom', {'v': 'twist.twist.linear.x'})
+        # One command per odometry message, once both are heard.
+        heard = (odometry['received'] >= received['received'][0]) & (
+            odometry['received'] <= received['received'][-1]
+        )
+        assert received['v'].size >= 0.99 * heard.sum()
+        assert heard.sum() >= 0.99 * 800
+        # The last command is a stop, sent when the controller ended; and the robot moved before.
+        assert received['v'][-1] == 0.0
+        assert received['w'][-1] == 0.0
+        assert np.ptp(odometry['v']) > 0.02
+        parameters = recording.metadata_records
+        assert parameters['provenance']['version']
+        assert float(parameters['controller']['law.gain']) > 0.0
+        assert float(parameters['sim_robot']['rate']) == 100.0
+        assert int(parameters['reference']['seed']) >= 0
+
+
+def _speeds(bag, topic='/ground_truth/odom'):
+    """Return stamps (ns) and the larger of |v| and a wheel's share of |omega|, m/s."""
+    with open_bag(bag) as recording:
+        data = recording.series(topic, {'v': 'twist.twist.linear.x', 'w': 'twist.twist.angular.z'})
+        stamps = recording.start_ns + np.round(data['stamp'] * NANOSECONDS).astype(np.int64)
+    return stamps, np.abs(data['v']) + 0.0735 * np.abs(data['w'])
+
+
+def _moving_share(stamps, speed, start_ns, seconds):
+    chosen = (stamps >= start_ns) & (stamps < start_ns + seconds * NANOSECONDS)
+    assert chosen.any()
+    return float(np.mean(speed[chosen] > 0.01))
+
+
+@pytest.mark.parametrize('victim', ['reference', 'controller'])
+def test_killing_a_source_stops_the_robot_within_half_a_second_and_a_restart_resumes(
+    victim, fleet, tmp_path
+):
+    bag = tmp_path / 'bag'
+    _start_loop(fleet, bag)
+    time.sleep(5.0)
+    killed_ns = time.time_ns()
+    fleet.kill(victim)
+    time.sleep(2.0)
+    fleet.check()  # the others keep running
+    _start(fleet, victim, bag)
+    restarted_ns = time.time_ns()
+    time.sleep(7.0)  # finding each other over DDS takes up to three seconds
+    fleet.check()
+    assert set(fleet.stop_all(('reference', 'controller', 'sim_robot', 'recorder')).values()) == {
+        0
+    }
+
+    stamps, speed = _speeds(bag)
+    assert _moving_share(stamps, speed, killed_ns - NANOSECONDS, 1.0) > 0.8
+    assert _moving_share(stamps, speed, restarted_ns + 5 * NANOSECONDS, 1.5) > 0.5
+    late = (stamps > killed_ns + NANOSECONDS) & (stamps < killed_ns + 2 * NANOSECONDS)
+    assert speed[late].max() < 0.01, 'the robot still moved a second after the kill'
+    # Between its stepper motors the body swings by about a millimetre once they have stopped.
+    stamps, pulses = _speeds(bag, '/odom')
+    late = (stamps > killed_ns + NANOSECONDS // 2) & (stamps < killed_ns + 2 * NANOSECONDS)
+    assert pulses[late].max() < 0.01, 'the motors still turned half a second after the kill'
+
+
+def test_killing_the_robot_zeroes_the_command_and_a_restart_resumes(fleet, tmp_path):
+    bag = tmp_path / 'bag'
+    _start_loop(fleet, bag)
+    time.sleep(5.0)
+    killed_ns = time.time_ns()
+    fleet.kill('sim_robot')
+    time.sleep(1.5)
+    fleet.check()
+    _start(fleet, 'sim_robot', bag)
+    restarted_ns = time.time_ns()
+    time.sleep(7.0)
+    fleet.check()
+    assert set(fleet.stop_all(('reference', 'controller', 'sim_robot', 'recorder')).values()) == {
+        0
+    }
+
+    with open_bag(bag) as recording:
+        commands = recording.series('/cmd_vel', {'v': 'linear.x', 'w': 'angular.z'})
+        stamps = recording.start_ns + np.round(commands['received'] * NANOSECONDS).astype(np.int64)
+    silent = (stamps > killed_ns + NANOSECONDS // 2) & (stamps < killed_ns + 1.4 * NANOSECONDS)
+    assert silent.sum() >= 5, 'the controller keeps saying stop while it hears nothing'
+    assert not commands['v'][silent].any()
+    assert not commands['w'][silent].any()
+    stamps, speed = _speeds(bag)
+    assert _moving_share(stamps, speed, restarted_ns + 5 * NANOSECONDS, 1.5) > 0.5
+
+
+def test_killing_the_recorder_stops_nobody_and_a_restart_continues_the_bag(fleet, tmp_path):
+    bag = tmp_path / 'bag'
+    _start_loop(fleet, bag)
+    time.sleep(3.0)
+    fleet.kill('recorder')
+    time.sleep(1.0)
+    fleet.check()
+    _start(fleet, 'recorder', bag)
+    restarted_ns = time.time_ns()
+    time.sleep(6.0)
+    fleet.check()
+    assert set(fleet.stop_all(('reference', 'controller', 'sim_robot', 'recorder')).values()) == {
+        0
+    }
+    assert len(list(bag.glob('*.mcap'))) == 2
+    stamps, speed = _speeds(bag)
+    assert _moving_share(stamps, speed, restarted_ns + 4 * NANOSECONDS, 1.5) > 0.8
+
+
+def test_all_in_one_closes_the_loop_in_one_process(fleet, tmp_path):
+    bag = tmp_path / 'bag'
+    fleet.start('all_in_one', parameters={'folder': str(bag)})
+    fleet.wait_ready('all_in_one')
+    time.sleep(6.0)
+    assert fleet.stop('all_in_one') == 0
+    stamps, speed = _speeds(bag)
+    assert speed.max() > 0.02
+    with open_bag(bag) as recording:
+        assert missing_sample_ratio(recording.series('/odom', {})['stamp'], 100.0) < 0.01
+
+
+@pytest.mark.parametrize(
+    'name, arguments, words',
+    [
+        ('controller', ['--ros-args', '-p', 'law.gain:=-1.0'], ['law.gain', '0.1', '-1']),
+        (
+            'controller',
+            ['--ros-args', '-p', 'law.gian:=1.0'],
+            ['law.gian', 'did you mean law.gain'],
+        ),
+        ('reference', ['--ros-args', '-p', 'rate:=fast'], ['rate', 'a number', 'fast']),
+        ('sim_robot', ['--ros-args', '-p', 'drive.kind:=warp'], ['drive.kind', 'one of', 'warp']),
+        ('recorder', ['--ros-args', '--params-file', 'MISSING'], ['MISSING', 'cannot read']),
+        ('recorder', ['--ros-args', '--params-file', 'BROKEN'], ['BROKEN', 'not valid YAML']),
+        ('recorder', ['--ros-args', '-p', 'folder:=FILE/bag'], ['FILE/bag']),
+        ('controller', ['--ros-args', '-p', 'model:=BROKEN'], ['BROKEN', 'not a model file']),
+    ],
+)
+def test_bad_input_at_start_is_one_clear_line_and_exit_code_2(
+    name, arguments, words, fleet, tmp_path
+):
+    (tmp_path / 'BROKEN').write_text('controller:\n  ros__parameters: [1,\n')
+    (tmp_path / 'FILE').write_text('a file where a folder is wanted')
+    places = {word: str(tmp_path / word) for word in ('BROKEN', 'FILE', 'MISSING')}
+    given = list(arguments)
+    for word, path in places.items():
+        given = [argument.replace(word, path) for argument in given]
+    fleet.start(name, *given)
+    with pytest.raises(ProcessError, match='code 2'):
+        fleet.wait_ready(name)
+    said = fleet.log(name).read_text()
+    assert 'Traceback' not in said
+    line = next(line for line in said.splitlines() if line.startswith(f'{name}: '))
+    for word in words:
+        assert word in line
+
+
+def test_an_integer_where_a_number_is_wanted_is_taken(fleet):
+    fleet.start('controller', '--ros-args', '-p', 'law.gain:=5')
+    fleet.wait_ready('controller')
+    assert fleet.stop('controller') == 0

@@ -1,0 +1,202 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The bridge as a node: a real port (a pty), real time, and a scripted dongle behind it."""
+
+import errno
+import os
+import select
+import threading
+import time
+import tty
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from nav_msgs.msg import Odometry
+import pytest
+from sensor_msgs.msg import BatteryState, Imu, JointState, Range
+from std_srvs.srv import SetBool, Trigger
+from support.radio_bench import FakeDongle, FakeRobot
+from test_nodes_behaviour import Driver, World, twist
+
+from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
+from t3mpc_ros.radio.protocol.authentication import KeyFileError
+from t3mpc_ros.robot.interface import RANGE_SENSORS
+
+pytestmark = pytest.mark.ros
+
+
+@pytest.fixture
+def world(ros):
+    made = World()
+    yield made
+    made.close()
+
+
+class Plug:
+    """A dongle that can be pulled out of its port and put in again."""
+
+    def __init__(self, path, key=b''):
+        self.path = str(path)
+        self.robot = FakeRobot(key)
+        self.dongle = FakeDongle(self.robot)
+        self.in_port = False
+        self.put_in()
+
+    def put_in(self):
+        self._master, slave = os.openpty()
+        tty.setraw(slave)
+        os.symlink(os.ttyname(slave), self.path)
+        os.close(slave)
+        self.dongle.restart(time.monotonic_ns())
+        self.in_port = True
+        self._thread = threading.Thread(target=self._answer, daemon=True)
+        self._thread.start()
+
+    def pull_out(self):
+        self.in_port = False
+        self._thread.join()
+        os.unlink(self.path)
+        os.close(self._master)
+
+    def _answer(self):
+        replies = []
+        while self.in_port:
+            now_ns = time.monotonic_ns()
+            while replies and replies[0][0] <= now_ns:
+                os.write(self._master, replies.pop(0)[1])
+            wait = min(0.02, max(0.0, (replies[0][0] - now_ns) / 1e9)) if replies else 0.02
+            if not select.select([self._master], [], [], wait)[0]:
+                continue
+            try:
+                data = os.read(self._master, 4096)
+            except OSError as error:
+                if error.errno != errno.EIO:  # nobody has the other end open
+                    raise
+                time.sleep(0.005)
+                continue
+            replies += self.dongle.take(data, time.monotonic_ns())
+            replies.sort()
+
+
+@pytest.fixture
+def plug(tmp_path):
+    made = Plug(tmp_path / 'dongle')
+    yield made
+    if made.in_port:
+        made.pull_out()
+
+
+def says(node):
+    return node.produce_diagnostics()[1]
+
+
+def driving(world, plug, linear=0.1):
+    """Return the node, the driver and what is heard on odom, once the robot drives."""
+    node = world.add(RadioBridgeNode, port=plug.path)
+    odom = world.hear(Odometry, 'odom')
+    driver = Driver(world)
+    driver.message = twist(linear)
+    world.until(lambda: odom and odom[-1].twist.twist.linear.x > 0.9 * linear, 'it drives')
+    return node, driver, odom
+
+
+def test_it_tells_what_sim_robot_tells_but_for_the_truth(world, plug):
+    heard = {
+        name: world.hear(kind, name)
+        for kind, name in (
+            (Imu, 'imu/data_raw'),
+            (JointState, 'joint_states'),
+            (BatteryState, 'battery_state'),
+            (Range, 'range/left_back'),
+        )
+    }
+    node, _, odom = driving(world, plug)
+    world.until(lambda: all(heard.values()), 'every topic')
+    level, text, values = node.produce_diagnostics()
+    if 'round trips take' not in text:  # as on a machine that has other things to do
+        assert (level, text) == (DiagnosticStatus.OK, 'following commands, unauthenticated')
+    assert values['link'] == 'running'
+    assert values['authenticated'] is False
+    stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in odom]
+    assert stamps == sorted(set(stamps))
+    assert abs(stamps[-1] - node.now_ns()) < 2e9  # ROS's clock, not the link's
+    assert odom[-1].pose.pose.position.x > odom[0].pose.pose.position.x
+    topics = {name for name, _ in node.get_publisher_names_and_types_by_node('radio_bridge', '/')}
+    assert {f'/range/{name}' for name in RANGE_SENSORS} <= topics
+    assert '/ground_truth/odom' not in topics
+
+
+def test_a_missing_dongle_is_named_with_what_to_do_and_used_as_soon_as_it_is_there(world, plug):
+    plug.pull_out()
+    node = world.add(RadioBridgeNode, port=plug.path)
+    world.until(lambda: 'is the dongle plugged in?' in says(node), 'the reason')
+    assert node.produce_diagnostics()[0] == DiagnosticStatus.ERROR
+    plug.put_in()
+    world.until(lambda: node.produce_diagnostics()[2]['link'] == 'running', 'the link')
+
+
+def test_pulled_out_while_driving_it_is_found_again_by_itself(world, plug):
+    node, _, odom = driving(world, plug)
+    plug.pull_out()
+    world.until(lambda: 'is the dongle plugged in?' in says(node), 'the reason')
+    plug.put_in()
+    before = len(odom)
+    world.until(lambda: len(odom) > before + 20, 'odometry')
+    world.until(lambda: odom[-1].twist.twist.linear.x > 0.09, 'it drives again')
+    assert node.produce_diagnostics()[2]['port_failures'] == 1
+
+
+def test_silence_stops_the_robot_and_an_emergency_stop_holds(world, plug):
+    node, driver, _ = driving(world, plug)
+    driver.message = None
+    world.until(lambda: says(node).startswith('no command for 0.25 s'), 'the reason')
+    world.until(lambda: plug.robot.speeds == (0.0, 0.0), 'standstill')
+    assert world.call(SetBool, 'e_stop', data=True).success
+    driver.message = twist(0.1)
+    world.until(lambda: plug.robot.estop, 'the stop')
+    assert 'emergency stop: asked for by service e_stop' in says(node)
+    assert plug.robot.speeds == (0.0, 0.0)
+    assert world.call(SetBool, 'e_stop', data=False).success
+    world.until(lambda: max(plug.robot.speeds) > 2.0, 'it drives again')
+
+
+def test_odometry_is_reset_at_rest_only(world, plug):
+    _, driver, odom = driving(world, plug)
+    assert not world.call(Trigger, 'reset_odometry').success
+    driver.message = twist(0.0)
+    world.until(lambda: odom[-1].twist.twist.linear.x == 0.0, 'standstill')
+    world.until(lambda: world.call(Trigger, 'reset_odometry').success, 'the reset')
+    world.until(lambda: abs(odom[-1].pose.pose.position.x) < 1e-6, 'the origin')
+
+
+def test_the_end_leaves_the_robot_at_rest_with_its_drives_out(world, plug):
+    node, driver, _ = driving(world, plug)
+    driver.message = None
+    world.remove(node)
+    assert plug.robot.speeds == (0.0, 0.0)
+    assert not plug.robot.enabled
+    assert not node._courier.is_alive()
+
+
+def test_a_key_file_that_others_may_read_is_refused(world, plug, tmp_path):
+    key = tmp_path / 'key'
+    key.write_text('00' * 16)
+    key.chmod(0o644)
+    with pytest.raises(KeyFileError, match='chmod 600'):
+        world.add(RadioBridgeNode, port=plug.path, key_file=str(key))
+
+
+def test_with_the_key_commands_are_signed(world, tmp_path):
+    key = bytes(range(16))
+    path = tmp_path / 'key'
+    path.write_text(key.hex())
+    path.chmod(0o600)
+    plug = Plug(tmp_path / 'dongle', key)
+    try:
+        node = world.add(RadioBridgeNode, port=plug.path, key_file=str(path))
+        driver = Driver(world)
+        driver.message = twist(0.1)
+        world.until(lambda: max(plug.robot.speeds) > 2.0, 'it drives')
+        world.until(lambda: says(node) == 'following commands', 'all is well')
+        assert node.produce_diagnostics()[2]['authenticated'] is True
+    finally:
+        plug.pull_out()

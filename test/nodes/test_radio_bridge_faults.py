@@ -1,0 +1,183 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The bridge over a real port, and what is done to both: killed, unplugged, opened twice.
+
+Times are those of the emulator: it knows when the last command reached its robot, and when the
+wheels stood, however busy this machine is.
+"""
+
+from contextlib import suppress
+import os
+import random
+import re
+import threading
+
+from nav_msgs.msg import Odometry
+import pytest
+from test_nodes_behaviour import Driver, World, twist
+
+from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters, StopTimeMonitor
+from t3mpc_ros.emulator.pty_port import PtyPort, serve
+from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
+from t3mpc_ros.radio.protocol.codec import encode
+from t3mpc_ros.radio.protocol.frames import Command, Poll, Transmit
+from t3mpc_ros.radio.protocol.framing import encode_frame
+
+pytestmark = pytest.mark.ros
+
+REST = 0.45
+"""s after the last command that was followed"""
+FULL = 0.35
+"""m/s: both wheels at their largest speed, 10 rad/s"""
+
+
+@pytest.fixture
+def world(ros):
+    made = World()
+    yield made
+    made.close()
+
+
+class Served:
+    """An emulator behind a pty, on the wall clock, in a thread; its numbers are at hand."""
+
+    def __init__(self, path, **flat):
+        self.path = str(path)
+        names = {name.replace('__', '.'): value for name, value in flat.items()}
+        self.emulator = Emulator(EmulatorParameters.from_dict(names))
+        self.emulator.plant.warm_up()
+        self.port = PtyPort(path)
+        self.watch = StopTimeMonitor(self.emulator)
+        note = self.emulator.board.followed
+        self.followed = []
+
+        def follow(now_us, command):
+            note(now_us, command)
+            self.followed.append((self.emulator.now_ns, command))
+
+        self.emulator.board.followed = follow
+        self.news = []
+        self.back_ns = None
+        self._todo = []
+        self._ended = False
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def _serve(self):
+        serve(self.emulator, self.port, 1.0, self._stopped, look=self._look)
+
+    def _stopped(self):
+        while self._todo:
+            self.emulator.inject(*self._todo.pop(0))
+        return self._ended
+
+    def _look(self):
+        if said := self.watch.news():
+            self.news.append(said)
+        if not self.emulator.port_open:
+            self.back_ns = self.emulator.now_ns
+
+    def inject(self, *fault):
+        self._todo.append(fault)
+
+    def close(self):
+        self._ended = True
+        self._thread.join()
+        self.port.close()
+
+
+@pytest.fixture
+def served(tmp_path):
+    made = []
+
+    def serve_one(**flat):
+        made.append(Served(tmp_path / 'dongle', **flat))
+        return made[-1]
+
+    yield serve_one
+    for one in made:
+        one.close()
+
+
+def says(node):
+    return node.produce_diagnostics()[1]
+
+
+def obeyed(node):
+    """Whether nothing hinders the robot; a busy machine may still be worth a warning."""
+    return node._robot.reason(node.steady_ns()) == ''
+
+
+@pytest.mark.slow
+def test_a_killed_bridge_leaves_the_wheels_at_rest_in_time(world, fleet, tmp_path):
+    """All of them processes: SIGKILL, from full speed; the emulator says how long it took."""
+    path = tmp_path / 'dongle'
+    fleet.start('board_emulator', '--link', str(path))
+    fleet.wait_for('board_emulator', 'stop with Ctrl-C', 120.0)
+    odom = world.hear(Odometry, 'odom')
+    driver = Driver(world)
+    for _ in range(2):
+        fleet.start('radio_bridge', parameters={'port': str(path)})
+        driver.message = twist(FULL)
+        odom.clear()
+        world.until(lambda: odom and odom[-1].twist.twist.linear.x > 0.98 * FULL, 'full speed')
+        fleet.kill('radio_bridge')
+        before = fleet.log('board_emulator').read_text().count('at rest')
+        world.until(
+            lambda before=before: (
+                fleet.log('board_emulator').read_text().count('at rest') > before
+            ),
+            'rest',
+        )
+    found = re.findall(r'at rest ([0-9.]+) s', fleet.log('board_emulator').read_text())
+    print(f'\nat rest {", ".join(found)} s after the last command')
+    assert len(found) >= 2
+    assert max(map(float, found)) <= REST
+
+
+def test_replugged_it_is_driven_again_within_a_second(world, served):
+    board = served(dongle_start=0.0)
+    node = world.add(RadioBridgeNode, port=board.path)
+    driver = Driver(world)
+    driver.message = twist(0.1)
+    world.until(lambda: board.followed and board.followed[-1][1].left > 2000, 'it drives')
+    board.inject('close_port', 0.7)
+    world.until(lambda: 'is the dongle plugged in?' in says(node), 'the reason')
+    world.until(lambda: board.back_ns and board.followed[-1][0] > board.back_ns, 'it goes on')
+    first = next(now_ns for now_ns, _ in board.followed if now_ns > board.back_ns)
+    took = (first - board.back_ns) / 1e9
+    print(f'\nfollows commands {took:.2f} s after the port is back')
+    assert took <= 2.0  # 0.2 s in virtual time: see test_firmware_avr_faults.py
+    world.until(lambda: obeyed(node), 'all is well')
+
+
+def test_a_second_opener_makes_no_wrong_command_and_is_got_over(world, served):
+    """It ignores the lock, steals answers, writes noise and frames of a session of its own."""
+    board = served()
+    node = world.add(RadioBridgeNode, port=board.path)
+    driver = Driver(world)
+    driver.message = twist(0.1)
+    world.until(lambda: len(board.followed) > 20, 'it drives')
+    stranger = os.open(board.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    dice = random.Random(4)
+    count = len(board.followed)
+    for _ in range(60):
+        foreign = Command(
+            1 + dice.randrange(255), dice.randrange(256), 1, 20, -9000, 9000, dice.randrange(2**32)
+        )
+        if foreign.session == board.emulator.board.session:
+            continue  # one in 255 is the session of the bridge: only a key keeps that out
+        poll = encode(Poll(foreign.session, 0, 0))
+        frame = encode_frame(encode(Transmit(dice.randrange(256), 6, encode(foreign), poll)))
+        os.write(stranger, dice.choice((frame, dice.randbytes(20), frame[:9])))
+        with suppress(BlockingIOError):
+            os.read(stranger, 64)
+        end = node.steady_ns() + 30_000_000
+        world.until(lambda end=end: node.steady_ns() > end, 'a while')
+    print(f'\nwhile it wrote: {says(node)}, {len(board.followed) - count} commands followed')
+    os.close(stranger)
+    world.until(lambda: obeyed(node), 'it is got over')
+    count = len(board.followed)
+    world.until(lambda: len(board.followed) > count + 20, 'commands')
+    for _, command in board.followed:
+        assert 0 <= command.left == command.right <= 3000

@@ -1,0 +1,145 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The recorder as a process: under load, killed, asked to end, and on a disk that is full."""
+
+import random
+import resource
+import signal
+import time
+
+import pytest
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from std_msgs.msg import Float64MultiArray
+from support.recorder_bench import run
+
+from t3mpc_ros.bag.mcap_file import finalize_file
+from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.cli.process_group import ProcessError
+from t3mpc_ros.geometry.types import NANOSECONDS
+
+pytestmark = pytest.mark.ros
+
+DEEP = QoSProfile(depth=5000)
+
+
+def test_two_thousand_messages_a_second_are_all_recorded(fleet, tmp_path):
+    """``recorder_bench.py`` runs this for a minute and prints what it costs."""
+    found = run(tmp_path / 'bag', fleet, seconds=4.0)
+    assert found.sent == 8000
+    assert found.recorded == found.sent
+    assert found.in_order
+    with open_bag(tmp_path / 'bag') as recording:
+        assert recording.metadata_records['losses'] == {'dropped': '0', 'lost': '0'}
+
+
+class Talker:
+    """Publishes numbers from this process to a recorder in another one."""
+
+    def __init__(self, topic='number'):
+        self._node = Node('talker')
+        self._publisher = self._node.create_publisher(Float64MultiArray, topic, DEEP)
+        self._random = random.Random(1)
+        self.ballast = 0
+        """Random numbers behind the one that counts: nothing compresses those."""
+        self.sent = []
+        """When each number was published, nanoseconds since 1970."""
+
+    def find(self, seconds=20.0):
+        deadline = time.monotonic() + seconds
+        while not self._publisher.get_subscription_count():
+            assert time.monotonic() < deadline, 'no recorder'
+            time.sleep(0.05)
+
+    def say(self, count, period=0.01):
+        for _ in range(count):
+            self.sent.append(time.time_ns())
+            number = float(len(self.sent) - 1)
+            self._publisher.publish(Float64MultiArray(data=[number, *self._ballast()]))
+            time.sleep(period)
+
+    def _ballast(self):
+        return [self._random.random() for _ in range(self.ballast)]
+
+    def acknowledged(self):
+        return self._publisher.wait_for_all_acked(Duration(seconds=10))
+
+    def close(self):
+        self._node.destroy_node()
+
+
+@pytest.fixture
+def talker(ros):
+    made = Talker()
+    yield made
+    made.close()
+
+
+def start(fleet, folder, **more):
+    fleet.start('recorder', parameters={'folder': str(folder), 'topics': ['number'], **more})
+    fleet.wait_ready('recorder')
+
+
+def numbers(path):
+    with open_bag(path) as recording:
+        return recording.series('/number', {'n': 'data[0]'})['n'].astype(int).tolist()
+
+
+@pytest.mark.parametrize('moment', [1, 2])
+def test_a_killed_recorder_has_lost_at_most_the_last_second(moment, fleet, talker, tmp_path):
+    start(fleet, tmp_path / 'bag')
+    talker.find()
+    talker.say(150 + random.Random(moment).randrange(100))
+    killed = time.time_ns()
+    fleet.kill('recorder')
+    (path,) = (tmp_path / 'bag').glob('*.mcap')
+    finalize_file(path)
+    kept = numbers(path)
+    due = [i for i, sent in enumerate(talker.sent) if sent <= killed - NANOSECONDS]
+    assert kept[: len(due)] == due
+    assert kept == list(range(len(kept)))
+
+
+def test_after_a_second_of_silence_a_killed_recorder_has_lost_nothing(fleet, talker, tmp_path):
+    start(fleet, tmp_path / 'bag')
+    talker.find()
+    talker.say(20)
+    time.sleep(1.0)
+    fleet.kill('recorder')
+    (path,) = (tmp_path / 'bag').glob('*.mcap')
+    assert finalize_file(path) == 20
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_what_has_come_before_a_signal_is_in_the_bag(number, fleet, talker, tmp_path):
+    start(fleet, tmp_path / 'bag')
+    talker.find()
+    talker.say(900, period=0.0)
+    assert talker.acknowledged()
+    assert fleet.stop('recorder', number) == 0
+    assert numbers(tmp_path / 'bag') == list(range(900))
+
+
+def test_a_file_that_may_not_grow_stops_the_recording_and_can_be_read(fleet, talker, tmp_path):
+    start(fleet, tmp_path / 'bag', chunk_time=0.05)
+    talker.find()
+    talker.ballast = 500
+    # Beyond what ending a file on a full disk leaves free.
+    resource.prlimit(fleet.pid('recorder'), resource.RLIMIT_FSIZE, (400_000, 400_000))
+
+    def say_until_it_ends():
+        while len(talker.sent) < 3000:
+            talker.say(1)
+            fleet.check()
+
+    with pytest.raises(ProcessError, match='ended with code 1'):
+        say_until_it_ends()
+    said = fleet.log('recorder').read_text()
+    assert said.count('recording has stopped') == 1
+    for words in ('File too large', 'messages are kept', 'start the recorder again'):
+        assert words in said
+    assert 'Traceback' not in said
+    kept = numbers(tmp_path / 'bag')
+    assert len(kept) > 50
+    assert kept == list(range(len(kept)))

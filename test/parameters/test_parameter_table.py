@@ -1,0 +1,109 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The one table of settings: what it accepts, what it refuses, and how it says so."""
+
+from argparse import ArgumentTypeError
+from dataclasses import dataclass, replace
+
+import pytest
+
+from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, parse_assignments
+from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
+from t3mpc_ros.radio.link.link_parameters import LinkParameters
+
+
+@dataclass(frozen=True)
+class Inner(Parameters):
+    gain: float = parameter(8.0, 'gain', unit='1/s', low=0.1, high=100.0, dynamic=True)
+    kind: str = parameter('a', 'kind', choices=('a', 'b'))
+
+
+@dataclass(frozen=True)
+class Outer(Parameters):
+    low: float = parameter(1.0, 'lower end')
+    high: float = parameter(2.0, 'upper end')
+    count: int = parameter(3, 'how many', low=1)
+    levels: tuple[float, ...] = parameter((0.1, 0.2), 'levels', low=0.0)
+    on: bool = parameter(True, 'switch')
+    inner: Inner = group(Inner)
+
+    def check_consistency(self) -> None:
+        if self.low >= self.high:
+            raise ParameterError(f'low must be below high: got {self.low} and {self.high}')
+
+
+def test_rows_carry_everything_a_person_needs():
+    rows = {row.name: row for row in Outer.rows()}
+    assert list(rows) == ['low', 'high', 'count', 'levels', 'on', 'inner.gain', 'inner.kind']
+    gain = rows['inner.gain']
+    assert (gain.kind, gain.many, gain.default, gain.unit, gain.dynamic) == (
+        float, False, 8.0, '1/s', True,
+    )  # fmt: skip
+    assert gain.bounds() == 'from 0.1 to 100 1/s'
+    assert rows['inner.kind'].bounds() == 'one of a, b'
+    assert rows['count'].bounds() == 'at least 1'
+
+
+def test_flat_and_back_is_the_identity():
+    table = Outer.from_dict({'inner.gain': 5, 'levels': [1, 2.5], 'count': 7})
+    assert table.inner.gain == 5.0
+    assert isinstance(table.inner.gain, float)
+    assert table.levels == (1.0, 2.5)
+    assert Outer.from_dict(table.to_dict()) == table
+
+
+@pytest.mark.parametrize(
+    'values, words',
+    [
+        ({'inner.gain': -1.0}, ['inner.gain', 'from 0.1 to 100', '-1']),
+        ({'inner.gain': float('nan')}, ['inner.gain', 'finite', 'nan']),
+        ({'inner.gain': 'fast'}, ['inner.gain', 'a number', 'fast']),
+        ({'inner.gain': True}, ['inner.gain', 'a number', 'True']),
+        ({'inner.kind': 'c'}, ['inner.kind', 'one of a, b', 'c']),
+        ({'count': 2.5}, ['count', 'a whole number', '2.5']),
+        ({'levels': [0.1, -2.0]}, ['levels', 'at least 0', '-2']),
+        ({'levels': 3.0}, ['levels', 'a list', '3.0']),
+        ({'inner.gian': 1.0}, ['inner.gian', 'did you mean inner.gain']),
+        ({'low': 3.0}, ['low must be below high', '3.0', '2.0']),
+    ],
+)
+def test_wrong_values_are_refused_with_name_bound_and_value(values, words):
+    with pytest.raises(ParameterError) as caught:
+        Outer.from_dict(values)
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_direct_construction_is_checked_too():
+    with pytest.raises(ParameterError):
+        Inner(gain=0.0)
+    with pytest.raises(ParameterError):
+        replace(Outer(), high=0.5)
+
+
+def test_words_of_a_command_line_become_what_the_table_asks_for():
+    """``link.rate=2M`` and the address 5433 must stay text, true must not."""
+    words = ['address=5433', 'retries=3', 'cycle_rate=25', 'robot.invert_left=true', 'rate=2M']
+    found = parse_assignments(LinkParameters, words)
+    assert found == {
+        'address': '5433',
+        'retries': 3,
+        'cycle_rate': 25,
+        'robot.invert_left': True,
+        'rate': '2M',
+    }
+    with pytest.raises(ParameterError, match="NAME=VALUE: got 'retries'"):
+        parse_assignments(LinkParameters, ['retries'])
+    with pytest.raises(ParameterError, match='nothing_such'):
+        LinkParameters.from_dict(parse_assignments(LinkParameters, ['nothing_such=1']))
+
+
+def test_numbers_of_a_command_line_are_kept_within_their_bounds():
+    read = bounded_float(0.0, 1e6, '1/s²')
+    assert (read('0'), read('1e6'), bounded_int(1, 5)('5')) == (0.0, 1e6, 5)
+    for text in ('-1', '1000001', 'nan', 'inf'):
+        with pytest.raises(ArgumentTypeError, match=f'must be from 0 to 1000000 1/s²: got {text}'):
+            read(text)
+    for text in ('x', '1.5', ''):
+        with pytest.raises(ValueError, match='invalid literal'):
+            bounded_int(1, 5)(text)

@@ -1,0 +1,311 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Only who has the key moves a keyed robot, and nobody does so twice with the same bytes."""
+
+import json
+from pathlib import Path
+import random
+
+import pytest
+
+from t3mpc_ros.radio.protocol import frames
+from t3mpc_ros.radio.protocol.authentication import (
+    CommandVerifier,
+    KeyFileError,
+    Signer,
+    frame_tag,
+    key_check,
+    read_key,
+    session_key,
+    sign_hello,
+    siphash,
+    verify_hello,
+)
+from t3mpc_ros.radio.protocol.codec import decode_downlink, encode
+from t3mpc_ros.radio.protocol.frames import CommandFlag, FrameError
+
+GOLDEN = json.loads((Path(__file__).parents[1] / 'golden' / 'radio_vectors.json').read_text())
+VECTORS = GOLDEN['authentication']
+KEY = bytes(range(100, 116))
+ALIEN = bytes(range(101, 117))
+COMMAND = frames.Command(9, 1, CommandFlag.ENABLE, 20, 3000, 3000, 0)
+SAMPLES = (
+    COMMAND,
+    frames.ParamSet(9, 2, 0, 15000),
+    frames.Action(9, 3, frames.RESET_ODOMETRY),
+)
+
+
+def meet(key=KEY, host_us=1000, session=9, nonces=(b'HOSTHOST', b'ROBOTROB'), gate=None):
+    """Return both ends of a session."""
+    gate = gate or CommandVerifier(key)
+    assert gate.greet(sign_hello(key, session, 0, host_us, nonces[0]), nonces[1]) == ''
+    return Signer(session_key(key, nonces[0], gate.nonce), host_us), gate
+
+
+def test_golden_session_step_by_step():
+    gate = CommandVerifier(bytes.fromhex(VECTORS['key']))
+    for row in VECTORS['robot']:
+        frame = decode_downlink(bytes.fromhex(row['bytes']))
+        if isinstance(frame, frames.Hello):
+            why = gate.greet(frame, bytes.fromhex(row['fresh_nonce']))
+        else:
+            why = gate.check(frame)
+        assert (why == '', why) == (row['accepted'], row['why']), row['name']
+        assert (gate.session, gate.nonce.hex()) == (row['session'], row['robot_nonce'])
+    for row in VECTORS['robot_without_key']:
+        frame = decode_downlink(bytes.fromhex(row['bytes']))
+        assert (CommandVerifier().greet(frame, bytes(8)) == '') == row['accepted']
+
+
+def test_golden_stops_are_obeyed_all_and_counted_like_any_command():
+    """The gate once let every stop pass without a look; the firmware counted those of the host."""
+    story = VECTORS['stops']
+    gates = [CommandVerifier(bytes.fromhex(VECTORS['key'])) for _ in range(2)]
+    for gate in gates:
+        hello = decode_downlink(bytes.fromhex(story['hello']))
+        assert gate.greet(hello, bytes.fromhex(story['fresh_nonce'])) == ''
+    counted = []
+    for row in story['frames']:
+        frame = decode_downlink(bytes.fromhex(row['bytes']))
+        counted.append(gates[0].admit(frame) == '')
+        assert counted[-1] == row['counted'], row['name']
+        stops = bool(frame.flags & CommandFlag.ESTOP)
+        assert (gates[1].check(frame) == '') == (stops or counted[-1]), row['name']
+    assert len(set(counted)) == 2
+
+
+def test_a_stop_that_is_held_for_hours_keeps_the_epoch():
+    """Both ends count wraps of the host's clock: also while nothing but stops is sent."""
+    signer, gate = meet(host_us=1000)
+    stop = frames.Command(9, 0, CommandFlag.ESTOP, 0, 0, 0, 0)
+    for number in range(1, 7):
+        host_us = (1000 + number * 0x80000001) % (1 << 32)
+        assert gate.admit(signer.sign(stop._replace(seq=number, host_us=host_us))) == ''
+    clear = frames.Command(9, 7, CommandFlag.ESTOP_CLEAR, 0, 0, 0, (host_us + 1) % (1 << 32))
+    assert gate.check(signer.sign(clear)) == ''
+    assert signer.epoch == 3
+
+
+def test_nobody_passes_a_gate_with_a_damaged_key_but_stops_do():
+    gate = CommandVerifier(locked=True)
+    assert gate.nonce == bytes(8)
+    for hello in (frames.Hello(1, 0, 0), sign_hello(bytes(16), 1, 0, 0, bytes(8))):
+        assert gate.greet(hello, bytes(8)) == 'the key is damaged'
+    assert gate.session == 0
+    assert gate.check(frames.Command(1, 0, frames.CommandFlag.ENABLE, 1, 0, 0, 0)) != ''
+    assert gate.check(frames.Command(1, 0, CommandFlag.ESTOP, 1, 0, 0, 0)) == ''
+
+
+def test_the_check_value_tells_keys_apart_and_is_the_published_hash():
+    assert {row['check'] for row in GOLDEN['key_checks']} == {
+        int.from_bytes(siphash(bytes.fromhex(row['key']), b't3mpc')[:4], 'little')
+        for row in GOLDEN['key_checks']
+    }
+    assert all(
+        key_check(bytes.fromhex(row['key'])) == row['check'] for row in GOLDEN['key_checks']
+    )
+
+
+def test_golden_session_keys_and_tags():
+    key = bytes.fromhex(VECTORS['key'])
+    for row in VECTORS['session_keys']:
+        nonces = bytes.fromhex(row['host_nonce']), bytes.fromhex(row['robot_nonce'])
+        assert session_key(key, *nonces).hex() == row['session_key']
+    for row in VECTORS['tags']:
+        frame = decode_downlink(bytes.fromhex(row['bytes']))
+        assert frame_tag(frame, bytes.fromhex(row['session_key']), row['epoch']) == frame.tag
+
+
+@pytest.mark.parametrize('frame', SAMPLES, ids=lambda frame: type(frame).__name__)
+def test_every_bit_of_a_signed_frame_counts(frame):
+    signer, gate = meet()
+    data = encode(signer.sign(frame._replace(host_us=2000)))
+    refused = 0
+    for bit in range(8 * len(data)):
+        flipped = bytearray(data)
+        flipped[bit // 8] ^= 1 << bit % 8
+        try:
+            forged = decode_downlink(bytes(flipped))
+        except FrameError:
+            continue
+        if isinstance(forged, frames.Command) and forged.flags & CommandFlag.ESTOP:
+            continue  # stopping is always allowed
+        if not isinstance(forged, frames.Poll | frames.ParamGet | frames.Hello):
+            refused += 1
+            assert gate.check(forged)
+    assert refused > 6 * len(data)
+    # None of this has cost the true frame anything.
+    assert gate.check(decode_downlink(data)) == ''
+
+
+def test_every_bit_of_a_signed_hello_counts():
+    data = encode(sign_hello(KEY, 9, 1, 5, b'HOSTHOST'))
+    for bit in range(8 * len(data)):
+        flipped = bytearray(data)
+        flipped[bit // 8] ^= 1 << bit % 8
+        try:
+            forged = decode_downlink(bytes(flipped))
+        except FrameError:
+            continue
+        assert not verify_hello(KEY, forged)
+        gate = CommandVerifier(KEY)
+        assert gate.greet(forged, b'ROBOTROB') == 'HELLO has a bad tag'
+        assert gate.session == 0
+
+
+def test_a_tag_of_one_kind_or_session_does_not_fit_another():
+    signer, _ = meet()
+    signed = [signer.sign(frame._replace(host_us=10 + at)) for at, frame in enumerate(SAMPLES)]
+    assert len({frame.tag for frame in signed}) == 3
+    for key in (KEY, ALIEN, session_key(KEY, b'HOSTHOST', b'OTHERROB')):
+        for frame in signed:
+            for epoch in (0, 1):
+                if (key, epoch) != (session_key(KEY, b'HOSTHOST', b'ROBOTROB'), 0):
+                    assert frame_tag(frame, key, epoch) != frame.tag
+
+
+def test_nothing_counts_twice_in_the_same_session():
+    signer, gate = meet()
+    sent = []
+    for step in range(60):
+        frame = SAMPLES[step % 3]._replace(host_us=2000 + 10 * step)
+        signed = signer.sign(frame)
+        assert gate.check(signed) == ''
+        sent.append(signed)
+        for old in sent:
+            assert gate.check(old)
+
+
+def test_nothing_of_an_earlier_session_counts_in_a_later_one():
+    """Numbers and times may repeat: the robot draws a new nonce at every HELLO."""
+    signer, gate = meet()
+    recorded = [signer.sign(COMMAND._replace(host_us=2000 + step)) for step in range(20)]
+    for frame in recorded:
+        assert gate.check(frame) == ''
+    hello = sign_hello(KEY, 9, 0, 1000, b'HOSTHOST')
+    meet(gate=gate, nonces=(b'NEWHOST.', b'NEWROBOT'))
+    for frame in recorded:
+        assert gate.check(frame)
+    # Not even after the recorded HELLO: it gets the recorder a session without a key.
+    assert gate.greet(hello, b'THIRDROB') == ''
+    for frame in recorded:
+        assert gate.check(frame)
+
+
+def test_a_repeated_hello_does_not_change_the_key_under_a_host_that_has_heard_the_answer():
+    signer, gate = meet()
+    signed = signer.sign(COMMAND._replace(host_us=2000))
+    assert gate.greet(sign_hello(KEY, 9, 0, 1000, b'HOSTHOST'), b'OTHERROB') == ''
+    assert gate.nonce == b'ROBOTROB'
+    assert gate.check(signed) == ''
+    assert gate.greet(sign_hello(KEY, 9, 0, 1000, b'HOSTHOST'), b'OTHERROB') == ''
+    assert gate.check(signed) == 'frame is a replay'
+
+
+def test_a_wrong_key_gets_no_session_and_moves_nothing():
+    gate = CommandVerifier(KEY)
+    assert gate.greet(sign_hello(ALIEN, 9, 0, 5, b'HOSTHOST'), b'ROBOTROB') == (
+        'HELLO has a bad tag'
+    )
+    assert gate.session == 0
+    _, gate = meet()
+    alien = Signer(session_key(ALIEN, b'HOSTHOST', b'ROBOTROB'), 1000)
+    for frame in SAMPLES:
+        assert gate.check(alien.sign(frame._replace(host_us=frame.seq + 5000)))
+
+
+def test_both_ends_count_the_wraps_of_host_us_alike():
+    """With commands 20 ms apart and losses of up to a minute, over five wraps: six hours."""
+    source = random.Random(3)
+    signer, gate = meet(host_us=0xFFFFFFF0)
+    now, taken = 0xFFFFFFF0, 0
+    while now < 6 << 32:
+        now += source.choice((20_000, 60_000_000, source.randrange(1, 600_000_000)))
+        signed = signer.sign(COMMAND._replace(host_us=now & 0xFFFFFFFF))
+        assert signer.epoch == (now >> 32)
+        if source.random() < 0.5:  # the others are lost
+            assert gate.check(signed) == ''
+            taken += 1
+    assert taken > 50
+
+
+def test_a_frame_of_before_a_wrap_is_refused_after_it():
+    signer, gate = meet(host_us=0xFFFFFF00)
+    late = signer.sign(COMMAND._replace(host_us=0xFFFFFFFE))
+    assert gate.check(signer.sign(COMMAND._replace(host_us=3))) == ''
+    assert gate.check(late)
+    # The robot tries the epoch after its own for it, and only that.
+    assert gate.check(signer.sign(COMMAND._replace(host_us=4))) == ''
+
+
+def test_the_host_never_signs_the_same_instant_twice():
+    signer, _ = meet()
+    signer.sign(COMMAND._replace(host_us=7000))
+    with pytest.raises(ValueError, match='host_us must increase: got 7000 twice'):
+        signer.sign(COMMAND._replace(host_us=7000))
+
+
+def test_stopping_is_always_allowed_and_releasing_is_not():
+    signer, gate = meet()
+    stop = frames.Command(0, 0, CommandFlag.ESTOP, 0, 0, 0, 0)
+    clear = frames.Command(9, 1, CommandFlag.ESTOP_CLEAR, 0, 0, 0, 5000)
+    for frame in (stop, stop._replace(session=77, tag=bytes(8)), stop._replace(flags=7)):
+        assert gate.check(frame) == ''
+        assert CommandVerifier(KEY).check(frame) == ''
+        assert CommandVerifier().check(frame) == ''
+    assert gate.check(clear) == 'frame is not signed'
+    assert gate.check(clear._replace(tag=bytes(8)))
+    assert gate.check(signer.sign(clear)) == ''
+
+
+def test_keyed_and_open_ends_refuse_each_other():
+    assert CommandVerifier(KEY).greet(frames.Hello(9, 0, 0), bytes(8)) == 'HELLO is not signed'
+    signed = sign_hello(KEY, 9, 0, 0, b'HOSTHOST')
+    assert CommandVerifier().greet(signed, bytes(8)) == 'no key to check the HELLO with'
+    gate = CommandVerifier()
+    assert gate.nonce == b''
+    assert gate.greet(frames.Hello(9, 0, 0), bytes(8)) == ''
+    assert gate.check(COMMAND) == ''
+    assert gate.check(COMMAND._replace(tag=bytes(8))) == 'no key to check the tag with'
+    assert gate.check(COMMAND._replace(session=8)) == 'session is 9: got 8'
+
+
+def test_a_robot_without_session_takes_nothing_of_session_zero():
+    for gate in (CommandVerifier(), CommandVerifier(KEY)):
+        assert gate.check(COMMAND._replace(session=0)) == 'session is 0: got 0'
+
+
+@pytest.mark.parametrize('text', ['6465' * 8, '64 65 ' * 8, ('6465' * 8).upper() + '\n'])
+def test_a_key_file_of_32_digits_is_read(tmp_path, text):
+    path = tmp_path / 'key'
+    path.write_text(text)
+    path.chmod(0o600)
+    assert read_key(path) == b'de' * 8
+    path.chmod(0o400)
+    assert read_key(path) == b'de' * 8
+
+
+@pytest.mark.parametrize(
+    'text, mode, expected',
+    [
+        ('6465' * 8, 0o640, 'closed to all but its owner: got mode 0640; chmod 600'),
+        ('6465' * 8, 0o604, 'closed to all but its owner'),
+        ('6465' * 7, 0o600, 'must hold 32 hexadecimal digits: got 28'),
+        ('secret' * 5 + 'zz', 0o600, 'must hold hexadecimal digits only'),
+        ('schlüssel', 0o600, 'must hold hexadecimal digits only'),
+    ],
+)
+def test_a_key_file_that_will_not_do_is_refused_without_quoting_it(tmp_path, text, mode, expected):
+    path = tmp_path / 'key'
+    path.write_text(text)
+    path.chmod(mode)
+    with pytest.raises(KeyFileError, match=expected) as error:
+        read_key(path)
+    assert text[:6] not in str(error.value)
+    assert error.value.__cause__ is None
+
+
+def test_a_key_file_that_is_missing_is_named(tmp_path):
+    with pytest.raises(KeyFileError, match='cannot be read: No such file'):
+        read_key(tmp_path / 'nothing')

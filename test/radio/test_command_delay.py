@@ -1,0 +1,70 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""How late the radio makes a controller's command: what ``estimate.dead_time`` has to say."""
+
+import random
+
+import numpy as np
+import pytest
+from support.emulator_bench import MS, RobotBench
+
+from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.robot.interface import RobotCommand
+
+DEAD_TIME = 0.02
+"""s: what the demonstration and the launch file of the real robot tell the controller."""
+
+
+class Controlled(RobotBench):
+    """A controller answers each state, milliseconds later; whoever is to wake does so late."""
+
+    def __init__(self, thinking_ns, lateness_ns, **given):
+        super().__init__(**given)
+        self._thinking_ns, self._lateness_ns = thinking_ns, lateness_ns
+        self._dice = random.Random(8)
+        self._due = []
+        self.answers = {}
+        """When the state was sampled that each command answers, by its left speed in mrad/s."""
+
+    def _step(self, received):
+        self.now_ns += self._dice.randrange(self._lateness_ns + 1)
+        super()._step(received)
+        for state in self.states:
+            # Slow enough that no ramp delays it, and no two alike.
+            number = 2000 + len(self.answers) % 2000
+            self.answers[number] = state.stamp_ns
+            thinking = round(self._thinking_ns * self._dice.uniform(0.5, 1.5))
+            self._due.append((self.now_ns + thinking, number / 1000.0))
+        self.states.clear()
+        if self._due:
+            self.wake_ns = min(self.wake_ns, self._due[0][0])
+
+    def _command(self):
+        while self._due and self._due[0][0] <= self.now_ns:
+            _, speed = self._due.pop(0)
+            self.robot.apply(RobotCommand(WheelSpeeds(speed, speed), self.now_ns), self.now_ns)
+
+
+@pytest.mark.parametrize('thinking', [1.0, 3.0, 8.0])
+@pytest.mark.parametrize('lateness', [0.0, 0.3, 1.0])
+@pytest.mark.parametrize('loss', [0.0, 0.1])
+def test_a_command_is_obeyed_one_cycle_after_what_it_answers(thinking, lateness, loss):
+    """The guard once had a clock of its own beside the link's cycle.
+
+    A thread that woke a little late let them slip against each other: then each command waited
+    for the cycle after the next, 39 ms instead of 19, for as long as the phase stayed so.
+    """
+    bench = Controlled(round(thinking * MS), round(lateness * MS))
+    bench.connect()
+    bench.inject('loss', 100.0, loss)
+    bench.run(20.0)
+    found = [
+        (now_ns - bench.answers[command.left]) / 1e9
+        for now_ns, command in bench.followed[50:]
+        if command.left in bench.answers
+    ]
+    assert len(found) > 800
+    middle, late = np.median(found), np.quantile(found, 0.95)
+    print(f'\n{1e3 * middle:.1f} ms, {1e3 * late:.1f} ms (95 %) after the sample')
+    assert middle == pytest.approx(DEAD_TIME, abs=0.0015)
+    assert late <= DEAD_TIME + 0.003

@@ -1,0 +1,281 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Frames: golden bytes, round trips, and nothing between a whole frame and none."""
+
+import importlib.util
+import json
+from pathlib import Path
+import random
+
+import pytest
+
+from t3mpc_ros.radio.protocol import codec, frames
+from t3mpc_ros.radio.protocol.codec import (
+    decode_downlink,
+    decode_from_board,
+    decode_from_dongle,
+    decode_to_board,
+    decode_to_dongle,
+    decode_uplink,
+    encode,
+)
+from t3mpc_ros.radio.protocol.frames import FrameError, FrameErrorKind
+from t3mpc_ros.radio.protocol.framing import encode_frame
+
+GOLDEN = Path(__file__).parents[1] / 'golden'
+VECTORS = json.loads((GOLDEN / 'radio_vectors.json').read_text())
+DECODERS = {
+    'down': decode_downlink,
+    'up': decode_uplink,
+    'to_dongle': decode_to_dongle,
+    'from_dongle': decode_from_dongle,
+    'to_board': decode_to_board,
+    'from_board': decode_from_board,
+}
+ROWS = [(way, row) for way in DECODERS for row in VECTORS[way]]
+WAYS = {
+    decode_downlink: (
+        frames.Command,
+        frames.ParamGet,
+        frames.ParamSet,
+        frames.Hello,
+        frames.Poll,
+        frames.Action,
+    ),
+    decode_uplink: (frames.State, frames.Param, frames.Info, frames.Ack, frames.Aux),
+    decode_to_dongle: (frames.Transmit, frames.Configure, frames.Ping),
+    decode_from_dongle: (frames.Result, frames.Configured, frames.Pong, frames.Refusal),
+    decode_to_board: (frames.Ping, frames.Key),
+    decode_from_board: (frames.Pong, frames.KeyState, frames.Refusal),
+}
+KINDS = [(kind, decode) for decode, kinds in WAYS.items() for kind in kinds]
+
+# Without their optional end these are frames, too: unsigned, or a question.
+SHORTER = {
+    frames.Command: 14,
+    frames.ParamSet: 8,
+    frames.Action: 6,
+    frames.Info: 17,
+    frames.Configure: 2,
+    frames.Key: 2,
+}
+
+
+def frame_of(row):
+    kind = getattr(frames, row['kind'])
+    return kind(
+        **{
+            name: bytes.fromhex(value) if isinstance(value, str) else value
+            for name, value in row['fields'].items()
+        }
+    )
+
+
+def columns(kind, signed):
+    """Return name -> (code, low, high) of the fields of a frame with a fixed layout."""
+    form = codec._LAYOUTS[kind].forms[-1 if signed else 0]
+    return {column.name: column for column in form._columns if column.name in kind._fields}
+
+
+def some(kind, source, extreme=None):
+    """Return a frame with random fields, each in its range; with extreme, at one end of it."""
+    values = {}
+    for name, column in columns(kind, source.random() < 0.5).items():
+        if column.code.endswith('s'):
+            values[name] = source.randbytes(column.high)
+        elif extreme is not None:
+            values[name] = (column.low, column.high)[extreme]
+        else:
+            values[name] = source.randint(column.low, column.high)
+    if kind is frames.Transmit:
+        values['first'] = source.randbytes(source.randint(1, 32))
+        values['second'] = source.randbytes(source.randint(0, 32))
+    if kind is frames.Result:
+        first, second = source.choice(
+            [(0x01, 0x03), (0xF3, 0x21), (0x03, 0xF4), (0x34, 0x08), (0x11, 0x01), (0, 0)]
+        )
+        values |= {'first': first, 'second': second}
+        answered = 2 & (first | second)
+        values['payload'] = source.randbytes(source.randint(1, 32)) if answered else b''
+    return kind(**values)
+
+
+def test_the_frames_of_the_specification_byte_for_byte():
+    command = frames.Command(0x5A, 7, frames.CommandFlag.ENABLE, 20, 5000, -2500, 0x01020304)
+    data = encode(command)
+    assert data == bytes.fromhex('115a0701140088133cf604030201')
+    sent = encode(frames.Transmit(0x2A, 6, data, encode(frames.Poll(0x5A, 7, frames.STATE))))
+    assert encode_frame(sent).hex() == '0a012a060e115a0701140c88133cf604030201155a070398b400'
+    state = frames.State(
+        0x5A, 7, 3, 123456789, 1000, -1000, -131, 164, 0, 76, bytes.fromhex('a0fe013c00145078')
+    )
+    assert encode(state).hex() == (
+        '115a070315cd5b07e803000018fcffff7dffa40000004c00a0fe013c00145078'
+    )
+    result = frames.Result(0x2A, 0x03, 0x13, 0x075BCA00, encode(state))
+    assert encode_frame(encode(result)).hex() == (
+        '05812a03130eca5b07115a070315cd5b07e803010818fcffff7dffa40101024c05a0fe013c06145078142300'
+    )
+    assert codec.decode_exchange_status(0x13) == (True, True, False, False, 1)
+
+
+def test_the_committed_vectors_are_what_their_script_writes():
+    spec = importlib.util.spec_from_file_location('writer', GOLDEN / 'write_radio_vectors.py')
+    writer = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(writer)
+    assert writer.TARGET.read_text() == writer.text()
+
+
+@pytest.mark.parametrize('way, row', ROWS, ids=[f'{way}-{row["name"]}' for way, row in ROWS])
+def test_golden_vectors_both_ways(way, row):
+    frame, data = frame_of(row), bytes.fromhex(row['bytes'])
+    assert encode(frame) == data
+    decoded = DECODERS[way](data)
+    assert decoded == frame
+    assert type(decoded) is type(frame)
+    if 'wire' in row:
+        assert encode_frame(data).hex() == row['wire']
+
+
+def test_every_kind_has_a_golden_vector():
+    assert {row['kind'] for _, row in ROWS} == {kind.__name__ for kind, _ in KINDS}
+
+
+@pytest.mark.parametrize('row', VECTORS['rejected'], ids=lambda row: row['bytes'][:20])
+def test_golden_rejections(row):
+    with pytest.raises(FrameError) as error:
+        DECODERS[row['direction']](bytes.fromhex(row['bytes']))
+    assert error.value.fault is FrameErrorKind(row['fault'])
+
+
+@pytest.mark.parametrize('kind, decode', KINDS)
+def test_every_field_survives_the_round_trip(kind, decode):
+    source = random.Random(7)
+    for extreme in [0, 1, *200 * [None]]:
+        frame = some(kind, source, extreme)
+        data = encode(frame)
+        again = decode(data)
+        assert again == frame
+        assert encode(again) == data
+
+
+@pytest.mark.parametrize('kind, decode', KINDS)
+def test_what_does_not_fit_is_not_encoded_and_the_error_says_which_field(kind, decode):
+    source = random.Random(8)
+    good = some(kind, source)
+    for name, column in columns(kind, good[-1] != b'').items():
+        if column.code.endswith('s'):
+            bad = [bytes(column.high + 1), bytes(column.high - 1), None, 3]
+        else:
+            bad = [column.low - 1, column.high + 1, None, 1.5, b'']
+        for value in bad:
+            if value in (b'', bytes(0)) and name == kind._fields[-1]:
+                continue
+            with pytest.raises(FrameError, match=rf'\.{name} must be .*: got'):
+                encode(good._replace(**{name: value}))
+
+
+@pytest.mark.parametrize('kind, decode', KINDS)
+def test_every_truncation_and_every_byte_too_many_is_rejected(kind, decode):
+    source = random.Random(9)
+    for _ in range(20):
+        data = encode(some(kind, source))
+        if kind is frames.Transmit:
+            # Its end has no length of its own: the CRC of the line vouches for it.
+            shortest = 4 + data[3]
+        elif kind is frames.Result and len(data) > 8:
+            shortest = 9
+        else:
+            shortest = len(data)
+        for size in range(shortest):
+            if size == SHORTER.get(kind):
+                assert encode(decode(data[:size])) == data[:size]
+                continue
+            with pytest.raises(FrameError) as error:
+                decode(data[:size])
+            # A HELLO says by a flag whether it is signed.
+            flagged = kind is frames.Hello and size == 8
+            assert error.value.fault is (
+                FrameErrorKind.VALUE if flagged else FrameErrorKind.LENGTH
+            )
+        if kind not in (frames.Transmit, frames.Result):
+            with pytest.raises(FrameError):
+                decode(data + b'\0')
+
+
+@pytest.mark.parametrize('kind, decode', KINDS)
+def test_every_bit_flip_is_rejected_or_read_whole(kind, decode):
+    """A radio payload has no CRC of its own: what passes must at least be exactly what it says."""
+    source = random.Random(10)
+    for _ in range(10):
+        data = encode(some(kind, source))
+        for bit in range(8 * len(data)):
+            flipped = bytearray(data)
+            flipped[bit // 8] ^= 1 << bit % 8
+            try:
+                frame = decode(bytes(flipped))
+            except FrameError:
+                continue
+            assert encode(frame) == flipped
+            assert frame != decode(data) or type(frame) is not kind
+
+
+@pytest.mark.parametrize('decode', list(WAYS))
+def test_random_bytes_are_rejected_or_read_whole(decode):
+    source = random.Random(11)
+    whole = [encode(some(kind, source)) for kind in WAYS[decode]]
+    read = 0
+    for _ in range(4000):
+        data = source.randbytes(source.randint(0, 80))
+        if source.random() < 0.8:
+            frame = source.choice(whole)
+            # Of the right length, half of the time, and with a few bytes that are right.
+            size = source.choice((len(data), len(frame)))
+            data = (frame[: source.randint(1, 4)] + source.randbytes(80))[:size]
+        try:
+            frame = decode(data)
+        except FrameError:
+            continue
+        read += 1
+        assert encode(frame) == data
+    assert read > 10
+
+
+def test_widths_beyond_what_the_chip_can_hold_are_rejected():
+    """A chip that claims more than 32 bytes is a known way to overrun whoever believes it."""
+    for size in range(33, 256):
+        for decode in (decode_downlink, decode_uplink):
+            for head in (b'\x11', b'\x13', b'\x14'):
+                with pytest.raises(FrameError, match='1 to 32 bytes'):
+                    decode(head + bytes(size - 1))
+
+
+def test_another_version_is_told_from_another_kind():
+    for head in range(256):
+        for decode in (decode_downlink, decode_uplink):
+            with pytest.raises(FrameError) as error:
+                decode(bytes([head, 0, 0]))
+            assert (error.value.fault is FrameErrorKind.VERSION) == (head >> 4 != 1)
+
+
+def test_a_field_that_only_a_signed_frame_has_is_not_lost_silently():
+    with pytest.raises(FrameError, match=r'PARAM_SET.host_us must be 0 without tag: got 5'):
+        encode(frames.ParamSet(1, 2, 3, 4, host_us=5))
+    with pytest.raises(FrameError, match=r'HELLO.nonce must be b.. without tag'):
+        encode(frames.Hello(1, 2, 3, nonce=bytes(8)))
+
+
+def test_a_result_that_contradicts_itself_is_rejected():
+    good = 0
+    for first in range(256):
+        for payload in (b'', b'\1'):
+            try:
+                encode(frames.Result(0, first, 0, 0, payload))
+            except FrameError:
+                continue
+            good += 1
+            said = codec.decode_exchange_status(first)
+            assert bool(payload) == said.answered
+            assert said.acknowledged + said.given_up + said.skipped <= 1
+    # Sixteen counts of tries each: acknowledged, answered, given up, none of them; once skipped.
+    assert good == 4 * 16 + 1

@@ -1,0 +1,209 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The splitter finds every good frame and no other, whatever happens to the bytes."""
+
+import json
+from pathlib import Path
+import random
+
+import pytest
+
+from t3mpc_ros.radio.protocol import framing as module
+from t3mpc_ros.radio.protocol.framing import (
+    FRAME_LIMIT,
+    FrameDecoder,
+    cobs_decode,
+    cobs_encode,
+    crc16,
+    encode_frame,
+)
+
+VECTORS = json.loads((Path(__file__).parents[1] / 'golden' / 'radio_vectors.json').read_text())
+
+
+def random_frame(source, longest=FRAME_LIMIT):
+    # Zeros and 255 are what stuffing is about.
+    size = source.randint(1, longest)
+    return bytes(source.choice((0, 255, source.randrange(256))) for _ in range(size))
+
+
+def damage(wire, source):
+    """Return the bytes of a frame after something happened to them."""
+    at = source.randrange(len(wire))
+    match source.randrange(4):
+        case 0:
+            return wire[:at] + bytes([wire[at] ^ 1 << source.randrange(8)]) + wire[at + 1 :]
+        case 1:
+            return wire[:at] + wire[at + 1 :]
+        case 2:
+            return wire[:at] + source.randbytes(source.randint(1, 5)) + wire[at:]
+        case _:
+            return wire[:at] + wire[at : at + 1] + wire[at:]
+
+
+def test_crc_check_value_and_golden_vectors():
+    assert crc16(b'123456789') == 0x29B1
+    for row in VECTORS['crc16']:
+        assert crc16(bytes.fromhex(row['bytes'])) == row['crc']
+
+
+def test_crc_is_the_division_by_its_polynomial():
+    source = random.Random(1)
+    for _ in range(50):
+        data = source.randbytes(source.randint(0, 40))
+        register = 0xFFFF
+        for byte in data:
+            register ^= byte << 8
+            for _ in range(8):
+                register = register << 1 ^ (0x1021 if register & 0x8000 else 0)
+                register &= 0xFFFF
+        assert crc16(data) == register
+
+
+def test_stuffing_golden_vectors():
+    for row in VECTORS['cobs']:
+        data, stuffed = bytes.fromhex(row['bytes']), bytes.fromhex(row['stuffed'])
+        assert cobs_encode(data) == stuffed
+        assert cobs_decode(stuffed) == data
+    for row in VECTORS['wire']:
+        assert encode_frame(bytes.fromhex(row['bytes'])).hex() == row['wire']
+
+
+def test_stuffing_costs_one_byte_leaves_no_zero_and_can_be_undone():
+    source = random.Random(2)
+    for size in range(254):
+        data = bytes(source.choice((0, source.randrange(256))) for _ in range(size))
+        stuffed = cobs_encode(data)
+        assert len(stuffed) == size + 1
+        assert 0 not in stuffed
+        assert cobs_decode(stuffed) == data
+    with pytest.raises(ValueError, match='at most 254 bytes long: got 255'):
+        cobs_encode(bytes(255))
+
+
+def test_only_what_stuffing_makes_can_be_unstuffed():
+    source = random.Random(3)
+    undone = 0
+    for _ in range(20000):
+        stuffed = bytes(source.randint(0, 6) for _ in range(source.randint(0, 8)))
+        data = cobs_decode(stuffed)
+        if data is not None:
+            undone += 1
+            assert cobs_encode(data) == stuffed
+    assert undone > 500
+
+
+def test_frames_that_do_not_fit_are_refused():
+    for frame in (b'', bytes(FRAME_LIMIT + 1)):
+        with pytest.raises(ValueError, match=f'must have 1 to 78 bytes: got {len(frame)}'):
+            encode_frame(frame)
+
+
+def test_the_stream_may_be_cut_anywhere():
+    source = random.Random(4)
+    sent = [random_frame(source) for _ in range(40)]
+    stream = b''.join(encode_frame(frame) for frame in sent)
+    stream = stream[:500] + b'rubbish' + stream[500:1200] + b'\0\0\0' + stream[1200:]
+    whole = FrameDecoder()
+    expected = whole.feed(stream)
+    assert len(expected) > 35
+    for step in (1, 2, 3, 7, 64, 1000):
+        splitter = FrameDecoder()
+        found = []
+        for at in range(0, len(stream), step):
+            found += splitter.feed(stream[at : at + step])
+        assert found == expected
+        assert splitter.counts == whole.counts
+    for cut in range(0, len(stream), 3):
+        splitter = FrameDecoder()
+        assert splitter.feed(stream[:cut]) + splitter.feed(stream[cut:]) == expected
+
+
+def test_zeros_in_a_row_are_no_errors():
+    splitter = FrameDecoder()
+    assert splitter.feed(b'\0\0' + encode_frame(b'abc') + b'\0\0\0' + encode_frame(b'd')) == [
+        b'abc',
+        b'd',
+    ]
+    assert splitter.counts == (2, 0, 0)
+
+
+def test_each_kind_of_error_is_counted_once():
+    good = encode_frame(b'good')
+    for bad, counted in (
+        (cobs_encode(b'wrong' + b'\0\0') + b'\0', (0, 1, 0)),
+        (cobs_encode(b'\1\2') + b'\0', (0, 0, 1)),  # a CRC and nothing before it
+        (b'\x01\0', (0, 0, 1)),
+        (b'\x09\x01\0', (0, 0, 1)),  # a run beyond the end
+        (bytes([7]) * 500 + b'\0', (0, 0, 1)),
+        (cobs_encode(bytes(79) + crc16(bytes(79)).to_bytes(2, 'little')) + b'\0', (0, 0, 1)),
+    ):
+        splitter = FrameDecoder()
+        assert splitter.feed(bad + good) == [b'good']
+        assert splitter.counts == (counted[0] + 1, *counted[1:])
+
+
+def test_a_million_random_bytes_give_nothing_and_take_no_room():
+    """CRC-16 lets one in 65 536 well-formed pieces pass; few pieces of noise are well-formed."""
+    source = random.Random(5)
+    splitter, found = FrameDecoder(), []
+    for _ in range(1000):
+        found += splitter.feed(source.randbytes(1000))
+        assert len(splitter._kept) <= module._ENCODED_LIMIT
+    counts = splitter.counts
+    assert counts.frames == len(found) <= 1
+    assert counts.crc_errors + counts.frame_errors > 3500  # a zero every 256 bytes
+    splitter.feed(b'\0')
+    assert splitter.feed(encode_frame(b'still here')) == [b'still here']
+
+
+def test_a_flood_without_a_zero_takes_no_room():
+    splitter = FrameDecoder()
+    for _ in range(100):
+        assert splitter.feed(b'\x55' * 10000) == []
+        assert len(splitter._kept) <= module._ENCODED_LIMIT
+    assert splitter.feed(b'\0' + encode_frame(b'now')) == [b'now']
+    assert splitter.counts == (1, 0, 1)
+
+
+def test_every_single_bit_flip_is_found():
+    source = random.Random(6)
+    for _ in range(20):
+        wire = encode_frame(random_frame(source))
+        for bit in range(8 * len(wire)):
+            flipped = bytearray(wire)
+            flipped[bit // 8] ^= 1 << bit % 8
+            assert FrameDecoder().feed(bytes(flipped) + b'\0') == []
+
+
+def test_with_most_frames_damaged_no_wrong_one_passes_and_the_next_good_one_always_does():
+    """A damaged frame may swallow the one behind it (its zero is gone), never the one after."""
+    source = random.Random(7)
+    splitter = FrameDecoder()
+    wrong = damaged = neighbours = 0
+    after_good = False
+    for number in range(20000):
+        # Told apart by their numbers: a frame of another round is a wrong one.
+        frame = number.to_bytes(4, 'little') + random_frame(source, 30)
+        hit = source.random() < 0.6
+        wire = damage(encode_frame(frame), source) if hit else encode_frame(frame)
+        found = splitter.feed(wire)
+        damaged += hit
+        wrong += sum(one != frame for one in found)
+        if not hit:
+            neighbours += frame not in found
+            assert frame in found or not after_good
+        after_good = not hit
+    assert damaged > 11000
+    # One in 65 536 is what the CRC promises; these are 12 000 damages.
+    assert wrong <= 2
+    assert neighbours < 0.1 * damaged
+
+
+def test_what_was_begun_before_a_new_connection_is_forgotten():
+    splitter = FrameDecoder()
+    wire = encode_frame(b'of this connection')
+    splitter.feed(wire[:5])
+    splitter.forget()
+    assert splitter.feed(wire) == [b'of this connection']
+    assert splitter.counts == (1, 0, 0)

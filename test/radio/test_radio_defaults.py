@@ -1,0 +1,82 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Both boards, the emulator, the host and the documents meet on one channel without being told."""
+
+from pathlib import Path
+import re
+
+import yaml
+
+from t3mpc_ros.emulator.board import uplink
+from t3mpc_ros.emulator.board.robot_board import SETTLE_SLOW_US, SETTLE_US
+from t3mpc_ros.emulator.emulator import EmulatorParameters
+from t3mpc_ros.emulator.link import dongle
+from t3mpc_ros.emulator.link.radio_channel import RadioParameters
+from t3mpc_ros.radio.link.link_parameters import LinkParameters
+
+ROOT = Path(__file__).resolve().parents[2]
+HOST = LinkParameters().configure(0)
+
+
+def defined(header, name):
+    """Return what a header defines, of several lines as one."""
+    text = (ROOT / 'firmware' / 'core' / header).read_text().replace('\\\n', ' ')
+    (value,) = re.findall(rf'^ *#define {name}\s+(.*?)(?://.*)?$', text, re.MULTILINE)
+    return value.strip()
+
+
+def test_the_firmware_starts_where_the_host_looks():
+    channel, rate = (int(defined('t3_port.h', f'T3_RADIO_{name}')) for name in ('CHANNEL', 'RATE'))
+    delays = re.fullmatch(
+        r'\(T3_RADIO_RATE == 0 \? (\d+) : (\d+)\)', defined('t3_port.h', 'T3_RETRY_DELAY')
+    )
+    slow, usual = map(int, delays.groups())
+    assert (slow, usual) == tuple(
+        LinkParameters(rate=rate).configure(0).retry_delay for rate in ('250k', '1M')
+    )
+    everything = re.fullmatch(
+        r'\{T3_RADIO_CHANNEL, T3_RADIO_RATE, (\d), T3_RETRY_DELAY, (\d), \{(.*)\}\}',
+        defined('t3_port.h', 'T3_RADIO_DEFAULTS'),
+    )
+    power, retries, letters = everything.groups()
+    address = ''.join(re.findall("'(.)'", letters)).encode()
+    there = (channel, rate, int(power), usual, int(retries), address)
+    assert there == HOST[1:]
+
+
+def test_the_emulator_starts_where_the_host_looks():
+    assert tuple(RadioParameters()) == HOST[1:]
+    parameters = EmulatorParameters()
+    assert (parameters.channel, parameters.rate) == (
+        LinkParameters().channel,
+        LinkParameters().rate,
+    )
+
+
+def test_the_documents_name_the_same_place():
+    text = (ROOT / 'docs' / 'radio.md').read_text()
+    letters = HOST.address.hex(' ')
+    rates = {0: '250 kbit/s', 1: '1 Mbit/s', 2: '2 Mbit/s'}
+    said = (
+        f'both ends start with `{HOST.address.decode()}` ({letters}) on channel {HOST.channel} at '
+        f'{rates[HOST.rate]}'
+    )
+    assert said in ' '.join(text.split())
+
+
+def test_no_configuration_moves_one_end_alone():
+    for path in (ROOT / 'config').glob('*.yaml'):
+        for content in yaml.safe_load(path.read_text()).values():
+            link = content['ros__parameters'].get('link', {})
+            for name, value in link.items():
+                if name in ('channel', 'rate', 'address'):
+                    assert value == getattr(LinkParameters(), name), path.name
+
+
+def test_the_emulated_boards_say_they_are_the_firmware_they_stand_for():
+    number = [
+        int(defined('t3_protocol.h', f'T3_FIRMWARE_{name}')[:-1]) for name in ('MAJOR', 'MINOR')
+    ]
+    assert number == [uplink.FIRMWARE_MAJOR, uplink.FIRMWARE_MINOR] == [dongle.MAJOR, dongle.MINOR]
+    for name, value in (('T3_SETTLE_US', SETTLE_US), ('T3_SETTLE_SLOW_US', SETTLE_SLOW_US)):
+        assert int(defined('t3_robot.h', name)[:-1]) == value

@@ -1,0 +1,1014 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The link against a scripted dongle and robot, in virtual time."""
+
+import math
+import random
+
+import numpy as np
+import pytest
+from support.radio_bench import MS, Bench, FakeRobot
+
+from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.parameters.table import ParameterError
+from t3mpc_ros.radio.link import port_actions
+from t3mpc_ros.radio.link.handshake import Session
+from t3mpc_ros.radio.link.link_parameters import LinkParameters
+from t3mpc_ros.radio.link.port_actions import LinkState
+from t3mpc_ros.radio.link.setpoint import SetpointArbiter
+from t3mpc_ros.radio.link.statistics import DiagnosticLevel, LinkStatistics
+from t3mpc_ros.radio.link.telemetry import TelemetryDecoder
+from t3mpc_ros.radio.link.transaction import TransactionLayer
+from t3mpc_ros.radio.protocol import frames
+from t3mpc_ros.radio.protocol.codec import encode
+from t3mpc_ros.radio.protocol.frames import BOARD_PARAMETERS, CommandFlag
+from t3mpc_ros.radio.protocol.framing import encode_frame
+from t3mpc_ros.robot.interface import RobotCommand
+
+KEY = bytes(range(60, 76))
+ALIEN = bytes(range(61, 77))
+
+
+@pytest.fixture(params=[b'', KEY], ids=['open', 'keyed'])
+def bench(request):
+    """Return a bench whose link runs and drives."""
+    made = Bench(key=request.param)
+    made.connect()
+    made.drive(3.0, -2.0)
+    made.run(0.5)
+    assert made.robot.speeds == (-2.0, 3.0)
+    assert made.link.reason(made.now_ns) == ''
+    return made
+
+
+def running(bench):
+    return bench.link.phase is LinkState.RUN
+
+
+def moving(bench):
+    return bench.robot.speeds == (-2.0, 3.0) and bench.link.reason(bench.now_ns) == ''
+
+
+def commands(bench, since_ns=0):
+    return [
+        frame
+        for at, frame in bench.robot.log
+        if isinstance(frame, frames.Command) and at >= since_ns
+    ]
+
+
+# -- connecting -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('key', [b'', KEY])
+def test_from_a_closed_port_to_running(key):
+    bench = Bench(key=key)
+    assert bench.link.phase is LinkState.CLOSED
+    assert bench.connect() < 0.2
+    assert bench.phases == [
+        LinkState.PING,
+        LinkState.CFG,
+        LinkState.HELLO,
+        LinkState.PARAMS,
+        LinkState.RUN,
+    ]
+    assert bench.robot.speeds == (0.0, 0.0)
+    bench.run(0.1)
+    assert bench.link.reason(bench.now_ns) == port_actions.NO_COMMAND
+    assert bench.link.authenticated == bool(key)
+    assert all(bool(frame.tag) == bool(key) for frame in commands(bench))
+    info = bench.link.info
+    assert (info.steps_per_rev, info.microsteps) == (200, 16)
+
+
+@pytest.mark.parametrize('key', [b'', KEY])
+def test_a_robot_that_answers_hello_with_a_state_is_asked_who_it_is(key):
+    """So it is whenever the POLL behind HELLO gets lost: the first packet fetched a state."""
+    bench = Bench(key=key)
+    take = bench.robot.take
+
+    def plain(data, now_ns):
+        take(data, now_ns)
+        if data[0] == 0x14:
+            bench.robot.answer = None
+
+    bench.robot.take = plain
+    assert bench.connect() < 0.2
+    assert bench.phases[2:5] == [LinkState.HELLO, LinkState.INFO, LinkState.PARAMS]
+
+
+def test_parameters_are_written_and_read_back():
+    parameters = LinkParameters().with_values(
+        {
+            'robot.max_speed': 7.5,
+            'robot.acceleration': 12.0,
+            'robot.deceleration': 22.0,
+            'robot.ttl_max': 0.3,
+            'robot.battery_low': 9.9,
+            'robot.idle_off': 60.0,
+            'robot.invert_right': True,
+        }
+    )
+    bench = Bench(parameters)
+    bench.connect()
+    expected = {
+        'max_speed': 7500,
+        'acceleration': 12000,
+        'deceleration': 22000,
+        'ttl_max': 300,
+        'microsteps': 16,
+        'steps_per_rev': 200,
+        'gyro_range': 500,
+        'battery_low': 9900,
+        'idle_off': 60000,
+        'invert_wheels': 2,
+    }
+    assert bench.link.parameters == expected
+    assert bench.robot.parameters == list(expected.values())
+    order = [type(frame).__name__ for _, frame in bench.robot.log]
+    assert order.index('ParamGet') > max(at for at, name in enumerate(order) if name == 'ParamSet')
+
+
+def test_defaults_of_the_settings_are_those_of_the_robot():
+    wire = LinkParameters().robot.on_wire()
+    assert len(wire) == 7
+    for number, value in wire.items():
+        row = BOARD_PARAMETERS[number]
+        assert value == row.default
+        assert row.low <= value <= row.high
+        assert row.low < row.high, 'read-only'
+
+
+def test_a_dongle_that_is_reset_by_opening_the_port_gets_the_time_it_needs():
+    bench = Bench()
+    bench.dongle.boot_delay_ns = 1500 * MS
+    bench.dongle.restart(bench.now_ns)
+    bench.run(1.0)
+    assert bench.link.phase is LinkState.PING
+    assert bench.link.reason(bench.now_ns) == port_actions.DONGLE_STARTING
+    assert bench.run(3.0, lambda: running(bench)) < 0.8
+    assert len(bench.opens) == 1
+
+
+def test_something_that_is_no_dongle_is_given_up_after_five_seconds_less_and_less_often():
+    """A GPS receiver that talks without being asked."""
+    bench = Bench()
+    bench.dongle.take = lambda data, now_ns: [(now_ns + MS, b'$GPGGA,123519,4807.038,N*47\r\n')]
+    bench.run(40.0)
+    gaps = np.diff(bench.opens) / 1e9
+    np.testing.assert_allclose(gaps, [5.2, 5.4, 5.8, 6.6, 7.0, 7.0][: len(gaps)], atol=0.02)
+    assert len(gaps) >= 5
+    assert bench.link.reason(bench.now_ns) in (
+        port_actions.NO_DONGLE,
+        port_actions.DONGLE_STARTING,
+    )
+
+
+def test_a_port_in_use_is_tried_less_and_less_often_and_the_reason_is_the_ports():
+    bench = Bench()
+    bench.problem = ('/dev/ttyUSB0 is busy', False)
+    bench.run(12.0)
+    assert bench.link.reason(bench.now_ns) == '/dev/ttyUSB0 is busy'
+    np.testing.assert_allclose(np.diff(bench.opens[:7]) / 1e9, [0.2, 0.4, 0.8, 1.6, 2.0, 2.0])
+    bench.problem = ('', True)
+    assert bench.connect() < 2.2
+    # Once a dongle has answered, the next trouble is not held against the port.
+    bench.problem = ('/dev/ttyUSB0 is busy', False)
+    bench.link.failed('/dev/ttyUSB0 failed', False, bench.now_ns)
+    since = len(bench.opens)
+    bench.run(2.0)
+    np.testing.assert_allclose(np.diff(bench.opens[since : since + 3]) / 1e9, [0.4, 0.8])
+
+
+def test_a_busy_port_that_is_pulled_out_is_tried_at_once_when_it_comes_back():
+    """The long waits were kept over an absence: a device that came back free had to wait 2 s."""
+    bench = Bench()
+    bench.problem = ('/dev/ttyUSB0 is busy', False)
+    bench.run(8.0)
+    assert np.diff(bench.opens)[-1] / 1e9 == pytest.approx(2.0)
+    bench.problem = ('/dev/ttyUSB0 is not there', True)
+    bench.plugged = False
+    bench.run(6.0)
+    np.testing.assert_allclose(np.diff(bench.opens[-10:]) / 1e9, 0.2)
+    assert bench.link.reason(bench.now_ns) == '/dev/ttyUSB0 is not there'
+    # Back, but held again: not less and less often from where it was, but from the start.
+    bench.problem = ('/dev/ttyUSB0 is busy', False)
+    since = len(bench.opens)
+    bench.run(4.0)
+    gaps = np.diff(bench.opens[since : since + 4]) / 1e9
+    np.testing.assert_allclose(gaps, [0.2, 0.4, 0.8])
+    bench.problem = ('', True)
+    bench.plug()
+    assert bench.connect() < 2.2
+
+
+def test_a_device_that_is_absent_is_looked_for_five_times_a_second_however_long():
+    """However long it was away, the robot drives within a second of the dongle's return."""
+    bench = Bench()
+    bench.plugged = False
+    bench.run(60.0)
+    np.testing.assert_allclose(np.diff(bench.opens) / 1e9, 0.2)
+    bench.plug()
+    assert bench.connect() < 0.4
+
+
+def test_a_dongle_that_does_not_take_what_is_set_is_named():
+    """Its radio would talk to nobody, or to somebody else's robot."""
+    bench = Bench()
+    reply = bench.dongle.reply
+
+    def stubborn(frame, now_ns):
+        at, answer = reply(frame, now_ns)
+        if isinstance(answer, frames.Configured):
+            answer = answer._replace(channel=76)
+        return at, answer
+
+    bench.dongle.reply = stubborn
+    bench.run(2.0)
+    assert bench.link.reason(bench.now_ns) == port_actions.RADIO_NOT_CONFIGURED
+    assert LinkState.HELLO not in bench.phases
+    bench.dongle.reply = reply
+    assert bench.connect() < 0.3
+
+
+def test_a_dongle_without_a_radio_chip_is_named_and_noticed_when_repaired():
+    bench = Bench()
+    bench.dongle.chip_ok = False
+    bench.run(10.0)
+    assert bench.link.reason(bench.now_ns) == port_actions.NO_CHIP
+    assert len(bench.opens) == 1
+    bench.dongle.chip_ok = True
+    assert bench.connect() < 1.2
+
+
+def test_a_robot_that_is_off_is_named_and_found_when_switched_on():
+    bench = Bench()
+    bench.dongle.jam_until_ns = bench.now_ns + 20_000 * MS
+    bench.run(19.9)
+    assert bench.link.phase is LinkState.HELLO
+    assert bench.link.reason(bench.now_ns) == (
+        'the robot does not answer: is it on, in range, on channel 82?'
+    )
+    assert bench.run(2.0, lambda: running(bench)) < 0.5
+
+
+@pytest.mark.parametrize(
+    'host, robot, reason',
+    [
+        (KEY, ALIEN, port_actions.KEY_MISMATCH),
+        (KEY, b'', port_actions.ROBOT_KEY_MISSING),
+        (b'', KEY, port_actions.HOST_KEY_MISSING),
+    ],
+)
+def test_keys_that_do_not_fit_are_named_and_nothing_moves(host, robot, reason):
+    bench = Bench(key=host, robot_key=robot)
+    bench.drive(1.0, 1.0)
+    bench.run(3.0)
+    assert bench.link.reason(bench.now_ns) == reason
+    assert not bench.link.authenticated
+    assert LinkState.RUN not in bench.phases
+    assert bench.robot.speeds == (0.0, 0.0)
+    assert bench.robot.gate.session == 0 or not host
+
+
+def test_a_parameter_that_is_refused_is_named_with_its_bounds_and_keeps_the_robot_still():
+    bench = Bench()
+    bench.robot.refuses[1] = frames.OUT_OF_RANGE
+    bench.drive(1.0, 1.0)
+    bench.run(3.0)
+    assert bench.link.phase is LinkState.PARAMS
+    assert bench.link.reason(bench.now_ns) == (
+        'parameter acceleration = 30000 was refused: the robot allows 100 to 100000'
+    )
+    assert commands(bench) == []
+    bench.robot.refuses.clear()
+    assert bench.connect() < 1.2
+
+
+def test_a_parameter_that_does_not_stay_is_named():
+    bench = Bench()
+    keep = bench.robot.set
+
+    def forgetful(frame):
+        keep(frame)
+        bench.robot.parameters[2] = 4711
+
+    bench.robot.set = forgetful
+    bench.run(3.0)
+    assert bench.link.reason(bench.now_ns) == (
+        'parameter deceleration must be 60000: the robot keeps 4711'
+    )
+    assert LinkState.RUN not in bench.phases
+
+
+def test_an_older_robot_with_fewer_parameters_is_asked_for_those_only():
+    bench = Bench()
+    info = bench.robot.info
+    bench.robot.info = lambda seq, now_ns: info(seq, now_ns)._replace(parameters=8)
+    bench.robot.refuses[9] = frames.UNKNOWN
+    bench.run(2.0)
+    assert 'invert_wheels = 0 was refused: the robot does not know it' in (
+        bench.link.reason(bench.now_ns)
+    )
+
+
+# -- measuring ------------------------------------------------------------------------------------
+
+
+def test_a_state_becomes_si_units():
+    bench = Bench()
+    bench.connect()
+    bench.run(1.5)
+    telemetry = bench.link.telemetry
+    assert telemetry.imu.angular == pytest.approx(math.radians(655 / 65.5))
+    assert telemetry.imu.forward == pytest.approx(9.80665)
+    assert telemetry.imu.sideways == pytest.approx(-9.80665 / 2)
+    expected = (math.nan, -math.inf, 0.1, 0.5, 0.8, math.inf, math.nan, 0.3)
+    np.testing.assert_array_equal(telemetry.ranges, expected)
+    assert telemetry.status.enabled
+    assert not telemetry.status.moving
+    assert bench.link.battery.voltage == 11.1
+    assert math.isnan(bench.link.battery.charge)
+    assert bench.link.quality(bench.now_ns).robot.bad_session == 3
+    assert bench.link.quality(bench.now_ns).dongle.protocol == 1
+
+
+def test_a_measurement_that_is_not_newer_than_the_last_is_dropped():
+    """When the POLL gets lost, the payload is what the robot had loaded some time before."""
+    robot, reader = FakeRobot(), TelemetryDecoder()
+    old, new = robot.state(0), robot.state(20 * MS)
+    assert reader.read(new, 21 * MS).raw is new
+    assert reader.read(old, 41 * MS) is None
+    assert reader.read(new, 61 * MS) is None
+    assert reader.read(robot.state(80 * MS), 81 * MS) is not None
+    assert not reader.rebooted
+
+
+@pytest.mark.parametrize('skew', [0.005, -0.005])
+def test_angles_are_those_of_their_stamp_behind_a_jittery_lossy_link(skew):
+    bench = Bench()
+    bench.robot.skew = skew
+    bench.dongle.jitter_ns = MS
+    bench.dongle.loss = 0.05
+    bench.connect()
+    bench.drive(10.0, 10.0)
+    errors, speeds, last = [], [], None
+    for _ in range(3000):
+        bench.run(0.005)
+        telemetry = bench.link.telemetry
+        if telemetry is not last and bench.robot.speeds == (10.0, 10.0):
+            last = telemetry
+            ahead = (bench.robot.reached_ns - telemetry.stamp_ns) / 1e9
+            errors.append((bench.robot.angles[0] - telemetry.angles.right) / 10.0 - ahead)
+            speeds.append(telemetry.wheels.right)
+            assert telemetry.stamp_ns <= bench.now_ns
+    # Half a step is 0.1 ms here; the bytes of the result are late by half a millisecond.
+    settled = np.array(errors[len(errors) // 2 :])
+    assert len(settled) > 300
+    assert np.sqrt(np.mean((settled - settled.mean()) ** 2)) < 0.2e-3
+    assert abs(settled.mean()) < 0.5e-3
+    assert np.mean(speeds[50:]) == pytest.approx(10.0, rel=1e-3)
+
+
+def test_step_counters_wrap_without_a_jump():
+    bench = Bench()
+    bench.robot.boot(bench.now_ns, clock_us=2**32 - 700_000, steps=(2**31 - 200, -(2**31) + 150))
+    bench.connect()
+    bench.drive(-10.0, 10.0)
+    bench.run(0.2, lambda: bench.link.telemetry is not None)
+    start = bench.link.telemetry.angles
+    before = start
+    for _ in range(60):
+        bench.run(0.02)
+        angles = bench.link.telemetry.angles
+        assert angles.left - before.left < 0.5
+        assert before.right - angles.right < 0.5
+        before = angles
+    assert before.left - start.left == pytest.approx(10.0 * 1.2, abs=0.8)
+    assert before.right - start.right == pytest.approx(-10.0 * 1.2, abs=0.8)
+    left, right = bench.link.telemetry.raw.left, bench.link.telemetry.raw.right
+    assert left < 0 < right
+
+
+# -- commanding -----------------------------------------------------------------------------------
+
+
+def test_the_newest_command_wins_and_none_is_queued(bench):
+    source = random.Random(1)
+    for _ in range(50):
+        since = bench.now_ns
+        for _ in range(7):
+            wheels = WheelSpeeds(source.uniform(-5, 5), source.uniform(-5, 5))
+            assert bench.link.command(RobotCommand(wheels, bench.now_ns), bench.now_ns) == ''
+        bench.release_controls()
+        bench.run(0.03)
+        sent = commands(bench, since)
+        assert 1 <= len(sent) <= 2
+        for frame in sent:
+            assert (frame.left, frame.right) == (
+                round(1000 * wheels.left),
+                round(1000 * wheels.right),
+            )
+        assert bench.link.sent == pytest.approx(wheels, abs=5e-4)
+
+
+def test_commands_are_counted_up_and_leave_on_the_period(bench):
+    since = bench.now_ns
+    bench.run(2.0)
+    times = [at for at, frame in bench.robot.log if isinstance(frame, frames.Command)]
+    times = [at for at in times if at > since]
+    assert len(times) == pytest.approx(100, abs=1)
+    np.testing.assert_allclose(np.diff(times), 20 * MS, atol=4 * MS)
+    steps = np.diff([frame.seq for frame in commands(bench, since)]) % 256
+    assert set(steps.tolist()) == {1}
+    assert bench.link.quality(bench.now_ns).lost == 0
+
+
+def test_a_silent_controller_means_standstill_after_a_quarter_of_a_second(bench):
+    bench.release_controls()
+    bench.run(0.2)
+    assert moving(bench)
+    bench.run(0.1)
+    assert bench.robot.speeds == (0.0, 0.0)
+    assert bench.link.reason(bench.now_ns) == 'no command for 0.25 s'
+    assert bench.robot.enabled
+    assert commands(bench)[-1].flags == CommandFlag.ENABLE
+    bench.drive(3.0, -2.0)
+    bench.run(0.1)
+    assert moving(bench)
+
+
+def test_a_command_that_is_not_finite_stops_the_robot(bench):
+    bench.release_controls()
+    bad = RobotCommand(WheelSpeeds(math.nan, 1.0), bench.now_ns)
+    assert 'command is not finite: got nan, 1.0 rad/s' in bench.link.command(bad, bench.now_ns)
+    bench.run(0.05)
+    assert bench.robot.speeds == (0.0, 0.0)
+    assert 'not finite' in bench.link.reason(bench.now_ns)
+
+
+def test_old_commands_are_not_taken(bench):
+    bench.release_controls()
+    late = RobotCommand(WheelSpeeds(9.0, 9.0), bench.now_ns - 100 * MS)
+    assert bench.link.command(late, bench.now_ns) == 'command is older than the one before it'
+    bench.run(0.5)
+    stale = RobotCommand(WheelSpeeds(9.0, 9.0), bench.now_ns - 250 * MS)
+    assert bench.link.command(stale, bench.now_ns) == 'command is too old: 0.250 s'
+    bench.run(0.1)
+    assert bench.robot.speeds == (0.0, 0.0)
+
+
+def test_wheels_that_are_too_fast_are_slowed_by_one_factor(bench):
+    bench.drive(30.0, -15.0)
+    bench.run(0.1)
+    assert bench.robot.speeds == (-5.0, 10.0)
+    assert bench.link.sent == (10.0, -5.0)
+    bench.drive(10.0, -20.0)
+    bench.run(0.1)
+    assert bench.robot.speeds == (-10.0, 5.0)
+
+
+def test_a_stop_lasts_until_the_next_command(bench):
+    bench.release_controls()
+    bench.link.stop('the reference is gone')
+    bench.run(0.05)
+    assert bench.robot.speeds == (0.0, 0.0)
+    assert bench.link.reason(bench.now_ns) == 'the reference is gone'
+    bench.drive(3.0, -2.0)
+    bench.run(0.05)
+    assert moving(bench)
+
+
+# -- emergency stop -------------------------------------------------------------------------------
+
+
+def test_emergency_stop_and_release(bench):
+    bench.link.latch_estop('asked for')
+    bench.run(0.03)
+    assert bench.robot.estop
+    assert bench.robot.speeds == (0.0, 0.0)
+    bench.run(1.0)
+    assert bench.link.quality(bench.now_ns).sessions == 1
+    assert bench.link.reason(bench.now_ns) == 'emergency stop: asked for'
+    command = RobotCommand(WheelSpeeds(1.0, 1.0), bench.now_ns)
+    assert bench.link.command(command, bench.now_ns) == 'emergency stop: asked for'
+    bench.release_controls()
+    assert bench.link.release_estop(bench.now_ns) == ''
+    bench.run(0.3)
+    assert not bench.robot.estop
+    # What was commanded before is not taken up again.
+    assert bench.robot.speeds == (0.0, 0.0)
+    assert 'released' in bench.link.reason(bench.now_ns)
+    assert bench.link.release_estop(bench.now_ns) == 'no emergency stop is latched'
+    bench.drive(3.0, -2.0)
+    bench.run(0.1)
+    assert moving(bench)
+
+
+def test_a_release_is_asked_for_even_if_the_robot_has_not_said_yet_that_it_is_latched():
+    orders = SetpointArbiter(LinkParameters())
+    orders.latch('asked for')
+    assert orders.next(False, 0).flags == CommandFlag.ESTOP
+    assert orders.release(False, 0) == ''
+    flags = [orders.next(False, cycle * 20 * MS).flags for cycle in range(5)]
+    assert flags == 3 * [CommandFlag.ESTOP_CLEAR] + 2 * [CommandFlag.ENABLE]
+
+
+def test_nothing_is_commanded_while_the_robot_says_that_it_is_latched():
+    orders = SetpointArbiter(LinkParameters())
+    assert orders.take(RobotCommand(WheelSpeeds(1.0, 2.0), 0), 0) == ''
+    assert orders.next(True, MS) == (CommandFlag.ENABLE, 0, 0)
+    assert orders.sent == (0.0, 0.0)
+    assert orders.next(False, MS) == (CommandFlag.ENABLE, 2000, 1000)
+
+
+def test_an_emergency_stop_survives_a_jam_of_the_link(bench):
+    bench.dongle.jam_until_ns = bench.now_ns + 300 * MS
+    bench.link.latch_estop('asked for')
+    bench.run(0.4)
+    assert bench.robot.estop
+
+
+def test_the_button_of_the_robot_is_named_and_released_from_here(bench):
+    bench.robot.estop = bench.robot.button = True
+    bench.run(0.1)
+    assert bench.robot.speeds == (0.0, 0.0)
+    assert bench.link.reason(bench.now_ns) == port_actions.ROBOT_ESTOP
+    assert bench.link.release_estop(bench.now_ns) == ''
+    bench.run(1.2)
+    assert bench.robot.estop
+    assert bench.link.reason(bench.now_ns) == port_actions.ESTOP_BUTTON_HELD
+    bench.robot.button = False
+    assert bench.link.release_estop(bench.now_ns) == ''
+    bench.run(0.2)
+    assert moving(bench)
+
+
+def test_a_robot_that_refuses_our_session_stops_all_the_same():
+    """Whoever has no key may still stop it."""
+    bench = Bench(key=ALIEN, robot_key=KEY)
+    bench.run(1.0)
+    assert not bench.robot.estop
+    bench.link.latch_estop('asked for')
+    bench.run(0.1)
+    assert bench.robot.estop
+    assert bench.link.phase is LinkState.HELLO
+
+
+# -- faults of the link ---------------------------------------------------------------------------
+
+
+def test_a_jam_stops_the_robot_by_its_own_clock_and_the_link_goes_on_after_it(bench):
+    bench.dongle.jam_until_ns = bench.now_ns + 1000 * MS
+    bench.run(0.22)
+    bench.robot.run_to(bench.now_ns)
+    assert bench.robot.speeds == (0.0, 0.0)
+    assert bench.robot.expired
+    bench.run(0.28)
+    assert 'does not answer' in bench.link.reason(bench.now_ns)
+    quality = bench.link.quality(bench.now_ns)
+    assert quality.level is DiagnosticLevel.ERROR
+    assert 'no word of the robot for 0.5' in quality.text
+    session = bench.robot.gate.session
+    bench.run(0.5)
+    assert bench.run(1.0, lambda: moving(bench)) < 0.05
+    assert bench.robot.gate.session == session
+    quality = bench.link.quality(bench.now_ns)
+    assert 45 <= quality.lost <= 52
+    assert quality.level is DiagnosticLevel.WARN
+    assert 'of the cycles are lost' in quality.text
+
+
+def test_after_a_long_jam_sequence_numbers_do_not_look_old(bench):
+    """Eight bits: after 128 lost commands the robot would take new ones for old."""
+    for jam_ns in (2600 * MS, 3500 * MS, 5100 * MS, 20_000 * MS):
+        bench.dongle.jam_until_ns = bench.now_ns + jam_ns
+        bench.run(jam_ns / 1e9)
+        assert bench.run(2.0, lambda: moving(bench)) < 0.4
+
+
+@pytest.mark.parametrize('loss', [0.1, 0.3])
+def test_lost_packets_cost_their_own_cycle_only(bench, loss):
+    bench.dongle.loss = loss
+    bench.run(10.0)
+    bench.dongle.loss = 0.0
+    bench.run(0.1)
+    quality = bench.link.quality(bench.now_ns)
+    assert quality.lost_share == pytest.approx(loss, abs=0.06)
+    assert quality.robot_resets == quality.dongle_resets == 0
+    assert quality.sessions == 1
+    # Absolute counters: nothing of the way is missing.
+    assert bench.link.telemetry.angles.right == pytest.approx(bench.robot.angles[0], abs=0.15)
+
+
+def test_frames_damaged_on_the_serial_line_are_dropped_and_counted(bench):
+    source = random.Random(5)
+    take = bench.dongle.take
+
+    def noisy(data, now_ns):
+        replies = []
+        for at, wire in take(data, now_ns):
+            if source.random() < 0.3:
+                spot = source.randrange(len(wire))
+                wire = wire[:spot] + source.randbytes(1) + wire[spot + source.randrange(2) :]
+            replies.append((at, wire))
+        return replies
+
+    bench.dongle.take = noisy
+    bench.run(20.0)
+    bench.dongle.take = take
+    bench.run(1.0)
+    assert moving(bench)
+    counts = bench.link.quality(bench.now_ns).host
+    assert counts.crc_errors + counts.frame_errors > 20
+    assert bench.link.telemetry.angles.right == pytest.approx(bench.robot.angles[0], abs=0.15)
+
+
+def test_a_robot_that_restarts_is_greeted_anew_and_its_angles_go_on(bench):
+    bench.run(2.0)
+    before = bench.link.telemetry.angles
+    last = bench.robot.angles
+    bench.robot.boot(bench.now_ns)
+    assert bench.run(1.0, lambda: moving(bench)) < 0.3
+    bench.run(1.0)
+    quality = bench.link.quality(bench.now_ns)
+    assert (quality.robot_resets, quality.sessions, quality.dongle_resets) == (1, 2, 0)
+    # Since its start the robot has turned by bench.robot.angles; unseen before were some steps.
+    expected = before.right + (last[0] - before.right) + bench.robot.angles[0]
+    assert bench.link.telemetry.angles.right == pytest.approx(expected, abs=0.3)
+    assert LinkState.CLOSED not in bench.phases[1:]
+
+
+def test_a_robot_that_restarts_out_of_reach_is_noticed_by_its_clock(bench):
+    bench.run(3.0)
+    before = bench.link.telemetry.angles
+    bench.dongle.jam_until_ns = bench.now_ns + 10_000 * MS
+    bench.run(5.0)
+    bench.robot.boot(bench.now_ns)
+    bench.release_controls()
+    bench.run(6.0)
+    assert running(bench)
+    assert bench.link.quality(bench.now_ns).robot_resets == 1
+    assert bench.link.telemetry.angles.right == pytest.approx(before.right, abs=0.8)
+
+
+def test_a_robot_that_ends_its_session_has_not_restarted(bench):
+    before = bench.link.quality(bench.now_ns)
+    bench.robot.gate = type(bench.robot.gate)(bench.robot.key)
+    assert bench.run(1.0, lambda: not running(bench)) < 0.05
+    assert bench.run(1.0, lambda: moving(bench)) < 0.3
+    quality = bench.link.quality(bench.now_ns)
+    assert quality.robot_resets == before.robot_resets == 0
+    assert quality.sessions == 2
+    bench.run(0.5)
+    assert bench.link.telemetry.angles.right == pytest.approx(bench.robot.angles[0], abs=0.15)
+
+
+def test_another_host_that_takes_the_robot_is_noticed():
+    bench = Bench()
+    bench.connect()
+    ours = bench.robot.gate.session
+    theirs = ours % 255 + 1
+    bench.robot.take(bytes([0x14, theirs, 0, 0, 0, 0, 0, 0]), bench.now_ns)
+    bench.run(0.05, lambda: not running(bench))
+    assert bench.link.reason(bench.now_ns) == 'the robot has lost its session'
+    bench.run(1.0, lambda: running(bench))
+    assert bench.robot.gate.session not in (0, ours)
+
+
+def test_a_session_whose_key_was_taken_from_under_us_is_replaced():
+    """Somebody replays our old HELLO: the number fits, the robot's nonce no longer does."""
+    bench = Bench(key=KEY)
+    bench.connect()
+    old = next(frame for _, frame in bench.robot.log if isinstance(frame, frames.Hello))
+    bench.robot.boot(bench.now_ns)
+    bench.connect()
+    bench.drive(3.0, -2.0)
+    bench.run(0.5)
+    assert moving(bench)
+    bench.robot.gate.greet(old, b'ANEWONE.')
+    bench.robot.last_seq = None
+    assert bench.run(3.0, lambda: not running(bench)) < 0.7
+    assert bench.run(3.0, lambda: moving(bench)) < 0.4
+
+
+def test_a_robot_that_takes_no_commands_is_named_and_greeted_anew(bench):
+    bench.robot.deaf_to_commands = True
+    assert bench.run(2.0, lambda: not running(bench)) == pytest.approx(0.5, abs=0.1)
+    assert bench.link.reason(bench.now_ns) == port_actions.COMMANDS_REJECTED
+    bench.robot.deaf_to_commands = False
+    assert bench.run(2.0, lambda: moving(bench)) < 0.4
+
+
+def test_a_dongle_that_restarts_is_set_anew(bench):
+    bench.dongle.boot_delay_ns = 1500 * MS
+    bench.dongle.restart(bench.now_ns)
+    bench.run(0.4)
+    assert bench.link.phase is LinkState.PING
+    assert bench.link.reason(bench.now_ns) == port_actions.DONGLE_TIMEOUT
+    assert bench.run(3.0, lambda: moving(bench)) < 1.5
+    quality = bench.link.quality(bench.now_ns)
+    assert quality.dongle_resets == 1
+    assert quality.robot_resets == 0
+    assert bench.closes == 0
+
+
+def test_a_dongle_that_restarts_at_once_is_noticed_by_its_clock(bench):
+    """By its watchdog: no frame is missing, but the radio is not set any more."""
+    bench.run(2.0)
+    bench.dongle.restart(bench.now_ns)
+    assert bench.run(1.0, lambda: not running(bench)) < 0.05
+    assert bench.run(1.0, lambda: moving(bench)) < 0.3
+    assert bench.link.quality(bench.now_ns).dongle_resets == 1
+
+
+def test_unplugged_and_plugged_in_again(bench):
+    bench.run(1.0)
+    start = bench.link.telemetry.angles.right
+    for away in (0.05, 0.7, 13.0):
+        bench.unplug()
+        closes = bench.closes
+        opened = len(bench.opens)
+        bench.run(0.01)
+        # At once: while the dead device is held, it comes back under another name.
+        assert bench.closes == closes + 1
+        bench.problem = ('dongle is not there', True)
+        bench.run(away)
+        assert bench.link.reason(bench.now_ns) == 'dongle is not there'
+        assert len(bench.opens) - opened <= 5 * away + 2
+        bench.plug()
+        assert bench.run(2.0, lambda: moving(bench)) < 1.0
+    quality = bench.link.quality(bench.now_ns)
+    assert quality.port_failures == 3
+    assert quality.robot_resets == 0
+    bench.run(0.5)
+    assert bench.link.telemetry.angles.right > start
+    assert bench.link.telemetry.angles.right == pytest.approx(bench.robot.angles[0], abs=0.15)
+
+
+def test_a_dongle_that_is_busy_costs_cycles_only(bench):
+    bench.dongle.busy = 20
+    bench.run(1.0)
+    assert moving(bench)
+    assert bench.link.quality(bench.now_ns).lost == pytest.approx(20, abs=2)
+    assert running(bench)
+
+
+def test_results_that_get_lost_are_waited_for_no_longer_than_a_moment(bench):
+    bench.dongle.drop_replies = 4
+    bench.run(0.4)
+    assert moving(bench)
+    assert bench.link.quality(bench.now_ns).lost in (3, 4)
+    assert LinkState.PING not in bench.phases[1:]
+
+
+def test_the_wrap_of_the_hosts_microseconds_does_not_show(bench):
+    made = Bench(key=bench.robot.key)
+    made.now_ns = (2**32 - 2_000_000) * 1000
+    made.dongle.restart(made.now_ns)
+    made.robot.boot(made.now_ns)
+    made.connect()
+    made.drive(3.0, -2.0)
+    made.run(4.0)
+    assert moving(made)
+    assert made.link.quality(made.now_ns).lost == 0
+    assert made.link.quality(made.now_ns).sessions == 1
+
+
+def test_an_answer_belongs_to_its_frame_or_to_none():
+    """A result that comes late must not be taken for that of the next command."""
+    dialogue = TransactionLayer(LinkStatistics(0.02, 0.2))
+    command, poll = frames.Command(1, 1, 0, 0, 0, 0, 5), frames.Poll(1, 1, frames.STATE)
+    dialogue.transact(command, poll, 6, 0)
+    assert dialogue.expire(49 * MS) is None
+    assert dialogue.expire(50 * MS).reply is None
+    assert dialogue.silent == 1
+    dialogue.transact(command, poll, 6, 60 * MS)
+    late, due = (encode_frame(encode(frames.Result(number, 0x34, 0x08, 0))) for number in (1, 2))
+    assert dialogue.feed(late, 61 * MS) == []
+    (heard,) = dialogue.feed(due + due, 64 * MS)
+    assert heard.round_trip == 0.004
+    assert dialogue.silent == 0
+    dialogue.ping(50 * MS, 70 * MS)
+    pong = frames.Pong(3, b'late', 0, 1, 1, 0, 1, 0, 0, 0, 0)
+    assert dialogue.feed(encode_frame(encode(pong)), 71 * MS) == []
+    assert dialogue.deadline_ns == 120 * MS
+
+
+@pytest.mark.parametrize('tries', [0, 1, 15])
+def test_only_commands_that_needed_no_second_try_tell_the_time(tries):
+    dialogue = TransactionLayer(LinkStatistics(0.02, 0.2))
+    command, poll = frames.Command(1, 1, 0, 0, 0, 0, 5), frames.Poll(1, 1, frames.STATE)
+    payload = encode(FakeRobot().state(0))
+    for first in (command, poll):
+        dialogue.transact(first, poll, 6, 10 * MS)
+        number = 1 if first is command else 2
+        result = frames.Result(number, 0x03 | tries << 4, 0x03, 0, payload)
+        (heard,) = dialogue.feed(encode_frame(encode(result)), 14 * MS)
+        assert heard.uplink == FakeRobot().state(0)
+        assert (heard.sending is not None) == (first is command and tries == 0)
+        if heard.sending is not None:
+            assert heard.sending == (10 * MS, 965_000)
+
+
+# -- requests, end, pace --------------------------------------------------------------------------
+
+
+def test_an_action_is_asked_for_until_it_is_answered(bench):
+    bench.link.request(frames.RESET_ODOMETRY)
+    assert bench.link.answer(frames.RESET_ODOMETRY) is None
+    bench.run(0.2)
+    assert bench.link.answer(frames.RESET_ODOMETRY) == 'refused while the robot moves'
+    bench.release_controls()
+    bench.run(0.5)
+    bench.dongle.loss = 0.5
+    bench.link.request(frames.RESET_ODOMETRY)
+    bench.run(2.0)
+    assert bench.link.answer(frames.RESET_ODOMETRY) == ''
+    assert bench.robot.steps == [0.0, 0.0]
+
+
+def test_at_a_hundred_cycles_a_second_requests_still_get_their_turn():
+    """They were starved once: ten milliseconds leave no time between two cycles."""
+    bench = Bench(LinkParameters(cycle_rate=100.0))
+    bench.connect()
+    bench.drive(0.0, 0.0)
+    bench.run(0.5)
+    bench.link.request(frames.CLEAR_COUNTERS)
+    since = bench.now_ns
+    bench.run(3.0)
+    assert bench.link.answer(frames.CLEAR_COUNTERS) == ''
+    quality = bench.link.quality(bench.now_ns)
+    assert quality.robot is not None
+    assert bench.now_ns / 1e3 - quality.dongle.time_us < 1.2e6
+    assert len(commands(bench, since)) > 285
+
+
+def test_shutting_down_stops_the_robot_takes_its_drives_out_and_closes(bench):
+    since = bench.now_ns
+    bench.link.shut_down()
+    assert bench.run(1.5, lambda: bench.link.phase is LinkState.DONE) < 0.2
+    sent = commands(bench, since)
+    assert len(sent) >= 4
+    assert [frame.flags for frame in sent] == [CommandFlag.ENABLE] * (len(sent) - 1) + [0]
+    assert all((frame.left, frame.right) == (0, 0) for frame in sent)
+    assert not bench.robot.enabled
+    assert not bench.is_open
+    assert bench.link.reason(bench.now_ns) == port_actions.SHUT_DOWN
+    opened = len(bench.opens)
+    bench.link.failed('too late', False, bench.now_ns)
+    bench.run(3.0)
+    assert len(bench.opens) == opened
+    assert bench.link.phase is LinkState.DONE
+
+
+def test_drives_are_taken_out_only_when_the_wheels_stand(bench):
+    """Motors without power roll on: they must have come to rest first."""
+    follow = bench.robot.follow
+
+    def slow(frame, now_ns):
+        follow(frame, now_ns)
+        if bench.robot.enabled and now_ns < end_ns:
+            bench.robot.speeds, bench.robot.until_ns = (1.0, 1.0), end_ns
+
+    end_ns = bench.now_ns + 400 * MS
+    bench.robot.follow = slow
+    bench.link.shut_down()
+    assert bench.run(1.5, lambda: bench.link.phase is LinkState.DONE) > 0.4
+    assert [frame.flags for frame in commands(bench)].count(0) == 1
+
+
+def test_shutting_down_does_not_wait_for_a_robot_that_is_gone(bench):
+    bench.dongle.jam_until_ns = bench.now_ns + 60_000 * MS
+    bench.run(0.5)
+    bench.link.shut_down()
+    assert bench.run(3.0, lambda: bench.link.phase is LinkState.DONE) < 1.3
+
+
+def test_a_robot_that_restarts_while_shutting_down_is_not_greeted_again(bench):
+    bench.link.shut_down()
+    bench.robot.boot(bench.now_ns)
+    bench.robot.log.clear()
+    bench.run(1.5, lambda: bench.link.phase is LinkState.DONE)
+    assert not any(isinstance(frame, frames.Hello) for _, frame in bench.robot.log)
+
+
+def test_what_was_on_its_way_when_the_port_was_lost_is_forgotten(bench):
+    bench.run(0.5, lambda: bench.link._dialogue.deadline_ns is not None)
+    bench.link.failed('failed', True, bench.now_ns)
+    assert bench.link.step(bench.now_ns)[-1].until_ns - bench.now_ns == 200 * MS
+
+
+@pytest.mark.parametrize('seconds', [0.0, 0.03])
+def test_shutting_down_before_anything_runs(seconds):
+    bench = Bench()
+    bench.run(seconds)
+    bench.link.shut_down()
+    bench.run(0.1)
+    assert bench.link.phase is LinkState.DONE
+    assert not bench.is_open
+
+
+def test_nobody_waits_busily(bench):
+    calls = 0
+    step = bench.link.step
+
+    def counted(now_ns, received):
+        nonlocal calls
+        calls += 1
+        return step(now_ns, received)
+
+    bench.link.step = counted
+    bench.run(10.0)
+    assert calls < 10 * 50 * 6
+    bench.unplug()
+    bench.release_controls()
+    bench.run(0.1)
+    calls = 0
+    bench.run(10.0)
+    assert calls < 10 * 5 * 4
+
+
+def test_equal_runs_are_equal_byte_for_byte():
+    logs = []
+    for _ in range(2):
+        bench = Bench(key=KEY, seed=3)
+        bench.dongle.loss = 0.2
+        bench.drive(1.0, 2.0)
+        bench.run(5.0)
+        logs.append(bench.robot.log)
+    assert logs[0] == logs[1]
+    assert len(logs[0]) > 300
+
+
+def test_sessions_are_numbered_at_random_and_never_twice_in_a_row():
+    numbers = []
+    bench = Bench(robot=FakeRobot(), seed=9)
+    bench.connect()
+    for _ in range(150):
+        bench.run(0.3)
+        numbers.append(bench.robot.gate.session)
+        bench.robot.boot(bench.now_ns)
+        bench.run(0.05, lambda: not running(bench))
+        bench.connect()
+    assert all(a != b for a, b in zip(numbers, numbers[1:], strict=False))
+    assert len(set(numbers)) > 90
+    assert min(numbers) >= 1
+    assert bench.link.quality(bench.now_ns).robot_resets == 150
+
+
+def test_what_is_signed_is_stamped_in_strict_order_even_if_the_clock_stands():
+    session = Session(KEY, random.Random(1).randbytes, 0, 5_000_000)
+    stamps = [session.hello(5_000_000).host_us]
+    for now_ns in (5_000_000, 5_000_000, 4_000_000, 5_000_400, 9_000_000):
+        stamps.append(session.command(0, 0, 0, 0, now_ns).host_us)
+    assert stamps == [5001, 5002, 5003, 5004, 5005, 9000]
+
+
+@pytest.mark.parametrize('key', [b'', KEY])
+def test_every_try_to_greet_says_what_time_it_is_and_keeps_its_nonce(key):
+    """The same bytes at each try told a robot that came 30 s later a clock that was 30 s behind.
+
+    A first command that had been held up for 2 s then passed for a prompt one.
+    """
+    bench = Bench(key=key)
+    bench.dongle.loss = 1.0
+    bench.run(5.0)
+    sent = [(at, frame) for at, frame in bench.dongle.asked if isinstance(frame, frames.Hello)]
+    assert len(sent) > 20
+    for at, frame in sent:
+        assert 0 <= at // 1000 - frame.host_us < 20_000
+    assert len({frame.nonce for _, frame in sent}) == 1
+    bench.dongle.loss = 0.0
+    assert bench.connect() < 1.0
+
+
+def test_a_board_with_a_key_gets_time_for_its_hashes():
+    """Within 1.5 ms an AVR had not loaded INFO yet, and the POLL fetched nothing of use."""
+    parameters = LinkParameters()
+    session = Session(KEY, random.Random(1).randbytes, 0, 0)
+    assert parameters.gap_after(session.hello(1000)) * 250e-6 == pytest.approx(5e-3)
+    open_one = Session(b'', random.Random(1).randbytes, 0, 0)
+    assert parameters.gap_after(open_one.hello(1000)) == parameters.gap
+    assert parameters.gap_after(session.command(0, 0, 0, 0, 2000)) == parameters.gap
+
+
+def test_requests_do_not_use_up_the_numbers_of_commands():
+    """A robot would take a command for an old one after 128 requests that got lost."""
+    session = Session(b'', random.Random(1).randbytes, 0, 0)
+    before = session.command(0, 0, 0, 0, 1000).seq
+    numbers = {session.get(0).seq for _ in range(200)} | {session.set(0, 1, 2000).seq}
+    assert len(numbers) == 201
+    assert session.action(1, 3000).seq == 202
+    assert session.command(0, 0, 0, 0, 4000).seq == before + 1
+
+
+def test_settings_that_do_not_fit_are_refused():
+    with pytest.raises(ParameterError, match='ttl must be at most robot.ttl_max'):
+        LinkParameters(ttl=0.3)
+    for address in ('c25a33a6', 'c25a33a6zz', 'c2 5a 33 a6', 'c25a33a6e1e1'):
+        with pytest.raises(ParameterError, match='address must be 10 hexadecimal digits'):
+            LinkParameters(address=address)
+    slow = LinkParameters(rate='250k')
+    assert (slow.gap, slow.configure(1).retry_delay, slow.configure(1).rate) == (11, 5, 0)
+    assert (LinkParameters().gap, LinkParameters().configure(1).rate) == (6, 1)

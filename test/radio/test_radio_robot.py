@@ -1,0 +1,209 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The real robot behind the seam, in virtual time against a scripted dongle and robot."""
+
+import math
+import random
+
+import pytest
+from support.radio_bench import Bench
+
+from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.parameters.table import ParameterError
+from t3mpc_ros.radio.link.port_actions import LinkState
+from t3mpc_ros.radio.protocol import frames
+from t3mpc_ros.radio.radio_robot import RadioRobot, RadioRobotParameters
+from t3mpc_ros.robot.interface import RANGE_SENSORS, RobotCommand, RobotInterface
+from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON
+
+KEY = bytes(range(16))
+
+
+class Seam:
+    """What the bench takes for a link: steps and commands go through the robot."""
+
+    def __init__(self, host):
+        self.host = host
+        self.states = []
+
+    def step(self, now_ns, received):
+        deeds = self.host.step(now_ns, received)
+        self.states += self.host.take_states()
+        return deeds
+
+    def command(self, command, now_ns):
+        return self.host.apply(command, now_ns)
+
+    def __getattr__(self, name):
+        return getattr(self.host.link, name)
+
+
+def bench(key=b'', seed=1, **changes):
+    made = Bench(key=key, seed=seed)
+    parameters = RadioRobotParameters.from_dict(
+        {name.replace('__', '.'): value for name, value in changes.items()}
+    )
+    made.host = RadioRobot(parameters, key, random.Random(seed).randbytes)
+    made.link = Seam(made.host)
+    return made
+
+
+def ramped(made, right, left, seconds):
+    made.drive(right, left)
+    made.run(seconds)
+    return made.link.states[-1]
+
+
+def test_the_radio_robot_has_every_part_of_the_seam():
+    for name in ('apply', 'advance', 'stop', 'reset_odometry', 'latch_estop', 'release_estop'):
+        assert getattr(RadioRobot, name) is not getattr(RobotInterface, name)
+
+
+@pytest.mark.parametrize('key', [b'', KEY])
+def test_it_drives_and_reckons_where_it_is_from_the_counters(key):
+    made = bench(key)
+    made.connect()
+    state = ramped(made, 4.0, 4.0, 3.0)
+    assert state.reason == ''
+    assert tuple(state.wheels) == pytest.approx((4.0, 4.0), rel=0.01)
+    assert tuple(state.commanded) == (4.0, 4.0)
+    way = 0.035 * state.angles.right
+    assert way > 0.3
+    assert state.odometry.pose.x == pytest.approx(way, rel=1e-9)
+    assert state.odometry.twist.linear == pytest.approx(0.14, rel=0.01)
+    assert len(state.ranges) == len(RANGE_SENSORS)
+    assert state.status.enabled
+    assert state.status.moving
+
+
+def test_states_come_once_each_and_in_order():
+    made = bench()
+    made.connect()
+    ramped(made, 2.0, 1.0, 2.0)
+    stamps = [state.stamp_ns for state in made.link.states]
+    assert stamps == sorted(set(stamps))
+    assert len(stamps) == pytest.approx(100, abs=6)
+    assert made.host.take_states() == []
+
+
+def test_the_ramp_of_the_guard_is_what_is_sent():
+    made = bench()
+    made.connect()
+    made.drive(6.0, 6.0)
+    made.run(0.5)
+    sent = [f.right / 1000.0 for _, f in made.robot.log if isinstance(f, frames.Command)]
+    rises = [b - a for a, b in zip(sent, sent[1:], strict=False)]
+    assert max(sent) == 6.0
+    assert max(rises) <= 30.0 * 0.02 + 0.01
+
+
+def test_silence_of_the_sender_stops_it_with_the_reason():
+    made = bench()
+    made.connect()
+    ramped(made, 5.0, 5.0, 1.0)
+    made.release_controls()
+    made.run(0.5)
+    assert made.host.reason(made.now_ns) == 'no command for 0.25 s'
+    assert made.robot.speeds == (0.0, 0.0)
+
+
+def test_a_pulled_dongle_is_named_and_found_again():
+    made = bench()
+    made.connect()
+    ramped(made, 3.0, 3.0, 1.0)
+    made.unplug()
+    made.run(0.5)
+    assert made.host.reason(made.now_ns) == 'dongle is not there'
+    assert made.host.advance(made.now_ns).reason == 'dongle is not there'
+    made.plug()
+    assert made.connect() < 1.0
+    assert ramped(made, 3.0, 3.0, 1.0).reason == ''
+
+
+def test_a_rebooted_robot_keeps_its_place_and_forgets_its_bias():
+    made = bench()
+    made.connect()
+    made.run(2.5)  # the gyro learns at a standstill
+    assert made.host._odometry.calibrated
+    before = ramped(made, 4.0, 4.0, 2.0)
+    made.robot.boot(made.now_ns)
+    made.run(1.5)
+    after = made.link.states[-1]
+    assert after.odometry.pose.x >= before.odometry.pose.x
+    assert after.odometry.pose.x < before.odometry.pose.x + 0.3
+    assert made.host.link.robot_resets == 1
+    assert not made.host._odometry.calibrated
+
+
+def test_an_emergency_stop_holds_until_it_is_released_on_both_ends():
+    made = bench()
+    made.connect()
+    ramped(made, 5.0, 5.0, 1.0)
+    made.host.latch_estop('asked for', made.now_ns)
+    made.run(0.5)
+    assert made.robot.estop
+    assert made.robot.speeds == (0.0, 0.0)
+    assert 'emergency stop: asked for' in made.host.reason(made.now_ns)
+    assert made.host.apply(RobotCommand(WheelSpeeds(1.0, 1.0), made.now_ns), made.now_ns)
+    assert made.host.release_estop(made.now_ns) == ''
+    made.run(0.5)
+    assert not made.robot.estop
+    assert ramped(made, 1.0, 1.0, 0.5).reason == ''
+    assert made.host.release_estop(made.now_ns) == 'no emergency stop is latched'
+
+
+def test_odometry_is_reset_at_rest_only():
+    made = bench()
+    made.connect()
+    ramped(made, 4.0, 4.0, 1.0)
+    assert made.host.reset_odometry(made.now_ns) == (
+        'odometry cannot be reset while the robot moves'
+    )
+    made.drive(0.0, 0.0)
+    made.run(1.0)
+    assert made.host.reset_odometry(made.now_ns) == ''
+    assert made.host.advance(made.now_ns).odometry.pose.x == 0.0
+
+
+def test_lasting_disagreement_of_gyro_and_steps_stops_it():
+    made = bench()
+    made.connect()
+    made.run(2.5)
+    made.drive(3.0, -3.0)  # the scripted robot's gyro reads a constant
+    made.run(3.0)
+    assert any(state.status.slipping for state in made.link.states)
+    assert SLIP_STOP_REASON in {state.reason for state in made.link.states}
+
+
+def test_a_command_that_is_not_finite_stops_it():
+    made = bench()
+    made.connect()
+    ramped(made, 5.0, 5.0, 1.0)
+    made.release_controls()
+    text = made.host.apply(RobotCommand(WheelSpeeds(math.nan, 0.0), made.now_ns), made.now_ns)
+    assert 'not finite' in text
+    made.run(0.3)
+    assert made.robot.speeds == (0.0, 0.0)
+
+
+def test_the_link_ends_with_standstill_and_the_port_closed():
+    made = bench()
+    made.connect()
+    ramped(made, 5.0, 5.0, 1.0)
+    made.host.shut_down()
+    made.run(2.0, lambda: made.host.link.phase is LinkState.DONE)
+    assert made.robot.speeds == (0.0, 0.0)
+    assert not made.is_open
+
+
+@pytest.mark.parametrize(
+    ('name', 'value'),
+    [
+        ('guard.wheel_speed', 12.0),
+        ('guard.acceleration', 35.0),
+        ('guard.stop_deceleration', 80.0),
+    ],
+)
+def test_what_the_board_would_cut_is_refused_here(name, value):
+    with pytest.raises(ParameterError, match=f'{name} must be at most what the board does itself'):
+        RadioRobotParameters.from_dict({name: value})

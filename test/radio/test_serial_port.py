@@ -1,0 +1,132 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The port on a pseudo terminal: every way to lose it is a PortError that says what to do."""
+
+import errno
+import os
+import select
+import termios
+import tty
+
+import pytest
+
+from t3mpc_ros.radio import serial_port as module
+from t3mpc_ros.radio.serial_port import PortError, SerialPort
+
+
+@pytest.fixture
+def line(tmp_path):
+    """Return the master's end of a raw pseudo terminal, and the path of the other one."""
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    path = tmp_path / 'dongle'
+    path.symlink_to(os.ttyname(slave))
+    os.close(slave)
+    ends = [master]
+    yield ends, str(path)
+    for end in ends:
+        os.close(end)
+
+
+def unplug(ends, path):
+    """Let the device vanish, as when the dongle is pulled out."""
+    os.close(ends.pop())
+    os.unlink(path)
+
+
+def test_bytes_go_both_ways_unchanged(line):
+    (master, *_), path = line
+    port = SerialPort(path)
+    everything = bytes(range(256))
+    port.write(everything)
+    found = b''
+    while len(found) < 256 and select.select([master], [], [], 5.0)[0]:
+        found += os.read(master, 1000)
+    assert found == everything
+    assert port.read() == b''  # nothing there, and no waiting
+    os.write(master, everything)
+    found = b''
+    while len(found) < 256 and select.select([port.fileno()], [], [], 5.0)[0]:
+        found += port.read()
+    assert found == everything
+    assert not port.low_latency  # a pseudo terminal knows no such thing: that is no error
+    port.close()
+    port.close()
+
+
+@pytest.mark.parametrize('use', ['read', 'write', 'fileno after read'])
+def test_a_dongle_that_is_pulled_out_is_noticed_at_the_next_use(line, use):
+    """Depending on the call it raises SerialException, plain OSError or termios.error."""
+    ends, path = line
+    port = SerialPort(path)
+    unplug(ends, path)
+    with pytest.raises(PortError, match='is not there: is the dongle plugged in') as error:
+        port.write(b'x') if use == 'write' else port.read()
+    assert error.value.absent
+    # It is closed by now; whatever is asked of it says so, in the same words.
+    for again in (port.read, port.fileno, lambda: port.write(b'x')):
+        with pytest.raises(PortError):
+            again()
+
+
+def test_a_port_is_ours_alone_and_free_again_after_close(line):
+    _, path = line
+    port = SerialPort(path)
+    with pytest.raises(PortError, match=r'is busy: another program has it open; lsof') as error:
+        SerialPort(path)
+    assert not error.value.absent
+    port.close()
+    SerialPort(path).close()
+
+
+def test_a_reader_that_never_reads_does_not_block_us(line):
+    _, path = line
+    port = SerialPort(path)
+    with pytest.raises(PortError, match='failed: Write timeout'):
+        port.write(bytes(200_000))
+
+
+def test_a_port_that_is_missing_is_absent(tmp_path):
+    with pytest.raises(PortError, match='nothing is not there') as error:
+        SerialPort(str(tmp_path / 'nothing'))
+    assert error.value.absent
+
+
+def test_a_file_is_no_port(tmp_path):
+    path = tmp_path / 'file'
+    path.write_text('no port')
+    with pytest.raises(PortError, match='failed: ') as error:
+        SerialPort(str(path))
+    assert not error.value.absent
+
+
+@pytest.mark.parametrize(
+    'error, expected',
+    [
+        (OSError(errno.EACCES, 'Permission denied'), 'usermod -aG dialout'),
+        (OSError(errno.EPERM, 'not permitted'), 'permission denied'),
+        (OSError(errno.EBUSY, 'busy'), 'is busy'),
+        (OSError(errno.ENODEV, 'gone'), 'is not there'),
+        (termios.error(errno.EIO, 'Input/output error'), 'failed: .*Input/output error'),
+        (termios.error(errno.ENXIO, 'gone'), 'is not there'),
+        (ValueError('Invalid baud rate'), 'failed: Invalid baud rate'),
+        (TypeError('an integer is required'), 'failed: an integer is required'),
+    ],
+    ids=str,
+)
+def test_every_kind_of_error_leaves_in_words(line, monkeypatch, error, expected):
+    def fail(*args, **more):
+        raise error
+
+    monkeypatch.setattr(module.serial, 'Serial', fail)
+    with pytest.raises(PortError, match=expected):
+        SerialPort(line[1])
+
+
+def test_an_error_of_ours_is_not_taken_for_one_of_the_port(line, monkeypatch):
+    def fail(*args, **more):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(module.serial, 'Serial', fail)
+    with pytest.raises(ZeroDivisionError):
+        SerialPort(line[1])

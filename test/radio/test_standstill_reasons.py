@@ -1,0 +1,255 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Why the robot does not move, in words: each cause, provoked, and what the user is told.
+
+What the port itself may say is in ``test_radio_port.py`` and reaches the user as it is.
+"""
+
+import math
+
+import pytest
+from support.emulator_bench import RobotBench
+from support.radio_bench import Bench as ScriptedBench
+from support.radio_bench import FakeRobot
+
+from t3mpc_ros.nodes.common.diagnostics import complaints
+from t3mpc_ros.radio.link import port_actions
+from t3mpc_ros.radio.link.port_actions import LinkState
+from t3mpc_ros.radio.protocol.codec import encode
+from t3mpc_ros.radio.protocol.frames import Command, CommandFlag, Pong, StatusFlag
+from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON
+
+KEY = bytes(range(16))
+CAUSES = {}
+
+
+def cause(says, **given):
+    """Note a cause: what is told, and how the bench is made on which it is provoked."""
+
+    def note(provoke):
+        CAUSES[provoke.__name__] = says, given, provoke
+        return provoke
+
+    return note
+
+
+def driving(bench):
+    bench.connect()
+    bench.drive(3.0, 3.0)
+    bench.run(0.5)
+    assert told(bench) == ''
+
+
+def told(bench):
+    """Return what diagnostics say, most important first."""
+    state = bench.robot.advance(bench.now_ns)
+    well = bench.robot.quality(bench.now_ns)
+    return '; '.join([*complaints(state, None), *([well.text] if well.text else [])])
+
+
+@cause('no command yet')
+def nobody_commands(bench):
+    bench.connect()
+    bench.run(0.1)
+
+
+@cause('no command for 0.25 s')
+def the_commander_falls_silent(bench):
+    driving(bench)
+    bench.release_controls()
+    bench.run(0.6)
+
+
+@cause('command is not finite')
+def a_command_is_not_finite(bench):
+    driving(bench)
+    bench.drive(math.nan, 1.0)
+    bench.run(0.5)
+
+
+@cause('emergency stop: asked for')
+def an_emergency_stop_is_asked_for(bench):
+    driving(bench)
+    bench.robot.latch_estop('asked for by service e_stop', bench.now_ns)
+    bench.run(0.3)
+
+
+@cause('the emergency stop of the robot is latched')
+def the_button_is_pressed(bench):
+    driving(bench)
+    bench.inject('button', 0.1)
+    bench.run(0.3)
+
+
+@cause('is the button still pressed?')
+def the_button_is_held_while_it_is_released(bench):
+    driving(bench)
+    bench.inject('button')
+    bench.run(0.3)
+    bench.robot.release_estop(bench.now_ns)
+    bench.run(1.5)
+
+
+@cause('the emergency stop of the robot is latched')
+def a_stranger_stops_the_robot(bench):
+    driving(bench)
+    bench.board.packet(encode(Command(9, 200, CommandFlag.ESTOP, 0, 0, 0, 0)))
+    bench.run(0.3)
+
+
+@cause('dongle is not there')
+def the_dongle_is_pulled_out(bench):
+    driving(bench)
+    bench.inject('close_port', 5.0)
+    bench.run(0.5)
+
+
+@cause('the dongle has fallen silent: was it restarted?')
+def the_line_is_dead(bench):
+    driving(bench)
+    bench.inject('silence')
+    bench.run(0.6)
+
+
+@cause('nothing on the port answers like a dongle')
+def another_device_is_at_the_port(bench):
+    bench.inject('silence')
+    bench.run(8.0)
+
+
+@cause('the radio chip of the dongle does not answer')
+def the_radio_chip_is_dead(bench):
+    bench.inject('radio_dead')
+    bench.run(1.0)
+
+
+@cause('the robot does not answer: is it on, in range, on channel 82?')
+def the_robot_is_off(bench):
+    bench.inject('robot_reset', math.inf)
+    bench.run(1.0)
+
+
+@cause('the robot does not answer: is it on, in range, on channel 82?')
+def the_air_is_jammed(bench):
+    driving(bench)
+    bench.inject('jam')
+    bench.run(0.5)
+
+
+@cause('of the cycles are lost')
+def the_air_is_bad(bench):
+    driving(bench)
+    bench.inject('loss', math.inf, 0.35)
+    bench.run(5.0)
+
+
+@cause('the keys differ', key=KEY, robot_key=bytes(16))
+def the_keys_differ(bench):
+    bench.run(1.0)
+
+
+@cause('the robot wants signed commands: give the host the key', robot_key=KEY)
+def the_host_has_no_key(bench):
+    bench.run(1.0)
+
+
+@cause('the robot has no key to check our signature with', key=KEY, robot_key=b'')
+def the_robot_has_no_key(bench):
+    bench.run(1.0)
+
+
+@cause('the inertial sensor does not answer', flat={'twin.faults.gyro_dead': True})
+def the_inertial_sensor_is_dead(bench):
+    driving_with_complaints(bench)
+
+
+@cause('the battery is low: 10.0 V', flat={'twin.faults.supply_sag': 2.5})
+def the_battery_is_low(bench):
+    driving_with_complaints(bench)
+
+
+@cause(SLIP_STOP_REASON, flat={'twin.faults.wheel_blocked': 'left'})
+def a_wheel_is_blocked(bench):
+    bench.connect()
+    bench.run(1.5)  # the gyro's bias is measured meanwhile
+    bench.drive(4.0, 4.0)
+    bench.run(2.0)
+
+
+@cause('the robot has lost its session')
+def the_robot_has_forgotten_the_session(bench):
+    """Said while the robot is greeted anew, until it answers."""
+    driving(bench)
+    bench.inject('robot_reset', 0.01)
+    bench.run(1.0, lambda: bench.link.phase is LinkState.HELLO)
+
+
+@cause('the link is shut down')
+def the_bridge_ends(bench):
+    driving(bench)
+    bench.robot.shut_down()
+    bench.run(1.0)
+
+
+def driving_with_complaints(bench):
+    bench.connect()
+    bench.drive(2.0, 2.0)
+    bench.run(1.3)
+    assert bench.followed[-1][1].left == 2000  # a warning, no reason to stand
+
+
+@pytest.mark.parametrize('name', CAUSES)
+def test_each_cause_is_told_in_words_that_name_it(name):
+    says, given, provoke = CAUSES[name]
+    bench = RobotBench(**given)
+    provoke(bench)
+    print(f'\n{name}: {told(bench)}')
+    assert says in told(bench)
+
+
+# -- what only a robot or dongle of another make does ---------------------------------------------
+
+
+class Odd(FakeRobot):
+    """Says of itself what it is told to."""
+
+    add, drop, protocol, accepts = StatusFlag(0), StatusFlag(0), 1, True
+
+    def status(self):
+        return (super().status() | self.add) & ~self.drop
+
+    def info(self, seq, now_ns):
+        info = super().info(seq, now_ns)._replace(protocol=self.protocol)
+        return info if self.accepts else info._replace(session=0)
+
+
+@pytest.mark.parametrize(
+    'odd, says',
+    [
+        ({'add': StatusFlag.TTL_EXPIRED}, port_actions.TTL_EXPIRED),
+        ({'drop': StatusFlag.ENABLED}, port_actions.DRIVES_DISABLED),
+        ({'protocol': 2}, 'the robot must speak protocol 1: it speaks 2'),
+        ({'accepts': False}, port_actions.HELLO_REJECTED),
+    ],
+)
+def test_what_an_odd_robot_does_is_told(odd, says):
+    robot = Odd()
+    for name, value in odd.items():
+        setattr(robot, name, value)
+    bench = ScriptedBench(robot=robot)
+    bench.drive(3.0, 3.0)
+    bench.run(1.0)
+    assert bench.link.reason(bench.now_ns) == says
+
+
+def test_a_dongle_of_another_protocol_is_named():
+    bench = ScriptedBench()
+    reply = bench.dongle.reply
+
+    def newer(frame, now_ns):
+        at, answer = reply(frame, now_ns)
+        return at, answer._replace(protocol=3) if isinstance(answer, Pong) else answer
+
+    bench.dongle.reply = newer
+    bench.run(1.0)
+    assert bench.link.reason(bench.now_ns) == 'the dongle must speak protocol 1: it speaks 3'

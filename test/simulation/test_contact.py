@@ -1,0 +1,344 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""What walls do to the bumper: along the normal, never a pull, conservative without damping."""
+
+import math
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.parameters.table import ParameterError
+from t3mpc_ros.simulation.plant.contact import BumperParameters, contact_force
+from t3mpc_ros.simulation.world import clearance, join_walls, load_world, parse_world
+
+NO_SEGMENTS, NO_CIRCLES = np.zeros((0, 4)), np.zeros((0, 3))
+RADIUS, STIFFNESS, DAMPING = 0.11, 2e4, 100.0
+SPRING = BumperParameters(damping=0.0).vector()
+DAMPED = BumperParameters().vector()
+MASS = 1.5
+FLOOR = np.array([[-1.0, 0.0, 1.0, 0.0]])
+BOX = np.array([[0.0, 0.0, 0.5, 0.0], [0.5, 0, 0.5, 0.3], [0.5, 0.3, 0, 0.3], [0, 0.3, 0, 0]])
+
+
+def force(x, y, segments=NO_SEGMENTS, circles=NO_CIRCLES, bumper=SPRING, speed=(0.0, 0.0)):
+    return np.array(contact_force(x, y, *map(float, speed), bumper, segments, circles))
+
+
+def polyline(points, closed=False):
+    """Return the walls along points."""
+    points = [tuple(map(float, point)) for point in points]
+    pairs = list(zip(points, points[1:], strict=False)) + [(points[-1], points[0])] * closed
+    return np.array([[*start, *end] for start, end in pairs])
+
+
+def round_room(sides, radius):
+    angles = np.arange(sides) * math.tau / sides
+    return polyline(radius * np.column_stack([np.cos(angles), np.sin(angles)]), closed=True)
+
+
+def work_around(points, segments, circles=NO_CIRCLES):
+    """Return the work along a closed way, and that of the same forces all in one direction."""
+    forces = [force(*point, segments, circles) for point in points.tolist()]
+    means = 0.5 * (np.array(forces) + np.roll(forces, -1, axis=0))
+    steps = np.roll(points, -1, axis=0) - points
+    total = np.sum(np.linalg.norm(means, axis=1) * np.linalg.norm(steps, axis=1))
+    return float(np.sum(means * steps)), float(total)
+
+
+def largest_jump(path, segments):
+    """Return the largest change of the force from one point of a path to the next, N."""
+    forces = np.array([force(*point, segments) for point in path])
+    return float(np.linalg.norm(np.diff(forces, axis=0), axis=1).max())
+
+
+def test_defaults_are_those_of_the_vector_and_bounds_are_kept():
+    assert DAMPED.tolist() == [RADIUS, STIFFNESS, DAMPING]
+    with pytest.raises(ParameterError, match='stiffness must be from 1000 to 1e'):
+        BumperParameters(stiffness=10.0)
+
+
+def test_there_is_no_force_without_touching():
+    generator = np.random.default_rng(1)
+    world = load_world('room')
+    apart = 0
+    for _ in range(3000):
+        x, y = generator.uniform((-2.2, -1.7), (2.2, 1.7)).tolist()
+        pushed = force(x, y, world.segments, world.circles, DAMPED, generator.normal(size=2))
+        if world.is_free(x, y, RADIUS):
+            assert not pushed.any()
+            apart += 1
+    assert apart > 1000
+    assert not force(0.0, 0.0).any()
+
+
+@pytest.mark.parametrize('side', [-1.0, 1.0])
+def test_a_wall_pushes_along_its_normal_with_spring_and_damper(side):
+    depth = 0.004
+    for angle in (0.0, 0.7, 2.5):
+        along, across = (
+            np.array([math.cos(angle), math.sin(angle)]),
+            side * np.array([-math.sin(angle), math.cos(angle)]),
+        )
+        wall = np.array([[*-along, *along]])
+        at = 0.3 * along + (RADIUS - depth) * across
+        spring = STIFFNESS * depth
+        assert force(*at, wall) == pytest.approx(spring * across, abs=1e-9)
+        # Sliding costs nothing, closing costs, and leaving fast never pulls.
+        for closing, sliding in ((0.2, 0.0), (0.2, 1.5), (-0.1, 1.5), (-5.0, 0.3)):
+            speed = -closing * across + sliding * along
+            expected = max(spring + DAMPING * closing, 0.0)
+            assert force(*at, wall, bumper=DAMPED, speed=speed) == pytest.approx(
+                expected * across, abs=1e-9
+            )
+
+
+def test_a_pillar_pushes_outwards_however_deep_the_bumper_is():
+    pillar = np.array([[1.0, 0.0, 0.2]])
+    for angle in np.linspace(0.0, 6.0, 20):
+        out = np.array([math.cos(angle), math.sin(angle)])
+        for distance in (0.309, 0.25, 0.2, 0.1):
+            expected = STIFFNESS * (0.2 + RADIUS - distance) * out
+            assert force(1.0 + distance * out[0], distance * out[1], circles=pillar) == (
+                pytest.approx(expected, abs=1e-9)
+            )
+    assert force(1.0, 0.0, circles=pillar).tolist() == [0.0, 0.0]
+
+
+def test_the_end_of_a_wall_and_a_corner_push_once_from_that_very_point():
+    """Both sides of a corner have it for nearest point; adding them up doubled the push."""
+    for angle in np.linspace(math.pi + 0.01, 1.5 * math.pi - 0.01, 30):
+        out = np.array([math.cos(angle), math.sin(angle)])
+        at = (RADIUS - 0.005) * out
+        assert force(*at, BOX) == pytest.approx(STIFFNESS * 0.005 * out, abs=1e-9)
+        speed = -0.3 * out + 0.7 * np.array([-out[1], out[0]])
+        assert force(*at, BOX, bumper=DAMPED, speed=speed) == pytest.approx(
+            (STIFFNESS * 0.005 + DAMPING * 0.3) * out, abs=1e-9
+        )
+        assert force(*at, BOX[:1]) == pytest.approx(STIFFNESS * 0.005 * out, abs=1e-9)
+
+
+def test_any_number_of_walls_that_meet_in_a_point_push_from_it_once():
+    for count in range(1, 7):
+        angles = np.linspace(-1.0, 1.0, count)
+        star = np.array([[0.0, 0.0, math.cos(a), math.sin(a)] for a in angles])
+        star[::2] = star[::2][:, [2, 3, 0, 1]]  # whichever way round they were drawn
+        assert force(-0.1, 0.0, star) == pytest.approx([-STIFFNESS * 0.01, 0.0], abs=1e-9)
+
+
+def test_both_walls_of_an_inner_corner_push():
+    walls = polyline([(0, 1), (0, 0), (1, 0)])
+    assert force(RADIUS - 0.004, RADIUS - 0.007, walls) == pytest.approx(
+        [STIFFNESS * 0.004, STIFFNESS * 0.007], abs=1e-9
+    )
+
+
+def test_the_joint_of_two_walls_in_line_is_not_felt():
+    one, two = FLOOR, polyline([(-1, 0), (0.1, 0), (1, 0)])
+    three = two[::-1][:, [2, 3, 0, 1]]
+    generator = np.random.default_rng(2)
+    for _ in range(2000):
+        x = 0.1 + generator.normal(0.0, 0.1)
+        y = float(generator.uniform(0.08, 0.12))
+        speed = generator.normal(0.0, 1.0, 2)
+        plain = force(x, y, one, bumper=DAMPED, speed=speed)
+        assert force(x, y, two, bumper=DAMPED, speed=speed) == pytest.approx(plain, abs=1e-9)
+        assert force(x, y, three, bumper=DAMPED, speed=speed) == pytest.approx(plain, abs=1e-9)
+
+
+def test_the_force_is_continuous_along_joints_and_past_corners_on_both_sides():
+    """A force that leaps at a joint shakes whoever slides along the wall."""
+    step = 1e-5
+    # No straight piece, corner or sum of two can change faster than this, per metre of way.
+    bound = 4.0 * STIFFNESS * step
+    for turn in (-1.5, -0.5, -0.05, -0.002, 0.0, 0.002, 0.05, 0.5, 1.5):
+        walls = polyline([(-0.3, 0), (0, 0), (0.3 * math.cos(turn), 0.3 * math.sin(turn))])
+        for depth in (0.0005, 0.004, 0.02):
+            path = [(x, RADIUS - depth) for x in np.arange(-0.2, 0.15, step).tolist()]
+            # No further than to where the other wall would be run through.
+            free = [clearance(*point, walls, NO_CIRCLES) > 0.06 for point in path]
+            assert largest_jump(path[: [*free, False].index(False)], walls) < bound
+
+
+@pytest.mark.parametrize('sides', [24, 36, 180])
+def test_a_polygon_stands_for_a_circle_from_within_and_from_without(sides):
+    """In a shallow inner corner two walls touch at once, yet must not push like two."""
+    radius = 0.6
+    room = round_room(sides, radius)
+    sagitta = radius * (1.0 - math.cos(math.pi / sides))
+    depth = 0.006
+    for side in (-1.0, 1.0):
+        for angle in np.linspace(0.0, 1.0, 500):
+            out = np.array([math.cos(angle), math.sin(angle)])
+            pushed = force(*((radius + side * (RADIUS - depth)) * out), room)
+            # Where the polygon differs from the circle, so may the depth: on both walls within.
+            assert abs(side * pushed @ out / STIFFNESS - depth) <= 1.5 * sagitta + 1e-6
+            aslant = abs(pushed[0] * out[1] - pushed[1] * out[0])
+            assert aslant <= 1.01 * math.tan(math.pi / sides) * abs(pushed @ out)
+
+
+def test_without_damping_no_work_is_left_on_any_closed_way():
+    generator = np.random.default_rng(3)
+    worlds = [
+        (BOX, np.array([[0.6, 0.4, 0.05]])),
+        (polyline([(-0.3, 0.02), (0, 0), (0.3, 0.04)]), NO_CIRCLES),
+        (polyline([(0, 0.5), (0, 0), (0.5, 0)]), NO_CIRCLES),
+        (join_walls(np.array([[-1.0, 0, 1, 0], [0, 0, 0, 1]])), NO_CIRCLES),
+    ]
+    turns = np.arange(4000) * math.tau / 4000
+    ring = np.column_stack([np.cos(turns), np.sin(turns)])
+    tested = 0
+    for segments, circles in worlds:
+        corners = np.unique(segments.reshape(-1, 2), axis=0)
+        for _ in range(12):
+            angle = generator.uniform(0.0, math.tau)
+            corner = corners[generator.integers(len(corners))]
+            middle = corner + 0.1 * np.array([math.cos(angle), math.sin(angle)])
+            free = clearance(*middle.tolist(), segments, circles)
+            # Through a wall it would come out on the other side, which is no closed way.
+            way = middle + min(0.04, 0.9 * free) * ring * generator.uniform(0.3, 1.0, 2)
+            work, total = work_around(way, segments, circles)
+            assert abs(work) <= 2e-6 * total + 1e-12
+            tested += total > 0.1
+    assert tested > 20
+
+
+def test_the_damper_never_gives_energy():
+    generator = np.random.default_rng(4)
+    world = load_world('room')
+    rooms = [(world.segments, world.circles), (round_room(24, 0.5), NO_CIRCLES)]
+    touching = 0
+    for segments, circles in rooms:
+        for wall in segments.tolist() * 150:
+            share = generator.uniform(-0.1, 1.1)
+            foot = np.array(wall[:2]) + share * (np.array(wall[2:]) - wall[:2])
+            x, y = (foot + generator.normal(0.0, 0.08, 2)).tolist()
+            if clearance(x, y, segments, circles) < 0.08:
+                continue
+            speed = generator.normal(0.0, 1.0, 2)
+            spring = force(x, y, segments, circles)
+            damped = force(x, y, segments, circles, DAMPED, speed)
+            assert (damped - spring) @ speed <= 1e-9
+            touching += bool(spring.any())
+    assert touching > 500
+
+
+def test_no_pull_towards_the_nearest_wall_at_any_speed():
+    generator = np.random.default_rng(5)
+    world = load_world('corridor')
+    touching = 0
+    for wall in world.segments.tolist() * 300:
+        foot = np.array(wall[:2]) + generator.uniform() * (np.array(wall[2:]) - wall[:2])
+        x, y = (foot + generator.normal(0.0, 0.08, 2)).tolist()
+        free = clearance(x, y, world.segments, world.circles)
+        if not 0.09 < free < RADIUS:
+            continue
+        speed = generator.normal(0.0, 3.0, 2)
+        pushed = force(x, y, world.segments, world.circles, DAMPED, speed)
+        slope = [
+            clearance(x + dx, y + dy, world.segments, world.circles) - free
+            for dx, dy in ((1e-7, 0.0), (0.0, 1e-7))
+        ]
+        assert pushed @ slope >= -1e-12
+        touching += 1
+    assert touching > 200
+
+
+def throw(speed, bumper, dt, angle=0.0, start=0.12, walls=FLOOR, x=0.0):
+    """Return where and how fast a thrown point mass is, the lowest it was, and its time in touch.
+
+    Semi-implicit Euler, as a simulation would do it.
+    """
+    y, lowest, touch = start, start, 0.0
+    speed_x, speed_y = speed * math.sin(angle), -speed * math.cos(angle)
+    for _ in range(round(1.0 / dt)):
+        force_x, force_y = contact_force(x, y, speed_x, speed_y, bumper, walls, NO_CIRCLES)
+        if force_y != 0.0:
+            touch += dt
+        speed_x += dt * force_x / MASS
+        speed_y += dt * force_y / MASS
+        x, y = x + dt * speed_x, y + dt * speed_y
+        lowest = min(lowest, y)
+        if y > start:
+            break
+    return (x, y), (speed_x, speed_y), lowest, touch
+
+
+@pytest.mark.parametrize('angle', [0.0, 0.6])
+def test_a_mass_thrown_at_a_spring_returns_as_fast_as_it_came_after_half_a_period(angle):
+    _, (speed_x, speed_y), lowest, touch = throw(0.5, SPRING, 1e-5, angle)
+    assert speed_y == pytest.approx(0.5 * math.cos(angle), rel=1e-3)
+    assert speed_x == pytest.approx(0.5 * math.sin(angle))  # no friction
+    if angle == 0.0:  # what the text of the setting says
+        assert RADIUS - lowest == pytest.approx(0.5 * math.sqrt(MASS / STIFFNESS), rel=1e-3)
+        assert RADIUS - lowest == pytest.approx(4.3e-3, abs=5e-5)
+        assert touch == pytest.approx(math.pi * math.sqrt(MASS / STIFFNESS), rel=2e-3)
+        assert touch == pytest.approx(0.027, abs=5e-4)
+
+
+def test_a_damped_bounce_loses_what_the_theory_of_spring_and_damper_says():
+    _, (_, speed_y), _, _ = throw(0.5, DAMPED, 1e-5)
+    # m a + c v + k z = 0 from z = 0; the wall lets go where k z + c v = 0.
+    decay = 0.5 * DAMPING / MASS
+    own = math.sqrt(STIFFNESS / MASS - decay**2)
+    time = math.atan2(2.0 * decay * own, decay**2 - own**2) / own
+    if time < 0.0:
+        time += math.tau / own
+    speed = math.exp(-decay * time) * (math.cos(own * time) - decay / own * math.sin(own * time))
+    assert speed_y == pytest.approx(-0.5 * speed, rel=2e-3)
+    assert 0.0 < speed_y < 0.35
+
+
+@pytest.mark.parametrize('speed', [0.05, 0.5, 1.4, 3.0])
+def test_steps_of_a_millisecond_are_fine_enough_for_the_defaults(speed):
+    _, (_, fine), _, _ = throw(speed, DAMPED, 1e-5)
+    _, (_, coarse), lowest, _ = throw(speed, DAMPED, 1e-3)
+    assert lowest > 0.05
+    assert coarse == pytest.approx(fine, abs=0.1 * speed)
+
+
+def test_a_ball_in_a_box_keeps_its_energy_over_many_bounces():
+    room = parse_world(
+        'walls: [{points: [[0, 0], [0.5, 0], [0.6, 0.4], [0.1, 0.5]], closed: true}]', 'box'
+    )
+    x, y, speed_x, speed_y, dt = 0.3, 0.25, 0.41, 0.29, 2e-4
+    reversals = 0
+    for _ in range(50_000):
+        force_x, force_y = contact_force(x, y, 0.0, 0.0, SPRING, room.segments, room.circles)
+        before = speed_x
+        speed_x, speed_y = speed_x + dt * force_x / MASS, speed_y + dt * force_y / MASS
+        x, y = x + dt * speed_x, y + dt * speed_y
+        reversals += before * speed_x < 0.0
+        assert clearance(x, y, room.segments, room.circles) > 0.1
+    while not room.is_free(x, y, RADIUS):
+        force_x, force_y = contact_force(x, y, 0.0, 0.0, SPRING, room.segments, room.circles)
+        speed_x, speed_y = speed_x + dt * force_x / MASS, speed_y + dt * force_y / MASS
+        x, y = x + dt * speed_x, y + dt * speed_y
+    assert reversals > 10
+    assert math.hypot(speed_x, speed_y) == pytest.approx(math.hypot(0.41, 0.29), rel=0.01)
+
+
+def test_a_wall_that_ends_on_another_is_not_felt_on_its_far_side():
+    """A partition that only touches the wall would push through it, beside the wall itself."""
+    apart = np.array([[-1.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, -1.0]])
+    joined = join_walls(apart)
+    assert len(joined) == 3
+    for x in np.linspace(-0.2, 0.2, 41).tolist():
+        assert force(x, 0.105, joined) == pytest.approx([0.0, STIFFNESS * 0.005], abs=1e-9)
+    assert force(0.0, 0.105, apart)[1] == pytest.approx(2.0 * STIFFNESS * 0.005)
+
+
+def test_walls_that_overlap_or_stand_twice_push_once():
+    floors = np.array([[-1.0, 0, 0.4, 0], [0.6, 0, -0.2, 0], [0.4, 5e-5, 1, 0], [-1, 0, 0.4, 0]])
+    joined = join_walls(floors)
+    for x in np.linspace(-0.9, 0.9, 61).tolist():
+        assert force(x, 0.105, joined) == pytest.approx(
+            [0.0, STIFFNESS * 0.005], abs=STIFFNESS * 1e-4
+        )
+
+
+def test_boxes_side_by_side_make_one_wall():
+    world = parse_world(
+        'boxes: [{center: [0.1, 0], size: [0.2, 0.2]}, {center: [0.3, 0], size: [0.2, 0.2]}]', 'a'
+    )
+    for x in np.linspace(0.0, 0.4, 41).tolist():
+        assert force(x, 0.205, world.segments) == pytest.approx([0.0, STIFFNESS * 0.005], abs=1e-6)

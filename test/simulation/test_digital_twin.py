@@ -1,0 +1,344 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The digital twin as a whole: it repeats itself, converges, and goes wrong as a robot does."""
+
+import math
+from pathlib import Path
+import re
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.geometry.types import Pose, WheelSpeeds
+from t3mpc_ros.parameters.table import ParameterError
+from t3mpc_ros.robot.interface import RANGE_SENSORS, RobotCommand, RobotInterface
+from t3mpc_ros.simulation.digital_twin import (
+    BROWN_OUT_REASON,
+    DigitalTwin,
+    DigitalTwinParameters,
+    make_robot,
+)
+from t3mpc_ros.simulation.plant.paper_plant import PaperRobot
+
+PERIOD = 10_000_000
+STILL = WheelSpeeds(0.0, 0.0)
+
+
+def parameters(**changes: object) -> DigitalTwinParameters:
+    return DigitalTwinParameters.from_dict(
+        {name.replace('__', '.'): value for name, value in changes.items()}
+    )
+
+
+def course(seed: int, periods: int) -> list[WheelSpeeds]:
+    """Wheel speeds like those of the chaotic reference: smooth, up to 6 rad/s, both signs."""
+    generator = np.random.default_rng(seed)
+    time = 0.01 * np.arange(periods)
+    speeds = np.full((2, periods), 1.5)
+    for _ in range(4):
+        frequency = generator.uniform(0.05, 0.6, (2, 1))
+        phase = generator.uniform(0.0, 2.0 * np.pi, (2, 1))
+        speeds += 1.5 * np.sin(2.0 * np.pi * frequency * time + phase)
+    return [WheelSpeeds(*pair) for pair in speeds.T.tolist()]
+
+
+def drive(robot: DigitalTwin, speeds: list[WheelSpeeds]) -> list:
+    robot.advance(0)
+    return [robot.step(wheels) for wheels in speeds]
+
+
+def faulty(robot: DigitalTwin, **faults: object) -> None:
+    robot.configure(
+        robot.parameters.with_values({f'faults.{name}': value for name, value in faults.items()})
+    )
+
+
+def astray(state) -> float:
+    """Return how far (m) odometry is from the truth."""
+    true, told = state.truth.pose, state.odometry.pose
+    return math.hypot(true.x - told.x, true.y - told.y)
+
+
+# -- it repeats itself ----------------------------------------------------------------------------
+
+
+def test_the_twin_has_every_part_of_the_seam():
+    for name in ('apply', 'advance', 'stop', 'reset_odometry', 'latch_estop', 'release_estop'):
+        assert getattr(DigitalTwin, name) is not getattr(RobotInterface, name)
+
+
+def test_the_table_says_which_robot_it_is():
+    assert type(make_robot(parameters())) is DigitalTwin
+    assert type(make_robot(parameters(drive__kind='velocity'))) is PaperRobot
+    with pytest.raises(ValueError, match='stepper is for DigitalTwin'):
+        PaperRobot(parameters())
+
+
+def test_many_twins_in_one_process_are_each_what_they_are_alone():
+    """A sweep may step its robots in any order: none knows of another."""
+    tables = [parameters(seed=seed, world='room', noise__variance=0.04) for seed in range(5)]
+    speeds = course(1, 150)
+    alone = [drive(DigitalTwin(table), speeds)[-1] for table in tables]
+    robots = [DigitalTwin(table) for table in tables]
+    for robot in robots:
+        robot.advance(0)
+    for wheels in speeds:
+        together = [robot.step(wheels) for robot in robots]
+    for one, other in zip(alone, together, strict=True):
+        assert repr(one) == repr(other)
+    assert len({repr(state.imu) for state in alone}) == 5
+
+
+def test_how_often_the_state_is_asked_for_changes_nothing():
+    speeds = course(2, 200)
+    whole, parts = DigitalTwin(parameters()), DigitalTwin(parameters())
+    for robot in (whole, parts):
+        robot.advance(0)
+    for k, wheels in enumerate(speeds):
+        for robot in (whole, parts):
+            robot.apply(RobotCommand(wheels, k * PERIOD), k * PERIOD)
+        last = whole.advance((k + 1) * PERIOD)
+        for tenth in range(1, 11):
+            asked = parts.advance(k * PERIOD + tenth * PERIOD // 10)
+    assert repr(last) == repr(asked)
+
+
+def test_a_setting_of_one_part_does_not_shift_the_random_numbers_of_another():
+    speeds = course(3, 100)
+    before = drive(DigitalTwin(parameters(world='corridor')), speeds)
+    after = drive(DigitalTwin(parameters(world='corridor', sharp__voltage_noise=0.1)), speeds)
+    assert [state.imu for state in before] == [state.imu for state in after]
+    assert before[-1].truth == after[-1].truth
+    assert [repr(s.ranges) for s in before] != [repr(s.ranges) for s in after]
+
+
+def test_halving_the_integration_step_changes_a_minute_by_less_than_a_tenth_of_a_millimetre():
+    """Seen at the stages alone, pulses came up to half a step late: 0.36 mm after a minute."""
+    speeds = course(4, 6000)
+    coarse, fine = (
+        np.array(
+            [
+                state.truth.pose[:2]
+                for state in drive(DigitalTwin(parameters(substep=step)), speeds)
+            ]
+        )
+        for step in (0.001, 0.0005)
+    )
+    assert np.ptp(coarse, axis=0).max() > 0.5  # it went somewhere
+    assert np.hypot(*(coarse - fine).T).max() < 0.01e-3
+
+
+# -- odometry is wrong exactly when steps are lost or tyres slide ---------------------------------
+
+
+def test_counters_tell_the_way_as_long_as_no_step_is_lost_and_no_tyre_slides():
+    robot = DigitalTwin(parameters(odometry__use_gyro=False))
+    for state in drive(robot, course(5, 3000)):
+        assert state.lost_steps == (0, 0)
+    assert robot.inside.slid == (0.0, 0.0)
+    last = state
+    apart = astray(last)
+    assert apart < 2e-3
+    assert math.remainder(last.truth.pose.yaw - last.odometry.pose.yaw, math.tau) < 2e-3
+
+
+@pytest.mark.parametrize(
+    ('cause', 'changes'),
+    [
+        ('a tyre that slides', {'tyres__grip': 0.03}),
+        ('lost steps', {'motor__phase_current': 0.12}),
+        ('a held wheel', {'faults__wheel_blocked': 'left'}),
+    ],
+)
+def test_odometry_does_not_notice(cause, changes):
+    robot = DigitalTwin(parameters(odometry__use_gyro=False, slip_stop=0.0, **changes))
+    last = drive(robot, course(5, 1000))[-1]
+    apart = astray(last)
+    assert apart > 0.02, cause
+    slid, lost = robot.inside.slid, last.lost_steps
+    assert max(slid) > 0.02 or max(map(abs, lost)) >= 4
+
+
+# -- board ----------------------------------------------------------------------------------------
+
+
+def test_a_command_reaches_the_wheels_after_the_dead_time():
+    robot = DigitalTwin(parameters(drive__dead_time=0.03))
+    robot.advance(0)
+    speeds = [robot.step(WheelSpeeds(1.0, 1.0)).wheels.right for _ in range(8)]
+    assert speeds[:3] == [0.0, 0.0, 0.0]
+    assert speeds[4] > 0.2
+
+
+def test_a_stale_command_is_refused_before_it_is_sent():
+    """Sent, it would reach a board that drops it and has no way to say so."""
+    robot = DigitalTwin(parameters())
+    now_ns = robot.advance(10**10).stamp_ns
+    for age, stale in ((0.0, False), (0.249, False), (0.25, True), (2.0, True), (-1.0, False)):
+        command = RobotCommand(WheelSpeeds(1.0, 1.0), now_ns - round(age * 1e9))
+        assert ('too old' in robot.apply(command, now_ns)) == stale, age
+
+
+def test_a_brown_out_resets_the_board_and_new_commands_bring_it_back():
+    robot = DigitalTwin(parameters(boot_time=0.5))
+    drive(robot, [WheelSpeeds(4.0, 4.0)] * 100)
+    before = robot.state
+    faulty(robot, brown_out=True)
+    states = [robot.step(WheelSpeeds(4.0, 4.0)) for _ in range(45)]
+    assert states[-1].reason == BROWN_OUT_REASON
+    assert not states[-1].status.enabled
+    assert (
+        robot.apply(RobotCommand(STILL, states[-1].stamp_ns), states[-1].stamp_ns)
+        == BROWN_OUT_REASON
+    )
+    assert states[-1].imu is None
+    assert abs(states[-1].true_wheels.right) < 3.0  # nothing pulls: friction brakes
+    faulty(robot, brown_out=False)
+    back = [robot.step(WheelSpeeds(4.0, 4.0)) for _ in range(60)]
+    assert back[-1].reason == ''
+    assert back[-1].wheels.right == pytest.approx(4.0, abs=0.4)
+    # The host adds up what every board counted: the wheel angle goes on where it was.
+    assert back[-1].angles.right > before.angles.right
+
+
+def test_a_battery_that_collapses_is_a_brown_out():
+    full, weak = (DigitalTwin(parameters(battery__resistance=ohms)) for ohms in (0.15, 8.0))
+    assert drive(full, [WheelSpeeds(3.0, 3.0)] * 20)[-1].reason == ''
+    states = drive(weak, [WheelSpeeds(3.0, 3.0)] * 20)
+    assert BROWN_OUT_REASON in {state.reason for state in states}
+
+
+def test_lasting_slip_stops_the_robot_with_a_reason():
+    robot = DigitalTwin(parameters())
+    drive(robot, [STILL] * 150)  # the gyro learns its bias at a standstill
+    faulty(robot, wheel_blocked='right')
+    states = [robot.step(WheelSpeeds(3.0, 3.0)) for _ in range(250)]
+    assert any(state.status.slipping for state in states)
+    assert any('a wheel slips, is blocked, or has lost steps' in state.reason for state in states)
+
+
+def test_every_word_of_a_fault_is_in_force_at_once():
+    robot = DigitalTwin(parameters(faults__slippery=0.5, faults__load_change=1.0))
+    assert robot.inside.faults == ('load_change 1 kg', 'slippery 0.5')
+
+
+# -- world and sensors ----------------------------------------------------------------------------
+
+
+def test_a_wall_stops_the_body_and_the_sensors_see_it_coming(tmp_path):
+    wall = tmp_path / 'wall.yaml'
+    wall.write_text('walls:\n  - points: [[1.0, -2.0], [1.0, 2.0]]\n')
+    exact = {'sharp__voltage_noise': 0.0, 'sharp__voltage_offset': 0.0}
+    robot = DigitalTwin(parameters(world=str(wall), **exact))
+    states = drive(robot, [WheelSpeeds(5.0, 5.0)] * 800)
+    radius = robot.parameters.bumper.radius
+    assert states[-1].truth.pose.x == pytest.approx(1.0 - radius, abs=0.005)
+    assert max(state.truth.pose.x for state in states) < 1.0 - radius + 0.01
+    assert robot.inside.max_contact_force > 3.0
+    assert states[-1].odometry.pose.x > 1.1  # the wheels went on
+    # 0.5 m before the wall, a front sensor on the body's edge reads the rest of the way.
+    halfway = min(states, key=lambda state: abs(state.truth.pose.x - 0.5))
+    front = halfway.ranges[RANGE_SENSORS.index('front_left')]
+    assert front == pytest.approx(1.0 - 0.5 - robot.parameters.sharp.half_length, abs=0.03)
+    assert halfway.ranges[RANGE_SENSORS.index('rear_left')] == math.inf
+    assert halfway.ranges[RANGE_SENSORS.index('left_front')] == math.inf
+
+
+def test_a_robot_cannot_be_put_into_a_wall(tmp_path):
+    box = tmp_path / 'box.yaml'
+    box.write_text('boxes:\n  - center: [1.0, 0.0]\n    size: [0.5, 0.5]\n')
+    robot = DigitalTwin(parameters(world=str(box)))
+    robot.advance(0)
+    robot.set_pose(Pose(1.0, 1.0, 0.3))
+    for wrong in (Pose(1.0, 0.0, 0.0), Pose(0.7, 0.0, 0.0)):
+        with pytest.raises(ValueError, match=r'pose must be at least 0.11 m away'):
+            robot.set_pose(wrong)
+    with pytest.raises(ValueError, match='pose must be finite'):
+        robot.set_pose(Pose(math.nan, 0.0, 0.0))
+    assert robot.state.truth.pose == pytest.approx((1.0, 1.0, 0.3))
+
+
+def test_a_slippery_patch_is_where_the_world_says(tmp_path):
+    ice = tmp_path / 'ice.yaml'
+    ice.write_text('patches:\n  - center: [0.5, 0.0]\n    radius: 0.2\n    grip: 0.0\n')
+    robot = DigitalTwin(parameters(world=str(ice)))
+    speeds = [WheelSpeeds(4.0, 4.0)] * 230 + [WheelSpeeds(2.0, 2.0)] * 200
+    slid, last = [], 0.0
+    robot.advance(0)
+    for wheels in speeds:
+        place = robot.step(wheels).truth.pose.x
+        now = robot.inside.slid[0]
+        if now > last + 1e-9:
+            slid.append(place)
+        last = now
+    assert slid
+    assert min(slid) > 0.29
+    assert max(slid) < 0.76
+
+
+def test_the_gyro_sums_up_to_the_turn_that_was_made():
+    quiet = {'imu__gyro_noise': 0.0, 'imu__gyro_offset': 0.0, 'imu__gyro_drift': 0.0}
+    robot = DigitalTwin(parameters(imu__gyro_scale_error=0.0, **quiet))
+    states = drive(robot, [WheelSpeeds(2.0, -2.0)] * 300 + [STILL] * 100)
+    turned = 0.01 * sum(state.imu.angular for state in states)
+    truth = 0.01 * sum(state.truth.twist.angular for state in states)
+    assert turned > 2.0
+    assert turned == pytest.approx(truth, rel=0.002)
+
+
+def test_the_accelerometer_feels_acceleration_and_the_bend():
+    quiet = {'imu__accel_noise': 0.0, 'imu__accel_offset': 0.0}
+    robot = DigitalTwin(parameters(body__com_offset=0.0, **quiet))
+    states = drive(robot, [WheelSpeeds(6.0, 4.0)] * 300)
+    speed, turning = states[-1].truth.twist
+    sideways = np.mean([state.imu.sideways for state in states[200:]])
+    assert sideways == pytest.approx(speed * turning, rel=0.03)
+    assert max(state.imu.forward for state in states[:30]) > 0.5
+
+
+def test_the_battery_pays_for_the_motors():
+    idle, busy = DigitalTwin(parameters()), DigitalTwin(parameters())
+    drive(idle, [STILL] * 200)
+    drive(busy, [WheelSpeeds(8.0, 8.0)] * 200)
+    assert busy.state.battery.charge < idle.state.battery.charge < 1.0
+    copper = 2.0 * 1.0**2 * 1.5
+    assert idle.state.battery.current * idle.state.battery.voltage > copper
+
+
+# -- bad settings ---------------------------------------------------------------------------------
+
+
+def test_speeds_that_the_pulses_cannot_make_are_refused():
+    with pytest.raises(ParameterError, match=r'guard.wheel_speed must be at most 1\.227 rad/s'):
+        parameters(motor__microsteps=256)
+    parameters(motor__microsteps=256, guard__wheel_speed=1.2)
+
+
+def test_odometry_must_know_how_late_the_gyro_is():
+    with pytest.raises(ParameterError, match=r'odometry.gyro_delay must be about 0.041 s'):
+        parameters(imu__low_pass='6')
+    parameters(imu__low_pass='6', odometry__gyro_delay=0.041)
+    parameters(imu__low_pass='6', odometry__use_gyro=False)
+
+
+def test_a_step_too_long_for_the_rotor_is_refused_with_the_longest():
+    with pytest.raises(ParameterError, match=r'substep must be at most 0\.0018 s'):
+        parameters(substep=0.002)
+
+
+def test_what_is_built_in_stays_while_the_robot_runs():
+    robot = DigitalTwin(parameters())
+    with pytest.raises(ParameterError, match='motor.microsteps is fixed while the robot runs'):
+        robot.configure(parameters(motor__microsteps=8))
+
+
+# -- the page -------------------------------------------------------------------------------------
+
+
+def test_the_example_on_the_page_runs(capsys):
+    page = (Path(__file__).resolve().parents[2] / 'docs' / 'twin.md').read_text()
+    (example,) = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
+    exec(example, {})
+    yaws = eval(capsys.readouterr().out)
+    assert len(yaws) == 8
+    assert all(math.isfinite(yaw) for yaw in yaws)

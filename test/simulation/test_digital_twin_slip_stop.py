@@ -1,0 +1,166 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""A robot that stops for slip stands, and stands until whoever commands it has let go."""
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, RobotCommand
+from t3mpc_ros.robot.slip_monitor import RELEASE_TIME, SLIP_STOP_REASON
+from t3mpc_ros.simulation.digital_twin import BROWN_OUT_REASON, DigitalTwin, DigitalTwinParameters
+
+FORWARD = WheelSpeeds(5.0, 5.0)
+PERIOD_NS = 10_000_000
+
+
+def a_robot(**changes):
+    """Return a robot whose gyro is calibrated: it has stood for longer than a second."""
+    robot = DigitalTwin(DigitalTwinParameters.from_dict(changes))
+    robot.warm_up()
+    drive(robot, ZERO_WHEEL_SPEEDS, 1.3)
+    return robot
+
+
+def drive(robot, wheels, seconds):
+    """Command ``wheels`` in every period and return all states."""
+    return [robot.step(wheels) for _ in range(round(100 * seconds))]
+
+
+def silence(robot, seconds):
+    """Command nothing at all and return all states."""
+    start = robot.state.stamp_ns
+    return [robot.advance(start + PERIOD_NS * (k + 1)) for k in range(round(100 * seconds))]
+
+
+def fault(robot, **changes):
+    given = {f'faults.{name}': value for name, value in changes.items()}
+    robot.configure(robot.parameters.with_values(given))
+
+
+def stopped(**changes):
+    """Return a robot that a held right wheel has stopped."""
+    robot = a_robot(**changes)
+    drive(robot, FORWARD, 1.0)
+    fault(robot, wheel_blocked='right')
+    drive(robot, FORWARD, 1.5)
+    return robot
+
+
+def test_a_robot_with_a_held_wheel_stops_and_does_not_only_say_so():
+    """The guard took the next command 10 ms after each stop: the robot drove on for ever."""
+    robot = stopped()
+    states = drive(robot, FORWARD, 5.0)
+    assert {state.reason for state in states} == {SLIP_STOP_REASON}
+    assert all(state.commanded == ZERO_WHEEL_SPEEDS for state in states)
+    assert np.abs([state.true_wheels for state in states[50:]]).max() < 0.1
+    start, end = states[50].truth.pose, states[-1].truth.pose
+    np.testing.assert_allclose(start, end, atol=1e-3)
+
+
+def test_it_stops_once_slip_has_lasted_for_the_time_that_is_set():
+    robot = a_robot(slip_stop=0.6)
+    drive(robot, FORWARD, 1.0)
+    fault(robot, wheel_blocked='right')
+    states = drive(robot, FORWARD, 2.0)
+    first = next(k for k, state in enumerate(states) if state.reason)
+    # Slip is counted from when the smoothed disagreement passes the threshold.
+    assert 0.6 < 0.01 * first < 0.8
+
+
+@pytest.mark.parametrize('held', [True, False])
+def test_it_does_not_start_by_itself_when_the_fault_is_gone(held):
+    """No stop and go: with something in the wheel each new try would be another push."""
+    robot = stopped()
+    if not held:
+        fault(robot, wheel_blocked='none')
+    states = drive(robot, FORWARD, 6.0)
+    assert not any(state.status.slipping for state in states[100:])
+    assert all(state.commanded == ZERO_WHEEL_SPEEDS for state in states)
+
+
+@pytest.mark.parametrize(
+    'let_go', [silence, lambda robot, time: drive(robot, ZERO_WHEEL_SPEEDS, time)]
+)
+def test_it_obeys_again_once_no_motion_was_commanded_for_a_while(let_go):
+    robot = stopped()
+    fault(robot, wheel_blocked='none')
+    drive(robot, FORWARD, 1.0)
+    states = let_go(robot, RELEASE_TIME + 0.05)
+    assert {state.reason for state in states[:-10]} == {SLIP_STOP_REASON}
+    states = drive(robot, FORWARD, 1.0)
+    assert states[-1].reason == ''
+    assert states[-1].true_wheels == pytest.approx(FORWARD, abs=0.2)
+
+
+def test_a_shorter_pause_does_not_count():
+    robot = stopped()
+    fault(robot, wheel_blocked='none')
+    drive(robot, FORWARD, 1.0)
+    for _ in range(5):
+        drive(robot, ZERO_WHEEL_SPEEDS, 0.8 * RELEASE_TIME)
+        states = drive(robot, FORWARD, 0.1)
+    assert states[-1].reason == SLIP_STOP_REASON
+    assert states[-1].commanded == ZERO_WHEEL_SPEEDS
+
+
+def test_with_the_wheel_still_held_it_stops_again():
+    robot = stopped()
+    drive(robot, ZERO_WHEEL_SPEEDS, RELEASE_TIME + 0.05)
+    states = drive(robot, FORWARD, 2.0)
+    assert any(state.commanded != ZERO_WHEEL_SPEEDS for state in states)
+    assert states[-1].reason == SLIP_STOP_REASON
+    assert states[-1].commanded == ZERO_WHEEL_SPEEDS
+
+
+def test_late_commands_count_when_they_arrive():
+    """What was sent before the stick was let go is not a new wish, but it is not silence."""
+    robot = stopped()
+    fault(robot, wheel_blocked='none', command_delay=0.2)
+    drive(robot, FORWARD, 0.1)
+    silence(robot, RELEASE_TIME - 0.1)
+    robot.apply(RobotCommand(FORWARD, robot.state.stamp_ns), robot.state.stamp_ns)
+    assert silence(robot, 0.25)[-1].reason == SLIP_STOP_REASON
+    silence(robot, RELEASE_TIME)
+    assert drive(robot, FORWARD, 0.4)[-1].reason == ''
+
+
+def test_taking_the_rule_away_lets_it_go_on():
+    robot = stopped()
+    robot.configure(robot.parameters.with_values({'slip_stop': 0.0}))
+    assert drive(robot, FORWARD, 0.2)[-1].commanded == FORWARD
+
+
+def test_zero_means_that_it_never_stops_for_slip():
+    robot = a_robot(slip_stop=0.0)
+    fault(robot, wheel_blocked='right')
+    states = drive(robot, FORWARD, 3.0)
+    assert any(state.status.slipping for state in states)
+    assert not any(state.reason for state in states)
+
+
+def test_an_emergency_stop_is_not_hidden_and_is_itself_a_time_without_commands():
+    robot = stopped()
+    fault(robot, wheel_blocked='none')
+    robot.latch_estop('a person', robot.state.stamp_ns)
+    states = drive(robot, FORWARD, 1.0)
+    assert all('a person' in state.reason for state in states)
+    robot.release_estop(robot.state.stamp_ns)
+    assert drive(robot, FORWARD, 0.5)[-1].reason == ''
+
+
+def test_a_board_that_restarts_has_forgotten_why_it_stood():
+    robot = stopped()
+    fault(robot, wheel_blocked='none', brown_out=True)
+    assert drive(robot, FORWARD, 0.3)[-1].reason == BROWN_OUT_REASON
+    assert drive(robot, FORWARD, 0.8)[-1].reason == ''
+
+
+def test_turning_the_standing_robot_by_hand_ends_with_the_hand():
+    """A gyro that shows a turn which nobody commanded is no reason to refuse the next command."""
+    robot = a_robot()
+    fault(robot, gyro_bias_jump=1.0)
+    assert drive(robot, ZERO_WHEEL_SPEEDS, 1.4)[-1].reason == SLIP_STOP_REASON
+    fault(robot, gyro_bias_jump=0.0)
+    drive(robot, ZERO_WHEEL_SPEEDS, RELEASE_TIME + 0.3)
+    assert drive(robot, FORWARD, 0.3)[-1].reason == ''

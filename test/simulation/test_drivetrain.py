@@ -1,0 +1,346 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Rotors, tyres and body together: Newton, momentum and energy, rolling and sliding."""
+
+import math
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.simulation.plant.contact import BumperParameters
+from t3mpc_ros.simulation.plant.disturbances import (
+    Disturbance,
+    DisturbanceParameters,
+    FrictionParameters,
+)
+from t3mpc_ros.simulation.plant.drivetrain import (
+    ROLLING,
+    Drivetrain,
+    Load,
+    TyreParameters,
+    begin_rolling,
+    body_vector,
+    loses_grip,
+    mean_pulses,
+    mean_rate,
+    state_derivative,
+    stops_sliding,
+)
+from t3mpc_ros.simulation.plant.dynamics import (
+    BodyParameters,
+    coriolis_factor,
+    dynamics_vector,
+    wheel_acceleration,
+    wheel_inertia,
+)
+from t3mpc_ros.simulation.plant.stepper_motor import StepperMotorParameters
+from t3mpc_ros.simulation.world import load_world
+
+GEOMETRY = WheelGeometry()
+BODY = BodyParameters(com_offset=0.03)
+MOTOR = StepperMotorParameters()
+NO_FRICTION = FrictionParameters(viscous=0.0, coulomb=0.0)
+RADIUS, HALF = GEOMETRY.wheel_radius, GEOMETRY.half_separation
+BUMPER = BumperParameters().vector()
+NOWHERE = np.zeros((0, 4)), np.zeros((0, 3))
+VOLTS = 12.0
+OWN = BODY.wheel_inertia
+
+
+def rates(state, modes, torque, grip=1e9):
+    slope, pushed = np.zeros(9), np.zeros(3)
+    tyres = np.array([OWN, OWN, grip, grip])
+    state_derivative(
+        state,
+        np.array(modes, dtype=np.int64),
+        np.array(torque),
+        body_vector(BODY, GEOMETRY),
+        tyres,
+        BUMPER,
+        *NOWHERE,
+        slope,
+        pushed,
+    )
+    return slope, pushed
+
+
+def random_state(generator):
+    state = generator.uniform(-5.0, 5.0, 9)
+    state[5:7] = state[7:9]  # both tyres roll
+    return state
+
+
+def drivetrain(
+    *,
+    grip: float = 5.0,
+    grip_factor: float = 1.0,
+    friction: FrictionParameters = NO_FRICTION,
+    motor: StepperMotorParameters = MOTOR,
+    step: float = 0.001,
+    blocked: tuple[bool, bool] = (False, False),
+) -> Drivetrain:
+    made = Drivetrain(motor, BumperParameters(), load_world(''), step, 0.1)
+    made.load(motor, load(grip=grip, grip_factor=grip_factor, friction=friction, blocked=blocked))
+    return made
+
+
+def load(
+    *,
+    grip: float = 5.0,
+    grip_factor: float = 1.0,
+    friction: FrictionParameters = NO_FRICTION,
+    blocked: tuple[bool, bool] = (False, False),
+) -> Load:
+    tyres = TyreParameters(grip=grip, load_share=1.0)
+    return Load(BODY, GEOMETRY, friction, 1.0, tyres, grip_factor, blocked)
+
+
+def calm() -> Disturbance:
+    return Disturbance(DisturbanceParameters(bound=0.0), np.random.default_rng(1))
+
+
+def kinetic(robot: Drivetrain, motor: StepperMotorParameters = MOTOR) -> float:
+    """Energy (J) of body and wheels."""
+    ground, wheels = np.array(robot.ground), np.array(robot.wheels)
+    inertia = wheel_inertia(BODY, GEOMETRY) - BODY.wheel_inertia * np.eye(2)
+    own = BODY.wheel_inertia + motor.rotor_inertia
+    return float(0.5 * ground @ inertia @ ground + 0.5 * own * wheels @ wheels)
+
+
+def magnetic(robot: Drivetrain, motor: StepperMotorParameters = MOTOR) -> float:
+    """Energy (J) of the rotors in fields at rest."""
+    peak = motor.torque_constant * motor.phase_current
+    return sum(
+        peak / motor.teeth * (1.0 - math.cos(motor.teeth * angle)) for angle in robot.load_angles
+    )
+
+
+def swinging(motor: StepperMotorParameters, step: float) -> Drivetrain:
+    """A robot whose rotors swing freely in fields that have just stopped."""
+    robot = drivetrain(motor=motor, step=step)
+    for _ in range(round(0.02 / step)):
+        robot.run(WheelSpeeds(2.0, -1.2), 0.0, VOLTS, calm(), 1)
+    robot.run(WheelSpeeds(0.0, 0.0), 0.0, VOLTS, calm(), 2)
+    return robot
+
+
+# -- pulses ---------------------------------------------------------------------------------------
+
+
+def test_the_mean_place_of_a_field_is_that_of_the_staircase():
+    generator = np.random.default_rng(8)
+    for _ in range(200):
+        start, way = generator.uniform(-5.0, 5.0), generator.uniform(-7.0, 7.0)
+        fine = np.floor(start + way * (np.arange(200_000) + 0.5) / 200_000)
+        assert mean_pulses(start, start + way) == pytest.approx(fine.mean(), abs=2e-4)
+    assert mean_pulses(2.3, 2.3) == 2.0
+    assert mean_pulses(-2.3, -2.3) == -3.0
+
+
+def test_a_rate_that_gets_where_it_should_stays_there():
+    """A ramp that ends within a step: counted as a whole one, pulses would depend on the step."""
+    for rate, target, reach in ((0.0, 10.0, 40.0), (3.0, -5.0, 16.0), (2.0, 50.0, 12.0)):
+        times = (np.arange(100_000) + 0.5) / 100_000
+        way = target - rate
+        courses = rate + np.sign(way) * np.minimum(reach * times, abs(way))
+        assert mean_rate(rate, target, abs(way) / reach) == pytest.approx(courses.mean(), abs=1e-4)
+
+
+# -- Newton ---------------------------------------------------------------------------------------
+
+
+def test_where_both_tyres_roll_the_coupled_equations_are_equation_10():
+    generator = np.random.default_rng(1)
+    dynamics = dynamics_vector(BODY, GEOMETRY)
+    for _ in range(100):
+        state, torque = random_state(generator), generator.uniform(-1.0, 1.0, 2)
+        slope, _ = rates(state, (ROLLING, ROLLING), torque)
+        expected = wheel_acceleration(state[5], state[6], torque[0], torque[1], dynamics)
+        np.testing.assert_allclose(slope[5:7], expected, rtol=1e-10, atol=1e-9)
+        np.testing.assert_array_equal(slope[5:7], slope[7:9])
+
+
+@pytest.mark.parametrize('modes', [(0, 0), (1, 0), (0, -1), (1, -1), (-1, -1)])
+def test_tyre_forces_are_all_that_moves_the_body(modes):
+    """Newton and Euler of the body: m v' - m_c d w² = F_R + F_L, and the same for turning."""
+    generator = np.random.default_rng(2)
+    mass, moment = BODY.total_mass, BODY.body_mass * BODY.com_offset
+    for _ in range(50):
+        state, torque = random_state(generator), generator.uniform(-1.0, 1.0, 2)
+        grip = 2.0
+        slope, pushed = rates(state, modes, torque, grip)
+        force = pushed[:2] / RADIUS
+        speed, angular = (
+            0.5 * RADIUS * sum(state[7:9]),
+            0.5 * RADIUS / HALF * (state[7] - state[8]),
+        )
+        gain, turning = 0.5 * RADIUS * sum(slope[7:9]), 0.5 * RADIUS / HALF * (slope[7] - slope[8])
+        assert mass * gain - moment * angular**2 == pytest.approx(force.sum(), abs=1e-8)
+        inertia = BODY.total_inertia(GEOMETRY)
+        assert inertia * turning + moment * speed * angular == pytest.approx(
+            HALF * (force[0] - force[1]), abs=1e-8
+        )
+        for wheel, mode in enumerate(modes):
+            if mode != ROLLING:
+                assert force[wheel] == pytest.approx(mode * grip)
+            own = torque[wheel] - OWN * slope[5 + wheel]
+            assert pushed[wheel] == pytest.approx(own, abs=1e-8)
+
+
+def test_a_tyre_that_takes_hold_keeps_the_momentum_and_gives_off_energy():
+    generator = np.random.default_rng(3)
+    inertia = wheel_inertia(BODY, GEOMETRY) - BODY.wheel_inertia * np.eye(2)
+    tyres = np.array([OWN, OWN, 1.0, 1.0])
+    for modes in ((1, 0), (0, -1), (1, -1), (-1, 1)):
+        for _ in range(20):
+            state = generator.uniform(-5.0, 5.0, 9)
+            for wheel, mode in enumerate(modes):
+                if mode == ROLLING:
+                    state[5 + wheel] = state[7 + wheel]
+                else:  # the slide has just gone through zero
+                    state[5 + wheel] = state[7 + wheel] - mode * 0.01
+            before = inertia @ state[7:9] + OWN * state[5:7]
+            energy = 0.5 * state[7:9] @ inertia @ state[7:9] + 0.5 * OWN * state[5:7] @ state[5:7]
+            now = np.array(modes, dtype=np.int64)
+            assert stops_sliding(state, now)
+            begin_rolling(state, now, body_vector(BODY, GEOMETRY), tyres)
+            np.testing.assert_array_equal(now, (ROLLING, ROLLING))
+            np.testing.assert_array_equal(state[5:7], state[7:9])
+            np.testing.assert_allclose(inertia @ state[7:9] + OWN * state[5:7], before, rtol=1e-12)
+            after = 0.5 * state[7:9] @ inertia @ state[7:9] + 0.5 * OWN * state[5:7] @ state[5:7]
+            assert after <= energy + 1e-15
+
+
+def test_a_tyre_lets_go_exactly_beyond_its_grip_and_slides_the_way_it_was_pushed():
+    body = body_vector(BODY, GEOMETRY)
+    tyres = np.array([OWN, OWN, 2.0, 2.0])
+    for force, mode in ((1.999, 0), (2.001, 1), (-2.001, -1)):
+        modes = np.zeros(2, dtype=np.int64)
+        assert loses_grip(modes, np.array([RADIUS * force, 0.0, 0.0]), body, tyres) == (mode != 0)
+        assert modes.tolist() == [mode, 0]
+
+
+# -- energy ---------------------------------------------------------------------------------------
+
+
+def test_free_swings_keep_their_energy_to_the_order_of_the_method():
+    """Nothing rubs: kinetic and magnetic energy only change places, to order 4 of the step."""
+    motor = StepperMotorParameters(microsteps=256, damping=0.0)
+    errors = []
+    for step in (0.004, 0.002, 0.001):
+        robot = swinging(motor, 0.0005)
+        coarse = drivetrain(motor=motor, step=step)
+        coarse._state[:], coarse._field[:] = robot._state, robot._field
+        coarse._read()
+        start = kinetic(coarse) + magnetic(coarse)
+        assert start > 1e-5
+        for _ in range(round(0.4 / step)):
+            coarse.run(WheelSpeeds(0.0, 0.0), 0.0, VOLTS, calm(), 1)
+        errors.append(abs(kinetic(coarse) + magnetic(coarse) - start) / start)
+    assert errors[2] < 1e-5
+    assert errors[0] / errors[1] > 12.0
+    assert errors[1] / errors[2] > 12.0
+
+
+def test_damping_and_friction_only_ever_take_energy_out_while_the_fields_rest():
+    robot = swinging(StepperMotorParameters(microsteps=256), 0.0005)
+    robot.load(StepperMotorParameters(microsteps=256), load(friction=FrictionParameters()))
+    energy = kinetic(robot) + magnetic(robot)
+    for _ in range(1500):
+        robot.run(WheelSpeeds(0.0, 0.0), 0.0, VOLTS, calm(), 2)
+        now = kinetic(robot) + magnetic(robot)
+        assert now <= energy + 1e-12
+        energy = now
+    assert energy < 1e-6
+
+
+def test_what_the_turning_fields_do_is_what_the_robot_gains():
+    """Fields of 256 microsteps turn all but evenly: their work is the robot's energy."""
+    motor = StepperMotorParameters(microsteps=256, damping=0.0, step_rate=1e6)
+    robot = drivetrain(motor=motor, step=0.00025)
+    for _ in range(400):
+        robot.run(WheelSpeeds(6.0, 3.0), 15.0, VOLTS, calm(), 4)
+    gained = kinetic(robot, motor) + magnetic(robot, motor)
+    assert gained > 0.02
+    assert robot.field_work == pytest.approx(gained, rel=0.003)
+
+
+def test_a_sliding_robot_loses_what_its_tyres_rub_off():
+    """Both wheels are held at speed: the body comes to rest, its energy goes into the floor."""
+    robot = drivetrain(grip=0.6)
+    for _ in range(100):
+        robot.run(WheelSpeeds(8.0, 8.0), 30.0, VOLTS, calm(), 10)
+    speed = RADIUS * robot.ground.right
+    body = 0.5 * BODY.total_mass * speed**2
+    robot.load(MOTOR, load(grip=0.6, blocked=(True, True)))
+    for _ in range(100):
+        robot.run(WheelSpeeds(8.0, 8.0), 30.0, VOLTS, calm(), 10)
+    force = 0.6 * 9.81 * BODY.total_mass  # of both tyres together
+    assert tuple(robot.ground) == pytest.approx((0.0, 0.0), abs=1e-6)
+    assert np.mean(robot.slid) == pytest.approx(body / force, rel=0.01)
+    assert np.mean(robot.slid) == pytest.approx(speed**2 / (2.0 * 0.6 * 9.81), rel=0.01)
+
+
+# -- momentum -------------------------------------------------------------------------------------
+
+
+def test_on_ice_the_wheels_spin_and_the_body_keeps_its_momentum():
+    robot = drivetrain()
+    for _ in range(100):
+        robot.run(WheelSpeeds(4.0, 4.0), 10.0, VOLTS, calm(), 10)
+    for _ in range(100):
+        robot.run(WheelSpeeds(4.0, 4.0), 10.0, VOLTS, calm(), 10)
+    robot.load(MOTOR, load(grip_factor=0.0))
+    robot.run(WheelSpeeds(4.0, 4.0), 10.0, VOLTS, calm(), 1)  # at its end the tyres let go
+    ground = robot.ground
+    for _ in range(100):
+        robot.run(WheelSpeeds(10.0, -10.0), 30.0, VOLTS, calm(), 10)
+    assert tuple(robot.wheels) == pytest.approx((10.0, -10.0), abs=1.0)
+    assert tuple(robot.ground) == pytest.approx(tuple(ground), abs=1e-9)
+    assert robot.lost_steps == (0, 0)
+
+
+def test_on_ice_a_body_that_turns_keeps_its_energy():
+    robot = drivetrain()
+    for _ in range(200):
+        robot.run(WheelSpeeds(6.0, 2.0), 10.0, VOLTS, calm(), 10)
+    robot.load(MOTOR, load(grip_factor=0.0))
+    robot.run(WheelSpeeds(6.0, 2.0), 10.0, VOLTS, calm(), 1)
+    ground = np.array(robot.ground)
+    inertia = wheel_inertia(BODY, GEOMETRY) - BODY.wheel_inertia * np.eye(2)
+    before = ground @ inertia @ ground
+    for _ in range(200):
+        robot.run(WheelSpeeds(6.0, 2.0), 10.0, VOLTS, calm(), 10)
+    ground = np.array(robot.ground)
+    assert coriolis_factor(BODY, GEOMETRY) > 0.0  # (12) does work on neither, but swaps v and w
+    assert ground @ inertia @ ground == pytest.approx(before, rel=1e-9)
+
+
+def test_acceleration_beyond_the_grip_slides_at_the_grip():
+    """The best a robot can do is mu g of the weight on its wheels; the counters do not know."""
+    robot = drivetrain(grip=0.1)
+    for _ in range(30):
+        robot.run(WheelSpeeds(12.0, 12.0), 120.0, VOLTS, calm(), 10)
+    assert robot.lost_steps == (0, 0)
+    assert robot.sliding == (True, True)
+    expected = 0.1 * 9.81 * 0.3  # v = mu g t
+    assert RADIUS * robot.ground.right == pytest.approx(expected, rel=0.02)
+    assert robot.slid[0] > 0.05
+
+
+def test_a_held_wheel_is_what_the_robot_turns_about():
+    robot = drivetrain(grip=2.0, blocked=(True, False))
+    for _ in range(200):
+        robot.run(WheelSpeeds(3.0, 3.0), 10.0, VOLTS, calm(), 10)
+    assert robot.wheels.right == pytest.approx(0.0, abs=1e-6)
+    assert robot.ground.right == pytest.approx(0.0, abs=1e-3)
+    assert robot.wheels.left == pytest.approx(3.0, abs=0.3)
+    assert robot.lost_steps[0] >= 4
+    assert robot.lost_steps[1] == 0
+    yaw = robot.pose.yaw
+    for _ in range(100):
+        robot.run(WheelSpeeds(3.0, 3.0), 10.0, VOLTS, calm(), 10)
+    turned = math.remainder(robot.pose.yaw - yaw, math.tau)
+    assert turned == pytest.approx(-RADIUS * 3.0 / (2.0 * HALF), rel=0.02)

@@ -1,0 +1,400 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Faults by name: each live, each scriptable, and schedules that hold what they say."""
+
+from dataclasses import replace
+import math
+from pathlib import Path
+import re
+import runpy
+
+import numpy as np
+import pytest
+import setuptools
+
+from t3mpc_ros.simulation.fault_injection import (
+    FAULTS,
+    MIN_DURATION,
+    SCHEDULES_FOLDER,
+    FaultEvent,
+    FaultParameters,
+    FaultSchedule,
+    ScheduleError,
+    active_faults,
+    load_schedule,
+)
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = (ROOT / 'docs' / 'faults.md').read_text()
+NO_FAULT = FaultParameters()
+ROWS = {row.name: row for row in FaultParameters.rows()}
+NAMES = [fault.name for fault in FAULTS]
+
+
+def some_value(name: str, generator: np.random.Generator) -> object:
+    """Return a random value that the table allows."""
+    row = ROWS[name]
+    if row.kind is bool:
+        return bool(generator.integers(2))
+    if row.choices:
+        return str(generator.choice(row.choices))
+    return float(generator.uniform(row.low, row.high))
+
+
+def a_fault(name: str) -> object:
+    """Return a value that is a fault."""
+    row = ROWS[name]
+    if row.kind is bool:
+        return True
+    return 'left' if row.choices else 0.5
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / 'ride.yaml'
+    path.write_text(text)
+    return path
+
+
+# --- the table ----------------------------------------------------------------------------------
+
+
+def test_faults_are_the_live_rows_with_their_texts_and_only_the_schedule_is_fixed():
+    assert [row.name for row in FaultParameters.rows() if not row.dynamic] == ['schedule']
+    assert [(row.name, row.text) for row in FaultParameters.rows() if row.dynamic] == list(FAULTS)
+    assert all('\n' not in fault.text for fault in FAULTS)
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_every_fault_can_be_set_alone_and_is_told_of(name):
+    assert active_faults(NO_FAULT) == ()
+    faulty = NO_FAULT.with_values({name: a_fault(name)})
+    (text,) = active_faults(faulty)
+    assert text.split()[0] == name
+    assert active_faults(faulty.with_values({name: ROWS[name].default})) == ()
+
+
+def test_words_for_faults_carry_value_and_unit_and_no_word_for_the_schedule():
+    parameters = FaultParameters(
+        command_delay=0.1, slippery=0.25, gyro_dead=True, wheel_blocked='left', schedule='x'
+    )
+    assert active_faults(parameters) == (
+        'command_delay 0.1 s', 'gyro_dead', 'wheel_blocked left', 'slippery 0.25',
+    )  # fmt: skip
+
+
+# --- a schedule ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_every_fault_can_be_scheduled_and_ends(name):
+    value = a_fault(name)
+    schedule = FaultSchedule([FaultEvent(1.0, name, value, 2.0)])
+    for elapsed in (-1.0, 0.0, 0.999, 3.0, 1e5):
+        assert schedule.at(elapsed, NO_FAULT) == NO_FAULT
+        assert schedule.active_names(elapsed) == ()
+    for elapsed in (1.0, 2.0, 2.999):
+        assert schedule.at(elapsed, NO_FAULT) == replace(NO_FAULT, **{name: value})
+        assert schedule.active_names(elapsed) == (name,)
+
+
+def test_without_an_end_a_fault_stays():
+    schedule = FaultSchedule([FaultEvent(1.0, 'supply_sag', 2.0)])
+    assert schedule.at(1e6, NO_FAULT).supply_sag == 2.0
+
+
+def test_the_later_start_wins_while_it_lasts_whatever_the_order_in_the_list():
+    outer = FaultEvent(1.0, 'command_delay', 0.1, 9.0)
+    inner = FaultEvent(3.0, 'command_delay', 0.3, 2.0)
+    beyond = FaultEvent(8.0, 'command_delay', 0.8, 4.0)
+    for events in ([outer, inner, beyond], [beyond, inner, outer]):
+        schedule = FaultSchedule(events)
+        delays = [schedule.at(second + 0.5, NO_FAULT).command_delay for second in range(13)]
+        assert delays == [0, 0.1, 0.1, 0.3, 0.3, 0.1, 0.1, 0.1, 0.8, 0.8, 0.8, 0.8, 0]
+
+
+def test_of_two_that_start_together_the_later_in_the_list_wins():
+    first = FaultEvent(1.0, 'command_delay', 0.1, 4.0)
+    second = FaultEvent(1.0, 'command_delay', 0.2, 2.0)
+    assert FaultSchedule([first, second]).at(2.0, NO_FAULT).command_delay == 0.2
+    assert FaultSchedule([first, second]).at(4.0, NO_FAULT).command_delay == 0.1
+    assert FaultSchedule([second, first]).at(2.0, NO_FAULT).command_delay == 0.1
+
+
+def test_events_of_different_faults_do_not_touch_each_other():
+    schedule = FaultSchedule(
+        [FaultEvent(0.0, 'gyro_dead', True, 5.0), FaultEvent(1.0, 'command_loss', 0.5, 1.0)]
+    )
+    assert schedule.active_names(1.5) == ('command_loss', 'gyro_dead')  # in the table's order
+    assert active_faults(schedule.at(1.5, NO_FAULT)) == ('command_loss 0.5', 'gyro_dead')
+
+
+def test_live_values_hold_beside_the_schedule_and_are_back_after_it_as_they_are_then():
+    schedule = FaultSchedule([FaultEvent(1.0, 'command_delay', 0.3, 1.0)])
+    before = FaultParameters(command_delay=0.1, gyro_dead=True)
+    after = FaultParameters(command_delay=0.2)
+    assert schedule.at(0.5, before) == before
+    assert schedule.at(1.5, before) == replace(before, command_delay=0.3)
+    assert schedule.at(1.6, after) == replace(after, command_delay=0.3)
+    assert schedule.at(2.0, after) == after
+
+
+def test_a_value_that_is_no_fault_hides_a_live_one():
+    schedule = FaultSchedule([FaultEvent(1.0, 'wheel_blocked', 'none', 1.0)])
+    assert schedule.at(1.5, FaultParameters(wheel_blocked='both')) == NO_FAULT
+
+
+def test_an_empty_schedule_changes_nothing():
+    dynamic = FaultParameters(command_loss=0.5)
+    assert load_schedule('').at(3.0, dynamic) == dynamic
+    assert load_schedule('').events == ()
+
+
+def naive(events: list[FaultEvent], elapsed: float, dynamic: FaultParameters) -> FaultParameters:
+    """Return the same by the rule as it is told, one fault after the other."""
+    values = {}
+    for name in NAMES:
+        holding = [
+            (event.at, index, event.value)
+            for index, event in enumerate(events)
+            if event.fault == name and event.at <= elapsed < event.at + event.duration
+        ]
+        if holding:
+            values[name] = max(holding, key=lambda one: one[:2])[2]
+    return replace(dynamic, **values)
+
+
+def random_events(generator: np.random.Generator) -> list[FaultEvent]:
+    """Return events on a grid of 1/4 s, so that many start and end together."""
+    events = []
+    for _ in range(generator.integers(0, 25)):
+        name = str(generator.choice(NAMES[:4] if generator.random() < 0.7 else NAMES))
+        lasts = generator.integers(1, 20) / 4 if generator.random() < 0.8 else math.inf
+        events.append(
+            FaultEvent(generator.integers(0, 40) / 4, name, some_value(name, generator), lasts)
+        )
+    return events
+
+
+def test_random_schedules_equal_a_naive_evaluation_asked_in_any_order():
+    generator = np.random.default_rng(1)
+    differ = 0
+    for _ in range(40):
+        events = random_events(generator)
+        schedule = FaultSchedule(events)
+        lives = [NO_FAULT, FaultParameters(command_delay=0.7, gyro_dead=True)]
+        for elapsed in generator.permutation(np.arange(-4, 120) / 8)[:40].tolist():
+            dynamic = lives[generator.integers(2)]
+            expected = naive(events, elapsed, dynamic)
+            assert schedule.at(elapsed, dynamic) == expected
+            differ += expected != dynamic
+    assert differ > 300
+
+
+def test_a_schedule_does_not_depend_on_the_step_at_which_it_is_asked():
+    generator = np.random.default_rng(2)
+    for _ in range(10):
+        events = random_events(generator)
+        fine, coarse = FaultSchedule(events), FaultSchedule(events)
+        every_ms = [fine.at(0.001 * tick, NO_FAULT) for tick in range(0, 12000, 10)]
+        for tick in range(0, 1200, 7):
+            assert coarse.at(0.01 * tick, NO_FAULT) == every_ms[tick]
+
+
+def test_sums_of_floats_neither_prolong_nor_shorten_an_event():
+    """0.1 + 0.2 is more than 0.3 to a float, and 3 * 0.1 too: an event held one step more."""
+    schedule = FaultSchedule([FaultEvent(0.2, 'gyro_dead', True, 0.1)])
+    assert schedule.at(0.2, NO_FAULT).gyro_dead
+    assert not schedule.at(0.3, NO_FAULT).gyro_dead
+    assert not schedule.at(300_000_000 / 1e9, NO_FAULT).gyro_dead
+    for at in range(1, 200):
+        late = FaultSchedule([FaultEvent(at / 100, 'gyro_dead', True)])
+        ticks = [tick for tick in range(202) if late.at(0.01 * tick, NO_FAULT).gyro_dead]
+        assert ticks[0] == at
+
+
+def test_the_answer_is_kept_until_something_changes():
+    schedule = FaultSchedule([FaultEvent(1.0, 'gyro_dead', True, 2.0)])
+    first = schedule.at(1.0, NO_FAULT)
+    assert schedule.at(2.9, NO_FAULT) is first
+    assert schedule.at(2.9, FaultParameters()) is first  # an equal table is no change
+
+
+@pytest.mark.parametrize('elapsed', [math.nan, math.inf])
+def test_an_instant_that_is_none_is_refused(elapsed):
+    with pytest.raises(ValueError, match='elapsed must be finite'):
+        FaultSchedule().at(elapsed, NO_FAULT)
+
+
+# --- files --------------------------------------------------------------------------------------
+
+
+def test_a_list_and_a_mapping_with_events_are_the_same(tmp_path):
+    entry = '- {at: 1, fault: slippery, value: 0, for: 2}\n'
+    alone = load_schedule(write(tmp_path, entry)).events
+    below = load_schedule(str(write(tmp_path, 'events:\n' + entry))).events
+    assert alone == below == (FaultEvent(1.0, 'slippery', 0.0, 2.0),)
+    assert isinstance(alone[0].value, float)
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_every_fault_can_be_written_into_a_file(name, tmp_path):
+    value = str(a_fault(name)).lower()
+    path = write(tmp_path, f'- {{at: 1.5, fault: {name}, value: {value}, for: 2}}\n')
+    (event,) = load_schedule(path).events
+    assert event == FaultEvent(1.5, name, a_fault(name), 2.0)
+
+
+ENTRY = '- {at: 1, fault: gyro_dead, value: true, for: 2}\n'
+BAD = {
+    'empty': ('', ['events must be a list', 'None']),
+    'a text': ('hello', ['events must be a list', 'hello']),
+    'no list below events': ('events: {at: 1}', ['events must be a list', "{'at': 1}"]),
+    'another key': ('events: []\nfaults: []', ['nothing besides events', 'faults']),
+    'not YAML': (ENTRY + '- {at: 1', ['not YAML', 'line 2']),
+    'a tag': ('!!python/object:os.system {}', ['not YAML', 'line 1', 'python/object']),
+    'a date that is none': ('- {at: 2026-13-41, fault: x, value: 1}', ['not YAML', 'month']),
+    'too deep': ('[' * 5000, ['not YAML', 'recursion']),
+    'a forgotten dash': (
+        '- at: 1\n  fault: gyro_dead\n  value: true\n  at: 2\n',
+        ['not YAML', 'line 4', 'at stands twice', '"- "'],
+    ),
+    'an entry that is a text': (ENTRY + '- gyro_dead', ['events[1] must be a mapping', 'gyro']),
+    'no value': ('- {at: 1, fault: gyro_dead}', ['events[0].value is missing']),
+    'no time': (ENTRY + '- {fault: gyro_dead, value: true}', ['events[1].at is missing']),
+    'no fault': (ENTRY * 3 + '- {at: 1, value: true}', ['events[3].fault is missing']),
+    'an unknown key': (
+        '- {at: 1, fualt: gyro_dead, value: true}',
+        ['events[0]', 'at, fault, value, for', 'fualt', 'did you mean fault?'],
+    ),
+    'an unknown fault': (
+        ENTRY + '- {at: 1, fault: comand_delay, value: 0.1}',
+        ['events[1].fault', 'comand_delay', 'did you mean command_delay?', 'brown_out'],
+    ),
+    'schedule in schedule': ('- {at: 1, fault: schedule, value: x}', ["got 'schedule'"]),
+    'a list of faults': ('- {at: 1, fault: [gyro_dead], value: true}', ["got ['gyro_dead']"]),
+    'too much': (
+        ENTRY * 3 + '- {at: 1, fault: command_loss, value: 3}',
+        ['events[3].value: command_loss must be from 0 to 1: got 3'],
+    ),
+    'more than a float holds': (
+        f'- {{at: 1, fault: command_loss, value: 1{"0" * 400}}}',
+        ['events[0].value: command_loss must be from 0 to 1'],
+    ),
+    'no number': ('- {at: 1, fault: command_loss, value: .nan}', ['value', 'finite', 'nan']),
+    'a number for a switch': (
+        '- {at: 1, fault: gyro_dead, value: 1}',
+        ['events[0].value: gyro_dead must be true or false: got 1'],
+    ),
+    'no such wheel': (
+        '- {at: 1, fault: wheel_blocked, value: front}',
+        ['wheel_blocked must be one of none, right, left, both', 'front'],
+    ),
+    'no point in the number': (
+        '- {at: 1, fault: command_loss, value: 1e-3}',
+        ["command_loss must be a number: got '1e-3'", '1.0e-3'],
+    ),
+    'too early': ('- {at: -1, fault: gyro_dead, value: true}', ['[0].at must be', 'got -1']),
+    'never': ('- {at: .inf, fault: gyro_dead, value: true}', ['events[0].at', 'got inf']),
+    'for no time': (
+        '- {at: 1, fault: gyro_dead, value: true, for: 0}',
+        ['events[0].for must be at least 0.02 s', 'got 0'],
+    ),
+    'for nothing': (
+        '- {at: 1, fault: gyro_dead, value: true, for: }',
+        ['events[0].for must be at least 0.02 s', 'None'],
+    ),
+}
+
+
+@pytest.mark.parametrize('text, words', BAD.values(), ids=BAD)
+def test_a_bad_file_is_refused_with_its_name_the_entry_the_bound_and_the_value(
+    text, words, tmp_path
+):
+    path = write(tmp_path, text)
+    with pytest.raises(ScheduleError) as caught:
+        load_schedule(path)
+    message = str(caught.value)
+    assert message.startswith(f'{path}: ')
+    assert '\n' not in message
+    assert len(message) < 400 + len(str(path))
+    for word in words:
+        assert word in message
+
+
+def test_files_that_cannot_be_read_are_refused_by_name(tmp_path):
+    for path, words in [(tmp_path / 'no.yaml', 'No such file'), (tmp_path, 'directory')]:
+        with pytest.raises(ScheduleError, match=rf'{re.escape(str(path))}: cannot be .*{words}'):
+            load_schedule(path)
+    (tmp_path / 'no.yaml').write_bytes(b'- \xff')
+    with pytest.raises(ScheduleError, match='not YAML.*utf-8'):
+        load_schedule(tmp_path / 'no.yaml')
+
+
+def test_a_name_that_is_not_shipped_is_refused_with_the_nearest():
+    with pytest.raises(ScheduleError, match='rough_ride, or a file.*did you mean rough_ride'):
+        load_schedule('rough_rid')
+
+
+def test_an_event_checks_itself_however_it_is_made():
+    assert FaultEvent(0, 'gyro_dead', True, MIN_DURATION).until == MIN_DURATION
+    for values in [(-1.0, 'gyro_dead', True), (0.0, 'no', True), (0.0, 'gyro_dead', 'yes')]:
+        with pytest.raises(ScheduleError):
+            FaultEvent(*values)
+
+
+# --- what is shipped, and the page --------------------------------------------------------------
+
+
+def test_the_shipped_ride_has_every_fault_and_ends_without_one():
+    schedule = load_schedule('rough_ride')
+    assert schedule.name == 'rough_ride'
+    assert {event.fault for event in schedule.events} == set(NAMES)
+    assert schedule.at(0.0, NO_FAULT) == NO_FAULT
+    assert schedule.at(60.0, NO_FAULT) == NO_FAULT
+    for event in schedule.events:
+        assert getattr(schedule.at(event.at, NO_FAULT), event.fault) == event.value
+        assert active_faults(schedule.at(event.at, NO_FAULT))
+
+
+def test_schedules_are_installed_with_the_package(monkeypatch):
+    called = {}
+    monkeypatch.setattr(setuptools, 'setup', lambda **arguments: called.update(arguments))
+    monkeypatch.chdir(ROOT)
+    runpy.run_path(str(ROOT / 'setup.py'))
+    package = 't3mpc_ros.simulation'
+    assert package in called['packages']
+    folder = ROOT / package.replace('.', '/')
+    installed = {path for glob in called['package_data'][package] for path in folder.glob(glob)}
+    assert installed
+    assert installed == {path for path in SCHEDULES_FOLDER.iterdir() if path.is_file()}
+
+
+def test_the_example_of_the_page_is_a_schedule_and_does_what_its_comments_say(tmp_path):
+    (text,) = re.findall(r'```yaml\n(.*?)```', PAGE, re.DOTALL)
+    schedule = load_schedule(write(tmp_path, text))
+    delays = [schedule.at(time, NO_FAULT).command_delay for time in (4.9, 5.0, 6.0, 7.0, 9.0)]
+    assert delays == [0.0, 0.1, 0.3, 0.1, 0.0]
+    assert schedule.active_names(6.5) == ('command_delay', 'command_loss')
+    assert schedule.at(12.05, NO_FAULT).brown_out
+    assert not schedule.at(12.1, NO_FAULT).brown_out
+    assert schedule.at(3600.0, NO_FAULT) == FaultParameters(load_change=0.5)
+
+
+def test_the_message_on_the_page_is_the_one_that_comes(tmp_path, monkeypatch):
+    (text,) = re.findall(r'```text\n(.*?)\n```', PAGE, re.DOTALL)
+    (tmp_path / 'faults.yaml').write_text(BAD['too much'][0])
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ScheduleError) as caught:
+        load_schedule('faults.yaml')
+    assert str(caught.value) == text
+
+
+def test_the_page_lists_every_fault_with_its_bounds_and_text():
+    lines = []
+    for row in FaultParameters.rows():
+        if row.dynamic:
+            default = f'{row.default:g}' if row.kind is float else str(row.default).lower()
+            first = f'`{row.name}` | {default} {row.unit}'.rstrip()
+            middle = f'{row.bounds()} ' if row.bounds() else ''
+            lines.append(f'| {first} | {middle}| {row.text} |')
+    assert '\n'.join(lines) + '\n\n' in PAGE

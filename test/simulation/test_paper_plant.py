@@ -1,0 +1,240 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""From a command to motion: the drives."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.parameters.table import ParameterError
+from t3mpc_ros.robot.command_limiter import ramp_towards
+from t3mpc_ros.simulation.plant.disturbances import Disturbance
+from t3mpc_ros.simulation.plant.dynamics import wheel_coriolis, wheel_inertia
+from t3mpc_ros.simulation.plant.paper_plant import (
+    PaperPlant,
+    PaperRobot,
+    PaperRobotParameters,
+    delay_command,
+)
+
+IDEAL: dict[str, object] = {
+    'friction.viscous': 0.0,
+    'friction.coulomb': 0.0,
+    'disturbance.bound': 0.0,
+    'drive.dead_time': 0.0,
+    'drive.acceleration': 0.0,
+    'drive.torque_limit': 100.0,
+    'guard.acceleration': 1e5,
+    'guard.stop_deceleration': 1e5,
+}
+"""Nothing but the lag: every limit out of the way."""
+
+LAG = 0.02
+
+
+def robot(**changes: object) -> PaperRobot:
+    dotted = {name.replace('__', '.'): value for name, value in changes.items()}
+    return PaperRobot(PaperRobotParameters.from_dict(IDEAL | dotted))
+
+
+def response(machine: PaperRobot, wheels: WheelSpeeds, count: int) -> np.ndarray:
+    return np.array([machine.step(wheels).true_wheels for _ in range(count)])
+
+
+def test_approach_moves_both_wheels_by_one_factor_and_never_past_the_target():
+    generator = np.random.default_rng(1)
+    for _ in range(200):
+        right, left, target_right, target_left = generator.uniform(-10.0, 10.0, 4)
+        reach = float(generator.uniform(0.0, 15.0))
+        new = np.array(ramp_towards(right, left, target_right, target_left, reach))
+        moved, gap = new - [right, left], np.array([target_right - right, target_left - left])
+        assert np.abs(moved).max() == pytest.approx(min(reach, np.abs(gap).max()))
+        assert moved[0] * gap[1] == pytest.approx(moved[1] * gap[0], abs=1e-9)
+        assert np.all(np.abs(moved) <= np.abs(gap) + 1e-12)
+    assert ramp_towards(0.0, 0.0, 5.0, -5.0, -1.0) == (5.0, -5.0)
+
+
+@pytest.mark.parametrize('length', [0, 1, 2, 10])
+def test_a_command_comes_out_of_the_line_exactly_so_many_steps_later(length):
+    commands, cursor = np.zeros((length, 2)), np.zeros(1, dtype=np.int64)
+    out = [delay_command(float(n), -float(n), commands, cursor) for n in range(1, 40)]
+    expected = [0] * length + list(range(1, 40 - length))
+    assert [pair[0] for pair in out] == expected
+    assert [-pair[1] for pair in out] == expected
+
+
+def test_the_nominal_robot_follows_a_step_as_an_exact_first_order_lag():
+    # Straight on, so that the offset of the centre of mass does not show.
+    times = 0.01 * np.arange(1, 16)
+    wheels = response(robot(), WheelSpeeds(10.0, 10.0), 15)
+    expected = 10.0 * (1.0 - np.exp(-times / LAG))
+    assert wheels[:, 0] == pytest.approx(expected, abs=1e-6)
+    assert wheels[:, 1] == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_step_response_converges_with_order_four():
+    def error(substep: float) -> float:
+        wheels = response(robot(substep=substep), WheelSpeeds(10.0, 10.0), 5)
+        return float(np.abs(wheels[-1, 0] - 10.0 * (1.0 - math.exp(-0.05 / LAG))))
+
+    assert math.log2(error(0.005) / error(0.0025)) == pytest.approx(4.0, abs=0.4)
+
+
+def test_in_turns_the_lag_is_exact_without_offset_and_the_offset_shows_with_it():
+    times = 0.01 * np.arange(1, 16)
+    shape = 1.0 - np.exp(-times / LAG)
+    centred = response(robot(body__com_offset=0.0), WheelSpeeds(10.0, -4.0), 15)
+    assert centred == pytest.approx(np.outer(shape, [10.0, -4.0]), abs=1e-6)
+    offset = response(robot(body__com_offset=0.05), WheelSpeeds(10.0, -4.0), 15)
+    assert np.abs(offset - centred).max() > 0.05
+
+
+def test_nothing_moves_before_the_dead_time_is_over():
+    delayed = response(robot(drive__dead_time=0.03), WheelSpeeds(10.0, 10.0), 10)
+    prompt = response(robot(), WheelSpeeds(10.0, 10.0), 7)
+    assert not delayed[:3].any()
+    assert delayed[3:] == pytest.approx(prompt, abs=1e-12)
+
+
+def test_under_the_acceleration_limit_the_wheels_follow_the_ramp_of_a_lag():
+    rate = 20.0
+    changes = {
+        'guard__acceleration': rate,
+        'guard__stop_deceleration': rate,
+        'drive__acceleration': rate,
+    }
+    wheels = response(robot(**changes), WheelSpeeds(10.0, 10.0), 40)
+    times = 0.01 * np.arange(1, 41)
+    ramp = rate * (times - LAG * (1.0 - np.exp(-times / LAG)))
+    assert wheels[:, 0] == pytest.approx(ramp, abs=1e-5)
+    assert np.diff(wheels[:, 0]).max() <= rate * 0.01 + 1e-9
+
+
+def test_the_drive_limits_acceleration_by_itself_in_both_wheels_by_one_factor():
+    parameters = PaperRobotParameters.from_dict(
+        IDEAL
+        | {'drive.acceleration': 50.0, 'guard.acceleration': 30.0}
+        | {'guard.stop_deceleration': 50.0, 'body.com_offset': 0.0}
+    )
+    plant = PaperPlant(parameters.drive, parameters.step)
+    bodies = parameters.body, parameters.body
+    plant.load(parameters.drive, bodies, parameters.geometry, parameters.friction, 1.0)
+    calm = Disturbance(parameters.disturbance, np.random.default_rng(1))
+    wheels = []
+    for _ in range(300):
+        plant.run((10.0, -5.0), False, calm, 1)
+        wheels.append(plant.wheels)
+    assert np.abs(np.diff(wheels, axis=0)).max() <= 50.0 * parameters.step * (1.0 + 1e-9)
+    times = parameters.step * np.arange(1, 200)
+    ramp = 50.0 * (times - LAG * (1.0 - np.exp(-times / LAG)))
+    assert np.array(wheels)[:199, 0] == pytest.approx(ramp, abs=1e-5)
+    assert np.array(wheels)[:, 1] == pytest.approx(-0.5 * np.array(wheels)[:, 0], abs=1e-9)
+    with pytest.raises(ParameterError, match=r'drive\.acceleration'):
+        robot(drive__acceleration=50.0)
+
+
+def test_a_heavier_load_makes_the_same_drive_slower_by_the_ratio_of_inertias():
+    machine = robot()
+    parameters = machine.parameters
+    response(machine, WheelSpeeds(0.0, 0.0), 3)
+    machine.configure(parameters.with_values({'mass_factor': 3.0}))
+    wheels = response(machine, WheelSpeeds(10.0, 10.0), 15)
+    nominal = wheel_inertia(parameters.body, parameters.geometry).sum(axis=0)[0]
+    true = wheel_inertia(machine.parameters.true_body, parameters.geometry).sum(axis=0)[0]
+    assert true > 2.0 * nominal
+    times = 0.01 * np.arange(1, 16)
+    expected = 10.0 * (1.0 - np.exp(-times * nominal / true / LAG))
+    assert wheels[:, 0] == pytest.approx(expected, abs=1e-6)
+    # And back again in mid-run.
+    machine.configure(parameters)
+    gap = 10.0 - wheels[-1, 0]
+    lighter = response(machine, WheelSpeeds(10.0, 10.0), 5)
+    assert 10.0 - lighter[:, 0] == pytest.approx(gap * np.exp(-times[:5] / LAG), rel=1e-5)
+
+
+def test_inertia_and_friction_factors_change_the_true_robot_only():
+    parameters = PaperRobotParameters().with_values({'inertia_factor': 2.0, 'mass_factor': 1.5})
+    assert parameters.true_body.body_inertia == pytest.approx(2.0 * parameters.body.body_inertia)
+    assert parameters.true_body.body_mass == pytest.approx(1.5 * parameters.body.body_mass)
+    free, rough = robot(friction__coulomb=0.004), robot(friction__coulomb=0.004)
+    rough.configure(rough.parameters.with_values({'friction_factor': 5.0}))
+    slow = response(rough, WheelSpeeds(5.0, 5.0), 60)[-1, 0]
+    fast = response(free, WheelSpeeds(5.0, 5.0), 60)[-1, 0]
+    assert 5.0 - slow == pytest.approx(5.0 * (5.0 - fast), rel=1e-3)
+
+
+def test_friction_leaves_the_offset_that_the_servo_needs_to_hold_it():
+    machine = robot(friction__viscous=2e-4, friction__coulomb=0.004)
+    parameters = machine.parameters
+    speed = response(machine, WheelSpeeds(8.0, 8.0), 100)[-1, 0]
+    inertia = wheel_inertia(parameters.body, parameters.geometry).sum(axis=0)[0]
+    assert inertia * (8.0 - speed) / LAG == pytest.approx(0.004 + 2e-4 * speed, rel=1e-6)
+
+
+def test_torque_is_limited_wheel_by_wheel():
+    machine = robot(drive__torque_limit=0.01)
+    parameters = machine.parameters
+    wheels = response(machine, WheelSpeeds(10.0, 10.0), 20)
+    inertia = wheel_inertia(parameters.body, parameters.geometry).sum(axis=0)[0]
+    # 0.01 N m is far below what the servo asks for at first: constant acceleration.
+    times = 0.01 * np.arange(1, 11)
+    assert wheels[:10, 0] == pytest.approx(0.01 / inertia * times, rel=1e-9)
+
+
+def test_the_torque_drive_is_the_dynamics_and_nothing_else():
+    """(3) and (10) with friction and disturbance, against an independent solver."""
+    changes = {'drive__kind': 'torque', 'friction__viscous': 2e-4, 'friction__coulomb': 0.004}
+    changes |= {'disturbance__bound': 0.003, 'disturbance__walk_share': 0.0}
+    machine = robot(**changes)
+    parameters = machine.parameters
+    geometry, friction = parameters.geometry, parameters.friction
+    seed = np.random.SeedSequence(parameters.seed).spawn(2)[0]
+    disturbance = Disturbance(parameters.disturbance, np.random.default_rng(seed))
+    inverse = np.linalg.inv(wheel_inertia(parameters.body, geometry))
+    torque = np.zeros(2)
+
+    def rate(time: float, state: np.ndarray) -> np.ndarray:
+        chi = state[3:]
+        wheels = WheelSpeeds(*chi)
+        linear = geometry.wheel_radius * chi.mean()
+        turn = geometry.wheel_radius * (chi[0] - chi[1]) / geometry.wheel_separation
+        loss = friction.viscous * chi + friction.coulomb * np.tanh(chi / friction.coulomb_width)
+        load = wheel_coriolis(wheels, parameters.body, geometry) @ chi + loss
+        push = inverse @ (torque - load - np.array(disturbance.torque(time)))
+        return np.array([linear * math.cos(state[2]), linear * math.sin(state[2]), turn, *push])
+
+    state, end = np.zeros(5), None
+    for tick in range(150):
+        torque = np.array([0.008 + 0.006 * math.sin(0.07 * tick), 0.008 * math.cos(0.03 * tick)])
+        end = machine.step_torque(*torque)
+        state = solve_ivp(rate, (0.01 * tick, 0.01 * (tick + 1)), state, rtol=1e-10, atol=1e-12).y[
+            :, -1
+        ]
+    assert end.true_wheels == pytest.approx(state[3:], abs=1e-7)
+    assert end.truth.pose[:2] == pytest.approx(state[:2], abs=1e-8)
+    turns = math.remainder(end.truth.pose.yaw - state[2], math.tau)
+    assert turns == pytest.approx(0.0, abs=1e-8)
+
+
+def test_each_kind_of_drive_takes_its_own_commands_only():
+    with pytest.raises(ValueError, match='torque'):
+        robot().step_torque(0.0, 0.0)
+    with pytest.raises(ValueError, match='velocity'):
+        robot(drive__kind='torque').step(WheelSpeeds(0.0, 0.0))
+
+
+def test_motors_cannot_exceed_their_ceiling():
+    machine = robot(drive__kind='torque', drive__speed_ceiling=12.0)
+    for _ in range(200):
+        state = machine.step_torque(0.4, 0.4)
+    assert state.true_wheels == (12.0, 12.0)
+
+
+def test_a_substep_too_long_for_the_body_is_refused_with_the_length_that_would_do():
+    with pytest.raises(ParameterError, match='substep must be at most'):
+        PaperRobotParameters.from_dict({'friction.coulomb': 1.0, 'friction.coulomb_width': 0.01})
+    with pytest.raises(ParameterError, match='substep'):
+        PaperRobotParameters.from_dict({'drive.lag': 0.001, 'mass_factor': 0.1, 'substep': 0.01})

@@ -1,0 +1,242 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Distances along rays and all around, against plain geometry and against themselves."""
+
+import math
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.simulation.world import (
+    cast_ray,
+    cast_rays,
+    clearance,
+    grip_at,
+    nearest_on_segment,
+    parse_world,
+)
+
+NO_SEGMENTS, NO_CIRCLES = np.zeros((0, 4)), np.zeros((0, 3))
+SQUARE = np.array([[-1.0, -1, 1, -1], [1, -1, 1, 1], [1, 1, -1, 1], [-1, 1, -1, -1]])
+
+
+def random_walls(generator, segments=12, circles=4):
+    return (
+        generator.uniform(-3.0, 3.0, (segments, 4)),
+        np.column_stack(
+            [generator.uniform(-3.0, 3.0, (circles, 2)), generator.uniform(0.05, 0.8, circles)]
+        ),
+    )
+
+
+def moved(points, angle, shift):
+    """Return points (n, 2) turned about the origin, then shifted."""
+    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    return points @ turn.T + shift
+
+
+def algebraic_distance(x, y, direction, segments, circles):
+    """Return the nearest hit by solving for each wall: linear equations, and a polynomial."""
+    origin, ray = np.array([x, y]), np.array([math.cos(direction), math.sin(direction)])
+    hits = [math.inf]
+    for wall in segments:
+        start, run = wall[:2], wall[2:] - wall[:2]
+        along, share = np.linalg.solve(np.column_stack([ray, -run]), start - origin)
+        if along >= 0.0 and 0.0 <= share <= 1.0:
+            hits.append(along)
+    for *centre, radius in circles:
+        off = origin - centre
+        for root in np.roots([1.0, 2.0 * off @ ray, off @ off - radius**2]):
+            if abs(root.imag) < 1e-12 and root.real >= 0.0:
+                hits.append(root.real)
+    return min(hits)
+
+
+def test_a_ray_ends_where_algebra_says_in_any_world():
+    generator = np.random.default_rng(1)
+    seen = 0
+    for _ in range(40):
+        segments, circles = random_walls(generator)
+        for x, y, direction in generator.uniform((-4, -4, -7), (4, 4, 7), (25, 3)).tolist():
+            expected = algebraic_distance(x, y, direction, segments, circles)
+            assert cast_ray(x, y, direction, segments, circles) == pytest.approx(
+                expected, abs=1e-9
+            )
+            seen += math.isfinite(expected)
+    assert 300 < seen < 1000  # both answers were asked for
+
+
+def test_the_clearance_is_that_of_the_nearest_of_many_points_of_the_walls():
+    generator = np.random.default_rng(2)
+    shares = np.linspace(0.0, 1.0, 4001)[:, None]
+    angles = np.linspace(0.0, math.tau, 4001)
+    for _ in range(40):
+        segments, circles = random_walls(generator, 5, 2)
+        x, y = generator.uniform(-4.0, 4.0, 2).tolist()
+        samples = [start + shares * (end - start) for start, end in segments.reshape(-1, 2, 2)]
+        for centre_x, centre_y, radius in circles:
+            ring = np.column_stack([np.cos(angles), np.sin(angles)])
+            samples.append((centre_x, centre_y) + radius * ring)
+        nearest = min(float(np.hypot(*(points - (x, y)).T).min()) for points in samples)
+        assert clearance(x, y, segments, circles) <= nearest + 1e-12
+        assert clearance(x, y, segments, circles) == pytest.approx(nearest, abs=2e-3)
+
+
+def test_no_ray_is_shorter_than_the_clearance_and_one_is_as_short():
+    generator = np.random.default_rng(3)
+    for _ in range(40):
+        segments, circles = random_walls(generator)
+        x, y = generator.uniform(-4.0, 4.0, 2).tolist()
+        free = clearance(x, y, segments, circles)
+        rays = [
+            cast_ray(x, y, direction, segments, circles)
+            for direction in np.linspace(0.0, math.tau, 400).tolist()
+        ]
+        assert min(rays) >= free - 1e-12
+        ends = [nearest_on_segment(x, y, *wall) for wall in segments.tolist()]
+        ends += [centre for *centre, _ in circles.tolist()]
+        # Walls are met where they are nearest, circles in the direction of their middle, or
+        # opposite to it from within; the tiny turn is for rounding at the very end of a wall,
+        # which may be met at a grazing angle.
+        towards = [math.atan2(end[1] - y, end[0] - x) for end in ends]
+        shortest = min(
+            cast_ray(x, y, direction + turn, segments, circles)
+            for direction in [*towards, *(direction + math.pi for direction in towards)]
+            for turn in (-1e-9, 0.0, 1e-9)
+        )
+        assert shortest == pytest.approx(free, abs=1e-5)
+
+
+def test_turning_and_moving_world_and_robot_together_changes_no_distance():
+    generator = np.random.default_rng(4)
+    for _ in range(200):
+        segments, circles = random_walls(generator)
+        x, y, direction, angle = generator.uniform(-4.0, 4.0, 4).tolist()
+        shift = generator.uniform(-10.0, 10.0, 2)
+        other_segments = moved(segments.reshape(-1, 2), angle, shift).reshape(-1, 4)
+        other_circles = np.column_stack([moved(circles[:, :2], angle, shift), circles[:, 2]])
+        other_x, other_y = moved(np.array([[x, y]]), angle, shift)[0].tolist()
+        assert cast_ray(
+            other_x, other_y, direction + angle, other_segments, other_circles
+        ) == pytest.approx(cast_ray(x, y, direction, segments, circles), abs=1e-8)
+        assert clearance(other_x, other_y, other_segments, other_circles) == pytest.approx(
+            clearance(x, y, segments, circles), abs=1e-12
+        )
+
+
+def test_two_points_see_each_other_or_neither_sees_the_other():
+    generator = np.random.default_rng(5)
+    seen = 0
+    for _ in range(2000):
+        segments, circles = random_walls(generator, 3, 1)
+        (x, y), (other_x, other_y) = generator.uniform(-4.0, 4.0, (2, 2)).tolist()
+        apart = math.hypot(other_x - x, other_y - y)
+        there = math.atan2(other_y - y, other_x - x)
+        forth = cast_ray(x, y, there, segments, circles) > apart
+        back = cast_ray(other_x, other_y, there + math.pi, segments, circles) > apart
+        assert forth == back
+        seen += forth
+    assert 300 < seen < 1700
+
+
+@pytest.mark.parametrize('yaw', [0.0, 0.3, 1.0])
+def test_no_ray_leaks_out_of_a_closed_room_or_into_a_box(yaw):
+    generator = np.random.default_rng(6)
+    room = moved(SQUARE.reshape(-1, 2), yaw, (0.3, -0.7)).reshape(-1, 4)
+    for _ in range(4):
+        x, y = moved(generator.uniform(-0.99, 0.99, (1, 2)), yaw, (0.3, -0.7))[0].tolist()
+        for direction in generator.uniform(-math.pi, math.pi, 2500).tolist():
+            assert cast_ray(x, y, direction, room, NO_CIRCLES) < 2.9
+        # Straight at the corners, where rounding decides on which side of the ray they are.
+        for corner_x, corner_y in room[:, :2].tolist():
+            aim = math.atan2(corner_y - y, corner_x - x)
+            apart = math.hypot(corner_x - x, corner_y - y)
+            for turn in [0.0, *(generator.normal(0.0, 1e-16, 200))]:
+                ray = cast_ray(x, y, aim + float(turn), room, NO_CIRCLES)
+                assert ray == pytest.approx(apart, abs=1e-7)
+    # From outside: the near face hides the far one.
+    for _ in range(10_000):
+        angle, aim = generator.uniform(-math.pi, math.pi, 2).tolist()
+        x, y = 0.3 + 3.0 * math.cos(angle), -0.7 + 3.0 * math.sin(angle)
+        # Aimed at a disc within the box.
+        target_x, target_y = 0.3 + 0.9 * math.cos(aim), -0.7 + 0.9 * math.sin(aim)
+        direction = math.atan2(target_y - y, target_x - x)
+        ray = cast_ray(x, y, direction, room, NO_CIRCLES)
+        assert ray < math.hypot(target_x - x, target_y - y)
+
+
+def test_a_ray_along_a_wall_sees_its_end_and_from_on_it_sees_nothing_nearer():
+    wall = np.array([[1.0, 0.5, 3.0, 0.5]])
+    assert cast_ray(0.0, 0.5, 0.0, wall, NO_CIRCLES) == 1.0
+    assert cast_ray(2.0, 0.5, 0.0, wall, NO_CIRCLES) == 0.0
+    assert cast_ray(4.0, 0.5, 0.0, wall, NO_CIRCLES) == math.inf
+    assert cast_ray(0.0, 0.4999, 0.0, wall, NO_CIRCLES) == math.inf
+    assert cast_ray(0.0, 0.4999, 0.0, SQUARE, NO_CIRCLES) == 1.0
+    nearly = np.array([[1.0, -1e-9, 3.0, 1e-9]])
+    assert cast_ray(0.0, 0.0, 0.0, nearly, NO_CIRCLES) == pytest.approx(2.0)
+    # Along one wall of a room, a hair inside: the wall ahead is what counts.
+    assert cast_ray(0.0, -1.0 + 1e-12, 0.0, SQUARE, NO_CIRCLES) == pytest.approx(1.0)
+
+
+def test_touching_the_end_of_a_wall_is_a_hit():
+    wall = np.array([[1.0, 0.0, 1.0, 1.0]])
+    assert cast_ray(0.0, 0.0, 0.0, wall, NO_CIRCLES) == 1.0
+    assert cast_ray(0.0, 1.0, 0.0, wall, NO_CIRCLES) == 1.0
+    assert cast_ray(0.0, 1.0 + 1e-12, 0.0, wall, NO_CIRCLES) == math.inf
+
+
+def test_a_circle_is_seen_from_outside_from_within_and_not_from_past_it():
+    circle = np.array([[2.0, 0.0, 0.5]])
+    assert cast_ray(0.0, 0.0, 0.0, NO_SEGMENTS, circle) == pytest.approx(1.5)
+    assert cast_ray(2.1, 0.0, 0.0, NO_SEGMENTS, circle) == pytest.approx(0.4)
+    assert cast_ray(2.1, 0.0, math.pi, NO_SEGMENTS, circle) == pytest.approx(0.6)
+    assert cast_ray(3.0, 0.0, 0.0, NO_SEGMENTS, circle) == math.inf
+    assert clearance(2.1, 0.0, NO_SEGMENTS, circle) == pytest.approx(0.4)
+
+
+def test_an_empty_plain_shows_nothing():
+    assert cast_ray(0.0, 0.0, 1.0, NO_SEGMENTS, NO_CIRCLES) == math.inf
+    assert clearance(0.0, 0.0, NO_SEGMENTS, NO_CIRCLES) == math.inf
+    assert grip_at(0.0, 0.0, np.zeros((0, 4))) == 1.0
+
+
+def test_sensors_look_from_where_they_sit_on_the_body_and_only_those_asked():
+    generator = np.random.default_rng(7)
+    segments, circles = random_walls(generator)
+    mounts = generator.uniform((-0.1, -0.1, -3.0), (0.1, 0.1, 3.0), (8, 3))
+    for _ in range(50):
+        x, y, yaw = generator.uniform(-3.0, 3.0, 3).tolist()
+        which = generator.permutation(8)[: generator.integers(0, 9)].astype(np.int64)
+        out = np.full(8, -1.0)
+        cast_rays(x, y, yaw, mounts, which, segments, circles, out)
+        at = moved(mounts[:, :2], yaw, (x, y)).tolist()
+        for row in range(8):
+            expected = -1.0
+            if row in which:
+                expected = cast_ray(*at[row], yaw + mounts[row, 2], segments, circles)
+            assert out[row] == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_patch_takes_grip_up_to_its_rim_and_of_two_the_more_slippery_counts():
+    patches = np.array([[0.0, 0.0, 1.0, 0.5], [0.5, 0.0, 1.0, 0.2], [0.0, 0.0, 0.1, 0.9]])
+    assert grip_at(-0.9, 0.0, patches) == 0.5
+    assert grip_at(-1.0, 0.0, patches) == 0.5
+    assert grip_at(-1.0000001, 0.0, patches) == 1.0
+    assert grip_at(0.0, 0.0, patches) == 0.2
+    assert grip_at(1.4, 0.0, patches) == 0.2
+
+
+def test_corners_of_a_box_from_a_file_are_tight():
+    """Sides that each compute their own corner differ in the last bit, and a ray gets through."""
+    generator = np.random.default_rng(8)
+    for _ in range(20):
+        x, y, length, width, yaw = generator.uniform(
+            (-5, -5, 0.1, 0.1, -6), (5, 5, 2, 2, 6)
+        ).tolist()
+        box = f'center: [{x}, {y}], size: [{length}, {width}], yaw: {yaw}'
+        world = parse_world(f'boxes: [{{{box}}}]', 'box')
+        for corner_x, corner_y in world.segments[:, :2].tolist():
+            aim = math.atan2(corner_y - y, corner_x - x)
+            for turn in [0.0, *generator.normal(0.0, 2e-16, 100)]:
+                ray = cast_ray(x, y, aim + float(turn), world.segments, world.circles)
+                assert ray == pytest.approx(0.5 * math.hypot(length, width), abs=1e-7)

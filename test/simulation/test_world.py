@@ -1,0 +1,341 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""World files: what they mean, which are refused and with what words."""
+
+import math
+from pathlib import Path
+import re
+import shutil
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.simulation.plant.contact import BumperParameters
+from t3mpc_ros.simulation.world import (
+    JOIN_TOLERANCE,
+    MAX_CIRCLES,
+    MAX_COORDINATE,
+    MAX_PATCHES,
+    MAX_SEGMENTS,
+    MIN_SIZE,
+    WORLDS_FOLDER,
+    World,
+    WorldError,
+    bundled_worlds,
+    cast_ray,
+    grip_at,
+    join_walls,
+    load_world,
+    parse_world,
+)
+
+PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'worlds.md'
+EXAMPLE = re.search(r'```yaml\n(.*?)```', PAGE.read_text(), re.DOTALL).group(1)
+BUMPER = BumperParameters().radius
+
+
+def lengths(world):
+    return np.hypot(*(world.segments[:, 2:] - world.segments[:, :2]).T)
+
+
+# --- what a file means -----------------------------------------------------------------------
+
+
+def test_the_example_of_the_page_is_a_world_and_holds_what_it_says():
+    world = parse_world(EXAMPLE, 'page.yaml')
+    assert world.name == 'workshop'
+    # Four walls, one of them cut where the partition begins, the partition, and two boxes.
+    assert world.segments.shape == (4 + 1 + 1 + 8, 4)
+    assert world.circles.tolist() == [[-0.6, 0.9, 0.12]]
+    assert world.patches.tolist() == [[0.4, -0.6, 0.3, 0.2]]
+    assert world.extent == (-1.5, -1.0, 2.5, 2.0)
+    assert world.is_free(0.0, 0.0, BUMPER)
+    assert grip_at(0.4, -0.5, world.patches) == 0.2
+    # Along the yaw of the first box its end is half its length away, across half its width.
+    for turn, half in ((0.0, 0.3), (math.pi / 2, 0.15)):
+        ray = cast_ray(1.8, 0.2, 0.7854 + turn, world.segments, world.circles)
+        assert ray == pytest.approx(half)
+
+
+def test_the_page_gives_the_bounds_the_worlds_and_the_error_there_are():
+    page = PAGE.read_text()
+    assert f'| -{MAX_COORDINATE:g} to {MAX_COORDINATE:g} m |' in page
+    assert f'| {MIN_SIZE:g} to {MAX_COORDINATE:g} m |' in page
+    assert f'| {MAX_SEGMENTS} together |' in page
+    assert f'| {MAX_CIRCLES}, {MAX_PATCHES} |' in page
+    assert f'nearer than {1e3 * JOIN_TOLERANCE:g} mm' in page
+    assert set(re.findall(r'^\| `(\w+)` \| a ', page, re.MULTILINE)) == set(bundled_worlds())
+    wrong = EXAMPLE.replace('[0.4, 0.4]', '[-0.4, 0.4]')
+    with pytest.raises(WorldError) as caught:
+        parse_world(wrong, 'workshop.yaml')
+    assert f'\n    {caught.value}\n' in page
+
+
+@pytest.mark.parametrize('name', bundled_worlds())
+def test_a_shipped_world_loads_by_name_and_has_room_for_the_robot_at_its_start(name):
+    world = load_world(name)
+    assert world.name == name
+    assert world.is_free(0.0, 0.0, BUMPER + 0.2)
+    for array, width in ((world.segments, 4), (world.circles, 3), (world.patches, 4)):
+        assert array.shape[1] == width
+        assert array.dtype == np.float64
+        assert array.flags.c_contiguous
+    left, bottom, right, top = world.extent
+    for direction in np.linspace(-3.0, 3.0, 500).tolist():  # it is closed
+        ray = cast_ray(0.0, 0.0, direction, world.segments, world.circles)
+        assert ray < math.hypot(right - left, top - bottom)
+
+
+def test_the_room_is_four_by_three_metres_with_two_boxes_a_pillar_and_oil():
+    world = load_world('room')
+    assert world.extent == (-2.0, -1.5, 2.0, 1.5)
+    assert [len(a) for a in (world.segments, world.boxes, world.circles, world.patches)] == [
+        12,
+        2,
+        1,
+        1,
+    ]
+
+
+def test_no_name_is_the_empty_plain():
+    world = load_world('')
+    assert world.segments.shape == (0, 4)
+    assert world.circles.shape == (0, 3)
+    assert world.patches.shape == (0, 4)
+    assert world.is_free(1e6, -1e6, 100.0)
+    assert world.extent == (0.0, 0.0, 0.0, 0.0)
+
+
+def test_a_file_loads_by_its_path_and_names_itself_after_it(tmp_path, monkeypatch):
+    path = tmp_path / 'yard.yaml'
+    path.write_text('circles: [{center: [1, 2], radius: 0.5}]\n')
+    for given in (path, str(path)):
+        world = load_world(given)
+        assert world.name == 'yard'
+        assert world.circles.tolist() == [[1.0, 2.0, 0.5]]
+        assert world.extent == (0.5, 1.5, 1.5, 2.5)
+    # A file of one's own does not hide a shipped world, nor the other way round.
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(path, 'room')
+    assert len(load_world('room').segments) == 12
+    assert len(load_world('./room').segments) == 0
+    assert len(load_world(str(WORLDS_FOLDER / 'room.yaml')).segments) == 12
+
+
+def test_a_closed_wall_has_one_piece_for_each_point_an_open_one_one_less():
+    points = '[[0, 0], [3, 0], [3, 4]]'
+    assert lengths(parse_world(f'walls: [{{points: {points}}}]', 'a')).tolist() == [3.0, 4.0]
+    closed = parse_world(f'walls: [{{points: {points}, closed: true}}]', 'a')
+    assert sorted(lengths(closed)) == [3.0, 4.0, 5.0]
+
+
+def test_what_is_free_agrees_with_a_search_by_points_inside_a_turned_box():
+    world = parse_world(
+        'boxes: [{center: [1, 2], size: [0.8, 0.4], yaw: 0.5}]\n'
+        'circles: [{center: [-1, 0], radius: 0.6}]',
+        'a',
+    )
+    generator = np.random.default_rng(1)
+    # Points that fill box and circle; a disc is free when it covers none of them.
+    grid = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 161), np.linspace(-0.2, 0.2, 81)), -1)
+    cosine, sine = math.cos(0.5), math.sin(0.5)
+    turn = np.array([[cosine, sine], [-sine, cosine]])
+    box = grid.reshape(-1, 2) @ turn + (1.0, 2.0)
+    both = {True: 0, False: 0}
+    for _ in range(1000):
+        x, y = generator.uniform((-2, -1), (2, 3)).tolist()
+        radius = float(generator.choice([0.0, 0.11, 0.3]))
+        gap = min(float(np.hypot(*(box - (x, y)).T).min()), max(math.hypot(x + 1.0, y) - 0.6, 0.0))
+        if abs(gap - radius) > 0.005 or (radius == 0.0 and math.hypot(x + 1.0, y) < 0.6):
+            assert world.is_free(x, y, radius) == (gap > radius)
+            both[gap > radius] += 1
+    assert min(both.values()) > 100
+    assert not world.is_free(1.0, 2.0, 0.0)
+    assert not world.is_free(-1.0, 0.0, 0.0)
+
+
+def test_the_inside_of_a_closed_wall_is_free_and_what_is_not_finite_is_not():
+    world = load_world('room')
+    assert world.is_free(0, 0, 0)
+    assert world.is_free(9.0, 9.0, 0.1)
+    for numbers in ((math.nan, 0.0, 0.1), (0.0, math.inf, 0.1), (0.0, 0.0, math.nan)):
+        assert not world.is_free(*numbers)
+    with pytest.raises(ValueError, match='radius must be at least 0 m: got -0.1'):
+        world.is_free(0.0, 0.0, -0.1)
+
+
+def test_a_world_is_frozen_and_needs_no_other_object_to_be_made():
+    world = World('mine', np.zeros((0, 4)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 5)))
+    assert world.is_free(0.0, 0.0, 1.0)
+    with pytest.raises(AttributeError):
+        world.name = 'yours'
+
+
+# --- joints ------------------------------------------------------------------------------------
+
+
+def test_walls_that_should_meet_do_to_the_last_bit():
+    """0.3333 and 1/3 are one corner to whoever wrote the file."""
+    joined = join_walls(np.array([[0, 0, 1 / 3, 0], [0.3333, 0.00005, 0.3333, 1.0]], dtype=float))
+    assert joined[0, 2:].tolist() == joined[1, :2].tolist()
+    assert len(joined) == 2
+
+
+def test_a_wall_is_cut_where_others_end_on_it_in_order_and_keeps_its_length():
+    generator = np.random.default_rng(2)
+    for _ in range(20):
+        shares = generator.uniform(0.05, 0.95, 5)
+        angle = generator.uniform(0.0, 6.0)
+        along = np.array([math.cos(angle), math.sin(angle)])
+        across = np.array([-along[1], along[0]])
+        walls = [[*(-2.0 * along), *(2.0 * along)]]
+        for share in shares:
+            foot = (4.0 * share - 2.0) * along + generator.uniform(-9e-5, 9e-5) * across
+            walls.append([*foot, *(foot + across)])
+        walls.append([*(0.3 * along + 0.01 * across), *(0.3 * along + across)])  # stops short
+        joined = join_walls(np.array(walls))
+        pieces = joined[:6]
+        assert len(joined) == 6 + 6
+        assert (pieces[1:, :2] == pieces[:-1, 2:]).all()
+        total = np.hypot(*(pieces[:, 2:] - pieces[:, :2]).T).sum()
+        assert total == pytest.approx(4.0, abs=1e-6)
+        assert {tuple(wall[:2]) for wall in joined[6:11]} == {tuple(p) for p in pieces[1:, :2]}
+
+
+def test_walls_apart_are_left_as_they_are():
+    generator = np.random.default_rng(3)
+    walls = generator.uniform(-100.0, 100.0, (60, 4))
+    assert (join_walls(walls) == walls).all()
+    assert join_walls(np.zeros((0, 4))).shape == (0, 4)
+
+
+# --- what is refused ---------------------------------------------------------------------------
+
+CIRCLE = 'center: [0, 0], radius: 0.1'
+BAD = {
+    'boxes: [{center: [0, 0], size: [1, 0]}]': (
+        'boxes[0].size[1] must be a number from 0.01 to 1000 m: got 0'
+    ),
+    f'circles: [{{{CIRCLE}}}, {{center: [0, 0], radius: -1}}]': (
+        'circles[1].radius must be a number from 0.01 to 1000 m: got -1'
+    ),
+    'circles: [{center: [0, .nan], radius: 1}]': (
+        'circles[0].center[1] must be a number from -1000 to 1000 m: got nan'
+    ),
+    'circles: [{center: [0, 0], radius: .inf}]': 'circles[0].radius must be a number',
+    'circles: [{center: [0, 2.0e+9], radius: 1}]': 'got 2000000000.0',
+    f'circles: [{{center: [0, {10**400}], radius: 1}}]': 'circles[0].center[1] must be a number',
+    'circles: [{center: [0, 1e-3], radius: 1}]': "got '1e-3', a text to YAML; write numbers like",
+    'circles: [{center: [0, -.5], radius: 1}]': "got '-.5', a text to YAML; write numbers like",
+    'circles: [{center: [0, two], radius: 1}]': "must be a number from -1000 to 1000 m: got 'two'",
+    'circles: [{center: [0, true], radius: 1}]': 'circles[0].center[1] must be a number',
+    'circles: [{center: [0], radius: 1}]': 'circles[0].center must have 2 entries: got 1',
+    'circles: [{center: 3, radius: 1}]': 'circles[0].center must be a list: got 3',
+    'circles: [{center: [0, 0]}]': 'circles[0] must have a radius',
+    'circles: [7]': 'circles[0] must hold center, radius by name: got 7',
+    f'patches: [{{{CIRCLE}, grip: 1.2}}]': 'patches[0].grip must be a number from 0 to 1: got 1.2',
+    f'patches: [{{{CIRCLE}}}]': 'patches[0] must have a grip',
+    f'circles: [{{{CIRCLE}, grip: 1}}]': "circles[0] has no 'grip'",
+    'boxes: [{center: [0, 0], size: [1, 1], yaw: 45}]': (
+        'boxes[0].heading must be a number from -6.28319 to 6.28319 rad: got 45'
+    ),
+    'boxes: [{centre: [0, 0], size: [1, 1]}]': "boxes[0] has no 'centre'; did you mean center?",
+    'wals: []': "the world has no 'wals'; did you mean walls?",
+    'zzz: []': "the world has no 'zzz'; known are name, walls, boxes, circles, patches",
+    'walls: [{points: [[0, 0]]}]': 'walls[0].points must have from 2 to 2001 entries: got 1',
+    'walls: [{points: [[0, 0], [1, 1]], closed: true}]': 'must have from 3 to 2001 entries: got 2',
+    'walls: [{points: [[0, 0], [1, 1]], closed: 1}]': 'walls[0].closed must be true or false',
+    'walls: [{points: [[0, 0], [1, 1], [1, 1]]}]': (
+        'walls[0].points[2] must be at least 0.01 m from the point before it: got 0 m'
+    ),
+    'walls: [{points: [[0, 0], [1, 1], [0, 1], [0, 0]], closed: true}]': (
+        'walls[0].points[0] must be at least 0.01 m from the point before it: got 0 m; leave the '
+        'last point out'
+    ),
+    'walls: [[0, 0], [1, 1]]': 'walls[0] must hold points, closed by name: got [0, 0]',
+    'walls:': 'walls must be a list: got None',
+    'name: 7': 'name must be a text: got 7',
+    'name: a\nwalls: []\nname: b': 'name is given twice in one entry, at line 3',
+    '': 'the world must hold name, walls, boxes, circles, patches by name: got None',
+    'walls: [': 'not YAML: line 1: ',
+    'name: \x07': 'not YAML: ',
+    'name: 2026-13-45': 'not YAML that can be read: month must be in 1..12',
+    'name: !!int ""': 'not YAML that can be read: ',
+    f'name: {"[" * 5000}': 'not YAML that can be read: ',
+    'name: !!python/object:os.system {}': 'not YAML: line 1: could not determine a constructor',
+    'walls: !!map [1]': 'not YAML: line 1: expected a mapping node',
+    'circles: &a [*a]': 'circles[0] must hold center, radius by name: got [',
+}
+
+
+@pytest.mark.parametrize('text', BAD, ids=lambda text: text[:60])
+def test_a_file_that_does_not_fit_is_refused_by_entry_bound_and_value(text):
+    with pytest.raises(WorldError) as caught:
+        parse_world(text, 'yard.yaml')
+    message = str(caught.value)
+    assert message.startswith('yard.yaml: ')
+    assert BAD[text] in message
+    assert len(message) < 250
+
+
+def test_lists_and_the_pieces_of_all_walls_together_are_bounded():
+    def refused(text, words):
+        with pytest.raises(WorldError, match=re.escape(words)):
+            parse_world(text, 'yard.yaml')
+
+    box = '{center: [0, 0], size: [1, 1]}'
+    zigzag = ', '.join(f'[{index % 2}, {0.4 * (index - 1000):g}]' for index in range(2001))
+    wall = f'walls: [{{points: [{zigzag}]}}]'
+    refused(f'circles: [{", ".join(501 * ["7"])}]', 'circles must have from 0 to 500 entries')
+    refused(f'patches: [{", ".join(101 * ["7"])}]', 'patches must have from 0 to 100 entries')
+    refused(f'boxes: [{", ".join(501 * [box])}]', 'boxes must have from 0 to 500 entries')
+    assert len(parse_world(wall, 'a').segments) == 2000
+    refused(f'{wall}\nboxes: [{box}]', 'at most 2000 straight pieces together: got 2004')
+    closed = wall.replace(']]}', ']], closed: true}')
+    refused(closed, 'at most 2000 straight pieces together: got 2001')
+    refused(wall.replace('points: [', 'points: [[5, 5], '), 'from 2 to 2001 entries: got 2002')
+
+
+def test_cutting_walls_where_they_meet_does_not_pass_the_bound():
+    feet = ', '.join(f'{{points: [[{0.1 * i:g}, 0], [{0.1 * i:g}, 1]]}}' for i in range(1500))
+    text = f'walls: [{{points: [[-1, 0], [999, 0]]}}, {feet}]'
+    with pytest.raises(WorldError, match='at most 2000 straight pieces together: got 3001'):
+        parse_world(text, 'yard.yaml')
+
+
+def test_what_is_no_file_of_text_is_refused_by_its_name(tmp_path):
+    with pytest.raises(WorldError, match=r'there is no world rooom, .* did you mean room\?'):
+        load_world('rooom')
+    with pytest.raises(WorldError, match='there is no world .*none.yaml, neither a file nor one'):
+        load_world(tmp_path / 'none.yaml')
+    with pytest.raises(WorldError, match='cannot be read: Is a directory'):
+        load_world(tmp_path)
+    latin = tmp_path / 'latin.yaml'
+    latin.write_bytes('name: Küche'.encode('latin-1'))
+    with pytest.raises(WorldError, match=r'latin\.yaml must be UTF-8 text'):
+        load_world(latin)
+    long = tmp_path / 'long.yaml'
+    long.write_text('# ' + 1_000_000 * 'x')
+    with pytest.raises(WorldError, match=r'long\.yaml must have at most 1000000 bytes'):
+        load_world(long)
+    broken = tmp_path / 'broken.yaml'
+    broken.write_text('boxes: 1')
+    with pytest.raises(WorldError, match=r'broken\.yaml: boxes must be a list: got 1'):
+        load_world(broken)
+
+
+def test_a_damaged_file_is_read_or_refused_and_nothing_else():
+    generator = np.random.default_rng(4)
+    read = 0
+    for _ in range(300):
+        text = list(EXAMPLE)
+        for _ in range(generator.integers(1, 4)):
+            place = int(generator.integers(len(text)))
+            text[place] = str(generator.choice(list('[]{}:,-.#!&*?|>"\'%@ \n\t0e~ax')))
+        try:
+            world = parse_world(''.join(text), 'a')
+        except WorldError:
+            continue
+        read += 1
+        assert np.isfinite(world.segments).all()
+    assert 10 < read < 290

@@ -1,0 +1,361 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""A scripted dongle and robot in virtual time for tests of the link; faults go by name."""
+
+import math
+import random
+
+from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.radio.link.link import Link
+from t3mpc_ros.radio.link.link_parameters import LinkParameters
+from t3mpc_ros.radio.link.port_actions import Close, LinkState, Open, Wait, Write
+from t3mpc_ros.radio.protocol import frames
+from t3mpc_ros.radio.protocol.authentication import CommandVerifier
+from t3mpc_ros.radio.protocol.codec import decode_downlink, decode_to_dongle, encode
+from t3mpc_ros.radio.protocol.frames import BOARD_PARAMETERS, CommandFlag, StatusFlag
+from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
+from t3mpc_ros.robot.interface import RobotCommand
+
+MS = 1_000_000
+STEP = math.tau / 3200
+WRAP = 1 << 32
+
+
+def signed32(value):
+    return (value + WRAP // 2) % WRAP - WRAP // 2
+
+
+class FakeRobot:
+    """The robot's rules, plainly: session, sequence, TTL, emergency stop, parameters.
+
+    Wheels reach what is commanded at once; between packets they turn on.
+    """
+
+    def __init__(self, key=b''):
+        self.key = key
+        self.skew = 0.0
+        self.boots = 0
+        self.refuses = {}
+        self.deaf_to_commands = False
+        self.button = False
+        self.boot(0)
+
+    def boot(self, now_ns, clock_us=0, steps=(0, 0)):
+        self.boots += 1
+        self.gate = CommandVerifier(self.key)
+        self.booted_ns, self.clock_us = now_ns, clock_us
+        self.steps = [float(steps[0]), float(steps[1])]
+        self.parameters = [parameter.default for parameter in BOARD_PARAMETERS]
+        self.speeds = (0.0, 0.0)
+        self.enabled = self.estop = self.expired = False
+        self.seq, self.last_seq = 0, None
+        self.command_ns, self.until_ns = None, None
+        self.reached_ns = now_ns
+        self.answer = None
+        self.log = []
+
+    def time_us(self, now_ns):
+        return int((now_ns - self.booted_ns) / 1000 * (1.0 + self.skew) + self.clock_us) % WRAP
+
+    def run_to(self, now_ns):
+        end = now_ns if self.until_ns is None else min(max(self.until_ns, self.reached_ns), now_ns)
+        for wheel in (0, 1):
+            self.steps[wheel] += self.speeds[wheel] * (end - self.reached_ns) / 1e9 / STEP
+        if self.until_ns is not None and now_ns >= self.until_ns:
+            self.expired |= self.speeds != (0.0, 0.0)
+            self.speeds, self.until_ns = (0.0, 0.0), None
+        self.reached_ns = now_ns
+
+    @property
+    def angles(self):
+        """Right and left, rad since the last start."""
+        return self.steps[1] * STEP, self.steps[0] * STEP
+
+    def status(self):
+        bits = StatusFlag(0)
+        bits |= StatusFlag.ENABLED if self.enabled else StatusFlag(0)
+        bits |= StatusFlag.MOVING if self.speeds != (0.0, 0.0) else StatusFlag(0)
+        bits |= StatusFlag.ESTOP if self.estop else StatusFlag(0)
+        bits |= StatusFlag.TTL_EXPIRED if self.expired else StatusFlag(0)
+        bits |= StatusFlag.NO_SESSION if not self.gate.session else StatusFlag(0)
+        return bits
+
+    def state(self, now_ns):
+        self.run_to(now_ns)
+        age = frames.AGE_NONE
+        if self.command_ns is not None:
+            age = min(round((now_ns - self.command_ns) / 10_000 * (1.0 + self.skew)), 0xFFFE)
+        left, right = (signed32(math.floor(steps)) for steps in self.steps)
+        ranges = bytes([0, 1, 20, 100, 160, 254, 255, 60])
+        return frames.State(
+            self.gate.session,
+            self.seq,
+            self.status(),
+            self.time_us(now_ns),
+            left,
+            right,
+            655,
+            16384,
+            -8192,
+            age,
+            ranges,
+        )
+
+    def take(self, data, now_ns):
+        """Hear a packet."""
+        self.run_to(now_ns)
+        frame = decode_downlink(data)
+        self.log.append((now_ns, frame))
+        self.answer = None
+        if isinstance(frame, frames.Hello):
+            nonce = self.boots.to_bytes(4, 'little') + self.time_us(now_ns).to_bytes(4, 'little')
+            if not self.gate.greet(frame, nonce):
+                self.last_seq, self.seq, self.speeds, self.enabled = None, 0, (0.0, 0.0), False
+            self.answer = self.info(frame.seq, now_ns)
+        elif isinstance(frame, frames.Poll):
+            if frame.what == frames.INFO:
+                self.answer = self.info(frame.seq, now_ns)
+            elif frame.what == frames.AUX:
+                counters = (1, 2, 3, 4, 5)
+                self.answer = frames.Aux(
+                    self.gate.session, 0, self.status(), 11100, 0, 0, 0, 0, *counters, 0, 6, 7
+                )
+        elif isinstance(frame, frames.ParamGet):
+            self.answer = self.parameter(frame, frames.OK)
+        elif self.gate.check(frame) == '':
+            if isinstance(frame, frames.Command):
+                self.follow(frame, now_ns)
+            elif isinstance(frame, frames.ParamSet):
+                self.set(frame)
+            else:
+                busy = self.speeds != (0.0, 0.0)
+                rc = frames.BUSY if busy else frames.OK
+                if frame.verb == frames.RESET_ODOMETRY and not busy:
+                    self.steps = [0.0, 0.0]
+                self.answer = frames.Ack(self.gate.session, frame.seq, frame.verb, rc)
+
+    def info(self, seq, now_ns):
+        return frames.Info(
+            self.gate.session,
+            seq,
+            1,
+            1,
+            0,
+            2,
+            len(BOARD_PARAMETERS),
+            200,
+            16,
+            self.time_us(now_ns),
+            self.status(),
+            self.gate.nonce,
+        )
+
+    def parameter(self, frame, rc):
+        row = BOARD_PARAMETERS[frame.id]
+        value = self.parameters[frame.id]
+        return frames.Param(self.gate.session, frame.seq, frame.id, rc, value, row.low, row.high)
+
+    def set(self, frame):
+        rc = self.refuses.get(frame.id, frames.OK)
+        if rc == frames.OK:
+            self.parameters[frame.id] = frame.value
+        self.answer = self.parameter(frame, rc)
+
+    def follow(self, frame, now_ns):
+        if frame.flags & CommandFlag.ESTOP:
+            self.estop, self.enabled, self.speeds = True, False, (0.0, 0.0)
+            return
+        if self.deaf_to_commands:
+            return
+        if self.last_seq is not None and not 0 < (frame.seq - self.last_seq) % 256 < 128:
+            return
+        self.last_seq = self.seq = frame.seq
+        self.command_ns = now_ns
+        if frame.flags == CommandFlag.ESTOP_CLEAR and not self.button:
+            self.estop = False
+        self.expired = False
+        self.enabled = bool(frame.flags & CommandFlag.ENABLE) and not self.estop
+        ttl_ms = min(10 * frame.ttl, self.parameters[3])
+        wanted = (frame.left / 1000.0, frame.right / 1000.0) if self.enabled and ttl_ms else (0, 0)
+        self.speeds = (float(wanted[0]), float(wanted[1]))
+        self.until_ns = now_ns + ttl_ms * MS
+
+
+class FakeDongle:
+    """Answers each frame after the time it takes; whoever wants a fault calls it by name."""
+
+    def __init__(self, robot, seed=1):
+        self.robot = robot
+        self.source = random.Random(seed)
+        self.parameters = None
+        self.chip_ok = True
+        self.loss = 0.0
+        self.jam_until_ns = 0
+        self.drop_replies = 0
+        self.busy = 0
+        self.jitter_ns = 0
+        self.asked = []
+        self.boot_delay_ns = 0
+        self.restart(0)
+
+    def restart(self, now_ns):
+        """Start anew: what was set is gone, and the boot loader takes its time."""
+        self.started_ns = now_ns
+        self.ready_ns = now_ns + self.boot_delay_ns
+        self.splitter = FrameDecoder()
+        self.configured = False
+
+    def time_us(self, now_ns):
+        return (now_ns - self.started_ns) // 1000 % WRAP
+
+    def hears(self, now_ns):
+        """Whether a packet gets through at the first try."""
+        return (
+            self.configured
+            and self.chip_ok
+            and now_ns >= self.jam_until_ns
+            and self.source.random() >= self.loss
+        )
+
+    def take(self, data, now_ns):
+        """Return (time, bytes) of each reply."""
+        if now_ns < self.ready_ns:
+            return []
+        replies = []
+        for frame in self.splitter.feed(data):
+            at, reply = self.reply(decode_to_dongle(frame), now_ns + len(data) * 20_000)
+            if self.drop_replies:
+                self.drop_replies -= 1
+                continue
+            at += self.source.randrange(self.jitter_ns + 1)
+            replies.append((at, encode_frame(encode(reply))))
+        return replies
+
+    def reply(self, frame, now_ns):
+        if isinstance(frame, frames.Ping):
+            chip = int(self.chip_ok)
+            clock = self.time_us(now_ns)
+            counts = self.splitter.counts[1:]
+            pong = frames.Pong(frame.id, frame.echo, clock, 1, 1, 0, chip, *counts, 0, 2)
+            return now_ns + MS, pong
+        if isinstance(frame, frames.Configure):
+            self.configured = True
+            return now_ns + MS, frames.Configured(*frame, int(self.chip_ok))
+        if self.busy:
+            self.busy -= 1
+            return now_ns + MS, frames.Refusal(3, frame.id)
+        return self.transact(frame, now_ns)
+
+    def transact(self, frame, now_ns):
+        clock = self.time_us(now_ns + 4 * MS)
+        self.asked.append((now_ns, decode_downlink(frame.first)))
+        if not self.hears(now_ns):
+            return now_ns + 3 * MS, frames.Result(frame.id, 0x34, 0x08, clock)
+        robot = self.robot
+        robot.take(frame.first, now_ns + 445_000)
+        first, second = 0x03, 0x03
+        # The first packet fetches what was measured at some time before.
+        payload = encode(robot.state(now_ns + 445_000))
+        if self.source.random() >= self.loss:
+            answer = robot.answer or robot.state(now_ns + 1_245_000)
+            payload = encode(answer)
+            robot.take(frame.second, now_ns + 2 * MS)
+        else:
+            second = 0x34
+        return now_ns + 3 * MS, frames.Result(frame.id, first, second, clock, payload)
+
+
+class Bench:
+    """Runs a link against a port in virtual time."""
+
+    def __init__(self, parameters=None, key=b'', robot=None, seed=1, robot_key=None):
+        entropy = random.Random(seed)
+        self.robot = robot or FakeRobot(key if robot_key is None else robot_key)
+        self.dongle = FakeDongle(self.robot)
+        self.link = Link(parameters or LinkParameters(), key, entropy.randbytes)
+        self.now_ns = 5_000_000_000
+        self.plugged = True
+        self.problem = ('dongle is not there', True)
+        self.is_open = False
+        self.replies = []
+        self.wake_ns = 0
+        self.phases = []
+        self.opens = []
+        self.closes = 0
+        self.wheels = None
+        self.commanded_ns = 0
+        self.before_each = None
+
+    def unplug(self):
+        """Pull the dongle out: the next use of the port fails."""
+        self.plugged = False
+        self.replies.clear()
+
+    def plug(self):
+        """Plug it in again; it starts anew."""
+        self.plugged = True
+        self.dongle.restart(self.now_ns)
+
+    def run(self, seconds, until=None):
+        """Let time pass; return how long it took until ``until`` held."""
+        start, end = self.now_ns, self.now_ns + round(seconds * 1e9)
+        while self.now_ns < end:
+            self._command()
+            received = b''
+            while self.replies and self.replies[0][0] <= self.now_ns:
+                received += self.replies.pop(0)[1]
+            if self.is_open and not self.plugged:
+                self.is_open = False
+                self.link.failed('dongle is not there', True, self.now_ns)
+            self._do(self.link.step(self.now_ns, received))
+            if until is not None and until():
+                break
+            times = [self.wake_ns, end, *(at for at, _ in self.replies[:1])]
+            if self.wheels is not None:
+                times.append(self.commanded_ns + 20 * MS)
+            self.now_ns = max(min(times), self.now_ns + 1000)
+        else:
+            if until is not None:
+                raise AssertionError(f'not within {seconds} s: {self.link.reason(self.now_ns)}')
+        return (self.now_ns - start) / 1e9
+
+    def drive(self, right, left):
+        """Command these wheel speeds fifty times a second from now on."""
+        self.wheels = WheelSpeeds(right, left)
+
+    def release_controls(self):
+        """Command nothing any more."""
+        self.wheels = None
+
+    def _command(self):
+        if self.wheels is not None and self.now_ns >= self.commanded_ns + 20 * MS:
+            self.commanded_ns = self.now_ns
+            self.link.command(RobotCommand(self.wheels, self.now_ns), self.now_ns)
+
+    def _do(self, deeds):
+        assert isinstance(deeds[-1], Wait)
+        assert sum(isinstance(deed, Wait) for deed in deeds) == 1
+        assert deeds[-1].until_ns >= self.now_ns
+        self.wake_ns = deeds[-1].until_ns
+        for deed in deeds:
+            if isinstance(deed, Open):
+                self.opens.append(self.now_ns)
+                self.wake_ns = self.now_ns
+                if self.plugged and self.problem[1]:
+                    self.is_open = True
+                    self.replies.clear()
+                    self.link.opened(self.now_ns)
+                else:
+                    self.link.failed(*self.problem, self.now_ns)
+            elif isinstance(deed, Close):
+                self.closes += 1
+                self.is_open = False
+            elif isinstance(deed, Write) and self.is_open and self.plugged:
+                self.replies += self.dongle.take(deed.data, self.now_ns)
+                self.replies.sort()
+        if not self.phases or self.phases[-1] is not self.link.phase:
+            self.phases.append(self.link.phase)
+
+    def connect(self):
+        """Run until the link runs."""
+        return self.run(10.0, lambda: self.link.phase is LinkState.RUN)

@@ -1,0 +1,143 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""How much the recorder loses, and what it costs, at many messages a second.
+
+    PYTHONPATH=. .venv/bin/python test/support/recorder_bench.py [--seconds 60] [--topics 20] [--rate 100]
+
+A publisher and the recorder run as processes of their own over DDS on loopback. Half of the
+topics are Odometry (about 0.7 kB), half Float64; each message carries its number. Printed are the
+messages sent, recorded and lost, and the processor time of the recorder (user and system, of all
+its threads) as a share of one core, from the first message to the last. Nothing is asserted
+here; ``test_nodes_recorder_run.py`` runs a short one and asserts that nothing is lost.
+"""
+
+import argparse
+from dataclasses import dataclass
+import os
+from pathlib import Path
+import subprocess
+import sys
+import tempfile
+import time
+
+from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.cli.process_group import ProcessGroup, private_graph
+
+FIELDS = {
+    'nav_msgs/msg/Odometry': 'pose.pose.position.x',
+    'std_msgs/msg/Float64': 'data',
+}
+DEPTH = 1000
+"""Of the publishers' queues: what DDS may hold back for a recorder that is late."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of one run."""
+
+    sent: int
+    recorded: int
+    in_order: bool
+    """Whether each topic's messages are there once each, in the order in which they were sent."""
+    share: float
+    """Processor time of the recorder per time, 1 = one core."""
+    seconds: float
+    size: int
+    """Bytes of the bag."""
+
+
+def processor_time(pid: int) -> float:
+    """Return the seconds of processor time, user and system, that a process has used."""
+    fields = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
+
+
+def run(folder: Path, fleet: ProcessGroup, seconds: float, topics: int = 20, rate: float = 100.0):
+    """Return the :class:`Outcome` of one recording in ``folder``."""
+    fleet.start('recorder', parameters={'folder': str(folder), 'topics': ['bench/*']})
+    fleet.wait_ready('recorder')
+    pid = fleet.pid('recorder')
+    words = [sys.executable, __file__, '--publish', '--seconds', str(seconds)]
+    words += ['--topics', str(topics), '--rate', str(rate)]
+    publisher = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=fleet._environment)
+    try:
+        assert publisher.stdout.readline() == 'begin\n'
+        begin, used = time.monotonic(), processor_time(pid)
+        assert publisher.stdout.readline() == 'end\n'
+        elapsed, used = time.monotonic() - begin, processor_time(pid) - used
+        sent = int(publisher.communicate(timeout=30.0)[0])
+    finally:
+        publisher.kill()
+        publisher.wait()
+    code = fleet.stop('recorder')
+    assert code == 0, f'the recorder ended with code {code}'
+    recorded, in_order = 0, True
+    with open_bag(folder) as recording:
+        for name, topic in recording.topics.items():
+            recorded += topic.message_count
+            numbers = recording.series(name, {'n': FIELDS[topic.type_name]})['n']
+            in_order &= numbers.tolist() == list(range(sent // topics))
+    size = sum(path.stat().st_size for path in folder.glob('*.mcap'))
+    return Outcome(sent, recorded, in_order, used / elapsed, elapsed, size)
+
+
+def publish(seconds: float, topics: int, rate: float) -> None:
+    """Publish on all topics, evenly over each period, once somebody listens to every one."""
+    from nav_msgs.msg import Odometry
+    import rclpy
+    from rclpy.duration import Duration
+    from rclpy.node import Node
+    from std_msgs.msg import Float64
+
+    rclpy.init(args=[])
+    node = Node('bench')
+    kinds = [Odometry if i % 2 else Float64 for i in range(topics)]
+    publishers = [node.create_publisher(k, f'bench/n{i}', DEPTH) for i, k in enumerate(kinds)]
+    while not all(publisher.get_subscription_count() for publisher in publishers):
+        time.sleep(0.1)
+    time.sleep(1.0)  # both ends have found each other
+    messages = [kind() for kind in kinds]
+    print('begin', flush=True)
+    count = round(seconds * rate)
+    begin = time.monotonic()
+    for number in range(count):
+        for i, publisher in enumerate(publishers):
+            if kinds[i] is Float64:
+                messages[i].data = float(number)
+            else:
+                messages[i].pose.pose.position.x = float(number)
+            publisher.publish(messages[i])
+            if i % 5 == 4:  # in bursts of five, as an executor would
+                due = begin + (number + (i + 1) / topics) / rate
+                time.sleep(max(0.0, due - time.monotonic()))
+    print('end', flush=True)
+    for publisher in publishers:
+        publisher.wait_for_all_acked(Duration(nanoseconds=10**10))
+    print(count * topics, flush=True)
+    rclpy.try_shutdown()
+
+
+def main() -> int:
+    """Run one, and print what came of it."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--seconds', type=float, default=60.0)
+    parser.add_argument('--topics', type=int, default=20)
+    parser.add_argument('--rate', type=float, default=100.0)
+    parser.add_argument('--publish', action='store_true', help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.publish:
+        publish(given.seconds, given.topics, given.rate)
+        return 0
+    with tempfile.TemporaryDirectory() as place:
+        fleet = ProcessGroup(Path(place) / 'log', private_graph())
+        found = run(Path(place) / 'bag', fleet, given.seconds, given.topics, given.rate)
+    print(f'sent      {found.sent} in {found.seconds:.1f} s, {found.sent / found.seconds:.0f}/s')
+    print(f'recorded  {found.recorded}, in order and complete: {found.in_order}')
+    print(f'lost      {found.sent - found.recorded}')
+    print(f'processor {100 * found.share:.1f} % of one core')
+    print(f'bag       {found.size / 1e6:.1f} MB')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
