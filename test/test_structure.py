@@ -1,8 +1,9 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The architecture, kept by a test: who may import whom, and what every file carries."""
+"""Architecture of the package: import direction, import closure, names, licence headers."""
 
 import ast
+from collections import defaultdict
 from pathlib import Path
 import re
 import xml.etree.ElementTree as ElementTree
@@ -16,109 +17,153 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / 't3mpc_ros'
 SOURCES = sorted(PACKAGE.rglob('*.py'))
 
-# What each room may import besides itself, the standard library and numpy.
-ROOMS = {
+BASE = {'parameters', 'geometry', 'kernels'}
+# Packages that each package may import beside itself, the standard library and numpy.
+PACKAGES = {
+    'parameters': set(),
     'kernels': set(),
-    'settings': set(),
-    'motion': {'settings', 'kernels'},
-    'chaos': {'settings', 'kernels', 'motion'},
-    'fuzzy': {'settings', 'kernels', 'motion'},
-    'mpc': {'settings', 'kernels', 'motion'},
-    'robot': {'settings', 'kernels', 'motion'},
-    'radio': {'settings', 'kernels', 'motion', 'robot'},
-    'emulator': {'settings', 'kernels', 'motion', 'robot', 'radio'},
-    'record': {'settings', 'motion'},
-    'control': {'settings', 'kernels', 'motion', 'fuzzy', 'mpc'},
-    'lab': {
-        'settings',
-        'kernels',
-        'motion',
-        'chaos',
-        'fuzzy',
-        'mpc',
-        'robot',
-        'record',
-        'control',
-    },
-    'nodes': {
-        'settings',
-        'kernels',
-        'motion',
-        'chaos',
-        'fuzzy',
-        'mpc',
-        'robot',
-        'radio',
-        'record',
-        'control',
-    },
+    'stop_signal': set(),
+    'geometry': {'parameters', 'kernels'},
+    'chaos': BASE,
+    'fuzzy': BASE,
+    'mpc': BASE,
+    'robot': BASE,
+    'bag': BASE,
+    'control': BASE | {'fuzzy', 'mpc'},
+    'simulation': BASE | {'robot'},
+    'radio': BASE | {'robot'},
+    'emulator': BASE | {'robot', 'simulation', 'radio'},
+    'evaluation': BASE | {'chaos', 'fuzzy', 'mpc', 'robot', 'bag', 'control', 'simulation'},
+    'nodes': BASE
+    | {'chaos', 'fuzzy', 'mpc', 'robot', 'bag', 'control', 'simulation', 'radio', 'stop_signal'},
+    'cli': BASE
+    | {'chaos', 'fuzzy', 'mpc', 'robot', 'bag', 'control', 'simulation', 'radio', 'stop_signal'}
+    | {'emulator', 'evaluation'},
 }
+# Libraries that each package may import.
 LIBRARIES = {
     'kernels': {'numba'},
-    'robot': {'yaml'},
+    'simulation': {'yaml'},
     'radio': {'serial'},
-    'record': {'mcap', 'rosbags', 'yaml', 'zstandard', 'lz4'},
-    'lab': {'matplotlib', 'yaml', 'cma', 'casadi'},
+    'bag': {'mcap', 'rosbags', 'yaml', 'zstandard', 'lz4'},
+    'evaluation': {'matplotlib', 'yaml', 'cma', 'casadi'},
     'nodes': {'yaml'},
+    'cli': {'yaml'},
 }
 ROS = re.compile(
     r'^(rclpy|rcl_interfaces|builtin_interfaces|tf2_ros|std_srvs|\w+_msgs|launch\w*)$'
 )
+# Basenames of several modules that belong to one concept.
+SHARED_BASENAMES = {
+    'controller': 'the controller, and the node that runs it',
+    'emulator': 'the emulator, and the command that starts it',
+    'fault_injection': 'faults injected into the twin, and into the emulated board',
+    'metadata': 'the metadata of a bag, and their collection in the recorder',
+    'node': 'the node of a folder in nodes/',
+    'qos': 'QoS profiles, in bags and of publishers and subscriptions',
+}
+MAX_CLOSURE = 45
+"""Maximum number of modules of the package that the controller node imports."""
 
 
-def _imports(path: Path) -> set[str]:
+def _imports(path: Path, *, lazy: bool = True) -> set[str]:
+    """Return the imported modules; without ``lazy`` only those imported at import time."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    pending: list[ast.AST] = [ast.parse(path.read_text())]
+    while pending:
+        node = pending.pop()
+        if not lazy and isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        pending.extend(ast.iter_child_nodes(node))
         if isinstance(node, ast.Import):
             found |= {name.name for name in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f'{path}: relative import'
             found.add(node.module or '')
-            if node.module == 't3mpc_ros':
-                found |= {f't3mpc_ros.{name.name}' for name in node.names}
+            if (node.module or '').split('.')[0] == 't3mpc_ros':
+                found |= {f'{node.module}.{name.name}' for name in node.names}
     return found
 
 
-def _room(path: Path) -> str:
-    return path.relative_to(PACKAGE).parts[0] if path.parent != PACKAGE else ''
+def _package(path: Path) -> str:
+    """Return the package or the module directly below ``t3mpc_ros`` that holds a file."""
+    part = path.relative_to(PACKAGE).parts[0]
+    return '' if part == '__init__.py' else part.removesuffix('.py')
+
+
+def _module_file(module: str) -> Path | None:
+    """Return the file of a module of the package, None if the name is no module."""
+    path = ROOT.joinpath(*module.split('.'))
+    files = (path / '__init__.py', path.with_suffix('.py'))
+    return next((file for file in files if file.is_file()), None)
+
+
+def _closure(module: str) -> set[str]:
+    """Return the modules of the package that importing a module imports, with itself."""
+    found: set[str] = set()
+    pending = [module]
+    while pending:
+        name = pending.pop()
+        file = _module_file(name)
+        if not name.startswith('t3mpc_ros') or name in found or file is None:
+            continue
+        found.add(name)
+        pending += [name.rpartition('.')[0], *_imports(file, lazy=False)]
+    return found
 
 
 @pytest.mark.parametrize('path', SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_imports_follow_the_rules_of_the_rooms(path):
+def test_imports_follow_the_direction_of_the_packages(path):
     import sys
 
-    room = _room(path)
+    package = _package(path)
     for name in _imports(path):
         top, *rest = name.split('.')
         if top == 't3mpc_ros':
-            if rest and (PACKAGE / rest[0]).is_dir():
-                assert room, f'{path}: the package itself imports no room'
-                assert rest[0] == room or rest[0] in ROOMS[room], f'{room} imports {rest[0]}'
+            if rest and rest[0] in PACKAGES:
+                assert package, f'{path}: the top-level package imports no other package'
+                allowed = PACKAGES[package] | {package}
+                assert rest[0] in allowed, f'{package} imports {rest[0]}'
         elif ROS.match(top):
-            assert room == 'nodes', f'{path} imports {name}: only nodes/ knows ROS'
+            assert package == 'nodes', f'{path} imports {name}: only nodes/ may import ROS'
         else:
-            allowed = set(sys.stdlib_module_names) | {'numpy'} | LIBRARIES.get(room, set())
+            allowed = set(sys.stdlib_module_names) | {'numpy'} | LIBRARIES.get(package, set())
             assert top in allowed, f'{path} imports {name}'
 
 
-def test_only_the_port_of_the_radio_knows_pyserial():
+def test_only_the_serial_port_of_the_radio_imports_pyserial():
     users = [path for path in SOURCES if 'serial' in _imports(path)]
-    assert users == [PACKAGE / 'radio' / 'host' / 'port.py']
+    assert users == [PACKAGE / 'radio' / 'serial_port.py']
 
 
-def test_the_room_table_is_complete():
-    rooms = {path.name for path in PACKAGE.iterdir() if (path / '__init__.py').exists()}
-    assert rooms == set(ROOMS)
+def test_the_table_of_packages_is_complete():
+    packages = {path.name for path in PACKAGE.iterdir() if (path / '__init__.py').exists()}
+    modules = {path.stem for path in PACKAGE.glob('*.py')} - {'__init__'}
+    assert packages | modules == set(PACKAGES)
 
 
-@pytest.mark.parametrize('room', sorted(ROOMS))
-def test_a_room_can_be_read_in_one_sitting(room):
-    for folder in {PACKAGE / room, *(p.parent for p in (PACKAGE / room).rglob('*.py'))}:
-        files = [path for path in folder.glob('*.py') if path.name != '__init__.py']
-        assert len(files) <= 8, f'{folder.name} has {len(files)} files'
-        for path in files:
-            length = len(path.read_text().splitlines())
-            assert length <= 400, f'{path.name} has {length} lines'
+def test_the_controller_node_imports_few_modules():
+    closure = _closure('t3mpc_ros.nodes.controller')
+    assert len(closure) <= MAX_CLOSURE, '\n'.join(sorted(closure))
+
+
+def test_a_module_basename_has_one_meaning():
+    paths = defaultdict(list)
+    for path in SOURCES:
+        if path.name != '__init__.py':
+            paths[path.stem].append(str(path.relative_to(PACKAGE)))
+    repeated = {stem: found for stem, found in paths.items() if len(found) > 1}
+    unknown = {stem: found for stem, found in repeated.items() if stem not in SHARED_BASENAMES}
+    assert not unknown
+    assert set(SHARED_BASENAMES) == set(repeated), 'an entry of the list is not needed'
+
+
+def test_package_init_files_hold_a_docstring_only():
+    for path in SOURCES:
+        if path.name == '__init__.py' and path.parent != PACKAGE:
+            body = ast.parse(path.read_text()).body
+            assert len(body) == 1, path
+            assert isinstance(body[0], ast.Expr), path
 
 
 def test_every_source_file_carries_the_licence():
@@ -147,28 +192,16 @@ def test_package_xml_names_every_ros_package_that_is_imported():
                 assert top in declared, f'{path.name} imports {top}, package.xml does not name it'
 
 
-def test_no_global_random_numbers_and_no_clock_outside_nodes():
-    """Seeds are explicit, time is an argument; what runs processes is the exception."""
+def test_no_global_random_numbers_and_no_clock_in_libraries():
+    """Seeds are explicit and time is an argument, except in programs and at a serial port."""
     clock = re.compile(
         r'\btime\.(time|monotonic|perf_counter|sleep)|datetime\.now|np\.random\.(?!Gen|def|SeedS)'
     )
-    exempt = {
-        'lab/processes.py',
-        'lab/demo.py',
-        'lab/program.py',
-        'lab/bag/program.py',
-        'lab/bag/rerun.py',
-        'lab/tuning/command.py',
-        'lab/paper/program.py',
-        'emulator/serial_end.py',
-        'radio/bench/carrier.py',
-    }
+    exempt = {'emulator/pty_port.py', 'radio/tool/procedure.py'}
     for path in SOURCES:
         name = str(path.relative_to(PACKAGE))
-        if _room(path) != 'nodes' and name not in exempt:
-            assert not clock.search(path.read_text()), (
-                f'{name} reads a clock or global random state'
-            )
+        if _package(path) not in ('nodes', 'cli') and name not in exempt:
+            assert not clock.search(path.read_text()), f'{name} reads a clock or global state'
 
 
 def test_every_yaml_of_config_fits_its_node():
