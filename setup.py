@@ -56,10 +56,7 @@ setup(
             f'recorder = {NAME}.nodes.common.entry_point:recorder',
             f'player = {NAME}.nodes.common.entry_point:player',
             f'composed = {NAME}.nodes.common.entry_point:composed',
-            f'lab = {NAME}.cli.main:main',
-            f'bag = {NAME}.cli.bag:main',
-            f'board_emulator = {NAME}.cli.emulator:main',
-            f'radio_tool = {NAME}.cli.robot:main',
+            f't3mpc = {NAME}.cli.main:main',
         ],
     },
 )

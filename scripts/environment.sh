@@ -99,7 +99,7 @@ make_environment() {
     install_data --install-dir "$VENV") >>"$LOG" 2>&1 ||
     fail "the package could not be installed: $(tail -n 1 "$LOG")" "see $LOG"
   say "  compiling the kernels"
-  (cd -- "$ROOT" && "$PYTHON" -m t3mpc_ros.cli.main warm) >>"$LOG" 2>&1 ||
+  (cd -- "$ROOT" && "$PYTHON" -m t3mpc_ros.cli.main compile) >>"$LOG" 2>&1 ||
     fail "the kernels could not be compiled: $(tail -n 1 "$LOG")" "see $LOG"
   wanted_stamp >"$VENV/stamp"
 }

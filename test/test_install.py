@@ -167,7 +167,7 @@ def copied(build):
 def test_a_workspace_holds_everything_ros_looks_for(tree):
     assert (tree.prefix / 'share/ament_index/resource_index/packages/t3mpc_ros').is_file()
     executables = {path.name for path in (tree.prefix / 'lib' / 't3mpc_ros').iterdir()}
-    assert executables == EXECUTABLES == {*NODES, 'lab', 'bag', 'board_emulator', 'radio_tool'}
+    assert executables == EXECUTABLES == {*NODES, 't3mpc'}
     assert all(os.access(tree.prefix / 'lib/t3mpc_ros' / name, os.X_OK) for name in executables)
     for pattern in ('package.xml', 'config/*', 'launch/*.launch.py'):
         wanted = {path.relative_to(tree.source) for path in tree.source.glob(pattern)}
@@ -205,8 +205,8 @@ def test_every_installed_node_gets_ready_and_ends_with_0(tree, graph):
 
 
 @pytest.mark.slow
-def test_the_installed_lab_computes_lyapunov_exponents(tree):
-    done = tree.run('lab', 'exponents', '--duration', '20')
+def test_the_installed_program_computes_lyapunov_exponents(tree):
+    done = tree.run('t3mpc', 'exponents', '--duration', '20')
     assert done.returncode == 0, done.stderr
     # The sum is the trace of the Jacobian, whatever the duration.
     assert float(re.search(r'sum: (-?[\d.]+)', done.stdout).group(1)) == pytest.approx(
@@ -355,13 +355,13 @@ exec(sys.argv[2])' "$here" "$2" ;;
 *'setup.py'*)
   echo setup >>"$notes"
   mkdir -p "${!#}/lib/t3mpc_ros"
-  printf '#!/bin/sh\necho "lab got $*"\n' >"${!#}/lib/t3mpc_ros/lab"
-  chmod +x "${!#}/lib/t3mpc_ros/lab" ;;
-*program\ warm) echo warm >>"$notes" ;;
+  printf '#!/bin/sh\necho "t3mpc got $*"\n' >"${!#}/lib/t3mpc_ros/t3mpc"
+  chmod +x "${!#}/lib/t3mpc_ros/t3mpc" ;;
+*main\ compile) echo compile >>"$notes" ;;
 *) echo "unexpected: $*" >&2; exit 99 ;;
 esac
 """
-SET_UP = ['venv', 'pip', 'setup', 'warm']
+SET_UP = ['venv', 'pip', 'setup', 'compile']
 
 
 class Checkout:
@@ -418,20 +418,20 @@ def checkout(tmp_path):
 
 
 def test_run_sets_up_once_and_passes_arguments_on(checkout):
-    first = checkout.run('lab', 'two words', '-x')
-    assert (first.returncode, first.stdout) == (0, 'lab got two words -x\n'), first.stderr
+    first = checkout.run('t3mpc', 'two words', '-x')
+    assert (first.returncode, first.stdout) == (0, 't3mpc got two words -x\n'), first.stderr
     assert checkout.done() == SET_UP
-    again = checkout.run('lab')
-    assert (again.returncode, again.stdout, again.stderr) == (0, 'lab got \n', '')
+    again = checkout.run('t3mpc')
+    assert (again.returncode, again.stdout, again.stderr) == (0, 't3mpc got \n', '')
     assert checkout.done() == []
 
 
-@pytest.mark.parametrize('arguments', [(), ('laboratory',), ('.',), ('../lab',)])
+@pytest.mark.parametrize('arguments', [(), ('t3mpcs',), ('.',), ('../t3mpc',)])
 def test_run_without_a_known_name_lists_the_names_and_exits_with_2(arguments, checkout):
-    checkout.run('lab')
+    checkout.run('t3mpc')
     told = checkout.run(*arguments)
     assert told.returncode == 2
-    assert 'NAME one of: lab\n' in told.stderr
+    assert 'NAME one of: t3mpc\n' in told.stderr
     assert all(f'no executable {name}\n' in told.stderr for name in arguments)
 
 
@@ -440,47 +440,47 @@ def test_run_without_a_known_name_lists_the_names_and_exits_with_2(arguments, ch
     ['requirements.txt', 'requirements-colcon.txt', 'setup.py', 'config/fastdds_loopback.xml'],
 )
 def test_a_stale_environment_is_brought_up_to_date(file, checkout):
-    checkout.run('lab')
+    checkout.run('t3mpc')
     checkout.done()
     with (checkout.root / file).open('a') as text:
         text.write('# changed\n')
-    assert checkout.run('lab').returncode == 0
-    assert checkout.done() == ['pip', 'setup', 'warm']
-    checkout.run('lab')
+    assert checkout.run('t3mpc').returncode == 0
+    assert checkout.done() == ['pip', 'setup', 'compile']
+    checkout.run('t3mpc')
     assert checkout.done() == []
 
 
 def test_compiled_files_beside_the_launch_file_do_no_harm(checkout):
     """A folder launch/__pycache__ once ended every script without a word."""
     (checkout.root / 'launch' / '__pycache__').mkdir()
-    assert checkout.run('lab').returncode == 0
+    assert checkout.run('t3mpc').returncode == 0
 
 
 def test_a_moved_checkout_or_another_python_gets_a_new_environment(checkout, tmp_path):
-    checkout.run('lab')
+    checkout.run('t3mpc')
     checkout.root = checkout.root.rename(tmp_path / 'moved')
     checkout.done()
-    assert checkout.run('lab').returncode == 0
+    assert checkout.run('t3mpc').returncode == 0
     assert checkout.done() == SET_UP
     newer = checkout.python(tmp_path / 'newer', '3.13.1')
-    assert checkout.run('lab', T3MPC_PYTHON=newer).returncode == 0
+    assert checkout.run('t3mpc', T3MPC_PYTHON=newer).returncode == 0
     assert checkout.done() == SET_UP
     # It stays the one in use without being named again.
-    assert checkout.run('lab').returncode == 0
+    assert checkout.run('t3mpc').returncode == 0
     assert checkout.done() == []
 
 
 def test_two_scripts_at_once_set_up_once(checkout):
-    both = [subprocess.Popen(**checkout.command('lab')) for _ in range(2)]
+    both = [subprocess.Popen(**checkout.command('t3mpc')) for _ in range(2)]
     for process in both:
         said, errors = process.communicate(timeout=30)
-        assert (process.returncode, said) == (0, 'lab got \n'), errors
+        assert (process.returncode, said) == (0, 't3mpc got \n'), errors
     assert checkout.done() == SET_UP
 
 
 def test_a_python_that_is_too_old_is_named_with_a_remedy(checkout):
     checkout.python(checkout.bin, '3.9.2')
-    told = checkout.run('lab')
+    told = checkout.run('t3mpc')
     assert told.returncode == 1
     assert re.search(r'^error: .*3\.11.*Python 3\.9\.2', told.stderr, re.MULTILINE)
     assert re.search(r'^remedy: .*T3MPC_PYTHON=', told.stderr, re.MULTILINE)
@@ -492,7 +492,7 @@ def test_a_python_that_was_asked_for_is_not_silently_replaced(version, named, ch
     asked = tmp_path / 'asked' / 'python3'
     if version:
         checkout.python(asked.parent, version)
-    told = checkout.run('lab', T3MPC_PYTHON=asked)
+    told = checkout.run('t3mpc', T3MPC_PYTHON=asked)
     assert told.returncode == 1
     assert f'error: T3MPC_PYTHON={asked}' in told.stderr
     assert named in told.stderr
@@ -502,7 +502,7 @@ def test_a_python_that_was_asked_for_is_not_silently_replaced(version, named, ch
 
 def test_an_interrupted_set_up_is_repaired_by_the_next_run(checkout):
     (checkout.notes.parent / 'no_index').touch()
-    told = checkout.run('lab')
+    told = checkout.run('t3mpc')
     assert told.returncode == 1
     assert 'ERROR: Could not find a version' in told.stderr
     assert 'error: the libraries could not be installed' in told.stderr
@@ -510,18 +510,18 @@ def test_an_interrupted_set_up_is_repaired_by_the_next_run(checkout):
     assert checkout.done() == ['venv', 'pip']
     assert not checkout.stamped
     (checkout.notes.parent / 'no_index').unlink()
-    assert checkout.run('lab').returncode == 0
-    assert checkout.done() == ['pip', 'setup', 'warm']
+    assert checkout.run('t3mpc').returncode == 0
+    assert checkout.done() == ['pip', 'setup', 'compile']
 
 
 def test_a_failed_renewal_does_not_pass_for_an_environment(checkout):
-    checkout.run('lab')
+    checkout.run('t3mpc')
     with (checkout.root / 'requirements.txt').open('a') as text:
         text.write('# changed\n')
     (checkout.notes.parent / 'no_index').touch()
-    assert checkout.run('lab').returncode == 1
+    assert checkout.run('t3mpc').returncode == 1
     assert not checkout.stamped
-    assert checkout.run('lab').returncode == 1
+    assert checkout.run('t3mpc').returncode == 1
 
 
 @pytest.mark.slow
@@ -542,7 +542,7 @@ def test_an_unreachable_index_is_an_error_with_a_remedy(tmp_path):
         {'PIP_NO_INDEX': 1},
     ):
         told = subprocess.run(
-            [root / 'scripts' / 'run', 'lab', 'exponents'],
+            [root / 'scripts' / 'run', 't3mpc', 'exponents'],
             env=clean_environment(**offline, **index),
             capture_output=True,
             text=True,
@@ -558,11 +558,11 @@ def test_a_sourced_ros_is_kept_out_of_the_local_environment(checkout, tmp_path):
     libraries = tmp_path / 'ros' / 'lib'
     libraries.mkdir(parents=True)
     (libraries / 'librcl.so').touch()
-    checkout.run('lab')
-    lab = checkout.root / '.venv' / 'lib' / 't3mpc_ros' / 'lab'
+    checkout.run('t3mpc')
+    lab = checkout.root / '.venv' / 'lib' / 't3mpc_ros' / 't3mpc'
     lab.write_text('#!/bin/sh\nenv\n')
     said = checkout.run(
-        'lab',
+        't3mpc',
         PYTHONPATH=tmp_path / 'ros',
         AMENT_PREFIX_PATH=tmp_path / 'ros',
         LD_LIBRARY_PATH=f'{libraries}:{tmp_path / "own"}',
@@ -583,7 +583,7 @@ def test_a_sourced_ros_is_kept_out_of_the_local_environment(checkout, tmp_path):
 def test_run_starts_the_real_lab():
     run = [ROOT / 'scripts' / 'run']
     done = subprocess.run(
-        [*run, 'lab', 'exponents', '--duration', '5'], capture_output=True, text=True
+        [*run, 't3mpc', 'exponents', '--duration', '5'], capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     assert 'trace of the Jacobian: -38' in done.stdout

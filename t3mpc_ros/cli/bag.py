@@ -94,7 +94,7 @@ def _info_text(held: BagInfo) -> str:
     if held.unfinished:
         parts.append(
             f'A file without its end is still being written, or its writer broke off: '
-            f'`bag recover {held.path}` writes what is in it into a new bag.'
+            f'`t3mpc bag recover {held.path}` writes what is in it into a new bag.'
         )
     if held.topics:
         parts.append(_topic_table(held))
@@ -303,13 +303,13 @@ def run_report(options: argparse.Namespace) -> int:
 
 
 def add_replay_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
-    """Add ``rerun`` to the commands of ``bag``; :func:`run` carries it out."""
+    """Add ``replay`` to the commands of ``bag``; :func:`run` carries it out."""
     parser = commands.add_parser(
-        'rerun',
+        'replay',
         help='compute a recorded run again',
         description='Gives the recorded odometry and reference to the controller of today, '
         'offline and as fast as it goes, in the order in which the recorded controller took them. '
-        'With other settings, or with another method of the lab, it says what would have been '
+        'With other settings, or with another method, it says what would have been '
         'commanded; the robot does not answer to that.',
     )
     parser.add_argument('bag', type=Path, metavar='BAG', help='folder of the bag, or its file')
@@ -317,7 +317,7 @@ def add_replay_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPar
         '--output', type=Path, metavar='DIR', help='write a bag of what was computed'
     )
     parser.add_argument(
-        '--rival', metavar='NAME', help="a method of the lab in the controller's place"
+        '--method', metavar='NAME', help="another method in the controller's place"
     )
     add_input_options(parser)
     parser.set_defaults(run=run_replay)
@@ -327,7 +327,7 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
     """Add what says how a bag is taken as the inputs of a controller."""
     parser.add_argument(
         '--set',
-        dest='settings',
+        dest='parameters',
         action='append',
         default=[],
         metavar='NAME=VALUE',
@@ -368,9 +368,9 @@ def run_replay(options: argparse.Namespace) -> int:
     begin = time.perf_counter()
     inputs = load_inputs(options.bag, options.namespace, model)
     read = time.perf_counter()
-    if options.rival:
+    if options.method:
         ready = read
-        again = replay_method(inputs, options.rival, changes)
+        again = replay_method(inputs, options.method, changes)
     else:
         controllers = make_controllers(inputs, changes)
         ready = time.perf_counter()
@@ -385,7 +385,7 @@ def run_replay(options: argparse.Namespace) -> int:
         + (f'; {starting:.2f} s to compile and to warm up are not counted' if starting else '')
     )
     print(compare(inputs, again).table())
-    if options.rival or changes or options.model:
+    if options.method or changes or options.model:
         print(OPEN_LOOP)
     if options.output:
         print(f'written to {write_replay(inputs, again, options.output)}')
@@ -400,8 +400,8 @@ def add_compare_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPa
     """Add ``compare`` to the commands of ``bag``; :func:`run` carries it out."""
     parser = commands.add_parser(
         'compare',
-        help='compare a recorded run with its rerun, or with another bag',
-        description='With one bag: it is computed again, see bag rerun, and each field compared. '
+        help='compare a recorded run with its replay, or with another bag',
+        description='With one bag: it is computed again, see bag replay, and each field compared. '
         'With two: what they hold of one run. Exit code 0: all within the tolerances; 3: '
         'something differs; 1: it cannot be compared.',
     )
@@ -471,7 +471,7 @@ def run_compare(options: argparse.Namespace) -> int:
     inputs = load_inputs(options.bag, options.namespace, model)
     if options.other is not None:
         if changes or model:
-            raise ValueError('--set and --model are for a rerun: give one bag only')
+            raise ValueError('--set and --model are for a replay: give one bag only')
         other = load_inputs(options.other, options.namespace)
         outcome = compare_bags(inputs, other, tolerances)
     else:
@@ -525,7 +525,7 @@ def add_train_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPars
     parser.set_defaults(run=run_bags)
 
 
-def bag_main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Return the exit code: 0 done, 1 failed with a reason, 2 wrong command line.
 
     3 is the command's own: done, but not all is well with the bag.
@@ -534,7 +534,7 @@ def bag_main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _bag_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog='bag', description=__doc__)
+    parser = argparse.ArgumentParser(prog='t3mpc bag', description='Bags without a ROS graph.')
     commands = parser.add_subparsers(dest='command', required=True)
     add_info_parser(commands)
     add_recover_parser(commands, time.monotonic)
@@ -546,4 +546,4 @@ def _bag_parser() -> argparse.ArgumentParser:
 
 
 if __name__ == '__main__':
-    sys.exit(bag_main())
+    sys.exit(main())

@@ -13,7 +13,7 @@ from t3mpc_ros.cli.process_group import ProcessError, ProcessGroup, private_grap
 from t3mpc_ros.evaluation.bag_report.metrics import ReportMetrics
 from t3mpc_ros.evaluation.bag_report.report_page import write_report
 
-BOARD = 'board_emulator'
+BOARD = 'emulator'
 """No node: it has no parameters, and says that it is ready in words of its own."""
 PAPER_NOISE = 0.04
 """Variance of the measured wheel speeds, (rad/s)², as in the paper's simulations."""
@@ -145,7 +145,7 @@ def run_demo(options: DemoOptions) -> ReportMetrics:
     )
     try:
         if board := options.board():
-            fleet.start(BOARD, *board)
+            fleet.start(BOARD, BOARD, *board, program='t3mpc')
             fleet.wait_for(BOARD, 'stop with Ctrl-C', 120.0)
             stopped = (*stopped, BOARD)
         for name in options.nodes:

@@ -31,10 +31,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for text in options.fault:
             emulator.play(parse_fault(text))
     except (FaultError, KeyFileError, ParameterError, WorldError) as error:
-        print(f'board_emulator: {error}', file=sys.stderr)
+        print(f't3mpc emulator: {error}', file=sys.stderr)
         return 2
     with StopSignal() as stop:
-        print('board_emulator: getting ready', flush=True)
+        print('t3mpc emulator: getting ready', flush=True)
         emulator.plant.warm_up()
         with ExitStack() as ends:
             try:
@@ -45,12 +45,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     cable = PtyPort(options.robot_link)
                     ends.callback(cable.close)
             except PtyPortError as error:
-                print(f'board_emulator: {error}', file=sys.stderr)
+                print(f't3mpc emulator: {error}', file=sys.stderr)
                 return 2
             secured = 'signed commands only' if key else 'no key'
             usb = f", the robot's own USB at {options.robot_link.absolute()}" if cable else ''
             print(
-                f'board_emulator: dongle and robot at {options.link.absolute()}{usb} ({secured}); '
+                f't3mpc emulator: dongle and robot at {options.link.absolute()}{usb} ({secured}); '
                 f'stop with Ctrl-C or kill {os.getpid()}',
                 flush=True,
             )
@@ -64,18 +64,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 cable,
                 lambda: _tell(watch.news()),
             )
-    print('board_emulator: stopped', flush=True)
+    print('t3mpc emulator: stopped', flush=True)
     return 0
 
 
 def _tell(news: str) -> None:
     if news:
-        print(f'board_emulator: {news}', flush=True)
+        print(f't3mpc emulator: {news}', flush=True)
 
 
 def _parameters(options: argparse.Namespace) -> EmulatorParameters:
-    flat: dict[str, object] = {'twin.world': options.world, 'twin.seed': options.seed}
-    return EmulatorParameters.from_dict(flat | parse_assignments(EmulatorParameters, options.set))
+    values: dict[str, object] = {'twin.world': options.world, 'twin.seed': options.seed}
+    return EmulatorParameters.from_dict(
+        values | parse_assignments(EmulatorParameters, options.set)
+    )
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -84,7 +86,7 @@ def _parser() -> argparse.ArgumentParser:
         for kind in FAULT_KINDS
     )
     parser = argparse.ArgumentParser(
-        prog='board_emulator',
+        prog='t3mpc emulator',
         description='Dongle and robot behind a serial port, for the radio bridge to drive.',
         epilog=f'faults, with the value that is meant when none is given:\n{faults}',
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -1,10 +1,11 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""``t3mpc``: command-line program of everything without a ROS graph."""
+"""``t3mpc``: the command-line program for everything that needs no ROS graph."""
 
 import argparse
 from collections.abc import Mapping, Sequence
 from datetime import datetime
+from importlib import import_module
 import json
 from pathlib import Path
 import sys
@@ -12,7 +13,7 @@ import time
 from typing import TYPE_CHECKING
 import webbrowser
 
-from t3mpc_ros.cli.bag import add_report_parser
+import t3mpc_ros
 from t3mpc_ros.cli.command import run_command
 from t3mpc_ros.cli.faults import add_outcomes_parser
 from t3mpc_ros.cli.paper import add_parser as add_paper
@@ -27,10 +28,22 @@ if TYPE_CHECKING:
 
 SECONDS = bounded_float(1.0, 86_400.0, 'seconds')
 
+PROGRAMS = {
+    'bag': 'inspect, report, recover, replay, compare bags, and train from them',
+    'robot': 'key, link test, channel scan, wheel jog, parameters of the real robot',
+    'emulator': 'emulated dongle and robot board behind a serial port',
+}
+"""Subcommands with a parser of their own, in the module of the same name."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Return the exit code: 0 done, 1 failed with a reason, 2 wrong command line."""
-    return run_command(_parser(), arguments)
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words and words[0] in PROGRAMS:
+        # Imported only when it is used: `t3mpc --help` stays fast.
+        code: int = import_module(f't3mpc_ros.cli.{words[0]}').main(words[1:])
+        return code
+    return run_command(_parser(), words)
 
 
 def _demo(options: argparse.Namespace) -> int:
@@ -83,7 +96,7 @@ def _exponents(options: argparse.Namespace) -> int:
     return 0
 
 
-def _warm(options: argparse.Namespace) -> int:
+def _compile(options: argparse.Namespace) -> int:
     from t3mpc_ros.control.controller import Controller, ControllerParameters
     from t3mpc_ros.evaluation.closed_loop import MethodSpec, run
     from t3mpc_ros.evaluation.proposed_method import ComposedParameters, ProposedController
@@ -99,15 +112,20 @@ def _warm(options: argparse.Namespace) -> int:
     return 0
 
 
-def _contestants() -> 'Sequence[MethodDefinition]':
+def _method_definitions() -> 'Sequence[MethodDefinition]':
     from t3mpc_ros.evaluation.methods import method_definitions
 
     return method_definitions()
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog='lab', description=__doc__)
-    commands = parser.add_subparsers(dest='command', required=True)
+    parser = argparse.ArgumentParser(
+        prog='t3mpc', description='Everything of t3mpc_ros that needs no ROS graph.'
+    )
+    parser.add_argument(
+        '--version', action='version', version=f't3mpc_ros {t3mpc_ros.__version__}'
+    )
+    commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
 
     demo = commands.add_parser('demo', help='run all nodes as processes, record, report')
     demo.add_argument('--duration', type=SECONDS, default=60.0, help='seconds (default 60)')
@@ -129,7 +147,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     demo.set_defaults(run=_demo)
 
-    add_report_parser(commands)
+    for name, text in PROGRAMS.items():
+        commands.add_parser(name, help=text, add_help=False)
 
     estimation = commands.add_parser(
         'estimation', help='the kinds of fuzzy systems as estimators, without a controller (86)'
@@ -152,13 +171,13 @@ def _parser() -> argparse.ArgumentParser:
     exponents.set_defaults(run=_exponents)
 
     add_paper(commands)
-    add_tune(commands, _contestants)
+    add_tune(commands, _method_definitions)
     add_train(commands)
     add_twin(commands, time.monotonic)
     add_outcomes_parser(commands, time.monotonic)
 
-    warm = commands.add_parser('warm', help='compile every kernel into the cache')
-    warm.set_defaults(run=_warm)
+    compiling = commands.add_parser('compile', help='compile every kernel into the cache')
+    compiling.set_defaults(run=_compile)
     return parser
 
 

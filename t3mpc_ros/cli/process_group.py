@@ -84,10 +84,18 @@ class ProcessGroup:
         self._log_start: dict[str, int] = {}
 
     def start(
-        self, name: str, *arguments: str, parameters: Mapping[str, object] | None = None
+        self,
+        name: str,
+        *arguments: str,
+        parameters: Mapping[str, object] | None = None,
+        program: str = '',
     ) -> None:
-        """Start one executable with ROS parameters; its output is appended to its log."""
-        command = [str(executable(name)), *arguments]
+        """Start one executable with ROS parameters and append its output to its log.
+
+        ``program`` is the executable if ``name`` is not: ``start('emulator', 'emulator',
+        '--link', 'x', program='t3mpc')``.
+        """
+        command = [str(executable(program or name)), *arguments]
         given = dict(parameters or {})
         if given:
             command.append('--ros-args')

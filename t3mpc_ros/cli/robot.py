@@ -37,9 +37,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return int(options.run(options, stop))
         except (ProcedureError, KeyFileError, ParameterError) as error:
             if stop():
-                print('radio_tool: interrupted', file=sys.stderr)
+                print('t3mpc robot: interrupted', file=sys.stderr)
                 return EXIT_INTERRUPTED
-            print(f'radio_tool: {error}', file=sys.stderr)
+            print(f't3mpc robot: {error}', file=sys.stderr)
             return EXIT_FAILED
 
 
@@ -128,7 +128,7 @@ def _show_parameters(options: argparse.Namespace, stop: StopSignal) -> int:
 def _jog(options: argparse.Namespace, stop: StopSignal) -> int:
     parameters = _link_parameters(options)
     if not options.yes and not _confirmed(options, stop):
-        print('radio_tool: nothing was moved', file=sys.stderr)
+        print('t3mpc robot: nothing was moved', file=sys.stderr)
         return EXIT_INTERRUPTED if stop() else EXIT_FAILED
     task = jog.Jog(
         parameters,
@@ -137,7 +137,7 @@ def _jog(options: argparse.Namespace, stop: StopSignal) -> int:
         options.wheel,
         options.revolutions,
         options.speed,
-        lambda text: print(f'radio_tool: {text}', file=sys.stderr),
+        lambda text: print(f't3mpc robot: {text}', file=sys.stderr),
     )
     run_at_port(task, options.port, stop)
     if task.result is not None:
@@ -203,7 +203,7 @@ def _revolutions(text: str) -> float:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog='radio_tool',
+        prog='t3mpc robot',
         description='Key, link and wheels of the real robot, at the bench.',
         epilog='exit code: 0 all is well, 1 what was found is not good, 2 it could not be done',
     )
@@ -214,9 +214,9 @@ def _parser() -> argparse.ArgumentParser:
     ping.add_argument(
         '--count', type=bounded_int(1, 100_000), default=200, help='times each is asked'
     )
-    find = commands.add_parser('find', help='on which channels the robot answers')
+    find = commands.add_parser('scan', help='on which channels the robot answers')
     find.add_argument('--all-rates', action='store_true', help='at 250k, 1M and 2M')
-    turning = commands.add_parser('turn', help='turn one wheel, with both in the air')
+    turning = commands.add_parser('jog', help='turn one wheel, with both in the air')
     turning.add_argument('wheel', choices=(jog.LEFT, jog.RIGHT))
     turning.add_argument(
         'revolutions', type=_revolutions, metavar='REVOLUTIONS', help='below 0: backward'

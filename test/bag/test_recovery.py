@@ -28,7 +28,7 @@ from t3mpc_ros.bag.recovery.recover_bag import RecoveryOutputError, default_outp
 from t3mpc_ros.bag.recovery.recover_file import UnreadableError, recover_file
 from t3mpc_ros.bag.schema import MessageDefinitions
 from t3mpc_ros.bag.writer import BagWriter
-from t3mpc_ros.cli.bag import bag_main
+from t3mpc_ros.cli.bag import main as bag_main
 
 START = 1_700_000_000_000_000_000
 TEXT, NUMBER = 'std_msgs/msg/String', 'std_msgs/msg/Float64'

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""``board_emulator`` as a process on the wall clock, and the pseudo terminal it stands behind."""
+"""``t3mpc emulator`` as a process on the wall clock, and the pseudo terminal it stands behind."""
 
 import os
 from pathlib import Path
@@ -152,7 +152,7 @@ def test_a_host_drives_the_process_over_the_real_port_with_a_key_and_a_replug(st
     code, said = process.stop(signal.SIGTERM)
     assert code == 0
     *news, last = said.splitlines()
-    assert last == 'board_emulator: stopped'
+    assert last == 't3mpc emulator: stopped'
     # Once when the dongle was pulled out, and for the end if the wheels had begun to turn again.
     took = [re.search('at rest ([0-9.]+) s after the last command', line)[1] for line in news]
     assert max(map(float, took)) <= 0.45

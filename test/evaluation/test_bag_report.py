@@ -14,8 +14,8 @@ from rosbags.typesys import Stores, get_typestore
 import yaml
 
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.cli.bag import bag_main
-from t3mpc_ros.cli.main import main as lab
+from t3mpc_ros.cli.bag import main as bag_main
+from t3mpc_ros.cli.main import main as t3mpc
 from t3mpc_ros.evaluation.bag_report.link_history import link_metrics
 from t3mpc_ros.evaluation.bag_report.report_page import write_report
 from t3mpc_ros.evaluation.bag_report.response import (
@@ -338,8 +338,8 @@ def test_a_bag_without_motion_is_an_error_that_says_what_it_holds(
     text = TYPES[SCAN](data='hello')
     folder = write(tmp_path / 'bag', [(0.1 * i, '/chatter', text) for i in range(5)])
     output = tmp_path / 'out'
-    for program in (bag_main, lab):
-        assert program(['report', str(folder), '--output', str(output), *options]) == 1
+    for program, before in ((bag_main, []), (t3mpc, ['bag'])):
+        assert program([*before, 'report', str(folder), '--output', str(output), *options]) == 1
         said = capsys.readouterr().err
         assert words in said
         assert '/chatter' in said

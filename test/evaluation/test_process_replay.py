@@ -611,7 +611,7 @@ def test_a_damaged_bag_is_refused_or_read_never_more(bag, tmp_path):
 
 
 def test_a_rerun_written_as_a_bag_compares_with_its_source(bag, tmp_path, capsys):
-    assert bag_program('rerun', bag, '--output', tmp_path / 'again') == 0
+    assert bag_program('replay', bag, '--output', tmp_path / 'again') == 0
     said = capsys.readouterr().out
     assert 'x real time' in said
     assert 's to compile and to warm up are not counted' in said
@@ -622,7 +622,7 @@ def test_a_rerun_written_as_a_bag_compares_with_its_source(bag, tmp_path, capsys
 def test_a_rerun_under_other_settings_differs_and_says_that_the_loop_is_open(
     bag, tmp_path, capsys
 ):
-    assert bag_program('rerun', bag, '--output', tmp_path / 'what', '--set', 'law.gain=30') == 0
+    assert bag_program('replay', bag, '--output', tmp_path / 'what', '--set', 'law.gain=30') == 0
     assert 'open loop' in capsys.readouterr().out
     one, other = load_inputs(bag), load_inputs(tmp_path / 'what')
     outcome = compare_bags(one, other)

@@ -112,8 +112,8 @@ def obeyed(node):
 def test_a_killed_bridge_leaves_the_wheels_at_rest_in_time(world, fleet, tmp_path):
     """All of them processes: SIGKILL, from full speed; the emulator says how long it took."""
     path = tmp_path / 'dongle'
-    fleet.start('board_emulator', '--link', str(path))
-    fleet.wait_for('board_emulator', 'stop with Ctrl-C', 120.0)
+    fleet.start('emulator', 'emulator', '--link', str(path), program='t3mpc')
+    fleet.wait_for('emulator', 'stop with Ctrl-C', 120.0)
     odom = world.hear(Odometry, 'odom')
     driver = Driver(world)
     for _ in range(2):
@@ -122,14 +122,12 @@ def test_a_killed_bridge_leaves_the_wheels_at_rest_in_time(world, fleet, tmp_pat
         odom.clear()
         world.until(lambda: odom and odom[-1].twist.twist.linear.x > 0.98 * FULL, 'full speed')
         fleet.kill('radio_bridge')
-        before = fleet.log('board_emulator').read_text().count('at rest')
+        before = fleet.log('emulator').read_text().count('at rest')
         world.until(
-            lambda before=before: (
-                fleet.log('board_emulator').read_text().count('at rest') > before
-            ),
+            lambda before=before: fleet.log('emulator').read_text().count('at rest') > before,
             'rest',
         )
-    found = re.findall(r'at rest ([0-9.]+) s', fleet.log('board_emulator').read_text())
+    found = re.findall(r'at rest ([0-9.]+) s', fleet.log('emulator').read_text())
     print(f'\nat rest {", ".join(found)} s after the last command')
     assert len(found) >= 2
     assert max(map(float, found)) <= REST

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""``radio_tool`` against the emulator: in virtual time, and once over pseudo terminals."""
+"""``t3mpc robot`` against the emulator: in virtual time, and once over pseudo terminals."""
 
 import math
 import os
@@ -485,7 +485,7 @@ def ports(tmp_path):
     yield str(dongle), str(robot)
     child.send_signal(signal.SIGTERM)
     said, _ = child.communicate(timeout=20)
-    assert said.endswith('board_emulator: stopped\n')
+    assert said.endswith('t3mpc emulator: stopped\n')
     assert 'Traceback' not in said
     assert not dongle.is_symlink()
     assert not robot.is_symlink()
@@ -517,15 +517,15 @@ def test_a_new_robot_on_the_bench_from_key_to_wheel(ports, tmp_path, capsys):
     code, said = run('parameters', '--port', dongle, '--key', key, '--set', 'robot.idle_off=5')
     assert (code, 'ttl_max' in said, '5000' in said) == (0, True, True)
     assert 'robot answers by radio' in run('ping', '--port', dongle, '--count', '20')[1]
-    code, said = run('find', '--port', dongle)
+    code, said = run('scan', '--port', dongle)
     assert (code, 'channel 82 at 1M' in said) == (0, True)
-    code, said = run('turn', 'left', '0.2', '--port', dongle, '--key', key, '--yes')
+    code, said = run('jog', 'left', '0.2', '--port', dongle, '--key', key, '--yes')
     assert (code, '640 wanted' in said) == (0, True)
 
     # Ctrl-C in mid-turn: the robot stands, then the program ends.
     threading.Timer(4.0, os.kill, (os.getpid(), signal.SIGINT)).start()
     begun = time.monotonic()
-    code, said = run('turn', 'left', '90', '--port', dongle, '--key', key, '--yes')
+    code, said = run('jog', 'left', '90', '--port', dongle, '--key', key, '--yes')
     assert code == 130
     assert time.monotonic() - begun < 60.0
     assert 'interrupted' in said
@@ -534,7 +534,7 @@ def test_a_new_robot_on_the_bench_from_key_to_wheel(ports, tmp_path, capsys):
 
 def test_errors_of_the_port_are_words_with_a_remedy(tmp_path, capsys):
     missing = str(tmp_path / 'nothing')
-    for command in (['ping'], ['find'], ['parameters'], ['turn', 'left', '1', '--yes']):
+    for command in (['ping'], ['scan'], ['parameters'], ['jog', 'left', '1', '--yes']):
         assert robot.main([*command, '--port', missing]) == 2
         assert 'is the dongle plugged in?' in capsys.readouterr().err
     assert robot.main(['key', 'state', '--port', missing]) == 2
@@ -554,9 +554,9 @@ def test_errors_of_the_port_are_words_with_a_remedy(tmp_path, capsys):
     [
         (['ping', '--port', 'x', '--set', 'channel=126'], 'channel'),
         (['ping', '--port', 'x', '--set', 'chanel=12'], 'chanel'),
-        (['find', '--port', 'x', '--set', 'rate'], 'NAME=VALUE'),
-        (['turn', 'left', '1', '--port', 'x', '--key', 'no/such/file', '--yes'], 'no/such/file'),
-        (['turn', 'left', '1', '--port', 'x'], '--yes'),
+        (['scan', '--port', 'x', '--set', 'rate'], 'NAME=VALUE'),
+        (['jog', 'left', '1', '--port', 'x', '--key', 'no/such/file', '--yes'], 'no/such/file'),
+        (['jog', 'left', '1', '--port', 'x'], '--yes'),
         (['key', 'check', 'no/such/file'], 'no/such/file'),
     ],
 )
@@ -581,11 +581,11 @@ def test_a_wheel_turns_only_if_a_person_says_yes(answer, capsys, monkeypatch):
             threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
         else:
             os.write(master, answer.encode() + b'\n')
-        code = robot.main(['turn', 'left', '1', '--port', 'x'])
+        code = robot.main(['jog', 'left', '1', '--port', 'x'])
         assert code == (130 if answer == 'ctrl-c' else 2)
         assert opened == []
         os.write(master, b'yes\n')
-        assert robot.main(['turn', 'left', '1', '--port', 'x']) == 0
+        assert robot.main(['jog', 'left', '1', '--port', 'x']) == 0
     os.close(master)
     assert len(opened) == 1
     said = capsys.readouterr()
@@ -604,9 +604,9 @@ def test_a_file_of_zeros_is_no_key(tmp_path, capsys):
 @pytest.mark.parametrize(
     'arguments',
     [
-        ['turn', 'left', '0', '--port', 'x'],
-        ['turn', 'middle', '1', '--port', 'x'],
-        ['turn', 'left', '1', '--speed', '11', '--port', 'x'],
+        ['jog', 'left', '0', '--port', 'x'],
+        ['jog', 'middle', '1', '--port', 'x'],
+        ['jog', 'left', '1', '--speed', '11', '--port', 'x'],
         ['ping', '--count', '0', '--port', 'x'],
         ['ping'],
         ['key'],

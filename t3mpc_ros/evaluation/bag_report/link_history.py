@@ -1,0 +1,174 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Diagnostics over time: warnings of every node, and metrics of a radio link."""
+
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.bag.reader import BagReader
+
+
+Array = NDArray[np.float64]
+
+SHARES = ('lost_share', 'round_trip_median_ms', 'round_trip_p99_ms', 'telemetry_age_s')
+"""Keys of numbers that come and go, see ``radio_bridge``."""
+COUNTERS = (
+    'cycles',
+    'cycles_lost',
+    'robot_resets',
+    'dongle_resets',
+    'sessions',
+    'port_failures',
+    'crc_errors',
+    'frame_errors',
+    'commands',
+    'commands_refused',
+)
+"""Keys of numbers that only grow."""
+LINK_KEYS = ('cycles', 'cycles_lost', 'lost_share', 'round_trip_median_ms', 'round_trip_p99_ms')
+"""Two of these make a status one of a link."""
+_LEVELS = {1: 'warning', 2: 'error', 3: 'stale'}
+
+DiagnosticEvent = tuple[float, str, str, str]
+"""When first, level, who, what."""
+
+
+@dataclass(frozen=True)
+class LinkHistory:
+    """One link over time."""
+
+    name: str
+    """Of the status that tells of it."""
+    time: Array
+    """s, of receipt."""
+    values: Mapping[str, Array]
+    """By key, NaN where it was not said; those of :data:`SHARES` and :data:`COUNTERS`."""
+
+    def answered(self) -> Array:
+        """Return which share of the cycles since the report before was answered, shape (n,)."""
+        cycles, lost = self.values.get('cycles'), self.values.get('cycles_lost')
+        if cycles is None or lost is None:
+            share = self.values.get('lost_share')
+            return np.full(self.time.size, math.nan) if share is None else 1.0 - share
+        made, failed = (np.diff(table, prepend=math.nan) for table in (cycles, lost))
+        with np.errstate(invalid='ignore', divide='ignore'):
+            # A counter that falls is that of a bridge that was started anew.
+            return np.where((made > 0.0) & (failed >= 0.0), 1.0 - failed / made, math.nan)
+
+    def grown(self, key: str) -> float:
+        """Return by how much a counter grew in the recording, over restarts; NaN if unknown."""
+        table = self.values.get(key)
+        if table is None or not np.isfinite(table).any():
+            return math.nan
+        known = table[np.isfinite(table)]
+        steps = np.diff(known)
+        return float(np.where(steps >= 0.0, steps, known[1:]).sum())
+
+
+@dataclass(frozen=True)
+class LinkMetrics:
+    """How well a link worked over a recording; NaN where that was not said."""
+
+    cycles: float
+    lost: float
+    answered: float
+    """Share of the cycles."""
+    round_trip: float
+    """Median over the reports of the median round trip, s."""
+    round_trip_99: float
+    """Largest reported 99th percentile, s."""
+    oldest: float
+    """Largest reported age of the last measurement, s."""
+    resets: float
+    """Of the robot's board."""
+    dongle_resets: float
+    port_failures: float
+    sessions: float
+    """Begun after the first report."""
+    damaged: float
+    """Frames with a wrong checksum or form."""
+
+
+def link_metrics(link: LinkHistory) -> LinkMetrics:
+    """Return a link in few numbers."""
+    cycles, lost = link.grown('cycles'), link.grown('cycles_lost')
+    answered = 1.0 - lost / cycles if cycles > 0.0 else math.nan
+    if math.isnan(answered):
+        answered = _over(np.nanmean, link.answered())
+    empty = np.full(1, math.nan)
+    return LinkMetrics(
+        cycles,
+        lost,
+        answered,
+        1e-3 * _over(np.nanmedian, link.values.get('round_trip_median_ms', empty)),
+        1e-3 * _over(np.nanmax, link.values.get('round_trip_p99_ms', empty)),
+        _over(np.nanmax, link.values.get('telemetry_age_s', empty)),
+        link.grown('robot_resets'),
+        link.grown('dongle_resets'),
+        link.grown('port_failures'),
+        link.grown('sessions'),
+        link.grown('crc_errors') + link.grown('frame_errors'),
+    )
+
+
+def _over(measure: Callable[[Array], Any], values: Array) -> float:
+    return float(measure(values)) if np.isfinite(values).any() else math.nan
+
+
+def read_diagnostics(
+    recording: BagReader, namespace: str
+) -> tuple[tuple[DiagnosticEvent, ...], tuple[LinkHistory, ...]]:
+    """Return each distinct warning or error with when it came first, and the links there are.
+
+    Of the whole bag ``/diagnostics`` is read, and of the namespace its own.
+    """
+    found: dict[tuple[str, str, str], float] = {}
+    rows: dict[str, list[tuple[float, dict[str, float]]]] = {}
+    for topic in sorted({'/diagnostics', f'{namespace}/diagnostics'} & set(recording.topics)):
+        if not recording.topics[topic].type_name.endswith('DiagnosticArray'):
+            continue
+        for received, message in recording.messages(topic):
+            for status in message.status:
+                level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
+                if level:
+                    word = _LEVELS.get(level, str(level))
+                    found.setdefault((word, status.name, status.message), received)
+                if numbers := _numbers(status):
+                    rows.setdefault(status.name, []).append((received, numbers))
+    links = []
+    for name, entries in rows.items():
+        keys = [k for k in (*SHARES, *COUNTERS) if any(k in numbers for _, numbers in entries)]
+        links.append(
+            LinkHistory(
+                name,
+                np.array([when for when, _ in entries]),
+                {
+                    key: np.array([numbers.get(key, math.nan) for _, numbers in entries])
+                    for key in keys
+                },
+            )
+        )
+    complaints = sorted(found.items(), key=lambda item: item[1])
+    return tuple((when, *key) for key, when in complaints), tuple(links)
+
+
+def _numbers(status: Any) -> dict[str, float]:
+    """Return what a status says of a link; nothing when it is of something else."""
+    told = {entry.key: entry.value for entry in status.values}
+    if sum(key in told for key in LINK_KEYS) < 2:
+        return {}
+    numbers = {}
+    for key in (*SHARES, *COUNTERS):
+        try:
+            value = float(told[key])
+        except (KeyError, ValueError):
+            continue  # a text, or not said: unknown
+        numbers[key] = value if math.isfinite(value) else math.nan
+    return numbers
+

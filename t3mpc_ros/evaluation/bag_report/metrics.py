@@ -1,0 +1,334 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Metrics of a recorded run: tracking errors, chatter, latencies."""
+
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.evaluation.bag_report.run_data import (Run, Series)
+from t3mpc_ros.evaluation.bag_report.topic_roles import (COMMAND, ODOMETRY, REFERENCE)
+
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+import math
+from pathlib import Path
+
+import numpy as np
+
+from t3mpc_ros.evaluation.bag_report.link_history import (LinkMetrics, link_metrics)
+
+from t3mpc_ros.evaluation.bag_report.run_data import (Channel, Run)
+from t3mpc_ros.evaluation.bag_report.response import (ResponseFit, responses)
+from t3mpc_ros.evaluation.bag_report.topic_roles import (COMMAND, ODOMETRY, REFERENCE)
+
+
+Array = NDArray[np.float64]
+
+SETTLING = 1.0
+"""Seconds in which the robot catches up: left out after the start of the drive, and after each
+switch where it is to have settled; also the longest time left out before a switch."""
+WINDOW = 0.2
+"""Width (s) over which the target of the estimate is smoothed."""
+
+
+@dataclass(frozen=True)
+class ErrorStatistics:
+    """Of the tracking error of one channel, in its unit; NaN without a sample."""
+
+    rmse: float
+    mae: float
+    largest: float
+    count: int
+    seconds: float
+    """How much time the samples stand for, s."""
+
+
+def statistics(error: Array, period: float = math.nan) -> ErrorStatistics:
+    """Return root mean square, mean and largest of the absolute error.
+
+    Each sample of ``error`` stands for ``period`` seconds.
+    """
+    size = np.abs(error[np.isfinite(error)])
+    if not size.size:
+        return ErrorStatistics(math.nan, math.nan, math.nan, 0, 0.0)
+    return ErrorStatistics(
+        float(np.sqrt(np.mean(size**2))),
+        float(size.mean()),
+        float(size.max()),
+        int(size.size),
+        size.size * period,
+    )
+
+
+def tracking_error(run: Run, measured: str) -> Series | None:
+    """Return measured less wanted of both channels at the stamps of the ``measured`` motion.
+
+    The reference is interpolated, but over a switch its earlier sample holds; outside the
+    reference there is no error. None when either is absent.
+    """
+    motion, reference = run.motions.get(measured), run.motions.get(REFERENCE)
+    if motion is None or reference is None:
+        return None
+    inside = (motion.time >= reference.time[0]) & (motion.time <= reference.time[-1])
+    time = motion.time[inside]
+    before = np.clip(np.searchsorted(reference.time, time, 'right') - 1, 0, None)
+    following = np.minimum(before + 1, len(reference) - 1)
+    held = np.isin(reference.time[following], run.switches)
+    errors = {}
+    for wheel, *_ in run.channels:
+        wanted = np.interp(time, reference.time, reference[wheel])
+        wanted = np.where(held, reference[wheel][before], wanted)
+        errors[wheel] = motion[wheel][inside] - wanted
+    return Series(time, errors)
+
+
+def driving(run: Run) -> tuple[float, float]:
+    """Return from when to when the robot was being driven, s: first and last command but zero.
+
+    Before, the controller did not follow the reference yet; after, it had stopped, though the
+    reference is stamped ahead and goes on. A stop in between belongs to the drive. From infinity
+    to minus infinity when every command was zero; the other way round when the bag has none.
+    """
+    command = run.motions.get(COMMAND)
+    if command is None:
+        return -math.inf, math.inf
+    moving = command.time[(command['linear'] != 0.0) | (command['angular'] != 0.0)]
+    return (float(moving[0]), float(moving[-1])) if moving.size else (math.inf, -math.inf)
+
+
+def driven(time: Array, run: Run) -> NDArray[np.bool_]:
+    """Return at which of ``time``, the stamps of an error, the robot was being driven (s).
+
+    The first :data:`SETTLING` seconds with a command and a reference are left out: the robot
+    has yet to catch up.
+    """
+    first, last = driving(run)
+    since: Array = time - np.maximum(first, time[:1])
+    return (since >= SETTLING) & (time <= last)
+
+
+def preview_before_switch(run: Run) -> float:
+    """Return how long before a switch a controller may already be leaving the old reference, s.
+
+    A switch is known as long before as the reference is stamped ahead. No controller needs
+    longer for it than :data:`SETTLING`, however far ahead the stamps are.
+    """
+    return min(run.lead, SETTLING)
+
+
+def settled(time: Array, switches: Array, before: float) -> NDArray[np.bool_]:
+    """Return which of ``time`` are not about a switch, all in seconds.
+
+    About a switch is from ``before`` seconds before it until :data:`SETTLING` seconds after it.
+    """
+    following = np.searchsorted(switches, time, 'right')
+    since: Array = time - np.concatenate([[-math.inf], switches])[following]
+    until: Array = np.concatenate([switches, [math.inf]])[following] - time
+    return (since >= SETTLING) & (until > before)
+
+
+def variation(series: Series, name: str) -> float:
+    """Return the total variation per second of one quantity: how much it chatters."""
+    if len(series) < 2:
+        return math.nan
+    return float(np.abs(np.diff(series[name])).sum() / (series.time[-1] - series.time[0]))
+
+
+def latencies(run: Run) -> Series | None:
+    """Return for each command how long after the newest odometry it was received (s)."""
+    heard, told = run.receipts.get(ODOMETRY), run.receipts.get(COMMAND)
+    if heard is None or told is None:
+        return None
+    index = np.searchsorted(heard, told, 'right') - 1
+    told = told[index >= 0]
+    return Series(told, {'value': told - heard[index[index >= 0]]}) if told.size else None
+
+
+def estimation_target(run: Run, wheel: str) -> Series | None:
+    r"""Return what the estimate g of one wheel should be: :math:`\dot\chi - u` (64), rad/s².
+
+    The derivative is the slope of a straight line fitted to :data:`WINDOW` seconds of the
+    measured wheel speed; the applied u is averaged with the weights that this slope has on the
+    derivative, so that both see the same smoothing. It is NaN around switches, where u jumps
+    between two of its sparse samples. None when either is absent.
+    """
+    motion = run.motions.get(run.measured)
+    applied = run.numbers.get(f'controller/terms/applied/{wheel}')
+    if motion is None or applied is None:
+        return None
+    step, half = WINDOW / 20, 10
+    start = max(motion.time[0], applied.time[0])
+    count = int((min(motion.time[-1], applied.time[-1]) - start) / step) + 1
+    if count <= 2 * half + 1:
+        return None
+    grid = start + step * np.arange(count)
+    speed = np.interp(grid, motion.time, motion[wheel])
+    control = np.interp(grid, applied.time, applied['value'])
+    offsets = np.arange(-half, half + 1.0)
+    slope = offsets / (step * np.sum(offsets**2))
+    # The slope is a weighted mean of the steps from point to point; their weights:
+    weights = -step * np.cumsum(slope)[:-1]
+    rate = np.correlate(speed, slope, 'valid')
+    mean = np.correlate(0.5 * (control[:-1] + control[1:]), weights, 'valid')
+    time = grid[half : count - half]
+    reach = WINDOW / 2 + float(np.median(np.diff(applied.time)))
+    near = np.searchsorted(run.switches, time - reach) < np.searchsorted(
+        run.switches, time + reach
+    )
+    return Series(time, {'value': np.where(near, np.nan, rate - mean)})
+
+
+def path_of(motion: Series, start: tuple[float, float, float]) -> tuple[Array, Array]:
+    """Return x and y (m) of driving the twists of ``motion`` from a pose, by the arcs of (2)."""
+    dt = np.diff(motion.time)
+    turn = motion['angular'][:-1] * dt
+    chord = motion['linear'][:-1] * dt * np.sinc(turn / math.tau)
+    yaw = start[2] + np.concatenate([[0.0], np.cumsum(turn)[:-1]]) + 0.5 * turn
+    x = start[0] + np.concatenate([[0.0], np.cumsum(chord * np.cos(yaw))])
+    y = start[1] + np.concatenate([[0.0], np.cumsum(chord * np.sin(yaw))])
+    return x, y
+
+
+UNMEASURED = 'not measured'
+"""Said where there is nothing to count, which a number would hide."""
+
+
+@dataclass(frozen=True)
+class ChannelMetrics:
+    """How well one channel followed; NaN where the bag does not tell."""
+
+    overall: ErrorStatistics
+    """While the robot was being driven, but for the second in which it caught up."""
+    settled: ErrorStatistics
+    """Also without the time about each switch."""
+    chatter: float
+    """Total variation of the commanded speed per second."""
+    demand: float
+    """The same of the reference: what following it exactly would take."""
+
+
+@dataclass(frozen=True)
+class ReportMetrics:
+    """The main figures of a run; NaN where the bag does not tell."""
+
+    report: Path
+    pictures: tuple[Path, ...]
+    duration: float
+    messages: int
+    switches: int
+    measured: str
+    """Where errors are taken from: ``ground_truth/odom``, else ``odom``, else empty."""
+    wheels: Mapping[str, ChannelMetrics]
+    """Of ``right`` and ``left``, or of ``linear`` and ``angular`` where wheels are not known."""
+    channels: tuple[Channel, Channel]
+    """Names and units of these."""
+    responses: Mapping[str, ResponseFit]
+    """How the robot answers its commands, by channel, where that can be told."""
+    links: Mapping[str, LinkMetrics]
+    """How well the radio worked, by the name of what told."""
+    latency: float
+    """Median time (s) from the receipt of odometry to that of the command."""
+    latency_99: float
+    """Its 99th percentile (s)."""
+    missing: Mapping[str, float]
+    """Share of missing samples by relative topic name."""
+    absent: tuple[str, ...]
+    """Topics the report had to do without."""
+
+    def summary(self) -> str:
+        """Return the figures in one line."""
+        right, left = (self.wheels[each.name] for each in self.channels)
+        overall, calm = (
+            f'{format_channels(one.rmse, other.rmse, self.channels)} in {one.seconds:.1f} s'
+            if one.count
+            else UNMEASURED
+            for one, other in ((right.overall, left.overall), (right.settled, left.settled))
+        )
+        chatter = format_channels(right.chatter, left.chatter, self.channels, '²')
+        titles = '/'.join(each.short for each in self.channels)
+        answers = [
+            f'{each.short} {1e3 * (fit.dead_time + fit.lag):.0f} ms'
+            for each in self.channels
+            if (fit := self.responses.get(each.name)) and fit.clear
+        ]
+        answer = f'answers after {", ".join(answers)}; ' if answers else ''
+        for name, link in self.links.items():
+            answer += f'{name}: {format_number(100.0 * link.answered)} % of cycles answered; '
+        missing = format_number(100.0 * self.missing.get(ODOMETRY, math.nan))
+        return (
+            f'{self.duration:.1f} s, {self.switches} switches; RMSE {titles} while driven '
+            f'{overall}, settled {calm}; command varies by {chatter}; {answer}'
+            f'loop {format_number(1e3 * self.latency)} ms, 99 % below '
+            f'{format_number(1e3 * self.latency_99)} ms; {missing} % of odom missing: {self.report}'
+        )
+
+
+def compute_metrics(run: Run, report: Path, pictures: tuple[Path, ...], messages: int) -> ReportMetrics:
+    """Return the main figures of ``run``."""
+    errors = errors_of(run, run.measured)
+    command, reference = run.motions.get(COMMAND), run.motions.get(REFERENCE)
+    wheels = {
+        wheel: ChannelMetrics(
+            *errors[wheel],
+            math.nan if command is None else variation(command, wheel),
+            math.nan if reference is None else variation(reference, wheel),
+        )
+        for wheel, *_ in run.channels
+    }
+    delay = latencies(run)
+    delays = np.array([math.nan]) if delay is None else delay['value']
+    return ReportMetrics(
+        report=report,
+        pictures=pictures,
+        duration=run.duration,
+        messages=messages,
+        switches=run.switches.size,
+        measured=run.measured,
+        wheels=wheels,
+        channels=run.channels,
+        responses=responses(run),
+        links={link.name: link_metrics(link) for link in run.links},
+        latency=float(np.percentile(delays, 50.0)),
+        latency_99=float(np.percentile(delays, 99.0)),
+        missing={name: timing.missing for name, timing in run.timing.items()},
+        absent=run.absent,
+    )
+
+
+def errors_of(run: Run, measured: str) -> dict[str, tuple[ErrorStatistics, ErrorStatistics]]:
+    """Return the statistics while driven, and those where settled, by wheel."""
+    error = tracking_error(run, measured)
+    if error is None:
+        nothing = statistics(np.empty(0))
+        return dict.fromkeys((each.name for each in run.channels), (nothing, nothing))
+    moving = driven(error.time, run)
+    calm = moving & settled(error.time, run.switches, preview_before_switch(run))
+    period = float(np.median(np.diff(error.time))) if len(error) > 1 else math.nan
+    return {
+        wheel: (
+            statistics(error[wheel][moving], period),
+            statistics(error[wheel][calm], period),
+        )
+        for wheel, *_ in run.channels
+    }
+
+
+def format_channels(one: float, other: float, channels: tuple[Channel, Channel], power: str = '') -> str:
+    """Return numbers of both channels with their units, which may differ."""
+    units = [each.unit + power for each in channels]
+    if units[0] == units[1]:
+        return f'{format_number(one)}/{format_number(other)} {units[0]}'
+    return f'{format_number(one)} {units[0]}/{format_number(other)} {units[1]}'
+
+
+def format_number(value: float) -> str:
+    """Return three significant digits, a dash for what is not known."""
+    if not math.isfinite(value):
+        return '–'
+    return f'{value:.0f}' if abs(value) >= 99.95 else f'{value:#.3g}'
+

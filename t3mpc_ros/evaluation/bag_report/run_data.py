@@ -1,0 +1,369 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Data of a recorded run: motions, commands and control terms on one time axis."""
+
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.evaluation.bag_report.link_history import (DiagnosticEvent, LinkHistory, read_diagnostics)
+from t3mpc_ros.evaluation.bag_report.topic_roles import (COMMAND, NAMES, NUMBERS, ODOMETRY, REFERENCE, SIGNALS, TRUTH, WHEELS, ReportOptions, choose_topics)
+from t3mpc_ros.geometry.kinematics import (WheelGeometry, wheels_from_twist)
+from t3mpc_ros.geometry.types import BodyTwist
+from t3mpc_ros.bag.reader import (BagReader, missing_sample_ratio)
+from t3mpc_ros.parameters.table import ParameterError
+
+
+Array = NDArray[np.float64]
+
+_ODOMETRY_FIELDS = {
+    'x': 'pose.pose.position.x',
+    'y': 'pose.pose.position.y',
+    'z': 'pose.pose.orientation.z',
+    'w': 'pose.pose.orientation.w',
+    'linear': 'twist.twist.linear.x',
+    'angular': 'twist.twist.angular.z',
+}
+
+
+_TWIST_FIELDS = {'linear': 'linear.x', 'angular': 'angular.z'}
+JUMP = 10.0
+"""Seconds by which stamps leap against the receipts when a clock was set, not merely late."""
+
+
+class Channel(NamedTuple):
+    """One of the two numbers that a motion is shown by."""
+
+    name: str
+    """In :attr:`Run.motions`."""
+    title: str
+    short: str
+    unit: str
+
+
+BY_WHEEL = (
+    Channel('right', 'right wheel', 'right', 'rad/s'),
+    Channel('left', 'left wheel', 'left', 'rad/s'),
+)
+BY_BODY = (
+    Channel('linear', 'forward speed', 'forward', 'm/s'),
+    Channel('angular', 'turn rate', 'turning', 'rad/s'),
+)
+"""Of a robot whose wheels are not known."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """One quantity over time: ``values[name]`` beside ``time``, both in seconds and SI units."""
+
+    time: Array
+    values: Mapping[str, Array]
+
+    def __getitem__(self, name: str) -> Array:
+        return self.values[name]
+
+    def __len__(self) -> int:
+        return int(self.time.size)
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How regularly one topic came."""
+
+    count: int
+    period: float
+    """Median (s) of the times between receipts."""
+    jitter: float
+    """99th percentile (s) of how far one such time is from the median."""
+    missing: float
+    """Share of samples missing at the median rate of the stamps, see :func:`missing_share`."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A recorded run, ready to be measured and drawn; times in seconds since its start."""
+
+    duration: float
+    topics: Mapping[str, str]
+    """Full name by relative name, of those with at least one message."""
+    absent: tuple[str, ...]
+    """Relative names that are not in the bag, or have no message."""
+    namespaces: tuple[str, ...]
+    """The namespace shown, then others that the bag holds."""
+    ours: bool
+    """Whether more is expected of the bag than of any robot's."""
+    geometry: WheelGeometry | None
+    """None when the wheels are not known."""
+    channels: tuple[Channel, Channel]
+    """By what motions are shown: wheels where they are known, else forward speed and turn rate."""
+    motions: Mapping[str, Series]
+    """``reference``, ``odom``, ``ground_truth/odom``, ``cmd_vel``: linear, angular (m/s, rad/s),
+    right, left (rad/s) where the wheels are known, and of odometry x, y (m), yaw (rad)."""
+    numbers: Mapping[str, Series]
+    """Plain numbers by relative name, as ``value``."""
+    receipts: Mapping[str, Array]
+    """Times of receipt by relative name, by the recorder's clock."""
+    timing: Mapping[str, Timing]
+    switches: Array
+    """When the reference switched."""
+    lead: float
+    """Median (s) of how far ahead of their receipt the stamps of the reference are."""
+    complaints: tuple[DiagnosticEvent, ...]
+    """From diagnostics: when first, level, who, what."""
+    links: tuple[LinkHistory, ...]
+    """Radio links that diagnostics tell of."""
+    notes: tuple[str, ...]
+
+    @property
+    def measured(self) -> str:
+        """Relative name of the motion that errors are taken from: truth where there is one."""
+        return next((name for name in (TRUTH, ODOMETRY) if name in self.motions), '')
+
+
+def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
+    """Return the run in ``recording``; of the fullest namespace unless one is named.
+
+    Raises
+    ------
+    ReportError
+        There is nothing to report, or what was asked for cannot be used.
+    DataError
+        A message cannot be read.
+    ParameterError
+        The wheels that were given cannot be.
+    """
+    wanted = wanted or ReportOptions()
+    choice = choose_topics(recording, wanted)
+    topics = choice.topics
+    notes = [*choice.notes]
+    geometry = _geometry(recording.metadata_records, wanted, choice.ours, notes)
+    raw = {name: _read(recording, name, topic, notes) for name, topic in topics.items()}
+    raw = {name: table for name, table in raw.items() if table['stamp'].size}
+    clock = _Clock(raw, notes)
+    motions, numbers = {}, {}
+    for name, table in raw.items():
+        if name == 'reference/signals':
+            for i, signal in enumerate(SIGNALS):
+                numbers[signal] = Series(
+                    clock.applies(table['received']), {'value': table[f'{i}']}
+                )
+        elif name in NUMBERS:
+            time = clock.applies if name in SIGNALS else clock.local
+            numbers[name] = Series(time(table['received']), {'value': table['value']})
+        elif name == COMMAND or 'x' not in table:
+            motions[name] = _motion(clock.local(table['received']), table, geometry)
+        else:
+            motions[name] = _motion(table['stamp'] - clock.origin, table, geometry)
+    complaints, links = read_diagnostics(recording, choice.namespaces[0])
+    return Run(
+        duration=recording.duration,
+        topics=topics,
+        absent=_absent(topics, choice.ours),
+        namespaces=choice.namespaces,
+        ours=choice.ours,
+        geometry=geometry,
+        channels=BY_BODY if geometry is None else BY_WHEEL,
+        motions=motions,
+        numbers=numbers,
+        receipts={name: table['received'] for name, table in raw.items()},
+        timing={
+            name: _timing(table)
+            for name, table in raw.items()
+            if table['stamp'].size > 2 and name != 'reference/signals'  # sent when it changes
+        },
+        switches=_switches(numbers, motions.get(REFERENCE)),
+        lead=clock.lead,
+        complaints=complaints,
+        links=links,
+        notes=tuple(notes),
+    )
+
+
+class _Clock:
+    """Brings times of receipt and stamps onto one axis.
+
+    Messages without a header are placed by their receipt. Where the robot lives in simulated
+    time, the odometry, which has both, tells how the clocks lie to each other.
+    """
+
+    def __init__(self, raw: Mapping[str, Mapping[str, Array]], notes: list[str]) -> None:
+        self.origin = 0.0
+        self._received, self._offset = np.zeros(1), np.zeros(1)
+        table = raw.get(ODOMETRY) or raw.get(TRUTH)
+        if table:
+            offset = table['stamp'] - table['received']
+            if abs(float(np.median(offset))) > 1.0 or np.ptp(offset) > JUMP:
+                self._received, self._offset = table['received'], offset
+                self.origin = float(table['stamp'].min())
+                notes.append(
+                    'The stamps are of another clock than the receipts (simulated time?); '
+                    'messages without a stamp were placed through the odometry.'
+                )
+        self.lead = 0.0
+        if REFERENCE in raw:
+            ahead = raw[REFERENCE]['stamp'] - self.origin - self.local(raw[REFERENCE]['received'])
+            self.lead = max(0.0, float(np.median(ahead)))
+
+    def local(self, received: Array) -> Array:
+        """Return the time of what was received then."""
+        return received + np.interp(received, self._received, self._offset) - self.origin
+
+    def applies(self, received: Array) -> Array:
+        """Return the time for which the reference node said something it sent then."""
+        return self.local(received) + self.lead
+
+
+def _read(recording: BagReader, name: str, topic: str, notes: list[str]) -> dict[str, Array]:
+    """Return the arrays of one topic, without the rows that are not finite."""
+    kind = recording.topics[topic].type_name
+    if kind.endswith(('/Twist', '/TwistStamped')):
+        inner = 'twist.' if kind.endswith('Stamped') else ''
+        fields = {key: inner + field for key, field in _TWIST_FIELDS.items()}
+    elif name == 'reference/signals':
+        fields = {f'{i}': f'data[{i}]' for i in range(3)}
+    else:
+        fields = {'value': 'data'} if name in NUMBERS else _ODOMETRY_FIELDS
+    table = recording.series(topic, fields)
+    sound = np.all([np.isfinite(column) for column in table.values()], axis=0)
+    if not sound.all():
+        notes.append(f'{np.count_nonzero(~sound)} messages of {topic} held a number that is not '
+                     'finite; they are left out.')  # fmt: skip
+    table = {key: column[sound] for key, column in table.items()}
+    if fields is _ODOMETRY_FIELDS:
+        _mend_stamps(table, topic, notes)
+    return table
+
+
+def _mend_stamps(table: dict[str, Array], topic: str, notes: list[str]) -> None:
+    """Put the receipts in the place of stamps that do not tell the time."""
+    received, stamps = table['received'], table['stamp']
+    if stamps.size > 2 and np.unique(stamps).size < 0.5 * np.unique(received).size:
+        table['stamp'] = received
+        notes.append(f'The stamps of {topic} stand still; its messages were placed by receipt.')
+        return
+    steps, gaps = np.diff(stamps), np.diff(received)
+    if leaps := np.flatnonzero((steps < -JUMP) | (steps > gaps + JUMP)).tolist():
+        table['stamp'] = received
+        notes.append(
+            f'The stamps of {topic} leap {len(leaps)} times, first by {steps[leaps[0]]:.1f} s at '
+            f'{received[leaps[0]]:.1f} s: a clock was set; its messages were placed by receipt.'
+        )
+    elif leaps := np.flatnonzero(gaps > steps + JUMP).tolist():
+        notes.append(
+            f'From {received[leaps[0]]:.1f} s on nothing of {topic} was received for '
+            f'{gaps[leaps[0]]:.1f} s, but by its stamps that was {steps[leaps[0]]:.1f} s: the '
+            "recorder's clock was set, or the recording was paused."
+        )
+    if late := np.count_nonzero((steps < 0.0) & (steps >= -JUMP)):
+        notes.append(f'{late} messages of {topic} came behind later ones; they were sorted.')
+
+
+def _motion(time: Array, table: Mapping[str, Array], geometry: WheelGeometry | None) -> Series:
+    """Return a motion in order of time; of two at one instant the one that came last."""
+    time, back = np.unique(time[::-1], return_index=True)
+    order = table['linear'].size - 1 - back
+    linear: Any = table['linear'][order]
+    angular: Any = table['angular'][order]
+    values = {'linear': linear, 'angular': angular}
+    if geometry is not None:
+        wheels: Any = wheels_from_twist(BodyTwist(linear, angular), geometry)
+        values |= {'right': wheels.right, 'left': wheels.left}
+    if 'x' in table:
+        yaw = 2.0 * np.arctan2(table['z'], table['w'])
+        values |= {'x': table['x'][order], 'y': table['y'][order], 'yaw': yaw[order]}
+    return Series(time, values)
+
+
+def _timing(table: Mapping[str, Array]) -> Timing:
+    gaps = np.diff(table['received'])
+    period = float(np.median(gaps))
+    # The stamps know the rate better than the receipts, which jitter.
+    steps = np.diff(np.unique(table['stamp'][np.isfinite(table['stamp'])]))
+    grid = float(np.median(steps)) if steps.size else 0.0
+    missing = missing_sample_ratio(table['stamp'], 1.0 / grid) if grid > 0.0 else math.nan
+    jitter = round(float(np.percentile(np.abs(gaps - period), 99.0)), 9)  # receipts are in ns
+    return Timing(int(table['received'].size), period, jitter, missing)
+
+
+def _switches(numbers: Mapping[str, Series], reference: Series | None) -> Array:
+    """Return when what drives the reference changed, each moved to the jump it caused.
+
+    The mode may be published at a lower rate than the reference, so the stamp of the largest
+    step of the reference within a quarter of a second is taken.
+    """
+    times: set[float] = set()
+    for name in SIGNALS:
+        if name in numbers:
+            series = numbers[name]
+            changed = np.flatnonzero(np.diff(series['value'])) + 1
+            times |= set(series.time[changed].tolist())
+    found = set()
+    for time in times:
+        if reference is not None and len(reference) > 1:
+            near = np.flatnonzero(np.abs(reference.time[1:] - time) < 0.25)
+            if near.size:
+                step = sum(np.abs(np.diff(reference[wheel]))[near] for wheel in WHEELS)
+                time = float(reference.time[1:][near[np.argmax(step)]])
+        found.add(time)
+    return np.array(sorted(found), dtype=np.float64)
+
+
+def _geometry(
+    metadata_records: Mapping[str, Mapping[str, str]], wanted: ReportOptions, ours: bool, notes: list[str]
+) -> WheelGeometry | None:
+    """Return the lengths that were given, else those of the recorded settings, else None.
+
+    Of the settings the robot's own word comes first. A bag of this package's nodes that does not
+    tell is taken to be of the robot they are made for.
+    """
+    order = sorted(metadata_records, key=lambda title: title not in ('sim_robot', 'radio_bridge', 'robot'))
+    given = {'wheel_radius': wanted.wheel_radius, 'wheel_separation': wanted.track}
+    values: dict[str, object] = {key: value for key, value in given.items() if value is not None}
+    for title in order:
+        for key, text in metadata_records[title].items():
+            name = key.rpartition('.')[2]
+            if name in given and name not in values:
+                try:
+                    values[name] = float(text)
+                except ValueError:
+                    notes.append(f'The recorded {key} is no number: {text!r}.')
+    said = wanted.wheel_radius is not None or wanted.track is not None
+    try:
+        geometry = WheelGeometry.from_dict(values)
+    except ParameterError as error:
+        if said:
+            raise
+        notes.append(f'The recorded geometry cannot be used: {error}.')
+        values, geometry = {}, WheelGeometry()
+    if len(values) == len(given):
+        return geometry
+    if not ours:
+        notes.append(
+            'The bag does not say how large the wheels are and how far apart: speeds are those of '
+            'the robot, in m/s and rad/s (--wheel-radius and --track give those of the wheels).'
+        )
+        return None
+    notes.append(
+        f'The bag does not say how large the wheels are; {geometry.wheel_radius:g} m radius '
+        f'and {geometry.wheel_separation:g} m apart are assumed.'
+    )
+    return geometry
+
+
+def _absent(topics: Mapping[str, str], ours: bool) -> tuple[str, ...]:
+    if not ours:
+        return tuple(name for name in (REFERENCE, ODOMETRY, COMMAND) if name not in topics)
+    names = set(NAMES) - set(topics)
+    # One topic announces the signals, or three do; of the three the bag may hold a part.
+    names -= (
+        set(SIGNALS)
+        if names >= set(SIGNALS) or 'reference/signals' in topics
+        else {'reference/signals'}
+    )
+    return tuple(name for name in NAMES if name in names)
+

@@ -1,0 +1,193 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Roles of the topics of a bag: odometry, command, reference, ground truth."""
+
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from t3mpc_ros.bag.reader import (BagReader, TopicSummary)
+
+
+WHEELS = ('right', 'left')
+TERMS = ('fuzzy', 'feedback', 'feedforward', 'compensator', 'predictive')
+TRUTH, ODOMETRY, REFERENCE, COMMAND = 'ground_truth/odom', 'odom', 'reference', 'cmd_vel'
+SIGNALS = ('reference/mode', 'reference/signal/right', 'reference/signal/left')
+NUMBERS = (
+    *SIGNALS,
+    *(f'controller/{name}/{w}' for name in ('error', 'estimate', 'skill') for w in WHEELS),
+    *(f'controller/terms/{name}/{w}' for name in (*TERMS, 'applied') for w in WHEELS),
+    'controller/lyapunov/value',
+    'controller/lyapunov/margin',
+)
+NAMES = (REFERENCE, ODOMETRY, TRUTH, COMMAND, 'reference/signals', *NUMBERS)
+
+_ODOMETRY, _TWIST = 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/Twist'
+_NUMBER = 'std_msgs/msg/Float64'
+_TWISTS = (_TWIST, f'{_TWIST}Stamped')
+KINDS: Mapping[str, tuple[str, ...]] = {
+    TRUTH: (_ODOMETRY,),
+    ODOMETRY: (_ODOMETRY,),
+    REFERENCE: (_ODOMETRY, *_TWISTS),
+    COMMAND: _TWISTS,
+    'reference/signals': ('std_msgs/msg/Int32MultiArray',),
+    **dict.fromkeys(NUMBERS, (_NUMBER,)),
+}
+"""Types of message that each can be."""
+_ALIEN = ('truth', 'reference', 'goal', 'target', 'desired', 'gps', 'map', 'visual')
+"""Words in names of odometry that is not the robot's own."""
+
+
+class ReportError(RuntimeError):
+    """A bag that no report can be made of; the text says what is missing, and what was found."""
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """What is said of a bag beforehand; nothing need be."""
+
+    namespace: str | None = None
+    """Whose topics; by default of the robot with the most known ones."""
+    odom: str = ''
+    """Full name of the topic, as the next two; empty: found by name, else by type."""
+    cmd_vel: str = ''
+    reference: str = ''
+    wheel_radius: float | None = None
+    """m; by default what the recorded settings say."""
+    track: float | None = None
+    """Distance between the wheels, m; likewise."""
+
+
+@dataclass(frozen=True)
+class TopicChoice:
+    """Which topics a report is made from."""
+
+    topics: Mapping[str, str]
+    """Full name by relative name, of those with at least one message."""
+    namespaces: tuple[str, ...]
+    """The chosen one, then others that hold known topics."""
+    ours: bool
+    """Whether the bag holds more than any robot's would: a reference, or terms of the law."""
+    notes: tuple[str, ...]
+
+
+def choose_topics(recording: BagReader, wanted: ReportOptions) -> TopicChoice:
+    """Return which topics stand for what.
+
+    Raises
+    ------
+    ReportError
+        There is nothing to report, or a topic that was asked for is not there or of another type.
+    """
+    names, namespaces = find_topics(recording.topics, wanted.namespace)
+    held = {name: topic for name, topic in recording.topics.items() if topic.message_count}
+    chosen = {
+        name: full
+        for name, full in names.items()
+        if full in held and held[full].type_name in KINDS[name]
+    }
+    for name, full in (
+        (ODOMETRY, wanted.odom),
+        (COMMAND, wanted.cmd_vel),
+        (REFERENCE, wanted.reference),
+    ):
+        if full:
+            chosen[name] = _requested_topic(recording, name, full)
+    if wanted.odom and not wanted.namespace:
+        chosen.pop(TRUTH, None)  # errors are taken from what was asked for
+    notes = []
+    space = wanted.namespace and '/' + wanted.namespace.strip('/') + '/'
+    for name, said, option in (
+        (ODOMETRY, wanted.odom, '--odom'),
+        (COMMAND, wanted.cmd_vel, '--cmd-vel'),
+    ):
+        if said or (name == ODOMETRY and TRUTH in chosen):
+            continue
+        others = [
+            topic
+            for topic in held.values()
+            if topic.type_name in KINDS[name]
+            and topic.name not in chosen.values()
+            and not any(topic.name.endswith(f'/{known}') for known in NAMES if known != name)
+            and (not space or topic.name.startswith(space))
+        ]
+        others.sort(key=lambda topic: _rank(name, topic, namespaces[0]))
+        by_name = name in chosen
+        if not by_name and others:
+            chosen[name] = others.pop(0).name
+        if name in chosen and (others or not by_name):
+            what = 'Odometry' if name == ODOMETRY else 'The command'
+            also = ', '.join(topic.name for topic in others)
+            rest = f'; there is also {also} ({option} chooses)' if also else ''
+            notes.append(f'{what} is taken from {chosen[name]}{rest}.')
+    if not chosen:
+        raise ReportError(
+            f'{recording.folder}: there is nothing to report: no message of odometry '
+            f'({_ODOMETRY}) and none of a command ({" or ".join(_TWISTS)}); found: '
+            f'{_listing(recording)}'
+        )
+    ours = bool({REFERENCE, *NUMBERS} & set(chosen)) and not wanted.reference
+    return TopicChoice(chosen, namespaces, ours, tuple(notes))
+
+
+def _requested_topic(recording: BagReader, name: str, full: str) -> str:
+    """Return the full name of a topic that was asked for, once it is known to be usable."""
+    topic = recording.topics.get(full) or recording.topics.get(f'/{full}')
+    if topic is None:
+        raise ReportError(
+            f'{recording.folder}: there is no topic {full}; found: {_listing(recording)}'
+        )
+    if topic.type_name not in KINDS[name]:
+        raise ReportError(
+            f'{topic.name} must be {" or ".join(KINDS[name])}: it is {topic.type_name}'
+        )
+    if not topic.message_count:
+        raise ReportError(f'{topic.name} has no message')
+    return topic.name
+
+
+def _listing(recording: BagReader, most: int = 20) -> str:
+    topics = list(recording.topics.values())
+    words = [f'{t.name} ({t.type_name}, {t.message_count} messages)' for t in topics[:most]]
+    more = [f'{len(topics) - most} more'] if len(topics) > most else []
+    return ', '.join(words + more) or 'no topic at all'
+
+
+def _rank(name: str, topic: TopicSummary, space: str) -> tuple[int, int, int, int, str]:
+    """Return a key by which the likeliest topic comes first."""
+    low = topic.name.lower()
+    words = ('odom',) if name == ODOMETRY else ('cmd_vel', 'cmd', 'command')
+    fit = next((i for i, word in enumerate(words) if word in low), len(words))
+    alien = any(word in low for word in _ALIEN)
+    return alien, fit, not low.startswith(f'{space}/'), -topic.message_count, topic.name
+
+
+def bag_display_name(folder: Path) -> str:
+    """Return what a person would call a bag: its folder, and the one above if it is ``bag``."""
+    folder = folder.resolve()
+    return f'{folder.parent.name}/bag' if folder.name == 'bag' else folder.name
+
+
+def find_topics(
+    names: Iterable[str], namespace: str | None = None
+) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Return full names by relative names, and the namespaces there are, the chosen one first.
+
+    A topic belongs to the longest known name it ends with, so ``/a/ground_truth/odom`` is never
+    taken for the ``odom`` of ``/a/ground_truth``. Without ``namespace`` the one with the most
+    known topics is chosen.
+    """
+    found: dict[str, dict[str, str]] = {}
+    for full in names:
+        known = [name for name in NAMES if full.endswith(f'/{name}')]
+        if known:
+            name = max(known, key=len)
+            found.setdefault(full[: -len(name) - 1], {})[name] = full
+    order = sorted(found, key=lambda space: (-len(found[space]), space))
+    if namespace is not None:
+        chosen = '/' + namespace.strip('/') if namespace.strip('/') else ''
+        order = [chosen, *(space for space in order if space != chosen)]
+    order = order or ['']
+    return found.get(order[0], {}), tuple(order)
+
