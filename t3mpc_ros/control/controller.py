@@ -54,7 +54,7 @@ SNAPSHOT_COUNT = 3
 class ControllerParameters(Nt3fsMpcParameters):
     """The whole controller: the law, the robot's lengths, limits and time-outs."""
 
-    geometry: WheelGeometry = group(WheelGeometry)
+    geometry: WheelGeometry = group(WheelGeometry, inline=True)
     limits: LimitParameters = group(LimitParameters)
     watchdog: WatchdogParameters = group(WatchdogParameters)
 

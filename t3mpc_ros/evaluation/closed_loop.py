@@ -96,7 +96,7 @@ class FastPlant:
             A setting differs that is fixed: those of the robot, and :data:`DRAWN`.
         """
         before, after = self._parameters.to_dict(), parameters.to_dict()
-        for row in PaperRobotParameters.rows():
+        for row in PaperRobotParameters.specs():
             fixed = not row.dynamic or row.name in DRAWN
             if fixed and before[row.name] != after[row.name]:
                 raise ParameterError(

@@ -140,7 +140,7 @@ class FuzzySets:
             'centres': centres,
             'widths': widths,
             'levels': levels,
-            'pull': fuzziness**2 / (widths**2 + fuzziness**2),
+            'nonsingleton_gain': fuzziness**2 / (widths**2 + fuzziness**2),
             'sharpness': 1.0 / widths,
             'shares': levels / levels.sum(),
         }

@@ -403,7 +403,7 @@ class PredictiveController:
             ``feedback_gain`` is not positive.
         """
         now, wanted = self.parameters.to_dict(), parameters.to_dict()
-        for row in parameters.rows():
+        for row in parameters.specs():
             if not row.dynamic and wanted[row.name] != now[row.name]:
                 raise ParameterError(
                     f'{row.name} is fixed while running at {now[row.name]}: got {wanted[row.name]}'

@@ -85,7 +85,7 @@ def parameters_page() -> str:
         lines += ['', f'## {node}', '']
         lines += ['| parameter | default | range | live | meaning | source |']
         lines += ['|---|---|---|---|---|---|']
-        for row in table.rows():
+        for row in table.specs():
             default = ', '.join(map(str, row.default)) if row.many else str(row.default)  # type: ignore[arg-type]
             unit = f' {row.unit}' if row.unit else ''
             cells = (

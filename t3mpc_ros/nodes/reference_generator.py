@@ -44,7 +44,7 @@ class ReferenceNodeParameters(ReferenceParameters):
     path_points: int = parameter(
         600, 'most poses in reference/path (one every 0.1 s); 0 = no path', low=0, high=100_000
     )
-    geometry: WheelGeometry = group(WheelGeometry)
+    geometry: WheelGeometry = group(WheelGeometry, inline=True)
 
     def check_consistency(self) -> None:
         """Raise :class:`ParameterError` for a secret seed beside one that all can read."""

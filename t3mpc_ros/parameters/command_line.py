@@ -26,7 +26,7 @@ def parse_assignments(table: type[Parameters], texts: Iterable[str]) -> dict[str
     ParameterError
         A text is not ``NAME=VALUE``.
     """
-    texts_only = {row.name for row in table.rows() if row.kind is str and not row.many}
+    texts_only = {row.name for row in table.specs() if row.kind is str and not row.many}
     found: dict[str, object] = {}
     for text in texts:
         name, sign, value = text.partition('=')

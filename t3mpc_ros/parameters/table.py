@@ -1,13 +1,18 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Parameter tables: frozen dataclasses whose fields carry default, unit, range and description."""
+"""Parameter tables: frozen dataclasses whose fields carry default, unit, range and description.
+
+A module declares its parameters as a subclass of :class:`Parameters`. ROS parameters, YAML files,
+the documentation and recorded bags all use that one table. Tables nest: a field made with
+:func:`group` holds another table, whose parameters get dotted names (``law.gain``).
+"""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 import difflib
 from functools import partial
 import math
-from typing import Any, Self, get_args, get_origin, get_type_hints
+from typing import Any, NamedTuple, Self, get_args, get_origin, get_type_hints
 
 Value = (
     bool
@@ -22,14 +27,15 @@ Value = (
 
 
 class ParameterError(ValueError):
-    """A setting that cannot be used; the text names the setting, the bound and the value."""
+    """An invalid parameter; the text contains its name, the bound and the value."""
 
 
 @dataclass(frozen=True, slots=True)
 class ParameterSpec:
-    """One line of the table: everything a person or a program needs to know of a setting."""
+    """Name, type, default, range and description of one parameter."""
 
     name: str
+    """ROS name."""
     kind: type
     """Element type: ``bool``, ``int``, ``float`` or ``str``."""
     many: bool
@@ -40,13 +46,13 @@ class ParameterSpec:
     high: float | None
     choices: tuple[str, ...]
     dynamic: bool
-    """Whether it may change while a node runs."""
+    """Whether it may change while a node runs; otherwise it is read-only."""
     text: str
     source: str
-    """Where the default comes from: ``assumed`` unless a paper or data sheet gives it."""
+    """Origin of the default: ``assumed`` unless a paper or data sheet gives it."""
 
     def check(self, value: object) -> Value:
-        """Return ``value`` as this row's type, or raise :class:`ParameterError`."""
+        """Return ``value`` converted to the parameter's type, or raise :class:`ParameterError`."""
         if self.many:
             if isinstance(value, str) or not hasattr(value, '__iter__'):
                 raise ParameterError(
@@ -56,7 +62,7 @@ class ParameterSpec:
         return self._check_one(value)
 
     def bounds(self) -> str:
-        """Return the range in words, empty when anything of the type goes."""
+        """Return the range as text, empty when every value of the type is valid."""
         if self.choices:
             return 'one of ' + ', '.join(self.choices)
         unit = f' {self.unit}' if self.unit else ''
@@ -92,6 +98,7 @@ def parameter(
     default: Value,
     text: str,
     *,
+    name: str = '',
     unit: str = '',
     low: float | None = None,
     high: float | None = None,
@@ -99,9 +106,10 @@ def parameter(
     dynamic: bool = False,
     source: str = 'assumed',
 ) -> Any:
-    """Return a dataclass field that carries its row of the table.
+    """Return a dataclass field that is one parameter of its table.
 
-    Bounds are inclusive; those of a tuple hold for each element.
+    ``name`` is the ROS name within the table, which may contain dots; without it the attribute
+    gives the name. Bounds are inclusive; for a tuple they apply to each element.
     """
     details = {
         'unit': unit,
@@ -112,103 +120,147 @@ def parameter(
         'text': text,
         'source': source,
     }
-    return field(default=default, metadata={'row': details})
+    return field(default=default, metadata={'spec': details, 'name': name})
 
 
-def group(table: type['Parameters'], **changed: Value) -> Any:
-    """Return a dataclass field that holds another table, at its defaults but for ``changed``."""
-    return field(default_factory=partial(table, **changed))
+def group(table: type['Parameters'], *, inline: bool = False, **defaults: Value) -> Any:
+    """Return a dataclass field that holds another table, with some of its defaults replaced.
+
+    Its parameters are named ``<attribute>.<name>``; with ``inline`` they have no prefix.
+    """
+    return field(default_factory=partial(table, **defaults), metadata={'inline': inline})
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """Base of every table: checks itself when made, flattens, and names what it does not know.
+    """Base of every table: validates itself, and converts from and to values by ROS name.
 
-    Subclasses are frozen dataclasses; relations between settings go into :meth:`check_together`.
+    Subclasses are frozen dataclasses; :meth:`check_consistency` checks relations between
+    parameters.
     """
 
     def __post_init__(self) -> None:
-        for row in self._own_rows():
-            object.__setattr__(self, row.name, row.check(getattr(self, row.name)))
+        for entry in _entries(type(self)):
+            if len(entry.path) == 1:
+                name = entry.path[0]
+                object.__setattr__(self, name, entry.spec.check(getattr(self, name)))
         self.check_consistency()
 
     def check_consistency(self) -> None:
-        """Raise :class:`ParameterError` when settings that are each in range do not fit together."""
+        """Raise :class:`ParameterError` when values that are each in range contradict."""
 
     @classmethod
-    def rows(cls) -> tuple[ParameterSpec, ...]:
-        """Return every row, nested ones with dotted names, in order of declaration."""
-        return tuple(cls._walk(''))
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, object]) -> Self:
-        """Return the table with ``values`` (dotted names) in place of the defaults."""
-        return cls().with_values(values)
-
-    def with_values(self, values: Mapping[str, object]) -> Self:
-        """Return a copy with some rows replaced, checked as a whole.
+    def specs(cls) -> tuple[ParameterSpec, ...]:
+        """Return every parameter, groups included, in order of declaration.
 
         Raises
         ------
         ParameterError
-            For an unknown name (with the nearest known one), a wrong type, a value out of range,
-            or values that do not fit together.
+            Two parameters of the table have the same name, or one name is a prefix of another.
         """
-        known = {row.name: row for row in self.rows()}
+        return tuple(entry.spec for entry in _entries(cls))
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, object]) -> Self:
+        """Return the table with ``values`` (by ROS name) in place of the defaults."""
+        return cls().with_values(values)
+
+    def with_values(self, values: Mapping[str, object]) -> Self:
+        """Return a copy with some values replaced, validated as a whole.
+
+        Raises
+        ------
+        ParameterError
+            An unknown name (with the nearest known one), a wrong type, a value out of range, or
+            values that contradict.
+        """
+        known = {entry.spec.name: entry for entry in _entries(type(self))}
+        checked: dict[tuple[str, ...], Value] = {}
         for name in values:
             if name not in known:
                 near = difflib.get_close_matches(name, known, n=1)
                 hint = f'; did you mean {near[0]}?' if near else ''
-                raise ParameterError(f'there is no setting {name}{hint}')
-        # Checked here too, so that a nested setting is named in full.
-        return self._changed({name: known[name].check(value) for name, value in values.items()})
+                raise ParameterError(f'there is no parameter {name}{hint}')
+        for name, value in values.items():
+            # Checked before the group checks itself, so that the error contains the full name.
+            checked[known[name].path] = known[name].spec.check(value)
+        return self._replace(checked)
 
     def to_dict(self) -> dict[str, Value]:
-        """Return every value under its dotted name."""
-        result: dict[str, Value] = {}
-        for row in self.rows():
-            owner: Any = self
-            for part in row.name.split('.'):
-                owner = getattr(owner, part)
-            result[row.name] = owner
-        return result
+        """Return every value by ROS name."""
+        return {entry.spec.name: entry.value_of(self) for entry in _entries(type(self))}
 
-    def _changed(self, values: Mapping[str, Value]) -> Self:
+    def _replace(self, values: Mapping[tuple[str, ...], Value]) -> Self:
+        """Return a copy with the values at some attribute paths replaced."""
         updates: dict[str, Any] = {}
-        deeper: dict[str, dict[str, Value]] = {}
-        for name, value in values.items():
-            head, _, rest = name.partition('.')
+        groups: dict[str, dict[tuple[str, ...], Value]] = {}
+        for (head, *rest), value in values.items():
             if rest:
-                deeper.setdefault(head, {})[rest] = value
+                groups.setdefault(head, {})[tuple(rest)] = value
             else:
                 updates[head] = value
-        for head, inner in deeper.items():
-            updates[head] = getattr(self, head)._changed(inner)
+        for head, inner in groups.items():
+            updates[head] = getattr(self, head)._replace(inner)
         return replace(self, **updates)
 
-    @classmethod
-    def _own_rows(cls) -> Iterator[ParameterSpec]:
-        hints = get_type_hints(cls)
-        for item in fields(cls):
-            if 'row' not in item.metadata:
-                continue
-            hint = hints[item.name]
+
+class _Entry(NamedTuple):
+    """One parameter of a table, and where its value is."""
+
+    spec: ParameterSpec
+    path: tuple[str, ...]
+    """Attributes from the table to the value."""
+
+    def value_of(self, table: Parameters) -> Value:
+        owner: Any = table
+        for name in self.path:
+            owner = getattr(owner, name)
+        value: Value = owner
+        return value
+
+
+_tables: dict[object, tuple[_Entry, ...]] = {}
+"""Parameters of each table, collected when it is first used."""
+
+
+def _entries(table: type[Parameters]) -> tuple[_Entry, ...]:
+    """Return the parameters of a table, or raise when their names clash."""
+    if table not in _tables:
+        entries = tuple(_declared(table))
+        _check_names(table.__name__, [entry.spec.name for entry in entries])
+        _tables[table] = entries
+    return _tables[table]
+
+
+def _check_names(table: str, names: list[str]) -> None:
+    for position, name in enumerate(names):
+        if name in names[:position]:
+            raise ParameterError(f'{table} has two parameters {name}')
+        parts = name.split('.')
+        for count in range(1, len(parts)):
+            prefix = '.'.join(parts[:count])
+            if prefix in names:
+                raise ParameterError(f'{table} has the parameters {prefix} and {name}')
+
+
+def _declared(table: type[Parameters]) -> Iterator[_Entry]:
+    hints = get_type_hints(table)
+    for item in fields(table):
+        hint = hints[item.name]
+        if 'spec' in item.metadata:
             many = get_origin(hint) is tuple
             kind = get_args(hint)[0] if many else hint
+            name = item.metadata['name'] or item.name
             default: Any = item.default
-            yield ParameterSpec(item.name, kind, many, default, **item.metadata['row'])
-
-    @classmethod
-    def _walk(cls, prefix: str) -> Iterator[ParameterSpec]:
-        hints = get_type_hints(cls)
-        own = {row.name: row for row in cls._own_rows()}
-        for item in fields(cls):
-            if item.name in own:
-                row = own[item.name]
-                yield replace(row, name=prefix + row.name)
-            elif is_dataclass(hints[item.name]) and issubclass(hints[item.name], Parameters):
-                defaults = item.default_factory().to_dict()  # type: ignore[operator]
-                for row in hints[item.name]._walk(''):
-                    yield replace(
-                        row, name=f'{prefix}{item.name}.{row.name}', default=defaults[row.name]
-                    )
+            spec = ParameterSpec(name, kind, many, default, **item.metadata['spec'])
+            yield _Entry(spec, (item.name,))
+        elif isinstance(hint, type) and issubclass(hint, Parameters):
+            prefix = '' if item.metadata.get('inline') else f'{item.name}.'
+            defaults = item.default_factory()  # type: ignore[operator]
+            for entry in _entries(hint):
+                spec = replace(
+                    entry.spec,
+                    name=prefix + entry.spec.name,
+                    default=entry.value_of(defaults),
+                )
+                yield _Entry(spec, (item.name, *entry.path))

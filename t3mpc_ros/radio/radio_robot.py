@@ -40,7 +40,7 @@ UNKNOWN_STATUS = RobotStatus(
 class RadioRobotParameters(Parameters):
     """Everything that can be set of the real robot, on the host's side."""
 
-    geometry: WheelGeometry = group(WheelGeometry)
+    geometry: WheelGeometry = group(WheelGeometry, inline=True)
     guard: CommandLimiterParameters = group(CommandLimiterParameters)
     odometry: GyroOdometryParameters = group(GyroOdometryParameters)
     link: LinkParameters = group(LinkParameters)

@@ -99,7 +99,7 @@ class Fault(NamedTuple):
 
 
 _ROWS: Mapping[str, ParameterSpec] = {
-    row.name: row for row in FaultParameters.rows() if row.dynamic
+    row.name: row for row in FaultParameters.specs() if row.dynamic
 }
 FAULTS = tuple(Fault(row.name, row.text) for row in _ROWS.values())
 """Every fault there is: the live rows of :class:`FaultParameters`, in their order."""

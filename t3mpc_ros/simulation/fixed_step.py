@@ -18,7 +18,7 @@ S = TypeVar('S', bound=Parameters)
 def check_read_only(before: Parameters, after: Parameters) -> None:
     """Raise ParameterError when a setting differs that is fixed once the robot is made."""
     old, new = before.to_dict(), after.to_dict()
-    for row in before.rows():
+    for row in before.specs():
         if not row.dynamic and old[row.name] != new[row.name]:
             raise ParameterError(
                 f'{row.name} is fixed while the robot runs '

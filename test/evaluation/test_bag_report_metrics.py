@@ -55,7 +55,7 @@ LEAD = 0.2
 SWITCHES = (4.0, 8.0, 12.0, 16.0)
 DETAILS = {
     'provenance': {'version': '0.1.0', 'commit': '<script>alert(1)</script>'},
-    'sim_robot': {'geometry.wheel_radius': '0.04', 'geometry.wheel_separation': '0.16'},
+    'sim_robot': {'wheel_radius': '0.04', 'wheel_separation': '0.16'},
     'controller': {'law.gain': '8.0'},
 }
 TERMS = ('fuzzy', 'feedback', 'feedforward', 'compensator', 'predictive', 'applied')
@@ -691,7 +691,7 @@ def test_a_geometry_that_cannot_be_used_is_told(rows, tmp_path, metadata_records
 def test_the_robot_s_own_word_on_its_wheels_comes_first(rows, tmp_path):
     """The reference node has a geometry of its own, at its default unless somebody set it."""
     metadata_records = {
-        'reference': {'geometry.wheel_radius': '0.035', 'geometry.wheel_separation': '0.147'},
+        'reference': {'wheel_radius': '0.035', 'wheel_separation': '0.147'},
         **DETAILS,
     }
     bag = sheet_of(rows[:20], terms=False).write(tmp_path / 'bag', metadata_records)

@@ -195,14 +195,14 @@ def test_a_constant_disturbance_leaves_no_error(kind):
 
 @pytest.mark.parametrize('kind', ALL)
 def test_settings_are_ready_for_a_logarithmic_search(kind):
-    for row in kind.parameters_type.rows():
+    for row in kind.parameters_type.specs():
         assert row.low is not None
         assert row.high is not None
         if row.unit == '1/s':
             assert row.low > 0.0
             assert row.low < row.default < row.high
     share = 1.0 - math.exp(-T / 0.02)
-    gains = {row.name: row for row in kind.parameters_type.rows()}
+    gains = {row.name: row for row in kind.parameters_type.specs()}
     gain = gains.get('gain', gains.get('reaching'))
     assert gain.low <= share / T <= gain.high
 

@@ -58,7 +58,7 @@ def _knowledge(drive, robot=FREE):
 def _make(kind, drive, robot=FREE, **parameters):
     if kind is CasadiNmpc:
         pytest.importorskip('casadi')
-    rows = {row.name for row in kind.parameters_type.rows()}
+    rows = {row.name for row in kind.parameters_type.specs()}
     chosen = {name: value for name, value in parameters.items() if name in rows}
     return kind(kind.parameters_type().with_values(chosen), _knowledge(drive, robot))
 

@@ -59,7 +59,7 @@ def test_default_interval_footprint_is_the_mean_type3_footprint_weighted_by_leve
     levels = slice_levels(Sets().slices)
     half = 0.5 * np.diff(type3_widths(1.0, levels), axis=-1)[..., 0]
     mean = float(np.sum(levels * half) / np.sum(levels))
-    assert Sets().footprint == pytest.approx(mean, abs=0.005)
+    assert Sets().footprint_of_uncertainty == pytest.approx(mean, abs=0.005)
 
 
 def test_input_fuzziness_is_matched_to_the_noise_of_variance_0_04():
@@ -83,7 +83,7 @@ def test_kinds_differ_only_in_the_numbers_of_the_tables():
 
 
 def test_interval_type2_without_footprint_has_the_tables_of_type1():
-    interval = build_sets(Sets(kind='interval_type2', footprint=0.0))
+    interval = build_sets(Sets(kind='interval_type2', footprint_of_uncertainty=0.0))
     np.testing.assert_array_equal(interval.widths, build_sets(Sets(kind='type1')).widths)
 
 

@@ -726,7 +726,7 @@ def test_another_type_on_cmd_vel_is_a_warning_that_names_it(stamped, world):
 def test_every_row_of_the_table_is_a_described_parameter(name, world, tmp_path):
     given = {'folder': str(tmp_path / 'bag')} if name == 'recorder' else {}
     node = world.add(NODES[name], **given)
-    rows = PARAMETER_CLASSES[name].rows()
+    rows = PARAMETER_CLASSES[name].specs()
     assert rows
     for row in rows:
         described = node.describe_parameter(row.name)
@@ -750,7 +750,7 @@ def test_every_row_of_the_table_is_a_described_parameter(name, world, tmp_path):
 @pytest.mark.parametrize('name', ['controller', 'sim_robot'])
 def test_every_live_setting_can_be_set_and_every_fixed_one_is_refused(name, world):
     node = world.add(NODES[name])
-    for row in PARAMETER_CLASSES[name].rows():
+    for row in PARAMETER_CLASSES[name].specs():
         held = node.get_parameter(row.name)
         answer = node.set_parameters([held])[0]
         assert answer.successful == row.dynamic, row.name

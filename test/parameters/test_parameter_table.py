@@ -4,6 +4,7 @@
 
 from argparse import ArgumentTypeError
 from dataclasses import dataclass, replace
+import random
 
 import pytest
 
@@ -33,7 +34,7 @@ class Outer(Parameters):
 
 
 def test_rows_carry_everything_a_person_needs():
-    rows = {row.name: row for row in Outer.rows()}
+    rows = {row.name: row for row in Outer.specs()}
     assert list(rows) == ['low', 'high', 'count', 'levels', 'on', 'inner.gain', 'inner.kind']
     gain = rows['inner.gain']
     assert (gain.kind, gain.many, gain.default, gain.unit, gain.dynamic) == (
@@ -72,6 +73,74 @@ def test_wrong_values_are_refused_with_name_bound_and_value(values, words):
         Outer.from_dict(values)
     for word in words:
         assert word in str(caught.value)
+
+
+@dataclass(frozen=True)
+class Limits(Parameters):
+    speed: float = parameter(1.0, 'speed', name='linear.x.max_velocity', low=0.0)
+    rate: float = parameter(2.0, 'rate', low=0.0)
+
+
+@dataclass(frozen=True)
+class Robot(Parameters):
+    size: float = parameter(0.5, 'size', low=0.0)
+    limits: Limits = group(Limits, inline=True, rate=3.0)
+    spare: Limits = group(Limits)
+
+
+def test_explicit_and_inline_names():
+    assert [(spec.name, spec.default) for spec in Robot.specs()] == [
+        ('size', 0.5),
+        ('linear.x.max_velocity', 1.0),
+        ('rate', 3.0),
+        ('spare.linear.x.max_velocity', 1.0),
+        ('spare.rate', 2.0),
+    ]
+    robot = Robot.from_dict({'linear.x.max_velocity': 4, 'spare.linear.x.max_velocity': 5.0})
+    assert (robot.limits.speed, robot.spare.speed, robot.limits.rate) == (4.0, 5.0, 3.0)
+
+
+def test_named_parameters_survive_the_round_trip():
+    generator = random.Random(1)
+    names = [spec.name for spec in Robot.specs()]
+    for _ in range(200):
+        chosen = generator.sample(names, generator.randrange(len(names) + 1))
+        values = {name: generator.uniform(0.0, 9.0) for name in chosen}
+        robot = Robot().with_values(values)
+        assert robot.to_dict() == Robot().to_dict() | values
+        assert list(robot.to_dict()) == names
+        assert Robot.from_dict(robot.to_dict()) == robot
+
+
+def test_errors_name_the_parameter_by_its_full_name():
+    with pytest.raises(ParameterError, match='did you mean linear.x.max_velocity'):
+        Robot.from_dict({'linear.x.max_velocty': 1.0})
+    with pytest.raises(ParameterError, match='there is no parameter limits.rate'):
+        Robot.from_dict({'limits.rate': 1.0})
+    with pytest.raises(ParameterError, match='spare.linear.x.max_velocity must be at least 0'):
+        Robot.from_dict({'spare.linear.x.max_velocity': -1.0})
+    with pytest.raises(ParameterError, match='linear.x.max_velocity must be at least 0'):
+        Limits(speed=-1.0)
+
+
+def test_a_table_with_clashing_names_is_rejected():
+    @dataclass(frozen=True)
+    class Twice(Parameters):
+        rate: float = parameter(1.0, 'rate')
+        limits: Limits = group(Limits, inline=True)
+
+    @dataclass(frozen=True)
+    class Prefix(Parameters):
+        first: float = parameter(1.0, 'first', name='linear.x')
+        limits: Limits = group(Limits, inline=True)
+
+    for table, message in (
+        (Twice, 'Twice has two parameters rate'),
+        (Prefix, 'Prefix has the parameters linear.x and linear.x.max_velocity'),
+    ):
+        for use in (table.specs, table, lambda table=table: table.from_dict({})):
+            with pytest.raises(ParameterError, match=message):
+                use()
 
 
 def test_direct_construction_is_checked_too():

@@ -27,7 +27,7 @@ from t3mpc_ros.simulation.fault_injection import (
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / 'docs' / 'faults.md').read_text()
 NO_FAULT = FaultParameters()
-ROWS = {row.name: row for row in FaultParameters.rows()}
+ROWS = {row.name: row for row in FaultParameters.specs()}
 NAMES = [fault.name for fault in FAULTS]
 
 
@@ -59,8 +59,8 @@ def write(folder: Path, text: str) -> Path:
 
 
 def test_faults_are_the_live_rows_with_their_texts_and_only_the_schedule_is_fixed():
-    assert [row.name for row in FaultParameters.rows() if not row.dynamic] == ['schedule']
-    assert [(row.name, row.text) for row in FaultParameters.rows() if row.dynamic] == list(FAULTS)
+    assert [row.name for row in FaultParameters.specs() if not row.dynamic] == ['schedule']
+    assert [(row.name, row.text) for row in FaultParameters.specs() if row.dynamic] == list(FAULTS)
     assert all('\n' not in fault.text for fault in FAULTS)
 
 
@@ -391,7 +391,7 @@ def test_the_message_on_the_page_is_the_one_that_comes(tmp_path, monkeypatch):
 
 def test_the_page_lists_every_fault_with_its_bounds_and_text():
     lines = []
-    for row in FaultParameters.rows():
+    for row in FaultParameters.specs():
         if row.dynamic:
             default = f'{row.default:g}' if row.kind is float else str(row.default).lower()
             first = f'`{row.name}` | {default} {row.unit}'.rstrip()

@@ -417,7 +417,7 @@ def test_only_live_settings_change_while_running():
         machine.configure(machine.parameters.with_values({name: value}))
         assert machine.parameters.to_dict()[name] == value
     before = machine.parameters
-    for name, value in (('rate', 50.0), ('seed', 9), ('geometry.wheel_radius', 0.05)):
+    for name, value in (('rate', 50.0), ('seed', 9), ('wheel_radius', 0.05)):
         with pytest.raises(ParameterError, match=name):
             machine.configure(before.with_values({name: value}))
     assert machine.parameters is before

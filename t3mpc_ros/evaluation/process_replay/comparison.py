@@ -305,7 +305,7 @@ def _recorded_values(
 
 
 def _differing(one: ControllerInputs, other: ControllerInputs) -> list[str]:
-    names = {row.name: None for row in ControllerParameters.rows()}
+    names = {row.name: None for row in ControllerParameters.specs()}
     mine, its = _recorded_values(one, names), _recorded_values(other, names)
     return [
         f'{name} is {_format_values(its[name])} in {other.bag}, {_format_values(mine[name])} in {one.bag}'

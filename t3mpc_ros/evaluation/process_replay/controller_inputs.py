@@ -211,7 +211,7 @@ def _parameters(values: Mapping[str, object]) -> ControllerParameters:
 
 @cache
 def _names() -> frozenset[str]:
-    return frozenset(row.name for row in ControllerParameters.rows())
+    return frozenset(row.name for row in ControllerParameters.specs())
 
 
 class _Reader:

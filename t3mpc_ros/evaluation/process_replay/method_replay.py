@@ -185,10 +185,7 @@ class _MethodAdapter:
                 'rate': parameters.rate,
                 'drive.lag': parameters.estimate.lag,
                 'drive.dead_time': parameters.estimate.dead_time,
-                **{
-                    f'geometry.{key}': value
-                    for key, value in parameters.geometry.to_dict().items()
-                },
+                **parameters.geometry.to_dict(),
             }
         )
         limits, geometry = parameters.limits, parameters.geometry

@@ -30,6 +30,7 @@ from t3mpc_ros.evaluation.training.training_data import (
     TrainingError,
     load_training_data,
 )
+from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.parameters.provenance import provenance
 
 Array = NDArray[np.float64]
@@ -193,8 +194,8 @@ def check_compatible(
 ) -> None:
     """Raise :class:`TrainingError` unless what is learnt under both means the same."""
     mine, its = first.to_dict(), other.to_dict()
-    names = [row.name for row in Nt3fsMpcParameters.rows() if row.name not in FREE]
-    names += [name for name in mine if name.startswith('geometry.')]
+    names = [spec.name for spec in Nt3fsMpcParameters.specs() if spec.name not in FREE]
+    names += [spec.name for spec in WheelGeometry.specs()]
     if differing := [name for name in names if mine[name] != its[name]]:
         raise TrainingError(
             f'{path} and {other_path} must have the same settings; they differ in '

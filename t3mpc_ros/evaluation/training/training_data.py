@@ -143,10 +143,10 @@ def recorded_parameters(
     if table is None:
         raise TrainingError(f"{recording.folder}: the controller's settings are not in the bag")
     values: dict[str, object] = {}
-    for row in ControllerParameters.rows():
+    for row in ControllerParameters.specs():
         if row.name in table:
             values[row.name] = _value(row, table[row.name])
-    absent = [row.name for row in ControllerParameters.rows() if row.name not in values]
+    absent = [row.name for row in ControllerParameters.specs() if row.name not in values]
     if absent:
         notes.append(f'not in the bag, taken at their defaults: {", ".join(absent)}')
     try:

@@ -77,7 +77,7 @@ class SearchSpace:
     def __init__(self, table: type[Parameters], ranges: Sequence[SearchRange]) -> None:
         if not ranges:
             raise ParameterError(f'{table.__name__}: at least one setting must be tuned')
-        known = {row.name: row for row in table.rows()}
+        known = {row.name: row for row in table.specs()}
         self.table = table
         self.ranges = tuple(ranges)
         self._whole: list[bool] = []

@@ -169,7 +169,7 @@ class TunedParameters:
             It was not tuned, or what is stored does not fit the table; names the setting.
         """
         entry = self.entry(method, drive)
-        known = [row.name for row in table.rows()]
+        known = [row.name for row in table.specs()]
         where = f'{method}, {drive}'
         for name in [*entry.values, *entry.tuned]:
             if name not in known:

@@ -47,7 +47,7 @@ def declare_parameters(node: Node, table: type[S], changed: Callable[[S], None])
         type or out of range; the text names it, the bound and the value.
     """
     given = _overrides(node)
-    rows = {row.name: row for row in table.rows()}
+    rows = {row.name: row for row in table.specs()}
     _reject_unknown(node, given, rows)
     parameters = table.from_dict({name: given[name] for name in rows if name in given})
     values = parameters.to_dict()
@@ -133,7 +133,7 @@ def _names_of_all_nodes() -> frozenset[str]:
     """Return the names other nodes know: a file or command line may speak to several nodes."""
     from t3mpc_ros.nodes.node_parameters import PARAMETER_CLASSES
 
-    return frozenset(row.name for table in PARAMETER_CLASSES.values() for row in table.rows())
+    return frozenset(row.name for table in PARAMETER_CLASSES.values() for row in table.specs())
 
 
 def _parameter_value(row: ParameterSpec, value: object) -> object:

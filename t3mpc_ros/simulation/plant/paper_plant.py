@@ -380,7 +380,7 @@ class PaperPlant:
 class PaperRobotParameters(Parameters):
     """Everything that can be set of a simulated robot."""
 
-    geometry: WheelGeometry = group(WheelGeometry)
+    geometry: WheelGeometry = group(WheelGeometry, inline=True)
     body: BodyParameters = group(BodyParameters)
     friction: FrictionParameters = group(FrictionParameters)
     disturbance: DisturbanceParameters = group(DisturbanceParameters)
