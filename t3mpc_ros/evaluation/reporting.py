@@ -11,7 +11,6 @@ import sys
 from typing import TextIO
 
 
-
 class Progress:
     """Writes how many runs are done and how much time is left; the last line stays.
 

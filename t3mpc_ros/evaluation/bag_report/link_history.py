@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Diagnostics over time: warnings of every node, and metrics of a radio link."""
 
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 import math
@@ -12,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.bag.reader import BagReader
-
 
 Array = NDArray[np.float64]
 
@@ -171,4 +169,3 @@ def _numbers(status: Any) -> dict[str, float]:
             continue  # a text, or not said: unknown
         numbers[key] = value if math.isfinite(value) else math.nan
     return numbers
-

@@ -2,30 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Metrics of a recorded run: tracking errors, chatter, latencies."""
 
-
-from dataclasses import dataclass
-import math
-
-import numpy as np
-from numpy.typing import NDArray
-
-from t3mpc_ros.evaluation.bag_report.run_data import (Run, Series)
-from t3mpc_ros.evaluation.bag_report.topic_roles import (COMMAND, ODOMETRY, REFERENCE)
-
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 import math
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.bag_report.link_history import (LinkMetrics, link_metrics)
-
-from t3mpc_ros.evaluation.bag_report.run_data import (Channel, Run)
-from t3mpc_ros.evaluation.bag_report.response import (ResponseFit, responses)
-from t3mpc_ros.evaluation.bag_report.topic_roles import (COMMAND, ODOMETRY, REFERENCE)
-
+from t3mpc_ros.evaluation.bag_report.link_history import LinkMetrics, link_metrics
+from t3mpc_ros.evaluation.bag_report.response import ResponseFit, responses
+from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series
+from t3mpc_ros.evaluation.bag_report.topic_roles import COMMAND, ODOMETRY, REFERENCE
 
 Array = NDArray[np.float64]
 
@@ -268,7 +256,9 @@ class ReportMetrics:
         )
 
 
-def compute_metrics(run: Run, report: Path, pictures: tuple[Path, ...], messages: int) -> ReportMetrics:
+def compute_metrics(
+    run: Run, report: Path, pictures: tuple[Path, ...], messages: int
+) -> ReportMetrics:
     """Return the main figures of ``run``."""
     errors = errors_of(run, run.measured)
     command, reference = run.motions.get(COMMAND), run.motions.get(REFERENCE)
@@ -318,7 +308,9 @@ def errors_of(run: Run, measured: str) -> dict[str, tuple[ErrorStatistics, Error
     }
 
 
-def format_channels(one: float, other: float, channels: tuple[Channel, Channel], power: str = '') -> str:
+def format_channels(
+    one: float, other: float, channels: tuple[Channel, Channel], power: str = ''
+) -> str:
     """Return numbers of both channels with their units, which may differ."""
     units = [each.unit + power for each in channels]
     if units[0] == units[1]:
@@ -331,4 +323,3 @@ def format_number(value: float) -> str:
     if not math.isfinite(value):
         return '–'
     return f'{value:.0f}' if abs(value) >= 99.95 else f'{value:#.3g}'
-

@@ -2,47 +2,48 @@
 # SPDX-License-Identifier: Apache-2.0
 """Figures of the bag report in page order."""
 
-
-from typing import Any
-
-import numpy as np
-
-from t3mpc_ros.evaluation.plotting import (COLOURS, LABELS, add_legend, draw_line, is_long, name_time, new_panels, over_time, thinned)
-from t3mpc_ros.evaluation.bag_report.run_data import (Run, Series)
-from t3mpc_ros.evaluation.bag_report.response import (busiest, fit_response, predicted, smooth)
-from t3mpc_ros.evaluation.bag_report.topic_roles import COMMAND
-
-
-from typing import Any
-
-import numpy as np
-
-from t3mpc_ros.evaluation.plotting import (COLOURS, add_legend, name_time, new_panels)
-from t3mpc_ros.evaluation.bag_report.run_data import Run
-
-
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from matplotlib.ticker import MaxNLocator
 import numpy as np
 
-from t3mpc_ros.evaluation.plotting import (COLOURS, LABELS, STRENGTH, add_legend, draw_line, every_nth, is_long, name_time, new_figure, new_panels, over_time, thinned)
-from t3mpc_ros.evaluation.bag_report.metrics import (driven, estimation_target, latencies, path_of, statistics, tracking_error)
-from t3mpc_ros.evaluation.bag_report.metrics import UNMEASURED
-from t3mpc_ros.evaluation.bag_report.run_data import (Run, Series)
-from t3mpc_ros.evaluation.bag_report.topic_roles import (COMMAND, ODOMETRY, REFERENCE, SIGNALS, TERMS, TRUTH, WHEELS)
-
-
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
-
-
-from t3mpc_ros.evaluation.bag_report.metrics import WINDOW
-from t3mpc_ros.evaluation.bag_report.run_data import Run
-
-from t3mpc_ros.evaluation.bag_report.topic_roles import (COMMAND, ODOMETRY, REFERENCE, SIGNALS, TERMS, TRUTH, WHEELS)
-
+from t3mpc_ros.evaluation.bag_report.metrics import (
+    UNMEASURED,
+    WINDOW,
+    driven,
+    estimation_target,
+    latencies,
+    path_of,
+    statistics,
+    tracking_error,
+)
+from t3mpc_ros.evaluation.bag_report.response import busiest, fit_response, predicted, smooth
+from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
+from t3mpc_ros.evaluation.bag_report.topic_roles import (
+    COMMAND,
+    ODOMETRY,
+    REFERENCE,
+    SIGNALS,
+    TERMS,
+    TRUTH,
+    WHEELS,
+)
+from t3mpc_ros.evaluation.plotting import (
+    COLOURS,
+    LABELS,
+    STRENGTH,
+    add_legend,
+    draw_line,
+    every_nth,
+    is_long,
+    name_time,
+    new_figure,
+    new_panels,
+    over_time,
+    thinned,
+)
 
 DETAIL = 4.0
 """Seconds of the stretch that is shown closely: the one in which the command varies most."""
@@ -517,6 +518,13 @@ REPORT_FIGURES = (
     ),
 )
 """In the order of the report."""
-PACKAGE_FIGURES = ('tracking', 'error', 'switching', 'terms', 'estimates', 'portrait', 'certificate')
+PACKAGE_FIGURES = (
+    'tracking',
+    'error',
+    'switching',
+    'terms',
+    'estimates',
+    'portrait',
+    'certificate',
+)
 """Stems of those that nobody expects of a robot without this package's nodes."""
-

@@ -2,17 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """HTML report of a recorded run."""
 
-
-from collections.abc import Mapping
-import math
-
-from t3mpc_ros.evaluation.bag_report.link_history import LinkMetrics
-from t3mpc_ros.evaluation.bag_report.metrics import format_number
-from t3mpc_ros.evaluation.bag_report.run_data import Run
-from t3mpc_ros.evaluation.bag_report.response import (ResponseFit, motion_summary, roughness)
-from t3mpc_ros.evaluation.bag_report.topic_roles import COMMAND
-
-
 import base64
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
@@ -20,16 +9,33 @@ from html import escape
 import math
 from pathlib import Path
 
-from t3mpc_ros.evaluation.plotting import (LABELS, png_of)
-from t3mpc_ros.evaluation.bag_report.report_figures import (REPORT_FIGURES, PACKAGE_FIGURES)
-from t3mpc_ros.evaluation.bag_report.metrics import (SETTLING, ErrorStatistics, driving, preview_before_switch)
-from t3mpc_ros.evaluation.bag_report.metrics import (UNMEASURED, ReportMetrics, format_channels, errors_of, compute_metrics, format_number)
-from t3mpc_ros.evaluation.bag_report.run_data import (Channel, Run, load_run)
-
-from t3mpc_ros.evaluation.bag_report.topic_roles import (COMMAND, ODOMETRY, REFERENCE, TRUTH, ReportOptions, bag_display_name)
+from t3mpc_ros.bag.reader import BagReader, open_bag
+from t3mpc_ros.evaluation.bag_report.link_history import LinkMetrics
+from t3mpc_ros.evaluation.bag_report.metrics import (
+    SETTLING,
+    UNMEASURED,
+    ErrorStatistics,
+    ReportMetrics,
+    compute_metrics,
+    driving,
+    errors_of,
+    format_channels,
+    format_number,
+    preview_before_switch,
+)
+from t3mpc_ros.evaluation.bag_report.report_figures import PACKAGE_FIGURES, REPORT_FIGURES
+from t3mpc_ros.evaluation.bag_report.response import ResponseFit, motion_summary, roughness
+from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, load_run
+from t3mpc_ros.evaluation.bag_report.topic_roles import (
+    COMMAND,
+    ODOMETRY,
+    REFERENCE,
+    TRUTH,
+    ReportOptions,
+    bag_display_name,
+)
+from t3mpc_ros.evaluation.plotting import LABELS, png_of
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.bag.reader import (BagReader, open_bag)
-
 
 TableRows = tuple[list[str], list[list[str]]]
 """Head and rows."""
@@ -99,7 +105,10 @@ def link_table(links: Mapping[str, LinkMetrics]) -> TableRows:
         ['lost', *(_whole(one.lost) for one in each)],
         ['answered', *(f'{format_number(100.0 * one.answered)} %' for one in each)],
         ['round trip, median', *(f'{format_number(1e3 * one.round_trip)} ms' for one in each)],
-        ['round trip, worst 99 %', *(f'{format_number(1e3 * one.round_trip_99)} ms' for one in each)],
+        [
+            'round trip, worst 99 %',
+            *(f'{format_number(1e3 * one.round_trip_99)} ms' for one in each),
+        ],
         ['oldest measurement', *(f'{format_number(one.oldest)} s' for one in each)],
         ["resets of the robot's board", *(_whole(one.resets) for one in each)],
         ['resets of the dongle', *(_whole(one.dongle_resets) for one in each)],
@@ -148,7 +157,9 @@ def write_report(
             if png is not None:
                 paths.append(output / 'figures' / f'{stem}.png')
                 paths[-1].write_bytes(png)
-        figures = compute_metrics(run, output / 'report.html', tuple(paths), recording.message_count)
+        figures = compute_metrics(
+            run, output / 'report.html', tuple(paths), recording.message_count
+        )
         figures.report.write_text(_page(recording, run, figures, pictures), encoding='utf-8')
     return figures
 
@@ -305,7 +316,9 @@ def _error_table(run: Run) -> str:
         for channel, pair in zip(run.channels, errors_of(run, source).values(), strict=True):
             for extent, values in zip(('driven', 'settled'), pair, strict=True):
                 numbers = (values.rmse, values.mae, values.largest)
-                cells = [format_number(number) if values.count else UNMEASURED for number in numbers]
+                cells = [
+                    format_number(number) if values.count else UNMEASURED for number in numbers
+                ]
                 cells += [f'{values.seconds:.1f}', str(values.count)]
                 rows.append([LABELS[source], channel.title, extent, *cells, channel.unit])
     if not rows:
@@ -425,7 +438,9 @@ def _topic_table(recording: BagReader) -> str:
     if not rows:
         return '<p>No topic.</p>'
     summary = f'<summary>Topics, {len(rows)}</summary>'
-    return f'<details>{summary}{_html_table(["topic", "type", "messages"], rows, text=2)}</details>'
+    return (
+        f'<details>{summary}{_html_table(["topic", "type", "messages"], rows, text=2)}</details>'
+    )
 
 
 def _details(title: str, table: Mapping[str, str]) -> str:
@@ -451,4 +466,3 @@ def _html_table(
 
 def _rmse(right: ErrorStatistics, left: ErrorStatistics, channels: tuple[Channel, Channel]) -> str:
     return format_channels(right.rmse, left.rmse, channels) if right.count else UNMEASURED
-

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Response of a robot to its commands: dead time, lag, accelerations, stops."""
 
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 import math
@@ -10,10 +9,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.kernels import kernel
-from t3mpc_ros.evaluation.bag_report.run_data import (Run, Series)
+from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
 from t3mpc_ros.evaluation.bag_report.topic_roles import COMMAND
-
+from t3mpc_ros.kernels import kernel
 
 Array = NDArray[np.float64]
 
@@ -264,4 +262,3 @@ def responses(run: Run) -> Mapping[str, ResponseFit]:
         return {}
     fits = {each.name: fit_response(command, motion, each.name) for each in run.channels}
     return {name: fit for name, fit in fits.items() if fit is not None}
-

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Data of a recorded run: motions, commands and control terms on one time axis."""
 
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 import math
@@ -11,13 +10,27 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.bag_report.link_history import (DiagnosticEvent, LinkHistory, read_diagnostics)
-from t3mpc_ros.evaluation.bag_report.topic_roles import (COMMAND, NAMES, NUMBERS, ODOMETRY, REFERENCE, SIGNALS, TRUTH, WHEELS, ReportOptions, choose_topics)
-from t3mpc_ros.geometry.kinematics import (WheelGeometry, wheels_from_twist)
+from t3mpc_ros.bag.reader import BagReader, missing_sample_ratio
+from t3mpc_ros.evaluation.bag_report.link_history import (
+    DiagnosticEvent,
+    LinkHistory,
+    read_diagnostics,
+)
+from t3mpc_ros.evaluation.bag_report.topic_roles import (
+    COMMAND,
+    NAMES,
+    NUMBERS,
+    ODOMETRY,
+    REFERENCE,
+    SIGNALS,
+    TRUTH,
+    WHEELS,
+    ReportOptions,
+    choose_topics,
+)
+from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
 from t3mpc_ros.geometry.types import BodyTwist
-from t3mpc_ros.bag.reader import (BagReader, missing_sample_ratio)
 from t3mpc_ros.parameters.table import ParameterError
-
 
 Array = NDArray[np.float64]
 
@@ -314,14 +327,19 @@ def _switches(numbers: Mapping[str, Series], reference: Series | None) -> Array:
 
 
 def _geometry(
-    metadata_records: Mapping[str, Mapping[str, str]], wanted: ReportOptions, ours: bool, notes: list[str]
+    metadata_records: Mapping[str, Mapping[str, str]],
+    wanted: ReportOptions,
+    ours: bool,
+    notes: list[str],
 ) -> WheelGeometry | None:
     """Return the lengths that were given, else those of the recorded settings, else None.
 
     Of the settings the robot's own word comes first. A bag of this package's nodes that does not
     tell is taken to be of the robot they are made for.
     """
-    order = sorted(metadata_records, key=lambda title: title not in ('sim_robot', 'radio_bridge', 'robot'))
+    order = sorted(
+        metadata_records, key=lambda title: title not in ('sim_robot', 'radio_bridge', 'robot')
+    )
     given = {'wheel_radius': wanted.wheel_radius, 'wheel_separation': wanted.track}
     values: dict[str, object] = {key: value for key, value in given.items() if value is not None}
     for title in order:
@@ -366,4 +384,3 @@ def _absent(topics: Mapping[str, str], ours: bool) -> tuple[str, ...]:
         else {'reference/signals'}
     )
     return tuple(name for name in NAMES if name in names)
-

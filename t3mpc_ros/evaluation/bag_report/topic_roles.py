@@ -2,13 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Roles of the topics of a bag: odometry, command, reference, ground truth."""
 
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from t3mpc_ros.bag.reader import (BagReader, TopicSummary)
-
+from t3mpc_ros.bag.reader import BagReader, TopicSummary
 
 WHEELS = ('right', 'left')
 TERMS = ('fuzzy', 'feedback', 'feedforward', 'compensator', 'predictive')
@@ -190,4 +188,3 @@ def find_topics(
         order = [chosen, *(space for space in order if space != chosen)]
     order = order or ['']
     return found.get(order[0], {}), tuple(order)
-
