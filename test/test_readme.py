@@ -1,12 +1,13 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Every command in the README is run, from a shell, as a new user would."""
+"""Every command of the README and the tutorial is run from a shell, as a new user would."""
 
 from contextlib import contextmanager
 from pathlib import Path
 import re
 import signal
 import subprocess
+import sys
 import time
 
 import pytest
@@ -19,15 +20,16 @@ ROOT = Path(__file__).resolve().parent.parent
 
 BOARDS = 'scripts/run t3mpc emulator --link dongle --robot-link robot_usb'
 
-# How each command is run here: what is added to it, and whether it runs until it is told to stop.
+# How each command is run here: what is added to it, and whether it runs until it is stopped.
 SHORTENED = {
     # Long enough to learn from.
     'scripts/demo': (['--duration', '20', '--headless', '--output', 'OUTPUT/run'], False),
     'scripts/check': (['--version'], False),  # this very test is part of it
-    'scripts/run sim_robot': ([], True),
+    'scripts/run sim_robot --ros-args -p world:=room': ([], True),
     'scripts/run sim_robot --ros-args -p world:=room -p faults.schedule:=rough_ride': ([], True),
-    'scripts/run lab twin --quick': (['--output', 'OUTPUT/twin'], False),
-    'scripts/run lab faults': (['brown_out', 'collision'], False),
+    'scripts/run t3mpc --help': ([], False),
+    'scripts/run t3mpc twin --quick': (['--output', 'OUTPUT/twin'], False),
+    'scripts/run t3mpc faults': (['brown_out', 'collision'], False),
     'scripts/demo --robot servo': (
         ['--duration', '5', '--headless', '--output', 'OUTPUT/servo'],
         False,
@@ -36,39 +38,69 @@ SHORTENED = {
         ['--duration', '5', '--headless', '--output', 'OUTPUT/emulator'],
         False,
     ),
-    'scripts/run controller --ros-args -p law.gain:=30.0': ([], True),
-    'scripts/run all_in_one': (['--ros-args', '-p', 'folder:=OUTPUT/bag'], True),
-    'scripts/run lab paper --quick': (['--seeds', '1', '--output', 'OUTPUT/paper'], False),
-    'scripts/run lab tune': (
+    'scripts/run controller --ros-args -p law.gain:=20.0': ([], True),
+    'scripts/run reference_generator --ros-args -p seed:=7': ([], True),
+    'scripts/run composed': (['--ros-args', '-p', 'storage.uri:=OUTPUT/bag'], True),
+    'scripts/run t3mpc paper --quick': (['--seeds', '1', '--output', 'OUTPUT/paper'], False),
+    'scripts/run t3mpc tune': (
         ['PI + feed-forward', '--evaluations', '2', '--output', 'OUTPUT/tuned.json'],
         False,
     ),
-    'scripts/run lab train': (['--seeds', '1', '--output', 'OUTPUT/model.npz'], False),
-    'scripts/run lab exponents': (['--duration', '20'], False),
-    'scripts/run lab estimation': (['--seeds', '2'], False),
+    'scripts/run t3mpc train': (['--seeds', '1', '--output', 'OUTPUT/model.npz'], False),
+    'scripts/run t3mpc exponents': (['--duration', '20'], False),
+    'scripts/run t3mpc estimation': (['--seeds', '2'], False),
     BOARDS: ([], True),
     'scripts/run t3mpc robot key create robot.key': ([], False),
     'scripts/run t3mpc robot key write robot.key --port robot_usb': ([], False),
     'scripts/run t3mpc robot ping --port dongle': ([], False),
     'scripts/run t3mpc robot jog left 1 --port dongle --key robot.key --yes': ([], False),
     'scripts/run radio_bridge --ros-args -p port:=dongle -p key_file:=robot.key': ([], True),
-    'scripts/run bag info runs/<time>/bag': ([], False),
-    'scripts/run bag report runs/<time>/bag': (['--output', 'OUTPUT/report'], False),
-    'scripts/run bag rerun runs/<time>/bag --set law.gain=30.0': ([], False),
-    'scripts/run bag compare runs/<time>/bag --picture divergence.png': ([], False),
-    'scripts/run bag recover runs/<time>/bag --output recovered': ([], False),
-    'scripts/run bag train runs/<time>/bag --keep-predictor --output model.npz': ([], False),
-    'scripts/run replayer --ros-args -p bags:=[runs/<time>/bag]': (['-p', 'rate:=10.0'], False),
+    'scripts/run t3mpc bag info runs/<time>/bag': ([], False),
+    'scripts/run t3mpc bag report runs/<time>/bag': (['--output', 'OUTPUT/report'], False),
+    'scripts/run t3mpc bag replay runs/<time>/bag': ([], False),
+    'scripts/run t3mpc bag replay runs/<time>/bag --set law.gain=20.0': ([], False),
+    'scripts/run t3mpc bag compare runs/<time>/bag --picture divergence.png': ([], False),
+    'scripts/run t3mpc bag recover runs/<time>/bag --output recovered': ([], False),
+    'scripts/run t3mpc bag train runs/<time>/bag --keep-predictor --output model.npz': ([], False),
+    'scripts/run player --ros-args -p storage.uris:=[runs/<time>/bag]': (
+        ['-p', 'play.rate:=10.0'],
+        False,
+    ),
 }
 
 
-def _commands():
-    blocks = re.findall(r'```console\n(.*?)```', (ROOT / 'README.md').read_text(), re.DOTALL)
+def _commands(page):
+    blocks = re.findall(r'```console\n(.*?)```', page.read_text(), re.DOTALL)
     return [line for block in blocks for line in block.splitlines() if line.strip()]
 
 
-def test_every_command_of_the_readme_is_known_here():
-    assert sorted(_commands()) == sorted(SHORTENED)
+@pytest.mark.parametrize('page', ['README.md', 'docs/tutorial.md'])
+def test_every_command_of_the_page_is_run_here(page):
+    assert set(_commands(ROOT / page)) <= set(SHORTENED)
+
+
+def test_every_command_run_here_is_in_a_page():
+    pages = [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
+    text = '\n'.join(page.read_text() for page in pages)
+    assert [command for command in SHORTENED if command not in text] == []
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / 'README.md').read_bytes()) <= 6000
+
+
+def test_the_controller_of_the_tutorial_runs(tmp_path):
+    """The Python block is run as the tutorial says, in the local environment."""
+    [code] = re.findall(r'```python\n(.*?)```', (ROOT / 'docs/tutorial.md').read_text(), re.DOTALL)
+    script = tmp_path / 'mine.py'
+    script.write_text(code)
+    done = subprocess.run(
+        [sys.executable, script], capture_output=True, text=True, timeout=240, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    found = dict(re.findall(r'^(.+): RMSE ([0-9.]+) rad/s$', done.stdout, re.MULTILINE))
+    assert set(found) == {'mine', 'PI + feed-forward'}
+    assert float(found['mine']) < 0.5
 
 
 @pytest.fixture(scope='module')
