@@ -12,29 +12,32 @@ from typing import ParamSpec, TypeVar, cast
 import numba
 import numba.core.config
 
-PACKAGE_DIRECTORY = Path(__file__).resolve().parent.parent
+P = ParamSpec('P')
+R = TypeVar('R')
+
+PACKAGE_DIRECTORY = Path(__file__).resolve().parent
 
 
 def cache_directory(environment: Mapping[str, str], sources: Path = PACKAGE_DIRECTORY) -> Path:
-    """Return a writable folder for the kernels compiled from these very sources.
+    """Return a writable folder for the kernels compiled from the present sources.
 
-    The compiler's own cache looks only at the file a kernel stands in, so a kernel kept from
-    yesterday would go on calling yesterday's version of a kernel in another file. The folder's
-    name therefore carries a fingerprint of every source file that holds a kernel.
+    The compiler's own cache checks only the file that contains a kernel: a cached kernel would
+    keep calling an outdated version of a kernel in another file. The name of the folder therefore
+    contains a fingerprint of every source file with a kernel.
 
     Parameters
     ----------
     environment
-        ``T3MPC_CACHE_DIR`` wins, then ``XDG_CACHE_HOME``, then ``HOME``, then the temporary
-        folder; the first one that can be written to is taken. An installed package is often
+        The folder is below ``T3MPC_CACHE_DIR``, ``XDG_CACHE_HOME``, ``HOME`` or the temporary
+        folder: the first of them that is set and writable. An installed package is often
         read-only, so nothing is written beside the sources.
     sources
-        The folder whose ``*.py`` files with kernels are fingerprinted.
+        The folder whose ``*.py`` files are fingerprinted.
 
     Raises
     ------
     OSError
-        No candidate can be written to; the message names them all.
+        No candidate is writable; the message names them all.
     """
     leaf = source_fingerprint(sources)
     tried = []
@@ -57,7 +60,7 @@ def source_fingerprint(sources: Path) -> str:
     digest = hashlib.sha256()
     for path in sorted(sources.rglob('*.py')):
         content = path.read_bytes()
-        if b'@kernel' in content or path.parent.name == 'kernels':
+        if b'@kernel' in content or path.name == 'kernels.py':
             digest.update(str(path.relative_to(sources)).encode())
             digest.update(content)
     return digest.hexdigest()[:16]
@@ -73,20 +76,17 @@ def _base_directories(environment: Mapping[str, str]) -> Iterator[Path]:
     yield Path(tempfile.gettempdir()) / f't3mpc_ros-{os.getuid()}'
 
 
-P = ParamSpec('P')
-R = TypeVar('R')
-
-# Set once, before any kernel is made: numba asks for the folder when it decorates.
+# Set before the first kernel is made: numba reads the setting when it decorates.
 if not numba.core.config.CACHE_DIR:
     numba.core.config.CACHE_DIR = str(cache_directory(os.environ))
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Return ``function`` compiled to machine code on its first call, and kept on disk.
+    """Return ``function``, compiled to machine code on its first call and cached on disk.
 
     A kernel takes arrays and numbers only. Division by zero gives inf or NaN as in IEEE 754
-    instead of an exception: arguments are checked once, above the kernel. Constants that may
-    change are passed as arguments, because the cache does not notice a changed global.
+    instead of an exception; arguments are validated before the kernel is called. Constants that
+    may change are passed as arguments, because the cache does not detect a changed global.
     """
     return cast(
         'Callable[P, R]',

@@ -1,6 +1,11 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Reference wheel speeds: scaled, slowed and switched hyperchaos, equation (85) with E6."""
+"""Reference wheel speeds: scaled, slowed and switched hyperchaos, equation (85) with E6.
+
+The raw states of (85) change by some 25 standard deviations per second, which no wheel can follow.
+The reference is therefore y(kappa t) with a time scale kappa much below 1, times an amplitude per
+signal; only then does Assumption 3 of the paper hold, that the outputs can reach the reference.
+"""
 
 from dataclasses import dataclass
 import math
@@ -18,13 +23,13 @@ from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parame
 
 @dataclass(frozen=True)
 class ReferenceParameters(Parameters):
-    """How system (85) becomes wheel speeds."""
+    """Solution of system (85), and its conversion to wheel speeds."""
 
     rate: float = parameter(100.0, 'samples per second', unit='Hz', low=1.0, high=10000.0)
     output: str = parameter(
         'wheels',
         'wheels: the two signals are the speeds of right and left wheel; '
-        'body: they drive v and omega through the two scales',
+        'body: they are v and omega, multiplied by the two scales',
         choices=('wheels', 'body'),
         source='paper: wheels',
     )
@@ -47,13 +52,13 @@ class ReferenceParameters(Parameters):
     amplitude: tuple[float, ...] = parameter(
         (0.26, 1.25, 3.0, 0.125),
         'wheel speed per unit of each state. Standard deviations measured at q = 0.98 over '
-        '10 000 s: 10.6, 2.22, 0.937, 22.2; so each signal has 2.8 rad/s, peaks of 8 rad/s in a '
-        'minute and of 13 rad/s in a day',
+        '10 000 s: 10.6, 2.22, 0.937, 22.2; so each signal has 2.8 rad/s, peaks of 8 rad/s per '
+        'minute and of 13 rad/s per day',
         unit='rad/s',
     )
     offset: tuple[float, ...] = parameter(
         (0.0, 0.0, 4.79, 0.0),
-        'subtracted from each state first: its mean, measured at q = 0.98; states 1, 2 and 4 '
+        'subtracted from each state: its mean, measured at q = 0.98; states 1, 2 and 4 '
         'have mean 0 by the symmetry of (85)',
     )
     linear_scale: float = parameter(
@@ -67,31 +72,33 @@ class ReferenceParameters(Parameters):
         0.33, 'output body: omega per rad/s of the second signal', low=-20.0, high=20.0
     )
     initial: tuple[float, ...] = parameter(
-        (1.0, 1.0, 1.0, 1.0), 'state of (85) at which its memory begins', low=-30.0, high=30.0
+        (1.0, 1.0, 1.0, 1.0), 'initial state of (85)', low=-30.0, high=30.0
     )
     seed: int = parameter(
-        0, 'perturbs the initial state and draws random switching; 0: initial as given', low=0
+        0,
+        'seed of the perturbation of the initial state and of random switching; 0: initial as given',
+        low=0,
     )
     perturbation: float = parameter(
-        0.5, 'largest change of each initial state by the seed', low=1e-9, high=5.0
+        0.5, 'maximum perturbation of each initial state', low=1e-9, high=5.0
     )
     settle: float = parameter(
         20.0,
-        'system time run before the first sample, to land on the attractor',
+        'system time simulated before the first sample, to reach the attractor',
         unit='s',
         low=0.1,
         high=10000.0,
     )
     solver_step: float = parameter(
         1e-3,
-        'longest solver step in system time; a whole number of steps makes one sample',
+        'maximum solver step in system time; one sample is a whole number of steps',
         unit='s',
         low=1e-6,
         high=2e-3,
     )
     memory_horizon: float = parameter(
         1e5,
-        'system time over which the memory kernel keeps its tolerance; '
+        'system time over which the memory kernel is within its tolerance; '
         'divided by the time scale, 23 days at the defaults',
         unit='s',
         low=10.0,
@@ -102,7 +109,7 @@ class ReferenceParameters(Parameters):
     )
     ramp: float = parameter(
         3.0,
-        'time over which the reference grows smoothly from zero, for a robot at rest',
+        'duration of the smooth increase from zero, for a robot at rest',
         unit='s',
         low=0.0,
         high=600.0,
@@ -118,20 +125,20 @@ class ReferenceParameters(Parameters):
 
     @property
     def steps_per_sample(self) -> int:
-        """How many solver steps make one sample."""
+        """Number of solver steps per sample."""
         longest = self.time_scale / (self.rate * self.solver_step)
-        # The margin keeps a ratio that is whole but for rounding from taking one step more.
+        # The margin prevents an additional step when rounding increases a whole ratio.
         return max(1, math.ceil(longest * (1.0 - 1e-9)))
 
     @property
     def step(self) -> float:
-        """The solver step taken, in seconds of system time."""
+        """Solver step, in seconds of system time."""
         return self.time_scale / (self.rate * self.steps_per_sample)
 
 
 @dataclass(frozen=True, slots=True)
 class ReferenceSample:
-    """The motion wanted at one instant of the grid n / rate."""
+    """Reference at one instant of the grid n / rate."""
 
     index: int
     elapsed: float
@@ -139,13 +146,13 @@ class ReferenceSample:
     wheels: WheelSpeeds
     """rad/s"""
     rate: WheelSpeeds
-    """rad/s², time derivative of ``wheels``; at a sudden jump that of the new signal alone"""
+    """rad/s², time derivative of ``wheels``; at a sudden switch that of the new signal alone"""
     twist: BodyTwist
     """m/s and rad/s, equation (1)"""
     mode: int
     """index of the active mode"""
     selected: tuple[int, int]
-    """the signals, from 1, that drive the first and the second output"""
+    """numbers, from 1, of the signals at the first and the second output"""
     switched: bool
     """whether this is the first sample of a new mode"""
     states: tuple[float, float, float, float]
@@ -153,14 +160,14 @@ class ReferenceSample:
 
 
 class ChaoticReference:
-    """Gives one sample after the other of the switching chaotic reference.
+    """Generates the samples of the switching chaotic reference.
 
     Parameters
     ----------
     settings
         System, scaling and switching.
     geometry
-        Turns wheel speeds into the body twist and back.
+        Wheel radius and separation.
     """
 
     def __init__(self, parameters: ReferenceParameters, geometry: WheelGeometry) -> None:
@@ -177,23 +184,23 @@ class ChaoticReference:
         self.reset()
 
     def reset(self, seed: int | None = None) -> None:
-        """Start again from the first sample, with another seed if one is given.
+        """Restart at the first sample, with another seed if one is given.
 
-        The seed may be of any length: with 128 bits from the operating system a run cannot be
-        guessed beforehand. It is kept nowhere but here.
+        The seed may have any length: with 128 random bits a run cannot be predicted. The seed is
+        not published or logged.
 
         Raises
         ------
         ValueError
-            A negative seed.
+            The seed is negative.
         """
         if seed is not None and seed < 0:
-            raise ValueError('seed must not be negative')  # and must not be printed either
+            raise ValueError('seed must not be negative')  # without its value, which is secret
         self._seed = self._seed if seed is None else seed
         initial = np.array(self._parameters.initial)
         if self._seed:
             bound = self._parameters.perturbation
-            # A stream apart from the schedule's: dwells that all can see must not tell this.
+            # Independent of the schedule's stream: public dwell times must not reveal this one.
             generator = np.random.default_rng((self._seed, 1))
             initial += generator.uniform(-bound, bound, initial.size)
         self._schedule = SwitchingSchedule(self._parameters.switching, self._seed)
@@ -208,7 +215,7 @@ class ChaoticReference:
         Raises
         ------
         FloatingPointError
-            The solution of (85) has left the finite numbers.
+            The solution of (85) is not finite.
         """
         parameters = self._parameters
         if self._index:
@@ -218,14 +225,14 @@ class ChaoticReference:
         signals = np.array(parameters.amplitude) * (states - np.array(parameters.offset))
         # reference(t) = y(kappa t), so d/dt is kappa times the rate in system time.
         rates = parameters.time_scale * np.array(parameters.amplitude) * self._solver.rate
-        selection = self._schedule.at(elapsed)
-        selected = self._schedule.pairs[selection.mode]
+        mode = self._schedule.at(elapsed)
+        selected = self._schedule.pairs[mode.mode]
         active = np.array(selected) - 1
-        before = np.array(self._schedule.pairs[selection.previous]) - 1
-        share = selection.blend
-        value = (1.0 - share) * signals[before] + share * signals[active]
-        slope = (1.0 - share) * rates[before] + share * rates[active]
-        slope += selection.blend_rate * (signals[active] - signals[before])
+        before = np.array(self._schedule.pairs[mode.previous]) - 1
+        weight = mode.blend
+        value = (1.0 - weight) * signals[before] + weight * signals[active]
+        slope = (1.0 - weight) * rates[before] + weight * rates[active]
+        slope += mode.blend_rate * (signals[active] - signals[before])
         grown, growth = self._growth(elapsed)
         wheels = self._wheels(grown * value)
         sample = ReferenceSample(
@@ -234,24 +241,24 @@ class ChaoticReference:
             wheels,
             self._wheels(grown * slope + growth * value),
             twist_from_wheels(wheels, self._geometry),
-            selection.mode,
+            mode.mode,
             selected,
-            selection.switches != self._switches,
+            mode.switches != self._switches,
             tuple(states.tolist()),
         )
         self._index += 1
-        self._switches = selection.switches
+        self._switches = mode.switches
         return sample
 
     def _growth(self, elapsed: float) -> tuple[float, float]:
-        """Return the ramp's share of the full reference and its derivative (1/s)."""
+        """Return the ramp's factor of the reference and its derivative (1/s)."""
         if elapsed >= self._parameters.ramp:
             return 1.0, 0.0
         x = elapsed / self._parameters.ramp
         return x * x * (3.0 - 2.0 * x), 6.0 * x * (1.0 - x) / self._parameters.ramp
 
     def _wheels(self, outputs: NDArray[np.float64]) -> WheelSpeeds:
-        """Return wheel speeds (or their rates) of the two outputs; linear, so it serves both."""
+        """Return the wheel speeds, or their rates, of the two outputs; a linear map."""
         first, second = outputs.tolist()
         if self._parameters.output == 'wheels':
             return WheelSpeeds(first, second)

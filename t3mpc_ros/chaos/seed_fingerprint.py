@@ -1,6 +1,11 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Salted hash of a seed: proves knowledge of the seed without publishing it."""
+"""Salted hash of a seed: proves knowledge of the seed without publishing it.
+
+The seed of a patrol determines the path of the robot, so no parameter, log or bag contains it. The
+diagnostics contain its fingerprint: a random salt and the SHA-256 of salt and seed. It hides a
+seed of 128 random bits; a small number chosen by hand is found by trying every one.
+"""
 
 import hashlib
 import hmac
@@ -8,13 +13,13 @@ import re
 
 SALT_BYTES = 16
 FINGERPRINT_KEY = 'seed_fingerprint'
-"""Under which a node tells it in its diagnostics."""
+"""Key of the fingerprint in a node's diagnostics."""
 
 _PATTERN = re.compile(r'([0-9a-f]{32,}):([0-9a-f]{64})')
 
 
 def fingerprint_seed(seed: int, salt: bytes) -> str:
-    """Return the fingerprint of ``seed``: salt and digest as hexadecimal digits, a colon between.
+    """Return the fingerprint of ``seed``: salt and digest as hexadecimal digits, with a colon.
 
     Parameters
     ----------
@@ -31,7 +36,7 @@ def fingerprint_seed(seed: int, salt: bytes) -> str:
     if len(salt) < SALT_BYTES:
         raise ValueError(f'salt must have at least {SALT_BYTES} bytes: got {len(salt)}')
     if seed < 0:
-        raise ValueError('seed must not be negative')  # and must not be printed either
+        raise ValueError('seed must not be negative')  # without its value, which is secret
     digest = hashlib.sha256(salt + str(seed).encode('ascii')).hexdigest()
     return f'{salt.hex()}:{digest}'
 
@@ -42,7 +47,7 @@ def matches_fingerprint(text: str, seed: int) -> bool:
     Raises
     ------
     ValueError
-        ``text`` is no fingerprint at all.
+        ``text`` does not have the form of a fingerprint.
     """
     match = _PATTERN.fullmatch(text)
     if not match or len(match[1]) % 2:

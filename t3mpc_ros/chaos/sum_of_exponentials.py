@@ -1,6 +1,33 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The memory kernel of a fractional integral as a short sum of exponentials."""
+r"""The memory kernel of a fractional integral as a short sum of exponentials.
+
+The fractional integral of order q in (0, 1] weights the past with the kernel
+
+.. math:: k(t) = \frac{t^{q-1}}{\Gamma(q)}
+               = \frac{\sin \pi q}{\pi} \int_0^\infty e^{-s t} s^{-q}\,ds
+               = \frac{\sin \pi q}{\pi} \int_{-\infty}^{\infty} e^{-t e^x} e^{(1-q) x}\,dx,
+
+the last form by s = e^x. Each exponential is a first-order filter with one state and a constant
+cost per step, so a finite sum of them replaces the whole past. It is constructed in four steps:
+
+1. *Sampling.* The trapezoid rule with spacing w in x: rates e^{jw + x_0}, weights
+   w e^{(1-q)(jw + x_0)} sin(pi q)/pi. By Poisson's formula its relative error oscillates in ln t
+   with amplitude 2 abs(Gamma(1 - q + 2 pi i/w)) / Gamma(1 - q), independent of t, and decreases
+   like exp(-pi^2/w).
+2. *Fast end.* Terms with e^{-s h} negligible at the shortest lag h are omitted.
+3. *Slow end.* Towards s = 0 the weights decrease only like s^{1-q}: for q = 0.98 a thousand
+   decades would be needed to reach 1e-20. Over the horizon T those terms are nearly constant, so
+   the geometric series of their weights, and of weight times rate, is summed analytically into
+   one mode with the same total weight and the same mean rate. The error is of second order in
+   s T. As q -> 1 this mode's weight tends to 1 and its rate to 0, all others vanish, and at q = 1
+   the kernel *is* that one mode: an ordinary integral.
+4. *Verification.* The relative error is evaluated on a grid of [h, T] much finer than its
+   oscillation, and the spacing is reduced until the error is within the tolerance.
+
+Beyond T the error grows slowly with (t/T)^2 from the share of the tolerance assigned to the slow
+mode, which continues to decay at its small mean rate.
+"""
 
 from dataclasses import dataclass
 import math
@@ -11,7 +38,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class SumOfExponentials:
-    """k(t) as the sum of weight * exp(-rate * t), with the error measured on its range."""
+    """k(t) as a sum of weight * exp(-rate * t), with its measured error."""
 
     rates: NDArray[np.float64]
     """Shape (m,), 1/s, ascending and not negative."""
@@ -28,12 +55,12 @@ class SumOfExponentials:
 def fit_sum_of_exponentials(
     order: float, shortest: float, horizon: float, tolerance: float
 ) -> SumOfExponentials:
-    """Return rates and weights whose sum keeps k(t) within ``tolerance``, relatively.
+    """Return a sum that approximates k(t) with a relative error of at most ``tolerance``.
 
     Parameters
     ----------
     order
-        q, above 0 and at most 1; at 1 the answer is one mode of rate 0 and weight 1, exactly.
+        q, above 0 and at most 1; at 1 the result is exactly one mode of rate 0 and weight 1.
     shortest, horizon
         The lags (s) between which the error is bounded.
     tolerance
@@ -42,9 +69,9 @@ def fit_sum_of_exponentials(
     Raises
     ------
     ValueError
-        An argument outside its range.
+        An argument is outside its range.
     ArithmeticError
-        The tolerance is not reached; rounding allows it for lags up to 15 decades apart.
+        The tolerance is not reached; rounding permits it for lags up to 15 decades apart.
     """
     if not 0.0 < order <= 1.0:
         raise ValueError(f'order must be above 0 and at most 1: got {order}')
@@ -55,7 +82,7 @@ def fit_sum_of_exponentials(
     if order == 1.0:
         return SumOfExponentials(np.zeros(1), np.ones(1), 0.0)
     spacing = _spacing(order, 0.5 * tolerance)
-    for _ in range(20):  # one or two are enough; a bound, so that a slip can never run away
+    for _ in range(20):  # one or two are enough
         found = _sample_kernel(order, shortest, horizon, tolerance / 8.0, spacing)
         if found.error <= tolerance:
             return found
@@ -67,7 +94,7 @@ def _spacing(order: float, tolerance: float) -> float:
     """Return the widest spacing w whose sampling error is near the tolerance.
 
     Uses the large-argument form abs(Gamma(b + iy)) ~ sqrt(2 pi) y^(b - 1/2) exp(-pi y/2) with
-    b = 1 - q; the measured error decides, so an estimate is enough.
+    b = 1 - q. An estimate is enough, because the caller measures the error.
     """
     beta = 1.0 - order
     spacing = 2.0
@@ -84,7 +111,7 @@ def _sample_kernel(
 ) -> SumOfExponentials:
     beta = 1.0 - order
     scale = spacing * math.sin(math.pi * beta) / math.pi
-    # Fast end: what is left out is below C Gamma(q) u^-q exp(-u) of k at the shortest lag.
+    # Fast end: the omitted terms are below C Gamma(q) u^-q exp(-u) of k at the shortest lag.
     share = math.gamma(order) * math.sin(math.pi * beta) / math.pi
     u = 0.5
     while share * u**-order * math.exp(-u) > tolerance:
@@ -113,8 +140,8 @@ def _measure_error(
 ) -> float:
     """Return the largest relative error on a fine grid, with a margin for between its points.
 
-    Modes are narrower than two in ln t, so the error oscillates no faster than that; 48 points
-    per unit of ln t miss a crest by well under one per cent.
+    Modes are narrower than two in ln t, which limits how fast the error oscillates; 48 points
+    per unit of ln t miss a maximum by well under one per cent.
     """
     count = math.ceil(48.0 * math.log(horizon / shortest)) + 2
     time = np.geomspace(shortest, horizon, count)

@@ -15,7 +15,7 @@ from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 
 @dataclass(frozen=True)
 class SwitchingParameters(Parameters):
-    """When the outputs change signals, to which, and how abruptly."""
+    """Times, modes and transitions of the switching signal."""
 
     kind: str = parameter(
         'fixed',
@@ -30,21 +30,21 @@ class SwitchingParameters(Parameters):
     )
     times: tuple[float, ...] = parameter(
         (12.0, 24.0, 36.0, 48.0),
-        'switch times of kind fixed, ascending; after the last one switching goes on, modes in '
-        'turn, with the last dwell repeated; empty: never. The paper switches four times, at '
-        'times its text does not give',
+        'switch times of kind fixed, ascending; after the last one switching continues, modes in '
+        'turn, with the last dwell time repeated; empty: no switching. The paper switches four '
+        'times, at times that it does not state',
         unit='s',
         low=0.01,
     )
     shortest_dwell: float = parameter(
-        8.0, 'least time in a mode, kind random', unit='s', low=0.1, high=86400.0
+        8.0, 'minimum dwell time, kind random', unit='s', low=0.1, high=86400.0
     )
     longest_dwell: float = parameter(
-        16.0, 'most time in a mode, kind random', unit='s', low=0.1, high=86400.0
+        16.0, 'maximum dwell time, kind random', unit='s', low=0.1, high=86400.0
     )
     blend: float = parameter(
         0.0,
-        'time over which one mode passes smoothly into the next; 0 jumps, as the paper does',
+        'duration of the smooth transition between two modes; 0: sudden, as in the paper',
         unit='s',
         low=0.0,
         high=3600.0,
@@ -52,7 +52,7 @@ class SwitchingParameters(Parameters):
     )
 
     def check_consistency(self) -> None:
-        """Raise :class:`ParameterError` for odd pairs, times out of order, a blend too long."""
+        """Raise :class:`ParameterError` for an odd pair, unordered times or a long transition."""
         if not self.modes or len(self.modes) % 2:
             raise ParameterError(f'modes must be one or more pairs: got {len(self.modes)} numbers')
         dwells = [after - before for before, after in pairwise((0.0, *self.times))]
@@ -63,7 +63,7 @@ class SwitchingParameters(Parameters):
                 f'longest_dwell must be at least shortest_dwell, {self.shortest_dwell:g} s: '
                 f'got {self.longest_dwell:g}'
             )
-        # A blend fills a dwell at most, or the signal before the previous one would be cut off.
+        # A transition must end within its dwell: only one previous mode is kept.
         least = min(dwells[1:] or dwells, default=math.inf)
         if self.kind == 'random':
             least = self.shortest_dwell
@@ -79,40 +79,40 @@ class SwitchingParameters(Parameters):
 
 
 class SwitchingMode(NamedTuple):
-    """What drives the outputs at one instant."""
+    """Active mode of the switching signal at one instant, with its transition."""
 
     mode: int
     """Index of the active pair, from 0."""
     previous: int
-    """Index of the pair before it; the active one before the first switch."""
+    """Index of the previous pair; before the first switch that of the active one."""
     blend: float
-    """Share of the active mode in the outputs, from 0 to 1; the previous one has the rest."""
+    """Weight of the active mode in the outputs, from 0 to 1; the previous one has the rest."""
     blend_rate: float
-    """Time derivative of the share (1/s); 0 at a sudden jump, which has none."""
+    """Time derivative of the weight (1/s); 0 at a sudden switch, which has none."""
     switches: int
-    """How many switches have happened so far."""
+    """Number of switches so far."""
     since: float
-    """When the active mode began (s)."""
+    """Start of the active mode (s)."""
     until: float
-    """When the next switch comes (s), inf when none will."""
+    """Time of the next switch (s), inf without one."""
 
 
 class SwitchingSchedule:
-    """Answers for any time what drives the outputs, the same whatever was asked before.
+    """Switching signal as a function of time, independent of the order of the queries.
 
     At a switch time itself the new mode is active. Kind *fixed* takes the modes in turn; kind
     *random* draws each dwell uniformly between its bounds and each next mode uniformly among the
-    others, so that neither can be foretold without the seed. With one mode nothing ever switches.
+    others, so that neither can be predicted without the seed. With one mode there are no switches.
 
-    Only the current dwell is kept: memory is constant, going forward costs one draw per switch
-    passed, and a question about an earlier dwell starts over from time zero.
+    Only the current dwell is kept: memory is constant, each switch passed costs one draw, and a
+    query about an earlier dwell restarts at time zero.
 
     Parameters
     ----------
     settings
         Kind, modes and times.
     seed
-        Not negative, of any length; without effect on kind *fixed*.
+        Not negative, of any length; kind *fixed* ignores it.
     """
 
     def __init__(self, parameters: SwitchingParameters, seed: int = 0) -> None:
@@ -124,12 +124,12 @@ class SwitchingSchedule:
         self._restart()
 
     def at(self, time: float) -> SwitchingMode:
-        """Return the selection at ``time`` (s since the run began).
+        """Return the active mode at ``time`` (s since the start of the run).
 
         Raises
         ------
         ValueError
-            A time that is negative or not finite.
+            The time is negative or not finite.
         """
         if not 0.0 <= time < math.inf:
             raise ValueError(f'time must be finite and not negative: got {time}')
@@ -160,7 +160,7 @@ class SwitchingSchedule:
         self._dwell = next(self._dwells)
 
     def _walk(self) -> Iterator[SwitchingMode]:
-        """Yield dwell after dwell, each with its blend completed, the last one endless."""
+        """Yield every dwell, its transition completed; the last one may be infinite."""
         generator = np.random.default_rng(self._seed)
         mode = previous = 0
         since = 0.0
@@ -174,7 +174,7 @@ class SwitchingSchedule:
             mode = (mode + step) % len(self.pairs)
 
     def _end(self, switches: int, since: float, generator: np.random.Generator) -> float:
-        """Return when the dwell after ``switches`` switches ends."""
+        """Return the end (s) of the dwell after ``switches`` switches."""
         if len(self.pairs) == 1:
             return math.inf
         if self._parameters.kind == 'random':
@@ -185,5 +185,5 @@ class SwitchingSchedule:
         if len(times) == 1:
             return math.inf
         beyond = switches - (len(times) - 2)
-        # A product, not a running sum: the thousandth switch falls on the grid like the first.
+        # A product, not a running sum: rounding does not accumulate.
         return times[switches + 1] if beyond <= 0 else times[-1] + beyond * (times[-1] - times[-2])

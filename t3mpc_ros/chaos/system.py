@@ -13,7 +13,7 @@ from t3mpc_ros.kernels import kernel
 
 
 class Terms(NamedTuple):
-    """The right-hand side of a quadratic system as lists of its non-zero terms, for kernels."""
+    """Non-zero terms of the right-hand side of a quadratic system, as arrays for kernels."""
 
     constant: NDArray[np.float64]
     """Shape (d,), 1/s to the order q, as all gains here."""
@@ -33,12 +33,12 @@ class QuadraticSystem:
 
     .. math:: D^{q_i} y_i = c_i + \sum_j L_{ij} y_j + \sum_{jk} Q_{ijk}\, y_j y_k
 
-    Terms that stand twice are added. States are counted from zero.
+    Repeated terms are added. States are numbered from zero.
 
     Raises
     ------
     ValueError
-        An order outside (0, 1], a state that does not exist, a gain that is not finite.
+        An order is outside (0, 1], a state does not exist, or a gain is not finite.
     """
 
     orders: tuple[float, ...]
@@ -133,8 +133,8 @@ def hyperchaotic_system(
               D^q y_3 &= -b\, y_3 + y_1 y_2 \\
               D^q y_4 &= -k\, y_2
 
-    E6: the printed second line lost the sign before ``25 y1``. It is plus, as in the system's
-    origin (Chen, Yang, Qi, Yuan, Phys. Lett. A 360, 2007): with minus (``c=-25``) every state
+    E6: the printed second line lost the sign before ``25 y1``. It is plus, as in the original
+    publication (Chen, Yang, Qi, Yuan, Phys. Lett. A 360, 2007): with minus (``c=-25``) every state
     decays to zero, with plus two Lyapunov exponents are positive at q = 1. The states then stay
     within about abs(y1) < 36, abs(y2) < 9, 1.5 < y3 < 8.6, abs(y4) < 80.
     """

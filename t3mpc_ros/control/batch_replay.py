@@ -433,11 +433,11 @@ class BatchStepper:
         """Tell the parts what has become of them, and the rows of all steps that were done."""
         parts, state = self._parts, self._state.tolist()
         track, plan, law = parts.track, parts.pursuit.plan, parts.pursuit.law
-        track.went_on(state[TRACK_FIRST], state[TRACK_END])
+        track.synchronize(state[TRACK_FIRST], state[TRACK_END])
         parts.watchdog.went_on(state[LAST_NS], state[SEEN_NS], waiting=bool(state[WAITING]))
         if len(answers):
             plan.count = state[CROSSINGS]
-            law.predictive.went_on(state[PHASE], state[SAMPLES])
+            law.predictive.synchronize(state[PHASE], state[SAMPLES])
             law.frozen = bool(state[SATURATED])
             parts.following.went_on(answers[:, COMMAND : COMMAND + 2], state[EVIDENCE])
             parts.drive.limited = bool(answers[-1, LIMITED])

@@ -148,7 +148,7 @@ class Controller:
             # The source has started again: what it said of later is no longer so.
             self._jumps = [jump for jump in self._jumps if jump.stamp_ns < motion.stamp_ns]
             self._pursuit.plan.withdraw(motion.stamp_ns)
-        if track.jumped:
+        if track.has_jumps:
             self._jumps += track.pop_jumps()
         self._freshness.reference_arrived()
         return True

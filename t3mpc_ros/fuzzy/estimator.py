@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.fuzzy.inference import basis, basis_of, combine
+from t3mpc_ros.fuzzy.inference import combine, compute_basis, evaluate_basis
 from t3mpc_ros.fuzzy.sets import FuzzyParameters, FuzzySets, build_sets
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
@@ -18,15 +18,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class AdaptationParameters(Parameters):
-    """How fast the coefficients learn, and what they must not do."""
+    """Gains and bounds of the adaptation."""
 
-    enabled: bool = parameter(True, 'whether the coefficients are adapted at all', dynamic=True)
+    enabled: bool = parameter(True, 'whether the coefficients are adapted', dynamic=True)
     gamma: float = parameter(
         240.0,
-        'adaptation gain gamma of (77)-(78). What is felt is the normalised gain gamma |Phi|² '
-        '(1/s²): the error then obeys s² + K s + gamma |Phi|² = 0. With the default type-3 sets '
-        '|Phi|² is 0.015 to 0.14, so 240 makes about 15; with type1 or interval_type2 it is about '
-        'three times larger, so a third of gamma does the same',
+        'adaptation gain gamma of (77)-(78). The normalised gain gamma |Phi|² (1/s²) determines '
+        'the dynamics of the error: s² + K s + gamma |Phi|² = 0. With the default type-3 sets '
+        '|Phi|² is 0.015 to 0.14, so 240 gives about 15; with type1 or interval_type2 it is about '
+        'three times larger, so a third of gamma gives the same dynamics',
         unit='1/s²',
         low=0.0,
         high=1e6,
@@ -34,9 +34,9 @@ class AdaptationParameters(Parameters):
     )
     radius: float = parameter(
         40.0,
-        'root mean square of the coefficients of an output at the surface of the ball they are '
-        'projected onto, |alpha| <= radius sqrt(2 r lambda): a constant estimate of this size '
-        'just fits in, whatever the number of rules',
+        'radius of the ball that the coefficients of an output are projected onto, as a root mean '
+        'square: |alpha| <= radius sqrt(2 r lambda), so the largest constant estimate is radius '
+        'for any number of rules',
         unit='rad/s²',
         low=0.0,
         high=1e4,
@@ -44,8 +44,8 @@ class AdaptationParameters(Parameters):
     )
     sigma_modification: float = parameter(
         0.0,
-        'rate at which coefficients leak towards zero (gamma times the usual sigma); bounds them '
-        'without a known ball, at the price of a bias',
+        'rate of the leakage of the coefficients towards zero (gamma times the usual sigma); '
+        'bounds them without a known ball, but biases them',
         unit='1/s',
         low=0.0,
         high=10.0,
@@ -53,9 +53,9 @@ class AdaptationParameters(Parameters):
     )
     dead_zone: float = parameter(
         0.0,
-        'error from which on coefficients adapt; a smaller one counts as noise. At least the '
-        'disturbance that no coefficients can explain divided by K; noise about as wide already '
-        'drifts little',
+        'error below which the coefficients do not adapt. It should be at least the disturbance '
+        'that the coefficients cannot represent, divided by K; even noise of about this size '
+        'causes little drift',
         unit='rad/s',
         low=0.0,
         high=10.0,
@@ -63,8 +63,8 @@ class AdaptationParameters(Parameters):
     )
     step_limit: float = parameter(
         2.0,
-        'largest gamma |Phi|² dt of one step, beyond which gamma is reduced; the sampled loop is '
-        'stable only while it stays below K',
+        'maximum of gamma |Phi|² dt per step, above which gamma is reduced; the sampled loop is '
+        'stable only below K',
         unit='1/s',
         low=0.001,
         high=1000.0,
@@ -76,7 +76,7 @@ class AdaptationParameters(Parameters):
 def beyond_dead_zone(error: float, width: float) -> float:
     """Return the part of ``error`` outside the dead zone, delta - sat(delta), rad/s.
 
-    It is continuous: a switch at the edge would let noise adapt in full steps.
+    It is continuous: with a step at the edge, noise would adapt the coefficients fully.
     """
     return error - min(max(error, -width), width)
 
@@ -93,32 +93,32 @@ def adapt(
     dead_zone: float,
     step_limit: float,
 ) -> bool:
-    r"""Adapt the coefficients over ``dt`` and decide whether the errors could be used.
+    r"""Adapt the coefficients over ``dt``; return whether the errors are finite.
 
     .. math:: \dot\alpha = \gamma\Phi\,(\delta - \mathrm{sat}(\delta)) - \sigma\alpha,
               \qquad \|\alpha\| \le \rho
 
-    (77)-(78) alone make V of (74) decrease only while estimation errors omega are absent. Under
-    noise alpha is a sum of random steps and drifts without bound. With
-    alpha~ = alpha* - alpha, each addition has its own argument (Ioannou and Sun, Robust Adaptive
-    Control, 1996, chapter 8; Narendra and Annaswamy, Stable Adaptive Systems, 1989, chapter 8):
+    With (77)-(78) alone, V of (74) decreases only without estimation errors omega; under noise
+    alpha is a sum of random steps and drifts without bound. With alpha~ = alpha* - alpha, each
+    modification has its own proof (Ioannou and Sun, Robust Adaptive Control, 1996, chapter 8;
+    Narendra and Annaswamy, Stable Adaptive Systems, 1989, chapter 8):
 
-    - *Dead zone.* Take V with d = delta - sat(delta) in the place of delta. Outside the zone
+    - *Dead zone.* Let V contain d = delta - sat(delta) instead of delta. Outside the zone
       d delta = |d|(|d| + width), so V' <= -K d² - |d|(K width - |omega|): V decreases whenever
-      the width is at least |omega|/K. Inside, d = 0 and V rests: nothing drifts.
+      the width is at least |omega|/K. Inside, d = 0 and V is constant: there is no drift.
     - *sigma-modification.* The leakage adds (sigma/gamma) alpha~'alpha to V', which is at most
       (sigma/2 gamma)(|alpha*|² - |alpha~|²): negative once alpha~ is larger than alpha*, so
-      alpha is bounded for any omega. Its decay is taken exactly, hence stable at any dt.
-    - *Projection.* The nearest point of a convex set is no farther from any member than the
-      point was: while alpha* lies in the ball, |alpha~| and so V can only shrink by it. This
-      holds for whole steps too, unlike the usual projection of the derivative.
+      alpha is bounded for any omega. The decay is computed exactly, hence stable at any dt.
+    - *Projection.* Projection onto a convex set does not increase the distance to any of its
+      members: while alpha* lies in the ball, |alpha~| and V do not increase. This also applies
+      to a finite step, unlike the usual projection of the derivative.
     - *Step limit.* With sampling, delta and the estimate follow the matrix
       [[1 - K dt, dt], [-gamma |Phi|² dt, 1]]. By Jury's conditions it is stable, for K dt < 2,
-      exactly when its determinant is below one: gamma |Phi|² dt² < K dt. So the step's
-      gamma |Phi|² dt is capped at a rate below K, whatever gamma and however long the step.
+      exactly when its determinant is below one: gamma |Phi|² dt² < K dt. The step's
+      gamma |Phi|² dt is therefore limited to a rate below K, for any gamma and any dt.
 
     coefficients : shape (m, p), alpha, updated, rad/s²
-    phi : shape (p,), basis at which the errors arose
+    phi : shape (p,), basis of the evaluation before the errors
     errors : shape (m,), delta, rad/s
     dt : s, not negative
     gamma : 1/s²
@@ -135,13 +135,13 @@ def adapt(
     power = 0.0
     for k in range(phi.size):
         power += phi[k] * phi[k]
-    # Without a basis no coefficient bears any blame; any finite gain then does nothing.
+    # Without a basis no coefficient changes at any finite gain.
     gain = gamma * dt if power > 0.0 else 0.0
     if gain * power > step_limit:
         gain = step_limit / power
     keep = math.exp(-leakage * dt)
     for z in range(errors.size):
-        # Errors beyond 1e9 end on the ball's surface like that one, without overflow.
+        # Larger errors than 1e9 give the same point on the ball, and would overflow.
         step = gain * beyond_dead_zone(min(max(errors[z], -1e9), 1e9), dead_zone)
         square = 0.0
         for k in range(phi.size):
@@ -173,30 +173,30 @@ def estimate(
     """Write basis and outputs (31); return False, and change nothing, unless inputs are finite.
 
     inputs        : shape (n,), U, rad/s
-    centres ... phi : as in :func:`t3mpc_ros.fuzzy.inference.basis`
+    centres ... phi : as in :func:`t3mpc_ros.fuzzy.inference.evaluate_basis`
     coefficients, outputs : as in :func:`t3mpc_ros.fuzzy.inference.combine`
     """
     for i in range(inputs.size):
         if not math.isfinite(inputs[i]):
             return False
-    basis(inputs, centres, nonsingleton_gain, sharpness, shares, grades, firings, phi)
+    evaluate_basis(inputs, centres, nonsingleton_gain, sharpness, shares, grades, firings, phi)
     combine(coefficients, phi, outputs)
     return True
 
 
 class FuzzyEstimator:
-    """Estimates g of chi' = g(U|alpha) + u (30) from the wheel speeds, and learns it.
+    """Estimates g of chi' = g(U|alpha) + u (30) from the wheel speeds, and adapts to them.
 
     All outputs share one basis, as in (70)-(71): the inputs and the sets are the same, and an
-    error of the coefficients alpha* - alpha makes the error (alpha* - alpha)ᵀ Phi of g. Work
-    space belongs to the object, so that a call costs one kernel and no allocation but the result.
+    error of the coefficients alpha* - alpha causes the error (alpha* - alpha)ᵀ Phi of g. The
+    object owns the work space, so a call runs one kernel and allocates only the result.
 
     Parameters
     ----------
     settings
-        Shape of the fuzzy system.
+        Fuzzy sets.
     adaptation
-        How it learns.
+        Gains and bounds of the adaptation.
     outputs
         Number of outputs m, two for two wheels.
     inputs
@@ -205,7 +205,7 @@ class FuzzyEstimator:
     Raises
     ------
     ValueError
-        Inputs or outputs are fewer than one, or the rules too many.
+        Inputs or outputs are fewer than one, or there are too many rules.
     """
 
     def __init__(
@@ -232,28 +232,28 @@ class FuzzyEstimator:
             self._phi,
             self._coefficients,
         )
-        """What :func:`estimate` reads and writes between inputs and outputs, in its order."""
+        """Arguments of :func:`estimate` between inputs and outputs, in its order."""
         self.configure(adaptation)
 
     def configure(self, adaptation: AdaptationParameters) -> None:
-        """Learn differently from the next step on; what was learnt is kept."""
+        """Replace the adaptation parameters from the next step on; keep the coefficients."""
         self._adaptation = adaptation
         self._radius = adaptation.radius * math.sqrt(self._sets.size)
 
     def reset(self) -> None:
-        """Forget what was learnt: all coefficients zero, no basis until the next evaluation."""
+        """Set all coefficients to zero, and clear the basis until the next evaluation."""
         self._coefficients[:] = 0.0
         self._phi[:] = 0.0
 
     def warm_up(self) -> None:
-        """Compile the kernels now, never inside a step; the state is left as it was."""
+        """Compile the kernels now instead of in the first step, without changing the state."""
         phi, coefficients = self._phi.copy(), self._coefficients.copy()
         self.evaluate(np.zeros(self._sets.inputs))
         self._adapt(np.zeros(coefficients.shape[0]), 0.0)
         self._phi[:], self._coefficients[:] = phi, coefficients
 
     def evaluate(self, inputs: Array) -> Array:
-        """Return the estimates g (rad/s²), shape (m,), equation (31), and keep the basis.
+        """Return the estimates g (rad/s²), shape (m,), equation (31), and store the basis.
 
         Parameters
         ----------
@@ -263,7 +263,7 @@ class FuzzyEstimator:
         Raises
         ------
         ValueError
-            The inputs are not n finite numbers; the basis of before is kept.
+            The inputs are not n finite numbers; the basis is unchanged.
         """
         values = np.ascontiguousarray(inputs, dtype=np.float64)
         sets = self._sets
@@ -273,23 +273,22 @@ class FuzzyEstimator:
         return outputs
 
     def adapt(self, errors: Array, dt: float) -> None:
-        """Let the coefficients learn from the tracking errors, equations (77)-(78).
+        """Adapt the coefficients to the tracking errors, equations (77)-(78).
 
-        The basis is that of the last :meth:`evaluate`; without one there is nothing to blame the
-        error on and nothing is learnt.
+        The basis is that of the last :meth:`evaluate`; without one the coefficients do not change.
 
         Parameters
         ----------
         errors
-            delta = chi - r of the same instant, shape (m,), rad/s.
+            delta = chi - r at the same instant, shape (m,), rad/s.
         dt
-            Seconds since the last step.
+            Time since the last step, s.
 
         Raises
         ------
         ValueError
-            The errors are not m finite numbers, or dt is negative or not finite; nothing is
-            learnt.
+            The errors are not m finite numbers, or dt is negative or not finite; the coefficients
+            are unchanged.
         """
         if not 0.0 <= dt < math.inf:
             raise ValueError(f'dt must be finite and not negative: got {dt} s')
@@ -298,22 +297,22 @@ class FuzzyEstimator:
 
     @property
     def radius(self) -> float:
-        """Radius of the ball that each output's coefficients stay in, rad/s²."""
+        """Radius of the ball of each output's coefficients, rad/s²."""
         return self._radius
 
     @property
     def sets(self) -> FuzzySets:
-        """The tables of the fuzzy system."""
+        """Tables of the fuzzy system."""
         return self._sets
 
     @property
     def adaptation(self) -> AdaptationParameters:
-        """How it learns at present."""
+        """Present parameters of the adaptation."""
         return self._adaptation
 
     @property
     def basis(self) -> Array:
-        """A copy of Phi of the last evaluation, shape (2 r lambda,); zeros before any."""
+        """A copy of Phi of the last evaluation, shape (2 r lambda,); zeros before the first."""
         return self._phi.copy()
 
     @property
@@ -321,15 +320,12 @@ class FuzzyEstimator:
         """A copy of alpha, shape (m, 2 r lambda), rad/s², in the order of (32).
 
         They are the consequents of the rules (28), one at the lower and one at the upper level
-        of each slice.
-
-        Setting it checks it; coefficients outside the ball are brought back by the next step
-        of adaptation.
+        of each slice. The next adaptation step projects coefficients outside the ball onto it.
 
         Raises
         ------
         ValueError
-            When set to another shape, or to numbers that are not all finite.
+            Set to an array of another shape, or with a number that is not finite.
         """
         return self._coefficients.copy()
 
@@ -368,25 +364,25 @@ class FuzzyEstimator:
 def gamma_for(
     parameters: FuzzyParameters, normalised_gain: float, inputs: int = 2, samples: int = 400
 ) -> float:
-    """Return the gamma (1/s²) whose normalised gain gamma |Phi|² is this on average.
+    """Return the gamma (1/s²) of a given mean normalised gain gamma |Phi|².
 
-    |Phi|² depends on the kind of sets and their number: systems compared at the same gamma
-    would learn at different speeds, and the comparison would be of nothing else.
+    |Phi|² depends on the kind and the number of the sets: at the same gamma, fuzzy systems adapt
+    at different rates, which would dominate their comparison.
 
     Parameters
     ----------
     settings
-        Shape of the fuzzy system.
+        Fuzzy sets.
     normalised_gain
-        Wanted mean of gamma |Phi|², 1/s².
+        Mean of gamma |Phi|², 1/s².
     inputs
         Number of inputs.
     samples
-        Inputs averaged over, uniform between the first and last centre, from a fixed seed.
+        Number of inputs in the mean, uniform between first and last centre, from a fixed seed.
     """
     sets = build_sets(parameters, inputs)
     drawn = np.random.default_rng(0).uniform(
         parameters.centre_low, parameters.centre_high, (samples, inputs)
     )
-    power = np.mean([np.sum(basis_of(point, sets) ** 2) for point in drawn])
+    power = np.mean([np.sum(compute_basis(point, sets) ** 2) for point in drawn])
     return float(normalised_gain / power)

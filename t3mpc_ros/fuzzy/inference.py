@@ -1,6 +1,11 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Inference of the non-singleton type-3 fuzzy system, equations (16)-(33) with E7 and E8."""
+"""Inference of the non-singleton type-3 fuzzy system, equations (16)-(33) with E7 and E8.
+
+Arrays over sets have shape (n, M, lambda, 2, 2): input, set, slice, level, bound; arrays over
+rules (r, lambda, 2, 2). On the last two axes 0 is lower and 1 is upper, as in
+:mod:`t3mpc_ros.fuzzy.sets`, which builds the tables.
+"""
 
 import math
 
@@ -14,57 +19,56 @@ Array = NDArray[np.float64]
 
 
 @kernel
-def fuzzify(inputs: Array, centres: Array, nonsingleton_gain: Array, found: Array) -> None:
-    r"""Write where each fuzzy input meets each set, equations (16)-(19).
+def fuzzify(inputs: Array, centres: Array, nonsingleton_gain: Array, maxima: Array) -> None:
+    r"""Write the maximum x* of the product of fuzzy input and set, equations (16)-(19).
 
     .. math:: x^* = \frac{U\beta^2 + o\beta_U^2}{\beta^2 + \beta_U^2}
                   = U + (o - U)\frac{\beta_U^2}{\beta^2 + \beta_U^2}
 
-    This is where the product of the input's Gaussian about U and the set's Gaussian about o is
-    largest. The second form is U itself, to the last bit, when the input is not fuzzy. With the
-    upper width it is (16) at the upper level of a slice and (17) at the lower one, with the lower
-    width (18) and (19).
+    The product is that of the input's Gaussian about U and the set's Gaussian about o. The second
+    form is exactly U when the input is not fuzzy. With the upper width it is (16) at the upper
+    level of a slice and (17) at the lower one, with the lower width (18) and (19).
 
     inputs : shape (n,), U, rad/s
     centres : shape (n, M), o, rad/s
-    pull : shape (n, M, lambda, 2, 2), the last fraction
-    found : shape as pull, overwritten, x*, rad/s
+    nonsingleton_gain : shape (n, M, lambda, 2, 2), the last fraction
+    maxima : shape as nonsingleton_gain, overwritten, x*, rad/s
     """
     for i in range(centres.shape[0]):
-        # From 1e9 rad/s on, the nearest rule has long taken all of the weight: the bound changes
-        # nothing there, and keeps squares finite for any finite input.
+        # Above 1e9 rad/s the nearest rule has all of the weight, so the limit does not change the
+        # result; it keeps squares finite for any finite input.
         value = min(max(inputs[i], -1e9), 1e9)
         for h in range(centres.shape[1]):
             offset = centres[i, h] - value
             for j in range(nonsingleton_gain.shape[2]):
                 for level in range(2):
                     for bound in range(2):
-                        found[i, h, j, level, bound] = (
+                        maxima[i, h, j, level, bound] = (
                             value + offset * nonsingleton_gain[i, h, j, level, bound]
                         )
 
 
 @kernel
-def square_distances(found: Array, centres: Array, sharpness: Array, squares: Array) -> None:
+def square_distances(maxima: Array, centres: Array, sharpness: Array, squares: Array) -> None:
     r"""Write the exponents :math:`((x^* - o)/\beta)^2` of the memberships (20)-(23) with E7.
 
-    With the upper width it is that of (20) at the upper level of a slice and of (21) at the lower
-    one, with the lower width of (22) and (23).
+    With the upper width these are the exponents of (20) at the upper level of a slice and of (21)
+    at the lower one, with the lower width those of (22) and (23).
 
-    E7: the exponent is squared in a Gaussian; the printed one is linear, and lets grades grow
-    beyond one on one side of the centre.
+    E7: the exponent of a Gaussian is squared; the printed one is linear, and grades exceed one on
+    one side of the centre.
 
-    found, sharpness : shape (n, M, lambda, 2, 2), x* (rad/s) and 1/beta (s/rad)
+    maxima, sharpness : shape (n, M, lambda, 2, 2), x* (rad/s) and 1/beta (s/rad)
     centres : shape (n, M), rad/s
-    squares : shape as found, overwritten; may be found itself
+    squares : shape as maxima, overwritten; may be maxima itself
     """
     for i in range(centres.shape[0]):
         for h in range(centres.shape[1]):
             centre = centres[i, h]
-            for j in range(found.shape[2]):
+            for j in range(maxima.shape[2]):
                 for level in range(2):
                     for bound in range(2):
-                        apart = found[i, h, j, level, bound] - centre
+                        apart = maxima[i, h, j, level, bound] - centre
                         apart *= sharpness[i, h, j, level, bound]
                         squares[i, h, j, level, bound] = apart * apart
 
@@ -75,8 +79,8 @@ def memberships(
 ) -> None:
     r"""Write the grades :math:`\zeta = \exp(-((x^* - o)/\beta)^2)`, (16)-(23) with E7.
 
-    They are (20), (21), (22) and (23) for upper and lower width, upper and lower level each. A
-    control step takes :func:`relative_memberships` instead, which cannot underflow.
+    They are (20) and (21) for the upper width at upper and lower level, (22) and (23) for the
+    lower width. A control step uses :func:`relative_memberships` instead, which cannot underflow.
     Arguments as in :func:`fuzzify` and :func:`square_distances`; ``grades`` is overwritten.
     """
     fuzzify(inputs, centres, nonsingleton_gain, grades)
@@ -88,12 +92,12 @@ def memberships(
 
 @kernel
 def relative_memberships(squares: Array) -> None:
-    """Turn exponents into grades whose products are the firings over the strongest firing.
+    """Replace exponents by grades whose products are firing strengths relative to the largest.
 
-    (33) divides each firing by their sum over the rules, so a factor that all rules of a slice
-    and level share changes nothing. Taking out the strongest one before the exponential leaves
-    it at exactly one: the sum cannot underflow, however far the inputs are from all centres.
-    Lower and upper bound keep their ratio, which goes to the grades of the first input.
+    (33) divides each firing strength by their sum over the rules, so a factor common to all rules
+    of a slice and level cancels. Removing the largest one before the exponential makes it exactly
+    one: the sum cannot underflow, however far the inputs are from all centres. The ratio of lower
+    and upper bound is kept in the grades of the first input.
 
     squares : shape (n, M, lambda, 2, 2), exponents from :func:`square_distances`, overwritten
         with the relative grades
@@ -102,7 +106,7 @@ def relative_memberships(squares: Array) -> None:
         for level in range(2):
             lower = _subtract_nearest(squares, j, level, 0)
             upper = _subtract_nearest(squares, j, level, 1)
-            # The difference first: a small square must not be lost beside a large sum.
+            # The difference first: rounding must not lose a small square beside a large sum.
             strongest = min(lower, upper)
             for h in range(squares.shape[1]):
                 squares[0, h, j, level, 0] += lower - strongest
@@ -114,7 +118,7 @@ def relative_memberships(squares: Array) -> None:
 
 @kernel
 def _subtract_nearest(squares: Array, j: int, level: int, bound: int) -> float:
-    """Make each input's smallest square zero; return the sum of what was taken off."""
+    """Subtract each input's smallest square; return the sum of the subtracted squares."""
     total = 0.0
     for i in range(squares.shape[0]):
         nearest = squares[i, 0, j, level, bound]
@@ -128,24 +132,24 @@ def _subtract_nearest(squares: Array, j: int, level: int, bound: int) -> float:
 
 @kernel
 def firing_strengths(grades: Array, firings: Array) -> None:
-    r"""Write the firing of every rule, :math:`\Omega^l = \prod_i \zeta_i`, (24)-(27).
+    r"""Write the firing strengths of the rules, :math:`\Omega^l = \prod_i \zeta_i`, (24)-(27).
 
-    A rule (28) takes one set of each input. Upper grades make (24) at the upper level of a slice
-    and (25) at the lower one, lower grades (26) and (27).
+    A rule (28) combines one set of each input. Upper grades give (24) at the upper level of a
+    slice and (25) at the lower one, lower grades (26) and (27).
 
     grades : shape (n, M, lambda, 2, 2)
     firings : shape (r, lambda, 2, 2) with r = M**n, overwritten; the last input's set changes
         fastest from rule to rule
     """
     inputs, sets = grades.shape[0], grades.shape[1]
-    # Slices, levels and bounds lie together in memory, and are all treated alike.
+    # Slices, levels and bounds are contiguous in memory and have the same computation.
     each = grades.reshape((inputs, sets, -1))
     products = firings.reshape((firings.shape[0], -1))
     products[0] = 1.0
     count = 1
     for i in range(inputs):
-        # Each product so far becomes M products. Going down, none is overwritten before it has
-        # been used: its children's places are not below its own.
+        # Each product is expanded into M products. In descending order none is overwritten before
+        # its use, because the indices of its products are not below its own.
         for rule in range(count - 1, -1, -1):
             for h in range(sets - 1, -1, -1):
                 for k in range(products.shape[1]):
@@ -154,16 +158,16 @@ def firing_strengths(grades: Array, firings: Array) -> None:
 
 
 @kernel
-def weigh(firings: Array, shares: Array, phi: Array) -> None:
+def basis(firings: Array, shares: Array, phi: Array) -> None:
     r"""Write the basis, equation (33) with E8.
 
     .. math:: \Phi = \frac{\varsigma_j}{\sum_j(\underline\varsigma_j + \bar\varsigma_j)}
                      \frac{\bar\Omega^l + \underline\Omega^l}
                           {\sum_l(\bar\Omega^l + \underline\Omega^l)}
 
-    E8: the printed factor 0.5 / (sum of upper levels) makes the basis add up to less than one
-    and draws the output towards zero; over the sum of all levels it is a convex combination.
-    The sums run over the rules, where the printed (33) repeats rule one.
+    E8: with the printed factor 0.5 / (sum of upper levels) the basis adds up to less than one,
+    which biases the output towards zero; with the sum of all levels it is a convex combination.
+    The sums are over the rules, where the printed (33) repeats rule one.
 
     firings : shape (r, lambda, 2, 2), up to a factor common to the rules
     shares : shape (lambda, 2), levels over the sum of all levels
@@ -186,7 +190,7 @@ def weigh(firings: Array, shares: Array, phi: Array) -> None:
 
 
 @kernel
-def basis(
+def evaluate_basis(
     inputs: Array,
     centres: Array,
     nonsingleton_gain: Array,
@@ -196,13 +200,13 @@ def basis(
     firings: Array,
     phi: Array,
 ) -> None:
-    """Write the basis Phi of the inputs: (16)-(27), (33) with E7 and E8 in one call.
+    """Write the basis Phi of the inputs in one call: (16)-(27), (33) with E7 and E8.
 
-    Exponentials are taken per input and set, not per rule. For any finite inputs the basis is
-    not negative and adds up to one; ``grades`` and ``firings`` are relative to the strongest.
+    Exponentials are computed per input and set, not per rule. For any finite inputs the basis is
+    not negative and adds up to one; ``grades`` and ``firings`` are relative to the largest.
 
     inputs : shape (n,), U, rad/s, finite
-    centres, pull, sharpness, shares : tables of :class:`FuzzySets`
+    centres, nonsingleton_gain, sharpness, shares : tables of :class:`FuzzySets`
     grades, firings : shapes (n, M, lambda, 2, 2) and (r, lambda, 2, 2), overwritten
     phi : shape (2 r lambda,), overwritten, order of (32)
     """
@@ -210,7 +214,7 @@ def basis(
     square_distances(grades, centres, sharpness, grades)
     relative_memberships(grades)
     firing_strengths(grades, firings)
-    weigh(firings, shares, phi)
+    basis(firings, shares, phi)
 
 
 @kernel
@@ -228,10 +232,10 @@ def combine(coefficients: Array, phi: Array, outputs: Array) -> None:
         outputs[z] = total
 
 
-def basis_of(inputs: Array, sets: FuzzySets) -> Array:
+def compute_basis(inputs: Array, sets: FuzzySets) -> Array:
     """Return the basis Phi of one input vector, shape (2 r lambda,), equation (33) with E8.
 
-    For experiments and figures: it allocates, which a control step does not.
+    For experiments and figures: it allocates memory, which a control step must not.
 
     Raises
     ------
@@ -244,7 +248,7 @@ def basis_of(inputs: Array, sets: FuzzySets) -> Array:
     grades = np.empty(sets.widths.shape)
     firings = np.empty((sets.rules, sets.slices, 2, 2))
     phi = np.empty(sets.size)
-    basis(
+    evaluate_basis(
         values,
         sets.centres,
         sets.nonsingleton_gain,
@@ -266,17 +270,17 @@ def output_by_double_sum(inputs: Array, sets: FuzzySets, lower: Array, upper: Ar
         \bar\alpha_{l,j}}{\sum_l(\bar\Omega^l_{\bar\varsigma_j} +
         \underline\Omega^l_{\bar\varsigma_j})} + \underline\varsigma_j\frac{\cdots}{\cdots}\right)
 
-    E8: each slice is a mean of the coefficients weighted by the firings, hence without the
-    printed 1/2, and the slices are averaged with their own levels as weights. Written as it
-    reads, one number at a time, as a check of (31)-(33); too slow for a control step, and it
-    divides 0 by 0 far outside the centres, where every firing underflows.
+    E8: each slice is a mean of the coefficients weighted by the firing strengths, hence without
+    the printed 1/2, and the slices are averaged with their levels as weights. An independent,
+    literal implementation that checks (31)-(33): too slow for a control step, and 0/0 far outside
+    the centres, where every firing strength underflows.
 
     Parameters
     ----------
     inputs
         U, shape (n,), rad/s.
     sets
-        The tables; only centres, widths, levels and the fuzziness of the inputs are used.
+        Tables, of which centres, widths, levels and input fuzziness are used.
     lower, upper
         Rule coefficients at the lower and upper levels, shape (r, lambda) each, rad/s².
     """

@@ -1,6 +1,11 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Gaussian fuzzy sets of type 3, and of type 2 and 1 as special cases, as tables."""
+"""Gaussian fuzzy sets of type 3, and of type 2 and 1 as special cases, as tables.
+
+At each slice level a type-3 set is an interval type-2 set: one centre, two widths (Fig. 4). The
+kinds of fuzzy system differ only in the numbers of these tables, and share one inference, so a
+comparison of the kinds differs in nothing else.
+"""
 
 from dataclasses import dataclass, field
 
@@ -12,20 +17,20 @@ from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 Array = NDArray[np.float64]
 
 LOWER, UPPER = 0, 1
-"""Places on the last two axes of the tables: lower and upper level, lower and upper width."""
+"""Indices on the last two axes of the tables: lower and upper level, lower and upper width."""
 
 MAX_COEFFICIENTS = 100_000
-"""Most coefficients per output that are accepted: M**n grows fast with the inputs n."""
+"""Maximum number of coefficients per output: M**n grows fast with the number of inputs n."""
 
 
 @dataclass(frozen=True)
 class FuzzyParameters(Parameters):
-    """The shape of the fuzzy system; the same for all its inputs."""
+    """Fuzzy sets of the inputs, the same for every input."""
 
     kind: str = parameter(
         'type3',
-        'what the sets are; type1 and interval_type2 are single slices at level one, the latter '
-        'with the footprint set below',
+        'type of the sets; type1 and interval_type2 are single slices at level one, the latter with '
+        'footprint_of_uncertainty',
         choices=('type3', 'interval_type2', 'type1'),
         source='paper: NT3FS, compared with the others',
     )
@@ -42,30 +47,30 @@ class FuzzyParameters(Parameters):
     )
     centre_exponent: float = parameter(
         2.0,
-        'how much closer together the centres are in the middle, where Coulomb friction changes '
-        'its sign: their places in [-1, 1] are raised to this power; 1 is even',
+        'exponent of the centre positions in [-1, 1]: above 1 the centres are denser in the '
+        'middle, where Coulomb friction changes its sign; 1: evenly spaced',
         low=0.2,
         high=5.0,
     )
     spread: float = parameter(
         0.6,
         'width sigma of the sets as a fraction of the centre spacing, in exp(-((x - o)/sigma)²); '
-        'at 0.6 neighbours cross at grade one half (a single set has the range as its spacing)',
+        'at 0.6 adjacent sets cross at grade one half (the spacing of a single set is the range)',
         low=0.05,
         high=10.0,
     )
-    slices: int = parameter(4, 'slices lambda of the type-3 sets', low=1, high=32)
+    slices: int = parameter(4, 'number of slices lambda of the type-3 sets', low=1, high=32)
     footprint_of_uncertainty: float = parameter(
         0.23,
-        'interval_type2 only: widths are (1 - footprint) sigma and (1 + footprint) sigma; at '
-        '0.23 as wide as the type-3 default is on average, weighted by level',
+        'interval_type2 only: widths are (1 - f) sigma and (1 + f) sigma; 0.23 is the mean of the '
+        'type-3 default, weighted by level',
         low=0.0,
         high=0.95,
     )
     input_fuzziness: float = parameter(
         0.283,
         'fuzziness of the inputs beta_U, in exp(-((x - U)/beta_U)²): sqrt(2) times the standard '
-        'deviation of the noise (0.2 rad/s); zero makes the fuzzifier a singleton',
+        'deviation of the noise (0.2 rad/s); 0: singleton fuzzifier',
         unit='rad/s',
         low=0.0,
         high=100.0,
@@ -73,7 +78,7 @@ class FuzzyParameters(Parameters):
     )
 
     def check_consistency(self) -> None:
-        """Raise ParameterError unless the centres ascend."""
+        """Raise :class:`ParameterError` unless the centres ascend."""
         if self.centre_high <= self.centre_low:
             raise ParameterError(
                 f'centre_high must be above centre_low ({self.centre_low:g} rad/s): '
@@ -92,7 +97,7 @@ class FuzzyParameters(Parameters):
 
     @property
     def widths(self) -> Array:
-        """Widths sigma of the sets at level one, rad/s, shape (M,): by the spacing around each."""
+        """Widths sigma of the sets at level one, rad/s, shape (M,), from the local spacing."""
         if self.sets == 1:
             return np.array([self.spread * (self.centre_high - self.centre_low)])
         return self.spread * np.gradient(self.centres)
@@ -100,15 +105,15 @@ class FuzzyParameters(Parameters):
 
 @dataclass(frozen=True, eq=False)
 class FuzzySets:
-    """The tables that inference reads; checked when made and read-only from then on.
+    """Tables of the inference, validated and read-only.
 
-    n inputs, M sets per input, lambda slices. The rules are all M**n combinations, the last
-    input's set changing fastest.
+    n inputs, M sets per input, lambda slices. The rules are all M**n combinations; the set of the
+    last input changes fastest.
 
     Raises
     ------
     ValueError
-        A table has the wrong shape or a value out of range; the message names it.
+        A table has the wrong shape or a value out of range.
     """
 
     centres: Array
@@ -118,16 +123,16 @@ class FuzzySets:
     (lower, upper) and the bound (lower, upper width)."""
     levels: Array
     """Slice levels, shape (lambda, 2): lower and upper level of each slice, in (0, 1]. The paper
-    has the lower one strictly below; equality is the limit in which a slice is one level."""
+    has the lower one strictly below; when they are equal, the slice is one level."""
     input_fuzziness: float
     """beta_U, rad/s."""
     nonsingleton_gain: Array = field(init=False)
-    """beta_U² / (beta² + beta_U²): how far (16)-(19) draw the input to the centre; as widths."""
+    """beta_U² / (beta² + beta_U²), the weight of the centre in (16)-(19); shape as widths."""
     sharpness: Array = field(init=False)
     """1/beta, s/rad, shape as widths."""
     shares: Array = field(init=False)
     """Levels over their sum, shape (lambda, 2). E8: the sum runs over lower *and* upper levels,
-    so that the shares add up to one and the output stays within the hull of the coefficients."""
+    so that the shares add up to one and the output lies in the hull of the coefficients."""
 
     def __post_init__(self) -> None:
         centres, widths, levels = (
@@ -198,16 +203,16 @@ def _check_size(inputs: int, sets: int, slices: int) -> None:
     size = 2 * sets**inputs * slices
     if size > MAX_COEFFICIENTS:
         raise ValueError(
-            f'inputs must leave at most {MAX_COEFFICIENTS} coefficients: got {inputs} inputs of {sets} '
-            f'sets with {slices} slices, which make {size}'
+            f'inputs must give at most {MAX_COEFFICIENTS} coefficients: got {inputs} inputs of {sets} '
+            f'sets with {slices} slices, {size} in total'
         )
 
 
 def slice_levels(slices: int) -> Array:
     """Return the lower and upper level of each slice, shape (slices, 2).
 
-    Both kinds of level are evenly spaced and interleave up to one: with four slices the lower
-    levels are 1/8, 3/8, 5/8, 7/8 and the upper ones 2/8, 4/8, 6/8, 8/8.
+    Lower and upper levels are evenly spaced and alternate: with four slices the lower levels are
+    1/8, 3/8, 5/8, 7/8 and the upper ones 2/8, 4/8, 6/8, 8/8.
     """
     return np.arange(1, 2 * slices + 1, dtype=np.float64).reshape(slices, 2) / (2 * slices)
 
@@ -218,28 +223,28 @@ def type3_widths(width: float, levels: Array) -> Array:
     .. math:: \bar\beta(\varsigma) = \sigma\varsigma^{-1/2}, \qquad
               \underline\beta(\varsigma) = \sigma\varsigma^{+1/2}
 
-    Raising the grade exp(-((x - o)/sigma)²) to the power of the level gives a Gaussian of the
-    first width, raising it to the inverse of the level one of the second. At level one both are
-    sigma, which is type-1; the lower the level, the wider the footprint.
+    The grade exp(-((x - o)/sigma)²) to the power of the level is a Gaussian of the first width, to
+    the inverse of the level one of the second. At level one both are sigma, which is type-1; the
+    footprint increases as the level decreases.
     """
     root = np.sqrt(levels)
     return np.stack([width * root, width / root], axis=-1)
 
 
 def build_sets(parameters: FuzzyParameters, inputs: int = 2) -> FuzzySets:
-    """Return the tables of ``inputs`` equal inputs.
+    """Return the tables for ``inputs`` equal inputs.
 
     Raises
     ------
     ValueError
-        There is no input, or the combinations of sets are too many.
+        There is no input, or there are too many combinations of sets.
     """
     if inputs < 1:
         raise ValueError(f'inputs must be at least 1: got {inputs}')
     if parameters.kind == 'type3':
         levels = slice_levels(parameters.slices)
     else:
-        levels = np.ones((1, 2))  # one slice, at level one: secondary grades are all one
+        levels = np.ones((1, 2))  # one slice at level one: all secondary grades are one
     _check_size(inputs, parameters.sets, len(levels))
     each = np.stack([type3_widths(width, levels) for width in parameters.widths.tolist()])
     if parameters.kind == 'interval_type2':

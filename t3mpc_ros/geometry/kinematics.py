@@ -11,7 +11,7 @@ from t3mpc_ros.parameters.table import Parameters, parameter
 
 @dataclass(frozen=True)
 class WheelGeometry(Parameters):
-    """The two lengths that turn wheel speeds into body speeds."""
+    """Wheel radius and separation, which relate wheel speeds to the body twist."""
 
     wheel_radius: float = parameter(
         0.035, 'wheel radius R', unit='m', low=0.005, high=1.0, source='paper: 7 cm wheels'
@@ -22,11 +22,11 @@ class WheelGeometry(Parameters):
 
     @property
     def half_separation(self) -> float:
-        """The paper's iota, b (m). E1: it is *half* the separation, or omega comes out halved."""
+        """The paper's iota, b (m). E1: *half* the separation; the full one would halve omega."""
         return 0.5 * self.wheel_separation
 
 
-# Plain, because who only reads a bag needs no compiler; the controller makes an @kernel of one.
+# Plain Python: reading a bag must not need the compiler. The controller makes a kernel of it.
 def body_speeds(
     right: float, left: float, radius: float, half_separation: float
 ) -> tuple[float, float]:
@@ -67,7 +67,7 @@ def pose_rate(yaw: float, wheels: WheelSpeeds, geometry: WheelGeometry) -> Pose:
 def advance_pose(pose: Pose, twist: BodyTwist, dt: float) -> Pose:
     """Return the pose after ``dt`` seconds of constant twist: the exact arc of (2).
 
-    The chord formula with sin(x)/x keeps full accuracy through straight motion.
+    The chord formula with sin(x)/x is accurate for straight motion as well.
     """
     half_turn = 0.5 * twist.angular * dt
     chord = twist.linear * dt * (math.sin(half_turn) / half_turn if half_turn else 1.0)

@@ -6,27 +6,27 @@ from t3mpc_ros.geometry.types import NANOSECONDS
 
 
 class SampleScheduler:
-    """Turns irregular calls into samples on an exact grid, none of them lost.
+    """Assigns the samples of a fixed-rate grid to irregular timer calls, without losing any.
 
-    A timer that comes late is answered with every sample it missed, so a busy machine delays a
-    stream but leaves no holes in it.
+    A late timer call returns every sample it missed, so a busy machine delays a stream but leaves
+    no gaps in it.
 
     Parameters
     ----------
     rate
-        Samples a second.
+        Samples per second.
     burst
-        Longest time (s) that is caught up with; what is older is skipped and counted.
+        Longest delay (s) that is made up for; older samples are skipped and counted.
     slack
-        How long (s) before the first call the grid begins. A timer of the same period then
-        finds each sample due although it sometimes comes a little early; without slack such a
-        call finds none, and the next one two.
+        Time (s) from the start of the grid to the first call. A timer of the same period then
+        finds one sample due in each call although some calls are slightly early; without slack an
+        early call finds none, and the next one two.
     """
 
     def __init__(self, rate: float, burst: float = 0.5, slack: float = 0.0) -> None:
         self._period_ns = NANOSECONDS / rate
         self._slack_ns = round(slack * NANOSECONDS)
-        self._most = max(1, int(burst * rate))
+        self._max_burst = max(1, int(burst * rate))
         self.reset()
 
     def reset(self) -> None:
@@ -34,12 +34,12 @@ class SampleScheduler:
         self._start_ns: int | None = None
         self._next = 0
         self.skipped = 0
-        """Samples given up since the grid began."""
+        """Samples skipped since the start of the grid."""
 
     def due(self, now_ns: int) -> list[int]:
-        """Return the stamps (ns) of all samples due at ``now_ns`` that were not returned before.
+        """Return the stamps (ns) of all samples due at ``now_ns`` and not returned before.
 
-        The first call starts the grid. A clock that has jumped back starts a new one.
+        The first call starts the grid; a backward jump of the clock starts a new one.
         """
         if self._start_ns is None or now_ns < self._stamp(self._next - 1):
             self.reset()
@@ -47,13 +47,13 @@ class SampleScheduler:
         last = int((now_ns - self._start_ns) / self._period_ns)
         if self._stamp(last + 1) <= now_ns:  # the division may have rounded down
             last += 1
-        first = max(self._next, last + 1 - self._most)
+        first = max(self._next, last + 1 - self._max_burst)
         self.skipped += first - self._next
         self._next = max(self._next, last + 1)
         return [self._stamp(n) for n in range(first, last + 1)]
 
     def lateness(self, now_ns: int) -> float:
-        """Return how long ago (s) the newest sample returned was due."""
+        """Return the time (s) since the newest returned sample was due."""
         if self._start_ns is None:
             return 0.0
         return (now_ns - self._stamp(self._next - 1)) / NANOSECONDS
@@ -64,64 +64,68 @@ class SampleScheduler:
 
 
 class SimulatedTime:
-    """Decides what time it is where time is made: faster or slower than the machine's, or by hand.
+    """Clock of a simulation, which runs faster or slower than real time, or step by step.
 
-    Samples lie on an exact grid that always starts at the same instant, and none is ever left
-    out: on a machine that cannot keep up, time passes more slowly. It never runs ahead of the
-    next sample, so nobody hears of a time that has not been computed.
+    Samples form an exact grid that always starts at the same instant, and none is skipped: on a
+    machine that is too slow, time passes more slowly. The clock never passes the next sample, so
+    it never shows a time that has not been simulated.
 
     Parameters
     ----------
     rate
-        Samples a second of simulated time.
-    speed
-        Simulated seconds per second; 0: time stands, and moves by :meth:`step` only.
-    most
-        Most samples due at once, so that others get their turn between them.
+        Samples per second of simulated time.
+    real_time_factor
+        Simulated seconds per second; 0: the clock is stopped, and :meth:`step` advances it.
+    max_burst
+        Maximum number of samples returned at once, so that other callbacks run in between.
     start_ns
-        Where the grid begins: not at 0, which to many means that nobody knows the time.
+        Start of the grid. Not 0, which in ROS means that the time is unknown.
     """
 
     def __init__(
-        self, rate: float, speed: float, most: int = 50, start_ns: int = NANOSECONDS
+        self,
+        rate: float,
+        real_time_factor: float,
+        max_burst: int = 50,
+        start_ns: int = NANOSECONDS,
     ) -> None:
         self._period_ns = NANOSECONDS / rate
         self._slack_ns = round(0.2 * self._period_ns)
-        self._most = most
+        self._max_burst = max_burst
         self._start_ns = start_ns
         self._next = 0
         self._anchor = start_ns, 0
-        """An instant of simulated time, and the machine's time at which it was."""
+        """An instant of simulated time, and the steady clock's time of that instant."""
         self._anchored = False
-        self._speed = speed
+        self._real_time_factor = real_time_factor
 
     @property
-    def speed(self) -> float:
-        """Simulated seconds per second that are asked for."""
-        return self._speed
+    def real_time_factor(self) -> float:
+        """Requested number of simulated seconds per second."""
+        return self._real_time_factor
 
-    def change_speed(self, speed: float, steady_ns: int) -> None:
-        """Let time pass at another speed from now on; 0 freezes it."""
+    def set_real_time_factor(self, factor: float, steady_ns: int) -> None:
+        """Change the real-time factor from now on; 0 stops the clock."""
         self._anchor = self.now_ns(steady_ns), steady_ns
         self._anchored = False
-        self._speed = speed
+        self._real_time_factor = factor
 
     def now_ns(self, steady_ns: int) -> int:
-        """Return the simulated time when the machine's is ``steady_ns``."""
+        """Return the simulated time when the steady clock is at ``steady_ns``."""
         if not self._anchored:
             return self._anchor[0]
-        return min(self._run(steady_ns), self._stamp(self._next))
+        return min(self._unbounded_ns(steady_ns), self._stamp(self._next))
 
     def due(self, steady_ns: int) -> list[int]:
         """Return the stamps (ns) of the samples due now: the first at once, then each in turn."""
-        if self._speed == 0.0:
+        if self._real_time_factor == 0.0:
             return self.step(0) if self._next == 0 else []
         if not self._anchored:
-            # The grid follows the timer: one that jitters then finds each sample in its turn.
+            # The grid follows the timer: each call of a jittering timer then finds one sample.
             self._anchor = self._stamp(self._next) + self._slack_ns, steady_ns
             self._anchored = True
-        passed = int((self._run(steady_ns) - self._start_ns) / self._period_ns)
-        last = min(passed, self._next + self._most - 1)
+        passed = int((self._unbounded_ns(steady_ns) - self._start_ns) / self._period_ns)
+        last = min(passed, self._next + self._max_burst - 1)
         stamps = [self._stamp(n) for n in range(self._next, last + 1)]
         self._next = max(self._next, last + 1)
         if last < passed:
@@ -129,17 +133,17 @@ class SimulatedTime:
         return stamps
 
     def step(self, count: int) -> list[int]:
-        """Return the stamps of the next ``count`` samples, and let time stand at the last.
+        """Return the stamps of the next ``count`` samples, and stop the clock at the last one.
 
-        The first sample, where time starts, is not one of those counted.
+        The first sample, at the start of the grid, is returned in addition to ``count``.
 
         Raises
         ------
         ValueError
-            Time runs by itself.
+            The clock is running.
         """
-        if self._speed != 0.0:
-            raise ValueError(f'speed must be 0 to go step by step: got {self._speed:g}')
+        if self._real_time_factor != 0.0:
+            raise ValueError(f'real_time_factor must be 0 to step: got {self._real_time_factor:g}')
         last = max(self._next - 1, 0) + count
         stamps = [self._stamp(n) for n in range(self._next, last + 1)]
         self._next = last + 1
@@ -147,29 +151,29 @@ class SimulatedTime:
             self._anchor = stamps[-1], 0
         return stamps
 
-    def _run(self, steady_ns: int) -> int:
+    def _unbounded_ns(self, steady_ns: int) -> int:
         instant, then = self._anchor
-        return instant + round((steady_ns - then) * self._speed)
+        return instant + round((steady_ns - then) * self._real_time_factor)
 
     def _stamp(self, n: int) -> int:
         return self._start_ns + round(n * self._period_ns)
 
 
 class RealTimeFactor:
-    """Measures how many simulated seconds pass in a second, over the last second or so."""
+    """Measures the simulated seconds per second, averaged over about one second."""
 
     def __init__(self) -> None:
         self.value: float | None = None
-        """None until the first second is over."""
+        """None during the first second."""
         self.restart()
 
     def restart(self) -> None:
-        """Begin a new measurement: the speed that is asked for has changed."""
+        """Start a new measurement, because the requested factor has changed."""
         self.value = None
         self._since: tuple[int, int] | None = None
 
-    def note(self, simulated_ns: int, steady_ns: int) -> None:
-        """Take note of what time it is, simulated and by the machine."""
+    def update(self, simulated_ns: int, steady_ns: int) -> None:
+        """Add a pair of simulated time and time of the steady clock."""
         if self._since is None:
             self._since = simulated_ns, steady_ns
         simulated, steady = self._since

@@ -10,12 +10,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+Array = NDArray[np.float64]
+
 NANOSECONDS = 1_000_000_000
-"""Nanoseconds in a second: stamps are ``int`` nanoseconds, durations ``float`` seconds."""
+"""Nanoseconds per second: stamps are ``int`` nanoseconds, durations ``float`` seconds."""
 
 
 class Pose(NamedTuple):
-    """Where the middle of the wheel axle is in the world frame, and where it points."""
+    """Position and yaw of the middle of the wheel axle in the world frame."""
 
     x: float
     """m"""
@@ -26,7 +28,7 @@ class Pose(NamedTuple):
 
 
 class BodyTwist(NamedTuple):
-    """Speeds in the robot's own frame."""
+    """Velocity in the robot's own frame."""
 
     linear: float
     """m/s, forward; the paper's v"""
@@ -43,57 +45,54 @@ class WheelSpeeds(NamedTuple):
     """rad/s"""
 
 
-def check_pose(pose: Pose) -> None:
-    """Raise ValueError when a pose is not finite."""
-    if not all(map(math.isfinite, pose)):
-        raise ValueError(f'pose must be finite: got {pose}')
-
-
-ORIGIN = Pose(0.0, 0.0, 0.0)
-STANDSTILL = BodyTwist(0.0, 0.0)
-
-
 class State(NamedTuple):
-    """A pose and a twist at one instant: measured, true or wanted."""
+    """Pose and twist at one instant: measured, true or reference."""
 
     stamp_ns: int
     pose: Pose
     twist: BodyTwist
 
     def is_finite(self) -> bool:
-        """Whether every number is finite, so that it may be used at all."""
+        """Return whether every number is finite."""
         (x, y, yaw), (linear, angular) = self.pose, self.twist
-        # A finite sum has finite terms; huge ones may overflow in it, and are looked at singly.
+        # A finite sum has finite terms; the sum of huge terms may overflow, so check them singly.
         return math.isfinite(x + y + yaw + linear + angular) or all(
             map(math.isfinite, (*self.pose, *self.twist))
         )
 
 
+ORIGIN = Pose(0.0, 0.0, 0.0)
+STANDSTILL = BodyTwist(0.0, 0.0)
+
+
+def check_pose(pose: Pose) -> None:
+    """Raise ValueError when a pose is not finite."""
+    if not all(map(math.isfinite, pose)):
+        raise ValueError(f'pose must be finite: got {pose}')
+
+
 def wrap_angle(angle: float) -> float:
-    """Return ``angle`` (rad) brought into (-pi, pi]."""
+    """Return ``angle`` (rad) wrapped into (-pi, pi]."""
     wrapped = math.remainder(angle, math.tau)
     return math.pi if wrapped == -math.pi else wrapped
 
 
-Array = NDArray[np.float64]
-
-
 class StateArray:
-    """A sequence of :class:`Motion`.
+    """A sequence of :class:`State`, stored as arrays.
 
     Parameters
     ----------
     stamps_ns
         Shape (n,).
     poses
-        x, y (m) and heading (rad), shape (n, 3).
+        x, y (m) and yaw (rad), shape (n, 3).
     twists
-        Forward (m/s) and turning speed (rad/s), shape (n, 2).
+        Linear (m/s) and angular velocity (rad/s), shape (n, 2).
 
     Raises
     ------
     ValueError
-        The shapes do not fit together.
+        The shapes do not match.
     """
 
     def __init__(self, stamps_ns: NDArray[np.int64], poses: Array, twists: Array) -> None:
@@ -108,7 +107,7 @@ class StateArray:
         self.twists: Array = np.ascontiguousarray(twists, dtype=np.float64)
         numbers = np.concatenate([self.poses, self.twists], axis=1)
         self.finite: NDArray[np.bool_] = np.all(np.isfinite(numbers), axis=1)
-        """Whether every number of each is finite, as ``Motion.is_finite`` says, shape (n,)."""
+        """``State.is_finite`` of each state, shape (n,)."""
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -121,7 +120,7 @@ class StateArray:
         )
 
     def __iter__(self) -> Iterator[State]:
-        # As the named tuples make themselves, without a call of Python for each.
+        # As the named tuples make themselves, without a Python call for each.
         make = tuple.__new__
         poses = map(make, repeat(Pose), self.poses.tolist())
         twists = map(make, repeat(BodyTwist), self.twists.tolist())

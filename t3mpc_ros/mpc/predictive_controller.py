@@ -356,7 +356,7 @@ class PredictiveController:
         how = timing.average, timing.decimation, self._decay, self._rules, self._learning_row
         return *seen, self._decays, change, *how, self._numbers, self._whole, self.status
 
-    def went_on(self, phase: int, samples: int) -> None:
+    def synchronize(self, phase: int, samples: int) -> None:
         """Take note that kernels have gone on with :attr:`tables`: up to where."""
         self.phase, self.samples = phase, samples
         self._skill = self.rows[_SKILLS].copy()

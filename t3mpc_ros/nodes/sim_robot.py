@@ -162,8 +162,8 @@ class SimRobotNode(BaseNode[SimRobotNodeParameters]):
         """Hand live settings on to the robot."""
         self._robot.configure(parameters)
         self._topics.configure(parameters, _robot_description(parameters))
-        if self._own_time is not None and parameters.speed != self._own_time.speed:
-            self._own_time.change_speed(parameters.speed, self.steady_ns())
+        if self._own_time is not None and parameters.speed != self._own_time.real_time_factor:
+            self._own_time.set_real_time_factor(parameters.speed, self.steady_ns())
             self._factor.restart()
             self._ticks.timer_period_ns = round(self._tick_period() * NANOSECONDS)
             self._ticks.reset()
@@ -195,12 +195,12 @@ class SimRobotNode(BaseNode[SimRobotNodeParameters]):
             stamps = self._pace.due(self._robot_now_ns())
         else:
             stamps = self._own_time.due(self.steady_ns())
-            if not stamps and self._own_time.speed == 0.0:
+            if not stamps and self._own_time.real_time_factor == 0.0:
                 # For those who come while time stands: they would not know that it is known.
                 self._publish_clock()
         self._advance(stamps)
         if self._state is not None:
-            self._factor.note(self._state.stamp_ns, self.steady_ns())
+            self._factor.update(self._state.stamp_ns, self.steady_ns())
 
     def _advance(self, stamps: list[int]) -> None:
         for stamp_ns in stamps:
@@ -237,7 +237,7 @@ class SimRobotNode(BaseNode[SimRobotNodeParameters]):
         pose = self.parameters.start
         response.success = not problem
         response.message = problem or (
-            f'the robot is at x {pose.x:g} m, y {pose.y:g} m, heading {pose.heading:g} rad '
+            f'the robot is at x {pose.x:g} m, y {pose.y:g} m, yaw {pose.yaw:g} rad '
             '(set start_x, start_y, start_heading)'
         )
         return response
@@ -246,8 +246,8 @@ class SimRobotNode(BaseNode[SimRobotNodeParameters]):
         time = self._own_time
         if time is None:
             response.message = 'publish_clock must be true at start to go step by step: got false'
-        elif time.speed != 0.0:
-            response.message = f'speed must be 0 to go step by step: got {time.speed:g}'
+        elif time.real_time_factor != 0.0:
+            response.message = f'speed must be 0 to go step by step: got {time.real_time_factor:g}'
         else:
             self._advance(time.step(self.parameters.step_periods))
             response.success = True
@@ -286,8 +286,8 @@ class SimRobotNode(BaseNode[SimRobotNodeParameters]):
         if self._pace.skipped:
             return 'samples were given up'
         time, factor = self._own_time, self._factor.value
-        if time is not None and factor is not None and factor < MIN_SPEED_SHARE * time.speed:
-            return f'{factor:.3g} instead of {time.speed:g} simulated seconds per second'
+        if time is not None and factor is not None and factor < MIN_SPEED_SHARE * time.real_time_factor:
+            return f'{factor:.3g} instead of {time.real_time_factor:g} simulated seconds per second'
         return ''
 
     def finish(self) -> None:

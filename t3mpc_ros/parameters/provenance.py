@@ -12,10 +12,10 @@ PACKAGE_DIRECTORY = Path(t3mpc_ros.__file__).resolve().parent
 
 
 def provenance(package: Path = PACKAGE_DIRECTORY) -> dict[str, str]:
-    """Return version, commit and Python version, for bags and reports.
+    """Return version, commit and Python version.
 
-    The commit is that of the checkout the package is imported from, with ``-dirty`` behind it
-    when files differ; ``unknown`` when it is not imported from a checkout of its own.
+    The commit is that of the checkout that contains the package, with the suffix ``-dirty`` when
+    files differ from it; ``unknown`` when the package is not in a checkout of its own.
     """
     return {
         'version': t3mpc_ros.__version__,
@@ -26,7 +26,7 @@ def provenance(package: Path = PACKAGE_DIRECTORY) -> dict[str, str]:
 
 def _commit(package: Path) -> str:
     root = package.parent
-    if not (root / '.git').exists():  # installed somewhere below another project's checkout?
+    if not (root / '.git').exists():  # the package may be installed inside another checkout
         return 'unknown'
     try:
         result = subprocess.run(

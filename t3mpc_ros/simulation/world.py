@@ -244,7 +244,7 @@ def _box(content: object, where: str) -> tuple[float, ...]:
     return (
         *_point(read['center'], f'{where}.center'),
         *(_number(size[i], f'{where}.size[{i}]', MIN_SIZE, MAX_COORDINATE, ' m') for i in (0, 1)),
-        _number(read.get('yaw', 0.0), f'{where}.heading', -math.tau, math.tau, ' rad'),
+        _number(read.get('yaw', 0.0), f'{where}.yaw', -math.tau, math.tau, ' rad'),
     )
 
 

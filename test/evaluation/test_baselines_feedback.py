@@ -16,7 +16,7 @@ from t3mpc_ros.evaluation.baselines.feedback_baseline import (
     observer_gains,
 )
 from t3mpc_ros.evaluation.baselines.model_based_feedback import ComputedTorque, SlidingMode
-from t3mpc_ros.fuzzy.inference import basis_of
+from t3mpc_ros.fuzzy.inference import compute_basis
 from t3mpc_ros.fuzzy.sets import build_sets
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.simulation.plant.disturbances import friction_torque
@@ -414,7 +414,7 @@ def test_in_the_ideal_case_the_lyapunov_function_falls_by_the_amount_derived(kin
     values, squares, errors = [], [], []
 
     def load(k, chi):
-        phi = basis_of(chi, sets)
+        phi = compute_basis(chi, sets)
         e = rival.error
         away = ideal - rival.fuzzy.coefficients
         values.append(0.5 * e @ e + np.sum(away**2) / (2.0 * gamma))
@@ -473,7 +473,7 @@ def test_the_robust_term_holds_the_error_that_the_fuzzy_system_cannot_explain():
 def test_the_adaptation_gain_means_the_same_for_any_sets(kind, sets):
     rival = make(kind, normalised_gain=150.0, sets=sets)
     drawn = np.random.default_rng(9).uniform(-10.0, 10.0, (500, 2))
-    power = np.mean([np.sum(basis_of(point, rival.fuzzy.sets) ** 2) for point in drawn])
+    power = np.mean([np.sum(compute_basis(point, rival.fuzzy.sets) ** 2) for point in drawn])
     assert rival.fuzzy.adaptation.gamma * power == pytest.approx(150.0, rel=0.03)
 
 

@@ -24,7 +24,7 @@ from t3mpc_ros.evaluation.open_loop_estimation import (
     torque_robot,
 )
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator
-from t3mpc_ros.fuzzy.inference import basis_of
+from t3mpc_ros.fuzzy.inference import compute_basis
 from t3mpc_ros.fuzzy.sets import FuzzyParameters
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.simulation.plant.disturbances import friction_torque
@@ -135,7 +135,7 @@ def test_noise_is_in_the_measurement_only():
 def test_every_kind_learns_at_the_same_rate(kind):
     fuzzy = estimator(kind, 0.04, 40.0)
     drawn = np.random.default_rng(1).uniform(-10.0, 10.0, (300, 2))
-    power = np.mean([np.sum(basis_of(point, fuzzy.sets) ** 2) for point in drawn])
+    power = np.mean([np.sum(compute_basis(point, fuzzy.sets) ** 2) for point in drawn])
     assert fuzzy.adaptation.gamma * power == pytest.approx(40.0, rel=0.05)
     assert fuzzy.sets.input_fuzziness == pytest.approx(np.sqrt(2.0 * 0.04))
 

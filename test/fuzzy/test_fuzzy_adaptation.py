@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import norm
 
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, adapt, beyond_dead_zone
-from t3mpc_ros.fuzzy.inference import basis_of
+from t3mpc_ros.fuzzy.inference import compute_basis
 from t3mpc_ros.fuzzy.sets import FuzzyParameters, build_sets
 
 Sets = partial(FuzzyParameters, sets=3, centre_exponent=1.0)
@@ -24,7 +24,7 @@ PLAIN = {'radius': 1e12, 'leakage': 0.0, 'dead_zone': 0.0, 'step_limit': 1e9}
 def _bases(count, seed):
     rng = np.random.default_rng(seed)
     sets = build_sets(Sets())
-    return np.array([basis_of(u, sets) for u in rng.uniform(-10.0, 10.0, (count, 2))])
+    return np.array([compute_basis(u, sets) for u in rng.uniform(-10.0, 10.0, (count, 2))])
 
 
 def _matched_run(dt, parameters, disturbance=0.0, duration=2.0):

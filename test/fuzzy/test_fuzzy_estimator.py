@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, gamma_for
-from t3mpc_ros.fuzzy.inference import basis_of
+from t3mpc_ros.fuzzy.inference import compute_basis
 from t3mpc_ros.fuzzy.sets import FuzzyParameters, build_sets
 
 Sets = partial(FuzzyParameters, sets=3, centre_exponent=1.0)
@@ -119,7 +119,7 @@ def test_outputs_share_one_basis_and_equal_alpha_times_phi():
     u = np.array([1.0, -4.0])
     g = estimator.evaluate(u)
     assert g.shape == (3,)
-    np.testing.assert_array_equal(estimator.basis, basis_of(u, build_sets(Sets())))
+    np.testing.assert_array_equal(estimator.basis, compute_basis(u, build_sets(Sets())))
     np.testing.assert_allclose(g, alpha @ estimator.basis, rtol=1e-13)
 
 
@@ -155,7 +155,7 @@ def test_gamma_for_equalises_what_is_learnt_per_step_on_average():
     for kind in KINDS:
         parameters = Sets(kind=kind)
         sets = build_sets(parameters)
-        power = np.mean([np.sum(basis_of(u, sets) ** 2) for u in drawn])
+        power = np.mean([np.sum(compute_basis(u, sets) ** 2) for u in drawn])
         assert gamma_for(parameters, 40.0) * power == pytest.approx(40.0, rel=0.05)
 
 
@@ -164,7 +164,7 @@ def test_default_gamma_is_an_adaptation_that_does_not_swing():
     sets = build_sets(FuzzyParameters())
     drawn = np.random.default_rng(34).uniform(-10.0, 10.0, (500, 2))
     gains = AdaptationParameters().gamma * np.array(
-        [np.sum(basis_of(u, sets) ** 2) for u in drawn]
+        [np.sum(compute_basis(u, sets) ** 2) for u in drawn]
     )
     assert gains.min() > 2.0
     assert 4.0 * gains.max() < 15.2**2

@@ -12,7 +12,7 @@ from scipy.optimize import minimize_scalar
 from scipy.special import logsumexp
 
 from t3mpc_ros.fuzzy.inference import (
-    basis_of,
+    compute_basis,
     firing_strengths,
     fuzzify,
     memberships,
@@ -64,7 +64,7 @@ def test_output_stays_in_the_hull_of_the_coefficients_anywhere(kind):
     near = rng.uniform(-15.0, 15.0, (200, 2))
     far = np.array(list(itertools.product([0.3, *FAR], repeat=2)))
     for u in np.concatenate([near, far]):
-        phi = basis_of(u, sets)
+        phi = compute_basis(u, sets)
         assert np.all(phi >= 0.0)
         assert phi.sum() == pytest.approx(1.0, abs=1e-13)
         alpha = rng.normal(scale=100.0, size=(20, sets.size))
@@ -83,7 +83,7 @@ def test_the_double_sum_29_equals_31_to_33(inputs, per_input, slices):
         alpha = np.concatenate([lower.ravel(), upper.ravel()])  # the order of (32)
         u = rng.uniform(-12.0, 12.0, inputs)
         expected = output_by_double_sum(u, sets, lower, upper)
-        assert alpha @ basis_of(u, sets) == pytest.approx(expected, rel=1e-11, abs=1e-13)
+        assert alpha @ compute_basis(u, sets) == pytest.approx(expected, rel=1e-11, abs=1e-13)
 
 
 @pytest.mark.parametrize('inputs, per_input, slices', [(1, 6, 2), (2, 3, 4), (3, 3, 3), (4, 2, 1)])
@@ -93,14 +93,14 @@ def test_kernel_equals_whole_array_reference(inputs, per_input, slices):
         sets = _random_sets(rng, inputs, per_input, slices)
         u = rng.uniform(-15.0, 15.0, inputs)
         np.testing.assert_allclose(
-            basis_of(u, sets), _reference_basis(u, sets), rtol=1e-11, atol=1e-300
+            compute_basis(u, sets), _reference_basis(u, sets), rtol=1e-11, atol=1e-300
         )
 
 
 def test_order_of_32_each_coefficient_speaks_for_its_rule_slice_and_level():
     sets = _random_sets(np.random.default_rng(4))
     u = np.array([1.0, -2.0])
-    phi = basis_of(u, sets)
+    phi = compute_basis(u, sets)
     for rule, j, level in itertools.product(range(9), range(4), range(2)):
         one = np.zeros((2, 9, 4))
         one[level, rule, j] = 1.0
@@ -134,7 +134,7 @@ def test_type1_is_a_textbook_weighted_average(fuzziness):
 
     alpha = np.tile(constants.ravel(), 2)
     for u in rng.uniform(-14.0, 14.0, (50, 2)):
-        assert alpha @ basis_of(u, sets) == pytest.approx(textbook(*u), rel=1e-12)
+        assert alpha @ compute_basis(u, sets) == pytest.approx(textbook(*u), rel=1e-12)
 
 
 def test_interval_type2_is_a_nie_tan_system():
@@ -150,7 +150,7 @@ def test_interval_type2_is_a_nie_tan_system():
         lower = np.exp(-(((u[:, None] - centres) / (0.6 * sigma)) ** 2))
         weights = 0.5 * (np.outer(*upper) + np.outer(*lower)).ravel()
         nie_tan = weights @ constants / weights.sum()
-        assert np.tile(constants, 2) @ basis_of(u, sets) == pytest.approx(nie_tan, rel=1e-12)
+        assert np.tile(constants, 2) @ compute_basis(u, sets) == pytest.approx(nie_tan, rel=1e-12)
 
 
 def test_type3_of_one_slice_at_level_one_is_type1():
@@ -167,7 +167,9 @@ def test_type3_of_one_slice_at_level_one_is_type1():
     gaps = []
     for level in (1.0, 1.0 - 1e-3, 1.0 - 5e-4):
         sets = at(level)
-        gaps.append(max(np.abs(basis_of(u, sets) - basis_of(u, type1)).max() for u in points))
+        gaps.append(
+            max(np.abs(compute_basis(u, sets) - compute_basis(u, type1)).max() for u in points)
+        )
     assert gaps[0] == 0.0
     assert gaps[1] == pytest.approx(2.0 * gaps[2], rel=0.02)  # and it is approached linearly
 
@@ -180,8 +182,8 @@ def test_slices_without_footprint_change_nothing():
     rng = np.random.default_rng(8)
     constants = rng.normal(size=9)
     for u in rng.uniform(-14.0, 14.0, (20, 2)):
-        full = np.tile(np.repeat(constants, 5), 2) @ basis_of(u, sliced)
-        assert full == pytest.approx(np.tile(constants, 2) @ basis_of(u, type1), rel=1e-12)
+        full = np.tile(np.repeat(constants, 5), 2) @ compute_basis(u, sliced)
+        assert full == pytest.approx(np.tile(constants, 2) @ compute_basis(u, type1), rel=1e-12)
 
 
 def test_singleton_limit_the_input_is_met_where_it_is():
@@ -246,7 +248,7 @@ def test_e7_grades_are_even_about_the_centre_and_at_most_one():
 def test_e8_printed_normalisation_leaves_the_hull():
     """With 0.5 / (sum of upper levels) a constant 1 on every rule comes out as 0.9."""
     sets = build_sets(Sets())
-    phi = basis_of(np.array([1.0, 2.0]), sets)
+    phi = compute_basis(np.array([1.0, 2.0]), sets)
     printed = phi * sets.levels.sum() * 0.5 / sets.levels[:, 1].sum()
     assert np.ones(sets.size) @ phi == pytest.approx(1.0, abs=1e-14)
     assert np.ones(sets.size) @ printed == pytest.approx(0.9, abs=1e-14)
@@ -273,7 +275,7 @@ def test_far_outside_where_firings_underflow_the_basis_is_still_exact():
         at_lowest_width = np.exp(_log_firings(u, sets))[..., 0, 0, 0]
         assert at_lowest_width.max() == 0.0
         np.testing.assert_allclose(
-            basis_of(np.array(u), sets), _reference_basis(u, sets), rtol=1e-6, atol=1e-300
+            compute_basis(np.array(u), sets), _reference_basis(u, sets), rtol=1e-6, atol=1e-300
         )
 
 
@@ -289,7 +291,7 @@ def test_a_rule_28_that_fires_alone_answers_between_its_two_consequents():
     sets = FuzzySets(centres, np.full((2, 3, 1, 2, 2), 0.5), levels, 0.1)
     lower, upper = np.sort(rng.uniform(-5.0, 5.0, (2, 9)), axis=0)
     for rule, u in enumerate(itertools.product(*centres)):
-        y = np.concatenate([lower, upper]) @ basis_of(np.array(u), sets)
+        y = np.concatenate([lower, upper]) @ compute_basis(np.array(u), sets)
         assert lower[rule] < y < upper[rule]
         assert y == pytest.approx((0.3 * lower[rule] + 0.9 * upper[rule]) / 1.2, rel=1e-12)
 
@@ -297,7 +299,7 @@ def test_a_rule_28_that_fires_alone_answers_between_its_two_consequents():
 @pytest.mark.parametrize('distance', FAR[2:])
 def test_far_outside_the_nearest_rule_takes_all(distance):
     sets = build_sets(Sets())
-    phi = basis_of(np.array([distance, distance]), sets).reshape(2, 9, 4)
+    phi = compute_basis(np.array([distance, distance]), sets).reshape(2, 9, 4)
     nearest = 8 if distance > 0.0 else 0
     np.testing.assert_allclose(phi[:, nearest].T, sets.shares, rtol=1e-12)
 
@@ -317,7 +319,7 @@ def test_output_is_smooth_where_the_nearest_rule_changes():
 
         def second(step, place=place, direction=direction):
             values = [
-                alpha @ basis_of(place + k * step * direction, sets) for k in (-1.0, 0.0, 1.0)
+                alpha @ compute_basis(place + k * step * direction, sets) for k in (-1.0, 0.0, 1.0)
             ]
             return (values[0] - 2.0 * values[1] + values[2]) / step**2
 
@@ -328,4 +330,4 @@ def test_inputs_that_are_no_numbers_are_refused():
     sets = build_sets(Sets())
     for wrong in ([0.0], [0.0, math.nan], [math.inf, 0.0], [0.0, 0.0, 0.0]):
         with pytest.raises(ValueError, match='inputs must be 2 finite numbers'):
-            basis_of(np.array(wrong), sets)
+            compute_basis(np.array(wrong), sets)

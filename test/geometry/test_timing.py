@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The grid of due samples."""
+"""Sample scheduler, simulated time and real-time factor."""
 
 import numpy as np
 import pytest
@@ -11,61 +11,61 @@ MS = 1_000_000
 
 
 @pytest.mark.parametrize('rate', [100.0, 30.0, 333.0, 7.3, 60.0, 1000.0])
-def test_irregular_calls_give_every_sample_once_and_on_the_grid(rate):
-    pace = SampleScheduler(rate)
+def test_irregular_calls_give_every_sample_once_on_the_grid(rate):
+    scheduler = SampleScheduler(rate)
     generator = np.random.default_rng(1)
     start = now = 1_700_000_000_000_000_000
     seen = []
     while now < start + 3_000_000_000:
-        due = pace.due(now)
+        due = scheduler.due(now)
         assert all(stamp <= now for stamp in due)
         seen += due
         now += int(generator.uniform(0.0, 80.0) * MS)
     assert seen == [start + round(n * 1e9 / rate) for n in range(len(seen))]
     assert len(seen) > 2.7 * rate
-    assert pace.skipped == 0
+    assert scheduler.skipped == 0
 
 
-def test_a_sample_is_due_at_its_stamp_and_not_a_nanosecond_before():
-    pace = SampleScheduler(100.0)
-    assert pace.due(0) == [0]
-    assert pace.due(10 * MS - 1) == []
-    assert pace.due(10 * MS) == [10 * MS]
-    assert pace.due(10 * MS) == []
+def test_a_sample_is_due_exactly_at_its_stamp():
+    scheduler = SampleScheduler(100.0)
+    assert scheduler.due(0) == [0]
+    assert scheduler.due(10 * MS - 1) == []
+    assert scheduler.due(10 * MS) == [10 * MS]
+    assert scheduler.due(10 * MS) == []
 
 
-def test_a_late_timer_is_caught_up_with_up_to_the_burst():
-    pace = SampleScheduler(100.0, burst=0.1)
-    pace.due(0)
-    due = pace.due(1000 * MS)
+def test_a_late_timer_catches_up_by_at_most_one_burst():
+    scheduler = SampleScheduler(100.0, burst=0.1)
+    scheduler.due(0)
+    due = scheduler.due(1000 * MS)
     assert due == [n * 10 * MS for n in range(91, 101)]
-    assert pace.skipped == 90
+    assert scheduler.skipped == 90
 
 
 def test_a_clock_that_jumps_back_starts_a_new_grid():
-    pace = SampleScheduler(100.0)
-    pace.due(5_000 * MS)
-    assert pace.due(1_003 * MS) == [1_003 * MS]
-    assert pace.due(1_013 * MS) == [1_013 * MS]
+    scheduler = SampleScheduler(100.0)
+    scheduler.due(5_000 * MS)
+    assert scheduler.due(1_003 * MS) == [1_003 * MS]
+    assert scheduler.due(1_013 * MS) == [1_013 * MS]
 
 
-def test_standing_still_gives_nothing_twice():
-    pace = SampleScheduler(100.0)
-    assert pace.due(25 * MS) == [25 * MS]
-    assert [pace.due(25 * MS) for _ in range(5)] == [[]] * 5
-    assert pace.due(36 * MS) == [35 * MS]
+def test_repeated_calls_return_no_sample_twice():
+    scheduler = SampleScheduler(100.0)
+    assert scheduler.due(25 * MS) == [25 * MS]
+    assert [scheduler.due(25 * MS) for _ in range(5)] == [[]] * 5
+    assert scheduler.due(36 * MS) == [35 * MS]
 
 
 def test_lateness_counts_from_the_newest_sample():
-    pace = SampleScheduler(100.0)
-    assert pace.lateness(0) == 0.0
-    pace.due(0)
-    pace.due(13 * MS)
-    assert pace.lateness(14 * MS) == pytest.approx(0.004)
+    scheduler = SampleScheduler(100.0)
+    assert scheduler.lateness(0) == 0.0
+    scheduler.due(0)
+    scheduler.due(13 * MS)
+    assert scheduler.lateness(14 * MS) == pytest.approx(0.004)
 
 
-def test_with_slack_a_timer_that_jitters_finds_exactly_one_sample_each_time():
-    """Without it a timer a little early found nothing, and the next call two samples."""
+def test_with_slack_each_jittering_call_finds_one_sample():
+    """Without slack, a call that is slightly early finds no sample, and the next one two."""
     rng = np.random.default_rng(9)
     ticks = [round(k * 10 * MS + rng.uniform(-0.9, 0.9) * MS) for k in range(1, 1000)]
     loose, tight = SampleScheduler(100.0, slack=0.002), SampleScheduler(100.0)
@@ -80,7 +80,7 @@ SECOND = 1000 * MS
 
 
 @pytest.mark.parametrize('speed', [0.1, 1.0, 3.0, 10.0, 37.5])
-def test_simulated_time_passes_at_its_speed_and_every_sample_comes_once(speed):
+def test_simulated_time_follows_its_factor_without_gaps(speed):
     time = SimulatedTime(100.0, speed)
     rng = np.random.default_rng(4)
     begin = steady = 123 * SECOND
@@ -93,37 +93,37 @@ def test_simulated_time_passes_at_its_speed_and_every_sample_comes_once(speed):
     assert seen[-1] - seen[0] == pytest.approx(speed * 20 * SECOND, abs=30 * MS)
 
 
-def test_a_machine_that_cannot_keep_up_makes_time_slower_and_leaves_nothing_out():
-    """2000 samples a second are asked for, and 10 ms each is what they take."""
-    time = SimulatedTime(100.0, 20.0, most=7)
+def test_a_slow_machine_slows_time_and_skips_no_sample():
+    """The requested rate is 2000 samples per second, and each takes 10 ms."""
+    time = SimulatedTime(100.0, 20.0, max_burst=7)
     steady, seen = 5 * SECOND, []
     for _ in range(50):
         due = time.due(steady)
         assert len(due) <= 7
         seen += due
         steady += len(due) * 10 * MS
-        # Nobody hears of a time that has not been computed.
+        # The clock never shows a time that has not been simulated.
         assert time.now_ns(steady) <= seen[-1] + 10 * MS
     assert seen == [SECOND + n * 10 * MS for n in range(len(seen))]
     assert len(seen) > 300
-    # What was not done in time is not made up for once there is time again.
+    # The delay is not made up for when the machine is fast again.
     time.due(steady)
     assert sum(len(time.due(steady + n * MS)) for n in range(1, 101)) in range(195, 206)
     steady += 100 * MS
-    time.change_speed(1.0, steady)
+    time.set_real_time_factor(1.0, steady)
     assert len(time.due(steady)) == 1
     assert [len(time.due(steady + n * 10 * MS)) for n in range(1, 50)] == [1] * 49
 
 
-def test_simulated_time_never_goes_back_whatever_is_done_to_it():
+def test_simulated_time_is_monotonic():
     rng = np.random.default_rng(8)
     time = SimulatedTime(250.0, 1.0)
     steady, before, seen = 0, 0, []
     for _ in range(3000):
         steady += int(rng.exponential(4 * MS))
         if rng.random() < 0.1:
-            time.change_speed(float(rng.choice([0.0, 0.3, 1.0, 5.0])), steady)
-        if time.speed == 0.0 and rng.random() < 0.5:
+            time.set_real_time_factor(float(rng.choice([0.0, 0.3, 1.0, 5.0])), steady)
+        if time.real_time_factor == 0.0 and rng.random() < 0.5:
             seen += time.step(int(rng.integers(1, 4)))
         else:
             seen += time.due(steady)
@@ -135,7 +135,7 @@ def test_simulated_time_never_goes_back_whatever_is_done_to_it():
     assert len(seen) > 1000
 
 
-def test_time_that_stands_moves_by_steps_only():
+def test_stopped_time_advances_only_by_steps():
     time = SimulatedTime(100.0, 0.0)
     assert time.now_ns(7) == SECOND
     assert time.due(8) == [SECOND]
@@ -143,30 +143,30 @@ def test_time_that_stands_moves_by_steps_only():
     assert time.now_ns(9 * SECOND) == SECOND
     assert time.step(2) == [SECOND + 10 * MS, SECOND + 20 * MS]
     assert time.now_ns(10 * SECOND) == SECOND + 20 * MS
-    time.change_speed(2.0, 11 * SECOND)
-    with pytest.raises(ValueError, match='speed must be 0 .*: got 2'):
+    time.set_real_time_factor(2.0, 11 * SECOND)
+    with pytest.raises(ValueError, match='real_time_factor must be 0 .*: got 2'):
         time.step(1)
     assert time.due(11 * SECOND) == [SECOND + 30 * MS]
-    time.change_speed(0.0, 11 * SECOND + 2 * MS)
-    assert time.now_ns(50 * SECOND) == SECOND + 36 * MS, 'it stands between two samples'
+    time.set_real_time_factor(0.0, 11 * SECOND + 2 * MS)
+    assert time.now_ns(50 * SECOND) == SECOND + 36 * MS, 'stopped between two samples'
     assert time.step(1) == [SECOND + 40 * MS]
 
 
-def test_a_step_before_the_first_sample_brings_that_one_too():
+def test_a_first_step_also_returns_the_first_sample():
     time = SimulatedTime(100.0, 0.0)
     assert time.step(1) == [SECOND, SECOND + 10 * MS]
 
 
-def test_the_real_time_factor_is_that_of_the_last_second_and_begins_anew_on_request():
+def test_real_time_factor_covers_the_last_second():
     factor = RealTimeFactor()
     for n in range(100):
-        factor.note(30 * n * MS, 10 * n * MS)
+        factor.update(30 * n * MS, 10 * n * MS)
     assert factor.value is None
     for n in range(100, 250):
-        factor.note(30 * n * MS, 10 * n * MS)
+        factor.update(30 * n * MS, 10 * n * MS)
     assert factor.value == pytest.approx(3.0)
     factor.restart()
     assert factor.value is None
     for n in range(250, 360):
-        factor.note(0, 10 * n * MS)
+        factor.update(0, 10 * n * MS)
     assert factor.value == 0.0

@@ -131,7 +131,7 @@ def test_a_robot_other_than_the_nominal_one_is_still_helped(plant):
 
 
 def test_it_works_for_other_control_periods_and_feedback_gains():
-    parameters = DEFAULT.with_values({'every': 10, 'average': 10})
+    parameters = DEFAULT.with_values({'decimation': 10, 'average': 10})
     assert _gain(_levels(3000, 1), parameters, nominal_gain=4.0, gain=4.0) < 0.45
 
 
@@ -439,9 +439,9 @@ def test_what_does_not_fit_is_refused_and_changes_nothing():
     'values, match',
     [
         ({'control_horizon': 11}, 'control_horizon must be at most horizon'),
-        ({'average': 6}, 'average must be at most every'),
+        ({'average': 6}, 'average must be at most decimation'),
         ({'hidden': 7}, 'hidden must be at least'),
-        ({'fade_low': 0.5, 'fade_high': 0.2}, 'fade_low must be below'),
+        ({'skill_low': 0.5, 'skill_high': 0.2}, 'skill_low must be below'),
     ],
     ids=str,
 )

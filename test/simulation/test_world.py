@@ -237,7 +237,7 @@ BAD = {
     f'patches: [{{{CIRCLE}}}]': 'patches[0] must have a grip',
     f'circles: [{{{CIRCLE}, grip: 1}}]': "circles[0] has no 'grip'",
     'boxes: [{center: [0, 0], size: [1, 1], yaw: 45}]': (
-        'boxes[0].heading must be a number from -6.28319 to 6.28319 rad: got 45'
+        'boxes[0].yaw must be a number from -6.28319 to 6.28319 rad: got 45'
     ),
     'boxes: [{centre: [0, 0], size: [1, 1]}]': "boxes[0] has no 'centre'; did you mean center?",
     'wals: []': "the world has no 'wals'; did you mean walls?",
