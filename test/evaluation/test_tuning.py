@@ -740,7 +740,7 @@ def test_settings_that_do_not_fit_together_cost_an_evaluation_and_no_run(tmp_pat
 
 
 def _rival_of(table):
-    return type('Made', (Feedback,), {'settings_type': table})
+    return type('Made', (Feedback,), {'parameters_type': table})
 
 
 def test_a_method_without_a_finite_price_is_named_and_the_others_are_kept(tmp_path):
