@@ -114,7 +114,7 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
                 with self._lock:
                     deeds = self._robot.step(self.steady_ns(), received)
                     states = self._robot.take_states()
-                    done = self._robot.link.phase is LinkState.DONE
+                    done = self._robot.link.state is LinkState.DONE
                     reason = self._robot.reason(self.steady_ns())
                 self._say(reason)
                 until_ns = self.steady_ns()
@@ -142,7 +142,7 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
             if isinstance(deed, Open):
                 self._port = SerialPort(self.parameters.port)
                 with self._lock:
-                    self._robot.link.opened(self.steady_ns())
+                    self._robot.link.port_opened(self.steady_ns())
             elif isinstance(deed, Write) and self._port is not None:
                 self._port.write(deed.data)
             elif isinstance(deed, Close) and self._port is not None:
@@ -167,7 +167,7 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
     def _lose(self, error: PortError) -> None:
         self._port = None
         with self._lock:
-            self._robot.link.failed(str(error), error.absent, self.steady_ns())
+            self._robot.link.port_failed(str(error), error.absent, self.steady_ns())
 
     def _tell(self, state: RobotState) -> None:
         """Publish a state with stamps of ROS's clock instead of the link's."""
@@ -188,7 +188,7 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
         with self._lock:
             state, link = self._robot.advance(now_ns), self._robot.link
             well = self._robot.quality(now_ns)
-            phase, signed = link.phase, link.authenticated
+            phase, signed = link.state, link.authenticated
         values: dict[str, object] = {
             'port': self.parameters.port,
             'link': phase.value,

@@ -135,7 +135,7 @@ class RadioRobot(RobotInterface):
 
     def reason(self, now_ns: int) -> str:
         """Return why the robot does not do what it is told; empty when it does."""
-        if self.link.phase is not LinkState.RUN:
+        if self.link.state is not LinkState.RUN:
             return self.link.reason(now_ns)
         return self._limiter.reason or self.link.reason(now_ns)
 

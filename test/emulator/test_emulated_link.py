@@ -63,7 +63,7 @@ def test_a_whole_cycle_is_lost_as_seldom_as_four_retries_allow(loss, most):
     """Whole: the command was taken, and the state that it led to came back with it."""
     bench = Bench()
     bench.inject('loss', math.inf, loss)
-    bench.run(20.0, lambda: bench.link.phase is LinkState.RUN)
+    bench.run(20.0, lambda: bench.link.state is LinkState.RUN)
     bench.drive(4.0, 4.0)
     bench.run(60.0)
     quality = bench.link.quality(bench.now_ns)
@@ -149,7 +149,7 @@ def test_a_shut_down_link_leaves_the_robot_at_rest_without_drives():
     bench.drive(7.0, -7.0)
     bench.run(1.0)
     bench.link.shut_down()
-    bench.run(2.0, lambda: bench.link.phase is LinkState.DONE)
+    bench.run(2.0, lambda: bench.link.state is LinkState.DONE)
     bench.run(0.1)
     assert bench.board.speeds == (0, 0)
     assert not bench.board.powered
@@ -175,7 +175,7 @@ def test_a_burst_that_was_held_for_a_second_moves_nothing():
     bench.run(0.5)
     assert bench.board.counters == before
     bench.emulator.end('silence')
-    bench.run(2.0, lambda: bench.link.phase is LinkState.RUN)
+    bench.run(2.0, lambda: bench.link.state is LinkState.RUN)
     bench.run(2.0)
     assert bench.link.quality(bench.now_ns).robot.stale == 15
 
@@ -290,7 +290,7 @@ def test_a_robot_on_another_channel_is_not_found():
     bench = Bench({'channel': 83})
     bench.run(2.0)
     assert 'does not answer' in bench.link.reason(bench.now_ns)
-    assert bench.link.phase is LinkState.HELLO
+    assert bench.link.state is LinkState.HELLO
 
 
 def test_an_empty_battery_takes_the_board_down():

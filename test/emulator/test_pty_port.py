@@ -61,14 +61,14 @@ class Host:
                 return deed.until_ns
             if isinstance(deed, Open):
                 self.port = SerialPort(self.path)
-                self.link.opened(now)
+                self.link.port_opened(now)
             elif isinstance(deed, Close):
                 self.close()
             elif isinstance(deed, Write) and self.port is not None:
                 self.port.write(deed.data)
         except PortError as error:
             self.port = None
-            self.link.failed(str(error), error.absent, now)
+            self.link.port_failed(str(error), error.absent, now)
         return now
 
     def _read(self, seconds):
@@ -80,7 +80,7 @@ class Host:
             return self.port.read()
         except PortError as error:
             self.port = None
-            self.link.failed(str(error), error.absent, time.monotonic_ns())
+            self.link.port_failed(str(error), error.absent, time.monotonic_ns())
             return b''
 
     def close(self):
@@ -140,14 +140,14 @@ def test_a_host_drives_the_process_over_the_real_port_with_a_key_and_a_replug(st
     assert f'kill {process.child.pid}' in said
     host = Host(path, KEY)
     link = host.link
-    assert host.run(10.0, lambda: link.phase is LinkState.RUN)
+    assert host.run(10.0, lambda: link.state is LinkState.RUN)
     host.wheels = WheelSpeeds(4.0, 4.0)
     assert host.run(5.0, lambda: link.telemetry is not None and link.telemetry.wheels.right > 3.5)
     assert link.authenticated
-    assert host.run(10.0, lambda: link.phase is LinkState.CLOSED)
-    assert host.run(15.0, lambda: link.phase is LinkState.RUN)
+    assert host.run(10.0, lambda: link.state is LinkState.CLOSED)
+    assert host.run(15.0, lambda: link.state is LinkState.RUN)
     link.shut_down()
-    assert host.run(5.0, lambda: link.phase is LinkState.DONE)
+    assert host.run(5.0, lambda: link.state is LinkState.DONE)
     host.close()
     code, said = process.stop(signal.SIGTERM)
     assert code == 0

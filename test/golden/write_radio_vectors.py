@@ -208,10 +208,10 @@ def _session() -> dict:
     rows: list[dict] = []
 
     def hello(name: str, frame: frames.Hello, drawn: bytes = bytes(8)) -> None:
-        _add(name, frame, lambda: gate.greet(frame, drawn), {'fresh_nonce': drawn.hex()})
+        _add(name, frame, lambda: gate.begin_session(frame, drawn), {'fresh_nonce': drawn.hex()})
 
     def other_kind(name: str, frame: authentication.SignedFrame) -> None:
-        _add(name, frame, lambda: gate.check(frame), {})
+        _add(name, frame, lambda: gate.verify(frame), {})
 
     def _add(name: str, frame: tuple, judge: Callable[[], str], more: dict) -> None:
         why = judge()
@@ -299,7 +299,7 @@ def _session() -> dict:
             {
                 'name': 'a signed HELLO cannot be checked',
                 'bytes': codec.encode(first).hex(),
-                'accepted': not keyless.greet(first, bytes(8)),
+                'accepted': not keyless.begin_session(first, bytes(8)),
             },
         ],
     }
@@ -311,7 +311,7 @@ def _stops(key: bytes) -> dict:
     host, fresh = bytes.fromhex('2122232425262728'), bytes.fromhex('c1c2c3c4c5c6c7c8')
     gate = authentication.CommandVerifier(key)
     hello = authentication.sign_hello(key, 0x5B, 1, start, host)
-    if why := gate.greet(hello, fresh):
+    if why := gate.begin_session(hello, fresh):
         raise ValueError(f'HELLO must be accepted: got {why}')
     signer = authentication.Signer(authentication.session_key(key, host, fresh), start)
     stop = frames.Command(0x5B, 1, CommandFlag.ESTOP, 0, 0, 0, 0)
@@ -338,7 +338,7 @@ def _stops(key: bytes) -> dict:
                 'name': name,
                 'kind': 'Command',
                 'bytes': codec.encode(frame).hex(),
-                'counted': not gate.admit(frame),
+                'counted': not gate.accept(frame),
             }
             for name, frame in story
         ],

@@ -39,7 +39,7 @@ SAMPLES = (
 def meet(key=KEY, host_us=1000, session=9, nonces=(b'HOSTHOST', b'ROBOTROB'), gate=None):
     """Return both ends of a session."""
     gate = gate or CommandVerifier(key)
-    assert gate.greet(sign_hello(key, session, 0, host_us, nonces[0]), nonces[1]) == ''
+    assert gate.begin_session(sign_hello(key, session, 0, host_us, nonces[0]), nonces[1]) == ''
     return Signer(session_key(key, nonces[0], gate.nonce), host_us), gate
 
 
@@ -48,14 +48,14 @@ def test_golden_session_step_by_step():
     for row in VECTORS['robot']:
         frame = decode_downlink(bytes.fromhex(row['bytes']))
         if isinstance(frame, frames.Hello):
-            why = gate.greet(frame, bytes.fromhex(row['fresh_nonce']))
+            why = gate.begin_session(frame, bytes.fromhex(row['fresh_nonce']))
         else:
-            why = gate.check(frame)
+            why = gate.verify(frame)
         assert (why == '', why) == (row['accepted'], row['why']), row['name']
         assert (gate.session, gate.nonce.hex()) == (row['session'], row['robot_nonce'])
     for row in VECTORS['robot_without_key']:
         frame = decode_downlink(bytes.fromhex(row['bytes']))
-        assert (CommandVerifier().greet(frame, bytes(8)) == '') == row['accepted']
+        assert (CommandVerifier().begin_session(frame, bytes(8)) == '') == row['accepted']
 
 
 def test_golden_stops_are_obeyed_all_and_counted_like_any_command():
@@ -64,14 +64,14 @@ def test_golden_stops_are_obeyed_all_and_counted_like_any_command():
     gates = [CommandVerifier(bytes.fromhex(VECTORS['key'])) for _ in range(2)]
     for gate in gates:
         hello = decode_downlink(bytes.fromhex(story['hello']))
-        assert gate.greet(hello, bytes.fromhex(story['fresh_nonce'])) == ''
+        assert gate.begin_session(hello, bytes.fromhex(story['fresh_nonce'])) == ''
     counted = []
     for row in story['frames']:
         frame = decode_downlink(bytes.fromhex(row['bytes']))
-        counted.append(gates[0].admit(frame) == '')
+        counted.append(gates[0].accept(frame) == '')
         assert counted[-1] == row['counted'], row['name']
         stops = bool(frame.flags & CommandFlag.ESTOP)
-        assert (gates[1].check(frame) == '') == (stops or counted[-1]), row['name']
+        assert (gates[1].verify(frame) == '') == (stops or counted[-1]), row['name']
     assert len(set(counted)) == 2
 
 
@@ -81,9 +81,9 @@ def test_a_stop_that_is_held_for_hours_keeps_the_epoch():
     stop = frames.Command(9, 0, CommandFlag.ESTOP, 0, 0, 0, 0)
     for number in range(1, 7):
         host_us = (1000 + number * 0x80000001) % (1 << 32)
-        assert gate.admit(signer.sign(stop._replace(seq=number, host_us=host_us))) == ''
+        assert gate.accept(signer.sign(stop._replace(seq=number, host_us=host_us))) == ''
     clear = frames.Command(9, 7, CommandFlag.ESTOP_CLEAR, 0, 0, 0, (host_us + 1) % (1 << 32))
-    assert gate.check(signer.sign(clear)) == ''
+    assert gate.verify(signer.sign(clear)) == ''
     assert signer.epoch == 3
 
 
@@ -91,10 +91,10 @@ def test_nobody_passes_a_gate_with_a_damaged_key_but_stops_do():
     gate = CommandVerifier(locked=True)
     assert gate.nonce == bytes(8)
     for hello in (frames.Hello(1, 0, 0), sign_hello(bytes(16), 1, 0, 0, bytes(8))):
-        assert gate.greet(hello, bytes(8)) == 'the key is damaged'
+        assert gate.begin_session(hello, bytes(8)) == 'the key is damaged'
     assert gate.session == 0
-    assert gate.check(frames.Command(1, 0, frames.CommandFlag.ENABLE, 1, 0, 0, 0)) != ''
-    assert gate.check(frames.Command(1, 0, CommandFlag.ESTOP, 1, 0, 0, 0)) == ''
+    assert gate.verify(frames.Command(1, 0, frames.CommandFlag.ENABLE, 1, 0, 0, 0)) != ''
+    assert gate.verify(frames.Command(1, 0, CommandFlag.ESTOP, 1, 0, 0, 0)) == ''
 
 
 def test_the_check_value_tells_keys_apart_and_is_the_published_hash():
@@ -133,10 +133,10 @@ def test_every_bit_of_a_signed_frame_counts(frame):
             continue  # stopping is always allowed
         if not isinstance(forged, frames.Poll | frames.ParamGet | frames.Hello):
             refused += 1
-            assert gate.check(forged)
+            assert gate.verify(forged)
     assert refused > 6 * len(data)
     # None of this has cost the true frame anything.
-    assert gate.check(decode_downlink(data)) == ''
+    assert gate.verify(decode_downlink(data)) == ''
 
 
 def test_every_bit_of_a_signed_hello_counts():
@@ -150,7 +150,7 @@ def test_every_bit_of_a_signed_hello_counts():
             continue
         assert not verify_hello(KEY, forged)
         gate = CommandVerifier(KEY)
-        assert gate.greet(forged, b'ROBOTROB') == 'HELLO has a bad tag'
+        assert gate.begin_session(forged, b'ROBOTROB') == 'HELLO has a bad tag'
         assert gate.session == 0
 
 
@@ -171,10 +171,10 @@ def test_nothing_counts_twice_in_the_same_session():
     for step in range(60):
         frame = SAMPLES[step % 3]._replace(host_us=2000 + 10 * step)
         signed = signer.sign(frame)
-        assert gate.check(signed) == ''
+        assert gate.verify(signed) == ''
         sent.append(signed)
         for old in sent:
-            assert gate.check(old)
+            assert gate.verify(old)
 
 
 def test_nothing_of_an_earlier_session_counts_in_a_later_one():
@@ -182,37 +182,37 @@ def test_nothing_of_an_earlier_session_counts_in_a_later_one():
     signer, gate = meet()
     recorded = [signer.sign(COMMAND._replace(host_us=2000 + step)) for step in range(20)]
     for frame in recorded:
-        assert gate.check(frame) == ''
+        assert gate.verify(frame) == ''
     hello = sign_hello(KEY, 9, 0, 1000, b'HOSTHOST')
     meet(gate=gate, nonces=(b'NEWHOST.', b'NEWROBOT'))
     for frame in recorded:
-        assert gate.check(frame)
+        assert gate.verify(frame)
     # Not even after the recorded HELLO: it gets the recorder a session without a key.
-    assert gate.greet(hello, b'THIRDROB') == ''
+    assert gate.begin_session(hello, b'THIRDROB') == ''
     for frame in recorded:
-        assert gate.check(frame)
+        assert gate.verify(frame)
 
 
 def test_a_repeated_hello_does_not_change_the_key_under_a_host_that_has_heard_the_answer():
     signer, gate = meet()
     signed = signer.sign(COMMAND._replace(host_us=2000))
-    assert gate.greet(sign_hello(KEY, 9, 0, 1000, b'HOSTHOST'), b'OTHERROB') == ''
+    assert gate.begin_session(sign_hello(KEY, 9, 0, 1000, b'HOSTHOST'), b'OTHERROB') == ''
     assert gate.nonce == b'ROBOTROB'
-    assert gate.check(signed) == ''
-    assert gate.greet(sign_hello(KEY, 9, 0, 1000, b'HOSTHOST'), b'OTHERROB') == ''
-    assert gate.check(signed) == 'frame is a replay'
+    assert gate.verify(signed) == ''
+    assert gate.begin_session(sign_hello(KEY, 9, 0, 1000, b'HOSTHOST'), b'OTHERROB') == ''
+    assert gate.verify(signed) == 'frame is a replay'
 
 
 def test_a_wrong_key_gets_no_session_and_moves_nothing():
     gate = CommandVerifier(KEY)
-    assert gate.greet(sign_hello(ALIEN, 9, 0, 5, b'HOSTHOST'), b'ROBOTROB') == (
+    assert gate.begin_session(sign_hello(ALIEN, 9, 0, 5, b'HOSTHOST'), b'ROBOTROB') == (
         'HELLO has a bad tag'
     )
     assert gate.session == 0
     _, gate = meet()
     alien = Signer(session_key(ALIEN, b'HOSTHOST', b'ROBOTROB'), 1000)
     for frame in SAMPLES:
-        assert gate.check(alien.sign(frame._replace(host_us=frame.seq + 5000)))
+        assert gate.verify(alien.sign(frame._replace(host_us=frame.seq + 5000)))
 
 
 def test_both_ends_count_the_wraps_of_host_us_alike():
@@ -225,7 +225,7 @@ def test_both_ends_count_the_wraps_of_host_us_alike():
         signed = signer.sign(COMMAND._replace(host_us=now & 0xFFFFFFFF))
         assert signer.epoch == (now >> 32)
         if source.random() < 0.5:  # the others are lost
-            assert gate.check(signed) == ''
+            assert gate.verify(signed) == ''
             taken += 1
     assert taken > 50
 
@@ -233,10 +233,10 @@ def test_both_ends_count_the_wraps_of_host_us_alike():
 def test_a_frame_of_before_a_wrap_is_refused_after_it():
     signer, gate = meet(host_us=0xFFFFFF00)
     late = signer.sign(COMMAND._replace(host_us=0xFFFFFFFE))
-    assert gate.check(signer.sign(COMMAND._replace(host_us=3))) == ''
-    assert gate.check(late)
+    assert gate.verify(signer.sign(COMMAND._replace(host_us=3))) == ''
+    assert gate.verify(late)
     # The robot tries the epoch after its own for it, and only that.
-    assert gate.check(signer.sign(COMMAND._replace(host_us=4))) == ''
+    assert gate.verify(signer.sign(COMMAND._replace(host_us=4))) == ''
 
 
 def test_the_host_never_signs_the_same_instant_twice():
@@ -251,29 +251,32 @@ def test_stopping_is_always_allowed_and_releasing_is_not():
     stop = frames.Command(0, 0, CommandFlag.ESTOP, 0, 0, 0, 0)
     clear = frames.Command(9, 1, CommandFlag.ESTOP_CLEAR, 0, 0, 0, 5000)
     for frame in (stop, stop._replace(session=77, tag=bytes(8)), stop._replace(flags=7)):
-        assert gate.check(frame) == ''
-        assert CommandVerifier(KEY).check(frame) == ''
-        assert CommandVerifier().check(frame) == ''
-    assert gate.check(clear) == 'frame is not signed'
-    assert gate.check(clear._replace(tag=bytes(8)))
-    assert gate.check(signer.sign(clear)) == ''
+        assert gate.verify(frame) == ''
+        assert CommandVerifier(KEY).verify(frame) == ''
+        assert CommandVerifier().verify(frame) == ''
+    assert gate.verify(clear) == 'frame is not signed'
+    assert gate.verify(clear._replace(tag=bytes(8)))
+    assert gate.verify(signer.sign(clear)) == ''
 
 
 def test_keyed_and_open_ends_refuse_each_other():
-    assert CommandVerifier(KEY).greet(frames.Hello(9, 0, 0), bytes(8)) == 'HELLO is not signed'
+    assert (
+        CommandVerifier(KEY).begin_session(frames.Hello(9, 0, 0), bytes(8))
+        == 'HELLO is not signed'
+    )
     signed = sign_hello(KEY, 9, 0, 0, b'HOSTHOST')
-    assert CommandVerifier().greet(signed, bytes(8)) == 'no key to check the HELLO with'
+    assert CommandVerifier().begin_session(signed, bytes(8)) == 'no key to check the HELLO with'
     gate = CommandVerifier()
     assert gate.nonce == b''
-    assert gate.greet(frames.Hello(9, 0, 0), bytes(8)) == ''
-    assert gate.check(COMMAND) == ''
-    assert gate.check(COMMAND._replace(tag=bytes(8))) == 'no key to check the tag with'
-    assert gate.check(COMMAND._replace(session=8)) == 'session is 9: got 8'
+    assert gate.begin_session(frames.Hello(9, 0, 0), bytes(8)) == ''
+    assert gate.verify(COMMAND) == ''
+    assert gate.verify(COMMAND._replace(tag=bytes(8))) == 'no key to check the tag with'
+    assert gate.verify(COMMAND._replace(session=8)) == 'session is 9: got 8'
 
 
 def test_a_robot_without_session_takes_nothing_of_session_zero():
     for gate in (CommandVerifier(), CommandVerifier(KEY)):
-        assert gate.check(COMMAND._replace(session=0)) == 'session is 0: got 0'
+        assert gate.verify(COMMAND._replace(session=0)) == 'session is 0: got 0'
 
 
 @pytest.mark.parametrize('text', ['6465' * 8, '64 65 ' * 8, ('6465' * 8).upper() + '\n'])

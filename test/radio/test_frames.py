@@ -145,7 +145,7 @@ def test_every_kind_has_a_golden_vector():
 def test_golden_rejections(row):
     with pytest.raises(FrameError) as error:
         DECODERS[row['direction']](bytes.fromhex(row['bytes']))
-    assert error.value.fault is FrameErrorKind(row['fault'])
+    assert error.value.kind is FrameErrorKind(row['fault'])
 
 
 @pytest.mark.parametrize('kind, decode', KINDS)
@@ -195,9 +195,7 @@ def test_every_truncation_and_every_byte_too_many_is_rejected(kind, decode):
                 decode(data[:size])
             # A HELLO says by a flag whether it is signed.
             flagged = kind is frames.Hello and size == 8
-            assert error.value.fault is (
-                FrameErrorKind.VALUE if flagged else FrameErrorKind.LENGTH
-            )
+            assert error.value.kind is (FrameErrorKind.VALUE if flagged else FrameErrorKind.LENGTH)
         if kind not in (frames.Transmit, frames.Result):
             with pytest.raises(FrameError):
                 decode(data + b'\0')
@@ -255,7 +253,7 @@ def test_another_version_is_told_from_another_kind():
         for decode in (decode_downlink, decode_uplink):
             with pytest.raises(FrameError) as error:
                 decode(bytes([head, 0, 0]))
-            assert (error.value.fault is FrameErrorKind.VERSION) == (head >> 4 != 1)
+            assert (error.value.kind is FrameErrorKind.VERSION) == (head >> 4 != 1)
 
 
 def test_a_field_that_only_a_signed_frame_has_is_not_lost_silently():

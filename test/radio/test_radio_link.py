@@ -11,7 +11,7 @@ from support.radio_bench import MS, Bench, FakeRobot
 
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError
-from t3mpc_ros.radio.link import port_actions
+from t3mpc_ros.radio.link import standstill_reasons as reasons
 from t3mpc_ros.radio.link.handshake import Session
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.port_actions import LinkState
@@ -42,7 +42,7 @@ def bench(request):
 
 
 def running(bench):
-    return bench.link.phase is LinkState.RUN
+    return bench.link.state is LinkState.RUN
 
 
 def moving(bench):
@@ -63,9 +63,9 @@ def commands(bench, since_ns=0):
 @pytest.mark.parametrize('key', [b'', KEY])
 def test_from_a_closed_port_to_running(key):
     bench = Bench(key=key)
-    assert bench.link.phase is LinkState.CLOSED
+    assert bench.link.state is LinkState.CLOSED
     assert bench.connect() < 0.2
-    assert bench.phases == [
+    assert bench.link_states == [
         LinkState.PING,
         LinkState.CFG,
         LinkState.HELLO,
@@ -74,7 +74,7 @@ def test_from_a_closed_port_to_running(key):
     ]
     assert bench.robot.speeds == (0.0, 0.0)
     bench.run(0.1)
-    assert bench.link.reason(bench.now_ns) == port_actions.NO_COMMAND
+    assert bench.link.reason(bench.now_ns) == reasons.NO_COMMAND
     assert bench.link.authenticated == bool(key)
     assert all(bool(frame.tag) == bool(key) for frame in commands(bench))
     info = bench.link.info
@@ -94,7 +94,7 @@ def test_a_robot_that_answers_hello_with_a_state_is_asked_who_it_is(key):
 
     bench.robot.take = plain
     assert bench.connect() < 0.2
-    assert bench.phases[2:5] == [LinkState.HELLO, LinkState.INFO, LinkState.PARAMS]
+    assert bench.link_states[2:5] == [LinkState.HELLO, LinkState.INFO, LinkState.PARAMS]
 
 
 def test_parameters_are_written_and_read_back():
@@ -144,8 +144,8 @@ def test_a_dongle_that_is_reset_by_opening_the_port_gets_the_time_it_needs():
     bench.dongle.boot_delay_ns = 1500 * MS
     bench.dongle.restart(bench.now_ns)
     bench.run(1.0)
-    assert bench.link.phase is LinkState.PING
-    assert bench.link.reason(bench.now_ns) == port_actions.DONGLE_STARTING
+    assert bench.link.state is LinkState.PING
+    assert bench.link.reason(bench.now_ns) == reasons.DONGLE_STARTING
     assert bench.run(3.0, lambda: running(bench)) < 0.8
     assert len(bench.opens) == 1
 
@@ -159,8 +159,8 @@ def test_something_that_is_no_dongle_is_given_up_after_five_seconds_less_and_les
     np.testing.assert_allclose(gaps, [5.2, 5.4, 5.8, 6.6, 7.0, 7.0][: len(gaps)], atol=0.02)
     assert len(gaps) >= 5
     assert bench.link.reason(bench.now_ns) in (
-        port_actions.NO_DONGLE,
-        port_actions.DONGLE_STARTING,
+        reasons.NO_DONGLE,
+        reasons.DONGLE_STARTING,
     )
 
 
@@ -174,7 +174,7 @@ def test_a_port_in_use_is_tried_less_and_less_often_and_the_reason_is_the_ports(
     assert bench.connect() < 2.2
     # Once a dongle has answered, the next trouble is not held against the port.
     bench.problem = ('/dev/ttyUSB0 is busy', False)
-    bench.link.failed('/dev/ttyUSB0 failed', False, bench.now_ns)
+    bench.link.port_failed('/dev/ttyUSB0 failed', False, bench.now_ns)
     since = len(bench.opens)
     bench.run(2.0)
     np.testing.assert_allclose(np.diff(bench.opens[since : since + 3]) / 1e9, [0.4, 0.8])
@@ -225,8 +225,8 @@ def test_a_dongle_that_does_not_take_what_is_set_is_named():
 
     bench.dongle.reply = stubborn
     bench.run(2.0)
-    assert bench.link.reason(bench.now_ns) == port_actions.RADIO_NOT_CONFIGURED
-    assert LinkState.HELLO not in bench.phases
+    assert bench.link.reason(bench.now_ns) == reasons.RADIO_NOT_CONFIGURED
+    assert LinkState.HELLO not in bench.link_states
     bench.dongle.reply = reply
     assert bench.connect() < 0.3
 
@@ -235,7 +235,7 @@ def test_a_dongle_without_a_radio_chip_is_named_and_noticed_when_repaired():
     bench = Bench()
     bench.dongle.chip_ok = False
     bench.run(10.0)
-    assert bench.link.reason(bench.now_ns) == port_actions.NO_CHIP
+    assert bench.link.reason(bench.now_ns) == reasons.NO_CHIP
     assert len(bench.opens) == 1
     bench.dongle.chip_ok = True
     assert bench.connect() < 1.2
@@ -245,7 +245,7 @@ def test_a_robot_that_is_off_is_named_and_found_when_switched_on():
     bench = Bench()
     bench.dongle.jam_until_ns = bench.now_ns + 20_000 * MS
     bench.run(19.9)
-    assert bench.link.phase is LinkState.HELLO
+    assert bench.link.state is LinkState.HELLO
     assert bench.link.reason(bench.now_ns) == (
         'the robot does not answer: is it on, in range, on channel 82?'
     )
@@ -255,9 +255,9 @@ def test_a_robot_that_is_off_is_named_and_found_when_switched_on():
 @pytest.mark.parametrize(
     'host, robot, reason',
     [
-        (KEY, ALIEN, port_actions.KEY_MISMATCH),
-        (KEY, b'', port_actions.ROBOT_KEY_MISSING),
-        (b'', KEY, port_actions.HOST_KEY_MISSING),
+        (KEY, ALIEN, reasons.KEY_MISMATCH),
+        (KEY, b'', reasons.ROBOT_KEY_MISSING),
+        (b'', KEY, reasons.HOST_KEY_MISSING),
     ],
 )
 def test_keys_that_do_not_fit_are_named_and_nothing_moves(host, robot, reason):
@@ -266,7 +266,7 @@ def test_keys_that_do_not_fit_are_named_and_nothing_moves(host, robot, reason):
     bench.run(3.0)
     assert bench.link.reason(bench.now_ns) == reason
     assert not bench.link.authenticated
-    assert LinkState.RUN not in bench.phases
+    assert LinkState.RUN not in bench.link_states
     assert bench.robot.speeds == (0.0, 0.0)
     assert bench.robot.gate.session == 0 or not host
 
@@ -276,7 +276,7 @@ def test_a_parameter_that_is_refused_is_named_with_its_bounds_and_keeps_the_robo
     bench.robot.refuses[1] = frames.OUT_OF_RANGE
     bench.drive(1.0, 1.0)
     bench.run(3.0)
-    assert bench.link.phase is LinkState.PARAMS
+    assert bench.link.state is LinkState.PARAMS
     assert bench.link.reason(bench.now_ns) == (
         'parameter acceleration = 30000 was refused: the robot allows 100 to 100000'
     )
@@ -298,7 +298,7 @@ def test_a_parameter_that_does_not_stay_is_named():
     assert bench.link.reason(bench.now_ns) == (
         'parameter deceleration must be 60000: the robot keeps 4711'
     )
-    assert LinkState.RUN not in bench.phases
+    assert LinkState.RUN not in bench.link_states
 
 
 def test_an_older_robot_with_fewer_parameters_is_asked_for_those_only():
@@ -533,11 +533,11 @@ def test_the_button_of_the_robot_is_named_and_released_from_here(bench):
     bench.robot.estop = bench.robot.button = True
     bench.run(0.1)
     assert bench.robot.speeds == (0.0, 0.0)
-    assert bench.link.reason(bench.now_ns) == port_actions.ROBOT_ESTOP
+    assert bench.link.reason(bench.now_ns) == reasons.ROBOT_ESTOP
     assert bench.link.release_estop(bench.now_ns) == ''
     bench.run(1.2)
     assert bench.robot.estop
-    assert bench.link.reason(bench.now_ns) == port_actions.ESTOP_BUTTON_HELD
+    assert bench.link.reason(bench.now_ns) == reasons.ESTOP_BUTTON_HELD
     bench.robot.button = False
     assert bench.link.release_estop(bench.now_ns) == ''
     bench.run(0.2)
@@ -552,7 +552,7 @@ def test_a_robot_that_refuses_our_session_stops_all_the_same():
     bench.link.latch_estop('asked for')
     bench.run(0.1)
     assert bench.robot.estop
-    assert bench.link.phase is LinkState.HELLO
+    assert bench.link.state is LinkState.HELLO
 
 
 # -- faults of the link ---------------------------------------------------------------------------
@@ -636,7 +636,7 @@ def test_a_robot_that_restarts_is_greeted_anew_and_its_angles_go_on(bench):
     # Since its start the robot has turned by bench.robot.angles; unseen before were some steps.
     expected = before.right + (last[0] - before.right) + bench.robot.angles[0]
     assert bench.link.telemetry.angles.right == pytest.approx(expected, abs=0.3)
-    assert LinkState.CLOSED not in bench.phases[1:]
+    assert LinkState.CLOSED not in bench.link_states[1:]
 
 
 def test_a_robot_that_restarts_out_of_reach_is_noticed_by_its_clock(bench):
@@ -686,7 +686,7 @@ def test_a_session_whose_key_was_taken_from_under_us_is_replaced():
     bench.drive(3.0, -2.0)
     bench.run(0.5)
     assert moving(bench)
-    bench.robot.gate.greet(old, b'ANEWONE.')
+    bench.robot.gate.begin_session(old, b'ANEWONE.')
     bench.robot.last_seq = None
     assert bench.run(3.0, lambda: not running(bench)) < 0.7
     assert bench.run(3.0, lambda: moving(bench)) < 0.4
@@ -695,7 +695,7 @@ def test_a_session_whose_key_was_taken_from_under_us_is_replaced():
 def test_a_robot_that_takes_no_commands_is_named_and_greeted_anew(bench):
     bench.robot.deaf_to_commands = True
     assert bench.run(2.0, lambda: not running(bench)) == pytest.approx(0.5, abs=0.1)
-    assert bench.link.reason(bench.now_ns) == port_actions.COMMANDS_REJECTED
+    assert bench.link.reason(bench.now_ns) == reasons.COMMANDS_REJECTED
     bench.robot.deaf_to_commands = False
     assert bench.run(2.0, lambda: moving(bench)) < 0.4
 
@@ -704,8 +704,8 @@ def test_a_dongle_that_restarts_is_set_anew(bench):
     bench.dongle.boot_delay_ns = 1500 * MS
     bench.dongle.restart(bench.now_ns)
     bench.run(0.4)
-    assert bench.link.phase is LinkState.PING
-    assert bench.link.reason(bench.now_ns) == port_actions.DONGLE_TIMEOUT
+    assert bench.link.state is LinkState.PING
+    assert bench.link.reason(bench.now_ns) == reasons.DONGLE_TIMEOUT
     assert bench.run(3.0, lambda: moving(bench)) < 1.5
     quality = bench.link.quality(bench.now_ns)
     assert quality.dongle_resets == 1
@@ -759,7 +759,7 @@ def test_results_that_get_lost_are_waited_for_no_longer_than_a_moment(bench):
     bench.run(0.4)
     assert moving(bench)
     assert bench.link.quality(bench.now_ns).lost in (3, 4)
-    assert LinkState.PING not in bench.phases[1:]
+    assert LinkState.PING not in bench.link_states[1:]
 
 
 def test_the_wrap_of_the_hosts_microseconds_does_not_show(bench):
@@ -847,19 +847,19 @@ def test_at_a_hundred_cycles_a_second_requests_still_get_their_turn():
 def test_shutting_down_stops_the_robot_takes_its_drives_out_and_closes(bench):
     since = bench.now_ns
     bench.link.shut_down()
-    assert bench.run(1.5, lambda: bench.link.phase is LinkState.DONE) < 0.2
+    assert bench.run(1.5, lambda: bench.link.state is LinkState.DONE) < 0.2
     sent = commands(bench, since)
     assert len(sent) >= 4
     assert [frame.flags for frame in sent] == [CommandFlag.ENABLE] * (len(sent) - 1) + [0]
     assert all((frame.left, frame.right) == (0, 0) for frame in sent)
     assert not bench.robot.enabled
     assert not bench.is_open
-    assert bench.link.reason(bench.now_ns) == port_actions.SHUT_DOWN
+    assert bench.link.reason(bench.now_ns) == reasons.SHUT_DOWN
     opened = len(bench.opens)
-    bench.link.failed('too late', False, bench.now_ns)
+    bench.link.port_failed('too late', False, bench.now_ns)
     bench.run(3.0)
     assert len(bench.opens) == opened
-    assert bench.link.phase is LinkState.DONE
+    assert bench.link.state is LinkState.DONE
 
 
 def test_drives_are_taken_out_only_when_the_wheels_stand(bench):
@@ -874,7 +874,7 @@ def test_drives_are_taken_out_only_when_the_wheels_stand(bench):
     end_ns = bench.now_ns + 400 * MS
     bench.robot.follow = slow
     bench.link.shut_down()
-    assert bench.run(1.5, lambda: bench.link.phase is LinkState.DONE) > 0.4
+    assert bench.run(1.5, lambda: bench.link.state is LinkState.DONE) > 0.4
     assert [frame.flags for frame in commands(bench)].count(0) == 1
 
 
@@ -882,20 +882,20 @@ def test_shutting_down_does_not_wait_for_a_robot_that_is_gone(bench):
     bench.dongle.jam_until_ns = bench.now_ns + 60_000 * MS
     bench.run(0.5)
     bench.link.shut_down()
-    assert bench.run(3.0, lambda: bench.link.phase is LinkState.DONE) < 1.3
+    assert bench.run(3.0, lambda: bench.link.state is LinkState.DONE) < 1.3
 
 
 def test_a_robot_that_restarts_while_shutting_down_is_not_greeted_again(bench):
     bench.link.shut_down()
     bench.robot.boot(bench.now_ns)
     bench.robot.log.clear()
-    bench.run(1.5, lambda: bench.link.phase is LinkState.DONE)
+    bench.run(1.5, lambda: bench.link.state is LinkState.DONE)
     assert not any(isinstance(frame, frames.Hello) for _, frame in bench.robot.log)
 
 
 def test_what_was_on_its_way_when_the_port_was_lost_is_forgotten(bench):
     bench.run(0.5, lambda: bench.link._dialogue.deadline_ns is not None)
-    bench.link.failed('failed', True, bench.now_ns)
+    bench.link.port_failed('failed', True, bench.now_ns)
     assert bench.link.step(bench.now_ns)[-1].until_ns - bench.now_ns == 200 * MS
 
 
@@ -905,7 +905,7 @@ def test_shutting_down_before_anything_runs(seconds):
     bench.run(seconds)
     bench.link.shut_down()
     bench.run(0.1)
-    assert bench.link.phase is LinkState.DONE
+    assert bench.link.state is LinkState.DONE
     assert not bench.is_open
 
 

@@ -191,7 +191,7 @@ def test_the_link_ends_with_standstill_and_the_port_closed():
     made.connect()
     ramped(made, 5.0, 5.0, 1.0)
     made.host.shut_down()
-    made.run(2.0, lambda: made.host.link.phase is LinkState.DONE)
+    made.run(2.0, lambda: made.host.link.state is LinkState.DONE)
     assert made.robot.speeds == (0.0, 0.0)
     assert not made.is_open
 

@@ -57,7 +57,7 @@ class Bench:
                     received = b''.join(data for _, data in (cable if robot else arrived))
                 if self.is_open and not robot and not self.emulator.port_open:
                     self.is_open = False
-                    task.failed('dongle is not there', True, self.now_ns)
+                    task.port_failed('dongle is not there', True, self.now_ns)
                     break
             if self.each is not None:
                 self.each(self)
@@ -73,7 +73,7 @@ class Bench:
                 wake = deed.until_ns
             elif isinstance(deed, Open):
                 self.is_open = True
-                task.opened(self.now_ns)
+                task.port_opened(self.now_ns)
                 return self.now_ns
             elif isinstance(deed, Write) and self.is_open and robot:
                 self.emulator.feed_console(deed.data, self.now_ns)

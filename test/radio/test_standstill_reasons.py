@@ -13,7 +13,7 @@ from support.radio_bench import Bench as ScriptedBench
 from support.radio_bench import FakeRobot
 
 from t3mpc_ros.nodes.common.diagnostics import complaints
-from t3mpc_ros.radio.link import port_actions
+from t3mpc_ros.radio.link import standstill_reasons as reasons
 from t3mpc_ros.radio.link.port_actions import LinkState
 from t3mpc_ros.radio.protocol.codec import encode
 from t3mpc_ros.radio.protocol.frames import Command, CommandFlag, Pong, StatusFlag
@@ -81,7 +81,7 @@ def the_button_is_pressed(bench):
     bench.run(0.3)
 
 
-@cause('is the button still pressed?')
+@cause('is its button still pressed?')
 def the_button_is_held_while_it_is_released(bench):
     driving(bench)
     bench.inject('button')
@@ -104,14 +104,14 @@ def the_dongle_is_pulled_out(bench):
     bench.run(0.5)
 
 
-@cause('the dongle has fallen silent: was it restarted?')
+@cause('the dongle stopped answering: did it restart?')
 def the_line_is_dead(bench):
     driving(bench)
     bench.inject('silence')
     bench.run(0.6)
 
 
-@cause('nothing on the port answers like a dongle')
+@cause('no dongle answers on this port')
 def another_device_is_at_the_port(bench):
     bench.inject('silence')
     bench.run(8.0)
@@ -148,12 +148,12 @@ def the_keys_differ(bench):
     bench.run(1.0)
 
 
-@cause('the robot wants signed commands: give the host the key', robot_key=KEY)
+@cause('the robot requires signed commands: give the host the key', robot_key=KEY)
 def the_host_has_no_key(bench):
     bench.run(1.0)
 
 
-@cause('the robot has no key to check our signature with', key=KEY, robot_key=b'')
+@cause('the robot has no key to verify signatures', key=KEY, robot_key=b'')
 def the_robot_has_no_key(bench):
     bench.run(1.0)
 
@@ -181,7 +181,7 @@ def the_robot_has_forgotten_the_session(bench):
     """Said while the robot is greeted anew, until it answers."""
     driving(bench)
     bench.inject('robot_reset', 0.01)
-    bench.run(1.0, lambda: bench.link.phase is LinkState.HELLO)
+    bench.run(1.0, lambda: bench.link.state is LinkState.HELLO)
 
 
 @cause('the link is shut down')
@@ -226,10 +226,10 @@ class Odd(FakeRobot):
 @pytest.mark.parametrize(
     'odd, says',
     [
-        ({'add': StatusFlag.TTL_EXPIRED}, port_actions.TTL_EXPIRED),
-        ({'drop': StatusFlag.ENABLED}, port_actions.DRIVES_DISABLED),
+        ({'add': StatusFlag.TTL_EXPIRED}, reasons.TTL_EXPIRED),
+        ({'drop': StatusFlag.ENABLED}, reasons.DRIVES_DISABLED),
         ({'protocol': 2}, 'the robot must speak protocol 1: it speaks 2'),
-        ({'accepts': False}, port_actions.HELLO_REJECTED),
+        ({'accepts': False}, reasons.HELLO_REJECTED),
     ],
 )
 def test_what_an_odd_robot_does_is_told(odd, says):

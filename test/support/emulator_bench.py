@@ -89,7 +89,7 @@ class Bench:
             arrived = self.emulator.run_to(self.now_ns)
             if self.is_open and not self.emulator.port_open:
                 self.is_open = False
-                self.link.failed('dongle is not there', True, self.now_ns)
+                self.link.port_failed('dongle is not there', True, self.now_ns)
                 return
             if arrived and self.is_open:
                 self._step(b''.join(data for _, data in arrived))
@@ -114,9 +114,9 @@ class Bench:
             elif isinstance(deed, Open):
                 self.is_open = self.emulator.port_open
                 if self.is_open:
-                    self.link.opened(self.now_ns)
+                    self.link.port_opened(self.now_ns)
                 else:
-                    self.link.failed('dongle is not there', True, self.now_ns)
+                    self.link.port_failed('dongle is not there', True, self.now_ns)
                 self.wake_ns = self.now_ns
                 deeds = []
 
@@ -146,7 +146,7 @@ class Bench:
 
     def connect(self):
         """Run until the link runs."""
-        return self.run(10.0, lambda: self.link.phase is LinkState.RUN)
+        return self.run(10.0, lambda: self.link.state is LinkState.RUN)
 
 
 class RobotBench(Bench):

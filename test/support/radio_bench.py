@@ -109,7 +109,7 @@ class FakeRobot:
         self.answer = None
         if isinstance(frame, frames.Hello):
             nonce = self.boots.to_bytes(4, 'little') + self.time_us(now_ns).to_bytes(4, 'little')
-            if not self.gate.greet(frame, nonce):
+            if not self.gate.begin_session(frame, nonce):
                 self.last_seq, self.seq, self.speeds, self.enabled = None, 0, (0.0, 0.0), False
             self.answer = self.info(frame.seq, now_ns)
         elif isinstance(frame, frames.Poll):
@@ -122,7 +122,7 @@ class FakeRobot:
                 )
         elif isinstance(frame, frames.ParamGet):
             self.answer = self.parameter(frame, frames.OK)
-        elif self.gate.check(frame) == '':
+        elif self.gate.verify(frame) == '':
             if isinstance(frame, frames.Command):
                 self.follow(frame, now_ns)
             elif isinstance(frame, frames.ParamSet):
@@ -279,7 +279,7 @@ class Bench:
         self.is_open = False
         self.replies = []
         self.wake_ns = 0
-        self.phases = []
+        self.link_states = []
         self.opens = []
         self.closes = 0
         self.wheels = None
@@ -306,7 +306,7 @@ class Bench:
                 received += self.replies.pop(0)[1]
             if self.is_open and not self.plugged:
                 self.is_open = False
-                self.link.failed('dongle is not there', True, self.now_ns)
+                self.link.port_failed('dongle is not there', True, self.now_ns)
             self._do(self.link.step(self.now_ns, received))
             if until is not None and until():
                 break
@@ -344,18 +344,18 @@ class Bench:
                 if self.plugged and self.problem[1]:
                     self.is_open = True
                     self.replies.clear()
-                    self.link.opened(self.now_ns)
+                    self.link.port_opened(self.now_ns)
                 else:
-                    self.link.failed(*self.problem, self.now_ns)
+                    self.link.port_failed(*self.problem, self.now_ns)
             elif isinstance(deed, Close):
                 self.closes += 1
                 self.is_open = False
             elif isinstance(deed, Write) and self.is_open and self.plugged:
                 self.replies += self.dongle.take(deed.data, self.now_ns)
                 self.replies.sort()
-        if not self.phases or self.phases[-1] is not self.link.phase:
-            self.phases.append(self.link.phase)
+        if not self.link_states or self.link_states[-1] is not self.link.state:
+            self.link_states.append(self.link.state)
 
     def connect(self):
         """Run until the link runs."""
-        return self.run(10.0, lambda: self.link.phase is LinkState.RUN)
+        return self.run(10.0, lambda: self.link.state is LinkState.RUN)

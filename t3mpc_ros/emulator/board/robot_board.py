@@ -253,7 +253,7 @@ class RobotBoard:
             self._counts.add('expired')
             self._ramp.halt()
         if self.gate.session and now - self._heard_us > SESSION_TIMEOUT_US:
-            self.gate.end()
+            self.gate.end_session()
             self._disable()
         self._wheels.switch_power(self._enabled, now)
         self._stirred = self._wheels.move_on(now)
@@ -291,7 +291,7 @@ class RobotBoard:
         try:
             frame = decode_downlink(data)
         except FrameError as error:
-            strange = error.fault in (FrameErrorKind.VERSION, FrameErrorKind.KIND)
+            strange = error.kind in (FrameErrorKind.VERSION, FrameErrorKind.KIND)
             self._counts.add('bad_version' if strange else 'short')
             return
         if isinstance(frame, Hello):
@@ -312,13 +312,13 @@ class RobotBoard:
             return bool(session) and frame.session == session
         # An ESTOP is obeyed already. Of whom nobody knows, nothing else is believed, or a
         # stranger's number would make the host's next ones look old.
-        return self.gate.admit(frame) == ''
+        return self.gate.accept(frame) == ''
 
     def _greet(self, hello: Hello) -> None:
         # Refused or not, INFO tells the host which session holds and whether there is a key.
         self._answer = PendingReply(frames.Info, hello.seq)
         before = self.gate.nonce
-        if self.gate.greet(hello, self._entropy(NONCE_SIZE)):
+        if self.gate.begin_session(hello, self._entropy(NONCE_SIZE)):
             self._counts.add('bad_session')
             return
         if self.gate.key and self.gate.nonce == before:

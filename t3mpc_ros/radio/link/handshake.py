@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable
 
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.radio.link import port_actions
+from t3mpc_ros.radio.link import standstill_reasons as reasons
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.port_actions import LinkState
 from t3mpc_ros.radio.link.transaction import TransactionResult
@@ -101,11 +101,11 @@ class Session:
         if info.protocol != VERSION:
             return f'the robot must speak protocol {VERSION}: it speaks {info.protocol}'
         if self._key and not info.nonce:
-            return port_actions.ROBOT_KEY_MISSING
+            return reasons.ROBOT_KEY_MISSING
         if info.nonce and not self._key:
-            return port_actions.HOST_KEY_MISSING
+            return reasons.HOST_KEY_MISSING
         if info.session != self._number:
-            return port_actions.KEY_MISMATCH if self._key else port_actions.HELLO_REJECTED
+            return reasons.KEY_MISMATCH if self._key else reasons.HELLO_REJECTED
         if self._key:
             key = session_key(self._key, self._nonce, info.nonce)
             self._signer = Signer(key, self._hello_us)
@@ -170,7 +170,7 @@ class Handshake:
         self._session = session
         self._wanted = parameters.robot.on_wire()
         self._channel = parameters.channel
-        self._phase = LinkState.HELLO
+        self._state = LinkState.HELLO
         self._why = why
         self._todo: deque[tuple[int, int | None]] = deque()
         self._tries = 0
@@ -178,9 +178,9 @@ class Handshake:
         self._board_parameters: dict[int, int] = {}
 
     @property
-    def phase(self) -> LinkState:
+    def state(self) -> LinkState:
         """HELLO, INFO or PARAMS; RUN when there is nothing left to do."""
-        return self._phase
+        return self._state
 
     @property
     def why(self) -> str:
@@ -199,9 +199,9 @@ class Handshake:
 
     def next(self, now_ns: int) -> tuple[Downlink, int]:
         """Return what to send now, and what to POLL after it."""
-        if self._phase is LinkState.HELLO:
+        if self._state is LinkState.HELLO:
             return self._session.hello(now_ns), frames.INFO
-        if self._phase is LinkState.INFO:
+        if self._state is LinkState.INFO:
             return self._session.poll(frames.INFO), frames.INFO
         number, value = self._todo[0]
         if value is None:
@@ -210,24 +210,24 @@ class Handshake:
 
     def hear(self, heard: TransactionResult) -> int:
         """Take the answer and return how long (ns) to wait before the next step."""
-        if self._phase is LinkState.PARAMS:
+        if self._state is LinkState.PARAMS:
             return self._hear_parameter(heard)
         if isinstance(heard.uplink, Info):
             return self._meet(heard.uplink)
         if heard.uplink is None:
-            self._phase = LinkState.HELLO
-            self._why = robot_absent(self._channel)
+            self._state = LinkState.HELLO
+            self._why = reasons.robot_absent(self._channel)
             return _RETRY_NS
-        self._phase = LinkState.INFO
+        self._state = LinkState.INFO
         return 0
 
     def _meet(self, info: Info) -> int:
         problem = self._session.accept(info)
         if problem:
-            self._phase, self._why = LinkState.HELLO, problem
+            self._state, self._why = LinkState.HELLO, problem
             return _RETRY_NS
         self._info = info
-        self._phase = LinkState.PARAMS
+        self._state = LinkState.PARAMS
         self._list(info.parameters)
         return 0
 
@@ -244,10 +244,10 @@ class Handshake:
         if not isinstance(answer, Param) or (answer.id, answer.seq) != (number, asked_seq):
             self._tries += 1
             if self._tries >= _MAX_ATTEMPTS:
-                self._tries, self._phase, self._why = (
+                self._tries, self._state, self._why = (
                     0,
                     LinkState.HELLO,
-                    robot_absent(self._channel),
+                    reasons.robot_absent(self._channel),
                 )
             return 0 if heard.uplink is not None else _RETRY_NS // 5
         self._tries = 0
@@ -265,10 +265,5 @@ class Handshake:
             return _REJECTED_RETRY_NS
         self._todo.popleft()
         if not self._todo:
-            self._phase = LinkState.RUN
+            self._state = LinkState.RUN
         return 0
-
-
-def robot_absent(channel: int) -> str:
-    """Return the words for a robot that does not answer."""
-    return f'the robot does not answer: is it on, in range, on channel {channel}?'

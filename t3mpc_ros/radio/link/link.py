@@ -12,8 +12,8 @@ import secrets
 from typing import NamedTuple
 
 from t3mpc_ros.geometry.types import NANOSECONDS, WheelSpeeds
-from t3mpc_ros.radio.link import port_actions
-from t3mpc_ros.radio.link.handshake import Entropy, Handshake, Session, robot_absent
+from t3mpc_ros.radio.link import standstill_reasons as reasons
+from t3mpc_ros.radio.link.handshake import Entropy, Handshake, Session
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.port_actions import Close, LinkState, Open, PortAction, Wait, Write
 from t3mpc_ros.radio.link.setpoint import SetpointArbiter
@@ -137,7 +137,11 @@ class ActiveSession:
             self._say_goodbye(heard)
         if isinstance(heard.uplink, State):
             return self._judge(heard, heard.uplink)
-        return robot_absent(self._parameters.channel) if self._lost >= _MAX_LOST_CYCLES else ''
+        return (
+            reasons.robot_absent(self._parameters.channel)
+            if self._lost >= _MAX_LOST_CYCLES
+            else ''
+        )
 
     def _aside(self, now_ns: int) -> Downlink | PingRequest | None:
         """Return the request that has waited for a moment between cycles, if any."""
@@ -182,7 +186,7 @@ class ActiveSession:
             if state.seq == heard.asked.seq or heard.asked.flags & CommandFlag.ESTOP:
                 self._taken_ns = heard.returned_ns
             elif heard.returned_ns - self._taken_ns > _REJECTED_TIMEOUT_NS:
-                return port_actions.COMMANDS_REJECTED
+                return reasons.COMMANDS_REJECTED
         return ''
 
 
@@ -240,7 +244,7 @@ class Link:
         self._dialogue = TransactionLayer(self._statistics)
         self._orders = SetpointArbiter(parameters)
         self._reader = TelemetryDecoder()
-        self._phase = LinkState.CLOSED
+        self._state = LinkState.CLOSED
         self._why = LinkState.CLOSED.value
         self._deeds: list[PortAction] = []
         self._due_ns = 0
@@ -260,14 +264,14 @@ class Link:
     # -- for whoever asks -------------------------------------------------------------------------
 
     @property
-    def phase(self) -> LinkState:
+    def state(self) -> LinkState:
         """How far the link has come."""
-        return self._phase
+        return self._state
 
     @property
     def authenticated(self) -> bool:
         """Whether commands are signed, and the robot checks them."""
-        return bool(self._key) and self._phase in (LinkState.PARAMS, LinkState.RUN, LinkState.STOP)
+        return bool(self._key) and self._state in (LinkState.PARAMS, LinkState.RUN, LinkState.STOP)
 
     @property
     def telemetry(self) -> Telemetry | None:
@@ -318,19 +322,19 @@ class Link:
 
     def reason(self, now_ns: int) -> str:
         """Return in words why the robot does not move; empty when nothing hinders it."""
-        if self._phase in _HANDSHAKE_STATES and self._greeting is not None:
+        if self._state in _HANDSHAKE_STATES and self._greeting is not None:
             return self._greeting.why
-        if self._phase is not LinkState.RUN:
+        if self._state is not LinkState.RUN:
             return self._why
         silence = min(self._age(now_ns), (now_ns - self._since_ns) / NANOSECONDS)
         if silence > self._parameters.ttl:
-            return robot_absent(self._parameters.channel)
+            return reasons.robot_absent(self._parameters.channel)
         status = self._telemetry.raw.status if self._telemetry is not None else StatusFlag(0)
         if why := self._orders.reason(bool(status & StatusFlag.ESTOP)):
             return why
         if status & StatusFlag.TTL_EXPIRED:
-            return port_actions.TTL_EXPIRED
-        return '' if status & StatusFlag.ENABLED else port_actions.DRIVES_DISABLED
+            return reasons.TTL_EXPIRED
+        return '' if status & StatusFlag.ENABLED else reasons.DRIVES_DISABLED
 
     # -- for whoever orders -----------------------------------------------------------------------
 
@@ -361,22 +365,22 @@ class Link:
 
     # -- for whoever holds the port ---------------------------------------------------------------
 
-    def opened(self, now_ns: int) -> None:
+    def port_opened(self, now_ns: int) -> None:
         """Take notice that the port is open."""
         self._dialogue.reset()
         # What was found at the last try is said until there is something newer to say.
-        why = self._why if self._why == port_actions.NO_DONGLE else port_actions.DONGLE_STARTING
+        why = self._why if self._why == reasons.NO_DONGLE else reasons.DONGLE_STARTING
         self._look_for_dongle(why, now_ns)
 
-    def failed(self, text: str, absent: bool, now_ns: int) -> None:
+    def port_failed(self, text: str, absent: bool, now_ns: int) -> None:
         """Take notice that the port could not be opened or used; ``text`` says why.
 
         A device that is absent is looked for five times a second, which costs nothing; after any
         other failure the port is tried less and less often.
         """
-        if self._phase is LinkState.DONE:
+        if self._state is LinkState.DONE:
             return
-        if self._phase is not LinkState.OPEN:
+        if self._state is not LinkState.OPEN:
             self._statistics.port_failures += 1
         self._close(LinkState.CLOSED, text)
         self._due_ns = now_ns + (_MIN_REOPEN_NS if absent else self._back_off_ns)
@@ -403,13 +407,13 @@ class Link:
     # -- inside -----------------------------------------------------------------------------------
 
     def _until_ns(self, now_ns: int) -> int:
-        if self._phase in (LinkState.OPEN, LinkState.DONE):
+        if self._state in (LinkState.OPEN, LinkState.DONE):
             return now_ns + NANOSECONDS
         if self._dialogue.deadline_ns is not None:
             return self._dialogue.deadline_ns
         if self._running is not None:
             return self._running.due_ns
-        if self._phase in _HANDSHAKE_STATES and self._orders.estop:
+        if self._state in _HANDSHAKE_STATES and self._orders.estop:
             return min(self._due_ns, self._estop_ns)
         return self._due_ns
 
@@ -417,20 +421,20 @@ class Link:
         """Send what is due: one frame at most."""
         if self._running is not None and self._session is not None:
             self._speak_running(self._running, now_ns)
-        elif self._phase in _HANDSHAKE_STATES and self._orders.estop and now_ns >= self._estop_ns:
+        elif self._state in _HANDSHAKE_STATES and self._orders.estop and now_ns >= self._estop_ns:
             self._estop_ns = now_ns + round(NANOSECONDS / self._parameters.cycle_rate)
             if self._session is not None:  # it has not begun, but stopping needs none
                 self._transact(self._session.command(CommandFlag.ESTOP, 0, 0, 0, now_ns), now_ns)
         elif now_ns < self._due_ns:
             pass
-        elif self._phase is LinkState.CLOSED:
-            self._phase = LinkState.OPEN
+        elif self._state is LinkState.CLOSED:
+            self._state = LinkState.OPEN
             self._deeds.append(Open())
-        elif self._phase is LinkState.PING and now_ns - self._since_ns >= _DONGLE_START_TIMEOUT_NS:
-            self.failed(port_actions.NO_DONGLE, False, now_ns)
-        elif self._phase is LinkState.PING:
+        elif self._state is LinkState.PING and now_ns - self._since_ns >= _DONGLE_START_TIMEOUT_NS:
+            self.port_failed(reasons.NO_DONGLE, False, now_ns)
+        elif self._state is LinkState.PING:
             self._write(self._dialogue.ping(_PING_TIMEOUT_NS, now_ns))
-        elif self._phase is LinkState.CFG:
+        elif self._state is LinkState.CFG:
             self._write(self._dialogue.configure(self._parameters.configure(0), now_ns))
         elif self._greeting is not None:
             frame, fetch = self._greeting.next(now_ns)
@@ -461,24 +465,24 @@ class Link:
             self._statistics.robot = heard.uplink
         if isinstance(heard.uplink, State):
             self._see(heard, heard.uplink)
-        if self._phase is LinkState.PING:
+        if self._state is LinkState.PING:
             self._hear_pong(heard, now_ns)
         elif heard.dongle_restarted:
             self._set_radio(now_ns)  # what was set is gone
         elif self._dialogue.silent >= _MAX_TIMEOUTS:
-            self._look_for_dongle(port_actions.DONGLE_TIMEOUT, now_ns)
-        elif self._phase is LinkState.CFG:
+            self._look_for_dongle(reasons.DONGLE_TIMEOUT, now_ns)
+        elif self._state is LinkState.CFG:
             self._hear_configured(heard, now_ns)
         elif self._running is not None:
             why = self._running.hear(heard)
             if self._running.finished:
-                self._close(LinkState.DONE, port_actions.SHUT_DOWN)
+                self._close(LinkState.DONE, reasons.SHUT_DOWN)
             elif why:
                 self._greet(why, now_ns)
         elif self._greeting is not None and not isinstance(heard.asked, frames.Command):
             self._due_ns = now_ns + self._greeting.hear(heard)
-            self._phase = self._greeting.phase
-            if self._phase is LinkState.RUN:
+            self._state = self._greeting.state
+            if self._state is LinkState.RUN:
                 self._run(self._greeting, now_ns)
 
     def _see(self, heard: TransactionResult, state: State) -> None:
@@ -501,7 +505,7 @@ class Link:
                 f'the dongle must speak protocol {frames.VERSION}: it speaks {pong.protocol}'
             )
         elif not pong.chip_ok:
-            self._why = port_actions.NO_CHIP
+            self._why = reasons.NO_CHIP
         else:
             self._set_radio(now_ns)
             return
@@ -513,12 +517,12 @@ class Link:
         reply = heard.reply
         if isinstance(reply, Configured) and isinstance(heard.asked, frames.Configure):
             if not reply.chip_ok:
-                self._look_for_dongle(port_actions.NO_CHIP, now_ns)
+                self._look_for_dongle(reasons.NO_CHIP, now_ns)
                 return
             if reply[:-1] == tuple(heard.asked):
-                self._greet(robot_absent(self._parameters.channel), now_ns)
+                self._greet(reasons.robot_absent(self._parameters.channel), now_ns)
                 return
-            self._why = port_actions.RADIO_NOT_CONFIGURED
+            self._why = reasons.RADIO_NOT_CONFIGURED
         self._due_ns = now_ns + _CONFIGURE_RETRY_NS
 
     def _look_for_dongle(self, why: str, now_ns: int) -> None:
@@ -554,20 +558,20 @@ class Link:
         )
 
     def _stop(self, now_ns: int) -> None:
-        if self._phase is LinkState.RUN and self._running is not None:
-            self._phase, self._why = LinkState.STOP, LinkState.STOP.value
+        if self._state is LinkState.RUN and self._running is not None:
+            self._state, self._why = LinkState.STOP, LinkState.STOP.value
             self._running.begin_stop(now_ns)
-        elif self._phase not in (LinkState.STOP, LinkState.DONE):
-            self._close(LinkState.DONE, port_actions.SHUT_DOWN)
+        elif self._state not in (LinkState.STOP, LinkState.DONE):
+            self._close(LinkState.DONE, reasons.SHUT_DOWN)
 
-    def _close(self, phase: LinkState, why: str) -> None:
-        if self._phase is not LinkState.CLOSED:
+    def _close(self, state: LinkState, why: str) -> None:
+        if self._state is not LinkState.CLOSED:
             self._deeds.append(Close())
         self._dialogue.reset()
-        self._enter(phase, why)
+        self._enter(state, why)
 
-    def _enter(self, phase: LinkState, why: str) -> None:
-        self._phase, self._why = phase, why
+    def _enter(self, state: LinkState, why: str) -> None:
+        self._state, self._why = state, why
         self._greeting = self._running = None
 
     def _age(self, now_ns: int) -> float:

@@ -6,7 +6,7 @@ import math
 from typing import NamedTuple
 
 from t3mpc_ros.geometry.types import NANOSECONDS, WheelSpeeds
-from t3mpc_ros.radio.link import port_actions
+from t3mpc_ros.radio.link import standstill_reasons as reasons
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol.frames import BUSY, OK, Ack, Action, CommandFlag, Uplink
 from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, RobotCommand
@@ -41,7 +41,7 @@ class SetpointArbiter:
     def __init__(self, parameters: LinkParameters) -> None:
         self._parameters = parameters
         self._command: RobotCommand | None = None
-        self._why = port_actions.NO_COMMAND
+        self._why = reasons.NO_COMMAND
         self._estop = ''
         self._release_until_ns: int | None = None
         self._releases = 0
@@ -90,7 +90,7 @@ class SetpointArbiter:
         """Order the emergency stop from now on."""
         self._estop = f'emergency stop: {reason}'
         self._release_until_ns = None
-        self.drop(port_actions.NO_COMMAND)
+        self.drop(reasons.NO_COMMAND)
 
     def release(self, latched_there: bool, now_ns: int) -> str:
         """Order its release, here and in the robot, or return why that is not needed."""
@@ -131,7 +131,7 @@ class SetpointArbiter:
         if self._estop:
             return self._estop
         if latched_there:
-            return port_actions.ESTOP_BUTTON_HELD if self._button else port_actions.ROBOT_ESTOP
+            return reasons.ESTOP_BUTTON_HELD if self._button else reasons.ROBOT_ESTOP
         return '' if self._command is not None else self._why
 
     @property

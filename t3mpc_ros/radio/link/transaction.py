@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Transaction layer: one frame in flight to the dongle; its result is a reply, an error or a timeout."""
+"""Transaction layer: one frame in flight to the dongle, and its reply or timeout."""
 
 from typing import NamedTuple
 

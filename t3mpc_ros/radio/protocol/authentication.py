@@ -236,7 +236,7 @@ class CommandVerifier:
         """The robot's nonce, for INFO: zeros before the first HELLO; empty without a key."""
         return self._robot_nonce
 
-    def greet(self, hello: Hello, fresh_nonce: bytes) -> str:
+    def begin_session(self, hello: Hello, fresh_nonce: bytes) -> str:
         """Start the session a HELLO asks for, or return why not.
 
         ``fresh_nonce`` (8 bytes nobody can foresee) becomes the robot's, unless this HELLO repeats
@@ -257,20 +257,20 @@ class CommandVerifier:
         self._session = hello.session
         return ''
 
-    def end(self) -> None:
+    def end_session(self) -> None:
         """Forget the session: the HELLO that began it may begin another, with a new nonce."""
         self._session = 0
         self._host_nonce = b''
 
-    def check(self, frame: SignedFrame) -> str:
+    def verify(self, frame: SignedFrame) -> str:
         """Return why a frame does not count; when it does, none like it or older counts again.
 
-        A CMD with ESTOP always counts; what else it says does only if :meth:`admit` takes it.
+        A CMD with ESTOP always counts; what else it says does only if :meth:`accept` takes it.
         """
-        why = self.admit(frame)
+        why = self.accept(frame)
         return '' if isinstance(frame, Command) and frame.flags & CommandFlag.ESTOP else why
 
-    def admit(self, frame: SignedFrame) -> str:
+    def accept(self, frame: SignedFrame) -> str:
         """Return why a frame is none of the session's; when it is, it is part of the order.
 
         So is a well-signed ESTOP: one that is repeated for hours keeps the epoch known. One that

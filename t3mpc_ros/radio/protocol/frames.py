@@ -26,9 +26,9 @@ class FrameErrorKind(Enum):
 class FrameError(ValueError):
     """A frame that cannot be read or written."""
 
-    def __init__(self, fault: FrameErrorKind, text: str) -> None:
+    def __init__(self, kind: FrameErrorKind, text: str) -> None:
         super().__init__(text)
-        self.fault = fault
+        self.kind = kind
 
 
 class CommandFlag(IntFlag):

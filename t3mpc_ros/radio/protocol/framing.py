@@ -3,7 +3,7 @@
 """Framing of the serial line: COBS(frame | CRC-16) and a zero byte, decoded from a byte stream.
 
 The zero byte occurs nowhere else, so the decoder resynchronises at the next one after any error.
-COBS: S. Cheshire, M. Baker, Consistent overhead byte stuffing, IEEE/ACM Trans. Networking 7 (1999),
+COBS: S. Cheshire, M. Baker, Consistent overhead byte stuffing, IEEE/ACM Trans. Networking 7, 1999,
 DOI 10.1109/90.769765. CRC-16/IBM-3740: polynomial 0x1021, initial value 0xFFFF.
 """
 

@@ -99,16 +99,16 @@ class Jog:
     @property
     def done(self) -> bool:
         """Whether the robot stands, its drives are out, and the port is closed."""
-        return self.link.phase is LinkState.DONE
+        return self.link.state is LinkState.DONE
 
-    def opened(self, now_ns: int) -> None:
+    def port_opened(self, now_ns: int) -> None:
         """Take notice that the port is open."""
-        self.link.opened(now_ns)
+        self.link.port_opened(now_ns)
 
-    def failed(self, text: str, absent: bool, now_ns: int) -> None:
+    def port_failed(self, text: str, absent: bool, now_ns: int) -> None:
         """Give up: the robot stops by itself within its time to live."""
         self._give_up(text)
-        self.link.failed(text, absent, now_ns)
+        self.link.port_failed(text, absent, now_ns)
 
     def interrupt(self, now_ns: int) -> None:
         """Bring the wheel to rest, take the drives out, and leave."""
@@ -132,7 +132,7 @@ class Jog:
         """Order the next bit of the way."""
         link, telemetry = self.link, self.link.telemetry
         reason = link.reason(now_ns)
-        if link.phase is not LinkState.RUN or telemetry is None:
+        if link.state is not LinkState.RUN or telemetry is None:
             self._tell(reason, now_ns)
             if self._start is not None:
                 self._give_up(reason or 'the link was lost')

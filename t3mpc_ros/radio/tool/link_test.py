@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.radio.link.handshake import robot_absent
+from t3mpc_ros.radio.link import standstill_reasons as reasons
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.statistics import LOSS_LIMIT, RETRY_COUNTS, ROUND_TRIP_LIMIT
 from t3mpc_ros.radio.protocol import frames
@@ -186,9 +186,8 @@ def _evaluate_losses(seen: LinkTestResult, parameters: LinkParameters) -> Report
         '--set rate=250k with plus chips at both ends'
     )
     if not seen.cycles:
-        remedy = (
-            f'{robot_absent(parameters.channel)} t3mpc robot scan looks on all channels; {remedy}'
-        )
+        absent = reasons.robot_absent(parameters.channel)
+        remedy = f'{absent} t3mpc robot scan searches all channels; {remedy}'
     return ReportRow(
         'robot answers by radio', f'{len(seen.cycles)} of {seen.asked}', verdict, remedy
     )
@@ -222,7 +221,7 @@ def _evaluate_robot(state: State) -> ReportRow:
     troubles = {
         StatusFlag.ESTOP: 'its emergency stop is latched',
         StatusFlag.IMU_FAULT: 'its inertial sensor does not answer: SDA at 20, SCL at 21, 5 V',
-        StatusFlag.LOW_BATTERY: 'its battery is low, or its divider is not the one of docs/radio.md',
+        StatusFlag.LOW_BATTERY: 'its battery is low, or its divider differs from docs/robot.md',
     }
     found = [text for bit, text in troubles.items() if status & bit]
     session = f'in session {state.session}' if state.session else 'in no session'

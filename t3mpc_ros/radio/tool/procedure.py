@@ -14,7 +14,7 @@ import time
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.radio.link import port_actions
+from t3mpc_ros.radio.link import standstill_reasons as reasons
 from t3mpc_ros.radio.link.port_actions import Close, Open, PortAction, Wait, Write
 from t3mpc_ros.radio.protocol.codec import encode
 from t3mpc_ros.radio.protocol.frames import (
@@ -95,10 +95,10 @@ class PortTask(Protocol):
     def step(self, now_ns: int, received: bytes = b'') -> list[PortAction]:
         """Return what to do now; the last deed says until when there is nothing more."""
 
-    def opened(self, now_ns: int) -> None:
+    def port_opened(self, now_ns: int) -> None:
         """Take notice that the port is open."""
 
-    def failed(self, text: str, absent: bool, now_ns: int) -> None:
+    def port_failed(self, text: str, absent: bool, now_ns: int) -> None:
         """Take notice that the port cannot be opened or used."""
 
     def interrupt(self, now_ns: int) -> None:
@@ -132,12 +132,12 @@ class Procedure(Generic[Value]):
         self.result: Value | None = None
         """What the script returned."""
 
-    def opened(self, now_ns: int) -> None:
+    def port_opened(self, now_ns: int) -> None:
         """Begin."""
         self._open = True
         self._go_on(lambda: next(self._script), now_ns)
 
-    def failed(self, text: str, absent: bool, now_ns: int) -> None:
+    def port_failed(self, text: str, absent: bool, now_ns: int) -> None:
         """End: the port cannot be opened or used."""
         self._open = False
         # Whatever the script wants to put back, there is nobody to tell.
@@ -221,7 +221,7 @@ def wait_for_board(nobody: str) -> Script[Pong]:
 
 def wait_for_dongle() -> Script[Pong]:
     """Wait for a dongle with a working radio, or raise ProcedureError."""
-    pong = yield from wait_for_board(port_actions.NO_DONGLE)
+    pong = yield from wait_for_board(reasons.NO_DONGLE)
     heard = yield Request(Configure(0), _PING_TIMEOUT)
     if isinstance(heard.reply, Refusal):
         raise ProcedureError(
@@ -229,7 +229,7 @@ def wait_for_dongle() -> Script[Pong]:
             'ls -l /dev/serial/by-id names both'
         )
     if not pong.chip_ok:
-        raise ProcedureError(port_actions.NO_CHIP)
+        raise ProcedureError(reasons.NO_CHIP)
     return pong
 
 
@@ -240,9 +240,9 @@ def configure_radio(frame: Configure) -> Script[None]:
         reply = heard.reply
         if isinstance(reply, Configured) and reply[1:-1] == frame[1:]:
             if not reply.chip_ok:
-                raise ProcedureError(port_actions.NO_CHIP)
+                raise ProcedureError(reasons.NO_CHIP)
             return
-    raise ProcedureError(port_actions.RADIO_NOT_CONFIGURED)
+    raise ProcedureError(reasons.RADIO_NOT_CONFIGURED)
 
 
 def read_radio_setup() -> Script[Configure]:
@@ -251,7 +251,7 @@ def read_radio_setup() -> Script[Configure]:
         heard = yield Request(Configure(0), _PING_TIMEOUT)
         if isinstance(heard.reply, Configured):
             return Configure(*heard.reply[:-1])
-    raise ProcedureError(port_actions.DONGLE_TIMEOUT)
+    raise ProcedureError(reasons.DONGLE_TIMEOUT)
 
 
 _POLL_PERIOD = 0.05
@@ -297,7 +297,7 @@ class _PortRunner:
                     wake_ns = deed.until_ns
                 elif isinstance(deed, Open):
                     self._port = SerialPort(self._path, self._device)
-                    self._task.opened(time.monotonic_ns())
+                    self._task.port_opened(time.monotonic_ns())
                     return time.monotonic_ns()
                 elif isinstance(deed, Write) and self._port is not None:
                     self._port.write(deed.data)
@@ -329,4 +329,4 @@ class _PortRunner:
 
     def _lose(self, error: PortError) -> None:
         self._port = None
-        self._task.failed(str(error), error.absent, time.monotonic_ns())
+        self._task.port_failed(str(error), error.absent, time.monotonic_ns())

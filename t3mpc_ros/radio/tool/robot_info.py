@@ -5,8 +5,8 @@
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from t3mpc_ros.radio.link import port_actions
-from t3mpc_ros.radio.link.handshake import Session, robot_absent
+from t3mpc_ros.radio.link import standstill_reasons as reasons
+from t3mpc_ros.radio.link.handshake import Session
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import decode_uplink, encode
@@ -86,11 +86,11 @@ def _request_info(parameters: LinkParameters) -> Script[Info]:
                     f'the robot must speak protocol {VERSION}: it speaks {told.protocol}'
                 )
             return told
-    raise ProcedureError(robot_absent(parameters.channel))
+    raise ProcedureError(reasons.robot_absent(parameters.channel))
 
 
 def _start_session(parameters: LinkParameters, session: Session) -> Script[Info]:
-    problem = port_actions.HELLO_REJECTED
+    problem = reasons.HELLO_REJECTED
     for number in range(_MAX_ATTEMPTS):
         # A clock of its own: nobody commands in this session, it only has to go on.
         hello = session.hello(1000 * number)

@@ -1,0 +1,29 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Texts that explain why the robot does not move, with a remedy where one is known."""
+
+NO_COMMAND = 'no command yet'
+DONGLE_STARTING = 'the dongle does not answer yet: it takes 1.5 s to start'
+DONGLE_TIMEOUT = 'the dongle stopped answering: did it restart?'
+NO_DONGLE = 'no dongle answers on this port: is it the right port?'
+NO_CHIP = 'the radio chip of the dongle does not answer: check its wiring and supply'
+RADIO_NOT_CONFIGURED = 'the dongle rejects the radio configuration'
+HOST_KEY_MISSING = 'the robot requires signed commands: give the host the key'
+ROBOT_KEY_MISSING = (
+    'the robot has no key to verify signatures: store the key in it, or use none on the host'
+)
+KEY_MISMATCH = (
+    'the robot rejects HELLO: the keys differ, or its own is damaged (t3mpc robot key state)'
+)
+HELLO_REJECTED = 'the robot rejects HELLO'
+COMMANDS_REJECTED = 'the robot receives commands but accepts none'
+DRIVES_DISABLED = 'the drives of the robot are not enabled yet'
+TTL_EXPIRED = 'no command reached the robot in time: it stopped by itself'
+ROBOT_ESTOP = 'the emergency stop of the robot is latched'
+ESTOP_BUTTON_HELD = 'the emergency stop of the robot stays latched: is its button still pressed?'
+SHUT_DOWN = 'the link is shut down'
+
+
+def robot_absent(channel: int) -> str:
+    """Return the text for a robot that does not answer on a radio channel."""
+    return f'the robot does not answer: is it on, in range, on channel {channel}?'
