@@ -39,28 +39,54 @@ class LimitParameters(Parameters):
     """What a command may ask of the robot."""
 
     linear: float = parameter(
-        0.35, 'largest forward speed |v|', unit='m/s', low=0.01, high=5.0, dynamic=True
+        0.35,
+        'largest forward velocity |v|',
+        name='linear.x.max_velocity',
+        unit='m/s',
+        low=0.01,
+        high=5.0,
+        dynamic=True,
     )
     angular: float = parameter(
-        4.5, 'largest turning speed |omega|', unit='rad/s', low=0.05, high=50.0, dynamic=True
+        4.5,
+        'largest yaw rate |omega|',
+        name='angular.z.max_velocity',
+        unit='rad/s',
+        low=0.05,
+        high=50.0,
+        dynamic=True,
     )
     wheel_speed: float = parameter(
         10.0,
-        'largest wheel speed; from here a robot that hears nothing more rests within 0.5 s',
+        'largest wheel speed; from here a robot without commands stops within 0.5 s',
+        name='wheel.max_velocity',
         unit='rad/s',
         low=0.1,
         high=200.0,
         dynamic=True,
     )
     linear_acceleration: float = parameter(
-        1.0, 'largest |dv/dt|', unit='m/s²', low=0.01, high=50.0, dynamic=True
+        1.0,
+        'largest |dv/dt|',
+        name='linear.x.max_acceleration',
+        unit='m/s²',
+        low=0.01,
+        high=50.0,
+        dynamic=True,
     )
     angular_acceleration: float = parameter(
-        14.0, 'largest |d omega/dt|', unit='rad/s²', low=0.05, high=500.0, dynamic=True
+        14.0,
+        'largest |d omega/dt|',
+        name='angular.z.max_acceleration',
+        unit='rad/s²',
+        low=0.05,
+        high=500.0,
+        dynamic=True,
     )
     wheel_acceleration: float = parameter(
         30.0,
-        'largest acceleration of a wheel, no more than the robot itself allows',
+        'largest wheel acceleration, at most what the robot itself allows',
+        name='wheel.max_acceleration',
         unit='rad/s²',
         low=0.1,
         high=1e4,

@@ -55,7 +55,7 @@ class ControllerParameters(Nt3fsMpcParameters):
     """The whole controller: the law, the robot's lengths, limits and time-outs."""
 
     geometry: WheelGeometry = group(WheelGeometry, inline=True)
-    limits: LimitParameters = group(LimitParameters)
+    limits: LimitParameters = group(LimitParameters, inline=True)
     watchdog: WatchdogParameters = group(WatchdogParameters)
 
 

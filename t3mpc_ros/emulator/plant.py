@@ -13,17 +13,14 @@ import numpy as np
 from t3mpc_ros.emulator.board.hardware import Registers
 from t3mpc_ros.geometry.types import Pose, WheelSpeeds
 from t3mpc_ros.robot.interface import RANGE_SENSORS, ZERO_WHEEL_SPEEDS
+from t3mpc_ros.robot.sensor_conversions import GRAVITY, encode_range
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 from t3mpc_ros.simulation.plant.disturbances import Disturbance
 from t3mpc_ros.simulation.plant.drivetrain import Drivetrain
 from t3mpc_ros.simulation.plant.stepper_motor import StepperMotorParameters
 from t3mpc_ros.simulation.sensors.battery import SimulatedBattery
-from t3mpc_ros.simulation.sensors.imu import GRAVITY, SimulatedImu
-from t3mpc_ros.simulation.sensors.range_sensor import (
-    SimulatedRangeSensors,
-    encode_range,
-    sensor_mounts,
-)
+from t3mpc_ros.simulation.sensors.imu import SimulatedImu
+from t3mpc_ros.simulation.sensors.range_sensor import SimulatedRangeSensors, sensor_mounts
 from t3mpc_ros.simulation.world import cast_rays, clearance, grip_at, load_world
 
 _SAMPLE_STEPS = 5
@@ -55,10 +52,10 @@ class Plant:
         )
         self._disturbance = Disturbance(parameters.disturbance, disturbance)
         self._imu = SimulatedImu(parameters.imu, imu)
-        self._ranges = SimulatedRangeSensors(parameters.sharp, ranges)
+        self._ranges = SimulatedRangeSensors(parameters.range_sensor, ranges)
         self._battery = SimulatedBattery(parameters.battery)
         self._world = load_world(parameters.world)
-        self._mounts = sensor_mounts(parameters.sharp)
+        self._mounts = sensor_mounts(parameters.range_sensor)
         self._distances = np.full(len(RANGE_SENSORS), math.inf)
         self._owed = 0.0
         """Integration steps that have not been made yet."""

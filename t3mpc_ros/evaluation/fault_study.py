@@ -183,18 +183,18 @@ def stop_reasons(record: TwinRecord, begin: float) -> dict[str, float]:
 
 def _broken(record: TwinRecord, begin: float, parameters: DigitalTwinParameters) -> str:
     """Return what was out of bounds; '' when nothing was."""
-    guard = parameters.guard
+    limiter = parameters.limiter
     rows = slice(record.rows(FINAL_STANDSTILL, begin).start, None)
-    limit = guard.wheel_speed
+    limit = limiter.wheel_speed
     for what, speeds in (('command', record.commanded[rows]), ('wheel', record.rotors[rows])):
         fastest = float(np.max(np.abs(speeds)))
         if not fastest <= limit + 1e-6:
             return f'a {what} of {fastest:.1f} rad/s, the limit being {limit:g}'
     for right, left in record.commanded[rows].tolist():
         twist = twist_from_wheels(WheelSpeeds(right, left), parameters.geometry)
-        if abs(twist.linear) > guard.linear_speed + 1e-6:
+        if abs(twist.linear) > limiter.linear_speed + 1e-6:
             return f'a command of {twist.linear:.2f} m/s'
-        if abs(twist.angular) > guard.angular_speed + 1e-6:
+        if abs(twist.angular) > limiter.angular_speed + 1e-6:
             return f'a command of {twist.angular:.1f} rad/s about the vertical'
     since = None
     for row, text in enumerate(record.robot_says):

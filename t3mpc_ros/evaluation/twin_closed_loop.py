@@ -182,7 +182,7 @@ def run_twin(
         wheels = wheels_from_twist(twist, geometry)
         robot.apply(RobotCommand(wheels, status.stamp_ns), state.stamp_ns)
         reason = '' if status.reason.moves else status.reason.value
-        notes.take(k, state, wheels, reason, geometry, robot.inside.max_contact_force)
+        notes.take(k, state, wheels, reason, geometry, robot.diagnostics.max_contact_force)
     return notes.record(course[:count])
 
 

@@ -32,9 +32,11 @@ from t3mpc_ros.radio.protocol.authentication import read_key
 from t3mpc_ros.radio.radio_robot import RadioRobot, RadioRobotParameters
 from t3mpc_ros.radio.serial_port import PortError, SerialPort
 from t3mpc_ros.robot.interface import RobotCommand, RobotState
-from t3mpc_ros.simulation.sensors.battery import BatteryParameters
-from t3mpc_ros.simulation.sensors.imu import ImuParameters
-from t3mpc_ros.simulation.sensors.range_sensor import RangeSensorParameters
+from t3mpc_ros.robot.sensor_conversions import (
+    BatteryParameters,
+    ImuParameters,
+    RangeSensorParameters,
+)
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ class RadioBridgeParameters(RobotTopicParameters, RadioRobotParameters):
         '', 'file with the key of the robot (32 hexadecimal digits, yours alone); empty = open'
     )
     imu: ImuParameters = group(ImuParameters)
-    sharp: RangeSensorParameters = group(RangeSensorParameters)
+    range_sensor: RangeSensorParameters = group(RangeSensorParameters)
     battery: BatteryParameters = group(BatteryParameters)
 
 
@@ -222,7 +224,7 @@ def _robot_description(parameters: RadioBridgeParameters) -> RobotDescription:
     """Return what the robot of these settings is like."""
     rate = parameters.link.cycle_rate
     variance = count_variance(math.tau / (STEPS_PER_REV * MICROSTEPS), 1.0 / rate)
-    sensors = parameters.imu, parameters.sharp, parameters.battery
+    sensors = parameters.imu, parameters.range_sensor, parameters.battery
     return RobotDescription(rate, parameters.geometry, variance, sensors)
 
 

@@ -121,7 +121,7 @@ def _robot_description(parameters: SimRobotNodeParameters) -> RobotDescription:
     if parameters.drive.kind != 'stepper':
         return RobotDescription(rate, parameters.geometry, variance, None, parameters.world_frame)
     variance += count_variance(parameters.motor.microstep, 1.0 / rate)
-    sensors = parameters.imu, parameters.sharp, parameters.battery
+    sensors = parameters.imu, parameters.range_sensor, parameters.battery
     return RobotDescription(rate, parameters.geometry, variance, sensors, parameters.world_frame)
 
 
@@ -280,7 +280,7 @@ class SimRobotNode(BaseNode[SimRobotNodeParameters]):
         return OK, 'following commands', values
 
     def _inside(self) -> TwinDiagnostics | None:
-        return self._robot.inside if isinstance(self._robot, DigitalTwin) else None
+        return self._robot.diagnostics if isinstance(self._robot, DigitalTwin) else None
 
     def _too_slow(self) -> str:
         if self._pace.skipped:

@@ -41,7 +41,7 @@ class RadioRobotParameters(Parameters):
     """Everything that can be set of the real robot, on the host's side."""
 
     geometry: WheelGeometry = group(WheelGeometry, inline=True)
-    guard: CommandLimiterParameters = group(CommandLimiterParameters)
+    limiter: CommandLimiterParameters = group(CommandLimiterParameters, inline=True)
     odometry: GyroOdometryParameters = group(GyroOdometryParameters)
     link: LinkParameters = group(LinkParameters)
     slip_stop: float = parameter(
@@ -55,11 +55,11 @@ class RadioRobotParameters(Parameters):
 
     def check_consistency(self) -> None:
         """Raise ParameterError when the board would cut or lag behind what the host allows."""
-        guard, board = self.guard, self.link.robot
+        limiter, board = self.limiter, self.link.robot
         for name, host, there in (
-            ('guard.wheel_speed', guard.wheel_speed, board.max_speed),
-            ('guard.acceleration', guard.acceleration, board.acceleration),
-            ('guard.stop_deceleration', guard.stop_deceleration, board.deceleration),
+            ('wheel.max_velocity', limiter.wheel_speed, board.max_speed),
+            ('wheel.max_acceleration', limiter.acceleration, board.acceleration),
+            ('wheel.stop_deceleration', limiter.stop_deceleration, board.deceleration),
         ):
             if host > there:
                 raise ParameterError(
@@ -93,7 +93,7 @@ class RadioRobot(RobotInterface):
         self._parameters = parameters
         self.link = Link(parameters.link, key, entropy)
         """The connection: its phase, its reason, its quality."""
-        self._limiter = CommandLimiter(parameters.guard, parameters.geometry)
+        self._limiter = CommandLimiter(parameters.limiter, parameters.geometry)
         self._odometry = GyroOdometry(parameters.odometry, parameters.geometry)
         self._slip_monitor = SlipMonitor()
         self._period_ns = round(NANOSECONDS / parameters.link.cycle_rate)
@@ -142,7 +142,7 @@ class RadioRobot(RobotInterface):
     def configure(self, parameters: RadioRobotParameters) -> None:
         """Go on with other live settings."""
         self._parameters = parameters
-        self._limiter.parameters = parameters.guard
+        self._limiter.parameters = parameters.limiter
         self._odometry.parameters = parameters.odometry
 
     def shut_down(self) -> None:

@@ -13,37 +13,33 @@ from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, RobotCommand
 
 
-@kernel
-def ramp_towards(
-    right: float, left: float, target_right: float, target_left: float, reach: float
-) -> tuple[float, float]:
-    """Return the pair (rad/s) moved towards its target by at most ``reach`` in each wheel.
-
-    One factor serves both wheels, so that slowing down to zero keeps the curvature of the path.
-    A negative ``reach`` means no limit.
-    """
-    gap_right, gap_left = target_right - right, target_left - left
-    widest = max(abs(gap_right), abs(gap_left))
-    if reach < 0.0 or widest <= reach:
-        return target_right, target_left
-    factor = reach / widest
-    return right + factor * gap_right, left + factor * gap_left
-
-
 @dataclass(frozen=True)
 class CommandLimiterParameters(Parameters):
-    """Limits of a command, and how a robot stops."""
+    """Limits of a command, and the deceleration of a stop."""
 
     linear_speed: float = parameter(
-        0.5, 'largest |v| that is passed on', unit='m/s', low=0.0, high=5.0, dynamic=True
+        0.5,
+        'largest forward velocity |v| of a command',
+        name='linear.x.max_velocity',
+        unit='m/s',
+        low=0.0,
+        high=5.0,
+        dynamic=True,
     )
     angular_speed: float = parameter(
-        8.0, 'largest |omega| that is passed on', unit='rad/s', low=0.0, high=50.0, dynamic=True
+        8.0,
+        'largest yaw rate |omega| of a command',
+        name='angular.z.max_velocity',
+        unit='rad/s',
+        low=0.0,
+        high=50.0,
+        dynamic=True,
     )
     wheel_speed: float = parameter(
         10.0,
-        'largest wheel speed that is passed on; from here silence brings the wheels to rest '
-        'within 0.5 s. The board steps at up to 19.6 rad/s (10 000 microsteps a second)',
+        'largest wheel speed of a command; from here a robot without commands stops within 0.5 s. '
+        'The board steps at up to 19.6 rad/s (10 000 microsteps a second)',
+        name='wheel.max_velocity',
         unit='rad/s',
         low=0.0,
         high=200.0,
@@ -51,7 +47,8 @@ class CommandLimiterParameters(Parameters):
     )
     acceleration: float = parameter(
         30.0,
-        'how fast the faster changing wheel may change its speed',
+        'largest acceleration of the faster changing wheel',
+        name='wheel.max_acceleration',
         unit='rad/s²',
         low=0.1,
         high=1e5,
@@ -59,7 +56,8 @@ class CommandLimiterParameters(Parameters):
     )
     stop_deceleration: float = parameter(
         60.0,
-        'the same when the robot is to stand, for whatever reason',
+        'largest deceleration of the faster changing wheel in a stop, whatever its reason',
+        name='wheel.stop_deceleration',
         unit='rad/s²',
         low=0.1,
         high=1e5,
@@ -67,7 +65,8 @@ class CommandLimiterParameters(Parameters):
     )
     command_timeout: float = parameter(
         0.25,
-        'age at which a command is no longer followed (board level; the host has its own)',
+        'age at which a command expires (board level; the host has its own timeout)',
+        name='cmd_vel_timeout',
         unit='s',
         low=0.01,
         high=0.5,
@@ -75,29 +74,29 @@ class CommandLimiterParameters(Parameters):
     )
 
     def check_consistency(self) -> None:
-        """Raise ParameterError when a stop would be gentler than ordinary driving."""
+        """Raise ParameterError when a stop would be slower than ordinary deceleration."""
         if self.stop_deceleration < self.acceleration:
             raise ParameterError(
-                'stop_deceleration must be at least acceleration '
+                'wheel.stop_deceleration must be at least wheel.max_acceleration '
                 f'({self.acceleration:g} rad/s²): got {self.stop_deceleration:g}'
             )
 
 
 class LimitedCommand(NamedTuple):
-    """What may go to the wheels now."""
+    """Output of the limiter for one period."""
 
     wheels: WheelSpeeds
     target: WheelSpeeds
-    """Where the ramp leads."""
+    """End of the ramp."""
     estop: bool
     timed_out: bool
     limited: bool
     reason: str
-    """Why the target is zero although somebody may want otherwise; empty when it is not so."""
+    """Why the target is zero, unless a zero command is the reason; otherwise empty."""
 
 
 class _Ramp(NamedTuple):
-    """Wheel speeds on their way to a target, from an instant on."""
+    """Wheel speeds that change towards a target from an instant on."""
 
     start: WheelSpeeds
     target: WheelSpeeds
@@ -105,30 +104,30 @@ class _Ramp(NamedTuple):
     """rad/s²"""
     since_ns: int
     hold: float
-    """s, for how long the end of the ramp was handed out"""
+    """s, period for which the end of the ramp was returned"""
 
     def at(self, elapsed: float) -> WheelSpeeds:
-        """Return the wheel speeds ``elapsed`` seconds on."""
+        """Return the wheel speeds after ``elapsed`` seconds."""
         return WheelSpeeds(*ramp_towards(*self.start, *self.target, self.rate * elapsed))
 
 
 NO_COMMAND = 'no command yet'
-CLOCK_JUMPED_BACK = 'the clock went back'
+CLOCK_JUMPED_BACK = 'the clock jumped back'
 
 
 class CommandLimiter:
-    """Decides what may reach the wheels: every rule of motion, in one place and without a clock.
+    """Decides which wheel speeds are commanded: every rule of motion, without a clock.
 
-    A command that is not finite, or a clock that goes back, stops the robot; a command that is
-    older than the timeout, or than the one before it, is not taken; one that is too fast is
-    scaled in both wheels by the same factor. Changes of speed are ramped, likewise by one factor.
+    A command that is not finite, or a clock that jumps back, stops the robot. A command older
+    than the timeout, or than the one before it, is rejected. A command beyond a limit is scaled
+    in both wheels by the same factor. Changes of speed are ramped, likewise by one factor.
 
     Parameters
     ----------
-    settings
-        Replaceable while running.
+    parameters
+        Replaceable at run time.
     geometry
-        Turns wheel speeds into (v, omega) for the limits.
+        Converts wheel speeds to (v, omega) for the limits.
     """
 
     def __init__(self, parameters: CommandLimiterParameters, geometry: WheelGeometry) -> None:
@@ -140,7 +139,7 @@ class CommandLimiter:
         self._timed_out = False
         self._ramp = _Ramp(ZERO_WHEEL_SPEEDS, ZERO_WHEEL_SPEEDS, 0.0, 0, 0.0)
         self._clock_ns: int | None = None
-        ramp_towards(0.0, 0.0, 0.0, 0.0, 0.0)  # compiled now: no stop ever waits for it
+        ramp_towards(0.0, 0.0, 0.0, 0.0, 0.0)  # compile now, so that no stop waits for it
 
     @property
     def estop(self) -> bool:
@@ -149,26 +148,26 @@ class CommandLimiter:
 
     @property
     def timed_out(self) -> bool:
-        """Whether the last command was dropped because of its age."""
+        """Whether the last command expired."""
         return self._timed_out
 
     @property
     def reason(self) -> str:
-        """Why the robot is to stand; empty when a command is followed."""
+        """Why the robot is stopped; empty while it follows a command."""
         return self._reason
 
     def accept(self, command: RobotCommand, now_ns: int) -> str:
-        """Take a command, or return why not.
+        """Accept a command, or return why it is rejected.
 
         Its age counts from its stamp, or from now if the stamp lies in the future.
         """
-        self._notice(now_ns)
-        # float: an int would make the compiler build every kernel once more, in mid-step.
+        self._check_clock(now_ns)
+        # float: an int argument would compile every kernel again, within a step.
         wheels = WheelSpeeds(float(command.wheels.right), float(command.wheels.left))
         twist = twist_from_wheels(wheels, self._geometry)
         if not all(map(math.isfinite, (*wheels, *twist))):
-            # The number meant may have been anything, zero included.
-            self._drop(f'command is not finite: got {wheels.right}, {wheels.left} rad/s')
+            # The intended value is unknown, zero included.
+            self._drop_command(f'command is not finite: got {wheels.right}, {wheels.left} rad/s')
             return self._reason
         if self._estop:
             return self._estop
@@ -183,79 +182,77 @@ class CommandLimiter:
         return ''
 
     def staleness(self, command: RobotCommand, now_ns: int) -> str:
-        """Return that a command is too old to be followed, empty when it is not."""
+        """Return why a command is too old, empty when it is not."""
         age = (now_ns - command.stamp_ns) / NANOSECONDS
         return f'command is too old: {age:.3f} s' if age >= self.parameters.command_timeout else ''
 
     def accept_twist(self, twist: BodyTwist, now_ns: int) -> str:
-        """Take a body twist that is wanted now, or return why not."""
+        """Accept a body twist stamped now, or return why it is rejected."""
         return self.accept(RobotCommand.from_twist(twist, self._geometry, now_ns), now_ns)
 
     def advance(self, now_ns: int, hold: float) -> LimitedCommand:
         """Return the wheel speeds to command from ``now_ns`` on, for ``hold`` seconds.
 
-        That is where the ramp will be when they are replaced: a command then loses no time. The
-        ramp never runs ahead of what was handed out, however late the next call comes.
+        They are the value of the ramp at the end of that period, so a command is not delayed by
+        it. The ramp never runs ahead of the returned values, however late the next call is.
         """
-        self._notice(now_ns)
+        self._check_clock(now_ns)
         parameters = self.parameters
         elapsed = (now_ns - self._ramp.since_ns) / NANOSECONDS
         wheels = self._ramp.at(min(elapsed, self._ramp.hold))
         if self._command is not None:
             age = (now_ns - self._command.stamp_ns) / NANOSECONDS
             if age >= parameters.command_timeout:
-                self._drop(f'no command for {parameters.command_timeout:g} s')
+                self._drop_command(f'no command for {parameters.command_timeout:g} s')
                 self._timed_out = True
         target, limited = ZERO_WHEEL_SPEEDS, False
         if self._command is not None:
             target, limited = self._within_limits(self._command.wheels)
-        rate = (
-            parameters.stop_deceleration
-            if target == ZERO_WHEEL_SPEEDS
-            else parameters.acceleration
-        )
+        stops = target == ZERO_WHEEL_SPEEDS
+        rate = parameters.stop_deceleration if stops else parameters.acceleration
         self._ramp = _Ramp(wheels, target, rate, now_ns, hold)
         return LimitedCommand(
             self._ramp.at(hold), target, self.estop, self._timed_out, limited, self._reason
         )
 
     def stop(self, reason: str, now_ns: int) -> None:
-        """Forget the command; the next one is taken again."""
-        self._notice(now_ns)
-        self._drop(reason)
+        """Drop the command; the next one is accepted again."""
+        self._check_clock(now_ns)
+        self._drop_command(reason)
 
     def latch(self, reason: str, now_ns: int) -> None:
-        """Forget the command, and take none until :meth:`release`."""
-        self._notice(now_ns)
+        """Drop the command, and reject every other until :meth:`release`."""
+        self._check_clock(now_ns)
         self._estop = f'emergency stop: {reason}'
-        self._drop(self._estop)
+        self._drop_command(self._estop)
 
     def release(self, now_ns: int) -> str:
-        """Release the emergency stop, or return why that was not needed.
+        """Release the emergency stop, or return why there is none.
 
-        The command from before is not taken up again.
+        The dropped command is not resumed.
         """
-        self._notice(now_ns)
+        self._check_clock(now_ns)
         if not self._estop:
             return 'no emergency stop is latched'
         self._estop = ''
-        self._drop('no command since the emergency stop was released')
+        self._drop_command('no command since the emergency stop was released')
         return ''
 
-    def _drop(self, reason: str) -> None:
+    def _drop_command(self, reason: str) -> None:
         self._command = None
         self._timed_out = False
         self._reason = self._estop or reason
 
-    def _notice(self, now_ns: int) -> None:
+    def _check_clock(self, now_ns: int) -> None:
+        """Stop when the clock has jumped back."""
         if self._clock_ns is not None and now_ns < self._clock_ns:
-            self._drop(CLOCK_JUMPED_BACK)
-            # The hold may have run out or not: where it leads is what was handed out last.
+            self._drop_command(CLOCK_JUMPED_BACK)
+            # Whether or not the period has ended, the end of the ramp was commanded last.
             self._ramp = _Ramp(self._ramp.at(self._ramp.hold), ZERO_WHEEL_SPEEDS, 0.0, now_ns, 0.0)
         self._clock_ns = now_ns
 
     def _within_limits(self, wheels: WheelSpeeds) -> tuple[WheelSpeeds, bool]:
-        """Return the wheels scaled by one factor, and whether that was less than 1.
+        """Return the wheels scaled by one factor, and whether it is less than 1.
 
         Twist and wheel speeds are proportional, so one factor keeps v/omega, the curvature.
         """
@@ -275,3 +272,20 @@ class CommandLimiter:
 
 def _scale_within(limit: float, value: float) -> float:
     return 1.0 if abs(value) <= limit else limit / abs(value)
+
+
+@kernel
+def ramp_towards(
+    right: float, left: float, target_right: float, target_left: float, reach: float
+) -> tuple[float, float]:
+    """Return the pair (rad/s) moved towards its target by at most ``reach`` in each wheel.
+
+    One factor serves both wheels, so that slowing down to zero keeps the curvature of the path.
+    A negative ``reach`` means no limit.
+    """
+    gap_right, gap_left = target_right - right, target_left - left
+    widest = max(abs(gap_right), abs(gap_left))
+    if reach < 0.0 or widest <= reach:
+        return target_right, target_left
+    factor = reach / widest
+    return right + factor * gap_right, left + factor * gap_left

@@ -40,10 +40,10 @@ from t3mpc_ros.simulation.plant.paper_plant import (
     PaperRobotParameters,
 )
 from t3mpc_ros.simulation.plant.stepper_motor import StepperMotorParameters
-from t3mpc_ros.simulation.sensors.battery import BatteryParameters, SimulatedBattery
-from t3mpc_ros.simulation.sensors.imu import ImuParameters, SimulatedImu
+from t3mpc_ros.simulation.sensors.battery import SimulatedBattery, SimulatedBatteryParameters
+from t3mpc_ros.simulation.sensors.imu import SimulatedImu, SimulatedImuParameters
 from t3mpc_ros.simulation.sensors.range_sensor import (
-    RangeSensorParameters,
+    SimulatedRangeSensorParameters,
     SimulatedRangeSensors,
     sensor_mounts,
 )
@@ -63,9 +63,9 @@ class DigitalTwinParameters(PaperRobotParameters):
     motor: StepperMotorParameters = group(StepperMotorParameters)
     tyres: TyreParameters = group(TyreParameters)
     bumper: BumperParameters = group(BumperParameters)
-    imu: ImuParameters = group(ImuParameters)
-    sharp: RangeSensorParameters = group(RangeSensorParameters)
-    battery: BatteryParameters = group(BatteryParameters)
+    imu: SimulatedImuParameters = group(SimulatedImuParameters)
+    range_sensor: SimulatedRangeSensorParameters = group(SimulatedRangeSensorParameters)
+    battery: SimulatedBatteryParameters = group(SimulatedBatteryParameters)
     odometry: GyroOdometryParameters = group(GyroOdometryParameters)
     faults: FaultParameters = group(FaultParameters)
     world: str = parameter(
@@ -114,11 +114,11 @@ class DigitalTwinParameters(PaperRobotParameters):
                 f'substep must be at most {STABILITY_LIMIT / fastest:.2g} s with this motor, body, bumper '
                 f'and friction (fastest rate {fastest:.4g} 1/s): got {self.substep:g}'
             )
-        if self.guard.wheel_speed > self.motor.top_speed:
+        if self.limiter.wheel_speed > self.motor.top_speed:
             raise ParameterError(
-                f'guard.wheel_speed must be at most {self.motor.top_speed:.4g} rad/s, which is '
+                f'wheel.max_velocity must be at most {self.motor.top_speed:.4g} rad/s, which is '
                 f'{self.motor.step_rate:g} pulses a second with {self.motor.microsteps} '
-                f'microsteps: got {self.guard.wheel_speed:g}'
+                f'microsteps: got {self.limiter.wheel_speed:g}'
             )
         delay, told = self.imu.delay, self.odometry.gyro_delay
         if self.odometry.use_gyro and abs(told - delay) > 0.25 * delay:
@@ -169,7 +169,7 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
     def __init__(
         self, parameters: DigitalTwinParameters, schedule: FaultSchedule | None = None
     ) -> None:
-        guard = CommandLimiter(parameters.guard, parameters.geometry)
+        guard = CommandLimiter(parameters.limiter, parameters.geometry)
         super().__init__(
             parameters, parameters.rate, parameters.substeps, parameters.longest_gap, guard
         )
@@ -180,12 +180,12 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
         self._disturbance = Disturbance(parameters.disturbance, disturbance)
         self._noise = SpeedNoise(parameters.noise, noise)
         self._imu = SimulatedImu(parameters.imu, imu)
-        self._ranges = SimulatedRangeSensors(parameters.sharp, ranges)
+        self._ranges = SimulatedRangeSensors(parameters.range_sensor, ranges)
         self._channel = TransportDelay(channel)
         self._battery = SimulatedBattery(parameters.battery)
         self._odometry = GyroOdometry(parameters.odometry, parameters.geometry)
         self._world = load_world(parameters.world)
-        self._mounts = sensor_mounts(parameters.sharp)
+        self._mounts = sensor_mounts(parameters.range_sensor)
         self._distances = np.full(self._mounts.shape[0], math.inf)
         self._drivetrain = Drivetrain(
             parameters.motor,
@@ -240,7 +240,7 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
     # -- only in simulation -----------------------------------------------------------------------
 
     @property
-    def inside(self) -> TwinDiagnostics:
+    def diagnostics(self) -> TwinDiagnostics:
         """What nobody outside a simulation can see."""
         drivetrain = self._drivetrain
         return TwinDiagnostics(
@@ -301,7 +301,7 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
 
     def _apply_parameters(self) -> None:
         parameters = self._parameters
-        self._limiter.parameters = parameters.guard
+        self._limiter.parameters = parameters.limiter
         self._odometry.parameters = parameters.odometry
         self._disturbance.parameters = parameters.disturbance
         self._noise.parameters = parameters.noise

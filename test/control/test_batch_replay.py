@@ -209,7 +209,7 @@ def test_a_winding_run_with_jitter_and_a_deaf_robot(seed):
         {'estimate.dead_time': 0.025},
         {'use_fuzzy': False, 'predictive.algorithm': 'gradient'},
         {'watchdog.response_bound': 0.0},
-        {'limits.wheel_acceleration': 3.0},
+        {'wheel.max_acceleration': 3.0},
     ],
     ids=str,
 )
@@ -265,7 +265,7 @@ def test_messages_spoilt_in_every_way(wanted):
 def test_live_changes_stops_and_resets_between_marches():
     deeds = {
         100: lambda c: c.configure(c.parameters.with_values({'law.gain': 20.0})),
-        200: lambda c: c.configure(c.parameters.with_values({'limits.linear': 0.1})),
+        200: lambda c: c.configure(c.parameters.with_values({'linear.x.max_velocity': 0.1})),
         300: lambda c: c.enable(False),
         320: lambda c: c.enable(True),
         400: lambda c: c.reset(),

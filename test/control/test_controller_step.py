@@ -219,7 +219,12 @@ def test_live_settings_reach_every_part():
     loop = Loop()
     loop.run(50)
     changed = loop.controller.parameters.with_values(
-        {'law.gain': 3.0, 'adaptation.gamma': 0.0, 'predictive.v_max': 0.0, 'limits.linear': 0.05}
+        {
+            'law.gain': 3.0,
+            'adaptation.gamma': 0.0,
+            'predictive.v_max': 0.0,
+            'linear.x.max_velocity': 0.05,
+        }
     )
     loop.controller.configure(changed)
     before = loop.controller.law.fuzzy.coefficients.copy()

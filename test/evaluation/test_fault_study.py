@@ -216,7 +216,7 @@ def test_speeds_beyond_the_limits_are_unbounded(field, value):
     record = undisturbed('chaotic', AT.duration)
     values = getattr(record, field).copy()
     values[1200] = value
-    parameters = loop_robot().with_values({'guard.angular_speed': 4.0})
+    parameters = loop_robot().with_values({'angular.z.max_velocity': 4.0})
     healthy = undisturbed('chaotic', AT.duration)
     result = evaluate_outcome(
         AT.name, AT.course, replace(record, **{field: values}), healthy, 10.0, 15.0, parameters

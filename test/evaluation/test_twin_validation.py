@@ -13,7 +13,7 @@ from t3mpc_ros.evaluation.plotting import WIDTH
 from t3mpc_ros.evaluation.twin_validation import component_tests, courses, yaw_drift
 from t3mpc_ros.evaluation.twin_validation.validation_figures import VALIDATION_FIGURES
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
-from t3mpc_ros.simulation.sensors.range_sensor import RangeSensorParameters
+from t3mpc_ros.simulation.sensors.range_sensor import SimulatedRangeSensorParameters
 
 SEEDS = (1, 2, 3, 4)
 GRIPS = yaw_drift.SLIPS[:3]
@@ -113,7 +113,7 @@ def test_a_square_is_one_to_the_steps_even_while_wheels_slip(clockwise):
 
 
 def test_a_course_that_cannot_be_driven_says_so():
-    stuck = yaw_drift.robot(1).with_values({'guard.wheel_speed': 0.0})
+    stuck = yaw_drift.robot(1).with_values({'wheel.max_velocity': 0.0})
     with pytest.raises(RuntimeError, match=r'leg 1 did not end within .* rad to go'):
         courses.spin(stuck, 1)
 
@@ -147,7 +147,7 @@ def test_the_ceiling_is_v_over_2_l_i_steps_a_second():
     parameters = DigitalTwinParameters()
     curve = component_tests.torque_curve(parameters.motor, 12.0, 1.7, 140.0)
     assert curve.ceiling / math.tau == pytest.approx(6.30, abs=0.01)
-    at_work = np.interp(parameters.guard.wheel_speed, curve.speed, curve.torque)
+    at_work = np.interp(parameters.limiter.wheel_speed, curve.speed, curve.torque)
     assert at_work > component_tests.needed_torque(parameters)
 
 
@@ -167,7 +167,7 @@ def test_a_ramp_beyond_the_torque_loses_whole_pitches_that_odometry_does_not_see
 def test_the_distance_sensor_is_its_data_sheet_and_lies_when_too_near():
     assert component_tests.sharp_deviation() < 0.025
     readings = component_tests.sharp_readings(
-        RangeSensorParameters(), np.array([0.0, 0.03, 0.06, 0.4]), seed=1
+        SimulatedRangeSensorParameters(), np.array([0.0, 0.03, 0.06, 0.4]), seed=1
     )
     assert np.isposinf(readings[0]).all()
     np.testing.assert_allclose(readings[1], 0.13, atol=0.02)

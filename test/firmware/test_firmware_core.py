@@ -18,6 +18,7 @@ import subprocess
 
 import pytest
 
+from t3mpc_ros.robot.sensor_conversions import encode_range
 from t3mpc_ros.simulation.sensors import range_sensor
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -463,9 +464,9 @@ def test_siphash_agrees_with_the_published_vectors_and_the_reference(library):
 
 def test_range_codes_are_those_of_the_simulated_board(library):
     """Both ends of a simulation must see the same; an open or shorted wire is the board's own."""
-    parameters = range_sensor.RangeSensorParameters()
+    parameters = range_sensor.SimulatedRangeSensorParameters()
     for count in range(984):
-        wanted = range_sensor.encode_range(
+        wanted = encode_range(
             range_sensor.distance_from_voltage(parameters.volts(count))
         )
         assert library.t3_host_range_code(count) == wanted, count
@@ -1312,9 +1313,9 @@ def test_state_carries_what_the_sensors_say(robot):
     robot.run(10_000)  # one of them is read every millisecond
     state = robot.ask(b'\x15\0\0\0')
     assert struct.unpack_from('<hhh', state, 16) == (-131, 164, -5)
-    parameters = range_sensor.RangeSensorParameters()
+    parameters = range_sensor.SimulatedRangeSensorParameters()
     middle = [
-        range_sensor.encode_range(range_sensor.distance_from_voltage(parameters.volts(count)))
+        encode_range(range_sensor.distance_from_voltage(parameters.volts(count)))
         for count in (300, 150)
     ]
     assert list(state[24:]) == [0, 255, *middle, 1, 254, 254, 255]

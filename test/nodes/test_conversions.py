@@ -25,11 +25,14 @@ from t3mpc_ros.robot.interface import (
     RobotStatus,
     WheelAngles,
 )
+from t3mpc_ros.robot.sensor_conversions import (
+    BatteryParameters,
+    ImuParameters,
+    RangeSensorParameters,
+)
 from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON
 from t3mpc_ros.simulation.digital_twin import TwinDiagnostics
-from t3mpc_ros.simulation.sensors.battery import BatteryParameters
-from t3mpc_ros.simulation.sensors.imu import ImuParameters, SimulatedImu
-from t3mpc_ros.simulation.sensors.range_sensor import RangeSensorParameters
+from t3mpc_ros.simulation.sensors.imu import SimulatedImu, SimulatedImuParameters
 
 YAWS = [*np.linspace(-math.pi, math.pi, 41)[1:], 1e-9, -1e-9, math.pi - 1e-9, 1e-9 - math.pi]
 STAMPS = [0, 1, NANOSECONDS - 1, NANOSECONDS, 1_795_240_567_146_950_308, (2**31 - 1) * NANOSECONDS]
@@ -186,7 +189,7 @@ def test_wheel_joints_keep_their_order():
 
 def test_the_spread_claimed_of_the_inertial_sensor_is_that_of_its_samples():
     """Standing still, for as long as the bias walks less than the noise."""
-    parameters = ImuParameters(gyro_drift=0.0)
+    parameters = SimulatedImuParameters(gyro_drift=0.0)
     sensor = SimulatedImu(parameters, np.random.default_rng(3))
     still = np.zeros((3, 2))
     samples = np.array([sensor.measure(still, 0.01) for _ in range(20_000)])

@@ -74,7 +74,7 @@ def live_run(fleet, bag, model):
         time.sleep(2.0)
         person.set('law.gain', 17.0)
         time.sleep(1.0)
-        person.set('limits.linear', 0.2)
+        person.set('linear.x.max_velocity', 0.2)
         time.sleep(1.0)
         assert person.call(SetBool, '/e_stop', data=True).success  # the robot does not follow
         time.sleep(1.0)

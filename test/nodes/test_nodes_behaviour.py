@@ -434,7 +434,7 @@ def test_a_command_however_large_stays_within_the_limits(world):
         count = len(odom)
         world.until(lambda start=count: len(odom) > start + 30)
     world.until(lambda: len(odom) > 100)
-    limits = robot.parameters.guard
+    limits = robot.parameters.limiter
     assert max(abs(message.twist.twist.linear.x) for message in odom) <= 1.05 * limits.linear_speed
     turning = max(abs(message.twist.twist.angular.z) for message in odom)
     assert turning <= 1.05 * limits.angular_speed
@@ -446,7 +446,7 @@ def test_live_limits_of_the_robot_take_effect(world):
     driver = Driver(world)
     driver.message = twist(0.3)
     world.until(lambda: odom and speed(odom[-1]) > 0.28)
-    assert robot.set_parameters([Parameter('guard.linear_speed', value=0.1)])[0].successful
+    assert robot.set_parameters([Parameter('linear.x.max_velocity', value=0.1)])[0].successful
     world.until(lambda: abs(speed(odom[-1]) - 0.1) < 0.01)
     assert robot.produce_diagnostics()[2]['limited']
 
@@ -688,7 +688,7 @@ def test_live_settings_of_the_controller_take_effect(world):
     bench.refer(0.3, seconds=0.5)
     bench.run(40)
     assert bench.newest().linear.x > 0.1
-    lower = Parameter('limits.linear', value=0.05)
+    lower = Parameter('linear.x.max_velocity', value=0.05)
     assert bench.controller.set_parameters([lower])[0].successful
     bench.refer(0.3, seconds=0.5)
     bench.run(40)
@@ -775,14 +775,14 @@ def test_every_live_setting_can_be_set_and_every_fixed_one_is_refused(name, worl
 
 def test_settings_that_do_not_fit_together_are_refused_with_the_reason(world):
     robot = world.add(SimRobotNode)
-    slow = Parameter('guard.stop_deceleration', value=10.0)
+    slow = Parameter('wheel.stop_deceleration', value=10.0)
     answer = robot.set_parameters([slow])[0]
     assert not answer.successful
     assert 'stop_deceleration must be at least acceleration (30 rad/s²): got 10' in answer.reason
-    assert robot.parameters.guard.stop_deceleration == 60.0
-    both = [Parameter('guard.acceleration', value=5.0), slow]
+    assert robot.parameters.limiter.stop_deceleration == 60.0
+    both = [Parameter('wheel.max_acceleration', value=5.0), slow]
     assert robot.set_parameters_atomically(both).successful, 'together they fit'
-    assert robot.parameters.guard.stop_deceleration == 10.0
+    assert robot.parameters.limiter.stop_deceleration == 10.0
     with pytest.raises(ParameterError, match='drive.kind must be stepper or velocity'):
         world.add(SimRobotNode, namespace='other', drive__kind='torque')
 

@@ -199,9 +199,9 @@ def test_the_link_ends_with_standstill_and_the_port_closed():
 @pytest.mark.parametrize(
     ('name', 'value'),
     [
-        ('guard.wheel_speed', 12.0),
-        ('guard.acceleration', 35.0),
-        ('guard.stop_deceleration', 80.0),
+        ('wheel.max_velocity', 12.0),
+        ('wheel.max_acceleration', 35.0),
+        ('wheel.stop_deceleration', 80.0),
     ],
 )
 def test_what_the_board_would_cut_is_refused_here(name, value):

@@ -148,7 +148,7 @@ def test_a_clock_that_goes_back_stops_until_the_next_command():
     watch.advance(1000 * MS, 0.01)
     limited_command = watch.advance(10 * MS, 0.01)
     assert limited_command.target == (0.0, 0.0)
-    assert limited_command.reason == 'the clock went back'
+    assert limited_command.reason == 'the clock jumped back'
     assert watch.accept(command(4.0, 4.0, 20.0), 20 * MS) == ''
     assert watch.advance(20 * MS, 0.01).target == (4.0, 4.0)
 

@@ -9,8 +9,8 @@ import pytest
 
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.simulation.sensors.battery import (
-    BatteryParameters,
     SimulatedBattery,
+    SimulatedBatteryParameters,
     open_circuit_voltage,
 )
 
@@ -18,7 +18,7 @@ FULL = 2.2 * 3600.0  # coulombs
 
 
 def battery(**changes: object) -> SimulatedBattery:
-    return SimulatedBattery(BatteryParameters.from_dict(changes))
+    return SimulatedBattery(SimulatedBatteryParameters.from_dict(changes))
 
 
 def test_open_circuit_voltage_rises_with_charge_between_the_ends_of_a_cell():
@@ -172,12 +172,12 @@ def test_numbers_that_cannot_be_are_refused_and_change_nothing(power, dt):
 )
 def test_settings_that_do_not_fit_are_refused_by_name(changes, name):
     with pytest.raises(ParameterError, match=f'^{name} '):
-        BatteryParameters.from_dict(changes)
+        SimulatedBatteryParameters.from_dict(changes)
 
 
 def test_a_sagging_cell_shows_in_the_voltage_and_takes_the_board_down():
     """Taken from the motors alone, a sag was seen by no reading, no warning and no board."""
-    battery = SimulatedBattery(BatteryParameters())
+    battery = SimulatedBattery(SimulatedBatteryParameters())
     healthy = battery.draw(5.0, 0.01).voltage
     assert battery.draw(5.0, 0.01, sag=2.0).voltage == pytest.approx(healthy - 2.0, abs=0.05)
     assert not battery.collapsed

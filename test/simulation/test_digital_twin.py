@@ -106,7 +106,9 @@ def test_how_often_the_state_is_asked_for_changes_nothing():
 def test_a_setting_of_one_part_does_not_shift_the_random_numbers_of_another():
     speeds = course(3, 100)
     before = drive(DigitalTwin(parameters(world='corridor')), speeds)
-    after = drive(DigitalTwin(parameters(world='corridor', sharp__voltage_noise=0.1)), speeds)
+    after = drive(
+        DigitalTwin(parameters(world='corridor', range_sensor__voltage_noise=0.1)), speeds
+    )
     assert [state.imu for state in before] == [state.imu for state in after]
     assert before[-1].truth == after[-1].truth
     assert [repr(s.ranges) for s in before] != [repr(s.ranges) for s in after]
@@ -135,7 +137,7 @@ def test_counters_tell_the_way_as_long_as_no_step_is_lost_and_no_tyre_slides():
     robot = DigitalTwin(parameters(odometry__use_gyro=False))
     for state in drive(robot, course(5, 3000)):
         assert state.lost_steps == (0, 0)
-    assert robot.inside.slid == (0.0, 0.0)
+    assert robot.diagnostics.slid == (0.0, 0.0)
     last = state
     apart = astray(last)
     assert apart < 2e-3
@@ -155,7 +157,7 @@ def test_odometry_does_not_notice(cause, changes):
     last = drive(robot, course(5, 1000))[-1]
     apart = astray(last)
     assert apart > 0.02, cause
-    slid, lost = robot.inside.slid, last.lost_steps
+    slid, lost = robot.diagnostics.slid, last.lost_steps
     assert max(slid) > 0.02 or max(map(abs, lost)) >= 4
 
 
@@ -219,7 +221,7 @@ def test_lasting_slip_stops_the_robot_with_a_reason():
 
 def test_every_word_of_a_fault_is_in_force_at_once():
     robot = DigitalTwin(parameters(faults__slippery=0.5, faults__load_change=1.0))
-    assert robot.inside.faults == ('load_change 1 kg', 'slippery 0.5')
+    assert robot.diagnostics.faults == ('load_change 1 kg', 'slippery 0.5')
 
 
 # -- world and sensors ----------------------------------------------------------------------------
@@ -228,18 +230,18 @@ def test_every_word_of_a_fault_is_in_force_at_once():
 def test_a_wall_stops_the_body_and_the_sensors_see_it_coming(tmp_path):
     wall = tmp_path / 'wall.yaml'
     wall.write_text('walls:\n  - points: [[1.0, -2.0], [1.0, 2.0]]\n')
-    exact = {'sharp__voltage_noise': 0.0, 'sharp__voltage_offset': 0.0}
+    exact = {'range_sensor__voltage_noise': 0.0, 'range_sensor__voltage_offset': 0.0}
     robot = DigitalTwin(parameters(world=str(wall), **exact))
     states = drive(robot, [WheelSpeeds(5.0, 5.0)] * 800)
     radius = robot.parameters.bumper.radius
     assert states[-1].truth.pose.x == pytest.approx(1.0 - radius, abs=0.005)
     assert max(state.truth.pose.x for state in states) < 1.0 - radius + 0.01
-    assert robot.inside.max_contact_force > 3.0
+    assert robot.diagnostics.max_contact_force > 3.0
     assert states[-1].odometry.pose.x > 1.1  # the wheels went on
     # 0.5 m before the wall, a front sensor on the body's edge reads the rest of the way.
     halfway = min(states, key=lambda state: abs(state.truth.pose.x - 0.5))
     front = halfway.ranges[RANGE_SENSORS.index('front_left')]
-    assert front == pytest.approx(1.0 - 0.5 - robot.parameters.sharp.half_length, abs=0.03)
+    assert front == pytest.approx(1.0 - 0.5 - robot.parameters.range_sensor.half_length, abs=0.03)
     assert halfway.ranges[RANGE_SENSORS.index('rear_left')] == math.inf
     assert halfway.ranges[RANGE_SENSORS.index('left_front')] == math.inf
 
@@ -267,7 +269,7 @@ def test_a_slippery_patch_is_where_the_world_says(tmp_path):
     robot.advance(0)
     for wheels in speeds:
         place = robot.step(wheels).truth.pose.x
-        now = robot.inside.slid[0]
+        now = robot.diagnostics.slid[0]
         if now > last + 1e-9:
             slid.append(place)
         last = now
@@ -309,9 +311,9 @@ def test_the_battery_pays_for_the_motors():
 
 
 def test_speeds_that_the_pulses_cannot_make_are_refused():
-    with pytest.raises(ParameterError, match=r'guard.wheel_speed must be at most 1\.227 rad/s'):
+    with pytest.raises(ParameterError, match=r'wheel.max_velocity must be at most 1\.227 rad/s'):
         parameters(motor__microsteps=256)
-    parameters(motor__microsteps=256, guard__wheel_speed=1.2)
+    parameters(motor__microsteps=256, wheel__max_velocity=1.2)
 
 
 def test_odometry_must_know_how_late_the_gyro_is():

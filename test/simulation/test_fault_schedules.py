@@ -23,6 +23,7 @@ from t3mpc_ros.simulation.fault_injection import (
     active_faults,
     load_schedule,
 )
+from t3mpc_ros.simulation.world import WORLDS_FOLDER
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / 'docs' / 'faults.md').read_text()
@@ -366,7 +367,12 @@ def test_schedules_are_installed_with_the_package(monkeypatch):
     folder = ROOT / package.replace('.', '/')
     installed = {path for glob in called['package_data'][package] for path in folder.glob(glob)}
     assert installed
-    assert installed == {path for path in SCHEDULES_FOLDER.iterdir() if path.is_file()}
+    assert installed == {
+        path
+        for data in (SCHEDULES_FOLDER, WORLDS_FOLDER)
+        for path in data.iterdir()
+        if path.is_file()
+    }
 
 
 def test_the_example_of_the_page_is_a_schedule_and_does_what_its_comments_say(tmp_path):

@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from t3mpc_ros.simulation.sensors.imu import GRAVITY, ImuParameters, SimulatedImu, low_pass
+from t3mpc_ros.robot.sensor_conversions import GRAVITY
+from t3mpc_ros.simulation.sensors.imu import SimulatedImu, SimulatedImuParameters, low_pass
 
 IDEAL = {
     'gyro_noise': 0.0,
@@ -33,7 +34,7 @@ ACCEL = {'2': 16384.0, '4': 8192.0, '8': 4096.0, '16': 2048.0}
 
 
 def sensor(seed: int = 1, **changes: object) -> SimulatedImu:
-    return SimulatedImu(ImuParameters.from_dict(changes), np.random.default_rng(seed))
+    return SimulatedImu(SimulatedImuParameters.from_dict(changes), np.random.default_rng(seed))
 
 
 def settled(angular: float = 0.0, forward: float = 0.0, sideways: float = 0.0) -> np.ndarray:
@@ -86,7 +87,7 @@ def test_samples_are_the_counts_at_their_nominal_scale():
         assert sample.sideways == pytest.approx(aside / 16384.0 * 9.80665, rel=1e-12)
 
 
-def response(parameters: ImuParameters, frequency: float) -> complex:
+def response(parameters: SimulatedImuParameters, frequency: float) -> complex:
     """Return gain and phase of the low-pass, from its answer to a sine in short steps."""
     step = 0.002 / frequency
     share, filtered = parameters.share(step), np.zeros((3, 2))
@@ -106,7 +107,7 @@ def response(parameters: ImuParameters, frequency: float) -> complex:
 
 @pytest.mark.parametrize('setting', REGISTER_MAP)
 def test_low_pass_loses_three_decibels_where_the_register_map_says(setting):
-    parameters, frequency = ImuParameters(low_pass=setting), REGISTER_MAP[setting][0]
+    parameters, frequency = SimulatedImuParameters(low_pass=setting), REGISTER_MAP[setting][0]
     gain = response(parameters, frequency)
     assert abs(gain) == pytest.approx(math.sqrt(0.5), rel=1e-3)
     pole = frequency * math.tau / math.sqrt(math.sqrt(2.0) - 1.0)
@@ -118,7 +119,7 @@ def test_low_pass_loses_three_decibels_where_the_register_map_says(setting):
 @pytest.mark.parametrize('setting', REGISTER_MAP)
 def test_low_pass_delays_as_long_as_its_settings_say(setting):
     """The delay of slow signals is the area above the step response."""
-    parameters = ImuParameters(low_pass=setting)
+    parameters = SimulatedImuParameters(low_pass=setting)
     step, filtered = parameters.delay / 200.0, np.zeros((3, 2))
     share, missing = parameters.share(step), [1.0]
     for _ in range(6000):
@@ -129,9 +130,9 @@ def test_low_pass_delays_as_long_as_its_settings_say(setting):
 
 
 def test_delay_is_the_data_sheets_at_the_default_and_within_a_millisecond_above():
-    assert ImuParameters().delay == pytest.approx(REGISTER_MAP['3'][1], abs=0.1e-3)
+    assert SimulatedImuParameters().delay == pytest.approx(REGISTER_MAP['3'][1], abs=0.1e-3)
     for setting in '0123':
-        assert ImuParameters(low_pass=setting).delay == pytest.approx(
+        assert SimulatedImuParameters(low_pass=setting).delay == pytest.approx(
             REGISTER_MAP[setting][1], abs=0.9e-3
         )
     # One pole alone would already be slower than the sheet at 5 Hz: no such filter has both.
@@ -139,7 +140,7 @@ def test_delay_is_the_data_sheets_at_the_default_and_within_a_millisecond_above(
 
 
 def test_low_pass_does_not_depend_on_the_step():
-    parameters, ends = ImuParameters(), []
+    parameters, ends = SimulatedImuParameters(), []
     for count in (1, 8, 80):
         filtered = np.array([[0.3, -0.2], [1.0, 2.0], [0.0, 0.0]])
         share = parameters.share(0.008 / count)
@@ -151,7 +152,7 @@ def test_low_pass_does_not_depend_on_the_step():
 
 
 def test_low_pass_survives_steps_that_are_too_long_to_leave_anything():
-    filtered, share = np.ones((3, 2)), ImuParameters(low_pass='0').share(1e3)
+    filtered, share = np.ones((3, 2)), SimulatedImuParameters(low_pass='0').share(1e3)
     assert share == 1.0
     low_pass(filtered, 5.0, 6.0, 7.0, share)
     assert filtered == pytest.approx(settled(5.0, 6.0, 7.0))
@@ -167,7 +168,7 @@ def test_noise_at_the_100_hz_low_pass_is_that_of_the_data_sheet():
 def test_noise_of_the_accelerometer_follows_its_density():
     imu, still = sensor(), settled()
     found = np.array([imu.measure(still, 0.01)[1:] for _ in range(20000)])
-    expected = 400e-6 * GRAVITY * math.sqrt(ImuParameters().noise_bandwidth)
+    expected = 400e-6 * GRAVITY * math.sqrt(SimulatedImuParameters().noise_bandwidth)
     assert found.std(axis=0) == pytest.approx([expected, expected], rel=0.02)
     assert abs(np.corrcoef(found.T)[0, 1]) < 0.03
 
@@ -187,7 +188,7 @@ def test_allan_deviation_of_the_noise_is_that_of_its_density(setting, dt):
     White samples of the right spread would average out far too fast at 5 Hz, where neighbours
     are nearly equal.
     """
-    parameters = ImuParameters(gyro_drift=0.0, low_pass=setting, gyro_range='250')
+    parameters = SimulatedImuParameters(gyro_drift=0.0, low_pass=setting, gyro_range='250')
     imu, size = SimulatedImu(parameters, np.random.default_rng(1)), round(1.0 / dt)
     found = allan(rates(imu, 400 * size, dt), size)
     # Sampling folds in what lies beyond half the rate: the sum over the autocorrelation.

@@ -27,8 +27,8 @@ IDEAL: dict[str, object] = {
     'drive.dead_time': 0.0,
     'drive.acceleration': 0.0,
     'drive.torque_limit': 100.0,
-    'guard.acceleration': 1e5,
-    'guard.stop_deceleration': 1e5,
+    'wheel.max_acceleration': 1e5,
+    'wheel.stop_deceleration': 1e5,
 }
 """Nothing but the lag: every limit out of the way."""
 
@@ -102,8 +102,8 @@ def test_nothing_moves_before_the_dead_time_is_over():
 def test_under_the_acceleration_limit_the_wheels_follow_the_ramp_of_a_lag():
     rate = 20.0
     changes = {
-        'guard__acceleration': rate,
-        'guard__stop_deceleration': rate,
+        'wheel__max_acceleration': rate,
+        'wheel__stop_deceleration': rate,
         'drive__acceleration': rate,
     }
     wheels = response(robot(**changes), WheelSpeeds(10.0, 10.0), 40)
@@ -116,8 +116,8 @@ def test_under_the_acceleration_limit_the_wheels_follow_the_ramp_of_a_lag():
 def test_the_drive_limits_acceleration_by_itself_in_both_wheels_by_one_factor():
     parameters = PaperRobotParameters.from_dict(
         IDEAL
-        | {'drive.acceleration': 50.0, 'guard.acceleration': 30.0}
-        | {'guard.stop_deceleration': 50.0, 'body.com_offset': 0.0}
+        | {'drive.acceleration': 50.0, 'wheel.max_acceleration': 30.0}
+        | {'wheel.stop_deceleration': 50.0, 'body.com_offset': 0.0}
     )
     plant = PaperPlant(parameters.drive, parameters.step)
     bodies = parameters.body, parameters.body

@@ -178,9 +178,9 @@ def test_no_finite_command_makes_a_state_that_is_not_finite():
         machine = robot(
             drive__kind=kind,
             drive__torque_limit=100.0,
-            guard__wheel_speed=200.0,
-            guard__linear_speed=5.0,
-            guard__angular_speed=50.0,
+            wheel__max_velocity=200.0,
+            linear__x__max_velocity=5.0,
+            angular__z__max_velocity=50.0,
             friction__viscous=0.0,
             friction__coulomb=0.0,
             body__com_offset=0.1,
@@ -286,7 +286,7 @@ def test_a_clock_that_goes_back_stops_the_robot_and_starts_a_new_grid():
         before = machine.advance((tick + 1) * PERIOD)
     state = machine.advance(3 * MS)
     assert state.stamp_ns == 3 * MS
-    assert 'clock went back' in state.reason
+    assert 'clock jumped back' in state.reason
     assert state.truth.pose.x == pytest.approx(before.truth.pose.x)
     assert not machine.advance(503 * MS).status.moving
     assert machine.apply(command(8.0, 8.0, 503 * MS), 503 * MS) == ''
@@ -413,7 +413,7 @@ def test_the_robot_can_be_put_elsewhere_and_odometry_does_not_notice():
 
 def test_only_live_settings_change_while_running():
     machine = robot()
-    for name, value in (('noise.variance', 0.1), ('guard.wheel_speed', 3.0), ('drive.lag', 0.05)):
+    for name, value in (('noise.variance', 0.1), ('wheel.max_velocity', 3.0), ('drive.lag', 0.05)):
         machine.configure(machine.parameters.with_values({name: value}))
         assert machine.parameters.to_dict()[name] == value
     before = machine.parameters

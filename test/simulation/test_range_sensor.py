@@ -9,16 +9,18 @@ import pytest
 
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.robot.interface import RANGE_SENSORS
-from t3mpc_ros.simulation.sensors.range_sensor import (
+from t3mpc_ros.robot.sensor_conversions import (
     BEYOND,
     FAULT,
     NOT_MEASURED,
     TOO_NEAR,
-    RangeSensorParameters,
-    SimulatedRangeSensors,
     decode_range,
-    distance_from_voltage,
     encode_range,
+)
+from t3mpc_ros.simulation.sensors.range_sensor import (
+    SimulatedRangeSensorParameters,
+    SimulatedRangeSensors,
+    distance_from_voltage,
     output_voltage,
     sensor_mounts,
 )
@@ -44,7 +46,7 @@ QUIET = {'voltage_noise': 0.0, 'voltage_offset': 0.0}
 
 def finders(seed: int = 1, **changes: object) -> SimulatedRangeSensors:
     return SimulatedRangeSensors(
-        RangeSensorParameters.from_dict(changes), np.random.default_rng(seed)
+        SimulatedRangeSensorParameters.from_dict(changes), np.random.default_rng(seed)
     )
 
 
@@ -90,7 +92,7 @@ def test_voltage_without_an_object_is_below_that_of_any_object():
 
 
 def test_board_inverts_the_curve_within_what_its_converter_resolves():
-    parameters = RangeSensorParameters()
+    parameters = SimulatedRangeSensorParameters()
     for place in np.linspace(0.1005, 0.79, 1500):
         slope = (output_voltage(place - 1e-4) - output_voltage(place + 1e-4)) / 2e-4
         found = distance_from_voltage(parameters.volts(parameters.count(output_voltage(place))))
@@ -167,7 +169,7 @@ def test_finite_readings_keep_half_a_centimetre_and_never_become_a_special_code(
 
 
 def test_mounts_are_two_on_each_side_and_look_outwards():
-    parameters = RangeSensorParameters(half_length=0.1, half_width=0.08, offset=0.03)
+    parameters = SimulatedRangeSensorParameters(half_length=0.1, half_width=0.08, offset=0.03)
     places = dict(zip(RANGE_SENSORS, sensor_mounts(parameters), strict=True))
     assert places['front_left'] == pytest.approx([0.1, 0.03, 0.0])
     assert places['front_right'] == pytest.approx([0.1, -0.03, 0.0])
@@ -289,4 +291,4 @@ def test_equal_seeds_read_equally_and_settings_do_not_shift_the_numbers():
 )
 def test_settings_that_do_not_fit_are_refused_by_name(changes, name):
     with pytest.raises(ParameterError, match=f'^{name} must be'):
-        RangeSensorParameters.from_dict(changes)
+        SimulatedRangeSensorParameters.from_dict(changes)

@@ -147,7 +147,7 @@ class AvrEmulator:
         self.plant = Plant(parameters.twin)
         self.plant.boot(parameters.twin.motor.microsteps)
         self._world = load_world(parameters.twin.world)
-        self._mounts = sensor_mounts(parameters.twin.sharp)
+        self._mounts = sensor_mounts(parameters.twin.range_sensor)
         self.distances = np.full(len(RANGE_SENSORS), math.inf)
         """m, of the faces of the sensors from what is before them."""
         self._plant_us = 0.0

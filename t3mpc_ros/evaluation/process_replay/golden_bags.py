@@ -66,7 +66,7 @@ GOLDEN_SCENARIOS: Mapping[str, GoldenScenario] = {
             1.5: ('configure', {'law.gain': 20.0}),
             2.5: ('configure', {'law.compensator': False, 'adaptation.gamma': 300.0}),
             3.5: ('configure', {'use_fuzzy': False}),
-            4.5: ('configure', {'limits.linear': 0.15, 'use_fuzzy': True}),
+            4.5: ('configure', {'linear.x.max_velocity': 0.15, 'use_fuzzy': True}),
             5.5: ('configure', {'switches.preview': False, 'predictive.move_weight': 0.01}),
         },
         (

@@ -15,9 +15,9 @@ from t3mpc_ros.simulation.plant.disturbances import Disturbance
 from t3mpc_ros.simulation.plant.drivetrain import Drivetrain
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
 from t3mpc_ros.simulation.plant.stepper_motor import StepperMotorParameters, pull_out_torque
-from t3mpc_ros.simulation.sensors.imu import ImuParameters, SimulatedImu, low_pass
+from t3mpc_ros.simulation.sensors.imu import SimulatedImu, SimulatedImuParameters, low_pass
 from t3mpc_ros.simulation.sensors.range_sensor import (
-    RangeSensorParameters,
+    SimulatedRangeSensorParameters,
     SimulatedRangeSensors,
     output_voltage,
 )
@@ -120,8 +120,8 @@ def needed_torque(parameters: DigitalTwinParameters) -> float:
     own = parameters.motor.rotor_inertia
     hardest = max(inertia[0, 0] + inertia[0, 1], inertia[0, 0] - inertia[0, 1]) + own
     friction = parameters.friction
-    rubs = friction.coulomb + friction.viscous * parameters.guard.wheel_speed
-    return float(hardest * parameters.guard.acceleration + parameters.friction_factor * rubs)
+    rubs = friction.coulomb + friction.viscous * parameters.limiter.wheel_speed
+    return float(hardest * parameters.limiter.acceleration + parameters.friction_factor * rubs)
 
 
 def breaking_acceleration(parameters: DigitalTwinParameters) -> float:
@@ -171,7 +171,9 @@ def sharp_curve(distances: Sequence[float] | Array) -> Array:
     return np.array([output_voltage(float(value)) for value in distances])
 
 
-def sharp_readings(parameters: RangeSensorParameters, distances: Array, seed: int) -> Array:
+def sharp_readings(
+    parameters: SimulatedRangeSensorParameters, distances: Array, seed: int
+) -> Array:
     """Return what the board reads (m, REP 117) of all eight sensors, shape (n, 8)."""
     finders = SimulatedRangeSensors(parameters, np.random.default_rng(seed))
     rows = []
@@ -190,7 +192,7 @@ def sharp_deviation() -> float:
 
 def low_pass_response(setting: int, step: float = 1e-4, length: int = 8192) -> LowPass:
     """Return what the low-pass of DLPF_CFG ``setting`` does to a pulse of one ``step`` (s)."""
-    share = ImuParameters(low_pass=str(setting)).share(step)
+    share = SimulatedImuParameters(low_pass=str(setting)).share(step)
     filtered = np.zeros((3, 2))
     answer = np.empty(length)
     for index in range(length):
@@ -204,7 +206,9 @@ def low_pass_response(setting: int, step: float = 1e-4, length: int = 8192) -> L
     return LowPass(frequency, gain, cutoff, 1e3 * step * middle)
 
 
-def standing_gyro(parameters: ImuParameters, seconds: float, rate: float, seed: int) -> Array:
+def standing_gyro(
+    parameters: SimulatedImuParameters, seconds: float, rate: float, seed: int
+) -> Array:
     """Return what a gyro that does not turn tells (deg/s), shape (seconds * rate,)."""
     gyro = SimulatedImu(parameters, np.random.default_rng(seed))
     still = np.zeros((3, 2))

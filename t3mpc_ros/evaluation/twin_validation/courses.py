@@ -197,7 +197,7 @@ def patrol(
             touched_before = True
         elif touches and math.isnan(hit_at):
             hit_at = log.elapsed
-    push = log.robot.inside.max_contact_force
+    push = log.robot.diagnostics.max_contact_force
     return Patrol(log.course(), np.array(ranges), blind_from, hit_at, touched_before, push)
 
 
@@ -264,7 +264,7 @@ class _Log:
         rows = np.array(self._rows)
         for yaw in (3, 6, 9):
             rows[:, yaw] = np.unwrap(rows[:, yaw])
-        inside = self.robot.inside
+        inside = self.robot.diagnostics
         return Course(
             name=self._name,
             time=rows[:, 0],
@@ -301,7 +301,7 @@ def _driven(
     log = _Log(name, parameters, spells)
     log.stand(STANDING)
     exact = 0.5 * parameters.motor.microstep
-    slowing = 2.0 * DECELERATION_ANGLE * parameters.guard.acceleration
+    slowing = 2.0 * DECELERATION_ANGLE * parameters.limiter.acceleration
     goal = np.array(log.state.angles)
     for number, leg in enumerate(legs, 1):
         goal += leg

@@ -134,7 +134,7 @@ def room(patrol: Patrol, parameters: DigitalTwinParameters) -> Any:
     axis.set_axisbelow(True)
     world = load_world(parameters.world)
     _draw_world(axis, world)
-    faces = sensor_mounts(parameters.sharp)
+    faces = sensor_mounts(parameters.range_sensor)
     blind = int(np.searchsorted(course.time, patrol.blind_from))
     moments = np.linspace(blind // 6, blind - 1, 5).astype(int)
     for moment in moments:
@@ -255,8 +255,8 @@ def torque(evidence: Evidence) -> Any:
 
 
 def _torque_panel(axis: Any, evidence: Evidence, current: float) -> None:
-    guard, motor = evidence.parameters.guard, evidence.parameters.motor
-    axis.axvspan(0.0, guard.wheel_speed, color='#dbeafe', lw=0.0, label='speeds of the robot')
+    limiter, motor = evidence.parameters.limiter, evidence.parameters.motor
+    axis.axvspan(0.0, limiter.wheel_speed, color='#dbeafe', lw=0.0, label='speeds of the robot')
     axis.axvline(motor.top_speed, color='#60a5fa', lw=1.0, label='fastest pulses')
     axis.axhline(evidence.needed, color=SHEET, lw=1.0, ls=':', label='needed to drive')
     chosen = [curve for curve in evidence.torque if curve.current == current]
@@ -315,7 +315,7 @@ def sharp(evidence: Evidence) -> Any:
     left, right = figure.subplots(1, 2)
     _sharp_panel(left, evidence)
     true, readings = 100.0 * evidence.readings[:, 0], 100.0 * evidence.readings[:, 1:]
-    limits = evidence.parameters.sharp
+    limits = evidence.parameters.range_sensor
     right.axvspan(100.0 * limits.minimum, 100.0 * limits.maximum, color='#f3f4f6', lw=0.0)
     right.plot((0, 100), (0, 100), color=FAINT, lw=1.0, label='right')
     finite = np.where(np.isfinite(readings), readings, np.nan)

@@ -114,7 +114,7 @@ def run_validation(seed: int, amount: ValidationSize, progress: Any = None) -> '
     ramps = tuple(component_tests.ramp(parameters, part * limit, 10.0) for part in (0.5, 1.5))
     near = np.linspace(0.0, 1.0, 401)
     places = np.concatenate([np.arange(0.0, 0.1, 0.001), np.arange(0.1, 1.0, 0.005)])
-    readings = component_tests.sharp_readings(parameters.sharp, places, seed)
+    readings = component_tests.sharp_readings(parameters.range_sensor, places, seed)
     rate = parameters.rate
     told = component_tests.standing_gyro(parameters.imu, amount.standing, rate, seed)
     low_pass = [component_tests.low_pass_response(number) for number in range(7)]
@@ -159,9 +159,11 @@ def bench_table(evidence: 'Evidence') -> 'Table':
     parameters, patrol = evidence.parameters, evidence.patrol
     rows = []
     for curve in evidence.torque:
-        pull = np.interp((parameters.guard.wheel_speed, curve.ceiling), curve.speed, curve.torque)
+        pull = np.interp(
+            (parameters.limiter.wheel_speed, curve.ceiling), curve.speed, curve.torque
+        )
         name = f'torque at {curve.volts:g} V, {curve.current:g} A'
-        at = f'at {parameters.guard.wheel_speed:g} rad/s {pull[0]:.3f} N m'
+        at = f'at {parameters.limiter.wheel_speed:g} rad/s {pull[0]:.3f} N m'
         at += f', at {curve.ceiling:.1f} rad/s {pull[1]:.3f}'
         rows.append((name, at, f'needed {evidence.needed:.3f} N m'))
     for ramp in evidence.ramps:

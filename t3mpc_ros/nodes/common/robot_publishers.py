@@ -14,9 +14,11 @@ from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.nodes.common import conversions, qos, sensor_messages
 from t3mpc_ros.parameters.table import Parameters, parameter
 from t3mpc_ros.robot.interface import RANGE_SENSORS, RobotState
-from t3mpc_ros.simulation.sensors.battery import BatteryParameters
-from t3mpc_ros.simulation.sensors.imu import ImuParameters
-from t3mpc_ros.simulation.sensors.range_sensor import RangeSensorParameters
+from t3mpc_ros.robot.sensor_conversions import (
+    BatteryParameters,
+    ImuParameters,
+    RangeSensorParameters,
+)
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,7 @@ class RobotPublishers:
         self._broadcaster = self._transforms() if parameters.enable_odom_tf else None
         self._has_sensors = facts.sensors is not None
         if facts.sensors is not None:
-            imu, sharp, battery = facts.sensors
+            imu, range_sensor, battery = facts.sensors
             self._imu = node.create_publisher(Imu, 'imu/data_raw', qos.STREAM)
             self._battery = node.create_publisher(BatteryState, 'battery_state', qos.SCALARS)
             self._reading = sensor_messages.battery_message(battery)
@@ -102,7 +104,7 @@ class RobotPublishers:
                 (
                     node.create_publisher(Range, f'range/{name}', qos.SCALARS),
                     sensor_messages.range_message(
-                        sharp, f'{parameters.range_frame_prefix}{name}_range_link'
+                        range_sensor, f'{parameters.range_frame_prefix}{name}_range_link'
                     ),
                 )
                 for name in (RANGE_SENSORS if parameters.range_rate else ())

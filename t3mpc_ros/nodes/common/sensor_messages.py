@@ -9,9 +9,12 @@ from sensor_msgs.msg import BatteryState, Imu, Range
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.nodes.common import conversions
 from t3mpc_ros.robot.interface import BatteryReading, ImuSample
-from t3mpc_ros.simulation.sensors.battery import BatteryParameters
-from t3mpc_ros.simulation.sensors.imu import GRAVITY, ImuParameters
-from t3mpc_ros.simulation.sensors.range_sensor import RangeSensorParameters
+from t3mpc_ros.robot.sensor_conversions import (
+    GRAVITY,
+    BatteryParameters,
+    ImuParameters,
+    RangeSensorParameters,
+)
 
 UNKNOWN_VARIANCE = 1e6
 """Variance of what is not measured, in whatever unit."""

@@ -9,8 +9,7 @@ from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.radio.protocol.clock_sync import ClockModel, CounterUnwrapper, wrapped_difference
 from t3mpc_ros.radio.protocol.frames import AGE_NONE, State, StatusFlag
 from t3mpc_ros.robot.interface import ImuSample, RobotStatus, WheelAngles
-from t3mpc_ros.simulation.sensors.imu import ImuParameters
-from t3mpc_ros.simulation.sensors.range_sensor import decode_range
+from t3mpc_ros.robot.sensor_conversions import ImuParameters, decode_range
 
 _MICROSECOND = 1000
 """ns"""

@@ -386,7 +386,7 @@ class PaperRobotParameters(Parameters):
     disturbance: DisturbanceParameters = group(DisturbanceParameters)
     noise: NoiseParameters = group(NoiseParameters)
     drive: DriveParameters = group(DriveParameters)
-    guard: CommandLimiterParameters = group(CommandLimiterParameters)
+    limiter: CommandLimiterParameters = group(CommandLimiterParameters, inline=True)
     odometry: WheelOdometryParameters = group(WheelOdometryParameters)
     mass_factor: float = parameter(
         1.0,
@@ -460,11 +460,11 @@ class PaperRobotParameters(Parameters):
 
     def check_ramp(self) -> None:
         """Raise ParameterError when the drive would cut stops short."""
-        drive, guard = self.drive, self.guard
-        if 0.0 < drive.acceleration < guard.stop_deceleration:
+        drive, limiter = self.drive, self.limiter
+        if 0.0 < drive.acceleration < limiter.stop_deceleration:
             raise ParameterError(
-                'drive.acceleration must be at least guard.stop_deceleration '
-                f'({guard.stop_deceleration:g} rad/s²), or 0: got {drive.acceleration:g}'
+                'drive.acceleration must be at least wheel.stop_deceleration '
+                f'({limiter.stop_deceleration:g} rad/s²), or 0: got {drive.acceleration:g}'
             )
 
 
@@ -480,7 +480,7 @@ class PaperRobot(FixedStepRobot[PaperRobotParameters]):
             raise ValueError(
                 'drive.kind must be velocity or torque here: stepper is for DigitalTwin'
             )
-        guard = CommandLimiter(parameters.guard, parameters.geometry)
+        guard = CommandLimiter(parameters.limiter, parameters.geometry)
         super().__init__(
             parameters, parameters.rate, parameters.substeps, parameters.longest_gap, guard
         )
@@ -553,7 +553,7 @@ class PaperRobot(FixedStepRobot[PaperRobotParameters]):
 
     def _apply_parameters(self) -> None:
         parameters = self._parameters
-        self._limiter.parameters = parameters.guard
+        self._limiter.parameters = parameters.limiter
         self._odometry.parameters = parameters.odometry
         self._disturbance.parameters = parameters.disturbance
         self._noise.parameters = parameters.noise

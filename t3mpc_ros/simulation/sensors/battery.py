@@ -6,30 +6,29 @@ from bisect import bisect_right
 from dataclasses import dataclass
 import math
 
-from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
+from t3mpc_ros.parameters.table import ParameterError, parameter
 from t3mpc_ros.robot.interface import BatteryReading
+from t3mpc_ros.robot.sensor_conversions import BatteryParameters
 
 # Charge (1) and open-circuit voltage (V) of a Li-ion (NMC) cell: rounded from the discharges at
-# C/32 and C/20 of Molicel P42A and Samsung 40T cells that Sunil et al. (IEEE Transactions on
-# Instrumentation and Measurement, 2025) publish; the two agree within 0.03 V from 10 % on.
+# C/32 and C/20 of Molicel P42A and Samsung 40T cells in Sunil et al. (IEEE Transactions on
+# Instrumentation and Measurement, 2025); the two agree within 0.03 V from 10 % on.
 _CHARGES = (0.0, 0.02, 0.05, 0.1, 0.15, 0.3, 0.45, 0.84, 0.95, 1.0)
 _VOLTAGES = (2.5, 2.95, 3.18, 3.33, 3.43, 3.58, 3.70, 4.065, 4.11, 4.2)
 _SECONDS_PER_HOUR = 3600.0
 
 
 @dataclass(frozen=True)
-class BatteryParameters(Parameters):
-    """Cells in series, and what hangs on them all the time."""
+class SimulatedBatteryParameters(BatteryParameters):
+    """Resistance, idle load, thresholds and initial charge of the simulated battery."""
 
-    cells: int = parameter(3, 'Li-ion cells in series', low=1, high=12)
-    capacity: float = parameter(2.2, 'charge when full', unit='Ah', low=0.01, high=100.0)
     resistance: float = parameter(
-        0.15, 'inner resistance, cells and wires', unit='ohm', low=1e-3, high=10.0, dynamic=True
+        0.15, 'resistance of cells and wires', unit='ohm', low=1e-3, high=10.0, dynamic=True
     )
     idle_current: float = parameter(
         0.3,
-        'drawn whatever the motors do: eight distance sensors at 30 mA and the board behind a '
-        'linear regulator',
+        'current besides the motors: eight range sensors at 30 mA and the board behind a linear '
+        'regulator',
         unit='A',
         low=0.0,
         high=10.0,
@@ -37,11 +36,16 @@ class BatteryParameters(Parameters):
         source='Sharp E4-A00201EN: 30 mA each; the remaining 60 mA assumed',
     )
     low_voltage: float = parameter(
-        10.2, 'below this the robot asks to be charged', unit='V', low=0.0, high=60.0, dynamic=True
+        10.2,
+        'voltage below which the robot reports a low battery',
+        unit='V',
+        low=0.0,
+        high=60.0,
+        dynamic=True,
     )
     brown_out: float = parameter(
         8.0,
-        'below this motor drivers and board drop out',
+        'voltage below which motor drivers and board fail',
         unit='V',
         low=0.0,
         high=60.0,
@@ -49,16 +53,16 @@ class BatteryParameters(Parameters):
     )
     hysteresis: float = parameter(
         0.3,
-        'how far the voltage has to come back before either is taken back',
+        'voltage above either threshold at which its condition ends',
         unit='V',
         low=0.0,
         high=5.0,
         dynamic=True,
     )
-    charge: float = parameter(1.0, 'charge at the start', low=0.0, high=1.0)
+    charge: float = parameter(1.0, 'initial charge, 0 to 1', low=0.0, high=1.0)
 
     def check_consistency(self) -> None:
-        """Raise ParameterError when a warning would come too late, or never end."""
+        """Raise ParameterError when the low-battery report would be late, or would never end."""
         if self.low_voltage < self.brown_out:
             raise ParameterError(
                 f'low_voltage must be at least brown_out ({self.brown_out:g} V): '
@@ -67,7 +71,7 @@ class BatteryParameters(Parameters):
         full = self.cells * _VOLTAGES[-1]
         if self.low_voltage + self.hysteresis >= full:
             raise ParameterError(
-                f'low_voltage with hysteresis must be less than that of a full battery '
+                f'low_voltage with hysteresis must be less than the voltage of a full battery '
                 f'({full:g} V): got {self.low_voltage + self.hysteresis:g}'
             )
 
@@ -82,15 +86,15 @@ def open_circuit_voltage(charge: float, cells: int = 1) -> float:
 
 
 class SimulatedBattery:
-    """Counts the charge that is drawn, and tells the voltage that is left.
+    """Charge and terminal voltage under load.
 
     Parameters
     ----------
-    settings
-        Replaceable while running; the charge stays as it is.
+    parameters
+        Replaceable at run time; the charge is kept.
     """
 
-    def __init__(self, parameters: BatteryParameters) -> None:
+    def __init__(self, parameters: SimulatedBatteryParameters) -> None:
         self.parameters = parameters
         self._charge = parameters.charge
         self._low = self._collapsed = False
@@ -98,40 +102,40 @@ class SimulatedBattery:
 
     @property
     def voltage(self) -> float:
-        """V between the terminals, under the load of the last draw."""
+        """Terminal voltage under the load of the last draw, V."""
         return self._voltage
 
     @property
     def charge(self) -> float:
-        """What is left, 0 to 1."""
+        """Remaining charge, 0 to 1."""
         return self._charge
 
     @property
     def low(self) -> bool:
-        """Whether it should be charged."""
+        """Whether the battery should be charged."""
         return self._low
 
     @property
     def collapsed(self) -> bool:
-        """Whether the voltage is too low for drivers and board, or was and has not come back."""
+        """Whether the voltage is, or within the hysteresis was, too low for drivers and board."""
         return self._collapsed
 
     def draw(self, power: float, dt: float, sag: float = 0.0) -> BatteryReading:
         r"""Return voltage, current and charge after ``dt`` seconds of ``power`` (W) to the motors.
 
-        With E the open-circuit voltage less ``sag`` (V, a fault of the cells) and what the idle
-        current I takes, the voltage solves
+        With E the open-circuit voltage less ``sag`` (V, a fault of the cells) and the voltage
+        drop of the idle current, the terminal voltage solves
 
         .. math:: V = E - R P / V, \qquad V = E/2 + \sqrt{E^2/4 - R P}.
 
         More than E²/4R cannot be drawn: the voltage is then E/2, and the battery collapses. An
-        empty one is switched off by its protection: no voltage, no current. Power that is fed
-        back (negative) is burnt in the drivers.
+        empty battery is disconnected by its protection: no voltage, no current. Regenerated
+        (negative) power is dissipated in the drivers.
 
         Raises
         ------
         ValueError
-            A number is not finite, or ``dt`` is negative; nothing has changed then.
+            A number is not finite, or ``dt`` is negative; the state is unchanged then.
         """
         if not (math.isfinite(power + sag) and 0.0 <= dt < math.inf):
             raise ValueError(
@@ -153,7 +157,7 @@ class SimulatedBattery:
             if current * dt < self._charge * full:
                 self._charge -= current * dt / full
             else:
-                # It gives out on the way: what it still gave is the mean over the step.
+                # Empty within the step: the current is the mean over the step.
                 current = self._charge * full / dt
                 self._charge = 0.0
         self._voltage = volts

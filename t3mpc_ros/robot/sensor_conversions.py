@@ -1,0 +1,194 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Data-sheet conversions of IMU, range sensors and battery, with the parameters they need.
+
+The driver of the real robot and the simulation share them; the errors of the sensors are
+parameters of the simulation alone (:mod:`t3mpc_ros.simulation.sensors`). Figures of the MPU6050
+are those of InvenSense's product specification PS-MPU-6000A-00 (revision 3.4) and its register
+map RM-MPU-6000A-00, those of the GP2Y0A21YK0F those of Sharp's data sheet E4-A00201EN.
+"""
+
+from dataclasses import dataclass
+import math
+
+from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
+
+# -- IMU ------------------------------------------------------------------------------------------
+
+GRAVITY = 9.80665
+"""m/s² per g of the data sheet."""
+IMU_DATA_SHEET = 'PS-MPU-6000A-00 r3.4'
+_LSB_PER_DEGREE = {'250': 131.0, '500': 65.5, '1000': 32.8, '2000': 16.4}
+_LSB_PER_G = {'2': 16384.0, '4': 8192.0, '8': 4096.0, '16': 2048.0}
+_BANDWIDTH = {'0': 256.0, '1': 188.0, '2': 98.0, '3': 42.0, '4': 20.0, '5': 10.0, '6': 5.0}
+_DEGREE = math.pi / 180.0
+
+
+@dataclass(frozen=True)
+class ImuParameters(Parameters):
+    r"""Registers and noise density of the MPU6050.
+
+    The digital low-pass is modelled by two equal real poles,
+
+    .. math:: H(s) = \left(\frac{p}{s + p}\right)^2, \qquad
+              p = \frac{2 \pi f}{\sqrt{\sqrt{2} - 1}},
+
+    so that :math:`f` is its -3 dB frequency. It delays slow signals by 2/p:
+
+    =========  ===  ====  ====  ====  ====  ====  ====
+    DLPF_CFG     0     1     2     3     4     5     6
+    =========  ===  ====  ====  ====  ====  ====  ====
+    gyro, Hz   256   188    98    42    20    10     5
+    sheet, ms  0.98  1.9   2.8   4.8   8.3  13.4  18.6
+    model, ms  0.80  1.09  2.09  4.88  10.2  20.5  41.0
+    =========  ===  ====  ====  ====  ====  ====  ====
+
+    No two real poles reach both figures at the low end. The accelerometer's frequencies (260,
+    184, 94, 44, 21, 10, 5 Hz) are within 5 % of these, and are taken as the same.
+    """
+
+    gyro_range: str = parameter(
+        '500',
+        'full scale of the gyro, deg/s (FS_SEL); 8 rad/s are 458 deg/s',
+        choices=('250', '500', '1000', '2000'),
+    )
+    accel_range: str = parameter(
+        '2', 'full scale of the accelerometer, g (AFS_SEL)', choices=('2', '4', '8', '16')
+    )
+    low_pass: str = parameter(
+        '3',
+        'low-pass of gyro and accelerometer (DLPF_CFG): 256, 188, 98, 42, 20, 10 or 5 Hz',
+        choices=('0', '1', '2', '3', '4', '5', '6'),
+    )
+    gyro_noise: float = parameter(
+        0.005,
+        'noise density of the gyro',
+        unit='deg/s/√Hz',
+        low=0.0,
+        high=10.0,
+        dynamic=True,
+        source=f'{IMU_DATA_SHEET} 6.1, at 10 Hz',
+    )
+    accel_noise: float = parameter(
+        400.0,
+        'noise density of the accelerometer',
+        unit='µg/√Hz',
+        low=0.0,
+        high=1e5,
+        dynamic=True,
+        source=f'{IMU_DATA_SHEET} 6.2, at 10 Hz',
+    )
+
+    @property
+    def rate_step(self) -> float:
+        """One count of the gyro, rad/s."""
+        return _DEGREE / _LSB_PER_DEGREE[self.gyro_range]
+
+    @property
+    def acceleration_step(self) -> float:
+        """One count of the accelerometer, m/s²."""
+        return GRAVITY / _LSB_PER_G[self.accel_range]
+
+    @property
+    def pole(self) -> float:
+        """Each of the two poles of the low-pass, 1/s."""
+        return math.tau * _BANDWIDTH[self.low_pass] / math.sqrt(math.sqrt(2.0) - 1.0)
+
+    @property
+    def delay(self) -> float:
+        """Delay of slow signals, s: 2/p."""
+        return 2.0 / self.pole
+
+    @property
+    def noise_bandwidth(self) -> float:
+        """Hz: noise of density N leaves the low-pass with the variance N² times this, p/8."""
+        return self.pole / 8.0
+
+
+# -- range sensors --------------------------------------------------------------------------------
+
+CODE_STEP = 0.005
+"""m per step of the range code in a radio frame."""
+NOT_MEASURED, TOO_NEAR, BEYOND, FAULT = 0, 1, 254, 255
+"""Range codes that are not a distance."""
+RANGE_DATA_SHEET = 'Sharp E4-A00201EN'
+
+
+@dataclass(frozen=True)
+class RangeSensorParameters(Parameters):
+    """Type, measuring range and beam of the range sensors."""
+
+    type: str = parameter(
+        'GP2Y0A21YK0F', 'type of the sensors', choices=('GP2Y0A21YK0F',), source=RANGE_DATA_SHEET
+    )
+    minimum: float = parameter(
+        0.10,
+        'smallest distance; the board reports anything nearer as too near',
+        unit='m',
+        low=0.07,
+        high=0.5,
+        source=f'{RANGE_DATA_SHEET}, distance measuring range',
+    )
+    maximum: float = parameter(
+        0.80,
+        'largest distance; the board reports anything farther as no object',
+        unit='m',
+        low=0.2,
+        high=1.2,
+        source=f'{RANGE_DATA_SHEET}, distance measuring range',
+    )
+    field_of_view: float = parameter(
+        0.1,
+        'opening angle of the beam, which the data sheet does not give',
+        unit='rad',
+        low=0.0,
+        high=1.0,
+    )
+
+    def check_consistency(self) -> None:
+        """Raise ParameterError when the measuring range is empty."""
+        if self.maximum <= self.minimum:
+            raise ParameterError(
+                f'maximum must be more than minimum ({self.minimum:g} m): got {self.maximum:g}'
+            )
+
+
+def encode_range(distance: float) -> int:
+    """Return the range code (a byte) of a reading (m, REP 117) in steps of half a centimetre.
+
+    NaN is 0, -inf is 1, inf is 254. The code of a faulty sensor, 255, has no reading.
+    """
+    steps = distance / CODE_STEP
+    if TOO_NEAR < steps < BEYOND:
+        return round(steps)
+    if math.isnan(steps):
+        return NOT_MEASURED
+    return BEYOND if steps >= BEYOND else TOO_NEAR
+
+
+def decode_range(code: int) -> float:
+    """Return the reading (m, REP 117) of a range code; NaN for not measured and for a fault.
+
+    Raises
+    ------
+    ValueError
+        The code is not a byte.
+    """
+    if not 0 <= code <= 255:
+        raise ValueError(f'code must be from 0 to 255: got {code}')
+    if code in (NOT_MEASURED, FAULT):
+        return math.nan
+    if code in (TOO_NEAR, BEYOND):
+        return math.inf if code == BEYOND else -math.inf
+    return CODE_STEP * code
+
+
+# -- battery --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class BatteryParameters(Parameters):
+    """Cells and capacity of the battery."""
+
+    cells: int = parameter(3, 'number of Li-ion cells in series', low=1, high=12)
+    capacity: float = parameter(2.2, 'charge of the full battery', unit='Ah', low=0.01, high=100.0)
