@@ -59,7 +59,7 @@ def test_every_equation_and_every_correction_has_exactly_one_row():
 
 
 @pytest.mark.parametrize('row', ROWS, ids=lambda row: row[0][:30])
-def test_no_cell_is_empty_and_the_last_two_hold_functions_and_tests_only(row):
+def test_no_cell_is_empty_and_references_are_well_formed(row):
     assert len(row) == (4 if row in NUMBERED else 3)
     assert all(row)
     assert row[-2] == ', '.join(
@@ -77,7 +77,7 @@ def test_every_function_named_exists(path, name, starred):
 
 
 @pytest.mark.parametrize('row', NUMBERED, ids=lambda row: row[0])
-def test_the_docstring_of_each_function_its_class_or_module_carries_the_number(row):
+def test_the_docstring_contains_the_equation_number(row):
     """A range such as (16)-(19) carries its ends only: a search for what is between finds none."""
     for path, name, _ in _named(row):
         module = _module(path)
@@ -89,7 +89,7 @@ def test_the_docstring_of_each_function_its_class_or_module_carries_the_number(r
         assert any(re.search(number, text) for text in texts if text), f'{path}::{name}'
 
 
-def test_a_search_for_a_number_finds_a_docstring_that_is_not_only_a_module_s():
+def test_each_number_is_in_a_docstring_below_module_level():
     for row in NUMBERED:
         own = [reduce(getattr, name.split('.'), _module(path)) for path, name, _ in _named(row)]
         assert any(row[0] in one.__doc__ for one in own), row[0]
@@ -120,7 +120,7 @@ def _imported(path):
     return {file for file in found if (ROOT / file).exists()}
 
 
-def test_a_star_marks_exactly_the_functions_that_nothing_running_calls():
+def test_a_star_marks_exactly_the_unused_functions():
     marked = {(path, name) for path, name, star in FUNCTIONS if star}
     plain = {(path, name) for path, name, star in FUNCTIONS if not star}
     assert not marked & plain
@@ -159,14 +159,14 @@ def _is_read(node):
     return isinstance(node.ctx, ast.Load)
 
 
-def test_the_page_of_settings_is_up_to_date():
+def test_the_page_of_parameters_is_up_to_date():
     assert (ROOT / 'docs' / 'settings.md').read_text() == parameters_page(), (
         'docs/settings.md is out of date: run '
         '`.venv/bin/python -m t3mpc_ros.nodes.node_parameters > docs/settings.md`'
     )
 
 
-def test_every_fault_of_the_boards_is_explained_with_its_usual_value():
+def test_every_fault_of_the_emulator_is_documented():
     page = (ROOT / 'docs' / 'emulator.md').read_text()
     rows = dict(re.findall(r'^\| `(\w+)` \| (.*) \| [^|]* \|$', page, re.MULTILINE))
     assert list(rows) == [kind.name for kind in FAULT_KINDS]

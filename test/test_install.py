@@ -164,7 +164,7 @@ def copied(build):
     return build()
 
 
-def test_a_workspace_holds_everything_ros_looks_for(tree):
+def test_a_workspace_contains_all_files_that_ros_needs(tree):
     assert (tree.prefix / 'share/ament_index/resource_index/packages/t3mpc_ros').is_file()
     executables = {path.name for path in (tree.prefix / 'lib' / 't3mpc_ros').iterdir()}
     assert executables == EXECUTABLES == {*NODES, 't3mpc'}
@@ -179,7 +179,7 @@ def test_a_workspace_holds_everything_ros_looks_for(tree):
         assert path.resolve().is_relative_to(tree.source.resolve()) == tree.symlinked
 
 
-def test_a_sourced_workspace_runs_its_own_code_and_all_of_it(tree):
+def test_a_sourced_workspace_runs_its_own_complete_code(tree):
     """``packages=[name]`` in setup.py would drop every room, and .venv would hide that."""
     code = 'import t3mpc_ros; print(t3mpc_ros.__path__[0])'
     said = subprocess.check_output(
@@ -196,7 +196,7 @@ def test_a_sourced_workspace_runs_its_own_code_and_all_of_it(tree):
 
 
 @pytest.mark.slow
-def test_every_installed_node_gets_ready_and_ends_with_0(tree, graph):
+def test_every_installed_node_starts_and_exits_with_0(tree, graph):
     for name in NODES:
         with tree.start(name) as node:
             node.wait_ready()
@@ -276,7 +276,7 @@ def test_each_yaml_reaches_its_node_with_and_without_a_namespace(name, copied, r
         reader.destroy_node()
 
 
-def test_every_yaml_is_tried():
+def test_every_yaml_is_tested():
     assert {path.stem for path in (ROOT / 'config').glob('*.yaml')} == set(CHANGED)
 
 
@@ -427,7 +427,7 @@ def test_run_sets_up_once_and_passes_arguments_on(checkout):
 
 
 @pytest.mark.parametrize('arguments', [(), ('t3mpcs',), ('.',), ('../t3mpc',)])
-def test_run_without_a_known_name_lists_the_names_and_exits_with_2(arguments, checkout):
+def test_run_with_an_unknown_name_lists_the_names(arguments, checkout):
     checkout.run('t3mpc')
     told = checkout.run(*arguments)
     assert told.returncode == 2
@@ -439,7 +439,7 @@ def test_run_without_a_known_name_lists_the_names_and_exits_with_2(arguments, ch
     'file',
     ['requirements.txt', 'requirements-colcon.txt', 'setup.py', 'config/fastdds_loopback.xml'],
 )
-def test_a_stale_environment_is_brought_up_to_date(file, checkout):
+def test_a_stale_environment_is_updated(file, checkout):
     checkout.run('t3mpc')
     checkout.done()
     with (checkout.root / file).open('a') as text:
@@ -450,13 +450,13 @@ def test_a_stale_environment_is_brought_up_to_date(file, checkout):
     assert checkout.done() == []
 
 
-def test_compiled_files_beside_the_launch_file_do_no_harm(checkout):
+def test_compiled_files_beside_the_launch_file_are_ignored(checkout):
     """A folder launch/__pycache__ once ended every script without a word."""
     (checkout.root / 'launch' / '__pycache__').mkdir()
     assert checkout.run('t3mpc').returncode == 0
 
 
-def test_a_moved_checkout_or_another_python_gets_a_new_environment(checkout, tmp_path):
+def test_a_moved_checkout_or_new_python_gets_a_new_environment(checkout, tmp_path):
     checkout.run('t3mpc')
     checkout.root = checkout.root.rename(tmp_path / 'moved')
     checkout.done()
@@ -478,7 +478,7 @@ def test_two_scripts_at_once_set_up_once(checkout):
     assert checkout.done() == SET_UP
 
 
-def test_a_python_that_is_too_old_is_named_with_a_remedy(checkout):
+def test_a_python_that_is_too_old_is_an_error_with_a_remedy(checkout):
     checkout.python(checkout.bin, '3.9.2')
     told = checkout.run('t3mpc')
     assert told.returncode == 1
@@ -488,7 +488,7 @@ def test_a_python_that_is_too_old_is_named_with_a_remedy(checkout):
 
 
 @pytest.mark.parametrize('version, named', [('3.9.2', 'Python 3.9.2'), (None, 'not found')])
-def test_a_python_that_was_asked_for_is_not_silently_replaced(version, named, checkout, tmp_path):
+def test_an_unusable_requested_python_is_an_error(version, named, checkout, tmp_path):
     asked = tmp_path / 'asked' / 'python3'
     if version:
         checkout.python(asked.parent, version)
@@ -500,7 +500,7 @@ def test_a_python_that_was_asked_for_is_not_silently_replaced(version, named, ch
     assert checkout.done() == []
 
 
-def test_an_interrupted_set_up_is_repaired_by_the_next_run(checkout):
+def test_an_interrupted_setup_is_repaired_by_the_next_run(checkout):
     (checkout.notes.parent / 'no_index').touch()
     told = checkout.run('t3mpc')
     assert told.returncode == 1
@@ -514,7 +514,7 @@ def test_an_interrupted_set_up_is_repaired_by_the_next_run(checkout):
     assert checkout.done() == ['pip', 'setup', 'compile']
 
 
-def test_a_failed_renewal_does_not_pass_for_an_environment(checkout):
+def test_a_failed_update_does_not_count_as_an_environment(checkout):
     checkout.run('t3mpc')
     with (checkout.root / 'requirements.txt').open('a') as text:
         text.write('# changed\n')
@@ -553,7 +553,7 @@ def test_an_unreachable_index_is_an_error_with_a_remedy(tmp_path):
         assert not (root / '.venv' / 'stamp').exists()
 
 
-def test_a_sourced_ros_is_kept_out_of_the_local_environment(checkout, tmp_path):
+def test_a_sourced_ros_does_not_enter_the_local_environment(checkout, tmp_path):
     """Modules of a system ROS for another Python, and its libraries, once came first."""
     libraries = tmp_path / 'ros' / 'lib'
     libraries.mkdir(parents=True)
@@ -580,7 +580,7 @@ def test_a_sourced_ros_is_kept_out_of_the_local_environment(checkout, tmp_path):
 @pytest.mark.skipif(
     Path(sys.prefix) != ROOT / '.venv', reason='not run through scripts/check: no .venv in use'
 )
-def test_run_starts_the_real_lab():
+def test_run_starts_the_real_program():
     run = [ROOT / 'scripts' / 'run']
     done = subprocess.run(
         [*run, 't3mpc', 'exponents', '--duration', '5'], capture_output=True, text=True

@@ -21,56 +21,62 @@ from t3mpc_ros.stop_signal import StopSignal
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the emulator until it is told to stop; return the exit code."""
+    """Run the emulator until a stop signal; return the exit code."""
     options = _parser().parse_args(arguments)
     try:
         key = read_key(options.key) if options.key is not None else b''
         emulator = Emulator(_parameters(options), key, options.seed)
         if options.loss:
-            emulator.play(Fault('loss', 0.0, math.inf, options.loss))
+            emulator.schedule_fault(Fault('loss', 0.0, math.inf, options.loss))
         for text in options.fault:
-            emulator.play(parse_fault(text))
+            emulator.schedule_fault(parse_fault(text))
     except (FaultError, KeyFileError, ParameterError, WorldError) as error:
-        print(f't3mpc emulator: {error}', file=sys.stderr)
-        return 2
+        return _fail(error)
     with StopSignal() as stop:
-        print('t3mpc emulator: getting ready', flush=True)
+        _print('starting')
         emulator.plant.warm_up()
-        with ExitStack() as ends:
+        with ExitStack() as ports:
             try:
                 port = PtyPort(options.link)
-                ends.callback(port.close)
-                cable = None
+                ports.callback(port.close)
+                console_port = None
                 if options.robot_link is not None:
-                    cable = PtyPort(options.robot_link)
-                    ends.callback(cable.close)
+                    console_port = PtyPort(options.robot_link)
+                    ports.callback(console_port.close)
             except PtyPortError as error:
-                print(f't3mpc emulator: {error}', file=sys.stderr)
-                return 2
-            secured = 'signed commands only' if key else 'no key'
-            usb = f", the robot's own USB at {options.robot_link.absolute()}" if cable else ''
-            print(
-                f't3mpc emulator: dongle and robot at {options.link.absolute()}{usb} ({secured}); '
-                f'stop with Ctrl-C or kill {os.getpid()}',
-                flush=True,
+                return _fail(error)
+            console = f', robot console at {options.robot_link.absolute()}' if console_port else ''
+            security = 'signed commands only' if key else 'no key'
+            _print(
+                f'dongle and robot at {options.link.absolute()}{console} ({security}); '
+                f'stop with Ctrl-C or kill {os.getpid()}'
             )
-            watch = StopTimeMonitor(emulator)
+            monitor = StopTimeMonitor(emulator)
+
+            def report() -> None:
+                if text := monitor.poll():
+                    _print(text)
+
             serve(
                 emulator,
                 port,
-                options.speed,
+                options.real_time_factor,
                 stop,
                 options.restart_on_open,
-                cable,
-                lambda: _tell(watch.news()),
+                console_port,
+                report,
             )
-    print('t3mpc emulator: stopped', flush=True)
+    _print('stopped')
     return 0
 
 
-def _tell(news: str) -> None:
-    if news:
-        print(f't3mpc emulator: {news}', flush=True)
+def _print(text: str) -> None:
+    print(f't3mpc emulator: {text}', flush=True)
+
+
+def _fail(error: Exception) -> int:
+    print(f't3mpc emulator: {error}', file=sys.stderr)
+    return 2
 
 
 def _parameters(options: argparse.Namespace) -> EmulatorParameters:
@@ -87,43 +93,46 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser = argparse.ArgumentParser(
         prog='t3mpc emulator',
-        description='Dongle and robot behind a serial port, for the radio bridge to drive.',
-        epilog=f'faults, with the value that is meant when none is given:\n{faults}',
+        description='Emulated dongle and robot board behind a serial port, for radio_bridge.',
+        epilog=f'faults, with the default value in parentheses:\n{faults}',
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add('--link', type=Path, required=True, help='path of the port: a symbolic link is put there')
-    add('--robot-link', type=Path, help="the same for the USB of the robot's own board: its key")
-    add('--world', default='', help='world to drive in; empty: an endless plain')
+    add('--link', type=Path, required=True, help='path of the port, made as a symbolic link')
+    add('--robot-link', type=Path, help='path of the USB console of the robot board')
+    add('--world', default='', help='world around the robot; default: no obstacles')
     add(
-        '--loss', type=bounded_float(0.0, 1.0), default=0.0, help='share of lost packets, each way'
+        '--loss',
+        type=bounded_float(0.0, 1.0),
+        default=0.0,
+        help='share of lost radio packets, each way',
     )
     add(
         '--fault',
         action='append',
         default=[],
         metavar='NAME:AT[:FOR[:VALUE]]',
-        help='what goes wrong when (s), for how long (s); more than once',
+        help='fault with start (s), duration (s) and value; repeatable',
     )
-    add('--key', type=Path, help='file with the key of the robot; without: an open link')
-    add('--seed', type=int, default=1, help='of everything that is drawn')
+    add('--key', type=Path, help='file with the key of the robot; default: open link')
+    add('--seed', type=int, default=1, help='seed of all random generators')
     add(
-        '--speed',
+        '--real-time-factor',
         type=bounded_float(0.01, 100.0),
         default=1.0,
-        help='seconds of the robot in a second',
+        help='virtual seconds per second',
     )
     add(
         '--restart-on-open',
         action='store_true',
-        help='opening a port restarts its board, as it does with many',
+        help='opening a port reboots its board, as on most boards',
     )
     add(
         '--set',
         action='append',
         default=[],
         metavar='NAME=VALUE',
-        help='a setting, twin.load_change or robot_clock say; more than once',
+        help='parameter, such as robot_clock_error or twin.load_change; repeatable',
     )
     return parser
 

@@ -20,55 +20,56 @@ from t3mpc_ros.radio.protocol.frames import Command
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 
 _RATES = ('250k', '1M', '2M')
-_POWER_ON, _EXTERNAL, _BROWN_OUT = 1, 2, 4
-"""Causes of a reset, as the MCUSR of an AVR has them."""
-_BOOT_LOADER_NS = NANOSECONDS
-"""Of the robot's board."""
+_EXTERNAL_RESET, _BROWN_OUT_RESET = 2, 4
+"""Reset flags as in the MCUSR register of an AVR."""
+_ROBOT_BOOT_LOADER_NS = NANOSECONDS
 
 
 @dataclass(frozen=True)
 class EmulatorParameters(Parameters):
-    """What can be set of dongle, radio and robot."""
+    """Parameters of dongle, radio, robot board and plant."""
 
     twin: DigitalTwinParameters = group(DigitalTwinParameters)
-    robot_clock: float = parameter(
+    robot_clock_error: float = parameter(
         0.0,
-        "by how much the robot's clock is fast; the resonator of a small board may be off by this",
+        'relative error of the clock of the robot board',
         low=-0.02,
         high=0.02,
         source='ceramic resonators: 0.5 %',
     )
-    dongle_start: float = parameter(
-        1.5, 'how long the boot loader of the dongle takes', unit='s', low=0.0, high=10.0
+    dongle_boot_time: float = parameter(
+        1.5, 'duration of the boot loader of the dongle', unit='s', low=0.0, high=10.0
     )
-    channel: int = parameter(82, 'of the robot: 2400 MHz plus this', unit='MHz', low=0, high=125)
-    rate: str = parameter('1M', 'bits per second of the robot in the air', choices=_RATES)
+    channel: int = parameter(
+        82, 'radio channel of the robot, offset from 2400 MHz', unit='MHz', low=0, high=125
+    )
+    rate: str = parameter('1M', 'bit rate of the radio of the robot', choices=_RATES)
 
     def check_consistency(self) -> None:
-        """Raise ParameterError when the robot would not be the one the board is made for."""
+        """Raise ParameterError if the plant does not suit the board."""
         twin = self.twin
         if twin.drive.kind != 'stepper':
             raise ParameterError(f'twin.drive.kind must be stepper: got {twin.drive.kind}')
         if twin.motor.microsteps != 16 or twin.motor.full_steps != 200:
             raise ParameterError(
-                'twin.motor must have 16 microsteps and 200 full steps, which is what the board '
-                f'starts with: got {twin.motor.microsteps} and {twin.motor.full_steps}'
+                'twin.motor must have 16 microsteps and 200 full steps, the values with which the '
+                f'board boots: got {twin.motor.microsteps} and {twin.motor.full_steps}'
             )
 
 
 class Emulator:
-    """A dongle on a serial line, and a robot that hears it, in virtual time.
+    """A dongle on a serial line and a robot in its radio range, in virtual time.
 
     Parameters
     ----------
-    settings
-        Fixed for its life.
+    parameters
+        Constant during the life of the emulator.
     key
-        Of the robot, 16 bytes; empty for an open link.
+        Key of the robot, 16 bytes; empty for an open link.
     seed
-        Of all dice but those of the twin.
+        Seed of all random generators except those of the plant.
     now_ns
-        The start: both boards are ready, the robot stands.
+        Start of virtual time: both boards have booted, the robot is at rest.
     """
 
     def __init__(
@@ -82,258 +83,262 @@ class Emulator:
         self._start_ns = now_ns
         self._events = EventQueue(now_ns)
         self.faults = FaultInjection(lambda: self._events.now_ns, seed)
-        self._rate = 1.0 + parameters.robot_clock
-        self.plant = Plant(parameters.twin, self._rate)
+        self._clock_rate = 1.0 + parameters.robot_clock_error
+        self.plant = Plant(parameters.twin, self._clock_rate)
         nonces = random.Random(f'nonces {seed}')
         self._channel = RadioChannel(
             self._events,
             RadioParameters(channel=parameters.channel, rate=_RATES.index(parameters.rate)),
-            self._wake_robot,
-            lambda payload: self.board.packet(payload),
+            self._advance_robot,
+            lambda payload: self.board.receive(payload),
             self.faults,
             random.Random(f'air {seed}'),
         )
         settle_us = SETTLE_SLOW_US if parameters.rate == '250k' else SETTLE_US
         self.board = RobotBoard(self.plant, key, nonces.randbytes, self._channel.load, settle_us)
         self._boot_ns = now_ns
-        self._away = False
-        """The robot has no power."""
+        self._robot_off = False
+        """Whether the robot board is without power or in its boot loader."""
         self.dongle = Dongle(
             self._events, self._channel, self._chip_ok, lambda data: self._to_host.send(data)
         )
         self._from_host = SerialLine(self._events, self.faults, self.dongle.feed)
-        self._to_host = SerialLine(self._events, self.faults, self._arrive)
-        self._arrived: list[tuple[int, bytes]] = []
-        # The faults of the line are those of the dongle's.
-        sound = FaultInjection(lambda: self._events.now_ns, seed)
-        self._from_cable = SerialLine(self._events, sound, self._tell_console)
-        self._to_cable = SerialLine(self._events, sound, self._arrive_by_cable)
-        self._said: list[tuple[int, bytes]] = []
-        self.board.console.reply = self._to_cable.send
+        self._to_host = SerialLine(self._events, self.faults, self._deliver_to_host)
+        self._host_input: list[tuple[int, bytes]] = []
+        # Faults of the serial line act on the dongle's line, not on the console's.
+        no_faults = FaultInjection(lambda: self._events.now_ns, seed)
+        self._to_console = SerialLine(self._events, no_faults, self._deliver_to_console)
+        self._from_console = SerialLine(self._events, no_faults, self._deliver_from_console)
+        self._console_output: list[tuple[int, bytes]] = []
+        self.board.console.reply = self._from_console.send
         self.port_open = True
-        """Whether there is a dongle to open."""
-        self.port_name = 0
-        """Counts up when the device comes back under another name."""
+        """Whether the dongle is plugged in."""
+        self.port_number = 0
+        """Number of the device; increments when the dongle changes its device name."""
 
     @property
     def now_ns(self) -> int:
-        """Up to when everything has happened."""
+        """Virtual time up to which all events have run."""
         return self._events.now_ns
 
     @property
     def next_ns(self) -> int | None:
-        """When something happens next; None: nothing will."""
+        """Time of the next event; None: no event is scheduled."""
         return self._events.next_ns
 
     @property
     def powered(self) -> bool:
-        """Whether the robot is on."""
-        return not self._away
+        """Whether the robot board runs."""
+        return not self._robot_off
 
-    # -- the line ---------------------------------------------------------------------------------
+    # -- serial line ------------------------------------------------------------------------------
 
     def feed(self, data: bytes, now_ns: int) -> None:
-        """Take what the host writes at this time."""
+        """Send bytes from the host to the dongle at this time."""
         self._events.run_to(now_ns)
         if self.port_open:
             self._from_host.send(data)
 
     def run_to(self, now_ns: int) -> list[tuple[int, bytes]]:
-        """Return what has come to the host by then, each piece with its time of arrival."""
+        """Advance to a time; return the blocks that reached the host, with arrival times."""
         self._events.run_to(now_ns)
-        self._wake_robot()
-        arrived, self._arrived = self._arrived, []
-        return arrived
+        self._advance_robot()
+        received, self._host_input = self._host_input, []
+        return received
 
-    def _arrive(self, data: bytes) -> None:
+    def _deliver_to_host(self, data: bytes) -> None:
         if self.port_open:
-            self._arrived.append((self._events.now_ns, data))
+            self._host_input.append((self._events.now_ns, data))
 
-    # -- the USB of the robot ---------------------------------------------------------------------
+    # -- USB console of the robot board -----------------------------------------------------------
 
     def feed_console(self, data: bytes, now_ns: int) -> None:
-        """Take what somebody writes to the robot's own USB at this time."""
+        """Send bytes to the USB console of the robot board at this time."""
         self._events.run_to(now_ns)
-        self._from_cable.send(data)
+        self._to_console.send(data)
 
     def take_console(self) -> list[tuple[int, bytes]]:
-        """Return what has come from the robot's own USB by now, each piece with its time."""
-        said, self._said = self._said, []
-        return said
+        """Return the blocks that the console has sent, with arrival times."""
+        sent, self._console_output = self._console_output, []
+        return sent
 
     def restart_robot(self) -> None:
-        """Start the robot anew, as opening its own port does to many boards."""
-        if not self._away:
-            self._from_cable.clear()
-            self._to_cable.clear()
+        """Reboot the robot board, as most boards do when their port is opened."""
+        if not self._robot_off:
+            self._to_console.clear()
+            self._from_console.clear()
             self._cut_power()
-            self._events.at(
-                self._events.now_ns + _BOOT_LOADER_NS, lambda: self._boot_robot(_EXTERNAL)
+            self._events.schedule(
+                self._events.now_ns + _ROBOT_BOOT_LOADER_NS,
+                lambda: self._boot_robot(_EXTERNAL_RESET),
             )
 
-    def _tell_console(self, data: bytes) -> None:
-        if not self._wake_robot():
+    def _deliver_to_console(self, data: bytes) -> None:
+        if not self._advance_robot():
             return
         self.board.console.feed(data)
-        if (written_us := self.board.slot.due_us) is not None:
-            # A loop of the board later, by a clock that may be slow.
-            later_us = 1.02 * (written_us - self.board.now_us) + LOOP_US
-            self._events.after_us(later_us, lambda: _ignore(self._wake_robot()))
+        if (done_us := self.board.key_store.done_us) is not None:
+            # One pass of the main loop later, on a clock that may be slow.
+            later_us = 1.02 * (done_us - self.board.now_us) + LOOP_US
 
-    def _arrive_by_cable(self, data: bytes) -> None:
-        self._said.append((self._events.now_ns, data))
+            def advance() -> None:
+                self._advance_robot()
 
-    # -- what goes wrong --------------------------------------------------------------------------
+            self._events.schedule_after(later_us, advance)
 
-    def play(self, fault: Fault) -> None:
-        """Let a fault happen; its time counts from the start of the emulator.
+    def _deliver_from_console(self, data: bytes) -> None:
+        self._console_output.append((self._events.now_ns, data))
+
+    # -- faults -----------------------------------------------------------------------------------
+
+    def schedule_fault(self, fault: Fault) -> None:
+        """Schedule a fault; its start counts from the start of the emulator.
 
         Raises
         ------
         FaultError
-            There is no such fault, or a number is out of range.
+            The kind does not exist, or a number is out of range.
         """
-        self._play(fault, self._start_ns)
+        self._schedule_fault(fault, self._start_ns)
 
     def inject(self, name: str, duration: float = math.nan, value: float = math.nan) -> None:
-        """Let a fault begin now."""
-        self._play(Fault(name, 0.0, duration, value), self._events.now_ns)
+        """Begin a fault now."""
+        self._schedule_fault(Fault(name, 0.0, duration, value), self._events.now_ns)
         self._events.run_to(self._events.now_ns)
 
-    def end(self, name: str) -> None:
-        """End a fault now, however long it was meant to last."""
+    def end_fault(self, name: str) -> None:
+        """End all faults of a kind now."""
         self.faults.clear(name)
         self._effects(name)[1]()
 
-    def _play(self, fault: Fault, start_ns: int) -> None:
-        span = self.faults.add(fault, start_ns)
-        begins, ends = self._effects(fault.name)
-        self._events.at(span.start_ns, begins)
-        if math.isfinite(span.end_ns):
-            self._events.at(round(span.end_ns), ends)
+    def _schedule_fault(self, fault: Fault, start_ns: int) -> None:
+        interval = self.faults.add(fault, start_ns)
+        begin, end = self._effects(fault.name)
+        self._events.schedule(interval.start_ns, begin)
+        if math.isfinite(interval.end_ns):
+            self._events.schedule(round(interval.end_ns), end)
 
     def _effects(self, name: str) -> tuple[Callable[[], None], Callable[[], None]]:
-        """Return what the begin and the end of a fault do at once."""
+        """Return the actions at the begin and at the end of a fault."""
         effects = {
-            'robot_reset': (self._cut_power, lambda: self._boot_robot(_EXTERNAL)),
-            'imu_absent': (lambda: self._imu(True), lambda: self._imu(False)),
-            'button': (lambda: self._press(True), lambda: self._press(False)),
-            'dongle_reset': (self.restart_dongle, _nothing),
-            'close_port': (self._pull_out, self._plug_in),
-            'move_link': (self._move_link, _nothing),
+            'robot_reset': (self._cut_power, lambda: self._boot_robot(_EXTERNAL_RESET)),
+            'imu_absent': (lambda: self._set_imu(False), lambda: self._set_imu(True)),
+            'button': (lambda: self._press_button(True), lambda: self._press_button(False)),
+            'dongle_reset': (self.restart_dongle, _no_action),
+            'close_port': (self._unplug, self._plug_in),
+            'move_link': (self._change_port, _no_action),
         }
-        return effects.get(name, (_nothing, _nothing))
+        return effects.get(name, (_no_action, _no_action))
 
     def restart_dongle(self) -> None:
-        """Start the dongle anew, as opening its port does to many boards."""
+        """Reboot the dongle, as most boards do when their port is opened."""
         self._from_host.clear()
         self._to_host.clear()
-        self.dongle.boot(_EXTERNAL, round(self._parameters.dongle_start * NANOSECONDS))
+        self.dongle.boot(_EXTERNAL_RESET, round(self._parameters.dongle_boot_time * NANOSECONDS))
 
-    def _pull_out(self) -> None:
+    def _unplug(self) -> None:
         self.port_open = False
-        self._arrived.clear()
+        self._host_input.clear()
         self.restart_dongle()
 
     def _plug_in(self) -> None:
         self.port_open = True
         self.restart_dongle()
 
-    def _move_link(self) -> None:
-        self.port_name += 1
+    def _change_port(self) -> None:
+        self.port_number += 1
         self.restart_dongle()
 
-    def _imu(self, absent: bool) -> None:
-        self._wake_robot()
-        self.plant.imu_absent = absent
+    def _set_imu(self, present: bool) -> None:
+        self._advance_robot()
+        self.plant.imu_absent = not present
 
-    def _press(self, pressed: bool) -> None:
-        self._wake_robot()
-        self.board.press(pressed)
+    def _press_button(self, pressed: bool) -> None:
+        self._advance_robot()
+        self.board.press_button(pressed)
 
     def _chip_ok(self) -> bool:
         return not self.faults.active('radio_dead')
 
-    # -- the robot --------------------------------------------------------------------------------
+    # -- robot ------------------------------------------------------------------------------------
 
-    def _wake_robot(self) -> bool:
-        """Bring the robot to this instant; return whether it listens."""
+    def _advance_robot(self) -> bool:
+        """Advance the robot to now; return whether its board runs."""
         elapsed = self._events.now_ns - self._boot_ns
-        time_us = int(elapsed * self._rate) // MICROSECOND
-        if self._away:
+        time_us = int(elapsed * self._clock_rate) // MICROSECOND
+        if self._robot_off:
             self.plant.run(time_us)
             self._boot_ns = self._events.now_ns
             return False
         self.board.run_to(time_us)
-        if self.plant.collapsed:
+        if self.plant.undervoltage:
             self._lose_power()
-            away = round(self._parameters.twin.boot_time * NANOSECONDS)
-            self._events.at(self._events.now_ns + away, lambda: self._boot_robot(_BROWN_OUT))
+            self._events.schedule(
+                self._restart_time_ns(), lambda: self._boot_robot(_BROWN_OUT_RESET)
+            )
             return False
         return True
 
+    def _restart_time_ns(self) -> int:
+        return self._events.now_ns + round(self._parameters.twin.boot_time * NANOSECONDS)
+
     def _cut_power(self) -> None:
-        self._wake_robot()
+        self._advance_robot()
         self._lose_power()
 
     def _lose_power(self) -> None:
-        self._away = True
+        self._robot_off = True
         self._boot_ns = self._events.now_ns
         self._channel.clear()
-        self.plant.turn(0, 0)
-        self.plant.power(False)
+        self.plant.set_speeds(0, 0)
+        self.plant.set_power(False)
 
     def _boot_robot(self, cause: int) -> None:
-        if not self._away:
+        if not self._robot_off:
             return
-        self._wake_robot()
-        if self.plant.collapsed:
-            again = self._events.now_ns + round(self._parameters.twin.boot_time * NANOSECONDS)
-            self._events.at(again, lambda: self._boot_robot(cause))
+        self._advance_robot()
+        if self.plant.undervoltage:
+            self._events.schedule(self._restart_time_ns(), lambda: self._boot_robot(cause))
             return
-        self._away = False
+        self._robot_off = False
         self._boot_ns = self._events.now_ns
         self.board.boot(cause)
 
 
-def _ignore(awake: bool) -> None:
-    """Take no notice of whether the robot is awake."""
-
-
-def _nothing() -> None:
-    """Do nothing: most faults are looked up when they matter."""
+def _no_action() -> None:
+    """Do nothing: the components query most faults while they are active."""
 
 
 class StopTimeMonitor:
-    """Tells each stop but those for which a speed of zero was commanded.
+    """Measures the time from the last command to standstill, unless standstill was commanded.
 
-    So after silence, a reset, an emergency stop, and when a host takes its leave.
+    Stops after silence, reset, emergency stop and shutdown of the host are measured.
 
     Parameters
     ----------
     emulator
-        Its board tells of each command that it follows.
+        The monitor takes over ``on_command`` of its board.
     """
 
     def __init__(self, emulator: Emulator) -> None:
         self._plant = emulator.plant
         self._command: Command | None = None
-        self._followed = 0.0
-        emulator.board.followed = self._follow
+        self._command_time = 0.0
+        emulator.board.on_command = self._on_command
 
-    def news(self) -> str:
-        """Return a line when the wheels have come to rest since the last call, else nothing."""
+    def poll(self) -> str:
+        """Return a report if the wheels have stopped since the last call, else an empty text."""
         command, stopped = self._command, self._plant.stopped_at
-        if command is None or stopped is None or stopped < self._followed:
+        if command is None or stopped is None or stopped < self._command_time:
             return ''
         self._command = None
         if not command.left and not command.right:
             return ''
         right, left = command.right / 1000.0, command.left / 1000.0
         return (
-            f'wheels at rest {stopped - self._followed:.3f} s after the last command '
+            f'wheels at rest {stopped - self._command_time:.3f} s after the last command '
             f'(right {right:g}, left {left:g} rad/s)'
         )
 
-    def _follow(self, now_us: int, command: Command) -> None:
-        self._command, self._followed = command, self._plant.elapsed
+    def _on_command(self, now_us: int, command: Command) -> None:
+        self._command, self._command_time = command, self._plant.elapsed

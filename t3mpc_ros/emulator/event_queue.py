@@ -13,34 +13,34 @@ Callback = Callable[[], None]
 
 
 class EventQueue:
-    """Does each deed at its time, in order; those of one time in the order they were noted."""
+    """Runs each callback at its time; callbacks of equal time run in the order of scheduling."""
 
     def __init__(self, now_ns: int) -> None:
         self._now_ns = now_ns
-        self._deeds: list[tuple[int, int, Callback]] = []
+        self._events: list[tuple[int, int, Callback]] = []
         self._numbers = count()
 
     @property
     def now_ns(self) -> int:
-        """Time of the deed that is being done, or up to which all are."""
+        """Time of the running callback, or the time up to which all callbacks have run."""
         return self._now_ns
 
     @property
     def next_ns(self) -> int | None:
-        """When the next deed is due; None if there is none."""
-        return self._deeds[0][0] if self._deeds else None
+        """Time of the next callback; None if the queue is empty."""
+        return self._events[0][0] if self._events else None
 
-    def at(self, time_ns: int, deed: Callback) -> None:
-        """Note a deed; one that should have been done already is done next."""
-        heapq.heappush(self._deeds, (max(time_ns, self._now_ns), next(self._numbers), deed))
+    def schedule(self, time_ns: int, callback: Callback) -> None:
+        """Schedule a callback; a time in the past counts as now."""
+        heapq.heappush(self._events, (max(time_ns, self._now_ns), next(self._numbers), callback))
 
-    def after_us(self, delay_us: float, deed: Callback) -> None:
-        """Note a deed for so many microseconds from now."""
-        self.at(self._now_ns + round(delay_us * MICROSECOND), deed)
+    def schedule_after(self, delay_us: float, callback: Callback) -> None:
+        """Schedule a callback ``delay_us`` from now."""
+        self.schedule(self._now_ns + round(delay_us * MICROSECOND), callback)
 
     def run_to(self, now_ns: int) -> None:
-        """Do all that is due by then."""
-        while self._deeds and self._deeds[0][0] <= now_ns:
-            self._now_ns, _, deed = heapq.heappop(self._deeds)
-            deed()
+        """Run all callbacks due by ``now_ns``."""
+        while self._events and self._events[0][0] <= now_ns:
+            self._now_ns, _, callback = heapq.heappop(self._events)
+            callback()
         self._now_ns = max(self._now_ns, now_ns)

@@ -12,75 +12,73 @@ from t3mpc_ros.geometry.types import NANOSECONDS
 
 
 class FaultKind(NamedTuple):
-    """One thing that can go wrong."""
+    """A kind of fault with its default value and duration."""
 
     name: str
     value: float
-    """What is meant when none is given; NaN: it takes no value."""
+    """Default value; NaN: the fault takes no value."""
     high: float
+    """Upper bound of the value; the lower bound is 0."""
     text: str
-    """What it does, and what its value is."""
+    """Effect of the fault and meaning of its value."""
     duration: float = math.inf
-    """s it lasts when nothing else is said"""
+    """Default duration, s."""
 
 
-_NONE = math.nan
-_ONCE = 1e-3
+_NO_VALUE = math.nan
+_INSTANT = 1e-3
+"""s"""
 FAULT_KINDS = (
-    FaultKind('drop_bytes', 0.002, 1.0, 'share of the bytes on the line that vanish'),
-    FaultKind(
-        'flip_bits', 0.002, 1.0, 'share of the bytes on the line of which one bit turns over'
-    ),
-    FaultKind('duplicate_bytes', 0.002, 1.0, 'share of the bytes on the line that come twice'),
-    FaultKind(
-        'insert_bytes', 0.002, 1.0, 'share of the bytes on the line before which one appears'
-    ),
-    FaultKind('split', 0.5, 1.0, 'share of the pieces of data that come in two parts, 2 ms apart'),
-    FaultKind('delay', 0.02, 60.0, 's by which what goes over the line is late'),
-    FaultKind('stall', _NONE, 0.0, 'the line stands still; all comes at once when it is over'),
-    FaultKind('reorder', 0.1, 1.0, 'share of the frames on the line that the next one overtakes'),
-    FaultKind('silence', _NONE, 0.0, 'what either end says over the line is lost'),
-    FaultKind('wrong_version', 0.1, 1.0, 'share of the radio payloads of another version'),
-    FaultKind('loss', 0.1, 1.0, 'share of the packets that are lost, of each direction'),
-    FaultKind('loss_down', 0.1, 1.0, 'the same, to the robot'),
-    FaultKind('loss_up', 0.1, 1.0, 'the same, of its acknowledgements'),
-    FaultKind('jam', _NONE, 0.0, 'nothing gets through the air'),
-    FaultKind('radio_dead', _NONE, 0.0, 'the radio chip of the dongle does not answer'),
-    FaultKind('dongle_reset', _NONE, 0.0, 'the dongle starts anew, and takes 1.5 s for it', _ONCE),
-    FaultKind('robot_reset', _NONE, 0.0, 'the robot has no power, then starts anew', 0.5),
-    FaultKind('imu_absent', _NONE, 0.0, 'the inertial sensor of the robot does not answer'),
-    FaultKind('button', _NONE, 0.0, 'the emergency stop of the robot is pressed'),
-    FaultKind('close_port', _NONE, 0.0, 'the dongle is pulled out, and plugged in again', 1.0),
-    FaultKind('move_link', _NONE, 0.0, 'the dongle comes back under another name', _ONCE),
+    FaultKind('drop_bytes', 0.002, 1.0, 'share of bytes on the serial line that are lost'),
+    FaultKind('flip_bits', 0.002, 1.0, 'share of bytes on the serial line with one bit inverted'),
+    FaultKind('duplicate_bytes', 0.002, 1.0, 'share of bytes on the serial line sent twice'),
+    FaultKind('insert_bytes', 0.002, 1.0, 'random bytes on the serial line per byte sent'),
+    FaultKind('split', 0.5, 1.0, 'share of writes that arrive in two parts, 2 ms apart'),
+    FaultKind('delay', 0.02, 60.0, 'delay of all data on the serial line, s'),
+    FaultKind('stall', _NO_VALUE, 0.0, 'the serial line holds all data until the fault ends'),
+    FaultKind('reorder', 0.1, 1.0, 'share of frames on the serial line sent after the next one'),
+    FaultKind('silence', _NO_VALUE, 0.0, 'all data on the serial line are lost, both ways'),
+    FaultKind('wrong_version', 0.1, 1.0, 'share of radio payloads of another protocol version'),
+    FaultKind('loss', 0.1, 1.0, 'share of lost radio packets, each way'),
+    FaultKind('loss_down', 0.1, 1.0, 'share of lost radio packets to the robot'),
+    FaultKind('loss_up', 0.1, 1.0, 'share of lost acknowledgements from the robot'),
+    FaultKind('jam', _NO_VALUE, 0.0, 'all radio packets are lost'),
+    FaultKind('radio_dead', _NO_VALUE, 0.0, 'the radio chip of the dongle does not respond'),
+    FaultKind('dongle_reset', _NO_VALUE, 0.0, 'the dongle reboots (1.5 s)', _INSTANT),
+    FaultKind('robot_reset', _NO_VALUE, 0.0, 'the robot board loses power, then reboots', 0.5),
+    FaultKind('imu_absent', _NO_VALUE, 0.0, 'the IMU of the robot does not respond'),
+    FaultKind('button', _NO_VALUE, 0.0, 'the emergency stop button of the robot is pressed'),
+    FaultKind('close_port', _NO_VALUE, 0.0, 'the dongle is unplugged, then plugged in again', 1.0),
+    FaultKind('move_link', _NO_VALUE, 0.0, 'the dongle changes its device name', _INSTANT),
 )
 _KIND_OF_NAME = {kind.name: kind for kind in FAULT_KINDS}
 
 
 class FaultError(ValueError):
-    """A fault that cannot be played; the text says what is wrong with it."""
+    """Invalid fault; the text names the field, the bound and the value."""
 
 
 class Fault(NamedTuple):
-    """Something that goes wrong for a time."""
+    """A fault with start, duration and value."""
 
     name: str
     at: float
-    """s after the start"""
+    """Start, s."""
     duration: float = math.nan
-    """s; NaN: the usual one"""
+    """s; NaN: the default of the kind."""
     value: float = math.nan
-    """NaN: the usual one"""
+    """NaN: the default of the kind."""
 
 
 def parse_fault(text: str) -> Fault:
-    """Return the fault that a text like ``jam:5:1.0`` or ``loss:5:inf:0.3`` names.
+    """Return the fault written as ``name:at[:for[:value]]``, ``loss:5:inf:0.3`` for example.
 
-    The numbers are: when (s), for how long (s), and its value.
+    ``at`` (start) and ``for`` (duration) are in seconds.
 
     Raises
     ------
     FaultError
-        There is no such fault, or a number is none.
+        The kind does not exist, a number is malformed or out of range.
     """
     name, *numbers = text.split(':')
     if not 1 <= len(numbers) <= 3:
@@ -88,18 +86,18 @@ def parse_fault(text: str) -> Fault:
     try:
         values = [float(number) for number in numbers]
     except ValueError:
-        raise FaultError(f'fault must have numbers behind its name: got {text!r}') from None
+        raise FaultError(f'fault must have numbers after its name: got {text!r}') from None
     return check_fault(Fault(name, *values))
 
 
 def check_fault(fault: Fault) -> Fault:
-    """Return the fault with its value filled in, or raise FaultError."""
+    """Return the fault with the defaults of its kind filled in, or raise FaultError."""
     name, at, duration, value = fault
     kind = _KIND_OF_NAME.get(name)
     if kind is None:
         near = difflib.get_close_matches(name, _KIND_OF_NAME, n=1)
-        hint = f'; did you mean {near[0]}?' if near else f'; there are {", ".join(_KIND_OF_NAME)}'
-        raise FaultError(f'fault {name!r} does not exist{hint}')
+        hint = f'did you mean {near[0]}?' if near else f'known are {", ".join(_KIND_OF_NAME)}'
+        raise FaultError(f'fault {name!r} does not exist; {hint}')
     if not 0.0 <= at < math.inf:
         raise FaultError(f'{name}: at must be at least 0 s and finite: got {at:g}')
     if math.isnan(duration):
@@ -117,7 +115,7 @@ def check_fault(fault: Fault) -> Fault:
 
 
 class FaultInterval(NamedTuple):
-    """From when to when a fault happens."""
+    """Interval in which a fault is active."""
 
     start_ns: int
     end_ns: float
@@ -125,67 +123,69 @@ class FaultInterval(NamedTuple):
 
 
 class FaultInjection:
-    """Knows what is wrong now, and throws the dice for it.
+    """Schedule of faults: which are active now, and when a random fault occurs.
 
     Parameters
     ----------
     now_ns
-        Tells the time.
+        Returns the virtual time.
     seed
-        Each fault has dice of its own: one more does not shift those of the others.
+        Seed of the random generators. Each kind of fault has its own generator, so faults do not
+        change each other's random sequence.
     """
 
     def __init__(self, now_ns: Callable[[], int], seed: int) -> None:
         self._now_ns = now_ns
-        self._spans: dict[str, list[FaultInterval]] = {kind.name: [] for kind in FAULT_KINDS}
-        self.dice = {kind.name: random.Random(f'{kind.name} {seed}') for kind in FAULT_KINDS}
+        self._intervals: dict[str, list[FaultInterval]] = {kind.name: [] for kind in FAULT_KINDS}
+        self.generators = {kind.name: random.Random(f'{kind.name} {seed}') for kind in FAULT_KINDS}
 
     def add(self, fault: Fault, start_ns: int) -> FaultInterval:
-        """Let a fault happen from ``start_ns`` plus its own time on; return when."""
+        """Add a fault at ``start_ns`` plus its own start; return its interval."""
         fault = check_fault(fault)
         begin = start_ns + round(fault.at * NANOSECONDS)
         end = begin + fault.duration * NANOSECONDS
-        span = FaultInterval(begin, end, fault.value)
-        self._spans[fault.name].append(span)
-        return span
+        interval = FaultInterval(begin, end, fault.value)
+        self._intervals[fault.name].append(interval)
+        return interval
 
     def clear(self, name: str) -> None:
-        """End all faults of a name."""
-        self._spans[name].clear()
+        """Remove all faults of a kind."""
+        self._intervals[name].clear()
 
-    def span(self, name: str) -> FaultInterval | None:
-        """Return the fault of that name that began last of those that happen now."""
-        spans = self._spans[name]
-        if not spans:
+    def interval(self, name: str) -> FaultInterval | None:
+        """Return the interval of the active fault of a kind that began last; None: none."""
+        intervals = self._intervals[name]
+        if not intervals:
             return None
         now = self._now_ns()
-        happening = [span for span in spans if span.start_ns <= now < span.end_ns]
-        return max(happening) if happening else None
+        active = [interval for interval in intervals if interval.start_ns <= now < interval.end_ns]
+        return max(active) if active else None
 
     def active(self, name: str) -> bool:
-        """Return whether a fault happens now."""
-        return self.span(name) is not None
+        """Return whether a fault of a kind is active now."""
+        return self.interval(name) is not None
 
     def value(self, name: str) -> float:
-        """Return the value of a fault, 0 if it does not happen now."""
-        span = self.span(name)
-        return span.value if span is not None else 0.0
+        """Return the value of the active fault of a kind; 0 if none is active."""
+        interval = self.interval(name)
+        return interval.value if interval is not None else 0.0
 
-    def share(self, *names: str) -> float:
-        """Return the share that is lost by several causes that know nothing of each other."""
-        kept = 1.0
+    def combined_probability(self, *names: str) -> float:
+        """Return the probability that at least one of several independent faults occurs."""
+        none_occurs = 1.0
         for name in names:
-            kept *= 1.0 - self.value(name)
-        return 1.0 - kept
+            none_occurs *= 1.0 - self.value(name)
+        return 1.0 - none_occurs
 
     def occurs(self, name: str) -> bool:
-        """Throw the dice of a fault."""
-        share = self.value(name)
-        return share > 0.0 and self.dice[name].random() < share
+        """Decide at random, with the value of the fault as probability, whether it occurs."""
+        probability = self.value(name)
+        return probability > 0.0 and self.generators[name].random() < probability
 
-    def corrupt(self, payload: bytes, name: str) -> bytes:
-        """Return a radio payload, of another version if the fault strikes."""
-        if not payload or not self.occurs(name):
+    def corrupt(self, payload: bytes) -> bytes:
+        """Return a radio payload; with another protocol version if ``wrong_version`` occurs."""
+        if not payload or not self.occurs('wrong_version'):
             return payload
-        version = self.dice[name].choice([number for number in range(16) if number != 1])
+        versions = [number for number in range(16) if number != 1]
+        version = self.generators['wrong_version'].choice(versions)
         return bytes([version << 4 | payload[0] & 0x0F]) + payload[1:]

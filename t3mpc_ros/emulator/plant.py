@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plant of the emulated board: motors, body, world, sensors and battery of the digital twin.
 
-Frames and the board order the wheels left, right; the twin orders them right, left.
+Frames and board have the wheel order left, right; the digital twin has right, left.
 """
 
 from dataclasses import replace
@@ -24,23 +24,24 @@ from t3mpc_ros.simulation.sensors.range_sensor import SimulatedRangeSensors, sen
 from t3mpc_ros.simulation.world import cast_rays, clearance, grip_at, load_world
 
 _SAMPLE_STEPS = 5
-"""Integration steps (1 ms) between two readings of the sensors."""
-_DIVIDER = 20_000
-"""mV at the end of the converter: 5 V behind a divider by four."""
-_CONVERTER = 1024
+"""Integration steps (1 ms) between two samples of the sensors."""
+_ADC_FULL_SCALE = 20_000
+"""Full scale of the battery measurement, mV: 5 V behind a voltage divider by four."""
+_ADC_COUNTS = 1024
 _TEMPERATURE = round((25.0 - 36.53) * 340.0)
-"""Register of the MPU6050 at 25 degrees: data sheet RM-MPU-6000A, 4.18."""
+"""Temperature register of the MPU6050 at 25 °C: register map RM-MPU-6000A, 4.18."""
 
 
 class Plant:
-    """Everything of the robot but its board.
+    """The robot without its board: implements the hardware interface of the board.
 
     Parameters
     ----------
-    settings
-        Of the twin; guard, channel, odometry and slip stop belong to its board and play no part.
+    parameters
+        Of the digital twin. Its command limiter, transport delay, odometry and slip monitor are
+        part of its board and unused here.
     clock_rate
-        How much longer a second of the board's crystal counts: at 1.005 it counts 1.005 s.
+        Rate of the clock of the board: 1.005 means 1.005 s on that clock per second.
     """
 
     def __init__(self, parameters: DigitalTwinParameters, clock_rate: float = 1.0) -> None:
@@ -57,21 +58,21 @@ class Plant:
         self._world = load_world(parameters.world)
         self._mounts = sensor_mounts(parameters.range_sensor)
         self._distances = np.full(len(RANGE_SENSORS), math.inf)
-        self._owed = 0.0
-        """Integration steps that have not been made yet."""
+        self._pending_steps = 0.0
+        """Integration steps still to run, a fraction of one."""
         self._wheels = ZERO_WHEEL_SPEEDS
         self._powered = False
         self._field_work = 0.0
         self._measured_at = 0
         self.elapsed = 0.0
-        """s that have passed, by a true clock."""
+        """True time since the start, s."""
         self.stopped_at: float | None = None
-        """When, by :attr:`elapsed`, the motors last got their last pulse; None while they turn."""
+        """Value of :attr:`elapsed` at the last motor pulse; None while the motors turn."""
         self.imu_absent = False
-        """Whether the inertial sensor does not answer."""
-        self._make_chassis(parameters.motor, None)
+        """Whether the IMU does not respond."""
+        self._build_drivetrain(parameters.motor, None)
 
-    def _make_chassis(self, motor: StepperMotorParameters, before: Drivetrain | None) -> None:
+    def _build_drivetrain(self, motor: StepperMotorParameters, before: Drivetrain | None) -> None:
         parameters = self._parameters
         step, share = parameters.step, parameters.imu.share(parameters.step)
         self._motor = motor
@@ -82,15 +83,15 @@ class Plant:
         self._drivetrain.load(motor, parameters.load_with_faults(parameters.faults))
         self._field_work = 0.0
 
-    # -- for the board ----------------------------------------------------------------------------
+    # -- hardware interface -----------------------------------------------------------------------
 
     def run(self, elapsed_us: int) -> None:
-        """Let time pass, by the board's clock."""
+        """Advance by a time on the clock of the board."""
         seconds = elapsed_us / (1e6 * self._clock_rate)
         self.elapsed += seconds
-        self._owed += seconds / self._drivetrain.step
-        count = math.floor(self._owed + 1e-9)
-        self._owed -= count
+        self._pending_steps += seconds / self._drivetrain.step
+        count = math.floor(self._pending_steps + 1e-9)
+        self._pending_steps -= count
         while count:
             sampled = self._drivetrain.steps_done % _SAMPLE_STEPS
             part = min(count, _SAMPLE_STEPS - sampled)
@@ -100,102 +101,104 @@ class Plant:
             if self._drivetrain.steps_done % _SAMPLE_STEPS == 0:
                 self._measure()
 
-    def turn(self, left: int, right: int) -> None:
-        """Step both motors at these speeds (urad/s) from now on."""
+    def set_speeds(self, left: int, right: int) -> None:
+        """Set the speed of both motors (urad/s)."""
         if left or right:
             self.stopped_at = None
         elif self.stopped_at is None:
             self.stopped_at = self.elapsed
         scale = 1e-6 * self._clock_rate
-        top = self._motor.top_speed
+        limit = self._motor.top_speed
         self._wheels = WheelSpeeds(
-            min(max(scale * right, -top), top), min(max(scale * left, -top), top)
+            min(max(scale * right, -limit), limit), min(max(scale * left, -limit), limit)
         )
 
-    def power(self, on: bool) -> None:
-        """Give power to both drivers, or take it away."""
+    def set_power(self, on: bool) -> None:
+        """Switch the power of both motor drivers."""
         self._powered = on
 
     def boot(self, microsteps: int) -> None:
-        """Start with both counters at zero, for drivers set to so many microsteps.
+        """Reset both counters, and set the drivers to this number of microsteps per step.
 
-        A change of the microsteps finds the wheels standing, whatever they did.
+        A change of the microsteps also stops the wheels.
         """
         if microsteps != self._motor.microsteps:
-            self._make_chassis(replace(self._motor, microsteps=microsteps), self._drivetrain)
+            self._build_drivetrain(replace(self._motor, microsteps=microsteps), self._drivetrain)
         self._drivetrain.restart_board()
         self._imu.restart()
 
     @property
     def counters(self) -> tuple[int, int]:
-        """Pulses issued since the start, left first; within a step as its speed lets expect."""
+        """Pulses issued since boot, left first; interpolated within an integration step."""
         right, left = self._drivetrain.counters
-        part = self._owed * self._drivetrain.step / self._motor.microstep
+        part = self._pending_steps * self._drivetrain.step / self._motor.microstep
         speeds = self._drivetrain.pulse_speeds
-        # Cut, so that the next whole step is never behind.
+        # Truncated, so that the next integration step never counts backwards.
         return left + int(part * speeds.left), right + int(part * speeds.right)
 
     @property
     def registers(self) -> Registers | None:
-        """The newest sample of the inertial sensor; None while it does not answer."""
+        """Newest sample of the IMU; None while it does not respond."""
         if self.imu_absent or self._parameters.faults.gyro_dead:
             return None
-        turn, ahead, aside = self._imu.counts
-        upright = round(GRAVITY / self._parameters.imu.acceleration_step)
-        return Registers(ahead, aside, min(upright, 32767), _TEMPERATURE, 0, 0, turn)
+        gyro_z, accel_x, accel_y = self._imu.counts
+        accel_z = round(GRAVITY / self._parameters.imu.acceleration_step)
+        return Registers(accel_x, accel_y, min(accel_z, 32767), _TEMPERATURE, 0, 0, gyro_z)
 
     @property
     def ranges(self) -> bytes:
-        """A code for each of the eight distance sensors."""
+        """Range code of each of the eight range sensors."""
         if self._parameters.faults.ranges_dead:
             return bytes(len(RANGE_SENSORS))
         return bytes(map(encode_range, self._ranges.readings))
 
     @property
     def battery(self) -> int:
-        """mV, as the converter tells them."""
-        count = int(1000.0 * self._battery.voltage * _CONVERTER / _DIVIDER)
-        return min(count, _CONVERTER - 1) * _DIVIDER // _CONVERTER
+        """Battery voltage as measured by the converter, mV."""
+        count = int(1000.0 * self._battery.voltage * _ADC_COUNTS / _ADC_FULL_SCALE)
+        return min(count, _ADC_COUNTS - 1) * _ADC_FULL_SCALE // _ADC_COUNTS
 
-    # -- for whoever looks on ---------------------------------------------------------------------
+    # -- ground truth -----------------------------------------------------------------------------
 
     @property
     def pulses(self) -> tuple[int, int]:
-        """Pulses issued since the start, left first, at the last integration step."""
+        """Pulses issued since boot, left first, at the last integration step."""
         right, left = self._drivetrain.counters
         return left, right
 
     @property
     def pose(self) -> Pose:
-        """Where the robot truly is."""
+        """True pose of the robot."""
         return self._drivetrain.pose
 
     @property
     def wheels(self) -> WheelSpeeds:
-        """How fast the rotors turn, rad/s."""
+        """Speeds of the rotors, rad/s."""
         return self._drivetrain.wheels
 
     @property
     def lost_steps(self) -> tuple[int, int]:
-        """Full steps the rotors are behind their fields, right first."""
+        """Full steps that the rotors lag behind their fields, right first."""
         return self._drivetrain.lost_steps
 
     @property
-    def collapsed(self) -> bool:
-        """Whether the supply is too low for the board."""
+    def undervoltage(self) -> bool:
+        """Whether the supply voltage is too low for the board."""
         return self._battery.collapsed
 
     def warm_up(self) -> None:
-        """Compile everything now: the first packet must not wait for it."""
-        other = Plant(self._parameters)
-        other.boot(self._motor.microsteps)
-        other.power(True)
-        other.run(50_000)
+        """Compile all kernels, so that the first packet does not wait for it."""
+        plant = Plant(self._parameters)
+        plant.boot(self._motor.microsteps)
+        plant.set_power(True)
+        plant.run(50_000)
         room = load_world('room')
         clearance(0.0, 0.0, room.segments, room.circles)
         grip_at(0.0, 0.0, room.patches)
-        every = np.arange(len(RANGE_SENSORS))
-        cast_rays(0.0, 0.0, 0.0, self._mounts, every, room.segments, room.circles, self._distances)
+        sensors = np.arange(len(RANGE_SENSORS))
+        cast_rays(
+            0.0, 0.0, 0.0, self._mounts, sensors, room.segments, room.circles, self._distances
+        )
         self._distances[:] = math.inf
 
     def _measure(self) -> None:
@@ -203,11 +206,11 @@ class Plant:
         dt = (drivetrain.steps_done - self._measured_at) * drivetrain.step
         self._measured_at = drivetrain.steps_done
         self._imu.measure(drivetrain.filtered, dt, parameters.faults.gyro_bias_jump)
-        self._look(dt)
-        self._feed(dt)
+        self._measure_ranges(dt)
+        self._discharge(dt)
         self._disturbance.draw(dt)
 
-    def _look(self, dt: float) -> None:
+    def _measure_ranges(self, dt: float) -> None:
         due = self._ranges.due(dt)
         world = self._world
         if due and (world.segments.size or world.circles.size):
@@ -217,11 +220,11 @@ class Plant:
         for sensor in due:
             self._ranges.measure(sensor, float(self._distances[sensor]))
 
-    def _feed(self, dt: float) -> None:
-        """Take from the battery what motors and board need."""
+    def _discharge(self, dt: float) -> None:
+        """Discharge the battery by the power of motors and board."""
         done, power = self._drivetrain.field_work, 0.0
         if self._powered:
-            # A phase carries I cos or I sin of the field: two of each heat with I²R a motor.
+            # Phase currents are I cos and I sin of the field angle: copper loss I²R per motor.
             power = 2.0 * self._motor.phase_current**2 * self._motor.resistance
             power += max(0.0, done - self._field_work) / dt
         self._field_work = done

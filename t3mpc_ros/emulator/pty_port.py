@@ -19,27 +19,27 @@ from t3mpc_ros.emulator.emulator import Emulator
 from t3mpc_ros.geometry.types import NANOSECONDS
 
 _POLL_PERIOD_NS = NANOSECONDS // 50
-"""Longest time between two looks at the emulator, and for a client where there is none."""
+"""Longest time between two updates of the emulator, and between two checks for a client."""
 _MAX_SLEEP = 0.1
-"""s: after a longer sleep of this process its time is not made up for."""
+"""Longest interruption of the process that virtual time catches up with, s."""
 
 
 class PtyPortError(Exception):
-    """The path cannot lead to the emulator; the text says why and what to do."""
+    """The symbolic link cannot be made; the text contains the reason and the remedy."""
 
 
 class PtyPort:
-    """A pseudo terminal and the symbolic link that leads to it.
+    """A pseudo-terminal and the symbolic link to it.
 
     Parameters
     ----------
     link
-        Where clients look for the port; a symbolic link that is there already is replaced.
+        Path of the port; an existing symbolic link is replaced.
 
     Raises
     ------
     PtyPortError
-        Something else is there, or the folder cannot be written to.
+        The path exists and is no symbolic link, or its folder is not writable.
     """
 
     def __init__(self, link: Path) -> None:
@@ -49,15 +49,15 @@ class PtyPort:
         self.open()
 
     def open(self) -> None:
-        """Make a new terminal, and let the path lead to it; the old one hangs up afterwards."""
+        """Open a new pseudo-terminal, redirect the link, then hang up the old one."""
         before = self._master
         self._master, slave = pty.openpty()
         try:
-            # Before anybody can open it: a cooked terminal would echo what the host writes.
+            # Before a client can open it: a cooked terminal echoes the input of the client.
             tty.setraw(slave)
             self._target = os.ttyname(slave)
         finally:
-            # While we held it open, we could not see a client leave.
+            # An open slave end would hide that a client closes its own.
             os.close(slave)
         os.set_blocking(self._master, False)
         self._publish()
@@ -65,7 +65,7 @@ class PtyPort:
             os.close(before)
 
     def close(self) -> None:
-        """Hang up, and take the path away if it still leads here."""
+        """Hang up, and remove the link if it still leads to this terminal."""
         with suppress(OSError):
             if os.readlink(self._link) == self._target:
                 self._link.unlink()
@@ -74,7 +74,7 @@ class PtyPort:
             self._master = None
 
     def wait(self, seconds: float) -> bytes | None:
-        """Return what the client has written, at the latest after so long; None: there is none."""
+        """Wait for input; return it, empty on timeout, None if there is no client."""
         if self._master is None:
             time.sleep(seconds)
             return None
@@ -86,12 +86,12 @@ class PtyPort:
         except OSError as error:
             if error.errno != errno.EIO:
                 raise
-            # Nobody has the other end open: the terminal is readable all the time.
+            # EIO: the slave end is closed, and the terminal is always readable.
             time.sleep(max(seconds, 0.0))
             return None
 
     def write(self, data: bytes) -> None:
-        """Send to the client; what it does not read in time is lost, as on a serial line."""
+        """Send to the client; data beyond the buffer are lost, as on a serial line."""
         if self._master is not None:
             with suppress(BlockingIOError):
                 os.write(self._master, data)
@@ -101,7 +101,7 @@ class PtyPort:
         try:
             if link.exists() and not link.is_symlink():
                 raise PtyPortError(f'{link} is no symbolic link: choose another path, or move it')
-            # In one piece: nobody ever finds the path missing.
+            # Atomic: the path exists at any time.
             new = link.with_name(f'{link.name}.{os.getpid()}')
             new.unlink(missing_ok=True)
             new.symlink_to(self._target)
@@ -113,76 +113,78 @@ class PtyPort:
 def serve(
     emulator: Emulator,
     port: PtyPort,
-    speed: float,
+    real_time_factor: float,
     stopped: Callable[[], bool],
-    restarts: bool = False,
-    cable: PtyPort | None = None,
-    look: Callable[[], None] = lambda: None,
+    restart_on_open: bool = False,
+    console_port: PtyPort | None = None,
+    on_update: Callable[[], None] = lambda: None,
 ) -> None:
-    """Let the emulator run on the wall clock until ``stopped()``.
+    """Run the emulator on the wall clock until ``stopped()`` is true.
 
     Parameters
     ----------
     emulator
-        Its time goes on from where it is.
+        Continues from its current virtual time.
     port
-        Where the host is.
-    speed
-        Seconds of the emulator in a second.
+        Port of the dongle.
+    real_time_factor
+        Virtual seconds per second.
     stopped
-        Asked 50 times a second at least.
-    restarts
-        Opening a port restarts its board, as DTR does with many.
-    cable
-        Where the robot's own USB is, if anywhere.
-    look
-        Called whenever the emulator has moved on.
+        Polled at least 50 times a second.
+    restart_on_open
+        Whether opening a port reboots its board, as DTR does on most boards.
+    console_port
+        Port of the USB console of the robot board, if any.
+    on_update
+        Called after each update of the emulator.
     """
     now_ns, clock = emulator.now_ns, time.monotonic()
-    name, there, connected = emulator.port_name, emulator.port_open, False
-    robot = None if cable is None else _ConsolePort(emulator, cable, restarts)
+    number, plugged_in, connected = emulator.port_number, emulator.port_open, False
+    console = None
+    if console_port is not None:
+        console = _ConsolePort(emulator, console_port, restart_on_open)
     while not stopped():
         next_ns = emulator.next_ns
-        until_ns = (
-            now_ns + _POLL_PERIOD_NS if next_ns is None else min(next_ns, now_ns + _POLL_PERIOD_NS)
-        )
-        received = port.wait(max(until_ns - now_ns, 0) / NANOSECONDS / speed)
-        passed = time.monotonic() - clock
-        clock += passed
-        now_ns += round(min(passed, _MAX_SLEEP) * speed * NANOSECONDS)
-        if received is not None and not connected and restarts:
+        until_ns = now_ns + _POLL_PERIOD_NS
+        if next_ns is not None:
+            until_ns = min(next_ns, until_ns)
+        received = port.wait(max(until_ns - now_ns, 0) / NANOSECONDS / real_time_factor)
+        elapsed = time.monotonic() - clock
+        clock += elapsed
+        now_ns += round(min(elapsed, _MAX_SLEEP) * real_time_factor * NANOSECONDS)
+        if received is not None and not connected and restart_on_open:
             emulator.restart_dongle()
         connected = received is not None
-        # What is due came before what has just arrived.
-        arrived = emulator.run_to(now_ns)
+        # Events that are due precede the input that has just arrived.
+        replies = emulator.run_to(now_ns)
         if received:
             emulator.feed(received, now_ns)
         if connected:
-            for _, data in arrived:
+            for _, data in replies:
                 port.write(data)
-        if robot is not None:
-            robot.look(now_ns)
-        look()
-        if emulator.port_open != there:
-            there = emulator.port_open
-            port.open() if there else port.close()
-        if emulator.port_name != name:
-            name = emulator.port_name
+        if console is not None:
+            console.update(now_ns)
+        on_update()
+        if emulator.port_open != plugged_in:
+            plugged_in = emulator.port_open
+            port.open() if plugged_in else port.close()
+        if emulator.port_number != number:
+            number = emulator.port_number
             port.open()
 
 
 class _ConsolePort:
-    """The USB of the robot, looked at whenever the dongle's is: 50 times a second at least."""
+    """USB port of the robot board, updated together with that of the dongle."""
 
-    def __init__(self, emulator: Emulator, port: PtyPort, restarts: bool) -> None:
+    def __init__(self, emulator: Emulator, port: PtyPort, restart_on_open: bool) -> None:
         self._emulator = emulator
         self._port = port
-        self._restarts = restarts
+        self._restart_on_open = restart_on_open
         self._connected = False
 
-    def look(self, now_ns: int) -> None:
+    def update(self, now_ns: int) -> None:
         received = self._port.wait(0.0)
-        if received is not None and not self._connected and self._restarts:
+        if received is not None and not self._connected and self._restart_on_open:
             self._emulator.restart_robot()
         self._connected = received is not None
         if received:

@@ -117,7 +117,7 @@ class Pair:
 
     def packet(self, data):
         self.call('packet', bytes(data), ctypes.c_uint8(len(data)))
-        self.board.packet(bytes(data))
+        self.board.receive(bytes(data))
 
     def hello(self, frame, nonce):
         self.nonce = nonce
@@ -131,7 +131,7 @@ class Pair:
 
     def press(self, pressed):
         self.call('press', ctypes.c_bool(pressed))
-        self.board.press(pressed)
+        self.board.press_button(pressed)
 
     def imu(self, answers):
         self.call('set_imu', ctypes.c_bool(answers), (ctypes.c_int16 * 7)(*SAMPLE))
@@ -161,11 +161,11 @@ class Pair:
 
 
 class Driver:
-    """A host that errs in every way, by dice."""
+    """A host that errs in every way, by rng."""
 
     def __init__(self, pair, key, seed):
         self.pair, self.key = pair, key
-        self.dice = random.Random(seed)
+        self.rng = random.Random(seed)
         self.session, self.seq, self.epoch = 0, 0, 0
         self.travel = 1000
         self.session_key = b''
@@ -176,9 +176,9 @@ class Driver:
         return (self.pair.now - self.travel) % WRAP
 
     def greet(self):
-        self.session = self.dice.randint(1, 255)
+        self.session = self.rng.randint(1, 255)
         self.seq = 0
-        nonce, theirs = self.dice.randbytes(8), self.dice.randbytes(8)
+        nonce, theirs = self.rng.randbytes(8), self.rng.randbytes(8)
         if self.key:
             hello = sign_hello(self.key, self.session, 0, self.host_us, nonce)
             self.session_key = session_key(self.key, nonce, theirs)
@@ -193,52 +193,52 @@ class Driver:
         return encode(frame._replace(tag=frame_tag(frame, self.session_key, 0)))
 
     def command(self):
-        dice = self.dice
-        flags = dice.choices((1, 0, 2, 4, 5, 3), (90, 3, 1, 4, 1, 1))[0]
-        self.seq = (self.seq + dice.choices((1, 0, -1, 2, 100, 200), (90, 2, 2, 3, 2, 1))[0]) % 256
-        session = dice.choices((self.session, dice.randrange(256)), (60, 1))[0]
-        top = dice.choice((1000, 8000, 32767))
-        still = dice.random() < 0.2 or flags == 4
-        left, right = (0 if still else dice.randint(-top, top) for _ in range(2))
-        ttl = dice.choice((20, 20, 20, 5, 0, 255))
-        stamp = self.host_us - dice.choices((0, 400_000, 90_000), (30, 1, 2))[0]
+        rng = self.rng
+        flags = rng.choices((1, 0, 2, 4, 5, 3), (90, 3, 1, 4, 1, 1))[0]
+        self.seq = (self.seq + rng.choices((1, 0, -1, 2, 100, 200), (90, 2, 2, 3, 2, 1))[0]) % 256
+        session = rng.choices((self.session, rng.randrange(256)), (60, 1))[0]
+        top = rng.choice((1000, 8000, 32767))
+        still = rng.random() < 0.2 or flags == 4
+        left, right = (0 if still else rng.randint(-top, top) for _ in range(2))
+        ttl = rng.choice((20, 20, 20, 5, 0, 255))
+        stamp = self.host_us - rng.choices((0, 400_000, 90_000), (30, 1, 2))[0]
         return self.signed(Command(session, self.seq, flags, ttl, left, right, stamp % WRAP))
 
     def request(self):
-        dice = self.dice
-        number = dice.randrange(12)
-        session = dice.choices((self.session, dice.randrange(256)), (20, 1))[0]
-        match dice.randrange(6):
+        rng = self.rng
+        number = rng.randrange(12)
+        session = rng.choices((self.session, rng.randrange(256)), (20, 1))[0]
+        match rng.randrange(6):
             case 0:
-                return encode(ParamGet(session, dice.randrange(256), number))
+                return encode(ParamGet(session, rng.randrange(256), number))
             case 1 | 2:
                 # Far enough from 1 that the microsteps of the next start are usual ones.
-                value = dice.choice((0, 1, 3, 16, 32, 100, 250, 5000, 9000, 30000, 10**6))
-                return self.signed(ParamSet(session, dice.randrange(256), number, value))
+                value = rng.choice((0, 1, 3, 16, 32, 100, 250, 5000, 9000, 30000, 10**6))
+                return self.signed(ParamSet(session, rng.randrange(256), number, value))
             case 3:
-                return self.signed(Action(session, dice.randrange(4), dice.randrange(4)))
+                return self.signed(Action(session, rng.randrange(4), rng.randrange(4)))
             case _:
-                return encode(Poll(dice.randrange(256), dice.randrange(256), dice.randrange(3)))
+                return encode(Poll(rng.randrange(256), rng.randrange(256), rng.randrange(3)))
 
     def damaged(self):
-        dice = self.dice
-        data = bytearray(dice.choice(self.sent))
-        match dice.randrange(4):
+        rng = self.rng
+        data = bytearray(rng.choice(self.sent))
+        match rng.randrange(4):
             case 0:
                 pass
             case 1:
-                bit = dice.randrange(8 * len(data))
+                bit = rng.randrange(8 * len(data))
                 data[bit // 8] ^= 1 << bit % 8
             case 2:
-                del data[dice.randrange(len(data)) :]
+                del data[rng.randrange(len(data)) :]
                 data = data or bytearray(1)
             case 3:
-                data += dice.randbytes(dice.randrange(20))
+                data += rng.randbytes(rng.randrange(20))
         return bytes(data)
 
     def act(self):
-        pair, dice = self.pair, self.dice
-        match dice.choices(range(8), (60, 15, 6, 1, 1, 1, 1, 0.4))[0]:
+        pair, rng = self.pair, self.rng
+        match rng.choices(range(8), (60, 15, 6, 1, 1, 1, 1, 0.4))[0]:
             case 0:
                 self.send(self.command())
             case 1:
@@ -246,13 +246,13 @@ class Driver:
             case 2:
                 pair.packet(self.damaged())
             case 3:
-                pair.press(dice.random() < 0.5)
+                pair.press(rng.random() < 0.5)
             case 4:
-                pair.imu(dice.random() < 0.7)
+                pair.imu(rng.random() < 0.7)
             case 5:
                 self.greet()
             case 6:
-                pair.run(dice.choice((300_000, 1_000_000, 6_000_000)))
+                pair.run(rng.choice((300_000, 1_000_000, 6_000_000)))
             case 7:
                 pair.reset()
 
@@ -263,7 +263,7 @@ class Driver:
 
 @pytest.mark.parametrize('key', [b'', KEY], ids=['open', 'keyed'])
 @pytest.mark.parametrize('seed', range(12))
-def test_board_and_firmware_answer_alike(library, key, seed):
+def test_emulated_board_and_firmware_reply_alike(library, key, seed):
     """600 random packets, requests, resets and silences; every answer and every ramp compared."""
     pair = Pair(library, key)
     driver = Driver(pair, key, seed)
@@ -271,7 +271,7 @@ def test_board_and_firmware_answer_alike(library, key, seed):
     driver.greet()
     moved, kinds = False, set()
     for _ in range(600):
-        pair.run(driver.dice.choice((700, 1500, 5000, 20_000, 19_950)))
+        pair.run(driver.rng.choice((700, 1500, 5000, 20_000, 19_950)))
         pair.compare()
         driver.act()
         moved |= any(pair.board.speeds)
@@ -282,7 +282,7 @@ def test_board_and_firmware_answer_alike(library, key, seed):
     assert kinds >= {b'\x11', b'\x12', b'\x13', b'\x14', b'\x15'}
 
 
-def test_a_session_that_silence_has_ended_leaves_the_same_behind(library):
+def test_board_and_firmware_agree_after_a_session_timeout(library):
     """The emulator once told a nonce of zeros then, as if nobody had ever greeted it."""
     pair = Pair(library, KEY)
     pair.run(1000)
@@ -314,7 +314,7 @@ def pair(library):
     return made
 
 
-def test_a_key_that_came_over_the_cable_keeps_strangers_out_at_once(pair):
+def test_a_key_from_the_console_locks_out_other_hosts_at_once(pair):
     assert pair.ask(Key(1)) == [KeyState(1, OK, NO_KEY, 0)]
     assert pair.ask(Key(2, KEY)) == []
     assert pair.call('writing')
@@ -341,7 +341,7 @@ def test_a_key_that_came_over_the_cable_keeps_strangers_out_at_once(pair):
     assert pair.board.session == driver.session
 
 
-def test_no_key_is_taken_while_the_robot_moves_or_its_drivers_have_power(pair):
+def test_no_key_is_written_while_the_drivers_have_power(pair):
     driver = Driver(pair, b'', 1)
     driver.greet()
     drive = Command(driver.session, 1, CommandFlag.ENABLE, 5, 3000, 3000, driver.host_us)
@@ -361,9 +361,7 @@ def test_no_key_is_taken_while_the_robot_moves_or_its_drivers_have_power(pair):
 
 @pytest.mark.parametrize('before', [b'', KEY], ids=['none', 'another'])
 @pytest.mark.parametrize('after', [bytes(16), OTHER], ids=['none', 'one'])
-def test_a_supply_that_fails_leaves_the_old_key_the_new_one_or_a_locked_robot(
-    library, before, after
-):
+def test_power_loss_leaves_the_old_key_the_new_key_or_a_lock(library, before, after):
     """Power is cut at every cell; a robot that is locked moves nothing, and can be given a key."""
     states = set()
     for cut_us in range(CELL_US // 2, 22 * CELL_US, CELL_US):
@@ -397,21 +395,21 @@ def test_a_supply_that_fails_leaves_the_old_key_the_new_one_or_a_locked_robot(
 
 
 @pytest.mark.parametrize('seed', range(6))
-def test_no_damaged_frame_over_the_cable_changes_the_key(pair, seed):
-    dice = random.Random(seed)
+def test_no_damaged_console_frame_changes_the_key(pair, seed):
+    rng = random.Random(seed)
     whole = encode_frame(encode(Key(7, OTHER)))
     for _ in range(300):
         wire = bytearray(whole)
-        match dice.randrange(4):
+        match rng.randrange(4):
             case 0:
-                bit = dice.randrange(8 * len(wire))
+                bit = rng.randrange(8 * len(wire))
                 wire[bit // 8] ^= 1 << bit % 8
             case 1:
-                del wire[dice.randrange(len(wire) - 1)]
+                del wire[rng.randrange(len(wire) - 1)]
             case 2:
-                wire.insert(dice.randrange(len(wire)), dice.randrange(256))
+                wire.insert(rng.randrange(len(wire)), rng.randrange(256))
             case 3:
-                wire = bytearray(encode_frame(encode(Key(7, OTHER))[: dice.randrange(3, 18)]))
+                wire = bytearray(encode_frame(encode(Key(7, OTHER))[: rng.randrange(3, 18)]))
         if bytes(wire).strip(b'\0') == whole.strip(b'\0'):
             continue
         pair.usb(wire + b'\0')
@@ -424,7 +422,7 @@ def test_no_damaged_frame_over_the_cable_changes_the_key(pair, seed):
     assert pong.crc_errors > 50
 
 
-def test_what_belongs_to_a_dongle_is_refused(pair):
+def test_frames_for_a_dongle_are_refused(pair):
     for frame in (b'\x01\x00\x00\x01\x15', b'\x02\x00', b'\x05'):
         pair.usb(encode_frame(frame))
         (told,) = FrameDecoder().feed(pair.heard())
@@ -433,7 +431,7 @@ def test_what_belongs_to_a_dongle_is_refused(pair):
     assert decode_from_board(FrameDecoder().feed(pair.heard())[0]) == Refusal(2, 4)
 
 
-def test_a_cell_that_does_not_hold_is_told_and_locks_the_robot(library):
+def test_a_worn_cell_is_reported_and_locks_the_robot(library):
     """The emulator's memory does not wear out: this is the firmware alone."""
     for address in (8, 20, 25, 26):
         pair = Pair(library)

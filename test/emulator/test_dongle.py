@@ -36,14 +36,14 @@ class Scripted:
 class Station:
     """A dongle, and a robot that only notes what it hears."""
 
-    def __init__(self, *dice):
+    def __init__(self, *rng):
         self.events = EventQueue(0)
         self.faults = FaultInjection(lambda: self.events.now_ns, 1)
         self.heard = []
         self.replies = []
         self.robot = RadioParameters()
         self.channel = RadioChannel(
-            self.events, self.robot, lambda: True, self._hear, self.faults, Scripted(*dice)
+            self.events, self.robot, lambda: True, self._hear, self.faults, Scripted(*rng)
         )
         self.chip_ok = True
         self.dongle = Dongle(self.events, self.channel, lambda: self.chip_ok, self._reply)
@@ -72,7 +72,7 @@ class Station:
 CMD, POLL = bytes(14), b'poll'
 
 
-def test_an_exchange_takes_the_times_of_the_data_sheet():
+def test_exchange_timing_is_that_of_the_data_sheet():
     station = Station()
     station.channel.load(bytes(32))
     station.write(Transmit(9, 6, CMD))
@@ -87,7 +87,7 @@ def test_an_exchange_takes_the_times_of_the_data_sheet():
     assert result.payload == bytes(32)
 
 
-def test_the_second_packet_comes_a_gap_after_the_first_was_answered():
+def test_the_second_packet_follows_the_first_reply_after_the_gap():
     station = Station()
     station.channel.load(bytes(32))
     station.write(Transmit(9, 6, CMD, POLL))
@@ -100,7 +100,7 @@ def test_the_second_packet_comes_a_gap_after_the_first_was_answered():
     assert station.answer()[1][1:3] == (0x03, 0x03)
 
 
-def test_an_answer_is_fetched_once_and_an_empty_fifo_answers_with_nothing():
+def test_a_reply_is_fetched_once_then_acknowledgements_are_empty():
     station = Station()
     station.channel.load(b'once')
     station.write(Transmit(9, 6, CMD, POLL))
@@ -110,7 +110,7 @@ def test_an_answer_is_fetched_once_and_an_empty_fifo_answers_with_nothing():
     assert result.payload == b'once'
 
 
-def test_a_lost_acknowledgement_brings_the_packet_again_but_not_to_the_robot():
+def test_a_retransmitted_packet_is_delivered_once():
     station = Station(1.0, 0.0, 1.0, 0.0, 1.0, 1.0)
     station.faults.add(Fault('loss', 0.0, value=0.5), 0)
     station.channel.load(b'state')
@@ -124,7 +124,7 @@ def test_a_lost_acknowledgement_brings_the_packet_again_but_not_to_the_robot():
     assert at == pytest.approx(140 + 130 + 3 * 185 + 2 * 500 + 130 + 113 + 330, abs=1)
 
 
-def test_nobody_there_is_given_up_after_four_more_tries_and_the_poll_skipped():
+def test_without_receiver_four_retries_and_the_poll_is_skipped():
     station = Station()
     station.faults.add(Fault('jam', 0.0), 0)
     station.write(Transmit(9, 6, CMD, POLL))
@@ -138,7 +138,7 @@ def test_nobody_there_is_given_up_after_four_more_tries_and_the_poll_skipped():
 @pytest.mark.parametrize(
     'changed', [{'channel': 83}, {'rate': 2}, {'address': b'other'}, {'retry_delay': 0}]
 )
-def test_a_radio_set_otherwise_is_not_answered(changed):
+def test_a_radio_with_another_configuration_gets_no_reply(changed):
     """The last one is: 250 us are too short for an acknowledgement of 32 bytes."""
     station = Station()
     station.channel.load(bytes(32))
@@ -164,7 +164,7 @@ def test_nothing_is_queued():
     assert station.answer()[1].id == 9
 
 
-def test_what_is_no_frame_is_refused_or_counted():
+def test_a_malformed_frame_is_refused_or_counted():
     station = Station()
     station.write(b'\x05abc')
     assert station.answer()[1] == Refusal(1, 5)
@@ -178,7 +178,7 @@ def test_what_is_no_frame_is_refused_or_counted():
     assert (pong.crc_errors, pong.frame_errors) == (1, 1)
 
 
-def test_a_chip_that_dies_in_mid_exchange_is_given_up():
+def test_an_exchange_with_a_dead_chip_times_out():
     station = Station()
     station.write(Transmit(9, 6, CMD, POLL))
     station.run(200)
@@ -189,7 +189,7 @@ def test_a_chip_that_dies_in_mid_exchange_is_given_up():
     assert at == pytest.approx(140 + 150_000 + 330)
 
 
-def test_a_dongle_that_starts_hears_nothing_and_forgets_its_transaction():
+def test_a_booting_dongle_ignores_input_and_ends_its_transaction():
     station = Station()
     station.write(Transmit(9, 6, CMD, POLL))
     station.run(1000)
@@ -228,7 +228,7 @@ class Wire:
         return [data for _, data in self.got]
 
 
-def test_a_byte_takes_twenty_microseconds_and_pieces_wait_for_each_other():
+def test_blocks_are_sent_in_order_at_20_us_per_byte():
     wire = Wire()
     wire.send(bytes(10), bytes(5), every_ns=0)
     assert [at for at, _ in wire.got] == [10 * BYTE_NS, 15 * BYTE_NS]
@@ -247,7 +247,7 @@ def test_a_byte_takes_twenty_microseconds_and_pieces_wait_for_each_other():
         ('reorder:0:inf:0.5', 1000, 1000, False),
     ],
 )
-def test_a_fault_does_to_the_bytes_what_its_name_says(fault, smallest, largest, same):
+def test_effect_of_each_line_fault(fault, smallest, largest, same):
     wire = Wire(fault)
     pieces = [bytes([index]) * 10 for index in range(100)]
     data = b''.join(wire.send(*pieces))
@@ -255,7 +255,7 @@ def test_a_fault_does_to_the_bytes_what_its_name_says(fault, smallest, largest, 
     assert (data == b''.join(pieces)) == same
 
 
-def test_a_stalled_line_gives_all_at_once():
+def test_a_stalled_line_delivers_everything_at_its_end():
     wire = Wire('stall:0:1')
     assert wire.send(b'a', b'b', b'c') == [b'a', b'b', b'c']
     assert [at for at, _ in wire.got] == [1000 * MS + n * BYTE_NS for n in (1, 2, 3)]
@@ -267,12 +267,12 @@ def test_a_delayed_line_keeps_its_order():
     assert wire.got[0][0] == 500 * MS + BYTE_NS
 
 
-def test_reordered_frames_come_in_pairs_turned_round():
+def test_reordered_frames_swap_in_pairs():
     wire = Wire('reorder:0:inf:1')
     assert wire.send(b'a', b'b', b'c', b'd') == [b'ba', b'dc']
 
 
-def test_dice_of_one_fault_do_not_shift_those_of_another():
+def test_random_sequences_of_faults_are_independent():
     pieces = [bytes([index]) * 10 for index in range(50)]
     alone = Wire('flip_bits:0:inf:0.05').send(*pieces)
     both = Wire('flip_bits:0:inf:0.05', 'delay:0:inf:0.1').send(*pieces)
@@ -303,12 +303,12 @@ def test_a_fault_is_written_as_name_time_duration_value():
         ('loss:1:1:1.5', 'from 0 to 1'),
     ],
 )
-def test_what_is_no_fault_is_refused_with_the_reason(text, words):
+def test_an_invalid_fault_is_rejected_with_a_reason(text, words):
     with pytest.raises(FaultError, match=words):
         parse_fault(text)
 
 
-def test_every_fault_has_a_usual_form():
+def test_every_fault_has_valid_defaults():
     for kind in FAULT_KINDS:
         fault = check_fault(Fault(kind.name, 0.0))
         assert fault.duration > 0.0

@@ -24,8 +24,8 @@ def at_rest(bench):
     bench.run(2.0)
 
 
-def test_sixty_seconds_at_fifty_hertz_the_counters_are_the_pulses_of_the_plant():
-    bench = Bench({'robot_clock': 0.005})
+def test_counters_equal_the_pulses_of_the_plant_over_60_s():
+    bench = Bench({'robot_clock_error': 0.005})
     assert bench.connect() < 0.2
     for second in range(60):
         bench.drive(5.0 * math.sin(0.7 * second), 6.0 * math.cos(0.4 * second))
@@ -44,7 +44,7 @@ def test_sixty_seconds_at_fifty_hertz_the_counters_are_the_pulses_of_the_plant()
     check_followed(bench)
 
 
-def test_a_round_trip_takes_as_long_as_line_radio_and_gap_do():
+def test_round_trip_time_is_that_of_line_radio_and_gap():
     """26 and 44 bytes at 20 us, 0.77 and 0.69 ms of radio, 1.7 ms of gap, 0.47 ms of firmware."""
     bench = Bench()
     bench.connect()
@@ -59,7 +59,7 @@ def test_a_round_trip_takes_as_long_as_line_radio_and_gap_do():
 
 
 @pytest.mark.parametrize('loss, most', [(0.1, 0.005), (0.3, 0.10), (0.5, 0.45)])
-def test_a_whole_cycle_is_lost_as_seldom_as_four_retries_allow(loss, most):
+def test_share_of_lost_cycles_with_four_retries(loss, most):
     """Whole: the command was taken, and the state that it led to came back with it."""
     bench = Bench()
     bench.inject('loss', math.inf, loss)
@@ -80,7 +80,7 @@ def test_a_whole_cycle_is_lost_as_seldom_as_four_retries_allow(loss, most):
     check_followed(bench)
 
 
-def test_only_up_or_only_down_loses_less():
+def test_loss_in_one_direction_costs_fewer_cycles():
     lost = {}
     for name in ('loss_down', 'loss_up'):
         bench = Bench()
@@ -127,7 +127,7 @@ def test_wheels_rest_within_045_s_of_the_last_command(fault, speed, deceleration
     assert rest_ns[-1] == bench.now_ns
 
 
-def test_a_reset_stops_the_pulses_at_once_and_the_wheels_roll_out():
+def test_a_reset_stops_the_pulses_and_the_wheels_coast():
     bench = Bench()
     bench.connect()
     bench.drive(7.0, 7.0)
@@ -143,7 +143,7 @@ def test_a_reset_stops_the_pulses_at_once_and_the_wheels_roll_out():
     assert max(map(abs, bench.plant.wheels)) < 0.2
 
 
-def test_a_shut_down_link_leaves_the_robot_at_rest_without_drives():
+def test_shutdown_leaves_the_robot_at_rest_with_drivers_off():
     bench = Bench()
     bench.connect()
     bench.drive(7.0, -7.0)
@@ -155,7 +155,7 @@ def test_a_shut_down_link_leaves_the_robot_at_rest_without_drives():
     assert not bench.board.powered
 
 
-def test_a_burst_that_was_held_for_a_second_moves_nothing():
+def test_a_burst_held_for_a_second_does_not_move_the_robot():
     """Fifteen commands on their way for 1 s, all at once: each is refused, the wheels stand."""
     bench = Bench()
     bench.connect()
@@ -170,17 +170,17 @@ def test_a_burst_that_was_held_for_a_second_moves_nothing():
     for index in range(15):
         seq = (bench.link.telemetry.raw.seq + 1 + index) % 256
         host_us = (held_us + 1_000_000 + 20_000 * index) % (1 << 32)
-        bench.board.packet(encode(Command(session, seq, 1, 20, 8000, 8000, host_us)))
+        bench.board.receive(encode(Command(session, seq, 1, 20, 8000, 8000, host_us)))
         bench.run(0.001)
     bench.run(0.5)
     assert bench.board.counters == before
-    bench.emulator.end('silence')
+    bench.emulator.end_fault('silence')
     bench.run(2.0, lambda: bench.link.state is LinkState.RUN)
     bench.run(2.0)
     assert bench.link.quality(bench.now_ns).robot.stale == 15
 
 
-def test_a_line_that_stalls_for_a_second_lets_nothing_old_through():
+def test_no_stale_command_is_executed_after_a_stalled_line():
     for begin in (0.5, 0.503, 0.507, 0.511, 0.515):
         bench = Bench()
         bench.connect()
@@ -215,18 +215,18 @@ def test_the_link_recovers_from_every_fault(name, key):
 
 @pytest.mark.parametrize('key', [b'', KEY], ids=['open', 'keyed'])
 @pytest.mark.parametrize('seed', range(8))
-def test_no_wrong_and_no_old_command_is_ever_followed(seed, key):
+def test_no_wrong_or_stale_command_is_executed(seed, key):
     """A fault every half second for half a minute, most of them overlapping others."""
-    dice = random.Random(seed)
-    bench = Bench({'robot_clock': dice.uniform(-0.005, 0.005)}, key=key, seed=seed)
+    rng = random.Random(seed)
+    bench = Bench({'robot_clock_error': rng.uniform(-0.005, 0.005)}, key=key, seed=seed)
     bench.connect()
     names = [kind.name for kind in FAULT_KINDS]
     # After these it takes seconds until there are commands again that could be wrong.
     slow = ('dongle_reset', 'close_port', 'move_link', 'radio_dead', 'robot_reset', 'button')
     weights = [0.1 if name in slow else 1.0 for name in names]
     for _ in range(60):
-        bench.drive(dice.uniform(-9.0, 9.0), dice.uniform(-9.0, 9.0))
-        bench.inject(dice.choices(names, weights)[0], dice.uniform(0.02, 0.8))
+        bench.drive(rng.uniform(-9.0, 9.0), rng.uniform(-9.0, 9.0))
+        bench.inject(rng.choices(names, weights)[0], rng.uniform(0.02, 0.8))
         bench.run(0.5)
         bench.link.release_estop(bench.now_ns)
     check_followed(bench)
@@ -240,7 +240,7 @@ def test_no_wrong_and_no_old_command_is_ever_followed(seed, key):
 # -- what the robot tells -------------------------------------------------------------------------
 
 
-def test_counters_go_on_over_a_restart_of_the_robot():
+def test_wheel_angles_continue_over_a_reboot_of_the_robot():
     bench = Bench()
     bench.connect()
     bench.drive(5.0, 5.0)
@@ -257,7 +257,7 @@ def test_counters_go_on_over_a_restart_of_the_robot():
     assert round(turned / STEP) == bench.plant.pulses[1] > 3000
 
 
-def test_an_inertial_sensor_that_is_gone_is_told_and_comes_back():
+def test_an_absent_imu_is_reported_and_recovers():
     bench = Bench()
     bench.connect()
     bench.run(1.0)
@@ -293,7 +293,7 @@ def test_a_robot_on_another_channel_is_not_found():
     assert bench.link.state is LinkState.HELLO
 
 
-def test_an_empty_battery_takes_the_board_down():
+def test_an_empty_battery_switches_the_board_off():
     bench = Bench({'twin.battery.charge': 0.0})
     bench.run(2.0)
     assert not bench.emulator.powered
@@ -313,7 +313,7 @@ def test_the_same_seed_gives_the_same_bytes():
     assert bytes_heard() == bytes_heard()
 
 
-def test_wheels_mounted_the_other_way_are_turned_back_and_still_count_forward():
+def test_inverted_wheels_count_in_the_commanded_direction():
     parameters = LinkParameters.from_dict({'robot.invert_left': True, 'robot.invert_right': True})
     bench = Bench(link=parameters)
     bench.connect()
@@ -328,7 +328,7 @@ def test_wheels_mounted_the_other_way_are_turned_back_and_still_count_forward():
 # -- emergency stop -------------------------------------------------------------------------------
 
 
-def test_the_button_latches_until_the_host_releases_and_it_is_let_go():
+def test_the_button_latches_until_released_and_cleared():
     bench = Bench()
     bench.connect()
     bench.drive(5.0, 5.0)
@@ -339,7 +339,7 @@ def test_the_button_latches_until_the_host_releases_and_it_is_let_go():
     bench.link.release_estop(bench.now_ns)
     bench.run(2.0)
     assert 'button' in bench.link.reason(bench.now_ns)
-    bench.emulator.end('button')
+    bench.emulator.end_fault('button')
     bench.link.release_estop(bench.now_ns)
     bench.run(2.0)
     assert bench.link.reason(bench.now_ns) == ''
@@ -357,16 +357,16 @@ def test_a_host_with_another_key_cannot_drive_but_can_stop():
     assert not bench.followed
 
 
-def test_a_stranger_without_the_key_can_stop_a_robot_that_drives():
+def test_a_sender_without_the_key_can_stop_a_moving_robot():
     bench = Bench(key=KEY)
     bench.connect()
     bench.drive(5.0, 5.0)
     bench.run(1.0)
     for flags in (CommandFlag.ENABLE, CommandFlag.ESTOP_CLEAR):
-        bench.board.packet(encode(Command(9, 200, flags, 20, -5000, -5000, 0)))
+        bench.board.receive(encode(Command(9, 200, flags, 20, -5000, -5000, 0)))
     bench.run(0.5)
     assert bench.link.reason(bench.now_ns) == ''
-    bench.board.packet(encode(Command(9, 200, CommandFlag.ESTOP, 0, 0, 0, 0)))
+    bench.board.receive(encode(Command(9, 200, CommandFlag.ESTOP, 0, 0, 0, 0)))
     bench.run(0.5)
     assert bench.board.speeds == (0, 0)
     assert bench.link.telemetry.status.estop
@@ -376,9 +376,9 @@ def test_a_stranger_without_the_key_can_stop_a_robot_that_drives():
     check_followed(bench)
 
 
-def test_who_has_heard_everything_but_the_key_moves_nothing():
+def test_replayed_or_forged_frames_do_not_move_a_keyed_robot():
     """Replays, flipped bits, forged tags and stamps, between the packets of the host."""
-    dice = random.Random(3)
+    rng = random.Random(3)
     bench = Bench(key=KEY)
     bench.connect()
     bench.drive(4.0, -3.0)
@@ -387,20 +387,20 @@ def test_who_has_heard_everything_but_the_key_moves_nothing():
         bench.run(0.05)
         heard = [encode(command) for command in sent_commands(bench)]
         for _ in range(30):
-            data = bytearray(dice.choice(heard))
-            match dice.randrange(5):
+            data = bytearray(rng.choice(heard))
+            match rng.randrange(5):
                 case 1 | 2:
-                    for _ in range(dice.choice((1, 1, 2, 3))):
-                        bit = dice.randrange(8 * len(data))
+                    for _ in range(rng.choice((1, 1, 2, 3))):
+                        bit = rng.randrange(8 * len(data))
                         data[bit // 8] ^= 1 << bit % 8
                 case 3:
-                    data[-8:] = dice.randbytes(8)
+                    data[-8:] = rng.randbytes(8)
                 case 4:
                     data[10:14] = ((bench.now_ns // 1000) & 0xFFFFFFFF).to_bytes(4, 'little')
-                    data[2] = (data[2] + dice.randrange(128)) % 256
+                    data[2] = (data[2] + rng.randrange(128)) % 256
             if data[0] == 0x11 and data[3] & CommandFlag.ESTOP:
                 continue  # stopping is always allowed
-            bench.board.packet(bytes(data))
+            bench.board.receive(bytes(data))
             tried += 1
     bench.run(0.1)
     assert tried > 2000

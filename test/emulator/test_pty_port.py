@@ -128,7 +128,7 @@ def start():
 
 
 @pytest.mark.slow
-def test_a_host_drives_the_process_over_the_real_port_with_a_key_and_a_replug(start, tmp_path):
+def test_a_host_drives_the_process_over_a_pty_with_a_key(start, tmp_path):
     key_file = tmp_path / 'key'
     key_file.write_text(KEY.hex())
     key_file.chmod(0o600)
@@ -160,7 +160,7 @@ def test_a_host_drives_the_process_over_the_real_port_with_a_key_and_a_replug(st
 
 
 @pytest.mark.slow
-def test_ctrl_c_takes_the_path_away(start, tmp_path):
+def test_ctrl_c_removes_the_link(start, tmp_path):
     path = tmp_path / 'dongle'
     process = start('--link', path)
     process.ready()
@@ -169,7 +169,7 @@ def test_ctrl_c_takes_the_path_away(start, tmp_path):
     assert not path.is_symlink()
 
 
-def test_the_terminal_is_raw_before_the_path_leads_to_it(tmp_path):
+def test_the_terminal_is_raw_before_it_is_published(tmp_path):
     """A cooked one would send back what the host writes, and turn carriage returns."""
     port = PtyPort(tmp_path / 'dongle')
     assert port.wait(0.0) is None
@@ -187,7 +187,7 @@ def test_the_terminal_is_raw_before_the_path_leads_to_it(tmp_path):
     assert not (tmp_path / 'dongle').is_symlink()
 
 
-def test_a_new_terminal_hangs_up_the_old_one_and_moves_the_path(tmp_path):
+def test_a_new_terminal_hangs_up_the_old_one_and_moves_the_link(tmp_path):
     path = tmp_path / 'dongle'
     port = PtyPort(path)
     old = SerialPort(str(path))
@@ -203,7 +203,7 @@ def test_a_new_terminal_hangs_up_the_old_one_and_moves_the_path(tmp_path):
     port.close()
 
 
-def test_a_client_that_does_not_read_blocks_nothing(tmp_path):
+def test_a_client_that_does_not_read_does_not_block(tmp_path):
     port = PtyPort(tmp_path / 'dongle')
     client = SerialPort(str(tmp_path / 'dongle'))
     for _ in range(100):
@@ -212,7 +212,7 @@ def test_a_client_that_does_not_read_blocks_nothing(tmp_path):
     port.close()
 
 
-def test_a_path_that_leads_elsewhere_by_now_is_left_alone(tmp_path):
+def test_a_link_to_another_terminal_is_not_removed(tmp_path):
     path = tmp_path / 'dongle'
     first, second = PtyPort(path), PtyPort(path)
     first.close()
@@ -221,7 +221,7 @@ def test_a_path_that_leads_elsewhere_by_now_is_left_alone(tmp_path):
     assert not path.is_symlink()
 
 
-def test_no_file_is_ever_replaced(tmp_path):
+def test_a_file_is_not_replaced(tmp_path):
     path = tmp_path / 'thesis'
     path.write_text('chapter 1')
     with pytest.raises(PtyPortError, match='no symbolic link'):
@@ -236,21 +236,21 @@ def test_no_file_is_ever_replaced(tmp_path):
     [
         (['--fault', 'jamm:1'], 'did you mean jam'),
         (['--set', 'twin.nothing=1'], 'twin.nothing'),
-        (['--set', 'robot_clock'], 'NAME=VALUE'),
-        (['--set', 'robot_clock=0.5'], 'robot_clock'),
+        (['--set', 'robot_clock_error'], 'NAME=VALUE'),
+        (['--set', 'robot_clock_error=0.5'], 'robot_clock_error'),
         (['--set', 'twin.motor.microsteps=32'], 'microsteps'),
         (['--world', 'atlantis'], 'atlantis'),
         (['--key', 'no/such/file'], 'no/such/file'),
     ],
 )
-def test_what_cannot_be_done_is_said_before_anything_starts(arguments, words, tmp_path, capsys):
+def test_invalid_arguments_are_reported_before_the_start(arguments, words, tmp_path, capsys):
     path = tmp_path / 'dongle'
     assert emulator.main(['--link', str(path), *arguments]) == 2
     assert words in capsys.readouterr().err
     assert not path.is_symlink()
 
 
-def test_a_robot_link_that_cannot_be_made_takes_the_other_one_away(tmp_path, capsys):
+def test_a_failed_robot_link_removes_the_other_link(tmp_path, capsys):
     thesis, path = tmp_path / 'thesis', tmp_path / 'dongle'
     thesis.write_text('chapter 1')
     assert emulator.main(['--link', str(path), '--robot-link', str(thesis)]) == 2
@@ -259,7 +259,9 @@ def test_a_robot_link_that_cannot_be_made_takes_the_other_one_away(tmp_path, cap
     assert thesis.read_text() == 'chapter 1'
 
 
-@pytest.mark.parametrize('arguments', [['--loss', '2'], ['--speed', '0'], ['--seed', 'x']])
+@pytest.mark.parametrize(
+    'arguments', [['--loss', '2'], ['--real-time-factor', '0'], ['--seed', 'x']]
+)
 def test_a_number_out_of_range_is_a_usage_error(arguments, tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
         emulator.main(['--link', str(tmp_path / 'dongle'), *arguments])

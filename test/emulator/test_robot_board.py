@@ -45,7 +45,7 @@ class Robot:
         self.board.run_to(self.board.now_us + us)
 
     def ask(self, frame):
-        self.board.packet(encode(frame) if not isinstance(frame, bytes) else frame)
+        self.board.receive(encode(frame) if not isinstance(frame, bytes) else frame)
         self.run(1000)
         return decode_uplink(self.loaded)
 
@@ -85,7 +85,7 @@ def test_nothing_moves_before_hello_and_enable():
     assert robot.status == StatusFlag.ENABLED | StatusFlag.MOVING
 
 
-def test_a_number_counts_once_and_only_ahead_of_the_last(robot):
+def test_only_newer_sequence_numbers_are_executed(robot):
     robot.command(1000, 1000, seq=250)
     for seq in (250, 249, 200, 123):
         robot.command(9000, 9000, seq=seq)
@@ -97,7 +97,7 @@ def test_a_number_counts_once_and_only_ahead_of_the_last(robot):
     assert robot.board.speeds == (2_000_000, 2_000_000)
 
 
-def test_a_command_is_followed_for_its_time_to_live_and_no_longer_than_allowed(robot):
+def test_a_command_is_valid_for_its_ttl_up_to_the_maximum(robot):
     for ttl, held in ((10, 100_000), (255, 250_000)):
         robot.command(100, 100, ttl=ttl)
         robot.run(held - 1000 - 1000)
@@ -109,7 +109,7 @@ def test_a_command_is_followed_for_its_time_to_live_and_no_longer_than_allowed(r
     assert not robot.status & StatusFlag.TTL_EXPIRED
 
 
-def test_a_late_command_is_refused_and_a_late_wish_to_stand_is_granted(robot):
+def test_a_stale_command_is_rejected_but_a_stale_stop_executed(robot):
     robot.command(1000, 1000)
     robot.run(150_000)
     robot.command(9000, 9000, late_us=251_000)
@@ -143,7 +143,7 @@ def test_both_wheels_ramp_by_one_factor(robot):
 
 
 @pytest.mark.parametrize('session, seq', [(SESSION, 1), (SESSION, 0), (7, 200)])
-def test_anybody_may_stop_and_only_the_session_clears(robot, session, seq):
+def test_any_sender_may_stop_and_only_the_session_clears(robot, session, seq):
     robot.command(5000, 5000)
     robot.run(100_000)
     robot.command(flags=CommandFlag.ESTOP, session=session, seq=seq)
@@ -161,7 +161,7 @@ def test_anybody_may_stop_and_only_the_session_clears(robot, session, seq):
     assert robot.status == 0
 
 
-def test_a_stop_of_a_stranger_does_not_make_the_hosts_next_commands_look_old(robot):
+def test_a_foreign_estop_keeps_the_sequence_of_the_host(robot):
     robot.command(1000, 1000)
     robot.command(flags=CommandFlag.ESTOP, session=7, seq=(robot.seq + 100) % 256)
     robot.command(flags=CommandFlag.ESTOP_CLEAR)
@@ -169,22 +169,22 @@ def test_a_stop_of_a_stranger_does_not_make_the_hosts_next_commands_look_old(rob
     assert robot.status == StatusFlag.ENABLED | StatusFlag.MOVING
 
 
-def test_the_button_stops_and_cannot_be_overruled(robot):
+def test_estop_is_not_cleared_while_the_button_is_pressed(robot):
     robot.command(5000, 5000)
     robot.run(100_000)
-    robot.board.press(True)
+    robot.board.press_button(True)
     robot.rest()
     robot.command(flags=CommandFlag.ESTOP_CLEAR)
     robot.run(1000)
     assert robot.status == StatusFlag.ESTOP
-    robot.board.press(False)
+    robot.board.press_button(False)
     robot.run(1000)
     assert robot.status == StatusFlag.ESTOP
     robot.command(flags=CommandFlag.ESTOP_CLEAR)
     assert robot.status == 0
 
 
-def test_parameters_are_checked_and_forgotten_at_a_restart_but_for_the_microsteps(robot):
+def test_only_the_microsteps_survive_a_reboot(robot):
     assert robot.set(0, 19_601).rc == frames.OUT_OF_RANGE
     assert robot.set(5, 200).rc == frames.READ_ONLY
     assert robot.set(10, 1).rc == frames.UNKNOWN
@@ -207,7 +207,7 @@ def test_parameters_are_checked_and_forgotten_at_a_restart_but_for_the_microstep
     assert robot.board.speeds[0] == 9_817_000
 
 
-def test_an_action_is_done_once_and_odometry_is_not_reset_while_moving(robot):
+def test_an_action_runs_once_and_no_reset_while_moving(robot):
     robot.command(5000, 5000)
     assert robot.ask(Action(SESSION, 1, frames.RESET_ODOMETRY)).rc == frames.BUSY
     robot.rest()
@@ -217,7 +217,7 @@ def test_an_action_is_done_once_and_odometry_is_not_reset_while_moving(robot):
     assert robot.board.counters == (0, 0)
 
 
-def test_drivers_rest_when_they_may_and_never_while_the_wheels_turn(robot):
+def test_drivers_switch_off_after_idle_time_but_not_while_moving(robot):
     robot.set(8, 500)
     robot.command(5000, 5000)
     robot.run(100_000)
@@ -239,7 +239,7 @@ def test_a_session_ends_after_half_an_hour_of_silence(robot):
     assert robot.status == StatusFlag.NO_SESSION
 
 
-def test_clocks_may_wrap_while_the_robot_drives():
+def test_clock_wrap_while_driving():
     robot = Robot()
     robot.board.boot(1, (1 << 32) - 500_000)
     robot.seq = 0
@@ -255,8 +255,8 @@ def test_clocks_may_wrap_while_the_robot_drives():
     assert robot.ask(Poll(0, 0, frames.STATE)).time_us < 2_000_000
 
 
-def test_what_is_wider_than_the_radio_allows_is_not_even_read(robot):
+def test_an_oversized_payload_is_ignored(robot):
     stop = encode(Command(SESSION, 1, CommandFlag.ESTOP, 0, 0, 0, 0))
-    robot.board.packet(stop + bytes(19))
+    robot.board.receive(stop + bytes(19))
     assert robot.status == 0
     assert robot.aux().short == 1

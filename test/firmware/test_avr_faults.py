@@ -106,12 +106,12 @@ def counted(bench):
         ('delay', 0.015),
     ],
 )
-def test_a_bad_line_moves_nothing_wrong_and_all_is_well_after_it(build, name, share):
+def test_line_faults_cause_no_wrong_motion_and_the_link_recovers(build, name, share):
     bench = driving(build)
-    dice = random.Random(2)
+    rng = random.Random(2)
     bench.inject(name, 1.0, share)
     for _ in range(10):
-        bench.drive(dice.uniform(-6.0, 6.0), dice.uniform(-6.0, 6.0))
+        bench.drive(rng.uniform(-6.0, 6.0), rng.uniform(-6.0, 6.0))
         bench.run(0.1)
     bench.drive(3.0, 3.0)
     bench.run(0.5)
@@ -123,7 +123,7 @@ def test_a_bad_line_moves_nothing_wrong_and_all_is_well_after_it(build, name, sh
 
 
 @pytest.mark.parametrize('phase', [0.0, 0.007])
-def test_what_a_stalled_line_lets_go_after_a_second_moves_nothing(build, phase):
+def test_data_released_by_a_stalled_line_do_not_move_the_robot(build, phase):
     bench = driving(build)
     bench.run(phase)
     bench.inject('stall', 1.0)
@@ -135,7 +135,7 @@ def test_what_a_stalled_line_lets_go_after_a_second_moves_nothing(build, phase):
 
 
 @pytest.mark.parametrize('key', [b'', KEY], ids=['open', 'keyed'])
-def test_a_burst_held_for_a_second_is_refused_to_the_last_command(build, key):
+def test_every_command_of_a_burst_held_for_a_second_is_stale(build, key):
     """Fifteen good commands, in session and in sequence (and signed), all a second late."""
     bench = build(key=key)
     bench.connect()
@@ -168,7 +168,7 @@ def hold(bench, count):
 def stale(bench):
     """Return how many commands the robot has found to be late."""
     board = bench.board
-    return board.stale if isinstance(board, AvrBoard) else board._counts['stale']
+    return board.stale if isinstance(board, AvrBoard) else board.packet_counters['stale']
 
 
 # -- the boards, the air, the port ----------------------------------------------------------------
@@ -187,8 +187,8 @@ def stale(bench):
         ('close_port', 0.3),
     ],
 )
-def test_what_fails_at_full_speed_stops_the_robot_in_time_and_it_goes_on(build, name, seconds):
-    bench = driving(build, 10.0, 10.0, flat={'dongle_start': 0.3})
+def test_a_fault_at_full_speed_stops_the_robot_and_it_recovers(build, name, seconds):
+    bench = driving(build, 10.0, 10.0, flat={'dongle_boot_time': 0.3})
     bench.inject(name, seconds)
     if name == 'imu_absent':
         bench.run(0.2)
@@ -208,8 +208,8 @@ def test_what_fails_at_full_speed_stops_the_robot_in_time_and_it_goes_on(build, 
 
 
 @pytest.mark.parametrize('start', [0.0, 1.5])
-def test_a_replugged_dongle_is_driven_within_a_second_of_its_answering(build, start):
-    bench = driving(build, flat={'dongle_start': start})
+def test_commands_resume_within_1_s_of_a_replugged_dongle(build, start):
+    bench = driving(build, flat={'dongle_boot_time': start})
     bench.inject('close_port', 0.5)
     bench.run(0.45)
     assert 'dongle' in bench.link.reason(bench.now_ns)
@@ -220,8 +220,8 @@ def test_a_replugged_dongle_is_driven_within_a_second_of_its_answering(build, st
 
 
 @pytest.mark.parametrize('name', ['dongle_reset', 'robot_reset'])
-def test_a_restarted_board_is_driven_within_a_second_of_its_answering(build, name):
-    bench = driving(build, flat={'dongle_start': 0.3})
+def test_commands_resume_within_1_s_of_a_rebooted_board(build, name):
+    bench = driving(build, flat={'dongle_boot_time': 0.3})
     bench.inject(name, 0.2)
     took = resumes(bench, 5.0)
     print(f'\n{name}: follows commands after {took:.2f} s')
@@ -233,7 +233,7 @@ def test_a_restarted_board_is_driven_within_a_second_of_its_answering(build, nam
 # -- the host -------------------------------------------------------------------------------------
 
 
-def test_a_killed_host_leaves_the_wheels_at_rest_in_time_at_every_phase(build):
+def test_wheels_stop_in_time_after_a_host_is_killed_at_any_phase(build):
     """From full speed, at phases all over a cycle; default parameters."""
     rests = []
     bench = driving(build, 10.0, 10.0)
@@ -252,7 +252,7 @@ def test_a_killed_host_leaves_the_wheels_at_rest_in_time_at_every_phase(build):
     check_followed(bench)
 
 
-def test_a_host_killed_within_a_frame_leaves_the_wheels_at_rest(build):
+def test_wheels_stop_after_a_host_is_killed_within_a_frame(build):
     """Half a command is none; the next host's first frame ends it and is not lost."""
     bench = driving(build, 10.0, 10.0)
     for size in (1, 13, 25):
@@ -270,7 +270,7 @@ def revive(bench):
     """Start the host anew: another link at the same port."""
     fresh = Bench(emulator=bench.emulator, seed=len(bench.written))
     bench.link = fresh.link
-    bench.emulator.board.followed = bench._note
+    bench.emulator.board.on_command = bench._note
     bench.killed = bench.is_open = False
     bench.wake_ns = bench.now_ns
 
@@ -278,17 +278,17 @@ def revive(bench):
 # -- a second opener ------------------------------------------------------------------------------
 
 
-def test_a_second_host_on_the_same_line_never_makes_a_wrong_command(build):
+def test_a_second_host_on_the_line_causes_no_wrong_command(build):
     """An opener that ignores the lock: both write, and each byte goes to who reads first."""
     bench = driving(build)
     other = Bench(emulator=bench.emulator, seed=77)
-    bench.emulator.board.followed = bench._note
+    bench.emulator.board.on_command = bench._note
     other.drive(-3.0, 5.0)
-    dice = random.Random(5)
+    rng = random.Random(5)
     for _ in range(500):
-        bench.run(dice.uniform(0.0005, 0.002))
+        bench.run(rng.uniform(0.0005, 0.002))
         other.now_ns = bench.now_ns
-        other.run(dice.uniform(0.0005, 0.002))
+        other.run(rng.uniform(0.0005, 0.002))
         bench.now_ns = other.now_ns
     check_followed(bench, other)
     values = {(command.left, command.right) for _, command in bench.followed}
@@ -301,17 +301,17 @@ def test_a_second_host_on_the_same_line_never_makes_a_wrong_command(build):
     assert rest_of(bench) <= REST
 
 
-def test_rubbish_and_foreign_frames_between_those_of_the_host_change_nothing(build):
+def test_noise_and_foreign_frames_on_the_line_have_no_effect(build):
     """A second opener that only writes: noise, frames of a session nobody is in, cut frames."""
     bench = driving(build)
-    dice = random.Random(6)
+    rng = random.Random(6)
     for _ in range(40):
-        bench.run(0.02 + dice.uniform(0.0, 0.02))
-        foreign = Command(9 + dice.randrange(200), dice.randrange(256), 1, 20, -9000, 9000, 0)
+        bench.run(0.02 + rng.uniform(0.0, 0.02))
+        foreign = Command(9 + rng.randrange(200), rng.randrange(256), 1, 20, -9000, 9000, 0)
         poll = encode(Poll(9, 0, 0))
-        frame = encode_frame(encode(Transmit(dice.randrange(256), 6, encode(foreign), poll)))
-        cut = frame[: dice.randrange(1, len(frame))]
-        rubbish = dice.choice((frame, cut, dice.randbytes(dice.randrange(1, 40))))
+        frame = encode_frame(encode(Transmit(rng.randrange(256), 6, encode(foreign), poll)))
+        cut = frame[: rng.randrange(1, len(frame))]
+        rubbish = rng.choice((frame, cut, rng.randbytes(rng.randrange(1, 40))))
         bench.emulator.feed(rubbish, bench.now_ns)
     values = {(command.left, command.right) for _, command in bench.followed}
     assert values <= {(0, 0), (4000, 4000)}
@@ -321,7 +321,7 @@ def test_rubbish_and_foreign_frames_between_those_of_the_host_change_nothing(bui
     counted(bench)
 
 
-def test_frames_that_the_dongle_refuses_are_told_apart_from_answers(build):
+def test_a_refusal_does_not_disturb_the_transaction_in_progress(build):
     """Two transactions at once: the second is refused, the first is not disturbed."""
     bench = driving(build)
     bench.kill()

@@ -44,7 +44,7 @@ def boards() -> Iterator[Boards]:
 # -- bytes ----------------------------------------------------------------------------------------
 
 
-def test_golden_transmission_reaches_the_robot_byte_by_byte(boards: Boards) -> None:
+def test_golden_transmissions_reach_the_robot(boards: Boards) -> None:
     boards.run(0.13)
     for vector in VECTORS['to_dongle']:
         if vector['kind'] != 'Transmit':
@@ -59,7 +59,7 @@ def test_golden_transmission_reaches_the_robot_byte_by_byte(boards: Boards) -> N
         assert boards.heard().hex() == (fields['second'] or fields['first'])
 
 
-def test_golden_answers_pass_the_dongle_byte_by_byte(boards: Boards) -> None:
+def test_golden_replies_pass_the_dongle(boards: Boards) -> None:
     boards.run(0.13)
     for number, vector in enumerate(VECTORS['up']):
         data = bytes.fromhex(vector['bytes'])
@@ -70,7 +70,7 @@ def test_golden_answers_pass_the_dongle_byte_by_byte(boards: Boards) -> None:
         boards.run(0.002)
 
 
-def test_golden_settings_and_pings_come_back(boards: Boards) -> None:
+def test_golden_configurations_and_pings_are_answered(boards: Boards) -> None:
     boards.run(0.13)
     for vector in VECTORS['to_dongle']:
         boards.write(bytes.fromhex(vector['wire']))
@@ -86,7 +86,7 @@ def test_golden_settings_and_pings_come_back(boards: Boards) -> None:
             assert answer.chip_ok
 
 
-def test_robot_refuses_every_rejected_vector_and_counts_it(boards: Boards) -> None:
+def test_rejected_vectors_are_counted(boards: Boards) -> None:
     boards.start()
     wrong = [
         (bytes.fromhex(vector['bytes']), vector['fault'])
@@ -104,7 +104,7 @@ def test_robot_refuses_every_rejected_vector_and_counts_it(boards: Boards) -> No
     assert after.short - before.short == len(wrong) - unknown
 
 
-def test_a_packet_that_claims_more_than_the_fifo_holds_is_thrown_away(boards: Boards) -> None:
+def test_a_packet_wider_than_the_fifo_is_dropped(boards: Boards) -> None:
     """Such a width stops firmware that trusts it, or lets it write beyond its buffer."""
     boards.start()
     before = boards.request(Poll(0, 0, 1), Poll(0, 0, 1))
@@ -115,7 +115,7 @@ def test_a_packet_that_claims_more_than_the_fifo_holds_is_thrown_away(boards: Bo
     assert boards.drive().seq == boards.seq
 
 
-def test_serial_line_survives_rubbish_and_bursts(boards: Boards) -> None:
+def test_serial_line_recovers_from_noise_and_bursts(boards: Boards) -> None:
     boards.run(0.13)
     boards.write(b'\x05rubbish\x00' + encode_frame(b'\x03\x01abcd')[:-4] + b'\x00')
     pings = [encode_frame(codec.encode(Ping(i, b'ping'))) for i in range(20)]
@@ -131,7 +131,7 @@ def test_serial_line_survives_rubbish_and_bursts(boards: Boards) -> None:
 
 
 @pytest.mark.parametrize('rate', [50, 100])
-def test_every_cycle_is_answered_within_six_milliseconds(boards: Boards, rate: int) -> None:
+def test_round_trip_time_is_below_six_milliseconds(boards: Boards, rate: int) -> None:
     boards.start()
     times, states, clocks = [], [], []
     for number in range(500):
@@ -154,7 +154,7 @@ def test_every_cycle_is_answered_within_six_milliseconds(boards: Boards, rate: i
 
 
 @pytest.mark.parametrize(('p', 'limit'), [(0.1, 0.005), (0.3, 0.1)])
-def test_few_whole_cycles_are_lost_in_a_bad_air(boards: Boards, p: float, limit: float) -> None:
+def test_share_of_lost_cycles_on_a_lossy_channel(boards: Boards, p: float, limit: float) -> None:
     """Whole: the command was taken, and the state that it led to came back with it."""
     boards.start()
     assert boards.ask(LinkParameters().configure(1)).chip_ok
@@ -202,7 +202,7 @@ def test_telemetry_never_lags_by_an_exchange(boards: Boards) -> None:
     assert boards.radio(ROBOT).queued_acks == 0
 
 
-def test_dongle_clock_passes_half_of_its_range(boards: Boards) -> None:
+def test_dongle_clock_beyond_half_of_its_range(boards: Boards) -> None:
     """A counter of overflows with 16 bits made it come round after 35.8 minutes."""
     boards.run(0.13)
     address = boards.symbol(DONGLE, 'overflows')
@@ -218,7 +218,7 @@ def test_dongle_clock_passes_half_of_its_range(boards: Boards) -> None:
 # -- what it takes --------------------------------------------------------------------------------
 
 
-def test_programs_fit_and_leave_the_processors_time(boards: Boards) -> None:
+def test_program_size_and_processor_load(boards: Boards) -> None:
     sizes = build()
     print('\n' + sizes)
     rows = [[int(word) for word in line.split()[:3]] for line in sizes.splitlines()[1:]]

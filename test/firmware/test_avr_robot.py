@@ -38,7 +38,7 @@ pytestmark = pytest.mark.skipif(bool(missing_tools()), reason=f'not installed: {
 
 EXTERNAL_RESET, WATCHDOG_RESET = 2, 8
 TIMER_0_INTERRUPTS = 0x6E  # TIMSK0 of the ATmega2560
-KEY_PLACE = 8
+KEY_ADDRESS = 8
 SLOW_GAP = 20  # 5 ms: a signed HELLO costs the robot four hashes
 
 
@@ -98,7 +98,7 @@ def test_button_stops_and_stays_latched_until_cleared(boards: Boards) -> None:
     odometry_agrees(boards)
 
 
-def test_anybody_may_stop_the_robot(boards: Boards) -> None:
+def test_any_sender_may_stop_the_robot(boards: Boards) -> None:
     boards.start()
     drive(boards, 0.3, 5000, 5000)
     foreign = codec.encode(boards.command(flags=CommandFlag.ESTOP, session=0x77))
@@ -109,7 +109,7 @@ def test_anybody_may_stop_the_robot(boards: Boards) -> None:
     assert boards.pulses() == before
 
 
-def test_step_pulses_at_full_speed_suit_every_driver(boards: Boards) -> None:
+def test_step_pulse_timing_at_full_speed(boards: Boards) -> None:
     """DRV8825: 1.9 us high and low, 0.65 us from DIR to STEP."""
     boards.start()
     boards.request(ParamSet(boards.session, 9, 0, 19600))
@@ -149,7 +149,7 @@ def test_drivers_have_no_power_before_the_first_command(boards: Boards) -> None:
 # -- failures -------------------------------------------------------------------------------------
 
 
-def test_robot_stops_in_a_jam_of_a_second_and_comes_back(boards: Boards) -> None:
+def test_robot_stops_during_a_jam_and_recovers(boards: Boards) -> None:
     boards.start()
     drive(boards, 0.4, 5000, 5000)
     boards.call('jam', True)
@@ -168,7 +168,7 @@ def test_robot_stops_in_a_jam_of_a_second_and_comes_back(boards: Boards) -> None
     odometry_agrees(boards)
 
 
-def test_robot_reboot_is_seen_and_moves_nothing(boards: Boards) -> None:
+def test_robot_reboot_is_detected_and_moves_nothing(boards: Boards) -> None:
     boards.start()
     drive(boards, 0.3, 5000, 5000)
     boards.call('reset', ROBOT)
@@ -190,7 +190,7 @@ def test_robot_reboot_is_seen_and_moves_nothing(boards: Boards) -> None:
     assert (state.left, state.right) == moved
 
 
-def test_dongle_reset_costs_nothing_but_its_time(boards: Boards) -> None:
+def test_dongle_reset_keeps_the_session(boards: Boards) -> None:
     boards.start()
     drive(boards, 0.3, 3000, 3000)
     boards.call('reset', DONGLE)
@@ -234,10 +234,10 @@ def test_imu_may_fail_and_come_back(boards: Boards) -> None:
 
 
 @pytest.mark.parametrize('board', [DONGLE, ROBOT])
-def test_a_radio_that_lost_its_supply_is_set_up_again(boards: Boards, board: int) -> None:
+def test_a_radio_is_configured_again_after_power_loss(boards: Boards, board: int) -> None:
     boards.start()
     boards.drive()
-    boards.suffered = True  # nobody tells the firmware: it goes on for a while
+    boards.rules_broken = True  # the firmware does not notice at once
     boards.call('radio_power', board, False)
     boards.run(0.05)
     boards.call('radio_power', board, True)
@@ -272,7 +272,7 @@ def test_ranges_battery_and_temperature_reach_the_host(boards: Boards) -> None:
     assert boards.drive().status & StatusFlag.LOW_BATTERY
 
 
-def test_microsteps_outlive_a_reset(boards: Boards) -> None:
+def test_microsteps_survive_a_reset(boards: Boards) -> None:
     boards.start()
     assert boards.request(ParamSet(boards.session, 9, 4, 8)).rc == OK
     boards.run(0.1)
@@ -281,7 +281,7 @@ def test_microsteps_outlive_a_reset(boards: Boards) -> None:
     assert boards.hello().microsteps == 8
 
 
-def test_odometry_starts_anew_on_request(boards: Boards) -> None:
+def test_odometry_is_reset_on_request(boards: Boards) -> None:
     boards.start()
     drive(boards, 0.3, 5000, 5000)
     drive(boards, 0.4, 0, 0)
@@ -292,7 +292,7 @@ def test_odometry_starts_anew_on_request(boards: Boards) -> None:
 
 def test_keyed_robot_follows_only_signed_commands(boards: Boards) -> None:
     key = bytes(range(0x80, 0x90))
-    boards.store(KEY_PLACE, key + crc16(key).to_bytes(2, 'little'))
+    boards.store(KEY_ADDRESS, key + crc16(key).to_bytes(2, 'little'))
     boards.run(0.13)
     assert boards.hello().session == 0  # an unsigned one is refused
     host_us = round(boards.now_us)
@@ -319,7 +319,7 @@ def test_keyed_robot_follows_only_signed_commands(boards: Boards) -> None:
 def test_signed_commands_are_answered_in_time(boards: Boards) -> None:
     """Two tags of 7000 cycles and more: the state is loaded before the POLL fetches it."""
     key = bytes(range(0x80, 0x90))
-    boards.store(KEY_PLACE, key + crc16(key).to_bytes(2, 'little'))
+    boards.store(KEY_ADDRESS, key + crc16(key).to_bytes(2, 'little'))
     boards.run(0.13)
     host_us = round(boards.now_us)
     hello = sign_hello(key, boards.session, 0, host_us, b'hostnonc')

@@ -40,7 +40,7 @@ def watched(bench, seconds):
     return np.array(times), np.unwrap(yaws)
 
 
-def test_the_gyro_tells_how_fast_the_body_turns_and_how_late(build):
+def test_gyro_rate_and_delay(build):
     """Within the 3 % of the data sheet, and as late as its filter and the two buses make it."""
     bench = build(flat={'twin.imu.gyro_offset': 0.0})
     bench.connect()
@@ -75,7 +75,7 @@ def test_the_gyro_tells_how_fast_the_body_turns_and_how_late(build):
     assert ratio == pytest.approx(1.0, abs=0.03)
 
 
-def test_odometry_with_the_gyro_knows_where_the_robot_is(build):
+def test_gyro_odometry_agrees_with_the_true_pose(build):
     bench = build(flat={'twin.imu.gyro_offset': 0.0})
     bench.connect()
     bench.run(0.2)
@@ -92,7 +92,7 @@ def test_odometry_with_the_gyro_knows_where_the_robot_is(build):
     assert not bench.states[-1].status.slipping
 
 
-def test_towards_a_wall_the_ranges_shrink_as_the_distance_does(build):
+def test_ranges_agree_with_the_distance_to_a_wall(build):
     """Backwards to the end of the corridor; both sides keep their distance."""
     bench = build(flat={'twin.world': 'corridor'})
     bench.connect()
@@ -128,7 +128,7 @@ def test_towards_a_wall_the_ranges_shrink_as_the_distance_does(build):
 
 
 @pytest.mark.parametrize('blocked, sign', [('right', 1.0), ('left', -1.0)])
-def test_a_blocked_wheel_shows_as_gyro_against_steps_and_stops_the_robot(build, blocked, sign):
+def test_a_blocked_wheel_is_detected_and_stops_the_robot(build, blocked, sign):
     """Steps say straight on; the body turns about the wheel that stands."""
     bench = build(
         flat={'twin.faults.wheel_blocked': blocked},
@@ -151,7 +151,7 @@ def test_a_blocked_wheel_shows_as_gyro_against_steps_and_stops_the_robot(build, 
     assert bench.board.speeds == (0, 0)
 
 
-def test_an_empty_battery_and_a_dead_sensor_reach_the_host(build):
+def test_low_battery_and_imu_fault_are_reported(build):
     bench = build(flat={'twin.faults.gyro_dead': True, 'twin.faults.supply_sag': 2.5})
     bench.connect()
     bench.run(1.1)

@@ -52,7 +52,7 @@ from t3mpc_ros.radio.protocol.framing import FrameDecoder, crc16, encode_frame
 pytestmark = pytest.mark.skipif(bool(missing_tools()), reason=f'not installed: {missing_tools()}')
 
 KEY, OTHER = bytes(range(0x80, 0x90)), bytes(range(0x30, 0x40))
-KEY_PLACE, MARK_PLACE = 8, 26
+KEY_ADDRESS, MARK_ADDRESS = 8, 26
 WRITING = 0.3
 """s that are enough for a key: some 25 cells of 3.4 ms, each sought in rounds of 0.4 ms."""
 HOST_NONCE = b'hostnonc'
@@ -98,7 +98,7 @@ def signed(boards: Boards, signer: Signer, left: int, right: int) -> Any:
 # -- the key --------------------------------------------------------------------------------------
 
 
-def test_a_key_that_came_over_the_robots_usb_makes_a_keyed_link(boards: Boards) -> None:
+def test_a_key_from_the_console_makes_a_keyed_link(boards: Boards) -> None:
     boards.start()
     assert tell(boards, Key(1)) == [KeyState(1, OK, NO_KEY, 0)]
     assert tell(boards, Key(2, KEY)) == []
@@ -111,8 +111,8 @@ def test_a_key_that_came_over_the_robots_usb_makes_a_keyed_link(boards: Boards) 
         told = hear(boards)
     print(f'\nwritten and verified after {(boards.now_us - begun) / 1000 + 10:.0f} ms')
     assert told == [KeyState(2, OK, KEY_HELD, key_check(KEY))]
-    assert boards.eeprom(KEY_PLACE, 18) == KEY + crc16(KEY).to_bytes(2, 'little')
-    assert boards.eeprom(MARK_PLACE, 1) == b'\xff'
+    assert boards.eeprom(KEY_ADDRESS, 18) == KEY + crc16(KEY).to_bytes(2, 'little')
+    assert boards.eeprom(MARK_ADDRESS, 1) == b'\xff'
     assert boards.hello().session == 0  # unsigned
     assert meet(boards, OTHER) is None
     signer = meet(boards, KEY)
@@ -128,11 +128,11 @@ def test_a_key_that_came_over_the_robots_usb_makes_a_keyed_link(boards: Boards) 
     assert meet(boards, KEY) is not None
     assert tell(boards, Key(6, bytes(16)), WRITING) == [KeyState(6, OK, NO_KEY, 0)]
     assert boards.hello().session == boards.session
-    assert boards.eeprom(KEY_PLACE, 18) == b'\xff' * 18
+    assert boards.eeprom(KEY_ADDRESS, 18) == b'\xff' * 18
     assert boards.call('usb_overruns') == 0
 
 
-def test_the_board_says_how_it_fares_and_what_it_does_not_know(boards: Boards) -> None:
+def test_console_answers_pings_and_refuses_other_frames(boards: Boards) -> None:
     boards.start()
     (pong,) = tell(boards, Ping(7, b'ping'))
     assert isinstance(pong, Pong)
@@ -144,7 +144,7 @@ def test_the_board_says_how_it_fares_and_what_it_does_not_know(boards: Boards) -
     assert 3_000 < later.time_us - pong.time_us < 12_000
 
 
-def test_no_key_is_taken_from_a_robot_whose_drivers_have_power(boards: Boards) -> None:
+def test_no_key_is_written_while_the_drivers_of_the_avr_are_on(boards: Boards) -> None:
     boards.start()
     drive(boards, 0.2, 4000, 4000)
     assert tell(boards, Key(1, KEY)) == [KeyState(1, BUSY, NO_KEY, 0)]
@@ -158,7 +158,7 @@ def test_no_key_is_taken_from_a_robot_whose_drivers_have_power(boards: Boards) -
     odometry_agrees(boards)
 
 
-def test_no_flipped_bit_on_the_cable_changes_anything(boards: Boards) -> None:
+def test_no_flipped_bit_on_the_console_has_an_effect(boards: Boards) -> None:
     boards.start()
     wire = encode_frame(codec.encode(Key(1, KEY)))
     before = boards.eeprom(0, 40)
@@ -178,14 +178,14 @@ def test_no_flipped_bit_on_the_cable_changes_anything(boards: Boards) -> None:
 
 
 @pytest.mark.parametrize('before', [b'', OTHER], ids=['first key', 'another key'])
-def test_power_that_fails_while_a_key_is_written_opens_nothing(before: bytes) -> None:
+def test_power_loss_during_a_key_write_never_unlocks_the_robot(before: bytes) -> None:
     """Cut at five places: the robot has what it had, the new key, or moves for nobody."""
     avr_boards.build()
     states = []
     for cut in (0.001, 0.008, 0.03, 0.07, WRITING):
         boards = Boards()
         if before:
-            boards.store(KEY_PLACE, before + crc16(before).to_bytes(2, 'little'))
+            boards.store(KEY_ADDRESS, before + crc16(before).to_bytes(2, 'little'))
         boards.run(0.2)
         told = tell(boards, Key(1, KEY), cut)
         boards.call('reset', ROBOT)
@@ -212,13 +212,13 @@ def test_power_that_fails_while_a_key_is_written_opens_nothing(before: bytes) ->
     assert states[-1] == KEY_HELD
 
 
-def test_a_flood_on_the_cable_delays_nothing(boards: Boards) -> None:
+def test_a_flood_on_the_console_does_not_delay_replies(boards: Boards) -> None:
     """50 000 bytes a second, frames and rubbish, while the robot checks tags and drives.
 
     The POLL finds the answer to its own CMD; in one run of several, one of a hundred was a cycle
     old.
     """
-    boards.store(KEY_PLACE, KEY + crc16(KEY).to_bytes(2, 'little'))
+    boards.store(KEY_ADDRESS, KEY + crc16(KEY).to_bytes(2, 'little'))
     boards.run(0.13)
     signer = meet(boards, KEY)
     assert signer is not None

@@ -373,7 +373,7 @@ def c_wire(library, frame):
     return room.raw[:size]
 
 
-def test_frames_go_over_the_line_as_the_reference_writes_them(library):
+def test_encoded_frames_equal_the_reference(library):
     generator = random.Random(2)
     for size in (*range(1, 79), *generator.choices(range(1, 79), k=2000)):
         frame = bytes(generator.choices((0, 1, 0xFF, generator.randrange(256)), k=size))
@@ -416,7 +416,7 @@ def split(data):
 
 
 @pytest.mark.parametrize('seed', range(40))
-def test_the_splitter_finds_what_the_reference_finds_in_a_damaged_stream(library, seed):
+def test_decoder_equals_the_reference_on_a_damaged_stream(library, seed):
     generator = random.Random(seed)
     stream = bytearray()
     for _ in range(300):
@@ -443,7 +443,7 @@ def test_the_splitter_finds_what_the_reference_finds_in_a_damaged_stream(library
     assert min(counts[1:]) > 10
 
 
-def test_siphash_agrees_with_the_published_vectors_and_the_reference(library):
+def test_siphash_equals_published_vectors_and_reference(library):
     """The paper's appendix, and the first lines of its authors' ``vectors.h``."""
     key = bytes(range(16))
     room = ctypes.create_string_buffer(8)
@@ -462,7 +462,7 @@ def test_siphash_agrees_with_the_published_vectors_and_the_reference(library):
         assert hashed(key, message) == siphash(key, message)
 
 
-def test_range_codes_are_those_of_the_simulated_board(library):
+def test_range_codes_equal_those_of_the_simulation(library):
     """Both ends of a simulation must see the same; an open or shorted wire is the board's own."""
     parameters = range_sensor.SimulatedRangeSensorParameters()
     for count in range(984):
@@ -474,7 +474,7 @@ def test_range_codes_are_those_of_the_simulated_board(library):
     assert library.t3_host_range_code(0xFFFF) == 0
 
 
-def test_time_is_right_wherever_it_is_read(library):
+def test_clock_is_exact_around_a_timer_overflow(library):
     """A timer that wraps between the read of its count and of its flag must not lose 50 us."""
     for start in (0, 0xFFFFFFC8, 0x7FFFFFF0):
         for true in range(200):
@@ -505,7 +505,7 @@ def c_encode(library, kind, numbers, nonce=False):
     return room.raw[:size]
 
 
-def test_the_first_golden_vectors_are_met_byte_for_byte(library):
+def test_first_golden_vectors_byte_for_byte(library):
     fault, packet = c_decode(library, COMMAND)
     assert fault == 0
     assert (packet['session'], packet['seq'], packet['what'], packet['ttl']) == (0x5A, 7, 1, 20)
@@ -516,7 +516,7 @@ def test_the_first_golden_vectors_are_met_byte_for_byte(library):
     assert c_wire(library, bytes.fromhex('012a060e') + COMMAND + b'\x15\x5a\x07\0') == TX_WIRE
 
 
-def test_a_transaction_gives_the_golden_result(library):
+def test_transaction_with_the_golden_result(library):
     dongle = Dongle(library)
     dongle.run(123_456_000 - 3000)
     dongle.call('bytes', TX_WIRE, ctypes.c_uint32(len(TX_WIRE)))
@@ -542,7 +542,7 @@ def golden():
 DOWN_NAMES = {'flags': 'what', 'id': 'what', 'verb': 'what'}
 
 
-def test_every_golden_payload_from_the_host_is_read(library, golden):
+def test_golden_downlink_payloads_are_decoded(library, golden):
     for vector in golden['down']:
         data, fields = bytes.fromhex(vector['bytes']), vector['fields']
         fault, packet = c_decode(library, data)
@@ -554,7 +554,7 @@ def test_every_golden_payload_from_the_host_is_read(library, golden):
                 assert packet[DOWN_NAMES.get(name, name)] == value, (vector['name'], name)
 
 
-def test_every_golden_payload_from_the_robot_is_written(library, golden):
+def test_golden_uplink_payloads_are_encoded(library, golden):
     kinds = {'State': 1, 'Param': 2, 'Info': 3, 'Ack': 4, 'Aux': 5}
     for vector in golden['up']:
         numbers, fields = [], vector['fields']
@@ -564,7 +564,7 @@ def test_every_golden_payload_from_the_robot_is_written(library, golden):
         assert written.hex() == vector['bytes'], vector['name']
 
 
-def test_golden_faults_are_faults_here_too(library, golden):
+def test_golden_malformed_frames_are_rejected(library, golden):
     faults = {'version': 1, 'kind': 1, 'length': 2, 'value': 2}
     for vector in golden['rejected']:
         data = bytes.fromhex(vector['bytes'])
@@ -578,7 +578,7 @@ def test_golden_faults_are_faults_here_too(library, golden):
             assert dongle.sent() == b''
 
 
-def test_golden_lines_and_parameters_and_hashes_are_met(library, golden):
+def test_golden_encodings_parameters_and_hashes(library, golden):
     for vector in golden['wire']:
         assert c_wire(library, bytes.fromhex(vector['bytes'])).hex() == vector['wire']
     robot = Robot(library)
@@ -593,7 +593,7 @@ def test_golden_lines_and_parameters_and_hashes_are_met(library, golden):
         assert room.raw.hex() == tag
 
 
-def test_a_keyed_robot_takes_and_refuses_what_the_golden_session_says(library, golden):
+def test_golden_session_of_a_keyed_robot(library, golden):
     story = golden['authentication']
     robot = Robot(library, bytes.fromhex(story['key']))
     robot.run(1000)
@@ -615,7 +615,7 @@ def test_a_keyed_robot_takes_and_refuses_what_the_golden_session_says(library, g
         assert info[17:].hex() == event['robot_nonce'], event['name']
 
 
-def test_golden_stops_are_counted_here_as_there(library, golden):
+def test_golden_emergency_stops_are_counted(library, golden):
     story = golden['authentication']['stops']
     robot = Robot(library, bytes.fromhex(golden['authentication']['key']))
     robot.run(1000)
@@ -633,7 +633,7 @@ def test_golden_stops_are_counted_here_as_there(library, golden):
     assert 0 < refused < len(story['frames'])
 
 
-def test_golden_frames_of_the_robots_own_usb_are_met(library, golden):
+def test_golden_console_frames(library, golden):
     for vector in golden['to_board']:
         robot = Robot(library)
         robot.run(1000)
@@ -688,7 +688,7 @@ def test_hello_starts_a_session_at_rest_and_keeps_the_counters(robot):
     assert robot.speeds == (0.0, 0.0)
 
 
-def test_silence_ramps_down_and_says_why(gentle):
+def test_ttl_expiry_ramps_down_and_sets_the_flag(gentle):
     gentle.drive(4500, 4500, 1_000_000)
     gentle.send(gentle.command(4500, 4500, ttl=20))
     gentle.run(199_000)
@@ -730,7 +730,7 @@ def rest_time(robot, ttl):
         (20, 30_000, 0.536),
     ],
 )
-def test_the_wheels_are_at_rest_soon_after_the_last_command(robot, ttl, deceleration, limit):
+def test_stop_time_is_ttl_plus_ramp(robot, ttl, deceleration, limit):
     """TTL + speed / deceleration: the first line is the default of both ends.
 
     Within 0.45 s of the last command takes 41 rad/s² at a TTL of 200 ms, and 52 at the longest
@@ -741,7 +741,7 @@ def test_the_wheels_are_at_rest_soon_after_the_last_command(robot, ttl, decelera
     assert limit - 0.01 < rest_time(robot, ttl) <= limit
 
 
-def test_the_robot_itself_bounds_how_long_a_command_holds(robot):
+def test_the_robot_limits_the_ttl(robot):
     robot.send(robot.command(1000, 1000, ttl=255))
     robot.run(249_000)
     assert not robot.status & EXPIRED
@@ -749,7 +749,7 @@ def test_the_robot_itself_bounds_how_long_a_command_holds(robot):
     assert robot.status & EXPIRED
 
 
-def test_a_ttl_of_zero_is_a_wish_to_stop_and_no_accident(robot):
+def test_a_ttl_of_zero_stops_without_the_expiry_flag(robot):
     robot.drive(5000, 5000, 500_000)
     robot.drive(5000, 5000, 500_000, ttl=0)
     assert robot.status == ENABLED
@@ -770,7 +770,7 @@ def test_only_newer_sequence_numbers_count(robot):
             assert robot.counters()['duplicates'] - before == (not moved)
 
 
-def test_a_repeated_command_does_not_prolong_itself(robot):
+def test_a_repeated_command_does_not_extend_its_ttl(robot):
     frame = robot.command(3000, 3000, seq=9)
     for _ in range(30):
         robot.send(frame)
@@ -778,7 +778,7 @@ def test_a_repeated_command_does_not_prolong_itself(robot):
     assert robot.status & EXPIRED
 
 
-def test_another_session_moves_nothing_and_is_counted(robot):
+def test_frames_of_another_session_are_counted_and_ignored(robot):
     for session in set(range(256)) - {SESSION}:
         robot.drive(5000, 5000, 20_000, session=session)
     assert robot.pulses == (0, 0)
@@ -789,7 +789,7 @@ def test_another_session_moves_nothing_and_is_counted(robot):
 
 @pytest.mark.parametrize('session', [0, 1, SESSION, 255])
 @pytest.mark.parametrize('flags', [ESTOP, ESTOP | ENABLE, ESTOP | CLEAR, 7, 0xFF])
-def test_an_emergency_stop_is_honoured_from_anybody(robot, session, flags):
+def test_an_emergency_stop_is_accepted_from_any_sender(robot, session, flags):
     robot.drive(5000, 5000, 500_000)
     robot.send(robot.command(5000, 5000, flags, seq=0, session=session, host_us=0))
     robot.run(1000)
@@ -802,7 +802,7 @@ def test_an_emergency_stop_is_honoured_from_anybody(robot, session, flags):
     assert robot.status == LATCHED
 
 
-def test_only_a_clear_wish_of_the_session_clears_an_emergency_stop(robot):
+def test_only_a_valid_clear_of_the_session_clears_the_estop(robot):
     robot.send(robot.command(flags=ESTOP))
     for refused in (
         {'flags': 0},
@@ -827,7 +827,7 @@ def test_only_a_clear_wish_of_the_session_clears_an_emergency_stop(robot):
     assert robot.status == ENABLED | MOVING
 
 
-def test_the_button_latches_however_short_it_is_pressed(robot):
+def test_the_button_latches_after_the_shortest_press(robot):
     robot.drive(5000, 5000, 500_000)
     robot.call('press', ctypes.c_bool(True))
     robot.run(200)
@@ -841,7 +841,7 @@ def test_the_button_latches_however_short_it_is_pressed(robot):
 
 
 @pytest.mark.parametrize('silence', [1.0, 6.0, 15.0, 100.0, 1500.0])
-def test_commands_that_were_held_and_released_at_once_are_all_rejected(robot, silence):
+def test_commands_held_and_released_at_once_are_rejected(robot, silence):
     """A stalled USB hub holds 15 commands and then lets them all go.
 
     Forgetting the ordinary delay after two windows would take the burst of a long hold for it.
@@ -862,7 +862,7 @@ def test_commands_that_were_held_and_released_at_once_are_all_rejected(robot, si
 
 @pytest.mark.parametrize('skew', [-0.005, 0.005])
 @pytest.mark.parametrize('start', [0, (1 << 32) - 30_000_000])
-def test_a_clock_that_is_half_a_percent_off_raises_no_false_alarm(library, skew, start):
+def test_a_clock_error_of_half_a_percent_is_not_stale(library, skew, start):
     robot = Robot(library, time=start)
     generator = random.Random(4)
     robot.travel = 0
@@ -878,7 +878,7 @@ def test_a_clock_that_is_half_a_percent_off_raises_no_false_alarm(library, skew,
     assert robot.status == ENABLED | MOVING
 
 
-def test_a_silence_of_a_minute_raises_no_false_alarm(library):
+def test_a_silence_of_a_minute_is_not_stale(library):
     """Clocks drift apart meanwhile: 0.3 s within a minute at 0.5 %."""
     for skew in (-0.005, 0.005):
         robot = Robot(library)
@@ -891,7 +891,7 @@ def test_a_silence_of_a_minute_raises_no_false_alarm(library):
         assert robot.counters()['stale'] == 0
 
 
-def test_a_delay_that_grows_is_found_when_it_exceeds_the_ttl(robot):
+def test_a_growing_delay_is_detected_beyond_ttl_and_slack(robot):
     start, delays = robot.now, []
     for index in range(200):
         robot.run(22_000)
@@ -908,7 +908,7 @@ def test_a_delay_that_grows_is_found_when_it_exceeds_the_ttl(robot):
     assert robot.speeds == (0.0, 0.0)
 
 
-def test_a_stop_that_comes_late_still_stops(robot):
+def test_a_stale_stop_still_stops(robot):
     robot.drive(5000, 5000, 500_000)
     robot.travel = 400_000
     robot.send(robot.command(0, 0))
@@ -933,7 +933,7 @@ def test_a_session_ends_after_half_an_hour_of_silence(robot):
 # -- wheels ---------------------------------------------------------------------------------------
 
 
-def test_ten_rad_per_second_are_ten(robot):
+def test_wheel_speed_is_exact_at_10_rad_per_s(robot):
     robot.drive(10_000, -10_000, 1_000_000)
     before = robot.pulses
     robot.drive(10_000, -10_000, 10_000_000)
@@ -946,7 +946,7 @@ def test_ten_rad_per_second_are_ten(robot):
     assert robot.steps == robot.pulses
 
 
-def test_slow_speeds_are_exact_too(robot):
+def test_wheel_speed_is_exact_at_low_speed(robot):
     robot.drive(1, -3, 100_000)
     before = robot.pulses
     robot.drive(1, -3, 100_000_000)
@@ -971,7 +971,7 @@ def test_speed_crosses_zero_without_a_jump(robot):
     assert robot.call('hasty_pulses') == 0  # DIR is settled before every STEP
 
 
-def test_no_driver_gets_more_than_ten_thousand_steps_a_second(robot):
+def test_step_rate_is_limited_to_10_000_per_second(robot):
     assert robot.set(MAX_SPEED, 19_600) == (OK, 19_600)
     robot.drive(32_767, -32_768, 2_000_000)
     assert robot.status & LIMITED
@@ -983,7 +983,7 @@ def test_no_driver_gets_more_than_ten_thousand_steps_a_second(robot):
 
 
 @pytest.mark.parametrize('microsteps', [1, 8, 32, 256])
-def test_other_microsteps_hold_from_the_next_boot_and_keep_the_rate(library, microsteps):
+def test_microsteps_take_effect_at_boot_and_keep_the_speed(library, microsteps):
     robot = Robot(library)
     robot.hello()
     assert robot.set(MICROSTEPS, microsteps) == (OK, microsteps)
@@ -1007,7 +1007,7 @@ def test_other_microsteps_hold_from_the_next_boot_and_keep_the_rate(library, mic
 @pytest.mark.parametrize(
     'inverted, signs', [(0, (1, 1)), (1, (-1, 1)), (2, (1, -1)), (3, (-1, -1))]
 )
-def test_an_inverted_wheel_turns_the_other_way_and_counts_the_same(robot, inverted, signs):
+def test_an_inverted_wheel_turns_backwards_and_counts_forwards(robot, inverted, signs):
     assert robot.set(INVERT, inverted) == (OK, inverted)
     robot.drive(3000, 2000, 500_000)
     assert min(robot.steps) > 100
@@ -1038,7 +1038,7 @@ def test_one_factor_keeps_the_curvature_in_every_ramp(gentle, left, right):
     assert rates[2:-1] == [pytest.approx(0.3, abs=0.01)] * len(rates[2:-1])
 
 
-def test_speeding_up_and_slowing_down_have_their_own_rates(gentle):
+def test_acceleration_and_deceleration_rates_differ(gentle):
     gentle.drive(1000, 1000, 200_000)
     start = gentle.speeds[0]
     gentle.drive(9000, 9000, 100_000)
@@ -1052,7 +1052,7 @@ def test_speeding_up_and_slowing_down_have_their_own_rates(gentle):
     assert gentle.speeds[0] == pytest.approx(-1.5, abs=0.05)
 
 
-def test_one_wheel_up_and_one_down_keep_to_the_gentler_rate(gentle):
+def test_opposite_speed_changes_use_the_smaller_rate(gentle):
     gentle.drive(1000, 9000, 1_000_000)
     gentle.drive(9000, 1000, 100_000)
     assert gentle.speeds == pytest.approx((2.5, 7.5), abs=0.03)
@@ -1062,7 +1062,7 @@ def test_one_wheel_up_and_one_down_keep_to_the_gentler_rate(gentle):
     assert gentle.speeds == pytest.approx((1.5, 8.5), abs=0.03)
 
 
-def test_a_main_loop_that_hangs_makes_no_jump_of_the_speed(gentle):
+def test_a_stalled_main_loop_causes_no_speed_jump(gentle):
     gentle.drive(9000, 9000, 1_000_000)
     gentle.send(gentle.command(0, 0))
     gentle.run(2000)
@@ -1085,7 +1085,7 @@ def test_a_command_beyond_the_limit_is_scaled_as_a_whole(robot):
     assert robot.speeds == (0.0, 0.0)
 
 
-def test_drivers_rest_when_told_and_wake_before_the_first_step(robot):
+def test_drivers_switch_off_when_idle_and_on_before_a_step(robot):
     assert robot.set(IDLE_OFF, 1000) == (OK, 1000)
     robot.drive(1000, 1000, 500_000)
     robot.drive(0, 0, 900_000)
@@ -1097,7 +1097,7 @@ def test_drivers_rest_when_told_and_wake_before_the_first_step(robot):
     assert robot.call('unpowered_pulses') == 0
 
 
-def test_standing_for_hours_wakes_nothing_when_the_clock_comes_round(robot):
+def test_clock_wrap_after_hours_at_rest_has_no_effect(robot):
     """2**32 us later an old time looks like now: to drivers at rest, to the age of a command."""
     assert robot.set(IDLE_OFF, 1000) == (OK, 1000)
     robot.send(robot.command(0, 0))
@@ -1130,7 +1130,7 @@ def test_drivers_keep_their_power_until_a_ramp_has_ended(gentle):
 
 @pytest.mark.parametrize('before', [1000, 50_000, 150_000, 210_000, 350_000])
 @pytest.mark.parametrize('wrap', [1 << 15, 1 << 16, 1 << 31, 1 << 32])
-def test_nothing_changes_when_a_clock_of_any_width_wraps(robot, wrap, before):
+def test_clock_wrap_of_any_width_has_no_effect(robot, wrap, before):
     """A 16-bit count of overflows made the proof's clock wrap at 35.8 minutes."""
     robot.drive(5000, 5000, 500_000)
     robot.poke(wrap - before)
@@ -1146,7 +1146,7 @@ def test_nothing_changes_when_a_clock_of_any_width_wraps(robot, wrap, before):
     assert robot.status == ENABLED | MOVING
 
 
-def test_more_than_71_minutes_of_driving_are_uneventful(robot):
+def test_driving_for_more_than_71_minutes(robot):
     for _ in range(4400):
         robot.drive(100, 100, 1_000_000, period=200_000, ttl=25)
     assert robot.now < 200_000_000
@@ -1157,7 +1157,7 @@ def test_more_than_71_minutes_of_driving_are_uneventful(robot):
     assert robot.steps[0] * STEP == pytest.approx(440.0, abs=0.1)
 
 
-def test_counters_wrap_as_numbers_of_32_bits(robot):
+def test_counters_wrap_at_32_bits(robot):
     robot.call('poke_steps', 0, (1 << 31) - 3)
     robot.call('poke_steps', 1, -(1 << 31) + 3)
     robot.drive(1000, -1000, 200_000)
@@ -1167,7 +1167,7 @@ def test_counters_wrap_as_numbers_of_32_bits(robot):
     assert (1 << 31) - 200 < right < 1 << 31
 
 
-def test_speeds_at_the_ends_of_their_field_are_harmless(robot):
+def test_extreme_speeds_are_scaled(robot):
     for left, right in ((-32_768, 32_767), (32_767, -32_768), (-32_768, -32_768), (0, -32_768)):
         robot.drive(left, right, 1_500_000)
         scale = 10.0 / 32_768
@@ -1201,7 +1201,7 @@ def test_parameters_keep_their_bounds(robot, number):
     assert struct.unpack_from('<ii', answer, 9) == (low, high)
 
 
-def test_what_is_fixed_or_unknown_says_so(robot):
+def test_read_only_and_unknown_parameters_are_rejected(robot):
     assert robot.set(STEPS_PER_REV, 400) == (READ_ONLY, 200)
     assert robot.set(GYRO_RANGE, 250) == (READ_ONLY, 500)
     for number in (10, 11, 128, 255):
@@ -1210,7 +1210,7 @@ def test_what_is_fixed_or_unknown_says_so(robot):
 
 
 @pytest.mark.parametrize('number', [MICROSTEPS, INVERT])
-def test_what_must_not_change_under_way_waits_for_rest(robot, number):
+def test_microsteps_and_direction_change_only_at_rest(robot, number):
     before = robot.get(number)[1]
     robot.drive(1000, 1000, 100_000)
     assert robot.set(number, 2) == (BUSY, before)
@@ -1219,7 +1219,7 @@ def test_what_must_not_change_under_way_waits_for_rest(robot, number):
     assert robot.set(number, 2) == (OK, 2)
 
 
-def test_parameters_are_forgotten_at_boot_but_for_the_microsteps(robot):
+def test_boot_restores_the_parameter_defaults(robot):
     assert robot.set(MAX_SPEED, 123) == (OK, 123)
     robot.call('boot', 1, 0)
     robot.hello()
@@ -1236,7 +1236,7 @@ def test_odometry_is_reset_only_at_rest(robot):
     assert robot.act(3, seq=3) == bytes([0x14, SESSION, 3, 3, UNKNOWN])
 
 
-def test_a_repeated_action_is_answered_but_not_done_again(robot):
+def test_a_repeated_action_is_acknowledged_but_runs_once(robot):
     """The answer was lost, the host asks again, and the robot has moved meanwhile."""
     assert robot.act(1, seq=7)[4] == OK
     robot.drive(1000, 1000, 500_000)
@@ -1248,14 +1248,14 @@ def test_a_repeated_action_is_answered_but_not_done_again(robot):
     assert robot.steps == (0, 0)
 
 
-def test_counters_are_cleared_by_their_action(robot):
+def test_counters_are_cleared_by_the_action(robot):
     robot.send(robot.command(session=3))
     assert robot.counters()['bad_session'] == 1
     assert robot.act(2, seq=1)[4] == OK
     assert set(robot.counters().values()) == {0, 1}
 
 
-def test_each_packet_is_answered_with_what_it_asks_for(robot):
+def test_reply_to_each_kind_of_packet(robot):
     kinds = {
         'CMD': (robot.command(), 0x11),
         'PARAM_GET': (bytes([0x12, SESSION, 1, 0]), 0x12),
@@ -1277,7 +1277,7 @@ def test_each_packet_is_answered_with_what_it_asks_for(robot):
     assert len(robot.answer()) == 32
 
 
-def test_an_answer_waits_until_the_acknowledgement_is_off_the_air(robot):
+def test_a_reply_is_loaded_after_the_acknowledgement_is_sent(robot):
     robot.run(5000)
     loads = robot.call('loads')
     robot.send(robot.command())
@@ -1305,7 +1305,7 @@ def test_the_age_is_none_when_it_does_not_fit(robot):
     assert robot.ask(b'\x15\0\0\0')[22:24] == b'\xff\xff'
 
 
-def test_state_carries_what_the_sensors_say(robot):
+def test_state_contains_the_sensor_readings(robot):
     seven = (ctypes.c_int16 * 7)(164, -5, 8192, -4000, -12, 13, -131)
     robot.call('set_imu', ctypes.c_bool(True), seven)
     for channel, count in enumerate((0xFFFF, 0xFFFE, 300, 150, 600, 60, 0, 1023)):
@@ -1331,7 +1331,7 @@ def test_state_carries_what_the_sensors_say(robot):
     assert state[16:22] == bytes(6)
 
 
-def test_what_is_wider_than_the_radio_allows_is_not_even_read(robot):
+def test_an_oversized_payload_is_ignored(robot):
     """Some nRF24 report widths over 32 when a packet is crafted so."""
     for size in range(33, 256):
         robot.send((robot.command(5000, 5000, ESTOP) + bytes(300))[:size])
@@ -1340,7 +1340,7 @@ def test_what_is_wider_than_the_radio_allows_is_not_even_read(robot):
     assert robot.counters()['short'] == 223
 
 
-def test_malformed_packets_change_nothing_and_are_counted_by_kind(robot):
+def test_malformed_packets_are_ignored_and_counted_by_kind(robot):
     good = robot.command(5000, 5000)
     for size in range(32):
         if size not in (14, 22):
@@ -1361,7 +1361,7 @@ def test_malformed_packets_change_nothing_and_are_counted_by_kind(robot):
 # -- signed sessions ------------------------------------------------------------------------------
 
 
-def test_both_ends_say_when_only_one_has_a_key(library, robot, keyed):
+def test_a_key_at_one_end_only_is_rejected_and_reported(library, robot, keyed):
     refused = struct.pack('<BBBBI', 0x14, 7, 0, 0, 0)
     info = keyed.ask(refused)
     assert (info[0], info[1], len(info)) == (0x13, SESSION, 25)
@@ -1377,7 +1377,7 @@ def test_both_ends_say_when_only_one_has_a_key(library, robot, keyed):
     assert robot.status == 0
 
 
-def test_a_signed_session_drives_and_sets(keyed):
+def test_a_signed_session_drives_and_writes_parameters(keyed):
     keyed.drive(5000, 5000, 1_000_000)
     assert keyed.status == ENABLED | MOVING
     keyed.run(20_000)
@@ -1389,7 +1389,7 @@ def test_a_signed_session_drives_and_sets(keyed):
     assert keyed.counters()['bad_session'] == 0
 
 
-def test_a_repeated_hello_changes_nothing_and_a_new_one_makes_a_new_nonce(keyed):
+def test_a_new_hello_draws_a_nonce_and_a_repeated_one_does_not(keyed):
     first = keyed.hello()
     keyed.drive(5000, 5000, 500_000)
     assert keyed.hello()[17:] == first[17:]
@@ -1404,7 +1404,7 @@ def test_a_repeated_hello_changes_nothing_and_a_new_one_makes_a_new_nonce(keyed)
     assert len(seen) == 201
 
 
-def test_a_key_that_is_damaged_locks_the_robot_and_does_not_open_it(library):
+def test_a_damaged_key_locks_the_robot(library):
     for address in range(8, 26):
         robot = Robot(library, KEY)
         robot.call('poke_eeprom', ctypes.c_uint8(address), ctypes.c_uint8(0x55))
@@ -1417,7 +1417,7 @@ def test_a_key_that_is_damaged_locks_the_robot_and_does_not_open_it(library):
         assert robot.status == NO_SESSION
 
 
-def test_a_key_can_be_taken_away_again(library):
+def test_a_key_can_be_removed(library):
     robot = Robot(library, KEY)
     robot.call('store_key', None)
     robot.call('boot', 1, 0)
@@ -1425,7 +1425,7 @@ def test_a_key_can_be_taken_away_again(library):
     assert robot.hello()[1] == SESSION
 
 
-def test_the_clock_of_signed_frames_may_wrap_and_never_goes_back(library):
+def test_signed_clock_may_wrap_but_not_decrease(library):
     robot = Robot(library, KEY)
     robot.run(1000)
     robot.travel = robot.now + 5_000_000  # the host's clock wraps 5 s from now
@@ -1466,7 +1466,7 @@ def damage(generator, recorded):
     return bytes(frame)
 
 
-def test_no_forged_replayed_or_altered_frame_is_ever_executed(library):
+def test_no_forged_replayed_or_altered_frame_is_executed(library):
     """100 000 tries of somebody who has heard two sessions, but not the key.
 
     Stopping is always allowed, so a bit that makes a frame an emergency stop is honoured; but that
@@ -1526,7 +1526,7 @@ def test_one_frame_is_one_transaction_is_one_result(library):
     assert dongle.sent() == dongle.read() == b''  # nothing is repeated by itself
 
 
-def test_the_second_payload_is_skipped_when_nobody_took_the_first(library):
+def test_the_second_payload_is_skipped_without_acknowledgement(library):
     dongle = Dongle(library)
     dongle.write(tx(9, b'abc', b'def'))
     dongle.sent()
@@ -1544,7 +1544,7 @@ def test_the_second_payload_is_skipped_when_nobody_took_the_first(library):
         ((b'', 3, False), (3, 0x34), b'one'),
     ],
 )
-def test_the_last_answer_is_reported(library, second, statuses, payload):
+def test_the_last_reply_is_reported(library, second, statuses, payload):
     dongle = Dongle(library)
     dongle.write(tx(9, b'abc', b'def', gap=0))
     dongle.reply(b'one')
@@ -1571,7 +1571,7 @@ def test_nothing_is_queued(library):
     assert dongle.sent() == b'abc'
 
 
-def test_a_chip_that_dies_in_mid_exchange_is_given_up_and_set_anew(library):
+def test_a_dead_chip_times_out_and_is_configured_again(library):
     dongle = Dongle(library)
     dongle.write(tx(9, b'abc', b'def'))
     dongle.call('set_chip', ctypes.c_bool(False))
@@ -1585,14 +1585,14 @@ def test_a_chip_that_dies_in_mid_exchange_is_given_up_and_set_anew(library):
     assert dongle.read() == b''
 
 
-def test_an_answer_wider_than_the_radio_allows_is_none(library):
+def test_an_oversized_reply_is_dropped(library):
     dongle = Dongle(library)
     dongle.write(tx(9, b'abc'))
     dongle.reply(bytes(33))
     assert dongle.frames() == [b'\x81\x09\x01\x08' + bytes(4)]
 
 
-def test_the_radio_is_set_and_read_back(library):
+def test_radio_configuration_is_written_and_read_back(library):
     dongle = Dongle(library)
     dongle.write(b'\x02\x01')
     (standard,) = dongle.frames()
@@ -1610,7 +1610,7 @@ def test_the_radio_is_set_and_read_back(library):
     assert dongle.frames() == [b'\x82\x06' + wanted[2:] + b'\x01']
 
 
-def test_pong_tells_what_went_wrong_on_the_line(library):
+def test_pong_reports_the_errors_of_the_line(library):
     dongle = Dongle(library)
     dongle.run(5000)
     dongle.call('bytes', b'\x01\x01\x00' + b'\x04abc\x00' + bytes(3), ctypes.c_uint32(11))
@@ -1627,7 +1627,7 @@ def test_pong_tells_what_went_wrong_on_the_line(library):
     assert dongle.frames() == [b'\x8f\x01\x05', b'\x8f\x02\x03', b'\x8f\x02\x01']
 
 
-def test_a_cycle_through_dongle_and_robot_brings_a_state_of_just_now(library, robot):
+def test_a_cycle_returns_the_state_after_its_own_command(library, robot):
     """The POLL fetches what was sampled after the CMD of the same cycle, not of the one before."""
     dongle = Dongle(library)
     times = []
@@ -1658,7 +1658,7 @@ def test_a_cycle_through_dongle_and_robot_brings_a_state_of_just_now(library, ro
 
 
 @pytest.mark.slow
-def test_fuzzers_find_nothing(tmp_path):
+def test_fuzzers_find_no_error(tmp_path):
     """Ten million bytes and a million packets under the sanitizers."""
     if shutil.which('make') is None:
         pytest.skip('needs make')
@@ -1673,7 +1673,7 @@ def test_fuzzers_find_nothing(tmp_path):
     not (shutil.which('make') and shutil.which('avr-gcc') and shutil.which('simavr')),
     reason='needs make, avr-gcc and simavr',
 )
-def test_an_int_of_sixteen_bits_changes_nothing(tmp_path):
+def test_results_are_independent_of_the_int_width(tmp_path):
     """4500 packets through robot and dongle, on this machine and on a simulated ATmega2560."""
     run = subprocess.run(
         ['make', '-C', FIRMWARE, '-s', 'same', f'BUILD={tmp_path}'],

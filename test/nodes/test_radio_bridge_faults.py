@@ -48,14 +48,14 @@ class Served:
         self.emulator.plant.warm_up()
         self.port = PtyPort(path)
         self.watch = StopTimeMonitor(self.emulator)
-        note = self.emulator.board.followed
+        note = self.emulator.board.on_command
         self.followed = []
 
         def follow(now_us, command):
             note(now_us, command)
             self.followed.append((self.emulator.now_ns, command))
 
-        self.emulator.board.followed = follow
+        self.emulator.board.on_command = follow
         self.news = []
         self.back_ns = None
         self._todo = []
@@ -72,7 +72,7 @@ class Served:
         return self._ended
 
     def _look(self):
-        if said := self.watch.news():
+        if said := self.watch.poll():
             self.news.append(said)
         if not self.emulator.port_open:
             self.back_ns = self.emulator.now_ns
@@ -134,7 +134,7 @@ def test_a_killed_bridge_leaves_the_wheels_at_rest_in_time(world, fleet, tmp_pat
 
 
 def test_replugged_it_is_driven_again_within_a_second(world, served):
-    board = served(dongle_start=0.0)
+    board = served(dongle_boot_time=0.0)
     node = world.add(RadioBridgeNode, port=board.path)
     driver = Driver(world)
     driver.message = twist(0.1)

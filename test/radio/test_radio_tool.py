@@ -98,7 +98,7 @@ class Bench:
 
     def radio(self):
         """Return how the radio of the dongle is set."""
-        return self.emulator.dongle._radio
+        return self.emulator.dongle.radio
 
     def turn(self, wheel, revolutions, key=b'', speed=2.0, link=None):
         said = []
@@ -144,13 +144,13 @@ def test_a_key_goes_over_the_cable_and_is_told_apart_at_both_ends():
     assert f'{key_check(KEY):08x}' in key_provisioning.format_key_state(told)
     assert key_provisioning.holds_key(told, KEY)
     assert not key_provisioning.holds_key(told, OTHER)
-    assert bench.board.slot.gate().key == KEY
+    assert bench.board.key_store.create_verifier().key == KEY
     assert key_provisioning.holds_key(bench.at_robot(key_provisioning.write_key(OTHER)), OTHER)
     assert key_provisioning.holds_key(
         bench.at_robot(key_provisioning.write_key(key_provisioning.ERASE_KEY)),
         key_provisioning.ERASE_KEY,
     )
-    assert not bench.board.slot.gate().key
+    assert not bench.board.key_store.create_verifier().key
 
 
 def test_a_board_that_opening_its_port_has_reset_is_waited_for():
@@ -162,7 +162,7 @@ def test_a_board_that_opening_its_port_has_reset_is_waited_for():
 
 def test_a_damaged_key_is_told_and_put_right():
     bench = Bench(KEY)
-    bench.board.slot._cells[3] ^= 1
+    bench.board.key_store._cells[3] ^= 1
     bench.emulator.restart_robot()
     assert 'damaged' in key_provisioning.format_key_state(
         bench.at_robot(key_provisioning.read_key_state())
@@ -173,8 +173,8 @@ def test_a_damaged_key_is_told_and_put_right():
 def test_the_dongle_never_hears_a_key():
     bench = Bench()
     heard = []
-    take = bench.emulator.dongle._take
-    bench.emulator.dongle._take = lambda data: (heard.append(data), take(data))
+    take = bench.emulator.dongle._process
+    bench.emulator.dongle._process = lambda data: (heard.append(data), take(data))
     with pytest.raises(ProcedureError, match='this is the dongle'):
         bench.at_dongle(key_provisioning.write_key(KEY))
     assert heard
@@ -183,7 +183,7 @@ def test_the_dongle_never_hears_a_key():
 
 def test_a_moving_robot_takes_no_key_and_says_what_to_do():
     bench = Bench()
-    bench.each = lambda bench: bench.board.packet(
+    bench.each = lambda bench: bench.board.receive(
         bytes([0x14, 9, 0, 0]) + bytes(4)
         if bench.board.session != 9
         else bytes([0x11, 9, bench.now_ns // 1000 & 0x7F, CommandFlag.ENABLE, 20]) + bytes(9)

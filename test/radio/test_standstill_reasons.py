@@ -93,7 +93,7 @@ def the_button_is_held_while_it_is_released(bench):
 @cause('the emergency stop of the robot is latched')
 def a_stranger_stops_the_robot(bench):
     driving(bench)
-    bench.board.packet(encode(Command(9, 200, CommandFlag.ESTOP, 0, 0, 0, 0)))
+    bench.board.receive(encode(Command(9, 200, CommandFlag.ESTOP, 0, 0, 0, 0)))
     bench.run(0.3)
 
 

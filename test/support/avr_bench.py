@@ -1,9 +1,9 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The boards' real programs in simavr where else the Python emulator stands: same words and host.
+"""The real firmware of both boards in simavr, with the interface of the Python emulator.
 
-What the line does to bytes is the emulator's own; what the boards make of them is not. Their
-wheels drive the digital twin, and what its sensors would measure goes back to the robot's pins.
+The serial line is that of the emulator; the boards are not. Their step pulses drive the digital
+twin, and the values of its sensors are applied to the pins of the robot board.
 """
 
 from contextlib import contextmanager
@@ -30,14 +30,14 @@ from t3mpc_ros.simulation.sensors.range_sensor import output_voltage, sensor_mou
 from t3mpc_ros.simulation.world import cast_rays, load_world
 
 START_NS = 5_000_000_000
-KEY_PLACE = 8
+KEY_ADDRESS = 8
 BOOT_US = 130_000.0
 SLICE_US = 200.0
-"""Between two looks at the boards."""
+"""Period at which the boards are polled."""
 PLANT_US = 5000.0
-"""Between two looks of the twin at the pulses, and of the sensors at the twin."""
+"""Period of the plant and of its sensors."""
 DIVIDER = 4
-"""Before the converter that measures the battery."""
+"""Voltage divider of the battery measurement."""
 FIELDS = (
     'seq',
     'ttl_from_us',
@@ -51,8 +51,8 @@ STEP = math.tau / 3200
 
 
 @cache
-def places():
-    """Return where each field of the robot's variables is, as its compiler has laid them out."""
+def field_offsets():
+    """Return the offset of each field of the firmware's robot structure, from the compiler."""
     lines = [
         f'char at_{name.replace(".", "_")}[offsetof(struct t3_robot, {name}) + 1];'
         for name in FIELDS
@@ -79,7 +79,7 @@ def places():
 
 @contextmanager
 def on_avr(bench=Bench, **given):
-    """Yield a bench whose boards are simulated by instructions; check them at the end."""
+    """Yield a bench with both boards in simavr; check the boards at the end."""
     parameters = {name: given.pop(name) for name in ('flat', 'seed') if name in given}
     with contextmanager(booted)(parameters.get('seed', 1)) as boards:
         emulator = AvrEmulator(boards, key=given.get('key', b''), **parameters)
@@ -87,31 +87,31 @@ def on_avr(bench=Bench, **given):
 
 
 class Ram:
-    """The robot's variables, read while its program runs."""
+    """Variables of the robot firmware, read and written while it runs."""
 
     def __init__(self, boards):
         self._boards = boards
         self._base = boards.symbol(ROBOT, 'robot')
-        self._places = places()
+        self._offsets = field_offsets()
 
     def get(self, name, size, index=0, signed=False):
-        at = self._base + self._places[name] + index * size
+        at = self._base + self._offsets[name] + index * size
         data = bytes(self._boards.call('peek', ROBOT, at + i) for i in range(size))
         return int.from_bytes(data, 'little', signed=signed)
 
     def put(self, name, value, size=4):
-        at = self._base + self._places[name]
+        at = self._base + self._offsets[name]
         for i, byte in enumerate(value.to_bytes(size, 'little')):
             self._boards.call('poke', ROBOT, at + i, byte)
 
 
 class AvrBoard:
-    """The robot's program, under the words of ``t3mpc_ros.emulator.board.robot_board.RobotBoard``."""
+    """The robot firmware, with the interface of the emulated ``RobotBoard``."""
 
     def __init__(self, boards):
         self._boards = boards
         self.ram = Ram(boards)
-        self.followed = lambda now_us, command: None
+        self.on_command = lambda now_us, command: None
 
     @property
     def session(self):
@@ -119,7 +119,7 @@ class AvrBoard:
 
     @property
     def speeds(self):
-        """Of the ramp, urad/s."""
+        """Speeds of the ramp, urad/s."""
         return tuple(self.ram.get('ramp.speed', 4, wheel, True) for wheel in (0, 1))
 
     @property
@@ -130,40 +130,40 @@ class AvrBoard:
     def stale(self):
         return self.ram.get('counters.stale', 2)
 
-    def packet(self, data):
-        """Let a packet reach the robot's radio that the dongle has not sent."""
+    def receive(self, data):
+        """Inject a packet into the radio of the robot."""
         assert self._boards.call('inject', data, len(data), len(data))
 
 
 class AvrEmulator:
-    """Dongle and robot in simavr, their surroundings in Python, in virtual time."""
+    """Dongle and robot in simavr, with the plant and the serial line in Python, in virtual time."""
 
     def __init__(self, boards, flat=None, key=b'', seed=1):
         self.boards = boards
         parameters = EmulatorParameters.from_dict(flat or {})
         self._parameters = parameters
         if key:
-            boards.store(KEY_PLACE, key + crc16(key).to_bytes(2, 'little'))
+            boards.store(KEY_ADDRESS, key + crc16(key).to_bytes(2, 'little'))
         self.plant = Plant(parameters.twin)
         self.plant.boot(parameters.twin.motor.microsteps)
         self._world = load_world(parameters.twin.world)
         self._mounts = sensor_mounts(parameters.twin.range_sensor)
         self.distances = np.full(len(RANGE_SENSORS), math.inf)
-        """m, of the faces of the sensors from what is before them."""
+        """Distance in front of each range sensor, m."""
         self._plant_us = 0.0
         self._pulses = (0, 0)
         self.board = AvrBoard(boards)
-        self._ttl_from_us = self._seen_us = 0
+        self._ttl_from_us = self._ttl_start_us = 0
         self._events = EventQueue(START_NS)
         self.faults = FaultInjection(lambda: self._events.now_ns, seed)
-        self._air = (0.0, 0.0, False)
+        self._radio_faults = (0.0, 0.0, False)
         self._to_dongle = SerialLine(self._events, self.faults, self._write, 0)
-        self._to_host = SerialLine(self._events, self.faults, self._arrive, 0)
+        self._to_host = SerialLine(self._events, self.faults, self._deliver, 0)
         self._piece = b''
-        self._arrived = []
+        self._host_input = []
         self.port_open = True
-        self._deaf_until_ns = START_NS
-        self._look_around(0.0)
+        self._dongle_ready_ns = START_NS
+        self._update_plant(0.0)
         self._run(BOOT_US)
         self._offset_ns = START_NS - round(boards.now_us * 1000)
 
@@ -189,15 +189,15 @@ class AvrEmulator:
 
     def run_to(self, now_ns):
         self.run_until(now_ns)
-        arrived, self._arrived = self._arrived, []
-        return arrived
+        received, self._host_input = self._host_input, []
+        return received
 
     def run_until(self, now_ns):
         while self._events.now_ns < now_ns:
             until_ns = min(self._events.now_ns + round(SLICE_US * 1000), now_ns)
-            self._set_air()
+            self._apply_radio_faults()
             self._run((until_ns - self._offset_ns) / 1000 - self.boards.now_us)
-            self._note_followed()
+            self._report_command()
             self._read()
             self._events.run_to(until_ns)
 
@@ -206,45 +206,45 @@ class AvrEmulator:
         elapsed = self.boards.now_us - self._plant_us
         if elapsed >= PLANT_US:
             self._plant_us = self.boards.now_us
-            self._look_around(elapsed)
+            self._update_plant(elapsed)
 
     def _write(self, data):
-        if self.now_ns >= self._deaf_until_ns:
+        if self.now_ns >= self._dongle_ready_ns:
             self.boards.write(data)
 
     def _read(self):
-        """Hand on whole frames, as the emulator does."""
+        """Forward whole frames, like the emulator."""
         for byte in self.boards.read_bytes():
             self._piece += byte
             if byte == b'\0':
                 piece, self._piece = self._piece, b''
-                if self.now_ns >= self._deaf_until_ns:
+                if self.now_ns >= self._dongle_ready_ns:
                     self._to_host.send(piece)
 
-    def _arrive(self, data):
+    def _deliver(self, data):
         if self.port_open:
-            self._arrived.append((self.now_ns, data))
+            self._host_input.append((self.now_ns, data))
 
     # -- the robot --------------------------------------------------------------------------------
 
-    def _note_followed(self):
-        """Tell of a command that the wheels are to follow: its packet was the last one heard.
+    def _report_command(self):
+        """Report a command that sets the wheel speeds: the last packet that was received.
 
-        A look later than its time has changed: the program may be in the middle of taking it.
+        One poll after its time stamp has changed: the firmware may be interrupted in between.
         """
-        before, self._seen_us = self._seen_us, self.board.ram.get('ttl_from_us', 4)
-        if self._seen_us != before or self._seen_us in (self._ttl_from_us, 0):
+        before, self._ttl_start_us = self._ttl_start_us, self.board.ram.get('ttl_from_us', 4)
+        if self._ttl_start_us != before or self._ttl_start_us in (self._ttl_from_us, 0):
             return
-        self._ttl_from_us = self._seen_us
+        self._ttl_from_us = self._ttl_start_us
         command = decode_downlink(self.boards.heard())
         assert isinstance(command, Command)
         assert command.seq == self.board.ram.get('seq', 1)
         target = [self.board.ram.get('ramp.target', 4, wheel, True) for wheel in (0, 1)]
         assert target == [1000 * command.left, 1000 * command.right]
-        self.board.followed(self._seen_us, command)
+        self.board.on_command(self._ttl_start_us, command)
 
-    def _look_around(self, elapsed_us):
-        """Let the twin turn its wheels as the pulses say, and the robot's sensors see it."""
+    def _update_plant(self, elapsed_us):
+        """Advance the plant by the step pulses, and apply the values of its sensors to the pins."""
         boards, plant = self.boards, self.plant
         pulses = boards.pulses()
         if elapsed_us:
@@ -252,71 +252,74 @@ class AvrEmulator:
                 round((after - before) * STEP * 1e12 / elapsed_us)
                 for before, after in zip(self._pulses, pulses, strict=True)
             )
-            plant.power(self.powered)
-            plant.turn(left, right)
+            plant.set_power(self.powered)
+            plant.set_speeds(left, right)
             plant.run(round(elapsed_us))
         self._pulses = pulses
         registers = plant.registers
         boards.imu(registers is not None, registers or Registers())
         boards.call('millivolts', len(RANGE_SENSORS), plant.battery // DIVIDER)
         if self._world.segments.size or self._world.circles.size:
-            every = np.arange(len(RANGE_SENSORS))
+            sensors = np.arange(len(RANGE_SENSORS))
             walls = self._world.segments, self._world.circles
-            cast_rays(*plant.pose, self._mounts, every, *walls, self.distances)
+            cast_rays(*plant.pose, self._mounts, sensors, *walls, self.distances)
         for channel, distance in enumerate(self.distances):
             boards.call('millivolts', channel, round(1000.0 * output_voltage(distance)))
 
-    # -- what goes wrong --------------------------------------------------------------------------
+    # -- faults -----------------------------------------------------------------------------------
 
     def inject(self, name, duration=math.nan, value=math.nan):
-        """Let a fault of the emulator begin now."""
-        span = self.faults.add(Fault(name, 0.0, duration, value), self.now_ns)
-        begins, ends = self._effects(name)
-        begins()
-        if math.isfinite(span.end_ns):
-            self._events.at(round(span.end_ns), ends)
+        """Begin a fault of the emulator now."""
+        interval = self.faults.add(Fault(name, 0.0, duration, value), self.now_ns)
+        begin, end = self._effects(name)
+        begin()
+        if math.isfinite(interval.end_ns):
+            self._events.schedule(round(interval.end_ns), end)
 
-    def end(self, name):
+    def end_fault(self, name):
         self.faults.clear(name)
         self._effects(name)[1]()
 
     def _effects(self, name):
-        def nothing():
+        def no_action():
             pass
 
         effects = {
             'robot_reset': (self._reset_robot, self._reset_robot),
-            'imu_absent': (lambda: self._imu(True), lambda: self._imu(False)),
-            'button': (lambda: self._press(True), lambda: self._press(False)),
-            'dongle_reset': (self.restart_dongle, nothing),
-            'close_port': (self._pull_out, self._plug_in),
-            'radio_dead': (lambda: self._supply(False), lambda: self._supply(True)),
+            'imu_absent': (lambda: self._set_imu(False), lambda: self._set_imu(True)),
+            'button': (lambda: self._press_button(True), lambda: self._press_button(False)),
+            'dongle_reset': (self.restart_dongle, no_action),
+            'close_port': (self._unplug, self._plug_in),
+            'radio_dead': (
+                lambda: self._set_radio_power(False),
+                lambda: self._set_radio_power(True),
+            ),
         }
-        return effects.get(name, (nothing, nothing))
+        return effects.get(name, (no_action, no_action))
 
-    def _set_air(self):
+    def _apply_radio_faults(self):
         faults = self.faults
-        air = (
-            faults.share('loss', 'loss_down'),
-            faults.share('loss', 'loss_up'),
+        values = (
+            faults.combined_probability('loss', 'loss_down'),
+            faults.combined_probability('loss', 'loss_up'),
             faults.active('jam'),
         )
-        if air != self._air:
-            self._air = air
-            self.boards.call('loss', *air[:2])
-            self.boards.call('jam', air[2])
+        if values != self._radio_faults:
+            self._radio_faults = values
+            self.boards.call('loss', *values[:2])
+            self.boards.call('jam', values[2])
 
     def restart_dongle(self):
-        """Start the dongle's program anew, behind a boot loader that hears nothing."""
+        """Reset the dongle, followed by a boot loader that ignores all input."""
         self._to_dongle.clear()
         self._to_host.clear()
         self._piece = b''
         self.boards.call('reset', DONGLE)
-        self._deaf_until_ns = self.now_ns + round(self._parameters.dongle_start * 1e9)
+        self._dongle_ready_ns = self.now_ns + round(self._parameters.dongle_boot_time * 1e9)
 
-    def _pull_out(self):
+    def _unplug(self):
         self.port_open = False
-        self._arrived.clear()
+        self._host_input.clear()
         self.restart_dongle()
 
     def _plug_in(self):
@@ -326,13 +329,13 @@ class AvrEmulator:
     def _reset_robot(self):
         self.boards.call('reset', ROBOT)
 
-    def _imu(self, absent):
-        self.plant.imu_absent = absent
-        self._look_around(0.0)
+    def _set_imu(self, present):
+        self.plant.imu_absent = not present
+        self._update_plant(0.0)
 
-    def _press(self, pressed):
+    def _press_button(self, pressed):
         self.boards.call('press', pressed)
 
-    def _supply(self, on):
-        self.boards.suffered = True  # nobody tells the firmware: it goes on for a while
+    def _set_radio_power(self, on):
+        self.boards.rules_broken = True  # the firmware does not notice at once
         self.boards.call('radio_power', DONGLE, on)

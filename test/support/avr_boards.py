@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Both boards' firmware in simavr, as Python sees it: bytes in, bytes out, virtual time."""
+"""The firmware of both boards in simavr: bytes in, bytes out, virtual time."""
 
 from collections.abc import Iterator
 import ctypes
@@ -33,7 +33,7 @@ BUILD = FIRMWARE / 'build'
 DONGLE, ROBOT = 0, 1
 CYCLES_PER_US = 16
 GAP = 6
-"""Between both exchanges of a transaction, 250 us."""
+"""Gap between the exchanges of a transaction, in 250 us."""
 IMU = (100, 200, 16384, 3000, 10, 20, -131)
 """accel x, y, z, temperature, gyro x, y, z"""
 
@@ -74,7 +74,7 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
 
 
 def missing_tools() -> str:
-    """Return what is not installed, empty if the firmware can be built and run here."""
+    """Return the missing tools; empty if the firmware can be built and simulated."""
     tools = [name for name in ('make', 'gcc', 'avr-gcc') if shutil.which(name) is None]
     if not Path('/usr/include/simavr/sim_avr.h').exists():
         tools.append('libsimavr-dev')
@@ -85,7 +85,7 @@ def missing_tools() -> str:
 
 @cache
 def build() -> str:
-    """Build both programs and the simulator; return what make printed, sizes at the end."""
+    """Build both programs and the simulator; return the table of their sizes."""
     done = subprocess.run(
         ['make', '-C', str(FIRMWARE), 'avr', 'simavr'], capture_output=True, text=True
     )
@@ -102,7 +102,7 @@ def build() -> str:
 
 
 class Wheel(NamedTuple):
-    """What a stepper driver has seen; times in cycles."""
+    """Statistics of the pins of a stepper driver; times in cycles."""
 
     pulses: int
     unpowered: int
@@ -113,7 +113,7 @@ class Wheel(NamedTuple):
 
 
 class RadioCounts(NamedTuple):
-    """What a radio chip has done, and from ``early_spi`` on what should not happen."""
+    """Counters of a radio chip; from ``early_spi`` on, violations of its data sheet."""
 
     sent: int
     received: int
@@ -129,7 +129,7 @@ class RadioCounts(NamedTuple):
 
 
 class Boards:
-    """A dongle and a robot, and a host that speaks to them in whole frames."""
+    """A dongle and a robot, and a host that exchanges whole frames with them."""
 
     def __init__(self, seed: int = 1) -> None:
         self._library = ctypes.CDLL(str(BUILD / 'libt3simavr.so'))
@@ -145,7 +145,7 @@ class Boards:
         self.session = 0x5A
         self.seq = 0
         self.id = 0
-        self.suffered = False  # the test itself broke a rule of the radio's data sheet
+        self.rules_broken = False  # the test itself violated the data sheet of the radio
         self.imu(True)
         for channel in range(8):
             self.call('millivolts', channel, 1000)
@@ -175,7 +175,7 @@ class Boards:
         self.call('write', data, len(data))
 
     def read(self) -> list[tuple[bytes, float]]:
-        """Return the frames that came, and when each was through (us)."""
+        """Return the received frames, each with the time (us) of its last byte."""
         data, at = (c_uint8 * 4096)(), (c_uint64 * 4096)()
         count = self.call('read', data, at, 4096)
         frames = []
@@ -186,13 +186,13 @@ class Boards:
         return frames
 
     def read_bytes(self) -> list[bytes]:
-        """Return the bytes that came, one by one."""
+        """Return the received bytes, one by one."""
         data, at = (c_uint8 * 4096)(), (c_uint64 * 4096)()
         count = self.call('read', data, at, 4096)
         return [bytes(data[i : i + 1]) for i in range(count)]
 
     def wait(self, limit_us: float = 20000.0) -> tuple[bytes, float] | None:
-        """Return the next frame and when it was through; None after so long."""
+        """Return the next frame with the time of its last byte; None after the limit."""
         end = self.now_us + limit_us
         while self.now_us < end:
             if self.call('run_to_byte', round(end - self.now_us)):
@@ -201,7 +201,7 @@ class Boards:
         return None
 
     def ask(self, frame: Any, limit_us: float = 20000.0) -> Any:
-        """Return the dongle's answer to a frame, None if there is none."""
+        """Return the reply of the dongle to a frame, None if there is none."""
         self.write(encode_frame(codec.encode(frame)))
         found = self.wait(limit_us)
         return codec.decode_from_dongle(found[0]) if found else None
@@ -209,7 +209,7 @@ class Boards:
     # -- robot ------------------------------------------------------------------------------------
 
     def exchange(self, first: Any, second: Any = None, gap: int = GAP) -> Result:
-        """Return the RESULT of a transaction; without a second payload: a POLL for the state."""
+        """Return the RESULT of a transaction; the default second payload is a POLL of the state."""
         self.id = (self.id + 1) % 256
         second = Poll(self.session, 0, 0) if second is None else second
         frame = Transmit(self.id, gap, codec.encode(first), codec.encode(second))
@@ -219,7 +219,7 @@ class Boards:
         return result
 
     def request(self, first: Any, second: Any = None, gap: int = GAP) -> Any:
-        """Return what the robot answered, None if it did not."""
+        """Return the reply of the robot, None if there is none."""
         result = self.exchange(first, second, gap)
         return codec.decode_uplink(result.payload) if result.payload else None
 
@@ -248,7 +248,7 @@ class Boards:
         self.run(0.13)
         return self.hello()
 
-    # -- surroundings -----------------------------------------------------------------------------
+    # -- hardware ---------------------------------------------------------------------------------
 
     def imu(self, present: bool, seven: tuple[int, ...] = IMU) -> None:
         self.call('imu', present, (c_int16 * 7)(*seven))
@@ -267,7 +267,7 @@ class Boards:
         return RadioCounts(*eleven)
 
     def heard(self) -> bytes:
-        """Return the last packet that reached the robot's radio."""
+        """Return the last packet that the radio of the robot received."""
         data = (c_uint8 * 32)()
         size = self.call('heard', data)
         return bytes(data[:size])
@@ -292,15 +292,15 @@ class Boards:
 
 
 def booted(seed: int = 1) -> Iterator[Boards]:
-    """Yield a fresh pair; then check what holds whatever a test does with it."""
+    """Yield a new pair of boards; then check the conditions that hold after every test."""
     build()
     pair = Boards(seed)
     yield pair
-    # No data sheet is violated, and no step goes astray.
+    # No data sheet is violated, and no step is lost.
     for board in (DONGLE, ROBOT):
         counts = pair.radio(board)
         assert counts.unknown == counts.overfull == counts.queued_acks == 0
-        assert pair.suffered or counts.early_spi == counts.early_ce == 0
+        assert pair.rules_broken or counts.early_spi == counts.early_ce == 0
     for wheel in (0, 1):
         assert pair.wheel(wheel).unpowered == pair.wheel(wheel).hasty == 0
     assert pair.call('overruns') == 0
@@ -308,7 +308,7 @@ def booted(seed: int = 1) -> Iterator[Boards]:
 
 
 def cycle(boards: Boards, period: float, left: int = 0, right: int = 0) -> object:
-    """Return the state of one cycle that takes ``period`` in all."""
+    """Return the state after one cycle of ``period`` seconds."""
     end = boards.now_us + period * 1e6
     state = boards.drive(left, right)
     boards.run_until(end)
@@ -316,7 +316,7 @@ def cycle(boards: Boards, period: float, left: int = 0, right: int = 0) -> objec
 
 
 def drive(boards: Boards, seconds: float, left: int, right: int, period: float = 0.02) -> object:
-    """Return the last state of a drive."""
+    """Return the last state after driving for some seconds."""
     state = None
     for _ in range(round(seconds / period)):
         state = cycle(boards, period, left, right)

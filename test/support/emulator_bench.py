@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The host's end of the link against the emulator, in virtual time; hardware that only counts."""
+"""Bench of the host link against the emulator in virtual time, and a pulse-counting hardware."""
 
 import math
 import random
@@ -25,7 +25,7 @@ SAMPLE = Registers(164, -5, 8192, -4000, -12, 13, -131)
 
 
 class Bench:
-    """Runs a link and an emulator; whoever wants a fault injects it by name."""
+    """Runs a link against an emulator; faults are injected by name."""
 
     def __init__(self, flat=None, key=b'', robot_key=None, link=None, seed=1, emulator=None):
         robot_key = key if robot_key is None else robot_key
@@ -33,7 +33,7 @@ class Bench:
             parameters = EmulatorParameters.from_dict(flat or {})
             emulator = Emulator(parameters, robot_key, seed, START_NS)
         self.emulator = emulator
-        """Or whatever behaves like one: ``avr_bench.AvrEmulator`` does."""
+        """The emulator, or an object with its interface such as ``avr_bench.AvrEmulator``."""
         self.link = Link(link or LinkParameters(), key, random.Random(seed).randbytes)
         self.now_ns = emulator.now_ns
         self.is_open = False
@@ -42,13 +42,13 @@ class Bench:
         self.wheels = None
         self.commanded_ns = 0
         self.written = []
-        """Each piece of data that the host has written, with its time."""
+        """Each write of the host, with its time."""
         self.followed = []
-        """Each command that the robot has followed, with the time of the host."""
+        """Each command that the robot has executed, with its time."""
         self.each = None
-        self.emulator.board.followed = self._note
+        self.emulator.board.on_command = self._record_command
 
-    def _note(self, now_us, command):
+    def _record_command(self, now_us, command):
         self.followed.append((self.emulator.now_ns, command))
 
     @property
@@ -63,7 +63,7 @@ class Bench:
         self.emulator.inject(*arguments)
 
     def run(self, seconds, until=None):
-        """Let time pass; return how long it took until ``until`` held."""
+        """Run for a time or until ``until`` holds; return the elapsed time, s."""
         start, end = self.now_ns, self.now_ns + round(seconds * 1e9)
         while self.now_ns < end:
             self._command()
@@ -78,7 +78,7 @@ class Bench:
         return seconds
 
     def _wait(self, end):
-        """Let time pass until the link or whoever drives it has something to do."""
+        """Advance to the next event of the link, the setpoint or the emulator."""
         times = [max(self.wake_ns, self.now_ns + 1000), end]
         if self.wheels is not None:
             times.append(max(self.commanded_ns + 20 * MS, self.now_ns + 1000))
@@ -86,13 +86,13 @@ class Bench:
         while True:
             next_ns = self.emulator.next_ns
             self.now_ns = until if next_ns is None else max(min(until, next_ns), self.now_ns)
-            arrived = self.emulator.run_to(self.now_ns)
+            received_blocks = self.emulator.run_to(self.now_ns)
             if self.is_open and not self.emulator.port_open:
                 self.is_open = False
                 self.link.port_failed('dongle is not there', True, self.now_ns)
                 return
-            if arrived and self.is_open:
-                self._step(b''.join(data for _, data in arrived))
+            if received_blocks and self.is_open:
+                self._step(b''.join(data for _, data in received_blocks))
                 return
             if self.now_ns >= until:
                 return
@@ -101,56 +101,56 @@ class Bench:
         if self.killed:
             self.wake_ns = self.now_ns + 1000 * MS
             return
-        deeds = self._ask(received)
-        while deeds:
-            deed = deeds.pop(0)
-            if isinstance(deed, Wait):
-                self.wake_ns = deed.until_ns
-            elif isinstance(deed, Write) and self.is_open:
-                self.written.append((self.now_ns, deed.data))
-                self.emulator.feed(deed.data, self.now_ns)
-            elif isinstance(deed, Close):
+        actions = self._step_link(received)
+        while actions:
+            action = actions.pop(0)
+            if isinstance(action, Wait):
+                self.wake_ns = action.until_ns
+            elif isinstance(action, Write) and self.is_open:
+                self.written.append((self.now_ns, action.data))
+                self.emulator.feed(action.data, self.now_ns)
+            elif isinstance(action, Close):
                 self.is_open = False
-            elif isinstance(deed, Open):
+            elif isinstance(action, Open):
                 self.is_open = self.emulator.port_open
                 if self.is_open:
                     self.link.port_opened(self.now_ns)
                 else:
                     self.link.port_failed('dongle is not there', True, self.now_ns)
                 self.wake_ns = self.now_ns
-                deeds = []
+                actions = []
 
     def _command(self):
         if self.wheels is not None and self.now_ns >= self.commanded_ns + 20 * MS:
             self.commanded_ns = self.now_ns
-            self._order(RobotCommand(self.wheels, self.now_ns))
+            self._send_setpoint(RobotCommand(self.wheels, self.now_ns))
 
-    def _ask(self, received):
+    def _step_link(self, received):
         return self.link.step(self.now_ns, received)
 
-    def _order(self, command):
+    def _send_setpoint(self, command):
         self.link.command(command, self.now_ns)
 
     def drive(self, right, left):
-        """Command these wheel speeds fifty times a second from now on."""
+        """Command these wheel speeds 50 times a second from now on."""
         self.wheels = WheelSpeeds(right, left)
 
     def release_controls(self):
-        """Command nothing any more."""
+        """Send no more setpoints."""
         self.wheels = None
 
     def kill(self):
-        """Let the host be gone in the middle of whatever it does, as SIGKILL does."""
+        """Stop the host at once, like SIGKILL."""
         self.killed = True
         self.wheels = None
 
     def connect(self):
-        """Run until the link runs."""
+        """Run until the link is in the state RUN; return the elapsed time, s."""
         return self.run(10.0, lambda: self.link.state is LinkState.RUN)
 
 
 class RobotBench(Bench):
-    """A bench whose host is the bridge's: guard, odometry and slip stop around the link."""
+    """Bench with the host side of the radio bridge: limiter, odometry and slip monitor."""
 
     def __init__(self, parameters=None, **given):
         super().__init__(**given)
@@ -159,17 +159,17 @@ class RobotBench(Bench):
         self.link = self.robot.link
         self.states = []
 
-    def _ask(self, received):
-        deeds = self.robot.step(self.now_ns, received)
+    def _step_link(self, received):
+        actions = self.robot.step(self.now_ns, received)
         self.states += self.robot.take_states()
-        return deeds
+        return actions
 
-    def _order(self, command):
+    def _send_setpoint(self, command):
         self.robot.apply(command, self.now_ns)
 
 
 def sent_commands(*benches):
-    """Return every command in what the hosts have written; of one host in order."""
+    """Return every command in the writes of the hosts, each host in order."""
     found = []
     for bench in benches:
         splitter = FrameDecoder()
@@ -183,7 +183,7 @@ def sent_commands(*benches):
 
 
 def check_followed(bench, *others):
-    """Every command that was followed was sent, once, in the order of its host, and is not old."""
+    """Check the executed commands: sent by a host, unique, in order, and not stale."""
     sent = sent_commands(bench, *others)
     position = {command: index for index, command in enumerate(sent)}
     assert len(position) == len(sent)
@@ -191,13 +191,13 @@ def check_followed(bench, *others):
     for now_ns, command in bench.followed:
         order.setdefault(command.session, []).append(position[command])
         age = (now_ns // 1000 - command.host_us) % (1 << 32) / 1e6
-        assert age <= TTL_AND_SLACK, f'{command} was followed after {age} s'
+        assert age <= TTL_AND_SLACK, f'{command} was executed after {age} s'
     for followed in order.values():
         assert followed == sorted(set(followed))
 
 
 class PulseCounter:
-    """Hardware that steps exactly: a phase of each wheel, cut to whole pulses."""
+    """Hardware with exact pulse counters: one phase per wheel, rounded down."""
 
     def __init__(self):
         self.phase = [0.0, 0.0]
@@ -215,10 +215,10 @@ class PulseCounter:
         for wheel in (0, 1):
             self.phase[wheel] += self.speeds[wheel] * elapsed_us * self.gain
 
-    def turn(self, left, right):
+    def set_speeds(self, left, right):
         self.speeds = left, right
 
-    def power(self, on):
+    def set_power(self, on):
         self.on = on
 
     @property

@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol
 
 
 class Registers(NamedTuple):
-    """What the MPU6050 last measured, as its registers hold it."""
+    """Newest sample of the MPU6050, as raw register values."""
 
     accel_x: int = 0
     accel_y: int = 0
@@ -18,32 +18,32 @@ class Registers(NamedTuple):
 
 
 class Hardware(Protocol):
-    """What the board drives and reads; left first."""
+    """Motors, sensors and battery of the board; wheel order left, right."""
 
     def run(self, elapsed_us: int) -> None:
-        """Let time pass, by the board's clock."""
+        """Advance by a time on the clock of the board."""
 
-    def turn(self, left: int, right: int) -> None:
-        """Step both motors at these speeds (urad/s) from now on."""
+    def set_speeds(self, left: int, right: int) -> None:
+        """Set the speed of both motors (urad/s)."""
 
-    def power(self, on: bool) -> None:
-        """Give power to both drivers, or take it away."""
+    def set_power(self, on: bool) -> None:
+        """Switch the power of both motor drivers."""
 
     def boot(self, microsteps: int) -> None:
-        """Start with both counters at zero, for drivers set to so many microsteps."""
+        """Reset both counters, and set the drivers to this number of microsteps per step."""
 
     @property
     def counters(self) -> tuple[int, int]:
-        """Pulses issued since the start, by the direction of the pins."""
+        """Pulses issued since boot, signed by the direction pins."""
 
     @property
     def registers(self) -> Registers | None:
-        """The newest sample of the inertial sensor; None while it does not answer."""
+        """Newest sample of the IMU; None while it does not respond."""
 
     @property
     def ranges(self) -> bytes:
-        """A code for each of the eight distance sensors."""
+        """Range code of each of the eight range sensors."""
 
     @property
     def battery(self) -> int:
-        """mV; 0: nothing is wired to the converter."""
+        """Battery voltage, mV; 0: not connected to the converter."""

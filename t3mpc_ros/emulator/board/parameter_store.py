@@ -17,36 +17,36 @@ from t3mpc_ros.radio.protocol.frames import BOARD_PARAMETERS
     IDLE_OFF,
     INVERT_WHEELS,
 ) = range(len(BOARD_PARAMETERS))
-_AT_REST = (MICROSTEPS, INVERT_WHEELS)
+_ONLY_AT_REST = (MICROSTEPS, INVERT_WHEELS)
 
 
 class ParameterStore:
-    """The values in force, by id; read them with ``parameters[MAX_SPEED]``."""
+    """Current parameter values by id; read with ``store[MAX_SPEED]``."""
 
     def __init__(self) -> None:
-        self._stored = BOARD_PARAMETERS[MICROSTEPS].default
-        self.restart()
+        self._stored_microsteps = BOARD_PARAMETERS[MICROSTEPS].default
+        self.reset()
 
     def __getitem__(self, number: int) -> int:
         return self._values[number]
 
-    def restart(self) -> None:
-        """Forget what was written, but for the microsteps, which hold from now on."""
+    def reset(self) -> None:
+        """Restore the defaults; the microsteps written last become effective."""
         self._values = [parameter.default for parameter in BOARD_PARAMETERS]
-        self._values[MICROSTEPS] = self._stored
+        self._values[MICROSTEPS] = self._stored_microsteps
 
     def set(self, number: int, value: int, busy: bool) -> int:
-        """Change a parameter if everything allows it; return the result for the host."""
+        """Write a parameter if it exists, is writable and in range; return the result code."""
         if number >= len(BOARD_PARAMETERS):
             return frames.UNKNOWN
-        row = BOARD_PARAMETERS[number]
-        if row.low == row.high:
+        parameter = BOARD_PARAMETERS[number]
+        if parameter.low == parameter.high:
             return frames.READ_ONLY
-        if not row.low <= value <= row.high:
+        if not parameter.low <= value <= parameter.high:
             return frames.OUT_OF_RANGE
-        if number in _AT_REST and busy and value != self._values[number]:
+        if number in _ONLY_AT_REST and busy and value != self._values[number]:
             return frames.BUSY
         self._values[number] = value
         if number == MICROSTEPS:
-            self._stored = value
+            self._stored_microsteps = value
         return frames.OK

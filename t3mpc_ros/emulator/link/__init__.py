@@ -1,3 +1,3 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Emulated dongle, serial line and radio channel."""
+"""Emulated link from the host to the robot board: serial line, dongle, radio channel."""

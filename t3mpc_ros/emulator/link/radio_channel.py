@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Radio channel between two nRF24L01+ transceivers, packet by packet, with data-sheet timing.
 
-Product specification 1.0: 7.4 (retransmission), 7.5 (acknowledgement with payload), 6.1.7 (timing).
+nRF24L01+ product specification 1.0: 7.4 (retransmission), 7.5 (acknowledgement with payload),
+6.1.7 (timing).
 """
 
 from collections.abc import Callable
@@ -13,7 +14,7 @@ from t3mpc_ros.emulator.event_queue import EventQueue
 from t3mpc_ros.emulator.fault_injection import FaultInjection
 
 SETTLE_US = 130.0
-"""From standby to the air."""
+"""Transmitter settling time, standby to first bit."""
 _BITS_PER_US = (0.25, 1.0, 2.0)
 _OVERHEAD = 1 + 5 + 2
 """Bytes of preamble, address and CRC."""
@@ -21,11 +22,11 @@ _CONTROL_BITS = 9
 _DELAY_UNIT_US = 250.0
 
 ExchangeCallback = Callable[[bool, int, bytes], None]
-"""Told whether a packet was acknowledged, after how many retransmissions, with what payload."""
+"""Called with: acknowledged, number of retransmissions, payload of the acknowledgement."""
 
 
 class RadioParameters(NamedTuple):
-    """How a chip is set, as a CFG frame says it."""
+    """Configuration of a transceiver, with the fields of a CFG frame."""
 
     channel: int = 82
     rate: int = 1
@@ -35,16 +36,16 @@ class RadioParameters(NamedTuple):
     address: bytes = b'T3MPC'
 
     def air_us(self, size: int) -> float:
-        """Return how long a payload of ``size`` bytes is in the air."""
+        """Return the on-air time of a payload of ``size`` bytes."""
         return (8 * (_OVERHEAD + size) + _CONTROL_BITS) / _BITS_PER_US[self.rate]
 
     @property
-    def delay_us(self) -> float:
-        """From the end of a packet to the start of the next try."""
+    def retry_delay_us(self) -> float:
+        """Delay from the end of a packet to the start of its retransmission."""
         return _DELAY_UNIT_US * (self.retry_delay + 1)
 
-    def hears(self, other: 'RadioParameters') -> bool:
-        """Decide whether chips set like this and like ``other`` can hear each other."""
+    def matches(self, other: 'RadioParameters') -> bool:
+        """Return whether two transceivers receive each other."""
         return (self.channel, self.rate, self.address) == (
             other.channel,
             other.rate,
@@ -57,109 +58,105 @@ class RadioChannel:
 
     Parameters
     ----------
-    agenda
-        Where what happens later is noted.
+    events
+        Queue in which receptions are scheduled.
     robot
-        How the robot's chip is set.
-    receive
-        Brings the robot to this instant and returns whether it listens.
+        Configuration of the robot's transceiver.
+    advance_robot
+        Advances the robot to now; returns whether its receiver is on.
     deliver
-        Hands the robot a payload that it has received now.
+        Receives each payload that reaches the robot.
     faults
-        Of the radio.
-    dice
-        Used for nothing else: two numbers for each try, whatever is set.
+        Faults of the radio.
+    generator
+        Random generator of this channel alone: two numbers per transmission, whatever the faults.
     """
 
     def __init__(
         self,
         events: EventQueue,
         robot: RadioParameters,
-        receive: Callable[[], bool],
+        advance_robot: Callable[[], bool],
         deliver: Callable[[bytes], None],
         faults: FaultInjection,
-        dice: random.Random,
+        generator: random.Random,
     ) -> None:
         self._events = events
         self._robot = robot
-        self._receive = receive
+        self._advance_robot = advance_robot
         self._deliver = deliver
         self._faults = faults
-        self._dice = dice
-        self._waiting: bytes | None = None
+        self._generator = generator
+        self._ack_payload: bytes | None = None
         self._fetched = False
 
     def load(self, payload: bytes) -> None:
-        """Replace what the next packet fetches: the robot empties its FIFO first."""
-        self._waiting, self._fetched = payload, False
+        """Replace the acknowledgement payload: the robot flushes its FIFO before each load."""
+        self._ack_payload, self._fetched = payload, False
 
     def clear(self) -> None:
-        """Forget what waits, as a chip without power does."""
-        self._waiting = None
+        """Discard the acknowledgement payload, as on loss of power."""
+        self._ack_payload = None
 
-    def send(self, payload: bytes, parameters: RadioParameters, done: ExchangeCallback) -> None:
-        """Send a packet, and again if nobody acknowledges it, and tell what became of it."""
-        _Exchange(self, payload, parameters, done).begin()
+    def send(self, payload: bytes, radio: RadioParameters, done: ExchangeCallback) -> None:
+        """Send a packet with automatic retransmission; call ``done`` with the outcome."""
+        _Exchange(self, payload, radio, done).begin()
 
-    def _hear(self, payload: bytes, parameters: RadioParameters, again: bool) -> bytes | None:
-        """Return the payload of the robot's acknowledgement; None if it has heard nothing.
+    def _receive(self, payload: bytes, radio: RadioParameters, repeated: bool) -> bytes | None:
+        """Return the payload of the robot's acknowledgement; None if it received nothing.
 
-        A packet that comes again (same number and CRC) is acknowledged and dropped. What was
-        fetched stays in the FIFO until a new packet says that it has arrived.
+        A repeated packet (same PID and CRC) is acknowledged and dropped. A fetched payload stays
+        in the FIFO until a packet with a new PID confirms its reception.
         """
-        listens = self._receive() and parameters.hears(self._robot)
-        lost = self._dice.random() < self._faults.share('loss', 'loss_down')
-        if not listens or lost or self._faults.active('jam'):
+        receives = self._advance_robot() and radio.matches(self._robot)
+        lost = self._generator.random() < self._faults.combined_probability('loss', 'loss_down')
+        if not receives or lost or self._faults.active('jam'):
             return None
-        if not again and self._fetched:
-            self._waiting = None
-        answer = self._waiting or b''
+        if not repeated and self._fetched:
+            self._ack_payload = None
+        reply = self._ack_payload or b''
         self._fetched = True
-        if not again:
-            self._deliver(self._faults.corrupt(payload, 'wrong_version'))
-        return self._faults.corrupt(answer, 'wrong_version')
+        if not repeated:
+            self._deliver(self._faults.corrupt(payload))
+        return self._faults.corrupt(reply)
 
-    def _returns(self) -> bool:
-        lost = self._dice.random() < self._faults.share('loss', 'loss_up')
+    def _acknowledgement_arrives(self) -> bool:
+        lost = self._generator.random() < self._faults.combined_probability('loss', 'loss_up')
         return not lost and not self._faults.active('jam')
 
 
 class _Exchange:
-    """One packet on its way, try after try."""
+    """One packet with its retransmissions and its acknowledgement."""
 
     def __init__(
-        self,
-        channel: RadioChannel,
-        payload: bytes,
-        parameters: RadioParameters,
-        done: ExchangeCallback,
+        self, channel: RadioChannel, payload: bytes, radio: RadioParameters, done: ExchangeCallback
     ) -> None:
         self._channel = channel
         self._payload = payload
-        self._parameters = parameters
+        self._radio = radio
         self._done = done
-        self._heard = False
-        self._tries = 0
+        self._received = False
+        self._retransmissions = 0
 
     def begin(self) -> None:
-        arrives = SETTLE_US + self._parameters.air_us(len(self._payload))
-        self._channel._events.after_us(arrives, self._arrive)
+        arrival = SETTLE_US + self._radio.air_us(len(self._payload))
+        self._channel._events.schedule_after(arrival, self._arrive)
 
     def _arrive(self) -> None:
-        parameters, events = self._parameters, self._channel._events
-        answer = self._channel._hear(self._payload, parameters, self._heard)
-        returns = self._channel._returns()
-        delay = parameters.delay_us
-        if answer is not None:
-            self._heard = True
-            takes = SETTLE_US + parameters.air_us(len(answer))
-            # An acknowledgement that is longer than the delay is cut off by the next try.
-            if returns and takes <= delay:
-                retries = self._tries
-                events.after_us(takes, lambda: self._done(True, retries, answer))
+        radio, events = self._radio, self._channel._events
+        reply = self._channel._receive(self._payload, radio, self._received)
+        acknowledged = self._channel._acknowledgement_arrives()
+        delay = radio.retry_delay_us
+        if reply is not None:
+            self._received = True
+            duration = SETTLE_US + radio.air_us(len(reply))
+            # The retransmission cuts off an acknowledgement longer than the delay.
+            if acknowledged and duration <= delay:
+                count = self._retransmissions
+                events.schedule_after(duration, lambda: self._done(True, count, reply))
                 return
-        if self._tries < parameters.retries:
-            self._tries += 1
-            events.after_us(delay + parameters.air_us(len(self._payload)), self._arrive)
+        if self._retransmissions < radio.retries:
+            self._retransmissions += 1
+            events.schedule_after(delay + radio.air_us(len(self._payload)), self._arrive)
         else:
-            events.after_us(delay, lambda: self._done(False, self._tries, b''))
+            events.schedule_after(delay, lambda: self._done(False, self._retransmissions, b''))

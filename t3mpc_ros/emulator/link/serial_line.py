@@ -14,48 +14,48 @@ _SPLIT_NS = 2_000_000
 
 
 class SerialLine:
-    """Brings pieces of data to the other end: in order, at the pace of the line.
+    """Delivers blocks of data to the other end, in order and at the baud rate.
 
-    A piece arrives as a whole when its last byte does.
+    A block is delivered as a whole when its last byte arrives.
 
     Parameters
     ----------
-    agenda
-        Where arrivals are noted.
+    events
+        Queue in which deliveries are scheduled.
     faults
-        Of the line.
-    arrive
-        Takes each piece at its time.
+        Faults of the line.
+    deliver
+        Receives each block on arrival.
     byte_ns
-        Time of a byte; 0 where somebody else keeps the pace of the line.
+        Transmission time of a byte; 0 if the baud rate is simulated elsewhere.
     """
 
     def __init__(
         self,
         events: EventQueue,
         faults: FaultInjection,
-        arrive: Callable[[bytes], None],
+        deliver: Callable[[bytes], None],
         byte_ns: int = BYTE_NS,
     ) -> None:
         self._events = events
         self._faults = faults
-        self._arrive = arrive
+        self._deliver = deliver
         self._byte_ns = byte_ns
-        self._busy_ns = 0
-        """Until when there are bytes on the line."""
+        self._busy_until_ns = 0
         self._held = b''
+        """Frame that the ``reorder`` fault sends after the next one."""
         self._generation = 0
 
     def clear(self) -> None:
-        """Lose what is on its way."""
+        """Discard all data in transit."""
         self._generation += 1
         self._held = b''
-        self._busy_ns = 0
+        self._busy_until_ns = 0
 
     def send(self, data: bytes) -> None:
-        """Put a piece of data on the line now."""
+        """Send a block of data now."""
         faults = self._faults
-        data = self._damaged(data)
+        data = self._corrupt(data)
         if not data or faults.active('silence'):
             return
         if self._held:
@@ -64,46 +64,42 @@ class SerialLine:
             self._held = data
             return
         if len(data) > 1 and faults.occurs('split'):
-            at = faults.dice['split'].randrange(1, len(data))
-            self._put(data[:at], 0)
-            self._put(data[at:], _SPLIT_NS)
+            at = faults.generators['split'].randrange(1, len(data))
+            self._transmit(data[:at], 0)
+            self._transmit(data[at:], _SPLIT_NS)
         else:
-            self._put(data, 0)
+            self._transmit(data, 0)
 
-    def _put(self, data: bytes, later_ns: int) -> None:
+    def _transmit(self, data: bytes, later_ns: int) -> None:
         now = self._events.now_ns
         start = now + later_ns + round(self._faults.value('delay') * NANOSECONDS)
-        stall = self._faults.span('stall')
+        stall = self._faults.interval('stall')
         if stall is not None:
             start = max(start, round(min(stall.end_ns, now + 1e15)))
-        end = max(start, self._busy_ns) + self._byte_ns * len(data)
-        self._busy_ns = end
+        end = max(start, self._busy_until_ns) + self._byte_ns * len(data)
+        self._busy_until_ns = end
         generation = self._generation
 
-        def arrive() -> None:
+        def deliver() -> None:
             if generation == self._generation:
-                self._arrive(data)
+                self._deliver(data)
 
-        self._events.at(end, arrive)
+        self._events.schedule(end, deliver)
 
-    def _damaged(self, data: bytes) -> bytes:
+    def _corrupt(self, data: bytes) -> bytes:
         faults = self._faults
-        shares = {
-            name: share
-            for name in ('drop_bytes', 'flip_bits', 'duplicate_bytes', 'insert_bytes')
-            if (share := faults.value(name)) > 0.0
-        }
-        if not shares:
+        names = ('drop_bytes', 'flip_bits', 'duplicate_bytes', 'insert_bytes')
+        if all(faults.value(name) <= 0.0 for name in names):
             return data
-        damaged = bytearray()
+        corrupted = bytearray()
         for value in data:
             byte = value
             if faults.occurs('insert_bytes'):
-                damaged.append(faults.dice['insert_bytes'].randrange(256))
+                corrupted.append(faults.generators['insert_bytes'].randrange(256))
             if faults.occurs('flip_bits'):
-                byte ^= 1 << faults.dice['flip_bits'].randrange(8)
+                byte ^= 1 << faults.generators['flip_bits'].randrange(8)
             if not faults.occurs('drop_bytes'):
-                damaged.append(byte)
+                corrupted.append(byte)
             if faults.occurs('duplicate_bytes'):
-                damaged.append(byte)
-        return bytes(damaged)
+                corrupted.append(byte)
+        return bytes(corrupted)
