@@ -1,7 +1,7 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-# Sourced by every script: makes or renews the local environment .venv, then offers $PYTHON.
-# Nothing but Python 3.11 to 3.14 and a reachable package index is needed; no system ROS.
+# Sourced by every script: creates or updates the local environment .venv, and sets $PYTHON.
+# Requires Python 3.11 to 3.14 and a package index; a system ROS is neither required nor used.
 
 set -euo pipefail
 
@@ -21,7 +21,7 @@ usable() {
   "$1" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))' >/dev/null 2>&1
 }
 
-# What an environment made here with Python $1 belongs to: when it changes, .venv is made anew.
+# Print the origin of .venv for Python $1: location, interpreter, version. A change recreates .venv.
 origin_of() {
   printf '%s ' "$ROOT"
   "$1" -c 'import sys; from os.path import realpath as r; print(r(sys.base_prefix), *sys.version_info[:2])' 2>/dev/null
@@ -35,15 +35,15 @@ choose_python() {
       return
     fi
     fail "T3MPC_PYTHON=$T3MPC_PYTHON is not a Python from 3.11 to 3.14 ($(version_of "$T3MPC_PYTHON"))" \
-      "set it to one that is, such as T3MPC_PYTHON=/usr/bin/python3.12, or unset it to have one looked for"
+      "set it to another Python, T3MPC_PYTHON=/usr/bin/python3.12 for example, or unset it"
   fi
-  # The one that .venv was made with stays: no need to name it again at every call.
+  # The Python of an existing .venv remains in use without T3MPC_PYTHON.
   if [ -x "$PYTHON" ] && [ "$(origin_of "$PYTHON")" = "$(cat "$VENV/origin" 2>/dev/null)" ]; then
     printf '%s\n' "$PYTHON"
     return
   fi
   for candidate in python3 python3.14 python3.13 python3.12 python3.11; do
-    # Not the one of .venv itself, which may be about to be deleted.
+    # Skip the Python of .venv itself: it may be deleted below.
     candidate="$(PATH="${PATH//"$VENV/bin:"/}" command -v "$candidate")" || continue
     if usable "$candidate"; then
       printf '%s\n' "$candidate"
@@ -59,7 +59,7 @@ version_of() {
   if command -v "$1" >/dev/null; then "$1" --version 2>&1 | tail -n 1 || true; else echo 'not found'; fi
 }
 
-# What is installed into the environment: when any of it changes, the environment is stale.
+# Print the hash of everything that determines the content of the environment.
 wanted_stamp() {
   {
     origin_of "$BASE_PYTHON"
@@ -76,11 +76,11 @@ make_environment() {
   : >"$LOG"
   origin="$(origin_of "$BASE_PYTHON")"
   if [ "$(cat "$VENV/origin" 2>/dev/null)" = "$origin" ]; then
-    say "bringing the local environment .venv up to date (log: $LOG)"
+    say "updating the local environment .venv (log: $LOG)"
   else
-    say "making the local environment .venv (once, about a minute; log: $LOG)"
+    say "creating the local environment .venv (once, about a minute; log: $LOG)"
     "$BASE_PYTHON" -m venv --clear "$VENV" >>"$LOG" 2>&1 ||
-      fail "the environment could not be made with $BASE_PYTHON: $(tail -n 1 "$LOG")" \
+      fail "the environment could not be created with $BASE_PYTHON: $(tail -n 1 "$LOG")" \
         "install Python's venv module (Debian and Ubuntu: apt install python3-venv), then run $0 again"
     printf '%s\n' "$origin" >"$VENV/origin"
   fi
@@ -91,10 +91,10 @@ make_environment() {
     fail "the libraries could not be installed with $("$PYTHON" --version) on $(uname -sm)" \
       "check the network and the package index (\"$PYTHON -m pip config list\"; proxies: HTTPS_PROXY), then run $0 again; the wheels of ROS 2 exist for Linux on x86_64"
   fi
-  say "  installing t3mpc_ros itself, as colcon would"
-  # What somebody's own "pip install" left there would hide the executables that are new.
+  say "  installing t3mpc_ros"
+  # The files of an earlier pip install would hide new executables.
   "$PYTHON" -m pip uninstall --disable-pip-version-check -q -y t3mpc_ros >>"$LOG" 2>&1 || true
-  # develop puts the executables into lib/t3mpc_ros, where ros2 run looks for them.
+  # develop installs the executables into lib/t3mpc_ros, the folder that ros2 run searches.
   (cd -- "$ROOT" && "$PYTHON" -W ignore setup.py -q develop --no-deps \
     install_data --install-dir "$VENV") >>"$LOG" 2>&1 ||
     fail "the package could not be installed: $(tail -n 1 "$LOG")" "see $LOG"
@@ -104,9 +104,9 @@ make_environment() {
   wanted_stamp >"$VENV/stamp"
 }
 
-# A ROS 2 or a workspace that happens to be sourced would be mixed with this environment: its
-# modules and libraries stay outside, and so does its middleware (only Fast DDS is installed here).
-leave_other_ros() {
+# Remove a sourced ROS 2 or workspace from the environment: its modules, its libraries and its
+# middleware (only Fast DDS is installed here).
+unset_other_ros() {
   local folder kept='' folders
   unset PYTHONPATH PYTHONHOME RMW_IMPLEMENTATION _ROS_WHEELS_BOOTSTRAP_COMPLETE
   IFS=: read -r -a folders <<<"${LD_LIBRARY_PATH:-}"
@@ -119,15 +119,15 @@ leave_other_ros() {
   export AMENT_PREFIX_PATH="$VENV"
 }
 
-leave_other_ros
+unset_other_ros
 BASE_PYTHON="$(choose_python)"
 if ! is_current; then
-  [ -w "$ROOT" ] || fail "$ROOT cannot be written to, and .venv is made there" \
-    "copy the folder to a place of your own and run $0 there"
+  [ -w "$ROOT" ] || fail "$ROOT is not writable; .venv is created there" \
+    "copy the folder to a writable location and run $0 there"
   (
-    # One script at a time may set up; the others wait for it.
+    # One script at a time creates the environment; the others wait.
     flock --nonblock 9 || {
-      say "waiting for another script that is making the local environment"
+      say "waiting for another script that creates the local environment"
       flock 9
     }
     is_current || make_environment

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The pages in docs/ say what is true: every equation has a function and a test that exist."""
+"""The pages agree with the code: equations, parameters, faults, and links between the pages."""
 
 import ast
 from functools import cache, reduce
@@ -17,12 +17,12 @@ from t3mpc_ros.nodes.node_parameters import parameters_page
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / 'docs' / 'equations.md'
 FUNCTION = re.compile(r'`(t3mpc_ros/[\w/]+\.py)::([\w.]+)`(\\\*)?')
-TEST = re.compile(r'`(test/test_\w+\.py)::(test_\w+)`')
+TEST = re.compile(r'`(test/[\w/]+\.py)::(test_\w+)`')
 NUMBER = re.compile(r'\((\d+)\)|(E\d+)')
 
 
 def _rows():
-    """Return the cells of every row of every table; the functions and tests stand last."""
+    """Return the cells of every row of every table; functions and tests are the last cells."""
     rows = []
     for line in PAGE.read_text().splitlines():
         if line.startswith('| ') and 'implemented by' not in line:
@@ -78,7 +78,7 @@ def test_every_function_named_exists(path, name, starred):
 
 @pytest.mark.parametrize('row', NUMBERED, ids=lambda row: row[0])
 def test_the_docstring_contains_the_equation_number(row):
-    """A range such as (16)-(19) carries its ends only: a search for what is between finds none."""
+    """A range such as (16)-(19) does not count for the numbers between its ends."""
     for path, name, _ in _named(row):
         module = _module(path)
         texts = [module.__doc__]
@@ -125,14 +125,14 @@ def test_a_star_marks_exactly_the_unused_functions():
     plain = {(path, name) for path, name, star in FUNCTIONS if not star}
     assert not marked & plain
     for path, name in marked:
-        assert not _called(path, name, marked), f'{path}::{name} is called: no star'
+        assert not _called(path, name, marked), f'{path}::{name} is called: remove the star'
     for path, name in plain:
-        if '.' not in name and name[0].islower():  # methods and classes are not looked for
-            assert _called(path, name, marked), f'{path}::{name} is called by nothing: a star'
+        if '.' not in name and name[0].islower():  # methods and classes are not checked
+            assert _called(path, name, marked), f'{path}::{name} is not called: add a star'
 
 
 def _called(path, name, marked):
-    """Whether the package refers to a function other than in itself and in marked ones."""
+    """Return whether the package uses a function outside itself and the marked functions."""
     module = path.removesuffix('.py').replace('/', '.')
     for source in (ROOT / 't3mpc_ros').rglob('*.py'):
         file = str(source.relative_to(ROOT))
@@ -173,3 +173,52 @@ def test_every_fault_of_the_emulator_is_documented():
     for kind in FAULT_KINDS:
         value = '' if math.isnan(kind.value) else f'{kind.value:g}'
         assert rows[kind.name] == f'{kind.text} | {value}'
+
+
+# -- links ----------------------------------------------------------------------------------------
+
+PAGES = [
+    path
+    for path in (ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'SECURITY.md')
+    if path.exists()
+] + sorted((ROOT / 'docs').glob('*.md'))
+
+
+@pytest.mark.parametrize('page', PAGES, ids=lambda path: path.name)
+def test_no_relative_link_is_dead(page):
+    """The file of each link exists, and so does the heading or the id of its anchor."""
+    dead = []
+    for target in _links(page):
+        if re.match(r'[a-z]+:', target):
+            continue
+        name, _, anchor = target.partition('#')
+        file = page.parent / name if name else page
+        found = file.exists() and (not anchor or anchor in _anchors(file))
+        if not found:
+            dead.append(target)
+    assert not dead
+
+
+def _prose(page):
+    """Return the text of a page without its code blocks."""
+    return re.sub(r'^(```|~~~).*?^\1', '', page.read_text(), flags=re.DOTALL | re.MULTILINE)
+
+
+def _links(page):
+    """Return the targets of links and images: inline, by reference, and in HTML."""
+    text = re.sub(r'`[^`\n]*`', '', _prose(page))
+    inline = re.findall(r'\]\(\s*<?([^()\s<>]+)>?(?:\s+"[^"]*")?\s*\)', text)
+    reference = re.findall(r'^\[[^\]]+\]:\s*<?([^\s<>]+)', text, re.MULTILINE)
+    html = re.findall(r'(?:href|src)="([^"]+)"', text)
+    return [*inline, *reference, *html]
+
+
+def _anchors(page):
+    """Return the anchors of a page: its headings in the form of GitHub, and its ids."""
+    anchors, count = set(), {}
+    for heading in re.findall(r'^#{1,6}\s+(.*?)\s*#*$', _prose(page), re.MULTILINE):
+        plain = re.sub(r'\[([^\]]*)\]\([^)]*\)', r'\1', heading).lower()
+        slug = re.sub(r'[^\w\- ]', '', plain).replace(' ', '-')
+        number = count[slug] = count.get(slug, -1) + 1
+        anchors.add(f'{slug}-{number}' if number else slug)
+    return anchors | set(re.findall(r'(?:id|name)="([^"]+)"', page.read_text()))
