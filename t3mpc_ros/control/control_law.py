@@ -15,8 +15,11 @@ from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, adapt, estimate
 from t3mpc_ros.fuzzy.sets import FuzzyParameters
 from t3mpc_ros.kernels import kernel
-from t3mpc_ros.mpc.predictive_controller import PredictiveController, signals_view
-from t3mpc_ros.mpc.predictor import PredictiveParameters
+from t3mpc_ros.mpc.predictive_controller import (
+    PredictiveController,
+    PredictiveParameters,
+    signals_view,
+)
 from t3mpc_ros.parameters.table import Parameters, group, parameter
 
 Array = NDArray[np.float64]
@@ -404,7 +407,7 @@ def step_law(
     if gains.adapted and not frozen:
         # What is left of a jump that was announced is nobody's fault, and teaches nothing.
         for i in range(blame.size):
-            blame[i] = predictive.unforeseen[i] - gains.integral_transfer * predictive.v[i]
+            blame[i] = predictive.jump_free_errors[i] - gains.integral_transfer * predictive.v[i]
         adapt(
             coefficients,
             phi,
@@ -497,7 +500,7 @@ class Nt3fsMpcController:
 
     def learnt(self) -> dict[str, Array]:
         """Return everything learnt, by name, to be saved: coefficients and predictor weights."""
-        weights = self.predictive.weights()
+        weights = self.predictive.get_weights()
         return {'fuzzy.coefficients': self.fuzzy.coefficients.copy()} | {
             f'predictive.{name}': value for name, value in weights.items()
         }

@@ -130,7 +130,7 @@ class ProposedController(BaselineController):
     def _forget(self, seed: int) -> None:
         """Give the predictor random output weights of the size of the taught ones."""
         predictive = self._pursuit.law.predictive
-        weights = predictive.weights()
+        weights = predictive.get_weights()
         generator = np.random.default_rng((seed, 7))
         for name in ('output_weights', 'anchor'):
             taught = weights[name]

@@ -1,6 +1,11 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Boltzmann machine that predicts the tracking error of one wheel, (35)-(44) with E9."""
+"""Boltzmann machine that predicts the tracking error of one wheel, (35)-(44) with E9.
+
+All values inside the machine are of order one: errors are divided by ``delta_scale``, predictive
+signals by ``move_scale``. Time is measured in predictive periods; histories are stored newest
+first.
+"""
 
 import math
 from typing import NamedTuple
@@ -15,12 +20,12 @@ Array = NDArray[np.float64]
 
 
 class LayerSizes(NamedTuple):
-    """How many past values the machine sees, and how many hidden units it has."""
+    """Number of past values in the visible layer, and of hidden units."""
 
     delta_lags: int
-    """The paper's tau: past tracking errors in (35)."""
+    """Past tracking errors in (35), the paper's tau."""
     move_lags: int
-    """Past predictive signals; (35) has one, which cannot cover a dead time."""
+    """Past predictive signals; (35) has one, which cannot represent a dead time."""
     hidden: int
 
     @property
@@ -30,85 +35,85 @@ class LayerSizes(NamedTuple):
 
 
 class BoltzmannMachine(NamedTuple):
-    """Weights of one machine and its working memory; kernels change the arrays in place."""
+    """Weights and work space of one machine; kernels change the arrays in place."""
 
     visible_weights: Array
     """X_v, shape (visible, hidden)."""
     output_weights: Array
     """X_o, shape (hidden,)."""
     delta_lags: int
-    """How many of the visible units are tracking errors; the rest are predictive signals."""
+    """Number of visible units that are tracking errors; the rest are predictive signals."""
     scales: Array
     """(delta_scale in rad/s, move_scale in rad/s²)."""
     lags: Array
-    """Shape (visible,): eta_0 of the latest pass, (35)."""
+    """Shape (visible,): eta_0 of the last pass, (35)."""
     mu0: Array
     """Shape (hidden,): (39)."""
     eta1: Array
     """Shape (visible,): (38), the reconstruction of eta_0."""
     mu1: Array
-    """Shape (hidden,): (37), the features the output layer sees."""
+    """Shape (hidden,): (37), the features of the output layer."""
 
 
 class History(NamedTuple):
-    """What one output has seen, newest first, and how it was predicted; kernels change it."""
+    """Past errors and moves of one output, newest first, and how well they were predicted."""
 
     errors: Array
-    """Tracking errors (rad/s): errors[0] is the latest."""
+    """Tracking errors (rad/s): errors[0] is the newest."""
     moves: Array
-    """Applied v_p (rad/s²): moves[i] was held from errors[i] on; moves[0] is not known yet."""
+    """Applied v_p (rad/s²): moves[i] was held from errors[i] on; moves[0] is not yet known."""
     offsets: Array
-    """Offsets e (rad/s) in force after each instant, shape (middle,)."""
-    misses: Array
-    """Latest errors (rad/s) of machine and persistence: one step, then middle of the horizon."""
-    predicted: Array
-    """Mean squares of the machine's errors, (rad/s)²: one step, middle."""
+    """Offsets e (rad/s) used after each instant, shape (middle,)."""
+    residuals: Array
+    """Last errors (rad/s) of machine and persistence: one step, then middle of the horizon."""
+    prediction_mse: Array
+    """Mean squared error of the machine, (rad/s)²: one step, middle."""
     persistence_mse: Array
-    """The same of persistence, which predicts that nothing changes."""
-    recent: Array
-    """The same over a second or so: tells whether there is anything to predict."""
-    planned: Array
-    """Working memory, shape (n_p,); the next are delta_lags, move_lags and middle long."""
+    """The same of persistence, which predicts no change."""
+    recent_mse: Array
+    """The same of persistence over about one second: the variation there is to predict."""
+    planned_moves: Array
+    """Work space, shape (n_p,); the next three have lengths delta_lags, move_lags, middle."""
     lagged_errors: Array
     lagged_moves: Array
-    ahead: Array
+    half_horizon: Array
 
 
 class RlsState(NamedTuple):
-    """What the output layer remembers, see ``training.recall``; kernels change it in place."""
+    """State of the recursive least squares of the output layer, see :func:`rls_step`."""
 
     information: Array
-    """Shape (hidden, hidden): weighted sum of mu_1 mu_1ᵀ over the recent past."""
+    """Shape (hidden, hidden): weighted sum of mu_1 mu_1ᵀ over the recent past, A."""
     prior: Array
-    """Shape (hidden, hidden): the same of the pre-training, R_0."""
+    """Shape (hidden, hidden): the same of the pretraining, R_0."""
     anchor: Array
-    """Shape (hidden,): the pre-trained output weights."""
+    """Shape (hidden,): the pretrained output weights."""
     total: Array
-    """Working memory, shape (hidden, hidden), then (hidden, hidden) and (hidden,)."""
+    """Work space, shape (hidden, hidden); the next two (hidden, hidden) and (hidden,)."""
     lower: Array
     move: Array
     power: Array
-    """Shape (3,): running mean of |mu_1|², its mean in pre-training, and that of mere noise."""
+    """Shape (3,): running mean of |mu_1|², its mean in pretraining, and that of noise alone."""
 
 
 @kernel
 def table_view(store: Array, first: int, rows: int, columns: int) -> Array:
-    """Return a part of a flat store as a table, shape (rows, columns): a view, no copy."""
+    """Return a part of a flat store as a view of shape (rows, columns)."""
     return store[first : first + rows * columns].reshape((rows, columns))
 
 
 @kernel
 def machine_size(delta_lags: int, move_lags: int, hidden: int) -> int:
-    """Return how many numbers make a machine."""
+    """Return the size of the store of a machine."""
     return (delta_lags + move_lags) * (hidden + 2) + 3 * hidden + 2
 
 
 @kernel
 def machine_view(store: Array, delta_lags: int, move_lags: int, hidden: int) -> BoltzmannMachine:
-    """Return the views of a flat store that are a machine.
+    """Return the views of a flat store that form a machine.
 
-    A call from Python costs time for every array, so whoever calls kernels often hands them one
-    store in place of a dozen arrays.
+    Each array argument of a kernel costs time when Python calls it, so frequent calls pass one
+    store instead of a dozen arrays.
     """
     visible = delta_lags + move_lags
     hidden_rows = table_view(store, visible * hidden, 3, hidden)
@@ -127,13 +132,13 @@ def machine_view(store: Array, delta_lags: int, move_lags: int, hidden: int) -> 
 
 @kernel
 def rls_state_size(hidden: int) -> int:
-    """Return how many numbers make a memory."""
+    """Return the size of the store of an RLS state."""
     return 4 * hidden * hidden + 2 * hidden + 3
 
 
 @kernel
 def rls_state_view(store: Array, hidden: int) -> RlsState:
-    """Return the views of a flat store that are a memory."""
+    """Return the views of a flat store that form an RLS state."""
     square = hidden * hidden
     rows = table_view(store, 4 * square, 2, hidden)
     return RlsState(
@@ -149,7 +154,7 @@ def rls_state_view(store: Array, hidden: int) -> RlsState:
 
 @kernel
 def history_size(delta_lags: int, move_lags: int, horizon: int) -> int:
-    """Return how many numbers make a past."""
+    """Return the size of the store of a history."""
     middle = max(horizon // 2, 1)
     length = max(delta_lags, move_lags) + middle
     return 2 * length + 2 * middle + max(horizon, middle) + delta_lags + move_lags + 10
@@ -157,7 +162,7 @@ def history_size(delta_lags: int, move_lags: int, horizon: int) -> int:
 
 @kernel
 def history_view(store: Array, delta_lags: int, move_lags: int, horizon: int) -> History:
-    """Return the views of a flat store that are a past, long enough to predict half a horizon."""
+    """Return the views of a flat store that form a history for predicting half a horizon."""
     middle = max(horizon // 2, 1)
     length = max(delta_lags, move_lags) + middle
     lengths = table_view(store, 0, 2, length)
@@ -186,28 +191,29 @@ def make_machine(
     spread: float,
     generator: np.random.Generator,
 ) -> BoltzmannMachine:
-    """Return a machine with small, well-conditioned random weights and a zero output layer.
+    """Return a machine with well-conditioned random weights and a zero output layer.
 
     The rows of X_v are orthogonal and of length ``spread``: X_v X_vᵀ = spread² I. In the linear
-    range mu_1 = X_vᵀ X_v X_vᵀ eta_0 / 8, so the three passes keep all of eta_0 and favour no
-    direction of it. Independent random weights would raise their condition number to the third
-    power. This needs as many hidden as visible units.
+    range mu_1 = X_vᵀ X_v X_vᵀ eta_0 / 8, so the three passes preserve every direction of eta_0
+    equally; with independent random weights their condition number is raised to the third power.
+    This requires at least as many hidden as visible units.
 
     Parameters
     ----------
     shape
         Sizes of the layers.
     delta_scale, move_scale
-        What counts as 1 inside the machine: rad/s and rad/s².
+        Values that are 1 inside the machine: rad/s and rad/s².
     spread
-        Length of each row of X_v; at 2 an eta_0 in the linear range is reconstructed whole.
+        Length of each row of X_v; at 2 an eta_0 in the linear range is reconstructed exactly.
     generator
         Source of the random directions.
 
     Raises
     ------
     ValueError
-        Fewer hidden than visible units, a lag count below one, or a scale that is not positive.
+        There are fewer hidden than visible units, a number of lags is below one, or a scale is
+        not positive.
     """
     if shape.delta_lags < 1 or shape.move_lags < 1:
         raise ValueError(f'shape must have at least one lag of each kind: got {shape}')
@@ -228,37 +234,37 @@ def make_machine(
 
 
 def make_rls_state(hidden: int) -> RlsState:
-    """Return an empty memory; its prior is filled by ``training.pretrain``."""
-    memory = rls_state_view(np.zeros(rls_state_size(hidden)), hidden)
-    memory.prior[:] = np.eye(hidden)
-    memory.power[:] = 1.0
-    return memory
+    """Return an initial RLS state; pretraining sets its prior."""
+    rls = rls_state_view(np.zeros(rls_state_size(hidden)), hidden)
+    rls.prior[:] = np.eye(hidden)
+    rls.power[:] = 1.0
+    return rls
 
 
 def make_history(delta_lags: int, move_lags: int, horizon: int) -> History:
-    """Return an empty past that is long enough to predict from half a horizon ago."""
+    """Return an empty history that is long enough to predict from half a horizon ago."""
     size = history_size(delta_lags, move_lags, horizon)
-    past = history_view(np.zeros(size), delta_lags, move_lags, horizon)
-    past.predicted[:] = 1.0
-    past.persistence_mse[:] = 1.0
-    return past
+    history = history_view(np.zeros(size), delta_lags, move_lags, horizon)
+    history.prediction_mse[:] = 1.0
+    history.persistence_mse[:] = 1.0
+    return history
 
 
 @kernel
-def reset_history(past: History, error: float) -> None:
-    """Make the past as if ``error`` (rad/s) had always been measured, and nothing done."""
-    past.errors[:] = error
-    past.moves[:] = 0.0
-    past.offsets[:] = 0.0
-    past.misses[:] = 0.0
-    past.recent[:] = 0.0
+def reset_history(history: History, error: float) -> None:
+    """Set the history to a constant ``error`` (rad/s) and zero moves."""
+    history.errors[:] = error
+    history.moves[:] = 0.0
+    history.offsets[:] = 0.0
+    history.residuals[:] = 0.0
+    history.recent_mse[:] = 0.0
 
 
 @kernel
 def bipolar_sigmoid(y: float) -> float:
     """Return Xi(y) = (1 - exp(-y))/(1 + exp(-y)) = tanh(y/2), equation (40).
 
-    The second form cannot overflow.
+    The last form cannot overflow.
     """
     return math.tanh(0.5 * y)
 
@@ -268,7 +274,7 @@ def infer_hidden(visible_weights: Array, eta: Array, mu: Array) -> None:
     """Write mu = Xi(X_vᵀ eta), equations (37) and (39), into ``mu``, shape (hidden,)."""
     for j in range(mu.size):
         mu[j] = 0.0
-    # Along the rows, which lie together in memory.
+    # By rows, which are contiguous in memory.
     for i in range(eta.size):
         for j in range(mu.size):
             mu[j] += visible_weights[i, j] * eta[i]
@@ -290,16 +296,16 @@ def infer_visible(visible_weights: Array, mu: Array, eta: Array) -> None:
 def set_visible(machine: BoltzmannMachine, errors: Array, moves: Array, first: int) -> None:
     """Write the scaled visible vector (35) into ``machine.lags``.
 
-    The paper's vector holds one v_p only. Further lags are needed because a move that left one
-    dead time ago acts only now.
+    The paper's vector contains one v_p only. Further lags are needed because a move acts one
+    dead time later.
 
     errors : delta, newest first (rad/s), at least first + delta_lags values
     moves  : v_p, newest first (rad/s²), at least first + move_lags values; moves[first] is held
              from the instant of errors[first] on
-    first  : where the newest lag stands: 0 to predict the future, more to predict the past again
+    first  : index of the newest lag: 0 to predict the future, more to predict past values again
 
-    Values beyond ten scales are cut to ten: there every hidden unit is saturated anyway, and
-    (43) must stay finite whatever is measured.
+    Values are limited to ten scales: beyond, every hidden unit is saturated, and (43) must remain
+    finite for any measurement.
     """
     n_errors = machine.delta_lags
     for i in range(n_errors):
@@ -313,8 +319,8 @@ def set_visible(machine: BoltzmannMachine, errors: Array, moves: Array, first: i
 def predict_error(machine: BoltzmannMachine) -> float:
     """Return delta_hat = X_oᵀ mu_1 (36) in rad/s, from ``machine.lags``.
 
-    The passes run (39), (38), (37): the paper prints them in the reverse order of computing.
-    They stay in ``machine.mu0``, ``.eta1`` and ``.mu1`` for learning.
+    The order of computation is (39), (38), (37), the reverse of the paper's. The results remain
+    in ``machine.mu0``, ``.eta1`` and ``.mu1`` for learning.
     """
     infer_hidden(machine.visible_weights, machine.lags, machine.mu0)
     infer_visible(machine.visible_weights, machine.mu0, machine.eta1)
@@ -340,7 +346,7 @@ def energy(visible_weights: Array, eta: Array, mu: Array) -> float:
 def free_energy(visible_weights: Array, eta: Array) -> float:
     """Return F(eta) = -ln of the sum of exp(-E/2) over every mu in {-1, 1}^hidden.
 
-    The hidden units of (42) do not meet, so the sum is a product of 2 cosh(X_vᵀ eta / 2).
+    (42) does not couple the hidden units, so the sum is a product of 2 cosh(X_vᵀ eta / 2).
     """
     total = 0.0
     for j in range(visible_weights.shape[1]):
@@ -357,13 +363,13 @@ def boltzmann_distribution(energies: Array) -> Array:
 
     E9: the printed J' = delta^E / E is no distribution. The temperature is 2 because Xi (40),
     the tanh of *half* its argument, is the mean of a unit in {-1, 1} at exactly that
-    temperature; at temperature 1 the passes (36)-(39) would not sample from (41). It only
-    scales X_v, and its gradient only scales gamma in (43).
+    temperature; at temperature 1 the passes (36)-(39) do not sample from (41). The temperature
+    only scales X_v, and gamma in (43).
 
     Parameters
     ----------
     energies
-        E of every state that can occur, equation (42).
+        E of every possible state, equation (42).
     """
     weights: Array = np.exp(-0.5 * (energies - energies.min()))
     weights /= weights.sum()
@@ -372,30 +378,30 @@ def boltzmann_distribution(energies: Array) -> Array:
 
 @kernel
 def contrastive_divergence_step(machine: BoltzmannMachine, rate: float) -> None:
-    """Move X_v along eta_0 mu_0ᵀ - eta_1 mu_1ᵀ, equation (43), after :func:`predict`.
+    """Update X_v along eta_0 mu_0ᵀ - eta_1 mu_1ᵀ, equation (43), after :func:`predict_error`.
 
     With the energy (42) this is the slope of E(eta_1, mu_1) - E(eta_0, mu_0) at fixed states:
-    the data become likelier than their own reconstruction under (41) with E9. A visible unit
-    lives in [-1, 1]; what lies beyond is cut, or no weight would be large enough to reconstruct
-    it and X_v would grow for ever.
+    the data become more likely than their reconstruction under (41) with E9. The data are limited
+    to the range [-1, 1] of a visible unit: no weight is large enough to reconstruct larger
+    values, and X_v would grow without bound.
     """
     for i in range(machine.lags.size):
-        seen = min(max(machine.lags[i], -1.0), 1.0)
+        visible = min(max(machine.lags[i], -1.0), 1.0)
         for j in range(machine.mu0.size):
             machine.visible_weights[i, j] += rate * (
-                seen * machine.mu0[j] - machine.eta1[i] * machine.mu1[j]
+                visible * machine.mu0[j] - machine.eta1[i] * machine.mu1[j]
             )
 
 
 @kernel
 def gradient_step(machine: BoltzmannMachine, error: float, rate: float, floor: float) -> None:
-    """Move X_o by rate * error * mu_1 / (floor + |mu_1|²), equation (44) normalised.
+    """Update X_o by rate * error * mu_1 / (floor + |mu_1|²), equation (44) normalised.
 
-    (44) itself is rate * error * mu_1. Divided by |mu_1|², a rate below 2 is stable at any
-    amplitude; with the plain form the useful rate depends on the square of the amplitude.
+    (44) itself is rate * error * mu_1. Normalised by |mu_1|², a rate below 2 is stable at any
+    amplitude; without it the useful rate depends on the square of the amplitude.
 
     error : delta - delta_hat (rad/s)
-    floor : share of |mu_1|² (dimensionless) below which steps get shorter
+    floor : value of |mu_1|² (dimensionless) below which the steps are reduced
     """
     squared = floor
     for j in range(machine.mu1.size):
@@ -406,46 +412,52 @@ def gradient_step(machine: BoltzmannMachine, error: float, rate: float, floor: f
 
 @kernel
 def rls_step(
-    machine: BoltzmannMachine, memory: RlsState, error: float, keep: float, smooth: float
+    machine: BoltzmannMachine,
+    rls: RlsState,
+    error: float,
+    forgetting: float,
+    power_forgetting: float,
 ) -> bool:
-    r"""Move X_o to the best fit of the recent past, given the pre-training; False if it cannot.
+    r"""Update X_o by recursive least squares; return False if the matrix is singular.
 
     .. math:: X_o \leftarrow X_o + (A + R_0)^{-1}
               \left[g \mu_1 (\delta - \hat\delta) + (1 - \lambda) R_0 (X_o^0 - X_o)\right],
               \quad A \leftarrow \lambda A + g \mu_1 \mu_1^T
 
     (44) with the matrix (A + R_0)^-1 for gamma: recursive least squares that forgets *towards the
-    pre-trained weights* X_o^0. X_o minimises the sum of g lambda^(t-i) (delta_i - X_oᵀ mu_1i)²
-    plus |X_o - X_o^0|² in the metric R_0. Plain forgetting would lose what a quiet time cannot
-    show, and burst afterwards; this falls back to X_o^0. The lags of a slow signal are nearly
-    parallel, so that a scalar gamma needs thousands of steps where this needs dozens. The weight
-    g = (mean |mu_1|² in pre-training) / (recent mean |mu_1|²) is the normalisation.
+    pretrained weights* X_o^0. X_o minimises the sum of g lambda^(t-i) (delta_i - X_oᵀ mu_1i)²
+    plus |X_o - X_o^0|² in the metric R_0. Without excitation X_o returns to X_o^0, whereas plain
+    forgetting loses information and then bursts. The lags of a slow signal are nearly parallel,
+    so a scalar gamma needs thousands of steps where this needs dozens. The weight
+    g = (mean |mu_1|² in pretraining) / (recent mean |mu_1|²) is the normalisation.
 
-    error  : delta - delta_hat (rad/s)
-    keep   : lambda, share of the past kept per step
-    smooth : share of the recent mean of |mu_1|² kept per step
+    error            : delta - delta_hat (rad/s)
+    forgetting       : lambda, forgetting factor of A per step
+    power_forgetting : forgetting factor of the recent mean of |mu_1|²
     """
     n = machine.mu1.size
     squared = 0.0
     for j in range(n):
         squared += machine.mu1[j] * machine.mu1[j]
-    # Rises at once with a sudden signal, so that no instant weighs more than ten ordinary ones.
-    memory.power[0] = max(smooth * memory.power[0] + (1.0 - smooth) * squared, 0.1 * squared)
-    gain = memory.power[1] / max(memory.power[0], memory.power[2])
+    # Follows a sudden increase at once, which limits the weight of one instant to ten.
+    rls.power[0] = max(
+        power_forgetting * rls.power[0] + (1.0 - power_forgetting) * squared, 0.1 * squared
+    )
+    gain = rls.power[1] / max(rls.power[0], rls.power[2])
     for j in range(n):
-        memory.move[j] = gain * machine.mu1[j] * error / machine.scales[0]
+        rls.move[j] = gain * machine.mu1[j] * error / machine.scales[0]
         for k in range(n):
-            memory.information[j, k] = (
-                keep * memory.information[j, k] + gain * machine.mu1[j] * machine.mu1[k]
+            rls.information[j, k] = (
+                forgetting * rls.information[j, k] + gain * machine.mu1[j] * machine.mu1[k]
             )
-            memory.total[j, k] = memory.information[j, k] + memory.prior[j, k]
-            memory.move[j] += (
-                (1.0 - keep) * memory.prior[j, k] * (memory.anchor[k] - machine.output_weights[k])
+            rls.total[j, k] = rls.information[j, k] + rls.prior[j, k]
+            rls.move[j] += (
+                (1.0 - forgetting) * rls.prior[j, k] * (rls.anchor[k] - machine.output_weights[k])
             )
-    if not cholesky(memory.total, memory.lower):
+    if not cholesky(rls.total, rls.lower):
         return False
-    solve_lower(memory.lower, memory.move)
-    solve_upper(memory.lower, memory.move)
+    solve_lower(rls.lower, rls.move)
+    solve_upper(rls.lower, rls.move)
     for j in range(n):
-        machine.output_weights[j] += memory.move[j]
+        machine.output_weights[j] += rls.move[j]
     return True

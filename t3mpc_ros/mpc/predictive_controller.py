@@ -3,9 +3,9 @@
 """Predictive controller: v_p of every wheel from its tracking error, equations (34)-(63)."""
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,19 +18,17 @@ from t3mpc_ros.mpc.boltzmann_machine import (
 )
 from t3mpc_ros.mpc.prediction import predict_responses, predicted_errors, toeplitz
 from t3mpc_ros.mpc.predictor import (
-    Array,
     LearningConstants,
-    MoveConstants,
-    PredictiveParameters,
     Predictor,
     authority,
     learning_constants_view,
-    move_constants_view,
     observe,
     skill_score,
     wheel_state_view,
 )
 from t3mpc_ros.mpc.pretraining import (
+    ExcitationParameters,
+    NominalLoopParameters,
     SampleTiming,
     nominal_step_response,
     simulate_excitation,
@@ -44,39 +42,244 @@ from t3mpc_ros.mpc.quadratic_program import (
     workspace_size,
     workspace_view,
 )
-from t3mpc_ros.parameters.table import ParameterError
+from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PredictiveParameters(Parameters):
+    """Horizon, bounds, machine, learning and authority of the predictive controller."""
+
+    enabled: bool = parameter(
+        True, 'whether v_p is applied; the machine learns in either case', dynamic=True
+    )
+    decimation: int = parameter(
+        5, 'control periods per predictive period T; n_p T should reach 3/K', low=1, high=100
+    )
+    average: int = parameter(
+        5, 'newest errors in the mean of one sample, at most decimation', low=1, high=100
+    )
+    horizon: int = parameter(10, 'prediction horizon n_p, in periods T', low=1, high=50)
+    control_horizon: int = parameter(
+        5, 'control horizon n_c: later changes of v_p are zero', low=1, high=50
+    )
+    error_weight: float = parameter(
+        1.0, 'mu of (60)', unit='s²/rad²', low=0.0, high=1e6, dynamic=True
+    )
+    move_weight: float = parameter(
+        0.029, 'pi of (60)', unit='s⁴/rad²', low=1e-9, high=1e6, dynamic=True
+    )
+    v_max: float = parameter(
+        10.0, 'bound of v_p, v_p-bar of (80)', unit='rad/s²', low=0.0, high=1e4, dynamic=True
+    )
+    dv_max: float = parameter(
+        4.0,
+        'bound of the change of v_p in a period T',
+        unit='rad/s²',
+        low=0.0,
+        high=1e4,
+        dynamic=True,
+    )
+    dither: float = parameter(
+        0.0,
+        'maximum random level added to v_p, a new one each period. Use it to record bags for '
+        'training: with feedback alone v_p varies too little to identify its effect',
+        unit='rad/s²',
+        low=0.0,
+        high=1e3,
+        dynamic=True,
+    )
+    probe: float = parameter(
+        1.0, 'step dv of the step response (48), (51)', unit='rad/s²', low=1e-3, high=1e3
+    )
+    delta_lags: int = parameter(4, 'past errors in the visible layer, tau of (35)', low=1, high=50)
+    move_lags: int = parameter(
+        4, 'past v_p in the visible layer; they must cover the dead time', low=1, high=50
+    )
+    hidden: int = parameter(
+        12, 'number of hidden units, at least that of the lags', low=2, high=200
+    )
+    spread: float = parameter(1.0, 'length of each row of the initial X_v', low=1e-3, high=2.0)
+    delta_scale: float = parameter(
+        3.0, 'error that is 1 inside the machine', unit='rad/s', low=1e-3, high=1e3
+    )
+    move_scale: float = parameter(
+        20.0, 'v_p that is 1 inside the machine', unit='rad/s²', low=1e-3, high=1e4
+    )
+    learning: bool = parameter(True, 'whether the machine learns online', dynamic=True)
+    algorithm: str = parameter(
+        'recursive',
+        'learning of the output layer: recursive least squares, or the normalised gradient (44)',
+        choices=('recursive', 'gradient'),
+    )
+    memory: float = parameter(20.0, 'time constant of forgetting', unit='s', low=0.1, high=1e4)
+    trust: float = parameter(
+        30.0,
+        'weight of the pretraining, as a duration of online learning',
+        unit='s',
+        low=0.01,
+        high=1e5,
+    )
+    output_rate: float = parameter(0.05, 'gamma of (44), normalised', low=0.0, high=1.0)
+    contrast_rate: float = parameter(1e-4, 'gamma of (43) online', low=0.0, high=1.0)
+    offset_gain: float = parameter(
+        0.0032, 'gain of the offset e on the last prediction error', low=0.0, high=1.0
+    )
+    noise: float = parameter(
+        0.05,
+        'standard deviation of the noise of a sample of the error',
+        unit='rad/s',
+        low=1e-9,
+        high=10.0,
+    )
+    skill_memory: float = parameter(5.0, 'time constant of the skill', unit='s', low=0.1, high=1e4)
+    skill_low: float = parameter(
+        -1.0, 'skill up to which the authority of v_p is 0', low=-100.0, high=1.0
+    )
+    skill_high: float = parameter(
+        0.0,
+        'skill from which the authority of v_p is 1; 0 is as good as persistence',
+        low=-100.0,
+        high=1.0,
+    )
+    gain_low: float = parameter(
+        0.2,
+        'step response over the nominal one up to which the authority is 0',
+        low=-1.0,
+        high=1.0,
+    )
+    gain_high: float = parameter(
+        0.5, 'step response over the nominal one from which it is 1', low=-1.0, high=1.0
+    )
+    seed: int = parameter(1, 'seed of the initial weights and of the simulated run', low=0)
+    nominal: NominalLoopParameters = group(NominalLoopParameters)
+    excitation: ExcitationParameters = group(ExcitationParameters)
+
+    def check_consistency(self) -> None:
+        """Raise :class:`ParameterError` for horizons, lags or limits in the wrong order."""
+        for low, high in (
+            ('control_horizon', 'horizon'),
+            ('average', 'decimation'),
+        ):
+            small, large = getattr(self, low), getattr(self, high)
+            if small > large:
+                raise ParameterError(f'{low} must be at most {high} = {large}: got {small}')
+        if self.hidden < self.delta_lags + self.move_lags:
+            raise ParameterError(
+                f'hidden must be at least delta_lags + move_lags = '
+                f'{self.delta_lags + self.move_lags}: got {self.hidden}'
+            )
+        for low, high in (('skill_low', 'skill_high'), ('gain_low', 'gain_high')):
+            if not getattr(self, low) < getattr(self, high):
+                raise ParameterError(
+                    f'{low} must be below {high} = {getattr(self, high)}: got {getattr(self, low)}'
+                )
+
+
+def learning_constants(parameters: PredictiveParameters, span: float) -> LearningConstants:
+    """Return the constants of online learning for a predictive period of ``span`` s."""
+    return LearningConstants(
+        recursive=parameters.algorithm == 'recursive',
+        contrast_rate=parameters.contrast_rate,
+        output_rate=parameters.output_rate,
+        rls_forgetting=math.exp(-span / parameters.memory),
+        power_forgetting=math.exp(-span / 2.0),
+        skill_forgetting=math.exp(-span / parameters.skill_memory),
+        offset_gain=parameters.offset_gain,
+        noise=parameters.noise,
+    )
+
+
+class MoveConstants(NamedTuple):
+    """Constants of the computation of v_p, for kernels."""
+
+    enabled: bool
+    learning: bool
+    dithered: bool
+    quiet_threshold: float
+    """Residual of a jump (rad/s) above which the machine does not learn: limits of the robot
+    dominate the decay of a large jump."""
+    probe: float
+    error_weight: float
+    move_weight: float
+    v_max: float
+    dv_max: float
+    skill_low: float
+    skill_high: float
+    gain_low: float
+    gain_high: float
+
+    @classmethod
+    def of(cls, parameters: PredictiveParameters) -> Self:
+        """Return the constants of the parameters."""
+        return cls(
+            parameters.enabled,
+            parameters.learning,
+            parameters.enabled and parameters.dither > 0.0,
+            0.1 * parameters.delta_scale,
+            parameters.probe,
+            parameters.error_weight,
+            parameters.move_weight,
+            parameters.v_max,
+            parameters.dv_max,
+            parameters.skill_low,
+            parameters.skill_high,
+            parameters.gain_low,
+            parameters.gain_high,
+        )
+
+
+@kernel
+def move_constants_view(row: Array) -> MoveConstants:
+    """Return the constants by name, see :func:`learning_constants_view`."""
+    return MoveConstants(
+        row[0] != 0.0,
+        row[1] != 0.0,
+        row[2] != 0.0,
+        row[3],
+        row[4],
+        row[5],
+        row[6],
+        row[7],
+        row[8],
+        row[9],
+        row[10],
+        row[11],
+        row[12],
+    )
 
 
 class Signals(NamedTuple):
-    """What each output's v_p is made of from step to step, shape (outputs,) each."""
+    """State of the computation of v_p, shape (outputs,) each."""
 
     sums: Array
-    """Sum of the errors of this sample so far, rad/s."""
+    """Sum of the errors of the present sample, rad/s."""
     applied_sums: Array
     """Sum of the v_p applied since the last sample, rad/s²."""
     applied: Array
-    """v_p as applied in this control period, rad/s²."""
+    """v_p applied in the present control period, rad/s²."""
     v: Array
     """v_p (63), held between samples, rad/s²."""
     dither: Array
-    """Its random part, rad/s²."""
-    drawn: Array
-    """The random level to be added to the next one, rad/s²."""
+    """Random part of v_p, rad/s²."""
+    next_dither: Array
+    """Random part of the next v_p, rad/s²."""
     jumps: Array
-    """What is left of the known jumps of the error, rad/s."""
+    """Residual of the known jumps of the error, rad/s."""
     authorities: Array
-    """Share of the bound of v_p in force."""
+    """Fraction of the bound of v_p in use."""
     skills: Array
     """Skill in the middle of the horizon."""
     errors: Array
     """The last errors delta = chi - r, rad/s."""
-    unforeseen: Array
-    """The same less what was left of the known jumps, rad/s."""
+    jump_free_errors: Array
+    """The same without the residual of the known jumps, rad/s."""
 
 
 @kernel
 def signals_view(rows: Array) -> Signals:
-    """Return the rows of a table, shape (11, outputs), as signals."""
+    """Return the rows of an array, shape (11, outputs), as signals."""
     return Signals(
         rows[0],
         rows[1],
@@ -94,7 +297,7 @@ def signals_view(rows: Array) -> Signals:
 
 @kernel
 def end_control_period(signals: Signals, decay: float) -> None:
-    """End a control period: known jumps die away, and v_p is taken to be applied as it is."""
+    """End a control period: known jumps decay, and v_p is assumed to be applied."""
     for z in range(signals.v.size):
         signals.jumps[z] *= decay
         signals.applied[z] = signals.v[z]
@@ -104,12 +307,12 @@ def end_control_period(signals: Signals, decay: float) -> None:
 def accumulate_sample(
     speeds: Array, wanted: Array, sampled: bool, due: bool, decay: float, rows: Array
 ) -> bool:
-    """Add a control period to the sums of a sample; return False if an error is not finite.
+    """Add a control period to the sums of the sample; return False if an error is not finite.
 
     speeds, wanted : shape (outputs,), chi and r, rad/s
     sampled : whether this period's errors belong to the sample
-    due     : whether the sample is complete; :func:`renew` ends the period then
-    decay   : share of a known jump that is left after a period
+    due     : whether the sample is complete; :func:`predictive_step` then ends the period
+    decay   : decay of a known jump per control period
     rows    : the :class:`Signals`
     """
     signals = signals_view(rows)
@@ -119,9 +322,9 @@ def accumulate_sample(
     for z in range(speeds.size):
         signals.errors[z] = speeds[z] - wanted[z]
         signals.applied_sums[z] += signals.applied[z]
-        signals.unforeseen[z] = signals.errors[z] - signals.jumps[z]
+        signals.jump_free_errors[z] = signals.errors[z] - signals.jumps[z]
         if sampled:
-            signals.sums[z] += signals.unforeseen[z]
+            signals.sums[z] += signals.jump_free_errors[z]
     if not due:
         end_control_period(signals, decay)
     return True
@@ -129,11 +332,11 @@ def accumulate_sample(
 
 @kernel
 def predict_known_errors(jump: float, decays: Array, change: Array, known: Array) -> None:
-    """Write the known part of the errors to come: jumps past and to come, dying away by K.
+    """Write the future errors caused by past and future known jumps, decaying with K.
 
-    jump   : what is left of the past ones, rad/s
-    decays : shape (n_p + 1,), share of a jump that is left 0, 1, ... periods T later
-    change : shape (n_p,), jumps in each period T to come, rad/s
+    jump   : residual of the past jumps, rad/s
+    decays : shape (n_p + 1,), decay of a jump after 0, 1, ... periods T
+    change : shape (n_p,), jumps in each future period T, rad/s
     known  : shape (n_p,), overwritten, rad/s
     """
     for j in range(known.size):
@@ -147,29 +350,30 @@ def predict_known_errors(jump: float, decays: Array, change: Array, known: Array
 def plan_moves(
     steps: Array,
     free: Array,
-    held: float,
+    v_previous: float,
     error_weight: float,
     move_weight: float,
     dv_max: float,
     v_max: float,
     matrix: Array,
-    space: Workspace,
+    work: Workspace,
     prediction: Array,
 ) -> int:
-    """Write the optimal moves into ``space`` and what they lead to; return the solver's status.
+    """Write the optimal changes and the predicted errors; return the status of the solver.
 
     steps, free  : the step response (48) and Psi_free (56)
-    held         : v_p(t-1), inside v_max (rad/s²)
+    v_previous   : v_p(t-1), inside v_max (rad/s²)
     error_weight, move_weight, dv_max, v_max : mu, pi and the bounds (rad/s²) of the program
     matrix       : S (54), shape (n_p, n_c), overwritten
+    work         : overwritten, with the optimal changes
     prediction   : Psi (52), shape (n_p,), overwritten
     """
     toeplitz(steps, matrix)
-    most = 20 * space.slope.size
+    max_iterations = 20 * work.gradient.size
     status = solve_quadratic_program(
-        matrix, free, error_weight, move_weight, held, dv_max, v_max, most, space
+        matrix, free, error_weight, move_weight, v_previous, dv_max, v_max, max_iterations, work
     )
-    predicted_errors(matrix, space.changes, free, prediction)
+    predicted_errors(matrix, work.changes, free, prediction)
     return status
 
 
@@ -188,122 +392,120 @@ def predictive_step(
     decay: float,
     move_row: Array,
     learning_row: Array,
-    numbers: Array,
-    whole: Indices,
+    float_work: Array,
+    int_work: Indices,
     status: Indices,
 ) -> None:
-    """Take the sample of each output, and renew its v_p: (34)-(63) in one call.
+    """Process the sample of each output, and update its v_p: (34)-(63) in one call.
 
-    stores, sizes : the :class:`Wheel` of each output, and :attr:`Predictor.sizes`
+    stores, sizes : the :class:`WheelState` of each output, and :attr:`Predictor.sizes`
     rows          : the :class:`Signals`
     tables        : shape (4, outputs, n_p), overwritten: step responses (48), Psi_free (56),
-                    predictions Psi (52), and the part of the errors to come that is known
+                    predictions Psi (52), and future errors of known jumps
     nominal       : nominal step response in the middle of the horizon
-    decays        : shape (n_p + 1,), share of a known jump that is left 0, 1, ... periods T later
-    change        : shape (n_p, outputs), jumps to come in each period T, rad/s
-    samples       : how many were taken before
-    average, every: control periods in a sample's mean, and in a period T
-    decay         : share of a known jump that is left after a control period
-    rules_told, how_told : the numbers of :class:`Rules` and :class:`Learning`
-    numbers, whole : working memory: S and the :class:`Space` of the program
-    status        : shape (outputs,), overwritten, how each program ended
+    decays        : shape (n_p + 1,), decay of a known jump after 0, 1, ... periods T
+    change        : shape (n_p, outputs), jumps in each future period T, rad/s
+    samples       : number of previous samples
+    average, decimation : control periods in the mean of a sample, and in a period T
+    decay         : decay of a known jump per control period
+    move_row, learning_row : :class:`MoveConstants` and :class:`LearningConstants` as arrays
+    float_work, int_work : work space: S and the :class:`Workspace` of the solver
+    status        : shape (outputs,), overwritten, status of each solution
     """
-    rules, how = move_constants_view(move_row), learning_constants_view(learning_row)
+    constants, learning = move_constants_view(move_row), learning_constants_view(learning_row)
     signals = signals_view(rows)
     horizon = decays.size - 1
-    moves = whole.shape[1] - 1
-    matrix = numbers[: horizon * moves].reshape((horizon, moves))
-    space = workspace_view(numbers[horizon * moves :], whole, moves)
+    moves = int_work.shape[1] - 1
+    matrix = float_work[: horizon * moves].reshape((horizon, moves))
+    work = workspace_view(float_work[horizon * moves :], int_work, moves)
     for z in range(len(stores)):
         wheel = wheel_state_view(stores[z], sizes[0], sizes[1], sizes[2], sizes[3])
-        machine, past = wheel.machine, wheel.past
+        machine, history = wheel.machine, wheel.history
         steps, free, known = tables[0, z], tables[1, z], tables[3, z]
         predict_known_errors(signals.jumps[z], decays, change[:, z], known)
-        # The first sample has one measurement; nothing was before it.
+        # The first sample has one measurement and no history.
         sample = signals.sums[z] / (average if samples > 0 else 1)
         if samples == 0:
-            reset_history(past, sample)
-        enough = samples > past.errors.size
+            reset_history(history, sample)
+        enough = samples > history.errors.size
         observe(
             machine,
-            wheel.memory,
-            past,
+            wheel.rls,
+            history,
             sample,
             signals.applied_sums[z] / decimation,
             enough,
-            enough and abs(signals.jumps[z]) < rules.quiet_threshold and rules.learning,
-            how,
+            enough and abs(signals.jumps[z]) < constants.quiet_threshold and constants.learning,
+            learning,
         )
-        # (62) starts from v_p(t-1) as applied, less the dither. A bound that has just been lowered
-        # is kept at once, because the compensator (81) counts on it: that is no part of dv_max.
+        # (62) starts from v_p(t-1) as applied, without the dither. A reduced bound takes effect at
+        # once, regardless of dv_max, because the compensator (81) relies on it.
         v = signals.v[z] - signals.dither[z]
-        held = min(max(signals.applied[z] - signals.dither[z], min(v, 0.0)), max(v, 0.0))
-        held = min(max(held, -rules.v_max), rules.v_max)
-        predict_responses(machine, past, held, rules.probe, known, steps, free)
-        # Whichever skill is worse: a response that goes to zero is hard to beat half a horizon
-        # ahead, but an untaught machine misses the very next error by far.
-        signals.skills[z] = skill_score(past, 1)
+        v_previous = min(max(signals.applied[z] - signals.dither[z], min(v, 0.0)), max(v, 0.0))
+        v_previous = min(max(v_previous, -constants.v_max), constants.v_max)
+        predict_responses(machine, history, v_previous, constants.probe, known, steps, free)
+        # The smaller of both skills: half a horizon ahead even an untrained machine may predict
+        # a decaying error well, but not one step ahead.
+        signals.skills[z] = skill_score(history, 1)
         share = authority(
-            min(skill_score(past, 0), signals.skills[z]),
-            steps[past.offsets.size - 1] / nominal,
-            rules.skill_low,
-            rules.skill_high,
-            rules.gain_low,
-            rules.gain_high,
+            min(skill_score(history, 0), signals.skills[z]),
+            steps[history.offsets.size - 1] / nominal,
+            constants.skill_low,
+            constants.skill_high,
+            constants.gain_low,
+            constants.gain_high,
         )
-        signals.authorities[z] = share if rules.enabled else 0.0
-        # A share that falls takes v_p out no faster than dv_max, so that no step is made of it.
-        bound = max(signals.authorities[z] * rules.v_max, abs(held) - rules.dv_max)
+        signals.authorities[z] = share if constants.enabled else 0.0
+        # A decreasing authority reduces v_p by at most dv_max per period, without a step.
+        bound = max(signals.authorities[z] * constants.v_max, abs(v_previous) - constants.dv_max)
         status[z] = plan_moves(
             steps,
             free,
-            held,
-            rules.error_weight,
-            rules.move_weight,
-            rules.dv_max,
+            v_previous,
+            constants.error_weight,
+            constants.move_weight,
+            constants.dv_max,
             bound,
             matrix,
-            space,
+            work,
             tables[2, z],
         )
-        # Rounding must not carry v_p over its bound, nor leave dust when it is zero.
-        v = min(max(held + space.changes[0], -bound), bound)
+        # Rounding must not move v_p beyond its bound, or leave a residual when it is zero.
+        v = min(max(v_previous + work.changes[0], -bound), bound)
         signals.v[z] = v
-        if rules.dithered:
-            signals.v[z] = min(max(v + signals.drawn[z], -rules.v_max), rules.v_max)
+        if constants.dithered:
+            signals.v[z] = min(max(v + signals.next_dither[z], -constants.v_max), constants.v_max)
         signals.dither[z] = signals.v[z] - v
         signals.sums[z] = 0.0
         signals.applied_sums[z] = 0.0
     end_control_period(signals, decay)
 
 
-__all__ = ['PredictiveParameters', 'PredictiveController']
-
-
-_APPLIED, _V, _DRAWN, _JUMPS, _AUTHORITIES, _SKILLS = map(
-    Signals._fields.index, ('applied', 'v', 'drawn', 'jumps', 'authorities', 'skills')
+_APPLIED, _V, _NEXT_DITHER, _JUMPS, _AUTHORITIES, _SKILLS = map(
+    Signals._fields.index, ('applied', 'v', 'next_dither', 'jumps', 'authorities', 'skills')
 )
 
 
 class PredictiveController:
-    """Computes v_p for each output from its tracking error, equations (34)-(63).
+    """Computes v_p of each output from its tracking error, equations (34)-(63).
 
-    :meth:`step` is called every control period; every ``settings.every`` of them the machines
-    take a sample, learn from it, predict, and the programs are solved; v_p is held in between.
+    :meth:`step` is called in every control period. Every ``decimation`` periods each machine
+    processes a sample, learns and predicts, and the quadratic programs are solved; v_p is held in
+    between.
 
-    A jump of the reference makes the error jump by a known amount, which then dies away as the
-    law's own feedback K makes it: exp(-K t). This known part is kept apart from what the machine
-    sees and added to what it predicts, so that a jump is neither learnt as dynamics nor
-    saturates the machine, whatever its size.
+    A jump of the reference is a known jump of the error, which decays with the feedback K of the
+    control law: exp(-K t). This known part is subtracted from the input of the machine and added
+    to its prediction, so a jump of any size is not learned as dynamics and does not saturate the
+    machine.
 
     Parameters
     ----------
-    settings
-        Everything that can be chosen.
+    parameters
+        Parameters of the controller.
     period
         Control period, s.
     feedback_gain
-        K of the law (1/s); it replaces the one in ``settings.nominal``.
+        K of the control law (1/s); it replaces the one in ``parameters.nominal``.
     outputs
         Number of wheels.
 
@@ -337,76 +539,91 @@ class PredictiveController:
         self._zeros = np.zeros(outputs)
         self._no_change = np.zeros((parameters.horizon, outputs))
         moves = parameters.control_horizon
-        self._numbers = np.zeros(parameters.horizon * moves + workspace_size(moves))
-        self._whole = np.zeros((2, moves + 1), dtype=np.int64)
+        self._float_work = np.zeros(parameters.horizon * moves + workspace_size(moves))
+        self._int_work = np.zeros((2, moves + 1), dtype=np.int64)
         self.status: NDArray[np.int64] = np.zeros(outputs, dtype=np.int64)
-        """How each output's last program ended, see :mod:`t3mpc_ros.mpc.quadratic_program`."""
+        """Status of each last solution, see :mod:`t3mpc_ros.mpc.quadratic_program`."""
         self.parameters = parameters
         self.configure(parameters, feedback_gain)
         self.pretrain()
 
     @property
     def tables(self) -> tuple[Any, ...]:
-        """What :func:`renew` reads and writes but the count of samples, in its order.
+        """Arguments of :func:`predictive_step` except ``samples``, in its order.
 
-        No jump of the error is known in it.
+        They contain no future jumps.
         """
         timing, change = self._timing, self._no_change
         seen = self._stores, self._sizes, self.rows, self._tables, self._nominal_response
-        how = timing.average, timing.decimation, self._decay, self._rules, self._learning_row
-        return *seen, self._decays, change, *how, self._numbers, self._whole, self.status
+        learning = (
+            timing.average,
+            timing.decimation,
+            self._decay,
+            self._move_row,
+            self._learning_row,
+        )
+        return (
+            *seen,
+            self._decays,
+            change,
+            *learning,
+            self._float_work,
+            self._int_work,
+            self.status,
+        )
 
     def synchronize(self, phase: int, samples: int) -> None:
-        """Take note that kernels have gone on with :attr:`tables`: up to where."""
+        """Set phase and number of samples after kernels have advanced :attr:`tables`."""
         self.phase, self.samples = phase, samples
         self._skill = self.rows[_SKILLS].copy()
 
     @property
     def skill(self) -> Array:
-        """Skill against persistence in the middle of the horizon, shape (outputs,): read only."""
+        """Skill against persistence in the middle of the horizon, shape (outputs,); read-only."""
         skill: Array = self._skill
         return skill
 
     @property
     def one_step_skill(self) -> Array:
         """Skill against persistence one step ahead, shape (outputs,)."""
-        return np.array([skill_score(wheel.past, 0) for wheel in self._predictors])
+        return np.array([skill_score(wheel.history, 0) for wheel in self._predictors])
 
     @property
-    def fade(self) -> Array:
-        """Share of v_p's bound in force, in [0, 1], shape (outputs,)."""
-        found: Array = self.rows[_AUTHORITIES]
-        return found.copy()
+    def authority(self) -> Array:
+        """Fraction of the bound of v_p in use, in [0, 1], shape (outputs,)."""
+        values: Array = self.rows[_AUTHORITIES]
+        return values.copy()
 
     @property
     def prediction(self) -> Array:
         """Predicted errors Psi (52) under the planned moves, rad/s, shape (outputs, n_p)."""
-        found: Array = self._tables[2]
-        return found.copy()
+        values: Array = self._tables[2]
+        return values.copy()
 
     @property
     def step_response(self) -> Array:
         """Latest s_0 ... s_{n_p-1} (48), (rad/s)/(rad/s²), shape (outputs, n_p)."""
-        found: Array = self._tables[0]
-        return found.copy()
+        values: Array = self._tables[0]
+        return values.copy()
 
     def configure(
         self, parameters: PredictiveParameters, feedback_gain: float | None = None
     ) -> None:
-        """Use other live settings, and another K (1/s), from the next step on.
+        """Replace dynamic parameters, and K (1/s), from the next step on.
 
         Raises
         ------
         ParameterError
-            A setting differs that is not live.
+            A read-only parameter differs.
         ValueError
             ``feedback_gain`` is not positive.
         """
         now, wanted = self.parameters.to_dict(), parameters.to_dict()
-        for row in parameters.specs():
-            if not row.dynamic and wanted[row.name] != now[row.name]:
+        for spec in parameters.specs():
+            name = spec.name
+            if not spec.dynamic and wanted[name] != now[name]:
                 raise ParameterError(
-                    f'{row.name} is fixed while running at {now[row.name]}: got {wanted[row.name]}'
+                    f'{name} is read-only with value {now[name]}: got {wanted[name]}'
                 )
         if feedback_gain is not None:
             if not feedback_gain > 0.0:
@@ -419,27 +636,26 @@ class PredictiveController:
             steps = nominal_step_response(self._loop, self._timing, parameters.horizon)
             self._nominal_response = float(steps[max(parameters.horizon // 2, 1) - 1])
         self.parameters = parameters
-        self._how = LearningConstants.of(parameters, self._timing.span)
-        self._learning_row = np.array(self._how, dtype=np.float64)
-        self._rules = np.array(MoveConstants.of(parameters), dtype=np.float64)
+        self._learning = learning_constants(parameters, self._timing.span)
+        self._learning_row = np.array(self._learning, dtype=np.float64)
+        self._move_row = np.array(MoveConstants.of(parameters), dtype=np.float64)
         self.dithered = parameters.enabled and parameters.dither > 0.0
 
     def pretrain(self, errors: Array | None = None, moves: Array | None = None) -> None:
-        """Make new machines and teach them from the beginning, then :meth:`reset`.
+        """Create new machines and pretrain them, then :meth:`reset`.
 
         Parameters
         ----------
         errors, moves
             A recorded run, oldest first, one row per predictive period, shape (N, outputs):
-            errors (rad/s) and the v_p applied after each (rad/s²), NaN where they are not known,
-            and in a row between two runs. Of the last quarter the longest stretch without a gap
-            is kept to measure the skill. Without them the nominal loop is simulated, and so is
-            the trial.
+            errors (rad/s) and the v_p applied after each (rad/s²), NaN where unknown and in a row
+            between two runs. The longest stretch without a gap in the last quarter is the trial
+            run for the skill. Without a recorded run both are simulated with the nominal loop.
 
         Raises
         ------
         ValueError
-            The two do not have one shape (N, outputs), are infinite, or too little is known.
+            Their shapes are not (N, outputs), they are infinite, or too few values are known.
         """
         parameters, outputs = self.parameters, self.status.size
         recorded = None
@@ -447,25 +663,28 @@ class PredictiveController:
             recorded = split_runs(np.asarray(errors), np.asarray(moves), outputs)
         generator = np.random.default_rng(parameters.seed)
         predictors: list[Predictor] = []
-        shape = LayerSizes(parameters.delta_lags, parameters.move_lags, parameters.hidden)
+        sizes = LayerSizes(parameters.delta_lags, parameters.move_lags, parameters.hidden)
         trial = replace(
             parameters.excitation, duration=max(0.25 * parameters.excitation.duration, 10.0)
         )
         for z in range(outputs):
             machine = make_machine(
-                shape, parameters.delta_scale, parameters.move_scale, parameters.spread, generator
+                sizes, parameters.delta_scale, parameters.move_scale, parameters.spread, generator
             )
             runs = [
                 simulate_excitation(
-                    self._loop, how, self._timing, parameters.move_scale, generator
+                    self._loop, learning, self._timing, parameters.move_scale, generator
                 )
-                for how in (parameters.excitation, trial)
+                for learning in (parameters.excitation, trial)
             ]
             if recorded is not None:
                 runs = recorded[z]
             predictor = Predictor(machine, parameters.horizon, runs[1])
             predictor.fit(
-                *runs[0], parameters.excitation, parameters.trust / self._timing.span, self._how
+                *runs[0],
+                parameters.excitation,
+                parameters.trust / self._timing.span,
+                self._learning,
             )
             predictors.append(predictor)
         self._predictors = predictors
@@ -474,41 +693,43 @@ class PredictiveController:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the past, and start from v_p = 0; weights and skill are kept."""
+        """Clear the history and set v_p to 0; keep weights and skill."""
         self.rows[:] = 0.0
         self._tables[:] = 0.0
         self._generator = np.random.default_rng((self.parameters.seed, 1))
         self.status[:] = OPTIMAL
         self.phase = 0
-        """Control periods since the last sample, below ``settings.every``."""
+        """Control periods since the last sample, below ``decimation``."""
         self.samples = 0
-        """Samples taken."""
+        """Number of samples."""
         for predictor in self._predictors:
-            reset_history(predictor.past, 0.0)
-        self._skill = np.array([skill_score(predictor.past, 1) for predictor in self._predictors])
+            reset_history(predictor.history, 0.0)
+        self._skill = np.array(
+            [skill_score(predictor.history, 1) for predictor in self._predictors]
+        )
         self.rows[_SKILLS] = self._skill
 
     def warm_up(self) -> None:
-        """Compile every kernel now, never inside a step; nothing is remembered of it."""
+        """Compile every kernel now instead of in the first step, then :meth:`reset`."""
         for _ in range(2 * self._timing.decimation):
             self.step(np.zeros(self.status.size))
         self.reset()
 
-    def weights(self) -> dict[str, Array]:
-        """Return everything learnt, to be saved; each array has the outputs in front."""
-        each = [predictor.weights() for predictor in self._predictors]
+    def get_weights(self) -> dict[str, Array]:
+        """Return all learned arrays, for saving; the first axis is the output."""
+        each = [predictor.get_weights() for predictor in self._predictors]
         return {name: np.stack([one[name] for one in each]) for name in each[0]}
 
     def set_weights(self, weights: Mapping[str, Array]) -> None:
-        """Use what :meth:`weights` returned; its skill is measured anew on a trial run.
+        """Set the arrays of :meth:`get_weights`, and measure the skill on the trial run.
 
         Raises
         ------
         ValueError
             A name is missing or unknown, a shape differs, a number is not finite, or the scales
-            are others than this term's. Nothing is changed then.
+            differ; nothing is changed.
         """
-        now = self.weights()
+        now = self.get_weights()
         if set(weights) != set(now):
             raise ValueError(f'weights must be {sorted(now)}: got {sorted(weights)}')
         for name, value in weights.items():
@@ -523,34 +744,36 @@ class PredictiveController:
                 f'scales must be {now["scales"].tolist()}: got {np.asarray(weights["scales"])}'
             )
         for z, predictor in enumerate(self._predictors):
-            predictor.set_weights({name: value[z] for name, value in weights.items()}, self._how)
+            predictor.set_weights(
+                {name: value[z] for name, value in weights.items()}, self._learning
+            )
         self.reset()
 
     def snapshot(self) -> list[Array]:
-        """Return what is learnt as it is now, for :meth:`go_back`: much faster than weights."""
+        """Return a copy of the state for :meth:`rollback`, much faster than the weights."""
         return [store.copy() for store in self._stores]
 
     def rollback(self, snapshot: list[Array]) -> None:
-        """Use what :meth:`copies` returned; its skill is measured anew on a trial run."""
+        """Restore a :meth:`snapshot`, and measure its skill on the trial run."""
         for predictor, copy in zip(self._predictors, snapshot, strict=True):
             predictor.store[:] = copy
-            predictor.evaluate(self._how)
+            predictor.evaluate(self._learning)
         self.reset()
 
     def notify_applied(self, v_p: Array) -> None:
-        """Tell what was applied of the v_p last returned (rad/s²), when it was not all of it.
+        """Set the v_p (rad/s²) that was applied, when it differs from the last one returned.
 
-        The machine must learn from what really acted. What goes beyond v_p, or against it, acts
-        too, but is no start for the next change: that starts between zero and v_p.
+        The machine learns from the applied v_p. The next change starts from the applied v_p,
+        limited to the range from zero to the returned one.
         """
         if np.shape(v_p) != self.status.shape or not np.isfinite(v_p).all():
             raise ValueError(f'v_p must be {self.status.size} finite numbers: got {v_p}')
         self.rows[_APPLIED] = v_p
 
     def notify_jump(self, jump: Array) -> None:
-        """Tell that the error jumps by ``jump`` (rad/s) at the coming step, because r jumps.
+        """Add a known jump of the error by ``jump`` (rad/s) at the next step.
 
-        Call it before :meth:`step` of the same period; jumps add up.
+        Call it before :meth:`step` of the same period; jumps are added.
         """
         if np.shape(jump) != self.status.shape or not np.isfinite(jump).all():
             raise ValueError(f'jump must be {self.status.size} finite numbers: got {jump}')
@@ -562,17 +785,16 @@ class PredictiveController:
         Parameters
         ----------
         errors
-            (Estimated) tracking errors delta = chi - r, rad/s, shape (outputs,).
+            Measured or estimated tracking errors delta = chi - r, rad/s, shape (outputs,).
         known_change
-            Jumps of delta that are still to come, shape (n_p, outputs), rad/s: row j holds what
-            the reference's jumps add between t + jT and t + (j+1)T, zero where nothing jumps.
-            Each is added to Psi_free where it happens, and dies away after it. Read only at the
-            steps where the program is solved, see :attr:`due`.
+            Known future jumps of delta, shape (n_p, outputs), rad/s: row j is the sum of the jumps
+            between t + jT and t + (j+1)T. Each is added to Psi_free from its time on, and
+            decays. Used only in steps that solve the quadratic program, see :attr:`due`.
 
         Raises
         ------
         ValueError
-            A shape is wrong or an error is not finite; nothing is changed then.
+            A shape is wrong or an error is not finite; nothing is changed.
         """
         errors = np.asarray(errors, dtype=np.float64)
         if errors.shape != self.status.shape:
@@ -589,18 +811,18 @@ class PredictiveController:
         return v_p.copy()
 
     def advance(self, speeds: Array, wanted: Array, known_change: Array | None = None) -> None:
-        """Renew ``rows`` as :meth:`step` does with speeds - wanted; shapes are not checked."""
+        """Update ``rows`` like :meth:`step` with errors speeds - wanted, without shape checks."""
         timing, phase = self._timing, self.phase
         sampled = phase == 0 or phase > timing.decimation - timing.average
         if not accumulate_sample(speeds, wanted, sampled, phase == 0, self._decay, self.rows):
             raise ValueError(f'errors must be finite: got {speeds - wanted}')
         if phase == 0:
-            self._renew(self._no_change if known_change is None else known_change)
+            self._predictive_step(self._no_change if known_change is None else known_change)
         self.phase = (phase + 1) % timing.decimation
 
     @property
     def known_error(self) -> Array:
-        """What is left of the jumps told by :meth:`shift`, rad/s, shape (outputs,)."""
+        """Residual of the known jumps, rad/s, shape (outputs,)."""
         left: Array = self.rows[_JUMPS]
         return left
 
@@ -611,14 +833,14 @@ class PredictiveController:
 
     @property
     def due(self) -> bool:
-        """Whether the next :meth:`step` solves the program, and reads ``known_change``."""
+        """Whether the next :meth:`step` solves the quadratic program, with ``known_change``."""
         return self.phase == 0
 
-    def _renew(self, change: Array) -> None:
-        """Take the sample of each output, and renew its v_p."""
+    def _predictive_step(self, change: Array) -> None:
+        """Process the sample of each output, and update its v_p."""
         if self.dithered:
-            drawn = self._generator.uniform(-1.0, 1.0, self.status.size)
-            self.rows[_DRAWN] = self.parameters.dither * drawn
+            next_dither = self._generator.uniform(-1.0, 1.0, self.status.size)
+            self.rows[_NEXT_DITHER] = self.parameters.dither * next_dither
         timing = self._timing
         predictive_step(
             self._stores,
@@ -632,10 +854,10 @@ class PredictiveController:
             timing.average,
             timing.decimation,
             self._decay,
-            self._rules,
+            self._move_row,
             self._learning_row,
-            self._numbers,
-            self._whole,
+            self._float_work,
+            self._int_work,
             self.status,
         )
         self._skill = self.rows[_SKILLS].copy()

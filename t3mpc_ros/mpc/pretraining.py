@@ -19,17 +19,19 @@ from t3mpc_ros.mpc.boltzmann_machine import (
 )
 from t3mpc_ros.parameters.table import Parameters, parameter
 
+Array = NDArray[np.float64]
+
 
 @dataclass(frozen=True)
 class NominalLoopParameters(Parameters):
-    """The error dynamics the machine is trained on before it meets the robot.
+    """Nominal error dynamics, on which the machine is pretrained.
 
     delta' = -K (delta + noise) + a + w,   lag a' = v_p(t - dead_time) - a.
     """
 
     feedback_gain: float = parameter(
         8.0,
-        'feedback K; the controller puts its own in its place',
+        'feedback K; the controller replaces it by its own',
         unit='1/s',
         low=0.1,
         high=100.0,
@@ -37,26 +39,26 @@ class NominalLoopParameters(Parameters):
     lag: float = parameter(
         0.02, 'time constant from v_p to acceleration', unit='s', low=1e-3, high=1.0
     )
-    dead_time: float = parameter(0.01, 'delay before v_p acts', unit='s', low=0.0, high=1.0)
+    dead_time: float = parameter(0.01, 'dead time of v_p', unit='s', low=0.0, high=1.0)
 
 
 @dataclass(frozen=True)
 class ExcitationParameters(Parameters):
-    """The simulated run, and how the machine learns from it beforehand."""
+    """Simulated run of the pretraining, and the learning from it."""
 
     duration: float = parameter(240.0, 'length of the run', unit='s', low=10.0, high=3600.0)
     move: float = parameter(
-        0.5, 'largest v_p of the random levels, as a share of its scale', low=0.01, high=2.0
+        0.5, 'maximum v_p of the random levels, as a fraction of its scale', low=0.01, high=2.0
     )
     move_hold: float = parameter(
-        0.3, 'mean time a level of v_p lasts', unit='s', low=0.01, high=100.0
+        0.3, 'mean duration of a level of v_p', unit='s', low=0.01, high=100.0
     )
     disturbance: float = parameter(
         2.0, 'standard deviation of the disturbance w', unit='rad/s²', low=0.0, high=1000.0
     )
     disturbance_hold: float = parameter(
         2.0,
-        'mean time a level of w lasts: the machine expects disturbances to last as long',
+        'mean duration of a level of w, which the machine learns to expect',
         unit='s',
         low=0.01,
         high=1000.0,
@@ -64,14 +66,14 @@ class ExcitationParameters(Parameters):
     noise: float = parameter(
         0.15, 'standard deviation of the measured error', unit='rad/s', low=0.0, high=10.0
     )
-    epochs: int = parameter(2, 'passes of CD-1 (43) over the run', low=0, high=100)
-    contrast_rate: float = parameter(0.002, 'gamma of (43) during the run', low=0.0, high=1.0)
+    epochs: int = parameter(2, 'epochs of CD-1 (43) over the run', low=0, high=100)
+    contrast_rate: float = parameter(0.002, 'gamma of (43) in pretraining', low=0.0, high=1.0)
     ridge: float = parameter(
-        1e-6, 'ridge penalty, as a share of the mean square of the features', low=1e-12, high=1.0
+        1e-6,
+        'ridge penalty, as a fraction of the mean square of the features',
+        low=1e-12,
+        high=1.0,
     )
-
-
-Array = NDArray[np.float64]
 
 
 def ridge_regression(features: Array, targets: Array, penalty: float) -> Array:
@@ -84,7 +86,7 @@ def ridge_regression(features: Array, targets: Array, penalty: float) -> Array:
     targets
         delta of each instant over its scale, shape (N,).
     penalty
-        p as a share of the mean of the diagonal of featuresᵀ features.
+        p as a fraction of the mean of the diagonal of featuresᵀ features.
     """
     square = features.T @ features
     weight = penalty * np.trace(square) / square.shape[0] + np.finfo(np.float64).tiny
@@ -95,10 +97,10 @@ def ridge_regression(features: Array, targets: Array, penalty: float) -> Array:
 def contrastive_divergence_epoch(
     machine: BoltzmannMachine, errors: Array, moves: Array, rate: float, features: Array
 ) -> None:
-    """Pass once through a run, oldest first; learn by (43), and write each mu_1.
+    """Learn from every instant of a run by (43), oldest first, and write each mu_1.
 
-    errors, moves : newest first, length N; NaN where they are not known
-    rate          : gamma of (43), 0 to only look
+    errors, moves : newest first, length N; NaN where unknown
+    rate          : gamma of (43); 0 leaves X_v unchanged
     features      : row i belongs to errors[i], shape (N - lags, hidden); NaN if a lag is unknown
     """
     n_errors, n_moves = machine.delta_lags, machine.lags.size - machine.delta_lags
@@ -114,32 +116,32 @@ def contrastive_divergence_epoch(
 
 def pretrain(
     machine: BoltzmannMachine,
-    memory: RlsState,
+    rls: RlsState,
     errors: Array,
     moves: Array,
-    how: ExcitationParameters,
+    excitation: ExcitationParameters,
     trust: float,
     noise: float,
 ) -> None:
-    """Teach the machine a run: CD-1 epochs for X_v (43), then ridge regression for X_o.
+    """Fit the machine to a run: CD-1 epochs for X_v (43), then ridge regression for X_o.
 
     Parameters
     ----------
-    machine, memory
-        Changed in place; the memory then holds the run as its prior.
+    machine, rls
+        Changed in place; the run becomes the prior of the RLS state.
     errors, moves
-        The run, *newest first*, in rad/s and rad/s²: simulated or recorded, NaN in its gaps.
-    how
+        The run, *newest first*, in rad/s and rad/s²: simulated or recorded, NaN in gaps.
+    excitation
         Epochs, rate and ridge penalty.
     trust
-        How many instants of later experience the prior is worth.
+        Weight of the prior, as a number of later instants.
     noise
-        Standard deviation of an error that is mere noise, rad/s.
+        Standard deviation of the noise of the errors, rad/s.
 
     Raises
     ------
     ValueError
-        The arrays differ in length, are infinite, or hold too little to fit the output layer.
+        The arrays differ in length, are infinite, or too short to fit the output layer.
     """
     lags = max(machine.delta_lags, machine.lags.size - machine.delta_lags)
     count, hidden = max(errors.size - lags, 0), machine.output_weights.size
@@ -150,31 +152,33 @@ def pretrain(
     if np.isinf((errors, moves)).any():
         raise ValueError('errors and moves must be finite, or NaN in gaps: got inf')
     features = np.zeros((count, hidden))
-    for rate in (*[how.contrast_rate] * how.epochs, 0.0):
+    for rate in (*[excitation.contrast_rate] * excitation.epochs, 0.0):
         contrastive_divergence_epoch(machine, errors, moves, rate, features)
     known = ~np.isnan(features[:, 0])
     features, targets = features[known], errors[:count][known] / machine.scales[0]
     if targets.size <= hidden:
         raise ValueError(f'errors must hold more than {hidden} finite values: got {targets.size}')
-    machine.output_weights[:] = ridge_regression(features, targets, how.ridge)
+    machine.output_weights[:] = ridge_regression(features, targets, excitation.ridge)
     square = features.T @ features / targets.size
     mean = float(np.trace(square))
-    memory.information[:] = 0.0
-    memory.prior[:] = trust * (square + how.ridge * mean / square.shape[0] * np.eye(len(square)))
-    memory.anchor[:] = machine.output_weights
+    rls.information[:] = 0.0
+    rls.prior[:] = trust * (
+        square + excitation.ridge * mean / square.shape[0] * np.eye(len(square))
+    )
+    rls.anchor[:] = machine.output_weights
     quiet = noise**2 / max(float(np.nanmean(errors**2)), noise**2)
-    memory.power[:] = (mean, mean, mean * quiet)
+    rls.power[:] = (mean, mean, mean * quiet)
 
 
 class SampleTiming(NamedTuple):
-    """How predictive periods are made of control periods."""
+    """Control period, predictive period, and averaging of the errors."""
 
     period: float
     """Control period, s."""
     decimation: int
     """Control periods per predictive period."""
     average: int
-    """Newest control periods, 1 to ``every``, whose errors are averaged to one sample."""
+    """Number of newest errors, 1 to ``decimation``, in the mean of one sample."""
 
     @property
     def span(self) -> float:
@@ -185,8 +189,8 @@ class SampleTiming(NamedTuple):
 def nominal_transition(loop: NominalLoopParameters, duration: float) -> Array:
     """Return the exact map of (delta, a, v_p, w, noise) to (delta, a) after ``duration`` s.
 
-    Rows (delta, a), shape (2, 5). The matrix exponential by Taylor series on a scaled-down
-    matrix, squared back up.
+    Rows (delta, a), shape (2, 5). The matrix exponential is computed by scaling and squaring of
+    a Taylor series.
     """
     gain, lag = loop.feedback_gain, loop.lag
     rates = np.zeros((5, 5))
@@ -218,16 +222,16 @@ def simulate_nominal_loop(
     """Write the measured errors of the nominal loop, one per predictive period.
 
     step_matrix, late_matrix : shape (2, 5), transitions of (delta, a) over the first part of a
-        control period, where the older v_p still acts, and over the rest; inputs v_p, w, noise
-    whole_delay              : whole control periods of dead time
-    every, average           : control periods per sample, and measurements in its mean
+        control period, in which the older v_p acts, and over the rest; inputs v_p, w, noise
+    whole_delay              : dead time in whole control periods
+    decimation, average      : control periods per sample, and measurements in its mean
     moves                    : v_p of each predictive period
     disturbance, noise       : of each control period
     """
     delta, actuator = 0.0, 0.0
     errors[:] = 0.0
     for k in range(errors.size * decimation):
-        # The sample at a predictive instant is the mean of the newest ``average`` measurements.
+        # The sample of a predictive period is the mean of the newest ``average`` measurements.
         if k % decimation == 0 or k % decimation > decimation - average:
             sample = (k + decimation - 1) // decimation
             if sample < errors.size:
@@ -248,7 +252,7 @@ def simulate_nominal_loop(
 
 
 def random_levels(generator: np.random.Generator, count: int, mean_hold: float) -> Array:
-    """Return ``count`` levels in [-1, 1], each lasting ``mean_hold`` values on average."""
+    """Return ``count`` random levels in [-1, 1], held for ``mean_hold`` values on average."""
     fresh = generator.random(count) < 1.0 / max(mean_hold, 1.0)
     fresh[0] = True
     levels = generator.uniform(-1.0, 1.0, count)
@@ -265,17 +269,17 @@ def simulate_excitation(
 ) -> tuple[Array, Array]:
     """Return (errors, moves) of a simulated run, *newest first*, one per predictive period.
 
-    v_p and the disturbance w jump between random levels that last a while on average; v_p
-    changes only with the predictive period. The feedback acts on the noisy error.
+    v_p and the disturbance w are random levels of a given mean duration; v_p changes only with
+    the predictive period. The feedback acts on the noisy error.
 
     Parameters
     ----------
     loop, excitation, timing
         The nominal dynamics, the signals and the periods.
     move_scale
-        v_p (rad/s²) of which ``excitation.move`` is a share.
+        Scale of v_p (rad/s²), of which ``excitation.move`` is a fraction.
     generator
-        Source of every random number.
+        Random number generator.
     """
     count = max(round(excitation.duration / timing.span), 2)
     fine = count * timing.decimation
@@ -292,7 +296,7 @@ def simulate_excitation(
 def nominal_step_response(
     loop: NominalLoopParameters, timing: SampleTiming, horizon: int
 ) -> Array:
-    """Return the true s_0 ... s_{n_p-1} of the nominal loop, in (rad/s)/(rad/s²)."""
+    """Return s_0 ... s_{n_p-1} of the nominal loop, in (rad/s)/(rad/s²)."""
     none = np.zeros((horizon + 1) * timing.decimation)
     return _simulate(loop, timing, np.ones(horizon + 1), none, none)[1:]
 
@@ -321,19 +325,19 @@ def _simulate(
 
 
 def split_runs(errors: Array, moves: Array, outputs: int) -> list[list[tuple[Array, Array]]]:
-    """Return for each output the first three quarters and the rest of a run, *newest first*.
+    """Return the first three quarters and the rest of a run for each output, *newest first*.
 
-    Of the rest it is the longest stretch without a gap: a trial goes through it step by step.
+    The rest is reduced to its longest stretch without a gap, as a trial run needs.
 
     Parameters
     ----------
     errors, moves
-        A recorded run, oldest first, shape (N, outputs); NaN where it is not known.
+        A recorded run, oldest first, shape (N, outputs); NaN where unknown.
 
     Raises
     ------
     ValueError
-        The two do not have one shape, or not as many columns as there are outputs.
+        The shapes differ, or the number of columns is not the number of outputs.
     """
     if errors.shape != moves.shape or errors.shape[1:] != (outputs,):
         raise ValueError(

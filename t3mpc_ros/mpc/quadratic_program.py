@@ -1,6 +1,15 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Quadratic program for the moves of v_p, (34), (60)-(62) with E10, and its active-set solver."""
+"""Quadratic program for the moves of v_p, (34), (60)-(62) with E10, and its active-set solver.
+
+The problem, for the changes dv of the predictive signal in the next n_c periods:
+
+    minimise    mu |S dv + Psi_free|² + pi |dv|²
+    subject to  |dv_i| <= dv_max,   |v_p(t-1) + dv_0 + ... + dv_i| <= v_max.
+
+Row i < n_c of the constraints is dv_i, row n_c + i the sum up to i. Each has a lower and an upper
+bound with one multiplier each.
+"""
 
 import math
 from typing import NamedTuple
@@ -14,39 +23,52 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
+OPTIMAL = 0
+"""The solution satisfies the Karush-Kuhn-Tucker conditions."""
+NOT_POSITIVE = 1
+"""mu SᵀS + pi I is not positive definite, or a number is not finite; dv is zero."""
+INFEASIBLE = 2
+"""No dv satisfies the constraints (v_p(t-1) is outside its bound); dv is zero."""
+UNFINISHED = 3
+"""The maximum number of iterations was reached; dv is zero."""
+
+BOUND_TOLERANCE = 1e-10
+"""Tolerance of a bound, relative to the larger of the two bounds."""
+
+
 class Workspace(NamedTuple):
-    """Everything the solver writes to, for n = n_c moves; made once by :func:`make_space`."""
+    """Results and work space of the solver for n = n_c changes."""
 
     hessian: Array
     """mu SᵀS + pi I, shape (n, n)."""
-    slope: Array
+    gradient: Array
     """mu SᵀPsi_free, shape (n,)."""
     lower: Array
     """Cholesky factor L of the Hessian, shape (n, n)."""
     changes: Array
-    """The answer dv, shape (n,), rad/s²."""
+    """Solution dv, shape (n,), rad/s²."""
     multipliers: Array
-    """Shape (2, 2n): of the lower bounds and of the upper bounds of the rows, all >= 0."""
+    """Shape (2, 2n): multipliers of the lower and of the upper bounds of the rows, all >= 0."""
     active: Indices
-    """Shape (n,): rows held at a bound, in order of adding."""
+    """Shape (n,): active rows, in the order in which they were added."""
     sides: Array
-    """Shape (n,): 1 where an active row is held by its upper bound, -1 by its lower."""
-    weights: Array
+    """Shape (n,): 1 where an active row is at its upper bound, -1 at its lower."""
+    active_multipliers: Array
     """Shape (n,): multipliers of the active rows."""
     basis: Array
     """Shape (n, n): orthonormal rows that span L⁻¹ times the active normals."""
     triangle: Array
     """Shape (n, n): L⁻¹ times normal k is the sum over j <= k of triangle[j, k] basis[j]."""
     normal: Array
-    """Shape (n,): working memory, as the next two."""
-    share: Array
-    start: Array
+    """Shape (n,): work space, as the next two."""
+    projection: Array
+    unconstrained: Array
     components: Indices
-    """Shape (n + 1,): working memory of ``active_set.depends``."""
+    """Shape (n + 1,): work space of :func:`is_dependent`."""
 
 
 def make_workspace(moves: int) -> Workspace:
-    """Return the working memory of a program with ``moves`` (n_c) unknowns."""
+    """Return the work space for ``moves`` (n_c) unknowns."""
     if moves < 1:
         raise ValueError(f'moves must be at least 1: got {moves}')
     return workspace_view(
@@ -56,13 +78,13 @@ def make_workspace(moves: int) -> Workspace:
 
 @kernel
 def workspace_size(moves: int) -> int:
-    """Return how many numbers make the space of a program, whole numbers not counted."""
+    """Return the size of the float store of a work space."""
     return 4 * moves * moves + 11 * moves
 
 
 @kernel
 def workspace_view(store: Array, whole: Indices, moves: int) -> Workspace:
-    """Return the views of a flat store, and of whole numbers (2, n + 1), that are a space."""
+    """Return the views of a float store and an integer store (2, n + 1) that form a work space."""
     tables = store[: 4 * moves * moves].reshape((4, moves, moves))
     rows = store[4 * moves * moves :].reshape((11, moves))
     return Workspace(
@@ -81,6 +103,111 @@ def workspace_view(store: Array, whole: Indices, moves: int) -> Workspace:
         rows[6],
         whole[1],
     )
+
+
+@kernel
+def solve_quadratic_program(
+    matrix: Array,
+    free: Array,
+    error_weight: float,
+    move_weight: float,
+    v_previous: float,
+    dv_max: float,
+    v_max: float,
+    max_iterations: int,
+    work: Workspace,
+) -> int:
+    """Write the optimal changes and multipliers into ``work``; return a status.
+
+    Goldfarb and Idnani (1983), a dual active-set method: it starts at the unconstrained optimum
+    (62), with E10, and repeatedly adds the bound with the largest violation, dropping active
+    bounds whose multiplier would become negative. Usually (62) satisfies the bounds and no
+    iteration is needed, so a warm start would gain nothing.
+
+    matrix, free              : S, shape (n_p, n_c); Psi_free, shape (n_p,)
+    error_weight, move_weight : mu and pi (> 0)
+    v_previous                : v_p(t-1), rad/s²; inside v_max, or the status is INFEASIBLE
+    dv_max, v_max             : rad/s², zero allowed
+    max_iterations            : maximum number of additions and removals of bounds
+    """
+    n = work.gradient.size
+    normal_equations(matrix, free, error_weight, move_weight, work.hessian, work.gradient)
+    fine = cholesky(work.hessian, work.lower)
+    total = 0.0
+    for i in range(n):
+        work.unconstrained[i] = -work.gradient[i]
+        total += work.gradient[i]
+    work.multipliers[:] = 0.0
+    work.changes[:] = 0.0
+    if not fine or not math.isfinite(total + v_previous):
+        return NOT_POSITIVE
+    if dv_max == 0.0 and abs(v_previous) <= v_max:
+        # No change is possible: the bounds on the changes balance the whole gradient.
+        for i in range(n):
+            work.multipliers[0, i] = max(work.gradient[i], 0.0)
+            work.multipliers[1, i] = max(-work.gradient[i], 0.0)
+        return OPTIMAL
+    solve_lower(work.lower, work.unconstrained)
+    close = BOUND_TOLERANCE * max(dv_max, v_max)
+    count = 0
+    solve_with_active_rows(work, count, v_previous, dv_max, v_max)
+    worst, side = find_violation(work, count, v_previous, dv_max, v_max, close)
+    for _ in range(max_iterations):
+        if worst < 0:
+            for k in range(count):
+                upper = 1 if work.sides[k] > 0.0 else 0
+                work.multipliers[upper, work.active[k]] = max(work.active_multipliers[k], 0.0)
+            return OPTIMAL
+        dependent = is_dependent(worst, work.active, count, work.components)
+        row_normal(worst, side, work.lower, work.normal)
+        project_out(work, count)
+        # Largest dual step before an active multiplier is zero.
+        longest, drop = math.inf, -1
+        for k in range(count - 1, -1, -1):
+            rate = work.projection[k]
+            for j in range(k + 1, count):
+                rate -= work.triangle[k, j] * work.projection[j]
+            work.projection[k] = rate / work.triangle[k, k]
+            if (
+                work.projection[k] > 1e-12
+                and work.active_multipliers[k] < longest * work.projection[k]
+            ):
+                longest, drop = work.active_multipliers[k] / work.projection[k], k
+        # Step to the new bound, infinite for a dependent normal.
+        needed = math.inf
+        if not dependent:
+            squared = 0.0
+            for i in range(n):
+                squared += work.normal[i] * work.normal[i]
+            gap = side * row_value(worst, work.changes)
+            gap -= bound(worst, side, n, v_previous, dv_max, v_max)
+            needed = max(gap, 0.0) / squared
+        step = min(longest, needed)
+        if math.isinf(step):
+            work.changes[:] = 0.0
+            return INFEASIBLE
+        if needed <= longest:
+            work.active[count] = worst
+            work.sides[count] = side
+            count += 1
+            rebuild_basis(work, count)
+            solve_with_active_rows(work, count, v_previous, dv_max, v_max)
+            worst, side = find_violation(work, count, v_previous, dv_max, v_max, close)
+        else:
+            if not dependent:
+                solve_upper(work.lower, work.normal)
+                for i in range(n):
+                    work.changes[i] -= step * work.normal[i]
+            for k in range(count):
+                work.active_multipliers[k] -= step * work.projection[k]
+            count -= 1
+            for k in range(drop, count):
+                work.active[k] = work.active[k + 1]
+                work.sides[k] = work.sides[k + 1]
+                work.active_multipliers[k] = work.active_multipliers[k + 1]
+            rebuild_basis(work, count)
+    work.changes[:] = 0.0
+    return UNFINISHED
 
 
 @kernel
@@ -106,16 +233,16 @@ def normal_equations(
     error_weight: float,
     move_weight: float,
     hessian: Array,
-    slope: Array,
+    gradient: Array,
 ) -> None:
-    """Write mu SᵀS + pi I and mu SᵀPsi_free, the two parts of half the gradient (61).
+    """Write mu SᵀS + pi I and mu SᵀPsi_free, the two terms of half the gradient (61).
 
     matrix  : S, shape (n_p, n_c)
     free    : Psi_free, shape (n_p,)
     hessian : shape (n_c, n_c), overwritten
-    slope   : shape (n_c,), overwritten
+    gradient : shape (n_c,), overwritten
     """
-    n = slope.size
+    n = gradient.size
     for i in range(n):
         for k in range(i + 1):
             total = 0.0
@@ -127,12 +254,12 @@ def normal_equations(
         total = 0.0
         for j in range(free.size):
             total += matrix[j, i] * free[j]
-        slope[i] = error_weight * total
+        gradient[i] = error_weight * total
 
 
 @kernel
 def cholesky(matrix: Array, lower: Array) -> bool:
-    """Write the Cholesky factor of ``matrix`` into ``lower``; return False if there is none."""
+    """Write the Cholesky factor of ``matrix`` into ``lower``; return False without one."""
     for i in range(matrix.shape[0]):
         for k in range(i + 1):
             total = matrix[i, k]
@@ -166,24 +293,24 @@ def solve_upper(lower: Array, x: Array) -> None:
 
 
 @kernel
-def unconstrained_optimum(lower: Array, slope: Array, changes: Array) -> None:
+def unconstrained_optimum(lower: Array, gradient: Array, changes: Array) -> None:
     """Write dv = -mu (mu SᵀS + pi I)⁻¹ SᵀPsi_free, equation (62) with E10.
 
-    E10: the printed right side lacks the minus sign that follows from (61).
+    E10: the printed right-hand side lacks the minus sign that follows from (61).
 
     lower   : Cholesky factor of the Hessian
-    slope   : mu SᵀPsi_free
+    gradient : mu SᵀPsi_free
     changes : shape (n_c,), overwritten (rad/s²)
     """
     for i in range(changes.size):
-        changes[i] = -slope[i]
+        changes[i] = -gradient[i]
     solve_lower(lower, changes)
     solve_upper(lower, changes)
 
 
 @kernel
 def row_value(row: int, changes: Array) -> float:
-    """Return dv_row, or for the rows after the first n the sum of dv up to that move."""
+    """Return the value of a row: dv_row, or after the first n rows the sum of dv."""
     n = changes.size
     if row < n:
         value: float = changes[row]
@@ -195,18 +322,18 @@ def row_value(row: int, changes: Array) -> float:
 
 
 @kernel
-def bound(row: int, side: float, n: int, before: float, dv_max: float, v_max: float) -> float:
-    """Return the bound of a row on one side, as a bound on side * (row's value)."""
-    return dv_max if row < n else v_max - side * before
+def bound(row: int, side: float, n: int, v_previous: float, dv_max: float, v_max: float) -> float:
+    """Return the bound of a row on one side, as the upper bound of side * value."""
+    return dv_max if row < n else v_max - side * v_previous
 
 
 @kernel
 def kkt_residuals(
-    space: Workspace, before: float, dv_max: float, v_max: float, out: Array
+    work: Workspace, v_previous: float, dv_max: float, v_max: float, out: Array
 ) -> float:
-    """Return the largest of the four Karush-Kuhn-Tucker residuals of the answer in ``space``.
+    """Return the largest of the four Karush-Kuhn-Tucker residuals of the solution in ``work``.
 
-    All are relative, so that one figure serves every scale of weights and bounds. With g the
+    All are relative, so one tolerance is valid for every scale of weights and bounds. With g the
     larger of |mu SᵀPsi_free| and |H||dv|, and w the larger of the two bounds:
 
     out[0] stationarity    : |H dv + mu SᵀPsi_free + A'(upper - lower multipliers)| / g
@@ -214,50 +341,37 @@ def kkt_residuals(
     out[2] dual            : most negative multiplier / g
     out[3] complementarity : largest |multiplier * distance to its bound| / (g w)
     """
-    n = space.slope.size
+    n = work.gradient.size
     size, steepest, largest = 0.0, 0.0, 0.0
     for i in range(n):
-        size = max(size, abs(space.changes[i]))
-        steepest = max(steepest, abs(space.slope[i]))
+        size = max(size, abs(work.changes[i]))
+        steepest = max(steepest, abs(work.gradient[i]))
         for k in range(n):
-            largest = max(largest, abs(space.hessian[i, k]))
+            largest = max(largest, abs(work.hessian[i, k]))
     steepest = max(steepest, largest * size)
     widest = max(dv_max, v_max)
     gradient_scale = steepest if steepest > 0.0 else 1.0
     width_scale = widest if widest > 0.0 else 1.0
     out[:] = 0.0
     for i in range(n):
-        total = space.slope[i]
+        total = work.gradient[i]
         for k in range(n):
-            total += space.hessian[i, k] * space.changes[k]
+            total += work.hessian[i, k] * work.changes[k]
         for row in range(2 * n):
             if row == i or row - n >= i:
-                total += space.multipliers[1, row] - space.multipliers[0, row]
+                total += work.multipliers[1, row] - work.multipliers[0, row]
         out[0] = max(out[0], abs(total) / gradient_scale)
     for row in range(2 * n):
-        value = row_value(row, space.changes)
+        value = row_value(row, work.changes)
         for upper in range(2):
             side = 1.0 if upper == 1 else -1.0
-            beyond = side * value - bound(row, side, n, before, dv_max, v_max)
-            multiplier = space.multipliers[upper, row]
+            beyond = side * value - bound(row, side, n, v_previous, dv_max, v_max)
+            multiplier = work.multipliers[upper, row]
             out[1] = max(out[1], beyond / width_scale)
             out[2] = max(out[2], -multiplier / gradient_scale)
             out[3] = max(out[3], abs(multiplier * beyond) / (gradient_scale * width_scale))
     worst: float = max(max(out[0], out[1]), max(out[2], out[3]))
     return worst
-
-
-OPTIMAL = 0
-"""The answer satisfies the Karush-Kuhn-Tucker conditions."""
-NOT_POSITIVE = 1
-"""mu SᵀS + pi I is not positive definite, or something is not finite; the answer is no move."""
-INFEASIBLE = 2
-"""No move satisfies the constraints (v_p(t-1) lies outside its bound); the answer is no move."""
-UNFINISHED = 3
-"""The cap on iterations was met; the answer is no move."""
-
-BOUND_TOLERANCE = 1e-10
-"""How far outside a bound still counts as on it, relative to the larger of the two bounds."""
 
 
 @kernel
@@ -271,11 +385,11 @@ def row_normal(row: int, side: float, lower: Array, out: Array) -> None:
 
 @kernel
 def is_dependent(row: int, active: Indices, count: int, components: Indices) -> bool:
-    """Decide exactly whether a row is a linear combination of the active ones.
+    """Return whether a row is a linear combination of the active ones, decided exactly.
 
-    In the running sums c_i the rows are c_i and c_i - c_(i-1): edges of a graph whose points are
-    0 (the ground) and 1 ... n. Edges depend on each other exactly when they close a loop, so
-    joining points to islands answers without a tolerance. (Rows 0 and n are twice the same edge.)
+    In the running sums c_i the rows are c_i and c_i - c_(i-1): edges of a graph with the nodes 0
+    (ground) and 1 ... n. Edges are dependent exactly when they form a cycle, which the connected
+    components show without a tolerance. (Rows 0 and n are the same edge.)
     """
     n = components.size - 1
     for point in range(n + 1):
@@ -294,193 +408,91 @@ def is_dependent(row: int, active: Indices, count: int, components: Indices) -> 
 
 
 @kernel
-def project_out(space: Workspace, count: int) -> None:
-    """Split ``space.normal`` into its share in the span of the active normals and the rest.
+def project_out(work: Workspace, count: int) -> None:
+    """Split ``work.normal`` into its projection on the active normals and the remainder.
 
-    Twice, because the first pass leaves rounding of the order of what it removed.
+    Two passes, because the rounding of the first is of the order of the projection.
     """
     for k in range(count):
-        space.share[k] = 0.0
+        work.projection[k] = 0.0
     for _ in range(2):
         for k in range(count):
             part = 0.0
-            for i in range(space.normal.size):
-                part += space.basis[k, i] * space.normal[i]
-            for i in range(space.normal.size):
-                space.normal[i] -= part * space.basis[k, i]
-            space.share[k] += part
+            for i in range(work.normal.size):
+                part += work.basis[k, i] * work.normal[i]
+            for i in range(work.normal.size):
+                work.normal[i] -= part * work.basis[k, i]
+            work.projection[k] += part
 
 
 @kernel
-def rebuild_basis(space: Workspace, count: int) -> None:
-    """Write ``basis`` and ``triangle`` of the first ``count`` active rows, from scratch.
+def rebuild_basis(work: Workspace, count: int) -> None:
+    """Compute ``basis`` and ``triangle`` of the first ``count`` active rows.
 
-    With a dozen unknowns this costs no more than updating, and rounding cannot build up.
+    With a dozen unknowns this costs no more than an update, and rounding does not accumulate.
     """
     for k in range(count):
-        row_normal(space.active[k], space.sides[k], space.lower, space.normal)
-        project_out(space, k)
+        row_normal(work.active[k], work.sides[k], work.lower, work.normal)
+        project_out(work, k)
         for j in range(k):
-            space.triangle[j, k] = space.share[j]
+            work.triangle[j, k] = work.projection[j]
         length = 0.0
-        for i in range(space.normal.size):
-            length += space.normal[i] * space.normal[i]
+        for i in range(work.normal.size):
+            length += work.normal[i] * work.normal[i]
         length = math.sqrt(length)
-        space.triangle[k, k] = length
-        for i in range(space.normal.size):
-            space.basis[k, i] = space.normal[i] / length
+        work.triangle[k, k] = length
+        for i in range(work.normal.size):
+            work.basis[k, i] = work.normal[i] / length
 
 
 @kernel
 def solve_with_active_rows(
-    space: Workspace, count: int, before: float, dv_max: float, v_max: float
+    work: Workspace, count: int, v_previous: float, dv_max: float, v_max: float
 ) -> None:
-    """Write the optimum with the active rows held at their bounds, and their multipliers."""
-    n = space.slope.size
-    # The part of the unconstrained optimum that the active rows leave free. Splitting it off
-    # first keeps the rounding of a distant optimum out of an answer that may be much smaller.
-    space.normal[:] = space.start
-    project_out(space, count)
-    space.changes[:] = space.normal
+    """Write the optimum with the active rows at their bounds, and their multipliers."""
+    n = work.gradient.size
+    # The component of the unconstrained optimum that is orthogonal to the active rows, computed
+    # first: the rounding of a distant optimum must not affect a much smaller solution.
+    work.normal[:] = work.unconstrained
+    project_out(work, count)
+    work.changes[:] = work.normal
     for k in range(count):
-        along = bound(space.active[k], space.sides[k], n, before, dv_max, v_max)
+        along = bound(work.active[k], work.sides[k], n, v_previous, dv_max, v_max)
         for j in range(k):
-            along -= space.triangle[j, k] * space.weights[j]
-        # Where the answer must lie along basis k, for the active rows to be at their bounds.
-        space.weights[k] = along / space.triangle[k, k]
+            along -= work.triangle[j, k] * work.active_multipliers[j]
+        # Component along basis k that puts the active rows at their bounds.
+        work.active_multipliers[k] = along / work.triangle[k, k]
         for i in range(n):
-            space.changes[i] += space.weights[k] * space.basis[k, i]
+            work.changes[i] += work.active_multipliers[k] * work.basis[k, i]
     for k in range(count - 1, -1, -1):
-        total = space.share[k] - space.weights[k]
+        total = work.projection[k] - work.active_multipliers[k]
         for j in range(k + 1, count):
-            total -= space.triangle[k, j] * space.weights[j]
-        space.weights[k] = total / space.triangle[k, k]
-    solve_upper(space.lower, space.changes)
+            total -= work.triangle[k, j] * work.active_multipliers[j]
+        work.active_multipliers[k] = total / work.triangle[k, k]
+    solve_upper(work.lower, work.changes)
 
 
 @kernel
 def find_violation(
-    space: Workspace, count: int, before: float, dv_max: float, v_max: float, close: float
+    work: Workspace, count: int, v_previous: float, dv_max: float, v_max: float, close: float
 ) -> tuple[int, float]:
-    """Return the row furthest outside a bound and the side it is on; row -1 when none is."""
-    n = space.changes.size
-    worst, side, most = -1, 1.0, close
+    """Return the row with the largest violation of a bound, and its side; row -1 without one."""
+    n = work.changes.size
+    worst, side, largest = -1, 1.0, close
     total = 0.0
     for row in range(2 * n):
         if row == n:
             total = 0.0
-        value = space.changes[row] if row < n else 0.0
+        value = work.changes[row] if row < n else 0.0
         if row >= n:
-            total += space.changes[row - n]
+            total += work.changes[row - n]
             value = total
         for way in (1.0, -1.0):
-            beyond = way * value - bound(row, way, n, before, dv_max, v_max)
-            if beyond > most:
+            beyond = way * value - bound(row, way, n, v_previous, dv_max, v_max)
+            if beyond > largest:
                 held = False
                 for k in range(count):
-                    held = held or space.active[k] == row
+                    held = held or work.active[k] == row
                 if not held:
-                    worst, side, most = row, way, beyond
+                    worst, side, largest = row, way, beyond
     return worst, side
-
-
-@kernel
-def solve_quadratic_program(
-    matrix: Array,
-    free: Array,
-    error_weight: float,
-    move_weight: float,
-    before: float,
-    dv_max: float,
-    v_max: float,
-    most: int,
-    space: Workspace,
-) -> int:
-    """Write the optimal changes and multipliers into ``space``; return a status.
-
-    Goldfarb and Idnani (1983), a dual active-set method: it starts at the unconstrained optimum
-    (62), with E10, and adds the bound that is violated most, dropping active bounds whose
-    multiplier would turn negative. When (62) keeps the bounds nothing more is done, which is the
-    usual case; so there is nothing to gain from remembering the last active set.
-
-    matrix, free              : S, shape (n_p, n_c); Psi_free, shape (n_p,)
-    error_weight, move_weight : mu and pi (> 0)
-    before                    : v_p(t-1), rad/s²; inside v_max, or the status is INFEASIBLE
-    dv_max, v_max             : rad/s², zero allowed
-    most                      : cap on additions and droppings together
-    """
-    n = space.slope.size
-    normal_equations(matrix, free, error_weight, move_weight, space.hessian, space.slope)
-    fine = cholesky(space.hessian, space.lower)
-    total = 0.0
-    for i in range(n):
-        space.start[i] = -space.slope[i]
-        total += space.slope[i]
-    space.multipliers[:] = 0.0
-    space.changes[:] = 0.0
-    if not fine or not math.isfinite(total + before):
-        return NOT_POSITIVE
-    if dv_max == 0.0 and abs(before) <= v_max:
-        # Nothing can move: the bounds on the changes carry the whole slope.
-        for i in range(n):
-            space.multipliers[0, i] = max(space.slope[i], 0.0)
-            space.multipliers[1, i] = max(-space.slope[i], 0.0)
-        return OPTIMAL
-    solve_lower(space.lower, space.start)
-    close = BOUND_TOLERANCE * max(dv_max, v_max)
-    count = 0
-    solve_with_active_rows(space, count, before, dv_max, v_max)
-    worst, side = find_violation(space, count, before, dv_max, v_max, close)
-    for _ in range(most):
-        if worst < 0:
-            for k in range(count):
-                upper = 1 if space.sides[k] > 0.0 else 0
-                space.multipliers[upper, space.active[k]] = max(space.weights[k], 0.0)
-            return OPTIMAL
-        dependent = is_dependent(worst, space.active, count, space.components)
-        row_normal(worst, side, space.lower, space.normal)
-        project_out(space, count)
-        # Longest dual step before an active multiplier reaches zero.
-        longest, drop = math.inf, -1
-        for k in range(count - 1, -1, -1):
-            rate = space.share[k]
-            for j in range(k + 1, count):
-                rate -= space.triangle[k, j] * space.share[j]
-            space.share[k] = rate / space.triangle[k, k]
-            if space.share[k] > 1e-12 and space.weights[k] < longest * space.share[k]:
-                longest, drop = space.weights[k] / space.share[k], k
-        # Step that reaches the new bound; a dependent normal cannot get there.
-        needed = math.inf
-        if not dependent:
-            squared = 0.0
-            for i in range(n):
-                squared += space.normal[i] * space.normal[i]
-            gap = side * row_value(worst, space.changes)
-            gap -= bound(worst, side, n, before, dv_max, v_max)
-            needed = max(gap, 0.0) / squared
-        step = min(longest, needed)
-        if math.isinf(step):
-            space.changes[:] = 0.0
-            return INFEASIBLE
-        if needed <= longest:
-            space.active[count] = worst
-            space.sides[count] = side
-            count += 1
-            rebuild_basis(space, count)
-            solve_with_active_rows(space, count, before, dv_max, v_max)
-            worst, side = find_violation(space, count, before, dv_max, v_max, close)
-        else:
-            if not dependent:
-                solve_upper(space.lower, space.normal)
-                for i in range(n):
-                    space.changes[i] -= step * space.normal[i]
-            for k in range(count):
-                space.weights[k] -= step * space.share[k]
-            count -= 1
-            for k in range(drop, count):
-                space.active[k] = space.active[k + 1]
-                space.sides[k] = space.sides[k + 1]
-                space.weights[k] = space.weights[k + 1]
-            rebuild_basis(space, count)
-    space.changes[:] = 0.0
-    return UNFINISHED

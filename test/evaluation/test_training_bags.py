@@ -82,7 +82,7 @@ def test_three_recorded_bags_teach_as_much_as_three_runs_of_the_lab(model):
         for name, values in model.learnt.items()
         if name.startswith(prefix)
     }
-    nominal = Controller(parameters).law.predictive.weights()
+    nominal = Controller(parameters).law.predictive.get_weights()
     coefficients = fit_coefficients(parameters, lab), model.learnt['fuzzy.coefficients']
     found, shares = [], []
     for seed in HELD_OUT_SEEDS[:5]:

@@ -52,8 +52,7 @@ from t3mpc_ros.mpc.boltzmann_machine import (
     predict_error,
     set_visible,
 )
-from t3mpc_ros.mpc.predictive_controller import PredictiveController
-from t3mpc_ros.mpc.predictor import PredictiveParameters
+from t3mpc_ros.mpc.predictive_controller import PredictiveController, PredictiveParameters
 from t3mpc_ros.mpc.pretraining import ExcitationParameters, pretrain, ridge_regression, split_runs
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.simulation.plant.disturbances import friction_torque
@@ -233,7 +232,7 @@ def test_the_predictor_of_a_bag_is_at_least_as_good_as_that_of_practice(run, sam
         for weights in (
             lesson.weights,
             predictor_of(fit_simulated_runs('velocity')[0]),
-            Controller(parameters).law.predictive.weights(),
+            Controller(parameters).law.predictive.get_weights(),
         )
     )
     assert own.min() > 0.5
@@ -262,7 +261,7 @@ def test_the_model_is_learnt_from_all_and_judged_by_folds(run, sampled, trained)
 
 def test_skills_of_stretches_are_those_of_all_their_squares_together(run, sampled):
     parameters = run.controller.parameters
-    weights = Controller(parameters).law.predictive.weights()
+    weights = Controller(parameters).law.predictive.get_weights()
     errors, moves = sampled[0][-300:-2].copy(), sampled[1][-300:-2].copy()
     errors[[100, 120]] = math.nan
     parts = stretches(errors, moves)

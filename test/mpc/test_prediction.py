@@ -56,44 +56,44 @@ def _linear_machine():
 
 
 def _past(generator, horizon=10):
-    past = make_history(4, 4, horizon)
-    past.errors[:] = generator.standard_normal(past.errors.size)
-    past.moves[:] = 3.0 * generator.standard_normal(past.moves.size)
-    return past
+    history = make_history(4, 4, horizon)
+    history.errors[:] = generator.standard_normal(history.errors.size)
+    history.moves[:] = 3.0 * generator.standard_normal(history.moves.size)
+    return history
 
 
 def test_rolling_forward_feeds_the_machine_with_its_own_outputs(taught):
-    past = _past(np.random.default_rng(4))
-    past.planned[:] = np.linspace(-2.0, 2.0, 10)
+    history = _past(np.random.default_rng(4))
+    history.planned_moves[:] = np.linspace(-2.0, 2.0, 10)
     out = np.zeros(10)
-    roll_forward(taught, past, 0, 0.03, out)
-    errors, moves = list(past.errors), list(past.moves[1:])
+    roll_forward(taught, history, 0, 0.03, out)
+    errors, moves = list(history.errors), list(history.moves[1:])
     for j in range(10):
-        moves.insert(0, past.planned[j])
+        moves.insert(0, history.planned_moves[j])
         set_visible(taught, np.array(errors), np.array(moves), 0)
         errors.insert(0, predict_error(taught) + 0.03)
         assert out[j] == pytest.approx(errors[0], rel=1e-12)
 
 
 def test_free_response_holds_the_last_move_and_step_response_one_probe_more(taught):
-    past, out = _past(np.random.default_rng(5)), np.zeros(10)
-    past.offsets[0] = 0.02
+    history, out = _past(np.random.default_rng(5)), np.zeros(10)
+    history.offsets[0] = 0.02
     free, steps = np.zeros(10), np.zeros(10)
-    free_response(taught, past, 1.5, free)
-    step_response(taught, past, 1.5, 0.5, free, steps)
-    past.planned[:] = 1.5
-    roll_forward(taught, past, 0, 0.02, out)
+    free_response(taught, history, 1.5, free)
+    step_response(taught, history, 1.5, 0.5, free, steps)
+    history.planned_moves[:] = 1.5
+    roll_forward(taught, history, 0, 0.02, out)
     np.testing.assert_allclose(free, out)
-    past.planned[:] = 2.0
-    roll_forward(taught, past, 0, 0.02, out)
+    history.planned_moves[:] = 2.0
+    roll_forward(taught, history, 0, 0.02, out)
     np.testing.assert_allclose(steps, (out - free) / 0.5)
 
 
 def test_step_response_of_the_taught_machine_is_the_nominal_one(taught):
     """A naive machine's step response has a random sign and size."""
-    past, free, steps = make_history(4, 4, 10), np.zeros(10), np.zeros(10)
-    free_response(taught, past, 0.0, free)
-    step_response(taught, past, 0.0, 1.0, free, steps)
+    history, free, steps = make_history(4, 4, 10), np.zeros(10), np.zeros(10)
+    free_response(taught, history, 0.0, free)
+    step_response(taught, history, 0.0, 1.0, free, steps)
     true = nominal_step_response(NominalLoopParameters(), TIMING, 10)
     assert np.all(steps > 0.0)
     np.testing.assert_allclose(steps[2:], true[2:], rtol=0.2)
@@ -129,15 +129,15 @@ def test_forced_response_is_the_matrix_form_and_moves_act_only_after_they_are_ma
 def test_free_plus_forced_is_what_a_linear_machine_does_under_any_moves():
     """(45), (52): this fixes every index of (47)-(54) at once."""
     generator = np.random.default_rng(7)
-    machine, past = _linear_machine(), _past(generator)
-    held, changes = 2.0, generator.standard_normal(6)
+    machine, history = _linear_machine(), _past(generator)
+    v_previous, changes = 2.0, generator.standard_normal(6)
     free, steps, psi, true = (np.zeros(10) for _ in range(4))
-    predict_responses(machine, past, held, 1.0, np.zeros(10), steps, free)
+    predict_responses(machine, history, v_previous, 1.0, np.zeros(10), steps, free)
     matrix = np.zeros((10, 6))
     toeplitz(steps, matrix)
     predicted_errors(matrix, changes, free, psi)
-    past.planned[:] = held + np.cumsum(np.r_[changes, np.zeros(4)])
-    roll_forward(machine, past, 0, past.offsets[0], true)
+    history.planned_moves[:] = v_previous + np.cumsum(np.r_[changes, np.zeros(4)])
+    roll_forward(machine, history, 0, history.offsets[0], true)
     np.testing.assert_allclose(psi, true, atol=1e-6)
     assert np.max(np.abs(psi - free)) > 0.01
 
@@ -148,25 +148,25 @@ def test_a_steady_error_is_predicted_to_stay_so_that_the_program_removes_it(taug
     Added once to the finished response it leaves a rest that the program takes for progress:
     v_p would stop at a steady error.
     """
-    past, out = make_history(4, 4, 10), np.zeros(10)
-    reset_history(past, 0.7)
-    past.moves[:] = -2.0
-    set_visible(taught, past.errors, past.moves, 1)
-    past.offsets[0] = 0.7 - predict_error(taught)
-    free_response(taught, past, -2.0, out)
+    history, out = make_history(4, 4, 10), np.zeros(10)
+    reset_history(history, 0.7)
+    history.moves[:] = -2.0
+    set_visible(taught, history.errors, history.moves, 1)
+    history.offsets[0] = 0.7 - predict_error(taught)
+    free_response(taught, history, -2.0, out)
     np.testing.assert_allclose(out, 0.7, rtol=1e-12)
-    past.planned[:] = -2.0
+    history.planned_moves[:] = -2.0
     once = np.zeros(10)
-    roll_forward(taught, past, 0, 0.0, once)
-    once += past.offsets[0]
+    roll_forward(taught, history, 0, 0.0, once)
+    once += history.offsets[0]
     assert np.max(np.abs(once - 0.7)) > 0.05
 
 
 def test_the_known_future_is_added_to_the_free_response_and_not_to_the_steps(taught):
-    past = _past(np.random.default_rng(8))
+    history = _past(np.random.default_rng(8))
     plain, known = (np.zeros(10), np.zeros(10)), (np.zeros(10), np.zeros(10))
     coming = np.linspace(0.0, 5.0, 10)
-    predict_responses(taught, past, 1.0, 1.0, np.zeros(10), *plain)
-    predict_responses(taught, past, 1.0, 1.0, coming, *known)
+    predict_responses(taught, history, 1.0, 1.0, np.zeros(10), *plain)
+    predict_responses(taught, history, 1.0, 1.0, coming, *known)
     np.testing.assert_array_equal(plain[0], known[0])
     np.testing.assert_allclose(known[1] - plain[1], coming, atol=1e-12)

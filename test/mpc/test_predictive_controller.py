@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from t3mpc_ros.mpc.predictive_controller import PredictiveController
-from t3mpc_ros.mpc.predictor import PredictiveParameters
+from t3mpc_ros.mpc.predictive_controller import PredictiveController, PredictiveParameters
 from t3mpc_ros.mpc.quadratic_program import OPTIMAL
 from t3mpc_ros.parameters.table import ParameterError
 
@@ -87,7 +86,7 @@ def _gain(disturbance, parameters=DEFAULT, noise=0.0, nominal_gain=GAIN, **plant
 
 @cache
 def _weights():
-    return PredictiveController(DEFAULT, PERIOD, GAIN).weights()
+    return PredictiveController(DEFAULT, PERIOD, GAIN).get_weights()
 
 
 def test_it_removes_most_of_a_piecewise_constant_disturbance():
@@ -190,7 +189,7 @@ def test_a_machine_with_the_wrong_sign_of_v_p_is_silenced_although_it_predicts()
     term.set_weights(weights)
     _, moves = _run(term, _levels(1000, 3))
     assert np.all(term.step_response[:, 4] < 0.0)
-    np.testing.assert_array_equal(term.fade, 0.0)
+    np.testing.assert_array_equal(term.authority, 0.0)
     np.testing.assert_array_equal(moves, 0.0)
 
 
@@ -224,7 +223,7 @@ def test_v_p_goes_on_by_the_first_of_the_optimal_changes_63():
         v_p = term.step(loop.error)
         if due:
             assert np.all(term.status == OPTIMAL)
-            np.testing.assert_allclose(term.fade, 1.0)
+            np.testing.assert_allclose(term.authority, 1.0)
             first = -parameters.error_weight * np.sum(term.step_response * term.prediction, axis=1)
             np.testing.assert_allclose(v_p - before, first / parameters.move_weight, atol=1e-9)
             changes.append(v_p - before)
@@ -251,17 +250,17 @@ def test_a_lowered_bound_is_kept_at_once():
     term.configure(replace(DEFAULT, v_max=2.0))
     v = [term.step(np.zeros(2)) for _ in range(5)]
     assert np.max(np.abs(v[-1])) <= 2.0
-    with pytest.raises(ParameterError, match='horizon is fixed'):
+    with pytest.raises(ParameterError, match='horizon is read-only'):
         term.configure(replace(DEFAULT, horizon=8))
 
 
 def test_switched_off_it_returns_zero_and_still_learns():
     term = PredictiveController(DEFAULT.with_values({'enabled': False}), PERIOD, GAIN)
-    before = term.weights()['output_weights']
+    before = term.get_weights()['output_weights']
     _, moves = _run(term, _levels(1000, 6))
     np.testing.assert_array_equal(moves, 0.0)
-    np.testing.assert_array_equal(term.fade, 0.0)
-    assert np.any(term.weights()['output_weights'] != before)
+    np.testing.assert_array_equal(term.authority, 0.0)
+    assert np.any(term.get_weights()['output_weights'] != before)
 
 
 def _jumping(told, preview):
@@ -355,14 +354,14 @@ def test_after_a_limit_the_next_change_starts_between_zero_and_v_p():
 def test_reset_forgets_the_run_but_not_the_weights():
     term = PredictiveController(DEFAULT, PERIOD, GAIN)
     _run(term, _levels(1000, 10))
-    weights, skill = term.weights(), term.skill
+    weights, skill = term.get_weights(), term.skill
     term.reset()
-    for name, array in term.weights().items():
+    for name, array in term.get_weights().items():
         np.testing.assert_array_equal(array, weights[name])
     np.testing.assert_array_equal(term.skill, skill)
     np.testing.assert_array_equal(term.step(np.zeros(2)), 0.0)
     term.pretrain()
-    for name, array in term.weights().items():
+    for name, array in term.get_weights().items():
         np.testing.assert_array_equal(array, _weights()[name])
 
 
@@ -374,12 +373,12 @@ def test_the_term_is_a_function_of_its_inputs_and_saved_weights_carry_on():
     np.testing.assert_array_equal(_run(first, disturbance)[1], _run(again, disturbance)[1])
     first.reset()
     copy = PredictiveController(DEFAULT, PERIOD, GAIN)
-    copy.set_weights(first.weights())
-    for name, array in first.weights().items():
-        np.testing.assert_array_equal(array, copy.weights()[name])
-    copied = copy.weights()
+    copy.set_weights(first.get_weights())
+    for name, array in first.get_weights().items():
+        np.testing.assert_array_equal(array, copy.get_weights()[name])
+    copied = copy.get_weights()
     copied['output_weights'][:] = 7.0
-    assert np.all(copy.weights()['output_weights'] != 7.0)
+    assert np.all(copy.get_weights()['output_weights'] != 7.0)
 
 
 def test_a_recorded_run_teaches_what_the_nominal_loop_cannot():
@@ -411,7 +410,7 @@ def test_a_recorded_run_teaches_what_the_nominal_loop_cannot():
 
 def test_what_does_not_fit_is_refused_and_changes_nothing():
     term = PredictiveController(DEFAULT, PERIOD, GAIN)
-    good = term.weights()
+    good = term.get_weights()
     for wrong, match in (
         ({**good, 'extra': np.zeros(2)}, 'weights must be'),
         ({**good, 'anchor': np.zeros(3)}, 'anchor must have shape'),
@@ -471,15 +470,15 @@ def test_a_copy_of_the_term_goes_its_own_way():
         sample = errors * np.sin(0.1 * k)
         np.testing.assert_array_equal(twin.step(sample), term.step(sample))
     np.testing.assert_array_equal(twin.skill, term.skill)
-    for name, value in term.weights().items():
-        np.testing.assert_array_equal(twin.weights()[name], value)
+    for name, value in term.get_weights().items():
+        np.testing.assert_array_equal(twin.get_weights()[name], value)
 
 
 def test_going_back_is_what_restoring_the_weights_is():
     term, errors = PredictiveController(DEFAULT, PERIOD, GAIN), np.array([0.3, -0.2])
     for k in range(400):
         term.step(errors * np.sin(0.1 * k))
-    snapshot, weights = term.snapshot(), term.weights()
+    snapshot, weights = term.snapshot(), term.get_weights()
     for k in range(400):
         term.step(errors * np.cos(0.3 * k))
     restored = deepcopy(term)

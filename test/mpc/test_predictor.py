@@ -47,37 +47,37 @@ def _predictor(seed=0):
     return Predictor(machine, 10, runs[1]), runs[0]
 
 
-def _feed(past, missed, persistence_mse, count):
+def _feed(history, missed, persistence_mse, count):
     for _ in range(count):
-        past.misses[0], past.misses[1] = missed, persistence_mse
-        update_mse(past, 0, 0.99, 0.05)
+        history.residuals[0], history.residuals[1] = missed, persistence_mse
+        update_mse(history, 0, 0.99, 0.05)
 
 
 def test_skill_is_one_less_the_ratio_of_mean_squares():
-    past = make_history(4, 4, 10)
-    _feed(past, 0.5, 1.0, 5000)
-    assert skill_score(past, 0) == pytest.approx(0.75, abs=1e-3)
-    _feed(past, 1.0, 1.0, 5000)
-    assert skill_score(past, 0) == pytest.approx(0.0, abs=1e-3)
-    _feed(past, 2.0, 1.0, 5000)
-    assert skill_score(past, 0) == pytest.approx(-3.0, abs=1e-2)
+    history = make_history(4, 4, 10)
+    _feed(history, 0.5, 1.0, 5000)
+    assert skill_score(history, 0) == pytest.approx(0.75, abs=1e-3)
+    _feed(history, 1.0, 1.0, 5000)
+    assert skill_score(history, 0) == pytest.approx(0.0, abs=1e-3)
+    _feed(history, 2.0, 1.0, 5000)
+    assert skill_score(history, 0) == pytest.approx(-3.0, abs=1e-2)
 
 
 def test_in_quiet_times_the_skill_stays_what_it_was():
     """Without the floor, mere noise on a well-controlled robot would rate the machine."""
-    past = make_history(4, 4, 10)
-    _feed(past, 0.5, 1.0, 5000)
-    _feed(past, 1e-4, 1e-5, 5000)
-    assert skill_score(past, 0) > 0.6
-    _feed(past, 0.0, 0.0, 5000)
-    assert skill_score(past, 0) > 0.6
+    history = make_history(4, 4, 10)
+    _feed(history, 0.5, 1.0, 5000)
+    _feed(history, 1e-4, 1e-5, 5000)
+    assert skill_score(history, 0) > 0.6
+    _feed(history, 0.0, 0.0, 5000)
+    assert skill_score(history, 0) > 0.6
 
 
 def test_no_evidence_at_all_gives_a_finite_skill():
-    past = make_history(4, 4, 10)
-    past.predicted[:] = past.persistence_mse[:] = 0.0
-    _feed(past, 0.0, 0.0, 10)
-    assert np.isfinite(skill_score(past, 0))
+    history = make_history(4, 4, 10)
+    history.prediction_mse[:] = history.persistence_mse[:] = 0.0
+    _feed(history, 0.0, 0.0, 10)
+    assert np.isfinite(skill_score(history, 0))
 
 
 def test_fade_is_smooth_rises_with_skill_and_needs_the_right_sign():
@@ -98,32 +98,32 @@ def test_fade_is_smooth_rises_with_skill_and_needs_the_right_sign():
 def test_a_taught_machine_is_skilled_on_a_run_it_has_not_seen():
     predictor, run = _predictor()
     predictor.fit(*run, ExcitationParameters(), 600.0, HOW)
-    assert skill_score(predictor.past, 0) > 0.5
-    assert skill_score(predictor.past, 1) > 0.8
+    assert skill_score(predictor.history, 0) > 0.5
+    assert skill_score(predictor.history, 1) > 0.8
 
 
 def test_an_untaught_machine_is_not():
     predictor, _ = _predictor()
     predictor.machine.output_weights[:] = np.random.default_rng(1).standard_normal(12)
     predictor.evaluate(HOW)
-    assert skill_score(predictor.past, 0) < 0.0
-    assert skill_score(predictor.past, 1) < 0.3
+    assert skill_score(predictor.history, 0) < 0.0
+    assert skill_score(predictor.history, 1) < 0.3
 
 
 def test_rehearsal_scores_by_definition_and_changes_no_weights():
     predictor, run = _predictor()
     predictor.fit(*run, ExcitationParameters(), 600.0, HOW)
-    weights = predictor.weights()
-    machine, past = predictor.machine, make_history(4, 4, 10)
+    weights = predictor.get_weights()
+    machine, history = predictor.machine, make_history(4, 4, 10)
     errors, moves = run
-    evaluate_offline(machine, predictor.memory, past, errors, moves, HOW)
+    evaluate_offline(machine, predictor.rls, history, errors, moves, HOW)
     for name, before in weights.items():
-        np.testing.assert_array_equal(before, predictor.weights()[name])
-    count = errors.size - 1 - past.errors.size
+        np.testing.assert_array_equal(before, predictor.get_weights()[name])
+    count = errors.size - 1 - history.errors.size
     stayed = np.mean((errors[:count] - errors[1 : count + 1]) ** 2)
-    assert past.persistence_mse[0] == pytest.approx(stayed, rel=1e-10)
+    assert history.persistence_mse[0] == pytest.approx(stayed, rel=1e-10)
     stayed = np.mean((errors[:count] - errors[5 : count + 5]) ** 2)
-    assert past.persistence_mse[1] == pytest.approx(stayed, rel=1e-10)
+    assert history.persistence_mse[1] == pytest.approx(stayed, rel=1e-10)
 
 
 def test_observing_keeps_what_was_predicted_against_what_came():
@@ -133,28 +133,30 @@ def test_observing_keeps_what_was_predicted_against_what_came():
     generator = np.random.default_rng(3)
     quiet = ExcitationParameters(noise=0.0, disturbance=0.0, move_hold=0.05)
     errors, moves = simulate_excitation(NominalLoopParameters(), quiet, TIMING, 20.0, generator)
-    past = predictor.past
-    reset_history(past, 0.0)
+    history = predictor.history
+    reset_history(history, 0.0)
     missed, stayed = [], []
     for i in range(errors.size - 2, -1, -1):
         observe(
-            predictor.machine, predictor.memory, past, errors[i], moves[i + 1], True, False, HOW
+            predictor.machine, predictor.rls, history, errors[i], moves[i + 1], True, False, HOW
         )
         if i < errors.size - 20:
-            missed.append(past.misses[2])
+            missed.append(history.residuals[2])
             stayed.append(errors[i] - errors[i + 5])
-            assert past.misses[3] == pytest.approx(stayed[-1])
+            assert history.residuals[3] == pytest.approx(stayed[-1])
     assert np.mean(np.square(missed)) < 0.05 * np.mean(np.square(stayed))
 
 
 def test_a_blow_beyond_the_range_of_the_machine_teaches_nothing():
     predictor, run = _predictor()
     predictor.fit(*run, ExcitationParameters(), 600.0, HOW)
-    before = predictor.weights()
-    observe(predictor.machine, predictor.memory, predictor.past, 1e200, 0.0, True, True, HOW)
-    for name, array in predictor.weights().items():
+    before = predictor.get_weights()
+    observe(predictor.machine, predictor.rls, predictor.history, 1e200, 0.0, True, True, HOW)
+    for name, array in predictor.get_weights().items():
         np.testing.assert_array_equal(array, before[name])
-    assert np.isfinite([skill_score(predictor.past, 0), skill_score(predictor.past, 1)]).all()
+    assert np.isfinite(
+        [skill_score(predictor.history, 0), skill_score(predictor.history, 1)]
+    ).all()
 
 
 def test_a_trial_too_short_to_predict_in_is_refused():
@@ -185,7 +187,7 @@ def test_a_wheel_has_the_shapes_that_its_kernels_expect():
     assert wheel.machine.visible_weights.shape == (7, 9)
     assert wheel.machine.lags.shape == wheel.machine.eta1.shape == (7,)
     assert wheel.machine.mu0.shape == wheel.machine.output_weights.shape == (9,)
-    assert wheel.memory.prior.shape == wheel.memory.information.shape == (9, 9)
-    assert wheel.past.errors.shape == wheel.past.moves.shape == (4 + 5,)
-    assert wheel.past.offsets.shape == wheel.past.ahead.shape == (5,)
-    assert wheel.past.planned.shape == (10,)
+    assert wheel.rls.prior.shape == wheel.rls.information.shape == (9, 9)
+    assert wheel.history.errors.shape == wheel.history.moves.shape == (4 + 5,)
+    assert wheel.history.offsets.shape == wheel.history.half_horizon.shape == (5,)
+    assert wheel.history.planned_moves.shape == (10,)

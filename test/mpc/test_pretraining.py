@@ -184,39 +184,39 @@ def test_gradient_step_removes_its_share_of_the_error_at_any_amplitude():
 
 def test_recall_is_the_weighted_least_squares_fit_anchored_at_the_pre_training():
     generator = np.random.default_rng(8)
-    machine, memory = _machine(), make_rls_state(12)
+    machine, rls = _machine(), make_rls_state(12)
     root = generator.standard_normal((12, 12))
-    memory.prior[:] = root @ root.T + np.eye(12)
-    memory.anchor[:] = generator.standard_normal(12)
-    machine.output_weights[:] = memory.anchor
-    memory.power[:] = (1.0, 2.0, 0.0)
+    rls.prior[:] = root @ root.T + np.eye(12)
+    rls.anchor[:] = generator.standard_normal(12)
+    machine.output_weights[:] = rls.anchor
+    rls.power[:] = (1.0, 2.0, 0.0)
     keep, rows, targets, weights = 0.9, [], [], []
     for _ in range(30):
         machine.lags[:] = generator.uniform(-1.0, 1.0, 8)
         error = generator.standard_normal() - predict_error(machine)
         targets.append((error + predict_error(machine)) / 3.0)
         rows.append(machine.mu1.copy())
-        assert rls_step(machine, memory, error, keep, 0.95)
-        weights.append(memory.power[1] / memory.power[0])
+        assert rls_step(machine, rls, error, keep, 0.95)
+        weights.append(rls.power[1] / rls.power[0])
     share = np.array(weights) * keep ** np.arange(29, -1, -1)
     rows = np.array(rows)
-    square = rows.T @ (share[:, None] * rows) + memory.prior
-    right = rows.T @ (share * np.array(targets)) + memory.prior @ memory.anchor
+    square = rows.T @ (share[:, None] * rows) + rls.prior
+    right = rows.T @ (share * np.array(targets)) + rls.prior @ rls.anchor
     np.testing.assert_allclose(machine.output_weights, np.linalg.solve(square, right), rtol=1e-8)
 
 
 def test_recall_falls_back_to_the_pre_training_when_nothing_happens():
     """Forgetting without a prior would keep the last weights, and wind up its gain to a burst."""
-    machine, memory = _machine(), make_rls_state(12)
-    memory.anchor[:] = 0.5
+    machine, rls = _machine(), make_rls_state(12)
+    rls.anchor[:] = 0.5
     machine.output_weights[:] = -2.0
-    memory.power[:] = (1.0, 1.0, 1e-3)
+    rls.power[:] = (1.0, 1.0, 1e-3)
     machine.lags[:] = 0.0
     for _ in range(2000):
         predict_error(machine)
-        rls_step(machine, memory, 0.0, 0.99, 0.95)
+        rls_step(machine, rls, 0.0, 0.99, 0.95)
     np.testing.assert_allclose(machine.output_weights, 0.5, atol=1e-6)
-    assert np.max(memory.information) < 1e-6
+    assert np.max(rls.information) < 1e-6
 
 
 def test_recall_learns_a_changed_robot_faster_than_any_gradient_rate():
@@ -234,22 +234,22 @@ def test_recall_learns_a_changed_robot_faster_than_any_gradient_rate():
     )
 
     def missed(rule):
-        machine, memory = _machine(), make_rls_state(12)
-        pretrain(machine, memory, *before, excitation, 20.0, 0.05)
+        machine, rls = _machine(), make_rls_state(12)
+        pretrain(machine, rls, *before, excitation, 20.0, 0.05)
         total = 0.0
         for i in range(1000, 0, -1):
             machine.lags[:4] = after[0][i : i + 4] / 3.0
             machine.lags[4:] = after[1][i : i + 4] / 20.0
             error = after[0][i - 1] - predict_error(machine)
             total += error * error if i > 500 else 0.0
-            rule(machine, memory, error)
+            rule(machine, rls, error)
         return total
 
     best = min(
         missed(lambda m, _, e, r=rate: gradient_step(m, e, r, 0.01))
         for rate in (0.01, 0.03, 0.1, 0.3, 1.0)
     )
-    recalled = missed(lambda m, memory, e: rls_step(m, memory, e, 0.9975, 0.95))
+    recalled = missed(lambda m, rls, e: rls_step(m, rls, e, 0.9975, 0.95))
     assert recalled < 0.75 * best
     assert recalled < 0.2 * missed(lambda *_: None)
 
@@ -328,12 +328,12 @@ def test_the_run_is_the_same_for_the_same_seed_and_obeys_the_nominal_loop_at_res
 
 
 def test_pre_training_predicts_the_next_error_of_a_run_it_has_not_seen():
-    machine, memory = _machine(), make_rls_state(12)
+    machine, rls = _machine(), make_rls_state(12)
     generator = np.random.default_rng(12)
     excitation = ExcitationParameters(noise=0.0, disturbance=0.0)
     pretrain(
         machine,
-        memory,
+        rls,
         *simulate_excitation(NominalLoopParameters(), excitation, TIMING, 20.0, generator),
         excitation,
         100.0,
@@ -349,21 +349,19 @@ def test_pre_training_predicts_the_next_error_of_a_run_it_has_not_seen():
         missed.append(errors[i] - predict_error(machine))
         stayed.append(errors[i] - errors[i + 1])
     assert np.var(missed) < 0.01 * np.var(stayed)
-    np.testing.assert_allclose(memory.anchor, machine.output_weights)
-    np.testing.assert_allclose(memory.prior, memory.prior.T)
-    assert np.all(np.linalg.eigvalsh(memory.prior) > 0.0)
+    np.testing.assert_allclose(rls.anchor, machine.output_weights)
+    np.testing.assert_allclose(rls.prior, rls.prior.T)
+    assert np.all(np.linalg.eigvalsh(rls.prior) > 0.0)
 
 
 def test_runs_that_cannot_be_learnt_are_refused():
-    machine, memory = _machine(), make_rls_state(12)
+    machine, rls = _machine(), make_rls_state(12)
     with pytest.raises(ValueError, match='one length'):
-        pretrain(machine, memory, np.zeros(50), np.zeros(40), ExcitationParameters(), 1.0, 0.1)
+        pretrain(machine, rls, np.zeros(50), np.zeros(40), ExcitationParameters(), 1.0, 0.1)
     with pytest.raises(ValueError, match='must hold more'):
-        pretrain(machine, memory, np.zeros(16), np.zeros(16), ExcitationParameters(), 1.0, 0.1)
+        pretrain(machine, rls, np.zeros(16), np.zeros(16), ExcitationParameters(), 1.0, 0.1)
     with pytest.raises(ValueError, match='finite'):
-        pretrain(
-            machine, memory, np.full(50, np.nan), np.zeros(50), ExcitationParameters(), 1.0, 0.1
-        )
+        pretrain(machine, rls, np.full(50, np.nan), np.zeros(50), ExcitationParameters(), 1.0, 0.1)
     with pytest.raises(ValueError, match='must be'):
         split_runs(np.zeros((50, 3)), np.zeros((50, 3)), 2)
 
@@ -376,11 +374,11 @@ def test_a_recorded_run_is_split_in_time_and_turned_newest_first():
 
 
 def test_more_noise_than_taught_makes_prediction_worse_but_never_absurd():
-    machine, memory = _machine(), make_rls_state(12)
+    machine, rls = _machine(), make_rls_state(12)
     generator = np.random.default_rng(13)
     excitation = ExcitationParameters()
     run = simulate_excitation(NominalLoopParameters(), excitation, TIMING, 20.0, generator)
-    pretrain(machine, memory, *run, excitation, 100.0, 0.05)
+    pretrain(machine, rls, *run, excitation, 100.0, 0.05)
     figures = []
     for noise in (0.0, 0.15, 1.0):
         errors, moves = simulate_excitation(

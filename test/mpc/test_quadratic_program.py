@@ -53,26 +53,26 @@ def _random(generator):
         dv_max = v_max = 0.0
     elif draw < 0.3:
         dv_max = v_max / generator.integers(1, 5)  # bounds that meet in corners
-    before = generator.uniform(-v_max, v_max)
+    v_previous = generator.uniform(-v_max, v_max)
     if generator.random() < 0.3:
-        before = v_max * generator.choice((-1.0, 1.0))  # at its bound: row n_c starts active
-    return _matrix(steps, moves), free, mu, pi, before, dv_max, v_max
+        v_previous = v_max * generator.choice((-1.0, 1.0))  # at its bound: row n_c starts active
+    return _matrix(steps, moves), free, mu, pi, v_previous, dv_max, v_max
 
 
-def _kkt(matrix, free, mu, pi, before, dv_max, v_max, space):
+def _kkt(matrix, free, mu, pi, v_previous, dv_max, v_max, work):
     """Return the four residuals once more, in plain NumPy and from the definition."""
     moves = matrix.shape[1]
     rows = np.vstack((np.eye(moves), np.tril(np.ones((moves, moves)))))
-    upper = np.r_[np.full(moves, dv_max), np.full(moves, v_max - before)]
-    lower = np.r_[np.full(moves, -dv_max), np.full(moves, -v_max - before)]
+    upper = np.r_[np.full(moves, dv_max), np.full(moves, v_max - v_previous)]
+    lower = np.r_[np.full(moves, -dv_max), np.full(moves, -v_max - v_previous)]
     hessian = mu * matrix.T @ matrix + pi * np.eye(moves)
-    slope = mu * matrix.T @ free
-    dv, (down, up) = space.changes, space.multipliers
-    scale = max(np.abs(slope).max(), np.abs(hessian).max() * np.abs(dv).max()) or 1.0
+    gradient = mu * matrix.T @ free
+    dv, (down, up) = work.changes, work.multipliers
+    scale = max(np.abs(gradient).max(), np.abs(hessian).max() * np.abs(dv).max()) or 1.0
     width = max(dv_max, v_max) or 1.0
     value = rows @ dv
     return (
-        np.abs(hessian @ dv + slope + rows.T @ (up - down)).max() / scale,
+        np.abs(hessian @ dv + gradient + rows.T @ (up - down)).max() / scale,
         max((value - upper).max(), (lower - value).max(), 0.0) / width,
         max(-up.min(), -down.min(), 0.0) / scale,
         max(np.abs(up * (value - upper)).max(), np.abs(down * (value - lower)).max())
@@ -87,34 +87,34 @@ def test_ten_thousand_programs_satisfy_karush_kuhn_tucker():
     worst = 0.0
     for _ in range(10_000):
         program = _random(generator)
-        space = make_workspace(program[0].shape[1])
-        assert solve_quadratic_program(*program, 50 * space.slope.size, space) == OPTIMAL
-        ours = kkt_residuals(space, *program[4:], out)
-        worst = max(worst, ours, *_kkt(*program, space))
+        work = make_workspace(program[0].shape[1])
+        assert solve_quadratic_program(*program, 50 * work.gradient.size, work) == OPTIMAL
+        ours = kkt_residuals(work, *program[4:], out)
+        worst = max(worst, ours, *_kkt(*program, work))
     assert worst < 1e-10
 
 
 def test_residual_sees_every_kind_of_wrong_answer():
     matrix, free = _matrix(np.linspace(0.1, 0.5, 6), 3), np.ones(6)
-    space, out = make_workspace(3), np.zeros(4)
+    work, out = make_workspace(3), np.zeros(4)
     problem = (0.0, 0.2, 0.3)
-    assert solve_quadratic_program(matrix, free, 1.0, 0.01, *problem, 100, space) == OPTIMAL
-    assert kkt_residuals(space, *problem, out) < 1e-12
-    right = space.changes.copy(), space.multipliers.copy()
-    space.changes[1] += 0.05
-    kkt_residuals(space, *problem, out)
+    assert solve_quadratic_program(matrix, free, 1.0, 0.01, *problem, 100, work) == OPTIMAL
+    assert kkt_residuals(work, *problem, out) < 1e-12
+    right = work.changes.copy(), work.multipliers.copy()
+    work.changes[1] += 0.05
+    kkt_residuals(work, *problem, out)
     assert out[0] > 1e-3
-    space.changes[:] = right[0]
-    space.changes[0] -= 1.0
-    kkt_residuals(space, *problem, out)
+    work.changes[:] = right[0]
+    work.changes[0] -= 1.0
+    kkt_residuals(work, *problem, out)
     assert out[1] > 0.1
-    space.changes[:] = right[0]
-    space.multipliers[0, 0] -= 2.0 * space.multipliers[0].max()
-    kkt_residuals(space, *problem, out)
+    work.changes[:] = right[0]
+    work.multipliers[0, 0] -= 2.0 * work.multipliers[0].max()
+    kkt_residuals(work, *problem, out)
     assert out[2] > 0.1
-    space.multipliers[:] = right[1]
-    space.multipliers[1, 2] += 1.0
-    kkt_residuals(space, *problem, out)
+    work.multipliers[:] = right[1]
+    work.multipliers[1, 2] += 1.0
+    kkt_residuals(work, *problem, out)
     assert out[3] > 0.01
 
 
@@ -122,12 +122,12 @@ def test_forty_programs_agree_with_an_independent_solver():
     generator = np.random.default_rng(3)
     compared = agreed = 0
     while compared < 40:
-        matrix, free, mu, pi, before, dv_max, v_max = _random(generator)
+        matrix, free, mu, pi, v_previous, dv_max, v_max = _random(generator)
         moves = matrix.shape[1]
         if moves > 8 or min(dv_max, v_max) < 0.05 or np.abs(free).max() > 20.0 or pi < 1e-3:
             continue
-        space = make_workspace(moves)
-        solve_quadratic_program(matrix, free, mu, pi, before, dv_max, v_max, 500, space)
+        work = make_workspace(moves)
+        solve_quadratic_program(matrix, free, mu, pi, v_previous, dv_max, v_max, 500, work)
         hessian = mu * matrix.T @ matrix + pi * np.eye(moves)
         scale = max(mu * np.abs(matrix.T @ free).max(), 1e-9)
         sums = np.tril(np.ones((moves, moves)))
@@ -137,10 +137,10 @@ def test_forty_programs_agree_with_an_independent_solver():
             jac=lambda x, h=hessian, f=matrix.T @ free * mu, s=scale: (h @ x + f) / s,
             method='SLSQP',
             bounds=[(-dv_max, dv_max)] * moves,
-            constraints=LinearConstraint(sums, -v_max - before, v_max - before),
+            constraints=LinearConstraint(sums, -v_max - v_previous, v_max - v_previous),
             options={'ftol': 1e-15, 'maxiter': 1000},
         )
-        ours = cost(matrix, free, space.changes, mu, pi)
+        ours = cost(matrix, free, work.changes, mu, pi)
         theirs = cost(matrix, free, found.x, mu, pi)
         assert ours <= theirs + 1e-9 * abs(theirs)
         if found.success:
@@ -156,25 +156,23 @@ def test_with_bounds_on_the_changes_only_it_is_bounded_least_squares():
         moves = int(generator.integers(1, 11))
         matrix = _matrix(generator.standard_normal(12), moves)
         free = generator.standard_normal(12)
-        space = make_workspace(moves)
-        assert (
-            solve_quadratic_program(matrix, free, 2.0, 0.1, 0.0, 0.1, 1e3, 500, space) == OPTIMAL
-        )
+        work = make_workspace(moves)
+        assert solve_quadratic_program(matrix, free, 2.0, 0.1, 0.0, 0.1, 1e3, 500, work) == OPTIMAL
         tall = np.vstack((np.sqrt(2.0) * matrix, np.sqrt(0.1) * np.eye(moves)))
         target = np.r_[-np.sqrt(2.0) * free, np.zeros(moves)]
         found = lsq_linear(tall, target, (-0.1, 0.1), method='bvls', tol=1e-14)
-        np.testing.assert_allclose(space.changes, found.x, atol=1e-9)
+        np.testing.assert_allclose(work.changes, found.x, atol=1e-9)
 
 
 def test_without_active_bounds_it_is_the_closed_form_with_its_minus_sign():
     """E10: as printed, (62) climbs: the error would grow instead of falling."""
     generator = np.random.default_rng(5)
     matrix, free = _matrix(generator.standard_normal(8), 4), generator.standard_normal(8)
-    space = make_workspace(4)
-    assert solve_quadratic_program(matrix, free, 1.5, 0.2, 0.0, 1e6, 1e6, 100, space) == OPTIMAL
+    work = make_workspace(4)
+    assert solve_quadratic_program(matrix, free, 1.5, 0.2, 0.0, 1e6, 1e6, 100, work) == OPTIMAL
     square = 1.5 * matrix.T @ matrix + 0.2 * np.eye(4)
     closed = -1.5 * np.linalg.solve(square, matrix.T @ free)
-    np.testing.assert_allclose(space.changes, closed, rtol=1e-11)
+    np.testing.assert_allclose(work.changes, closed, rtol=1e-11)
     rest = cost(matrix, free, np.zeros(4), 1.5, 0.2)
     assert cost(matrix, free, closed, 1.5, 0.2) < rest
     assert cost(matrix, free, -closed, 1.5, 0.2) > rest
@@ -185,18 +183,16 @@ def test_closed_form_62_is_where_the_gradient_61_vanishes_and_where_the_solver_b
     for moves in (1, 4, 9):
         matrix, free = _matrix(generator.standard_normal(9), moves), generator.standard_normal(9)
         hessian, lower = np.zeros((moves, moves)), np.zeros((moves, moves))
-        slope, closed = np.zeros(moves), np.zeros(moves)
-        normal_equations(matrix, free, 1.5, 0.2, hessian, slope)
+        gradient, closed = np.zeros(moves), np.zeros(moves)
+        normal_equations(matrix, free, 1.5, 0.2, hessian, gradient)
         np.testing.assert_allclose(hessian, 1.5 * matrix.T @ matrix + 0.2 * np.eye(moves))
-        np.testing.assert_allclose(slope, 1.5 * matrix.T @ free, atol=1e-14)
+        np.testing.assert_allclose(gradient, 1.5 * matrix.T @ free, atol=1e-14)
         assert cholesky(hessian, lower)
-        unconstrained_optimum(lower, slope, closed)
-        np.testing.assert_allclose(hessian @ closed + slope, 0.0, atol=1e-12)
-        space = make_workspace(moves)
-        assert (
-            solve_quadratic_program(matrix, free, 1.5, 0.2, 0.0, 1e6, 1e6, 100, space) == OPTIMAL
-        )
-        np.testing.assert_allclose(space.changes, closed, rtol=1e-10, atol=1e-13)
+        unconstrained_optimum(lower, gradient, closed)
+        np.testing.assert_allclose(hessian @ closed + gradient, 0.0, atol=1e-12)
+        work = make_workspace(moves)
+        assert solve_quadratic_program(matrix, free, 1.5, 0.2, 0.0, 1e6, 1e6, 100, work) == OPTIMAL
+        np.testing.assert_allclose(work.changes, closed, rtol=1e-10, atol=1e-13)
 
 
 def test_cost_has_the_gradient_61():
@@ -215,13 +211,13 @@ def test_clipping_the_closed_form_is_worse_than_the_optimum():
     """Why the program is solved: "closed form, then clip" wastes moves that the bounds forbid."""
     steps = 0.12 * (1.0 - np.exp(-0.4 * np.arange(1, 11)))
     matrix, free = _matrix(steps, 5), np.full(10, 1.0)
-    space = make_workspace(5)
-    solve_quadratic_program(matrix, free, 1.0, 0.001, 0.0, 3.0, 10.0, 100, space)
+    work = make_workspace(5)
+    solve_quadratic_program(matrix, free, 1.0, 0.001, 0.0, 3.0, 10.0, 100, work)
     square = matrix.T @ matrix + 0.001 * np.eye(5)
     closed = -np.linalg.solve(square, matrix.T @ free)
     v = np.clip(np.cumsum(np.clip(closed, -3.0, 3.0)), -10.0, 10.0)
     clipped = np.diff(v, prepend=0.0)
-    ours = cost(matrix, free, space.changes, 1.0, 0.001)
+    ours = cost(matrix, free, work.changes, 1.0, 0.001)
     assert ours < 0.98 * cost(matrix, free, clipped, 1.0, 0.001)
 
 
@@ -243,41 +239,39 @@ def test_dependence_of_rows_is_decided_as_by_their_rank():
 
 def test_every_status_is_reached_and_then_nothing_moves():
     matrix, free = _matrix(np.linspace(0.1, 0.5, 6), 3), np.ones(6)
-    space = make_workspace(3)
+    work = make_workspace(3)
+    assert solve_quadratic_program(matrix, free, 1.0, 0.01, 5.0, 0.1, 1.0, 100, work) == INFEASIBLE
+    np.testing.assert_array_equal(work.changes, 0.0)
+    assert solve_quadratic_program(matrix, free, 1.0, 0.01, 0.0, 0.1, 0.15, 1, work) == UNFINISHED
+    np.testing.assert_array_equal(work.changes, 0.0)
     assert (
-        solve_quadratic_program(matrix, free, 1.0, 0.01, 5.0, 0.1, 1.0, 100, space) == INFEASIBLE
-    )
-    np.testing.assert_array_equal(space.changes, 0.0)
-    assert solve_quadratic_program(matrix, free, 1.0, 0.01, 0.0, 0.1, 0.15, 1, space) == UNFINISHED
-    np.testing.assert_array_equal(space.changes, 0.0)
-    assert (
-        solve_quadratic_program(matrix, np.full(6, np.nan), 1.0, 0.01, 0.0, 1.0, 1.0, 9, space)
+        solve_quadratic_program(matrix, np.full(6, np.nan), 1.0, 0.01, 0.0, 1.0, 1.0, 9, work)
         == NOT_POSITIVE
     )
     assert (
-        solve_quadratic_program(0.0 * matrix, free, 1.0, 0.0, 0.0, 1.0, 1.0, 9, space)
+        solve_quadratic_program(0.0 * matrix, free, 1.0, 0.0, 0.0, 1.0, 1.0, 9, work)
         == NOT_POSITIVE
     )
-    np.testing.assert_array_equal(space.changes, 0.0)
+    np.testing.assert_array_equal(work.changes, 0.0)
     with pytest.raises(ValueError, match='moves'):
         make_workspace(0)
 
 
 def test_v_outside_its_bound_but_within_one_change_is_brought_back():
     matrix, free = _matrix(np.linspace(0.1, 0.5, 6), 3), np.zeros(6)
-    space, out = make_workspace(3), np.zeros(4)
-    assert solve_quadratic_program(matrix, free, 1.0, 0.01, 1.05, 0.1, 1.0, 100, space) == OPTIMAL
-    assert space.changes[0] == pytest.approx(-0.05)
-    assert kkt_residuals(space, 1.05, 0.1, 1.0, out) < 1e-10
+    work, out = make_workspace(3), np.zeros(4)
+    assert solve_quadratic_program(matrix, free, 1.0, 0.01, 1.05, 0.1, 1.0, 100, work) == OPTIMAL
+    assert work.changes[0] == pytest.approx(-0.05)
+    assert kkt_residuals(work, 1.05, 0.1, 1.0, out) < 1e-10
 
 
 @pytest.mark.parametrize('moves', [1, 2, 5, 11])
 def test_the_parts_of_a_space_fill_its_stores_and_none_lies_on_another(moves):
     store, whole = np.zeros(workspace_size(moves)), np.zeros((2, moves + 1), dtype=np.int64)
-    space = workspace_view(store, whole, moves)
-    for array in space:
+    work = workspace_view(store, whole, moves)
+    for array in work:
         array += 1
     np.testing.assert_array_equal(store, 1.0)
     assert whole.sum() == 2 * moves + 1
-    assert space.multipliers.shape == (2, 2 * moves)
-    assert space.basis.shape == (moves, moves)
+    assert work.multipliers.shape == (2, 2 * moves)
+    assert work.basis.shape == (moves, moves)

@@ -101,7 +101,7 @@ def cross_validate(
                 judged = sum(part[0][0].size for part in parts) * span
                 nominal = PredictiveController(
                     predictive, 1.0 / parameters.rate, parameters.law.gain
-                ).weights()
+                ).get_weights()
                 ratings = {
                     title: skills(predictive, span, weights, parts)
                     for title, weights in (

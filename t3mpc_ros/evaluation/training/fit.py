@@ -13,7 +13,8 @@ from t3mpc_ros.control.control_law import Nt3fsMpcParameters
 from t3mpc_ros.evaluation.training.training_data import TrainingData, TrainingError
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator
 from t3mpc_ros.mpc.boltzmann_machine import BoltzmannMachine, LayerSizes, make_machine
-from t3mpc_ros.mpc.predictor import LearningConstants, PredictiveParameters, Predictor
+from t3mpc_ros.mpc.predictive_controller import PredictiveParameters, learning_constants
+from t3mpc_ros.mpc.predictor import Predictor
 from t3mpc_ros.mpc.pretraining import SampleTiming, nominal_step_response
 
 Array = NDArray[np.float64]
@@ -240,7 +241,7 @@ def fit_predictor(parameters: Nt3fsMpcParameters, errors: Array, moves: Array) -
             'controller while recording (a few rad/s²), record for longer, or keep the predictor '
             'as it is (--keep-predictor)'
         )
-    learning = LearningConstants.of(predictive, timing.span)
+    learning = learning_constants(predictive, timing.span)
     generator = np.random.default_rng(predictive.seed)
     longest = max(parts, key=lambda part: part[0][0].size)
     each = []
@@ -248,7 +249,7 @@ def fit_predictor(parameters: Nt3fsMpcParameters, errors: Array, moves: Array) -
         predictor = Predictor(_machine(predictive, generator), predictive.horizon, longest[z])
         trust = predictive.trust / timing.span
         predictor.fit(*run, predictive.excitation, trust, learning)
-        each.append(predictor.weights())
+        each.append(predictor.get_weights())
     weights = {name: np.stack([one[name] for one in each]) for name in each[0]}
     return PredictorFit(weights, uncertainty, float(taught))
 
@@ -320,7 +321,7 @@ def skills(
     parts
         As :func:`stretches` returns them.
     """
-    learning = LearningConstants.of(parameters, span)
+    learning = learning_constants(parameters, span)
     outputs = len(weights['scales'])
     missed, persistence_mse = np.zeros((2, outputs)), np.zeros((2, outputs))
     for part in parts:
@@ -328,9 +329,9 @@ def skills(
             machine = _machine(parameters, np.random.default_rng(parameters.seed))
             predictor = Predictor(machine, parameters.horizon, run)
             predictor.set_weights({name: value[z] for name, value in weights.items()}, learning)
-            weight = run[0].size - 1 - predictor.past.errors.size
-            missed[:, z] += weight * predictor.past.predicted
-            persistence_mse[:, z] += weight * predictor.past.persistence_mse
+            weight = run[0].size - 1 - predictor.history.errors.size
+            missed[:, z] += weight * predictor.history.prediction_mse
+            persistence_mse[:, z] += weight * predictor.history.persistence_mse
     with np.errstate(invalid='ignore'):
         return 1.0 - missed / persistence_mse
 

@@ -129,7 +129,7 @@ def held_out_skills(
     last_quarter = [[trial for _, trial in split_runs(errors, moves, 2)]]
     return {
         name: skills(predictive, term.span, weights, last_quarter)
-        for name, weights in (('before', term.weights()), ('after', after))
+        for name, weights in (('before', term.get_weights()), ('after', after))
     }
 
 
