@@ -45,7 +45,7 @@ def generate_launch_description():
             node('radio_bridge', {'port': text('port'), 'key_file': text('key_file')}),
             # 50 commands a second over the radio, and as many measurements; a command goes with
             # the cycle after the one it answers.
-            node('controller', {'rate': 50.0, 'estimate.dead_time': 0.02}),
+            node('controller', {'rate': 50.0, 'speed_filter.dead_time': 0.02}),
             node('reference', {'rate': 50.0}),
             node('recorder', {}, IfCondition(LaunchConfiguration('record'))),
         ]

@@ -21,13 +21,13 @@ ROBOTS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
     'twin': {'sim_robot': {'drive.kind': 'stepper'}},
     'servo': {
         'sim_robot': {'drive.kind': 'velocity'},
-        'controller': {'estimate.lag': 0.02},
+        'controller': {'speed_filter.lag': 0.02},
     },
     'emulator': {
         'radio_bridge': {},
         # Fifty measurements a second; a command goes with the cycle after the one it answers,
         # 19 ms after the sample: test_radio_delay.py.
-        'controller': {'rate': 50.0, 'estimate.dead_time': 0.02},
+        'controller': {'rate': 50.0, 'speed_filter.dead_time': 0.02},
     },
 }
 """Robots there are, and what each node is told of them: the digital twin, the paper's plant, and

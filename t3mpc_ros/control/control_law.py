@@ -25,10 +25,10 @@ from t3mpc_ros.parameters.table import Parameters, group, parameter
 Array = NDArray[np.float64]
 
 TERM_NAMES = ('fuzzy', 'feedback', 'feedforward', 'compensator', 'predictive')
-"""What the law adds up, in the order of the rows of ``terms``."""
+"""Summands of the law, in the order of the rows of ``terms``."""
 
 TANH_GAP = 0.2785
-"""E14: the largest value of |x| - x tanh(x), rounded up (0.27846, taken at x = 0.6392)."""
+"""E14: the maximum of |x| - x tanh(x), rounded up (0.27846, at x = 0.6392)."""
 
 
 @dataclass(frozen=True)
@@ -37,20 +37,20 @@ class LawParameters(Parameters):
 
     gain: float = parameter(
         15.2,
-        'feedback K on the tracking error (66)-(67), found by lab tune for the velocity drive; K '
-        'and the slope of the compensator, (omega-bar + v_p-bar)/epsilon, make 41 together, close '
-        'to (1 - exp(-T/lag))/T = 39.3, where measured noise does not reach the command by itself',
+        'feedback gain K of the tracking error (66)-(67), tuned for the velocity drive; K plus '
+        'the slope of the compensator, (omega-bar + v_p-bar)/epsilon, is 41, close to '
+        '(1 - exp(-T/lag))/T = 39.3, at which measurement noise cancels in the command',
         unit='1/s',
         low=0.1,
         high=100.0,
         dynamic=True,
     )
     compensator: bool = parameter(
-        True, 'whether the compensator (81)-(82) is part of the command', dynamic=True
+        True, 'whether the command includes the compensator (81)-(82)', dynamic=True
     )
     error_bound: float = parameter(
         6.0,
-        'bound of the estimation error per wheel that the compensator outweighs, omega-bar (80)',
+        'bound omega-bar (80) of the estimation error of a wheel that the compensator outweighs',
         unit='rad/s²',
         low=0.0,
         high=100.0,
@@ -58,13 +58,88 @@ class LawParameters(Parameters):
     )
     smoothing: float = parameter(
         0.62,
-        'width of the compensator about zero error, epsilon in tanh(delta/epsilon): E14 pays '
-        '0.2785 epsilon for it, small values chatter under noise',
+        'width epsilon of the compensator tanh(delta/epsilon): the error bound E14 grows with '
+        '0.2785 epsilon, small values chatter with noise',
         unit='rad/s',
         low=1e-3,
         high=100.0,
         dynamic=True,
     )
+
+
+@dataclass(frozen=True)
+class Nt3fsMpcParameters(Parameters):
+    """The law and its parts, each of which can be disabled."""
+
+    rate: float = parameter(100.0, 'control rate', unit='Hz', low=5.0, high=1000.0)
+    use_fuzzy: bool = parameter(
+        True, 'whether the fuzzy estimate g is adapted and cancelled (NT3FS)', dynamic=True
+    )
+    integral_transfer: float = parameter(
+        0.025,
+        'transfer of a persistent v_p to the fuzzy systems, which learn from '
+        'delta - integral_transfer v_p; 0 gives (77)-(78) as printed',
+        unit='s',
+        low=0.0,
+        high=10.0,
+        dynamic=True,
+    )
+    law: LawParameters = group(LawParameters)
+    jump_transition: JumpTransitionParameters = group(JumpTransitionParameters)
+    speed_filter: SpeedFilterParameters = group(SpeedFilterParameters)
+    fuzzy: FuzzyParameters = group(FuzzyParameters)
+    adaptation: AdaptationParameters = group(AdaptationParameters)
+    predictive: PredictiveParameters = group(PredictiveParameters)
+
+    @property
+    def compensated_bound(self) -> float:
+        """Sum omega-bar + v_p-bar of (80)-(82), rad/s², which the compensator outweighs."""
+        predictive = self.predictive.v_max if self.predictive.enabled else 0.0
+        return self.law.error_bound + predictive
+
+
+# -- law (66)-(67) and compensator (81)-(82) --------------------------------------------------
+
+
+@kernel
+def law_terms(
+    speeds: Array,
+    reference: Array,
+    reference_rate: Array,
+    estimate: Array,
+    predictive: Array,
+    gain: float,
+    bound: float,
+    smoothing: float,
+    terms: Array,
+    command: Array,
+) -> None:
+    r"""Write the terms of the law and their sum, equations (66)-(67) with E12.
+
+    .. math:: u_i = -g_i(\chi|\alpha_i) - K\delta_i + \dot r_i + v_{c,i} + v_{p,i}, \qquad
+              \delta = \chi - r
+
+    E12: the printed :math:`+\omega_i` is the unknown estimation error and cannot be applied; the
+    correct term is :math:`\dot r_i`. With it, (68)-(69) follow from (64)-(65), and by (70)-(71)
+    the error system (72)-(73) of each wheel,
+    :math:`\dot\delta = \tilde\alpha^T\Phi - K\delta + \omega + v_c + v_p`. The compensator is
+    (81)-(82),
+    :math:`v_c = -(\bar\omega + \bar v_p)\tanh(\delta/\epsilon)`.
+
+    speeds, reference : shape (n,), chi and r, rad/s
+    reference_rate, estimate, predictive : shape (n,), r', g and v_p, rad/s²
+    gain, bound, smoothing : K (1/s), omega-bar + v_p-bar (rad/s²), epsilon (rad/s)
+    terms : shape (5, n), overwritten, rows as in ``TERM_NAMES``, rad/s²
+    command : shape (n,), overwritten, u, rad/s²
+    """
+    for i in range(speeds.size):
+        error = speeds[i] - reference[i]
+        terms[0, i] = -estimate[i]
+        terms[1, i] = -gain * error
+        terms[2, i] = reference_rate[i]
+        terms[3, i] = compensator(error, bound, smoothing)
+        terms[4, i] = predictive[i]
+        command[i] = terms[0, i] + terms[1, i] + terms[2, i] + terms[3, i] + terms[4, i]
 
 
 @kernel
@@ -78,57 +153,19 @@ def compensator(error: float, bound: float, smoothing: float) -> float:
     bound
         omega-bar + v_p-bar, rad/s².
     smoothing
-        epsilon, rad/s; the paper's tanh(delta) is epsilon = 1 rad/s.
+        epsilon, rad/s; the paper's tanh(delta) has epsilon = 1 rad/s.
     """
     return -bound * math.tanh(error / smoothing)
 
 
-@kernel
-def law_terms(
-    speeds: Array,
-    wanted: Array,
-    wanted_rate: Array,
-    estimate: Array,
-    predictive: Array,
-    gain: float,
-    bound: float,
-    smoothing: float,
-    terms: Array,
-    command: Array,
-) -> None:
-    r"""Write the law's terms and their sum, equations (66)-(67) with E12.
-
-    .. math:: u_i = -g_i(\chi|\alpha_i) - K\delta_i + \dot r_i + v_{c,i} + v_{p,i}, \qquad
-              \delta = \chi - r
-
-    E12: the printed :math:`+\omega_i` is the unknown estimation error and cannot be applied; it
-    is :math:`\dot r_i`, and with it (68)-(69) follow from (64)-(65), and by (70)-(71) the error
-    system (72)-(73) of each wheel,
-    :math:`\dot\delta = \tilde\alpha^T\Phi - K\delta + \omega + v_c + v_p`. The compensator is
-    (81)-(82),
-    :math:`v_c = -(\bar\omega + \bar v_p)\tanh(\delta/\epsilon)`.
-
-    speeds, wanted : shape (n,), chi and r, rad/s
-    wanted_rate, estimate, predictive : shape (n,), r', g and v_p, rad/s²
-    gain, bound, smoothing : K (1/s), omega-bar + v_p-bar (rad/s²), epsilon (rad/s)
-    terms : shape (5, n), overwritten, rows as in ``TERMS``, rad/s²
-    command : shape (n,), overwritten, u, rad/s²
-    """
-    for i in range(speeds.size):
-        error = speeds[i] - wanted[i]
-        terms[0, i] = -estimate[i]
-        terms[1, i] = -gain * error
-        terms[2, i] = wanted_rate[i]
-        terms[3, i] = compensator(error, bound, smoothing)
-        terms[4, i] = predictive[i]
-        command[i] = terms[0, i] + terms[1, i] + terms[2, i] + terms[3, i] + terms[4, i]
+# -- stability: V of (74), its bound E14, and the certificate at run time -------------------------
 
 
 def lyapunov_value(errors: Array, coefficient_errors: Array, adaptation_gain: float) -> float:
     """Return V of equation (74), rad²/s²: half of |delta|² plus |alpha* - alpha|²/(2 gamma).
 
-    Along the loop V' is (75), the sum of delta delta' - alpha~ alpha'/gamma. With the law in it
-    that is (76), and (79) when the coefficients follow (77)-(78).
+    Along the closed loop V' is (75), the sum of delta delta' - alpha~ alpha'/gamma. With the law
+    it becomes (76), and (79) if the coefficients follow (77)-(78).
 
     Parameters
     ----------
@@ -145,7 +182,7 @@ def lyapunov_value(errors: Array, coefficient_errors: Array, adaptation_gain: fl
 
 @kernel
 def lyapunov_rate_bound(errors: Array, gain: float, bound: float, smoothing: float) -> float:
-    r"""Return the largest V' that the law allows, rad²/s³: (83) as corrected by E14.
+    r"""Return the upper bound of V' under the law, rad²/s³: (83) as corrected by E14.
 
     .. math:: \dot V \le -K\|\delta\|^2 + 0.2785\,\epsilon \sum_i(\bar\omega_i + \bar v_{p,i})
 
@@ -155,7 +192,7 @@ def lyapunov_rate_bound(errors: Array, gain: float, bound: float, smoothing: flo
     ultimately bounded by :func:`ultimate_bound` instead of vanishing. E13: the last cross term
     of (76) and (79) is delta_2 v_p2.
 
-    E17: (84) also lost V(0); its integral is negative, V is not. Integrated, the bound says
+    E17: the printed (84) omits V(0); its integral is negative, V is not. Integrated, the bound is
     :math:`V(t) \le V(0) - K\int\|\delta\|^2 + 0.2785\,\epsilon\, t
     \sum_i(\bar\omega_i + \bar v_{p,i})`.
     """
@@ -172,39 +209,78 @@ def squared_norm(errors: Array) -> float:
 
 
 def ultimate_bound(gain: float, bound: float, smoothing: float, wheels: int = 2) -> float:
-    """Return the radius (rad/s) outside which V of (74) must fall: the ball of E14."""
+    """Return the radius (rad/s) outside which V of (74) decreases: the ball of E14."""
     return math.sqrt(TANH_GAP * smoothing * bound * wheels / gain)
 
 
 class CertificateReading(NamedTuple):
-    """What the run-time certificate says at one step."""
+    """Value of V, its rate and the bound of the rate at one step."""
 
     value: float
-    """Half of |delta|², rad²/s²: the part of V (74) that can be measured."""
+    """Half of |delta|², rad²/s²: the measurable part of V (74)."""
     rate: float
-    """Its measured rate of change, averaged over the window, rad²/s³."""
+    """Measured rate of the value, averaged over the window, rad²/s³."""
     bound: float
-    """The largest rate E14 allows, averaged alike, rad²/s³."""
+    """Upper bound of the rate by E14, averaged over the window, rad²/s³."""
 
     @classmethod
-    def of(cls, remembered: Array) -> Self:
-        """Return what :func:`update_certificate` has written."""
-        return cls(*remembered[:STARTED].tolist())
+    def from_state(cls, state: Array) -> Self:
+        """Return the reading in the state of :func:`update_certificate`."""
+        return cls(*state[:STARTED].tolist())
 
     @property
     def margin(self) -> float:
-        """Return bound minus rate: the certificate holds while this is not negative."""
+        """Bound minus rate; the certificate holds while it is not negative."""
         return self.bound - self.rate
 
     @property
     def holds(self) -> bool:
-        """Whether the measured decrease respects the bound of E14."""
+        """Whether the measured rate is within the bound of E14."""
         return self.margin >= 0.0
 
 
+class Certificate:
+    """Checks at run time that the error decreases as E14 predicts.
+
+    The ideal coefficients alpha* in (74) are unknown at run time, so the certificate uses the
+    measurable part V = |delta|²/2. Its rate obeys the same bound (83)/E14 as long as the *whole*
+    estimation error, g* - g plus disturbance, is within omega-bar. A negative margin shows a
+    larger error, or a recent jump of the reference.
+
+    Parameters
+    ----------
+    window
+        Time constant (s) of the averages: single differences are mostly measurement noise.
+    """
+
+    def __init__(self, window: float = 0.5) -> None:
+        self.window = window
+        self.state: Array = np.zeros(4)
+        """State of :func:`update_certificate`."""
+        self.reset()
+
+    def reset(self) -> None:
+        """Clear the averages."""
+        self.state[:] = 0.0
+
+    @property
+    def reading(self) -> CertificateReading:
+        """Reading at the last step."""
+        return CertificateReading.from_state(self.state)
+
+    def update(
+        self, errors: Array, parameters: LawParameters, bound: float, dt: float
+    ) -> CertificateReading:
+        """Return the reading after an error sample (rad/s), ``dt`` seconds after the last one."""
+        update_certificate(
+            errors, parameters.gain, bound, parameters.smoothing, dt, self.window, self.state
+        )
+        return self.reading
+
+
 VALUE, RATE, BOUND, STARTED = range(4)
-"""Places of what a certificate remembers: the numbers of a :class:`CertificateReading`, and
-whether there was a step before, 0 or 1."""
+"""Elements of the state of a certificate: the numbers of a :class:`CertificateReading`, and
+whether there was a previous step, 0 or 1."""
 
 
 @kernel
@@ -215,248 +291,46 @@ def update_certificate(
     smoothing: float,
     dt: float,
     window: float,
-    remembered: Array,
+    state: Array,
 ) -> None:
-    """Compare the rate of V with the bound of E14, both averaged over the window.
+    """Update the rate of V and the bound of E14, both averaged over the window.
 
     errors     : shape (n,), rad/s
     gain, bound, smoothing : as in :func:`law_terms`
     dt, window : s
-    remembered : shape (4,), at VALUE, RATE, BOUND, BEGUN
+    state      : shape (4,), at VALUE, RATE, BOUND, STARTED
     """
     value = 0.5 * squared_norm(errors)
-    rate = (value - remembered[VALUE]) / dt if remembered[STARTED] > 0.0 else 0.0
+    rate = (value - state[VALUE]) / dt if state[STARTED] > 0.0 else 0.0
     allowed = lyapunov_rate_bound(errors, gain, bound, smoothing)
-    share = min(1.0, dt / window)
-    remembered[RATE] += share * (rate - remembered[RATE])
-    remembered[BOUND] += share * (allowed - remembered[BOUND])
-    remembered[VALUE] = value
-    remembered[STARTED] = 1.0
+    weight = min(1.0, dt / window)
+    state[RATE] += weight * (rate - state[RATE])
+    state[BOUND] += weight * (allowed - state[BOUND])
+    state[VALUE] = value
+    state[STARTED] = 1.0
 
 
-class Certificate:
-    """Checks at run time that the error falls as E14 promises.
-
-    The ideal coefficients alpha* in (74) are unknown while the robot runs, so the certificate
-    watches the measurable part V = |delta|²/2. Its rate obeys the same bound (83)/E14 as long as
-    the *whole* estimation error, g* - g plus disturbance, stays within omega-bar; a negative
-    margin says that it did not, or that the reference has just jumped.
-
-    Parameters
-    ----------
-    window
-        Time constant (s) of the averages: single differences are mostly measurement noise.
-    """
-
-    def __init__(self, window: float = 0.5) -> None:
-        self.window = window
-        self.remembered: Array = np.zeros(4)
-        """What :func:`update_certificate` remembers."""
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the past."""
-        self.remembered[:] = 0.0
-
-    @property
-    def reading(self) -> CertificateReading:
-        """What the certificate says now."""
-        return CertificateReading.of(self.remembered)
-
-    def update(
-        self, errors: Array, parameters: LawParameters, bound: float, dt: float
-    ) -> CertificateReading:
-        """Return the reading after an error sample (rad/s) that came ``dt`` seconds later."""
-        update_certificate(
-            errors, parameters.gain, bound, parameters.smoothing, dt, self.window, self.remembered
-        )
-        return self.reading
-
-
-@dataclass(frozen=True)
-class Nt3fsMpcParameters(Parameters):
-    """Everything the law is made of; each part can be left out."""
-
-    rate: float = parameter(100.0, 'control steps a second', unit='Hz', low=5.0, high=1000.0)
-    use_fuzzy: bool = parameter(
-        True, 'whether the fuzzy estimate g is learnt and cancelled (NT3FS)', dynamic=True
-    )
-    integral_transfer: float = parameter(
-        0.025,
-        'how strongly a lasting v_p teaches the fuzzy systems, which then take it over: they '
-        'learn from delta - integral_transfer v_p; 0 is (77)-(78) as printed',
-        unit='s',
-        low=0.0,
-        high=10.0,
-        dynamic=True,
-    )
-    law: LawParameters = group(LawParameters)
-    switches: JumpTransitionParameters = group(JumpTransitionParameters)
-    estimate: SpeedFilterParameters = group(SpeedFilterParameters)
-    fuzzy: FuzzyParameters = group(FuzzyParameters)
-    adaptation: AdaptationParameters = group(AdaptationParameters)
-    predictive: PredictiveParameters = group(PredictiveParameters)
-
-    @property
-    def compensated_bound(self) -> float:
-        """omega-bar + v_p-bar of (80)-(82), rad/s²: what the compensator must outweigh."""
-        predictive = self.predictive.v_max if self.predictive.enabled else 0.0
-        return self.law.error_bound + predictive
-
-
-class LawGains(NamedTuple):
-    """What :func:`compose` is told of the settings: plain numbers, for kernels."""
-
-    use_fuzzy: bool
-    adapted: bool
-    integral_transfer: float
-    gain: float
-    bound: float
-    smoothing: float
-    window: float
-    gamma: float
-    radius: float
-    leakage: float
-    dead_zone: float
-    step_limit: float
-
-
-@kernel
-def unpack_gains(told: Array) -> LawGains:
-    """Return the numbers of a row by name."""
-    return LawGains(
-        told[0] != 0.0,
-        told[1] != 0.0,
-        told[2],
-        told[3],
-        told[4],
-        told[5],
-        told[6],
-        told[7],
-        told[8],
-        told[9],
-        told[10],
-        told[11],
-    )
-
-
-@kernel
-def step_law(
-    speeds: Array,
-    wanted: Array,
-    wanted_rate: Array,
-    rows: Array,
-    dt: float,
-    frozen: bool,
-    gains_told: Array,
-    centres: Array,
-    nonsingleton_gain: Array,
-    sharpness: Array,
-    shares: Array,
-    grades: Array,
-    firings: Array,
-    phi: Array,
-    coefficients: Array,
-    work: Array,
-    terms: Array,
-    command: Array,
-    remembered: Array,
-) -> bool:
-    """Write terms and command of the law, adapt, and renew the certificate.
-
-    Returns False, and changes nothing, when a speed is not finite.
-
-    speeds ... wanted_rate : as in :func:`t3mpc_ros.control.control_law.law_terms`
-    rows           : :class:`t3mpc_ros.mpc.predictive_controller.Signals` of the predictive term
-    dt             : s since the last step
-    frozen         : whether a limit cut the last command
-    gains_told     : the numbers of :class:`Gains`
-    centres ... coefficients : as in :func:`t3mpc_ros.fuzzy.estimator.estimate`
-    work           : shape (2, n), overwritten: g, and what the coefficients learn from
-    terms, command : overwritten
-    remembered     : as in :func:`t3mpc_ros.control.control_law.update_certificate`
-    """
-    gains, predictive = unpack_gains(gains_told), signals_view(rows)
-    guess, blame = work[0], work[1]
-    guess[:] = 0.0
-    if gains.use_fuzzy and not estimate(
-        speeds,
-        centres,
-        nonsingleton_gain,
-        sharpness,
-        shares,
-        grades,
-        firings,
-        phi,
-        coefficients,
-        guess,
-    ):
-        return False
-    law_terms(
-        speeds,
-        wanted,
-        wanted_rate,
-        guess,
-        predictive.v,
-        gains.gain,
-        gains.bound,
-        gains.smoothing,
-        terms,
-        command,
-    )
-    if gains.adapted and not frozen:
-        # What is left of a jump that was announced is nobody's fault, and teaches nothing.
-        for i in range(blame.size):
-            blame[i] = predictive.jump_free_errors[i] - gains.integral_transfer * predictive.v[i]
-        adapt(
-            coefficients,
-            phi,
-            blame,
-            dt,
-            gains.gamma,
-            gains.radius,
-            gains.leakage,
-            gains.dead_zone,
-            gains.step_limit,
-        )
-    update_certificate(
-        predictive.errors, gains.gain, gains.bound, gains.smoothing, dt, gains.window, remembered
-    )
-    return True
-
-
-@kernel
-def set_applied_term(terms: Array, acceleration: Array, command: Array, rows: Array) -> bool:
-    """Write the v_p that was applied where a limit cut u; return False if it is not finite.
-
-    terms, command : of :func:`compose`
-    acceleration   : shape (2,), what the limits made of the command, rad/s²
-    rows           : :class:`t3mpc_ros.mpc.predictive_controller.Signals` of the predictive term
-    """
-    predictive = signals_view(rows)
-    for i in range(acceleration.size):
-        predictive.applied[i] = terms[4, i] + (acceleration[i] - command[i])
-        if not math.isfinite(predictive.applied[i]):
-            return False
-    return True
+# -- the controller ----------------------------------------------------------------------
 
 
 class Nt3fsMpcController:
-    """Computes the wheel accelerations that make two wheels follow a reference.
+    """Computes the wheel accelerations with which two wheels track a reference.
 
-    The plant it expects is (64)-(65): chi' = g*(chi) + u + omega for each wheel, g* unknown.
-    :class:`t3mpc_ros.control.actuation.VelocityActuation` makes that plant of a robot, and tells by
-    :meth:`applied` what its limits made of u, because estimates must use the acceleration that
-    was really applied. The law knows neither poses nor clocks: speeds in, accelerations out.
+    The plant is (64)-(65): chi' = g*(chi) + u + omega for each wheel, with unknown g*.
+    :class:`t3mpc_ros.control.actuation.VelocityActuation` provides this plant on a robot and
+    reports by :meth:`set_applied` the u within the limits, because the estimates must use the
+    acceleration that was applied. Inputs are speeds, outputs accelerations; the law uses no pose
+    and no clock.
 
-    **Handover.** The adaptation and the offset-free predictive term both integrate; left alone
-    they may share a lasting disturbance in any way, even against each other. The fuzzy systems
-    therefore learn from delta - integral_transfer v_p. A v_p that opposes what they have not learnt,
-    v_p = -(g* - g), adds -integral_transfer (g* - g)² to (76): it can only help the proof.
+    **Integral transfer.** The adaptation and the offset-free predictive term both integrate.
+    Without further measures their shares of a persistent disturbance are arbitrary and may oppose
+    each other. The fuzzy systems therefore learn from delta - integral_transfer v_p. A v_p that
+    compensates the unlearnt part, v_p = -(g* - g), adds -integral_transfer (g* - g)² to (76):
+    the stability proof remains valid.
 
     Parameters
     ----------
-    settings
+    parameters
         The parts and their gains.
     """
 
@@ -470,21 +344,21 @@ class Nt3fsMpcController:
         self._certificate = Certificate()
         self._work: Array = np.zeros((2, 2))
         self.terms: Array = np.zeros((len(TERM_NAMES), 2))
-        """The law's terms of the last step, rows as in ``law.TERMS``, rad/s²."""
+        """Terms of the last step, rows as in ``TERM_NAMES``, rad/s²."""
         self.command: Array = np.zeros(2)
         """Their sum u, rad/s²."""
-        self.frozen = False
-        """Whether a limit cut the last command."""
-        self._gains = self._make_gains()
+        self.saturated = False
+        """Whether a limit changed the last command."""
+        self._gains = self._pack_gains()
         self.reset()
 
     def warm_up(self) -> None:
-        """Compile every kernel and pre-train the predictor now, never inside a step."""
+        """Compile every kernel and pretrain the predictor, so that no step has to."""
         self.fuzzy.warm_up()
         self.predictive.warm_up()
         coefficients = self.fuzzy.coefficients
         self.step(np.zeros(2), np.zeros(2), np.zeros(2), self._period)
-        self.applied(self.command, limited=True)
+        self.set_applied(self.command, saturated=True)
         self.fuzzy.reset()
         self.fuzzy.coefficients = coefficients
         self.reset()
@@ -492,139 +366,136 @@ class Nt3fsMpcController:
         self.command[:] = 0.0
 
     def configure(self, parameters: Nt3fsMpcParameters) -> None:
-        """Use other live settings from the next step on; what was learnt is kept."""
+        """Use new values of the dynamic parameters from the next step on; weights are kept."""
         self._parameters = parameters
         self.fuzzy.configure(parameters.adaptation)
         self.predictive.configure(parameters.predictive, parameters.law.gain)
-        self._gains = self._make_gains()
+        self._gains = self._pack_gains()
 
-    def learnt(self) -> dict[str, Array]:
-        """Return everything learnt, by name, to be saved: coefficients and predictor weights."""
+    def get_weights(self) -> dict[str, Array]:
+        """Return all adapted arrays by name: fuzzy coefficients and predictor weights."""
         weights = self.predictive.get_weights()
         return {'fuzzy.coefficients': self.fuzzy.coefficients.copy()} | {
             f'predictive.{name}': value for name, value in weights.items()
         }
 
-    def restore(self, learnt: Mapping[str, Array]) -> None:
-        """Use what :meth:`learnt` returned.
+    def set_weights(self, weights: Mapping[str, Array]) -> None:
+        """Use weights as returned by :meth:`get_weights`.
 
         Raises
         ------
         ValueError
-            A name is missing or unknown, a shape does not fit these settings, or a number is not
-            finite; nothing is changed then but the fuzzy coefficients.
+            A name is missing or unknown, a shape does not fit the parameters, or a number is not
+            finite; the predictor is then unchanged.
         """
-        weights = {
+        predictive = {
             name.removeprefix('predictive.'): value
-            for name, value in learnt.items()
+            for name, value in weights.items()
             if name.startswith('predictive.')
         }
-        if 'fuzzy.coefficients' not in learnt:
+        if 'fuzzy.coefficients' not in weights:
             raise ValueError('fuzzy.coefficients are missing')
-        self.fuzzy.coefficients = learnt['fuzzy.coefficients']
-        self.predictive.set_weights(weights)
+        self.fuzzy.coefficients = weights['fuzzy.coefficients']
+        self.predictive.set_weights(predictive)
 
     def snapshot(self) -> tuple[Array, list[Array]]:
-        """Return what is learnt as it is now, for :meth:`go_back`: much faster than learnt."""
+        """Return a copy of the weights for :meth:`rollback`, faster than :meth:`get_weights`."""
         return self.fuzzy.coefficients, self.predictive.snapshot()
 
     def rollback(self, snapshot: tuple[Array, list[Array]]) -> None:
-        """Use what :meth:`copies` returned, as :meth:`restore` does."""
+        """Restore the weights of a :meth:`snapshot`."""
         coefficients, predictors = snapshot
         self.fuzzy.coefficients = coefficients
         self.predictive.rollback(predictors)
 
     def reset(self) -> None:
-        """Start a new run; what was learnt is kept."""
+        """Start a new run; the weights are kept."""
         self.predictive.reset()
         self._certificate.reset()
-        self.frozen = False
+        self.saturated = False
 
     @property
-    def tables(self) -> tuple[Array, ...]:
-        """What :func:`compose` reads and writes beside its inputs, in its order."""
-        remembered = self._certificate.remembered
-        return self._gains, *self.fuzzy.tables, self._work, self.terms, self.command, remembered
+    def kernel_arguments(self) -> tuple[Array, ...]:
+        """State and constants of :func:`step_law`, in its order."""
+        certificate = self._certificate.state
+        return self._gains, *self.fuzzy.tables, self._work, self.terms, self.command, certificate
 
     @property
-    def watched(self) -> Array:
-        """What the certificate remembers, see :func:`update_certificate`."""
-        return self._certificate.remembered
+    def certificate_state(self) -> Array:
+        """State of the certificate, see :func:`update_certificate`."""
+        return self._certificate.state
 
     @property
-    def reading(self) -> CertificateReading:
-        """What the certificate says."""
+    def certificate(self) -> CertificateReading:
+        """Reading of the certificate at the last step."""
         return self._certificate.reading
 
     @property
-    def ball(self) -> float:
-        """Radius (rad/s) of the ball that E14 promises the error ends in."""
+    def ultimate_bound(self) -> float:
+        """Radius (rad/s) of the ball in which the error ends by E14."""
         law = self._parameters.law
         return ultimate_bound(law.gain, self._bound(), law.smoothing)
 
     def step(
         self,
         speeds: Array,
-        wanted: Array,
-        wanted_rate: Array,
+        reference: Array,
+        reference_rate: Array,
         dt: float,
-        known_change: Array | None = None,
+        future_jumps: Array | None = None,
     ) -> Array:
         """Return the wheel accelerations u (rad/s²) of (66)-(67), shape (2,).
 
         Parameters
         ----------
         speeds
-            Wheel speeds chi (estimated, for the instant at which u begins to act), rad/s, (2,).
-        wanted, wanted_rate
-            Reference r (rad/s) at that instant and its time derivative until the next step
-            (rad/s²), shape (2,): a reference that the wheels can follow.
+            Wheel speeds chi, predicted for the instant at which u takes effect, rad/s, shape (2,).
+        reference, reference_rate
+            Reachable reference r (rad/s) at that instant and its derivative until the next step
+            (rad/s²), shape (2,).
         dt
-            Seconds since the last step.
-        known_change
-            Jumps of the error still to come, see :meth:`PredictiveController.step`.
+            Time since the last step, s.
+        future_jumps
+            Future jumps of the error, see :meth:`PredictiveController.step`.
         """
-        self.predictive.advance(speeds, wanted, known_change)
+        self.predictive.advance(speeds, reference, future_jumps)
         if not step_law(
             speeds,
-            wanted,
-            wanted_rate,
+            reference,
+            reference_rate,
             self.predictive.rows,
             dt,
-            self.frozen,
+            self.saturated,
             self._gains,
             *self.fuzzy.tables,
             self._work,
             self.terms,
             self.command,
-            self._certificate.remembered,
+            self._certificate.state,
         ):
             raise ValueError(f'speeds must be finite: got {speeds}')
         return self.command
 
-    def applied(self, acceleration: Array, *, limited: bool) -> None:
-        """Take note of what the drive made of the last command.
+    def set_applied(self, acceleration: Array, *, saturated: bool) -> None:
+        """Set the acceleration that the actuation applied at the last step.
 
         Parameters
         ----------
         acceleration
-            Wheel accelerations really applied, rad/s², shape (2,).
-        limited
-            Whether a limit cut the command: the error is then not the estimate's fault, so
-            adaptation pauses, and the predictor is told that less of v_p arrived.
+            Applied wheel accelerations, rad/s², shape (2,).
+        saturated
+            Whether a limit changed the command. The adaptation then pauses, because the error is
+            not an estimation error, and the predictor uses the applied part of v_p.
         """
-        self.frozen = limited
-        if limited and not set_applied_term(
+        self.saturated = saturated
+        if saturated and not set_applied_term(
             self.terms, acceleration, self.command, self.predictive.rows
         ):
             raise ValueError(f'acceleration must be finite: got {acceleration}')
 
-    def _make_gains(self) -> Array:
-        parameters, law, adaptation = (
-            self._parameters,
-            self._parameters.law,
-            self._parameters.adaptation,
-        )
+    def _pack_gains(self) -> Array:
+        parameters, law = self._parameters, self._parameters.law
+        adaptation = parameters.adaptation
         return np.array(
             LawGains(
                 use_fuzzy=parameters.use_fuzzy,
@@ -644,4 +515,144 @@ class Nt3fsMpcController:
         )
 
     def _bound(self) -> float:
-        return self._parameters.compensated_bound if self._parameters.law.compensator else 0.0
+        parameters = self._parameters
+        return parameters.compensated_bound if parameters.law.compensator else 0.0
+
+
+class LawGains(NamedTuple):
+    """Parameters of :func:`step_law` as plain numbers."""
+
+    use_fuzzy: bool
+    adapted: bool
+    integral_transfer: float
+    gain: float
+    bound: float
+    smoothing: float
+    window: float
+    gamma: float
+    radius: float
+    leakage: float
+    dead_zone: float
+    step_limit: float
+
+
+@kernel
+def unpack_gains(row: Array) -> LawGains:
+    """Return the numbers of a row by name."""
+    return LawGains(
+        row[0] != 0.0,
+        row[1] != 0.0,
+        row[2],
+        row[3],
+        row[4],
+        row[5],
+        row[6],
+        row[7],
+        row[8],
+        row[9],
+        row[10],
+        row[11],
+    )
+
+
+@kernel
+def step_law(
+    speeds: Array,
+    reference: Array,
+    reference_rate: Array,
+    rows: Array,
+    dt: float,
+    saturated: bool,
+    packed_gains: Array,
+    centres: Array,
+    nonsingleton_gain: Array,
+    sharpness: Array,
+    shares: Array,
+    grades: Array,
+    firings: Array,
+    phi: Array,
+    coefficients: Array,
+    work: Array,
+    terms: Array,
+    command: Array,
+    certificate: Array,
+) -> bool:
+    """Write terms and command of the law, adapt the fuzzy systems, update the certificate.
+
+    Returns False, and changes nothing, if a speed is not finite.
+
+    speeds ... reference_rate : as in :func:`law_terms`
+    rows           : :class:`t3mpc_ros.mpc.predictive_controller.Signals` of the predictive term
+    dt             : time since the last step, s
+    saturated      : whether a limit changed the last command
+    packed_gains   : the numbers of :class:`LawGains`
+    centres ... coefficients : as in :func:`t3mpc_ros.fuzzy.estimator.estimate`
+    work           : shape (2, n), overwritten: g, and the error of the adaptation
+    terms, command : overwritten
+    certificate    : as in :func:`update_certificate`
+    """
+    gains, predictive = unpack_gains(packed_gains), signals_view(rows)
+    fuzzy_estimate, adaptation_error = work[0], work[1]
+    fuzzy_estimate[:] = 0.0
+    if gains.use_fuzzy and not estimate(
+        speeds,
+        centres,
+        nonsingleton_gain,
+        sharpness,
+        shares,
+        grades,
+        firings,
+        phi,
+        coefficients,
+        fuzzy_estimate,
+    ):
+        return False
+    law_terms(
+        speeds,
+        reference,
+        reference_rate,
+        fuzzy_estimate,
+        predictive.v,
+        gains.gain,
+        gains.bound,
+        gains.smoothing,
+        terms,
+        command,
+    )
+    if gains.adapted and not saturated:
+        # The residual of an announced jump is excluded from adaptation.
+        for i in range(adaptation_error.size):
+            adaptation_error[i] = (
+                predictive.jump_free_errors[i] - gains.integral_transfer * predictive.v[i]
+            )
+        adapt(
+            coefficients,
+            phi,
+            adaptation_error,
+            dt,
+            gains.gamma,
+            gains.radius,
+            gains.leakage,
+            gains.dead_zone,
+            gains.step_limit,
+        )
+    update_certificate(
+        predictive.errors, gains.gain, gains.bound, gains.smoothing, dt, gains.window, certificate
+    )
+    return True
+
+
+@kernel
+def set_applied_term(terms: Array, acceleration: Array, command: Array, rows: Array) -> bool:
+    """Write the v_p that was applied when a limit changed u; return False if it is not finite.
+
+    terms, command : of :func:`step_law`
+    acceleration   : shape (2,), the command after the limits, rad/s²
+    rows           : :class:`t3mpc_ros.mpc.predictive_controller.Signals` of the predictive term
+    """
+    predictive = signals_view(rows)
+    for i in range(acceleration.size):
+        predictive.applied[i] = terms[4, i] + (acceleration[i] - command[i])
+        if not math.isfinite(predictive.applied[i]):
+            return False
+    return True

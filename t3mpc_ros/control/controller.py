@@ -6,395 +6,347 @@ from collections import deque
 from dataclasses import dataclass
 from itertools import count
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.control.actuation import LimitParameters, VelocityActuation
-from t3mpc_ros.control.batch_replay import (
-    APPLIED,
-    ERROR,
-    NEVER,
-    BatchStepper,
-    ControllerParts,
-    Status,
-    StepResults,
+from t3mpc_ros.control.control_law import (
+    CertificateReading,
+    Nt3fsMpcController,
+    Nt3fsMpcParameters,
 )
-from t3mpc_ros.control.control_law import Nt3fsMpcController, Nt3fsMpcParameters
-from t3mpc_ros.control.switching_tracker import SwitchingTracker, sample_reference
+from t3mpc_ros.control.jump_transition import JumpTransition
 from t3mpc_ros.control.watchdog import InputWatchdog, Reason, ResponseMonitor, WatchdogParameters
+from t3mpc_ros.geometry import kinematics
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
-from t3mpc_ros.geometry.trajectory import Jump, ReferenceTrajectory, Stamps
+from t3mpc_ros.geometry.trajectory import Jump, ReferenceTrajectory, Stamps, interpolate
 from t3mpc_ros.geometry.types import (
     NANOSECONDS,
     ORIGIN,
     STANDSTILL,
     BodyTwist,
     State,
-    StateArray,
     WheelSpeeds,
 )
+from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import group
-
-__all__ = ['Controller', 'ControllerParameters', 'Status']
 
 Array = NDArray[np.float64]
 
 JUMP_DETECTION_FACTOR = 2.2
-"""A reference that changes this many times faster than the robot may is taken as a switch."""
-
+"""A reference acceleration above this multiple of the acceleration limit is a jump."""
 
 SNAPSHOT_PERIOD = 0.25
-"""s between two copies of what is learnt."""
+"""Time between two snapshots of the weights, s."""
 SNAPSHOT_COUNT = 3
-"""The oldest of so many is from before a robot stopped following; doubt takes some time."""
+"""Number of snapshots kept; the oldest one is older than the response time-out."""
 
 
 @dataclass(frozen=True)
 class ControllerParameters(Nt3fsMpcParameters):
-    """The whole controller: the law, the robot's lengths, limits and time-outs."""
+    """Parameters of the controller: control law, wheel geometry, limits and time-outs."""
 
     geometry: WheelGeometry = group(WheelGeometry, inline=True)
     limits: LimitParameters = group(LimitParameters, inline=True)
     watchdog: WatchdogParameters = group(WatchdogParameters)
 
 
-class Controller:
-    """Follows a stamped reference with one robot, one step per odometry message.
+class Status(NamedTuple):
+    """Result of one step beside the command; arrays are right wheel first."""
 
-    Its output is a function of the messages it was given, in their order: it reads no clock.
+    stamp_ns: int
+    reason: Reason
+    error: Array
+    """delta = chi - r, rad/s; NaN while no reference is known."""
+    terms: Array
+    """Shape (5, 2), rows as in ``TERM_NAMES``, rad/s²."""
+    applied: Array
+    """Wheel accelerations after the limits, rad/s²."""
+    certificate_state: Array
+    """State of :func:`t3mpc_ros.control.control_law.update_certificate`."""
+    skill: Array
+    """Skill of the predictor in the middle of its horizon."""
+    limited: bool
+    """Whether a limit changed the command."""
+
+    @property
+    def estimate(self) -> Array:
+        """Estimate g of the fuzzy systems, rad/s², shape (2,)."""
+        estimate: Array = 0.0 - self.terms[0]
+        return estimate
+
+    @property
+    def certificate(self) -> CertificateReading:
+        """Reading of the run-time certificate."""
+        return CertificateReading.from_state(self.certificate_state)
+
+
+class Controller:
+    """Tracks a stamped reference with one robot, one step per odometry message.
+
+    The output is a function of the messages in their order; the controller reads no clock.
     """
 
     def __init__(self, parameters: ControllerParameters) -> None:
         self.parameters = parameters
-        self._pursuit = SwitchingTracker(parameters, 'velocity')
+        self._tracker = SwitchingTracker(parameters, 'velocity')
         self._period = 1.0 / parameters.rate
         self._period_ns = round(self._period * NANOSECONDS)
-        self._drive = VelocityActuation(
-            parameters.estimate, parameters.limits, parameters.geometry, 'velocity', self._period
+        self._actuation = VelocityActuation(
+            parameters.speed_filter,
+            parameters.limits,
+            parameters.geometry,
+            'velocity',
+            self._period,
         )
-        self._dead_ns = round(self._drive.dead_time * NANOSECONDS)
-        self._looking = self._how_to_look()
-        self._speeds, self._wanted, self._begin, self._end = np.zeros((4, 2))
-        self._freshness = InputWatchdog(parameters.watchdog)
-        self._following = ResponseMonitor(parameters.watchdog, self._period)
+        self._dead_time_ns = round(self._actuation.dead_time * NANOSECONDS)
+        self._sampling = self._sampling_arguments()
+        self._speeds, self._reference = np.zeros((2, 2))
+        self._reference_begin, self._reference_end = np.zeros((2, 2))
+        self._watchdog = InputWatchdog(parameters.watchdog)
+        self._response = ResponseMonitor(parameters.watchdog, self._period)
         limits = parameters.limits
-        self._track = ReferenceTrajectory(
+        self._trajectory = ReferenceTrajectory(
             BodyTwist(
                 JUMP_DETECTION_FACTOR * limits.linear_acceleration,
                 JUMP_DETECTION_FACTOR * limits.angular_acceleration,
             )
         )
-        self._before: deque[tuple[Array, list[Array]]] = deque(maxlen=SNAPSHOT_COUNT)
-        """What had been learnt, from oldest to newest."""
-        self._since_copy = 0
-        self._copy_after = next(n for n in count(1) if n * self._period >= SNAPSHOT_PERIOD)
+        self._snapshots: deque[tuple[Array, list[Array]]] = deque(maxlen=SNAPSHOT_COUNT)
+        """Weights, oldest first."""
+        self._steps_since_snapshot = 0
+        self._snapshot_steps = next(n for n in count(1) if n * self._period >= SNAPSHOT_PERIOD)
         self._jumps: list[Jump] = []
-        self._told: set[int] = set()
+        self._announced: set[int] = set()
         self._moving = False
         self._last_stamp_ns: int | None = None
-        self.status = self._status(0, Reason.NO_ODOMETRY, np.full(2, math.nan))
+        self.status = self._make_status(0, Reason.NO_ODOMETRY, np.full(2, math.nan))
 
     @property
     def law(self) -> Nt3fsMpcController:
-        """The law, with everything it has learnt."""
-        return self._pursuit.law
+        """The control law with its weights."""
+        return self._tracker.law
 
     @property
-    def drive(self) -> VelocityActuation:
-        """The seam to the robot: what is estimated and sent. A replay tells it what was sent."""
-        return self._drive
+    def actuation(self) -> VelocityActuation:
+        """Speed filter and last command; a replay sets the recorded commands here."""
+        return self._actuation
 
     def warm_up(self) -> None:
-        """Compile and pre-train now, never inside a step; nothing is remembered of it."""
+        """Compile and pretrain, so that no step has to; the state of the controller is kept."""
         self.law.warm_up()
         other, jump = Controller(self.parameters), 2.0 * JUMP_DETECTION_FACTOR * self._period
         jumped = BodyTwist(jump * self.parameters.limits.linear_acceleration, 0.0)
         for k in range(10):
-            wanted = STANDSTILL if k < 4 else jumped
-            other.add_reference(State(k * self._period_ns, ORIGIN, wanted))
+            reference = STANDSTILL if k < 4 else jumped
+            other.add_reference(State(k * self._period_ns, ORIGIN, reference))
         for k in range(6):
             other.step(State(k * self._period_ns, ORIGIN, STANDSTILL))
 
     def configure(self, parameters: ControllerParameters) -> None:
-        """Use other live settings from the next step on."""
+        """Use new values of the dynamic parameters from the next step on."""
         self.parameters = parameters
-        self._pursuit.configure(parameters)
-        self._drive.configure(parameters.limits)
-        self._looking = self._how_to_look()
+        self._tracker.configure(parameters)
+        self._actuation.configure(parameters.limits)
+        self._sampling = self._sampling_arguments()
 
     def enable(self, on: bool) -> None:
-        """Let the robot move, or stop it until it is let again."""
-        self._freshness.enabled = on
+        """Enable the robot's motion, or stop the robot until it is enabled again."""
+        self._watchdog.enabled = on
 
     def reset(self) -> None:
-        """Forget the run and everything learnt in it; the robot stops until inputs are fresh."""
-        enabled = self._freshness.enabled
-        self._freshness.reset()
-        self._freshness.enabled = enabled
-        self._forget_reference()
+        """Discard the state and the weights; the robot stops until new inputs arrive."""
+        enabled = self._watchdog.enabled
+        self._watchdog.reset()
+        self._watchdog.enabled = enabled
+        self._clear_reference()
         self.law.fuzzy.reset()
         self.law.predictive.pretrain()
         self._stop()
         self._last_stamp_ns = None
 
-    def add_reference(self, motion: State) -> bool:
-        """Keep a wanted motion; return False when it is not finite and therefore ignored."""
-        track = self._track
-        newest = track.newest_ns
-        if not track.add(motion):
+    def add_reference(self, reference: State) -> bool:
+        """Store a reference sample; return False if it is not finite and therefore ignored."""
+        trajectory = self._trajectory
+        newest = trajectory.newest_ns
+        if not trajectory.add(reference):
             return False
-        if newest is not None and motion.stamp_ns <= newest:
-            # The source has started again: what it said of later is no longer so.
-            self._jumps = [jump for jump in self._jumps if jump.stamp_ns < motion.stamp_ns]
-            self._pursuit.plan.withdraw(motion.stamp_ns)
-        if track.has_jumps:
-            self._jumps += track.pop_jumps()
-        self._freshness.reference_arrived()
+        if newest is not None and reference.stamp_ns <= newest:
+            # The source has restarted: its samples replace those with later stamps.
+            self._jumps = [jump for jump in self._jumps if jump.stamp_ns < reference.stamp_ns]
+            self._tracker.transition.withdraw(reference.stamp_ns)
+        if trajectory.has_jumps:
+            self._jumps += trajectory.pop_jumps()
+        self._watchdog.reference_received()
         return True
 
-    def step(self, measured: State) -> tuple[BodyTwist, Status]:
-        """Return the twist to command now, and why.
+    def step(self, odometry: State) -> tuple[BodyTwist, Status]:
+        """Return the twist to command now, and the status.
 
         Parameters
         ----------
-        measured
-            The robot's odometry. A second message with the same stamp changes nothing; one that
-            is not finite, out of time or too late stops the robot, with the reason in the status.
+        odometry
+            State of the robot. A second message with the same stamp changes nothing. A message
+            that is not finite, out of order or too late stops the robot, with the reason in the
+            status.
         """
-        stamp = measured.stamp_ns
+        stamp = odometry.stamp_ns
         if stamp == self._last_stamp_ns:
-            return self._drive.twist, self.status
+            return self._actuation.twist, self.status
         restarted = self._last_stamp_ns is not None and stamp < self._last_stamp_ns
         self._last_stamp_ns = stamp
-        elapsed = self._freshness.elapsed(stamp)
+        elapsed = self._watchdog.elapsed(stamp)
         if restarted:
-            self._forget_reference()
+            self._clear_reference()
 
-        finite = measured.is_finite()
-        acts_ns = stamp + self._dead_ns
-        speeds, wanted, begin, end = self._speeds, self._wanted, self._begin, self._end
-        track, twist = self._track, measured.twist
+        finite = odometry.is_finite()
+        effect_ns = stamp + self._dead_time_ns
+        speeds, reference = self._speeds, self._reference
+        begin, end = self._reference_begin, self._reference_end
+        trajectory, twist = self._trajectory, odometry.twist
         known, speed, error = sample_reference(
-            track.stamps,
-            track.samples,
-            track.first,
-            track.end,
-            track.jump,
+            trajectory.stamps,
+            trajectory.samples,
+            trajectory.first,
+            trajectory.end,
+            trajectory.jump,
             stamp,
-            acts_ns,
-            *self._looking,
+            effect_ns,
+            *self._sampling,
             twist.linear,
             twist.angular,
             speeds,
-            wanted,
+            reference,
             begin,
             end,
         )
-        reason = self._freshness.decide(
+        reason = self._watchdog.decide(
             stamp, finite=finite, known=known, speed=speed, error=error if finite else 0.0
         )
         if reason.moves and restarted:
             reason = Reason.ODOMETRY_RESTARTED
         if not reason.moves:
             self._stop()
-            self.status = self._status(stamp, reason, speeds - wanted)
+            self.status = self._make_status(stamp, reason, speeds - reference)
             return STANDSTILL, self.status
 
-        fresh = elapsed is None or not self._moving
-        if fresh:
-            self._drive.reset(speeds)
-            self._following.reset()
-            self._before.clear()
-        elif not self._following.heard(*speeds.tolist()):
+        restart = elapsed is None or not self._moving
+        if restart:
+            self._actuation.reset(speeds)
+            self._response.reset()
+            self._snapshots.clear()
+        elif not self._response.update(*speeds.tolist()):
             return self._command_unresponsive(stamp)
         elif self.status.reason is Reason.NOT_FOLLOWING:
-            fresh = True
-            self._drive.reset(speeds)
-        drive = self._drive
-        drive.observe(speeds, elapsed or self._period)
-        if fresh:
-            self._pursuit.begin(acts_ns, self._drive.ahead, begin)
+            restart = True
+            self._actuation.reset(speeds)
+        actuation = self._actuation
+        actuation.observe(speeds, elapsed or self._period)
+        if restart:
+            self._tracker.begin(effect_ns, actuation.predicted, begin)
             self._moving = True
-            self._told.clear()
-            known_ns = acts_ns if self.parameters.switches.preview else stamp
+            self._announced.clear()
+            known_ns = effect_ns if self.parameters.jump_transition.preview else stamp
             self._jumps = [jump for jump in self._jumps if jump.stamp_ns > known_ns]
-        if self._jumps or self._told:
-            self._announce(stamp, acts_ns)
-        command = self._pursuit.step(acts_ns, drive.ahead, begin, end, elapsed or self._period)
-        applied = drive.send(command).copy()
-        self._pursuit.applied(applied, limited=drive.limited)
-        self._following.told(*drive.command.tolist())
-        self._keep()
-        self.status = self._status(stamp, reason, drive.speeds - wanted, applied)
-        return drive.twist, self.status
+        if self._jumps or self._announced:
+            self._announce_jumps(stamp, effect_ns)
+        acceleration = self._tracker.step(
+            effect_ns, actuation.predicted, begin, end, elapsed or self._period
+        )
+        applied = actuation.send_acceleration(acceleration).copy()
+        self._tracker.set_applied(applied, saturated=actuation.limited)
+        self._response.add_command(*actuation.command.tolist())
+        self._take_snapshot()
+        self.status = self._make_status(stamp, reason, actuation.speeds - reference, applied)
+        return actuation.twist, self.status
 
-    def march(
-        self, measured: StateArray, references: StateArray, rows: Stamps, answers: StepResults
-    ) -> int:
-        """Do many steps of a recorded run; return how many of them were plain.
+    def check_odometry(self, last_received_ns: int | None, now_ns: int) -> bool:
+        """Whether the odometry has timed out, so that a stop must be commanded.
 
-        The same as :meth:`add_reference` and :meth:`step` one after the other, to the last bit.
-        Plain steps, at which a robot follows a reference that does not jump, are done in compiled
-        stretches; the first stretch ever is compiled before.
-
-        Parameters
-        ----------
-        measured, references
-            Odometry and wanted motions.
-        rows
-            For each step its odometry message, and from where to where references are handed
-            over before it, shape (n, 3).
-        answers
-            Its n rows are overwritten.
-
-        Raises
-        ------
-        ValueError
-            A number has come to be infinite or NaN; the controller cannot be used further.
+        Both times are from one clock of the caller. After a time-out the controller clears its
+        state, and the next odometry message is a new start.
         """
-        k = plain = 0
-        while k < len(rows):
-            taken, handed = self._go_on(measured, references, rows, k, answers)
-            k, plain = k + taken, plain + taken
-            if k == len(rows):
-                break
-            heard, begin, end = rows[k].tolist()
-            for j in range(max(begin, handed), end):
-                self.add_reference(references[j])
-            answers.note(k, *self.step(measured[heard]))
-            k += 1
-        return plain
-
-    def _command_unresponsive(self, stamp_ns: int) -> tuple[BodyTwist, Status]:
-        """Go on commanding the reference to a robot that does not follow, and learn nothing.
-
-        A stop would be for ever: a board that has restarted waits for commands. What was learnt
-        until this was noticed is taken back. When the robot follows again, the law starts as
-        after a stop, with what it knew before.
-        """
-        if self.status.reason is not Reason.NOT_FOLLOWING:
-            self._pursuit.reset()
-            if self._before:
-                self.law.rollback(self._before[0])
-                self._before.clear()
-        self._drive.aim(self._wanted)
-        self._following.told(*self._drive.command.tolist())
-        error = self._speeds - self._wanted
-        self.status = self._status(stamp_ns, Reason.NOT_FOLLOWING, error)
-        return self._drive.twist, self.status
-
-    def _go_on(
-        self,
-        measured: StateArray,
-        references: StateArray,
-        rows: Stamps,
-        first: int,
-        answers: StepResults,
-    ) -> tuple[int, int]:
-        """Do plain steps from a row on; return how many, and up to where references are kept."""
-        handed, switches = int(rows[first, 1]), self.parameters.switches
-        jumps = {jump.stamp_ns for jump in self._jumps}
-        seen = self._speeds, self._wanted, self._begin, self._end
-        acting = self._track, self._pursuit, self._drive, self._freshness, self._following
-        parts = ControllerParts(*acting, seen, self._looking)
-        if not (
-            self._moving
-            and self.status.reason is Reason.TRACKING
-            and self._last_stamp_ns is not None
-            and switches.crossing == 'ramp'
-            and self._told <= jumps
-            # What is to be seen beforehand waits for the sample after it.
-            and (self._told == jumps or not switches.preview)
-            and parts.are_plain
-        ):
-            return 0, handed
-        # One that is told of is forgotten when a command acts after it, another is told when seen.
-        due_ns = min((t + self._dead_ns * (t not in self._told) for t in jumps), default=NEVER)
-        when = self._last_stamp_ns, self._dead_ns, due_ns
-        steps = BatchStepper(parts, self.parameters.watchdog, measured, references, handed, *when)
-        k = until = first
-        while k == until < len(rows):
-            until = min(len(rows), k + self._copy_after - self._since_copy)
-            taken = steps.run(rows, k, until, answers.numbers)
-            k += taken
-            self._keep(taken)
-        done = answers.numbers[first:k]
-        steps.finish(done)
-        if len(done):
-            answers.follows(first, k)
-            self._last_stamp_ns = steps.last_ns
-            error, applied = done[-1, ERROR:][:2].copy(), done[-1, APPLIED:][:2].copy()
-            self.status = self._status(steps.last_ns, Reason.TRACKING, error, applied)
-        return len(done), steps.handed
-
-    def _keep(self, steps: int = 1) -> None:
-        """Copy what is learnt, now and then."""
-        self._since_copy += steps
-        if self._since_copy >= self._copy_after:
-            self._since_copy = 0
-            self._before.append(self.law.snapshot())
-
-    def silent(self, last_heard_ns: int | None, now_ns: int) -> bool:
-        """Whether the odometry has gone silent, so that a stop must be commanded.
-
-        Both times come from one clock of the caller's. When it has, the controller forgets its
-        motion, and takes the next odometry message as a new start.
-        """
-        if not self._freshness.silent(last_heard_ns, now_ns):
+        if not self._watchdog.odometry_timed_out(last_received_ns, now_ns):
             return False
         self._stop()
-        self.status = self._status(
+        self.status = self._make_status(
             self._last_stamp_ns or 0, Reason.NO_ODOMETRY, np.full(2, math.nan)
         )
         return True
 
-    def _how_to_look(self) -> tuple[float, float, bool, float, float]:
-        """Return what :func:`look` is told of the settings."""
+    def _command_unresponsive(self, stamp_ns: int) -> tuple[BodyTwist, Status]:
+        """Command the reference to a robot that does not follow commands; adaptation pauses.
+
+        A stop would be permanent, because a restarted board needs commands to start. The weights
+        return to a snapshot from before the fault. When the robot follows commands again, the
+        law starts as after a stop, with these weights.
+        """
+        if self.status.reason is not Reason.NOT_FOLLOWING:
+            self._tracker.reset()
+            if self._snapshots:
+                self.law.rollback(self._snapshots[0])
+                self._snapshots.clear()
+        self._actuation.send_speeds(self._reference)
+        self._response.add_command(*self._actuation.command.tolist())
+        error = self._speeds - self._reference
+        self.status = self._make_status(stamp_ns, Reason.NOT_FOLLOWING, error)
+        return self._actuation.twist, self.status
+
+    def _take_snapshot(self, steps: int = 1) -> None:
+        """Store a snapshot of the weights once per SNAPSHOT_PERIOD."""
+        self._steps_since_snapshot += steps
+        if self._steps_since_snapshot >= self._snapshot_steps:
+            self._steps_since_snapshot = 0
+            self._snapshots.append(self.law.snapshot())
+
+    def _sampling_arguments(self) -> tuple[float, float, bool, float, float]:
+        """Return the parameters of :func:`sample_reference`, in its order."""
         parameters, geometry = self.parameters, self.parameters.geometry
         return (
             self._period,
             parameters.watchdog.reference_timeout * NANOSECONDS,
-            parameters.switches.preview,
+            parameters.jump_transition.preview,
             geometry.wheel_radius,
             geometry.half_separation,
         )
 
-    def _announce(self, stamp_ns: int, acts_ns: int) -> None:
-        """Tell the plan of jumps: when they are seen, or before if that is wanted."""
-        newest = self._track.newest_ns or 0
-        preview, geometry = self.parameters.switches.preview, self.parameters.geometry
-        soon_ns = acts_ns + self._period_ns if preview else stamp_ns
+    def _announce_jumps(self, stamp_ns: int, effect_ns: int) -> None:
+        """Announce jumps to the transition: in advance with preview, else when they occur."""
+        newest = self._trajectory.newest_ns or 0
+        preview, geometry = self.parameters.jump_transition.preview, self.parameters.geometry
+        soon_ns = effect_ns + self._period_ns if preview else stamp_ns
         for jump in self._jumps:
-            # Beforehand, wait for the sample after it: then the slope after it is known too.
+            # With preview, the sample after the jump must be known, for the slope after it.
             known = jump.stamp_ns <= soon_ns or (preview and newest > jump.stamp_ns)
-            if known and jump.stamp_ns not in self._told:
-                self._told.add(jump.stamp_ns)
-                after = self._track.at(jump.stamp_ns)
+            if known and jump.stamp_ns not in self._announced:
+                self._announced.add(jump.stamp_ns)
+                after = self._trajectory.at(jump.stamp_ns)
                 slope = BodyTwist(0.0, 0.0) if after is None else after.rate
-                self._pursuit.plan.announce(
+                self._tracker.transition.announce(
                     jump.stamp_ns,
-                    _array(wheels_from_twist(jump.change, geometry)),
-                    _array(wheels_from_twist(slope, geometry)),
+                    _as_array(wheels_from_twist(jump.change, geometry)),
+                    _as_array(wheels_from_twist(slope, geometry)),
                 )
         self._jumps = [
             jump
             for jump in self._jumps
-            if jump.stamp_ns > acts_ns or jump.stamp_ns not in self._told
+            if jump.stamp_ns > effect_ns or jump.stamp_ns not in self._announced
         ]
-        self._told.intersection_update(jump.stamp_ns for jump in self._jumps)
+        self._announced.intersection_update(jump.stamp_ns for jump in self._jumps)
 
-    def _forget_reference(self) -> None:
-        self._track.clear()
+    def _clear_reference(self) -> None:
+        self._trajectory.clear()
         self._jumps.clear()
 
     def _stop(self) -> None:
-        if self._moving or np.any(self._drive.command):
-            self._pursuit.reset()
-            self._drive.reset(np.zeros(2))
+        if self._moving or np.any(self._actuation.command):
+            self._tracker.reset()
+            self._actuation.reset(np.zeros(2))
         self._moving = False
 
-    def _status(
+    def _make_status(
         self, stamp_ns: int, reason: Reason, error: Array, applied: Array | None = None
     ) -> Status:
         law = self.law
@@ -405,11 +357,162 @@ class Controller:
             error,
             law.terms.copy() if moves else np.zeros_like(law.terms),
             np.zeros(2) if applied is None else applied,
-            law.watched.copy(),
+            law.certificate_state.copy(),
             law.predictive.skill,
-            reason.moves and self._drive.limited,
+            reason.moves and self._actuation.limited,
         )
 
 
-def _array(wheels: WheelSpeeds) -> Array:
+class SwitchingTracker:
+    """Computes the accelerations that track a reference with jumps.
+
+    All times are the instant at which the result takes effect.
+
+    Parameters
+    ----------
+    parameters
+        Control law and treatment of jumps.
+    drive
+        ``'velocity'`` or ``'torque'``; with ``'velocity'`` the transition includes the servo lag.
+    """
+
+    def __init__(self, parameters: Nt3fsMpcParameters, drive: str) -> None:
+        self._parameters = parameters
+        self._period = 1.0 / parameters.rate
+        self.law = Nt3fsMpcController(parameters)
+        lag = parameters.speed_filter.lag if drive == 'velocity' else 0.0
+        self.transition = JumpTransition(parameters.jump_transition, lag, self._period)
+
+    def configure(self, parameters: Nt3fsMpcParameters) -> None:
+        """Use new values of the dynamic parameters from the next step on."""
+        self._parameters = parameters
+        self.law.configure(parameters)
+        self.transition.configure(parameters.jump_transition)
+
+    def reset(self) -> None:
+        """Discard jumps and state; the weights are kept."""
+        self.law.reset()
+        self.transition.reset()
+
+    def begin(self, now_ns: int, speeds: Array, reference: Array) -> None:
+        """Start at the present wheel speeds; their distance to the reference is a jump."""
+        self.reset()
+        self.transition.announce(now_ns, reference - speeds, np.zeros(2))
+
+    def step(
+        self, now_ns: int, speeds: Array, reference: Array, reference_next: Array, dt: float
+    ) -> Array:
+        """Return u (rad/s²), shape (2,).
+
+        Parameters
+        ----------
+        now_ns
+            The instant at which u takes effect, ns.
+        speeds
+            Predicted wheel speeds at that instant, rad/s, shape (2,).
+        reference, reference_next
+            Reference at that instant and one period later, including jumps, rad/s, shape (2,).
+        dt
+            Time since the last step, s.
+        """
+        transition = self.transition
+        if self._parameters.jump_transition.method == 'predictive':
+            return self._step_predictive(now_ns, speeds, reference, reference_next, dt)
+        transition.step(now_ns, reference, reference_next)
+        return self.law.step(speeds, transition.reachable, transition.rate, dt)
+
+    def _step_predictive(
+        self, now_ns: int, speeds: Array, reference: Array, reference_next: Array, dt: float
+    ) -> Array:
+        """Return u with the jumps as known disturbances in Psi_free (56)."""
+        predictive, transition = self.law.predictive, self.transition
+        until_ns = now_ns + round(self._period * 1e9)
+        predictive.notify_jump(-transition.pop_passed(now_ns))
+        change = None
+        if predictive.due:
+            horizon = predictive.parameters.horizon
+            change = transition.future_jumps(now_ns, predictive.span, horizon)
+        soon = -transition.future_jumps(now_ns, (until_ns - now_ns) / 1e9, 1)[0]
+        rate = (reference_next - soon - reference) / self._period
+        return self.law.step(speeds, reference, rate, dt, change)
+
+    def set_applied(self, acceleration: Array, *, saturated: bool) -> None:
+        """Set the applied acceleration, see :meth:`Nt3fsMpcController.set_applied`."""
+        self.law.set_applied(acceleration, saturated=saturated)
+
+
+wheel_speeds = kernel(kinematics.wheel_speeds)
+
+
+@kernel
+def sample_reference(
+    stamps: Stamps,
+    samples: Array,
+    first: int,
+    end: int,
+    jump: Array,
+    stamp_ns: int,
+    effect_ns: int,
+    period: float,
+    hold_ns: float,
+    preview: bool,
+    radius: float,
+    half: float,
+    linear: float,
+    angular: float,
+    speeds: Array,
+    reference: Array,
+    reference_begin: Array,
+    reference_end: Array,
+) -> tuple[bool, float, float]:
+    """Write measured and reference wheel speeds (rad/s); return whether the reference is known.
+
+    Also returned: the largest magnitudes of the measured speeds and of the tracking error.
+
+    stamps ... jump   : a trajectory, as in :func:`t3mpc_ros.geometry.trajectory.interpolate`
+    stamp_ns          : stamp of the odometry with twist ``linear``, ``angular``
+    effect_ns         : instant at which the next command takes effect
+    period            : control period, s
+    hold_ns           : how long the newest sample is held
+    preview           : whether to use future samples; else the slope extrapolates the reference
+    radius, half      : wheel radius and half of the wheel separation, m
+    speeds, reference : shape (2,), overwritten, at ``stamp_ns``
+    reference_begin, reference_end : shape (2,), overwritten, reference at ``effect_ns`` and one
+                        period later
+    """
+    speeds[0], speeds[1] = wheel_speeds(linear, angular, radius, half)
+    speed = max(abs(speeds[0]), abs(speeds[1]))
+    newest = stamps[end - 1] if end > first else 0
+    trajectory = (stamps, samples, first, end, jump)
+    known, v, w, v_rate, w_rate = interpolate(*trajectory, hold_newest(stamp_ns, newest, hold_ns))
+    if not known:
+        reference[:] = math.nan
+        return False, speed, 0.0
+    reference[0], reference[1] = wheel_speeds(v, w, radius, half)
+    error = max(abs(speeds[0] - reference[0]), abs(speeds[1] - reference[1]))
+    if preview:
+        until_ns = effect_ns + round(period * NANOSECONDS)
+        begin_ns = hold_newest(effect_ns, newest, hold_ns)
+        end_ns = hold_newest(until_ns, newest, hold_ns)
+        begin_known, v_begin, w_begin, _, _ = interpolate(*trajectory, begin_ns)
+        end_known, v_end, w_end, _, _ = interpolate(*trajectory, end_ns)
+        if begin_known and end_known:
+            reference_begin[0], reference_begin[1] = wheel_speeds(v_begin, w_begin, radius, half)
+            reference_end[0], reference_end[1] = wheel_speeds(v_end, w_end, radius, half)
+            return True, speed, error
+    slopes = wheel_speeds(v_rate, w_rate, radius, half)
+    ahead = (effect_ns - stamp_ns) / NANOSECONDS
+    for i in range(2):
+        reference_begin[i] = reference[i] + ahead * slopes[i]
+        reference_end[i] = reference[i] + (ahead + period) * slopes[i]
+    return True, speed, error
+
+
+@kernel
+def hold_newest(stamp_ns: int, newest_ns: int, hold_ns: float) -> int:
+    """Return the instant to interpolate at: the newest sample holds for ``hold_ns``."""
+    return newest_ns if 0 < stamp_ns - newest_ns <= hold_ns else stamp_ns
+
+
+def _as_array(wheels: WheelSpeeds) -> Array:
     return np.array((wheels.right, wheels.left))

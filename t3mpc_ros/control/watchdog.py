@@ -17,33 +17,33 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class WatchdogParameters(Parameters):
-    """How old the inputs may be."""
+    """Time-outs of the inputs and bounds of a plausible state."""
 
     reference_timeout: float = parameter(
         0.15,
-        'oldest reference that is still followed, in time of the odometry stamps',
+        'maximum age of the reference, measured with the odometry stamps',
         unit='s',
         low=0.01,
         high=5.0,
     )
     odometry_timeout: float = parameter(
         0.2,
-        'longest gap in the odometry before the robot is stopped',
+        'maximum gap in the odometry; the robot stops after a longer gap',
         unit='s',
         low=0.02,
         high=5.0,
     )
     speed_bound: float = parameter(
-        40.0, 'measured wheel speed beyond which the state is diverging', unit='rad/s', low=1.0,
+        40.0, 'measured wheel speed above which the state is diverging', unit='rad/s', low=1.0,
         high=1000.0,
     )  # fmt: skip
     error_bound: float = parameter(
-        25.0, 'tracking error beyond which the state is diverging', unit='rad/s', low=0.5,
+        25.0, 'tracking error above which the state is diverging', unit='rad/s', low=0.5,
         high=1000.0,
     )  # fmt: skip
     hold_time: float = parameter(
         0.5,
-        'how long the robot stays stopped after a diverging state',
+        'duration of the stop after a diverging state',
         unit='s',
         low=0.0,
         high=60.0,
@@ -51,22 +51,22 @@ class WatchdogParameters(Parameters):
 
     response_bound: float = parameter(
         1.5,
-        'how far a measured wheel speed may lie outside the commands of following_window before '
-        'the robot counts as not following; 0 = it always follows',
+        'distance of a measured wheel speed from the range of the commands in response_window '
+        'above which the robot does not follow commands; 0 disables the check',
         unit='rad/s',
         low=0.0,
         high=100.0,
     )
     response_window: float = parameter(
         0.15,
-        'how long a command may take to be seen in the odometry',
+        'maximum delay between a command and its effect in the odometry',
         unit='s',
         low=0.01,
         high=2.0,
     )
     response_timeout: float = parameter(
         0.1,
-        'for how long it must, or must no longer, lie outside',
+        'duration of a missing or restored response before the decision changes',
         unit='s',
         low=0.0,
         high=5.0,
@@ -74,7 +74,7 @@ class WatchdogParameters(Parameters):
 
 
 class Reason(enum.Enum):
-    """Why the robot is stopped, or that it is not."""
+    """Decision of the watchdog: the robot follows the reference, or the reason why it does not."""
 
     TRACKING = 'tracking'
     DISABLED = 'disabled by request'
@@ -84,18 +84,18 @@ class Reason(enum.Enum):
     NO_REFERENCE = 'no reference yet'
     REFERENCE_STALE = 'reference is stale'
     DIVERGING = 'state is diverging'
-    NOT_FOLLOWING = 'the robot does not do what it is told'
+    NOT_FOLLOWING = 'the robot does not follow commands'
 
     def __init__(self, text: str) -> None:
-        self.moves = text in ('tracking', 'the robot does not do what it is told')
-        """Whether the robot may move."""
+        self.moves = text in ('tracking', 'the robot does not follow commands')
+        """Whether a non-zero command may be sent."""
 
 
 class InputWatchdog:
-    """Decides step by step whether what the controller knows is good enough to move on.
+    """Decides at each step whether odometry and reference are recent and plausible.
 
-    Only stamps count, never a clock: the decision is a function of the messages, in the order in
-    which they came. The one exception is silence, which no message can tell: see :meth:`silent`.
+    The decision uses message stamps only and reads no clock; it is a function of the messages in
+    their order of arrival. Missing odometry is the exception, see :meth:`odometry_timed_out`.
     """
 
     def __init__(self, parameters: WatchdogParameters) -> None:
@@ -104,21 +104,21 @@ class InputWatchdog:
         self.reset()
 
     def reset(self) -> None:
-        """Forget every stamp; the robot has to earn its motion anew."""
+        """Clear all stamps; the robot may move after the next valid odometry and reference."""
         self._odometry_ns: int | None = None
-        self._reference_seen_ns: int | None = None
-        self._reference_waiting = False
-        self._held_until_ns: int | None = None
+        self._reference_ns: int | None = None
+        self._reference_pending = False
+        self._hold_until_ns: int | None = None
 
-    def reference_arrived(self) -> None:
-        """Note that a usable reference came; it counts from the next odometry stamp on."""
-        self._reference_waiting = True
+    def reference_received(self) -> None:
+        """Register a valid reference; its age counts from the next odometry stamp."""
+        self._reference_pending = True
 
     def elapsed(self, stamp_ns: int) -> float | None:
-        """Return seconds since the last odometry; None when there is nothing to go on from.
+        """Return the time since the previous odometry, s; None if integration must restart.
 
-        A first message, a stamp that goes backwards and a gap longer than the time-out all give
-        None: whatever was integrated before must not be used further.
+        The result is None for the first message, for a stamp that decreases, and for a gap longer
+        than the time-out.
         """
         last, self._odometry_ns = self._odometry_ns, stamp_ns
         if last is None:
@@ -126,80 +126,80 @@ class InputWatchdog:
         elapsed = (stamp_ns - last) / NANOSECONDS
         if elapsed < 0.0 or elapsed > self._parameters.odometry_timeout:
             if elapsed < 0.0:
-                self._reference_seen_ns = None
-                self._held_until_ns = None
+                self._reference_ns = None
+                self._hold_until_ns = None
             return None
         return elapsed
 
     def decide(
         self, stamp_ns: int, *, finite: bool, known: bool, speed: float, error: float
     ) -> Reason:
-        """Return whether the robot may move at this odometry stamp, or why not.
+        """Return TRACKING if the robot may move at this odometry stamp, else the reason to stop.
 
         Parameters
         ----------
         stamp_ns
             Stamp of the odometry.
         finite
-            Whether every number of it is finite.
+            Whether every number of the odometry is finite.
         known
-            Whether the reference is known for this stamp.
+            Whether the reference is known at this stamp.
         speed, error
-            Largest magnitude of measured wheel speed and tracking error, rad/s.
+            Largest magnitudes of measured wheel speed and of tracking error, rad/s.
         """
-        if self._reference_waiting:
-            self._reference_waiting = False
-            self._reference_seen_ns = stamp_ns
+        if self._reference_pending:
+            self._reference_pending = False
+            self._reference_ns = stamp_ns
         if not self.enabled:
             return Reason.DISABLED
         if not finite:
             return Reason.ODOMETRY_BAD
-        if self._reference_seen_ns is None:
+        if self._reference_ns is None:
             return Reason.NO_REFERENCE
-        age = (stamp_ns - self._reference_seen_ns) / NANOSECONDS
+        age = (stamp_ns - self._reference_ns) / NANOSECONDS
         if age > self._parameters.reference_timeout:
             return Reason.REFERENCE_STALE
         if not known:
             return Reason.NO_REFERENCE
         if speed > self._parameters.speed_bound or error > self._parameters.error_bound:
-            self._held_until_ns = stamp_ns + round(self._parameters.hold_time * NANOSECONDS)
-        if self._held_until_ns is not None and stamp_ns <= self._held_until_ns:
+            self._hold_until_ns = stamp_ns + round(self._parameters.hold_time * NANOSECONDS)
+        if self._hold_until_ns is not None and stamp_ns <= self._hold_until_ns:
             return Reason.DIVERGING
-        self._held_until_ns = None
+        self._hold_until_ns = None
         return Reason.TRACKING
 
     @property
-    def held(self) -> bool:
+    def holding(self) -> bool:
         """Whether the robot is stopped by request or after a diverging state."""
-        return not self.enabled or self._held_until_ns is not None
+        return not self.enabled or self._hold_until_ns is not None
 
     @property
-    def reference_seen(self) -> tuple[int | None, bool]:
-        """At which odometry stamp the last reference counted (ns), and whether one waits."""
-        return self._reference_seen_ns, self._reference_waiting
+    def last_reference(self) -> tuple[int | None, bool]:
+        """Odometry stamp of the last reference (ns), and whether a newer reference is pending."""
+        return self._reference_ns, self._reference_pending
 
-    def went_on(self, stamp_ns: int, seen_ns: int, *, waiting: bool) -> None:
-        """Take note of odometry at which all was well, and of :attr:`reference_seen`."""
-        self._odometry_ns = stamp_ns
-        self._reference_seen_ns, self._reference_waiting = seen_ns, waiting
+    def synchronize(self, odometry_ns: int, reference_ns: int, *, pending: bool) -> None:
+        """Set the last odometry stamp and :attr:`last_reference` after a batch of steps."""
+        self._odometry_ns = odometry_ns
+        self._reference_ns, self._reference_pending = reference_ns, pending
 
-    def silent(self, last_heard_ns: int | None, now_ns: int) -> bool:
-        """Whether the odometry has gone silent, both times from one and the same clock."""
-        if last_heard_ns is None:
+    def odometry_timed_out(self, last_received_ns: int | None, now_ns: int) -> bool:
+        """Whether the odometry is older than the time-out; both times are from one clock."""
+        if last_received_ns is None:
             return True
-        return now_ns - last_heard_ns > self._parameters.odometry_timeout * NANOSECONDS
+        return now_ns - last_received_ns > self._parameters.odometry_timeout * NANOSECONDS
 
 
 EVIDENCE_WEIGHT = 20
-"""So much more a sample counts, for trust in the robot, that one that stands could not give."""
+"""Weight of a sample that a standing robot cannot produce; other samples have weight 1."""
 
 
 class ResponseMonitor:
-    """Decides whether the robot does what it is told: else its errors say nothing of the law.
+    """Decides whether the wheels respond to the commands.
 
-    A robot that hears nothing, restarts, or whose wheel is held, is no plant to learn from. Its
-    wheel speeds lie outside everything that was commanded lately, however late a command acts.
-    Commands near zero prove nothing: a robot that stands obeys them too.
+    A robot without radio contact, in a restart or with a blocked wheel must not be used for
+    adaptation. Its wheel speeds lie outside the range of the recent commands, whatever the delay
+    of the robot. Commands near zero carry little evidence: a standing robot fits them too.
     """
 
     def __init__(self, parameters: WatchdogParameters, period: float) -> None:
@@ -207,62 +207,62 @@ class ResponseMonitor:
         self._commands: deque[tuple[float, float]] = deque(
             maxlen=max(1, round(parameters.response_window / period))
         )
-        self._patience = max(1, round(parameters.response_timeout / period))
-        self._against = 0
-        self.holds = True
-        """Whether the robot follows."""
+        self._timeout_steps = max(1, round(parameters.response_timeout / period))
+        self._evidence = 0
+        self.responsive = True
+        """Whether the robot follows commands."""
 
     def reset(self) -> None:
-        """Trust the robot again, and forget what it was told."""
+        """Clear the commands and assume a responsive robot."""
         self._commands.clear()
-        self._against = 0
-        self.holds = True
+        self._evidence = 0
+        self.responsive = True
 
     @property
-    def newest(self) -> tuple[float, float] | None:
-        """What was commanded last, rad/s; None when that is forgotten."""
+    def last_command(self) -> tuple[float, float] | None:
+        """The last command, rad/s; None after a reset."""
         return self._commands[-1] if self._commands else None
 
     @property
     def window(self) -> int:
-        """How many commands are remembered at most."""
+        """Maximum number of stored commands."""
         return self._commands.maxlen or 0
 
     @property
     def counts(self) -> tuple[int, int]:
-        """How many commands are remembered, and how much speaks against what holds."""
-        return len(self._commands), self._against
+        """Number of stored commands, and evidence against the present decision."""
+        return len(self._commands), self._evidence
 
-    def went_on(self, commands: Array, against: int) -> None:
-        """Take note of commands (rad/s, shape (n, 2)) that the robot was seen to follow."""
+    def synchronize(self, commands: Array, evidence: int) -> None:
+        """Set the state after a batch of steps with these commands, rad/s, shape (n, 2)."""
         self._commands.extend(map(tuple, commands[-self.window :].tolist()))
-        self._against = against
+        self._evidence = evidence
 
-    def told(self, right: float, left: float) -> None:
-        """Note what is commanded now, rad/s."""
+    def add_command(self, right: float, left: float) -> None:
+        """Store the wheel speeds commanded at this step, rad/s."""
         self._commands.append((right, left))
 
-    def heard(self, right: float, left: float) -> bool:
-        """Decide whether the robot follows, from its measured wheel speeds (rad/s)."""
+    def update(self, right: float, left: float) -> bool:
+        """Return whether the robot follows commands, given measured wheel speeds, rad/s."""
         bound, commands = self._parameters.response_bound, self._commands
         if bound == 0.0 or len(commands) < (commands.maxlen or 0):
-            return self.holds
+            return self.responsive
         newest = commands[-1]
-        if self.holds and max(abs(right - newest[0]), abs(left - newest[1])) <= bound:
-            # So close to one of the commands it cannot lie further outside all of them.
-            self._against = 0
+        if self.responsive and max(abs(right - newest[0]), abs(left - newest[1])) <= bound:
+            # A speed within the bound of one command is within the bound of their range.
+            self._evidence = 0
             return True
-        outside = asleep = 0.0
+        outside = standstill_outside = 0.0
         for measured, given in zip((right, left), zip(*commands, strict=True), strict=True):
             lowest, highest = min(given), max(given)
             outside = max(outside, measured - highest, lowest - measured)
-            asleep = max(asleep, -highest, lowest)
-        if (outside > bound) != self.holds:
-            self._against = 0
-        elif self.holds or asleep > bound:
-            self._against += EVIDENCE_WEIGHT
+            standstill_outside = max(standstill_outside, -highest, lowest)
+        if (outside > bound) != self.responsive:
+            self._evidence = 0
+        elif self.responsive or standstill_outside > bound:
+            self._evidence += EVIDENCE_WEIGHT
         else:
-            self._against += 1  # one that hears nothing would do the same
-        if self._against >= EVIDENCE_WEIGHT * self._patience:
-            self.holds, self._against = not self.holds, 0
-        return self.holds
+            self._evidence += 1  # a standing robot fits these commands as well
+        if self._evidence >= EVIDENCE_WEIGHT * self._timeout_steps:
+            self.responsive, self._evidence = not self.responsive, 0
+        return self.responsive

@@ -361,7 +361,7 @@ def run(
     terms: object = getattr(controller, 'terms', None)
     has_terms = isinstance(terms, np.ndarray) and terms.shape == record.terms.shape[1:]
     observation = Observation(
-        seam.ahead, seam.unexplained, now[0], following[0], seam.command, None
+        seam.predicted, seam.disturbance, now[0], following[0], seam.command, None
     )
 
     last: Array = np.zeros(2)
@@ -372,9 +372,9 @@ def run(
         record.measured[k] = plant.measured
         record.speeds[k] = plant.speeds
         record.estimated[k] = seam.speeds
-        record.unexplained[k] = seam.unexplained
-        observation.speeds = seam.ahead
-        observation.unexplained = seam.unexplained
+        record.unexplained[k] = seam.disturbance
+        observation.speeds = seam.predicted
+        observation.unexplained = seam.disturbance
         observation.wanted = now[k]
         observation.wanted_next = following[k]
         observation.command = seam.command
@@ -394,7 +394,7 @@ def run(
             torque = np.clip(inertia @ asked, -torque_limit, torque_limit)
             asked = np.asarray(np.linalg.solve(inertia, torque), dtype=np.float64)
         command = record.command[k]
-        command[:] = seam.send(asked)
+        command[:] = seam.send_acceleration(asked)
         limited = seam.limited or cut
         record.limited[k] = limited
         controller.applied(command, limited=limited)
@@ -469,7 +469,7 @@ def warm_up() -> None:
         scenario = Scenario(drive, 0.0, 'nominal', 1)
         seam = drive_for(scenario)
         seam.observe(np.zeros(2), 1.0 / RATE)
-        seam.send(np.zeros(2))
+        seam.send_acceleration(np.zeros(2))
         seam.observe(np.zeros(2), 1.0 / RATE)
         FastPlant(scenario.robot(), 1).step(0.0, 0.0)
 

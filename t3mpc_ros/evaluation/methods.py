@@ -53,15 +53,15 @@ STAGES: Mapping[str, Mapping[str, object]] = {
         'use_fuzzy': False,
         'law.compensator': False,
         'predictive.enabled': False,
-        'switches.preview': False,
+        'jump_transition.preview': False,
     },
     '+NT3FS': {
         'law.compensator': False,
         'predictive.enabled': False,
-        'switches.preview': False,
+        'jump_transition.preview': False,
     },
-    '+compensator': {'predictive.enabled': False, 'switches.preview': False},
-    '+MPC': {'switches.preview': False},
+    '+compensator': {'predictive.enabled': False, 'jump_transition.preview': False},
+    '+MPC': {'jump_transition.preview': False},
     FULL: {},
 }
 """The controller as it grows, as changes of the full one; the last step adds preview."""
@@ -74,7 +74,7 @@ WITHOUT: Mapping[str, Mapping[str, object]] = {
         'predictive.enabled': False,
         'law.error_bound': ComposedParameters().compensated_bound,
     },
-    'full without preview': {'switches.preview': False},
+    'full without preview': {'jump_transition.preview': False},
     'full with random predictor': {'random_predictor': True, 'predictive.learning': False},
 }
 """The full controller with one part left out. Without v_p the bound (80) of the compensator is
@@ -217,7 +217,7 @@ def proposed_parameters() -> dict[str, Parameters]:
     Torques are not limited as a stepper's acceleration is: switches are crossed faster.
     """
     velocity = ComposedParameters()
-    torque = velocity.with_values({'law.gain': 12.0, 'switches.acceleration': 200.0})
+    torque = velocity.with_values({'law.gain': 12.0, 'jump_transition.acceleration': 200.0})
     return {'torque': torque, 'velocity': velocity}
 
 
@@ -258,6 +258,6 @@ def _proposed_methods(full: Parameters) -> dict[str, ComparedMethod]:
     found = {}
     for name, changes in {**STAGES, **WITHOUT}.items():
         parameters = full.with_values(changes)
-        previews = parameters.to_dict()['switches.preview'] is True
+        previews = parameters.to_dict()['jump_transition.preview'] is True
         found[name] = ComparedMethod(name, ProposedController, parameters, True, False, previews)
     return found

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.control.control_law import Nt3fsMpcParameters
-from t3mpc_ros.control.switching_tracker import SwitchingTracker
+from t3mpc_ros.control.controller import SwitchingTracker
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
     BaselineController,
     NominalModel,
@@ -53,31 +53,31 @@ class ProposedController(BaselineController):
             raise ValueError(
                 f'settings must be ComposedParameters: got {type(parameters).__name__}'
             )
-        self.preview: bool = parameters.switches.preview  # type: ignore[misc]
+        self.preview: bool = parameters.jump_transition.preview  # type: ignore[misc]
         self._period = nominal_model.period
         self._period_ns = round(nominal_model.period * NANOSECONDS)
-        self._pursuit = deepcopy(_untouched(parameters, nominal_model.drive))
+        self._tracker = deepcopy(_untouched(parameters, nominal_model.drive))
         self._random = parameters.predictive.seed if parameters.random_predictor else None
         if self._random is not None:
             self._forget(self._random)
         self._steps = 0
         self._expected: Array = np.zeros(2)
         self._slope: Array = np.zeros(2)
-        self.terms = self._pursuit.law.terms
+        self.terms = self._tracker.law.terms
         """The law's terms of the last step, rows as in ``law.TERMS``, rad/s², shape (5, 2)."""
 
     @property
     def skill(self) -> Array:
         """Skill of the predictor in the middle of its horizon, shape (2,)."""
-        return self._pursuit.law.predictive.skill
+        return self._tracker.law.predictive.skill
 
     def learnt(self) -> dict[str, Array]:
         """Return fuzzy coefficients and predictor weights, as a model file keeps them."""
-        return self._pursuit.law.learnt()
+        return self._tracker.law.get_weights()
 
     def restore(self, learnt: Mapping[str, Array]) -> None:
         """Begin with another run's; random output weights stay random."""
-        self._pursuit.law.restore(learnt)
+        self._tracker.law.set_weights(learnt)
         if self._random is not None:
             self._forget(self._random)
 
@@ -85,7 +85,7 @@ class ProposedController(BaselineController):
         """Return u (rad/s²) of (66)-(67) on the reference with its switches crossed."""
         now_ns = self._steps * self._period_ns
         if self._steps == 0:
-            self._pursuit.begin(now_ns, observation.speeds, observation.wanted)
+            self._tracker.begin(now_ns, observation.speeds, observation.wanted)
             if observation.future is not None:
                 for j in range(1, len(observation.future) - 1):
                     self._look(now_ns + j * self._period_ns, observation.future, j)
@@ -97,13 +97,13 @@ class ProposedController(BaselineController):
         self._expected = observation.wanted_next.copy()
         self._slope = (observation.wanted_next - observation.wanted) / self._period
         self._steps += 1
-        return self._pursuit.step(
+        return self._tracker.step(
             now_ns, observation.speeds, observation.wanted, observation.wanted_next, self._period
         )
 
     def applied(self, acceleration: Array, *, limited: bool) -> None:
         """Take note of the u that the drive's limits let through."""
-        self._pursuit.applied(acceleration, limited=limited)
+        self._tracker.set_applied(acceleration, saturated=limited)
 
     def _look(self, instant_ns: int, future: Array, j: int) -> None:
         """Announce a jump at row j of the future, seen by the rows around it."""
@@ -118,18 +118,18 @@ class ProposedController(BaselineController):
         if np.max(np.abs(before)) <= JUMP:
             jump = future[j] - future[j - 1] - before
             after = (future[j + 1] - future[j]) / self._period
-            self._pursuit.plan.announce(instant_ns, jump, after)
+            self._tracker.transition.announce(instant_ns, jump, after)
 
     def _notice(self, now_ns: int, observation: Observation) -> None:
         """Announce a jump that has just happened."""
         jump = observation.wanted - self._expected
         if np.max(np.abs(jump)) > JUMP:
             slope = (observation.wanted_next - observation.wanted) / self._period
-            self._pursuit.plan.announce(now_ns, jump, slope)
+            self._tracker.transition.announce(now_ns, jump, slope)
 
     def _forget(self, seed: int) -> None:
         """Give the predictor random output weights of the size of the taught ones."""
-        predictive = self._pursuit.law.predictive
+        predictive = self._tracker.law.predictive
         weights = predictive.get_weights()
         generator = np.random.default_rng((seed, 7))
         for name in ('output_weights', 'anchor'):

@@ -48,7 +48,9 @@ def straight_course(duration: float, speed: float = 0.2, turn: float = 0.0) -> A
 
 def loop_controller() -> ControllerParameters:
     """Return the controller as it is used on the stepper twin."""
-    return ControllerParameters.from_dict({'estimate.lag': 0.003, 'estimate.noise_variance': 0.04})
+    return ControllerParameters.from_dict(
+        {'speed_filter.lag': 0.003, 'speed_filter.noise_variance': 0.04}
+    )
 
 
 def loop_robot(world: str = '', seed: int = 1) -> DigitalTwinParameters:

@@ -18,9 +18,8 @@ from std_srvs.srv import SetBool, Trigger
 
 from t3mpc_ros.bag.run.journal import Journal, parameters_to_json
 from t3mpc_ros.bag.run.model_file import ModelError, load_model, save_model
-from t3mpc_ros.control.batch_replay import Status
 from t3mpc_ros.control.control_law import TERM_NAMES
-from t3mpc_ros.control.controller import Controller, ControllerParameters
+from t3mpc_ros.control.controller import Controller, ControllerParameters, Status
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.types import STANDSTILL, BodyTwist
@@ -34,7 +33,7 @@ class ControllerNodeParameters(ControllerParameters):
     """The controller as a node."""
 
     # A stepper's rotor follows its field at once; the lag of 0.02 s is that of the servo.
-    estimate: SpeedFilterParameters = group(SpeedFilterParameters, lag=0.003)
+    speed_filter: SpeedFilterParameters = group(SpeedFilterParameters, lag=0.003)
     stamped: bool = parameter(False, 'publish cmd_vel as TwistStamped instead of Twist')
     frame_id: str = parameter('base_link', 'frame of a stamped command')
     terms_rate: float = parameter(
@@ -85,7 +84,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         if not path:
             return
         try:
-            self._controller.law.restore(load_model(Path(path)))
+            self._controller.law.set_weights(load_model(Path(path)))
         except ValueError as error:
             raise ModelError(f'{path} does not fit these settings: {error}') from error
         self._note(self._journal.model(zlib.crc32(Path(path).read_bytes())))
@@ -126,7 +125,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
     def _on_watch(self) -> None:
         if self._heard_ns is None:
             return
-        if self._controller.silent(self._heard_ns, self.steady_ns()):
+        if self._controller.check_odometry(self._heard_ns, self.steady_ns()):
             self._publish(STANDSTILL, self.now_ns())
             self._note(self._journal.silent(self._controller.status.stamp_ns))
             self._tell(self._controller.status)
@@ -195,7 +194,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
     ) -> Trigger.Response:
         path = Path(self.parameters.model_output)
         try:
-            save_model(path, self._controller.law.learnt(), self.parameters.to_dict())
+            save_model(path, self._controller.law.get_weights(), self.parameters.to_dict())
         except ModelError as error:
             response.success = False
             response.message = str(error)
@@ -213,7 +212,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             'limited': status.limited,
             'certificate_margin': status.certificate.margin,
             'certificate_holds': status.certificate.holds,
-            'ultimate_bound_rad_s': self._controller.law.ball,
+            'ultimate_bound_rad_s': self._controller.law.ultimate_bound,
             'skill_right': float(status.skill[0]),
             'skill_left': float(status.skill[1]),
             'references_refused': self._refused,

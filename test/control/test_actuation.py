@@ -45,7 +45,7 @@ def _drive(limits=WIDE, kind='velocity', **estimate):
 
 
 @pytest.mark.parametrize('dead_time', [0.0, 0.004, 0.01, 0.017, 0.03])
-def test_e19_the_wheels_accelerate_as_asked_once_the_dead_time_is_over(dead_time):
+def test_e19_wheels_accelerate_by_u_after_the_dead_time(dead_time):
     """Chi at the instant of acting is foreseen, and one period later it is T u further on."""
     drive, servo = _drive(dead_time=dead_time), Servo(dead_time=dead_time)
     rng = np.random.default_rng(1)
@@ -53,10 +53,10 @@ def test_e19_the_wheels_accelerate_as_asked_once_the_dead_time_is_over(dead_time
     expected = []
     for _ in range(60):
         drive.observe(servo.speeds, T)
-        expected.append(drive.ahead.copy())
+        expected.append(drive.predicted.copy())
         u = rng.uniform(-20.0, 20.0, 2)
-        np.testing.assert_allclose(drive.send(u), u, atol=1e-9)
-        expected.append(drive.ahead + T * u)
+        np.testing.assert_allclose(drive.send_acceleration(u), u, atol=1e-9)
+        expected.append(drive.predicted + T * u)
         for _ in range(10):  # what the servo does, millisecond by millisecond
             fine.append(servo.speeds.copy())
             servo.told = [*servo.told[1:], drive.command.copy()]
@@ -68,7 +68,7 @@ def test_e19_the_wheels_accelerate_as_asked_once_the_dead_time_is_over(dead_time
         np.testing.assert_allclose(fine[10 * (k + 1) + late], expected[2 * k + 1], atol=1e-6)
 
 
-def test_with_the_servos_own_gain_the_measurement_does_not_reach_the_command():
+def test_with_the_servo_gain_the_measurement_cancels():
     """K = (1 - exp(-T/lag))/T: c = r + (r_next - r)/(1 - exp(-T/lag)), whatever is measured."""
     share = 1.0 - math.exp(-T / 0.02)
     rng = np.random.default_rng(2)
@@ -78,13 +78,13 @@ def test_with_the_servos_own_gain_the_measurement_does_not_reach_the_command():
         drive = _drive(noise_variance=0.04)
         for _ in range(20):
             drive.observe(wanted + rng.normal(scale=0.5, size=2), T)
-            drive.send(rate - share / T * (drive.ahead - wanted))
+            drive.send_acceleration(rate - share / T * (drive.predicted - wanted))
         commands.append(drive.command.copy())
     np.testing.assert_allclose(commands[0], commands[1], atol=1e-9)
     np.testing.assert_allclose(commands[0], wanted + T * rate / share, atol=1e-9)
 
 
-def test_a_constant_push_is_found_and_told_as_the_servo_feels_it():
+def test_a_constant_disturbance_is_estimated_after_the_servo():
     """chi_(k+1) = chi_k + T (u_k + d_k), d_k less than the push, because the servo resists it.
 
     Told as it is, a law that cancels d cancelled a quarter too much.
@@ -94,27 +94,27 @@ def test_a_constant_push_is_found_and_told_as_the_servo_feels_it():
     for _ in range(200):
         drive.observe(servo.speeds, T)
         if before is not None:
-            expected = before[0] + T * (before[1] + drive.unexplained)
-        before = drive.ahead.copy(), drive.send(np.array([2.0, -1.0])).copy()
+            expected = before[0] + T * (before[1] + drive.disturbance)
+        before = drive.predicted.copy(), drive.send_acceleration(np.array([2.0, -1.0])).copy()
         servo.run(drive.command)
     felt = 0.02 / T * (1.0 - math.exp(-T / 0.02))
-    np.testing.assert_allclose(drive.unexplained, felt * np.array([4.0, -3.0]), rtol=1e-3)
+    np.testing.assert_allclose(drive.disturbance, felt * np.array([4.0, -3.0]), rtol=1e-3)
     np.testing.assert_allclose(before[0], expected, rtol=1e-6)
 
 
-def test_torque_is_passed_on_without_limits_and_without_dead_time():
+def test_a_torque_drive_has_no_limits_and_no_dead_time():
     drive = _drive(LimitParameters(), 'torque')
     speeds = np.array([1.0, 2.0])
     drive.reset(speeds)
     drive.observe(speeds, T)
     u = np.array([500.0, -700.0])
-    np.testing.assert_array_equal(drive.send(u), u)
+    np.testing.assert_array_equal(drive.send_acceleration(u), u)
     assert not drive.limited
     assert drive.dead_time == 0.0
-    np.testing.assert_array_equal(drive.ahead, drive.speeds)
+    np.testing.assert_array_equal(drive.predicted, drive.speeds)
 
 
-def test_nothing_winds_up_behind_a_limit():
+def test_the_command_does_not_wind_up_behind_a_limit():
     """Full throttle for ten seconds, then full brake: the command must turn round at once.
 
     An integral that had gone on growing behind the limit would need as long to come back.
@@ -123,19 +123,19 @@ def test_nothing_winds_up_behind_a_limit():
     drive, servo = _drive(limits), Servo()
     for _ in range(1000):
         drive.observe(servo.speeds, T)
-        drive.send(np.full(2, 30.0))
+        drive.send_acceleration(np.full(2, 30.0))
         servo.run(drive.command)
     assert drive.twist.linear == pytest.approx(limits.linear)
     assert drive.limited
     top = drive.twist.linear
     for _ in range(3):
         drive.observe(servo.speeds, T)
-        drive.send(np.full(2, -30.0))
+        drive.send_acceleration(np.full(2, -30.0))
         servo.run(drive.command)
     assert drive.twist.linear < top - 2 * limits.linear_acceleration * T
 
 
-def test_what_is_applied_is_what_the_limited_command_means():
+def test_the_applied_acceleration_is_that_of_the_limited_command():
     rng = np.random.default_rng(5)
     drive, servo = _drive(LimitParameters()), Servo()
     stretch = T / (1.0 - math.exp(-T / 0.02))
@@ -144,8 +144,8 @@ def test_what_is_applied_is_what_the_limited_command_means():
         before = drive.command.copy()
         drive.observe(servo.speeds, T)
         u = rng.normal(scale=60.0, size=2)
-        applied = drive.send(u)
-        np.testing.assert_allclose(drive.command, drive.ahead + stretch * applied, atol=1e-9)
+        applied = drive.send_acceleration(u)
+        np.testing.assert_allclose(drive.command, drive.predicted + stretch * applied, atol=1e-9)
         assert np.max(np.abs(drive.command - before)) <= 30.0 * T * (1 + 1e-9)
         if not drive.limited:
             np.testing.assert_allclose(applied, u, atol=1e-6)
@@ -154,7 +154,7 @@ def test_what_is_applied_is_what_the_limited_command_means():
     assert 100 < limited <= 500
 
 
-def test_an_unknown_drive_or_period_is_refused():
+def test_an_unknown_drive_or_period_is_rejected():
     with pytest.raises(ValueError, match='drive must be'):
         _drive(kind='warp')
     with pytest.raises(ValueError, match='period must be positive: got 0'):

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from t3mpc_ros.control.batch_replay import StepResults
+from t3mpc_ros.control.batch_replay import StepResults, replay_batch
 from t3mpc_ros.control.controller import SNAPSHOT_PERIOD, Controller, ControllerParameters
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
@@ -48,12 +48,12 @@ def bits(thing):
     return thing
 
 
-def one_by_one(self, measured, references, rows, answers):
-    """Do what ``Controller.march`` says it does, by its own words."""
-    for k, (heard, begin, end) in enumerate(rows.tolist()):
+def step_by_step(controller, odometry, references, rows, results):
+    """Return 0, after the single steps that ``replay_batch`` must reproduce."""
+    for k, (received, begin, end) in enumerate(rows.tolist()):
         for j in range(begin, end):
-            self.add_reference(references[j])
-        answers.note(k, *self.step(measured[heard]))
+            controller.add_reference(references[j])
+        results.set_row(k, *controller.step(odometry[received]))
     return 0
 
 
@@ -63,7 +63,7 @@ def same_answers(one, other):
     return numbers[0] == numbers[1] and one.reasons.tolist() == other.reasons.tolist()
 
 
-def test_motions_are_those_that_they_were_made_of():
+def test_a_state_array_holds_the_states_it_was_made_of():
     items = [
         State(5, Pose(1.0, -2.0, 0.5), BodyTwist(0.1, -0.2)),
         State(-7, Pose(math.nan, 0.0, 0.0), BodyTwist(0.0, 0.0)),
@@ -82,12 +82,12 @@ def test_motions_are_those_that_they_were_made_of():
 
 
 @pytest.mark.parametrize('path', GOLDEN, ids=lambda path: path.stem)
-def test_recorded_runs_come_out_the_same_to_the_last_bit(path, monkeypatch):
+def test_recorded_runs_are_replayed_to_the_last_bit(path, monkeypatch):
     """Stops, restarts, silence, live settings, jumps and a robot that does not follow."""
     inputs = load_inputs(path)
     marched, stepped = make_controllers(inputs), make_controllers(inputs)
     fast = replay_controller(inputs, controllers=marched)
-    monkeypatch.setattr(Controller, 'march', one_by_one)
+    monkeypatch.setattr(controller_replay, 'replay_batch', step_by_step)
     slow = replay_controller(inputs, controllers=stepped)
     assert slow.plain == 0
     assert fast.plain > 0.7 * fast.steps
@@ -157,11 +157,11 @@ class Run:
 
     def check(self, cuts=(), deeds=None):
         """Compare march on with march off; return the answers and how many were plain."""
-        marched, fast, plain = self.outcome(Controller.march, cuts, deeds)
-        stepped, slow, _ = self.outcome(one_by_one, cuts, deeds)
+        marched, fast, plain = self.outcome(replay_batch, cuts, deeds)
+        stepped, slow, _ = self.outcome(step_by_step, cuts, deeds)
         assert same_answers(fast, slow)
         assert bits(marched) == bits(stepped)
-        assert bits(marched.law.learnt()) == bits(stepped.law.learnt())
+        assert bits(marched.law.get_weights()) == bits(stepped.law.get_weights())
         return fast, plain
 
 
@@ -185,7 +185,7 @@ def switching(time):
 
 
 @pytest.mark.parametrize('seed', [1, 2])
-def test_a_winding_run_with_jitter_and_a_deaf_robot(seed):
+def test_a_run_with_jitter_and_an_unresponsive_robot(seed):
     run = Run(seed, 1200, winding)
     answers, plain = run.check()
     assert plain > 900
@@ -201,22 +201,22 @@ def test_a_winding_run_with_jitter_and_a_deaf_robot(seed):
     'changes',
     [
         {},
-        {'switches.preview': False},
-        {'switches.crossing': 'program'},
+        {'jump_transition.preview': False},
+        {'jump_transition.method': 'predictive'},
         {'predictive.dither': 0.2},
         {'predictive.enabled': False},
-        {'estimate.enabled': False},
-        {'estimate.dead_time': 0.025},
+        {'speed_filter.enabled': False},
+        {'speed_filter.dead_time': 0.025},
         {'use_fuzzy': False, 'predictive.algorithm': 'gradient'},
         {'watchdog.response_bound': 0.0},
         {'wheel.max_acceleration': 3.0},
     ],
     ids=str,
 )
-def test_switches_with_other_settings(changes):
+def test_jumps_with_other_parameters(changes):
     run = Run(3, 500, switching, **changes)
     answers, plain = run.check()
-    never = 'predictive.dither' in changes or changes.get('switches.crossing') == 'program'
+    never = 'predictive.dither' in changes or changes.get('jump_transition.method') == 'predictive'
     assert plain == 0 if never else plain > 250
     assert answers.reasons.tolist().count(Reason.TRACKING) > 300
 
@@ -250,7 +250,7 @@ def troubled(k, odometry, coming):
 
 
 @pytest.mark.parametrize('wanted', [winding, switching])
-def test_messages_spoilt_in_every_way(wanted):
+def test_invalid_messages_of_every_kind(wanted):
     answers, plain = Run(5, 700, wanted, troubled).check()
     assert plain > 300
     assert {
@@ -262,16 +262,16 @@ def test_messages_spoilt_in_every_way(wanted):
     } <= set(answers.reasons.tolist())
 
 
-def test_live_changes_stops_and_resets_between_marches():
+def test_parameter_changes_stops_and_resets_between_batches():
     deeds = {
         100: lambda c: c.configure(c.parameters.with_values({'law.gain': 20.0})),
         200: lambda c: c.configure(c.parameters.with_values({'linear.x.max_velocity': 0.1})),
         300: lambda c: c.enable(False),
         320: lambda c: c.enable(True),
         400: lambda c: c.reset(),
-        450: lambda c: c.silent(None, 0),
-        500: lambda c: c.configure(c.parameters.with_values({'switches.preview': False})),
-        510: lambda c: c.drive.tell(np.array([1.0, 2.0])),
+        450: lambda c: c.check_odometry(None, 0),
+        500: lambda c: c.configure(c.parameters.with_values({'jump_transition.preview': False})),
+        510: lambda c: c.actuation.set_command(np.array([1.0, 2.0])),
         560: lambda c: c.configure(c.parameters.with_values({'predictive.dither': 0.1})),
     }
     answers, plain = Run(6, 650, switching).check(sorted(deeds), deeds)
@@ -279,28 +279,28 @@ def test_live_changes_stops_and_resets_between_marches():
     assert Reason.DISABLED in answers.reasons.tolist()
 
 
-def test_stretches_end_where_what_is_learnt_is_copied():
+def test_batches_end_at_the_snapshots_of_the_weights():
     """The oldest copy is what a robot that stops following goes back to."""
     run = Run(7, 400, winding)
-    controller, _, plain = run.outcome(Controller.march)
+    controller, _, plain = run.outcome(replay_batch)
     assert plain > 350
     ages = []
-    for coefficients, _ in controller._before:
+    for coefficients, _ in controller._snapshots:
         distance = np.abs(controller.law.fuzzy.coefficients - coefficients).max()
         ages.append(distance)
     assert len(ages) == 3
     assert ages[0] > ages[-1] > 0.0
-    assert controller._copy_after * 0.01 == pytest.approx(SNAPSHOT_PERIOD)
+    assert controller._snapshot_steps * 0.01 == pytest.approx(SNAPSHOT_PERIOD)
 
 
-def test_a_march_that_is_refused_a_number_says_so():
+def test_a_batch_with_a_number_that_is_not_finite_raises():
     run = Run(8, 300, winding)
-    controller, _, _ = run.outcome(Controller.march)
+    controller, _, _ = run.outcome(replay_batch)
     controller.law.fuzzy.tables[-1][:] = math.nan
     more = Run(8, 400, winding)
     rows = more.rows[300:]
     slow, fast = copy.deepcopy(controller), controller
     with pytest.raises(ValueError, match='must be finite'):
-        one_by_one(slow, more.odometry, more.references, rows, StepResults.empty(100))
+        step_by_step(slow, more.odometry, more.references, rows, StepResults.empty(100))
     with pytest.raises(ValueError, match='must be finite'):
-        fast.march(more.odometry, more.references, rows, StepResults.empty(100))
+        replay_batch(fast, more.odometry, more.references, rows, StepResults.empty(100))

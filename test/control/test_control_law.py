@@ -65,7 +65,7 @@ def test_e12_with_the_reference_rate_the_error_obeys_68():
     assert np.all(np.abs(g + printed - rate - (terms[1] + terms[3] + terms[4])) > 1.0)
 
 
-def test_the_robot_under_the_torque_theta_bar_u_is_the_plant_of_30_and_64_65():
+def test_torque_theta_bar_u_makes_the_plant_of_30_and_64_65():
     """What u leaves of chi' depends on chi alone: one g(chi) can stand for it, u has gain one.
 
     With an inertia that is not the robot's neither is true: what the law then calls unknown
@@ -103,7 +103,7 @@ def _matched_pair(rng, gamma=600.0):
     return pair
 
 
-def test_error_of_g_70_71_makes_the_error_system_72_73_under_the_law():
+def test_the_law_and_g_error_70_71_make_the_error_system_72_73():
     """Plant (64)-(65), law (66)-(67): what is left is (68)-(69), and in alpha~ (72)-(73)."""
     rng = np.random.default_rng(4)
     learner, plant = _matched_pair(rng)
@@ -123,7 +123,7 @@ def test_error_of_g_70_71_makes_the_error_system_72_73_under_the_law():
         )
 
 
-def test_v_is_the_sum_74_and_falls_to_zero_only_with_both_its_parts():
+def test_v_is_the_sum_74_and_zero_only_if_both_parts_are():
     delta, alpha_error = np.array([3.0, -4.0]), np.array([[1.0, 2.0], [0.0, -2.0]])
     assert lyapunov_value(delta, alpha_error, 0.5) == pytest.approx(12.5 + 9.0)
     assert lyapunov_value(delta, 0.0 * alpha_error, 0.5) == pytest.approx(12.5)
@@ -144,7 +144,7 @@ def _slope_of_v(delta, delta_rate, alpha_error, alpha_rate, gamma):
 
 
 @pytest.mark.parametrize('tuned', [False, True], ids=['any alpha rate', 'rate of (77)-(78)'])
-def test_v_rate_is_75_then_76_and_79_once_the_coefficients_follow_77_78(tuned):
+def test_v_rate_is_75_76_and_79_if_coefficients_follow_77_78(tuned):
     """The terms in alpha~ cancel by the rates that ``adapt`` makes, and by no other."""
     rng = np.random.default_rng(5)
     gamma, dt = 600.0, 1e-7
@@ -172,7 +172,7 @@ def test_v_rate_is_75_then_76_and_79_once_the_coefficients_follow_77_78(tuned):
             assert abs(slope - by_79) > 1e-3
 
 
-def test_the_compensated_bound_is_the_least_that_80_allows():
+def test_the_compensated_bound_is_the_smallest_that_80_permits():
     """Whatever omega and v_p do within their bounds, (79) stays below (80); and it gets there.
 
     A compensator for omega-bar alone, without v_p-bar, would be outweighed.
@@ -199,7 +199,7 @@ def test_the_compensated_bound_is_the_least_that_80_allows():
 
 
 @pytest.mark.parametrize('seed', range(2))
-def test_e17_the_integral_of_84_holds_with_v_at_the_start_and_not_as_printed(seed):
+def test_e17_the_integral_of_84_holds_with_the_initial_v_only(seed):
     """V(t) - V(0) is at most the integral of the bound; print leaves V(0) out.
 
     Without it the printed (84) puts V, which is never negative, below a negative integral.
@@ -231,7 +231,7 @@ def test_e17_the_integral_of_84_holds_with_v_at_the_start_and_not_as_printed(see
     assert np.all(value[1:] > -spent[:-1])  # the printed (84), violated throughout
 
 
-def test_compensator_81_82_opposes_the_error_and_never_exceeds_its_bound():
+def test_compensator_81_82_opposes_the_error_within_its_bound():
     for error in np.linspace(-20.0, 20.0, 4001):
         value = compensator(float(error), 3.0, 0.5)
         assert abs(value) <= 3.0
@@ -239,7 +239,7 @@ def test_compensator_81_82_opposes_the_error_and_never_exceeds_its_bound():
     assert compensator(1.0, 2.0, 1.0) == pytest.approx(-2.0 * math.tanh(1.0))
 
 
-def test_e14_the_gap_between_absolute_value_and_tanh_is_0_2785_epsilon():
+def test_e14_the_gap_of_abs_and_tanh_is_0_2785_epsilon():
     """(83) treats tanh as the sign function; the gap it forgets is exactly this large."""
     for epsilon in (0.05, 1.0, 7.0):
         x = np.linspace(-10 * epsilon, 10 * epsilon, 200_001)
@@ -248,7 +248,7 @@ def test_e14_the_gap_between_absolute_value_and_tanh_is_0_2785_epsilon():
         assert gap.max() > 0.999 * TANH_GAP * epsilon
 
 
-def test_e14_the_printed_claim_83_is_violated_where_the_corrected_one_holds():
+def test_e14_print_83_is_violated_where_the_correction_holds():
     """A constant disturbance at its bound: V rises inside the ball although (83) forbids it."""
     law = LawParameters(gain=2.0, error_bound=1.0, smoothing=1.0)
     delta = np.array([0.3, 0.0])
@@ -261,7 +261,7 @@ def test_e14_the_printed_claim_83_is_violated_where_the_corrected_one_holds():
     assert rate <= lyapunov_rate_bound(delta, law.gain, law.error_bound, law.smoothing)
 
 
-def test_e13_each_wheels_predictive_term_works_on_its_own_error():
+def test_e13_the_predictive_term_of_a_wheel_acts_on_its_error():
     """(76) and (79) print delta_1 v_p2; the derivative of (74) along (73) holds delta_2 v_p2."""
     rng = np.random.default_rng(2)
     delta, v_p, residual = rng.normal(size=(3, 2))
@@ -324,7 +324,7 @@ def test_e14_bound_holds_at_every_step_of_a_noise_free_run(seed):
     assert largest_late < 3.0 * ball
 
 
-def test_certificate_holds_on_a_decaying_error_and_names_a_rising_one():
+def test_certificate_holds_for_a_decaying_error_only():
     law = LawParameters(gain=5.0, error_bound=0.0, smoothing=1.0)
     watch = Certificate(window=0.2)
     for k in range(200):

@@ -16,7 +16,7 @@ A = 28.0
 
 def _cross(jump, slopes=(0.0, 0.0), *, lag=0.0, known=100, at=100, steps=250):
     """Cross one jump at step ``at`` that is told at step ``known``; return r, rbar, commands."""
-    plan = JumpTransition(JumpTransitionParameters(acceleration=A), lag, T)
+    transition = JumpTransition(JumpTransitionParameters(acceleration=A), lag, T)
     before, after = slopes
     k = np.arange(steps + 1)
     r = np.where(k < at, before * T * (k - at), after * T * (k - at) + jump)
@@ -25,24 +25,24 @@ def _cross(jump, slopes=(0.0, 0.0), *, lag=0.0, known=100, at=100, steps=250):
     followed, commands = np.zeros((steps, 2)), np.zeros((steps, 2))
     for n in range(steps):
         if n == known:
-            plan.announce(at * NS, np.array([jump, -jump]), np.array([after, -after]))
-        plan.step(n * NS, r[n], r[n + 1])
-        followed[n] = r[n] + plan.offset
-        following = r[n + 1] + plan.offset_next
+            transition.announce(at * NS, np.array([jump, -jump]), np.array([after, -after]))
+        transition.step(n * NS, r[n], r[n + 1])
+        followed[n] = r[n] + transition.offset
+        following = r[n + 1] + transition.offset_next
         commands[n] = followed[n] + (following - followed[n]) / share
-    assert not plan.crossing
+    assert not transition.active
     return r[:-1], followed, commands
 
 
 @pytest.mark.parametrize('jump', [0.5, 3.0, 10.0])
 @pytest.mark.parametrize('known', [40, 100])
-def test_what_is_followed_is_continuous_and_reachable(jump, known):
+def test_the_reachable_reference_respects_the_acceleration(jump, known):
     _, followed, _ = _cross(jump, known=known)
     assert np.max(np.abs(np.diff(followed, axis=0))) <= A * T * (1 + 1e-9)
 
 
 @pytest.mark.parametrize('jump', [3.0, 10.0])
-def test_known_beforehand_the_squared_error_is_a_quarter(jump):
+def test_with_preview_the_squared_error_is_a_quarter(jump):
     """J³/(12 a) instead of J³/(3 a): half before the jump, half after it."""
     energy = []
     for known in (40, 100):
@@ -53,15 +53,15 @@ def test_known_beforehand_the_squared_error_is_a_quarter(jump):
 
 
 @pytest.mark.parametrize('slopes', [(0.0, 0.0), (10.0, -8.0), (-12.0, 6.0)])
-def test_no_reachable_path_is_better_not_even_a_planned_one(slopes):
-    """The plan against a quadratic program over all speeds that change by at most a T a step."""
+def test_no_reachable_path_has_a_smaller_squared_error(slopes):
+    """Compare with a quadratic program over all speeds that change by at most a T per step."""
     from scipy.optimize import lsq_linear
 
     jump, at, steps = 4.0, 40, 90
     r, followed, _ = _cross(jump, slopes, known=0, at=at, steps=steps)
     sums = np.tril(np.ones((steps, steps)))
     best = lsq_linear(sums, r[:, 0], bounds=(-A * T, A * T), tol=1e-12)
-    # The first step of the program may jump to r: its start is free like that of the plan.
+    # The first step of the program may jump to r: its start is free like that of the transition.
     first = r[0, 0]
     best = lsq_linear(sums[:, 1:], r[:, 0] - first, bounds=(-A * T, A * T), tol=1e-12)
     least = np.sum((sums[:, 1:] @ best.x + first - r[:, 0]) ** 2)
@@ -70,7 +70,7 @@ def test_no_reachable_path_is_better_not_even_a_planned_one(slopes):
     assert ours <= 1.04 * least
 
 
-def test_with_a_lagging_servo_the_command_is_what_keeps_within_the_acceleration():
+def test_with_servo_lag_the_command_respects_the_acceleration():
     """A ramp of chi itself would need a command that steps by lag * a at each of its ends."""
     r, followed, commands = _cross(6.0, lag=0.02, known=30)
     assert np.max(np.abs(np.diff(commands, axis=0))) <= A * T * (1 + 1e-9)
@@ -78,53 +78,53 @@ def test_with_a_lagging_servo_the_command_is_what_keeps_within_the_acceleration(
     assert energy == pytest.approx(6.0**3 / (12.0 * A), rel=0.05)
 
 
-def test_two_jumps_may_overlap():
-    plan = JumpTransition(JumpTransitionParameters(acceleration=A), 0.02, T)
+def test_two_transitions_may_overlap():
+    transition = JumpTransition(JumpTransitionParameters(acceleration=A), 0.02, T)
     k = np.arange(201)
     r = np.where(k < 100, 0.0, np.where(k < 105, 4.0, -2.0))
     r = np.stack([r, r], axis=1)
-    plan.announce(100 * NS, np.full(2, 4.0), np.zeros(2))
-    plan.announce(105 * NS, np.full(2, -6.0), np.zeros(2))
+    transition.announce(100 * NS, np.full(2, 4.0), np.zeros(2))
+    transition.announce(105 * NS, np.full(2, -6.0), np.zeros(2))
     followed = []
     for n in range(200):
-        plan.step(n * NS, r[n], r[n + 1])
-        followed.append(r[n] + plan.offset)
+        transition.step(n * NS, r[n], r[n + 1])
+        followed.append(r[n] + transition.offset)
     assert np.max(np.abs(np.diff(followed, axis=0))) <= 2.0 * A * T
     np.testing.assert_allclose(followed[-1], -2.0, atol=1e-9)
-    assert not plan.crossing
+    assert not transition.active
 
 
-def test_a_jump_that_is_taken_back_leaves_nothing_behind():
+def test_a_withdrawn_jump_leaves_no_offset():
     """The source of the reference starts again: the jump it had announced never comes."""
-    plan = JumpTransition(JumpTransitionParameters(acceleration=A), 0.02, T)
+    transition = JumpTransition(JumpTransitionParameters(acceleration=A), 0.02, T)
     r = np.array([1.0, -1.0])
-    plan.announce(30 * NS, np.array([6.0, 6.0]), np.zeros(2))
+    transition.announce(30 * NS, np.array([6.0, 6.0]), np.zeros(2))
     offsets = []
     for n in range(150):
         if n == 25:
-            plan.withdraw(25 * NS)
-        plan.step(n * NS, r, r)
-        offsets.append(plan.offset.copy())
+            transition.withdraw(25 * NS)
+        transition.step(n * NS, r, r)
+        offsets.append(transition.offset.copy())
     assert np.max(np.abs(offsets)) > 0.5  # it was on its way
     assert np.max(np.abs(np.diff(offsets, axis=0))) <= A * T * (1 + 1e-9)
     np.testing.assert_allclose(offsets[-1], 0.0, atol=1e-9)
-    assert not plan.crossing
+    assert not transition.active
 
 
-def test_jumps_to_come_are_told_to_psi_free_in_the_period_they_happen_in():
-    plan = JumpTransition(JumpTransitionParameters(), 0.0, T)
-    plan.announce(7 * NS, np.array([2.0, -1.0]), np.zeros(2))
-    plan.announce(10 * NS, np.array([0.5, 0.5]), np.zeros(2))
-    change = plan.known_change(0, 5 * T, 4)
+def test_future_jumps_enter_psi_free_in_their_period():
+    transition = JumpTransition(JumpTransitionParameters(), 0.0, T)
+    transition.announce(7 * NS, np.array([2.0, -1.0]), np.zeros(2))
+    transition.announce(10 * NS, np.array([0.5, 0.5]), np.zeros(2))
+    change = transition.future_jumps(0, 5 * T, 4)
     np.testing.assert_allclose(change, [[0.0, 0.0], [-2.5, 0.5], [0.0, 0.0], [0.0, 0.0]])
-    np.testing.assert_allclose(plan.known_change(7 * NS, 5 * T, 4)[0], [-0.5, -0.5])
-    np.testing.assert_allclose(plan.take_passed(8 * NS), [2.0, -1.0])
-    np.testing.assert_allclose(plan.take_passed(8 * NS), 0.0)
+    np.testing.assert_allclose(transition.future_jumps(7 * NS, 5 * T, 4)[0], [-0.5, -0.5])
+    np.testing.assert_allclose(transition.pop_passed(8 * NS), [2.0, -1.0])
+    np.testing.assert_allclose(transition.pop_passed(8 * NS), 0.0)
 
 
-def test_without_jumps_what_is_followed_is_the_reference():
-    plan = JumpTransition(JumpTransitionParameters(), 0.02, T)
-    plan.step(0, np.ones(2), np.zeros(2))
-    assert not plan.crossing
-    np.testing.assert_array_equal(plan.offset, 0.0)
-    np.testing.assert_array_equal(plan.offset_next, 0.0)
+def test_without_jumps_the_offset_is_zero():
+    transition = JumpTransition(JumpTransitionParameters(), 0.02, T)
+    transition.step(0, np.ones(2), np.zeros(2))
+    assert not transition.active
+    np.testing.assert_array_equal(transition.offset, 0.0)
+    np.testing.assert_array_equal(transition.offset_next, 0.0)

@@ -22,7 +22,7 @@ GEOMETRY = WheelGeometry()
 MS = 1_000_000
 
 
-def test_a_limited_command_keeps_curvature_and_stays_within_the_limits():
+def test_a_scaled_command_keeps_its_curvature_and_the_limits():
     rng = np.random.default_rng(3)
     for _ in range(2000):
         wish = BodyTwist(*rng.normal(scale=(2.0, 20.0)))
@@ -40,7 +40,7 @@ def test_a_limited_command_keeps_curvature_and_stays_within_the_limits():
         assert (share == 1.0) == free
 
 
-def test_change_never_exceeds_the_acceleration_limits():
+def test_the_command_change_respects_the_acceleration_limits():
     rng = np.random.default_rng(4)
     limits, out = wheel_limits(LIMITS, GEOMETRY), np.zeros(2)
     for _ in range(2000):
@@ -53,14 +53,14 @@ def test_change_never_exceeds_the_acceleration_limits():
         assert np.max(np.abs(out - before)) <= LIMITS.wheel_acceleration * 0.01 * (1 + 1e-9)
 
 
-def test_an_infinite_wish_does_not_break_the_command():
+def test_a_huge_target_gives_a_finite_command():
     limits, out = wheel_limits(LIMITS, GEOMETRY), np.zeros(2)
     assert limit_command(1e300, -1e300, np.zeros(2), limits, 0.01, out)
     assert np.isfinite(out).all()
 
 
 @pytest.mark.parametrize('drive', ['velocity', 'torque'])
-def test_the_estimate_beats_the_measurement_and_finds_the_unexplained(drive):
+def test_the_filter_reduces_noise_and_finds_the_disturbance(drive):
     parameters = SpeedFilterParameters(noise_variance=0.04, disturbance=10.0)
     estimator = SpeedKalmanFilter(parameters, drive, 0.01)
     rng = np.random.default_rng(6)
@@ -82,7 +82,7 @@ def test_the_estimate_beats_the_measurement_and_finds_the_unexplained(drive):
         if k > 500:
             raw.append(measured - chi)
             filtered.append(estimate - chi)
-            unexplained.append(estimator.unexplained.copy())
+            unexplained.append(estimator.disturbance.copy())
     ratio = np.std(filtered) / np.std(raw)
     assert ratio < 0.6
     np.testing.assert_allclose(np.mean(unexplained, axis=0), push, atol=0.6)  # three sigma
@@ -101,7 +101,7 @@ def test_the_gain_is_the_fixed_point_of_the_riccati_equation():
     np.testing.assert_allclose(stationary_gain(transition, parameters, 0.01), expected, rtol=1e-6)
 
 
-def test_without_noise_or_switched_off_the_measurement_is_believed():
+def test_without_noise_or_disabled_the_measurement_is_used():
     for parameters in (
         SpeedFilterParameters(enabled=False),
         SpeedFilterParameters(noise_variance=0.0),
@@ -111,7 +111,7 @@ def test_without_noise_or_switched_off_the_measurement_is_believed():
         np.testing.assert_allclose(estimator.correct(np.array([1.0, 2.0])), [1.0, 2.0], rtol=1e-3)
 
 
-def test_an_unknown_drive_is_refused():
+def test_an_unknown_drive_is_rejected():
     with pytest.raises(ValueError, match='drive'):
         SpeedKalmanFilter(SpeedFilterParameters(), 'warp', 0.01)
 
@@ -121,19 +121,19 @@ def _decide(watchdog, stamp_ms, **changes):
     return watchdog.decide(stamp_ms * MS, **facts)
 
 
-def test_every_reason_to_stop_is_found_and_the_good_case_moves():
+def test_every_reason_to_stop_is_detected():
     watchdog = InputWatchdog(WatchdogParameters())
     assert _decide(watchdog, 0) is Reason.NO_REFERENCE
-    watchdog.reference_arrived()
+    watchdog.reference_received()
     assert _decide(watchdog, 10) is Reason.TRACKING
     assert _decide(watchdog, 20, finite=False) is Reason.ODOMETRY_BAD
     assert _decide(watchdog, 30, known=False) is Reason.NO_REFERENCE
     assert _decide(watchdog, 150) is Reason.TRACKING
     assert _decide(watchdog, 170) is Reason.REFERENCE_STALE
-    watchdog.reference_arrived()
+    watchdog.reference_received()
     assert _decide(watchdog, 180) is Reason.TRACKING
     watchdog.enabled = False
-    watchdog.reference_arrived()
+    watchdog.reference_received()
     assert _decide(watchdog, 190) is Reason.DISABLED
     watchdog.enabled = True
     assert _decide(watchdog, 200) is Reason.TRACKING
@@ -144,14 +144,14 @@ def test_a_diverging_state_stops_the_robot_for_the_hold_time(fault):
     watchdog = InputWatchdog(WatchdogParameters())
     reasons = []
     for k in range(100):
-        watchdog.reference_arrived()
+        watchdog.reference_received()
         reasons.append(_decide(watchdog, 10 * k, **(fault if k == 10 else {})))
     assert reasons[9] is Reason.TRACKING
     assert all(reason is Reason.DIVERGING for reason in reasons[10:61])
     assert all(reason is Reason.TRACKING for reason in reasons[61:])
 
 
-def test_elapsed_refuses_gaps_first_messages_and_time_running_backwards():
+def test_elapsed_is_none_for_first_messages_gaps_and_restarts():
     watchdog = InputWatchdog(WatchdogParameters())
     assert watchdog.elapsed(1000 * MS) is None
     assert watchdog.elapsed(1010 * MS) == pytest.approx(0.01)
@@ -160,8 +160,8 @@ def test_elapsed_refuses_gaps_first_messages_and_time_running_backwards():
     assert watchdog.elapsed(500 * MS) is None
 
 
-def test_silence_is_judged_by_one_clock():
+def test_the_odometry_timeout_is_measured_with_one_clock():
     watchdog = InputWatchdog(WatchdogParameters(odometry_timeout=0.2))
-    assert watchdog.silent(None, 0)
-    assert not watchdog.silent(1000 * MS, 1199 * MS)
-    assert watchdog.silent(1000 * MS, 1201 * MS)
+    assert watchdog.odometry_timed_out(None, 0)
+    assert not watchdog.odometry_timed_out(1000 * MS, 1199 * MS)
+    assert watchdog.odometry_timed_out(1000 * MS, 1201 * MS)

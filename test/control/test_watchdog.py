@@ -22,64 +22,64 @@ def following(**changes):
 
 
 @pytest.mark.parametrize('late', [0, 1, 5, 12])
-def test_a_robot_that_follows_late_and_with_noise_is_believed(late):
+def test_a_delayed_and_noisy_robot_is_responsive(late):
     """0.12 s late, noise of variance 0.1: all within the window and the bound."""
     generator = np.random.default_rng(late)
     watch = following()
     time = PERIOD * np.arange(4000)
     told = 4.0 * np.sin(np.outer(2.0 * np.pi * time, (0.4, 0.27)))
     for k in range(len(time)):
-        watch.told(*told[k])
+        watch.add_command(*told[k])
         seen = told[max(0, k - late)] + math.sqrt(0.1) * generator.standard_normal(2)
-        assert watch.heard(*seen)
+        assert watch.update(*seen)
 
 
-def test_a_robot_that_stands_is_doubted_after_window_and_patience():
+def test_a_standing_robot_is_unresponsive_after_the_timeout():
     watch = following()
     steps = 0
-    while watch.holds:
-        watch.told(3.0, -3.0)
-        watch.heard(0.0, 0.0)
+    while watch.responsive:
+        watch.add_command(3.0, -3.0)
+        watch.update(0.0, 0.0)
         steps += 1
     assert steps * PERIOD == pytest.approx(0.15 + 0.1, abs=0.03)
 
 
-def test_one_wheel_is_enough():
+def test_one_unresponsive_wheel_is_enough():
     watch = following()
     for _ in range(60):
-        watch.told(3.0, 3.0)
-        watch.heard(3.0, 0.0)
-    assert not watch.holds
+        watch.add_command(3.0, 3.0)
+        watch.update(3.0, 0.0)
+    assert not watch.responsive
 
 
-def test_standing_while_told_to_stand_proves_nothing():
+def test_standing_at_a_zero_command_is_weak_evidence():
     """A reference that crosses zero made a deaf robot seem to obey, and the law learn from it."""
     watch = following()
     for _ in range(60):
-        watch.told(3.0, 3.0)
-        watch.heard(0.0, 0.0)
-    assert not watch.holds
+        watch.add_command(3.0, 3.0)
+        watch.update(0.0, 0.0)
+    assert not watch.responsive
     steps = 0
-    while not watch.holds:
-        watch.told(0.2, 0.1)
-        watch.heard(0.0, 0.0)
+    while not watch.responsive:
+        watch.add_command(0.2, 0.1)
+        watch.update(0.0, 0.0)
         steps += 1
     assert steps >= EVIDENCE_WEIGHT * 10  # 2 s; with a proof it takes 0.1 s
     again = following()
     for _ in range(60):
-        again.told(3.0, 3.0)
-        again.heard(0.0, 0.0)
+        again.add_command(3.0, 3.0)
+        again.update(0.0, 0.0)
     for _ in range(11):
-        again.told(3.0, 3.0)
-        again.heard(2.9, 3.1)
-    assert again.holds
+        again.add_command(3.0, 3.0)
+        again.update(2.9, 3.1)
+    assert again.responsive
 
 
-def test_a_bound_of_zero_always_believes():
+def test_a_bound_of_zero_disables_the_check():
     watch = following(response_bound=0.0)
     for _ in range(500):
-        watch.told(9.0, 9.0)
-        assert watch.heard(-9.0, 0.0)
+        watch.add_command(9.0, 9.0)
+        assert watch.update(-9.0, 0.0)
 
 
 class Deaf:
@@ -87,7 +87,7 @@ class Deaf:
 
     def __init__(self, **changes):
         self.controller = Controller(
-            ControllerParameters.from_dict({'estimate.noise_variance': 0.0} | changes)
+            ControllerParameters.from_dict({'speed_filter.noise_variance': 0.0} | changes)
         )
         self.speeds = np.zeros(2)
         self.late = BodyTwist(0.0, 0.0)
@@ -119,7 +119,7 @@ def settled(robot):
     return float(np.sqrt(np.mean(robot.run(5.0)[100:] ** 2)))
 
 
-def test_a_robot_that_was_deaf_for_5_s_is_followed_as_before():
+def test_after_5_s_without_response_the_error_is_as_before():
     """The law had learnt that commands do nothing: the error was five times as large for 30 s."""
     errors = {}
     for name, changes in (('watched', {}), ('not', {'watchdog.response_bound': 0.0})):
@@ -135,22 +135,22 @@ def test_a_robot_that_was_deaf_for_5_s_is_followed_as_before():
     assert errors['not'] > 1.3 * errors['watched']
 
 
-def test_while_it_does_not_follow_the_reference_itself_is_commanded_and_nothing_learnt():
+def test_an_unresponsive_robot_gets_the_reference_as_command():
     robot = Deaf()
     robot.run(5.0)
     robot.run(1.0, deaf=True)
     assert robot.controller.status.reason is Reason.NOT_FOLLOWING
     assert Reason.NOT_FOLLOWING.moves  # a board that restarts waits for commands
-    learnt = robot.controller.law.learnt()
+    learnt = robot.controller.law.get_weights()
     robot.run(2.0, deaf=True)
-    for name, value in robot.controller.law.learnt().items():
+    for name, value in robot.controller.law.get_weights().items():
         np.testing.assert_array_equal(value, learnt[name])
     sent = wheels_from_twist(robot.late, GEOMETRY)
     wanted = wheels_from_twist(robot.wanted(robot.now - STEP), GEOMETRY)
     assert sent == pytest.approx(wanted, abs=0.05)
 
 
-def test_a_speed_near_the_newest_command_is_judged_as_by_the_whole_window():
+def test_the_shortcut_for_the_last_command_keeps_the_decision():
     """The newest command is looked at first, to save the search: the verdict is the same."""
     generator = np.random.default_rng(4)
     watch, whole = following(), following()
@@ -159,19 +159,19 @@ def test_a_speed_near_the_newest_command_is_judged_as_by_the_whole_window():
         told = 3.0 * np.sin(0.02 * k) + generator.normal(size=2)
         off = 5.0 if k % 700 > 600 else 0.0
         seen = told + off + generator.normal(scale=0.8, size=2)
-        verdicts.append(watch.heard(*seen))
+        verdicts.append(watch.update(*seen))
         # The same commands in another order are the same window: the nearest comes first.
         if len(whole._commands) == whole._commands.maxlen:
             far = max(whole._commands, key=lambda one: abs(one[0] - seen[0]))
             kept = list(whole._commands)
             whole._commands.remove(far)
             whole._commands.append(far)
-            assert whole.heard(*seen) == verdicts[-1]
+            assert whole.update(*seen) == verdicts[-1]
             whole._commands.clear()
             whole._commands.extend(kept)
         else:
-            assert whole.heard(*seen) == verdicts[-1]
-        watch.told(*told)
-        whole.told(*told)
+            assert whole.update(*seen) == verdicts[-1]
+        watch.add_command(*told)
+        whole.add_command(*told)
     assert True in verdicts
     assert False in verdicts

@@ -423,9 +423,9 @@ class NotingDrive(VelocityActuation):
         self.log.append(('observe', measured.copy()))
         super().observe(measured, dt)
 
-    def send(self, acceleration, *rest):
+    def send_acceleration(self, acceleration, *rest):
         self.log.append(('send', acceleration.copy()))
-        return super().send(acceleration, *rest)
+        return super().send_acceleration(acceleration, *rest)
 
 
 @pytest.mark.parametrize('drive', DRIVES)

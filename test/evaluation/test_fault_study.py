@@ -177,7 +177,7 @@ def test_a_delay_that_the_controller_is_told_costs_little():
     robot = loop_robot().with_values({'faults.command_delay': 0.1})
     errors = []
     for dead_time in (0.01, 0.11):
-        controller = loop_controller().with_values({'estimate.dead_time': dead_time})
+        controller = loop_controller().with_values({'speed_filter.dead_time': dead_time})
         record = run_twin(robot, controller, chaotic_course(15.0), 15.0)
         rows = record.rows(5.0, 15.0)
         errors.append(np.sqrt(np.mean((record.rotors - record.wanted)[rows] ** 2)))

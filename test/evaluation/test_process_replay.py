@@ -418,7 +418,7 @@ def short_run(folder, model=None, steps=120):
             if k >= 40:
                 lagging = BodyTwist(0.09 * math.sin(0.05 * (k - 41)), 0.45)
                 taped.step(now + 500_000, State(now, Pose(0.0, 0.0, 0.0), lagging))
-        learnt = taped.controller.law.learnt()
+        learnt = taped.controller.law.get_weights()
     return folder, learnt
 
 

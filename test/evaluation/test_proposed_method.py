@@ -30,7 +30,7 @@ def _as_the_nodes_close_it(scenario):
     robot = PaperRobot(scenario.robot())
     geometry = scenario.robot().geometry
     controller = Controller(
-        ControllerParameters.from_dict({'estimate.noise_variance': scenario.noise})
+        ControllerParameters.from_dict({'speed_filter.noise_variance': scenario.noise})
     )
     controller.warm_up()
     wanted = scenario.reference().wanted
@@ -57,7 +57,7 @@ def _as_the_nodes_close_it(scenario):
 def test_the_offline_loop_is_the_loop_of_the_nodes(noise):
     """What the lab reports of the full controller is what the node does, jump for jump."""
     scenario = Scenario('velocity', noise, 'nominal', 2, 30.0)
-    record = run(scenario, _spec(**{'estimate.noise_variance': noise}))
+    record = run(scenario, _spec(**{'speed_filter.noise_variance': noise}))
     assert np.abs(np.diff(record.wanted, axis=0)).max() > 2.0  # there is a real jump in it
     np.testing.assert_allclose(record.speeds, _as_the_nodes_close_it(scenario), atol=1e-6)
 
@@ -66,9 +66,9 @@ SEEDS = (1, 2, 3, 4, 5)
 
 
 def _errors(drive, noise, case='nominal', **changes):
-    given = {'estimate.noise_variance': noise}
+    given = {'speed_filter.noise_variance': noise}
     if drive == 'torque':
-        given |= {'law.gain': 8.0, 'switches.acceleration': 100.0}
+        given |= {'law.gain': 8.0, 'jump_transition.acceleration': 100.0}
     return [
         run(Scenario(drive, noise, case, seed, 30.0), _spec(**(given | changes))).rmse()
         for seed in SEEDS
@@ -79,7 +79,7 @@ PARTS = {
     'NT3FS': {'use_fuzzy': False},
     'compensator': {'law.compensator': False},
     'MPC': {'predictive.enabled': False},
-    'preview': {'switches.preview': False},
+    'preview': {'jump_transition.preview': False},
 }
 
 
@@ -94,7 +94,7 @@ def test_leaving_out_a_part_costs_accuracy_on_the_same_seeds(part, drive):
 def test_jumps_left_to_the_program_alone_cost_more_than_a_ramp():
     """Psi_free knows the jump beforehand, but v_p is bounded and K works against it."""
     more = paired(
-        _errors('velocity', 0.0, **{'switches.crossing': 'program'}), _errors('velocity', 0.0)
+        _errors('velocity', 0.0, **{'jump_transition.method': 'predictive'}), _errors('velocity', 0.0)
     )
     assert more.mean > 0.02
     assert more.certain

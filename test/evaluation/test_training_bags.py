@@ -127,7 +127,7 @@ def test_the_model_file_is_loaded_and_says_where_it_is_from(bags, model, tmp_pat
     assert model.text in said
     assert f'saved {path}' in said
     loaded = load_model(path)
-    Controller(model.parameters).law.restore(loaded)
+    Controller(model.parameters).law.set_weights(loaded)
     for name, values in model.learnt.items():
         np.testing.assert_array_equal(loaded[name], values)
     header = read_model_header(path)

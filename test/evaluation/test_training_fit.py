@@ -185,7 +185,7 @@ def test_a_stretch_in_which_the_robot_was_stopped_is_left_out(tmp_path):
 
 def test_jumps_that_the_law_is_told_of_are_no_errors(tmp_path):
     """Left to the program, a switch makes the error jump; the machine does not see that part."""
-    jumping = ClosedLoopObjective(3, 14.0, tape=True, **{'switches.crossing': 'program'})
+    jumping = ClosedLoopObjective(3, 14.0, tape=True, **{'jump_transition.method': 'predictive'})
     replay, _, _ = load_training_data(jumping.tape.write(tmp_path / 'bag'))
     part = slice(1150, 1400)
     assert np.abs(jumping.errors[part]).max() > 1.0
@@ -418,11 +418,11 @@ def test_the_coefficients_can_be_learnt_without_the_predictor(calm):
     assert 'skill,' not in kept.text
     assert 'skill' not in kept.origin['cross_validation']
     law = Controller(kept.parameters).law
-    for name, values in law.learnt().items():
+    for name, values in law.get_weights().items():
         if name != 'fuzzy.coefficients':
             np.testing.assert_array_equal(learnt[name], values)
     assert np.abs(learnt['fuzzy.coefficients']).max() > 1.0
-    law.restore(learnt)
+    law.set_weights(learnt)
 
 
 @pytest.mark.parametrize('gone', NEEDED)
@@ -503,7 +503,7 @@ def test_a_few_nan_leave_gaps_and_are_told(run, tmp_path):
     'parameters, complaint',
     [
         ({'law.gain': '20.0'}, 'other settings'),
-        ({'estimate.noise_variance': '1.0'}, 'other settings'),
+        ({'speed_filter.noise_variance': '1.0'}, 'other settings'),
         ({'law.gain': 'much'}, "law.gain must be a number: got 'much'"),
         ({'predictive.decimation': '0'}, 'predictive.decimation must be'),
         ({'predictive.horizon': 'None'}, 'predictive.horizon must be a whole number'),
@@ -554,11 +554,11 @@ def test_a_drive_that_is_told_goes_on_as_the_one_that_sent():
         measured = rng.normal(size=2)
         for drive in (sender, told):
             drive.observe(measured, 0.01)
-        np.testing.assert_allclose(told.ahead, sender.ahead, atol=1e-12)
+        np.testing.assert_allclose(told.predicted, sender.predicted, atol=1e-12)
         u = rng.uniform(-40.0, 40.0, 2)
-        applied = sender.send(u).copy()
-        told.send(rng.uniform(-40.0, 40.0, 2))
-        told.tell(sender.command)
+        applied = sender.send_acceleration(u).copy()
+        told.send_acceleration(rng.uniform(-40.0, 40.0, 2))
+        told.set_command(sender.command)
         np.testing.assert_allclose(told.applied, applied, atol=1e-9)
         np.testing.assert_array_equal(told.command, sender.command)
         assert not told.limited
@@ -569,10 +569,10 @@ def test_a_drive_is_told_two_finite_wheel_speeds_or_nothing():
     before = drive.command.copy()
     for wrong in (np.array([1.0, math.nan]), np.ones(3)):
         with pytest.raises(ValueError, match='two finite numbers'):
-            drive.tell(wrong)
+            drive.set_command(wrong)
     np.testing.assert_array_equal(drive.command, before)
     with pytest.raises(ValueError, match='velocity drive'):
-        _drive('torque').tell(np.zeros(2))
+        _drive('torque').set_command(np.zeros(2))
 
 
 def test_runs_with_a_gap_between_them_are_learnt_as_two_runs():
@@ -719,7 +719,7 @@ def test_a_model_for_other_shapes_is_refused_when_it_is_loaded(trained):
     parameters = ControllerParameters()
     other = replace(parameters, predictive=replace(parameters.predictive, hidden=16))
     with pytest.raises(ValueError, match='must have shape'):
-        Controller(other).law.restore(trained.learnt)
+        Controller(other).law.set_weights(trained.learnt)
 
 
 def test_the_bag_carries_the_settings_it_was_made_under(bag, run):

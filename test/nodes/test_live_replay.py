@@ -57,7 +57,7 @@ class Person:
 
 def live_run(fleet, bag, model):
     """Drive for about twenty seconds, with everything that can happen to a controller."""
-    learnt = Controller(ControllerParameters()).law.learnt()
+    learnt = Controller(ControllerParameters()).law.get_weights()
     learnt['fuzzy.coefficients'] += 0.25
     save_model(model, learnt, {})
     parameters = {'recorder': {'folder': str(bag)}, 'controller': {'model': str(model)}}

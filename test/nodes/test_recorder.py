@@ -327,7 +327,7 @@ def test_a_snapshot_that_cannot_be_written_is_told_and_the_recording_goes_on(wor
 def test_the_models_of_a_controller_are_attached_to_every_file(world, tmp_path):
     model, output = tmp_path / 'start.npz', tmp_path / 'learnt.npz'
     first = world.add(ControllerNode)
-    save_model(model, first._controller.law.learnt(), first.parameters.to_dict())
+    save_model(model, first._controller.law.get_weights(), first.parameters.to_dict())
     world.remove(first)
     shutil.copy(model, output)
     os.utime(output, (1, 1))  # of a run before

@@ -503,7 +503,7 @@ def test_what_a_launch_file_says_fits_its_nodes(file, launched):
         given = {key: value for key, value in values.items() if key != 'use_sim_time'}
         parameters = PARAMETER_CLASSES[name].from_dict(given)
         if name == 'controller':
-            assert parameters.estimate.lag == 0.003  # what a stepper needs
+            assert parameters.speed_filter.lag == 0.003  # what a stepper needs
 
 
 def test_the_two_robots_of_the_launch_file_do_not_hear_each_other(world, launched):
@@ -552,5 +552,5 @@ def test_the_demonstration_drives_the_robot_that_was_asked_for():
         }
         assert tables['sim_robot'].drive.kind == kind
         assert tables['sim_robot'].noise.variance == 0.04
-        assert tables['controller'].estimate.lag == lag
+        assert tables['controller'].speed_filter.lag == lag
         assert tables['sim_robot'].seed == tables['reference'].seed == 7

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""How late the radio makes a controller's command: what ``estimate.dead_time`` has to say."""
+"""How late the radio makes a controller's command: what ``speed_filter.dead_time`` has to say."""
 
 import random
 

@@ -87,7 +87,7 @@ class ClosedLoopObjective:
         robot = PaperRobot(scenario.robot())
         self.controller = Controller(ControllerParameters.from_dict(changes))
         if learnt is not None:
-            self.controller.law.restore(learnt)
+            self.controller.law.set_weights(learnt)
         parameters = {
             name: str(value) for name, value in self.controller.parameters.to_dict().items()
         }
@@ -108,8 +108,8 @@ class ClosedLoopObjective:
             twist, status = self.controller.step(state.odometry)
             self.statuses.append(status)
             self.speeds.append(state.true_wheels)
-            self.estimates.append(self.controller.drive.speeds.copy())
-            self.unexplained.append(self.controller.drive.unexplained.copy())
+            self.estimates.append(self.controller.actuation.speeds.copy())
+            self.unexplained.append(self.controller.actuation.disturbance.copy())
             if tape:
                 self._record(k, heard_ns, state.odometry, twist, status)
             state = robot.step(wheels_from_twist(twist, GEOMETRY))

@@ -14,9 +14,8 @@ import numpy as np
 from t3mpc_ros.bag.run.journal import Journal, parameters_to_json
 from t3mpc_ros.bag.run.model_file import load_model
 from t3mpc_ros.bag.writer import BagWriter
-from t3mpc_ros.control.batch_replay import Status
 from t3mpc_ros.control.control_law import TERM_NAMES
-from t3mpc_ros.control.controller import Controller, ControllerParameters
+from t3mpc_ros.control.controller import Controller, ControllerParameters, Status
 from t3mpc_ros.evaluation.bag_report.topic_roles import COMMAND, ODOMETRY, REFERENCE, WHEELS
 from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     CONTROLLER,
@@ -148,7 +147,7 @@ class RecordedController:
         self.controller.warm_up()
         tape.parameters(now_ns, 0, parameters.to_dict())
         if model is not None:
-            self.controller.law.restore(load_model(model))
+            self.controller.law.set_weights(load_model(model))
             tape.row(now_ns, self._journal.model(zlib.crc32(model.read_bytes())))
 
     def add_reference(self, now_ns: int, motion: State) -> None:
@@ -171,7 +170,7 @@ class RecordedController:
 
     def silent(self, now_ns: int) -> None:
         """Find that the odometry has gone silent, and stop."""
-        self.controller.silent(None, now_ns)
+        self.controller.check_odometry(None, now_ns)
         self._tape.command(now_ns, STANDSTILL)
         self._tape.row(now_ns + LATER, self._journal.silent(self.controller.status.stamp_ns))
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.bag.run.journal import Event
-from t3mpc_ros.control.batch_replay import StepResults
+from t3mpc_ros.control.batch_replay import StepResults, replay_batch
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.control.watchdog import Reason
@@ -43,7 +43,7 @@ class ReplayResult:
     """Why the robot moved or did not; None at rows that are no step and no silence."""
     steps: int
     plain: int
-    """How many of the steps were done in compiled stretches, see :meth:`Controller.march`."""
+    """How many of the steps were done in compiled stretches, see :func:`replay_batch`."""
     parameters: ControllerParameters
     """At the end."""
     changed: Mapping[str, object]
@@ -103,7 +103,7 @@ def make_controllers(
         controller = Controller(life.parameters[life.start].with_values(changes or {}))
         controller.warm_up()
         if life.model is not None:
-            controller.law.restore(life.model)
+            controller.law.set_weights(life.model)
         controllers.append(controller)
     if controllers:
         _compile_march(controllers[0].parameters)
@@ -118,7 +118,7 @@ def _compile_march(parameters: ControllerParameters) -> None:
     rows = np.zeros((count, 3), dtype=np.int64)
     rows[:, 0] = np.arange(count)
     rows[0, 2], rows[1:, 1:] = count, count
-    Controller(parameters).march(standing, standing, rows, StepResults.empty(count))
+    replay_batch(Controller(parameters), standing, standing, rows, StepResults.empty(count))
 
 
 def _replay_session(
@@ -137,7 +137,7 @@ def _replay_session(
     for k in [*np.flatnonzero(~steps).tolist(), len(events)]:
         if done < k:
             part = rows[done:k]
-            plain += controller.march(odometry, references, part, answers.part(done, k))
+            plain += replay_batch(controller, odometry, references, part, answers.part(done, k))
         done = k + 1
         if k == len(events):
             break
@@ -145,10 +145,10 @@ def _replay_session(
             controller.add_reference(references[j])
         event, value = int(events[k]), int(life.rows[k, 4])
         if event == Event.ODOMETRY_TIMEOUT:
-            controller.silent(None, 0)
-            answers.note(k, STANDSTILL, controller.status)
+            controller.check_odometry(None, 0)
+            answers.set_row(k, STANDSTILL, controller.status)
         elif event == Event.FINISH:
-            answers.note(k, STANDSTILL, controller.status)
+            answers.set_row(k, STANDSTILL, controller.status)
         elif event == Event.CONFIGURE:
             if value in life.parameters:
                 controller.configure(life.parameters[value].with_values(changes))

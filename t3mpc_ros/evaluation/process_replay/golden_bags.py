@@ -67,7 +67,10 @@ GOLDEN_SCENARIOS: Mapping[str, GoldenScenario] = {
             2.5: ('configure', {'law.compensator': False, 'adaptation.gamma': 300.0}),
             3.5: ('configure', {'use_fuzzy': False}),
             4.5: ('configure', {'linear.x.max_velocity': 0.15, 'use_fuzzy': True}),
-            5.5: ('configure', {'switches.preview': False, 'predictive.move_weight': 0.01}),
+            5.5: (
+                'configure',
+                {'jump_transition.preview': False, 'predictive.move_weight': 0.01},
+            ),
         },
         (
             FaultEvent(2.0, 'load_change', 0.5, 3.0),

@@ -101,7 +101,7 @@ class _MethodAdapter:
         self._period = 1.0 / parameters.rate
         limits = parameters.limits
         self._drive = VelocityActuation(
-            parameters.estimate, limits, parameters.geometry, 'velocity', self._period
+            parameters.speed_filter, limits, parameters.geometry, 'velocity', self._period
         )
         self.track = ReferenceTrajectory(
             BodyTwist(
@@ -137,20 +137,20 @@ class _MethodAdapter:
         if rival is None or (rows := self._rows(stamp, rival.preview)) is None:
             return None
         observation = Observation(
-            drive.ahead,
-            drive.unexplained,
+            drive.predicted,
+            drive.disturbance,
             rows[0],
             rows[1],
             drive.command,
             rows if rival.preview else None,
         )
-        applied = drive.send(rival.step(observation)).copy()
+        applied = drive.send_acceleration(rival.step(observation)).copy()
         rival.applied(applied, limited=drive.limited)
         return drive.twist
 
     def tell(self, sent: BodyTwist) -> None:
         """Take note of what was sent in the rival's place."""
-        self._drive.tell(np.array(wheels_from_twist(sent, self._parameters.geometry)))
+        self._drive.set_command(np.array(wheels_from_twist(sent, self._parameters.geometry)))
 
     def _rows(self, stamp_ns: int, preview: bool) -> Array | None:
         """Return r when the command begins to act and each period after it, shape (n, 2)."""
@@ -183,8 +183,8 @@ class _MethodAdapter:
             {
                 'drive.kind': 'velocity',
                 'rate': parameters.rate,
-                'drive.lag': parameters.estimate.lag,
-                'drive.dead_time': parameters.estimate.dead_time,
+                'drive.lag': parameters.speed_filter.lag,
+                'drive.dead_time': parameters.speed_filter.dead_time,
                 **parameters.geometry.to_dict(),
             }
         )
@@ -195,4 +195,4 @@ class _MethodAdapter:
             limits.angular_acceleration * geometry.half_separation / radius,
             limits.wheel_acceleration,
         )
-        return NominalModel('velocity', self._period, parameters.estimate.lag, reach, robot)
+        return NominalModel('velocity', self._period, parameters.speed_filter.lag, reach, robot)

@@ -105,7 +105,7 @@ def fit_bags(
         f'{"s" if len(folders) > 1 else ""}'
     )
     # Taught by all: what cannot be done at all is said before folds are tried.
-    learnt = Nt3fsMpcController(parameters).learnt()
+    learnt = Nt3fsMpcController(parameters).get_weights()
     learnt['fuzzy.coefficients'] = fit_coefficients(parameters, replay)
     said = 'predictor: kept as the nominal loop has taught it'
     if not keep_predictor:

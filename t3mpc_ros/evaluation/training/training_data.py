@@ -234,16 +234,16 @@ def _rebuild(
         if not status.reason.moves:
             last_ns = None
             continue
-        drive, terms = controller.drive, status.terms
+        drive, terms = controller.actuation, status.terms
         if math.isfinite(commands[i, 0]):  # else its own answer is the best guess
-            drive.tell(commands[i])
+            drive.set_command(commands[i])
         commands[i] = drive.command
         begins[i] = last_ns is None or motion.stamp_ns - last_ns > patience
         last_ns = motion.stamp_ns
         feedback[i] = terms[_FEEDBACK]
         errors[i] = -terms[_FEEDBACK] / gain - revive * controller.law.predictive.known_error
         rest[i] = drive.applied - terms[_FOLLOWED].sum(axis=0)
-        speeds[i], unexplained[i] = drive.speeds, drive.unexplained
+        speeds[i], unexplained[i] = drive.speeds, drive.disturbance
     moves, said = (
         _published(messages, name, sent['received'], answer, times.size)
         for name in (MOVES, FEEDBACK)
