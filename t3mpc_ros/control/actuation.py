@@ -41,6 +41,7 @@ class LimitParameters(Parameters):
     linear: float = parameter(
         0.35,
         'maximum forward speed |v|',
+        name='linear.x.max_velocity',
         unit='m/s',
         low=0.01,
         high=5.0,
@@ -49,6 +50,7 @@ class LimitParameters(Parameters):
     angular: float = parameter(
         4.5,
         'maximum yaw rate |omega|',
+        name='angular.z.max_velocity',
         unit='rad/s',
         low=0.05,
         high=50.0,
@@ -57,20 +59,34 @@ class LimitParameters(Parameters):
     wheel_speed: float = parameter(
         10.0,
         'maximum wheel speed; from this speed a robot without commands stops within 0.5 s',
+        name='wheel.max_velocity',
         unit='rad/s',
         low=0.1,
         high=200.0,
         dynamic=True,
     )
     linear_acceleration: float = parameter(
-        1.0, 'maximum |dv/dt|', unit='m/s²', low=0.01, high=50.0, dynamic=True
+        1.0,
+        'maximum |dv/dt|',
+        name='linear.x.max_acceleration',
+        unit='m/s²',
+        low=0.01,
+        high=50.0,
+        dynamic=True,
     )
     angular_acceleration: float = parameter(
-        14.0, 'maximum |d omega/dt|', unit='rad/s²', low=0.05, high=500.0, dynamic=True
+        14.0,
+        'maximum |d omega/dt|',
+        name='angular.z.max_acceleration',
+        unit='rad/s²',
+        low=0.05,
+        high=500.0,
+        dynamic=True,
     )
     wheel_acceleration: float = parameter(
         30.0,
         'maximum acceleration of a wheel, at most the limit of the robot itself',
+        name='wheel.max_acceleration',
         unit='rad/s²',
         low=0.1,
         high=1e4,

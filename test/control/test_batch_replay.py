@@ -13,6 +13,7 @@ import pytest
 from t3mpc_ros.control.batch_replay import StepResults, replay_batch
 from t3mpc_ros.control.controller import SNAPSHOT_PERIOD, Controller, ControllerParameters
 from t3mpc_ros.control.watchdog import Reason
+from t3mpc_ros.evaluation.process_replay import controller_replay
 from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
 from t3mpc_ros.evaluation.process_replay.controller_replay import (
     make_controllers,

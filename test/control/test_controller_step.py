@@ -383,9 +383,9 @@ def test_the_weights_survive_saving_and_loading(tmp_path):
     path = tmp_path / 'model.npz'
     save_model(path, law.get_weights(), QUIET.to_dict())
     other = Nt3fsMpcController(QUIET)
-    other.restore(load_model(path))
+    other.set_weights(load_model(path))
     for name, value in law.get_weights().items():
-        np.testing.assert_array_equal(other.learnt()[name], value, err_msg=name)
+        np.testing.assert_array_equal(other.get_weights()[name], value, err_msg=name)
 
     with pytest.raises(ModelError, match='cannot read'):
         load_model(tmp_path / 'none.npz')
@@ -396,7 +396,7 @@ def test_the_weights_survive_saving_and_loading(tmp_path):
         save_model(tmp_path / 'none' / 'x.npz', law.get_weights(), {})
     smaller = Nt3fsMpcController(replace(QUIET, fuzzy=replace(QUIET.fuzzy, sets=2)))
     with pytest.raises(ValueError, match='coefficients must have shape'):
-        smaller.restore(load_model(path))
+        smaller.set_weights(load_model(path))
 
 
 def test_a_model_of_another_format_is_rejected(tmp_path, monkeypatch):
@@ -419,9 +419,8 @@ def test_wheels_to_twist_and_back_is_the_identity():
 
 COMPILES = """
 import sys
-from t3mpc_ros.control.controller import (Controller, ControllerParameters)
-from t3mpc_ros.geometry.types import (BodyTwist, State)
-from t3mpc_ros.geometry.types import ORIGIN
+from t3mpc_ros.control.controller import Controller, ControllerParameters
+from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, State
 
 def signatures():
     modules = [module for name, module in sys.modules.items() if name.startswith('t3mpc_ros')]
@@ -435,8 +434,8 @@ before = signatures()
 twist = BodyTwist(0.0, 0.0)
 for k in range(100):
     jumped = 0.2 if k > 50 else 0.0
-    controller.add_reference(Motion((k + 40) * 10_000_000, ORIGIN, BodyTwist(jumped, 0.1)))
-    twist, status = controller.step(Motion(k * 10_000_000, ORIGIN, twist))
+    controller.add_reference(State((k + 40) * 10_000_000, ORIGIN, BodyTwist(jumped, 0.1)))
+    twist, status = controller.step(State(k * 10_000_000, ORIGIN, twist))
 assert status.reason.name == 'TRACKING', status
 after = signatures()
 print({name for name in after if after[name] != before[name]} or 'nothing')
