@@ -342,7 +342,9 @@ class BatchStepper:
         parts, state = self._parts, self._state.tolist()
         law = parts.tracker.law
         parts.trajectory.synchronize(state[TRAJECTORY_FIRST], state[TRAJECTORY_END])
-        parts.watchdog.synchronize(state[LAST_NS], state[REFERENCE_NS], pending=bool(state[PENDING]))
+        parts.watchdog.synchronize(
+            state[LAST_NS], state[REFERENCE_NS], pending=bool(state[PENDING])
+        )
         if len(results):
             parts.tracker.transition.count = state[TRANSITIONS]
             law.predictive.synchronize(state[PHASE], state[SAMPLES])
