@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The emulated board against the firmware's core: the same packets, the same answers."""
+"""Differential test of the emulated board and the firmware core: equal packets, equal replies."""
 
 import ctypes
 from pathlib import Path
@@ -66,7 +66,7 @@ def library(tmp_path_factory):
 
 
 class Pair:
-    """The C core and the emulated board, told the same."""
+    """The firmware core and the emulated board with the same input."""
 
     def __init__(self, library, key=b''):
         self.library = library
@@ -78,8 +78,8 @@ class Pair:
         if key:
             self.call('store_key', key)
         self.call('set_cell_us', ctypes.c_uint32(CELL_US))
-        self.said = b''
-        self.board.console.reply = self._say
+        self.console_output = b''
+        self.board.console.reply = self._record
         self.call('boot', ctypes.c_uint8(1), ctypes.c_uint32(0))
         self.call('set_imu', ctypes.c_bool(True), (ctypes.c_int16 * 7)(*SAMPLE))
         self.now = 0
@@ -87,27 +87,27 @@ class Pair:
     def _load(self, payload):
         self.loaded = payload
 
-    def _say(self, data):
-        self.said += data
+    def _record(self, data):
+        self.console_output += data
 
     def usb(self, data):
-        """Send bytes over the cable."""
+        """Send bytes to both consoles."""
         self.call('usb', bytes(data), ctypes.c_uint32(len(data)))
         self.board.console.feed(bytes(data))
 
-    def ask(self, frame, us=1000):
-        """Return what both answer over the cable within a time: the same, or nothing."""
+    def request(self, frame, us=1000):
+        """Send a frame to both consoles; return their common replies within a time."""
         self.usb(encode_frame(encode(frame)))
         self.run(us)
-        return [decode_from_board(data) for data in FrameDecoder().feed(self.heard())]
+        return [decode_from_board(data) for data in FrameDecoder().feed(self.console_replies())]
 
-    def heard(self):
-        """Return what both have said over the cable since the last call."""
+    def console_replies(self):
+        """Return the output of both consoles since the last call; check that it is equal."""
         room = ctypes.create_string_buffer(4096)
         size = self.call('usb_take', room, ctypes.c_uint32(4096))
-        said, self.said = self.said, b''
-        assert said.hex() == room.raw[:size].hex()
-        return said
+        output, self.console_output = self.console_output, b''
+        assert output.hex() == room.raw[:size].hex()
+        return output
 
     def __del__(self):
         self.call('free')
@@ -133,9 +133,9 @@ class Pair:
         self.call('press', ctypes.c_bool(pressed))
         self.board.press_button(pressed)
 
-    def imu(self, answers):
-        self.call('set_imu', ctypes.c_bool(answers), (ctypes.c_int16 * 7)(*SAMPLE))
-        self.hardware.registers = SAMPLE if answers else None
+    def imu(self, present):
+        self.call('set_imu', ctypes.c_bool(present), (ctypes.c_int16 * 7)(*SAMPLE))
+        self.hardware.registers = SAMPLE if present else None
 
     def reset(self):
         self.run(-self.now % 1000)
@@ -147,44 +147,45 @@ class Pair:
     def compare(self):
         room = ctypes.create_string_buffer(32)
         size = self.call('ack', room)
-        ours, theirs = self.loaded, room.raw[:size]
+        emulated, real = self.loaded, room.raw[:size]
         speeds = self.call('speed', 0), self.call('speed', 1)
         assert self.board.speeds == speeds
         assert self.board.powered == self.call('powered')
         steps = self.call('steps', 0), self.call('steps', 1)
-        for mine, its in zip(self.board.counters, steps, strict=True):
-            # A pulse generator in 50 us ticks rounds otherwise than one without.
-            assert abs(mine - its) <= 3 + abs(its) * 1e-5
-        if ours[:1] == b'\x11' and len(ours) == len(theirs) == 32:
-            ours, theirs = ours[:8] + ours[16:], theirs[:8] + theirs[16:]
-        assert ours.hex() == theirs.hex()
+        for emulated_steps, real_steps in zip(self.board.counters, steps, strict=True):
+            # The pulse generator of the firmware has ticks of 50 us.
+            assert abs(emulated_steps - real_steps) <= 3 + abs(real_steps) * 1e-5
+        if emulated[:1] == b'\x11' and len(emulated) == len(real) == 32:
+            # Without the step counters, which are compared above.
+            emulated, real = emulated[:8] + emulated[16:], real[:8] + real[16:]
+        assert emulated.hex() == real.hex()
 
 
 class Driver:
-    """A host that errs in every way, by rng."""
+    """A host that sends random valid, invalid and damaged packets."""
 
     def __init__(self, pair, key, seed):
         self.pair, self.key = pair, key
         self.rng = random.Random(seed)
         self.session, self.seq, self.epoch = 0, 0, 0
-        self.travel = 1000
+        self.delay = 1000
         self.session_key = b''
         self.sent = [bytes(14)]
 
     @property
     def host_us(self):
-        return (self.pair.now - self.travel) % WRAP
+        return (self.pair.now - self.delay) % WRAP
 
-    def greet(self):
+    def hello(self):
         self.session = self.rng.randint(1, 255)
         self.seq = 0
-        nonce, theirs = self.rng.randbytes(8), self.rng.randbytes(8)
+        nonce, robot_nonce = self.rng.randbytes(8), self.rng.randbytes(8)
         if self.key:
             hello = sign_hello(self.key, self.session, 0, self.host_us, nonce)
-            self.session_key = session_key(self.key, nonce, theirs)
+            self.session_key = session_key(self.key, nonce, robot_nonce)
         else:
             hello = Hello(self.session, 0, self.host_us)
-        self.pair.hello(hello, theirs)
+        self.pair.hello(hello, robot_nonce)
 
     def signed(self, frame):
         if not self.key:
@@ -212,7 +213,7 @@ class Driver:
             case 0:
                 return encode(ParamGet(session, rng.randrange(256), number))
             case 1 | 2:
-                # Far enough from 1 that the microsteps of the next start are usual ones.
+                # Values that keep the microsteps of the next boot in the usual range.
                 value = rng.choice((0, 1, 3, 16, 32, 100, 250, 5000, 9000, 30000, 10**6))
                 return self.signed(ParamSet(session, rng.randrange(256), number, value))
             case 3:
@@ -250,7 +251,7 @@ class Driver:
             case 4:
                 pair.imu(rng.random() < 0.7)
             case 5:
-                self.greet()
+                self.hello()
             case 6:
                 pair.run(rng.choice((300_000, 1_000_000, 6_000_000)))
             case 7:
@@ -264,11 +265,11 @@ class Driver:
 @pytest.mark.parametrize('key', [b'', KEY], ids=['open', 'keyed'])
 @pytest.mark.parametrize('seed', range(12))
 def test_emulated_board_and_firmware_reply_alike(library, key, seed):
-    """600 random packets, requests, resets and silences; every answer and every ramp compared."""
+    """600 random packets, requests, resets and silences; all replies and ramps are compared."""
     pair = Pair(library, key)
     driver = Driver(pair, key, seed)
     pair.run(1000)
-    driver.greet()
+    driver.hello()
     moved, kinds = False, set()
     for _ in range(600):
         pair.run(driver.rng.choice((700, 1500, 5000, 20_000, 19_950)))
@@ -283,28 +284,28 @@ def test_emulated_board_and_firmware_reply_alike(library, key, seed):
 
 
 def test_board_and_firmware_agree_after_a_session_timeout(library):
-    """The emulator once told a nonce of zeros then, as if nobody had ever greeted it."""
+    """INFO still contains the last nonce; the emulator once reported zeros."""
     pair = Pair(library, KEY)
     pair.run(1000)
     driver = Driver(pair, KEY, 1)
-    driver.greet()
+    driver.hello()
     pair.run(1_801_000_000)
     assert pair.board.session == 0
     pair.packet(encode(Poll(0, 0, 2)))
     pair.run(1000)
     pair.compare()
     assert pair.loaded[-8:] != bytes(8)
-    driver.greet()
+    driver.hello()
     pair.run(1000)
     pair.compare()
     assert pair.board.session == driver.session
 
 
-# -- the robot's own USB --------------------------------------------------------------------------
+# -- USB console ----------------------------------------------------------------------------------
 
 OTHER = bytes(range(0x20, 0x30))
 WRITTEN_US = 25 * CELL_US
-"""A key, both marks, and the count of starts that goes with a key."""
+"""Time to write a key, both marks and the boot counter."""
 
 
 @pytest.fixture
@@ -315,27 +316,27 @@ def pair(library):
 
 
 def test_a_key_from_the_console_locks_out_other_hosts_at_once(pair):
-    assert pair.ask(Key(1)) == [KeyState(1, OK, NO_KEY, 0)]
-    assert pair.ask(Key(2, KEY)) == []
+    assert pair.request(Key(1)) == [KeyState(1, OK, NO_KEY, 0)]
+    assert pair.request(Key(2, KEY)) == []
     assert pair.call('writing')
-    assert pair.ask(Key(3, OTHER)) == [KeyState(3, BUSY, KEY_DAMAGED, 0)]
+    assert pair.request(Key(3, OTHER)) == [KeyState(3, BUSY, KEY_DAMAGED, 0)]
     pair.packet(encode(Hello(0x5A, 0, pair.now)))
     pair.run(WRITTEN_US)
-    (told,) = [decode_from_board(data) for data in FrameDecoder().feed(pair.heard())]
-    assert told == KeyState(2, OK, KEY_HELD, key_check(KEY))
+    (state,) = [decode_from_board(data) for data in FrameDecoder().feed(pair.console_replies())]
+    assert state == KeyState(2, OK, KEY_HELD, key_check(KEY))
     pair.packet(encode(Hello(0x5A, 0, pair.now)))  # unsigned
     pair.run(1000)
     pair.compare()
     assert pair.board.session == 0
     driver = Driver(pair, KEY, 1)
-    driver.greet()
+    driver.hello()
     assert pair.board.session == driver.session
     pair.reset()
     pair.run(1000)
-    assert pair.ask(Key(4)) == [KeyState(4, OK, KEY_HELD, key_check(KEY))]
-    assert pair.ask(Key(5, bytes(16)), WRITTEN_US) == [KeyState(5, OK, NO_KEY, 0)]
+    assert pair.request(Key(4)) == [KeyState(4, OK, KEY_HELD, key_check(KEY))]
+    assert pair.request(Key(5, bytes(16)), WRITTEN_US) == [KeyState(5, OK, NO_KEY, 0)]
     driver = Driver(pair, b'', 1)
-    driver.greet()
+    driver.hello()
     pair.run(1000)
     pair.compare()
     assert pair.board.session == driver.session
@@ -343,18 +344,18 @@ def test_a_key_from_the_console_locks_out_other_hosts_at_once(pair):
 
 def test_no_key_is_written_while_the_drivers_have_power(pair):
     driver = Driver(pair, b'', 1)
-    driver.greet()
+    driver.hello()
     drive = Command(driver.session, 1, CommandFlag.ENABLE, 5, 3000, 3000, driver.host_us)
     pair.packet(encode(drive))
-    assert pair.ask(Key(1, KEY), 10) == [KeyState(1, BUSY, NO_KEY, 0)]
+    assert pair.request(Key(1, KEY), 10) == [KeyState(1, BUSY, NO_KEY, 0)]
     pair.run(20_000)
-    assert pair.ask(Key(2, KEY)) == [KeyState(2, BUSY, NO_KEY, 0)]
-    pair.run(1_000_000)  # the time to live is over, the drivers hold the wheels
+    assert pair.request(Key(2, KEY)) == [KeyState(2, BUSY, NO_KEY, 0)]
+    pair.run(1_000_000)  # the TTL has expired, the drivers are on
     assert pair.board.speeds == (0, 0)
-    assert pair.ask(Key(3, KEY)) == [KeyState(3, BUSY, NO_KEY, 0)]
+    assert pair.request(Key(3, KEY)) == [KeyState(3, BUSY, NO_KEY, 0)]
     pair.packet(encode(Command(driver.session, 2, 0, 0, 0, 0, driver.host_us)))
     pair.run(1000)
-    assert pair.ask(Key(4, KEY), WRITTEN_US) == [KeyState(4, OK, KEY_HELD, key_check(KEY))]
+    assert pair.request(Key(4, KEY), WRITTEN_US) == [KeyState(4, OK, KEY_HELD, key_check(KEY))]
     assert pair.board.session == 0
     pair.compare()
 
@@ -362,16 +363,16 @@ def test_no_key_is_written_while_the_drivers_have_power(pair):
 @pytest.mark.parametrize('before', [b'', KEY], ids=['none', 'another'])
 @pytest.mark.parametrize('after', [bytes(16), OTHER], ids=['none', 'one'])
 def test_power_loss_leaves_the_old_key_the_new_key_or_a_lock(library, before, after):
-    """Power is cut at every cell; a robot that is locked moves nothing, and can be given a key."""
+    """Power fails at every cell; a locked robot does not move, and accepts a new key."""
     states = set()
     for cut_us in range(CELL_US // 2, 22 * CELL_US, CELL_US):
         pair = Pair(library, before)
-        pair.run(50_000)  # a robot with a key has counted its start
-        pair.ask(Key(1, after), cut_us)
-        pair.heard()
+        pair.run(50_000)  # a robot with a key increments its boot counter
+        pair.request(Key(1, after), cut_us)
+        pair.console_replies()
         pair.reset()
         pair.run(1000)
-        ((number, rc, state, check),) = pair.ask(Key(2))
+        ((number, rc, state, check),) = pair.request(Key(2))
         assert (number, rc) == (2, OK)
         kept = check == key_check(before) if before else state == NO_KEY
         changed = check == key_check(after) if any(after) else state == NO_KEY
@@ -379,7 +380,7 @@ def test_power_loss_leaves_the_old_key_the_new_key_or_a_lock(library, before, af
         states.add('kept' if kept else 'changed' if changed else 'damaged')
         if state == KEY_DAMAGED:
             driver = Driver(pair, OTHER, 1)
-            driver.greet()
+            driver.hello()
             pair.run(1000)
             pair.compare()
             assert pair.board.session == 0
@@ -387,8 +388,8 @@ def test_power_loss_leaves_the_old_key_the_new_key_or_a_lock(library, before, af
             pair.run(1000)
             pair.compare()
             assert pair.board.status & StatusFlag.ESTOP
-            told = KeyState(3, OK, KEY_HELD, key_check(KEY))
-            assert pair.ask(Key(3, KEY), WRITTEN_US) == [told]
+            expected = KeyState(3, OK, KEY_HELD, key_check(KEY))
+            assert pair.request(Key(3, KEY), WRITTEN_US) == [expected]
     assert states == (
         {'kept', 'damaged', 'changed'} if before or any(after) else {'kept'} | states
     )
@@ -414,10 +415,10 @@ def test_no_damaged_console_frame_changes_the_key(pair, seed):
             continue
         pair.usb(wire + b'\0')
         pair.run(200)
-        pair.heard()
+        pair.console_replies()
     assert not pair.call('writing')
-    assert pair.ask(Key(1)) == [KeyState(1, OK, NO_KEY, 0)]
-    (pong,) = pair.ask(Ping(2, b'ping'))
+    assert pair.request(Key(1)) == [KeyState(1, OK, NO_KEY, 0)]
+    (pong,) = pair.request(Ping(2, b'ping'))
     assert isinstance(pong, Pong)
     assert pong.crc_errors > 50
 
@@ -425,14 +426,14 @@ def test_no_damaged_console_frame_changes_the_key(pair, seed):
 def test_frames_for_a_dongle_are_refused(pair):
     for frame in (b'\x01\x00\x00\x01\x15', b'\x02\x00', b'\x05'):
         pair.usb(encode_frame(frame))
-        (told,) = FrameDecoder().feed(pair.heard())
-        assert decode_from_board(told) == Refusal(1, frame[0])
+        (state,) = FrameDecoder().feed(pair.console_replies())
+        assert decode_from_board(state) == Refusal(1, frame[0])
     pair.usb(encode_frame(b'\x04'))
-    assert decode_from_board(FrameDecoder().feed(pair.heard())[0]) == Refusal(2, 4)
+    assert decode_from_board(FrameDecoder().feed(pair.console_replies())[0]) == Refusal(2, 4)
 
 
 def test_a_worn_cell_is_reported_and_locks_the_robot(library):
-    """The emulator's memory does not wear out: this is the firmware alone."""
+    """The firmware alone: EEPROM wear is not emulated."""
     for address in (8, 20, 25, 26):
         pair = Pair(library)
         pair.run(1000)
@@ -441,5 +442,5 @@ def test_a_worn_cell_is_reported_and_locks_the_robot(library):
         pair.call('run', ctypes.c_uint32(WRITTEN_US))
         room = ctypes.create_string_buffer(64)
         size = pair.call('usb_take', room, ctypes.c_uint32(64))
-        (told,) = FrameDecoder().feed(room.raw[:size])
-        assert decode_from_board(told) == KeyState(1, FAILED, KEY_DAMAGED, 0)
+        (state,) = FrameDecoder().feed(room.raw[:size])
+        assert decode_from_board(state) == KeyState(1, FAILED, KEY_DAMAGED, 0)

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The link of the host against the emulated dongle and robot: driving, losing, stopping."""
+"""Host link against the emulated dongle and robot: motion, packet loss, stops, recovery."""
 
 import math
 import random
@@ -18,8 +18,8 @@ KEY = bytes(range(16))
 STEP = math.tau / 3200
 
 
-def at_rest(bench):
-    """Let everything come to rest, and its measurement arrive."""
+def run_to_rest(bench):
+    """Stop the robot, and run until its final state has arrived."""
     bench.release_controls()
     bench.run(2.0)
 
@@ -31,7 +31,7 @@ def test_counters_equal_the_pulses_of_the_plant_over_60_s():
         bench.drive(5.0 * math.sin(0.7 * second), 6.0 * math.cos(0.4 * second))
         bench.run(1.0)
         assert bench.link.reason(bench.now_ns) == ''
-    at_rest(bench)
+    run_to_rest(bench)
     right, left = bench.link.telemetry.angles
     pulses = bench.plant.pulses
     assert (round(left / STEP), round(right / STEP)) == pulses
@@ -51,10 +51,10 @@ def test_round_trip_time_is_that_of_line_radio_and_gap():
     bench.drive(3.0, 3.0)
     bench.run(5.0)
     quality = bench.link.quality(bench.now_ns)
-    # COBS may need no byte more than one, so the length never varies.
+    # COBS always adds one byte, so the length is constant.
     assert quality.round_trip_median == pytest.approx(5.04e-3, abs=0.02e-3)
     assert quality.round_trip_p99 == pytest.approx(quality.round_trip_median, abs=1e-6)
-    # Sampled when the answer to the CMD of the same cycle is loaded, not one cycle before.
+    # Sampled when the reply to the CMD of this cycle is loaded, not one cycle before.
     assert 60 <= bench.link.telemetry.raw.age <= 80
 
 
@@ -91,7 +91,7 @@ def test_loss_in_one_direction_costs_fewer_cycles():
         quality = bench.link.quality(bench.now_ns)
         lost[name] = quality.lost
         assert quality.lost / quality.cycles < 0.03
-        # What came again because its acknowledgement was lost is acknowledged, not obeyed twice.
+        # A retransmission after a lost acknowledgement is acknowledged, not executed again.
         assert quality.robot.duplicates == 0
         check_followed(bench)
 
@@ -104,7 +104,7 @@ def test_loss_in_one_direction_costs_fewer_cycles():
 )
 @pytest.mark.parametrize('speed, deceleration', [(7.0, 30.0), (10.0, 50.0)])
 def test_wheels_rest_within_045_s_of_the_last_command(fault, speed, deceleration):
-    """Whatever keeps commands away; silence is also what a killed host leaves behind."""
+    """For every fault that interrupts the commands; ``silence`` also covers a dead host."""
     link = LinkParameters.from_dict({'robot.deceleration': deceleration})
     bench = Bench(link=link)
     bench.connect()
@@ -112,19 +112,19 @@ def test_wheels_rest_within_045_s_of_the_last_command(fault, speed, deceleration
     bench.run(2.0)
     assert bench.plant.wheels.right == pytest.approx(speed, abs=0.3)
     bench.inject(fault, 3.0)
-    rest_ns = []
+    still_ns = []
 
-    def watch():
+    def check_speeds():
         still = bench.board.speeds == (0, 0)
         if still and max(map(abs, bench.plant.wheels)) < 0.2:
-            rest_ns.append(bench.now_ns)
+            still_ns.append(bench.now_ns)
 
-    bench.each = watch
+    bench.each = check_speeds
     bench.run(1.0)
     last_ns = bench.followed[-1][0]
-    assert rest_ns, 'the wheels never came to rest'
-    assert rest_ns[0] - last_ns <= 0.45e9
-    assert rest_ns[-1] == bench.now_ns
+    assert still_ns, 'the wheels did not stop'
+    assert still_ns[0] - last_ns <= 0.45e9
+    assert still_ns[-1] == bench.now_ns
 
 
 def test_a_reset_stops_the_pulses_and_the_wheels_coast():
@@ -156,14 +156,14 @@ def test_shutdown_leaves_the_robot_at_rest_with_drivers_off():
 
 
 def test_a_burst_held_for_a_second_does_not_move_the_robot():
-    """Fifteen commands on their way for 1 s, all at once: each is refused, the wheels stand."""
+    """Fifteen commands, delayed by 1 s and released at once, are rejected."""
     bench = Bench()
     bench.connect()
     bench.run(1.0)
     session = bench.board.session
     held_us = bench.now_ns // 1000
     bench.run(1.0)
-    bench.inject('silence')  # so that no prompt command comes between
+    bench.inject('silence')  # no prompt command in between
     bench.run(1.0)
     before = bench.board.counters
     assert not bench.followed or bench.followed[-1][1].left == 0
@@ -216,12 +216,12 @@ def test_the_link_recovers_from_every_fault(name, key):
 @pytest.mark.parametrize('key', [b'', KEY], ids=['open', 'keyed'])
 @pytest.mark.parametrize('seed', range(8))
 def test_no_wrong_or_stale_command_is_executed(seed, key):
-    """A fault every half second for half a minute, most of them overlapping others."""
+    """A fault every half second for half a minute, most of them overlapping."""
     rng = random.Random(seed)
     bench = Bench({'robot_clock_error': rng.uniform(-0.005, 0.005)}, key=key, seed=seed)
     bench.connect()
     names = [kind.name for kind in FAULT_KINDS]
-    # After these it takes seconds until there are commands again that could be wrong.
+    # Commands resume only seconds after these faults.
     slow = ('dongle_reset', 'close_port', 'move_link', 'radio_dead', 'robot_reset', 'button')
     weights = [0.1 if name in slow else 1.0 for name in names]
     for _ in range(60):
@@ -237,7 +237,7 @@ def test_no_wrong_or_stale_command_is_executed(seed, key):
     assert bench.link.reason(bench.now_ns) == ''
 
 
-# -- what the robot tells -------------------------------------------------------------------------
+# -- telemetry ------------------------------------------------------------------------------------
 
 
 def test_wheel_angles_continue_over_a_reboot_of_the_robot():
@@ -245,13 +245,13 @@ def test_wheel_angles_continue_over_a_reboot_of_the_robot():
     bench.connect()
     bench.drive(5.0, 5.0)
     bench.run(2.0)
-    at_rest(bench)
+    run_to_rest(bench)
     before = bench.link.telemetry.angles
     bench.inject('robot_reset')
     bench.run(3.0)
     bench.drive(5.0, 5.0)
     bench.run(2.0)
-    at_rest(bench)
+    run_to_rest(bench)
     assert bench.link.quality(bench.now_ns).robot_resets == 1
     turned = bench.link.telemetry.angles.right - before.right
     assert round(turned / STEP) == bench.plant.pulses[1] > 3000
@@ -276,7 +276,7 @@ def test_gyro_ranges_and_battery_are_those_of_the_plant():
     bench.drive(3.0, -3.0)
     bench.run(3.0)
     telemetry = bench.link.telemetry
-    # Turning on the spot: 6 rad/s between wheels of 35 mm on a track of 147 mm.
+    # Rotation on the spot: speed difference 6 rad/s, wheel radius 35 mm, separation 147 mm.
     assert telemetry.imu.angular == pytest.approx(6.0 * 0.035 / 0.147, rel=0.05)
     assert any(math.isfinite(distance) for distance in telemetry.ranges)
     assert 11.0 < bench.link.battery.voltage < 13.0
@@ -301,7 +301,7 @@ def test_an_empty_battery_switches_the_board_off():
 
 
 def test_the_same_seed_gives_the_same_bytes():
-    def bytes_heard():
+    def run():
         bench = Bench({'twin.world': 'room'}, seed=4)
         bench.inject('loss', math.inf, 0.2)
         bench.inject('flip_bits')
@@ -310,7 +310,7 @@ def test_the_same_seed_gives_the_same_bytes():
         bench.run(3.0)
         return bench.written, bench.followed, bench.link.telemetry
 
-    assert bytes_heard() == bytes_heard()
+    assert run() == run()
 
 
 def test_inverted_wheels_count_in_the_commanded_direction():
@@ -320,7 +320,7 @@ def test_inverted_wheels_count_in_the_commanded_direction():
     bench.drive(4.0, 4.0)
     bench.run(2.0)
     assert bench.plant.wheels.right == pytest.approx(-4.0, abs=0.3)
-    at_rest(bench)
+    run_to_rest(bench)
     right = round(bench.link.telemetry.angles.right / STEP)
     assert right == -bench.plant.pulses[1] > 3000
 
@@ -377,7 +377,7 @@ def test_a_sender_without_the_key_can_stop_a_moving_robot():
 
 
 def test_replayed_or_forged_frames_do_not_move_a_keyed_robot():
-    """Replays, flipped bits, forged tags and stamps, between the packets of the host."""
+    """Replays, inverted bits, forged tags and stamps, between the packets of the host."""
     rng = random.Random(3)
     bench = Bench(key=KEY)
     bench.connect()
@@ -385,9 +385,9 @@ def test_replayed_or_forged_frames_do_not_move_a_keyed_robot():
     tried = 0
     for _ in range(100):
         bench.run(0.05)
-        heard = [encode(command) for command in sent_commands(bench)]
+        recorded = [encode(command) for command in sent_commands(bench)]
         for _ in range(30):
-            data = bytearray(rng.choice(heard))
+            data = bytearray(rng.choice(recorded))
             match rng.randrange(5):
                 case 1 | 2:
                     for _ in range(rng.choice((1, 1, 2, 3))):
@@ -399,12 +399,12 @@ def test_replayed_or_forged_frames_do_not_move_a_keyed_robot():
                     data[10:14] = ((bench.now_ns // 1000) & 0xFFFFFFFF).to_bytes(4, 'little')
                     data[2] = (data[2] + rng.randrange(128)) % 256
             if data[0] == 0x11 and data[3] & CommandFlag.ESTOP:
-                continue  # stopping is always allowed
+                continue  # an emergency stop is always accepted
             bench.board.receive(bytes(data))
             tried += 1
     bench.run(0.1)
     assert tried > 2000
     check_followed(bench)
     assert bench.link.reason(bench.now_ns) == ''
-    # Those of the host were all taken in spite of it.
+    # The commands of the host are executed nevertheless.
     assert len(bench.followed) > 0.95 * len(sent_commands(bench))

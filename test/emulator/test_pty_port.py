@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""``t3mpc emulator`` as a process on the wall clock, and the pseudo terminal it stands behind."""
+"""Pseudo-terminal port of the emulator, and ``t3mpc emulator`` as a process."""
 
 import os
 from pathlib import Path
@@ -28,7 +28,7 @@ KEY = bytes(range(16))
 
 
 class Host:
-    """The link over the real port on the wall clock."""
+    """Host link over a real port, on the wall clock."""
 
     def __init__(self, path, key=b''):
         self.path = str(path)
@@ -37,7 +37,7 @@ class Host:
         self.wheels = None
 
     def run(self, seconds, until=None):
-        """Let time pass; return whether ``until`` held."""
+        """Run for a time or until ``until`` holds; return whether it holds."""
         end = time.monotonic() + seconds
         received = b''
         while time.monotonic() < end:
@@ -45,27 +45,27 @@ class Host:
             if self.wheels is not None:
                 self.link.command(RobotCommand(self.wheels, now), now)
             wake = now
-            deeds = self.link.step(now, received)
+            actions = self.link.step(now, received)
             received = b''
-            for deed in deeds:
-                wake = self._do(deed, wake)
+            for action in actions:
+                wake = self._do(action, wake)
             if until is not None and until():
                 return True
             received = self._read(min((wake - time.monotonic_ns()) / 1e9, 0.02))
         return until is None
 
-    def _do(self, deed, wake):
+    def _do(self, action, wake):
         now = time.monotonic_ns()
         try:
-            if isinstance(deed, Wait):
-                return deed.until_ns
-            if isinstance(deed, Open):
+            if isinstance(action, Wait):
+                return action.until_ns
+            if isinstance(action, Open):
                 self.port = SerialPort(self.path)
                 self.link.port_opened(now)
-            elif isinstance(deed, Close):
+            elif isinstance(action, Close):
                 self.close()
-            elif isinstance(deed, Write) and self.port is not None:
-                self.port.write(deed.data)
+            elif isinstance(action, Write) and self.port is not None:
+                self.port.write(action.data)
         except PortError as error:
             self.port = None
             self.link.port_failed(str(error), error.absent, now)
@@ -98,18 +98,18 @@ class Process:
         )
 
     def ready(self):
-        """Return the line that says where it is."""
+        """Return the line with the path of the port."""
         for line in self.child.stdout:
             if 'dongle and robot' in line:
                 return line
         raise AssertionError(self.child.stderr.read())
 
     def stop(self, number):
-        """Return the exit code and what it said last."""
+        """Send a signal; return the exit code and the remaining output."""
         self.child.send_signal(number)
-        said, wrong = self.child.communicate(timeout=20)
-        assert wrong == ''
-        return self.child.returncode, said
+        output, errors = self.child.communicate(timeout=20)
+        assert errors == ''
+        return self.child.returncode, output
 
 
 @pytest.fixture
@@ -133,11 +133,11 @@ def test_a_host_drives_the_process_over_a_pty_with_a_key(start, tmp_path):
     key_file.write_text(KEY.hex())
     key_file.chmod(0o600)
     path = tmp_path / 'dongle'
-    # On a busy machine a second of the host need not be one of the emulator: faults by its clock.
+    # Faults on the clock of the emulator: on a busy machine it is slower than that of the host.
     process = start('--link', path, '--key', key_file, '--loss', '0.05', '--fault', 'close_port:4')
-    said = process.ready()
-    assert str(path) in said
-    assert f'kill {process.child.pid}' in said
+    ready = process.ready()
+    assert str(path) in ready
+    assert f'kill {process.child.pid}' in ready
     host = Host(path, KEY)
     link = host.link
     assert host.run(10.0, lambda: link.state is LinkState.RUN)
@@ -149,13 +149,13 @@ def test_a_host_drives_the_process_over_a_pty_with_a_key(start, tmp_path):
     link.shut_down()
     assert host.run(5.0, lambda: link.state is LinkState.DONE)
     host.close()
-    code, said = process.stop(signal.SIGTERM)
+    code, output = process.stop(signal.SIGTERM)
     assert code == 0
-    *news, last = said.splitlines()
+    *reports, last = output.splitlines()
     assert last == 't3mpc emulator: stopped'
-    # Once when the dongle was pulled out, and for the end if the wheels had begun to turn again.
-    took = [re.search('at rest ([0-9.]+) s after the last command', line)[1] for line in news]
-    assert max(map(float, took)) <= 0.45
+    # One stop when the dongle is unplugged, and one at the end if the wheels turned again.
+    times = [re.search('at rest ([0-9.]+) s after the last command', line)[1] for line in reports]
+    assert max(map(float, times)) <= 0.45
     assert not path.is_symlink()
 
 
@@ -170,17 +170,17 @@ def test_ctrl_c_removes_the_link(start, tmp_path):
 
 
 def test_the_terminal_is_raw_before_it_is_published(tmp_path):
-    """A cooked one would send back what the host writes, and turn carriage returns."""
+    """A cooked terminal echoes the input and translates carriage returns."""
     port = PtyPort(tmp_path / 'dongle')
     assert port.wait(0.0) is None
     client = os.open(tmp_path / 'dongle', os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     assert not termios.tcgetattr(client)[3] & (termios.ECHO | termios.ICANON)
-    everything = bytes(range(256))
-    os.write(client, everything)
-    assert port.wait(1.0) == everything
-    port.write(everything)
+    data = bytes(range(256))
+    os.write(client, data)
+    assert port.wait(1.0) == data
+    port.write(data)
     select.select([client], [], [], 1.0)
-    assert os.read(client, 1000) == everything
+    assert os.read(client, 1000) == data
     os.close(client)
     assert port.wait(0.0) is None
     port.close()
@@ -232,7 +232,7 @@ def test_a_file_is_not_replaced(tmp_path):
 
 
 @pytest.mark.parametrize(
-    'arguments, words',
+    'arguments, text',
     [
         (['--fault', 'jamm:1'], 'did you mean jam'),
         (['--set', 'twin.nothing=1'], 'twin.nothing'),
@@ -243,10 +243,10 @@ def test_a_file_is_not_replaced(tmp_path):
         (['--key', 'no/such/file'], 'no/such/file'),
     ],
 )
-def test_invalid_arguments_are_reported_before_the_start(arguments, words, tmp_path, capsys):
+def test_invalid_arguments_are_reported_before_the_start(arguments, text, tmp_path, capsys):
     path = tmp_path / 'dongle'
     assert emulator.main(['--link', str(path), *arguments]) == 2
-    assert words in capsys.readouterr().err
+    assert text in capsys.readouterr().err
     assert not path.is_symlink()
 
 
@@ -272,6 +272,6 @@ def test_a_number_out_of_range_is_a_usage_error(arguments, tmp_path, capsys):
 def test_help_names_every_fault(capsys):
     with pytest.raises(SystemExit):
         emulator.main(['--help'])
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     for kind in emulator.FAULT_KINDS:
-        assert f'  {kind.name} ' in said
+        assert f'  {kind.name} ' in output

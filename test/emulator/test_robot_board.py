@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The rules of the emulated board, payload by payload, on hardware that only counts."""
+"""Rules of the emulated robot board, payload by payload, with a pulse counter as hardware."""
 
 import pytest
 from support.emulator_bench import PulseCounter
@@ -24,7 +24,7 @@ MOVE = int(CommandFlag.ENABLE)
 
 
 class Robot:
-    """A board in session, and a host that takes 1 ms to reach it."""
+    """A board in a session, and a host with a delay of 1 ms."""
 
     def __init__(self):
         self.hardware = PulseCounter()
@@ -44,27 +44,27 @@ class Robot:
     def run(self, us):
         self.board.run_to(self.board.now_us + us)
 
-    def ask(self, frame):
+    def request(self, frame):
         self.board.receive(encode(frame) if not isinstance(frame, bytes) else frame)
         self.run(1000)
         return decode_uplink(self.loaded)
 
     def hello(self):
-        self.ask(Hello(SESSION, 0, self.board.now_us - 1000))
+        self.request(Hello(SESSION, 0, self.board.now_us - 1000))
 
     def command(self, left=0, right=0, flags=MOVE, ttl=20, seq=None, session=SESSION, late_us=0):
         if seq is None:
             seq = self.seq = (self.seq + 1) % 256
         host_us = self.board.now_us - 1000 - late_us
-        return self.ask(Command(session, seq, flags, ttl, left, right, host_us))
+        return self.request(Command(session, seq, flags, ttl, left, right, host_us))
 
     def set(self, number, value):
-        return self.ask(ParamSet(SESSION, 1, number, value))
+        return self.request(ParamSet(SESSION, 1, number, value))
 
     def aux(self):
-        return self.ask(Poll(0, 0, frames.AUX))
+        return self.request(Poll(0, 0, frames.AUX))
 
-    def rest(self):
+    def run_to_rest(self):
         self.run(2_000_000)
 
 
@@ -147,7 +147,7 @@ def test_any_sender_may_stop_and_only_the_session_clears(robot, session, seq):
     robot.command(5000, 5000)
     robot.run(100_000)
     robot.command(flags=CommandFlag.ESTOP, session=session, seq=seq)
-    robot.rest()
+    robot.run_to_rest()
     assert robot.status == StatusFlag.ESTOP
     robot.command(5000, 5000)
     robot.run(50_000)
@@ -173,7 +173,7 @@ def test_estop_is_not_cleared_while_the_button_is_pressed(robot):
     robot.command(5000, 5000)
     robot.run(100_000)
     robot.board.press_button(True)
-    robot.rest()
+    robot.run_to_rest()
     robot.command(flags=CommandFlag.ESTOP_CLEAR)
     robot.run(1000)
     assert robot.status == StatusFlag.ESTOP
@@ -190,17 +190,17 @@ def test_only_the_microsteps_survive_a_reboot(robot):
     assert robot.set(10, 1).rc == frames.UNKNOWN
     robot.command(5000, 5000)
     assert robot.set(4, 32).rc == frames.BUSY
-    robot.rest()
+    robot.run_to_rest()
     for number, value in ((0, 5000), (4, 32)):
-        answer = robot.set(number, value)
-        assert (answer.rc, answer.value) == (frames.OK, value)
-    assert robot.ask(Poll(0, 0, frames.INFO)).microsteps == 16
+        reply = robot.set(number, value)
+        assert (reply.rc, reply.value) == (frames.OK, value)
+    assert robot.request(Poll(0, 0, frames.INFO)).microsteps == 16
     robot.board.boot(4, robot.board.now_us)
     robot.hello()
-    info = robot.ask(Poll(0, 0, frames.INFO))
+    info = robot.request(Poll(0, 0, frames.INFO))
     assert (info.microsteps, info.reset_cause) == (32, 4)
-    assert robot.ask(ParamGet(SESSION, 1, 0)).value == 10_000
-    # 10 000 pulses a second are no more than 9.8 rad/s now.
+    assert robot.request(ParamGet(SESSION, 1, 0)).value == 10_000
+    # The limit of 10 000 pulses per second is 9.8 rad/s now.
     for _ in range(100):
         robot.command(10_000, 10_000)
         robot.run(10_000)
@@ -209,11 +209,11 @@ def test_only_the_microsteps_survive_a_reboot(robot):
 
 def test_an_action_runs_once_and_no_reset_while_moving(robot):
     robot.command(5000, 5000)
-    assert robot.ask(Action(SESSION, 1, frames.RESET_ODOMETRY)).rc == frames.BUSY
-    robot.rest()
+    assert robot.request(Action(SESSION, 1, frames.RESET_ODOMETRY)).rc == frames.BUSY
+    robot.run_to_rest()
     assert min(robot.board.counters) > 100
-    assert robot.ask(Action(SESSION, 1, frames.RESET_ODOMETRY)).rc == frames.BUSY  # asked again
-    assert robot.ask(Action(SESSION, 2, frames.RESET_ODOMETRY)).rc == frames.OK
+    assert robot.request(Action(SESSION, 1, frames.RESET_ODOMETRY)).rc == frames.BUSY  # repeated
+    assert robot.request(Action(SESSION, 2, frames.RESET_ODOMETRY)).rc == frames.OK
     assert robot.board.counters == (0, 0)
 
 
@@ -224,10 +224,10 @@ def test_drivers_switch_off_after_idle_time_but_not_while_moving(robot):
     assert robot.hardware.on
     robot.command(flags=0)
     assert robot.hardware.on
-    robot.rest()
+    robot.run_to_rest()
     assert not robot.hardware.on
     robot.command()
-    assert not robot.hardware.on  # it has stood for longer than that
+    assert not robot.hardware.on  # idle time exceeded
     robot.command(1000, 1000)
     assert robot.hardware.on
 
@@ -244,15 +244,15 @@ def test_clock_wrap_while_driving():
     robot.board.boot(1, (1 << 32) - 500_000)
     robot.seq = 0
     board = robot.board
-    robot.ask(Hello(SESSION, 0, (board.now_us - 1000) % (1 << 32)))
+    robot.request(Hello(SESSION, 0, (board.now_us - 1000) % (1 << 32)))
     for index in range(100):
         host_us = (board.now_us - 1000) % (1 << 32)
-        robot.ask(Command(SESSION, (index + 1) % 256, MOVE, 20, 3000, 3000, host_us))
+        robot.request(Command(SESSION, (index + 1) % 256, MOVE, 20, 3000, 3000, host_us))
         robot.run(19_000)
         assert board.status == StatusFlag.ENABLED | StatusFlag.MOVING
     assert board.now_us > 1 << 32
     assert robot.aux().stale == 0
-    assert robot.ask(Poll(0, 0, frames.STATE)).time_us < 2_000_000
+    assert robot.request(Poll(0, 0, frames.STATE)).time_us < 2_000_000
 
 
 def test_an_oversized_payload_is_ignored(robot):

@@ -1,0 +1,44 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Fault injection of the emulator: notation, bounds and defaults."""
+
+import pytest
+
+from t3mpc_ros.emulator.fault_injection import (
+    FAULT_KINDS,
+    Fault,
+    FaultError,
+    check_fault,
+    parse_fault,
+)
+
+
+def test_a_fault_is_written_as_name_time_duration_value():
+    assert parse_fault('jam:5:1.0') == Fault('jam', 5.0, 1.0, parse_fault('jam:5').value)
+    assert parse_fault('loss:5:inf:0.3') == Fault('loss', 5.0, float('inf'), 0.3)
+    assert parse_fault('robot_reset:2').duration == 0.5
+
+
+@pytest.mark.parametrize(
+    'text, words',
+    [
+        ('jamm:5', 'did you mean jam'),
+        ('jam', 'name:at'),
+        ('jam:1:2:3:4', 'name:at'),
+        ('jam:soon', 'numbers'),
+        ('jam:-1', 'at least 0 s'),
+        ('jam:nan', 'at least 0 s'),
+        ('jam:1:0', 'more than 0 s'),
+        ('jam:1:1:0.5', 'takes no value'),
+        ('loss:1:1:1.5', 'from 0 to 1'),
+    ],
+)
+def test_an_invalid_fault_is_rejected_with_a_reason(text, words):
+    with pytest.raises(FaultError, match=words):
+        parse_fault(text)
+
+
+def test_every_fault_has_valid_defaults():
+    for kind in FAULT_KINDS:
+        fault = check_fault(Fault(kind.name, 0.0))
+        assert fault.duration > 0.0
