@@ -3,13 +3,12 @@
 """Differential test of the emulated board and the firmware core: equal packets, equal replies."""
 
 import ctypes
-from pathlib import Path
 import random
 import shutil
-import subprocess
 
 import pytest
 from support.emulator_bench import SAMPLE, PulseCounter
+from support.firmware_core import FIRMWARE, KEY, compile_core
 
 from t3mpc_ros.emulator.board.console import CELL_US
 from t3mpc_ros.emulator.board.robot_board import RobotBoard
@@ -38,8 +37,6 @@ from t3mpc_ros.radio.protocol.frames import (
 )
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
 
-FIRMWARE = Path(__file__).resolve().parents[2] / 'firmware'
-KEY = bytes(range(0x80, 0x90))
 WRAP = 1 << 32
 
 pytestmark = pytest.mark.skipif(
@@ -49,20 +46,7 @@ pytestmark = pytest.mark.skipif(
 
 @pytest.fixture(scope='module')
 def library(tmp_path_factory):
-    target = tmp_path_factory.mktemp('firmware') / 'libt3core.so'
-    sources = sorted(map(str, [*FIRMWARE.glob('core/*.c'), *FIRMWARE.glob('host/*.c')]))
-    folders = [f'-I{FIRMWARE / "core"}', f'-I{FIRMWARE / "host"}']
-    flags = ['-std=c99', '-O2', '-fPIC', '-shared']
-    subprocess.run(['gcc', *flags, *folders, '-o', target, *sources], check=True)
-    core = ctypes.CDLL(str(target))
-    core.t3_host_robot_new.restype = ctypes.c_void_p
-    core.t3_host_robot_ack.restype = ctypes.c_uint8
-    core.t3_host_robot_usb_take.restype = ctypes.c_uint32
-    core.t3_host_robot_writing.restype = ctypes.c_bool
-    core.t3_host_robot_powered.restype = ctypes.c_bool
-    core.t3_host_robot_speed.restype = ctypes.c_int32
-    core.t3_host_robot_steps.restype = ctypes.c_int32
-    return core
+    return compile_core(tmp_path_factory.mktemp('firmware') / 'libt3core.so')
 
 
 class Pair:

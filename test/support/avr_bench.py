@@ -136,7 +136,7 @@ class AvrBoard:
 
 
 class AvrEmulator:
-    """Dongle and robot in simavr, with the plant and the serial line in Python, in virtual time."""
+    """Dongle and robot in simavr; plant and serial line in Python."""
 
     def __init__(self, boards, flat=None, key=b'', seed=1):
         self.boards = boards
@@ -179,7 +179,7 @@ class AvrEmulator:
     def powered(self):
         return self.boards.call('powered')
 
-    # -- the line ---------------------------------------------------------------------------------
+    # -- serial line ------------------------------------------------------------------------------
 
     def feed(self, data, now_ns):
         self.run_until(now_ns)
@@ -225,7 +225,7 @@ class AvrEmulator:
         if self.port_open:
             self._host_input.append((self.now_ns, data))
 
-    # -- the robot --------------------------------------------------------------------------------
+    # -- robot ------------------------------------------------------------------------------------
 
     def _report_command(self):
         """Report a command that sets the wheel speeds: the last packet that was received.
@@ -244,7 +244,7 @@ class AvrEmulator:
         self.board.on_command(self._ttl_start_us, command)
 
     def _update_plant(self, elapsed_us):
-        """Advance the plant by the step pulses, and apply the values of its sensors to the pins."""
+        """Advance the plant by the step pulses, and apply its sensor values to the pins."""
         boards, plant = self.boards, self.plant
         pulses = boards.pulses()
         if elapsed_us:

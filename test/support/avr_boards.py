@@ -209,7 +209,7 @@ class Boards:
     # -- robot ------------------------------------------------------------------------------------
 
     def exchange(self, first: Any, second: Any = None, gap: int = GAP) -> Result:
-        """Return the RESULT of a transaction; the default second payload is a POLL of the state."""
+        """Return the RESULT of a transaction; the second payload defaults to a POLL."""
         self.id = (self.id + 1) % 256
         second = Poll(self.session, 0, 0) if second is None else second
         frame = Transmit(self.id, gap, codec.encode(first), codec.encode(second))

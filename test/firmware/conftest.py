@@ -1,0 +1,53 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Fixtures: the firmware core, robots in the states that tests start from, golden vectors."""
+
+import json
+from pathlib import Path
+import shutil
+
+import pytest
+from support.firmware_core import ACCELERATION, DECELERATION, KEY, OK, Robot, compile_core
+
+GOLDEN = Path(__file__).resolve().parents[1] / 'golden' / 'radio_vectors.json'
+
+
+@pytest.fixture(scope='session')
+def library(tmp_path_factory):
+    """Return the compiled core."""
+    if shutil.which('gcc') is None:
+        pytest.skip('needs gcc')
+    return compile_core(tmp_path_factory.mktemp('firmware') / 'libt3core.so')
+
+
+@pytest.fixture
+def robot(library):
+    """Return a robot without a key, in a session, at rest."""
+    made = Robot(library)
+    made.run(1000)
+    made.hello()
+    return made
+
+
+@pytest.fixture
+def slow_ramps(robot):
+    """Return a robot with slow ramps: acceleration 15 rad/s², deceleration 30 rad/s²."""
+    assert robot.set(ACCELERATION, 15_000) == (OK, 15_000)
+    assert robot.set(DECELERATION, 30_000) == (OK, 30_000)
+    return robot
+
+
+@pytest.fixture
+def keyed(library):
+    """Return a robot with a key, in a session, at rest."""
+    made = Robot(library, KEY)
+    made.run(1000)
+    made.hello()
+    return made
+
+
+@pytest.fixture(scope='session')
+def golden():
+    if not GOLDEN.exists():
+        pytest.skip('test/golden/radio_vectors.json is not there')
+    return json.loads(GOLDEN.read_text())

@@ -1,0 +1,270 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Firmware core: CRC, framing, SipHash, range codes, clock, and the golden vectors."""
+
+from binascii import crc_hqx
+import ctypes
+import random
+import struct
+
+import pytest
+from support.firmware_core import (
+    ESTOP,
+    LATCHED,
+    OK,
+    SESSION,
+    Decoder,
+    Dongle,
+    Robot,
+    c_decode,
+    c_encode,
+    c_encode_frame,
+    encode_frame,
+    siphash,
+    split_stream,
+)
+
+from t3mpc_ros.robot.sensor_conversions import encode_range
+from t3mpc_ros.simulation.sensors import range_sensor
+
+COMMAND = bytes.fromhex('115a0701140088133cf604030201')
+TX_WIRE = bytes.fromhex('0a012a060e115a0701140c88133cf604030201155a070398b400')
+STATE = bytes.fromhex('115a070315cd5b07e803000018fcffff7dffa40000004c00a0fe013c00145078')
+RESULT_WIRE = bytes.fromhex(
+    '05812a03130eca5b07115a070315cd5b07e803010818fcffff7dffa40101024c05a0fe013c06145078142300'
+)
+
+
+def test_the_crc_is_that_of_the_standard_library(library):
+    assert library.t3_host_crc16(b'123456789', 9) == 0x29B1
+    generator = random.Random(1)
+    for size in range(79):
+        data = generator.randbytes(size)
+        assert library.t3_host_crc16(data, size) == crc_hqx(data, 0xFFFF)
+
+
+def test_encoded_frames_equal_the_reference(library):
+    generator = random.Random(2)
+    for size in (*range(1, 79), *generator.choices(range(1, 79), k=2000)):
+        frame = bytes(generator.choices((0, 1, 0xFF, generator.randrange(256)), k=size))
+        assert c_encode_frame(library, frame) == encode_frame(frame)
+    assert c_encode_frame(library, b'') == c_encode_frame(library, bytes(79)) == b''
+
+
+@pytest.mark.parametrize('seed', range(40))
+def test_decoder_equals_the_reference_on_a_damaged_stream(library, seed):
+    generator = random.Random(seed)
+    stream = bytearray()
+    for _ in range(300):
+        wire = bytearray(encode_frame(generator.randbytes(generator.randint(1, 78))))
+        for _ in range(generator.choice((0, 0, 1, 2))):
+            at = generator.randrange(len(wire))
+            match generator.randrange(4):
+                case 0:
+                    wire[at] = generator.randrange(256)
+                case 1:
+                    del wire[at]
+                case 2:
+                    wire.insert(at, generator.randrange(256))
+                case 3:
+                    wire += generator.randbytes(100)
+            wire = wire or bytearray(1)
+        stream += wire
+    stream += b'\0'
+    decoder = Decoder(library)
+    found, counts = split_stream(bytes(stream))
+    assert decoder.feed(bytes(stream)) == found
+    assert decoder.counts() == counts
+    assert counts[0] > 100
+    assert min(counts[1:]) > 10
+
+
+def test_siphash_equals_published_vectors_and_reference(library):
+    """Vectors of the appendix of the paper, and the first of the authors' ``vectors.h``."""
+    key = bytes(range(16))
+    room = ctypes.create_string_buffer(8)
+
+    def hashed(key, message):
+        library.t3_host_siphash(key, message, ctypes.c_uint8(len(message)), room)
+        return room.raw
+
+    assert hashed(key, bytes(range(15))) == (0xA129CA6149BE45E5).to_bytes(8, 'little')
+    published = ('310e0edd47db6f72', 'fd67dc93c539f874', '5a4fa9d909806c0d', '2d7efbd796666785')
+    for size, text in enumerate(published):
+        assert hashed(key, bytes(range(size))).hex() == text
+    generator = random.Random(3)
+    for size in (*range(64), 255):
+        key, message = generator.randbytes(16), generator.randbytes(size)
+        assert hashed(key, message) == siphash(key, message)
+
+
+def test_range_codes_equal_those_of_the_simulation(library):
+    """Open and shorted wires are codes of the board alone."""
+    parameters = range_sensor.SimulatedRangeSensorParameters()
+    for count in range(984):
+        wanted = encode_range(range_sensor.distance_from_voltage(parameters.volts(count)))
+        assert library.t3_host_range_code(count) == wanted, count
+    assert {library.t3_host_range_code(count) for count in (984, 1023, 0xFFFE)} == {255}
+    assert library.t3_host_range_code(0xFFFF) == 0
+
+
+def test_clock_is_exact_around_a_timer_overflow(library):
+    """An overflow between reading the count and the flag of the timer does not lose 50 us."""
+    for start in (0, 0xFFFFFFC8, 0x7FFFFFF0):
+        for true in range(200):
+            ticks, timer = divmod(true, 50)
+            # The last interrupt may be pending shortly after an overflow, and the next one may
+            # become pending right after the count was read.
+            for pending in {False, timer < 25, timer == 49}:
+                base = start + 50 * (ticks - (1 if pending and timer < 25 else 0))
+                read = library.t3_host_time_us(
+                    ctypes.c_uint32(base), ctypes.c_uint8(timer), ctypes.c_bool(pending)
+                )
+                assert read == (start + true) % (1 << 32)
+
+
+# -- golden vectors -------------------------------------------------------------------------------
+
+
+def test_first_golden_vectors_byte_for_byte(library):
+    fault, packet = c_decode(library, COMMAND)
+    assert fault == 0
+    assert (packet['session'], packet['seq'], packet['what'], packet['ttl']) == (0x5A, 7, 1, 20)
+    assert (packet['left'], packet['right']) == (5000, -2500)
+    assert packet['host_us'] == 0x01020304
+    numbers = (0x5A, 7, 3, 123456789, 1000, -1000, -131, 164, 0, 76)
+    assert c_encode(library, 1, (*numbers, *bytes.fromhex('a0fe013c00145078'))) == STATE
+    assert (
+        c_encode_frame(library, bytes.fromhex('012a060e') + COMMAND + b'\x15\x5a\x07\0') == TX_WIRE
+    )
+
+
+def test_transaction_with_the_golden_result(library):
+    dongle = Dongle(library)
+    dongle.run(123_456_000 - 3000)
+    dongle.call('bytes', TX_WIRE, ctypes.c_uint32(len(TX_WIRE)))
+    assert dongle.sent() == COMMAND
+    dongle.run(1500)
+    dongle.reply(bytes(32))
+    dongle.run(1490)
+    assert dongle.sent() == b''
+    dongle.run(10)
+    assert dongle.sent() == b'\x15\x5a\x07\0'
+    assert dongle.read() == b''
+    dongle.reply(STATE, retransmits=1)
+    assert dongle.read() == RESULT_WIRE
+
+
+DOWN_NAMES = {'flags': 'what', 'id': 'what', 'verb': 'what'}
+
+
+def test_golden_downlink_payloads_are_decoded(library, golden):
+    for vector in golden['down']:
+        data, fields = bytes.fromhex(vector['bytes']), vector['fields']
+        fault, packet = c_decode(library, data)
+        assert fault == 0, vector['name']
+        for name, value in fields.items():
+            if name in ('nonce', 'tag'):
+                assert packet[name] == bool(value), vector['name']
+            else:
+                assert packet[DOWN_NAMES.get(name, name)] == value, (vector['name'], name)
+
+
+def test_golden_uplink_payloads_are_encoded(library, golden):
+    kinds = {'State': 1, 'Param': 2, 'Info': 3, 'Ack': 4, 'Aux': 5}
+    for vector in golden['up']:
+        numbers, fields = [], vector['fields']
+        for value in fields.values():
+            numbers += [value] if isinstance(value, int) else bytes.fromhex(value)
+        written = c_encode(library, kinds[vector['kind']], numbers, bool(fields.get('nonce')))
+        assert written.hex() == vector['bytes'], vector['name']
+
+
+def test_golden_malformed_frames_are_rejected(library, golden):
+    faults = {'version': 1, 'kind': 1, 'length': 2, 'value': 2}
+    for vector in golden['rejected']:
+        data = bytes.fromhex(vector['bytes'])
+        if vector['direction'] == 'down':
+            assert c_decode(library, data)[0] == faults[vector['fault']], vector
+        elif vector['direction'] == 'to_dongle' and data:
+            dongle = Dongle(library)
+            dongle.write(data)
+            code = 1 if vector['fault'] == 'kind' else 2
+            assert dongle.frames() == [bytes([0x8F, code, data[0]])], vector
+            assert dongle.sent() == b''
+
+
+def test_golden_encodings_parameters_and_hashes(library, golden):
+    for vector in golden['wire']:
+        assert c_encode_frame(library, bytes.fromhex(vector['bytes'])).hex() == vector['wire']
+    robot = Robot(library)
+    robot.hello()
+    for row in golden['constants']['parameters']:
+        answer = robot.request(bytes([0x12, SESSION, 0, row['id']]))
+        value, low, high = struct.unpack_from('<iii', answer, 5)
+        assert (answer[4], value, low, high) == (0, row['default'], row['low'], row['high'])
+    room = ctypes.create_string_buffer(8)
+    for size, tag in enumerate(golden['siphash']['tags']):
+        library.t3_host_siphash(bytes(range(16)), bytes(range(size)), ctypes.c_uint8(size), room)
+        assert room.raw.hex() == tag
+
+
+def test_golden_session_of_a_keyed_robot(library, golden):
+    session = golden['authentication']
+    robot = Robot(library, bytes.fromhex(session['key']))
+    robot.run(1000)
+    rejected = 0
+    for event in session['robot']:
+        if 'fresh_nonce' in event:
+            robot.call('force_nonce', bytes.fromhex(event['fresh_nonce']))
+        data = bytes.fromhex(event['bytes'])
+        robot.send(data)
+        stops = event['kind'] == 'Command' and data[3] & ESTOP
+        rejected += (
+            not event['accepted']
+            or (stops and len(data) == 14)
+            or (stops and 'bad tag' in event['name'])
+        )
+        assert robot.counters()['bad_session'] == rejected, event['name']
+        info = robot.request(b'\x15\0\0\2')
+        assert info[1] == event['session'], event['name']
+        assert info[17:].hex() == event['robot_nonce'], event['name']
+
+
+def test_golden_emergency_stops_are_counted(library, golden):
+    stops = golden['authentication']['stops']
+    robot = Robot(library, bytes.fromhex(golden['authentication']['key']))
+    robot.run(1000)
+    robot.call('force_nonce', bytes.fromhex(stops['fresh_nonce']))
+    robot.send(bytes.fromhex(stops['hello']))
+    rejected = 0
+    for row in stops['frames']:
+        data = bytes.fromhex(row['bytes'])
+        robot.send(data)
+        rejected += not row['counted']
+        assert robot.counters()['bad_session'] == rejected, row['name']
+        assert robot.status & LATCHED
+        if row['counted']:
+            assert robot.request(b'\x15\0\0\0')[2] == data[2], row['name']
+    assert 0 < rejected < len(stops['frames'])
+
+
+def test_golden_console_frames(library, golden):
+    for vector in golden['to_board']:
+        robot = Robot(library)
+        robot.run(1000)
+        (reply,) = robot.console(bytes.fromhex(vector['bytes']))
+        frame = bytes.fromhex(vector['bytes'])
+        assert c_encode_frame(library, frame).hex() == vector['wire']
+        if frame[0] == 3:
+            assert reply[:6] == b'\x83' + frame[1:]
+        else:
+            assert reply[:3] == bytes([0x84, frame[1], OK])
+    for row in golden['key_checks']:
+        robot = Robot(library, bytes.fromhex(row['key']))
+        assert robot.console(b'\x04\x09') == [b'\x84\x09\0\1' + struct.pack('<I', row['check'])]
+    for vector in golden['rejected']:
+        data = bytes.fromhex(vector['bytes'])
+        if vector['direction'] == 'to_board':
+            code = 1 if vector['fault'] == 'kind' else 2
+            assert Robot(library).console(data) == [bytes([0x8F, code, data[0]])], vector

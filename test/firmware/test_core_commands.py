@@ -1,0 +1,297 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Firmware core: sessions, TTL, sequence numbers, emergency stop, stale commands."""
+
+import ctypes
+import random
+import struct
+
+import pytest
+from support.firmware_core import (
+    CLEAR,
+    DECELERATION,
+    ENABLE,
+    ENABLED,
+    ESTOP,
+    EXPIRED,
+    LATCHED,
+    MAX_SPEED,
+    MOVING,
+    NO_SESSION,
+    OK,
+    SESSION,
+    Robot,
+)
+
+
+def test_nothing_moves_before_hello_and_enable(library):
+    robot = Robot(library)
+    assert not robot.call('powered')
+    for session in range(256):
+        robot.drive(5000, 5000, 20_000, session=session)
+    assert robot.status & NO_SESSION
+    robot.hello()
+    robot.drive(5000, 5000, 500_000, flags=0)
+    assert robot.status == 0
+    assert not robot.call('powered')
+    assert robot.pulses == (0, 0)
+    robot.drive(5000, 5000, 500_000)
+    assert robot.status == ENABLED | MOVING
+    assert robot.speeds == (5.0, 5.0)
+    assert robot.pulses[0] > 500
+
+
+def test_hello_starts_a_session_at_rest_and_keeps_the_counters(robot):
+    robot.drive(5000, 5000, 500_000)
+    steps = robot.steps
+    info = robot.hello(session=77)
+    assert (info[0], info[1], info[3], info[7]) == (0x13, 77, 1, 10)
+    assert struct.unpack_from('<HH', info, 8) == (200, 16)
+    robot.run(300_000)
+    assert robot.status == 0
+    assert not robot.call('powered')
+    assert robot.steps > steps
+    robot.drive(5000, 5000, 100_000, session=SESSION)
+    assert robot.speeds == (0.0, 0.0)
+
+
+def test_ttl_expiry_ramps_down_and_sets_the_flag(slow_ramps):
+    slow_ramps.drive(4500, 4500, 1_000_000)
+    slow_ramps.send(slow_ramps.command(4500, 4500, ttl=20))
+    slow_ramps.run(199_000)
+    assert slow_ramps.speeds == (4.5, 4.5)
+    assert slow_ramps.status == ENABLED | MOVING
+    slow_ramps.run(2_000)
+    assert slow_ramps.status == ENABLED | MOVING | EXPIRED
+    slow_ramps.run(74_000)
+    # Half of 4.5 rad/s at 30 rad/s².
+    assert slow_ramps.speeds == pytest.approx((2.25, 2.25), abs=0.07)
+    slow_ramps.run(76_500)
+    assert slow_ramps.speeds == (0.0, 0.0)
+    assert slow_ramps.status == ENABLED | EXPIRED
+    assert slow_ramps.call('powered')  # holding torque
+    assert slow_ramps.counters()['expired'] == 1
+    slow_ramps.drive(1000, 1000, 20_000)
+    assert slow_ramps.status == ENABLED | MOVING
+
+
+def rest_time(robot, ttl):
+    """Return the time (s) from the last command at full speed to standstill."""
+    robot.drive(10_000, 10_000, 2_000_000)
+    robot.send(robot.command(10_000, 10_000, ttl=ttl))
+    assert robot.speeds == (10.0, 10.0)
+    elapsed = 0
+    while robot.status & MOVING:
+        robot.run(1000)
+        elapsed += 1000
+    return elapsed / 1e6
+
+
+@pytest.mark.parametrize(
+    'ttl, deceleration, limit',
+    [
+        (20, 60_000, 0.37),
+        (255, 60_000, 0.42),
+        (20, 41_000, 0.45),
+        (255, 52_000, 0.45),
+        (20, 30_000, 0.536),
+    ],
+)
+def test_stop_time_is_ttl_plus_ramp(robot, ttl, deceleration, limit):
+    """Stop time = TTL + speed / deceleration; the first case is the default of both ends.
+
+    Standstill within 0.45 s requires 41 rad/s² at a TTL of 200 ms, and 52 rad/s² at the largest
+    TTL that the robot accepts.
+    """
+    assert robot.get(DECELERATION) == (OK, 60_000)
+    assert robot.set(DECELERATION, deceleration) == (OK, deceleration)
+    assert limit - 0.01 < rest_time(robot, ttl) <= limit
+
+
+def test_the_robot_limits_the_ttl(robot):
+    robot.send(robot.command(1000, 1000, ttl=255))
+    robot.run(249_000)
+    assert not robot.status & EXPIRED
+    robot.run(2_000)
+    assert robot.status & EXPIRED
+
+
+def test_a_ttl_of_zero_stops_without_the_expiry_flag(robot):
+    robot.drive(5000, 5000, 500_000)
+    robot.drive(5000, 5000, 500_000, ttl=0)
+    assert robot.status == ENABLED
+    assert robot.counters()['expired'] == 0
+
+
+def test_only_newer_sequence_numbers_count(robot):
+    """(int8)(seq - last) > 0, for every last one and every difference."""
+    for last in (0, 1, 127, 128, 254, 255):
+        for difference in range(256):
+            robot.hello()
+            robot.send(robot.command(0, 0, seq=last))
+            before = robot.counters()['duplicates']
+            robot.send(robot.command(3000, 3000, seq=(last + difference) % 256))
+            robot.run(2000)
+            moved = bool(robot.status & MOVING)
+            assert moved == (1 <= difference <= 127), (last, difference)
+            assert robot.counters()['duplicates'] - before == (not moved)
+
+
+def test_a_repeated_command_does_not_extend_its_ttl(robot):
+    frame = robot.command(3000, 3000, seq=9)
+    for _ in range(30):
+        robot.send(frame)
+        robot.run(10_000)
+    assert robot.status & EXPIRED
+
+
+def test_frames_of_another_session_are_counted_and_ignored(robot):
+    for session in set(range(256)) - {SESSION}:
+        robot.drive(5000, 5000, 20_000, session=session)
+    assert robot.pulses == (0, 0)
+    assert robot.counters()['bad_session'] == 255
+    assert robot.request(struct.pack('<BBBBi', 0x13, 3, 9, MAX_SPEED, 1))[0] == 0x11
+    assert robot.get(MAX_SPEED) == (OK, 10_000)
+
+
+@pytest.mark.parametrize('session', [0, 1, SESSION, 255])
+@pytest.mark.parametrize('flags', [ESTOP, ESTOP | ENABLE, ESTOP | CLEAR, 7, 0xFF])
+def test_an_emergency_stop_is_accepted_from_any_sender(robot, session, flags):
+    robot.drive(5000, 5000, 500_000)
+    robot.send(robot.command(5000, 5000, flags, seq=0, session=session, host_us=0))
+    robot.run(1000)
+    assert robot.status & LATCHED
+    robot.drive(5000, 5000, 400_000)
+    assert robot.status == LATCHED
+    assert robot.speeds == (0.0, 0.0)
+    robot.hello(session=5)
+    robot.drive(5000, 5000, 100_000, session=5)
+    assert robot.status == LATCHED
+
+
+def test_only_a_valid_clear_of_the_session_clears_the_estop(robot):
+    robot.send(robot.command(flags=ESTOP))
+    for rejected in (
+        {'flags': 0},
+        {'flags': CLEAR | ENABLE},
+        {'flags': CLEAR | ESTOP},
+        {'flags': CLEAR, 'left': 1},
+        {'flags': CLEAR, 'right': -1},
+        {'flags': CLEAR, 'session': 3},
+        {'flags': CLEAR, 'seq': robot.seq},
+        {'flags': CLEAR, 'host_us': (robot.host_us - 1_000_000) % (1 << 32)},
+    ):
+        robot.send(robot.command(**rejected))
+        robot.run(20_000)
+        assert robot.status & LATCHED, rejected
+    robot.call('press', ctypes.c_bool(True))
+    robot.send(robot.command(flags=CLEAR))
+    assert robot.status & LATCHED
+    robot.call('press', ctypes.c_bool(False))
+    robot.send(robot.command(flags=CLEAR))
+    assert robot.status == 0
+    robot.drive(1000, 1000, 200_000)
+    assert robot.status == ENABLED | MOVING
+
+
+def test_the_button_latches_after_the_shortest_press(robot):
+    robot.drive(5000, 5000, 500_000)
+    robot.call('press', ctypes.c_bool(True))
+    robot.run(200)
+    robot.call('press', ctypes.c_bool(False))
+    robot.drive(5000, 5000, 500_000)
+    assert robot.status == LATCHED
+    assert not robot.call('powered')
+
+
+# -- stale commands -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('silence', [1.0, 6.0, 15.0, 100.0, 1500.0])
+def test_commands_held_and_released_at_once_are_rejected(robot, silence):
+    """A stalled USB hub holds 15 commands, then releases them.
+
+    A reference delay that expired after two windows would accept a burst held for longer.
+    """
+    robot.drive(0, 0, 500_000)
+    held = [
+        robot.command(5000, 5000, host_us=(robot.now + 20_000 * i) % (1 << 32)) for i in range(15)
+    ]
+    robot.run(round(silence * 1e6))
+    for frame in held:
+        robot.send(frame)
+        robot.run(500)
+    assert robot.counters()['stale'] == 15
+    assert robot.pulses == (0, 0)
+    robot.drive(5000, 5000, 40_000)
+    assert robot.status & MOVING
+
+
+@pytest.mark.parametrize('skew', [-0.005, 0.005])
+@pytest.mark.parametrize('start', [0, (1 << 32) - 30_000_000])
+def test_a_clock_error_of_half_a_percent_is_not_stale(library, skew, start):
+    robot = Robot(library, time=start)
+    generator = random.Random(4)
+    robot.delay = 0
+    robot.run(1000)
+    robot.hello()
+    for index in range(3000):
+        stamp = round((1.0 + skew) * 20_000 * index) + start
+        late = generator.randrange(5000)
+        robot.run(late)
+        robot.send(robot.command(100, 100, host_us=stamp % (1 << 32)))
+        robot.run(20_000 - late)
+    assert robot.counters()['stale'] == 0
+    assert robot.status == ENABLED | MOVING
+
+
+def test_a_silence_of_a_minute_is_not_stale(library):
+    """The clocks drift apart by 0.3 s per minute at 0.5 %."""
+    for skew in (-0.005, 0.005):
+        robot = Robot(library)
+        robot.delay = 0
+        robot.run(1000)
+        robot.hello()
+        for second in (0, 1, 61, 62, 63, 70):
+            robot.run(second * 1_000_000 - robot.now + 2000)
+            robot.send(robot.command(100, 100, host_us=round(second * 1e6 * (1 + skew))))
+        assert robot.counters()['stale'] == 0
+
+
+def test_a_growing_delay_is_detected_beyond_ttl_and_slack(robot):
+    start, delays = robot.now, []
+    for index in range(200):
+        robot.run(22_000)
+        sent = 20_000 * index
+        robot.delay = robot.now - start - sent  # grows by 100 ms per second of the host
+        before = robot.counters()['stale']
+        robot.send(robot.command(1000, 1000))
+        if robot.counters()['stale'] > before:
+            delays.append(robot.delay)
+    # 200 ms of TTL and 50 ms of slack beyond the delay of HELLO, detected by the next command.
+    assert 250_000 < delays[0] - 1000 <= 255_000
+    assert len(delays) > 50  # detected from then on
+    robot.run(250_000)
+    assert robot.speeds == (0.0, 0.0)
+
+
+def test_a_stale_stop_still_stops(robot):
+    robot.drive(5000, 5000, 500_000)
+    robot.delay = 400_000
+    robot.send(robot.command(0, 0))
+    assert robot.counters()['stale'] == 1
+    robot.run(170_000)
+    assert robot.speeds == (0.0, 0.0)
+
+
+def test_a_session_ends_after_half_an_hour_of_silence(robot):
+    """Beyond 35 minutes the sign of a difference of 32-bit clocks is ambiguous."""
+    robot.drive(1000, 1000, 100_000)
+    robot.run(1_799_000_000)
+    assert not robot.status & NO_SESSION
+    robot.run(2_000_000)
+    assert robot.status == NO_SESSION | EXPIRED
+    robot.drive(1000, 1000, 100_000)
+    assert robot.status == NO_SESSION | EXPIRED
+    robot.hello()
+    assert robot.status == 0

@@ -1,0 +1,213 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Firmware core: parameters, actions, and the replies to each packet."""
+
+import ctypes
+import struct
+
+import pytest
+from support.firmware_core import (
+    ACCELERATION,
+    BATTERY_LOW,
+    BUSY,
+    DECELERATION,
+    ESTOP,
+    GYRO_RANGE,
+    IDLE_OFF,
+    IMU_FAULT,
+    INVERT,
+    LOW_BATTERY,
+    MAX_SPEED,
+    MICROSTEPS,
+    OK,
+    RANGE,
+    READ_ONLY,
+    SESSION,
+    STEPS_PER_REV,
+    TTL_MAX,
+    UNKNOWN,
+)
+
+from t3mpc_ros.robot.sensor_conversions import encode_range
+from t3mpc_ros.simulation.sensors import range_sensor
+
+BOUNDS = {
+    MAX_SPEED: (0, 19_600),
+    ACCELERATION: (100, 100_000),
+    DECELERATION: (100, 200_000),
+    TTL_MAX: (20, 500),
+    MICROSTEPS: (1, 256),
+    BATTERY_LOW: (0, 30_000),
+    IDLE_OFF: (0, 600_000),
+    INVERT: (0, 3),
+}
+
+
+@pytest.mark.parametrize('number', BOUNDS)
+def test_parameters_keep_their_bounds(robot, number):
+    low, high = BOUNDS[number]
+    assert robot.set(number, low) == (OK, low)
+    assert robot.set(number, high) == (OK, high)
+    for value in (low - 1, high + 1, -(1 << 31), (1 << 31) - 1):
+        assert robot.set(number, value) == (RANGE, high)
+    assert robot.get(number) == (OK, high)
+    reply = robot.request(bytes([0x12, SESSION, 44, number]))
+    assert reply[2] == 44
+    assert struct.unpack_from('<ii', reply, 9) == (low, high)
+
+
+def test_read_only_and_unknown_parameters_are_rejected(robot):
+    assert robot.set(STEPS_PER_REV, 400) == (READ_ONLY, 200)
+    assert robot.set(GYRO_RANGE, 250) == (READ_ONLY, 500)
+    for number in (10, 11, 128, 255):
+        assert robot.set(number, 1) == (UNKNOWN, 0)
+        assert robot.get(number) == (UNKNOWN, 0)
+
+
+@pytest.mark.parametrize('number', [MICROSTEPS, INVERT])
+def test_microsteps_and_direction_change_only_at_rest(robot, number):
+    before = robot.get(number)[1]
+    robot.drive(1000, 1000, 100_000)
+    assert robot.set(number, 2) == (BUSY, before)
+    assert robot.set(number, before) == (OK, before)  # rewritten by the host after a reconnection
+    robot.drive(0, 0, 300_000)
+    assert robot.set(number, 2) == (OK, 2)
+
+
+def test_boot_restores_the_parameter_defaults(robot):
+    assert robot.set(MAX_SPEED, 123) == (OK, 123)
+    robot.call('boot', 1, 0)
+    robot.hello()
+    assert robot.get(MAX_SPEED) == (OK, 10_000)
+
+
+def test_odometry_is_reset_only_at_rest(robot):
+    robot.drive(1000, 1000, 500_000)
+    assert robot.act(1, seq=1) == bytes([0x14, SESSION, 1, 1, BUSY])
+    robot.drive(0, 0, 300_000)
+    assert min(robot.steps) > 100
+    assert robot.act(1, seq=2) == bytes([0x14, SESSION, 2, 1, OK])
+    assert robot.steps == (0, 0)
+    assert robot.act(3, seq=3) == bytes([0x14, SESSION, 3, 3, UNKNOWN])
+
+
+def test_a_repeated_action_is_acknowledged_but_runs_once(robot):
+    """The reply was lost, the host repeats the request, the robot has moved meanwhile."""
+    assert robot.act(1, seq=7)[4] == OK
+    robot.drive(1000, 1000, 500_000)
+    robot.drive(0, 0, 300_000)
+    steps = robot.steps
+    assert robot.act(1, seq=7)[4] == OK
+    assert robot.steps == steps
+    assert robot.act(1, seq=8)[4] == OK
+    assert robot.steps == (0, 0)
+
+
+def test_counters_are_cleared_by_the_action(robot):
+    robot.send(robot.command(session=3))
+    assert robot.counters()['bad_session'] == 1
+    assert robot.act(2, seq=1)[4] == OK
+    assert set(robot.counters().values()) == {0, 1}
+
+
+def test_reply_to_each_kind_of_packet(robot):
+    kinds = {
+        'CMD': (robot.command(), 0x11),
+        'PARAM_GET': (bytes([0x12, SESSION, 1, 0]), 0x12),
+        'PARAM_SET': (struct.pack('<BBBBi', 0x13, SESSION, 1, 0, 1), 0x12),
+        'POLL state': (b'\x15\0\1\0', 0x11),
+        'POLL aux': (b'\x15\0\1\1', 0x15),
+        'POLL info': (b'\x15\0\1\2', 0x13),
+        'ACTION': (struct.pack('<BBBBH', 0x16, SESSION, 1, 2, 0), 0x14),
+        'HELLO': (struct.pack('<BBBBI', 0x14, SESSION, 1, 0, robot.host_us), 0x13),
+        'other session': (bytes([0x12, 3, 1, 0]), 0x11),
+        'other version': (b'\x25\0\1\1', 0x11),
+        'nothing': (b'', 0x11),
+    }
+    for name, (data, head) in kinds.items():
+        reply = robot.request(data)
+        assert reply[0] == head, name
+        if name in ('CMD', 'PARAM_GET', 'PARAM_SET', 'POLL info', 'ACTION', 'HELLO'):
+            assert reply[1] == SESSION
+    assert len(robot.reply()) == 32
+
+
+def test_a_reply_is_loaded_after_the_acknowledgement_is_sent(robot):
+    robot.run(5000)
+    loads = robot.call('loads')
+    robot.send(robot.command())
+    robot.run(500)
+    assert robot.call('loads') == loads
+    robot.run(400)
+    assert robot.call('loads') == loads + 1
+    state = robot.reply()
+    # Sampled after the settling time; STATE contains its age.
+    assert 60 <= struct.unpack_from('<H', state, 22)[0] <= 90
+    robot.run(99_000)
+    assert robot.call('loads') == loads + 1
+    robot.run(2_000)
+    assert robot.call('loads') == loads + 2
+
+
+def test_the_age_is_none_when_it_does_not_fit(robot):
+    assert robot.request(b'\x15\0\0\0')[22:24] == b'\xff\xff'
+    robot.send(robot.command())
+    robot.run(600_000)
+    assert struct.unpack_from('<H', robot.request(b'\x15\0\0\0'), 22)[0] == pytest.approx(
+        60_080, abs=40
+    )
+    robot.run(60_000)
+    assert robot.request(b'\x15\0\0\0')[22:24] == b'\xff\xff'
+
+
+def test_state_contains_the_sensor_readings(robot):
+    seven = (ctypes.c_int16 * 7)(164, -5, 8192, -4000, -12, 13, -131)
+    robot.call('set_imu', ctypes.c_bool(True), seven)
+    for channel, count in enumerate((0xFFFF, 0xFFFE, 300, 150, 600, 60, 0, 1023)):
+        robot.call('set_adc', channel, ctypes.c_uint16(count))
+    robot.run(10_000)  # one channel per millisecond
+    state = robot.request(b'\x15\0\0\0')
+    assert struct.unpack_from('<hhh', state, 16) == (-131, 164, -5)
+    parameters = range_sensor.SimulatedRangeSensorParameters()
+    middle = [
+        encode_range(range_sensor.distance_from_voltage(parameters.volts(count)))
+        for count in (300, 150)
+    ]
+    assert list(state[24:]) == [0, 255, *middle, 1, 254, 254, 255]
+    robot.call('set_adc', 8, ctypes.c_uint16(522))
+    aux = robot.request(b'\x15\0\0\1')
+    assert struct.unpack_from('<Hhhhh', aux, 4) == (10_195, -4000, 8192, -12, 13)
+    assert robot.status & LOW_BATTERY
+    assert robot.set(BATTERY_LOW, 10_000)[0] == OK
+    assert not robot.status & LOW_BATTERY
+    robot.call('set_imu', ctypes.c_bool(False), seven)
+    state = robot.request(b'\x15\0\0\0')
+    assert state[3] & IMU_FAULT
+    assert state[16:22] == bytes(6)
+
+
+def test_an_oversized_payload_is_ignored(robot):
+    """A crafted packet makes some nRF24 report widths above 32."""
+    for size in range(33, 256):
+        robot.send((robot.command(5000, 5000, ESTOP) + bytes(300))[:size])
+    robot.run(20_000)
+    assert robot.status == 0
+    assert robot.counters()['short'] == 223
+
+
+def test_malformed_packets_are_ignored_and_counted_by_kind(robot):
+    good = robot.command(5000, 5000)
+    for size in range(32):
+        if size not in (14, 22):
+            robot.send((good + bytes(32))[:size])
+    for version in (0, 2, 15):
+        robot.send(bytes([version << 4 | 1]) + good[1:])
+    for kind in (0, *range(7, 16)):
+        robot.send(bytes([0x10 | kind]) + good[1:])
+    robot.send(good[:3] + b'\x09' + good[4:])
+    robot.send(good[:5] + b'\x01' + good[6:])
+    counters = robot.counters()
+    assert counters['short'] == 30 + 2
+    assert counters['bad_version'] == 13
+    robot.run(20_000)
+    assert robot.status == 0
