@@ -113,7 +113,7 @@ class RadioRobot(RobotInterface):
         self._now_ns = now_ns
         # With the cycle, not beside it: by a clock of its own it would fall behind, and every
         # command would wait for the cycle after the next.
-        due_ns = self.link.cycle_ns
+        due_ns = self.link.next_cycle_ns
         if now_ns >= (self._next_ns if due_ns is None else due_ns):
             self._next_ns = now_ns + self._period_ns
             self._order(now_ns)

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Write radio_vectors.json: what every implementation of the radio protocol must agree on.
+"""Write radio_vectors.json, the reference vectors of the radio protocol.
 
 Run ``PYTHONPATH=. python test/golden/write_radio_vectors.py`` after a change of the protocol; a
-test compares the committed file with what this would write. docs/radio.md describes the format.
+test compares the committed file with the output of this script. The format is in docs/radio.md.
 """
 
 from collections.abc import Callable
@@ -48,33 +48,33 @@ ADDRESS = bytes.fromhex('c25a33a6e1')
 
 DOWN = {
     'radio.md': GOLDEN_COMMAND,
-    'all at their least': frames.Command(0, 0, 0, 0, -32768, -32768, 0),
-    'all at their most': frames.Command(255, 255, 7, 255, 32767, 32767, 0xFFFFFFFF),
+    'minimum values': frames.Command(0, 0, 0, 0, -32768, -32768, 0),
+    'maximum values': frames.Command(255, 255, 7, 255, 32767, 32767, 0xFFFFFFFF),
     'stop': frames.Command(0x5A, 8, 0, 0, 0, 0, 0x01020305),
-    'emergency stop of nobody': frames.Command(0, 0, CommandFlag.ESTOP, 0, 0, 0, 0),
+    'emergency stop, session 0': frames.Command(0, 0, CommandFlag.ESTOP, 0, 0, 0, 0),
     'release': frames.Command(0x5A, 9, CommandFlag.ESTOP_CLEAR, 0, 0, 0, 0x01020306),
-    'with a tag that is none': GOLDEN_COMMAND._replace(tag=TAG),
+    'with an invalid tag': GOLDEN_COMMAND._replace(tag=TAG),
     'get': frames.ParamGet(0x5A, 10, 3),
     'set': frames.ParamSet(0x5A, 11, 0, 12345678),
-    'set below zero': frames.ParamSet(0x5A, 12, 255, -0x80000000),
-    'set with a tag that is none': frames.ParamSet(0x5A, 13, 1, 15000, 0x01020307, TAG),
+    'set, negative': frames.ParamSet(0x5A, 12, 255, -0x80000000),
+    'set, with an invalid tag': frames.ParamSet(0x5A, 13, 1, 15000, 0x01020307, TAG),
     'hello': frames.Hello(0x5A, 14, 0x01020308),
-    'hello with a tag that is none': frames.Hello(0xFF, 15, 0xFFFFFFFF, NONCE, TAG),
+    'hello, with an invalid tag': frames.Hello(0xFF, 15, 0xFFFFFFFF, NONCE, TAG),
     'poll state': frames.Poll(0x5A, 7, frames.STATE),
     'poll aux': frames.Poll(0x5A, 7, frames.AUX),
-    'poll info of nobody': frames.Poll(0, 0, frames.INFO),
+    'poll info, session 0': frames.Poll(0, 0, frames.INFO),
     'reset odometry': frames.Action(0x5A, 16, frames.RESET_ODOMETRY),
-    'clear counters, with a tag that is none': frames.Action(
+    'clear counters, with an invalid tag': frames.Action(
         0x5A, 17, frames.CLEAR_COUNTERS, 0x01020309, TAG
     ),
     'unknown verb': frames.Action(0x5A, 18, 255),
 }
 UP = {
     'radio.md': GOLDEN_STATE,
-    'least': frames.State(
+    'minimum values': frames.State(
         0, 0, 0, 0, -0x80000000, -0x80000000, -32768, -32768, -32768, 0, bytes(8)
     ),
-    'most': frames.State(
+    'maximum values': frames.State(
         255, 255, 255, 0xFFFFFFFF, 0x7FFFFFFF, 0x7FFFFFFF, 32767, 32767, 32767, 0xFFFF, b'\xff' * 8
     ),
     'ttl_max': frames.Param(0x5A, 10, 3, frames.OK, 250, 20, 500),
@@ -93,26 +93,26 @@ TO_DONGLE = {
         0x2A, 6, codec.encode(GOLDEN_COMMAND), codec.encode(frames.Poll(0x5A, 7, frames.STATE))
     ),
     'one payload only': frames.Transmit(0, 0, codec.encode(frames.Poll(0, 0, frames.INFO))),
-    'the longest': frames.Transmit(255, 255, bytes(range(32)), bytes(32)),
-    'ask for the radio': frames.Configure(1),
-    'set the radio': frames.Configure(2, 82, 1, 0, 1, 3, ADDRESS),
+    'maximum length': frames.Transmit(255, 255, bytes(range(32)), bytes(32)),
+    'read the radio configuration': frames.Configure(1),
+    'configure the radio': frames.Configure(2, 82, 1, 0, 1, 3, ADDRESS),
     'ping': frames.Ping(3, b'\x00\x11\x22\x33'),
 }
 FROM_DONGLE = {
     'radio.md': frames.Result(0x2A, 0x03, 0x13, 0x075BCA00, codec.encode(GOLDEN_STATE)),
-    'nobody there': frames.Result(0x2B, 0x34, 0x08, 1),
-    'acknowledged, no answer': frames.Result(0x2C, 0x01, 0x21, 0xFFFFFFFF),
-    'only the first was answered': frames.Result(0x2D, 0x03, 0x34, 2, b'\x00\x00\x00'),
-    'the radio': frames.Configured(2, 82, 1, 0, 1, 3, ADDRESS, 1),
+    'no acknowledgement': frames.Result(0x2B, 0x34, 0x08, 1),
+    'acknowledged, no payload': frames.Result(0x2C, 0x01, 0x21, 0xFFFFFFFF),
+    'payload of the first only': frames.Result(0x2D, 0x03, 0x34, 2, b'\x00\x00\x00'),
+    'the radio configuration': frames.Configured(2, 82, 1, 0, 1, 3, ADDRESS, 1),
     'no radio chip': frames.Configured(2, 0, 0, 0, 0, 0, bytes(5), 0),
     'pong': frames.Pong(3, b'\x00\x11\x22\x33', 4711, 1, 1, 2, 1, 10, 20, 65535, 0x02),
     'busy': frames.Refusal(3, 0x2A),
 }
 
 TO_BOARD = {
-    'ask for the key': frames.Key(1),
+    'read the state of the key': frames.Key(1),
     'store a key': frames.Key(2, bytes(range(0x80, 0x90))),
-    'forget the key': frames.Key(3, bytes(16)),
+    'erase the key': frames.Key(3, bytes(16)),
     'ping': frames.Ping(4, b'\x00\x11\x22\x33'),
 }
 FROM_BOARD = {
@@ -121,9 +121,9 @@ FROM_BOARD = {
         2, frames.OK, frames.KEY_HELD, authentication.key_check(bytes(range(0x80, 0x90)))
     ),
     'busy': frames.KeyState(3, frames.BUSY, frames.KEY_HELD, 0xFFFFFFFF),
-    'it did not hold': frames.KeyState(4, frames.FAILED, frames.KEY_DAMAGED, 0),
+    'EEPROM failed': frames.KeyState(4, frames.FAILED, frames.KEY_DAMAGED, 0),
     'pong': frames.Pong(4, b'\x00\x11\x22\x33', 4711, 1, 1, 2, 1, 10, 20, 65535, 0x02),
-    'not for a robot': frames.Refusal(1, 0x01),
+    'unknown to the robot board': frames.Refusal(1, 0x01),
 }
 KEYS = (bytes(range(0x80, 0x90)), bytes(range(16)), b'\xff' * 16)
 
@@ -198,25 +198,26 @@ def _random_wires() -> list[dict]:
 
 
 def _session() -> dict:
-    """Return a keyed session as the robot sees it: each frame, and what it makes of it."""
+    """Return a keyed session at the robot: each frame and its verification."""
     key = bytes(range(0x80, 0x90))
     other = bytes(range(0x81, 0x91))
     nonces = bytes.fromhex('0102030405060708'), bytes.fromhex('1112131415161718')
     fresh = bytes.fromhex('a1a2a3a4a5a6a7a8'), bytes.fromhex('b1b2b3b4b5b6b7b8')
     start = 0xFFFFF000
-    gate = authentication.CommandVerifier(key)
+    verifier = authentication.CommandVerifier(key)
     rows: list[dict] = []
 
-    def hello(name: str, frame: frames.Hello, drawn: bytes = bytes(8)) -> None:
-        _add(name, frame, lambda: gate.begin_session(frame, drawn), {'fresh_nonce': drawn.hex()})
+    def hello(name: str, frame: frames.Hello, nonce: bytes = bytes(8)) -> None:
+        begin = lambda: verifier.begin_session(frame, nonce)  # noqa: E731
+        _add(name, frame, begin, {'fresh_nonce': nonce.hex()})
 
     def other_kind(name: str, frame: authentication.SignedFrame) -> None:
-        _add(name, frame, lambda: gate.verify(frame), {})
+        _add(name, frame, lambda: verifier.verify(frame), {})
 
-    def _add(name: str, frame: tuple, judge: Callable[[], str], more: dict) -> None:
-        why = judge()
+    def _add(name: str, frame: tuple, verify: Callable[[], str], more: dict) -> None:
+        why = verify()
         row = {'name': name, 'kind': type(frame).__name__, 'bytes': codec.encode(frame).hex()}
-        after = {'session': gate.session, 'robot_nonce': gate.nonce.hex()}
+        after = {'session': verifier.session, 'robot_nonce': verifier.nonce.hex()}
         rows.append(row | more | {'accepted': not why, 'why': why} | after)
 
     first = authentication.sign_hello(key, 0x5A, 1, start, nonces[0])
@@ -246,15 +247,15 @@ def _session() -> dict:
     other_kind('PARAM_SET again', setting)
     other_kind('ACTION with one bit of its tag changed', _flip(reset))
     other_kind('ACTION', reset)
-    other_kind('ESTOP of nobody, without a tag', stop)
+    other_kind('ESTOP of session 0, without a tag', stop)
     other_kind('ESTOP with a bad tag', stop._replace(session=0x5A, tag=TAG))
     other_kind('ESTOP_CLEAR without a tag', clear._replace(tag=b''))
     other_kind('ESTOP_CLEAR with a bad tag', _flip(clear))
     other_kind('ESTOP_CLEAR', clear)
-    other_kind('CMD that was overtaken', late)
+    other_kind('CMD received out of order', late)
     other_kind('CMD with speeds exchanged', wrapped._replace(left=-2500, right=5000))
     other_kind('CMD after the wrap of host_us', wrapped)
-    other_kind('CMD of before the wrap again', late)
+    other_kind('CMD from before the wrap again', late)
     other_kind('PARAM_SET at the end of epoch 1', after)
     other_kind('CMD of epoch 1 again', wrapped)
     other_kind('CMD of epoch 2', twice)
@@ -263,7 +264,7 @@ def _session() -> dict:
     other_kind('CMD of the session before', late)
     signer = authentication.Signer(authentication.session_key(key, nonces[1], fresh[1]), 100)
     other_kind('CMD of this one', signer.sign(command._replace(seq=3, host_us=101)))
-    hello('the first HELLO again: a session nobody has the key of', first, bytes(8))
+    hello('the first HELLO again: a session with an unknown key', first, bytes(8))
     other_kind('CMD of the first session', early)
 
     keyless = authentication.CommandVerifier()
@@ -306,12 +307,12 @@ def _session() -> dict:
 
 
 def _stops(key: bytes) -> dict:
-    """Return what becomes of emergency stops: all are obeyed, `counted` are those in the order."""
+    """Return emergency stops: all are executed, ``counted`` are those that pass verification."""
     start = 0xFFFFF000
     host, fresh = bytes.fromhex('2122232425262728'), bytes.fromhex('c1c2c3c4c5c6c7c8')
-    gate = authentication.CommandVerifier(key)
+    verifier = authentication.CommandVerifier(key)
     hello = authentication.sign_hello(key, 0x5B, 1, start, host)
-    if why := gate.begin_session(hello, fresh):
+    if why := verifier.begin_session(hello, fresh):
         raise ValueError(f'HELLO must be accepted: got {why}')
     signer = authentication.Signer(authentication.session_key(key, host, fresh), start)
     stop = frames.Command(0x5B, 1, CommandFlag.ESTOP, 0, 0, 0, 0)
@@ -319,15 +320,15 @@ def _stops(key: bytes) -> dict:
     signed = signer.sign(stop._replace(seq=3, host_us=start + 20))
     wrapped = signer.sign(stop._replace(seq=4, host_us=5))
     later = signer.sign(GOLDEN_COMMAND._replace(session=0x5B, seq=5, host_us=30))
-    story = (
-        ('ESTOP of nobody', stop._replace(session=0)),
+    cases = (
+        ('ESTOP of session 0', stop._replace(session=0)),
         ('ESTOP without a tag', stop),
-        ('ESTOP with a bad tag, of a time to come', stop._replace(host_us=start + 999, tag=TAG)),
+        ('ESTOP with a bad tag and a later host_us', stop._replace(host_us=start + 999, tag=TAG)),
         ('ESTOP', signed),
-        ('CMD that was overtaken by it', before),
+        ('CMD received after it, sent before', before),
         ('ESTOP again', signed),
         ('ESTOP after the wrap of host_us', wrapped),
-        ('ESTOP of before the wrap', signed),
+        ('ESTOP from before the wrap', signed),
         ('CMD after it', later),
     )
     return {
@@ -338,9 +339,9 @@ def _stops(key: bytes) -> dict:
                 'name': name,
                 'kind': 'Command',
                 'bytes': codec.encode(frame).hex(),
-                'counted': not gate.accept(frame),
+                'counted': not verifier.accept(frame),
             }
-            for name, frame in story
+            for name, frame in cases
         ],
     }
 

@@ -112,7 +112,7 @@ def test_a_resonator_that_warms_up_is_followed():
 def test_a_model_that_knows_nothing_says_so():
     model = ClockModel()
     assert not model.is_set
-    with pytest.raises(ValueError, match='at least: got none'):
+    with pytest.raises(ValueError, match='at least one transaction: got none'):
         model.to_host_ns(0)
     model.add(1000, 0, 5_000_000, 1_000_000)
     assert model.is_set

@@ -74,7 +74,7 @@ def frame_of(row):
 def columns(kind, signed):
     """Return name -> (code, low, high) of the fields of a frame with a fixed layout."""
     form = codec._LAYOUTS[kind].forms[-1 if signed else 0]
-    return {column.name: column for column in form._columns if column.name in kind._fields}
+    return {field.name: field for field in form._fields if field.name in kind._fields}
 
 
 def some(kind, source, extreme=None):
@@ -273,7 +273,7 @@ def test_a_result_that_contradicts_itself_is_rejected():
                 continue
             good += 1
             said = codec.decode_exchange_status(first)
-            assert bool(payload) == said.answered
-            assert said.acknowledged + said.given_up + said.skipped <= 1
+            assert bool(payload) == said.has_payload
+            assert said.acknowledged + said.failed + said.skipped <= 1
     # Sixteen counts of tries each: acknowledged, answered, given up, none of them; once skipped.
     assert good == 4 * 16 + 1

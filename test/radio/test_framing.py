@@ -149,7 +149,7 @@ def test_a_million_random_bytes_give_nothing_and_take_no_room():
     splitter, found = FrameDecoder(), []
     for _ in range(1000):
         found += splitter.feed(source.randbytes(1000))
-        assert len(splitter._kept) <= module._ENCODED_LIMIT
+        assert len(splitter._buffer) <= module._ENCODED_LIMIT
     counts = splitter.counts
     assert counts.frames == len(found) <= 1
     assert counts.crc_errors + counts.frame_errors > 3500  # a zero every 256 bytes
@@ -161,7 +161,7 @@ def test_a_flood_without_a_zero_takes_no_room():
     splitter = FrameDecoder()
     for _ in range(100):
         assert splitter.feed(b'\x55' * 10000) == []
-        assert len(splitter._kept) <= module._ENCODED_LIMIT
+        assert len(splitter._buffer) <= module._ENCODED_LIMIT
     assert splitter.feed(b'\0' + encode_frame(b'now')) == [b'now']
     assert splitter.counts == (1, 0, 1)
 
@@ -204,6 +204,6 @@ def test_what_was_begun_before_a_new_connection_is_forgotten():
     splitter = FrameDecoder()
     wire = encode_frame(b'of this connection')
     splitter.feed(wire[:5])
-    splitter.forget()
+    splitter.reset()
     assert splitter.feed(wire) == [b'of this connection']
     assert splitter.counts == (1, 0, 0)

@@ -20,7 +20,7 @@ def after(*trips):
 def test_nothing_is_claimed_before_anything_was_measured():
     quality = LinkStatistics(0.02, 0.2).quality(math.inf, NOTHING)
     assert quality.level is DiagnosticLevel.ERROR
-    assert quality.text == 'no word of the robot for inf s'
+    assert quality.text == 'no telemetry for inf s'
     assert math.isnan(quality.lost_share)
     assert math.isnan(quality.round_trip_median)
     assert math.isnan(quality.round_trip_p99)
@@ -53,7 +53,7 @@ def test_slow_round_trips_are_worth_a_warning_with_their_usual_cause():
     assert after(*[0.009] * 100).quality(0.0, NOTHING).level is DiagnosticLevel.OK
     slow = after(*[0.005] * 97, *[0.016] * 3).quality(0.0, NOTHING)
     assert slow.level is DiagnosticLevel.WARN
-    assert slow.text == 'round trips take up to 16.0 ms: serial port not at low latency?'
+    assert slow.text == 'round trips up to 16.0 ms: is the port in low-latency mode?'
 
 
 def test_a_robot_that_must_have_stopped_by_itself_is_an_error():
@@ -61,7 +61,7 @@ def test_a_robot_that_must_have_stopped_by_itself_is_an_error():
     assert statistics.quality(0.2, NOTHING).level is DiagnosticLevel.OK
     lost = statistics.quality(0.25, NOTHING)
     assert lost.level is DiagnosticLevel.ERROR
-    assert lost.text == 'no word of the robot for 0.25 s'
+    assert lost.text == 'no telemetry for 0.25 s'
 
 
 def test_retransmissions_are_counted_by_how_many():

@@ -123,14 +123,14 @@ def test_parameters_are_written_and_read_back():
         'idle_off': 60000,
         'invert_wheels': 2,
     }
-    assert bench.link.parameters == expected
+    assert bench.link.board_parameters == expected
     assert bench.robot.parameters == list(expected.values())
     order = [type(frame).__name__ for _, frame in bench.robot.log]
     assert order.index('ParamGet') > max(at for at, name in enumerate(order) if name == 'ParamSet')
 
 
 def test_defaults_of_the_settings_are_those_of_the_robot():
-    wire = LinkParameters().robot.on_wire()
+    wire = LinkParameters().robot.to_wire()
     assert len(wire) == 7
     for number, value in wire.items():
         row = BOARD_PARAMETERS[number]
@@ -307,7 +307,7 @@ def test_an_older_robot_with_fewer_parameters_is_asked_for_those_only():
     bench.robot.info = lambda seq, now_ns: info(seq, now_ns)._replace(parameters=8)
     bench.robot.refuses[9] = frames.UNKNOWN
     bench.run(2.0)
-    assert 'invert_wheels = 0 was refused: the robot does not know it' in (
+    assert 'invert_wheels = 0 was refused: the robot does not support it' in (
         bench.link.reason(bench.now_ns)
     )
 
@@ -335,13 +335,13 @@ def test_a_state_becomes_si_units():
 
 def test_a_measurement_that_is_not_newer_than_the_last_is_dropped():
     """When the POLL gets lost, the payload is what the robot had loaded some time before."""
-    robot, reader = FakeRobot(), TelemetryDecoder()
+    robot, decoder = FakeRobot(), TelemetryDecoder()
     old, new = robot.state(0), robot.state(20 * MS)
-    assert reader.read(new, 21 * MS).raw is new
-    assert reader.read(old, 41 * MS) is None
-    assert reader.read(new, 61 * MS) is None
-    assert reader.read(robot.state(80 * MS), 81 * MS) is not None
-    assert not reader.rebooted
+    assert decoder.decode(new, 21 * MS).raw is new
+    assert decoder.decode(old, 41 * MS) is None
+    assert decoder.decode(new, 61 * MS) is None
+    assert decoder.decode(robot.state(80 * MS), 81 * MS) is not None
+    assert not decoder.rebooted
 
 
 @pytest.mark.parametrize('skew', [0.005, -0.005])
@@ -409,7 +409,7 @@ def test_the_newest_command_wins_and_none_is_queued(bench):
                 round(1000 * wheels.left),
                 round(1000 * wheels.right),
             )
-        assert bench.link.sent == pytest.approx(wheels, abs=5e-4)
+        assert bench.link.sent_wheels == pytest.approx(wheels, abs=5e-4)
 
 
 def test_commands_are_counted_up_and_leave_on_the_period(bench):
@@ -462,7 +462,7 @@ def test_wheels_that_are_too_fast_are_slowed_by_one_factor(bench):
     bench.drive(30.0, -15.0)
     bench.run(0.1)
     assert bench.robot.speeds == (-5.0, 10.0)
-    assert bench.link.sent == (10.0, -5.0)
+    assert bench.link.sent_wheels == (10.0, -5.0)
     bench.drive(10.0, -20.0)
     bench.run(0.1)
     assert bench.robot.speeds == (-10.0, 5.0)
@@ -506,20 +506,20 @@ def test_emergency_stop_and_release(bench):
 
 
 def test_a_release_is_asked_for_even_if_the_robot_has_not_said_yet_that_it_is_latched():
-    orders = SetpointArbiter(LinkParameters())
-    orders.latch('asked for')
-    assert orders.next(False, 0).flags == CommandFlag.ESTOP
-    assert orders.release(False, 0) == ''
-    flags = [orders.next(False, cycle * 20 * MS).flags for cycle in range(5)]
+    arbiter = SetpointArbiter(LinkParameters())
+    arbiter.latch('asked for')
+    assert arbiter.next_setpoint(False, 0).flags == CommandFlag.ESTOP
+    assert arbiter.release(False, 0) == ''
+    flags = [arbiter.next_setpoint(False, cycle * 20 * MS).flags for cycle in range(5)]
     assert flags == 3 * [CommandFlag.ESTOP_CLEAR] + 2 * [CommandFlag.ENABLE]
 
 
 def test_nothing_is_commanded_while_the_robot_says_that_it_is_latched():
-    orders = SetpointArbiter(LinkParameters())
-    assert orders.take(RobotCommand(WheelSpeeds(1.0, 2.0), 0), 0) == ''
-    assert orders.next(True, MS) == (CommandFlag.ENABLE, 0, 0)
-    assert orders.sent == (0.0, 0.0)
-    assert orders.next(False, MS) == (CommandFlag.ENABLE, 2000, 1000)
+    arbiter = SetpointArbiter(LinkParameters())
+    assert arbiter.accept(RobotCommand(WheelSpeeds(1.0, 2.0), 0), 0) == ''
+    assert arbiter.next_setpoint(True, MS) == (CommandFlag.ENABLE, 0, 0)
+    assert arbiter.sent_wheels == (0.0, 0.0)
+    assert arbiter.next_setpoint(False, MS) == (CommandFlag.ENABLE, 2000, 1000)
 
 
 def test_an_emergency_stop_survives_a_jam_of_the_link(bench):
@@ -568,7 +568,7 @@ def test_a_jam_stops_the_robot_by_its_own_clock_and_the_link_goes_on_after_it(be
     assert 'does not answer' in bench.link.reason(bench.now_ns)
     quality = bench.link.quality(bench.now_ns)
     assert quality.level is DiagnosticLevel.ERROR
-    assert 'no word of the robot for 0.5' in quality.text
+    assert 'no telemetry for 0.5' in quality.text
     session = bench.robot.gate.session
     bench.run(0.5)
     assert bench.run(1.0, lambda: moving(bench)) < 0.05
@@ -777,54 +777,54 @@ def test_the_wrap_of_the_hosts_microseconds_does_not_show(bench):
 
 def test_an_answer_belongs_to_its_frame_or_to_none():
     """A result that comes late must not be taken for that of the next command."""
-    dialogue = TransactionLayer(LinkStatistics(0.02, 0.2))
+    transactions = TransactionLayer(LinkStatistics(0.02, 0.2))
     command, poll = frames.Command(1, 1, 0, 0, 0, 0, 5), frames.Poll(1, 1, frames.STATE)
-    dialogue.transact(command, poll, 6, 0)
-    assert dialogue.expire(49 * MS) is None
-    assert dialogue.expire(50 * MS).reply is None
-    assert dialogue.silent == 1
-    dialogue.transact(command, poll, 6, 60 * MS)
+    transactions.transact(command, poll, 6, 0)
+    assert transactions.expire(49 * MS) is None
+    assert transactions.expire(50 * MS).reply is None
+    assert transactions.timeouts == 1
+    transactions.transact(command, poll, 6, 60 * MS)
     late, due = (encode_frame(encode(frames.Result(number, 0x34, 0x08, 0))) for number in (1, 2))
-    assert dialogue.feed(late, 61 * MS) == []
-    (heard,) = dialogue.feed(due + due, 64 * MS)
-    assert heard.round_trip == 0.004
-    assert dialogue.silent == 0
-    dialogue.ping(50 * MS, 70 * MS)
+    assert transactions.feed(late, 61 * MS) == []
+    (result,) = transactions.feed(due + due, 64 * MS)
+    assert result.round_trip == 0.004
+    assert transactions.timeouts == 0
+    transactions.ping(50 * MS, 70 * MS)
     pong = frames.Pong(3, b'late', 0, 1, 1, 0, 1, 0, 0, 0, 0)
-    assert dialogue.feed(encode_frame(encode(pong)), 71 * MS) == []
-    assert dialogue.deadline_ns == 120 * MS
+    assert transactions.feed(encode_frame(encode(pong)), 71 * MS) == []
+    assert transactions.deadline_ns == 120 * MS
 
 
 @pytest.mark.parametrize('tries', [0, 1, 15])
 def test_only_commands_that_needed_no_second_try_tell_the_time(tries):
-    dialogue = TransactionLayer(LinkStatistics(0.02, 0.2))
+    transactions = TransactionLayer(LinkStatistics(0.02, 0.2))
     command, poll = frames.Command(1, 1, 0, 0, 0, 0, 5), frames.Poll(1, 1, frames.STATE)
     payload = encode(FakeRobot().state(0))
     for first in (command, poll):
-        dialogue.transact(first, poll, 6, 10 * MS)
+        transactions.transact(first, poll, 6, 10 * MS)
         number = 1 if first is command else 2
         result = frames.Result(number, 0x03 | tries << 4, 0x03, 0, payload)
-        (heard,) = dialogue.feed(encode_frame(encode(result)), 14 * MS)
-        assert heard.uplink == FakeRobot().state(0)
-        assert (heard.sending is not None) == (first is command and tries == 0)
-        if heard.sending is not None:
-            assert heard.sending == (10 * MS, 965_000)
+        (result,) = transactions.feed(encode_frame(encode(result)), 14 * MS)
+        assert result.uplink == FakeRobot().state(0)
+        assert (result.timing is not None) == (first is command and tries == 0)
+        if result.timing is not None:
+            assert result.timing == (10 * MS, 965_000)
 
 
 # -- requests, end, pace --------------------------------------------------------------------------
 
 
 def test_an_action_is_asked_for_until_it_is_answered(bench):
-    bench.link.request(frames.RESET_ODOMETRY)
-    assert bench.link.answer(frames.RESET_ODOMETRY) is None
+    bench.link.request_action(frames.RESET_ODOMETRY)
+    assert bench.link.action_result(frames.RESET_ODOMETRY) is None
     bench.run(0.2)
-    assert bench.link.answer(frames.RESET_ODOMETRY) == 'refused while the robot moves'
+    assert bench.link.action_result(frames.RESET_ODOMETRY) == 'refused while the robot moves'
     bench.release_controls()
     bench.run(0.5)
     bench.dongle.loss = 0.5
-    bench.link.request(frames.RESET_ODOMETRY)
+    bench.link.request_action(frames.RESET_ODOMETRY)
     bench.run(2.0)
-    assert bench.link.answer(frames.RESET_ODOMETRY) == ''
+    assert bench.link.action_result(frames.RESET_ODOMETRY) == ''
     assert bench.robot.steps == [0.0, 0.0]
 
 
@@ -834,10 +834,10 @@ def test_at_a_hundred_cycles_a_second_requests_still_get_their_turn():
     bench.connect()
     bench.drive(0.0, 0.0)
     bench.run(0.5)
-    bench.link.request(frames.CLEAR_COUNTERS)
+    bench.link.request_action(frames.CLEAR_COUNTERS)
     since = bench.now_ns
     bench.run(3.0)
-    assert bench.link.answer(frames.CLEAR_COUNTERS) == ''
+    assert bench.link.action_result(frames.CLEAR_COUNTERS) == ''
     quality = bench.link.quality(bench.now_ns)
     assert quality.robot is not None
     assert bench.now_ns / 1e3 - quality.dongle.time_us < 1.2e6
@@ -894,7 +894,7 @@ def test_a_robot_that_restarts_while_shutting_down_is_not_greeted_again(bench):
 
 
 def test_what_was_on_its_way_when_the_port_was_lost_is_forgotten(bench):
-    bench.run(0.5, lambda: bench.link._dialogue.deadline_ns is not None)
+    bench.run(0.5, lambda: bench.link._transactions.deadline_ns is not None)
     bench.link.port_failed('failed', True, bench.now_ns)
     assert bench.link.step(bench.now_ns)[-1].until_ns - bench.now_ns == 200 * MS
 

@@ -37,35 +37,35 @@ from t3mpc_ros.radio.protocol.frames import (
 )
 
 Entropy = Callable[[int], bytes]
-"""Returns that many bytes nobody can foresee."""
+"""Returns a number of unpredictable bytes."""
 
 _BYTE, _WORD = 0xFF, 0xFFFFFFFF
 _RETRY_NS = NANOSECONDS // 10
 _REJECTED_RETRY_NS = NANOSECONDS
-"""What was refused will be again: another try now and then, for it may have been set right."""
+"""Retry period after a rejection, whose cause may be repaired meanwhile."""
 _MAX_ATTEMPTS = 50
-"""Of one parameter, before the robot is greeted anew."""
+"""Attempts for one parameter before a new HELLO."""
 _RESULT_TEXTS = {
-    frames.UNKNOWN: 'does not know it',
+    frames.UNKNOWN: 'does not support it',
     frames.OUT_OF_RANGE: 'allows {low} to {high}',
-    frames.READ_ONLY: 'does not let it be changed',
+    frames.READ_ONLY: 'has it read-only',
     frames.BUSY: 'is busy',
 }
 
 
 class Session:
-    """Makes the frames of one session, signed if there is a key.
+    """Builds the frames of one session, signed if there is a key.
 
     Parameters
     ----------
     key
-        The long-term key; empty on an open link.
+        Long-term key; empty on an open link.
     entropy
-        For the number and the nonce.
+        Source of the session number and the nonce.
     before
-        Number of the session before: this one gets another.
+        Number of the previous session, which is not used again; 0 without one.
     now_ns
-        By the host's steady clock.
+        Host time.
     """
 
     def __init__(self, key: bytes, entropy: Entropy, before: int, now_ns: int) -> None:
@@ -76,20 +76,20 @@ class Session:
         self._seq = 0
         self._request = 0
         self._signer: Signer | None = None
-        # The same at every try, so that the robot knows a repeated one.
+        # Constant over all attempts, so that the robot recognises a repeated HELLO.
         self._nonce = entropy(NONCE_SIZE) if key else b''
         self._hello_us = self._last_us & _WORD
 
     @property
     def number(self) -> int:
-        """1 to 255."""
+        """Session number, 1 to 255."""
         return self._number
 
     def hello(self, now_ns: int) -> Hello:
-        """Return the frame that starts this session, stamped anew at every try.
+        """Return the HELLO of this session with the current time stamp.
 
-        It is the first the robot learns of the host's clock: with the stamp of an earlier try, a
-        command as old as that would pass for a prompt one.
+        The robot derives the age of commands from it: with the stamp of an earlier attempt, a
+        command of that age would count as prompt.
         """
         self._hello_us = host_us = self._stamp(now_ns)
         if not self._key:
@@ -97,7 +97,7 @@ class Session:
         return sign_hello(self._key, self._number, 0, host_us, self._nonce)
 
     def accept(self, info: Info) -> str:
-        """Begin the session if the robot is in it; return what is wrong if not."""
+        """Start the session with the INFO of the robot; return the problem if there is one."""
         if info.protocol != VERSION:
             return f'the robot must speak protocol {VERSION}: it speaks {info.protocol}'
         if self._key and not info.nonce:
@@ -115,14 +115,14 @@ class Session:
         """Return the next CMD."""
         self._seq = self._seq + 1 & _BYTE
         frame = Command(self._number, self._seq, flags, ttl, left, right, self._stamp(now_ns))
-        return self._signed(frame)
+        return self._sign(frame)
 
     def set(self, number: int, value: int, now_ns: int) -> ParamSet:
         """Return a PARAM_SET."""
         frame = ParamSet(self._number, self._next_request(), number, value)
         if self._signer is None:
             return frame
-        return self._signed(frame._replace(host_us=self._stamp(now_ns)))
+        return self._sign(frame._replace(host_us=self._stamp(now_ns)))
 
     def get(self, number: int) -> ParamGet:
         """Return a PARAM_GET."""
@@ -133,137 +133,134 @@ class Session:
         frame = Action(self._number, self._next_request(), verb)
         if self._signer is None:
             return frame
-        return self._signed(frame._replace(host_us=self._stamp(now_ns)))
+        return self._sign(frame._replace(host_us=self._stamp(now_ns)))
 
     def poll(self, what: int) -> Poll:
         """Return a POLL."""
         return Poll(self._number, self._seq, what)
 
-    def _signed(self, frame: AnySignedFrame) -> AnySignedFrame:
+    def _sign(self, frame: AnySignedFrame) -> AnySignedFrame:
         return frame if self._signer is None else self._signer.sign(frame)
 
     def _next_request(self) -> int:
-        # Apart from the commands: the robot would take those for old after 128 lost requests.
+        # Separate from commands, which the robot would reject as old after 128 lost requests.
         self._request = self._request + 1 & _BYTE
         return self._request
 
     def _stamp(self, now_ns: int) -> int:
-        # Strictly increasing even if the clock stands: it is the counter of what is signed.
+        # Strictly increasing even if the clock is not: it is the counter of signed frames.
         self._last_us = max(self._last_us + 1, now_ns // 1000)
         return self._last_us & _WORD
 
 
 class Handshake:
-    """Leads from HELLO to RUN.
+    """Handshake from HELLO to RUN.
 
     Parameters
     ----------
     session
-        To be begun.
-    settings
-        Its robot parameters are written.
-    why
-        Why the robot has to be greeted; said until there is something newer to say.
+        Session to start.
+    parameters
+        Contains the board parameters to write.
+    reason
+        Reason for the handshake; reported until there is a newer one.
     """
 
-    def __init__(self, session: Session, parameters: LinkParameters, why: str) -> None:
+    def __init__(self, session: Session, parameters: LinkParameters, reason: str) -> None:
         self._session = session
-        self._wanted = parameters.robot.on_wire()
+        self._targets = parameters.robot.to_wire()
         self._channel = parameters.channel
         self._state = LinkState.HELLO
-        self._why = why
-        self._todo: deque[tuple[int, int | None]] = deque()
-        self._tries = 0
+        self._reason = reason
+        self._pending: deque[tuple[int, int | None]] = deque()
+        self._attempts = 0
         self._info: Info | None = None
         self._board_parameters: dict[int, int] = {}
 
     @property
     def state(self) -> LinkState:
-        """HELLO, INFO or PARAMS; RUN when there is nothing left to do."""
+        """HELLO, INFO or PARAMS; RUN when the handshake is complete."""
         return self._state
 
     @property
-    def why(self) -> str:
-        """What is being waited for, or what is wrong."""
-        return self._why
+    def reason(self) -> str:
+        """Reason why the handshake is not complete."""
+        return self._reason
 
     @property
     def info(self) -> Info | None:
-        """Who the robot is, once the session has begun."""
+        """Identity of the robot, once the session has started."""
         return self._info
 
     @property
-    def parameters(self) -> dict[int, int]:
-        """What was read back, by id."""
+    def board_parameters(self) -> dict[int, int]:
+        """Board parameters as read back, by id."""
         return self._board_parameters
 
-    def next(self, now_ns: int) -> tuple[Downlink, int]:
-        """Return what to send now, and what to POLL after it."""
+    def next_request(self, now_ns: int) -> tuple[Downlink, int]:
+        """Return the payload to send now, and the frame to POLL after it."""
         if self._state is LinkState.HELLO:
             return self._session.hello(now_ns), frames.INFO
         if self._state is LinkState.INFO:
             return self._session.poll(frames.INFO), frames.INFO
-        number, value = self._todo[0]
+        number, value = self._pending[0]
         if value is None:
             return self._session.get(number), frames.STATE
         return self._session.set(number, value, now_ns), frames.STATE
 
-    def hear(self, heard: TransactionResult) -> int:
-        """Take the answer and return how long (ns) to wait before the next step."""
+    def handle(self, result: TransactionResult) -> int:
+        """Process a result; return the delay before the next request, ns."""
         if self._state is LinkState.PARAMS:
-            return self._hear_parameter(heard)
-        if isinstance(heard.uplink, Info):
-            return self._meet(heard.uplink)
-        if heard.uplink is None:
+            return self._handle_parameter(result)
+        if isinstance(result.uplink, Info):
+            return self._handle_info(result.uplink)
+        if result.uplink is None:
             self._state = LinkState.HELLO
-            self._why = reasons.robot_absent(self._channel)
+            self._reason = reasons.robot_absent(self._channel)
             return _RETRY_NS
         self._state = LinkState.INFO
         return 0
 
-    def _meet(self, info: Info) -> int:
+    def _handle_info(self, info: Info) -> int:
         problem = self._session.accept(info)
         if problem:
-            self._state, self._why = LinkState.HELLO, problem
+            self._state, self._reason = LinkState.HELLO, problem
             return _RETRY_NS
         self._info = info
         self._state = LinkState.PARAMS
-        self._list(info.parameters)
+        self._queue_parameters(info.parameters)
         return 0
 
-    def _list(self, count: int) -> None:
-        """Note what is to be written and read; a robot of an older make has fewer parameters."""
-        self._todo.clear()
-        self._todo.extend((number, self._wanted[number]) for number in self._wanted)
-        self._todo.extend((number, None) for number in range(min(count, len(BOARD_PARAMETERS))))
+    def _queue_parameters(self, count: int) -> None:
+        """Queue all writes and reads; older firmware has fewer parameters."""
+        self._pending.clear()
+        self._pending.extend((number, self._targets[number]) for number in self._targets)
+        self._pending.extend((number, None) for number in range(min(count, len(BOARD_PARAMETERS))))
 
-    def _hear_parameter(self, heard: TransactionResult) -> int:
-        number, wanted = self._todo[0]
-        answer = heard.uplink
-        asked_seq = getattr(heard.asked, 'seq', None)
-        if not isinstance(answer, Param) or (answer.id, answer.seq) != (number, asked_seq):
-            self._tries += 1
-            if self._tries >= _MAX_ATTEMPTS:
-                self._tries, self._state, self._why = (
-                    0,
-                    LinkState.HELLO,
-                    reasons.robot_absent(self._channel),
-                )
-            return 0 if heard.uplink is not None else _RETRY_NS // 5
-        self._tries = 0
+    def _handle_parameter(self, result: TransactionResult) -> int:
+        number, target = self._pending[0]
+        answer = result.uplink
+        expected_seq = getattr(result.request, 'seq', None)
+        if not isinstance(answer, Param) or (answer.id, answer.seq) != (number, expected_seq):
+            self._attempts += 1
+            if self._attempts >= _MAX_ATTEMPTS:
+                self._attempts, self._state = 0, LinkState.HELLO
+                self._reason = reasons.robot_absent(self._channel)
+            return 0 if result.uplink is not None else _RETRY_NS // 5
+        self._attempts = 0
         name = BOARD_PARAMETERS[number].name
         if answer.rc != frames.OK:
-            told = _RESULT_TEXTS[answer.rc].format(low=answer.low, high=answer.high)
-            what = f'{name} = {wanted}' if isinstance(heard.asked, ParamSet) else name
-            self._why = f'parameter {what} was refused: the robot {told}'
+            text = _RESULT_TEXTS[answer.rc].format(low=answer.low, high=answer.high)
+            what = f'{name} = {target}' if isinstance(result.request, ParamSet) else name
+            self._reason = f'parameter {what} was refused: the robot {text}'
             return _RETRY_NS if answer.rc == frames.BUSY else _REJECTED_RETRY_NS
         self._board_parameters[number] = answer.value
-        expected = self._wanted.get(number, answer.value)
+        expected = self._targets.get(number, answer.value)
         if answer.value != expected:
-            self._why = f'parameter {name} must be {expected}: the robot keeps {answer.value}'
-            self._list(self._info.parameters if self._info else 0)
+            self._reason = f'parameter {name} must be {expected}: the robot keeps {answer.value}'
+            self._queue_parameters(self._info.parameters if self._info else 0)
             return _REJECTED_RETRY_NS
-        self._todo.popleft()
-        if not self._todo:
+        self._pending.popleft()
+        if not self._pending:
             self._state = LinkState.RUN
         return 0

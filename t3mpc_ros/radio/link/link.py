@@ -36,199 +36,197 @@ from t3mpc_ros.radio.protocol.frames import (
 )
 from t3mpc_ros.robot.interface import BatteryReading, RobotCommand
 
+_MIN_REOPEN_NS, _MAX_REOPEN_NS = NANOSECONDS // 5, 2 * NANOSECONDS
+_PING_TIMEOUT_NS = _CONFIGURE_RETRY_NS = NANOSECONDS // 10
+_DONGLE_START_TIMEOUT_NS = 5 * NANOSECONDS
+"""Includes 1.5 s of boot loader after a reset by opening the port."""
+_DEFECT_RETRY_NS = NANOSECONDS
+_MAX_TIMEOUTS = 5
+"""Consecutive requests without a reply before the link searches for the dongle again."""
+_HANDSHAKE_STATES = (LinkState.HELLO, LinkState.INFO, LinkState.PARAMS)
+_GYRO_RANGE_ID = [parameter.name for parameter in BOARD_PARAMETERS].index('gyro_range')
+
 _MIN_IDLE_NS = NANOSECONDS // 100
-"""A request is sent between two cycles if this much time is left."""
+"""Idle time before the next cycle that a request needs."""
 _REQUEST_DECIMATION = 10
-"""Where cycles leave no such time, every tenth gives way to a request."""
+"""Without idle time, every tenth cycle is replaced by a request."""
 _AUX_PERIOD_NS = _PING_PERIOD_NS = NANOSECONDS
+_ACTIVE_PING_TIMEOUT_NS = NANOSECONDS // 20
+"""Short, because the next command waits for it."""
 _MAX_LOST_CYCLES = 100
-"""Cycles without an answer before the robot is greeted anew: from the 128th on it would take
-commands for old ones, because sequence numbers have eight bits."""
+"""Consecutive lost cycles before a new handshake: sequence numbers have eight bits, so from the
+128th on the robot would reject commands as old."""
 _REJECTED_TIMEOUT_NS = NANOSECONDS // 2
 _MIN_STOP_COMMANDS = 3
-"""Commands of standstill before the drives are taken out, if the robot stands by then."""
+"""Standstill commands before the drives are disabled, if the robot then stands still."""
 _STOP_TIMEOUT_NS = NANOSECONDS
-"""After this long the drives are taken out even if it does not, or does not answer."""
+"""Time after which the drives are disabled in any case."""
 _DISABLE_COMMANDS = 3
 
 
 class PingRequest(NamedTuple):
-    """Ask the dongle how it fares."""
+    """PING the dongle, for its counters."""
 
 
 class ActiveSession:
-    """Decides what to send in a session, and when the session is over.
+    """Cycles of command and state within a session, requests between them, and its end.
 
     Parameters
     ----------
-    settings
-        The pace and the TTL.
+    parameters
+        Cycle rate and TTL.
     session
-        That has begun.
-    orders
-        What to tell the robot.
+        Session of a finished handshake.
+    arbiter
+        Source of the setpoints.
     statistics
         Counts the cycles.
     now_ns
-        The first cycle is due.
+        Time of the first cycle.
     """
 
     def __init__(
         self,
         parameters: LinkParameters,
         session: Session,
-        orders: SetpointArbiter,
+        arbiter: SetpointArbiter,
         statistics: LinkStatistics,
         now_ns: int,
     ) -> None:
         self._parameters = parameters
         self._session = session
-        self._orders = orders
+        self._arbiter = arbiter
         self._statistics = statistics
         self._period_ns = round(NANOSECONDS / parameters.cycle_rate)
         self._due_ns = now_ns
-        self._aux_ns = self._look_ns = now_ns
+        self._aux_ns = self._ping_ns = now_ns
         self._cycles = 0
-        self._taken_ns = now_ns
+        self._accepted_ns = now_ns
         self._status = StatusFlag(0)
         self._lost = 0
         self._stops: int | None = None
         self._stop_until_ns = 0
-        self._goodbyes = _DISABLE_COMMANDS
+        self._disable_attempts = _DISABLE_COMMANDS
 
     @property
     def due_ns(self) -> int:
-        """When the next cycle is due."""
+        """Time of the next cycle."""
         return self._due_ns
 
     @property
     def finished(self) -> bool:
-        """Whether the robot was brought to rest, as far as that can be done from here."""
-        return self._goodbyes == 0
+        """Whether the stop is complete: drives disabled, or all attempts used."""
+        return self._disable_attempts == 0
 
     def begin_stop(self, now_ns: int) -> None:
-        """Bring the robot to rest from now on, whatever is ordered."""
+        """Stop the robot from now on; setpoints are ignored."""
         if self._stops is None:
             self._stops, self._stop_until_ns = _MIN_STOP_COMMANDS, now_ns + _STOP_TIMEOUT_NS
             self._due_ns = now_ns
 
     def next(self, now_ns: int) -> Downlink | PingRequest | None:
-        """Return what to send now, if anything; a POLL for the state goes with a payload."""
+        """Return the request to send now, if any; a POLL for STATE follows each payload."""
         if now_ns < self._due_ns:
-            return self._aside(now_ns) if self._due_ns - now_ns >= _MIN_IDLE_NS else None
-        # Late cycles are left out, not made up for.
+            return self._next_request(now_ns) if self._due_ns - now_ns >= _MIN_IDLE_NS else None
+        # Late cycles are skipped.
         self._due_ns = max(self._due_ns + self._period_ns, now_ns + self._period_ns // 2)
         self._cycles += 1
         if self._period_ns < 2 * _MIN_IDLE_NS and self._cycles % _REQUEST_DECIMATION == 0:
-            aside = self._aside(now_ns)
-            if aside is not None:
-                return aside
-        return self._cycle(now_ns)
+            request = self._next_request(now_ns)
+            if request is not None:
+                return request
+        return self._next_command(now_ns)
 
-    def hear(self, heard: TransactionResult) -> str:
-        """Take an answer; return why the robot must be greeted anew, empty if it need not."""
-        if isinstance(heard.asked, Action):
-            self._orders.hear(heard.asked, heard.uplink)
-        if isinstance(heard.asked, Command):
-            answered = isinstance(heard.uplink, State)
-            whole = answered and _is_own_state(heard, heard.asked)
-            self._statistics.add_cycle(heard.round_trip if whole else None)
+    def handle(self, result: TransactionResult) -> str:
+        """Process a result; return the reason for a new handshake, empty if none is needed."""
+        if isinstance(result.request, Action):
+            self._arbiter.handle_action_result(result.request, result.uplink)
+        if isinstance(result.request, Command):
+            answered = isinstance(result.uplink, State)
+            complete = answered and _is_own_state(result, result.request)
+            self._statistics.add_cycle(result.round_trip if complete else None)
             self._lost = 0 if answered else self._lost + 1
-            self._say_goodbye(heard)
-        if isinstance(heard.uplink, State):
-            return self._judge(heard, heard.uplink)
-        return (
-            reasons.robot_absent(self._parameters.channel)
-            if self._lost >= _MAX_LOST_CYCLES
-            else ''
-        )
+            self._count_disable(result)
+        if isinstance(result.uplink, State):
+            return self._check_state(result, result.uplink)
+        if self._lost >= _MAX_LOST_CYCLES:
+            return reasons.robot_absent(self._parameters.channel)
+        return ''
 
-    def _aside(self, now_ns: int) -> Downlink | PingRequest | None:
-        """Return the request that has waited for a moment between cycles, if any."""
+    def _next_request(self, now_ns: int) -> Downlink | PingRequest | None:
+        """Return the request that is due between cycles, if any."""
         if self._stops is not None:
             return None
-        if self._orders.requested is not None:
-            return self._session.action(self._orders.requested, now_ns)
+        if self._arbiter.pending_action is not None:
+            return self._session.action(self._arbiter.pending_action, now_ns)
         if now_ns >= self._aux_ns:
             self._aux_ns = now_ns + _AUX_PERIOD_NS
             return self._session.poll(frames.AUX)
-        if now_ns >= self._look_ns:
-            self._look_ns = now_ns + _PING_PERIOD_NS
+        if now_ns >= self._ping_ns:
+            self._ping_ns = now_ns + _PING_PERIOD_NS
             return PingRequest()
         return None
 
-    def _cycle(self, now_ns: int) -> Downlink:
+    def _next_command(self, now_ns: int) -> Downlink:
         if self._stops is not None:
-            stands = not self._status & StatusFlag.MOVING and self._stops <= 0
-            leave = stands or now_ns >= self._stop_until_ns
-            self._stops = min(self._stops - 1, -1 if leave else self._stops)
-            flags = CommandFlag(0) if leave else CommandFlag.ENABLE
+            standing = not self._status & StatusFlag.MOVING and self._stops <= 0
+            disable = standing or now_ns >= self._stop_until_ns
+            self._stops = min(self._stops - 1, -1 if disable else self._stops)
+            flags = CommandFlag(0) if disable else CommandFlag.ENABLE
             return self._session.command(flags, 0, 0, 0, now_ns)
-        order = self._orders.next(bool(self._status & StatusFlag.ESTOP), now_ns)
+        setpoint = self._arbiter.next_setpoint(bool(self._status & StatusFlag.ESTOP), now_ns)
         return self._session.command(
-            order.flags, self._parameters.ttl_units, order.left, order.right, now_ns
+            setpoint.flags, self._parameters.ttl_units, setpoint.left, setpoint.right, now_ns
         )
 
-    def _say_goodbye(self, heard: TransactionResult) -> None:
-        """Count a command that took the drives out; one that was acknowledged is enough."""
-        if self._stops is None or not isinstance(heard.asked, Command) or heard.asked.flags:
+    def _count_disable(self, result: TransactionResult) -> None:
+        """Count commands that disable the drives; one acknowledgement completes the stop."""
+        if self._stops is None or not isinstance(result.request, Command) or result.request.flags:
             return
-        reply = heard.reply
-        taken = isinstance(reply, Result) and bool(reply.first & 1)
-        self._goodbyes = 0 if taken else self._goodbyes - 1
+        reply = result.reply
+        acknowledged = isinstance(reply, Result) and bool(reply.first & 1)
+        self._disable_attempts = 0 if acknowledged else self._disable_attempts - 1
 
-    def _judge(self, heard: TransactionResult, state: State) -> str:
+    def _check_state(self, result: TransactionResult, state: State) -> str:
         self._status = StatusFlag(state.status)
         if state.session != self._session.number or state.status & StatusFlag.NO_SESSION:
             return 'the robot has lost its session'
-        if isinstance(heard.asked, Command):
-            # An emergency stop is always obeyed, whatever comes of the rest of the command.
-            if state.seq == heard.asked.seq or heard.asked.flags & CommandFlag.ESTOP:
-                self._taken_ns = heard.returned_ns
-            elif heard.returned_ns - self._taken_ns > _REJECTED_TIMEOUT_NS:
+        if isinstance(result.request, Command):
+            # ESTOP is always executed, whether or not the rest of the command is accepted.
+            if state.seq == result.request.seq or result.request.flags & CommandFlag.ESTOP:
+                self._accepted_ns = result.returned_ns
+            elif result.returned_ns - self._accepted_ns > _REJECTED_TIMEOUT_NS:
                 return reasons.COMMANDS_REJECTED
         return ''
 
 
-def _is_own_state(heard: TransactionResult, asked: Command) -> bool:
-    """Return whether a state is this cycle's own: a CMD alone fetches what was loaded before.
+def _is_own_state(result: TransactionResult, command: Command) -> bool:
+    """Return whether a STATE was sampled in this cycle: the CMD itself fetches an older one.
 
-    Unless it was sent again: then it may fetch the answer to itself, and leave the POLL none.
+    A retransmitted CMD may fetch its own STATE; the POLL then returns none.
     """
     fetched = (
-        isinstance(heard.reply, Result) and decode_exchange_status(heard.reply.second).answered
+        isinstance(result.reply, Result)
+        and decode_exchange_status(result.reply.second).has_payload
     )
-    return fetched or getattr(heard.uplink, 'seq', None) == asked.seq
-
-
-_MIN_REOPEN_NS, _MAX_REOPEN_NS = NANOSECONDS // 5, 2 * NANOSECONDS
-_PING_TIMEOUT_NS = _CONFIGURE_RETRY_NS = NANOSECONDS // 10
-_DONGLE_START_TIMEOUT_NS = 5 * NANOSECONDS
-"""For the boot loader of a dongle that opening the port has reset: 1.5 s."""
-_DEFECT_RETRY_NS = NANOSECONDS
-_ACTIVE_PING_TIMEOUT_NS = NANOSECONDS // 20
-"""While the link runs: the next command must not wait."""
-_MAX_TIMEOUTS = 5
-"""Frames without an answer of the dongle before it is looked for anew."""
-_HANDSHAKE_STATES = (LinkState.HELLO, LinkState.INFO, LinkState.PARAMS)
-_GYRO_RANGE_ID = [parameter.name for parameter in BOARD_PARAMETERS].index('gyro_range')
+    return fetched or getattr(result.uplink, 'seq', None) == command.seq
 
 
 class Link:
-    """Decides what to send and when, from time, bytes and orders alone.
+    """State machine of the link: decides what to send and when, from time, bytes and commands.
 
-    Whoever holds the port calls :meth:`step` whenever bytes arrive or the instant of the last
-    ``Wait`` has come, does what it returns, and reports with :meth:`opened` and :meth:`failed`.
-    Times are those of a steady clock in nanoseconds.
+    The owner of the port calls :meth:`step` when bytes arrive or the last ``Wait`` ends, executes
+    the returned actions, and reports with :meth:`port_opened` and :meth:`port_failed`. Times are
+    nanoseconds of one steady clock.
 
     Parameters
     ----------
-    settings
-        Fixed for the life of the link.
+    parameters
+        Read-only.
     key
-        Of the robot, 16 bytes; empty for an open link.
+        Key of the robot, 16 bytes; empty for an open link.
     entropy
-        For session numbers and nonces.
+        Source of session numbers and nonces.
     """
 
     def __init__(
@@ -241,61 +239,61 @@ class Link:
         self._key = key
         self._entropy = entropy
         self._statistics = LinkStatistics(1.0 / parameters.cycle_rate, parameters.ttl)
-        self._dialogue = TransactionLayer(self._statistics)
-        self._orders = SetpointArbiter(parameters)
-        self._reader = TelemetryDecoder()
+        self._transactions = TransactionLayer(self._statistics)
+        self._arbiter = SetpointArbiter(parameters)
+        self._decoder = TelemetryDecoder()
         self._state = LinkState.CLOSED
-        self._why = LinkState.CLOSED.value
-        self._deeds: list[PortAction] = []
+        self._reason = LinkState.CLOSED.value
+        self._actions: list[PortAction] = []
         self._due_ns = 0
         self._since_ns = 0
-        """When looking for the dongle, or running, began."""
-        self._back_off_ns = _MIN_REOPEN_NS
+        """Entry into PING or RUN."""
+        self._reopen_ns = _MIN_REOPEN_NS
         self._estop_ns = 0
         self._session: Session | None = None
-        self._greeting: Handshake | None = None
-        self._running: ActiveSession | None = None
+        self._handshake: Handshake | None = None
+        self._active: ActiveSession | None = None
         self._info: Info | None = None
         self._board_parameters: dict[int, int] = {}
         self._telemetry: Telemetry | None = None
-        self._heard_ns: int | None = None
-        self._stopping = False
+        self._received_ns: int | None = None
+        self._shutting_down = False
 
-    # -- for whoever asks -------------------------------------------------------------------------
+    # -- status -----------------------------------------------------------------------------------
 
     @property
     def state(self) -> LinkState:
-        """How far the link has come."""
+        """State of the connection."""
         return self._state
 
     @property
     def authenticated(self) -> bool:
-        """Whether commands are signed, and the robot checks them."""
+        """Whether commands are signed and the robot verifies them."""
         return bool(self._key) and self._state in (LinkState.PARAMS, LinkState.RUN, LinkState.STOP)
 
     @property
     def telemetry(self) -> Telemetry | None:
-        """The newest measurement."""
+        """Newest measurement."""
         return self._telemetry
 
     @property
-    def cycle_ns(self) -> int | None:
-        """When the next command is to be sent: what is ordered then is not late; None: never."""
-        return None if self._running is None else self._running.due_ns
+    def next_cycle_ns(self) -> int | None:
+        """Time at which the next command is sent; None outside a session."""
+        return None if self._active is None else self._active.due_ns
 
     @property
-    def sent(self) -> WheelSpeeds:
-        """The wheel speeds that were last ordered, after every limit of the host."""
-        return self._orders.sent
+    def sent_wheels(self) -> WheelSpeeds:
+        """Wheel speeds of the last setpoint, after every limit of the host."""
+        return self._arbiter.sent_wheels
 
     @property
     def info(self) -> Info | None:
-        """Who the robot is; None before it was met."""
+        """Identity of the robot; None before the first session."""
         return self._info
 
     @property
-    def parameters(self) -> dict[str, int]:
-        """The robot's parameters as read back, in their units on the wire."""
+    def board_parameters(self) -> dict[str, int]:
+        """Board parameters as read back, in their units on the wire."""
         return {
             BOARD_PARAMETERS[number].name: value
             for number, value in self._board_parameters.items()
@@ -303,277 +301,277 @@ class Link:
 
     @property
     def battery(self) -> BatteryReading | None:
-        """The robot's supply as it last said."""
+        """Last battery reading of the robot."""
         aux = self._statistics.robot
         return BatteryReading(aux.battery / 1000.0, math.nan, math.nan) if aux else None
 
     @property
     def robot_resets(self) -> int:
-        """How often the robot was seen to start anew."""
+        """Number of detected restarts of the robot."""
         return self._statistics.robot_resets
 
-    def answer(self, verb: int) -> str | None:
-        """Return what became of the last request: None not known yet, empty done, or why not."""
-        return self._orders.answers.get(verb)
+    def action_result(self, verb: int) -> str | None:
+        """Return the result of the last request: None pending, empty done, else the error."""
+        return self._arbiter.action_results.get(verb)
 
     def quality(self, now_ns: int) -> LinkQuality:
-        """Return how well the link works."""
-        return self._statistics.quality(self._age(now_ns), self._dialogue.splitter.counts)
+        """Return the quality of the link."""
+        return self._statistics.quality(self._age(now_ns), self._transactions.frame_counts)
 
     def reason(self, now_ns: int) -> str:
-        """Return in words why the robot does not move; empty when nothing hinders it."""
-        if self._state in _HANDSHAKE_STATES and self._greeting is not None:
-            return self._greeting.why
+        """Return why the robot does not move; empty when it follows commands."""
+        if self._state in _HANDSHAKE_STATES and self._handshake is not None:
+            return self._handshake.reason
         if self._state is not LinkState.RUN:
-            return self._why
+            return self._reason
         silence = min(self._age(now_ns), (now_ns - self._since_ns) / NANOSECONDS)
         if silence > self._parameters.ttl:
             return reasons.robot_absent(self._parameters.channel)
         status = self._telemetry.raw.status if self._telemetry is not None else StatusFlag(0)
-        if why := self._orders.reason(bool(status & StatusFlag.ESTOP)):
-            return why
+        if reason := self._arbiter.reason(bool(status & StatusFlag.ESTOP)):
+            return reason
         if status & StatusFlag.TTL_EXPIRED:
             return reasons.TTL_EXPIRED
         return '' if status & StatusFlag.ENABLED else reasons.DRIVES_DISABLED
 
-    # -- for whoever orders -----------------------------------------------------------------------
+    # -- commands ---------------------------------------------------------------------------------
 
     def command(self, command: RobotCommand, now_ns: int) -> str:
-        """Follow a command until the next one or until it is too old; return why not."""
-        return self._orders.take(command, now_ns)
+        """Follow a command until the next one or its timeout; return why it is rejected."""
+        return self._arbiter.accept(command, now_ns)
 
     def stop(self, reason: str) -> None:
-        """Come to rest; the next command moves the robot again."""
-        self._orders.drop(reason)
+        """Stop until the next command."""
+        self._arbiter.clear(reason)
 
     def latch_estop(self, reason: str) -> None:
-        """Come to rest and stay so; a robot that is in nobody's session obeys, too."""
-        self._orders.latch(reason)
+        """Latch the emergency stop; the robot accepts it in any session."""
+        self._arbiter.latch(reason)
 
     def release_estop(self, now_ns: int) -> str:
-        """Release the emergency stop here and in the robot; return why that is not needed."""
-        there = self._telemetry is not None and self._telemetry.status.estop
-        return self._orders.release(there, now_ns)
+        """Release the emergency stop of host and robot; return why that is not needed."""
+        robot_latched = self._telemetry is not None and self._telemetry.status.estop
+        return self._arbiter.release(robot_latched, now_ns)
 
-    def request(self, verb: int) -> None:
-        """Ask the robot for an action as soon as it can be reached; see :meth:`answer`."""
-        self._orders.request(verb)
+    def request_action(self, verb: int) -> None:
+        """Request an action of the robot; :meth:`action_result` returns its result."""
+        self._arbiter.request_action(verb)
 
     def shut_down(self) -> None:
-        """Bring the robot to rest, take its drives out, close the port: the phase is DONE then."""
-        self._stopping = True
+        """Stop the robot, disable its drives and close the port; the final state is DONE."""
+        self._shutting_down = True
 
-    # -- for whoever holds the port ---------------------------------------------------------------
+    # -- port -------------------------------------------------------------------------------------
 
     def port_opened(self, now_ns: int) -> None:
-        """Take notice that the port is open."""
-        self._dialogue.reset()
-        # What was found at the last try is said until there is something newer to say.
-        why = self._why if self._why == reasons.NO_DONGLE else reasons.DONGLE_STARTING
-        self._look_for_dongle(why, now_ns)
+        """Report that the port is open."""
+        self._transactions.reset()
+        # The finding of the last attempt stays visible until there is a new one.
+        reason = self._reason if self._reason == reasons.NO_DONGLE else reasons.DONGLE_STARTING
+        self._search_dongle(reason, now_ns)
 
     def port_failed(self, text: str, absent: bool, now_ns: int) -> None:
-        """Take notice that the port could not be opened or used; ``text`` says why.
+        """Report that the port cannot be opened or used, for the reason ``text``.
 
-        A device that is absent is looked for five times a second, which costs nothing; after any
-        other failure the port is tried less and less often.
+        The port of an absent device is retried five times a second; after any other failure the
+        retry interval doubles up to 2 s.
         """
         if self._state is LinkState.DONE:
             return
         if self._state is not LinkState.OPEN:
             self._statistics.port_failures += 1
         self._close(LinkState.CLOSED, text)
-        self._due_ns = now_ns + (_MIN_REOPEN_NS if absent else self._back_off_ns)
-        # One that went away may come back free: whoever held it has lost it, too.
-        self._back_off_ns = min(
-            _MIN_REOPEN_NS if absent else 2 * self._back_off_ns, _MAX_REOPEN_NS
-        )
+        self._due_ns = now_ns + (_MIN_REOPEN_NS if absent else self._reopen_ns)
+        # A device that was unplugged returns free of other users: the interval starts again.
+        self._reopen_ns = min(_MIN_REOPEN_NS if absent else 2 * self._reopen_ns, _MAX_REOPEN_NS)
 
     def step(self, now_ns: int, received: bytes = b'') -> list[PortAction]:
-        """Return what to do now; the last deed says until when there is nothing more to do."""
-        for heard in self._dialogue.feed(received, now_ns):
-            self._hear(heard, now_ns)
-        silence = self._dialogue.expire(now_ns)
+        """Return the actions to execute now; the last one is the time of the next call."""
+        for result in self._transactions.feed(received, now_ns):
+            self._handle(result, now_ns)
+        silence = self._transactions.expire(now_ns)
         if silence is not None:
-            self._hear(silence, now_ns)
-        if self._stopping:
-            self._stop(now_ns)
-        if self._dialogue.deadline_ns is None:
-            self._speak(now_ns)
-        deeds, self._deeds = self._deeds, []
-        deeds.append(Wait(max(self._until_ns(now_ns), now_ns)))
-        return deeds
+            self._handle(silence, now_ns)
+        if self._shutting_down:
+            self._continue_stop(now_ns)
+        if self._transactions.deadline_ns is None:
+            self._send(now_ns)
+        actions, self._actions = self._actions, []
+        actions.append(Wait(max(self._until_ns(now_ns), now_ns)))
+        return actions
 
-    # -- inside -----------------------------------------------------------------------------------
+    # -- internal ---------------------------------------------------------------------------------
 
     def _until_ns(self, now_ns: int) -> int:
         if self._state in (LinkState.OPEN, LinkState.DONE):
             return now_ns + NANOSECONDS
-        if self._dialogue.deadline_ns is not None:
-            return self._dialogue.deadline_ns
-        if self._running is not None:
-            return self._running.due_ns
-        if self._state in _HANDSHAKE_STATES and self._orders.estop:
+        if self._transactions.deadline_ns is not None:
+            return self._transactions.deadline_ns
+        if self._active is not None:
+            return self._active.due_ns
+        if self._state in _HANDSHAKE_STATES and self._arbiter.estop:
             return min(self._due_ns, self._estop_ns)
         return self._due_ns
 
-    def _speak(self, now_ns: int) -> None:
-        """Send what is due: one frame at most."""
-        if self._running is not None and self._session is not None:
-            self._speak_running(self._running, now_ns)
-        elif self._state in _HANDSHAKE_STATES and self._orders.estop and now_ns >= self._estop_ns:
+    def _send(self, now_ns: int) -> None:
+        """Send the request that is due, if any."""
+        if self._active is not None and self._session is not None:
+            self._send_active(self._active, now_ns)
+        elif self._state in _HANDSHAKE_STATES and self._arbiter.estop and now_ns >= self._estop_ns:
             self._estop_ns = now_ns + round(NANOSECONDS / self._parameters.cycle_rate)
-            if self._session is not None:  # it has not begun, but stopping needs none
+            if self._session is not None:  # not started yet, but ESTOP needs no session
                 self._transact(self._session.command(CommandFlag.ESTOP, 0, 0, 0, now_ns), now_ns)
         elif now_ns < self._due_ns:
             pass
         elif self._state is LinkState.CLOSED:
             self._state = LinkState.OPEN
-            self._deeds.append(Open())
+            self._actions.append(Open())
         elif self._state is LinkState.PING and now_ns - self._since_ns >= _DONGLE_START_TIMEOUT_NS:
             self.port_failed(reasons.NO_DONGLE, False, now_ns)
         elif self._state is LinkState.PING:
-            self._write(self._dialogue.ping(_PING_TIMEOUT_NS, now_ns))
+            self._write(self._transactions.ping(_PING_TIMEOUT_NS, now_ns))
         elif self._state is LinkState.CFG:
-            self._write(self._dialogue.configure(self._parameters.configure(0), now_ns))
-        elif self._greeting is not None:
-            frame, fetch = self._greeting.next(now_ns)
-            self._transact(frame, now_ns, fetch)
+            self._write(self._transactions.configure(self._parameters.configure(0), now_ns))
+        elif self._handshake is not None:
+            frame, what = self._handshake.next_request(now_ns)
+            self._transact(frame, now_ns, what)
 
-    def _speak_running(self, running: ActiveSession, now_ns: int) -> None:
-        frame = running.next(now_ns)
+    def _send_active(self, active: ActiveSession, now_ns: int) -> None:
+        frame = active.next(now_ns)
         if isinstance(frame, PingRequest):
-            self._write(self._dialogue.ping(_ACTIVE_PING_TIMEOUT_NS, now_ns))
+            self._write(self._transactions.ping(_ACTIVE_PING_TIMEOUT_NS, now_ns))
         elif frame is not None:
             self._transact(frame, now_ns)
 
-    def _transact(self, first: Downlink, now_ns: int, fetch: int = frames.STATE) -> None:
+    def _transact(self, first: Downlink, now_ns: int, what: int = frames.STATE) -> None:
         if self._session is not None:
-            poll = self._session.poll(fetch)
+            poll = self._session.poll(what)
             self._write(
-                self._dialogue.transact(first, poll, self._parameters.gap_after(first), now_ns)
+                self._transactions.transact(first, poll, self._parameters.gap_after(first), now_ns)
             )
 
     def _write(self, data: bytes) -> None:
-        self._deeds.append(Write(data))
+        self._actions.append(Write(data))
 
-    def _hear(self, heard: TransactionResult, now_ns: int) -> None:
-        self._statistics.dongle_resets += heard.dongle_restarted
-        if isinstance(heard.reply, frames.Pong):
-            self._statistics.dongle = heard.reply
-        if isinstance(heard.uplink, frames.Aux):
-            self._statistics.robot = heard.uplink
-        if isinstance(heard.uplink, State):
-            self._see(heard, heard.uplink)
+    def _handle(self, result: TransactionResult, now_ns: int) -> None:
+        self._statistics.dongle_resets += result.dongle_restarted
+        if isinstance(result.reply, frames.Pong):
+            self._statistics.dongle = result.reply
+        if isinstance(result.uplink, frames.Aux):
+            self._statistics.robot = result.uplink
+        if isinstance(result.uplink, State):
+            self._handle_state(result, result.uplink)
         if self._state is LinkState.PING:
-            self._hear_pong(heard, now_ns)
-        elif heard.dongle_restarted:
-            self._set_radio(now_ns)  # what was set is gone
-        elif self._dialogue.silent >= _MAX_TIMEOUTS:
-            self._look_for_dongle(reasons.DONGLE_TIMEOUT, now_ns)
+            self._handle_pong(result, now_ns)
+        elif result.dongle_restarted:
+            self._configure_radio(now_ns)  # the restart cleared its configuration
+        elif self._transactions.timeouts >= _MAX_TIMEOUTS:
+            self._search_dongle(reasons.DONGLE_TIMEOUT, now_ns)
         elif self._state is LinkState.CFG:
-            self._hear_configured(heard, now_ns)
-        elif self._running is not None:
-            why = self._running.hear(heard)
-            if self._running.finished:
+            self._handle_configured(result, now_ns)
+        elif self._active is not None:
+            reason = self._active.handle(result)
+            if self._active.finished:
                 self._close(LinkState.DONE, reasons.SHUT_DOWN)
-            elif why:
-                self._greet(why, now_ns)
-        elif self._greeting is not None and not isinstance(heard.asked, frames.Command):
-            self._due_ns = now_ns + self._greeting.hear(heard)
-            self._state = self._greeting.state
+            elif reason:
+                self._start_handshake(reason, now_ns)
+        elif self._handshake is not None and not isinstance(result.request, frames.Command):
+            self._due_ns = now_ns + self._handshake.handle(result)
+            self._state = self._handshake.state
             if self._state is LinkState.RUN:
-                self._run(self._greeting, now_ns)
+                self._start_session(self._handshake, now_ns)
 
-    def _see(self, heard: TransactionResult, state: State) -> None:
-        """Take a measurement; its times count if it answers the command that was sent."""
-        ours = self._running is not None and state.seq == getattr(heard.asked, 'seq', None)
-        sending = heard.sending if ours else None
-        telemetry = self._reader.read(state, heard.returned_ns, sending)
-        self._statistics.robot_resets += self._reader.rebooted
+    def _handle_state(self, result: TransactionResult, state: State) -> None:
+        """Process a STATE; it is a clock sample if it answers the command sent."""
+        own = self._active is not None and state.seq == getattr(result.request, 'seq', None)
+        timing = result.timing if own else None
+        telemetry = self._decoder.decode(state, result.returned_ns, timing)
+        self._statistics.robot_resets += self._decoder.rebooted
         if telemetry is not None:
             self._telemetry = telemetry
-            self._heard_ns = heard.returned_ns
+            self._received_ns = result.returned_ns
 
-    def _hear_pong(self, heard: TransactionResult, now_ns: int) -> None:
-        pong = heard.reply
+    def _handle_pong(self, result: TransactionResult, now_ns: int) -> None:
+        pong = result.reply
         if not isinstance(pong, frames.Pong):
             return
-        self._back_off_ns = _MIN_REOPEN_NS
+        self._reopen_ns = _MIN_REOPEN_NS
         if pong.protocol != frames.VERSION:
-            self._why = (
+            self._reason = (
                 f'the dongle must speak protocol {frames.VERSION}: it speaks {pong.protocol}'
             )
         elif not pong.chip_ok:
-            self._why = reasons.NO_CHIP
+            self._reason = reasons.NO_CHIP
         else:
-            self._set_radio(now_ns)
+            self._configure_radio(now_ns)
             return
-        # It is there; what is wrong takes a person.
+        # The dongle answers; the defect needs manual repair.
         self._since_ns = now_ns
         self._due_ns = now_ns + _DEFECT_RETRY_NS
 
-    def _hear_configured(self, heard: TransactionResult, now_ns: int) -> None:
-        reply = heard.reply
-        if isinstance(reply, Configured) and isinstance(heard.asked, frames.Configure):
+    def _handle_configured(self, result: TransactionResult, now_ns: int) -> None:
+        reply = result.reply
+        if isinstance(reply, Configured) and isinstance(result.request, frames.Configure):
             if not reply.chip_ok:
-                self._look_for_dongle(reasons.NO_CHIP, now_ns)
+                self._search_dongle(reasons.NO_CHIP, now_ns)
                 return
-            if reply[:-1] == tuple(heard.asked):
-                self._greet(reasons.robot_absent(self._parameters.channel), now_ns)
+            if reply[:-1] == tuple(result.request):
+                self._start_handshake(reasons.robot_absent(self._parameters.channel), now_ns)
                 return
-            self._why = reasons.RADIO_NOT_CONFIGURED
+            self._reason = reasons.RADIO_NOT_CONFIGURED
         self._due_ns = now_ns + _CONFIGURE_RETRY_NS
 
-    def _look_for_dongle(self, why: str, now_ns: int) -> None:
-        self._enter(LinkState.PING, why)
+    def _search_dongle(self, reason: str, now_ns: int) -> None:
+        self._enter(LinkState.PING, reason)
         self._since_ns = self._due_ns = now_ns
 
-    def _set_radio(self, now_ns: int) -> None:
+    def _configure_radio(self, now_ns: int) -> None:
         self._enter(LinkState.CFG, LinkState.CFG.value)
         self._due_ns = now_ns
 
-    def _greet(self, why: str, now_ns: int) -> None:
+    def _start_handshake(self, reason: str, now_ns: int) -> None:
         before = self._session.number if self._session else 0
         self._session = Session(self._key, self._entropy, before, now_ns)
-        self._enter(LinkState.HELLO, why)
-        self._greeting = Handshake(self._session, self._parameters, why)
+        self._enter(LinkState.HELLO, reason)
+        self._handshake = Handshake(self._session, self._parameters, reason)
         self._due_ns = now_ns
 
-    def _run(self, greeting: Handshake, now_ns: int) -> None:
-        self._info, self._board_parameters = greeting.info, greeting.parameters
-        if self._session is None or greeting.info is None:
+    def _start_session(self, handshake: Handshake, now_ns: int) -> None:
+        self._info, self._board_parameters = handshake.info, handshake.board_parameters
+        if self._session is None or handshake.info is None:
             return
-        steps = greeting.info.steps_per_rev * greeting.info.microsteps
+        steps = handshake.info.steps_per_rev * handshake.info.microsteps
         try:
-            self._reader.configure(steps, self._board_parameters.get(_GYRO_RANGE_ID, GYRO_RANGE))
+            self._decoder.configure(steps, self._board_parameters.get(_GYRO_RANGE_ID, GYRO_RANGE))
         except ValueError as error:
-            self._greet(f'the robot tells nonsense of itself: {error}', now_ns)
+            self._start_handshake(f'the robot reports invalid information: {error}', now_ns)
             return
         self._enter(LinkState.RUN, '')
         self._since_ns = now_ns
         self._statistics.sessions += 1
-        self._running = ActiveSession(
-            self._parameters, self._session, self._orders, self._statistics, now_ns
+        self._active = ActiveSession(
+            self._parameters, self._session, self._arbiter, self._statistics, now_ns
         )
 
-    def _stop(self, now_ns: int) -> None:
-        if self._state is LinkState.RUN and self._running is not None:
-            self._state, self._why = LinkState.STOP, LinkState.STOP.value
-            self._running.begin_stop(now_ns)
+    def _continue_stop(self, now_ns: int) -> None:
+        if self._state is LinkState.RUN and self._active is not None:
+            self._state, self._reason = LinkState.STOP, LinkState.STOP.value
+            self._active.begin_stop(now_ns)
         elif self._state not in (LinkState.STOP, LinkState.DONE):
             self._close(LinkState.DONE, reasons.SHUT_DOWN)
 
-    def _close(self, state: LinkState, why: str) -> None:
+    def _close(self, state: LinkState, reason: str) -> None:
         if self._state is not LinkState.CLOSED:
-            self._deeds.append(Close())
-        self._dialogue.reset()
-        self._enter(state, why)
+            self._actions.append(Close())
+        self._transactions.reset()
+        self._enter(state, reason)
 
-    def _enter(self, state: LinkState, why: str) -> None:
-        self._state, self._why = state, why
-        self._greeting = self._running = None
+    def _enter(self, state: LinkState, reason: str) -> None:
+        self._state, self._reason = state, reason
+        self._handshake = self._active = None
 
     def _age(self, now_ns: int) -> float:
-        """Return how many seconds ago the robot was last heard."""
-        return math.inf if self._heard_ns is None else (now_ns - self._heard_ns) / NANOSECONDS
+        """Return the time since the last telemetry, s."""
+        return (
+            math.inf if self._received_ns is None else (now_ns - self._received_ns) / NANOSECONDS
+        )

@@ -11,55 +11,59 @@ _RATES = ('250k', '1M', '2M')
 _POWERS = ('-18', '-12', '-6', '0')
 _GAP_UNIT = 250e-6
 _GAPS = {'250k': 2.75e-3, '1M': 1.5e-3, '2M': 1.75e-3}
-"""s; at 250k acknowledgements take long, at 2M the POLL would come before a tag is checked."""
+"""s; at 250k acknowledgements are long, at 2M the tag check takes longer than 1.5 ms."""
 _HELLO_GAP = 5e-3
-"""s; four hashes on a 16 MHz AVR"""
+"""s; the robot computes four hashes at 16 MHz"""
 _TTL_UNIT = 0.01
 
 
 @dataclass(frozen=True)
 class RobotParameters(Parameters):
-    """Parameters that are written into the robot at the start of every session.
+    """Board parameters that the host writes at the start of every session.
 
-    Microsteps, steps per revolution and the range of the gyro are the board's; the host asks.
+    Microsteps, steps per revolution and gyro range are set on the board; the host reads them.
     """
 
     max_speed: float = parameter(
         10.0,
-        'largest wheel speed; the faster wheel sets the scale of both',
+        'maximum wheel speed; the faster wheel sets the scale of both',
         unit='rad/s',
         low=0.0,
         high=19.6,
-        source='10 000 microsteps a second at 16 microsteps are 19.6 rad/s',
+        source='10 000 microsteps per second at 16 microsteps are 19.6 rad/s',
     )
     acceleration: float = parameter(
-        30.0, 'how fast the faster changing wheel may', unit='rad/s²', low=0.1, high=100.0
+        30.0,
+        'maximum acceleration of the wheel whose speed changes faster',
+        unit='rad/s²',
+        low=0.1,
+        high=100.0,
     )
     deceleration: float = parameter(
         60.0,
-        'the same when it is to stand: from 10 rad/s within 0.37 s of the last command',
+        'the same while stopping: from 10 rad/s to rest within 0.37 s of the last command',
         unit='rad/s²',
         low=0.1,
         high=200.0,
     )
     ttl_max: float = parameter(
-        0.25, 'no command is followed for longer than this', unit='s', low=0.02, high=0.5
+        0.25, 'maximum time to live of a command', unit='s', low=0.02, high=0.5
     )
     battery_low: float = parameter(
-        10.2, 'below this the robot warns', unit='V', low=0.0, high=30.0
+        10.2, 'supply voltage below which the robot warns', unit='V', low=0.0, high=30.0
     )
     idle_off: float = parameter(
         0.0,
-        'at rest for this long the drivers go off, and hold nothing; 0: never',
+        'standstill after which the drivers switch off, without holding torque; 0: never',
         unit='s',
         low=0.0,
         high=600.0,
     )
-    invert_left: bool = parameter(False, 'the left motor is mounted or wired the other way round')
-    invert_right: bool = parameter(False, 'the right motor is')
+    invert_left: bool = parameter(False, 'the left motor is mounted or wired in reverse')
+    invert_right: bool = parameter(False, 'the right motor is mounted or wired in reverse')
 
-    def on_wire(self) -> dict[int, int]:
-        """Return the numbers to write, by id of the parameter."""
+    def to_wire(self) -> dict[int, int]:
+        """Return the values on the wire, by id of the board parameter."""
         values = {
             name: round(1000.0 * getattr(self, name))
             for name in (
@@ -81,7 +85,7 @@ class RobotParameters(Parameters):
 
 @dataclass(frozen=True)
 class LinkParameters(Parameters):
-    """The radio link from the host's side."""
+    """Parameters of the radio link on the host."""
 
     channel: int = parameter(
         82,
@@ -92,32 +96,32 @@ class LinkParameters(Parameters):
         source='nRF24L01+ data sheet 1.0, 6.3',
     )
     rate: str = parameter(
-        '1M', 'bits per second in the air; 250k only with plus parts', choices=_RATES
+        '1M', 'air data rate, bit/s; 250k only with nRF24L01+ chips', choices=_RATES
     )
-    power: str = parameter('0', 'transmitter output, dBm', choices=_POWERS)
+    power: str = parameter('0', 'transmitter output power, dBm', choices=_POWERS)
     retries: int = parameter(
         4,
-        'tries more when nobody acknowledges, 0.7 ms each: a late command is worthless',
+        'retransmissions without an acknowledgement, 0.7 ms each; late commands are worthless',
         low=0,
         high=15,
     )
     address: str = parameter(
         '54334d5043',
-        'of the robot: 10 hexadecimal digits, the byte sent last first; this is T3MPC',
+        'address of the robot: 10 hexadecimal digits, last transmitted byte first; this is T3MPC',
     )
     cycle_rate: float = parameter(
-        50.0, 'commands and measurements per second', unit='Hz', low=1.0, high=100.0
+        50.0, 'rate of commands and measurements', unit='Hz', low=1.0, high=100.0
     )
     ttl: float = parameter(
         0.2,
-        'how long the robot follows a command when no other comes',
+        'time for which the robot follows a command without a newer one',
         unit='s',
         low=0.02,
         high=0.5,
     )
     cmd_vel_timeout: float = parameter(
         0.25,
-        'age at which the host commands standstill instead',
+        'age of a command at which the link sends standstill instead',
         unit='s',
         low=0.02,
         high=0.5,
@@ -125,7 +129,7 @@ class LinkParameters(Parameters):
     robot: RobotParameters = group(RobotParameters)
 
     def check_consistency(self) -> None:
-        """Raise ParameterError when the address is none, or the robot would cut the TTL short."""
+        """Raise ParameterError for an invalid address, or a TTL that the robot would shorten."""
         try:
             size = len(bytes.fromhex(self.address))
         except ValueError:
@@ -139,22 +143,22 @@ class LinkParameters(Parameters):
 
     @property
     def gap(self) -> int:
-        """Between CMD and POLL, in steps of 250 us: the answer must be off the air before."""
+        """Gap between CMD and POLL, unit 250 us: the acknowledgement ends within it."""
         return round(_GAPS[self.rate] / _GAP_UNIT)
 
     def gap_after(self, first: Downlink) -> int:
-        """Return the gap after a first packet: a board with a key hashes long over a HELLO."""
+        """Return the gap after a first packet; it is longer for a signed HELLO."""
         signed = isinstance(first, Hello) and first.tag
         return max(self.gap, round(_HELLO_GAP / _GAP_UNIT)) if signed else self.gap
 
     @property
     def ttl_units(self) -> int:
-        """The TTL as it goes into a CMD."""
+        """TTL of a CMD, unit 10 ms."""
         return round(self.ttl / _TTL_UNIT)
 
     def configure(self, number: int) -> Configure:
-        """Return the frame that sets the dongle's radio."""
-        # Shorter, and acknowledgements of 32 bytes would be cut off (data sheet 7.4.2).
+        """Return the frame that configures the radio of the dongle."""
+        # A shorter delay would cut off acknowledgements of 32 bytes (data sheet 7.4.2).
         delay = 5 if self.rate == '250k' else 1
         return Configure(
             number,

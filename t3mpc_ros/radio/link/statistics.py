@@ -14,19 +14,19 @@ from t3mpc_ros.radio.protocol.frames import Aux, Pong
 from t3mpc_ros.radio.protocol.framing import FrameCounts
 
 _WINDOW_CYCLES = 500
-"""Ten seconds at 50 Hz are looked back on."""
+"""Window of the statistics: ten seconds at 50 Hz."""
 _MIN_CYCLES = 50
-"""Cycles below which a share says nothing."""
+"""Minimum number of cycles for a judgement."""
 LOSS_LIMIT = 0.05
-"""Share of lost cycles above which the link is worth a warning."""
+"""Loss rate above which the level is WARN."""
 ROUND_TRIP_LIMIT = 0.5
-"""Share of the period above which the slowest round trips are."""
+"""Fraction of the period above which slow round trips cause WARN."""
 RETRY_COUNTS = 16
-"""The radio chip counts to 15."""
+"""Number of retransmission counts: the radio chip counts to 15."""
 
 
 class DiagnosticLevel(IntEnum):
-    """How bad it is, as diagnostics count."""
+    """Level of a diagnostic status."""
 
     OK = 0
     WARN = 1
@@ -34,59 +34,59 @@ class DiagnosticLevel(IntEnum):
 
 
 class LinkQuality(NamedTuple):
-    """The link as it is now; shares and round trips over the last 500 cycles."""
+    """Quality of the link; loss rate and round trips over the last 500 cycles."""
 
     level: DiagnosticLevel
     text: str
-    """Why the level is not OK; empty when it is."""
+    """Reason of the level; empty for OK."""
     cycles: int
-    """Since the port was opened first."""
+    """Since the port was first opened."""
     lost: int
-    """Of these."""
+    """Lost cycles since then."""
     lost_in_a_row: int
-    """Up to now."""
+    """Current run of lost cycles."""
     lost_share: float
-    """0 to 1; NaN before the first cycle, as the two below."""
+    """0 to 1; NaN before the first cycle, like the next two."""
     round_trip_median: float
     """s"""
     round_trip_p99: float
     """s"""
     retransmissions: tuple[int, ...]
-    """How many exchanges needed 0, 1, … 15 tries more; of both packets, acknowledged or not."""
+    """Number of packets with 0, 1, … 15 retransmissions, acknowledged or not."""
     age: float
-    """s since the last measurement was taken; inf before the first"""
+    """Time since the last telemetry, s; inf before the first."""
     robot_resets: int
-    """Seen since the port was opened first, as the next three."""
+    """Since the port was first opened, like the next three."""
     dongle_resets: int
     sessions: int
-    """Begun, the first included."""
+    """Started, including the first."""
     port_failures: int
     host: FrameCounts
-    """Frames the host has received."""
+    """Frames received by the host."""
     malformed: int
-    """Good ones by their CRC that made no sense."""
+    """Frames with valid CRC and invalid content."""
     dongle: Pong | None
-    """What the dongle last said of itself."""
+    """Last PONG of the dongle."""
     robot: Aux | None
-    """What the robot last said of itself."""
+    """Last AUX of the robot."""
 
 
 class LinkStatistics:
-    """Collects what happens on the link, and judges it.
+    """Collects the events of the link and computes its quality.
 
     Parameters
     ----------
     period
-        s, from one cycle to the next.
-    patience
-        s without a measurement after which the link counts as lost: the robot stops by then.
+        Period of the cycles, s.
+    timeout
+        Age of the telemetry above which the level is ERROR, s: the robot has stopped by then.
     """
 
-    def __init__(self, period: float, patience: float) -> None:
+    def __init__(self, period: float, timeout: float) -> None:
         self._period = period
-        self._patience = patience
+        self._timeout = timeout
         self._recent: deque[float | None] = deque(maxlen=_WINDOW_CYCLES)
-        """Round trip of each cycle, None of a lost one."""
+        """Round trip of each cycle, None for a lost one."""
         self._retransmissions = [0] * RETRY_COUNTS
         self._cycles = self._lost = self._lost_in_a_row = 0
         self.robot_resets = 0
@@ -99,15 +99,15 @@ class LinkStatistics:
 
     @property
     def lost_in_a_row(self) -> int:
-        """Cycles lost up to now."""
+        """Current run of lost cycles."""
         return self._lost_in_a_row
 
     def add_exchange(self, retransmissions: int) -> None:
-        """Count one packet that went on the air."""
+        """Count one transmitted packet."""
         self._retransmissions[retransmissions] += 1
 
     def add_cycle(self, round_trip: float | None) -> None:
-        """Count a cycle that took ``round_trip`` seconds; None: lost."""
+        """Count a cycle with its round trip (s); None for a lost one."""
         self._cycles += 1
         self._recent.append(round_trip)
         if round_trip is None:
@@ -117,14 +117,14 @@ class LinkStatistics:
             self._lost_in_a_row = 0
 
     def quality(self, age: float, host: FrameCounts) -> LinkQuality:
-        """Return the link as it is, ``age`` seconds after the last measurement was taken."""
+        """Return the quality of the link at telemetry age ``age`` (s)."""
         trips = sorted(trip for trip in self._recent if trip is not None)
         recent = len(self._recent)
         lost_share = (recent - len(trips)) / recent if recent else float('nan')
         median, slow = _quantile(trips, 0.5), _quantile(trips, 0.99)
         level, text = DiagnosticLevel.OK, ''
-        if age > self._patience:
-            level, text = DiagnosticLevel.ERROR, f'no word of the robot for {age:.2f} s'
+        if age > self._timeout:
+            level, text = DiagnosticLevel.ERROR, f'no telemetry for {age:.2f} s'
         elif recent < _MIN_CYCLES:
             pass
         elif lost_share > LOSS_LIMIT:
@@ -134,7 +134,8 @@ class LinkStatistics:
             )
         elif slow > ROUND_TRIP_LIMIT * self._period:
             level = DiagnosticLevel.WARN
-            text = f'round trips take up to {1e3 * slow:.1f} ms: serial port not at low latency?'
+            milliseconds = 1e3 * slow
+            text = f'round trips up to {milliseconds:.1f} ms: is the port in low-latency mode?'
         return LinkQuality(
             level,
             text,
@@ -158,7 +159,7 @@ class LinkStatistics:
 
 
 def _quantile(ordered: list[float], share: float) -> float:
-    """Return the value that ``share`` of the others do not exceed; NaN of none."""
+    """Return the quantile ``share`` of sorted values; NaN without values."""
     if not ordered:
         return float('nan')
     return ordered[min(int(share * len(ordered)), len(ordered) - 1)]

@@ -14,43 +14,44 @@ from t3mpc_ros.robot.sensor_conversions import ImuParameters, decode_range
 _MICROSECOND = 1000
 """ns"""
 _MAX_CLOCK_ERROR = 1.0
-"""s by which host and robot may disagree on how much time has passed, besides the share below."""
+"""Maximum constant difference of the time that elapsed for host and robot, s."""
 _MAX_CLOCK_ERROR_RATIO = 0.02
+"""Maximum additional difference relative to the elapsed time."""
 _MAX_STATE_AGE_US = 200_000
-"""A robot that hears nothing loads a new state twice as often as this."""
+"""Maximum age of a STATE: without packets, the robot loads one twice as often."""
 _MAX_SPEED_INTERVAL = 0.5
-"""s; over a longer gap the mean of the speed is not the speed"""
+"""Maximum interval for a mean wheel speed, s."""
 STEPS_PER_REV, MICROSTEPS, GYRO_RANGE = 200, 16, 500
 
 
 class Telemetry(NamedTuple):
-    """One measurement of the robot: what a RobotState is made of."""
+    """One measurement of the robot, the source of a RobotState."""
 
     stamp_ns: int
     """Host time of the sample."""
     angles: WheelAngles
-    """Goes on over wraps of the counters and restarts of the robot."""
+    """Continuous over wraps of the counters and restarts of the robot."""
     wheels: WheelSpeeds
-    """Mean since the measurement before."""
+    """Mean since the previous measurement."""
     imu: ImuSample | None
     """None when the sensor does not answer."""
     ranges: tuple[float, ...]
     """m, in the order of RANGE_SENSORS: -inf too near, inf beyond, NaN not measured or faulty."""
     status: RobotStatus
     raw: State
-    """As it came."""
+    """The decoded frame."""
 
 
 class CommandTiming(NamedTuple):
-    """When the host sent the CMD that a state answers; only of one that needed no second try."""
+    """Transmission time of the CMD that a STATE answers, if it had no retransmission."""
 
     sent_ns: int
-    travel_ns: int
-    """To the robot, at least: ``clock.forward_ns``."""
+    delay_ns: int
+    """Minimum delay to the robot: ``clock_sync.forward_delay_ns``."""
 
 
 class TelemetryDecoder:
-    """Turns STATE after STATE into measurements; notices when the robot has started anew."""
+    """Converts successive STATE frames into measurements; detects restarts of the robot."""
 
     def __init__(self) -> None:
         self._clock = ClockModel()
@@ -67,32 +68,32 @@ class TelemetryDecoder:
 
     @property
     def rebooted(self) -> bool:
-        """Whether the robot had started anew before the last measurement."""
+        """Whether the robot restarted before the last measurement."""
         return self._rebooted
 
     @property
     def skew(self) -> float:
-        """By how much a second of the robot is longer than one of the host."""
+        """Relative excess of a robot second over a host second."""
         return self._clock.skew
 
     @property
     def angles(self) -> WheelAngles:
-        """How far the wheels have turned since the first measurement."""
+        """Wheel angles since the first measurement."""
         return WheelAngles(
             self._base.right + self._right.total * self._step,
             self._base.left + self._left.total * self._step,
         )
 
     def configure(self, steps: int, gyro_range: int) -> None:
-        """Take the microsteps of a wheel's turn, and the full scale of the gyro (deg/s).
+        """Set the microsteps per revolution and the full scale of the gyro (deg/s).
 
         Raises
         ------
         ValueError
-            There are no such steps, or the MPU6050 has no such range.
+            ``steps`` is below 1, or the MPU6050 lacks the range.
         """
         if steps < 1:
-            raise ValueError(f'steps of a turn must be at least 1: got {steps}')
+            raise ValueError(f'steps per revolution must be at least 1: got {steps}')
         imu = ImuParameters(gyro_range=str(gyro_range))
         self._rate_step, self._acceleration_step = imu.rate_step, imu.acceleration_step
         step = math.tau / steps
@@ -100,10 +101,10 @@ class TelemetryDecoder:
             self._base, self._step = self.angles, step
             self._left, self._right = CounterUnwrapper(), CounterUnwrapper()
 
-    def read(
-        self, state: State, now_ns: int, sending: CommandTiming | None = None
+    def decode(
+        self, state: State, now_ns: int, timing: CommandTiming | None = None
     ) -> Telemetry | None:
-        """Return the measurement; None if it is not newer than the last one."""
+        """Return the measurement of a STATE; None if it is not newer than the last one."""
         self._rebooted = self._has_restarted(state, now_ns)
         if self._rebooted:
             for counter in (self._time, self._left, self._right):
@@ -116,23 +117,24 @@ class TelemetryDecoder:
         right = self._right.add(state.right) - right
         left = self._left.add(state.left) - left
         self._last, self._last_ns = state, now_ns
-        if sending is not None and state.age != AGE_NONE:
-            self._clock.add(time_us - 10 * state.age, sending.sent_ns, now_ns, sending.travel_ns)
-        self._speed(time_us - before_us, right, left)
+        if timing is not None and state.age != AGE_NONE:
+            self._clock.add(time_us - 10 * state.age, timing.sent_ns, now_ns, timing.delay_ns)
+        self._update_speed(time_us - before_us, right, left)
         return Telemetry(
             min(self._clock.to_host_ns(time_us), now_ns) if self._clock.is_set else now_ns,
             self.angles,
             self._wheels,
-            self._imu(state),
+            self._decode_imu(state),
             tuple(map(decode_range, state.ranges)),
-            _status(state.status),
+            _decode_status(state.status),
             state,
         )
 
     def _has_restarted(self, state: State, now_ns: int) -> bool:
-        """Return whether host and robot differ on how much time has passed.
+        """Return whether the robot clock jumped against the host clock.
 
-        A lost session alone is no sign: a robot that hears nothing for long ends it and counts on.
+        A lost session alone is no evidence: the robot ends it after a long silence and keeps its
+        counters.
         """
         last = self._last
         if last is None:
@@ -140,18 +142,18 @@ class TelemetryDecoder:
         back_us = wrapped_difference(state.time_us, last.time_us)
         if state.status & StatusFlag.NO_SESSION and back_us > _MAX_STATE_AGE_US:
             return True
-        passed_us = (now_ns - self._last_ns) // _MICROSECOND
-        off = wrapped_difference((last.time_us + passed_us) % (1 << 32), state.time_us) / 1e6
-        return abs(off) > _MAX_CLOCK_ERROR + _MAX_CLOCK_ERROR_RATIO * passed_us / 1e6
+        elapsed_us = (now_ns - self._last_ns) // _MICROSECOND
+        error = wrapped_difference((last.time_us + elapsed_us) % (1 << 32), state.time_us) / 1e6
+        return abs(error) > _MAX_CLOCK_ERROR + _MAX_CLOCK_ERROR_RATIO * elapsed_us / 1e6
 
-    def _speed(self, elapsed_us: int, right: int, left: int) -> None:
+    def _update_speed(self, elapsed_us: int, right: int, left: int) -> None:
         if self._rebooted:
             self._wheels = WheelSpeeds(0.0, 0.0)
         elapsed = elapsed_us / 1e6 * (1.0 + self._clock.skew)
         if 0.0 < elapsed <= _MAX_SPEED_INTERVAL:
             self._wheels = WheelSpeeds(right * self._step / elapsed, left * self._step / elapsed)
 
-    def _imu(self, state: State) -> ImuSample | None:
+    def _decode_imu(self, state: State) -> ImuSample | None:
         if state.status & StatusFlag.IMU_FAULT:
             return None
         step = self._acceleration_step
@@ -160,7 +162,7 @@ class TelemetryDecoder:
         )
 
 
-def _status(bits: int) -> RobotStatus:
+def _decode_status(bits: int) -> RobotStatus:
     return RobotStatus(
         enabled=bool(bits & StatusFlag.ENABLED),
         moving=bool(bits & StatusFlag.MOVING),

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Transaction layer: one frame in flight to the dongle, and its reply or timeout."""
+"""Transaction layer: one frame in pending to the dongle, and its reply or timeout."""
 
 from typing import NamedTuple
 
@@ -29,37 +29,37 @@ from t3mpc_ros.radio.protocol.frames import (
     Transmit,
     Uplink,
 )
-from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
+from t3mpc_ros.radio.protocol.framing import FrameCounts, FrameDecoder, encode_frame
 
 _REPLY_TIMEOUT_NS = 50_000_000
-"""For an answer; the longest transaction takes 10.3 ms, an FTDI at its default 16 ms each way."""
+"""Timeout of a reply; a transaction takes 10.3 ms at most, an FTDI chip up to 16 ms each way."""
 _MAX_CLOCK_ERROR_US = 1_000_000
-"""By which the dongle's clock may differ from the host's between two results."""
+"""Maximum difference between dongle clock and host clock over the time between two results."""
 
 
 class TransactionResult(NamedTuple):
-    """What became of a frame."""
+    """Result of a request to the dongle."""
 
-    asked: Ping | Configure | Downlink
-    """Of a transaction the first payload."""
+    request: Ping | Configure | Downlink
+    """The request; for a transaction, its first payload."""
     reply: FromDongle | None
-    """None: silence."""
+    """Reply of the dongle; None after a timeout."""
     uplink: Uplink | None
-    """The robot's answer; None if there is none, or none that makes sense."""
+    """Answer of the robot; None if missing or malformed."""
     sent_ns: int
     returned_ns: int
-    sending: CommandTiming | None
-    """For the clock model; None where the first packet was not answered at the first try."""
+    timing: CommandTiming | None
+    """Sample for the clock model; None if the first packet was retransmitted or unanswered."""
     dongle_restarted: bool
 
     @property
     def round_trip(self) -> float:
-        """From the frame written to its answer, s."""
+        """Time from writing the request to its reply, s."""
         return (self.returned_ns - self.sent_ns) / NANOSECONDS
 
 
 class _PendingRequest(NamedTuple):
-    asked: Ping | Configure | Downlink
+    request: Ping | Configure | Downlink
     id: int
     sent_ns: int
     deadline_ns: int
@@ -68,146 +68,146 @@ class _PendingRequest(NamedTuple):
 
 
 class TransactionLayer:
-    """Numbers and wraps frames, and matches answers with them.
+    """Numbers and encodes requests, and matches replies with them.
 
     Parameters
     ----------
     statistics
-        Counts exchanges and what makes no sense.
+        Counts exchanges and malformed frames.
     """
 
     def __init__(self, statistics: LinkStatistics) -> None:
         self._statistics = statistics
-        self._splitter = FrameDecoder()
-        self._flight: _PendingRequest | None = None
+        self._decoder = FrameDecoder()
+        self._pending: _PendingRequest | None = None
         self._id = 0
         self._dongle: tuple[int, int] | None = None
-        """Its clock (us) and ours (ns) at its last answer."""
-        self._silent = 0
+        """Dongle clock (us) and host clock (ns) at its last reply."""
+        self._timeouts = 0
 
     @property
-    def splitter(self) -> FrameDecoder:
-        """Cuts what comes in."""
-        return self._splitter
+    def frame_counts(self) -> FrameCounts:
+        """Counters of the received frames."""
+        return self._decoder.counts
 
     @property
-    def silent(self) -> int:
-        """Frames in a row that the dongle has not answered."""
-        return self._silent
+    def timeouts(self) -> int:
+        """Number of consecutive requests without a reply."""
+        return self._timeouts
 
     @property
     def deadline_ns(self) -> int | None:
-        """Until when an answer is waited for; None: nothing is on its way."""
-        return None if self._flight is None else self._flight.deadline_ns
+        """End of the reply timeout; None if no request is in pending."""
+        return None if self._pending is None else self._pending.deadline_ns
 
     def reset(self) -> None:
-        """Forget what was on its way: the port was opened or closed."""
-        self._splitter.forget()
-        self._flight = None
+        """Drop the request in pending, because the port was opened or closed."""
+        self._decoder.reset()
+        self._pending = None
         self._dongle = None
-        self._silent = 0
+        self._timeouts = 0
 
-    def ping(self, patience_ns: int, now_ns: int) -> bytes:
-        """Return the bytes of a PING."""
+    def ping(self, timeout_ns: int, now_ns: int) -> bytes:
+        """Return the bytes of a PING with its own timeout."""
         self._id = self._id + 1 & 0xFF
         frame = Ping(self._id, (now_ns // 1000 & 0xFFFFFFFF).to_bytes(4, 'little'))
-        # The zero ends whatever the dongle may have of a frame that was cut off.
-        return b'\0' + self._launch(frame, encode(frame), 0, patience_ns, now_ns)
+        # The zero ends a partial frame that the dongle may have received.
+        return b'\0' + self._send(frame, encode(frame), 0, timeout_ns, now_ns)
 
     def configure(self, frame: Configure, now_ns: int) -> bytes:
         """Return the bytes of a CFG."""
         self._id = self._id + 1 & 0xFF
         frame = frame._replace(id=self._id)
-        return self._launch(frame, encode(frame), 0, _REPLY_TIMEOUT_NS, now_ns)
+        return self._send(frame, encode(frame), 0, _REPLY_TIMEOUT_NS, now_ns)
 
     def transact(self, first: Downlink, second: Poll, gap: int, now_ns: int) -> bytes:
         """Return the bytes of a TX."""
         self._id = self._id + 1 & 0xFF
         payload = encode(first)
         frame = encode(Transmit(self._id, gap, payload, encode(second)))
-        return self._launch(first, frame, len(payload), _REPLY_TIMEOUT_NS, now_ns)
+        return self._send(first, frame, len(payload), _REPLY_TIMEOUT_NS, now_ns)
 
     def feed(self, data: bytes, now_ns: int) -> list[TransactionResult]:
-        """Return what ``data`` tells of the frame on its way; of older ones nothing is told."""
-        heard = []
-        for frame in self._splitter.feed(data):
+        """Return the result of the request in pending; replies to older ones are ignored."""
+        results = []
+        for frame in self._decoder.feed(data):
             try:
                 reply = decode_from_dongle(frame)
             except FrameError:
                 self._statistics.malformed += 1
                 continue
-            flight = self._flight
-            if flight is not None and _answers(reply, flight):
-                self._flight = None
-                self._silent = 0
-                heard.append(self._explain(flight, reply, now_ns))
-        return heard
+            pending = self._pending
+            if pending is not None and _is_reply_to(reply, pending):
+                self._pending = None
+                self._timeouts = 0
+                results.append(self._result(pending, reply, now_ns))
+        return results
 
     def expire(self, now_ns: int) -> TransactionResult | None:
-        """Return the frame whose answer is no longer waited for."""
-        flight = self._flight
-        if flight is None or now_ns < flight.deadline_ns:
+        """Return the request in pending if its timeout has expired."""
+        pending = self._pending
+        if pending is None or now_ns < pending.deadline_ns:
             return None
-        self._flight = None
-        self._silent += 1
-        return TransactionResult(flight.asked, None, None, flight.sent_ns, now_ns, None, False)
+        self._pending = None
+        self._timeouts += 1
+        return TransactionResult(pending.request, None, None, pending.sent_ns, now_ns, None, False)
 
-    def _launch(
+    def _send(
         self,
-        asked: Ping | Configure | Downlink,
+        request: Ping | Configure | Downlink,
         frame: bytes,
         payload_bytes: int,
-        patience_ns: int,
+        timeout_ns: int,
         now_ns: int,
     ) -> bytes:
         wire = encode_frame(frame)
-        self._flight = _PendingRequest(
-            asked, self._id, now_ns, now_ns + patience_ns, len(wire), payload_bytes
+        self._pending = _PendingRequest(
+            request, self._id, now_ns, now_ns + timeout_ns, len(wire), payload_bytes
         )
         return wire
 
-    def _explain(
-        self, flight: _PendingRequest, reply: FromDongle, now_ns: int
+    def _result(
+        self, pending: _PendingRequest, reply: FromDongle, now_ns: int
     ) -> TransactionResult:
-        uplink, sending, restarted = None, None, False
+        uplink, timing, restarted = None, None, False
         if isinstance(reply, Pong):
-            restarted = self._has_restarted(reply.time_us, now_ns)
+            restarted = self._detect_restart(reply.time_us, now_ns)
         elif isinstance(reply, Result):
-            restarted = self._has_restarted(reply.dongle_us, now_ns)
-            first, second = (
-                decode_exchange_status(reply.first),
-                decode_exchange_status(reply.second),
-            )
-            for one in (first, second):
-                if one.acknowledged or one.given_up:
-                    self._statistics.add_exchange(one.retransmissions)
+            restarted = self._detect_restart(reply.dongle_us, now_ns)
+            first = decode_exchange_status(reply.first)
+            second = decode_exchange_status(reply.second)
+            for status in (first, second):
+                if status.acknowledged or status.failed:
+                    self._statistics.add_exchange(status.retransmissions)
             if reply.payload:
                 try:
                     uplink = decode_uplink(reply.payload)
                 except FrameError:
                     self._statistics.malformed += 1
-            if isinstance(flight.asked, Command) and not first.retransmissions and second.answered:
-                travel = forward_delay_ns(flight.wire_bytes, flight.payload_bytes)
-                sending = CommandTiming(flight.sent_ns, travel)
+            prompt = not first.retransmissions and second.has_payload
+            if isinstance(pending.request, Command) and prompt:
+                delay = forward_delay_ns(pending.wire_bytes, pending.payload_bytes)
+                timing = CommandTiming(pending.sent_ns, delay)
         return TransactionResult(
-            flight.asked, reply, uplink, flight.sent_ns, now_ns, sending, restarted
+            pending.request, reply, uplink, pending.sent_ns, now_ns, timing, restarted
         )
 
-    def _has_restarted(self, dongle_us: int, now_ns: int) -> bool:
+    def _detect_restart(self, dongle_us: int, now_ns: int) -> bool:
+        """Return whether the dongle clock jumped against the host clock since the last reply."""
         before, self._dongle = self._dongle, (dongle_us, now_ns)
         if before is None:
             return False
-        passed_us = (now_ns - before[1]) // 1000
-        slip = wrapped_difference((before[0] + passed_us) % (1 << 32), dongle_us)
-        return abs(slip) > _MAX_CLOCK_ERROR_US + passed_us // 50
+        elapsed_us = (now_ns - before[1]) // 1000
+        error = wrapped_difference((before[0] + elapsed_us) % (1 << 32), dongle_us)
+        return abs(error) > _MAX_CLOCK_ERROR_US + elapsed_us // 50
 
 
-def _answers(reply: FromDongle, flight: _PendingRequest) -> bool:
-    """Return whether a reply belongs to the frame on its way."""
+def _is_reply_to(reply: FromDongle, pending: _PendingRequest) -> bool:
+    """Return whether a reply answers the request in pending."""
     if isinstance(reply, Refusal):
-        return True  # it has no number, but nothing else is on its way
+        return True  # without an id, but only one request is in pending
     if isinstance(reply, Pong):
-        return isinstance(flight.asked, Ping) and reply.echo == flight.asked.echo
+        return isinstance(pending.request, Ping) and reply.echo == pending.request.echo
     if isinstance(reply, Configured):
-        return isinstance(flight.asked, Configure) and reply.id == flight.id
-    return not isinstance(flight.asked, Ping | Configure) and reply.id == flight.id
+        return isinstance(pending.request, Configure) and reply.id == pending.id
+    return not isinstance(pending.request, Ping | Configure) and reply.id == pending.id

@@ -25,6 +25,233 @@ KEY_SIZE = 16
 """bytes"""
 TAG_SIZE = 8
 """bytes"""
+NONCE_SIZE = 8
+"""bytes"""
+
+SignedFrame = Command | ParamSet | Action
+"""Frames that change the robot, signed under the session key."""
+
+AnySignedFrame = TypeVar('AnySignedFrame', Command, ParamSet, Action)
+_EMPTY_TAG = bytes(TAG_SIZE)
+
+
+class KeyFileError(ValueError):
+    """A key file that is unreadable, unprotected or invalid; the text contains the remedy."""
+
+
+def read_key(path: Path) -> bytes:
+    """Return the key in a file of 32 hexadecimal digits that only its owner can read.
+
+    Raises
+    ------
+    KeyFileError
+        The file is unreadable, readable by others, or holds no key. The text never quotes it.
+    """
+    try:
+        with path.open('rb') as source:
+            # Mode of the open file: the path may lead to another file meanwhile.
+            mode = stat.S_IMODE(os.fstat(source.fileno()).st_mode)
+            content = source.read(1024)
+    except OSError as error:
+        raise KeyFileError(f'key file {path} cannot be read: {error.strerror}') from error
+    if mode & 0o077:
+        raise KeyFileError(
+            f'key file {path} must be closed to all but its owner: got mode {mode:04o}; '
+            f'chmod 600 {path}'
+        )
+    try:
+        key = bytes.fromhex(content.decode('ascii'))
+    except ValueError:  # includes UnicodeDecodeError, whose text would show the content
+        raise KeyFileError(f'key file {path} must hold hexadecimal digits only') from None
+    if len(key) != KEY_SIZE:
+        raise KeyFileError(
+            f'key file {path} must hold {2 * KEY_SIZE} hexadecimal digits: got {2 * len(key)}'
+        )
+    return key
+
+
+def key_check(key: bytes) -> int:
+    """Return a check value of 32 bits for comparing two keys.
+
+    It allows a candidate key to be tested offline: the key must be random, not a passphrase.
+    """
+    return int.from_bytes(siphash(key, b't3mpc')[:4], 'little')
+
+
+def session_key(key: bytes, host_nonce: bytes, robot_nonce: bytes) -> bytes:
+    """Return the key (16 bytes) of a session from the long-term key and both nonces."""
+    for name, nonce in (('host_nonce', host_nonce), ('robot_nonce', robot_nonce)):
+        if len(nonce) != NONCE_SIZE:
+            raise ValueError(f'{name} must be {NONCE_SIZE} bytes long: got {len(nonce)}')
+    nonces = host_nonce + robot_nonce
+    return siphash(key, nonces + b'\x00') + siphash(key, nonces + b'\x01')
+
+
+def sign_hello(key: bytes, session: int, seq: int, host_us: int, nonce: bytes) -> Hello:
+    """Return a HELLO signed under the long-term key."""
+    hello = Hello(session, seq, host_us, nonce, _EMPTY_TAG)
+    return hello._replace(tag=siphash(key, encode(hello)[:-TAG_SIZE]))
+
+
+def verify_hello(key: bytes, hello: Hello) -> bool:
+    """Return whether a HELLO carries the tag of the long-term key."""
+    return bool(hello.tag) and _tags_match(siphash(key, encode(hello)[:-TAG_SIZE]), hello.tag)
+
+
+def frame_tag(frame: SignedFrame, key: bytes, epoch: int) -> bytes:
+    """Return the tag of a frame under a session key; the tag in the frame is ignored."""
+    body = encode(frame._replace(tag=_EMPTY_TAG))[:-TAG_SIZE]
+    return siphash(key, body + epoch.to_bytes(4, 'little'))
+
+
+class Signer:
+    """Host end of a session: signs frames and counts the epoch.
+
+    Parameters
+    ----------
+    key
+        Session key.
+    host_us
+        ``host_us`` of the HELLO.
+    """
+
+    def __init__(self, key: bytes, host_us: int) -> None:
+        self._key = key
+        self._last = host_us
+        self._epoch = 0
+
+    @property
+    def epoch(self) -> int:
+        """Number of wraps of host_us since HELLO."""
+        return self._epoch
+
+    def sign(self, frame: AnySignedFrame) -> AnySignedFrame:
+        """Return the frame with its tag.
+
+        A lower ``host_us`` than before counts as a wrap: frames are signed in order of time, each
+        within 71 minutes of the one before.
+
+        Raises
+        ------
+        ValueError
+            ``host_us`` equals that of the frame before: the robot would reject it as a replay.
+        """
+        if frame.host_us == self._last:
+            raise ValueError(f'host_us must increase: got {frame.host_us} twice')
+        if frame.host_us < self._last:
+            self._epoch += 1
+        self._last = frame.host_us
+        return frame._replace(tag=frame_tag(frame, self._key, self._epoch))
+
+
+class CommandVerifier:
+    """Robot end of a session: decides which frames are valid.
+
+    Its methods return the reason for a rejection, empty for a valid frame. Emulator and tests use
+    it; the firmware implements the same rules in C.
+
+    Parameters
+    ----------
+    key
+        Long-term key; empty for a robot without one.
+    locked
+        The key is damaged or about to change: no session starts, ESTOP stays valid.
+    """
+
+    def __init__(self, key: bytes = b'', locked: bool = False) -> None:
+        if key and len(key) != KEY_SIZE:
+            raise ValueError(f'key must be {KEY_SIZE} bytes long: got {len(key)}')
+        self._key = key
+        self._locked = locked
+        self._session = 0
+        self._session_key = b''
+        self._host_nonce = b''
+        self._robot_nonce = bytes(NONCE_SIZE) if key or locked else b''
+        self._last = (0, 0)
+
+    @property
+    def key(self) -> bytes:
+        """Long-term key; empty without a usable key."""
+        return self._key
+
+    @property
+    def locked(self) -> bool:
+        """Whether no session can start."""
+        return self._locked
+
+    @property
+    def session(self) -> int:
+        """Current session; 0 before the first HELLO."""
+        return self._session
+
+    @property
+    def nonce(self) -> bytes:
+        """Robot nonce for INFO: zeros before the first HELLO; empty without a key."""
+        return self._robot_nonce
+
+    def begin_session(self, hello: Hello, fresh_nonce: bytes) -> str:
+        """Start the session of a HELLO; return the reason for a rejection.
+
+        ``fresh_nonce`` (8 unpredictable bytes) becomes the robot nonce, unless this HELLO repeats
+        the last one because its answer was lost; then nothing changes.
+        """
+        if self._locked:
+            return 'the key is damaged'
+        if bool(self._key) != bool(hello.tag):
+            return 'no key to check the HELLO with' if hello.tag else 'HELLO is not signed'
+        if self._key:
+            if not verify_hello(self._key, hello):
+                return 'HELLO has a bad tag'
+            if hello.nonce == self._host_nonce:
+                return ''
+            self._session_key = session_key(self._key, hello.nonce, fresh_nonce)
+            self._host_nonce, self._robot_nonce = hello.nonce, fresh_nonce
+            self._last = (0, hello.host_us)
+        self._session = hello.session
+        return ''
+
+    def end_session(self) -> None:
+        """End the session; its HELLO may then start another one, with a new nonce."""
+        self._session = 0
+        self._host_nonce = b''
+
+    def verify(self, frame: SignedFrame) -> str:
+        """Return the reason for rejecting a frame; a valid one invalidates itself and older ones.
+
+        A CMD with ESTOP is always valid; its other fields count only if :meth:`accept` accepts it.
+        """
+        why = self.accept(frame)
+        return '' if isinstance(frame, Command) and frame.flags & CommandFlag.ESTOP else why
+
+    def accept(self, frame: SignedFrame) -> str:
+        """Return why a frame is not part of the session; a valid one advances the replay counter.
+
+        This includes a validly signed ESTOP, so that an ESTOP repeated for hours keeps the epoch.
+        An ESTOP with a bad tag does not change the counter.
+        """
+        if not self._session or frame.session != self._session:
+            return f'session is {self._session}: got {frame.session}'
+        if not self._key:
+            return 'no key to check the tag with' if frame.tag else ''
+        if not frame.tag:
+            return 'frame is not signed'
+        epoch, last = self._last
+        if frame.host_us == last:
+            return 'frame is a replay'
+        if frame.host_us < last:
+            epoch += 1
+        if not _tags_match(frame_tag(frame, self._session_key, epoch), frame.tag):
+            return 'frame has a bad tag, or is a replay'
+        self._last = (epoch, frame.host_us)
+        return ''
+
+
+def _tags_match(expected: bytes, got: bytes) -> bool:
+    # Constant time: the duration is independent of the number of equal bytes.
+    return hmac.compare_digest(expected, got)
+
+
+# -- SipHash-2-4 ----------------------------------------------------------------------------------
 
 _MASK_64 = 0xFFFFFFFFFFFFFFFF
 
@@ -71,228 +298,3 @@ def _sip_rounds(a: int, b: int, c: int, d: int, count: int) -> tuple[int, int, i
         b = (b << 17 & _MASK_64 | b >> 47) ^ c
         c = c << 32 & _MASK_64 | c >> 32
     return a, b, c, d
-
-
-NONCE_SIZE = 8
-"""bytes"""
-
-SignedFrame = Command | ParamSet | Action
-"""Kinds that change something, and are signed under the key of the session."""
-
-AnySignedFrame = TypeVar('AnySignedFrame', Command, ParamSet, Action)
-_EMPTY_TAG = bytes(TAG_SIZE)
-
-
-class KeyFileError(ValueError):
-    """A key file that must not or cannot be used; the text says what to do."""
-
-
-def read_key(path: Path) -> bytes:
-    """Return the key in a file of 32 hexadecimal digits that nobody but its owner may read.
-
-    Raises
-    ------
-    KeyFileError
-        It cannot be read, others may read it, or it holds no key. The text never quotes it.
-    """
-    try:
-        with path.open('rb') as source:
-            # Of the open file: the path may lead elsewhere by the time it is read.
-            mode = stat.S_IMODE(os.fstat(source.fileno()).st_mode)
-            content = source.read(1024)
-    except OSError as error:
-        raise KeyFileError(f'key file {path} cannot be read: {error.strerror}') from error
-    if mode & 0o077:
-        raise KeyFileError(
-            f'key file {path} must be closed to all but its owner: got mode {mode:04o}; '
-            f'chmod 600 {path}'
-        )
-    try:
-        key = bytes.fromhex(content.decode('ascii'))
-    except ValueError:  # a UnicodeDecodeError is one; its text would show the content
-        raise KeyFileError(f'key file {path} must hold hexadecimal digits only') from None
-    if len(key) != KEY_SIZE:
-        raise KeyFileError(
-            f'key file {path} must hold {2 * KEY_SIZE} hexadecimal digits: got {2 * len(key)}'
-        )
-    return key
-
-
-def key_check(key: bytes) -> int:
-    """Return 32 bits by which two people can tell whether their keys are the same.
-
-    They say no more of the key than how one may be tried: it must have been drawn, not thought of.
-    """
-    return int.from_bytes(siphash(key, b't3mpc')[:4], 'little')
-
-
-def session_key(key: bytes, host_nonce: bytes, robot_nonce: bytes) -> bytes:
-    """Return the key (16 bytes) of a session from the long-term key and both nonces."""
-    for name, nonce in (('host_nonce', host_nonce), ('robot_nonce', robot_nonce)):
-        if len(nonce) != NONCE_SIZE:
-            raise ValueError(f'{name} must be {NONCE_SIZE} bytes long: got {len(nonce)}')
-    nonces = host_nonce + robot_nonce
-    return siphash(key, nonces + b'\x00') + siphash(key, nonces + b'\x01')
-
-
-def sign_hello(key: bytes, session: int, seq: int, host_us: int, nonce: bytes) -> Hello:
-    """Return a HELLO signed under the long-term key."""
-    hello = Hello(session, seq, host_us, nonce, _EMPTY_TAG)
-    return hello._replace(tag=siphash(key, encode(hello)[:-TAG_SIZE]))
-
-
-def verify_hello(key: bytes, hello: Hello) -> bool:
-    """Return whether a HELLO carries the tag of the long-term key."""
-    return bool(hello.tag) and _tags_match(siphash(key, encode(hello)[:-TAG_SIZE]), hello.tag)
-
-
-def frame_tag(frame: SignedFrame, key: bytes, epoch: int) -> bytes:
-    """Return the tag of a frame under a session's key; whatever tag it carries plays no part."""
-    body = encode(frame._replace(tag=_EMPTY_TAG))[:-TAG_SIZE]
-    return siphash(key, body + epoch.to_bytes(4, 'little'))
-
-
-class Signer:
-    """The host's end of a session: signs, and knows the epoch.
-
-    Parameters
-    ----------
-    key
-        Of the session.
-    host_us
-        That of the HELLO.
-    """
-
-    def __init__(self, key: bytes, host_us: int) -> None:
-        self._key = key
-        self._last = host_us
-        self._epoch = 0
-
-    @property
-    def epoch(self) -> int:
-        """How often host_us has wrapped since HELLO."""
-        return self._epoch
-
-    def sign(self, frame: AnySignedFrame) -> AnySignedFrame:
-        """Return the frame with its tag.
-
-        A lower ``host_us`` than before is taken as a wrap, so frames must be signed in the order
-        of their times, and all within 71 minutes of the one before.
-
-        Raises
-        ------
-        ValueError
-            ``host_us`` is that of the frame before: the robot would take it for a replay.
-        """
-        if frame.host_us == self._last:
-            raise ValueError(f'host_us must increase: got {frame.host_us} twice')
-        if frame.host_us < self._last:
-            self._epoch += 1
-        self._last = frame.host_us
-        return frame._replace(tag=frame_tag(frame, self._key, self._epoch))
-
-
-class CommandVerifier:
-    """The robot's end: decides which frames count. Every refusal is a text; empty is yes.
-
-    Emulators and tests use it; the firmware has the same rules in C.
-
-    Parameters
-    ----------
-    key
-        The long-term key; empty for a robot without one.
-    locked
-        The key is damaged, or about to change: nobody gets in, everybody may stop the robot.
-    """
-
-    def __init__(self, key: bytes = b'', locked: bool = False) -> None:
-        if key and len(key) != KEY_SIZE:
-            raise ValueError(f'key must be {KEY_SIZE} bytes long: got {len(key)}')
-        self._key = key
-        self._locked = locked
-        self._session = 0
-        self._session_key = b''
-        self._host_nonce = b''
-        self._robot_nonce = bytes(NONCE_SIZE) if key or locked else b''
-        self._last = (0, 0)
-
-    @property
-    def key(self) -> bytes:
-        """The long-term key; empty if there is none, or none that can be used."""
-        return self._key
-
-    @property
-    def locked(self) -> bool:
-        """Whether nobody gets in."""
-        return self._locked
-
-    @property
-    def session(self) -> int:
-        """The session the robot is in; 0 before the first HELLO."""
-        return self._session
-
-    @property
-    def nonce(self) -> bytes:
-        """The robot's nonce, for INFO: zeros before the first HELLO; empty without a key."""
-        return self._robot_nonce
-
-    def begin_session(self, hello: Hello, fresh_nonce: bytes) -> str:
-        """Start the session a HELLO asks for, or return why not.
-
-        ``fresh_nonce`` (8 bytes nobody can foresee) becomes the robot's, unless this HELLO repeats
-        the last one: the host has not heard the answer, and nothing changes.
-        """
-        if self._locked:
-            return 'the key is damaged'
-        if bool(self._key) != bool(hello.tag):
-            return 'no key to check the HELLO with' if hello.tag else 'HELLO is not signed'
-        if self._key:
-            if not verify_hello(self._key, hello):
-                return 'HELLO has a bad tag'
-            if hello.nonce == self._host_nonce:
-                return ''
-            self._session_key = session_key(self._key, hello.nonce, fresh_nonce)
-            self._host_nonce, self._robot_nonce = hello.nonce, fresh_nonce
-            self._last = (0, hello.host_us)
-        self._session = hello.session
-        return ''
-
-    def end_session(self) -> None:
-        """Forget the session: the HELLO that began it may begin another, with a new nonce."""
-        self._session = 0
-        self._host_nonce = b''
-
-    def verify(self, frame: SignedFrame) -> str:
-        """Return why a frame does not count; when it does, none like it or older counts again.
-
-        A CMD with ESTOP always counts; what else it says does only if :meth:`accept` takes it.
-        """
-        why = self.accept(frame)
-        return '' if isinstance(frame, Command) and frame.flags & CommandFlag.ESTOP else why
-
-    def accept(self, frame: SignedFrame) -> str:
-        """Return why a frame is none of the session's; when it is, it is part of the order.
-
-        So is a well-signed ESTOP: one that is repeated for hours keeps the epoch known. One that
-        is not well signed leaves no trace in it.
-        """
-        if not self._session or frame.session != self._session:
-            return f'session is {self._session}: got {frame.session}'
-        if not self._key:
-            return 'no key to check the tag with' if frame.tag else ''
-        if not frame.tag:
-            return 'frame is not signed'
-        epoch, last = self._last
-        if frame.host_us == last:
-            return 'frame is a replay'
-        if frame.host_us < last:
-            epoch += 1
-        if not _tags_match(frame_tag(frame, self._session_key, epoch), frame.tag):
-            return 'frame has a bad tag, or is a replay'
-        self._last = (epoch, frame.host_us)
-        return ''
-
-
-def _tags_match(expected: bytes, got: bytes) -> bool:
-    # In a time that does not tell how many bytes are right.
-    return hmac.compare_digest(expected, got)

@@ -19,28 +19,28 @@ _MICROSECOND = 1000
 """ns"""
 _WINDOW_NS = 10 * NANOSECONDS
 _MAX_SKEW = 0.02
-# Weight (s²) of a sample of rate 1 among those measured: spread of a pair (0.2 ms) over spread of
-# resonators (0.5 %), squared. It decides nothing once a third of a second is seen.
+# Weight (s²) of the prior skew 0 against the measured samples: standard deviation of a sample
+# (0.2 ms) over that of resonators (0.5 %), squared. Negligible after a third of a second.
 _SKEW_PRIOR_WEIGHT = (0.2e-3 / 0.005) ** 2
 
 BYTE_NS = 20 * _MICROSECOND
-"""One byte on the serial line at 500 000 baud."""
+"""Duration of one byte on the serial line at 500 000 baud, ns."""
 
 
 def forward_delay_ns(wire_bytes: int, payload_bytes: int) -> int:
-    """Return how long a CMD takes from the first byte written to its arrival at the robot.
+    """Return the delay (ns) of a CMD from its first byte written to its reception by the robot.
 
-    Its bytes on the line, twice 130 us for the radios to settle and to fetch it, and its time in
-    the air at 1 Mbit/s: preamble 1, address 5, control 9 bit, CRC 2 (nRF24L01+ data sheet 1.0).
+    Sum of its bytes on the line, twice 130 us of radio settling and transfer, and the air time at
+    1 Mbit/s: preamble 1, address 5, control 9 bit, CRC 2 (nRF24L01+ data sheet 1.0).
     """
     air_us = (1 + 5 + payload_bytes + 2) * 8 + 9
     return wire_bytes * BYTE_NS + (130 + 130 + air_us) * _MICROSECOND
 
 
 class CounterUnwrapper:
-    """A counter of 32 bits that goes on where it wraps.
+    """Unwraps a 32-bit counter.
 
-    Between two values it must move by less than 2**31: 35 minutes of microseconds.
+    Consecutive values must differ by less than 2**31: 35 minutes of microseconds.
     """
 
     def __init__(self) -> None:
@@ -49,11 +49,11 @@ class CounterUnwrapper:
 
     @property
     def total(self) -> int:
-        """The sum of all moves, from the first value on; from zero after :meth:`rebase`."""
+        """Sum of all differences since the first value."""
         return self._total
 
     def add(self, value: int) -> int:
-        """Return the total after the counter was seen at ``value`` (signed or not)."""
+        """Return the total at the counter value ``value`` (signed or unsigned)."""
         if self._last is None:
             self._last = value
             return self._total
@@ -62,28 +62,28 @@ class CounterUnwrapper:
         return self._total
 
     def rebase(self) -> None:
-        """Keep the total, and take the next value for where the counter now stands."""
+        """Keep the total; the next value is the new origin of the counter."""
         self._last = None
 
 
 def wrapped_difference(before: int, after: int) -> int:
-    """Return by how much a counter of 32 bits has moved, the shorter way round."""
+    """Return the difference of two 32-bit counter values, modulo 2**32, in [-2**31, 2**31)."""
     return (after - before + (_WRAP >> 1)) % _WRAP - (_WRAP >> 1)
 
 
 class ClockModel:
-    """Turns robot times into host times by a line through the fast half of the last ten seconds.
+    """Maps robot time to host time: a line fitted to the fast half of the last ten seconds.
 
-    Robot times are microseconds that do not wrap (:class:`Unwrapped`).
+    Robot times are unwrapped microseconds (:class:`CounterUnwrapper`).
     """
 
     def __init__(self) -> None:
         self._samples: deque[tuple[int, int, int]] = deque()
-        """Robot time (us), earliest host time (ns) it can be, round trip (ns)."""
+        """Robot time (us), earliest possible host time (ns), round trip (ns)."""
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: the robot has started anew."""
+        """Drop all samples, after a restart of the robot."""
         self._samples.clear()
         self._origin_us = 0
         self._origin_ns = 0
@@ -91,25 +91,25 @@ class ClockModel:
 
     @property
     def is_set(self) -> bool:
-        """Whether a single pair of times is known."""
+        """Whether at least one sample is available."""
         return bool(self._samples)
 
     @property
     def skew(self) -> float:
-        """By how much a second of the robot is longer than one of the host; 0 if not known."""
+        """Relative excess of a robot second over a host second; 0 without samples."""
         return self._skew
 
     def add(self, robot_us: int, sent_ns: int, returned_ns: int, travel_ns: int) -> None:
-        """Learn from a transaction whose first packet needed no second try.
+        """Add a transaction whose first packet had no retransmission.
 
         Parameters
         ----------
         robot_us
-            When the CMD reached the robot, by its own clock.
+            Reception of the CMD, by the robot clock.
         sent_ns, returned_ns
-            When the host sent it, and when the result was back.
+            Transmission by the host, and return of the result.
         travel_ns
-            What the way to the robot takes at least: :func:`forward_ns`.
+            Minimum delay to the robot: :func:`forward_delay_ns`.
         """
         samples = self._samples
         samples.append((robot_us, sent_ns + travel_ns, returned_ns - sent_ns))
@@ -123,21 +123,21 @@ class ClockModel:
         Raises
         ------
         ValueError
-            Nothing has been learnt yet.
+            There is no sample yet.
         """
         if not self._samples:
-            raise ValueError('clock model must have seen one transaction at least: got none')
+            raise ValueError('clock model must have at least one transaction: got none')
         since = (robot_us - self._origin_us) * _MICROSECOND
         return self._origin_ns + since + round(self._skew * since)
 
     def _fit(self) -> None:
         last_us, last_ns, _ = self._samples[-1]
-        # Relative to the newest sample whole numbers become exact floats.
+        # Differences to the newest sample are exact as floats.
         table = np.array(self._samples, dtype=np.int64) - (last_us, last_ns, 0)
         robot, host, trip = table[:, 0] * _MICROSECOND, table[:, 1], table[:, 2]
         fast = trip <= np.median(trip)
-        # What a round trip takes longer than the shortest was lost there or back: half of it each
-        # way is wrong by half of it at most, and by nothing in the mean.
+        # The excess over the shortest round trip arose on the way there or back: assigning half to
+        # each way is wrong by at most half of it, and by zero on average.
         excess = 0.5 * (trip[fast] - trip.min())
         x = robot[fast] / NANOSECONDS
         y = (host[fast] - robot[fast] + excess) / NANOSECONDS

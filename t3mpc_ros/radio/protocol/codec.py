@@ -45,35 +45,37 @@ from t3mpc_ros.radio.protocol.frames import (
 
 
 class ExchangeStatus(NamedTuple):
-    """What became of one radio payload."""
+    """Result of the transmission of one radio payload."""
 
     acknowledged: bool
-    answered: bool
-    """With a payload."""
-    given_up: bool
-    """Nobody acknowledged any try (MAX_RT)."""
+    has_payload: bool
+    """Whether the acknowledgement carried a payload."""
+    failed: bool
+    """No transmission was acknowledged (MAX_RT)."""
     skipped: bool
-    """Not sent, because the one before it was given up."""
+    """Not transmitted, because the payload before it failed."""
     retransmissions: int
 
 
 def decode_exchange_status(status: int) -> ExchangeStatus:
-    """Return what a status byte of a RESULT says.
+    """Return the decoded status byte of a RESULT.
 
     Raises
     ------
     FrameError
-        It contradicts itself.
+        Bits of the status contradict each other.
     """
-    acknowledged, answered, given_up, skipped = (bool(status & bit) for bit in (1, 2, 4, 8))
-    said = ExchangeStatus(acknowledged, answered, given_up, skipped, status >> 4)
+    acknowledged, has_payload, failed, skipped = (bool(status & bit) for bit in (1, 2, 4, 8))
+    retransmissions = status >> 4
     if (
-        said.acknowledged + said.given_up + said.skipped > 1
-        or (said.answered and not said.acknowledged)
-        or (said.skipped and said.retransmissions)
+        acknowledged + failed + skipped > 1
+        or (has_payload and not acknowledged)
+        or (skipped and retransmissions)
     ):
-        raise FrameError(FrameErrorKind.VALUE, f'RESULT.status must make sense: got {status:#04x}')
-    return said
+        raise FrameError(
+            FrameErrorKind.VALUE, f'RESULT.status must be consistent: got {status:#04x}'
+        )
+    return ExchangeStatus(acknowledged, has_payload, failed, skipped, retransmissions)
 
 
 def encode(
@@ -84,10 +86,10 @@ def encode(
     Raises
     ------
     FrameError
-        Something does not fit; the text names frame, field, bound and value.
+        A value does not fit; the text names frame, field, bound and value.
     """
     layout = _LAYOUTS[type(frame)]
-    # An optional end (nonce, tag, address) is there or not; which, its last field tells.
+    # The last field shows whether the optional end (nonce, tag, address) is present.
     fixed = layout.forms[-1 if frame[-1] != b'' else 0].pack(frame)
     if isinstance(frame, Transmit):
         _check_payloads(frame)
@@ -99,23 +101,23 @@ def encode(
 
 
 def decode_downlink(data: bytes) -> Downlink:
-    """Return the radio payload a host sends, or raise FrameError."""
+    """Return the radio payload from a host, or raise FrameError."""
     return _decode(data, _DOWNLINK)  # type: ignore[no-any-return]
 
 
 def is_estop_command(data: bytes) -> bool:
-    """Return whether this is a CMD that asks for an emergency stop, whatever else is wrong."""
+    """Return whether this is a CMD with ESTOP, valid or not in its other fields."""
     sizes = [form.size for form in _DOWNLINK[0x11].forms]
     return len(data) in sizes and data[0] == 0x11 and bool(data[3] & CommandFlag.ESTOP)
 
 
 def decode_uplink(data: bytes) -> Uplink:
-    """Return the radio payload a robot sends, or raise FrameError."""
+    """Return the radio payload from a robot, or raise FrameError."""
     return _decode(data, _UPLINK)  # type: ignore[no-any-return]
 
 
 def decode_to_dongle(data: bytes) -> ToDongle:
-    """Return the frame a host sends over USB, or raise FrameError."""
+    """Return the USB frame from the host to the dongle, or raise FrameError."""
     if data[:1] != b'\x01':
         return _decode(data, _TO_DONGLE)  # type: ignore[no-any-return]
     if len(data) < 4:
@@ -134,7 +136,7 @@ def decode_to_dongle(data: bytes) -> ToDongle:
 
 
 def decode_from_dongle(data: bytes) -> FromDongle:
-    """Return the frame a dongle sends over USB, or raise FrameError."""
+    """Return the USB frame from the dongle to the host, or raise FrameError."""
     if data[:1] != b'\x81':
         return _decode(data, _FROM_DONGLE)  # type: ignore[no-any-return]
     form = _LAYOUTS[Result].forms[0]
@@ -144,12 +146,12 @@ def decode_from_dongle(data: bytes) -> FromDongle:
 
 
 def decode_to_board(data: bytes) -> ToBoard:
-    """Return the frame a host sends over the robot's own USB, or raise FrameError."""
+    """Return the USB frame from the host to the robot board, or raise FrameError."""
     return _decode(data, _TO_BOARD)  # type: ignore[no-any-return]
 
 
 def decode_from_board(data: bytes) -> FromBoard:
-    """Return the frame a robot sends over its own USB, or raise FrameError."""
+    """Return the USB frame from the robot board to the host, or raise FrameError."""
     return _decode(data, _FROM_BOARD)  # type: ignore[no-any-return]
 
 
@@ -157,8 +159,9 @@ class _Field(NamedTuple):
     name: str
     code: str
     low: int
+    """Lower bound of a number; length of a byte string."""
     high: int
-    """Of a number; a text of bytes has its length here twice."""
+    """Upper bound of a number; length of a byte string."""
 
     def check(self, kind: str, value: object) -> None:
         if self.code.endswith('s'):
@@ -184,36 +187,36 @@ _RANGES = {
 
 
 class _Form:
-    """One layout of a frame: its first byte, then columns ``name code [low high]``.
+    """One layout of a frame: its first byte, then fields ``name code [low high]``.
 
-    A column that is no field of the frame's type always holds its one allowed value.
+    A field that the frame type lacks is reserved and holds its one valid value.
     """
 
-    def __init__(self, kind: Any, name: str, head: int, columns: str) -> None:
+    def __init__(self, kind: Any, name: str, head: int, fields: str) -> None:
         self._kind, self._name, self._head = kind, name, head
-        self._columns = []
-        for text in columns.split(', '):
-            column, code, *bounds = text.split()
+        self._fields = []
+        for text in fields.split(', '):
+            field, code, *bounds = text.split()
             low, high = map(int, bounds) if bounds else _RANGES.get(code) or 2 * (int(code[:-1]),)
-            self._columns.append(_Field(column, code, low, high))
-        self._struct = struct.Struct('<B' + ''.join(column.code for column in self._columns))
+            self._fields.append(_Field(field, code, low, high))
+        self._struct = struct.Struct('<B' + ''.join(field.code for field in self._fields))
         self.size = self._struct.size
-        self._given = {column.name for column in self._columns}
+        self._names = {field.name for field in self._fields}
 
     def pack(self, frame: Any) -> bytes:
         values = []
-        for column in self._columns:
-            value = getattr(frame, column.name, column.low)
-            column.check(self._name, value)
+        for field in self._fields:
+            value = getattr(frame, field.name, field.low)
+            field.check(self._name, value)
             values.append(value)
-        for field, default in self._kind._field_defaults.items():
-            # What is not in this form would be lost.
-            if field not in self._given and field not in _VARIABLE_FIELDS:
-                value = getattr(frame, field)
+        for name, default in self._kind._field_defaults.items():
+            # A value outside this form would be lost.
+            if name not in self._names and name not in _VARIABLE_FIELDS:
+                value = getattr(frame, name)
                 if value != default:
                     raise FrameError(
                         FrameErrorKind.VALUE,
-                        f'{self._name}.{field} must be {default!r} without '
+                        f'{self._name}.{name} must be {default!r} without '
                         f'{self._kind._fields[-1]}: got {value!r}',
                     )
         return self._struct.pack(self._head, *values)
@@ -225,10 +228,10 @@ class _Form:
                 f'{self._name} must be at least {self.size} bytes long: got {len(data)}',
             )
         values = {}
-        for column, value in zip(self._columns, self._struct.unpack(data)[1:], strict=True):
-            column.check(self._name, value)
-            if column.name in self._kind._fields:
-                values[column.name] = value
+        for field, value in zip(self._fields, self._struct.unpack(data)[1:], strict=True):
+            field.check(self._name, value)
+            if field.name in self._kind._fields:
+                values[field.name] = value
         return self._kind(**values)
 
 
@@ -238,11 +241,11 @@ class _Layout(NamedTuple):
 
 
 _VARIABLE_FIELDS = ('first', 'second', 'payload')
-"""Fields of TX and RESULT whose length is not fixed."""
+"""Fields of TX and RESULT with variable length."""
 
 
-def _layout(kind: Any, name: str, head: int, columns: str, *longer: str) -> _Layout:
-    forms = tuple(_Form(kind, name, head, text) for text in (columns, *longer))
+def _layout(kind: Any, name: str, head: int, fields: str, *longer: str) -> _Layout:
+    forms = tuple(_Form(kind, name, head, text) for text in (fields, *longer))
     layout = _Layout(name, forms)
     _LAYOUTS[kind] = layout
     return layout
@@ -279,19 +282,17 @@ def _check_payloads(frame: Transmit) -> None:
 
 
 def _check_result_payload(frame: Result) -> None:
-    answered = (
-        decode_exchange_status(frame.first).answered
-        or decode_exchange_status(frame.second).answered
-    )
-    if len(frame.payload) > PAYLOAD_LIMIT or bool(frame.payload) != answered:
-        bound = f'1 to {PAYLOAD_LIMIT}' if answered else 'no'
+    statuses = decode_exchange_status(frame.first), decode_exchange_status(frame.second)
+    expected = any(status.has_payload for status in statuses)
+    if len(frame.payload) > PAYLOAD_LIMIT or bool(frame.payload) != expected:
+        bound = f'1 to {PAYLOAD_LIMIT}' if expected else 'no'
         raise FrameError(
             FrameErrorKind.LENGTH,
             f'RESULT.payload must have {bound} bytes: got {len(frame.payload)}',
         )
 
 
-# -- the table ------------------------------------------------------------------------------------
+# -- layouts --------------------------------------------------------------------------------------
 
 _LAYOUTS: dict[Any, _Layout] = {}
 _COMMAND = 'session B, seq B, flags B 0 7, ttl B, reserved B 0 0, left h, right h, host_us I'

@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 VERSION = 1
 PAYLOAD_LIMIT = 32
-"""bytes: the radio chip takes no more, and a robot rejects whatever claims to be longer"""
+"""Maximum radio payload, bytes; a longer one is rejected."""
 
 
 class FrameErrorKind(Enum):
-    """Why a frame is none: the robot counts these apart."""
+    """Why bytes are rejected; the robot counts the kinds separately."""
 
     VERSION = 'version'
     KIND = 'kind'
@@ -24,7 +24,7 @@ class FrameErrorKind(Enum):
 
 
 class FrameError(ValueError):
-    """A frame that cannot be read or written."""
+    """A frame that cannot be decoded or encoded."""
 
     def __init__(self, kind: FrameErrorKind, text: str) -> None:
         super().__init__(text)
@@ -40,7 +40,7 @@ class CommandFlag(IntFlag):
 
 
 class StatusFlag(IntFlag):
-    """What the robot says of itself in STATE, INFO and AUX."""
+    """Status bits in STATE, INFO and AUX."""
 
     ENABLED = 1
     MOVING = 2
@@ -53,13 +53,13 @@ class StatusFlag(IntFlag):
 
 
 STATE, AUX, INFO = 0, 1, 2
-"""What a POLL asks for."""
+"""Frame that a POLL fetches."""
 RESET_ODOMETRY, CLEAR_COUNTERS = 1, 2
-"""Verbs of an ACTION; the first is refused while the robot moves."""
+"""Verbs of an ACTION; RESET_ODOMETRY is rejected while the robot moves."""
 OK, UNKNOWN, OUT_OF_RANGE, READ_ONLY, BUSY, FAILED = range(6)
-"""Results in PARAM, ACK and, the last only there, KEY."""
+"""Result codes of PARAM, ACK and KEY; FAILED only in KEY."""
 NO_KEY, KEY_HELD, KEY_DAMAGED = range(3)
-"""What a robot tells of its key."""
+"""State of the key in KEY from the robot."""
 AGE_NONE = 0xFFFF
 """Age in a STATE before the first CMD of a session."""
 
@@ -68,25 +68,25 @@ AGE_NONE = 0xFFFF
 
 
 class Command(NamedTuple):
-    """CMD: the wheel speeds that are wanted, for as long as ``ttl`` says."""
+    """CMD: wheel speeds, valid for ``ttl``."""
 
     session: int
     seq: int
     flags: int
     ttl: int
-    """10 ms; 0 stops"""
+    """Time to live, unit 10 ms; 0 stops."""
     left: int
     """mrad/s"""
     right: int
     """mrad/s"""
     host_us: int
-    """The host's own microseconds, modulo 2**32."""
+    """Host time, us, modulo 2**32."""
     tag: bytes = b''
-    """8 bytes on a keyed link."""
+    """8 bytes on a keyed link, otherwise empty."""
 
 
 class ParamGet(NamedTuple):
-    """PARAM_GET: ask for a parameter."""
+    """PARAM_GET: read a parameter."""
 
     session: int
     seq: int
@@ -94,7 +94,7 @@ class ParamGet(NamedTuple):
 
 
 class ParamSet(NamedTuple):
-    """PARAM_SET: change a parameter; the robot answers with what it is then."""
+    """PARAM_SET: change a parameter; the robot answers with the resulting value."""
 
     session: int
     seq: int
@@ -117,7 +117,7 @@ class Hello(NamedTuple):
 
 
 class Poll(NamedTuple):
-    """POLL: fetch an answer; changes nothing, and any session may."""
+    """POLL: fetch an answer; read only, accepted from any session."""
 
     session: int
     seq: int
@@ -125,7 +125,7 @@ class Poll(NamedTuple):
 
 
 class Action(NamedTuple):
-    """ACTION: do something once."""
+    """ACTION: execute an action once."""
 
     session: int
     seq: int
@@ -139,11 +139,11 @@ class Action(NamedTuple):
 
 
 class State(NamedTuple):
-    """STATE: what the robot measures, in the 32 bytes that fit."""
+    """STATE: measurements of the robot, 32 bytes."""
 
     session: int
     seq: int
-    """Of the last CMD it took notice of."""
+    """Of the last accepted CMD."""
     status: int
     time_us: int
     """Robot time of the sample, modulo 2**32."""
@@ -151,17 +151,17 @@ class State(NamedTuple):
     """Microsteps issued since boot, modulo 2**32 as int32."""
     right: int
     gyro_z: int
-    """Register of the MPU6050, as the next two."""
+    """MPU6050 register, like the next two."""
     accel_x: int
     accel_y: int
     age: int
-    """10 us from the reception of the last CMD to the sample; AGE_NONE: there was none."""
+    """Time from the reception of the last CMD to the sample, unit 10 us; AGE_NONE without one."""
     ranges: bytes
-    """A code for each of the eight distance sensors."""
+    """One code for each of the eight distance sensors."""
 
 
 class Param(NamedTuple):
-    """PARAM: a parameter as it is now."""
+    """PARAM: current value and bounds of a parameter."""
 
     session: int
     seq: int
@@ -173,7 +173,7 @@ class Param(NamedTuple):
 
 
 class Info(NamedTuple):
-    """INFO: who the robot is."""
+    """INFO: identity of the robot."""
 
     session: int
     seq: int
@@ -183,17 +183,17 @@ class Info(NamedTuple):
     reset_cause: int
     """MCUSR of the AVR."""
     parameters: int
-    """How many there are."""
+    """Number of board parameters."""
     steps_per_rev: int
     microsteps: int
     time_us: int
     status: int
     nonce: bytes = b''
-    """8 bytes from a keyed robot; zeros before its first HELLO."""
+    """8 bytes from a keyed robot, zeros before its first HELLO; otherwise empty."""
 
 
 class Ack(NamedTuple):
-    """ACK: what became of an ACTION."""
+    """ACK: result of an ACTION."""
 
     session: int
     seq: int
@@ -202,7 +202,7 @@ class Ack(NamedTuple):
 
 
 class Aux(NamedTuple):
-    """AUX: what is worth knowing once a second."""
+    """AUX: slow measurements and counters, fetched once a second."""
 
     session: int
     seq: int
@@ -210,39 +210,39 @@ class Aux(NamedTuple):
     battery: int
     """mV"""
     temperature: int
-    """Register of the MPU6050, as the next three."""
+    """MPU6050 register, like the next three."""
     accel_z: int
     gyro_x: int
     gyro_y: int
     received: int
-    """Counters from here on, modulo 2**16."""
+    """This and the following counters are modulo 2**16."""
     duplicates: int
     bad_session: int
     """Frames of another session, with a bad tag, or replayed."""
     stale: int
     expired: int
-    """How often the TTL ran out."""
+    """Number of TTL expiries."""
     time_us: int
     bad_version: int
     short: int
-    """Frames of a wrong length or with a value out of range."""
+    """Frames of wrong length or with a value out of range."""
 
 
 # -- USB ------------------------------------------------------------------------------------------
 
 
 class Transmit(NamedTuple):
-    """TX: send the first payload, wait ``gap``, send the second unless empty."""
+    """TX: transmit the first payload, wait ``gap``, transmit the second unless empty."""
 
     id: int
     gap: int
-    """250 us"""
+    """Unit 250 us."""
     first: bytes
     second: bytes = b''
 
 
 class Result(NamedTuple):
-    """RESULT: what became of a TX; ``codec.exchange`` reads the two statuses."""
+    """RESULT: result of a TX; ``codec.exchange`` decodes the status bytes."""
 
     id: int
     first: int
@@ -250,28 +250,28 @@ class Result(NamedTuple):
     dongle_us: int
     """Dongle time at completion, modulo 2**32."""
     payload: bytes = b''
-    """Of the last exchange that was answered with one."""
+    """ACK payload of the last exchange that returned one."""
 
 
 class Configure(NamedTuple):
-    """CFG, host to dongle: set the radio; without an address: only ask."""
+    """CFG, host to dongle: configure the radio; without an address, read its configuration."""
 
     id: int
     channel: int = 0
-    """2400 MHz + this"""
+    """2400 MHz plus this."""
     rate: int = 0
     """0: 250 kbit/s, 1: 1 Mbit/s, 2: 2 Mbit/s"""
     power: int = 0
     """0: -18 dBm, 1: -12, 2: -6, 3: 0"""
     retry_delay: int = 0
-    """(this + 1) 250 us"""
+    """(This + 1) 250 us."""
     retries: int = 0
     address: bytes = b''
-    """5 bytes, lowest first"""
+    """5 bytes, lowest first."""
 
 
 class Configured(NamedTuple):
-    """CFG, dongle to host: how the radio is set."""
+    """CFG, dongle to host: configuration of the radio."""
 
     id: int
     channel: int
@@ -281,19 +281,19 @@ class Configured(NamedTuple):
     retries: int
     address: bytes
     chip_ok: int
-    """1: the radio chip answers and holds what was set."""
+    """1: the radio chip answers and holds the configuration."""
 
 
 class Ping(NamedTuple):
-    """PING: is a dongle there? Never touches the radio."""
+    """PING: test the serial line; does not use the radio."""
 
     id: int
     echo: bytes
-    """4 bytes of the host's choice."""
+    """4 arbitrary bytes, returned in PONG."""
 
 
 class Pong(NamedTuple):
-    """PONG: it is, and this is how it fares."""
+    """PONG: identity, state of the radio chip, error counters."""
 
     id: int
     echo: bytes
@@ -309,32 +309,32 @@ class Pong(NamedTuple):
 
 
 class Refusal(NamedTuple):
-    """ERR: the dongle could not make sense of a frame."""
+    """ERR: the dongle rejects a frame."""
 
     code: int
-    """1: unknown kind, 2: malformed, 3: busy"""
+    """1: unknown kind, 2: malformed, 3: busy."""
     argument: int
-    """First byte of that frame; for 3, its id."""
+    """First byte of the rejected frame; its id for code 3."""
 
 
 class Key(NamedTuple):
-    """KEY, host to the robot's own USB: store a key, or forget it; without one: only ask."""
+    """KEY, host to the USB of the robot board: store or erase the key; empty reads its state."""
 
     id: int
     key: bytes = b''
-    """16 bytes; all zero: forget it."""
+    """16 bytes; all zero erases the key."""
 
 
 class KeyState(NamedTuple):
-    """KEY, robot to host over its own USB: what became of it, and what there is now."""
+    """KEY, robot board to host over its USB: result and state of the key."""
 
     id: int
     rc: int
-    """OK, BUSY: it moves, its drivers are on, or it is writing one; FAILED: it did not hold."""
+    """OK; BUSY: moving, drivers on, or writing a key; FAILED: the EEPROM did not hold the key."""
     state: int
     """NO_KEY, KEY_HELD or KEY_DAMAGED."""
     check: int
-    """``authentication.key_check`` of a key that is held, else 0."""
+    """``authentication.key_check`` of the stored key, else 0."""
 
 
 Downlink = Command | ParamGet | ParamSet | Hello | Poll | Action
@@ -342,15 +342,15 @@ Uplink = State | Param | Info | Ack | Aux
 ToDongle = Transmit | Configure | Ping
 FromDongle = Result | Configured | Pong | Refusal
 ToBoard = Ping | Key
-"""Over the USB of the robot's own board, as the next."""
+"""Over the USB of the robot board, like the next."""
 FromBoard = Pong | KeyState | Refusal
 
 
-# -- parameters of the robot ----------------------------------------------------------------------
+# -- board parameters -----------------------------------------------------------------------------
 
 
 class BoardParameter(NamedTuple):
-    """What a robot's parameter is called, and what it may be. It is kept in RAM only."""
+    """Name, unit, default and bounds of a board parameter, which the robot holds in RAM."""
 
     name: str
     unit: str
@@ -361,17 +361,15 @@ class BoardParameter(NamedTuple):
 
 
 BOARD_PARAMETERS = (
-    BoardParameter(
-        'max_speed', 'mrad/s', 10000, 0, 19600, 'of a wheel; the faster one sets the scale'
-    ),
+    BoardParameter('max_speed', 'mrad/s', 10000, 0, 19600, 'of a wheel; the faster scales both'),
     BoardParameter('acceleration', 'mrad/s2', 30000, 100, 100000, 'of the faster changing wheel'),
-    BoardParameter('deceleration', 'mrad/s2', 60000, 100, 200000, 'the same when it is to stand'),
-    BoardParameter('ttl_max', 'ms', 250, 20, 500, 'no command is followed longer than this'),
-    BoardParameter('microsteps', '', 16, 1, 256, 'takes effect at the next start; only at rest'),
+    BoardParameter('deceleration', 'mrad/s2', 60000, 100, 200000, 'the same while stopping'),
+    BoardParameter('ttl_max', 'ms', 250, 20, 500, 'maximum time to live of a command'),
+    BoardParameter('microsteps', '', 16, 1, 256, 'applied at the next start; set at standstill'),
     BoardParameter('steps_per_rev', '', 200, 200, 200, 'full steps of the motor'),
     BoardParameter('gyro_range', 'deg/s', 500, 500, 500, 'full scale of the gyro'),
-    BoardParameter('battery_low', 'mV', 10200, 0, 30000, 'below this the status says so'),
-    BoardParameter('idle_off', 'ms', 0, 0, 600000, 'at rest this long, drivers go off; 0: never'),
+    BoardParameter('battery_low', 'mV', 10200, 0, 30000, 'status bit LOW_BATTERY below this'),
+    BoardParameter('idle_off', 'ms', 0, 0, 600000, 'drivers off after this standstill; 0: never'),
     BoardParameter('invert_wheels', 'bits', 0, 0, 3, '1: left, 2: right'),
 )
-"""In the order of their ids; one with ``low == high`` is read-only."""
+"""Board parameters by id; one with ``low == high`` is read-only."""

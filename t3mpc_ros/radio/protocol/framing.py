@@ -11,7 +11,7 @@ from binascii import crc_hqx
 from typing import NamedTuple
 
 FRAME_LIMIT = 78
-"""Bytes of the longest frame: a TX with two radio payloads has 68."""
+"""Maximum length of a frame, bytes; a TX with two radio payloads has 68."""
 
 _CRC_SIZE = 2
 _ENCODED_LIMIT = FRAME_LIMIT + _CRC_SIZE + 1
@@ -23,33 +23,33 @@ def crc16(data: bytes) -> int:
 
 
 def cobs_encode(data: bytes) -> bytes:
-    """Return ``data`` without zeros, one byte longer (COBS; at most 254 bytes).
+    """Return ``data`` encoded without zero bytes, one byte longer (COBS; at most 254 bytes).
 
     Raises
     ------
     ValueError
-        It is longer than that.
+        ``data`` is longer.
     """
     if len(data) > 254:
         raise ValueError(f'data must be at most 254 bytes long: got {len(data)}')
     return b''.join(bytes([len(run) + 1]) + run for run in data.split(b'\0'))
 
 
-def cobs_decode(stuffed: bytes) -> bytes | None:
-    """Return what :func:`stuff` was given, or None if nothing stuffs to this."""
+def cobs_decode(encoded: bytes) -> bytes | None:
+    """Return the decoded data, or None if no data encodes to these bytes."""
     runs, at = [], 0
-    while at < len(stuffed):
-        code = stuffed[at]
-        run = stuffed[at + 1 : at + code]
+    while at < len(encoded):
+        code = encoded[at]
+        run = encoded[at + 1 : at + code]
         if len(run) != code - 1 or b'\0' in run:
             return None
         runs.append(run)
         at += code
-    return b'\0'.join(runs) if 0 < len(stuffed) < 256 else None
+    return b'\0'.join(runs) if 0 < len(encoded) < 256 else None
 
 
 def encode_frame(frame: bytes) -> bytes:
-    """Return the bytes to send for a frame: stuffed with its CRC, zero at the end.
+    """Return the bytes of a frame on the serial line: COBS of frame and CRC, then a zero.
 
     Raises
     ------
@@ -62,61 +62,61 @@ def encode_frame(frame: bytes) -> bytes:
 
 
 class FrameCounts(NamedTuple):
-    """What a splitter has seen so far."""
+    """Counters of a frame decoder."""
 
     frames: int
-    """Good ones."""
+    """Valid frames."""
     crc_errors: int
-    """Well-formed, but another CRC."""
+    """Valid COBS, wrong CRC."""
     frame_errors: int
-    """Too long, too short, or no COBS."""
+    """Too long, too short, or invalid COBS."""
 
 
 class FrameDecoder:
-    """Cuts frames out of a stream, however it is split, damaged or polluted.
+    """Decodes frames from a byte stream that may be split, damaged or polluted anywhere.
 
-    At most one frame's length is kept; the rest of what is longer is counted once and dropped.
+    It buffers at most one frame; a longer piece is dropped and counts as one frame error.
     """
 
     def __init__(self) -> None:
-        self._kept = bytearray()
+        self._buffer = bytearray()
         self._too_long = False
         self._frames = self._crc_errors = self._frame_errors = 0
 
     @property
     def counts(self) -> FrameCounts:
-        """What was seen so far."""
+        """Counters since construction."""
         return FrameCounts(self._frames, self._crc_errors, self._frame_errors)
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Return the good frames that end within ``data``, without CRC, in order."""
-        found = []
-        *ended, begun = data.split(b'\0')
-        for piece in ended:
-            self._keep(piece)
+        """Return the valid frames that end within ``data``, without CRC, in order."""
+        frames = []
+        *complete, partial = data.split(b'\0')
+        for piece in complete:
+            self._append(piece)
             frame = self._finish()
             if frame is not None:
-                found.append(frame)
-        self._keep(begun)
-        return found
+                frames.append(frame)
+        self._append(partial)
+        return frames
 
-    def forget(self) -> None:
-        """Drop the begun frame: the next byte comes from another connection."""
-        self._kept.clear()
+    def reset(self) -> None:
+        """Drop the partial frame, for a new connection."""
+        self._buffer.clear()
         self._too_long = False
 
-    def _keep(self, piece: bytes) -> None:
-        room = _ENCODED_LIMIT - len(self._kept)
+    def _append(self, piece: bytes) -> None:
+        room = _ENCODED_LIMIT - len(self._buffer)
         self._too_long |= len(piece) > room
-        self._kept += piece[:room]
+        self._buffer += piece[:room]
 
     def _finish(self) -> bytes | None:
-        """Return the frame kept, None if it is none; start anew."""
-        stuffed, too_long = bytes(self._kept), self._too_long
-        self.forget()
-        if not stuffed:
-            return None  # zeros in a row: whoever is unsure of the line may send one first
-        data = None if too_long else cobs_decode(stuffed)
+        """Return the buffered frame, None if it is invalid; empty the buffer."""
+        encoded, too_long = bytes(self._buffer), self._too_long
+        self.reset()
+        if not encoded:
+            return None  # zeros in a row: a sender may start with one to resynchronise
+        data = None if too_long else cobs_decode(encoded)
         if data is None or len(data) <= _CRC_SIZE:
             self._frame_errors += 1
             return None

@@ -112,7 +112,7 @@ def _read_parameter(parameters: LinkParameters, session: int, number: int) -> Sc
 
 def format_robot_info(inventory: RobotInfo, parameters: LinkParameters) -> str:
     """Return the parameters as text: value, bounds, and what a bridge with these settings sets."""
-    info, wanted = inventory.info, parameters.robot.on_wire()
+    info, wanted = inventory.info, parameters.robot.to_wire()
     signed = 'signed commands only' if info.nonce else 'no key'
     lines = [
         f'firmware {info.major}.{info.minor}, {info.steps_per_rev} steps of {info.microsteps} '
