@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Compiled kernels: one decorator, a cache that is writable and never stale."""
+"""Kernel decorator: floating-point behaviour, and a cache that is writable and up to date."""
 
 import os
 from pathlib import Path
@@ -23,7 +23,7 @@ def test_division_by_zero_gives_infinity_not_an_exception():
     assert np.isposinf(out[0])
 
 
-def test_the_fingerprint_changes_with_any_file_that_holds_a_kernel_and_with_no_other(tmp_path):
+def test_fingerprint_depends_on_files_with_kernels_only(tmp_path):
     (tmp_path / 'a').mkdir()
     file, other = tmp_path / 'a' / 'x.py', tmp_path / 'a' / 'y.py'
     file.write_text('@kernel\ndef f(): return 1\n')
@@ -34,9 +34,9 @@ def test_the_fingerprint_changes_with_any_file_that_holds_a_kernel_and_with_no_o
     assert source_fingerprint(tmp_path) != before
 
 
-def test_an_unwritable_place_is_passed_over(tmp_path):
+def test_an_unwritable_folder_is_skipped(tmp_path):
     blocked = tmp_path / 'file'
-    blocked.write_text('a file, so nothing can be made below it')
+    blocked.write_text('a file, so no folder can be created below it')
     chosen = cache_directory(
         {'T3MPC_CACHE_DIR': str(blocked / 'x'), 'XDG_CACHE_HOME': str(tmp_path / 'ok')}
     )
@@ -44,7 +44,7 @@ def test_an_unwritable_place_is_passed_over(tmp_path):
     assert chosen.is_dir()
 
 
-def test_without_any_writable_place_the_error_names_them_and_the_remedy(tmp_path, monkeypatch):
+def test_error_without_a_writable_folder_names_all_candidates(tmp_path, monkeypatch):
     blocked = tmp_path / 'file'
     blocked.write_text('')
     monkeypatch.setattr('tempfile.gettempdir', lambda: str(blocked / 'tmp'))
@@ -53,11 +53,11 @@ def test_without_any_writable_place_the_error_names_them_and_the_remedy(tmp_path
     assert str(blocked) in str(caught.value)
 
 
-def test_a_package_installed_read_only_still_compiles_and_caches(tmp_path):
-    """Numba's default puts the cache beside the source, and fails where it may not write.
+def test_a_read_only_package_still_compiles_and_caches(tmp_path):
+    """Numba's default cache beside the source fails for a read-only package.
 
-    The test runs as root on some machines, where no folder is read-only: so it shows instead
-    that nothing at all is written beside the sources, and that the chosen folder is used.
+    As root no folder is read-only, so the test checks that nothing is written beside the sources
+    and that the selected folder is used.
     """
     package = Path(__file__).resolve().parent.parent / 't3mpc_ros'
     environment = dict(os.environ, T3MPC_CACHE_DIR=str(tmp_path))

@@ -164,7 +164,7 @@ class ChaoticReference:
 
     Parameters
     ----------
-    settings
+    parameters
         System, scaling and switching.
     geometry
         Wheel radius and separation.

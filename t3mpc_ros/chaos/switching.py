@@ -109,7 +109,7 @@ class SwitchingSchedule:
 
     Parameters
     ----------
-    settings
+    parameters
         Kind, modes and times.
     seed
         Not negative, of any length; kind *fixed* ignores it.

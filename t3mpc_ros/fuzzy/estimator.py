@@ -193,7 +193,7 @@ class FuzzyEstimator:
 
     Parameters
     ----------
-    settings
+    parameters
         Fuzzy sets.
     adaptation
         Gains and bounds of the adaptation.
@@ -371,7 +371,7 @@ def gamma_for(
 
     Parameters
     ----------
-    settings
+    parameters
         Fuzzy sets.
     normalised_gain
         Mean of gamma |Phi|², 1/s².

@@ -38,7 +38,7 @@ def derivative(values, rate):
     return inner * rate / 12.0
 
 
-def test_samples_lie_on_the_grid_and_a_robot_at_rest_can_follow_from_the_first():
+def test_samples_are_on_the_grid_and_start_from_rest():
     run = samples(400)
     assert [sample.index for sample in run] == list(range(400))
     assert [sample.elapsed for sample in run] == [n / 100.0 for n in range(400)]
@@ -48,7 +48,7 @@ def test_samples_lie_on_the_grid_and_a_robot_at_rest_can_follow_from_the_first()
     assert np.abs(wheels_of(run)[:30]).max() < 0.3
 
 
-def test_wheels_are_the_scaled_states_that_are_selected():
+def test_wheels_are_the_selected_scaled_states():
     parameters = ReferenceParameters(ramp=0.0)
     for sample in samples(2600, ramp=0.0):
         signals = np.array(parameters.amplitude) * (np.array(sample.states) - parameters.offset)
@@ -60,15 +60,17 @@ def test_wheels_are_the_scaled_states_that_are_selected():
 @pytest.mark.parametrize('output', ['wheels', 'body'])
 @pytest.mark.parametrize('blend', [0.0, 4.0])
 def test_rate_is_the_derivative_of_the_wheels_away_from_jumps(output, blend):
-    """Finite differences over 60 s: ramp, blends and plain stretches; jumps are left out."""
+    """Finite differences over 60 s with ramp, transitions and constant modes, without jumps."""
     run = samples(6000, **{'output': output, 'switching.blend': blend})
     difference = derivative(wheels_of(run), 100.0)
     error = np.abs(difference - rates_of(run)[2:-2]).max(axis=1)
     jump = np.array([sample.switched for sample in run])
-    near = np.convolve(jump, np.ones(5), 'same')[2:-2] > 0  # kinks in the second derivative too
+    near = (
+        np.convolve(jump, np.ones(5), 'same')[2:-2] > 0
+    )  # includes kinks of the second derivative
     assert near.sum() == 20
     assert error[~near].max() < 0.02
-    assert rates_of(run).std() > 3.0  # what the error is to be compared with
+    assert rates_of(run).std() > 3.0  # scale of the error
     if blend:
         assert error.max() < 0.2
 
@@ -79,7 +81,7 @@ def test_rate_has_no_impulse_at_a_sudden_jump():
     jumps = [sample.index for sample in run if sample.switched]
     assert jumps == [1200, 2400, 3600, 4800]
     steps = np.abs(wheels[jumps] - wheels[np.array(jumps) - 1]).max(axis=1)
-    assert steps.max() > 1.0  # truly sudden
+    assert steps.max() > 1.0  # a sudden switch
     parameters = ReferenceParameters()
     scale = np.array(parameters.amplitude)
     for jump in jumps:
@@ -105,7 +107,7 @@ def test_defaults_are_what_a_small_robot_can_follow():
     assert np.all(rates.std(axis=0) > 2.0)
 
 
-def test_twist_is_equation_1_of_the_wheels_and_body_output_its_inverse():
+def test_twist_is_equation_1_and_body_output_its_inverse():
     geometry = WheelGeometry(wheel_radius=0.05, wheel_separation=0.3)
     wheels, body = (
         samples(200, geometry, output=output, ramp=0.0) for output in ('wheels', 'body')
@@ -118,7 +120,7 @@ def test_twist_is_equation_1_of_the_wheels_and_body_output_its_inverse():
 
 
 def test_time_scale_only_slows_the_same_states_down():
-    """reference(t) = y(kappa t): half the scale at half the rate gives the very same states."""
+    """reference(t) = y(kappa t): half the scale at half the rate gives identical states."""
     fast = samples(300, rate=100.0, time_scale=0.05, ramp=0.0)
     slow = samples(300, rate=50.0, time_scale=0.025, ramp=0.0)
     assert states_of(fast).tolist() == states_of(slow).tolist()
@@ -136,7 +138,7 @@ def test_a_whole_number_of_solver_steps_makes_one_sample(rate, time_scale, steps
     assert parameters.step * steps * rate == pytest.approx(time_scale)
 
 
-def test_seed_zero_begins_exactly_at_the_initial_state_and_others_near_it():
+def test_seed_zero_starts_at_the_initial_state_others_near_it():
     parameters = ReferenceParameters(settle=0.1)
     solver = FractionalSolver(hyperchaotic_system(), parameters.step, np.array(parameters.initial))
     start = solver.advance(round(0.1 / parameters.step))
@@ -149,8 +151,8 @@ def test_seed_zero_begins_exactly_at_the_initial_state_and_others_near_it():
     np.testing.assert_allclose(other, exact, atol=1e-4)
 
 
-def test_visible_switch_times_do_not_give_the_perturbation_away():
-    """Both once came from one stream: the first dwell was the perturbation of y1, rescaled."""
+def test_switch_times_do_not_reveal_the_perturbation():
+    """With a common random stream the first dwell is the scaled perturbation of y1."""
     parameters = ReferenceParameters.from_dict(
         {'settle': 0.1, 'perturbation': 1e-6, 'switching.kind': 'random'}
     )
@@ -159,10 +161,10 @@ def test_visible_switch_times_do_not_give_the_perturbation_away():
     base = np.array(reference.advance().states)
     for seed in range(1, 200):
         reference.reset(seed)
-        # Over 0.1 s the perturbation only grows, linearly: the shift is a mix of four draws.
+        # Over 0.1 s the perturbation grows linearly: the shift is a combination of four draws.
         shifts.append(np.array(reference.advance().states) - base)
         dwells.append(SwitchingSchedule(parameters.switching, seed).switches_until(20.0)[0])
-    # Solve for the part of the dwell that any linear mix of the shifts explains.
+    # Remove the part of the dwell that a linear combination of the shifts explains.
     design = np.column_stack([np.ones(len(shifts)), np.array(shifts) * 1e6])
     centred = np.array(dwells) - np.mean(dwells)
     left = centred - design @ np.linalg.lstsq(design, centred, rcond=None)[0]
@@ -184,13 +186,13 @@ def test_reset_repeats_a_run_and_another_seed_gives_another_one():
     assert [reference.advance() for _ in range(2500)] == first
 
 
-def test_settings_need_one_value_per_state():
+def test_lists_need_one_value_per_state():
     for name in ('orders', 'amplitude', 'offset', 'initial'):
         with pytest.raises(ParameterError, match=name):
             ReferenceParameters(**{name: (1.0, 1.0)})
 
 
-def test_a_seed_that_cannot_be_used_is_refused_without_being_told():
+def test_an_invalid_seed_is_rejected_without_printing_it():
     reference = ChaoticReference(ReferenceParameters(settle=0.1), GEOMETRY)
     with pytest.raises(ValueError, match='seed must not be negative') as caught:
         reference.reset(-123456)

@@ -23,7 +23,7 @@ def slope_of(system, state):
     return out
 
 
-def test_term_lists_say_what_equation_85_with_e6_says():
+def test_terms_are_those_of_equation_85_with_e6():
     for y1, y2, y3, y4 in STATES:
         expected = [
             35 * (y2 * y3 + (y2 - y1)),
@@ -36,7 +36,7 @@ def test_term_lists_say_what_equation_85_with_e6_says():
 
 
 def test_jacobian_is_the_derivative_of_the_slope():
-    # Central differences of a quadratic are exact but for rounding.
+    # Central differences of a quadratic function are exact up to rounding.
     system = hyperchaotic_system()
     out = np.full((4, 4), np.nan)
     for state in STATES:
@@ -69,13 +69,13 @@ def test_repeated_terms_and_squares_are_added():
 
 
 @pytest.mark.parametrize('order', [0.98, 1.0])
-def test_plus_sign_of_e6_lives_and_minus_sign_decays(order):
-    """The paper's (85) prints '- 5 y1 y3 25 y1': with minus there is no chaos to follow.
+def test_plus_sign_of_e6_is_chaotic_and_minus_sign_decays(order):
+    """The paper prints (85) with '- 5 y1 y3 25 y1'.
 
-    Read as minus, the origin attracts every state; read as plus, as in the system's origin, the
-    states go on moving over their full range.
+    With minus the origin attracts every state; with plus, as in the original publication, the
+    states cover their full range.
     """
-    # The range of q = 1 serves both orders here: what is asked is life or death.
+    # The range for q = 1 is sufficient to distinguish both cases for both orders.
     for sign, alive in ((1.0, True), (-1.0, False)):
         system = hyperchaotic_system(c=sign * 25.0, orders=(order,) * 4)
         solver = FractionalSolver(system, 1e-3, np.ones(4))
@@ -101,7 +101,7 @@ def test_plus_sign_of_e6_lives_and_minus_sign_decays(order):
         (((1.0,), (), (), (np.inf,)), 'constant'),
     ],
 )
-def test_what_cannot_be_a_system_is_refused_by_name(arguments, name):
+def test_invalid_systems_are_rejected_by_name(arguments, name):
     with pytest.raises(ValueError, match=name):
         QuadraticSystem(*arguments)
 

@@ -79,14 +79,14 @@ def run(solver, samples, every=1):
 
 
 @pytest.mark.parametrize('order', [0.3, 0.5, 0.8, 0.98])
-def test_the_series_and_the_integral_of_the_mittag_leffler_function_agree(order):
+def test_mittag_leffler_series_and_integral_agree(order):
     for time in (0.1, 1.0, 2.0):
         series = mittag_leffler(order, time)
         assert series == pytest.approx(mittag_leffler_tail(order, time), abs=1e-11)
 
 
 @pytest.mark.parametrize('order', [0.3, 0.98, 1.0])
-def test_full_memory_weights_are_exact_far_back_where_the_closed_form_loses_digits(order):
+def test_full_memory_weights_are_exact_at_large_lags(order):
     """In double precision the closed form of lag 20 000 keeps eight digits of sixteen.
 
     An oracle that is wrong by 1e-8 cannot judge a solver that states 1e-8; the reference here is
@@ -147,7 +147,7 @@ def test_scheme_coincides_with_diethelms_on_a_linear_equation(order):
     np.testing.assert_allclose(ours, published, rtol=0.0, atol=1e-12)
 
 
-def test_scheme_is_as_near_to_the_truth_of_85_as_diethelms():
+def test_scheme_is_as_accurate_on_85_as_diethelms():
     step, steps = 5e-4, 400
     truth = solve_full_memory(hyperchaotic_system(), step / 16, START, 16 * steps)[::16]
     ours = np.abs(solve_full_memory(hyperchaotic_system(), step, START, steps) - truth).max()
@@ -170,7 +170,7 @@ def test_order_one_is_heuns_method_to_rounding():
 
 
 @pytest.mark.parametrize('tolerance', [1e-6, 1e-8, 1e-10])
-def test_running_solver_follows_the_full_memory_over_a_lyapunov_time(tolerance):
+def test_solver_follows_the_full_memory_for_a_lyapunov_time(tolerance):
     """Over 0.4 s of (85), states up to 40, running and full memory differ by 100 tolerances.
 
     With 1e-8 that is 6.6e-7, five orders below the scheme's own error at this step, so the
@@ -210,7 +210,7 @@ def windowed_decay(order, step, steps, window):
     return 1.0 + change[-1]
 
 
-def test_the_past_is_never_cut_off():
+def test_the_past_is_never_truncated():
     """A fractional decay ends in a power of time, which a windowed memory cannot follow.
 
     Plain Gruenwald-Letnikov with a window of a thousand steps was the obvious bounded solver; it
@@ -246,7 +246,7 @@ def test_rate_is_unknown_at_time_zero_unless_the_order_is_one():
     assert np.isfinite(solver.rate).all()
 
 
-def test_memory_stays_the_same_size_however_long_it_runs():
+def test_memory_size_does_not_depend_on_the_run_length():
     solver = FractionalSolver(hyperchaotic_system(), 1e-3, START)
 
     def size():
@@ -261,7 +261,7 @@ def test_memory_stays_the_same_size_however_long_it_runs():
     assert solver.memory_bytes == 8 * 4 * (modes + 6)
 
 
-def test_many_steps_at_once_are_the_same_as_one_by_one():
+def test_many_steps_at_once_equal_single_steps():
     single, many = (FractionalSolver(hyperchaotic_system(), 1e-3, START) for _ in range(2))
     for _ in range(60):
         single.advance()
@@ -271,7 +271,7 @@ def test_many_steps_at_once_are_the_same_as_one_by_one():
     assert single.time == many.time == pytest.approx(0.06)
 
 
-def test_reset_gives_the_same_run_again():
+def test_reset_repeats_the_run():
     solver = FractionalSolver(hyperchaotic_system(), 1e-3, START)
     first = run(solver, 50)
     solver.reset()
@@ -283,7 +283,7 @@ def test_reset_gives_the_same_run_again():
     assert run(solver, 50).tolist() == run(fresh, 50).tolist()
 
 
-def test_answers_are_copies():
+def test_returned_states_are_copies():
     solver = FractionalSolver(hyperchaotic_system(), 1e-3, START)
     solver.advance(5)
     state = solver.state
@@ -294,7 +294,7 @@ def test_answers_are_copies():
     assert np.isfinite(solver.advance()).all()
 
 
-def test_statistics_of_the_running_solver_are_those_of_the_full_memory():
+def test_statistics_are_those_of_the_full_memory():
     step, steps, settled = 2e-3, 8000, 1000
     full = solve_full_memory(hyperchaotic_system(), step, START, steps)[settled:]
     running = run(FractionalSolver(hyperchaotic_system(), step, START), steps)[settled:]
@@ -326,7 +326,7 @@ def test_a_long_run_stays_on_the_attractor():
     assert np.all(np.abs(offset) < [0.3, 0.02, 0.06, 15.0])
 
 
-def test_a_solution_that_explodes_says_so():
+def test_a_diverging_solution_raises():
     system = QuadraticSystem((0.9,), linear=(), quadratic=((0, 0, 0, 1.0),))
     solver = FractionalSolver(system, 0.01, ONE)
     with pytest.raises(FloatingPointError, match='not finite'):
@@ -347,6 +347,6 @@ def test_a_solution_that_explodes_says_so():
         (lambda: solve_full_memory(hyperchaotic_system(), 1e-3, START, -5), 'steps'),
     ],
 )
-def test_arguments_out_of_range_are_refused_by_name(call, name):
+def test_arguments_out_of_range_are_rejected_by_name(call, name):
     with pytest.raises(ValueError, match=name):
         call()

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Fingerprints prove a seed to who knows it, and tell nobody else anything."""
+"""Seed fingerprints identify the right seed, and reveal no information about it."""
 
 import hashlib
 import random
@@ -20,20 +20,20 @@ def test_the_right_seed_is_recognised_and_others_are_not(seed):
         assert matches_fingerprint(text, other) == (other == seed)
 
 
-def test_it_is_what_any_other_program_computes_from_salt_and_seed():
+def test_fingerprint_is_the_sha256_of_salt_and_seed():
     salt, digest = fingerprint_seed(42, SALT).split(':')
     assert bytes.fromhex(salt) == SALT
     assert digest == hashlib.sha256(SALT + b'42').hexdigest()
 
 
-def test_two_fingerprints_of_one_seed_have_nothing_in_common_that_tells_so():
+def test_two_fingerprints_of_one_seed_differ():
     generator = random.Random(1)
     texts = {fingerprint_seed(7, generator.randbytes(16)) for _ in range(100)}
     assert len({text.split(':')[1] for text in texts}) == 100
     assert all(matches_fingerprint(text, 7) for text in texts)
 
 
-def test_neither_the_seed_nor_a_part_of_it_stands_in_the_text():
+def test_the_text_does_not_contain_the_seed():
     seed = random.Random(2).getrandbits(128)
     text = fingerprint_seed(seed, SALT)
     assert str(seed) not in text
@@ -41,12 +41,12 @@ def test_neither_the_seed_nor_a_part_of_it_stands_in_the_text():
 
 
 @pytest.mark.parametrize('text', ['', 'a:b', '00' * 16, f'{"00" * 16}:{"g" * 64}', '0' * 97])
-def test_what_is_no_fingerprint_is_an_error_and_not_a_no(text):
+def test_a_malformed_fingerprint_is_an_error(text):
     with pytest.raises(ValueError, match='salt:digest'):
         matches_fingerprint(text, 1)
 
 
-def test_a_short_salt_and_a_negative_seed_are_refused_without_telling_the_seed():
+def test_invalid_salt_and_seed_are_rejected_without_the_seed():
     with pytest.raises(ValueError, match='at least 16 bytes: got 15'):
         fingerprint_seed(123456789, SALT[:15])
     with pytest.raises(ValueError, match='negative') as error:

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The memory kernel as a sum of exponentials keeps the error it states."""
+"""The sum of exponentials approximates the memory kernel within its stated error."""
 
 import math
 
@@ -18,34 +18,34 @@ def relative_error(memory, order, time):
 
 @pytest.mark.parametrize('order', ORDERS)
 @pytest.mark.parametrize('tolerance', [1e-3, 1e-6, 1e-8, 1e-11])
-def test_stated_error_bounds_the_error_on_a_dense_logarithmic_grid(order, tolerance):
+def test_stated_error_bounds_the_error_on_a_dense_grid(order, tolerance):
     memory = fit_sum_of_exponentials(order, 1e-3, 1e5, tolerance)
     error = np.abs(relative_error(memory, order, np.geomspace(1e-3, 1e5, 40_009)))
     assert memory.error <= tolerance
-    # 1e-14: at order 1 the stated error is zero, and so is the true one but for rounding here.
+    # 1e-14: at order 1 both errors are zero, apart from rounding here.
     assert error.max() <= memory.error + 1e-14
 
 
 @pytest.mark.parametrize('order', [0.5, 0.98])
-def test_stated_error_is_not_an_empty_promise(order):
+def test_stated_error_is_tight(order):
     memory = fit_sum_of_exponentials(order, 1e-3, 1e5, 1e-8)
     error = np.abs(relative_error(memory, order, np.geomspace(1e-3, 1e5, 40_009)))
     assert error.max() > 0.9 * memory.error
-    assert memory.error > 1e-9  # nor is it bought with far more modes than the tolerance asks
+    assert memory.error > 1e-9  # not far more modes than the tolerance requires
 
 
-def test_order_one_is_exactly_one_mode_that_never_forgets():
+def test_order_one_is_exactly_one_mode_without_decay():
     memory = fit_sum_of_exponentials(1.0, 1e-3, 1e5, 1e-8)
     assert memory.rates.tolist() == [0.0]
     assert memory.weights.tolist() == [1.0]
     assert memory.error == 0.0
 
 
-def test_memory_tends_to_that_single_mode_as_the_order_tends_to_one():
-    """The weight s^-q is almost not integrable at s = 0 for q near 1.
+def test_kernel_tends_to_a_single_mode_as_the_order_tends_to_1():
+    """For q near 1 the weight s^-q is almost not integrable at s = 0.
 
-    Cutting the integral there, as for q = 0.5, would lose nearly the whole kernel; the lumped
-    slow mode is what carries it.
+    Truncating the integral there, as for q = 0.5, would lose nearly the whole kernel; the lumped
+    slow mode represents it.
     """
     for distance in (1e-4, 1e-8, 1e-12):
         memory = fit_sum_of_exponentials(1.0 - distance, 1e-3, 1e5, 1e-8)
@@ -54,7 +54,7 @@ def test_memory_tends_to_that_single_mode_as_the_order_tends_to_one():
         assert memory.rates[0] < distance
 
 
-def test_modes_are_positive_and_the_kernel_therefore_completely_monotone():
+def test_modes_are_positive_so_the_kernel_is_monotone():
     for order in ORDERS:
         memory = fit_sum_of_exponentials(order, 1e-3, 1e5, 1e-8)
         assert np.all(memory.weights > 0.0)
@@ -87,6 +87,6 @@ def test_error_grows_slowly_beyond_the_horizon():
         ((math.nan, 1e-3, 1.0, 1e-8), 'order'),
     ],
 )
-def test_arguments_out_of_range_are_refused_by_name(arguments, name):
+def test_arguments_out_of_range_are_rejected_by_name(arguments, name):
     with pytest.raises(ValueError, match=name):
         fit_sum_of_exponentials(*arguments)

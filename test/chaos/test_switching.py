@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Switching sigma(t): deterministic, unbounded in time, smooth where a blend asks for it."""
+"""Switching signal: deterministic, unbounded in time, with smooth transitions."""
 
 import math
 
@@ -14,7 +14,7 @@ from t3mpc_ros.parameters.table import ParameterError
 RANDOM = SwitchingParameters(kind='random', shortest_dwell=2.0, longest_dwell=5.0)
 
 
-def test_default_switches_four_times_in_the_papers_run():
+def test_default_switches_four_times_as_in_the_paper():
     schedule = SwitchingSchedule(SwitchingParameters())
     assert schedule.switches_until(59.99) == [12.0, 24.0, 36.0, 48.0]
     modes = [schedule.at(time).mode for time in (0.0, 11.99, 12.0, 24.0, 36.0, 47.99, 48.0)]
@@ -27,7 +27,7 @@ def test_every_signal_drives_each_output_once_by_default():
     assert sorted(pair[1] for pair in pairs) == [1, 2, 3, 4]
 
 
-def test_fixed_switching_goes_on_with_the_last_dwell_and_stays_on_its_grid():
+def test_fixed_switching_repeats_the_last_dwell_on_its_grid():
     schedule = SwitchingSchedule(SwitchingParameters(times=(3.0, 10.0, 10.5)))
     assert schedule.switches_until(12.0) == [3.0, 10.0, 10.5, 11.0, 11.5, 12.0]
     late = schedule.at(5010.5)  # 10 000 half seconds after the last listed time
@@ -35,7 +35,7 @@ def test_fixed_switching_goes_on_with_the_last_dwell_and_stays_on_its_grid():
     assert late.mode == 10_003 % 4
 
 
-def test_a_single_switch_time_is_a_period_and_none_is_for_ever():
+def test_one_switch_time_is_a_period_and_none_is_no_switching():
     once = SwitchingSchedule(SwitchingParameters(times=(7.0,)))
     assert once.switches_until(30.0) == [7.0, 14.0, 21.0, 28.0]
     never = SwitchingSchedule(SwitchingParameters(times=()))
@@ -50,7 +50,7 @@ def test_one_mode_never_switches(kind):
 
 
 @pytest.mark.parametrize('parameters', [SwitchingParameters(blend=1.0), RANDOM])
-def test_answers_do_not_depend_on_what_was_asked_before(parameters):
+def test_the_mode_does_not_depend_on_earlier_queries(parameters):
     times = np.random.default_rng(1).uniform(0.0, 300.0, 200)
     asked = SwitchingSchedule(parameters, seed=5)
     for time in times:
@@ -69,7 +69,7 @@ def test_random_dwells_are_uniform_between_their_bounds():
     assert kstest(dwells, 'uniform', args=(2.0, 3.0)).pvalue > 0.01
 
 
-def test_random_modes_change_at_every_switch_and_reach_each_other_mode_equally():
+def test_random_modes_are_uniform_among_the_other_modes():
     schedule = SwitchingSchedule(RANDOM, seed=3)
     modes = [0] + [schedule.at(time).mode for time in schedule.switches_until(14_000.0)]
     changes = np.diff(modes) % 4
@@ -78,7 +78,7 @@ def test_random_modes_change_at_every_switch_and_reach_each_other_mode_equally()
     np.testing.assert_allclose(shares[1:], 1.0 / 3.0, atol=0.03)
 
 
-def test_seeds_give_different_runs_and_may_be_of_any_length():
+def test_seeds_give_different_runs_and_may_have_any_length():
     runs = [
         tuple(SwitchingSchedule(RANDOM, seed=seed).switches_until(50.0))
         for seed in (0, 1, 2**128 - 1)
@@ -86,7 +86,7 @@ def test_seeds_give_different_runs_and_may_be_of_any_length():
     assert len(set(runs)) == 3
 
 
-def test_switch_times_and_answers_tell_the_same_story():
+def test_switch_times_agree_with_the_modes():
     schedule = SwitchingSchedule(RANDOM, seed=4)
     for number, time in enumerate(schedule.switches_until(200.0), start=1):
         before, after = schedule.at(np.nextafter(time, 0.0)), schedule.at(time)
@@ -95,7 +95,7 @@ def test_switch_times_and_answers_tell_the_same_story():
         assert after.previous == before.mode != after.mode
 
 
-def test_a_sudden_jump_is_a_jump():
+def test_a_sudden_switch_has_no_transition():
     schedule = SwitchingSchedule(SwitchingParameters())
     for time in (0.0, 5.0, 12.0, 12.001, 30.0):
         selection = schedule.at(time)
@@ -106,7 +106,7 @@ def test_blend_is_continuous_with_a_continuous_derivative():
     schedule = SwitchingSchedule(SwitchingParameters(blend=2.0))
     times = np.linspace(11.0, 15.0, 40_001)
     selections = [schedule.at(time) for time in times]
-    # The new mode takes over at 12 s, so its share counts from there; before, nothing has begun.
+    # The weight of the new mode starts at its switch at 12 s.
     share = np.array([s.blend if s.switches else 0.0 for s in selections])
     rate = np.array([s.blend_rate for s in selections])
     step = times[1] - times[0]
@@ -118,7 +118,7 @@ def test_blend_is_continuous_with_a_continuous_derivative():
     assert schedule.at(13.0).blend == 0.5
 
 
-def test_nothing_is_blended_in_before_the_first_switch():
+def test_there_is_no_transition_before_the_first_switch():
     assert SwitchingSchedule(SwitchingParameters(blend=5.0)).at(0.0).blend == 1.0
 
 
@@ -136,12 +136,12 @@ def test_nothing_is_blended_in_before_the_first_switch():
         ({'kind': 'sometimes'}, 'kind'),
     ],
 )
-def test_settings_that_do_not_fit_together_are_refused_by_name(values, name):
+def test_inconsistent_parameters_are_rejected_by_name(values, name):
     with pytest.raises(ParameterError, match=name):
         SwitchingParameters(**values)
 
 
 @pytest.mark.parametrize('time', [-1.0, math.nan, math.inf])
-def test_only_times_of_the_run_can_be_asked_for(time):
+def test_times_outside_the_run_are_rejected(time):
     with pytest.raises(ValueError, match='time'):
         SwitchingSchedule(SwitchingParameters()).at(time)

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Adaptation (77)-(78): the Lyapunov argument of the law and of each of its modifications."""
+"""Adaptation (77)-(78): the Lyapunov proof of the law and of each modification."""
 
 from functools import partial
 
@@ -18,7 +18,7 @@ GAIN = 8.0
 """K, 1/s."""
 
 PLAIN = {'radius': 1e12, 'leakage': 0.0, 'dead_zone': 0.0, 'step_limit': 1e9}
-"""Every modification off."""
+"""Without modifications."""
 
 
 def _bases(count, seed):
@@ -63,7 +63,7 @@ def test_the_law_is_77_and_78():
     np.testing.assert_allclose(alpha, expected, rtol=1e-14)
 
 
-def test_v_falls_by_exactly_the_integral_of_k_delta_squared():
+def test_v_decreases_by_the_integral_of_k_delta_squared():
     """Without noise and disturbance, (79) is an equality: V(0) - V(T) = K int |delta|² dt.
 
     Cross terms left over by a wrong sign or factor in (77)-(78) would break it. Euler steps of
@@ -80,15 +80,15 @@ def test_v_falls_by_exactly_the_integral_of_k_delta_squared():
     assert gaps[0] / gaps[1] == pytest.approx(2.0, rel=0.1)
 
 
-def test_v_never_rises_in_a_step():
-    """And it does fall: the run ends with a fraction of the V it began with."""
+def test_v_never_increases_in_a_step():
+    """V at the end of the run is a fraction of V at its start."""
     delta, distance = _matched_run(1e-3, AdaptationParameters(dead_zone=0.0, radius=1e4))
     v = 0.5 * np.sum(delta**2, axis=1) + 0.5 * distance
     assert np.diff(v).max() <= 1e-12 * v[0]
     assert v[-1] < 0.8 * v[0]
 
 
-def test_with_a_dead_zone_v_never_rises_for_disturbances_up_to_k_times_its_width():
+def test_with_a_dead_zone_v_decreases_for_bounded_disturbances():
     """The disturbance has amplitude K * width per wheel, the largest the argument allows.
 
     Without the dead zone the same V, taken with delta itself, does rise.
@@ -131,7 +131,7 @@ def _drift(noise, dead_zone):
     return norms
 
 
-def test_pure_noise_makes_the_plain_law_drift_and_a_dead_zone_stops_it():
+def test_noise_makes_the_plain_law_drift_a_dead_zone_stops_it():
     """Noise of 0.2 rad/s for 20 s takes |alpha| to 14 rad/s², and on with the root of time.
 
     A dead zone of two standard deviations leaves a ninth of the drift of Gaussian noise, 1.5
@@ -143,14 +143,14 @@ def test_pure_noise_makes_the_plain_law_drift_and_a_dead_zone_stops_it():
     steps = 0.01 * 600.0 * 0.2 * np.linalg.norm(_bases(2000, 22), axis=1)
     assert whole == pytest.approx(np.sqrt(np.sum(steps**2)), rel=0.15)
     assert whole / quarter == pytest.approx(2.0, rel=0.15)
-    outside = 2.0 * (5.0 * norm.sf(2.0) - 2.0 * norm.pdf(2.0))  # variance left, of one
+    outside = 2.0 * (5.0 * norm.sf(2.0) - 2.0 * norm.pdf(2.0))  # remaining part of the variance
     assert _drift(gaussian, 0.4)[1] == pytest.approx(np.sqrt(outside) * whole, rel=0.15)
     bounded = rng.uniform(-0.2, 0.2, (2000, 20))
     assert _drift(bounded, 0.0)[1] > 5.0
     assert _drift(bounded, 0.2)[1] == 0.0
 
 
-def test_leakage_bounds_what_noise_makes_of_the_coefficients():
+def test_leakage_bounds_the_coefficients_under_noise():
     """With -sigma alpha in (77), |alpha| stays below gamma |Phi||delta| / sigma for ever."""
     rng = np.random.default_rng(24)
     phi = _bases(200, 24)
@@ -159,7 +159,7 @@ def test_leakage_bounds_what_noise_makes_of_the_coefficients():
     bound = 0.01 * 600.0 * np.linalg.norm(phi, axis=1).max() * 0.2 / -np.expm1(-0.5 * 0.01)
     largest = 0.0
     for k in range(20_000):
-        # Errors of one sign: the worst there is, not just noise.
+        # Errors of one sign are the worst case.
         error = np.array([rng.uniform(0.0, 0.2)])
         adapt(alpha, phi[k % 200], error, 0.01, 600.0, **limits)
         largest = max(largest, float(np.linalg.norm(alpha)))
@@ -175,7 +175,7 @@ def test_leakage_decays_exactly_at_any_step(dt):
     np.testing.assert_allclose(alpha, 3.0 * np.exp(-2.0 * dt), rtol=1e-13)
 
 
-def test_leakage_draws_a_distance_larger_than_the_truth_in():
+def test_leakage_reduces_a_distance_larger_than_the_truth():
     """Since alpha~'alpha <= (|alpha*|² - |alpha~|²)/2, leakage helps where alpha~ > alpha*."""
     rng = np.random.default_rng(25)
     phi = _bases(1, 25)[0]
@@ -188,7 +188,7 @@ def test_leakage_draws_a_distance_larger_than_the_truth_in():
             assert np.linalg.norm(truth - alpha) < before
 
 
-def test_projection_keeps_the_ball_and_never_goes_away_from_a_truth_inside():
+def test_projection_keeps_the_ball_and_reduces_the_distance():
     rng = np.random.default_rng(26)
     phi = _bases(300, 26)
     radius, outside = 10.0, 0
@@ -206,10 +206,10 @@ def test_projection_keeps_the_ball_and_never_goes_away_from_a_truth_inside():
             truth *= radius * rng.uniform() / np.linalg.norm(truth)
             without = np.linalg.norm(truth - free[z])
             assert np.linalg.norm(truth - alpha[z]) <= without * (1.0 + 1e-14)
-    assert outside > 100  # the ball was really met
+    assert outside > 100  # the projection was used
 
 
-def test_step_limit_argument_the_sampled_loop_is_stable_exactly_below_k():
+def test_step_limit_the_sampled_loop_is_stable_below_k():
     """Eigenvalues of the sampled loop against the condition gamma |Phi|² dt < K in the text."""
     for k in (0.5, 2.0, 8.0, 30.0):
         for dt in (1e-3, 0.01, 0.05):
@@ -221,7 +221,7 @@ def test_step_limit_argument_the_sampled_loop_is_stable_exactly_below_k():
                 assert (np.abs(np.linalg.eigvals(loop)).max() < 1.0) == (ratio < 1.0)
 
 
-def test_step_limit_caps_the_change_of_the_estimate():
+def test_step_limit_bounds_the_change_of_the_estimate():
     """One step changes g by gamma |Phi|² dt delta; that is at most limit * delta, at any dt."""
     phi = _bases(1, 27)[0]
     for gamma, dt in ((600.0, 0.01), (600.0, 1.0), (1e6, 0.01), (1e6, 1e6), (1e6, 1e300)):
@@ -231,7 +231,7 @@ def test_step_limit_caps_the_change_of_the_estimate():
         assert alpha[0] @ phi == pytest.approx(wanted, rel=1e-12)
 
 
-def test_absurd_but_finite_errors_end_on_the_ball():
+def test_huge_finite_errors_end_on_the_ball():
     phi = _bases(1, 28)[0]
     alpha = np.zeros((2, phi.size))
     limits = {**PLAIN, 'radius': 5.0, 'step_limit': 1000.0}

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The estimator as the controller uses it: in a closed loop, and against wrong input."""
+"""Fuzzy estimator in the closed loop, and with invalid input."""
 
 import dataclasses
 from functools import partial
@@ -69,7 +69,7 @@ def _rms(values):
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_adaptation_lowers_the_tracking_error_and_the_estimate_nears_its_target(kind):
+def test_adaptation_reduces_tracking_and_estimation_errors(kind):
     """K = 8 1/s at 100 Hz, friction unknown: 0.79 rad/s RMS without adaptation, 0.21 with."""
     sets = Sets(kind=kind)
     parameters = AdaptationParameters(gamma=gamma_for(sets, 40.0))
@@ -89,8 +89,8 @@ def test_adaptation_still_helps_on_noisy_speeds(noise):
     assert _rms(tracking[half:]) < 0.5 * _rms(without[half:])
 
 
-def test_a_target_of_the_same_family_is_learnt_under_excitation():
-    """With a plant that some alpha* describes exactly, the estimate goes on improving."""
+def test_a_target_of_the_same_family_is_learned():
+    """With a plant that some alpha* describes exactly, the estimate keeps improving."""
     sets = Sets()
     plant = FuzzyEstimator(sets, AdaptationParameters())
     plant.coefficients = np.random.default_rng(31).uniform(-15.0, 15.0, plant.coefficients.shape)
@@ -101,8 +101,8 @@ def test_a_target_of_the_same_family_is_learnt_under_excitation():
     assert quarters[-1] < 0.25 * quarters[0]
 
 
-def test_an_absurd_gamma_does_not_destabilise_the_sampled_loop():
-    """Without the step limit the same gamma throws the coefficients from wall to wall."""
+def test_a_huge_gamma_does_not_destabilise_the_sampled_loop():
+    """Without the step limit the same gamma makes the coefficients oscillate between bounds."""
     sets = Sets()
     limited = AdaptationParameters(gamma=1e6, radius=1e4)
     limits = (limited, dataclasses.replace(limited, step_limit=1000.0))
@@ -132,7 +132,7 @@ def test_adaptation_uses_the_basis_of_the_last_evaluation():
     np.testing.assert_allclose(estimator.coefficients, expected, rtol=1e-13)
 
 
-def test_before_any_evaluation_nothing_is_learnt():
+def test_before_the_first_evaluation_nothing_is_learned():
     estimator = FuzzyEstimator(Sets(), AdaptationParameters())
     estimator.adapt(np.array([5.0, 5.0]), DT)
     assert not estimator.coefficients.any()
@@ -150,7 +150,7 @@ def test_radius_is_the_root_mean_square_of_the_coefficients():
         np.testing.assert_allclose(estimator.coefficients, 7.0, rtol=1e-13)
 
 
-def test_gamma_for_equalises_what_is_learnt_per_step_on_average():
+def test_gamma_for_gives_the_mean_normalised_gain():
     drawn = np.random.default_rng(33).uniform(-10.0, 10.0, (500, 2))
     for kind in KINDS:
         parameters = Sets(kind=kind)
@@ -159,7 +159,7 @@ def test_gamma_for_equalises_what_is_learnt_per_step_on_average():
         assert gamma_for(parameters, 40.0) * power == pytest.approx(40.0, rel=0.05)
 
 
-def test_default_gamma_is_an_adaptation_that_does_not_swing():
+def test_default_gamma_does_not_oscillate():
     """s² + K s + gamma |Phi|² = 0 has real roots over all of the input range."""
     sets = build_sets(FuzzyParameters())
     drawn = np.random.default_rng(34).uniform(-10.0, 10.0, (500, 2))
@@ -170,7 +170,7 @@ def test_default_gamma_is_an_adaptation_that_does_not_swing():
     assert 4.0 * gains.max() < 15.2**2
 
 
-def test_configure_takes_effect_and_keeps_what_was_learnt():
+def test_configure_takes_effect_and_keeps_coefficients():
     estimator = FuzzyEstimator(Sets(), AdaptationParameters())
     estimator.evaluate(np.zeros(2))
     estimator.adapt(np.ones(2), DT)
@@ -183,7 +183,7 @@ def test_configure_takes_effect_and_keeps_what_was_learnt():
     assert not estimator.coefficients.any()
 
 
-def test_reset_forgets_and_warm_up_changes_nothing():
+def test_reset_clears_and_warm_up_changes_nothing():
     estimator = FuzzyEstimator(Sets(), AdaptationParameters(sigma_modification=1.0))
     estimator.evaluate(np.array([1.0, 2.0]))
     estimator.adapt(np.ones(2), DT)
@@ -208,7 +208,7 @@ def test_coefficients_and_basis_are_copies():
 @pytest.mark.parametrize(
     'wrong', [[0.0], [0.0, math.nan], [math.inf, 0.0], [[0.0, 0.0]], [0.0, 0.0, 0.0]]
 )
-def test_wrong_inputs_and_errors_are_refused_and_change_nothing(wrong):
+def test_invalid_inputs_are_rejected_without_effect(wrong):
     estimator = FuzzyEstimator(Sets(), AdaptationParameters())
     estimator.evaluate(np.array([1.0, 2.0]))
     estimator.adapt(np.ones(2), DT)
@@ -222,13 +222,13 @@ def test_wrong_inputs_and_errors_are_refused_and_change_nothing(wrong):
 
 
 @pytest.mark.parametrize('dt', [-0.01, math.nan, math.inf])
-def test_a_step_that_is_no_duration_is_refused(dt):
+def test_an_invalid_duration_is_rejected(dt):
     estimator = FuzzyEstimator(Sets(), AdaptationParameters())
     with pytest.raises(ValueError, match='dt must be finite and not negative'):
         estimator.adapt(np.zeros(2), dt)
 
 
-def test_wrong_coefficients_are_refused():
+def test_invalid_coefficients_are_rejected():
     estimator = FuzzyEstimator(Sets(), AdaptationParameters())
     with pytest.raises(ValueError, match=r'coefficients must have shape \(2, 72\)'):
         estimator.coefficients = np.zeros((2, 71))
@@ -240,14 +240,14 @@ def test_wrong_coefficients_are_refused():
         FuzzyEstimator(Sets(), AdaptationParameters(), outputs=0)
 
 
-def test_other_numbers_of_inputs_work_alike():
+def test_other_numbers_of_inputs_work_as_well():
     for inputs in (1, 3):
         estimator = FuzzyEstimator(Sets(), AdaptationParameters(), 1, inputs)
         estimator.coefficients = np.full(estimator.coefficients.shape, 2.5)
         assert estimator.evaluate(np.zeros(inputs))[0] == pytest.approx(2.5)
 
 
-def test_non_contiguous_and_whole_number_inputs_are_read_correctly():
+def test_non_contiguous_and_integer_inputs_are_accepted():
     estimator = FuzzyEstimator(Sets(), AdaptationParameters())
     estimator.coefficients = np.random.default_rng(35).normal(size=(2, 72))
     expected = estimator.evaluate(np.array([1.0, -4.0]))

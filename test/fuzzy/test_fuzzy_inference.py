@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Inference (16)-(33) with E7 and E8: the hull, the special cases, the limits."""
+"""Inference (16)-(33) with E7 and E8: hull, special cases, limits."""
 
 from functools import partial
 import itertools
@@ -27,7 +27,7 @@ FAR = [40.0, -80.0, 1e3, -1e5, 1e9, -1e12, 1e200, -1.7e308]
 
 
 def _random_sets(rng, inputs=2, sets=3, slices=4):
-    """Tables without any regularity: a slip in an index cannot hide behind a symmetry."""
+    """Return tables without symmetry, which would hide an error in an index."""
     lower = rng.uniform(0.5, 4.0, (inputs, sets, slices, 2))
     upper = lower + rng.uniform(0.0, 3.0, lower.shape)
     return FuzzySets(
@@ -39,7 +39,7 @@ def _random_sets(rng, inputs=2, sets=3, slices=4):
 
 
 def _log_firings(u, sets):
-    """Logarithms of (24)-(27), shape (r, lambda, 2, 2), from the equations with whole arrays."""
+    """Return logarithms of (24)-(27), shape (r, lambda, 2, 2), by array operations."""
     square, own = sets.widths**2, sets.input_fuzziness**2
     o = sets.centres[:, :, None, None, None]
     x = (np.asarray(u)[:, None, None, None, None] * square + o * own) / (square + own)
@@ -50,7 +50,7 @@ def _log_firings(u, sets):
 
 
 def _reference_basis(u, sets):
-    """(33) with E8, by logarithms: valid at any distance."""
+    """Return (33) with E8 by logarithms, valid at any distance."""
     logs = _log_firings(u, sets)
     both = logsumexp(logs, axis=-1)  # r, lambda, level
     part = np.exp(both - logsumexp(both, axis=0)) * sets.levels / sets.levels.sum()
@@ -58,7 +58,7 @@ def _reference_basis(u, sets):
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_output_stays_in_the_hull_of_the_coefficients_anywhere(kind):
+def test_output_lies_in_the_hull_of_the_coefficients(kind):
     rng = np.random.default_rng(1)
     sets = build_sets(Sets(kind=kind))
     near = rng.uniform(-15.0, 15.0, (200, 2))
@@ -97,7 +97,7 @@ def test_kernel_equals_whole_array_reference(inputs, per_input, slices):
         )
 
 
-def test_order_of_32_each_coefficient_speaks_for_its_rule_slice_and_level():
+def test_order_of_32_is_by_rule_slice_and_level():
     sets = _random_sets(np.random.default_rng(4))
     u = np.array([1.0, -2.0])
     phi = compute_basis(u, sets)
@@ -110,7 +110,7 @@ def test_order_of_32_each_coefficient_speaks_for_its_rule_slice_and_level():
 
 @pytest.mark.parametrize('fuzziness', [0.0, 0.283, 3.0])
 def test_type1_is_a_textbook_weighted_average(fuzziness):
-    """Written from the textbook: product of grades, weighted average of one constant per rule.
+    """The textbook form: product of grades, weighted average of one constant per rule.
 
     For the non-singleton fuzzifier the grade at the best match of input and set is
     exp(-((U - o) beta / (beta² + beta_U²))²).
@@ -171,7 +171,7 @@ def test_type3_of_one_slice_at_level_one_is_type1():
             max(np.abs(compute_basis(u, sets) - compute_basis(u, type1)).max() for u in points)
         )
     assert gaps[0] == 0.0
-    assert gaps[1] == pytest.approx(2.0 * gaps[2], rel=0.02)  # and it is approached linearly
+    assert gaps[1] == pytest.approx(2.0 * gaps[2], rel=0.02)  # linear convergence
 
 
 def test_slices_without_footprint_change_nothing():
@@ -186,7 +186,7 @@ def test_slices_without_footprint_change_nothing():
         assert full == pytest.approx(np.tile(constants, 2) @ compute_basis(u, type1), rel=1e-12)
 
 
-def test_singleton_limit_the_input_is_met_where_it_is():
+def test_singleton_limit_the_maximum_is_the_input():
     sets = build_sets(Sets(input_fuzziness=0.0))
     u = np.array([3.3, -7.1])
     found = np.empty(sets.widths.shape)
@@ -196,15 +196,15 @@ def test_singleton_limit_the_input_is_met_where_it_is():
     )
 
 
-def test_wide_input_limit_is_met_at_the_centres():
+def test_wide_input_limit_the_maxima_are_the_centres():
     sets = build_sets(Sets(input_fuzziness=100.0))
     found = np.empty(sets.widths.shape)
     fuzzify(np.array([3.3, -7.1]), sets.centres, sets.nonsingleton_gain, found)
     assert np.abs(found - sets.centres[:, :, None, None, None]).max() < 1.0
 
 
-def test_fuzzification_finds_the_largest_product_of_input_and_set():
-    """(16)-(19) are where the product of the two Gaussians peaks, whatever their widths."""
+def test_fuzzification_maximises_the_product_of_input_and_set():
+    """(16)-(19) maximise the product of the two Gaussians for any widths."""
     rng = np.random.default_rng(9)
     sets = _random_sets(rng, slices=2)
     u = np.array([2.0, -3.0])
@@ -222,7 +222,7 @@ def test_fuzzification_finds_the_largest_product_of_input_and_set():
         x = found[i, h, j, level, bound]
         assert x == pytest.approx(best.x, abs=1e-5)
         assert minus_log_product(x) <= best.fun + 1e-12
-        # The height of the peak, known in closed form: it is nowhere exceeded.
+        # The maximum in closed form is an upper bound.
         height = (u[i] - o) ** 2 / (beta**2 + sets.input_fuzziness**2)
         assert minus_log_product(x) == pytest.approx(height, rel=1e-12)
 
@@ -246,7 +246,7 @@ def test_e7_grades_are_even_about_the_centre_and_at_most_one():
 
 
 def test_e8_printed_normalisation_leaves_the_hull():
-    """With 0.5 / (sum of upper levels) a constant 1 on every rule comes out as 0.9."""
+    """With 0.5 / (sum of upper levels) a constant 1 on every rule gives 0.9."""
     sets = build_sets(Sets())
     phi = compute_basis(np.array([1.0, 2.0]), sets)
     printed = phi * sets.levels.sum() * 0.5 / sets.levels[:, 1].sum()
@@ -268,8 +268,8 @@ def test_memberships_and_firings_are_the_printed_products():
     np.testing.assert_allclose(firings, np.exp(_log_firings(u, sets)), rtol=1e-11)
 
 
-def test_far_outside_where_firings_underflow_the_basis_is_still_exact():
-    """Plain firings are all zero here and (33) would be 0/0; logarithms know better."""
+def test_the_basis_is_exact_where_firing_strengths_underflow():
+    """All firing strengths underflow and (33) is 0/0; the reference uses logarithms."""
     sets = build_sets(Sets())
     for u in ([80.0, -90.0], [-300.0, 2.0], [1e4, 1e4]):
         at_lowest_width = np.exp(_log_firings(u, sets))[..., 0, 0, 0]
@@ -279,7 +279,7 @@ def test_far_outside_where_firings_underflow_the_basis_is_still_exact():
         )
 
 
-def test_a_rule_28_that_fires_alone_answers_between_its_two_consequents():
+def test_a_single_firing_rule_28_gives_its_consequents():
     """'If chi_1 is ... and chi_2 is ... then y in [lower alpha, upper alpha]', rule by rule.
 
     At the centres of narrow sets one rule fires and the others do not. With one slice its two
@@ -297,7 +297,7 @@ def test_a_rule_28_that_fires_alone_answers_between_its_two_consequents():
 
 
 @pytest.mark.parametrize('distance', FAR[2:])
-def test_far_outside_the_nearest_rule_takes_all(distance):
+def test_far_outside_only_the_nearest_rule_counts(distance):
     sets = build_sets(Sets())
     phi = compute_basis(np.array([distance, distance]), sets).reshape(2, 9, 4)
     nearest = 8 if distance > 0.0 else 0
@@ -305,7 +305,7 @@ def test_far_outside_the_nearest_rule_takes_all(distance):
 
 
 def test_output_is_smooth_where_the_nearest_rule_changes():
-    """The strongest rule is taken out of the exponents; its change must leave no kink.
+    """The largest firing strength is removed from the exponents, which must cause no kink.
 
     A kink would make the second difference double when its step is halved.
     """
@@ -326,7 +326,7 @@ def test_output_is_smooth_where_the_nearest_rule_changes():
         assert second(2e-3) == pytest.approx(second(1e-3), rel=1e-3, abs=1e-6)
 
 
-def test_inputs_that_are_no_numbers_are_refused():
+def test_non_finite_inputs_are_rejected():
     sets = build_sets(Sets())
     for wrong in ([0.0], [0.0, math.nan], [math.inf, 0.0], [0.0, 0.0, 0.0]):
         with pytest.raises(ValueError, match='inputs must be 2 finite numbers'):

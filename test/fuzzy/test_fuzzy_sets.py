@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The tables of fuzzy sets: what they say, and what they refuse."""
+"""Tables of fuzzy sets: values, special cases, validation."""
 
 from functools import partial
 
@@ -31,7 +31,7 @@ def test_slice_levels_lie_in_order_between_zero_and_one(slices):
     assert np.all(np.diff(levels.ravel()) > 0.0)  # lower_1 < upper_1 < lower_2 < ...
 
 
-def test_type3_widths_are_those_of_the_grade_raised_to_the_level_and_its_inverse():
+def test_type3_widths_are_powers_of_the_grade():
     x = np.linspace(-4.0, 4.0, 41)
     grade = np.exp(-((x / 1.7) ** 2))
     levels = slice_levels(3)
@@ -43,7 +43,7 @@ def test_type3_widths_are_those_of_the_grade_raised_to_the_level_and_its_inverse
         np.testing.assert_allclose(lower, grade ** (1.0 / levels[place]), rtol=1e-12)
 
 
-def test_type3_footprint_widens_as_the_level_falls_and_closes_at_one():
+def test_type3_footprint_decreases_with_the_level_to_zero():
     footprint = np.diff(type3_widths(1.0, slice_levels(6)), axis=-1).ravel()
     assert np.all(np.diff(footprint) < 0.0)
     assert footprint[-1] == 0.0
@@ -55,15 +55,15 @@ def test_default_sets_cross_at_one_half():
     assert np.exp(-((half_spacing / parameters.widths[0]) ** 2)) == pytest.approx(0.5, abs=0.002)
 
 
-def test_default_interval_footprint_is_the_mean_type3_footprint_weighted_by_level():
+def test_default_interval_footprint_is_the_type3_mean():
     levels = slice_levels(Sets().slices)
     half = 0.5 * np.diff(type3_widths(1.0, levels), axis=-1)[..., 0]
     mean = float(np.sum(levels * half) / np.sum(levels))
     assert Sets().footprint_of_uncertainty == pytest.approx(mean, abs=0.005)
 
 
-def test_input_fuzziness_is_matched_to_the_noise_of_variance_0_04():
-    """The Gaussians here have no 1/2 in the exponent: beta is sqrt(2) standard deviations."""
+def test_input_fuzziness_matches_the_noise_variance_0_04():
+    """The Gaussians have no 1/2 in the exponent: beta is sqrt(2) standard deviations."""
     assert Sets().input_fuzziness == pytest.approx(np.sqrt(2.0 * 0.04), abs=0.001)
 
 
@@ -82,7 +82,7 @@ def test_kinds_differ_only_in_the_numbers_of_the_tables():
     np.testing.assert_allclose(widths[..., UPPER], 1.23 * sigma)
 
 
-def test_interval_type2_without_footprint_has_the_tables_of_type1():
+def test_interval_type2_without_footprint_is_type1():
     interval = build_sets(Sets(kind='interval_type2', footprint_of_uncertainty=0.0))
     np.testing.assert_array_equal(interval.widths, build_sets(Sets(kind='type1')).widths)
 
@@ -97,7 +97,7 @@ def test_tables_have_the_stated_shapes_for_any_number_of_inputs(inputs):
     assert sets.size == 2 * 4**inputs * 5
 
 
-def test_a_single_set_stands_in_the_middle_of_the_range():
+def test_a_single_set_is_in_the_middle_of_the_range():
     sets = build_sets(Sets(sets=1, centre_low=-2.0, centre_high=6.0))
     np.testing.assert_array_equal(sets.centres, [[2.0], [2.0]])
 
@@ -134,7 +134,7 @@ def test_tables_are_read_only_and_do_not_alias_their_source():
         ({'input_fuzziness': np.nan}, 'input_fuzziness must be'),
     ],
 )
-def test_tables_out_of_range_are_refused_by_name(change, message):
+def test_tables_out_of_range_are_rejected_by_name(change, message):
     tables = {
         'centres': np.array([[0.0, 1.0], [0.0, 1.0]]),
         'widths': np.ones((2, 2, 1, 2, 2)),
@@ -146,7 +146,7 @@ def test_tables_out_of_range_are_refused_by_name(change, message):
         FuzzySets(**{**tables, **change})
 
 
-def test_settings_out_of_order_or_too_large_are_refused():
+def test_invalid_parameters_are_rejected():
     with pytest.raises(ParameterError, match='centre_high must be above centre_low'):
         Sets(centre_low=1.0, centre_high=1.0)
     with pytest.raises(ParameterError, match='kind must be one of'):

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Unicycle kinematics (1)-(3) and the words they speak in."""
+"""Unicycle kinematics (1)-(3), poses, twists and states."""
 
 import math
 
@@ -29,15 +29,15 @@ def test_wheel_speeds_to_body_twist_and_back_is_the_identity():
         assert back == pytest.approx(wheels, rel=1e-12, abs=1e-12)
 
 
-def test_equal_wheels_drive_straight_and_opposite_wheels_turn_on_the_spot():
+def test_equal_wheels_go_straight_opposite_wheels_turn_in_place():
     straight = twist_from_wheels(WheelSpeeds(4.0, 4.0), GEOMETRY)
     assert straight == (pytest.approx(4.0 * GEOMETRY.wheel_radius), 0.0)
     spot = twist_from_wheels(WheelSpeeds(4.0, -4.0), GEOMETRY)
     assert spot.linear == 0.0
-    assert spot.angular > 0.0  # the right wheel forward turns to the left
+    assert spot.angular > 0.0  # right wheel forward: left turn
 
 
-def test_a_circle_driven_for_one_turn_of_the_wheel_tracks_closes():
+def test_one_turn_along_the_wheel_tracks_closes_the_circle():
     """E1: the printed (1) divides by twice the *separation* and closes after two turns only.
 
     The tracks are measured here without (1): on a circle of radius r the right wheel runs
@@ -83,7 +83,7 @@ def test_pose_rate_is_the_derivative_of_the_exact_arc():
         assert slope == pytest.approx(pose_rate(pose.yaw, wheels, GEOMETRY), abs=1e-8)
 
 
-def test_arcs_add_up_whatever_they_are_cut_into():
+def test_arcs_compose_for_any_subdivision():
     generator = np.random.default_rng(3)
     for _ in range(50):
         pose = Pose(*generator.uniform(-2.0, 2.0, 3))
@@ -98,7 +98,7 @@ def test_arcs_add_up_whatever_they_are_cut_into():
 
 
 @pytest.mark.parametrize('angular', [0.0, 1e-300, 1e-18, 1e-12, 1e-9, 1e-6, 1e-3, -1e-7])
-def test_nearly_straight_motion_keeps_full_accuracy(angular):
+def test_nearly_straight_motion_has_full_accuracy(angular):
     # The textbook form r (sin(P + w t) - sin P) loses all digits here.
     end = advance_pose(ORIGIN, BodyTwist(2.0, angular), 1.5)
     turn = 1.5 * angular
@@ -106,7 +106,7 @@ def test_nearly_straight_motion_keeps_full_accuracy(angular):
     assert end.y == pytest.approx(3.0 * (turn / 2.0 - turn**3 / 24.0), rel=1e-12, abs=1e-300)
 
 
-def test_wrapped_angles_lie_in_the_half_open_turn_and_point_the_same_way():
+def test_wrapped_angles_are_equivalent_and_in_range():
     generator = np.random.default_rng(4)
     for angle in [*generator.uniform(-1e3, 1e3, 200), math.pi, -math.pi, 3.0 * math.pi, 0.0]:
         wrapped = wrap_angle(float(angle))
@@ -118,14 +118,14 @@ def test_wrapped_angles_lie_in_the_half_open_turn_and_point_the_same_way():
 
 @pytest.mark.parametrize('bad', [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize('place', range(5))
-def test_a_motion_with_one_number_that_is_not_finite_says_so(bad, place):
+def test_a_state_with_a_non_finite_number_is_not_finite(bad, place):
     numbers = [0.1, 0.2, 0.3, 0.4, 0.5]
     assert State(0, Pose(*numbers[:3]), BodyTwist(*numbers[3:])).is_finite()
     numbers[place] = bad
     assert not State(0, Pose(*numbers[:3]), BodyTwist(*numbers[3:])).is_finite()
 
 
-def test_a_geometry_without_size_is_refused():
+def test_a_geometry_of_zero_size_is_rejected():
     with pytest.raises(ParameterError, match='wheel_radius'):
         WheelGeometry(wheel_radius=0.0)
     with pytest.raises(ParameterError, match='wheel_separation'):

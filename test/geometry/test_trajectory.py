@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The track that answers for any instant between stamped motions."""
+"""Reference trajectory: interpolation, jumps, restarts and capacity."""
 
 import math
 
@@ -19,16 +19,16 @@ def sample(stamp_ms: float, linear: float, angular: float = 0.0) -> State:
 
 
 def filled(*samples: State, capacity: int = 512) -> ReferenceTrajectory:
-    track = ReferenceTrajectory(JUMP, capacity)
+    trajectory = ReferenceTrajectory(JUMP, capacity)
     for item in samples:
-        assert track.add(item)
-    return track
+        assert trajectory.add(item)
+    return trajectory
 
 
 def test_a_straight_line_is_reproduced_exactly_with_its_rate():
-    track = filled(*(sample(10.0 * n, 0.02 * n, -0.1 * n) for n in range(20)))
+    trajectory = filled(*(sample(10.0 * n, 0.02 * n, -0.1 * n) for n in range(20)))
     for now_ms in np.random.default_rng(1).uniform(0.0, 189.9, 100):
-        point = track.at(int(now_ms * MS))
+        point = trajectory.at(int(now_ms * MS))
         steps = int(now_ms * MS) / (10.0 * MS)
         assert point.twist == pytest.approx((0.02 * steps, -0.1 * steps), abs=1e-12)
         assert point.rate == pytest.approx((2.0, -10.0), rel=1e-9)
@@ -37,12 +37,12 @@ def test_a_straight_line_is_reproduced_exactly_with_its_rate():
 def test_a_curve_is_interpolated_with_second_order():
     def error(period_ms: float) -> float:
         count = round(1000.0 / period_ms) + 1
-        track = filled(
+        trajectory = filled(
             *(sample(n * period_ms, math.sin(3.0 * n * period_ms / 1e3)) for n in range(count))
         )
         times = np.linspace(0.0, 999.0, 997)
         return max(
-            abs(track.at(int(t * MS)).twist.linear - math.sin(3.0 * int(t * MS) / 1e9))
+            abs(trajectory.at(int(t * MS)).twist.linear - math.sin(3.0 * int(t * MS) / 1e9))
             for t in times
         )
 
@@ -50,75 +50,75 @@ def test_a_curve_is_interpolated_with_second_order():
     assert order == pytest.approx(2.0, abs=0.1)
 
 
-def test_the_samples_themselves_are_answered_exactly():
-    track = filled(sample(0.0, 0.1), sample(7.0, 0.11), sample(20.0, 0.09))
-    assert track.at(0).twist.linear == 0.1
-    assert track.at(7 * MS).twist.linear == 0.11
-    last = track.at(20 * MS)
+def test_the_samples_are_reproduced_exactly():
+    trajectory = filled(sample(0.0, 0.1), sample(7.0, 0.11), sample(20.0, 0.09))
+    assert trajectory.at(0).twist.linear == 0.1
+    assert trajectory.at(7 * MS).twist.linear == 0.11
+    last = trajectory.at(20 * MS)
     assert last.twist.linear == 0.09
     assert last.rate == (0.0, 0.0)
 
 
-def test_nothing_is_answered_outside_the_samples():
-    track = ReferenceTrajectory(JUMP)
-    assert track.at(0) is None
-    assert track.newest_ns is None
-    track.add(sample(10.0, 0.1))
-    assert track.at(10 * MS - 1) is None
-    assert track.at(10 * MS).twist.linear == 0.1
-    assert track.at(10 * MS + 1) is None
-    track.add(sample(20.0, 0.1))
-    assert track.at(20 * MS + 1) is None
-    assert track.newest_ns == 20 * MS
+def test_the_value_outside_the_samples_is_unknown():
+    trajectory = ReferenceTrajectory(JUMP)
+    assert trajectory.at(0) is None
+    assert trajectory.newest_ns is None
+    trajectory.add(sample(10.0, 0.1))
+    assert trajectory.at(10 * MS - 1) is None
+    assert trajectory.at(10 * MS).twist.linear == 0.1
+    assert trajectory.at(10 * MS + 1) is None
+    trajectory.add(sample(20.0, 0.1))
+    assert trajectory.at(20 * MS + 1) is None
+    assert trajectory.newest_ns == 20 * MS
 
 
 @pytest.mark.parametrize('after', [BodyTwist(0.3, 0.0), BodyTwist(0.1, 0.5)])
 def test_a_jump_happens_at_the_later_sample_and_has_no_rate(after):
-    track = filled(sample(0.0, 0.1), sample(10.0, 0.1))
-    track.add(State(20 * MS, Pose(0.0, 0.0, 0.0), after))
-    track.add(State(30 * MS, Pose(0.0, 0.0, 0.0), after))
+    trajectory = filled(sample(0.0, 0.1), sample(10.0, 0.1))
+    trajectory.add(State(20 * MS, Pose(0.0, 0.0, 0.0), after))
+    trajectory.add(State(30 * MS, Pose(0.0, 0.0, 0.0), after))
     for now_ns in (10 * MS, 15 * MS, 20 * MS - 1):
-        point = track.at(now_ns)
+        point = trajectory.at(now_ns)
         assert point.twist == (0.1, 0.0)
         assert point.rate == (0.0, 0.0)
-    assert track.at(20 * MS).twist == after
-    assert track.at(20 * MS).rate == (0.0, 0.0)
+    assert trajectory.at(20 * MS).twist == after
+    assert trajectory.at(20 * MS).rate == (0.0, 0.0)
 
 
 def test_a_change_just_within_the_limit_is_no_jump():
-    track = filled(sample(0.0, 0.0), sample(10.0, 0.0499))
-    assert track.at(5 * MS).rate.linear == pytest.approx(4.99)
+    trajectory = filled(sample(0.0, 0.0), sample(10.0, 0.0499))
+    assert trajectory.at(5 * MS).rate.linear == pytest.approx(4.99)
 
 
-def test_a_source_that_starts_again_replaces_what_it_had_said():
-    track = filled(*(sample(10.0 * n, 0.1) for n in range(10)))
-    track.add(sample(40.0, 0.2))
-    assert track.newest_ns == 40 * MS
-    assert track.at(50 * MS) is None
-    assert track.at(40 * MS).twist.linear == 0.2
-    assert track.at(30 * MS).twist.linear == 0.1
-    track.add(sample(-500.0, 0.3))  # before everything it had said
-    assert track.newest_ns == -500 * MS
-    assert track.at(30 * MS) is None
+def test_a_restarted_source_replaces_later_samples():
+    trajectory = filled(*(sample(10.0 * n, 0.1) for n in range(10)))
+    trajectory.add(sample(40.0, 0.2))
+    assert trajectory.newest_ns == 40 * MS
+    assert trajectory.at(50 * MS) is None
+    assert trajectory.at(40 * MS).twist.linear == 0.2
+    assert trajectory.at(30 * MS).twist.linear == 0.1
+    trajectory.add(sample(-500.0, 0.3))  # before every earlier sample
+    assert trajectory.newest_ns == -500 * MS
+    assert trajectory.at(30 * MS) is None
 
 
-def test_a_sample_that_is_repeated_takes_the_place_of_the_one_before():
-    track = filled(sample(0.0, 0.1), sample(10.0, 0.1), sample(20.0, 0.1), capacity=4)
+def test_a_repeated_sample_replaces_the_previous_one():
+    trajectory = filled(sample(0.0, 0.1), sample(10.0, 0.1), sample(20.0, 0.1), capacity=4)
     for speed in (0.11, 0.12, 0.13, 0.12):
-        track.add(sample(20.0, speed))
-    assert track.at(0).twist.linear == 0.1  # nothing was pushed out
-    assert track.at(15 * MS).twist.linear == pytest.approx(0.11)
+        trajectory.add(sample(20.0, speed))
+    assert trajectory.at(0).twist.linear == 0.1  # no sample was dropped
+    assert trajectory.at(15 * MS).twist.linear == pytest.approx(0.11)
 
 
-def test_a_stamp_far_in_the_future_does_not_shut_out_what_follows():
-    track = filled(sample(0.0, 0.1), sample(3_600_000.0, 0.4))
-    track.add(sample(10.0, 0.12))
-    track.add(sample(20.0, 0.14))
-    assert track.newest_ns == 20 * MS
-    assert track.at(15 * MS).twist.linear == pytest.approx(0.13)
+def test_a_stamp_far_ahead_does_not_block_later_samples():
+    trajectory = filled(sample(0.0, 0.1), sample(3_600_000.0, 0.4))
+    trajectory.add(sample(10.0, 0.12))
+    trajectory.add(sample(20.0, 0.14))
+    assert trajectory.newest_ns == 20 * MS
+    assert trajectory.at(15 * MS).twist.linear == pytest.approx(0.13)
 
 
-def test_samples_stamped_ahead_make_the_value_independent_of_when_they_arrive():
+def test_lead_time_makes_the_value_independent_of_arrival():
     lead_ms = 50.0
     prompt, late = ReferenceTrajectory(JUMP), ReferenceTrajectory(JUMP)
     generator = np.random.default_rng(2)
@@ -134,39 +134,39 @@ def test_samples_stamped_ahead_make_the_value_independent_of_when_they_arrive():
 
 
 @pytest.mark.parametrize('bad', [math.nan, math.inf, -math.inf])
-def test_what_is_not_finite_is_refused_and_changes_nothing(bad):
-    track = filled(sample(0.0, 0.1), sample(10.0, 0.2))
-    before = track.at(5 * MS)
-    assert not track.add(sample(5.0, bad))
-    assert not track.add(sample(20.0, 0.0, bad))
-    assert not track.add(State(20 * MS, Pose(bad, 0.0, 0.0), BodyTwist(0.0, 0.0)))
-    assert track.newest_ns == 10 * MS
-    assert track.at(5 * MS) == before
+def test_a_non_finite_sample_is_rejected_without_effect(bad):
+    trajectory = filled(sample(0.0, 0.1), sample(10.0, 0.2))
+    before = trajectory.at(5 * MS)
+    assert not trajectory.add(sample(5.0, bad))
+    assert not trajectory.add(sample(20.0, 0.0, bad))
+    assert not trajectory.add(State(20 * MS, Pose(bad, 0.0, 0.0), BodyTwist(0.0, 0.0)))
+    assert trajectory.newest_ns == 10 * MS
+    assert trajectory.at(5 * MS) == before
 
 
 def test_only_the_newest_samples_are_kept():
-    track = filled(*(sample(10.0 * n, 0.1) for n in range(100)), capacity=8)
-    assert track.at(919 * MS) is None
-    assert track.at(920 * MS) is not None
-    assert track.newest_ns == 990 * MS
+    trajectory = filled(*(sample(10.0 * n, 0.1) for n in range(100)), capacity=8)
+    assert trajectory.at(919 * MS) is None
+    assert trajectory.at(920 * MS) is not None
+    assert trajectory.newest_ns == 990 * MS
 
 
-def test_a_cleared_track_knows_nothing():
-    track = filled(sample(0.0, 0.1), sample(10.0, 0.1))
-    track.clear()
-    assert track.at(5 * MS) is None
-    assert track.newest_ns is None
+def test_a_cleared_trajectory_is_empty():
+    trajectory = filled(sample(0.0, 0.1), sample(10.0, 0.1))
+    trajectory.clear()
+    assert trajectory.at(5 * MS) is None
+    assert trajectory.newest_ns is None
 
 
 def test_numbers_near_the_largest_one_make_a_jump_and_never_nan():
-    track = filled(sample(0.0, -1.7e308), sample(10.0, 1.7e308))
-    point = track.at(5 * MS)
+    trajectory = filled(sample(0.0, -1.7e308), sample(10.0, 1.7e308))
+    point = trajectory.at(5 * MS)
     assert point.twist.linear == -1.7e308
     assert point.rate == (0.0, 0.0)
 
 
-def test_the_newest_samples_are_kept_however_many_come():
-    """They move to the front of their array now and then; nothing may change by that."""
+def test_the_newest_samples_are_kept_for_any_number():
+    """The move of the samples to the front of their array has no effect on the values."""
     small, large = ReferenceTrajectory(JUMP, 16), ReferenceTrajectory(JUMP, 4096)
     generator = np.random.default_rng(3)
     for n in range(1000):

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The Boltzmann machine: its passes, its energy and the distribution they belong to."""
+"""Boltzmann machine: passes, energy and distribution."""
 
 import itertools
 
@@ -29,7 +29,7 @@ def _states(count):
     return [np.array(state) for state in itertools.product((-1.0, 1.0), repeat=count)]
 
 
-def test_squash_is_the_printed_fraction_and_never_overflows():
+def test_sigmoid_is_the_printed_fraction_without_overflow():
     for y in (-30.0, -2.0, -1e-9, 0.0, 0.3, 5.0, 30.0):
         printed = (1.0 - np.exp(-y)) / (1.0 + np.exp(-y))
         assert bipolar_sigmoid(y) == pytest.approx(printed, rel=1e-7, abs=1e-15)
@@ -52,14 +52,14 @@ def test_passes_run_in_the_order_39_38_37_36():
     np.testing.assert_allclose(machine.mu1, mu1, rtol=1e-13)
 
 
-def test_visible_vector_holds_lags_of_the_error_and_of_the_move_in_scales():
+def test_visible_vector_contains_scaled_lags():
     machine = _machine()
     errors, moves = np.arange(1.0, 7.0), 10.0 * np.arange(1.0, 7.0)
     set_visible(machine, errors, moves, 1)
     np.testing.assert_allclose(machine.lags, [2 / 3, 3 / 3, 4 / 3, 20 / 20, 30 / 20])
 
 
-def test_absurd_inputs_are_cut_and_predictions_stay_finite():
+def test_huge_inputs_are_limited_and_predictions_finite():
     machine = _machine()
     machine.output_weights[:] = 1.0
     set_visible(machine, np.array([1e300, -1e300, 0.0]), np.array([1e308, -1e308]), 0)
@@ -67,14 +67,14 @@ def test_absurd_inputs_are_cut_and_predictions_stay_finite():
     assert np.isfinite(predict_error(machine))
 
 
-def test_first_weights_have_orthogonal_rows_so_that_the_passes_keep_every_direction():
-    """Independent random weights raise their condition number to the third power in mu_1."""
+def test_initial_weights_have_orthogonal_rows():
+    """With independent random weights the condition number is raised to the third power."""
     for spread in (0.3, 1.0, 2.0):
         weights = _machine(spread=spread).visible_weights
         np.testing.assert_allclose(weights @ weights.T, spread**2 * np.eye(5), atol=1e-13)
 
 
-def test_small_signals_pass_linearly_as_one_eighth_of_the_weights_cubed():
+def test_small_signals_pass_linearly():
     machine = _machine(spread=0.8)
     generator = np.random.default_rng(2)
     gaps = []
@@ -93,7 +93,7 @@ def test_same_seed_same_machine():
     assert np.any(_machine(4).visible_weights != _machine(5).visible_weights)
 
 
-def test_shapes_and_scales_that_cannot_work_are_refused():
+def test_invalid_shapes_and_scales_are_rejected():
     generator = np.random.default_rng(0)
     with pytest.raises(ValueError, match='hidden must be at least'):
         make_machine(LayerSizes(3, 3, 5), 1.0, 1.0, 1.0, generator)
@@ -112,8 +112,8 @@ def test_energy_is_minus_the_bilinear_form_42():
     )
 
 
-def test_the_squash_is_the_mean_of_a_hidden_unit_under_the_boltzmann_distribution():
-    """E9: only at temperature 2 do the passes (37), (39) belong to the distribution (41)."""
+def test_sigmoid_is_the_mean_of_a_hidden_unit():
+    """E9: only at temperature 2 the passes (37), (39) are means of the distribution (41)."""
     machine = _machine(shape=LayerSizes(2, 2, 4), spread=1.5)
     for eta in _states(4):
         states = _states(4)
@@ -126,7 +126,7 @@ def test_the_squash_is_the_mean_of_a_hidden_unit_under_the_boltzmann_distributio
         np.testing.assert_allclose(machine.mu0, mean, atol=1e-13)
 
 
-def test_ratio_of_probabilities_is_that_of_boltzmann_and_absurd_energies_are_no_trouble():
+def test_probability_ratios_follow_boltzmann_for_any_energy():
     """E9: the printed J' = delta^E / E is not even positive."""
     probability = boltzmann_distribution(np.array([1.0, 3.0, -2.0]))
     assert probability[0] / probability[1] == pytest.approx(np.exp(1.0), rel=1e-13)

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Free, step and forced responses: superposition, indices, and the offset at rest."""
+"""Free, step and forced responses: superposition, indices, steady-state offset."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ SHAPE = LayerSizes(4, 4, 12)
 
 @pytest.fixture(scope='module')
 def taught():
-    """Return a machine taught a simulated run."""
+    """Return a machine that is pretrained on a simulated run."""
     generator = np.random.default_rng(1)
     machine = make_machine(SHAPE, 3.0, 20.0, 1.0, generator)
     run = simulate_excitation(
@@ -49,7 +49,7 @@ def taught():
 
 
 def _linear_machine():
-    """Return a machine so near to linear that superposition holds to rounding."""
+    """Return a nearly linear machine, for which superposition holds to rounding."""
     machine = make_machine(SHAPE, 1e5, 1e5, 1.0, np.random.default_rng(2))
     machine.output_weights[:] = np.random.default_rng(3).standard_normal(12)
     return machine
@@ -62,7 +62,7 @@ def _past(generator, horizon=10):
     return history
 
 
-def test_rolling_forward_feeds_the_machine_with_its_own_outputs(taught):
+def test_iterated_prediction_uses_its_own_outputs(taught):
     history = _past(np.random.default_rng(4))
     history.planned_moves[:] = np.linspace(-2.0, 2.0, 10)
     out = np.zeros(10)
@@ -75,7 +75,7 @@ def test_rolling_forward_feeds_the_machine_with_its_own_outputs(taught):
         assert out[j] == pytest.approx(errors[0], rel=1e-12)
 
 
-def test_free_response_holds_the_last_move_and_step_response_one_probe_more(taught):
+def test_free_and_step_response_hold_the_last_move(taught):
     history, out = _past(np.random.default_rng(5)), np.zeros(10)
     history.offsets[0] = 0.02
     free, steps = np.zeros(10), np.zeros(10)
@@ -89,8 +89,8 @@ def test_free_response_holds_the_last_move_and_step_response_one_probe_more(taug
     np.testing.assert_allclose(steps, (out - free) / 0.5)
 
 
-def test_step_response_of_the_taught_machine_is_the_nominal_one(taught):
-    """A naive machine's step response has a random sign and size."""
+def test_step_response_after_pretraining_is_nominal(taught):
+    """Without pretraining the step response has a random sign and size."""
     history, free, steps = make_history(4, 4, 10), np.zeros(10), np.zeros(10)
     free_response(taught, history, 0.0, free)
     step_response(taught, history, 0.0, 1.0, free, steps)
@@ -101,7 +101,7 @@ def test_step_response_of_the_taught_machine_is_the_nominal_one(taught):
 
 
 def test_toeplitz_shifts_the_step_response_down_the_columns():
-    """E11: the printed last row repeats s_(n_p-1); it must run down to s_0."""
+    """E11: the printed last row repeats s_(n_p-1); it must end with s_0."""
     steps = np.array([1.0, 2.0, 3.0, 4.0])
     matrix = np.zeros((4, 4))
     toeplitz(steps, matrix)
@@ -111,7 +111,7 @@ def test_toeplitz_shifts_the_step_response_down_the_columns():
     np.testing.assert_array_equal(short, matrix[:, :2])
 
 
-def test_forced_response_is_the_matrix_form_and_moves_act_only_after_they_are_made():
+def test_forced_response_is_causal_and_equals_the_matrix_form():
     """E11: with the printed index t + j - i + 1 a move would act two periods early."""
     generator = np.random.default_rng(6)
     steps, changes = generator.standard_normal(8), generator.standard_normal(5)
@@ -126,8 +126,8 @@ def test_forced_response_is_the_matrix_form_and_moves_act_only_after_they_are_ma
     assert forced_response(steps, late, 4) == steps[0]
 
 
-def test_free_plus_forced_is_what_a_linear_machine_does_under_any_moves():
-    """(45), (52): this fixes every index of (47)-(54) at once."""
+def test_free_plus_forced_is_exact_for_a_linear_machine():
+    """(45), (52): this checks every index of (47)-(54) at once."""
     generator = np.random.default_rng(7)
     machine, history = _linear_machine(), _past(generator)
     v_previous, changes = 2.0, generator.standard_normal(6)
@@ -142,11 +142,11 @@ def test_free_plus_forced_is_what_a_linear_machine_does_under_any_moves():
     assert np.max(np.abs(psi - free)) > 0.01
 
 
-def test_a_steady_error_is_predicted_to_stay_so_that_the_program_removes_it(taught):
-    """Offset-free: the prediction error runs through the roll-out.
+def test_a_steady_error_is_predicted_as_constant(taught):
+    """Offset-free: the offset is added in every step of the iterated prediction.
 
-    Added once to the finished response it leaves a rest that the program takes for progress:
-    v_p would stop at a steady error.
+    Added once to the finished response it leaves a residual, and v_p would stop at a steady
+    error.
     """
     history, out = make_history(4, 4, 10), np.zeros(10)
     reset_history(history, 0.7)
@@ -162,7 +162,7 @@ def test_a_steady_error_is_predicted_to_stay_so_that_the_program_removes_it(taug
     assert np.max(np.abs(once - 0.7)) > 0.05
 
 
-def test_the_known_future_is_added_to_the_free_response_and_not_to_the_steps(taught):
+def test_known_errors_are_added_to_the_free_response_only(taught):
     history = _past(np.random.default_rng(8))
     plain, known = (np.zeros(10), np.zeros(10)), (np.zeros(10), np.zeros(10))
     coming = np.linspace(0.0, 5.0, 10)

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The predictive term in a nominal loop that shares no code with it, and what it is worth."""
+"""Predictive controller in an independently implemented nominal loop, and its benefit."""
 
 from copy import deepcopy
 from dataclasses import replace
@@ -58,15 +58,15 @@ def _waves(count):
     return 4.0 * np.sin(2 * np.pi * 0.2 * t) + 2.0 * np.sin(2 * np.pi * 0.53 * t + 1.0)
 
 
-def _run(term, disturbance, noise=0.0, seed=7, **plant):
+def _run(controller, disturbance, noise=0.0, seed=7, **plant):
     """Return (true errors, v_p) of a closed loop, each of shape (N, 2)."""
     loop, count = Loop(**plant), len(disturbance)
     noises = noise * np.random.default_rng(seed).standard_normal((count, 2))
     errors, moves = np.zeros((count, 2)), np.zeros((count, 2))
     for k in range(count):
         errors[k] = loop.error
-        if term is not None:
-            moves[k] = term.step(loop.error + noises[k])
+        if controller is not None:
+            moves[k] = controller.step(loop.error + noises[k])
         loop.step(moves[k], disturbance[k], noises[k])
     return errors, moves
 
@@ -76,11 +76,11 @@ def _rms(values):
 
 
 def _gain(disturbance, parameters=DEFAULT, noise=0.0, nominal_gain=GAIN, **plant):
-    """Return RMSE with the term over RMSE without it, from the first second on."""
-    term = PredictiveController(parameters, PERIOD, nominal_gain)
-    on, _ = _run(term, disturbance, noise, **plant)
+    """Return RMSE with the controller over RMSE without it, from the first second on."""
+    controller = PredictiveController(parameters, PERIOD, nominal_gain)
+    on, _ = _run(controller, disturbance, noise, **plant)
     off, _ = _run(None, disturbance, noise, **plant)
-    assert np.all(term.status == OPTIMAL)
+    assert np.all(controller.status == OPTIMAL)
     return _rms(on) / _rms(off)
 
 
@@ -90,7 +90,7 @@ def _weights():
 
 
 def test_it_removes_most_of_a_piecewise_constant_disturbance():
-    """A naive version did nothing: v_p stayed at 0.3 % of u, its step response at random."""
+    """Without pretraining v_p stays at 0.3 % of u, with a random step response."""
     assert _gain(_levels(3000, 1)) < 0.40
 
 
@@ -98,15 +98,15 @@ def test_it_removes_most_of_a_slowly_varying_disturbance():
     assert _gain(_waves(3000)) < 0.35
 
 
-def test_it_is_still_worth_it_with_noise_of_variance_0_04():
+def test_it_helps_with_noise_of_variance_0_04():
     assert _gain(_levels(3000, 1), noise=0.2) < 0.55
 
 
-def test_with_noise_alone_it_stays_bounded_and_costs_a_few_per_cent():
-    """There is nothing to predict but noise; what it does then must not be felt."""
-    term = PredictiveController(DEFAULT, PERIOD, GAIN)
+def test_with_noise_alone_it_costs_a_few_per_cent():
+    """With only noise to predict, the effect of v_p must be negligible."""
+    controller = PredictiveController(DEFAULT, PERIOD, GAIN)
     nothing = np.zeros((6000, 2))
-    on, moves = _run(term, nothing, 0.2)
+    on, moves = _run(controller, nothing, 0.2)
     off, _ = _run(None, nothing, 0.2)
     assert _rms(on) < 1.10 * _rms(off)
     assert _rms(on[3000:]) < 1.03 * _rms(off[3000:])
@@ -125,7 +125,7 @@ def test_with_noise_alone_it_stays_bounded_and_costs_a_few_per_cent():
     ],
     ids=str,
 )
-def test_a_robot_other_than_the_nominal_one_is_still_helped(plant):
+def test_it_helps_a_robot_other_than_the_nominal_one(plant):
     assert _gain(_levels(3000, 2), noise=0.05, **plant) < 0.65
 
 
@@ -134,28 +134,28 @@ def test_it_works_for_other_control_periods_and_feedback_gains():
     assert _gain(_levels(3000, 1), parameters, nominal_gain=4.0, gain=4.0) < 0.45
 
 
-def test_the_taught_step_response_has_the_right_sign_and_size_from_the_first_second():
-    term = PredictiveController(DEFAULT, PERIOD, GAIN)
-    term.step(np.zeros(2))
+def test_step_response_is_right_from_the_first_second():
+    controller = PredictiveController(DEFAULT, PERIOD, GAIN)
+    controller.step(np.zeros(2))
     loop, fine = Loop(), []
     for _ in range(50):
         loop.step(np.ones(2), np.zeros(2), np.zeros(2))
         fine.append(loop.error[0])
     true = np.mean(np.reshape(fine, (10, 5)), axis=1)
-    assert np.all(term.step_response > 0.0)
-    np.testing.assert_allclose(term.step_response[:, 4], true[4], rtol=0.2)
-    np.testing.assert_allclose(term.step_response[:, -1], true[9], rtol=0.25)
+    assert np.all(controller.step_response > 0.0)
+    np.testing.assert_allclose(controller.step_response[:, 4], true[4], rtol=0.2)
+    np.testing.assert_allclose(controller.step_response[:, -1], true[9], rtol=0.25)
 
 
-def test_the_taught_machine_is_skilled_on_data_it_has_not_seen():
-    term = PredictiveController(DEFAULT, PERIOD, GAIN)
-    assert np.all(term.skill > 0.8)
-    assert np.all(term.one_step_skill > 0.5)
+def test_the_skill_is_high_on_unseen_data():
+    controller = PredictiveController(DEFAULT, PERIOD, GAIN)
+    assert np.all(controller.skill > 0.8)
+    assert np.all(controller.one_step_skill > 0.5)
 
 
-def test_with_random_weights_the_fade_keeps_v_p_near_zero_and_from_doing_harm():
-    """Skill half a horizon ahead alone let a third through: zero is no bad guess that far."""
-    term = PredictiveController(DEFAULT.with_values({'learning': False}), PERIOD, GAIN)
+def test_random_weights_get_no_authority():
+    """With the skill half a horizon ahead alone, a third would get authority."""
+    controller = PredictiveController(DEFAULT.with_values({'learning': False}), PERIOD, GAIN)
     disturbance = _levels(1000, 3)
     off, _ = _run(None, disturbance)
     figures = []
@@ -165,66 +165,68 @@ def test_with_random_weights_the_fade_keeps_v_p_near_zero_and_from_doing_harm():
             weights = dict(_weights())
             for name, spread in (('visible_weights', 0.3), ('output_weights', size)):
                 weights[name] = spread * generator.standard_normal(weights[name].shape)
-            term.set_weights(weights)
-            on, moves = _run(term, disturbance)
+            controller.set_weights(weights)
+            on, moves = _run(controller, disturbance)
             assert _rms(on) < 1.02 * _rms(off)
             figures.append(_rms(moves))
     assert np.median(figures) < 1e-3 * DEFAULT.v_max
     assert np.mean(np.array(figures) < 1e-2 * DEFAULT.v_max) > 0.9
 
 
-def test_a_machine_with_the_wrong_sign_of_v_p_is_silenced_although_it_predicts():
-    """Met on the way: an error that dies away by itself is well predicted without knowing v_p."""
+def test_a_wrong_sign_of_v_p_gets_no_authority():
+    """A decaying error is predictable without a model of v_p."""
     parameters = DEFAULT.with_values({'learning': False})
-    term = PredictiveController(parameters, PERIOD, GAIN)
+    controller = PredictiveController(parameters, PERIOD, GAIN)
     weights = {name: array.copy() for name, array in _weights().items()}
     lags = parameters.delta_lags
     square = np.einsum('zih,zjh->zij', weights['visible_weights'], weights['visible_weights'])
-    # Turn the part of the output that answers to v_p round, in the linear range.
+    # Reverse the sign of the response to v_p, in the linear range.
     for z in range(2):
         passed = weights['visible_weights'][z].T @ square[z] / 8.0
         linear = passed.T @ weights['output_weights'][z]
         linear[lags:] *= -1.0
         weights['output_weights'][z] = np.linalg.lstsq(passed.T, linear, rcond=None)[0]
-    term.set_weights(weights)
-    _, moves = _run(term, _levels(1000, 3))
-    assert np.all(term.step_response[:, 4] < 0.0)
-    np.testing.assert_array_equal(term.authority, 0.0)
+    controller.set_weights(weights)
+    _, moves = _run(controller, _levels(1000, 3))
+    assert np.all(controller.step_response[:, 4] < 0.0)
+    np.testing.assert_array_equal(controller.authority, 0.0)
     np.testing.assert_array_equal(moves, 0.0)
 
 
 def test_a_steady_disturbance_leaves_no_steady_error():
-    """Offset-free; without learning, so that nothing but the offset e can do it."""
+    """Without learning, the offset e alone removes the error."""
     parameters = DEFAULT.with_values({'learning': False, 'offset_gain': 0.2})
-    term = PredictiveController(parameters, PERIOD, GAIN)
-    errors, moves = _run(term, np.full((3000, 2), 4.0))
+    controller = PredictiveController(parameters, PERIOD, GAIN)
+    errors, moves = _run(controller, np.full((3000, 2), 4.0))
     np.testing.assert_allclose(errors[-1], 0.0, atol=2e-3)
     np.testing.assert_allclose(moves[-1], -4.0, atol=0.02)
 
 
-def test_v_p_keeps_its_bounds_whatever_the_errors():
+def test_v_p_keeps_its_bounds_for_any_errors():
     parameters = DEFAULT.with_values({'v_max': 3.0, 'dv_max': 0.8})
-    term = PredictiveController(parameters, PERIOD, GAIN)
+    controller = PredictiveController(parameters, PERIOD, GAIN)
     generator = np.random.default_rng(4)
-    v = np.array([term.step(e) for e in 4.0 * generator.standard_cauchy((3000, 2))])
+    v = np.array([controller.step(e) for e in 4.0 * generator.standard_cauchy((3000, 2))])
     assert np.max(np.abs(v)) <= 3.0
     changes = np.abs(np.diff(v[::5], axis=0))
     assert np.max(changes) <= 0.8 + 1e-9
-    assert np.max(np.abs(v)) > 0.3  # it did something
+    assert np.max(np.abs(v)) > 0.3  # v_p is active
 
 
-def test_v_p_goes_on_by_the_first_of_the_optimal_changes_63():
-    """Where no bound is met, (61) says pi dv_0 = -mu sum of s_j Psi_j, with the plan's own Psi."""
+def test_v_p_changes_by_the_first_optimal_change_63():
+    """Without active bounds, (61) gives pi dv_0 = -mu sum of s_j Psi_j."""
     parameters = DEFAULT.with_values({'v_max': 1e3, 'dv_max': 1e3, 'learning': False})
-    term, loop = PredictiveController(parameters, PERIOD, GAIN), Loop()
+    controller, loop = PredictiveController(parameters, PERIOD, GAIN), Loop()
     before, changes = np.zeros(2), []
     for w in _waves(1000):
-        due = term.due
-        v_p = term.step(loop.error)
+        due = controller.due
+        v_p = controller.step(loop.error)
         if due:
-            assert np.all(term.status == OPTIMAL)
-            np.testing.assert_allclose(term.authority, 1.0)
-            first = -parameters.error_weight * np.sum(term.step_response * term.prediction, axis=1)
+            assert np.all(controller.status == OPTIMAL)
+            np.testing.assert_allclose(controller.authority, 1.0)
+            first = -parameters.error_weight * np.sum(
+                controller.step_response * controller.prediction, axis=1
+            )
             np.testing.assert_allclose(v_p - before, first / parameters.move_weight, atol=1e-9)
             changes.append(v_p - before)
         else:
@@ -236,36 +238,38 @@ def test_v_p_goes_on_by_the_first_of_the_optimal_changes_63():
 
 
 def test_v_p_is_held_between_the_predictive_steps():
-    term = PredictiveController(DEFAULT, PERIOD, GAIN)
+    controller = PredictiveController(DEFAULT, PERIOD, GAIN)
     generator = np.random.default_rng(5)
-    v = np.array([term.step(e) for e in generator.standard_normal((200, 2))]).reshape(40, 5, 2)
+    v = np.array([controller.step(e) for e in generator.standard_normal((200, 2))]).reshape(
+        40, 5, 2
+    )
     np.testing.assert_array_equal(v, np.repeat(v[:, :1], 5, axis=1))
     assert np.count_nonzero(np.diff(v[:, 0, 0])) > 30
 
 
-def test_a_lowered_bound_is_kept_at_once():
-    term = PredictiveController(DEFAULT, PERIOD, GAIN)
-    _run(term, np.full((300, 2), 8.0))
-    assert np.all(np.abs(term.step(np.zeros(2))) > 5.0)
-    term.configure(replace(DEFAULT, v_max=2.0))
-    v = [term.step(np.zeros(2)) for _ in range(5)]
+def test_a_reduced_bound_takes_effect_at_once():
+    controller = PredictiveController(DEFAULT, PERIOD, GAIN)
+    _run(controller, np.full((300, 2), 8.0))
+    assert np.all(np.abs(controller.step(np.zeros(2))) > 5.0)
+    controller.configure(replace(DEFAULT, v_max=2.0))
+    v = [controller.step(np.zeros(2)) for _ in range(5)]
     assert np.max(np.abs(v[-1])) <= 2.0
     with pytest.raises(ParameterError, match='horizon is read-only'):
-        term.configure(replace(DEFAULT, horizon=8))
+        controller.configure(replace(DEFAULT, horizon=8))
 
 
-def test_switched_off_it_returns_zero_and_still_learns():
-    term = PredictiveController(DEFAULT.with_values({'enabled': False}), PERIOD, GAIN)
-    before = term.get_weights()['output_weights']
-    _, moves = _run(term, _levels(1000, 6))
+def test_disabled_it_returns_zero_and_still_learns():
+    controller = PredictiveController(DEFAULT.with_values({'enabled': False}), PERIOD, GAIN)
+    before = controller.get_weights()['output_weights']
+    _, moves = _run(controller, _levels(1000, 6))
     np.testing.assert_array_equal(moves, 0.0)
-    np.testing.assert_array_equal(term.authority, 0.0)
-    assert np.any(term.get_weights()['output_weights'] != before)
+    np.testing.assert_array_equal(controller.authority, 0.0)
+    assert np.any(controller.get_weights()['output_weights'] != before)
 
 
-def _jumping(told, preview):
-    """Return the true errors of a run in which the reference jumps, and the term."""
-    count, term = 4000, PredictiveController(DEFAULT, PERIOD, GAIN)
+def _jumping(known, preview):
+    """Return the true errors of a run with jumps of the reference, and the controller."""
+    count, controller = 4000, PredictiveController(DEFAULT, PERIOD, GAIN)
     generator, loop = np.random.default_rng(8), Loop()
     jumps = np.zeros((count + 60, 2))
     jumps[150:count:150] = generator.uniform(-3.0, 3.0, jumps[150:count:150].shape)
@@ -274,98 +278,98 @@ def _jumping(told, preview):
     for k in range(count):
         loop.state[0] += jumps[k]
         errors[k] = loop.error
-        if told and jumps[k].any():
-            term.notify_jump(jumps[k])
+        if known and jumps[k].any():
+            controller.notify_jump(jumps[k])
         coming = None
-        if preview and term.due:
+        if preview and controller.due:
             coming = jumps[k + 1 : k + 51].reshape(10, 5, 2).sum(axis=1)
-        v_p = term.step(loop.error + noise[k], coming)
+        v_p = controller.step(loop.error + noise[k], coming)
         loop.step(v_p, np.zeros(2), noise[k])
-    return errors, term
+    return errors, controller
 
 
-def test_a_jump_that_is_told_is_not_learnt_as_dynamics_and_preview_pays():
-    """Untold, jumps look like a robot whose errors come from nowhere: its gain is mislearnt."""
-    untold, blind = _jumping(told=False, preview=False)
-    told, knowing = _jumping(told=True, preview=False)
-    seen, _ = _jumping(told=True, preview=True)
-    assert np.all(knowing.skill > blind.skill + 0.2)
+def test_a_known_jump_is_not_learned_and_preview_helps():
+    """Unknown jumps look like dynamics of the robot, so a wrong gain is learned."""
+    unknown, unaware = _jumping(known=False, preview=False)
+    known, aware = _jumping(known=True, preview=False)
+    previewed, _ = _jumping(known=True, preview=True)
+    assert np.all(aware.skill > unaware.skill + 0.2)
     true = PredictiveController(DEFAULT, PERIOD, GAIN)
     true.step(np.zeros(2))
-    ratio = knowing.step_response[:, 4] / true.step_response[:, 4]
-    wrong = blind.step_response[:, 4] / true.step_response[:, 4]
+    ratio = aware.step_response[:, 4] / true.step_response[:, 4]
+    wrong = unaware.step_response[:, 4] / true.step_response[:, 4]
     assert np.all(np.abs(ratio - 1.0) < 0.25)
     assert np.max(np.abs(wrong - 1.0)) > np.max(np.abs(ratio - 1.0))
-    assert _rms(told) < _rms(untold)
-    assert _rms(seen) < 0.75 * _rms(told)
+    assert _rms(known) < _rms(unknown)
+    assert _rms(previewed) < 0.75 * _rms(known)
 
 
-def test_a_known_jump_dies_away_in_the_prediction_as_the_feedback_makes_it():
+def test_a_known_jump_decays_in_the_prediction_with_the_feedback():
     parameters = DEFAULT.with_values({'enabled': False})
-    term = PredictiveController(parameters, PERIOD, GAIN)
-    term.notify_jump(np.array([100.0, -2.0]))
-    term.step(np.array([100.0, -2.0]))
+    controller = PredictiveController(parameters, PERIOD, GAIN)
+    controller.notify_jump(np.array([100.0, -2.0]))
+    controller.step(np.array([100.0, -2.0]))
     fall = np.exp(-GAIN * 0.05 * np.arange(1, 11))
-    np.testing.assert_allclose(term.prediction, np.outer([100.0, -2.0], fall), atol=1e-9)
-    term.reset()
+    np.testing.assert_allclose(controller.prediction, np.outer([100.0, -2.0], fall), atol=1e-9)
+    controller.reset()
     coming = np.zeros((10, 2))
     coming[3] = (1.0, 0.0)
-    term.step(np.zeros(2), coming)
+    controller.step(np.zeros(2), coming)
     expected = np.r_[np.zeros(3), np.exp(-GAIN * 0.05 * np.arange(7))]
-    np.testing.assert_allclose(term.prediction[0], expected, atol=1e-9)
-    np.testing.assert_allclose(term.prediction[1], 0.0, atol=1e-9)
+    np.testing.assert_allclose(controller.prediction[0], expected, atol=1e-9)
+    np.testing.assert_allclose(controller.prediction[1], 0.0, atol=1e-9)
 
 
-def test_what_was_applied_is_what_is_learnt_from():
-    """A limit that swallows v_p must not teach the machine that v_p does nothing."""
+def test_it_learns_from_the_applied_v_p():
+    """When a limit suppresses v_p, the machine must not learn that v_p has no effect."""
     disturbance = _levels(4000, 9)
 
-    def gain(honest):
-        term, loop = PredictiveController(DEFAULT, PERIOD, GAIN), Loop()
+    def gain(notify):
+        controller, loop = PredictiveController(DEFAULT, PERIOD, GAIN), Loop()
         for k, w in enumerate(disturbance):
-            v_p = term.step(loop.error)
-            applied = v_p * (k % 100 >= 50)  # the limit holds half of the time
-            if honest:
-                term.notify_applied(applied)
+            v_p = controller.step(loop.error)
+            applied = v_p * (k % 100 >= 50)  # the limit is active half of the time
+            if notify:
+                controller.notify_applied(applied)
             loop.step(applied, w, np.zeros(2))
-        return np.mean(term.step_response[:, 4])
+        return np.mean(controller.step_response[:, 4])
 
     fresh = PredictiveController(DEFAULT, PERIOD, GAIN)
     fresh.step(np.zeros(2))
     true = np.mean(fresh.step_response[:, 4])
-    assert abs(gain(honest=True) / true - 1.0) < 0.35
-    assert abs(gain(honest=True) - true) < abs(gain(honest=False) - true)
+    assert abs(gain(notify=True) / true - 1.0) < 0.35
+    assert abs(gain(notify=True) - true) < abs(gain(notify=False) - true)
 
 
-def test_after_a_limit_the_next_change_starts_between_zero_and_v_p():
-    """A limit may cut far more than v_p; started from there, v_p would jump to its bound."""
+def test_after_a_limit_changes_start_between_zero_and_v_p():
+    """A limit may exceed v_p; a change that starts there would move v_p to its bound."""
     for applied, start in ((-50.0, 0.0), (0.5, 0.5), (99.0, None)):
-        term = PredictiveController(DEFAULT, PERIOD, GAIN)
+        controller = PredictiveController(DEFAULT, PERIOD, GAIN)
         for _ in range(50):
-            v = term.step(np.full(2, -0.5))
+            v = controller.step(np.full(2, -0.5))
         assert np.all(v > 1.0)
-        term.notify_applied(np.full(2, applied))
-        term.configure(replace(DEFAULT, dv_max=1e-6))
-        after = term.step(np.full(2, -0.5))
+        controller.notify_applied(np.full(2, applied))
+        controller.configure(replace(DEFAULT, dv_max=1e-6))
+        after = controller.step(np.full(2, -0.5))
         np.testing.assert_allclose(after, v if start is None else start, atol=1e-5)
-        assert np.all(term.status == OPTIMAL)
+        assert np.all(controller.status == OPTIMAL)
 
 
-def test_reset_forgets_the_run_but_not_the_weights():
-    term = PredictiveController(DEFAULT, PERIOD, GAIN)
-    _run(term, _levels(1000, 10))
-    weights, skill = term.get_weights(), term.skill
-    term.reset()
-    for name, array in term.get_weights().items():
+def test_reset_clears_the_history_but_not_the_weights():
+    controller = PredictiveController(DEFAULT, PERIOD, GAIN)
+    _run(controller, _levels(1000, 10))
+    weights, skill = controller.get_weights(), controller.skill
+    controller.reset()
+    for name, array in controller.get_weights().items():
         np.testing.assert_array_equal(array, weights[name])
-    np.testing.assert_array_equal(term.skill, skill)
-    np.testing.assert_array_equal(term.step(np.zeros(2)), 0.0)
-    term.pretrain()
-    for name, array in term.get_weights().items():
+    np.testing.assert_array_equal(controller.skill, skill)
+    np.testing.assert_array_equal(controller.step(np.zeros(2)), 0.0)
+    controller.pretrain()
+    for name, array in controller.get_weights().items():
         np.testing.assert_array_equal(array, _weights()[name])
 
 
-def test_the_term_is_a_function_of_its_inputs_and_saved_weights_carry_on():
+def test_it_is_deterministic_and_weights_can_be_restored():
     first = PredictiveController(DEFAULT, PERIOD, GAIN)
     first.warm_up()
     again = PredictiveController(DEFAULT, PERIOD, GAIN)
@@ -381,8 +385,8 @@ def test_the_term_is_a_function_of_its_inputs_and_saved_weights_carry_on():
     assert np.all(copy.get_weights()['output_weights'] != 7.0)
 
 
-def test_a_recorded_run_teaches_what_the_nominal_loop_cannot():
-    """A robot three times as slow as the nominal one, its run recorded and learnt from."""
+def test_a_recorded_run_improves_on_the_nominal_loop():
+    """The recorded run is that of a robot three times as slow as the nominal one."""
     parameters = DEFAULT.with_values({'learning': False})
     generator = np.random.default_rng(12)
     plant = {'lag': 0.15, 'delay_steps': 5}
@@ -398,19 +402,19 @@ def test_a_recorded_run_teaches_what_the_nominal_loop_cannot():
             samples.append(loop.error)
         if k + 1 < 2400:
             errors[k + 1] = np.mean(samples, axis=0)
-    taught = PredictiveController(parameters, PERIOD, GAIN)
-    taught.pretrain(errors, moves)
-    assert np.all(taught.skill > 0.8)
+    trained = PredictiveController(parameters, PERIOD, GAIN)
+    trained.pretrain(errors, moves)
+    assert np.all(trained.skill > 0.8)
     disturbance = _levels(3000, 13)
     nominal = _run(PredictiveController(parameters, PERIOD, GAIN), disturbance, **plant)[0]
-    assert _rms(_run(taught, disturbance, **plant)[0]) < _rms(nominal)
+    assert _rms(_run(trained, disturbance, **plant)[0]) < _rms(nominal)
     with pytest.raises(ValueError, match='must be'):
-        taught.pretrain(errors)
+        trained.pretrain(errors)
 
 
-def test_what_does_not_fit_is_refused_and_changes_nothing():
-    term = PredictiveController(DEFAULT, PERIOD, GAIN)
-    good = term.get_weights()
+def test_invalid_input_is_rejected_without_effect():
+    controller = PredictiveController(DEFAULT, PERIOD, GAIN)
+    good = controller.get_weights()
     for wrong, match in (
         ({**good, 'extra': np.zeros(2)}, 'weights must be'),
         ({**good, 'anchor': np.zeros(3)}, 'anchor must have shape'),
@@ -418,20 +422,22 @@ def test_what_does_not_fit_is_refused_and_changes_nothing():
         ({**good, 'scales': 2.0 * good['scales']}, 'scales must be'),
     ):
         with pytest.raises(ValueError, match=match):
-            term.set_weights(wrong)
+            controller.set_weights(wrong)
     with pytest.raises(ValueError, match='shape'):
-        term.step(np.zeros(3))
+        controller.step(np.zeros(3))
     with pytest.raises(ValueError, match='finite'):
-        term.step(np.array([0.0, np.inf]))
+        controller.step(np.array([0.0, np.inf]))
     with pytest.raises(ValueError, match='known_change'):
-        term.step(np.zeros(2), np.zeros((2, 10)))
+        controller.step(np.zeros(2), np.zeros((2, 10)))
     with pytest.raises(ValueError, match='jump'):
-        term.notify_jump(np.array([np.nan, 0.0]))
+        controller.notify_jump(np.array([np.nan, 0.0]))
     with pytest.raises(ValueError, match='v_p'):
-        term.notify_applied(np.zeros(1))
+        controller.notify_applied(np.zeros(1))
     untouched = PredictiveController(DEFAULT, PERIOD, GAIN)
     disturbance = _levels(200, 14)
-    np.testing.assert_array_equal(_run(term, disturbance)[1], _run(untouched, disturbance)[1])
+    np.testing.assert_array_equal(
+        _run(controller, disturbance)[1], _run(untouched, disturbance)[1]
+    )
 
 
 @pytest.mark.parametrize(
@@ -444,12 +450,12 @@ def test_what_does_not_fit_is_refused_and_changes_nothing():
     ],
     ids=str,
 )
-def test_settings_that_do_not_fit_together_are_refused(values, match):
+def test_inconsistent_parameters_are_rejected(values, match):
     with pytest.raises(ParameterError, match=match):
         DEFAULT.with_values(values)
 
 
-def test_lags_that_do_not_cover_the_dead_time_are_refused():
+def test_lags_shorter_than_the_dead_time_are_rejected():
     parameters = DEFAULT.with_values({'nominal.dead_time': 0.2})
     with pytest.raises(ParameterError, match='move_lags must cover'):
         PredictiveController(parameters, PERIOD, GAIN)
@@ -458,33 +464,33 @@ def test_lags_that_do_not_cover_the_dead_time_are_refused():
         PredictiveController(DEFAULT, PERIOD, 0.0)
 
 
-def test_a_copy_of_the_term_goes_its_own_way():
-    """Nobody may keep views of a flat store: in a deep copy they are views of it no longer."""
-    term, errors = PredictiveController(DEFAULT, PERIOD, GAIN), np.array([0.3, -0.2])
+def test_a_deep_copy_is_independent():
+    """Stored views of a flat store would not be views of it in a deep copy."""
+    controller, errors = PredictiveController(DEFAULT, PERIOD, GAIN), np.array([0.3, -0.2])
     for k in range(60):
-        term.step(errors * np.sin(0.1 * k))
-    twin, other = deepcopy(term), deepcopy(term)
+        controller.step(errors * np.sin(0.1 * k))
+    twin, other = deepcopy(controller), deepcopy(controller)
     for _ in range(20):
         other.step(-errors)
     for k in range(60, 160):
         sample = errors * np.sin(0.1 * k)
-        np.testing.assert_array_equal(twin.step(sample), term.step(sample))
-    np.testing.assert_array_equal(twin.skill, term.skill)
-    for name, value in term.get_weights().items():
+        np.testing.assert_array_equal(twin.step(sample), controller.step(sample))
+    np.testing.assert_array_equal(twin.skill, controller.skill)
+    for name, value in controller.get_weights().items():
         np.testing.assert_array_equal(twin.get_weights()[name], value)
 
 
-def test_going_back_is_what_restoring_the_weights_is():
-    term, errors = PredictiveController(DEFAULT, PERIOD, GAIN), np.array([0.3, -0.2])
+def test_rollback_equals_restoring_the_weights():
+    controller, errors = PredictiveController(DEFAULT, PERIOD, GAIN), np.array([0.3, -0.2])
     for k in range(400):
-        term.step(errors * np.sin(0.1 * k))
-    snapshot, weights = term.snapshot(), term.get_weights()
+        controller.step(errors * np.sin(0.1 * k))
+    snapshot, weights = controller.snapshot(), controller.get_weights()
     for k in range(400):
-        term.step(errors * np.cos(0.3 * k))
-    restored = deepcopy(term)
+        controller.step(errors * np.cos(0.3 * k))
+    restored = deepcopy(controller)
     restored.set_weights(weights)
-    term.rollback(snapshot)
-    np.testing.assert_array_equal(term.skill, restored.skill)
+    controller.rollback(snapshot)
+    np.testing.assert_array_equal(controller.skill, restored.skill)
     for k in range(100):
         sample = errors * np.sin(0.2 * k)
-        np.testing.assert_array_equal(term.step(sample), restored.step(sample))
+        np.testing.assert_array_equal(controller.step(sample), restored.step(sample))

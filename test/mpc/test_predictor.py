@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The skill against persistence, and how it fades v_p out."""
+"""Predictor: skill against persistence, authority, online learning, state views."""
 
 import numpy as np
 import pytest
@@ -53,7 +53,7 @@ def _feed(history, missed, persistence_mse, count):
         update_mse(history, 0, 0.99, 0.05)
 
 
-def test_skill_is_one_less_the_ratio_of_mean_squares():
+def test_skill_is_one_minus_the_ratio_of_mean_squares():
     history = make_history(4, 4, 10)
     _feed(history, 0.5, 1.0, 5000)
     assert skill_score(history, 0) == pytest.approx(0.75, abs=1e-3)
@@ -63,8 +63,8 @@ def test_skill_is_one_less_the_ratio_of_mean_squares():
     assert skill_score(history, 0) == pytest.approx(-3.0, abs=1e-2)
 
 
-def test_in_quiet_times_the_skill_stays_what_it_was():
-    """Without the floor, mere noise on a well-controlled robot would rate the machine."""
+def test_in_quiet_times_the_skill_is_constant():
+    """Without the floor, noise on a well-controlled robot would determine the skill."""
     history = make_history(4, 4, 10)
     _feed(history, 0.5, 1.0, 5000)
     _feed(history, 1e-4, 1e-5, 5000)
@@ -73,14 +73,14 @@ def test_in_quiet_times_the_skill_stays_what_it_was():
     assert skill_score(history, 0) > 0.6
 
 
-def test_no_evidence_at_all_gives_a_finite_skill():
+def test_skill_is_finite_without_any_variation():
     history = make_history(4, 4, 10)
     history.prediction_mse[:] = history.persistence_mse[:] = 0.0
     _feed(history, 0.0, 0.0, 10)
     assert np.isfinite(skill_score(history, 0))
 
 
-def test_fade_is_smooth_rises_with_skill_and_needs_the_right_sign():
+def test_authority_is_smooth_and_needs_skill_and_sign():
     x = np.linspace(-2.0, 1.0, 301)
     values = np.array([authority(v, 1.0, -1.0, 0.0, 0.1, 0.4) for v in x])
     assert values[0] == 0.0
@@ -95,14 +95,14 @@ def test_fade_is_smooth_rises_with_skill_and_needs_the_right_sign():
     assert smooth_step(0.5, 0.0, 1.0) == 0.5
 
 
-def test_a_taught_machine_is_skilled_on_a_run_it_has_not_seen():
+def test_a_pretrained_machine_predicts_an_unseen_run():
     predictor, run = _predictor()
     predictor.fit(*run, ExcitationParameters(), 600.0, HOW)
     assert skill_score(predictor.history, 0) > 0.5
     assert skill_score(predictor.history, 1) > 0.8
 
 
-def test_an_untaught_machine_is_not():
+def test_an_untrained_machine_has_no_skill():
     predictor, _ = _predictor()
     predictor.machine.output_weights[:] = np.random.default_rng(1).standard_normal(12)
     predictor.evaluate(HOW)
@@ -110,7 +110,7 @@ def test_an_untaught_machine_is_not():
     assert skill_score(predictor.history, 1) < 0.3
 
 
-def test_rehearsal_scores_by_definition_and_changes_no_weights():
+def test_offline_evaluation_changes_no_weights():
     predictor, run = _predictor()
     predictor.fit(*run, ExcitationParameters(), 600.0, HOW)
     weights = predictor.get_weights()
@@ -126,8 +126,8 @@ def test_rehearsal_scores_by_definition_and_changes_no_weights():
     assert history.persistence_mse[1] == pytest.approx(stayed, rel=1e-10)
 
 
-def test_observing_keeps_what_was_predicted_against_what_came():
-    """The middle prediction uses the moves really made since, or a good plan would look bad."""
+def test_residuals_compare_predictions_with_measurements():
+    """The prediction over half a horizon uses the moves that were made since."""
     predictor, run = _predictor()
     predictor.fit(*run, ExcitationParameters(noise=0.0, disturbance=0.0), 600.0, HOW)
     generator = np.random.default_rng(3)
@@ -147,7 +147,7 @@ def test_observing_keeps_what_was_predicted_against_what_came():
     assert np.mean(np.square(missed)) < 0.05 * np.mean(np.square(stayed))
 
 
-def test_a_blow_beyond_the_range_of_the_machine_teaches_nothing():
+def test_an_error_beyond_the_range_is_not_learned():
     predictor, run = _predictor()
     predictor.fit(*run, ExcitationParameters(), 600.0, HOW)
     before = predictor.get_weights()
@@ -159,7 +159,7 @@ def test_a_blow_beyond_the_range_of_the_machine_teaches_nothing():
     ).all()
 
 
-def test_a_trial_too_short_to_predict_in_is_refused():
+def test_a_trial_run_that_is_too_short_is_rejected():
     machine = make_machine(LayerSizes(4, 4, 12), 3.0, 20.0, 1.0, np.random.default_rng(0))
     with pytest.raises(ValueError, match='trial must be longer'):
         Predictor(machine, 10, (np.zeros(5), np.zeros(5)))
@@ -167,14 +167,14 @@ def test_a_trial_too_short_to_predict_in_is_refused():
 
 
 def _arrays(parts):
-    """Return every array of named tuples, however deep."""
+    """Return every array of nested named tuples."""
     if isinstance(parts, np.ndarray):
         return [parts]
     return [array for part in parts for array in _arrays(part)] if isinstance(parts, tuple) else []
 
 
 @pytest.mark.parametrize('sizes', [(4, 4, 12, 10), (1, 1, 2, 1), (6, 3, 9, 7), (2, 5, 8, 2)])
-def test_the_parts_of_a_wheel_fill_its_store_and_none_lies_on_another(sizes):
+def test_the_parts_of_a_wheel_state_fill_its_store_once(sizes):
     store = np.zeros(wheel_state_size(*sizes))
     for array in _arrays(wheel_state_view(store, *sizes)):
         assert array.size
@@ -182,7 +182,7 @@ def test_the_parts_of_a_wheel_fill_its_store_and_none_lies_on_another(sizes):
     np.testing.assert_array_equal(store, 1.0)
 
 
-def test_a_wheel_has_the_shapes_that_its_kernels_expect():
+def test_a_wheel_state_has_the_expected_shapes():
     wheel = wheel_state_view(np.zeros(wheel_state_size(4, 3, 9, 10)), 4, 3, 9, 10)
     assert wheel.machine.visible_weights.shape == (7, 9)
     assert wheel.machine.lags.shape == wheel.machine.eta1.shape == (7,)

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""How the machine learns: contrastive divergence, its output layer, and the nominal run."""
+"""Learning rules of the machine, pretraining, and the simulated nominal run."""
 
 from dataclasses import replace
 import itertools
@@ -56,7 +56,7 @@ def _slope(function, weights, step=1e-6):
     return out
 
 
-def test_contrast_is_the_slope_of_the_energy_between_data_and_reconstruction():
+def test_cd_step_is_the_gradient_of_the_energy_difference():
     """E9: (43) is E(eta_1, mu_1) - E(eta_0, mu_0) differentiated at fixed states."""
     machine = _machine(spread=1.5)
     machine.lags[:] = np.random.default_rng(1).uniform(-1.0, 1.0, 8)
@@ -74,10 +74,10 @@ def test_contrast_is_the_slope_of_the_energy_between_data_and_reconstruction():
     )
 
 
-def test_contrast_is_the_contrastive_divergence_estimate_of_the_likelihood_gradient():
-    """E9: ln J' of (41) has the slope -F(eta_0)' + <F'>; CD-1 puts eta_1 for the average.
+def test_cd_step_estimates_the_likelihood_gradient():
+    """E9: ln J' of (41) has the gradient -F(eta_0)' + <F'>; CD-1 replaces the mean by eta_1.
 
-    The hidden units are summed out exactly; at temperature 2 the slope is half of (43).
+    The sum over hidden units is exact; at temperature 2 the gradient is half of (43).
     """
     machine = _machine(seed=3, spread=1.5)
     machine.lags[:] = np.random.default_rng(4).uniform(-1.0, 1.0, 8)
@@ -94,7 +94,7 @@ def test_contrast_is_the_contrastive_divergence_estimate_of_the_likelihood_gradi
 
 
 def _likelihood(weights, data):
-    """Return the mean ln J' of visible states, with every state of (41) counted out."""
+    """Return the mean ln J' of visible states, by enumerating every state of (41)."""
     visible = [np.array(s) for s in itertools.product((-1.0, 1.0), repeat=weights.shape[0])]
     hidden = [np.array(s) for s in itertools.product((-1.0, 1.0), repeat=weights.shape[1])]
     energies = np.array([[energy(weights, eta, mu) for mu in hidden] for eta in visible])
@@ -103,8 +103,8 @@ def _likelihood(weights, data):
     return np.mean([np.log(probability[index[tuple(eta)]]) for eta in data])
 
 
-def test_contrast_climbs_the_exact_likelihood_of_the_data():
-    """On a machine small enough to count every state, CD-1 agrees with the true gradient."""
+def test_cd_steps_increase_the_exact_likelihood():
+    """On a machine small enough for enumeration CD-1 agrees with the true gradient."""
     machine = _machine(seed=5, shape=LayerSizes(2, 2, 4), spread=0.5)
     data = [np.array(s) for s in ((1.0, 1.0, -1.0, 1.0), (-1.0, -1.0, 1.0, 1.0))]
     start = machine.visible_weights.copy()
@@ -112,9 +112,7 @@ def test_contrast_climbs_the_exact_likelihood_of_the_data():
     for eta in data:
         machine.lags[:] = eta
         predict_error(machine)
-        contrastive_divergence_step(
-            machine, 1e-6
-        )  # so small that both patterns see the same weights
+        contrastive_divergence_step(machine, 1e-6)  # small enough to leave the weights unchanged
     moved = machine.visible_weights - start
     cosine = np.sum(moved * true_slope) / np.linalg.norm(moved) / np.linalg.norm(true_slope)
     assert cosine > 0.7  # one step of a chain is a biased estimate
@@ -130,7 +128,7 @@ def test_contrast_climbs_the_exact_likelihood_of_the_data():
     assert figures[-1] > figures[0] + 0.5
 
 
-def test_contrast_lowers_the_reconstruction_error_on_the_excitation_run():
+def test_cd_epochs_reduce_the_reconstruction_error():
     machine = _machine()
     errors, moves = simulate_excitation(
         NominalLoopParameters(), ExcitationParameters(), TIMING, 20.0, np.random.default_rng(0)
@@ -154,8 +152,8 @@ def test_contrast_lowers_the_reconstruction_error_on_the_excitation_run():
     assert figures[-1] < 0.7 * figures[0]
 
 
-def test_contrast_stays_bounded_for_ever():
-    """Met on the way: data outside [-1, 1] cannot be reconstructed, and X_v grew without end."""
+def test_cd_weights_remain_bounded():
+    """Data outside [-1, 1] cannot be reconstructed; without the limit X_v diverges."""
     machine = _machine()
     generator = np.random.default_rng(6)
     for _ in range(20_000):
@@ -165,7 +163,7 @@ def test_contrast_stays_bounded_for_ever():
     assert np.max(np.abs(machine.visible_weights)) < 20.0
 
 
-def test_gradient_step_is_the_plain_form_where_the_features_have_unit_length():
+def test_gradient_step_is_the_plain_form_for_unit_features():
     machine = _machine()
     machine.lags[:] = np.random.default_rng(7).uniform(-1.0, 1.0, 8)
     predict_error(machine)
@@ -173,8 +171,8 @@ def test_gradient_step_is_the_plain_form_where_the_features_have_unit_length():
     np.testing.assert_allclose(machine.output_weights, 0.1 * 0.6 / 3.0 * machine.mu1, rtol=1e-13)
 
 
-def test_gradient_step_removes_its_share_of_the_error_at_any_amplitude():
-    """The plain form (44) at a fixed gamma is stable at one amplitude and useless at another."""
+def test_gradient_step_is_independent_of_the_amplitude():
+    """The plain form (44) with a fixed gamma is stable at one amplitude only."""
     for size in (1e-3, 1.0):
         machine = _machine()
         machine.lags[:] = size
@@ -182,7 +180,7 @@ def test_gradient_step_removes_its_share_of_the_error_at_any_amplitude():
         assert predict_error(machine) == pytest.approx(0.45, rel=1e-10)
 
 
-def test_recall_is_the_weighted_least_squares_fit_anchored_at_the_pre_training():
+def test_rls_is_the_anchored_weighted_least_squares_fit():
     generator = np.random.default_rng(8)
     machine, rls = _machine(), make_rls_state(12)
     root = generator.standard_normal((12, 12))
@@ -205,8 +203,8 @@ def test_recall_is_the_weighted_least_squares_fit_anchored_at_the_pre_training()
     np.testing.assert_allclose(machine.output_weights, np.linalg.solve(square, right), rtol=1e-8)
 
 
-def test_recall_falls_back_to_the_pre_training_when_nothing_happens():
-    """Forgetting without a prior would keep the last weights, and wind up its gain to a burst."""
+def test_rls_returns_to_the_pretraining_without_excitation():
+    """Forgetting without a prior keeps the last weights, and its gain increases to a burst."""
     machine, rls = _machine(), make_rls_state(12)
     rls.anchor[:] = 0.5
     machine.output_weights[:] = -2.0
@@ -219,8 +217,8 @@ def test_recall_falls_back_to_the_pre_training_when_nothing_happens():
     assert np.max(rls.information) < 1e-6
 
 
-def test_recall_learns_a_changed_robot_faster_than_any_gradient_rate():
-    """Lags of one slow signal are nearly parallel: the reason for the matrix in place of gamma."""
+def test_rls_adapts_faster_than_any_gradient_rate():
+    """Lags of one slow signal are nearly parallel, which a scalar gamma cannot handle."""
     excitation = ExcitationParameters()
     before = simulate_excitation(
         NominalLoopParameters(), excitation, TIMING, 20.0, np.random.default_rng(9)
@@ -254,7 +252,7 @@ def test_recall_learns_a_changed_robot_faster_than_any_gradient_rate():
     assert recalled < 0.2 * missed(lambda *_: None)
 
 
-def test_ridge_solves_its_normal_equations_and_shrinks_with_the_penalty():
+def test_ridge_solves_its_normal_equations():
     generator = np.random.default_rng(10)
     features, targets = generator.standard_normal((50, 6)), generator.standard_normal(50)
     free = ridge_regression(features, targets, 1e-12)
@@ -280,7 +278,7 @@ def test_transition_is_the_matrix_exponential(duration):
 
 
 @pytest.mark.parametrize('dead_time', [0.0, 0.004, 0.01, 0.037, 0.12])
-def test_nominal_step_is_the_analytic_response_whatever_the_dead_time(dead_time):
+def test_nominal_step_is_analytic_for_any_dead_time(dead_time):
     gain, lag = 8.0, 0.02
     loop = NominalLoopParameters(gain, lag, dead_time)
     t = np.maximum(0.05 * np.arange(1, 9) - dead_time, 0.0)
@@ -293,14 +291,14 @@ def test_nominal_step_is_the_analytic_response_whatever_the_dead_time(dead_time)
     )
 
 
-def test_averaged_samples_are_the_mean_of_the_newest_measurements():
+def test_samples_are_the_mean_of_the_newest_measurements():
     fine = nominal_step_response(NominalLoopParameters(), SampleTiming(0.01, 1, 1), 40)
     coarse = nominal_step_response(NominalLoopParameters(), SampleTiming(0.01, 5, 3), 8)
     expected = [fine[5 * j - 3 : 5 * j].mean() for j in range(1, 9)]
     np.testing.assert_allclose(coarse, expected, rtol=1e-9)
 
 
-def test_random_levels_hold_as_long_as_asked_and_stay_in_range():
+def test_random_levels_have_the_given_duration_and_range():
     levels = random_levels(np.random.default_rng(11), 20_000, 8.0)
     changes = np.count_nonzero(np.diff(levels))
     assert 20_000 / changes == pytest.approx(8.0, rel=0.1)
@@ -308,7 +306,7 @@ def test_random_levels_hold_as_long_as_asked_and_stay_in_range():
     assert abs(levels.mean()) < 0.05
 
 
-def test_the_run_is_the_same_for_the_same_seed_and_obeys_the_nominal_loop_at_rest():
+def test_simulated_run_is_reproducible_and_nominal_at_rest():
     first = simulate_excitation(
         NominalLoopParameters(), ExcitationParameters(), TIMING, 20.0, np.random.default_rng(1)
     )
@@ -327,7 +325,7 @@ def test_the_run_is_the_same_for_the_same_seed_and_obeys_the_nominal_loop_at_res
     )
 
 
-def test_pre_training_predicts_the_next_error_of_a_run_it_has_not_seen():
+def test_pretraining_predicts_an_unseen_run():
     machine, rls = _machine(), make_rls_state(12)
     generator = np.random.default_rng(12)
     excitation = ExcitationParameters(noise=0.0, disturbance=0.0)
@@ -354,7 +352,7 @@ def test_pre_training_predicts_the_next_error_of_a_run_it_has_not_seen():
     assert np.all(np.linalg.eigvalsh(rls.prior) > 0.0)
 
 
-def test_runs_that_cannot_be_learnt_are_refused():
+def test_invalid_runs_are_rejected():
     machine, rls = _machine(), make_rls_state(12)
     with pytest.raises(ValueError, match='one length'):
         pretrain(machine, rls, np.zeros(50), np.zeros(40), ExcitationParameters(), 1.0, 0.1)
@@ -366,14 +364,14 @@ def test_runs_that_cannot_be_learnt_are_refused():
         split_runs(np.zeros((50, 3)), np.zeros((50, 3)), 2)
 
 
-def test_a_recorded_run_is_split_in_time_and_turned_newest_first():
+def test_a_recorded_run_is_split_in_time_and_reversed():
     errors = np.arange(16.0).reshape(8, 2)
     runs = split_runs(errors, -errors, 2)
     np.testing.assert_array_equal(runs[1][0][0], [11.0, 9.0, 7.0, 5.0, 3.0, 1.0])
     np.testing.assert_array_equal(runs[1][1][1], [-15.0, -13.0])
 
 
-def test_more_noise_than_taught_makes_prediction_worse_but_never_absurd():
+def test_more_noise_than_in_pretraining_remains_bounded():
     machine, rls = _machine(), make_rls_state(12)
     generator = np.random.default_rng(13)
     excitation = ExcitationParameters()

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The bounded program: its optimum, certified by the Karush-Kuhn-Tucker conditions."""
+"""Quadratic program: optimum verified by the Karush-Kuhn-Tucker conditions."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def _matrix(steps, moves):
 
 
 def _random(generator):
-    """Return a random program: sizes, scales, and the degenerate cases of the field."""
+    """Return a random program: sizes, scales and degenerate cases."""
     moves = int(generator.integers(1, 21))
     horizon = int(generator.integers(moves, 22))
     kind = generator.integers(0, 8)
@@ -40,19 +40,19 @@ def _random(generator):
     if kind < 2:
         steps = generator.standard_normal(horizon)
     elif kind == 2:
-        steps = np.zeros(horizon)  # a machine that does not know v_p
+        steps = np.zeros(horizon)  # a machine without knowledge of v_p
     free = generator.standard_normal(horizon) * 10 ** generator.uniform(-3, 3)
     mu, pi = 10 ** generator.uniform(-2, 2), 10 ** generator.uniform(-6, 1)
     dv_max, v_max = 10 ** generator.uniform(-2, 2), 10 ** generator.uniform(-2, 2)
     draw = generator.random()
     if draw < 0.05:
-        v_max = 0.0  # faded out
+        v_max = 0.0  # no authority
     elif draw < 0.10:
         dv_max = 0.0
     elif draw < 0.11:
         dv_max = v_max = 0.0
     elif draw < 0.3:
-        dv_max = v_max / generator.integers(1, 5)  # bounds that meet in corners
+        dv_max = v_max / generator.integers(1, 5)  # bounds that intersect in corners
     v_previous = generator.uniform(-v_max, v_max)
     if generator.random() < 0.3:
         v_previous = v_max * generator.choice((-1.0, 1.0))  # at its bound: row n_c starts active
@@ -60,7 +60,7 @@ def _random(generator):
 
 
 def _kkt(matrix, free, mu, pi, v_previous, dv_max, v_max, work):
-    """Return the four residuals once more, in plain NumPy and from the definition."""
+    """Return the four residuals from their definition, independently."""
     moves = matrix.shape[1]
     rows = np.vstack((np.eye(moves), np.tril(np.ones((moves, moves)))))
     upper = np.r_[np.full(moves, dv_max), np.full(moves, v_max - v_previous)]
@@ -81,7 +81,7 @@ def _kkt(matrix, free, mu, pi, v_previous, dv_max, v_max, work):
 
 
 def test_ten_thousand_programs_satisfy_karush_kuhn_tucker():
-    """Met on the way: zero bounds, and optima 10⁶ times the bounds, cycled on rounding."""
+    """Zero bounds, and optima 10⁶ times the bounds, may cycle because of rounding."""
     generator = np.random.default_rng(20)
     out = np.zeros(4)
     worst = 0.0
@@ -94,7 +94,7 @@ def test_ten_thousand_programs_satisfy_karush_kuhn_tucker():
     assert worst < 1e-10
 
 
-def test_residual_sees_every_kind_of_wrong_answer():
+def test_residuals_detect_every_kind_of_error():
     matrix, free = _matrix(np.linspace(0.1, 0.5, 6), 3), np.ones(6)
     work, out = make_workspace(3), np.zeros(4)
     problem = (0.0, 0.2, 0.3)
@@ -150,7 +150,7 @@ def test_forty_programs_agree_with_an_independent_solver():
     assert agreed > 30
 
 
-def test_with_bounds_on_the_changes_only_it_is_bounded_least_squares():
+def test_with_bounds_on_changes_it_is_bounded_least_squares():
     generator = np.random.default_rng(4)
     for _ in range(40):
         moves = int(generator.integers(1, 11))
@@ -164,8 +164,8 @@ def test_with_bounds_on_the_changes_only_it_is_bounded_least_squares():
         np.testing.assert_allclose(work.changes, found.x, atol=1e-9)
 
 
-def test_without_active_bounds_it_is_the_closed_form_with_its_minus_sign():
-    """E10: as printed, (62) climbs: the error would grow instead of falling."""
+def test_without_active_bounds_it_is_the_closed_form():
+    """E10: as printed, (62) increases the cost."""
     generator = np.random.default_rng(5)
     matrix, free = _matrix(generator.standard_normal(8), 4), generator.standard_normal(8)
     work = make_workspace(4)
@@ -178,7 +178,7 @@ def test_without_active_bounds_it_is_the_closed_form_with_its_minus_sign():
     assert cost(matrix, free, -closed, 1.5, 0.2) > rest
 
 
-def test_closed_form_62_is_where_the_gradient_61_vanishes_and_where_the_solver_begins():
+def test_gradient_61_is_zero_at_the_closed_form_62():
     generator = np.random.default_rng(8)
     for moves in (1, 4, 9):
         matrix, free = _matrix(generator.standard_normal(9), moves), generator.standard_normal(9)
@@ -208,7 +208,7 @@ def test_cost_has_the_gradient_61():
 
 
 def test_clipping_the_closed_form_is_worse_than_the_optimum():
-    """Why the program is solved: "closed form, then clip" wastes moves that the bounds forbid."""
+    """Clipping the closed form to the bounds is suboptimal, so the program is solved."""
     steps = 0.12 * (1.0 - np.exp(-0.4 * np.arange(1, 11)))
     matrix, free = _matrix(steps, 5), np.full(10, 1.0)
     work = make_workspace(5)
@@ -221,7 +221,7 @@ def test_clipping_the_closed_form_is_worse_than_the_optimum():
     assert ours < 0.98 * cost(matrix, free, clipped, 1.0, 0.001)
 
 
-def test_dependence_of_rows_is_decided_as_by_their_rank():
+def test_dependence_of_rows_agrees_with_their_rank():
     generator = np.random.default_rng(7)
     for _ in range(300):
         moves = int(generator.integers(1, 7))
@@ -237,7 +237,7 @@ def test_dependence_of_rows_is_decided_as_by_their_rank():
                 active.append(int(row))
 
 
-def test_every_status_is_reached_and_then_nothing_moves():
+def test_every_failure_status_gives_zero_changes():
     matrix, free = _matrix(np.linspace(0.1, 0.5, 6), 3), np.ones(6)
     work = make_workspace(3)
     assert solve_quadratic_program(matrix, free, 1.0, 0.01, 5.0, 0.1, 1.0, 100, work) == INFEASIBLE
@@ -257,7 +257,7 @@ def test_every_status_is_reached_and_then_nothing_moves():
         make_workspace(0)
 
 
-def test_v_outside_its_bound_but_within_one_change_is_brought_back():
+def test_v_slightly_outside_its_bound_is_brought_back():
     matrix, free = _matrix(np.linspace(0.1, 0.5, 6), 3), np.zeros(6)
     work, out = make_workspace(3), np.zeros(4)
     assert solve_quadratic_program(matrix, free, 1.0, 0.01, 1.05, 0.1, 1.0, 100, work) == OPTIMAL
@@ -266,7 +266,7 @@ def test_v_outside_its_bound_but_within_one_change_is_brought_back():
 
 
 @pytest.mark.parametrize('moves', [1, 2, 5, 11])
-def test_the_parts_of_a_space_fill_its_stores_and_none_lies_on_another(moves):
+def test_the_parts_of_a_work_space_fill_its_stores_once(moves):
     store, whole = np.zeros(workspace_size(moves)), np.zeros((2, moves + 1), dtype=np.int64)
     work = workspace_view(store, whole, moves)
     for array in work:

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The one table of settings: what it accepts, what it refuses, and how it says so."""
+"""Parameter tables: specification, validation, names, error texts, command line."""
 
 from argparse import ArgumentTypeError
 from dataclasses import dataclass, replace
@@ -33,19 +33,19 @@ class Outer(Parameters):
             raise ParameterError(f'low must be below high: got {self.low} and {self.high}')
 
 
-def test_rows_carry_everything_a_person_needs():
-    rows = {row.name: row for row in Outer.specs()}
-    assert list(rows) == ['low', 'high', 'count', 'levels', 'on', 'inner.gain', 'inner.kind']
-    gain = rows['inner.gain']
+def test_specs_contain_type_default_unit_and_range():
+    specs = {spec.name: spec for spec in Outer.specs()}
+    assert list(specs) == ['low', 'high', 'count', 'levels', 'on', 'inner.gain', 'inner.kind']
+    gain = specs['inner.gain']
     assert (gain.kind, gain.many, gain.default, gain.unit, gain.dynamic) == (
         float, False, 8.0, '1/s', True,
     )  # fmt: skip
     assert gain.bounds() == 'from 0.1 to 100 1/s'
-    assert rows['inner.kind'].bounds() == 'one of a, b'
-    assert rows['count'].bounds() == 'at least 1'
+    assert specs['inner.kind'].bounds() == 'one of a, b'
+    assert specs['count'].bounds() == 'at least 1'
 
 
-def test_flat_and_back_is_the_identity():
+def test_to_dict_and_from_dict_are_inverse():
     table = Outer.from_dict({'inner.gain': 5, 'levels': [1, 2.5], 'count': 7})
     assert table.inner.gain == 5.0
     assert isinstance(table.inner.gain, float)
@@ -68,7 +68,7 @@ def test_flat_and_back_is_the_identity():
         ({'low': 3.0}, ['low must be below high', '3.0', '2.0']),
     ],
 )
-def test_wrong_values_are_refused_with_name_bound_and_value(values, words):
+def test_invalid_values_are_rejected_with_name_bound_and_value(values, words):
     with pytest.raises(ParameterError) as caught:
         Outer.from_dict(values)
     for word in words:
@@ -143,15 +143,15 @@ def test_a_table_with_clashing_names_is_rejected():
                 use()
 
 
-def test_direct_construction_is_checked_too():
+def test_direct_construction_is_validated():
     with pytest.raises(ParameterError):
         Inner(gain=0.0)
     with pytest.raises(ParameterError):
         replace(Outer(), high=0.5)
 
 
-def test_words_of_a_command_line_become_what_the_table_asks_for():
-    """``link.rate=2M`` and the address 5433 must stay text, true must not."""
+def test_assignments_are_parsed_by_the_type_of_the_parameter():
+    """``link.rate=2M`` and the address 5433 remain text, ``true`` does not."""
     words = ['address=5433', 'retries=3', 'cycle_rate=25', 'robot.invert_left=true', 'rate=2M']
     found = parse_assignments(LinkParameters, words)
     assert found == {
@@ -167,7 +167,7 @@ def test_words_of_a_command_line_become_what_the_table_asks_for():
         LinkParameters.from_dict(parse_assignments(LinkParameters, ['nothing_such=1']))
 
 
-def test_numbers_of_a_command_line_are_kept_within_their_bounds():
+def test_bounded_numbers_reject_values_out_of_range():
     read = bounded_float(0.0, 1e6, '1/s²')
     assert (read('0'), read('1e6'), bounded_int(1, 5)('5')) == (0.0, 1e6, 5)
     for text in ('-1', '1000001', 'nan', 'inf'):
