@@ -99,7 +99,7 @@ def _exponents(options: argparse.Namespace) -> int:
 def _compile(options: argparse.Namespace) -> int:
     from t3mpc_ros.control.controller import Controller, ControllerParameters
     from t3mpc_ros.evaluation.closed_loop import MethodSpec, run
-    from t3mpc_ros.evaluation.proposed_method import ProposedParameters, ProposedController
+    from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
     from t3mpc_ros.evaluation.scenario import DRIVES, Scenario
     from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters, make_robot
 
