@@ -11,7 +11,7 @@ from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.closed_loop import LoopRecord, MethodSpec, pretrain, run
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean, paired
 from t3mpc_ros.evaluation.methods import FULL, methods, proposed_parameters
-from t3mpc_ros.evaluation.proposed_method import ProposedParameters, ProposedController
+from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
 from t3mpc_ros.evaluation.scenario import (
     HELD_OUT_SEEDS,
     PRETRAINING_DURATION,
