@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The real robot: bridge, reference, controller and recorder.
+"""Launch the real robot: radio bridge, reference generator, controller and recorder.
 
 ``ros2 launch t3mpc_ros robot.launch.py port:=/dev/serial/by-id/... key_file:=~/.t3mpc_key``
 """
@@ -36,17 +36,17 @@ def generate_launch_description():
     return LaunchDescription(
         [
             DeclareLaunchArgument(
-                'port', default_value='/dev/t3mpc_dongle', description='of the dongle'
+                'port', default_value='/dev/t3mpc_dongle', description='serial port of the dongle'
             ),
             DeclareLaunchArgument(
-                'key_file', default_value='', description='key of the robot; empty: open'
+                'key_file', default_value='', description='key of the robot; empty: no key'
             ),
-            DeclareLaunchArgument('record', default_value='true', description='write a bag'),
+            DeclareLaunchArgument('record', default_value='true', description='record a bag'),
             node('radio_bridge', {'port': text('port'), 'key_file': text('key_file')}),
-            # 50 commands a second over the radio, and as many measurements; a command goes with
-            # the cycle after the one it answers.
+            # The radio link carries 50 commands and 50 measurements per second; a command is sent
+            # one cycle after the measurement that it is computed from.
             node('controller', {'rate': 50.0, 'speed_filter.dead_time': 0.02}),
-            node('reference', {'rate': 50.0}),
+            node('reference_generator', {'rate': 50.0}),
             node('recorder', {}, IfCondition(LaunchConfiguration('record'))),
         ]
     )

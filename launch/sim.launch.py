@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""ros2 launch t3mpc_ros sim.launch.py: the whole loop with the simulated robot."""
+"""Launch the closed loop with the simulated robot: ``ros2 launch t3mpc_ros sim.launch.py``."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from launch_ros.actions import Node
 
 from launch import LaunchDescription
 
-NODES = ('sim_robot', 'controller', 'reference')
+NODES = ('sim_robot', 'controller', 'reference_generator')
 
 
 def generate_launch_description():
@@ -41,9 +41,11 @@ def generate_launch_description():
     )
     return LaunchDescription(
         [
-            DeclareLaunchArgument('namespace', default_value='', description='of every node'),
+            DeclareLaunchArgument(
+                'namespace', default_value='', description='namespace of all nodes'
+            ),
             DeclareLaunchArgument('use_sim_time', default_value='false', description='use /clock'),
-            DeclareLaunchArgument('record', default_value='true', description='write a bag'),
+            DeclareLaunchArgument('record', default_value='true', description='record a bag'),
             *nodes,
             recorder,
         ]

@@ -1,9 +1,9 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""ros2 launch t3mpc_ros two_robots.launch.py: two robots in one world, each in a namespace.
+"""Launch two simulated robots: ``ros2 launch t3mpc_ros two_robots.launch.py``.
 
-With use_sim_time the first robot makes the time for all. They do not bump into each other: each
-knows the walls only.
+Each robot has a namespace. With ``use_sim_time`` the first robot publishes the clock for all
+nodes. The robots do not collide with each other, only with the walls of the world.
 """
 
 from pathlib import Path
@@ -17,35 +17,39 @@ from launch_ros.parameter_descriptions import ParameterValue
 from launch import LaunchDescription
 
 ROBOTS = {
-    'robot_1': {'seed': 1, 'start_x': -0.5, 'start_y': 0.0, 'start_heading': 0.0},
-    'robot_2': {'seed': 2, 'start_x': 0.5, 'start_y': 0.4, 'start_heading': 3.0},
+    'robot_1': {'seed': 1, 'initial_pose.x': -0.5, 'initial_pose.y': 0.0, 'initial_pose.yaw': 0.0},
+    'robot_2': {'seed': 2, 'initial_pose.x': 0.5, 'initial_pose.y': 0.4, 'initial_pose.yaw': 3.0},
 }
 
 
 def generate_launch_description():
     share = Path(get_package_share_directory('t3mpc_ros'))
-    # As text, whatever it looks like: an empty one is no world at all.
+    # A text in any case: an empty value would have no type.
     world = ParameterValue(LaunchConfiguration('world'), value_type=str)
     use_sim_time = LaunchConfiguration('use_sim_time')
     nodes = []
     for name, robot in ROBOTS.items():
         odom, base = f'{name}/odom', f'{name}/base_link'
-        makes_time = {'publish_clock': use_sim_time} if name == min(ROBOTS) else {}
-        given = {
+        clock = {'publish_clock': use_sim_time} if name == min(ROBOTS) else {}
+        parameters = {
             'sim_robot': {
                 'world': world,
                 'odom_frame_id': odom,
                 'base_frame_id': base,
                 'world_frame': 'world',
-                'imu_frame': f'{name}/imu_link',
+                'imu_frame_id': f'{name}/imu_link',
                 'range_frame_prefix': f'{name}/',
                 'right_wheel_name': f'{name}/right_wheel_joint',
                 'left_wheel_name': f'{name}/left_wheel_joint',
                 **robot,
-                **makes_time,
+                **clock,
             },
             'controller': {'frame_id': base},
-            'reference': {'frame_id': odom, 'child_frame_id': base, 'seed': robot['seed']},
+            'reference_generator': {
+                'frame_id': odom,
+                'child_frame_id': base,
+                'seed': robot['seed'],
+            },
         }
         nodes += [
             Node(
@@ -56,16 +60,20 @@ def generate_launch_description():
                 output='screen',
                 parameters=[
                     str(share / 'config' / f'{executable}.yaml'),
-                    {'use_sim_time': use_sim_time, **settings},
+                    {'use_sim_time': use_sim_time, **values},
                 ],
             )
-            for executable, settings in given.items()
+            for executable, values in parameters.items()
         ]
     return LaunchDescription(
         [
-            DeclareLaunchArgument('world', default_value='room', description='world of both'),
             DeclareLaunchArgument(
-                'use_sim_time', default_value='false', description='the first robot makes time'
+                'world', default_value='room', description='world of both robots'
+            ),
+            DeclareLaunchArgument(
+                'use_sim_time',
+                default_value='false',
+                description='the first robot publishes /clock',
             ),
             *nodes,
         ]

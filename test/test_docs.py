@@ -12,7 +12,7 @@ import re
 import pytest
 
 from t3mpc_ros.emulator.fault_injection import FAULT_KINDS
-from t3mpc_ros.nodes.node_parameters import parameters_page
+from t3mpc_ros.nodes.registry import parameters_page
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / 'docs' / 'equations.md'
@@ -162,7 +162,7 @@ def _is_read(node):
 def test_the_page_of_parameters_is_up_to_date():
     assert (ROOT / 'docs' / 'settings.md').read_text() == parameters_page(), (
         'docs/settings.md is out of date: run '
-        '`.venv/bin/python -m t3mpc_ros.nodes.node_parameters > docs/settings.md`'
+        '`.venv/bin/python -m t3mpc_ros.nodes.registry > docs/settings.md`'
     )
 
 

@@ -205,14 +205,14 @@ def test_no_global_random_numbers_and_no_clock_in_libraries():
 
 
 def test_every_yaml_of_config_fits_its_node():
-    from t3mpc_ros.nodes.node_parameters import PARAMETER_CLASSES
+    from t3mpc_ros.nodes.registry import parameter_class
 
     files = sorted((ROOT / 'config').glob('*.yaml'))
     assert files
     for path in files:
         for node, content in yaml.safe_load(path.read_text()).items():
-            table = PARAMETER_CLASSES[node.rsplit('/', 1)[-1]]
-            table.from_dict(_flat(content['ros__parameters']))
+            parameters = parameter_class(node.rsplit('/', 1)[-1])
+            parameters.from_dict(_flat(content['ros__parameters']))
 
 
 def _flat(tree: dict, prefix: str = '') -> dict:

@@ -57,7 +57,7 @@ class DemoOptions:
     @property
     def nodes(self) -> tuple[str, ...]:
         """The nodes, in the order in which they are started."""
-        return 'recorder', 'controller', self.robot_node, 'reference'
+        return 'recorder', 'controller', self.robot_node, 'reference_generator'
 
     @property
     def port(self) -> Path:
@@ -74,7 +74,7 @@ class DemoOptions:
         else:
             given['sim_robot']['noise.variance'] = PAPER_NOISE
         if self.seed is not None:
-            given['reference']['seed'] = self.seed
+            given['reference_generator']['seed'] = self.seed
             if self.robot != 'emulator':
                 given['sim_robot']['seed'] = self.seed
         return given
@@ -138,7 +138,7 @@ def run_demo(options: DemoOptions) -> ReportMetrics:
     parameters['recorder']['snapshot_time'] = 0.0
     # The robot stops last but for the recorder, and its board after it.
     stopped: tuple[str, ...] = (
-        'reference',
+        'reference_generator',
         'controller',
         options.robot_node,
         'recorder',

@@ -1,11 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Closed loop of controller and digital twin without ROS, with faults.
-
-The loop has the timing of the nodes. Each report of the robot carries its stamp to the controller;
-the command computed from it leaves at once, carries that stamp to the command limiter, and arrives
-after the delay of the twin's channel.
-"""
+"""Closed loop of controller and digital twin without ROS, with faults."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -39,7 +34,7 @@ def chaotic_course(duration: float, seed: int = 1) -> Array:
     It is the reference of every offline trial with that seed, see :class:`Scenario`.
     """
     scenario = Scenario('velocity', 0.0, 'nominal', seed, duration, LEAD)
-    return scenario.reference().speeds
+    return scenario.reference().wanted
 
 
 def straight_course(duration: float, speed: float = 0.2, turn: float = 0.0) -> Array:
@@ -74,7 +69,7 @@ class TwinRecord:
 
     time: Array
     """s since the robot started, shape (n,)"""
-    reference: Array
+    wanted: Array
     """rad/s, shape (n, 2)"""
     asked: Array
     """What the controller sent, rad/s, shape (n, 2)"""
@@ -229,12 +224,12 @@ class _RecordWriter:
         self._robot_says.append(state.reason)
         self._controller_says.append(reason)
 
-    def record(self, reference: Array) -> TwinRecord:
+    def record(self, wanted: Array) -> TwinRecord:
         asked, commanded, measured, rotors, ground = self._wheels
         odometry, truth = self._poses
         return TwinRecord(
             time=self._time,
-            reference=reference,
+            wanted=wanted,
             asked=asked,
             commanded=commanded,
             measured=measured,

@@ -2,42 +2,57 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ros2 run t3mpc_ros composed``: runs several nodes of the package in one process."""
 
-from importlib import import_module
+from dataclasses import dataclass
 from typing import Any
 
 from t3mpc_ros.nodes.common.base_node import BaseNode
 from t3mpc_ros.nodes.common.introspection import RCLError
-from t3mpc_ros.nodes.node_parameters import AllInOneParameters
-from t3mpc_ros.parameters.table import ParameterError
+from t3mpc_ros.nodes.registry import node_module
+from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 
-MODULES = {'recorder': 'recorder.node', 'reference': 'reference_generator'}
+CONFIGURATION_ERRORS: tuple[type[Exception], ...] = ()
+"""Errors of :func:`make` other than :class:`ParameterError`; it converts those of the nodes."""
 
 
-class ComposedNode(BaseNode[AllInOneParameters]):
-    """Says which nodes this process runs."""
+@dataclass(frozen=True)
+class ComposedParameters(Parameters):
+    """Parameters of the composed process."""
 
-    def __init__(self, **given: Any) -> None:
-        super().__init__('all_in_one', AllInOneParameters, **given)
+    nodes: tuple[str, ...] = parameter(
+        ('sim_robot', 'controller', 'reference_generator', 'recorder'),
+        'nodes to run in this process',
+        choices=('sim_robot', 'controller', 'reference_generator', 'recorder'),
+    )
+
+
+class ComposedNode(BaseNode[ComposedParameters]):
+    """Node of the process itself: holds the list of nodes to run."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__('composed', ComposedParameters, **options)
 
 
 def make() -> list[BaseNode]:
-    """Return the nodes of this process, the chosen ones and one that stands for the process.
+    """Return the chosen nodes and the node of the process.
 
     Raises
     ------
     ParameterError
-        Two nodes want one topic in different types: within a process ROS refuses the second.
+        A node cannot be made with its parameters, or two nodes use one topic with different
+        types, which ROS does not allow within a process.
     """
-    chooser = ComposedNode()
+    process = ComposedNode()
     nodes: list[BaseNode] = []
-    # The recorder last: what it expects must not forbid what the others publish.
-    for name in sorted(chooser.parameters.nodes, key='recorder'.__eq__):
+    # The recorder last: its early subscriptions must not fix the type of a topic.
+    for name in sorted(process.parameters.nodes, key='recorder'.__eq__):
+        module = node_module(name)
         try:
-            module = MODULES.get(name, name)
-            nodes += import_module(f't3mpc_ros.nodes.{module}').make()
+            nodes += module.make()
+        except module.CONFIGURATION_ERRORS as error:
+            raise ParameterError(str(error)) from error
         except RCLError as error:
             raise ParameterError(
                 f'{name} cannot share a process with {", ".join(n.get_name() for n in nodes)}; '
-                f'is stamped the same for all? ({error})'
+                f'set enable_stamped_cmd_vel to the same value for all ({error})'
             ) from error
-    return [*nodes, chooser]
+    return [*nodes, process]

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""``ros2 run t3mpc_ros controller``: subscribes to ``reference`` and ``odom``, publishes ``cmd_vel``."""
+"""``ros2 run t3mpc_ros controller``: tracks ``reference`` with ``odom``, publishes ``cmd_vel``."""
 
 from array import array
 from collections.abc import Mapping
@@ -22,62 +22,112 @@ from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.control.controller import Controller, ControllerParameters, Status
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.control.watchdog import Reason
-from t3mpc_ros.geometry.types import STANDSTILL, BodyTwist
+from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist
 from t3mpc_ros.nodes.common import conversions, introspection, qos
 from t3mpc_ros.nodes.common.base_node import ERROR, OK, WARN, BaseNode, publish_and_wait_for_acked
 from t3mpc_ros.parameters.table import group, parameter
 
+CONFIGURATION_ERRORS = (ModelError,)
+"""Errors of :func:`make` other than :class:`ParameterError`."""
+
+WHEELS = ('right', 'left')
+INITIAL_INPUT_TIME_NS = 10 * NANOSECONDS
+"""Time from the first input for which inputs are republished on ``~/initial_inputs/*``."""
+WATCHDOG_PERIOD = 0.05
+"""Time between two checks for an odometry timeout, s."""
+
 
 @dataclass(frozen=True)
 class ControllerNodeParameters(ControllerParameters):
-    """The controller as a node."""
+    """Parameters of the controller node."""
 
-    # A stepper's rotor follows its field at once; the lag of 0.02 s is that of the servo.
+    # The rotor of a stepper motor follows its field at once; the lag of 0.02 s is that of the
+    # velocity drive.
     speed_filter: SpeedFilterParameters = group(SpeedFilterParameters, lag=0.003)
-    stamped: bool = parameter(False, 'publish cmd_vel as TwistStamped instead of Twist')
+    enable_stamped_cmd_vel: bool = parameter(
+        False, 'publish cmd_vel as TwistStamped instead of Twist'
+    )
     frame_id: str = parameter('base_link', 'frame of a stamped command')
     terms_rate: float = parameter(
         20.0,
-        'how often the plain numbers (~/error, ~/estimate, ~/terms, ~/lyapunov, ~/skill) are '
-        'published; 0 turns them off',
+        'rate of the scalar topics (~/error, ~/estimate, ~/terms, ~/lyapunov, ~/skill); 0 = none',
         unit='Hz',
         low=0.0,
         high=1000.0,
     )
-    model: str = parameter('', 'model file to start from; empty = learn from nothing')
+    model: str = parameter('', 'model file to load at start; empty = start without learnt weights')
     model_output: str = parameter('controller_model.npz', 'file that ~/save_model writes')
 
 
-WHEELS = ('right', 'left')
+class InitialInputs:
+    """Republishes the first messages of an input on a transient-local topic.
+
+    A recorder that discovers the controller late receives them and can replay the run from its
+    beginning, while the input itself is volatile.
+
+    Parameters
+    ----------
+    node
+        Node that publishes.
+    name
+        Name of the input.
+    """
+
+    def __init__(self, node: BaseNode[ControllerNodeParameters], name: str) -> None:
+        self._node = node
+        self._publisher = node.create_publisher(
+            Odometry, f'~/initial_inputs/{name}', qos.INITIAL_INPUTS
+        )
+        self._remaining = qos.INITIAL_INPUTS.depth
+        self._end_ns: int | None = None
+
+    def republish(self, message: Odometry) -> None:
+        """Publish a message received within the first 10 s, as long as all of them are kept."""
+        if not self._remaining:
+            return
+        now_ns = self._node.steady_ns()
+        if self._end_ns is None:
+            self._end_ns = now_ns + INITIAL_INPUT_TIME_NS
+        if now_ns >= self._end_ns:
+            self._remaining = 0
+            return
+        self._remaining -= 1
+        self._publisher.publish(message)
 
 
 class ControllerNode(BaseNode[ControllerNodeParameters]):
-    """Publishes the controller's command each time the robot reports its motion."""
+    """Runs one control step per odometry message and publishes the command."""
 
-    def __init__(self, **given: Any) -> None:
-        super().__init__('controller', ControllerNodeParameters, **given)
-        self.get_logger().info('preparing (the first start compiles, for half a minute)')
+    def __init__(self, **options: Any) -> None:
+        super().__init__('controller', ControllerNodeParameters, **options)
+        self.get_logger().info('initialising (the first start compiles the kernels, about 30 s)')
         self._controller = Controller(self.parameters)
-        self._controller.warm_up()  # compile and pre-train now, never inside a step
+        self._controller.warm_up()  # compile and pre-train here, not within a step
         self._journal = Journal()
-        self._rows = self.create_publisher(Int64MultiArray, '~/journal', qos.JOURNAL)
-        self._row = Int64MultiArray(data=self._journal.row)
-        self._revisions = self.create_publisher(String, '~/settings', qos.PARAMETER_REVISIONS)
-        self._tell_settings()
+        self._journal_publisher = self.create_publisher(Int64MultiArray, '~/journal', qos.JOURNAL)
+        self._journal_message = Int64MultiArray(data=self._journal.row)
+        self._revision_publisher = self.create_publisher(
+            String, '~/settings', qos.PARAMETER_REVISIONS
+        )
+        self._publish_parameters()
         self._load_model()
-        self._heard_ns: int | None = None
+        self._last_odometry_ns: int | None = None
         self._steps = 0
-        self._refused = 0
-        self._said = self._controller.status.reason
-        self._type = TwistStamped if self.parameters.stamped else Twist
-        self._command = self.create_publisher(self._type, 'cmd_vel', qos.COMMAND)
-        self._numbers = self._number_publishers() if self.parameters.terms_rate else {}
+        self._rejected_references = 0
+        self._logged_reason = self._controller.status.reason
+        self._command_type = TwistStamped if self.parameters.enable_stamped_cmd_vel else Twist
+        self._command_publisher = self.create_publisher(self._command_type, 'cmd_vel', qos.COMMAND)
+        self._scalar_publishers = (
+            self._create_scalar_publishers() if self.parameters.terms_rate else {}
+        )
+        self._initial_reference = InitialInputs(self, 'reference')
+        self._initial_odometry = InitialInputs(self, 'odom')
         self.create_subscription(Odometry, 'reference', self._on_reference, qos.STREAM)
         self.create_subscription(Odometry, 'odom', self._on_odometry, qos.STREAM)
         self.create_service(SetBool, '~/enable', self._on_enable)
         self.create_service(Trigger, '~/reset', self._on_reset)
         self.create_service(Trigger, '~/save_model', self._on_save_model)
-        self.every(0.05, self._on_watch)
+        self.create_steady_timer(WATCHDOG_PERIOD, self._on_watchdog)
 
     def _load_model(self) -> None:
         path = self.parameters.model
@@ -86,66 +136,69 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         try:
             self._controller.law.set_weights(load_model(Path(path)))
         except ValueError as error:
-            raise ModelError(f'{path} does not fit these settings: {error}') from error
-        self._note(self._journal.model(zlib.crc32(Path(path).read_bytes())))
+            raise ModelError(f'{path} does not fit the parameters: {error}') from error
+        self._publish_journal(self._journal.model(zlib.crc32(Path(path).read_bytes())))
 
-    def configure(self, parameters: ControllerNodeParameters) -> None:
-        """Hand live settings on to the controller."""
+    def on_parameters_changed(self, parameters: ControllerNodeParameters) -> None:
+        """Apply dynamic parameters to the controller and record them in the journal."""
         self._controller.configure(parameters)
         row = self._journal.configure()
-        self._tell_settings()
-        self._note(row)
+        self._publish_parameters()
+        self._publish_journal(row)
 
-    def _tell_settings(self) -> None:
+    def _publish_parameters(self) -> None:
         text = parameters_to_json(self._journal.revision, self.parameters.to_dict())
-        self._revisions.publish(String(data=text))
+        self._revision_publisher.publish(String(data=text))
 
-    def _note(self, row: 'array[int]') -> None:
-        """Publish a row of the journal: after the command, which cannot wait."""
-        self._row.data = row
-        self._rows.publish(self._row)
+    def _publish_journal(self, row: 'array[int]') -> None:
+        """Publish a row of the journal, after the command to keep the latency of the latter."""
+        self._journal_message.data = row
+        self._journal_publisher.publish(self._journal_message)
 
     def _on_reference(self, message: Odometry) -> None:
-        motion = conversions.state_from_odometry(message)
-        self._journal.reference(motion.stamp_ns)
-        if not self._controller.add_reference(motion):
-            self._refused += 1
+        state = conversions.state_from_odometry(message)
+        self._journal.reference(state.stamp_ns)
+        if not self._controller.add_reference(state):
+            self._rejected_references += 1
+        self._initial_reference.republish(message)
 
     def _on_odometry(self, message: Odometry) -> None:
-        self._heard_ns = self.steady_ns()
+        self._last_odometry_ns = self.steady_ns()
         measured = conversions.state_from_odometry(message)
         command, status = self._controller.step(measured)
-        self._publish(command, status.stamp_ns)
-        self._note(self._journal.step(measured.stamp_ns))
+        self._publish_command(command, status.stamp_ns)
+        self._publish_journal(self._journal.step(measured.stamp_ns))
+        self._initial_odometry.republish(message)
         self._steps += 1
-        if self._numbers and self._steps % self._every_step() == 0:
-            self._publish_numbers(status)
-        self._tell(status)
+        if self._scalar_publishers and self._steps % self._steps_per_scalar() == 0:
+            self._publish_scalars(status)
+        self._log_reason(status)
 
-    def _on_watch(self) -> None:
-        if self._heard_ns is None:
+    def _on_watchdog(self) -> None:
+        if self._last_odometry_ns is None:
             return
-        if self._controller.check_odometry(self._heard_ns, self.steady_ns()):
-            self._publish(STANDSTILL, self.now_ns())
-            self._note(self._journal.silent(self._controller.status.stamp_ns))
-            self._tell(self._controller.status)
+        if self._controller.check_odometry(self._last_odometry_ns, self.steady_ns()):
+            self._publish_command(STANDSTILL, self.now_ns())
+            self._publish_journal(self._journal.silent(self._controller.status.stamp_ns))
+            self._log_reason(self._controller.status)
 
-    def _publish(self, command: BodyTwist, stamp_ns: int) -> None:
-        if self.parameters.stamped:
-            message = conversions.stamped_twist(command, stamp_ns, self.parameters.frame_id)
-        else:
-            message = conversions.twist_from_body(command)
-        self._command.publish(message)
+    def _publish_command(self, command: BodyTwist, stamp_ns: int) -> None:
+        self._command_publisher.publish(self._command_message(command, stamp_ns))
 
-    def _tell(self, status: Status) -> None:
-        if status.reason is not self._said:
-            self._said = status.reason
+    def _command_message(self, command: BodyTwist, stamp_ns: int) -> Twist | TwistStamped:
+        if self.parameters.enable_stamped_cmd_vel:
+            return conversions.stamped_twist(command, stamp_ns, self.parameters.frame_id)
+        return conversions.twist_from_body(command)
+
+    def _log_reason(self, status: Status) -> None:
+        if status.reason is not self._logged_reason:
+            self._logged_reason = status.reason
             self.get_logger().info(status.reason.value)
 
-    def _every_step(self) -> int:
+    def _steps_per_scalar(self) -> int:
         return max(1, round(self.parameters.rate / self.parameters.terms_rate))
 
-    def _number_publishers(self) -> dict[str, Publisher]:
+    def _create_scalar_publishers(self) -> dict[str, Publisher]:
         wheels = [
             f'{name}/{wheel}'
             for name in (
@@ -160,33 +213,33 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         names = [*wheels, 'lyapunov/value', 'lyapunov/margin']
         return {name: self.create_publisher(Float64, f'~/{name}', qos.SCALARS) for name in names}
 
-    def _publish_numbers(self, status: Status) -> None:
+    def _publish_scalars(self, status: Status) -> None:
         for i, wheel in enumerate(WHEELS):
-            self._number(f'error/{wheel}', status.error[i])
-            self._number(f'estimate/{wheel}', status.estimate[i])
-            self._number(f'skill/{wheel}', status.skill[i])
-            self._number(f'terms/applied/{wheel}', status.applied[i])
+            self._publish_scalar(f'error/{wheel}', status.error[i])
+            self._publish_scalar(f'estimate/{wheel}', status.estimate[i])
+            self._publish_scalar(f'skill/{wheel}', status.skill[i])
+            self._publish_scalar(f'terms/applied/{wheel}', status.applied[i])
             for row, term in enumerate(TERM_NAMES):
-                self._number(f'terms/{term}/{wheel}', status.terms[row, i])
-        self._number('lyapunov/value', status.certificate.value)
-        self._number('lyapunov/margin', status.certificate.margin)
+                self._publish_scalar(f'terms/{term}/{wheel}', status.terms[row, i])
+        self._publish_scalar('lyapunov/value', status.certificate.value)
+        self._publish_scalar('lyapunov/margin', status.certificate.margin)
 
-    def _number(self, name: str, value: float) -> None:
-        if math.isfinite(value):  # an error without a reference is no number to plot
-            self._numbers[name].publish(Float64(data=float(value)))
+    def _publish_scalar(self, name: str, value: float) -> None:
+        if math.isfinite(value):  # the error is NaN while there is no reference
+            self._scalar_publishers[name].publish(Float64(data=float(value)))
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._controller.enable(request.data)
-        self._note(self._journal.enable(request.data))
+        self._publish_journal(self._journal.enable(request.data))
         response.success = True
         response.message = 'the robot may move' if request.data else 'the robot is stopped'
         return response
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._controller.reset()
-        self._note(self._journal.reset())
+        self._publish_journal(self._journal.reset())
         response.success = True
-        response.message = 'everything learnt in this run is forgotten'
+        response.message = 'learnt weights of this run are discarded'
         return response
 
     def _on_save_model(
@@ -204,7 +257,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         return response
 
     def produce_diagnostics(self) -> tuple[bytes, str, Mapping[str, object]]:
-        """Return whether the robot may move, and if not why not."""
+        """Return whether the controller tracks the reference, or the reason of the stop."""
         status = self._controller.status
         values = {
             'reason': status.reason.value,
@@ -215,32 +268,28 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             'ultimate_bound_rad_s': self._controller.law.ultimate_bound,
             'skill_right': float(status.skill[0]),
             'skill_left': float(status.skill[1]),
-            'references_refused': self._refused,
+            'references_rejected': self._rejected_references,
         }
         waiting = self._steps == 0
         stopped = f'stopped: {status.reason.value}'
         if not status.reason.moves and not waiting:
             return ERROR, stopped, values
-        if other := introspection.mismatched_type(self, 'cmd_vel', self._type, subscribers=True):
-            return WARN, f'cmd_vel is taken as {other} by another node: set stamped', values
+        if problem := introspection.command_type_problem(self, self._command_type, publish=True):
+            return WARN, problem, values
         if waiting:
             return WARN, stopped, values
         if status.reason is Reason.NOT_FOLLOWING:
             return WARN, status.reason.value, values
-        if self._refused:
-            return WARN, 'references that are not finite were ignored', values
+        if self._rejected_references:
+            return WARN, 'reference messages with non-finite values were ignored', values
         return OK, status.reason.value, values
 
-    def finish(self) -> None:
-        """Stop the robot."""
-        publish_and_wait_for_acked(self._command, self._stop_message())
-        self._row.data = self._journal.finish()
-        publish_and_wait_for_acked(self._rows, self._row)
-
-    def _stop_message(self) -> Twist | TwistStamped:
-        if self.parameters.stamped:
-            return conversions.stamped_twist(STANDSTILL, self.now_ns(), self.parameters.frame_id)
-        return conversions.twist_from_body(STANDSTILL)
+    def on_shutdown(self) -> None:
+        """Publish a zero command and the last row of the journal."""
+        stop = self._command_message(STANDSTILL, self.now_ns())
+        publish_and_wait_for_acked(self._command_publisher, stop)
+        self._journal_message.data = self._journal.finish()
+        publish_and_wait_for_acked(self._journal_publisher, self._journal_message)
 
 
 def make() -> list[ControllerNode]:

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""``ros2 run t3mpc_ros sim_robot``: the simulated robot with the topics and services of the real one."""
+"""``ros2 run t3mpc_ros sim_robot``: simulated robot with topics and services of the real one."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,9 +12,8 @@ from std_srvs.srv import Trigger
 
 from t3mpc_ros.geometry.timing import RealTimeFactor, SampleScheduler, SimulatedTime
 from t3mpc_ros.geometry.types import NANOSECONDS, Pose
-from t3mpc_ros.nodes.common import conversions, introspection, qos
+from t3mpc_ros.nodes.common import conversions, diagnostics, introspection, qos
 from t3mpc_ros.nodes.common.base_node import ERROR, NO_CLOCK, OK, WARN, BaseNode
-from t3mpc_ros.nodes.common.diagnostics import complaints, measures
 from t3mpc_ros.nodes.common.robot_publishers import (
     RobotDescription,
     RobotPublishers,
@@ -22,7 +21,7 @@ from t3mpc_ros.nodes.common.robot_publishers import (
 )
 from t3mpc_ros.nodes.common.robot_services import RobotServices
 from t3mpc_ros.nodes.common.sensor_messages import count_variance
-from t3mpc_ros.parameters.table import ParameterError, parameter
+from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
 from t3mpc_ros.robot.interface import RobotCommand, RobotState
 from t3mpc_ros.simulation.digital_twin import (
     DigitalTwin,
@@ -30,65 +29,82 @@ from t3mpc_ros.simulation.digital_twin import (
     TwinDiagnostics,
     make_robot,
 )
-from t3mpc_ros.simulation.fault_injection import active_faults
+from t3mpc_ros.simulation.fault_injection import ScheduleError, active_faults
+from t3mpc_ros.simulation.world import WorldError
+
+CONFIGURATION_ERRORS = (WorldError, ScheduleError)
+"""Errors of :func:`make` other than :class:`ParameterError`."""
+
+MIN_TIMER_PERIOD, MAX_TIMER_PERIOD = 0.001, 0.05
+"""Limits of the timer period, s."""
+
+MIN_REAL_TIME_SHARE = 0.9
+"""Share of the set real-time factor below which the diagnostics warn."""
 
 
 @dataclass(frozen=True)
-class SimRobotNodeParameters(RobotTopicParameters, DigitalTwinParameters):
-    """The simulated robot as a node."""
+class InitialPoseParameters(Parameters):
+    """Pose in the world at start, and after ``~/set_pose``."""
 
-    world_frame: str = parameter('odom', 'frame of ground_truth/odom')
-    publish_clock: bool = parameter(
-        False, 'make the time, and publish it as /clock, instead of following the machine'
+    x: float = parameter(
+        0.0, 'x of the robot at start and after ~/set_pose', unit='m', dynamic=True
     )
-    speed: float = parameter(
+    y: float = parameter(
+        0.0, 'y of the robot at start and after ~/set_pose', unit='m', dynamic=True
+    )
+    yaw: float = parameter(
+        0.0, 'yaw of the robot at start and after ~/set_pose', unit='rad', dynamic=True
+    )
+
+
+@dataclass(frozen=True)
+class SimRobotParameters(RobotTopicParameters, DigitalTwinParameters):
+    """Parameters of the simulated robot node."""
+
+    world_frame: str = parameter('map', 'frame of ground_truth/odom')
+    publish_clock: bool = parameter(
+        False, 'generate simulated time and publish it on /clock, instead of using the node clock'
+    )
+    real_time_factor: float = parameter(
         1.0,
-        'simulated seconds per second; 0 = time stands, and ~/step moves it. Other than 1 with '
-        'publish_clock only',
+        'simulated seconds per second; 0 = paused, ~/step advances the time. Values other than 1 '
+        'need publish_clock',
         low=0.0,
         high=100.0,
         dynamic=True,
     )
     step_time: float = parameter(
         0.01,
-        'time that ~/step lets pass: whole periods, at least one',
+        'simulated time that ~/step advances: whole periods, at least one',
         unit='s',
         low=0.001,
-        # Streams are made up for, and queues hold, no more than this at once.
+        # Subscription queues hold the messages of at most this time.
         high=0.5,
         dynamic=True,
     )
-    start_x: float = parameter(
-        0.0, 'where the robot stands at first, and ~/set_pose puts it', unit='m', dynamic=True
-    )
-    start_y: float = parameter(
-        0.0, 'where the robot stands at first, and ~/set_pose puts it', unit='m', dynamic=True
-    )
-    start_heading: float = parameter(
-        0.0, 'where it looks at first, and ~/set_pose points it', unit='rad', dynamic=True
-    )
+    initial_pose: InitialPoseParameters = group(InitialPoseParameters)
 
     @property
-    def start(self) -> Pose:
-        """Where the robot stands at first, in the world."""
-        return Pose(self.start_x, self.start_y, self.start_heading)
+    def pose(self) -> Pose:
+        """Initial pose in the world."""
+        return Pose(self.initial_pose.x, self.initial_pose.y, self.initial_pose.yaw)
 
     @property
     def step_periods(self) -> int:
-        """How many periods ``~/step`` lets pass."""
+        """Number of periods that ``~/step`` advances."""
         return max(1, round(self.step_time * self.rate))
 
     def check_consistency(self) -> None:
-        """Raise :class:`ParameterError` for a drive that takes no velocities, or has not the parts.
+        """Raise :class:`ParameterError` for a drive that the node or the settings cannot use.
 
-        And for a time of its own that nobody would hear of.
+        Also for a real-time factor other than 1 without ``publish_clock``.
         """
         super().check_consistency()
         kind = self.drive.kind
         if kind == 'torque':
             raise ParameterError(
                 'drive.kind must be stepper or velocity, because cmd_vel is a velocity: '
-                'got torque, which is for the lab'
+                'got torque, which only the evaluation uses'
             )
         if kind == 'velocity':
             faults = {
@@ -101,79 +117,63 @@ class SimRobotNodeParameters(RobotTopicParameters, DigitalTwinParameters):
                         f'drive.kind must be stepper for {name} to have an effect: '
                         f'got velocity with {value if isinstance(value, str) else value[0]}'
                     )
-        if self.speed != 1.0 and not self.publish_clock:
+        if self.real_time_factor != 1.0 and not self.publish_clock:
             raise ParameterError(
-                'publish_clock must be true at start for a speed other than 1, or nobody hears '
-                f'what time it is: got speed {self.speed:g} without it'
+                'publish_clock must be true at start for a real_time_factor other than 1: got '
+                f'real_time_factor {self.real_time_factor:g} with publish_clock false'
             )
 
 
-MIN_TIMER_PERIOD, MAX_TIMER_PERIOD = 0.001, 0.05
-"""s; the machine wakes up neither more often, nor less often, than this."""
+class SimRobotNode(BaseNode[SimRobotParameters]):
+    """Advances the simulated robot on an exact time grid and publishes its measurements.
 
-MIN_SPEED_SHARE = 0.9
-"""Share of the asked-for speed from which on nobody needs to hear that it is not reached."""
-
-
-def _robot_description(parameters: SimRobotNodeParameters) -> RobotDescription:
-    """Return what the robot of these settings is like."""
-    rate, variance = parameters.rate, parameters.noise.variance
-    if parameters.drive.kind != 'stepper':
-        return RobotDescription(rate, parameters.geometry, variance, None, parameters.world_frame)
-    variance += count_variance(parameters.motor.microstep, 1.0 / rate)
-    sensors = parameters.imu, parameters.range_sensor, parameters.battery
-    return RobotDescription(rate, parameters.geometry, variance, sensors, parameters.world_frame)
-
-
-class SimRobotNode(BaseNode[SimRobotNodeParameters]):
-    """Moves the simulated robot on an exact grid of time and publishes what it measures.
-
-    Time is that of the node, or with ``publish_clock`` the robot's own, which may pass faster,
-    slower, or step by step.
+    The time is that of the node, or with ``publish_clock`` simulated time with a real-time factor
+    or single steps.
     """
 
-    def __init__(self, **given: Any) -> None:
-        super().__init__('sim_robot', SimRobotNodeParameters, **given)
+    def __init__(self, **options: Any) -> None:
+        super().__init__('sim_robot', SimRobotParameters, **options)
         parameters = self.parameters
         self._robot = make_robot(parameters)
-        if problem := self._place():
-            raise ParameterError(f'start_x and start_y: {problem}')
-        self._robot.warm_up()  # compile now, never inside a step
-        self._pace = SampleScheduler(parameters.rate, slack=0.2 / parameters.rate)
-        self._own_time = (
-            SimulatedTime(parameters.rate, parameters.speed) if parameters.publish_clock else None
+        if problem := self._set_pose():
+            raise ParameterError(f'initial_pose.x and initial_pose.y: {problem}')
+        self._robot.warm_up()  # compile here, not within a step
+        self._scheduler = SampleScheduler(parameters.rate, slack=0.2 / parameters.rate)
+        self._simulated_time = (
+            SimulatedTime(parameters.rate, parameters.real_time_factor)
+            if parameters.publish_clock
+            else None
         )
-        self._factor = RealTimeFactor()
+        self._real_time_factor = RealTimeFactor()
         self._state: RobotState | None = None
-        self._commands = self._refused = 0
-        self._said = ''
-        self._problem = ''
-        self._topics = RobotPublishers(self, parameters, _robot_description(parameters))
+        self._commands = self._rejected_commands = 0
+        self._last_problem = ''
+        self._logged_reason = ''
+        self._robot_publishers = RobotPublishers(self, parameters, _robot_description(parameters))
         if parameters.publish_clock:
-            self._clock_topic = self.create_publisher(Clock, '/clock', qos.LATEST)
-        self._type = TwistStamped if parameters.stamped else Twist
-        self.create_subscription(self._type, 'cmd_vel', self._on_command, qos.LATEST)
+            self._clock_publisher = self.create_publisher(Clock, '/clock', qos.LATEST)
+        self._command_type = TwistStamped if parameters.enable_stamped_cmd_vel else Twist
+        self.create_subscription(self._command_type, 'cmd_vel', self._on_command, qos.LATEST)
         RobotServices(self, self._robot, self._robot_now_ns)
         self.create_service(Trigger, '~/set_pose', self._on_set_pose)
         self.create_service(Trigger, '~/step', self._on_step)
-        self._ticks = self.create_timer(self._tick_period(), self._on_tick, clock=self._steady)
+        self._timer = self.create_steady_timer(self._timer_period(), self._on_timer)
 
-    def configure(self, parameters: SimRobotNodeParameters) -> None:
-        """Hand live settings on to the robot."""
+    def on_parameters_changed(self, parameters: SimRobotParameters) -> None:
+        """Apply dynamic parameters to the robot, its messages and the simulated time."""
         self._robot.configure(parameters)
-        self._topics.configure(parameters, _robot_description(parameters))
-        if self._own_time is not None and parameters.speed != self._own_time.real_time_factor:
-            self._own_time.set_real_time_factor(parameters.speed, self.steady_ns())
-            self._factor.restart()
-            self._ticks.timer_period_ns = round(self._tick_period() * NANOSECONDS)
-            self._ticks.reset()
+        self._robot_publishers.configure(parameters, _robot_description(parameters))
+        time, factor = self._simulated_time, parameters.real_time_factor
+        if time is not None and factor != time.real_time_factor:
+            time.set_real_time_factor(factor, self.steady_ns())
+            self._real_time_factor.restart()
+            self._timer.timer_period_ns = round(self._timer_period() * NANOSECONDS)
+            self._timer.reset()
 
-    def _tick_period(self) -> float:
-        samples = self.parameters.rate * self.parameters.speed
+    def _timer_period(self) -> float:
+        rate = self.parameters.rate * self.parameters.real_time_factor
         return (
-            min(max(1.0 / samples, MIN_TIMER_PERIOD), MAX_TIMER_PERIOD)
-            if samples
-            else MAX_TIMER_PERIOD
+            min(max(1.0 / rate, MIN_TIMER_PERIOD), MAX_TIMER_PERIOD) if rate else MAX_TIMER_PERIOD
         )
 
     def _on_command(self, message: Twist | TwistStamped) -> None:
@@ -182,50 +182,53 @@ class SimRobotNode(BaseNode[SimRobotNodeParameters]):
         twist, stamp_ns = conversions.twist_and_stamp(message, now_ns)
         command = RobotCommand.from_twist(twist, self.parameters.geometry, stamp_ns)
         if problem := self._robot.apply(command, now_ns):
-            self._refused += 1
-            if problem != self._problem:
-                # Texts that hold an age differ every time.
-                self.get_logger().warning(f'cmd_vel refused: {problem}', throttle_duration_sec=1.0)
-        self._problem = problem
+            self._rejected_commands += 1
+            if problem != self._last_problem:
+                # Texts with the age of a command differ each time.
+                self.get_logger().warning(
+                    f'cmd_vel rejected: {problem}', throttle_duration_sec=1.0
+                )
+        self._last_problem = problem
 
-    def _on_tick(self) -> None:
-        if self._own_time is None:
-            if not self.clock_received():
+    def _on_timer(self) -> None:
+        if self._simulated_time is None:
+            if not self.clock_started():
                 return
-            stamps = self._pace.due(self._robot_now_ns())
+            stamps = self._scheduler.due(self._robot_now_ns())
         else:
-            stamps = self._own_time.due(self.steady_ns())
-            if not stamps and self._own_time.real_time_factor == 0.0:
-                # For those who come while time stands: they would not know that it is known.
+            stamps = self._simulated_time.due(self.steady_ns())
+            if not stamps and self._simulated_time.real_time_factor == 0.0:
+                # Late subscribers need the paused time, too.
                 self._publish_clock()
         self._advance(stamps)
         if self._state is not None:
-            self._factor.update(self._state.stamp_ns, self.steady_ns())
+            self._real_time_factor.update(self._state.stamp_ns, self.steady_ns())
 
     def _advance(self, stamps: list[int]) -> None:
         for stamp_ns in stamps:
             self._state = state = self._robot.advance(stamp_ns)
-            if self._own_time is not None:
+            if self._simulated_time is not None:
                 self._publish_clock()
-            self._topics.publish(state)
-            if state.reason != self._said:
-                self._said = state.reason
+            self._robot_publishers.publish(state)
+            if state.reason != self._logged_reason:
+                self._logged_reason = state.reason
                 self.get_logger().info(state.reason or 'following commands')
 
     def _publish_clock(self) -> None:
         if self._state is not None:
-            self._clock_topic.publish(Clock(clock=conversions.time_from_ns(self._state.stamp_ns)))
+            stamp = conversions.time_from_ns(self._state.stamp_ns)
+            self._clock_publisher.publish(Clock(clock=stamp))
 
     def _robot_now_ns(self) -> int:
-        # The publisher of the simulated clock cannot wait for it.
-        if self._own_time is None:
+        # The publisher of /clock does not wait for its own message.
+        if self._simulated_time is None:
             return self.now_ns()
-        return self._own_time.now_ns(self.steady_ns())
+        return self._simulated_time.now_ns(self.steady_ns())
 
-    def _place(self) -> str:
-        """Put the robot where the settings say, or return why it cannot stand there."""
+    def _set_pose(self) -> str:
+        """Set the true pose to the initial pose; return why that is impossible, or nothing."""
         try:
-            self._robot.set_pose(self.parameters.start)
+            self._robot.set_pose(self.parameters.pose)
         except ValueError as error:
             return str(error)
         return ''
@@ -233,66 +236,82 @@ class SimRobotNode(BaseNode[SimRobotNodeParameters]):
     def _on_set_pose(
         self, request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        problem = self._place()
-        pose = self.parameters.start
+        problem = self._set_pose()
+        pose = self.parameters.pose
         response.success = not problem
         response.message = problem or (
             f'the robot is at x {pose.x:g} m, y {pose.y:g} m, yaw {pose.yaw:g} rad '
-            '(set start_x, start_y, start_heading)'
+            '(parameters initial_pose.x, initial_pose.y, initial_pose.yaw)'
         )
         return response
 
     def _on_step(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        time = self._own_time
+        time = self._simulated_time
         if time is None:
-            response.message = 'publish_clock must be true at start to go step by step: got false'
+            response.message = 'publish_clock must be true at start for single steps: got false'
         elif time.real_time_factor != 0.0:
-            response.message = f'speed must be 0 to go step by step: got {time.real_time_factor:g}'
+            response.message = (
+                f'real_time_factor must be 0 for single steps: got {time.real_time_factor:g}'
+            )
         else:
             self._advance(time.step(self.parameters.step_periods))
             response.success = True
-            response.message = f'it is {self._robot_now_ns() / NANOSECONDS:.9f} s'
+            response.message = f'simulated time {self._robot_now_ns() / NANOSECONDS:.9f} s'
         return response
 
     def produce_diagnostics(self) -> tuple[bytes, str, Mapping[str, object]]:
-        """Return whether the robot follows commands and is well, and if not why not."""
-        state, inside = self._state, self._inside()
+        """Return whether the robot follows commands, or the reason of its standstill."""
+        state, twin = self._state, self._twin_diagnostics()
         values: dict[str, object] = {
             'commands': self._commands,
-            'commands_refused': self._refused,
+            'commands_rejected': self._rejected_commands,
         }
-        if self._own_time is None:
-            values['lateness_s'] = self._pace.lateness(self._robot_now_ns())
-            values['skipped_samples'] = self._pace.skipped
-        if self._factor.value is not None:
-            values['real_time_factor'] = self._factor.value
+        if self._simulated_time is None:
+            values['lateness_s'] = self._scheduler.lateness(self._robot_now_ns())
+            values['skipped_samples'] = self._scheduler.skipped
+        if self._real_time_factor.value is not None:
+            values['real_time_factor'] = self._real_time_factor.value
         if state is None:
             return ERROR, NO_CLOCK, values
-        values |= measures(state, inside)
+        values |= diagnostics.values(state, twin)
         if state.status.estop:
             return ERROR, state.reason, values
-        if other := introspection.mismatched_type(self, 'cmd_vel', self._type, subscribers=False):
-            return WARN, f'cmd_vel is published as {other} by another node: set stamped', values
-        if slow := self._too_slow():
-            return WARN, f'the machine is too slow: {slow}', values
-        if found := complaints(state, inside):
+        if problem := introspection.command_type_problem(self, self._command_type, publish=False):
+            return WARN, problem, values
+        if overload := self._overload():
+            return WARN, f'processor overloaded: {overload}', values
+        if found := diagnostics.warnings(state, twin):
             return WARN, '; '.join(found), values
         return OK, 'following commands', values
 
-    def _inside(self) -> TwinDiagnostics | None:
+    def _twin_diagnostics(self) -> TwinDiagnostics | None:
         return self._robot.diagnostics if isinstance(self._robot, DigitalTwin) else None
 
-    def _too_slow(self) -> str:
-        if self._pace.skipped:
-            return 'samples were given up'
-        time, factor = self._own_time, self._factor.value
-        if time is not None and factor is not None and factor < MIN_SPEED_SHARE * time.real_time_factor:
-            return f'{factor:.3g} instead of {time.real_time_factor:g} simulated seconds per second'
+    def _overload(self) -> str:
+        if self._scheduler.skipped:
+            return 'samples were skipped'
+        time, factor = self._simulated_time, self._real_time_factor.value
+        if (
+            time is not None
+            and factor is not None
+            and factor < MIN_REAL_TIME_SHARE * time.real_time_factor
+        ):
+            return f'real-time factor {factor:.3g} instead of {time.real_time_factor:g}'
         return ''
 
-    def finish(self) -> None:
+    def on_shutdown(self) -> None:
         """Stop the robot."""
-        self._robot.stop('the robot is switched off', self._robot_now_ns())
+        self._robot.stop('the node is shut down', self._robot_now_ns())
+
+
+def _robot_description(parameters: SimRobotParameters) -> RobotDescription:
+    """Return the properties of the simulated robot."""
+    rate, variance = parameters.rate, parameters.noise.variance
+    if parameters.drive.kind != 'stepper':
+        return RobotDescription(rate, parameters.geometry, variance, None, parameters.world_frame)
+    variance += count_variance(parameters.motor.microstep, 1.0 / rate)
+    sensors = parameters.imu, parameters.range_sensor, parameters.battery
+    return RobotDescription(rate, parameters.geometry, variance, sensors, parameters.world_frame)
 
 
 def make() -> list[SimRobotNode]:

@@ -537,13 +537,9 @@ class Feedback(BaselineController):
             raise RuntimeError('asked to fail')
         self._gain, self._period = parameters.gain, nominal_model.period
 
-    def step(self, observation):
-        forward = (observation.next_reference - observation.reference) / self._period
-        return (
-            forward
-            - observation.unexplained
-            - self._gain * (observation.speeds - observation.reference)
-        )
+    def step(self, view):
+        forward = (view.wanted_next - view.wanted) / self._period
+        return forward - view.unexplained - self._gain * (view.speeds - view.wanted)
 
 
 FEEDBACK = MethodDefinition(
@@ -728,22 +724,22 @@ def test_time_left_is_rounded(seconds, words):
 
 def test_settings_that_do_not_fit_together_cost_an_evaluation_and_no_run(tmp_path):
     """The table refuses a + c beyond 1500, though each is in range."""
-    method = MethodDefinition(
+    contestant = MethodDefinition(
         'pair',
-        _baseline_of(Gains),
+        _rival_of(Gains),
         {'torque': Gains(a=500.0, c=500.0)},
         (SearchRange('a', 1.0, 1000.0, log=False), SearchRange('c', 1.0, 1000.0, log=False)),
     )
     evaluate, counts = counted(
         lambda method, drive, candidates: [1e4 - each.a - each.c for each in candidates]
     )
-    store = tune_methods([method], ['torque'], 150, 1, tmp_path / 'a.json', evaluate=evaluate)
+    store = tune_methods([contestant], ['torque'], 150, 1, tmp_path / 'a.json', evaluate=evaluate)
     assert counts['pair', 'torque'] < 150
     found = store.parameters('pair', 'torque', Gains)
     assert 1400.0 < found.a + found.c <= 1500.0
 
 
-def _baseline_of(table):
+def _rival_of(table):
     return type('Made', (Feedback,), {'parameters_type': table})
 
 

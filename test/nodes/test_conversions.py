@@ -15,8 +15,7 @@ from sensor_msgs.msg import Range
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose, State, WheelSpeeds, wrap_angle
-from t3mpc_ros.nodes.common import conversions, sensor_messages
-from t3mpc_ros.nodes.common.diagnostics import complaints, measures
+from t3mpc_ros.nodes.common import conversions, diagnostics, sensor_messages
 from t3mpc_ros.robot.interface import (
     ZERO_WHEEL_SPEEDS,
     BatteryReading,
@@ -54,7 +53,7 @@ def test_a_stamp_survives_to_the_nanosecond(stamp_ns):
     assert conversions.ns_from_time(stamp) == stamp_ns
 
 
-def test_a_motion_survives_odometry_and_the_message_may_be_used_again():
+def test_a_state_survives_a_reused_odometry_message():
     message = Odometry()
     for motion in motions():
         back = conversions.state_from_odometry(conversions.fill_odometry(message, motion))
@@ -65,7 +64,7 @@ def test_a_motion_survives_odometry_and_the_message_may_be_used_again():
 
 
 @pytest.mark.parametrize('yaw', YAWS)
-def test_a_heading_is_a_unit_quaternion_about_z_and_comes_back(yaw):
+def test_yaw_survives_the_conversion_to_a_quaternion(yaw):
     rotation = conversions.quaternion_from_yaw(yaw)
     assert (rotation.x, rotation.y) == (0.0, 0.0)
     assert math.hypot(rotation.z, rotation.w) == pytest.approx(1.0, abs=1e-15)
@@ -76,13 +75,13 @@ def test_a_heading_is_a_unit_quaternion_about_z_and_comes_back(yaw):
     assert abs(wrap_angle(conversions.yaw_from_quaternion(opposite) - yaw)) < 1e-15 * 4
 
 
-def test_a_heading_beyond_a_turn_comes_back_wrapped():
+def test_yaw_beyond_a_turn_is_wrapped():
     for yaw in np.linspace(-30.0, 30.0, 61):
         back = conversions.yaw_from_quaternion(conversions.quaternion_from_yaw(yaw))
         assert abs(wrap_angle(back - yaw)) < 1e-13
 
 
-def test_roll_and_pitch_do_not_change_the_heading():
+def test_roll_and_pitch_do_not_change_the_yaw():
     generator = np.random.default_rng(6)
     for _ in range(100):
         yaw = generator.uniform(-math.pi, math.pi)
@@ -95,7 +94,7 @@ def test_roll_and_pitch_do_not_change_the_heading():
 
 @pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf, 1e200])
 @pytest.mark.parametrize('axis', ['x', 'y', 'z', 'w'])
-def test_a_rotation_that_is_none_has_no_heading(axis, value):
+def test_an_invalid_rotation_has_no_yaw(axis, value):
     """An infinite z once had the yaw 3/4 pi, and 1e200 ended the node with OverflowError."""
     rotation = Quaternion(x=0.5, y=0.5, z=0.5, w=0.5)
     setattr(rotation, axis, value)
@@ -117,7 +116,7 @@ def test_poses_in_all_their_messages_agree():
         assert (offset.x, offset.y, offset.z) == (*motion.pose[:2], 0.0)
 
 
-def test_a_planar_covariance_lands_at_x_y_and_yaw():
+def test_a_planar_covariance_fills_x_y_and_yaw():
     """ROS orders the rows x, y, z, roll, pitch, yaw (REP 103, geometry_msgs)."""
     generator = np.random.default_rng(7)
     root = generator.normal(size=(3, 3))
@@ -146,7 +145,7 @@ def test_a_command_survives_a_twist():
 @pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize('part', ['linear', 'angular'])
 @pytest.mark.parametrize('axis', ['x', 'y', 'z'])
-def test_one_bad_number_anywhere_spoils_a_command(part, axis, value):
+def test_one_non_finite_number_invalidates_a_command(part, axis, value):
     message = conversions.twist_from_body(BodyTwist(0.5, 1.0))
     setattr(getattr(message, part), axis, value)
     assert not all(map(math.isfinite, conversions.body_twist(message)))
@@ -154,14 +153,14 @@ def test_one_bad_number_anywhere_spoils_a_command(part, axis, value):
     assert not all(map(math.isfinite, twist))
 
 
-def test_a_command_without_a_stamp_is_wanted_now():
+def test_a_command_without_a_stamp_has_the_present_time():
     assert conversions.twist_and_stamp(Twist(), 5) == (BodyTwist(0.0, 0.0), 5)
     assert conversions.twist_and_stamp(TwistStamped(), 5) == (BodyTwist(0.0, 0.0), 5)
 
 
 @pytest.mark.parametrize('place', ['x', 'y', 'yaw', 'linear', 'angular'])
 @pytest.mark.parametrize('value', [math.nan, math.inf])
-def test_a_bad_number_in_odometry_is_seen(place, value):
+def test_non_finite_odometry_stays_non_finite(place, value):
     message = conversions.fill_odometry(Odometry(), State(0, Pose(1, 2, 3), BodyTwist(4, 5)))
     assert conversions.state_from_odometry(message).is_finite()
     pose, twist = message.pose.pose, message.twist.twist
@@ -187,7 +186,7 @@ def test_wheel_joints_keep_their_order():
 # -- sensors --------------------------------------------------------------------------------------
 
 
-def test_the_spread_claimed_of_the_inertial_sensor_is_that_of_its_samples():
+def test_imu_covariance_is_the_variance_of_its_samples():
     """Standing still, for as long as the bias walks less than the noise."""
     parameters = SimulatedImuParameters(gyro_drift=0.0)
     sensor = SimulatedImu(parameters, np.random.default_rng(3))
@@ -206,7 +205,7 @@ def test_the_spread_claimed_of_the_inertial_sensor_is_that_of_its_samples():
     assert noisier.angular_velocity_covariance[8] > 50.0 * turn[8]
 
 
-def test_a_sample_keeps_its_axes_and_leaves_the_others_alone():
+def test_an_imu_sample_sets_its_axes_only():
     message = sensor_messages.imu_message(ImuParameters(), 'a/imu')
     sensor_messages.fill_imu(message, ImuSample(0.5, 1.0, -2.0), 7)
     assert conversions.ns_from_time(message.header.stamp) == 7
@@ -231,20 +230,20 @@ FLOATS = np.float32
         (math.inf, False, FLOATS(0.80)),
     ],
 )
-def test_a_distance_follows_rep_117_after_the_wire(distance, infinity, expected):
+def test_a_distance_follows_rep_117_after_serialization(distance, infinity, expected):
     """Numbers are single on the wire: what lies on a bound must not fall beyond it there."""
     message = sensor_messages.range_message(RangeSensorParameters(), 'left_front_range_link')
     sensor_messages.fill_range(message, distance, 7, infinity=infinity)
-    heard = deserialize_message(serialize_message(message), Range)
-    assert heard.range == expected
-    assert heard.radiation_type == Range.INFRARED
-    assert heard.field_of_view == FLOATS(0.1)
+    received = deserialize_message(serialize_message(message), Range)
+    assert received.range == expected
+    assert received.radiation_type == Range.INFRARED
+    assert received.field_of_view == FLOATS(0.1)
     if math.isfinite(expected):
-        assert heard.min_range <= heard.range <= heard.max_range
-        assert (heard.range == heard.max_range) == (expected == FLOATS(0.8))
+        assert received.min_range <= received.range <= received.max_range
+        assert (received.range == received.max_range) == (expected == FLOATS(0.8))
 
 
-def test_a_battery_that_gives_current_has_a_negative_one():
+def test_a_discharging_battery_has_a_negative_current():
     parameters = BatteryParameters(cells=4, capacity=2.0)
     message = sensor_messages.battery_message(parameters)
     sensor_messages.fill_battery(message, BatteryReading(15.0, 0.5, 0.75), 7)
@@ -269,7 +268,7 @@ def test_the_covariance_of_a_twist_is_that_of_its_wheels():
     np.testing.assert_array_equal(misled, 1e6 * np.eye(6))
 
 
-def test_the_variance_of_a_counted_speed_is_that_of_counting():
+def test_count_variance_is_that_of_quantisation():
     step, period = 0.002, 0.01
     rng = np.random.default_rng(10)
     angles = np.cumsum(rng.uniform(0.01, 0.05, 20_000))
@@ -314,20 +313,20 @@ INSIDE = TwinDiagnostics((), (0.1, 0.2), (0.0, 0.0), 0.05, 0.04, 0.0)
         (_state('why', imu_fault=True), INSIDE, ['why', 'inertial sensor']),
     ],
 )
-def test_a_robot_complains_of_what_is_wrong_and_of_nothing_else(state, inside, words):
-    found = complaints(state, inside)
+def test_warnings_name_each_problem_once(state, inside, words):
+    found = diagnostics.warnings(state, inside)
     assert len(found) == len(words)
     for text, word in zip(found, words, strict=True):
         assert word in text
 
 
-def test_faults_at_work_are_named():
+def test_active_faults_are_named():
     inside = replace(INSIDE, faults=('gyro_dead', 'command_delay 0.1 s'))
-    (text,) = complaints(_state(), inside)
+    (text,) = diagnostics.warnings(_state(), inside)
     assert text == 'faults: gyro_dead, command_delay 0.1 s'
-    assert measures(_state(), inside)['faults'] == 'gyro_dead, command_delay 0.1 s'
-    values = measures(_state(), INSIDE)
+    assert diagnostics.values(_state(), inside)['faults'] == 'gyro_dead, command_delay 0.1 s'
+    values = diagnostics.values(_state(), INSIDE)
     assert values['faults'] == 'none'
-    assert (values['gyro_bias_rad_s'], values['gyro_bias_learnt_rad_s']) == (0.05, 0.04)
+    assert (values['gyro_bias_rad_s'], values['gyro_bias_estimate_rad_s']) == (0.05, 0.04)
     assert (values['slid_right_m'], values['slid_left_m']) == (0.1, 0.2)
     assert values['battery_v'] == 9.87

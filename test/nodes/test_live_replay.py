@@ -24,7 +24,7 @@ from t3mpc_ros.evaluation.process_replay.controller_replay import replay_control
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 
-LOOP = ('recorder', 'controller', 'sim_robot', 'reference')
+LOOP = ('recorder', 'controller', 'sim_robot', 'reference_generator')
 
 
 class Person:
@@ -95,11 +95,11 @@ def live_run(fleet, bag, model):
     finally:
         person.leave()
     # The controller first: all that it has heard is then recorded, too.
-    codes = fleet.stop_all(('controller', 'reference', 'sim_robot', 'recorder'))
+    codes = fleet.stop_all(('controller', 'reference_generator', 'sim_robot', 'recorder'))
     assert set(codes.values()) == {0}
 
 
-def test_a_live_run_is_computed_again_to_the_last_bit(fleet, tmp_path):
+def test_a_live_run_replays_bit_for_bit(fleet, tmp_path):
     """Stops, starts, a robot that does not follow, silence, live settings and a model included."""
     live_run(fleet, tmp_path / 'bag', tmp_path / 'model.npz')
     inputs = load_inputs(tmp_path / 'bag')

@@ -14,8 +14,8 @@ from t3mpc_ros.geometry.types import NANOSECONDS
 
 pytestmark = pytest.mark.ros
 
-EXECUTABLES = ('reference', 'controller', 'sim_robot', 'recorder', 'replayer', 'all_in_one')
-LOOP = ('recorder', 'controller', 'sim_robot', 'reference')
+EXECUTABLES = ('reference_generator', 'controller', 'sim_robot', 'recorder', 'player', 'composed')
+LOOP = ('recorder', 'controller', 'sim_robot', 'reference_generator')
 
 
 def _start_loop(fleet, bag):
@@ -31,9 +31,7 @@ def _start(fleet, name, bag):
 
 @pytest.mark.parametrize('name', EXECUTABLES)
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_each_executable_starts_without_arguments_and_ends_with_0(
-    name, number, fleet, tmp_path, monkeypatch
-):
+def test_each_executable_starts_and_ends_with_code_0(name, number, fleet, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     fleet.start(name)
     fleet.wait_ready(name)
@@ -42,7 +40,7 @@ def test_each_executable_starts_without_arguments_and_ends_with_0(
 
 
 @pytest.mark.parametrize('delay', [0.4, 0.9, 1.6])
-def test_a_signal_during_start_up_ends_quietly_with_0(delay, fleet):
+def test_a_signal_during_start_ends_quietly_with_code_0(delay, fleet):
     """Importing ROS and the compiler takes a while; Ctrl-C must not need luck."""
     fleet.start('controller')
     time.sleep(delay)
@@ -50,12 +48,12 @@ def test_a_signal_during_start_up_ends_quietly_with_0(delay, fleet):
     assert 'Traceback' not in fleet.log('controller').read_text()
 
 
-def test_the_loop_runs_at_100_hz_over_four_processes(fleet, tmp_path):
+def test_the_loop_runs_at_100_hz_in_four_processes(fleet, tmp_path):
     bag = tmp_path / 'bag'
     _start_loop(fleet, bag)
     time.sleep(8.0)
     fleet.check()
-    codes = fleet.stop_all(('reference', 'controller', 'sim_robot', 'recorder'))
+    codes = fleet.stop_all(('reference_generator', 'controller', 'sim_robot', 'recorder'))
     assert set(codes.values()) == {0}
     with open_bag(bag) as recording:
         for topic in ('/reference', '/odom'):
@@ -64,11 +62,11 @@ def test_the_loop_runs_at_100_hz_over_four_processes(fleet, tmp_path):
         received = recording.series('/cmd_vel', {'v': 'linear.x', 'w': 'angular.z'})
         odometry = recording.series('/odom', {'v': 'twist.twist.linear.x'})
         # One command per odometry message, once both are heard.
-        heard = (odometry['received'] >= received['received'][0]) & (
+        received = (odometry['received'] >= received['received'][0]) & (
             odometry['received'] <= received['received'][-1]
         )
-        assert received['v'].size >= 0.99 * heard.sum()
-        assert heard.sum() >= 0.99 * 800
+        assert received['v'].size >= 0.99 * received.sum()
+        assert received.sum() >= 0.99 * 800
         # The last command is a stop, sent when the controller ended; and the robot moved before.
         assert received['v'][-1] == 0.0
         assert received['w'][-1] == 0.0
@@ -77,7 +75,7 @@ def test_the_loop_runs_at_100_hz_over_four_processes(fleet, tmp_path):
         assert parameters['provenance']['version']
         assert float(parameters['controller']['law.gain']) > 0.0
         assert float(parameters['sim_robot']['rate']) == 100.0
-        assert int(parameters['reference']['seed']) >= 0
+        assert int(parameters['reference_generator']['seed']) >= 0
 
 
 def _speeds(bag, topic='/ground_truth/odom'):
@@ -94,10 +92,8 @@ def _moving_share(stamps, speed, start_ns, seconds):
     return float(np.mean(speed[chosen] > 0.01))
 
 
-@pytest.mark.parametrize('victim', ['reference', 'controller'])
-def test_killing_a_source_stops_the_robot_within_half_a_second_and_a_restart_resumes(
-    victim, fleet, tmp_path
-):
+@pytest.mark.parametrize('victim', ['reference_generator', 'controller'])
+def test_killed_source_stops_robot_in_half_a_second(victim, fleet, tmp_path):
     bag = tmp_path / 'bag'
     _start_loop(fleet, bag)
     time.sleep(5.0)
@@ -109,9 +105,9 @@ def test_killing_a_source_stops_the_robot_within_half_a_second_and_a_restart_res
     restarted_ns = time.time_ns()
     time.sleep(7.0)  # finding each other over DDS takes up to three seconds
     fleet.check()
-    assert set(fleet.stop_all(('reference', 'controller', 'sim_robot', 'recorder')).values()) == {
-        0
-    }
+    assert set(
+        fleet.stop_all(('reference_generator', 'controller', 'sim_robot', 'recorder')).values()
+    ) == {0}
 
     stamps, speed = _speeds(bag)
     assert _moving_share(stamps, speed, killed_ns - NANOSECONDS, 1.0) > 0.8
@@ -124,7 +120,7 @@ def test_killing_a_source_stops_the_robot_within_half_a_second_and_a_restart_res
     assert pulses[late].max() < 0.01, 'the motors still turned half a second after the kill'
 
 
-def test_killing_the_robot_zeroes_the_command_and_a_restart_resumes(fleet, tmp_path):
+def test_a_killed_robot_zeroes_commands_until_its_restart(fleet, tmp_path):
     bag = tmp_path / 'bag'
     _start_loop(fleet, bag)
     time.sleep(5.0)
@@ -136,9 +132,9 @@ def test_killing_the_robot_zeroes_the_command_and_a_restart_resumes(fleet, tmp_p
     restarted_ns = time.time_ns()
     time.sleep(7.0)
     fleet.check()
-    assert set(fleet.stop_all(('reference', 'controller', 'sim_robot', 'recorder')).values()) == {
-        0
-    }
+    assert set(
+        fleet.stop_all(('reference_generator', 'controller', 'sim_robot', 'recorder')).values()
+    ) == {0}
 
     with open_bag(bag) as recording:
         commands = recording.series('/cmd_vel', {'v': 'linear.x', 'w': 'angular.z'})
@@ -151,7 +147,7 @@ def test_killing_the_robot_zeroes_the_command_and_a_restart_resumes(fleet, tmp_p
     assert _moving_share(stamps, speed, restarted_ns + 5 * NANOSECONDS, 1.5) > 0.5
 
 
-def test_killing_the_recorder_stops_nobody_and_a_restart_continues_the_bag(fleet, tmp_path):
+def test_a_restarted_recorder_continues_the_bag(fleet, tmp_path):
     bag = tmp_path / 'bag'
     _start_loop(fleet, bag)
     time.sleep(3.0)
@@ -162,20 +158,20 @@ def test_killing_the_recorder_stops_nobody_and_a_restart_continues_the_bag(fleet
     restarted_ns = time.time_ns()
     time.sleep(6.0)
     fleet.check()
-    assert set(fleet.stop_all(('reference', 'controller', 'sim_robot', 'recorder')).values()) == {
-        0
-    }
+    assert set(
+        fleet.stop_all(('reference_generator', 'controller', 'sim_robot', 'recorder')).values()
+    ) == {0}
     assert len(list(bag.glob('*.mcap'))) == 2
     stamps, speed = _speeds(bag)
     assert _moving_share(stamps, speed, restarted_ns + 4 * NANOSECONDS, 1.5) > 0.8
 
 
-def test_all_in_one_closes_the_loop_in_one_process(fleet, tmp_path):
+def test_composed_closes_the_loop_in_one_process(fleet, tmp_path):
     bag = tmp_path / 'bag'
-    fleet.start('all_in_one', parameters={'folder': str(bag)})
-    fleet.wait_ready('all_in_one')
+    fleet.start('composed', parameters={'folder': str(bag)})
+    fleet.wait_ready('composed')
     time.sleep(6.0)
-    assert fleet.stop('all_in_one') == 0
+    assert fleet.stop('composed') == 0
     stamps, speed = _speeds(bag)
     assert speed.max() > 0.02
     with open_bag(bag) as recording:
@@ -191,7 +187,7 @@ def test_all_in_one_closes_the_loop_in_one_process(fleet, tmp_path):
             ['--ros-args', '-p', 'law.gian:=1.0'],
             ['law.gian', 'did you mean law.gain'],
         ),
-        ('reference', ['--ros-args', '-p', 'rate:=fast'], ['rate', 'a number', 'fast']),
+        ('reference_generator', ['--ros-args', '-p', 'rate:=fast'], ['rate', 'a number', 'fast']),
         ('sim_robot', ['--ros-args', '-p', 'drive.kind:=warp'], ['drive.kind', 'one of', 'warp']),
         ('recorder', ['--ros-args', '--params-file', 'MISSING'], ['MISSING', 'cannot read']),
         ('recorder', ['--ros-args', '--params-file', 'BROKEN'], ['BROKEN', 'not valid YAML']),
@@ -199,9 +195,7 @@ def test_all_in_one_closes_the_loop_in_one_process(fleet, tmp_path):
         ('controller', ['--ros-args', '-p', 'model:=BROKEN'], ['BROKEN', 'not a model file']),
     ],
 )
-def test_bad_input_at_start_is_one_clear_line_and_exit_code_2(
-    name, arguments, words, fleet, tmp_path
-):
+def test_invalid_input_at_start_is_one_line_and_code_2(name, arguments, words, fleet, tmp_path):
     (tmp_path / 'BROKEN').write_text('controller:\n  ros__parameters: [1,\n')
     (tmp_path / 'FILE').write_text('a file where a folder is wanted')
     places = {word: str(tmp_path / word) for word in ('BROKEN', 'FILE', 'MISSING')}
@@ -211,14 +205,14 @@ def test_bad_input_at_start_is_one_clear_line_and_exit_code_2(
     fleet.start(name, *given)
     with pytest.raises(ProcessError, match='code 2'):
         fleet.wait_ready(name)
-    said = fleet.log(name).read_text()
-    assert 'Traceback' not in said
-    line = next(line for line in said.splitlines() if line.startswith(f'{name}: '))
+    status = fleet.log(name).read_text()
+    assert 'Traceback' not in status
+    line = next(line for line in status.splitlines() if line.startswith(f'{name}: '))
     for word in words:
         assert word in line
 
 
-def test_an_integer_where_a_number_is_wanted_is_taken(fleet):
+def test_an_integer_for_a_float_parameter_is_accepted(fleet):
     fleet.start('controller', '--ros-args', '-p', 'law.gain:=5')
     fleet.wait_ready('controller')
     assert fleet.stop('controller') == 0

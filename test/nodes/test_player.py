@@ -25,7 +25,7 @@ from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
-from test_nodes_behaviour import LATCHED, World, odometry, reason, twist
+from support.ros_graph import LATCHED, diagnostic, diagnostic_level, odometry, reason, twist
 
 from t3mpc_ros.bag.merged_reader import MergedReader, open_serialized_bag
 from t3mpc_ros.bag.qos import QosProfile
@@ -45,13 +45,6 @@ SECOND = 10**9
 START = 1_700_000_000 * SECOND
 ONE_LATCHED = QosProfile(depth=1, durability='transient_local')
 WEAK = QosProfile(reliability='best_effort')
-
-
-@pytest.fixture
-def world(ros):
-    made = World()
-    yield made
-    made.close()
 
 
 def write(folder, messages, profiles=None, **more):
@@ -82,20 +75,20 @@ def payloads(folder):
     return found
 
 
-def play(world, bag, *arguments, **more):
+def play(harness, bag, *arguments, **more):
     more = {'wait_for_subscribers': 20.0} | more
-    return world.add(PlayerNode, arguments, bags=[str(bag)], **more)
+    return harness.add(PlayerNode, arguments, bags=[str(bag)], **more)
 
 
-def call(world, name):
-    return world.call(Trigger, f'replayer/{name}')
+def call(harness, name):
+    return harness.call(Trigger, f'player/{name}')
 
 
 # -- what is published ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize('given', [{'allow_commands': True}, {'remap': ['cmd_vel:=velocity']}])
-def test_record_replay_record_gives_the_same_bytes_in_the_same_order(given, world, tmp_path):
+def test_a_played_and_recorded_bag_has_the_same_bytes(given, harness, tmp_path):
     messages = [('/map', 0.0, String(data='a map'))]
     for i in range(200):
         at = i * 0.005
@@ -108,14 +101,14 @@ def test_record_replay_record_gives_the_same_bytes_in_the_same_order(given, worl
     first = payloads(bag)
     if 'remap' in given:
         first['/velocity'] = first.pop('/cmd_vel')
-    recorder = world.add(RecorderNode, folder=str(tmp_path / 'second'), topics=list(first))
-    replayer = play(world, bag, **given)
+    recorder = harness.add(RecorderNode, folder=str(tmp_path / 'second'), topics=list(first))
+    player = play(harness, bag, **given)
     count = len(messages)
-    world.until(lambda: replayer.done, 'the bag ends')
-    world.until(lambda: recorder.produce_diagnostics()[2]['messages'] >= count, 'all is recorded')
-    assert replayer.exit_code == 0
-    world.remove(replayer)
-    world.remove(recorder)
+    harness.spin_until(lambda: player.exit_requested, 'the bag ends')
+    harness.spin_until(lambda: diagnostic(recorder, 'messages') >= count, 'all is recorded')
+    assert player.exit_code == 0
+    harness.remove(player)
+    harness.remove(recorder)
     second = payloads(tmp_path / 'second')
     assert second == first
     tape = MergedReader([open_serialized_bag(tmp_path / 'second')])
@@ -127,67 +120,69 @@ def test_record_replay_record_gives_the_same_bytes_in_the_same_order(given, worl
     tape.close()
 
 
-def test_who_comes_late_gets_the_latched_message(world, tmp_path):
+def test_a_late_subscriber_gets_the_latched_message(harness, tmp_path):
     messages = [('/map', 0.0, String(data='old')), *texts(), ('/map', 0.3, String(data='new'))]
     bag = write(tmp_path / 'bag', messages, {'/map': ONE_LATCHED})
-    replayer = play(world, bag, wait_for_subscribers=0.0, exit_at_end=False)
-    world.until(lambda: reason(replayer) == 'finished')
-    late = world.hear(String, 'map', LATCHED)
-    world.until(lambda: late)
+    player = play(harness, bag, wait_for_subscribers=0.0, exit_at_end=False)
+    harness.spin_until(lambda: reason(player) == 'finished')
+    late = harness.subscribe(String, 'map', LATCHED)
+    harness.spin_until(lambda: late)
     assert [message.data for message in late] == ['new']
 
 
-def test_a_later_start_brings_the_map_from_before_it(world, tmp_path):
+def test_a_start_offset_publishes_earlier_latched_messages(harness, tmp_path):
     messages = [('/map', 0.0, String(data='a map')), *texts(20)]
     bag = write(tmp_path / 'bag', messages, {'/map': ONE_LATCHED})
-    heard = world.hear(String, 'map', LATCHED), world.hear(String, 'text')
-    play(world, bag, start_offset=0.1, until=0.2)
-    world.until(lambda: len(heard[1]) == 6)
-    assert [message.data for message in heard[0]] == ['a map']
-    assert [int(message.data) for message in heard[1]] == [5, 6, 7, 8, 9, 10]
+    received = harness.subscribe(String, 'map', LATCHED), harness.subscribe(String, 'text')
+    play(harness, bag, start_offset=0.1, until=0.2)
+    harness.spin_until(lambda: len(received[1]) == 6)
+    assert [message.data for message in received[0]] == ['a map']
+    assert [int(message.data) for message in received[1]] == [5, 6, 7, 8, 9, 10]
 
 
-def test_overrides_win_over_what_was_recorded(world, tmp_path):
+def test_qos_overrides_replace_the_recorded_qos(harness, tmp_path):
     bag = write(tmp_path / 'bag', [*texts(), ('/other', 0.5, String())], {'/other': WEAK})
     overrides = tmp_path / 'overrides.yaml'
     overrides.write_text('/text: {reliability: best_effort, durability: transient_local}')
-    play(world, bag, quality_overrides=str(overrides))
+    play(harness, bag, quality_overrides=str(overrides))
 
     def offered(topic):
-        infos = world.probe.get_publishers_info_by_topic(topic)
+        infos = harness.probe.get_publishers_info_by_topic(topic)
         return [(i.qos_profile.reliability, i.qos_profile.durability) for i in infos]
 
     weak = ReliabilityPolicy.BEST_EFFORT
-    world.until(lambda: offered('/other') == [(weak, DurabilityPolicy.VOLATILE)])
-    world.until(lambda: offered('/text') == [(weak, DurabilityPolicy.TRANSIENT_LOCAL)])
+    harness.spin_until(lambda: offered('/other') == [(weak, DurabilityPolicy.VOLATILE)])
+    harness.spin_until(lambda: offered('/text') == [(weak, DurabilityPolicy.TRANSIENT_LOCAL)])
 
 
-def test_the_clock_of_the_bag_is_told(world, tmp_path):
+def test_the_time_of_the_bag_is_published_as_clock(harness, tmp_path):
     bag = write(tmp_path / 'bag', [*texts(50), ('/clock', 0.1, Clock())])
-    log = world.hear(Log, '/rosout', LATCHED)
-    clock = world.hear(Clock, '/clock', QoSProfile(depth=100))
-    text = world.hear(String, 'text')
-    replayer = play(world, bag, clock_rate=100.0, rate=2.0)
-    assert world.probe.get_publishers_info_by_topic('/clock')
-    world.until(lambda: replayer.done)
-    world.until(lambda: len(text) == 50)
+    log = harness.subscribe(Log, '/rosout', LATCHED)
+    clock = harness.subscribe(Clock, '/clock', QoSProfile(depth=100))
+    text = harness.subscribe(String, 'text')
+    player = play(harness, bag, clock_rate=100.0, rate=2.0)
+    assert harness.probe.get_publishers_info_by_topic('/clock')
+    harness.spin_until(lambda: player.exit_requested)
+    harness.spin_until(lambda: len(text) == 50)
     stamps = [conversions.ns_from_time(message.clock) for message in clock]
     assert stamps == sorted(stamps)
     assert stamps[0] >= START
     assert stamps[-1] <= START + 0.98 * SECOND
     assert len(stamps) > 20
-    assert any('/clock is not played: the replayer tells' in entry.msg for entry in log)
+    assert any(
+        '/clock is not played: the player publishes its own clock' in entry.msg for entry in log
+    )
 
 
-def test_a_type_that_is_not_installed_is_left_out_with_an_error(world, tmp_path, monkeypatch):
-    log = world.hear(Log, '/rosout', LATCHED)
+def test_a_type_that_is_not_installed_is_not_played(harness, tmp_path, monkeypatch):
+    log = harness.subscribe(Log, '/rosout', LATCHED)
     bag = write(tmp_path / 'bag', [*texts(), ('/odom', 0.1, odometry(0))])
     monkeypatch.setitem(sys.modules, 'nav_msgs.msg', None)
-    heard = world.hear(String, 'text')
-    replayer = play(world, bag)
-    world.until(lambda: len(heard) == 10)
-    world.until(lambda: [e.level for e in log if '/odom is not played' in e.msg] == [40])
-    assert replayer.produce_diagnostics()[2]['left_out'] == '/odom'
+    received = harness.subscribe(String, 'text')
+    player = play(harness, bag)
+    harness.spin_until(lambda: len(received) == 10)
+    harness.spin_until(lambda: [e.level for e in log if '/odom is not played' in e.msg] == [40])
+    assert diagnostic(player, 'excluded') == '/odom'
 
 
 # -- safety ---------------------------------------------------------------------------------------
@@ -204,106 +199,107 @@ def test_a_type_that_is_not_installed_is_left_out_with_an_error(world, tmp_path,
         (('-r', '/velocity:=/cmd_vel'), '/velocity'),
     ],
 )
-def test_a_velocity_is_not_played_unless_that_is_asked_for(arguments, topic, world, tmp_path):
-    log = world.hear(Log, '/rosout', LATCHED)
+def test_a_velocity_is_played_with_allow_commands_only(arguments, topic, harness, tmp_path):
+    log = harness.subscribe(Log, '/rosout', LATCHED)
     messages = [*texts(), *[(topic, 0.02 * i + 0.01, twist(0.3)) for i in range(10)]]
     bag = write(tmp_path / 'bag', messages)
     name = arguments[1].split(':=')[1] if arguments else topic
-    moved, heard = world.hear(Twist, name), world.hear(String, 'text')
+    moved, received = harness.subscribe(Twist, name), harness.subscribe(String, 'text')
     given = {'remap': ['cmd_vel:=velocity']} if arguments else {}
-    replayer = play(world, bag, *arguments, **given)
-    world.until(lambda: len(heard) == 10 and replayer.done)
+    player = play(harness, bag, *arguments, **given)
+    harness.spin_until(lambda: len(received) == 10 and player.exit_requested)
     assert not moved
-    assert replayer.produce_diagnostics()[2]['left_out'] == topic
+    assert diagnostic(player, 'excluded') == topic
     (entry,) = [entry for entry in log if f'{topic} is not played' in entry.msg]
     assert entry.level == 30
     assert 'allow_commands' in entry.msg
     assert 'remap' in entry.msg
-    world.remove(replayer)
-    again = play(world, bag, *arguments, allow_commands=True, **given)
-    world.until(lambda: len(moved) == 10 and again.done)
+    harness.remove(player)
+    again = play(harness, bag, *arguments, allow_commands=True, **given)
+    harness.spin_until(lambda: len(moved) == 10 and again.exit_requested)
 
 
-def test_a_renamed_velocity_does_not_reach_a_robot_by_a_detour(world, tmp_path):
-    robot = world.add(SimRobotNode, ['-r', 'cmd_vel:=/steer'])
-    log = world.hear(Log, '/rosout', LATCHED)
+def test_a_remapped_velocity_does_not_reach_a_robot(harness, tmp_path):
+    robot = harness.add(SimRobotNode, ['-r', 'cmd_vel:=/steer'])
+    log = harness.subscribe(Log, '/rosout', LATCHED)
     bag = write(tmp_path / 'bag', [(t, 0.02 * i, twist(0.3)) for i in range(20) for t in ['/v']])
-    replayer = play(world, bag, remap=['v:=steer'])
-    world.until(lambda: replayer.done)
-    assert any('/steer is played no longer: it would drive /sim_robot' in e.msg for e in log)
-    assert robot.produce_diagnostics()[2]['commands'] == 0
+    player = play(harness, bag, remap=['v:=steer'])
+    harness.spin_until(lambda: player.exit_requested)
+    assert any('/steer is disabled: it would move /sim_robot' in e.msg for e in log)
+    assert diagnostic(robot, 'commands') == 0
 
 
-def test_another_publisher_of_the_same_topic_is_named(world, tmp_path):
-    world.add(SimRobotNode)
+def test_another_publisher_of_a_topic_is_a_warning(harness, tmp_path):
+    harness.add(SimRobotNode)
     bag = write(tmp_path / 'bag', [('/odom', 0.02 * i, odometry(i)) for i in range(500)])
-    log = world.hear(Log, '/rosout', LATCHED)
-    world.hear(type(odometry(0)), 'odom')
-    replayer = play(world, bag)
-    world.until(lambda: any('/odom is published by /sim_robot, too' in e.msg for e in log))
-    world.until(
-        lambda: replayer.produce_diagnostics()[:2] == (WARN, 'also published by others: /odom')
+    log = harness.subscribe(Log, '/rosout', LATCHED)
+    harness.subscribe(type(odometry(0)), 'odom')
+    player = play(harness, bag)
+    harness.spin_until(lambda: any('/odom is published by /sim_robot, too' in e.msg for e in log))
+    harness.spin_until(
+        lambda: (
+            diagnostic_level(player) == WARN
+            and reason(player) == 'also published by other nodes: /odom'
+        )
     )
 
 
 # -- control --------------------------------------------------------------------------------------
 
 
-def test_services_pause_step_seek_and_set_the_rate(world, tmp_path):
+def test_services_pause_play_next_seek_and_set_the_rate(harness, tmp_path):
     bag = write(tmp_path / 'bag', texts(2000, 0.01))
-    heard = world.hear(String, 'text', 2000)
-    replayer = play(world, bag, start_paused=True, step_count=3)
-    assert call(world, 'step').success
-    world.until(lambda: len(heard) == 3)
-    replayer.set_parameters([Parameter('seek_time', value=15.0), Parameter('step_count', value=1)])
-    assert 'paused at 15.000 s' in call(world, 'seek').message
-    assert call(world, 'step').success
-    world.until(lambda: len(heard) == 4)
-    assert [message.data for message in heard] == ['0', '1', '2', '1500']
-    replayer.set_parameters([Parameter('seek_time', value=20.0)])
-    answer = call(world, 'seek')
-    assert not answer.success
-    assert answer.message == 'the place must be from 0.000 to 19.990 s: got 20.000 s'
-    assert 'playing' in call(world, 'resume').message
-    world.until(lambda: len(heard) > 20)
-    answer = call(world, 'step')
-    assert not answer.success
-    assert 'must be paused' in answer.message
-    assert 'paused' in call(world, 'pause').message
-    assert 'playing' in call(world, 'toggle_paused').message
-    replayer.set_parameters([Parameter('rate', value=50.0)])
-    assert 'rate 50' in call(world, 'set_rate').message
-    world.until(lambda: replayer.done, 'the end comes soon at that rate')
-    world.until(lambda: len(heard) == 503)
-    numbers = [int(message.data) for message in heard]
+    received = harness.subscribe(String, 'text', 2000)
+    player = play(harness, bag, start_paused=True, step_count=3)
+    assert call(harness, 'play_next').success
+    harness.spin_until(lambda: len(received) == 3)
+    player.set_parameters([Parameter('seek_time', value=15.0), Parameter('step_count', value=1)])
+    assert 'paused at 15.000 s' in call(harness, 'seek').message
+    assert call(harness, 'play_next').success
+    harness.spin_until(lambda: len(received) == 4)
+    assert [message.data for message in received] == ['0', '1', '2', '1500']
+    player.set_parameters([Parameter('seek_time', value=20.0)])
+    response = call(harness, 'seek')
+    assert not response.success
+    assert response.message == 'the place must be from 0.000 to 19.990 s: got 20.000 s'
+    assert 'playing' in call(harness, 'resume').message
+    harness.spin_until(lambda: len(received) > 20)
+    response = call(harness, 'play_next')
+    assert not response.success
+    assert 'must be paused' in response.message
+    assert 'paused' in call(harness, 'pause').message
+    assert 'playing' in call(harness, 'toggle_paused').message
+    player.set_parameters([Parameter('rate', value=50.0)])
+    assert 'rate 50' in call(harness, 'set_rate').message
+    harness.spin_until(lambda: player.exit_requested, 'the end comes soon at that rate')
+    harness.spin_until(lambda: len(received) == 503)
+    numbers = [int(message.data) for message in received]
     assert numbers == [0, 1, 2, *range(1500, 2000)]
 
 
-def test_without_a_bag_it_waits_and_says_so(world):
-    replayer = world.add(PlayerNode)
-    said = world.diagnosis('replayer')
-    assert (said.level, said.message) == (WARN, 'no bag is open: set bags')
-    answer = call(world, 'resume')
-    assert (answer.success, answer.message) == (False, 'no bag is open: set bags')
-    assert not replayer.done
+def test_without_a_bag_the_player_warns(harness):
+    player = harness.add(PlayerNode)
+    status = harness.next_status('player')
+    assert (status.level, status.message) == (WARN, 'no bag is open: set bags')
+    response = call(harness, 'resume')
+    assert (response.success, response.message) == (False, 'no bag is open: set bags')
+    assert not player.exit_requested
 
 
-def test_diagnostics_tell_place_and_punctuality(world, tmp_path):
+def test_diagnostics_hold_position_and_latency(harness, tmp_path):
     bag = write(tmp_path / 'bag', texts(500))
-    world.hear(String, 'text')
-    replayer = play(world, bag)
-    world.until(lambda: replayer.produce_diagnostics()[2]['messages'] > 10)
-    said = world.diagnosis('replayer')
-    values = {entry.key: entry.value for entry in said.values}
-    assert (said.level, said.message) == (OK, 'playing')
+    harness.subscribe(String, 'text')
+    player = play(harness, bag)
+    harness.spin_until(lambda: diagnostic(player, 'messages') > 10)
+    status = harness.next_status('player')
+    values = {entry.key: entry.value for entry in status.values}
+    assert (status.level, status.message) == (OK, 'playing')
     assert 0.0 < float(values['position_s']) < 9.98 == float(values['length_s'])
-    assert float(values['lateness_p99_ms']) >= float(values['lateness_p50_ms']) > 0.0
+    assert float(values['latency_p99_ms']) >= float(values['latency_p50_ms']) > 0.0
 
 
 @pytest.mark.parametrize('allowed', [True, False])
-def test_a_priority_is_asked_for_and_playing_goes_on_without_it(
-    allowed, world, tmp_path, monkeypatch
-):
+def test_playback_works_without_the_realtime_priority(allowed, harness, tmp_path, monkeypatch):
     asked = []
 
     def scheduler(number, policy, parameters):
@@ -312,18 +308,18 @@ def test_a_priority_is_asked_for_and_playing_goes_on_without_it(
             raise PermissionError(errno.EPERM, 'Operation not permitted')
 
     monkeypatch.setattr(os, 'sched_setscheduler', scheduler)
-    log = world.hear(Log, '/rosout', LATCHED)
-    heard = world.hear(String, 'text')
-    replayer = play(world, write(tmp_path / 'bag', texts(30)), realtime_priority=5)
-    world.until(lambda: replayer.done and len(heard) == 30)
-    assert asked == [('sender', os.SCHED_FIFO, 5)]
-    words = 'realtime_priority 5 cannot be had: Operation not permitted; it plays without'
+    log = harness.subscribe(Log, '/rosout', LATCHED)
+    received = harness.subscribe(String, 'text')
+    player = play(harness, write(tmp_path / 'bag', texts(30)), realtime_priority=5)
+    harness.spin_until(lambda: player.exit_requested and len(received) == 30)
+    assert asked == [('player', os.SCHED_FIFO, 5)]
+    words = 'realtime_priority 5 is not available: Operation not permitted; playing without it'
     if not allowed:
-        world.until(lambda: any(entry.msg == words for entry in log))
+        harness.spin_until(lambda: any(entry.msg == words for entry in log))
     assert allowed or sum(entry.msg == words for entry in log) == 1
 
 
-def test_a_bag_that_is_damaged_inside_ends_it_with_an_error(world, tmp_path):
+def test_a_damaged_bag_ends_playback_with_an_error(harness, tmp_path):
     bag = write(tmp_path / 'bag', texts(200), chunk_bytes=1024)
     (file,) = (tmp_path / 'bag').glob('*.mcap')
     with file.open('r+b') as content:
@@ -331,12 +327,12 @@ def test_a_bag_that_is_damaged_inside_ends_it_with_an_error(world, tmp_path):
         assert len(chunks) > 5
         content.seek(chunks[3].chunk_start_offset + chunks[3].chunk_length - 60)
         content.write(bytes(60))
-    log = world.hear(Log, '/rosout', LATCHED)
-    replayer = play(world, bag, wait_for_subscribers=0.0)
-    world.until(lambda: replayer.exit_code == 1)
-    assert replayer.produce_diagnostics()[2]['messages'] > 30, 'what comes before is played'
-    words = r'playing has ended early: .*bag_0.mcap cannot be read'
-    world.until(lambda: [e.level for e in log if re.match(words, e.msg)] == [40])
+    log = harness.subscribe(Log, '/rosout', LATCHED)
+    player = play(harness, bag, wait_for_subscribers=0.0)
+    harness.spin_until(lambda: player.exit_code == 1)
+    assert diagnostic(player, 'messages') > 30, 'what comes before is played'
+    words = r'playback has ended early: .*bag_0.mcap cannot be read'
+    harness.spin_until(lambda: [e.level for e in log if re.match(words, e.msg)] == [40])
 
 
 @pytest.mark.parametrize(
@@ -355,10 +351,10 @@ def test_a_bag_that_is_damaged_inside_ends_it_with_an_error(world, tmp_path):
         ({'quality_overrides': '/none.yaml'}, BagError, '/none.yaml cannot be read'),
     ],
 )
-def test_what_cannot_be_used_is_refused_at_start(given, error, words, world, tmp_path):
+def test_unusable_parameters_are_rejected_at_start(given, error, words, harness, tmp_path):
     bag = write(tmp_path / 'bag', texts())
     with pytest.raises(error, match=words):
-        world.add(PlayerNode, **({'bags': [bag]} | given))
+        harness.add(PlayerNode, **({'bags': [bag]} | given))
 
 
 # -- in a terminal --------------------------------------------------------------------------------
@@ -431,7 +427,7 @@ def terminal(graph):
         each.close()
 
 
-def test_keys_pause_step_and_change_the_rate(terminal, tmp_path):
+def test_keys_pause_play_next_and_change_the_rate(terminal, tmp_path):
     bag = write(tmp_path / 'bag', texts(100, 1.0))
     shell = terminal(f'bags:=["{bag}"]')
     shell.until(r'playing .* x1 ')
@@ -455,7 +451,7 @@ def test_keys_pause_step_and_change_the_rate(terminal, tmp_path):
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_the_terminal_is_given_back_after_a_signal(number, terminal, tmp_path):
+def test_the_terminal_is_restored_after_a_signal(number, terminal, tmp_path):
     bag = write(tmp_path / 'bag', texts(100, 0.1))
     shell = terminal(f'bags:=["{bag}"]', 'start_paused:=true')
     shell.until('paused')
@@ -466,7 +462,7 @@ def test_the_terminal_is_given_back_after_a_signal(number, terminal, tmp_path):
     assert 'Traceback' not in shell.text
 
 
-def test_the_terminal_is_given_back_at_the_end_of_the_bag(terminal, tmp_path):
+def test_the_terminal_is_restored_at_the_end_of_the_bag(terminal, tmp_path):
     bag = write(tmp_path / 'bag', texts(5))
     shell = terminal(f'bags:=["{bag}"]')
     shell.until('5 messages, timing error 50/99 %')
@@ -474,11 +470,11 @@ def test_the_terminal_is_given_back_at_the_end_of_the_bag(terminal, tmp_path):
     assert shell.settings() == shell.before
 
 
-def test_the_terminal_is_given_back_after_an_error(terminal, tmp_path):
+def test_the_terminal_is_restored_after_an_error(terminal, tmp_path):
     bag = write(tmp_path / 'bag', texts(5))
     fault = (
         'from t3mpc_ros.nodes.player.node import PlayerNode as node; '
-        'node._watch = lambda self: 1 / (self._keyboard is None); '
+        'node._monitor = lambda self: 1 / (self._keyboard is None); '
     )
     shell = terminal(f'bags:=["{bag}"]', program=fault + PROGRAM)
     assert shell.wait() == 1
@@ -486,7 +482,7 @@ def test_the_terminal_is_given_back_after_an_error(terminal, tmp_path):
     assert shell.settings() == shell.before
 
 
-def test_without_a_terminal_it_plays_to_the_end_and_exits(graph, tmp_path):
+def test_without_a_terminal_the_player_plays_to_the_end(graph, tmp_path):
     bag = write(tmp_path / 'bag', texts(5))
     command = [sys.executable, '-c', PROGRAM, '--ros-args', '-p']
     done = subprocess.run(
@@ -499,10 +495,10 @@ def test_without_a_terminal_it_plays_to_the_end_and_exits(graph, tmp_path):
         [*command, 'bags:=["/nowhere"]'], stdin=subprocess.DEVNULL, capture_output=True, text=True
     )
     assert refused.returncode == 2
-    assert refused.stderr == 'replayer: there is no bag /nowhere\n'
+    assert refused.stderr == 'player: there is no bag /nowhere\n'
 
 
-def test_keys_are_known_in_whatever_pieces_they_come():
+def test_keys_are_parsed_from_any_input():
     assert parse_keys(b' \x1b[A\x1bOB\x1b[C\x1b[D+-x\x1b[') == [
         'space',
         'up',

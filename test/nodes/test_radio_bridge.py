@@ -15,20 +15,13 @@ import pytest
 from sensor_msgs.msg import BatteryState, Imu, JointState, Range
 from std_srvs.srv import SetBool, Trigger
 from support.radio_bench import FakeDongle, FakeRobot
-from test_nodes_behaviour import Driver, World, twist
+from support.ros_graph import CommandSource, diagnostic, diagnostic_level, twist
 
 from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
 from t3mpc_ros.radio.protocol.authentication import KeyFileError
 from t3mpc_ros.robot.interface import RANGE_SENSORS
 
 pytestmark = pytest.mark.ros
-
-
-@pytest.fixture
-def world(ros):
-    made = World()
-    yield made
-    made.close()
 
 
 class Plug:
@@ -89,19 +82,19 @@ def says(node):
     return node.produce_diagnostics()[1]
 
 
-def driving(world, plug, linear=0.1):
+def driving(harness, plug, linear=0.1):
     """Return the node, the driver and what is heard on odom, once the robot drives."""
-    node = world.add(RadioBridgeNode, port=plug.path)
-    odom = world.hear(Odometry, 'odom')
-    driver = Driver(world)
-    driver.message = twist(linear)
-    world.until(lambda: odom and odom[-1].twist.twist.linear.x > 0.9 * linear, 'it drives')
-    return node, driver, odom
+    node = harness.add(RadioBridgeNode, port=plug.path)
+    odom = harness.subscribe(Odometry, 'odom')
+    source = CommandSource(harness)
+    source.message = twist(linear)
+    harness.spin_until(lambda: odom and odom[-1].twist.twist.linear.x > 0.9 * linear, 'it drives')
+    return node, source, odom
 
 
-def test_it_tells_what_sim_robot_tells_but_for_the_truth(world, plug):
-    heard = {
-        name: world.hear(kind, name)
+def test_topics_are_those_of_sim_robot_without_truth(harness, plug):
+    received = {
+        name: harness.subscribe(kind, name)
         for kind, name in (
             (Imu, 'imu/data_raw'),
             (JointState, 'joint_states'),
@@ -109,8 +102,8 @@ def test_it_tells_what_sim_robot_tells_but_for_the_truth(world, plug):
             (Range, 'range/left_back'),
         )
     }
-    node, _, odom = driving(world, plug)
-    world.until(lambda: all(heard.values()), 'every topic')
+    node, _, odom = driving(harness, plug)
+    harness.spin_until(lambda: all(received.values()), 'every topic')
     level, text, values = node.produce_diagnostics()
     if 'round trips up to' not in text:  # as on a machine that has other things to do
         assert (level, text) == (DiagnosticStatus.OK, 'following commands, unauthenticated')
@@ -125,78 +118,78 @@ def test_it_tells_what_sim_robot_tells_but_for_the_truth(world, plug):
     assert '/ground_truth/odom' not in topics
 
 
-def test_a_missing_dongle_is_named_with_what_to_do_and_used_as_soon_as_it_is_there(world, plug):
+def test_a_missing_dongle_is_reported_and_used_once_plugged_in(harness, plug):
     plug.pull_out()
-    node = world.add(RadioBridgeNode, port=plug.path)
-    world.until(lambda: 'is the dongle plugged in?' in says(node), 'the reason')
-    assert node.produce_diagnostics()[0] == DiagnosticStatus.ERROR
+    node = harness.add(RadioBridgeNode, port=plug.path)
+    harness.spin_until(lambda: 'is the dongle plugged in?' in says(node), 'the reason')
+    assert diagnostic_level(node) == DiagnosticStatus.ERROR
     plug.put_in()
-    world.until(lambda: node.produce_diagnostics()[2]['link'] == 'running', 'the link')
+    harness.spin_until(lambda: diagnostic(node, 'link') == 'running', 'the link')
 
 
-def test_pulled_out_while_driving_it_is_found_again_by_itself(world, plug):
-    node, _, odom = driving(world, plug)
+def test_a_dongle_unplugged_while_driving_is_found_again(harness, plug):
+    node, _, odom = driving(harness, plug)
     plug.pull_out()
-    world.until(lambda: 'is the dongle plugged in?' in says(node), 'the reason')
+    harness.spin_until(lambda: 'is the dongle plugged in?' in says(node), 'the reason')
     plug.put_in()
     before = len(odom)
-    world.until(lambda: len(odom) > before + 20, 'odometry')
-    world.until(lambda: odom[-1].twist.twist.linear.x > 0.09, 'it drives again')
-    assert node.produce_diagnostics()[2]['port_failures'] == 1
+    harness.spin_until(lambda: len(odom) > before + 20, 'odometry')
+    harness.spin_until(lambda: odom[-1].twist.twist.linear.x > 0.09, 'it drives again')
+    assert diagnostic(node, 'port_failures') == 1
 
 
-def test_silence_stops_the_robot_and_an_emergency_stop_holds(world, plug):
-    node, driver, _ = driving(world, plug)
-    driver.message = None
-    world.until(lambda: says(node).startswith('no command for 0.25 s'), 'the reason')
-    world.until(lambda: plug.robot.speeds == (0.0, 0.0), 'standstill')
-    assert world.call(SetBool, 'e_stop', data=True).success
-    driver.message = twist(0.1)
-    world.until(lambda: plug.robot.estop, 'the stop')
-    assert 'emergency stop: asked for by service e_stop' in says(node)
+def test_timeout_and_e_stop_stop_the_robot(harness, plug):
+    node, source, _ = driving(harness, plug)
+    source.message = None
+    harness.spin_until(lambda: says(node).startswith('no command for 0.25 s'), 'the reason')
+    harness.spin_until(lambda: plug.robot.speeds == (0.0, 0.0), 'standstill')
+    assert harness.call(SetBool, 'e_stop', data=True).success
+    source.message = twist(0.1)
+    harness.spin_until(lambda: plug.robot.estop, 'the stop')
+    assert 'emergency stop: requested by service e_stop' in says(node)
     assert plug.robot.speeds == (0.0, 0.0)
-    assert world.call(SetBool, 'e_stop', data=False).success
-    world.until(lambda: max(plug.robot.speeds) > 2.0, 'it drives again')
+    assert harness.call(SetBool, 'e_stop', data=False).success
+    harness.spin_until(lambda: max(plug.robot.speeds) > 2.0, 'it drives again')
 
 
-def test_odometry_is_reset_at_rest_only(world, plug):
-    _, driver, odom = driving(world, plug)
-    assert not world.call(Trigger, 'reset_odometry').success
-    driver.message = twist(0.0)
-    world.until(lambda: odom[-1].twist.twist.linear.x == 0.0, 'standstill')
-    world.until(lambda: world.call(Trigger, 'reset_odometry').success, 'the reset')
-    world.until(lambda: abs(odom[-1].pose.pose.position.x) < 1e-6, 'the origin')
+def test_odometry_is_reset_at_rest_only(harness, plug):
+    _, source, odom = driving(harness, plug)
+    assert not harness.call(Trigger, 'reset_odometry').success
+    source.message = twist(0.0)
+    harness.spin_until(lambda: odom[-1].twist.twist.linear.x == 0.0, 'standstill')
+    harness.spin_until(lambda: harness.call(Trigger, 'reset_odometry').success, 'the reset')
+    harness.spin_until(lambda: abs(odom[-1].pose.pose.position.x) < 1e-6, 'the origin')
 
 
-def test_the_end_leaves_the_robot_at_rest_with_its_drives_out(world, plug):
-    node, driver, _ = driving(world, plug)
-    driver.message = None
-    world.remove(node)
+def test_shutdown_stops_the_robot_and_disables_its_drives(harness, plug):
+    node, source, _ = driving(harness, plug)
+    source.message = None
+    harness.remove(node)
     assert plug.robot.speeds == (0.0, 0.0)
     assert not plug.robot.enabled
-    assert not node._courier.is_alive()
+    assert not node._port_thread.is_alive()
 
 
-def test_a_key_file_that_others_may_read_is_refused(world, plug, tmp_path):
+def test_a_key_file_readable_by_others_is_rejected(harness, plug, tmp_path):
     key = tmp_path / 'key'
     key.write_text('00' * 16)
     key.chmod(0o644)
     with pytest.raises(KeyFileError, match='chmod 600'):
-        world.add(RadioBridgeNode, port=plug.path, key_file=str(key))
+        harness.add(RadioBridgeNode, port=plug.path, key_file=str(key))
 
 
-def test_with_the_key_commands_are_signed(world, tmp_path):
+def test_commands_are_signed_with_the_key(harness, tmp_path):
     key = bytes(range(16))
     path = tmp_path / 'key'
     path.write_text(key.hex())
     path.chmod(0o600)
     plug = Plug(tmp_path / 'dongle', key)
     try:
-        node = world.add(RadioBridgeNode, port=plug.path, key_file=str(path))
-        driver = Driver(world)
-        driver.message = twist(0.1)
-        world.until(lambda: max(plug.robot.speeds) > 2.0, 'it drives')
-        world.until(lambda: says(node) == 'following commands', 'all is well')
-        assert node.produce_diagnostics()[2]['authenticated'] is True
+        node = harness.add(RadioBridgeNode, port=plug.path, key_file=str(path))
+        source = CommandSource(harness)
+        source.message = twist(0.1)
+        harness.spin_until(lambda: max(plug.robot.speeds) > 2.0, 'it drives')
+        harness.spin_until(lambda: says(node) == 'following commands', 'all is well')
+        assert diagnostic(node, 'authenticated') is True
     finally:
         plug.pull_out()

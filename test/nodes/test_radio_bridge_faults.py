@@ -14,7 +14,7 @@ import threading
 
 from nav_msgs.msg import Odometry
 import pytest
-from test_nodes_behaviour import Driver, World, twist
+from support.ros_graph import CommandSource, twist
 
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters, StopTimeMonitor
 from t3mpc_ros.emulator.pty_port import PtyPort, serve
@@ -29,13 +29,6 @@ REST = 0.45
 """s after the last command that was followed"""
 FULL = 0.35
 """m/s: both wheels at their largest speed, 10 rad/s"""
-
-
-@pytest.fixture
-def world(ros):
-    made = World()
-    yield made
-    made.close()
 
 
 class Served:
@@ -72,8 +65,8 @@ class Served:
         return self._ended
 
     def _look(self):
-        if said := self.watch.poll():
-            self.news.append(said)
+        if status := self.watch.poll():
+            self.news.append(status)
         if not self.emulator.port_open:
             self.back_ns = self.emulator.now_ns
 
@@ -109,21 +102,23 @@ def obeyed(node):
 
 
 @pytest.mark.slow
-def test_a_killed_bridge_leaves_the_wheels_at_rest_in_time(world, fleet, tmp_path):
+def test_a_killed_bridge_leaves_the_wheels_at_rest(harness, fleet, tmp_path):
     """All of them processes: SIGKILL, from full speed; the emulator says how long it took."""
     path = tmp_path / 'dongle'
     fleet.start('emulator', 'emulator', '--link', str(path), program='t3mpc')
     fleet.wait_for('emulator', 'stop with Ctrl-C', 120.0)
-    odom = world.hear(Odometry, 'odom')
-    driver = Driver(world)
+    odom = harness.subscribe(Odometry, 'odom')
+    source = CommandSource(harness)
     for _ in range(2):
         fleet.start('radio_bridge', parameters={'port': str(path)})
-        driver.message = twist(FULL)
+        source.message = twist(FULL)
         odom.clear()
-        world.until(lambda: odom and odom[-1].twist.twist.linear.x > 0.98 * FULL, 'full speed')
+        harness.spin_until(
+            lambda: odom and odom[-1].twist.twist.linear.x > 0.98 * FULL, 'full speed'
+        )
         fleet.kill('radio_bridge')
         before = fleet.log('emulator').read_text().count('at rest')
-        world.until(
+        harness.spin_until(
             lambda before=before: fleet.log('emulator').read_text().count('at rest') > before,
             'rest',
         )
@@ -133,30 +128,32 @@ def test_a_killed_bridge_leaves_the_wheels_at_rest_in_time(world, fleet, tmp_pat
     assert max(map(float, found)) <= REST
 
 
-def test_replugged_it_is_driven_again_within_a_second(world, served):
+def test_a_replugged_dongle_drives_within_a_second(harness, served):
     board = served(dongle_boot_time=0.0)
-    node = world.add(RadioBridgeNode, port=board.path)
-    driver = Driver(world)
-    driver.message = twist(0.1)
-    world.until(lambda: board.followed and board.followed[-1][1].left > 2000, 'it drives')
+    node = harness.add(RadioBridgeNode, port=board.path)
+    source = CommandSource(harness)
+    source.message = twist(0.1)
+    harness.spin_until(lambda: board.followed and board.followed[-1][1].left > 2000, 'it drives')
     board.inject('close_port', 0.7)
-    world.until(lambda: 'is the dongle plugged in?' in says(node), 'the reason')
-    world.until(lambda: board.back_ns and board.followed[-1][0] > board.back_ns, 'it goes on')
+    harness.spin_until(lambda: 'is the dongle plugged in?' in says(node), 'the reason')
+    harness.spin_until(
+        lambda: board.back_ns and board.followed[-1][0] > board.back_ns, 'it goes on'
+    )
     first = next(now_ns for now_ns, _ in board.followed if now_ns > board.back_ns)
     took = (first - board.back_ns) / 1e9
     print(f'\nfollows commands {took:.2f} s after the port is back')
     assert took <= 2.0  # 0.2 s in virtual time: see test_firmware_avr_faults.py
-    world.until(lambda: obeyed(node), 'all is well')
+    harness.spin_until(lambda: obeyed(node), 'all is well')
 
 
-def test_a_second_opener_makes_no_wrong_command_and_is_got_over(world, served):
+def test_a_second_reader_of_the_port_causes_no_wrong_command(harness, served):
     """It ignores the lock, steals answers, writes noise and frames of a session of its own."""
     board = served()
-    node = world.add(RadioBridgeNode, port=board.path)
-    driver = Driver(world)
-    driver.message = twist(0.1)
-    world.until(lambda: len(board.followed) > 20, 'it drives')
-    stranger = os.open(board.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    node = harness.add(RadioBridgeNode, port=board.path)
+    source = CommandSource(harness)
+    source.message = twist(0.1)
+    harness.spin_until(lambda: len(board.followed) > 20, 'it drives')
+    foreign_node = os.open(board.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     dice = random.Random(4)
     count = len(board.followed)
     for _ in range(60):
@@ -167,15 +164,15 @@ def test_a_second_opener_makes_no_wrong_command_and_is_got_over(world, served):
             continue  # one in 255 is the session of the bridge: only a key keeps that out
         poll = encode(Poll(foreign.session, 0, 0))
         frame = encode_frame(encode(Transmit(dice.randrange(256), 6, encode(foreign), poll)))
-        os.write(stranger, dice.choice((frame, dice.randbytes(20), frame[:9])))
+        os.write(foreign_node, dice.choice((frame, dice.randbytes(20), frame[:9])))
         with suppress(BlockingIOError):
-            os.read(stranger, 64)
+            os.read(foreign_node, 64)
         end = node.steady_ns() + 30_000_000
-        world.until(lambda end=end: node.steady_ns() > end, 'a while')
+        harness.spin_until(lambda end=end: node.steady_ns() > end, 'a while')
     print(f'\nwhile it wrote: {says(node)}, {len(board.followed) - count} commands followed')
-    os.close(stranger)
-    world.until(lambda: obeyed(node), 'it is got over')
+    os.close(foreign_node)
+    harness.spin_until(lambda: obeyed(node), 'it is got over')
     count = len(board.followed)
-    world.until(lambda: len(board.followed) > count + 20, 'commands')
+    harness.spin_until(lambda: len(board.followed) > count + 20, 'commands')
     for _, command in board.followed:
         assert 0 <= command.left == command.right <= 3000

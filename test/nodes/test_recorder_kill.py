@@ -121,7 +121,7 @@ def kept_after_kill(folder: Path, output: Path):
         return [bytes(data) for _, _, data in recording._reader.messages([odom])]
 
 
-def test_killed_at_20_random_moments_no_more_than_a_second_is_lost(source, tmp_path):
+def test_20_kills_lose_at_most_one_second_each(source, tmp_path):
     with ThreadPoolExecutor(SLOTS) as pool:
         slots = [pool.submit(kill_one_after_the_other, tmp_path, i, source) for i in range(SLOTS)]
         kills = [one for slot in slots for one in slot.result()]

@@ -87,7 +87,7 @@ def numbers(path):
 
 
 @pytest.mark.parametrize('moment', [1, 2])
-def test_a_killed_recorder_has_lost_at_most_the_last_second(moment, fleet, talker, tmp_path):
+def test_a_killed_recorder_loses_at_most_one_second(moment, fleet, talker, tmp_path):
     start(fleet, tmp_path / 'bag')
     talker.find()
     talker.say(150 + random.Random(moment).randrange(100))
@@ -101,7 +101,7 @@ def test_a_killed_recorder_has_lost_at_most_the_last_second(moment, fleet, talke
     assert kept == list(range(len(kept)))
 
 
-def test_after_a_second_of_silence_a_killed_recorder_has_lost_nothing(fleet, talker, tmp_path):
+def test_a_recorder_killed_after_a_pause_has_lost_nothing(fleet, talker, tmp_path):
     start(fleet, tmp_path / 'bag')
     talker.find()
     talker.say(20)
@@ -112,7 +112,7 @@ def test_after_a_second_of_silence_a_killed_recorder_has_lost_nothing(fleet, tal
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_what_has_come_before_a_signal_is_in_the_bag(number, fleet, talker, tmp_path):
+def test_messages_before_a_signal_are_in_the_bag(number, fleet, talker, tmp_path):
     start(fleet, tmp_path / 'bag')
     talker.find()
     talker.say(900, period=0.0)
@@ -121,7 +121,7 @@ def test_what_has_come_before_a_signal_is_in_the_bag(number, fleet, talker, tmp_
     assert numbers(tmp_path / 'bag') == list(range(900))
 
 
-def test_a_file_that_may_not_grow_stops_the_recording_and_can_be_read(fleet, talker, tmp_path):
+def test_a_file_size_limit_stops_recording_readably(fleet, talker, tmp_path):
     start(fleet, tmp_path / 'bag', chunk_time=0.05)
     talker.find()
     talker.ballast = 500
@@ -135,11 +135,11 @@ def test_a_file_that_may_not_grow_stops_the_recording_and_can_be_read(fleet, tal
 
     with pytest.raises(ProcessError, match='ended with code 1'):
         say_until_it_ends()
-    said = fleet.log('recorder').read_text()
-    assert said.count('recording has stopped') == 1
-    for words in ('File too large', 'messages are kept', 'start the recorder again'):
-        assert words in said
-    assert 'Traceback' not in said
+    status = fleet.log('recorder').read_text()
+    assert status.count('recording has stopped') == 1
+    for words in ('File too large', 'messages are kept', 'restart the recorder'):
+        assert words in status
+    assert 'Traceback' not in status
     kept = numbers(tmp_path / 'bag')
     assert len(kept) > 50
     assert kept == list(range(len(kept)))

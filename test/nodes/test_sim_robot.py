@@ -18,7 +18,16 @@ from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState, Imu, Range
 from std_srvs.srv import Trigger
-from test_nodes_behaviour import Driver, World, on_grid, reason, speed, stamp, twist
+from support.ros_graph import (
+    CommandSource,
+    diagnostic,
+    diagnostic_level,
+    on_grid,
+    reason,
+    speed,
+    stamp,
+    twist,
+)
 import yaml
 
 from t3mpc_ros.cli.demo import DemoOptions
@@ -26,9 +35,9 @@ from t3mpc_ros.cli.main import _parser
 from t3mpc_ros.cli.process_group import ProcessError
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.common.base_node import OK, WARN
-from t3mpc_ros.nodes.node_parameters import PARAMETER_CLASSES
 from t3mpc_ros.nodes.recorder.node import RecorderNode
-from t3mpc_ros.nodes.sim_robot import SimRobotNode, SimRobotNodeParameters
+from t3mpc_ros.nodes.registry import parameter_class
+from t3mpc_ros.nodes.sim_robot import SimRobotNode, SimRobotParameters
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.robot.interface import RANGE_SENSORS
 
@@ -37,76 +46,69 @@ pytestmark = pytest.mark.ros
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@pytest.fixture
-def world(ros):
-    made = World()
-    yield made
-    made.close()
-
-
-def paused(world, /, **parameters):
+def paused(harness, /, **parameters):
     """Return a robot whose time stands, once it has told its first state."""
-    robot = world.add(SimRobotNode, publish_clock=True, speed=0.0, **parameters)
-    world.until(
-        lambda: robot.produce_diagnostics()[2].get('moving') is not None, 'the first state'
-    )
+    robot = harness.add(SimRobotNode, publish_clock=True, real_time_factor=0.0, **parameters)
+    harness.spin_until(lambda: diagnostic(robot, 'moving') is not None, 'the first state')
     return robot
 
 
-def change(world, node, **values):
+def change(harness, node, **values):
     """Set parameters over the node's service, as ``ros2 param set`` does; return the results."""
     request = [
         Parameter(name.replace('__', '.'), value=value).to_parameter_msg()
         for name, value in values.items()
     ]
     full = node.get_fully_qualified_name()
-    return world.call(SetParameters, f'{full}/set_parameters', parameters=request).results
+    return harness.call(SetParameters, f'{full}/set_parameters', parameters=request).results
 
 
 def truths(node):
     """Return the newest state of a robot, and from now on every one that it tells."""
     states = [] if node._state is None else [node._state]
-    publish = node._topics.publish
+    publish = node._robot_publishers.publish
 
     def note(state):
         states.append(state)
         publish(state)
 
-    node._topics.publish = note
+    node._robot_publishers.publish = note
     return states
 
 
-def matched(world, robot, *topics):
+def matched(harness, robot, *topics):
     """Spin until those of the robot's topics that are heard have found who hears them."""
     names = {robot.resolve_topic_name(topic) for topic in topics}
     publishers = [one for one in robot.publishers if one.topic_name in names]
     assert len(publishers) == len(names)
     for publisher in publishers:
-        world.found(publisher)
+        harness.wait_for_subscriber(publisher)
 
 
 # -- sensors --------------------------------------------------------------------------------------
 
 
-def test_the_sensors_tell_what_the_robot_knows(world):
+def test_sensor_messages_match_the_robot_state(harness):
     """In a corner of the room, 0.3 m from the wall in front."""
-    heard = {name: world.hear(Range, f'range/{name}') for name in RANGE_SENSORS}
-    imu = world.hear(Imu, 'imu/data_raw')
-    battery = world.hear(BatteryState, 'battery_state')
+    received = {name: harness.subscribe(Range, f'range/{name}') for name in RANGE_SENSORS}
+    imu = harness.subscribe(Imu, 'imu/data_raw')
+    battery = harness.subscribe(BatteryState, 'battery_state')
     robot = paused(
-        world,
+        harness,
         world='room',
-        start_x=1.60,
-        imu_frame='a/imu',
+        initial_pose__x=1.60,
+        imu_frame_id='a/imu',
         range_frame_prefix='a/',
         step_time=0.5,
         noise__variance=0.04,
     )
     states = truths(robot)
-    matched(world, robot, 'imu/data_raw', 'battery_state', *(f'range/{n}' for n in RANGE_SENSORS))
+    matched(
+        harness, robot, 'imu/data_raw', 'battery_state', *(f'range/{n}' for n in RANGE_SENSORS)
+    )
     for _ in range(3):
-        assert world.call(Trigger, 'sim_robot/step').success
-    world.until(lambda: len(imu) >= 100 and battery and all(heard.values()))
+        assert harness.call(Trigger, 'sim_robot/step').success
+    harness.spin_until(lambda: len(imu) >= 100 and battery and all(received.values()))
 
     by_stamp = {state.stamp_ns: state for state in states}
     for message in imu:
@@ -125,7 +127,7 @@ def test_the_sensors_tell_what_the_robot_knows(world):
     assert np.var(rates) == pytest.approx(gyro[8], rel=0.6)
 
     seen = set()
-    for name, messages in heard.items():
+    for name, messages in received.items():
         index = RANGE_SENSORS.index(name)
         for message in messages:
             assert message.range == np.float32(by_stamp[stamp(message)].ranges[index])
@@ -137,7 +139,7 @@ def test_the_sensors_tell_what_the_robot_knows(world):
         assert last.field_of_view == np.float32(0.1)
         seen.add('inf' if message.range == math.inf else 'distance')
     assert seen == {'inf', 'distance'}
-    assert heard['front_left'][-1].range == pytest.approx(0.3, abs=0.05)
+    assert received['front_left'][-1].range == pytest.approx(0.3, abs=0.05)
 
     supply = battery[-1]
     assert supply.voltage == np.float32(by_stamp[stamp(supply)].battery.voltage)
@@ -147,51 +149,51 @@ def test_the_sensors_tell_what_the_robot_knows(world):
     assert supply.power_supply_status == BatteryState.POWER_SUPPLY_STATUS_DISCHARGING
 
 
-def test_sensors_come_at_their_rates_in_the_time_of_the_robot(world):
-    imu = world.hear(Imu, 'imu/data_raw')
-    left = world.hear(Range, 'range/left_front')
-    battery = world.hear(BatteryState, 'battery_state')
-    robot = world.add(SimRobotNode, publish_clock=True, speed=5.0, range_rate=25.0)
-    world.until(lambda: len(battery) > 3 and len(left) > 20)
+def test_sensors_are_published_at_their_rates(harness):
+    imu = harness.subscribe(Imu, 'imu/data_raw')
+    left = harness.subscribe(Range, 'range/left_front')
+    battery = harness.subscribe(BatteryState, 'battery_state')
+    robot = harness.add(SimRobotNode, publish_clock=True, real_time_factor=5.0, range_rate=25.0)
+    harness.spin_until(lambda: len(battery) > 3 and len(left) > 20)
     assert set(np.diff([stamp(message) for message in left])) == {NANOSECONDS // 25}
     assert set(np.diff([stamp(message) for message in battery])) == {NANOSECONDS}
     assert set(np.diff([stamp(message) for message in imu])) == {NANOSECONDS // 100}
     assert reason(robot) == 'no command yet'
 
 
-def test_a_free_view_is_max_range_for_those_who_want_it(world):
-    heard = world.hear(Range, 'range/front_left')
-    robot = world.add(SimRobotNode)
-    world.until(lambda: heard and heard[-1].range == math.inf)
-    assert change(world, robot, range_infinity=False)[0].successful
-    world.until(lambda: heard[-1].range == heard[-1].max_range == np.float32(0.8))
+def test_range_infinity_false_publishes_max_range(harness):
+    received = harness.subscribe(Range, 'range/front_left')
+    robot = harness.add(SimRobotNode)
+    harness.spin_until(lambda: received and received[-1].range == math.inf)
+    assert change(harness, robot, range_infinity=False)[0].successful
+    harness.spin_until(lambda: received[-1].range == received[-1].max_range == np.float32(0.8))
 
 
-def test_the_papers_plant_has_no_sensors_and_ranges_can_be_turned_off(world):
-    world.add(SimRobotNode, namespace='servo', drive__kind='velocity')
-    world.add(SimRobotNode, namespace='twin', range_rate=0.0)
-    odom = [world.hear(Odometry, f'{name}/odom') for name in ('servo', 'twin')]
-    world.until(lambda: min(map(len, odom)) > 5)
-    names = {name for name, _ in world.probe.get_topic_names_and_types()}
+def test_the_paper_plant_has_no_sensors(harness):
+    harness.add(SimRobotNode, namespace='servo', drive__kind='velocity')
+    harness.add(SimRobotNode, namespace='twin', range_rate=0.0)
+    odom = [harness.subscribe(Odometry, f'{name}/odom') for name in ('servo', 'twin')]
+    harness.spin_until(lambda: min(map(len, odom)) > 5)
+    names = {name for name, _ in harness.probe.get_topic_names_and_types()}
     assert '/twin/imu/data_raw' in names
     assert not any('/range/' in name for name in names)
     for name in ('imu/data_raw', 'battery_state'):
         assert f'/servo/{name}' not in names
 
 
-def test_the_recorder_keeps_the_sensors_without_being_told(world, tmp_path):
-    world.add(SimRobotNode)
-    recorder = world.add(RecorderNode, folder=str(tmp_path / 'bag'))
+def test_sensor_topics_are_recorded_by_default(harness, tmp_path):
+    harness.add(SimRobotNode)
+    recorder = harness.add(RecorderNode, folder=str(tmp_path / 'bag'))
     wanted = {'/imu/data_raw', '/battery_state', *(f'/range/{name}' for name in RANGE_SENSORS)}
-    world.until(lambda: wanted <= recorder._added.keys(), 'all are recorded')
+    harness.spin_until(lambda: wanted <= recorder._recorded_types.keys(), 'all are recorded')
 
 
-def test_odometry_says_how_well_its_twist_is_known(world):
-    odom = world.hear(Odometry, 'odom')
-    robot = world.add(SimRobotNode, noise__variance=0.04)
-    driver = Driver(world)
-    driver.message = twist(0.2)
-    world.until(lambda: len(odom) > 300)
+def test_twist_covariance_matches_the_noise(harness):
+    odom = harness.subscribe(Odometry, 'odom')
+    robot = harness.add(SimRobotNode, noise__variance=0.04)
+    source = CommandSource(harness)
+    source.message = twist(0.2)
+    harness.spin_until(lambda: len(odom) > 300)
     told = np.array(odom[-1].twist.covariance).reshape(6, 6)
     assert [told[i, i] for i in (1, 2, 3, 4)] == [1e6] * 4
     steady = odom[100:]
@@ -199,69 +201,73 @@ def test_odometry_says_how_well_its_twist_is_known(world):
     angular = np.var([message.twist.twist.angular.z for message in steady])
     assert linear == pytest.approx(told[0, 0], rel=0.5)
     assert angular == pytest.approx(told[5, 5], rel=0.5)
-    assert change(world, robot, noise__variance=0.0)[0].successful
+    assert change(harness, robot, noise__variance=0.0)[0].successful
     count = len(odom)
-    world.until(lambda: len(odom) > count + 5)
+    harness.spin_until(lambda: len(odom) > count + 5)
     assert odom[-1].twist.covariance[0] < 0.2 * told[0, 0]
 
 
 # -- faults ---------------------------------------------------------------------------------------
 
 
-def test_a_dead_gyro_is_silent_and_a_warning_until_it_answers_again(world):
-    robot = world.add(SimRobotNode)
-    imu = world.hear(Imu, 'imu/data_raw')
-    odom = world.hear(Odometry, 'odom')
-    driver = Driver(world)
-    driver.message = twist(0.1)
-    world.until(lambda: imu and robot.produce_diagnostics()[:2] == (OK, 'following commands'))
-    assert change(world, robot, faults__gyro_dead=True)[0].successful
-    said = world.diagnosis('sim_robot')
-    world.until(lambda: len(odom) > 0)
+def test_a_dead_gyro_is_a_warning_until_it_recovers(harness):
+    robot = harness.add(SimRobotNode)
+    imu = harness.subscribe(Imu, 'imu/data_raw')
+    odom = harness.subscribe(Odometry, 'odom')
+    source = CommandSource(harness)
+    source.message = twist(0.1)
+    harness.spin_until(
+        lambda: imu and (diagnostic_level(robot), reason(robot)) == (OK, 'following commands')
+    )
+    assert change(harness, robot, faults__gyro_dead=True)[0].successful
+    status = harness.next_status('sim_robot')
+    harness.spin_until(lambda: len(odom) > 0)
     silent, told = len(imu), len(odom)
-    world.until(lambda: len(odom) > told + 30)
+    harness.spin_until(lambda: len(odom) > told + 30)
     assert len(imu) == silent
-    assert said.level == WARN
-    assert 'inertial sensor does not answer' in said.message
-    assert 'faults: gyro_dead' in said.message
-    values = {entry.key: entry.value for entry in said.values}
+    assert status.level == WARN
+    assert 'inertial sensor does not answer' in status.message
+    assert 'faults: gyro_dead' in status.message
+    values = {entry.key: entry.value for entry in status.values}
     assert values['faults'] == 'gyro_dead'
     assert values['imu_fault'] == 'True'
-    assert change(world, robot, faults__gyro_dead=False)[0].successful
-    world.until(lambda: len(imu) > silent + 5)
-    world.until(lambda: robot.produce_diagnostics()[:2] == (OK, 'following commands'))
+    assert change(harness, robot, faults__gyro_dead=False)[0].successful
+    harness.spin_until(lambda: len(imu) > silent + 5)
+    harness.spin_until(
+        lambda: (diagnostic_level(robot), reason(robot)) == (OK, 'following commands')
+    )
 
 
-def test_a_brown_out_stops_the_robot_with_the_reason_and_it_drives_again(world):
-    robot = world.add(SimRobotNode)
-    odom = world.hear(Odometry, 'odom')
-    driver = Driver(world)
-    driver.message = twist(0.1)
-    world.until(lambda: odom and speed(odom[-1]) > 0.08)
+def test_a_brown_out_stops_the_robot_temporarily(harness):
+    robot = harness.add(SimRobotNode)
+    odom = harness.subscribe(Odometry, 'odom')
+    source = CommandSource(harness)
+    source.message = twist(0.1)
+    harness.spin_until(lambda: odom and speed(odom[-1]) > 0.08)
     states = truths(robot)
-    assert change(world, robot, faults__brown_out=True)[0].successful
-    world.until(lambda: 'brown-out: the board restarts' in reason(robot))
-    assert not robot.produce_diagnostics()[2]['enabled']
-    world.until(lambda: states[-1].reason == '', 'the board is back')
+    assert change(harness, robot, faults__brown_out=True)[0].successful
+    harness.spin_until(lambda: 'brown-out: the board restarts' in reason(robot))
+    assert not diagnostic(robot, 'enabled')
+    harness.spin_until(lambda: states[-1].reason == '', 'the board is back')
     count = len(odom)
-    world.until(lambda: len(odom) > count + 20)
-    world.until(lambda: speed(odom[-1]) > 0.08, 'it drives again, for commands still come')
+    harness.spin_until(lambda: len(odom) > count + 20)
+    harness.spin_until(lambda: speed(odom[-1]) > 0.08, 'it drives again, for commands still come')
     away = [state for state in states if state.reason]
     assert away[-1].stamp_ns - away[0].stamp_ns == pytest.approx(0.5 * NANOSECONDS, rel=0.2)
     # Nothing brakes it: without current the wheels run down by themselves.
     assert min(state.truth.twist.linear for state in away) < 0.02
-    assert robot.produce_diagnostics()[2]['commands_refused'] > 0
+    assert diagnostic(robot, 'commands_rejected') > 0
 
 
-def test_a_blocked_wheel_loses_steps_and_the_robot_says_so(world):
-    robot = world.add(SimRobotNode)
-    driver = Driver(world)
-    driver.message = twist(0.2)
-    world.until(lambda: robot.produce_diagnostics()[2].get('moving'))
-    assert change(world, robot, faults__wheel_blocked='right')[0].successful
-    world.until(lambda: 'steps lost: ' in reason(robot))
+def test_a_blocked_wheel_loses_steps_with_a_warning(harness):
+    robot = harness.add(SimRobotNode)
+    source = CommandSource(harness)
+    source.message = twist(0.2)
+    harness.spin_until(lambda: diagnostic(robot, 'moving'))
+    assert change(harness, robot, faults__wheel_blocked='right')[0].successful
+    harness.spin_until(lambda: 'steps lost: ' in reason(robot))
     assert 'wheel_blocked right' in reason(robot)
-    assert robot.produce_diagnostics()[2]['lost_steps_right'] > 0
+    assert diagnostic(robot, 'lost_steps_right') > 0
 
 
 @pytest.mark.parametrize(
@@ -272,35 +278,41 @@ def test_a_blocked_wheel_loses_steps_and_the_robot_says_so(world):
         {'faults.schedule': 'rough_ride'},
     ],
 )
-def test_what_the_papers_plant_does_not_have_is_refused(given):
+def test_the_paper_plant_rejects_worlds_and_faults(given):
     """A fault that was set and did nothing would be taken for a robot that copes."""
     with pytest.raises(ParameterError, match=f'must be stepper for {next(iter(given))[:5]}'):
-        SimRobotNodeParameters.from_dict({'drive.kind': 'velocity', **given})
-    SimRobotNodeParameters.from_dict(given)
+        SimRobotParameters.from_dict({'drive.kind': 'velocity', **given})
+    SimRobotParameters.from_dict(given)
 
 
 # -- places ---------------------------------------------------------------------------------------
 
 
-def test_a_robot_starts_where_it_is_told_and_never_in_a_wall(world):
-    truth = world.hear(Odometry, 'ground_truth/odom')
-    robot = world.add(
-        SimRobotNode, world='room', world_frame='map', start_x=-1.0, start_y=0.2, start_heading=1.0
+def test_the_initial_pose_is_used_unless_within_a_wall(harness):
+    truth = harness.subscribe(Odometry, 'ground_truth/odom')
+    robot = harness.add(
+        SimRobotNode,
+        world='room',
+        world_frame='map',
+        initial_pose__x=-1.0,
+        initial_pose__y=0.2,
+        initial_pose__yaw=1.0,
     )
-    world.until(lambda: truth)
+    harness.spin_until(lambda: truth)
     where = truth[0].pose.pose.position
     assert (where.x, where.y) == pytest.approx((-1.0, 0.2))
     assert truth[0].header.frame_id == 'map'
-    assert change(world, robot, start_x=1.25, start_y=0.85)[0].successful
-    answer = world.call(Trigger, 'sim_robot/set_pose')
-    assert not answer.success
-    assert 'must be at least' in answer.message
-    assert 'room' in answer.message
+    assert change(harness, robot, initial_pose__x=1.25, initial_pose__y=0.85)[0].successful
+    response = harness.call(Trigger, 'sim_robot/set_pose')
+    assert not response.success
+    assert 'must be at least' in response.message
+    assert 'room' in response.message
     count = len(truth)
-    world.until(lambda: len(truth) > count + 3)
+    harness.spin_until(lambda: len(truth) > count + 3)
     assert truth[-1].pose.pose.position.x == pytest.approx(-1.0)
-    with pytest.raises(ParameterError, match=r'start_x and start_y: pose must be .* got x 1.95 m'):
-        world.add(SimRobotNode, namespace='other', world='room', start_x=1.95)
+    words = r'initial_pose.x and initial_pose.y: pose must be .* got x 1.95 m'
+    with pytest.raises(ParameterError, match=words):
+        harness.add(SimRobotNode, namespace='other', world='room', initial_pose__x=1.95)
 
 
 @pytest.mark.parametrize(
@@ -308,10 +320,10 @@ def test_a_robot_starts_where_it_is_told_and_never_in_a_wall(world):
     [
         ({'world': 'rome'}, ['rome', 'did you mean room?']),
         ({'faults.schedule': 'rough_rid'}, ['rough_rid', 'did you mean rough_ride?']),
-        ({'speed': 10.0}, ['publish_clock must be true', 'got speed 10']),
+        ({'real_time_factor': 10.0}, ['publish_clock must be true', 'real_time_factor 10']),
     ],
 )
-def test_what_cannot_be_used_ends_the_process_with_one_line_and_code_2(given, words, fleet):
+def test_unusable_parameters_end_the_process_with_code_2(given, words, fleet):
     fleet.start('sim_robot', parameters=given)
     with pytest.raises(ProcessError, match='code 2'):
         fleet.wait_ready('sim_robot')
@@ -325,79 +337,82 @@ def test_what_cannot_be_used_ends_the_process_with_one_line_and_code_2(given, wo
 # -- time -----------------------------------------------------------------------------------------
 
 
-def test_while_time_stands_only_a_step_moves_the_robot(world):
-    odom = world.hear(Odometry, 'odom')
-    clock = world.hear(Clock, '/clock')
-    robot = paused(world, step_time=0.02)
-    commands = world.speak(Twist, 'cmd_vel')
-    world.found(commands)
-    world.until(lambda: robot.count_subscribers('odom') and len(clock) > 3)
+def test_paused_time_advances_by_steps_only(harness):
+    odom = harness.subscribe(Odometry, 'odom')
+    clock = harness.subscribe(Clock, '/clock')
+    robot = paused(harness, step_time=0.02)
+    commands = harness.create_publisher(Twist, 'cmd_vel')
+    harness.wait_for_subscriber(commands)
+    harness.spin_until(lambda: robot.count_subscribers('odom') and len(clock) > 3)
     states = truths(robot)
     commands.publish(twist(0.3))
     count = len(clock)
-    world.until(lambda: len(clock) > count + 5, 'the time that stands is told to late comers')
+    harness.spin_until(
+        lambda: len(clock) > count + 5, 'the time that stands is told to late comers'
+    )
     assert {(message.clock.sec, message.clock.nanosec) for message in clock} == {(1, 0)}
     assert len(states) == 1
-    answers = [world.call(Trigger, 'sim_robot/step') for _ in range(10)]
-    assert [answer.message for answer in answers] == [
-        f'it is {1.0 + 0.02 * n:.9f} s' for n in range(1, 11)
+    answers = [harness.call(Trigger, 'sim_robot/step') for _ in range(10)]
+    assert [response.message for response in answers] == [
+        f'simulated time {1.0 + 0.02 * n:.9f} s' for n in range(1, 11)
     ]
     assert [state.stamp_ns for state in states] == [
         NANOSECONDS + n * 10_000_000 for n in range(21)
     ]
     assert states[-1].truth.pose.x > 0.01
-    world.until(lambda: odom and stamp(odom[-1]) == states[-1].stamp_ns)
-    world.until(lambda: clock[-1].clock == odom[-1].header.stamp)
+    harness.spin_until(lambda: odom and stamp(odom[-1]) == states[-1].stamp_ns)
+    harness.spin_until(lambda: clock[-1].clock == odom[-1].header.stamp)
 
-    assert change(world, robot, speed=1.0)[0].successful
-    world.until(lambda: len(states) > 30, 'time runs')
-    answer = world.call(Trigger, 'sim_robot/step')
-    assert not answer.success
-    assert 'speed must be 0' in answer.message
-    assert change(world, robot, speed=0.0)[0].successful
+    assert change(harness, robot, real_time_factor=1.0)[0].successful
+    harness.spin_until(lambda: len(states) > 30, 'time runs')
+    response = harness.call(Trigger, 'sim_robot/step')
+    assert not response.success
+    assert 'real_time_factor must be 0' in response.message
+    assert change(harness, robot, real_time_factor=0.0)[0].successful
     count = len(clock)
-    world.until(lambda: len(clock) > count + 5)
+    harness.spin_until(lambda: len(clock) > count + 5)
     assert clock[-1] == clock[-5]
     assert all(np.diff([state.stamp_ns for state in states]) == 10_000_000)
 
 
-def test_time_of_its_own_must_be_told(world):
-    robot = world.add(SimRobotNode)
-    answer = world.call(Trigger, 'sim_robot/step')
-    assert not answer.success
-    assert 'publish_clock must be true' in answer.message
-    (result,) = change(world, robot, speed=2.0)
+def test_simulated_time_needs_publish_clock(harness):
+    robot = harness.add(SimRobotNode)
+    response = harness.call(Trigger, 'sim_robot/step')
+    assert not response.success
+    assert 'publish_clock must be true' in response.message
+    (result,) = change(harness, robot, real_time_factor=2.0)
     assert not result.successful
     assert 'publish_clock must be true' in result.reason
     assert robot.parameters.speed == 1.0
 
 
-def test_one_seed_and_one_sequence_of_steps_and_commands_give_the_same_messages(world):
+def test_equal_seeds_steps_and_commands_give_equal_messages(harness):
     kinds = {'odom': Odometry, 'imu/data_raw': Imu, 'battery_state': BatteryState}
     kinds |= {f'range/{name}': Range for name in RANGE_SENSORS}
     stories = []
     for name, seed in (('a', 5), ('b', 5), ('c', 6)):
         robot = paused(
-            world, namespace=name, seed=seed, world='room', noise__variance=0.04, step_time=0.2
+            harness, namespace=name, seed=seed, world='room', noise__variance=0.04, step_time=0.2
         )
-        heard = {topic: world.hear(kind, f'{name}/{topic}', 1000) for topic, kind in kinds.items()}
-        matched(world, robot, *kinds)
-        commands = world.speak(Twist, f'{name}/cmd_vel')
-        world.found(commands)
+        received = {
+            topic: harness.subscribe(kind, f'{name}/{topic}', 1000)
+            for topic, kind in kinds.items()
+        }
+        matched(harness, robot, *kinds)
+        commands = harness.create_publisher(Twist, f'{name}/cmd_vel')
+        harness.wait_for_subscriber(commands)
         states = truths(robot)
         for n in range(8):
             commands.publish(twist(0.05 * n, 0.3 * n))
-            world.until(
-                lambda one=robot, count=n + 1: one.produce_diagnostics()[2]['commands'] == count
-            )
-            assert world.call(Trigger, f'{name}/sim_robot/step').success
+            harness.spin_until(lambda one=robot, count=n + 1: diagnostic(one, 'commands') == count)
+            assert harness.call(Trigger, f'{name}/sim_robot/step').success
         end_ns = states[-1].stamp_ns
         for topic in ('odom', 'imu/data_raw'):
-            world.until(lambda some=heard[topic], end=end_ns: stamp(some[-1]) == end)
+            harness.spin_until(lambda some=received[topic], end=end_ns: stamp(some[-1]) == end)
         # As text: a battery has numbers that nobody measures, and NaN equals nothing.
-        told = {topic: [str(message) for message in some] for topic, some in heard.items()}
+        told = {topic: [str(message) for message in some] for topic, some in received.items()}
         stories.append((told, [state.truth for state in states]))
-        world.remove(robot)
+        harness.remove(robot)
     (first, path), (same, again), (other, another) = stories
     assert len(first['odom']) == len(path) - 1 == 160
     assert path == again != another
@@ -406,23 +421,25 @@ def test_one_seed_and_one_sequence_of_steps_and_commands_give_the_same_messages(
     assert first['odom'] != other['odom']
 
 
-def test_ten_times_as_fast_is_about_ten_times_as_fast(world):
+def test_real_time_factor_10_is_about_ten_times_as_fast(harness):
     clock = []
-    world.probe.create_subscription(
+    harness.probe.create_subscription(
         Clock, '/clock', lambda message: clock.append((time.monotonic(), message.clock.sec)), 100
     )
-    robot = world.add(SimRobotNode, publish_clock=True, speed=10.0)
-    world.until(lambda: robot.produce_diagnostics()[2].get('real_time_factor', 0.0) > 6.0)
-    assert robot.produce_diagnostics()[2]['real_time_factor'] < 11.0
-    world.until(lambda: clock and clock[-1][0] - clock[0][0] > 1.0)
+    robot = harness.add(SimRobotNode, publish_clock=True, real_time_factor=10.0)
+    harness.spin_until(lambda: robot.produce_diagnostics()[2].get('real_time_factor', 0.0) > 6.0)
+    assert diagnostic(robot, 'real_time_factor') < 11.0
+    harness.spin_until(lambda: clock and clock[-1][0] - clock[0][0] > 1.0)
     (first, begin), (last, end) = clock[0], clock[-1]
     assert 5.0 < (end - begin) / (last - first) < 12.0
-    assert change(world, robot, speed=1.0)[0].successful
-    world.until(lambda: 0.7 < robot.produce_diagnostics()[2].get('real_time_factor', 0.0) < 1.2)
+    assert change(harness, robot, real_time_factor=1.0)[0].successful
+    harness.spin_until(
+        lambda: 0.7 < robot.produce_diagnostics()[2].get('real_time_factor', 0.0) < 1.2
+    )
 
 
-def test_a_speed_that_cannot_be_reached_is_a_warning_and_leaves_no_state_out(world, monkeypatch):
-    robot = world.add(SimRobotNode, publish_clock=True, speed=100.0)
+def test_an_unreachable_real_time_factor_is_a_warning(harness, monkeypatch):
+    robot = harness.add(SimRobotNode, publish_clock=True, real_time_factor=100.0)
     advance = robot._robot.advance
 
     def slowly(now_ns):
@@ -431,11 +448,11 @@ def test_a_speed_that_cannot_be_reached_is_a_warning_and_leaves_no_state_out(wor
 
     monkeypatch.setattr(robot._robot, 'advance', slowly)
     states = truths(robot)
-    world.until(lambda: 'the machine is too slow' in reason(robot))
-    assert 'instead of 100 simulated seconds per second' in reason(robot)
-    assert 0.0 < robot.produce_diagnostics()[2]['real_time_factor'] < 20.0
+    harness.spin_until(lambda: 'processor overloaded' in reason(robot))
+    assert 'instead of 100' in reason(robot)
+    assert 0.0 < diagnostic(robot, 'real_time_factor') < 20.0
     assert set(np.diff([state.stamp_ns for state in states])) == {10_000_000}
-    assert world.call(Trigger, 'reset_odometry').success, 'others get their turn'
+    assert harness.call(Trigger, 'reset_odometry').success, 'others get their turn'
 
 
 # -- two robots -----------------------------------------------------------------------------------
@@ -498,39 +515,39 @@ def launched(monkeypatch):
 
 
 @pytest.mark.parametrize('file', ['sim.launch.py', 'two_robots.launch.py', 'robot.launch.py'])
-def test_what_a_launch_file_says_fits_its_nodes(file, launched):
+def test_launch_file_parameters_fit_their_nodes(file, launched):
     for _, name, values in launched(file):
         given = {key: value for key, value in values.items() if key != 'use_sim_time'}
-        parameters = PARAMETER_CLASSES[name].from_dict(given)
+        parameters = parameter_class(name).from_dict(given)
         if name == 'controller':
             assert parameters.speed_filter.lag == 0.003  # what a stepper needs
 
 
-def test_the_two_robots_of_the_launch_file_do_not_hear_each_other(world, launched):
+def test_two_robots_launch_file_separates_the_robots(harness, launched):
     nodes = launched('two_robots.launch.py')
     assert sorted(name for _, name, _ in nodes) == sorted(
-        2 * ['controller', 'reference', 'sim_robot']
+        2 * ['controller', 'reference_generator', 'sim_robot']
     )
     robots = {}
     for namespace, name, values in nodes:
         if name == 'sim_robot':
-            robots[namespace] = world.add(SimRobotNode, namespace=namespace, **values)
+            robots[namespace] = harness.add(SimRobotNode, namespace=namespace, **values)
     one, two = robots.values()
     assert one.parameters.seed != two.parameters.seed
     states = {name: truths(robot) for name, robot in robots.items()}
-    imu = {name: world.hear(Imu, f'{name}/imu/data_raw') for name in robots}
-    driver = Driver(world, 'robot_1/cmd_vel')
-    driver.message = twist(0.2)
-    world.until(lambda: states['robot_1'] and states['robot_1'][-1].truth.pose.x > -0.4)
-    assert states['robot_2'][-1].truth.pose == pytest.approx(two.parameters.start, abs=1e-4)
-    assert change(world, two, faults__gyro_dead=True)[0].successful
-    world.until(lambda: two.produce_diagnostics()[2]['imu_fault'])
-    world.until(lambda: all(imu.values()))
+    imu = {name: harness.subscribe(Imu, f'{name}/imu/data_raw') for name in robots}
+    source = CommandSource(harness, 'robot_1/cmd_vel')
+    source.message = twist(0.2)
+    harness.spin_until(lambda: states['robot_1'] and states['robot_1'][-1].truth.pose.x > -0.4)
+    assert states['robot_2'][-1].truth.pose == pytest.approx(two.parameters.pose, abs=1e-4)
+    assert change(harness, two, faults__gyro_dead=True)[0].successful
+    harness.spin_until(lambda: diagnostic(two, 'imu_fault'))
+    harness.spin_until(lambda: all(imu.values()))
     silent, told = len(imu['robot_2']), len(imu['robot_1'])
-    world.until(lambda: len(imu['robot_1']) > told + 20)
+    harness.spin_until(lambda: len(imu['robot_1']) > told + 20)
     assert len(imu['robot_2']) <= silent + 1
     assert imu['robot_1'][-1].header.frame_id == 'robot_1/imu_link'
-    topics = {name for name, _ in world.probe.get_topic_names_and_types()}
+    topics = {name for name, _ in harness.probe.get_topic_names_and_types()}
     for part in ('odom', 'cmd_vel', 'battery_state', 'range/front_left', 'joint_states'):
         assert {f'/robot_1/{part}', f'/robot_2/{part}'} <= topics
         assert f'/{part}' not in topics
@@ -539,7 +556,7 @@ def test_the_two_robots_of_the_launch_file_do_not_hear_each_other(world, launche
 # -- the demonstration ----------------------------------------------------------------------------
 
 
-def test_the_demonstration_drives_the_robot_that_was_asked_for():
+def test_the_demo_uses_the_selected_robot():
     asked = {
         words: _parser().parse_args(['demo', *words.split()]).robot
         for words in ('', '--robot twin', '--robot servo')
@@ -547,10 +564,8 @@ def test_the_demonstration_drives_the_robot_that_was_asked_for():
     assert list(asked.values()) == ['twin', 'twin', 'servo']
     for robot, kind, lag in (('twin', 'stepper', 0.003), ('servo', 'velocity', 0.02)):
         given = DemoOptions(robot=robot, seed=7).parameters()
-        tables = {
-            name: PARAMETER_CLASSES[name].from_dict(values) for name, values in given.items()
-        }
+        tables = {name: parameter_class(name).from_dict(values) for name, values in given.items()}
         assert tables['sim_robot'].drive.kind == kind
         assert tables['sim_robot'].noise.variance == 0.04
         assert tables['controller'].speed_filter.lag == lag
-        assert tables['sim_robot'].seed == tables['reference'].seed == 7
+        assert tables['sim_robot'].seed == tables['reference_generator'].seed == 7

@@ -12,7 +12,7 @@ from support.emulator_bench import RobotBench
 from support.radio_bench import Bench as ScriptedBench
 from support.radio_bench import FakeRobot
 
-from t3mpc_ros.nodes.common.diagnostics import complaints
+from t3mpc_ros.nodes.common import diagnostics
 from t3mpc_ros.radio.link import standstill_reasons as reasons
 from t3mpc_ros.radio.link.port_actions import LinkState
 from t3mpc_ros.radio.protocol.codec import encode
@@ -44,7 +44,7 @@ def told(bench):
     """Return what diagnostics say, most important first."""
     state = bench.robot.advance(bench.now_ns)
     well = bench.robot.quality(bench.now_ns)
-    return '; '.join([*complaints(state, None), *([well.text] if well.text else [])])
+    return '; '.join([*diagnostics.warnings(state), *([well.text] if well.text else [])])
 
 
 @cause('no command yet')

@@ -19,6 +19,8 @@ NUMBERS = (
     'controller/lyapunov/value',
     'controller/lyapunov/margin',
 )
+INITIAL_INPUTS = 'controller/initial_inputs/'
+"""Topics on which the controller republishes its first inputs; they are no topics of a robot."""
 NAMES = (REFERENCE, ODOMETRY, TRUTH, COMMAND, 'reference/signals', *NUMBERS)
 
 _ODOMETRY, _TWIST = 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/Twist'
@@ -107,6 +109,7 @@ def choose_topics(recording: BagReader, wanted: ReportOptions) -> TopicChoice:
             for topic in held.values()
             if topic.type_name in KINDS[name]
             and topic.name not in chosen.values()
+            and f'/{INITIAL_INPUTS}' not in topic.name
             and not any(topic.name.endswith(f'/{known}') for known in NAMES if known != name)
             and (not space or topic.name.startswith(space))
         ]
@@ -178,6 +181,8 @@ def find_topics(
     """
     found: dict[str, dict[str, str]] = {}
     for full in names:
+        if f'/{INITIAL_INPUTS}' in full:
+            continue
         known = [name for name in NAMES if full.endswith(f'/{name}')]
         if known:
             name = max(known, key=len)

@@ -21,6 +21,7 @@ from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.control.controller import ControllerParameters
 from t3mpc_ros.evaluation.bag_report.topic_roles import (
     COMMAND,
+    INITIAL_INPUTS,
     ODOMETRY,
     REFERENCE,
     WHEELS,
@@ -32,6 +33,7 @@ from t3mpc_ros.evaluation.process_replay.message_alignment import (
     commands_of,
     match,
     rows_of,
+    with_initial_inputs,
 )
 from t3mpc_ros.evaluation.training.training_data import recorded_parameters
 from t3mpc_ros.geometry.types import NANOSECONDS, StateArray
@@ -160,8 +162,16 @@ def load_inputs(
     if not revisions:
         with open_bag(bag) as recording:
             default = recorded_parameters(recording, prefix, notes)
-    columns = read_columns(held, topics.values())
+    initial = {
+        name: full
+        for name in (REFERENCE, ODOMETRY)
+        if held.counts.get(full := f'{prefix}/{INITIAL_INPUTS}{name}')
+    }
+    columns = read_columns(held, [*topics.values(), *initial.values()])
     by_name = {name: columns[full] for name, full in topics.items()}
+    if f'{CONTROLLER}/journal' in by_name:
+        for name, full in initial.items():
+            by_name[name] = with_initial_inputs(by_name[name], columns[full])
     reader = _Reader(bag, held, by_name, revisions, default, model, notes)
     lives, time_ns, commands = reader.lives()
     recorded = reader.answers(lives, commands)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.bag.columns import TopicColumns
 from t3mpc_ros.bag.run.journal import COMMAND_EVENTS, Event
 from t3mpc_ros.evaluation.training.training_data import match_commands
 from t3mpc_ros.geometry.types import NANOSECONDS
@@ -33,6 +34,34 @@ class ConsumedMessages:
     lost_odometry: int
     lost_references: int
     lost_events: int
+
+
+def with_initial_inputs(received: TopicColumns, initial: TopicColumns) -> TopicColumns:
+    """Return the messages of an input, completed by those that the recorder discovered too late.
+
+    The controller republishes its first inputs on a transient-local topic. A message with a stamp
+    that the plain topic lacks is inserted in front of the first message with a later stamp.
+
+    Parameters
+    ----------
+    received
+        Recorded messages of the input, in order of receipt.
+    initial
+        Messages that the controller has republished, in order of publication.
+    """
+    missing = np.flatnonzero(~np.isin(initial.stamps_ns, received.stamps_ns))
+    if not missing.size:
+        return received
+    # The controller may have been restarted: its history then begins anew, in order of stamps.
+    _, first = np.unique(initial.stamps_ns[missing], return_index=True)
+    missing = missing[first]
+    latest = np.maximum.accumulate(received.stamps_ns)
+    places = np.searchsorted(latest, initial.stamps_ns[missing], side='right')
+    merged = {
+        name: np.insert(getattr(received, name), places, getattr(initial, name)[missing], axis=0)
+        for name in ('received_ns', 'published_ns', 'stamps_ns', 'numbers')
+    }
+    return TopicColumns(**merged, integers=received.integers)
 
 
 def match(rows: Integers, odometry_ns: Integers, reference_ns: Integers) -> ConsumedMessages:

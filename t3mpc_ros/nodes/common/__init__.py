@@ -1,3 +1,3 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Parts that all nodes share: base node, QoS, conversions, entry points."""
+"""Base node, QoS profiles, message conversions and publishers shared by the nodes."""

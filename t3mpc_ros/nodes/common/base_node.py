@@ -1,78 +1,104 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Base class of the nodes: parameters, diagnostics at 1 Hz, shutdown hook."""
+"""Base class of the nodes: ROS parameters from a parameter class, diagnostics, shutdown hook."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+import difflib
+import sys
 from typing import Any, Generic, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 
-from t3mpc_ros.nodes.common import parameter_declaration, qos
-from t3mpc_ros.parameters.table import Parameters
+from t3mpc_ros.nodes.common import qos
+from t3mpc_ros.parameters.table import ParameterError, Parameters, ParameterSpec
 
-S = TypeVar('S', bound=Parameters)
+P = TypeVar('P', bound=Parameters)
 
 OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
 ERROR = DiagnosticStatus.ERROR
 
-NO_CLOCK = 'the simulated clock has not been heard yet'
+NO_CLOCK = 'no message on /clock yet'
+
+ACK_TIMEOUT = Duration(nanoseconds=200_000_000)
+"""Maximum wait of :func:`publish_and_wait_for_acked`."""
+
+_PARAMETER_TYPES = {
+    (bool, False): Parameter.Type.BOOL,
+    (int, False): Parameter.Type.INTEGER,
+    (float, False): Parameter.Type.DOUBLE,
+    (str, False): Parameter.Type.STRING,
+    (bool, True): Parameter.Type.BOOL_ARRAY,
+    (int, True): Parameter.Type.INTEGER_ARRAY,
+    (float, True): Parameter.Type.DOUBLE_ARRAY,
+    (str, True): Parameter.Type.STRING_ARRAY,
+}
+
+_RCLPY_PARAMETERS = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
+"""Parameters (or their first name part) that rclpy declares for every node."""
 
 
-class BaseNode(Node, Generic[S]):
-    """A node whose parameters are one table of settings, and that says how it is at 1 Hz.
+class BaseNode(Node, Generic[P]):
+    """A node that declares the parameters of one parameter class and publishes diagnostics.
 
-    A subclass overrides :meth:`configure` (live settings have changed), :meth:`health` (what to
-    say in ``/diagnostics``) and :meth:`finish` (last words before the process ends).
+    Subclasses override :meth:`on_parameters_changed` (dynamic parameters were set),
+    :meth:`produce_diagnostics` (status for ``/diagnostics`` at 1 Hz) and :meth:`on_shutdown`.
     """
 
-    def __init__(self, name: str, table: type[S], **kwargs: Any) -> None:
+    def __init__(self, name: str, parameter_class: type[P], **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
         self.exit_code = 0
-        """Set to something else to end the process."""
-        self.done = False
-        """Set to end the process with this exit code."""
-        self.parameters: S = parameter_declaration.declare_parameters(self, table, self._on_change)
+        """Exit code of the process; a value other than 0 ends the process."""
+        self.exit_requested = False
+        """Set to True to end the process with :attr:`exit_code`."""
+        self.parameters: P = declare_parameters(self, parameter_class, self._on_change)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', qos.DIAGNOSTICS)
-        # Wall time, so that the node reports even while the simulated clock stands still.
+        # Steady time: diagnostics continue while the simulated clock is paused.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(1.0, self._report, clock=self._steady)
+        self.create_steady_timer(1.0, self._publish_diagnostics)
 
     def now_ns(self) -> int:
-        """Return the node's time: of the machine, or simulated if ``use_sim_time`` is set."""
+        """Return the node's time, ns: system time, or simulated time with ``use_sim_time``."""
         return int(self.get_clock().now().nanoseconds)
 
-    def clock_received(self) -> bool:
-        """Whether the node's time means anything: a simulated clock not yet heard says 0."""
+    def clock_started(self) -> bool:
+        """Return whether the node's time is valid: simulated time is 0 before the first clock."""
         return self.now_ns() != 0
 
     def steady_ns(self) -> int:
-        """Return a time that only ever runs forward, for measuring silence."""
+        """Return monotonic time, ns, for timeouts."""
         return int(self._steady.now().nanoseconds)
 
-    def every(self, seconds: float, callback: Any) -> None:
-        """Call ``callback`` every so many seconds of the machine's time."""
-        self.create_timer(seconds, callback, clock=self._steady)
+    def create_steady_timer(self, period: float, callback: Callable[[], None]) -> Any:
+        """Return a timer that calls ``callback`` every ``period`` seconds of steady time."""
+        return self.create_timer(period, callback, clock=self._steady)
 
-    def configure(self, parameters: S) -> None:
-        """Take over changed live settings."""
+    def on_parameters_changed(self, parameters: P) -> None:
+        """Apply changed dynamic parameters."""
 
     def produce_diagnostics(self) -> tuple[bytes, str, Mapping[str, object]]:
         """Return level, message and values for ``/diagnostics``."""
         return OK, 'running', {}
 
-    def finish(self) -> None:
-        """Say the last words: the robot must stand still after this."""
+    def on_shutdown(self) -> None:
+        """Stop the robot, publish final messages, close files."""
 
-    def _on_change(self, parameters: S) -> None:
+    def _on_change(self, parameters: P) -> None:
         self.parameters = parameters
-        self.configure(parameters)
+        self.on_parameters_changed(parameters)
 
-    def _report(self) -> None:
+    def _publish_diagnostics(self) -> None:
         level, message, values = self.produce_diagnostics()
         status = DiagnosticStatus(
             level=level,
@@ -87,9 +113,119 @@ class BaseNode(Node, Generic[S]):
 
 
 def publish_and_wait_for_acked(publisher: Publisher, message: Any) -> None:
-    """Publish ``message`` and wait, at most 0.2 s, until reliable subscribers have it."""
+    """Publish ``message`` and wait, at most 0.2 s, for the acknowledgements of subscribers."""
     publisher.publish(message)
-    publisher.wait_for_all_acked(Duration(nanoseconds=200_000_000))
+    publisher.wait_for_all_acked(ACK_TIMEOUT)
+
+
+def declare_parameters(node: Node, parameter_class: type[P], changed: Callable[[P], None]) -> P:
+    """Return the node's parameters: the overrides of the user on the defaults of the class.
+
+    Every specification becomes a ROS parameter with description, unit and range. Parameters that
+    are not dynamic are read-only. ``changed`` is called with the new values after an accepted set
+    request.
+
+    Raises
+    ------
+    ParameterError
+        An override is unknown to this node (the text has the nearest known name), of the wrong
+        type or out of range; the text has the name, the bound and the value.
+    """
+    overrides = _overrides(node)
+    specs = {spec.name: spec for spec in parameter_class.specs()}
+    _reject_unknown(node, overrides, specs)
+    parameters = parameter_class.from_dict(
+        {name: overrides[name] for name in specs if name in overrides}
+    )
+    values = parameters.to_dict()
+    for name, spec in specs.items():
+        node.declare_parameter(
+            name, _ros_value(spec, values[name]), parameter_descriptor(spec), ignore_override=True
+        )
+
+    current = [parameters]
+
+    def validate(requested: list[Parameter]) -> SetParametersResult:
+        try:
+            _with_changes(current[0], specs, requested)
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def apply(accepted: list[Parameter]) -> None:
+        new = _with_changes(current[0], specs, accepted)
+        if new != current[0]:
+            current[0] = new
+            changed(new)
+
+    node.add_on_set_parameters_callback(validate)
+    node.add_post_set_parameters_callback(apply)
+    return parameters
+
+
+def parameter_descriptor(spec: ParameterSpec) -> ParameterDescriptor:
+    """Return the descriptor of one parameter, as ``ros2 param describe`` shows it."""
+    unit = f' [{spec.unit}]' if spec.unit else ''
+    source = '' if spec.source == 'assumed' else f' ({spec.source})'
+    descriptor = ParameterDescriptor(
+        name=spec.name,
+        type=_PARAMETER_TYPES[spec.kind, spec.many].value,
+        description=f'{spec.text}{unit}{source}',
+        additional_constraints=spec.bounds(),
+        read_only=not spec.dynamic,
+    )
+    if spec.many or (spec.low is None and spec.high is None):
+        return descriptor
+    if spec.kind is float:
+        largest = sys.float_info.max
+        low = -largest if spec.low is None else spec.low
+        high = largest if spec.high is None else spec.high
+        descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+    elif spec.kind is int:
+        low = -(2**63) if spec.low is None else int(spec.low)
+        high = 2**63 - 1 if spec.high is None else int(spec.high)
+        descriptor.integer_range = [IntegerRange(from_value=low, to_value=high, step=1)]
+    return descriptor
+
+
+def _overrides(node: Node) -> dict[str, object]:
+    # rclpy has no public access to the overrides: automatic declaration fails on an empty list
+    # and does not accept a descriptor afterwards.
+    return {
+        name: (() if parameter.value is None else parameter.value)
+        for name, parameter in node._parameter_overrides.items()
+    }
+
+
+def _reject_unknown(
+    node: Node, overrides: dict[str, object], specs: dict[str, ParameterSpec]
+) -> None:
+    for name in overrides:
+        if name in specs or name.split('.')[0] in _RCLPY_PARAMETERS or name in _names_of_nodes():
+            continue
+        near = difflib.get_close_matches(name, specs, n=1)
+        hint = f'; did you mean {near[0]}?' if near else ''
+        raise ParameterError(
+            f'{node.get_name()} has no parameter {name}{hint} '
+            f'(`ros2 param list /{node.get_name()}` lists them)'
+        )
+
+
+def _names_of_nodes() -> frozenset[str]:
+    """Return the parameter names of all nodes: one file or command line may serve several."""
+    from t3mpc_ros.nodes.registry import NODES, parameter_class
+
+    return frozenset(spec.name for node in NODES for spec in parameter_class(node).specs())
+
+
+def _ros_value(spec: ParameterSpec, value: object) -> object:
+    return list(value) if spec.many and isinstance(value, tuple) else value
+
+
+def _with_changes(parameters: P, specs: dict[str, ParameterSpec], changes: list[Parameter]) -> P:
+    return parameters.with_values(
+        {parameter.name: parameter.value for parameter in changes if parameter.name in specs}
+    )
 
 
 def _text(value: object) -> str:

@@ -12,36 +12,39 @@ from sensor_msgs.msg import JointState
 
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose, State
 
+UNKNOWN_VARIANCE = 1e6
+"""Variance of a quantity that is not measured, in any unit."""
+
 
 def time_from_ns(stamp_ns: int) -> Time:
-    """Return a stamp as a message."""
+    """Return a stamp in nanoseconds as a message."""
     seconds, rest = divmod(stamp_ns, NANOSECONDS)
     return Time(sec=seconds, nanosec=rest)
 
 
 def ns_from_time(stamp: Time) -> int:
-    """Return a message's stamp in nanoseconds."""
+    """Return the stamp of a message in nanoseconds."""
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
 
 
 def quaternion_from_yaw(yaw: float) -> Quaternion:
-    """Return the rotation by ``heading`` (rad) about z."""
+    """Return the rotation by ``yaw`` (rad) about z."""
     return Quaternion(z=math.sin(0.5 * yaw), w=math.cos(0.5 * yaw))
 
 
 def yaw_from_quaternion(rotation: Quaternion) -> float:
-    """Return the heading (rad) of a rotation, whatever its roll and pitch; NaN if not finite."""
-    # Products, not powers: those raise OverflowError.
+    """Return the yaw (rad) of a rotation with any roll and pitch; NaN if not finite."""
+    # Products, not powers, which raise OverflowError.
     sine = 2.0 * (rotation.w * rotation.z + rotation.x * rotation.y)
     cosine = 1.0 - 2.0 * (rotation.y * rotation.y + rotation.z * rotation.z)
-    # The angle of an infinite vector would be finite.
+    # atan2 of an infinite vector is finite.
     if not (math.isfinite(sine) and math.isfinite(cosine)):
         return math.nan
     return math.atan2(sine, cosine)
 
 
 def state_from_odometry(message: Odometry) -> State:
-    """Return the planar motion in an odometry message."""
+    """Return the planar state in an odometry message."""
     position = message.pose.pose.position
     twist = message.twist.twist
     return State(
@@ -51,37 +54,37 @@ def state_from_odometry(message: Odometry) -> State:
     )
 
 
-def fill_odometry(message: Odometry, motion: State) -> Odometry:
-    """Write a motion into ``message``, which is used again and again: making one is slow."""
-    message.header.stamp = time_from_ns(motion.stamp_ns)
-    message.pose.pose.position.x = motion.pose.x
-    message.pose.pose.position.y = motion.pose.y
-    message.pose.pose.orientation.z = math.sin(0.5 * motion.pose.yaw)
-    message.pose.pose.orientation.w = math.cos(0.5 * motion.pose.yaw)
-    message.twist.twist.linear.x = motion.twist.linear
-    message.twist.twist.angular.z = motion.twist.angular
+def fill_odometry(message: Odometry, state: State) -> Odometry:
+    """Write a state into ``message``; messages are reused because construction is slow."""
+    message.header.stamp = time_from_ns(state.stamp_ns)
+    message.pose.pose.position.x = state.pose.x
+    message.pose.pose.position.y = state.pose.y
+    message.pose.pose.orientation.z = math.sin(0.5 * state.pose.yaw)
+    message.pose.pose.orientation.w = math.cos(0.5 * state.pose.yaw)
+    message.twist.twist.linear.x = state.twist.linear
+    message.twist.twist.angular.z = state.twist.angular
     return message
 
 
 def planar_covariance(pose: Sequence[Sequence[float]]) -> list[float]:
-    """Return the 36 numbers of a message for a covariance (3, 3) of x, y, heading.
+    """Return the 36 numbers of a message for a covariance (3, 3) of x, y, yaw.
 
-    What a planar robot cannot know (z, roll, pitch) gets the large variance 1e6.
+    z, roll and pitch of a planar robot get :data:`UNKNOWN_VARIANCE`.
     """
     full = [0.0] * 36
-    places = (0, 1, 5)
-    for row, i in enumerate(places):
-        for column, j in enumerate(places):
+    planar = (0, 1, 5)
+    for row, i in enumerate(planar):
+        for column, j in enumerate(planar):
             full[6 * i + j] = float(pose[row][column])
     for i in (2, 3, 4):
-        full[7 * i] = 1e6
+        full[7 * i] = UNKNOWN_VARIANCE
     return full
 
 
 def body_twist(message: Twist) -> BodyTwist:
-    """Return forward and turning speed of a command; NaN when any of its numbers is not finite.
+    """Return linear x and angular z of a command; NaN if any of its six numbers is not finite.
 
-    What a differential drive cannot do (sideways, up, roll, pitch) is left out, as is usual.
+    The other four have no effect on a differential drive.
     """
     others = (message.linear.y, message.linear.z, message.angular.x, message.angular.y)
     if not all(map(math.isfinite, others)):
@@ -90,9 +93,9 @@ def body_twist(message: Twist) -> BodyTwist:
 
 
 def twist_and_stamp(message: Twist | TwistStamped, now_ns: int) -> tuple[BodyTwist, int]:
-    """Return a command and when it was wanted (ns): now, unless its header says otherwise.
+    """Return a command and its stamp (ns): that of the header, otherwise ``now_ns``.
 
-    A stamp of zero is one that nobody has set, as is usual for teleoperation.
+    A stamp of zero counts as not set, which is usual for teleoperation.
     """
     if isinstance(message, TwistStamped):
         return body_twist(message.twist), ns_from_time(message.header.stamp) or now_ns
@@ -100,7 +103,7 @@ def twist_and_stamp(message: Twist | TwistStamped, now_ns: int) -> tuple[BodyTwi
 
 
 def twist_from_body(twist: BodyTwist) -> Twist:
-    """Return a command message."""
+    """Return a command as a message."""
     message = Twist()
     message.linear.x = float(twist.linear)
     message.angular.z = float(twist.angular)
@@ -108,33 +111,33 @@ def twist_from_body(twist: BodyTwist) -> Twist:
 
 
 def stamped_twist(twist: BodyTwist, stamp_ns: int, frame: str) -> TwistStamped:
-    """Return a command message with a header."""
+    """Return a command as a message with a header."""
     message = TwistStamped(twist=twist_from_body(twist))
     message.header.stamp = time_from_ns(stamp_ns)
     message.header.frame_id = frame
     return message
 
 
-def pose_stamped(motion: State, frame: str) -> PoseStamped:
-    """Return the pose of a motion as a message."""
+def pose_stamped(state: State, frame: str) -> PoseStamped:
+    """Return the pose of a state as a message."""
     message = PoseStamped()
-    message.header.stamp = time_from_ns(motion.stamp_ns)
+    message.header.stamp = time_from_ns(state.stamp_ns)
     message.header.frame_id = frame
-    message.pose.position.x = motion.pose.x
-    message.pose.position.y = motion.pose.y
-    message.pose.orientation = quaternion_from_yaw(motion.pose.yaw)
+    message.pose.position.x = state.pose.x
+    message.pose.position.y = state.pose.y
+    message.pose.orientation = quaternion_from_yaw(state.pose.yaw)
     return message
 
 
-def transform(motion: State, frame: str, child: str) -> TransformStamped:
-    """Return the pose of a motion as a transform from ``frame`` to ``child``."""
+def transform(state: State, frame: str, child: str) -> TransformStamped:
+    """Return the pose of a state as a transform from ``frame`` to ``child``."""
     message = TransformStamped()
-    message.header.stamp = time_from_ns(motion.stamp_ns)
+    message.header.stamp = time_from_ns(state.stamp_ns)
     message.header.frame_id = frame
     message.child_frame_id = child
-    message.transform.translation.x = motion.pose.x
-    message.transform.translation.y = motion.pose.y
-    message.transform.rotation = quaternion_from_yaw(motion.pose.yaw)
+    message.transform.translation.x = state.pose.x
+    message.transform.translation.y = state.pose.y
+    message.transform.rotation = quaternion_from_yaw(state.pose.yaw)
     return message
 
 

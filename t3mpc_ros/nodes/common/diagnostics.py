@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Diagnostics of the robot state: warnings and key values."""
+"""Diagnostics of the robot state: warnings and values."""
 
 from collections.abc import Mapping
 
@@ -9,10 +9,15 @@ from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON
 from t3mpc_ros.simulation.digital_twin import TwinDiagnostics
 
 
-def complaints(state: RobotState, inside: TwinDiagnostics | None) -> tuple[str, ...]:
-    """Return what a user should know of, most important first; empty when all is well.
+def warnings(state: RobotState, twin: TwinDiagnostics | None = None) -> tuple[str, ...]:
+    """Return the warnings about a robot state, most important first.
 
-    ``inside`` is what only a simulation knows.
+    Parameters
+    ----------
+    state
+        The state of a simulated or real robot.
+    twin
+        Quantities that only the digital twin has.
     """
     status = state.status
     found = [state.reason] if state.reason else []
@@ -23,27 +28,27 @@ def complaints(state: RobotState, inside: TwinDiagnostics | None) -> tuple[str, 
     if status.low_battery:
         volts = f': {state.battery.voltage:.1f} V' if state.battery else ''
         found.append(f'the battery is low{volts}')
-    if inside is not None and inside.faults:
-        found.append(f'faults: {", ".join(inside.faults)}')
+    if twin is not None and twin.faults:
+        found.append(f'faults: {", ".join(twin.faults)}')
     if state.lost_steps is not None and any(state.lost_steps):
         right, left = state.lost_steps
         found.append(f'steps lost: {right} right, {left} left')
     return tuple(found)
 
 
-def measures(state: RobotState, inside: TwinDiagnostics | None) -> Mapping[str, object]:
-    """Return the status, and what else is known in numbers."""
-    values: dict[str, object] = {**state.status._asdict()}
+def values(state: RobotState, twin: TwinDiagnostics | None = None) -> Mapping[str, object]:
+    """Return the status and the measured quantities of a robot state by diagnostic key."""
+    found: dict[str, object] = {**state.status._asdict()}
     if state.battery is not None:
-        values['battery_v'] = state.battery.voltage
+        found['battery_v'] = state.battery.voltage
     if state.lost_steps is not None:
-        values['lost_steps_right'], values['lost_steps_left'] = state.lost_steps
-    if inside is not None:
-        values |= {
-            'slid_right_m': inside.slid[0],
-            'slid_left_m': inside.slid[1],
-            'gyro_bias_rad_s': inside.gyro_bias,
-            'gyro_bias_learnt_rad_s': inside.estimated_bias,
-            'faults': ', '.join(inside.faults) or 'none',
+        found['lost_steps_right'], found['lost_steps_left'] = state.lost_steps
+    if twin is not None:
+        found |= {
+            'slid_right_m': twin.slid[0],
+            'slid_left_m': twin.slid[1],
+            'gyro_bias_rad_s': twin.gyro_bias,
+            'gyro_bias_estimate_rad_s': twin.estimated_bias,
+            'faults': ', '.join(twin.faults) or 'none',
         }
-    return values
+    return found

@@ -1,45 +1,31 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Entry points of the executables; signal handlers are installed before slow imports."""
+"""Entry points of the executables: signal handling, start, spin, shutdown, exit code.
 
-import importlib
+Importing rclpy and numba takes one to two seconds. SIGINT in that time has to end the process
+without a traceback, so the signal handlers are installed first and slow imports follow in the
+functions.
+"""
+
+from collections.abc import Sequence
 import os
+from pathlib import Path
 import signal
 import sys
 from types import FrameType
+from typing import TYPE_CHECKING
 
+from t3mpc_ros.nodes.registry import node_module
 
-class StopRequest:
-    """Whether somebody has asked this process to end."""
+if TYPE_CHECKING:
+    from t3mpc_ros.nodes.common.base_node import BaseNode
 
-    def __init__(self) -> None:
-        self.wanted = False
-        self.starting = True
-        """While True a signal ends the process at once: there is nothing to stop yet."""
-
-    def install(self) -> None:
-        """Take over SIGINT and SIGTERM."""
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._handle)
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        self.wanted = True
-        if self.starting:
-            # Raised as an exception it would be lost, with a traceback, where Python happens to
-            # be in a __del__; and there is nothing to clean up.
-            os._exit(0)
-
-
-def _main(name: str, room: str = '') -> int:
-    request = StopRequest()
-    request.install()
-    process = importlib.import_module('t3mpc_ros.nodes.common.node_process')
-    module = importlib.import_module(f't3mpc_ros.nodes.{room or name}')
-    return process.run(name, module.make, request, sys.argv)
+USAGE_ERROR = 2
+"""Exit code for an unusable parameter, parameter file or command line."""
 
 
 def reference_generator() -> int:
-    """Run the fractional hyperchaotic reference generator."""
+    """Run the fractional-order chaotic reference generator."""
     return _main('reference_generator')
 
 
@@ -60,14 +46,133 @@ def radio_bridge() -> int:
 
 def recorder() -> int:
     """Run the MCAP recorder."""
-    return _main('recorder', 'recorder.node')
+    return _main('recorder')
 
 
 def player() -> int:
-    """Run the player of bags."""
-    return _main('player', 'player.node')
+    """Run the bag player."""
+    return _main('player')
 
 
 def composed() -> int:
-    """Run all four in one process."""
+    """Run several nodes in one process."""
     return _main('composed')
+
+
+class StopRequest:
+    """Whether SIGINT or SIGTERM was received."""
+
+    def __init__(self) -> None:
+        self.received = False
+        self.starting = True
+        """While True a signal ends the process at once: no robot moves and no file is open."""
+
+    def install(self) -> None:
+        """Install the handler of SIGINT and SIGTERM."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._handle)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        self.received = True
+        if self.starting:
+            # An exception would be lost, with a traceback, if Python is in a __del__; there is
+            # nothing to clean up yet.
+            os._exit(0)
+
+
+def _main(name: str) -> int:
+    request = StopRequest()
+    request.install()
+    return run(name, request, sys.argv)
+
+
+def run(name: str, request: StopRequest, argv: Sequence[str]) -> int:
+    """Spin the nodes of an executable until a stop request; return the exit code of the process.
+
+    0 after SIGINT or SIGTERM, with the robot stopped, or after a node has requested the exit; 2
+    for an unusable parameter, parameter file or command line, with one line on standard error
+    that names it and the reason.
+    """
+    import rclpy
+    from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+    from rclpy.executors import ExternalShutdownException
+    from rclpy.signals import SignalHandlerOptions
+
+    from t3mpc_ros.parameters.table import ParameterError
+
+    module = node_module(name)
+    if problem := parameter_file_problem(argv):
+        return _usage_error(name, problem)
+    try:
+        rclpy.init(args=list(argv), signal_handler_options=SignalHandlerOptions.NO)
+    except (RuntimeError, ValueError) as error:
+        return _usage_error(name, f'invalid command line: {error}')
+    configuration_errors = (
+        ParameterError,
+        InvalidParameterTypeException,
+        InvalidParameterValueException,
+        *module.CONFIGURATION_ERRORS,
+    )
+    nodes: Sequence[BaseNode] = ()
+    try:
+        nodes = module.make()
+        request.starting = False
+        if not request.received:
+            _spin(nodes, request)
+    except configuration_errors as error:
+        return _usage_error(name, str(error))
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        request.starting = False
+        for node in nodes:
+            node.on_shutdown()
+        for node in nodes:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return max((node.exit_code for node in nodes), default=0)
+
+
+def parameter_file_problem(argv: Sequence[str]) -> str:
+    """Return why a ``--params-file`` of the command line is unusable; empty if usable."""
+    import yaml
+
+    for flag, name in zip(argv, list(argv)[1:], strict=False):
+        if flag != '--params-file':
+            continue
+        try:
+            content = yaml.safe_load(Path(name).read_text(encoding='utf-8'))
+        except OSError as error:
+            return f'cannot read the parameter file {name}: {error.strerror}'
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            place = ' '.join(str(error).split())
+            return f'the parameter file {name} is not valid YAML: {place}'
+        if not isinstance(content, dict):
+            return (
+                f'the parameter file {name} must hold "<node>: ros__parameters: ...": got nothing'
+            )
+    return ''
+
+
+def _spin(nodes: Sequence['BaseNode'], request: StopRequest) -> None:
+    from rclpy.executors import SingleThreadedExecutor
+
+    executor = SingleThreadedExecutor()
+    for node in nodes:
+        executor.add_node(node)
+        node.get_logger().info(f'{node.get_name()} ready')
+    try:
+        # A Python signal handler runs only between two calls of the executor.
+        while not request.received and not any(
+            node.exit_code or node.exit_requested for node in nodes
+        ):
+            executor.spin_once(timeout_sec=0.1)
+    finally:
+        for node in nodes:
+            executor.remove_node(node)
+        executor.shutdown()
+
+
+def _usage_error(name: str, problem: str) -> int:
+    print(f'{name}: {problem}', file=sys.stderr, flush=True)
+    return USAGE_ERROR

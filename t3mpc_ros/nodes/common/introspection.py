@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Message types by name, and topic types used by other nodes in the graph."""
+"""Message types by name, and the topic types that other nodes in the graph use."""
 
 import importlib
 
@@ -9,7 +9,7 @@ from rclpy.node import Node
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 RCLError: type[Exception] = rclpy_implementation.RCLError
-"""What rclpy raises, among others, for a topic that this process knows with another type."""
+"""Error of rclpy, among others for a topic that this process uses with another type."""
 
 
 def type_name(message: type) -> str:
@@ -24,26 +24,39 @@ def message_class(name: str) -> type:
     Raises
     ------
     ImportError
-        The package is not installed, or has no such type.
+        The package is not installed, or has no such message.
     """
-    package, _, kind = name.split('/')
+    package, _, message = name.split('/')
     try:
-        found: type = getattr(importlib.import_module(f'{package}.msg'), kind)
+        found: type = getattr(importlib.import_module(f'{package}.msg'), message)
     except AttributeError as error:
-        raise ImportError(f'{package} has no message {kind}') from error
+        raise ImportError(f'{package} has no message {message}') from error
     return found
 
 
-def mismatched_type(node: Node, topic: str, ours: type, *, subscribers: bool) -> str:
-    """Return the type another node uses on ``topic`` instead of ours; empty when none does.
+def command_type_problem(node: Node, message: type, *, publish: bool) -> str:
+    """Return why a node and its peers use ``cmd_vel`` with different types; empty if equal.
 
-    ROS 2 connects only equal types and says nothing when they differ.
+    ROS 2 connects endpoints of equal type only and reports nothing when the types differ.
+
+    Parameters
+    ----------
+    node
+        The node that publishes or subscribes to ``cmd_vel``.
+    message
+        Its message class.
+    publish
+        Whether it publishes; its peers then subscribe.
     """
-    name = node.resolve_topic_name(topic)
-    infos: list[TopicEndpointInfo] = (
+    name = node.resolve_topic_name('cmd_vel')
+    peers: list[TopicEndpointInfo] = (
         node.get_subscriptions_info_by_topic(name)
-        if subscribers
+        if publish
         else node.get_publishers_info_by_topic(name)
     )
-    expected = type_name(ours)
-    return next((info.topic_type for info in infos if info.topic_type != expected), '')
+    expected = type_name(message)
+    other = next((peer.topic_type for peer in peers if peer.topic_type != expected), '')
+    if not other:
+        return ''
+    action = 'expects' if publish else 'publishes'
+    return f'another node {action} {other} on cmd_vel: set enable_stamped_cmd_vel'

@@ -24,48 +24,46 @@ def _profile(depth: int, durability: DurabilityPolicy = DurabilityPolicy.VOLATIL
 
 
 STREAM = _profile(100)
-"""Odometry and reference: every sample counts, and one second of them may pile up."""
+"""Odometry, reference and sensors: every sample counts; one second of them is queued."""
 
-CONTROLLER_INPUT = _profile(1000, DurabilityPolicy.TRANSIENT_LOCAL)
-"""Reference and odometry as they are published: a recorder that finds them later than the
-controller did must miss nothing that the controller knew, or the run cannot be computed again. On
-a busy machine discovery has taken more than two seconds."""
+INITIAL_INPUTS = _profile(1000, DurabilityPolicy.TRANSIENT_LOCAL)
+"""First inputs of the controller, 10 s at 100 Hz, for a recorder that discovers it late."""
 
 COMMAND = _profile(50)
-"""Published commands: kept long enough for a recorder to get each one."""
+"""Published commands, queued until a recorder has received each of them."""
 
 LATEST = _profile(1)
-"""Commands as the robot takes them: the newest wins, nothing is queued."""
+"""Commands received by a robot, and /clock: only the latest message counts."""
 
 SCALARS = _profile(20)
-"""Plain numbers for plot tools."""
+"""Scalars for plot tools, joint states and slow sensors."""
 
 LATCHED = _profile(1, DurabilityPolicy.TRANSIENT_LOCAL)
-"""What a late subscriber should still see."""
+"""Topics whose last message late subscribers receive."""
 
 JOURNAL = _profile(1000, DurabilityPolicy.TRANSIENT_LOCAL)
-"""The journal of the controller: a recorder that is slow to find it misses nothing of 10 s."""
+"""Journal of the controller, with the last 10 s for a recorder that discovers it late."""
 
 PARAMETER_REVISIONS = _profile(20, DurabilityPolicy.TRANSIENT_LOCAL)
-"""Settings of the controller as they change: the journal speaks of each of them."""
+"""Revisions of the controller's parameters, to which the journal refers."""
 
 DIAGNOSTICS = _profile(10)
-"""Health of the nodes."""
+"""Diagnostics."""
 
 RECORDER = _profile(1000)
-"""A topic as the recorder takes it: so much may wait while the disk is busy."""
+"""Subscriptions of the recorder, with a queue for times when the disk is busy."""
 
 RECORDER_LATCHED = _profile(RECORDER.depth, DurabilityPolicy.TRANSIENT_LOCAL)
-"""The same of a topic whose publishers keep what was said before they were found."""
+"""Subscriptions of the recorder to topics with transient-local publishers."""
 
 
 def is_transient_local(profile: QoSProfile) -> bool:
-    """Whether it is about messages that late subscribers still get."""
+    """Return whether late subscribers receive earlier messages."""
     return bool(profile.durability == DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def compatible_with_all(subscription: QoSProfile, publishers: Sequence[QoSProfile]) -> bool:
-    """Whether a subscription hears every publisher: none of them offers less than it asks for."""
+    """Return whether the offers of all publishers satisfy the request of a subscription."""
     return all(
         qos_check_compatible(offered, subscription)[0] != QoSCompatibility.ERROR
         for offered in publishers
@@ -73,7 +71,7 @@ def compatible_with_all(subscription: QoSProfile, publishers: Sequence[QoSProfil
 
 
 def adapt_request_to_offers(publishers: Sequence[QoSProfile]) -> QoSProfile:
-    """Return the best profile for the recorder's subscription that hears every publisher."""
+    """Return the strictest request for the recorder that all offers satisfy."""
     reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in publishers)
     latched = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers)
     return QoSProfile(

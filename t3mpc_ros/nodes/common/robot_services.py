@@ -13,18 +13,18 @@ from t3mpc_ros.robot.interface import RobotInterface
 
 
 class RobotServices:
-    """``reset_odometry`` and ``e_stop``, which latches until it is released.
+    """Offers ``reset_odometry`` and ``e_stop``, which latches until released.
 
     Parameters
     ----------
     node
-        Under whose names they are.
+        Node that offers the services.
     robot
-        Who does what they ask.
+        Robot that they act on.
     now_ns
-        The time the robot goes by.
+        Returns the time of the robot, ns.
     lock
-        Held while the robot is spoken to, where more than one thread does.
+        Held during calls of the robot where several threads use it; None: not needed.
     """
 
     def __init__(
@@ -46,14 +46,14 @@ class RobotServices:
         with self._lock:
             problem = self._robot.reset_odometry(self._now_ns())
         response.success = not problem
-        response.message = problem or 'odometry starts at the origin'
+        response.message = problem or 'odometry reset to the origin'
         return response
 
     def _on_e_stop(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         problem = ''
         with self._lock:
             if request.data:
-                self._robot.latch_estop('asked for by service e_stop', self._now_ns())
+                self._robot.latch_estop('requested by service e_stop', self._now_ns())
             else:
                 problem = self._robot.release_estop(self._now_ns())
         response.success = not problem

@@ -8,6 +8,7 @@ from sensor_msgs.msg import BatteryState, Imu, Range
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.nodes.common import conversions
+from t3mpc_ros.nodes.common.conversions import UNKNOWN_VARIANCE
 from t3mpc_ros.robot.interface import BatteryReading, ImuSample
 from t3mpc_ros.robot.sensor_conversions import (
     GRAVITY,
@@ -16,30 +17,29 @@ from t3mpc_ros.robot.sensor_conversions import (
     RangeSensorParameters,
 )
 
-UNKNOWN_VARIANCE = 1e6
-"""Variance of what is not measured, in whatever unit."""
-
 
 def imu_message(parameters: ImuParameters, frame: str) -> Imu:
-    """Return a message that says how well an inertial sensor measures, and holds no sample yet.
+    """Return an Imu message with frame and covariances, without a sample.
 
-    Orientation is not measured (its covariance begins with -1, REP 145), nor is anything out of
-    the plane. Variances are those of noise and counts; bias and scale error are no noise.
+    Orientation is not measured (its covariance begins with -1, REP 145), nor are quantities out
+    of the plane. The variances are those of noise and quantisation, without bias and scale error.
     """
     message = Imu()
     message.header.frame_id = frame
     message.orientation_covariance[0] = -1.0
-    turn = _noise_variance(math.radians(parameters.gyro_noise), parameters.rate_step, parameters)
-    push = _noise_variance(
+    rate = _noise_variance(math.radians(parameters.gyro_noise), parameters.rate_step, parameters)
+    acceleration = _noise_variance(
         1e-6 * GRAVITY * parameters.accel_noise, parameters.acceleration_step, parameters
     )
-    message.angular_velocity_covariance = _diagonal(UNKNOWN_VARIANCE, UNKNOWN_VARIANCE, turn)
-    message.linear_acceleration_covariance = _diagonal(push, push, UNKNOWN_VARIANCE)
+    message.angular_velocity_covariance = _diagonal(UNKNOWN_VARIANCE, UNKNOWN_VARIANCE, rate)
+    message.linear_acceleration_covariance = _diagonal(
+        acceleration, acceleration, UNKNOWN_VARIANCE
+    )
     return message
 
 
 def fill_imu(message: Imu, sample: ImuSample, stamp_ns: int) -> Imu:
-    """Write a sample into ``message``, which is used again and again."""
+    """Write a sample into ``message``."""
     message.header.stamp = conversions.time_from_ns(stamp_ns)
     message.angular_velocity.z = sample.angular
     message.linear_acceleration.x = sample.forward
@@ -48,7 +48,7 @@ def fill_imu(message: Imu, sample: ImuSample, stamp_ns: int) -> Imu:
 
 
 def range_message(parameters: RangeSensorParameters, frame: str) -> Range:
-    """Return a message that says what a distance sensor can see, and holds no distance yet."""
+    """Return a Range message with the limits of the sensor, without a distance."""
     message = Range(
         radiation_type=Range.INFRARED,
         field_of_view=parameters.field_of_view,
@@ -61,10 +61,10 @@ def range_message(parameters: RangeSensorParameters, frame: str) -> Range:
 
 
 def fill_range(message: Range, distance: float, stamp_ns: int, *, infinity: bool) -> Range:
-    """Write a distance (m) into ``message``, which is used again and again.
+    """Write a distance (m) into ``message``.
 
-    REP 117: -inf is nearer than the sensor can tell, inf beyond its range. Without ``infinity``
-    the latter becomes ``max_range``, for those who take that for a free view.
+    REP 117: -inf is closer than the minimum range, inf beyond the maximum range. Without
+    ``infinity`` the latter becomes ``max_range``, which some consumers take for free space.
     """
     message.header.stamp = conversions.time_from_ns(stamp_ns)
     message.range = message.max_range if distance == math.inf and not infinity else distance
@@ -72,7 +72,7 @@ def fill_range(message: Range, distance: float, stamp_ns: int, *, infinity: bool
 
 
 def battery_message(parameters: BatteryParameters) -> BatteryState:
-    """Return a message that says what battery it is, and holds no reading yet."""
+    """Return a BatteryState message with the type of the battery, without a reading."""
     return BatteryState(
         temperature=math.nan,
         capacity=math.nan,
@@ -86,7 +86,7 @@ def battery_message(parameters: BatteryParameters) -> BatteryState:
 
 
 def fill_battery(message: BatteryState, reading: BatteryReading, stamp_ns: int) -> BatteryState:
-    """Write a reading into ``message``; what flows out of a battery is negative there."""
+    """Write a reading into ``message``; the current of a discharging battery is negative there."""
     message.header.stamp = conversions.time_from_ns(stamp_ns)
     message.voltage = reading.voltage
     message.current = -reading.current
@@ -96,32 +96,32 @@ def fill_battery(message: BatteryState, reading: BatteryReading, stamp_ns: int) 
 
 
 def twist_covariance(geometry: WheelGeometry, variance: float) -> list[float]:
-    """Return the 36 numbers for the twist of two wheels measured with ``variance`` ((rad/s)²).
+    """Return the 36 numbers for a twist from wheel speeds of variance ``variance`` ((rad/s)²).
 
-    By (1), v and omega are their mean and difference. How fast the robot slides sideways is not
-    measured, and nothing is if the variance is infinite: the wheels are known to mislead.
+    By (1), v and omega are the mean and the difference of the wheel speeds. Lateral speed is not
+    measured. With infinite variance (slipping wheels) all variances are that of an unknown.
     """
-    forward = 0.5 * variance * geometry.wheel_radius**2
-    turn = forward / geometry.half_separation**2
+    linear = 0.5 * variance * geometry.wheel_radius**2
+    angular = linear / geometry.half_separation**2
     return conversions.planar_covariance(
         (
-            (min(forward, UNKNOWN_VARIANCE), 0.0, 0.0),
+            (min(linear, UNKNOWN_VARIANCE), 0.0, 0.0),
             (0.0, UNKNOWN_VARIANCE, 0.0),
-            (0.0, 0.0, min(turn, UNKNOWN_VARIANCE)),
+            (0.0, 0.0, min(angular, UNKNOWN_VARIANCE)),
         )
     )
 
 
 def count_variance(step: float, period: float) -> float:
-    """Return the variance ((rad/s)²) of a speed read from a counter once per ``period`` seconds.
+    """Return the variance ((rad/s)²) of a speed from a counter read every ``period`` seconds.
 
-    Each of the two readings is off by up to one ``step`` (rad), evenly spread.
+    The quantisation error of both readings is uniform over one ``step`` (rad).
     """
     return (step / period) ** 2 / 6.0
 
 
 def _noise_variance(density: float, step: float, parameters: ImuParameters) -> float:
-    """Return the variance of a noise density behind the low-pass, rounded to whole counts."""
+    """Return the variance of a noise density behind the low-pass filter, with quantisation."""
     return density**2 * parameters.noise_bandwidth + step**2 / 12.0
 
 

@@ -1,6 +1,10 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Playback thread: publishes each message when it is due."""
+"""Playback thread: publishes each message when it is due.
+
+A cycle of the rclpy executor takes half a millisecond and more; a thread of its own wakes up
+without that delay.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -18,7 +22,7 @@ from t3mpc_ros.nodes.common import conversions
 
 @dataclass(frozen=True)
 class PlaybackStatus:
-    """How far a playback has come."""
+    """Position and state of a playback."""
 
     stamp_ns: int
     remaining_ns: int
@@ -27,113 +31,123 @@ class PlaybackStatus:
     paused: bool
     finished: bool
 
+    @property
+    def state(self) -> str:
+        """``playing``, ``paused`` or ``finished``."""
+        return 'finished' if self.finished else 'paused' if self.paused else 'playing'
+
 
 class PlayerThread:
-    """Publishes what a playback says, when it says it, from a thread of its own.
+    """Publishes the due messages of a playback timeline.
 
     Parameters
     ----------
+    timeline
+        Decides which messages are due.
+    publishers
+        Publishers by topic.
     clock
-        Where the time of the bag is told; None = nowhere.
+        Publisher of the bag's time; None: the time is not published.
     clock_with_messages
-        Tell it before each message, too.
+        Whether the time is published before each message, too.
     priority
-        Of the thread among those of the system that go before all others; 0 = one of the others.
+        Real-time priority of the thread (SCHED_FIFO); 0 = none.
     """
 
     def __init__(
         self,
-        playback: PlaybackTimeline,
+        timeline: PlaybackTimeline,
         publishers: Mapping[str, Publisher],
         clock: Publisher | None,
         clock_with_messages: bool,
         priority: int = 0,
     ) -> None:
-        self._playback = playback
+        self._timeline = timeline
         self._publishers = dict(publishers)
         self._clock = clock
         self._clock_with_messages = clock_with_messages
         self._priority = priority
         self.priority_problem = ''
-        """Why the system does not let the thread go before others."""
+        """Why the operating system does not grant the priority."""
         self._lock = threading.Lock()
-        self._nudge = threading.Event()
+        self._wake = threading.Event()
         self._closing = False
-        self._thread = threading.Thread(target=self._run, name='sender', daemon=True)
-        self.lateness = LatencyHistogram()
+        self._thread = threading.Thread(target=self._run, name='player', daemon=True)
+        self.latency = LatencyHistogram()
         self.published = 0
         self.failure = ''
-        """Why it has ended before the end; empty while all is well."""
+        """Why playback has ended early; empty if it has not."""
 
     def start(self) -> None:
-        """Begin to publish."""
+        """Start publishing."""
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread and let go of the bag; again, do nothing."""
+        """End the thread and close the bag; idempotent."""
         self._closing = True
-        self._nudge.set()
+        self._wake.set()
         if self._thread.is_alive():
             self._thread.join()
-        self._playback.close()
+        self._timeline.close()
 
-    def ask(self, what: Callable[[PlaybackTimeline, int], str | None]) -> str:
-        """Ask the playback for something at this time; return why it will not, or nothing."""
+    def control(self, action: Callable[[PlaybackTimeline, int], str | None]) -> str:
+        """Apply an action to the timeline at the present time; return its problem, or nothing."""
         with self._lock:
-            problem = what(self._playback, time.monotonic_ns())
-        self._nudge.set()
+            problem = action(self._timeline, time.monotonic_ns())
+        self._wake.set()
         return problem or ''
 
-    def mute(self, topic: str) -> None:
-        """Publish nothing more on a topic."""
+    def disable(self, topic: str) -> None:
+        """Stop publishing a topic."""
         with self._lock:
             self._publishers.pop(topic, None)
 
-    def where(self) -> PlaybackStatus:
-        """Return how far it has come."""
+    def status(self) -> PlaybackStatus:
+        """Return position and state of the playback."""
         with self._lock:
-            now_ns, playback = time.monotonic_ns(), self._playback
+            now_ns, timeline = time.monotonic_ns(), self._timeline
             return PlaybackStatus(
-                playback.stamp_ns(now_ns),
-                playback.remaining_ns(now_ns),
-                playback.loops(now_ns),
-                playback.rate,
-                playback.paused,
-                playback.finished,
+                timeline.stamp_ns(now_ns),
+                timeline.remaining_ns(now_ns),
+                timeline.loops(now_ns),
+                timeline.rate,
+                timeline.paused,
+                timeline.finished,
             )
 
-    def _hurry(self) -> None:
-        """Ask the system to let this thread go before all others that have no such priority."""
+    def _set_priority(self) -> None:
+        """Request the real-time priority for this thread."""
         try:
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(self._priority))  # 0: this one
+            # Process number 0 is the calling thread.
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(self._priority))
         except OSError as error:
             self.priority_problem = str(error.strerror)
 
     def _run(self) -> None:
         if self._priority:
-            self._hurry()
+            self._set_priority()
         try:
             while not self._closing:
-                self._nudge.clear()
+                self._wake.clear()
                 with self._lock:
-                    emissions, wake_ns = self._playback.due(time.monotonic_ns())
-                for emission in emissions:
-                    self._publish(emission)
+                    due, wake_ns = self._timeline.due(time.monotonic_ns())
+                for item in due:
+                    self._publish(item)
                 if wake_ns is None:
-                    self._nudge.wait()
+                    self._wake.wait()
                 elif (wait_ns := wake_ns - time.monotonic_ns()) > 0:
-                    self._nudge.wait(wait_ns / NANOSECONDS)
-        except Exception as error:  # a dead thread must not look like a bag without messages
+                    self._wake.wait(wait_ns / NANOSECONDS)
+        except Exception as error:  # a silent thread would look like a bag without messages
             self.failure = str(error) or type(error).__name__
 
-    def _publish(self, emission: DueMessage) -> None:
-        message = emission.message
+    def _publish(self, due: DueMessage) -> None:
+        message = due.message
         if self._clock is not None and (message is None or self._clock_with_messages):
-            self._clock.publish(Clock(clock=conversions.time_from_ns(emission.stamp_ns)))
+            self._clock.publish(Clock(clock=conversions.time_from_ns(due.stamp_ns)))
         if message is None:
             return
         publisher = self._publishers.get(message.topic)
         if publisher is not None:
-            self.lateness.note(time.monotonic_ns() - emission.due_ns)
+            self.latency.note(time.monotonic_ns() - due.due_ns)
             publisher.publish(message.data)
             self.published += 1

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""One publisher per played topic, with its QoS and the rule against moving a robot."""
+"""One publisher per played topic, with its QoS; velocity commands are excluded by default."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -28,46 +28,50 @@ from t3mpc_ros.nodes.common import introspection
 
 CLOCK = '/clock'
 ROBOT_NODES = ('radio_bridge', 'sim_robot')
-"""Nodes of this package that move when a velocity comes."""
+"""Nodes of this package that execute velocity commands."""
 SHARED_TOPICS = ('/diagnostics', '/rosout', '/parameter_events', '/tf', '/tf_static')
-"""Topics on which everybody publishes."""
+"""Topics with several publishers in every graph."""
 
 
 @dataclass(frozen=True)
 class PublishingRules:
-    """What may be published, and how."""
+    """What may be published, and with which QoS."""
 
     allow_commands: bool
-    own_clock: bool
-    """Whether the replayer tells the time itself."""
-    overrides: Mapping[str, QosProfile]
-    """Profiles by topic, recorded or new name."""
+    publishes_clock: bool
+    """Whether the player publishes ``/clock`` itself."""
+    qos_overrides: Mapping[str, QosProfile]
+    """QoS profiles by topic, under the recorded or the new name."""
 
 
 class TopicPublishers:
-    """The publishers of a tape; topics that cannot or must not be published leave the tape.
+    """The publishers of the played topics; other topics are excluded from the reader.
 
     Parameters
     ----------
     node
-        Whose publishers they are. Its own remapping counts: a topic is judged by the name under
-        which it really comes.
+        Node that publishes. The rule on velocity commands applies to the names after its
+        remapping.
+    reader
+        Reader of the bags.
+    rules
+        What may be published.
     """
 
-    def __init__(self, node: Node, tape: MergedReader, rules: PublishingRules) -> None:
+    def __init__(self, node: Node, reader: MergedReader, rules: PublishingRules) -> None:
         self._node = node
         self._allow_commands = rules.allow_commands
         self.by_topic: dict[str, Publisher] = {}
-        self.left_out: dict[str, str] = {}
-        """Why, by topic."""
-        self.refused: dict[str, str] = {}
-        """Those that would move a robot: why, by topic."""
-        for topic in list(tape.tracks):
+        self.unusable: dict[str, str] = {}
+        """Reasons by topic that cannot be published."""
+        self.blocked: dict[str, str] = {}
+        """Reasons by topic that is not published because it could move a robot."""
+        for topic in list(reader.tracks):
             try:
-                if problem := self._danger(tape, topic):
-                    self.refused[topic] = problem
+                if problem := self._velocity_risk(reader, topic):
+                    self.blocked[topic] = problem
                 else:
-                    self.by_topic[topic] = self._create(tape, topic, rules)
+                    self.by_topic[topic] = self._create(reader, topic, rules)
                     continue
             except (
                 BagError,
@@ -75,36 +79,37 @@ class TopicPublishers:
                 NameValidationException,
                 introspection.RCLError,
             ) as error:
-                self.left_out[topic] = str(error)
+                self.unusable[topic] = str(error)
             except ValueError as error:
-                self.left_out[topic] = f'its type cannot be used: {error}'
-            tape.exclude_topic(topic)
+                self.unusable[topic] = f'its type is unusable: {error}'
+            reader.exclude_topic(topic)
 
-    def _danger(self, tape: MergedReader, topic: str) -> str:
+    def _velocity_risk(self, reader: MergedReader, topic: str) -> str:
         if self._allow_commands:
             return ''
         name = self._node.resolve_topic_name(topic)
-        type_name = tape.tracks[topic].type_name
-        problems = (velocity_command_risk(old, name, type_name) for old in tape.recorded[topic])
+        type_name = reader.tracks[topic].type_name
+        problems = (velocity_command_risk(old, name, type_name) for old in reader.recorded[topic])
         return next(filter(None, problems), '')
 
-    def _create(self, tape: MergedReader, topic: str, rules: PublishingRules) -> Publisher:
-        track = tape.tracks[topic]
+    def _create(self, reader: MergedReader, topic: str, rules: PublishingRules) -> Publisher:
+        track = reader.tracks[topic]
         require_cdr(track)
-        if rules.own_clock and self._node.resolve_topic_name(topic) == CLOCK:
-            raise BagError('the replayer tells the time itself (clock_rate)')
-        names = [topic, *tape.recorded[topic]]
-        override = next((rules.overrides[n] for n in names if n in rules.overrides), None)
+        if rules.publishes_clock and self._node.resolve_topic_name(topic) == CLOCK:
+            raise BagError('the player publishes its own clock (clock_rate)')
+        names = [topic, *reader.recorded[topic]]
+        overrides = rules.qos_overrides
+        override = next((overrides[name] for name in names if name in overrides), None)
         offer = override or adapt_offer_to_recorded_offers(track.profiles)
         message = introspection.message_class(track.type_name)
         return self._node.create_publisher(message, topic, qos_profile(offer))
 
-    def heard(self) -> bool:
-        """Return whether every topic has somebody who listens."""
+    def all_subscribed(self) -> bool:
+        """Return whether every topic has a subscriber."""
         return all(each.get_subscription_count() for each in self.by_topic.values())
 
-    def driven(self) -> dict[str, str]:
-        """Return which robot listens to a velocity that must not move one, by topic."""
+    def subscribed_robots(self) -> dict[str, str]:
+        """Return the robots that subscribe to a blocked velocity under another name, by topic."""
         found = {}
         for topic, publisher in self.by_topic.items():
             if (
@@ -117,8 +122,8 @@ class TopicPublishers:
                     found[topic] = _full_name(info)
         return found
 
-    def rivals(self) -> dict[str, str]:
-        """Return who else publishes on a topic of ours, by topic."""
+    def other_publishers(self) -> dict[str, str]:
+        """Return another node that publishes a played topic, by topic."""
         found = {}
         own = self._node.get_fully_qualified_name()
         for topic, publisher in self.by_topic.items():
@@ -129,18 +134,18 @@ class TopicPublishers:
                     found[topic] = _full_name(info)
         return found
 
-    def flush(self, seconds: float) -> None:
-        """Wait, at most so long, until listeners have what was published reliably."""
-        end = time.monotonic() + seconds  # not the node's time, which may stand still
+    def wait_for_acked(self, timeout: float) -> None:
+        """Wait, at most ``timeout`` seconds, until reliable subscribers have all messages."""
+        end = time.monotonic() + timeout  # the node's time may be paused
         for publisher in self.by_topic.values():
-            left = end - time.monotonic()
-            if left <= 0.0:
+            remaining = end - time.monotonic()
+            if remaining <= 0.0:
                 return
-            publisher.wait_for_all_acked(Duration(nanoseconds=round(left * NANOSECONDS)))
+            publisher.wait_for_all_acked(Duration(nanoseconds=round(remaining * NANOSECONDS)))
 
 
 def qos_profile(profile: QosProfile) -> QoSProfile:
-    """Return a profile of the bag as rclpy takes it."""
+    """Return a QoS profile of a bag as one of rclpy."""
     return QoSProfile(
         history=HistoryPolicy[profile.history.upper()],
         depth=profile.depth,
@@ -155,7 +160,7 @@ def qos_profile(profile: QosProfile) -> QoSProfile:
 
 
 def _duration(nanoseconds: int) -> Duration:
-    return Duration(nanoseconds=0 if nanoseconds == UNLIMITED else nanoseconds)  # 0: no limit
+    return Duration(nanoseconds=0 if nanoseconds == UNLIMITED else nanoseconds)  # 0: unlimited
 
 
 def _full_name(info: TopicEndpointInfo) -> str:

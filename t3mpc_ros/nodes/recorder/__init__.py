@@ -1,3 +1,3 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder node."""
+"""The recorder node: raw subscriptions, metadata, writer thread, snapshots."""

@@ -19,90 +19,87 @@ from t3mpc_ros.bag.writer import Attachment, SerializedMessage, TopicMetadata
 
 FOLDER = 'snapshots'
 SLICE_PAUSE = 0.01
-"""Seconds after every slice of a snapshot: compressing it at once would hold up the recording."""
+"""Pause between the slices of a snapshot, s, so that its compression does not delay recording."""
 
 
 class SnapshotWriter:
-    """Keeps the last seconds, and writes them down when asked, one snapshot at a time.
+    """Caches the last seconds and writes them on request, one snapshot at a time.
 
     Parameters
     ----------
     folder
-        Of the bag; snapshots go into a folder below it.
-    ring
-        Where the messages are kept.
+        Folder of the bag; snapshots are written to a folder below it.
+    cache
+        Cache of the messages.
     definitions
-        Where schemas come from.
+        Source of the message schemas.
     """
 
     def __init__(
-        self, folder: Path, ring: CircularMessageCache, definitions: MessageDefinitions
+        self, folder: Path, cache: CircularMessageCache, definitions: MessageDefinitions
     ) -> None:
         self._folder = folder / FOLDER
-        self._ring = ring
+        self._cache = cache
         self._definitions = definitions
         self._topics: dict[str, TopicMetadata] = {}
-        self._hurry = threading.Event()
+        self._closing = threading.Event()
         self._thread: threading.Thread | None = None
-        self.done: list[Path] = []
-        """Folders of the snapshots that are complete."""
+        self.completed: list[Path] = []
+        """Folders of the complete snapshots."""
         self.problem = ''
-        """Why the last one could not be written; empty when it was."""
+        """Why the last snapshot failed; empty if it did not."""
 
     @property
     def busy(self) -> bool:
         """Whether a snapshot is being written."""
         return self._thread is not None and self._thread.is_alive()
 
-    def announce(self, topic: TopicMetadata, latched: int) -> None:
-        """Remember what a snapshot has to know of a topic.
-
-        ``latched`` is how many of its publishers keep their last message for those who come late.
-        """
+    def add_topic(self, topic: TopicMetadata, latched: int) -> None:
+        """Add the metadata of a topic with ``latched`` transient-local publishers."""
         self._topics[topic.topic] = topic
         if latched:
-            self._ring.latch(topic.topic, latched)
+            self._cache.latch(topic.topic, latched)
 
     def add(self, messages: list[SerializedMessage]) -> None:
-        """Keep ``messages``, in order of receipt."""
-        self._ring.add(messages)
+        """Add messages to the cache, in order of reception."""
+        self._cache.add(messages)
 
-    def take(
+    def start(
         self,
         reason: str,
         now_ns: int,
         metadata_records: Mapping[str, Mapping[str, str]],
         attachments: list[tuple[Attachment, int]],
-        told: Callable[[bool, str], None],
+        finished: Callable[[bool, str], None],
     ) -> Path:
-        """Return the folder into which a snapshot is being written from now on.
+        """Start writing a snapshot in a thread and return its folder.
 
         Parameters
         ----------
         reason
-            Why; part of the folder's name and of the details.
+            Reason of the snapshot, for the folder name and the metadata.
         now_ns
-            Nanoseconds since 1970, the clock of the stamps of receipt.
-        details, attachments
-            What else the bag is to hold.
-        told
-            Called by the writing thread: whether it is complete, and the outcome in words.
+            System time, ns since 1970, as the stamps of reception.
+        metadata_records, attachments
+            Further content of the bag.
+        finished
+            Called by the writing thread with success and a text.
 
         Raises
         ------
         BagError
-            Another one is being written, or there is nothing to write.
+            Another snapshot is being written, or the cache is empty.
         """
         if self.busy:
-            raise BagError('another snapshot is being written: ask again when it is done')
-        messages = self._ring.held(now_ns)
+            raise BagError('another snapshot is being written: try again after it')
+        messages = self._cache.held(now_ns)
         if not messages:
-            raise BagError('nothing has been received in the time of a snapshot')
-        moment = datetime.fromtimestamp(now_ns / 1e9)
+            raise BagError('no message was received within snapshot_time')
+        time = datetime.fromtimestamp(now_ns / 1e9)
         folder = unused_folder(
-            self._folder, snapshot_folder_name(f'{moment:%Y_%m_%d-%H_%M_%S}', reason)
+            self._folder, snapshot_folder_name(f'{time:%Y_%m_%d-%H_%M_%S}', reason)
         )
-        title = {SNAPSHOT_RECORD: {'reason': reason, 'time_ns': str(now_ns)}}
+        record = {SNAPSHOT_RECORD: {'reason': reason, 'time_ns': str(now_ns)}}
         topics = dict(self._topics)
 
         def write() -> None:
@@ -111,25 +108,25 @@ class SnapshotWriter:
                     folder,
                     messages,
                     topics=topics,
-                    metadata_records={**metadata_records, **title},
+                    metadata_records={**metadata_records, **record},
                     attachments=attachments,
                     definitions=self._definitions,
-                    pause=lambda: self._hurry.wait(SLICE_PAUSE),
+                    pause=lambda: self._closing.wait(SLICE_PAUSE),
                 )
-            except Exception as error:  # a dead thread must not look like a snapshot that is there
+            except Exception as error:  # a silent thread would look like a complete snapshot
                 self.problem = f'no snapshot of "{reason}": {error}'
-                told(False, self.problem)
+                finished(False, self.problem)
             else:
                 self.problem = ''
-                self.done.append(folder)
-                told(True, f'snapshot of "{reason}": {count} messages in {folder}')
+                self.completed.append(folder)
+                finished(True, f'snapshot of "{reason}": {count} messages in {folder}')
 
         self._thread = threading.Thread(target=write, name='snapshot', daemon=True)
         self._thread.start()
         return folder
 
-    def close(self, seconds: float) -> None:
-        """Wait until the snapshot that is being written is complete, now at full speed."""
-        self._hurry.set()
+    def close(self, timeout: float) -> None:
+        """Complete the current snapshot without pauses, within ``timeout`` seconds."""
+        self._closing.set()
         if self._thread is not None:
-            self._thread.join(seconds)
+            self._thread.join(timeout)

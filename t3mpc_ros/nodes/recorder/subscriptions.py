@@ -1,6 +1,18 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Raw subscriptions polled by a timer, topic discovery and QoS adaptation of the recorder."""
+"""Raw subscriptions polled by a timer, topic discovery and QoS adaptation of the recorder.
+
+The executor of rclpy builds a wait set with all entities of the node for each message that it
+delivers; at 2000 messages per second this alone takes more than one core. The callback group of
+the raw subscriptions therefore never becomes ready, and a timer takes all queued messages with the
+call that the executor uses: ``subscription.handle.take_message(type, raw)`` (rclpy 7.1,
+``Executor._take_subscription``). Polling does not affect the stamps: the middleware stores the
+times of reception and publication with each message.
+
+A reader with KEEP_LAST replaces its oldest samples when its queue is full, which DDS does not
+report as lost. The sequence numbers of the publisher reveal these losses. Losses in transport are
+reported by the message-lost event, which is polled, too.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,111 +36,131 @@ from t3mpc_ros.bag.topic_filter import TopicFilter
 from t3mpc_ros.bag.writer import SerializedMessage, TopicMetadata
 from t3mpc_ros.nodes.common import introspection, qos
 
+EXPECTED_TOPICS = {
+    'reference': 'nav_msgs/msg/Odometry',
+    'odom': 'nav_msgs/msg/Odometry',
+    'ground_truth/odom': 'nav_msgs/msg/Odometry',
+    'cmd_vel': 'geometry_msgs/msg/Twist',
+    'controller/journal': 'std_msgs/msg/Int64MultiArray',
+    'controller/initial_inputs/reference': 'nav_msgs/msg/Odometry',
+    'controller/initial_inputs/odom': 'nav_msgs/msg/Odometry',
+}
+"""Types of topics subscribed to before they are published, to record the first message."""
+
+LATCHED_TOPICS = (
+    'controller/journal',
+    'controller/initial_inputs/reference',
+    'controller/initial_inputs/odom',
+)
+"""Expected topics with transient-local publishers: their messages from before discovery, without
+which a run cannot be replayed, are received, too."""
+
 _RECEIVE_TIME = attrgetter('received_ns')
 
 
 class PolledCallbackGroup(CallbackGroup):
-    """A callback group whose entities the executor leaves alone."""
+    """A callback group whose entities the executor never waits for."""
 
     def can_execute(self, entity: object) -> bool:
-        """Return False: the executor does not even wait for the entity."""
+        """Return False: the executor does not wait for the entity."""
         return False
 
     def beginning_execution(self, entity: object) -> bool:
-        """Return False: the executor may not run the entity."""
+        """Return False: the executor does not run the entity."""
         return False
 
     def ending_execution(self, entity: object) -> None:
-        """Nothing has been executed."""
+        """Do nothing: no entity is executed."""
 
 
 @dataclass
 class RawSubscription:
-    """How one topic is listened to."""
+    """A subscription to serialized messages, with its loss counters."""
 
-    kind: str
-    quality: QoSProfile
+    type_name: str
+    qos: QoSProfile
     subscription: Subscription
     lost_event: Any
-    """Handle of the message-lost event, None where the middleware has none."""
+    """Handle of the message-lost event; None if the middleware has none."""
     sequence: int | None = None
-    """Number that the publisher gave the last message."""
+    """Publication sequence number of the last message."""
 
 
 class RawSubscriptions:
-    """The subscriptions of a recorder.
+    """The raw subscriptions of a recorder by topic.
 
     Parameters
     ----------
     node
-        Whose they are.
+        Node that subscribes.
     """
 
     def __init__(self, node: Node) -> None:
         self._node = node
         self._group = PolledCallbackGroup()
-        self._ears: dict[str, RawSubscription] = {}
+        self._subscriptions: dict[str, RawSubscription] = {}
         self._lost: dict[str, int] = {}
 
     @property
     def lost(self) -> dict[str, int]:
-        """Messages of each topic that the middleware has lost, as of :meth:`count_lost`."""
+        """Lost messages by topic, up to the last :meth:`count_lost`."""
         return dict(self._lost)
 
-    def ear(self, topic: str) -> RawSubscription | None:
-        """Return how ``topic`` is listened to, None when it is not."""
-        return self._ears.get(topic)
+    def get(self, topic: str) -> RawSubscription | None:
+        """Return the subscription to a topic, None without one."""
+        return self._subscriptions.get(topic)
 
-    def kind(self, topic: str) -> str:
-        """Return the type in which ``topic`` is listened to."""
-        return self._ears[topic].kind
+    def type_name(self, topic: str) -> str:
+        """Return the message type of the subscription to a topic."""
+        return self._subscriptions[topic].type_name
 
-    def listen(self, topic: str, kind: str, profile: QoSProfile) -> None:
-        """Listen to ``topic``, in a new way if it was listened to before.
+    def subscribe(self, topic: str, type_name: str, profile: QoSProfile) -> None:
+        """Subscribe to a topic, in place of the former subscription to it.
 
         Raises
         ------
         ImportError
-            The type is not installed.
+            The message type is not installed.
         RCLError
-            This process knows the topic with another type.
+            This process uses the topic with another type.
         """
-        message = introspection.message_class(kind)
-        self.stop(topic)
+        message = introspection.message_class(type_name)
+        self.unsubscribe(topic)
         subscription = self._node.create_subscription(
             message,
             topic,
             _unused_callback,
             profile,
             callback_group=self._group,
-            # Offers that do not fit are looked for in the graph, and the profile is changed.
+            # Topic discovery finds incompatible offers in the graph and adapts the profile.
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             raw=True,
         )
-        self._ears[topic] = RawSubscription(kind, profile, subscription, _lost_event(subscription))
+        self._subscriptions[topic] = RawSubscription(
+            type_name, profile, subscription, _lost_event(subscription)
+        )
 
-    def stop(self, topic: str) -> None:
-        """Listen to ``topic`` no longer; what has come and was not taken is lost."""
-        if ear := self._ears.pop(topic, None):
-            self._count_lost(topic, ear)
-            if ear.lost_event is not None:
-                ear.lost_event.destroy_when_not_in_use()
-            self._node.destroy_subscription(ear.subscription)
+    def unsubscribe(self, topic: str) -> None:
+        """Destroy the subscription to a topic with the messages still in its queue."""
+        if held := self._subscriptions.pop(topic, None):
+            self._count_lost(topic, held)
+            if held.lost_event is not None:
+                held.lost_event.destroy_when_not_in_use()
+            self._node.destroy_subscription(held.subscription)
 
     def close(self) -> None:
-        """Listen to nothing any longer."""
-        for topic in list(self._ears):
-            self.stop(topic)
+        """Destroy all subscriptions."""
+        for topic in list(self._subscriptions):
+            self.unsubscribe(topic)
 
-    def take(self) -> list[SerializedMessage]:
-        """Return all that has come since the last time, in order of receipt."""
+    def take_messages(self) -> list[SerializedMessage]:
+        """Return the messages received since the last call, in order of reception."""
         found: list[SerializedMessage] = []
-        for topic, ear in self._ears.items():
-            subscription = ear.subscription
-            handle, kind = subscription.handle, subscription.msg_type
+        for topic, held in self._subscriptions.items():
+            handle, message_type = held.subscription.handle, held.subscription.msg_type
             before = len(found)
             with handle:
-                while (item := handle.take_message(kind, True)) is not None:
+                while (item := handle.take_message(message_type, True)) is not None:
                     data, info = item
                     sequence = info['publication_sequence_number']
                     if len(found) == before:
@@ -137,65 +169,135 @@ class RawSubscriptions:
                         SerializedMessage(
                             topic,
                             info['received_timestamp'],
-                            max(0, info['source_timestamp']),  # a stranger may say anything
+                            max(0, info['source_timestamp']),  # a foreign publisher sets it
                             data,
                         )
                     )
             if (count := len(found) - before) == 0:
                 continue
-            if count >= ear.quality.depth:
-                self._lose(topic, self._fallen_out(ear, first))
-            ear.sequence = sequence
+            if count >= held.qos.depth:
+                self._add_lost(topic, self._replaced(held, first))
+            held.sequence = sequence
         found.sort(key=_RECEIVE_TIME)
         return found
 
     def count_lost(self) -> None:
-        """Ask the middleware what it has lost since the last time."""
-        for topic, ear in self._ears.items():
-            self._count_lost(topic, ear)
+        """Update the counters from the message-lost events."""
+        for topic, held in self._subscriptions.items():
+            self._count_lost(topic, held)
 
-    def _count_lost(self, topic: str, ear: RawSubscription) -> None:
-        if ear.lost_event is not None:
-            with ear.lost_event:
-                self._lose(topic, ear.lost_event.take_event().total_count_change)
+    def _count_lost(self, topic: str, held: RawSubscription) -> None:
+        if held.lost_event is not None:
+            with held.lost_event:
+                self._add_lost(topic, held.lost_event.take_event().total_count_change)
 
-    def _lose(self, topic: str, count: int) -> None:
+    def _add_lost(self, topic: str, count: int) -> None:
         if count > 0:
             self._lost[topic] = self._lost.get(topic, 0) + count
 
     @staticmethod
-    def _fallen_out(ear: RawSubscription, first: int | None) -> int:
-        """Return how many messages a full queue has lost; 1 where nobody can tell."""
-        if ear.sequence is None or first is None or ear.subscription.get_publisher_count() != 1:
-            return 1  # each publisher counts for itself, and does not say which one it is
-        return max(0, first - ear.sequence - 1)
+    def _replaced(held: RawSubscription, first: int | None) -> int:
+        """Return the number of messages replaced in a full queue; 1 if it cannot be determined."""
+        if held.sequence is None or first is None or held.subscription.get_publisher_count() != 1:
+            return 1  # each publisher has its own sequence, and a message does not identify it
+        return max(0, first - held.sequence - 1)
 
 
-def _lost_event(subscription: Subscription) -> Any:
-    try:
-        with subscription.handle:
-            return rclpy_implementation.EventHandle(
-                subscription.handle, QoSSubscriptionEventType.RCL_SUBSCRIPTION_MESSAGE_LOST
+class TopicDiscovery:
+    """Finds the selected topics in the graph and subscribes with a QoS that fits all publishers.
+
+    Parameters
+    ----------
+    node
+        Node that queries the graph.
+    topic_filter
+        Selects the topics to record.
+    subscriptions
+        Subscriptions that are made and replaced.
+    take_messages
+        Called before a subscription is replaced, so that no received message is lost.
+    recorded
+        Returns whether messages of a topic were recorded already.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        topic_filter: TopicFilter,
+        subscriptions: RawSubscriptions,
+        take_messages: Callable[[], None],
+        recorded: Callable[[str], bool],
+    ) -> None:
+        self._node = node
+        self._topic_filter = topic_filter
+        self._subscriptions = subscriptions
+        self._take_messages = take_messages
+        self._recorded = recorded
+        self.excluded: set[str] = set()
+        """Selected topics that cannot be recorded."""
+
+    def subscribe_expected(self) -> None:
+        """Subscribe to the expected topics before they are published."""
+        for name, type_name in EXPECTED_TOPICS.items():
+            topic = self._node.resolve_topic_name(name)
+            if not self._topic_filter.matches(topic, [type_name]):
+                continue
+            profile = qos.RECORDER_LATCHED if name in LATCHED_TOPICS else qos.RECORDER
+            try:
+                self._subscriptions.subscribe(topic, type_name, profile)
+            except introspection.RCLError:
+                # A node of this process uses another type; discovery finds its publisher.
+                continue
+
+    def discover(self) -> None:
+        """Subscribe to the selected topics that have publishers."""
+        for topic, type_names in self._node.get_topic_names_and_types():
+            if topic in self.excluded or not self._topic_filter.matches(topic, type_names):
+                continue
+            if publishers := self._node.get_publishers_info_by_topic(topic):
+                self._adapt(topic, publishers)
+
+    def exclude(self, topic: str, reason: str) -> None:
+        """Stop recording a topic, with a warning."""
+        self._subscriptions.unsubscribe(topic)
+        self.excluded.add(topic)
+        self._node.get_logger().warning(f'{topic} is not recorded: {reason}')
+
+    def _adapt(self, topic: str, publishers: Sequence[TopicEndpointInfo]) -> None:
+        """Subscribe again if type or QoS of the subscription do not fit the publishers."""
+        type_names = [info.topic_type for info in publishers]
+        profiles = [info.qos_profile for info in publishers]
+        held = self._subscriptions.get(topic)
+        request = qos.adapt_request_to_offers(profiles)
+        if held and held.type_name in type_names:
+            # Only a transient-local subscription receives messages from before discovery; after
+            # the first recorded message a new one would receive them twice.
+            lacks_history = qos.is_transient_local(request) and not qos.is_transient_local(
+                held.qos
             )
-    except UnsupportedEventTypeError:
-        return None
-
-
-def _unused_callback(data: bytes) -> None:
-    """Stand where rclpy wants a callback."""
+            if qos.compatible_with_all(held.qos, profiles) and (
+                not lacks_history or self._recorded(topic)
+            ):
+                return
+        type_name = held.type_name if held and held.type_name in type_names else type_names[0]
+        self._take_messages()
+        try:
+            self._subscriptions.subscribe(topic, type_name, request)
+        except (ImportError, introspection.RCLError) as error:
+            self.exclude(topic, str(error))
 
 
 def offered_qos(
-    topic: str, kind: str, publishers: Sequence[TopicEndpointInfo]
+    topic: str, type_name: str, publishers: Sequence[TopicEndpointInfo]
 ) -> tuple[TopicMetadata, int]:
-    """Return what a bag has to know of a topic, and how many of its publishers are latched."""
-    profiles = tuple(_qos_profile(info.qos_profile) for info in publishers)
+    """Return the metadata of a topic for the bag, and its number of transient-local publishers."""
+    profiles = tuple(_bag_profile(info.qos_profile) for info in publishers)
     type_hash = str(publishers[-1].topic_type_hash) if publishers else None
     latched = sum(qos.is_transient_local(info.qos_profile) for info in publishers)
-    return TopicMetadata(topic, kind, profiles, type_hash), latched
+    return TopicMetadata(topic, type_name, profiles, type_hash), latched
 
 
-def _qos_profile(offered: QoSProfile) -> QosProfile:
+def _bag_profile(offered: QoSProfile) -> QosProfile:
     return QosProfile(
         history=offered.history.name.lower(),
         depth=offered.depth,
@@ -209,95 +311,15 @@ def _qos_profile(offered: QoSProfile) -> QosProfile:
     )
 
 
-EXPECTED_TOPICS = {
-    'reference': 'nav_msgs/msg/Odometry',
-    'odom': 'nav_msgs/msg/Odometry',
-    'ground_truth/odom': 'nav_msgs/msg/Odometry',
-    'cmd_vel': 'geometry_msgs/msg/Twist',
-    'controller/journal': 'std_msgs/msg/Int64MultiArray',
-}
-"""Topics subscribed to before anybody publishes them, so that their first message is kept."""
-LATCHED_TOPICS = ('reference', 'odom', 'controller/journal')
-"""Those of them whose publishers, ours, keep what they have said. A recorder that finds them a
-moment after the controller did would otherwise lose what the run cannot be computed again from."""
+def _lost_event(subscription: Subscription) -> Any:
+    try:
+        with subscription.handle:
+            return rclpy_implementation.EventHandle(
+                subscription.handle, QoSSubscriptionEventType.RCL_SUBSCRIPTION_MESSAGE_LOST
+            )
+    except UnsupportedEventTypeError:
+        return None
 
 
-class TopicDiscovery:
-    """Decides which topics the ears are at, and with what quality of service.
-
-    Parameters
-    ----------
-    node
-        Who looks around in the graph.
-    selection
-        What is wanted.
-    ears
-        Those that listen.
-    take
-        Takes in what has been heard so far, before a topic is listened to in another way.
-    recorded
-        Whether something of a topic has been recorded already.
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        selection: TopicFilter,
-        ears: RawSubscriptions,
-        take: Callable[[], None],
-        recorded: Callable[[str], bool],
-    ) -> None:
-        self._node = node
-        self._selection = selection
-        self._ears = ears
-        self._take = take
-        self._recorded = recorded
-        self.left_out: set[str] = set()
-        """Topics that are wanted and cannot be recorded."""
-
-    def expect(self) -> None:
-        """Listen to what will be there sooner or later."""
-        for name, kind in EXPECTED_TOPICS.items():
-            topic = self._node.resolve_topic_name(name)
-            if not self._selection.matches(topic, [kind]):
-                continue
-            try:
-                latched = name in LATCHED_TOPICS
-                self._ears.listen(topic, kind, qos.RECORDER_LATCHED if latched else qos.RECORDER)
-            except introspection.RCLError:
-                # A node of this process has it with another type: the publisher will tell.
-                continue
-
-    def discover(self) -> None:
-        """Listen to what is published and wanted."""
-        for topic, kinds in self._node.get_topic_names_and_types():
-            if topic in self.left_out or not self._selection.matches(topic, kinds):
-                continue
-            if publishers := self._node.get_publishers_info_by_topic(topic):
-                self._attend(topic, publishers)
-
-    def leave_out(self, topic: str, why: str) -> None:
-        """Listen to a topic no longer, and say so."""
-        self._ears.stop(topic)
-        self.left_out.add(topic)
-        self._node.get_logger().warning(f'{topic} is not recorded: {why}')
-
-    def _attend(self, topic: str, publishers: Sequence[TopicEndpointInfo]) -> None:
-        kinds = [info.topic_type for info in publishers]
-        profiles = [info.qos_profile for info in publishers]
-        held = self._ears.ear(topic)
-        wanted = qos.adapt_request_to_offers(profiles)
-        if held and held.kind in kinds:
-            # What was latched before this recorder came is heard only by those who ask for it;
-            # once something was recorded, asking would bring it twice.
-            missed = qos.is_transient_local(wanted) and not qos.is_transient_local(held.quality)
-            if qos.compatible_with_all(held.quality, profiles) and (
-                not missed or self._recorded(topic)
-            ):
-                return
-        kind = held.kind if held and held.kind in kinds else kinds[0]
-        self._take()  # what was heard the old way is kept
-        try:
-            self._ears.listen(topic, kind, wanted)
-        except (ImportError, introspection.RCLError) as error:
-            self.leave_out(topic, str(error))
+def _unused_callback(data: bytes) -> None:
+    """Fill the mandatory callback argument of rclpy; it is never called."""

@@ -16,95 +16,95 @@ from t3mpc_ros.bag.writer import SerializedMessage
 T = TypeVar('T')
 
 POLL_PERIOD = 0.04
-"""Seconds between two looks into the backlog; a part of what a killed recorder loses."""
+"""Maximum time between two reads of the queue, s; a killed recorder loses this, too."""
 SHUTDOWN_TIMEOUT = 60.0
-"""Seconds that the disk is given at the end, before what waits is given up."""
+"""Shutdown timeout for the write queue, s."""
 
 
 class WriterThread:
-    """Writes a backlog into a series of files, in a thread of its own.
+    """Writes a message queue into a bag in a thread of its own.
 
     Parameters
     ----------
-    series
-        The recording; from now on only this thread touches it.
-    backlog
-        What waits.
+    writer
+        Writer of the bag; only this thread uses it.
+    queue
+        Messages and tasks to process.
     clock
-        Steady nanoseconds.
+        Returns steady time, ns.
     """
 
     def __init__(
-        self, series: SplitWriter, backlog: MessageQueue[SplitWriter], clock: Callable[[], int]
+        self, writer: SplitWriter, queue: MessageQueue[SplitWriter], clock: Callable[[], int]
     ) -> None:
-        self._series = series
-        self._backlog = backlog
+        self._writer = writer
+        self._queue = queue
         self._clock = clock
         self.failure = ''
-        """Why nothing is written any more; empty while all is well."""
-        self.file_name = series.path.name
+        """Why writing has stopped; empty if it has not."""
+        self.file_name = writer.path.name
         self._lock = threading.Lock()
-        self._unanswered: list[Future[Any]] = []
-        self._ending = threading.Event()
+        self._pending: list[Future[Any]] = []
+        self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name='writer', daemon=True)
         self._thread.start()
 
-    def ask(self, order: Callable[[SplitWriter], T]) -> 'Future[T]':
-        """Return the answer, once there is one, of what is done after all that waits.
+    def submit(self, task: Callable[[SplitWriter], T]) -> 'Future[T]':
+        """Return the future result of a task that runs after all queued messages are written.
 
-        It is a :class:`BagError` when nothing is written any more.
+        The future raises :class:`BagError` if writing has stopped.
         """
-        answer: Future[T] = Future()
+        future: Future[T] = Future()
 
-        def do(series: SplitWriter) -> None:
-            answer.set_result(order(series))
+        def run(writer: SplitWriter) -> None:
+            future.set_result(task(writer))
 
         with self._lock:
             if self.failure:
-                answer.set_exception(BagError(self.failure))
+                future.set_exception(BagError(self.failure))
             else:
-                self._unanswered = [item for item in self._unanswered if not item.done()]
-                self._unanswered.append(answer)
-                self._backlog.order(do)
-        return answer
+                self._pending = [item for item in self._pending if not item.done()]
+                self._pending.append(future)
+                self._queue.order(run)
+        return future
 
     def close(self) -> str:
-        """Return what went wrong, after all that waits has been written and the file closed."""
-        self._ending.set()
-        self._backlog.order(lambda series: None)  # so that it wakes up
+        """Write the queue, close the file and return the failure, or an empty text."""
+        self._closing.set()
+        self._queue.order(lambda writer: None)  # wakes the thread
         self._thread.join(SHUTDOWN_TIMEOUT)
         if self._thread.is_alive():
-            return f'the disk did not take the last messages within {SHUTDOWN_TIMEOUT:g} s'
+            return f'the disk did not accept the last messages within {SHUTDOWN_TIMEOUT:g} s'
         return self.failure
 
     def _run(self) -> None:
         try:
             while True:
-                # Once more after the end was asked for: what was put before it is then there.
-                ending = self._ending.is_set()
-                for item in self._backlog.take(0.0 if ending else POLL_PERIOD):
-                    self._do(item)
-                self._series.tick(self._clock())
-                self.file_name = self._series.path.name
-                if ending:
+                # One more pass after the request to close: it finds all earlier items.
+                closing = self._closing.is_set()
+                for item in self._queue.take(0.0 if closing else POLL_PERIOD):
+                    self._process(item)
+                self._writer.tick(self._clock())
+                self.file_name = self._writer.path.name
+                if closing:
                     break
-            self._series.close()
+            self._writer.close()
         except BagError as error:
             self._fail(str(error))
-        except Exception as error:  # a dead thread must not look like a recording that goes on
-            self._fail(f'writing has failed: {type(error).__name__}: {error}')
+        except Exception as error:  # a silent thread would look like a running recording
+            self._fail(f'writing failed: {type(error).__name__}: {error}')
 
-    def _do(self, item: Any) -> None:
+    def _process(self, item: Any) -> None:
         if isinstance(item, SerializedMessage):
-            self._series.write(item, self._clock())
+            self._writer.write(item, self._clock())
         else:
-            item(self._series)
+            item(self._writer)
 
-    def _fail(self, why: str) -> None:
-        with contextlib.suppress(BagError):  # the first error is the one to report
-            self._series.close()
+    def _fail(self, reason: str) -> None:
+        with contextlib.suppress(BagError):  # the first error is reported
+            self._writer.close()
         with self._lock:
-            self.failure = why
-            for answer in self._unanswered:  # or somebody would wait for ever
-                if not answer.done():
-                    answer.set_exception(BagError(why))
+            self.failure = reason
+            for future in self._pending:  # no caller waits for ever
+                if not future.done():
+                    future.set_exception(BagError(reason))

@@ -1,0 +1,98 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Replay of a run whose recorder has discovered odometry and reference late."""
+
+from pathlib import Path
+
+from mcap.reader import make_reader
+import numpy as np
+import pytest
+
+from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.bag.writer import BagWriter
+from t3mpc_ros.evaluation.bag_report.topic_roles import ReportOptions, choose_topics, find_topics
+from t3mpc_ros.evaluation.process_replay.comparison import ELSEWHERE, Tolerances, compare
+from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
+from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller
+
+GOLDEN = Path(__file__).parents[1] / 'golden' / 'switches.mcap'
+INPUTS = ('reference', 'odom')
+LATE = 1_000_000_000
+"""Time of discovery after the first message, ns."""
+
+
+@pytest.fixture(scope='module')
+def complete():
+    return load_inputs(GOLDEN)
+
+
+def record_late(folder, lost, republished):
+    """Copy the golden bag as a late recorder writes it.
+
+    Parameters
+    ----------
+    folder
+        Folder of the copy.
+    lost
+        Number of first messages of each input that the recorder did not receive.
+    republished
+        Number of first messages of each input that the controller has republished.
+    """
+    counts = {}
+    with GOLDEN.open('rb') as file:
+        reader = make_reader(file)
+        records = {item.name: dict(item.metadata) for item in reader.iter_metadata()}
+        records.pop('rosbag2')
+        with BagWriter(folder, metadata_records=records) as writer:
+            for schema, channel, message in reader.iter_messages():
+                topic, times = channel.topic, (message.log_time, message.publish_time)
+                number = counts[topic] = counts.get(topic, -1) + 1
+                if topic.strip('/') in INPUTS:
+                    if number < republished:
+                        initial = f'/controller/initial_inputs{topic}'
+                        writer.add_topic(initial, schema.name)
+                        writer.write(initial, times[0] + LATE, times[1] + 1000, message.data)
+                    if number < lost:
+                        continue
+                writer.add_topic(topic, schema.name)
+                writer.write(topic, *times, message.data)
+    return folder
+
+
+def same_columns(one, other):
+    return np.array_equal(one.stamps_ns, other.stamps_ns) and np.array_equal(
+        one.numbers, other.numbers
+    )
+
+
+@pytest.mark.parametrize('lost, republished', [(0, 200), (150, 200), (150, 150)])
+def test_initial_inputs_complete_a_late_recording(lost, republished, complete, tmp_path):
+    inputs = load_inputs(record_late(tmp_path / 'bag', lost, republished))
+    assert same_columns(inputs.odometry, complete.odometry)
+    assert same_columns(inputs.references, complete.references)
+    assert inputs.notes == ()
+    assert inputs.exact.all()
+    outcome = compare(inputs, replay_controller(inputs), Tolerances(ELSEWHERE, ELSEWHERE))
+    assert outcome.same, outcome.table()
+
+
+def test_without_initial_inputs_a_late_recording_is_not_exact(complete, tmp_path):
+    inputs = load_inputs(record_late(tmp_path / 'bag', 150, 0))
+    assert not inputs.exact.all()
+    assert len(inputs.odometry) == len(complete.odometry) - 150
+
+
+def test_a_gap_after_the_initial_inputs_is_not_hidden(tmp_path):
+    inputs = load_inputs(record_late(tmp_path / 'bag', 150, 100))
+    assert not inputs.exact.all()
+    assert any('odometry messages' in note for note in inputs.notes)
+
+
+def test_initial_inputs_are_no_topics_of_a_robot(tmp_path):
+    folder = record_late(tmp_path / 'bag', 0, 10)
+    with open_bag(folder) as recording:
+        assert '/controller/initial_inputs/odom' in recording.topics
+        assert find_topics(recording.topics)[1] == ('',)
+        choice = choose_topics(recording, ReportOptions())
+    assert choice.topics['odom'] == '/odom'
+    assert not any('initial_inputs' in note for note in choice.notes)

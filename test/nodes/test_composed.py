@@ -1,0 +1,59 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Several nodes in one process."""
+
+import time
+
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from support.ros_graph import TIMEOUT, is_ok
+
+from t3mpc_ros.nodes import composed
+from t3mpc_ros.nodes.registry import NODES
+from t3mpc_ros.parameters.table import ParameterError
+
+pytestmark = pytest.mark.ros
+
+
+@pytest.fixture
+def compose(graph, tmp_path):
+    """Return a function that makes ``all_in_one`` as its command line would."""
+    nodes = []
+
+    def make(*parameters):
+        words = [f'folder:={tmp_path}', *parameters]
+        rclpy.init(args=['--ros-args', *(word for item in words for word in ('-p', item))])
+        nodes.extend(composed.make())
+        return {node.get_name(): node for node in nodes}
+
+    yield make
+    for node in nodes:
+        node.on_shutdown()
+        node.destroy_node()
+    rclpy.try_shutdown()
+
+
+@pytest.mark.parametrize(
+    'order', ['', 'nodes:=[recorder, controller, sim_robot, reference_generator]']
+)
+def test_composed_runs_with_stamped_commands_in_any_order(order, compose, tmp_path):
+    """The recorder expected a Twist, and ROS refuses a second type in one process."""
+    nodes = compose('enable_stamped_cmd_vel:=true', *filter(None, [order]))
+    assert nodes.keys() == set(NODES) - {'radio_bridge', 'player'}
+    executor = SingleThreadedExecutor()
+    for node in nodes.values():
+        executor.add_node(node)
+    deadline = time.monotonic() + TIMEOUT
+    while not is_ok(nodes['sim_robot'], 'following commands'):
+        assert time.monotonic() < deadline
+        executor.spin_once(timeout_sec=0.05)
+    while not nodes['recorder'].count_subscribers('cmd_vel') > 1:
+        assert time.monotonic() < deadline
+        executor.spin_once(timeout_sec=0.05)
+    executor.shutdown()
+
+
+def test_two_types_on_one_topic_cannot_share_a_process(compose):
+    with pytest.raises(ParameterError, match='controller cannot share a process with sim_robot'):
+        compose('controller:enable_stamped_cmd_vel:=true')

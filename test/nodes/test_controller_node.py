@@ -1,0 +1,289 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The controller node with good, invalid and missing input."""
+
+import math
+
+from geometry_msgs.msg import Twist, TwistStamped
+from nav_msgs.msg import Odometry
+import numpy as np
+import pytest
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import Float64
+from std_srvs.srv import SetBool, Trigger
+from support.ros_graph import (
+    LATCHED,
+    ControllerHarness,
+    diagnostic,
+    diagnostic_level,
+    odometry,
+    reason,
+    stamp,
+)
+
+from t3mpc_ros.bag.run.model_file import ModelError, load_model
+from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.nodes import controller as controller_module
+from t3mpc_ros.nodes.common import qos
+from t3mpc_ros.nodes.common.base_node import ERROR, OK, WARN
+from t3mpc_ros.nodes.controller import ControllerNode
+
+pytestmark = pytest.mark.ros
+
+
+def test_without_odometry_the_controller_warns_and_stops(harness):
+    controller = harness.add(ControllerNode)
+    reference = harness.create_publisher(Odometry, 'reference')
+    commands = harness.subscribe(Twist, 'cmd_vel')
+    harness.wait_for_subscriber(reference)
+    reference.publish(odometry(NANOSECONDS, 0.2))
+    status = harness.next_status('controller')
+    assert status.level == WARN
+    assert status.message == 'stopped: no odometry'
+    assert not any(message.linear.x or message.angular.z for message in commands)
+    assert diagnostic(controller, 'steps') == 0
+
+
+def test_a_stale_reference_gives_a_zero_command_with_the_reason(harness):
+    bench = ControllerHarness(harness)
+    controller = bench.controller
+    bench.publish_odometry()
+    assert reason(controller) == 'stopped: no reference yet'
+    bench.publish_reference()
+    bench.run(5)
+    assert (diagnostic_level(controller), reason(controller)) == (OK, 'tracking')
+    assert bench.last_command().linear.x > 0.0
+    bench.run(30, linear=0.1)  # the reference ends after 0.1 s and is good for 0.15 s more
+    assert (diagnostic_level(controller), reason(controller)) == (
+        ERROR,
+        'stopped: reference is stale',
+    )
+    assert bench.last_command() == Twist()
+    status = harness.next_status('controller')
+    assert status.message != 'tracking'
+
+
+def test_an_odometry_timeout_gives_zero_commands(harness):
+    bench = ControllerHarness(harness, odometry_timeout=0.2)
+    controller = bench.controller
+    bench.publish_odometry()
+    bench.publish_reference()
+    bench.run(5)
+    harness.spin_until(lambda: any(message.linear.x > 0.0 for message in bench.commands))
+    harness.spin_until(lambda: reason(controller) == 'stopped: no odometry')
+    count = len(bench.commands)
+    harness.spin_until(lambda: len(bench.commands) > count + 3, 'it keeps saying stop')
+    assert bench.commands[-1] == Twist()
+
+
+def test_non_finite_odometry_or_reference_moves_nothing(harness):
+    bench = ControllerHarness(harness)
+    controller = bench.controller
+    bench.publish_odometry()
+    bench.publish_reference(math.nan)
+    bench.publish_reference(0.1, math.inf)
+    harness.spin_until(lambda: diagnostic(controller, 'references_rejected') == 22)
+    bench.publish_odometry()
+    assert reason(controller) == 'stopped: no reference yet'
+    bench.publish_reference()
+    bench.run(3)
+    assert diagnostic_level(controller) == WARN, 'tracking, but some were refused'
+    assert bench.last_command().linear.x > 0.0
+    bench.publish_odometry(math.nan)
+    assert (diagnostic_level(controller), reason(controller)) == (
+        ERROR,
+        'stopped: odometry is not finite',
+    )
+    assert bench.last_command() == Twist()
+
+
+def test_huge_numbers_stop_the_robot_without_a_crash(harness):
+    bench = ControllerHarness(harness)
+    odom = harness.create_publisher(Odometry, 'odom')
+    bench.publish_odometry()
+    for value in (1e19, 1e160, 1e200, 1.7e308):
+        bench.publish_reference(seconds=0.0)
+        bench.publish_odometry()
+        assert reason(bench.controller) == 'tracking'
+        bad = odometry(bench.stamp_ns + 1, value, value)
+        bad.pose.pose.position.x = bad.pose.pose.orientation.y = value
+        steps = diagnostic(bench.controller, 'steps')
+        odom.publish(bad)
+        harness.spin_until(lambda count=steps: diagnostic(bench.controller, 'steps') > count)
+        assert diagnostic_level(bench.controller) == ERROR
+        assert bench.last_command() == Twist()
+        bench.publish_reference(value, -value)
+        bench.run(60)  # it is held for half a second
+        assert diagnostic_level(bench.controller) == ERROR
+        assert bench.last_command() == Twist()
+        bench.run(80)
+    assert all(math.isfinite(message.linear.x) for message in bench.commands)
+
+
+def test_enable_and_disable(harness):
+    bench = ControllerHarness(harness)
+    controller = bench.controller
+    bench.publish_odometry()
+    bench.publish_reference(seconds=0.5)
+    bench.run(5)
+    assert bench.last_command().linear.x > 0.0
+    assert harness.call(SetBool, 'controller/enable', data=False).success
+    bench.run(2)
+    assert (diagnostic_level(controller), reason(controller)) == (
+        ERROR,
+        'stopped: disabled by request',
+    )
+    assert bench.last_command() == Twist()
+    assert harness.call(SetBool, 'controller/enable', data=True).success
+    bench.run(5)
+    assert (diagnostic_level(controller), reason(controller)) == (OK, 'tracking')
+    assert bench.last_command().linear.x > 0.0
+
+
+def test_stamped_commands_have_frame_and_stamp_of_the_odometry(harness):
+    bench = ControllerHarness(
+        harness, TwistStamped, enable_stamped_cmd_vel=True, frame_id='a/base'
+    )
+    bench.publish_odometry()
+    bench.publish_reference()
+    bench.run(5)
+    newest = bench.last_command()
+    assert stamp(newest) == bench.stamp_ns
+    assert newest.header.frame_id == 'a/base'
+    assert newest.twist.linear.x > 0.0
+    count = len(bench.commands)
+    bench.controller.on_shutdown()
+    harness.spin_until(lambda: len(bench.commands) > count)
+    assert bench.commands[-1].twist == Twist(), 'the last word is stop'
+
+
+def test_weights_survive_in_a_model_file_and_not_a_reset(harness, tmp_path):
+    bench = ControllerHarness(harness, model_output=str(tmp_path / 'model.npz'))
+
+    def saved():
+        response = harness.call(Trigger, 'controller/save_model')
+        assert response.success
+        assert str(tmp_path / 'model.npz') in response.message
+        return load_model(tmp_path / 'model.npz')
+
+    untaught = saved()
+    bench.publish_odometry()
+    bench.publish_reference(0.1, 1.0, seconds=0.8)
+    bench.run(50)  # a robot that does not move although it should: much to learn
+    learnt = saved()
+    change = learnt['fuzzy.coefficients'] - untaught['fuzzy.coefficients']
+    assert np.abs(change).max() > 1e-3
+
+    files = {name: str(tmp_path / f'{name}.npz') for name in ('model', 'pupil')}
+    harness.add(
+        ControllerNode, namespace='pupil', model=files['model'], model_output=files['pupil']
+    )
+    assert harness.call(Trigger, 'pupil/controller/save_model').success
+    taught = load_model(tmp_path / 'pupil.npz')
+    assert taught.keys() == learnt.keys()
+    for name in learnt:
+        np.testing.assert_array_equal(taught[name], learnt[name])
+
+    assert harness.call(Trigger, 'controller/reset').success
+    for name, value in saved().items():
+        np.testing.assert_array_equal(value, untaught[name])
+    bench.publish_odometry()
+    assert reason(bench.controller) == 'stopped: no reference yet', 'it earns its motion anew'
+
+
+def test_an_unusable_model_file_is_named(harness, tmp_path):
+    harness.add(ControllerNode, model_output=str(tmp_path / 'no' / 'folder.npz'))
+    response = harness.call(Trigger, 'controller/save_model')
+    assert not response.success
+    assert 'no/folder.npz' in response.message
+    small = harness.add(
+        ControllerNode,
+        namespace='small',
+        fuzzy__sets=5,
+        model_output=str(tmp_path / 'small.npz'),
+    )
+    assert harness.call(Trigger, 'small/controller/save_model').success
+    harness.remove(small)
+    with pytest.raises(ModelError, match=r'small.npz does not fit the parameters'):
+        harness.add(ControllerNode, namespace='other', model=str(tmp_path / 'small.npz'))
+
+
+def test_scalars_are_published_at_terms_rate(harness):
+    harness.add(ControllerNode, namespace='quiet', terms_rate=0.0)
+    bench = ControllerHarness(harness, terms_rate=20.0)
+    names = {
+        name
+        for name, kinds in harness.probe.get_topic_names_and_types()
+        if 'std_msgs/msg/Float64' in kinds
+    }
+    assert not any(name.startswith('/quiet/') for name in names)
+    assert len(names) >= 20
+    received = {name: harness.subscribe(Float64, name) for name in sorted(names)}
+    for name in names:
+        harness.spin_until(lambda topic=name: bench.controller.count_subscribers(topic) > 0)
+    bench.publish_odometry()
+    bench.publish_reference(seconds=0.9)
+    bench.run(99)
+    harness.spin_until(lambda: all(len(values) == 20 for values in received.values()))
+    # The estimate still hopes that the wheels do as they are told, which here they do not.
+    assert received['/controller/error/right'][-1].data == pytest.approx(-0.1 / 0.035, rel=0.03)
+    for name in ('terms/applied/right', 'terms/feedback/left', 'lyapunov/value', 'skill/left'):
+        assert math.isfinite(received[f'/controller/{name}'][-1].data), name
+
+
+def test_dynamic_controller_parameters_take_effect(harness):
+    bench = ControllerHarness(harness)
+    bench.publish_odometry()
+    bench.publish_reference(0.3, seconds=0.5)
+    bench.run(40)
+    assert bench.last_command().linear.x > 0.1
+    lower = Parameter('linear.x.max_velocity', value=0.05)
+    assert bench.controller.set_parameters([lower])[0].successful
+    bench.publish_reference(0.3, seconds=0.5)
+    bench.run(40)
+    assert bench.last_command().linear.x == pytest.approx(0.05, abs=0.001)
+    assert diagnostic(bench.controller, 'limited')
+
+
+# -- initial inputs -------------------------------------------------------------------------------
+
+
+def test_initial_inputs_reach_a_late_subscriber(harness):
+    bench = ControllerHarness(harness)
+    odom = harness.subscribe(Odometry, 'odom')
+    reference = harness.subscribe(Odometry, 'reference')
+    harness.wait_for_subscriber(bench.odom_publisher, 2)
+    harness.wait_for_subscriber(bench.reference_publisher, 2)
+    bench.publish_reference(0.1, 0.5)
+    bench.run(20)
+    late = {
+        name: harness.subscribe(Odometry, f'controller/initial_inputs/{name}', LATCHED)
+        for name in ('odom', 'reference')
+    }
+    harness.spin_until(lambda: len(late['odom']) >= 20 and len(late['reference']) >= 11)
+    assert late == {'odom': odom, 'reference': reference}
+    bench.run(1)
+    harness.spin_until(lambda: len(late['odom']) == 21, 'republished while it is received')
+
+
+@pytest.mark.parametrize(
+    'limit, value, kept', [('INITIAL_INPUT_TIME_NS', 0, 0), ('INITIAL_INPUTS', 5, 5)]
+)
+def test_initial_inputs_end_and_keep_the_first(limit, value, kept, harness, monkeypatch):
+    """Beyond the time, or the depth of the history, the first messages must not be replaced."""
+    if limit == 'INITIAL_INPUTS':
+        profile = QoSProfile(depth=value, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        monkeypatch.setattr(qos, limit, profile)
+    else:
+        monkeypatch.setattr(controller_module, limit, value)
+    bench = ControllerHarness(harness)
+    odom = harness.subscribe(Odometry, 'odom')
+    harness.wait_for_subscriber(bench.odom_publisher, 2)
+    bench.run(20)
+    late = harness.subscribe(Odometry, 'controller/initial_inputs/odom', LATCHED)
+    (publisher,) = harness.probe.get_publishers_info_by_topic('/controller/initial_inputs/odom')
+    assert publisher.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    harness.spin_until(lambda: len(late) >= kept)
+    bench.run(5)
+    assert late == odom[:kept]

@@ -1,0 +1,208 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Nodes in one graph: message types, diagnostics, simulated time, namespaces."""
+
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Twist, TwistStamped
+from nav_msgs.msg import Odometry
+import pytest
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import SetBool
+from support.ros_graph import diagnostic, is_ok, on_grid, reason, speed, stamp
+
+from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.nodes.common import conversions
+from t3mpc_ros.nodes.common.base_node import OK, WARN
+from t3mpc_ros.nodes.composed import ComposedNode
+from t3mpc_ros.nodes.controller import ControllerNode
+from t3mpc_ros.nodes.player.node import PlayerNode
+from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
+from t3mpc_ros.nodes.recorder.node import RecorderNode
+from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
+from t3mpc_ros.nodes.registry import NODES
+from t3mpc_ros.nodes.sim_robot import SimRobotNode
+
+pytestmark = pytest.mark.ros
+
+NODE_CLASSES = {
+    'reference_generator': ReferenceGeneratorNode,
+    'controller': ControllerNode,
+    'sim_robot': SimRobotNode,
+    'radio_bridge': RadioBridgeNode,
+    'recorder': RecorderNode,
+    'player': PlayerNode,
+    'composed': ComposedNode,
+}
+
+LATE_DURABILITIES = (DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+# -- message types that do not fit ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize('stamped', [False, True])
+def test_another_type_on_cmd_vel_is_a_warning(stamped, harness):
+    """ROS 2 connects only equal types and says nothing about the others."""
+    robot = harness.add(SimRobotNode, enable_stamped_cmd_vel=stamped)
+    controller = harness.add(ControllerNode, enable_stamped_cmd_vel=stamped)
+    harness.add(ReferenceGeneratorNode)
+    harness.spin_until(
+        lambda: reason(controller) == 'tracking' and is_ok(robot, 'following commands')
+    )
+    other = Twist if stamped else TwistStamped
+    foreign_node = harness.foreign_node()
+    foreign_node.create_publisher(other, 'cmd_vel', 10)
+    foreign_node.create_subscription(other, 'cmd_vel', print, 10)
+
+    words = f' geometry_msgs/msg/{other.__name__} '
+    for node in (robot, controller):
+        harness.spin_until(lambda one=node: words in reason(one), f'{node.get_name()} warns')
+        status = harness.next_status(node.get_name())
+        assert status.level == WARN
+        assert words in status.message
+
+
+# -- diagnostics ----------------------------------------------------------------------------------
+
+
+def test_every_node_publishes_diagnostics_at_1_hz(harness, tmp_path):
+    stamps = {}
+    harness.probe.create_subscription(
+        DiagnosticArray,
+        '/diagnostics',
+        lambda m: stamps.setdefault(m.status[0].name, []).append(time.monotonic()),
+        100,
+    )
+    for name, kind in NODE_CLASSES.items():
+        if name != 'recorder':
+            harness.add(kind)
+    harness.add(RecorderNode, folder=str(tmp_path / 'bag'))
+    harness.add(ComposedNode, namespace='two')
+    harness.spin_until(lambda: stamps.keys() == {*NODES, 'two/composed'})
+    harness.spin_until(lambda: all(len(times) >= 4 for times in stamps.values()))
+    for name, times in stamps.items():
+        assert 0.5 < (times[-1] - times[0]) / (len(times) - 1) < 2.0, name
+    expected = {
+        'controller': 'tracking',
+        'recorder': 'recording',
+        'reference_generator': 'running',
+    }
+    harness.spin_until(
+        lambda: all(harness.statuses(name)[-1].message == text for name, text in expected.items())
+    )
+    for name in expected:
+        status = harness.statuses(name)[-1]
+        assert status.level == OK
+        assert status.hardware_id
+        assert status.values
+
+
+# -- simulated time -------------------------------------------------------------------------------
+
+
+def test_the_loop_closes_in_simulated_time(harness):
+    harness.add(SimRobotNode, publish_clock=True)
+    controller = harness.add(ControllerNode, use_sim_time=True)
+    reference = harness.add(ReferenceGeneratorNode, use_sim_time=True)
+    odom = harness.subscribe(Odometry, 'odom')
+    received = harness.subscribe(Odometry, 'reference')
+    harness.spin_until(lambda: reason(controller) == 'tracking')
+    harness.spin_until(lambda: speed(odom[-1]) > 0.02, 'the robot follows')
+    away = stamp(received[-1]) - stamp(odom[-1])
+    assert abs(away) < 2 * NANOSECONDS
+    for node in (controller, reference):
+        assert abs(node.now_ns() - stamp(odom[-1])) < 2 * NANOSECONDS
+    assert diagnostic(reference, 'skipped_samples') < 1000
+
+
+def test_tracking_resumes_after_the_clock_jumps_back(harness, tmp_path):
+    """Before the clock is first heard a node's time is 0; that was taken for a grid once."""
+    clock = harness.create_publisher(Clock, '/clock')
+    offset_ns = [10**6 * NANOSECONDS]
+
+    def now_ns():
+        return offset_ns[0] + time.monotonic_ns()
+
+    kinds = (SimRobotNode, ControllerNode, ReferenceGeneratorNode)
+    robot, controller, reference = (harness.add(kind, use_sim_time=True) for kind in kinds)
+    harness.add(RecorderNode, use_sim_time=True, folder=str(tmp_path / 'bag'))
+    odom = harness.subscribe(Odometry, 'odom')
+    harness.wait_for_subscriber(clock, 4)
+    # The nodes run for a while before the clock does.
+    for node in (controller, reference):
+        harness.next_status(node.get_name())
+    assert not odom
+    harness.publish_periodically(
+        clock, lambda: Clock(clock=conversions.time_from_ns(now_ns())), 0.01
+    )
+    harness.spin_until(lambda: reason(controller) == 'tracking')
+    harness.spin_until(lambda: speed(odom[-1]) > 0.02)
+    for node in (robot, reference):
+        assert diagnostic(node, 'skipped_samples') == 0
+
+    before_ns = stamp(odom[-1])
+    offset_ns[0] -= 100 * NANOSECONDS
+    harness.spin_until(lambda: stamp(odom[-1]) < before_ns - 50 * NANOSECONDS)
+    count = len(odom)
+    harness.spin_until(lambda: reason(controller) == 'tracking' and len(odom) > count + 50)
+    harness.spin_until(lambda: speed(odom[-1]) > 0.02, 'the robot follows again')
+    assert on_grid(odom[count:], 100)
+
+
+# -- durability -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('topic', ['odom', 'reference'])
+@pytest.mark.parametrize('durability', LATE_DURABILITIES)
+def test_late_subscribers_receive_no_old_messages(topic, durability, harness):
+    """Ten seconds of old odometry would be taken for a robot that moves."""
+    node = harness.add(SimRobotNode if topic == 'odom' else ReferenceGeneratorNode)
+    early = harness.subscribe(Odometry, topic)
+    harness.spin_until(lambda: len(early) > 50)
+    newest_ns = stamp(early[-1])
+    late = harness.subscribe(
+        Odometry,
+        topic,
+        QoSProfile(depth=1000, durability=durability, reliability=ReliabilityPolicy.BEST_EFFORT),
+    )
+    (offer,) = harness.probe.get_publishers_info_by_topic(f'/{topic}')
+    assert offer.qos_profile.durability == DurabilityPolicy.VOLATILE
+    count = len(early)
+    harness.spin_until(lambda: len(early) > count + 50)
+    assert all(stamp(message) > newest_ns for message in late)
+    if durability == DurabilityPolicy.VOLATILE:
+        harness.spin_until(lambda: late, f'{node.get_name()} is not received')
+
+
+# -- names ----------------------------------------------------------------------------------------
+
+
+def test_namespaces_separate_two_robots(harness):
+    for name in ('a', 'b'):
+        harness.add(SimRobotNode, namespace=name)
+    harness.add(ControllerNode, namespace='a')
+    harness.add(ReferenceGeneratorNode, namespace='a')
+    odom = {name: harness.subscribe(Odometry, f'/{name}/odom') for name in ('a', 'b')}
+    foreign = harness.subscribe(Twist, '/b/cmd_vel')
+    harness.spin_until(lambda: odom['a'] and speed(odom['a'][-1]) > 0.05)
+    assert odom['b']
+    assert max(map(speed, odom['b'])) < 1e-3
+    assert not foreign
+    harness.spin_until(lambda: harness.statuses('a/sim_robot') and harness.statuses('b/sim_robot'))
+    assert harness.call(SetBool, '/b/e_stop', data=True).success
+    count = len(odom['a'])
+    harness.spin_until(lambda: len(odom['a']) > count + 20)
+    assert speed(odom['a'][-1]) > 0.0
+
+
+def test_topics_can_be_remapped(harness):
+    harness.add(SimRobotNode, ['-r', 'cmd_vel:=/steer', '-r', 'odom:=wheels/odom'])
+    controller = harness.add(ControllerNode, ['-r', 'cmd_vel:=/steer', '-r', 'odom:=wheels/odom'])
+    harness.add(ReferenceGeneratorNode)
+    commands = harness.subscribe(Twist, '/steer')
+    harness.spin_until(lambda: reason(controller) == 'tracking' and commands)
+    assert not harness.probe.get_publishers_info_by_topic('/cmd_vel')
+    assert not harness.probe.get_publishers_info_by_topic('/odom')

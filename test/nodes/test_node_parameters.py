@@ -1,0 +1,113 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""ROS parameters of all nodes."""
+
+import math
+
+import pytest
+from rclpy.parameter import Parameter
+
+from t3mpc_ros.nodes.composed import ComposedNode
+from t3mpc_ros.nodes.controller import ControllerNode
+from t3mpc_ros.nodes.player.node import PlayerNode
+from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
+from t3mpc_ros.nodes.recorder.node import RecorderNode
+from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
+from t3mpc_ros.nodes.registry import NODES, parameter_class
+from t3mpc_ros.nodes.sim_robot import SimRobotNode
+from t3mpc_ros.parameters.table import ParameterError
+
+pytestmark = pytest.mark.ros
+
+NODE_CLASSES = {
+    'reference_generator': ReferenceGeneratorNode,
+    'controller': ControllerNode,
+    'sim_robot': SimRobotNode,
+    'radio_bridge': RadioBridgeNode,
+    'recorder': RecorderNode,
+    'player': PlayerNode,
+    'composed': ComposedNode,
+}
+
+
+@pytest.mark.parametrize('name', NODES)
+def test_every_specification_is_a_described_parameter(name, harness, tmp_path):
+    given = {'folder': str(tmp_path / 'bag')} if name == 'recorder' else {}
+    node = harness.add(NODE_CLASSES[name], **given)
+    rows = parameter_class(name).specs()
+    assert rows
+    for row in rows:
+        described = node.describe_parameter(row.name)
+        assert described.description.startswith(row.text)
+        if row.unit:
+            assert f'[{row.unit}]' in described.description, row.name
+        assert described.additional_constraints == row.bounds()
+        assert described.read_only == (not row.dynamic)
+        if not row.many and (row.low is not None or row.high is not None):
+            ranges = described.floating_point_range or described.integer_range
+            assert len(ranges) == 1, row.name
+            if row.low is not None:
+                assert ranges[0].from_value == row.low, row.name
+            if row.high is not None:
+                assert ranges[0].to_value == row.high, row.name
+        value = node.get_parameter(row.name).value
+        if row.name not in given:
+            assert (tuple(value) if row.many else value) == row.default, row.name
+
+
+@pytest.mark.parametrize('name', ['controller', 'sim_robot'])
+def test_only_dynamic_parameters_can_be_set(name, harness):
+    node = harness.add(NODE_CLASSES[name])
+    for row in parameter_class(name).specs():
+        held = node.get_parameter(row.name)
+        response = node.set_parameters([held])[0]
+        assert response.successful == row.dynamic, row.name
+        if not row.dynamic:
+            assert row.name in response.reason
+            assert 'read-only' in response.reason
+            continue
+        for edge in (row.low, row.high):
+            if edge is None or row.kind is not float:
+                continue
+            outside = edge - 1.0 if edge == row.low else edge * 2.0
+            response = node.set_parameters([Parameter(row.name, value=outside)])[0]
+            assert not response.successful, row.name
+            for word in (row.name, f'{edge}', f'{outside}'):
+                assert word in response.reason
+        if row.kind is float:
+            response = node.set_parameters([Parameter(row.name, value=math.nan)])[0]
+            assert not response.successful, row.name
+            assert row.name in response.reason
+        assert node.get_parameter(row.name).value == held.value
+
+
+def test_inconsistent_parameters_are_rejected_with_the_reason(harness):
+    robot = harness.add(SimRobotNode)
+    slow = Parameter('wheel.stop_deceleration', value=10.0)
+    response = robot.set_parameters([slow])[0]
+    assert not response.successful
+    assert (
+        'wheel.stop_deceleration must be at least wheel.max_acceleration (30 rad/s²): got 10'
+        in response.reason
+    )
+    assert robot.parameters.limiter.stop_deceleration == 60.0
+    both = [Parameter('wheel.max_acceleration', value=5.0), slow]
+    assert robot.set_parameters_atomically(both).successful, 'together they fit'
+    assert robot.parameters.limiter.stop_deceleration == 10.0
+    with pytest.raises(ParameterError, match='drive.kind must be stepper or velocity'):
+        harness.add(SimRobotNode, namespace='other', drive__kind='torque')
+
+
+def test_integers_and_empty_lists_are_accepted_at_start(harness, tmp_path):
+    controller = harness.add(ControllerNode, ['-p', 'law.gain:=5', '-p', 'rate:=50'])
+    assert controller.parameters.law.gain == 5.0
+    assert controller.get_parameter('rate').value == 50.0
+    recorder = harness.add(RecorderNode, folder=str(tmp_path), topics=[])
+    assert recorder.parameters.topics == ()
+
+
+def test_an_unknown_parameter_is_rejected_with_a_suggestion(harness):
+    with pytest.raises(ParameterError, match=r'no parameter law.gian; did you mean law.gain\?'):
+        harness.add(ControllerNode, law__gian=5.0)
+    # What another node of the package knows may be said to all of them at once.
+    harness.add(ControllerNode, publish_clock=True)

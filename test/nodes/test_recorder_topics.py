@@ -1,0 +1,210 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Topics, types and QoS that the recorder records."""
+
+import sys
+
+from geometry_msgs.msg import Twist, TwistStamped
+from nav_msgs.msg import Odometry
+import pytest
+from rcl_interfaces.msg import Log
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+from support.ros_graph import (
+    LATCHED,
+    CommandSource,
+    diagnostic,
+    diagnostic_level,
+    is_ok,
+    odometry,
+    twist,
+)
+from visualization_msgs.msg import Marker
+
+from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.bag.writer import BagWriter, DiskError
+from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.nodes.common.base_node import ERROR, OK
+from t3mpc_ros.nodes.controller import ControllerNode
+from t3mpc_ros.nodes.recorder.node import RecorderNode
+from t3mpc_ros.nodes.sim_robot import SimRobotNode
+
+pytestmark = pytest.mark.ros
+
+
+def _count(harness, recorder, count):
+    harness.spin_until(lambda: diagnostic(recorder, 'messages') >= count)
+
+
+def _recorder(harness, folder, *topics, **more):
+    return harness.add(RecorderNode, folder=str(folder), topics=list(topics), **more)
+
+
+def test_a_type_that_is_not_installed_is_a_warning(harness, tmp_path, monkeypatch):
+    log = harness.subscribe(Log, '/rosout', LATCHED)
+    marker, message = harness.create_publisher(Marker, 'marker'), Marker()
+    text = harness.create_publisher(String, 'text')
+    monkeypatch.setitem(sys.modules, 'visualization_msgs.msg', None)
+    recorder = _recorder(harness, tmp_path, 'marker', 'text')
+    harness.wait_for_subscriber(text)
+    harness.spin_until(lambda: any('/marker is not recorded' in entry.msg for entry in log))
+    marker.publish(message)
+    text.publish(String(data='hello'))
+    _count(harness, recorder, 1)
+    warned = [entry for entry in log if '/marker' in entry.msg]
+    assert len(warned) == 1, 'said once'
+    assert warned[0].level == 30
+    assert diagnostic_level(recorder) == OK
+    harness.remove(recorder)
+    with open_bag(tmp_path) as recording:
+        assert list(recording.topics) == ['/text']
+
+
+def test_best_effort_publishers_are_recorded(harness, tmp_path):
+    """The recorder waits for odometry as reliable, and once did not hear a robot that is not."""
+    recorder = _recorder(harness, tmp_path, 'odom', 'other')
+    weak = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+    publishers = (
+        harness.create_publisher(Odometry, 'odom', weak),
+        harness.create_publisher(Odometry, 'other', weak),
+    )
+    for publisher in publishers:
+        harness.wait_for_subscriber(publisher)
+        publisher.publish(odometry(NANOSECONDS, 0.25))
+    _count(harness, recorder, 2)
+    harness.remove(recorder)
+    with open_bag(tmp_path) as recording:
+        assert {name: topic.message_count for name, topic in recording.topics.items()} == {
+            '/odom': 1,
+            '/other': 1,
+        }
+        assert recording.series('/odom', {'v': 'twist.twist.linear.x'})['v'][0] == 0.25
+
+
+def test_a_second_best_effort_publisher_is_recorded(harness, tmp_path):
+    recorder = _recorder(harness, tmp_path, 'text')
+    strong = harness.create_publisher(String, 'text')
+    harness.wait_for_subscriber(strong)
+    strong.publish(String(data='strong'))
+    _count(harness, recorder, 1)
+    weak = harness.create_publisher(
+        String, 'text', QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+    )
+    harness.wait_for_subscriber(weak)
+    harness.wait_for_subscriber(strong)
+    weak.publish(String(data='weak'))
+    strong.publish(String(data='strong again'))
+    _count(harness, recorder, 3)
+    harness.remove(recorder)
+    with open_bag(tmp_path) as recording:
+        received = {message.data for _, message in recording.messages('/text')}
+    assert received == {'strong', 'weak', 'strong again'}
+
+
+def test_stamped_commands_are_recorded_with_their_type(harness, tmp_path):
+    """The recorder expects a Twist on cmd_vel, and once heard nothing when it was stamped."""
+    recorder = _recorder(harness, tmp_path, 'cmd_vel')
+    commands = harness.foreign_node().create_publisher(TwistStamped, 'cmd_vel', 10)
+    harness.wait_for_subscriber(commands)
+    commands.publish(TwistStamped(twist=twist(0.5)))
+    _count(harness, recorder, 1)
+    harness.remove(recorder)
+    with open_bag(tmp_path) as recording:
+        assert recording.topics['/cmd_vel'].type_name == 'geometry_msgs/msg/TwistStamped'
+        assert recording.series('/cmd_vel', {'v': 'twist.linear.x'})['v'][0] == 0.5
+
+
+def test_a_type_change_of_a_topic_does_not_end_recording(harness, tmp_path):
+    log = harness.subscribe(Log, '/rosout', LATCHED)
+    recorder = _recorder(harness, tmp_path, 'cmd_vel', 'text')
+    first = harness.create_publisher(Twist, 'cmd_vel')
+    text = harness.create_publisher(String, 'text')
+    harness.wait_for_subscriber(first)
+    harness.wait_for_subscriber(text)
+    first.publish(twist(0.5))
+    _count(harness, recorder, 1)
+    harness.probe.destroy_publisher(first)
+    second = harness.foreign_node().create_publisher(TwistStamped, 'cmd_vel', 10)
+    harness.wait_for_subscriber(second)
+    second.publish(TwistStamped())
+    harness.spin_until(lambda: any('/cmd_vel is not recorded' in entry.msg for entry in log))
+    text.publish(String(data='still here'))
+    _count(harness, recorder, 2)
+    assert diagnostic_level(recorder) == OK
+    harness.remove(recorder)
+    with open_bag(tmp_path) as recording:
+        assert recording.topics['/cmd_vel'].message_count == 1
+        assert recording.topics['/text'].message_count == 1
+
+
+def test_earlier_latched_messages_are_recorded(harness, tmp_path):
+    latched = harness.create_publisher(String, 'map', LATCHED)
+    latched.publish(String(data='once'))
+    recorder = _recorder(harness, tmp_path, 'map')
+    _count(harness, recorder, 1)
+    harness.remove(recorder)
+    with open_bag(tmp_path) as recording:
+        assert [message.data for _, message in recording.messages('/map')] == ['once']
+
+
+def test_a_split_bag_loses_no_message(harness, tmp_path):
+    recorder = _recorder(harness, tmp_path, 'text')
+    text = harness.create_publisher(String, 'text')
+    harness.wait_for_subscriber(text)
+    for part in range(3):
+        for number in range(5):
+            text.publish(String(data=f'{part} {number}'))
+        _count(harness, recorder, 5 * (part + 1))
+        if part < 2:
+            response = harness.call(Trigger, 'recorder/split')
+            assert response.success
+            assert f'_{part + 1}.mcap' in response.message
+    harness.remove(recorder)
+    assert len(list(tmp_path.glob('*.mcap'))) == 3
+    with open_bag(tmp_path) as recording:
+        received = [message.data for _, message in recording.messages('/text')]
+    assert received == [f'{part} {number}' for part in range(3) for number in range(5)]
+
+
+def test_a_full_disk_ends_the_recording_only(harness, tmp_path, monkeypatch):
+    log = harness.subscribe(Log, '/rosout', LATCHED)
+    recorder = _recorder(harness, tmp_path, 'odom')
+    robot = harness.add(SimRobotNode)
+    odom = harness.subscribe(Odometry, 'odom')
+    source = CommandSource(harness)
+    source.message = twist(0.2)
+    _count(harness, recorder, 5)
+
+    def full(*_):
+        raise DiskError('recording into x failed: No space left on device; 5 messages are kept')
+
+    monkeypatch.setattr(BagWriter, 'write', full)
+    harness.spin_until(lambda: recorder.exit_code == 1)
+    assert diagnostic_level(recorder) == ERROR
+    status = harness.next_status('recorder')
+    assert status.level == ERROR
+    assert 'No space left on device' in status.message
+    assert [entry.level for entry in log if 'No space left' in entry.msg] == [40]
+    response = harness.call(Trigger, 'recorder/split')
+    assert not response.success, 'a recording that has failed cannot go on'
+    assert 'No space left' in response.message
+    count = len(odom)
+    harness.spin_until(lambda: len(odom) > count + 20)
+    assert is_ok(robot, 'following commands')
+    assert robot.exit_code == 0
+
+
+def test_parameters_are_recorded_by_namespace(harness, tmp_path):
+    """Two controllers share a name in two namespaces; one's gain once stood for the other's."""
+    recorder = _recorder(harness, tmp_path, 'odom', namespace='a')
+    harness.add(ControllerNode, namespace='a', law__gain=3.0)
+    harness.add(ControllerNode, namespace='b', law__gain=4.0)
+    harness.spin_until(
+        lambda: len(recorder._metadata.records) >= 4
+    )  # provenance, itself, two controllers
+    harness.remove(recorder)
+    with open_bag(tmp_path) as recording:
+        assert recording.metadata_records['controller']['law.gain'] == '3.0'
+        assert recording.metadata_records['/b/controller']['law.gain'] == '4.0'
+        assert recording.metadata_records['recorder']['folder'] == str(tmp_path)

@@ -1,0 +1,257 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Commands, stops and odometry of the simulated robot node."""
+
+import math
+
+from geometry_msgs.msg import Twist, TwistStamped
+from nav_msgs.msg import Odometry
+import numpy as np
+import pytest
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool, Trigger
+from support.ros_graph import (
+    CommandSource,
+    diagnostic,
+    diagnostic_level,
+    is_ok,
+    on_grid,
+    reason,
+    speed,
+    stamp,
+    twist,
+)
+
+from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.nodes.common import conversions
+from t3mpc_ros.nodes.common.base_node import ERROR, WARN
+from t3mpc_ros.nodes.sim_robot import SimRobotNode
+
+pytestmark = pytest.mark.ros
+
+
+FIELDS = [(part, axis) for part in ('linear', 'angular') for axis in 'xyz']
+
+
+def test_a_non_finite_command_never_moves_the_robot(harness):
+    """The number meant may have been anything; fields a wheeled robot does not use count too."""
+    robot = harness.add(SimRobotNode)
+    odom = harness.subscribe(Odometry, 'odom')
+    commands = harness.create_publisher(Twist, 'cmd_vel')
+    harness.wait_for_subscriber(commands)
+    refused = 0
+    for part, axis in FIELDS:
+        for value in (math.nan, math.inf, -math.inf):
+            bad = twist(0.3, 2.0)
+            setattr(getattr(bad, part), axis, value)
+            commands.publish(bad)
+            refused += 1
+            harness.spin_until(
+                lambda count=refused: diagnostic(robot, 'commands_rejected') == count,
+                f'{part}.{axis} = {value} was not refused',
+            )
+    count = len(odom)
+    harness.spin_until(lambda: len(odom) > count + 5)
+    status = harness.next_status('sim_robot')
+    assert status.level == WARN
+    assert 'not finite' in status.message
+    assert max(map(speed, odom)) < 1e-3
+    commands.publish(twist(0.3, 0.0))
+    harness.spin_until(
+        lambda: odom[-1].twist.twist.linear.x > 0.1, 'a good command moves the robot'
+    )
+
+
+def test_a_non_finite_command_stops_a_moving_robot(harness):
+    robot = harness.add(SimRobotNode)
+    odom = harness.subscribe(Odometry, 'odom')
+    source = CommandSource(harness)
+    source.message = twist(0.3)
+    harness.spin_until(lambda: odom and speed(odom[-1]) > 0.28)
+    assert is_ok(robot, 'following commands')
+    source.message = twist(0.3, math.nan)
+    harness.spin_until(lambda: speed(odom[-1]) < 1e-3, 'the robot stops')
+    assert 'not finite' in reason(robot)
+    source.message = twist(0.3)
+    harness.spin_until(lambda: speed(odom[-1]) > 0.28, 'the robot moves again')
+    assert is_ok(robot, 'following commands')
+
+
+def test_lateral_and_vertical_commands_are_ignored(harness):
+    harness.add(SimRobotNode, disturbance__bound=0.0)
+    odom = harness.subscribe(Odometry, 'odom')
+    source = CommandSource(harness)
+    message = twist()
+    message.linear.y = message.linear.z = message.angular.x = message.angular.y = 1.0
+    source.message = message
+    harness.spin_until(lambda: len(odom) > 30)
+    assert max(map(speed, odom)) == 0.0
+    message.linear.x = 0.3
+    harness.spin_until(lambda: odom[-1].pose.pose.position.x > 0.05)
+    assert abs(odom[-1].pose.pose.position.y) < 1e-9
+    assert odom[-1].twist.twist.linear.y == 0.0
+
+
+def test_a_command_timeout_stops_the_robot_with_the_reason(harness):
+    harness.add(SimRobotNode)
+    odom = harness.subscribe(Odometry, 'odom')
+    source = CommandSource(harness)
+    source.message = twist(0.3)
+    harness.spin_until(lambda: odom and speed(odom[-1]) > 0.28)
+    source.message = None
+    harness.spin_until(lambda: speed(odom[-1]) < 1e-3, 'the robot stops')
+    status = harness.next_status('sim_robot')
+    assert status.level == WARN
+    assert status.message == 'no command for 0.25 s'
+    assert {entry.key: entry.value for entry in status.values}['timed_out'] == 'True'
+
+
+def test_e_stop_latches_and_release_needs_a_new_command(harness):
+    robot = harness.add(SimRobotNode)
+    odom = harness.subscribe(Odometry, 'odom')
+    source = CommandSource(harness)
+    source.message = twist(0.3)
+    harness.spin_until(lambda: odom and speed(odom[-1]) > 0.28)
+    assert harness.call(SetBool, 'e_stop', data=True).success
+    harness.spin_until(lambda: speed(odom[-1]) < 1e-3, 'the robot stops')
+    status = harness.next_status('sim_robot')
+    assert status.level == ERROR
+    assert 'emergency stop' in status.message
+    # More than a second of commands later it still stands.
+    count = len(odom)
+    harness.spin_until(lambda: len(odom) > count + 20)
+    assert max(map(speed, odom[count:])) < 1e-3
+
+    source.message = None
+    count = diagnostic(robot, 'commands_rejected')
+    assert count > 0
+    assert harness.call(SetBool, 'e_stop', data=False).success
+    count = len(odom)
+    harness.spin_until(lambda: len(odom) > count + 20)
+    assert max(map(speed, odom[count:])) < 1e-3, 'the old command is not taken up again'
+    assert 'released' in reason(robot)
+    source.message = twist(0.3)
+    harness.spin_until(lambda: speed(odom[-1]) > 0.28, 'a new command moves the robot')
+    response = harness.call(SetBool, 'e_stop', data=False)
+    assert not response.success
+    assert 'no emergency stop' in response.message
+
+
+def test_a_latched_stop_is_an_error_before_any_warning(harness):
+    """A warning about message types once stood in front of the emergency stop."""
+    robot = harness.add(SimRobotNode)
+    harness.foreign_node().create_publisher(TwistStamped, 'cmd_vel', 10)
+    harness.spin_until(lambda: 'TwistStamped' in reason(robot))
+    assert harness.call(SetBool, 'e_stop', data=True).success
+    harness.spin_until(lambda: diagnostic_level(robot) == ERROR)
+    assert 'emergency stop' in reason(robot)
+
+
+def test_odometry_is_reset_at_rest_only(harness):
+    harness.add(SimRobotNode)
+    odom = harness.subscribe(Odometry, 'odom')
+    truth = harness.subscribe(Odometry, 'ground_truth/odom')
+    source = CommandSource(harness)
+    source.message = twist(0.3)
+    harness.spin_until(lambda: odom and odom[-1].pose.pose.position.x > 0.05)
+    response = harness.call(Trigger, 'reset_odometry')
+    assert not response.success
+    assert 'moves' in response.message
+    assert odom[-1].pose.pose.position.x > 0.05
+    source.message = None
+    harness.spin_until(lambda: speed(odom[-1]) < 1e-3)
+    assert harness.call(Trigger, 'reset_odometry').success
+    harness.spin_until(lambda: abs(odom[-1].pose.pose.position.x) < 1e-3)
+    harness.spin_until(lambda: truth[-1].pose.pose.position.x > 0.05, 'the robot itself stays')
+
+
+def test_set_pose_moves_the_true_pose_only(harness):
+    robot = harness.add(SimRobotNode)
+    odom = harness.subscribe(Odometry, 'odom')
+    truth = harness.subscribe(Odometry, 'ground_truth/odom')
+    values = {'initial_pose.x': 1.5, 'initial_pose.y': -2.0, 'initial_pose.yaw': 0.5}
+    for name, value in values.items():
+        assert robot.set_parameters([Parameter(name, value=value)])[0].successful
+    assert harness.call(Trigger, 'sim_robot/set_pose').success
+    harness.spin_until(lambda: truth and abs(truth[-1].pose.pose.position.x - 1.5) < 1e-3)
+    pose = conversions.state_from_odometry(truth[-1]).pose
+    assert pose == pytest.approx((1.5, -2.0, 0.5), abs=1e-3)
+    assert conversions.state_from_odometry(odom[-1]).pose == pytest.approx((0, 0, 0), abs=1e-3)
+    response = robot.set_parameters([Parameter('initial_pose.x', value=math.nan)])[0]
+    assert not response.successful
+    assert 'initial_pose.x must be finite' in response.reason
+
+
+def test_odometry_has_an_exact_grid_frames_and_joints(harness):
+    harness.add(
+        SimRobotNode,
+        odom_frame_id='a/odom',
+        base_frame_id='a/base',
+        right_wheel_name='r',
+        left_wheel_name='l',
+        rate=50.0,
+        joint_rate=25.0,
+    )
+    odom = harness.subscribe(Odometry, 'odom')
+    joints = harness.subscribe(JointState, 'joint_states')
+    source = CommandSource(harness)
+    source.message = twist(0.2, 1.0)
+    harness.spin_until(lambda: len(odom) > 40 and len(joints) > 10)
+    assert on_grid(odom, 50)
+    assert odom[-1].header.frame_id == 'a/odom'
+    assert odom[-1].child_frame_id == 'a/base'
+    assert joints[-1].name == ['r', 'l']
+    assert np.median(np.diff([stamp(message) for message in joints])) == NANOSECONDS // 25
+    right, left = joints[-1].velocity
+    assert right > left > 0.0
+
+
+def test_stamped_commands_are_accepted_and_stale_ones_rejected(harness):
+    """A stamped command that was recorded, or held up on its way, must not move a robot."""
+    robot = harness.add(SimRobotNode, enable_stamped_cmd_vel=True)
+    odom = harness.subscribe(Odometry, 'odom')
+    commands = harness.create_publisher(TwistStamped, 'cmd_vel')
+    harness.wait_for_subscriber(commands)
+
+    def say(stamp_ns):
+        message = TwistStamped(twist=twist(0.3))
+        message.header.stamp = conversions.time_from_ns(stamp_ns)
+        commands.publish(message)
+
+    say(robot.now_ns() - 2 * NANOSECONDS)
+    harness.spin_until(lambda: diagnostic(robot, 'commands_rejected') == 1)
+    count = len(odom)
+    harness.spin_until(lambda: len(odom) > count + 5)
+    assert max(map(speed, odom)) < 1e-3
+    say(robot.now_ns())
+    harness.spin_until(lambda: speed(odom[-1]) > 0.1, 'a fresh one moves the robot')
+    harness.spin_until(lambda: speed(odom[-1]) < 1e-3)
+    say(0)
+    harness.spin_until(lambda: speed(odom[-1]) > 0.1, 'a stamp of zero means now, as is usual')
+
+
+def test_huge_commands_stay_within_the_limits(harness):
+    robot = harness.add(SimRobotNode)
+    odom = harness.subscribe(Odometry, 'odom')
+    source = CommandSource(harness)
+    for value in (1e3, 1e160, 1.7e308):
+        source.message = twist(value, value)
+        count = len(odom)
+        harness.spin_until(lambda start=count: len(odom) > start + 30)
+    harness.spin_until(lambda: len(odom) > 100)
+    limits = robot.parameters.limiter
+    assert max(abs(message.twist.twist.linear.x) for message in odom) <= 1.05 * limits.linear_speed
+    turning = max(abs(message.twist.twist.angular.z) for message in odom)
+    assert turning <= 1.05 * limits.angular_speed
+
+
+def test_dynamic_limits_of_the_robot_take_effect(harness):
+    robot = harness.add(SimRobotNode)
+    odom = harness.subscribe(Odometry, 'odom')
+    source = CommandSource(harness)
+    source.message = twist(0.3)
+    harness.spin_until(lambda: odom and speed(odom[-1]) > 0.28)
+    assert robot.set_parameters([Parameter('linear.x.max_velocity', value=0.1)])[0].successful
+    harness.spin_until(lambda: abs(speed(odom[-1]) - 0.1) < 0.01)
+    assert diagnostic(robot, 'limited')
