@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Fixtures: a ROS graph of its own for every test that needs one."""
+"""Fixtures: an isolated ROS graph for each test that needs one."""
 
 import fcntl
 from pathlib import Path
@@ -14,10 +14,10 @@ from t3mpc_ros.cli.process_group import ProcessGroup, private_graph
 
 @pytest.fixture
 def graph(monkeypatch):
-    """Return a ``ROS_DOMAIN_ID`` nobody else uses, set for this process and its children.
+    """Return an unused ``ROS_DOMAIN_ID``, set for this process and its children.
 
-    Two runs of the tests at once would hear each other's robots: a lock file per domain keeps
-    them apart. Beyond 101 the ports of DDS are handed out to others.
+    A lock file per domain isolates concurrent test runs. Domains above 101 use ports of the
+    ephemeral range.
     """
     for domain in random.SystemRandom().sample(range(1, 102), 101):
         lock = (Path(tempfile.gettempdir()) / f't3mpc_ros_domain_{domain}.lock').open('w')
@@ -37,7 +37,7 @@ def graph(monkeypatch):
 
 @pytest.fixture
 def ros(graph):
-    """Initialise rclpy in the test's own process for the length of a test."""
+    """Initialise rclpy in the process of the test, for the duration of a test."""
     import rclpy
 
     rclpy.init(args=[])
@@ -47,7 +47,7 @@ def ros(graph):
 
 @pytest.fixture
 def fleet(graph, tmp_path):
-    """Return a fleet of executables; whatever still runs at the end is killed."""
+    """Return a process group; processes that still run at the end are killed."""
     started = ProcessGroup(tmp_path / 'log', private_graph())
     yield started
     for name in list(started.running()):

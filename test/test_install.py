@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The package as users get it: built with colcon, run from there, or through scripts/."""
+"""Installation: the package built with colcon, and the scripts with their environment."""
 
 from fnmatch import fnmatch
 import functools
@@ -21,23 +21,23 @@ import yaml
 
 from t3mpc_ros.nodes.registry import NODES, parameter_class
 
-# One build serves them all.
+# All tests share one build.
 pytestmark = pytest.mark.ros
 
 ROOT = Path(__file__).resolve().parent.parent
 EXECUTABLES = set(re.findall(r"f'(\w+) = \{NAME\}", (ROOT / 'setup.py').read_text()))
-# Not the user's own ROS, workspace or pip: what these tests build and run is theirs alone.
+# Variables of the user's ROS, workspace and pip, removed for the tests.
 FOREIGN = ('PYTHONPATH', 'AMENT_PREFIX_PATH', 'COLCON_', 'PIP_', 'T3MPC_')
 
 
 def clean_environment(**extra):
-    """Return this process's environment without what belongs to somebody else's set-up."""
+    """Return the environment of this process without the variables of the user's setup."""
     kept = {key: value for key, value in os.environ.items() if not key.startswith(FOREIGN)}
     return kept | {key: str(value) for key, value in extra.items()}
 
 
 def copy_package(destination):
-    """Copy what the version control system would hand to a user: nothing that is ignored."""
+    """Copy the package without the files that version control ignores."""
     ignored = [line.rstrip('/') for line in (ROOT / '.gitignore').read_text().split()]
     shutil.copytree(ROOT, destination, ignore=shutil.ignore_patterns('.git', *ignored))
     return destination
@@ -59,7 +59,7 @@ class Tree:
         self.environment = clean_environment(
             AMENT_PREFIX_PATH=sys.prefix,
             COLCON_HOME=folder / 'colcon',
-            # Kernels are cached by the path of their source: not in the user's own cache.
+            # The cache of the kernels is keyed by source path: keep the user's own cache clean.
             T3MPC_CACHE_DIR=folder / 'kernels',
         )
         built = subprocess.run(
@@ -76,17 +76,17 @@ class Tree:
 
     def _sourced(self, setup):
         """Return the environment of a shell that has sourced the workspace."""
-        said = subprocess.run(
+        output = subprocess.run(
             ['bash', '-c', 'source "$1" && env -0', 'bash', setup],
             env=self.environment,
             capture_output=True,
             text=True,
             check=True,
         )
-        return dict(line.split('=', 1) for line in said.stdout.split('\0') if line)
+        return dict(line.split('=', 1) for line in output.stdout.split('\0') if line)
 
     def start(self, name, *arguments):
-        """Start one executable as ``ros2 run`` does, in the graph of the current test."""
+        """Start an executable like ``ros2 run``, in the graph of the current test."""
         graph = {k: v for k, v in os.environ.items() if k.startswith(('ROS_', 'FASTRTPS_'))}
         return Process(self, name, arguments, self.environment | graph)
 
@@ -101,7 +101,7 @@ class Tree:
 
 
 class Process:
-    """A running executable; as a context manager it is gone at the end, whatever happens."""
+    """A running executable; as a context manager it is killed at the end."""
 
     def __init__(self, tree, name, arguments, environment):
         self._name = name
@@ -124,14 +124,14 @@ class Process:
             self._process.kill()
         self._process.wait()
 
-    def said(self):
+    def output(self):
         return self._log.read_text(errors='replace')
 
     def wait_ready(self, seconds=180.0):
         deadline = time.monotonic() + seconds
-        while f'{self._name} ready' not in self.said():
-            assert self._process.poll() is None, f'{self._name} ended early:\n{self.said()}'
-            assert time.monotonic() < deadline, f'{self._name} is not ready:\n{self.said()}'
+        while f'{self._name} ready' not in self.output():
+            assert self._process.poll() is None, f'{self._name} exited early:\n{self.output()}'
+            assert time.monotonic() < deadline, f'{self._name} is not ready:\n{self.output()}'
             time.sleep(0.05)
 
     def interrupt(self):
@@ -173,18 +173,18 @@ def test_a_workspace_contains_all_files_that_ros_needs(tree):
         there = {path.relative_to(tree.share) for path in tree.share.glob(pattern)}
         assert wanted == there != set()
     for path in tree.share.glob('config/*'):
-        # Symlinked: an edited YAML counts at once. Copied: the source may go.
+        # Symlinked: an edited YAML takes effect. Copied: independent of the source.
         assert path.is_relative_to(tree.prefix)
         assert path.resolve().is_relative_to(tree.source.resolve()) == tree.symlinked
 
 
 def test_a_sourced_workspace_runs_its_own_complete_code(tree):
-    """``packages=[name]`` in setup.py would drop every room, and .venv would hide that."""
+    """``packages=[name]`` in setup.py would omit the sub-packages, which .venv would hide."""
     code = 'import t3mpc_ros; print(t3mpc_ros.__path__[0])'
-    said = subprocess.check_output(
+    output = subprocess.check_output(
         [sys.executable, '-c', code], cwd=tree.scratch, env=tree.environment, text=True
     )
-    installed = Path(said.strip())
+    installed = Path(output.strip())
     assert installed.is_relative_to(tree.prefix.parent.parent)
     source = tree.source / 't3mpc_ros'
     assert {path.relative_to(installed) for path in installed.rglob('*.py')} == {
@@ -199,8 +199,8 @@ def test_every_installed_node_starts_and_exits_with_0(tree, graph):
     for name in NODES:
         with tree.start(name) as node:
             node.wait_ready()
-            assert node.interrupt() == 0, node.said()
-            assert 'Traceback' not in node.said()
+            assert node.interrupt() == 0, node.output()
+            assert 'Traceback' not in node.output()
 
 
 @pytest.mark.slow
@@ -223,11 +223,11 @@ CHANGED = {
     'reference_generator': ('seed', 77),
     'sim_robot': ('noise.variance', 0.0625),
 }
-"""One parameter of each node, and a value that is not its default."""
+"""One parameter of each node with a value that is not its default."""
 
 
 def _read_parameter(node, name, wanted):
-    """Return a parameter of a running node, over its own service."""
+    """Return a parameter of a running node, read through its service."""
     from rcl_interfaces.srv import GetParameters
     import rclpy
     from rclpy.parameter import parameter_value_to_python
@@ -242,10 +242,10 @@ def _read_parameter(node, name, wanted):
 @pytest.mark.slow
 @pytest.mark.parametrize('name', CHANGED)
 def test_each_yaml_reaches_its_node_with_and_without_a_namespace(name, copied, ros, tmp_path):
-    """The key must match ``/controller`` as well as ``/robot_1/controller``.
+    """The key matches ``/controller`` and ``/robot_1/controller``.
 
-    The installed file is loaded, then a copy of it in which one value differs from the default,
-    so that a key which matches nothing cannot pass.
+    The installed file is loaded, then a copy with one value that differs from the default: a key
+    that matches no node fails.
     """
     import rclpy
 
@@ -270,7 +270,7 @@ def test_each_yaml_reaches_its_node_with_and_without_a_namespace(name, copied, r
             with copied.start(name, '--ros-args', *remap, *files) as node:
                 node.wait_ready()
                 assert _read_parameter(reader, f'{namespace}/{name}', parameter) == value
-                assert node.interrupt() == 0, node.said()
+                assert node.interrupt() == 0, node.output()
     finally:
         reader.destroy_node()
 
@@ -280,7 +280,7 @@ def test_every_yaml_is_tested():
 
 
 class _Recorded:
-    """Stands in for what launch files are written with; remembers the arguments."""
+    """Substitute for the classes of launch files; stores the arguments."""
 
     def __init__(self, *arguments, **named):
         self.arguments = arguments
@@ -288,8 +288,8 @@ class _Recorded:
 
 
 def test_the_launch_file_names_only_what_is_installed(copied, monkeypatch):
-    """The package ``launch`` comes with apt only, so the file runs against stand-ins here."""
-    words = {
+    """The package ``launch`` is available from apt only: the file runs with substitutes."""
+    substitutes = {
         'launch': ['LaunchDescription'],
         'launch.actions': ['DeclareLaunchArgument'],
         'launch.conditions': ['IfCondition'],
@@ -297,10 +297,10 @@ def test_the_launch_file_names_only_what_is_installed(copied, monkeypatch):
         'launch_ros': [],
         'launch_ros.actions': ['Node'],
     }
-    for name, classes in words.items():
+    for name, classes in substitutes.items():
         module = types.ModuleType(name)
-        for word in classes:
-            setattr(module, word, type(word, (_Recorded,), {}))
+        for class_name in classes:
+            setattr(module, class_name, type(class_name, (_Recorded,), {}))
         monkeypatch.setitem(sys.modules, name, module)
     monkeypatch.setenv('AMENT_PREFIX_PATH', copied.environment['AMENT_PREFIX_PATH'])
 
@@ -327,8 +327,8 @@ def test_the_launch_file_names_only_what_is_installed(copied, monkeypatch):
 
 # --- scripts ------------------------------------------------------------------------------------
 
-# Stands in for a Python and its environment: pretends a version, notes what is asked of it, and
-# fails to install while a file `no_index` lies beside the notes.
+# Fake Python: reports a version, logs its calls, and fails to install while a file `no_index`
+# exists beside the log.
 FAKE_PYTHON = r"""#!/usr/bin/env bash
 notes="$FAKE_NOTES"
 here="$(cat "$(dirname "$0")/version")"
@@ -364,7 +364,7 @@ SET_UP = ['venv', 'pip', 'setup', 'compile']
 
 
 class Checkout:
-    """A fresh copy of the package, on a machine whose only Python is a stand-in."""
+    """A new copy of the package, with a fake Python as the only one on PATH."""
 
     def __init__(self, folder):
         self.root = copy_package(folder / 'a checkout')
@@ -376,7 +376,7 @@ class Checkout:
             (self.bin / tool).symlink_to(shutil.which(tool))
 
     def python(self, folder, version):
-        """Put a ``python3`` that says it is this version into a folder."""
+        """Create a fake ``python3`` of a version in a folder."""
         folder.mkdir(exist_ok=True)
         path = folder / 'python3'
         path.write_text(FAKE_PYTHON)
@@ -400,7 +400,7 @@ class Checkout:
         return subprocess.run(**self.command(*arguments, **extra))
 
     def done(self):
-        """Return what was asked of the stand-in since the last call."""
+        """Return the logged calls of the fake Python since the last call."""
         steps = self.notes.read_text().split() if self.notes.exists() else []
         self.notes.unlink(missing_ok=True)
         return steps
@@ -412,7 +412,7 @@ class Checkout:
 
 @pytest.fixture
 def checkout(tmp_path):
-    """Return a fresh copy of the package with a stand-in for Python."""
+    """Return a new copy of the package with a fake Python."""
     return Checkout(tmp_path)
 
 
@@ -428,10 +428,10 @@ def test_run_sets_up_once_and_passes_arguments_on(checkout):
 @pytest.mark.parametrize('arguments', [(), ('t3mpcs',), ('.',), ('../t3mpc',)])
 def test_run_with_an_unknown_name_lists_the_names(arguments, checkout):
     checkout.run('t3mpc')
-    told = checkout.run(*arguments)
-    assert told.returncode == 2
-    assert 'NAME one of: t3mpc\n' in told.stderr
-    assert all(f'no executable {name}\n' in told.stderr for name in arguments)
+    done = checkout.run(*arguments)
+    assert done.returncode == 2
+    assert 'NAME one of: t3mpc\n' in done.stderr
+    assert all(f'no executable {name}\n' in done.stderr for name in arguments)
 
 
 @pytest.mark.parametrize(
@@ -450,7 +450,7 @@ def test_a_stale_environment_is_updated(file, checkout):
 
 
 def test_compiled_files_beside_the_launch_file_are_ignored(checkout):
-    """A folder launch/__pycache__ once ended every script without a word."""
+    """Regression: a folder launch/__pycache__ ended every script without a message."""
     (checkout.root / 'launch' / '__pycache__').mkdir()
     assert checkout.run('t3mpc').returncode == 0
 
@@ -464,7 +464,7 @@ def test_a_moved_checkout_or_new_python_gets_a_new_environment(checkout, tmp_pat
     newer = checkout.python(tmp_path / 'newer', '3.13.1')
     assert checkout.run('t3mpc', T3MPC_PYTHON=newer).returncode == 0
     assert checkout.done() == SET_UP
-    # It stays the one in use without being named again.
+    # It remains in use without T3MPC_PYTHON.
     assert checkout.run('t3mpc').returncode == 0
     assert checkout.done() == []
 
@@ -472,40 +472,40 @@ def test_a_moved_checkout_or_new_python_gets_a_new_environment(checkout, tmp_pat
 def test_two_scripts_at_once_set_up_once(checkout):
     both = [subprocess.Popen(**checkout.command('t3mpc')) for _ in range(2)]
     for process in both:
-        said, errors = process.communicate(timeout=30)
-        assert (process.returncode, said) == (0, 't3mpc got \n'), errors
+        output, errors = process.communicate(timeout=30)
+        assert (process.returncode, output) == (0, 't3mpc got \n'), errors
     assert checkout.done() == SET_UP
 
 
 def test_a_python_that_is_too_old_is_an_error_with_a_remedy(checkout):
     checkout.python(checkout.bin, '3.9.2')
-    told = checkout.run('t3mpc')
-    assert told.returncode == 1
-    assert re.search(r'^error: .*3\.11.*Python 3\.9\.2', told.stderr, re.MULTILINE)
-    assert re.search(r'^remedy: .*T3MPC_PYTHON=', told.stderr, re.MULTILINE)
+    done = checkout.run('t3mpc')
+    assert done.returncode == 1
+    assert re.search(r'^error: .*3\.11.*Python 3\.9\.2', done.stderr, re.MULTILINE)
+    assert re.search(r'^remedy: .*T3MPC_PYTHON=', done.stderr, re.MULTILINE)
     assert not (checkout.root / '.venv').exists()
 
 
 @pytest.mark.parametrize('version, named', [('3.9.2', 'Python 3.9.2'), (None, 'not found')])
 def test_an_unusable_requested_python_is_an_error(version, named, checkout, tmp_path):
-    asked = tmp_path / 'asked' / 'python3'
+    requested = tmp_path / 'requested' / 'python3'
     if version:
-        checkout.python(asked.parent, version)
-    told = checkout.run('t3mpc', T3MPC_PYTHON=asked)
-    assert told.returncode == 1
-    assert f'error: T3MPC_PYTHON={asked}' in told.stderr
-    assert named in told.stderr
-    assert 'remedy: ' in told.stderr
+        checkout.python(requested.parent, version)
+    done = checkout.run('t3mpc', T3MPC_PYTHON=requested)
+    assert done.returncode == 1
+    assert f'error: T3MPC_PYTHON={requested}' in done.stderr
+    assert named in done.stderr
+    assert 'remedy: ' in done.stderr
     assert checkout.done() == []
 
 
 def test_an_interrupted_setup_is_repaired_by_the_next_run(checkout):
     (checkout.notes.parent / 'no_index').touch()
-    told = checkout.run('t3mpc')
-    assert told.returncode == 1
-    assert 'ERROR: Could not find a version' in told.stderr
-    assert 'error: the libraries could not be installed' in told.stderr
-    assert 'remedy: check the network' in told.stderr
+    done = checkout.run('t3mpc')
+    assert done.returncode == 1
+    assert 'ERROR: Could not find a version' in done.stderr
+    assert 'error: the libraries could not be installed' in done.stderr
+    assert 'remedy: check the network' in done.stderr
     assert checkout.done() == ['venv', 'pip']
     assert not checkout.stamped
     (checkout.notes.parent / 'no_index').unlink()
@@ -525,7 +525,7 @@ def test_a_failed_update_does_not_count_as_an_environment(checkout):
 
 @pytest.mark.slow
 def test_an_unreachable_index_is_an_error_with_a_remedy(tmp_path):
-    """With the real Python and the real pip: nobody listens on the index's port."""
+    """With the real Python and pip, and an index that does not respond."""
     root = copy_package(tmp_path / 'checkout')
     with socket.socket() as listener:
         listener.bind(('127.0.0.1', 0))
@@ -540,27 +540,27 @@ def test_an_unreachable_index_is_an_error_with_a_remedy(tmp_path):
         {'PIP_INDEX_URL': f'http://127.0.0.1:{port}/simple', 'no_proxy': '127.0.0.1'},
         {'PIP_NO_INDEX': 1},
     ):
-        told = subprocess.run(
+        done = subprocess.run(
             [root / 'scripts' / 'run', 't3mpc', 'exponents'],
             env=clean_environment(**offline, **index),
             capture_output=True,
             text=True,
         )
-        assert told.returncode == 1
-        assert 'error: the libraries could not be installed' in told.stderr
-        assert 'remedy: check the network and the package index' in told.stderr
+        assert done.returncode == 1
+        assert 'error: the libraries could not be installed' in done.stderr
+        assert 'remedy: check the network and the package index' in done.stderr
         assert not (root / '.venv' / 'stamp').exists()
 
 
 def test_a_sourced_ros_does_not_enter_the_local_environment(checkout, tmp_path):
-    """Modules of a system ROS for another Python, and its libraries, once came first."""
+    """Regression: modules and libraries of a system ROS took precedence."""
     libraries = tmp_path / 'ros' / 'lib'
     libraries.mkdir(parents=True)
     (libraries / 'librcl.so').touch()
     checkout.run('t3mpc')
-    lab = checkout.root / '.venv' / 'lib' / 't3mpc_ros' / 't3mpc'
-    lab.write_text('#!/bin/sh\nenv\n')
-    said = checkout.run(
+    program = checkout.root / '.venv' / 'lib' / 't3mpc_ros' / 't3mpc'
+    program.write_text('#!/bin/sh\nenv\n')
+    output = checkout.run(
         't3mpc',
         PYTHONPATH=tmp_path / 'ros',
         AMENT_PREFIX_PATH=tmp_path / 'ros',
@@ -568,11 +568,11 @@ def test_a_sourced_ros_does_not_enter_the_local_environment(checkout, tmp_path):
         RMW_IMPLEMENTATION='rmw_cyclonedds_cpp',
         ROS_DOMAIN_ID='7',
     ).stdout
-    seen = dict(line.split('=', 1) for line in said.splitlines() if '=' in line)
-    assert seen['AMENT_PREFIX_PATH'] == str(checkout.root / '.venv')
-    assert seen['LD_LIBRARY_PATH'] == str(tmp_path / 'own')
-    assert seen['ROS_DOMAIN_ID'] == '7'
-    assert not {'PYTHONPATH', 'RMW_IMPLEMENTATION'} & set(seen)
+    environment = dict(line.split('=', 1) for line in output.splitlines() if '=' in line)
+    assert environment['AMENT_PREFIX_PATH'] == str(checkout.root / '.venv')
+    assert environment['LD_LIBRARY_PATH'] == str(tmp_path / 'own')
+    assert environment['ROS_DOMAIN_ID'] == '7'
+    assert not {'PYTHONPATH', 'RMW_IMPLEMENTATION'} & set(environment)
 
 
 @pytest.mark.slow
@@ -586,6 +586,6 @@ def test_run_starts_the_real_program():
     )
     assert done.returncode == 0, done.stderr
     assert 'trace of the Jacobian: -38' in done.stdout
-    told = subprocess.run(run, capture_output=True, text=True)
-    assert told.returncode == 2
-    assert told.stderr.endswith(f'NAME one of: {" ".join(sorted(EXECUTABLES))}\n')
+    done = subprocess.run(run, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr.endswith(f'NAME one of: {" ".join(sorted(EXECUTABLES))}\n')

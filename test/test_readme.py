@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Every command of the README and the tutorial is run from a shell, as a new user would."""
+"""Every command of the README and the tutorial works from a shell."""
 
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,11 +20,11 @@ ROOT = Path(__file__).resolve().parent.parent
 
 BOARDS = 'scripts/run t3mpc emulator --link dongle --robot-link robot_usb'
 
-# How each command is run here: what is added to it, and whether it runs until it is stopped.
+# For each command: the additional arguments, and whether it runs until it is stopped.
 SHORTENED = {
-    # Long enough to learn from.
+    # Long enough for training.
     'scripts/demo': (['--duration', '20', '--headless', '--output', 'OUTPUT/run'], False),
-    'scripts/check': (['--version'], False),  # this very test is part of it
+    'scripts/check': (['--version'], False),  # runs this test
     'scripts/run sim_robot --ros-args -p world:=room': ([], True),
     'scripts/run sim_robot --ros-args -p world:=room -p faults.schedule:=rough_ride': ([], True),
     'scripts/run t3mpc --help': ([], False),
@@ -90,7 +90,7 @@ def test_the_readme_is_short():
 
 
 def test_the_controller_of_the_tutorial_runs(tmp_path):
-    """The Python block is run as the tutorial says, in the local environment."""
+    """The Python block of the tutorial runs in the local environment."""
     [code] = re.findall(r'```python\n(.*?)```', (ROOT / 'docs/tutorial.md').read_text(), re.DOTALL)
     script = tmp_path / 'mine.py'
     script.write_text(code)
@@ -110,46 +110,44 @@ def output(tmp_path_factory):
 
 @pytest.fixture
 def boards(command, output):
-    """Run the emulated boards beside a command that talks to them."""
+    """Run the emulated boards for a command that connects to them."""
     if command == BOARDS or not re.search(r'dongle|robot_usb', command):
         yield
         return
     key = ['--key', 'robot.key'] if 'robot.key' in command and 'write' not in command else []
-    said = output / 'boards.txt'
-    with _started([*BOARDS.split(), *key], output, said) as process:
-        _wait_until(process, said, 'stop with Ctrl-C')
+    log = output / 'boards.txt'
+    with _started([*BOARDS.split(), *key], output, log) as process:
+        _wait_until(process, log, 'stop with Ctrl-C')
         yield
         process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=30) == 0, said.read_text()
+        assert process.wait(timeout=30) == 0, log.read_text()
 
 
 @pytest.mark.parametrize('command', list(SHORTENED))
 def test_the_command_works(command, output, tmp_path, graph, boards):
     extra, endless = SHORTENED[command]
-    words = command.replace('runs/<time>', 'run').split()
-    words += [word.replace('OUTPUT', str(output)) for word in extra]
-    said = tmp_path / 'said.txt'
-    with _started(words, output, said) as process:
+    arguments = command.replace('runs/<time>', 'run').split()
+    arguments += [word.replace('OUTPUT', str(output)) for word in extra]
+    log = tmp_path / 'output.txt'
+    with _started(arguments, output, log) as process:
         if endless:
-            ready = 'stop with Ctrl-C' if command == BOARDS else f'{words[1]} ready'
-            _wait_until(process, said, ready)
+            ready = 'stop with Ctrl-C' if command == BOARDS else f'{arguments[1]} ready'
+            _wait_until(process, log, ready)
             process.send_signal(signal.SIGINT)
         code = process.wait(timeout=240)
-    # On a busy machine the round trip is long, and ping says so.
-    assert code == 0 or ('ping' in command and 'robot answers' in said.read_text()), (
-        said.read_text()
-    )
-    assert 'Traceback' not in said.read_text()
+    # On a busy machine the round trip is long, and ping fails with a report.
+    assert code == 0 or ('ping' in command and 'robot answers' in log.read_text()), log.read_text()
+    assert 'Traceback' not in log.read_text()
     if command == 'scripts/demo':
         assert (output / 'run' / 'report.html').stat().st_size > 100_000
 
 
 @contextmanager
-def _started(words, folder, said):
-    """Run a command in ``folder``, and leave none behind: other tests would hear it."""
-    with said.open('wb') as target:
+def _started(arguments, folder, log):
+    """Run a command in ``folder``; kill it at the end, so that it does not disturb other tests."""
+    with log.open('wb') as target:
         process = subprocess.Popen(
-            [str(ROOT / words[0]), *words[1:]],
+            [str(ROOT / arguments[0]), *arguments[1:]],
             cwd=folder,
             env=private_graph(),
             stdin=subprocess.DEVNULL,
@@ -163,9 +161,9 @@ def _started(words, folder, said):
         process.wait()
 
 
-def _wait_until(process, said, words):
+def _wait_until(process, log, text):
     deadline = time.monotonic() + 120.0
-    while words not in said.read_text():
-        assert process.poll() is None, said.read_text()
-        assert time.monotonic() < deadline, said.read_text()
+    while text not in log.read_text():
+        assert process.poll() is None, log.read_text()
+        assert time.monotonic() < deadline, log.read_text()
         time.sleep(0.05)

@@ -99,12 +99,12 @@ def _exponents(options: argparse.Namespace) -> int:
 def _compile(options: argparse.Namespace) -> int:
     from t3mpc_ros.control.controller import Controller, ControllerParameters
     from t3mpc_ros.evaluation.closed_loop import MethodSpec, run
-    from t3mpc_ros.evaluation.proposed_method import ComposedParameters, ProposedController
+    from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
     from t3mpc_ros.evaluation.scenario import DRIVES, Scenario
     from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters, make_robot
 
     for drive in DRIVES:
-        spec = MethodSpec('full', ProposedController, ComposedParameters())
+        spec = MethodSpec('full', ProposedController, ProposedParameters())
         run(Scenario(drive, 0.04, 'nominal', 1, 1.0), spec)
     Controller(ControllerParameters()).warm_up()
     for kind in ('velocity', 'stepper'):

@@ -1,6 +1,10 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Closed loop of plant and controller without ROS; runs scenarios, in several processes if asked."""
+"""Closed loop of plant and controller without ROS; runs scenarios, in several processes if asked.
+
+Worker processes import the main module again: a script that uses more than one worker guards its
+work by ``if __name__ == '__main__':``.
+"""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -151,7 +155,7 @@ class LoopRecord:
 
     time: Array
     """s, shape (n,)"""
-    wanted: Array
+    reference: Array
     """r, rad/s, shape (n, 2)"""
     measured: Array
     """chi with its noise, rad/s, shape (n, 2)"""
@@ -181,7 +185,7 @@ class LoopRecord:
         """Return a record of ``steps`` rows of zeros, to be filled."""
         return cls(
             time=np.zeros(steps),
-            wanted=np.zeros((steps, 2)),
+            reference=np.zeros((steps, 2)),
             measured=np.zeros((steps, 2)),
             speeds=np.zeros((steps, 2)),
             estimated=np.zeros((steps, 2)),
@@ -197,7 +201,7 @@ class LoopRecord:
     @property
     def error(self) -> Array:
         """True tracking error chi - r, rad/s, shape (n, 2)."""
-        return self.speeds - self.wanted
+        return self.speeds - self.reference
 
     @property
     def finite(self) -> bool:
@@ -269,18 +273,18 @@ class MethodSpec:
     """Whether it comes with what it learnt in :data:`PRACTICE`, if it is one that learns."""
 
     def __post_init__(self) -> None:
-        wanted = self.controller_type.parameters_type
-        if not isinstance(self.parameters, wanted):
+        expected = self.controller_type.parameters_type
+        if not isinstance(self.parameters, expected):
             raise ValueError(
-                f'settings of {self.name} must be {wanted.__name__}: '
+                f'settings of {self.name} must be {expected.__name__}: '
                 f'got {type(self.parameters).__name__}'
             )
 
     def __call__(self, nominal_model: NominalModel) -> BaselineController:
         """Return a new controller that knows of no runs before, but of its practice."""
         controller = self.controller_type(self.parameters, nominal_model)
-        if self.pretrained and controller.learnt():
-            controller.restore(
+        if self.pretrained and controller.get_weights():
+            controller.set_weights(
                 pretrain(self.controller_type, self.parameters, nominal_model.drive)
             )
         return controller
@@ -291,15 +295,15 @@ def pretrain(
     controller_type: type[BaselineController], parameters: Parameters, drive: str
 ) -> Mapping[str, Array]:
     """Return what a method learns in the runs of :data:`PRACTICE`, one after the other."""
-    learnt: Mapping[str, Array] = {}
+    weights: Mapping[str, Array] = {}
     for seed in PRETRAINING_SEEDS:
         scenario = Scenario(drive, PRETRAINING_NOISE, 'nominal', seed, PRETRAINING_DURATION)
         controller = controller_type(parameters, scenario.nominal_model())
-        if learnt:
-            controller.restore(learnt)
+        if weights:
+            controller.set_weights(weights)
         run(scenario, lambda _, controller=controller: controller)  # type: ignore[misc]
-        learnt = controller.learnt()
-    return learnt
+        weights = controller.get_weights()
+    return weights
 
 
 Job = tuple[Scenario, MethodSpec]
@@ -375,8 +379,8 @@ def run(
         record.unexplained[k] = seam.disturbance
         observation.speeds = seam.predicted
         observation.unexplained = seam.disturbance
-        observation.wanted = now[k]
-        observation.wanted_next = following[k]
+        observation.reference = now[k]
+        observation.next_reference = following[k]
         observation.command = seam.command
         if rows:
             observation.future = now[k : k + rows]
@@ -417,7 +421,7 @@ def _prepare(scenario: Scenario) -> LoopRecord:
     """Return a record with all that is known before the run."""
     record, reference = LoopRecord.empty(scenario.steps), scenario.reference()
     record.time[:] = reference.time[: scenario.steps]
-    record.wanted[:] = reference.wanted[: scenario.steps]
+    record.reference[:] = reference.speeds[: scenario.steps]
     record.modes[:] = reference.modes[: scenario.steps]
     return record
 
@@ -435,17 +439,17 @@ def _observed_reference(
     late = round(dead_time * RATE)
     if not math.isclose(dead_time * RATE, late, abs_tol=1e-6):
         raise ValueError(f'dead time must be whole periods of {1.0 / RATE:g} s: got {dead_time} s')
-    reference, steps = scenario.reference(), scenario.steps
+    sampled, steps = scenario.reference(), scenario.steps
     rows = max(2, round(scenario.lead * RATE))
-    if steps + late + rows > reference.time.size:
+    if steps + late + rows > sampled.time.size:
         raise ValueError(
-            f'dead time must be at most {(reference.time.size - steps - rows) / RATE:g} s, '
+            f'dead time must be at most {(sampled.time.size - steps - rows) / RATE:g} s, '
             f'as far as the reference reaches: got {dead_time} s'
         )
     if preview:
-        return reference.wanted[late:].copy(), reference.wanted[late + 1 :].copy(), rows
-    wanted, slope = reference.wanted[:steps], reference.rate[:steps] / RATE
-    return wanted + late * slope, wanted + (late + 1) * slope, 0
+        return sampled.speeds[late:].copy(), sampled.speeds[late + 1 :].copy(), rows
+    reference, slope = sampled.speeds[:steps], sampled.rate[:steps] / RATE
+    return reference + late * slope, reference + (late + 1) * slope, 0
 
 
 def _break_off(record: LoopRecord, k: int) -> None:

@@ -1,6 +1,11 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Outcome of the closed loop under each named fault, and the table of docs/faults.md."""
+"""Outcome of the closed loop under each named fault, and the table of docs/faults.md.
+
+Every fault begins and ends while the controller drives the twin; its errors are compared with the
+same run without the fault. What the robot can detect is kept apart from what only ground truth
+shows.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -144,7 +149,7 @@ def time_to_return(record: TwinRecord, healthy: TwinRecord, end: float) -> float
     It is back if from then on to the end of the run it is at most :data:`ALLOWED` times as large
     as in the run without the fault, there or before the fault, whichever is more.
     """
-    errors = record.rotors - record.wanted, healthy.rotors - healthy.wanted
+    errors = record.rotors - record.reference, healthy.rotors - healthy.reference
     usual = _rms(errors[1][healthy.rows(SETTLED, BEGIN)])
     last = float(record.time[-1])
     for wait in np.arange(0.0, last - REST - end, 0.5).tolist():
@@ -156,7 +161,7 @@ def time_to_return(record: TwinRecord, healthy: TwinRecord, end: float) -> float
 
 def wheel_error(record: TwinRecord, begin: float, end: float) -> float:
     """Return the error (rad/s) of the rotors from ``begin`` to ``end`` (s)."""
-    return _rms((record.rotors - record.wanted)[record.rows(begin, end)])
+    return _rms((record.rotors - record.reference)[record.rows(begin, end)])
 
 
 def _rms(values: Array) -> float:
@@ -227,8 +232,8 @@ def _noticed(record: TwinRecord, healthy: TwinRecord, begin: float, end: float) 
     during = record.rows(begin, end)
     if np.isnan(record.nearest[during]).all():
         found.append('no distances')
-    error = _rms((record.measured - record.wanted)[during])
-    usual = _rms((healthy.measured - healthy.wanted)[during])
+    error = _rms((record.measured - record.reference)[during])
+    usual = _rms((healthy.measured - healthy.reference)[during])
     if error > ALLOWED * usual and not any(record.robot_says[during]):
         found.append(f'tracking error {error:.2f} rad/s')
     return tuple(found)
@@ -408,7 +413,7 @@ def _span(
     return trial.event.at, trial.event.until + away
 
 
-BEGIN_MARK = '<!-- outcomes: written by `lab faults`, do not edit by hand -->'
+BEGIN_MARK = '<!-- outcomes: written by `t3mpc faults`, do not edit by hand -->'
 END_MARK = '<!-- end of outcomes -->'
 
 TITLES = {

@@ -12,17 +12,16 @@ from t3mpc_ros.evaluation.baselines.adaptive_fuzzy import (
     AdaptiveType1,
     AdaptiveType1Parameters,
 )
+from t3mpc_ros.evaluation.baselines.computed_torque import ComputedTorque, ComputedTorqueParameters
+from t3mpc_ros.evaluation.baselines.disturbance_rejection import (
+    DisturbanceRejection,
+    DisturbanceRejectionParameters,
+)
 from t3mpc_ros.evaluation.baselines.dynamic_matrix_control import (
     DynamicMatrix,
     DynamicMatrixParameters,
     DynamicMatrixPreview,
     DynamicMatrixPreviewParameters,
-)
-from t3mpc_ros.evaluation.baselines.feedback_baseline import (
-    DisturbanceRejection,
-    DisturbanceRejectionParameters,
-    ProportionalIntegral,
-    ProportionalIntegralParameters,
 )
 from t3mpc_ros.evaluation.baselines.linear_mpc import (
     LinearMpc,
@@ -30,15 +29,14 @@ from t3mpc_ros.evaluation.baselines.linear_mpc import (
     LinearMpcPreview,
     LinearMpcPreviewParameters,
 )
-from t3mpc_ros.evaluation.baselines.model_based_feedback import (
-    ComputedTorque,
-    ComputedTorqueParameters,
-    SlidingMode,
-    SlidingModeParameters,
-)
 from t3mpc_ros.evaluation.baselines.nonlinear_mpc import CasadiNmpc, CasadiNmpcParameters
+from t3mpc_ros.evaluation.baselines.proportional_integral import (
+    ProportionalIntegral,
+    ProportionalIntegralParameters,
+)
+from t3mpc_ros.evaluation.baselines.sliding_mode import SlidingMode, SlidingModeParameters
 from t3mpc_ros.evaluation.closed_loop import MethodSpec
-from t3mpc_ros.evaluation.proposed_method import ComposedParameters, ProposedController
+from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
 from t3mpc_ros.evaluation.scenario import DRIVES
 from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition, SearchRange
 from t3mpc_ros.evaluation.tuning.tuned_parameters import PACKAGED_FILE, TunedParameters
@@ -46,7 +44,7 @@ from t3mpc_ros.parameters.table import Parameters
 
 FULL = 'full'
 MODEL_ERROR = 1.3
-"""Inertia that the models of the predictive rivals with preview believe in, over the true one."""
+"""Inertia that the models of the predictive baselines with preview believe in, over the true one."""
 
 STAGES: Mapping[str, Mapping[str, object]] = {
     'feedback': {
@@ -72,7 +70,7 @@ WITHOUT: Mapping[str, Mapping[str, object]] = {
     'full without MPC': {'predictive.enabled': False},
     'full without MPC, equal bound': {
         'predictive.enabled': False,
-        'law.error_bound': ComposedParameters().compensated_bound,
+        'law.error_bound': ProposedParameters().compensated_bound,
     },
     'full without preview': {'jump_transition.preview': False},
     'full with random predictor': {'random_predictor': True, 'predictive.learning': False},
@@ -85,7 +83,7 @@ lower too; with equal bound it stays, which shows what v_p is worth by itself.""
 class ComparedMethod(MethodSpec):
     """A method as it is run, and how tables sort it."""
 
-    rival: bool = True
+    baseline: bool = True
     """Whether it is somebody else's method, not a stage of ours."""
     preview: bool = False
     """Whether it is told the future of the reference."""
@@ -216,7 +214,7 @@ def proposed_parameters() -> dict[str, Parameters]:
 
     Torques are not limited as a stepper's acceleration is: switches are crossed faster.
     """
-    velocity = ComposedParameters()
+    velocity = ProposedParameters()
     torque = velocity.with_values({'law.gain': 12.0, 'jump_transition.acceleration': 200.0})
     return {'torque': torque, 'velocity': velocity}
 

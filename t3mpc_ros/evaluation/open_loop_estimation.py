@@ -1,6 +1,18 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Open-loop estimation error of each kind of fuzzy system, equation (86)."""
+r"""Open-loop estimation error of each kind of fuzzy system, equation (86).
+
+The paper removes the controller and runs :math:`\hat\chi' = g(U|\alpha)` beside the robot. Two
+terms are missing in print (E18): a robot at rest gives nothing to estimate, so a known input
+drives it, the u of (30); and without output error nothing ties :math:`\hat\chi` to :math:`\chi`,
+so that V of (74) has no decreasing term. This module runs the series-parallel form
+
+.. math:: \hat\chi' = g(\chi|\alpha) + u + a\,(\chi - \hat\chi), \qquad
+          \alpha' = \gamma\Phi\,(\chi - \hat\chi)
+
+which is the error system (72)-(73) of the law with :math:`\hat\chi` in place of r and a in place
+of K, adapted by (77)-(78); V of (74) decreases by the same argument.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -27,7 +27,7 @@ JUMP = 0.3
 
 
 @dataclass(frozen=True)
-class ComposedParameters(Nt3fsMpcParameters):
+class ProposedParameters(Nt3fsMpcParameters):
     """The controller's settings, and what a study may change about its predictor."""
 
     random_predictor: bool = parameter(
@@ -38,7 +38,7 @@ class ComposedParameters(Nt3fsMpcParameters):
 
 
 @lru_cache(maxsize=8)
-def _untouched(parameters: ComposedParameters, drive: str) -> SwitchingTracker:
+def _template(parameters: ProposedParameters, drive: str) -> SwitchingTracker:
     """Return a controller to be copied: teaching its predictor takes a tenth of a second."""
     return SwitchingTracker(parameters, drive)
 
@@ -46,20 +46,20 @@ def _untouched(parameters: ComposedParameters, drive: str) -> SwitchingTracker:
 class ProposedController(BaselineController):
     """The law of :mod:`t3mpc_ros.control`, with its plan across switches."""
 
-    parameters_type = ComposedParameters
+    parameters_type = ProposedParameters
 
     def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None:
-        if not isinstance(parameters, ComposedParameters):
+        if not isinstance(parameters, ProposedParameters):
             raise ValueError(
-                f'settings must be ComposedParameters: got {type(parameters).__name__}'
+                f'settings must be ProposedParameters: got {type(parameters).__name__}'
             )
         self.preview: bool = parameters.jump_transition.preview  # type: ignore[misc]
         self._period = nominal_model.period
         self._period_ns = round(nominal_model.period * NANOSECONDS)
-        self._tracker = deepcopy(_untouched(parameters, nominal_model.drive))
+        self._tracker = deepcopy(_template(parameters, nominal_model.drive))
         self._random = parameters.predictive.seed if parameters.random_predictor else None
         if self._random is not None:
-            self._forget(self._random)
+            self._randomize_predictor(self._random)
         self._steps = 0
         self._expected: Array = np.zeros(2)
         self._slope: Array = np.zeros(2)
@@ -71,41 +71,41 @@ class ProposedController(BaselineController):
         """Skill of the predictor in the middle of its horizon, shape (2,)."""
         return self._tracker.law.predictive.skill
 
-    def learnt(self) -> dict[str, Array]:
+    def get_weights(self) -> dict[str, Array]:
         """Return fuzzy coefficients and predictor weights, as a model file keeps them."""
         return self._tracker.law.get_weights()
 
-    def restore(self, learnt: Mapping[str, Array]) -> None:
+    def set_weights(self, weights: Mapping[str, Array]) -> None:
         """Begin with another run's; random output weights stay random."""
-        self._tracker.law.set_weights(learnt)
+        self._tracker.law.set_weights(weights)
         if self._random is not None:
-            self._forget(self._random)
+            self._randomize_predictor(self._random)
 
     def step(self, observation: Observation) -> Array:
         """Return u (rad/s²) of (66)-(67) on the reference with its switches crossed."""
         now_ns = self._steps * self._period_ns
         if self._steps == 0:
-            self._tracker.begin(now_ns, observation.speeds, observation.wanted)
+            self._tracker.begin(now_ns, observation.speeds, observation.reference)
             if observation.future is not None:
                 for j in range(1, len(observation.future) - 1):
-                    self._look(now_ns + j * self._period_ns, observation.future, j)
+                    self._announce_future_jump(now_ns + j * self._period_ns, observation.future, j)
         elif observation.future is None:
-            self._notice(now_ns, observation)
+            self._announce_current_jump(now_ns, observation)
         else:
             j = len(observation.future) - 2
-            self._look(now_ns + j * self._period_ns, observation.future, j)
-        self._expected = observation.wanted_next.copy()
-        self._slope = (observation.wanted_next - observation.wanted) / self._period
+            self._announce_future_jump(now_ns + j * self._period_ns, observation.future, j)
+        self._expected = observation.next_reference.copy()
+        self._slope = (observation.next_reference - observation.reference) / self._period
         self._steps += 1
         return self._tracker.step(
-            now_ns, observation.speeds, observation.wanted, observation.wanted_next, self._period
+            now_ns, observation.speeds, observation.reference, observation.next_reference, self._period
         )
 
     def applied(self, acceleration: Array, *, limited: bool) -> None:
         """Take note of the u that the drive's limits let through."""
         self._tracker.set_applied(acceleration, saturated=limited)
 
-    def _look(self, instant_ns: int, future: Array, j: int) -> None:
+    def _announce_future_jump(self, instant_ns: int, future: Array, j: int) -> None:
         """Announce a jump at row j of the future, seen by the rows around it."""
         for i in range(2):
             here, was = float(future[j, i]), float(future[j - 1, i])
@@ -120,14 +120,14 @@ class ProposedController(BaselineController):
             after = (future[j + 1] - future[j]) / self._period
             self._tracker.transition.announce(instant_ns, jump, after)
 
-    def _notice(self, now_ns: int, observation: Observation) -> None:
+    def _announce_current_jump(self, now_ns: int, observation: Observation) -> None:
         """Announce a jump that has just happened."""
-        jump = observation.wanted - self._expected
+        jump = observation.reference - self._expected
         if np.max(np.abs(jump)) > JUMP:
-            slope = (observation.wanted_next - observation.wanted) / self._period
+            slope = (observation.next_reference - observation.reference) / self._period
             self._tracker.transition.announce(now_ns, jump, slope)
 
-    def _forget(self, seed: int) -> None:
+    def _randomize_predictor(self, seed: int) -> None:
         """Give the predictor random output weights of the size of the taught ones."""
         predictive = self._tracker.law.predictive
         weights = predictive.get_weights()

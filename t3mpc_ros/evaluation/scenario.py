@@ -97,7 +97,7 @@ class SampledReference:
 
     time: Array
     """s, shape (n + m,)"""
-    wanted: Array
+    speeds: Array
     """r, rad/s, right wheel first, shape (n + m, 2)"""
     rate: Array
     """r' without the jumps, rad/s², shape (n + m, 2); at a jump that of the new signal"""
@@ -248,18 +248,18 @@ def _reference(seed: int, rows: int) -> SampledReference:
     chaos = ChaoticReference(reference_parameters(seed), WheelGeometry())
     run = SampledReference(
         time=np.arange(rows) / RATE,
-        wanted=np.empty((rows, 2)),
+        speeds=np.empty((rows, 2)),
         rate=np.empty((rows, 2)),
         modes=np.empty(rows, dtype=np.int64),
         switched=np.empty(rows, dtype=np.bool_),
     )
     for k in range(rows):
         sample = chaos.advance()
-        run.wanted[k] = sample.wheels
+        run.speeds[k] = sample.wheels
         run.rate[k] = sample.rate
         run.modes[k] = sample.mode
         run.switched[k] = sample.switched
-    for values in (run.time, run.wanted, run.rate, run.modes, run.switched):
+    for values in (run.time, run.speeds, run.rate, run.modes, run.switched):
         values.setflags(write=False)
     return run
 

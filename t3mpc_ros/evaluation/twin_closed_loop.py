@@ -1,6 +1,11 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Closed loop of controller and digital twin without ROS, with faults."""
+"""Closed loop of controller and digital twin without ROS, with faults.
+
+The loop has the timing of the nodes. Each report of the robot carries its stamp to the controller;
+the command computed from it leaves at once, carries that stamp to the command limiter, and arrives
+after the delay of the twin's channel.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,7 +39,7 @@ def chaotic_course(duration: float, seed: int = 1) -> Array:
     It is the reference of every offline trial with that seed, see :class:`Scenario`.
     """
     scenario = Scenario('velocity', 0.0, 'nominal', seed, duration, LEAD)
-    return scenario.reference().wanted
+    return scenario.reference().speeds
 
 
 def straight_course(duration: float, speed: float = 0.2, turn: float = 0.0) -> Array:
@@ -69,7 +74,7 @@ class TwinRecord:
 
     time: Array
     """s since the robot started, shape (n,)"""
-    wanted: Array
+    reference: Array
     """rad/s, shape (n, 2)"""
     asked: Array
     """What the controller sent, rad/s, shape (n, 2)"""
@@ -224,12 +229,12 @@ class _RecordWriter:
         self._robot_says.append(state.reason)
         self._controller_says.append(reason)
 
-    def record(self, wanted: Array) -> TwinRecord:
+    def record(self, reference: Array) -> TwinRecord:
         asked, commanded, measured, rotors, ground = self._wheels
         odometry, truth = self._poses
         return TwinRecord(
             time=self._time,
-            wanted=wanted,
+            reference=reference,
             asked=asked,
             commanded=commanded,
             measured=measured,

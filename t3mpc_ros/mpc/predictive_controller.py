@@ -305,11 +305,11 @@ def end_control_period(signals: Signals, decay: float) -> None:
 
 @kernel
 def accumulate_sample(
-    speeds: Array, wanted: Array, sampled: bool, due: bool, decay: float, rows: Array
+    speeds: Array, reference: Array, sampled: bool, due: bool, decay: float, rows: Array
 ) -> bool:
     """Add a control period to the sums of the sample; return False if an error is not finite.
 
-    speeds, wanted : shape (outputs,), chi and r, rad/s
+    speeds, reference : shape (outputs,), chi and r, rad/s
     sampled : whether this period's errors belong to the sample
     due     : whether the sample is complete; :func:`predictive_step` then ends the period
     decay   : decay of a known jump per control period
@@ -317,10 +317,10 @@ def accumulate_sample(
     """
     signals = signals_view(rows)
     for z in range(speeds.size):
-        if not math.isfinite(speeds[z] - wanted[z]):
+        if not math.isfinite(speeds[z] - reference[z]):
             return False
     for z in range(speeds.size):
-        signals.errors[z] = speeds[z] - wanted[z]
+        signals.errors[z] = speeds[z] - reference[z]
         signals.applied_sums[z] += signals.applied[z]
         signals.jump_free_errors[z] = signals.errors[z] - signals.jumps[z]
         if sampled:
@@ -618,12 +618,12 @@ class PredictiveController:
         ValueError
             ``feedback_gain`` is not positive.
         """
-        now, wanted = self.parameters.to_dict(), parameters.to_dict()
+        now, new = self.parameters.to_dict(), parameters.to_dict()
         for spec in parameters.specs():
             name = spec.name
-            if not spec.dynamic and wanted[name] != now[name]:
+            if not spec.dynamic and new[name] != now[name]:
                 raise ParameterError(
-                    f'{name} is read-only with value {now[name]}: got {wanted[name]}'
+                    f'{name} is read-only with value {now[name]}: got {new[name]}'
                 )
         if feedback_gain is not None:
             if not feedback_gain > 0.0:
@@ -810,12 +810,12 @@ class PredictiveController:
         v_p: Array = self.rows[_V]
         return v_p.copy()
 
-    def advance(self, speeds: Array, wanted: Array, known_change: Array | None = None) -> None:
-        """Update ``rows`` like :meth:`step` with errors speeds - wanted, without shape checks."""
+    def advance(self, speeds: Array, reference: Array, known_change: Array | None = None) -> None:
+        """Update ``rows`` like :meth:`step`, without shape checks."""
         timing, phase = self._timing, self.phase
         sampled = phase == 0 or phase > timing.decimation - timing.average
-        if not accumulate_sample(speeds, wanted, sampled, phase == 0, self._decay, self.rows):
-            raise ValueError(f'errors must be finite: got {speeds - wanted}')
+        if not accumulate_sample(speeds, reference, sampled, phase == 0, self._decay, self.rows):
+            raise ValueError(f'errors must be finite: got {speeds - reference}')
         if phase == 0:
             self._predictive_step(self._no_change if known_change is None else known_change)
         self.phase = (phase + 1) % timing.decimation

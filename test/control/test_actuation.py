@@ -1,17 +1,26 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The seam between law and robot: both drives are chi_(k+1) = chi_k + T (u_k + d_k)."""
+"""Actuation: with both drives the plant is chi_(k+1) = chi_k + T (u_k + d_k)."""
 
 import math
 
 import numpy as np
 import pytest
 
-from t3mpc_ros.control.actuation import LimitParameters, VelocityActuation
+from t3mpc_ros.control.actuation import (
+    LimitParameters,
+    VelocityActuation,
+    limit_command,
+    limit_scale,
+    wheel_limits,
+)
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
-from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
+from t3mpc_ros.geometry.types import BodyTwist, WheelSpeeds
 
 T = 0.01
+GEOMETRY = WheelGeometry()
+LIMITS = LimitParameters()
 WIDE = LimitParameters(
     linear=5.0,
     angular=50.0,
@@ -23,30 +32,30 @@ WIDE = LimitParameters(
 
 
 class Servo:
-    """Wheels that follow the command with lag and dead time, exactly."""
+    """Exact response of the wheels to commands, with lag and dead time."""
 
-    def __init__(self, lag=0.02, dead_time=0.01, push=(0.0, 0.0)):
-        self.lag, self.push = lag, np.array(push)
-        self.late = round(dead_time / 0.001)
-        self.told = [np.zeros(2)] * (self.late + 1)
+    def __init__(self, lag=0.02, dead_time=0.01, disturbance=(0.0, 0.0)):
+        self.lag, self.disturbance = lag, np.array(disturbance)
+        self.delay = round(dead_time / 0.001)
+        self.commands = [np.zeros(2)] * (self.delay + 1)
         self.speeds = np.zeros(2)
 
     def run(self, command):
         decay = math.exp(-0.001 / self.lag)
         for _ in range(10):
-            self.told = [*self.told[1:], command.copy()]
-            goal = self.told[0] + self.lag * self.push
+            self.commands = [*self.commands[1:], command.copy()]
+            goal = self.commands[0] + self.lag * self.disturbance
             self.speeds = goal + decay * (self.speeds - goal)
 
 
-def _drive(limits=WIDE, kind='velocity', **estimate):
-    given = {'noise_variance': 0.0} | estimate
-    return VelocityActuation(SpeedFilterParameters(**given), limits, WheelGeometry(), kind, T)
+def _drive(limits=WIDE, kind='velocity', **changes):
+    parameters = SpeedFilterParameters(**({'noise_variance': 0.0} | changes))
+    return VelocityActuation(parameters, limits, GEOMETRY, kind, T)
 
 
 @pytest.mark.parametrize('dead_time', [0.0, 0.004, 0.01, 0.017, 0.03])
 def test_e19_wheels_accelerate_by_u_after_the_dead_time(dead_time):
-    """Chi at the instant of acting is foreseen, and one period later it is T u further on."""
+    """Chi is predicted for the instant of effect, and increases by T u within a period."""
     drive, servo = _drive(dead_time=dead_time), Servo(dead_time=dead_time)
     rng = np.random.default_rng(1)
     fine = []
@@ -57,39 +66,39 @@ def test_e19_wheels_accelerate_by_u_after_the_dead_time(dead_time):
         u = rng.uniform(-20.0, 20.0, 2)
         np.testing.assert_allclose(drive.send_acceleration(u), u, atol=1e-9)
         expected.append(drive.predicted + T * u)
-        for _ in range(10):  # what the servo does, millisecond by millisecond
+        for _ in range(10):  # response of the servo, in steps of 1 ms
             fine.append(servo.speeds.copy())
-            servo.told = [*servo.told[1:], drive.command.copy()]
+            servo.commands = [*servo.commands[1:], drive.command.copy()]
             decay = math.exp(-0.001 / servo.lag)
-            servo.speeds = servo.told[0] + decay * (servo.speeds - servo.told[0])
-    late = round(dead_time / 0.001)
+            servo.speeds = servo.commands[0] + decay * (servo.speeds - servo.commands[0])
+    delay = round(dead_time / 0.001)
     for k in range(2, 50):
-        np.testing.assert_allclose(fine[10 * k + late], expected[2 * k], atol=1e-6)
-        np.testing.assert_allclose(fine[10 * (k + 1) + late], expected[2 * k + 1], atol=1e-6)
+        np.testing.assert_allclose(fine[10 * k + delay], expected[2 * k], atol=1e-6)
+        np.testing.assert_allclose(fine[10 * (k + 1) + delay], expected[2 * k + 1], atol=1e-6)
 
 
 def test_with_the_servo_gain_the_measurement_cancels():
-    """K = (1 - exp(-T/lag))/T: c = r + (r_next - r)/(1 - exp(-T/lag)), whatever is measured."""
+    """K = (1 - exp(-T/lag))/T makes c = r + (r_next - r)/(1 - exp(-T/lag))."""
     share = 1.0 - math.exp(-T / 0.02)
     rng = np.random.default_rng(2)
-    wanted, rate = np.array([2.0, -1.0]), np.array([3.0, 4.0])
+    reference, rate = np.array([2.0, -1.0]), np.array([3.0, 4.0])
     commands = []
     for _ in range(2):
         drive = _drive(noise_variance=0.04)
         for _ in range(20):
-            drive.observe(wanted + rng.normal(scale=0.5, size=2), T)
-            drive.send_acceleration(rate - share / T * (drive.predicted - wanted))
+            drive.observe(reference + rng.normal(scale=0.5, size=2), T)
+            drive.send_acceleration(rate - share / T * (drive.predicted - reference))
         commands.append(drive.command.copy())
     np.testing.assert_allclose(commands[0], commands[1], atol=1e-9)
-    np.testing.assert_allclose(commands[0], wanted + T * rate / share, atol=1e-9)
+    np.testing.assert_allclose(commands[0], reference + T * rate / share, atol=1e-9)
 
 
 def test_a_constant_disturbance_is_estimated_after_the_servo():
-    """chi_(k+1) = chi_k + T (u_k + d_k), d_k less than the push, because the servo resists it.
+    """chi_(k+1) = chi_k + T (u_k + d_k) with d_k below the disturbance: the servo attenuates it.
 
-    Told as it is, a law that cancels d cancelled a quarter too much.
+    A law that cancelled the disturbance itself would cancel a quarter too much.
     """
-    drive, servo = _drive(), Servo(push=(4.0, -3.0))
+    drive, servo = _drive(), Servo(disturbance=(4.0, -3.0))
     before = None
     for _ in range(200):
         drive.observe(servo.speeds, T)
@@ -115,9 +124,9 @@ def test_a_torque_drive_has_no_limits_and_no_dead_time():
 
 
 def test_the_command_does_not_wind_up_behind_a_limit():
-    """Full throttle for ten seconds, then full brake: the command must turn round at once.
+    """After ten seconds of full acceleration, deceleration takes effect at once.
 
-    An integral that had gone on growing behind the limit would need as long to come back.
+    An integrator that grows behind the limit would need the same time to return.
     """
     limits = LimitParameters()
     drive, servo = _drive(limits), Servo()
@@ -159,3 +168,39 @@ def test_an_unknown_drive_or_period_is_rejected():
         _drive(kind='warp')
     with pytest.raises(ValueError, match='period must be positive: got 0'):
         VelocityActuation(SpeedFilterParameters(), WIDE, WheelGeometry(), 'torque', 0.0)
+
+
+def test_a_scaled_command_keeps_its_curvature_and_the_limits():
+    rng = np.random.default_rng(3)
+    for _ in range(2000):
+        target = BodyTwist(*rng.normal(scale=(2.0, 20.0)))
+        wheels = wheels_from_twist(target, GEOMETRY)
+        scale = limit_scale(*wheels, wheel_limits(LIMITS, GEOMETRY)[0])
+        right, left = scale * wheels.right, scale * wheels.left
+        limited = twist_from_wheels(WheelSpeeds(right, left), GEOMETRY)
+        assert abs(limited.linear) <= LIMITS.linear * (1 + 1e-12)
+        assert abs(limited.angular) <= LIMITS.angular * (1 + 1e-12)
+        assert limited.linear * target.angular == pytest.approx(limited.angular * target.linear)
+        assert max(abs(right), abs(left)) <= LIMITS.wheel_speed * (1 + 1e-12)
+        free = max(map(abs, wheels)) <= LIMITS.wheel_speed
+        free &= abs(target.linear) <= LIMITS.linear and abs(target.angular) <= LIMITS.angular
+        assert (scale == 1.0) == free
+
+
+def test_the_command_change_respects_the_acceleration_limits():
+    rng = np.random.default_rng(4)
+    limits, out = wheel_limits(LIMITS, GEOMETRY), np.zeros(2)
+    for _ in range(2000):
+        previous, target = rng.normal(scale=6.0, size=(2, 2))
+        limited = limit_command(*target, previous, limits, 0.01, out)
+        assert limited == (not np.allclose(out, target, rtol=0.0, atol=1e-8))
+        change = twist_from_wheels(WheelSpeeds(*(out - previous)), GEOMETRY)
+        assert abs(change.linear) <= LIMITS.linear_acceleration * 0.01 * (1 + 1e-9)
+        assert abs(change.angular) <= LIMITS.angular_acceleration * 0.01 * (1 + 1e-9)
+        assert np.max(np.abs(out - previous)) <= LIMITS.wheel_acceleration * 0.01 * (1 + 1e-9)
+
+
+def test_a_huge_target_gives_a_finite_command():
+    limits, out = wheel_limits(LIMITS, GEOMETRY), np.zeros(2)
+    assert limit_command(1e300, -1e300, np.zeros(2), limits, 0.01, out)
+    assert np.isfinite(out).all()

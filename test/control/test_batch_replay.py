@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Many steps in compiled stretches are the same steps as one by one, to the last bit."""
+"""The compiled batch replay equals single steps to the last bit."""
 
 from collections import deque
 import copy
@@ -29,7 +29,7 @@ GEOMETRY = WheelGeometry()
 
 
 def bits(thing):
-    """Return everything that a thing is made of, so that equal lists mean equal bits."""
+    """Return the contents of an object; equal results mean equal bits."""
     if isinstance(thing, np.ndarray):
         if thing.dtype == object:
             return [bits(each) for each in thing.tolist()]
@@ -58,8 +58,8 @@ def step_by_step(controller, odometry, references, rows, results):
     return 0
 
 
-def same_answers(one, other):
-    """Whether two tables are equal to the last bit, but for what only a march writes down."""
+def same_results(one, other):
+    """Whether two results have equal bits, except for columns of the batch replay only."""
     numbers = [np.delete(each.numbers, (22, 23), axis=1).tobytes() for each in (one, other)]
     return numbers[0] == numbers[1] and one.reasons.tolist() == other.reasons.tolist()
 
@@ -71,12 +71,12 @@ def test_a_state_array_holds_the_states_it_was_made_of():
         State(2**62, Pose(0.0, 1e308, 1e308), BodyTwist(0.0, 0.0)),
         State(9, Pose(0.0, 0.0, 0.0), BodyTwist(0.0, math.inf)),
     ]
-    motions = as_motions(items)
-    assert bits(list(motions)) == bits(items)
-    assert bits([motions[k] for k in range(len(motions))]) == bits(items)
-    assert motions.finite.tolist() == [item.is_finite() for item in items]
+    states = as_state_array(items)
+    assert bits(list(states)) == bits(items)
+    assert bits([states[k] for k in range(len(states))]) == bits(items)
+    assert states.finite.tolist() == [item.is_finite() for item in items]
     with pytest.raises(ValueError, match='poses must be'):
-        StateArray(motions.stamps_ns[1:], motions.poses, motions.twists)
+        StateArray(states.stamps_ns[1:], states.poses, states.twists)
 
 
 # -- recorded runs --------------------------------------------------------------------------------
@@ -84,89 +84,88 @@ def test_a_state_array_holds_the_states_it_was_made_of():
 
 @pytest.mark.parametrize('path', GOLDEN, ids=lambda path: path.stem)
 def test_recorded_runs_are_replayed_to_the_last_bit(path, monkeypatch):
-    """Stops, restarts, silence, live settings, jumps and a robot that does not follow."""
+    """Stops, restarts, time-outs, dynamic parameters, jumps and an unresponsive robot."""
     inputs = load_inputs(path)
-    marched, stepped = make_controllers(inputs), make_controllers(inputs)
-    fast = replay_controller(inputs, controllers=marched)
+    batched, stepped = make_controllers(inputs), make_controllers(inputs)
+    fast = replay_controller(inputs, controllers=batched)
     monkeypatch.setattr(controller_replay, 'replay_batch', step_by_step)
     slow = replay_controller(inputs, controllers=stepped)
     assert slow.plain == 0
     assert fast.plain > 0.7 * fast.steps
     assert fast.reasons == slow.reasons
     assert bits(fast.fields) == bits(slow.fields)
-    for one, other in zip(marched, stepped, strict=True):
+    for one, other in zip(batched, stepped, strict=True):
         assert bits(one) == bits(other)
 
 
-# -- made-up runs ---------------------------------------------------------------------------------
+# -- synthetic runs ------------------------------------------------------------------------------
 
 
 class Run:
-    """A servo robot that is driven, and what the controller was told on the way."""
+    """A closed loop with a servo robot, and the messages that its controller received."""
 
-    def __init__(self, seed, count, wanted, trouble=None, **changes):
+    def __init__(self, seed, count, reference, corrupt=None, **changes):
         generator = np.random.default_rng(seed)
         self.parameters = ControllerParameters.from_dict(changes)
         controller = Controller(self.parameters)
-        self.deeds = {}
-        trouble = trouble or (lambda k, odometry, coming: (odometry, coming))
-        speeds, late = np.zeros(2), BodyTwist(0.0, 0.0)
+        corrupt = corrupt or (lambda k, odometry, samples: (odometry, samples))
+        speeds, delayed = np.zeros(2), BodyTwist(0.0, 0.0)
         odometry, references, rows = [], [], []
         for k in range(count):
-            # Odometry that comes at uneven times, and one that is half a period late.
+            # Odometry with jitter of up to 0.4 ms.
             stamp = k * STEP + int(generator.integers(-400_000, 400_000)) + STEP
             noisy = speeds + 0.1 * generator.standard_normal(2)
             twist = twist_from_wheels(WheelSpeeds(*noisy.tolist()), GEOMETRY)
             ahead = (k + 1 + LEAD) * STEP
-            coming = [State(ahead, Pose(0.0, 0.0, 0.0), BodyTwist(*wanted(ahead / 1e9)))]
+            samples = [State(ahead, Pose(0.0, 0.0, 0.0), BodyTwist(*reference(ahead / 1e9)))]
             if generator.uniform() < 0.1:
-                coming = []  # the next step then hears of two
+                samples = []  # the next step then receives two
             elif references and rows and rows[-1][1] == rows[-1][2]:
                 before = ahead - STEP
-                coming.insert(0, coming[0]._replace(stamp_ns=before))
-            message, coming = trouble(k, State(stamp, Pose(0.0, 0.0, 0.0), twist), coming)
-            rows.append((k, len(references), len(references) + len(coming)))
-            references += coming
+                samples.insert(0, samples[0]._replace(stamp_ns=before))
+            message, samples = corrupt(k, State(stamp, Pose(0.0, 0.0, 0.0), twist), samples)
+            rows.append((k, len(references), len(references) + len(samples)))
+            references += samples
             odometry.append(message)
-            for motion in coming:
+            for motion in samples:
                 controller.add_reference(motion)
             sent, _ = controller.step(message)
-            told = np.array(wheels_from_twist(late, GEOMETRY))
-            speeds = told + math.exp(-0.5) * (speeds - told)
-            if self.deaf(k):
+            command = np.array(wheels_from_twist(delayed, GEOMETRY))
+            speeds = command + math.exp(-0.5) * (speeds - command)
+            if self.unresponsive(k):
                 speeds = speeds * 0.5
-            late = sent
-        self.odometry, self.references = as_motions(odometry), as_motions(references)
+            delayed = sent
+        self.odometry, self.references = as_state_array(odometry), as_state_array(references)
         self.rows = np.array(rows, dtype=np.int64)
 
-    def deaf(self, k):
+    def unresponsive(self, k):
         return 700 <= k < 760
 
-    def outcome(self, march, cuts=(), deeds=None):
-        """Return the controller, its answers, and how many steps were plain."""
+    def outcome(self, replay, cuts=(), actions=None):
+        """Return the controller, its results, and the number of regular steps."""
         controller = Controller(self.parameters)
-        answers = StepResults.empty(len(self.rows))
-        plain = 0
+        results = StepResults.empty(len(self.rows))
+        regular = 0
         edges = [0, *cuts, len(self.rows)]
         for first, until in zip(edges, edges[1:], strict=False):
-            if deeds and first in deeds:
-                deeds[first](controller)
-            part = answers.part(first, until)
+            if actions and first in actions:
+                actions[first](controller)
+            part = results.part(first, until)
             messages = self.odometry, self.references, self.rows[first:until], part
-            plain += march(controller, *messages)
-        return controller, answers, plain
+            regular += replay(controller, *messages)
+        return controller, results, regular
 
-    def check(self, cuts=(), deeds=None):
-        """Compare march on with march off; return the answers and how many were plain."""
-        marched, fast, plain = self.outcome(replay_batch, cuts, deeds)
-        stepped, slow, _ = self.outcome(step_by_step, cuts, deeds)
-        assert same_answers(fast, slow)
-        assert bits(marched) == bits(stepped)
-        assert bits(marched.law.get_weights()) == bits(stepped.law.get_weights())
-        return fast, plain
+    def check(self, cuts=(), actions=None):
+        """Compare batches with single steps; return results and number of regular steps."""
+        batched, fast, regular = self.outcome(replay_batch, cuts, actions)
+        stepped, slow, _ = self.outcome(step_by_step, cuts, actions)
+        assert same_results(fast, slow)
+        assert bits(batched) == bits(stepped)
+        assert bits(batched.law.get_weights()) == bits(stepped.law.get_weights())
+        return fast, regular
 
 
-def as_motions(items):
+def as_state_array(items):
     return StateArray(
         np.array([item.stamp_ns for item in items]),
         np.array([item.pose for item in items]),
@@ -174,12 +173,12 @@ def as_motions(items):
     )
 
 
-def winding(time):
+def smooth(time):
     return 0.12 + 0.05 * math.sin(0.9 * time), 1.2 * math.sin(0.7 * time)
 
 
 def switching(time):
-    """Jumps every 0.7 s, some 30 ms apart, so that several are known at once."""
+    """Return a reference with jumps every 0.7 s, some 30 ms apart, so that several are known."""
     side = 1.0 if int(time / 0.7) % 2 else -0.6
     also = 0.05 if 0.03 < time % 1.4 < 0.5 else 0.0
     return 0.1 * side + also, 1.5 * side
@@ -187,15 +186,15 @@ def switching(time):
 
 @pytest.mark.parametrize('seed', [1, 2])
 def test_a_run_with_jitter_and_an_unresponsive_robot(seed):
-    run = Run(seed, 1200, winding)
-    answers, plain = run.check()
-    assert plain > 900
-    assert Reason.NOT_FOLLOWING in answers.reasons.tolist()
-    assert answers.limited.any()
-    # To stop and go on anywhere makes no difference either.
+    run = Run(seed, 1200, smooth)
+    results, regular = run.check()
+    assert regular > 900
+    assert Reason.NOT_FOLLOWING in results.reasons.tolist()
+    assert results.limited.any()
+    # The division into batches does not change the results.
     cuts = sorted(np.random.default_rng(seed).choice(np.arange(1, 1200), 40, replace=False))
     again, _ = run.check(cuts)
-    assert same_answers(answers, again)
+    assert same_results(results, again)
 
 
 @pytest.mark.parametrize(
@@ -216,55 +215,55 @@ def test_a_run_with_jitter_and_an_unresponsive_robot(seed):
 )
 def test_jumps_with_other_parameters(changes):
     run = Run(3, 500, switching, **changes)
-    answers, plain = run.check()
+    results, regular = run.check()
     never = 'predictive.dither' in changes or changes.get('jump_transition.method') == 'predictive'
-    assert plain == 0 if never else plain > 250
-    assert answers.reasons.tolist().count(Reason.TRACKING) > 300
+    assert regular == 0 if never else regular > 250
+    assert results.reasons.tolist().count(Reason.TRACKING) > 300
 
 
-def troubled(k, odometry, coming):
-    """Spoil messages in many ways."""
+def corrupted(k, odometry, samples):
+    """Return messages with faults of every kind."""
     if k == 120:
-        return odometry._replace(twist=BodyTwist(math.nan, 0.0)), coming
+        return odometry._replace(twist=BodyTwist(math.nan, 0.0)), samples
     if k == 150:
-        return odometry._replace(pose=Pose(math.inf, 0.0, 0.0)), coming
+        return odometry._replace(pose=Pose(math.inf, 0.0, 0.0)), samples
     if k == 180:
-        return odometry._replace(stamp_ns=k * STEP - 50_000_000), coming  # goes back
+        return odometry._replace(stamp_ns=k * STEP - 50_000_000), samples  # decreasing
     if k == 220:
-        return odometry._replace(twist=BodyTwist(5.0, 0.0)), coming  # diverging
+        return odometry._replace(twist=BodyTwist(5.0, 0.0)), samples  # diverging
     if 320 <= k < 345:
         return odometry, []  # the reference is stale
     if k >= 400:  # a gap in the odometry
         odometry = odometry._replace(stamp_ns=odometry.stamp_ns + 30 * STEP)
-        coming = [each._replace(stamp_ns=each.stamp_ns + 30 * STEP) for each in coming]
-    if k in (450, 451):  # twice the same stamp
+        samples = [each._replace(stamp_ns=each.stamp_ns + 30 * STEP) for each in samples]
+    if k in (450, 451):  # a repeated stamp
         odometry = odometry._replace(stamp_ns=452 * STEP + 30 * STEP)
-    if k == 500:  # the source starts again, a little before
-        coming = [State((k + 60) * STEP, Pose(0.0, 0.0, 0.0), BodyTwist(0.1, 0.0))]
+    if k == 500:  # the source restarts, slightly earlier
+        samples = [State((k + 60) * STEP, Pose(0.0, 0.0, 0.0), BodyTwist(0.1, 0.0))]
     if k == 550:
-        coming = [each._replace(twist=BodyTwist(math.nan, 0.0)) for each in coming]
-    if k in (685, 686):  # doubted for a moment, which is forgotten when it follows again
-        return odometry._replace(twist=BodyTwist(odometry.twist.linear + 0.2, 0.0)), coming
+        samples = [each._replace(twist=BodyTwist(math.nan, 0.0)) for each in samples]
+    if k in (685, 686):  # evidence that a normal response clears
+        return odometry._replace(twist=BodyTwist(odometry.twist.linear + 0.2, 0.0)), samples
     if k == 600:
         odometry = odometry._replace(twist=BodyTwist(1e300, 1e300))
-    return odometry, coming
+    return odometry, samples
 
 
-@pytest.mark.parametrize('wanted', [winding, switching])
-def test_invalid_messages_of_every_kind(wanted):
-    answers, plain = Run(5, 700, wanted, troubled).check()
-    assert plain > 300
+@pytest.mark.parametrize('reference', [smooth, switching])
+def test_invalid_messages_of_every_kind(reference):
+    results, regular = Run(5, 700, reference, corrupted).check()
+    assert regular > 300
     assert {
         Reason.NO_REFERENCE,
         Reason.ODOMETRY_BAD,
         Reason.REFERENCE_STALE,
         Reason.DIVERGING,
         Reason.TRACKING,
-    } <= set(answers.reasons.tolist())
+    } <= set(results.reasons.tolist())
 
 
 def test_parameter_changes_stops_and_resets_between_batches():
-    deeds = {
+    actions = {
         100: lambda c: c.configure(c.parameters.with_values({'law.gain': 20.0})),
         200: lambda c: c.configure(c.parameters.with_values({'linear.x.max_velocity': 0.1})),
         300: lambda c: c.enable(False),
@@ -275,16 +274,16 @@ def test_parameter_changes_stops_and_resets_between_batches():
         510: lambda c: c.actuation.set_command(np.array([1.0, 2.0])),
         560: lambda c: c.configure(c.parameters.with_values({'predictive.dither': 0.1})),
     }
-    answers, plain = Run(6, 650, switching).check(sorted(deeds), deeds)
-    assert 200 < plain < 550
-    assert Reason.DISABLED in answers.reasons.tolist()
+    results, regular = Run(6, 650, switching).check(sorted(actions), actions)
+    assert 200 < regular < 550
+    assert Reason.DISABLED in results.reasons.tolist()
 
 
 def test_batches_end_at_the_snapshots_of_the_weights():
-    """The oldest copy is what a robot that stops following goes back to."""
-    run = Run(7, 400, winding)
-    controller, _, plain = run.outcome(replay_batch)
-    assert plain > 350
+    """The oldest snapshot holds the weights for an unresponsive robot."""
+    run = Run(7, 400, smooth)
+    controller, _, regular = run.outcome(replay_batch)
+    assert regular > 350
     ages = []
     for coefficients, _ in controller._snapshots:
         distance = np.abs(controller.law.fuzzy.coefficients - coefficients).max()
@@ -295,10 +294,10 @@ def test_batches_end_at_the_snapshots_of_the_weights():
 
 
 def test_a_batch_with_a_number_that_is_not_finite_raises():
-    run = Run(8, 300, winding)
+    run = Run(8, 300, smooth)
     controller, _, _ = run.outcome(replay_batch)
     controller.law.fuzzy.tables[-1][:] = math.nan
-    more = Run(8, 400, winding)
+    more = Run(8, 400, smooth)
     rows = more.rows[300:]
     slow, fast = copy.deepcopy(controller), controller
     with pytest.raises(ValueError, match='must be finite'):

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The law (64)-(84): its sum, E12-E14, and the bound along simulated runs."""
+"""Control law (64)-(84): its sum, E12-E14, and the bound along simulated runs."""
 
 from functools import partial
 import math
@@ -34,9 +34,11 @@ from t3mpc_ros.simulation.plant.dynamics import (
 Sets = partial(FuzzyParameters, sets=3, centre_exponent=1.0)
 
 
-def _law(speeds, wanted, rate, estimate, predictive, gain=8.0, bound=2.0, smoothing=0.5):
+def _law(speeds, reference, rate, estimate, predictive, gain=8.0, bound=2.0, smoothing=0.5):
     terms, command = np.zeros((5, 2)), np.zeros(2)
-    law_terms(speeds, wanted, rate, estimate, predictive, gain, bound, smoothing, terms, command)
+    law_terms(
+        speeds, reference, rate, estimate, predictive, gain, bound, smoothing, terms, command
+    )
     return terms, command
 
 
@@ -53,8 +55,8 @@ def test_command_is_the_sum_of_the_terms_of_66_and_67():
 def test_e12_with_the_reference_rate_the_error_obeys_68():
     """The printed +omega_i cannot be applied, and without r' a moving reference leaves an error.
 
-    With exact g and no disturbance, (68) says delta' = -K delta + v_c + v_p: the derivative of
-    the reference must drop out. It does with r' in the law, and only then.
+    With exact g and no disturbance, (68) is delta' = -K delta + v_c + v_p: the derivative of
+    the reference must cancel, which requires r' in the law.
     """
     chi, r, rate = np.array([1.0, -2.0]), np.array([0.5, -1.0]), np.array([3.0, -4.0])
     g = np.array([0.7, -0.3])
@@ -66,16 +68,15 @@ def test_e12_with_the_reference_rate_the_error_obeys_68():
 
 
 def test_torque_theta_bar_u_makes_the_plant_of_30_and_64_65():
-    """What u leaves of chi' depends on chi alone: one g(chi) can stand for it, u has gain one.
+    """The difference of chi' and u depends on chi alone: it is a function g(chi).
 
-    With an inertia that is not the robot's neither is true: what the law then calls unknown
-    would depend on its own command.
+    With a wrong inertia this does not hold: the difference then depends on u.
     """
     body, geometry = BodyParameters(), WheelGeometry()
     nominal, heavy = wheel_inertia(body, geometry), BodyParameters(body_mass=1.5 * body.body_mass)
     rng = np.random.default_rng(3)
 
-    def left_over(chi, u, true):
+    def difference(chi, u, true):
         friction = 0.002 * chi + 0.004 * np.tanh(chi / 0.2)
         torque = nominal @ u - friction
         return np.array(wheel_acceleration(*chi, *torque, dynamics_vector(true, geometry))) - u
@@ -85,10 +86,10 @@ def test_torque_theta_bar_u_makes_the_plant_of_30_and_64_65():
         friction = 0.002 * chi + 0.004 * np.tanh(chi / 0.2)
         coriolis = wheel_coriolis(WheelSpeeds(*chi), body, geometry) @ chi
         g = np.linalg.solve(nominal, -coriolis - friction)
-        pushes = rng.uniform(-30.0, 30.0, (5, 2))
-        for u in pushes:
-            np.testing.assert_allclose(left_over(chi, u, body), g, atol=1e-10)
-        spread = np.ptp([left_over(chi, u, heavy) for u in pushes], axis=0)
+        accelerations = rng.uniform(-30.0, 30.0, (5, 2))
+        for u in accelerations:
+            np.testing.assert_allclose(difference(chi, u, body), g, atol=1e-10)
+        spread = np.ptp([difference(chi, u, heavy) for u in accelerations], axis=0)
         assert spread.max() > 1.0
 
 
@@ -104,7 +105,7 @@ def _matched_pair(rng, gamma=600.0):
 
 
 def test_the_law_and_g_error_70_71_make_the_error_system_72_73():
-    """Plant (64)-(65), law (66)-(67): what is left is (68)-(69), and in alpha~ (72)-(73)."""
+    """Plant (64)-(65) and law (66)-(67) give (68)-(69), and (72)-(73) in alpha~."""
     rng = np.random.default_rng(4)
     learner, plant = _matched_pair(rng)
     for _ in range(50):
@@ -145,7 +146,7 @@ def _slope_of_v(delta, delta_rate, alpha_error, alpha_rate, gamma):
 
 @pytest.mark.parametrize('tuned', [False, True], ids=['any alpha rate', 'rate of (77)-(78)'])
 def test_v_rate_is_75_76_and_79_if_coefficients_follow_77_78(tuned):
-    """The terms in alpha~ cancel by the rates that ``adapt`` makes, and by no other."""
+    """The terms in alpha~ cancel with the rates of ``adapt`` only."""
     rng = np.random.default_rng(5)
     gamma, dt = 600.0, 1e-7
     for _ in range(20):
@@ -173,9 +174,9 @@ def test_v_rate_is_75_76_and_79_if_coefficients_follow_77_78(tuned):
 
 
 def test_the_compensated_bound_is_the_smallest_that_80_permits():
-    """Whatever omega and v_p do within their bounds, (79) stays below (80); and it gets there.
+    """For all omega and v_p within their bounds (79) is at most (80), with equality.
 
-    A compensator for omega-bar alone, without v_p-bar, would be outweighed.
+    A compensator for omega-bar without v_p-bar would be too weak.
     """
     parameters = Nt3fsMpcParameters()
     omega_bar, v_bar = parameters.law.error_bound, parameters.predictive.v_max
@@ -200,9 +201,9 @@ def test_the_compensated_bound_is_the_smallest_that_80_permits():
 
 @pytest.mark.parametrize('seed', range(2))
 def test_e17_the_integral_of_84_holds_with_the_initial_v_only(seed):
-    """V(t) - V(0) is at most the integral of the bound; print leaves V(0) out.
+    """V(t) - V(0) is at most the integral of the bound; the printed (84) omits V(0).
 
-    Without it the printed (84) puts V, which is never negative, below a negative integral.
+    The printed (84) bounds V, which is not negative, by a negative integral.
     """
     rng = np.random.default_rng(seed)
     gamma, gain, bound, smoothing, dt = 600.0, 6.0, 3.5, 0.4, 1e-4
@@ -240,7 +241,7 @@ def test_compensator_81_82_opposes_the_error_within_its_bound():
 
 
 def test_e14_the_gap_of_abs_and_tanh_is_0_2785_epsilon():
-    """(83) treats tanh as the sign function; the gap it forgets is exactly this large."""
+    """(83) treats tanh as the sign function and omits exactly this gap."""
     for epsilon in (0.05, 1.0, 7.0):
         x = np.linspace(-10 * epsilon, 10 * epsilon, 200_001)
         gap = np.abs(x) - x * np.tanh(x / epsilon)
@@ -281,9 +282,9 @@ def test_e13_the_predictive_term_of_a_wheel_acts_on_its_error():
 def test_e14_bound_holds_at_every_step_of_a_noise_free_run(seed):
     """Plant (64)-(65) with known alpha*, bounded disturbance and bounded v_p, law and adaptation.
 
-    Everything of the proof is real here: V is (74) with the true alpha*, the fuzzy system is the
-    package's, the plant's own fuzzy system has other coefficients, the disturbance reaches its
-    bound, v_p is as bad as its bound allows. Small steps, so that V' is the derivative.
+    The run meets all assumptions of the proof: V is (74) with the true alpha*, the plant has a
+    fuzzy system of the same family with other coefficients, the disturbance reaches its bound,
+    and v_p is the worst within its bound. The steps are small, so that V' is the derivative.
     """
     rng = np.random.default_rng(seed)
     adaptation = AdaptationParameters(sigma_modification=0.0, dead_zone=0.0)
@@ -312,7 +313,7 @@ def test_e14_bound_holds_at_every_step_of_a_noise_free_run(seed):
             worst = max(worst, (value - previous[0]) / dt - previous[1])
         previous = value, lyapunov_rate_bound(delta, law.gain, bound, law.smoothing)
         w = law.error_bound * np.sin(np.array([7.0, 11.0]) * t + phases[2:4])
-        v_p = v_bound * np.sign(delta)  # pushes the wrong way, as hard as it may
+        v_p = v_bound * np.sign(delta)  # opposite to its purpose, at its bound
         truth = plant.evaluate(chi).copy()
         g = learner.evaluate(chi)
         law_terms(chi, r, rate, g, v_p, law.gain, bound, law.smoothing, terms, u)

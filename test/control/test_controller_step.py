@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The controller as the node uses it: stops with reasons, switches, learning, models."""
+"""Controller step by step: stops and their reasons, jumps, adaptation, weights."""
 
 from dataclasses import replace
 import math
@@ -23,24 +23,24 @@ LEAD = 400 * MS
 GEOMETRY = WheelGeometry()
 
 
-def _motion(stamp_ns, linear=0.0, angular=0.0):
+def _state(stamp_ns, linear=0.0, angular=0.0):
     return State(stamp_ns, ORIGIN, BodyTwist(linear, angular))
 
 
 class Loop:
-    """A controller around an ideal robot: its speed is the last command."""
+    """A closed loop with an ideal robot, whose speed is the last command."""
 
-    def __init__(self, wanted=lambda t: (0.1, 0.5), **changes):
+    def __init__(self, reference=lambda t: (0.1, 0.5), **changes):
         self.controller = Controller(ControllerParameters.from_dict(changes))
-        self.wanted = wanted
+        self.reference = reference
         self.now = 0
         self.twist = BodyTwist(0.0, 0.0)
-        self.reference_alive = True
+        self.reference_active = True
 
     def step(self, measured=None):
-        if self.reference_alive:
+        if self.reference_active:
             stamp = self.now + LEAD
-            self.controller.add_reference(_motion(stamp, *self.wanted(stamp / 1e9)))
+            self.controller.add_reference(_state(stamp, *self.reference(stamp / 1e9)))
         motion = measured or State(self.now, ORIGIN, self.twist)
         self.twist, status = self.controller.step(motion)
         self.now += PERIOD
@@ -51,19 +51,19 @@ class Loop:
 
 
 class ServoLoop(Loop):
-    """The same around wheels that lag 20 ms behind a command that is 10 ms late."""
+    """A closed loop with a servo lag of 20 ms and a dead time of 10 ms."""
 
-    def __init__(self, wanted, **changes):
-        super().__init__(wanted, **({'speed_filter.noise_variance': 0.0} | changes))
+    def __init__(self, reference, **changes):
+        super().__init__(reference, **({'speed_filter.noise_variance': 0.0} | changes))
         self.speeds = np.zeros(2)
-        self.late = BodyTwist(0.0, 0.0)
+        self.delayed = BodyTwist(0.0, 0.0)
 
     def step(self, measured=None):
         motion = State(self.now, ORIGIN, twist_from_wheels(WheelSpeeds(*self.speeds), GEOMETRY))
         status = super().step(motion)
-        told = np.array(wheels_from_twist(self.late, GEOMETRY))
-        self.speeds = told + math.exp(-0.5) * (self.speeds - told)
-        self.late = self.twist
+        command = np.array(wheels_from_twist(self.delayed, GEOMETRY))
+        self.speeds = command + math.exp(-0.5) * (self.speeds - command)
+        self.delayed = self.twist
         return status
 
     def run(self, seconds):
@@ -76,7 +76,7 @@ class ServoLoop(Loop):
 
     def squared_error(self, seconds, after):
         speeds = self.run(seconds)
-        twists = [BodyTwist(*self.wanted(0.01 * k)) for k in range(len(speeds))]
+        twists = [BodyTwist(*self.reference(0.01 * k)) for k in range(len(speeds))]
         r = np.array([wheels_from_twist(twist, GEOMETRY) for twist in twists])
         return 0.01 * np.sum((speeds - r)[round(100 * after) :, 0] ** 2)
 
@@ -113,16 +113,16 @@ def test_the_command_never_exceeds_the_limits():
 
 
 def test_a_missing_reference_stops_the_robot_despite_preview():
-    """The reference is stamped 0.2 s ahead: a dead generator must not be followed so long."""
+    """Samples are stamped ahead; without new ones the robot stops within 0.16 s."""
     loop = Loop()
     loop.run(100)
-    loop.reference_alive = False
+    loop.reference_active = False
     statuses = loop.run(40)
     moving = [status.reason is Reason.TRACKING for status in statuses]
     assert sum(moving) * 10 <= 160
     assert statuses[-1].reason is Reason.REFERENCE_STALE
     assert loop.twist == BodyTwist(0.0, 0.0)
-    loop.reference_alive = True
+    loop.reference_active = True
     assert loop.run(30)[-1].reason is Reason.TRACKING
 
 
@@ -130,7 +130,7 @@ def test_a_missing_reference_stops_the_robot_despite_preview():
 def test_odometry_that_is_not_finite_stops_the_robot_for_a_step(value):
     loop = Loop()
     loop.run(100)
-    status = loop.step(_motion(loop.now, value, 0.0))
+    status = loop.step(_state(loop.now, value, 0.0))
     assert status.reason is Reason.ODOMETRY_BAD
     assert loop.twist == BodyTwist(0.0, 0.0)
     statuses = loop.run(50)
@@ -141,14 +141,14 @@ def test_odometry_that_is_not_finite_stops_the_robot_for_a_step(value):
 
 def test_a_reference_that_is_not_finite_is_rejected():
     loop = Loop()
-    assert not loop.controller.add_reference(_motion(0, math.nan, 0.0))
-    assert loop.controller.add_reference(_motion(0, 0.1, 0.0))
+    assert not loop.controller.add_reference(_state(0, math.nan, 0.0))
+    assert loop.controller.add_reference(_state(0, 0.1, 0.0))
 
 
 def test_odometry_that_jumps_back_in_time_restarts_the_law():
     loop = Loop()
     loop.run(200)
-    loop.now = 0  # the robot, or a simulated clock, has started again
+    loop.now = 0  # the robot, or the simulated clock, has restarted
     statuses = loop.run(60)
     assert statuses[0].reason is not Reason.TRACKING
     assert statuses[-1].reason is Reason.TRACKING
@@ -158,9 +158,9 @@ def test_a_gap_in_the_odometry_restarts_the_law_without_a_jump():
     loop = Loop()
     loop.run(200)
     loop.now += 1000 * MS
-    for k in range(30):  # the reference went on meanwhile
+    for k in range(30):  # the reference continued in the gap
         stamp = loop.now + LEAD - (30 - k) * PERIOD
-        loop.controller.add_reference(_motion(stamp, *loop.wanted(stamp / 1e9)))
+        loop.controller.add_reference(_state(stamp, *loop.reference(stamp / 1e9)))
     before = loop.twist
     status = loop.step()
     assert status.reason is Reason.TRACKING
@@ -189,7 +189,7 @@ def test_disabling_stops_and_enabling_resumes():
 def test_a_diverging_robot_is_stopped():
     loop = Loop()
     loop.run(100)
-    status = loop.step(_motion(loop.now, 3.0, 0.0))  # 86 rad/s at the wheels
+    status = loop.step(_state(loop.now, 3.0, 0.0))  # 86 rad/s at the wheels
     assert status.reason is Reason.DIVERGING
     assert loop.twist == BodyTwist(0.0, 0.0)
 
@@ -243,13 +243,13 @@ def test_reset_discards_the_weights():
     assert loop.run(60)[-1].reason is Reason.TRACKING
 
 
-# --- the law underneath --------------------------------------------------------------------------
+# --- the control law -----------------------------------------------------------------------------
 
 
-def _ideal_run(steps, reference, parameters, push=(0.0, 0.0), jumps=()):
-    """Torque drive on chi' = u + push without noise; returns errors, coefficients and the law.
+def _ideal_run(steps, reference, parameters, disturbance=(0.0, 0.0), jumps=()):
+    """Run a torque drive on chi' = u + disturbance; return errors, coefficients and the law.
 
-    ``jumps`` are (instant, size of the jump) that the reference takes.
+    ``jumps`` are pairs of instant and size of the jumps of the reference.
     """
     tracker = SwitchingTracker(parameters, 'torque')
     law = tracker.law
@@ -265,12 +265,12 @@ def _ideal_run(steps, reference, parameters, push=(0.0, 0.0), jumps=()):
                 tracker.transition.announce(k * PERIOD, np.full(2, size), np.zeros(2))
                 later = reference(k * 0.01 + 0.01)[0]
         if any(k == round(100 * instant) - 1 for instant, _ in jumps):
-            later = r  # nobody knows of it yet
+            later = r  # the jump is not known yet
         u = tracker.step(k * PERIOD, chi, r, later, 0.01).copy()
         tracker.set_applied(u, saturated=False)
         errors.append(chi - r)
         learning.append(law.fuzzy.coefficients.copy())
-        chi = chi + 0.01 * (u + np.array(push))
+        chi = chi + 0.01 * (u + np.array(disturbance))
     return np.array(errors), learning, law
 
 
@@ -279,7 +279,7 @@ QUIET = Nt3fsMpcParameters.from_dict({'speed_filter.noise_variance': 0.0})
 
 @pytest.mark.parametrize('method', ['ramp', 'predictive'])
 def test_a_jump_is_followed_without_a_persistent_error(method):
-    """A jump of r is no estimation error; taken for one it left a wrong g behind for seconds."""
+    """A jump of r is no estimation error: adaptation must not change g because of it."""
 
     def reference(t):
         return np.array([1.0, -1.0]) + (3.0 if t >= 0.999 else 0.0), np.zeros(2)
@@ -289,19 +289,19 @@ def test_a_jump_is_followed_without_a_persistent_error(method):
     before = errors[99]
     np.testing.assert_allclose(before, 0.0, atol=0.02)
     assert errors[100] == pytest.approx([-3.0, -3.0], abs=0.05)
-    if method == 'ramp':  # arrives in time and without overshoot
+    if method == 'ramp':  # in time and without overshoot
         assert errors[100:].max() < 0.05
         arrival = 1.0 + 3.0 / parameters.jump_transition.acceleration + 0.03
         drift = np.linalg.norm(learning[-1] - learning[99])
-        assert drift < 0.4, 'the jump has taught the fuzzy systems something'
-    else:  # feedback closes up, and v_p, which takes the compensator for a push, overshoots a bit
+        assert drift < 0.4, 'the fuzzy systems have adapted to the jump'
+    else:  # v_p compensates the compensator as a disturbance, with a small overshoot
         assert errors[100:].max() < 0.2
         arrival = 1.0 + 5.0 / parameters.law.gain
     assert np.abs(errors[round(100 * arrival) :]).max() < 0.1
 
 
 def test_with_preview_a_jump_costs_a_quarter_of_squared_error():
-    """The whole controller on a robot with lag and dead time, with and without preview."""
+    """The controller on a robot with lag and dead time, with and without preview."""
     energy = []
     for preview in (True, False):
         loop = ServoLoop(
@@ -311,23 +311,23 @@ def test_with_preview_a_jump_costs_a_quarter_of_squared_error():
         energy.append(loop.squared_error(3.0, after=1.0))
     jump = 0.2 / GEOMETRY.wheel_radius
     a = JumpTransitionParameters().acceleration
-    # Late by dead time and servo as well: 10 ms + 15.4 ms (20 ms less half a period, sampled).
+    # The delay adds dead time and servo: 10 ms + 15.4 ms (20 ms less half a period, sampled).
     assert energy[0] == pytest.approx(jump**3 / (12 * a), rel=0.1)
     assert energy[1] == pytest.approx(jump**3 / (3 * a) + (0.0254 + 0.005) * jump**2, rel=0.1)
 
 
 def test_the_source_may_restart_while_a_jump_is_announced():
-    """A jump was announced 0.4 s ahead; then the generator starts anew and never jumps."""
+    """The generator restarts after the announcement of a jump and does not jump."""
     loop = ServoLoop(lambda t: (0.1, 0.0) if t < 1.5 else (-0.1, 0.0))
     loop.run(1.3)
-    loop.wanted = lambda t: (0.1, 0.0)
+    loop.reference = lambda t: (0.1, 0.0)
     stamp = loop.now - PERIOD
-    while stamp <= loop.now + LEAD:  # what had been said of later is said anew
-        loop.controller.add_reference(_motion(stamp, 0.1, 0.0))
+    while stamp <= loop.now + LEAD:  # new samples for the same stamps
+        loop.controller.add_reference(_state(stamp, 0.1, 0.0))
         stamp += PERIOD
     speeds = loop.run(1.0)
     np.testing.assert_allclose(speeds[-1], 0.1 / GEOMETRY.wheel_radius, rtol=0.02)
-    assert np.min(speeds) > 0.0  # it never followed the jump that did not come
+    assert np.min(speeds) > 0.0  # no transition of the withdrawn jump
 
 
 def test_a_constant_disturbance_moves_to_the_fuzzy_estimate():
@@ -339,18 +339,18 @@ def test_a_constant_disturbance_moves_to_the_fuzzy_estimate():
     def reference(t):
         return np.array([2.0, 1.0]), np.zeros(2)
 
-    push = np.array([3.0, -2.0])
-    errors, _, law = _ideal_run(3000, reference, QUIET, push)
+    disturbance = np.array([3.0, -2.0])
+    errors, _, law = _ideal_run(3000, reference, QUIET, disturbance)
     assert np.abs(errors[-100:]).max() < 0.08
-    np.testing.assert_allclose(-law.terms[0], push, atol=0.35)  # g is the push
-    np.testing.assert_allclose(law.terms[4], 0.0, atol=0.35)  # v_p has gone
+    np.testing.assert_allclose(-law.terms[0], disturbance, atol=0.35)  # g is the disturbance
+    np.testing.assert_allclose(law.terms[4], 0.0, atol=0.35)  # v_p vanishes
     without = replace(QUIET, integral_transfer=0.0)
-    _, _, tug = _ideal_run(3000, reference, without, push)
-    assert np.abs(tug.terms[4]).max() > np.abs(law.terms[4]).max()
+    _, _, other = _ideal_run(3000, reference, without, disturbance)
+    assert np.abs(other.terms[4]).max() > np.abs(law.terms[4]).max()
 
 
 def test_the_certificate_holds_along_a_noise_free_run():
-    """E14 at run time: |delta|²/2 falls as promised while the push stays within its bound."""
+    """E14 at run time: |delta|²/2 decreases while the disturbance is within its bound."""
 
     def reference(t):
         return (
@@ -367,8 +367,8 @@ def test_the_certificate_holds_along_a_noise_free_run():
         u = law.step(chi, r, rate, 0.01).copy()
         law.set_applied(u, saturated=False)
         margins.append(law.certificate.margin)
-        push = 0.9 * np.array([math.sin(5.0 * k * 0.01), math.cos(3.0 * k * 0.01)])
-        chi = chi + 0.01 * (u + push)
+        disturbance = 0.9 * np.array([math.sin(5.0 * k * 0.01), math.cos(3.0 * k * 0.01)])
+        chi = chi + 0.01 * (u + disturbance)
     assert min(margins[100:]) > 0.0
     assert np.linalg.norm(chi - r) < law.ultimate_bound
 
@@ -443,7 +443,7 @@ print({name for name in after if after[name] != before[name]} or 'nothing')
 
 
 def test_after_the_warm_up_no_step_compiles():
-    """In a process of its own: in this one other tests have compiled all there is."""
+    """A separate process, because other tests compile in this one."""
     done = subprocess.run(
         [sys.executable, '-c', COMPILES], capture_output=True, text=True, timeout=300, check=False
     )

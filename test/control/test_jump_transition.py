@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Crossing a jump of the reference: reachable, optimal, and taken back when it does not come."""
+"""Transition across a jump: reachable, optimal, and withdrawn with the jump."""
 
 import math
 
@@ -14,31 +14,31 @@ NS = 10_000_000
 A = 28.0
 
 
-def _cross(jump, slopes=(0.0, 0.0), *, lag=0.0, known=100, at=100, steps=250):
-    """Cross one jump at step ``at`` that is told at step ``known``; return r, rbar, commands."""
+def _transition(jump, slopes=(0.0, 0.0), *, lag=0.0, known=100, at=100, steps=250):
+    """Return r, rbar and commands for a jump at step ``at``, announced at step ``known``."""
     transition = JumpTransition(JumpTransitionParameters(acceleration=A), lag, T)
     before, after = slopes
     k = np.arange(steps + 1)
     r = np.where(k < at, before * T * (k - at), after * T * (k - at) + jump)
     r = np.stack([r, -r], axis=1)
-    share = 1.0 - math.exp(-T / lag) if lag else 1.0
-    followed, commands = np.zeros((steps, 2)), np.zeros((steps, 2))
+    servo_step = 1.0 - math.exp(-T / lag) if lag else 1.0
+    reachable, commands = np.zeros((steps, 2)), np.zeros((steps, 2))
     for n in range(steps):
         if n == known:
             transition.announce(at * NS, np.array([jump, -jump]), np.array([after, -after]))
         transition.step(n * NS, r[n], r[n + 1])
-        followed[n] = r[n] + transition.offset
-        following = r[n + 1] + transition.offset_next
-        commands[n] = followed[n] + (following - followed[n]) / share
+        reachable[n] = r[n] + transition.offset
+        reachable_next = r[n + 1] + transition.offset_next
+        commands[n] = reachable[n] + (reachable_next - reachable[n]) / servo_step
     assert not transition.active
-    return r[:-1], followed, commands
+    return r[:-1], reachable, commands
 
 
 @pytest.mark.parametrize('jump', [0.5, 3.0, 10.0])
 @pytest.mark.parametrize('known', [40, 100])
 def test_the_reachable_reference_respects_the_acceleration(jump, known):
-    _, followed, _ = _cross(jump, known=known)
-    assert np.max(np.abs(np.diff(followed, axis=0))) <= A * T * (1 + 1e-9)
+    _, reachable, _ = _transition(jump, known=known)
+    assert np.max(np.abs(np.diff(reachable, axis=0))) <= A * T * (1 + 1e-9)
 
 
 @pytest.mark.parametrize('jump', [3.0, 10.0])
@@ -46,8 +46,8 @@ def test_with_preview_the_squared_error_is_a_quarter(jump):
     """J³/(12 a) instead of J³/(3 a): half before the jump, half after it."""
     energy = []
     for known in (40, 100):
-        r, followed, _ = _cross(jump, known=known)
-        energy.append(T * np.sum((followed - r)[:, 0] ** 2))
+        r, reachable, _ = _transition(jump, known=known)
+        energy.append(T * np.sum((reachable - r)[:, 0] ** 2))
     assert energy[0] == pytest.approx(jump**3 / (12.0 * A), rel=0.03)
     assert energy[1] == pytest.approx(jump**3 / (3.0 * A) + 0.5 * T * jump**2, rel=0.05)
 
@@ -58,23 +58,23 @@ def test_no_reachable_path_has_a_smaller_squared_error(slopes):
     from scipy.optimize import lsq_linear
 
     jump, at, steps = 4.0, 40, 90
-    r, followed, _ = _cross(jump, slopes, known=0, at=at, steps=steps)
+    r, reachable, _ = _transition(jump, slopes, known=0, at=at, steps=steps)
     sums = np.tril(np.ones((steps, steps)))
     best = lsq_linear(sums, r[:, 0], bounds=(-A * T, A * T), tol=1e-12)
-    # The first step of the program may jump to r: its start is free like that of the transition.
+    # The start of the program is free, as that of the transition: its first step may jump to r.
     first = r[0, 0]
     best = lsq_linear(sums[:, 1:], r[:, 0] - first, bounds=(-A * T, A * T), tol=1e-12)
     least = np.sum((sums[:, 1:] @ best.x + first - r[:, 0]) ** 2)
-    ours = np.sum((followed - r)[:, 0] ** 2)
+    ours = np.sum((reachable - r)[:, 0] ** 2)
     assert least <= ours * (1.0 + 1e-6)
     assert ours <= 1.04 * least
 
 
 def test_with_servo_lag_the_command_respects_the_acceleration():
-    """A ramp of chi itself would need a command that steps by lag * a at each of its ends."""
-    r, followed, commands = _cross(6.0, lag=0.02, known=30)
+    """A ramp of chi itself would need command steps of lag * a at both ends."""
+    r, reachable, commands = _transition(6.0, lag=0.02, known=30)
     assert np.max(np.abs(np.diff(commands, axis=0))) <= A * T * (1 + 1e-9)
-    energy = T * np.sum((followed - r)[:, 0] ** 2)
+    energy = T * np.sum((reachable - r)[:, 0] ** 2)
     assert energy == pytest.approx(6.0**3 / (12.0 * A), rel=0.05)
 
 
@@ -85,17 +85,17 @@ def test_two_transitions_may_overlap():
     r = np.stack([r, r], axis=1)
     transition.announce(100 * NS, np.full(2, 4.0), np.zeros(2))
     transition.announce(105 * NS, np.full(2, -6.0), np.zeros(2))
-    followed = []
+    reachable = []
     for n in range(200):
         transition.step(n * NS, r[n], r[n + 1])
-        followed.append(r[n] + transition.offset)
-    assert np.max(np.abs(np.diff(followed, axis=0))) <= 2.0 * A * T
-    np.testing.assert_allclose(followed[-1], -2.0, atol=1e-9)
+        reachable.append(r[n] + transition.offset)
+    assert np.max(np.abs(np.diff(reachable, axis=0))) <= 2.0 * A * T
+    np.testing.assert_allclose(reachable[-1], -2.0, atol=1e-9)
     assert not transition.active
 
 
 def test_a_withdrawn_jump_leaves_no_offset():
-    """The source of the reference starts again: the jump it had announced never comes."""
+    """The source of the reference restarts: the announced jump does not occur."""
     transition = JumpTransition(JumpTransitionParameters(acceleration=A), 0.02, T)
     r = np.array([1.0, -1.0])
     transition.announce(30 * NS, np.array([6.0, 6.0]), np.zeros(2))
@@ -105,7 +105,7 @@ def test_a_withdrawn_jump_leaves_no_offset():
             transition.withdraw(25 * NS)
         transition.step(n * NS, r, r)
         offsets.append(transition.offset.copy())
-    assert np.max(np.abs(offsets)) > 0.5  # it was on its way
+    assert np.max(np.abs(offsets)) > 0.5  # the transition had started
     assert np.max(np.abs(np.diff(offsets, axis=0))) <= A * T * (1 + 1e-9)
     np.testing.assert_allclose(offsets[-1], 0.0, atol=1e-9)
     assert not transition.active

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""A robot that does not do what it is told is no plant to learn from."""
+"""Input watchdog and response monitor; the controller with an unresponsive robot."""
 
 import math
 
@@ -8,64 +8,122 @@ import numpy as np
 import pytest
 
 from t3mpc_ros.control.controller import Controller, ControllerParameters
-from t3mpc_ros.control.watchdog import EVIDENCE_WEIGHT, Reason, ResponseMonitor, WatchdogParameters
+from t3mpc_ros.control.watchdog import (
+    EVIDENCE_WEIGHT,
+    InputWatchdog,
+    Reason,
+    ResponseMonitor,
+    WatchdogParameters,
+)
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, State, WheelSpeeds
 
+MS = 1_000_000
 PERIOD = 0.01
 STEP = 10_000_000
 GEOMETRY = WheelGeometry()
 
 
-def following(**changes):
+def _decide(watchdog, stamp_ms, **changes):
+    facts = {'finite': True, 'known': True, 'speed': 1.0, 'error': 0.1} | changes
+    return watchdog.decide(stamp_ms * MS, **facts)
+
+
+def test_every_reason_to_stop_is_detected():
+    watchdog = InputWatchdog(WatchdogParameters())
+    assert _decide(watchdog, 0) is Reason.NO_REFERENCE
+    watchdog.reference_received()
+    assert _decide(watchdog, 10) is Reason.TRACKING
+    assert _decide(watchdog, 20, finite=False) is Reason.ODOMETRY_BAD
+    assert _decide(watchdog, 30, known=False) is Reason.NO_REFERENCE
+    assert _decide(watchdog, 150) is Reason.TRACKING
+    assert _decide(watchdog, 170) is Reason.REFERENCE_STALE
+    watchdog.reference_received()
+    assert _decide(watchdog, 180) is Reason.TRACKING
+    watchdog.enabled = False
+    watchdog.reference_received()
+    assert _decide(watchdog, 190) is Reason.DISABLED
+    watchdog.enabled = True
+    assert _decide(watchdog, 200) is Reason.TRACKING
+
+
+@pytest.mark.parametrize('fault', [{'speed': 41.0}, {'error': 26.0}])
+def test_a_diverging_state_stops_the_robot_for_the_hold_time(fault):
+    watchdog = InputWatchdog(WatchdogParameters())
+    reasons = []
+    for k in range(100):
+        watchdog.reference_received()
+        reasons.append(_decide(watchdog, 10 * k, **(fault if k == 10 else {})))
+    assert reasons[9] is Reason.TRACKING
+    assert all(reason is Reason.DIVERGING for reason in reasons[10:61])
+    assert all(reason is Reason.TRACKING for reason in reasons[61:])
+
+
+def test_elapsed_is_none_for_first_messages_gaps_and_restarts():
+    watchdog = InputWatchdog(WatchdogParameters())
+    assert watchdog.elapsed(1000 * MS) is None
+    assert watchdog.elapsed(1010 * MS) == pytest.approx(0.01)
+    assert watchdog.elapsed(1300 * MS) is None
+    assert watchdog.elapsed(1310 * MS) == pytest.approx(0.01)
+    assert watchdog.elapsed(500 * MS) is None
+
+
+def test_the_odometry_timeout_is_measured_with_one_clock():
+    watchdog = InputWatchdog(WatchdogParameters(odometry_timeout=0.2))
+    assert watchdog.odometry_timed_out(None, 0)
+    assert not watchdog.odometry_timed_out(1000 * MS, 1199 * MS)
+    assert watchdog.odometry_timed_out(1000 * MS, 1201 * MS)
+
+
+def response_monitor(**changes):
     return ResponseMonitor(WatchdogParameters(**changes), PERIOD)
 
 
-@pytest.mark.parametrize('late', [0, 1, 5, 12])
-def test_a_delayed_and_noisy_robot_is_responsive(late):
-    """0.12 s late, noise of variance 0.1: all within the window and the bound."""
-    generator = np.random.default_rng(late)
-    watch = following()
+@pytest.mark.parametrize('delay', [0, 1, 5, 12])
+def test_a_delayed_and_noisy_robot_is_responsive(delay):
+    """A delay of 0.12 s and noise of variance 0.1 are within the window and the bound."""
+    generator = np.random.default_rng(delay)
+    monitor = response_monitor()
     time = PERIOD * np.arange(4000)
-    told = 4.0 * np.sin(np.outer(2.0 * np.pi * time, (0.4, 0.27)))
+    command = 4.0 * np.sin(np.outer(2.0 * np.pi * time, (0.4, 0.27)))
     for k in range(len(time)):
-        watch.add_command(*told[k])
-        seen = told[max(0, k - late)] + math.sqrt(0.1) * generator.standard_normal(2)
-        assert watch.update(*seen)
+        monitor.add_command(*command[k])
+        measured = command[max(0, k - delay)] + math.sqrt(0.1) * generator.standard_normal(2)
+        assert monitor.update(*measured)
 
 
 def test_a_standing_robot_is_unresponsive_after_the_timeout():
-    watch = following()
+    monitor = response_monitor()
     steps = 0
-    while watch.responsive:
-        watch.add_command(3.0, -3.0)
-        watch.update(0.0, 0.0)
+    while monitor.responsive:
+        monitor.add_command(3.0, -3.0)
+        monitor.update(0.0, 0.0)
         steps += 1
     assert steps * PERIOD == pytest.approx(0.15 + 0.1, abs=0.03)
 
 
 def test_one_unresponsive_wheel_is_enough():
-    watch = following()
+    monitor = response_monitor()
     for _ in range(60):
-        watch.add_command(3.0, 3.0)
-        watch.update(3.0, 0.0)
-    assert not watch.responsive
+        monitor.add_command(3.0, 3.0)
+        monitor.update(3.0, 0.0)
+    assert not monitor.responsive
 
 
 def test_standing_at_a_zero_command_is_weak_evidence():
-    """A reference that crosses zero made a deaf robot seem to obey, and the law learn from it."""
-    watch = following()
+    """Zero crossings of the reference must not end the pause of the adaptation."""
+    monitor = response_monitor()
     for _ in range(60):
-        watch.add_command(3.0, 3.0)
-        watch.update(0.0, 0.0)
-    assert not watch.responsive
+        monitor.add_command(3.0, 3.0)
+        monitor.update(0.0, 0.0)
+    assert not monitor.responsive
     steps = 0
-    while not watch.responsive:
-        watch.add_command(0.2, 0.1)
-        watch.update(0.0, 0.0)
+    while not monitor.responsive:
+        monitor.add_command(0.2, 0.1)
+        monitor.update(0.0, 0.0)
         steps += 1
-    assert steps >= EVIDENCE_WEIGHT * 10  # 2 s; with a proof it takes 0.1 s
-    again = following()
+    assert steps >= EVIDENCE_WEIGHT * 10  # 2 s; other samples need 0.1 s
+    again = response_monitor()
     for _ in range(60):
         again.add_command(3.0, 3.0)
         again.update(0.0, 0.0)
@@ -76,41 +134,45 @@ def test_standing_at_a_zero_command_is_weak_evidence():
 
 
 def test_a_bound_of_zero_disables_the_check():
-    watch = following(response_bound=0.0)
+    monitor = response_monitor(response_bound=0.0)
     for _ in range(500):
-        watch.add_command(9.0, 9.0)
-        assert watch.update(-9.0, 0.0)
+        monitor.add_command(9.0, 9.0)
+        assert monitor.update(-9.0, 0.0)
 
 
-class Deaf:
-    """A servo robot that hears nothing for a while, and the controller that drives it."""
+class ServoLoop:
+    """A closed loop with a servo robot that can stop responding to commands."""
 
     def __init__(self, **changes):
         self.controller = Controller(
             ControllerParameters.from_dict({'speed_filter.noise_variance': 0.0} | changes)
         )
         self.speeds = np.zeros(2)
-        self.late = BodyTwist(0.0, 0.0)
+        self.delayed = BodyTwist(0.0, 0.0)
         self.now = 0
         self.reasons = []
 
-    def wanted(self, stamp_ns):
+    def reference(self, stamp_ns):
         time = stamp_ns / 1e9
         return BodyTwist(0.12 + 0.05 * math.sin(0.9 * time), 1.2 * math.sin(0.7 * time))
 
-    def run(self, seconds, deaf=False):
+    def run(self, seconds, unresponsive=False):
         """Return the errors of the wheels, shape (n, 2)."""
         errors = []
         for _ in range(round(seconds / PERIOD)):
             stamp = self.now + 40 * STEP
-            self.controller.add_reference(State(stamp, ORIGIN, self.wanted(stamp)))
+            self.controller.add_reference(State(stamp, ORIGIN, self.reference(stamp)))
             twist = twist_from_wheels(WheelSpeeds(*self.speeds.tolist()), GEOMETRY)
-            errors.append(self.speeds - wheels_from_twist(self.wanted(self.now), GEOMETRY))
+            errors.append(self.speeds - wheels_from_twist(self.reference(self.now), GEOMETRY))
             sent, status = self.controller.step(State(self.now, ORIGIN, twist))
             self.reasons.append(status.reason)
-            told = np.zeros(2) if deaf else np.array(wheels_from_twist(self.late, GEOMETRY))
-            self.speeds = told + math.exp(-0.5) * (self.speeds - told)
-            self.late = sent
+            command = (
+                np.zeros(2)
+                if unresponsive
+                else np.array(wheels_from_twist(self.delayed, GEOMETRY))
+            )
+            self.speeds = command + math.exp(-0.5) * (self.speeds - command)
+            self.delayed = sent
             self.now += STEP
         return np.array(errors)
 
@@ -120,58 +182,58 @@ def settled(robot):
 
 
 def test_after_5_s_without_response_the_error_is_as_before():
-    """The law had learnt that commands do nothing: the error was five times as large for 30 s."""
+    """Without the response monitor, the adaptation increases the error for 30 s."""
     errors = {}
-    for name, changes in (('watched', {}), ('not', {'watchdog.response_bound': 0.0})):
-        robot = Deaf(**changes)
+    for name, changes in (('monitored', {}), ('unmonitored', {'watchdog.response_bound': 0.0})):
+        robot = ServoLoop(**changes)
         robot.run(8.0)
         before = settled(robot)
-        robot.run(5.0, deaf=True)
+        robot.run(5.0, unresponsive=True)
         robot.run(1.0)
         errors[name] = settled(robot) / before
-        assert (Reason.NOT_FOLLOWING in robot.reasons) == (name == 'watched')
+        assert (Reason.NOT_FOLLOWING in robot.reasons) == (name == 'monitored')
         assert robot.reasons[-1] is Reason.TRACKING
-    assert errors['watched'] < 1.5
-    assert errors['not'] > 1.3 * errors['watched']
+    assert errors['monitored'] < 1.5
+    assert errors['unmonitored'] > 1.3 * errors['monitored']
 
 
 def test_an_unresponsive_robot_gets_the_reference_as_command():
-    robot = Deaf()
+    robot = ServoLoop()
     robot.run(5.0)
-    robot.run(1.0, deaf=True)
+    robot.run(1.0, unresponsive=True)
     assert robot.controller.status.reason is Reason.NOT_FOLLOWING
-    assert Reason.NOT_FOLLOWING.moves  # a board that restarts waits for commands
-    learnt = robot.controller.law.get_weights()
-    robot.run(2.0, deaf=True)
+    assert Reason.NOT_FOLLOWING.moves  # a restarted board needs commands
+    weights = robot.controller.law.get_weights()
+    robot.run(2.0, unresponsive=True)
     for name, value in robot.controller.law.get_weights().items():
-        np.testing.assert_array_equal(value, learnt[name])
-    sent = wheels_from_twist(robot.late, GEOMETRY)
-    wanted = wheels_from_twist(robot.wanted(robot.now - STEP), GEOMETRY)
-    assert sent == pytest.approx(wanted, abs=0.05)
+        np.testing.assert_array_equal(value, weights[name])
+    sent = wheels_from_twist(robot.delayed, GEOMETRY)
+    reference = wheels_from_twist(robot.reference(robot.now - STEP), GEOMETRY)
+    assert sent == pytest.approx(reference, abs=0.05)
 
 
 def test_the_shortcut_for_the_last_command_keeps_the_decision():
-    """The newest command is looked at first, to save the search: the verdict is the same."""
+    """Comparing the last command first avoids a search and gives the same decision."""
     generator = np.random.default_rng(4)
-    watch, whole = following(), following()
-    verdicts = []
+    monitor, whole = response_monitor(), response_monitor()
+    decisions = []
     for k in range(3000):
-        told = 3.0 * np.sin(0.02 * k) + generator.normal(size=2)
+        command = 3.0 * np.sin(0.02 * k) + generator.normal(size=2)
         off = 5.0 if k % 700 > 600 else 0.0
-        seen = told + off + generator.normal(scale=0.8, size=2)
-        verdicts.append(watch.update(*seen))
-        # The same commands in another order are the same window: the nearest comes first.
+        measured = command + off + generator.normal(scale=0.8, size=2)
+        decisions.append(monitor.update(*measured))
+        # Reorder the window to disable the shortcut: the most distant command is the last.
         if len(whole._commands) == whole._commands.maxlen:
-            far = max(whole._commands, key=lambda one: abs(one[0] - seen[0]))
+            far = max(whole._commands, key=lambda one: abs(one[0] - measured[0]))
             kept = list(whole._commands)
             whole._commands.remove(far)
             whole._commands.append(far)
-            assert whole.update(*seen) == verdicts[-1]
+            assert whole.update(*measured) == decisions[-1]
             whole._commands.clear()
             whole._commands.extend(kept)
         else:
-            assert whole.update(*seen) == verdicts[-1]
-        watch.add_command(*told)
-        whole.add_command(*told)
-    assert True in verdicts
-    assert False in verdicts
+            assert whole.update(*measured) == decisions[-1]
+        monitor.add_command(*command)
+        whole.add_command(*command)
+    assert True in decisions
+    assert False in decisions

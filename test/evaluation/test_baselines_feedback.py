@@ -10,12 +10,13 @@ import pytest
 
 from t3mpc_ros.evaluation.baselines.adaptive_fuzzy import AdaptiveIntervalType2, AdaptiveType1
 from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
-from t3mpc_ros.evaluation.baselines.feedback_baseline import (
+from t3mpc_ros.evaluation.baselines.computed_torque import ComputedTorque
+from t3mpc_ros.evaluation.baselines.disturbance_rejection import (
     DisturbanceRejection,
-    ProportionalIntegral,
     observer_gains,
 )
-from t3mpc_ros.evaluation.baselines.model_based_feedback import ComputedTorque, SlidingMode
+from t3mpc_ros.evaluation.baselines.proportional_integral import ProportionalIntegral
+from t3mpc_ros.evaluation.baselines.sliding_mode import SlidingMode
 from t3mpc_ros.fuzzy.inference import compute_basis
 from t3mpc_ros.fuzzy.sets import build_sets
 from t3mpc_ros.geometry.types import WheelSpeeds
@@ -30,7 +31,7 @@ ALL = INTEGRATING + ADAPTIVE
 
 
 def make(kind, drive='torque', **changes):
-    """Return a rival; double underscores in names of settings stand for dots."""
+    """Return a baseline; double underscores in names of settings stand for dots."""
     values = {name.replace('__', '.'): value for name, value in changes.items()}
     parameters = kind.parameters_type.from_dict(values)
     limit = math.inf if drive == 'torque' else 28.0
@@ -46,20 +47,22 @@ def waves(steps, jump=0.0):
     """Return r and r' of moving wheels, r with a jump in mid-run that r' does not tell."""
     time = T * np.arange(steps)[:, None]
     angular, phase = np.array([3.0, 4.5]), np.array([0.0, 1.0])
-    wanted = 2.0 * np.sin(angular * time + phase)
+    reference = 2.0 * np.sin(angular * time + phase)
     rate = 2.0 * angular * np.cos(angular * time + phase)
-    wanted[steps // 2 :] += np.array([jump, -jump])
-    return wanted, rate
+    reference[steps // 2 :] += np.array([jump, -jump])
+    return reference, rate
 
 
-def run(rival, reference, load=None, limit=math.inf, ramp=math.inf, start=(0.0, 0.0), noise=0.0):
-    """Return what happened on the plant chi + T (u + d), with a probe of the rival each step.
+def run(
+    baseline, reference, load=None, limit=math.inf, ramp=math.inf, start=(0.0, 0.0), noise=0.0
+):
+    """Return what happened on the plant chi + T (u + d), with a probe of the baseline each step.
 
     load : d (rad/s²) of step and speeds; limit : largest |u|; ramp : largest change of the
     command c = chi + T u/share per second, as the velocity drive has it
     """
-    wanted, rate = reference
-    steps = len(wanted)
+    speeds, rate = reference
+    steps = len(speeds)
     rng = np.random.default_rng(5)
     chi = np.array(start, dtype=np.float64)
     stretch = T / (1.0 - math.exp(-T / 0.02))
@@ -69,28 +72,28 @@ def run(rival, reference, load=None, limit=math.inf, ramp=math.inf, start=(0.0, 
     for k in range(steps):
         d = np.zeros(2) if load is None else np.asarray(load(k, chi), dtype=np.float64)
         seen = chi + noise * rng.standard_normal(2)
-        u = rival.step(
-            Observation(seen, d, wanted[k], wanted[k] + T * rate[k], empty, None)
+        u = baseline.step(
+            Observation(seen, d, speeds[k], speeds[k] + T * rate[k], empty, None)
         ).copy()
         wish = chi + stretch * np.clip(u, -limit, limit)
         told = told + np.clip(wish - told, -ramp * T, ramp * T)
         a = (told - chi) / stretch
         limited = bool(np.any(np.abs(a - u) > 1e-9))
-        rival.applied(a, limited=limited)
+        baseline.applied(a, limited=limited)
         log.chi[k], log.u[k] = chi, u
         log.limited.append(limited)
-        log.probe.append(probe(rival))
+        log.probe.append(probe(baseline))
         chi = chi + T * (a + d)
-    log.error = log.chi - wanted
+    log.error = log.chi - speeds
     log.probe = np.array(log.probe)
     return log
 
 
-def probe(rival):
+def probe(baseline):
     for name in ('integral', 'observed', 'surface'):
-        if hasattr(rival, name):
-            return np.ravel(getattr(rival, name))
-    return rival.fuzzy.coefficients.ravel()
+        if hasattr(baseline, name):
+            return np.ravel(getattr(baseline, name))
+    return baseline.fuzzy.coefficients.ravel()
 
 
 def kick(step, size):
@@ -136,9 +139,9 @@ def test_neither_a_jump_nor_a_limit_is_learnt_from(kind):
 @pytest.mark.parametrize('kind', ALL)
 def test_a_saturated_step_of_10_rad_s_does_not_overshoot(kind):
     changes = {'belief': 0.0, 'integral': 200.0} if kind is ComputedTorque else {}
-    wanted, rate = still(800)
-    wanted[400:] = [10.0, -10.0]
-    log = run(make(kind, **changes), (wanted, rate), lambda k, chi: [4.0, 3.0], limit=28.0)
+    reference, rate = still(800)
+    reference[400:] = [10.0, -10.0]
+    log = run(make(kind, **changes), (reference, rate), lambda k, chi: [4.0, 3.0], limit=28.0)
     assert sum(log.limited) > 20
     over = log.error[400:] * np.array([1.0, -1.0])
     # The fuzzy systems have not learnt the disturbance at the speeds they come to.
@@ -154,20 +157,20 @@ def test_without_word_from_the_drive_the_same_step_winds_up():
         def applied(self, acceleration, *, limited):
             pass
 
-    wanted, rate = still(800)
-    wanted[400:] = [10.0, -10.0]
-    log = run(make(Deaf), (wanted, rate), limit=28.0)
+    reference, rate = still(800)
+    reference[400:] = [10.0, -10.0]
+    log = run(make(Deaf), (reference, rate), limit=28.0)
     assert np.max(log.error[400:] * np.array([1.0, -1.0])) > 1.0
 
 
 @pytest.mark.parametrize('kind', ALL)
 def test_jumps_close_at_the_rate_asked_for_and_the_reference_is_followed_exactly(kind):
     changes = {'belief': 0.0} if kind is ComputedTorque else {}
-    rival = make(kind, crossing__rate=30.0, crossing__acceleration=1000.0, **changes)
-    wanted, rate = waves(400, jump=5.0)
+    baseline = make(kind, jump_transient__rate=30.0, jump_transient__acceleration=1000.0, **changes)
+    reference, rate = waves(400, jump=5.0)
     # The slope told is that of the chord, so that nothing but the jump is news.
     smooth, _ = waves(401)
-    log = run(rival, (wanted, np.diff(smooth, axis=0) / T), start=wanted[0])
+    log = run(baseline, (reference, np.diff(smooth, axis=0) / T), start=reference[0])
     np.testing.assert_allclose(log.error[:200], 0.0, atol=1e-12)
     decay = np.exp(-30.0 * T * np.arange(200))
     np.testing.assert_allclose(log.error[200:, 0], -5.0 * decay, atol=1e-9)
@@ -237,11 +240,11 @@ def test_with_the_gain_of_the_servo_noise_does_not_reach_the_command():
     for gain, reached in ((share / T, 0.0), (0.5 * share / T, 0.5)):
         commands = []
         for speed in (0.0, 0.3):
-            rival = make(ProportionalIntegral, 'velocity', gain=gain, integral=0.1)
+            baseline = make(ProportionalIntegral, 'velocity', gain=gain, integral=0.1)
             zero = np.zeros(2)
-            rival.step(Observation(zero, zero, zero, zero, zero, None))
+            baseline.step(Observation(zero, zero, zero, zero, zero, None))
             seen = np.full(2, speed)
-            u = rival.step(Observation(seen, zero, zero, zero, zero, None))
+            u = baseline.step(Observation(seen, zero, zero, zero, zero, None))
             commands.append(speed + T * u[0] / share)
         assert (commands[1] - commands[0]) / 0.3 == pytest.approx(reached, abs=1e-4)
 
@@ -258,8 +261,8 @@ def test_the_observer_has_both_poles_where_they_were_asked_for(bandwidth):
     polynomial = np.poly(seen @ plant)
     np.testing.assert_allclose(polynomial, [1.0, -2.0 * beta, beta**2], atol=1e-12)
     # And so has the one that runs: its error after a step of the disturbance.
-    rival = make(DisturbanceRejection, observer_bandwidth=bandwidth)
-    log = run(rival, still(100), lambda k, chi: [5.0, -5.0], limit=3.0)
+    baseline = make(DisturbanceRejection, observer_bandwidth=bandwidth)
+    log = run(baseline, still(100), lambda k, chi: [5.0, -5.0], limit=3.0)
     assert any(log.limited)
     missing = 5.0 - log.probe[:, 2]
     assert missing[0] == 5.0
@@ -269,8 +272,8 @@ def test_the_observer_has_both_poles_where_they_were_asked_for(bandwidth):
 
 
 def test_with_the_shared_estimate_a_known_disturbance_never_shows():
-    rival = make(DisturbanceRejection, shared_disturbance=1.0, shared_speed=1.0)
-    log = run(rival, still(300), lambda k, chi: [6.0 * math.sin(0.3 * k), 2.0])
+    baseline = make(DisturbanceRejection, shared_disturbance=1.0, shared_speed=1.0)
+    log = run(baseline, still(300), lambda k, chi: [6.0 * math.sin(0.3 * k), 2.0])
     np.testing.assert_allclose(log.error, 0.0, atol=1e-12)
     own = run(
         make(DisturbanceRejection), still(300), lambda k, chi: [6.0 * math.sin(0.3 * k), 2.0]
@@ -280,8 +283,8 @@ def test_with_the_shared_estimate_a_known_disturbance_never_shows():
 
 @pytest.mark.parametrize('input_gain', [0.6, 1.0, 1.6])
 def test_an_input_gain_that_is_not_the_plants_still_leaves_no_error(input_gain):
-    rival = make(DisturbanceRejection, input_gain=input_gain, gain=15.0)
-    log = run(rival, still(3000), lambda k, chi: [5.0, -7.0])
+    baseline = make(DisturbanceRejection, input_gain=input_gain, gain=15.0)
+    log = run(baseline, still(3000), lambda k, chi: [5.0, -7.0])
     assert np.max(np.abs(log.error[-1])) < 1e-6
 
 
@@ -295,8 +298,8 @@ def test_outside_the_layer_the_sliding_variable_falls_as_the_reaching_law_says()
         push = 3.0 / T if k == 20 else 0.0
         return np.array([most * math.cos(0.2 * k) + push, -most - push])
 
-    rival = make(SlidingMode, switching=eta, reaching=reaching, boundary=0.2, surface=5.0)
-    log = run(rival, still(400), load)
+    baseline = make(SlidingMode, switching=eta, reaching=reaching, boundary=0.2, surface=5.0)
+    log = run(baseline, still(400), load)
     s = np.abs(log.probe)
     outside = s > 0.2
     assert outside[21:40].all()
@@ -313,8 +316,8 @@ def test_outside_the_layer_the_sliding_variable_falls_as_the_reaching_law_says()
 
 
 def test_beyond_the_switching_gain_the_layer_cannot_be_held():
-    rival = make(SlidingMode, switching=2.0, reaching=0.1, boundary=0.2)
-    log = run(rival, still(400), lambda k, chi: [6.0, 1.0])
+    baseline = make(SlidingMode, switching=2.0, reaching=0.1, boundary=0.2)
+    log = run(baseline, still(400), lambda k, chi: [6.0, 1.0])
     assert abs(log.probe[-1, 0]) > 1.0
     assert abs(log.probe[-1, 1]) < 0.2
 
@@ -350,8 +353,8 @@ def test_on_the_nominal_plant_computed_torque_leaves_a_linear_error():
     def load(k, chi):
         return nominal_forces(chi) + kick(100, 2.0)(k, chi)
 
-    rival = make(ComputedTorque, gain=gain, integral=0.1, measured=1.0)
-    log = run(rival, reference, load, start=smooth[0])
+    baseline = make(ComputedTorque, gain=gain, integral=0.1, measured=1.0)
+    log = run(baseline, reference, load, start=smooth[0])
     np.testing.assert_allclose(log.error[:101], 0.0, atol=1e-12)
     e = log.error[101:]
     assert np.max(np.abs(nominal_forces(log.chi[150]))) > 1.0
@@ -381,19 +384,19 @@ def test_on_the_simulated_robot_the_model_is_worth_what_the_drive_feels(drive, m
             {'drive.kind': drive, 'drive.dead_time': 0.0, 'disturbance.bound': 0.0}
         )
         robot = PaperRobot(table)
-        rival = make(ComputedTorque, drive, integral=0.1, measured=measured, belief=belief)
+        baseline = make(ComputedTorque, drive, integral=0.1, measured=measured, belief=belief)
         inertia = wheel_inertia(table.body, table.geometry)
         stretch = T / (1.0 - math.exp(-T / 0.02))
-        wanted, zero = np.array([4.0, 1.5]), np.zeros(2)
+        reference, zero = np.array([4.0, 1.5]), np.zeros(2)
         state = robot.state
         for _ in range(150):
             chi = np.array(state.true_wheels)
-            u = rival.step(Observation(chi, zero, wanted, wanted, zero, None))
+            u = baseline.step(Observation(chi, zero, reference, reference, zero, None))
             if drive == 'torque':
                 state = robot.step_torque(*(inertia @ u))
             else:
                 state = robot.step(WheelSpeeds(*(chi + stretch * u)))
-        return np.max(np.abs(np.array(state.true_wheels) - wanted))
+        return np.max(np.abs(np.array(state.true_wheels) - reference))
 
     assert settle(1.0) < 2e-3
     assert settle(0.75) > 0.01
@@ -407,23 +410,23 @@ def test_on_the_simulated_robot_the_model_is_worth_what_the_drive_feels(drive, m
 def test_in_the_ideal_case_the_lyapunov_function_falls_by_the_amount_derived(kind):
     """V = |e|²/2 + |alpha* - alpha|²/(2 gamma) in discrete time, not only in its derivative."""
     gain = 12.0
-    rival = make(kind, gain=gain, normalised_gain=300.0, dead_zone=0.0, error_bound=0.0, sets=3)
-    sets = build_sets(rival.parameters_type(sets=3).fuzzy())
+    baseline = make(kind, gain=gain, normalised_gain=300.0, dead_zone=0.0, error_bound=0.0, sets=3)
+    sets = build_sets(baseline.parameters_type(sets=3).fuzzy())
     ideal = np.random.default_rng(3).uniform(-8.0, 8.0, (2, sets.size))
-    gamma = rival.fuzzy.adaptation.gamma
+    gamma = baseline.fuzzy.adaptation.gamma
     values, squares, errors = [], [], []
 
     def load(k, chi):
         phi = compute_basis(chi, sets)
-        e = rival.error
-        away = ideal - rival.fuzzy.coefficients
+        e = baseline.error
+        away = ideal - baseline.fuzzy.coefficients
         values.append(0.5 * e @ e + np.sum(away**2) / (2.0 * gamma))
         squares.append(phi @ phi)
         errors.append(e)
         return ideal @ phi
 
     # The load is asked before the step: V of step k stands in entry k + 1.
-    run(rival, waves(600), load, start=waves(1)[0][0])
+    run(baseline, waves(600), load, start=waves(1)[0][0])
     v, e, power = np.array(values[1:]), np.array(errors[1:]), np.array(squares[:-2])
     change = -0.5 * (
         np.sum(e[:-1] ** 2, axis=1)
@@ -438,16 +441,16 @@ def test_in_the_ideal_case_the_lyapunov_function_falls_by_the_amount_derived(kin
 
 @pytest.mark.parametrize('kind', ADAPTIVE)
 def test_the_step_limit_keeps_any_adaptation_gain_stable(kind):
-    rival = make(kind, gain=5.0, normalised_gain=5000.0, dead_zone=0.0, error_bound=0.0)
-    log = run(rival, waves(1500), lambda k, chi: 7.0 * np.tanh(chi / 0.2))
+    baseline = make(kind, gain=5.0, normalised_gain=5000.0, dead_zone=0.0, error_bound=0.0)
+    log = run(baseline, waves(1500), lambda k, chi: 7.0 * np.tanh(chi / 0.2))
     assert np.isfinite(log.chi).all()
     assert np.max(np.abs(log.error[500:])) < 1.0
 
 
 @pytest.mark.parametrize('kind', ADAPTIVE)
 def test_nothing_is_learnt_while_the_drive_is_limited_or_within_the_dead_zone(kind):
-    rival = make(kind, dead_zone=0.02)
-    log = run(rival, waves(600, jump=10.0), lambda k, chi: [4.0, -3.0], ramp=28.0)
+    baseline = make(kind, dead_zone=0.02)
+    log = run(baseline, waves(600, jump=10.0), lambda k, chi: [4.0, -3.0], ramp=28.0)
     learnt = np.any(np.diff(log.probe, axis=0) != 0.0, axis=1)
     limited = np.array(log.limited[:-1])
     assert limited.sum() > 20
@@ -462,8 +465,8 @@ def test_the_robust_term_holds_the_error_that_the_fuzzy_system_cannot_explain():
     """Without learning, |e| settles where K e + bound tanh(e/epsilon) is the disturbance."""
     changes = {'dead_zone': 2.0, 'gain': 10.0, 'smoothing': 0.1}
     for bound in (0.0, 6.0):
-        rival = make(AdaptiveType1, error_bound=bound, **changes)
-        e = run(rival, still(600), lambda k, chi: [5.0, -5.0]).error[-1]
+        baseline = make(AdaptiveType1, error_bound=bound, **changes)
+        e = run(baseline, still(600), lambda k, chi: [5.0, -5.0]).error[-1]
         np.testing.assert_allclose(10.0 * e + bound * np.tanh(e / 0.1), [5.0, -5.0], rtol=1e-9)
         assert abs(e[0]) == pytest.approx(0.5) if bound == 0.0 else abs(e[0]) < 0.15
 
@@ -471,10 +474,10 @@ def test_the_robust_term_holds_the_error_that_the_fuzzy_system_cannot_explain():
 @pytest.mark.parametrize('kind', ADAPTIVE)
 @pytest.mark.parametrize('sets', [3, 7])
 def test_the_adaptation_gain_means_the_same_for_any_sets(kind, sets):
-    rival = make(kind, normalised_gain=150.0, sets=sets)
+    baseline = make(kind, normalised_gain=150.0, sets=sets)
     drawn = np.random.default_rng(9).uniform(-10.0, 10.0, (500, 2))
-    power = np.mean([np.sum(compute_basis(point, rival.fuzzy.sets) ** 2) for point in drawn])
-    assert rival.fuzzy.adaptation.gamma * power == pytest.approx(150.0, rel=0.03)
+    power = np.mean([np.sum(compute_basis(point, baseline.fuzzy.sets) ** 2) for point in drawn])
+    assert baseline.fuzzy.adaptation.gamma * power == pytest.approx(150.0, rel=0.03)
 
 
 def test_the_two_adaptive_rivals_differ_in_their_sets_only():

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The predictive rivals: optimal, within bounds, free of offset, and as good as theory allows."""
+"""The predictive baselines: optimal, within bounds, free of offset, and as good as theory allows."""
 
 import math
 import sys
@@ -63,13 +63,13 @@ def _make(kind, drive, robot=FREE, **parameters):
     return kind(kind.parameters_type().with_values(chosen), _knowledge(drive, robot))
 
 
-def _run(rival, drive, wanted, load=None, seen=None, noise=0.0):
+def _run(baseline, drive, reference, load=None, seen=None, noise=0.0):
     """Close the loop with the plant of the interface; return chi, c (or u) and the answers.
 
     wanted : shape (n + AHEAD + 1, 2); load : chi -> true acceleration; seen : shape (n, 2), the
-    estimate of it that the rival is given
+    estimate of it that the baseline is given
     """
-    steps = len(wanted) - AHEAD - 1
+    steps = len(reference) - AHEAD - 1
     generator = np.random.default_rng(5)
     speeds, command = np.zeros(2), np.zeros(2)
     record = np.zeros((3, steps, 2))
@@ -77,13 +77,14 @@ def _run(rival, drive, wanted, load=None, seen=None, noise=0.0):
         observation = Observation(
             speeds + noise * generator.standard_normal(2),
             np.zeros(2) if seen is None else seen[k].copy(),
-            wanted[k].copy(),
+            reference[k].copy(),
             # Its slope is known at any rate, its jumps are not.
-            wanted[k] + np.where(np.abs(step := wanted[k + 1] - wanted[k]) < 0.3, step, 0.0),
+            reference[k]
+            + np.where(np.abs(step := reference[k + 1] - reference[k]) < 0.3, step, 0.0),
             command.copy(),
-            wanted[k : k + AHEAD].copy() if rival.preview else None,
+            reference[k : k + AHEAD].copy() if baseline.preview else None,
         )
-        u = rival.step(observation)
+        u = baseline.step(observation)
         record[0, k], record[2, k] = speeds, u
         acting = np.zeros(2) if load is None else load(speeds)
         if drive == 'velocity':
@@ -92,33 +93,33 @@ def _run(rival, drive, wanted, load=None, seen=None, noise=0.0):
         else:
             command = u
             speeds = speeds + PERIOD * (u + acting)
-        rival.applied(u, limited=False)
+        baseline.applied(u, limited=False)
         record[1, k] = command
     return record
 
 
 def _jump(size, steps=200, at=100):
     """Return a reference that jumps up right and down left."""
-    wanted = np.zeros((steps + AHEAD + 1, 2))
-    wanted[at:] = size, -size
-    return wanted
+    reference = np.zeros((steps + AHEAD + 1, 2))
+    reference[at:] = size, -size
+    return reference
 
 
-def _energy(speeds, wanted):
+def _energy(speeds, reference):
     """Return the integral of the squared error of one wheel, rad²/s."""
-    return float(np.sum((speeds - wanted[: len(speeds)]) ** 2) * PERIOD / 2.0)
+    return float(np.sum((speeds - reference[: len(speeds)]) ** 2) * PERIOD / 2.0)
 
 
 def _wander(steps, seed=3):
     """Return a smooth reference with jumps, shape (steps + AHEAD + 1, 2)."""
     generator = np.random.default_rng(seed)
     time = PERIOD * np.arange(steps + AHEAD + 1)[:, None]
-    wanted = np.zeros((time.size, 2))
+    reference = np.zeros((time.size, 2))
     for rate in (0.3, 0.7, 1.1):
-        wanted += 1.5 * np.sin(2 * np.pi * rate * time + generator.uniform(0, 6, 2))
+        reference += 1.5 * np.sin(2 * np.pi * rate * time + generator.uniform(0, 6, 2))
     for at in range(60, steps, 90):
-        wanted[at:] += generator.uniform(-5, 5, 2)
-    return wanted
+        reference[at:] += generator.uniform(-5, 5, 2)
+    return reference
 
 
 # -- the program ----------------------------------------------------------------------------------
@@ -222,12 +223,12 @@ def test_slope_dies_away_without_preview():
 # -- optimality -----------------------------------------------------------------------------------
 
 
-def _dense(drive, before, speeds, wanted, weight, nominal_model):
+def _dense(drive, before, speeds, reference, weight, nominal_model):
     """Return the best commands, shape (2, N), by simulating every unit input and least squares.
 
     wanted : shape (N, 2), for periods 1 ... N
     """
-    n = len(wanted)
+    n = len(reference)
     pole, push = (KEPT, 1.0 - KEPT) if drive == 'velocity' else (1.0, PERIOD)
 
     def outputs(start, commands):
@@ -249,14 +250,14 @@ def _dense(drive, before, speeds, wanted, weight, nominal_model):
             sums = np.linalg.inv(changes)
             matrix = np.vstack((by_command @ sums, math.sqrt(weight) * np.eye(n)))
             held = by_command @ np.full(n, before[z])
-            target = np.r_[wanted[:, z] - free[z] - held, np.zeros(n)]
+            target = np.r_[reference[:, z] - free[z] - held, np.zeros(n)]
             reach = nominal_model.acceleration * PERIOD
             best = lsq_linear(matrix, target, (-reach, reach), 'bvls', tol=1e-15, max_iter=1000)
             answer.append(before[z] + sums @ best.x)
         return np.array(answer)
     inertia = wheel_inertia(nominal_model.robot.body, nominal_model.robot.geometry)
     one = np.vstack((by_command, math.sqrt(weight) * changes))
-    target = [np.r_[wanted[:, z] - free[z], math.sqrt(weight) * first[z]] for z in range(2)]
+    target = [np.r_[reference[:, z] - free[z], math.sqrt(weight) * first[z]] for z in range(2)]
     limit = nominal_model.robot.drive.torque_limit
     best = lsq_linear(
         np.kron(np.linalg.inv(inertia), one),
@@ -276,14 +277,14 @@ def test_linear_plan_is_the_optimum_of_the_dense_program(drive, size):
     nominal_model = _knowledge(drive)
     move_time = 0.01
     weight = (move_time / PERIOD) ** 2 if drive == 'velocity' else (move_time**2 / PERIOD) ** 2
-    rival = _make(LinearMpcPreview, drive, move_time=move_time)
+    baseline = _make(LinearMpcPreview, drive, move_time=move_time)
     future = size * np.sin(0.2 * np.arange(41))[:, None] * [1.0, -0.4] + 0.1
     future[12:] += size, -size
     speeds, command = np.array([0.3, 0.1]), np.array([0.2, -0.1])
-    rival.applied(command, limited=False)
-    u = rival.step(Observation(speeds, np.zeros(2), future[0], future[1], command, future))
+    baseline.applied(command, limited=False)
+    u = baseline.step(Observation(speeds, np.zeros(2), future[0], future[1], command, future))
     best = _dense(drive, command, speeds, future[1:], weight, nominal_model)
-    assert rival.plan == pytest.approx(best, rel=1e-6, abs=1e-7 * max(1.0, np.abs(best).max()))
+    assert baseline.plan == pytest.approx(best, rel=1e-6, abs=1e-7 * max(1.0, np.abs(best).max()))
     first = u if drive == 'torque' else speeds + PERIOD * u / (1.0 - KEPT)
     assert first == pytest.approx(best[:, 0], rel=1e-6, abs=1e-6)
 
@@ -291,16 +292,18 @@ def test_linear_plan_is_the_optimum_of_the_dense_program(drive, size):
 @pytest.mark.parametrize('size', [1.0, 3.0, 10.0])
 def test_preview_is_within_two_percent_of_knowing_everything(size):
     """Forty rows of future against one program over the whole run."""
-    wanted = _jump(size, 90, 45)
-    best = _dense('velocity', np.zeros(2), np.zeros(2), wanted[1:90], 1e-3, _knowledge('velocity'))
+    reference = _jump(size, 90, 45)
+    best = _dense(
+        'velocity', np.zeros(2), np.zeros(2), reference[1:90], 1e-3, _knowledge('velocity')
+    )
     chi = np.zeros((90, 2))
     for k in range(89):
         chi[k + 1] = KEPT * chi[k] + (1.0 - KEPT) * best[:, k]
-    least = math.sqrt(_energy(chi, wanted))
+    least = math.sqrt(_energy(chi, reference))
     for kind in (LinearMpcPreview, DynamicMatrixPreview):
-        rival = _make(kind, 'velocity', move_time=0.002)
-        speeds, *_ = _run(rival, 'velocity', wanted)
-        assert least * (1.0 - 1e-9) <= math.sqrt(_energy(speeds, wanted)) < 1.02 * least
+        baseline = _make(kind, 'velocity', move_time=0.002)
+        speeds, *_ = _run(baseline, 'velocity', reference)
+        assert least * (1.0 - 1e-9) <= math.sqrt(_energy(speeds, reference)) < 1.02 * least
 
 
 @pytest.mark.parametrize('size', [6.0, 10.0])
@@ -310,13 +313,13 @@ def test_jump_costs_what_theory_says_with_and_without_preview(size):
     Without preview the command sets out when the jump comes: its ramp is J/a long, and the wheel
     is behind by a lag more. With preview the ramp is centred on the jump: a quarter of J³/(3a).
     """
-    wanted = _jump(size)
+    reference = _jump(size)
     ramp = size**3 / (3.0 * REACH)
     for late, early in ((LinearMpc, LinearMpcPreview), (DynamicMatrix, DynamicMatrixPreview)):
         costs = []
         for kind in (late, early):
-            rival = _make(kind, 'velocity', move_time=0.002)
-            costs.append(_energy(_run(rival, 'velocity', wanted)[0], wanted))
+            baseline = _make(kind, 'velocity', move_time=0.002)
+            costs.append(_energy(_run(baseline, 'velocity', reference)[0], reference))
         assert costs[0] == pytest.approx(ramp + LAG * size**2, rel=0.02)
         assert costs[1] == pytest.approx(ramp / 4.0, rel=0.01)
 
@@ -326,11 +329,11 @@ def test_smoothing_is_the_symmetric_filter_that_the_setting_promises(drive):
     """Gain 1/(1 + (w t)²(1 + (w lag)²)) with the servo, 1/(1 + (w t)⁴) with the integrator."""
     rate, move_time = 12.0, 0.05
     time = PERIOD * np.arange(460 + AHEAD + 1)
-    wanted = np.column_stack((np.cos(rate * time), np.sin(rate * time)))
-    speeds, *_ = _run(_make(LinearMpcPreview, drive, move_time=move_time), drive, wanted)
+    reference = np.column_stack((np.cos(rate * time), np.sin(rate * time)))
+    speeds, *_ = _run(_make(LinearMpcPreview, drive, move_time=move_time), drive, reference)
     late = slice(200, 460)
-    gains = [np.mean(np.sum(wave[late] * wanted[late], 1)) for wave in (speeds, wanted)]
-    turned = wanted[:, ::-1] * [1.0, -1.0]
+    gains = [np.mean(np.sum(wave[late] * reference[late], 1)) for wave in (speeds, reference)]
+    turned = reference[:, ::-1] * [1.0, -1.0]
     gain = gains[0] / gains[1]
     through = (rate * move_time) ** 2 * (1.0 + (rate * LAG) ** 2)
     if drive == 'torque':
@@ -343,9 +346,9 @@ def test_smoothing_is_the_symmetric_filter_that_the_setting_promises(drive):
 @pytest.mark.parametrize('drive', DRIVES)
 @pytest.mark.parametrize('kind', EVERY)
 def test_bounds_are_never_left(kind, drive):
-    rival = _make(kind, drive, robot={}, move_time=0.003)
-    inertia = wheel_inertia(rival._knowledge.robot.body, rival._knowledge.robot.geometry)
-    _, command, u = _run(rival, drive, _wander(300), noise=0.3)
+    baseline = _make(kind, drive, robot={}, move_time=0.003)
+    inertia = wheel_inertia(baseline._knowledge.robot.body, baseline._knowledge.robot.geometry)
+    _, command, u = _run(baseline, drive, _wander(300), noise=0.3)
     if drive == 'velocity':
         moves = np.diff(command, axis=0, prepend=0.0)
         assert np.abs(moves).max() <= REACH * PERIOD + 1e-9
@@ -366,21 +369,21 @@ def test_no_offset_is_left_by_a_constant_disturbance_and_a_wrong_model(kind, dri
     """Whatever share of the disturbance the shared estimate sees."""
     push = np.array([5.0, -3.0])
     times = {'integral_time': 0.1, 'bias_time': 0.1, 'filter_time': 0.02}
-    rival = _make(kind, drive, model_error=1.3, disturbance_share=1.0, **times)
-    wanted = np.tile([2.0, 1.0], (500 + AHEAD + 1, 1))
-    speeds, *_ = _run(rival, drive, wanted, lambda chi: push, np.tile(seen * push, (500, 1)))
-    assert np.abs(speeds[150] - wanted[0]).max() < 0.5
-    assert np.abs(speeds[-1] - wanted[0]).max() < 1e-6
+    baseline = _make(kind, drive, model_error=1.3, disturbance_share=1.0, **times)
+    reference = np.tile([2.0, 1.0], (500 + AHEAD + 1, 1))
+    speeds, *_ = _run(baseline, drive, reference, lambda chi: push, np.tile(seen * push, (500, 1)))
+    assert np.abs(speeds[150] - reference[0]).max() < 0.5
+    assert np.abs(speeds[-1] - reference[0]).max() < 1e-6
 
 
 @pytest.mark.parametrize('kind', EVERY)
 def test_offset_stays_while_its_own_errors_are_ignored(kind):
     """The counterpart: it is the integral, or the bias, that removes the offset."""
     push = np.array([5.0, -3.0])
-    rival = _make(kind, 'velocity', integral_time=50.0, bias_time=5.0, model_error=1.3)
-    wanted = np.tile([2.0, 1.0], (60 + AHEAD + 1, 1))
-    speeds, *_ = _run(rival, 'velocity', wanted, lambda chi: push)
-    assert np.abs(speeds[-1] - wanted[0]).min() > 0.5 * LAG * 3.0
+    baseline = _make(kind, 'velocity', integral_time=50.0, bias_time=5.0, model_error=1.3)
+    reference = np.tile([2.0, 1.0], (60 + AHEAD + 1, 1))
+    speeds, *_ = _run(baseline, 'velocity', reference, lambda chi: push)
+    assert np.abs(speeds[-1] - reference[0]).min() > 0.5 * LAG * 3.0
 
 
 @pytest.mark.parametrize('drive', DRIVES)
@@ -392,22 +395,24 @@ def test_knowing_the_friction_helps_where_the_estimate_is_late(kind, drive):
     friction = parameters.friction
     table = np.array([friction.viscous, friction.coulomb, friction.coulomb_width])
     dynamics = dynamics_vector(parameters.body, parameters.geometry)
-    wanted = _wander(500, seed=1)
-    wanted[:] = 3.0 * np.sin(6.0 * PERIOD * np.arange(len(wanted)))[:, None] * [1.0, -0.7]
+    reference = _wander(500, seed=1)
+    reference[:] = 3.0 * np.sin(6.0 * PERIOD * np.arange(len(reference)))[:, None] * [1.0, -0.7]
     late = np.array(
-        [load_acceleration(*wanted[max(k - 10, 0)], table, dynamics) for k in range(500)]
+        [load_acceleration(*reference[max(k - 10, 0)], table, dynamics) for k in range(500)]
     )
     errors = []
     for known in (robot, {**robot, 'friction.coulomb': 0.0, 'friction.viscous': 0.0}):
-        rival = _make(kind, drive, robot=known, disturbance_share=0.3 if known is robot else 1.0)
+        baseline = _make(
+            kind, drive, robot=known, disturbance_share=0.3 if known is robot else 1.0
+        )
         speeds, *_ = _run(
-            rival,
+            baseline,
             drive,
-            wanted,
+            reference,
             lambda chi: np.array(load_acceleration(*chi, table, dynamics)),
             late,
         )
-        errors.append(np.sqrt(np.mean((speeds - wanted[:500])[100:] ** 2)))
+        errors.append(np.sqrt(np.mean((speeds - reference[:500])[100:] ** 2)))
     assert errors[0] < 0.7 * errors[1]
 
 
@@ -415,12 +420,12 @@ def test_knowing_the_friction_helps_where_the_estimate_is_late(kind, drive):
 @pytest.mark.parametrize('kind', [LinearMpc, LinearMpcPreview, CasadiNmpc])
 def test_observer_parts_noise_from_following(kind, drive):
     """With a true model a slow observer follows as sharply, and feeds back far less noise."""
-    wanted = _wander(400)
+    reference = _wander(400)
     quiet, noisy = [], []
     for filter_time in (0.001, 0.5):
         how = {'filter_time': filter_time, 'integral_time': 20.0, 'disturbance_share': 0.01}
-        quiet.append(_run(_make(kind, drive, **how), drive, wanted)[0])
-        noisy.append(_run(_make(kind, drive, **how), drive, wanted, noise=0.2)[0])
+        quiet.append(_run(_make(kind, drive, **how), drive, reference)[0])
+        noisy.append(_run(_make(kind, drive, **how), drive, reference, noise=0.2)[0])
     assert np.abs(quiet[0] - quiet[1]).max() < 1e-3
     # It starts from a single noisy estimate, which takes its time to be forgotten.
     spread = [np.std((with_noise - quiet[0])[200:]) for with_noise in noisy]
@@ -454,51 +459,51 @@ def test_what_does_not_settle_cannot_be_identified():
 @pytest.mark.parametrize('drive', DRIVES)
 def test_convolution_of_moves_and_loads_is_the_wheel_itself(drive):
     """With a true model nothing is ever missed, however command and known disturbance move."""
-    rival = _make(DynamicMatrixPreview, drive, disturbance_share=1.0)
+    baseline = _make(DynamicMatrixPreview, drive, disturbance_share=1.0)
     seen = 4.0 * np.sign(np.sin(0.11 * np.arange(300)))[:, None] * [1.0, 0.5]
-    missed, now, original = [], iter(seen), rival.step
+    missed, now, original = [], iter(seen), baseline.step
 
     def step(observation):
         u = original(observation)
-        missed.append(np.abs(rival.bias).max())
+        missed.append(np.abs(baseline.bias).max())
         return u
 
-    rival.step = step
-    speeds, *_ = _run(rival, drive, _wander(300), lambda chi: next(now), seen)
+    baseline.step = step
+    speeds, *_ = _run(baseline, drive, _wander(300), lambda chi: next(now), seen)
     assert np.abs(speeds).max() > 3.0
     assert max(missed) < 2e-3  # what of the responses is cut off
 
 
 def test_known_loads_are_compensated_by_a_shift_of_the_command():
     """Friction that is known, and therefore not fed forward again, changes nothing but that."""
-    wanted = 2.0 * np.sin(0.05 * np.arange(100))[:, None] * [1.0, -0.5]
+    reference = 2.0 * np.sin(0.05 * np.arange(100))[:, None] * [1.0, -0.5]
     rough = _make(DynamicMatrixPreview, 'velocity', robot={})
     smooth = _make(DynamicMatrixPreview, 'velocity')
     robot = PaperRobotParameters()
     friction = robot.friction
     table = np.array([friction.viscous, friction.coulomb, friction.coulomb_width])
     dynamics = dynamics_vector(robot.body, robot.geometry)
-    first = np.array(load_acceleration(*wanted[1], table, dynamics))
+    first = np.array(load_acceleration(*reference[1], table, dynamics))
     commands = np.array([-LAG * first, np.zeros(2)])
     for k in range(55):
-        load = np.array(load_acceleration(*wanted[k + 1], table, dynamics))
-        future = wanted[k : k + AHEAD]
-        for i, (rival, seen) in enumerate(((rough, load), (smooth, np.zeros(2)))):
+        load = np.array(load_acceleration(*reference[k + 1], table, dynamics))
+        future = reference[k : k + AHEAD]
+        for i, (baseline, seen) in enumerate(((rough, load), (smooth, np.zeros(2)))):
             observation = Observation(
-                wanted[k], seen, wanted[k], wanted[k + 1], commands[i].copy(), future
+                reference[k], seen, reference[k], reference[k + 1], commands[i].copy(), future
             )
-            u = rival.step(observation)
-            commands[i] = wanted[k] + PERIOD * u / (1.0 - KEPT)
+            u = baseline.step(observation)
+            commands[i] = reference[k] + PERIOD * u / (1.0 - KEPT)
         assert commands[0] + LAG * load == pytest.approx(commands[1], abs=2e-4)
     assert np.abs(commands).max() > 0.5
 
 
 def test_dynamic_matrix_and_state_space_agree_on_a_true_model():
     """Peers with one model, one cost and one disturbance give one answer."""
-    wanted = _wander(300)
+    reference = _wander(300)
     same = {'move_time': 0.02, 'disturbance_share': 1.0}
     answers = [
-        _run(_make(kind, 'velocity', **same), 'velocity', wanted)[2]
+        _run(_make(kind, 'velocity', **same), 'velocity', reference)[2]
         for kind in (LinearMpcPreview, DynamicMatrixPreview)
     ]
     assert np.abs(answers[0]).max() > 10.0
@@ -510,11 +515,11 @@ def test_dynamic_matrix_and_state_space_agree_on_a_true_model():
 
 @pytest.mark.parametrize('drive', DRIVES)
 def test_nonlinear_agrees_with_linear_where_the_wheels_are_linear(drive):
-    wanted = _wander(250)
+    reference = _wander(250)
     seen = np.tile([2.0, -1.0], (250, 1))
     same = {'disturbance_share': 1.0, 'integral_time': 1.0}
     linear, nonlinear = (
-        _run(_make(kind, drive, **same), drive, wanted, lambda chi: seen[0], seen)[2]
+        _run(_make(kind, drive, **same), drive, reference, lambda chi: seen[0], seen)[2]
         for kind in (LinearMpcPreview, CasadiNmpc)
     )
     assert np.abs(linear).max() > 20.0
@@ -598,9 +603,9 @@ def test_derivatives_of_the_model_are_its_differences(drive):
 
 def test_one_linearisation_a_step_follows_the_converged_plan():
     """Real-time iterations: what one leaves over, the next step takes up."""
-    wanted = _wander(200)
+    reference = _wander(200)
     once, often = (
-        _run(_make(CasadiNmpc, 'velocity', robot={}, iterations=count), 'velocity', wanted)[0]
+        _run(_make(CasadiNmpc, 'velocity', robot={}, iterations=count), 'velocity', reference)[0]
         for count in (1, 5)
     )
     assert np.abs(once - often).max() < 0.02
@@ -618,27 +623,29 @@ def test_without_casadi_only_making_one_fails(monkeypatch):
 @pytest.mark.parametrize('drive', DRIVES)
 @pytest.mark.parametrize('kind', EVERY)
 def test_equal_runs_are_equal_bit_for_bit_and_lent_arrays_stay(kind, drive):
-    wanted = _wander(120)
-    kept = wanted.copy()
-    one, two = (_run(_make(kind, drive, robot={}), drive, wanted, noise=0.2)[2] for _ in range(2))
+    reference = _wander(120)
+    kept = reference.copy()
+    one, two = (
+        _run(_make(kind, drive, robot={}), drive, reference, noise=0.2)[2] for _ in range(2)
+    )
     assert np.array_equal(one, two)
-    assert np.array_equal(wanted, kept)
-    rival = _make(kind, drive, robot={})
+    assert np.array_equal(reference, kept)
+    baseline = _make(kind, drive, robot={})
     lent = [np.array([0.1 * i, -0.2]) for i in range(1, 6)]
     copies = [array.copy() for array in lent]
-    answer = rival.step(Observation(*lent, wanted[:AHEAD] if kind.preview else None))
+    answer = baseline.step(Observation(*lent, reference[:AHEAD] if kind.preview else None))
     for array, copy in zip(lent, copies, strict=True):
         assert np.array_equal(array, copy)
     before = answer.copy()
-    rival.step(Observation(*lent, wanted[:AHEAD] if kind.preview else None))
+    baseline.step(Observation(*lent, reference[:AHEAD] if kind.preview else None))
     assert np.array_equal(answer, before), 'the answer must not be overwritten by the next step'
 
 
 @pytest.mark.parametrize('kind', [LinearMpcPreview, DynamicMatrixPreview, CasadiNmpc])
 def test_preview_without_a_future_is_refused(kind):
-    rival = _make(kind, 'velocity')
+    baseline = _make(kind, 'velocity')
     with pytest.raises(ValueError, match='future'):
-        rival.step(Observation(*(np.zeros(2) for _ in range(5)), None))
+        baseline.step(Observation(*(np.zeros(2) for _ in range(5)), None))
 
 
 @pytest.mark.parametrize(
@@ -660,15 +667,15 @@ def test_settings_of_another_method_are_refused(kind, wrong):
 @pytest.mark.parametrize('kind', LINEAR)
 def test_cut_answers_leave_no_wind_up(kind, drive):
     """A drive that lets only a tenth through for a while; afterwards all is as before."""
-    rival = _make(kind, drive)
+    baseline = _make(kind, drive)
     nominal_model = _knowledge(drive)
     speeds, command, far = np.zeros(2), np.zeros(2), np.array([6.0, -6.0])
     highest = 0.0
     for k in range(600):
-        wanted = far if k < 50 else 0.1 * far
-        future = np.tile(wanted, (AHEAD, 1)) if kind.preview else None
-        u = rival.step(
-            Observation(speeds.copy(), np.zeros(2), wanted, wanted, command.copy(), future)
+        reference = far if k < 50 else 0.1 * far
+        future = np.tile(reference, (AHEAD, 1)) if kind.preview else None
+        u = baseline.step(
+            Observation(speeds.copy(), np.zeros(2), reference, reference, command.copy(), future)
         )
         allowed = np.clip(u, -10.0, 10.0) if k < 200 else u
         if drive == 'velocity':
@@ -676,7 +683,7 @@ def test_cut_answers_leave_no_wind_up(kind, drive):
             speeds = KEPT * speeds + (1.0 - KEPT) * command
         else:
             speeds = speeds + PERIOD * allowed
-        rival.applied(allowed, limited=bool(np.any(allowed != u)))
+        baseline.applied(allowed, limited=bool(np.any(allowed != u)))
         if k > 100:
             highest = max(highest, float(np.abs(speeds - 0.1 * far).max()))
     assert highest < 4.5  # how far it had come when it was called back

@@ -64,10 +64,10 @@ class Proportional(BaselineController):
         self.steps += 1
         if 0 <= self.parameters.broken_from < self.steps:
             return np.full(2, math.nan)
-        slope = (observation.wanted_next - observation.wanted) / self.nominal_model.period
+        slope = (observation.next_reference - observation.reference) / self.nominal_model.period
         return (
             slope
-            - self.parameters.gain * (observation.speeds - observation.wanted)
+            - self.parameters.gain * (observation.speeds - observation.reference)
             - observation.unexplained
         )
 
@@ -92,8 +92,8 @@ class Noting(Proportional):
                     np.array(getattr(observation, name))
                     for name in ('speeds', 'unexplained', 'command')
                 ),
-                observation.wanted.copy(),
-                observation.wanted_next.copy(),
+                observation.reference.copy(),
+                observation.next_reference.copy(),
                 future,
             ]
         )
@@ -260,7 +260,7 @@ def test_every_case_shows_in_the_run_and_the_load_change_from_half_of_it_on(driv
     for case, changed in runs.items():
         differs = np.flatnonzero((changed.speeds != nominal.speeds).any(axis=1))
         assert differs.size > 50, case
-        np.testing.assert_array_equal(changed.wanted, nominal.wanted)
+        np.testing.assert_array_equal(changed.reference, nominal.reference)
         np.testing.assert_allclose(
             changed.measured - changed.speeds, nominal.measured - nominal.speeds, atol=1e-12
         )
@@ -298,7 +298,7 @@ def test_a_method_knows_how_fast_both_wheels_may_change_at_once():
 
 def test_the_reference_has_three_rad_per_second_on_every_wheel_over_seeds():
     values = np.array(
-        [Scenario('torque', 0.0, 'nominal', s).reference().wanted[300:6000] for s in TUNING_SEEDS]
+        [Scenario('torque', 0.0, 'nominal', s).reference().speeds[300:6000] for s in TUNING_SEEDS]
     )
     assert values.std(axis=(0, 1)) == pytest.approx([3.0, 3.0], rel=0.08)
     assert np.abs(values.mean(axis=(0, 1))).max() < 0.5
@@ -311,7 +311,7 @@ def test_the_reference_jumps_at_the_switch_times_alone_and_its_slope_does_not_ju
     assert np.flatnonzero(reference.switched).tolist() == switches
     assert (np.flatnonzero(np.diff(reference.modes)) + 1).tolist() == switches
     # Between switches r is the integral of its slope (trapezoid).
-    jump = np.diff(reference.wanted, axis=0) - 0.5 / RATE * (
+    jump = np.diff(reference.speeds, axis=0) - 0.5 / RATE * (
         reference.rate[1:] + reference.rate[:-1]
     )
     size = np.abs(jump).max(axis=1)
@@ -326,7 +326,7 @@ def test_a_reference_is_computed_once_and_cannot_be_written_to():
     assert Scenario('velocity', 0.1, 'friction x3', 5, 3.0).reference() is first
     assert Scenario('torque', 0.0, 'nominal', 6, 3.0).reference() is not first
     with pytest.raises(ValueError, match='read-only'):
-        first.wanted[0] = 1.0
+        first.speeds[0] = 1.0
 
 
 # -- the loop ---------------------------------------------------------------------------------
@@ -358,7 +358,7 @@ def test_what_is_recorded_fits_together(drive):
     scenario = Scenario(drive, 0.04, 'nominal', 9, 14.0)
     record, method = noted(Noting, scenario)
     reference = scenario.reference()
-    np.testing.assert_array_equal(record.wanted, reference.wanted[:1400])
+    np.testing.assert_array_equal(record.reference, reference.speeds[:1400])
     assert record.time[-1] == 13.99
     noise = record.measured - record.speeds
     assert np.var(noise) == pytest.approx(0.04, rel=0.1)
@@ -381,9 +381,9 @@ def test_what_is_recorded_fits_together(drive):
 
 def method_u(method):
     """Return what the method answered, from what it saw."""
-    for speeds, unexplained, _, wanted, following, _ in method.seen:
-        slope = (following - wanted) / method.nominal_model.period
-        yield (slope - 8.0 * (speeds - wanted) - unexplained,)
+    for speeds, unexplained, _, reference, following, _ in method.seen:
+        slope = (following - reference) / method.nominal_model.period
+        yield (slope - 8.0 * (speeds - reference) - unexplained,)
 
 
 @pytest.mark.parametrize(
@@ -392,18 +392,18 @@ def method_u(method):
 )
 def test_a_method_sees_the_reference_of_the_instant_at_which_it_acts(drive, case, late):
     scenario = Scenario(drive, 0.04, case, 6, 12.5, 0.2)
-    reference = scenario.reference()
+    sampled = scenario.reference()
     _, blind = noted(Noting, scenario)
     _, seer = noted(ForeseeingNoting, scenario)
     for k in (0, 500, 1200 - late - 1, 1200 - late, 1199, 1200, 1249):
-        *_, wanted, following, future = seer.seen[k]
+        *_, reference, following, future = seer.seen[k]
         assert future.shape == (20, 2)
-        np.testing.assert_array_equal(future, reference.wanted[k + late : k + late + 20])
-        np.testing.assert_array_equal([wanted, following], future[:2])
-        *_, wanted, following, future = blind.seen[k]
+        np.testing.assert_array_equal(future, sampled.speeds[k + late : k + late + 20])
+        np.testing.assert_array_equal([reference, following], future[:2])
+        *_, reference, following, future = blind.seen[k]
         assert future is None
-        r, slope = reference.wanted[k], reference.rate[k]
-        np.testing.assert_allclose(wanted, r + late * 0.01 * slope, atol=1e-12)
+        r, slope = sampled.speeds[k], sampled.rate[k]
+        np.testing.assert_allclose(reference, r + late * 0.01 * slope, atol=1e-12)
         np.testing.assert_allclose(following, r + (late + 1) * 0.01 * slope, atol=1e-12)
 
 
@@ -487,7 +487,7 @@ def test_an_answer_that_is_no_number_ends_the_run_and_shows():
     np.testing.assert_array_equal(record.speeds[:50], whole.speeds[:50])
     for name in ('measured', 'speeds', 'estimated', 'command', 'sent', 'unexplained'):
         assert np.isnan(getattr(record, name)[50:]).all(), name
-    np.testing.assert_array_equal(record.wanted, whole.wanted)
+    np.testing.assert_array_equal(record.reference, whole.reference)
 
 
 def test_what_does_not_fit_the_loop_is_refused():
@@ -560,7 +560,7 @@ def test_rmse_leaves_out_the_start_and_what_follows_a_switch():
     record.time[:] = np.arange(10.0)
     record.modes[6:] = 1
     record.speeds[:, 0] = [9, 9, 9, 1, 1, 1, 7, 7, 1, 1]
-    record.wanted[:, 1] = [9, 9, 9, 1, 1, 1, 7, 7, 1, 1]
+    record.reference[:, 1] = [9, 9, 9, 1, 1, 1, 7, 7, 1, 1]
     assert record.rmse(cut=2.0) == 1.0
     assert record.rmse() == pytest.approx(math.sqrt((5 + 2 * 49) / 7))
     assert record.largest_error() == 7.0
@@ -637,10 +637,10 @@ class Counting(BaselineController):
         self.steps += 1.0
         return np.zeros(2)
 
-    def learnt(self):
+    def get_weights(self):
         return {'steps': self.steps.copy()}
 
-    def restore(self, learnt):
+    def set_weights(self, learnt):
         self.steps = learnt['steps'].copy()
 
 
@@ -658,5 +658,6 @@ def test_what_practises_begins_with_what_it_learnt_run_after_run():
 def test_a_method_that_does_not_learn_needs_no_practice():
     nominal_model = Scenario('torque', 0.0, 'nominal', 101).nominal_model()
     assert (
-        MethodSpec('P', Proportional, ProportionalParameters(), True)(nominal_model).learnt() == {}
+        MethodSpec('P', Proportional, ProportionalParameters(), True)(nominal_model).get_weights()
+        == {}
     )

@@ -96,7 +96,7 @@ def test_the_robot_stands_until_its_gyro_is_calibrated_and_then_follows_closely(
     assert not record.asked[standing].any()
     assert set(np.array(record.controller_says)[standing]) == {'disabled by request'}
     assert not any(np.array(record.controller_says)[~standing])
-    error = (record.rotors - record.wanted)[record.rows(3.0, 6.0)]
+    error = (record.rotors - record.reference)[record.rows(3.0, 6.0)]
     assert np.sqrt(np.mean(error**2)) < 0.06
 
 
@@ -180,7 +180,7 @@ def test_a_delay_that_the_controller_is_told_costs_little():
         controller = loop_controller().with_values({'speed_filter.dead_time': dead_time})
         record = run_twin(robot, controller, chaotic_course(15.0), 15.0)
         rows = record.rows(5.0, 15.0)
-        errors.append(np.sqrt(np.mean((record.rotors - record.wanted)[rows] ** 2)))
+        errors.append(np.sqrt(np.mean((record.rotors - record.reference)[rows] ** 2)))
     assert errors[0] > 0.5
     assert errors[1] < 0.2
 

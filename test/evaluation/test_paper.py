@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""``lab paper``: the plan, the campaign that can be stopped, statistics, claims and the page."""
+"""``t3mpc paper``: the plan, the campaign that can be stopped, statistics, claims and the page."""
 
 import argparse
 import csv
@@ -68,7 +68,7 @@ EXACT = 'linear MPC preview, exact model'
 @dataclass(frozen=True)
 class FakeMethod:
     name: str
-    rival: bool
+    baseline: bool
     preview: bool
     parameters: dict = field(default_factory=dict)
     controller_type: type | None = None
@@ -84,9 +84,14 @@ class FakeScenario:
 
 
 def fake_methods(drive):
-    """Return stages that get better one by one, and four rivals that never do."""
-    rivals = (('PI + feed-forward', False), ('type-1 fuzzy', False), ('NMPC', True), (EXACT, True))
-    table = {name: FakeMethod(name, True, ahead, {'error': 0.9}) for name, ahead in rivals}
+    """Return stages that get better one by one, and four baselines that never do."""
+    baselines = (
+        ('PI + feed-forward', False),
+        ('type-1 fuzzy', False),
+        ('NMPC', True),
+        (EXACT, True),
+    )
+    table = {name: FakeMethod(name, True, ahead, {'error': 0.9}) for name, ahead in baselines}
     for i, stage in enumerate(STAGES):
         table[stage] = FakeMethod(stage, False, stage == FULL, {'error': 0.5 - 0.08 * i})
     for name in WITHOUT.values():
@@ -103,12 +108,12 @@ def fake_run(scenario, method):
     time[:] = np.arange(n) / 100.0
     modes = np.minimum(time // 12.0, 4.0)
     phases = generator.uniform(0.0, 6.0, 2)
-    wanted = 4.0 * np.sin(0.8 * time[:, np.newaxis] + phases + 2.0 * modes[:, np.newaxis])
+    reference = 4.0 * np.sin(0.8 * time[:, np.newaxis] + phases + 2.0 * modes[:, np.newaxis])
     size = method.parameters['error'] * (1.0 + scenario.noise)
     run.modes[:] = modes
-    run.wanted[:] = wanted
-    run.speeds[:] = wanted + size * generator.standard_normal((n, 2))
-    run.command[:] = run.effort[:] = np.gradient(wanted, 0.01, axis=0)
+    run.reference[:] = reference
+    run.speeds[:] = reference + size * generator.standard_normal((n, 2))
+    run.command[:] = run.effort[:] = np.gradient(reference, 0.01, axis=0)
     run.terms[:, 0] = generator.standard_normal((n, 2))
     noise = math.sqrt(scenario.noise) * generator.standard_normal((n, 2))
     run.measured[:] = run.speeds + noise
@@ -154,30 +159,30 @@ def small_campaign(path, runner, methods=fake_methods, sources='s', progress=Non
 def test_the_full_plan_holds_every_run_that_the_tables_need_and_no_other():
     found = needed_experiments(bench(), make_grid(bench()))
     names = fake_methods('torque')
-    rivals = {name for name, method in names.items() if method.rival}
+    baselines = {name for name, method in names.items() if method.baseline}
     missing = {name for name in names if name.startswith('full with')}
-    stages = set(names) - rivals - missing
-    wanted = set()
+    stages = set(names) - baselines - missing
+    expected = set()
     for drive in ('torque', 'velocity'):
         for noise in NOISES:
-            wanted |= {Experiment(name, drive, noise, 'nominal') for name in stages | rivals}
+            expected |= {Experiment(name, drive, noise, 'nominal') for name in stages | baselines}
             for case in CASES[1:]:
                 if drive == 'torque' and case == 'dead time':
                     continue
                 if noise in (0.0, 0.04):
-                    wanted |= {Experiment(name, drive, noise, case) for name in stages}
+                    expected |= {Experiment(name, drive, noise, case) for name in stages}
                 if noise == 0.04 and case in ('mass +30 %', 'mass -30 %'):
-                    wanted |= {
+                    expected |= {
                         Experiment(name, drive, noise, case)
-                        for name in rivals
+                        for name in baselines
                         if names[name].preview
                     }
         for name in missing:
             for case in ('nominal', *INTENDED_CASES.get(name, ())):
                 if drive == 'velocity' or case != 'dead time':
-                    wanted.add(Experiment(name, drive, 0.04, case))
+                    expected.add(Experiment(name, drive, 0.04, case))
     assert len(found) == len(set(found))
-    assert set(found) == wanted
+    assert set(found) == expected
 
 
 def test_the_quick_plan_is_part_of_the_full_one_and_shorter():
@@ -208,7 +213,7 @@ def test_a_stage_of_the_controller_that_is_called_a_rival_is_refused():
     def confused(drive):
         return fake_methods(drive) | {FULL: FakeMethod(FULL, True, True)}
 
-    with pytest.raises(ValueError, match='must not be rivals: got full'):
+    with pytest.raises(ValueError, match='must not be baselines: got full'):
         needed_experiments(bench(methods=confused), SMALL)
 
 
@@ -311,7 +316,7 @@ def test_numbers_survive_the_file_bit_for_bit(tmp_path):
 
 def test_what_is_measured_of_a_run():
     run = fake_run(FakeScenario('torque', 0.0, 'nominal', 101, 20.0), fake_methods('')[FULL])
-    run.speeds[:] = run.wanted
+    run.speeds[:] = run.reference
     run.speeds[250] += 9.0  # within the start: nobody looks
     run.speeds[1210] += 0.5  # within the second about the switch at 12 s
     run.speeds[1700, 1] -= 0.25
@@ -376,7 +381,7 @@ def test_settings_that_are_not_plain_are_refused():
 
 def test_the_digest_sees_what_can_change_a_run_and_nothing_else(tmp_path):
     names = (
-        'control/law.py', 'lab/rivals/pi.py', 'lab/paper/store.py', 'lab/paper/page.py',
+        'control/law.py', 'lab/baselines/pi.py', 'lab/paper/store.py', 'lab/paper/page.py',
         'nodes/a.py', 'lab/program.py', 'control/__pycache__/law.pyc', 'control/notes.md',
     )  # fmt: skip
     for name in names:
@@ -402,7 +407,7 @@ def numbers_of(*rmse, chatter=100.0, settled=0.01):
 
 def table_of(entries, settled=0.01, chatter=None):
     """Return results from {(method, drive, noise, case): RMSE of each seed}."""
-    kinds = {name: (method.rival, method.preview) for name, method in fake_methods('').items()}
+    kinds = {name: (method.baseline, method.preview) for name, method in fake_methods('').items()}
     chatter = chatter or {}
     numbers = {
         Experiment(*key): numbers_of(*rmse, settled=settled, chatter=chatter.get(key[0], 100.0))
@@ -679,7 +684,7 @@ def test_the_json_has_what_is_promised(folder):
     content = json.loads((folder / 'results.json').read_text())
     assert {'results', 'claims', 'settings', 'version', 'estimation'} <= set(content)
     keys = {
-        'controller', 'rival', 'preview', 'drive', 'noise', 'case', 'rmse_mean', 'rmse_ci95',
+        'controller', 'baseline', 'preview', 'drive', 'noise', 'case', 'rmse_mean', 'rmse_ci95',
         'settled_mean', 'settled_ci95', 'chatter_mean', 'largest_error', 'finite', 'seeds',
         'duration',
     }  # fmt: skip

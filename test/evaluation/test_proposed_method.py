@@ -11,7 +11,7 @@ from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.evaluation.closed_loop import MethodSpec, run
 from t3mpc_ros.evaluation.confidence_intervals import paired
 from t3mpc_ros.evaluation.methods import methods
-from t3mpc_ros.evaluation.proposed_method import ComposedParameters, ProposedController
+from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
 from t3mpc_ros.evaluation.scenario import RATE, Scenario
 from t3mpc_ros.evaluation.tuning.tuned_parameters import StoreError, TunedParameters
 from t3mpc_ros.geometry.kinematics import twist_from_wheels, wheels_from_twist
@@ -22,7 +22,7 @@ NS = 10_000_000
 
 
 def _spec(**changes):
-    return MethodSpec('full', ProposedController, ComposedParameters.from_dict(changes))
+    return MethodSpec('full', ProposedController, ProposedParameters.from_dict(changes))
 
 
 def _as_the_nodes_close_it(scenario):
@@ -33,11 +33,11 @@ def _as_the_nodes_close_it(scenario):
         ControllerParameters.from_dict({'speed_filter.noise_variance': scenario.noise})
     )
     controller.warm_up()
-    wanted = scenario.reference().wanted
+    reference = scenario.reference().speeds
     lead = round(scenario.lead * RATE)
 
     def tell(k):
-        twist = twist_from_wheels(WheelSpeeds(*wanted[k].tolist()), geometry)
+        twist = twist_from_wheels(WheelSpeeds(*reference[k].tolist()), geometry)
         controller.add_reference(State(k * NS, ORIGIN, twist))
 
     for k in range(lead):
@@ -58,7 +58,7 @@ def test_the_offline_loop_is_the_loop_of_the_nodes(noise):
     """What the lab reports of the full controller is what the node does, jump for jump."""
     scenario = Scenario('velocity', noise, 'nominal', 2, 30.0)
     record = run(scenario, _spec(**{'speed_filter.noise_variance': noise}))
-    assert np.abs(np.diff(record.wanted, axis=0)).max() > 2.0  # there is a real jump in it
+    assert np.abs(np.diff(record.reference, axis=0)).max() > 2.0  # there is a real jump in it
     np.testing.assert_allclose(record.speeds, _as_the_nodes_close_it(scenario), atol=1e-6)
 
 
@@ -105,7 +105,7 @@ def test_a_random_predictor_has_no_skill_and_the_taught_one_has():
     skills = {}
     for random in (False, True):
         method = ProposedController(
-            ComposedParameters.from_dict(
+            ProposedParameters.from_dict(
                 {'random_predictor': random, 'predictive.learning': not random}
             ),
             scenario.nominal_model(),

@@ -537,9 +537,13 @@ class Feedback(BaselineController):
             raise RuntimeError('asked to fail')
         self._gain, self._period = parameters.gain, nominal_model.period
 
-    def step(self, view):
-        forward = (view.wanted_next - view.wanted) / self._period
-        return forward - view.unexplained - self._gain * (view.speeds - view.wanted)
+    def step(self, observation):
+        forward = (observation.next_reference - observation.reference) / self._period
+        return (
+            forward
+            - observation.unexplained
+            - self._gain * (observation.speeds - observation.reference)
+        )
 
 
 FEEDBACK = MethodDefinition(
@@ -724,22 +728,22 @@ def test_time_left_is_rounded(seconds, words):
 
 def test_settings_that_do_not_fit_together_cost_an_evaluation_and_no_run(tmp_path):
     """The table refuses a + c beyond 1500, though each is in range."""
-    contestant = MethodDefinition(
+    method = MethodDefinition(
         'pair',
-        _rival_of(Gains),
+        _baseline_of(Gains),
         {'torque': Gains(a=500.0, c=500.0)},
         (SearchRange('a', 1.0, 1000.0, log=False), SearchRange('c', 1.0, 1000.0, log=False)),
     )
     evaluate, counts = counted(
         lambda method, drive, candidates: [1e4 - each.a - each.c for each in candidates]
     )
-    store = tune_methods([contestant], ['torque'], 150, 1, tmp_path / 'a.json', evaluate=evaluate)
+    store = tune_methods([method], ['torque'], 150, 1, tmp_path / 'a.json', evaluate=evaluate)
     assert counts['pair', 'torque'] < 150
     found = store.parameters('pair', 'torque', Gains)
     assert 1400.0 < found.a + found.c <= 1500.0
 
 
-def _rival_of(table):
+def _baseline_of(table):
     return type('Made', (Feedback,), {'parameters_type': table})
 
 

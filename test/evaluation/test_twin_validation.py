@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""``lab twin``: courses under slip, parts against their sheets, and the command."""
+"""``t3mpc twin``: courses under slip, parts against their sheets, and the command."""
 
 import math
 

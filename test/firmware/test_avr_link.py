@@ -32,7 +32,7 @@ from t3mpc_ros.radio.protocol.framing import encode_frame
 pytestmark = pytest.mark.skipif(bool(missing_tools()), reason=f'not installed: {missing_tools()}')
 
 FIRST_PHASE = 1700
-"""us; the next command reaches the robot 2.7 ms after its last state was sampled"""
+"""us; the next command reaches the robot 2.7 ms after the last state was sampled"""
 VECTORS = json.loads((Path(__file__).parents[1] / 'golden' / 'radio_vectors.json').read_text())
 
 
@@ -41,7 +41,7 @@ def boards() -> Iterator[Boards]:
     yield from booted()
 
 
-# -- bytes ----------------------------------------------------------------------------------------
+# -- frames ---------------------------------------------------------------------------------------
 
 
 def test_golden_transmissions_reach_the_robot(boards: Boards) -> None:
@@ -56,7 +56,7 @@ def test_golden_transmissions_reach_the_robot(boards: Boards) -> None:
         result = codec.decode_from_dongle(found[0])
         assert result.id == fields['id']
         assert result.first & 1
-        assert boards.heard().hex() == (fields['second'] or fields['first'])
+        assert boards.last_packet().hex() == (fields['second'] or fields['first'])
 
 
 def test_golden_replies_pass_the_dongle(boards: Boards) -> None:
@@ -105,7 +105,7 @@ def test_rejected_vectors_are_counted(boards: Boards) -> None:
 
 
 def test_a_packet_wider_than_the_fifo_is_dropped(boards: Boards) -> None:
-    """Such a width stops firmware that trusts it, or lets it write beyond its buffer."""
+    """Without the check such a width stops the firmware or overflows a buffer."""
     boards.start()
     before = boards.request(Poll(0, 0, 1), Poll(0, 0, 1))
     boards.call('inject', bytes(32), 32, 200)
@@ -117,7 +117,7 @@ def test_a_packet_wider_than_the_fifo_is_dropped(boards: Boards) -> None:
 
 def test_serial_line_recovers_from_noise_and_bursts(boards: Boards) -> None:
     boards.run(0.13)
-    boards.write(b'\x05rubbish\x00' + encode_frame(b'\x03\x01abcd')[:-4] + b'\x00')
+    boards.write(b'\x05noise\x00' + encode_frame(b'\x03\x01abcd')[:-4] + b'\x00')
     pings = [encode_frame(codec.encode(Ping(i, b'ping'))) for i in range(20)]
     boards.write(b''.join(pings))
     boards.run(0.03)
@@ -127,7 +127,7 @@ def test_serial_line_recovers_from_noise_and_bursts(boards: Boards) -> None:
     assert pongs[-1].overruns == 0
 
 
-# -- times ----------------------------------------------------------------------------------------
+# -- timing ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize('rate', [50, 100])
@@ -145,7 +145,7 @@ def test_round_trip_time_is_below_six_milliseconds(boards: Boards, rate: int) ->
     middle, worst = statistics.median(times), max(times)
     print(f'\n{rate} Hz: round trip {middle:.2f} ms (median), {worst:.2f} ms (longest)')
     assert all(states)
-    # A stepping interrupt that is missed costs the robot's clock 50 us.
+    # A missed step interrupt delays the clock of the robot by 50 us.
     assert abs(min(clocks[:250]) - min(clocks[250:])) < 50
     assert middle <= 6.0
     assert worst <= 1000 / rate
@@ -155,24 +155,24 @@ def test_round_trip_time_is_below_six_milliseconds(boards: Boards, rate: int) ->
 
 @pytest.mark.parametrize(('p', 'limit'), [(0.1, 0.005), (0.3, 0.1)])
 def test_share_of_lost_cycles_on_a_lossy_channel(boards: Boards, p: float, limit: float) -> None:
-    """Whole: the command was taken, and the state that it led to came back with it."""
+    """A cycle is complete if its command was executed and its own state was returned."""
     boards.start()
     assert boards.ask(LinkParameters().configure(1)).chip_ok
     boards.call('loss', p, p)
-    lost = unheard = 0
+    lost = unacknowledged = 0
     for _ in range(500):
         end = boards.now_us + 14000
         command = boards.command()
         result = boards.exchange(command)
-        unheard += not result.first & 1
+        unacknowledged += not result.first & 1
         state = codec.decode_uplink(result.payload) if result.payload else None
         whole = state is not None and state.seq == command.seq
-        # A state that the POLL has fetched is the cycle's own, never the one before.
+        # A state fetched by the POLL is that of this cycle, never that of the previous one.
         assert whole or not result.second & 2
         lost += not whole
         boards.run_until(end)
     one = (1 - (1 - p) ** 2) ** 5
-    print(f'\np = {p}: {unheard / 5:.1f} % of commands without ACK ({100 * one:.1f} % expected)')
+    print(f'\np = {p}: {unacknowledged / 5:.1f} % without ACK ({100 * one:.1f} % expected)')
     print(
         f'{lost / 5:.1f} % of whole cycles ({100 * (1 - (1 - one) ** 2):.1f} % expected at most)'
     )
@@ -183,10 +183,10 @@ def test_share_of_lost_cycles_on_a_lossy_channel(boards: Boards, p: float, limit
 
 @pytest.mark.slow
 def test_telemetry_never_lags_by_an_exchange(boards: Boards) -> None:
-    """A refresh that met a packet once left two payloads queued: every later state was old.
+    """Regression: a refresh concurrent with a packet left two payloads queued.
 
     After 100 ms of silence the robot loads a newer state; commands arrive at 2000 phases of that,
-    a microsecond apart. The silence is told to the program, not waited for: 3 minutes else.
+    1 us apart. The silence is written into the variables of the firmware, which saves 3 minutes.
     """
     boards.start()
     ram = Ram(boards)
@@ -196,14 +196,14 @@ def test_telemetry_never_lags_by_an_exchange(boards: Boards) -> None:
         assert boards.call('waiting_acks') <= 1
         loaded = ram.get('loaded_us', 4) - 100_000 + FIRST_PHASE + phase
         ram.put('loaded_us', loaded % 2**32)
-        if phase in (0, 1999):  # the first refresh comes before the command, the last one behind
+        if phase in (0, 1999):  # refresh before the first command, after the last
             boards.run(0.0009)
             assert (ram.get('loaded_us', 4) != loaded % 2**32) is (phase == 0)
     assert boards.radio(ROBOT).queued_acks == 0
 
 
 def test_dongle_clock_beyond_half_of_its_range(boards: Boards) -> None:
-    """A counter of overflows with 16 bits made it come round after 35.8 minutes."""
+    """Regression: a 16-bit overflow counter made the clock wrap after 35.8 minutes."""
     boards.run(0.13)
     address = boards.symbol(DONGLE, 'overflows')
     for i, byte in enumerate((0xFFFE).to_bytes(4, 'little')):
@@ -215,7 +215,7 @@ def test_dongle_clock_beyond_half_of_its_range(boards: Boards) -> None:
     assert after - before == pytest.approx(100_000, abs=2000)
 
 
-# -- what it takes --------------------------------------------------------------------------------
+# -- resources ------------------------------------------------------------------------------------
 
 
 def test_program_size_and_processor_load(boards: Boards) -> None:

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The boards' real programs, run instruction by instruction: motion, stops, failures, sensors."""
+"""The real firmware of both boards in simavr: motion, stops, failures, sensors."""
 
 from collections.abc import Iterator
 import statistics
@@ -39,7 +39,7 @@ pytestmark = pytest.mark.skipif(bool(missing_tools()), reason=f'not installed: {
 EXTERNAL_RESET, WATCHDOG_RESET = 2, 8
 TIMER_0_INTERRUPTS = 0x6E  # TIMSK0 of the ATmega2560
 KEY_ADDRESS = 8
-SLOW_GAP = 20  # 5 ms: a signed HELLO costs the robot four hashes
+SLOW_GAP = 20  # 5 ms: a signed HELLO takes four hashes
 
 
 @pytest.fixture
@@ -65,11 +65,11 @@ def test_wheels_turn_as_fast_as_commanded(boards: Boards) -> None:
 def test_silence_stops_the_wheels(boards: Boards) -> None:
     boards.start()
     drive(boards, 0.5, 5000, 5000)
-    boards.run(0.15)  # the TTL of 0.2 s still runs
+    boards.run(0.15)  # within the TTL of 0.2 s
     before = boards.pulses()
     boards.run(0.02)
     assert boards.pulses() != before
-    boards.run(0.2)  # 0.2 s of TTL, 0.17 s of ramp
+    boards.run(0.2)  # TTL 0.2 s, ramp 0.17 s
     before = boards.pulses()
     boards.run(0.3)
     assert boards.pulses() == before
@@ -110,7 +110,7 @@ def test_any_sender_may_stop_the_robot(boards: Boards) -> None:
 
 
 def test_step_pulse_timing_at_full_speed(boards: Boards) -> None:
-    """DRV8825: 1.9 us high and low, 0.65 us from DIR to STEP."""
+    """DRV8825: STEP 1.9 us high and low, 0.65 us from DIR to STEP."""
     boards.start()
     boards.request(ParamSet(boards.session, 9, 0, 19600))
     drive(boards, 1.5, 19600, 19600)
@@ -155,7 +155,7 @@ def test_robot_stops_during_a_jam_and_recovers(boards: Boards) -> None:
     boards.call('jam', True)
     lost = sum(cycle(boards, 0.02, 5000, 5000) is None for _ in range(50))
     assert lost == 50
-    # A chip that gave up begins anew if its flag goes before its packet: that hid the retransmits.
+    # Clearing the flag before flushing the packet would restart the chip and hide the count.
     assert boards.exchange(boards.command()).first == 0x44
     before = boards.pulses()
     boards.run(0.05)
@@ -250,7 +250,7 @@ def test_a_radio_is_configured_again_after_power_loss(boards: Boards, board: int
     assert answers[-1]
 
 
-# -- sensors and settings -------------------------------------------------------------------------
+# -- sensors and parameters -----------------------------------------------------------------------
 
 
 def test_ranges_battery_and_temperature_reach_the_host(boards: Boards) -> None:
@@ -294,7 +294,7 @@ def test_keyed_robot_follows_only_signed_commands(boards: Boards) -> None:
     key = bytes(range(0x80, 0x90))
     boards.store(KEY_ADDRESS, key + crc16(key).to_bytes(2, 'little'))
     boards.run(0.13)
-    assert boards.hello().session == 0  # an unsigned one is refused
+    assert boards.hello().session == 0  # an unsigned HELLO is rejected
     host_us = round(boards.now_us)
     hello = sign_hello(key, boards.session, 0, host_us, b'hostnonc')
     info = boards.request(hello, Poll(0, 1, 2), SLOW_GAP)
@@ -308,16 +308,16 @@ def test_keyed_robot_follows_only_signed_commands(boards: Boards) -> None:
     forged = signer.sign(boards.command(5000, 5000)._replace(tag=bytes(8)))
     forged = forged._replace(left=6000)
     assert boards.request(forged).seq != forged.seq
-    assert boards.request(signed).seq == signed.seq  # a replay: taken notice of once
+    assert boards.request(signed).seq == signed.seq  # a replay counts once
     assert boards.drive(5000, 5000).seq == signed.seq  # unsigned
     boards.run(0.3)
     assert boards.pulses() == before
     aux = boards.request(Poll(0, 0, 1), Poll(0, 0, 1))
-    assert aux.bad_session == 4  # and the HELLO
+    assert aux.bad_session == 4  # including the HELLO
 
 
 def test_signed_commands_are_answered_in_time(boards: Boards) -> None:
-    """Two tags of 7000 cycles and more: the state is loaded before the POLL fetches it."""
+    """Two tags of more than 7000 cycles: the state is loaded before the POLL fetches it."""
     key = bytes(range(0x80, 0x90))
     boards.store(KEY_ADDRESS, key + crc16(key).to_bytes(2, 'little'))
     boards.run(0.13)
@@ -335,7 +335,7 @@ def test_signed_commands_are_answered_in_time(boards: Boards) -> None:
         boards.run_until(begun + 10000)
     print(f'\nsigned: round trip {statistics.median(times):.2f} ms, {max(times):.2f} ms (longest)')
     assert max(times) <= 7.0
-    # A tag takes longer than a lost acknowledgement's repetition: neither disturbs the other.
+    # A tag takes longer than a retransmission; neither disturbs the other.
     boards.call('loss', 0.2, 0.2)
     for _ in range(100):
         boards.request(signer.sign(boards.command(3000, 3000)._replace(tag=bytes(8))))

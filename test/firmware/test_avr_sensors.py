@@ -1,9 +1,9 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The way round: step pulses of the real program turn the twin, whose sensors it reads in turn.
+"""Hardware in the loop: the real firmware drives the digital twin and reads its sensors.
 
-Pulses -> motors, body and world of the twin -> registers of the MPU6050 and voltages of the Sharps
--> the robot's program -> radio -> the host, which reckons where the robot is.
+Step pulses -> motors, body and world of the twin -> registers of the MPU6050 and voltages of the
+range sensors -> robot firmware -> radio -> host with odometry.
 """
 
 from contextlib import ExitStack
@@ -25,13 +25,13 @@ RADIUS, TRACK = 0.035, 0.147
 
 @pytest.fixture
 def build():
-    """Return what makes a bench of the bridge's host and both real programs."""
+    """Return a factory of benches with the host of the bridge and both boards in simavr."""
     with ExitStack() as stack:
         yield lambda **given: stack.enter_context(on_avr(RobotBench, **given))
 
 
-def watched(bench, seconds):
-    """Let time pass; return times (s) and true headings (rad), each millisecond."""
+def run_recorded(bench, seconds):
+    """Run for a time; return time (s) and true yaw (rad) at each millisecond."""
     times, yaws = [], []
     for _ in range(round(1000 * seconds)):
         bench.run(0.001)
@@ -41,7 +41,7 @@ def watched(bench, seconds):
 
 
 def test_gyro_rate_and_delay(build):
-    """Within the 3 % of the data sheet, and as late as its filter and the two buses make it."""
+    """Scale within the 3 % of the data sheet; delay of the filter and of both buses."""
     bench = build(flat={'twin.imu.gyro_offset': 0.0})
     bench.connect()
     bench.run(0.2)
@@ -49,29 +49,29 @@ def test_gyro_rate_and_delay(build):
     times, yaws = [], []
     for right in (4.0, -4.0, 4.0):
         bench.drive(right, -right)
-        for column, part in zip((times, yaws), watched(bench, 0.5), strict=True):
+        for column, part in zip((times, yaws), run_recorded(bench, 0.5), strict=True):
             column.append(part)
     times, yaws = np.concatenate(times), np.unwrap(np.concatenate(yaws))
     stamps = np.array([state.stamp_ns / 1e9 for state in bench.states])
-    told = np.array([state.imu.angular for state in bench.states])
+    measured = np.array([state.imu.angular for state in bench.states])
     use = stamps > times[0] + 0.05
-    stamps, told = stamps[use], told[use]
-    # The twin moves on every 5 ms.
+    stamps, measured = stamps[use], measured[use]
+    # The period of the twin is 5 ms.
     true = np.convolve(np.gradient(yaws, times), np.full(5, 0.2), 'same')
     assert np.abs(true).max() > 0.9 * 2 * 4.0 * RADIUS / TRACK
 
     def misfit(delay):
-        """Root mean square of the difference to what the body did that long before, rad/s."""
-        return float(np.sqrt(np.mean((told - np.interp(stamps - delay, times, true)) ** 2)))
+        """Return the RMS difference to the true rate ``delay`` earlier, rad/s."""
+        return float(np.sqrt(np.mean((measured - np.interp(stamps - delay, times, true)) ** 2)))
 
     delays = np.arange(0.0, 0.04, 0.0005)
     best = min(delays, key=misfit)
     print(f'\ngyro: {1e3 * best:.1f} ms late, {misfit(best):.3f} rad/s off (rms)')
-    # 4.8 ms of the filter; the twin looks at pulses, and the program at the sensor, now and then.
+    # 4.8 ms of the filter, plus the sampling periods of twin and firmware.
     assert 0.004 <= best <= 0.016
-    plateau = np.abs(told) > 0.9 * 2 * 4.0 * RADIUS / TRACK
+    plateau = np.abs(measured) > 0.9 * 2 * 4.0 * RADIUS / TRACK
     body = np.interp(stamps - best, times, true)
-    ratio = np.abs(told[plateau]).mean() / np.abs(body[plateau]).mean()
+    ratio = np.abs(measured[plateau]).mean() / np.abs(body[plateau]).mean()
     assert ratio == pytest.approx(1.0, abs=0.03)
 
 
@@ -84,28 +84,28 @@ def test_gyro_odometry_agrees_with_the_true_pose(build):
         bench.run(0.6)
     bench.drive(0.0, 0.0)
     bench.run(0.6)
-    true, told = bench.plant.pose, bench.states[-1].odometry.pose
-    print(f'\ntrue {true}\ntold {told}')
+    true, measured = bench.plant.pose, bench.states[-1].odometry.pose
+    print(f'\ntrue {true}\nmeasured {measured}')
     assert math.hypot(true.x, true.y) > 0.15
-    assert math.hypot(told.x - true.x, told.y - true.y) < 0.005
-    assert told.yaw == pytest.approx(true.yaw, abs=0.03)
+    assert math.hypot(measured.x - true.x, measured.y - true.y) < 0.005
+    assert measured.yaw == pytest.approx(true.yaw, abs=0.03)
     assert not bench.states[-1].status.slipping
 
 
 def test_ranges_agree_with_the_distance_to_a_wall(build):
-    """Backwards to the end of the corridor; both sides keep their distance."""
+    """Backwards to the end of the corridor; the distance to both sides is constant."""
     bench = build(flat={'twin.world': 'corridor'})
     bench.connect()
     bench.run(0.2)
     rear = [RANGE_SENSORS.index(name) for name in ('rear_left', 'rear_right')]
-    seen = []
+    rear_left = []
 
-    def look():
-        told, true = bench.states[-1].ranges, bench.emulator.distances
-        seen.append((told[rear[0]], true[rear[0]]))
-        for sensor, metres in enumerate(told):
+    def check_ranges():
+        measured, true = bench.states[-1].ranges, bench.emulator.distances
+        rear_left.append((measured[rear[0]], true[rear[0]]))
+        for sensor, metres in enumerate(measured):
             if math.isfinite(metres):
-                # 2 % of the formula, half a step of the code, one of the converter, 20 ms of way.
+                # 2 % of the formula, half a code step, one ADC step, 20 ms of motion.
                 step = 0.0049 * (true[sensor] + 0.0257) ** 2 / 0.282
                 limit = 0.02 * true[sensor] + 0.0025 + step + 0.02 * 0.28
                 assert abs(metres - true[sensor]) <= limit, RANGE_SENSORS[sensor]
@@ -115,13 +115,13 @@ def test_ranges_agree_with_the_distance_to_a_wall(build):
     bench.drive(-8.0, -8.0)
     for _ in range(13):
         bench.run(0.1)
-        look()
+        check_ranges()
     bench.drive(0.0, 0.0)
     bench.run(0.5)
-    look()
-    told = [metres for metres, _ in seen]
-    print('\nrear left told', [f'{metres:.3f}' for metres in told])
-    finite = [metres for metres in told if math.isfinite(metres)]
+    check_ranges()
+    measured = [metres for metres, _ in rear_left]
+    print('\nrear left', [f'{metres:.3f}' for metres in measured])
+    finite = [metres for metres in measured if math.isfinite(metres)]
     assert finite[0] > 0.45
     assert finite[-1] < 0.2
     assert all(after <= before for before, after in zip(finite, finite[1:], strict=False))
@@ -129,13 +129,13 @@ def test_ranges_agree_with_the_distance_to_a_wall(build):
 
 @pytest.mark.parametrize('blocked, sign', [('right', 1.0), ('left', -1.0)])
 def test_a_blocked_wheel_is_detected_and_stops_the_robot(build, blocked, sign):
-    """Steps say straight on; the body turns about the wheel that stands."""
+    """The steps are those of straight motion; the body turns about the blocked wheel."""
     bench = build(
         flat={'twin.faults.wheel_blocked': blocked},
         parameters={'slip_stop': 0.5, 'odometry.standstill_time': 0.5},
     )
     bench.connect()
-    bench.run(1.2)  # the gyro's bias is known from now on
+    bench.run(1.2)  # gyro bias calibrated
     assert bench.robot._odometry.calibrated
     bench.drive(-sign * 5.0, -sign * 5.0)
     bench.run(0.45)

@@ -1,8 +1,8 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The robot's real program: its own USB with its key, and the radio at its other rates.
+"""The real firmware of the robot in simavr: USB console with the key, and all radio rates.
 
-Nothing here has touched silicon: simavr executes the programs of both boards.
+Simulation only: simavr executes the programs of both boards.
 """
 
 from collections.abc import Iterator
@@ -54,7 +54,7 @@ pytestmark = pytest.mark.skipif(bool(missing_tools()), reason=f'not installed: {
 KEY, OTHER = bytes(range(0x80, 0x90)), bytes(range(0x30, 0x40))
 KEY_ADDRESS, MARK_ADDRESS = 8, 26
 WRITING = 0.3
-"""s that are enough for a key: some 25 cells of 3.4 ms, each sought in rounds of 0.4 ms."""
+"""Sufficient time to write a key, s: about 25 cells of 3.4 ms, started in passes of 0.4 ms."""
 HOST_NONCE = b'hostnonc'
 
 
@@ -63,23 +63,23 @@ def boards() -> Iterator[Boards]:
     yield from booted()
 
 
-def hear(boards: Boards) -> list[Any]:
-    """Return the frames that the robot has said over its USB."""
+def console_output(boards: Boards) -> list[Any]:
+    """Return the frames that the console has sent."""
     data, at = (c_uint8 * 4096)(), (c_uint64 * 4096)()
     count = boards.call('usb_read', data, at, 4096)
     return [codec.decode_from_board(frame) for frame in FrameDecoder().feed(bytes(data[:count]))]
 
 
-def tell(boards: Boards, frame: Any, seconds: float = 0.005) -> list[Any]:
-    """Return what the robot answers over its USB to a frame."""
+def request(boards: Boards, frame: Any, seconds: float = 0.005) -> list[Any]:
+    """Send a frame to the console; return the replies within a time."""
     wire = encode_frame(codec.encode(frame))
     boards.call('usb_write', wire, len(wire))
     boards.run(seconds)
-    return hear(boards)
+    return console_output(boards)
 
 
-def meet(boards: Boards, key: bytes, gap: int = 20) -> Signer | None:
-    """Return the host's end of a signed session, None if the robot does not accept it."""
+def begin_session(boards: Boards, key: bytes, gap: int = 20) -> Signer | None:
+    """Begin a signed session; return its signer, None if the robot rejects it."""
     host_us = round(boards.now_us)
     hello = sign_hello(key, boards.session, 0, host_us, HOST_NONCE)
     info = boards.request(hello, Poll(0, 1, 2), gap)
@@ -95,38 +95,38 @@ def signed(boards: Boards, signer: Signer, left: int, right: int) -> Any:
     return boards.request(signer.sign(boards.command(left, right)._replace(tag=bytes(8))))
 
 
-# -- the key --------------------------------------------------------------------------------------
+# -- key ------------------------------------------------------------------------------------------
 
 
 def test_a_key_from_the_console_makes_a_keyed_link(boards: Boards) -> None:
     boards.start()
-    assert tell(boards, Key(1)) == [KeyState(1, OK, NO_KEY, 0)]
-    assert tell(boards, Key(2, KEY)) == []
-    assert tell(boards, Key(3, OTHER)) == [KeyState(3, BUSY, KEY_DAMAGED, 0)]
-    assert boards.hello().session == 0  # nobody gets in meanwhile
+    assert request(boards, Key(1)) == [KeyState(1, OK, NO_KEY, 0)]
+    assert request(boards, Key(2, KEY)) == []
+    assert request(boards, Key(3, OTHER)) == [KeyState(3, BUSY, KEY_DAMAGED, 0)]
+    assert boards.hello().session == 0  # locked during the write
     begun = boards.now_us
-    told: list[Any] = []
-    while not told:
+    reply: list[Any] = []
+    while not reply:
         boards.run(0.005)
-        told = hear(boards)
+        reply = console_output(boards)
     print(f'\nwritten and verified after {(boards.now_us - begun) / 1000 + 10:.0f} ms')
-    assert told == [KeyState(2, OK, KEY_HELD, key_check(KEY))]
+    assert reply == [KeyState(2, OK, KEY_HELD, key_check(KEY))]
     assert boards.eeprom(KEY_ADDRESS, 18) == KEY + crc16(KEY).to_bytes(2, 'little')
     assert boards.eeprom(MARK_ADDRESS, 1) == b'\xff'
     assert boards.hello().session == 0  # unsigned
-    assert meet(boards, OTHER) is None
-    signer = meet(boards, KEY)
+    assert begin_session(boards, OTHER) is None
+    signer = begin_session(boards, KEY)
     assert signer is not None
     for _ in range(30):
         assert signed(boards, signer, 4000, 4000).seq == boards.seq
         boards.run(0.015)
     assert min(boards.pulses()) > 100
-    assert tell(boards, Key(4, OTHER)) == [KeyState(4, BUSY, KEY_HELD, key_check(KEY))]
+    assert request(boards, Key(4, OTHER)) == [KeyState(4, BUSY, KEY_HELD, key_check(KEY))]
     boards.call('reset', ROBOT)
     boards.run(0.15)
-    assert tell(boards, Key(5)) == [KeyState(5, OK, KEY_HELD, key_check(KEY))]
-    assert meet(boards, KEY) is not None
-    assert tell(boards, Key(6, bytes(16)), WRITING) == [KeyState(6, OK, NO_KEY, 0)]
+    assert request(boards, Key(5)) == [KeyState(5, OK, KEY_HELD, key_check(KEY))]
+    assert begin_session(boards, KEY) is not None
+    assert request(boards, Key(6, bytes(16)), WRITING) == [KeyState(6, OK, NO_KEY, 0)]
     assert boards.hello().session == boards.session
     assert boards.eeprom(KEY_ADDRESS, 18) == b'\xff' * 18
     assert boards.call('usb_overruns') == 0
@@ -134,27 +134,27 @@ def test_a_key_from_the_console_makes_a_keyed_link(boards: Boards) -> None:
 
 def test_console_answers_pings_and_refuses_other_frames(boards: Boards) -> None:
     boards.start()
-    (pong,) = tell(boards, Ping(7, b'ping'))
+    (pong,) = request(boards, Ping(7, b'ping'))
     assert isinstance(pong, Pong)
     assert (pong.id, pong.echo, pong.chip_ok) == (7, b'ping', 1)
     boards.call('usb_write', encode_frame(b'\x01\x00\x00\x01\x15'), 9)
     boards.run(0.002)
-    assert hear(boards) == [Refusal(1, 1)]
-    (later,) = tell(boards, Ping(8, b'ping'), 0.01)
+    assert console_output(boards) == [Refusal(1, 1)]
+    (later,) = request(boards, Ping(8, b'ping'), 0.01)
     assert 3_000 < later.time_us - pong.time_us < 12_000
 
 
 def test_no_key_is_written_while_the_drivers_of_the_avr_are_on(boards: Boards) -> None:
     boards.start()
     drive(boards, 0.2, 4000, 4000)
-    assert tell(boards, Key(1, KEY)) == [KeyState(1, BUSY, NO_KEY, 0)]
+    assert request(boards, Key(1, KEY)) == [KeyState(1, BUSY, NO_KEY, 0)]
     drive(boards, 0.4, 0, 0)
     assert boards.call('powered')
-    assert tell(boards, Key(2, KEY)) == [KeyState(2, BUSY, NO_KEY, 0)]
+    assert request(boards, Key(2, KEY)) == [KeyState(2, BUSY, NO_KEY, 0)]
     boards.drive(flags=0)
     boards.run(0.002)
     assert not boards.call('powered')
-    assert tell(boards, Key(3, KEY), WRITING) == [KeyState(3, OK, KEY_HELD, key_check(KEY))]
+    assert request(boards, Key(3, KEY), WRITING) == [KeyState(3, OK, KEY_HELD, key_check(KEY))]
     odometry_agrees(boards)
 
 
@@ -169,17 +169,17 @@ def test_no_flipped_bit_on_the_console_has_an_effect(boards: Boards) -> None:
         boards.run(0.002)
     boards.run(0.02)
     assert boards.eeprom(0, 40) == before
-    hear(boards)
-    assert tell(boards, Key(2)) == [KeyState(2, OK, NO_KEY, 0)]
-    (pong,) = tell(boards, Ping(3, b'ping'))
+    console_output(boards)
+    assert request(boards, Key(2)) == [KeyState(2, OK, NO_KEY, 0)]
+    (pong,) = request(boards, Ping(3, b'ping'))
     assert pong.overruns == 0
     assert pong.crc_errors + pong.frame_errors >= 8 * (len(wire) - 1)
-    assert boards.drive().session == boards.session  # nor has the session ended
+    assert boards.drive().session == boards.session  # the session continues
 
 
 @pytest.mark.parametrize('before', [b'', OTHER], ids=['first key', 'another key'])
 def test_power_loss_during_a_key_write_never_unlocks_the_robot(before: bytes) -> None:
-    """Cut at five places: the robot has what it had, the new key, or moves for nobody."""
+    """Power fails at five times: the robot has the old key, the new key, or is locked."""
     avr_boards.build()
     states = []
     for cut in (0.001, 0.008, 0.03, 0.07, WRITING):
@@ -187,24 +187,24 @@ def test_power_loss_during_a_key_write_never_unlocks_the_robot(before: bytes) ->
         if before:
             boards.store(KEY_ADDRESS, before + crc16(before).to_bytes(2, 'little'))
         boards.run(0.2)
-        told = tell(boards, Key(1, KEY), cut)
+        reply = request(boards, Key(1, KEY), cut)
         boards.call('reset', ROBOT)
         boards.run(0.15)
-        ((_, rc, state, check),) = tell(boards, Key(2))
+        ((_, rc, state, check),) = request(boards, Key(2))
         assert rc == OK
         states.append(state)
         if state == KEY_HELD:
             assert check in (key_check(KEY), key_check(before or KEY))
-            assert not told or check == key_check(KEY)
+            assert not reply or check == key_check(KEY)
         elif state == KEY_DAMAGED:
             assert boards.hello().session == 0
-            assert meet(boards, KEY) is None
-            assert meet(boards, OTHER) is None
+            assert begin_session(boards, KEY) is None
+            assert begin_session(boards, OTHER) is None
             stop = codec.encode(boards.command(flags=CommandFlag.ESTOP))
             assert boards.call('inject', stop, len(stop), len(stop))
             assert boards.request(Poll(0, 0, 0)).status & StatusFlag.ESTOP
             wanted = KeyState(3, OK, KEY_HELD, key_check(KEY))
-            assert tell(boards, Key(3, KEY), WRITING) == [wanted]
+            assert request(boards, Key(3, KEY), WRITING) == [wanted]
         else:
             assert not before
         boards.close()
@@ -213,14 +213,14 @@ def test_power_loss_during_a_key_write_never_unlocks_the_robot(before: bytes) ->
 
 
 def test_a_flood_on_the_console_does_not_delay_replies(boards: Boards) -> None:
-    """50 000 bytes a second, frames and rubbish, while the robot checks tags and drives.
+    """50 000 bytes per second, frames and noise, while the robot verifies tags and drives.
 
-    The POLL finds the answer to its own CMD; in one run of several, one of a hundred was a cycle
+    The POLL fetches the reply to its own CMD; in one of several runs, one in a hundred was a cycle
     old.
     """
     boards.store(KEY_ADDRESS, KEY + crc16(KEY).to_bytes(2, 'little'))
     boards.run(0.13)
-    signer = meet(boards, KEY)
+    signer = begin_session(boards, KEY)
     assert signer is not None
     source = random.Random(1)
     ping = encode_frame(codec.encode(Ping(1, b'ping')))
@@ -240,54 +240,52 @@ def test_a_flood_on_the_console_does_not_delay_replies(boards: Boards) -> None:
     assert max(times) <= 7.0
     assert late <= 1
     assert boards.call('resets', ROBOT) == 0
-    hear(boards)
+    console_output(boards)
     boards.run(0.01)
-    hear(boards)
-    boards.call('usb_write', b'\0', 1)  # ends what was cut off
-    (pong,) = tell(boards, Ping(9, b'ping'))
-    print(
-        f'robot counts {pong.overruns} losses on the cable of {boards.call("usb_overruns")} bytes'
-    )
+    console_output(boards)
+    boards.call('usb_write', b'\0', 1)  # ends the partial frame
+    (pong,) = request(boards, Ping(9, b'ping'))
+    print(f'console overruns: {pong.overruns} counted, {boards.call("usb_overruns")} bytes')
     assert pong.overruns > 0
     boards.run(1.0)
     odometry_agrees(boards)
 
 
-# -- other rates ----------------------------------------------------------------------------------
+# -- radio rates ----------------------------------------------------------------------------------
 
 
 @cache
 def build_at(folder: Path, rate: int) -> Path:
-    """Return where both programs stand, made for another rate of the radio."""
+    """Build both programs for a radio rate; return their folder."""
     command = ['make', '-C', str(FIRMWARE), 'avr', 'simavr', f'BUILD={folder}']
     subprocess.run([*command, f'RADIO_RATE={rate}'], check=True, capture_output=True)
     return folder
 
 
 @pytest.fixture(params=['250k', '1M', '2M'])
-def slow_or_fast(
+def boards_at_rate(
     request: pytest.FixtureRequest,
     tmp_path_factory: pytest.TempPathFactory,
     monkeypatch: pytest.MonkeyPatch,
 ) -> Iterator[tuple[Boards, LinkParameters]]:
-    """Yield both boards at one rate, set by the frame with which a host sets the dongle."""
+    """Yield both boards at each rate, configured by the CFG frame of the host."""
     parameters = LinkParameters(rate=request.param)
     wanted = parameters.configure(1)
     folder = tmp_path_factory.getbasetemp() / f'firmware_{request.param}'
     monkeypatch.setattr(avr_boards, 'BUILD', build_at(folder, wanted.rate))
     pair = Boards()
     pair.run(0.13)
-    told = pair.ask(wanted)
-    assert told[:-1] == tuple(wanted)
-    assert told.chip_ok
+    reply = pair.ask(wanted)
+    assert reply[:-1] == tuple(wanted)
+    assert reply.chip_ok
     yield pair, parameters
     counts = pair.radio(ROBOT)
     assert counts.queued_acks == counts.overfull == 0
     pair.close()
 
 
-def test_cycles_work_at_every_rate(slow_or_fast: tuple[Boards, LinkParameters]) -> None:
-    boards, parameters = slow_or_fast
+def test_cycles_work_at_every_rate(boards_at_rate: tuple[Boards, LinkParameters]) -> None:
+    boards, parameters = boards_at_rate
     greeting = Hello(boards.session, 0, round(boards.now_us))
     assert boards.request(greeting, Poll(0, 0, 2), parameters.gap).session == boards.session
     times, ages = [], []
@@ -308,9 +306,9 @@ def test_cycles_work_at_every_rate(slow_or_fast: tuple[Boards, LinkParameters]) 
 
 
 @pytest.mark.slow
-def test_telemetry_never_lags_at_any_rate(slow_or_fast: tuple[Boards, LinkParameters]) -> None:
-    """Losses make the dongle repeat packets; silence makes the robot refresh what waits."""
-    boards, parameters = slow_or_fast
+def test_telemetry_never_lags_at_any_rate(boards_at_rate: tuple[Boards, LinkParameters]) -> None:
+    """With retransmissions of the dongle, and with refreshes of the robot during silence."""
+    boards, parameters = boards_at_rate
     boards.request(Hello(boards.session, 0, round(boards.now_us)), Poll(0, 0, 2), parameters.gap)
     for phase in range(0, 4000, 160):
         command = boards.command()
@@ -319,7 +317,7 @@ def test_telemetry_never_lags_at_any_rate(slow_or_fast: tuple[Boards, LinkParame
         )
         assert boards.call('waiting_acks') <= 1
         boards.run(0.0956 + phase / 1e6)
-    # A refresh may meet a packet that nobody foresaw: its acknowledgement is then repeated.
+    # A refresh concurrent with a packet costs at most one acknowledgement.
     before = boards.radio(ROBOT).ack_damaged
     boards.call('loss', 0.2, 0.2)
     for _ in range(120):
@@ -333,11 +331,11 @@ def test_telemetry_never_lags_at_any_rate(slow_or_fast: tuple[Boards, LinkParame
 
 
 def test_signed_commands_are_answered_in_time_at_every_rate(
-    slow_or_fast: tuple[Boards, LinkParameters],
+    boards_at_rate: tuple[Boards, LinkParameters],
 ) -> None:
-    boards, parameters = slow_or_fast
-    assert tell(boards, Key(1, KEY), WRITING)[0].rc == OK
-    signer = meet(boards, KEY, parameters.gap_after(Hello(1, 0, 0, bytes(8), bytes(8))))
+    boards, parameters = boards_at_rate
+    assert request(boards, Key(1, KEY), WRITING)[0].rc == OK
+    signer = begin_session(boards, KEY, parameters.gap_after(Hello(1, 0, 0, bytes(8), bytes(8))))
     assert signer is not None
     for _ in range(40):
         command = signer.sign(boards.command(3000, 3000)._replace(tag=bytes(8)))

@@ -236,7 +236,7 @@ class AvrEmulator:
         if self._ttl_start_us != before or self._ttl_start_us in (self._ttl_from_us, 0):
             return
         self._ttl_from_us = self._ttl_start_us
-        command = decode_downlink(self.boards.heard())
+        command = decode_downlink(self.boards.last_packet())
         assert isinstance(command, Command)
         assert command.seq == self.board.ram.get('seq', 1)
         target = [self.board.ram.get('ramp.target', 4, wheel, True) for wheel in (0, 1)]

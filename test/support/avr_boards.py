@@ -266,7 +266,7 @@ class Boards:
         self.call('radio_counts', board, eleven)
         return RadioCounts(*eleven)
 
-    def heard(self) -> bytes:
+    def last_packet(self) -> bytes:
         """Return the last packet that the radio of the robot received."""
         data = (c_uint8 * 32)()
         size = self.call('heard', data)

@@ -95,7 +95,7 @@ class ClosedLoopObjective:
             {'controller': {**parameters, 'terms_rate': '20.0', 'use_sim_time': 'False'}}
         )
         self.taped = tape
-        self.wanted = scenario.reference().wanted
+        self.wanted = scenario.reference().speeds
         self.statuses, self.speeds, self.estimates, self.unexplained = [], [], [], []
         for k in range(LEAD):
             self._tell(k, 0)

@@ -15,8 +15,8 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Obs
 from t3mpc_ros.evaluation.baselines.feedback_baseline import (
     CLOSING,
     OWN,
-    CrossingParameters,
     FeedbackBaseline,
+    JumpTransientParameters,
     checked_parameters,
     disturbance_error,
     write_acceleration,
@@ -71,7 +71,7 @@ class AdaptiveParameters(Parameters):
     centre_exponent: float = parameter(
         2.0, 'how much closer together the centres are in the middle', low=0.2, high=5.0
     )
-    crossing: CrossingParameters = group(CrossingParameters)
+    jump_transient: JumpTransientParameters = group(JumpTransientParameters)
 
     def fuzzy(self) -> FuzzyParameters:
         """Return the shape of the fuzzy system, type-1; the fuzzifier is a singleton."""
@@ -116,19 +116,21 @@ def _unit_gamma(fuzzy: FuzzyParameters) -> float:
 
 
 @kernel
-def _find_errors(speeds: Array, wanted: Array, period: float, gains: Array, memory: Array) -> None:
+def _find_errors(
+    speeds: Array, reference: Array, period: float, gains: Array, memory: Array
+) -> None:
     """Write e into the first own row of memory. gains : as in :func:`_oppose`."""
     for i in range(2):
         memory[OWN, i] = disturbance_error(
-            i, speeds, wanted, period, 1.0, gains[3], gains[4], memory
+            i, speeds, reference, period, 1.0, gains[3], gains[4], memory
         )
 
 
 @kernel
 def _oppose(
     estimate: Array,
-    wanted: Array,
-    wanted_next: Array,
+    reference: Array,
+    next_reference: Array,
     period: float,
     gains: Array,
     memory: Array,
@@ -137,10 +139,10 @@ def _oppose(
     """Write the answer. gains : K, bound, smoothing, closing share and acceleration."""
     for i in range(2):
         error = memory[OWN, i]
-        feedforward = (wanted_next[i] - wanted[i]) / period + memory[CLOSING, i]
+        feedforward = (next_reference[i] - reference[i]) / period + memory[CLOSING, i]
         u = feedforward - estimate[i] - gains[0] * error
         u += compensator(error, gains[1], gains[2])
-        write_acceleration(i, u, wanted_next, memory, command)
+        write_acceleration(i, u, next_reference, memory, command)
 
 
 class _Adaptive(FeedbackBaseline):
@@ -161,7 +163,7 @@ class _Adaptive(FeedbackBaseline):
 
     def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None:
         table = checked_parameters(parameters, self._table)
-        super().__init__(nominal_model, table.crossing, own=1)
+        super().__init__(nominal_model, table.jump_transient, own=1)
         fuzzy = table.fuzzy()
         steps = table.gain * nominal_model.period
         self.fuzzy = FuzzyEstimator(
@@ -186,13 +188,13 @@ class _Adaptive(FeedbackBaseline):
     def step(self, observation: Observation) -> Array:
         """Return u, rad/s², shape (2,)."""
         memory = self._memory
-        _find_errors(observation.speeds, observation.wanted, self._period, self._gains, memory)
+        _find_errors(observation.speeds, observation.reference, self._period, self._gains, memory)
         if not self._limited:
             self.fuzzy.adapt(memory[OWN], self._period)
         _oppose(
             self.fuzzy.evaluate(observation.speeds),
-            observation.wanted,
-            observation.wanted_next,
+            observation.reference,
+            observation.next_reference,
             self._period,
             self._gains,
             memory,
@@ -205,13 +207,13 @@ class _Adaptive(FeedbackBaseline):
         super().applied(acceleration, limited=limited)
         self._limited = limited
 
-    def learnt(self) -> dict[str, Array]:
+    def get_weights(self) -> dict[str, Array]:
         """Return the coefficients."""
         return {'coefficients': self.fuzzy.coefficients}
 
-    def restore(self, learnt: Mapping[str, Array]) -> None:
+    def set_weights(self, weights: Mapping[str, Array]) -> None:
         """Begin with other coefficients."""
-        self.fuzzy.coefficients = learnt['coefficients']
+        self.fuzzy.coefficients = weights['coefficients']
 
 
 class AdaptiveType1(_Adaptive):

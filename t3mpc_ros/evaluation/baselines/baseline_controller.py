@@ -1,6 +1,16 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Interface of the compared controllers: nominal model, observation, step."""
+"""Interface of the compared controllers: nominal model, observation, step.
+
+All methods share the state estimate, the actuation and its limits
+(:mod:`t3mpc_ros.control.actuation`); they differ in how they choose an acceleration. The plant
+that a method controls is one equation for either drive, exact at the control periods T,
+
+    chi_(k+1) = chi_k + T (u_k + d_k).
+
+It contains no dead time: ``Observation.speeds`` is the estimate for the instant at which u_k
+takes effect, and the actuation converts u_k into the wheel speed command of the lagging servo.
+"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -57,9 +67,9 @@ class Observation:
     """Estimated chi at that instant, rad/s, shape (2,)."""
     unexplained: Array
     """Estimated acceleration d that chi' = u does not explain, rad/s², shape (2,)."""
-    wanted: Array
+    reference: Array
     """r at that instant, rad/s, shape (2,); extrapolated by its slope without preview."""
-    wanted_next: Array
+    next_reference: Array
     """r one period later, shape (2,), alike; ``(wanted_next - wanted) / T`` feeds forward."""
     command: Array
     """The wheel speeds last commanded, rad/s, shape (2,); unused with the torque drive."""
@@ -93,9 +103,9 @@ class BaselineController(ABC):
     def applied(self, acceleration: Array, *, limited: bool) -> None:  # noqa: B027
         """Take note of the u that the drive's limits let through (anti-windup)."""
 
-    def learnt(self) -> dict[str, Array]:
+    def get_weights(self) -> dict[str, Array]:
         """Return what was learnt so far, by name; nothing for a method that does not learn."""
         return {}
 
-    def restore(self, learnt: Mapping[str, Array]) -> None:  # noqa: B027
-        """Begin with what :meth:`learnt` returned after another run."""
+    def set_weights(self, weights: Mapping[str, Array]) -> None:  # noqa: B027
+        """Begin with what :meth:`get_weights` returned after another run."""

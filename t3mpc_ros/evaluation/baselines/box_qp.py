@@ -1,6 +1,16 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Box-constrained quadratic program of the predictive baselines: projected Newton, then active set."""
+"""Box-constrained quadratic program of the predictive baselines: projected Newton, then active set.
+
+The problem, for n moves x of a command:
+
+    minimise    x'Hx/2 + g'x    subject to    low <= x <= high,
+
+H being positive definite; infinite bounds are allowed. Unlike the program of
+:mod:`t3mpc_ros.mpc.quadratic_program`, it has no bounds on running sums of the moves. That solver
+starts at the unconstrained optimum and adds one bound at a time, while a planned ramp has up to
+forty active bounds. This one starts from the previous plan and changes many bounds at once.
+"""
 
 import math
 from typing import NamedTuple

@@ -1,6 +1,25 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Dynamic matrix control, with and without preview."""
+r"""Dynamic matrix control, with and without preview.
+
+Cutler and Ramaker (1980), Dynamic matrix control: a computer control algorithm, Joint Automatic
+Control Conference, paper WP5-B; with bounds on the moves as in Garcia and Morshedi (1986,
+doi 10.1080/00986448608911397). The model consists of the step response s_j of the wheel speed to
+the command and its response h_j to a unit disturbance:
+
+.. math:: \hat\chi_{k+j} = Y_j + b + \sum_{i=0}^{\min(j, M) - 1} s_{j-i}\, x_i, \quad j = 1 ... P
+
+Y is the remaining effect of past moves and known disturbances. The bias b, constant over the
+horizon, is the prediction error of the model (a constant output disturbance). The moves x minimise
+the squared distance of the prediction from the reference plus a weight times their squares (move
+suppression), |x_i| <= a T; the first move is applied.
+
+The bounds apply to the command that is sent. It is c less a static feed-forward of the nominal
+friction and turning at the next reference speeds. A torque drive integrates, and an integrator has
+no finite step response. As in practice, a proportional loop around the wheel, u = K0 (c - chi),
+comes first, and the method moves its set point c; the servo of the velocity drive already is such
+a loop.
+"""
 
 from dataclasses import dataclass
 import math
@@ -333,7 +352,7 @@ class DynamicMatrix(BaselineController):
         """Return u, rad/s², shape (2,)."""
         future = known_future(observation, self.preview)
         predict_reference(
-            observation.wanted, observation.wanted_next, future, self._fade, self._reference
+            observation.reference, observation.next_reference, future, self._fade, self._reference
         )
         if self._inner_gain and not self._begun:
             self._answer[:] = observation.speeds

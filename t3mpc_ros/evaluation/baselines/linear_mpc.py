@@ -1,6 +1,25 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Linear MPC with a disturbance estimate, with and without preview."""
+r"""Linear MPC with a disturbance estimate, with and without preview.
+
+Each wheel follows its command c (velocity drive) or integrates its input u (torque drive):
+
+.. math:: \chi_{j+1} = p\,\chi_j + (1-p)\,c_j + \ell (1-p)\,d_j, \quad p = e^{-T/\ell}
+          \qquad\text{or}\qquad \chi_{j+1} = \chi_j + T (b\,u_j + d_j)
+
+with the lag l or the gain b scaled by ``model_error``. The moves x, changes of c or u from one
+period to the next, minimise
+
+.. math:: \sum_{j=1}^{N} (\chi_j - r_j)^2 + \rho \sum_{j=0}^{N-1} x_j^2
+
+subject to |x_j| <= a T (velocity) or to the torque limit of the motors (torque); the first move is
+applied. The disturbance d is the shared estimate plus an integral of the prediction errors of the
+model, which removes the offset of a wrong model (Pannocchia and Rawlings 2003,
+doi 10.1002/aic.690490213). The horizon starts from the model's prediction, corrected towards the
+shared estimate by an observer; this separates the feedback of noise from the tracking bandwidth.
+Friction and turning along the reference are known of the nominal robot and enter as a measured
+disturbance.
+"""
 
 from dataclasses import dataclass
 import math
@@ -148,7 +167,7 @@ def move_weight(nominal_model: NominalModel, move_time: float) -> float:
 
 @kernel
 def predict_reference(
-    wanted: Array, wanted_next: Array, future: Array, fade: float, out: Array
+    reference: Array, next_reference: Array, future: Array, fade: float, out: Array
 ) -> None:
     """Write the reference expected 0 ... N periods after the answer begins to act, rad/s.
 
@@ -164,7 +183,7 @@ def predict_reference(
         for j in range(row):
             out[z, j] = future[j, z]
         if known == 0:
-            out[z, 0], out[z, 1], row = wanted[z], wanted_next[z], 2
+            out[z, 0], out[z, 1], row = reference[z], next_reference[z], 2
         slope = out[z, row - 1] - out[z, row - 2]
         if known > 2 and row == known:
             earlier = out[z, row - 2] - out[z, row - 3]
@@ -365,7 +384,7 @@ class LinearMpc(BaselineController):
         """Return u, rad/s², shape (2,)."""
         future = known_future(observation, self.preview)
         predict_reference(
-            observation.wanted, observation.wanted_next, future, self._fade, self._reference
+            observation.reference, observation.next_reference, future, self._fade, self._reference
         )
         linear_mpc_step(
             observation.speeds,

@@ -1,6 +1,23 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Nonlinear MPC with preview; CasADi generates the model and its derivatives."""
+r"""Nonlinear MPC with preview; CasADi generates the model and its derivatives.
+
+The model is (10) with the nominal friction and with mass and inertia of the body scaled by
+``model_error``, driven by the servo of the velocity drive or by a torque:
+
+.. math:: \bar\theta \dot\chi + \bar\eta(\chi)\chi + f(\chi)
+          = \bar\theta_{nom}\,(c - \chi)/\ell \quad\text{or}\quad \bar\theta_{nom}\,u,
+
+plus an additive acceleration, the disturbance estimate. Cost, bounds and observer are those of
+:mod:`t3mpc_ros.evaluation.baselines.linear_mpc`. A period is integrated by an exponential
+Runge-Kutta method of second order (Cox and Matthews 2002, doi 10.1006/jcph.2002.6995), which is
+exact in the stiff part, the servo.
+
+Solved by direct multiple shooting as real-time iterations (Diehl, Bock and Schlöder 2005,
+doi 10.1137/S0363012902400713): the previous plan, shifted by a period, is linearised once (or
+``iterations`` times), the states are eliminated, and the remaining Gauss-Newton program in the
+moves is solved to optimality.
+"""
 
 from dataclasses import dataclass, replace
 import importlib
@@ -318,7 +335,7 @@ class CasadiNmpc(BaselineController):
         """Return u, rad/s², shape (2,)."""
         future = known_future(observation, self.preview)
         predict_reference(
-            observation.wanted, observation.wanted_next, future, 1.0, self._reference
+            observation.reference, observation.next_reference, future, 1.0, self._reference
         )
         before = self._answer if self._torque else observation.command
         speeds = self._learn(observation, before)

@@ -1,6 +1,9 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Claims of the paper and of this package, decided from the results."""
+"""Claims of the paper and of this package, decided from the results.
+
+A method that diverged satisfies no claim.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -102,31 +105,31 @@ def all_claims(results: Results, estimated: Sequence[EstimationResult]) -> list[
 def share_of_best(
     results: Results, drive: str, noise: float, limit: float, *, paper: bool = False
 ) -> Claim:
-    """Decide whether the full controller's RMSE is at most ``limit`` of the best rival's.
+    """Decide whether the full controller's RMSE is at most ``limit`` of the best baseline's.
 
-    Ours leaves rivals with preview to :func:`no_worse_than_preview`; the paper's, that it is
+    Ours leaves baselines with preview to :func:`no_worse_than_preview`; the paper's, that it is
     better by half, is against all of them.
     """
-    kind = 'rival' if paper else 'rival without preview'
+    kind = 'baseline' if paper else 'baseline without preview'
     words = 'About 50 % more accurate than other methods: RMSE' if paper else 'RMSE'
     claim = Claim(
-        f'{"half of the best rival" if paper else "share of the best rival without preview"}, '
+        f'{"half of the best baseline" if paper else "share of the best baseline without preview"}, '
         f'{drive}, noise {noise:g}',
         'paper' if paper else 'ours',
         f'{words} at most {limit:.2f} of that of the best {kind} ({drive} drive, nominal, noise '
         f'{noise:g})',
     )
     full = results.row(FULL, drive, noise)
-    rivals = results.rows_of(drive, noise, rival=True, preview=None if paper else False)
-    rivals = [row for row in rivals if EXACT not in row.controller]
-    best = _best(rivals)
+    baselines = results.rows_of(drive, noise, baseline=True, preview=None if paper else False)
+    baselines = [row for row in baselines if EXACT not in row.controller]
+    best = _best(baselines)
     if full is None or best is None:
         return claim
     share = full.rmse_mean / best.rmse_mean
     return _answer(
         claim,
         share <= limit,
-        f'{_rmse(full)} against {_rmse(best)} of {best.controller}, the best of {len(rivals)}: '
+        f'{_rmse(full)} against {_rmse(best)} of {best.controller}, the best of {len(baselines)}: '
         f'{share:.2f} of it',
         {
             'full': full.rmse_mean,
@@ -139,22 +142,22 @@ def share_of_best(
 
 
 def no_worse_than_preview(results: Results, drive: str) -> Claim:
-    """Decide whether RMSE is no larger than any rival's that plans with a wrong inertia."""
+    """Decide whether RMSE is no larger than any baseline's that plans with a wrong inertia."""
     claim = Claim(
-        f'rivals with preview, wrong inertia in their models, {drive}',
+        f'baselines with preview, wrong inertia in their models, {drive}',
         'ours',
-        'RMSE no larger than that of any predictive rival with preview whose model is 30 % off '
+        'RMSE no larger than that of any predictive baseline with preview whose model is 30 % off '
         f'in its inertia, or within the paired interval ({drive} drive, noise {PAPER_NOISE:g})',
     )
     return _against_preview(claim, results, drive, (NOMINAL,), exact=False)
 
 
 def no_worse_than_exact_model(results: Results, drive: str) -> Claim:
-    """Decide the same of rivals that know the nominal inertia, where the robot has another."""
+    """Decide the same of baselines that know the nominal inertia, where the robot has another."""
     claim = Claim(
-        f'rivals with preview, wrong inertia of the robot, {drive}',
+        f'baselines with preview, wrong inertia of the robot, {drive}',
         'ours',
-        'RMSE no larger than that of any predictive rival with preview and the nominal model when '
+        'RMSE no larger than that of any predictive baseline with preview and the nominal model when '
         f'mass and inertia of the robot are 30 % more or less ({drive} drive, noise '
         f'{PAPER_NOISE:g})',
     )
@@ -193,7 +196,9 @@ def no_larger_than_pi(results: Results, drive: str) -> Claim:
         f'RMSE no larger than that of PI with feed-forward ({drive} drive, nominal, no noise)',
     )
     full = results.row(FULL, drive, 0.0)
-    pi = _best([row for row in results.rows_of(drive, 0.0, rival=True) if _is_pi(row.controller)])
+    pi = _best(
+        [row for row in results.rows_of(drive, 0.0, baseline=True) if _is_pi(row.controller)]
+    )
     if full is None or pi is None:
         return claim
     return _answer(
@@ -205,11 +210,11 @@ def no_larger_than_pi(results: Results, drive: str) -> Claim:
 
 
 def smallest_growth(results: Results, drive: str) -> Claim:
-    """Decide whether RMSE grows by no more rad/s with the noise than that of any rival."""
+    """Decide whether RMSE grows by no more rad/s with the noise than that of any baseline."""
     claim = Claim(
         f'smallest growth with noise, {drive}',
         'ours',
-        f'RMSE grows by no more than that of any rival from no noise to {LOUDEST:g} ({drive} '
+        f'RMSE grows by no more than that of any baseline from no noise to {LOUDEST:g} ({drive} '
         'drive, nominal, in rad/s)',
     )
     grown = _growths(results, drive)
@@ -280,16 +285,16 @@ def others_grow(results: Results, drive: str) -> Claim:
 
 
 def calm_control(results: Results, drive: str) -> Claim:
-    """Decide whether what is asked of the robot varies no more than the middle rival's."""
+    """Decide whether what is asked of the robot varies no more than the middle baseline's."""
     claim = Claim(
         f'no chatter, {drive}',
         'paper',
         'Control signals without high-frequency fluctuation (here: total variation of what is '
-        f'asked of the robot no more than the median of the rivals; {drive} drive, nominal, '
+        f'asked of the robot no more than the median of the baselines; {drive} drive, nominal, '
         f'noise {PAPER_NOISE:g})',
     )
     full = results.row(FULL, drive, PAPER_NOISE)
-    others = [row.chatter_mean for row in results.rows_of(drive, PAPER_NOISE, rival=True)]
+    others = [row.chatter_mean for row in results.rows_of(drive, PAPER_NOISE, baseline=True)]
     others = [value for value in others if math.isfinite(value)]
     if full is None or not others:
         return claim
@@ -346,8 +351,8 @@ def _against_preview(
     held, words, numbers = True, [], {}
     for case in cases:
         full = results.row(FULL, drive, PAPER_NOISE, case)
-        rivals = results.rows_of(drive, PAPER_NOISE, case, rival=True, preview=True)
-        best = _best([row for row in rivals if (EXACT in row.controller) is exact])
+        baselines = results.rows_of(drive, PAPER_NOISE, case, baseline=True, preview=True)
+        best = _best([row for row in baselines if (EXACT in row.controller) is exact])
         if full is None or best is None:
             return claim
         gap = results.paired(FULL, best.controller, drive, PAPER_NOISE, case)
@@ -373,9 +378,9 @@ def _is_pi(name: str) -> bool:
 def _growths(results: Results, drive: str) -> dict[str, tuple[float, float]]:
     """Return RMSE without and with the most noise; endless for what diverges under it."""
     found = {}
-    for name, (rival, _) in results.kinds.items():
+    for name, (baseline, _) in results.kinds.items():
         first, last = (results.row(name, drive, noise) for noise in (0.0, LOUDEST))
-        if not (rival or name == FULL) or EXACT in name or first is None or last is None:
+        if not (baseline or name == FULL) or EXACT in name or first is None or last is None:
             continue
         if math.isfinite(first.rmse_mean):
             end = last.rmse_mean if math.isfinite(last.rmse_mean) else math.inf

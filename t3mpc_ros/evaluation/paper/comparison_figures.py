@@ -21,12 +21,12 @@ from t3mpc_ros.evaluation.paper.experiment_grid import (
 from t3mpc_ros.evaluation.paper.experiment_runs import SETTLING, START
 from t3mpc_ros.evaluation.paper.figure_runs import FigureRuns, broken_at_switches
 from t3mpc_ros.evaluation.paper.results import PairedDifference, ResultRow, Results
-from t3mpc_ros.evaluation.paper.single_run_figures import WANTED, legend_above
+from t3mpc_ros.evaluation.paper.single_run_figures import REFERENCE_COLOUR, legend_above
 from t3mpc_ros.evaluation.plotting import COLOURS, new_figure
 
 OURS = '#be123c'
 """The full controller, in every figure."""
-_RIVALS = (
+_BASELINE_COLOURS = (
     '#0284c7', '#ea580c', '#15803d', '#7c3aed', '#a16207', '#0891b2',
     '#4338ca', '#db2777', '#65a30d', '#6b7280', '#92400e', '#0f766e', '#38bdf8', '#a78bfa',
     '#1f2937', '#f59e0b',
@@ -39,13 +39,15 @@ KIND_NAMES = {'type3': 'type 3', 'interval_type2': 'interval type 2', 'type1': '
 
 def colours_of(results: Results) -> dict[str, str]:
     """Return one colour per method, the same in every figure."""
-    rivals = [name for name, (rival, _) in results.kinds.items() if rival]
-    found = {name: _RIVALS[i % len(_RIVALS)] for i, name in enumerate(rivals)}
+    baselines = [name for name, (baseline, _) in results.kinds.items() if baseline]
+    found = {
+        name: _BASELINE_COLOURS[i % len(_BASELINE_COLOURS)] for i, name in enumerate(baselines)
+    }
     return dict.fromkeys(results.kinds, '#9ca3af') | found | {FULL: OURS}
 
 
 def rmse_bars(results: Results) -> Any:
-    """Return the RMSE of every rival and of ours at the paper's noise, with their intervals."""
+    """Return the RMSE of every baseline and of ours at the paper's noise, with their intervals."""
     shown = {drive: _ranked(results, drive) for drive in results.drives}
     shown = {drive: rows for drive, rows in shown.items() if rows}
     if not shown:
@@ -74,24 +76,24 @@ def rmse_bars(results: Results) -> Any:
 
 
 def noise_growth(results: Results) -> Any:
-    """Return RMSE against noise of every rival and of ours, and how much it grows."""
+    """Return RMSE against noise of every baseline and of ours, and how much it grows."""
     noises = results.noises
     if len(noises) < 2:
         return None
     colours = colours_of(results)
-    rivals = [name for name, (rival, _) in results.kinds.items() if rival]
-    figure = new_figure(5.6 + 0.16 * len(rivals) / 3)
+    baselines = [name for name, (baseline, _) in results.kinds.items() if baseline]
+    figure = new_figure(5.6 + 0.16 * len(baselines) / 3)
     drives = results.drives
     axes = figure.subplots(2, len(drives), sharex=True, sharey='row', squeeze=False)
     for column, drive in zip(axes.T, drives, strict=True):
-        for i, name in enumerate([*rivals, FULL]):
+        for i, name in enumerate([*baselines, FULL]):
             rows = [results.row(name, drive, noise) for noise in noises]
             points = [(row.noise, row.rmse_mean, row.rmse_ci95) for row in rows if row is not None]
             if not points:
                 continue
             x, y, bound = np.array(points).T
             # Beside each other, or the intervals of equal methods hide one another.
-            beside = x + 0.006 * noises[-1] * (i - 0.5 * len(rivals))
+            beside = x + 0.006 * noises[-1] * (i - 0.5 * len(baselines))
             bound = np.where(np.isfinite(bound), bound, 0.0)
             own = name == FULL
             style = {
@@ -219,8 +221,8 @@ def portraits(showcase: FigureRuns, results: Results) -> Any:
         axis.set_visible(False)
     for axis, (name, run) in zip(axes.flat, shown.items(), strict=False):
         counted = run.time >= START
-        wanted = broken_at_switches(run, run.wanted)
-        axis.plot(wanted[:, 1], wanted[:, 0], color=WANTED, linewidth=0.7)
+        reference = broken_at_switches(run, run.reference)
+        axis.plot(reference[:, 1], reference[:, 0], color=REFERENCE_COLOUR, linewidth=0.7)
         speeds = run.speeds[counted]
         axis.plot(speeds[:, 1], speeds[:, 0], color=colours[name], linewidth=0.8, alpha=0.9)
         title = '\n'.join(wrap(name, 24)[:2])
@@ -239,7 +241,7 @@ def estimation_portraits(showcase: FigureRuns) -> Any:
     for axis, (kind, found), colour in zip(axes.flat, shown.items(), palette, strict=False):
         miss = float(np.sqrt(np.mean((found - true) ** 2)))
         axis.plot(found[:, 1], found[:, 0], color=colour, linewidth=0.7, label='estimated')
-        axis.plot(true[:, 1], true[:, 0], color=WANTED, linewidth=0.8, label='true')
+        axis.plot(true[:, 1], true[:, 0], color=REFERENCE_COLOUR, linewidth=0.8, label='true')
         axis.set_title(f'{KIND_NAMES.get(kind, kind)}\nRMSE {miss:.3f} rad/s')
     _name_wheels(axes)
     return figure
@@ -254,20 +256,20 @@ def _name_wheels(axes: Any) -> None:
 
 def _ranked(results: Results, drive: str) -> list[ResultRow]:
     rows = results.rows_of(drive, PAPER_NOISE, NOMINAL)
-    rows = [row for row in rows if row.rival or row.controller == FULL]
+    rows = [row for row in rows if row.baseline or row.controller == FULL]
     return sorted((r for r in rows if math.isfinite(r.rmse_mean)), key=lambda r: r.rmse_mean)
 
 
 def _label(row: ResultRow) -> str:
-    return _with_mark(row.controller, row.rival, row.preview)
+    return _with_mark(row.controller, row.baseline, row.preview)
 
 
 def _name(results: Results, name: str) -> str:
     return _with_mark(name, *results.kinds[name])
 
 
-def _with_mark(name: str, rival: bool, preview: bool) -> str:
-    return f'{name} (preview)' if rival and preview and 'preview' not in name else name
+def _with_mark(name: str, baseline: bool, preview: bool) -> str:
+    return f'{name} (preview)' if baseline and preview and 'preview' not in name else name
 
 
 def _whisker(ci95: float) -> float:

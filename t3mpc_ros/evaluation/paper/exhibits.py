@@ -135,16 +135,21 @@ EXHIBITS = (
         'The accuracy of the suggested method is seen to surpass that of the others.',
         'Torque drive, noise variance 0.04 (rad/s)²; RMSE in rad/s of the run shown. Black: '
         'reference.',
-        ('half of the best rival',),
+        ('half of the best baseline',),
         'fig15_portraits',
         lambda m: comparison_figures.portraits(m.showcase, m.results),
     ),
     Exhibit(
-        'Comparison with rivals at the noise of the paper (Table 3)',
+        'Comparison with baselines at the noise of the paper (Table 3)',
         'The suggested method is about 50 % more accurate than the others.',
         'Every method had the same budget of tuning on other seeds, the same state estimate and '
         'the same drive. Whiskers: 95 % interval over seeds.',
-        ('half of the best rival', 'share of the best rival', 'rivals with preview', 'noise-free'),
+        (
+            'half of the best baseline',
+            'share of the best baseline',
+            'baselines with preview',
+            'noise-free',
+        ),
         'table3_rmse',
         lambda m: comparison_figures.rmse_bars(m.results),
         'Methods in every case',

@@ -20,7 +20,7 @@ PAPER_NOISE = 0.04
 """The paper's own noise variance, (rad/s)²."""
 NOMINAL = 'nominal'
 EXACT = 'exact model'
-"""In the name of a rival whose model has the nominal inertia; the models of all other rivals
+"""In the name of a baseline whose model has the nominal inertia; the models of all other baselines
 with preview believe in one that is 30 % off."""
 DEAD_TIME = 'dead time'
 """The case that only the velocity drive has."""
@@ -43,14 +43,14 @@ WITHOUT = {
 
 
 class Method(Protocol):
-    """A contestant, as plain data: what tables and results read of it; runs may read more."""
+    """A method, as plain data: what tables and results read of it; runs may read more."""
 
     @property
     def name(self) -> str:
         """Its name in tables and results."""
 
     @property
-    def rival(self) -> bool:
+    def baseline(self) -> bool:
         """Whether it is somebody else's method, not a stage of ours."""
 
     @property
@@ -70,7 +70,7 @@ class RunRecord(Protocol):
         """s, shape (n,)."""
 
     @property
-    def wanted(self) -> Array:
+    def reference(self) -> Array:
         """r, rad/s, shape (n, 2)."""
 
     @property
@@ -108,7 +108,7 @@ class ExperimentSetup:
     """Where methods and runs come from."""
 
     methods: Callable[[str], Mapping[str, Method]]
-    """The contestants of a drive by name."""
+    """The methods of a drive by name."""
     scenario: Callable[..., Any]
     """Called with drive, noise, case, seed and duration, by name; what
     ``measure_many`` takes."""
@@ -126,7 +126,7 @@ class ExperimentSetup:
 DURATION = 59.5
 """Length of a run, s: four switches, and an end before the fifth, which methods with preview would
 begin to cross without the run seeing what it is good for."""
-RIVAL_CASES = ('mass +30 %', 'mass -30 %')
+BASELINE_CASES = ('mass +30 %', 'mass -30 %')
 INTENDED_CASES = {
     WITHOUT['NT3FS']: ('mass +30 %', 'friction x3'),
     WITHOUT['compensator']: ('disturbance',),
@@ -150,10 +150,10 @@ class ExperimentGrid:
     """Noises at which the stages of the controller run the cases beside the nominal one."""
     missing_noises: tuple[float, ...] = (PAPER_NOISE,)
     """The same of the controller with one part left out."""
-    rival_noises: tuple[float, ...] = (PAPER_NOISE,)
-    """The same of the rivals."""
-    rival_cases: tuple[str, ...] = RIVAL_CASES
-    """The cases beside the nominal one that rivals with preview run."""
+    baseline_noises: tuple[float, ...] = (PAPER_NOISE,)
+    """The same of the baselines."""
+    baseline_cases: tuple[str, ...] = BASELINE_CASES
+    """The cases beside the nominal one that baselines with preview run."""
     drives: tuple[str, ...] = DRIVES
 
     def __post_init__(self) -> None:
@@ -204,16 +204,16 @@ def make_grid(
 def needed_experiments(bench: ExperimentSetup, extent: ExperimentGrid) -> tuple[Experiment, ...]:
     """Return every cell that is needed, each once, by drive, case, noise and method.
 
-    Every rival and every stage of the controller in the nominal case at every noise; the stages
+    Every baseline and every stage of the controller in the nominal case at every noise; the stages
     in every other case at ``perturbed_noises``; the controller with one part left out in the
-    cases that part is for, at ``missing_noises``; rivals with preview in ``rival_cases`` at
+    cases that part is for, at ``missing_noises``; baselines with preview in ``rival_cases`` at
     ``rival_noises``.
 
     Raises
     ------
     ValueError
         A drive has no controller named :data:`FULL`, a method another name than its key, or a
-        stage of the controller is called a rival.
+        stage of the controller is called a baseline.
     """
     found = []
     for drive in extent.drives:
@@ -221,9 +221,9 @@ def needed_experiments(bench: ExperimentSetup, extent: ExperimentGrid) -> tuple[
         if FULL not in methods or any(name != method.name for name, method in methods.items()):
             names = ', '.join(methods)
             raise ValueError(f'methods of {drive} must hold {FULL}, by their names: got {names}')
-        if wrong := [name for name in (*STAGES, *WITHOUT.values()) if _is_rival(methods, name)]:
+        if wrong := [name for name in (*STAGES, *WITHOUT.values()) if _is_baseline(methods, name)]:
             raise ValueError(
-                f'stages of the controller must not be rivals: got {", ".join(wrong)}'
+                f'stages of the controller must not be baselines: got {", ".join(wrong)}'
             )
         for case in extent.cases:
             if case == DEAD_TIME and drive != 'velocity':
@@ -242,10 +242,10 @@ def _noises(extent: ExperimentGrid, method: Method, case: str) -> tuple[float, .
         return extent.missing_noises if wanted else ()
     if case == NOMINAL:
         return extent.noises
-    if method.rival:
-        return extent.rival_noises if method.preview and case in extent.rival_cases else ()
+    if method.baseline:
+        return extent.baseline_noises if method.preview and case in extent.baseline_cases else ()
     return extent.perturbed_noises
 
 
-def _is_rival(methods: Mapping[str, Method], name: str) -> bool:
-    return name in methods and methods[name].rival
+def _is_baseline(methods: Mapping[str, Method], name: str) -> bool:
+    return name in methods and methods[name].baseline

@@ -37,7 +37,7 @@ START = 3.0
 _IRRELEVANT_SOURCES = (
     'nodes/', 'record/', 'radio/', 'emulator/', 'lab/bag/', 'lab/rerun/',
     'lab/report/', 'lab/paper/', 'lab/program.py', 'lab/commands.py', 'lab/demo.py',
-    'lab/processes.py', 'lab/exponents.py', 'lab/estimation.py', 'lab/contestants.py',
+    'lab/processes.py', 'lab/exponents.py', 'lab/estimation.py', 'lab/methods.py',
     'lab/timing', 'lab/tuning',
 )  # fmt: skip
 
@@ -60,10 +60,10 @@ class RunNumbers:
 
 def measure(run: RunRecord) -> RunNumbers:
     """Return what is kept of a run; the first :data:`START` seconds do not count."""
-    arrays = run.wanted, run.speeds, run.command, run.terms
+    arrays = run.reference, run.speeds, run.command, run.terms
     if not all(bool(np.isfinite(values).all()) for values in arrays):
         return RunNumbers(math.nan, math.nan, math.nan, math.nan, False)
-    counted = np.abs(run.speeds - run.wanted)[run.time >= START]
+    counted = np.abs(run.speeds - run.reference)[run.time >= START]
     return RunNumbers(
         float(run.rmse(START)),
         float(run.rmse(START, cut=SETTLING)),

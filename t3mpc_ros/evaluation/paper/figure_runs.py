@@ -84,9 +84,9 @@ def simulate_figure_runs(
     """
     seed = extent.seeds[0]
     shown = portrait_methods(results)
-    wanted = [('torque', name) for name in shown] + [('velocity', FULL)]
+    requested = [('torque', name) for name in shown] + [('velocity', FULL)]
     if NO_PREVIEW in bench.methods('velocity'):
-        wanted.append(('velocity', NO_PREVIEW))
+        requested.append(('velocity', NO_PREVIEW))
     methods = {kind: bench.methods(kind) for kind in ('torque', 'velocity')}
     jobs = [
         (
@@ -95,13 +95,13 @@ def simulate_figure_runs(
             ),
             methods[kind][name],
         )
-        for kind, name in wanted
+        for kind, name in requested
     ]
     found: dict[tuple[str, str], RunRecord] = {}
     for index, run in bench.measure_many(jobs, full_record, team):
-        found[wanted[index]] = run
-    if len(found) != len(wanted):
-        raise RuntimeError(f'{len(wanted) - len(found)} runs never came back')
+        found[requested[index]] = run
+    if len(found) != len(requested):
+        raise RuntimeError(f'{len(requested) - len(found)} runs never came back')
     alone = simulate_open_loop(torque_robot(PAPER_NOISE, seed), SETTLE + extent.duration, seed)
     first = round(SETTLE / alone.period)
     return FigureRuns(
@@ -125,8 +125,8 @@ def full_record(run: RunRecord) -> RunRecord:
 
 
 def portrait_methods(results: Results) -> list[str]:
-    """Return whose phase portraits are compared: ours, other fuzzy kinds, then the best rivals."""
-    rows = results.rows_of('torque', PAPER_NOISE, rival=True)
+    """Return whose phase portraits are compared: ours, other fuzzy kinds, then the best baselines."""
+    rows = results.rows_of('torque', PAPER_NOISE, baseline=True)
     rows.sort(key=lambda row: math.inf if math.isnan(row.rmse_mean) else row.rmse_mean)
     names = [row.controller for row in rows]
     kinds = re.compile(r'fuzzy|type.?[12]\b|\bi?t[12]\b', re.IGNORECASE)
@@ -152,7 +152,7 @@ def largest_switch(run: RunRecord) -> int | None:
     rows = early if early.size else rows
     if not rows.size:
         return None
-    jumps = np.abs(run.wanted[rows] - run.wanted[rows - 1]).sum(axis=1)
+    jumps = np.abs(run.reference[rows] - run.reference[rows - 1]).sum(axis=1)
     return int(rows[int(np.argmax(jumps))])
 
 

@@ -37,7 +37,7 @@ class PaperOptions:
 
 
 def default_setup() -> ExperimentSetup:
-    """Return the contestants and the closed loop of this package."""
+    """Return the methods and the closed loop of this package."""
     from t3mpc_ros.evaluation.closed_loop import WorkerPool, measure_many
     from t3mpc_ros.evaluation.methods import methods
     from t3mpc_ros.evaluation.scenario import CASES, HELD_OUT_SEEDS, Scenario

@@ -59,13 +59,13 @@ def chatter(results: Results, drive: str) -> Table:
     return Table(title, head, tuple(rows), (FULL,))
 
 
-def cases(results: Results, drive: str, noise: float, *, rivals: bool) -> Table | None:
-    """Return RMSE by case: of the rivals and the full controller, or of its stages.
+def cases(results: Results, drive: str, noise: float, *, baselines: bool) -> Table | None:
+    """Return RMSE by case: of the baselines and the full controller, or of its stages.
 
     None when nothing beside the nominal case was measured at this noise.
     """
-    if rivals:
-        names = [n for n, (rival, _) in results.kinds.items() if rival or n == FULL]
+    if baselines:
+        names = [n for n, (baseline, _) in results.kinds.items() if baseline or n == FULL]
     else:
         names = [*STAGES, *WITHOUT.values()]
     shown = [
@@ -80,9 +80,11 @@ def cases(results: Results, drive: str, noise: float, *, rivals: bool) -> Table 
         found = [results.row(name, drive, noise, case) for case in shown]
         if any(found):
             rows.append((name, *(_rmse(row) for row in found)))
-    what = 'Methods in every case' if rivals else 'The controller as it grows, and less one part'
+    what = (
+        'Methods in every case' if baselines else 'The controller as it grows, and less one part'
+    )
     title = f'{what}: RMSE (rad/s), {drive} drive, noise {noise:g}'
-    return Table(title, (('method' if rivals else 'stage'), *shown), tuple(rows), (FULL,))
+    return Table(title, (('method' if baselines else 'stage'), *shown), tuple(rows), (FULL,))
 
 
 def differences(
@@ -148,10 +150,10 @@ def all_tables(results: Results, estimated: Sequence[EstimationResult]) -> dict[
     for drive in results.drives:
         methods += [comparison(results, drive), comparison(results, drive, settled=True)]
         varied.append(chatter(results, drive))
-        perturbed += [cases(results, drive, noise, rivals=True) for noise in (PAPER_NOISE,)]
+        perturbed += [cases(results, drive, noise, baselines=True) for noise in (PAPER_NOISE,)]
         for noise in results.noises:
             parts += [
-                cases(results, drive, noise, rivals=False),
+                cases(results, drive, noise, baselines=False),
                 differences(results, stages, drive, noise, 'Adding a part'),
                 differences(results, losses, drive, noise, 'Leaving a part out'),
             ]

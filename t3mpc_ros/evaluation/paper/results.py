@@ -27,7 +27,7 @@ class ResultRow:
     """How one method fared in one situation; NaN where a run left the finite numbers."""
 
     controller: str
-    rival: bool
+    baseline: bool
     preview: bool
     drive: str
     noise: float
@@ -93,7 +93,7 @@ class Results:
     Parameters
     ----------
     kinds
-        Of each method: whether it is a rival, and whether it has preview; in the tables' order.
+        Of each method: whether it is a baseline, and whether it has preview; in the tables' order.
     numbers
         One entry per seed, in the same order of seeds in all cells.
     duration
@@ -128,7 +128,7 @@ class Results:
         noise: float,
         case: str = NOMINAL,
         *,
-        rival: bool | None = None,
+        baseline: bool | None = None,
         preview: bool | None = None,
     ) -> list[ResultRow]:
         """Return the rows of all methods in one situation, those of a kind if one is given."""
@@ -136,7 +136,7 @@ class Results:
             row
             for name in self.kinds
             if (row := self.row(name, drive, noise, case)) is not None
-            and rival in (None, row.rival)
+            and baseline in (None, row.baseline)
             and preview in (None, row.preview)
         ]
 
@@ -186,12 +186,12 @@ class Results:
         return [paired for paired in found if paired is not None]
 
     def _row(self, cell: Experiment, runs: Sequence[RunNumbers]) -> ResultRow:
-        rival, preview = self.kinds[cell.method]
+        baseline, preview = self.kinds[cell.method]
         rmse, settled = [run.rmse for run in runs], [run.settled for run in runs]
         finite = all(run.finite for run in runs)
         return ResultRow(
             controller=cell.method,
-            rival=rival,
+            baseline=baseline,
             preview=preview,
             drive=cell.drive,
             noise=cell.noise,
@@ -218,12 +218,12 @@ def results_of(
     Raises
     ------
     ValueError
-        A method is a rival, or has preview, with one drive and not with the other.
+        A method is a baseline, or has preview, with one drive and not with the other.
     """
     kinds: dict[str, tuple[bool, bool]] = {}
     for drive in extent.drives:
         for name, method in bench.methods(drive).items():
-            kind = (bool(method.rival), bool(method.preview))
+            kind = (bool(method.baseline), bool(method.preview))
             if kinds.setdefault(name, kind) != kind:
                 raise ValueError(f'{name} must be of the same kind with every drive')
     return Results(kinds, numbers, extent.duration)

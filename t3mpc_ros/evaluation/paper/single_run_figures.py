@@ -27,7 +27,7 @@ from t3mpc_ros.geometry.types import ORIGIN, WheelSpeeds
 
 Array = NDArray[np.float64]
 
-WANTED, DRIVEN = COLOURS[REFERENCE], COLOURS[TRUTH]
+REFERENCE_COLOUR, DRIVEN = COLOURS[REFERENCE], COLOURS[TRUTH]
 COMMAND, MEASURED = COLOURS['applied'], COLOURS[ODOMETRY]
 
 
@@ -36,10 +36,10 @@ def path(showcase: FigureRuns) -> Any:
     run = showcase.velocity
     figure = new_figure(5.0)
     axis = figure.subplots()
-    wanted, driven = floor_path(run.wanted, run.time), floor_path(run.speeds, run.time)
-    axis.plot(*wanted.T, color=WANTED, linewidth=1.0, label='wanted')
+    reference, driven = floor_path(run.reference, run.time), floor_path(run.speeds, run.time)
+    axis.plot(*reference.T, color=REFERENCE_COLOUR, linewidth=1.0, label='reference')
     axis.plot(*driven.T, color=DRIVEN, linewidth=1.6, label='driven')
-    axis.plot(*driven[0], 'o', color=WANTED, markersize=6, label='start')
+    axis.plot(*driven[0], 'o', color=REFERENCE_COLOUR, markersize=6, label='start')
     at = driven[1:][np.diff(run.modes) != 0]
     axis.plot(*at.T, 'D', color=COLOURS['switch'], markersize=5, label='switch')
     axis.set_aspect('equal', adjustable='datalim')
@@ -78,9 +78,9 @@ def floor_path(speeds: Array, time: Array, geometry: WheelGeometry | None = None
 def path_in_words(showcase: FigureRuns) -> str:
     """Return how long the way was and where it ended."""
     run = showcase.velocity
-    wanted, driven = floor_path(run.wanted, run.time), floor_path(run.speeds, run.time)
+    reference, driven = floor_path(run.reference, run.time), floor_path(run.speeds, run.time)
     way = float(np.hypot(*np.diff(driven, axis=0).T).sum())
-    apart = float(np.hypot(*(driven[-1] - wanted[-1])))
+    apart = float(np.hypot(*(driven[-1] - reference[-1])))
     return (
         f'A simulated robot: after {way:.1f} m in {run.time[-1]:.0f} s it is {apart:.2f} m from '
         'where the reference alone would have led, with nothing that corrects its place.'
@@ -110,10 +110,14 @@ def _portrait(run: RunRecord) -> Any:
     figure = new_figure(3.4)
     axes = figure.subplots(1, 2, sharex=True, sharey=True)
     for axis, values, colour, title in zip(
-        axes, (run.wanted, run.speeds), (WANTED, DRIVEN), ('reference', 'robot'), strict=True
+        axes,
+        (run.reference, run.speeds),
+        (REFERENCE_COLOUR, DRIVEN),
+        ('reference', 'robot'),
+        strict=True,
     ):
         # The robot's way through a switch is part of its portrait, the reference's jump is not.
-        shown = broken_at_switches(run, values) if values is run.wanted else values
+        shown = broken_at_switches(run, values) if values is run.reference else values
         axis.plot(shown[:, 1], shown[:, 0], color=colour, linewidth=0.8)
         axis.set_title(title)
         axis.set_xlabel('left wheel / rad/s')
@@ -152,7 +156,12 @@ def outputs(showcase: FigureRuns) -> Any:
                 axis.plot(
                     time, run.measured[rows, i], '.', color=MEASURED, ms=2.5, label='measured'
                 )
-            axis.plot(*thinned(time, run.wanted[rows, i]), color=WANTED, lw=1.0, label='reference')
+            axis.plot(
+                *thinned(time, run.reference[rows, i]),
+                color=REFERENCE_COLOUR,
+                lw=1.0,
+                label='reference',
+            )
             axis.plot(*thinned(time, run.speeds[rows, i]), color=DRIVEN, lw=1.2, label='robot')
     legend_above(figure, axes[0][-1])
     return figure
@@ -205,7 +214,14 @@ def preview(showcase: FigureRuns) -> Any:
     figure, axes = new_panels(2, 2.1)
     for axis, i in zip(axes, range(2), strict=True):
         axis.axvline(0.0, color=COLOURS['switch'], linewidth=0.8, linestyle=(0, (4, 3)))
-        axis.step(time, run.wanted[rows, i], color=WANTED, lw=1.0, where='post', label='reference')
+        axis.step(
+            time,
+            run.reference[rows, i],
+            color=REFERENCE_COLOUR,
+            lw=1.0,
+            where='post',
+            label='reference',
+        )
         axis.plot(time, run.speeds[rows, i], color=DRIVEN, lw=1.6, label='with preview')
         axis.plot(time, blind.speeds[rows, i], color='#ea580c', lw=1.6, label='without preview')
         axis.set_title(f'{WHEELS[i]} wheel')

@@ -109,32 +109,34 @@ class _MethodAdapter:
                 JUMP_DETECTION_FACTOR * limits.angular_acceleration,
             )
         )
-        self._rival: BaselineController | None = None
+        self._baseline: BaselineController | None = None
         self._learnt: Mapping[str, Array] = {}
         self._last_ns = 0
 
     def stop(self) -> None:
         """Let the rival rest; what it has learnt is kept."""
-        if self._rival is not None:
-            self._learnt = self._rival.learnt()
-            self._rival = None
+        if self._baseline is not None:
+            self._learnt = self._baseline.get_weights()
+            self._baseline = None
 
     def answer(self, measured: State) -> BodyTwist | None:
         """Return what the rival commands; None where the reference is not known far enough."""
         drive, stamp = self._drive, measured.stamp_ns
         speeds = np.array(wheels_from_twist(measured.twist, self._parameters.geometry))
         gap = (stamp - self._last_ns) / NANOSECONDS
-        fresh = self._rival is None or not 0.0 < gap <= self._parameters.watchdog.odometry_timeout
+        fresh = (
+            self._baseline is None or not 0.0 < gap <= self._parameters.watchdog.odometry_timeout
+        )
         self._last_ns = stamp
         if fresh:
             drive.reset(speeds)
         drive.observe(speeds, self._period if fresh else gap)
         if fresh:
-            self._rival = self._method(self._knowledge())
+            self._baseline = self._method(self._knowledge())
             if self._learnt:
-                self._rival.restore(self._learnt)
-        rival = self._rival
-        if rival is None or (rows := self._rows(stamp, rival.preview)) is None:
+                self._baseline.set_weights(self._learnt)
+        baseline = self._baseline
+        if baseline is None or (rows := self._rows(stamp, baseline.preview)) is None:
             return None
         observation = Observation(
             drive.predicted,
@@ -142,10 +144,10 @@ class _MethodAdapter:
             rows[0],
             rows[1],
             drive.command,
-            rows if rival.preview else None,
+            rows if baseline.preview else None,
         )
-        applied = drive.send_acceleration(rival.step(observation)).copy()
-        rival.applied(applied, limited=drive.limited)
+        applied = drive.send_acceleration(baseline.step(observation)).copy()
+        baseline.applied(applied, limited=drive.limited)
         return drive.twist
 
     def tell(self, sent: BodyTwist) -> None:

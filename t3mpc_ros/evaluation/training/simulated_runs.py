@@ -11,7 +11,7 @@ from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.closed_loop import LoopRecord, MethodSpec, pretrain, run
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean, paired
 from t3mpc_ros.evaluation.methods import FULL, methods, proposed_parameters
-from t3mpc_ros.evaluation.proposed_method import ComposedParameters, ProposedController
+from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
 from t3mpc_ros.evaluation.scenario import (
     HELD_OUT_SEEDS,
     PRETRAINING_DURATION,
@@ -34,7 +34,7 @@ EARLY = 10.0
 _FOLLOWED = [TERM_NAMES.index(name) for name in ('feedback', 'feedforward', 'compensator')]
 
 
-def full_parameters(drive: str) -> ComposedParameters:
+def full_parameters(drive: str) -> ProposedParameters:
     """Return the settings of our full controller: tuned, where tuned ones come with the package.
 
     Raises
@@ -47,12 +47,12 @@ def full_parameters(drive: str) -> ComposedParameters:
         if PACKAGED_FILE.is_file()
         else proposed_parameters()[drive]
     )
-    if not isinstance(parameters, ComposedParameters):
+    if not isinstance(parameters, ProposedParameters):
         raise TypeError(f'{FULL} must have ComposedParameters: got {type(parameters).__name__}')
     return parameters
 
 
-def fit_simulated_runs(drive: str) -> tuple[Mapping[str, Array], ComposedParameters]:
+def fit_simulated_runs(drive: str) -> tuple[Mapping[str, Array], ProposedParameters]:
     """Return what the full controller learns in the practice runs, and its settings."""
     parameters = full_parameters(drive)
     return pretrain(ProposedController, parameters, drive), parameters
@@ -60,7 +60,7 @@ def fit_simulated_runs(drive: str) -> tuple[Mapping[str, Array], ComposedParamet
 
 def assess(
     drive: str,
-    parameters: ComposedParameters,
+    parameters: ProposedParameters,
     learnt: Mapping[str, Array],
     seeds: Sequence[int],
     progress: Callable[[str], None] = lambda text: None,
@@ -82,7 +82,7 @@ def assess(
 
     def with_model(*given: object) -> ProposedController:
         controller = ProposedController(parameters, *given)  # type: ignore[arg-type]
-        controller.restore(learnt)
+        controller.set_weights(learnt)
         return controller
 
     fresh, taught = [], []
@@ -118,7 +118,7 @@ def early_rmse(record: LoopRecord) -> float:
 
 
 def held_out_skills(
-    parameters: ComposedParameters, learnt: Mapping[str, Array], record: LoopRecord
+    parameters: ProposedParameters, learnt: Mapping[str, Array], record: LoopRecord
 ) -> dict[str, Array]:
     """Return the skills before and after on the last quarter of a run, as :func:`skills` does."""
     predictive = parameters.predictive
@@ -142,7 +142,7 @@ def skill_table(skills: Mapping[str, Array]) -> str:
     return '\n'.join(lines)
 
 
-def training_data_of(record: LoopRecord, parameters: ComposedParameters) -> TrainingData:
+def training_data_of(record: LoopRecord, parameters: ProposedParameters) -> TrainingData:
     """Return a run of the lab as the replay of a bag would have it."""
     terms = record.terms
     begins = np.zeros(record.time.size, dtype=np.bool_)

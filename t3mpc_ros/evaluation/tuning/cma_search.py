@@ -1,6 +1,15 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""CMA-ES search in the unit cube with a fixed number of evaluations and a resumable history."""
+"""CMA-ES search in the unit cube with a fixed number of evaluations and a resumable history.
+
+CMA-ES samples a generation from a normal distribution and moves its mean and covariance towards
+the better half; it uses only the order of the values, so neither their scale nor outliers matter
+(N. Hansen, The CMA Evolution Strategy: A Tutorial, arXiv:1604.00772). pycma's ``BoundTransform``
+keeps the bounds: a smooth map folds samples beyond a face of the cube back, so no evaluation is
+spent outside. A search that converges early restarts at a random point of the cube with
+generations up to twice as large (IPOP, A. Auger and N. Hansen, 2005,
+doi 10.1109/CEC.2005.1554902): every method uses its whole budget.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,6 +1,14 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Tunable methods: their initial parameters and the search ranges as a unit cube."""
+r"""Tunable methods: their initial parameters and the search ranges as a unit cube.
+
+A search works in the unit cube. A parameter x in [a, b] and its coordinate p in [0, 1] are
+
+.. math:: x = a\,(b/a)^p \quad\text{(logarithmic)}, \qquad x = a + p\,(b - a) \quad\text{(linear)}
+
+so that equal steps are equal factors for gains and weights, whose order of magnitude is unknown.
+An integer has an interval of equal length around each value: a and b are extended by one half.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

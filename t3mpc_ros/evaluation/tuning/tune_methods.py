@@ -202,7 +202,7 @@ def _objective(
 def _about(method: MethodDefinition, drive: str, budget: TuningBudget) -> dict[str, object]:
     return {
         'method': method.name,
-        'rival': method.controller_type.__qualname__,
+        'controller': method.controller_type.__qualname__,
         'drive': drive,
         'training_seeds': budget.training_seeds,
         'noise_levels': budget.noise_levels,

@@ -1,6 +1,10 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Tuned parameters of all methods in one JSON file of the package."""
+"""Tuned parameters of all methods in one JSON file of the package.
+
+The file holds all parameters of a method, not only the tuned ones: a later change of a default
+does not change what was compared. A file that does not fit the parameter tables is rejected.
+"""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields

@@ -1,6 +1,13 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Test courses of the digital twin: UMBmark square, turns on the spot, patrol."""
+"""Test courses of the digital twin: UMBmark square, turns on the spot, patrol.
+
+Squares and turns follow Borenstein and Feng (Measurement and Correction of Systematic Odometry
+Errors in Mobile Robots, IEEE Trans. Robotics and Automation 12(6), 1996, doi:10.1109/70.544770):
+each leg ends at a wheel angle, measured by the step counters. Odometry therefore has no influence
+on the drive, and the same slip acts on every odometry. The robot rests before the start, for the
+gyro bias, and at the end.
+"""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
