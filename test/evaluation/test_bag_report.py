@@ -221,7 +221,7 @@ def test_a_bag_of_another_robot_has_a_report(rows, tmp_path, capsys, kind):
         write_old_metadata(folder, rows, kinds, 'mcap', file.name)
     said, page = text_of(folder, capsys)
     assert 'RMSE forward/turning while driven not measured' in said
-    assert re.search(r'answers after forward (29|30|31)\d ms, turning (29|30|31)\d ms;', said)
+    assert re.search(r'responds after forward (29|30|31)\d ms, turning (29|30|31)\d ms;', said)
     found = {path.stem for path in (tmp_path / 'out' / 'figures').iterdir()}
     assert found == {'control', 'response', 'acceleration', 'path', 'timing'}
     assert 'does not say how large the wheels are' in page

@@ -15,7 +15,7 @@ from t3mpc_ros.bag.reader import BagReader
 Array = NDArray[np.float64]
 
 SHARES = ('lost_share', 'round_trip_median_ms', 'round_trip_p99_ms', 'telemetry_age_s')
-"""Keys of numbers that come and go, see ``radio_bridge``."""
+"""Keys of gauges, see ``radio_bridge``."""
 COUNTERS = (
     'cycles',
     'cycles_lost',
@@ -28,39 +28,39 @@ COUNTERS = (
     'commands',
     'commands_refused',
 )
-"""Keys of numbers that only grow."""
+"""Keys of counters, which only grow."""
 LINK_KEYS = ('cycles', 'cycles_lost', 'lost_share', 'round_trip_median_ms', 'round_trip_p99_ms')
-"""Two of these make a status one of a link."""
+"""A status with at least two of these keys describes a link."""
 _LEVELS = {1: 'warning', 2: 'error', 3: 'stale'}
 
 DiagnosticEvent = tuple[float, str, str, str]
-"""When first, level, who, what."""
+"""Time of the first message, level, node, text."""
 
 
 @dataclass(frozen=True)
 class LinkHistory:
-    """One link over time."""
+    """Metrics of one link over time."""
 
     name: str
-    """Of the status that tells of it."""
+    """Name of the diagnostic status."""
     time: Array
-    """s, of receipt."""
+    """Receive time, s."""
     values: Mapping[str, Array]
-    """By key, NaN where it was not said; those of :data:`SHARES` and :data:`COUNTERS`."""
+    """Arrays by key, NaN where a value is missing; keys of :data:`SHARES` and :data:`COUNTERS`."""
 
     def answered(self) -> Array:
-        """Return which share of the cycles since the report before was answered, shape (n,)."""
+        """Return the share of answered cycles since the previous report, shape (n,)."""
         cycles, lost = self.values.get('cycles'), self.values.get('cycles_lost')
         if cycles is None or lost is None:
             share = self.values.get('lost_share')
             return np.full(self.time.size, math.nan) if share is None else 1.0 - share
         made, failed = (np.diff(table, prepend=math.nan) for table in (cycles, lost))
         with np.errstate(invalid='ignore', divide='ignore'):
-            # A counter that falls is that of a bridge that was started anew.
+            # A falling counter means that the bridge was restarted.
             return np.where((made > 0.0) & (failed >= 0.0), 1.0 - failed / made, math.nan)
 
     def grown(self, key: str) -> float:
-        """Return by how much a counter grew in the recording, over restarts; NaN if unknown."""
+        """Return the increase of a counter in the recording, over restarts; NaN if unknown."""
         table = self.values.get(key)
         if table is None or not np.isfinite(table).any():
             return math.nan
@@ -71,7 +71,7 @@ class LinkHistory:
 
 @dataclass(frozen=True)
 class LinkMetrics:
-    """How well a link worked over a recording; NaN where that was not said."""
+    """Quality of a link over a recording; NaN where it is unknown."""
 
     cycles: float
     lost: float
@@ -84,17 +84,17 @@ class LinkMetrics:
     oldest: float
     """Largest reported age of the last measurement, s."""
     resets: float
-    """Of the robot's board."""
+    """Resets of the robot board."""
     dongle_resets: float
     port_failures: float
     sessions: float
-    """Begun after the first report."""
+    """Sessions that began after the first report."""
     damaged: float
-    """Frames with a wrong checksum or form."""
+    """Frames with a wrong checksum or format."""
 
 
 def link_metrics(link: LinkHistory) -> LinkMetrics:
-    """Return a link in few numbers."""
+    """Return the summary of a link."""
     cycles, lost = link.grown('cycles'), link.grown('cycles_lost')
     answered = 1.0 - lost / cycles if cycles > 0.0 else math.nan
     if math.isnan(answered):
@@ -122,9 +122,9 @@ def _over(measure: Callable[[Array], Any], values: Array) -> float:
 def read_diagnostics(
     recording: BagReader, namespace: str
 ) -> tuple[tuple[DiagnosticEvent, ...], tuple[LinkHistory, ...]]:
-    """Return each distinct warning or error with when it came first, and the links there are.
+    """Return each distinct warning or error with its first time, and all links of the bag.
 
-    Of the whole bag ``/diagnostics`` is read, and of the namespace its own.
+    ``/diagnostics`` is read for the whole bag, and below the namespace for that robot.
     """
     found: dict[tuple[str, str, str], float] = {}
     rows: dict[str, list[tuple[float, dict[str, float]]]] = {}
@@ -157,7 +157,7 @@ def read_diagnostics(
 
 
 def _numbers(status: Any) -> dict[str, float]:
-    """Return what a status says of a link; nothing when it is of something else."""
+    """Return the link values of a status; empty when the status describes something else."""
     told = {entry.key: entry.value for entry in status.values}
     if sum(key in told for key in LINK_KEYS) < 2:
         return {}
@@ -166,6 +166,6 @@ def _numbers(status: Any) -> dict[str, float]:
         try:
             value = float(told[key])
         except (KeyError, ValueError):
-            continue  # a text, or not said: unknown
+            continue  # not a number or missing: unknown
         numbers[key] = value if math.isfinite(value) else math.nan
     return numbers

@@ -18,7 +18,7 @@ from t3mpc_ros.evaluation.bag_report.topic_roles import COMMAND, ODOMETRY, REFER
 Array = NDArray[np.float64]
 
 SETTLING = 1.0
-"""Seconds in which the robot catches up: left out after the start of the drive, and after each
+"""Settling time (s): excluded after the start of the drive and after each switch; also the longest
 switch where it is to have settled; also the longest time left out before a switch."""
 WINDOW = 0.2
 """Width (s) over which the target of the estimate is smoothed."""
@@ -26,14 +26,14 @@ WINDOW = 0.2
 
 @dataclass(frozen=True)
 class ErrorStatistics:
-    """Of the tracking error of one channel, in its unit; NaN without a sample."""
+    """Statistics of the tracking error of one channel, in its unit; NaN without a sample."""
 
     rmse: float
     mae: float
     largest: float
     count: int
     seconds: float
-    """How much time the samples stand for, s."""
+    """Time that the samples cover, s."""
 
 
 def statistics(error: Array, period: float = math.nan) -> ErrorStatistics:
@@ -54,10 +54,10 @@ def statistics(error: Array, period: float = math.nan) -> ErrorStatistics:
 
 
 def tracking_error(run: Run, measured: str) -> Series | None:
-    """Return measured less wanted of both channels at the stamps of the ``measured`` motion.
+    """Return measured minus reference of both channels at the stamps of the ``measured`` motion.
 
-    The reference is interpolated, but over a switch its earlier sample holds; outside the
-    reference there is no error. None when either is absent.
+    The reference is interpolated linearly; across a switch its earlier sample is held. Outside the
+    reference the error is undefined. None when either motion is missing.
     """
     motion, reference = run.motions.get(measured), run.motions.get(REFERENCE)
     if motion is None or reference is None:
@@ -76,11 +76,11 @@ def tracking_error(run: Run, measured: str) -> Series | None:
 
 
 def driving(run: Run) -> tuple[float, float]:
-    """Return from when to when the robot was being driven, s: first and last command but zero.
+    """Return start and end of the drive, s: the first and the last command other than zero.
 
-    Before, the controller did not follow the reference yet; after, it had stopped, though the
-    reference is stamped ahead and goes on. A stop in between belongs to the drive. From infinity
-    to minus infinity when every command was zero; the other way round when the bag has none.
+    Before, the controller does not follow the reference yet; afterwards it has stopped while the
+    reference, stamped ahead, continues. A stop in between belongs to the drive. (inf, -inf)
+    when every command is zero; (-inf, inf) when the bag has no commands.
     """
     command = run.motions.get(COMMAND)
     if command is None:
@@ -90,9 +90,9 @@ def driving(run: Run) -> tuple[float, float]:
 
 
 def driven(time: Array, run: Run) -> NDArray[np.bool_]:
-    """Return at which of ``time``, the stamps of an error, the robot was being driven (s).
+    """Return the mask of ``time`` (stamps of an error, s) in which the robot was driven.
 
-    The first :data:`SETTLING` seconds with a command and a reference are left out: the robot
+    The first :data:`SETTLING` seconds with a command and a reference are excluded as transient.
     has yet to catch up.
     """
     first, last = driving(run)
@@ -101,18 +101,18 @@ def driven(time: Array, run: Run) -> NDArray[np.bool_]:
 
 
 def preview_before_switch(run: Run) -> float:
-    """Return how long before a switch a controller may already be leaving the old reference, s.
+    """Return how long before a switch a controller may leave the old reference, s.
 
-    A switch is known as long before as the reference is stamped ahead. No controller needs
-    longer for it than :data:`SETTLING`, however far ahead the stamps are.
+    A switch is known in advance by the lead of the reference stamps. The interval is at most
+    :data:`SETTLING`, whatever the lead.
     """
     return min(run.lead, SETTLING)
 
 
 def settled(time: Array, switches: Array, before: float) -> NDArray[np.bool_]:
-    """Return which of ``time`` are not about a switch, all in seconds.
+    """Return the mask of ``time`` (s) that excludes the window around each switch.
 
-    About a switch is from ``before`` seconds before it until :data:`SETTLING` seconds after it.
+    The window extends from ``before`` seconds before a switch to :data:`SETTLING` seconds after it.
     """
     following = np.searchsorted(switches, time, 'right')
     since: Array = time - np.concatenate([[-math.inf], switches])[following]
@@ -121,14 +121,14 @@ def settled(time: Array, switches: Array, before: float) -> NDArray[np.bool_]:
 
 
 def variation(series: Series, name: str) -> float:
-    """Return the total variation per second of one quantity: how much it chatters."""
+    """Return the total variation per second of one quantity (chatter)."""
     if len(series) < 2:
         return math.nan
     return float(np.abs(np.diff(series[name])).sum() / (series.time[-1] - series.time[0]))
 
 
 def latencies(run: Run) -> Series | None:
-    """Return for each command how long after the newest odometry it was received (s)."""
+    """Return the delay of each command after the newest odometry message, by receipt (s)."""
     heard, told = run.receipts.get(ODOMETRY), run.receipts.get(COMMAND)
     if heard is None or told is None:
         return None
@@ -138,7 +138,7 @@ def latencies(run: Run) -> Series | None:
 
 
 def estimation_target(run: Run, wheel: str) -> Series | None:
-    r"""Return what the estimate g of one wheel should be: :math:`\dot\chi - u` (64), rad/s².
+    r"""Return the target of the estimate g of one wheel: :math:`\dot\chi - u` (64), rad/s².
 
     The derivative is the slope of a straight line fitted to :data:`WINDOW` seconds of the
     measured wheel speed; the applied u is averaged with the weights that this slope has on the
@@ -172,7 +172,7 @@ def estimation_target(run: Run, wheel: str) -> Series | None:
 
 
 def path_of(motion: Series, start: tuple[float, float, float]) -> tuple[Array, Array]:
-    """Return x and y (m) of driving the twists of ``motion`` from a pose, by the arcs of (2)."""
+    """Return x and y (m) of the integrated twists of ``motion`` from a pose, by the arcs of (2)."""
     dt = np.diff(motion.time)
     turn = motion['angular'][:-1] * dt
     chord = motion['linear'][:-1] * dt * np.sinc(turn / math.tau)
@@ -183,26 +183,26 @@ def path_of(motion: Series, start: tuple[float, float, float]) -> tuple[Array, A
 
 
 UNMEASURED = 'not measured'
-"""Said where there is nothing to count, which a number would hide."""
+"""Label of a metric without samples."""
 
 
 @dataclass(frozen=True)
 class ChannelMetrics:
-    """How well one channel followed; NaN where the bag does not tell."""
+    """Tracking metrics of one channel; NaN where the bag holds no data."""
 
     overall: ErrorStatistics
-    """While the robot was being driven, but for the second in which it caught up."""
+    """RMSE while driven, without the initial transient."""
     settled: ErrorStatistics
-    """Also without the time about each switch."""
+    """RMSE also without the windows around switches."""
     chatter: float
     """Total variation of the commanded speed per second."""
     demand: float
-    """The same of the reference: what following it exactly would take."""
+    """The same of the reference: the value of exact tracking."""
 
 
 @dataclass(frozen=True)
 class ReportMetrics:
-    """The main figures of a run; NaN where the bag does not tell."""
+    """Summary metrics of a run; NaN where the bag holds no data."""
 
     report: Path
     pictures: tuple[Path, ...]
@@ -210,15 +210,15 @@ class ReportMetrics:
     messages: int
     switches: int
     measured: str
-    """Where errors are taken from: ``ground_truth/odom``, else ``odom``, else empty."""
+    """Source of the errors: ``ground_truth/odom``, else ``odom``, else empty."""
     wheels: Mapping[str, ChannelMetrics]
-    """Of ``right`` and ``left``, or of ``linear`` and ``angular`` where wheels are not known."""
+    """Metrics of ``right`` and ``left``, or of ``linear`` and ``angular`` without wheel geometry."""
     channels: tuple[Channel, Channel]
-    """Names and units of these."""
+    """Names and units of the channels."""
     responses: Mapping[str, ResponseFit]
-    """How the robot answers its commands, by channel, where that can be told."""
+    """Fitted response of the robot to its commands, by channel, where it is identifiable."""
     links: Mapping[str, LinkMetrics]
-    """How well the radio worked, by the name of what told."""
+    """Quality of the radio links, by name."""
     latency: float
     """Median time (s) from the receipt of odometry to that of the command."""
     latency_99: float
@@ -226,10 +226,10 @@ class ReportMetrics:
     missing: Mapping[str, float]
     """Share of missing samples by relative topic name."""
     absent: tuple[str, ...]
-    """Topics the report had to do without."""
+    """Topics that are missing in the bag."""
 
     def summary(self) -> str:
-        """Return the figures in one line."""
+        """Return the metrics in one line."""
         right, left = (self.wheels[each.name] for each in self.channels)
         overall, calm = (
             f'{format_channels(one.rmse, other.rmse, self.channels)} in {one.seconds:.1f} s'
@@ -244,7 +244,7 @@ class ReportMetrics:
             for each in self.channels
             if (fit := self.responses.get(each.name)) and fit.clear
         ]
-        answer = f'answers after {", ".join(answers)}; ' if answers else ''
+        answer = f'responds after {", ".join(answers)}; ' if answers else ''
         for name, link in self.links.items():
             answer += f'{name}: {format_number(100.0 * link.answered)} % of cycles answered; '
         missing = format_number(100.0 * self.missing.get(ODOMETRY, math.nan))
@@ -259,7 +259,7 @@ class ReportMetrics:
 def compute_metrics(
     run: Run, report: Path, pictures: tuple[Path, ...], messages: int
 ) -> ReportMetrics:
-    """Return the main figures of ``run``."""
+    """Return the summary metrics of ``run``."""
     errors = errors_of(run, run.measured)
     command, reference = run.motions.get(COMMAND), run.motions.get(REFERENCE)
     wheels = {
@@ -291,7 +291,7 @@ def compute_metrics(
 
 
 def errors_of(run: Run, measured: str) -> dict[str, tuple[ErrorStatistics, ErrorStatistics]]:
-    """Return the statistics while driven, and those where settled, by wheel."""
+    """Return the statistics while driven and those when settled, by wheel."""
     error = tracking_error(run, measured)
     if error is None:
         nothing = statistics(np.empty(0))
@@ -311,7 +311,7 @@ def errors_of(run: Run, measured: str) -> dict[str, tuple[ErrorStatistics, Error
 def format_channels(
     one: float, other: float, channels: tuple[Channel, Channel], power: str = ''
 ) -> str:
-    """Return numbers of both channels with their units, which may differ."""
+    """Return the values of both channels with their units, which may differ."""
     units = [each.unit + power for each in channels]
     if units[0] == units[1]:
         return f'{format_number(one)}/{format_number(other)} {units[0]}'
@@ -319,7 +319,7 @@ def format_channels(
 
 
 def format_number(value: float) -> str:
-    """Return three significant digits, a dash for what is not known."""
+    """Return three significant digits, or a dash for an unknown value."""
     if not math.isfinite(value):
         return '–'
     return f'{value:.0f}' if abs(value) >= 99.95 else f'{value:#.3g}'

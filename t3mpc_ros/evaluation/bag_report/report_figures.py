@@ -46,11 +46,11 @@ from t3mpc_ros.evaluation.plotting import (
 )
 
 DETAIL = 4.0
-"""Seconds of the stretch that is shown closely: the one in which the command varies most."""
+"""Length (s) of the zoomed window: where the command varies most."""
 
 
 def response(run: Run) -> Any:
-    """Return command and measured speed of both channels, and closely what the fit expects."""
+    """Return command and measured speed of both channels, with a zoom and the fit."""
     command, motion = run.motions.get(COMMAND), run.motions.get(run.measured)
     if not is_long(command) or not is_long(motion):
         return None
@@ -60,7 +60,7 @@ def response(run: Run) -> Any:
     for row, (name, title, _, unit) in enumerate(run.channels):
         axis, close = axes[2 * row : 2 * row + 2]
         axis.set_title(title)
-        close.set_title(f'{title}, closely')
+        close.set_title(f'{title}, zoom')
         start, end = busiest(command, motion, name, DETAIL)
         for label, (series, key) in shown.items():
             draw_line(axis, series, name, COLOURS[key], label, width=0.9)
@@ -93,7 +93,7 @@ def response(run: Run) -> Any:
 
 
 def acceleration(run: Run) -> Any:
-    """Return how hard the measured speeds change, and their change in turn."""
+    """Return acceleration and jerk of the measured speeds."""
     motion = run.motions.get(run.measured)
     if not is_long(motion):
         return None
@@ -118,11 +118,11 @@ def _changes(motion: Series, name: str) -> tuple[Any, Any, Any]:
 
 
 COUNTED = {
-    'robot_resets': "resets of the robot's board",
+    'robot_resets': "resets of the robot board",
     'dongle_resets': 'resets of the dongle',
-    'port_failures': 'failures of the port',
+    'port_failures': 'port failures',
     'crc_errors': 'wrong checksums',
-    'frame_errors': 'broken frames',
+    'frame_errors': 'malformed frames',
 }
 _DASHES: tuple[Any, ...] = ('-', '--', ':', '-.', (0, (1, 3)))
 
@@ -204,7 +204,7 @@ def error(run: Run) -> Any:
 
 
 def switching(run: Run) -> Any:
-    """Return which mode and which chaotic signals drive the wheels, the paper's Fig. 10."""
+    """Return the active mode and the chaotic signals of the wheels, the paper's Fig. 10."""
     shown = {name: run.numbers[name] for name in SIGNALS if name in run.numbers}
     if not shown:
         return None
@@ -246,7 +246,7 @@ def control(run: Run) -> Any:
 
 
 def terms(run: Run) -> Any:
-    """Return what each term adds to the control, (66)-(67)."""
+    """Return each term of the control law, (66)-(67)."""
     names = [n for n in (*TERMS, 'applied') if any(is_long(_term(run, n, w)) for w in WHEELS)]
     if not names:
         return None
@@ -285,7 +285,7 @@ def estimates(run: Run) -> Any:
 
 
 def portrait(run: Run) -> Any:
-    """Return one channel against the other, wanted and driven, the paper's Figs. 9 and 14."""
+    """Return one channel over the other, reference and measured, the paper's Figs. 9 and 14."""
     shown = _motions(run, REFERENCE, run.measured)
     if len(shown) < 2:
         return None
@@ -293,7 +293,7 @@ def portrait(run: Run) -> Any:
     axes = figure.subplots(1, 2, sharex=True, sharey=True)
     for axis, (name, motion) in zip(axes, shown.items(), strict=True):
         right, left = (motion[each.name] for each in run.channels)
-        if name == REFERENCE:  # a jump is no line in the portrait
+        if name == REFERENCE:  # a jump is not drawn as a line
             jumps = np.flatnonzero(np.isin(motion.time, run.switches))
             right, left = np.insert(right, jumps, np.nan), np.insert(left, jumps, np.nan)
         axis.plot(every_nth(left), every_nth(right), color=COLOURS[name], linewidth=0.8)
@@ -304,7 +304,7 @@ def portrait(run: Run) -> Any:
 
 
 def path(run: Run) -> Any:
-    """Return the paths in the plane: driven, and of a robot that had followed exactly."""
+    """Return the paths in the plane: measured, and integrated from the reference."""
     shown = _motions(run, ODOMETRY, TRUTH)
     if not shown:
         return None
@@ -319,7 +319,7 @@ def path(run: Run) -> Any:
         style = {'color': COLOURS[REFERENCE], 'linewidth': 0.8, 'label': LABELS[REFERENCE]}
         axis.plot(every_nth(x), every_nth(y), **style)
     for name, motion in shown.items():
-        width = 2.6 if name == ODOMETRY else 1.1  # seen on both sides where they coincide
+        width = 2.6 if name == ODOMETRY else 1.1  # visible on both sides where they coincide
         x, y = every_nth(motion['x']), every_nth(motion['y'])
         axis.plot(x, y, color=COLOURS[name], lw=width, label=LABELS[name])
     axis.plot(driven['x'][0], driven['y'][0], 'o', color=COLOURS[REFERENCE], label='start')
@@ -351,7 +351,7 @@ def certificate(run: Run) -> Any:
         draw_line(axis, margin, 'value', COLOURS['margin'])
         axis.axhline(0.0, color='#6b7280', linewidth=0.8)
         below = 100.0 * float(np.mean(margin['value'] < 0.0))
-        axis.set_title(f'margin of the promised decrease, below zero {below:.1f} % of the time')
+        axis.set_title(f'margin of the guaranteed decrease, below zero {below:.1f} % of the time')
         axis.set_ylabel('rad²/s³')
     if skill:
         axis = next(free)
@@ -365,7 +365,7 @@ def certificate(run: Run) -> Any:
 
 
 def timing(run: Run) -> Any:
-    """Return how long the loop took, and how regularly odometry and commands came."""
+    """Return the loop latency and the regularity of odometry and commands."""
     delay = latencies(run)
     if not is_long(delay):
         return None
@@ -382,7 +382,7 @@ def timing(run: Run) -> Any:
         axis.set_title(title)
         axis.set_ylabel('ms')
         axis.set_ylim(0.0, 1.1e3 * max(float(gap.max()), 1e-6))
-    name_time(axes, 'time of receipt')
+    name_time(axes, 'receive time')
     return figure
 
 
@@ -399,14 +399,14 @@ LINK = 'diagnostics of a radio link'
 
 @dataclass(frozen=True)
 class ReportFigure:
-    """A figure with its words."""
+    """A figure with title and caption."""
 
     stem: str
     title: str
     caption: str
     draw: Callable[[Run], Any]
     needs: tuple[str, ...]
-    """Relative names of the topics it is drawn from."""
+    """Relative names of the topics it needs."""
 
 
 REPORT_FIGURES = (
@@ -420,46 +420,46 @@ REPORT_FIGURES = (
     ReportFigure(
         'error',
         'Tracking error over time',
-        'Speed minus reference, at the stamps of the measurement: of the whole recording, though '
-        'only the time the robot was being driven is counted.',
+        'Speed minus reference at the stamps of the measurement, over the whole recording; the '
+        'metrics count only the time in which the robot was driven.',
         error,
         (REFERENCE, ODOMETRY, TRUTH),
     ),
     ReportFigure(
         'switching',
-        'What drives each wheel, and when it switches (Fig. 10)',
-        'As announced by the reference node, drawn at the time it applies.',
+        'Switching modes and chaotic signals (Fig. 10)',
+        'As published by the reference node, at the time for which it is valid.',
         switching,
         ('reference/signals', *SIGNALS),
     ),
     ReportFigure(
         'control',
-        'What the robot is told (Fig. 12)',
-        'The command is published as a body twist; u is the acceleration that was left after '
+        'Commands (Fig. 12)',
+        'The command is published as a body twist; u is the acceleration after '
         'all limits.',
         control,
         (COMMAND, *(f'controller/terms/applied/{wheel}' for wheel in WHEELS)),
     ),
     ReportFigure(
         'response',
-        'How the robot answers its commands',
-        'The fit is the command, delayed, behind a first-order lag and scaled, chosen so that it '
-        'explains most of the measured speed. Commands are placed by their receipt, odometry by '
-        'its stamps, so the delay is what an observer beside the recorder sees.',
+        'Response of the robot to its commands',
+        'The fit is the command with a dead time, a first-order lag and a gain that together '
+        'explain most of the measured speed. Commands are placed by receive time, odometry by '
+        'its stamps, so the delay is the one observed at the recorder.',
         response,
         (COMMAND, ODOMETRY),
     ),
     ReportFigure(
         'acceleration',
-        'How hard the robot moves',
+        'Acceleration and jerk',
         'Derivatives of the measured speeds, of parabolas fitted to short windows.',
         acceleration,
         (ODOMETRY, TRUTH),
     ),
     ReportFigure(
         'terms',
-        'What each term of the law adds (Fig. 12)',
-        'The terms of (66)-(67) with E12, and the acceleration applied in the end.',
+        'Terms of the control law (Fig. 12)',
+        'The terms of (66)-(67) with E12, and the applied acceleration.',
         terms,
         tuple(f'controller/terms/{name}/{w}' for name in (*TERMS, 'applied') for w in WHEELS),
     ),
@@ -467,7 +467,7 @@ REPORT_FIGURES = (
         'estimates',
         'Estimates of the unknown dynamics and their targets (Fig. 13)',
         'The target is the measured acceleration of the wheel minus the applied one, both '
-        f'smoothed over {WINDOW:g} s by a local straight line; it is left open at switches, where '
+        f'smoothed over {WINDOW:g} s by a local straight line; it is undefined at switches, where '
         'the applied one jumps between two of its samples.',
         estimates,
         tuple(f'controller/estimate/{wheel}' for wheel in WHEELS),
@@ -482,16 +482,16 @@ REPORT_FIGURES = (
     ReportFigure(
         'path',
         'Path in the plane',
-        'The reference is integrated from where the robot was when it began. Where speeds are '
-        'tracked, not places, the paths part.',
+        'The reference is integrated from the initial pose of the robot. Speeds are tracked, not '
+        'positions, so the paths diverge.',
         path,
         (ODOMETRY, TRUTH),
     ),
     ReportFigure(
         'certificate',
         'Run-time certificate and skill of the predictor',
-        'The margin is how fast V may change by E14, minus how fast it does: a negative one says '
-        'that the disturbance was larger than assumed, or that the reference has just jumped. '
+        'The margin is the largest rate of V by E14 minus its actual rate: it is negative when the '
+        'disturbance is larger than assumed, or just after a jump of the reference. '
         'Skill is 1 for perfect prediction and 0 for no better than persistence.',
         certificate,
         (
@@ -503,8 +503,8 @@ REPORT_FIGURES = (
     ReportFigure(
         'link',
         'The radio link',
-        'From the diagnostics of the bridge. A cycle is a command with its question for '
-        'telemetry; it is answered when a measurement comes back. Round trips are over the last '
+        'From the diagnostics of the bridge. A cycle is a command with a request for telemetry; '
+        'it is answered when a measurement is received. Round trips are over the last '
         '500 cycles.',
         link,
         (LINK,),
@@ -512,7 +512,7 @@ REPORT_FIGURES = (
     ReportFigure(
         'timing',
         'Punctuality of the loop',
-        'By the times at which the recorder received the messages.',
+        'By receive times at the recorder.',
         timing,
         (ODOMETRY, COMMAND),
     ),
@@ -527,4 +527,4 @@ PACKAGE_FIGURES = (
     'portrait',
     'certificate',
 )
-"""Stems of those that nobody expects of a robot without this package's nodes."""
+"""Stems of the figures that need topics of this package's nodes."""

@@ -38,7 +38,7 @@ from t3mpc_ros.evaluation.plotting import LABELS, png_of
 from t3mpc_ros.geometry.types import NANOSECONDS
 
 TableRows = tuple[list[str], list[list[str]]]
-"""Head and rows."""
+"""Header cells and rows."""
 
 
 def response_table(run: Run, fits: Mapping[str, ResponseFit]) -> TableRows:
@@ -58,7 +58,7 @@ def response_table(run: Run, fits: Mapping[str, ResponseFit]) -> TableRows:
 
 
 def roughness_table(run: Run) -> TableRows:
-    """Return how hard command and motion change."""
+    """Return acceleration and jerk of command and motion."""
     head = ['of', 'speed', 'acceleration RMS', '99 % below', 'jerk RMS', '99 % below', 'unit']
     rows = []
     for words, name in (('command', COMMAND), ('robot', run.measured)):
@@ -74,7 +74,7 @@ def roughness_table(run: Run) -> TableRows:
 
 
 def motion_table(run: Run) -> TableRows:
-    """Return way, turning, stops and pace; no row when they are not known."""
+    """Return path length, turning, stops and speeds; no row when they are unknown."""
     found = motion_summary(run)
     if found is None:
         return ['quantity', 'value'], []
@@ -84,21 +84,21 @@ def motion_table(run: Run) -> TableRows:
     more = f', and {len(found.stops) - 5} more' if len(found.stops) > 5 else ''
     mean = found.distance / found.moving if found.moving > 0.0 else 0.0
     rows = [
-        ['way, forwards and backwards', f'{format_number(found.distance)} m'],
+        ['path length, forwards and backwards', f'{format_number(found.distance)} m'],
         ['turning, both ways', f'{format_number(found.turned)} rad'],
         ['speed while moving, mean and largest', f'{mean:.3f} and {found.fastest:.3f} m/s'],
         ['time moving', f'{found.moving:.1f} s'],
         ['stops', f'{len(found.stops)}, {stood:.1f} s in all, the longest {longest:.1f} s'],
     ]
     if found.stops:
-        rows.append(['stood at', f'{where}{more} s'])
+        rows.append(['standstill at', f'{where}{more} s'])
     if COMMAND in run.motions:
-        rows.append(['of that told to move', f'{found.disobeyed:.1f} s'])
+        rows.append(['of that, motion was commanded', f'{found.disobeyed:.1f} s'])
     return ['quantity', 'value'], rows
 
 
 def link_table(links: Mapping[str, LinkMetrics]) -> TableRows:
-    """Return how well each link worked, one column each."""
+    """Return the metrics of each link, one column each."""
     each = list(links.values())
     rows = [
         ['cycles', *(_whole(one.cycles) for one in each)],
@@ -126,23 +126,23 @@ def _whole(value: float) -> str:
 def write_report(
     folder: Path | str, output: Path | str | None = None, wanted: ReportOptions | None = None
 ) -> ReportMetrics:
-    """Return the main figures of a bag, after writing ``report.html`` and its pictures.
+    """Write ``report.html`` and its pictures, and return the summary metrics of a bag.
 
     Parameters
     ----------
     folder
         The bag.
     output
-        Where ``report.html`` and ``figures/*.png`` go; beside the bag by default.
+        Folder of ``report.html`` and ``figures/*.png``; beside the bag by default.
     wanted
-        Whose topics, which, and what the robot is like; by default what the bag suggests.
+        Namespace, topics and wheel geometry; by default found in the bag.
 
     Raises
     ------
     BagError
-        There is no bag, or it cannot be read.
+        The bag is missing or cannot be read.
     ReportError
-        There is nothing in it to report, or a topic that was asked for cannot be used.
+        The bag holds nothing to report, or a given topic cannot be used.
     OSError
         The output cannot be written.
     """
@@ -214,7 +214,7 @@ def _page(
         '<h2>Timing by topic</h2>',
         _timing_table(run),
         _complaint_table(run),
-        '<h2>What the bag holds</h2>',
+        '<h2>Contents of the bag</h2>',
         _topic_table(recording),
         *(_details(title, table) for title, table in sorted(recording.metadata_records.items())),
         '</body>\n</html>\n',
@@ -300,7 +300,7 @@ def _notes(recording: BagReader, run: Run) -> str:
     if run.absent:
         notes.append(f'Not in the bag, or without a message: {", ".join(run.absent)}.')
     if recording.unfinished:
-        notes.append(f'Files that broke off and are not read: {", ".join(recording.unfinished)}.')
+        notes.append(f'Unfinished files, not read: {", ".join(recording.unfinished)}.')
     if len(run.namespaces) > 1:
         others = ', '.join(space or '/' for space in run.namespaces[1:])
         notes.append(f'The bag also holds topics of {others}.')
@@ -329,20 +329,20 @@ def _error_table(run: Run) -> str:
 
 
 def _extents(run: Run) -> str:
-    """Return which time the errors are counted over, and what is left out."""
+    """Return the description of the time in which errors are counted."""
     first, last = driving(run)
     if COMMAND not in run.motions:
         extent = (
-            f'Driven: the whole reference but for its first {SETTLING:g} s, since the bag holds '
-            'no command that tells when the robot was being driven.'
+            f'Driven: the whole reference without its first {SETTLING:g} s; the bag holds '
+            'no command that would show when the robot was driven.'
         )
     elif first > last:
-        return 'Every command was zero: the robot was not being driven, and no error is counted.'
+        return 'Every command was zero: the robot was not driven, and no error is counted.'
     else:
         extent = (
-            f'Driven: from the first command that is not zero, at {first:.1f} s, to the last, at '
-            f'{last:.1f} s. Left out are the time the robot stood before and after, and the '
-            f'first {SETTLING:g} s with a command and a reference, in which it catches up.'
+            f'Driven: from the first command other than zero, at {first:.1f} s, to the last, at '
+            f'{last:.1f} s. Excluded: standstill before and after, and the '
+            f'first {SETTLING:g} s with a command and a reference (transient).'
         )
     before = preview_before_switch(run)
     ahead = (
@@ -355,7 +355,7 @@ def _extents(run: Run) -> str:
 
 
 def _response(run: Run, figures: ReportMetrics) -> list[str]:
-    """Return the tables of how the robot answers, moves and is reached, with their titles."""
+    """Return the tables of response, motion and radio link, with their titles."""
     parts = []
 
     def add(title: str, table: TableRows, text: int, note: str = '') -> None:
@@ -370,12 +370,12 @@ def _response(run: Run, figures: ReportMetrics) -> list[str]:
             'From command to motion',
             response_table(run, figures.responses),
             1,
-            'A dead time, a first-order lag and a gain that explain most of the measured speed; '
-            'their sum is known better than either. A dash: no clear answer to the command.',
+            'Dead time, first-order lag and gain that explain most of the measured speed; their '
+            'sum is better determined than either. A dash: no clear response to the command.',
         )
-    add('How hard the robot is moved', roughness_table(run), 2)
-    add('Way and stops', motion_table(run), 1)
-    add('How well the radio link worked', link_table(figures.links), 1)
+    add('Acceleration and jerk', roughness_table(run), 2)
+    add('Path and stops', motion_table(run), 1)
+    add('Radio link', link_table(figures.links), 1)
     return parts
 
 
@@ -384,7 +384,7 @@ def _pictures(run: Run, pictures: Mapping[str, bytes | None]) -> str:
     for item in REPORT_FIGURES:
         png = pictures[item.stem]
         if png is None and item.stem in PACKAGE_FIGURES and not run.ours:
-            continue  # nobody expects them of another robot
+            continue  # only bags of this package hold them
         if png is None and item.stem == 'link' and not run.links:
             continue
         title = escape(item.title)
@@ -420,7 +420,7 @@ def _timing_table(run: Run) -> str:
     )
     parts = [_html_table(head, rows[True], text=1)] if rows[True] else []
     if rows[False]:
-        summary = f'<summary>Plain numbers, {len(rows[False])} topics</summary>'
+        summary = f'<summary>Scalar topics, {len(rows[False])} topics</summary>'
         parts.append(f'<details>{summary}{_html_table(head, rows[False], text=1)}</details>')
     return '\n'.join([*parts, note]) if parts else '<p>No topic has enough messages.</p>'
 
@@ -429,7 +429,7 @@ def _complaint_table(run: Run) -> str:
     if not run.complaints:
         return ''
     rows = [[level, who, what, format_number(when)] for when, level, who, what in run.complaints]
-    head = ['level', 'who', 'what', 'first at / s']
+    head = ['level', 'node', 'message', 'first at / s']
     return '<h2>Warnings and errors of the nodes</h2>' + _html_table(head, rows, text=3)
 
 
@@ -452,7 +452,7 @@ def _details(title: str, table: Mapping[str, str]) -> str:
 def _html_table(
     head: Sequence[str], rows: Iterable[Sequence[str]], text: int, wrap: bool = True
 ) -> str:
-    """Return a table whose first ``text`` columns are words, the others numbers."""
+    """Return a table whose first ``text`` columns are text, the others numbers."""
     words = ' class="text long"' if wrap else ' class="text"'
     kinds = [words if i < text else '' for i in range(len(head))]
     top = ''.join(f'<th{k}>{escape(word)}</th>' for k, word in zip(kinds, head, strict=True))

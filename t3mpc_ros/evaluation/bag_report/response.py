@@ -16,44 +16,44 @@ from t3mpc_ros.kernels import kernel
 Array = NDArray[np.float64]
 
 LONGEST_DEAD_TIME, LONGEST_LAG = 1.0, 3.0
-"""s, of what is looked for."""
+"""Largest dead time and lag that are searched, s."""
 MOST = 20_000
-"""Samples that a fit is made on: of a longer run, the stretch in which the command varies most."""
+"""Number of samples of a fit: of a longer run, the window in which the command varies most."""
 FEWEST = 50
 MIN_EXPLAINED = 0.3
-"""Share explained below which there is no clear answer to the command."""
+"""Explained share below which the fit is rejected."""
 WINDOW = 0.2
-"""Least width (s) of what speeds are smoothed over before they are differentiated."""
+"""Least smoothing width (s) before differentiation."""
 STILL = {'linear': 0.01, 'angular': 0.05}
-"""Smoothed speeds (m/s, rad/s) below which a robot stands."""
+"""Smoothed speeds (m/s, rad/s) below which the robot is at standstill."""
 PAUSE = 0.5
-"""s that it stands at least for a stop."""
+"""Least duration of a stop, s."""
 
 
 @dataclass(frozen=True)
 class ResponseFit:
-    """The measured speed as the command, delayed, lagging, and scaled: k u(t - d) behind a lag."""
+    """First-order response with dead time: the measured speed is k u(t - d) behind a lag."""
 
     dead_time: float
-    """d, s; over the times at which the recorder heard commands, and the stamps of odometry."""
+    """d, s; between receive times of commands and stamps of odometry."""
     lag: float
     """Time constant of the first-order lag, s."""
     gain: float
-    """k, by which the speed is larger than the command."""
+    """k, ratio of speed to command."""
     explained: float
-    """Share of the variance of the measured speed."""
+    """Explained share of the variance of the measured speed."""
     step: float
     """Resolution of the dead time, s."""
 
     @property
     def clear(self) -> bool:
-        """Whether the robot was seen to answer at all."""
+        """Whether the fit explains enough of the response."""
         return self.explained >= MIN_EXPLAINED and self.gain > 0.0
 
 
 @kernel
 def lag_behind(u: Array, keep: float, out: Array) -> None:
-    """Write ``u`` behind a first-order lag: each step keeps a share of the last output.
+    """Write ``u`` filtered by a first-order lag: each step keeps a share of the last output.
 
     u, out : shape (n,)
     """
@@ -63,12 +63,12 @@ def lag_behind(u: Array, keep: float, out: Array) -> None:
 
 
 def fit_response(command: Series, motion: Series, name: str) -> ResponseFit | None:
-    """Return the delay, lag and gain with which the measured speed follows the command best.
+    """Return the dead time, lag and gain that fit the measured speed best.
 
-    By least squares of the output: every lag and dead time of a grid is tried, the lags twice.
-    The sum of dead time and lag is known better than either. In a closed loop noise that comes
-    back through the command makes the delay seem a little longer than it is. None where the two
-    do not overlap for long enough, or the command does not vary.
+    Least squares of the output error over a grid of lags and dead times, refined twice. The sum of
+    dead time and lag is better determined than either. In a closed loop, noise fed back through
+    the command biases the delay slightly upwards. None when the two series overlap too briefly
+    or the command does not vary.
     """
     if min(len(command), len(motion)) < 3:
         return None
@@ -94,7 +94,7 @@ def fit_response(command: Series, motion: Series, name: str) -> ResponseFit | No
 
 
 def busiest(command: Series, motion: Series, name: str, most: float) -> tuple[float, float]:
-    """Return the time of both, or the part of ``most`` s in which the command varies most."""
+    """Return the times of both, or the window of ``most`` s in which the command varies most."""
     start = float(max(command.time[0], motion.time[0]))
     end = float(min(command.time[-1], motion.time[-1]))
     if end - start <= most:
@@ -128,7 +128,7 @@ def _best(u: Array, y: Array, step: float, shifts: int, lags: list[float]) -> Re
 
 
 def predicted(fit: ResponseFit, command: Series, name: str, time: Array) -> Array:
-    """Return the speed that the fit expects at ``time``, which is evenly spaced, in its unit."""
+    """Return the speed that the fit predicts at evenly spaced ``time``, in its unit."""
     late = time - fit.dead_time
     u = command[name][np.maximum(np.searchsorted(command.time, late, 'right') - 1, 0)]
     out = np.empty(u.size)
@@ -138,20 +138,19 @@ def predicted(fit: ResponseFit, command: Series, name: str, time: Array) -> Arra
 
 
 def smooth(series: Series, name: str, held: bool = False) -> tuple[Array, Array, Array, Array]:
-    """Return evenly spaced times, and there the speed, its derivative and the second one.
+    """Return evenly spaced times with the speed and its first and second derivatives.
 
     Parabolas are fitted to windows of :data:`WINDOW` or of eight samples, whichever is longer.
-    Arrays of no length when the series is too short. Nothing is said (NaN) across gaps of more
-    than a window.
+    Empty arrays when the series is too short; NaN across gaps longer than a window.
 
     Parameters
     ----------
     series
-        What holds the speed.
+        Series that holds the speed.
     name
-        Which of its quantities.
+        Name of the quantity.
     held
-        Whether each value lasts until the next, as a command does.
+        Whether each value holds until the next, as a command does.
     """
     nothing = np.empty(0)
     if len(series) < 3:
@@ -181,18 +180,18 @@ def smooth(series: Series, name: str, held: bool = False) -> tuple[Array, Array,
 
 @dataclass(frozen=True)
 class Roughness:
-    """How hard a speed changes; per s and per s² of its unit, NaN where it is not known."""
+    """Rates of change of a speed, per s and per s² of its unit; NaN where unknown."""
 
     acceleration: float
-    """Root mean square, as the jerk."""
+    """Root mean square of acceleration and jerk."""
     acceleration_99: float
-    """99 % are below, as of the jerk."""
+    """99th percentile of acceleration and jerk."""
     jerk: float
     jerk_99: float
 
 
 def roughness(series: Series, name: str, held: bool = False) -> Roughness:
-    """Return how hard one quantity changes, after smoothing, see :func:`smooth`."""
+    """Return the rates of change of one quantity after smoothing, see :func:`smooth`."""
     _, _, rate, bend = smooth(series, name, held)
     numbers = []
     for each in (rate, bend):
@@ -206,24 +205,24 @@ def roughness(series: Series, name: str, held: bool = False) -> Roughness:
 
 @dataclass(frozen=True)
 class MotionSummary:
-    """Where a robot was, in few numbers; s, m and m/s."""
+    """Summary of the motion; s, m and m/s."""
 
     distance: float
-    """Of the way, forwards or backwards."""
+    """Path length, forwards or backwards."""
     turned: float
-    """Sum of all turning, rad."""
+    """Sum of absolute turning, rad."""
     fastest: float
     """Largest smoothed speed."""
     moving: float
-    """How long it moved."""
+    """Time in motion."""
     stops: tuple[tuple[float, float], ...]
-    """From when to when it stood, for at least :data:`PAUSE`."""
+    """Start and end of each standstill of at least :data:`PAUSE`."""
     disobeyed: float
-    """How long of that it had been told to move."""
+    """Part of that time in which motion was commanded."""
 
 
 def motion_summary(run: Run) -> MotionSummary | None:
-    """Return what the measured motion amounts to; None when there is too little of it."""
+    """Return the summary of the measured motion; None when there are too few samples."""
     motion = run.motions.get(run.measured)
     if motion is None:
         return None
@@ -256,7 +255,7 @@ def motion_summary(run: Run) -> MotionSummary | None:
 
 
 def responses(run: Run) -> Mapping[str, ResponseFit]:
-    """Return how the robot answers, by channel, of those that can be told."""
+    """Return the fitted response of each channel that is identifiable."""
     command, motion = run.motions.get(COMMAND), run.motions.get(run.measured)
     if command is None or motion is None:
         return {}

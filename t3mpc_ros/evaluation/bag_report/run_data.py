@@ -46,14 +46,14 @@ _ODOMETRY_FIELDS = {
 
 _TWIST_FIELDS = {'linear': 'linear.x', 'angular': 'angular.z'}
 JUMP = 10.0
-"""Seconds by which stamps leap against the receipts when a clock was set, not merely late."""
+"""Jump (s) of the stamps against the receive times that indicates a changed clock."""
 
 
 class Channel(NamedTuple):
-    """One of the two numbers that a motion is shown by."""
+    """One of the two quantities that represent a motion."""
 
     name: str
-    """In :attr:`Run.motions`."""
+    """Key in :attr:`Run.motions`."""
     title: str
     short: str
     unit: str
@@ -67,12 +67,12 @@ BY_BODY = (
     Channel('linear', 'forward speed', 'forward', 'm/s'),
     Channel('angular', 'turn rate', 'turning', 'rad/s'),
 )
-"""Of a robot whose wheels are not known."""
+"""Channels of a robot without known wheel geometry."""
 
 
 @dataclass(frozen=True)
 class Series:
-    """One quantity over time: ``values[name]`` beside ``time``, both in seconds and SI units."""
+    """One quantity over time: ``values[name]`` over ``time``, in seconds and SI units."""
 
     time: Array
     values: Mapping[str, Array]
@@ -86,69 +86,69 @@ class Series:
 
 @dataclass(frozen=True)
 class Timing:
-    """How regularly one topic came."""
+    """Regularity of one topic."""
 
     count: int
     period: float
-    """Median (s) of the times between receipts."""
+    """Median interval between receive times, s."""
     jitter: float
-    """99th percentile (s) of how far one such time is from the median."""
+    """99th percentile of the deviation of an interval from the median, s."""
     missing: float
     """Share of samples missing at the median rate of the stamps, see :func:`missing_share`."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """A recorded run, ready to be measured and drawn; times in seconds since its start."""
+    """A recorded run, ready for metrics and figures; times in seconds since its start."""
 
     duration: float
     topics: Mapping[str, str]
-    """Full name by relative name, of those with at least one message."""
+    """Full name by relative name, of topics with at least one message."""
     absent: tuple[str, ...]
-    """Relative names that are not in the bag, or have no message."""
+    """Relative names that are missing in the bag or have no message."""
     namespaces: tuple[str, ...]
-    """The namespace shown, then others that the bag holds."""
+    """The namespace shown, then the others in the bag."""
     ours: bool
-    """Whether more is expected of the bag than of any robot's."""
+    """Whether the bag holds more than any robot's: a reference, or control terms."""
     geometry: WheelGeometry | None
-    """None when the wheels are not known."""
+    """None without wheel geometry."""
     channels: tuple[Channel, Channel]
-    """By what motions are shown: wheels where they are known, else forward speed and turn rate."""
+    """Channels of the motions: wheels where the geometry is known, else linear and angular speed."""
     motions: Mapping[str, Series]
     """``reference``, ``odom``, ``ground_truth/odom``, ``cmd_vel``: linear, angular (m/s, rad/s),
     right, left (rad/s) where the wheels are known, and of odometry x, y (m), yaw (rad)."""
     numbers: Mapping[str, Series]
-    """Plain numbers by relative name, as ``value``."""
+    """Scalar topics by relative name, as ``value``."""
     receipts: Mapping[str, Array]
-    """Times of receipt by relative name, by the recorder's clock."""
+    """Receive times by relative name, by the recorder's clock."""
     timing: Mapping[str, Timing]
     switches: Array
-    """When the reference switched."""
+    """Times of the switches of the reference."""
     lead: float
-    """Median (s) of how far ahead of their receipt the stamps of the reference are."""
+    """Median lead (s) of the reference stamps over their receive times."""
     complaints: tuple[DiagnosticEvent, ...]
-    """From diagnostics: when first, level, who, what."""
+    """From diagnostics: first time, level, node, text."""
     links: tuple[LinkHistory, ...]
-    """Radio links that diagnostics tell of."""
+    """Radio links in the diagnostics."""
     notes: tuple[str, ...]
 
     @property
     def measured(self) -> str:
-        """Relative name of the motion that errors are taken from: truth where there is one."""
+        """Relative name of the motion that errors refer to: ground truth where recorded."""
         return next((name for name in (TRUTH, ODOMETRY) if name in self.motions), '')
 
 
 def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
-    """Return the run in ``recording``; of the fullest namespace unless one is named.
+    """Return the run in ``recording``; of the fullest namespace unless one is given.
 
     Raises
     ------
     ReportError
-        There is nothing to report, or what was asked for cannot be used.
+        The bag holds nothing to report, or an option does not fit it.
     DataError
         A message cannot be read.
     ParameterError
-        The wheels that were given cannot be.
+        The wheel geometry cannot be used.
     """
     wanted = wanted or ReportOptions()
     choice = choose_topics(recording, wanted)
@@ -187,7 +187,7 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
         timing={
             name: _timing(table)
             for name, table in raw.items()
-            if table['stamp'].size > 2 and name != 'reference/signals'  # sent when it changes
+            if table['stamp'].size > 2 and name != 'reference/signals'  # sent on change only
         },
         switches=_switches(numbers, motions.get(REFERENCE)),
         lead=clock.lead,
@@ -198,10 +198,10 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
 
 
 class _Clock:
-    """Brings times of receipt and stamps onto one axis.
+    """Maps receive times and stamps onto one time axis.
 
-    Messages without a header are placed by their receipt. Where the robot lives in simulated
-    time, the odometry, which has both, tells how the clocks lie to each other.
+    Messages without a header are placed by their receive time. With simulated time, the odometry,
+    which has both times, relates the two clocks.
     """
 
     def __init__(self, raw: Mapping[str, Mapping[str, Array]], notes: list[str]) -> None:
@@ -214,8 +214,8 @@ class _Clock:
                 self._received, self._offset = table['received'], offset
                 self.origin = float(table['stamp'].min())
                 notes.append(
-                    'The stamps are of another clock than the receipts (simulated time?); '
-                    'messages without a stamp were placed through the odometry.'
+                    'The stamps are of another clock than the receive times (simulated time?); '
+                    'messages without a stamp were placed by means of the odometry.'
                 )
         self.lead = 0.0
         if REFERENCE in raw:
@@ -223,11 +223,11 @@ class _Clock:
             self.lead = max(0.0, float(np.median(ahead)))
 
     def local(self, received: Array) -> Array:
-        """Return the time of what was received then."""
+        """Return the stamp time of a receive time."""
         return received + np.interp(received, self._received, self._offset) - self.origin
 
     def applies(self, received: Array) -> Array:
-        """Return the time for which the reference node said something it sent then."""
+        """Return the time for which the reference node sent a message received at that time."""
         return self.local(received) + self.lead
 
 
@@ -244,8 +244,8 @@ def _read(recording: BagReader, name: str, topic: str, notes: list[str]) -> dict
     table = recording.series(topic, fields)
     sound = np.all([np.isfinite(column) for column in table.values()], axis=0)
     if not sound.all():
-        notes.append(f'{np.count_nonzero(~sound)} messages of {topic} held a number that is not '
-                     'finite; they are left out.')  # fmt: skip
+        notes.append(f'{np.count_nonzero(~sound)} messages of {topic} hold a number that is not '
+                     'finite; they are excluded.')  # fmt: skip
     table = {key: column[sound] for key, column in table.items()}
     if fields is _ODOMETRY_FIELDS:
         _mend_stamps(table, topic, notes)
@@ -253,18 +253,18 @@ def _read(recording: BagReader, name: str, topic: str, notes: list[str]) -> dict
 
 
 def _mend_stamps(table: dict[str, Array], topic: str, notes: list[str]) -> None:
-    """Put the receipts in the place of stamps that do not tell the time."""
+    """Replace stamps that are unusable by receive times."""
     received, stamps = table['received'], table['stamp']
     if stamps.size > 2 and np.unique(stamps).size < 0.5 * np.unique(received).size:
         table['stamp'] = received
-        notes.append(f'The stamps of {topic} stand still; its messages were placed by receipt.')
+        notes.append(f'The stamps of {topic} are constant; its messages were placed by receive time.')
         return
     steps, gaps = np.diff(stamps), np.diff(received)
     if leaps := np.flatnonzero((steps < -JUMP) | (steps > gaps + JUMP)).tolist():
         table['stamp'] = received
         notes.append(
             f'The stamps of {topic} leap {len(leaps)} times, first by {steps[leaps[0]]:.1f} s at '
-            f'{received[leaps[0]]:.1f} s: a clock was set; its messages were placed by receipt.'
+            f'{received[leaps[0]]:.1f} s: a clock was set; its messages were placed by receive time.'
         )
     elif leaps := np.flatnonzero(gaps > steps + JUMP).tolist():
         notes.append(
@@ -273,11 +273,11 @@ def _mend_stamps(table: dict[str, Array], topic: str, notes: list[str]) -> None:
             "recorder's clock was set, or the recording was paused."
         )
     if late := np.count_nonzero((steps < 0.0) & (steps >= -JUMP)):
-        notes.append(f'{late} messages of {topic} came behind later ones; they were sorted.')
+        notes.append(f'{late} messages of {topic} were out of order; they were sorted.')
 
 
 def _motion(time: Array, table: Mapping[str, Array], geometry: WheelGeometry | None) -> Series:
-    """Return a motion in order of time; of two at one instant the one that came last."""
+    """Return a motion sorted by time; of two samples at one instant the last one."""
     time, back = np.unique(time[::-1], return_index=True)
     order = table['linear'].size - 1 - back
     linear: Any = table['linear'][order]
@@ -295,7 +295,7 @@ def _motion(time: Array, table: Mapping[str, Array], geometry: WheelGeometry | N
 def _timing(table: Mapping[str, Array]) -> Timing:
     gaps = np.diff(table['received'])
     period = float(np.median(gaps))
-    # The stamps know the rate better than the receipts, which jitter.
+    # The rate follows from the stamps: receive times jitter.
     steps = np.diff(np.unique(table['stamp'][np.isfinite(table['stamp'])]))
     grid = float(np.median(steps)) if steps.size else 0.0
     missing = missing_sample_ratio(table['stamp'], 1.0 / grid) if grid > 0.0 else math.nan
@@ -304,7 +304,7 @@ def _timing(table: Mapping[str, Array]) -> Timing:
 
 
 def _switches(numbers: Mapping[str, Series], reference: Series | None) -> Array:
-    """Return when what drives the reference changed, each moved to the jump it caused.
+    """Return the times of the switches, each moved to the jump it caused.
 
     The mode may be published at a lower rate than the reference, so the stamp of the largest
     step of the reference within a quarter of a second is taken.
@@ -332,10 +332,10 @@ def _geometry(
     ours: bool,
     notes: list[str],
 ) -> WheelGeometry | None:
-    """Return the lengths that were given, else those of the recorded settings, else None.
+    """Return the given geometry, else the recorded parameters, else None.
 
-    Of the settings the robot's own word comes first. A bag of this package's nodes that does not
-    tell is taken to be of the robot they are made for.
+    The parameters of the robot's node take precedence. A bag of this package without them is
+    assumed to be of the default robot.
     """
     order = sorted(
         metadata_records, key=lambda title: title not in ('sim_robot', 'radio_bridge', 'robot')
@@ -349,7 +349,7 @@ def _geometry(
                 try:
                     values[name] = float(text)
                 except ValueError:
-                    notes.append(f'The recorded {key} is no number: {text!r}.')
+                    notes.append(f'The recorded {key} is not a number: {text!r}.')
     said = wanted.wheel_radius is not None or wanted.track is not None
     try:
         geometry = WheelGeometry.from_dict(values)
@@ -362,12 +362,12 @@ def _geometry(
         return geometry
     if not ours:
         notes.append(
-            'The bag does not say how large the wheels are and how far apart: speeds are those of '
+            'The bag holds no wheel radius and separation: speeds are those of '
             'the robot, in m/s and rad/s (--wheel-radius and --track give those of the wheels).'
         )
         return None
     notes.append(
-        f'The bag does not say how large the wheels are; {geometry.wheel_radius:g} m radius '
+        f'The bag holds no wheel geometry; {geometry.wheel_radius:g} m radius '
         f'and {geometry.wheel_separation:g} m apart are assumed.'
     )
     return geometry
@@ -377,7 +377,7 @@ def _absent(topics: Mapping[str, str], ours: bool) -> tuple[str, ...]:
     if not ours:
         return tuple(name for name in (REFERENCE, ODOMETRY, COMMAND) if name not in topics)
     names = set(NAMES) - set(topics)
-    # One topic announces the signals, or three do; of the three the bag may hold a part.
+    # The signals are in one topic or in three; of the three the bag may hold a part.
     names -= (
         set(SIGNALS)
         if names >= set(SIGNALS) or 'reference/signals' in topics

@@ -34,51 +34,51 @@ KINDS: Mapping[str, tuple[str, ...]] = {
     'reference/signals': ('std_msgs/msg/Int32MultiArray',),
     **dict.fromkeys(NUMBERS, (_NUMBER,)),
 }
-"""Types of message that each can be."""
+"""Message types by role."""
 _ALIEN = ('truth', 'reference', 'goal', 'target', 'desired', 'gps', 'map', 'visual')
-"""Words in names of odometry that is not the robot's own."""
+"""Words in names of odometry that is not the robot's measured one."""
 
 
 class ReportError(RuntimeError):
-    """A bag that no report can be made of; the text says what is missing, and what was found."""
+    """No report can be made of the bag; the text names what is missing and what was found."""
 
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """What is said of a bag beforehand; nothing need be."""
+    """Options of a report; all optional."""
 
     namespace: str | None = None
-    """Whose topics; by default of the robot with the most known ones."""
+    """Namespace; by default that of the robot with the most known topics."""
     odom: str = ''
-    """Full name of the topic, as the next two; empty: found by name, else by type."""
+    """Full topic name, as the next two; empty: chosen by name, else by type."""
     cmd_vel: str = ''
     reference: str = ''
     wheel_radius: float | None = None
-    """m; by default what the recorded settings say."""
+    """m; by default from the recorded parameters."""
     track: float | None = None
-    """Distance between the wheels, m; likewise."""
+    """Distance between the wheels, m; by default from the recorded parameters."""
 
 
 @dataclass(frozen=True)
 class TopicChoice:
-    """Which topics a report is made from."""
+    """Topics a report is made from."""
 
     topics: Mapping[str, str]
-    """Full name by relative name, of those with at least one message."""
+    """Full name by relative name, of topics with at least one message."""
     namespaces: tuple[str, ...]
-    """The chosen one, then others that hold known topics."""
+    """The chosen namespace, then others with known topics."""
     ours: bool
-    """Whether the bag holds more than any robot's would: a reference, or terms of the law."""
+    """Whether the bag holds more than any robot's: a reference, or control terms."""
     notes: tuple[str, ...]
 
 
 def choose_topics(recording: BagReader, wanted: ReportOptions) -> TopicChoice:
-    """Return which topics stand for what.
+    """Return the topic of each role.
 
     Raises
     ------
     ReportError
-        There is nothing to report, or a topic that was asked for is not there or of another type.
+        The bag holds nothing to report, or a given topic is missing or of another type.
     """
     names, namespaces = find_topics(recording.topics, wanted.namespace)
     held = {name: topic for name, topic in recording.topics.items() if topic.message_count}
@@ -95,7 +95,7 @@ def choose_topics(recording: BagReader, wanted: ReportOptions) -> TopicChoice:
         if full:
             chosen[name] = _requested_topic(recording, name, full)
     if wanted.odom and not wanted.namespace:
-        chosen.pop(TRUTH, None)  # errors are taken from what was asked for
+        chosen.pop(TRUTH, None)  # errors refer to the given topic
     notes = []
     space = wanted.namespace and '/' + wanted.namespace.strip('/') + '/'
     for name, said, option in (
@@ -133,7 +133,7 @@ def choose_topics(recording: BagReader, wanted: ReportOptions) -> TopicChoice:
 
 
 def _requested_topic(recording: BagReader, name: str, full: str) -> str:
-    """Return the full name of a topic that was asked for, once it is known to be usable."""
+    """Return the full name of a given topic, after checking that it is usable."""
     topic = recording.topics.get(full) or recording.topics.get(f'/{full}')
     if topic is None:
         raise ReportError(
@@ -156,7 +156,7 @@ def _listing(recording: BagReader, most: int = 20) -> str:
 
 
 def _rank(name: str, topic: TopicSummary, space: str) -> tuple[int, int, int, int, str]:
-    """Return a key by which the likeliest topic comes first."""
+    """Return a sort key that puts the likeliest topic first."""
     low = topic.name.lower()
     words = ('odom',) if name == ODOMETRY else ('cmd_vel', 'cmd', 'command')
     fit = next((i for i, word in enumerate(words) if word in low), len(words))
@@ -165,7 +165,7 @@ def _rank(name: str, topic: TopicSummary, space: str) -> tuple[int, int, int, in
 
 
 def bag_display_name(folder: Path) -> str:
-    """Return what a person would call a bag: its folder, and the one above if it is ``bag``."""
+    """Return a short name of a bag: its folder, or the one above if the folder is ``bag``."""
     folder = folder.resolve()
     return f'{folder.parent.name}/bag' if folder.name == 'bag' else folder.name
 
@@ -173,7 +173,7 @@ def bag_display_name(folder: Path) -> str:
 def find_topics(
     names: Iterable[str], namespace: str | None = None
 ) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Return full names by relative names, and the namespaces there are, the chosen one first.
+    """Return full names by relative names, and the namespaces, the chosen one first.
 
     A topic belongs to the longest known name it ends with, so ``/a/ground_truth/odom`` is never
     taken for the ``odom`` of ``/a/ground_truth``. Without ``namespace`` the one with the most
