@@ -502,7 +502,7 @@ def test_standing_before_and_after_the_drive_changes_no_error_statistic(rows, tm
         assert astuple(other.overall) == pytest.approx(astuple(one.overall), rel=1e-6)
         assert astuple(other.settled) == pytest.approx(astuple(one.settled), rel=1e-6)
     text = page_of(longer).text()
-    assert 'from the first command that is not zero, at 3.2 s, to the last, at 9.2 s' in text
+    assert 'from the first command other than zero, at 3.2 s, to the last, at 9.2 s' in text
     assert '5.0 s counted' in text
     assert 'in 5.0 s, settled ' in longer.summary()
 
@@ -577,7 +577,7 @@ def test_without_commands_the_whole_reference_counts_but_its_first_second(rows, 
     figures = write_report(sheet.write(tmp_path / 'bag'))
     assert figures.wheels['left'].overall.count == 200
     assert figures.wheels['left'].settled.count == 200
-    assert 'the bag holds no command that tells when' in page_of(figures).text()
+    assert 'the bag holds no command that would show when' in page_of(figures).text()
 
 
 def test_a_foreign_bag_of_odometry_and_commands_has_a_report_without_errors(rows, tmp_path):
@@ -818,7 +818,7 @@ def test_numbers_that_are_not_finite_are_left_out_and_told(rows, tmp_path):
     figures = write_report(sheet.write(tmp_path / 'bag'))
     text = page_of(figures).text()
     for name in bad:
-        assert f'7 messages of /{name} held a number that is not finite' in text
+        assert f'7 messages of /{name} hold a number that is not finite' in text
     assert '1 messages of /controller/skill/right' in text
     assert np.isfinite(figures.wheels['right'].overall.rmse)
     # Driven from the eighth command on, at 0.074 s, and counted from a second later.
