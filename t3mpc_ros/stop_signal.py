@@ -10,22 +10,22 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopSignal:
-    """Becomes true when the process is asked to end; in a ``with`` block, instead of ending it."""
+    """True after the first signal; installs its handlers for the length of a ``with`` block."""
 
     def __init__(self) -> None:
-        self._asked = False
+        self._received = False
 
     def __call__(self) -> bool:
-        """Return whether it has been asked."""
-        return self._asked
+        """Return whether a signal was received."""
+        return self._received
 
     def __enter__(self) -> Self:
-        self._before = [signal.signal(number, self._take) for number in SIGNALS]
+        self._previous = [signal.signal(number, self._handle) for number in SIGNALS]
         return self
 
     def __exit__(self, *error: object) -> None:
-        for number, handler in zip(SIGNALS, self._before, strict=True):
+        for number, handler in zip(SIGNALS, self._previous, strict=True):
             signal.signal(number, handler)
 
-    def _take(self, number: int, frame: FrameType | None) -> None:
-        self._asked = True
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        self._received = True

@@ -33,12 +33,12 @@ from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON, SlipMonitor
 UNKNOWN_STATUS = RobotStatus(
     enabled=False, moving=False, estop=False, timed_out=False, limited=False, imu_fault=True
 )
-"""What is known of a robot that was never heard."""
+"""Status before the first telemetry."""
 
 
 @dataclass(frozen=True)
 class RadioRobotParameters(Parameters):
-    """Everything that can be set of the real robot, on the host's side."""
+    """Parameters of the real robot on the host."""
 
     geometry: WheelGeometry = group(WheelGeometry, inline=True)
     limiter: CommandLimiterParameters = group(CommandLimiterParameters, inline=True)
@@ -46,7 +46,7 @@ class RadioRobotParameters(Parameters):
     link: LinkParameters = group(LinkParameters)
     slip_stop: float = parameter(
         1.0,
-        'gyro and steps may disagree for so long, then the robot stops; 0 = it never does',
+        'duration of a disagreement between gyro and steps after which the robot stops; 0: never',
         unit='s',
         low=0.0,
         high=60.0,
@@ -54,34 +54,34 @@ class RadioRobotParameters(Parameters):
     )
 
     def check_consistency(self) -> None:
-        """Raise ParameterError when the board would cut or lag behind what the host allows."""
+        """Raise ParameterError when a limit of the host exceeds that of the board."""
         limiter, board = self.limiter, self.link.robot
-        for name, host, there in (
+        for name, host, board_limit in (
             ('wheel.max_velocity', limiter.wheel_speed, board.max_speed),
             ('wheel.max_acceleration', limiter.acceleration, board.acceleration),
             ('wheel.stop_deceleration', limiter.stop_deceleration, board.deceleration),
         ):
-            if host > there:
+            if host > board_limit:
                 raise ParameterError(
-                    f'{name} must be at most what the board does itself, {there:g} '
+                    f'{name} must be at most the limit of the board, {board_limit:g} '
                     f'(link.robot): got {host:g}'
                 )
 
 
 class RadioRobot(RobotInterface):
-    """Drives the robot through :class:`Link`, and reckons where it is from what it reports.
+    """Commands the robot through :class:`Link` and computes its odometry from the telemetry.
 
-    Whoever holds the port calls :meth:`step` as :class:`Link` asks for; all times are those of
-    one steady clock, in nanoseconds. Stamps of the states are of that clock, too.
+    The owner of the port calls :meth:`step` as for :class:`Link`. All times and stamps are
+    nanoseconds of one steady clock.
 
     Parameters
     ----------
     settings
-        Live ones may be replaced, see :meth:`configure`.
+        Dynamic ones change through :meth:`configure`.
     key
-        Of the robot, 16 bytes; empty for an open link.
+        Key of the robot, 16 bytes; empty for an open link.
     entropy
-        For session numbers and nonces.
+        Source of session numbers and nonces.
     """
 
     def __init__(
@@ -92,82 +92,82 @@ class RadioRobot(RobotInterface):
     ) -> None:
         self._parameters = parameters
         self.link = Link(parameters.link, key, entropy)
-        """The connection: its phase, its reason, its quality."""
+        """Connection to the robot."""
         self._limiter = CommandLimiter(parameters.limiter, parameters.geometry)
         self._odometry = GyroOdometry(parameters.odometry, parameters.geometry)
         self._slip_monitor = SlipMonitor()
         self._period_ns = round(NANOSECONDS / parameters.link.cycle_rate)
         self._next_ns = 0
         self._now_ns = 0
-        self._seen: Telemetry | None = None
+        self._telemetry: Telemetry | None = None
         self._resets = 0
         self._limited = False
         self._commanded = ZERO_WHEEL_SPEEDS
-        self._fresh: deque[RobotState] = deque(maxlen=1024)
-        self._state = self._unheard()
+        self._new_states: deque[RobotState] = deque(maxlen=1024)
+        self._state = self._initial_state()
 
-    # -- for whoever holds the port ---------------------------------------------------------------
+    # -- port -------------------------------------------------------------------------------------
 
     def step(self, now_ns: int, received: bytes = b'') -> list[PortAction]:
-        """Return what to do with the port now, see :meth:`Link.step`."""
+        """Return the actions to execute now, see :meth:`Link.step`."""
         self._now_ns = now_ns
-        # With the cycle, not beside it: by a clock of its own it would fall behind, and every
-        # command would wait for the cycle after the next.
+        # The limiter runs in phase with the cycle of the link; with an independent period,
+        # commands could wait for the cycle after the next.
         due_ns = self.link.next_cycle_ns
         if now_ns >= (self._next_ns if due_ns is None else due_ns):
             self._next_ns = now_ns + self._period_ns
-            self._order(now_ns)
-        deeds = self.link.step(now_ns, received)
+            self._send_command(now_ns)
+        actions = self.link.step(now_ns, received)
         telemetry = self.link.telemetry
-        if telemetry is not None and telemetry is not self._seen:
-            self._take(telemetry)
-        return deeds
+        if telemetry is not None and telemetry is not self._telemetry:
+            self._update(telemetry)
+        return actions
 
     def take_states(self) -> list[RobotState]:
-        """Return the states that have come since the last call, oldest first."""
-        states = list(self._fresh)
-        self._fresh.clear()
+        """Return the new states since the last call, oldest first."""
+        states = list(self._new_states)
+        self._new_states.clear()
         return states
 
     def quality(self, now_ns: int) -> LinkQuality:
-        """Return how well the link works."""
+        """Return the quality of the link."""
         return self.link.quality(now_ns)
 
     def reason(self, now_ns: int) -> str:
-        """Return why the robot does not do what it is told; empty when it does."""
+        """Return why the robot does not follow commands; empty when it does."""
         if self.link.state is not LinkState.RUN:
             return self.link.reason(now_ns)
         return self._limiter.reason or self.link.reason(now_ns)
 
     def configure(self, parameters: RadioRobotParameters) -> None:
-        """Go on with other live settings."""
+        """Apply changed dynamic parameters."""
         self._parameters = parameters
         self._limiter.parameters = parameters.limiter
         self._odometry.parameters = parameters.odometry
 
     def shut_down(self) -> None:
-        """Bring the robot to rest, take its drives out, close the port."""
+        """Stop the robot, disable its drives, close the port."""
         self.link.shut_down()
 
-    # -- the seam ---------------------------------------------------------------------------------
+    # -- robot interface --------------------------------------------------------------------------
 
     def apply(self, command: RobotCommand, now_ns: int) -> str:
-        """Follow ``command`` from the next cycle on; return why not if it is refused."""
+        """Follow ``command`` from the next cycle on; return the reason for a rejection."""
         if self._slip_monitor.refuses(command, now_ns / NANOSECONDS):
             return SLIP_STOP_REASON
         return self._limiter.accept(command, now_ns)
 
     def advance(self, now_ns: int) -> RobotState:
-        """Return the newest state; its reason is of now, its numbers are of its stamp."""
+        """Return the newest state, with the current reason."""
         return self._state._replace(reason=self.reason(now_ns))
 
     def stop(self, reason: str, now_ns: int) -> None:
-        """Come to rest; the next command moves the robot again."""
+        """Stop until the next command."""
         self._limiter.stop(reason, now_ns)
         self.link.stop(reason)
 
     def reset_odometry(self, now_ns: int) -> str:
-        """Let dead reckoning start at the origin; refused while the robot moves."""
+        """Reset the odometry to the origin; rejected while the robot moves."""
         if self._state.status.moving:
             return 'odometry cannot be reset while the robot moves'
         self._odometry.reset()
@@ -178,22 +178,22 @@ class RadioRobot(RobotInterface):
         return ''
 
     def latch_estop(self, reason: str, now_ns: int) -> None:
-        """Come to rest, and stay so; the robot obeys it from any session."""
+        """Latch the emergency stop of host and robot."""
         self._limiter.latch(reason, now_ns)
         self.link.latch_estop(reason)
 
     def release_estop(self, now_ns: int) -> str:
-        """Release the emergency stop here and in the robot."""
-        here, there = self._limiter.release(now_ns), self.link.release_estop(now_ns)
-        return there if here else ''
+        """Release the emergency stop of host and robot."""
+        host_error, robot_error = self._limiter.release(now_ns), self.link.release_estop(now_ns)
+        return robot_error if host_error else ''
 
-    # -- inside -----------------------------------------------------------------------------------
+    # -- internal ---------------------------------------------------------------------------------
 
-    def _order(self, now_ns: int) -> None:
-        """Tell the link what the guard lets through, once per cycle."""
+    def _send_command(self, now_ns: int) -> None:
+        """Pass the limited command to the link, once per cycle."""
         limited_command = self._limiter.advance(now_ns, self._period_ns / NANOSECONDS)
         self._limited = limited_command.limited
-        # The guard's own ramp down is sent too: it is the gentler way than the board's to stop.
+        # The ramp of the limiter is sent as well: it stops more gently than the board.
         if limited_command.reason and limited_command.wheels == ZERO_WHEEL_SPEEDS:
             self.link.stop(limited_command.reason)
             self._commanded = ZERO_WHEEL_SPEEDS
@@ -201,13 +201,13 @@ class RadioRobot(RobotInterface):
             self.link.command(RobotCommand(limited_command.wheels, now_ns), now_ns)
             self._commanded = limited_command.wheels
 
-    def _take(self, telemetry: Telemetry) -> None:
-        before, self._seen = self._seen, telemetry
+    def _update(self, telemetry: Telemetry) -> None:
+        before, self._telemetry = self._telemetry, telemetry
         resets = self.link.robot_resets
         if resets != self._resets:
             self._resets = resets
             self._odometry.forget_bias()
-            before = None  # what it did meanwhile, nobody counted
+            before = None  # motion during the restart was not counted
         if before is not None:
             elapsed = (telemetry.stamp_ns - before.stamp_ns) / NANOSECONDS
             if elapsed > 0.0:
@@ -222,7 +222,7 @@ class RadioRobot(RobotInterface):
         if self._slip_monitor.decide(slipping_for, self._parameters.slip_stop, now):
             self._limiter.stop(SLIP_STOP_REASON, self._now_ns)
         self._state = self._make_state(telemetry)
-        self._fresh.append(self._state)
+        self._new_states.append(self._state)
 
     def _make_state(self, telemetry: Telemetry) -> RobotState:
         twist = twist_from_wheels(telemetry.wheels, self._parameters.geometry)
@@ -244,7 +244,7 @@ class RadioRobot(RobotInterface):
             battery=self.link.battery,
         )
 
-    def _unheard(self) -> RobotState:
+    def _initial_state(self) -> RobotState:
         return RobotState(
             stamp_ns=0,
             wheels=WheelSpeeds(math.nan, math.nan),

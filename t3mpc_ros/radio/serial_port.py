@@ -16,35 +16,35 @@ from typing import NoReturn
 import serial
 
 BAUD_RATE = 500_000
-"""Exact on a 16 MHz AVR, and a rate Linux knows."""
+"""Exact on a 16 MHz AVR, and a standard rate of Linux."""
 _WRITE_TIMEOUT = 0.1
-"""s; a whole transaction is on the line within 2 ms"""
+"""s; a complete transaction takes 2 ms on the line"""
 _PORT_ERRORS = (OSError, termios.error, ValueError, TypeError)
 
 
 class PortError(Exception):
-    """The port cannot be used; the text says why and what to do."""
+    """The port cannot be used; the text contains the reason and the remedy."""
 
     def __init__(self, text: str, absent: bool) -> None:
         super().__init__(text)
         self.absent = absent
-        """There is no such device: looking again costs nothing."""
+        """Whether the device does not exist, so that retries are cheap."""
 
 
 class SerialPort:
-    """An open serial port that never blocks for long.
+    """An open serial port with short timeouts.
 
     Parameters
     ----------
     path
-        Such as ``/dev/serial/by-id/…``: it stays the same when the dongle is plugged in anew.
+        Such as ``/dev/serial/by-id/…``, which stays the same over replugging.
     device
-        What ought to be there, for the words of errors.
+        Name of the expected device in error texts.
 
     Raises
     ------
     PortError
-        It cannot be opened; an error at any later call closes it first.
+        The port cannot be opened. Later methods close it before they raise.
     """
 
     def __init__(self, path: str, device: str = 'the dongle') -> None:
@@ -56,11 +56,11 @@ class SerialPort:
             )
         except _PORT_ERRORS as error:
             raise _describe_error(path, device, error) from error
-        self.low_latency = self._ask_for_low_latency()
-        """Whether the driver took the request; CDC-ACM needs none, FTDI 16 ms without."""
+        self.low_latency = self._set_low_latency()
+        """Whether the driver has a low-latency mode; FTDI needs it, CDC-ACM does not."""
 
     def fileno(self) -> int:
-        """Return the file descriptor, to wait for bytes with.
+        """Return the file descriptor, for ``select``.
 
         Raises
         ------
@@ -70,53 +70,53 @@ class SerialPort:
         try:
             return int(self._serial.fileno())
         except _PORT_ERRORS as error:
-            self._give_up(error)
+            self._fail(error)
 
     def read(self) -> bytes:
-        """Return what has arrived, maybe nothing; raise PortError when the dongle is gone."""
+        """Return the received bytes, possibly none; raise PortError if the device is gone."""
         try:
-            # With timeout 0 this takes what is there; the size only bounds it.
+            # With timeout 0 this returns the available bytes, at most 4096.
             return bytes(self._serial.read(4096))
         except _PORT_ERRORS as error:
-            self._give_up(error)
+            self._fail(error)
 
     def write(self, data: bytes) -> None:
-        """Send ``data``; raise PortError when it cannot be done at once."""
+        """Write ``data``; raise PortError if that fails or blocks."""
         try:
             written = self._serial.write(data)
         except _PORT_ERRORS as error:
-            self._give_up(error)
+            self._fail(error)
         if written != len(data):
-            self._give_up(OSError(errno.EIO, f'{written} of {len(data)} bytes written'))
+            self._fail(OSError(errno.EIO, f'{written} of {len(data)} bytes written'))
 
     def close(self) -> None:
-        """Close the port; what goes wrong with it no longer matters."""
+        """Close the port, ignoring errors."""
         with suppress(*_PORT_ERRORS):
             self._serial.close()
 
-    def _ask_for_low_latency(self) -> bool:
+    def _set_low_latency(self) -> bool:
         try:
             self._serial.set_low_latency_mode(True)
-        except (*_PORT_ERRORS, NotImplementedError):  # only some drivers know it
+        except (*_PORT_ERRORS, NotImplementedError):  # only some drivers support it
             return False
         return True
 
-    def _give_up(self, error: Exception) -> NoReturn:
-        # At once: while the dead device is held, the dongle comes back under another name.
+    def _fail(self, error: Exception) -> NoReturn:
+        # Immediately: while the dead device is open, the dongle reappears under another name.
         self.close()
         raise _describe_error(self._path, self._device, error) from error
 
 
 def _describe_error(path: str, device: str, error: Exception) -> PortError:
-    """Return the error in words, with the remedy."""
+    """Return the error as PortError with a remedy."""
     code = getattr(error, 'errno', None)
     if isinstance(error, termios.error) and error.args:
         code = error.args[0]
     if code in (errno.ENOENT, errno.ENXIO, errno.ENODEV) or not os.path.exists(path):
-        return PortError(f'{path} is not there: is {device} plugged in?', True)
+        return PortError(f'{path} does not exist: is {device} plugged in?', True)
     if code in (errno.EACCES, errno.EPERM):
         return PortError(
-            f'{path} may not be opened: permission denied; sudo usermod -aG dialout $USER, '
+            f'{path} cannot be opened: permission denied; sudo usermod -aG dialout $USER, '
             'log in again',
             False,
         )

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Only who has the key moves a keyed robot, and nobody does so twice with the same bytes."""
+"""Authentication: a keyed robot accepts signed frames only, each of them once."""
 
 import json
 from pathlib import Path
@@ -36,68 +36,68 @@ SAMPLES = (
 )
 
 
-def meet(key=KEY, host_us=1000, session=9, nonces=(b'HOSTHOST', b'ROBOTROB'), gate=None):
+def meet(key=KEY, host_us=1000, session=9, nonces=(b'HOSTHOST', b'ROBOTROB'), verifier=None):
     """Return both ends of a session."""
-    gate = gate or CommandVerifier(key)
-    assert gate.begin_session(sign_hello(key, session, 0, host_us, nonces[0]), nonces[1]) == ''
-    return Signer(session_key(key, nonces[0], gate.nonce), host_us), gate
+    verifier = verifier or CommandVerifier(key)
+    assert verifier.begin_session(sign_hello(key, session, 0, host_us, nonces[0]), nonces[1]) == ''
+    return Signer(session_key(key, nonces[0], verifier.nonce), host_us), verifier
 
 
 def test_golden_session_step_by_step():
-    gate = CommandVerifier(bytes.fromhex(VECTORS['key']))
+    verifier = CommandVerifier(bytes.fromhex(VECTORS['key']))
     for row in VECTORS['robot']:
         frame = decode_downlink(bytes.fromhex(row['bytes']))
         if isinstance(frame, frames.Hello):
-            why = gate.begin_session(frame, bytes.fromhex(row['fresh_nonce']))
+            why = verifier.begin_session(frame, bytes.fromhex(row['fresh_nonce']))
         else:
-            why = gate.verify(frame)
+            why = verifier.verify(frame)
         assert (why == '', why) == (row['accepted'], row['why']), row['name']
-        assert (gate.session, gate.nonce.hex()) == (row['session'], row['robot_nonce'])
+        assert (verifier.session, verifier.nonce.hex()) == (row['session'], row['robot_nonce'])
     for row in VECTORS['robot_without_key']:
         frame = decode_downlink(bytes.fromhex(row['bytes']))
         assert (CommandVerifier().begin_session(frame, bytes(8)) == '') == row['accepted']
 
 
-def test_golden_stops_are_obeyed_all_and_counted_like_any_command():
-    """The gate once let every stop pass without a look; the firmware counted those of the host."""
+def test_golden_estops_are_executed_and_verified():
+    """Regression: the verifier accepted every ESTOP unseen, the firmware counted signed ones."""
     story = VECTORS['stops']
-    gates = [CommandVerifier(bytes.fromhex(VECTORS['key'])) for _ in range(2)]
-    for gate in gates:
+    verifiers = [CommandVerifier(bytes.fromhex(VECTORS['key'])) for _ in range(2)]
+    for verifier in verifiers:
         hello = decode_downlink(bytes.fromhex(story['hello']))
-        assert gate.begin_session(hello, bytes.fromhex(story['fresh_nonce'])) == ''
+        assert verifier.begin_session(hello, bytes.fromhex(story['fresh_nonce'])) == ''
     counted = []
     for row in story['frames']:
         frame = decode_downlink(bytes.fromhex(row['bytes']))
-        counted.append(gates[0].accept(frame) == '')
+        counted.append(verifiers[0].accept(frame) == '')
         assert counted[-1] == row['counted'], row['name']
         stops = bool(frame.flags & CommandFlag.ESTOP)
-        assert (gates[1].verify(frame) == '') == (stops or counted[-1]), row['name']
+        assert (verifiers[1].verify(frame) == '') == (stops or counted[-1]), row['name']
     assert len(set(counted)) == 2
 
 
-def test_a_stop_that_is_held_for_hours_keeps_the_epoch():
-    """Both ends count wraps of the host's clock: also while nothing but stops is sent."""
-    signer, gate = meet(host_us=1000)
+def test_estop_repeated_for_hours_keeps_the_epoch():
+    """Both ends count wraps of the host clock while only ESTOP frames are sent."""
+    signer, verifier = meet(host_us=1000)
     stop = frames.Command(9, 0, CommandFlag.ESTOP, 0, 0, 0, 0)
     for number in range(1, 7):
         host_us = (1000 + number * 0x80000001) % (1 << 32)
-        assert gate.accept(signer.sign(stop._replace(seq=number, host_us=host_us))) == ''
+        assert verifier.accept(signer.sign(stop._replace(seq=number, host_us=host_us))) == ''
     clear = frames.Command(9, 7, CommandFlag.ESTOP_CLEAR, 0, 0, 0, (host_us + 1) % (1 << 32))
-    assert gate.verify(signer.sign(clear)) == ''
+    assert verifier.verify(signer.sign(clear)) == ''
     assert signer.epoch == 3
 
 
-def test_nobody_passes_a_gate_with_a_damaged_key_but_stops_do():
-    gate = CommandVerifier(locked=True)
-    assert gate.nonce == bytes(8)
+def test_a_damaged_key_rejects_all_frames_but_estop():
+    verifier = CommandVerifier(locked=True)
+    assert verifier.nonce == bytes(8)
     for hello in (frames.Hello(1, 0, 0), sign_hello(bytes(16), 1, 0, 0, bytes(8))):
-        assert gate.begin_session(hello, bytes(8)) == 'the key is damaged'
-    assert gate.session == 0
-    assert gate.verify(frames.Command(1, 0, frames.CommandFlag.ENABLE, 1, 0, 0, 0)) != ''
-    assert gate.verify(frames.Command(1, 0, CommandFlag.ESTOP, 1, 0, 0, 0)) == ''
+        assert verifier.begin_session(hello, bytes(8)) == 'the key is damaged'
+    assert verifier.session == 0
+    assert verifier.verify(frames.Command(1, 0, frames.CommandFlag.ENABLE, 1, 0, 0, 0)) != ''
+    assert verifier.verify(frames.Command(1, 0, CommandFlag.ESTOP, 1, 0, 0, 0)) == ''
 
 
-def test_the_check_value_tells_keys_apart_and_is_the_published_hash():
+def test_the_check_value_is_the_published_hash_of_the_key():
     assert {row['check'] for row in GOLDEN['key_checks']} == {
         int.from_bytes(siphash(bytes.fromhex(row['key']), b't3mpc')[:4], 'little')
         for row in GOLDEN['key_checks']
@@ -118,8 +118,8 @@ def test_golden_session_keys_and_tags():
 
 
 @pytest.mark.parametrize('frame', SAMPLES, ids=lambda frame: type(frame).__name__)
-def test_every_bit_of_a_signed_frame_counts(frame):
-    signer, gate = meet()
+def test_every_bit_of_a_signed_frame_is_protected(frame):
+    signer, verifier = meet()
     data = encode(signer.sign(frame._replace(host_us=2000)))
     refused = 0
     for bit in range(8 * len(data)):
@@ -133,13 +133,13 @@ def test_every_bit_of_a_signed_frame_counts(frame):
             continue  # stopping is always allowed
         if not isinstance(forged, frames.Poll | frames.ParamGet | frames.Hello):
             refused += 1
-            assert gate.verify(forged)
+            assert verifier.verify(forged)
     assert refused > 6 * len(data)
-    # None of this has cost the true frame anything.
-    assert gate.verify(decode_downlink(data)) == ''
+    # The genuine frame is still valid.
+    assert verifier.verify(decode_downlink(data)) == ''
 
 
-def test_every_bit_of_a_signed_hello_counts():
+def test_every_bit_of_a_signed_hello_is_protected():
     data = encode(sign_hello(KEY, 9, 1, 5, b'HOSTHOST'))
     for bit in range(8 * len(data)):
         flipped = bytearray(data)
@@ -149,12 +149,12 @@ def test_every_bit_of_a_signed_hello_counts():
         except FrameError:
             continue
         assert not verify_hello(KEY, forged)
-        gate = CommandVerifier(KEY)
-        assert gate.begin_session(forged, b'ROBOTROB') == 'HELLO has a bad tag'
-        assert gate.session == 0
+        verifier = CommandVerifier(KEY)
+        assert verifier.begin_session(forged, b'ROBOTROB') == 'HELLO has a bad tag'
+        assert verifier.session == 0
 
 
-def test_a_tag_of_one_kind_or_session_does_not_fit_another():
+def test_a_tag_is_bound_to_its_kind_and_session():
     signer, _ = meet()
     signed = [signer.sign(frame._replace(host_us=10 + at)) for at, frame in enumerate(SAMPLES)]
     assert len({frame.tag for frame in signed}) == 3
@@ -165,118 +165,118 @@ def test_a_tag_of_one_kind_or_session_does_not_fit_another():
                     assert frame_tag(frame, key, epoch) != frame.tag
 
 
-def test_nothing_counts_twice_in_the_same_session():
-    signer, gate = meet()
+def test_replays_within_a_session_are_rejected():
+    signer, verifier = meet()
     sent = []
     for step in range(60):
         frame = SAMPLES[step % 3]._replace(host_us=2000 + 10 * step)
         signed = signer.sign(frame)
-        assert gate.verify(signed) == ''
+        assert verifier.verify(signed) == ''
         sent.append(signed)
         for old in sent:
-            assert gate.verify(old)
+            assert verifier.verify(old)
 
 
-def test_nothing_of_an_earlier_session_counts_in_a_later_one():
-    """Numbers and times may repeat: the robot draws a new nonce at every HELLO."""
-    signer, gate = meet()
+def test_replays_from_an_earlier_session_are_rejected():
+    """Session numbers and times may repeat: each HELLO leads to a new robot nonce."""
+    signer, verifier = meet()
     recorded = [signer.sign(COMMAND._replace(host_us=2000 + step)) for step in range(20)]
     for frame in recorded:
-        assert gate.verify(frame) == ''
+        assert verifier.verify(frame) == ''
     hello = sign_hello(KEY, 9, 0, 1000, b'HOSTHOST')
-    meet(gate=gate, nonces=(b'NEWHOST.', b'NEWROBOT'))
+    meet(verifier=verifier, nonces=(b'NEWHOST.', b'NEWROBOT'))
     for frame in recorded:
-        assert gate.verify(frame)
-    # Not even after the recorded HELLO: it gets the recorder a session without a key.
-    assert gate.begin_session(hello, b'THIRDROB') == ''
+        assert verifier.verify(frame)
+    # Nor after a replay of the HELLO: the session key of the new session is unknown.
+    assert verifier.begin_session(hello, b'THIRDROB') == ''
     for frame in recorded:
-        assert gate.verify(frame)
+        assert verifier.verify(frame)
 
 
-def test_a_repeated_hello_does_not_change_the_key_under_a_host_that_has_heard_the_answer():
-    signer, gate = meet()
+def test_a_repeated_hello_keeps_the_session_key():
+    signer, verifier = meet()
     signed = signer.sign(COMMAND._replace(host_us=2000))
-    assert gate.begin_session(sign_hello(KEY, 9, 0, 1000, b'HOSTHOST'), b'OTHERROB') == ''
-    assert gate.nonce == b'ROBOTROB'
-    assert gate.verify(signed) == ''
-    assert gate.begin_session(sign_hello(KEY, 9, 0, 1000, b'HOSTHOST'), b'OTHERROB') == ''
-    assert gate.verify(signed) == 'frame is a replay'
+    assert verifier.begin_session(sign_hello(KEY, 9, 0, 1000, b'HOSTHOST'), b'OTHERROB') == ''
+    assert verifier.nonce == b'ROBOTROB'
+    assert verifier.verify(signed) == ''
+    assert verifier.begin_session(sign_hello(KEY, 9, 0, 1000, b'HOSTHOST'), b'OTHERROB') == ''
+    assert verifier.verify(signed) == 'frame is a replay'
 
 
-def test_a_wrong_key_gets_no_session_and_moves_nothing():
-    gate = CommandVerifier(KEY)
-    assert gate.begin_session(sign_hello(ALIEN, 9, 0, 5, b'HOSTHOST'), b'ROBOTROB') == (
+def test_a_wrong_key_starts_no_session_and_moves_nothing():
+    verifier = CommandVerifier(KEY)
+    assert verifier.begin_session(sign_hello(ALIEN, 9, 0, 5, b'HOSTHOST'), b'ROBOTROB') == (
         'HELLO has a bad tag'
     )
-    assert gate.session == 0
-    _, gate = meet()
+    assert verifier.session == 0
+    _, verifier = meet()
     alien = Signer(session_key(ALIEN, b'HOSTHOST', b'ROBOTROB'), 1000)
     for frame in SAMPLES:
-        assert gate.verify(alien.sign(frame._replace(host_us=frame.seq + 5000)))
+        assert verifier.verify(alien.sign(frame._replace(host_us=frame.seq + 5000)))
 
 
-def test_both_ends_count_the_wraps_of_host_us_alike():
+def test_both_ends_count_the_same_wraps_of_host_us():
     """With commands 20 ms apart and losses of up to a minute, over five wraps: six hours."""
     source = random.Random(3)
-    signer, gate = meet(host_us=0xFFFFFFF0)
+    signer, verifier = meet(host_us=0xFFFFFFF0)
     now, taken = 0xFFFFFFF0, 0
     while now < 6 << 32:
         now += source.choice((20_000, 60_000_000, source.randrange(1, 600_000_000)))
         signed = signer.sign(COMMAND._replace(host_us=now & 0xFFFFFFFF))
         assert signer.epoch == (now >> 32)
-        if source.random() < 0.5:  # the others are lost
-            assert gate.verify(signed) == ''
+        if source.random() < 0.5:  # the other frames are lost
+            assert verifier.verify(signed) == ''
             taken += 1
     assert taken > 50
 
 
-def test_a_frame_of_before_a_wrap_is_refused_after_it():
-    signer, gate = meet(host_us=0xFFFFFF00)
+def test_a_frame_from_before_a_wrap_is_rejected_after_it():
+    signer, verifier = meet(host_us=0xFFFFFF00)
     late = signer.sign(COMMAND._replace(host_us=0xFFFFFFFE))
-    assert gate.verify(signer.sign(COMMAND._replace(host_us=3))) == ''
-    assert gate.verify(late)
-    # The robot tries the epoch after its own for it, and only that.
-    assert gate.verify(signer.sign(COMMAND._replace(host_us=4))) == ''
+    assert verifier.verify(signer.sign(COMMAND._replace(host_us=3))) == ''
+    assert verifier.verify(late)
+    # The robot tests only the next epoch for it.
+    assert verifier.verify(signer.sign(COMMAND._replace(host_us=4))) == ''
 
 
-def test_the_host_never_signs_the_same_instant_twice():
+def test_the_signer_rejects_a_repeated_host_us():
     signer, _ = meet()
     signer.sign(COMMAND._replace(host_us=7000))
     with pytest.raises(ValueError, match='host_us must increase: got 7000 twice'):
         signer.sign(COMMAND._replace(host_us=7000))
 
 
-def test_stopping_is_always_allowed_and_releasing_is_not():
-    signer, gate = meet()
+def test_estop_needs_no_tag_but_its_release_does():
+    signer, verifier = meet()
     stop = frames.Command(0, 0, CommandFlag.ESTOP, 0, 0, 0, 0)
     clear = frames.Command(9, 1, CommandFlag.ESTOP_CLEAR, 0, 0, 0, 5000)
     for frame in (stop, stop._replace(session=77, tag=bytes(8)), stop._replace(flags=7)):
-        assert gate.verify(frame) == ''
+        assert verifier.verify(frame) == ''
         assert CommandVerifier(KEY).verify(frame) == ''
         assert CommandVerifier().verify(frame) == ''
-    assert gate.verify(clear) == 'frame is not signed'
-    assert gate.verify(clear._replace(tag=bytes(8)))
-    assert gate.verify(signer.sign(clear)) == ''
+    assert verifier.verify(clear) == 'frame is not signed'
+    assert verifier.verify(clear._replace(tag=bytes(8)))
+    assert verifier.verify(signer.sign(clear)) == ''
 
 
-def test_keyed_and_open_ends_refuse_each_other():
+def test_keyed_and_open_ends_reject_each_other():
     assert (
         CommandVerifier(KEY).begin_session(frames.Hello(9, 0, 0), bytes(8))
         == 'HELLO is not signed'
     )
     signed = sign_hello(KEY, 9, 0, 0, b'HOSTHOST')
     assert CommandVerifier().begin_session(signed, bytes(8)) == 'no key to check the HELLO with'
-    gate = CommandVerifier()
-    assert gate.nonce == b''
-    assert gate.begin_session(frames.Hello(9, 0, 0), bytes(8)) == ''
-    assert gate.verify(COMMAND) == ''
-    assert gate.verify(COMMAND._replace(tag=bytes(8))) == 'no key to check the tag with'
-    assert gate.verify(COMMAND._replace(session=8)) == 'session is 9: got 8'
+    verifier = CommandVerifier()
+    assert verifier.nonce == b''
+    assert verifier.begin_session(frames.Hello(9, 0, 0), bytes(8)) == ''
+    assert verifier.verify(COMMAND) == ''
+    assert verifier.verify(COMMAND._replace(tag=bytes(8))) == 'no key to check the tag with'
+    assert verifier.verify(COMMAND._replace(session=8)) == 'session is 9: got 8'
 
 
-def test_a_robot_without_session_takes_nothing_of_session_zero():
-    for gate in (CommandVerifier(), CommandVerifier(KEY)):
-        assert gate.verify(COMMAND._replace(session=0)) == 'session is 0: got 0'
+def test_without_a_session_session_zero_is_rejected():
+    for verifier in (CommandVerifier(), CommandVerifier(KEY)):
+        assert verifier.verify(COMMAND._replace(session=0)) == 'session is 0: got 0'
 
 
 @pytest.mark.parametrize('text', ['6465' * 8, '64 65 ' * 8, ('6465' * 8).upper() + '\n'])
@@ -299,7 +299,7 @@ def test_a_key_file_of_32_digits_is_read(tmp_path, text):
         ('schlüssel', 0o600, 'must hold hexadecimal digits only'),
     ],
 )
-def test_a_key_file_that_will_not_do_is_refused_without_quoting_it(tmp_path, text, mode, expected):
+def test_an_invalid_key_file_is_rejected_without_quoting_it(tmp_path, text, mode, expected):
     path = tmp_path / 'key'
     path.write_text(text)
     path.chmod(mode)
@@ -309,6 +309,6 @@ def test_a_key_file_that_will_not_do_is_refused_without_quoting_it(tmp_path, tex
     assert error.value.__cause__ is None
 
 
-def test_a_key_file_that_is_missing_is_named(tmp_path):
+def test_a_missing_key_file_is_reported(tmp_path):
     with pytest.raises(KeyFileError, match='cannot be read: No such file'):
         read_key(tmp_path / 'nothing')

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The clock model finds when the robot measured, from round trips alone."""
+"""Clock synchronisation: sample times of the robot from round trips alone."""
 
 import numpy as np
 import pytest
@@ -48,43 +48,43 @@ def rms(errors):
 
 @pytest.mark.parametrize('seed', range(4))
 @pytest.mark.parametrize('skew', [0.005, -0.005])
-def test_a_resonator_half_a_percent_off_behind_a_jittery_port(skew, seed):
+def test_clock_error_of_half_a_percent_with_a_jittery_port(skew, seed):
     errors, arrival = drive(60.0, skew, 1e-3, 0.05, seed)
     assert rms(errors) < 0.13e-3
-    # From a full window on.
+    # With a full window.
     assert np.abs(errors[500:]).max() < 0.19e-3
     assert rms(arrival) > 20.0 * rms(errors)
 
 
-def test_the_first_second_is_no_worse_than_stamping_on_arrival():
+def test_the_first_second_is_no_worse_than_arrival_stamps():
     for seed in range(10):
         errors, arrival = drive(1.0, 0.005, 1e-3, 0.05, seed)
         assert np.abs(errors).max() < 1.0e-3
         assert np.abs(errors).max() < np.abs(arrival).max()
 
 
-def test_without_jitter_only_the_steps_of_the_age_are_left():
+def test_without_jitter_the_error_is_the_age_resolution():
     errors, _ = drive(20.0, -0.003, 0.0, 0.0)
     assert np.abs(errors[25:]).max() < 20e-6
 
 
-def test_the_wrap_of_the_robots_microseconds_does_not_show():
+def test_the_wrap_of_the_robot_clock_has_no_effect():
     near = 2**32 - 15_000_000
     errors, _ = drive(20.0, 0.005, 1e-3, 0.05, boot_us=near)
     plain, _ = drive(20.0, 0.005, 1e-3, 0.05)
-    # Times are cut to whole microseconds elsewhere, that is all.
+    # The difference is the truncation to microseconds.
     np.testing.assert_allclose(errors, plain, atol=3e-6)
 
 
-def test_the_rate_of_the_robots_clock_is_found():
+def test_the_rate_of_the_robot_clock_is_estimated():
     model = ClockModel()
     drive(12.0, 0.005, 1e-3, 0.05, model=model)
-    # A robot that is fast: its second is shorter.
+    # The second of a fast robot clock is shorter.
     assert model.skew == pytest.approx(1.0 / 1.005 - 1.0, abs=1e-4)
 
 
-def test_a_few_slow_transactions_do_not_bend_the_line():
-    """A port that now and then holds back bytes for 30 ms, one way only."""
+def test_slow_transactions_do_not_bias_the_fit():
+    """A port that sometimes delays bytes by 30 ms, one way only."""
     model = ClockModel()
     worst = 0.0
     for cycle in range(1000):
@@ -98,8 +98,8 @@ def test_a_few_slow_transactions_do_not_bend_the_line():
     assert worst < 20_000
 
 
-def test_a_resonator_that_warms_up_is_followed():
-    """What is older than ten seconds is forgotten: its rate was another one."""
+def test_a_drifting_resonator_is_tracked():
+    """Samples older than ten seconds, with another rate, are dropped."""
     model, robot_us = ClockModel(), 0
     for cycle in range(2000):
         robot_us += 20_100 if cycle < 1000 else 20_050
@@ -109,7 +109,7 @@ def test_a_resonator_that_warms_up_is_followed():
     assert model.to_host_ns(robot_us) == pytest.approx(sent + TRAVEL_NS, abs=10_000)
 
 
-def test_a_model_that_knows_nothing_says_so():
+def test_a_model_without_samples_raises():
     model = ClockModel()
     assert not model.is_set
     with pytest.raises(ValueError, match='at least one transaction: got none'):
@@ -121,7 +121,7 @@ def test_a_model_that_knows_nothing_says_so():
     assert model.skew == 0.0
 
 
-def test_times_since_1970_lose_no_nanoseconds():
+def test_epoch_times_keep_nanosecond_precision():
     origin = 1_800_000_000 * 10**9
     near, far = ClockModel(), ClockModel()
     for cycle in range(100):
@@ -131,13 +131,13 @@ def test_times_since_1970_lose_no_nanoseconds():
     assert far.to_host_ns(2_000_000) - origin == pytest.approx(near.to_host_ns(2_000_000), abs=2)
 
 
-def test_how_long_a_command_takes_to_the_robot():
+def test_forward_delay_of_a_command():
     """26 bytes at 20 us, 130 us twice, 185 us in the air: 965 us."""
     assert forward_delay_ns(26, 14) == 965_000
     assert forward_delay_ns(34, 22) == (34 * 20 + 260 + 249) * 1000
 
 
-def test_counters_go_on_where_they_wrap():
+def test_counters_are_unwrapped():
     counter = CounterUnwrapper()
     total = -5
     counter.add(total)
@@ -154,7 +154,7 @@ def test_counters_go_on_where_they_wrap():
     assert counter.add(20) == moved + 3
 
 
-def test_the_shorter_way_round():
+def test_wrapped_difference_is_the_shorter_one():
     assert wrapped_difference(0xFFFFFFFF, 1) == 2
     assert wrapped_difference(1, 0xFFFFFFFF) == -2
     assert wrapped_difference(-(2**31), 2**31 - 1) == -1

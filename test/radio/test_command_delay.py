@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""How late the radio makes a controller's command: what ``speed_filter.dead_time`` has to say."""
+"""Delay of a command over the radio, the basis of ``speed_filter.dead_time``."""
 
 import random
 
@@ -12,11 +12,11 @@ from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.robot.interface import RobotCommand
 
 DEAD_TIME = 0.02
-"""s: what the demonstration and the launch file of the real robot tell the controller."""
+"""Dead time that demo and launch file of the real robot configure, s."""
 
 
 class Controlled(RobotBench):
-    """A controller answers each state, milliseconds later; whoever is to wake does so late."""
+    """A controller that answers each state after milliseconds, with late wake-ups."""
 
     def __init__(self, thinking_ns, lateness_ns, **given):
         super().__init__(**given)
@@ -24,13 +24,13 @@ class Controlled(RobotBench):
         self._dice = random.Random(8)
         self._due = []
         self.answers = {}
-        """When the state was sampled that each command answers, by its left speed in mrad/s."""
+        """Sample time of the state that each command answers, by its left speed in mrad/s."""
 
     def _step(self, received):
         self.now_ns += self._dice.randrange(self._lateness_ns + 1)
         super()._step(received)
         for state in self.states:
-            # Slow enough that no ramp delays it, and no two alike.
+            # Slow enough to avoid ramp delays, and unique.
             number = 2000 + len(self.answers) % 2000
             self.answers[number] = state.stamp_ns
             thinking = round(self._thinking_ns * self._dice.uniform(0.5, 1.5))
@@ -48,11 +48,11 @@ class Controlled(RobotBench):
 @pytest.mark.parametrize('thinking', [1.0, 3.0, 8.0])
 @pytest.mark.parametrize('lateness', [0.0, 0.3, 1.0])
 @pytest.mark.parametrize('loss', [0.0, 0.1])
-def test_a_command_is_obeyed_one_cycle_after_what_it_answers(thinking, lateness, loss):
-    """The guard once had a clock of its own beside the link's cycle.
+def test_a_command_is_executed_one_cycle_after_its_state(thinking, lateness, loss):
+    """Regression: the limiter had a period of its own, independent of the link cycle.
 
-    A thread that woke a little late let them slip against each other: then each command waited
-    for the cycle after the next, 39 ms instead of 19, for as long as the phase stayed so.
+    A late thread let the two drift: each command waited for the cycle after the next, 39 ms
+    instead of 19, for as long as the phase lasted.
     """
     bench = Controlled(round(thinking * MS), round(lateness * MS))
     bench.connect()

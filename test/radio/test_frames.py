@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Frames: golden bytes, round trips, and nothing between a whole frame and none."""
+"""Frames: golden bytes, round trips, and decoding as all or nothing."""
 
 import importlib.util
 import json
@@ -50,7 +50,7 @@ WAYS = {
 }
 KINDS = [(kind, decode) for decode, kinds in WAYS.items() for kind in kinds]
 
-# Without their optional end these are frames, too: unsigned, or a question.
+# Sizes without the optional end: unsigned frames and read requests.
 SHORTER = {
     frames.Command: 14,
     frames.ParamSet: 8,
@@ -78,7 +78,7 @@ def columns(kind, signed):
 
 
 def some(kind, source, extreme=None):
-    """Return a frame with random fields, each in its range; with extreme, at one end of it."""
+    """Return a frame with random valid fields; with ``extreme``, each at one of its bounds."""
     values = {}
     for name, column in columns(kind, source.random() < 0.5).items():
         if column.code.endswith('s'):
@@ -100,7 +100,7 @@ def some(kind, source, extreme=None):
     return kind(**values)
 
 
-def test_the_frames_of_the_specification_byte_for_byte():
+def test_frames_of_the_specification_byte_for_byte():
     command = frames.Command(0x5A, 7, frames.CommandFlag.ENABLE, 20, 5000, -2500, 0x01020304)
     data = encode(command)
     assert data == bytes.fromhex('115a0701140088133cf604030201')
@@ -119,7 +119,7 @@ def test_the_frames_of_the_specification_byte_for_byte():
     assert codec.decode_exchange_status(0x13) == (True, True, False, False, 1)
 
 
-def test_the_committed_vectors_are_what_their_script_writes():
+def test_committed_vectors_equal_the_output_of_their_script():
     spec = importlib.util.spec_from_file_location('writer', GOLDEN / 'write_radio_vectors.py')
     writer = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(writer)
@@ -160,7 +160,7 @@ def test_every_field_survives_the_round_trip(kind, decode):
 
 
 @pytest.mark.parametrize('kind, decode', KINDS)
-def test_what_does_not_fit_is_not_encoded_and_the_error_says_which_field(kind, decode):
+def test_encoding_errors_name_the_field(kind, decode):
     source = random.Random(8)
     good = some(kind, source)
     for name, column in columns(kind, good[-1] != b'').items():
@@ -176,12 +176,12 @@ def test_what_does_not_fit_is_not_encoded_and_the_error_says_which_field(kind, d
 
 
 @pytest.mark.parametrize('kind, decode', KINDS)
-def test_every_truncation_and_every_byte_too_many_is_rejected(kind, decode):
+def test_truncated_and_extended_frames_are_rejected(kind, decode):
     source = random.Random(9)
     for _ in range(20):
         data = encode(some(kind, source))
         if kind is frames.Transmit:
-            # Its end has no length of its own: the CRC of the line vouches for it.
+            # The variable end has no length field: the CRC of the line protects it.
             shortest = 4 + data[3]
         elif kind is frames.Result and len(data) > 8:
             shortest = 9
@@ -193,7 +193,7 @@ def test_every_truncation_and_every_byte_too_many_is_rejected(kind, decode):
                 continue
             with pytest.raises(FrameError) as error:
                 decode(data[:size])
-            # A HELLO says by a flag whether it is signed.
+            # The flag of a HELLO shows whether it is signed.
             flagged = kind is frames.Hello and size == 8
             assert error.value.kind is (FrameErrorKind.VALUE if flagged else FrameErrorKind.LENGTH)
         if kind not in (frames.Transmit, frames.Result):
@@ -202,8 +202,8 @@ def test_every_truncation_and_every_byte_too_many_is_rejected(kind, decode):
 
 
 @pytest.mark.parametrize('kind, decode', KINDS)
-def test_every_bit_flip_is_rejected_or_read_whole(kind, decode):
-    """A radio payload has no CRC of its own: what passes must at least be exactly what it says."""
+def test_every_bit_flip_is_rejected_or_decoded_completely(kind, decode):
+    """A radio payload has no CRC: an accepted one must encode to the same bytes."""
     source = random.Random(10)
     for _ in range(10):
         data = encode(some(kind, source))
@@ -219,28 +219,28 @@ def test_every_bit_flip_is_rejected_or_read_whole(kind, decode):
 
 
 @pytest.mark.parametrize('decode', list(WAYS))
-def test_random_bytes_are_rejected_or_read_whole(decode):
+def test_random_bytes_are_rejected_or_decoded_completely(decode):
     source = random.Random(11)
     whole = [encode(some(kind, source)) for kind in WAYS[decode]]
-    read = 0
+    decoded = 0
     for _ in range(4000):
         data = source.randbytes(source.randint(0, 80))
         if source.random() < 0.8:
             frame = source.choice(whole)
-            # Of the right length, half of the time, and with a few bytes that are right.
+            # Half of them with a valid length and valid first bytes.
             size = source.choice((len(data), len(frame)))
             data = (frame[: source.randint(1, 4)] + source.randbytes(80))[:size]
         try:
             frame = decode(data)
         except FrameError:
             continue
-        read += 1
+        decoded += 1
         assert encode(frame) == data
-    assert read > 10
+    assert decoded > 10
 
 
-def test_widths_beyond_what_the_chip_can_hold_are_rejected():
-    """A chip that claims more than 32 bytes is a known way to overrun whoever believes it."""
+def test_payloads_longer_than_32_bytes_are_rejected():
+    """A payload width above 32 bytes is a known buffer overrun of the radio chip."""
     for size in range(33, 256):
         for decode in (decode_downlink, decode_uplink):
             for head in (b'\x11', b'\x13', b'\x14'):
@@ -248,7 +248,7 @@ def test_widths_beyond_what_the_chip_can_hold_are_rejected():
                     decode(head + bytes(size - 1))
 
 
-def test_another_version_is_told_from_another_kind():
+def test_wrong_version_and_wrong_kind_are_distinguished():
     for head in range(256):
         for decode in (decode_downlink, decode_uplink):
             with pytest.raises(FrameError) as error:
@@ -256,14 +256,14 @@ def test_another_version_is_told_from_another_kind():
             assert (error.value.kind is FrameErrorKind.VERSION) == (head >> 4 != 1)
 
 
-def test_a_field_that_only_a_signed_frame_has_is_not_lost_silently():
+def test_a_field_of_signed_frames_is_not_dropped_silently():
     with pytest.raises(FrameError, match=r'PARAM_SET.host_us must be 0 without tag: got 5'):
         encode(frames.ParamSet(1, 2, 3, 4, host_us=5))
     with pytest.raises(FrameError, match=r'HELLO.nonce must be b.. without tag'):
         encode(frames.Hello(1, 2, 3, nonce=bytes(8)))
 
 
-def test_a_result_that_contradicts_itself_is_rejected():
+def test_an_inconsistent_result_is_rejected():
     good = 0
     for first in range(256):
         for payload in (b'', b'\1'):
@@ -272,8 +272,9 @@ def test_a_result_that_contradicts_itself_is_rejected():
             except FrameError:
                 continue
             good += 1
-            said = codec.decode_exchange_status(first)
-            assert bool(payload) == said.has_payload
-            assert said.acknowledged + said.failed + said.skipped <= 1
-    # Sixteen counts of tries each: acknowledged, answered, given up, none of them; once skipped.
+            status = codec.decode_exchange_status(first)
+            assert bool(payload) == status.has_payload
+            assert status.acknowledged + status.failed + status.skipped <= 1
+    # Sixteen retransmission counts for each status: acknowledged, with payload, failed, none;
+    # skipped has one.
     assert good == 4 * 16 + 1

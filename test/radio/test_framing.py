@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The splitter finds every good frame and no other, whatever happens to the bytes."""
+"""Framing: the decoder finds all valid frames and no other in a damaged stream."""
 
 import json
 from pathlib import Path
@@ -22,13 +22,13 @@ VECTORS = json.loads((Path(__file__).parents[1] / 'golden' / 'radio_vectors.json
 
 
 def random_frame(source, longest=FRAME_LIMIT):
-    # Zeros and 255 are what stuffing is about.
+    # 0 and 255 are the special cases of COBS.
     size = source.randint(1, longest)
     return bytes(source.choice((0, 255, source.randrange(256))) for _ in range(size))
 
 
 def damage(wire, source):
-    """Return the bytes of a frame after something happened to them."""
+    """Return the bytes of a frame with one random damage."""
     at = source.randrange(len(wire))
     match source.randrange(4):
         case 0:
@@ -60,46 +60,46 @@ def test_crc_is_the_division_by_its_polynomial():
         assert crc16(data) == register
 
 
-def test_stuffing_golden_vectors():
+def test_cobs_golden_vectors():
     for row in VECTORS['cobs']:
-        data, stuffed = bytes.fromhex(row['bytes']), bytes.fromhex(row['stuffed'])
-        assert cobs_encode(data) == stuffed
-        assert cobs_decode(stuffed) == data
+        data, encoded = bytes.fromhex(row['bytes']), bytes.fromhex(row['stuffed'])
+        assert cobs_encode(data) == encoded
+        assert cobs_decode(encoded) == data
     for row in VECTORS['wire']:
         assert encode_frame(bytes.fromhex(row['bytes'])).hex() == row['wire']
 
 
-def test_stuffing_costs_one_byte_leaves_no_zero_and_can_be_undone():
+def test_cobs_adds_one_byte_removes_zeros_and_is_invertible():
     source = random.Random(2)
     for size in range(254):
         data = bytes(source.choice((0, source.randrange(256))) for _ in range(size))
-        stuffed = cobs_encode(data)
-        assert len(stuffed) == size + 1
-        assert 0 not in stuffed
-        assert cobs_decode(stuffed) == data
+        encoded = cobs_encode(data)
+        assert len(encoded) == size + 1
+        assert 0 not in encoded
+        assert cobs_decode(encoded) == data
     with pytest.raises(ValueError, match='at most 254 bytes long: got 255'):
         cobs_encode(bytes(255))
 
 
-def test_only_what_stuffing_makes_can_be_unstuffed():
+def test_only_valid_cobs_decodes():
     source = random.Random(3)
-    undone = 0
+    decoded = 0
     for _ in range(20000):
-        stuffed = bytes(source.randint(0, 6) for _ in range(source.randint(0, 8)))
-        data = cobs_decode(stuffed)
+        encoded = bytes(source.randint(0, 6) for _ in range(source.randint(0, 8)))
+        data = cobs_decode(encoded)
         if data is not None:
-            undone += 1
-            assert cobs_encode(data) == stuffed
-    assert undone > 500
+            decoded += 1
+            assert cobs_encode(data) == encoded
+    assert decoded > 500
 
 
-def test_frames_that_do_not_fit_are_refused():
+def test_frames_of_invalid_length_are_rejected():
     for frame in (b'', bytes(FRAME_LIMIT + 1)):
         with pytest.raises(ValueError, match=f'must have 1 to 78 bytes: got {len(frame)}'):
             encode_frame(frame)
 
 
-def test_the_stream_may_be_cut_anywhere():
+def test_the_stream_may_be_split_anywhere():
     source = random.Random(4)
     sent = [random_frame(source) for _ in range(40)]
     stream = b''.join(encode_frame(frame) for frame in sent)
@@ -108,24 +108,24 @@ def test_the_stream_may_be_cut_anywhere():
     expected = whole.feed(stream)
     assert len(expected) > 35
     for step in (1, 2, 3, 7, 64, 1000):
-        splitter = FrameDecoder()
+        decoder = FrameDecoder()
         found = []
         for at in range(0, len(stream), step):
-            found += splitter.feed(stream[at : at + step])
+            found += decoder.feed(stream[at : at + step])
         assert found == expected
-        assert splitter.counts == whole.counts
+        assert decoder.counts == whole.counts
     for cut in range(0, len(stream), 3):
-        splitter = FrameDecoder()
-        assert splitter.feed(stream[:cut]) + splitter.feed(stream[cut:]) == expected
+        decoder = FrameDecoder()
+        assert decoder.feed(stream[:cut]) + decoder.feed(stream[cut:]) == expected
 
 
 def test_zeros_in_a_row_are_no_errors():
-    splitter = FrameDecoder()
-    assert splitter.feed(b'\0\0' + encode_frame(b'abc') + b'\0\0\0' + encode_frame(b'd')) == [
+    decoder = FrameDecoder()
+    assert decoder.feed(b'\0\0' + encode_frame(b'abc') + b'\0\0\0' + encode_frame(b'd')) == [
         b'abc',
         b'd',
     ]
-    assert splitter.counts == (2, 0, 0)
+    assert decoder.counts == (2, 0, 0)
 
 
 def test_each_kind_of_error_is_counted_once():
@@ -138,35 +138,35 @@ def test_each_kind_of_error_is_counted_once():
         (bytes([7]) * 500 + b'\0', (0, 0, 1)),
         (cobs_encode(bytes(79) + crc16(bytes(79)).to_bytes(2, 'little')) + b'\0', (0, 0, 1)),
     ):
-        splitter = FrameDecoder()
-        assert splitter.feed(bad + good) == [b'good']
-        assert splitter.counts == (counted[0] + 1, *counted[1:])
+        decoder = FrameDecoder()
+        assert decoder.feed(bad + good) == [b'good']
+        assert decoder.counts == (counted[0] + 1, *counted[1:])
 
 
-def test_a_million_random_bytes_give_nothing_and_take_no_room():
-    """CRC-16 lets one in 65 536 well-formed pieces pass; few pieces of noise are well-formed."""
+def test_a_million_random_bytes_yield_no_frame_or_growth():
+    """CRC-16 passes one in 65 536 valid COBS blocks; noise rarely is valid COBS."""
     source = random.Random(5)
-    splitter, found = FrameDecoder(), []
+    decoder, found = FrameDecoder(), []
     for _ in range(1000):
-        found += splitter.feed(source.randbytes(1000))
-        assert len(splitter._buffer) <= module._ENCODED_LIMIT
-    counts = splitter.counts
+        found += decoder.feed(source.randbytes(1000))
+        assert len(decoder._buffer) <= module._ENCODED_LIMIT
+    counts = decoder.counts
     assert counts.frames == len(found) <= 1
     assert counts.crc_errors + counts.frame_errors > 3500  # a zero every 256 bytes
-    splitter.feed(b'\0')
-    assert splitter.feed(encode_frame(b'still here')) == [b'still here']
+    decoder.feed(b'\0')
+    assert decoder.feed(encode_frame(b'still here')) == [b'still here']
 
 
-def test_a_flood_without_a_zero_takes_no_room():
-    splitter = FrameDecoder()
+def test_a_stream_without_zeros_does_not_grow_the_buffer():
+    decoder = FrameDecoder()
     for _ in range(100):
-        assert splitter.feed(b'\x55' * 10000) == []
-        assert len(splitter._buffer) <= module._ENCODED_LIMIT
-    assert splitter.feed(b'\0' + encode_frame(b'now')) == [b'now']
-    assert splitter.counts == (1, 0, 1)
+        assert decoder.feed(b'\x55' * 10000) == []
+        assert len(decoder._buffer) <= module._ENCODED_LIMIT
+    assert decoder.feed(b'\0' + encode_frame(b'now')) == [b'now']
+    assert decoder.counts == (1, 0, 1)
 
 
-def test_every_single_bit_flip_is_found():
+def test_every_single_bit_flip_is_detected():
     source = random.Random(6)
     for _ in range(20):
         wire = encode_frame(random_frame(source))
@@ -176,18 +176,18 @@ def test_every_single_bit_flip_is_found():
             assert FrameDecoder().feed(bytes(flipped) + b'\0') == []
 
 
-def test_with_most_frames_damaged_no_wrong_one_passes_and_the_next_good_one_always_does():
-    """A damaged frame may swallow the one behind it (its zero is gone), never the one after."""
+def test_damaged_frames_never_pass_and_the_decoder_recovers():
+    """A damaged frame may destroy the next one (lost zero), never the one after that."""
     source = random.Random(7)
-    splitter = FrameDecoder()
+    decoder = FrameDecoder()
     wrong = damaged = neighbours = 0
     after_good = False
     for number in range(20000):
-        # Told apart by their numbers: a frame of another round is a wrong one.
+        # Unique by number: a frame from another round is wrong.
         frame = number.to_bytes(4, 'little') + random_frame(source, 30)
         hit = source.random() < 0.6
         wire = damage(encode_frame(frame), source) if hit else encode_frame(frame)
-        found = splitter.feed(wire)
+        found = decoder.feed(wire)
         damaged += hit
         wrong += sum(one != frame for one in found)
         if not hit:
@@ -195,15 +195,15 @@ def test_with_most_frames_damaged_no_wrong_one_passes_and_the_next_good_one_alwa
             assert frame in found or not after_good
         after_good = not hit
     assert damaged > 11000
-    # One in 65 536 is what the CRC promises; these are 12 000 damages.
+    # The CRC passes one in 65 536; there are 12 000 damaged frames.
     assert wrong <= 2
     assert neighbours < 0.1 * damaged
 
 
-def test_what_was_begun_before_a_new_connection_is_forgotten():
-    splitter = FrameDecoder()
+def test_a_partial_frame_does_not_survive_a_new_connection():
+    decoder = FrameDecoder()
     wire = encode_frame(b'of this connection')
-    splitter.feed(wire[:5])
-    splitter.reset()
-    assert splitter.feed(wire) == [b'of this connection']
-    assert splitter.counts == (1, 0, 0)
+    decoder.feed(wire[:5])
+    decoder.reset()
+    assert decoder.feed(wire) == [b'of this connection']
+    assert decoder.counts == (1, 0, 0)

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Statistics of the link: what they count, and when they complain."""
+"""Link statistics: counters, loss rate, round trips, and the resulting level."""
 
 import math
 
@@ -17,7 +17,7 @@ def after(*trips):
     return statistics
 
 
-def test_nothing_is_claimed_before_anything_was_measured():
+def test_quality_before_the_first_cycle():
     quality = LinkStatistics(0.02, 0.2).quality(math.inf, NOTHING)
     assert quality.level is DiagnosticLevel.ERROR
     assert quality.text == 'no telemetry for inf s'
@@ -36,7 +36,7 @@ def test_losses_and_round_trips_of_the_last_ten_seconds():
     assert abs(quality.round_trip_p99 - 0.099) < 0.0015
 
 
-def test_more_than_one_loss_in_twenty_is_worth_a_warning():
+def test_more_than_one_loss_in_twenty_is_a_warning():
     cycle = [0.005] * 19 + [None]
     assert after(*cycle * 10).quality(0.0, NOTHING).level is DiagnosticLevel.OK
     worse = after(*cycle * 10, None).quality(0.0, NOTHING)
@@ -49,14 +49,14 @@ def test_a_few_cycles_are_not_judged():
     assert after(None, 0.005).quality(0.0, NOTHING).level is DiagnosticLevel.OK
 
 
-def test_slow_round_trips_are_worth_a_warning_with_their_usual_cause():
+def test_slow_round_trips_are_a_warning_with_their_usual_cause():
     assert after(*[0.009] * 100).quality(0.0, NOTHING).level is DiagnosticLevel.OK
     slow = after(*[0.005] * 97, *[0.016] * 3).quality(0.0, NOTHING)
     assert slow.level is DiagnosticLevel.WARN
     assert slow.text == 'round trips up to 16.0 ms: is the port in low-latency mode?'
 
 
-def test_a_robot_that_must_have_stopped_by_itself_is_an_error():
+def test_telemetry_older_than_the_ttl_is_an_error():
     statistics = after(*[0.005] * 100)
     assert statistics.quality(0.2, NOTHING).level is DiagnosticLevel.OK
     lost = statistics.quality(0.25, NOTHING)
@@ -64,7 +64,7 @@ def test_a_robot_that_must_have_stopped_by_itself_is_an_error():
     assert lost.text == 'no telemetry for 0.25 s'
 
 
-def test_retransmissions_are_counted_by_how_many():
+def test_retransmissions_are_counted_by_number():
     statistics = LinkStatistics(0.02, 0.2)
     for tries in (0, 0, 3, 15):
         statistics.add_exchange(tries)

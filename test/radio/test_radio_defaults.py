@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Both boards, the emulator, the host and the documents meet on one channel without being told."""
+"""Radio defaults are equal in firmware, emulator, host and documents."""
 
 from pathlib import Path
 import re
@@ -19,13 +19,13 @@ HOST = LinkParameters().configure(0)
 
 
 def defined(header, name):
-    """Return what a header defines, of several lines as one."""
+    """Return the value of a macro in a header, with continuation lines joined."""
     text = (ROOT / 'firmware' / 'core' / header).read_text().replace('\\\n', ' ')
     (value,) = re.findall(rf'^ *#define {name}\s+(.*?)(?://.*)?$', text, re.MULTILINE)
     return value.strip()
 
 
-def test_the_firmware_starts_where_the_host_looks():
+def test_firmware_and_host_have_equal_radio_defaults():
     channel, rate = (int(defined('t3_port.h', f'T3_RADIO_{name}')) for name in ('CHANNEL', 'RATE'))
     delays = re.fullmatch(
         r'\(T3_RADIO_RATE == 0 \? (\d+) : (\d+)\)', defined('t3_port.h', 'T3_RETRY_DELAY')
@@ -44,7 +44,7 @@ def test_the_firmware_starts_where_the_host_looks():
     assert there == HOST[1:]
 
 
-def test_the_emulator_starts_where_the_host_looks():
+def test_emulator_and_host_have_equal_radio_defaults():
     assert tuple(RadioParameters()) == HOST[1:]
     parameters = EmulatorParameters()
     assert (parameters.channel, parameters.rate) == (
@@ -53,18 +53,18 @@ def test_the_emulator_starts_where_the_host_looks():
     )
 
 
-def test_the_documents_name_the_same_place():
+def test_the_documents_name_the_same_radio_defaults():
     text = (ROOT / 'docs' / 'radio.md').read_text()
     letters = HOST.address.hex(' ')
     rates = {0: '250 kbit/s', 1: '1 Mbit/s', 2: '2 Mbit/s'}
-    said = (
+    sentence = (
         f'both ends start with `{HOST.address.decode()}` ({letters}) on channel {HOST.channel} at '
         f'{rates[HOST.rate]}'
     )
-    assert said in ' '.join(text.split())
+    assert sentence in ' '.join(text.split())
 
 
-def test_no_configuration_moves_one_end_alone():
+def test_no_configuration_changes_one_end_alone():
     for path in (ROOT / 'config').glob('*.yaml'):
         for content in yaml.safe_load(path.read_text()).values():
             link = content['ros__parameters'].get('link', {})
@@ -73,7 +73,7 @@ def test_no_configuration_moves_one_end_alone():
                     assert value == getattr(LinkParameters(), name), path.name
 
 
-def test_the_emulated_boards_say_they_are_the_firmware_they_stand_for():
+def test_emulated_boards_report_the_firmware_version():
     number = [
         int(defined('t3_protocol.h', f'T3_FIRMWARE_{name}')[:-1]) for name in ('MAJOR', 'MINOR')
     ]

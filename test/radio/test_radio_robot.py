@@ -1,12 +1,12 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The real robot behind the seam, in virtual time against a scripted dongle and robot."""
+"""RadioRobot in virtual time against a scripted dongle and robot."""
 
 import math
 import random
 
 import pytest
-from support.radio_bench import Bench
+from support.radio_bench import LinkBench
 
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError
@@ -19,17 +19,17 @@ from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON
 KEY = bytes(range(16))
 
 
-class Seam:
-    """What the bench takes for a link: steps and commands go through the robot."""
+class RobotAsLink:
+    """Link interface of the bench that passes steps and commands through the robot."""
 
     def __init__(self, host):
         self.host = host
         self.states = []
 
     def step(self, now_ns, received):
-        deeds = self.host.step(now_ns, received)
+        actions = self.host.step(now_ns, received)
         self.states += self.host.take_states()
-        return deeds
+        return actions
 
     def command(self, command, now_ns):
         return self.host.apply(command, now_ns)
@@ -39,12 +39,12 @@ class Seam:
 
 
 def bench(key=b'', seed=1, **changes):
-    made = Bench(key=key, seed=seed)
+    made = LinkBench(key=key, seed=seed)
     parameters = RadioRobotParameters.from_dict(
         {name.replace('__', '.'): value for name, value in changes.items()}
     )
     made.host = RadioRobot(parameters, key, random.Random(seed).randbytes)
-    made.link = Seam(made.host)
+    made.link = RobotAsLink(made.host)
     return made
 
 
@@ -54,13 +54,13 @@ def ramped(made, right, left, seconds):
     return made.link.states[-1]
 
 
-def test_the_radio_robot_has_every_part_of_the_seam():
+def test_radio_robot_implements_the_robot_interface():
     for name in ('apply', 'advance', 'stop', 'reset_odometry', 'latch_estop', 'release_estop'):
         assert getattr(RadioRobot, name) is not getattr(RobotInterface, name)
 
 
 @pytest.mark.parametrize('key', [b'', KEY])
-def test_it_drives_and_reckons_where_it_is_from_the_counters(key):
+def test_driving_updates_the_odometry_from_the_counters(key):
     made = bench(key)
     made.connect()
     state = ramped(made, 4.0, 4.0, 3.0)
@@ -76,7 +76,7 @@ def test_it_drives_and_reckons_where_it_is_from_the_counters(key):
     assert state.status.moving
 
 
-def test_states_come_once_each_and_in_order():
+def test_states_are_returned_once_and_in_order():
     made = bench()
     made.connect()
     ramped(made, 2.0, 1.0, 2.0)
@@ -86,7 +86,7 @@ def test_states_come_once_each_and_in_order():
     assert made.host.take_states() == []
 
 
-def test_the_ramp_of_the_guard_is_what_is_sent():
+def test_the_ramp_of_the_limiter_is_sent():
     made = bench()
     made.connect()
     made.drive(6.0, 6.0)
@@ -97,7 +97,7 @@ def test_the_ramp_of_the_guard_is_what_is_sent():
     assert max(rises) <= 30.0 * 0.02 + 0.01
 
 
-def test_silence_of_the_sender_stops_it_with_the_reason():
+def test_missing_commands_stop_the_robot_with_a_reason():
     made = bench()
     made.connect()
     ramped(made, 5.0, 5.0, 1.0)
@@ -107,7 +107,7 @@ def test_silence_of_the_sender_stops_it_with_the_reason():
     assert made.robot.speeds == (0.0, 0.0)
 
 
-def test_a_pulled_dongle_is_named_and_found_again():
+def test_an_unplugged_dongle_is_reported_and_found_again():
     made = bench()
     made.connect()
     ramped(made, 3.0, 3.0, 1.0)
@@ -120,10 +120,10 @@ def test_a_pulled_dongle_is_named_and_found_again():
     assert ramped(made, 3.0, 3.0, 1.0).reason == ''
 
 
-def test_a_rebooted_robot_keeps_its_place_and_forgets_its_bias():
+def test_a_restart_keeps_the_pose_and_resets_the_gyro_bias():
     made = bench()
     made.connect()
-    made.run(2.5)  # the gyro learns at a standstill
+    made.run(2.5)  # calibration of the gyro bias at standstill
     assert made.host._odometry.calibrated
     before = ramped(made, 4.0, 4.0, 2.0)
     made.robot.boot(made.now_ns)
@@ -135,7 +135,7 @@ def test_a_rebooted_robot_keeps_its_place_and_forgets_its_bias():
     assert not made.host._odometry.calibrated
 
 
-def test_an_emergency_stop_holds_until_it_is_released_on_both_ends():
+def test_an_emergency_stop_is_latched_until_released():
     made = bench()
     made.connect()
     ramped(made, 5.0, 5.0, 1.0)
@@ -152,7 +152,7 @@ def test_an_emergency_stop_holds_until_it_is_released_on_both_ends():
     assert made.host.release_estop(made.now_ns) == 'no emergency stop is latched'
 
 
-def test_odometry_is_reset_at_rest_only():
+def test_odometry_is_reset_at_standstill_only():
     made = bench()
     made.connect()
     ramped(made, 4.0, 4.0, 1.0)
@@ -165,17 +165,17 @@ def test_odometry_is_reset_at_rest_only():
     assert made.host.advance(made.now_ns).odometry.pose.x == 0.0
 
 
-def test_lasting_disagreement_of_gyro_and_steps_stops_it():
+def test_lasting_slip_stops_the_robot():
     made = bench()
     made.connect()
     made.run(2.5)
-    made.drive(3.0, -3.0)  # the scripted robot's gyro reads a constant
+    made.drive(3.0, -3.0)  # the gyro of the scripted robot reads a constant
     made.run(3.0)
     assert any(state.status.slipping for state in made.link.states)
     assert SLIP_STOP_REASON in {state.reason for state in made.link.states}
 
 
-def test_a_command_that_is_not_finite_stops_it():
+def test_a_non_finite_command_stops_the_radio_robot():
     made = bench()
     made.connect()
     ramped(made, 5.0, 5.0, 1.0)
@@ -186,7 +186,7 @@ def test_a_command_that_is_not_finite_stops_it():
     assert made.robot.speeds == (0.0, 0.0)
 
 
-def test_the_link_ends_with_standstill_and_the_port_closed():
+def test_shutdown_ends_at_standstill_with_a_closed_port():
     made = bench()
     made.connect()
     ramped(made, 5.0, 5.0, 1.0)
@@ -204,6 +204,6 @@ def test_the_link_ends_with_standstill_and_the_port_closed():
         ('wheel.stop_deceleration', 80.0),
     ],
 )
-def test_what_the_board_would_cut_is_refused_here(name, value):
-    with pytest.raises(ParameterError, match=f'{name} must be at most what the board does itself'):
+def test_limits_above_those_of_the_board_are_rejected(name, value):
+    with pytest.raises(ParameterError, match=f'{name} must be at most the limit of the board'):
         RadioRobotParameters.from_dict({name: value})

@@ -1,20 +1,14 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""``t3mpc robot`` against the emulator: in virtual time, and once over pseudo terminals."""
+"""Bench procedures against the emulator, in virtual time."""
 
 import math
 import os
 import random
-import signal
 import stat
-import subprocess
-import sys
-import threading
-import time
 
 import pytest
 
-from t3mpc_ros.cli import robot
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.port_actions import Close, Open, Wait, Write
@@ -30,8 +24,8 @@ START_NS = 5_000_000_000
 TURN = 3200
 
 
-class Bench:
-    """An emulator, and whoever holds one of its two ports, in virtual time."""
+class ToolBench:
+    """Runs a task at one of the two ports of an emulator, in virtual time."""
 
     def __init__(self, key=b'', seed=1, **flat):
         self.emulator = Emulator(EmulatorParameters.from_dict(flat), key, seed, START_NS)
@@ -42,8 +36,8 @@ class Bench:
     def board(self):
         return self.emulator.board
 
-    def carry(self, task, robot=False, seconds=120.0):
-        """Carry a task out at the port of the dongle, or of the robot; return it."""
+    def run(self, task, robot=False, seconds=120.0):
+        """Run a task at the port of the dongle, or of the robot; return it."""
         end, self.is_open, received = self.now_ns + round(seconds * 1e9), False, b''
         while not task.done:
             wake = self._do(task, task.step(self.now_ns, received), robot)
@@ -66,42 +60,42 @@ class Bench:
         assert not self.is_open
         return task
 
-    def _do(self, task, deeds, robot):
+    def _do(self, task, actions, robot):
         wake = self.now_ns
-        for deed in deeds:
-            if isinstance(deed, Wait):
-                wake = deed.until_ns
-            elif isinstance(deed, Open):
+        for action in actions:
+            if isinstance(action, Wait):
+                wake = action.until_ns
+            elif isinstance(action, Open):
                 self.is_open = True
                 task.port_opened(self.now_ns)
                 return self.now_ns
-            elif isinstance(deed, Write) and self.is_open and robot:
-                self.emulator.feed_console(deed.data, self.now_ns)
-            elif isinstance(deed, Write) and self.is_open:
-                self.emulator.feed(deed.data, self.now_ns)
-            elif isinstance(deed, Close):
+            elif isinstance(action, Write) and self.is_open and robot:
+                self.emulator.feed_console(action.data, self.now_ns)
+            elif isinstance(action, Write) and self.is_open:
+                self.emulator.feed(action.data, self.now_ns)
+            elif isinstance(action, Close):
                 self.is_open = False
         return wake
 
-    def at_dongle(self, talk):
-        """Return what a talk with the dongle comes to."""
-        return self._result(self.carry(Procedure(talk, decode_from_dongle)))
+    def at_dongle(self, script):
+        """Return the result of a script at the port of the dongle."""
+        return self._result(self.run(Procedure(script, decode_from_dongle)))
 
-    def at_robot(self, talk):
-        """Return what a talk with the robot's own USB comes to."""
-        return self._result(self.carry(Procedure(talk, decode_from_board), robot=True))
+    def at_robot(self, script):
+        """Return the result of a script at the USB port of the robot board."""
+        return self._result(self.run(Procedure(script, decode_from_board), robot=True))
 
-    def _result(self, errand):
-        if errand.error:
-            raise ProcedureError(errand.error)
-        return errand.result
+    def _result(self, procedure):
+        if procedure.error:
+            raise ProcedureError(procedure.error)
+        return procedure.result
 
     def radio(self):
-        """Return how the radio of the dongle is set."""
+        """Return the radio configuration of the dongle."""
         return self.emulator.dongle.radio
 
-    def turn(self, wheel, revolutions, key=b'', speed=2.0, link=None):
-        said = []
+    def jog(self, wheel, revolutions, key=b'', speed=2.0, link=None):
+        reported = []
         task = jog.Jog(
             link or LinkParameters(),
             key,
@@ -109,41 +103,41 @@ class Bench:
             wheel,
             revolutions,
             speed,
-            said.append,
+            reported.append,
         )
-        self.carry(task)
-        return task, said
+        self.run(task)
+        return task, reported
 
 
 # -- key ------------------------------------------------------------------------------------------
 
 
-def test_a_new_key_is_closed_to_others_and_never_overwrites(tmp_path):
+def test_a_new_key_file_is_private_and_never_overwrites(tmp_path):
     path = tmp_path / 'key'
-    drawn = iter([bytes(16), KEY])  # zeros mean something else: drawn again
-    assert key_provisioning.create_key_file(path, lambda size: next(drawn)) == key_check(KEY)
+    keys = iter([bytes(16), KEY])  # zeros are reserved: keys again
+    assert key_provisioning.create_key_file(path, lambda size: next(keys)) == key_check(KEY)
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert read_key(path) == KEY
     with pytest.raises(KeyFileError, match='never overwritten'):
         key_provisioning.create_key_file(path, os.urandom)
     link = tmp_path / 'link'
     link.symlink_to(tmp_path / 'elsewhere')
-    with pytest.raises(KeyFileError, match='there already'):
+    with pytest.raises(KeyFileError, match='exists: a key'):
         key_provisioning.create_key_file(link, os.urandom)
     with pytest.raises(KeyFileError, match='No such file'):
         key_provisioning.create_key_file(tmp_path / 'nowhere' / 'key', os.urandom)
     assert read_key(path) == KEY
 
 
-def test_a_key_goes_over_the_cable_and_is_told_apart_at_both_ends():
-    bench = Bench()
+def test_a_key_is_written_over_usb_and_compared():
+    bench = ToolBench()
     assert 'no key' in key_provisioning.format_key_state(
         bench.at_robot(key_provisioning.read_key_state())
     )
-    told = bench.at_robot(key_provisioning.write_key(KEY))
-    assert f'{key_check(KEY):08x}' in key_provisioning.format_key_state(told)
-    assert key_provisioning.holds_key(told, KEY)
-    assert not key_provisioning.holds_key(told, OTHER)
+    state = bench.at_robot(key_provisioning.write_key(KEY))
+    assert f'{key_check(KEY):08x}' in key_provisioning.format_key_state(state)
+    assert key_provisioning.holds_key(state, KEY)
+    assert not key_provisioning.holds_key(state, OTHER)
     assert bench.board.key_store.create_verifier().key == KEY
     assert key_provisioning.holds_key(bench.at_robot(key_provisioning.write_key(OTHER)), OTHER)
     assert key_provisioning.holds_key(
@@ -153,15 +147,15 @@ def test_a_key_goes_over_the_cable_and_is_told_apart_at_both_ends():
     assert not bench.board.key_store.create_verifier().key
 
 
-def test_a_board_that_opening_its_port_has_reset_is_waited_for():
-    bench = Bench()
+def test_a_board_reset_by_opening_its_port_has_time_to_start():
+    bench = ToolBench()
     bench.emulator.restart_robot()
     assert key_provisioning.holds_key(bench.at_robot(key_provisioning.write_key(KEY)), KEY)
     assert bench.now_ns - START_NS > 1e9
 
 
-def test_a_damaged_key_is_told_and_put_right():
-    bench = Bench(KEY)
+def test_a_damaged_key_is_reported_and_replaced():
+    bench = ToolBench(KEY)
     bench.board.key_store._cells[3] ^= 1
     bench.emulator.restart_robot()
     assert 'damaged' in key_provisioning.format_key_state(
@@ -170,19 +164,19 @@ def test_a_damaged_key_is_told_and_put_right():
     assert key_provisioning.holds_key(bench.at_robot(key_provisioning.write_key(KEY)), KEY)
 
 
-def test_the_dongle_never_hears_a_key():
-    bench = Bench()
-    heard = []
+def test_a_key_is_never_sent_to_the_dongle():
+    bench = ToolBench()
+    received = []
     take = bench.emulator.dongle._process
-    bench.emulator.dongle._process = lambda data: (heard.append(data), take(data))
+    bench.emulator.dongle._process = lambda data: (received.append(data), take(data))
     with pytest.raises(ProcedureError, match='this is the dongle'):
         bench.at_dongle(key_provisioning.write_key(KEY))
-    assert heard
-    assert not any(KEY in data for data in heard)
+    assert received
+    assert not any(KEY in data for data in received)
 
 
-def test_a_moving_robot_takes_no_key_and_says_what_to_do():
-    bench = Bench()
+def test_a_moving_robot_rejects_a_key_with_a_remedy():
+    bench = ToolBench()
     bench.each = lambda bench: bench.board.receive(
         bytes([0x14, 9, 0, 0]) + bytes(4)
         if bench.board.session != 9
@@ -195,8 +189,8 @@ def test_a_moving_robot_takes_no_key_and_says_what_to_do():
         bench.at_robot(key_provisioning.write_key(KEY))
 
 
-def test_a_port_where_nobody_answers_is_given_up_with_advice():
-    bench = Bench()
+def test_a_silent_port_fails_with_a_remedy():
+    bench = ToolBench()
     bench.emulator.inject('silence', math.inf)
     with pytest.raises(ProcedureError, match='right port'):
         bench.at_dongle(link_test.run_link_test(LinkParameters(), 1))
@@ -206,8 +200,8 @@ def test_a_port_where_nobody_answers_is_given_up_with_advice():
 # -- ping -----------------------------------------------------------------------------------------
 
 
-def test_a_good_link_is_called_good_in_every_row():
-    bench = Bench()
+def test_a_good_link_is_good_in_every_row():
+    bench = ToolBench()
     seen = bench.at_dongle(link_test.run_link_test(LinkParameters(), 100))
     rows = link_test.evaluate(seen, LinkParameters())
     assert [row.verdict for row in rows] == [link_test.GOOD] * 6
@@ -219,22 +213,22 @@ def test_a_good_link_is_called_good_in_every_row():
     assert link_test.is_usable(rows)
 
 
-def test_losses_show_as_tries_and_at_last_as_a_bad_link():
-    bench = Bench()
+def test_losses_cause_retransmissions_and_a_bad_verdict():
+    bench = ToolBench()
     bench.emulator.inject('loss', math.inf, 0.4)
     seen = bench.at_dongle(link_test.run_link_test(LinkParameters(), 300))
     assert len(seen.cycles) / 300 == pytest.approx(1 - (1 - 0.6**2) ** 4, abs=0.07)
     assert seen.retransmissions[1] > 40
     rows = {row.name: row for row in link_test.evaluate(seen, LinkParameters())}
     assert rows['robot answers by radio'].verdict == link_test.BAD
-    assert rows['tries more per packet'].verdict == link_test.POOR
+    assert rows['retransmissions per packet'].verdict == link_test.POOR
     text = link_test.format_report(list(rows.values()))
     assert '10 uF' in text
     assert text.count('try: ') == 2
 
 
-def test_a_robot_that_is_off_says_where_to_look():
-    bench = Bench()
+def test_an_absent_robot_leads_to_the_channel_scan():
+    bench = ToolBench()
     bench.emulator.inject('robot_reset', 1000.0)
     rows = link_test.evaluate(
         bench.at_dongle(link_test.run_link_test(LinkParameters(), 10)), LinkParameters()
@@ -244,14 +238,14 @@ def test_a_robot_that_is_off_says_where_to_look():
     assert not link_test.is_usable(rows)
 
 
-def test_a_slow_cable_and_a_damaged_one_are_seen():
-    bench = Bench()
+def test_slow_and_damaged_cables_are_detected():
+    bench = ToolBench()
     bench.emulator.inject('delay', math.inf, 0.016)
     seen = bench.at_dongle(link_test.run_link_test(LinkParameters(), 20))
     rows = {row.name: row for row in link_test.evaluate(seen, LinkParameters())}
     assert rows['dongle answers over USB'].verdict == link_test.POOR
     assert rows['round trip to the robot'].verdict != link_test.GOOD
-    bench = Bench()
+    bench = ToolBench()
     bench.emulator.inject('flip_bits', math.inf, 0.004)
     seen = bench.at_dongle(link_test.run_link_test(LinkParameters(), 200))
     rows = {row.name: row for row in link_test.evaluate(seen, LinkParameters())}
@@ -259,56 +253,56 @@ def test_a_slow_cable_and_a_damaged_one_are_seen():
     assert rows['frames damaged on the cable'].verdict == link_test.POOR
 
 
-def test_the_robots_own_port_and_a_dead_chip_are_named():
-    bench = Bench()
-    with pytest.raises(ProcedureError, match='USB of the robot'):
+def test_the_wrong_port_and_a_dead_chip_are_reported():
+    bench = ToolBench()
+    with pytest.raises(ProcedureError, match='USB port of the robot board'):
         bench.at_robot(link_test.run_link_test(LinkParameters(), 1))
-    bench = Bench()
+    bench = ToolBench()
     bench.emulator.inject('radio_dead', math.inf)
     with pytest.raises(ProcedureError, match='radio chip'):
         bench.at_dongle(link_test.run_link_test(LinkParameters(), 1))
 
 
-# -- find -----------------------------------------------------------------------------------------
+# -- scan -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize('channel, rate', [(0, '1M'), (100, '250k'), (125, '2M')])
-def test_the_robot_is_found_wherever_it_is_and_the_radio_left_as_it_was(channel, rate):
-    bench = Bench(channel=channel, rate=rate)
+def test_the_scan_finds_the_robot_and_restores_the_radio(channel, rate):
+    bench = ToolBench(channel=channel, rate=rate)
     before, seen = bench.radio(), []
-    talk = channel_scan.scan_channels(
-        LinkParameters(), ('250k', '1M', '2M'), lambda *told: seen.append(told)
+    script = channel_scan.scan_channels(
+        LinkParameters(), ('250k', '1M', '2M'), lambda *report: seen.append(report)
     )
-    (place,) = bench.at_dongle(talk)
-    assert (place.channel, place.rate) == (channel, rate)
-    assert place.answered == place.asked == 20
-    assert [told[:2] for told in seen] == [(number + 1, 378) for number in range(378)]
-    assert [text for _, _, text in seen if text] == [channel_scan.format_channel(place)]
+    (result,) = bench.at_dongle(script)
+    assert (result.channel, result.rate) == (channel, rate)
+    assert result.answered == result.packets == 20
+    assert [report[:2] for report in seen] == [(number + 1, 378) for number in range(378)]
+    assert [text for _, _, text in seen if text] == [channel_scan.format_channel(result)]
     assert bench.radio() == before
-    good, advice = channel_scan.recommend([place], LinkParameters())
+    good, advice = channel_scan.recommend([result], LinkParameters())
     assert not good
     assert f'link.channel to {channel} and' in advice
-    assert channel_scan.recommend([place], LinkParameters(channel=channel, rate=rate))[0]
+    assert channel_scan.recommend([result], LinkParameters(channel=channel, rate=rate))[0]
 
 
-def test_a_search_that_is_interrupted_leaves_the_radio_as_it_was():
-    bench = Bench(channel=120)
+def test_an_interrupted_scan_restores_the_radio():
+    bench = ToolBench(channel=120)
     before = bench.radio()
 
     def interrupt(bench):
         if bench.radio().channel == 40:
-            errand.interrupt(bench.now_ns)
+            procedure.interrupt(bench.now_ns)
 
     bench.each = interrupt
-    talk = channel_scan.scan_channels(LinkParameters(), ('2M',), lambda *told: None)
-    errand = Procedure(talk, decode_from_dongle)
-    bench.carry(errand)
-    assert errand.error == 'interrupted'
+    script = channel_scan.scan_channels(LinkParameters(), ('2M',), lambda *report: None)
+    procedure = Procedure(script, decode_from_dongle)
+    bench.run(procedure)
+    assert procedure.error == 'interrupted'
     assert bench.radio() == before
 
 
-def test_a_dongle_that_is_pulled_out_in_mid_search_ends_it():
-    bench = Bench(channel=120)
+def test_unplugging_the_dongle_ends_the_scan():
+    bench = ToolBench(channel=120)
 
     def pull(bench):
         if bench.radio().channel == 40 and bench.emulator.port_open:
@@ -316,19 +310,21 @@ def test_a_dongle_that_is_pulled_out_in_mid_search_ends_it():
 
     bench.each = pull
     with pytest.raises(ProcedureError, match='not there'):
-        bench.at_dongle(channel_scan.scan_channels(LinkParameters(), ('1M',), lambda *told: None))
+        bench.at_dongle(
+            channel_scan.scan_channels(LinkParameters(), ('1M',), lambda *report: None)
+        )
 
 
-def test_a_robot_that_is_nowhere_gets_advice():
-    bench = Bench()
+def test_a_scan_without_result_has_a_recommendation():
+    bench = ToolBench()
     bench.emulator.inject('jam', math.inf)
     found = bench.at_dongle(
-        channel_scan.scan_channels(LinkParameters(), ('1M',), lambda *told: None)
+        channel_scan.scan_channels(LinkParameters(), ('1M',), lambda *report: None)
     )
     good, advice = channel_scan.recommend(found, LinkParameters())
     assert found == []
     assert not good
-    assert 'is it on' in advice
+    assert 'robot switched on' in advice
 
 
 # -- parameters -----------------------------------------------------------------------------------
@@ -336,78 +332,74 @@ def test_a_robot_that_is_nowhere_gets_advice():
 
 @pytest.mark.parametrize('key', [b'', KEY], ids=['open', 'keyed'])
 def test_all_parameters_are_read_and_none_is_changed(key):
-    bench = Bench(key)
+    bench = ToolBench(key)
     bench.emulator.inject('loss', math.inf, 0.2)
-    talk = robot_info.read_robot_info(LinkParameters(), key, random.Random(1).randbytes)
-    inventory = bench.at_dongle(talk)
-    told = [(value.value, value.low, value.high) for value in inventory.values]
-    assert told == [(row.default, row.low, row.high) for row in frames.BOARD_PARAMETERS]
+    script = robot_info.read_robot_info(LinkParameters(), key, random.Random(1).randbytes)
+    info = bench.at_dongle(script)
+    values = [(value.value, value.low, value.high) for value in info.values]
+    assert values == [(row.default, row.low, row.high) for row in frames.BOARD_PARAMETERS]
     assert not bench.board.powered
-    lines = robot_info.format_robot_info(
-        inventory, LinkParameters.from_dict({'robot.max_speed': 5.0})
-    )
+    lines = robot_info.format_robot_info(info, LinkParameters.from_dict({'robot.max_speed': 5.0}))
     row = next(line for line in lines.splitlines() if line.startswith('max_speed'))
     assert row.split() == ['max_speed', '10000', 'mrad/s', '0', 'to', '19600', '5000']
 
 
-def test_a_session_of_somebody_else_goes_on_while_parameters_are_read():
-    bench = Bench(KEY)
+def test_reading_parameters_keeps_the_session_of_another_host():
+    bench = ToolBench(KEY)
     bench.at_dongle(robot_info.read_robot_info(LinkParameters(), KEY, random.Random(1).randbytes))
     session = bench.board.session
-    talk = robot_info.read_robot_info(LinkParameters(), b'', random.Random(2).randbytes)
-    assert len(bench.at_dongle(talk).values) == len(frames.BOARD_PARAMETERS)
+    script = robot_info.read_robot_info(LinkParameters(), b'', random.Random(2).randbytes)
+    assert len(bench.at_dongle(script).values) == len(frames.BOARD_PARAMETERS)
     assert bench.board.session == session != 0
 
 
 @pytest.mark.parametrize(
-    'here, there, words',
+    'here, there, expected',
     [(b'', KEY, 'give the host the key'), (KEY, OTHER, 'keys differ'), (KEY, b'', 'no key')],
 )
-def test_keys_that_do_not_fit_are_named(here, there, words):
-    bench = Bench(there)
-    with pytest.raises(ProcedureError, match=words):
+def test_key_mismatch_is_reported(here, there, expected):
+    bench = ToolBench(there)
+    with pytest.raises(ProcedureError, match=expected):
         bench.at_dongle(
             robot_info.read_robot_info(LinkParameters(), here, random.Random(1).randbytes)
         )
 
 
-# -- turn -----------------------------------------------------------------------------------------
+# -- jog ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize('key', [b'', KEY], ids=['open', 'keyed'])
 @pytest.mark.parametrize('wheel', [jog.LEFT, jog.RIGHT])
 @pytest.mark.parametrize('revolutions', [1.0, -0.3])
-def test_one_wheel_turns_as_far_as_it_should_and_the_drives_are_out_after_it(
-    key, wheel, revolutions
-):
-    bench = Bench(key)
-    task, said = bench.turn(wheel, revolutions, key)
+def test_jog_turns_one_wheel_and_disables_the_drives(key, wheel, revolutions):
+    bench = ToolBench(key)
+    task, reported = bench.jog(wheel, revolutions, key)
     assert task.error == ''
-    turned = task.result
-    assert turned.wanted == revolutions * TURN
-    assert abs(turned.counted - turned.wanted) <= 10
-    assert turned.other == 0
+    result = task.result
+    assert result.target == revolutions * TURN
+    assert abs(result.counted - result.target) <= 10
+    assert result.other == 0
     counters = dict(zip((jog.LEFT, jog.RIGHT), bench.board.counters, strict=True))
-    assert counters.pop(wheel) == turned.counted
+    assert counters.pop(wheel) == result.counted
     assert list(counters.values()) == [0]
     assert not bench.board.powered
-    assert said == []
-    text = jog.format_result(turned, wheel, revolutions)
+    assert reported == []
+    text = jog.format_result(result, wheel, revolutions)
     assert ('forward' in text) == (revolutions > 0)
 
 
-def test_the_wheel_never_turns_faster_or_changes_faster_than_it_may():
-    bench, speeds = Bench(), []
+def test_jog_respects_speed_and_acceleration():
+    bench, speeds = ToolBench(), []
     bench.each = lambda bench: speeds.append((bench.now_ns, bench.board.speeds[0] / 1e6))
-    task, _ = bench.turn(jog.LEFT, 1.0, speed=1.5)
+    task, _ = bench.jog(jog.LEFT, 1.0, speed=1.5)
     assert task.error == ''
     assert max(speed for _, speed in speeds) == pytest.approx(1.5, abs=0.001)
     for (before_ns, before), (after_ns, after) in zip(speeds, speeds[1:], strict=False):
         assert abs(after - before) <= 8.0 * ((after_ns - before_ns) / 1e9 + 2e-3)
 
 
-def test_an_interruption_brings_the_wheel_to_rest_and_the_drives_out():
-    bench = Bench()
+def test_an_interrupted_jog_stops_and_disables_the_drives():
+    bench = ToolBench()
     task = jog.Jog(
         LinkParameters(), b'', random.Random(1).randbytes, jog.LEFT, 5.0, 3.0, lambda text: None
     )
@@ -417,7 +409,7 @@ def test_an_interruption_brings_the_wheel_to_rest_and_the_drives_out():
             task.interrupt(bench.now_ns)
 
     bench.each = interrupt
-    bench.carry(task)
+    bench.run(task)
     assert task.error == 'interrupted'
     assert 2000 < task.result.counted < 3000
     assert task.result.counted == bench.board.counters[0]
@@ -426,195 +418,41 @@ def test_an_interruption_brings_the_wheel_to_rest_and_the_drives_out():
 
 
 @pytest.mark.parametrize(
-    'fault, words', [('button', 'emergency stop'), ('jam', 'does not answer')]
+    'fault, expected', [('button', 'emergency stop'), ('jam', 'does not answer')]
 )
-def test_what_hinders_the_wheel_ends_it_with_its_reason(fault, words):
-    bench = Bench()
+def test_a_blocked_jog_ends_with_the_reason(fault, expected):
+    bench = ToolBench()
 
-    def hinder(bench):
+    def block(bench):
         if bench.board.counters[0] > 1000 and not bench.emulator.faults.active(fault):
             bench.emulator.inject(fault, 1000.0)
 
-    bench.each = hinder
-    task, _ = bench.turn(jog.LEFT, 5.0)
-    assert words in task.error
+    bench.each = block
+    task, _ = bench.jog(jog.LEFT, 5.0)
+    assert expected in task.error
     bench.emulator.run_to(bench.now_ns + 1_000_000_000)
     assert bench.board.speeds == (0, 0)
 
 
-def test_a_robot_that_does_not_answer_is_waited_for_and_said():
-    bench = Bench()
+def test_jog_reports_a_robot_that_does_not_answer():
+    bench = ToolBench()
     bench.emulator.inject('jam', math.inf)
-    task, said = bench.turn(jog.LEFT, 1.0)
+    task, reported = bench.jog(jog.LEFT, 1.0)
     assert 'does not answer' in task.error
-    assert said == [task.error]
+    assert reported == [task.error]
     assert task.result is None
 
 
-def test_a_dongle_that_is_pulled_out_ends_it_and_the_robot_stops_by_itself():
-    bench = Bench()
+def test_unplugging_the_dongle_ends_the_jog_and_stops_the_robot():
+    bench = ToolBench()
 
     def pull(bench):
         if bench.board.counters[1] > 1000 and bench.emulator.port_open:
             bench.emulator.inject('close_port', 1000.0)
 
     bench.each = pull
-    task, _ = bench.turn(jog.RIGHT, 5.0)
+    task, _ = bench.jog(jog.RIGHT, 5.0)
     assert 'not there' in task.error
     bench.emulator.run_to(bench.now_ns + 1_000_000_000)
     assert bench.board.speeds == (0, 0)
     assert bench.board.status & StatusFlag.TTL_EXPIRED
-
-
-# -- the program ----------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def ports(tmp_path):
-    """Yield the paths of both ports of an emulator that runs as a process."""
-    dongle, robot = tmp_path / 'dongle', tmp_path / 'robot'
-    command = [sys.executable, '-m', 't3mpc_ros.cli.emulator', '--link', str(dongle)]
-    child = subprocess.Popen(
-        [*command, '--robot-link', str(robot)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)},
-    )
-    assert any('own USB' in line for line in child.stdout)
-    yield str(dongle), str(robot)
-    child.send_signal(signal.SIGTERM)
-    said, _ = child.communicate(timeout=20)
-    assert said.endswith('t3mpc emulator: stopped\n')
-    assert 'Traceback' not in said
-    assert not dongle.is_symlink()
-    assert not robot.is_symlink()
-
-
-@pytest.mark.slow
-def test_a_new_robot_on_the_bench_from_key_to_wheel(ports, tmp_path, capsys):
-    """Over pseudo terminals on the wall clock, as a person would do it."""
-    dongle, robot = ports
-    key = str(tmp_path / 'key')
-
-    def run(*arguments):
-        code = robot.main(arguments)
-        said = capsys.readouterr()
-        return code, said.out + said.err
-
-    assert run('key', 'new', key)[0] == 0
-    assert run('key', 'new', key)[0] == 2
-    check = f'{key_check(read_key(tmp_path / "key")):08x}'
-    assert check in run('key', 'check', key)[1]
-    assert 'no key' in run('key', 'state', '--port', robot)[1]
-    code, said = run('key', 'write', key, '--port', robot)
-    assert (code, check in said) == (0, True)
-    assert run('key', 'state', '--port', robot, '--key', key)[0] == 0
-    code, said = run('key', 'write', key, '--port', dongle)
-    assert (code, 'this is the dongle' in said) == (2, True)
-    code, said = run('parameters', '--port', dongle)
-    assert (code, 'give the host the key' in said) == (2, True)
-    code, said = run('parameters', '--port', dongle, '--key', key, '--set', 'robot.idle_off=5')
-    assert (code, 'ttl_max' in said, '5000' in said) == (0, True, True)
-    assert 'robot answers by radio' in run('ping', '--port', dongle, '--count', '20')[1]
-    code, said = run('scan', '--port', dongle)
-    assert (code, 'channel 82 at 1M' in said) == (0, True)
-    code, said = run('jog', 'left', '0.2', '--port', dongle, '--key', key, '--yes')
-    assert (code, '640 wanted' in said) == (0, True)
-
-    # Ctrl-C in mid-turn: the robot stands, then the program ends.
-    threading.Timer(4.0, os.kill, (os.getpid(), signal.SIGINT)).start()
-    begun = time.monotonic()
-    code, said = run('jog', 'left', '90', '--port', dongle, '--key', key, '--yes')
-    assert code == 130
-    assert time.monotonic() - begun < 60.0
-    assert 'interrupted' in said
-    assert run('key', 'forget', '--port', robot)[0] == 0
-
-
-def test_errors_of_the_port_are_words_with_a_remedy(tmp_path, capsys):
-    missing = str(tmp_path / 'nothing')
-    for command in (['ping'], ['scan'], ['parameters'], ['jog', 'left', '1', '--yes']):
-        assert robot.main([*command, '--port', missing]) == 2
-        assert 'is the dongle plugged in?' in capsys.readouterr().err
-    assert robot.main(['key', 'state', '--port', missing]) == 2
-    assert "is the robot's board plugged in?" in capsys.readouterr().err
-    master, slave = os.openpty()
-    path = os.ttyname(slave)
-    holder = robot.run_at_port.__globals__['Port'](path)
-    assert robot.main(['ping', '--port', path]) == 2
-    assert 'another program has it open' in capsys.readouterr().err
-    holder.close()
-    os.close(master)
-    os.close(slave)
-
-
-@pytest.mark.parametrize(
-    'arguments, words',
-    [
-        (['ping', '--port', 'x', '--set', 'channel=126'], 'channel'),
-        (['ping', '--port', 'x', '--set', 'chanel=12'], 'chanel'),
-        (['scan', '--port', 'x', '--set', 'rate'], 'NAME=VALUE'),
-        (['jog', 'left', '1', '--port', 'x', '--key', 'no/such/file', '--yes'], 'no/such/file'),
-        (['jog', 'left', '1', '--port', 'x'], '--yes'),
-        (['key', 'check', 'no/such/file'], 'no/such/file'),
-    ],
-)
-def test_what_cannot_be_done_is_said_before_a_port_is_opened(
-    arguments, words, capsys, monkeypatch
-):
-    with open(os.devnull) as nobody:
-        monkeypatch.setattr(sys, 'stdin', nobody)
-        assert robot.main(arguments) == 2
-    assert words in capsys.readouterr().err
-
-
-@pytest.mark.parametrize('answer', ['no', '', 'yeah', 'ctrl-c'])
-def test_a_wheel_turns_only_if_a_person_says_yes(answer, capsys, monkeypatch):
-    """Reading a line goes on after a signal: the question must hear Ctrl-C by itself."""
-    opened = []
-    monkeypatch.setattr(robot, 'carry_out', lambda *arguments: opened.append(arguments))
-    master, slave = os.openpty()
-    with open(slave) as terminal:
-        monkeypatch.setattr(sys, 'stdin', terminal)
-        if answer == 'ctrl-c':
-            threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
-        else:
-            os.write(master, answer.encode() + b'\n')
-        code = robot.main(['jog', 'left', '1', '--port', 'x'])
-        assert code == (130 if answer == 'ctrl-c' else 2)
-        assert opened == []
-        os.write(master, b'yes\n')
-        assert robot.main(['jog', 'left', '1', '--port', 'x']) == 0
-    os.close(master)
-    assert len(opened) == 1
-    said = capsys.readouterr()
-    assert 'in the air' in said.out
-    assert 'nothing was moved' in said.err
-
-
-def test_a_file_of_zeros_is_no_key(tmp_path, capsys):
-    path = tmp_path / 'key'
-    path.write_text(32 * '0')
-    path.chmod(0o600)
-    assert robot.main(['key', 'write', str(path), '--port', 'x']) == 2
-    assert 'zeros' in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    'arguments',
-    [
-        ['jog', 'left', '0', '--port', 'x'],
-        ['jog', 'middle', '1', '--port', 'x'],
-        ['jog', 'left', '1', '--speed', '11', '--port', 'x'],
-        ['ping', '--count', '0', '--port', 'x'],
-        ['ping'],
-        ['key'],
-        [],
-    ],
-)
-def test_wrong_arguments_are_usage_errors(arguments, capsys):
-    with pytest.raises(SystemExit) as ended:
-        robot.main(arguments)
-    assert ended.value.code == 2
-    capsys.readouterr()

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The port on a pseudo terminal: every way to lose it is a PortError that says what to do."""
+"""Serial port on a pseudo terminal: every failure is a PortError with a remedy."""
 
 import errno
 import os
@@ -16,7 +16,7 @@ from t3mpc_ros.radio.serial_port import PortError, SerialPort
 
 @pytest.fixture
 def line(tmp_path):
-    """Return the master's end of a raw pseudo terminal, and the path of the other one."""
+    """Yield the master of a raw pseudo terminal, and the path of its slave."""
     master, slave = os.openpty()
     tty.setraw(slave)
     path = tmp_path / 'dongle'
@@ -29,12 +29,12 @@ def line(tmp_path):
 
 
 def unplug(ends, path):
-    """Let the device vanish, as when the dongle is pulled out."""
+    """Remove the device, as when the dongle is unplugged."""
     os.close(ends.pop())
     os.unlink(path)
 
 
-def test_bytes_go_both_ways_unchanged(line):
+def test_bytes_pass_unchanged_both_ways(line):
     (master, *_), path = line
     port = SerialPort(path)
     everything = bytes(range(256))
@@ -43,33 +43,33 @@ def test_bytes_go_both_ways_unchanged(line):
     while len(found) < 256 and select.select([master], [], [], 5.0)[0]:
         found += os.read(master, 1000)
     assert found == everything
-    assert port.read() == b''  # nothing there, and no waiting
+    assert port.read() == b''  # returns at once without bytes
     os.write(master, everything)
     found = b''
     while len(found) < 256 and select.select([port.fileno()], [], [], 5.0)[0]:
         found += port.read()
     assert found == everything
-    assert not port.low_latency  # a pseudo terminal knows no such thing: that is no error
+    assert not port.low_latency  # pseudo terminals have no such mode, which is no error
     port.close()
     port.close()
 
 
 @pytest.mark.parametrize('use', ['read', 'write', 'fileno after read'])
-def test_a_dongle_that_is_pulled_out_is_noticed_at_the_next_use(line, use):
-    """Depending on the call it raises SerialException, plain OSError or termios.error."""
+def test_an_unplugged_dongle_is_detected_at_the_next_use(line, use):
+    """Depending on the call, pyserial raises SerialException, OSError or termios.error."""
     ends, path = line
     port = SerialPort(path)
     unplug(ends, path)
-    with pytest.raises(PortError, match='is not there: is the dongle plugged in') as error:
+    with pytest.raises(PortError, match='does not exist: is the dongle plugged in') as error:
         port.write(b'x') if use == 'write' else port.read()
     assert error.value.absent
-    # It is closed by now; whatever is asked of it says so, in the same words.
+    # The port is closed now; every later call raises the same error.
     for again in (port.read, port.fileno, lambda: port.write(b'x')):
         with pytest.raises(PortError):
             again()
 
 
-def test_a_port_is_ours_alone_and_free_again_after_close(line):
+def test_a_port_is_exclusive_and_free_after_close(line):
     _, path = line
     port = SerialPort(path)
     with pytest.raises(PortError, match=r'is busy: another program has it open; lsof') as error:
@@ -79,20 +79,20 @@ def test_a_port_is_ours_alone_and_free_again_after_close(line):
     SerialPort(path).close()
 
 
-def test_a_reader_that_never_reads_does_not_block_us(line):
+def test_a_blocked_reader_does_not_block_write(line):
     _, path = line
     port = SerialPort(path)
     with pytest.raises(PortError, match='failed: Write timeout'):
         port.write(bytes(200_000))
 
 
-def test_a_port_that_is_missing_is_absent(tmp_path):
-    with pytest.raises(PortError, match='nothing is not there') as error:
+def test_a_missing_port_is_absent(tmp_path):
+    with pytest.raises(PortError, match='nothing does not exist') as error:
         SerialPort(str(tmp_path / 'nothing'))
     assert error.value.absent
 
 
-def test_a_file_is_no_port(tmp_path):
+def test_a_file_is_rejected_as_port(tmp_path):
     path = tmp_path / 'file'
     path.write_text('no port')
     with pytest.raises(PortError, match='failed: ') as error:
@@ -106,15 +106,15 @@ def test_a_file_is_no_port(tmp_path):
         (OSError(errno.EACCES, 'Permission denied'), 'usermod -aG dialout'),
         (OSError(errno.EPERM, 'not permitted'), 'permission denied'),
         (OSError(errno.EBUSY, 'busy'), 'is busy'),
-        (OSError(errno.ENODEV, 'gone'), 'is not there'),
+        (OSError(errno.ENODEV, 'gone'), 'does not exist'),
         (termios.error(errno.EIO, 'Input/output error'), 'failed: .*Input/output error'),
-        (termios.error(errno.ENXIO, 'gone'), 'is not there'),
+        (termios.error(errno.ENXIO, 'gone'), 'does not exist'),
         (ValueError('Invalid baud rate'), 'failed: Invalid baud rate'),
         (TypeError('an integer is required'), 'failed: an integer is required'),
     ],
     ids=str,
 )
-def test_every_kind_of_error_leaves_in_words(line, monkeypatch, error, expected):
+def test_every_error_becomes_a_port_error_with_a_remedy(line, monkeypatch, error, expected):
     def fail(*args, **more):
         raise error
 
@@ -123,7 +123,7 @@ def test_every_kind_of_error_leaves_in_words(line, monkeypatch, error, expected)
         SerialPort(line[1])
 
 
-def test_an_error_of_ours_is_not_taken_for_one_of_the_port(line, monkeypatch):
+def test_other_errors_are_not_converted(line, monkeypatch):
     def fail(*args, **more):
         raise ZeroDivisionError
 

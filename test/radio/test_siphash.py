@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""SipHash-2-4 is the published one."""
+"""SipHash-2-4 equals the published one."""
 
 import json
 from pathlib import Path
@@ -19,13 +19,13 @@ def test_all_64_vectors_of_the_reference_implementation():
         assert siphash(key, bytes(range(length))).hex() == tag
 
 
-def test_the_example_that_the_paper_works_through():
+def test_the_worked_example_of_the_paper():
     """Appendix A of the paper: 15 bytes under the key 00 … 0f give a129ca6149be45e5."""
     tag = siphash(bytes(range(16)), bytes(range(15)))
     assert int.from_bytes(tag, 'little') == 0xA129CA6149BE45E5
 
 
-def test_every_bit_of_key_and_message_changes_about_half_of_the_tag():
+def test_every_input_bit_changes_about_half_of_the_tag():
     key, message = bytes(range(16)), bytes(range(40, 61))
     tag = int.from_bytes(siphash(key, message), 'little')
     changed = []
@@ -40,6 +40,6 @@ def test_every_bit_of_key_and_message_changes_about_half_of_the_tag():
 
 
 @pytest.mark.parametrize('size', [0, 15, 17])
-def test_a_key_of_another_length_is_refused(size):
+def test_a_key_of_wrong_length_is_rejected(size):
     with pytest.raises(ValueError, match=f'key must be 16 bytes long: got {size}'):
         siphash(bytes(size), b'')

@@ -1,16 +1,15 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Why the robot does not move, in words: each cause, provoked, and what the user is told.
+"""Reasons for standstill: each cause is provoked, and its text reported.
 
-What the port itself may say is in ``test_radio_port.py`` and reaches the user as it is.
+Errors of the port are in ``test_serial_port.py`` and are reported unchanged.
 """
 
 import math
 
 import pytest
 from support.emulator_bench import RobotBench
-from support.radio_bench import Bench as ScriptedBench
-from support.radio_bench import FakeRobot
+from support.radio_bench import FakeRobot, LinkBench
 
 from t3mpc_ros.nodes.common import diagnostics
 from t3mpc_ros.radio.link import standstill_reasons as reasons
@@ -23,11 +22,11 @@ KEY = bytes(range(16))
 CAUSES = {}
 
 
-def cause(says, **given):
-    """Note a cause: what is told, and how the bench is made on which it is provoked."""
+def cause(reason, **given):
+    """Register a cause: its reported reason, and the arguments of its bench."""
 
     def note(provoke):
-        CAUSES[provoke.__name__] = says, given, provoke
+        CAUSES[provoke.__name__] = reason, given, provoke
         return provoke
 
     return note
@@ -37,18 +36,18 @@ def driving(bench):
     bench.connect()
     bench.drive(3.0, 3.0)
     bench.run(0.5)
-    assert told(bench) == ''
+    assert reported(bench) == ''
 
 
-def told(bench):
-    """Return what diagnostics say, most important first."""
+def reported(bench):
+    """Return the warnings in diagnostics, most important first."""
     state = bench.robot.advance(bench.now_ns)
     well = bench.robot.quality(bench.now_ns)
     return '; '.join([*diagnostics.warnings(state), *([well.text] if well.text else [])])
 
 
 @cause('no command yet')
-def nobody_commands(bench):
+def no_command(bench):
     bench.connect()
     bench.run(0.1)
 
@@ -171,14 +170,14 @@ def the_battery_is_low(bench):
 @cause(SLIP_STOP_REASON, flat={'twin.faults.wheel_blocked': 'left'})
 def a_wheel_is_blocked(bench):
     bench.connect()
-    bench.run(1.5)  # the gyro's bias is measured meanwhile
+    bench.run(1.5)  # calibration of the gyro bias
     bench.drive(4.0, 4.0)
     bench.run(2.0)
 
 
 @cause('the robot has lost its session')
 def the_robot_has_forgotten_the_session(bench):
-    """Said while the robot is greeted anew, until it answers."""
+    """Reported during the new handshake, until the robot answers."""
     driving(bench)
     bench.inject('robot_reset', 0.01)
     bench.run(1.0, lambda: bench.link.state is LinkState.HELLO)
@@ -199,19 +198,19 @@ def driving_with_complaints(bench):
 
 
 @pytest.mark.parametrize('name', CAUSES)
-def test_each_cause_is_told_in_words_that_name_it(name):
-    says, given, provoke = CAUSES[name]
+def test_each_cause_is_reported_with_its_reason(name):
+    reason, given, provoke = CAUSES[name]
     bench = RobotBench(**given)
     provoke(bench)
-    print(f'\n{name}: {told(bench)}')
-    assert says in told(bench)
+    print(f'\n{name}: {reported(bench)}')
+    assert reason in reported(bench)
 
 
-# -- what only a robot or dongle of another make does ---------------------------------------------
+# -- robots and dongles with unusual behaviour ----------------------------------------------------
 
 
-class Odd(FakeRobot):
-    """Says of itself what it is told to."""
+class UnusualRobot(FakeRobot):
+    """Reports configurable status bits and information."""
 
     add, drop, protocol, accepts = StatusFlag(0), StatusFlag(0), 1, True
 
@@ -224,7 +223,7 @@ class Odd(FakeRobot):
 
 
 @pytest.mark.parametrize(
-    'odd, says',
+    'odd, reason',
     [
         ({'add': StatusFlag.TTL_EXPIRED}, reasons.TTL_EXPIRED),
         ({'drop': StatusFlag.ENABLED}, reasons.DRIVES_DISABLED),
@@ -232,18 +231,18 @@ class Odd(FakeRobot):
         ({'accepts': False}, reasons.HELLO_REJECTED),
     ],
 )
-def test_what_an_odd_robot_does_is_told(odd, says):
-    robot = Odd()
+def test_an_unusual_robot_is_reported(odd, reason):
+    robot = UnusualRobot()
     for name, value in odd.items():
         setattr(robot, name, value)
-    bench = ScriptedBench(robot=robot)
+    bench = LinkBench(robot=robot)
     bench.drive(3.0, 3.0)
     bench.run(1.0)
-    assert bench.link.reason(bench.now_ns) == says
+    assert bench.link.reason(bench.now_ns) == reason
 
 
-def test_a_dongle_of_another_protocol_is_named():
-    bench = ScriptedBench()
+def test_a_dongle_with_another_protocol_is_reported():
+    bench = LinkBench()
     reply = bench.dongle.reply
 
     def newer(frame, now_ns):

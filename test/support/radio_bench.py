@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""A scripted dongle and robot in virtual time for tests of the link; faults go by name."""
+"""Scripted dongle and robot in virtual time, with faults by name, for tests of the link."""
 
 import math
 import random
@@ -26,9 +26,9 @@ def signed32(value):
 
 
 class FakeRobot:
-    """The robot's rules, plainly: session, sequence, TTL, emergency stop, parameters.
+    """Simplified rules of the robot: session, sequence, TTL, emergency stop, parameters.
 
-    Wheels reach what is commanded at once; between packets they turn on.
+    Wheels reach the commanded speed at once and keep it between packets.
     """
 
     def __init__(self, key=b''):
@@ -36,13 +36,13 @@ class FakeRobot:
         self.skew = 0.0
         self.boots = 0
         self.refuses = {}
-        self.deaf_to_commands = False
+        self.rejects_commands = False
         self.button = False
         self.boot(0)
 
     def boot(self, now_ns, clock_us=0, steps=(0, 0)):
         self.boots += 1
-        self.gate = CommandVerifier(self.key)
+        self.verifier = CommandVerifier(self.key)
         self.booted_ns, self.clock_us = now_ns, clock_us
         self.steps = [float(steps[0]), float(steps[1])]
         self.parameters = [parameter.default for parameter in BOARD_PARAMETERS]
@@ -68,7 +68,7 @@ class FakeRobot:
 
     @property
     def angles(self):
-        """Right and left, rad since the last start."""
+        """Right and left wheel angle since the last start, rad."""
         return self.steps[1] * STEP, self.steps[0] * STEP
 
     def status(self):
@@ -77,7 +77,7 @@ class FakeRobot:
         bits |= StatusFlag.MOVING if self.speeds != (0.0, 0.0) else StatusFlag(0)
         bits |= StatusFlag.ESTOP if self.estop else StatusFlag(0)
         bits |= StatusFlag.TTL_EXPIRED if self.expired else StatusFlag(0)
-        bits |= StatusFlag.NO_SESSION if not self.gate.session else StatusFlag(0)
+        bits |= StatusFlag.NO_SESSION if not self.verifier.session else StatusFlag(0)
         return bits
 
     def state(self, now_ns):
@@ -88,7 +88,7 @@ class FakeRobot:
         left, right = (signed32(math.floor(steps)) for steps in self.steps)
         ranges = bytes([0, 1, 20, 100, 160, 254, 255, 60])
         return frames.State(
-            self.gate.session,
+            self.verifier.session,
             self.seq,
             self.status(),
             self.time_us(now_ns),
@@ -101,15 +101,15 @@ class FakeRobot:
             ranges,
         )
 
-    def take(self, data, now_ns):
-        """Hear a packet."""
+    def receive(self, data, now_ns):
+        """Process a packet."""
         self.run_to(now_ns)
         frame = decode_downlink(data)
         self.log.append((now_ns, frame))
         self.answer = None
         if isinstance(frame, frames.Hello):
             nonce = self.boots.to_bytes(4, 'little') + self.time_us(now_ns).to_bytes(4, 'little')
-            if not self.gate.begin_session(frame, nonce):
+            if not self.verifier.begin_session(frame, nonce):
                 self.last_seq, self.seq, self.speeds, self.enabled = None, 0, (0.0, 0.0), False
             self.answer = self.info(frame.seq, now_ns)
         elif isinstance(frame, frames.Poll):
@@ -118,11 +118,11 @@ class FakeRobot:
             elif frame.what == frames.AUX:
                 counters = (1, 2, 3, 4, 5)
                 self.answer = frames.Aux(
-                    self.gate.session, 0, self.status(), 11100, 0, 0, 0, 0, *counters, 0, 6, 7
+                    self.verifier.session, 0, self.status(), 11100, 0, 0, 0, 0, *counters, 0, 6, 7
                 )
         elif isinstance(frame, frames.ParamGet):
             self.answer = self.parameter(frame, frames.OK)
-        elif self.gate.verify(frame) == '':
+        elif self.verifier.verify(frame) == '':
             if isinstance(frame, frames.Command):
                 self.follow(frame, now_ns)
             elif isinstance(frame, frames.ParamSet):
@@ -132,11 +132,11 @@ class FakeRobot:
                 rc = frames.BUSY if busy else frames.OK
                 if frame.verb == frames.RESET_ODOMETRY and not busy:
                     self.steps = [0.0, 0.0]
-                self.answer = frames.Ack(self.gate.session, frame.seq, frame.verb, rc)
+                self.answer = frames.Ack(self.verifier.session, frame.seq, frame.verb, rc)
 
     def info(self, seq, now_ns):
         return frames.Info(
-            self.gate.session,
+            self.verifier.session,
             seq,
             1,
             1,
@@ -147,13 +147,15 @@ class FakeRobot:
             16,
             self.time_us(now_ns),
             self.status(),
-            self.gate.nonce,
+            self.verifier.nonce,
         )
 
     def parameter(self, frame, rc):
         row = BOARD_PARAMETERS[frame.id]
         value = self.parameters[frame.id]
-        return frames.Param(self.gate.session, frame.seq, frame.id, rc, value, row.low, row.high)
+        return frames.Param(
+            self.verifier.session, frame.seq, frame.id, rc, value, row.low, row.high
+        )
 
     def set(self, frame):
         rc = self.refuses.get(frame.id, frames.OK)
@@ -165,7 +167,7 @@ class FakeRobot:
         if frame.flags & CommandFlag.ESTOP:
             self.estop, self.enabled, self.speeds = True, False, (0.0, 0.0)
             return
-        if self.deaf_to_commands:
+        if self.rejects_commands:
             return
         if self.last_seq is not None and not 0 < (frame.seq - self.last_seq) % 256 < 128:
             return
@@ -182,7 +184,7 @@ class FakeRobot:
 
 
 class FakeDongle:
-    """Answers each frame after the time it takes; whoever wants a fault calls it by name."""
+    """Answers each frame after its real duration; faults are attributes and methods."""
 
     def __init__(self, robot, seed=1):
         self.robot = robot
@@ -194,22 +196,22 @@ class FakeDongle:
         self.drop_replies = 0
         self.busy = 0
         self.jitter_ns = 0
-        self.asked = []
+        self.requests = []
         self.boot_delay_ns = 0
         self.restart(0)
 
     def restart(self, now_ns):
-        """Start anew: what was set is gone, and the boot loader takes its time."""
+        """Restart: the configuration is lost, and the boot loader runs."""
         self.started_ns = now_ns
         self.ready_ns = now_ns + self.boot_delay_ns
-        self.splitter = FrameDecoder()
+        self.decoder = FrameDecoder()
         self.configured = False
 
     def time_us(self, now_ns):
         return (now_ns - self.started_ns) // 1000 % WRAP
 
-    def hears(self, now_ns):
-        """Whether a packet gets through at the first try."""
+    def is_received(self, now_ns):
+        """Whether a packet is received without retransmission."""
         return (
             self.configured
             and self.chip_ok
@@ -217,12 +219,12 @@ class FakeDongle:
             and self.source.random() >= self.loss
         )
 
-    def take(self, data, now_ns):
+    def receive(self, data, now_ns):
         """Return (time, bytes) of each reply."""
         if now_ns < self.ready_ns:
             return []
         replies = []
-        for frame in self.splitter.feed(data):
+        for frame in self.decoder.feed(data):
             at, reply = self.reply(decode_to_dongle(frame), now_ns + len(data) * 20_000)
             if self.drop_replies:
                 self.drop_replies -= 1
@@ -235,7 +237,7 @@ class FakeDongle:
         if isinstance(frame, frames.Ping):
             chip = int(self.chip_ok)
             clock = self.time_us(now_ns)
-            counts = self.splitter.counts[1:]
+            counts = self.decoder.counts[1:]
             pong = frames.Pong(frame.id, frame.echo, clock, 1, 1, 0, chip, *counts, 0, 2)
             return now_ns + MS, pong
         if isinstance(frame, frames.Configure):
@@ -248,25 +250,25 @@ class FakeDongle:
 
     def transact(self, frame, now_ns):
         clock = self.time_us(now_ns + 4 * MS)
-        self.asked.append((now_ns, decode_downlink(frame.first)))
-        if not self.hears(now_ns):
+        self.requests.append((now_ns, decode_downlink(frame.first)))
+        if not self.is_received(now_ns):
             return now_ns + 3 * MS, frames.Result(frame.id, 0x34, 0x08, clock)
         robot = self.robot
-        robot.take(frame.first, now_ns + 445_000)
+        robot.receive(frame.first, now_ns + 445_000)
         first, second = 0x03, 0x03
-        # The first packet fetches what was measured at some time before.
+        # The first packet fetches an older STATE.
         payload = encode(robot.state(now_ns + 445_000))
         if self.source.random() >= self.loss:
             answer = robot.answer or robot.state(now_ns + 1_245_000)
             payload = encode(answer)
-            robot.take(frame.second, now_ns + 2 * MS)
+            robot.receive(frame.second, now_ns + 2 * MS)
         else:
             second = 0x34
         return now_ns + 3 * MS, frames.Result(frame.id, first, second, clock, payload)
 
 
-class Bench:
-    """Runs a link against a port in virtual time."""
+class LinkBench:
+    """Runs a link against a scripted port in virtual time."""
 
     def __init__(self, parameters=None, key=b'', robot=None, seed=1, robot_key=None):
         entropy = random.Random(seed)
@@ -287,17 +289,17 @@ class Bench:
         self.before_each = None
 
     def unplug(self):
-        """Pull the dongle out: the next use of the port fails."""
+        """Unplug the dongle: the next use of the port fails."""
         self.plugged = False
         self.replies.clear()
 
     def plug(self):
-        """Plug it in again; it starts anew."""
+        """Plug the dongle in; it restarts."""
         self.plugged = True
         self.dongle.restart(self.now_ns)
 
     def run(self, seconds, until=None):
-        """Let time pass; return how long it took until ``until`` held."""
+        """Advance time; return the duration until ``until`` holds, s."""
         start, end = self.now_ns, self.now_ns + round(seconds * 1e9)
         while self.now_ns < end:
             self._command()
@@ -320,11 +322,11 @@ class Bench:
         return (self.now_ns - start) / 1e9
 
     def drive(self, right, left):
-        """Command these wheel speeds fifty times a second from now on."""
+        """Command these wheel speeds fifty times a second."""
         self.wheels = WheelSpeeds(right, left)
 
     def release_controls(self):
-        """Command nothing any more."""
+        """Stop sending commands."""
         self.wheels = None
 
     def _command(self):
@@ -332,13 +334,13 @@ class Bench:
             self.commanded_ns = self.now_ns
             self.link.command(RobotCommand(self.wheels, self.now_ns), self.now_ns)
 
-    def _do(self, deeds):
-        assert isinstance(deeds[-1], Wait)
-        assert sum(isinstance(deed, Wait) for deed in deeds) == 1
-        assert deeds[-1].until_ns >= self.now_ns
-        self.wake_ns = deeds[-1].until_ns
-        for deed in deeds:
-            if isinstance(deed, Open):
+    def _do(self, actions):
+        assert isinstance(actions[-1], Wait)
+        assert sum(isinstance(action, Wait) for action in actions) == 1
+        assert actions[-1].until_ns >= self.now_ns
+        self.wake_ns = actions[-1].until_ns
+        for action in actions:
+            if isinstance(action, Open):
                 self.opens.append(self.now_ns)
                 self.wake_ns = self.now_ns
                 if self.plugged and self.problem[1]:
@@ -347,15 +349,15 @@ class Bench:
                     self.link.port_opened(self.now_ns)
                 else:
                     self.link.port_failed(*self.problem, self.now_ns)
-            elif isinstance(deed, Close):
+            elif isinstance(action, Close):
                 self.closes += 1
                 self.is_open = False
-            elif isinstance(deed, Write) and self.is_open and self.plugged:
-                self.replies += self.dongle.take(deed.data, self.now_ns)
+            elif isinstance(action, Write) and self.is_open and self.plugged:
+                self.replies += self.dongle.receive(action.data, self.now_ns)
                 self.replies.sort()
         if not self.link_states or self.link_states[-1] is not self.link.state:
             self.link_states.append(self.link.state)
 
     def connect(self):
-        """Run until the link runs."""
+        """Advance until the link is running; return the duration, s."""
         return self.run(10.0, lambda: self.link.state is LinkState.RUN)

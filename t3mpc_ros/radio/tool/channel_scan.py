@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+from t3mpc_ros.radio.link import standstill_reasons as reasons
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import decode_exchange_status, encode
@@ -21,94 +22,89 @@ from t3mpc_ros.radio.tool.procedure import (
 
 CHANNELS = 126
 _MIN_PACKETS = 2
-"""Of a channel, each with the retransmissions of the radio."""
+"""Packets per channel, each with the retransmissions of the radio."""
 _PACKETS = 20
-"""More of one that answers."""
+"""Packets on a channel that answers."""
 _REPLY_TIMEOUT = 0.25
 """s; fifteen retransmissions at 250 kbit/s take 60 ms"""
 
 Progress = Callable[[int, int, str], None]
-"""Told how many of how many channels are done, and what was found last."""
+"""Receives the number of tested channels, the total, and the text of a new result."""
 
 
 class ChannelResult(NamedTuple):
-    """Where the robot answered."""
+    """Channel and rate on which the robot answered."""
 
     channel: int
     rate: str
     answered: int
-    """Of ``asked`` packets."""
-    asked: int
+    packets: int
     retransmissions: float
-    """Per packet that was answered."""
+    """Mean per answered packet."""
 
 
 def scan_channels(
     parameters: LinkParameters, rates: Sequence[str], progress: Progress
 ) -> Script[list[ChannelResult]]:
-    """Return where the robot answers; the radio of the dongle is then set as it was."""
+    """Return where the robot answers; restore the radio configuration of the dongle."""
     yield from wait_for_dongle()
     before = yield from read_radio_setup()
-    found: list[ChannelResult] = []
+    results: list[ChannelResult] = []
     try:
         total = CHANNELS * len(rates)
         for number in range(total):
             rate, channel = rates[number // CHANNELS], number % CHANNELS
-            place = yield from _test_channel(replace(parameters, channel=channel, rate=rate))
-            if place is not None:
-                found.append(place)
-            progress(number + 1, total, '' if place is None else format_channel(place))
+            result = yield from _test_channel(replace(parameters, channel=channel, rate=rate))
+            if result is not None:
+                results.append(result)
+            progress(number + 1, total, '' if result is None else format_channel(result))
     finally:
         yield from configure_radio(before)
-    return found
+    return results
 
 
 def _test_channel(parameters: LinkParameters) -> Script[ChannelResult | None]:
     yield from configure_radio(parameters.configure(0))
-    asked = answered = again = 0
-    while asked < (_MIN_PACKETS if not answered else _PACKETS):
-        heard = yield Request(Transmit(0, 0, encode(Poll(0, 0, frames.STATE))), _REPLY_TIMEOUT)
-        if not isinstance(heard.reply, Result):
-            raise ProcedureError('the dongle has fallen silent: was it restarted?')
-        one = decode_exchange_status(heard.reply.first)
-        asked += 1
-        answered += one.acknowledged
-        again += one.retransmissions if one.acknowledged else 0
+    packets = answered = retransmissions = 0
+    while packets < (_MIN_PACKETS if not answered else _PACKETS):
+        response = yield Request(Transmit(0, 0, encode(Poll(0, 0, frames.STATE))), _REPLY_TIMEOUT)
+        if not isinstance(response.reply, Result):
+            raise ProcedureError(reasons.DONGLE_TIMEOUT)
+        status = decode_exchange_status(response.reply.first)
+        packets += 1
+        answered += status.acknowledged
+        retransmissions += status.retransmissions if status.acknowledged else 0
     if not answered:
         return None
-    return ChannelResult(parameters.channel, parameters.rate, answered, asked, again / answered)
+    mean = retransmissions / answered
+    return ChannelResult(parameters.channel, parameters.rate, answered, packets, mean)
 
 
-def format_channel(place: ChannelResult) -> str:
-    """Return a place in words."""
+def format_channel(result: ChannelResult) -> str:
+    """Return the result of a channel as text."""
     return (
-        f'channel {place.channel} at {place.rate}: {place.answered} of {place.asked} packets '
-        f'answered, {place.retransmissions:.1f} tries more each'
+        f'channel {result.channel} at {result.rate}: {result.answered} of {result.packets} '
+        f'packets answered, {result.retransmissions:.1f} retransmissions each'
     )
 
 
-def recommend(found: Sequence[ChannelResult], parameters: LinkParameters) -> tuple[bool, str]:
-    """Return whether the robot is where the settings look for it, and what to do."""
-    if not found:
+def recommend(results: Sequence[ChannelResult], parameters: LinkParameters) -> tuple[bool, str]:
+    """Return whether the robot answers on the configured channel, and a recommendation."""
+    if not results:
         return False, (
-            'the robot answers nowhere. Try: is it on, does its radio have 3.3 V with 10 uF next '
-            'to it, is the address the same at both ends, another --set rate=…; the dongle less '
-            'than 1 m away but more than 0.2 m; an antenna that is not touched'
+            'the robot answers on no channel. Check: robot switched on; 3.3 V and 10 uF at its '
+            'radio; same address at both ends; another --set rate=…; distance 0.2 to 1 m; '
+            'antenna free'
         )
-    here = [
-        place for place in found if (place.channel, place.rate) == _configured_channel(parameters)
-    ]
-    if not here:
-        best = max(found, key=lambda place: place.answered / place.asked)
+    expected = parameters.channel, parameters.rate
+    configured = [result for result in results if (result.channel, result.rate) == expected]
+    if not configured:
+        best = max(results, key=lambda result: result.answered / result.packets)
         return False, (
-            f'the robot is on another channel or rate than the settings say: set link.channel to '
+            'the robot is on another channel or rate than configured: set link.channel to '
             f"{best.channel} and link.rate to '{best.rate}', or build its firmware for "
             f'{parameters.channel} at {parameters.rate}'
         )
-    if here[0].answered < here[0].asked:
-        return True, 'the robot is where it is looked for; t3mpc robot ping says how well it hears'
-    return True, 'the robot is where it is looked for'
-
-
-def _configured_channel(parameters: LinkParameters) -> tuple[int, str]:
-    return parameters.channel, parameters.rate
+    if configured[0].answered < configured[0].packets:
+        return True, 'the robot answers as configured; t3mpc robot ping measures the link quality'
+    return True, 'the robot answers as configured'

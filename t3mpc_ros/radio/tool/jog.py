@@ -15,52 +15,53 @@ from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, RobotCommand, WheelAngl
 
 LEFT, RIGHT = 'left', 'right'
 _CONNECT_TIMEOUT = 15.0
-"""s for a dongle that starts, and a robot that is asked who it is."""
+"""Timeout for the start of the dongle and the handshake, s."""
 _PERIOD_NS = NANOSECONDS // 50
 _REPORT_DELAY_NS = NANOSECONDS
+"""A reason that lasts this long is reported."""
 _ACCELERATION = 8.0
-"""rad/s² up and down: nothing jumps off the bench."""
+"""rad/s², both ways."""
 _FINAL_SPEED = 0.2
-"""rad/s at which the end is met: 0.3 degrees in the time of a cycle."""
+"""Speed at the target, rad/s: 0.3 degrees per cycle."""
 _APPROACH_GAIN = 3.0
-"""1/s by which the speed goes with what is left."""
+"""Speed per remaining angle, 1/s."""
 _NOT_FOLLOWING_TIMEOUT = 1.0
-"""s for which the robot may not follow before it is given up."""
+"""Time without following after which the jog fails, s."""
 _TIME_MARGIN = 15.0
-"""s that speeding up and creeping may take, and more."""
+"""Additional time for acceleration and approach, s."""
 _SETTLING_TIME = 0.3
-"""s for which it must have stood before the steps count."""
+"""Standstill before the final count, s."""
 
 
 class JogResult(NamedTuple):
-    """What the board has counted; microsteps, forward is positive."""
+    """Microsteps counted by the board, forward positive."""
 
-    wanted: int
+    target: int
     counted: int
     other: int
-    """Of the wheel that was to stand still."""
+    """Of the other wheel, expected to be 0."""
     seconds: float
 
 
 class Jog:
-    """Drives the link like a bridge does: greets, commands, stops, takes the drives out.
+    """Turns one wheel over the link: handshake, commands, stop, drives disabled.
 
     Parameters
     ----------
-    settings
-        Of the link; its ramps are made gentle.
+    parameters
+        Parameters of the link; acceleration and deceleration are replaced by 8 rad/s².
     key
-        Of the robot; empty for an open link.
+        Key of the robot; empty for an open link.
     entropy
-        For session numbers and nonces.
+        Source of session numbers and nonces.
     wheel
         LEFT or RIGHT.
     revolutions
-        Below 0: backward.
+        Negative: backward.
     speed
-        rad/s of the wheel, above 0.
-    say
-        Told what is waited for, whenever that changes.
+        Maximum wheel speed, rad/s, positive.
+    report
+        Receives the reason for waiting when it changes.
     """
 
     def __init__(
@@ -71,7 +72,7 @@ class Jog:
         wheel: str,
         revolutions: float,
         speed: float,
-        say: Callable[[str], None],
+        report: Callable[[str], None],
     ) -> None:
         if wheel not in (LEFT, RIGHT):
             raise ValueError(f'wheel must be {LEFT} or {RIGHT}: got {wheel}')
@@ -80,108 +81,108 @@ class Jog:
         self._right = wheel == RIGHT
         self._angle = math.tau * revolutions
         self._speed = speed
-        self._say = say
-        self._said = self._reason = ''
+        self._report = report
+        self._reported = self._reason = ''
         self._reason_ns = 0
         self._start: WheelAngles | None = None
-        self._start_ns = self._begun_ns = 0
+        self._start_ns = self._begin_ns = 0
         self._next_ns = 0
-        self._followed_ns: int | None = None
-        self._stands_ns: int | None = None
-        self._patience = abs(self._angle) / speed + _TIME_MARGIN
+        self._following_ns: int | None = None
+        self._standstill_ns: int | None = None
+        self._timeout = abs(self._angle) / speed + _TIME_MARGIN
         self._seconds = 0.0
-        self._arrived = False
+        self._finished = False
         self.error = ''
-        """Why it was not done; empty if it was."""
+        """Reason of a failure; empty on success."""
         self.result: JogResult | None = None
-        """What the board has counted, as far as it went."""
+        """Counts of the board so far."""
 
     @property
     def done(self) -> bool:
-        """Whether the robot stands, its drives are out, and the port is closed."""
+        """Whether the drives are disabled and the port is closed."""
         return self.link.state is LinkState.DONE
 
     def port_opened(self, now_ns: int) -> None:
-        """Take notice that the port is open."""
+        """Report that the port is open."""
         self.link.port_opened(now_ns)
 
     def port_failed(self, text: str, absent: bool, now_ns: int) -> None:
-        """Give up: the robot stops by itself within its time to live."""
-        self._give_up(text)
+        """Fail with ``text``; the robot stops by itself within the TTL."""
+        self._fail(text)
         self.link.port_failed(text, absent, now_ns)
 
     def interrupt(self, now_ns: int) -> None:
-        """Bring the wheel to rest, take the drives out, and leave."""
-        self._give_up('interrupted')
+        """Stop the wheel, disable the drives, and end."""
+        self._fail('interrupted')
 
     def step(self, now_ns: int, received: bytes = b'') -> list[PortAction]:
-        """Return what to do with the port now."""
-        if not self._begun_ns:
-            self._begun_ns = now_ns
-        deeds = self.link.step(now_ns, received)
-        if not self.error and not self._arrived:
-            self._conduct(now_ns)
+        """Return the actions to execute now; the last one is the time of the next call."""
+        if not self._begin_ns:
+            self._begin_ns = now_ns
+        actions = self.link.step(now_ns, received)
+        if not self.error and not self._finished:
+            self._advance(now_ns)
         elif self.link.telemetry is not None:
             self._count(self.link.telemetry.angles)
-        last = deeds[-1]
+        last = actions[-1]
         if isinstance(last, Wait):
-            deeds[-1] = Wait(min(last.until_ns, now_ns + _PERIOD_NS))
-        return deeds
+            actions[-1] = Wait(min(last.until_ns, now_ns + _PERIOD_NS))
+        return actions
 
-    def _conduct(self, now_ns: int) -> None:
-        """Order the next bit of the way."""
+    def _advance(self, now_ns: int) -> None:
+        """Advance the jog by one step."""
         link, telemetry = self.link, self.link.telemetry
         reason = link.reason(now_ns)
         if link.state is not LinkState.RUN or telemetry is None:
-            self._tell(reason, now_ns)
+            self._report_reason(reason, now_ns)
             if self._start is not None:
-                self._give_up(reason or 'the link was lost')
-            elif now_ns - self._begun_ns > _CONNECT_TIMEOUT * NANOSECONDS:
-                self._give_up(reason)
+                self._fail(reason or 'the link was lost')
+            elif now_ns - self._begin_ns > _CONNECT_TIMEOUT * NANOSECONDS:
+                self._fail(reason)
             return
         if self._start is None:
             if telemetry.status.moving:
                 return
             self._start, self._start_ns = telemetry.angles, now_ns
-            self._followed_ns = now_ns
-        left = self._angle - self._gone(telemetry.angles)
-        passed = (now_ns - self._start_ns) / NANOSECONDS
-        self._seconds = passed
+            self._following_ns = now_ns
+        remaining = self._angle - self._travelled(telemetry.angles)
+        elapsed = (now_ns - self._start_ns) / NANOSECONDS
+        self._seconds = elapsed
         self._count(telemetry.angles)
-        if left * math.copysign(1.0, self._angle) <= _FINAL_SPEED / 100.0:
+        if remaining * math.copysign(1.0, self._angle) <= _FINAL_SPEED / 100.0:
             self._finish(telemetry.status.moving, now_ns)
             return
         if not telemetry.status.estop and telemetry.status.enabled:
-            self._followed_ns = now_ns
-        elif now_ns - (self._followed_ns or now_ns) > _NOT_FOLLOWING_TIMEOUT * NANOSECONDS:
-            self._give_up(reason or 'the robot does not follow')
+            self._following_ns = now_ns
+        elif now_ns - (self._following_ns or now_ns) > _NOT_FOLLOWING_TIMEOUT * NANOSECONDS:
+            self._fail(reason or 'the robot does not follow')
             return
-        if passed > self._patience:
-            self._give_up('the wheel does not come as far as it should: are its steps counted?')
+        if elapsed > self._timeout:
+            self._fail('the wheel does not reach its target: does the board count its steps?')
             return
-        self._order(left, now_ns)
+        self._command(remaining, now_ns)
 
-    def _order(self, left: float, now_ns: int) -> None:
+    def _command(self, remaining: float, now_ns: int) -> None:
         if now_ns < self._next_ns:
             return
         self._next_ns = now_ns + _PERIOD_NS
-        size = min(self._speed, max(_FINAL_SPEED, _APPROACH_GAIN * abs(left)))
+        size = min(self._speed, max(_FINAL_SPEED, _APPROACH_GAIN * abs(remaining)))
         speed = math.copysign(size, self._angle)
         wheels = WheelSpeeds(speed, 0.0) if self._right else WheelSpeeds(0.0, speed)
         self.link.command(RobotCommand(wheels, now_ns), now_ns)
 
     def _finish(self, moving: bool, now_ns: int) -> None:
-        """Wait until the wheel stands, then leave."""
+        """Wait for standstill, then shut the link down."""
         if now_ns >= self._next_ns:
             self._next_ns = now_ns + _PERIOD_NS
             self.link.command(RobotCommand(ZERO_WHEEL_SPEEDS, now_ns), now_ns)
-        if moving or self._stands_ns is None:
-            self._stands_ns = now_ns
-        elif now_ns - self._stands_ns > _SETTLING_TIME * NANOSECONDS:
-            self._arrived = True
+        if moving or self._standstill_ns is None:
+            self._standstill_ns = now_ns
+        elif now_ns - self._standstill_ns > _SETTLING_TIME * NANOSECONDS:
+            self._finished = True
             self.link.shut_down()
 
-    def _gone(self, angles: WheelAngles) -> float:
+    def _travelled(self, angles: WheelAngles) -> float:
         start = self._start or angles
         return angles.right - start.right if self._right else angles.left - start.left
 
@@ -190,42 +191,41 @@ class Jog:
         if info is None or start is None:
             return
         steps = info.steps_per_rev * info.microsteps
-        gone = self._gone(angles)
+        travelled = self._travelled(angles)
         other = angles.left - start.left if self._right else angles.right - start.right
-        wanted, counted, idle = (
-            round(way * steps / math.tau) for way in (self._angle, gone, other)
+        target, counted, idle = (
+            round(way * steps / math.tau) for way in (self._angle, travelled, other)
         )
-        self.result = JogResult(wanted, counted, idle, self._seconds)
+        self.result = JogResult(target, counted, idle, self._seconds)
 
-    def _tell(self, reason: str, now_ns: int) -> None:
-        """Say what is waited for, if that takes longer than a blink."""
+    def _report_reason(self, reason: str, now_ns: int) -> None:
+        """Report the reason for waiting once it has lasted a second."""
         if reason != self._reason:
             self._reason, self._reason_ns = reason, now_ns
-        elif reason and reason != self._said and now_ns - self._reason_ns >= _REPORT_DELAY_NS:
-            self._said = reason
-            self._say(reason)
+        elif reason and reason != self._reported and now_ns - self._reason_ns >= _REPORT_DELAY_NS:
+            self._reported = reason
+            self._report(reason)
 
-    def _give_up(self, why: str) -> None:
-        self.error = self.error or why
+    def _fail(self, reason: str) -> None:
+        self.error = self.error or reason
         self.link.shut_down()
 
 
-def format_result(turned: JogResult, wheel: str, revolutions: float) -> str:
-    """Return in words what was counted, and what a person must have seen."""
+def format_result(result: JogResult, wheel: str, revolutions: float) -> str:
+    """Return the result as text, with the expected motion and remedies."""
     way, top = ('forward', 'front') if revolutions > 0 else ('backward', 'back')
     other = RIGHT if wheel == LEFT else LEFT
     invert = f'robot.invert_{wheel}'
     return '\n'.join(
         (
-            f'{wheel}: {turned.counted} microsteps counted, {turned.wanted} wanted; '
-            f'{other}: {turned.other}; {turned.seconds:.1f} s',
-            f'You must have seen the {wheel} wheel make {abs(revolutions):g} turns {way} (its top '
-            f'moved to the {top}), and the {other} one stand still.',
-            '  the other wheel turned: exchange the cables of both drivers',
-            f'  it turned the other way: set link.{invert} of the bridge (--set {invert}=true '
-            'here), or turn one coil of the motor round',
-            '  more or fewer turns: the microsteps of the driver are not those of the board '
-            '(t3mpc robot parameters)',
-            '  it hummed, or turns were missing: more current, or a lower --speed',
+            f'{wheel}: {result.counted} microsteps counted, target {result.target}; '
+            f'{other}: {result.other}; {result.seconds:.1f} s',
+            f'Expected: {abs(revolutions):g} turns {way} of the {wheel} wheel (its top moves to '
+            f'the {top}), standstill of the {other} wheel. Otherwise:',
+            '  the other wheel turned: swap the cables of the two drivers',
+            f'  reverse direction: set link.{invert} of the bridge (--set {invert}=true here), or '
+            'swap the wires of one motor coil',
+            '  more or fewer turns: microsteps of driver and board (t3mpc robot parameters)',
+            '  humming or lost steps: more motor current, or a lower --speed',
         )
     )

@@ -18,106 +18,107 @@ from t3mpc_ros.radio.tool.procedure import (
     wait_for_board,
 )
 
-NO_BOARD = "nothing on the port answers like the robot's board: is it the robot's own USB?"
+NO_BOARD = 'no robot board answers on this port: is it the USB port of the robot?'
 WRONG_BOARD = (
-    "this is the dongle: a key is written over the USB of the robot's own board; "
-    'ls -l /dev/serial/by-id names both'
+    'this is the dongle: a key is written over the USB port of the robot board; '
+    'ls -l /dev/serial/by-id lists both'
 )
 ERASE_KEY = bytes(KEY_SIZE)
+"""Key value that erases the stored key."""
 _REPLY_TIMEOUT = 0.3
 _WRITE_TIMEOUT = 1.0
-"""s; 25 cells of 3.4 ms, and a board that is busy with its radio"""
+"""s; 25 EEPROM cells of 3.4 ms, and the load of the radio"""
 _MAX_ATTEMPTS = 5
 
 
 def create_key_file(path: Path, entropy: Callable[[int], bytes]) -> int:
-    """Return the check value of a key that was drawn into a new file, mode 600.
+    """Generate a key into a new file with mode 600; return its check value.
 
     Raises
     ------
     KeyFileError
-        There is such a file already, or it cannot be made.
+        The file exists or cannot be created.
     """
     key = ERASE_KEY
-    while key == ERASE_KEY:  # which means something else
+    while key == ERASE_KEY:  # reserved
         key = entropy(KEY_SIZE)
     try:
-        # Never through a link or over a file, and closed to others from the first moment on.
+        # O_EXCL follows no link and overwrites no file; the mode protects it from the start.
         handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     except FileExistsError:
         raise KeyFileError(
-            f'{path} is there already: a key is never overwritten; choose another name'
+            f'{path} exists: a key is never overwritten; choose another name'
         ) from None
     except OSError as error:
-        raise KeyFileError(f'{path} cannot be made: {error.strerror}') from error
+        raise KeyFileError(f'{path} cannot be created: {error.strerror}') from error
     with os.fdopen(handle, 'w') as target:
         target.write(key.hex() + '\n')
     return key_check(key)
 
 
 def read_key_state() -> Script[KeyState]:
-    """Return what the robot says of its key."""
+    """Return the state of the key in the robot."""
     yield from wait_for_board(NO_BOARD)
     return (yield from _request_key_state())
 
 
 def write_key(key: bytes) -> Script[KeyState]:
-    """Let the robot keep a key, or forget the one it has (:data:`FORGET`); return what it says.
+    """Store a key in the robot, or erase it (:data:`ERASE_KEY`); return the resulting state.
 
-    An answer that is lost costs nothing: what counts is what the robot then has.
+    A lost answer is harmless: the state of the key is read back.
     """
     yield from wait_for_board(NO_BOARD)
-    yield from _request_key_state()  # a dongle says here that it is one: it never hears the key
+    yield from _request_key_state()  # rejects a dongle, before the key is sent
     for _ in range(_MAX_ATTEMPTS):
-        heard = yield Request(Key(0, key), _WRITE_TIMEOUT)
-        reply = heard.reply
-        told = reply if isinstance(reply, KeyState) else (yield from _request_key_state())
-        if told.rc == frames.BUSY:
+        response = yield Request(Key(0, key), _WRITE_TIMEOUT)
+        reply = response.reply
+        key_state = reply if isinstance(reply, KeyState) else (yield from _request_key_state())
+        if key_state.rc == frames.BUSY:
             raise ProcedureError(
-                'the robot takes no key while it moves or its drivers have power: stop the '
-                'bridge, or press the reset button of the board'
+                'the robot stores no key while it moves or its drivers are on: stop the bridge, '
+                'or press the reset button of the board'
             )
-        if told.rc == frames.FAILED:
+        if key_state.rc == frames.FAILED:
             raise ProcedureError(
-                'the memory of the board does not hold the key: the robot is locked now; try '
-                'again, and if that does not help, the chip is worn out'
+                'the EEPROM of the board did not store the key: the robot is locked; try again; '
+                'if it fails repeatedly, the chip is worn out'
             )
-        if holds_key(told, key):
-            return told
-    raise ProcedureError('the robot does not say that it has the key: is the cable sound?')
+        if holds_key(key_state, key):
+            return key_state
+    raise ProcedureError('the robot does not confirm the key: is the cable good?')
 
 
-def holds_key(told: KeyState, key: bytes) -> bool:
-    """Return whether the robot has this key, or none if it is :data:`FORGET`."""
+def holds_key(key_state: KeyState, key: bytes) -> bool:
+    """Return whether the robot has this key; for :data:`ERASE_KEY`, whether it has none."""
     if key == ERASE_KEY:
-        return told.state == frames.NO_KEY
-    return (told.state, told.check) == (frames.KEY_HELD, key_check(key))
+        return key_state.state == frames.NO_KEY
+    return (key_state.state, key_state.check) == (frames.KEY_HELD, key_check(key))
 
 
-def format_key_state(told: KeyState) -> str:
-    """Return in words what the robot has."""
-    if told.state == frames.KEY_HELD:
-        return f'the robot has a key, check value {told.check:08x}'
-    if told.state == frames.KEY_DAMAGED:
+def format_key_state(key_state: KeyState) -> str:
+    """Return the state of the key as text."""
+    if key_state.state == frames.KEY_HELD:
+        return f'the robot has a key, check value {key_state.check:08x}'
+    if key_state.state == frames.KEY_DAMAGED:
         return (
-            'the key of the robot is damaged: it can be stopped, but nobody moves it until '
-            't3mpc robot key write (or key forget) puts that right'
+            'the key of the robot is damaged: the robot accepts only an emergency stop until '
+            't3mpc robot key write (or key erase) replaces the key'
         )
-    return 'the robot has no key: anybody with such a radio can drive it'
+    return 'the robot has no key: any nRF24 radio can drive it'
 
 
 def _request_key_state() -> Script[KeyState]:
     for _ in range(_MAX_ATTEMPTS):
-        heard = yield Request(Key(0), _REPLY_TIMEOUT)
-        if isinstance(heard.reply, KeyState):
-            return heard.reply
-        if isinstance(heard.reply, Refusal):
-            _raise_refusal(heard.reply)
-    raise ProcedureError('the board has fallen silent: was it restarted, is the cable sound?')
+        response = yield Request(Key(0), _REPLY_TIMEOUT)
+        if isinstance(response.reply, KeyState):
+            return response.reply
+        if isinstance(response.reply, Refusal):
+            _raise_refusal(response.reply)
+    raise ProcedureError('the board stopped answering: did it restart, is the cable good?')
 
 
 def _raise_refusal(refusal: ReplyFrame) -> NoReturn:
     unknown = isinstance(refusal, Refusal) and refusal.code == 1
     raise ProcedureError(
-        WRONG_BOARD if unknown else 'the board does not understand: is its firmware old?'
+        WRONG_BOARD if unknown else 'the board does not support keys: is its firmware old?'
     )

@@ -32,124 +32,125 @@ from t3mpc_ros.radio.tool.procedure import (
 )
 
 _REPLY_TIMEOUT = 0.25
+"""s"""
 GOOD, POOR, BAD = 'good', 'poor', 'BAD'
 _MAX_USB_ROUND_TRIP = 5e-3
-"""s; on the line a PING and its answer take 0.7 ms"""
+"""s; PING and PONG take 0.7 ms on the line"""
 _MAX_MEAN_RETRIES = 0.5
-"""Tries more per packet: the radio still gets through, with nothing to spare."""
+"""Mean retransmissions per packet above which the radio has no margin."""
 
 
 class LinkTestResult(NamedTuple):
-    """What was seen."""
+    """Measurements of the link test."""
 
-    asked: int
-    """PINGs, and cycles."""
+    requests: int
+    """Number of PINGs, and of radio cycles."""
     pings: tuple[float, ...]
-    """Round trips, s, of those that were answered."""
+    """Round trips of the answered PINGs, s."""
     cycles: tuple[float, ...]
+    """Round trips of the answered cycles, s."""
     retransmissions: tuple[int, ...]
-    """How many packets that were answered needed 0, 1, … 15 tries more."""
+    """Number of acknowledged packets with 0, 1, … 15 retransmissions."""
     line_errors: int
-    """Frames from the host that reached the dongle damaged, meanwhile."""
+    """Frames that reached the dongle damaged during the test."""
     state: State | None
-    """What the robot said last."""
+    """Last STATE of the robot."""
 
 
 class ReportRow(NamedTuple):
-    """A line of the report."""
+    """Row of the report."""
 
     name: str
-    seen: str
+    value: str
     verdict: str
     remedy: str = ''
 
 
 def run_link_test(parameters: LinkParameters, count: int) -> Script[LinkTestResult]:
-    """Ask ``count`` times over USB and by radio; the radio of the dongle is then as it was."""
+    """Send ``count`` requests over USB and by radio; restore the radio configuration."""
     first = yield from wait_for_dongle()
     pings = []
     last = first
     for _ in range(count):
-        heard = yield Request(Ping(0, b'ping'), _REPLY_TIMEOUT)
-        if isinstance(heard.reply, Pong):
-            pings.append(heard.round_trip)
-            last = heard.reply
+        response = yield Request(Ping(0, b'ping'), _REPLY_TIMEOUT)
+        if isinstance(response.reply, Pong):
+            pings.append(response.round_trip)
+            last = response.reply
     before = yield from read_radio_setup()
     cycles: list[float] = []
-    tries = [0] * RETRY_COUNTS
+    retries = [0] * RETRY_COUNTS
     state = None
     try:
         yield from configure_radio(parameters.configure(0))
         poll = encode(Poll(0, 0, frames.STATE))
         for _ in range(count):
-            heard = yield Request(Transmit(0, parameters.gap, poll, poll), _REPLY_TIMEOUT)
-            told = _read_state(heard.reply, tries)
-            if told is not None:
-                state = told
-                cycles.append(heard.round_trip)
-            spent = (heard.returned_ns - heard.sent_ns) / NANOSECONDS
-            yield Pause(max(1.0 / parameters.cycle_rate - spent, 0.0))
+            response = yield Request(Transmit(0, parameters.gap, poll, poll), _REPLY_TIMEOUT)
+            fetched = _read_state(response.reply, retries)
+            if fetched is not None:
+                state = fetched
+                cycles.append(response.round_trip)
+            elapsed = (response.returned_ns - response.sent_ns) / NANOSECONDS
+            yield Pause(max(1.0 / parameters.cycle_rate - elapsed, 0.0))
     finally:
         yield from configure_radio(before)
     errors = _line_errors(last) - _line_errors(first) & 0xFFFF
-    return LinkTestResult(count, tuple(pings), tuple(cycles), tuple(tries), errors, state)
+    return LinkTestResult(count, tuple(pings), tuple(cycles), tuple(retries), errors, state)
 
 
-def _read_state(reply: object, tries: list[int]) -> State | None:
-    """Count the exchanges of a cycle; return the state that one of them fetched.
+def _read_state(reply: object, retries: list[int]) -> State | None:
+    """Count the retransmissions of a cycle; return its STATE.
 
-    Where the first packet needed several tries, the later ones may have fetched the new state, and
-    nothing is left for the second.
+    A retransmission of the first packet may fetch the new STATE; the second then returns none.
     """
     if not isinstance(reply, Result):
         return None
-    for one in (decode_exchange_status(reply.first), decode_exchange_status(reply.second)):
-        if one.acknowledged:
-            tries[one.retransmissions] += 1
+    for status in (decode_exchange_status(reply.first), decode_exchange_status(reply.second)):
+        if status.acknowledged:
+            retries[status.retransmissions] += 1
     try:
-        told = decode_uplink(reply.payload)
+        payload = decode_uplink(reply.payload)
     except FrameError:
         return None
-    return told if isinstance(told, State) else None
+    return payload if isinstance(payload, State) else None
 
 
 def _line_errors(pong: Pong) -> int:
     return pong.crc_errors + pong.frame_errors + pong.overruns
 
 
-# -- in words -------------------------------------------------------------------------------------
+# -- report ---------------------------------------------------------------------------------------
 
 
-def evaluate(seen: LinkTestResult, parameters: LinkParameters) -> list[ReportRow]:
-    """Return the report: each figure with a verdict, and what to try if it is not good."""
+def evaluate(result: LinkTestResult, parameters: LinkParameters) -> list[ReportRow]:
+    """Return the report: each measurement with a verdict and a remedy."""
     rows = [
-        _evaluate_usb(seen),
+        _evaluate_usb(result),
         ReportRow(
             'frames damaged on the cable',
-            str(seen.line_errors),
-            GOOD if not seen.line_errors else POOR,
+            str(result.line_errors),
+            GOOD if not result.line_errors else POOR,
             'another cable, another USB port, no hub',
         ),
-        _evaluate_losses(seen, parameters),
+        _evaluate_losses(result, parameters),
     ]
-    if seen.cycles:
-        rows += [_evaluate_retries(seen), _evaluate_round_trips(seen, parameters)]
-    if seen.state is not None:
-        rows.append(_evaluate_robot(seen.state))
+    if result.cycles:
+        rows += [_evaluate_retries(result), _evaluate_round_trips(result, parameters)]
+    if result.state is not None:
+        rows.append(_evaluate_robot(result.state))
     return rows
 
 
 def is_usable(rows: list[ReportRow]) -> bool:
-    """Return whether the robot can be driven over this link."""
+    """Return whether the link is good enough to drive the robot."""
     return all(row.verdict != BAD for row in rows)
 
 
 def format_report(rows: list[ReportRow]) -> str:
     """Return the report as text."""
-    name, seen = (max(len(row[column]) for row in rows) for column in (0, 1))
+    name, width = (max(len(row[column]) for row in rows) for column in (0, 1))
     lines = []
     for row in rows:
-        lines.append(f'{row.name:<{name}}  {row.seen:<{seen}}  {row.verdict}')
+        lines.append(f'{row.name:<{name}}  {row.value:<{width}}  {row.verdict}')
         if row.verdict != GOOD:
             lines.append(f'  try: {row.remedy}')
     return '\n'.join(lines)
@@ -162,54 +163,59 @@ def _format_trips(trips: tuple[float, ...]) -> str:
     return f', {median:.1f} ms (median), {slow:.1f} ms (99 of 100)'
 
 
-def _evaluate_usb(seen: LinkTestResult) -> ReportRow:
+def _slow_trip(trips: tuple[float, ...]) -> float:
+    return float(np.quantile(trips, 0.99))
+
+
+def _evaluate_usb(result: LinkTestResult) -> ReportRow:
+    answered = len(result.pings)
     verdict = GOOD
-    if len(seen.pings) < seen.asked or float(np.quantile(seen.pings, 0.99)) > _MAX_USB_ROUND_TRIP:
+    if answered < result.requests or _slow_trip(result.pings) > _MAX_USB_ROUND_TRIP:
         verdict = POOR
-    if len(seen.pings) < seen.asked * (1.0 - LOSS_LIMIT):
+    if answered < result.requests * (1.0 - LOSS_LIMIT):
         verdict = BAD
     return ReportRow(
         'dongle answers over USB',
-        f'{len(seen.pings)} of {seen.asked}{_format_trips(seen.pings)}',
+        f'{answered} of {result.requests}{_format_trips(result.pings)}',
         verdict,
-        'the latency timer of an FTDI chip at 1 ms (docs/radio.md), another cable, no hub, a '
-        'computer that is less busy',
+        'the latency timer of an FTDI chip at 1 ms (docs/radio.md), another cable, no hub, less '
+        'load on the computer',
     )
 
 
-def _evaluate_losses(seen: LinkTestResult, parameters: LinkParameters) -> ReportRow:
-    share = 1.0 - len(seen.cycles) / seen.asked
+def _evaluate_losses(result: LinkTestResult, parameters: LinkParameters) -> ReportRow:
+    share = 1.0 - len(result.cycles) / result.requests
     verdict = GOOD if share <= LOSS_LIMIT / 5 else POOR if share <= LOSS_LIMIT else BAD
     remedy = (
-        'more than 0.2 m between both, antennas upright and free; 10 uF and 100 nF at both radio '
-        'chips; another channel (t3mpc robot scan shows where it answers now); --set power=…; '
-        '--set rate=250k with plus chips at both ends'
+        'more than 0.2 m between the radios, antennas upright and free; 10 uF and 100 nF at both '
+        'radio chips; another channel (t3mpc robot scan lists them); --set power=…; '
+        '--set rate=250k with nRF24L01+ chips at both ends'
     )
-    if not seen.cycles:
+    if not result.cycles:
         absent = reasons.robot_absent(parameters.channel)
         remedy = f'{absent} t3mpc robot scan searches all channels; {remedy}'
     return ReportRow(
-        'robot answers by radio', f'{len(seen.cycles)} of {seen.asked}', verdict, remedy
+        'robot answers by radio', f'{len(result.cycles)} of {result.requests}', verdict, remedy
     )
 
 
-def _evaluate_retries(seen: LinkTestResult) -> ReportRow:
-    tries = seen.retransmissions
-    mean = sum(number * count for number, count in enumerate(tries)) / max(sum(tries), 1)
-    told = ', '.join(f'{number}: {count}' for number, count in enumerate(tries) if count)
-    remedy = 'the same: the radio needs several tries for most packets'
+def _evaluate_retries(result: LinkTestResult) -> ReportRow:
+    retries = result.retransmissions
+    mean = sum(number * count for number, count in enumerate(retries)) / max(sum(retries), 1)
+    counts = ', '.join(f'{number}: {count}' for number, count in enumerate(retries) if count)
+    remedy = 'as for the answers by radio: most packets are retransmitted'
     return ReportRow(
-        'tries more per packet', told, GOOD if mean <= _MAX_MEAN_RETRIES else POOR, remedy
+        'retransmissions per packet', counts, GOOD if mean <= _MAX_MEAN_RETRIES else POOR, remedy
     )
 
 
-def _evaluate_round_trips(seen: LinkTestResult, parameters: LinkParameters) -> ReportRow:
-    slow = float(np.quantile(seen.cycles, 0.99))
+def _evaluate_round_trips(result: LinkTestResult, parameters: LinkParameters) -> ReportRow:
+    slow = _slow_trip(result.cycles)
     period = 1.0 / parameters.cycle_rate
     verdict = GOOD if slow <= ROUND_TRIP_LIMIT * period else POOR if slow <= period else BAD
     return ReportRow(
         'round trip to the robot',
-        _format_trips(seen.cycles)[2:],
+        _format_trips(result.cycles)[2:],
         verdict,
         f'half a period is {500.0 * period:g} ms: a lower --set cycle_rate, or the latency timer '
         'of the serial port at 1 ms (docs/radio.md)',
@@ -218,11 +224,11 @@ def _evaluate_round_trips(seen: LinkTestResult, parameters: LinkParameters) -> R
 
 def _evaluate_robot(state: State) -> ReportRow:
     status = StatusFlag(state.status)
-    troubles = {
+    problems = {
         StatusFlag.ESTOP: 'its emergency stop is latched',
         StatusFlag.IMU_FAULT: 'its inertial sensor does not answer: SDA at 20, SCL at 21, 5 V',
         StatusFlag.LOW_BATTERY: 'its battery is low, or its divider differs from docs/robot.md',
     }
-    found = [text for bit, text in troubles.items() if status & bit]
+    found = [text for bit, text in problems.items() if status & bit]
     session = f'in session {state.session}' if state.session else 'in no session'
     return ReportRow('robot', session, POOR if found else GOOD, '; '.join(found))

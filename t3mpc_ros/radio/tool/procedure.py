@@ -38,195 +38,199 @@ RequestFrame = Ping | Configure | Transmit | Key
 ReplyFrame = FromDongle | FromBoard
 
 _PING_TIMEOUT = 0.1
-"""s for the answer to a PING."""
+"""Timeout of a PING, s."""
 _MAX_PINGS = 50
-"""Five seconds: a board that opening its port has reset takes 1.5 s, with a slow boot loader 2."""
+"""Five seconds; a board that was reset by opening its port starts within 2 s."""
 _BYTE = 0xFF
+_POLL_PERIOD = 0.05
+"""Period at which the runner polls for an interruption, s."""
+SHUTDOWN_TIMEOUT_NS = 3 * NANOSECONDS
+"""Time for restoring a configuration or stopping the robot after an interruption."""
 
 
 class ProcedureError(Exception):
-    """It cannot be done; the text says why and what to do."""
+    """A failed procedure; the text contains the reason and the remedy."""
 
 
 class ProcedureInterrupted(Exception):
-    """Somebody wants it to end: put things back and leave."""
+    """Raised in a script to end it; it restores what it changed."""
 
 
 class Request(NamedTuple):
-    """Send a frame and wait for its answer; its number is given here."""
+    """Send a frame, whose id the procedure sets, and wait for its reply."""
 
     frame: RequestFrame
-    patience: float
+    timeout: float
     """s"""
 
 
 class Pause(NamedTuple):
-    """Do nothing for so many seconds."""
+    """Wait for a number of seconds."""
 
     seconds: float
 
 
 class Response(NamedTuple):
-    """What came of a question or a rest."""
+    """Result of a request or a pause."""
 
     reply: ReplyFrame | None
-    """None: silence."""
+    """None after a timeout or a pause."""
     sent_ns: int
     returned_ns: int
 
     @property
     def round_trip(self) -> float:
-        """From the frame written to its answer, s."""
+        """Time from writing the request to its reply, s."""
         return (self.returned_ns - self.sent_ns) / NANOSECONDS
 
 
 Value = TypeVar('Value')
 Script = Generator[Request | Pause, Response, Value]
-"""A script; what it returns is the result of the errand."""
+"""A script; its return value is the result of the procedure."""
 
 
 class PortTask(Protocol):
-    """What can be carried out at a port."""
+    """A task that :func:`run_at_port` can run."""
 
     @property
     def done(self) -> bool:
-        """Whether there is nothing left to do."""
+        """Whether the task has ended."""
 
     def step(self, now_ns: int, received: bytes = b'') -> list[PortAction]:
-        """Return what to do now; the last deed says until when there is nothing more."""
+        """Return the actions to execute now; the last one is the time of the next call."""
 
     def port_opened(self, now_ns: int) -> None:
-        """Take notice that the port is open."""
+        """Report that the port is open."""
 
     def port_failed(self, text: str, absent: bool, now_ns: int) -> None:
-        """Take notice that the port cannot be opened or used."""
+        """Report that the port cannot be opened or used."""
 
     def interrupt(self, now_ns: int) -> None:
-        """Come to an end, and leave things as they were found."""
+        """End early and restore the initial configuration."""
 
 
 class Procedure(Generic[Value]):
-    """Carries a script on.
+    """Runs a script as a function of time and bytes.
 
     Parameters
     ----------
     script
-        Its value becomes :attr:`result`; of what it raises, ProcedureError becomes :attr:`error`.
+        Its return value becomes :attr:`result`, a ProcedureError becomes :attr:`error`.
     decode
-        Reads the frames of the board that is talked to.
+        Decodes the frames of the board on the port.
     """
 
     def __init__(self, script: Script[Value], decode: Callable[[bytes], ReplyFrame]) -> None:
         self._script = script
         self._decode = decode
-        self._splitter = FrameDecoder()
-        self._deeds: list[PortAction] = [Open()]
-        self._asked: RequestFrame | None = None
+        self._decoder = FrameDecoder()
+        self._actions: list[PortAction] = [Open()]
+        self._request: RequestFrame | None = None
         self._sent_ns = self._until_ns = 0
         self._id = 0
         self._open = self._interrupted = False
         self.done = False
-        """Whether there is nothing left to do."""
+        """Whether the procedure has ended."""
         self.error = ''
-        """Why it could not be done; empty if it could."""
+        """Reason of a failure; empty on success."""
         self.result: Value | None = None
-        """What the script returned."""
+        """Return value of the script."""
 
     def port_opened(self, now_ns: int) -> None:
-        """Begin."""
+        """Start the script."""
         self._open = True
-        self._go_on(lambda: next(self._script), now_ns)
+        self._advance(lambda: next(self._script), now_ns)
 
     def port_failed(self, text: str, absent: bool, now_ns: int) -> None:
-        """End: the port cannot be opened or used."""
+        """End with the error ``text``."""
         self._open = False
-        # Whatever the script wants to put back, there is nobody to tell.
+        # Requests of the script that restore a configuration have no receiver any more.
         with suppress(ProcedureError, ProcedureInterrupted, StopIteration):
             while True:
                 self._script.throw(ProcedureError(text))
-        self._end(text)
+        self._finish(text)
 
     def interrupt(self, now_ns: int) -> None:
-        """Let the script put things back; a second time changes nothing."""
+        """Interrupt the script once, so that it restores what it changed."""
         if self.done or self._interrupted:
             return
         self._interrupted = True
         if self._open:
-            self._go_on(lambda: self._script.throw(ProcedureInterrupted()), now_ns)
+            self._advance(lambda: self._script.throw(ProcedureInterrupted()), now_ns)
         else:
-            self._end('interrupted')
+            self._finish('interrupted')
 
     def step(self, now_ns: int, received: bytes = b'') -> list[PortAction]:
-        """Return what to do now; the last deed says until when there is nothing more to do."""
-        for data in self._splitter.feed(received):
+        """Return the actions to execute now; the last one is the time of the next call."""
+        for data in self._decoder.feed(received):
             try:
                 reply = self._decode(data)
             except FrameError:
-                continue  # of another kind of board, or damaged beyond its CRC
-            if self._asked is not None and _is_reply_to(reply, self._asked):
-                self._tell(reply, now_ns)
+                continue  # from another kind of board, or damaged with a valid CRC
+            if self._request is not None and _is_reply_to(reply, self._request):
+                self._resume(reply, now_ns)
         if self._open and not self.done and now_ns >= self._until_ns:
-            self._tell(None, now_ns)
-        deeds, self._deeds = self._deeds, []
-        return [*deeds, Wait(max(self._until_ns, now_ns))]
+            self._resume(None, now_ns)
+        actions, self._actions = self._actions, []
+        return [*actions, Wait(max(self._until_ns, now_ns))]
 
-    def _tell(self, reply: ReplyFrame | None, now_ns: int) -> None:
-        heard = Response(reply, self._sent_ns, now_ns)
-        self._go_on(lambda: self._script.send(heard), now_ns)
+    def _resume(self, reply: ReplyFrame | None, now_ns: int) -> None:
+        response = Response(reply, self._sent_ns, now_ns)
+        self._advance(lambda: self._script.send(response), now_ns)
 
-    def _go_on(self, move: Callable[[], Request | Pause], now_ns: int) -> None:
-        self._asked = None
+    def _advance(self, resume: Callable[[], Request | Pause], now_ns: int) -> None:
+        self._request = None
         self._sent_ns = now_ns
         try:
-            wish = move()
+            request = resume()
         except StopIteration as end:
             self.result = end.value
-            self._end('')
+            self._finish('')
         except ProcedureInterrupted:
-            self._end('interrupted')
+            self._finish('interrupted')
         except ProcedureError as error:
-            self._end(str(error))
+            self._finish(str(error))
         else:
-            seconds = wish.seconds if isinstance(wish, Pause) else wish.patience
+            seconds = request.seconds if isinstance(request, Pause) else request.timeout
             self._until_ns = now_ns + round(seconds * NANOSECONDS)
-            if isinstance(wish, Request):
+            if isinstance(request, Request):
                 self._id = self._id + 1 & _BYTE
-                self._asked = wish.frame._replace(id=self._id)
-                # The zero ends whatever the board may have of a frame that was cut off.
-                self._deeds.append(Write(b'\0' + encode_frame(encode(self._asked))))
+                self._request = request.frame._replace(id=self._id)
+                # The zero ends a partial frame that the board may have received.
+                self._actions.append(Write(b'\0' + encode_frame(encode(self._request))))
 
-    def _end(self, error: str) -> None:
+    def _finish(self, error: str) -> None:
         if not self.done:
             self.done, self.error = True, error
-            self._deeds.append(Close())
+            self._actions.append(Close())
 
 
-def _is_reply_to(reply: ReplyFrame, asked: RequestFrame) -> bool:
+def _is_reply_to(reply: ReplyFrame, request: RequestFrame) -> bool:
     if isinstance(reply, Refusal):
-        return True  # it has no number, but nothing else is on its way
+        return True  # without an id, but only one request is in flight
     kinds = {Ping: Pong, Configure: Configured, Transmit: Result, Key: KeyState}
-    if not isinstance(reply, kinds[type(asked)]) or reply.id != asked.id:
+    if not isinstance(reply, kinds[type(request)]) or reply.id != request.id:
         return False
-    return not isinstance(asked, Ping) or getattr(reply, 'echo', b'') == asked.echo
+    return not isinstance(request, Ping) or getattr(reply, 'echo', b'') == request.echo
 
 
-def wait_for_board(nobody: str) -> Script[Pong]:
-    """Wait for a board to start; return what it says of itself, or raise ProcedureError."""
+def wait_for_board(absent: str) -> Script[Pong]:
+    """Wait for a board to start; return its PONG, or raise ProcedureError(absent)."""
     for _ in range(_MAX_PINGS):
-        heard = yield Request(Ping(0, b'look'), _PING_TIMEOUT)
-        if isinstance(heard.reply, Pong):
-            return heard.reply
-    raise ProcedureError(nobody)
+        response = yield Request(Ping(0, b'look'), _PING_TIMEOUT)
+        if isinstance(response.reply, Pong):
+            return response.reply
+    raise ProcedureError(absent)
 
 
 def wait_for_dongle() -> Script[Pong]:
     """Wait for a dongle with a working radio, or raise ProcedureError."""
     pong = yield from wait_for_board(reasons.NO_DONGLE)
-    heard = yield Request(Configure(0), _PING_TIMEOUT)
-    if isinstance(heard.reply, Refusal):
+    response = yield Request(Configure(0), _PING_TIMEOUT)
+    if isinstance(response.reply, Refusal):
         raise ProcedureError(
-            'this is the USB of the robot: the one of the dongle is wanted; '
-            'ls -l /dev/serial/by-id names both'
+            'this is the USB port of the robot board, not of the dongle; '
+            'ls -l /dev/serial/by-id lists both'
         )
     if not pong.chip_ok:
         raise ProcedureError(reasons.NO_CHIP)
@@ -234,10 +238,10 @@ def wait_for_dongle() -> Script[Pong]:
 
 
 def configure_radio(frame: Configure) -> Script[None]:
-    """Set the radio of the dongle, or raise ProcedureError."""
+    """Configure the radio of the dongle, or raise ProcedureError."""
     for _ in range(3):
-        heard = yield Request(frame, _PING_TIMEOUT)
-        reply = heard.reply
+        response = yield Request(frame, _PING_TIMEOUT)
+        reply = response.reply
         if isinstance(reply, Configured) and reply[1:-1] == frame[1:]:
             if not reply.chip_ok:
                 raise ProcedureError(reasons.NO_CHIP)
@@ -246,25 +250,19 @@ def configure_radio(frame: Configure) -> Script[None]:
 
 
 def read_radio_setup() -> Script[Configure]:
-    """Return how the radio of the dongle is set, or raise ProcedureError."""
+    """Return the radio configuration of the dongle, or raise ProcedureError."""
     for _ in range(3):
-        heard = yield Request(Configure(0), _PING_TIMEOUT)
-        if isinstance(heard.reply, Configured):
-            return Configure(*heard.reply[:-1])
+        response = yield Request(Configure(0), _PING_TIMEOUT)
+        if isinstance(response.reply, Configured):
+            return Configure(*response.reply[:-1])
     raise ProcedureError(reasons.DONGLE_TIMEOUT)
-
-
-_POLL_PERIOD = 0.05
-"""s: an interruption is heard so soon."""
-SHUTDOWN_TIMEOUT_NS = 3 * NANOSECONDS
-"""What a task gets for putting things back, a robot for coming to rest."""
 
 
 def run_at_port(
     task: PortTask, path: str, interrupted: Callable[[], bool], device: str = 'the dongle'
 ) -> None:
-    """Do the task at the port ``path`` of a device; ``interrupted`` is asked 20 times a second."""
-    courier = _PortRunner(task, path, device)
+    """Run a task at the port ``path`` of a device; poll ``interrupted`` 20 times a second."""
+    runner = _PortRunner(task, path, device)
     until_ns: int | None = None
     try:
         received = b''
@@ -275,10 +273,10 @@ def run_at_port(
                 task.interrupt(now_ns)
             if until_ns is not None and now_ns > until_ns:
                 return
-            received = courier.listen(courier.do(task.step(now_ns, received)))
-        courier.do(task.step(time.monotonic_ns()))
+            received = runner.receive(runner.execute(task.step(now_ns, received)))
+        runner.execute(task.step(time.monotonic_ns()))
     finally:
-        courier.close()
+        runner.close()
 
 
 class _PortRunner:
@@ -288,28 +286,28 @@ class _PortRunner:
         self._device = device
         self._port: SerialPort | None = None
 
-    def do(self, deeds: list[PortAction]) -> int:
-        """Do the deeds; return when the task wants to be asked again."""
+    def execute(self, actions: list[PortAction]) -> int:
+        """Execute the actions; return the time of the next step."""
         wake_ns = time.monotonic_ns()
-        for deed in deeds:
+        for action in actions:
             try:
-                if isinstance(deed, Wait):
-                    wake_ns = deed.until_ns
-                elif isinstance(deed, Open):
+                if isinstance(action, Wait):
+                    wake_ns = action.until_ns
+                elif isinstance(action, Open):
                     self._port = SerialPort(self._path, self._device)
                     self._task.port_opened(time.monotonic_ns())
                     return time.monotonic_ns()
-                elif isinstance(deed, Write) and self._port is not None:
-                    self._port.write(deed.data)
-                elif isinstance(deed, Close):
+                elif isinstance(action, Write) and self._port is not None:
+                    self._port.write(action.data)
+                elif isinstance(action, Close):
                     self.close()
             except PortError as error:
-                self._lose(error)
+                self._report_failure(error)
                 return time.monotonic_ns()
         return wake_ns
 
-    def listen(self, until_ns: int) -> bytes:
-        """Return what arrives before then."""
+    def receive(self, until_ns: int) -> bytes:
+        """Return the bytes received before ``until_ns``."""
         wait = min(max((until_ns - time.monotonic_ns()) / NANOSECONDS, 0.0), _POLL_PERIOD)
         if self._port is None:
             time.sleep(wait)
@@ -318,15 +316,15 @@ class _PortRunner:
             ready, _, _ = select.select([self._port], [], [], wait)
             return self._port.read() if ready else b''
         except PortError as error:
-            self._lose(error)
+            self._report_failure(error)
             return b''
 
     def close(self) -> None:
-        """Close the port, if it is open."""
+        """Close the port if it is open."""
         if self._port is not None:
             self._port.close()
             self._port = None
 
-    def _lose(self, error: PortError) -> None:
+    def _report_failure(self, error: PortError) -> None:
         self._port = None
         self._task.port_failed(str(error), error.absent, time.monotonic_ns())

@@ -33,11 +33,12 @@ from t3mpc_ros.radio.tool.procedure import (
 )
 
 _REPLY_TIMEOUT = 0.25
+"""s"""
 _MAX_ATTEMPTS = 20
 
 
 class RobotInfo(NamedTuple):
-    """What the robot is, and its parameters."""
+    """Identity and board parameters of the robot."""
 
     info: Info
     values: tuple[Param, ...]
@@ -46,10 +47,10 @@ class RobotInfo(NamedTuple):
 def read_robot_info(
     parameters: LinkParameters, key: bytes, entropy: Callable[[int], bytes]
 ) -> Script[RobotInfo]:
-    """Return all parameters of the robot.
+    """Return identity and board parameters of the robot.
 
-    One that is in a session is read in that, and goes on undisturbed. One that is in none is
-    greeted, which needs the key if it has one.
+    They are read in the current session of the robot, which continues undisturbed. Without one, a
+    session is started, which needs the key if the robot has one.
     """
     yield from wait_for_dongle()
     before = yield from read_radio_setup()
@@ -66,12 +67,12 @@ def read_robot_info(
     return RobotInfo(info, tuple(values))
 
 
-def _transact(parameters: LinkParameters, first: Downlink, fetch: int) -> Script[Uplink | None]:
-    payloads = encode(first), encode(Poll(0, 0, fetch))
-    heard = yield Request(Transmit(0, parameters.gap_after(first), *payloads), _REPLY_TIMEOUT)
-    if isinstance(heard.reply, Result) and heard.reply.payload:
+def _transact(parameters: LinkParameters, first: Downlink, what: int) -> Script[Uplink | None]:
+    payloads = encode(first), encode(Poll(0, 0, what))
+    response = yield Request(Transmit(0, parameters.gap_after(first), *payloads), _REPLY_TIMEOUT)
+    if isinstance(response.reply, Result) and response.reply.payload:
         try:
-            return decode_uplink(heard.reply.payload)
+            return decode_uplink(response.reply.payload)
         except FrameError:
             return None
     return None
@@ -79,40 +80,40 @@ def _transact(parameters: LinkParameters, first: Downlink, fetch: int) -> Script
 
 def _request_info(parameters: LinkParameters) -> Script[Info]:
     for _ in range(_MAX_ATTEMPTS):
-        told = yield from _transact(parameters, Poll(0, 0, frames.INFO), frames.INFO)
-        if isinstance(told, Info):
-            if told.protocol != VERSION:
+        answer = yield from _transact(parameters, Poll(0, 0, frames.INFO), frames.INFO)
+        if isinstance(answer, Info):
+            if answer.protocol != VERSION:
                 raise ProcedureError(
-                    f'the robot must speak protocol {VERSION}: it speaks {told.protocol}'
+                    f'the robot must speak protocol {VERSION}: it speaks {answer.protocol}'
                 )
-            return told
+            return answer
     raise ProcedureError(reasons.robot_absent(parameters.channel))
 
 
 def _start_session(parameters: LinkParameters, session: Session) -> Script[Info]:
     problem = reasons.HELLO_REJECTED
     for number in range(_MAX_ATTEMPTS):
-        # A clock of its own: nobody commands in this session, it only has to go on.
+        # An artificial clock, strictly increasing: no command is sent in this session.
         hello = session.hello(1000 * number)
-        told = yield from _transact(parameters, hello, frames.INFO)
-        if isinstance(told, Info):
-            problem = session.accept(told)
+        answer = yield from _transact(parameters, hello, frames.INFO)
+        if isinstance(answer, Info):
+            problem = session.accept(answer)
             if not problem:
-                return told
+                return answer
     raise ProcedureError(problem)
 
 
 def _read_parameter(parameters: LinkParameters, session: int, number: int) -> Script[Param]:
     for seq in range(_MAX_ATTEMPTS):
-        told = yield from _transact(parameters, ParamGet(session, seq, number), frames.STATE)
-        if isinstance(told, Param) and (told.id, told.seq) == (number, seq):
-            return told
-    raise ProcedureError('the robot was there, and no longer answers: has it another host?')
+        answer = yield from _transact(parameters, ParamGet(session, seq, number), frames.STATE)
+        if isinstance(answer, Param) and (answer.id, answer.seq) == (number, seq):
+            return answer
+    raise ProcedureError('the robot stopped answering: is another host connected to it?')
 
 
-def format_robot_info(inventory: RobotInfo, parameters: LinkParameters) -> str:
-    """Return the parameters as text: value, bounds, and what a bridge with these settings sets."""
-    info, wanted = inventory.info, parameters.robot.to_wire()
+def format_robot_info(robot: RobotInfo, parameters: LinkParameters) -> str:
+    """Return the parameters as text: value, bounds, and the value that the bridge writes."""
+    info, targets = robot.info, parameters.robot.to_wire()
     signed = 'signed commands only' if info.nonce else 'no key'
     lines = [
         f'firmware {info.major}.{info.minor}, {info.steps_per_rev} steps of {info.microsteps} '
@@ -120,16 +121,16 @@ def format_robot_info(inventory: RobotInfo, parameters: LinkParameters) -> str:
         '',
         f'{"parameter":<14}  {"value":>7}  {"unit":<7}  {"allowed":<16}  {"bridge sets":>11}',
     ]
-    for value in inventory.values:
-        lines.append(_format_parameter(value, wanted.get(value.id)))
+    for value in robot.values:
+        lines.append(_format_parameter(value, targets.get(value.id)))
     return '\n'.join(lines)
 
 
-def _format_parameter(value: Param, wanted: int | None) -> str:
+def _format_parameter(value: Param, target: int | None) -> str:
     known: Sequence[frames.BoardParameter] = BOARD_PARAMETERS
     row = known[value.id] if value.id < len(known) else None
     name, unit = (row.name, row.unit) if row else (f'number {value.id}', '')
     bounds = 'fixed' if value.low == value.high else f'{value.low} to {value.high}'
-    sets = '' if wanted is None else str(wanted)
+    sets = '' if target is None else str(target)
     text = f'{name:<14}  {value.value:>7}  {unit:<7}  {bounds:<16}  {sets:>11}'
     return text.rstrip()

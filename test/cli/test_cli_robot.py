@@ -1,0 +1,165 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``t3mpc robot`` as a command: exit codes, messages, and one run over pseudo terminals."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+from t3mpc_ros.cli import robot as cli
+from t3mpc_ros.radio.protocol.authentication import key_check, read_key
+from t3mpc_ros.radio.serial_port import SerialPort
+
+
+@pytest.fixture
+def ports(tmp_path):
+    """Yield the paths of both ports of an emulator process."""
+    dongle, robot = tmp_path / 'dongle', tmp_path / 'robot'
+    command = [sys.executable, '-m', 't3mpc_ros.cli.emulator', '--link', str(dongle)]
+    child = subprocess.Popen(
+        [*command, '--robot-link', str(robot)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)},
+    )
+    assert any('robot console' in line for line in child.stdout)
+    yield str(dongle), str(robot)
+    child.send_signal(signal.SIGTERM)
+    output, _ = child.communicate(timeout=20)
+    assert output.endswith('t3mpc emulator: stopped\n')
+    assert 'Traceback' not in output
+    assert not dongle.is_symlink()
+    assert not robot.is_symlink()
+
+
+@pytest.mark.slow
+def test_bench_session_from_key_to_jog(ports, tmp_path, capsys):
+    """Over pseudo terminals on the wall clock, in the order of docs/robot.md."""
+    dongle, robot = ports
+    key = str(tmp_path / 'key')
+
+    def run(*arguments):
+        code = cli.main(arguments)
+        output = capsys.readouterr()
+        return code, output.out + output.err
+
+    assert run('key', 'create', key)[0] == 0
+    assert run('key', 'create', key)[0] == 2
+    check = f'{key_check(read_key(tmp_path / "key")):08x}'
+    assert check in run('key', 'check', key)[1]
+    assert 'no key' in run('key', 'state', '--port', robot)[1]
+    code, output = run('key', 'write', key, '--port', robot)
+    assert (code, check in output) == (0, True)
+    assert run('key', 'state', '--port', robot, '--key', key)[0] == 0
+    code, output = run('key', 'write', key, '--port', dongle)
+    assert (code, 'this is the dongle' in output) == (2, True)
+    code, output = run('parameters', '--port', dongle)
+    assert (code, 'give the host the key' in output) == (2, True)
+    code, output = run('parameters', '--port', dongle, '--key', key, '--set', 'robot.idle_off=5')
+    assert (code, 'ttl_max' in output, '5000' in output) == (0, True, True)
+    assert 'robot answers by radio' in run('ping', '--port', dongle, '--count', '20')[1]
+    code, output = run('scan', '--port', dongle)
+    assert (code, 'channel 82 at 1M' in output) == (0, True)
+    code, output = run('jog', 'left', '0.2', '--port', dongle, '--key', key, '--yes')
+    assert (code, 'target 640' in output) == (0, True)
+
+    # Ctrl-C during a jog: the robot stops, then the command ends.
+    threading.Timer(4.0, os.kill, (os.getpid(), signal.SIGINT)).start()
+    start = time.monotonic()
+    code, output = run('jog', 'left', '90', '--port', dongle, '--key', key, '--yes')
+    assert code == 130
+    assert time.monotonic() - start < 60.0
+    assert 'interrupted' in output
+    assert run('key', 'erase', '--port', robot)[0] == 0
+
+
+def test_port_errors_contain_a_remedy(tmp_path, capsys):
+    missing = str(tmp_path / 'nothing')
+    for command in (['ping'], ['scan'], ['parameters'], ['jog', 'left', '1', '--yes']):
+        assert cli.main([*command, '--port', missing]) == 2
+        assert 'is the dongle plugged in?' in capsys.readouterr().err
+    assert cli.main(['key', 'state', '--port', missing]) == 2
+    assert "is the robot's board plugged in?" in capsys.readouterr().err
+    master, slave = os.openpty()
+    path = os.ttyname(slave)
+    holder = SerialPort(path)
+    assert cli.main(['ping', '--port', path]) == 2
+    assert 'another program has it open' in capsys.readouterr().err
+    holder.close()
+    os.close(master)
+    os.close(slave)
+
+
+@pytest.mark.parametrize(
+    'arguments, words',
+    [
+        (['ping', '--port', 'x', '--set', 'channel=126'], 'channel'),
+        (['ping', '--port', 'x', '--set', 'chanel=12'], 'chanel'),
+        (['scan', '--port', 'x', '--set', 'rate'], 'NAME=VALUE'),
+        (['jog', 'left', '1', '--port', 'x', '--key', 'no/such/file', '--yes'], 'no/such/file'),
+        (['jog', 'left', '1', '--port', 'x'], '--yes'),
+        (['key', 'check', 'no/such/file'], 'no/such/file'),
+    ],
+)
+def test_invalid_input_is_reported_before_the_port_opens(arguments, words, capsys, monkeypatch):
+    with open(os.devnull) as empty:
+        monkeypatch.setattr(sys, 'stdin', empty)
+        assert cli.main(arguments) == 2
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('answer', ['no', '', 'yeah', 'ctrl-c'])
+def test_jog_requires_a_confirmation(answer, capsys, monkeypatch):
+    """Readline continues after a signal, so the prompt has to poll for Ctrl-C."""
+    opened = []
+    monkeypatch.setattr(cli, 'run_at_port', lambda *arguments: opened.append(arguments))
+    master, slave = os.openpty()
+    with open(slave) as terminal:
+        monkeypatch.setattr(sys, 'stdin', terminal)
+        if answer == 'ctrl-c':
+            threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+        else:
+            os.write(master, answer.encode() + b'\n')
+        code = cli.main(['jog', 'left', '1', '--port', 'x'])
+        assert code == (130 if answer == 'ctrl-c' else 2)
+        assert opened == []
+        os.write(master, b'yes\n')
+        assert cli.main(['jog', 'left', '1', '--port', 'x']) == 0
+    os.close(master)
+    assert len(opened) == 1
+    output = capsys.readouterr()
+    assert 'in the air' in output.out
+    assert 'nothing was moved' in output.err
+
+
+def test_key_file_of_zeros_is_rejected(tmp_path, capsys):
+    path = tmp_path / 'key'
+    path.write_text(32 * '0')
+    path.chmod(0o600)
+    assert cli.main(['key', 'write', str(path), '--port', 'x']) == 2
+    assert 'zeros' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    'arguments',
+    [
+        ['jog', 'left', '0', '--port', 'x'],
+        ['jog', 'middle', '1', '--port', 'x'],
+        ['jog', 'left', '1', '--speed', '11', '--port', 'x'],
+        ['ping', '--count', '0', '--port', 'x'],
+        ['ping'],
+        ['key'],
+        [],
+    ],
+)
+def test_wrong_arguments_are_usage_errors(arguments, capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(arguments)
+    assert ended.value.code == 2
+    capsys.readouterr()
