@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 Subject = TypeVar('Subject')
 
 WIDTH = 6.2
-"""Inches: narrow enough for 9-point text to be read where a phone shows it at half the size."""
+"""Inches: narrow enough that 9-point text stays legible on a phone at half the size."""
 
 COLOURS = {
     REFERENCE: '#1f2937',
@@ -46,10 +46,10 @@ COLOURS = {
     'resets': '#be123c',
     'switch': '#d97706',
 }
-"""By quantity, the same in every figure."""
+"""Colours by quantity, the same in every figure."""
 LABELS = {TRUTH: 'robot (ground truth)', ODOMETRY: 'robot (odometry)', REFERENCE: 'reference'}
 STRENGTH = dict(zip(WHEELS, (1.0, 0.45), strict=True))
-"""Where both wheels share a panel, the left one is paler."""
+"""Opacity by wheel: where both share a panel, the left one is paler."""
 
 _STYLE = {
     'font.size': 9,
@@ -70,7 +70,7 @@ _STYLE = {
 
 
 def png_of(draw: Callable[[Subject], Any], subject: Subject) -> bytes | None:
-    """Return what ``draw`` makes of ``subject`` as a PNG file; None when it makes nothing."""
+    """Return the PNG of what ``draw`` returns for ``subject``; None when it returns None."""
     with matplotlib.rc_context(_STYLE):
         figure = draw(subject)
         if figure is None:
@@ -90,14 +90,14 @@ def new_figure(height: float) -> Any:
 def new_panels(count: int, height: float, *, shared: bool = True) -> tuple[Any, list[Any]]:
     """Return a figure and ``count`` panels below each other, each ``height`` inches.
 
-    ``shared`` says whether they have one axis of time.
+    ``shared`` selects one common time axis.
     """
     figure = new_figure(0.7 + height * count)
     return figure, list(figure.subplots(count, 1, sharex=shared, squeeze=False)[:, 0])
 
 
 def over_time(figure: Any, axes: list[Any], run: Run) -> Any:
-    """Return ``figure`` with the switches marked, the time named and one legend on top."""
+    """Return ``figure`` with switches marked, the time axis labelled and one legend on top."""
     for axis in axes:
         for i, switch in enumerate(run.switches):
             label = 'switch' if i == 0 else None
@@ -109,7 +109,7 @@ def over_time(figure: Any, axes: list[Any], run: Run) -> Any:
 
 
 def name_time(axes: list[Any], name: str = 'time') -> None:
-    """Label the axis of time that the panels share, with ticks at round numbers."""
+    """Label the common time axis, with ticks at round numbers."""
     for axis in axes:
         axis.margins(x=0.01)
         axis.xaxis.set_major_locator(MaxNLocator(steps=(1, 2, 5, 10)))
@@ -117,7 +117,7 @@ def name_time(axes: list[Any], name: str = 'time') -> None:
 
 
 def add_legend(axis: Any) -> None:
-    """Put the legend above the axis, to the right of its title, where it covers nothing."""
+    """Put the legend above the axis, to the right of its title."""
     handles, labels = axis.get_legend_handles_labels()
     if handles:
         place = {'loc': 'lower right', 'bbox_to_anchor': (1.0, 1.0), 'ncols': len(labels)}
@@ -141,7 +141,7 @@ def draw_line(
 
 
 def thinned(time: Array, value: Array, most: int = 6000) -> tuple[Array, Array]:
-    """Return the extremes of stretches of a long line: the same picture from fewer points."""
+    """Return the extremes of segments of a long line: the same picture from fewer points."""
     if time.size <= most:
         return time, value
     stretch = -(-time.size // (most // 2))
@@ -151,10 +151,10 @@ def thinned(time: Array, value: Array, most: int = 6000) -> tuple[Array, Array]:
 
 
 def every_nth(values: Array, most: int = 20_000) -> Array:
-    """Return a line in the plane by so few of its points that it can be drawn."""
+    """Return a thinned line in the plane."""
     return values[:: max(1, -(-values.size // most))]
 
 
 def is_long(series: Series | None) -> TypeGuard[Series]:
-    """Return whether there is anything to draw a line through."""
+    """Return whether there is more than one point."""
     return series is not None and len(series) > 1

@@ -12,14 +12,14 @@ from typing import TextIO
 
 
 class Progress:
-    """Writes how many runs are done and how much time is left; the last line stays.
+    """Prints the number of finished runs and the time left; the last line stays.
 
     Parameters
     ----------
     clock
         Seconds from any origin.
     stream
-        A terminal gets one line that is rewritten, anything else a line now and then; standard
+        A terminal gets one line that is rewritten, anything else a line at intervals; standard
         error when None.
     """
 
@@ -36,13 +36,13 @@ class Progress:
         print(text, file=self._stream, flush=True)
 
     def begin(self, total: int) -> None:
-        """Start to count ``total`` runs."""
+        """Start counting ``total`` runs."""
         self._total = total
         self._last = self._clock()
         self._marks = [(0, self._last)]
 
     def done(self, count: int) -> None:
-        """Take note that ``count`` runs are done, and say so when it is time to."""
+        """Report that ``count`` runs are finished; print when due."""
         now = self._clock()
         self._marks.append((count, now))
         pause = 0.5 if self._live else 15.0
@@ -64,13 +64,13 @@ class Progress:
         return (now - then) / (count - earlier)
 
     def broken_off(self) -> None:
-        """Leave the line that is being rewritten."""
+        """End the rewritten line."""
         if self._live:
             print(file=self._stream, flush=True)
 
 
 def format_duration(seconds: float) -> str:
-    """Return a stretch of time as people say it, rounded up to whole seconds."""
+    """Return a duration as text, rounded up to whole seconds."""
     whole = int(-(-seconds // 1))
     if whole < 60:
         return f'{whole} s'
@@ -87,7 +87,7 @@ class Table:
     head: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     bold: tuple[str, ...] = ()
-    """Names of rows that stand out."""
+    """Names of highlighted rows."""
 
     def markdown(self) -> str:
         """Return the table with its title in Markdown."""
@@ -110,7 +110,7 @@ class Table:
 
 
 def format_interval(mean: float, ci95: float, sign: str = '', digits: int = 3) -> str:
-    """Return a mean ± half its 95 % interval; the interval of a single seed is left out."""
+    """Return a mean ± half its 95 % interval; a single seed has no interval."""
     if not math.isfinite(mean):
         return 'diverged'
     text = f'{mean:{sign}.{digits}f}'

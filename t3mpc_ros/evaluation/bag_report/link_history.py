@@ -158,13 +158,13 @@ def read_diagnostics(
 
 def _numbers(status: Any) -> dict[str, float]:
     """Return the link values of a status; empty when the status describes something else."""
-    told = {entry.key: entry.value for entry in status.values}
-    if sum(key in told for key in LINK_KEYS) < 2:
+    values = {entry.key: entry.value for entry in status.values}
+    if sum(key in values for key in LINK_KEYS) < 2:
         return {}
     numbers = {}
     for key in (*SHARES, *COUNTERS):
         try:
-            value = float(told[key])
+            value = float(values[key])
         except (KeyError, ValueError):
             continue  # not a number or missing: unknown
         numbers[key] = value if math.isfinite(value) else math.nan

@@ -112,7 +112,7 @@ def preview_before_switch(run: Run) -> float:
 def settled(time: Array, switches: Array, before: float) -> NDArray[np.bool_]:
     """Return the mask of ``time`` (s) that excludes the window around each switch.
 
-    The window extends from ``before`` seconds before a switch to :data:`SETTLING` seconds after it.
+    The window is from ``before`` seconds before a switch to :data:`SETTLING` seconds after it.
     """
     following = np.searchsorted(switches, time, 'right')
     since: Array = time - np.concatenate([[-math.inf], switches])[following]
@@ -129,12 +129,16 @@ def variation(series: Series, name: str) -> float:
 
 def latencies(run: Run) -> Series | None:
     """Return the delay of each command after the newest odometry message, by receipt (s)."""
-    heard, told = run.receipts.get(ODOMETRY), run.receipts.get(COMMAND)
-    if heard is None or told is None:
+    odometry, commands = run.receipts.get(ODOMETRY), run.receipts.get(COMMAND)
+    if odometry is None or commands is None:
         return None
-    index = np.searchsorted(heard, told, 'right') - 1
-    told = told[index >= 0]
-    return Series(told, {'value': told - heard[index[index >= 0]]}) if told.size else None
+    index = np.searchsorted(odometry, commands, 'right') - 1
+    commands = commands[index >= 0]
+    return (
+        Series(commands, {'value': commands - odometry[index[index >= 0]]})
+        if commands.size
+        else None
+    )
 
 
 def estimation_target(run: Run, wheel: str) -> Series | None:
@@ -172,7 +176,7 @@ def estimation_target(run: Run, wheel: str) -> Series | None:
 
 
 def path_of(motion: Series, start: tuple[float, float, float]) -> tuple[Array, Array]:
-    """Return x and y (m) of the integrated twists of ``motion`` from a pose, by the arcs of (2)."""
+    """Return x and y (m) of ``motion``'s twists integrated from a pose, by the arcs of (2)."""
     dt = np.diff(motion.time)
     turn = motion['angular'][:-1] * dt
     chord = motion['linear'][:-1] * dt * np.sinc(turn / math.tau)
@@ -212,7 +216,7 @@ class ReportMetrics:
     measured: str
     """Source of the errors: ``ground_truth/odom``, else ``odom``, else empty."""
     wheels: Mapping[str, ChannelMetrics]
-    """Metrics of ``right`` and ``left``, or of ``linear`` and ``angular`` without wheel geometry."""
+    """Metrics of ``right`` and ``left``; without wheel geometry ``linear`` and ``angular``."""
     channels: tuple[Channel, Channel]
     """Names and units of the channels."""
     responses: Mapping[str, ResponseFit]
@@ -252,7 +256,8 @@ class ReportMetrics:
             f'{self.duration:.1f} s, {self.switches} switches; RMSE {titles} while driven '
             f'{overall}, settled {calm}; command varies by {chatter}; {answer}'
             f'loop {format_number(1e3 * self.latency)} ms, 99 % below '
-            f'{format_number(1e3 * self.latency_99)} ms; {missing} % of odom missing: {self.report}'
+            f'{format_number(1e3 * self.latency_99)} ms; {missing} % of odom missing: '
+            f'{self.report}'
         )
 
 

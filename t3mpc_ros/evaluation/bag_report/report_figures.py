@@ -118,7 +118,7 @@ def _changes(motion: Series, name: str) -> tuple[Any, Any, Any]:
 
 
 COUNTED = {
-    'robot_resets': "resets of the robot board",
+    'robot_resets': 'resets of the robot board',
     'dongle_resets': 'resets of the dongle',
     'port_failures': 'port failures',
     'crc_errors': 'wrong checksums',
@@ -133,14 +133,14 @@ def link(run: Run) -> Any:
         return None
     shown = run.links[0]
     values, answered = shown.values, shown.answered()
-    told = bool(np.isfinite(answered).any())
+    reported = bool(np.isfinite(answered).any())
     trips = [key for key in ('round_trip_median_ms', 'round_trip_p99_ms') if key in values]
     counted = [key for key in COUNTED if np.isfinite(values.get(key, np.nan)).any()]
-    if not (told or trips or counted):
+    if not (reported or trips or counted):
         return None
-    figure, axes = new_panels(told + bool(trips) + bool(counted), 1.5)
+    figure, axes = new_panels(reported + bool(trips) + bool(counted), 1.5)
     free = iter(axes)
-    if told:
+    if reported:
         axis = next(free)
         style = {'color': COLOURS['answered'], 'linewidth': 1.1, 'drawstyle': 'steps-pre'}
         axis.plot(shown.time, 100.0 * answered, **style)
@@ -435,8 +435,7 @@ REPORT_FIGURES = (
     ReportFigure(
         'control',
         'Commands (Fig. 12)',
-        'The command is published as a body twist; u is the acceleration after '
-        'all limits.',
+        'The command is published as a body twist; u is the acceleration after all limits.',
         control,
         (COMMAND, *(f'controller/terms/applied/{wheel}' for wheel in WHEELS)),
     ),
@@ -490,8 +489,8 @@ REPORT_FIGURES = (
     ReportFigure(
         'certificate',
         'Run-time certificate and skill of the predictor',
-        'The margin is the largest rate of V by E14 minus its actual rate: it is negative when the '
-        'disturbance is larger than assumed, or just after a jump of the reference. '
+        'The margin is the largest rate of V by E14 minus its actual rate: it is negative when '
+        'the disturbance is larger than assumed, or just after a jump of the reference. '
         'Skill is 1 for perfect prediction and 0 for no better than persistence.',
         certificate,
         (

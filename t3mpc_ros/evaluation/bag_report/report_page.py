@@ -269,7 +269,8 @@ def _tiles(figures: ReportMetrics) -> str:
         tiles.append(
             (
                 f'{format_number(100.0 * link.answered)} %',
-                f'of the cycles answered, {name}; round trip {format_number(1e3 * link.round_trip)} ms',
+                f'of the cycles answered, {name}; round trip '
+                f'{format_number(1e3 * link.round_trip)} ms',
             )
         )
     tiles += [
@@ -346,8 +347,8 @@ def _extents(run: Run) -> str:
         )
     before = preview_before_switch(run)
     ahead = (
-        f'the {before:.2g} s before each switch, in which a controller may already be leaving the '
-        'old reference because it was told so far ahead, and without '
+        f'the {before:.2g} s before each switch, in which a controller may already leave the '
+        'old reference because the new one is known in advance, and without '
         if before > 0.0
         else ''
     )

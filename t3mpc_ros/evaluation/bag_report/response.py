@@ -239,11 +239,11 @@ def motion_summary(run: Run) -> MotionSummary | None:
     disobeyed = 0.0
     command = run.motions.get(COMMAND)
     if command is not None and len(command):
-        told = np.zeros(time.size, dtype=np.bool_)
+        commanded = np.zeros(time.size, dtype=np.bool_)
         rows = np.searchsorted(command.time, time, 'right') - 1
         for name, least in STILL.items():
-            told |= (rows >= 0) & (np.abs(command[name][np.maximum(rows, 0)]) > 2.0 * least)
-        disobeyed = step * sum(int(np.count_nonzero(told[low:high])) for low, high in spans)
+            commanded |= (rows >= 0) & (np.abs(command[name][np.maximum(rows, 0)]) > 2.0 * least)
+        disobeyed = step * sum(int(np.count_nonzero(commanded[low:high])) for low, high in spans)
     return MotionSummary(
         distance=float(np.abs(linear[known]).sum() * step),
         turned=float(np.abs(angular[known]).sum() * step),

@@ -113,7 +113,7 @@ class Run:
     geometry: WheelGeometry | None
     """None without wheel geometry."""
     channels: tuple[Channel, Channel]
-    """Channels of the motions: wheels where the geometry is known, else linear and angular speed."""
+    """Channels of the motions: wheels with known geometry, else linear and angular speed."""
     motions: Mapping[str, Series]
     """``reference``, ``odom``, ``ground_truth/odom``, ``cmd_vel``: linear, angular (m/s, rad/s),
     right, left (rad/s) where the wheels are known, and of odometry x, y (m), yaw (rad)."""
@@ -257,14 +257,17 @@ def _mend_stamps(table: dict[str, Array], topic: str, notes: list[str]) -> None:
     received, stamps = table['received'], table['stamp']
     if stamps.size > 2 and np.unique(stamps).size < 0.5 * np.unique(received).size:
         table['stamp'] = received
-        notes.append(f'The stamps of {topic} are constant; its messages were placed by receive time.')
+        notes.append(
+            f'The stamps of {topic} are constant; its messages were placed by receive time.'
+        )
         return
     steps, gaps = np.diff(stamps), np.diff(received)
     if leaps := np.flatnonzero((steps < -JUMP) | (steps > gaps + JUMP)).tolist():
         table['stamp'] = received
         notes.append(
             f'The stamps of {topic} leap {len(leaps)} times, first by {steps[leaps[0]]:.1f} s at '
-            f'{received[leaps[0]]:.1f} s: a clock was set; its messages were placed by receive time.'
+            f'{received[leaps[0]]:.1f} s: a clock was set; its messages were placed by receive '
+            'time.'
         )
     elif leaps := np.flatnonzero(gaps > steps + JUMP).tolist():
         notes.append(
@@ -350,11 +353,11 @@ def _geometry(
                     values[name] = float(text)
                 except ValueError:
                     notes.append(f'The recorded {key} is not a number: {text!r}.')
-    said = wanted.wheel_radius is not None or wanted.track is not None
+    explicit = wanted.wheel_radius is not None or wanted.track is not None
     try:
         geometry = WheelGeometry.from_dict(values)
     except ParameterError as error:
-        if said:
+        if explicit:
             raise
         notes.append(f'The recorded geometry cannot be used: {error}.')
         values, geometry = {}, WheelGeometry()

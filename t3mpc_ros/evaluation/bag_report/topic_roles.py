@@ -98,11 +98,11 @@ def choose_topics(recording: BagReader, wanted: ReportOptions) -> TopicChoice:
         chosen.pop(TRUTH, None)  # errors refer to the given topic
     notes = []
     space = wanted.namespace and '/' + wanted.namespace.strip('/') + '/'
-    for name, said, option in (
+    for name, topic_name, option in (
         (ODOMETRY, wanted.odom, '--odom'),
         (COMMAND, wanted.cmd_vel, '--cmd-vel'),
     ):
-        if said or (name == ODOMETRY and TRUTH in chosen):
+        if topic_name or (name == ODOMETRY and TRUTH in chosen):
             continue
         others = [
             topic

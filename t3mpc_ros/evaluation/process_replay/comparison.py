@@ -24,26 +24,26 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 ABSOLUTE, RELATIVE = 1e-9, 1e-9
-"""Tolerances on the machine that made the recording: there it comes out to the last bit."""
+"""Default tolerances, for the machine of the recording: there the replay is bit-equal."""
 ELSEWHERE = 1e-6
-"""Both tolerances for other processors, compilers and libraries of linear algebra, which round
-in other ways; what is learnt carries their differences on."""
+"""Both tolerances for other processors, compilers and linear-algebra libraries, whose rounding
+differs; adaptation accumulates the differences."""
 
 
 @dataclass(frozen=True)
 class Tolerances:
-    """How far two numbers may be apart: absolute + relative |recorded|, in SI units.
+    """Allowed difference of two numbers: absolute + relative |recorded|, in SI units.
 
     Raises
     ------
     ValueError
-        A tolerance is negative or not finite, or a name fits no field.
+        A tolerance is negative or not finite, or a name matches no field.
     """
 
     absolute: float = ABSOLUTE
     relative: float = RELATIVE
     fields: Mapping[str, float] = field(default_factory=dict)
-    """Absolute ones by name of a field, ``*`` standing for anything; the last that fits counts,
+    """Absolute tolerances by field name, ``*`` as a wildcard; the last match counts,
     and the relative tolerance is then zero."""
 
     def __post_init__(self) -> None:
@@ -63,38 +63,38 @@ class Tolerances:
 
 @dataclass(frozen=True)
 class FieldComparison:
-    """How one field compares."""
+    """Comparison of one field."""
 
     field: str
     count: int
-    """Numbers that were compared."""
+    """Number of compared values."""
     absolute: float
-    """Largest difference; infinite where one of both is no number."""
+    """Largest difference; infinite where one value is NaN."""
     relative: float
-    """Largest difference over |recorded|, of those recorded as zero none."""
+    """Largest difference over |recorded|, over non-zero recorded values."""
     differing: int
-    """How many are beyond the tolerance."""
+    """Number of values beyond the tolerance."""
     first: float
-    """When the first of them was, s since the start of the bag; NaN without one."""
+    """Time of the first of them, s since the start of the bag; NaN without one."""
     first_step: int
-    """And at which row of the journal; -1 without one."""
+    """Its row in the journal; -1 without one."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """How a whole run compares."""
+    """Comparison of a whole run."""
 
     rows: tuple[FieldComparison, ...]
-    """Of the fields that are in the recording, in the order of :data:`FIELDS`."""
+    """Fields of the recording, in the order of :data:`FIELDS`."""
     tolerances: Tolerances
     time: Array
     recorded: Mapping[str, Array]
     computed: Mapping[str, Array]
     compared: Flags
-    """Which rows of the journal were compared, shape (n,)."""
+    """Mask of the compared journal rows, shape (n,)."""
     remarks: tuple[str, ...]
     parameters: tuple[str, ...]
-    """Settings that are not those of the recorded run, with both values."""
+    """Parameters that differ from the recorded ones, with both values."""
 
     @property
     def same(self) -> bool:
@@ -103,18 +103,18 @@ class Comparison:
 
     @property
     def first(self) -> FieldComparison | None:
-        """The field that diverges first; of several at once the one first in the table."""
+        """Field that diverges first; of several at once the first one in the table."""
         differing = [row for row in self.rows if row.differing]
         return min(differing, key=lambda row: row.first_step, default=None)
 
     def beyond(self, name: str) -> Flags:
-        """Return at which rows a field is beyond its tolerance, shape (n,)."""
+        """Return the mask of rows at which a field is beyond its tolerance, shape (n,)."""
         return self.compared & _beyond(
             self.recorded[name], self.computed[name], *self.tolerances.of(name)
         )
 
     def table(self) -> str:
-        """Return the comparison as text, what is to be known of it first."""
+        """Return the comparison as text, remarks first."""
         lines = [f'note: {remark}' for remark in self.remarks]
         lines += [f'setting: {text}' for text in self.parameters]
         count, total = int(np.count_nonzero(self.compared)), self.compared.size
@@ -134,7 +134,7 @@ class Comparison:
         return '\n'.join(lines)
 
     def verdict(self) -> str:
-        """Return the outcome in one sentence."""
+        """Return the verdict in one sentence."""
         first = self.first
         if first is None:
             absolute, relative = self.tolerances.absolute, self.tolerances.relative
@@ -151,15 +151,15 @@ class Comparison:
 def compare(
     inputs: ControllerInputs, again: ReplayResult, tolerances: Tolerances | None = None
 ) -> Comparison:
-    """Return how a rerun compares with the recorded run.
+    """Return the comparison of a replay with the recorded run.
 
-    Only those events count at which all is known that the answer depends on. Where there is none,
-    as in a bag without a journal, all are compared, and the outcome says so.
+    Only events with complete inputs count. Without any, as in a bag without a journal, all are
+    compared, and a remark states it.
 
     Raises
     ------
     ReplayError
-        Nothing was recorded that could be compared.
+        The recording holds nothing to compare.
     """
     remarks = list(inputs.notes)
     compared = inputs.exact
@@ -173,7 +173,7 @@ def compare(
         first = inputs.time[np.flatnonzero(~compared)[0]]
         remarks.append(
             f'{np.count_nonzero(~compared)} events, the first at {first:.3f} s, are left out: '
-            'what the controller knew then is not all in the bag'
+            'the inputs of the controller are not all in the bag'
         )
     differing = [
         f'{name} is {again.changed[name]}, recorded {_format_values(values)}'
@@ -188,7 +188,7 @@ def compare(
 def compare_bags(
     one: ControllerInputs, other: ControllerInputs, tolerances: Tolerances | None = None
 ) -> Comparison:
-    """Return how what two bags hold of one run compares, a bag and its rerun say.
+    """Return the comparison of two bags of one run, such as a bag and its replay.
 
     Events are matched by their number where both have a journal, else by the stamp of the
     odometry.
@@ -208,7 +208,7 @@ def compare_bags(
     for name in FIELDS:
         computed[name] = np.full(rows.size, np.nan)
         computed[name][there] = other.recorded[name][rows[there]]
-    # A topic that only one of both has cannot be compared.
+    # A topic that only one bag holds cannot be compared.
     recorded = {
         name: np.where(np.isnan(computed[name]), np.nan, one.recorded[name]) for name in FIELDS
     }
@@ -229,7 +229,7 @@ def compare_columns(
     remarks: Sequence[str] = (),
     parameters: Sequence[str] = (),
 ) -> Comparison:
-    """Return how columns of numbers compare where they were recorded; arrays are shape (n,)."""
+    """Return the comparison of columns where they were recorded; arrays have shape (n,)."""
     tolerances = tolerances or Tolerances()
     rows = []
     for name in (name for name in FIELDS if name in computed):
@@ -268,7 +268,7 @@ def compare_columns(
 
 
 def _beyond(was: Array, now: Array, absolute: float, relative: float) -> Flags:
-    """Return where two columns are further apart than they may; no number is far from any."""
+    """Return the mask of differences beyond the tolerance; a missing number always differs."""
     with np.errstate(invalid='ignore'):
         near = np.abs(now - was) <= absolute + relative * np.abs(was)
     return np.asarray(~near & ~np.isnan(was))
@@ -281,7 +281,7 @@ def _keys(inputs: ControllerInputs, numbered: bool) -> list[tuple[int, int]]:
             for start, life in enumerate(inputs.lives)
             for number in life.rows[:, 0].tolist()
         ]
-    # A stamp may come twice: the robot's clock has started again.
+    # A stamp may occur twice: the clock of the robot has been restarted.
     seen: dict[int, int] = {}
     keys = []
     for stamp, event in zip(inputs.stamps_ns.tolist(), inputs.events.tolist(), strict=True):
@@ -296,7 +296,7 @@ def _keys(inputs: ControllerInputs, numbered: bool) -> list[tuple[int, int]]:
 def _recorded_values(
     inputs: ControllerInputs, names: Mapping[str, object]
 ) -> dict[str, list[object]]:
-    """Return the values that settings had in the run, in their order."""
+    """Return the values of parameters over the run, in order."""
     tables = [parameters for life in inputs.lives for parameters in life.parameters.values()]
     found: dict[str, list[object]] = {}
     for name in names:
@@ -308,7 +308,8 @@ def _differing(one: ControllerInputs, other: ControllerInputs) -> list[str]:
     names = {row.name: None for row in ControllerParameters.specs()}
     mine, its = _recorded_values(one, names), _recorded_values(other, names)
     return [
-        f'{name} is {_format_values(its[name])} in {other.bag}, {_format_values(mine[name])} in {one.bag}'
+        f'{name} is {_format_values(its[name])} in {other.bag}, '
+        f'{_format_values(mine[name])} in {one.bag}'
         for name in names
         if mine[name] != its[name]
     ]

@@ -39,23 +39,23 @@ TYPES: Mapping[str, str] = {
 }
 """Types of the topics by relative name."""
 LATER = 20_000
-"""ns between a command and what the controller says of it."""
+"""ns between a command and the telemetry of the same step."""
 
 _HEAD = b'\x00\x01\x00\x00'  # CDR, little-endian
 _NO_COVARIANCE = bytes(36 * 8)
 
 
 class ControllerBag:
-    """Writes messages into a bag; a message is received as it is published.
+    """Writes messages into a bag; receive time and publish time are equal.
 
     Parameters
     ----------
     folder
-        Of the bag.
+        Folder of the bag.
     settings
-        The controller's, kept as details as the recorder does.
+        Parameters of the controller, stored as metadata record as by the recorder.
     details
-        Further tables of text.
+        Further metadata records.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class ControllerBag:
 
     @property
     def path(self) -> Path:
-        """The file that is written."""
+        """The written file."""
         return self._writer.path
 
     def motion(self, topic: str, now_ns: int, motion: State) -> None:
@@ -95,7 +95,7 @@ class ControllerBag:
         self.write(f'{CONTROLLER}/settings', now_ns, _HEAD + text)
 
     def number(self, now_ns: int, name: str, value: float) -> None:
-        """Write one of the numbers that the controller says of itself, if it is finite."""
+        """Write one scalar of the controller if it is finite."""
         if math.isfinite(value):
             self.write(f'{CONTROLLER}/{name}', now_ns, float_bytes(value))
 
@@ -110,25 +110,25 @@ class ControllerBag:
         self.close()
 
     def write(self, topic: str, now_ns: int, data: bytes) -> None:
-        """Write a message as it is."""
+        """Write a message unchanged."""
         self._writer.write(f'/{topic}', now_ns, now_ns, data)
 
 
 class RecordedController:
-    """A controller of which everything is written down, as its node and the recorder do.
+    """A controller whose inputs and outputs are written to a bag, as by node and recorder.
 
-    Every event carries the time at which it happens, which must not go backwards.
+    Every event has its time, which must not decrease.
 
     Parameters
     ----------
     settings
-        Of the controller.
+        Parameters of the controller.
     tape
-        Where its topics are written.
+        Bag for its topics.
     now_ns
-        When it starts.
+        Start time.
     every
-        Steps from one publication of its numbers to the next.
+        Steps between two publications of its scalars.
     model
         Model file to start from.
     """
@@ -151,13 +151,13 @@ class RecordedController:
             tape.row(now_ns, self._journal.model(zlib.crc32(model.read_bytes())))
 
     def add_reference(self, now_ns: int, motion: State) -> None:
-        """Hand a reference over."""
+        """Pass a reference to the controller."""
         self._tape.motion(REFERENCE, now_ns, motion)
         self._journal.reference(motion.stamp_ns)
         self.controller.add_reference(motion)
 
     def step(self, now_ns: int, measured: State) -> tuple[BodyTwist, Status]:
-        """Return command and status of one odometry message."""
+        """Return command and status for one odometry message."""
         self._tape.motion(ODOMETRY, now_ns, measured)
         command, status = self.controller.step(measured)
         self._tape.command(now_ns + LATER, command)
@@ -169,23 +169,23 @@ class RecordedController:
         return command, status
 
     def silent(self, now_ns: int) -> None:
-        """Find that the odometry has gone silent, and stop."""
+        """Handle missing odometry: stop."""
         self.controller.check_odometry(None, now_ns)
         self._tape.command(now_ns, STANDSTILL)
         self._tape.row(now_ns + LATER, self._journal.silent(self.controller.status.stamp_ns))
 
     def enable(self, now_ns: int, on: bool) -> None:
-        """Let the robot move, or stop it."""
+        """Enable or disable motion."""
         self.controller.enable(on)
         self._tape.row(now_ns, self._journal.enable(on))
 
     def reset(self, now_ns: int) -> None:
-        """Forget what was learnt."""
+        """Reset the controller."""
         self.controller.reset()
         self._tape.row(now_ns, self._journal.reset())
 
     def configure(self, now_ns: int, changes: Mapping[str, object]) -> None:
-        """Use other live settings."""
+        """Apply other dynamic parameters."""
         parameters = self.controller.parameters.with_values(changes)
         self.controller.configure(parameters)
         row = self._journal.configure()
@@ -193,16 +193,16 @@ class RecordedController:
         self._tape.row(now_ns, row)
 
     def finish(self, now_ns: int) -> None:
-        """Command the last stop."""
+        """Publish the final stop."""
         self._tape.command(now_ns, STANDSTILL)
         self._tape.row(now_ns + LATER, self._journal.finish())
 
 
 def write_replay(inputs: ControllerInputs, again: ReplayResult, folder: Path) -> Path:
-    """Return the bag file that holds a rerun: its inputs, and what was computed from them.
+    """Return the bag file of a replay: its inputs and its computed outputs.
 
-    Numbers are written at every step. Messages carry the times of the recorded run, so that both
-    bags can be looked at together.
+    Scalars are written at every step. Messages have the times of the recorded run, so that both
+    bags can be viewed together.
 
     Raises
     ------
@@ -237,7 +237,7 @@ def write_replay(inputs: ControllerInputs, again: ReplayResult, folder: Path) ->
 
 
 def numbers(status: Status) -> dict[str, float]:
-    """Return what the controller says of a step, by the names of ``NUMBERS``."""
+    """Return the scalars of a step by the names of ``NUMBERS``."""
     pairs = {
         'error': status.error,
         'estimate': status.estimate,
@@ -271,7 +271,7 @@ def row_bytes(row: Sequence[int]) -> bytes:
 
 
 def odometry_bytes(motion: State) -> bytes:
-    """Return a ``nav_msgs/msg/Odometry`` as CDR; frames as the nodes have them by default."""
+    """Return a ``nav_msgs/msg/Odometry`` as CDR, with the default frames of the nodes."""
     seconds, rest = divmod(motion.stamp_ns, NANOSECONDS)
     body = struct.pack('<iI', seconds, rest)
     for text in ('odom', 'base_link'):

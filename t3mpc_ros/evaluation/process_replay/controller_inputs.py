@@ -44,7 +44,7 @@ Flags = NDArray[np.bool_]
 
 CONTROLLER = 'controller'
 PAIRS = ('error', 'estimate', 'skill', *(f'terms/{name}' for name in (*TERM_NAMES, 'applied')))
-"""What the controller tells of both wheels."""
+"""Scalar topics of the controller for both wheels."""
 SPEEDS = ('cmd_vel.linear.x', 'cmd_vel.angular.z')
 NUMBERS = (
     *(f'{name}/{wheel}' for name in PAIRS for wheel in WHEELS),
@@ -52,67 +52,67 @@ NUMBERS = (
     'lyapunov/margin',
 )
 FIELDS = (*SPEEDS, *NUMBERS)
-"""What is compared, as columns of plain numbers."""
+"""Compared fields, as columns."""
 
 
 class ReplayError(RuntimeError):
-    """A bag that cannot be computed again, or not be compared; the text says which and why."""
+    """The bag cannot be replayed or compared; the text gives the reason."""
 
 
 @dataclass(frozen=True)
 class ControllerSession:
-    """What happened to a controller from one start of its node to the next, a row an event."""
+    """Events from one start of the controller node to the next, one row each."""
 
     first: int
-    """Its first row, counted over all lives."""
+    """Index of its first row over all lives."""
     rows: Integers
     """The journal, as in :data:`~t3mpc_ros.bag.run.journal.JOURNAL_COLUMNS`, shape (n, 5)."""
     taken: ConsumedMessages
     exact: Flags
-    """Whether all that the controller knew is in the bag: then its answer must come out, (n,)."""
+    """Whether all inputs are in the bag, so that the output must be equal, shape (n,)."""
     parameters: Mapping[int, ControllerParameters]
-    """By revision."""
+    """Parameters by revision."""
     start: int
-    """The revision it began with."""
+    """Initial revision."""
     model: Mapping[str, Array] | None
 
     @property
     def events(self) -> Integers:
-        """What happened, shape (n,)."""
+        """Event kinds, shape (n,)."""
         return self.rows[:, 1]
 
 
 @dataclass(frozen=True)
 class ControllerInputs:
-    """What a controller was given, and what it answered in the recorded run."""
+    """Inputs of a recorded controller and its outputs."""
 
     bag: Path
     odometry: TopicColumns
     references: TopicColumns
     lives: tuple[ControllerSession, ...]
     time: Array
-    """When each row was, s since the first message of the bag, shape (n,)."""
+    """Time of each row, s since the first message of the bag, shape (n,)."""
     recorded: Mapping[str, Array]
-    """By :data:`FIELDS`, NaN where nothing was recorded, shape (n,) each."""
+    """Recorded outputs by :data:`FIELDS`, NaN where missing, shape (n,) each."""
     journalled: bool
-    """Whether the order is that of the journal, and not of receipt."""
+    """Whether the order is that of the journal instead of receive times."""
     start_ns: int
     notes: tuple[str, ...] = field(default=())
-    """What a person should know of them."""
+    """Remarks for the user."""
 
     @property
     def stamps_ns(self) -> Integers:
-        """Stamp of the odometry of each row, shape (n,)."""
+        """Odometry stamp of each row, shape (n,)."""
         return np.concatenate([life.rows[:, 2] for life in self.lives])
 
     @property
     def events(self) -> Integers:
-        """Event of each row, shape (n,)."""
+        """Event kind of each row, shape (n,)."""
         return np.concatenate([life.events for life in self.lives])
 
     @property
     def exact(self) -> Flags:
-        """Whether all is known that the answer of each row depends on, shape (n,)."""
+        """Whether the inputs of each row are complete, shape (n,)."""
         return np.concatenate([life.exact for life in self.lives])
 
     @property
@@ -124,23 +124,23 @@ class ControllerInputs:
 def load_inputs(
     bag: Path, namespace: str | None = None, model: Mapping[str, Array] | None = None
 ) -> ControllerInputs:
-    """Return what the controller of a bag was given and answered.
+    """Return inputs and recorded outputs of the controller of a bag.
 
     Parameters
     ----------
     bag
-        Its folder, or a file of it.
+        Folder or file of the bag.
     namespace
-        Of the robot; the one with most topics by default.
+        Namespace of the robot; the one with most topics by default.
     model
-        What the controller began with, in place of what the bag says.
+        Initial model in place of the recorded one.
 
     Raises
     ------
     ReplayError
-        Topics or settings are missing.
+        Topics or parameters are missing.
     TrainingError
-        The recorded settings cannot be used.
+        The recorded parameters cannot be used.
     BagError
         The bag cannot be read.
     """
@@ -189,7 +189,7 @@ def load_inputs(
 
 
 def motions(column: TopicColumns) -> StateArray:
-    """Return odometry messages in the controller's own words."""
+    """Return odometry messages as states."""
     x, y, qx, qy, qz, qw, linear, angular = column.numbers.T
     with np.errstate(over='ignore', invalid='ignore'):
         sine = 2.0 * (qw * qz + qx * qy)
@@ -204,7 +204,7 @@ Revision = tuple[int, int, Mapping[str, object]]
 
 
 def _revisions(held: BagIndex, topic: str) -> list[Revision]:
-    """Return (received, revision, flat settings) in order of receipt."""
+    """Return (receive time, revision, parameters) in order of receipt."""
     if not held.counts.get(topic):
         return []
     try:
@@ -214,7 +214,7 @@ def _revisions(held: BagIndex, topic: str) -> list[Revision]:
 
 
 def _parameters(values: Mapping[str, object]) -> ControllerParameters:
-    """Return the controller's part of its node's settings."""
+    """Return the controller's own part of the node parameters."""
     names = _names()
     return ControllerParameters.from_dict({k: v for k, v in values.items() if k in names})
 
@@ -225,7 +225,7 @@ def _names() -> frozenset[str]:
 
 
 class _Reader:
-    """Puts together the lives of the controller of one bag, and says what is lost."""
+    """Assembles the lives of the controller of one bag and reports losses."""
 
     def __init__(
         self,
@@ -245,14 +245,14 @@ class _Reader:
         self._published: Integers = np.zeros(0, dtype=np.int64)
 
     def lives(self) -> tuple[list[ControllerSession], Integers, Integers]:
-        """Return the lives, when their rows were published, and the command of each row."""
+        """Return the lives, the publication time of their rows, and the command of each row."""
         if not self.journalled:
             return self._one_life()
         journal = self._columns[f'{CONTROLLER}/journal']
-        # Of an older start, kept by the publisher for whoever comes late: in order of sending.
+        # A previous life, kept by the latched publisher: in order of publication.
         order = np.argsort(journal.published_ns, kind='stable')
         rows, published = journal.integers[order], journal.published_ns[order]
-        fresh = np.concatenate([[True], np.diff(rows[:, 0]) != 0])  # heard twice after a restart
+        fresh = np.concatenate([[True], np.diff(rows[:, 0]) != 0])  # duplicates after a restart
         rows, published, received = (
             rows[fresh],
             published[fresh],
@@ -267,7 +267,7 @@ class _Reader:
         return lives, published, commands_of(rows, published, commands.published_ns)
 
     def answers(self, lives: Sequence[ControllerSession], commands: Integers) -> dict[str, Array]:
-        """Return what was recorded of each field, by row."""
+        """Return the recorded value of each field by row."""
         events = np.concatenate([life.events for life in lives])
         recorded = {name: np.full(len(events), np.nan) for name in FIELDS}
         there = commands >= 0
@@ -286,22 +286,22 @@ class _Reader:
         return recorded
 
     def _one_life(self) -> tuple[list[ControllerSession], Integers, Integers]:
-        """Return the only life there is to see without a journal: one that does not end."""
+        """Return the single life that is visible without a journal."""
         odometry, commands = self._columns[ODOMETRY], self._columns[COMMAND]
         taken, found = by_receipt(
             odometry.received_ns, self._columns[REFERENCE].received_ns, commands.received_ns
         )
         if not found.size:
-            raise ReplayError(f'{self._bag}: no command answers an odometry message')
+            raise ReplayError(f'{self._bag}: no command follows an odometry message')
         self._notes.append(
             'the bag has no journal of the controller: the order in which messages were received '
-            'stands in for the one in which they were taken'
+            'replaces the order of processing'
         )
         rows = np.zeros((found.size, len(JOURNAL_COLUMNS)), dtype=np.int64)
         rows[:, 0] = np.arange(found.size)
         rows[:, 2] = odometry.stamps_ns[taken.odometry]
         received = odometry.received_ns[taken.odometry]
-        # Numbers are told right after the command of their step.
+        # Scalars are published right after the command of their step.
         self._published = np.where(found >= 0, commands.published_ns[found], received)
         life = self._made(rows, taken, np.zeros(found.size, dtype=np.bool_), 0, received)
         return [life], received, found
@@ -351,10 +351,10 @@ class _Reader:
     def _parameters_of(
         self, rows: Integers, received: Integers
     ) -> tuple[dict[int, ControllerParameters], int]:
-        """Return the settings of one life by revision, and the revision it begins with."""
+        """Return the parameters of one life by revision, and its initial revision."""
         if self._default is not None:
             return {0: self._default}, 0
-        # The start is told before the first event.
+        # The initial parameters are published before the first event.
         starts = [i for i, entry in enumerate(self._revisions) if entry[1] == 0]
         before = [i for i in starts if self._revisions[i][0] <= received[-1]]
         begin = before[-1] if before else 0
@@ -363,12 +363,12 @@ class _Reader:
         found = {revision: _parameters(values) for _, revision, values in own}
         changes = rows[rows[:, 1] == Event.CONFIGURE, 4]
         start = 0
-        if rows[0, 0] > 0:  # what was in force before the first change that is in the bag
+        if rows[0, 0] > 0:  # in force before the first change in the bag
             start = int(changes[0]) - 1 if changes.size else max(found)
         return found, start
 
     def _model_name(self) -> str:
-        """Return the path that the controller was given, as far as it is recorded."""
+        """Return the path of the model file, as far as it is recorded."""
         if self._revisions:
             return str(self._revisions[0][2].get('model', ''))
         tables = (
@@ -377,7 +377,7 @@ class _Reader:
         return next((table['model'] for table in tables if 'model' in table), '')
 
     def _model_of(self, rows: Integers) -> Mapping[str, Array] | None:
-        """Return what the controller began with; None for nothing, or where it is lost."""
+        """Return the initial model; None without one, or where it is lost."""
         if self._model is not None:
             return self._model
         wanted = rows[rows[:, 1] == Event.MODEL, 4]

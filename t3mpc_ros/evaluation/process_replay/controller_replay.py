@@ -27,27 +27,27 @@ Array = NDArray[np.float64]
 
 _STEP = int(Event.STEP)  # an enumeration is slower to compare
 OPEN_LOOP = (
-    'open loop: the robot is the recorded one, which was driven by the recorded commands; it does '
-    'not answer to other ones'
+    'open loop: the robot is the recorded one, driven by the recorded commands; it does '
+    'not respond to other ones'
 )
-"""What has to be said of every rerun that is not made as the run was."""
+"""Remark on every replay with changes."""
 
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """What the controller answered, a row an event as in :class:`Inputs`; NaN where nothing."""
+    """Outputs of a replay, one row per event as in :class:`Inputs`; NaN where none."""
 
     fields: Mapping[str, Array]
-    """By :data:`~t3mpc_ros.evaluation.process_replay.controller_inputs.FIELDS`, or some of them, shape (n,) each."""
+    """Outputs by field name (``controller_inputs.FIELDS``), or some of them, shape (n,) each."""
     reasons: tuple[Reason | None, ...]
-    """Why the robot moved or did not; None at rows that are no step and no silence."""
+    """Stop reasons; None at rows that are neither a step nor a timeout."""
     steps: int
     plain: int
-    """How many of the steps were done in compiled stretches, see :func:`replay_batch`."""
+    """Number of steps computed in compiled batches, see :func:`replay_batch`."""
     parameters: ControllerParameters
-    """At the end."""
+    """Parameters at the end."""
     changed: Mapping[str, object]
-    """Settings that were given in place of the recorded ones."""
+    """Parameters that replaced the recorded ones."""
 
 
 def replay_controller(
@@ -55,23 +55,23 @@ def replay_controller(
     changes: Mapping[str, object] | None = None,
     controllers: Sequence[Controller] | None = None,
 ) -> ReplayResult:
-    """Return what today's controller makes of recorded inputs.
+    """Return the outputs of today's controller for recorded inputs.
 
     Parameters
     ----------
     inputs
-        Of the run.
+        Recorded inputs.
     changes
-        Settings by flat name that differ from the recorded ones, all through the run.
+        Parameters by name that replace the recorded ones throughout the run.
     controllers
-        What :func:`start` has returned for these; they are used up.
+        Controllers made by :func:`make_controllers`; consumed by the call.
 
     Raises
     ------
     ParameterError
-        A changed setting is unknown or cannot be used.
+        A changed parameter is unknown or invalid.
     ValueError
-        A model does not fit the settings.
+        A model does not fit the parameters.
     """
     changes = changes or {}
     controllers = make_controllers(inputs, changes) if controllers is None else controllers
@@ -91,12 +91,12 @@ def replay_controller(
 def make_controllers(
     inputs: ControllerInputs, changes: Mapping[str, object] | None = None
 ) -> list[Controller]:
-    """Return a controller for each life of the recorded one, compiled and as its node made it.
+    """Return one compiled controller for each recorded life, initialised as its node did.
 
     Raises
     ------
     ParameterError, ValueError
-        As :func:`rerun` does.
+        See :func:`replay_controller`.
     """
     controllers = []
     for life in inputs.lives:
@@ -111,7 +111,7 @@ def make_controllers(
 
 
 def _compile_march(parameters: ControllerParameters) -> None:
-    """Compile the plain stretches too, with a robot that stands and shall stand."""
+    """Compile the batch kernels too, with a robot at standstill."""
     count = 20
     stamps = np.arange(1, count + 1) * round(NANOSECONDS / parameters.rate)
     standing = StateArray(stamps, np.zeros((count, 3)), np.zeros((count, 2)))
@@ -129,7 +129,7 @@ def _replay_session(
     references: StateArray,
     answers: StepResults,
 ) -> int:
-    """Let the events of one life happen; return how many steps were plain."""
+    """Process the events of one life; return the number of steps computed in batches."""
     taken, events = life.taken, life.events
     rows = np.stack([taken.odometry, taken.begin, taken.end], axis=1)
     steps = (events == _STEP) & (taken.odometry >= 0)
@@ -161,7 +161,7 @@ def _replay_session(
 
 
 def _fields(answers: StepResults) -> dict[str, Array]:
-    """Return the answers by :data:`~t3mpc_ros.evaluation.process_replay.controller_inputs.FIELDS`."""
+    """Return the outputs by field name (``controller_inputs.FIELDS``)."""
     pairs = answers.pairs
     pairs |= {f'terms/{name}': pairs[name] for name in (*TERM_NAMES, 'applied')}
     columns = [*answers.twists.T]

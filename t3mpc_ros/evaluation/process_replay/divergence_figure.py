@@ -15,13 +15,13 @@ from t3mpc_ros.evaluation.process_replay.comparison import Comparison
 Array = NDArray[np.float64]
 
 BEFORE, AFTER = 0.5, 1.5
-"""s that are shown around the first divergence."""
+"""Half width of the zoomed window, s."""
 STRIPS = 400
-"""Most instants that the overview tells apart."""
+"""Maximum number of time bins of the overview."""
 
 
 def write_divergence_figure(outcome: Comparison, path: Path) -> None:
-    """Write a PNG of where, and in what, the computed run leaves the recorded one.
+    """Write a PNG of the first divergence of the replay from the recording.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def _close_up(close: Any, apart: Any, outcome: Comparison, name: str, when: floa
     time = outcome.time
     shown = (time >= when - BEFORE) & (time <= when + AFTER) & ~np.isnan(outcome.recorded[name])
     was, now = outcome.recorded[name][shown], outcome.computed[name][shown]
-    # The recorded line is wide, to be seen below the other where they agree.
+    # The recorded line is wide, so that it stays visible below the other.
     close.plot(time[shown], was, color=COLOURS['odom'], label='recorded', linewidth=4.0)
     close.plot(time[shown], now, color=COLOURS['error'], label='rerun', linewidth=1.0)
     close.set_title(name)
@@ -63,7 +63,7 @@ def _close_up(close: Any, apart: Any, outcome: Comparison, name: str, when: floa
     with np.errstate(invalid='ignore'):
         far = np.abs(now - was)
     allowed = np.maximum(absolute + relative * np.abs(was), 1e-18)
-    # Where both agree to the last bit there is no logarithm to show.
+    # Bit-equal values have no logarithm.
     floor = 0.1 * float(allowed.min())
     apart.plot(time[shown], np.maximum(far, floor), color=COLOURS['error'], label='difference')
     apart.plot(time[shown], allowed, color=COLOURS['target'], label='tolerance')
@@ -78,7 +78,7 @@ def _close_up(close: Any, apart: Any, outcome: Comparison, name: str, when: floa
 
 
 def _overview(axis: Any, outcome: Comparison, fields: list[str]) -> None:
-    """Draw for each field when it is compared (pale) and when it is beyond its tolerance."""
+    """Draw for each field where it is compared (pale) and where it exceeds its tolerance."""
     time = outcome.time
     span = max(float(time[-1] - time[0]), 1e-3)
     bins = np.minimum(((time - time[0]) / span * STRIPS).astype(int), STRIPS - 1)
@@ -102,9 +102,9 @@ def _overview(axis: Any, outcome: Comparison, fields: list[str]) -> None:
 
 
 def _spread(there: NDArray[np.int64], beyond: NDArray[np.int64]) -> Array:
-    """Return 1 where something is beyond, 0 where all agrees, NaN where nothing is known.
+    """Return 1 where a value exceeds its tolerance, 0 where all agree, NaN where unknown.
 
-    Numbers come less often than the strips are wide: each holds until the next.
+    Values are sparser than the bins: each holds until the next.
     """
     row = np.full(STRIPS, math.nan)
     row[there] = 0.0

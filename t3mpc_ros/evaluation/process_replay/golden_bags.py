@@ -21,9 +21,9 @@ from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule
 
 START_NS = 1_700_000_000 * NANOSECONDS
 RECEIPT_DELAY = 500_000
-"""ns from a stamp of the odometry to the controller hearing of it."""
+"""ns from the stamp of an odometry message to its arrival at the controller."""
 WATCHDOG_PERIOD = 0.05
-"""s from one look of the watch on the odometry to the next."""
+"""s between two checks of the odometry watchdog."""
 
 
 @dataclass(frozen=True)
@@ -31,18 +31,18 @@ class GoldenScenario:
     """One golden run."""
 
     seed: int
-    """Of reference and robot."""
+    """Seed of reference and robot."""
     stretches: tuple[tuple[float, float], ...]
-    """From when to when the reference is followed, s; it switches each 12 s, and between them."""
+    """Intervals in which the reference is followed, s; it switches every 12 s and between them."""
     deeds: Mapping[float, tuple[str, object]]
     """By time (s): ``enable`` (bool), ``reset`` (None), ``configure`` (changes)."""
     faults: tuple[FaultEvent, ...] = ()
     quiet_reference: tuple[float, float] = (math.inf, math.inf)
-    """From when to when no reference comes, s."""
+    """Interval without reference, s."""
     quiet_odometry: tuple[float, float] = (math.inf, math.inf)
-    """From when to when no odometry comes, s."""
+    """Interval without odometry, s."""
     bad_odometry: tuple[float, ...] = ()
-    """When a message comes that is not finite, s."""
+    """Times of odometry messages that are not finite, s."""
 
 
 GOLDEN_SCENARIOS: Mapping[str, GoldenScenario] = {
@@ -80,11 +80,11 @@ GOLDEN_SCENARIOS: Mapping[str, GoldenScenario] = {
         ),
     ),
 }
-"""By the name of their file."""
+"""Golden runs by the name of their file."""
 
 
 def write_golden(folder: Path, progress: Callable[[str], None] = print) -> list[Path]:
-    """Return the golden bags, made anew in ``folder`` by the controller as it is now.
+    """Write the golden bags to ``folder`` with the current controller, and return their paths.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def write_golden(folder: Path, progress: Callable[[str], None] = print) -> list[
 
 
 def run_golden_scenario(recipe: GoldenScenario, folder: Path) -> Path:
-    """Return the bag file of a run, written into ``folder``: equal recipes give equal messages."""
+    """Return the bag file of a run in ``folder``; equal recipes give equal messages."""
     parameters = loop_controller()
     robot = DigitalTwin(loop_robot(seed=recipe.seed), FaultSchedule(recipe.faults))
     whole = chaotic_course(recipe.stretches[-1][1], recipe.seed)
@@ -128,7 +128,7 @@ def run_golden_scenario(recipe: GoldenScenario, folder: Path) -> Path:
 
 
 class _Loop:
-    """Lets happen what a recipe says, in its time."""
+    """Executes a recipe in virtual time."""
 
     def __init__(self, recipe: GoldenScenario, taped: RecordedController) -> None:
         self._recipe, self._taped = recipe, taped
@@ -140,14 +140,14 @@ class _Loop:
         self._told_ns = 0
 
     def reference(self, k: int, now: int, wheels: list[float], geometry: WheelGeometry) -> None:
-        """Hand over sample ``k`` of the reference at period ``now``."""
+        """Pass sample ``k`` of the reference at period ``now``."""
         begin, end = self._recipe.quiet_reference
         if not begin <= now / RATE < end:
             twist = twist_from_wheels(WheelSpeeds(*wheels), geometry)
             self._taped.add_reference(self._later(now), State(START_NS + _stamp(k), ORIGIN, twist))
 
     def step(self, k: int, odometry: State) -> tuple[WheelSpeeds, int]:
-        """Return the newest command and the stamp of the odometry that it answers."""
+        """Return the newest command and the stamp of its odometry."""
         now, recipe = k / RATE, self._recipe
         for when in [when for when in self._deeds if when <= now]:
             self._do(k, *self._deeds.pop(when))
@@ -170,7 +170,7 @@ class _Loop:
         self._taped.finish(self._now_ns + NANOSECONDS // 100)
 
     def _watch(self, k: int, now: float) -> None:
-        """Look for silence, as the node does now and then."""
+        """Check for missing odometry, as the node does periodically."""
         timeout = self._taped.controller.parameters.watchdog.odometry_timeout
         if now - self._heard > timeout and now - self._watched > WATCHDOG_PERIOD - 1e-9:
             self._watched = now
@@ -187,7 +187,7 @@ class _Loop:
             self._taped.configure(now_ns, how)
 
     def _later(self, k: int) -> int:
-        """Return the time of period ``k``, a little later each time it is asked for."""
+        """Return the time of period ``k``, slightly later with each call."""
         self._now_ns = max(START_NS + _stamp(k), self._now_ns + 1000)
         return self._now_ns
 

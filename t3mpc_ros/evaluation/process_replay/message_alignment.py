@@ -19,18 +19,18 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class ConsumedMessages:
-    """Messages by event: rows of what was recorded."""
+    """Recorded messages by event, as row numbers."""
 
     odometry: Integers
-    """The message of each step; -1 at other events, and where it is not in the bag, shape (n,)."""
+    """Message of each step; -1 at other events, and where it is missing in the bag, shape (n,)."""
     begin: Integers
-    """First of the references that were handed over since the event before, shape (n,)."""
+    """First reference passed since the previous event, shape (n,)."""
     end: Integers
-    """One beyond the last of them."""
+    """One past the last of them."""
     broken: Flags
-    """Whether something is lost between the event before and this one, shape (n,)."""
+    """Whether something is lost between the previous event and this one, shape (n,)."""
     restarts: Flags
-    """Whether this is a reset after which nothing of before matters, shape (n,)."""
+    """Whether this is a reset that makes the past irrelevant, shape (n,)."""
     lost_odometry: int
     lost_references: int
     lost_events: int
@@ -65,7 +65,7 @@ def with_initial_inputs(received: TopicColumns, initial: TopicColumns) -> TopicC
 
 
 def match(rows: Integers, odometry_ns: Integers, reference_ns: Integers) -> ConsumedMessages:
-    """Return what the controller had, by its journal.
+    """Return the messages that the controller processed, by its journal.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def match(rows: Integers, odometry_ns: Integers, reference_ns: Integers) -> Cons
         odometry,
         begin,
         end,
-        # Without a reference the robot stands, and all that is kept of odometry is its last stamp.
+        # Without a reference the robot is at rest, and only the last odometry stamp is state.
         (missing & (handed > 0)) | (gaps > 0) | (lost > 0) | (reset & late),
         reset & ~late,
         int(np.count_nonzero(missing)),
@@ -98,15 +98,15 @@ def match(rows: Integers, odometry_ns: Integers, reference_ns: Integers) -> Cons
 def by_receipt(
     odometry: Integers, references: Integers, commands: Integers
 ) -> tuple[ConsumedMessages, Integers]:
-    """Return what the controller probably had, from when everything was received.
+    """Return the messages that the controller probably processed, by receive times.
 
-    Of the odometry the messages that a command answers count as steps, and those between them.
-    The second answer is the command of each step, -1 where none is known, shape (n,).
+    Odometry messages followed by a command count as steps, and those between them.
+    The second result is the command of each step, -1 where unknown, shape (n,).
 
     Parameters
     ----------
     odometry, references, commands
-        When the messages were received, ns, ascending; at least one of each.
+        Receive times, ns, ascending; at least one of each.
     """
     first = min(int(odometry[0]), int(commands[0]))
     answered = match_commands((odometry - first) / NANOSECONDS, (commands - first) / NANOSECONDS)
@@ -122,16 +122,16 @@ def by_receipt(
 
 
 def commands_of(rows: Integers, published: Integers, sent: Integers) -> Integers:
-    """Return which recorded command belongs to each row, -1 where none does, shape (n,).
+    """Return the recorded command of each row, -1 without one, shape (n,).
 
-    The controller sends a command, and then its row of the journal.
+    The controller publishes a command and then its journal row.
 
     Parameters
     ----------
     rows
         The journal, shape (n, 5).
     published, sent
-        When rows and commands were published, by the clock of the controller, ns.
+        Publication times of rows and commands, by the clock of the controller, ns.
     """
     found = np.full(len(rows), -1, dtype=np.int64)
     commanding = np.isin(rows[:, 1], COMMAND_EVENTS)
@@ -141,28 +141,28 @@ def commands_of(rows: Integers, published: Integers, sent: Integers) -> Integers
     fits[fits] = sent[last[fits]] > before[fits]
     found[fits] = last[fits]
     if np.count_nonzero(fits) < np.count_nonzero(commanding) == sent.size:
-        # Nobody noted when they were published: as none is lost, their order will do.
+        # Publication times are unknown: without losses the order suffices.
         found[commanding] = np.arange(sent.size)
     return found
 
 
-def rows_of(published: Integers, told: Integers, steps: Flags) -> Integers:
-    """Return the row of the journal that each number was told after, -1 without one, shape (m,).
+def rows_of(published: Integers, scalars: Integers, steps: Flags) -> Integers:
+    """Return the journal row that each scalar follows, -1 without one, shape (m,).
 
     Parameters
     ----------
-    published, told
-        When rows and numbers were published, ns.
+    published, scalars
+        Publication times of rows and scalars, ns.
     steps
-        Whether a row is a step: only those are followed by numbers.
+        Whether a row is a step: only steps are followed by scalars.
     """
-    rows = np.searchsorted(published, told, side='right') - 1
+    rows = np.searchsorted(published, scalars, side='right') - 1
     rows[(rows >= 0) & ~steps[rows]] = -1
     return np.asarray(rows, dtype=np.int64)
 
 
 def _in_turn(wanted: Integers, recorded: Integers) -> Integers:
-    """Return where each stamp is in the recording, one after the other; -1 where it is not."""
+    """Return the position of each stamp in the recording, in order; -1 where it is missing."""
     if not wanted.size or not recorded.size:
         return np.full(wanted.size, -1, dtype=np.int64)
     for first in np.flatnonzero(recorded == wanted[0]).tolist():
@@ -183,10 +183,10 @@ def _in_turn(wanted: Integers, recorded: Integers) -> Integers:
 def _reference_ranges(
     handed: Integers, newest: Integers, recorded: Integers
 ) -> tuple[Integers, Integers, Integers, Flags]:
-    """Return from where to where references were handed over before each row, and lost ones.
+    """Return the range of references passed before each row, and the lost ones.
 
-    ``newest`` is the stamp of the last of them, 0 where the row does not tell. The last answer is
-    whether some that came before a row are handed over after it, because it does not.
+    ``newest`` is the stamp of the last of them, 0 where the row does not hold it. The last result
+    is whether some references before a row are passed after it for that reason.
     """
     end = np.zeros(len(handed), dtype=np.int64)
     tells = (newest != 0) & (handed > 0)
@@ -195,7 +195,7 @@ def _reference_ranges(
         if handed[tells][0] + shift <= 0:
             continue
         if np.array_equal(recorded[handed[tells] + shift - 1], newest[tells]):
-            # References that a row without a stamp tells of are handed over just as well.
+            # References before a row without a stamp are passed all the same.
             end = np.where(handed > 0, np.maximum(handed + shift, 0), max(shift, 0))
             end = np.minimum(end, recorded.size)
             begin = np.concatenate([[max(shift, 0)], end[:-1]])
@@ -208,18 +208,18 @@ def _reference_ranges(
 def _reference_ranges_with_gaps(
     handed: Integers, newest: Integers, recorded: Integers
 ) -> tuple[Integers, Integers, Integers, Flags]:
-    """Return the same where references were lost, or heard by the recorder alone."""
+    """Return the same where references were lost, or received by the recorder only."""
     places: dict[int, list[int]] = {}
     for row, stamp in enumerate(recorded.tolist()):
         places.setdefault(stamp, []).append(row)
     begin, end, lost = np.zeros((3, len(handed)), dtype=np.int64)
     late = np.zeros(len(handed), dtype=np.bool_)
-    told, now = 0, 0
+    counted, now = 0, 0
     guessed: list[int] = []
     for k, (count, stamp) in enumerate(zip(handed.tolist(), newest.tolist(), strict=True)):
-        new = count - told
+        new = count - counted
         begin[k] = end[k] = now
-        if stamp == 0:  # a row that does not tell: none is lost, as far as is known
+        if stamp == 0:  # a row without a stamp: no loss is known
             begin[k], end[k] = (
                 (end[guessed[-1]] if guessed else now),
                 min(now + new, len(recorded)),
@@ -229,13 +229,13 @@ def _reference_ranges_with_gaps(
         if now + new <= len(recorded) and recorded[now + new - 1] == stamp:
             begin[k], end[k] = (end[guessed[-1]] if guessed else now), now + new
         else:
-            # Then those before rows that do not tell are not known: all come before this one.
+            # Those before rows without a stamp are unknown: all precede this one.
             for guess in guessed:
                 late[guess] = end[guess] > begin[guess]
                 begin[guess] = end[guess] = now
             last = min((row for row in places.get(stamp, ()) if row >= now), default=now - 1)
             lost[k] = new - min(new, last + 1 - now)
             begin[k], end[k] = max(now, last + 1 - new), last + 1
-        told, now = count, int(end[k])
+        counted, now = count, int(end[k])
         guessed.clear()
     return begin, end, lost, late

@@ -35,21 +35,21 @@ from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
 Array = NDArray[np.float64]
 
 PREVIEW = 0.4
-"""How far ahead a method with preview may see at most, s; as in a trial of the lab."""
+"""Largest preview, s, as in the closed-loop evaluation."""
 
 
 def replay_method(
     inputs: ControllerInputs, name: str, changes: Mapping[str, object] | None = None
 ) -> ReplayResult:
-    """Return what a rival would have commanded where the controller let the robot move.
+    """Return what another method would have commanded where the controller allowed motion.
 
-    When that is so our controller decides, on the same inputs: all methods stop alike. There
-    are no fields but the commands.
+    The controller decides when that is, on the same inputs: all methods stop alike. The result
+    holds the commands only.
 
     Raises
     ------
     ReplayError
-        There is no rival of that name.
+        The method is unknown.
     """
     known = methods('velocity')
     if name not in known:
@@ -71,7 +71,7 @@ def _replay_session(
     references: StateArray,
     answers: Mapping[str, Array],
 ) -> None:
-    """Write the answers of one life."""
+    """Write the outputs of one life."""
     parameters = life.parameters[life.start]
     seat = _MethodAdapter(parameters, method)
     taken = life.taken
@@ -79,22 +79,22 @@ def _replay_session(
         row = life.first + k
         for i in range(int(taken.begin[k]), int(taken.end[k])):
             seat.track.add(references[i])
-        heard = int(taken.odometry[k])
-        if heard < 0 or ours.reasons[row] is not Reason.TRACKING:
+        message = int(taken.odometry[k])
+        if message < 0 or ours.reasons[row] is not Reason.TRACKING:
             seat.stop()
             continue
-        answer = seat.answer(odometry[heard])
+        answer = seat.answer(odometry[message])
         for speed, value in zip(SPEEDS, answer or (math.nan, math.nan), strict=True):
             answers[speed][row] = value
         if answer is None:
             continue
         sent = BodyTwist(*(float(inputs.recorded[speed][row]) for speed in SPEEDS))
         if all(map(math.isfinite, sent)):
-            seat.tell(sent)
+            seat.report_sent(sent)
 
 
 class _MethodAdapter:
-    """Where a rival sits: behind the estimator and in front of the drive of the controller."""
+    """Adapter of a method between the estimator and the drive of the controller."""
 
     def __init__(self, parameters: ControllerParameters, method: MethodSpec) -> None:
         self._parameters, self._method = parameters, method
@@ -114,13 +114,13 @@ class _MethodAdapter:
         self._last_ns = 0
 
     def stop(self) -> None:
-        """Let the rival rest; what it has learnt is kept."""
+        """Reset the method; what it has learned is kept."""
         if self._baseline is not None:
             self._learnt = self._baseline.get_weights()
             self._baseline = None
 
     def answer(self, measured: State) -> BodyTwist | None:
-        """Return what the rival commands; None where the reference is not known far enough."""
+        """Return the command of the method; None where the reference is too short."""
         drive, stamp = self._drive, measured.stamp_ns
         speeds = np.array(wheels_from_twist(measured.twist, self._parameters.geometry))
         gap = (stamp - self._last_ns) / NANOSECONDS
@@ -150,12 +150,12 @@ class _MethodAdapter:
         baseline.applied(applied, limited=drive.limited)
         return drive.twist
 
-    def tell(self, sent: BodyTwist) -> None:
-        """Take note of what was sent in the rival's place."""
+    def report_sent(self, sent: BodyTwist) -> None:
+        """Report the acceleration that was sent."""
         self._drive.set_command(np.array(wheels_from_twist(sent, self._parameters.geometry)))
 
     def _rows(self, stamp_ns: int, preview: bool) -> Array | None:
-        """Return r when the command begins to act and each period after it, shape (n, 2)."""
+        """Return r when the command takes effect and each period after it, shape (n, 2)."""
         geometry, track = self._parameters.geometry, self.track
         late = self._drive.dead_time
         if not preview:
@@ -175,7 +175,7 @@ class _MethodAdapter:
             found.append(wheels_from_twist(point.twist, geometry))
         if not found:
             return None
-        # What is not known yet is taken as it is known last.
+        # Unknown future values repeat the last known one.
         found += [found[-1]] * (max(2, round(PREVIEW / self._period)) - len(found))
         return np.array(found)
 

@@ -24,22 +24,22 @@ from t3mpc_ros.mpc.predictive_controller import PredictiveController
 Array = NDArray[np.float64]
 
 FITTED, NOMINAL, RANDOM = 'taught', 'nominal loop', 'random'
-"""Predictors that are judged: taught by the other folds, by the nominal loop only, and with
-output weights of the same size drawn at random. Skill 0 is no prediction."""
+"""Compared predictors: fitted to the other folds, nominal only, and with random output
+weights of the same size. Skill 0 is no prediction."""
 NEXT_STEP, MIDDLE = 'next step', 'middle of the horizon'
 
 
 @dataclass(frozen=True)
 class Fold:
-    """What the other folds teach, judged on this one."""
+    """Model of the other folds, evaluated on this one."""
 
     name: str
     judged: float
-    """Length of what it was judged on, s."""
+    """Length of the evaluated part, s."""
     skills: Mapping[str, Array]
-    """Of each predictor, (next step, middle) by (right, left); empty when none was learnt."""
+    """For each predictor (next step, middle) by (right, left); empty when none was fitted."""
     explained: Array
-    """Share of the variance of the unexplained acceleration that g accounts for, (2,)."""
+    """Explained share of the variance of the unexplained acceleration, by g, (2,)."""
 
 
 def blocks(replay: TrainingData, count: int) -> list[TrainingData]:
@@ -70,21 +70,21 @@ def cross_validate(
     *,
     keep_predictor: bool = False,
 ) -> list[Fold]:
-    """Return for each run what all the others teach, judged on it.
+    """Return for each run the model of all others, evaluated on it.
 
     Parameters
     ----------
     settings
-        Under which all were made.
+        Common parameters of all runs.
     runs
-        By the name that is shown; at least 2.
+        Runs by displayed name; at least 2.
     keep_predictor
-        Judge the coefficients only.
+        Evaluate the fuzzy coefficients only.
 
     Raises
     ------
     TrainingError
-        Without one of them too little is left to learn from, or none can be judged on.
+        Without one of the runs too little data is left, or no run can be evaluated.
     """
     predictive = parameters.predictive
     span = predictive.decimation / parameters.rate
@@ -119,7 +119,7 @@ def cross_validate(
 
 
 def random_output_weights(weights: Mapping[str, Array], seed: int) -> dict[str, Array]:
-    """Return weights whose output layer is drawn at random, as large as the taught one."""
+    """Return weights with a random output layer of the same size as the fitted one."""
     generator = np.random.default_rng((seed, 7))
     drawn = dict(weights)
     for name in ('output_weights', 'anchor'):
@@ -129,7 +129,7 @@ def random_output_weights(weights: Mapping[str, Array], seed: int) -> dict[str, 
 
 
 def mean_and_spread(values: Sequence[Array]) -> tuple[Array, Array]:
-    """Return mean and standard deviation over folds, of those that are known."""
+    """Return mean and standard deviation over the folds with a value."""
     table = np.stack(values)
     known = np.isfinite(table)
     count = known.sum(axis=0)
@@ -140,7 +140,7 @@ def mean_and_spread(values: Sequence[Array]) -> tuple[Array, Array]:
 
 
 def fold_table(folds: Sequence[Fold]) -> str:
-    """Return what was found as lines: rows are folds, each number is (right/left)."""
+    """Return the result as lines: rows are folds, each number is (right/left)."""
     rows = [(f'{fold.name} ({fold.judged:.1f} s)', fold) for fold in folds]
     width = max(len(f'skill, {MIDDLE}'), *(len(name) for name, _ in rows))
     lines = []
@@ -174,5 +174,5 @@ def spread_in_words(values: Sequence[Array], scale: float) -> str:
 
 
 def pair(values: Array, form: str) -> str:
-    """Return the numbers of both wheels as text, a dash for what is not known."""
+    """Return the numbers of both wheels as text, a dash for an unknown one."""
     return '/'.join(f'{value:{form}}' if math.isfinite(value) else '–' for value in values)

@@ -22,14 +22,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class MoveEffect:
-    """What a run tells of the effect of v_p."""
+    """Identified effect of v_p on the error."""
 
     response: float
-    """Change of the error per change of v_p that is held, (rad/s)/(rad/s²)."""
+    """Change of the error per held change of v_p, (rad/s)/(rad/s²)."""
     error: float
-    """Standard error of it; infinite when the run tells nothing."""
+    """Standard error of the gain; infinite when it is not identifiable."""
     own: float
-    """Standard deviation of the v_p that neither errors nor older v_p foretell, rad/s²."""
+    """Standard deviation of the part of v_p that errors and older v_p do not predict, rad/s²."""
 
 
 def estimate_move_effect(
@@ -47,7 +47,7 @@ def estimate_move_effect(
     Parameters
     ----------
     errors, moves
-        *Newest first*, NaN where they are not known, shape (N,).
+        *Newest first*, NaN where unknown, shape (N,).
     delta_lags, move_lags
         n_a and n_b.
     ahead
@@ -84,7 +84,7 @@ def estimate_move_effect(
 
 
 def _response(values: Array, delta_lags: int, ahead: int) -> float:
-    """Return the error ``ahead`` periods after v_p has stepped from 0 to 1."""
+    """Return the error ``ahead`` periods after a unit step of v_p."""
     a, b = values[:delta_lags], values[delta_lags:]
     errors, moves = np.zeros(a.size), np.zeros(b.size)
     for _ in range(ahead):
@@ -97,26 +97,26 @@ def _response(values: Array, delta_lags: int, ahead: int) -> float:
 
 
 MIN_EXCITATION = 10.0
-"""Least length of what can be learnt from, s."""
+"""Least amount of usable data, s."""
 MIN_PERIODS = 40
-"""Least predictive periods of a stretch without a gap: shorter ones do not show their phase."""
+"""Least predictive periods of a segment without a gap: shorter ones do not show their phase."""
 JUDGED = 20
-"""Least predictive periods without a gap that a predictor is judged by."""
+"""Least predictive periods without a gap for an evaluation."""
 UNCERTAIN = 0.5
-"""Largest standard error of the effect of v_p, as a share of the nominal one: twice this, and an
-effect could not be told from none."""
+"""Largest standard error of the effect of v_p, as a share of the nominal one: at twice this an
+effect could not be distinguished from none."""
 PASSES, SHARE = 12, 0.1
-"""How often the coefficients go through a run, and mu of the first time."""
+"""Passes over a run, and mu of the first pass."""
 SETTLING = 0.5
-"""Start of every stretch that the coefficients do not learn from, s: the estimate settles."""
+"""Start of every segment that is excluded from the fit, s: the estimate settles."""
 
 
 @dataclass(frozen=True)
 class PredictorFit:
-    """What the predictor learnt."""
+    """Fitted predictor."""
 
     weights: dict[str, Array]
-    """As :meth:`PredictiveController.weights` returns them."""
+    """Weights as :meth:`PredictiveController.get_weights` returns them."""
     uncertainty: Array
     """Standard error of the effect of v_p over the nominal effect, shape (2,)."""
     taught: float
@@ -128,29 +128,29 @@ def periods(
 ) -> tuple[Array, Array]:
     """Return errors (rad/s) and moves (rad/s²) of each predictive period, oldest first, (N, 2).
 
-    They are sampled as :func:`t3mpc_ros.mpc.skill.gather` does: an error is the mean of the newest
-    ``average`` ones at the step that takes the sample, and v_p holds from that step on. How long
-    before a published v_p that was is seen in u, which jumps with v_p: so a recording may begin
+    They are sampled as by the predictive controller: an error is the mean of the newest
+    ``average`` ones at the step that takes the sample, and v_p holds from that step on. The delay
+    of a published v_p shows in u, which jumps with v_p: a recording may therefore begin
     at any time.
 
-    Messages may be missing. What is not known is NaN: errors that were rebuilt wrongly or not at
-    all, v_p in periods most of which limits cut u, and a whole row wherever a period is without a
-    message, or runs do not follow each other. Nothing is learnt across such a gap, nor from an
-    error whose lags reach into one; all the rest counts.
+    Messages may be missing. Unknown values are NaN: errors that were reconstructed wrongly or not
+    at all, v_p in periods in which limits mostly cut u, and a whole row wherever a period has no
+    message, or runs are not contiguous. Nothing is fitted across such a gap, nor to an
+    error whose lags reach into one; all other rows count.
 
     Parameters
     ----------
     replay
         One or several runs.
     settings
-        Of the predictive term.
+        Parameters of the predictive controller.
     rate
-        Control periods a second.
+        Control rate, Hz.
 
     Raises
     ------
     TrainingError
-        v_p was published too seldom.
+        v_p was published too rarely.
     """
     decimation, average, span = (
         parameters.decimation,
@@ -162,22 +162,23 @@ def periods(
     jumps = np.abs(np.diff(replay.rest, axis=0, prepend=replay.rest[:1])).sum(axis=1)
     edges = [*np.flatnonzero(replay.begins).tolist(), len(replay)]
     for first, last in pairwise(edges):
-        said = first + np.flatnonzero(np.isfinite(replay.moves[first:last]).all(axis=1))
-        said = _one_each(replay, said, span)
-        said = said[said >= first + decimation + average]
-        if said.size < MIN_PERIODS:
+        published = first + np.flatnonzero(np.isfinite(replay.moves[first:last]).all(axis=1))
+        published = _one_each(replay, published, span)
+        published = published[published >= first + decimation + average]
+        if published.size < MIN_PERIODS:
             continue
-        interval = float(np.median(np.diff(replay.time[said])))
+        interval = float(np.median(np.diff(replay.time[published])))
         if interval > 1.5 * span:
             raise TrainingError(
                 f'v_p must be published in each predictive period of {span:g} s: it was every '
                 f"{interval:.2g} s; set the controller's terms_rate to {1.0 / span:g} Hz"
             )
-        # The median, because limits make u jump too, but seldom.
-        starts = said - np.argmax([np.median(jumps[said - late]) for late in range(decimation)])
+        # The median: limits make u jump too, but rarely.
+        delays = [np.median(jumps[published - late]) for late in range(decimation)]
+        starts = published - np.argmax(delays)
         seen = starts[:, None] - np.arange(average)
         held = np.minimum(starts[:, None] + np.arange(decimation), last - 1)
-        error, move = replay.errors[seen].mean(axis=1), replay.moves[said]
+        error, move = replay.errors[seen].mean(axis=1), replay.moves[published]
         whole = (average - 0.5) / rate > replay.time[starts] - replay.time[seen[:, -1]]
         error[~whole] = math.nan
         move[replay.limited[held].mean(axis=1) > 0.5] = math.nan
@@ -188,7 +189,7 @@ def periods(
 
 
 def _one_each(replay: TrainingData, rows: NDArray[np.int64], span: float) -> NDArray[np.int64]:
-    """Return one of the rows per predictive period: the first of those with the same v_p."""
+    """Return one row per predictive period: the first with the same v_p."""
     kept: list[int] = []
     for row in rows.tolist():
         if (
@@ -201,12 +202,12 @@ def _one_each(replay: TrainingData, rows: NDArray[np.int64], span: float) -> NDA
 
 
 def fit_predictor(parameters: Nt3fsMpcParameters, errors: Array, moves: Array) -> PredictorFit:
-    """Return what the predictor learns from all of a run in periods, see :func:`periods`.
+    """Return the predictor fitted to all of a run in periods, see :func:`periods`.
 
     Raises
     ------
     TrainingError
-        Too little is known, or v_p moved too little to show what it does.
+        There is too little data, or v_p moved too little to identify its effect.
     """
     predictive, period = parameters.predictive, 1.0 / parameters.rate
     timing = SampleTiming(period, predictive.decimation, predictive.average)
@@ -214,14 +215,15 @@ def fit_predictor(parameters: Nt3fsMpcParameters, errors: Array, moves: Array) -
     parts = stretches(errors, moves)
     if taught < MIN_EXCITATION or not parts:
         raise TrainingError(
-            f'the run must hold at least {MIN_EXCITATION:g} s with known errors and v_p, and of these '
+            f'the run must hold at least {MIN_EXCITATION:g} s with known errors and v_p, and of '
+            'these '
             f'{JUDGED * timing.span:g} s without a gap: got {taught:.1f} s, the longest stretch '
             f'{_longest(errors + moves) * timing.span:.1f} s'
         )
     loop = replace(predictive.nominal, feedback_gain=min(feedback_slope(parameters), 100.0))
     middle = max(predictive.horizon // 2, 1)
     nominal = nominal_step_response(loop, timing, middle)[-1]
-    # Newest first, as everything in the machine's room.
+    # Newest first, as everywhere in the Boltzmann machine.
     runs = [
         (np.ascontiguousarray(errors[::-1, z]), np.ascontiguousarray(moves[::-1, z]))
         for z in range(2)
@@ -255,14 +257,14 @@ def fit_predictor(parameters: Nt3fsMpcParameters, errors: Array, moves: Array) -
 
 
 def _machine(parameters: PredictiveParameters, generator: np.random.Generator) -> BoltzmannMachine:
-    """Return a machine with first weights."""
+    """Return a machine with initial weights."""
     shape = LayerSizes(parameters.delta_lags, parameters.move_lags, parameters.hidden)
     scales = parameters.delta_scale, parameters.move_scale
     return make_machine(shape, *scales, parameters.spread, generator)
 
 
 def stretches(errors: Array, moves: Array) -> list[list[tuple[Array, Array]]]:
-    """Return the parts of a run without a gap, of at least :data:`JUDGED` periods.
+    """Return the segments of a run without a gap, of at least :data:`JUDGED` periods.
 
     Parameters
     ----------
@@ -290,13 +292,13 @@ def stretches(errors: Array, moves: Array) -> list[list[tuple[Array, Array]]]:
 
 
 def _longest(table: Array) -> int:
-    """Return how many rows in a row are known."""
+    """Return the length of the longest run of known rows."""
     gaps = np.flatnonzero(np.isnan(table).any(axis=1))
     return int(np.diff([-1, *gaps.tolist(), len(table)]).max()) - 1
 
 
 def feedback_slope(parameters: Nt3fsMpcParameters) -> float:
-    """Return what the law does against a small error, 1/s: K, and the slope of (81)-(82)."""
+    """Return the small-signal gain of the control law, 1/s: K, and the slope of (81)-(82)."""
     law = parameters.law
     return law.gain + (parameters.compensated_bound / law.smoothing if law.compensator else 0.0)
 
@@ -307,17 +309,17 @@ def skills(
     weights: dict[str, Array],
     parts: list[list[tuple[Array, Array]]],
 ) -> Array:
-    """Return the skill of saved weights on a run: next step and middle of the horizon, (2, m).
+    """Return the skill of weights on a run: next step and middle of the horizon, (2, m).
 
-    1 is perfect; 0 is no better than no prediction, which is that the error stays what it is. The
-    squares of all stretches are put together. NaN when there is none.
+    1 is perfect; 0 equals persistence, the prediction that the error stays constant. The
+    squared errors of all segments are summed. NaN without a segment.
 
     Parameters
     ----------
     settings, span
-        Of the predictive term, and its period, s.
+        Of the predictive controller, and its period, s.
     weights
-        As :meth:`PredictiveController.weights` returns them.
+        As :meth:`PredictiveController.get_weights` returns them.
     parts
         As :func:`stretches` returns them.
     """
@@ -337,7 +339,7 @@ def skills(
 
 
 def fit_coefficients(parameters: Nt3fsMpcParameters, replay: TrainingData) -> Array:
-    r"""Return the coefficients with which g explains what the estimate could not, (2, 2 r lambda).
+    r"""Return the coefficients with which g explains the estimator residual, (2, 2 r lambda).
 
     .. math:: \alpha \leftarrow P\left[\alpha + \gamma_n \Phi(\chi)
               \left(\hat d - \Phi(\chi)^T\alpha\right)\right], \qquad
@@ -345,8 +347,8 @@ def fit_coefficients(parameters: Nt3fsMpcParameters, replay: TrainingData) -> Ar
 
     This is (77)-(78) with the estimate's own error in the place of delta, per sample and
     normalised (Nagumo and Noda 1967, doi 10.1109/TAC.1967.1098599): any mu below 2 is stable. mu
-    falls with the passes, so that what is not a function of chi averages out. P is the projection
-    of the adaptation. d is the estimator's, as the law feels it; what g is to cancel.
+    decreases with the passes, so that what is not a function of chi averages out. P is the
+    projection of the adaptation. d is the estimator residual, as seen by the control law; g is to cancel it.
 
     Raises
     ------
@@ -360,7 +362,7 @@ def fit_coefficients(parameters: Nt3fsMpcParameters, replay: TrainingData) -> Ar
             f'the run must hold at least {MIN_EXCITATION:g} s of motion: '
             f'got {rows.size * decimation / parameters.rate:.1f} s'
         )
-    # So large a gamma is cut to the step limit: a share mu / |Phi|² of each miss.
+    # So large a gamma is clipped to the step limit: a share mu / |Phi|² of each residual.
     how = AdaptationParameters(gamma=1e6, radius=parameters.adaptation.radius)
     estimator = FuzzyEstimator(parameters.fuzzy, how)
     for number in range(PASSES):
@@ -372,9 +374,9 @@ def fit_coefficients(parameters: Nt3fsMpcParameters, replay: TrainingData) -> Ar
 
 
 def explained(parameters: Nt3fsMpcParameters, coefficients: Array, replay: TrainingData) -> Array:
-    """Return which share of the variance of the unexplained acceleration g accounts for, (2,).
+    """Return the share of the variance of the unexplained acceleration that g explains, (2,).
 
-    Negative where g is worse than nothing; NaN when the run does not tell.
+    Negative where g is worse than zero; NaN without usable rows.
     """
     rows = _informative_rows(parameters, replay)
     if rows.size < 2:
@@ -389,7 +391,7 @@ def explained(parameters: Nt3fsMpcParameters, coefficients: Array, replay: Train
 
 
 def _informative_rows(parameters: Nt3fsMpcParameters, replay: TrainingData) -> NDArray[np.int64]:
-    """Return the rows that tell of the unexplained acceleration, one in each predictive period."""
+    """Return the rows with a known unexplained acceleration, one in each predictive period."""
     settling = round(SETTLING * parameters.rate)
     since = np.arange(len(replay))
     since -= np.maximum.accumulate(np.where(replay.begins, since, 0))

@@ -36,49 +36,49 @@ from t3mpc_ros.parameters.provenance import provenance
 Array = NDArray[np.float64]
 
 FREE = ('predictive.dither',)
-"""What may differ between the bags of one model, of all that shapes what is learnt."""
+"""Parameters that may differ between the bags of one model, of all that affect the fit."""
 FOLDS = 5
-"""Into how many blocks a bag is cut that is alone."""
+"""Number of blocks of a single bag."""
 STORAGE = ('.mcap', '.db3')
 
 
 @dataclass(frozen=True)
 class FittedModel:
-    """What bags teach."""
+    """Model fitted to bags."""
 
     learnt: Mapping[str, Array]
-    """As a model file keeps it."""
+    """Weights as in a model file."""
     parameters: ControllerParameters
-    """Under which the bags were made."""
+    """Common parameters of the bags."""
     origin: Mapping[str, object]
-    """For the header of the model file: the bags, this program, and what the model is worth."""
+    """Header of the model file: the bags, this program, and the skill of the model."""
     folds: Sequence[Fold]
     text: str
-    """What there is to say, in lines."""
+    """Report, in lines."""
 
 
 def fit_bags(
     folders: Sequence[Path], *, keep_predictor: bool = False, count: int = FOLDS
 ) -> FittedModel:
-    """Return what all the bags teach, and what that is worth by cross-validation.
+    """Return the model of all bags, and its cross-validated skill.
 
-    Of several bags each is a fold. One alone is cut into blocks, one after the other: they are
-    less independent than bags, so the skill found is a little too good.
+    Of several bags each is a fold. A single bag is cut into consecutive blocks: they are
+    less independent than bags, so the skill is slightly optimistic.
 
     Parameters
     ----------
     folders
-        Bags made under the same settings.
+        Bags with the same parameters.
     keep_predictor
-        Learn the coefficients only. The predictor stays as the nominal loop has taught it: for
+        Fit the fuzzy coefficients only. The predictor stays pre-trained on the nominal loop: for
         bags in which v_p moved too little.
     count
-        Number of blocks of a bag that is alone, at least 2.
+        Number of blocks of a single bag, at least 2.
 
     Raises
     ------
     TrainingError
-        A bag cannot be learnt from, or the bags do not belong together.
+        A bag cannot be used, or the bags do not belong together.
     BagError
         A bag cannot be read.
     """
@@ -104,16 +104,16 @@ def fit_bags(
         f'rebuilt {len(replay) / parameters.rate:.1f} s of control from {len(folders)} bag'
         f'{"s" if len(folders) > 1 else ""}'
     )
-    # Taught by all: what cannot be done at all is said before folds are tried.
+    # First fitted to all: errors that concern all bags are reported before the folds.
     learnt = Nt3fsMpcController(parameters).get_weights()
     learnt['fuzzy.coefficients'] = fit_coefficients(parameters, replay)
-    said = 'predictor: kept as the nominal loop has taught it'
+    status = 'predictor: pre-trained on the nominal loop, unchanged'
     if not keep_predictor:
         lesson = fit_predictor(
             parameters, *periods(replay, parameters.predictive, parameters.rate)
         )
         learnt |= {f'predictive.{name}': value for name, value in lesson.weights.items()}
-        said = (
+        status = (
             f'predictor: learnt from {lesson.taught:.1f} s; the effect of v_p is known to '
             f'{pair(100.0 * lesson.uncertainty, ".0f")} % of the nominal one (standard error)'
         )
@@ -125,14 +125,14 @@ def fit_bags(
         f'cross-validated in {len(folds)} folds: each {"bag" if len(runs) > 1 else "block"} is '
         'judged by what the others teach (right/left); 0 is no prediction',
         fold_table(folds),
-        said + '; the model is learnt from all',
+        status + '; the model is learnt from all',
         *_warnings(folds),
     ]
     return FittedModel(learnt, parameters, _origin(origins, folds), folds, '\n'.join(lines))
 
 
 def _warnings(folds: Sequence[Fold]) -> list[str]:
-    """Return what speaks against using the model."""
+    """Return warnings about the use of the model."""
     found = []
     if folds[0].skills:
         taught, nominal = (
@@ -149,12 +149,12 @@ def _warnings(folds: Sequence[Fold]) -> list[str]:
             )
     share = mean_and_spread([fold.explained for fold in folds])[0]
     if (share <= 0.0).any():
-        found.append('warning: the coefficients explain nothing that they were not taught')
+        found.append('warning: the coefficients explain nothing of the held-out data')
     return found
 
 
 def _origin(bags: Sequence[Mapping[str, object]], folds: Sequence[Fold]) -> dict[str, object]:
-    """Return what the header of the model file says of where the model comes from."""
+    """Return the provenance for the header of the model file."""
     worth: dict[str, object] = {
         'folds': len(folds),
         'explained': _both([fold.explained for fold in folds]),
@@ -170,7 +170,7 @@ def _both(values: Sequence[Array]) -> dict[str, list[float] | list[list[float]]]
 
 
 def origin_of(folder: Path) -> dict[str, object]:
-    """Return which files a bag is made of (SHA-256 by name), and what made it, as plain data.
+    """Return the files of a bag (SHA-256 by name) and their provenance, as plain data.
 
     Raises
     ------
@@ -192,7 +192,7 @@ def origin_of(folder: Path) -> dict[str, object]:
 def check_compatible(
     first: ControllerParameters, other: ControllerParameters, path: Path, other_path: Path
 ) -> None:
-    """Raise :class:`TrainingError` unless what is learnt under both means the same."""
+    """Raise :class:`TrainingError` unless both models would be comparable."""
     mine, its = first.to_dict(), other.to_dict()
     names = [spec.name for spec in Nt3fsMpcParameters.specs() if spec.name not in FREE]
     names += [spec.name for spec in WheelGeometry.specs()]

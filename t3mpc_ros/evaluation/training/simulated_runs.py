@@ -30,17 +30,17 @@ from t3mpc_ros.mpc.pretraining import split_runs
 Array = NDArray[np.float64]
 
 EARLY = 10.0
-"""The first seconds, in which a model shows most."""
+"""Length of the initial phase, in which a model matters most, s."""
 _FOLLOWED = [TERM_NAMES.index(name) for name in ('feedback', 'feedforward', 'compensator')]
 
 
 def full_parameters(drive: str) -> ProposedParameters:
-    """Return the settings of our full controller: tuned, where tuned ones come with the package.
+    """Return the parameters of our full controller: the tuned ones of the package, if any.
 
     Raises
     ------
     StoreError
-        What is stored does not fit this version.
+        The stored parameters do not fit this version.
     """
     parameters = (
         methods(drive)[FULL].parameters
@@ -53,7 +53,7 @@ def full_parameters(drive: str) -> ProposedParameters:
 
 
 def fit_simulated_runs(drive: str) -> tuple[Mapping[str, Array], ProposedParameters]:
-    """Return what the full controller learns in the practice runs, and its settings."""
+    """Return the model fitted to the training runs, and the parameters of the controller."""
     parameters = full_parameters(drive)
     return pretrain(ProposedController, parameters, drive), parameters
 
@@ -65,18 +65,18 @@ def assess(
     seeds: Sequence[int],
     progress: Callable[[str], None] = lambda text: None,
 ) -> str:
-    """Return in words what a model is worth on seeds that it was not learnt on.
+    """Return a report on the model on held-out seeds.
 
     Parameters
     ----------
     drive
         One of ``scenario.DRIVES``.
     settings, learnt
-        Of the controller, and what it starts with.
+        Parameters of the controller, and its initial model.
     seeds
-        Runs with the model and without it.
+        Seeds of the runs with and without the model.
     progress
-        Told what is done.
+        Called with a progress message.
     """
     without = MethodSpec(FULL, ProposedController, parameters)
 
@@ -96,7 +96,8 @@ def assess(
         for measure in (early_rmse, LoopRecord.rmse)
     )
     lines = [
-        f'practice: {len(PRETRAINING_SEEDS)} runs of {PRETRAINING_DURATION:g} s, drive {drive}, noise '
+        f'practice: {len(PRETRAINING_SEEDS)} runs of {PRETRAINING_DURATION:g} s, drive {drive}, '
+        'noise '
         f'{PRETRAINING_NOISE:g} (rad/s)², seeds {", ".join(map(str, PRETRAINING_SEEDS))}',
         f'predictor: judged by errors and v_p in the last quarter of seed {seeds[0]} (right/left)',
         skill_table(held_out_skills(parameters, learnt, fresh[0])),
@@ -113,14 +114,14 @@ def assess(
 
 
 def early_rmse(record: LoopRecord) -> float:
-    """Return the tracking RMSE over both wheels in the first seconds, rad/s."""
+    """Return the tracking RMSE over both wheels in the initial phase, rad/s."""
     return float(np.sqrt(np.mean(record.error[record.time < EARLY] ** 2)))
 
 
 def held_out_skills(
     parameters: ProposedParameters, learnt: Mapping[str, Array], record: LoopRecord
 ) -> dict[str, Array]:
-    """Return the skills before and after on the last quarter of a run, as :func:`skills` does."""
+    """Return the skills before and after the fit on the last quarter of a run."""
     predictive = parameters.predictive
     term = PredictiveController(predictive, 1.0 / RATE, parameters.law.gain)
     prefix = 'predictive.'
@@ -134,7 +135,7 @@ def held_out_skills(
 
 
 def skill_table(skills: Mapping[str, Array]) -> str:
-    """Return skills of both wheels as lines; each is (next step, middle) by (right, left)."""
+    """Return the skills of both wheels as lines; each is (next step, middle) by (right, left)."""
     width = max(11, *map(len, skills))
     lines = [f'  {"skill after":<{width}}  {NEXT_STEP}     {MIDDLE}']
     for name, values in skills.items():
@@ -143,7 +144,7 @@ def skill_table(skills: Mapping[str, Array]) -> str:
 
 
 def training_data_of(record: LoopRecord, parameters: ProposedParameters) -> TrainingData:
-    """Return a run of the lab as the replay of a bag would have it."""
+    """Return a simulated run in the form of training data from a bag."""
     terms = record.terms
     begins = np.zeros(record.time.size, dtype=np.bool_)
     begins[0] = True
@@ -160,7 +161,7 @@ def training_data_of(record: LoopRecord, parameters: ProposedParameters) -> Trai
 
 
 def held_out_seeds(count: int) -> Sequence[int]:
-    """Return the first seeds of those on which results are reported.
+    """Return the first seeds of those used for results.
 
     Raises
     ------

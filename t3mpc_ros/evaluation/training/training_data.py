@@ -36,13 +36,13 @@ NEEDED = (
     COMMAND,
     *(f'{name}/{wheel}' for name in (MOVES, FEEDBACK) for wheel in WHEELS),
 )
-"""Topics without which nothing can be learnt from a bag."""
+"""Topics that a bag must hold."""
 
 ALIKE = 100
-"""Commands to each side that tell which message one of them answers."""
+"""Commands on each side that determine which message a command belongs to."""
 DISAGREES = 0.2
-"""Difference between a rebuilt error and the published one that is one, as a share of the error
-that counts as mere noise. Where nothing was lost they agree to rounding."""
+"""Difference between a reconstructed and the published error that counts as wrong, as a share of
+the error; without losses they agree to rounding."""
 
 _TWIST = {'linear': 'twist.twist.linear.x', 'angular': 'twist.twist.angular.z'}
 _FEEDBACK = TERM_NAMES.index('feedback')
@@ -50,51 +50,51 @@ _FOLLOWED = [TERM_NAMES.index(name) for name in ('feedback', 'feedforward', 'com
 
 
 class TrainingError(RuntimeError):
-    """A bag that nothing can be learnt from; the text says which and why."""
+    """The bag cannot be used for training; the text gives the reason."""
 
 
 @dataclass(frozen=True)
 class TrainingData:
     """One row for each step at which the controller moved the robot, right wheel first.
 
-    Several bags can be one replay: rows that follow each other in time are told by ``begins``.
+    Several bags can form one data set: ``begins`` marks the rows without a predecessor.
     """
 
     time: Array
     """Stamp, s, shape (n,)."""
     errors: Array
-    """delta-bar = chi - (r + h) at the instant of acting, rad/s, (n, 2): what the law acted on.
-    NaN where what was published proves that it was another."""
+    """delta-bar = chi - (r + h) at the instant of effect, rad/s, (n, 2): the error in the
+    control law. NaN where the published values contradict it."""
     moves: Array
     """v_p where it was published, else NaN, rad/s², shape (n, 2)."""
     rest: Array
-    """u as sent, less what the law adds of errors and reference alone: v_p - g, rad/s², (n, 2)."""
+    """u as sent, less the terms of errors and reference alone: v_p - g, rad/s², (n, 2)."""
     speeds: Array
     """Estimated chi, rad/s, shape (n, 2)."""
     unexplained: Array
     """Estimated acceleration that u does not explain, rad/s², shape (n, 2)."""
     limited: NDArray[np.bool_]
-    """Whether u as sent lies on a limit: then it was not all of what the law wanted, (n,)."""
+    """Whether u as sent lies on a limit, so that it is not all of the wanted u, (n,)."""
     begins: NDArray[np.bool_]
-    """Whether nothing of the run is known before this row, shape (n,)."""
+    """Whether the row has no predecessor, shape (n,)."""
 
     def __len__(self) -> int:
         return len(self.begins)
 
     @classmethod
     def joined(cls, parts: list['TrainingData']) -> 'TrainingData':
-        """Return several replays as one."""
+        """Return several data sets as one."""
         each = [[getattr(part, item.name) for part in parts] for item in fields(cls)]
         return cls(*map(np.concatenate, each))
 
 
 def load_training_data(folder: Path) -> tuple[TrainingData, ControllerParameters, list[str]]:
-    """Return the run of a bag, the settings it was made under, and what a person should know.
+    """Return the data of a bag, the parameters of the run, and remarks for the user.
 
     Raises
     ------
     TrainingError
-        Topics or settings are missing, or these settings do not lead to what was published.
+        Topics or parameters are missing, or the parameters contradict the published values.
     BagError
         The bag cannot be read.
     """
@@ -129,12 +129,12 @@ def load_training_data(folder: Path) -> tuple[TrainingData, ControllerParameters
 def recorded_parameters(
     recording: BagReader, namespace: str, notes: list[str]
 ) -> ControllerParameters:
-    """Return the controller's settings as the recorder asked for them.
+    """Return the controller's parameters as recorded.
 
     Raises
     ------
     TrainingError
-        They are not in the bag, or cannot be used.
+        They are not in the bag, or invalid.
     """
     own = f'{namespace}/controller'
     table = recording.metadata_records.get(
@@ -158,7 +158,7 @@ def recorded_parameters(
 
 
 def _value(row: ParameterSpec, text: str) -> object:
-    """Return what the recorder wrote with ``str``; text that is no value is left to be refused."""
+    """Return a value written by the recorder with ``str``; other text is rejected later."""
     if row.kind is str:
         return text
     try:
@@ -179,23 +179,23 @@ def _read(recording: BagReader, name: str, topic: str, notes: list[str]) -> Mapp
     if bad.any():
         notes.append(f'{np.count_nonzero(bad)} messages of {topic} are not finite')
     if name in (REFERENCE, ODOMETRY):
-        return columns  # the controller refuses them itself, as it did then
+        return columns  # rejected by the controller itself, as in the run
     return {key: column[~bad] for key, column in columns.items()}
 
 
 def match_commands(asked: Array, answered: Array) -> NDArray[np.int64]:
-    """Return for each command which odometry message it answers, -1 where none does, shape (m,).
+    """Return the odometry message of each command, -1 without one, shape (m,).
 
-    The controller answers each message it takes, in their order: command j answers message j + s,
-    where s is how many before it are without an answer, from before the first command or lost.
-    By their receipt alone commands would be mistaken: while the processor is busy the next message
-    comes before the answer, and of two publishers the second may even be heard first. Both pass,
+    The controller responds to each message it processes, in order: command j belongs to message
+    j + s, where s is the number of earlier messages without a command, from before the first
+    command or lost. Receive times alone mislead: on a busy processor the next message arrives
+    before the command, and of two publishers the second may even be received first. Both pass,
     so s is the median over two seconds.
 
     Parameters
     ----------
     asked, answered
-        Times of receipt, ascending, s.
+        Receive times, ascending, s.
     """
     numbers = np.arange(answered.size)
     behind = np.searchsorted(asked, answered, side='right') - 1 - numbers
@@ -209,7 +209,7 @@ def match_commands(asked: Array, answered: Array) -> NDArray[np.int64]:
 def _rebuild(
     parameters: ControllerParameters, messages: Mapping[str, Mapping[str, Array]], notes: list[str]
 ) -> TrainingData:
-    """Return what the controller knew and did at each step, from the messages it was given."""
+    """Return inputs and decisions of the controller at each step, from the recorded messages."""
     controller = Controller(parameters)
     odometry, reference, sent = messages[ODOMETRY], messages[REFERENCE], messages[COMMAND]
     motions, times = _motions(odometry), odometry['received']
@@ -220,7 +220,7 @@ def _rebuild(
         notes.append(f'{lost} of {times.size} messages of {ODOMETRY} have no {COMMAND} after them')
     coming = deque(zip(reference['received'].tolist(), _motions(reference), strict=True))
     gain, patience = parameters.law.gain, parameters.watchdog.odometry_timeout * NANOSECONDS
-    # What is left of jumps that the law was told of is read when it has died away for a period.
+    # The residual of announced jumps is evaluated after it has decayed for a period.
     revive = math.exp(gain / parameters.rate)
     errors, feedback, rest, speeds, unexplained = np.full((5, times.size, 2), math.nan)
     begins = np.zeros(times.size, dtype=np.bool_)
@@ -228,14 +228,14 @@ def _rebuild(
     for i, motion in enumerate(motions):
         while coming and coming[0][0] <= times[i]:
             controller.add_reference(coming.popleft()[1])
-        if motion.stamp_ns == last_ns:  # the controller knows it already
+        if motion.stamp_ns == last_ns:  # a duplicate
             continue
         _, status = controller.step(motion)
         if not status.reason.moves:
             last_ns = None
             continue
         drive, terms = controller.actuation, status.terms
-        if math.isfinite(commands[i, 0]):  # else its own answer is the best guess
+        if math.isfinite(commands[i, 0]):  # else the recomputed command is the best guess
             drive.set_command(commands[i])
         commands[i] = drive.command
         begins[i] = last_ns is None or motion.stamp_ns - last_ns > patience
@@ -244,15 +244,15 @@ def _rebuild(
         errors[i] = -terms[_FEEDBACK] / gain - revive * controller.law.predictive.known_error
         rest[i] = drive.applied - terms[_FOLLOWED].sum(axis=0)
         speeds[i], unexplained[i] = drive.speeds, drive.disturbance
-    moves, said = (
+    moves, recorded = (
         _published(messages, name, sent['received'], answer, times.size)
         for name in (MOVES, FEEDBACK)
     )
-    # A controller that stands still publishes zeros, and begins anew after them.
-    still = (said == 0.0).any(axis=1)
+    # At standstill the controller publishes zeros, and restarts afterwards.
+    still = (recorded == 0.0).any(axis=1)
     begins[1:] |= still[:-1]
     tolerance = gain * DISAGREES * parameters.predictive.noise
-    wrong = still | (np.abs(said - feedback) > tolerance).any(axis=1)
+    wrong = still | (np.abs(recorded - feedback) > tolerance).any(axis=1)
     reach = parameters.predictive.decimation - 1
     for i in np.flatnonzero(wrong).tolist():
         errors[max(i - reach, 0) : i + reach + 1] = math.nan
@@ -264,7 +264,7 @@ def _rebuild(
 
 
 def _at_limit(wheels: Array, limits: Array) -> NDArray[np.bool_]:
-    """Return whether pairs of wheels are as fast as :func:`share_within` lets them, shape (n,)."""
+    """Return the mask of wheel pairs at the limits of :func:`share_within`, shape (n,)."""
     mean, half = np.abs(wheels @ [0.5, 0.5]), np.abs(wheels @ [0.5, -0.5])
     used = np.stack([mean, half, np.abs(wheels).max(axis=1)], axis=1) / limits
     return np.asarray(used.max(axis=1) > 1.0 - 1e-6)
@@ -277,7 +277,7 @@ def _published(
     answer: NDArray[np.int64],
     count: int,
 ) -> Array:
-    """Return both wheels' numbers in the rows of the steps they tell of, (count, 2).
+    """Return both wheels' scalars in the rows of their steps, (count, 2).
 
     They are published right after the command of the same step.
     """
