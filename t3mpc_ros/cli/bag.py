@@ -27,7 +27,7 @@ from t3mpc_ros.cli.train import add_bag_options, run_bags
 
 
 def columns(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
-    """Return the rows below each other; columns whose numbers are in ``right`` end flush."""
+    """Return the rows as aligned columns; those numbered in ``right`` are right-aligned."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = []
     for row in rows:
@@ -40,7 +40,7 @@ def columns(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
 
 
 def size_text(count: int) -> str:
-    """Return a number of bytes in the unit that suits it."""
+    """Return a number of bytes in a suitable unit."""
     if count < 1000:
         return f'{count} B'
     value = float(count)
@@ -51,7 +51,7 @@ def size_text(count: int) -> str:
     return f'{value:.0f} GB'
 
 
-_MAX_LISTED_ENTRIES = 6  # rows of a table that are written out; longer ones are only counted
+_MAX_LISTED_ENTRIES = 6  # longer tables are only counted
 
 
 def add_info_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
@@ -59,7 +59,7 @@ def add_info_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParse
     parser = commands.add_parser(
         'info',
         help='files, time, topics, settings of a bag',
-        description='Says what a bag holds. Exit code 0, or 1 when nothing of it can be read.',
+        description='Prints the contents of a bag. Exit code 0, or 1 when nothing can be read.',
     )
     parser.add_argument('bag', type=Path, help='an MCAP file, or the folder of a bag')
     parser.add_argument('--json', action='store_true', help='everything, as JSON')
@@ -93,8 +93,8 @@ def _info_text(held: BagInfo) -> str:
     parts = [columns(rows)]
     if held.unfinished:
         parts.append(
-            f'A file without its end is still being written, or its writer broke off: '
-            f'`t3mpc bag recover {held.path}` writes what is in it into a new bag.'
+            f'A file without its end is still being written, or its writer was interrupted: '
+            f'`t3mpc bag recover {held.path}` writes its messages to a new bag.'
         )
     if held.topics:
         parts.append(_topic_table(held))
@@ -126,12 +126,12 @@ def _date(time_ns: int) -> str:
 
 
 EXIT_LOSS = 3
-"""Exit code: a bag was written, but something was lost or may have been."""
+"""Exit code: a bag was written, but messages were lost or may have been."""
 
 EXIT_USAGE = 2
-"""Exit code: the output folder that was asked for cannot be written into."""
+"""Exit code: the output folder cannot be written."""
 
-_MAX_LISTED_DAMAGES = 20  # damaged stretches of a file that are named one by one
+_MAX_LISTED_DAMAGES = 20  # further damaged spans are only counted
 
 
 def add_recover_parser(
@@ -139,13 +139,13 @@ def add_recover_parser(
 ) -> None:
     """Add ``recover`` to the commands of ``bag``.
 
-    ``clock`` tells seconds from any origin, for the time that is left.
+    ``clock`` returns seconds from any origin, for the time left.
     """
     parser = commands.add_parser(
         'recover',
         help='write what a damaged bag still holds into a new one',
         description='Writes what an MCAP file, or every MCAP file of a folder, still holds into '
-        'a new folder, with index and metadata.yaml, and says what was kept and lost. The input '
+        'a new folder, with index and metadata.yaml, and reports what was kept and lost. The input '
         'is only read. Exit code 0: nothing was lost; 3: something was, or a file has no end, so '
         'that its writer may have held more; 1: nothing can be read, or the output cannot be '
         'written.',
@@ -177,7 +177,7 @@ def _recovery_text(result: RecoveryResult) -> str:
     parts = [columns(rows, right=(2, 3, 4))]
     parts += [_file(file) for file in result.files]
     if any(topic.unchecked for topic in result.topics.values()):
-        parts.append('unchecked: no checksum of the file vouches for these messages')
+        parts.append('unchecked: no checksum of the file covers these messages')
     parts.append(_verdict(result, least))
     return '\n\n'.join(parts)
 
@@ -211,7 +211,7 @@ def _verdict(result: RecoveryResult, least: str) -> str:
         return f'{kept}; nothing is lost'
     seconds = result.lost_seconds
     during = '' if seconds is None else f', within {seconds:.3f} s'
-    number = f'{least}{result.lost}' if result.lost or result.exact else 'nobody knows how many'
+    number = f'{least}{result.lost}' if result.lost or result.exact else 'an unknown number of'
     return (
         f'{kept}; lost: {number} messages{during}, '
         f'{size_text(result.lost_bytes)} of the input not usable'
@@ -219,7 +219,7 @@ def _verdict(result: RecoveryResult, least: str) -> str:
 
 
 class _RecoveryProgress:
-    """Says on stderr how far a large file is, about once a second."""
+    """Prints the progress of a large file to stderr about once a second."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
@@ -239,7 +239,7 @@ class _RecoveryProgress:
 
 
 def add_report_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
-    """Add ``report`` to the commands of ``bag``; ``options.run(options)`` carries it out."""
+    """Add ``report`` to the commands of ``bag``."""
     parser = commands.add_parser(
         'report',
         help='draw the report of a bag',
@@ -271,18 +271,18 @@ def add_report_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPar
 
 
 def run_report(options: argparse.Namespace) -> int:
-    """Return 0 when the report was written; prints its main figures.
+    """Write the report, print its summary and return 0.
 
     Raises
     ------
     BagError
-        There is no bag, or it cannot be read.
+        The bag is missing or cannot be read.
     ReportError
-        There is nothing in it to report, or a topic that was asked for cannot be used.
+        The bag holds nothing to report, or a given topic cannot be used.
     OSError
         The output cannot be written.
     ValueError
-        One length of the wheels without the other, or one that cannot be.
+        Wheel radius without separation or the reverse, or an invalid one.
     """
     from t3mpc_ros.evaluation.bag_report.report_page import write_report
     from t3mpc_ros.evaluation.bag_report.topic_roles import ReportOptions
@@ -303,13 +303,13 @@ def run_report(options: argparse.Namespace) -> int:
 
 
 def add_replay_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
-    """Add ``replay`` to the commands of ``bag``; :func:`run` carries it out."""
+    """Add ``replay`` to the commands of ``bag``."""
     parser = commands.add_parser(
         'replay',
         help='compute a recorded run again',
         description='Gives the recorded odometry and reference to the controller of today, '
         'offline and as fast as it goes, in the order in which the recorded controller took them. '
-        'With other settings, or with another method, it says what would have been '
+        'With other settings, or with another method, it computes what would have been '
         'commanded; the robot does not answer to that.',
     )
     parser.add_argument('bag', type=Path, metavar='BAG', help='folder of the bag, or its file')
@@ -324,7 +324,7 @@ def add_replay_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPar
 
 
 def add_input_options(parser: argparse.ArgumentParser) -> None:
-    """Add what says how a bag is taken as the inputs of a controller."""
+    """Add the options that choose the controller inputs of a bag."""
     parser.add_argument(
         '--set',
         dest='parameters',
@@ -340,16 +340,16 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run_replay(options: argparse.Namespace) -> int:
-    """Return 0 when the run was computed; prints what became of it, and how fast.
+    """Replay the run, print the comparison and the speed, and return 0.
 
     Raises
     ------
     ReplayError
-        The bag cannot be computed again.
+        The bag cannot be replayed.
     BagError
         A bag cannot be read or written.
     ParameterError
-        A setting is unknown or cannot be used.
+        A parameter is unknown or invalid.
     """
     from t3mpc_ros.bag.run.model_file import load_model
     from t3mpc_ros.control.controller import ControllerParameters
@@ -397,7 +397,7 @@ SAME, DIFFERS = 0, 3
 
 
 def add_compare_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
-    """Add ``compare`` to the commands of ``bag``; :func:`run` carries it out."""
+    """Add ``compare`` to the commands of ``bag``."""
     parser = commands.add_parser(
         'compare',
         help='compare a recorded run with its replay, or with another bag',
@@ -441,16 +441,16 @@ def add_compare_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPa
 
 
 def run_compare(options: argparse.Namespace) -> int:
-    """Return 0 when all is within the tolerances, 3 when something differs; prints the table.
+    """Print the comparison; return 0 when all is within the tolerances, 3 otherwise.
 
     Raises
     ------
     ReplayError
-        Nothing can be compared.
+        The bags hold nothing to compare.
     BagError
         A bag cannot be read.
     ValueError
-        A tolerance or setting cannot be used, or there is no bag.
+        A tolerance or parameter is invalid, or no bag is given.
     """
     from t3mpc_ros.bag.run.model_file import load_model
     from t3mpc_ros.control.controller import ControllerParameters
@@ -488,12 +488,12 @@ def run_compare(options: argparse.Namespace) -> int:
 def tolerances_from(
     absolute: float | None, relative: float | None, fields: Sequence[str]
 ) -> 'Tolerances':
-    """Return the tolerances that a command line asks for.
+    """Return the tolerances given on the command line.
 
     Raises
     ------
     ValueError
-        A text is not ``FIELD=NUMBER``, or a tolerance cannot be used.
+        A text is not ``FIELD=NUMBER``, or a tolerance is invalid.
     """
     from t3mpc_ros.evaluation.process_replay.comparison import ABSOLUTE, RELATIVE, Tolerances
 
@@ -510,7 +510,7 @@ def tolerances_from(
 
 
 def add_train_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
-    """Add ``train`` to the commands of ``bag``; ``options.run(options)`` carries it out."""
+    """Add ``train`` to the commands of ``bag``."""
     parser = commands.add_parser(
         'train',
         help='learn a model file that the controller starts from',
@@ -528,7 +528,7 @@ def add_train_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPars
 def main(arguments: Sequence[str] | None = None) -> int:
     """Return the exit code: 0 done, 1 failed with a reason, 2 wrong command line.
 
-    3 is the command's own: done, but not all is well with the bag.
+    3: done, but the bag is damaged or differs; see each command.
     """
     return run_command(_bag_parser(), arguments)
 

@@ -14,7 +14,7 @@ from t3mpc_ros.evaluation.bag_report.metrics import ReportMetrics
 from t3mpc_ros.evaluation.bag_report.report_page import write_report
 
 BOARD = 'emulator'
-"""No node: it has no parameters, and says that it is ready in words of its own."""
+"""Not a node: it has no parameters and its own ready message."""
 PAPER_NOISE = 0.04
 """Variance of the measured wheel speeds, (rad/s)², as in the paper's simulations."""
 ROBOTS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
@@ -30,15 +30,15 @@ ROBOTS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
         'controller': {'rate': 50.0, 'speed_filter.dead_time': 0.02},
     },
 }
-"""Robots there are, and what each node is told of them: the digital twin, the paper's plant, and
-the twin on a board of its own that is reached over a serial port and a radio."""
+"""Robots, and the parameters of each node for them: the digital twin, the paper's plant, and
+the twin on an emulated board behind a serial port and a radio."""
 FOLLOWS = 'tracking'
-"""What the controller says when it follows the reference; finding each other takes seconds."""
+"""Log message of the controller when it follows the reference; discovery takes seconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class DemoOptions:
-    """What the command line of ``scripts/demo`` says."""
+    """Options of ``scripts/demo``."""
 
     duration: float = 60.0
     output: Path = Path('runs/demo')
@@ -47,11 +47,11 @@ class DemoOptions:
     robot: str = 'twin'
     """One of :data:`ROBOTS`."""
     loss: float = 0.0
-    """Share of the radio packets that are lost each way; for the emulator only."""
+    """Share of lost radio packets in each direction; for the emulator only."""
 
     @property
     def robot_node(self) -> str:
-        """The node that stands for the robot."""
+        """Name of the robot node."""
         return 'radio_bridge' if self.robot == 'emulator' else 'sim_robot'
 
     @property
@@ -61,7 +61,7 @@ class DemoOptions:
 
     @property
     def port(self) -> Path:
-        """Where the dongle of the emulator is plugged in."""
+        """Serial port of the emulated dongle."""
         return self.output.resolve() / 'dongle'
 
     def parameters(self) -> dict[str, dict[str, object]]:
@@ -80,7 +80,7 @@ class DemoOptions:
         return given
 
     def board(self) -> tuple[str, ...]:
-        """Return the command line of the emulated board; empty when there is none."""
+        """Return the command line of the emulated board; empty without one."""
         if self.robot != 'emulator':
             return ()
         words = ['--link', str(self.port), '--loss', str(self.loss)]
@@ -88,7 +88,7 @@ class DemoOptions:
 
 
 class Progress:
-    """A bar with the time left on a terminal, a line now and then elsewhere."""
+    """Progress bar with the time left on a terminal, a line at intervals elsewhere."""
 
     def __init__(self, seconds: float, *, live: bool) -> None:
         self._seconds = seconds
@@ -116,7 +116,7 @@ class Progress:
 
 
 def run_demo(options: DemoOptions) -> ReportMetrics:
-    """Run reference, controller, simulated robot and recorder, and return the main figures.
+    """Run reference generator, controller, robot and recorder; return the report metrics.
 
     The bag is in ``output/bag``, the nodes' logs in ``output/log``, the report beside them.
 
@@ -134,9 +134,9 @@ def run_demo(options: DemoOptions) -> ReportMetrics:
     fleet = ProcessGroup(options.output / 'log', private_graph())
     parameters = options.parameters()
     parameters['recorder']['folder'] = str(bag.resolve())
-    # The nodes are stopped one after the other: that is no fault to keep a snapshot of.
+    # The nodes are stopped one after the other, which is no reason for a snapshot.
     parameters['recorder']['snapshot_time'] = 0.0
-    # The robot stops last but for the recorder, and its board after it.
+    # The robot stops after the nodes that command it, then the recorder, then the board.
     stopped: tuple[str, ...] = (
         'reference_generator',
         'controller',
@@ -152,7 +152,7 @@ def run_demo(options: DemoOptions) -> ReportMetrics:
             print(f'  starting {name}', file=sys.stderr, flush=True)
             fleet.start(name, parameters=parameters[name])
             fleet.wait_ready(name)
-        print('  waiting until they have found each other', file=sys.stderr, flush=True)
+        print('  waiting for discovery', file=sys.stderr, flush=True)
         fleet.wait_for('controller', FOLLOWS)
         _watch(fleet, options)
     finally:

@@ -12,9 +12,9 @@ from pathlib import Path
 def add_outcomes_parser(
     commands: 'argparse._SubParsersAction[argparse.ArgumentParser]', clock: Callable[[], float]
 ) -> None:
-    """Add ``faults`` to the commands of ``lab``; :func:`run` carries it out.
+    """Add the subcommand ``faults``.
 
-    ``clock`` tells seconds from any origin, for the time that is left.
+    ``clock`` returns seconds from any origin, for the time left.
     """
     parser = commands.add_parser(
         'faults', help='drive the digital twin under every named fault, and say what comes of it'
@@ -30,7 +30,7 @@ def add_outcomes_parser(
 
 
 def run(options: argparse.Namespace) -> int:
-    """Return 0 when no loop got out of bounds, 1 when one did; prints what became of each."""
+    """Print the outcome of each fault; return 0 when every loop stayed bounded, else 1."""
     from t3mpc_ros.evaluation.fault_study import (
         FAULT_RUNS,
         console_text,

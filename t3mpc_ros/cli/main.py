@@ -33,7 +33,7 @@ PROGRAMS = {
     'robot': 'key, link test, channel scan, wheel jog, parameters of the real robot',
     'emulator': 'emulated dongle and robot board behind a serial port',
 }
-"""Subcommands with a parser of their own, in the module of the same name."""
+"""Subcommands with their own parser, in the module of the same name."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -80,7 +80,7 @@ def _estimation(options: argparse.Namespace) -> int:
 
 
 def _keep(records: Sequence[Mapping[str, object]], path: Path | None) -> int:
-    """Write the records to the file that was asked for, if one was, and return 0."""
+    """Write the records to the given file, if any, and return 0."""
     if path:
         path.write_text(json.dumps(records, indent=1) + '\n')
     return 0

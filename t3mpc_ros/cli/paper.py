@@ -15,7 +15,7 @@ from t3mpc_ros.parameters.command_line import bounded_int
 def add_parser(commands: Any) -> argparse.ArgumentParser:
     """Return the parser of ``paper``, added to the sub-parsers of a program."""
     parser: argparse.ArgumentParser = commands.add_parser(
-        'paper', help='every figure and table of the paper, and what became of its claims'
+        'paper', help='every figure and table of the paper, and the verdict on its claims'
     )
     parser.add_argument(
         '--quick', action='store_true', help='few seeds and short runs: shows that all works'
@@ -39,14 +39,14 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
     )
     parser.add_argument('--json', type=Path, help='also write the results to this file')
     parser.add_argument(
-        '--fresh', action='store_true', help='throw away the runs that the folder holds'
+        '--fresh', action='store_true', help='discard the runs that the folder holds'
     )
     parser.set_defaults(run=run)
     return parser
 
 
 def run(options: argparse.Namespace) -> int:
-    """Return 0 after everything was written; the command line's entry."""
+    """Write everything and return 0."""
     from t3mpc_ros.evaluation.reporting import Progress
 
     output = options.output or Path('runs') / ('paper-quick' if options.quick else 'paper')

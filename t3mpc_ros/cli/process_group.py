@@ -22,7 +22,7 @@ def executable(name: str) -> Path:
     Raises
     ------
     ProcessError
-        It is not installed; the text says how to install it.
+        It is not installed; the text gives the remedy.
     """
     path = _installed(Path('lib') / 't3mpc_ros' / name)
     if path is None or not os.access(path, os.X_OK):
@@ -35,11 +35,11 @@ def executable(name: str) -> Path:
 
 
 def private_graph() -> dict[str, str]:
-    """Return environment variables that keep a run to itself, on this machine only.
+    """Return environment variables that isolate a run on this machine.
 
-    What is set already stays. Otherwise a ``ROS_DOMAIN_ID`` is drawn, so that two runs at once
-    do not hear each other, and Fast DDS is kept to UDP on loopback: its shared memory may stop a
-    publisher for a third of a second when somebody new subscribes (Fast-DDS issue 6535).
+    Variables that are set already are kept. Otherwise a ``ROS_DOMAIN_ID`` is drawn, so that two
+    runs do not share a graph, and Fast DDS uses UDP on loopback only: its shared memory may block a
+    publisher for a third of a second when a subscriber joins (Fast-DDS issue 6535).
     """
     environment = dict(os.environ)
     environment.setdefault('ROS_DOMAIN_ID', str(random.SystemRandom().randint(1, 101)))
@@ -66,7 +66,7 @@ def _installed(path: Path) -> Path | None:
 
 
 class ProcessGroup:
-    """The executables of one run, each a process of its own with a log file.
+    """Executables of one run, each a process with a log file.
 
     Parameters
     ----------
@@ -109,8 +109,8 @@ class ProcessGroup:
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 env=self._environment,
-                # Ctrl-C in a terminal goes to the whole group: the fleet is stopped in order
-                # instead, so that the recorder is the last to go.
+                # Ctrl-C in a terminal reaches the whole group: here the processes are stopped
+                # in order instead, the recorder last.
                 start_new_session=True,
             )
 
@@ -119,28 +119,28 @@ class ProcessGroup:
         return self._logs / f'{name}.log'
 
     def wait_ready(self, name: str, seconds: float = 120.0) -> None:
-        """Wait until the executable says that it is ready, see :meth:`wait_for`."""
+        """Wait for the ready message of the executable, see :meth:`wait_for`."""
         self.wait_for(name, f'{name} ready', seconds)
 
     def wait_for(self, name: str, words: str, seconds: float = 30.0) -> None:
-        """Wait until the executable has said certain words since it was started.
+        """Wait until the output since the start of the executable holds ``words``.
 
         Raises
         ------
         ProcessError
-            It ended, or did not say so within ``seconds``; the text ends with its last lines.
+            It ended, or did not print them within ``seconds``; the text ends with its last lines.
         """
         deadline = time.monotonic() + seconds
         process = self._processes[name]
         while words not in self._fresh_output(name):
             if process.poll() is not None:
                 raise ProcessError(
-                    f'{name} ended with code {process.returncode} before it said '
+                    f'{name} ended with code {process.returncode} before it printed '
                     f'"{words}":\n' + self._tail(name)
                 )
             if time.monotonic() > deadline:
                 raise ProcessError(
-                    f'{name} did not say "{words}" within {seconds:g} s:\n' + self._tail(name)
+                    f'{name} did not print "{words}" within {seconds:g} s:\n' + self._tail(name)
                 )
             time.sleep(0.05)
 
@@ -154,7 +154,7 @@ class ProcessGroup:
                 )
 
     def running(self) -> tuple[str, ...]:
-        """Return the names of the executables that were started and not stopped."""
+        """Return the names of the running executables."""
         return tuple(self._processes)
 
     def pid(self, name: str) -> int:
@@ -162,18 +162,18 @@ class ProcessGroup:
         return self._processes[name].pid
 
     def kill(self, name: str) -> None:
-        """End one executable at once, as a crash would."""
+        """Kill one executable, as a crash would."""
         process = self._processes.pop(name)
         process.kill()
         process.wait()
 
     def stop(self, name: str, number: int = signal.SIGINT, seconds: float = 10.0) -> int:
-        """Ask one executable to end and return its exit code.
+        """Send a stop signal to one executable and return its exit code.
 
         Raises
         ------
         ProcessError
-            It did not end in time; it is killed then.
+            It did not end in time and was killed.
         """
         process = self._processes.pop(name)
         process.send_signal(number)
@@ -187,7 +187,7 @@ class ProcessGroup:
             ) from None
 
     def stop_all(self, order: Sequence[str] = ()) -> dict[str, int]:
-        """Stop what still runs, first in the given order, then the rest; return exit codes."""
+        """Stop all running executables, first in the given order; return exit codes."""
         names = [name for name in order if name in self._processes]
         names += [name for name in self._processes if name not in names]
         return {name: self.stop(name) for name in names}

@@ -13,12 +13,12 @@ FOLDS = 5
 
 
 def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
-    """Add ``train`` to the commands of ``lab``; :func:`run` carries it out."""
+    """Add the subcommand ``train``."""
     parser = commands.add_parser(
         'train',
         help='make a model file that the controller starts from',
-        description='Without a bag: what the full controller learns in simulated practice, and '
-        'what that is worth on other seeds. With bags: the same as bag train. The controller '
+        description='Without a bag: fits the model of the full controller to simulated runs and '
+        'reports its skill on held-out seeds. With bags: the same as bag train. The controller '
         'loads the file by its parameter model.',
     )
     parser.add_argument('bags', nargs='*', type=Path, metavar='BAG', help='folder of a bag')
@@ -36,7 +36,7 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
 
 
 def add_bag_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of learning from bags, see :func:`run_bags`."""
+    """Add the options of training from bags, see :func:`run_bags`."""
     parser.add_argument(
         '--output', type=Path, default=OUTPUT, help=f'model file to write (default {OUTPUT})'
     )
@@ -55,16 +55,16 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Return 0 when the model was written; prints what it is worth.
+    """Write the model, print its skill and return 0.
 
     Raises
     ------
     TrainingError
-        The bags do not teach anything.
+        The bags cannot be used for training.
     ModelError
         The file cannot be written.
     ValueError
-        Options that do not go together.
+        Options that contradict.
     """
     from t3mpc_ros.bag.run.model_file import save_model
 
@@ -89,7 +89,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def run_bags(options: argparse.Namespace) -> int:
-    """Return 0 when the model of ``options.bags`` was written; prints what it is worth.
+    """Write the model of ``options.bags``, print its skill and return 0.
 
     Raises as :func:`run`.
     """

@@ -22,13 +22,13 @@ EVALUATIONS = 120
 OUTPUT = Path('runs') / 'tuned.json'
 
 Table = Callable[[], 'Sequence[MethodDefinition]']
-"""Returns the methods that can be tuned. A function, so that ``lab --help`` need not load them."""
+"""Returns the methods that can be tuned; a function, so that ``--help`` does not load them."""
 
 
 def add_parser(
     commands: 'argparse._SubParsersAction[argparse.ArgumentParser]', table: Table
 ) -> None:
-    """Add ``tune`` to the commands of ``lab``; :func:`run` carries it out."""
+    """Add the subcommand ``tune``."""
     parser = commands.add_parser(
         'tune', help='search the settings of every method, with equally many evaluations'
     )
@@ -56,12 +56,12 @@ def add_parser(
 
 
 def run(options: argparse.Namespace) -> int:
-    """Return 0 when every method was tuned; prints what was gained.
+    """Tune every method, print the improvement and return 0.
 
     Raises
     ------
     ValueError
-        A method that is not in the table.
+        An unknown method.
     """
     from t3mpc_ros.evaluation.tuning.tune_methods import tune_methods
 
@@ -83,12 +83,12 @@ def run(options: argparse.Namespace) -> int:
 
 
 def chosen(known: 'Sequence[MethodDefinition]', names: Sequence[str]) -> 'list[MethodDefinition]':
-    """Return the methods that were named, all when none was; case and punctuation are free.
+    """Return the named methods, all without a name; case and punctuation are ignored.
 
     Raises
     ------
     ValueError
-        A name that is not known; tells the nearest one, or all.
+        An unknown name; the text holds the nearest one, or all.
     """
     from t3mpc_ros.evaluation.tuning.search_space import short_name
 

@@ -25,7 +25,7 @@ from t3mpc_ros.evaluation.twin_validation.validation_page import FULL, QUICK, wr
 def add_parser(commands: Any, clock: Callable[[], float]) -> argparse.ArgumentParser:
     """Return the parser of ``twin``, added to the sub-parsers of a program.
 
-    ``clock`` tells seconds from any origin, for the time that is left.
+    ``clock`` returns seconds from any origin, for the time left.
     """
     parser: argparse.ArgumentParser = commands.add_parser(
         'twin', help='the simulated robot against data sheets, and its odometry under slip'
@@ -45,7 +45,7 @@ def add_parser(commands: Any, clock: Callable[[], float]) -> argparse.ArgumentPa
 
 
 def run(options: argparse.Namespace) -> int:
-    """Return 0 after pictures, page and tables were written; the command line's entry."""
+    """Write figures, page and tables and return 0."""
     from t3mpc_ros.evaluation.reporting import Progress
 
     amount = QUICK if options.quick else FULL

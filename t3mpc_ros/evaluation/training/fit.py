@@ -348,7 +348,8 @@ def fit_coefficients(parameters: Nt3fsMpcParameters, replay: TrainingData) -> Ar
     This is (77)-(78) with the estimate's own error in the place of delta, per sample and
     normalised (Nagumo and Noda 1967, doi 10.1109/TAC.1967.1098599): any mu below 2 is stable. mu
     decreases with the passes, so that what is not a function of chi averages out. P is the
-    projection of the adaptation. d is the estimator residual, as seen by the control law; g is to cancel it.
+    projection of the adaptation. d is the estimator residual, as seen by the control
+    law; g is to cancel it.
 
     Raises
     ------
