@@ -145,8 +145,8 @@ def add_recover_parser(
         'recover',
         help='write what a damaged bag still holds into a new one',
         description='Writes what an MCAP file, or every MCAP file of a folder, still holds into '
-        'a new folder, with index and metadata.yaml, and reports what was kept and lost. The input '
-        'is only read. Exit code 0: nothing was lost; 3: something was, or a file has no end, so '
+        'a new folder, with index and metadata.yaml, and reports what was kept and lost. The '
+        'input is only read. Exit code 0: nothing was lost; 3: something was, or a file has no end, so '
         'that its writer may have held more; 1: nothing can be read, or the output cannot be '
         'written.',
     )

@@ -38,8 +38,8 @@ def private_graph() -> dict[str, str]:
     """Return environment variables that isolate a run on this machine.
 
     Variables that are set already are kept. Otherwise a ``ROS_DOMAIN_ID`` is drawn, so that two
-    runs do not share a graph, and Fast DDS uses UDP on loopback only: its shared memory may block a
-    publisher for a third of a second when a subscriber joins (Fast-DDS issue 6535).
+    runs do not share a graph, and Fast DDS uses UDP on loopback only: its shared memory may block
+    a publisher for a third of a second when a subscriber joins (Fast-DDS issue 6535).
     """
     environment = dict(os.environ)
     environment.setdefault('ROS_DOMAIN_ID', str(random.SystemRandom().randint(1, 101)))
