@@ -143,7 +143,7 @@ static void give_up(void)
     free_the_bus();
     transfer = IDLE;
     answers = false;
-    settled = 0;  // whoever comes back has forgotten its settings
+    settled = 0;  // a sensor that reappears has lost its settings
     wait_us = RETRY_US;
 }
 

@@ -144,7 +144,7 @@ static void allow_features(void)
     set(FEATURE, wanted);
     if (get(FEATURE) == wanted)
         return;
-    // The chip without a plus hides them until it is told so; a second time would hide them again.
+    // A non-plus chip hides them until ACTIVATE; a second ACTIVATE would hide them again.
     const uint8_t key = 0x73;
     tell(ACTIVATE, &key, 1);
     set(FEATURE, wanted);

@@ -20,7 +20,7 @@
 #include "t3_console.h"
 #include "t3_robot.h"
 
-// Nobody sends for so long: look whether the chip has lost its settings.
+// Silence after which the board checks whether the chip has lost its settings.
 #define RADIO_CHECK_US UINT32_C(500000)
 
 // The answer is sampled at once; then it waits for a quiet moment of the radio.
@@ -44,7 +44,7 @@ static bool waking;
 static uint8_t packet_size;  // of the last packet, and when it came
 static uint32_t packet_us;
 static uint8_t answer[T3_RADIO_LIMIT], answer_size;  // waits for its moment
-static bool chip_held;  // the radio chip, its settings, at the last look
+static bool chip_held;  // whether the radio chip held its settings at the last check
 static struct t3_console console;
 
 // Of the bytes from USB no more are looked at in one round, and of frames one. The line can bring

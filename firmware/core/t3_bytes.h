@@ -36,8 +36,8 @@ static inline uint8_t *t3_put32(uint8_t *to, uint32_t value)
     return t3_put16(t3_put16(to, (uint16_t)value), (uint16_t)(value >> 16));
 }
 
-// The conversion of an unsigned value above the signed range is left to the compiler by C99; these
-// say what is meant without it.
+// The conversion of an unsigned value above the signed range is implementation-defined in C99;
+// these functions are portable.
 static inline int16_t t3_signed16(uint16_t value)
 {
     return value <= INT16_MAX ? (int16_t)value : (int16_t)(-1 - (int16_t)(UINT16_MAX - value));

@@ -105,7 +105,7 @@ static void end_key(struct t3_console *console, uint8_t rc)
 {
     console->step = T3_KEY_RESTS;
     memset(console->key, 0, T3_KEY_SIZE);
-    // Where it failed, the session stays locked, and the mark says so to the next start.
+    // After a failure the session stays locked, and the mark reports it to the next start.
     if (rc == T3_RC_OK)
         t3_session_boot(&console->robot->session, console->robot->port);
     tell_key(console, console->id, rc);
@@ -140,7 +140,7 @@ bool t3_console_byte(struct t3_console *console, uint8_t byte)
     const uint8_t size = t3_splitter_byte(&console->splitter, byte);
     if (!size)
         return false;
-    // The splitter keeps the bytes until the next one comes.
+    // The decoder keeps the frame until the next byte.
     const uint8_t *frame = console->splitter.frame;
     switch (frame[0]) {
     case T3_PING:

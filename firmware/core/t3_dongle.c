@@ -40,7 +40,7 @@ static void configure(struct t3_dongle *dongle)
 static void send(struct t3_dongle *dongle, enum t3_dongle_phase phase, const uint8_t *payload,
                  uint8_t size)
 {
-    // Before the radio is told: its answer may come while it is.
+    // Before the radio sends: its answer may arrive meanwhile.
     dongle->phase = phase;
     dongle->phase_us = now(dongle);
     dongle->port->send(dongle->port->context, payload, size);
@@ -63,13 +63,13 @@ void t3_dongle_exchange(struct t3_dongle *dongle, bool acknowledged, uint8_t ret
                         const uint8_t *answer, uint8_t size)
 {
     if (dongle->phase != T3_FIRST && dongle->phase != T3_SECOND)
-        return;  // nobody waits for it any more
+        return;  // no transaction waits for it any more
     const bool first = dongle->phase == T3_FIRST;
     if (retransmits > RETRANSMITS_LIMIT)
         retransmits = RETRANSMITS_LIMIT;
     uint8_t status = (uint8_t)(retransmits << 4);
     status = (uint8_t)(status | (acknowledged ? T3_EXCHANGE_ACK : T3_EXCHANGE_MAX_RT));
-    // A chip that claims more than its FIFO holds has nothing to say.
+    // A width beyond the FIFO is invalid: drop the payload.
     if (acknowledged && size && size <= T3_RADIO_LIMIT) {
         status |= T3_EXCHANGE_PAYLOAD;
         memcpy(dongle->answer, answer, size);

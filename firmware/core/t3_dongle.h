@@ -42,7 +42,7 @@ void t3_dongle_boot(struct t3_dongle *dongle, const struct t3_dongle_port *port,
 // Take a byte from USB.
 void t3_dongle_byte(struct t3_dongle *dongle, uint8_t byte);
 
-// Count a byte that was lost because nobody took it in time.
+// Count a byte that was lost because it was not read in time.
 void t3_dongle_overrun(struct t3_dongle *dongle);
 
 // The radio has finished an exchange: acknowledged (with `size` bytes of answer, or none), or given

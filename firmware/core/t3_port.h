@@ -59,7 +59,7 @@ struct t3_console_port {
     void (*eeprom_cells)(void *context, uint8_t address, uint8_t *data, uint8_t size);
 };
 
-// How the radio chip is set, as a CFG frame says it.
+// Configuration of the radio chip, as in a CFG frame.
 struct t3_radio_settings {
     uint8_t channel;      // 2400 MHz + this
     uint8_t rate;         // 0: 250 kbit/s, 1: 1 Mbit/s, 2: 2 Mbit/s

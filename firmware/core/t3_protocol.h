@@ -135,7 +135,7 @@ enum { T3_ERR_UNKNOWN = 1, T3_ERR_MALFORMED, T3_ERR_BUSY };
 #define T3_PING_SIZE 6u
 #define T3_PONG_SIZE 21u
 
-// What a board says of itself in PONG, behind the PING's id and echo.
+// Status of a board in PONG, after id and echo of the PING.
 struct t3_pong {
     uint32_t time_us;
     bool chip_ok;

@@ -1,6 +1,6 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
-// PARAM_GET, PARAM_SET and ACTION: all may be repeated until their answer is heard.
+// PARAM_GET, PARAM_SET and ACTION: all may be repeated until answered.
 #ifndef T3_REQUESTS_H
 #define T3_REQUESTS_H
 

@@ -47,7 +47,7 @@ static bool button(const struct t3_robot *robot)
 static void take_hello(struct t3_robot *robot, const struct t3_packet *packet,
                        const uint8_t *data, uint32_t received_us)
 {
-    // Refused or not, INFO tells the host which session holds and whether the robot is keyed.
+    // Accepted or not, INFO reports the current session and whether the robot has a key.
     t3_answer_with(robot, T3_INFO, packet->seq, 0, 0);
     switch (t3_session_greet(&robot->session, robot->port, packet, data)) {
     case T3_GREETING_REFUSED:
@@ -186,7 +186,7 @@ void t3_robot_packet(struct t3_robot *robot, const uint8_t *data, uint8_t size,
     }
     if (t3_asks_to_stop(data, size))
         latch_estop(robot);
-    // Whatever is wrong with a packet, the next one fetches a state that says so.
+    // By default the next packet fetches a STATE, also after an invalid one.
     t3_answer_with(robot, T3_STATE, 0, 0, 0);
     robot->answer_waits = true;
     robot->answer_from_us = received_us;

@@ -3,9 +3,9 @@
 // Who may command the robot: the session, and on a keyed link the proof that a frame is the host's
 // and new.
 //
-// The radio itself keeps nobody out. With a 128-bit key at both ends, HELLO is signed under it with
-// a nonce of the host; the robot answers with one of its own, and both make a session key of the
-// two. So a recorded session is worth nothing in the next. Within a session the host's clock
+// The radio has no protection of its own. With a 128-bit key at both ends, HELLO is signed under it
+// with a nonce of the host; the robot answers with one of its own, and both derive a session key
+// from the two. So a recorded session is invalid in the next. Within a session the host clock
 // strictly increases over all signed frames.
 #ifndef T3_SESSION_H
 #define T3_SESSION_H
@@ -20,7 +20,7 @@
 struct t3_session {
     uint8_t id;  // 0: none
     bool keyed;
-    bool locked;  // the key is damaged, or about to change: nobody gets in
+    bool locked;  // the key is damaged or about to change: no session starts
     uint32_t check;  // of the key, for people to compare both ends by
     uint8_t key[T3_KEY_SIZE];
     uint8_t session_key[T3_KEY_SIZE];
@@ -31,11 +31,11 @@ struct t3_session {
 
 enum t3_greeting { T3_GREETING_REFUSED, T3_GREETING_NEW, T3_GREETING_REPEATED };
 
-// Read the key, if there is one; no session. A key that is damaged lets nobody in: the robot then
-// only stops.
+// Read the key, if there is one; no session. With a damaged key no session starts: the robot
+// only accepts ESTOP.
 void t3_session_boot(struct t3_session *session, const struct t3_port *port);
 
-// End the session and let nobody in until t3_session_boot.
+// End the session; start none until t3_session_boot.
 void t3_session_lock(struct t3_session *session);
 
 // Take a HELLO whose bytes are `data`. A repeated one changes nothing.
@@ -56,8 +56,8 @@ void t3_session_end(struct t3_session *session);
 // Store a key, or none (NULL), in the EEPROM; it holds from the next t3_session_boot on.
 void t3_session_store_key(const struct t3_port *port, const uint8_t *key);
 
-// Say in the EEPROM that the key is about to change, or has. A supply that fails in between leaves a
-// mixture of two keys; one in 65536 has the right CRC, so that alone does not tell.
+// Mark in the EEPROM that the key is about to change, or has changed. A supply failure in between
+// leaves a mixture of two keys; one in 65536 has the right CRC, so the CRC alone is not sufficient.
 void t3_session_mark_key(const struct t3_port *port, bool changing);
 
 #endif

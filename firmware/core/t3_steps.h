@@ -25,7 +25,7 @@ struct t3_wheel {
     uint32_t phase;     // 2**32 to a microstep
     int32_t increment;  // of the phase per tick
     int32_t count;      // microsteps issued, signed, modulo 2**32
-    bool back;          // direction the driver is told
+    bool back;          // direction sent to the driver
 };
 
 // Shared with the interrupt: from elsewhere only between lock and unlock of the port.

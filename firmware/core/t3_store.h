@@ -1,7 +1,7 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
 // Records in the EEPROM, each with a CRC: a board that never stored anything, or lost its supply
-// while it did, is told from one that has.
+// while storing, is distinguishable from one with a valid record.
 #ifndef T3_STORE_H
 #define T3_STORE_H
 

@@ -1,6 +1,6 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
-// What the robot tells.
+// Frames from the robot.
 #ifndef T3_TELEMETRY_H
 #define T3_TELEMETRY_H
 

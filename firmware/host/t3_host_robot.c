@@ -124,7 +124,7 @@ static void reply(void *context, const uint8_t *wire, uint8_t size)
 {
     struct t3_host_robot *host = context;
     if (host->said_size + size > USB_ROOM)
-        return;  // nobody reads: lost, as on a serial line
+        return;  // without a reader, bytes are lost as on a serial line
     memcpy(host->said + host->said_size, wire, size);
     host->said_size += size;
 }
@@ -207,7 +207,7 @@ void t3_host_robot_boot(struct t3_host_robot *host, uint8_t reset_cause, uint32_
     host->since_tick_us = 0;
     host->ack_size = 0;
     host->noise = 0;  // a board without any: what hangs on it must still hold
-    host->powered = true;  // pins float until the firmware says otherwise
+    host->powered = true;  // pins float until the firmware configures them
     memcpy(host->eeprom, host->cells, sizeof host->eeprom);
     host->since_cell_us = 0;
     t3_robot_boot(&host->robot, &host->port, reset_cause, T3_SETTLE_US);

@@ -1,7 +1,7 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
-// A board: one AVR of simavr with its radio chip, and what simavr 1.6 does not do as the data sheets
-// say put right from outside.
+// A board: one AVR of simavr with its radio chip, with corrections from outside where simavr 1.6
+// differs from the data sheets.
 #ifndef BOARD_MODEL_H
 #define BOARD_MODEL_H
 

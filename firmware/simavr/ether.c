@@ -55,7 +55,7 @@ static bool arrive(const struct nrf24 *from, struct nrf24 *to, uint64_t now)
             to->faults.unheard++;
             return false;
         }
-        // A packet that is new tells that the acknowledgement before has been heard.
+        // A new packet confirms the reception of the previous acknowledgement.
         if (to->ack_unconfirmed) {
             nrf24_drop(&to->tx);
             to->ack_unconfirmed = false;

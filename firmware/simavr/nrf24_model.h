@@ -13,7 +13,7 @@
 #define NRF24_DEPTH 3u
 
 struct nrf24_packet {
-    uint8_t width;  // as R_RX_PL_WID tells it
+    uint8_t width;  // as read by R_RX_PL_WID
     uint8_t data[NRF24_WIDTH];
 };
 

@@ -1,7 +1,7 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
-// Well-framed nonsense, damaged keys, packets and resets at once: the key is only ever what a whole
-// KEY frame said, in whole or not at all, and what stands between two keys lets nobody in.
+// Well-framed nonsense, damaged keys, packets and resets at once: the key is only ever that of a
+// complete KEY frame, and in the state between two keys no session starts.
 
 #include <stdbool.h>
 #include <stdio.h>
@@ -71,7 +71,7 @@ static void drive(struct t3_host_robot *robot, uint8_t session)
     t3_host_robot_packet(robot, data, T3_CMD_SIZE);
 }
 
-// What a reset would find is what was, what was asked for, or something nobody takes for a key.
+// After a reset the EEPROM holds the old key, the requested one, or an invalid one.
 static void check_cells(struct t3_host_robot *robot, const uint8_t *before)
 {
     uint8_t record[T3_KEY_SIZE + T3_CRC_SIZE];

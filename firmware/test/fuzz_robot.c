@@ -17,7 +17,7 @@
 
 static const uint8_t KEY[T3_KEY_SIZE] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
 
-static uint8_t session;  // that the robot is in, as its answers say
+static uint8_t session;  // session in the answers of the robot
 static uint8_t seq;
 
 static uint8_t common_session(void)

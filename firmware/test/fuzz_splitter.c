@@ -1,6 +1,6 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
-// Random and damaged bytes through the splitter: no fault, and no more frames than the CRC lets by.
+// Random and damaged bytes through the frame decoder: no fault, no more frames than the CRC passes.
 
 #include <math.h>
 #include <stdbool.h>
