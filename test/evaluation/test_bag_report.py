@@ -293,7 +293,7 @@ def test_topics_of_other_names_are_found_by_type_and_named(tmp_path, capsys):
     assert f'The command is taken from {names[1]}.' in page
 
 
-def test_of_several_candidates_the_likeliest_is_taken_and_the_others_are_named(tmp_path, capsys):
+def test_the_likeliest_topic_is_chosen_and_the_others_are_listed(tmp_path, capsys):
     rows = rows_of(('/wheels/odometry', '/base/cmd_vel'), duration=10.0)
     extra = rows_of(('/gps/odom_map', '/joy/velocity'), duration=5.0, seed=3)
     folder = write(tmp_path / 'bag', sorted(rows + extra, key=lambda row: row[0]))
@@ -332,9 +332,7 @@ def test_a_reference_may_be_named(rows, tmp_path, capsys):
         (['--odom', '/chatter'], '/chatter must be nav_msgs/msg/Odometry: it is std_msgs'),
     ],
 )
-def test_a_bag_without_motion_is_an_error_that_says_what_it_holds(
-    tmp_path, capsys, options, words
-):
+def test_a_bag_without_motion_is_an_error_that_lists_its_topics(tmp_path, capsys, options, words):
     text = TYPES[SCAN](data='hello')
     folder = write(tmp_path / 'bag', [(0.1 * i, '/chatter', text) for i in range(5)])
     output = tmp_path / 'out'

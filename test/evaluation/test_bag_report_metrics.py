@@ -418,7 +418,7 @@ def test_lost_messages_are_counted(rows, tmp_path):
     assert timing[TRUTH].missing == timing[COMMAND].missing == 0.0
 
 
-def test_the_target_of_the_estimate_is_the_unknown_part_of_the_dynamics(run, rows):
+def test_the_target_of_the_estimate_is_the_unknown_dynamics(run, rows):
     """The target is made from speeds and u alone, and must come out as g of the simulation."""
     times = np.array([row['t'] for row in rows]) + run.motions[TRUTH].time[0]
     true = np.array([dynamics(row['speeds']) for row in rows])
@@ -460,7 +460,7 @@ def test_the_path_is_the_exact_arc_of_each_twist():
         pose = advance_pose(pose, twist, time[i + 1] - time[i])
 
 
-def test_settled_leaves_out_a_second_after_switches_and_what_is_foreseen_before():
+def test_settled_excludes_the_window_around_each_switch():
     """The start is no longer its business: whether the robot is driven is asked apart."""
     time, switches = np.arange(0.0, 10.0, 0.5), np.array([3.0, 3.2, 9.9])
     late = np.arange(4.5, 10.0, 0.5).tolist()
@@ -483,7 +483,7 @@ def test_settled_leaves_out_a_second_after_switches_and_what_is_foreseen_before(
 
 
 @pytest.mark.parametrize('command', [True, False])
-def test_standing_before_and_after_the_drive_changes_no_error_statistic(rows, tmp_path, command):
+def test_standstill_before_and_after_does_not_change_statistics(rows, tmp_path, command):
     """A robot that followed within 0.04 rad/s was once said to miss by 0.2.
 
     The report also counted the seconds in which the nodes found each other, and those after the
@@ -537,7 +537,7 @@ def test_no_more_is_left_out_before_a_switch_than_after_it(run):
     assert preview_before_switch(replace(run, lead=10.0)) == SETTLING
 
 
-def test_the_drive_is_from_the_first_to_the_last_command_but_zero(run):
+def test_the_drive_spans_the_first_to_the_last_nonzero_command(run):
     """A stop in between, by a time-out say, is not excused."""
     time = np.arange(8.0)
     linear = np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -570,7 +570,7 @@ def test_where_nothing_is_left_to_count_no_number_is_given(rows, tmp_path, why):
     assert ('Every command was zero' in text) == idle
 
 
-def test_without_commands_the_whole_reference_counts_but_its_first_second(rows, tmp_path):
+def test_without_commands_all_but_the_first_second_counts(rows, tmp_path):
     sheet = sheet_of(rows[:300], terms=False)
     sheet.rows = [row for row in sheet.rows if row[1] != '/cmd_vel']
     sheet.topics.pop('/cmd_vel')
@@ -580,7 +580,7 @@ def test_without_commands_the_whole_reference_counts_but_its_first_second(rows, 
     assert 'the bag holds no command that would show when' in page_of(figures).text()
 
 
-def test_a_foreign_bag_of_odometry_and_commands_has_a_report_without_errors(rows, tmp_path):
+def test_a_foreign_bag_with_odometry_and_commands_has_a_report(rows, tmp_path):
     sheet = sheet_of(rows[:200], terms=False, announce='')
     sheet.rows = [row for row in sheet.rows if row[1] in ('/odom', '/cmd_vel')]
     sheet.topics = {name: sheet.topics[name] for name in ('/odom', '/cmd_vel')}

@@ -166,7 +166,9 @@ def test_without_word_from_the_drive_the_same_step_winds_up():
 @pytest.mark.parametrize('kind', ALL)
 def test_jumps_close_at_the_rate_asked_for_and_the_reference_is_followed_exactly(kind):
     changes = {'belief': 0.0} if kind is ComputedTorque else {}
-    baseline = make(kind, jump_transient__rate=30.0, jump_transient__acceleration=1000.0, **changes)
+    baseline = make(
+        kind, jump_transient__rate=30.0, jump_transient__acceleration=1000.0, **changes
+    )
     reference, rate = waves(400, jump=5.0)
     # The slope told is that of the chord, so that nothing but the jump is news.
     smooth, _ = waves(401)

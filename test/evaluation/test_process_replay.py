@@ -161,7 +161,7 @@ def test_a_file_that_breaks_off_in_its_summary_is_refused(bag, tmp_path):
 # -- what is detected -----------------------------------------------------------------------------
 
 
-def test_a_gain_one_percent_off_is_found_and_field_and_setting_are_named(inputs):
+def test_a_gain_one_percent_off_is_found_and_named(inputs):
     gain = inputs.lives[0].parameters[0].law.gain
     outcome = compare(
         inputs, replay_controller(inputs, {'law.gain': 1.01 * gain}), Tolerances(1e-6, 1e-6)
@@ -211,7 +211,7 @@ def columns_of(was, now, tolerances):
     return row
 
 
-def test_a_difference_counts_from_the_absolute_and_the_relative_tolerance_together():
+def test_the_tolerance_is_absolute_plus_relative():
     was, now = [0.0, 1.0, 100.0], [0.01, 1.02, 101.1]
     assert columns_of(was, now, Tolerances(0.01, 0.011)).differing == 0
     row = columns_of(was, now, Tolerances(0.01, 0.0105))
@@ -221,12 +221,12 @@ def test_a_difference_counts_from_the_absolute_and_the_relative_tolerance_togeth
     assert row.relative == pytest.approx(0.02)
 
 
-def test_no_number_is_infinitely_far_from_one_and_what_was_not_recorded_is_not_compared():
+def test_nan_differs_from_a_number_and_missing_is_not_compared():
     row = columns_of([math.nan, 1.0, 1.0], [5.0, 1.0, math.nan], Tolerances(1e9, 1e9))
     assert (row.count, row.differing, row.first_step, row.absolute) == (2, 1, 2, math.inf)
 
 
-def test_a_field_may_have_a_tolerance_of_its_own_and_the_last_that_fits_counts():
+def test_the_last_matching_field_tolerance_counts():
     tolerances = Tolerances(1.0, 0.5, {'cmd_vel.*': 0.1, 'cmd_vel.angular.z': 0.2})
     assert tolerances.of('cmd_vel.linear.x') == (0.1, 0.0)
     assert tolerances.of('cmd_vel.angular.z') == (0.2, 0.0)
@@ -249,7 +249,7 @@ def test_a_tolerance_that_cannot_be_used_is_refused(arguments, words):
 # -- bags from which something is missing --------------------------------------------------------
 
 
-def test_without_a_journal_the_order_of_receipt_stands_in_and_is_said(bag, tmp_path):
+def test_without_a_journal_receive_order_is_used_and_noted(bag, tmp_path):
     copy = without(bag, tmp_path / 'copy', lambda topic, _: topic == JOURNAL)
     inputs = load_inputs(copy)
     assert not inputs.journalled
@@ -269,7 +269,7 @@ def test_a_run_without_events_is_the_same_without_its_journal(tmp_path):
     assert outcome.same, outcome.table()
 
 
-def test_a_recorder_that_came_late_is_said_and_from_the_reset_on_all_is_compared(bag, tmp_path):
+def test_a_late_recorder_is_noted_and_compared_from_the_reset_on(bag, tmp_path):
     late = without(
         bag, tmp_path / 'late', lambda topic, n: topic != '/controller/settings' and n < 100
     )
@@ -293,9 +293,7 @@ def test_a_recorder_that_came_late_is_said_and_from_the_reset_on_all_is_compared
         (JOURNAL, '1 events are missing in the journal'),
     ],
 )
-def test_a_lost_message_is_counted_and_what_follows_until_a_reset_is_left_out(
-    topic, words, bag, tmp_path
-):
+def test_after_a_lost_message_comparison_resumes_at_a_reset(topic, words, bag, tmp_path):
     inputs = load_inputs(without(bag, tmp_path / 'copy', lambda *it: it == (topic, 120)))
     assert any(words in note for note in inputs.notes), inputs.notes
     reset = int(np.flatnonzero(inputs.events == Event.RESET)[0])
@@ -308,7 +306,7 @@ def test_a_lost_message_is_counted_and_what_follows_until_a_reset_is_left_out(
     assert int(np.count_nonzero(outcome.compared)) == inputs.events.size - gap.size
 
 
-def test_odometry_lost_before_the_first_reference_harms_nothing_else(tmp_path):
+def test_odometry_lost_before_the_first_reference_is_harmless(tmp_path):
     """The robot has not moved yet, as when the nodes have not all found each other."""
     parameters = loop_controller()
     start = 1_700_000_000_000_000_000
@@ -464,7 +462,7 @@ def journal_of(steps):
     return np.array([(k, 0, *step) for k, step in enumerate(steps)], dtype=np.int64)
 
 
-def test_references_that_only_the_recorder_heard_are_not_handed_over():
+def test_references_only_the_recorder_received_are_not_passed():
     taken = match(
         journal_of([(1, 0, 0), (2, 2, 40), (3, 3, 50)]), np.arange(4), np.arange(0, 60, 10)
     )
@@ -480,7 +478,7 @@ def test_a_reference_source_that_starts_again_is_followed():
     assert not taken.broken.any()
 
 
-def test_the_controller_may_hear_of_a_reference_after_the_recorder():
+def test_the_controller_may_get_a_reference_after_the_recorder():
     taken = match(
         journal_of([(1, 1, 10), (2, 1, 10), (3, 3, 30)]), np.arange(4), np.array([10, 20, 30])
     )
@@ -557,7 +555,7 @@ def test_a_message_that_is_cut_short_is_refused(length, tmp_path):
         read_columns(read_bag_index(tmp_path / 'bag'), ['/odom'])
 
 
-def test_a_bag_without_chunks_is_read_by_the_slow_way_to_the_same_numbers(bag, tmp_path):
+def test_a_bag_without_chunks_gives_the_same_numbers(bag, tmp_path):
     copy = tmp_path / 'flat.mcap'
     with bag.open('rb') as source, copy.open('wb') as target:
         writer = Writer(target, use_chunking=False)
@@ -619,9 +617,7 @@ def test_a_rerun_written_as_a_bag_compares_with_its_source(bag, tmp_path, capsys
     assert bag_program('compare', tmp_path / 'again', '--abs', '1e-6', '--rel', '1e-6') == 0
 
 
-def test_a_rerun_under_other_settings_differs_and_says_that_the_loop_is_open(
-    bag, tmp_path, capsys
-):
+def test_a_replay_with_other_parameters_reports_an_open_loop(bag, tmp_path, capsys):
     assert bag_program('replay', bag, '--output', tmp_path / 'what', '--set', 'law.gain=30') == 0
     assert 'open loop' in capsys.readouterr().out
     one, other = load_inputs(bag), load_inputs(tmp_path / 'what')

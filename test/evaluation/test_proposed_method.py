@@ -94,7 +94,8 @@ def test_leaving_out_a_part_costs_accuracy_on_the_same_seeds(part, drive):
 def test_jumps_left_to_the_program_alone_cost_more_than_a_ramp():
     """Psi_free knows the jump beforehand, but v_p is bounded and K works against it."""
     more = paired(
-        _errors('velocity', 0.0, **{'jump_transition.method': 'predictive'}), _errors('velocity', 0.0)
+        _errors('velocity', 0.0, **{'jump_transition.method': 'predictive'}),
+        _errors('velocity', 0.0),
     )
     assert more.mean > 0.02
     assert more.certain

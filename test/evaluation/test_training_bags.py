@@ -67,7 +67,7 @@ def lab_run(seed):
     )
 
 
-def test_three_recorded_bags_teach_as_much_as_three_runs_of_the_lab(model):
+def test_three_recorded_bags_train_as_well_as_three_simulations(model):
     """The same lesson, its runs once rebuilt from lossy bags and once known exactly.
 
     Judged on runs of the lab that neither has seen: skill within 5 %, and as much explained.

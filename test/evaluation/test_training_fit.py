@@ -194,7 +194,7 @@ def test_jumps_that_the_law_is_told_of_are_no_errors(tmp_path):
     np.testing.assert_allclose(replay.errors[quiet], jumping.errors[quiet], atol=1e-3)
 
 
-def test_each_command_answers_its_own_message_however_they_were_received():
+def test_each_command_matches_its_message_for_any_receive_order():
     rng = np.random.default_rng(1)
     asked = 0.01 * np.arange(3000)
     given = asked + rng.exponential(0.004, asked.size)  # now and then behind the next message
@@ -219,7 +219,7 @@ def predictor_of(learnt):
     return {k.removeprefix(prefix): v for k, v in learnt.items() if k.startswith(prefix)}
 
 
-def test_the_predictor_of_a_bag_is_at_least_as_good_as_that_of_practice(run, sampled):
+def test_a_predictor_from_a_bag_is_as_good_as_from_simulation(run, sampled):
     """On the quarter that it has not seen; the practice is 120 s of three other runs."""
     parameters = run.controller.parameters
     errors, moves = sampled
@@ -259,7 +259,7 @@ def test_the_model_is_learnt_from_all_and_judged_by_folds(run, sampled, trained)
     assert f'predictor: learnt from {lesson.taught:.1f} s' in trained.text
 
 
-def test_skills_of_stretches_are_those_of_all_their_squares_together(run, sampled):
+def test_the_skill_of_segments_pools_their_squared_errors(run, sampled):
     parameters = run.controller.parameters
     weights = Controller(parameters).law.predictive.get_weights()
     errors, moves = sampled[0][-300:-2].copy(), sampled[1][-300:-2].copy()
@@ -324,7 +324,7 @@ def test_the_coefficients_are_the_friction(replayed):
     assert np.all(np.abs(nothing) < 0.15)
 
 
-def test_the_first_seconds_are_better_with_the_model_than_without(trained, tmp_path):
+def test_the_model_improves_the_first_seconds(trained, tmp_path):
     save_model(tmp_path / 'm.npz', trained.learnt, trained.parameters.to_dict())
     loaded = load_model(tmp_path / 'm.npz')
     for seed in (103, 104):
@@ -601,7 +601,7 @@ def test_runs_with_a_gap_between_them_are_learnt_as_two_runs():
         pretrain(machine(), make_rls_state(12), joined[0], np.full(106, np.inf), how, 20.0, 0.05)
 
 
-def test_the_trial_is_the_longest_stretch_without_a_gap_in_the_last_quarter():
+def test_the_trial_is_the_longest_gapless_part_at_the_end():
     errors = np.arange(80.0).reshape(40, 2)
     errors[[3, 33, 38]] = math.nan
     moves = -np.arange(80.0).reshape(40, 2)
