@@ -39,14 +39,14 @@ def run(options: argparse.Namespace) -> int:
     )
     from t3mpc_ros.evaluation.reporting import Progress
 
-    known = dict.fromkeys(trial.fault for trial in FAULT_RUNS)
+    known = dict.fromkeys(fault_run.fault for fault_run in FAULT_RUNS)
     for name in options.names:
         if name not in known:
             raise ValueError(f'FAULT must be one of {", ".join(known)}: got {name}')
     if options.names and options.output:
         raise ValueError('--output replaces the whole table: give no FAULT with it')
-    trials = [trial for trial in FAULT_RUNS if not options.names or trial.fault in options.names]
-    results = study_faults(trials, Progress(options.clock))
+    fault_runs = [fault_run for fault_run in FAULT_RUNS if not options.names or fault_run.fault in options.names]
+    results = study_faults(fault_runs, Progress(options.clock))
     print(console_text(results))
     if options.output:
         update_page(options.output, results)

@@ -168,7 +168,7 @@ class LoopRecord:
     command: Array
     """u as the drive's limits let it through, rad/s², shape (n, 2)"""
     sent: Array
-    """What the robot was told, shape (n, 2): torques (N m) or wheel speeds (rad/s)"""
+    """Command to the robot, shape (n, 2): torques (N m) or wheel speeds (rad/s)"""
     effort: Array
     """Acceleration asked of the robot, rad/s², shape (n, 2): u with the torque drive, the rate of
     change of the commanded wheel speeds with the velocity drive"""
@@ -270,7 +270,7 @@ class MethodSpec:
     controller_type: type[BaselineController]
     parameters: Parameters
     pretrained: bool = False
-    """Whether it comes with what it learnt in :data:`PRACTICE`, if it is one that learns."""
+    """Whether a method with adaptation starts from the weights of :func:`pretrain`."""
 
     def __post_init__(self) -> None:
         expected = self.controller_type.parameters_type
@@ -332,14 +332,14 @@ def run(
     Each period k: measure, estimate, show the method its :class:`View`, send what it answers.
     The robot stands at the start, and the estimator begins with what is measured then. With a
     torque drive, u is cut where its torque would be beyond what the motors have, so that
-    estimator and method are told the u that acts. Equal arguments give equal runs, bit for bit.
+    estimator and method get the limited u. Equal arguments give equal runs, bit for bit.
 
     Parameters
     ----------
     scenario
         Drive, noise, case and seed.
     method
-        Makes the controller from what it is told, a :class:`MethodSpec` say.
+        Makes the controller from the nominal model, for example a :class:`MethodSpec`.
     drive
         A drive seam in place of :func:`drive_for`, of the same kind; it is reset first.
 
@@ -429,7 +429,7 @@ def _prepare(scenario: Scenario) -> LoopRecord:
 def _observed_reference(
     scenario: Scenario, dead_time: float, preview: bool
 ) -> tuple[Array, Array, int]:
-    """Return ``View.wanted`` and ``View.wanted_next`` of each period, and how long ``future`` is.
+    """Return reference and next reference of each observation, and the length of ``future``.
 
     With preview they are rows of the reference after the dead time, and go on beyond the run.
     Without, r is extrapolated over the dead time by the slope it has now: a switch is seen when

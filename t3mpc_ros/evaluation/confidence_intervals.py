@@ -39,7 +39,7 @@ def mean(values: Sequence[float]) -> float:
 def interval(values: Sequence[float], confidence: float = 0.95) -> float:
     """Return half the width of the confidence interval of the mean, by Student's t.
 
-    It is infinite for fewer than two values: one value does not tell how they scatter.
+    It is infinite for fewer than two values: one value has no standard deviation.
     """
     n = len(values)
     if n < 2:

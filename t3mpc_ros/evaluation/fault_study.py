@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.reporting import Progress
 from t3mpc_ros.evaluation.twin_closed_loop import (
-    FINAL_STANDSTILL,
+    INITIAL_STANDSTILL,
     STATUS_FLAGS,
     TwinRecord,
     chaotic_course,
@@ -41,116 +41,118 @@ from t3mpc_ros.simulation.fault_injection import (
 Array = NDArray[np.float64]
 
 BEGIN = 10.0
-"""s; when a fault comes."""
+"""Begin of every fault, s."""
 SETTLED = 3.0
-"""s; from here the errors of a run count."""
+"""Errors count from here, s."""
 AFTER = 2.0
-"""s after the end of a fault, from which the error counts as that after it."""
+"""Time after the end of a fault before its error after the fault counts, s."""
 ALLOWED = 1.5
-"""Errors up to this many times those without the fault count as being back."""
+"""Ratio to the error without the fault up to which an error counts as recovered."""
 REST = 4.0
-"""s; over less than that no error is called back."""
+"""Shortest time over which an error can count as recovered, s."""
 BRAKING_TIME = 0.6
-"""s; a robot that has said for so long why it stands must stand."""
+"""Time after a stop reason by which the robot must stand still, s."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of one trial; errors are root mean squares over time and both wheels."""
+    """Outcome of one run; errors are root mean squares over time and both wheels."""
 
     name: str
     course: str
     verdict: str
-    """``bounded``: it drives on within its limits, and the error comes back; ``stops``: it says
-    why; ``impaired``: within its limits, but the error stays; ``unbounded``: none of these."""
+    """``bounded``: the robot stays within its limits and the error recovers; ``stops``: it stops
+    with a reason; ``impaired``: within limits, but the error remains; ``unbounded``: otherwise."""
     reason: str
-    """Why it stopped, or what was out of bounds."""
-    stood: float
-    """s for which it said so"""
-    goes_on: str
-    """How it came to drive again: ``by itself``, ``after a pause`` or ``not``; '' if it drove."""
+    """Reason of the stop, or the violated bound."""
+    stopped_for: float
+    """Time with a stop reason, s"""
+    resumption: str
+    """How the robot resumed: ``by itself``, ``after a pause`` or ``not``; '' if it never stopped."""
     before: float
     """Error of the wheel speeds before the fault, rad/s"""
     during: float
     after: float | None
-    """None where the robot stands at last, or the fault stays."""
-    back: float | None
-    """s after the fault until the error is back for good; None if it never is."""
+    """None if the robot stands at the end, or the fault lasts."""
+    recovery_time: float | None
+    """Time from the end of the fault until the error stays recovered, s; None if it does not."""
     odometry_before: tuple[float, float]
-    """How far odometry is off the truth: m, rad"""
+    """Odometry error before the fault: m, rad"""
     odometry_after: tuple[float, float]
-    """At the end of the run."""
-    noticed: tuple[str, ...]
-    """What robot or controller say of it: flags, reasons, an error that rises."""
+    """Odometry error at the end of the run."""
+    detected: tuple[str, ...]
+    """Signs that robot or controller show: flags, reasons, a larger error."""
     ranges: str
-    """What the distance sensors say of a wall; nothing here acts on it."""
-    unseen: tuple[str, ...]
-    """What only the truth shows."""
+    """Range readings before and at a wall; the loop does not use them."""
+    undetected: tuple[str, ...]
+    """Effects that only ground truth shows."""
 
 
 def evaluate_outcome(
     name: str,
     course: str,
     record: TwinRecord,
-    healthy: TwinRecord,
+    undisturbed_run: TwinRecord,
     begin: float,
     end: float,
     parameters: DigitalTwinParameters,
 ) -> Outcome:
-    """Return the outcome that a record shows.
+    """Return the outcome of a recorded run.
 
     Parameters
     ----------
     name, course
-        What the trial is called, and what the controller was to follow.
+        Name of the run, and its reference course.
     record, healthy
         The run, and the same one without the fault.
     begin, end
-        When the fault came and went, s; beyond the record's end if it stays.
-    settings
-        Of the robot, for its limits.
+        Begin and end of the fault, s; the end may lie beyond the record.
+    parameters
+        Parameters of the robot, for its limits.
     """
     last = float(record.time[-1])
     stays = end >= last
-    told = stop_reasons(record, begin)
-    stands = bool(record.robot_says[-1] or record.controller_says[-1])
-    back = None if stays or stands else time_to_return(record, healthy, end)
-    broken = _broken(record, begin, parameters)
-    if broken:
+    reasons = stop_reasons(record, begin)
+    stopped = bool(record.robot_reasons[-1] or record.controller_reasons[-1])
+    recovery_time = None if stays or stopped else time_to_return(record, undisturbed_run, end)
+    violation = _bound_violation(record, begin, parameters)
+    if violation:
         verdict = 'unbounded'
-    elif told:
+    elif reasons:
         verdict = 'stops'
     else:
-        verdict = 'bounded' if stays or back is not None else 'impaired'
-    goes_on = ('not' if stands else 'by itself') if told else ''
-    before, after = _off(record, begin), _off(record, last)
+        verdict = 'bounded' if stays or recovery_time is not None else 'impaired'
+    resumption = ('not' if stopped else 'by itself') if reasons else ''
+    before, after = _odometry_error(record, begin), _odometry_error(record, last)
     return Outcome(
         name=name,
         course=course,
         verdict=verdict,
-        reason=broken or '; '.join(told),
-        stood=sum(told.values()),
-        goes_on=goes_on,
+        reason=violation or '; '.join(reasons),
+        stopped_for=sum(reasons.values()),
+        resumption=resumption,
         before=wheel_error(record, SETTLED, begin),
         during=wheel_error(record, begin, end),
-        after=None if stays or stands else wheel_error(record, end + AFTER, last),
-        back=back,
+        after=None if stays or stopped else wheel_error(record, end + AFTER, last),
+        recovery_time=recovery_time,
         odometry_before=before,
         odometry_after=after,
-        noticed=_noticed(record, healthy, begin, min(end, last)),
+        detected=_detected(record, undisturbed_run, begin, min(end, last)),
         ranges=_ranges(record, begin, min(end, last)),
-        unseen=_unseen(record, begin, min(end, last), after, _off(healthy, last)),
+        undetected=_undetected(
+            record, begin, min(end, last), after, _odometry_error(undisturbed_run, last)
+        ),
     )
 
 
-def time_to_return(record: TwinRecord, healthy: TwinRecord, end: float) -> float | None:
-    """Return how long (s) after ``end`` the wheel error is back for good; None: it is not.
+def time_to_return(record: TwinRecord, undisturbed_run: TwinRecord, end: float) -> float | None:
+    """Return the time (s) from ``end`` until the wheel error stays recovered; None if it does not.
 
-    It is back if from then on to the end of the run it is at most :data:`ALLOWED` times as large
-    as in the run without the fault, there or before the fault, whichever is more.
+    It has recovered if from then on to the end of the run it is at most :data:`ALLOWED` times as large
+    as in the run without the fault, in the same time or before the fault, whichever is larger.
     """
-    errors = record.rotors - record.reference, healthy.rotors - healthy.reference
-    usual = _rms(errors[1][healthy.rows(SETTLED, BEGIN)])
+    errors = record.rotors - record.reference, undisturbed_run.rotors - undisturbed_run.reference
+    usual = _rms(errors[1][undisturbed_run.rows(SETTLED, BEGIN)])
     last = float(record.time[-1])
     for wait in np.arange(0.0, last - REST - end, 0.5).tolist():
         mine, other = (_rms(error[record.rows(end + wait, last)]) for error in errors)
@@ -168,28 +170,28 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _off(record: TwinRecord, time: float) -> tuple[float, float]:
-    """Return by how much (m, rad) odometry is off the truth just before ``time`` (s)."""
+def _odometry_error(record: TwinRecord, time: float) -> tuple[float, float]:
+    """Return the odometry error (m, rad) just before ``time`` (s)."""
     row = record.rows(time, time + 1.0).start - 1
     x, y, yaw = (record.odometry[row] - record.truth[row]).tolist()
     return float(np.hypot(x, y)), abs(wrap_angle(yaw))
 
 
 def stop_reasons(record: TwinRecord, begin: float) -> dict[str, float]:
-    """Return for how long (s) robot or controller said why they did not drive, by what."""
+    """Return the duration (s) of each stop reason of robot and controller."""
     period = float(record.time[1] - record.time[0])
-    told: dict[str, float] = {}
+    reasons: dict[str, float] = {}
     for row in range(record.rows(begin, begin + 1.0).start, len(record.time)):
-        text = record.robot_says[row] or record.controller_says[row]
+        text = record.robot_reasons[row] or record.controller_reasons[row]
         if text:
-            told[text] = told.get(text, 0.0) + period
-    return told
+            reasons[text] = reasons.get(text, 0.0) + period
+    return reasons
 
 
-def _broken(record: TwinRecord, begin: float, parameters: DigitalTwinParameters) -> str:
-    """Return what was out of bounds; '' when nothing was."""
+def _bound_violation(record: TwinRecord, begin: float, parameters: DigitalTwinParameters) -> str:
+    """Return the violated bound as text; '' if there is none."""
     limiter = parameters.limiter
-    rows = slice(record.rows(FINAL_STANDSTILL, begin).start, None)
+    rows = slice(record.rows(INITIAL_STANDSTILL, begin).start, None)
     limit = limiter.wheel_speed
     for what, speeds in (('command', record.commanded[rows]), ('wheel', record.rotors[rows])):
         fastest = float(np.max(np.abs(speeds)))
@@ -202,17 +204,19 @@ def _broken(record: TwinRecord, begin: float, parameters: DigitalTwinParameters)
         if abs(twist.angular) > limiter.angular_speed + 1e-6:
             return f'a command of {twist.angular:.1f} rad/s about the vertical'
     since = None
-    for row, text in enumerate(record.robot_says):
+    for row, text in enumerate(record.robot_reasons):
         since = None if not text else row if since is None else since
         if since is None or record.time[row] - record.time[since] < BRAKING_TIME:
             continue
         if np.any(record.commanded[row]):
-            return f'it says that it stands, and drives ({text})'
+            return f'the robot moves although it reports a stop ({text})'
     return ''
 
 
-def _noticed(record: TwinRecord, healthy: TwinRecord, begin: float, end: float) -> tuple[str, ...]:
-    """Return what robot and controller say, from the begin of the fault on."""
+def _detected(
+    record: TwinRecord, undisturbed_run: TwinRecord, begin: float, end: float
+) -> tuple[str, ...]:
+    """Return the signs of robot and controller from the begin of the fault."""
     found = []
     rows = record.rows(begin, float(record.time[-1]))
 
@@ -226,41 +230,41 @@ def _noticed(record: TwinRecord, healthy: TwinRecord, begin: float, end: float) 
             name, raised = 'not enabled', ~raised
         if name != 'moving' and raised.any() and not raised.all():
             note(f'`{name}`', raised)
-    for text in dict.fromkeys(filter(None, record.robot_says[rows])):
-        said = np.array([one == text for one in record.robot_says[rows]])
-        note(f'"{text.split(":")[0]}"', said)
+    for text in dict.fromkeys(filter(None, record.robot_reasons[rows])):
+        reported = np.array([one == text for one in record.robot_reasons[rows]])
+        note(f'"{text.split(":")[0]}"', reported)
     during = record.rows(begin, end)
     if np.isnan(record.nearest[during]).all():
         found.append('no distances')
     error = _rms((record.measured - record.reference)[during])
-    usual = _rms((healthy.measured - healthy.reference)[during])
-    if error > ALLOWED * usual and not any(record.robot_says[during]):
+    usual = _rms((undisturbed_run.measured - undisturbed_run.reference)[during])
+    if error > ALLOWED * usual and not any(record.robot_reasons[during]):
         found.append(f'tracking error {error:.2f} rad/s')
     return tuple(found)
 
 
 def _ranges(record: TwinRecord, begin: float, end: float) -> str:
-    """Return the nearest that was measured in the last 2 s before ``begin``, and from then on."""
+    """Return the nearest range in the last 2 s before ``begin``, and from then on."""
     before, during = (
         record.nearest[record.rows(*span)] for span in ((begin - 2.0, begin), (begin, end))
     )
     if not np.isfinite(before).any():
         return ''
     span = ' to '.join(
-        f'{one:.2f} m' if np.isfinite(one) else 'nearer than they can tell'
+        f'{one:.2f} m' if np.isfinite(one) else 'below range'
         for one in dict.fromkeys((np.min(during), np.max(during)))
     )
     return f'distances fall to {np.min(before[np.isfinite(before)]):.2f} m before it, then {span}'
 
 
-def _unseen(
+def _undetected(
     record: TwinRecord,
     begin: float,
     end: float,
     off: tuple[float, float],
     usual: tuple[float, float],
 ) -> tuple[str, ...]:
-    """Return what only the truth shows."""
+    """Return the effects that only ground truth shows."""
     found = []
     rows = record.rows(begin, end)
     lost = np.abs(record.lost_steps[record.rows(begin, float(record.time[-1]))]).max(axis=0)
@@ -277,25 +281,26 @@ def _unseen(
 DURATION = 40.0
 """s; length of a run."""
 PAUSE = (5.0, 1.0)
-"""s; how long after the fault a person pauses a controller whose robot stands, for how long."""
+"""Time after the fault at which a person pauses the controller of a stopped robot, and length of the
+pause, s."""
 
-COURSES: Mapping[str, Callable[[float], Array]] = {
+REFERENCE_COURSES: Mapping[str, Callable[[float], Array]] = {
     'chaotic': chaotic_course,
     'straight': straight_course,
     'arc': lambda duration: straight_course(duration, turn=-0.06),
 }
-"""What the controller is to follow."""
+"""Reference courses by name."""
 
 
 @dataclass(frozen=True, slots=True)
 class FaultRun:
-    """One run to be: a course, and a fault on the way or a wall at its end."""
+    """One run of the study: a course with a fault, or with a wall at its end."""
 
     name: str
     course: str
     """One of :data:`COURSES`."""
     event: FaultEvent | None
-    """None: what goes wrong is the world."""
+    """None for a wall instead of a fault."""
     world: str = ''
     duration: float = DURATION
 
@@ -306,7 +311,7 @@ class FaultRun:
 
     @property
     def schedule(self) -> FaultSchedule:
-        """What the robot is to play."""
+        """Fault schedule of the robot."""
         return FaultSchedule([] if self.event is None else [self.event], self.name)
 
 
@@ -324,93 +329,99 @@ def _fault_runs() -> tuple[FaultRun, ...]:
         ('supply_sag', (2.0, 5.0), 5.0),
         ('brown_out', (True,), 0.1),
     )
-    trials = []
+    fault_runs = []
     for course in ('chaotic', 'straight'):
         for fault, values, duration in strengths:
             for value in values:
                 (name,) = active_faults(FaultParameters().with_values({fault: value}))
-                trials.append(FaultRun(name, course, FaultEvent(BEGIN, fault, value, duration)))
-    trials.append(FaultRun('collision, head-on', 'straight', None, 'room', 25.0))
-    trials.append(FaultRun('collision, at a slant', 'arc', None, 'room', 25.0))
-    return tuple(trials)
+                fault_runs.append(
+                    FaultRun(name, course, FaultEvent(BEGIN, fault, value, duration))
+                )
+    fault_runs.append(FaultRun('collision, head-on', 'straight', None, 'room', 25.0))
+    fault_runs.append(FaultRun('collision, at a slant', 'arc', None, 'room', 25.0))
+    return tuple(fault_runs)
 
 
 FAULT_RUNS = _fault_runs()
-"""Every run, those of one course together."""
+"""Every run, grouped by course."""
 
 
-def study_faults(trials: Sequence[FaultRun], progress: Progress | None = None) -> list[Outcome]:
-    """Return what becomes of each trial; ``progress`` is told how far it is."""
+def study_faults(
+    fault_runs: Sequence[FaultRun], progress: Progress | None = None
+) -> list[Outcome]:
+    """Return the outcome of each run; ``progress`` receives the number of finished runs."""
     if progress is not None:
-        progress.begin(len(trials))
+        progress.begin(len(fault_runs))
     results = []
-    for trial in trials:
-        results.append(run_fault(trial))
+    for fault_run in fault_runs:
+        results.append(run_fault(fault_run))
         if progress is not None:
             progress.done(len(results))
     return results
 
 
-def run_fault(trial: FaultRun) -> Outcome:
-    """Return what becomes of the closed loop in one trial.
+def run_fault(fault_run: FaultRun) -> Outcome:
+    """Return the outcome of the closed loop in one run.
 
-    If the robot stands at last, the run is repeated with a person who pauses the controller.
+    If the robot stands at the end, the run is repeated with a pause of the controller.
     """
-    parameters = loop_robot(trial.world)
-    record = _run(trial, parameters)
-    healthy = undisturbed(trial.course, trial.duration)
-    begin, end = _span(trial, record, parameters)
-    result = evaluate_outcome(trial.name, trial.course, record, healthy, begin, end, parameters)
-    if result.verdict == 'stops' and result.goes_on == 'not' and trial.event is not None:
+    parameters = loop_robot(fault_run.world)
+    record = _run(fault_run, parameters)
+    undisturbed_run = undisturbed(fault_run.course, fault_run.duration)
+    begin, end = _span(fault_run, record, parameters)
+    result = evaluate_outcome(
+        fault_run.name, fault_run.course, record, undisturbed_run, begin, end, parameters
+    )
+    if result.verdict == 'stops' and result.resumption == 'not' and fault_run.event is not None:
         again, wait = end + PAUSE[0], PAUSE[1]
-        paused = _run(trial, parameters, ((again, again + wait),))
-        told = stop_reasons(paused, again + wait + AFTER)
-        if not told:
+        paused = _run(fault_run, parameters, ((again, again + wait),))
+        remaining = stop_reasons(paused, again + wait + AFTER)
+        if not remaining:
             end = again + wait
             result = replace(
                 result,
-                goes_on='after a pause',
-                after=wheel_error(paused, end + AFTER, trial.duration),
-                back=time_to_return(paused, healthy, end),
+                resumption='after a pause',
+                after=wheel_error(paused, end + AFTER, fault_run.duration),
+                recovery_time=time_to_return(paused, undisturbed_run, end),
             )
     return result
 
 
 @lru_cache(maxsize=8)
 def undisturbed(course: str, duration: float) -> TwinRecord:
-    """Return the run on a course with no fault and an endless plain around it."""
+    """Return the run on a course without fault and walls."""
     return _run(FaultRun('none', course, None, '', duration), loop_robot())
 
 
 def _run(
-    trial: FaultRun,
+    fault_run: FaultRun,
     parameters: DigitalTwinParameters,
     pauses: tuple[tuple[float, float], ...] = (),
 ) -> TwinRecord:
     return run_twin(
         parameters,
         loop_controller(),
-        _course(trial.course, trial.duration),
-        trial.duration,
-        trial.schedule,
+        _course(fault_run.course, fault_run.duration),
+        fault_run.duration,
+        fault_run.schedule,
         pauses,
     )
 
 
 @cache
 def _course(name: str, duration: float) -> Array:
-    return COURSES[name](duration)
+    return REFERENCE_COURSES[name](duration)
 
 
 def _span(
-    trial: FaultRun, record: TwinRecord, parameters: DigitalTwinParameters
+    fault_run: FaultRun, record: TwinRecord, parameters: DigitalTwinParameters
 ) -> tuple[float, float]:
-    """Return when what goes wrong begins and ends, s."""
-    if trial.event is None:
-        touches = record.push > 0.0
-        return float(record.time[np.argmax(touches)] if touches.any() else 0.0), trial.duration
-    away = parameters.boot_time if trial.event.fault == 'brown_out' else 0.0
-    return trial.event.at, trial.event.until + away
+    """Return begin and end of the fault or the collision, s."""
+    if fault_run.event is None:
+        touches = record.contact_force > 0.0
+        return float(record.time[np.argmax(touches)] if touches.any() else 0.0), fault_run.duration
+    away = parameters.boot_time if fault_run.event.fault == 'brown_out' else 0.0
+    return fault_run.event.at, fault_run.event.until + away
 
 
 BEGIN_MARK = '<!-- outcomes: written by `t3mpc faults`, do not edit by hand -->'
@@ -423,32 +434,32 @@ TITLES = {
 }
 TABLE_HEAD = (
     '| fault | outcome | error of the wheels before, during, after (rad/s) '
-    '| odometry off the truth before, at the end | what the robot can know '
-    '| what only the truth shows |\n'
+    '| odometry error before, at the end | detected by robot or controller '
+    '| shown by ground truth only |\n'
     '|---|---|---|---|---|---|\n'
 )
-UNDETECTED = '**not seen by the robot, only ground truth shows it**: '
-UNREPORTED = '**no flag and no reason, the counters go on**: '
+UNDETECTED = '**undetected by the robot**: '
+UNREPORTED = '**no flag, no reason, and the counters advance**: '
 
 
 def outcome_sentence(outcome: Outcome) -> str:
-    """Return what became of a trial in words."""
-    back = (
-        'error not back' if outcome.back is None else f'error back after {outcome.back:g} s'
-        if outcome.back > 0.0 else 'error back at once'
+    """Return the outcome in words."""
+    recovery_time = (
+        'error not recovered' if outcome.recovery_time is None else f'error recovered after {outcome.recovery_time:g} s'
+        if outcome.recovery_time > 0.0 else 'error recovered at once'
     )  # fmt: skip
     if outcome.verdict == 'unbounded':
         return f'unbounded: {outcome.reason}'
     if outcome.verdict == 'impaired':
-        return 'within limits, but error not back'
+        return 'within limits, but error not recovered'
     if outcome.verdict == 'bounded':
-        return 'bounded' + ('' if outcome.after is None else f', {back}')
+        return 'bounded' + ('' if outcome.after is None else f', {recovery_time}')
     text = f'stops: {_short(outcome.reason)}'
-    if outcome.goes_on == 'by itself':
-        return f'{text}, for {outcome.stood:.1f} s; goes on by itself, {back}'
-    if outcome.goes_on == 'after a pause':
-        return f'{text}, until commands pause; then goes on, {back}'
-    return f'{text}, and stays so'
+    if outcome.resumption == 'by itself':
+        return f'{text}, for {outcome.stopped_for:.1f} s; resumes by itself, {recovery_time}'
+    if outcome.resumption == 'after a pause':
+        return f'{text}, until commands pause; then resumes, {recovery_time}'
+    return f'{text}, and remains stopped'
 
 
 def table_row(outcome: Outcome) -> str:
@@ -456,17 +467,17 @@ def table_row(outcome: Outcome) -> str:
     after = '–' if outcome.after is None else f'{outcome.after:.2f}'
     before_m, before_rad = outcome.odometry_before
     after_m, after_rad = outcome.odometry_after
-    unseen = ', '.join(outcome.unseen) or '–'
-    if outcome.unseen and not outcome.noticed:
-        unseen = (UNREPORTED if outcome.ranges else UNDETECTED) + unseen
-    known = [*outcome.noticed, outcome.ranges] if outcome.ranges else outcome.noticed
+    undetected = ', '.join(outcome.undetected) or '–'
+    if outcome.undetected and not outcome.detected:
+        undetected = (UNREPORTED if outcome.ranges else UNDETECTED) + undetected
+    known = [*outcome.detected, outcome.ranges] if outcome.ranges else outcome.detected
     cells = (
         f'`{outcome.name}`',
         outcome_sentence(outcome),
         f'{outcome.before:.2f}, {outcome.during:.2f}, {after}',
         f'{_length(before_m)}, {_degrees(before_rad)}; {_length(after_m)}, {_degrees(after_rad)}',
         ', '.join(known) or '–',
-        unseen,
+        undetected,
     )
     return '| ' + ' | '.join(cells) + ' |\n'
 
@@ -482,35 +493,37 @@ def markdown_tables(results: Sequence[Outcome]) -> str:
 
 
 def console_text(results: Sequence[Outcome]) -> str:
-    """Return the same for a terminal, a line for each outcome."""
+    """Return the outcomes for a terminal, one line each."""
     lines = []
     for course, title in TITLES.items():
         chosen = [result for result in results if result.course == course]
         lines += [f'{title}:'] if chosen else []
         for result in chosen:
-            hidden = ' (not noticed by the robot)' if result.unseen and not result.noticed else ''
+            hidden = (
+                ' (not detected by the robot)' if result.undetected and not result.detected else ''
+            )
             lines.append(f'  {result.name:24} {outcome_sentence(result)}{hidden}')
     return '\n'.join(lines)
 
 
 def page_section(results: Sequence[Outcome]) -> str:
-    """Return what stands in the page between the marks, these included."""
+    """Return the section of the page from mark to mark."""
     after, pause = PAUSE
     return f"""{BEGIN_MARK}
 
-The controller drives the twin. Each fault comes at {BEGIN:g} s and lasts 5 s; `brown_out` restarts
-the board, which is then away for 0.5 s. A run lasts {DURATION:g} s, one into a wall 25 s, of which
+The controller drives the twin. Each fault begins at {BEGIN:g} s and lasts 5 s; `brown_out` restarts
+the board, which takes 0.5 s. A run lasts {DURATION:g} s, one into a wall 25 s, of which
 the robot needs 11 s to get there.
 
-Errors are root mean squares over both wheels, of the speed of the rotors against what was wanted:
-from 3 s on before the fault, during it, and from 2 s after it to the end. The error is *back* when
+Errors are root mean squares over both wheels, of rotor speed against reference:
+from 3 s on before the fault, during it, and from 2 s after it to the end. The error has *recovered* when
 the rest of the run is no worse than {ALLOWED:g} times the same run without the fault. Where the
 robot stands until commands pause, a person pauses the controller for {pause:g} s, {after:g} s
-after the fault: the error after it is then that after the pause, the odometry that of a robot
-left alone.
+after the fault: the error after the fault then counts after the pause, and the odometry is
+that of the run without a pause.
 
-What only the truth shows: full steps lost by the right and the left motor at most, and how much
-faster (root mean square) the wheels turn than the floor goes by.
+Ground truth shows full steps lost by the right and the left motor at most, and how much
+faster (root mean square) the wheels turn than they roll.
 
 {markdown_tables(results)}
 {END_MARK}
@@ -518,7 +531,7 @@ faster (root mean square) the wheels turn than the floor goes by.
 
 
 def update_page(page: Path, results: Sequence[Outcome]) -> None:
-    """Replace what stands between the marks of a page.
+    """Replace the section between the marks of a page.
 
     Raises
     ------

@@ -84,9 +84,9 @@ class ComparedMethod(MethodSpec):
     """A method as it is run, and how tables sort it."""
 
     baseline: bool = True
-    """Whether it is somebody else's method, not a stage of ours."""
+    """Whether it is a baseline, not a stage of the proposed controller."""
     preview: bool = False
-    """Whether it is told the future of the reference."""
+    """Whether it has preview."""
 
 
 def _both(parameters: Parameters) -> dict[str, Parameters]:

@@ -98,7 +98,11 @@ class ProposedController(BaselineController):
         self._slope = (observation.next_reference - observation.reference) / self._period
         self._steps += 1
         return self._tracker.step(
-            now_ns, observation.speeds, observation.reference, observation.next_reference, self._period
+            now_ns,
+            observation.speeds,
+            observation.reference,
+            observation.next_reference,
+            self._period,
         )
 
     def applied(self, acceleration: Array, *, limited: bool) -> None:

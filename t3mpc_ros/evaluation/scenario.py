@@ -55,14 +55,14 @@ class Case:
     """Settings that change once more in mid-run."""
     when: float = 0.5
     """The instant of that change, as a share of the run."""
-    told: bool = False
+    known: bool = False
     """Whether the estimator and the methods know of ``changes``."""
     drives: tuple[str, ...] = DRIVES
     """The drives in which the case means something."""
 
 
 CASES: Mapping[str, Case] = {
-    'nominal': Case('the robot that everyone was told of, with its friction and disturbance'),
+    'nominal': Case('the nominal robot with its friction and disturbance'),
     'mass +30 %': Case(
         'body mass and inertia 30 % above nominal', {'mass_factor': 1.3, 'inertia_factor': 1.3}
     ),
@@ -81,7 +81,7 @@ CASES: Mapping[str, Case] = {
     'dead time': Case(
         'a command takes 30 ms instead of 10 ms to reach the wheels, and everyone knows it',
         {'drive.dead_time': 0.03},
-        told=True,
+        known=True,
         drives=('velocity',),
     ),
 }
@@ -202,8 +202,8 @@ class Scenario:
         return self.robot().with_values(later) if later else None
 
     def nominal_model(self, rate: float = RATE) -> NominalModel:
-        """Return what a method is told that answers ``rate`` times a second."""
-        robot = self._told()
+        """Return the nominal model for a method with ``rate`` steps per second."""
+        robot = self._known_robot()
         velocity = self.drive == 'velocity'
         return NominalModel(
             drive=self.drive,
@@ -216,11 +216,11 @@ class Scenario:
         )
 
     def estimate(self) -> SpeedFilterParameters:
-        """Return what the state estimator of every method is told.
+        """Return the parameters of the state estimator, equal for all methods.
 
         The true variance of the noise, and the lag and dead time that everyone knows.
         """
-        drive = self._told().drive
+        drive = self._known_robot().drive
         return SpeedFilterParameters.from_dict(
             {
                 'noise_variance': float(self.noise),
@@ -232,9 +232,9 @@ class Scenario:
     def _nominal(self) -> PaperRobotParameters:
         return PaperRobotParameters.from_dict({'drive.kind': self.drive, 'rate': RATE})
 
-    def _told(self) -> PaperRobotParameters:
+    def _known_robot(self) -> PaperRobotParameters:
         case, nominal = CASES[self.case], self._nominal()
-        return nominal.with_values(case.changes) if case.told else nominal
+        return nominal.with_values(case.changes) if case.known else nominal
 
 
 def reference_parameters(seed: int) -> ReferenceParameters:

@@ -26,17 +26,17 @@ from t3mpc_ros.simulation.fault_injection import FaultSchedule
 Array = NDArray[np.float64]
 
 LEAD = 0.4
-"""How far ahead of the odometry the reference is told, s."""
-FINAL_STANDSTILL = 1.5
-"""s; the robot stands for so long at first: without that its odometry does not use the gyro."""
+"""Lead of the reference over the odometry, s."""
+INITIAL_STANDSTILL = 1.5
+"""Standstill before the run, s; odometry uses the gyro only after it."""
 STATUS_FLAGS = RobotStatus._fields
-"""What the columns of :attr:`TwinRecord.flags` mean."""
+"""Columns of :attr:`TwinRecord.flags`."""
 
 
 def chaotic_course(duration: float, seed: int = 1) -> Array:
     """Return wheel speeds (rad/s) of the chaotic reference for a run, shape (n, 2).
 
-    It is the reference of every offline trial with that seed, see :class:`Scenario`.
+    It equals the reference of every :class:`Scenario` with that seed.
     """
     scenario = Scenario('velocity', 0.0, 'nominal', seed, duration, LEAD)
     return scenario.reference().speeds
@@ -52,14 +52,14 @@ def straight_course(duration: float, speed: float = 0.2, turn: float = 0.0) -> A
 
 
 def loop_controller() -> ControllerParameters:
-    """Return the controller as it is used on the stepper twin."""
+    """Return the controller parameters for the stepper twin."""
     return ControllerParameters.from_dict(
         {'speed_filter.lag': 0.003, 'speed_filter.noise_variance': 0.04}
     )
 
 
 def loop_robot(world: str = '', seed: int = 1) -> DigitalTwinParameters:
-    """Return the twin as the controller is told it is: its wheel speeds are as noisy."""
+    """Return the twin with the wheel speed noise that the controller assumes."""
     return DigitalTwinParameters.from_dict({'noise.variance': 0.04, 'world': world, 'seed': seed})
 
 
@@ -67,19 +67,19 @@ def loop_robot(world: str = '', seed: int = 1) -> DigitalTwinParameters:
 class TwinRecord:
     """One run, a row for each report of the robot; wheels are right first.
 
-    ``rotors`` are how fast the wheels turn, ``ground`` how fast wheels that roll would have to
-    turn for what the body does: they differ where a tyre slides. Both, the true pose and the
-    lost steps are known in simulation only.
+    ``rotors`` are the true wheel speeds, ``ground`` those of wheels rolling without slip under the
+    same body motion; they differ where a tyre slides. Both, the true pose and the lost steps exist
+    in simulation only.
     """
 
     time: Array
     """s since the robot started, shape (n,)"""
     reference: Array
     """rad/s, shape (n, 2)"""
-    asked: Array
-    """What the controller sent, rad/s, shape (n, 2)"""
+    requested: Array
+    """Command of the controller, rad/s, shape (n, 2)"""
     commanded: Array
-    """What the guard let through at the end of the period before, rad/s, shape (n, 2)"""
+    """Command after the limiter at the end of the previous period, rad/s, shape (n, 2)"""
     measured: Array
     """By the step counters, rad/s, shape (n, 2)"""
     rotors: Array
@@ -87,25 +87,25 @@ class TwinRecord:
     ground: Array
     """rad/s, shape (n, 2)"""
     odometry: Array
-    """x, y (m), heading (rad), shape (n, 3)"""
+    """x, y (m), yaw (rad), shape (n, 3)"""
     truth: Array
-    """The same, truly."""
+    """True pose, columns as in ``odometry``."""
     lost_steps: NDArray[np.int64]
     """Full steps, shape (n, 2)"""
-    push: Array
-    """N, the hardest that a wall has pushed so far, shape (n,)"""
+    contact_force: Array
+    """Largest contact force of a wall so far, N, shape (n,)"""
     flags: NDArray[np.bool_]
-    """What the robot says of itself, columns as in :data:`FLAGS`."""
+    """Status flags of the robot, columns as in :data:`STATUS_FLAGS`."""
     nearest: Array
-    """m, what the distance sensors say of the nearest thing, as in :attr:`RobotState.ranges`: -inf
-    nearer than they can tell, inf nothing, NaN not measured; shape (n,)"""
-    robot_says: tuple[str, ...]
-    """Why the robot does not do what it is told; empty where it does."""
-    controller_says: tuple[str, ...]
-    """Why the controller does not drive; empty where it does."""
+    """Smallest range reading, m, as in :attr:`RobotState.ranges`: -inf
+    below their range, inf nothing, NaN not measured; shape (n,)"""
+    robot_reasons: tuple[str, ...]
+    """Reason why the robot does not follow commands; empty where it does."""
+    controller_reasons: tuple[str, ...]
+    """Stop reason of the controller; empty where it drives."""
 
     def flag(self, name: str) -> NDArray[np.bool_]:
-        """Return what the robot said of itself under a name of :data:`FLAGS`, shape (n,)."""
+        """Return one status flag of the robot, a name of :data:`STATUS_FLAGS`, shape (n,)."""
         return self.flags[:, STATUS_FLAGS.index(name)]
 
     def rows(self, begin: float, end: float) -> slice:
@@ -122,26 +122,26 @@ def run_twin(
     schedule: FaultSchedule | None = None,
     pauses: Sequence[tuple[float, float]] = (),
 ) -> TwinRecord:
-    """Return what happened when the controller drove the twin along a course.
+    """Return the record of the controller driving the twin along a course.
 
-    The robot stands for :data:`STAND` seconds before the controller is enabled; the reference
-    runs on all the time. Equal arguments give equal runs, bit for bit.
+    The robot rests for :data:`INITIAL_STANDSTILL` seconds before the controller is enabled; the reference
+    runs from the start. Equal arguments give equal runs, bit for bit.
 
     Parameters
     ----------
-    robot_settings
-        Of the stepper twin, its world included.
-    controller_settings
-        Of the controller; it runs at the robot's rate.
+    robot_parameters
+        Parameters of the stepper twin, with its world.
+    controller_parameters
+        Parameters of the controller; its rate is that of the robot.
     course
-        Wanted wheel speeds (rad/s) of each period, shape (n, 2), up to :data:`LEAD` seconds
+        Reference wheel speeds (rad/s) of each period, shape (n, 2), up to :data:`LEAD` seconds
         beyond the end.
     duration
         s
     schedule
-        The faults to play, in place of those that the robot's settings name.
+        Faults in place of those of the robot's parameters.
     pauses
-        When a person disables the controller, and enables it again, s.
+        Times at which a person disables and re-enables the controller, s.
 
     Raises
     ------
@@ -167,21 +167,21 @@ def run_twin(
     robot = DigitalTwin(robot_parameters, schedule)
     controller = Controller(controller_parameters)
     controller.warm_up()
-    notes = _RecordWriter(count)
+    writer = _RecordWriter(count)
 
     def stamp(k: int) -> int:
         return round(k * NANOSECONDS / rate)
 
-    paused = [(0.0, FINAL_STANDSTILL), *pauses]
+    paused = [(0.0, INITIAL_STANDSTILL), *pauses]
 
-    def tell(k: int) -> None:
+    def add_reference(k: int) -> None:
         twist = twist_from_wheels(WheelSpeeds(*course[k].tolist()), geometry)
         controller.add_reference(State(stamp(k), ORIGIN, twist))
 
     for k in range(lead):
-        tell(k)
+        add_reference(k)
     for k in range(count):
-        tell(k + lead)
+        add_reference(k + lead)
         state = robot.advance(stamp(k))
         now = state.stamp_ns / NANOSECONDS
         controller.enable(not any(begin <= now < end for begin, end in paused))
@@ -189,53 +189,53 @@ def run_twin(
         wheels = wheels_from_twist(twist, geometry)
         robot.apply(RobotCommand(wheels, status.stamp_ns), state.stamp_ns)
         reason = '' if status.reason.moves else status.reason.value
-        notes.take(k, state, wheels, reason, geometry, robot.diagnostics.max_contact_force)
-    return notes.record(course[:count])
+        writer.add_row(k, state, wheels, reason, geometry, robot.diagnostics.max_contact_force)
+    return writer.record(course[:count])
 
 
 class _RecordWriter:
-    """The rows of a record while they are written."""
+    """Collects the rows of a record."""
 
     def __init__(self, count: int) -> None:
         self._time = np.empty(count)
         self._wheels = np.empty((5, count, 2))
         self._poses = np.empty((2, count, 3))
         self._lost = np.empty((count, 2), dtype=np.int64)
-        self._push = np.empty(count)
+        self._contact_force = np.empty(count)
         self._flags = np.empty((count, len(STATUS_FLAGS)), dtype=np.bool_)
         self._nearest = np.empty(count)
-        self._robot_says: list[str] = []
-        self._controller_says: list[str] = []
+        self._robot_reasons: list[str] = []
+        self._controller_reasons: list[str] = []
 
-    def take(
+    def add_row(
         self,
         k: int,
         state: RobotState,
-        asked: WheelSpeeds,
+        requested: WheelSpeeds,
         reason: str,
         geometry: WheelGeometry,
-        push: float,
+        contact_force: float,
     ) -> None:
         if state.truth is None or state.true_wheels is None or state.lost_steps is None:
             raise ValueError('the state of a simulated robot must hold the truth')
         self._time[k] = state.stamp_ns / NANOSECONDS
         ground = wheels_from_twist(state.truth.twist, geometry)
-        self._wheels[:, k] = asked, state.commanded, state.wheels, state.true_wheels, ground
+        self._wheels[:, k] = requested, state.commanded, state.wheels, state.true_wheels, ground
         self._poses[:, k] = state.odometry.pose, state.truth.pose
         self._lost[k] = state.lost_steps
-        self._push[k] = push
+        self._contact_force[k] = contact_force
         self._flags[k] = state.status
         self._nearest[k] = min((one for one in state.ranges if one == one), default=math.nan)
-        self._robot_says.append(state.reason)
-        self._controller_says.append(reason)
+        self._robot_reasons.append(state.reason)
+        self._controller_reasons.append(reason)
 
     def record(self, reference: Array) -> TwinRecord:
-        asked, commanded, measured, rotors, ground = self._wheels
+        requested, commanded, measured, rotors, ground = self._wheels
         odometry, truth = self._poses
         return TwinRecord(
             time=self._time,
             reference=reference,
-            asked=asked,
+            requested=requested,
             commanded=commanded,
             measured=measured,
             rotors=rotors,
@@ -243,9 +243,9 @@ class _RecordWriter:
             odometry=odometry,
             truth=truth,
             lost_steps=self._lost,
-            push=self._push,
+            contact_force=self._contact_force,
             flags=self._flags,
             nearest=self._nearest,
-            robot_says=tuple(self._robot_says),
-            controller_says=tuple(self._controller_says),
+            robot_reasons=tuple(self._robot_reasons),
+            controller_reasons=tuple(self._controller_reasons),
         )

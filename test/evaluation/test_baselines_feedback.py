@@ -117,7 +117,7 @@ def test_equal_inputs_give_equal_bits(kind):
 
 
 @pytest.mark.parametrize('kind', INTEGRATING)
-def test_neither_a_jump_nor_a_limit_is_learnt_from(kind):
+def test_neither_jumps_nor_limits_cause_adaptation(kind):
     """Integral, observer and sliding variable are those of the run without jump and limit.
 
     The linear ones see the same disturbance in both runs. That the limits bite is checked too.
@@ -150,7 +150,7 @@ def test_a_saturated_step_of_10_rad_s_does_not_overshoot(kind):
     assert np.max(np.abs(log.error[460:])) < (0.25 if kind in ADAPTIVE else 0.01)
 
 
-def test_without_word_from_the_drive_the_same_step_winds_up():
+def test_without_anti_windup_the_same_step_winds_up():
     """What the test above would see of a PI that does not listen."""
 
     class Deaf(ProportionalIntegral):
@@ -164,7 +164,7 @@ def test_without_word_from_the_drive_the_same_step_winds_up():
 
 
 @pytest.mark.parametrize('kind', ALL)
-def test_jumps_close_at_the_rate_asked_for_and_the_reference_is_followed_exactly(kind):
+def test_jumps_close_at_the_set_rate_with_exact_tracking(kind):
     changes = {'belief': 0.0} if kind is ComputedTorque else {}
     baseline = make(
         kind, jump_transient__rate=30.0, jump_transient__acceleration=1000.0, **changes
@@ -236,7 +236,7 @@ def test_the_error_under_pi_has_the_poles_promised(gain, integral):
     )
 
 
-def test_with_the_gain_of_the_servo_noise_does_not_reach_the_command():
+def test_noise_cancels_at_the_gain_of_the_servo():
     """The command c = chi + T u/share has no share of chi at K = share/T."""
     share = 1.0 - math.exp(-T / 0.02)
     for gain, reached in ((share / T, 0.0), (0.5 * share / T, 0.5)):
@@ -273,7 +273,7 @@ def test_the_observer_has_both_poles_where_they_were_asked_for(bandwidth):
     )
 
 
-def test_with_the_shared_estimate_a_known_disturbance_never_shows():
+def test_shared_estimate_cancels_a_known_disturbance():
     baseline = make(DisturbanceRejection, shared_disturbance=1.0, shared_speed=1.0)
     log = run(baseline, still(300), lambda k, chi: [6.0 * math.sin(0.3 * k), 2.0])
     np.testing.assert_allclose(log.error, 0.0, atol=1e-12)
@@ -284,7 +284,7 @@ def test_with_the_shared_estimate_a_known_disturbance_never_shows():
 
 
 @pytest.mark.parametrize('input_gain', [0.6, 1.0, 1.6])
-def test_an_input_gain_that_is_not_the_plants_still_leaves_no_error(input_gain):
+def test_wrong_input_gain_leaves_no_steady_error(input_gain):
     baseline = make(DisturbanceRejection, input_gain=input_gain, gain=15.0)
     log = run(baseline, still(3000), lambda k, chi: [5.0, -7.0])
     assert np.max(np.abs(log.error[-1])) < 1e-6
@@ -293,7 +293,7 @@ def test_an_input_gain_that_is_not_the_plants_still_leaves_no_error(input_gain):
 # -- sliding mode ---------------------------------------------------------------------------------
 
 
-def test_outside_the_layer_the_sliding_variable_falls_as_the_reaching_law_says():
+def test_reaching_law_holds_outside_the_boundary_layer():
     eta, reaching, most = 6.0, 4.0, 5.0
 
     def load(k, _):
@@ -346,7 +346,7 @@ def nominal_forces(chi):
     return np.array(wheel_acceleration(*chi, *torque, dynamics_vector(robot.body, robot.geometry)))
 
 
-def test_on_the_nominal_plant_computed_torque_leaves_a_linear_error():
+def test_computed_torque_error_is_linear_on_the_nominal_plant():
     """Friction, Coriolis and all: after a push the error decays as (1 - K T)^k."""
     gain = 12.0
     smooth, _ = waves(301)
@@ -374,7 +374,7 @@ def test_on_the_nominal_plant_computed_torque_leaves_a_linear_error():
 
 @pytest.mark.parametrize('measured', [0.0, 0.5, 1.0])
 @pytest.mark.parametrize('drive', ['torque', 'velocity'])
-def test_on_the_simulated_robot_the_model_is_worth_what_the_drive_feels(drive, measured):
+def test_computed_torque_scales_its_model_by_the_drive(drive, measured):
     """At constant speeds nothing is left to the feedback, in either drive.
 
     A servo feels only tau (1 - exp(-T/tau))/T of what acts on the wheels over a period; with
@@ -409,7 +409,7 @@ def test_on_the_simulated_robot_the_model_is_worth_what_the_drive_feels(drive, m
 
 
 @pytest.mark.parametrize('kind', ADAPTIVE)
-def test_in_the_ideal_case_the_lyapunov_function_falls_by_the_amount_derived(kind):
+def test_lyapunov_function_falls_by_the_derived_amount(kind):
     """V = |e|²/2 + |alpha* - alpha|²/(2 gamma) in discrete time, not only in its derivative."""
     gain = 12.0
     baseline = make(kind, gain=gain, normalised_gain=300.0, dead_zone=0.0, error_bound=0.0, sets=3)
@@ -450,7 +450,7 @@ def test_the_step_limit_keeps_any_adaptation_gain_stable(kind):
 
 
 @pytest.mark.parametrize('kind', ADAPTIVE)
-def test_nothing_is_learnt_while_the_drive_is_limited_or_within_the_dead_zone(kind):
+def test_adaptation_pauses_at_limits_and_in_the_dead_zone(kind):
     baseline = make(kind, dead_zone=0.02)
     log = run(baseline, waves(600, jump=10.0), lambda k, chi: [4.0, -3.0], ramp=28.0)
     learnt = np.any(np.diff(log.probe, axis=0) != 0.0, axis=1)
@@ -463,7 +463,7 @@ def test_nothing_is_learnt_while_the_drive_is_limited_or_within_the_dead_zone(ki
     np.testing.assert_array_equal(quiet.probe, 0.0)
 
 
-def test_the_robust_term_holds_the_error_that_the_fuzzy_system_cannot_explain():
+def test_robust_term_bounds_the_unexplained_error():
     """Without learning, |e| settles where K e + bound tanh(e/epsilon) is the disturbance."""
     changes = {'dead_zone': 2.0, 'gain': 10.0, 'smoothing': 0.1}
     for bound in (0.0, 6.0):
@@ -482,7 +482,7 @@ def test_the_adaptation_gain_means_the_same_for_any_sets(kind, sets):
     assert baseline.fuzzy.adaptation.gamma * power == pytest.approx(150.0, rel=0.03)
 
 
-def test_the_two_adaptive_rivals_differ_in_their_sets_only():
+def test_adaptive_baselines_differ_in_their_sets_only():
     load = [1.0, -2.0]
 
     def learn(kind, **changes):

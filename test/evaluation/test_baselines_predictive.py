@@ -169,7 +169,7 @@ def test_three_thousand_programs_satisfy_karush_kuhn_tucker():
         assert gradient[(x == high) & (x > low)].max(initial=0.0) < 1e-11
 
 
-def test_programs_agree_with_an_independent_solver_from_any_start():
+def test_box_qp_agrees_with_an_independent_solver():
     generator = np.random.default_rng(4)
     for _ in range(40):
         hessian, slope, low, high = _random_program(generator)
@@ -186,7 +186,7 @@ def test_programs_agree_with_an_independent_solver_from_any_start():
             assert np.linalg.norm(gap) < 1e-6 * max(np.linalg.norm(target), 1e-6)
 
 
-def test_programs_without_an_optimum_are_refused_and_keep_the_bounds():
+def test_box_qp_without_optimum_is_rejected_within_bounds():
     for hessian, slope in (
         (np.diag([1.0, -1.0]), np.ones(2)),
         (np.eye(2), np.array([1.0, math.nan])),
@@ -307,7 +307,7 @@ def test_preview_is_within_two_percent_of_knowing_everything(size):
 
 
 @pytest.mark.parametrize('size', [6.0, 10.0])
-def test_jump_costs_what_theory_says_with_and_without_preview(size):
+def test_jump_cost_equals_theory_with_and_without_preview(size):
     """Under a rate limit a, for a jump J.
 
     Without preview the command sets out when the jump comes: its ramp is J/a long, and the wheel
@@ -325,7 +325,7 @@ def test_jump_costs_what_theory_says_with_and_without_preview(size):
 
 
 @pytest.mark.parametrize('drive', DRIVES)
-def test_smoothing_is_the_symmetric_filter_that_the_setting_promises(drive):
+def test_move_time_sets_the_symmetric_smoothing_filter(drive):
     """Gain 1/(1 + (w t)²(1 + (w lag)²)) with the servo, 1/(1 + (w t)⁴) with the integrator."""
     rate, move_time = 12.0, 0.05
     time = PERIOD * np.arange(460 + AHEAD + 1)
@@ -365,7 +365,7 @@ def test_bounds_are_never_left(kind, drive):
 @pytest.mark.parametrize('drive', DRIVES)
 @pytest.mark.parametrize('kind', EVERY)
 @pytest.mark.parametrize('seen', [0.0, 0.5])
-def test_no_offset_is_left_by_a_constant_disturbance_and_a_wrong_model(kind, drive, seen):
+def test_no_offset_under_disturbance_and_model_error(kind, drive, seen):
     """Whatever share of the disturbance the shared estimate sees."""
     push = np.array([5.0, -3.0])
     times = {'integral_time': 0.1, 'bias_time': 0.1, 'filter_time': 0.02}
@@ -514,7 +514,7 @@ def test_dynamic_matrix_and_state_space_agree_on_a_true_model():
 
 
 @pytest.mark.parametrize('drive', DRIVES)
-def test_nonlinear_agrees_with_linear_where_the_wheels_are_linear(drive):
+def test_nonlinear_mpc_equals_linear_mpc_on_linear_wheels(drive):
     reference = _wander(250)
     seen = np.tile([2.0, -1.0], (250, 1))
     same = {'disturbance_share': 1.0, 'integral_time': 1.0}

@@ -208,7 +208,7 @@ def test_a_scenario_names_what_is_wrong_with_it(changes, text):
         Scenario(**({'drive': 'torque', 'noise': 0.04, 'case': 'nominal', 'seed': 1} | changes))
 
 
-def test_training_and_held_out_seeds_are_strangers_and_robots_have_seeds_of_their_own():
+def test_tuning_held_out_and_robot_seeds_are_disjoint():
     assert len(TUNING_SEEDS) == 9
     assert len(HELD_OUT_SEEDS) == 20
     seeds = [*TUNING_SEEDS, *PRETRAINING_SEEDS, *HELD_OUT_SEEDS]
@@ -230,7 +230,7 @@ EXPECTED = {
 @pytest.mark.parametrize(
     'case, drive', [(name, drive) for name, case in CASES.items() for drive in case.drives]
 )
-def test_every_case_changes_what_it_says_and_nobody_is_told_but_of_the_dead_time(case, drive):
+def test_only_the_dead_time_of_a_case_is_known_to_methods(case, drive):
     scenario = Scenario(drive, 0.07, case, 3)
     plain = PaperRobotParameters.from_dict(
         {'drive.kind': drive, 'noise.variance': 0.07, 'seed': scenario.robot().seed}
@@ -250,7 +250,7 @@ def test_every_case_changes_what_it_says_and_nobody_is_told_but_of_the_dead_time
 
 
 @pytest.mark.parametrize('drive', DRIVES)
-def test_every_case_shows_in_the_run_and_the_load_change_from_half_of_it_on(drive):
+def test_every_case_affects_the_run_load_change_from_half(drive):
     runs = {
         case: run(Scenario(drive, 0.04, case, 2, 2.0), P)
         for case in CASES
@@ -296,7 +296,7 @@ def test_a_method_knows_how_fast_both_wheels_may_change_at_once():
 # -- the reference ----------------------------------------------------------------------------
 
 
-def test_the_reference_has_three_rad_per_second_on_every_wheel_over_seeds():
+def test_reference_deviation_is_three_rad_per_second():
     values = np.array(
         [Scenario('torque', 0.0, 'nominal', s).reference().speeds[300:6000] for s in TUNING_SEEDS]
     )
@@ -305,7 +305,7 @@ def test_the_reference_has_three_rad_per_second_on_every_wheel_over_seeds():
 
 
 @pytest.mark.parametrize('seed', [1, 101])
-def test_the_reference_jumps_at_the_switch_times_alone_and_its_slope_does_not_jump(seed):
+def test_reference_jumps_only_at_switches_its_slope_does_not(seed):
     reference = Scenario('velocity', 0.0, 'nominal', seed).reference()
     switches = [1200, 2400, 3600, 4800, 6000]  # the last one lies in the preview
     assert np.flatnonzero(reference.switched).tolist() == switches
@@ -390,7 +390,7 @@ def method_u(method):
     'drive, case, late',
     [('torque', 'nominal', 0), ('velocity', 'nominal', 1), ('velocity', 'dead time', 3)],
 )
-def test_a_method_sees_the_reference_of_the_instant_at_which_it_acts(drive, case, late):
+def test_observation_holds_the_reference_after_the_dead_time(drive, case, late):
     scenario = Scenario(drive, 0.04, case, 6, 12.5, 0.2)
     sampled = scenario.reference()
     _, blind = noted(Noting, scenario)
@@ -429,7 +429,7 @@ class NotingDrive(VelocityActuation):
 
 
 @pytest.mark.parametrize('drive', DRIVES)
-def test_the_estimator_is_fed_every_measurement_once_and_in_order(drive):
+def test_estimator_gets_every_measurement_once_in_order(drive):
     scenario = Scenario(drive, 0.04, 'nominal', 6, 1.0)
     geometry = scenario.nominal_model().robot.geometry
     seam = NotingDrive(scenario.estimate(), scenario.limits, geometry, drive, 0.01)
@@ -443,7 +443,7 @@ def test_the_estimator_is_fed_every_measurement_once_and_in_order(drive):
 
 
 @pytest.mark.parametrize('drive', DRIVES)
-def test_the_estimate_is_better_than_the_measurement_and_knows_friction(drive):
+def test_estimate_beats_measurement_and_contains_friction(drive):
     record = run(Scenario(drive, 0.04, 'nominal', 8, 12.0), P)
     error = np.sqrt(np.mean((record.estimated - record.speeds)[300:] ** 2))
     assert error < 0.7 * 0.2
@@ -453,7 +453,7 @@ def test_the_estimate_is_better_than_the_measurement_and_knows_friction(drive):
     assert against[moving].mean() > 0.8
 
 
-def test_without_being_told_the_dead_time_the_estimator_looks_ahead_wrongly():
+def test_estimator_without_the_dead_time_predicts_wrongly():
     scenario = Scenario('velocity', 0.04, 'dead time', 3, 15.0)
     nominal = drive_for(Scenario('velocity', 0.04, 'nominal', 3))
     missed = []
@@ -464,7 +464,7 @@ def test_without_being_told_the_dead_time_the_estimator_looks_ahead_wrongly():
     assert missed[0] < 0.75 * missed[1]
 
 
-def test_estimator_and_method_are_told_what_the_motors_make_of_too_large_a_u():
+def test_estimator_and_method_get_the_torque_limited_u():
     scenario = Scenario('torque', 0.0, 'nominal', 9, 14.0)
     method = MethodSpec('steep', Proportional, ProportionalParameters(gain=80.0))
     record = run(scenario, method)
@@ -569,7 +569,7 @@ def test_rmse_leaves_out_the_start_and_what_follows_a_switch():
         record.rmse(20.0)
 
 
-def test_chatter_is_the_variation_of_the_effort_per_second_and_wheel():
+def test_chatter_is_effort_variation_per_second_and_wheel():
     record = LoopRecord.empty(101)
     record.time[:] = np.arange(101) * 0.01
     record.effort[:, 0] = np.arange(101)  # rises by 100 in a second
@@ -595,7 +595,7 @@ def test_quantiles_are_students():
         student_quantile(3, 1.0)
 
 
-def test_the_interval_holds_the_true_mean_as_often_as_it_says():
+def test_interval_covers_the_true_mean_at_its_confidence():
     generator = np.random.default_rng(3)
     draws = generator.normal(5.0, 2.0, (4000, 5))
     held = [abs(mean(values) - 5.0) <= interval(values) for values in draws]
@@ -644,7 +644,7 @@ class Counting(BaselineController):
         self.steps = learnt['steps'].copy()
 
 
-def test_what_practises_begins_with_what_it_learnt_run_after_run():
+def test_pretraining_carries_weights_from_run_to_run():
     nominal_model = Scenario('torque', 0.0, 'nominal', 101).nominal_model()
     fresh = MethodSpec('count', Counting, ProportionalParameters())(nominal_model)
     pretrained = MethodSpec('count', Counting, ProportionalParameters(), pretrained=True)

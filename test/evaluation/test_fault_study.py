@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from t3mpc_ros.cli.main import main
-from t3mpc_ros.evaluation import fault_study as trials
+from t3mpc_ros.evaluation import fault_study as fault_runs
 from t3mpc_ros.evaluation.fault_study import (
     BEGIN_MARK,
     END_MARK,
@@ -30,7 +30,7 @@ from t3mpc_ros.evaluation.fault_study import (
     update_page,
 )
 from t3mpc_ros.evaluation.twin_closed_loop import (
-    FINAL_STANDSTILL,
+    INITIAL_STANDSTILL,
     chaotic_course,
     loop_controller,
     loop_robot,
@@ -51,7 +51,7 @@ def short_run(schedule=None, pauses=(), **changes):
     return run_twin(robot, loop_controller(), chaotic_course(6.0), 6.0, schedule, pauses)
 
 
-def trial(course, name):
+def fault_run(course, name):
     (found,) = (one for one in FAULT_RUNS if (one.course, one.name) == (course, name))
     return found
 
@@ -78,32 +78,32 @@ def assert_same(line, other):
 # --- the loop -----------------------------------------------------------------------------------
 
 
-def test_equal_runs_are_equal_bit_for_bit_and_faults_come_as_from_a_file(tmp_path):
+def test_equal_runs_are_bit_equal_with_scheduled_faults(tmp_path):
     event = FaultEvent(3.0, 'command_delay', 0.1, 1.0)
     first = short_run(FaultSchedule([event]))
     path = tmp_path / 'ride.yaml'
     path.write_text('- {at: 3.0, fault: command_delay, value: 0.1, for: 1.0}\n')
     second = short_run(**{'faults.schedule': str(path)})
-    for name in ('asked', 'measured', 'rotors', 'odometry', 'truth', 'flags'):
+    for name in ('requested', 'measured', 'rotors', 'odometry', 'truth', 'flags'):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
-    assert first.robot_says == second.robot_says
+    assert first.robot_reasons == second.robot_reasons
     assert not np.array_equal(first.rotors, short_run().rotors)
 
 
-def test_the_robot_stands_until_its_gyro_is_calibrated_and_then_follows_closely():
+def test_robot_waits_for_gyro_calibration_then_tracks():
     record = short_run()
-    standing = record.time < FINAL_STANDSTILL
-    assert not record.asked[standing].any()
-    assert set(np.array(record.controller_says)[standing]) == {'disabled by request'}
-    assert not any(np.array(record.controller_says)[~standing])
+    standing = record.time < INITIAL_STANDSTILL
+    assert not record.requested[standing].any()
+    assert set(np.array(record.controller_reasons)[standing]) == {'disabled by request'}
+    assert not any(np.array(record.controller_reasons)[~standing])
     error = (record.rotors - record.reference)[record.rows(3.0, 6.0)]
     assert np.sqrt(np.mean(error**2)) < 0.06
 
 
 def test_a_person_can_pause_the_controller():
     record = short_run(pauses=[(3.0, 4.0)])
-    assert not record.asked[record.rows(3.0, 4.0)].any()
-    assert record.asked[record.rows(4.0, 6.0)].any()
+    assert not record.requested[record.rows(3.0, 4.0)].any()
+    assert record.requested[record.rows(4.0, 6.0)].any()
 
 
 def test_what_cannot_be_run_is_refused():
@@ -137,8 +137,8 @@ EXPECTED = {
 @pytest.mark.parametrize('name', EXPECTED)
 def test_the_loop_stays_bounded_or_stops_with_a_reason(name):
     """One strength of each fault, and the page says of it what comes out here."""
-    result = run_fault(trial('chaotic', name))
-    assert (result.verdict, result.reason, result.goes_on) == EXPECTED[name]
+    result = run_fault(fault_run('chaotic', name))
+    assert (result.verdict, result.reason, result.resumption) == EXPECTED[name]
     assert_same(table_row(result), page_rows()['chaotic', name])
 
 
@@ -155,13 +155,13 @@ def test_every_fault_is_among_those_expected():
         ('arc', 'collision, at a slant'),
     ],
 )
-def test_what_the_robot_cannot_see_is_said_plainly(course, name):
-    result = run_fault(trial(course, name))
-    assert not result.noticed
-    assert 'odometry is wrong' in result.unseen
+def test_undetected_faults_are_named(course, name):
+    result = run_fault(fault_run(course, name))
+    assert not result.detected
+    assert 'odometry is wrong' in result.undetected
     line = table_row(result)
     assert (UNREPORTED if 'collision' in name else UNDETECTED) in line
-    assert 'not noticed' in console_text([result])
+    assert 'not detected' in console_text([result])
     assert_same(line, page_rows()[course, name])
 
 
@@ -172,7 +172,7 @@ def test_the_page_has_a_row_for_every_trial_and_no_other():
     assert page_section([]).partition('\n###')[0].split(END_MARK)[0].strip() in PAGE.read_text()
 
 
-def test_a_delay_that_the_controller_is_told_costs_little():
+def test_a_known_delay_costs_little():
     """What hurts is not the delay but not to know of it."""
     robot = loop_robot().with_values({'faults.command_delay': 0.1})
     errors = []
@@ -187,26 +187,31 @@ def test_a_delay_that_the_controller_is_told_costs_little():
 
 # --- the judge ----------------------------------------------------------------------------------
 
-AT = trial('chaotic', 'gyro_dead')
+AT = fault_run('chaotic', 'gyro_dead')
 
 
 def judged(record):
-    healthy = undisturbed('chaotic', AT.duration)
-    return evaluate_outcome(AT.name, AT.course, record, healthy, 10.0, 15.0, loop_robot())
+    undisturbed_run = undisturbed('chaotic', AT.duration)
+    return evaluate_outcome(AT.name, AT.course, record, undisturbed_run, 10.0, 15.0, loop_robot())
 
 
 def test_a_run_without_fault_is_bounded_and_notices_nothing():
     result = judged(undisturbed('chaotic', AT.duration))
-    assert (result.verdict, result.back, result.noticed, result.unseen) == ('bounded', 0.0, (), ())
+    assert (result.verdict, result.recovery_time, result.detected, result.undetected) == (
+        'bounded',
+        0.0,
+        (),
+        (),
+    )
 
 
-def test_a_robot_that_says_it_stands_and_drives_is_not_taken_at_its_word():
+def test_a_robot_moving_with_a_stop_reason_is_out_of_bounds():
     """A slip stop once lasted for no more than a period, and only the reason stayed."""
     record = undisturbed('chaotic', AT.duration)
     says = tuple(SLIP_STOP_REASON if 11.0 <= time < 15.0 else '' for time in record.time)
-    result = judged(replace(record, robot_says=says))
+    result = judged(replace(record, robot_reasons=says))
     assert result.verdict == 'unbounded'
-    assert 'drives' in result.reason
+    assert 'moves' in result.reason
 
 
 @pytest.mark.parametrize(
@@ -217,14 +222,20 @@ def test_speeds_beyond_the_limits_are_unbounded(field, value):
     values = getattr(record, field).copy()
     values[1200] = value
     parameters = loop_robot().with_values({'angular.z.max_velocity': 4.0})
-    healthy = undisturbed('chaotic', AT.duration)
+    undisturbed_run = undisturbed('chaotic', AT.duration)
     result = evaluate_outcome(
-        AT.name, AT.course, replace(record, **{field: values}), healthy, 10.0, 15.0, parameters
+        AT.name,
+        AT.course,
+        replace(record, **{field: values}),
+        undisturbed_run,
+        10.0,
+        15.0,
+        parameters,
     )
     assert result.verdict == 'unbounded'
 
 
-def test_an_error_that_stays_is_impaired_and_one_that_goes_is_back_in_time():
+def test_a_lasting_error_is_impaired_a_passing_one_recovers():
     record = undisturbed('chaotic', AT.duration)
     rotors = record.rotors.copy()
     rotors[1500:] += 0.2
@@ -232,7 +243,7 @@ def test_an_error_that_stays_is_impaired_and_one_that_goes_is_back_in_time():
     rotors[2000:] -= 0.2
     result = judged(replace(record, rotors=rotors))
     assert result.verdict == 'bounded'
-    assert 3.0 <= result.back <= 5.0
+    assert 3.0 <= result.recovery_time <= 5.0
 
 
 # --- the page and the command -------------------------------------------------------------------
@@ -245,10 +256,10 @@ def two(monkeypatch):
     made = tuple(
         FaultRun('gyro_dead', course, event, '', 17.0) for course in ('chaotic', 'straight')
     )
-    monkeypatch.setattr(trials, 'TRIALS', made)
+    monkeypatch.setattr(fault_runs, 'FAULT_RUNS', made)
 
 
-def test_the_command_writes_table_and_numbers_and_only_between_the_marks(two, tmp_path, capsys):
+def test_command_writes_the_table_between_the_marks(two, tmp_path, capsys):
     page, numbers = tmp_path / 'page.md', tmp_path / 'numbers.json'
     page.write_text(f'before\n{BEGIN_MARK}\nold\n{END_MARK}\nafter\n')
     assert main(['faults', '--output', str(page), '--json', str(numbers)]) == 0

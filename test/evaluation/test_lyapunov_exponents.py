@@ -11,7 +11,7 @@ from t3mpc_ros.evaluation.lyapunov_exponents import lyapunov_exponents
 ORDINARY = (1.0, 1.0, 1.0, 1.0)
 
 
-def test_equation_85_with_e6_has_two_positive_exponents_whose_sum_is_the_trace():
+def test_equation_85_with_e6_has_two_positive_exponents():
     found = lyapunov_exponents(hyperchaotic_system(orders=ORDINARY), duration=400.0)
     assert found[0] == pytest.approx(2.3, abs=0.3)
     assert 0.3 < found[1] < 1.1
@@ -20,12 +20,12 @@ def test_equation_85_with_e6_has_two_positive_exponents_whose_sum_is_the_trace()
     assert found.sum() == pytest.approx(-38.0, abs=1e-3)
 
 
-def test_printed_minus_sign_of_e6_would_leave_no_positive_exponent():
+def test_printed_sign_of_e6_leaves_no_positive_exponent():
     found = lyapunov_exponents(hyperchaotic_system(c=-25.0, orders=ORDINARY), np.ones(4), 20.0)
     assert np.all(found < -1.0)
 
 
-def test_exponents_of_a_linear_system_are_the_real_parts_of_its_eigenvalues():
+def test_linear_exponents_are_real_parts_of_eigenvalues():
     # A rotation with growth 0.3, coupled to a decay.
     system = QuadraticSystem(
         (1.0, 1.0, 1.0),

@@ -63,7 +63,7 @@ def test_a_fuzzy_system_that_is_the_plant_estimates_it_exactly():
     np.testing.assert_allclose(unknown[:-1], run.target, atol=1e-9)
 
 
-def test_e18_as_printed_without_u_even_the_exact_fuzzy_system_misses():
+def test_e18_without_u_the_exact_fuzzy_system_misses():
     """(86) prints chi_hat' = g; the same estimator not told the push is off by the push."""
     run = _matched_run(_fuzzy(1), 0.01)
     blind = OpenLoopRun(run.period, np.zeros_like(run.push), run.speeds, run.measured)
@@ -72,7 +72,7 @@ def test_e18_as_printed_without_u_even_the_exact_fuzzy_system_misses():
     assert np.sqrt(np.mean((speeds - run.speeds) ** 2)) > 1.0
 
 
-def test_v_of_the_estimator_falls_by_exactly_the_output_error_spent():
+def test_estimator_v_falls_by_the_output_error_spent():
     """The proof of (74)-(79) with chi_hat for r: V(0) - V(T) = a int |chi - chi_hat|² dt.
 
     Euler steps keep it to first order: the gap halves with the period.
@@ -94,7 +94,7 @@ def test_v_of_the_estimator_falls_by_exactly_the_output_error_spent():
     assert gaps[0] / gaps[1] == pytest.approx(2.0, rel=0.15)
 
 
-def test_excitation_is_bounded_seeded_and_pushes_the_speeds_about_a_mean():
+def test_excitation_is_bounded_seeded_and_zero_mean():
     time = 0.01 * np.arange(60_000)
     push = excitation(time, 3)
     assert np.abs(push).max() <= 10.0 * 2.0 * np.pi * 0.4
@@ -148,7 +148,7 @@ def test_every_kind_estimates_better_than_none_at_any_noise(results, kind, noise
     assert mean(results[kind, noise].unknown) < mean(results[NO_FUZZY_SYSTEM, noise].unknown)
 
 
-def test_kinds_that_learn_equally_fast_differ_by_a_few_percent_and_suffer_alike(results):
+def test_kinds_at_equal_rates_differ_by_a_few_percent(results):
     """The paper finds type 3 some 50 % better, and the others alone hurt by noise; we do not."""
     for noise in (0.0, 0.1):
         base = mean(results['type3', noise].speed)

@@ -156,7 +156,7 @@ def small_campaign(path, runner, methods=fake_methods, sources='s', progress=Non
 # The plan
 
 
-def test_the_full_plan_holds_every_run_that_the_tables_need_and_no_other():
+def test_full_grid_holds_exactly_the_needed_experiments():
     found = needed_experiments(bench(), make_grid(bench()))
     names = fake_methods('torque')
     baselines = {name for name, method in names.items() if method.baseline}
@@ -209,7 +209,7 @@ def test_a_bench_without_the_full_controller_is_refused():
         needed_experiments(lame, SMALL)
 
 
-def test_a_stage_of_the_controller_that_is_called_a_rival_is_refused():
+def test_a_stage_marked_as_baseline_is_rejected():
     def confused(drive):
         return fake_methods(drive) | {FULL: FakeMethod(FULL, True, True)}
 
@@ -329,7 +329,7 @@ def test_what_is_measured_of_a_run():
     assert found.finite
 
 
-def test_a_run_that_left_the_finite_numbers_says_so():
+def test_a_diverged_run_is_marked_as_not_finite():
     run = fake_run(FakeScenario('torque', 0.0, 'nominal', 101, 6.0), fake_methods('')[FULL])
     run.command[-1, 0] = math.inf
     found = measure(run)
@@ -337,7 +337,7 @@ def test_a_run_that_left_the_finite_numbers_says_so():
     assert math.isnan(found.rmse)
 
 
-def test_progress_tells_the_time_left_from_the_pace_so_far():
+def test_progress_shows_the_time_left_from_its_pace():
     now, stream = [100.0], io.StringIO()
     progress = Progress(lambda: now[0], stream)
     progress.begin(100)
@@ -360,7 +360,7 @@ def test_progress_tells_the_time_left_from_the_pace_so_far():
 # The fingerprint
 
 
-def test_a_fingerprint_tells_settings_types_and_arrays_apart():
+def test_fingerprint_differs_by_parameters_types_arrays():
     method = FakeMethod('m', True, False, {'gains': np.array([1.0, 2.0]), 'count': 3})
     others = [
         replace(method, parameters={'gains': np.array([1.0, 2.5]), 'count': 3}),
@@ -460,7 +460,7 @@ def test_a_single_seed_has_a_mean_without_an_interval():
     assert finite_or_none(0.25) == 0.25
 
 
-def test_stage_differences_compare_neighbours_wherever_both_were_measured():
+def test_stage_differences_compare_measured_neighbours():
     entries = {(stage, 'torque', 0.04, 'nominal'): (0.4, 0.5) for stage in STAGES}
     entries['+MPC', 'torque', 0.04, 'friction x3'] = (0.4, 0.5)
     pairs = table_of(entries).stage_differences()
@@ -491,7 +491,7 @@ def verdict(claim):
 @pytest.mark.parametrize(
     'full, held', [((0.50, 0.58), True), ((0.50, 0.72), False), ((math.nan, 0.1), False)]
 )
-def test_share_of_the_best_rival_leaves_out_those_with_preview(full, held):
+def test_share_of_best_baseline_excludes_preview(full, held):
     values = {FULL: full, 'PI + feed-forward': (0.9, 1.1), 'type-1 fuzzy': (1.2, 1.2)}
     values['NMPC'] = (0.1, 0.1)
     results = table_of(in_all('velocity', 0.04, values))
@@ -503,7 +503,7 @@ def test_share_of_the_best_rival_leaves_out_those_with_preview(full, held):
 
 
 @pytest.mark.parametrize('nmpc, held', [(0.30, True), (0.31, True), (0.29, False)])
-def test_rivals_that_plan_with_a_wrong_inertia(nmpc, held):
+def test_baselines_with_a_wrong_inertia(nmpc, held):
     values = {FULL: (0.3,), 'NMPC': (nmpc,), 'type-1 fuzzy': (0.1,), EXACT: (0.1,)}
     results = table_of(in_all('torque', 0.04, values))
     assert verdict(claiming.no_worse_than_preview(results, 'torque')) is held
@@ -511,7 +511,7 @@ def test_rivals_that_plan_with_a_wrong_inertia(nmpc, held):
 
 
 @pytest.mark.parametrize('down, held', [(0.30, True), (0.31, True), (0.29, False)])
-def test_rivals_whose_robot_gets_another_inertia_than_they_plan_with(down, held):
+def test_baselines_with_another_inertia_than_their_model(down, held):
     up = in_all('torque', 0.04, {FULL: (0.3,), EXACT: (0.4,), 'NMPC': (0.1,)}, CASES[1])
     below = in_all('torque', 0.04, {FULL: (0.3,), EXACT: (down,)}, CASES[2])
     assert verdict(claiming.no_worse_than_exact_model(table_of(up | below), 'torque')) is held
@@ -519,7 +519,7 @@ def test_rivals_whose_robot_gets_another_inertia_than_they_plan_with(down, held)
 
 
 @pytest.mark.parametrize('part, case, drives', claiming.INTENDED)
-def test_a_part_helps_only_when_its_paired_interval_is_below_zero(part, case, drives):
+def test_a_part_helps_if_its_paired_interval_is_negative(part, case, drives):
     more, less = STAGES[PARTS.index(part) + 1], STAGES[PARTS.index(part)]
     base = (0.5, 0.7, 0.9, 1.1)
     for shift, held in (
@@ -581,7 +581,7 @@ def test_settled_within_two_per_cent_of_the_reference(settled, held):
 
 
 @pytest.mark.parametrize('own, held', [(100.0, True), (301.0, False)])
-def test_control_is_calm_against_the_middle_rival(own, held):
+def test_chatter_claim_compares_the_median_baseline(own, held):
     values = {FULL: (0.1,), 'PI + feed-forward': (0.1,), 'type-1 fuzzy': (0.1,), 'NMPC': (0.1,)}
     chatter = {FULL: own, 'PI + feed-forward': 50.0, 'type-1 fuzzy': 300.0, 'NMPC': 9000.0}
     results = table_of(in_all('torque', 0.04, values), chatter=chatter)
@@ -591,7 +591,7 @@ def test_control_is_calm_against_the_middle_rival(own, held):
 @pytest.mark.parametrize(
     'type3, half, slight', [((0.05, 0.04, 0.054), True, True), ((0.1, 0.2, 0.3), False, False)]
 )
-def test_what_the_paper_says_of_estimation(type3, half, slight):
+def test_estimation_claims_of_the_paper(type3, half, slight):
     others = {'interval_type2': (0.1, 0.1, 0.3), 'type1': (0.1, 0.2, 0.3)}
     kinds = {'type3': type3} | others
     results = [
@@ -637,7 +637,7 @@ def test_the_mark_of_an_exhibit_is_that_of_its_worst_claim():
 # What is measured in a single run
 
 
-def test_a_perfect_estimate_explains_everything_and_none_explains_nothing():
+def test_explained_share_is_one_if_perfect_zero_if_none():
     run = fake_run(FakeScenario('torque', 0.04, 'nominal', 101, 20.0), fake_methods('')[FULL])
     run.terms[:-1, 0] = -(np.diff(run.speeds, axis=0) / 0.01 - run.command[:-1])
     assert explained(run) == pytest.approx((1.0, 1.0), abs=1e-9)

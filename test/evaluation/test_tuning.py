@@ -112,7 +112,7 @@ def test_settings_and_cube_map_onto_each_other():
 
 @pytest.mark.parametrize('low, high', [(0.1, 1e3), (1e-6, 3.3), (0.7, 0.9)])
 @pytest.mark.parametrize('log', [True, False])
-def test_ends_of_the_cube_are_the_bounds_and_the_middle_their_mean(low, high, log):
+def test_cube_maps_to_the_bounds_and_their_mean(low, high, log):
     space = SearchSpace(Gains, [SearchRange('a', low, high, log)])
     assert space.values([0.0])['a'] == pytest.approx(low, rel=1e-12)
     assert space.values([1.0])['a'] == pytest.approx(high, rel=1e-12)
@@ -152,7 +152,7 @@ def test_whole_numbers_have_equal_cells_and_stay_whole():
         ([('a', math.nan, 1.0)], ['a', 'finite', 'nan']),
     ],
 )
-def test_ranges_that_do_not_fit_are_refused_by_name_bound_and_value(ranges, words):
+def test_bad_ranges_are_rejected_by_name_bound_and_value(ranges, words):
     with pytest.raises(ParameterError) as refusal:
         SearchSpace(Gains, [SearchRange(*each) for each in ranges])
     for word in words:
@@ -236,7 +236,7 @@ def test_badly_scaled_gains_are_found_by_their_logarithms():
 
 
 @pytest.mark.parametrize('seed', range(5))
-def test_a_start_that_is_the_optimum_is_returned_to_the_last_digit(seed):
+def test_an_optimal_start_is_returned_bit_equal(seed):
     start = Gains(a=1.0 / 3.0, b=math.pi, c=1e-7)
     space = SearchSpace(Gains, [SearchRange(name, 1e-9, 1e2) for name in 'abc'])
     best = np.array([start.a, start.b, start.c])
@@ -259,7 +259,7 @@ def test_the_start_is_never_made_worse(evaluations):
         assert found.value <= found.start_value
 
 
-def test_the_same_seed_gives_the_same_search_and_leaves_global_numbers_alone():
+def test_equal_seeds_give_equal_searches_without_global_rng():
     before = np.random.get_state()  # noqa: NPY002
     first, second, other = (
         search_best(each(rosenbrock), linear(4), Gains(), 90, seed) for seed in (5, 5, 6)
@@ -318,7 +318,7 @@ def test_values_that_are_not_numbers_count_as_worst(bad):
     assert found.values['a'] <= 1.5
 
 
-def test_a_method_that_never_works_costs_no_more_than_others_and_says_so():
+def test_a_method_that_always_fails_uses_the_same_budget():
     found = search_best(each(lambda x: math.nan), linear(3), Gains(), 70, 1)
     assert len(found.history) == 70
     assert found.value == found.start_value == math.inf
@@ -431,7 +431,7 @@ def test_a_finished_search_is_recalled_without_an_evaluation(tmp_path):
         ({'about': {'drive': 'velocity'}}, 'about'),
     ],
 )
-def test_the_history_of_another_search_is_refused_by_what_differs(tmp_path, change, name):
+def test_history_of_another_search_is_rejected(tmp_path, change, name):
     path = tmp_path / 'history.json'
     arguments = {
         'objective': each(sphere),
@@ -491,7 +491,7 @@ def test_a_thousand_of_chatter_costs_a_hundredth():
         assert objective(broken) == math.inf
 
 
-def test_training_mixes_every_noise_and_never_uses_a_held_out_seed():
+def test_tuning_mixes_noises_and_excludes_held_out_seeds():
     training = TuningScenarios()
     assert not set(training.seeds) & set(HELD_OUT_SEEDS)
     counts = [[noise for _, noise in training.runs()].count(x) for x in (0.0, 0.04, 0.1)]
@@ -507,7 +507,7 @@ def test_training_mixes_every_noise_and_never_uses_a_held_out_seed():
         TuningScenarios(seeds=(1, 2))
 
 
-def test_the_mean_price_does_not_depend_on_the_order_of_the_runs():
+def test_mean_objective_is_independent_of_run_order():
     prices = np.random.default_rng(1).uniform(size=12)
     expected = prices.reshape(3, 4).mean(axis=1)
     pairs = list(enumerate(prices.tolist()))
@@ -555,7 +555,7 @@ FEEDBACK = MethodDefinition(
 SHORT = TuningScenarios(seeds=(1, 2), noise_levels=(0.0, 0.1), duration=5.0)
 
 
-def test_the_closed_loop_is_priced_run_by_run():
+def test_closed_loop_objective_is_computed_per_run():
     candidates = [FeedbackParameters(gain=gain) for gain in (1.0, 8.0)]
     with ClosedLoopObjective(SHORT, 1) as evaluate:
         found = evaluate(FEEDBACK, 'torque', candidates)
@@ -570,7 +570,7 @@ def test_the_closed_loop_is_priced_run_by_run():
     assert found[1] < found[0]
 
 
-def test_settings_that_fail_are_worst_and_named_but_a_method_that_fails_is_an_error():
+def test_failing_parameters_are_worst_a_failing_method_raises():
     good, bad = FeedbackParameters(), FeedbackParameters(fault=1.0)
     said = []
     with ClosedLoopObjective(SHORT, 1, said.append) as evaluate:
@@ -641,7 +641,7 @@ def tune_both(path, evaluate=lag_plant, evaluations=80, **more):
     )
 
 
-def test_methods_of_any_size_get_the_same_budget_and_their_optimum(tmp_path):
+def test_methods_of_any_size_get_equal_budgets(tmp_path):
     path = tmp_path / 'sub' / 'tuned.json'
     evaluate, counts = counted(lag_plant)
     store = tune_both(path, evaluate)
@@ -726,7 +726,7 @@ def test_time_left_is_rounded(seconds, words):
     assert time_left(seconds) == words
 
 
-def test_settings_that_do_not_fit_together_cost_an_evaluation_and_no_run(tmp_path):
+def test_inconsistent_parameters_cost_an_evaluation_no_run(tmp_path):
     """The table refuses a + c beyond 1500, though each is in range."""
     method = MethodDefinition(
         'pair',
@@ -747,7 +747,7 @@ def _baseline_of(table):
     return type('Made', (Feedback,), {'parameters_type': table})
 
 
-def test_a_method_without_a_finite_price_is_named_and_the_others_are_kept(tmp_path):
+def test_a_method_without_finite_objective_is_named(tmp_path):
     def hopeless(method, drive, candidates):
         if method is FEEDBACK:
             return [math.nan] * len(candidates)
@@ -904,7 +904,7 @@ def test_what_is_no_such_file_is_refused(tmp_path, text):
         TunedParameters.load(tmp_path / 'missing.json')
 
 
-def test_unequal_budgets_are_told_apart():
+def test_unequal_budgets_are_distinguished():
     other = replace(ENTRY, budget=replace(BUDGET, evaluations=90))
     store = TunedParameters({('one', 'torque'): ENTRY, ('two', 'torque'): other})
     with pytest.raises(

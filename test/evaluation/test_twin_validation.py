@@ -38,14 +38,14 @@ def check_a_fifth(members, at_least):
 
 
 @pytest.mark.parametrize('slip', GRIPS, ids=lambda slip: slip.name)
-def test_the_gyro_leaves_a_fifth_of_the_drift_of_squares_at_every_strength(slipped, slip):
+def test_gyro_cuts_square_drift_to_a_fifth_at_any_slip(slipped, slip):
     chosen = [item for item in slipped if item.course in SQUARES and item.slip == slip.name]
     assert len(chosen) == 8
     check_a_fifth(chosen, math.radians(10.0))
 
 
 @pytest.mark.parametrize('course', SQUARES)
-def test_the_gyro_leaves_a_fifth_of_the_drift_of_squares_either_way_round(slipped, course):
+def test_gyro_cuts_square_drift_to_a_fifth_both_ways(slipped, course):
     chosen = [item for item in slipped if item.course == course]
     assert len(chosen) == 12
     check_a_fifth(chosen, math.radians(10.0))
@@ -63,14 +63,14 @@ def test_the_gyro_leaves_a_fifth_of_the_drift_of_ten_turns(slipped):
     assert all(item.holds for item in strong)
 
 
-def test_the_gyro_is_never_worse_than_its_own_errors_however_wheels_slip(slipped):
+def test_gyro_drift_stays_within_its_own_error_bound(slipped):
     """Scale and bias bound it, so a fifth is certain once steps drift by five times as much."""
     for item in slipped:
         assert abs(item.fused) <= 1.5 * item.limit, item
     assert yaw_drift.holds_from(slipped) < 7.5 * max(item.limit for item in slipped)
 
 
-def test_a_wheel_that_is_held_loses_steps_and_the_gyro_sees_the_turn():
+def test_a_held_wheel_loses_steps_the_gyro_measures_the_turn():
     (found,) = yaw_drift.measure_drifts((1,), (HELD,), courses=('square ccw',))
     assert found.lost > 100
     assert abs(found.steps) > math.radians(30.0)
@@ -84,14 +84,14 @@ def test_without_slip_both_headings_are_good(course):
     assert abs(found.steps) < math.radians(4.0)
     assert abs(found.fused) <= found.limit
     assert found.lost == 0
-    assert found.noticed == 0.0
+    assert found.detected == 0.0
 
 
-def test_without_the_gyro_the_odometry_is_that_of_the_steps_on_the_same_way():
+def test_odometry_without_gyro_equals_the_step_odometry():
     parameters = yaw_drift.robot(1)
     blind = parameters.with_values({'odometry.use_gyro': False})
-    spells = yaw_drift.slip_events('10 turns', STRONG, 1)
-    with_gyro, without = (courses.spin(table, 2, spells) for table in (parameters, blind))
+    slip_events = yaw_drift.slip_events('10 turns', STRONG, 1)
+    with_gyro, without = (courses.spin(table, 2, slip_events) for table in (parameters, blind))
     np.testing.assert_array_equal(with_gyro.truth, without.truth)
     np.testing.assert_allclose(without.odometry, without.steps, atol=1e-9)
     np.testing.assert_allclose(without.steps, with_gyro.steps, atol=1e-12)
@@ -101,8 +101,8 @@ def test_without_the_gyro_the_odometry_is_that_of_the_steps_on_the_same_way():
 @pytest.mark.parametrize('clockwise', [False, True])
 def test_a_square_is_one_to_the_steps_even_while_wheels_slip(clockwise):
     """It is driven by counting: what the floor makes of it does not show in the counters."""
-    spells = yaw_drift.slip_events('square cw', STRONG, 2)
-    course = courses.umbmark(yaw_drift.robot(2), clockwise, spells, side=0.5)
+    slip_events = yaw_drift.slip_events('square cw', STRONG, 2)
+    course = courses.umbmark(yaw_drift.robot(2), clockwise, slip_events, side=0.5)
     sign = -1.0 if clockwise else 1.0
     assert course.steps[-1, :2] == pytest.approx([0.0, 0.0], abs=5e-3)
     assert course.steps[-1, 2] == pytest.approx(sign * math.tau, abs=1e-3)
@@ -112,13 +112,13 @@ def test_a_square_is_one_to_the_steps_even_while_wheels_slip(clockwise):
     assert np.all(course.time[1:] > course.time[:-1])
 
 
-def test_a_course_that_cannot_be_driven_says_so():
+def test_an_impossible_course_is_rejected():
     stuck = yaw_drift.robot(1).with_values({'wheel.max_velocity': 0.0})
     with pytest.raises(RuntimeError, match=r'leg 1 did not end within .* rad to go'):
         courses.spin(stuck, 1)
 
 
-def test_spells_depend_on_seed_course_and_slip_and_do_not_overlap():
+def test_slip_events_depend_on_their_seed_without_overlap():
     shown = yaw_drift.slip_events('10 turns', MIDDLE, 1)
     assert shown == yaw_drift.slip_events('10 turns', MIDDLE, 1)
     assert shown != yaw_drift.slip_events('10 turns', MIDDLE, 2)
@@ -151,20 +151,20 @@ def test_the_ceiling_is_v_over_2_l_i_steps_a_second():
     assert at_work > component_tests.needed_torque(parameters)
 
 
-def test_a_ramp_beyond_the_torque_loses_whole_pitches_that_odometry_does_not_see():
+def test_a_ramp_beyond_the_torque_loses_pitches_unnoticed():
     parameters = DigitalTwinParameters()
     limit = component_tests.breaking_acceleration(parameters)
     within, beyond = (component_tests.ramp(parameters, part * limit, 10.0) for part in (0.5, 1.5))
     assert within.lost_steps == (0, 0)
-    assert within.believed[-1] == pytest.approx(within.driven[-1], abs=1e-3)
+    assert within.odometry_speed[-1] == pytest.approx(within.driven[-1], abs=1e-3)
     assert np.abs(within.behind).max() < 1.0
     assert beyond.lost_steps[0] >= 4
     assert beyond.lost_steps[0] % 4 == 0
     way = 0.035 * math.tau * beyond.lost_steps[0] / 200.0
-    assert beyond.believed[-1] - beyond.driven[-1] == pytest.approx(way, abs=1e-3)
+    assert beyond.odometry_speed[-1] - beyond.driven[-1] == pytest.approx(way, abs=1e-3)
 
 
-def test_the_distance_sensor_is_its_data_sheet_and_lies_when_too_near():
+def test_distance_sensor_matches_its_sheet_wrong_if_too_near():
     assert component_tests.sharp_deviation() < 0.025
     readings = component_tests.sharp_readings(
         SimulatedRangeSensorParameters(), np.array([0.0, 0.03, 0.06, 0.4]), seed=1
@@ -176,7 +176,7 @@ def test_the_distance_sensor_is_its_data_sheet_and_lies_when_too_near():
 
 
 @pytest.mark.parametrize('setting', range(7))
-def test_the_low_pass_has_lost_3_db_where_the_data_sheet_says(setting):
+def test_low_pass_cutoff_matches_the_data_sheet(setting):
     response = component_tests.low_pass_response(setting)
     assert response.cutoff == pytest.approx(component_tests.GYRO_SHEET[setting][0], rel=0.01)
     if setting == 3:
@@ -199,14 +199,14 @@ def test_the_standing_gyro_has_the_noise_of_the_data_sheet():
     """Noise above 50 Hz folds in at 100 samples a second: a tenth more than the sheet's."""
     parameters = DigitalTwinParameters().imu
     found = component_tests.allan_deviation(
-        component_tests.standing_gyro(parameters, 100.0, 100.0, 1), 100.0
+        component_tests.stationary_gyro(parameters, 100.0, 100.0, 1), 100.0
     )
     at = np.searchsorted(found.span, 0.1)
     density = found.deviation[at] * math.sqrt(2.0 * found.span[at])
     assert density == pytest.approx(parameters.gyro_noise, rel=0.2)
 
 
-def test_a_blind_robot_runs_into_the_wall_and_its_odometry_through_it():
+def test_a_blind_robot_hits_the_wall_its_odometry_passes_it():
     parameters = DigitalTwinParameters.from_dict({'seed': 1, 'world': 'room'})
     patrol = courses.patrol(parameters, 7.5, 30.0)
     blind = patrol.course.time > 7.5

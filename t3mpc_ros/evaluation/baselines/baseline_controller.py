@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class NominalModel:
-    """What a method is told about the robot beforehand; nothing of it is the truth of a case."""
+    """Nominal model of the robot that every method gets; it contains no true value of a case."""
 
     drive: str
     """``'torque'`` or ``'velocity'``."""
@@ -40,11 +40,11 @@ class NominalModel:
     acceleration: float
     """Largest rate of change of a wheel speed command, rad/s²; infinite for the torque drive."""
     robot: PaperRobotParameters
-    """The nominal robot: geometry, body, friction. Factors, disturbance and noise are not told."""
+    """The nominal robot: geometry, body, friction. It lacks factors, disturbance and noise."""
 
     @property
     def share(self) -> float:
-        """1 - exp(-T/lag): how much of a step of the command the servo has followed after T."""
+        """1 - exp(-T/lag): step response of the servo after one period T."""
         return 1.0 - math.exp(-self.period / self.lag)
 
     def acceleration_for(self, command: Array, speeds: Array) -> Array:
@@ -58,54 +58,54 @@ class NominalModel:
 
 @dataclass(slots=True)
 class Observation:
-    """What a method sees at a step; right wheel first, arrays are only lent.
+    """Input of a method at one step; right wheel first, valid until the next step.
 
-    Every time is counted from the instant at which the answer begins to act.
+    Times count from the instant at which the returned acceleration takes effect.
     """
 
     speeds: Array
     """Estimated chi at that instant, rad/s, shape (2,)."""
     unexplained: Array
-    """Estimated acceleration d that chi' = u does not explain, rad/s², shape (2,)."""
+    """Estimated disturbance acceleration d = chi' - u, rad/s², shape (2,)."""
     reference: Array
     """r at that instant, rad/s, shape (2,); extrapolated by its slope without preview."""
     next_reference: Array
-    """r one period later, shape (2,), alike; ``(wanted_next - wanted) / T`` feeds forward."""
+    """r one period later, shape (2,); ``(next_reference - reference) / T`` feeds forward."""
     command: Array
-    """The wheel speeds last commanded, rad/s, shape (2,); unused with the torque drive."""
+    """Last commanded wheel speeds, rad/s, shape (2,); unused with the torque drive."""
     future: Array | None
-    """r at that instant and each period after it, shape (n, 2), n >= 2: what preview gives.
+    """Preview: r at that instant and each period after it, shape (n, 2), n >= 2.
     None for a method without preview."""
 
 
 class BaselineController(ABC):
-    """A controller in a comparison; a new one is made for each run.
+    """Interface of a compared controller; each run creates a new one.
 
     Parameters
     ----------
     settings
-        What can be tuned, an instance of :attr:`settings_type`.
+        Tunable parameters, an instance of :attr:`settings_type`.
     knowledge
-        What is known of the robot.
+        Nominal model of the robot.
     """
 
     parameters_type: ClassVar[type[Parameters]]
     preview: ClassVar[bool] = False
-    """Whether it reads :attr:`View.future`."""
+    """Whether it uses :attr:`Observation.future`."""
 
     @abstractmethod
     def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None: ...
 
     @abstractmethod
     def step(self, observation: Observation) -> Array:
-        """Return u, the wanted wheel accelerations, rad/s², shape (2,)."""
+        """Return u, the requested wheel accelerations, rad/s², shape (2,)."""
 
     def applied(self, acceleration: Array, *, limited: bool) -> None:  # noqa: B027
-        """Take note of the u that the drive's limits let through (anti-windup)."""
+        """Store the u after the drive's limits (anti-windup)."""
 
     def get_weights(self) -> dict[str, Array]:
-        """Return what was learnt so far, by name; nothing for a method that does not learn."""
+        """Return the adapted weights by name; empty for a method without adaptation."""
         return {}
 
     def set_weights(self, weights: Mapping[str, Array]) -> None:  # noqa: B027
-        """Begin with what :meth:`get_weights` returned after another run."""
+        """Start from weights that :meth:`get_weights` returned after another run."""

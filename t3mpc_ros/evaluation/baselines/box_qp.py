@@ -45,7 +45,7 @@ MAX_NEWTON_STEPS = 20
 
 
 class Workspace(NamedTuple):
-    """A program of n moves and what its solver writes to; made once by :func:`make_space`."""
+    """Program of n moves and the working memory of its solver; made once by :func:`make_space`."""
 
     hessian: Array
     """H, shape (n, n), written by the caller."""
@@ -107,7 +107,7 @@ def response_matrix(steps: Array, moves: int) -> Array:
 
 @kernel
 def shift_plan(moves: Array, kept: float) -> None:
-    """Move the last plan on by a period, a warm start for the next; it ends as it did, or in 0.
+    """Shift the last plan by a period as a warm start; the last entry is repeated or 0.
 
     kept : share of the last entry that the new one has
     """
@@ -183,10 +183,10 @@ def newton_direction(space: Workspace, count: int) -> None:
 
 @kernel
 def projected_step(space: Workspace, length: float) -> tuple[bool, bool]:
-    """Go ``length`` times ``direction``, bent at the bounds.
+    """Take ``length`` times ``direction``, projected onto the bounds.
 
-    Returned are whether that paid (nothing is changed when not), and whether it was the whole
-    way: not bent at all, or so short that only rounding was left.
+    Returns whether the step decreases the cost enough (otherwise nothing changes), and whether it
+    was a full step: not projected, or no longer than rounding.
     """
     promised, bent, cut, longest, largest = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(space.moves.size):
@@ -224,10 +224,10 @@ def update_gradient(space: Workspace) -> float:
 
 @kernel
 def solve_active_set(space: Workspace, most: int) -> int:
-    """Go on to the optimum by changing one bound at a time, and return a status.
+    """Solve by changing one bound at a time, and return a status.
 
-    The primal active-set method (Nocedal and Wright 2006, section 16.5), which cannot fail to
-    end: straight to the optimum of the free moves or to the first bound on the way, which then
+    The primal active-set method (Nocedal and Wright 2006, section 16.5), which always
+    terminates: straight to the optimum of the free moves or to the first bound on the way, which then
     holds; at that optimum the bound that the slope pulls from most is given up.
     """
     moves, low, high, held = space.moves, space.low, space.high, space.held
@@ -273,7 +273,7 @@ def solve_active_set(space: Workspace, most: int) -> int:
 
 @kernel
 def solve(space: Workspace, most: int) -> int:
-    """Write the best moves into ``space.moves`` and return a status.
+    """Write the optimal moves into ``space.moves`` and return a status.
 
     Projected Newton steps (Bertsekas 1982, doi 10.1137/0320018): moves at a bound that the slope
     presses against it are held, the others go to their common optimum along a path bent at the
@@ -281,7 +281,7 @@ def solve(space: Workspace, most: int) -> int:
     three steps; should it take more than BOLD, or a step not pay, :func:`finish` goes on. The
     moves keep their bounds whatever the status.
 
-    Whoever changes H must set ``space.factored[0] = -1``.
+    Set ``space.factored[0] = -1`` after changing H.
 
     most : cap on the steps of :func:`finish`
     returned : OPTIMAL, NOT_POSITIVE (H is not, or something is not finite) or UNFINISHED

@@ -63,7 +63,7 @@ MAX_RESPONSE_LENGTH = 1000
 
 @dataclass(frozen=True)
 class DynamicMatrixPreviewParameters(Parameters):
-    """What can be chosen about dynamic matrix control that is told the future reference."""
+    """Parameters of dynamic matrix control with preview."""
 
     model_error: float = parameter(
         1.0, 'inertia that the model believes in over the nominal one', low=0.1, high=10.0
@@ -113,7 +113,7 @@ class DynamicMatrixPreviewParameters(Parameters):
 
 @dataclass(frozen=True)
 class DynamicMatrixParameters(DynamicMatrixPreviewParameters):
-    """The same without preview."""
+    """Parameters of dynamic matrix control without preview."""
 
     moves: int = parameter(
         12, 'M, moves planned; the command stays where they lead', low=1, high=200
@@ -128,7 +128,7 @@ class DynamicMatrixParameters(DynamicMatrixPreviewParameters):
 
 
 class Responses(NamedTuple):
-    """What is known of a wheel: its answer 1, 2, ... periods after a unit step, until settled."""
+    """Step responses of a wheel 1, 2, ... periods after a unit step, until settled."""
 
     steps: Array
     """s_j, to the command c, (rad/s)/(rad/s)."""
@@ -137,12 +137,12 @@ class Responses(NamedTuple):
 
 
 def identify_step_responses(model: WheelModel, inner_gain: float, least: int) -> Responses:
-    """Return the step responses of a wheel, taken down from two runs of ``model``.
+    """Return the step responses of a wheel from two simulations of ``model``.
 
     Parameters
     ----------
     model
-        The wheel as it is believed to be.
+        Wheel model.
     inner_gain
         K0 of the loop that is closed around it first, 1/s; 0 when it settles by itself.
     least
@@ -177,7 +177,7 @@ def identify_step_responses(model: WheelModel, inner_gain: float, least: int) ->
 
 
 class PlantModel(NamedTuple):
-    """What is believed of the robot, only read."""
+    """Model of the robot, read-only."""
 
     responses: Responses
     static: float
@@ -193,7 +193,7 @@ class PlantModel(NamedTuple):
 
 
 class ControllerState(NamedTuple):
-    """What is kept from step to step, one row or entry a wheel."""
+    """State between steps, one row or entry per wheel."""
 
     outputs: Array
     """Y_0 ... Y_(n-1), rad/s, shape (2, n)."""
@@ -272,7 +272,7 @@ def dmc_step(
 
 
 class DynamicMatrix(BaselineController):
-    """Dynamic matrix control that expects the reference to go on as it does now.
+    """Dynamic matrix control without preview: it extrapolates the reference by its slope.
 
     Raises
     ------
@@ -295,7 +295,7 @@ class DynamicMatrix(BaselineController):
         period, n = nominal_model.period, parameters.horizon
         model = wheel_model(nominal_model, parameters.model_error)
         self.responses = identify_step_responses(model, self._inner_gain, n + 1)
-        """What it believes of a wheel."""
+        """Step responses of the wheel model."""
         response = response_matrix(self.responses.steps[:n], parameters.moves)
         weight = (parameters.move_time / period) ** 2
         reach = nominal_model.acceleration * period
@@ -340,7 +340,7 @@ class DynamicMatrix(BaselineController):
 
     @property
     def bias(self) -> Array:
-        """What the model missed, b, rad/s, shape (2,)."""
+        """Prediction error of the model, b, rad/s, shape (2,)."""
         return self._memory.bias.copy()
 
     @property
@@ -380,7 +380,7 @@ class DynamicMatrix(BaselineController):
 
 
 class DynamicMatrixPreview(DynamicMatrix):
-    """Dynamic matrix control that is told the reference's future."""
+    """Dynamic matrix control with preview."""
 
     parameters_type: ClassVar[type[Parameters]] = DynamicMatrixPreviewParameters
     preview: ClassVar[bool] = True

@@ -38,13 +38,13 @@ from t3mpc_ros.parameters.table import Parameters, parameter
 Array = NDArray[np.float64]
 Table = TypeVar('Table', bound=Parameters)
 
-# Rows of a baseline's memory, shape (n, 2); what a method needs of its own comes after them.
+# Rows of the memory, shape (n, 2); rows of the individual method follow.
 TRANSIENT, CLOSING, REQUESTED, APPLIED, PREDICTED_REFERENCE, OWN = range(6)
 
 
 @dataclass(frozen=True)
 class JumpTransientParameters(Parameters):
-    """How the known part of the error, h, is closed after a jump of the reference."""
+    """Parameters of the transient h after a jump of the reference."""
 
     rate: float = parameter(
         100.0,
@@ -55,7 +55,7 @@ class JumpTransientParameters(Parameters):
     )
     acceleration: float = parameter(
         200.0,
-        'largest acceleration asked for it; torques are not told when they are cut, so that with '
+        'largest acceleration requested for it; a torque limit is not reported back, so that with '
         'a torque drive this should be what the motors can do',
         unit='rad/s²',
         low=1.0,
@@ -104,7 +104,7 @@ def write_acceleration(
 ) -> None:
     """Write u (rad/s²) of one wheel, and keep what the next :func:`trace` needs.
 
-    Until the drive says otherwise, all of u is applied.
+    All of u counts as applied until :meth:`FeedbackBaseline.applied` corrects it.
     """
     memory[REQUESTED, wheel] = u
     memory[APPLIED, wheel] = u
@@ -113,12 +113,12 @@ def write_acceleration(
 
 
 def checked_parameters(parameters: Parameters, kind: type[Table]) -> Table:
-    """Return ``settings``, of which a baseline is sure from then on that they are its own.
+    """Return ``parameters`` if they are of the type ``kind``.
 
     Raises
     ------
     ValueError
-        They are another method's.
+        They are of another method.
     """
     if not isinstance(parameters, kind):
         raise ValueError(f'settings must be {kind.__name__}: got {type(parameters).__name__}')
@@ -126,16 +126,16 @@ def checked_parameters(parameters: Parameters, kind: type[Table]) -> Table:
 
 
 class FeedbackBaseline(BaselineController):
-    """Base of baselines that tell the effect of disturbances from that of jumps and limits.
+    """Base of baselines that separate the effect of disturbances from that of jumps and limits.
 
     Parameters
     ----------
     knowledge
-        What is known of the robot.
-    crossing
-        How h is closed.
+        Nominal model of the robot.
+    jump_transient
+        Rate and acceleration limit of h.
     own
-        How many rows of memory the method needs for itself.
+        Number of additional memory rows of the method.
     """
 
     def __init__(
@@ -157,5 +157,5 @@ class FeedbackBaseline(BaselineController):
         return transient
 
     def applied(self, acceleration: Array, *, limited: bool) -> None:
-        """Take note of the u that the drive's limits let through: the rest goes into h."""
+        """Store the u after the drive's limits: the remainder adds to h."""
         self._memory[APPLIED] = acceleration

@@ -53,7 +53,7 @@ MAX_ITERATIONS = 1000
 
 @dataclass(frozen=True)
 class LinearMpcPreviewParameters(Parameters):
-    """What can be chosen about linear predictive control that is told the future reference."""
+    """Parameters of linear MPC with preview."""
 
     model_error: float = parameter(
         1.0, 'inertia that the model believes in over the nominal one', low=0.1, high=10.0
@@ -95,7 +95,7 @@ class LinearMpcPreviewParameters(Parameters):
 
 @dataclass(frozen=True)
 class LinearMpcParameters(LinearMpcPreviewParameters):
-    """The same without preview."""
+    """Parameters of linear MPC without preview."""
 
     slope_time: float = parameter(
         0.2,
@@ -115,7 +115,7 @@ class WheelModel(NamedTuple):
 
 
 def wheel_model(nominal_model: NominalModel, model_error: float) -> WheelModel:
-    """Return how a wheel answers c (velocity drive) or u (torque drive) and a disturbance.
+    """Return the response of a wheel to c (velocity drive) or u (torque drive) and a disturbance.
 
     model_error : inertia that is believed in over the nominal one; it makes the servo of the
         velocity drive slower, and what a torque drive's u achieves smaller.
@@ -171,7 +171,7 @@ def predict_reference(
 ) -> None:
     """Write the reference expected 0 ... N periods after the answer begins to act, rad/s.
 
-    wanted, wanted_next : shape (2,), rad/s; read where ``future`` has no rows
+    reference, next_reference : shape (2,), rad/s; read where ``future`` has no rows
     future : shape (n, 2), rad/s. It is continued by its last slope, or by the one before where
         that is flatter, so that a jump in the last row is not taken for a slope.
     fade : share of the slope that is left after a period, beyond what is known
@@ -234,7 +234,7 @@ class StepParameters(NamedTuple):
 
 
 class History(NamedTuple):
-    """What is kept from step to step, one row or entry a wheel."""
+    """State between steps, one row or entry per wheel."""
 
     integral: Array
     """Disturbance from its own prediction errors, rad/s², shape (2,)."""
@@ -308,7 +308,7 @@ def linear_mpc_step(
 
 
 class LinearMpc(BaselineController):
-    """Linear predictive control that expects the reference to go on as it does now."""
+    """Linear MPC without preview: it extrapolates the reference by its slope."""
 
     parameters_type: ClassVar[type[Parameters]] = LinearMpcParameters
 
@@ -401,13 +401,13 @@ class LinearMpc(BaselineController):
         return self._knowledge.acceleration_for(self._answer, observation.speeds)
 
     def applied(self, acceleration: Array, *, limited: bool) -> None:
-        """Go on from the u that was let through."""
+        """Continue from the u after the limits."""
         if self._torque:
             self._answer[:] = acceleration
 
 
 class LinearMpcPreview(LinearMpc):
-    """Linear predictive control that is told the reference's future."""
+    """Linear MPC with preview."""
 
     parameters_type: ClassVar[type[Parameters]] = LinearMpcPreviewParameters
     preview: ClassVar[bool] = True

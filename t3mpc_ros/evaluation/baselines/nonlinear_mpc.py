@@ -55,7 +55,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class CasadiNmpcParameters(Parameters):
-    """What can be chosen about nonlinear predictive control."""
+    """Parameters of nonlinear MPC."""
 
     model_error: float = parameter(
         1.0,
@@ -255,7 +255,7 @@ def solve_linearised(
 
 
 class CasadiNmpc(BaselineController):
-    """Nonlinear predictive control that is told the reference's future.
+    """Nonlinear MPC with preview.
 
     Raises
     ------
@@ -358,12 +358,12 @@ class CasadiNmpc(BaselineController):
         return self._knowledge.acceleration_for(self._answer, observation.speeds)
 
     def applied(self, acceleration: Array, *, limited: bool) -> None:
-        """Go on from the u that was let through."""
+        """Continue from the u after the limits."""
         if self._torque:
             self._answer[:] = acceleration
 
     def _learn(self, observation: Observation, before: Array) -> Array:
-        """Renew the disturbance and return the speeds the horizon starts from, rad/s."""
+        """Update the disturbance and return the initial speeds of the horizon, rad/s."""
         speeds = observation.speeds
         if self._begun:
             unlike = before - self._commands[0]

@@ -309,7 +309,7 @@ def calm_control(results: Results, drive: str) -> Claim:
 
 
 def estimation_claims(estimated: Sequence[EstimationResult]) -> list[Claim]:
-    """Decide what the paper says of its fuzzy system without a controller, (86)."""
+    """Decide the paper's claims on the fuzzy system without a controller, (86)."""
     ours, *others = KINDS
     half = Claim(
         'estimation, half of the others',

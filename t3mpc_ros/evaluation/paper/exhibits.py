@@ -31,7 +31,7 @@ class Exhibit:
 
     title: str
     paper: str
-    """What the paper says of it, in our words."""
+    """Statement of the paper, paraphrased."""
     caption: str
     claims: tuple[str, ...] = ()
     """Beginnings of the names of the claims that decide it."""
@@ -81,7 +81,7 @@ EXHIBITS = (
     Exhibit(
         'Switching modes (Fig. 10)',
         'Which of the four chaotic signals drives each output; it changes four times in the run.',
-        'At which times the paper switches its text does not tell; here every 12 s.',
+        'The paper does not state its switch times; here every 12 s.',
         ('four switches',),
         'fig10_modes',
         lambda m: single_run_figures.modes(m.showcase),

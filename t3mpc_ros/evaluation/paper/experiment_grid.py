@@ -51,7 +51,7 @@ class Method(Protocol):
 
     @property
     def baseline(self) -> bool:
-        """Whether it is somebody else's method, not a stage of ours."""
+        """Whether it is a baseline, not a stage of the proposed controller."""
 
     @property
     def preview(self) -> bool:

@@ -279,7 +279,7 @@ def run_missing(
     team
         Who works: how many processes, or what the bench's own ``team`` enters.
     progress
-        Told what is going on; None keeps silent.
+        Progress output; None for none.
 
     Raises
     ------

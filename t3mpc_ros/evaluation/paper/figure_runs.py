@@ -68,7 +68,7 @@ class FigureRuns:
     """What each kind of fuzzy system makes of them, alike."""
 
     def claims(self) -> list[Claim]:
-        """Return what the paper says of such runs, decided for these."""
+        """Return the paper's claims on single runs, decided for these."""
         return [switches_claim(self.torque), follows_claim(self.torque), estimate_claim(self)]
 
 

@@ -40,8 +40,8 @@ def comparison(results: Results, drive: str, *, settled: bool = False) -> Table:
         growth = EMPTY_CELL
         if first is not None and last is not None:
             growth = _growth(value(first)[0], value(last)[0])
-        told = all(results.kinds[name]) and 'preview' not in name
-        mark = ' (preview)' if told else ''
+        labelled = all(results.kinds[name]) and 'preview' not in name
+        mark = ' (preview)' if labelled else ''
         lines.append((name + mark, *cells, growth))
     title = f'{what} (rad/s), {drive} drive, nominal robot'
     return Table(title, tuple(head), tuple(lines), (FULL,))
@@ -162,7 +162,7 @@ def all_tables(results: Results, estimated: Sequence[EstimationResult]) -> dict[
 
 def claims_table(claims: Sequence[Claim], origin: str) -> Table:
     """Return the claims of one origin, ``'ours'`` or ``'paper'``, with what was found."""
-    title = 'What this package is to show' if origin == 'ours' else 'What the paper says'
+    title = 'Claims of this package' if origin == 'ours' else 'Claims of the paper'
     rows = [(claim.text, claim.found, claim.verdict) for claim in claims if claim.origin == origin]
     return Table(title, ('claim', 'found', 'verdict'), tuple(rows))
 

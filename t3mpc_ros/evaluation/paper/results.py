@@ -69,7 +69,7 @@ class PairedDifference:
     noise: float
     case: str
     difference: float
-    """Mean of first minus second; negative says that the first is better."""
+    """Mean of first minus second; negative if the first is better."""
     ci95: float
     """Half the 95 % interval of that mean (Student's t); infinite for a single seed."""
     seeds: int

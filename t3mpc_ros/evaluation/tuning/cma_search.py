@@ -50,7 +50,7 @@ class Evaluation:
 
     values: Values
     value: float
-    """What the objective said; infinite where it said anything but a finite number."""
+    """Value of the objective; infinite if that was not finite."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +150,7 @@ def search_best(
     generations = _Generations(origin, seed, batch)
     while course.left > generations.size:
         values = course.evaluate(generations.ask())
-        generations.tell(values, course.left)
+        generations.update(values, course.left)
     if course.left:
         points = generations.ask()[: course.left]
         if generations.learnt:
@@ -190,12 +190,12 @@ class _Evaluator:
         known = self._history.recall(points)
         if known is None:
             # Copies: the history stays true whatever the objective does to its argument.
-            told = [float(value) for value in self._objective([dict(each) for each in asked])]
-            if len(told) != len(points):
+            returned = [float(value) for value in self._objective([dict(each) for each in asked])]
+            if len(returned) != len(points):
                 raise ValueError(
-                    f'objective must return one value a point, {len(points)}: got {len(told)}'
+                    f'objective must return one value a point, {len(points)}: got {len(returned)}'
                 )
-            known = [value if math.isfinite(value) else math.inf for value in told]
+            known = [value if math.isfinite(value) else math.inf for value in returned]
             self._fresh += len(points)
             self._history.add(points, known)
         self._done += [
@@ -242,7 +242,7 @@ class _Generations:
         self._asked = self._strategy.ask()
         return [self._cut(point) for point in self._asked]
 
-    def tell(self, values: Sequence[float], left: int) -> None:
+    def update(self, values: Sequence[float], left: int) -> None:
         """Move the distribution by the values of the points last asked for.
 
         An infinite value counts as worse than any yet seen; ``left`` is how many evaluations
@@ -276,7 +276,7 @@ class _Generations:
 
 
 class _History:
-    """What was evaluated, as a file; an interrupted search is told the same values again."""
+    """Evaluations in a file; an interrupted search reads them back."""
 
     def __init__(self, path: Path | None, head: Mapping[str, object], resume: bool) -> None:
         self._path = path

@@ -96,7 +96,7 @@ class ClosedLoopObjective:
     workers
         How many processes.
     report
-        Told of settings with which a run raised an exception.
+        Receives the error text of parameters with which a run raised an exception.
     """
 
     def __init__(

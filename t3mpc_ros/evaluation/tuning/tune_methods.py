@@ -59,7 +59,7 @@ def tune_methods(
     path
         Where the tuned settings are kept.
     report
-        Told of the progress, line by line.
+        Receives the progress, line by line.
     clock
         Returns seconds that only go on, for the estimate of the time left; without it there is
         none.
@@ -107,7 +107,7 @@ def tune_methods(
                 method.start[drive],
                 evaluations,
                 seed,
-                progress.tell,
+                progress.report,
                 path=history_path(path, method, drive),
                 resume=resume,
                 about=_about(method, drive, budget),
@@ -148,7 +148,7 @@ class _Progress:
         self._name, self._report, self._clock = name, report, clock
         self._begin = clock() if clock else 0.0
 
-    def tell(self, standing: SearchProgress) -> None:
+    def report(self, standing: SearchProgress) -> None:
         """Report how far the search has come; what a resumed one already knew is passed over."""
         done, left = standing.done, standing.total - standing.done
         if self._report is None or (left and not standing.fresh):
@@ -191,8 +191,8 @@ def _objective(
             except ParameterError:
                 continue  # each in range, but they do not fit together: as bad as can be
         if candidates:
-            told = evaluate(method, drive, list(candidates.values()))
-            for i, value in zip(candidates, told, strict=True):
+            values = evaluate(method, drive, list(candidates.values()))
+            for i, value in zip(candidates, values, strict=True):
                 prices[i] = value
         return prices
 

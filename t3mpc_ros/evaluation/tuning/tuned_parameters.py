@@ -27,7 +27,7 @@ T = TypeVar('T', bound=Parameters)
 
 
 class StoreError(ValueError):
-    """A file of tuned settings that cannot be used; says where in it and why."""
+    """A file of tuned parameters is invalid; the text gives position and reason."""
 
 
 @dataclass(frozen=True, slots=True)

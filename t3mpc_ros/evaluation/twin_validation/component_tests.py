@@ -67,7 +67,7 @@ class Ramp:
     """rad/s at which it turns, shape (n,)"""
     behind: Array
     """Full steps the right rotor is behind its field, shape (n,)."""
-    believed: Array
+    odometry_speed: Array
     """m driven by the step counters, shape (n,)"""
     driven: Array
     """m driven, shape (n,)"""
@@ -162,8 +162,10 @@ def ramp(
             )
         )
     time: Array = step * np.arange(1.0, len(rows) + 1.0)
-    field, rotor, behind, believed, driven = np.array(rows).T
-    return Ramp(acceleration, time, field, rotor, behind, believed, driven, drivetrain.lost_steps)
+    field, rotor, behind, odometry_speed, driven = np.array(rows).T
+    return Ramp(
+        acceleration, time, field, rotor, behind, odometry_speed, driven, drivetrain.lost_steps
+    )
 
 
 def sharp_curve(distances: Sequence[float] | Array) -> Array:
@@ -206,25 +208,25 @@ def low_pass_response(setting: int, step: float = 1e-4, length: int = 8192) -> L
     return LowPass(frequency, gain, cutoff, 1e3 * step * middle)
 
 
-def standing_gyro(
+def stationary_gyro(
     parameters: SimulatedImuParameters, seconds: float, rate: float, seed: int
 ) -> Array:
     """Return what a gyro that does not turn tells (deg/s), shape (seconds * rate,)."""
     gyro = SimulatedImu(parameters, np.random.default_rng(seed))
     still = np.zeros((3, 2))
-    told = [gyro.measure(still, 1.0 / rate).angular for _ in range(round(seconds * rate))]
-    return (180.0 / math.pi) * np.array(told)
+    rates = [gyro.measure(still, 1.0 / rate).angular for _ in range(round(seconds * rate))]
+    return (180.0 / math.pi) * np.array(rates)
 
 
-def allan_deviation(told: Array, rate: float) -> Allan:
+def allan_deviation(rates: Array, rate: float) -> Allan:
     """Return the overlapping Allan deviation of a rate sampled ``rate`` times a second.
 
     For spans up to a fifth of the record. White noise of one-sided density N has N / sqrt(2 t),
     a random walk by K after a second K sqrt(t / 3). Source: IEEE Std 952, annex C, where N is
     the square root of the two-sided density.
     """
-    turned = np.concatenate(([0.0], np.cumsum(told))) / rate
-    longest = max(2, told.size // 5)
+    turned = np.concatenate(([0.0], np.cumsum(rates))) / rate
+    longest = max(2, rates.size // 5)
     sizes = np.unique(np.geomspace(1, longest, 40).astype(int))
     deviations = [
         math.sqrt(

@@ -54,7 +54,7 @@ class Slip(NamedTuple):
     length: float
     """s a spell lasts: on average (exponential) for grip, always for a held wheel"""
 
-    def spells(self, generator: np.random.Generator, until: float) -> tuple[FaultEvent, ...]:
+    def slip_events(self, generator: np.random.Generator, until: float) -> tuple[FaultEvent, ...]:
         """Return the spells that start within ``until`` seconds after the robot has stood."""
         events = []
         at = STANDING + generator.exponential(self.pause)
@@ -86,8 +86,8 @@ class Course:
     """m each tyre has slid, right first"""
     lost_steps: tuple[int, int]
     """Full steps the rotors are behind at the end."""
-    noticed: float
-    """s for which the robot said that gyro and steps disagree"""
+    detected: float
+    """s during which the robot reported a mismatch of gyro and steps"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +110,7 @@ class Patrol:
 def umbmark(
     parameters: DigitalTwinParameters,
     clockwise: bool,
-    spells: Iterable[FaultEvent] = (),
+    slip_events: Iterable[FaultEvent] = (),
     side: float = SIDE,
 ) -> Course:
     """Return the course of a square of ``side`` metres, back to where it started.
@@ -125,11 +125,11 @@ def umbmark(
     corner = 0.5 * math.pi * geometry.half_separation / geometry.wheel_radius
     corner *= -1.0 if clockwise else 1.0
     legs = [(along, along), (corner, -corner)] * 4
-    return _driven('square cw' if clockwise else 'square ccw', parameters, legs, spells)
+    return _driven('square cw' if clockwise else 'square ccw', parameters, legs, slip_events)
 
 
 def spin(
-    parameters: DigitalTwinParameters, turns: int, spells: Iterable[FaultEvent] = ()
+    parameters: DigitalTwinParameters, turns: int, slip_events: Iterable[FaultEvent] = ()
 ) -> Course:
     """Return the course of ``turns`` turns on the spot, counter-clockwise, with a stop after each.
 
@@ -140,7 +140,7 @@ def spin(
     """
     geometry = parameters.geometry
     turn = 2.0 * math.pi * geometry.half_separation / geometry.wheel_radius
-    return _driven(f'{turns} turns', parameters, [(turn, -turn)] * turns, spells)
+    return _driven(f'{turns} turns', parameters, [(turn, -turn)] * turns, slip_events)
 
 
 def yaw_drift(course: Course, by_steps: bool = False) -> float:
@@ -148,14 +148,14 @@ def yaw_drift(course: Course, by_steps: bool = False) -> float:
 
     That of the robot's odometry, or that of the step counters alone.
     """
-    believed = course.steps if by_steps else course.odometry
-    return float(believed[-1, 2] - course.truth[-1, 2])
+    odometry_speed = course.steps if by_steps else course.odometry
+    return float(odometry_speed[-1, 2] - course.truth[-1, 2])
 
 
 def place_error(course: Course, by_steps: bool = False) -> float:
     """Return how far (m) the robot thinks it is from where it is, in the end."""
-    believed = course.steps if by_steps else course.odometry
-    return math.dist(believed[-1, :2].tolist(), course.truth[-1, :2].tolist())
+    odometry_speed = course.steps if by_steps else course.odometry
+    return math.dist(odometry_speed[-1, :2].tolist(), course.truth[-1, :2].tolist())
 
 
 def gyro_limit(parameters: DigitalTwinParameters, course: Course) -> float:
@@ -230,15 +230,15 @@ class _Log:
     """A robot that is driven under a schedule of faults, and what was seen of it."""
 
     def __init__(
-        self, name: str, parameters: DigitalTwinParameters, spells: Iterable[FaultEvent]
+        self, name: str, parameters: DigitalTwinParameters, slip_events: Iterable[FaultEvent]
     ) -> None:
-        self.robot = _troubled(parameters, tuple(spells))
+        self.robot = _troubled(parameters, tuple(slip_events))
         self.state: RobotState = self.robot.advance(0)
         self._name = name
         self._parameters = parameters
         self._reckoning = WheelOdometry(parameters.odometry, parameters.geometry)
         self._rows: list[tuple[float, ...]] = []
-        self._noticed = 0
+        self._detected = 0
 
     @property
     def elapsed(self) -> float:
@@ -259,7 +259,7 @@ class _Log:
         self._reckoning.turn(now.right - before.right, now.left - before.left)
         truth = (0.0, 0.0, 0.0) if state.truth is None else state.truth.pose
         self._rows.append((self.elapsed, *truth, *state.odometry.pose, *self._reckoning.pose))
-        self._noticed += state.status.slipping
+        self._detected += state.status.slipping
 
     def stand(self, seconds: float) -> None:
         """Let the robot stand."""
@@ -280,18 +280,20 @@ class _Log:
             steps=rows[:, 7:10],
             slid=inside.slid,
             lost_steps=self.state.lost_steps or (0, 0),
-            noticed=self._noticed / self._parameters.rate,
+            detected=self._detected / self._parameters.rate,
         )
 
 
-def _troubled(parameters: DigitalTwinParameters, spells: Sequence[FaultEvent]) -> DigitalTwin:
+def _troubled(parameters: DigitalTwinParameters, slip_events: Sequence[FaultEvent]) -> DigitalTwin:
     """Return a robot that plays ``spells`` instead of the schedule of ``settings``, if any."""
-    if not spells:
+    if not slip_events:
         return DigitalTwin(parameters)
     entries = []
-    for spell in spells:
-        entry = {'at': spell.at, 'fault': spell.fault, 'value': spell.value}
-        entries.append(entry | ({'for': spell.duration} if spell.duration < math.inf else {}))
+    for slip_event in slip_events:
+        entry = {'at': slip_event.at, 'fault': slip_event.fault, 'value': slip_event.value}
+        entries.append(
+            entry | ({'for': slip_event.duration} if slip_event.duration < math.inf else {})
+        )
     with TemporaryDirectory() as folder:
         path = Path(folder) / 'spells.yaml'
         path.write_text(yaml.safe_dump({'events': entries}), encoding='utf-8')
@@ -302,10 +304,10 @@ def _driven(
     name: str,
     parameters: DigitalTwinParameters,
     legs: Iterable[tuple[float, float]],
-    spells: Iterable[FaultEvent],
+    slip_events: Iterable[FaultEvent],
 ) -> Course:
     """Drive legs, each a pair of angles (rad, right first) that the wheels shall turn."""
-    log = _Log(name, parameters, spells)
+    log = _Log(name, parameters, slip_events)
     log.stand(STANDING)
     exact = 0.5 * parameters.motor.microstep
     slowing = 2.0 * DECELERATION_ANGLE * parameters.limiter.acceleration

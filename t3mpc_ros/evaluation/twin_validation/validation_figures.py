@@ -68,20 +68,20 @@ def draw_square(axis: Any, course: Course) -> None:
     axis.set_aspect('equal', adjustable='datalim')
 
 
-def turns(course: Course, spells: Sequence[FaultEvent], slip: str) -> Any:
+def turns(course: Course, slip_events: Sequence[FaultEvent], slip: str) -> Any:
     """Return how wrong the headings are while the robot turns on the spot."""
     figure = new_figure(3.0)
     axis = figure.subplots()
-    for number, spell in enumerate(spells):
-        if spell.at < course.time[-1]:
+    for number, slip_event in enumerate(slip_events):
+        if slip_event.at < course.time[-1]:
             label = slip if number == 0 else None
-            axis.axvspan(spell.at, min(spell.until, course.time[-1]), color='#fde68a', lw=0.0,
+            axis.axvspan(slip_event.at, min(slip_event.until, course.time[-1]), color='#fde68a', lw=0.0,
                          label=label)  # fmt: skip
-    for believed, colour, label in (
+    for odometry_speed, colour, label in (
         (course.steps, STEPS, 'steps alone'),
         (course.odometry, FUSED, 'with gyro'),
     ):
-        wrong = np.degrees(believed[:, 2] - course.truth[:, 2])
+        wrong = np.degrees(odometry_speed[:, 2] - course.truth[:, 2])
         axis.plot(course.time, wrong, color=colour, lw=1.5, label=label)
     axis.set_xlabel('time / s')
     axis.set_ylabel('heading error / deg')
@@ -226,14 +226,14 @@ class Evidence:
     slip_shown: str
     """What made them slip."""
     turns: Course
-    spells: Sequence[FaultEvent]
+    slip_events: Sequence[FaultEvent]
     """Of the turns."""
     drifts: Sequence[Drift]
     patrol: Patrol
 
 
 class ValidationFigure(NamedTuple):
-    """One picture and what is said below it."""
+    """One figure with its caption."""
 
     stem: str
     title: str
@@ -284,7 +284,7 @@ def stall(evidence: Evidence) -> Any:
         column[1].plot(ramp.time, ramp.behind, color=COLOURS['value'], lw=1.1)
         if ramp.lost_steps[0] == 0:
             column[1].set_ylim(-1.5, 1.5)
-        column[2].plot(ramp.time, ramp.believed, color=STEPS, lw=1.5, label='by the steps')
+        column[2].plot(ramp.time, ramp.odometry_speed, color=STEPS, lw=1.5, label='by the steps')
         column[2].plot(ramp.time, ramp.driven, color=TRUE, lw=1.5, label='true')
         column[2].set_xlabel('time / s')
         column[2].margins(x=0.01)
@@ -464,7 +464,7 @@ VALIDATION_FIGURES = (
         'Ten turns on the spot',
         'What is wrong with both headings. Shaded: spells in which a wheel slips if it is asked '
         'for more than the grip that is left.',
-        lambda e: turns(e.turns, e.spells, e.slip_shown),
+        lambda e: turns(e.turns, e.slip_events, e.slip_shown),
     ),
     ValidationFigure(
         'drift',

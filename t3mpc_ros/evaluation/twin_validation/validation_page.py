@@ -82,12 +82,12 @@ def write_validation(output: Path, seed: int, amount: ValidationSize, progress: 
     findings = _findings(evidence)
     page = _page(origin, findings, tables, pictures)
     (output / PAGE).write_text(page, encoding='utf-8')
-    said = [table.markdown() for table in tables]
-    return '\n\n'.join([*said, '\n'.join(findings), str(output / PAGE)])
+    texts = [table.markdown() for table in tables]
+    return '\n\n'.join([*texts, '\n'.join(findings), str(output / PAGE)])
 
 
 def run_validation(seed: int, amount: ValidationSize, progress: Any = None) -> 'Evidence':
-    """Return everything that is measured; ``progress`` is told how far it is."""
+    """Return everything that is measured; ``progress`` receives the number of finished runs."""
     import numpy as np
 
     from t3mpc_ros.evaluation.twin_validation import component_tests, courses, yaw_drift
@@ -116,7 +116,7 @@ def run_validation(seed: int, amount: ValidationSize, progress: Any = None) -> '
     places = np.concatenate([np.arange(0.0, 0.1, 0.001), np.arange(0.1, 1.0, 0.005)])
     readings = component_tests.sharp_readings(parameters.range_sensor, places, seed)
     rate = parameters.rate
-    told = component_tests.standing_gyro(parameters.imu, amount.standing, rate, seed)
+    rates = component_tests.stationary_gyro(parameters.imu, amount.standing, rate, seed)
     low_pass = [component_tests.low_pass_response(number) for number in range(7)]
     count()
     found = yaw_drift.measure_drifts(seeds, slips, count)
@@ -124,7 +124,7 @@ def run_validation(seed: int, amount: ValidationSize, progress: Any = None) -> '
         yaw_drift.drive_course(name, shown, seed) for name in ('square ccw', 'square cw')
     )
     count()
-    turns, spells = (
+    turns, slip_events = (
         yaw_drift.drive_course('10 turns', shown, seed),
         yaw_drift.slip_events('10 turns', shown, seed),
     )
@@ -139,11 +139,11 @@ def run_validation(seed: int, amount: ValidationSize, progress: Any = None) -> '
         sharp=np.column_stack([near, component_tests.sharp_curve(near)]),
         readings=np.column_stack([places, readings]),
         low_pass=low_pass,
-        allan=component_tests.allan_deviation(told, rate),
+        allan=component_tests.allan_deviation(rates, rate),
         squares=(squares[0], squares[1]),
         slip_shown=shown.name,
         turns=turns,
-        spells=spells,
+        slip_events=slip_events,
         drifts=found,
         patrol=patrol,
     )
@@ -167,7 +167,7 @@ def bench_table(evidence: 'Evidence') -> 'Table':
         at += f', at {curve.ceiling:.1f} rad/s {pull[1]:.3f}'
         rows.append((name, at, f'needed {evidence.needed:.3f} N m'))
     for ramp in evidence.ramps:
-        wrong = 100.0 * abs(ramp.believed[-1] - ramp.driven[-1])
+        wrong = 100.0 * abs(ramp.odometry_speed[-1] - ramp.driven[-1])
         found = f'{ramp.lost_steps[0]} and {ramp.lost_steps[1]} steps lost, {wrong:.1f} cm wrong'
         rows.append((f'ramp of {ramp.acceleration:.0f} rad/s²', found, EMPTY_CELL))
     deviation = f'at most {100.0 * sharp_deviation():.1f} % off'
@@ -178,8 +178,8 @@ def bench_table(evidence: 'Evidence') -> 'Table':
     rows.append(('delay of the gyro', f'{response.delay:.2f} ms', f'{delay:g} ms'))
     brief = evidence.allan.span < 0.3
     density = evidence.allan.deviation[brief] * np.sqrt(2.0 * evidence.allan.span[brief])
-    told = f'{density[-1]:.4f} deg/s/√Hz'
-    rows.append(('noise of the gyro', told, f'{parameters.imu.gyro_noise:g} deg/s/√Hz'))
+    measured = f'{density[-1]:.4f} deg/s/√Hz'
+    rows.append(('noise of the gyro', measured, f'{parameters.imu.gyro_noise:g} deg/s/√Hz'))
     rows.append(('hardest push of a wall', f'{patrol.max_contact_force:.0f} N', EMPTY_CELL))
     return Table('Parts', ('what', 'twin', 'to compare'), tuple(rows))
 
@@ -190,7 +190,7 @@ def _findings(evidence: 'Evidence') -> list[str]:
 
     from t3mpc_ros.evaluation.twin_validation.yaw_drift import NO_SLIP, holds_from
 
-    said = []
+    lines = []
     for course in dict.fromkeys(item.course for item in evidence.drifts):
         slipped = [
             item for item in evidence.drifts if item.course == course and item.slip != NO_SLIP.name
@@ -198,12 +198,12 @@ def _findings(evidence: 'Evidence') -> list[str]:
         bound = np.degrees(max(item.limit for item in slipped))
         least = np.degrees(holds_from(slipped))
         kept = sum(item.holds for item in slipped)
-        said.append(
+        lines.append(
             f'{course}: with slip the gyro leaves at most a fifth of the heading error in {kept} '
             f'of {len(slipped)} runs, in all where the steps are wrong by more than {least:.1f} '
             f'deg; its own errors may come to {bound:.1f} deg.'
         )
-    return said
+    return lines
 
 
 def _page(
@@ -234,7 +234,7 @@ def _page(
 
 
 class _ProgressCounter:
-    """Counts what is done, for whoever shows progress."""
+    """Counts finished runs for the progress output."""
 
     def __init__(self, progress: Any, total: int) -> None:
         self._progress = progress

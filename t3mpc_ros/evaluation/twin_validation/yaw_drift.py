@@ -69,8 +69,8 @@ class Drift(NamedTuple):
     """m that the tyres have slid, the mean of both"""
     lost: int
     """Full steps lost by both motors."""
-    noticed: float
-    """s for which the robot said so"""
+    detected: float
+    """s during which the robot reported slip"""
 
     @property
     def holds(self) -> bool:
@@ -86,7 +86,7 @@ def robot(seed: int) -> DigitalTwinParameters:
 def slip_events(name: str, slip: Slip, seed: int) -> tuple[FaultEvent, ...]:
     """Return when wheels slip on a course; every argument leads to other spells."""
     numbers = [seed, list(COURSES).index(name), *slip.name.encode()]
-    return slip.spells(np.random.default_rng(numbers), LONGEST)
+    return slip.slip_events(np.random.default_rng(numbers), LONGEST)
 
 
 def drive_course(
@@ -111,7 +111,7 @@ def measure_drift(
         fused_place=place_error(course),
         slid=0.5 * sum(course.slid),
         lost=sum(map(abs, course.lost_steps)),
-        noticed=course.noticed,
+        detected=course.detected,
     )
 
 
