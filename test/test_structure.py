@@ -16,6 +16,7 @@ import t3mpc_ros
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / 't3mpc_ros'
 SOURCES = sorted(PACKAGE.rglob('*.py'))
+TESTS = ROOT / 'test'
 
 BASE = {'parameters', 'geometry', 'kernels'}
 # Packages that each package may import beside itself, the standard library and numpy.
@@ -164,6 +165,27 @@ def test_package_init_files_hold_a_docstring_only():
             body = ast.parse(path.read_text()).body
             assert len(body) == 1, path
             assert isinstance(body[0], ast.Expr), path
+
+
+def test_tests_mirror_the_packages():
+    """Folders of ``test/`` are packages, the firmware, or helpers; basenames are unique."""
+    folders = {path.name for path in TESTS.iterdir() if path.is_dir()}
+    known = set(PACKAGES) | {'firmware', 'golden', 'support', '__pycache__'}
+    assert folders - known == set()
+    names = [path.name for path in TESTS.rglob('test_*.py')]
+    assert len(names) == len(set(names))
+
+
+def test_no_test_imports_another_test():
+    for path in TESTS.rglob('*.py'):
+        for name in _imports(path):
+            assert not name.startswith(('test.', 'test_')), f'{path} imports {name}'
+
+
+def test_names_of_tests_have_at_most_60_characters():
+    for path in TESTS.rglob('test_*.py'):
+        for name in re.findall(r'^ *def (test_\w+)', path.read_text(), re.MULTILINE):
+            assert len(name) <= 60, f'{path}: {name}'
 
 
 def test_every_source_file_carries_the_licence():

@@ -175,7 +175,7 @@ class LoopRecord:
     limited: NDArray[np.bool_]
     """Whether a limit changed u, shape (n,)"""
     terms: Array
-    """Terms of u, rows as in ``law.TERMS``, rad/s², shape (n, 5, 2); zeros for a method that
+    """Terms of u, rows as in ``TERM_NAMES``, rad/s², shape (n, 5, 2); zeros for a method that
     has none. The fuzzy estimate is the first one negated."""
     modes: NDArray[np.int64]
     """Active switching mode, shape (n,)"""

@@ -64,7 +64,7 @@ class ProposedController(BaselineController):
         self._expected: Array = np.zeros(2)
         self._slope: Array = np.zeros(2)
         self.terms = self._tracker.law.terms
-        """The law's terms of the last step, rows as in ``law.TERMS``, rad/s², shape (5, 2)."""
+        """The law's terms of the last step, rows as in ``TERM_NAMES``, rad/s², shape (5, 2)."""
 
     @property
     def skill(self) -> Array:

@@ -87,7 +87,7 @@ class RunRecord(Protocol):
 
     @property
     def terms(self) -> Array:
-        """Terms of u, rad/s², shape (n, 5, 2), rows as in ``law.TERMS``."""
+        """Terms of u, rad/s², shape (n, 5, 2), rows as in ``TERM_NAMES``."""
 
     @property
     def modes(self) -> Array:
