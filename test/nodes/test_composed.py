@@ -18,7 +18,7 @@ pytestmark = pytest.mark.ros
 
 @pytest.fixture
 def compose(graph, tmp_path):
-    """Return a function that makes ``all_in_one`` as its command line would."""
+    """Return a function that makes the nodes of ``composed`` from parameters."""
     nodes = []
 
     def make(*parameters):
@@ -38,7 +38,7 @@ def compose(graph, tmp_path):
     'order', ['', 'nodes:=[recorder, controller, sim_robot, reference_generator]']
 )
 def test_composed_runs_with_stamped_commands_in_any_order(order, compose, tmp_path):
-    """The recorder expected a Twist, and ROS refuses a second type in one process."""
+    """An early subscription of the recorder must not fix the type of cmd_vel in the process."""
     nodes = compose('enable_stamped_cmd_vel:=true', *filter(None, [order]))
     assert nodes.keys() == set(NODES) - {'radio_bridge', 'player'}
     executor = SingleThreadedExecutor()

@@ -54,7 +54,7 @@ def test_a_stale_reference_gives_a_zero_command_with_the_reason(harness):
     bench.run(5)
     assert (diagnostic_level(controller), reason(controller)) == (OK, 'tracking')
     assert bench.last_command().linear.x > 0.0
-    bench.run(30, linear=0.1)  # the reference ends after 0.1 s and is good for 0.15 s more
+    bench.run(30, linear=0.1)  # the reference ends after 0.1 s and is valid for 0.15 s more
     assert (diagnostic_level(controller), reason(controller)) == (
         ERROR,
         'stopped: reference is stale',
@@ -73,7 +73,7 @@ def test_an_odometry_timeout_gives_zero_commands(harness):
     harness.spin_until(lambda: any(message.linear.x > 0.0 for message in bench.commands))
     harness.spin_until(lambda: reason(controller) == 'stopped: no odometry')
     count = len(bench.commands)
-    harness.spin_until(lambda: len(bench.commands) > count + 3, 'it keeps saying stop')
+    harness.spin_until(lambda: len(bench.commands) > count + 3, 'zero commands continue')
     assert bench.commands[-1] == Twist()
 
 
@@ -114,7 +114,7 @@ def test_huge_numbers_stop_the_robot_without_a_crash(harness):
         assert diagnostic_level(bench.controller) == ERROR
         assert bench.last_command() == Twist()
         bench.publish_reference(value, -value)
-        bench.run(60)  # it is held for half a second
+        bench.run(60)  # the stop lasts half a second
         assert diagnostic_level(bench.controller) == ERROR
         assert bench.last_command() == Twist()
         bench.run(80)
@@ -155,7 +155,7 @@ def test_stamped_commands_have_frame_and_stamp_of_the_odometry(harness):
     count = len(bench.commands)
     bench.controller.on_shutdown()
     harness.spin_until(lambda: len(bench.commands) > count)
-    assert bench.commands[-1].twist == Twist(), 'the last word is stop'
+    assert bench.commands[-1].twist == Twist(), 'the last command is a stop'
 
 
 def test_weights_survive_in_a_model_file_and_not_a_reset(harness, tmp_path):
@@ -167,29 +167,27 @@ def test_weights_survive_in_a_model_file_and_not_a_reset(harness, tmp_path):
         assert str(tmp_path / 'model.npz') in response.message
         return load_model(tmp_path / 'model.npz')
 
-    untaught = saved()
+    initial = saved()
     bench.publish_odometry()
     bench.publish_reference(0.1, 1.0, seconds=0.8)
-    bench.run(50)  # a robot that does not move although it should: much to learn
+    bench.run(50)  # a robot that does not follow: large adaptation
     learnt = saved()
-    change = learnt['fuzzy.coefficients'] - untaught['fuzzy.coefficients']
+    change = learnt['fuzzy.coefficients'] - initial['fuzzy.coefficients']
     assert np.abs(change).max() > 1e-3
 
-    files = {name: str(tmp_path / f'{name}.npz') for name in ('model', 'pupil')}
-    harness.add(
-        ControllerNode, namespace='pupil', model=files['model'], model_output=files['pupil']
-    )
-    assert harness.call(Trigger, 'pupil/controller/save_model').success
-    taught = load_model(tmp_path / 'pupil.npz')
-    assert taught.keys() == learnt.keys()
+    files = {name: str(tmp_path / f'{name}.npz') for name in ('model', 'copy')}
+    harness.add(ControllerNode, namespace='copy', model=files['model'], model_output=files['copy'])
+    assert harness.call(Trigger, 'copy/controller/save_model').success
+    loaded = load_model(tmp_path / 'copy.npz')
+    assert loaded.keys() == learnt.keys()
     for name in learnt:
-        np.testing.assert_array_equal(taught[name], learnt[name])
+        np.testing.assert_array_equal(loaded[name], learnt[name])
 
     assert harness.call(Trigger, 'controller/reset').success
     for name, value in saved().items():
-        np.testing.assert_array_equal(value, untaught[name])
+        np.testing.assert_array_equal(value, initial[name])
     bench.publish_odometry()
-    assert reason(bench.controller) == 'stopped: no reference yet', 'it earns its motion anew'
+    assert reason(bench.controller) == 'stopped: no reference yet', 'a new reference is needed'
 
 
 def test_an_unusable_model_file_is_named(harness, tmp_path):
@@ -226,7 +224,7 @@ def test_scalars_are_published_at_terms_rate(harness):
     bench.publish_reference(seconds=0.9)
     bench.run(99)
     harness.spin_until(lambda: all(len(values) == 20 for values in received.values()))
-    # The estimate still hopes that the wheels do as they are told, which here they do not.
+    # The speed filter expects the wheels to follow the command; here they do not.
     assert received['/controller/error/right'][-1].data == pytest.approx(-0.1 / 0.035, rel=0.03)
     for name in ('terms/applied/right', 'terms/feedback/left', 'lyapunov/value', 'skill/left'):
         assert math.isfinite(received[f'/controller/{name}'][-1].data), name
@@ -264,14 +262,14 @@ def test_initial_inputs_reach_a_late_subscriber(harness):
     harness.spin_until(lambda: len(late['odom']) >= 20 and len(late['reference']) >= 11)
     assert late == {'odom': odom, 'reference': reference}
     bench.run(1)
-    harness.spin_until(lambda: len(late['odom']) == 21, 'republished while it is received')
+    harness.spin_until(lambda: len(late['odom']) == 21, 'later inputs are republished, too')
 
 
 @pytest.mark.parametrize(
     'limit, value, kept', [('INITIAL_INPUT_TIME_NS', 0, 0), ('INITIAL_INPUTS', 5, 5)]
 )
 def test_initial_inputs_end_and_keep_the_first(limit, value, kept, harness, monkeypatch):
-    """Beyond the time, or the depth of the history, the first messages must not be replaced."""
+    """After the time limit, or beyond the depth, no later message replaces the first ones."""
     if limit == 'INITIAL_INPUTS':
         profile = QoSProfile(depth=value, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         monkeypatch.setattr(qos, limit, profile)

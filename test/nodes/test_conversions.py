@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Between messages and the package's words nothing is lost, and nothing bad gets through."""
+"""Conversions between ROS messages and the types of the package."""
 
 from dataclasses import replace
 import math
@@ -70,7 +70,7 @@ def test_yaw_survives_the_conversion_to_a_quaternion(yaw):
     assert math.hypot(rotation.z, rotation.w) == pytest.approx(1.0, abs=1e-15)
     back = conversions.yaw_from_quaternion(rotation)
     assert abs(wrap_angle(back - yaw)) < 1e-15 * 4
-    # q and -q are one rotation.
+    # q and -q are the same rotation.
     opposite = Quaternion(z=-rotation.z, w=-rotation.w)
     assert abs(wrap_angle(conversions.yaw_from_quaternion(opposite) - yaw)) < 1e-15 * 4
 
@@ -95,7 +95,7 @@ def test_roll_and_pitch_do_not_change_the_yaw():
 @pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf, 1e200])
 @pytest.mark.parametrize('axis', ['x', 'y', 'z', 'w'])
 def test_an_invalid_rotation_has_no_yaw(axis, value):
-    """An infinite z once had the yaw 3/4 pi, and 1e200 ended the node with OverflowError."""
+    """atan2 of infinite components is finite, and powers of 1e200 raise OverflowError."""
     rotation = Quaternion(x=0.5, y=0.5, z=0.5, w=0.5)
     setattr(rotation, axis, value)
     yaw = conversions.yaw_from_quaternion(rotation)
@@ -187,7 +187,7 @@ def test_wheel_joints_keep_their_order():
 
 
 def test_imu_covariance_is_the_variance_of_its_samples():
-    """Standing still, for as long as the bias walks less than the noise."""
+    """At rest, without drift of the bias."""
     parameters = SimulatedImuParameters(gyro_drift=0.0)
     sensor = SimulatedImu(parameters, np.random.default_rng(3))
     still = np.zeros((3, 2))
@@ -231,7 +231,7 @@ FLOATS = np.float32
     ],
 )
 def test_a_distance_follows_rep_117_after_serialization(distance, infinity, expected):
-    """Numbers are single on the wire: what lies on a bound must not fall beyond it there."""
+    """Ranges are serialized in single precision; a value at a limit must stay within it."""
     message = sensor_messages.range_message(RangeSensorParameters(), 'left_front_range_link')
     sensor_messages.fill_range(message, distance, 7, infinity=infinity)
     received = deserialize_message(serialize_message(message), Range)
@@ -261,9 +261,9 @@ def test_the_covariance_of_a_twist_is_that_of_its_wheels():
     rng = np.random.default_rng(9)
     wheels = rng.normal(scale=math.sqrt(variance), size=(20_000, 2))
     twists = np.array([twist_from_wheels(WheelSpeeds(*pair), geometry) for pair in wheels])
-    told = np.array(sensor_messages.twist_covariance(geometry, variance)).reshape(6, 6)
-    np.testing.assert_allclose([told[0, 0], told[5, 5]], twists.var(axis=0), rtol=0.05)
-    assert told[1, 1] == 1e6
+    covariance = np.array(sensor_messages.twist_covariance(geometry, variance)).reshape(6, 6)
+    np.testing.assert_allclose([covariance[0, 0], covariance[5, 5]], twists.var(axis=0), rtol=0.05)
+    assert covariance[1, 1] == 1e6
     misled = np.array(sensor_messages.twist_covariance(geometry, math.inf)).reshape(6, 6)
     np.testing.assert_array_equal(misled, 1e6 * np.eye(6))
 
@@ -277,7 +277,7 @@ def test_count_variance_is_that_of_quantisation():
     assert sensor_messages.count_variance(step, period) == pytest.approx(error.var(), rel=0.05)
 
 
-# -- what is wrong --------------------------------------------------------------------------------
+# -- diagnostics ----------------------------------------------------------------------------------
 
 
 def _state(reason='', lost=(0, 0), **status):

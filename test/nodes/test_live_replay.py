@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""A run of real processes over DDS, recorded, and computed again: each command comes out alike."""
+"""A recorded run of processes over DDS replays bit for bit."""
 
 import os
 import signal
@@ -27,12 +27,12 @@ pytestmark = [pytest.mark.ros, pytest.mark.slow]
 LOOP = ('recorder', 'controller', 'sim_robot', 'reference_generator')
 
 
-class Person:
-    """Somebody at the keyboard: calls services of the running nodes."""
+class Operator:
+    """Calls services of the running nodes."""
 
     def __init__(self):
         rclpy.init(args=[])
-        self._node = Node('person')
+        self._node = Node('operator')
 
     def call(self, kind, name, **request):
         client = self._node.create_client(kind, name)
@@ -50,13 +50,13 @@ class Person:
         ).results
         assert result.successful, result.reason
 
-    def leave(self):
+    def close(self):
         self._node.destroy_node()
         rclpy.try_shutdown()
 
 
 def live_run(fleet, bag, model):
-    """Drive for about twenty seconds, with everything that can happen to a controller."""
+    """Drive for about 20 s with every event of the controller journal."""
     learnt = Controller(ControllerParameters()).law.get_weights()
     learnt['fuzzy.coefficients'] += 0.25
     save_model(model, learnt, {})
@@ -65,42 +65,44 @@ def live_run(fleet, bag, model):
         fleet.start(name, parameters=parameters.get(name))
         fleet.wait_ready(name)
     fleet.wait_for('controller', 'tracking')
-    person = Person()
+    operator = Operator()
     try:
         time.sleep(1.0)
-        # Over DDS a recorder may hear of the reference later than the controller does, and what
-        # it missed is missing: from here on all is known.
-        assert person.call(Trigger, '/controller/reset').success
+        # The recorder may discover a topic later than the controller; a reset makes the replay
+        # independent of earlier messages.
+        assert operator.call(Trigger, '/controller/reset').success
         time.sleep(2.0)
-        person.set('law.gain', 17.0)
+        operator.set('law.gain', 17.0)
         time.sleep(1.0)
-        person.set('linear.x.max_velocity', 0.2)
+        operator.set('linear.x.max_velocity', 0.2)
         time.sleep(1.0)
-        assert person.call(SetBool, '/e_stop', data=True).success  # the robot does not follow
+        assert operator.call(
+            SetBool, '/e_stop', data=True
+        ).success  # the robot does not follow commands
         time.sleep(1.0)
-        assert person.call(SetBool, '/e_stop', data=False).success
+        assert operator.call(SetBool, '/e_stop', data=False).success
         time.sleep(2.0)
-        assert person.call(SetBool, '/controller/enable', data=False).success
+        assert operator.call(SetBool, '/controller/enable', data=False).success
         time.sleep(0.5)
-        assert person.call(SetBool, '/controller/enable', data=True).success
+        assert operator.call(SetBool, '/controller/enable', data=True).success
         time.sleep(1.5)
-        os.kill(fleet.pid('sim_robot'), signal.SIGSTOP)  # the odometry goes silent
+        os.kill(fleet.pid('sim_robot'), signal.SIGSTOP)  # odometry timeout
         time.sleep(0.6)
         os.kill(fleet.pid('sim_robot'), signal.SIGCONT)
         time.sleep(2.0)
-        assert person.call(Trigger, '/controller/reset').success
-        person.set('law.gain', 12.0)
+        assert operator.call(Trigger, '/controller/reset').success
+        operator.set('law.gain', 12.0)
         time.sleep(2.0)
         fleet.check()
     finally:
-        person.leave()
-    # The controller first: all that it has heard is then recorded, too.
+        operator.close()
+    # The controller first: the recorder then has all messages that the controller received.
     codes = fleet.stop_all(('controller', 'reference_generator', 'sim_robot', 'recorder'))
     assert set(codes.values()) == {0}
 
 
 def test_a_live_run_replays_bit_for_bit(fleet, tmp_path):
-    """Stops, starts, a robot that does not follow, silence, live settings and a model included."""
+    """With stops, an unresponsive robot, a timeout, dynamic parameters and a model file."""
     live_run(fleet, tmp_path / 'bag', tmp_path / 'model.npz')
     inputs = load_inputs(tmp_path / 'bag')
     assert inputs.journalled
@@ -109,7 +111,7 @@ def test_a_live_run_replays_bit_for_bit(fleet, tmp_path):
     reset = np.flatnonzero(life.events == Event.RESET)
     assert reset.size == 2
     assert life.exact[reset[0] :].all(), inputs.notes
-    # Only what came before the recorder had found everybody may be missing.
+    # Only messages from before the discovery by the recorder may be missing.
     assert life.exact.all() or any('references' in note for note in inputs.notes), inputs.notes
     again = replay_controller(inputs)
     reasons = set(again.reasons)

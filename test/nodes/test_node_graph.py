@@ -40,12 +40,12 @@ NODE_CLASSES = {
 LATE_DURABILITIES = (DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL)
 
 
-# -- message types that do not fit ----------------------------------------------------------------
+# -- mismatched message types ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize('stamped', [False, True])
 def test_another_type_on_cmd_vel_is_a_warning(stamped, harness):
-    """ROS 2 connects only equal types and says nothing about the others."""
+    """ROS 2 connects only endpoints of equal type and reports nothing about the others."""
     robot = harness.add(SimRobotNode, enable_stamped_cmd_vel=stamped)
     controller = harness.add(ControllerNode, enable_stamped_cmd_vel=stamped)
     harness.add(ReferenceGeneratorNode)
@@ -53,9 +53,9 @@ def test_another_type_on_cmd_vel_is_a_warning(stamped, harness):
         lambda: reason(controller) == 'tracking' and is_ok(robot, 'following commands')
     )
     other = Twist if stamped else TwistStamped
-    foreign_node = harness.foreign_node()
-    foreign_node.create_publisher(other, 'cmd_vel', 10)
-    foreign_node.create_subscription(other, 'cmd_vel', print, 10)
+    foreign = harness.foreign_node()
+    foreign.create_publisher(other, 'cmd_vel', 10)
+    foreign.create_subscription(other, 'cmd_vel', print, 10)
 
     words = f' geometry_msgs/msg/{other.__name__} '
     for node in (robot, controller):
@@ -119,7 +119,7 @@ def test_the_loop_closes_in_simulated_time(harness):
 
 
 def test_tracking_resumes_after_the_clock_jumps_back(harness, tmp_path):
-    """Before the clock is first heard a node's time is 0; that was taken for a grid once."""
+    """Before the first message on /clock the time of a node is 0, which must not start a grid."""
     clock = harness.create_publisher(Clock, '/clock')
     offset_ns = [10**6 * NANOSECONDS]
 
@@ -131,7 +131,7 @@ def test_tracking_resumes_after_the_clock_jumps_back(harness, tmp_path):
     harness.add(RecorderNode, use_sim_time=True, folder=str(tmp_path / 'bag'))
     odom = harness.subscribe(Odometry, 'odom')
     harness.wait_for_subscriber(clock, 4)
-    # The nodes run for a while before the clock does.
+    # The nodes run for a while before the clock starts.
     for node in (controller, reference):
         harness.next_status(node.get_name())
     assert not odom
@@ -158,7 +158,7 @@ def test_tracking_resumes_after_the_clock_jumps_back(harness, tmp_path):
 @pytest.mark.parametrize('topic', ['odom', 'reference'])
 @pytest.mark.parametrize('durability', LATE_DURABILITIES)
 def test_late_subscribers_receive_no_old_messages(topic, durability, harness):
-    """Ten seconds of old odometry would be taken for a robot that moves."""
+    """Old odometry would look like a moving robot."""
     node = harness.add(SimRobotNode if topic == 'odom' else ReferenceGeneratorNode)
     early = harness.subscribe(Odometry, topic)
     harness.spin_until(lambda: len(early) > 50)
@@ -177,7 +177,7 @@ def test_late_subscribers_receive_no_old_messages(topic, durability, harness):
         harness.spin_until(lambda: late, f'{node.get_name()} is not received')
 
 
-# -- names ----------------------------------------------------------------------------------------
+# -- namespaces -----------------------------------------------------------------------------------
 
 
 def test_namespaces_separate_two_robots(harness):

@@ -109,5 +109,5 @@ def test_integers_and_empty_lists_are_accepted_at_start(harness, tmp_path):
 def test_an_unknown_parameter_is_rejected_with_a_suggestion(harness):
     with pytest.raises(ParameterError, match=r'no parameter law.gian; did you mean law.gain\?'):
         harness.add(ControllerNode, law__gian=5.0)
-    # What another node of the package knows may be said to all of them at once.
+    # One parameter file may hold the parameters of several nodes.
     harness.add(ControllerNode, publish_clock=True)

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Real processes over real DDS: they start, loop, survive each other's death, and end with 0."""
+"""The executables as processes over DDS: start, closed loop, killed peers, exit codes."""
 
 import signal
 import time
@@ -41,7 +41,7 @@ def test_each_executable_starts_and_ends_with_code_0(name, number, fleet, tmp_pa
 
 @pytest.mark.parametrize('delay', [0.4, 0.9, 1.6])
 def test_a_signal_during_start_ends_quietly_with_code_0(delay, fleet):
-    """Importing ROS and the compiler takes a while; Ctrl-C must not need luck."""
+    """A signal during the slow imports must not end in a traceback."""
     fleet.start('controller')
     time.sleep(delay)
     assert fleet.stop('controller', signal.SIGINT) == 0
@@ -61,13 +61,13 @@ def test_the_loop_runs_at_100_hz_in_four_processes(fleet, tmp_path):
             assert missing_sample_ratio(stamps, 100.0) < 0.01, topic
         received = recording.series('/cmd_vel', {'v': 'linear.x', 'w': 'angular.z'})
         odometry = recording.series('/odom', {'v': 'twist.twist.linear.x'})
-        # One command per odometry message, once both are heard.
+        # One command per odometry message, once both topics are recorded.
         received = (odometry['received'] >= received['received'][0]) & (
             odometry['received'] <= received['received'][-1]
         )
         assert received['v'].size >= 0.99 * received.sum()
         assert received.sum() >= 0.99 * 800
-        # The last command is a stop, sent when the controller ended; and the robot moved before.
+        # The last command is the stop of the controller's shutdown; the robot moved before.
         assert received['v'][-1] == 0.0
         assert received['w'][-1] == 0.0
         assert np.ptp(odometry['v']) > 0.02
@@ -79,7 +79,7 @@ def test_the_loop_runs_at_100_hz_in_four_processes(fleet, tmp_path):
 
 
 def _speeds(bag, topic='/ground_truth/odom'):
-    """Return stamps (ns) and the larger of |v| and a wheel's share of |omega|, m/s."""
+    """Return stamps (ns) and |v| plus the share of |omega| in a wheel speed, m/s."""
     with open_bag(bag) as recording:
         data = recording.series(topic, {'v': 'twist.twist.linear.x', 'w': 'twist.twist.angular.z'})
         stamps = recording.start_ns + np.round(data['stamp'] * NANOSECONDS).astype(np.int64)
@@ -100,10 +100,10 @@ def test_killed_source_stops_robot_in_half_a_second(victim, fleet, tmp_path):
     killed_ns = time.time_ns()
     fleet.kill(victim)
     time.sleep(2.0)
-    fleet.check()  # the others keep running
+    fleet.check()  # the other processes run on
     _start(fleet, victim, bag)
     restarted_ns = time.time_ns()
-    time.sleep(7.0)  # finding each other over DDS takes up to three seconds
+    time.sleep(7.0)  # discovery takes up to three seconds
     fleet.check()
     assert set(
         fleet.stop_all(('reference_generator', 'controller', 'sim_robot', 'recorder')).values()
@@ -114,7 +114,7 @@ def test_killed_source_stops_robot_in_half_a_second(victim, fleet, tmp_path):
     assert _moving_share(stamps, speed, restarted_ns + 5 * NANOSECONDS, 1.5) > 0.5
     late = (stamps > killed_ns + NANOSECONDS) & (stamps < killed_ns + 2 * NANOSECONDS)
     assert speed[late].max() < 0.01, 'the robot still moved a second after the kill'
-    # Between its stepper motors the body swings by about a millimetre once they have stopped.
+    # The body oscillates by about a millimetre after the stepper motors have stopped.
     stamps, pulses = _speeds(bag, '/odom')
     late = (stamps > killed_ns + NANOSECONDS // 2) & (stamps < killed_ns + 2 * NANOSECONDS)
     assert pulses[late].max() < 0.01, 'the motors still turned half a second after the kill'
@@ -140,7 +140,7 @@ def test_a_killed_robot_zeroes_commands_until_its_restart(fleet, tmp_path):
         commands = recording.series('/cmd_vel', {'v': 'linear.x', 'w': 'angular.z'})
         stamps = recording.start_ns + np.round(commands['received'] * NANOSECONDS).astype(np.int64)
     silent = (stamps > killed_ns + NANOSECONDS // 2) & (stamps < killed_ns + 1.4 * NANOSECONDS)
-    assert silent.sum() >= 5, 'the controller keeps saying stop while it hears nothing'
+    assert silent.sum() >= 5, 'zero commands during the odometry timeout'
     assert not commands['v'][silent].any()
     assert not commands['w'][silent].any()
     stamps, speed = _speeds(bag)

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The replayer as a node over real DDS, and as a process in a terminal."""
+"""The player as a node over DDS and as a process in a terminal."""
 
 import errno
 import fcntl
@@ -48,7 +48,7 @@ WEAK = QosProfile(reliability='best_effort')
 
 
 def write(folder, messages, profiles=None, **more):
-    """Record (topic, seconds, message)."""
+    """Write a bag of (topic, seconds, message)."""
     with BagWriter(folder, metadata_records={}, **more) as bag:
         for topic, seconds, message in messages:
             offered = (profiles or {}).get(topic, QosProfile())
@@ -66,7 +66,7 @@ def texts(count=10, period=0.02, topic='/text', first=0):
 
 
 def payloads(folder):
-    """Return the messages of each topic, as bytes and in order."""
+    """Return the serialized messages of each topic, in order."""
     bag = open_serialized_bag(folder)
     tape, found = MergedReader([bag]), {}
     for message in tape.messages(0):
@@ -84,7 +84,7 @@ def call(harness, name):
     return harness.call(Trigger, f'player/{name}')
 
 
-# -- what is published ----------------------------------------------------------------------------
+# -- messages and QoS -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize('given', [{'allow_commands': True}, {'remap': ['cmd_vel:=velocity']}])
@@ -115,7 +115,7 @@ def test_a_played_and_recorded_bag_has_the_same_bytes(given, harness, tmp_path):
     assert tape.tracks['/map'].profiles[0].durability == 'transient_local'
     assert tape.tracks['/text'].profiles[0].reliability == 'best_effort'
     assert tape.tracks['/odom'].profiles[0].reliability == 'reliable'
-    # What was played in a second took a second.
+    # The recorded interval of one second is published within one second.
     assert (tape.end_ns - tape.start_ns) / SECOND == pytest.approx(0.996, abs=0.2)
     tape.close()
 
@@ -193,9 +193,9 @@ def test_a_type_that_is_not_installed_is_not_played(harness, tmp_path, monkeypat
     [
         ((), '/cmd_vel'),
         ((), '/robot_1/cmd_vel'),
-        # A launch file may have given the robot's topic any name.
+        # A launch file may remap the robot's topic to any name.
         ((), '/steer'),
-        # The name that counts is the one under which it would really come.
+        # The rule applies to the name after remapping.
         (('-r', '/velocity:=/cmd_vel'), '/velocity'),
     ],
 )
@@ -271,7 +271,7 @@ def test_services_pause_play_next_seek_and_set_the_rate(harness, tmp_path):
     assert 'playing' in call(harness, 'toggle_paused').message
     player.set_parameters([Parameter('rate', value=50.0)])
     assert 'rate 50' in call(harness, 'set_rate').message
-    harness.spin_until(lambda: player.exit_requested, 'the end comes soon at that rate')
+    harness.spin_until(lambda: player.exit_requested, 'the end of the bag at that rate')
     harness.spin_until(lambda: len(received) == 503)
     numbers = [int(message.data) for message in received]
     assert numbers == [0, 1, 2, *range(1500, 2000)]
@@ -330,7 +330,7 @@ def test_a_damaged_bag_ends_playback_with_an_error(harness, tmp_path):
     log = harness.subscribe(Log, '/rosout', LATCHED)
     player = play(harness, bag, wait_for_subscribers=0.0)
     harness.spin_until(lambda: player.exit_code == 1)
-    assert diagnostic(player, 'messages') > 30, 'what comes before is played'
+    assert diagnostic(player, 'messages') > 30, 'the messages before the damage are played'
     words = r'playback has ended early: .*bag_0.mcap cannot be read'
     harness.spin_until(lambda: [e.level for e in log if re.match(words, e.msg)] == [40])
 
@@ -363,15 +363,15 @@ PROGRAM = 'import sys; from t3mpc_ros.nodes.common.entry_point import player; sy
 
 
 class Terminal:
-    """The replayer in a pseudo terminal, started like a shell would."""
+    """The player in a pseudo-terminal, started as by a shell."""
 
     def __init__(self, *parameters, program=PROGRAM):
         self.master, self.slave = pty.openpty()
         self.before = termios.tcgetattr(self.slave)
         self.text = ''
-        words = ['--ros-args', *(word for item in parameters for word in ('-p', item))]
+        arguments = ['--ros-args', *(word for item in parameters for word in ('-p', item))]
         self.process = subprocess.Popen(
-            [sys.executable, '-c', program, *words],
+            [sys.executable, '-c', program, *arguments],
             stdin=self.slave,
             stdout=self.slave,
             stderr=self.slave,
@@ -383,7 +383,7 @@ class Terminal:
         fcntl.ioctl(self.slave, termios.TIOCSCTTY, 0)
 
     def until(self, pattern):
-        """Read until the terminal shows something; return it and forget what came before."""
+        """Read until the terminal shows ``pattern``; return the match, discard the text."""
         deadline = time.monotonic() + 15.0
         while not (match := re.search(pattern, self.text)):
             assert time.monotonic() < deadline, f'no {pattern} in {self.text!r}'
@@ -444,7 +444,7 @@ def test_keys_pause_play_next_and_change_the_rate(terminal, tmp_path):
     shell.until(rf' {max(0, place - 3)}\.00 / 99.00 s  x1.1 ')
     shell.press(b' ')
     shell.until(r'playing')
-    shell.press(b'\x03')  # Ctrl-C still is Ctrl-C
+    shell.press(b'\x03')  # Ctrl-C keeps its meaning
     assert shell.wait() == 0
     assert 'messages, timing error 50/99 %' in shell.text
     assert shell.settings() == shell.before
@@ -490,7 +490,7 @@ def test_without_a_terminal_the_player_plays_to_the_end(graph, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert '5 messages, timing error 50/99 %' in done.stderr
-    assert done.stdout == '', 'no line of progress in a log file'
+    assert done.stdout == '', 'no progress line without a terminal'
     refused = subprocess.run(
         [*command, 'bags:=["/nowhere"]'], stdin=subprocess.DEVNULL, capture_output=True, text=True
     )

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge as a node: a real port (a pty), real time, and a scripted dongle behind it."""
+"""The radio bridge node with a pseudo-terminal as its port and a scripted dongle."""
 
 import errno
 import os
@@ -15,7 +15,7 @@ import pytest
 from sensor_msgs.msg import BatteryState, Imu, JointState, Range
 from std_srvs.srv import SetBool, Trigger
 from support.radio_bench import FakeDongle, FakeRobot
-from support.ros_graph import CommandSource, diagnostic, diagnostic_level, twist
+from support.ros_graph import CommandSource, diagnostic, diagnostic_level, reason, twist
 
 from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
 from t3mpc_ros.radio.protocol.authentication import KeyFileError
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.ros
 
 
 class Plug:
-    """A dongle that can be pulled out of its port and put in again."""
+    """A dongle that can be unplugged and plugged in again."""
 
     def __init__(self, path, key=b''):
         self.path = str(path)
@@ -62,7 +62,7 @@ class Plug:
             try:
                 data = os.read(self._master, 4096)
             except OSError as error:
-                if error.errno != errno.EIO:  # nobody has the other end open
+                if error.errno != errno.EIO:  # the other end is closed
                     raise
                 time.sleep(0.005)
                 continue
@@ -78,17 +78,15 @@ def plug(tmp_path):
         made.pull_out()
 
 
-def says(node):
-    return node.produce_diagnostics()[1]
-
-
 def driving(harness, plug, linear=0.1):
-    """Return the node, the driver and what is heard on odom, once the robot drives."""
+    """Return the node, the command source and the received odometry, once the robot drives."""
     node = harness.add(RadioBridgeNode, port=plug.path)
     odom = harness.subscribe(Odometry, 'odom')
     source = CommandSource(harness)
     source.message = twist(linear)
-    harness.spin_until(lambda: odom and odom[-1].twist.twist.linear.x > 0.9 * linear, 'it drives')
+    harness.spin_until(
+        lambda: odom and odom[-1].twist.twist.linear.x > 0.9 * linear, 'the robot drives'
+    )
     return node, source, odom
 
 
@@ -105,13 +103,13 @@ def test_topics_are_those_of_sim_robot_without_truth(harness, plug):
     node, _, odom = driving(harness, plug)
     harness.spin_until(lambda: all(received.values()), 'every topic')
     level, text, values = node.produce_diagnostics()
-    if 'round trips up to' not in text:  # as on a machine that has other things to do
+    if 'round trips up to' not in text:  # on a busy machine
         assert (level, text) == (DiagnosticStatus.OK, 'following commands, unauthenticated')
     assert values['link'] == 'running'
     assert values['authenticated'] is False
     stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in odom]
     assert stamps == sorted(set(stamps))
-    assert abs(stamps[-1] - node.now_ns()) < 2e9  # ROS's clock, not the link's
+    assert abs(stamps[-1] - node.now_ns()) < 2e9  # the clock of the node, not that of the link
     assert odom[-1].pose.pose.position.x > odom[0].pose.pose.position.x
     topics = {name for name, _ in node.get_publisher_names_and_types_by_node('radio_bridge', '/')}
     assert {f'/range/{name}' for name in RANGE_SENSORS} <= topics
@@ -121,7 +119,9 @@ def test_topics_are_those_of_sim_robot_without_truth(harness, plug):
 def test_a_missing_dongle_is_reported_and_used_once_plugged_in(harness, plug):
     plug.pull_out()
     node = harness.add(RadioBridgeNode, port=plug.path)
-    harness.spin_until(lambda: 'is the dongle plugged in?' in says(node), 'the reason')
+    harness.spin_until(
+        lambda: 'is the dongle plugged in?' in reason(node), 'the reason in the diagnostics'
+    )
     assert diagnostic_level(node) == DiagnosticStatus.ERROR
     plug.put_in()
     harness.spin_until(lambda: diagnostic(node, 'link') == 'running', 'the link')
@@ -130,26 +130,30 @@ def test_a_missing_dongle_is_reported_and_used_once_plugged_in(harness, plug):
 def test_a_dongle_unplugged_while_driving_is_found_again(harness, plug):
     node, _, odom = driving(harness, plug)
     plug.pull_out()
-    harness.spin_until(lambda: 'is the dongle plugged in?' in says(node), 'the reason')
+    harness.spin_until(
+        lambda: 'is the dongle plugged in?' in reason(node), 'the reason in the diagnostics'
+    )
     plug.put_in()
     before = len(odom)
     harness.spin_until(lambda: len(odom) > before + 20, 'odometry')
-    harness.spin_until(lambda: odom[-1].twist.twist.linear.x > 0.09, 'it drives again')
+    harness.spin_until(lambda: odom[-1].twist.twist.linear.x > 0.09, 'the robot drives again')
     assert diagnostic(node, 'port_failures') == 1
 
 
 def test_timeout_and_e_stop_stop_the_robot(harness, plug):
     node, source, _ = driving(harness, plug)
     source.message = None
-    harness.spin_until(lambda: says(node).startswith('no command for 0.25 s'), 'the reason')
+    harness.spin_until(
+        lambda: reason(node).startswith('no command for 0.25 s'), 'the reason in the diagnostics'
+    )
     harness.spin_until(lambda: plug.robot.speeds == (0.0, 0.0), 'standstill')
     assert harness.call(SetBool, 'e_stop', data=True).success
     source.message = twist(0.1)
     harness.spin_until(lambda: plug.robot.estop, 'the stop')
-    assert 'emergency stop: requested by service e_stop' in says(node)
+    assert 'emergency stop: requested by service e_stop' in reason(node)
     assert plug.robot.speeds == (0.0, 0.0)
     assert harness.call(SetBool, 'e_stop', data=False).success
-    harness.spin_until(lambda: max(plug.robot.speeds) > 2.0, 'it drives again')
+    harness.spin_until(lambda: max(plug.robot.speeds) > 2.0, 'the robot drives again')
 
 
 def test_odometry_is_reset_at_rest_only(harness, plug):
@@ -188,8 +192,8 @@ def test_commands_are_signed_with_the_key(harness, tmp_path):
         node = harness.add(RadioBridgeNode, port=plug.path, key_file=str(path))
         source = CommandSource(harness)
         source.message = twist(0.1)
-        harness.spin_until(lambda: max(plug.robot.speeds) > 2.0, 'it drives')
-        harness.spin_until(lambda: says(node) == 'following commands', 'all is well')
+        harness.spin_until(lambda: max(plug.robot.speeds) > 2.0, 'the robot drives')
+        harness.spin_until(lambda: reason(node) == 'following commands', 'status OK')
         assert diagnostic(node, 'authenticated') is True
     finally:
         plug.pull_out()

@@ -14,7 +14,7 @@ import threading
 
 from nav_msgs.msg import Odometry
 import pytest
-from support.ros_graph import CommandSource, twist
+from support.ros_graph import CommandSource, reason, twist
 
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters, StopTimeMonitor
 from t3mpc_ros.emulator.pty_port import PtyPort, serve
@@ -26,13 +26,13 @@ from t3mpc_ros.radio.protocol.framing import encode_frame
 pytestmark = pytest.mark.ros
 
 REST = 0.45
-"""s after the last command that was followed"""
+"""Maximum time to standstill after the last executed command, s."""
 FULL = 0.35
-"""m/s: both wheels at their largest speed, 10 rad/s"""
+"""Speed with both wheels at their maximum of 10 rad/s, m/s."""
 
 
-class Served:
-    """An emulator behind a pty, on the wall clock, in a thread; its numbers are at hand."""
+class ServedEmulator:
+    """An emulator behind a pseudo-terminal, in a thread on the wall clock."""
 
     def __init__(self, path, **flat):
         self.path = str(path)
@@ -84,7 +84,7 @@ def served(tmp_path):
     made = []
 
     def serve_one(**flat):
-        made.append(Served(tmp_path / 'dongle', **flat))
+        made.append(ServedEmulator(tmp_path / 'dongle', **flat))
         return made[-1]
 
     yield serve_one
@@ -92,18 +92,14 @@ def served(tmp_path):
         one.close()
 
 
-def says(node):
-    return node.produce_diagnostics()[1]
-
-
-def obeyed(node):
-    """Whether nothing hinders the robot; a busy machine may still be worth a warning."""
+def follows_commands(node):
+    """Return whether the robot follows commands; a busy machine may add a warning."""
     return node._robot.reason(node.steady_ns()) == ''
 
 
 @pytest.mark.slow
 def test_a_killed_bridge_leaves_the_wheels_at_rest(harness, fleet, tmp_path):
-    """All of them processes: SIGKILL, from full speed; the emulator says how long it took."""
+    """SIGKILL at full speed; the emulator measures the time to standstill."""
     path = tmp_path / 'dongle'
     fleet.start('emulator', 'emulator', '--link', str(path), program='t3mpc')
     fleet.wait_for('emulator', 'stop with Ctrl-C', 120.0)
@@ -133,26 +129,31 @@ def test_a_replugged_dongle_drives_within_a_second(harness, served):
     node = harness.add(RadioBridgeNode, port=board.path)
     source = CommandSource(harness)
     source.message = twist(0.1)
-    harness.spin_until(lambda: board.followed and board.followed[-1][1].left > 2000, 'it drives')
-    board.inject('close_port', 0.7)
-    harness.spin_until(lambda: 'is the dongle plugged in?' in says(node), 'the reason')
     harness.spin_until(
-        lambda: board.back_ns and board.followed[-1][0] > board.back_ns, 'it goes on'
+        lambda: board.followed and board.followed[-1][1].left > 2000, 'the robot drives'
+    )
+    board.inject('close_port', 0.7)
+    harness.spin_until(
+        lambda: 'is the dongle plugged in?' in reason(node), 'the reason in the diagnostics'
+    )
+    harness.spin_until(
+        lambda: board.back_ns and board.followed[-1][0] > board.back_ns,
+        'commands after the reconnection',
     )
     first = next(now_ns for now_ns, _ in board.followed if now_ns > board.back_ns)
     took = (first - board.back_ns) / 1e9
     print(f'\nfollows commands {took:.2f} s after the port is back')
     assert took <= 2.0  # 0.2 s in virtual time: see test_firmware_avr_faults.py
-    harness.spin_until(lambda: obeyed(node), 'all is well')
+    harness.spin_until(lambda: follows_commands(node), 'status OK')
 
 
 def test_a_second_reader_of_the_port_causes_no_wrong_command(harness, served):
-    """It ignores the lock, steals answers, writes noise and frames of a session of its own."""
+    """The other process ignores the lock, reads responses, writes noise and frames of its own."""
     board = served()
     node = harness.add(RadioBridgeNode, port=board.path)
     source = CommandSource(harness)
     source.message = twist(0.1)
-    harness.spin_until(lambda: len(board.followed) > 20, 'it drives')
+    harness.spin_until(lambda: len(board.followed) > 20, 'the robot drives')
     foreign_node = os.open(board.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     dice = random.Random(4)
     count = len(board.followed)
@@ -161,17 +162,17 @@ def test_a_second_reader_of_the_port_causes_no_wrong_command(harness, served):
             1 + dice.randrange(255), dice.randrange(256), 1, 20, -9000, 9000, dice.randrange(2**32)
         )
         if foreign.session == board.emulator.board.session:
-            continue  # one in 255 is the session of the bridge: only a key keeps that out
+            continue  # one in 255 is the session of the bridge, which only a key protects
         poll = encode(Poll(foreign.session, 0, 0))
         frame = encode_frame(encode(Transmit(dice.randrange(256), 6, encode(foreign), poll)))
         os.write(foreign_node, dice.choice((frame, dice.randbytes(20), frame[:9])))
         with suppress(BlockingIOError):
             os.read(foreign_node, 64)
         end = node.steady_ns() + 30_000_000
-        harness.spin_until(lambda end=end: node.steady_ns() > end, 'a while')
-    print(f'\nwhile it wrote: {says(node)}, {len(board.followed) - count} commands followed')
+        harness.spin_until(lambda end=end: node.steady_ns() > end, 'the waiting time')
+    print(f'\nwhile it wrote: {reason(node)}, {len(board.followed) - count} commands followed')
     os.close(foreign_node)
-    harness.spin_until(lambda: obeyed(node), 'it is got over')
+    harness.spin_until(lambda: follows_commands(node), 'status OK afterwards')
     count = len(board.followed)
     harness.spin_until(lambda: len(board.followed) > count + 20, 'commands')
     for _, command in board.followed:

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""What the recorder selects, drops, attaches and hides, and what it does at a fault."""
+"""Recorder node: load, selection, snapshots, metadata and attachments."""
 
 import os
 import shutil
@@ -64,7 +64,7 @@ def test_reception_is_stamped_on_arrival_not_on_taking(harness, tmp_path):
     for number in range(5):
         sent.append(time.time_ns())
         text.publish(String(data=str(number)))
-        time.sleep(0.1)  # nobody spins
+        time.sleep(0.1)  # no executor spins
     taken = time.time_ns()
     harness.spin_until(lambda: values(recorder)['messages'] == 5)
     harness.remove(recorder)
@@ -111,13 +111,13 @@ def test_messages_beyond_the_queue_are_dropped_and_counted(harness, tmp_path, mo
 
 
 def test_messages_replaced_in_the_dds_queue_are_counted(harness, tmp_path):
-    """A full KEEP_LAST queue replaces its oldest samples, which DDS does not call lost."""
+    """A full KEEP_LAST queue replaces its oldest samples, which DDS does not count as lost."""
     recorder = record(harness, tmp_path, 'text', chunk_time=0.05)
     text = harness.create_publisher(String, 'text', DEEP)
     harness.wait_for_subscriber(text)
     text.publish(String(data='first'))
     harness.spin_until(lambda: values(recorder)['messages'] == 1)
-    for i in range(1500):  # nobody spins, and the queue holds a thousand
+    for i in range(1500):  # no executor spins; the queue holds 1000 messages
         text.publish(String(data=str(i)))
     assert text.wait_for_all_acked(Duration(seconds=10))
     harness.spin_until(lambda: values(recorder)['messages'] == 1001)
@@ -136,11 +136,13 @@ def test_expressions_and_types_select_in_the_graph(harness, tmp_path):
     recorder = record(
         harness, tmp_path, regex='/cam_[0-9]', exclude='/.*secret', types=['std_msgs/msg/Int32']
     )
-    says = {name: harness.create_publisher(String, name) for name in ('cam_1', 'cam_x', 'other')}
+    texts_by_topic = {
+        name: harness.create_publisher(String, name) for name in ('cam_1', 'cam_x', 'other')
+    }
     counts = {name: harness.create_publisher(Int32, name) for name in ('count', 'secret')}
     for name in ('cam_1', 'count'):
-        harness.wait_for_subscriber((says | counts)[name])
-    for publisher in says.values():
+        harness.wait_for_subscriber((texts_by_topic | counts)[name])
+    for publisher in texts_by_topic.values():
         publisher.publish(String(data='x'))
     for publisher in counts.values():
         publisher.publish(Int32(data=1))
@@ -156,7 +158,7 @@ def test_an_invalid_regular_expression_is_rejected(harness, tmp_path):
 
 
 def test_an_expected_latched_topic_is_recorded_from_its_start(harness, tmp_path):
-    """The recorder subscribed beforehand, as volatile, and so missed what was latched by then."""
+    """The early subscription is transient local, so it receives earlier messages."""
     journal = harness.create_publisher(Int64MultiArray, 'controller/journal', LATCHED)
     for number in range(5):
         journal.publish(Int64MultiArray(data=[number]))
@@ -212,7 +214,7 @@ def test_a_fault_starts_one_snapshot_with_its_reason(harness, tmp_path):
     text = harness.create_publisher(String, 'text')
     reports = harness.create_publisher(DiagnosticArray, '/diagnostics')
     harness.wait_for_subscriber(text)
-    harness.wait_for_subscriber(reports, 2)  # the probe listens, too
+    harness.wait_for_subscriber(reports, 2)  # the probe subscribes, too
 
     def report(level, reason, name='sim_robot'):
         status = DiagnosticStatus(level=level, name=name, message=reason)
@@ -226,7 +228,7 @@ def test_a_fault_starts_one_snapshot_with_its_reason(harness, tmp_path):
         report(ERROR, 'e-stop latched')
     harness.spin_until(lambda: values(recorder)['snapshots'] == 1)
     report(OK, 'following commands')
-    report(ERROR, 'e-stop latched')  # at once again: too soon
+    report(ERROR, 'e-stop latched')  # again within snapshot_pause
     harness.spin_until(lambda: any('snapshot_pause' in entry.msg for entry in log))
     harness.remove(recorder)
     (folder,) = snapshots(tmp_path)
@@ -249,7 +251,7 @@ def test_an_e_stop_of_the_own_robot_starts_a_snapshot(harness, tmp_path):
     harness.call(SetBool, 'b/e_stop', data=True)
     harness.spin_until(lambda: harness.statuses('b/sim_robot')[-1].level == ERROR)
     assert not recorder._snapshots.busy
-    assert values(recorder)['snapshots'] == 0, 'another robot is no concern of this recorder'
+    assert values(recorder)['snapshots'] == 0, 'only the own robot starts a snapshot'
     harness.call(SetBool, 'a/e_stop', data=True)
     harness.spin_until(lambda: values(recorder)['snapshots'] == 1)
     harness.remove(recorder)
@@ -268,7 +270,7 @@ def test_a_stop_of_the_controller_starts_a_snapshot(harness, tmp_path):
     harness.add(ReferenceGeneratorNode)
     controller = harness.add(ControllerNode)
     harness.spin_until(lambda: any(s.level == OK for s in harness.statuses('controller')))
-    assert values(recorder)['snapshots'] == 0, 'nothing was wrong while they found each other'
+    assert values(recorder)['snapshots'] == 0, 'no fault during discovery'
     assert harness.call(SetBool, 'controller/enable', data=False).success
     harness.spin_until(lambda: values(recorder)['snapshots'] == 1)
     stopped = reason(controller)
@@ -322,7 +324,7 @@ def test_a_failed_snapshot_is_reported_and_recording_continues(harness, tmp_path
     assert texts(tmp_path) == ['one', 'two']
 
 
-# -- where the numbers come from ------------------------------------------------------------------
+# -- metadata and attachments ---------------------------------------------------------------------
 
 
 def test_model_files_are_attached_to_every_file(harness, tmp_path):
@@ -331,7 +333,7 @@ def test_model_files_are_attached_to_every_file(harness, tmp_path):
     save_model(model, first._controller.law.get_weights(), first.parameters.to_dict())
     harness.remove(first)
     shutil.copy(model, output)
-    os.utime(output, (1, 1))  # of a run before
+    os.utime(output, (1, 1))  # saved by an earlier run
     world_map = tmp_path / 'room.yaml'
     world_map.write_text('walls: []')
     bag = tmp_path / 'bag'
@@ -352,7 +354,7 @@ def test_model_files_are_attached_to_every_file(harness, tmp_path):
 
 
 def test_parameters_of_a_restarted_node_are_recorded_again(harness, tmp_path):
-    """The bag once kept the settings of the first of two controllers."""
+    """A restarted node may have other parameters."""
     recorder = record(harness, tmp_path, 'odom')
     robot = harness.add(SimRobotNode, seed=3)
     harness.spin_until(lambda: recorder._metadata.records.get('sim_robot', {}).get('seed') == '3')
@@ -366,8 +368,8 @@ def test_parameters_of_a_restarted_node_are_recorded_again(harness, tmp_path):
         assert recording.metadata_records['sim_robot']['seed'] == '4'
 
 
-def everything(folder):
-    """Return all bytes that a reader of the bag could get at: raw, unpacked, details."""
+def all_bytes(folder):
+    """Return all bytes of a bag that a reader can access: raw, decompressed, metadata."""
     found = [path.read_bytes() for path in folder.rglob('*') if path.is_file()]
     for path in folder.rglob('*.mcap'):
         with path.open('rb') as file:
@@ -405,8 +407,8 @@ def test_a_bag_holds_the_fingerprint_of_a_secret_seed_only(harness, tmp_path):
     assert matches_fingerprint(first, seeds[0])
     assert matches_fingerprint(text, seeds[1])
     assert not matches_fingerprint(text, seeds[0])
-    content = everything(tmp_path)
-    assert text.encode() in content, 'or the search would find nothing whatever there was'
+    content = all_bytes(tmp_path)
+    assert text.encode() in content, 'the search finds text that is present'
     for seed in seeds:
         low = struct.pack('<Q', seed % 2**64), struct.pack('>Q', seed % 2**64)
         high = struct.pack('<Q', seed >> 64), struct.pack('>Q', seed >> 64)

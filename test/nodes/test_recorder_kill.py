@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Recorders killed with -9 at random moments of a 100 Hz run: what recovery brings back."""
+"""Recovery of the bags of recorders killed with SIGKILL at random times."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -25,23 +25,23 @@ pytestmark = [pytest.mark.ros, pytest.mark.slow]
 RATE = 100.0
 SLOTS, TURNS = 5, 4
 ALLOWED = 1.0
-"""Seconds before the kill that may be lost."""
+"""Time before the kill that may be lost, s."""
 
 
 class Source:
-    """Publishes numbered odometry at 100 Hz from a thread of its own, and keeps what it sent."""
+    """Publishes numbered odometry at 100 Hz from a thread, and stores the sent messages."""
 
     def __init__(self):
         self._node = rclpy.create_node('source')
         self._publisher = self._node.create_publisher(Odometry, 'odom', qos.STREAM)
         self._stop = threading.Event()
         self.sent = []
-        """(time of sending in ns, serialised message)"""
+        """(time of publication in ns, serialized message)"""
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
-    def is_heard_in(self, namespace):
-        """Return whether a node of this namespace listens."""
+    def has_subscriber_in(self, namespace):
+        """Return whether a node of this namespace subscribes."""
         found = self._node.get_subscriptions_info_by_topic('/odom')
         return any(info.node_namespace == namespace for info in found)
 
@@ -73,21 +73,21 @@ def source(ros):
 def wait_until(met, seconds=30.0):
     deadline = time.monotonic() + seconds
     while not met():
-        assert time.monotonic() < deadline, 'it did not come about in time'
+        assert time.monotonic() < deadline, 'timeout'
         time.sleep(0.02)
 
 
 @dataclass
-class Killed:
-    """A recorder that was killed: its bag, and when it was listening and when it died, in ns."""
+class KilledRecorder:
+    """A killed recorder: its bag, and the times of subscription and kill, ns."""
 
     bag: Path
-    heard_ns: int
+    subscribed_ns: int
     killed_ns: int
 
 
-def kill_one_after_the_other(root, slot, source):
-    """Return what came of some recorders, each started, let run for a random time, and killed."""
+def kill_in_sequence(root, slot, source):
+    """Start recorders one after the other, kill each after a random time; return them."""
     rng = random.Random(100 + slot)
     result = []
     for turn in range(TURNS):
@@ -101,20 +101,20 @@ def kill_one_after_the_other(root, slot, source):
                 parameters={'folder': str(bag), 'topics': ['/odom']},
             )
             fleet.wait_ready('recorder')
-            wait_until(lambda name=name: source.is_heard_in(f'/{name}'))
-            heard_ns = time.time_ns()
+            wait_until(lambda name=name: source.has_subscriber_in(f'/{name}'))
+            subscribed_ns = time.time_ns()
             time.sleep(rng.uniform(2.0, 5.0))
             killed_ns = time.time_ns()
         finally:
             fleet.kill('recorder')
-        result.append(Killed(bag, heard_ns, killed_ns))
+        result.append(KilledRecorder(bag, subscribed_ns, killed_ns))
     return result
 
 
 def kept_after_kill(folder: Path, output: Path):
-    """Return the odometry messages that recovery finds in a bag, as they were serialised."""
+    """Return the serialized odometry messages that recovery finds in a bag."""
     result = recover_bag(folder, output)
-    assert not result.clean  # a killed recorder's file has no end
+    assert not result.clean  # the file of a killed recorder has no footer
     with open_bag(output) as recording:
         assert recording.message_count == result.kept
         (odom,) = (item for item in recording._reader.connections if item.topic == '/odom')
@@ -123,7 +123,7 @@ def kept_after_kill(folder: Path, output: Path):
 
 def test_20_kills_lose_at_most_one_second_each(source, tmp_path):
     with ThreadPoolExecutor(SLOTS) as pool:
-        slots = [pool.submit(kill_one_after_the_other, tmp_path, i, source) for i in range(SLOTS)]
+        slots = [pool.submit(kill_in_sequence, tmp_path, i, source) for i in range(SLOTS)]
         kills = [one for slot in slots for one in slot.result()]
     sent = list(source.sent)
     losses = []
@@ -132,9 +132,9 @@ def test_20_kills_lose_at_most_one_second_each(source, tmp_path):
         assert kept, one.bag
         first = next(n for n, (_, data) in enumerate(sent) if data == kept[0])
         last = first + len(kept)
-        # In order, without a hole, byte for byte, and nothing that was not sent.
+        # In order, without a gap, and byte for byte equal.
         assert kept == [data for _, data in sent[first:last]]
-        assert sent[first][0] < one.heard_ns + NANOSECONDS
+        assert sent[first][0] < one.subscribed_ns + NANOSECONDS
         lost_ns = one.killed_ns - sent[last][0] if last < len(sent) else 0
         losses.append(max(0, lost_ns) / NANOSECONDS)
     losses.sort()

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder as a process: under load, killed, asked to end, and on a disk that is full."""
+"""The recorder as a process: load, SIGKILL, signals, and a file size limit."""
 
 import random
 import resource
@@ -25,7 +25,7 @@ DEEP = QoSProfile(depth=5000)
 
 
 def test_two_thousand_messages_a_second_are_all_recorded(fleet, tmp_path):
-    """``recorder_bench.py`` runs this for a minute and prints what it costs."""
+    """``recorder_bench.py`` runs this for a minute and prints the processor load."""
     found = run(tmp_path / 'bag', fleet, seconds=4.0)
     assert found.sent == 8000
     assert found.recorded == found.sent
@@ -34,25 +34,25 @@ def test_two_thousand_messages_a_second_are_all_recorded(fleet, tmp_path):
         assert recording.metadata_records['losses'] == {'dropped': '0', 'lost': '0'}
 
 
-class Talker:
+class NumberPublisher:
     """Publishes numbers from this process to a recorder in another one."""
 
     def __init__(self, topic='number'):
-        self._node = Node('talker')
+        self._node = Node('publisher')
         self._publisher = self._node.create_publisher(Float64MultiArray, topic, DEEP)
         self._random = random.Random(1)
         self.ballast = 0
-        """Random numbers behind the one that counts: nothing compresses those."""
+        """Incompressible random numbers appended to each message."""
         self.sent = []
-        """When each number was published, nanoseconds since 1970."""
+        """Time of publication of each number, ns since 1970."""
 
-    def find(self, seconds=20.0):
+    def wait_for_recorder(self, seconds=20.0):
         deadline = time.monotonic() + seconds
         while not self._publisher.get_subscription_count():
             assert time.monotonic() < deadline, 'no recorder'
             time.sleep(0.05)
 
-    def say(self, count, period=0.01):
+    def publish(self, count, period=0.01):
         for _ in range(count):
             self.sent.append(time.time_ns())
             number = float(len(self.sent) - 1)
@@ -70,8 +70,8 @@ class Talker:
 
 
 @pytest.fixture
-def talker(ros):
-    made = Talker()
+def publisher(ros):
+    made = NumberPublisher()
     yield made
     made.close()
 
@@ -87,24 +87,24 @@ def numbers(path):
 
 
 @pytest.mark.parametrize('moment', [1, 2])
-def test_a_killed_recorder_loses_at_most_one_second(moment, fleet, talker, tmp_path):
+def test_a_killed_recorder_loses_at_most_one_second(moment, fleet, publisher, tmp_path):
     start(fleet, tmp_path / 'bag')
-    talker.find()
-    talker.say(150 + random.Random(moment).randrange(100))
+    publisher.wait_for_recorder()
+    publisher.publish(150 + random.Random(moment).randrange(100))
     killed = time.time_ns()
     fleet.kill('recorder')
     (path,) = (tmp_path / 'bag').glob('*.mcap')
     finalize_file(path)
     kept = numbers(path)
-    due = [i for i, sent in enumerate(talker.sent) if sent <= killed - NANOSECONDS]
+    due = [i for i, sent in enumerate(publisher.sent) if sent <= killed - NANOSECONDS]
     assert kept[: len(due)] == due
     assert kept == list(range(len(kept)))
 
 
-def test_a_recorder_killed_after_a_pause_has_lost_nothing(fleet, talker, tmp_path):
+def test_a_recorder_killed_after_a_pause_has_lost_nothing(fleet, publisher, tmp_path):
     start(fleet, tmp_path / 'bag')
-    talker.find()
-    talker.say(20)
+    publisher.wait_for_recorder()
+    publisher.publish(20)
     time.sleep(1.0)
     fleet.kill('recorder')
     (path,) = (tmp_path / 'bag').glob('*.mcap')
@@ -112,29 +112,29 @@ def test_a_recorder_killed_after_a_pause_has_lost_nothing(fleet, talker, tmp_pat
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_messages_before_a_signal_are_in_the_bag(number, fleet, talker, tmp_path):
+def test_messages_before_a_signal_are_in_the_bag(number, fleet, publisher, tmp_path):
     start(fleet, tmp_path / 'bag')
-    talker.find()
-    talker.say(900, period=0.0)
-    assert talker.acknowledged()
+    publisher.wait_for_recorder()
+    publisher.publish(900, period=0.0)
+    assert publisher.acknowledged()
     assert fleet.stop('recorder', number) == 0
     assert numbers(tmp_path / 'bag') == list(range(900))
 
 
-def test_a_file_size_limit_stops_recording_readably(fleet, talker, tmp_path):
+def test_a_file_size_limit_stops_recording_readably(fleet, publisher, tmp_path):
     start(fleet, tmp_path / 'bag', chunk_time=0.05)
-    talker.find()
-    talker.ballast = 500
-    # Beyond what ending a file on a full disk leaves free.
+    publisher.wait_for_recorder()
+    publisher.ballast = 500
+    # More than the reserve for the end of a file on a full disk.
     resource.prlimit(fleet.pid('recorder'), resource.RLIMIT_FSIZE, (400_000, 400_000))
 
-    def say_until_it_ends():
-        while len(talker.sent) < 3000:
-            talker.say(1)
+    def publish_until_the_end():
+        while len(publisher.sent) < 3000:
+            publisher.publish(1)
             fleet.check()
 
     with pytest.raises(ProcessError, match='ended with code 1'):
-        say_until_it_ends()
+        publish_until_the_end()
     status = fleet.log('recorder').read_text()
     assert status.count('recording has stopped') == 1
     for words in ('File too large', 'messages are kept', 'restart the recorder'):

@@ -53,7 +53,7 @@ def test_a_type_that_is_not_installed_is_a_warning(harness, tmp_path, monkeypatc
     text.publish(String(data='hello'))
     _count(harness, recorder, 1)
     warned = [entry for entry in log if '/marker' in entry.msg]
-    assert len(warned) == 1, 'said once'
+    assert len(warned) == 1, 'one warning'
     assert warned[0].level == 30
     assert diagnostic_level(recorder) == OK
     harness.remove(recorder)
@@ -62,7 +62,7 @@ def test_a_type_that_is_not_installed_is_a_warning(harness, tmp_path, monkeypatc
 
 
 def test_best_effort_publishers_are_recorded(harness, tmp_path):
-    """The recorder waits for odometry as reliable, and once did not hear a robot that is not."""
+    """The early subscription to odometry is reliable and must adapt to a best-effort robot."""
     recorder = _recorder(harness, tmp_path, 'odom', 'other')
     weak = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
     publishers = (
@@ -103,7 +103,7 @@ def test_a_second_best_effort_publisher_is_recorded(harness, tmp_path):
 
 
 def test_stamped_commands_are_recorded_with_their_type(harness, tmp_path):
-    """The recorder expects a Twist on cmd_vel, and once heard nothing when it was stamped."""
+    """The early subscription to cmd_vel has type Twist and must adapt to TwistStamped."""
     recorder = _recorder(harness, tmp_path, 'cmd_vel')
     commands = harness.foreign_node().create_publisher(TwistStamped, 'cmd_vel', 10)
     harness.wait_for_subscriber(commands)
@@ -187,7 +187,7 @@ def test_a_full_disk_ends_the_recording_only(harness, tmp_path, monkeypatch):
     assert 'No space left on device' in status.message
     assert [entry.level for entry in log if 'No space left' in entry.msg] == [40]
     response = harness.call(Trigger, 'recorder/split')
-    assert not response.success, 'a recording that has failed cannot go on'
+    assert not response.success, 'a failed recording cannot be split'
     assert 'No space left' in response.message
     count = len(odom)
     harness.spin_until(lambda: len(odom) > count + 20)
@@ -196,13 +196,13 @@ def test_a_full_disk_ends_the_recording_only(harness, tmp_path, monkeypatch):
 
 
 def test_parameters_are_recorded_by_namespace(harness, tmp_path):
-    """Two controllers share a name in two namespaces; one's gain once stood for the other's."""
+    """Two controllers have the same name in two namespaces."""
     recorder = _recorder(harness, tmp_path, 'odom', namespace='a')
     harness.add(ControllerNode, namespace='a', law__gain=3.0)
     harness.add(ControllerNode, namespace='b', law__gain=4.0)
     harness.spin_until(
         lambda: len(recorder._metadata.records) >= 4
-    )  # provenance, itself, two controllers
+    )  # provenance, recorder, two controllers
     harness.remove(recorder)
     with open_bag(tmp_path) as recording:
         assert recording.metadata_records['controller']['law.gain'] == '3.0'

@@ -28,7 +28,7 @@ def test_the_reference_has_an_exact_grid_ahead_by_the_lead(harness):
     stamps = np.array([stamp(message) for _, message in received])
     assert on_grid([message for _, message in received], 100)
     ahead = (stamps - np.array([now for now, _ in received])) / NANOSECONDS
-    # A sample is never said before it is due, and soon afterwards if the machine is not busy.
+    # A sample is published when it is due, or late on a busy machine, but never early.
     assert ahead.max() <= 0.5
     assert ahead.max() > 0.4
     newest = received[-1][1]
@@ -40,7 +40,7 @@ def test_late_subscribers_receive_signals_and_path(harness):
     reference = harness.add(ReferenceGeneratorNode)
     harness.spin_until(lambda: diagnostic(reference, 'mode') != 'none')
     mode = diagnostic(reference, 'mode')
-    harness.next_status('reference_generator')  # the path follows once a second
+    harness.next_status('reference_generator')  # the path is published at 1 Hz
     modes = reference.parameters.switching.modes
     signals = harness.subscribe(Int32MultiArray, 'reference/signals', LATCHED)
     path = harness.subscribe(Path, 'reference/path', LATCHED)
@@ -59,7 +59,7 @@ def test_a_paused_reference_stands_still_and_resumes(harness):
     harness.spin_until(lambda: speed(received[-1]) == 0.0)
     held = received[-1].pose.pose
     count = len(received)
-    harness.spin_until(lambda: len(received) > count + 10, 'it goes on saying where to stand')
+    harness.spin_until(lambda: len(received) > count + 10, 'the paused reference is published')
     assert all(speed(message) == 0.0 for message in received[count:])
     assert received[-1].pose.pose == held
     assert reason(reference) == 'paused'
@@ -84,7 +84,7 @@ def test_one_seed_gives_one_reference(harness):
 
 
 def test_reseed_changes_the_reference_and_hides_the_seed(harness):
-    """The answer once held the new seed: whoever knows it knows the patrol."""
+    """The seed determines the path of the robot."""
     seed = 918_273_645
     log = harness.subscribe(Log, '/rosout', LATCHED)
     reference = harness.add(ReferenceGeneratorNode, seed=seed, ramp=1.0)
@@ -95,12 +95,12 @@ def test_reseed_changes_the_reference_and_hides_the_seed(harness):
     count = len(received)
     harness.spin_until(lambda: len(received) > count + 100)
     status = harness.next_status('reference_generator')
-    telling = [response.message, str(status), *(entry.msg for entry in log)]
-    for text in telling:
+    texts = [response.message, str(status), *(entry.msg for entry in log)]
+    for text in texts:
         assert not any(character.isdigit() for character in str(response.message))
         for number in range(seed - 2, seed + 3):
             assert str(number) not in text
-    # It grows from zero again, so a robot at rest can follow.
+    # The new reference starts from zero, so that a robot at rest can follow.
     assert min(speed(message) for message in received[140:]) < 1e-3
     assert on_grid(received, 100)
     assert reference.get_parameter('seed').value == seed

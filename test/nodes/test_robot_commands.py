@@ -35,21 +35,21 @@ FIELDS = [(part, axis) for part in ('linear', 'angular') for axis in 'xyz']
 
 
 def test_a_non_finite_command_never_moves_the_robot(harness):
-    """The number meant may have been anything; fields a wheeled robot does not use count too."""
+    """Fields that have no effect on a differential drive count, too."""
     robot = harness.add(SimRobotNode)
     odom = harness.subscribe(Odometry, 'odom')
     commands = harness.create_publisher(Twist, 'cmd_vel')
     harness.wait_for_subscriber(commands)
-    refused = 0
+    rejected = 0
     for part, axis in FIELDS:
         for value in (math.nan, math.inf, -math.inf):
             bad = twist(0.3, 2.0)
             setattr(getattr(bad, part), axis, value)
             commands.publish(bad)
-            refused += 1
+            rejected += 1
             harness.spin_until(
-                lambda count=refused: diagnostic(robot, 'commands_rejected') == count,
-                f'{part}.{axis} = {value} was not refused',
+                lambda count=rejected: diagnostic(robot, 'commands_rejected') == count,
+                f'{part}.{axis} = {value} was not rejected',
             )
     count = len(odom)
     harness.spin_until(lambda: len(odom) > count + 5)
@@ -59,7 +59,7 @@ def test_a_non_finite_command_never_moves_the_robot(harness):
     assert max(map(speed, odom)) < 1e-3
     commands.publish(twist(0.3, 0.0))
     harness.spin_until(
-        lambda: odom[-1].twist.twist.linear.x > 0.1, 'a good command moves the robot'
+        lambda: odom[-1].twist.twist.linear.x > 0.1, 'a finite command moves the robot'
     )
 
 
@@ -118,7 +118,7 @@ def test_e_stop_latches_and_release_needs_a_new_command(harness):
     status = harness.next_status('sim_robot')
     assert status.level == ERROR
     assert 'emergency stop' in status.message
-    # More than a second of commands later it still stands.
+    # The robot stays at rest although commands continue.
     count = len(odom)
     harness.spin_until(lambda: len(odom) > count + 20)
     assert max(map(speed, odom[count:])) < 1e-3
@@ -129,7 +129,7 @@ def test_e_stop_latches_and_release_needs_a_new_command(harness):
     assert harness.call(SetBool, 'e_stop', data=False).success
     count = len(odom)
     harness.spin_until(lambda: len(odom) > count + 20)
-    assert max(map(speed, odom[count:])) < 1e-3, 'the old command is not taken up again'
+    assert max(map(speed, odom[count:])) < 1e-3, 'the old command stays invalid'
     assert 'released' in reason(robot)
     source.message = twist(0.3)
     harness.spin_until(lambda: speed(odom[-1]) > 0.28, 'a new command moves the robot')
@@ -139,7 +139,7 @@ def test_e_stop_latches_and_release_needs_a_new_command(harness):
 
 
 def test_a_latched_stop_is_an_error_before_any_warning(harness):
-    """A warning about message types once stood in front of the emergency stop."""
+    """A mismatched message type must not hide the emergency stop."""
     robot = harness.add(SimRobotNode)
     harness.foreign_node().create_publisher(TwistStamped, 'cmd_vel', 10)
     harness.spin_until(lambda: 'TwistStamped' in reason(robot))
@@ -163,7 +163,7 @@ def test_odometry_is_reset_at_rest_only(harness):
     harness.spin_until(lambda: speed(odom[-1]) < 1e-3)
     assert harness.call(Trigger, 'reset_odometry').success
     harness.spin_until(lambda: abs(odom[-1].pose.pose.position.x) < 1e-3)
-    harness.spin_until(lambda: truth[-1].pose.pose.position.x > 0.05, 'the robot itself stays')
+    harness.spin_until(lambda: truth[-1].pose.pose.position.x > 0.05, 'the true pose is unchanged')
 
 
 def test_set_pose_moves_the_true_pose_only(harness):
@@ -208,7 +208,7 @@ def test_odometry_has_an_exact_grid_frames_and_joints(harness):
 
 
 def test_stamped_commands_are_accepted_and_stale_ones_rejected(harness):
-    """A stamped command that was recorded, or held up on its way, must not move a robot."""
+    """A played or delayed stamped command must not move a robot."""
     robot = harness.add(SimRobotNode, enable_stamped_cmd_vel=True)
     odom = harness.subscribe(Odometry, 'odom')
     commands = harness.create_publisher(TwistStamped, 'cmd_vel')
@@ -225,10 +225,10 @@ def test_stamped_commands_are_accepted_and_stale_ones_rejected(harness):
     harness.spin_until(lambda: len(odom) > count + 5)
     assert max(map(speed, odom)) < 1e-3
     say(robot.now_ns())
-    harness.spin_until(lambda: speed(odom[-1]) > 0.1, 'a fresh one moves the robot')
+    harness.spin_until(lambda: speed(odom[-1]) > 0.1, 'a present stamp moves the robot')
     harness.spin_until(lambda: speed(odom[-1]) < 1e-3)
     say(0)
-    harness.spin_until(lambda: speed(odom[-1]) > 0.1, 'a stamp of zero means now, as is usual')
+    harness.spin_until(lambda: speed(odom[-1]) > 0.1, 'a stamp of zero means now')
 
 
 def test_huge_commands_stay_within_the_limits(harness):

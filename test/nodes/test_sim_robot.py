@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The digital twin in ROS: its sensors, its faults, its time, and two of them in one world."""
+"""The digital twin as a node: sensors, faults, initial pose, simulated time, launch files."""
 
 import math
 from pathlib import Path
@@ -47,14 +47,14 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def paused(harness, /, **parameters):
-    """Return a robot whose time stands, once it has told its first state."""
+    """Return a robot with paused time that has published its first state."""
     robot = harness.add(SimRobotNode, publish_clock=True, real_time_factor=0.0, **parameters)
     harness.spin_until(lambda: diagnostic(robot, 'moving') is not None, 'the first state')
     return robot
 
 
 def change(harness, node, **values):
-    """Set parameters over the node's service, as ``ros2 param set`` does; return the results."""
+    """Set parameters with the node's service, as ``ros2 param set``; return the results."""
     request = [
         Parameter(name.replace('__', '.'), value=value).to_parameter_msg()
         for name, value in values.items()
@@ -63,8 +63,8 @@ def change(harness, node, **values):
     return harness.call(SetParameters, f'{full}/set_parameters', parameters=request).results
 
 
-def truths(node):
-    """Return the newest state of a robot, and from now on every one that it tells."""
+def published_states(node):
+    """Return a list of the last and all following states of a robot."""
     states = [] if node._state is None else [node._state]
     publish = node._robot_publishers.publish
 
@@ -76,8 +76,8 @@ def truths(node):
     return states
 
 
-def matched(harness, robot, *topics):
-    """Spin until those of the robot's topics that are heard have found who hears them."""
+def wait_for_subscribers(harness, robot, *topics):
+    """Spin until the publishers of the robot's topics have subscribers."""
     names = {robot.resolve_topic_name(topic) for topic in topics}
     publishers = [one for one in robot.publishers if one.topic_name in names]
     assert len(publishers) == len(names)
@@ -102,8 +102,8 @@ def test_sensor_messages_match_the_robot_state(harness):
         step_time=0.5,
         noise__variance=0.04,
     )
-    states = truths(robot)
-    matched(
+    states = published_states(robot)
+    wait_for_subscribers(
         harness, robot, 'imu/data_raw', 'battery_state', *(f'range/{n}' for n in RANGE_SENSORS)
     )
     for _ in range(3):
@@ -122,7 +122,7 @@ def test_sensor_messages_match_the_robot_state(harness):
     gyro, push = imu[-1].angular_velocity_covariance, imu[-1].linear_acceleration_covariance
     assert (gyro[0], gyro[4], push[8]) == (1e6, 1e6, 1e6)
     assert np.count_nonzero(gyro) == np.count_nonzero(push) == 3
-    # What is claimed of the noise is what it is: the spread of a gyro that stands.
+    # The covariance of the message is the variance of a gyro at rest.
     rates = np.array([state.imu.angular for state in states])
     assert np.var(rates) == pytest.approx(gyro[8], rel=0.6)
 
@@ -194,17 +194,17 @@ def test_twist_covariance_matches_the_noise(harness):
     source = CommandSource(harness)
     source.message = twist(0.2)
     harness.spin_until(lambda: len(odom) > 300)
-    told = np.array(odom[-1].twist.covariance).reshape(6, 6)
-    assert [told[i, i] for i in (1, 2, 3, 4)] == [1e6] * 4
+    covariance = np.array(odom[-1].twist.covariance).reshape(6, 6)
+    assert [covariance[i, i] for i in (1, 2, 3, 4)] == [1e6] * 4
     steady = odom[100:]
     linear = np.var([message.twist.twist.linear.x for message in steady])
     angular = np.var([message.twist.twist.angular.z for message in steady])
-    assert linear == pytest.approx(told[0, 0], rel=0.5)
-    assert angular == pytest.approx(told[5, 5], rel=0.5)
+    assert linear == pytest.approx(covariance[0, 0], rel=0.5)
+    assert angular == pytest.approx(covariance[5, 5], rel=0.5)
     assert change(harness, robot, noise__variance=0.0)[0].successful
     count = len(odom)
     harness.spin_until(lambda: len(odom) > count + 5)
-    assert odom[-1].twist.covariance[0] < 0.2 * told[0, 0]
+    assert odom[-1].twist.covariance[0] < 0.2 * covariance[0, 0]
 
 
 # -- faults ---------------------------------------------------------------------------------------
@@ -222,8 +222,8 @@ def test_a_dead_gyro_is_a_warning_until_it_recovers(harness):
     assert change(harness, robot, faults__gyro_dead=True)[0].successful
     status = harness.next_status('sim_robot')
     harness.spin_until(lambda: len(odom) > 0)
-    silent, told = len(imu), len(odom)
-    harness.spin_until(lambda: len(odom) > told + 30)
+    silent, before = len(imu), len(odom)
+    harness.spin_until(lambda: len(odom) > before + 30)
     assert len(imu) == silent
     assert status.level == WARN
     assert 'inertial sensor does not answer' in status.message
@@ -244,7 +244,7 @@ def test_a_brown_out_stops_the_robot_temporarily(harness):
     source = CommandSource(harness)
     source.message = twist(0.1)
     harness.spin_until(lambda: odom and speed(odom[-1]) > 0.08)
-    states = truths(robot)
+    states = published_states(robot)
     assert change(harness, robot, faults__brown_out=True)[0].successful
     harness.spin_until(lambda: 'brown-out: the board restarts' in reason(robot))
     assert not diagnostic(robot, 'enabled')
@@ -254,7 +254,7 @@ def test_a_brown_out_stops_the_robot_temporarily(harness):
     harness.spin_until(lambda: speed(odom[-1]) > 0.08, 'it drives again, for commands still come')
     away = [state for state in states if state.reason]
     assert away[-1].stamp_ns - away[0].stamp_ns == pytest.approx(0.5 * NANOSECONDS, rel=0.2)
-    # Nothing brakes it: without current the wheels run down by themselves.
+    # Without current the wheels coast to a stop.
     assert min(state.truth.twist.linear for state in away) < 0.02
     assert diagnostic(robot, 'commands_rejected') > 0
 
@@ -279,13 +279,13 @@ def test_a_blocked_wheel_loses_steps_with_a_warning(harness):
     ],
 )
 def test_the_paper_plant_rejects_worlds_and_faults(given):
-    """A fault that was set and did nothing would be taken for a robot that copes."""
+    """A fault without effect would look like a robot that tolerates it."""
     with pytest.raises(ParameterError, match=f'must be stepper for {next(iter(given))[:5]}'):
         SimRobotParameters.from_dict({'drive.kind': 'velocity', **given})
     SimRobotParameters.from_dict(given)
 
 
-# -- places ---------------------------------------------------------------------------------------
+# -- initial pose ---------------------------------------------------------------------------------
 
 
 def test_the_initial_pose_is_used_unless_within_a_wall(harness):
@@ -334,7 +334,7 @@ def test_unusable_parameters_end_the_process_with_code_2(given, words, fleet):
     assert not any('Traceback' in line for line in lines)
 
 
-# -- time -----------------------------------------------------------------------------------------
+# -- simulated time -------------------------------------------------------------------------------
 
 
 def test_paused_time_advances_by_steps_only(harness):
@@ -344,12 +344,10 @@ def test_paused_time_advances_by_steps_only(harness):
     commands = harness.create_publisher(Twist, 'cmd_vel')
     harness.wait_for_subscriber(commands)
     harness.spin_until(lambda: robot.count_subscribers('odom') and len(clock) > 3)
-    states = truths(robot)
+    states = published_states(robot)
     commands.publish(twist(0.3))
     count = len(clock)
-    harness.spin_until(
-        lambda: len(clock) > count + 5, 'the time that stands is told to late comers'
-    )
+    harness.spin_until(lambda: len(clock) > count + 5, 'the paused time is published')
     assert {(message.clock.sec, message.clock.nanosec) for message in clock} == {(1, 0)}
     assert len(states) == 1
     answers = [harness.call(Trigger, 'sim_robot/step') for _ in range(10)]
@@ -364,7 +362,7 @@ def test_paused_time_advances_by_steps_only(harness):
     harness.spin_until(lambda: clock[-1].clock == odom[-1].header.stamp)
 
     assert change(harness, robot, real_time_factor=1.0)[0].successful
-    harness.spin_until(lambda: len(states) > 30, 'time runs')
+    harness.spin_until(lambda: len(states) > 30, 'the time advances')
     response = harness.call(Trigger, 'sim_robot/step')
     assert not response.success
     assert 'real_time_factor must be 0' in response.message
@@ -389,7 +387,7 @@ def test_simulated_time_needs_publish_clock(harness):
 def test_equal_seeds_steps_and_commands_give_equal_messages(harness):
     kinds = {'odom': Odometry, 'imu/data_raw': Imu, 'battery_state': BatteryState}
     kinds |= {f'range/{name}': Range for name in RANGE_SENSORS}
-    stories = []
+    runs = []
     for name, seed in (('a', 5), ('b', 5), ('c', 6)):
         robot = paused(
             harness, namespace=name, seed=seed, world='room', noise__variance=0.04, step_time=0.2
@@ -398,10 +396,10 @@ def test_equal_seeds_steps_and_commands_give_equal_messages(harness):
             topic: harness.subscribe(kind, f'{name}/{topic}', 1000)
             for topic, kind in kinds.items()
         }
-        matched(harness, robot, *kinds)
+        wait_for_subscribers(harness, robot, *kinds)
         commands = harness.create_publisher(Twist, f'{name}/cmd_vel')
         harness.wait_for_subscriber(commands)
-        states = truths(robot)
+        states = published_states(robot)
         for n in range(8):
             commands.publish(twist(0.05 * n, 0.3 * n))
             harness.spin_until(lambda one=robot, count=n + 1: diagnostic(one, 'commands') == count)
@@ -409,11 +407,11 @@ def test_equal_seeds_steps_and_commands_give_equal_messages(harness):
         end_ns = states[-1].stamp_ns
         for topic in ('odom', 'imu/data_raw'):
             harness.spin_until(lambda some=received[topic], end=end_ns: stamp(some[-1]) == end)
-        # As text: a battery has numbers that nobody measures, and NaN equals nothing.
-        told = {topic: [str(message) for message in some] for topic, some in received.items()}
-        stories.append((told, [state.truth for state in states]))
+        # As text: unmeasured fields of the battery are NaN, which is unequal to itself.
+        messages = {topic: [str(message) for message in some] for topic, some in received.items()}
+        runs.append((messages, [state.truth for state in states]))
         harness.remove(robot)
-    (first, path), (same, again), (other, another) = stories
+    (first, path), (same, again), (other, another) = runs
     assert len(first['odom']) == len(path) - 1 == 160
     assert path == again != another
     for topic in kinds:
@@ -447,19 +445,19 @@ def test_an_unreachable_real_time_factor_is_a_warning(harness, monkeypatch):
         return advance(now_ns)
 
     monkeypatch.setattr(robot._robot, 'advance', slowly)
-    states = truths(robot)
+    states = published_states(robot)
     harness.spin_until(lambda: 'processor overloaded' in reason(robot))
     assert 'instead of 100' in reason(robot)
     assert 0.0 < diagnostic(robot, 'real_time_factor') < 20.0
     assert set(np.diff([state.stamp_ns for state in states])) == {10_000_000}
-    assert harness.call(Trigger, 'reset_odometry').success, 'others get their turn'
+    assert harness.call(Trigger, 'reset_odometry').success, 'services are served'
 
 
-# -- two robots -----------------------------------------------------------------------------------
+# -- launch files ---------------------------------------------------------------------------------
 
 
 class _Recorded:
-    """Stands in for what launch files are written with; remembers the arguments."""
+    """Replaces the classes of the launch packages; stores the arguments."""
 
     def __init__(self, *arguments, **named):
         self.arguments = arguments
@@ -468,7 +466,7 @@ class _Recorded:
 
 @pytest.fixture
 def launched(monkeypatch):
-    """Return a function that gives the nodes of a launch file: ``launch`` comes with apt only."""
+    """Return a function that returns the nodes of a launch file, without the launch packages."""
     words = {
         'launch': ['LaunchDescription'],
         'launch.actions': ['DeclareLaunchArgument'],
@@ -520,7 +518,7 @@ def test_launch_file_parameters_fit_their_nodes(file, launched):
         given = {key: value for key, value in values.items() if key != 'use_sim_time'}
         parameters = parameter_class(name).from_dict(given)
         if name == 'controller':
-            assert parameters.speed_filter.lag == 0.003  # what a stepper needs
+            assert parameters.speed_filter.lag == 0.003  # the lag of the stepper drive
 
 
 def test_two_robots_launch_file_separates_the_robots(harness, launched):
@@ -534,7 +532,7 @@ def test_two_robots_launch_file_separates_the_robots(harness, launched):
             robots[namespace] = harness.add(SimRobotNode, namespace=namespace, **values)
     one, two = robots.values()
     assert one.parameters.seed != two.parameters.seed
-    states = {name: truths(robot) for name, robot in robots.items()}
+    states = {name: published_states(robot) for name, robot in robots.items()}
     imu = {name: harness.subscribe(Imu, f'{name}/imu/data_raw') for name in robots}
     source = CommandSource(harness, 'robot_1/cmd_vel')
     source.message = twist(0.2)
@@ -543,8 +541,8 @@ def test_two_robots_launch_file_separates_the_robots(harness, launched):
     assert change(harness, two, faults__gyro_dead=True)[0].successful
     harness.spin_until(lambda: diagnostic(two, 'imu_fault'))
     harness.spin_until(lambda: all(imu.values()))
-    silent, told = len(imu['robot_2']), len(imu['robot_1'])
-    harness.spin_until(lambda: len(imu['robot_1']) > told + 20)
+    silent, before = len(imu['robot_2']), len(imu['robot_1'])
+    harness.spin_until(lambda: len(imu['robot_1']) > before + 20)
     assert len(imu['robot_2']) <= silent + 1
     assert imu['robot_1'][-1].header.frame_id == 'robot_1/imu_link'
     topics = {name for name, _ in harness.probe.get_topic_names_and_types()}
@@ -553,7 +551,7 @@ def test_two_robots_launch_file_separates_the_robots(harness, launched):
         assert f'/{part}' not in topics
 
 
-# -- the demonstration ----------------------------------------------------------------------------
+# -- demo -----------------------------------------------------------------------------------------
 
 
 def test_the_demo_uses_the_selected_robot():
