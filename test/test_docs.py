@@ -12,7 +12,7 @@ import re
 import pytest
 
 from t3mpc_ros.emulator.fault_injection import FAULT_KINDS
-from t3mpc_ros.nodes.registry import parameters_page
+from t3mpc_ros.nodes.registry import with_parameters
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / 'docs' / 'equations.md'
@@ -160,9 +160,10 @@ def _is_read(node):
 
 
 def test_the_page_of_parameters_is_up_to_date():
-    assert (ROOT / 'docs' / 'settings.md').read_text() == parameters_page(), (
-        'docs/settings.md is out of date: run '
-        '`.venv/bin/python -m t3mpc_ros.nodes.registry > docs/settings.md`'
+    page = (ROOT / 'docs' / 'nodes.md').read_text()
+    assert page == with_parameters(page), (
+        'docs/nodes.md is out of date: run '
+        '`.venv/bin/python -m t3mpc_ros.nodes.registry docs/nodes.md`'
     )
 
 

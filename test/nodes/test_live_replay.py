@@ -127,3 +127,26 @@ def test_a_live_run_replays_bit_for_bit(fleet, tmp_path):
     numbers = [row for row in outcome.rows if not row.field.startswith('cmd_vel')]
     assert len(numbers) == 20
     assert all(row.count > 100 and row.absolute == 0.0 for row in numbers), outcome.table()
+
+
+def test_a_late_recorder_can_replay_from_the_beginning(fleet, tmp_path):
+    """Without the initial inputs of the controller the first odometry messages would be lost."""
+    bag = tmp_path / 'bag'
+    for name in ('sim_robot', 'reference_generator', 'controller'):
+        fleet.start(name)
+        fleet.wait_ready(name)
+    fleet.wait_for('controller', 'tracking')
+    fleet.start('recorder', parameters={'folder': str(bag)})
+    fleet.wait_ready('recorder')
+    time.sleep(5.0)
+    fleet.check()
+    order = ('controller', 'reference_generator', 'sim_robot', 'recorder')
+    assert set(fleet.stop_all(order).values()) == {0}
+    inputs = load_inputs(bag)
+    assert inputs.journalled
+    [life] = inputs.lives
+    assert life.rows[0, 0] == 0, 'the journal begins with the first event'
+    assert life.exact.all(), inputs.notes
+    assert (life.events == Event.STEP).sum() > 500
+    outcome = compare(inputs, replay_controller(inputs), Tolerances(absolute=1e-9, relative=0.0))
+    assert outcome.same, outcome.table()

@@ -283,7 +283,7 @@ def test_a_stop_of_the_controller_starts_a_snapshot(harness, tmp_path):
 
 def test_snapshot_mode_writes_snapshots_only(harness, tmp_path):
     recorder = record(harness, tmp_path, 'text', snapshot_only=True, snapshot_time=60.0)
-    assert harness.call(Trigger, 'recorder/split').success is False
+    assert harness.call(Trigger, 'recorder/split_bagfile').success is False
     response = harness.call(Trigger, 'recorder/snapshot')
     assert not response.success
     assert 'no message was received' in response.message
@@ -340,7 +340,7 @@ def test_model_files_are_attached_to_every_file(harness, tmp_path):
     recorder = record(harness, bag, 'odom', attach=[str(world_map)])
     harness.add(ControllerNode, model=str(model), model_output=str(output))
     harness.spin_until(lambda: 'controller' in recorder._metadata.records)
-    assert harness.call(Trigger, 'recorder/split').success
+    assert harness.call(Trigger, 'recorder/split_bagfile').success
     assert harness.call(Trigger, 'controller/save_model').success
     harness.remove(recorder)
     one, two = sorted(bag.glob('*.mcap'))
@@ -427,7 +427,7 @@ def test_exception_in_the_writer_thread_is_an_error(harness, tmp_path, monkeypat
     harness.wait_for_subscriber(text)
     text.publish(String(data='kept'))
     harness.spin_until(lambda: values(recorder)['messages'] == 1)
-    assert harness.call(Trigger, 'recorder/split').success
+    assert harness.call(Trigger, 'recorder/split_bagfile').success
 
     def wrong(*_):
         raise TypeError('a mistake')
@@ -439,6 +439,6 @@ def test_exception_in_the_writer_thread_is_an_error(harness, tmp_path, monkeypat
         ERROR,
         'writing failed: TypeError: a mistake',
     )
-    assert not harness.call(Trigger, 'recorder/split').success
+    assert not harness.call(Trigger, 'recorder/split_bagfile').success
     harness.remove(recorder)
     assert texts(tmp_path) == ['kept']

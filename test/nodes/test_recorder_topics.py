@@ -157,7 +157,7 @@ def test_a_split_bag_loses_no_message(harness, tmp_path):
             text.publish(String(data=f'{part} {number}'))
         _count(harness, recorder, 5 * (part + 1))
         if part < 2:
-            response = harness.call(Trigger, 'recorder/split')
+            response = harness.call(Trigger, 'recorder/split_bagfile')
             assert response.success
             assert f'_{part + 1}.mcap' in response.message
     harness.remove(recorder)
@@ -186,7 +186,7 @@ def test_a_full_disk_ends_the_recording_only(harness, tmp_path, monkeypatch):
     assert status.level == ERROR
     assert 'No space left on device' in status.message
     assert [entry.level for entry in log if 'No space left' in entry.msg] == [40]
-    response = harness.call(Trigger, 'recorder/split')
+    response = harness.call(Trigger, 'recorder/split_bagfile')
     assert not response.success, 'a failed recording cannot be split'
     assert 'No space left' in response.message
     count = len(odom)

@@ -48,7 +48,7 @@ DISCOVERY_PERIOD = 0.2
 DROP_ERROR_TIME_NS = 2 * NANOSECONDS
 """Time for which dropped messages are reported as an error; afterwards as a warning."""
 SPLIT_TIMEOUT = 5.0
-"""Timeout of ``~/split`` for the disk, s."""
+"""Timeout of ``~/split_bagfile`` for the disk, s."""
 SNAPSHOT_TIMEOUT = 30.0
 """Shutdown timeout for the current snapshot, s."""
 
@@ -90,7 +90,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
         self.create_subscription(
             DiagnosticArray, '/diagnostics', self._on_diagnostics, qos.DIAGNOSTICS
         )
-        self.create_service(Trigger, '~/split', self._on_split)
+        self.create_service(Trigger, '~/split_bagfile', self._on_split)
         self.create_service(Trigger, '~/snapshot', self._on_snapshot)
         self.create_steady_timer(DISCOVERY_PERIOD, self._discovery.discover)
         self.create_steady_timer(DISCOVERY_PERIOD, self._collector.request_new)
