@@ -66,7 +66,7 @@ class Plug:
                     raise
                 time.sleep(0.005)
                 continue
-            replies += self.dongle.take(data, time.monotonic_ns())
+            replies += self.dongle.receive(data, time.monotonic_ns())
             replies.sort()
 
 

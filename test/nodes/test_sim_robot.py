@@ -381,7 +381,7 @@ def test_simulated_time_needs_publish_clock(harness):
     (result,) = change(harness, robot, real_time_factor=2.0)
     assert not result.successful
     assert 'publish_clock must be true' in result.reason
-    assert robot.parameters.speed == 1.0
+    assert robot.parameters.real_time_factor == 1.0
 
 
 def test_equal_seeds_steps_and_commands_give_equal_messages(harness):
