@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 #
 # make avr        both boards' firmware, build/dongle.elf and build/robot.elf, and their sizes;
-#                 RADIO_CHANNEL=0…125 and RADIO_RATE=0|1|2 (250 kbit/s, 1, 2 Mbit/s) make it others
-# make simavr     both in a simulator, with the world around them, as a library for ctypes
+#                 RADIO_CHANNEL=0…125 and RADIO_RATE=0|1|2 (250 kbit/s, 1, 2 Mbit/s) are options
+# make simavr     both boards in a simulator with their peripherals, as a library for ctypes
 
 AVR_OBJCOPY ?= avr-objcopy
 AVR_BOARD_FLAGS := $(AVR_FLAGS) -DF_CPU=16000000UL -Icore -Iavr -Wl,--gc-sections \

@@ -143,7 +143,7 @@ static void give_up(void)
     free_the_bus();
     transfer = IDLE;
     answers = false;
-    settled = 0;  // a sensor that reappears has lost its settings
+    settled = 0;  // a sensor that responds again has lost its configuration
     wait_us = RETRY_US;
 }
 

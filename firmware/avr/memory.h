@@ -12,7 +12,7 @@ void memory_start(void);
 void memory_read(uint8_t address, uint8_t *data, uint8_t size);
 void memory_write(uint8_t address, const uint8_t *data, uint8_t size);
 
-// Return whether nothing is left to be written.
+// Return whether all writes are complete.
 bool memory_settled(void);
 
 // Read the cells themselves. Waits if one is being written.

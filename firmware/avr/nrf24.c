@@ -90,7 +90,7 @@ static uint8_t ask(uint8_t code)
     return value;
 }
 
-static void tell(uint8_t code, const uint8_t *data, uint8_t size)
+static void write_command(uint8_t code, const uint8_t *data, uint8_t size)
 {
     select();
     swap(code);
@@ -101,7 +101,7 @@ static void tell(uint8_t code, const uint8_t *data, uint8_t size)
 
 static void set(uint8_t reg, uint8_t value)
 {
-    tell((uint8_t)(W_REGISTER | reg), &value, 1);
+    write_command((uint8_t)(W_REGISTER | reg), &value, 1);
 }
 
 static uint8_t get(uint8_t reg)
@@ -144,9 +144,9 @@ static void allow_features(void)
     set(FEATURE, wanted);
     if (get(FEATURE) == wanted)
         return;
-    // A non-plus chip hides them until ACTIVATE; a second ACTIVATE would hide them again.
+    // On the chip without plus they are hidden until ACTIVATE; a second ACTIVATE hides them again.
     const uint8_t key = 0x73;
-    tell(ACTIVATE, &key, 1);
+    write_command(ACTIVATE, &key, 1);
     set(FEATURE, wanted);
 }
 
@@ -172,8 +172,8 @@ bool nrf24_configure(const struct t3_radio_settings *settings, enum nrf24_role r
     set(SETUP_RETR, retries_of(settings));
     set(RF_CH, settings->channel);
     set(RF_SETUP, setup_of(settings));
-    tell(W_REGISTER | RX_ADDR_P0, settings->address, 5);
-    tell(W_REGISTER | TX_ADDR, settings->address, 5);
+    write_command(W_REGISTER | RX_ADDR_P0, settings->address, 5);
+    write_command(W_REGISTER | TX_ADDR, settings->address, 5);
     allow_features();
     set(DYNPD, PIPE_0);
     command(FLUSH_TX);
@@ -227,7 +227,7 @@ uint8_t nrf24_read(uint8_t payload[T3_RADIO_LIMIT])
 
 void nrf24_send(const uint8_t *payload, uint8_t size)
 {
-    tell(W_TX_PAYLOAD, payload, size);
+    write_command(W_TX_PAYLOAD, payload, size);
     enable(true);  // until the exchange is over: 10 us would do
 }
 
@@ -247,5 +247,5 @@ void nrf24_answer(const uint8_t *payload, uint8_t size)
     // The chip keeps a payload that was sent until a new packet confirms it, so without the flush
     // a second one queues up, and telemetry is late by one exchange for ever.
     command(FLUSH_TX);
-    tell(W_ACK_PAYLOAD, payload, size);
+    write_command(W_ACK_PAYLOAD, payload, size);
 }

@@ -24,12 +24,12 @@ enum nrf24_role { NRF24_HOST, NRF24_ROBOT };
 // Pins, SPI and the interrupt of the chip's IRQ.
 void nrf24_start(void);
 
-// Write all registers, CE low; return whether the chip holds them. `waking`: it was powered
-// down, so CE has to stay low for NRF24_WAKE_US.
+// Write all registers, CE low; return whether the chip holds them. `waking`: the chip was
+// powered down, so that CE has to stay low for NRF24_WAKE_US.
 bool nrf24_configure(const struct t3_radio_settings *settings, enum nrf24_role role,
                      bool *waking);
 
-// Return whether the chip is still configured, and did not lose its supply.
+// Return whether the chip still holds its configuration, which is lost with its supply.
 bool nrf24_holds(const struct t3_radio_settings *settings, enum nrf24_role role);
 
 void nrf24_listen(void);

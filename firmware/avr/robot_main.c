@@ -20,7 +20,7 @@
 #include "t3_console.h"
 #include "t3_robot.h"
 
-// Silence after which the board checks whether the chip has lost its settings.
+// Silence after which the configuration of the chip is checked.
 #define RADIO_CHECK_US UINT32_C(500000)
 
 // The answer is sampled at once; then it waits for a quiet moment of the radio.
@@ -37,7 +37,7 @@
 #define FLUSH_US 110u // what the flush takes, with the interrupts that may come meanwhile
 
 static const struct t3_radio_settings radio = T3_RADIO_DEFAULTS;
-static volatile bool heard;  // the radio's interrupt came
+static volatile bool radio_interrupt;  // set by the interrupt of the radio
 static volatile uint32_t heard_us;
 static uint32_t checked_us;
 static bool waking;
@@ -53,9 +53,9 @@ static struct t3_console console;
 
 ISR(RADIO_IRQ_VECTOR)
 {
-    if (!heard)
+    if (!radio_interrupt)
         heard_us = stepping_time_us();
-    heard = true;
+    radio_interrupt = true;
 }
 
 // -- the core's port -----------------------------------------------------------------------------
@@ -179,9 +179,9 @@ static void receive(void)
     uint32_t at_us = stepping_time_us();
     ATOMIC_BLOCK(ATOMIC_RESTORESTATE)
     {
-        if (heard)
+        if (radio_interrupt)
             at_us = heard_us;
-        heard = false;
+        radio_interrupt = false;
     }
     // Flags first: a packet that comes while the FIFO is read raises them again.
     nrf24_take_flags();
@@ -206,7 +206,7 @@ static uint16_t since_copy_us(uint16_t copy_us)
     return since_us < UINT16_MAX ? (uint16_t)since_us : UINT16_MAX;
 }
 
-// Return whether no acknowledgement is on the air that takes its bytes from what is loaded.
+// Return whether no acknowledgement that uses the loaded payload is being sent.
 static bool is_quiet(void)
 {
     const uint16_t copy_us = (uint16_t)COPY_US(packet_size);
@@ -227,7 +227,7 @@ static void load_answer(void)
 static void watch_radio(void)
 {
     // The pin too: an edge that was missed must not silence the robot for ever.
-    if (heard || !RADIO_IRQ_HIGH)
+    if (radio_interrupt || !RADIO_IRQ_HIGH)
         receive();
     const uint32_t now_us = stepping_time_us();
     const uint32_t since_us = now_us - checked_us;
@@ -250,13 +250,13 @@ static bool hurries(void)
     return robot.answer_waits || answer_size;
 }
 
-// Return whether it is time for more than the radio.
+// Return whether a pass of the main loop is due.
 static bool sleep_until_due(void)
 {
     for (bool slept = false;; slept = true) {
         cli();
         const bool due = stepping_due();
-        if (due || heard || (slept && hurries())) {
+        if (due || radio_interrupt || (slept && hurries())) {
             sei();
             return due;
         }

@@ -22,7 +22,7 @@ ISR(SERIAL_RX_VECTOR)
         lost++;
     in[in_head] = byte;
     in_head = next;
-    // Nobody takes them fast enough: what else comes is lost, and costs no time.
+    // The buffer is full: further bytes are lost, and cost no time.
     if ((uint8_t)(next - in_tail) >= SERIAL_ROOM)
         UCSR0B &= (uint8_t)~_BV(RXCIE0);
 }

@@ -12,7 +12,7 @@ void serial_start(void);
 // Take the oldest byte that came.
 bool serial_take(uint8_t *byte);
 
-// Return whether a byte waits. With interrupts off it stays so until they are on again.
+// Return whether a byte is available. With interrupts disabled the result remains valid.
 bool serial_waits(void);
 
 // Send a frame, whole or not at all.

@@ -28,7 +28,7 @@ uint32_t stepping_time_us(void);
 void stepping_lock(void);
 void stepping_unlock(void);
 
-// Return once whether the main loop is due: every eighth interrupt.
+// Return true once per eighth interrupt: a pass of the main loop is due.
 bool stepping_due(void);
 
 #endif

@@ -17,7 +17,7 @@ static inline uint32_t t3_get32(const uint8_t *from)
     return (uint32_t)t3_get16(from) | (uint32_t)t3_get16(from + 2) << 16;
 }
 
-// Each put returns the place behind what it wrote, so that a frame is put down field by field.
+// Each put returns the position after the written bytes, so that a frame is written field by field.
 static inline uint8_t *t3_put8(uint8_t *to, uint8_t value)
 {
     *to = value;
@@ -36,8 +36,8 @@ static inline uint8_t *t3_put32(uint8_t *to, uint32_t value)
     return t3_put16(t3_put16(to, (uint16_t)value), (uint16_t)(value >> 16));
 }
 
-// The conversion of an unsigned value above the signed range is implementation-defined in C99;
-// these functions are portable.
+// The conversion of an unsigned value above the signed range is left to the compiler by C99; these
+// functions define it.
 static inline int16_t t3_signed16(uint16_t value)
 {
     return value <= INT16_MAX ? (int16_t)value : (int16_t)(-1 - (int16_t)(UINT16_MAX - value));
@@ -48,7 +48,7 @@ static inline int32_t t3_signed32(uint32_t value)
     return value <= INT32_MAX ? (int32_t)value : -1 - (int32_t)(UINT32_MAX - value);
 }
 
-// How much later `a` is than `b` on a clock that wraps, in microseconds.
+// Return a - b on a clock that wraps, us.
 static inline int32_t t3_later_by(uint32_t a, uint32_t b)
 {
     return t3_signed32(a - b);

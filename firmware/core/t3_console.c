@@ -105,7 +105,7 @@ static void end_key(struct t3_console *console, uint8_t rc)
 {
     console->step = T3_KEY_RESTS;
     memset(console->key, 0, T3_KEY_SIZE);
-    // After a failure the session stays locked, and the mark reports it to the next start.
+    // After a failure the session remains locked, and the mark remains for the next boot.
     if (rc == T3_RC_OK)
         t3_session_boot(&console->robot->session, console->robot->port);
     tell_key(console, console->id, rc);

@@ -1,17 +1,17 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
-// The robot's own USB: how the board fares, and its key. A key comes in over this cable and no other
-// way; it never goes out, only a check value of 32 bits for comparing keys.
+// USB console of the robot board: status and key. The key is written over this port only and is never
+// sent; a check value of 32 bits identifies it.
 //
-// While a key is being written no session starts, and nothing moves. If the supply fails meanwhile,
-// the board finds at its next start what it had before, the new key, or a damaged one; with a damaged
-// one it only ever stops, until it is given a key again.
+// During the write of a key no session is accepted and nothing moves. After a loss of power during the
+// write, the board has the old key, the new key or a damaged key; with a damaged key it accepts only
+// emergency stops until a key is written.
 #ifndef T3_CONSOLE_H
 #define T3_CONSOLE_H
 
 #include "t3_robot.h"
 
-// State of the key in KEY.
+// States of the key in KEY.
 enum { T3_KEY_NONE, T3_KEY_HELD, T3_KEY_DAMAGED };
 
 struct t3_console {
@@ -24,17 +24,17 @@ struct t3_console {
     uint8_t key[T3_KEY_SIZE];
 };
 
-// Only after t3_robot_boot.
+// Call after t3_robot_boot.
 void t3_console_boot(struct t3_console *console, const struct t3_console_port *port,
                      struct t3_robot *robot);
 
-// Take a byte from USB; return whether it ended a frame, which takes longer.
+// Process a byte from USB; return whether it completed a frame, which takes longer.
 bool t3_console_byte(struct t3_console *console, uint8_t byte);
 
-// Count a byte that was lost because it was not read in time.
+// Count a byte lost to an overrun.
 void t3_console_overrun(struct t3_console *console);
 
-// Call as often as the main loop runs: a key takes the EEPROM a while.
+// Call in each pass of the main loop: the EEPROM write of a key takes many passes.
 void t3_console_tick(struct t3_console *console);
 
 #endif

@@ -40,7 +40,7 @@ static void configure(struct t3_dongle *dongle)
 static void send(struct t3_dongle *dongle, enum t3_dongle_phase phase, const uint8_t *payload,
                  uint8_t size)
 {
-    // Before the radio sends: its answer may arrive meanwhile.
+    // Before the call of the radio, which may already end the exchange.
     dongle->phase = phase;
     dongle->phase_us = now(dongle);
     dongle->port->send(dongle->port->context, payload, size);
@@ -63,7 +63,7 @@ void t3_dongle_exchange(struct t3_dongle *dongle, bool acknowledged, uint8_t ret
                         const uint8_t *answer, uint8_t size)
 {
     if (dongle->phase != T3_FIRST && dongle->phase != T3_SECOND)
-        return;  // no transaction waits for it any more
+        return;  // no transaction in progress
     const bool first = dongle->phase == T3_FIRST;
     if (retransmits > RETRANSMITS_LIMIT)
         retransmits = RETRANSMITS_LIMIT;

@@ -1,7 +1,7 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
-// The dongle: one TX frame over USB is one radio transaction is one RESULT frame back. It never
-// repeats a command by itself, so a host that died is silence, and silence stops the robot.
+// Dongle: one TX frame over USB is one radio transaction is one RESULT frame. It never repeats a
+// command by itself: a dead host is silence, and silence stops the robot.
 #ifndef T3_DONGLE_H
 #define T3_DONGLE_H
 
@@ -15,7 +15,7 @@
 #define T3_EXCHANGE_SKIPPED 8u
 
 #define T3_GAP_UNIT_US 250u
-// Longer than any exchange the chip can be set to (15 retries at 250 kbit/s): it has died.
+// Longer than the longest exchange (15 retries at 250 kbit/s): the radio chip has failed.
 #define T3_EXCHANGE_LIMIT_US UINT32_C(150000)
 
 enum t3_dongle_phase { T3_IDLE, T3_FIRST, T3_GAP, T3_SECOND };
@@ -39,18 +39,18 @@ struct t3_dongle {
 void t3_dongle_boot(struct t3_dongle *dongle, const struct t3_dongle_port *port,
                     uint8_t reset_cause);
 
-// Take a byte from USB.
+// Process a byte from USB.
 void t3_dongle_byte(struct t3_dongle *dongle, uint8_t byte);
 
-// Count a byte that was lost because it was not read in time.
+// Count a byte lost to an overrun.
 void t3_dongle_overrun(struct t3_dongle *dongle);
 
-// The radio has finished an exchange: acknowledged (with `size` bytes of answer, or none), or given
-// up after as many retransmits as it may make.
+// End of an exchange: acknowledged (with `size` bytes of reply, or none), or failed after the maximum
+// number of retransmissions.
 void t3_dongle_exchange(struct t3_dongle *dongle, bool acknowledged, uint8_t retransmits,
                         const uint8_t *answer, uint8_t size);
 
-// Call as often as the main loop runs.
+// Call in each pass of the main loop.
 void t3_dongle_tick(struct t3_dongle *dongle);
 
 #endif

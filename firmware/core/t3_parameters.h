@@ -1,7 +1,7 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
-// What a host may change on the robot. All but the microsteps live in RAM only: the host writes
-// them after each HELLO.
+// Parameters of the robot. All but the microsteps are in RAM only: the host writes them after each
+// HELLO.
 #ifndef T3_PARAMETERS_H
 #define T3_PARAMETERS_H
 
@@ -13,11 +13,11 @@ enum t3_parameter {
     T3_ACCELERATION,   // mrad/s^2
     T3_DECELERATION,   // mrad/s^2
     T3_TTL_MAX,        // ms
-    T3_MICROSTEPS,     // per full step; stored, and in force from the next boot on
+    T3_MICROSTEPS,     // per full step; stored, effective from the next boot
     T3_STEPS_PER_REV,  // full steps
     T3_GYRO_RANGE,     // deg/s
     T3_BATTERY_LOW,    // mV
-    T3_IDLE_OFF,       // ms at rest until the drivers lose their power; 0: they keep it
+    T3_IDLE_OFF,       // ms at rest until the drivers switch off; 0: never
     T3_INVERT_WHEELS,  // bit 0 left, bit 1 right
     T3_PARAMETERS
 };
@@ -29,15 +29,15 @@ struct t3_parameters {
 struct t3_bounds {
     int32_t initial, low, high;
     bool read_only;
-    bool at_rest;  // changes only while the robot stands
+    bool at_rest;  // writable only at rest
 };
 
-// Return the bounds of a parameter, NULL if there is none with this id.
+// Return the bounds of a parameter, NULL if the id is unknown.
 const struct t3_bounds *t3_parameter_bounds(uint8_t id);
 
 void t3_parameters_start(struct t3_parameters *parameters);
 
-// Change a parameter if everything allows it; return one of T3_RC_*.
+// Write a parameter if it exists, is writable and in range; return one of T3_RC_*.
 uint8_t t3_parameter_set(struct t3_parameters *parameters, uint8_t id, int32_t value, bool busy);
 
 #endif

@@ -1,65 +1,65 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
-// Everything the portable core asks of the hardware. A host test fills in these callbacks; on a
-// board they are a few lines over registers. The core never waits: each callback returns at once.
+// Hardware interface of the portable core. Host tests and boards implement these callbacks. The core
+// never blocks: each callback returns at once.
 #ifndef T3_PORT_H
 #define T3_PORT_H
 
 #include <stdbool.h>
 #include <stdint.h>
 
-// What the MPU6050 last measured, as its registers hold it.
+// Newest sample of the MPU6050, as raw register values.
 struct t3_imu {
     int16_t accel_x, accel_y, accel_z;
     int16_t temperature;
     int16_t gyro_x, gyro_y, gyro_z;
 };
 
-// Channels of `adc`: 0 to 7 are the distance sensors (front L, R, left F, B, rear L, R,
+// Channels of `adc`: 0 to 7 are the range sensors (front L, R, left F, B, rear L, R,
 // right F, B).
 #define T3_ADC_BATTERY 8u
-// A count of the converter is at most 1023; these are none.
+// Not counts of the converter, which are at most 1023.
 #define T3_ADC_NOT_MEASURED 0xFFFFu
 #define T3_ADC_FAULT 0xFFFEu
 
-// The robot's hardware. Step and direction pins are not here: t3_steps_tick returns their levels.
+// Hardware of the robot. Step and direction pins are not here: t3_steps_tick returns their levels.
 struct t3_port {
-    void *context;  // handed to every callback
+    void *context;  // passed to every callback
     // Microseconds since boot, modulo 2**32 (t3_steps.h has what a timer needs for that).
     uint32_t (*time_us)(void *context);
-    // FLUSH_TX, then exactly one W_ACK_PAYLOAD: two queued payloads make telemetry late for ever.
+    // FLUSH_TX, then exactly one W_ACK_PAYLOAD: with two queued payloads all later telemetry is late.
     void (*load_ack)(void *context, const uint8_t *payload, uint8_t size);
     // Power of both stepper drivers.
     void (*drivers)(void *context, bool on);
     bool (*estop_pressed)(void *context);
-    // The newest sample, false while the sensor does not answer.
+    // Newest sample; false while the sensor does not respond.
     bool (*imu)(void *context, struct t3_imu *sample);
-    // The newest 10-bit count of a channel.
+    // Newest 10-bit count of a channel.
     uint16_t (*adc)(void *context, uint8_t channel);
     void (*eeprom_read)(void *context, uint8_t address, uint8_t *data, uint8_t size);
     void (*eeprom_write)(void *context, uint8_t address, const uint8_t *data, uint8_t size);
-    // Anything hard to foresee (converter noise, timer jitter); only nonces are made with it.
+    // Unpredictable bits (converter noise, timer jitter); used for nonces only.
     uint32_t (*noise)(void *context);
-    // Keep the stepping interrupt out (and let it in again) while counters are read or written.
+    // Disable and enable the step interrupt around accesses to the counters.
     void (*lock)(void *context);
     void (*unlock)(void *context);
 };
 
-// The robot's own USB. Of the EEPROM it sees what t3_port's eeprom_write has asked for become true,
-// a cell at a time.
+// USB console of the robot. The cells requested by eeprom_write of t3_port become visible one at a
+// time.
 struct t3_console_port {
     void *context;
     // Bytes for the USB side, a whole frame at a time.
     void (*reply)(void *context, const uint8_t *wire, uint8_t size);
-    // Whether the radio chip holds what was set.
+    // Whether the radio chip holds its configuration.
     bool (*chip_ok)(void *context);
-    // Whether all that was to be written has been.
+    // Whether all EEPROM writes are complete.
     bool (*eeprom_settled)(void *context);
-    // Read the cells themselves, not what they ought to hold.
+    // Read the cells themselves, not the requested values.
     void (*eeprom_cells)(void *context, uint8_t address, uint8_t *data, uint8_t size);
 };
 
-// Configuration of the radio chip, as in a CFG frame.
+// Configuration of the radio chip, with the fields of a CFG frame.
 struct t3_radio_settings {
     uint8_t channel;      // 2400 MHz + this
     uint8_t rate;         // 0: 250 kbit/s, 1: 1 Mbit/s, 2: 2 Mbit/s
@@ -69,28 +69,28 @@ struct t3_radio_settings {
     uint8_t address[5];  // lowest first
 };
 
-// Channel and rate may be others at build time (make avr RADIO_CHANNEL=100 RADIO_RATE=0): a robot
-// keeps them for good.
+// Channel and rate are build options (make avr RADIO_CHANNEL=100 RADIO_RATE=0); those of a robot are
+// constant.
 #ifndef T3_RADIO_CHANNEL
 #define T3_RADIO_CHANNEL 82
 #endif
 #ifndef T3_RADIO_RATE
 #define T3_RADIO_RATE 1
 #endif
-// Shorter at 250 kbit/s, acknowledgements of 32 bytes would be cut off (data sheet 7.4.2).
+// A shorter delay cuts off acknowledgements of 32 bytes at 250 kbit/s (data sheet 7.4.2).
 #define T3_RETRY_DELAY (T3_RADIO_RATE == 0 ? 5 : 1)
-// Both ends start with these; the host's CFG may change the dongle's.
+// Defaults of both ends; CFG may change those of the dongle.
 #define T3_RADIO_DEFAULTS                                                                         \
     {T3_RADIO_CHANNEL, T3_RADIO_RATE, 3, T3_RETRY_DELAY, 4, {'T', '3', 'M', 'P', 'C'}}
 
-// The dongle's hardware. A radio answers each `send` by one call of t3_dongle_exchange.
+// Hardware of the dongle. The radio ends each `send` with one call of t3_dongle_exchange.
 struct t3_dongle_port {
     void *context;
     uint32_t (*time_us)(void *context);
     // Bytes for the USB side, a whole frame at a time.
     void (*reply)(void *context, const uint8_t *wire, uint8_t size);
     void (*send)(void *context, const uint8_t *payload, uint8_t size);
-    // Set the chip; false if it does not hold what was written.
+    // Configure the chip; false if it does not hold the written values.
     bool (*configure)(void *context, const struct t3_radio_settings *settings);
 };
 

@@ -28,7 +28,7 @@ static uint8_t header(uint8_t kind)
     return (uint8_t)(T3_VERSION << 4 | kind);
 }
 
-// Return whether every value is one that the protocol knows.
+// Return whether every value is valid.
 static bool read_command(const uint8_t *data, struct t3_packet *packet)
 {
     packet->ttl = data[4];
@@ -51,7 +51,7 @@ static bool read_hello(const uint8_t *data, struct t3_packet *packet)
     packet->host_us = t3_get32(data + 4);
     if (packet->tag)
         packet->nonce = data + 8;
-    // The flag must match the length; session 0 means none and cannot be started.
+    // Flag and length agree; session 0 means none and cannot be started.
     return packet->session && packet->what == (packet->tag ? 1 : 0);
 }
 
@@ -268,7 +268,7 @@ static uint8_t end_frame(struct t3_splitter *splitter)
     const bool bad = splitter->bad || splitter->left || size <= T3_CRC_SIZE;
     begin_frame(splitter);
     if (!begun)
-        return 0;  // zeros in a row: a sender may start with one to resynchronise
+        return 0;  // consecutive zeros: a sender may start with a zero to resynchronise
     if (bad) {
         splitter->frame_errors++;
         return 0;

@@ -12,7 +12,7 @@
 #define T3_FIRMWARE_MAJOR 1u
 #define T3_FIRMWARE_MINOR 0u
 
-#define T3_RADIO_LIMIT 32u  // bytes: the chip takes no more, and a wider claim is an attack
+#define T3_RADIO_LIMIT 32u  // bytes: maximum of the chip; a larger width is an attack
 #define T3_FRAME_LIMIT 78u  // bytes of a serial frame without CRC: a TX with two payloads has 68
 #define T3_CRC_SIZE 2u
 #define T3_WIRE_LIMIT (T3_FRAME_LIMIT + T3_CRC_SIZE + 2u)  // COBS adds one byte and the end one
@@ -29,7 +29,7 @@ enum { T3_STATE = 1, T3_PARAM, T3_INFO, T3_ACK, T3_AUX };
 #define T3_CMD_SIZE 14u
 #define T3_STATE_SIZE 32u
 #define T3_PARAM_SIZE 17u
-#define T3_INFO_SIZE 17u  // and a nonce from a keyed robot
+#define T3_INFO_SIZE 17u  // plus a nonce from a keyed robot
 #define T3_ACK_SIZE 5u
 #define T3_AUX_SIZE 32u
 
@@ -48,20 +48,20 @@ enum { T3_STATE = 1, T3_PARAM, T3_INFO, T3_ACK, T3_AUX };
 #define T3_STATUS_NO_SESSION 64u
 #define T3_STATUS_LIMITED 128u
 
-// What a POLL asks for.
+// Kinds of state that a POLL requests.
 enum { T3_POLL_STATE, T3_POLL_AUX, T3_POLL_INFO };
 // Verbs of an ACTION.
 enum { T3_RESET_ODOMETRY = 1, T3_CLEAR_COUNTERS };
-// Results in PARAM, ACK and, the last only there, KEY.
+// Results in PARAM, ACK and KEY; the last one in KEY only.
 enum { T3_RC_OK, T3_RC_UNKNOWN, T3_RC_RANGE, T3_RC_READ_ONLY, T3_RC_BUSY, T3_RC_FAILED };
 
 #define T3_AGE_NONE 0xFFFFu
 #define T3_RANGES 8u
 
-// Why a payload is none; the robot counts them apart.
+// Kinds of invalid payloads; the robot counts them separately.
 enum t3_fault { T3_GOOD, T3_BAD_VERSION, T3_BAD_LENGTH };
 
-// A radio payload from the host. Which fields mean something depends on the kind.
+// A radio payload from the host. The valid fields depend on the kind.
 struct t3_packet {
     uint8_t kind, session, seq;
     uint8_t what;  // CMD, HELLO: flags; PARAM_*: id; POLL: what; ACTION: verb
@@ -70,15 +70,15 @@ struct t3_packet {
     int32_t value;
     uint32_t host_us;
     const uint8_t *nonce;  // a signed HELLO's, else NULL
-    const uint8_t *tag;    // behind everything it signs, NULL if there is none
+    const uint8_t *tag;    // after the signed bytes; NULL if there is none
 };
 
-// Read a payload whole or not at all: a wrong length, or a value that no frame may have, is
-// T3_BAD_LENGTH; another version or an unknown kind T3_BAD_VERSION.
+// Decode a payload completely or not at all: a wrong length or an invalid value is T3_BAD_LENGTH;
+// another version or an unknown kind is T3_BAD_VERSION.
 enum t3_fault t3_decode(const uint8_t *data, uint8_t size, struct t3_packet *packet);
 
-// True for a CMD that asks for an emergency stop, whatever else is wrong with it: stopping is
-// always allowed.
+// Return whether a CMD requests an emergency stop, even if it is otherwise invalid: stopping is always
+// allowed.
 bool t3_asks_to_stop(const uint8_t *data, uint8_t size);
 
 struct t3_state {
@@ -103,7 +103,7 @@ struct t3_info {
     const uint8_t *nonce;  // NULL from a robot without a key
 };
 
-// What a robot counts, in the order of AUX; all modulo 2**16.
+// Counters of the robot, in the order of AUX, modulo 2**16.
 struct t3_counters {
     uint16_t received, duplicates, bad_session, stale, expired, bad_version, bad_length;
 };
@@ -135,7 +135,7 @@ enum { T3_ERR_UNKNOWN = 1, T3_ERR_MALFORMED, T3_ERR_BUSY };
 #define T3_PING_SIZE 6u
 #define T3_PONG_SIZE 21u
 
-// Status of a board in PONG, after id and echo of the PING.
+// Status of a board in PONG, after the id and echo of the PING.
 struct t3_pong {
     uint32_t time_us;
     bool chip_ok;
@@ -143,30 +143,30 @@ struct t3_pong {
     uint8_t reset_cause;
 };
 
-// Write the answer to a PING of T3_PING_SIZE bytes; return its size.
+// Write the reply to a PING of T3_PING_SIZE bytes; return its size.
 uint8_t t3_encode_pong(const uint8_t *ping, const struct t3_pong *pong, uint8_t *to);
 
 // CRC-16/IBM-3740, starting at 0xFFFF: 0x29B1 of "123456789".
 uint16_t t3_crc16(const uint8_t *data, uint8_t size);
 
-// Write a frame of 1 to T3_FRAME_LIMIT bytes as it goes over the line; return how many bytes that
-// are (at most T3_WIRE_LIMIT), 0 if the size is out of bounds.
+// Encode a frame of 1 to T3_FRAME_LIMIT bytes for the line; return the number of bytes (at most
+// T3_WIRE_LIMIT), 0 if the size is out of bounds.
 uint8_t t3_to_wire(const uint8_t *frame, uint8_t size, uint8_t *wire);
 
-// Cuts frames out of a byte stream, however it is damaged: in step again at the next zero byte.
+// Decodes frames from a byte stream; resynchronises at the next zero byte after any error.
 struct t3_splitter {
     uint8_t frame[T3_FRAME_LIMIT + T3_CRC_SIZE];
-    uint8_t size;  // of what is in `frame`
+    uint8_t size;  // number of bytes in `frame`
     uint8_t left;  // bytes left in the run
     bool begun, bad;
-    uint16_t frames;        // good ones
-    uint16_t crc_errors;    // well-formed, but another CRC
-    uint16_t frame_errors;  // too long, too short, or no COBS
+    uint16_t frames;        // valid frames
+    uint16_t crc_errors;    // well-formed, but with a wrong CRC
+    uint16_t frame_errors;  // too long, too short, or invalid COBS
 };
 
 void t3_splitter_start(struct t3_splitter *splitter);
-// Take a byte. When it completes a good frame, return the frame's size without CRC; the bytes are
-// in `frame` until the next call. Else return 0.
+// Process a byte. If it completes a valid frame, return its size without CRC; the bytes are in `frame`
+// until the next call. Otherwise return 0.
 uint8_t t3_splitter_byte(struct t3_splitter *splitter, uint8_t byte);
 
 #endif

@@ -68,7 +68,7 @@ static uint8_t act(struct t3_robot *robot, uint8_t verb)
 
 static void take_action(struct t3_robot *robot, const struct t3_packet *packet)
 {
-    // A host that missed the answer repeats the request: it gets the result, nothing is done twice.
+    // A host that missed the reply repeats the request; the action runs only once.
     if (!robot->action_done || packet->seq != robot->action_seq ||
         packet->what != robot->action_verb) {
         robot->action_rc = act(robot, packet->what);

@@ -47,7 +47,7 @@ static bool button(const struct t3_robot *robot)
 static void take_hello(struct t3_robot *robot, const struct t3_packet *packet,
                        const uint8_t *data, uint32_t received_us)
 {
-    // Accepted or not, INFO reports the current session and whether the robot has a key.
+    // Even after a rejection, INFO reports the current session and whether a key is stored.
     t3_answer_with(robot, T3_INFO, packet->seq, 0, 0);
     switch (t3_session_greet(&robot->session, robot->port, packet, data)) {
     case T3_GREETING_REFUSED:
@@ -63,9 +63,9 @@ static void take_hello(struct t3_robot *robot, const struct t3_packet *packet,
     robot->seq_known = robot->command_seen = robot->action_done = false;
     robot->seq = 0;
     robot->heard_us = received_us;
-    t3_freshness_start(&robot->freshness);
+    t3_stale_filter_start(&robot->stale_filter);
     // HELLO's own delay is the first one known: a burst held back right behind it is found.
-    t3_freshness_stale(&robot->freshness, received_us, packet->host_us, 0);
+    t3_stale_filter_check(&robot->stale_filter, received_us, packet->host_us, 0);
 }
 
 static bool clears_estop(const struct t3_robot *robot, const struct t3_packet *packet)
@@ -118,7 +118,7 @@ static void take_command(struct t3_robot *robot, const struct t3_packet *packet,
     const uint32_t longest = (uint32_t)parameter(robot, T3_TTL_MAX) * 1000u;
     if (ttl_us > longest)
         ttl_us = longest;
-    if (t3_freshness_stale(&robot->freshness, received_us, packet->host_us, ttl_us)) {
+    if (t3_stale_filter_check(&robot->stale_filter, received_us, packet->host_us, ttl_us)) {
         robot->counters.stale++;
         // A wish to stand is never too late; it does not count as a command otherwise.
         if (wants_to_stand(packet))
@@ -186,7 +186,7 @@ void t3_robot_packet(struct t3_robot *robot, const uint8_t *data, uint8_t size,
     }
     if (t3_asks_to_stop(data, size))
         latch_estop(robot);
-    // By default the next packet fetches a STATE, also after an invalid one.
+    // The reply to an invalid packet is STATE.
     t3_answer_with(robot, T3_STATE, 0, 0, 0);
     robot->answer_waits = true;
     robot->answer_from_us = received_us;

@@ -8,8 +8,8 @@
 
 #ifdef __AVR__
 
-// These counts are 2, 2, 2, 3 and 4 bytes, less three bits or more one. Bytes cost nothing to
-// rotate but their names; libgcc, which shifts bit by bit, needs 11200 cycles for a tag, this 6900.
+// These counts are 2, 2, 2, 3 and 4 bytes, minus three bits or plus one. Rotation by bytes costs no
+// instruction; a tag takes 6900 cycles instead of 11200 with the bitwise shifts of libgcc.
 #define T3_RIGHT_BY_ONE                                                                         \
     "bst %0,0\n\tlsr %7\n\tror %6\n\tror %5\n\tror %4\n\tror %3\n\tror %2\n\tror %1\n\tror %0\n\t" \
     "bld %7,7\n\t"

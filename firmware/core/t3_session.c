@@ -61,7 +61,7 @@ void t3_session_end(struct t3_session *session)
     session->id = 0;
 }
 
-// Constant time, so that a tag cannot be found byte by byte.
+// Constant time: the duration does not reveal the number of matching bytes.
 static bool same(const uint8_t *a, const uint8_t *b, uint8_t size)
 {
     uint8_t difference = 0;

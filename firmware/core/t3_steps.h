@@ -1,7 +1,7 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
 // Step pulses of both wheels by direct digital synthesis, in an interrupt at 20 kHz: a 32-bit phase
-// per wheel, a step when it overflows. It crosses zero smoothly and has 5e-6 steps/s of resolution.
+// per wheel, one step per overflow. Zero crossings are smooth; the resolution is 5e-6 steps/s.
 #ifndef T3_STEPS_H
 #define T3_STEPS_H
 
@@ -15,33 +15,33 @@
 enum { T3_LEFT, T3_RIGHT, T3_WHEELS };
 
 // Levels of the pins. A port writes the directions first, and lowers STEP no later than the next
-// tick, which returns it low: that is longer than any driver asks for.
+// tick, which returns it low: longer than the minimum pulse of every driver.
 #define T3_PIN_STEP_LEFT 1u
 #define T3_PIN_STEP_RIGHT 2u
 #define T3_PIN_BACK_LEFT 4u
 #define T3_PIN_BACK_RIGHT 8u
 
 struct t3_wheel {
-    uint32_t phase;     // 2**32 to a microstep
+    uint32_t phase;     // 2**32 per microstep
     int32_t increment;  // of the phase per tick
     int32_t count;      // microsteps issued, signed, modulo 2**32
-    bool back;          // direction sent to the driver
+    bool back;          // current direction of the driver
 };
 
-// Shared with the interrupt: from elsewhere only between lock and unlock of the port.
+// Shared with the interrupt: access elsewhere only between lock and unlock of the port.
 struct t3_steps {
     struct t3_wheel wheels[T3_WHEELS];
-    uint32_t time_us;     // of the last tick, modulo 2**32
-    uint8_t inverted;     // bit 0 left, bit 1 right: the motor is wired or mounted the other way
+    uint32_t time_us;     // time of the last tick, modulo 2**32
+    uint8_t inverted;     // bit 0 left, bit 1 right: the motor is reversed
     uint32_t top_speed;   // urad/s at the limit of the step rate
     uint32_t gain;        // phase per tick and urad/s, times 2**(32 - gain_shift)
     uint8_t gain_shift;
 };
 
-// Stand still at zero, for motors with so many microsteps per revolution of the wheel.
+// Reset to zero at rest, for a number of microsteps per revolution of the wheel.
 void t3_steps_start(struct t3_steps *steps, uint32_t microsteps_per_rev);
 
-// Return the increment for a speed in urad/s; no faster than the step rate allows.
+// Return the increment of a speed in urad/s, limited by the step rate.
 int32_t t3_steps_increment(const struct t3_steps *steps, int32_t speed);
 
 // Return whether the wheel steps in this tick. Its direction may have changed.
@@ -49,9 +49,9 @@ static inline bool t3_wheel_tick(struct t3_wheel *wheel)
 {
     const int32_t increment = wheel->increment;
     if (!increment)
-        return false;  // what a robot does most: at rest a tick takes 128 cycles for 186
+        return false;  // the usual case: at rest a tick takes 128 cycles, not 186
     if ((increment < 0) != wheel->back) {
-        // The driver needs its direction settled before a step (DRV8825: 650 ns): step from the
+        // The driver requires a stable direction before a step (DRV8825: 650 ns): step from the
         // next tick on.
         wheel->back = increment < 0;
         return false;
@@ -87,9 +87,9 @@ static inline uint8_t t3_steps_tick(struct t3_steps *steps)
     return (uint8_t)(pins ^ (uint8_t)(steps->inverted << 2));
 }
 
-// Return the time from what an interrupt-free section read: the time of the last tick, the timer
-// since (us), and whether its next tick was waiting. A tick that waits while the timer is already
-// in its second half became due after the timer was read.
+// Return the time from values read with interrupts disabled: the time of the last tick, the timer
+// since then (us), and whether the next tick is pending. A tick that is pending while the timer is in
+// its second half became due after the timer was read.
 static inline uint32_t t3_time_us(uint32_t last_tick_us, uint8_t timer_us, bool tick_waits)
 {
     const uint32_t now = last_tick_us + timer_us;

@@ -1,7 +1,7 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
-// Records in the EEPROM, each with a CRC: a board that never stored anything, or lost its supply
-// while storing, is distinguishable from one with a valid record.
+// Records in EEPROM, each with a CRC, which detects blank records and writes interrupted by a loss of
+// power.
 #ifndef T3_STORE_H
 #define T3_STORE_H
 
@@ -9,7 +9,7 @@
 
 #define T3_STORE_MICROSTEPS 0u  // u16
 #define T3_STORE_KEY 8u         // 16 bytes
-#define T3_STORE_KEY_MARK 26u   // a byte: 0xFF, or something else from before a key is written
+#define T3_STORE_KEY_MARK 26u   // a byte: 0xFF, or another value during the write of a key
                                 // until it is verified
 #define T3_STORE_BOOTS 32u      // u32
 #define T3_STORE_END 40u
@@ -21,7 +21,7 @@ enum t3_record t3_store_read(const struct t3_port *port, uint8_t address, uint8_
                              uint8_t size);
 void t3_store_write(const struct t3_port *port, uint8_t address, const uint8_t *data,
                     uint8_t size);
-// Make a record blank again.
+// Erase a record.
 void t3_store_erase(const struct t3_port *port, uint8_t address, uint8_t size);
 
 #endif

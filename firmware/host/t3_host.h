@@ -47,7 +47,7 @@ void t3_host_robot_poke_eeprom(struct t3_host_robot *host, uint8_t address, uint
 uint8_t t3_host_robot_cell(const struct t3_host_robot *host, uint8_t address);
 void t3_host_robot_set_cell_us(struct t3_host_robot *host, uint32_t us);
 void t3_host_robot_wear(struct t3_host_robot *host, uint8_t address, bool worn);
-// USB of the robot board: bytes in; take the bytes out (at most `room`).
+// USB console: feed bytes; take its output (at most `room`).
 void t3_host_robot_usb(struct t3_host_robot *host, const uint8_t *data, uint32_t size);
 uint32_t t3_host_robot_usb_take(struct t3_host_robot *host, uint8_t *to, uint32_t room);
 bool t3_host_robot_writing(const struct t3_host_robot *host);  // a key, that came over USB

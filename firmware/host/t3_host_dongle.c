@@ -28,7 +28,7 @@ static void reply(void *context, const uint8_t *wire, uint8_t size)
 {
     struct t3_host_dongle *host = context;
     if (host->written_size + size > ROOM)
-        return;  // without a reader, bytes are lost as on a serial line
+        return;  // buffer full: lost, as on a serial line
     memcpy(host->written + host->written_size, wire, size);
     host->written_size += size;
 }

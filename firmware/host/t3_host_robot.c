@@ -23,8 +23,8 @@ struct t3_host_robot {
     struct t3_console console;
     struct t3_console_port usb;
     bool chip_ok;
-    uint8_t said[USB_ROOM];
-    uint32_t said_size;
+    uint8_t usb_output[USB_ROOM];
+    uint32_t usb_output_size;
     uint8_t ack[T3_RADIO_LIMIT], ack_size;
     uint32_t loads;
     bool powered, pressed, imu_answers;
@@ -123,10 +123,10 @@ static void eeprom_write(void *context, uint8_t address, const uint8_t *data, ui
 static void reply(void *context, const uint8_t *wire, uint8_t size)
 {
     struct t3_host_robot *host = context;
-    if (host->said_size + size > USB_ROOM)
-        return;  // without a reader, bytes are lost as on a serial line
-    memcpy(host->said + host->said_size, wire, size);
-    host->said_size += size;
+    if (host->usb_output_size + size > USB_ROOM)
+        return;  // buffer full: lost, as on a serial line
+    memcpy(host->usb_output + host->usb_output_size, wire, size);
+    host->usb_output_size += size;
 }
 
 static bool chip_ok(void *context)
@@ -207,7 +207,7 @@ void t3_host_robot_boot(struct t3_host_robot *host, uint8_t reset_cause, uint32_
     host->since_tick_us = 0;
     host->ack_size = 0;
     host->noise = 0;  // a board without any: what hangs on it must still hold
-    host->powered = true;  // pins float until the firmware configures them
+    host->powered = true;  // pins float until the firmware drives them
     memcpy(host->eeprom, host->cells, sizeof host->eeprom);
     host->since_cell_us = 0;
     t3_robot_boot(&host->robot, &host->port, reset_cause, T3_SETTLE_US);
@@ -295,10 +295,10 @@ void t3_host_robot_poke_time(struct t3_host_robot *host, uint32_t to_us)
     robot->heard_us += by;
     robot->answer_from_us += by;
     robot->loaded_us += by;
-    robot->freshness.since += by;
-    robot->freshness.before_since += by;
-    robot->freshness.least += by;
-    robot->freshness.before_least += by;
+    robot->stale_filter.window_start += by;
+    robot->stale_filter.previous_start += by;
+    robot->stale_filter.minimum += by;
+    robot->stale_filter.previous_minimum += by;
 }
 
 uint32_t t3_host_robot_time(const struct t3_host_robot *host)
@@ -397,10 +397,10 @@ void t3_host_robot_usb(struct t3_host_robot *host, const uint8_t *data, uint32_t
 
 uint32_t t3_host_robot_usb_take(struct t3_host_robot *host, uint8_t *to, uint32_t room)
 {
-    const uint32_t size = host->said_size < room ? host->said_size : room;
-    memcpy(to, host->said, size);
-    host->said_size -= size;
-    memmove(host->said, host->said + size, host->said_size);
+    const uint32_t size = host->usb_output_size < room ? host->usb_output_size : room;
+    memcpy(to, host->usb_output, size);
+    host->usb_output_size -= size;
+    memmove(host->usb_output, host->usb_output + size, host->usb_output_size);
     return size;
 }
 

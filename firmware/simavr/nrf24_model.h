@@ -1,7 +1,7 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
-// nRF24L01+ as its registers show it: Product Specification 1.0 (Nordic, September 2008). Times are
-// cycles of 16 MHz, the same clock for everything.
+// Register-level model of the nRF24L01+: Product Specification 1.0 (Nordic, September 2008). Times are
+// in cycles of 16 MHz, one clock for everything.
 #ifndef NRF24_MODEL_H
 #define NRF24_MODEL_H
 
@@ -24,22 +24,22 @@ struct nrf24_fifo {
 
 enum nrf24_phase { NRF24_QUIET, NRF24_SETTLING, NRF24_ON_AIR, NRF24_ACK_COMES, NRF24_NO_ACK };
 
-// What a data sheet forbids or a firmware should not do, counted.
+// Counters of violations of the data sheet, and of operations that firmware should avoid.
 struct nrf24_faults {
     uint32_t early_spi;     // within 100 ms of power
     uint32_t early_ce;      // within 4.5 ms of PWR_UP
     uint32_t ack_damaged;   // flushed while an acknowledgement was sent from there
     uint32_t overfull;      // payload written to a full FIFO
-    uint32_t queued_acks;   // a second acknowledgement payload behind a waiting one
-    uint32_t unknown;       // commands that are none
-    uint32_t unheard;       // packets that found the RX FIFO full
+    uint32_t queued_acks;   // a second acknowledgement payload queued behind another
+    uint32_t unknown;       // unknown commands
+    uint32_t rx_overflows;       // packets dropped because the RX FIFO was full
 };
 
 struct nrf24 {
     uint8_t registers[0x20];
     uint8_t address[3][5];  // pipe 0, pipe 1, transmit
     struct nrf24_fifo rx, tx;
-    bool powered;           // has a supply
+    bool powered;           // supply on
     bool csn, ce, irq;      // levels
     uint64_t powered_at, awake_at, listening_at;
     uint8_t code, at, buffer[NRF24_WIDTH];  // of the command in progress
@@ -49,17 +49,17 @@ struct nrf24 {
     uint8_t pid, repeats;
     struct nrf24_packet ack;
     // Receiver.
-    bool heard_any;
-    uint8_t heard_pid;
-    struct nrf24_packet heard;
+    bool received_any;
+    uint8_t last_pid;
+    struct nrf24_packet last_packet;
     bool ack_unconfirmed, ack_damaged;
     uint64_t ack_until;
     uint32_t sent, received, duplicates, attempts;
     struct nrf24_faults faults;
 };
 
-// What lies between two radios.
-struct ether {
+// Radio channel between two transceivers.
+struct radio_channel {
     struct nrf24 *radios[2];
     double loss[2];  // probability per packet: to and from the receiver
     bool jammed;
@@ -70,10 +70,10 @@ void nrf24_power(struct nrf24 *radio, bool on, uint64_t now);
 void nrf24_select(struct nrf24 *radio, bool csn, uint64_t now);
 void nrf24_enable(struct nrf24 *radio, bool ce, uint64_t now);
 uint8_t nrf24_swap(struct nrf24 *radio, uint8_t byte, uint64_t now);
-// Put a packet into the receiver as if some other transmitter had sent it.
+// Deliver a packet to the receiver, as from another transmitter.
 bool nrf24_inject(struct nrf24 *radio, const uint8_t *data, uint8_t size, uint8_t width);
 
-// Let the air do what happens until `now`.
-void ether_run(struct ether *ether, uint64_t now);
+// Advance the channel to `now`.
+void radio_channel_run(struct radio_channel *channel, uint64_t now);
 
 #endif

@@ -31,7 +31,7 @@ struct wheel {
 
 struct simulation {
     struct board boards[BOARDS];
-    struct ether ether;
+    struct radio_channel channel;
     uint64_t now;
     struct wheel wheels[2];
     bool pressed;
@@ -117,9 +117,9 @@ struct simulation *t3_sim_new(const char *dongle_elf, const char *robot_elf, uin
     const char *elfs[BOARDS] = {dongle_elf, robot_elf};
     if (!sim)
         return NULL;
-    sim->ether.random = seed * 2 + 1;
+    sim->channel.random = seed * 2 + 1;
     for (int i = 0; i < BOARDS; i++) {
-        sim->ether.radios[i] = &sim->boards[i].radio;
+        sim->channel.radios[i] = &sim->boards[i].radio;
         if (!board_open(&sim->boards[i], &LAYOUTS[i], elfs[i])) {
             t3_sim_free(sim);
             return NULL;
@@ -153,7 +153,7 @@ static void step(struct simulation *sim, uint64_t until)
         board_run_uart(&sim->boards[i], sim->now);
         board_run(&sim->boards[i], until);
     }
-    ether_run(&sim->ether, until);
+    radio_channel_run(&sim->channel, until);
     sim->now = until;
 }
 
@@ -247,13 +247,13 @@ uint32_t t3_sim_overruns(const struct simulation *sim)
 
 void t3_sim_loss(struct simulation *sim, double down, double up)
 {
-    sim->ether.loss[0] = down;
-    sim->ether.loss[1] = up;
+    sim->channel.loss[0] = down;
+    sim->channel.loss[1] = up;
 }
 
 void t3_sim_jam(struct simulation *sim, bool jammed)
 {
-    sim->ether.jammed = jammed;
+    sim->channel.jammed = jammed;
 }
 
 void t3_sim_radio_power(struct simulation *sim, int board, bool on)
@@ -274,11 +274,11 @@ void t3_sim_answer(struct simulation *sim, const uint8_t *data, uint8_t size)
     memcpy(waiting->packets[0].data, data, size);
 }
 
-uint8_t t3_sim_heard(const struct simulation *sim, uint8_t *data)
+uint8_t t3_sim_last_packet(const struct simulation *sim, uint8_t *data)
 {
     const struct nrf24 *radio = &sim->boards[ROBOT].radio;
-    memcpy(data, radio->heard.data, radio->heard.width);
-    return radio->heard.width;
+    memcpy(data, radio->last_packet.data, radio->last_packet.width);
+    return radio->last_packet.width;
 }
 
 uint8_t t3_sim_radio_register(const struct simulation *sim, int board, uint8_t which)

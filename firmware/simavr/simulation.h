@@ -13,11 +13,11 @@ struct simulation;
 struct simulation *t3_sim_new(const char *dongle_elf, const char *robot_elf, uint64_t seed);
 void t3_sim_free(struct simulation *sim);
 void t3_sim_run(struct simulation *sim, uint32_t us);
-// Run until the dongle has sent a byte, at most so long; return whether it has.
+// Run until the dongle has sent a byte, or until the limit; return whether it has sent one.
 bool t3_sim_run_to_byte(struct simulation *sim, uint32_t us);
 uint64_t t3_sim_cycles(const struct simulation *sim);  // 16 to a microsecond
 
-// Serial line, paced at 500000 baud both ways. `at` is the time of the last bit of a byte.
+// Serial line at 500000 baud both ways. `at` is the time of the last bit of a byte.
 void t3_sim_write(struct simulation *sim, const uint8_t *data, uint32_t size);
 uint32_t t3_sim_read(struct simulation *sim, uint8_t *data, uint64_t *at, uint32_t room);
 uint32_t t3_sim_overruns(const struct simulation *sim);
@@ -33,8 +33,8 @@ void t3_sim_radio_power(struct simulation *sim, int board, bool on);
 bool t3_sim_inject(struct simulation *sim, const uint8_t *data, uint8_t size, uint8_t width);
 // Let this be what the robot's radio answers next, whatever its firmware has loaded.
 void t3_sim_answer(struct simulation *sim, const uint8_t *data, uint8_t size);
-// The last packet received by the radio of the robot; its width, 0 without one.
-uint8_t t3_sim_heard(const struct simulation *sim, uint8_t *data);
+// The last packet that the radio of the robot received; its width, 0 if there is none.
+uint8_t t3_sim_last_packet(const struct simulation *sim, uint8_t *data);
 uint8_t t3_sim_radio_register(const struct simulation *sim, int board, uint8_t which);
 uint8_t t3_sim_waiting_acks(const struct simulation *sim);
 // sent, received, duplicates, attempts, then what struct nrf24_faults counts, in its order.

@@ -1,7 +1,7 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
-// What the fuzzers share: a generator that gives the same numbers everywhere, and a check that
-// prints what failed.
+// Shared by the fuzzers: a random generator with equal numbers everywhere, and a check that reports
+// what failed.
 #ifndef FUZZ_H
 #define FUZZ_H
 

@@ -1,7 +1,7 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
-// Well-framed nonsense, damaged keys, packets and resets at once: the key is only ever that of a
-// complete KEY frame, and in the state between two keys no session starts.
+// Well-framed nonsense, damaged keys, packets and resets at once: the key is only ever what a whole
+// KEY frame requested, completely or not at all; during a write no session is accepted.
 
 #include <stdbool.h>
 #include <stdio.h>
@@ -71,7 +71,7 @@ static void drive(struct t3_host_robot *robot, uint8_t session)
     t3_host_robot_packet(robot, data, T3_CMD_SIZE);
 }
 
-// After a reset the EEPROM holds the old key, the requested one, or an invalid one.
+// After a reset the record is the old key, the new key, or an invalid record.
 static void check_cells(struct t3_host_robot *robot, const uint8_t *before)
 {
     uint8_t record[T3_KEY_SIZE + T3_CRC_SIZE];
@@ -87,7 +87,7 @@ static void check_cells(struct t3_host_robot *robot, const uint8_t *before)
     CHECK(!memcmp(record, wanted, T3_KEY_SIZE) || !memcmp(record, before, T3_KEY_SIZE));
 }
 
-static void hear(struct t3_host_robot *robot, struct t3_splitter *splitter)
+static void read_console(struct t3_host_robot *robot, struct t3_splitter *splitter)
 {
     uint8_t out[4096];
     const uint32_t size = t3_host_robot_usb_take(robot, out, sizeof out);
@@ -141,7 +141,7 @@ int main(void)
         CHECK(!t3_host_robot_writing(robot) ||
               !(t3_host_robot_status(robot) & (T3_STATUS_ENABLED | T3_STATUS_MOVING)));
         check_cells(robot, before);
-        hear(robot, &splitter);
+        read_console(robot, &splitter);
         if (fuzz_below(500) == 0) {
             // Damaged or not, the next key puts things right.
             t3_host_robot_boot(robot, 4, fuzz_next());
@@ -149,7 +149,7 @@ int main(void)
             for (uint8_t j = 0; j < T3_KEY_SIZE; j++)
                 wanted[j] = t3_host_robot_cell(robot, (uint8_t)(T3_STORE_KEY + j));
             t3_splitter_start(&splitter);
-            hear(robot, &splitter);
+            read_console(robot, &splitter);
         }
     }
     printf("console: %lu frames, %lu EEPROM writes\n", FRAMES,

@@ -54,7 +54,7 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     't3_sim_radio_power': (None, (c_void_p, c_int, c_bool)),
     't3_sim_inject': (c_bool, (c_void_p, c_char_p, c_uint8, c_uint8)),
     't3_sim_answer': (None, (c_void_p, c_char_p, c_uint8)),
-    't3_sim_heard': (c_uint8, (c_void_p, POINTER(c_uint8))),
+    't3_sim_last_packet': (c_uint8, (c_void_p, POINTER(c_uint8))),
     't3_sim_radio_register': (c_uint8, (c_void_p, c_int, c_uint8)),
     't3_sim_waiting_acks': (c_uint8, (c_void_p,)),
     't3_sim_radio_counts': (None, (c_void_p, c_int, POINTER(c_uint32))),
@@ -125,7 +125,7 @@ class RadioCounts(NamedTuple):
     overfull: int
     queued_acks: int
     unknown: int
-    unheard: int
+    rx_overflows: int
 
 
 class Boards:
@@ -269,7 +269,7 @@ class Boards:
     def last_packet(self) -> bytes:
         """Return the last packet that the radio of the robot received."""
         data = (c_uint8 * 32)()
-        size = self.call('heard', data)
+        size = self.call('last_packet', data)
         return bytes(data[:size])
 
     def eeprom(self, address: int, size: int) -> bytes:

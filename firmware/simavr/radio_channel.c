@@ -22,15 +22,15 @@ static uint64_t retry_cycles(const struct nrf24 *radio)
 }
 
 // xorshift64*, G. Marsaglia's generator with S. Vigna's multiplier.
-static double draw(struct ether *ether)
+static double draw(struct radio_channel *channel)
 {
-    ether->random ^= ether->random >> 12;
-    ether->random ^= ether->random << 25;
-    ether->random ^= ether->random >> 27;
-    return (double)(ether->random * UINT64_C(2685821657736338717) >> 11) * 0x1p-53;
+    channel->random ^= channel->random >> 12;
+    channel->random ^= channel->random << 25;
+    channel->random ^= channel->random >> 27;
+    return (double)(channel->random * UINT64_C(2685821657736338717) >> 11) * 0x1p-53;
 }
 
-static bool hears(const struct nrf24 *from, const struct nrf24 *to, uint64_t begun_at)
+static bool receives(const struct nrf24 *from, const struct nrf24 *to, uint64_t begun_at)
 {
     const uint8_t *a = from->registers, *b = to->registers;
     return nrf24_awake(to, begun_at) && to->ce && b[CONFIG] & PRIM_RX && begun_at >= to->listening_at &&
@@ -41,18 +41,18 @@ static bool hears(const struct nrf24 *from, const struct nrf24 *to, uint64_t beg
            !memcmp(from->address[2], to->address[0], 5);
 }
 
-// A packet ends: return whether the receiver acknowledges it, and begin that.
+// End of a packet at the receiver: return whether it is acknowledged, and begin the acknowledgement.
 static bool arrive(const struct nrf24 *from, struct nrf24 *to, uint64_t now)
 {
     const struct nrf24_packet *packet = &from->tx.packets[0];
-    const bool again = to->heard_any && to->heard_pid == from->pid &&
-                       to->heard.width == packet->width &&
-                       !memcmp(to->heard.data, packet->data, packet->width);
+    const bool again = to->received_any && to->last_pid == from->pid &&
+                       to->last_packet.width == packet->width &&
+                       !memcmp(to->last_packet.data, packet->data, packet->width);
     if (again) {
         to->duplicates++;
     } else {
         if (to->rx.count == NRF24_DEPTH) {
-            to->faults.unheard++;
+            to->faults.rx_overflows++;
             return false;
         }
         // A new packet confirms the reception of the previous acknowledgement.
@@ -61,9 +61,9 @@ static bool arrive(const struct nrf24 *from, struct nrf24 *to, uint64_t now)
             to->ack_unconfirmed = false;
             nrf24_flag(to, TX_DS);
         }
-        to->heard_any = true;
-        to->heard_pid = from->pid;
-        to->heard = *packet;
+        to->received_any = true;
+        to->last_pid = from->pid;
+        to->last_packet = *packet;
         to->rx.packets[to->rx.count++] = *packet;
         to->received++;
         nrf24_flag(to, RX_DR);
@@ -75,22 +75,22 @@ static bool arrive(const struct nrf24 *from, struct nrf24 *to, uint64_t now)
     return true;
 }
 
-static void end_packet(struct ether *ether, struct nrf24 *from, struct nrf24 *to)
+static void end_packet(struct radio_channel *channel, struct nrf24 *from, struct nrf24 *to)
 {
     const uint64_t now = from->next_at;
-    const bool down = draw(ether) >= ether->loss[0] && !ether->jammed;
-    const bool up = draw(ether) >= ether->loss[1] && !ether->jammed;
+    const bool down = draw(channel) >= channel->loss[0] && !channel->jammed;
+    const bool up = draw(channel) >= channel->loss[1] && !channel->jammed;
     from->sent_at = now;
     from->attempts++;
     from->phase = NRF24_NO_ACK;
     from->next_at = now + retry_cycles(from);
     const uint64_t begun_at = now - air_cycles(from, from->tx.packets[0].width);
-    if (!down || !hears(from, to, begun_at) || !arrive(from, to, now))
+    if (!down || !receives(from, to, begun_at) || !arrive(from, to, now))
         return;
     from->ack.width = 0;
     if (to->ack_unconfirmed)
         from->ack = to->tx.packets[0];
-    // One that takes longer than ARD meets the repetition.
+    // An acknowledgement longer than ARD collides with the retransmission.
     if (!up || to->ack_until > from->next_at || memcmp(from->address[0], to->address[0], 5))
         return;
     from->phase = NRF24_ACK_COMES;
@@ -133,10 +133,10 @@ static void repeat(struct nrf24 *from)
     nrf24_flag(from, MAX_RT);
 }
 
-static void step(struct ether *ether, struct nrf24 *from, struct nrf24 *to)
+static void step(struct radio_channel *channel, struct nrf24 *from, struct nrf24 *to)
 {
     if (!from->powered || !from->tx.count) {
-        from->phase = NRF24_QUIET;  // flushed in mid-air
+        from->phase = NRF24_QUIET;  // flushed during transmission
         return;
     }
     switch (from->phase) {
@@ -145,7 +145,7 @@ static void step(struct ether *ether, struct nrf24 *from, struct nrf24 *to)
         from->next_at += air_cycles(from, from->tx.packets[0].width);
         return;
     case NRF24_ON_AIR:
-        end_packet(ether, from, to);
+        end_packet(channel, from, to);
         return;
     case NRF24_ACK_COMES:
         end_ack(from, to);
@@ -158,11 +158,11 @@ static void step(struct ether *ether, struct nrf24 *from, struct nrf24 *to)
     }
 }
 
-void ether_run(struct ether *ether, uint64_t now)
+void radio_channel_run(struct radio_channel *channel, uint64_t now)
 {
     for (int i = 0; i < 2; i++) {
-        struct nrf24 *from = ether->radios[i], *to = ether->radios[1 - i];
+        struct nrf24 *from = channel->radios[i], *to = channel->radios[1 - i];
         while (from->phase != NRF24_QUIET && from->next_at <= now)
-            step(ether, from, to);
+            step(channel, from, to);
     }
 }
