@@ -153,7 +153,7 @@ class RadioRobot(RobotInterface):
 
     def apply(self, command: RobotCommand, now_ns: int) -> str:
         """Follow ``command`` from the next cycle on; return the reason for a rejection."""
-        if self._slip_monitor.refuses(command, now_ns / NANOSECONDS):
+        if self._slip_monitor.rejects(command, now_ns / NANOSECONDS):
             return SLIP_STOP_REASON
         return self._limiter.accept(command, now_ns)
 
@@ -219,7 +219,7 @@ class RadioRobot(RobotInterface):
                 )
         slipping_for = self._odometry.slipping_for
         now = self._now_ns / NANOSECONDS
-        if self._slip_monitor.decide(slipping_for, self._parameters.slip_stop, now):
+        if self._slip_monitor.update(slipping_for, self._parameters.slip_stop, now):
             self._limiter.stop(SLIP_STOP_REASON, self._now_ns)
         self._state = self._make_state(telemetry)
         self._new_states.append(self._state)

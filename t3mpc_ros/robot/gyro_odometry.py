@@ -1,6 +1,20 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Gyro odometry: error-state Kalman filter over wheel angles and yaw gyro, with slip detection."""
+"""Gyro odometry: error-state Kalman filter over wheel angles and yaw gyro, with slip detection.
+
+The steps of a stepper motor are issued pulses, not motion; a gyro has a zero-rate offset (bias)
+and a scale error. The filter over (x, y, yaw, bias, scale) combines both:
+
+- The *difference* between the gyro rate and the rate of the steps, delayed as in the gyro,
+  corrects the travels of the wheels before the pose is integrated, so yaw has no lag.
+- The gain follows from the white noise of both. Bias and scale are errors of another kind:
+  against steps alone they cannot be separated from unequal wheels and a wrong wheel separation,
+  so motion does not change their estimates. They are states of which only the correlation with
+  the pose is kept: ten turns one way leave a yaw uncertainty of 20 pi times the scale tolerance,
+  and turning back removes it.
+- The bias is measured at every standstill. Through the correlation this also corrects the yaw
+  drift that the bias caused; the scale is never estimated.
+"""
 
 from dataclasses import dataclass
 import math
@@ -23,19 +37,35 @@ Array = npt.NDArray[np.float64]
 
 DATA_SHEET = 'data sheet PS-MPU-6000A r3.4'
 
+# Memory of the filter besides pose and covariance; rates in rad/s, times in s. SUSPECT is a bias
+# measurement that needs confirmation.
+(
+    BIAS, CALIBRATED,
+    FIRST_POLE, SECOND_POLE, LAST_RATE, LAST_DT,
+    DISAGREEMENT, DISAGREES_FOR, SLIPPING,
+    STANDSTILL_FOR, PUSHED, COUNT, TIME, SUM, SQUARES,
+    SUSPECT, SUSPECT_VARIANCE,
+) = range(17)  # fmt: skip
+MEMORY_SIZE = 17
+"""Number of these entries."""
+STANDSTILL_RATE = 1e-4
+"""rad/s, far below the gyro noise: the response of its filter to a turn has decayed."""
+MIN_SAMPLES = 20
+"""Smallest number of samples for a standard deviation."""
+
 
 @dataclass(frozen=True)
 class GyroOdometryParameters(WheelOdometryParameters):
-    """How far steps and gyro are believed, and when they are said to disagree."""
+    """Errors of steps and gyro, and thresholds of the slip detection."""
 
     use_gyro: bool = parameter(
         True,
-        'let the gyro help; without it there are the steps alone, and no slip is seen',
+        'use the gyro; without it the odometry uses the steps alone and detects no slip',
         dynamic=True,
     )
     gyro_noise: float = parameter(
         8.7e-5,
-        'noise of the rate: a turn summed for a time t gets the variance noise² t',
+        'noise density of the gyro: a turn integrated over a time t has the variance noise² t',
         unit='rad/s/√Hz',
         low=1e-7,
         high=1.0,
@@ -44,14 +74,15 @@ class GyroOdometryParameters(WheelOdometryParameters):
     )
     gyro_scale_tolerance: float = parameter(
         0.001,
-        'spread of the relative error of scale, after calibration by ten turns; 0.03 without',
+        'standard deviation of the relative scale error after a calibration over ten turns; 0.03 '
+        'without calibration',
         low=0.0,
         high=0.5,
         dynamic=True,
     )
     gyro_bias_limit: float = parameter(
         0.7,
-        'largest bias that is believed; half of it is how uncertain an unknown one is',
+        'largest accepted bias; half of it is the standard deviation of an unknown bias',
         unit='rad/s',
         low=1e-3,
         high=10.0,
@@ -59,7 +90,7 @@ class GyroOdometryParameters(WheelOdometryParameters):
     )
     gyro_bias_drift: float = parameter(
         5e-5,
-        'random walk of the bias: spread after one second; warming up is faster than later',
+        'random walk of the bias: standard deviation after one second; larger during warm-up',
         unit='rad/s/√s',
         low=0.0,
         high=1.0,
@@ -67,7 +98,7 @@ class GyroOdometryParameters(WheelOdometryParameters):
     )
     gyro_delay: float = parameter(
         0.0048,
-        'delay of the low-pass filter in the gyro, here two equal poles (which then pass 43 Hz)',
+        'delay of the low-pass filter of the gyro, modelled as two equal poles (43 Hz)',
         unit='s',
         low=1e-4,
         high=0.1,
@@ -76,7 +107,7 @@ class GyroOdometryParameters(WheelOdometryParameters):
     )
     gyro_hold: float = parameter(
         0.05,
-        'for how long one sample may speak; of a longer gap the gyro knows but a part',
+        'longest time represented by one gyro sample; the rest of a longer gap uses the steps',
         unit='s',
         low=1e-3,
         high=10.0,
@@ -84,8 +115,8 @@ class GyroOdometryParameters(WheelOdometryParameters):
     )
     slip_threshold: float = parameter(
         0.25,
-        'yaw rate by which gyro and steps must disagree for slip; three times the tolerance of '
-        'the scale is allowed on top',
+        'yaw rate difference between gyro and steps that indicates slip, plus three times the '
+        'scale tolerance',
         unit='rad/s',
         low=0.01,
         high=10.0,
@@ -93,7 +124,7 @@ class GyroOdometryParameters(WheelOdometryParameters):
     )
     slip_time: float = parameter(
         0.15,
-        'for how long they must; a third of it smooths the disagreement',
+        'time the difference must last; a third of it is the smoothing time constant',
         unit='s',
         low=0.0,
         high=10.0,
@@ -101,14 +132,14 @@ class GyroOdometryParameters(WheelOdometryParameters):
     )
     slip_inflation: float = parameter(
         3000.0,
-        'factor on the variance of the paths of the wheels while they disagree',
+        'factor on the variance of the wheel travel while gyro and steps disagree',
         low=1.0,
         high=1e6,
         dynamic=True,
     )
     standstill_time: float = parameter(
         1.0,
-        'time without a step over which the bias is averaged, again and again',
+        'standstill time over which the bias is averaged, repeatedly',
         unit='s',
         low=0.1,
         high=60.0,
@@ -116,8 +147,8 @@ class GyroOdometryParameters(WheelOdometryParameters):
     )
     standstill_spread: float = parameter(
         0.0035,
-        'largest standard deviation of the samples at a standstill; if larger, or if a standing '
-        'robot turns by more than three times this rate, somebody moves it',
+        'largest standard deviation of the gyro at a standstill; beyond it, or at a yaw rate of '
+        'more than three times this value, the robot is being moved',
         unit='rad/s',
         low=1e-5,
         high=1.0,
@@ -125,7 +156,7 @@ class GyroOdometryParameters(WheelOdometryParameters):
     )
 
     def check_consistency(self) -> None:
-        """Raise ParameterError when slip could not be told from a robot being pushed."""
+        """Raise ParameterError when slip and a pushed robot cannot be distinguished."""
         if self.slip_threshold < 3.0 * self.standstill_spread:
             raise ParameterError(
                 'slip_threshold must be at least three times standstill_spread '
@@ -134,23 +165,22 @@ class GyroOdometryParameters(WheelOdometryParameters):
 
 
 class GyroOdometry:
-    """Keeps pose and covariance from step counters and, where there is one, a yaw gyro.
+    """Pose and covariance from step counters and a yaw gyro.
 
-    Until the robot has stood still once the gyro is not used: its bias may be as large as the
-    turns themselves. Without a gyro this is :class:`~t3mpc_ros.robot.odometry.WheelOdometry`.
+    The gyro is used after the first standstill, because its bias may be as large as the turns.
+    Without a gyro the result is that of :class:`~t3mpc_ros.robot.wheel_odometry.WheelOdometry`.
 
-    What it cannot see: wheels that slip alike (the gyro sees turns only); a bias that jumps
-    while the robot drives: the heading then drifts at that rate, unflagged below
-    ``slip_threshold``, until the next standstill, where about half of the drift is taken back
-    and the covariance says what is left; a standing robot that is turned as evenly as by a
-    machine, or more slowly than three times ``standstill_spread``.
+    Not detected: equal slip of both wheels (the gyro measures turns only); a bias jump in
+    motion below ``slip_threshold``: yaw then drifts at that rate until the next standstill, which
+    corrects about half of the drift and leaves the rest in the covariance; external rotation at a
+    standstill that is perfectly even, or slower than three times ``standstill_spread``.
 
     Parameters
     ----------
-    settings
-        Replaceable while running.
+    parameters
+        Replaceable at run time.
     geometry
-        R and 2b as the odometry believes them.
+        Nominal R and 2b.
     """
 
     def __init__(self, parameters: GyroOdometryParameters, geometry: WheelGeometry) -> None:
@@ -160,15 +190,15 @@ class GyroOdometry:
         self._drift: Array = np.zeros((5, 5))
         self._memory: Array = np.zeros(MEMORY_SIZE)
         self.parameters = parameters
-        self.update(0.0, 0.0, None, 1.0)  # compiled now, never in mid-step
+        self.update(0.0, 0.0, None, 1.0)  # compile now, not within a step
         self._memory[:] = 0.0
         self._drift[:] = 0.0
         self._covariance[3, 3] = (0.5 * parameters.gyro_bias_limit) ** 2
-        self._covariance[4, 4] = 1.0  # in tolerances, so that these may change
+        self._covariance[4, 4] = 1.0  # in units of the tolerance, which may change
 
     @property
     def parameters(self) -> GyroOdometryParameters:
-        """The table in use."""
+        """The parameters in use."""
         return self._parameters
 
     @parameters.setter
@@ -195,17 +225,17 @@ class GyroOdometry:
 
     @property
     def pose(self) -> Pose:
-        """Where the robot is thought to be; a measured bias may move it at a standstill."""
+        """Estimated pose; a bias measured at a standstill may move it."""
         return Pose(*self._pose.tolist())
 
     @property
     def covariance(self) -> Array:
-        """A copy of the covariance of (x, y, heading), shape (3, 3), m², m rad, rad²."""
+        """Copy of the covariance of (x, y, yaw), shape (3, 3), m², m rad, rad²."""
         return self._covariance[:3, :3].copy()
 
     @property
     def bias(self) -> float:
-        """What the gyro is thought to show of a robot that does not turn, rad/s."""
+        """Estimated gyro bias, rad/s."""
         return float(self._memory[BIAS])
 
     @property
@@ -215,21 +245,21 @@ class GyroOdometry:
 
     @property
     def calibrated(self) -> bool:
-        """Whether the bias was measured at a standstill, so that the gyro is used."""
+        """Whether the bias has been measured at a standstill; the gyro is then in use."""
         return bool(self._memory[CALIBRATED] > 0.0)
 
     @property
     def slipping(self) -> bool:
-        """Whether gyro and steps disagree for so long that a wheel slips or is blocked."""
+        """Whether gyro and steps have disagreed for ``slip_time``: a wheel slips or is blocked."""
         return bool(self._memory[SLIPPING] > 0.0)
 
     @property
     def slipping_for(self) -> float:
-        """For how long (s) they have disagreed, zero unless :attr:`slipping`."""
+        """Time (s) for which gyro and steps have disagreed, zero unless :attr:`slipping`."""
         return float(self._memory[DISAGREES_FOR]) if self.slipping else 0.0
 
     def reset(self, pose: Pose = ORIGIN) -> None:
-        """Start again at ``pose`` with full certainty; what is known of the bias stays.
+        """Set the pose and clear its covariance; the bias estimate is kept.
 
         Raises
         ------
@@ -243,7 +273,7 @@ class GyroOdometry:
             matrix[:, :3] = 0.0
 
     def forget_bias(self) -> None:
-        """Take the bias for unknown again, as after the sensor lost its power."""
+        """Reset the bias estimate, as after a power loss of the sensor."""
         self._memory[BIAS] = self._memory[CALIBRATED] = 0.0
         clear_window(self._memory)
         for matrix in (self._covariance, self._drift):
@@ -254,25 +284,25 @@ class GyroOdometry:
     def update(
         self, right: float, left: float, gyro: float | None, dt: float, jitter: float = 0.0
     ) -> None:
-        """Add what ``dt`` seconds brought.
+        """Update the estimate by the measurements of the last ``dt`` seconds.
 
         Parameters
         ----------
         right, left
-            Angles (rad) the wheels turned since the last call, by the step counters; exactly
-            zero without a step.
+            Angles (rad) by which the wheels turned since the last call, from the step counters;
+            exactly zero without a step.
         gyro
-            Yaw rate (rad/s, counter-clockwise) sampled at the end of that time, bias and all;
-            None when the sensor does not answer.
+            Yaw rate (rad/s, counter-clockwise) sampled at the end of that time, bias included;
+            None when the sensor does not respond.
         dt
             Seconds since the last call.
         jitter
-            Variance (rad²) of each angle that does not depend on the distance.
+            Variance (rad²) of each angle that does not depend on the travel.
 
         Raises
         ------
         ValueError
-            A number is not finite, dt not positive, or jitter negative; nothing has changed
+            A number is not finite, dt not positive, or jitter negative; the state is unchanged
             then.
         """
         rate = 0.0 if gyro is None else float(gyro)
@@ -301,34 +331,18 @@ class GyroOdometry:
         )
 
 
-# What the filter remembers besides pose and covariance; rates in rad/s, times in s.
-(
-    BIAS, CALIBRATED,
-    FIRST_POLE, SECOND_POLE, LAST_RATE, LAST_DT,
-    DISAGREEMENT, DISAGREES_FOR, SLIPPING,
-    STANDS_FOR, PUSHED, COUNT, TIME, SUM, SQUARES,
-    SUSPECT, SUSPECT_VARIANCE,
-) = range(17)  # fmt: skip
-MEMORY_SIZE = 17
-"""How many these are."""
-STANDSTILL_RATE = 1e-4
-"""rad/s, far below the gyro's noise: what is left of a turn in its filter is over."""
-MIN_SAMPLES = 20
-"""Fewer tell no spread."""
-
-
 @kernel
 def delayed_rate(memory: Array, rate: float, dt: float, delay: float) -> float:
-    """Return the rate (rad/s) that a gyro of this ``delay`` (s) shows at the end of ``dt``.
+    """Return the output (rad/s) of a gyro with this ``delay`` (s) at the end of ``dt``.
 
-    ``rate`` is the mean over ``dt``. Within it the rate is taken to change evenly, by what the
-    means tell: taken as constant, it would be wrong by half a period's change. The two poles
-    have half the delay each and are integrated exactly.
+    ``rate`` is the mean over ``dt``. Within ``dt`` the rate changes linearly with the slope of
+    consecutive means; a constant rate would be wrong by half the change of a period. The two
+    poles have half the delay each and are integrated exactly.
     """
     slope = 0.0
     if memory[LAST_DT] > 0.0:
         slope = 2.0 * (rate - memory[LAST_RATE]) / (dt + memory[LAST_DT])
-    else:  # the first call: as if it had always been so
+    else:  # the first call starts in steady state
         memory[FIRST_POLE] = memory[SECOND_POLE] = rate
     memory[LAST_RATE], memory[LAST_DT] = rate, dt
     pole, start = 0.5 * delay, rate - 0.5 * slope * dt
@@ -342,10 +356,11 @@ def delayed_rate(memory: Array, rate: float, dt: float, delay: float) -> float:
 
 @kernel
 def detect_slip(memory: Array, excess: float, dt: float, limit: float, time: float) -> bool:
-    """Decide whether gyro and steps disagree now; ``memory`` tells whether for long enough.
+    """Decide whether gyro and steps disagree now; after ``time`` set SLIPPING in ``memory``.
 
-    excess : gyro less steps; limit : for its smoothed size, half of it ends a slip, rad/s
-    time : after which it is slip, s
+    excess : gyro minus steps, rad/s
+    limit : of the magnitude of the smoothed excess, rad/s; half of it ends a slip
+    time : duration of a disagreement that counts as slip, s
     """
     smoothing = time / 3.0
     memory[DISAGREEMENT] += (excess - memory[DISAGREEMENT]) * dt / (smoothing + dt)
@@ -368,27 +383,27 @@ def propagate_covariance(
     dt: float,
     turn: float,
 ) -> None:
-    """Let errors of heading, bias and scale move the pose: ``matrix`` <- F ``matrix`` F'.
+    """Propagate errors of yaw, bias and scale to the pose: ``matrix`` <- F ``matrix`` F'.
 
-    matrix : shape (5, 5), of (x, y, heading, bias, scale); changed in place
-    across : d(x, y) by the heading; fused : d(pose) by the turn that the gyro tells
+    matrix : shape (5, 5), of (x, y, yaw, bias, scale); changed in place
+    across : d(x, y) by the yaw; fused : d(pose) by the turn measured by the gyro
     dt : s, effect of the bias on that turn; turn : rad, effect of the scale
     """
     for column in range(5):
-        told = dt * matrix[3, column] + turn * matrix[4, column]
-        matrix[0, column] += across[0] * matrix[2, column] - fused[0] * told
-        matrix[1, column] += across[1] * matrix[2, column] - fused[1] * told
-        matrix[2, column] -= fused[2] * told
+        shift = dt * matrix[3, column] + turn * matrix[4, column]
+        matrix[0, column] += across[0] * matrix[2, column] - fused[0] * shift
+        matrix[1, column] += across[1] * matrix[2, column] - fused[1] * shift
+        matrix[2, column] -= fused[2] * shift
     for row in range(5):
-        told = dt * matrix[row, 3] + turn * matrix[row, 4]
-        matrix[row, 0] += across[0] * matrix[row, 2] - fused[0] * told
-        matrix[row, 1] += across[1] * matrix[row, 2] - fused[1] * told
-        matrix[row, 2] -= fused[2] * told
+        shift = dt * matrix[row, 3] + turn * matrix[row, 4]
+        matrix[row, 0] += across[0] * matrix[row, 2] - fused[0] * shift
+        matrix[row, 1] += across[1] * matrix[row, 2] - fused[1] * shift
+        matrix[row, 2] -= fused[2] * shift
 
 
 @kernel
 def clear_window(memory: Array) -> None:
-    """Start another average of the standing gyro."""
+    """Start a new standstill average of the gyro."""
     memory[COUNT] = memory[TIME] = memory[SUM] = memory[SQUARES] = 0.0
 
 
@@ -402,31 +417,31 @@ def estimate_bias(
     spread: float,
     limit: float,
 ) -> None:
-    """Take the window's mean for the bias if nobody moved the robot; correct the pose by it.
+    """Update the bias by the mean of the window if the robot was not moved; correct the pose.
 
-    A mean that is not to be expected (5 sigma) waits for a second one that agrees with it: a
-    hand does not turn a robot so evenly. It is then a jump that may have come at any time since
-    the last standstill, which is what ``drift``, grown to its size, stands for.
+    A mean beyond 5 sigma is used only when a second one confirms it: a robot turned by hand does
+    not turn so evenly. It is then a jump at an unknown time since the last standstill, which
+    ``drift``, scaled to its size, represents in the covariance.
 
-    covariance : shape (5, 5); drift, memory : see :func:`fuse`
-    variance : of the mean, by the noise alone, above 0, (rad/s)²
+    covariance : shape (5, 5); drift, memory : see :func:`update_filter`
+    variance : of the mean, from the noise alone, above 0, (rad/s)²
     spread : largest standard deviation of the samples; limit : largest bias, rad/s
     """
     count = memory[COUNT]
-    surprise = memory[SUM] / count
-    scatter = max(memory[SQUARES] - surprise * memory[SUM], 0.0) / (count - 1.0)
+    innovation = memory[SUM] / count
+    scatter = max(memory[SQUARES] - innovation * memory[SUM], 0.0) / (count - 1.0)
     clear_window(memory)
-    if scatter > spread * spread or abs(memory[BIAS] + surprise) > limit:
+    if scatter > spread * spread or abs(memory[BIAS] + innovation) > limit:
         memory[SUSPECT_VARIANCE] = 0.0
         return
     variance = max(variance, scatter / count)
-    if memory[CALIBRATED] > 0.0 and surprise**2 > 25.0 * (covariance[3, 3] + variance):
-        alone = memory[SUSPECT_VARIANCE] == 0.0
-        apart = (surprise - memory[SUSPECT]) ** 2
-        if alone or apart > 25.0 * (memory[SUSPECT_VARIANCE] + variance):
-            memory[SUSPECT], memory[SUSPECT_VARIANCE] = surprise, variance
+    if memory[CALIBRATED] > 0.0 and innovation**2 > 25.0 * (covariance[3, 3] + variance):
+        first = memory[SUSPECT_VARIANCE] == 0.0
+        apart = (innovation - memory[SUSPECT]) ** 2
+        if first or apart > 25.0 * (memory[SUSPECT_VARIANCE] + variance):
+            memory[SUSPECT], memory[SUSPECT_VARIANCE] = innovation, variance
             return
-        factor = surprise * surprise / drift[3, 3]
+        factor = innovation * innovation / drift[3, 3]
         for row in range(4):
             for column in range(4):
                 covariance[row, column] += factor * drift[row, column]
@@ -436,13 +451,13 @@ def estimate_bias(
 
     total = covariance[3, 3] + variance
     for row in range(3):
-        pose[row] += covariance[row, 3] / total * surprise
+        pose[row] += covariance[row, 3] / total * innovation
     pose[2] = wrap_to_pi(pose[2])
-    memory[BIAS] += covariance[3, 3] / total * surprise
-    beside = (covariance[0, 3], covariance[1, 3], covariance[2, 3], covariance[3, 3])
+    memory[BIAS] += covariance[3, 3] / total * innovation
+    bias_column = (covariance[0, 3], covariance[1, 3], covariance[2, 3], covariance[3, 3])
     for row in range(4):
         for column in range(4):
-            covariance[row, column] -= beside[row] * beside[column] / total
+            covariance[row, column] -= bias_column[row] * bias_column[column] / total
 
 
 @kernel
@@ -458,64 +473,65 @@ def update_filter(
     dt: float,
     jitter: float,
 ) -> None:
-    """Move pose and covariance by two wheel angles and the gyro's rate at the end of ``dt``.
+    """Update pose and covariance by two wheel angles and the gyro rate at the end of ``dt``.
 
-    With the variances V of the two paths and N of the gyro's turn, and h = 1 / 2b, the gyro's
-    excess over the steps moves the paths by ``K excess dt``, ``K = V (h, -h) / (h² sum V + N)``.
+    With the variances V of the two travels and N of the turn measured by the gyro, and
+    h = 1 / 2b, the excess of the gyro over the steps changes the travels by ``K excess dt``,
+    ``K = V (h, -h) / (h² sum V + N)``.
 
     pose : shape (3,), m, m, rad; covariance : shape (5, 5); both changed in place
-    drift : shape (5, 5), what a random walk of the bias by 1 rad/s/√s would have added to
-        the covariance since the bias was last measured
-    memory : shape (MEMORY,); values : shape (14,), see ``GyroOdometry.settings``
+    drift : shape (5, 5), covariance that a random walk of the bias by 1 rad/s/√s would have
+        added since the last bias measurement
+    memory : shape (MEMORY,); values : shape (14,), see ``GyroOdometry.parameters``
     right, left : rad; gyro : rad/s, NaN without one; dt : s; jitter : rad², of each angle
     """
     radius, half, per_metre, inflation = values[0], values[1], values[2], values[3]
     noise, tolerance, walk, delay, hold = values[4], values[5], values[6], values[7], values[8]
     limit, slip_time, window, spread = values[9], values[10], values[11], values[12]
-    heard = not math.isnan(gyro)
+    has_gyro = not math.isnan(gyro)
     run_right, run_left, share = radius * right, radius * left, 0.5 / half
     delayed = delayed_rate(memory, share * (run_right - run_left) / dt, dt, delay)
     still = right == 0.0 and left == 0.0 and abs(delayed) < STANDSTILL_RATE
-    memory[STANDS_FOR] = memory[STANDS_FOR] + dt if still else 0.0
+    memory[STANDSTILL_FOR] = memory[STANDSTILL_FOR] + dt if still else 0.0
 
-    # How uncertain the paths are, and how far the gyro may correct them.
-    told = turn = noise_turn = gain_right = gain_left = 0.0
+    # Variance of the travels, and gain of the gyro.
+    gyro_excess = turn = noise_turn = gain_right = gain_left = 0.0
     constant = radius * radius * jitter
     path_right, path_left, rough = abs(run_right), abs(run_left), per_metre
-    if heard and memory[CALIBRATED] > 0.0:
+    if has_gyro and memory[CALIBRATED] > 0.0:
         rate = gyro - memory[BIAS]
         excess, brief = rate - delayed, min(dt, hold)
         disagrees = detect_slip(
             memory, excess, brief, limit + 3.0 * tolerance * abs(rate), slip_time
         )
-        # A hand that pushes back and forth passes through zero: it is heard to the end.
+        # A hand that pushes back and forth passes through zero: the push lasts until the end.
         memory[PUSHED] = max(memory[PUSHED] - dt, 0.0)
-        if memory[STANDS_FOR] > slip_time and abs(memory[DISAGREEMENT]) > 3.0 * spread:
+        if memory[STANDSTILL_FOR] > slip_time and abs(memory[DISAGREEMENT]) > 3.0 * spread:
             memory[PUSHED] = window
         pushed = still and memory[PUSHED] > 0.0
-        if disagrees or pushed:  # the path that the steps know nothing of is one as well
+        if disagrees or pushed:  # travel that the steps do not count
             rough *= inflation
             path_right += half * abs(excess) * dt
             path_left += half * abs(excess) * dt
         elif right == 0.0 and left == 0.0 and not still:
-            # The gyro still shows the end of the turn: hear it to the end.
+            # The gyro still responds to the end of the turn.
             path_right = path_left = half * abs(delayed) * dt
         noise_right, noise_left = rough * path_right + constant, rough * path_left + constant
         noise_steps = share * share * (noise_right + noise_left)
         if noise_steps > 0.0:
-            # One sample stands for all of dt, though its noise does not average out over it.
+            # One sample represents all of dt, but its noise does not average over it.
             noise_turn = noise * noise * dt * max(1.0, 0.5 * dt / delay)
             noise_turn += noise_steps * max(0.0, dt / hold - 1.0)
             gain_right = share * noise_right / (noise_steps + noise_turn)
             gain_left = -share * noise_left / (noise_steps + noise_turn)
-        told, turn = excess * dt, tolerance * rate * dt
+        gyro_excess, turn = excess * dt, tolerance * rate * dt
     else:
         memory[DISAGREEMENT] = memory[DISAGREES_FOR] = memory[SLIPPING] = 0.0
         memory[PUSHED] = 0.0
         noise_right, noise_left = rough * path_right + constant, rough * path_left + constant
 
     across_x, across_y, right_x, right_y, left_x, left_y, bend = integrate_arc(
-        pose, run_right + gain_right * told, run_left + gain_left * told, half
+        pose, run_right + gain_right * gyro_excess, run_left + gain_left * gyro_excess, half
     )
     fused = (
         right_x * gain_right + left_x * gain_left,
@@ -524,14 +540,14 @@ def update_filter(
     )
     propagate_covariance(covariance, (across_x, across_y), fused, dt, turn)
     propagate_covariance(drift, (across_x, across_y), fused, dt, 0.0)
-    mine, yours, bent = share * fused[0], share * fused[1], share * fused[2]
-    add_noise(covariance, noise_right, right_x - mine, right_y - yours, bend - bent)
-    add_noise(covariance, noise_left, left_x + mine, left_y + yours, bent - bend)
+    part_x, part_y, part_bend = share * fused[0], share * fused[1], share * fused[2]
+    add_noise(covariance, noise_right, right_x - part_x, right_y - part_y, bend - part_bend)
+    add_noise(covariance, noise_left, left_x + part_x, left_y + part_y, part_bend - bend)
     add_noise(covariance, noise_turn, fused[0], fused[1], fused[2])
     covariance[3, 3] += walk * walk * dt
     drift[3, 3] += dt
 
-    if not (still and heard):
+    if not (still and has_gyro):
         clear_window(memory)
         memory[SUSPECT_VARIANCE] = 0.0
     else:
@@ -545,7 +561,7 @@ def update_filter(
             estimate_bias(
                 pose, covariance, drift, memory, noise * noise * single, spread, values[13]
             )
-    for row in range(1, 5):  # rounding must not tear it apart over hours
+    for row in range(1, 5):  # keep it symmetric despite rounding over hours
         for column in range(row):
             mean = 0.5 * (covariance[row, column] + covariance[column, row])
             covariance[row, column] = covariance[column, row] = mean

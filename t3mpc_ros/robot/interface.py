@@ -1,6 +1,10 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Robot interface shared by the simulation, the emulator and the robot on the radio."""
+"""Robot interface shared by the simulation, the emulator and the robot on the radio.
+
+All of them take a :class:`RobotCommand` and return a :class:`RobotState`; whatever stops the
+robot gives a reason.
+"""
 
 from typing import NamedTuple, Protocol, Self
 
@@ -22,11 +26,11 @@ RANGE_SENSORS = (
     'right_front',
     'right_back',
 )
-"""The eight distance sensors, two on each side, in the order of every list of them."""
+"""The eight range sensors, two on each side, in the order of every list of them."""
 
 
 class RobotCommand(NamedTuple):
-    """Wheel speeds that are wanted, and when they were."""
+    """Commanded wheel speeds and the time of the command."""
 
     wheels: WheelSpeeds
     stamp_ns: int
@@ -38,7 +42,7 @@ class RobotCommand(NamedTuple):
 
 
 class WheelAngles(NamedTuple):
-    """How far the wheels have turned since the robot started, as step counters tell it."""
+    """Angles turned by the wheels since the start of the robot, from the step counters."""
 
     right: float
     """rad"""
@@ -47,7 +51,7 @@ class WheelAngles(NamedTuple):
 
 
 class RobotStatus(NamedTuple):
-    """What the robot says of itself."""
+    """Status flags of the robot."""
 
     enabled: bool
     """The drives may move."""
@@ -56,22 +60,22 @@ class RobotStatus(NamedTuple):
     estop: bool
     """The emergency stop is latched."""
     timed_out: bool
-    """The last command is too old to follow."""
+    """The last command has expired."""
     limited: bool
-    """The command was larger than the limits allow; curvature was kept."""
+    """The command exceeds a limit and is scaled with its curvature kept."""
     slipping: bool = False
     """Gyro and steps disagree: a wheel slips, is blocked, or its motor has lost steps."""
     imu_fault: bool = False
-    """The inertial sensor does not answer."""
+    """The IMU does not respond."""
     low_battery: bool = False
-    """The supply is so low that it should be charged."""
+    """The battery should be charged."""
 
 
 class ImuSample(NamedTuple):
-    """What a planar robot needs of its inertial sensor, in the frame of the body."""
+    """Planar part of an IMU measurement, in the body frame."""
 
     angular: float
-    """rad/s about the vertical, counter-clockwise, bias and all"""
+    """rad/s about the vertical, counter-clockwise, bias included"""
     forward: float
     """m/s²"""
     sideways: float
@@ -79,67 +83,67 @@ class ImuSample(NamedTuple):
 
 
 class BatteryReading(NamedTuple):
-    """The supply of motors and board."""
+    """Supply of motors and board."""
 
     voltage: float
     """V"""
     current: float
-    """A, drawn; NaN where nobody measures it"""
+    """A, drawn; NaN if not measured"""
     charge: float
-    """What is left, 0 to 1; NaN where nobody knows"""
+    """Remaining charge, 0 to 1; NaN if unknown"""
 
 
 class RobotState(NamedTuple):
-    """What a robot knows at one instant."""
+    """Measured and estimated state of the robot at one instant."""
 
     stamp_ns: int
     wheels: WheelSpeeds
-    """Measured, noise and all."""
+    """Measured, noise included."""
     angles: WheelAngles
     odometry: State
-    """Pose by dead reckoning, twist from the measured wheels."""
+    """Pose of the odometry, twist from the measured wheel speeds."""
     covariance: npt.NDArray[np.float64]
-    """Of the odometry pose (x, y, heading), shape (3, 3)."""
+    """Of the odometry pose (x, y, yaw), shape (3, 3)."""
     commanded: WheelSpeeds
-    """What is really asked of the wheels, after every limit: estimators use this."""
+    """Wheel speeds sent to the motors, after every limit; estimators use this."""
     status: RobotStatus
     reason: str
-    """Why the robot does not do what it is told; empty when it does."""
+    """Why the robot does not follow the command; empty when it does."""
     true_wheels: WheelSpeeds | None = None
     """Known only in simulation."""
     truth: State | None = None
     """Known only in simulation."""
     imu: ImuSample | None = None
-    """None where there is no such sensor, or it does not answer."""
+    """None without an IMU, or when it does not respond."""
     ranges: tuple[float, ...] = ()
-    """m, one for each sensor in :data:`RANGE_SENSORS`: -inf nearer than the sensor can tell, inf
-    beyond its range, NaN not measured; empty where there are none."""
+    """m, one for each sensor in :data:`RANGE_SENSORS`: -inf nearer than the measuring range, inf
+    beyond it, NaN not measured; empty without range sensors."""
     battery: BatteryReading | None = None
-    """None where it is not measured."""
+    """None if not measured."""
     lost_steps: tuple[int, int] | None = None
     """Full steps the rotors are behind their fields, right first: known only in simulation."""
 
 
 class RobotInterface(Protocol):
-    """What every robot can do. Texts returned say why a request was refused; empty is yes."""
+    """Operations of every robot; a returned text is the reason of a rejection, empty = success."""
 
     def apply(self, command: RobotCommand, now_ns: int) -> str:
-        """Take a command, to be followed until the next one or until it is too old."""
+        """Follow a command until the next one or until it expires."""
 
     def advance(self, now_ns: int) -> RobotState:
         """Return the newest state that is not later than ``now_ns``.
 
-        Asked for each instant of a grid in turn, even late, it returns each state once.
+        Called for each instant of a time grid in turn, even late, it returns each state once.
         """
 
     def stop(self, reason: str, now_ns: int) -> None:
-        """Come to rest; the next command moves the robot again."""
+        """Stop; the next command moves the robot again."""
 
     def reset_odometry(self, now_ns: int) -> str:
-        """Let dead reckoning start at the origin; refused while the robot moves."""
+        """Set the odometry pose to the origin; rejected while the robot moves."""
 
     def latch_estop(self, reason: str, now_ns: int) -> None:
-        """Come to rest, and stay so until the emergency stop is released."""
+        """Stop until the emergency stop is released."""
 
     def release_estop(self, now_ns: int) -> str:
         """Release the emergency stop; the robot then waits for a new command."""

@@ -5,52 +5,52 @@
 from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, RobotCommand
 
 RELEASE_TIME = 0.5
-"""s without a command that moves, after which the robot obeys again."""
+"""s without a motion command after which the robot follows commands again."""
 SLIP_STOP_REASON = (
     'gyro and steps disagree: a wheel slips, is blocked, or has lost steps; '
-    f'command nothing, or standstill, for {RELEASE_TIME:g} s to go on'
+    f'stop commanding motion for {RELEASE_TIME:g} s to resume'
 )
 
 
 class SlipMonitor:
-    """Decides whether a robot must stand because gyro and steps have disagreed for too long.
+    """Decides whether the robot must stop because gyro and steps disagreed for too long.
 
-    A stop of the guard lasts until the next command, and that is there a period later: the robot
-    would say that it stands, and drive. A stop that ends by itself would be tried again and
-    again, with something in the wheel. So it lasts until whoever commands has let go.
+    A stop of the command limiter lasts until the next command, which arrives one period later:
+    the robot would report a stop and drive on. A stop that ended by itself would be followed by
+    another push against the obstacle. The stop therefore lasts until motion commands pause.
     """
 
     def __init__(self) -> None:
-        self.holds = False
-        """Whether the robot is to stand."""
-        self._urged = 0.0
-        """When a command that moves last came while it stood, s."""
+        self.stopped = False
+        """Whether the robot must stand still."""
+        self._last_motion_command = 0.0
+        """Time of the last motion command during the stop, s."""
 
-    def refuses(self, command: RobotCommand, now: float) -> bool:
-        """Decide whether a command that arrives ``now`` (s) is not to be followed."""
-        if self.holds and command.wheels != ZERO_WHEEL_SPEEDS:
-            self._urged = now
-        return self.holds
+    def rejects(self, command: RobotCommand, now: float) -> bool:
+        """Decide whether a command that arrives at ``now`` (s) is rejected."""
+        if self.stopped and command.wheels != ZERO_WHEEL_SPEEDS:
+            self._last_motion_command = now
+        return self.stopped
 
-    def decide(self, slipping_for: float, limit: float, now: float) -> bool:
-        """Decide whether the robot is to stand at ``now`` (s).
+    def update(self, slipping_for: float, limit: float, now: float) -> bool:
+        """Decide whether the robot must stand still at ``now`` (s).
 
         Parameters
         ----------
         slipping_for
-            For how long gyro and steps have disagreed, s; 0: they do not.
+            Time for which gyro and steps have disagreed, s; 0 when they agree.
         limit
-            For how long they may, s; 0: for ever.
+            Largest permitted ``slipping_for``, s; 0 disables the stop.
         now
-            s, of the clock of :meth:`refuses`.
+            s, of the clock of :meth:`rejects`.
         """
         if limit > 0.0 and slipping_for > limit:
-            if not self.holds:
-                self.holds, self._urged = True, now
-        elif limit == 0.0 or now - self._urged >= RELEASE_TIME:
-            self.holds = False
-        return self.holds
+            if not self.stopped:
+                self.stopped, self._last_motion_command = True, now
+        elif limit == 0.0 or now - self._last_motion_command >= RELEASE_TIME:
+            self.stopped = False
+        return self.stopped
 
-    def forget(self) -> None:
-        """Let the robot move, as after a restart of its board."""
-        self.holds = False
+    def reset(self) -> None:
+        """End the stop, as after a restart of the board."""
+        self.stopped = False

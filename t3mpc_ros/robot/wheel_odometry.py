@@ -18,11 +18,11 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class WheelOdometryParameters(Parameters):
-    """How fast dead reckoning loses its certainty."""
+    """Error growth of the wheel odometry."""
 
     variance_per_metre: float = parameter(
         1e-5,
-        'variance that each metre of wheel travel adds to what the wheel is thought to have run',
+        'variance of the travel of a wheel per metre',
         unit='m²/m',
         low=0.0,
         high=1.0,
@@ -32,7 +32,7 @@ class WheelOdometryParameters(Parameters):
 
 @kernel
 def wrap_to_pi(angle: float) -> float:
-    """Return ``angle`` (rad) brought into (-pi, pi]; one that lies there keeps every bit."""
+    """Return ``angle`` (rad) wrapped into (-pi, pi]; an angle in that range stays bit-equal."""
     if angle > math.pi or angle <= -math.pi:
         angle -= 2.0 * math.pi * math.ceil((angle - math.pi) / (2.0 * math.pi))
     return angle
@@ -42,12 +42,12 @@ def wrap_to_pi(angle: float) -> float:
 def integrate_arc(
     pose: Array, run_right: float, run_left: float, half: float
 ) -> tuple[float, float, float, float, float, float, float]:
-    """Move ``pose`` along the exact arc of (1)-(3); return the derivatives of where it ends.
+    """Move ``pose`` along the exact arc of (1)-(3); return the derivatives of its end.
 
-    pose : shape (3,), x, y (m), heading (rad, kept in (-pi, pi]); changed in place
-    run_right, run_left : paths of the wheels, m; half : b (E1: half the separation), m
-    returns : d(x, y) by the heading at the start (m); d(x, y) by the right path, by the left
-        path; d heading by the right path (1/m), the negative of that by the left one
+    pose : shape (3,), x, y (m), yaw (rad, kept in (-pi, pi]); changed in place
+    run_right, run_left : travel of the wheels, m; half : b (E1: half the separation), m
+    returns : d(x, y) by the yaw at the start (m); d(x, y) by the right travel, by the left
+        travel; d yaw by the right travel (1/m), the negative of that by the left one
     """
     run = 0.5 * (run_right + run_left)
     half_turn = 0.25 * (run_right - run_left) / half
@@ -79,9 +79,9 @@ def integrate_arc(
 
 @kernel
 def add_noise(covariance: Array, variance: float, x: float, y: float, yaw: float) -> None:
-    """Add to ``covariance`` a noise of ``variance`` that moves the pose by these factors.
+    """Add the noise of a scalar with ``variance`` that moves the pose by these factors.
 
-    covariance : shape (n, n), n at least 3, the pose first; changed in place
+    covariance : shape (n, n), n at least 3, pose first; changed in place
     """
     effect = (x, y, yaw)
     for row in range(3):
@@ -100,15 +100,15 @@ def dead_reckon(
     per_metre: float,
     jitter: float,
 ) -> None:
-    """Move ``pose`` by two wheel angles along the exact arc of (1)-(3), and its covariance.
+    """Update ``pose`` by two wheel angles along the exact arc of (1)-(3), and its covariance.
 
-    The wheels' distances are taken as independent, each with variance
-    ``per_metre |distance| + radius² jitter``; the covariance follows as F C F' + G V G' with the
-    exact derivatives F by the pose and G by the distances.
+    The travels of the wheels are independent, each with variance
+    ``per_metre |travel| + radius² jitter``; the covariance becomes F C F' + G V G' with the exact
+    derivatives F by the pose and G by the travels.
 
-    pose : shape (3,), x, y (m), heading (rad, kept in (-pi, pi]); changed in place
+    pose : shape (3,), x, y (m), yaw (rad, kept in (-pi, pi]); changed in place
     covariance : shape (3, 3); changed in place
-    right, left : angles turned since last time, rad; jitter : variance of each, rad²
+    right, left : angles turned since the last update, rad; jitter : variance of each, rad²
     radius, half : R and b (E1: half the separation), m
     """
     run_right, run_left = radius * right, radius * left
@@ -129,16 +129,16 @@ def dead_reckon(
 
 
 class WheelOdometry:
-    """Keeps a pose and its covariance from what the wheels report, and from nothing else.
+    """Pose and covariance from measured wheel angles or speeds.
 
-    It never integrates commands: after a timeout a robot stands while its last command goes on.
+    Commands are never integrated: after a timeout the robot stops despite its last command.
 
     Parameters
     ----------
-    settings
-        Replaceable while running.
+    parameters
+        Replaceable at run time.
     geometry
-        R and 2b as the odometry believes them.
+        Nominal R and 2b.
     """
 
     def __init__(self, parameters: WheelOdometryParameters, geometry: WheelGeometry) -> None:
@@ -149,16 +149,16 @@ class WheelOdometry:
 
     @property
     def pose(self) -> Pose:
-        """Where the robot is thought to be."""
+        """Estimated pose."""
         return Pose(float(self._pose[0]), float(self._pose[1]), float(self._pose[2]))
 
     @property
     def covariance(self) -> Array:
-        """A copy of the covariance of (x, y, heading), shape (3, 3), m², m rad, rad²."""
+        """Copy of the covariance of (x, y, yaw), shape (3, 3), m², m rad, rad²."""
         return self._covariance.copy()
 
     def reset(self, pose: Pose = ORIGIN) -> None:
-        """Start again at ``pose`` with full certainty.
+        """Set the pose, and the covariance to zero.
 
         Raises
         ------
@@ -169,16 +169,16 @@ class WheelOdometry:
         self._pose[:] = pose
         self._covariance[:] = 0.0
 
-    def turn(self, right: float, left: float, jitter: float = 0.0) -> None:
-        """Add the angles (rad) that the wheels have turned since the last call.
+    def update(self, right: float, left: float, jitter: float = 0.0) -> None:
+        """Add the angles (rad) by which the wheels turned since the last call.
 
-        ``jitter`` is a variance (rad²) of each angle that does not depend on the distance.
-        Step counters are used this way: a report that got lost costs nothing.
+        ``jitter`` is a variance (rad²) of each angle that does not depend on the travel.
+        With step counters a lost report costs no accuracy.
 
         Raises
         ------
         ValueError
-            A number is not finite; nothing has changed then.
+            A number is not finite; the state is unchanged then.
         """
         if not (math.isfinite(right) and math.isfinite(left) and math.isfinite(jitter)):
             raise ValueError(f'wheel angles must be finite: got {right}, {left}, {jitter}')
@@ -194,6 +194,6 @@ class WheelOdometry:
             float(jitter),
         )
 
-    def drive(self, wheels: WheelSpeeds, dt: float, variance: float = 0.0) -> None:
+    def update_from_speeds(self, wheels: WheelSpeeds, dt: float, variance: float = 0.0) -> None:
         """Add ``dt`` seconds at constant measured speeds, each with ``variance`` ((rad/s)²)."""
-        self.turn(wheels.right * dt, wheels.left * dt, variance * dt * dt)
+        self.update(wheels.right * dt, wheels.left * dt, variance * dt * dt)

@@ -50,13 +50,16 @@ from t3mpc_ros.simulation.sensors.range_sensor import (
 from t3mpc_ros.simulation.transport_delay import TransportDelay
 from t3mpc_ros.simulation.world import cast_rays, clearance, grip_at, load_world
 
+BROWN_OUT_REASON = 'brown-out: the board restarts'
+_NO_OBSTACLE = (math.inf,) * len(RANGE_SENSORS)
+
 
 @dataclass(frozen=True)
 class DigitalTwinParameters(PaperRobotParameters):
-    """A simulated robot with stepper motors, tyres, sensors, a world and faults.
+    """Parameters of a simulated robot with stepper motors, tyres, sensors, a world and faults.
 
-    ``drive.kind`` says which parts are at work: ``stepper`` uses all of them, the others are the
-    paper's plant and know none.
+    With ``drive.kind`` ``stepper`` all of them apply; the other kinds use the paper's plant
+    without them.
     """
 
     drive: DriveParameters = group(DriveParameters, kind='stepper')
@@ -69,15 +72,15 @@ class DigitalTwinParameters(PaperRobotParameters):
     odometry: GyroOdometryParameters = group(GyroOdometryParameters)
     faults: FaultParameters = group(FaultParameters)
     world: str = parameter(
-        '', 'world to drive in: the name of a shipped one or a YAML file; empty = an endless plain'
+        '', 'world: name of a bundled world, or path of a YAML file; empty = endless plain'
     )
     boot_time: float = parameter(
-        0.5, 'how long the board is away after a loss of power', unit='s', low=0.0, high=10.0
+        0.5, 'restart time of the board after a power loss', unit='s', low=0.0, high=10.0
     )
     slip_stop: float = parameter(
         1.0,
-        'gyro and steps may disagree for so long, then the robot stops until no motion was '
-        'commanded for 0.5 s; 0 = it never does',
+        'longest disagreement of gyro and steps; beyond it the robot stops until no motion is '
+        'commanded for 0.5 s; 0 = no slip stop',
         unit='s',
         low=0.0,
         high=60.0,
@@ -85,13 +88,13 @@ class DigitalTwinParameters(PaperRobotParameters):
     )
 
     def body_with_faults(self, faults: FaultParameters) -> BodyParameters:
-        """Return the body that moves, with what a fault has put on it."""
+        """Return the true body with the load of a fault."""
         true = self.true_body
         return replace(true, body_mass=max(true.body_mass + faults.load_change, 0.01))
 
     def load_with_faults(self, faults: FaultParameters) -> Load:
-        """Return what the motors move, and what holds it back."""
-        held = faults.wheel_blocked
+        """Return the load of the motors."""
+        blocked = faults.wheel_blocked
         return Load(
             self.body_with_faults(faults),
             self.geometry,
@@ -99,11 +102,11 @@ class DigitalTwinParameters(PaperRobotParameters):
             self.friction_factor,
             self.tyres,
             faults.slippery,
-            (held in ('right', 'both'), held in ('left', 'both')),
+            (blocked in ('right', 'both'), blocked in ('left', 'both')),
         )
 
     def check_consistency(self) -> None:
-        """Raise ParameterError when the integration would be unstable, or a speed cannot be made."""
+        """Raise ParameterError when the integration is unstable, or a speed cannot be reached."""
         if self.drive.kind != 'stepper':
             super().check_consistency()
             return
@@ -111,8 +114,8 @@ class DigitalTwinParameters(PaperRobotParameters):
         fastest = max_rate(self.motor, load, self.bumper, self.friction_factor)
         if self.step * fastest > STABILITY_LIMIT:
             raise ParameterError(
-                f'substep must be at most {STABILITY_LIMIT / fastest:.2g} s with this motor, body, bumper '
-                f'and friction (fastest rate {fastest:.4g} 1/s): got {self.substep:g}'
+                f'substep must be at most {STABILITY_LIMIT / fastest:.2g} s with this motor, '
+                f'body, bumper and friction (fastest rate {fastest:.4g} 1/s): got {self.substep:g}'
             )
         if self.limiter.wheel_speed > self.motor.top_speed:
             raise ParameterError(
@@ -120,58 +123,58 @@ class DigitalTwinParameters(PaperRobotParameters):
                 f'{self.motor.step_rate:g} pulses a second with {self.motor.microsteps} '
                 f'microsteps: got {self.limiter.wheel_speed:g}'
             )
-        delay, told = self.imu.delay, self.odometry.gyro_delay
-        if self.odometry.use_gyro and abs(told - delay) > 0.25 * delay:
+        delay, assumed = self.imu.delay, self.odometry.gyro_delay
+        if self.odometry.use_gyro and abs(assumed - delay) > 0.25 * delay:
             raise ParameterError(
                 f'odometry.gyro_delay must be about {delay:.2g} s with imu.low_pass '
-                f'{self.imu.low_pass}, or quick turns look like slip: got {told:g}'
+                f'{self.imu.low_pass}, or fast turns are detected as slip: got {assumed:g}'
             )
         self.check_ramp()
 
 
-BROWN_OUT_REASON = 'brown-out: the board restarts'
-_NO_OBSTACLE = (math.inf,) * len(RANGE_SENSORS)
-
-
 @dataclass(frozen=True, slots=True)
 class TwinDiagnostics:
-    """What only a simulation knows of its robot, for diagnostics and pictures."""
+    """True internal values of the twin, for diagnostics and figures."""
 
     faults: tuple[str, ...]
-    """Faults at work, in words."""
+    """Active faults, as text."""
     slid: tuple[float, float]
-    """m each tyre has slid, right first"""
+    """distance slid by each tyre, m, right first"""
     load_angles: tuple[float, float]
-    """rad the fields are ahead of the rotors"""
+    """angles of the fields ahead of the rotors, rad"""
     gyro_bias: float
-    """rad/s, true"""
+    """true gyro bias, rad/s"""
     estimated_bias: float
-    """rad/s, as the odometry believes"""
+    """gyro bias estimated by the odometry, rad/s"""
     max_contact_force: float
-    """N, of a wall, so far"""
+    """largest contact force of a wall so far, N"""
 
 
 class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
-    """A robot that is computed part by part, so that it goes wrong as the real one does.
+    """Simulated robot with the components, errors and faults of the real one.
 
-    Step counters count pulses, so odometry is wrong exactly when steps are lost or a tyre slides;
-    the gyro shows what of it turns the robot. Every random part draws from a generator of its own,
-    the same numbers whatever the settings: changing one does not shift the others.
+    Step counters count pulses, so the odometry is wrong exactly when steps are lost or a tyre
+    slides; the gyro measures the resulting turn. Every random component has its own generator,
+    which draws the same numbers whatever the parameters: changing one does not shift the others.
 
     Parameters
     ----------
-    settings
-        Replaceable while running, as far as they are live.
+    parameters
+        The dynamic ones are replaceable at run time.
     schedule
-        The faults to play; without one, those that ``faults.schedule`` names.
+        Schedule of faults; by default the one that ``faults.schedule`` names.
     """
 
     def __init__(
         self, parameters: DigitalTwinParameters, schedule: FaultSchedule | None = None
     ) -> None:
-        guard = CommandLimiter(parameters.limiter, parameters.geometry)
+        limiter = CommandLimiter(parameters.limiter, parameters.geometry)
         super().__init__(
-            parameters, parameters.rate, parameters.substeps, parameters.longest_gap, guard
+            parameters,
+            parameters.rate,
+            parameters.substeps,
+            parameters.max_catch_up_time,
+            limiter,
         )
         disturbance, noise, imu, ranges, channel = (
             np.random.default_rng(part)
@@ -199,13 +202,13 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
         )
         self._faults = parameters.faults
         self._boots_until = 0
-        """Integration step at which the board is back."""
+        """Integration step at which the board has restarted."""
         self._slip_monitor = SlipMonitor()
         self._measured = ZERO_WHEEL_SPEEDS
         self._measured_at = 0
         self._counters = (0, 0)
         self._turned = (0.0, 0.0)
-        """Angles (rad) by the pulses of all boards since the start."""
+        """Angles (rad) from the pulses since the start, over all restarts of the board."""
         self._field_work = 0.0
         self._sample: ImuSample | None = None
         self._supply = self._battery.draw(0.0, 0.0)
@@ -213,12 +216,12 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
         self._apply_parameters()
         self._reports.append(self._make_state(0))
 
-    # -- the seam ---------------------------------------------------------------------------------
+    # -- robot interface --------------------------------------------------------------------------
 
     def apply(self, command: RobotCommand, now_ns: int) -> str:
-        """Send ``command`` on its way to the board; return why not if it is refused here.
+        """Send ``command`` to the board, or return why the host rejects it.
 
-        What the board makes of it when it arrives shows in the state's reason.
+        The reason of the state shows the decision of the board on arrival.
         """
         now_ns = self._run_to(now_ns)
         if self._restarting:
@@ -237,11 +240,11 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
         )
         return ''
 
-    # -- only in simulation -----------------------------------------------------------------------
+    # -- simulation only --------------------------------------------------------------------------
 
     @property
     def diagnostics(self) -> TwinDiagnostics:
-        """What nobody outside a simulation can see."""
+        """True internal values."""
         drivetrain = self._drivetrain
         return TwinDiagnostics(
             faults=active_faults(self._faults),
@@ -253,25 +256,25 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
         )
 
     def set_pose(self, pose: Pose) -> None:
-        """Put the robot elsewhere, its wheels turning as before; odometry does not notice.
+        """Move the robot to ``pose``; wheel speeds and odometry are unchanged.
 
         Raises
         ------
         ValueError
-            The pose is not finite, or the robot would stand in a wall.
+            The pose is not finite, or overlaps an obstacle of the world.
         """
         check_pose(pose)
         radius = self._parameters.bumper.radius
         if not self._world.is_free(pose.x, pose.y, radius):
             raise ValueError(
-                f'pose must be at least {radius:g} m away from what stands in the world '
+                f'pose must be at least {radius:g} m away from every obstacle of the world '
                 f'{self._world.name}: got x {pose.x:g} m, y {pose.y:g} m'
             )
         self._drivetrain.pose = pose
         self._refresh_state()
 
     def warm_up(self) -> None:
-        """Compile everything that a step needs, on a robot of its own."""
+        """Compile every kernel of a step, on a separate robot."""
         DigitalTwin(self._parameters).step(ZERO_WHEEL_SPEEDS)
         world = load_world('room')
         clearance(0.0, 0.0, world.segments, world.circles)
@@ -288,7 +291,7 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
             np.empty(self._mounts.shape[0]),
         )
 
-    # -- inside -----------------------------------------------------------------------------------
+    # -- simulation step --------------------------------------------------------------------------
 
     @property
     def _restarting(self) -> bool:
@@ -296,7 +299,7 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
 
     @property
     def _elapsed(self) -> float:
-        """Time since the robot was made, s: it never goes back."""
+        """Time since the start, s; it never decreases."""
         return self._drivetrain.steps_done * self._drivetrain.step
 
     def _apply_parameters(self) -> None:
@@ -310,7 +313,7 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
         self._update_load()
 
     def _update_faults(self) -> None:
-        """Look which faults are at work now, and let those that begin or end do so."""
+        """Update the active faults, and apply those that begin or end."""
         before = self._faults
         self._faults = self._schedule.at(self._elapsed, self._parameters.faults)
         if self._faults is before:
@@ -325,12 +328,12 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
         )
 
     def _lose_power(self) -> None:
-        """Let the board start anew: counters at zero, sensors too, and no command."""
+        """Restart the board: counters and sensors are reset, commands are dropped."""
         drivetrain = self._drivetrain
         self._boots_until = drivetrain.steps_done + round(
             self._parameters.boot_time / drivetrain.step
         )
-        self._slip_monitor.forget()
+        self._slip_monitor.reset()
         self._channel.clear()
         self._limiter.stop(BROWN_OUT_REASON, self._now_ns())
         self._imu.restart()
@@ -342,18 +345,18 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
     def _integrate(self, count: int) -> None:
         done = 0
         while done < count:
-            now_ns = self._after(self._steps_since_origin + done)
+            now_ns = self._stamp_after(self._steps_since_origin + done)
             for command in self._channel.arrived(now_ns):
-                if not self._slip_monitor.refuses(command, self._elapsed):
+                if not self._slip_monitor.rejects(command, self._elapsed):
                     self._limiter.accept(command, now_ns)
             part = count - done
             arrival_ns = self._channel.next_ns
             if arrival_ns is not None:
                 part = min(part, max(1, self._steps_until(arrival_ns - now_ns)))
-            self._drive(part, now_ns)
+            self._run_drivetrain(part, now_ns)
             done += part
 
-    def _drive(self, count: int, now_ns: int) -> None:
+    def _run_drivetrain(self, count: int, now_ns: int) -> None:
         """Run ``count`` steps under one command."""
         drivetrain = self._drivetrain
         self._limited_command = self._limiter.advance(now_ns, count * drivetrain.step)
@@ -371,13 +374,13 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
         dt = (drivetrain.steps_done - self._measured_at) * drivetrain.step
         self._measured_at = drivetrain.steps_done
         self._update_faults()
-        self._count(dt)
-        self._look(dt)
-        self._feed(dt)
+        self._update_odometry(dt)
+        self._update_ranges(dt)
+        self._update_battery(dt)
         self._disturbance.draw(dt)
 
-    def _count(self, dt: float) -> None:
-        """Read step counters and gyro, and reckon where they say the robot is."""
+    def _update_odometry(self, dt: float) -> None:
+        """Read step counters and gyro, and update odometry and slip monitor."""
         microstep = self._parameters.motor.microstep
         right, left = self._drivetrain.counters
         turned = WheelSpeeds(
@@ -393,15 +396,15 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
             self._odometry.update(turned.right, turned.left, gyro, dt)
             self._measured = self._noise.measure(WheelSpeeds(turned.right / dt, turned.left / dt))
         slipping_for = self._odometry.slipping_for
-        if self._slip_monitor.decide(slipping_for, self._parameters.slip_stop, self._elapsed):
+        if self._slip_monitor.update(slipping_for, self._parameters.slip_stop, self._elapsed):
             self._limiter.stop(SLIP_STOP_REASON, self._now_ns())
 
-    def _look(self, dt: float) -> None:
-        """Let those distance sensors see whose time has come."""
+    def _update_ranges(self, dt: float) -> None:
+        """Measure with the range sensors that are due."""
         world = self._world
         empty = not (world.segments.size or world.circles.size)
         if empty and self._ranges.readings == _NO_OBSTACLE:
-            return  # and nothing will ever be
+            return  # the readings cannot change
         due = self._ranges.due(dt)
         if due and not empty:
             cast_rays(
@@ -415,13 +418,13 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
         for sensor in due:
             self._ranges.measure(sensor, float(self._distances[sensor]))
 
-    def _feed(self, dt: float) -> None:
-        """Take from the battery what motors and board need; too much of it, and the board goes."""
+    def _update_battery(self, dt: float) -> None:
+        """Draw the power of motors and board from the battery; a collapse restarts the board."""
         motor = self._parameters.motor
         done = self._drivetrain.field_work
         power = 0.0
         if dt > 0.0 and not self._restarting:
-            # A phase carries I cos or I sin of the field: two of each heat with I²R a motor.
+            # The phases carry I cos and I sin of the field: copper loss I²R per motor.
             copper = 2.0 * motor.phase_current**2 * motor.resistance
             power = copper + max(0.0, done - self._field_work) / dt
         self._field_work = done
@@ -430,13 +433,13 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
             self._lose_power()
 
     def _make_state(self, stamp_ns: int) -> RobotState:
-        geometry, guard, drivetrain = self._parameters.geometry, self._limiter, self._drivetrain
+        geometry, limiter, drivetrain = self._parameters.geometry, self._limiter, self._drivetrain
         odometry, limited_command = self._odometry, self._limited_command
         status = RobotStatus(
-            enabled=not guard.estop and not self._restarting,
+            enabled=not limiter.estop and not self._restarting,
             moving=self._moving(),
-            estop=guard.estop,
-            timed_out=guard.timed_out,
+            estop=limiter.estop,
+            timed_out=limiter.timed_out,
             limited=limited_command.limited,
             slipping=odometry.slipping,
             imu_fault=self._sample is None,
@@ -450,7 +453,7 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
             covariance=odometry.covariance,
             commanded=limited_command.wheels,
             status=status,
-            reason=guard.reason,
+            reason=limiter.reason,
             true_wheels=drivetrain.wheels,
             truth=State(stamp_ns, drivetrain.pose, twist_from_wheels(drivetrain.ground, geometry)),
             imu=self._sample,
@@ -461,14 +464,14 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
 
     def _moving(self) -> bool:
         right, left = self._drivetrain.pulse_speeds
-        return max(abs(right), abs(left)) > self._parameters.rest_speed
+        return max(abs(right), abs(left)) > self._parameters.standstill_speed
 
     def _reset_odometry(self) -> None:
         self._odometry.reset()
 
 
 def make_robot(parameters: DigitalTwinParameters) -> PaperRobot | DigitalTwin:
-    """Return the robot that ``drive.kind`` asks for, standing at the origin."""
+    """Return the robot of ``drive.kind``, at standstill in the origin."""
     if parameters.drive.kind == 'stepper':
         return DigitalTwin(parameters)
     return PaperRobot(parameters)

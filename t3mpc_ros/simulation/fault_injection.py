@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Fault injection: faults set as parameters or scheduled in a YAML file."""
+"""Fault injection: faults set as dynamic parameters or scheduled in a YAML file."""
 
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping
@@ -16,24 +16,24 @@ import yaml
 from t3mpc_ros.parameters.table import ParameterError, Parameters, ParameterSpec, Value, parameter
 
 SCHEDULES_FOLDER = Path(__file__).resolve().parent / 'schedules'
-"""Where the schedules lie that have a name."""
+"""Folder of the bundled schedules."""
 
 MIN_DURATION = 0.02
-"""s; a fault that lasts less may fall between two questions of a robot that reports at 50 Hz."""
+"""s; a shorter fault could fall between two states of a robot that reports at 50 Hz."""
 
 _MAX_TIME = 1e6
-"""s; eleven days, of which a float still tells every nanosecond."""
+"""s; eleven days, within which a float resolves nanoseconds."""
 _ROUNDING = 0.5e-9
-"""s; stamps are whole nanoseconds, but 0.1 s after 0.2 s a float is late for 0.3 s."""
+"""s; stamps are whole nanoseconds, but the float 0.2 + 0.1 is more than 0.3."""
 
 
 @dataclass(frozen=True)
 class FaultParameters(Parameters):
-    """What goes wrong with the robot now; at its default a fault is none."""
+    """Faults that are active now; a parameter at its default is no fault."""
 
     command_delay: float = parameter(
         0.0,
-        'every command reaches the board this much later',
+        'additional delay of every command',
         unit='s',
         low=0.0,
         high=2.0,
@@ -41,52 +41,50 @@ class FaultParameters(Parameters):
     )
     command_jitter: float = parameter(
         0.0,
-        'each command is late by up to this much more, evenly spread, and may be overtaken',
+        'random additional delay of each command, uniform up to this value; commands may overtake',
         unit='s',
         low=0.0,
         high=2.0,
         dynamic=True,
     )
     command_loss: float = parameter(
-        0.0, 'share of the commands that never arrive', low=0.0, high=1.0, dynamic=True
+        0.0, 'fraction of the commands that is lost', low=0.0, high=1.0, dynamic=True
     )
     gyro_bias_jump: float = parameter(
         0.0,
-        'added to what the gyro tells; an MPU6050 may be off by 0.35 rad/s (20 deg/s)',
+        'offset added to the gyro; an MPU6050 may have 0.35 rad/s (20 deg/s)',
         unit='rad/s',
         low=-10.0,
         high=10.0,
         dynamic=True,
     )
-    gyro_dead: bool = parameter(False, 'the inertial sensor does not answer', dynamic=True)
-    ranges_dead: bool = parameter(False, 'no distance sensor is measured', dynamic=True)
+    gyro_dead: bool = parameter(False, 'the IMU does not respond', dynamic=True)
+    ranges_dead: bool = parameter(False, 'no range sensor is measured', dynamic=True)
     wheel_blocked: str = parameter(
         'none',
-        'which wheel is held fast',
+        'blocked wheel',
         choices=('none', 'right', 'left', 'both'),
         dynamic=True,
     )
     load_change: float = parameter(
         0.0,
-        'mass added to the body that nobody told the controller of; below 0: taken away',
+        'mass added to the body, unknown to the controller; negative: removed',
         unit='kg',
         low=-1.0,
         high=5.0,
         dynamic=True,
     )
     slippery: float = parameter(
-        1.0, 'factor of the grip of the tyres, everywhere', low=0.0, high=1.0, dynamic=True
+        1.0, 'factor on the grip of the tyres, everywhere', low=0.0, high=1.0, dynamic=True
     )
     supply_sag: float = parameter(
-        0.0, 'taken from the voltage of the battery', unit='V', low=0.0, high=20.0, dynamic=True
+        0.0, 'voltage drop of the battery cells', unit='V', low=0.0, high=20.0, dynamic=True
     )
-    brown_out: bool = parameter(
-        False, 'the board restarts at the instant at which this becomes true', dynamic=True
-    )
+    brown_out: bool = parameter(False, 'the board restarts when this becomes true', dynamic=True)
     schedule: str = parameter(
         '',
-        'schedule of faults to play: the name of a shipped one, or a YAML file, which must end in '
-        '.yaml; empty: none',
+        'schedule of faults: name of a bundled one, or path of a file that ends in .yaml; '
+        'empty = none',
     )
 
 
@@ -95,43 +93,43 @@ class Fault(NamedTuple):
 
     name: str
     text: str
-    """What it does, in one line."""
+    """Effect, in one line."""
 
 
-_ROWS: Mapping[str, ParameterSpec] = {
-    row.name: row for row in FaultParameters.specs() if row.dynamic
+_SPECS: Mapping[str, ParameterSpec] = {
+    spec.name: spec for spec in FaultParameters.specs() if spec.dynamic
 }
-FAULTS = tuple(Fault(row.name, row.text) for row in _ROWS.values())
-"""Every fault there is: the live rows of :class:`FaultParameters`, in their order."""
+FAULTS = tuple(Fault(spec.name, spec.text) for spec in _SPECS.values())
+"""All faults: the dynamic parameters of :class:`FaultParameters`, in their order."""
 
 
 def active_faults(parameters: FaultParameters) -> tuple[str, ...]:
-    """Return what is wrong in words, ``command_delay 0.1 s`` say; empty when nothing is."""
+    """Return the active faults as text, for example ``command_delay 0.1 s``."""
     texts = []
-    for name, row in _ROWS.items():
+    for name, spec in _SPECS.items():
         value = getattr(parameters, name)
-        if value == row.default:
+        if value == spec.default:
             continue
         if isinstance(value, bool):
             texts.append(name)
         else:
             number = f'{value:g}' if isinstance(value, float) else str(value)
-            texts.append(f'{name} {number} {row.unit}'.rstrip())
+            texts.append(f'{name} {number} {spec.unit}'.rstrip())
     return tuple(texts)
 
 
 class ScheduleError(ValueError):
-    """A schedule that cannot be played; the text names file, entry, bound and value."""
+    """An invalid schedule; the text contains file, entry, bound and value."""
 
 
 @dataclass(frozen=True)
 class FaultEvent:
-    """One entry of a schedule: a fault takes a value for a time.
+    """One entry of a schedule: a value of a fault for a time interval.
 
     Raises
     ------
     ScheduleError
-        For a fault that does not exist, or a value or time out of range.
+        The fault does not exist, or value or time is out of range.
     """
 
     at: float
@@ -139,66 +137,67 @@ class FaultEvent:
     fault: str
     value: Value
     duration: float = math.inf
-    """s; in a file it is called ``for``"""
+    """s; the key ``for`` in a file"""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'at', _seconds('at', self.at, 0.0))
         if self.duration != math.inf:
             object.__setattr__(self, 'duration', _seconds('for', self.duration, MIN_DURATION))
-        if not isinstance(self.fault, str) or self.fault not in _ROWS:
+        if not isinstance(self.fault, str) or self.fault not in _SPECS:
             raise ScheduleError(
-                f'fault must be one of {", ".join(_ROWS)}: '
-                f'got {_shown(self.fault)}{_nearest(self.fault, _ROWS)}'
+                f'fault must be one of {", ".join(_SPECS)}: '
+                f'got {_shortened(self.fault)}{_nearest(self.fault, _SPECS)}'
             )
-        row = _ROWS[self.fault]
+        spec = _SPECS[self.fault]
         try:
-            object.__setattr__(self, 'value', row.check(self.value))
+            object.__setattr__(self, 'value', spec.check(self.value))
         except ParameterError as error:
-            advice = _plain_number(self.value) if row.kind is float else ''
-            raise ScheduleError(f'value: {error}{advice}') from None
-        except OverflowError:  # a whole number that no float can hold
-            raise ScheduleError(f'value: {self.fault} must be {row.bounds()}') from None
+            hint = _number_hint(self.value) if spec.kind is float else ''
+            raise ScheduleError(f'value: {error}{hint}') from None
+        except OverflowError:  # an integer too large for a float
+            raise ScheduleError(f'value: {self.fault} must be {spec.bounds()}') from None
 
     @property
     def until(self) -> float:
-        """First instant at which the event is over, s since the start; infinite if it stays."""
+        """End of the event, s since the start; infinite if it persists."""
         return self.at + self.duration
 
 
 class FaultSchedule:
-    """Decides which faults are in force when.
+    """Decides which faults are active at a time.
 
-    An event holds from its start up to, and without, its end. Of several events of one fault the
-    one that started last holds; when it ends, one that still lasts takes over again, and at last
-    the live value. Of two that start together the later in the list holds.
+    An event is active from its start up to, but not including, its end. Of several events of one
+    fault the one with the latest start applies; when it ends, the next one that is still active
+    applies, and finally the dynamic value. Of two with the same start the later in the list
+    applies.
 
     Parameters
     ----------
     events
         In any order.
     name
-        What the schedule is called, for messages.
+        Name of the schedule, for messages.
     """
 
     def __init__(self, events: Iterable[FaultEvent] = (), name: str = '') -> None:
         self.events = tuple(events)
         self.name = name
-        # Stable: events that start together stay in the order of the list.
+        # Stable: events with the same start keep the order of the list.
         spans = ((event.at - _ROUNDING, event.until - _ROUNDING, event) for event in self.events)
         self._spans = sorted(spans, key=lambda span: span[0])
         times = {time for start, end, _ in self._spans for time in (start, end)}
         self._changes = sorted(times - {math.inf})
-        # The answer given last holds in [since, until) for one live table; there is none yet.
+        # The last result is valid in [since, until) for one dynamic table; there is none yet.
         self._since, self._until = math.inf, -math.inf
         self._scripted: dict[str, Value] = {}
-        self._live: FaultParameters | None = None
+        self._dynamic: FaultParameters | None = None
         self._result = FaultParameters()
 
     def at(self, elapsed: float, dynamic: FaultParameters) -> FaultParameters:
-        """Return the faults in force ``elapsed`` seconds after the start of the robot.
+        """Return the faults that are active ``elapsed`` seconds after the start of the robot.
 
-        What the schedule does not set at that instant is as in ``live``. The answer depends on
-        the arguments alone, not on when else the schedule was asked.
+        Faults without an active event are as in ``dynamic``. The result depends on the arguments
+        alone, not on earlier calls.
 
         Raises
         ------
@@ -206,25 +205,25 @@ class FaultSchedule:
             ``elapsed`` is not a number, or infinite.
         """
         if not self._since <= elapsed < self._until:
-            self._turn_to(elapsed)
-        if dynamic is not self._live and dynamic != self._live:
+            self._evaluate(elapsed)
+        if dynamic is not self._dynamic and dynamic != self._dynamic:
             self._result = dynamic.with_values(self._scripted) if self._scripted else dynamic
-            self._live = dynamic
+            self._dynamic = dynamic
         return self._result
 
     def active_names(self, elapsed: float) -> tuple[str, ...]:
-        """Return the names of the faults that the schedule sets at ``elapsed`` seconds."""
+        """Return the names of the faults set by the schedule at ``elapsed`` seconds."""
         scripted = self._scripted_at(elapsed)
-        return tuple(name for name in _ROWS if name in scripted)
+        return tuple(name for name in _SPECS if name in scripted)
 
-    def _turn_to(self, elapsed: float) -> None:
+    def _evaluate(self, elapsed: float) -> None:
         if not math.isfinite(elapsed):
             raise ValueError(f'elapsed must be finite: got {elapsed}')
         after = bisect_right(self._changes, elapsed)
         self._since = self._changes[after - 1] if after > 0 else -math.inf
         self._until = self._changes[after] if after < len(self._changes) else math.inf
         self._scripted = self._scripted_at(elapsed)
-        self._live = None
+        self._dynamic = None
 
     def _scripted_at(self, elapsed: float) -> dict[str, Value]:
         return {
@@ -233,14 +232,14 @@ class FaultSchedule:
 
 
 def load_schedule(name_or_path: str | Path) -> FaultSchedule:
-    """Return the schedule in a YAML file, or the shipped one of that name; '' holds no event.
+    """Return the schedule of a YAML file, or the bundled one of that name; '' has no events.
 
-    A text is a path if it ends in ``.yaml`` or ``.yml`` or contains a separator of folders.
+    A text is a path if it ends in ``.yaml`` or ``.yml`` or contains a path separator.
 
     Raises
     ------
     ScheduleError
-        There is no such schedule, or it cannot be played.
+        There is no such schedule, or it is invalid.
     """
     name = os.fspath(name_or_path)
     if not name:
@@ -250,11 +249,11 @@ def load_schedule(name_or_path: str | Path) -> FaultSchedule:
         isinstance(name_or_path, Path) or path.suffix in ('.yaml', '.yml') or path.name != name
     )
     if not by_path:
-        shipped = sorted(file.stem for file in SCHEDULES_FOLDER.glob('*.yaml'))
-        if name not in shipped:
+        bundled = sorted(file.stem for file in SCHEDULES_FOLDER.glob('*.yaml'))
+        if name not in bundled:
             raise ScheduleError(
-                f'schedule must be one of {", ".join(shipped)}, or a file that ends in .yaml: '
-                f'got {name}{_nearest(name, shipped)}'
+                f'schedule must be one of {", ".join(bundled)}, or a file that ends in .yaml: '
+                f'got {name}{_nearest(name, bundled)}'
             )
         path = SCHEDULES_FOLDER / f'{name}.yaml'
     try:
@@ -276,7 +275,7 @@ def _read(path: Path) -> object:
 
 
 class _OnceLoader(yaml.SafeLoader):
-    """Refuses a key that stands twice: YAML would forget the first, and with it an event."""
+    """Rejects a duplicate key, of which YAML would silently drop the first."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set()
@@ -284,7 +283,7 @@ class _OnceLoader(yaml.SafeLoader):
             if not isinstance(key, yaml.ScalarNode):
                 continue
             if key.value in seen:
-                problem = f'{key.value} stands twice in one entry; a new entry begins with "- "'
+                problem = f'{key.value} is given twice in one entry; a new entry begins with "- "'
                 raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
             seen.add(key.value)
         return super().construct_mapping(node, deep)
@@ -295,10 +294,10 @@ def _entries(content: object) -> tuple[list[str], list[object]]:
     if isinstance(content, dict):
         for key in content:
             if key != 'events':
-                raise ScheduleError(f'there must be nothing besides events: got {key}')
+                raise ScheduleError(f'the only key must be events: got {key}')
         content = content.get('events')
     if not isinstance(content, list):
-        raise ScheduleError(f'events must be a list of entries: got {_shown(content)}')
+        raise ScheduleError(f'events must be a list of entries: got {_shortened(content)}')
     return [f'events[{index}]' for index in range(len(content))], content
 
 
@@ -307,7 +306,9 @@ _KEYS = ('at', 'fault', 'value', 'for')
 
 def _event(name: str, entry: object) -> FaultEvent:
     if not isinstance(entry, dict):
-        raise ScheduleError(f'{name} must be a mapping of {", ".join(_KEYS)}: got {_shown(entry)}')
+        raise ScheduleError(
+            f'{name} must be a mapping of {", ".join(_KEYS)}: got {_shortened(entry)}'
+        )
     for key in entry:
         if key not in _KEYS:
             near = _nearest(key, _KEYS)
@@ -316,7 +317,7 @@ def _event(name: str, entry: object) -> FaultEvent:
             )
     for key in _KEYS[:3]:
         if key not in entry:
-            raise ScheduleError(f'{name}.{key} is missing: got {_shown(entry)}')
+            raise ScheduleError(f'{name}.{key} is missing: got {_shortened(entry)}')
     try:
         return FaultEvent(entry['at'], entry['fault'], entry['value'], entry.get('for', math.inf))
     except ScheduleError as error:
@@ -327,9 +328,9 @@ def _seconds(name: str, value: object, low: float) -> float:
     """Return ``value`` as seconds, or raise :class:`ScheduleError`."""
     bound = f'{name} must be at least {low:g} s'
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ScheduleError(f'{bound}: got {_shown(value)}{_plain_number(value)}')
+        raise ScheduleError(f'{bound}: got {_shortened(value)}{_number_hint(value)}')
     if not low <= value <= _MAX_TIME:  # not so for NaN either
-        raise ScheduleError(f'{bound} and at most {_MAX_TIME:g}: got {_shown(value)}')
+        raise ScheduleError(f'{bound} and at most {_MAX_TIME:g}: got {_shortened(value)}')
     return float(value)
 
 
@@ -338,16 +339,16 @@ def _nearest(word: object, known: Iterable[str]) -> str:
     return f'; did you mean {near[0]}?' if near else ''
 
 
-def _shown(value: object) -> str:
+def _shortened(value: object) -> str:
     text = repr(value)
     return text if len(text) <= 80 else f'{text[:77]}...'
 
 
-def _plain_number(value: object) -> str:
-    """Return advice for a number that YAML takes for a text, ``1e-3`` say; else nothing."""
+def _number_hint(value: object) -> str:
+    """Return a hint for a number that YAML reads as text, such as ``1e-3``; otherwise nothing."""
     try:
         number = isinstance(value, str) and math.isfinite(float(value))
     except ValueError:
         return ''
-    advice = '; without quotation marks, and with a point as in 1.0e-3, it is a number to YAML'
-    return advice if number else ''
+    hint = '; YAML reads a number only without quotation marks and with a point, as in 1.0e-3'
+    return hint if number else ''

@@ -16,59 +16,64 @@ S = TypeVar('S', bound=Parameters)
 
 
 def check_read_only(before: Parameters, after: Parameters) -> None:
-    """Raise ParameterError when a setting differs that is fixed once the robot is made."""
+    """Raise ParameterError when a read-only parameter differs."""
     old, new = before.to_dict(), after.to_dict()
-    for row in before.specs():
-        if not row.dynamic and old[row.name] != new[row.name]:
+    for spec in before.specs():
+        if not spec.dynamic and old[spec.name] != new[spec.name]:
             raise ParameterError(
-                f'{row.name} is fixed while the robot runs '
-                f'(it is {old[row.name]}): got {new[row.name]}'
+                f'{spec.name} is read-only while the robot runs '
+                f'(it is {old[spec.name]}): got {new[spec.name]}'
             )
 
 
 class FixedStepRobot(RobotInterface, ABC, Generic[S]):
-    """What every robot that is computed has in common: its grid of time, its guard, its reports.
+    """Base of the simulated robots: time grid, command limiter and reported states.
 
-    Time runs on a fixed grid that starts at the first instant it hears of. States are reported
-    once per control period; a command takes effect at the integration step in which it arrives.
-    What comes out depends on the settings and the calls alone: equal runs are equal bit for bit.
+    The time grid starts at the first instant passed to any method. States are reported once per
+    control period; a command takes effect at the integration step in which it arrives. The states
+    depend on the parameters and the calls alone: equal runs are bit-equal.
 
     Parameters
     ----------
-    settings
-        The whole table of the robot.
+    parameters
+        All parameters of the robot.
     rate
         Reports per second.
     substeps
         Integration steps between two reports.
-    longest_gap
-        Time (s) that is made up for when nobody asked; what is longer is skipped.
-    guard
-        Decides what reaches the wheels.
+    max_catch_up_time
+        Longest time (s) simulated after a gap between calls; the rest of the gap is skipped.
+    limiter
+        Limits the commands.
     """
 
     def __init__(
-        self, parameters: S, rate: float, substeps: int, longest_gap: float, guard: CommandLimiter
+        self,
+        parameters: S,
+        rate: float,
+        substeps: int,
+        max_catch_up_time: float,
+        limiter: CommandLimiter,
     ) -> None:
         self._parameters = parameters
-        self._limiter = guard
+        self._limiter = limiter
         self._substeps = substeps
-        self._longest_gap_ns = round(longest_gap * NANOSECONDS)
-        # A ratio of whole numbers: stamps stay exact however long the robot runs.
+        self._max_catch_up_ns = round(max_catch_up_time * NANOSECONDS)
+        # A ratio of integers keeps the stamps exact however long the robot runs.
         frequency = Fraction(rate) * substeps / NANOSECONDS
         self._top, self._bottom = frequency.as_integer_ratio()
         self._origin_ns: int | None = None
         self._steps_since_origin = 0
-        """Integration steps since the origin of the grid."""
+        """Integration steps since the origin of the time grid."""
         self._reached_ns = 0
         self._reports: deque[RobotState] = deque(maxlen=1024)
-        """The newest, and older ones that nobody has asked for."""
+        """The newest state, and older ones that were not requested yet."""
 
-    # -- what a robot has of its own --------------------------------------------------------------
+    # -- implemented by each robot ----------------------------------------------------------------
 
     @abstractmethod
     def _apply_parameters(self) -> None:
-        """Let every part use the settings in force."""
+        """Pass the current parameters to every component."""
 
     @abstractmethod
     def _integrate(self, count: int) -> None:
@@ -76,11 +81,11 @@ class FixedStepRobot(RobotInterface, ABC, Generic[S]):
 
     @abstractmethod
     def _measure(self) -> None:
-        """Measure at the end of a period, and draw what disturbs the next one."""
+        """Measure at the end of a period, and draw the disturbance of the next one."""
 
     @abstractmethod
     def _make_state(self, stamp_ns: int) -> RobotState:
-        """Return the state as last measured."""
+        """Return the last measured state."""
 
     @abstractmethod
     def _moving(self) -> bool:
@@ -88,16 +93,16 @@ class FixedStepRobot(RobotInterface, ABC, Generic[S]):
 
     @abstractmethod
     def _reset_odometry(self) -> None:
-        """Let dead reckoning start at the origin."""
+        """Set the odometry pose to the origin."""
 
-    # -- the seam ---------------------------------------------------------------------------------
+    # -- robot interface --------------------------------------------------------------------------
 
     def apply(self, command: RobotCommand, now_ns: int) -> str:
-        """Follow ``command`` from now on; return why not if it is refused."""
+        """Follow ``command`` from now on, or return why it is rejected."""
         return self._limiter.accept(command, self._run_to(now_ns))
 
     def advance(self, now_ns: int) -> RobotState:
-        """Return the state at the last point of the grid that is not later than ``now_ns``."""
+        """Return the state at the last instant of the time grid up to ``now_ns``."""
         self._run_to(now_ns, whole_periods=True)
         reports = self._reports
         while len(reports) > 1 and reports[1].stamp_ns <= now_ns:
@@ -105,11 +110,11 @@ class FixedStepRobot(RobotInterface, ABC, Generic[S]):
         return reports[0]
 
     def stop(self, reason: str, now_ns: int) -> None:
-        """Come to rest; the next command moves the robot again."""
+        """Stop; the next command moves the robot again."""
         self._limiter.stop(reason, self._run_to(now_ns))
 
     def reset_odometry(self, now_ns: int) -> str:
-        """Let dead reckoning start at the origin; refused while the robot moves."""
+        """Set the odometry pose to the origin; rejected while the robot moves."""
         self._run_to(now_ns)
         if self._moving():
             return 'odometry cannot be reset while the robot moves'
@@ -118,27 +123,27 @@ class FixedStepRobot(RobotInterface, ABC, Generic[S]):
         return ''
 
     def latch_estop(self, reason: str, now_ns: int) -> None:
-        """Come to rest, and stay so until :meth:`release_estop`."""
+        """Stop until :meth:`release_estop`."""
         self._limiter.latch(reason, self._run_to(now_ns))
 
     def release_estop(self, now_ns: int) -> str:
         """Release the emergency stop; the robot then waits for a new command."""
         return self._limiter.release(self._run_to(now_ns))
 
-    # -- only where time is computed --------------------------------------------------------------
+    # -- simulation only --------------------------------------------------------------------------
 
     @property
     def parameters(self) -> S:
-        """The table in force."""
+        """The parameters in use."""
         return self._parameters
 
     def configure(self, parameters: S) -> None:
-        """Go on with other settings, a heavier load say.
+        """Continue with other parameters, for example a heavier load.
 
         Raises
         ------
         ParameterError
-            A setting differs that is fixed once the robot is made.
+            A read-only parameter differs.
         """
         check_read_only(self._parameters, parameters)
         self._parameters = parameters
@@ -146,22 +151,22 @@ class FixedStepRobot(RobotInterface, ABC, Generic[S]):
 
     @property
     def state(self) -> RobotState:
-        """The state last reported."""
+        """The last reported state."""
         return self._reports[-1]
 
     def step(self, wheels: WheelSpeeds = ZERO_WHEEL_SPEEDS) -> RobotState:
         """Command ``wheels`` now and return the state one control period later.
 
-        For closed loops without a clock: the robot's own grid is the time.
+        For closed loops without a clock, on the time grid of the robot.
         """
         now_ns = self._now_ns()
         self.apply(RobotCommand(wheels, now_ns), now_ns)
         return self._advance_period()
 
-    # -- inside -----------------------------------------------------------------------------------
+    # -- time grid --------------------------------------------------------------------------------
 
     def _advance_period(self) -> RobotState:
-        return self.advance(self._after(self._steps_since_origin + self._substeps))
+        return self.advance(self._stamp_after(self._steps_since_origin + self._substeps))
 
     def _refresh_state(self) -> None:
         self._reports[-1] = self._make_state(self._reports[-1].stamp_ns)
@@ -170,7 +175,7 @@ class FixedStepRobot(RobotInterface, ABC, Generic[S]):
         """Return the time of the last finished substep."""
         return self._reached_ns
 
-    def _after(self, steps: int) -> int:
+    def _stamp_after(self, steps: int) -> int:
         """Return the instant (ns) that lies ``steps`` integration steps after the origin."""
         top = self._top
         return (self._origin_ns or 0) + (2 * steps * self._bottom + top) // (2 * top)
@@ -182,13 +187,13 @@ class FixedStepRobot(RobotInterface, ABC, Generic[S]):
     def _run_to(self, now_ns: int, whole_periods: bool = False) -> int:
         """Integrate up to ``now_ns`` and return the instant reached, within a step before it.
 
-        Reports are made on the way. A clock that went back to before the state last handed out,
-        or that left the longest gap behind, starts a new grid. One that went back by less is a
-        late question for a report that was made already.
+        States are reported on the way. A clock that jumps back before the last returned state, or
+        ahead by more than the maximum catch-up time, starts a new time grid. A smaller step back
+        is a late request for a state that is already reported.
         """
         if now_ns == self._reached_ns and self._origin_ns is not None:
             return now_ns
-        latest_ns = self._reached_ns + self._longest_gap_ns
+        latest_ns = self._reached_ns + self._max_catch_up_ns
         if self._origin_ns is None:
             self._reports.clear()
             self._start_grid(now_ns)
@@ -207,11 +212,11 @@ class FixedStepRobot(RobotInterface, ABC, Generic[S]):
         self._origin_ns = now_ns
         self._steps_since_origin = 0
         self._reached_ns = now_ns
-        self._make_report()
+        self._report_state()
 
     def _integrate_to(self, now_ns: int, whole_periods: bool) -> None:
         substeps = self._substeps
-        # Half a nanosecond more, because stamps are rounded to whole ones.
+        # Half a nanosecond more, because stamps are rounded to whole nanoseconds.
         elapsed = 2 * (now_ns - (self._origin_ns or 0)) + 1
         goal = elapsed * self._top // (2 * self._bottom)
         if whole_periods:
@@ -222,10 +227,10 @@ class FixedStepRobot(RobotInterface, ABC, Generic[S]):
             )
             self._integrate(count)
             self._steps_since_origin += count
-            self._reached_ns = self._after(self._steps_since_origin)
+            self._reached_ns = self._stamp_after(self._steps_since_origin)
             if self._steps_since_origin % substeps == 0:
-                self._make_report()
+                self._report_state()
 
-    def _make_report(self) -> None:
+    def _report_state(self) -> None:
         self._measure()
         self._reports.append(self._make_state(self._reached_ns))

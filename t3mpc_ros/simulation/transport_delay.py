@@ -12,79 +12,79 @@ from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.robot.interface import RobotCommand
 
 CAPACITY = 1000
-"""Commands that can be under way at once: 2 s of them at 500 Hz."""
+"""Commands in transit at most: 2 s at 500 Hz."""
 
 
 class TransportCounts(NamedTuple):
-    """What became of the commands of a channel since it was made.
+    """Number of commands by outcome.
 
-    ``sent`` is the sum of the others and of what is still under way.
+    ``sent`` is the sum of the others and of the commands in transit.
     """
 
     sent: int
     arrived: int
     lost: int
-    """By chance."""
+    """At random."""
     dropped: int
-    """The oldest, when more were under way than the channel holds."""
+    """The oldest commands beyond the capacity."""
     cleared: int
-    """Those under way when the channel was cleared, or its clock went back."""
+    """Those in transit when the delay was cleared, or its clock jumped back."""
 
 
 class TransportDelay:
-    """Keeps commands until they arrive; changes, doubles and invents none.
+    """Delays, reorders and loses commands; it never changes, duplicates or creates one.
 
-    All stamps come from one clock, that of whoever asks what arrived. If it goes back, what was
-    under way is gone: nobody could say when it is due.
+    All times are those of one clock. When it jumps back, the commands in transit are dropped,
+    because their arrival time is undefined.
 
     Parameters
     ----------
     generator
-        Used for nothing else. Two numbers are drawn for each command whatever becomes of it, so
+        Used by this delay alone. Two numbers are drawn for each command whatever its outcome, so
         that a change of loss does not shift the delays.
     """
 
     def __init__(self, generator: np.random.Generator) -> None:
         self._generator = generator
-        self._under_way: list[tuple[int, int, RobotCommand]] = []
+        self._in_transit: list[tuple[int, int, RobotCommand]] = []
         """A heap of (arrival, number, command); the number keeps ties in the order of sending."""
         self._clock_ns: int | None = None
         self._sent = self._arrived = self._lost = self._dropped = self._cleared = 0
 
     def __len__(self) -> int:
-        """How many commands are under way."""
-        return len(self._under_way)
+        """Number of commands in transit."""
+        return len(self._in_transit)
 
     @property
     def next_ns(self) -> int | None:
-        """When the next command arrives; None when none is under way."""
-        return self._under_way[0][0] if self._under_way else None
+        """Arrival time of the next command; None when none is in transit."""
+        return self._in_transit[0][0] if self._in_transit else None
 
     @property
     def counts(self) -> TransportCounts:
-        """What became of the commands so far."""
+        """Number of commands by outcome so far."""
         return TransportCounts(self._sent, self._arrived, self._lost, self._dropped, self._cleared)
 
     def send(
         self, command: RobotCommand, now_ns: int, delay_s: float, jitter_s: float, loss: float
     ) -> None:
-        """Put a command on its way: it arrives after ``delay_s`` to ``delay_s + jitter_s``.
+        """Send a command, which arrives after ``delay_s`` to ``delay_s + jitter_s``.
 
         Parameters
         ----------
         command
-            Anything, even what a guard will refuse.
+            Any command, even one that the limiter rejects.
         now_ns
-            When it leaves.
+            Time of sending.
         delay_s, jitter_s
-            s; the part of the jitter is drawn evenly.
+            s; the part of the jitter is uniform.
         loss
-            Share of the commands that never arrive, 0 to 1.
+            Fraction of the commands that is lost, 0 to 1.
 
         Raises
         ------
         ValueError
-            A delay is negative or not finite, or the loss is no share.
+            A delay is negative or not finite, or the loss is not in [0, 1].
         """
         if not (0.0 <= delay_s < math.inf and 0.0 <= jitter_s < math.inf):
             raise ValueError(
@@ -92,41 +92,41 @@ class TransportDelay:
             )
         if not 0.0 <= loss <= 1.0:
             raise ValueError(f'loss must be from 0 to 1: got {loss}')
-        self._notice(now_ns)
-        chance, part = self._generator.random(), self._generator.random()
+        self._check_clock(now_ns)
+        loss_number, jitter_number = self._generator.random(), self._generator.random()
         self._sent += 1
-        if chance < loss:
+        if loss_number < loss:
             self._lost += 1
             return
-        arrival_ns = now_ns + round((delay_s + jitter_s * part) * NANOSECONDS)
-        if len(self._under_way) >= CAPACITY:
+        arrival_ns = now_ns + round((delay_s + jitter_s * jitter_number) * NANOSECONDS)
+        if len(self._in_transit) >= CAPACITY:
             self._drop_oldest()
-        heapq.heappush(self._under_way, (arrival_ns, self._sent, command))
+        heapq.heappush(self._in_transit, (arrival_ns, self._sent, command))
 
     def arrived(self, now_ns: int) -> list[RobotCommand]:
-        """Return what has arrived by ``now_ns`` and was not returned before, first to last.
+        """Return the commands that arrived since the last call, in order of arrival.
 
-        That order is not always the order of sending: a guard refuses what was overtaken.
+        The order of sending may differ: the limiter rejects overtaken commands.
         """
-        self._notice(now_ns)
+        self._check_clock(now_ns)
         commands = []
-        while self._under_way and self._under_way[0][0] <= now_ns:
-            commands.append(heapq.heappop(self._under_way)[2])
+        while self._in_transit and self._in_transit[0][0] <= now_ns:
+            commands.append(heapq.heappop(self._in_transit)[2])
         self._arrived += len(commands)
         return commands
 
     def clear(self) -> None:
-        """Forget what is under way, as a board does that restarts."""
-        self._cleared += len(self._under_way)
-        self._under_way.clear()
+        """Drop the commands in transit, as a restart of the board does."""
+        self._cleared += len(self._in_transit)
+        self._in_transit.clear()
 
     def _drop_oldest(self) -> None:
-        oldest = min(self._under_way, key=lambda entry: entry[1])
-        self._under_way.remove(oldest)
-        heapq.heapify(self._under_way)
+        oldest = min(self._in_transit, key=lambda entry: entry[1])
+        self._in_transit.remove(oldest)
+        heapq.heapify(self._in_transit)
         self._dropped += 1
 
-    def _notice(self, now_ns: int) -> None:
+    def _check_clock(self, now_ns: int) -> None:
         if self._clock_ns is not None and now_ns < self._clock_ns:
             self.clear()
         self._clock_ns = now_ns

@@ -1,6 +1,12 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""World: walls, boxes, pillars and slippery patches from a YAML file, and ray casting in them."""
+"""World: walls, boxes, pillars and slippery patches from a YAML file, and ray casting in them.
+
+A file with an error is rejected, never repaired; the error names the entry. The kernels read the
+arrays of a :class:`World`: ``segments`` (n, 4: ax, ay, bx, by), ``circles`` (m, 3: x, y, radius),
+``patches`` (k, 4: x, y, radius, grip), all in m in the world frame except the grip; any of them
+may be empty.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,26 +26,28 @@ from t3mpc_ros.kernels import kernel
 Array = npt.NDArray[np.float64]
 
 WORLDS_FOLDER = Path(__file__).resolve().parent / 'worlds'
-"""Where the worlds are that come with the package."""
+"""Folder of the bundled worlds."""
 MAX_COORDINATE = 1000.0
-"""m: bound of every coordinate and size."""
+"""m, bound of every coordinate and size."""
 MIN_SIZE = 0.01
-"""m: bound of every size. What is thinner than a bumper gives way would push it on both sides."""
+"""m, lower bound of every size: a thinner obstacle would push the bumper on both sides."""
 MAX_SEGMENTS = 2000
-"""Straight pieces of wall, those of boxes included: each is looked at by each ray and step."""
+"""Straight wall segments, those of boxes included: every ray and every step visits each."""
 MAX_CIRCLES = 500
 MAX_PATCHES = 100
 MAX_FILE_SIZE = 1_000_000
 """Bytes."""
+JOIN_TOLERANCE = 1e-4
+"""m: ends nearer than this to each other, or to a wall, touch."""
 _NUMBER_PATTERN = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?', re.IGNORECASE)
 
 
 class WorldError(ValueError):
-    """A world that cannot be used; the text names the file, the entry, the bound and the value."""
+    """An invalid world; the text contains the file, the entry, the bound and the value."""
 
 
 class BoundingBox(NamedTuple):
-    """The smallest upright rectangle around everything there is."""
+    """Smallest axis-aligned rectangle around all obstacles and patches."""
 
     left: float
     """m"""
@@ -53,26 +61,25 @@ class BoundingBox(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """What stands around the robot, as the arrays that the kernels read; not to be written to.
+    """Obstacles and patches as arrays for the kernels; read-only by convention.
 
-    They are not locked against that: the compiler would build every kernel once more for arrays
-    that are.
+    They are not locked, because the kernels would be compiled again for read-only arrays.
     """
 
     name: str
     segments: Array
-    """Straight pieces of wall, shape (n, 4): ax, ay, bx, by, m; those of boxes too."""
+    """Wall segments, shape (n, 4): ax, ay, bx, by, m; those of boxes included."""
     circles: Array
     """Pillars, shape (m, 3): x, y, radius, m."""
     patches: Array
-    """Slippery floor, shape (k, 4): x, y, radius (m), grip (part of the tyres' own, 0 to 1)."""
+    """Slippery floor, shape (k, 4): x, y, radius (m), grip (factor on the tyre grip, 0 to 1)."""
     boxes: Array
-    """For the inside, shape (b, 5): x, y, length, width (m), yaw of the length (rad)."""
+    """Interior of the boxes, shape (b, 5): x, y, length, width (m), yaw of the length (rad)."""
 
     def is_free(self, x: float, y: float, radius: float) -> bool:
         """Decide whether a disc at (x, y) touches no wall and is in no box or circle, all in m.
 
-        What is not finite is not free.
+        Non-finite arguments are not free.
 
         Raises
         ------
@@ -83,7 +90,7 @@ class World:
             raise ValueError(f'radius must be at least 0 m: got {radius:g}')
         if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(radius)):
             return False
-        x, y = float(x), float(y)  # an int would make the compiler build the kernel once more
+        x, y = float(x), float(y)  # an int would compile the kernel again
         if clearance(x, y, self.segments, self.circles) < radius:
             return False
         if np.any(np.hypot(x - self.circles[:, 0], y - self.circles[:, 1]) <= self.circles[:, 2]):
@@ -95,8 +102,8 @@ class World:
         return not inside.any()
 
     @property
-    def extent(self) -> BoundingBox:
-        """What a picture has to show; all zero where there is nothing."""
+    def bounding_box(self) -> BoundingBox:
+        """Bounding box of all obstacles and patches; all zero for an empty world."""
         discs = np.vstack([self.circles, self.patches[:, :3]])
         corners = [self.segments.reshape(-1, 2)]
         corners += [discs[:, :2] + side * discs[:, 2:] for side in (-1.0, 1.0)]
@@ -107,20 +114,20 @@ class World:
 
 
 def bundled_worlds() -> tuple[str, ...]:
-    """Return the names of the worlds that come with the package."""
+    """Return the names of the bundled worlds."""
     return tuple(sorted(path.stem for path in WORLDS_FOLDER.glob('*.yaml')))
 
 
 def load_world(path_or_name: str | Path) -> World:
-    """Return a world by the name of a shipped one, else by the path of a file.
+    """Return a world by the name of a bundled one, otherwise by the path of a file.
 
-    An empty name is the empty plain. A file of your own that has the name of a shipped world is
-    reached with its folder: ``./room``.
+    An empty name is the empty plain. A file with the name of a bundled world needs its folder:
+    ``./room``.
 
     Raises
     ------
     WorldError
-        There is no such world, or the file does not hold one.
+        There is no such world, or the file is invalid.
     """
     if path_or_name == '':
         return parse_world('name: plain', 'plain')
@@ -147,19 +154,19 @@ def load_world(path_or_name: str | Path) -> World:
 
 
 def parse_world(text: str, source: str) -> World:
-    """Return the world that a YAML text describes.
+    """Return the world of a YAML text.
 
     Parameters
     ----------
     text
         See ``docs/worlds.md``.
     source
-        What the errors call it; without ``name`` in the text, its stem is the world's name.
+        Its name in errors; without ``name`` in the text, its stem is the name of the world.
 
     Raises
     ------
     WorldError
-        Names ``source``, the entry, the bound and the value.
+        Contains ``source``, the entry, the bound and the value.
     """
     try:
         return _world(_parsed(text), Path(source).stem)
@@ -168,7 +175,7 @@ def parse_world(text: str, source: str) -> World:
 
 
 class _Loader(yaml.SafeLoader):
-    """Refuses a key that is given twice, where YAML would keep the last one in silence."""
+    """Rejects a duplicate key, of which YAML would silently keep the last."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         pairs = node.value if isinstance(node, yaml.MappingNode) else []
@@ -192,8 +199,7 @@ def _parsed(text: str) -> object:
         problem = getattr(error, 'problem', None) or str(error)
         raise WorldError(f'not YAML: {line}{problem}') from error
     except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
-        # What the parser lets through: a date that is none, brackets without end, !!int without
-        # digits.
+        # Errors of the parser itself: an invalid date, endless brackets, !!int without digits.
         raise WorldError(f'not YAML that can be read: {error}') from error
 
 
@@ -313,9 +319,9 @@ def _point(content: object, where: str) -> tuple[float, float]:
 def _number(content: object, where: str, low: float, high: float, unit: str) -> float:
     bounds = f'{where} must be a number from {low:g} to {high:g}{unit}'
     if isinstance(content, bool) or not isinstance(content, int | float):
-        # PyYAML wants a digit between sign and point, and an exponent with point and sign.
-        like_one = isinstance(content, str) and _NUMBER_PATTERN.fullmatch(content)
-        hint = ', a text to YAML; write numbers like -0.9 or 1.0e-3' if like_one else ''
+        # PyYAML requires a digit between sign and point, and an exponent with point and sign.
+        number_like = isinstance(content, str) and _NUMBER_PATTERN.fullmatch(content)
+        hint = ', which YAML reads as text; write -0.9 or 1.0e-3' if number_like else ''
         raise WorldError(f'{bounds}: got {reprlib.repr(content)}{hint}')
     if not low <= content <= high:  # false for NaN, too
         raise WorldError(f'{bounds}: got {reprlib.repr(content)}')
@@ -325,7 +331,7 @@ def _number(content: object, where: str, low: float, high: float, unit: str) -> 
 def _check_count(count: int) -> None:
     if count > MAX_SEGMENTS:
         raise WorldError(
-            f'walls and boxes must have at most {MAX_SEGMENTS} straight pieces together: '
+            f'walls and boxes must have at most {MAX_SEGMENTS} segments together: '
             f'got {count} or more'
         )
 
@@ -339,21 +345,17 @@ def _near(name: str, known: tuple[str, ...]) -> str:
     return f'; did you mean {near[0]}?' if near else ''
 
 
-JOIN_TOLERANCE = 1e-4
-"""m: ends nearer to each other, or to a wall, than this are meant to touch."""
-
-
 def join_walls(segments: Array) -> Array:
-    """Return the walls with every meeting point an end of all walls there, shape (n', 4).
+    """Return the walls with every point of contact an end of all walls there, shape (n', 4).
 
-    Ends within :data:`JOIN` of one another become one; a wall on which another one ends is cut
-    there, and of what then stands twice one is kept. Walls that cross are left alone: at a
+    Ends within :data:`JOIN_TOLERANCE` of one another become bit-equal; a wall on which another
+    one ends is split there, and duplicates are removed. Crossing walls are unchanged: at a
     crossing the bumper is always in a corner.
 
     Parameters
     ----------
     segments
-        Shape (n, 4), m; each longer than twice :data:`JOIN`.
+        Shape (n, 4), m; each longer than twice :data:`JOIN_TOLERANCE`.
     """
     points: Array = segments.reshape(-1, 2).copy()
     for index in range(1, len(points)):
@@ -370,13 +372,13 @@ def join_walls(segments: Array) -> Array:
 
 
 def _ends_between(start: Array, end: Array, points: Array) -> list[Array]:
-    """Return the points that lie on a wall between its ends, in order from its start."""
+    """Return the points on a wall between its ends, in order from its start."""
     length = float(np.hypot(*(end - start)))
     direction = (end - start) / length
     away = points - start
     along = away @ direction
     off = np.abs(away @ np.array([-direction[1], direction[0]]))
-    # Ends nearer than JOIN to those of this wall are one with them by now.
+    # Ends within the tolerance of the ends of this wall are equal to them already.
     on = np.flatnonzero(
         (off <= JOIN_TOLERANCE)
         & (along > 0.5 * JOIN_TOLERANCE)
@@ -390,8 +392,8 @@ def _ends_between(start: Array, end: Array, points: Array) -> list[Array]:
 def cast_ray(x: float, y: float, direction: float, segments: Array, circles: Array) -> float:
     """Return the distance (m) from (x, y) to the first wall in a direction; inf if there is none.
 
-    From inside a circle that is its wall, seen from within. Touching an end point is a hit; a
-    wall has no thickness, so whether one seen exactly edge-on is hit is left to rounding.
+    From inside a circle it is the distance to that circle. Touching an end point is a hit; a
+    wall has no thickness, so rounding decides whether a wall exactly edge-on is hit.
 
     x, y : m; direction : rad from the x axis of the world
     """
@@ -400,8 +402,8 @@ def cast_ray(x: float, y: float, direction: float, segments: Array, circles: Arr
     for row in range(segments.shape[0]):
         start_x, start_y = segments[row, 0] - x, segments[row, 1] - y
         end_x, end_y = segments[row, 2] - x, segments[row, 3] - y
-        # On which side of the ray an end lies depends on that end alone. Two walls that share it
-        # get the same sign, however it is rounded, so no ray slips through between them.
+        # The side of the ray on which an end lies depends on that end alone. Two walls that share
+        # it get the same sign, however it is rounded, so no ray passes between them.
         start_off = cosine * start_y - sine * start_x
         end_off = cosine * end_y - sine * end_x
         if (start_off > 0.0 and end_off > 0.0) or (start_off < 0.0 and end_off < 0.0):
@@ -411,7 +413,7 @@ def cast_ray(x: float, y: float, direction: float, segments: Array, circles: Arr
         if start_off != end_off:
             distance = (start_on * end_off - end_on * start_off) / (end_off - start_off)
         elif start_on * end_on <= 0.0:
-            distance = 0.0  # both are on the ray's line, and it starts between them
+            distance = 0.0  # both ends are on the line of the ray, which starts between them
         else:
             distance = min(start_on, end_on)
         if 0.0 <= distance < nearest:
@@ -442,12 +444,12 @@ def cast_rays(
     circles: Array,
     out: Array,
 ) -> None:
-    """Write what some of the sensors on the body see into ``out``, as :func:`cast_ray` does.
+    """Write the distances of some sensors on the body into ``out``, see :func:`cast_ray`.
 
     x, y, yaw : pose of the body, m, m, rad
     mounts : shape (s, 3), of each sensor x (m, forward), y (m, to the left), direction (rad),
         in the frame of the body
-    which : int64, the rows of ``mounts`` to look from
+    which : int64, the rows of ``mounts`` to use
     out : shape (s,), m; ``out[row]`` is written for each row in ``which``, the others are kept
     """
     cosine, sine = math.cos(yaw), math.sin(yaw)
@@ -469,7 +471,7 @@ def nearest_on_segment(
 ) -> tuple[float, float]:
     """Return the point of the segment from a to b that is nearest to (x, y), all in m.
 
-    Where that is an end, it is that end to the last bit.
+    If it is an end, it is bit-equal to that end.
     """
     run_x, run_y = bx - ax, by - ay
     along = (x - ax) * run_x + (y - ay) * run_y
@@ -486,8 +488,8 @@ def nearest_on_segment(
 def clearance(x: float, y: float, segments: Array, circles: Array) -> float:
     """Return the distance (m) from (x, y) to the nearest wall, on either side; inf without walls.
 
-    Inside a box or circle that is the distance to its wall:
-    :meth:`~t3mpc_ros.simulation.world.World.is_free` tells inside from outside.
+    Inside a box or circle it is the distance to its wall:
+    :meth:`~t3mpc_ros.simulation.world.World.is_free` distinguishes inside and outside.
     """
     least = math.inf
     for row in range(segments.shape[0]):
@@ -504,9 +506,9 @@ def clearance(x: float, y: float, segments: Array, circles: Array) -> float:
 
 @kernel
 def grip_at(x: float, y: float, patches: Array) -> float:
-    """Return which part of their grip tyres keep at (x, y): 1 outside all patches.
+    """Return the grip factor of the tyres at (x, y): 1 outside all patches.
 
-    Where patches overlap the most slippery one counts: the same oil twice is no worse.
+    Where patches overlap the lowest grip applies.
     """
     grip = 1.0
     for row in range(patches.shape[0]):

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Steps and gyro fused: consistent, quick, not fooled by slip, and honest about the rest."""
+"""Gyro odometry: consistency, bias estimation and slip detection."""
 
 from dataclasses import replace
 import math
@@ -16,20 +16,20 @@ from t3mpc_ros.robot.wheel_odometry import WheelOdometry, WheelOdometryParameter
 
 GEOMETRY = WheelGeometry()
 RADIUS, TRACK = GEOMETRY.wheel_radius, GEOMETRY.wheel_separation
-SETTINGS = GyroOdometryParameters()
+PARAMETERS = GyroOdometryParameters()
 DEGREE = math.pi / 180.0
 PERIOD = 0.01
 STEP = math.tau / 3200.0
-"""rad of wheel, 1/16 step."""
+"""Wheel angle of a microstep, rad."""
 
 
 class Robots:
-    """Many true robots at once: their poses, and what the gyros on them show.
+    """True motion of many robots at once, and the output of their gyros.
 
     ``bias`` (rad/s), ``scale`` (relative error) and ``rate`` (true, rad/s) have one number each.
     """
 
-    def __init__(self, count, seed, delay=SETTINGS.gyro_delay):
+    def __init__(self, count, seed, delay=PARAMETERS.gyro_delay):
         self.generator = np.random.default_rng(seed)
         self.pose = np.zeros((3, count))
         self.bias = self.generator.uniform(-20.0, 20.0, count) * DEGREE
@@ -39,7 +39,7 @@ class Robots:
         self._lagged = np.zeros((2, count))
 
     def move(self, right, left, dt):
-        """Run these paths (m) in ``dt``."""
+        """Move by these wheel travels (m) in ``dt``."""
         run = 0.5 * (right + left) + np.zeros_like(self.bias)
         turn = (right - left) / TRACK + np.zeros_like(self.bias)
         chord, direction = run * np.sinc(0.5 * turn / math.pi), self.pose[2] + 0.5 * turn
@@ -50,17 +50,17 @@ class Robots:
         self._lagged[0] = self.rate + first * decay
         self._lagged[1] = self.rate + (second + first * share) * decay
 
-    def walk_bias(self, dt, drift=SETTINGS.gyro_bias_drift):
+    def walk_bias(self, dt, drift=PARAMETERS.gyro_bias_drift):
         self.bias += drift * math.sqrt(dt) * self.generator.standard_normal(self.bias.size)
 
-    def gyro(self, noise=SETTINGS.gyro_noise, delay=SETTINGS.gyro_delay):
-        """Return a sample: white noise within what the filter lets through."""
+    def gyro(self, noise=PARAMETERS.gyro_noise, delay=PARAMETERS.gyro_delay):
+        """Return a sample with white noise behind the filter."""
         sigma = noise / math.sqrt(2.0 * delay)
         noise = sigma * self.generator.standard_normal(self.bias.size)
         return (1.0 + self.scale) * self._lagged[1] + self.bias + noise
 
     def stand(self, odometries, seconds, push=None):
-        """Let them stand, or turn at ``push(time)`` (rad/s) without a step."""
+        """Stand still, or turn at ``push(time)`` (rad/s) without a step."""
         for index in range(round(seconds / PERIOD)):
             path = 0.0 if push is None else 0.5 * TRACK * PERIOD * push(index * PERIOD)
             self.move(path, -path, PERIOD)
@@ -68,14 +68,14 @@ class Robots:
                 odometry.update(0.0, 0.0, sample, PERIOD)
 
     def yaw_errors(self, odometries):
-        """Return estimate less truth, within half a turn."""
+        """Return estimate minus truth, within half a turn."""
         estimates = np.array([odometry.pose.yaw for odometry in odometries])
         return np.array([math.remainder(x, math.tau) for x in estimates - self.pose[2]])
 
     def drive(self, odometries, speeds, grip=1.0, period=PERIOD):
-        """Let wheels turn at ``speeds`` (rad/s, shape (milliseconds, 2, count)), counted in steps.
+        """Turn the wheels at ``speeds`` (rad/s, shape (milliseconds, 2, count)), counted in steps.
 
-        ``grip`` is the part of a path that is really run, of a shape like ``speeds``. Yields the
+        ``grip`` is the part of the travel that moves the robot, shaped like ``speeds``. Yields the
         time (s) after each period.
         """
         angles = np.cumsum(speeds * 1e-3, axis=0)
@@ -90,8 +90,8 @@ class Robots:
             yield (index + 1) * period
 
 
-def fused(count=1, **changes):
-    parameters = replace(SETTINGS, **changes)
+def make_odometries(count=1, **changes):
+    parameters = replace(PARAMETERS, **changes)
     return [GyroOdometry(parameters, GEOMETRY) for _ in range(count)]
 
 
@@ -117,15 +117,15 @@ def nees(robots, odometries):
     return float(np.mean(values))
 
 
-def test_errors_are_as_large_as_the_covariance_says():
+def test_normalized_estimation_error_matches_the_covariance():
     count = 200
-    robots, odometries = Robots(count, 1), fused(count)
+    robots, odometries = Robots(count, 1), make_odometries(count)
     generator = robots.generator
-    robots.scale = SETTINGS.gyro_scale_tolerance * generator.standard_normal(count)
+    robots.scale = PARAMETERS.gyro_scale_tolerance * generator.standard_normal(count)
     robots.stand(odometries, 3.0)
     for speeds in smooth_speeds(generator, count, 2000):
         runs = RADIUS * PERIOD * speeds
-        spread = np.sqrt(SETTINGS.variance_per_metre * np.abs(runs))
+        spread = np.sqrt(PARAMETERS.variance_per_metre * np.abs(runs))
         robots.walk_bias(PERIOD)
         robots.move(*(runs + spread * generator.standard_normal(runs.shape)), PERIOD)
         angles = runs / RADIUS
@@ -139,10 +139,10 @@ def test_errors_are_as_large_as_the_covariance_says():
     assert not any(odometry.slipping for odometry in odometries)
 
 
-def test_a_standstill_takes_back_what_the_heading_has_drifted():
+def test_standstill_corrects_half_of_the_yaw_drift():
     count = 60
     changes = {'gyro_scale_tolerance': 0.0, 'gyro_bias_drift': 5e-4}
-    robots, odometries = Robots(count, 2), fused(count, **changes)
+    robots, odometries = Robots(count, 2), make_odometries(count, **changes)
     robots.stand(odometries, 3.0)
     for speeds in smooth_speeds(robots.generator, count, 2000):
         robots.walk_bias(PERIOD, drift=5e-4)
@@ -152,38 +152,38 @@ def test_a_standstill_takes_back_what_the_heading_has_drifted():
     before = robots.yaw_errors(odometries)
     robots.stand(odometries, 2.0)
     after = robots.yaw_errors(odometries)
-    # A random walk W over T leaves int W dt half known by W(T): variance T³/3 becomes T³/12.
+    # W(T) of a random walk W explains half of int W dt: variance T³/3 becomes T³/12.
     assert np.std(after) / np.std(before) == pytest.approx(0.5, abs=0.12)
     sure = np.sqrt([odometry.covariance[2, 2] for odometry in odometries])
     assert np.std(after / sure) == pytest.approx(1.0, abs=0.25)
 
 
-@pytest.mark.parametrize('heard', ['none', 'refused', 'unknown bias'])
-def test_without_a_gyro_of_known_bias_it_is_dead_reckoning(heard):
+@pytest.mark.parametrize('gyro_state', ['none', 'disabled', 'unknown bias'])
+def test_without_calibrated_gyro_equals_wheel_odometry(gyro_state):
     generator = np.random.default_rng(3)
-    odometry = fused(use_gyro=heard != 'refused')[0]
+    odometry = make_odometries(use_gyro=gyro_state != 'disabled')[0]
     plain = WheelOdometry(WheelOdometryParameters(), GEOMETRY)
     odometry.reset(Pose(0.3, -0.2, 1.0))
     plain.reset(Pose(0.3, -0.2, 1.0))
     for index in range(1000):
         right, left = generator.uniform(-0.2, 0.3, 2)
         jitter = 1e-6 * (index % 3)
-        gyro = None if heard == 'none' else generator.uniform(-0.4, 0.4)
+        gyro = None if gyro_state == 'none' else generator.uniform(-0.4, 0.4)
         odometry.update(right, left, gyro, generator.uniform(0.001, 0.1), jitter)
-        plain.turn(right, left, jitter)
+        plain.update(right, left, jitter)
     assert odometry.pose == pytest.approx(plain.pose, abs=1e-12)
     assert odometry.covariance == pytest.approx(plain.covariance, rel=1e-10, abs=1e-18)
     assert not odometry.calibrated
     assert not odometry.slipping
 
 
-def test_before_the_first_standstill_a_large_bias_turns_nothing():
-    robots, odometries = Robots(1, 4), fused()
+def test_uncalibrated_gyro_bias_does_not_affect_yaw():
+    robots, odometries = Robots(1, 4), make_odometries()
     robots.bias[:] = 20.0 * DEGREE
     for _ in robots.drive(odometries, run([(6.0, 5.0, 10.0)])[:, :, None]):
         assert not odometries[0].slipping
     assert abs(robots.yaw_errors(odometries)[0]) < STEP * RADIUS / TRACK + 1e-3
-    assert odometries[0].bias_std == pytest.approx(0.5 * SETTINGS.gyro_bias_limit, rel=1e-3)
+    assert odometries[0].bias_std == pytest.approx(0.5 * PARAMETERS.gyro_bias_limit, rel=1e-3)
 
 
 def run(moves, acceleration=30.0):
@@ -198,7 +198,7 @@ def run(moves, acceleration=30.0):
 
 
 def square(sign):
-    """UMBmark: four sides of 4 m at 0.3 m/s, each with a right angle on the spot."""
+    """UMBmark: four sides of 4 m at 0.3 m/s, with right angles on the spot."""
     wheel, spin = 0.3 / RADIUS, 3.0
     side = (wheel, wheel, 4.0 / 0.3), (0.0, 0.0, 0.5)
     turn = 0.25 * math.pi * TRACK / RADIUS / spin
@@ -219,16 +219,16 @@ def slip_in_bursts(speeds):
 
 
 @pytest.mark.parametrize('course', [square, ten_turns])
-def test_slip_turns_the_heading_a_fifth_as_much_with_a_gyro(course):
-    """Both directions; the gyro's scale is wrong by 0.1 %, which is all the spins have left."""
+def test_gyro_reduces_slip_yaw_error_to_a_fifth(course):
+    """Both directions; the scale error of 0.1 % is the remaining error of the turns."""
     speeds = np.stack([course(1.0), course(-1.0)], axis=-1)
     errors = []
     for use_gyro in (True, False):
-        odometries, robots = fused(2, use_gyro=use_gyro), Robots(2, 5)
+        odometries, robots = make_odometries(2, use_gyro=use_gyro), Robots(2, 5)
         robots.scale[:] = 0.001, -0.001
         robots.stand(odometries, 2.0)
         for _ in robots.drive(odometries, speeds, slip_in_bursts(speeds)):
-            assert not any(odometry.slipping for odometry in odometries)  # too little to flag
+            assert not any(odometry.slipping for odometry in odometries)  # below the threshold
         errors.append(np.abs(robots.yaw_errors(odometries)))
         if use_gyro:
             sure = np.sqrt([odometry.covariance[2, 2] for odometry in odometries])
@@ -237,9 +237,9 @@ def test_slip_turns_the_heading_a_fifth_as_much_with_a_gyro(course):
     assert np.all(errors[0] < 0.2 * errors[1])
 
 
-def test_ten_turns_one_way_cost_the_tolerance_of_the_scale_and_turning_back_returns_it():
+def test_yaw_variance_of_ten_turns_cancels_when_turning_back():
     tolerance = 0.003
-    robots, odometries = Robots(1, 6), fused(gyro_scale_tolerance=tolerance)
+    robots, odometries = Robots(1, 6), make_odometries(gyro_scale_tolerance=tolerance)
     robots.stand(odometries, 2.0)
     for _ in robots.drive(odometries, ten_turns(1.0)[:, :, None]):
         pass
@@ -250,9 +250,9 @@ def test_ten_turns_one_way_cost_the_tolerance_of_the_scale_and_turning_back_retu
     assert math.sqrt(odometries[0].covariance[2, 2]) < 0.05 * sure
 
 
-def test_the_bias_is_learnt_at_a_standstill_and_again_after_a_jump():
+def test_bias_is_estimated_at_standstill_and_again_after_a_jump():
     count = 40
-    robots, odometries = Robots(count, 7), fused(count)
+    robots, odometries = Robots(count, 7), make_odometries(count)
     robots.stand(odometries, 0.95)
     assert not any(odometry.calibrated for odometry in odometries)
     robots.stand(odometries, 5.1)
@@ -272,9 +272,9 @@ def test_the_bias_is_learnt_at_a_standstill_and_again_after_a_jump():
 
 
 @pytest.mark.parametrize('part', [0.25, 0.5, 0.75])
-def test_a_jump_of_the_bias_in_motion_drifts_and_is_half_taken_back(part):
-    """By 1 deg/s it is not flagged; the next standstill knows of it, but not when it came."""
-    robots, odometries = Robots(1, 8), fused()
+def test_bias_jump_in_motion_is_half_corrected_at_standstill(part):
+    """A jump of 1 deg/s is not flagged; the next standstill measures it, but not its time."""
+    robots, odometries = Robots(1, 8), make_odometries()
     robots.stand(odometries, 3.0)
     for time in robots.drive(odometries, run([(6.0, 5.0, 10.0), (0.0, 0.0, 0.5)])[:, :, None]):
         robots.bias += DEGREE * (abs(time - 10.0 * part) < 0.5 * PERIOD)
@@ -289,16 +289,16 @@ def test_a_jump_of_the_bias_in_motion_drifts_and_is_half_taken_back(part):
     assert sure == pytest.approx(10.0 * DEGREE / math.sqrt(12.0), rel=0.3)
 
 
-def test_a_large_jump_of_the_bias_in_motion_is_flagged():
-    robots, odometries = Robots(1, 9), fused()
+def test_large_bias_jump_in_motion_is_flagged():
+    robots, odometries = Robots(1, 9), make_odometries()
     robots.stand(odometries, 3.0)
     for time in robots.drive(odometries, run([(6.0, 5.0, 4.0)])[:, :, None]):
         robots.bias += 20.0 * DEGREE * (abs(time - 2.0) < 0.5 * PERIOD)
         assert odometries[0].slipping == (time > 2.3) or 2.0 < time < 2.3
 
 
-def test_a_gyro_that_dies_leaves_the_steps_and_less_certainty():
-    robots, odometries = Robots(1, 10), fused()
+def test_gyro_failure_falls_back_to_wheel_odometry():
+    robots, odometries = Robots(1, 10), make_odometries()
     odometry, plain = odometries[0], WheelOdometry(WheelOdometryParameters(), GEOMETRY)
     robots.stand(odometries, 2.0)
     variances = []
@@ -309,7 +309,7 @@ def test_a_gyro_that_dies_leaves_the_steps_and_less_certainty():
         sample = robots.gyro()[0]
         odometry.update(0.03, 0.04, sample if index < 1000 else None, PERIOD)
         if index >= 1000:
-            plain.turn(0.03, 0.04)
+            plain.update(0.03, 0.04)
         variances.append(odometry.covariance[2, 2])
     assert odometry.pose == pytest.approx(plain.pose, abs=1e-9)
     assert variances[1999] - variances[1000] > 10.0 * (variances[999] - variances[0])
@@ -329,35 +329,35 @@ def reversals(acceleration=200.0, top=8.0):
 
 
 @pytest.mark.parametrize('period, error', [(0.005, 0.001), (0.01, 0.001), (0.02, 0.015)])
-def test_fast_reversals_are_not_taken_for_slip(period, error):
-    """The gyro lags by 4.8 ms: 1 rad/s at 200 rad/s². Compared at once, that looks like slip.
+def test_fast_reversals_are_not_detected_as_slip(period, error):
+    """The gyro lags by 4.8 ms: 1 rad/s at 200 rad/s², which without delay would indicate slip.
 
-    At 50 Hz the corners of the motion fall between the samples; some of that remains.
+    At 50 Hz the corners of the motion fall between the samples and cause a small error.
     """
     covariances = {}
-    for delay in (SETTINGS.gyro_delay, 1e-4):
+    for delay in (PARAMETERS.gyro_delay, 1e-4):
         for inflation in (1.0, 3000.0):
             robots = Robots(1, 11)
-            odometries = fused(slip_inflation=inflation, gyro_delay=delay)
+            odometries = make_odometries(slip_inflation=inflation, gyro_delay=delay)
             robots.stand(odometries, 2.0)
             for _ in robots.drive(odometries, reversals(), period=period):
                 assert not odometries[0].slipping
             covariances[delay, inflation] = odometries[0].covariance
-            if delay == SETTINGS.gyro_delay:
+            if delay == PARAMETERS.gyro_delay:
                 assert abs(robots.yaw_errors(odometries)[0]) < error
-    # Not even suspected, but for a gyro that is thought to be quick.
-    same = SETTINGS.gyro_delay
+    # No disagreement, except with an assumed delay that is too short.
+    same = PARAMETERS.gyro_delay
     assert np.array_equal(covariances[same, 1.0], covariances[same, 3000.0])
     assert not np.array_equal(covariances[1e-4, 1.0], covariances[1e-4, 3000.0])
 
 
 @pytest.mark.parametrize('speed', [0.05, 0.1, 0.3])
-def test_a_blocked_wheel_is_flagged_within_300_ms_and_the_heading_goes_on(speed):
+def test_blocked_wheel_is_flagged_within_300_ms(speed):
     wheel = speed / RADIUS
     speeds = run([(wheel, wheel, 3.0), (0.0, 0.0, 0.5)])[:, :, None]
     grip = np.ones_like(speeds)
     grip[1500:2500, 0] = 0.0
-    robots, odometries = Robots(1, 12), fused()
+    robots, odometries = Robots(1, 12), make_odometries()
     odometry = odometries[0]
     robots.stand(odometries, 2.0)
     traces = []
@@ -367,7 +367,7 @@ def test_a_blocked_wheel_is_flagged_within_300_ms_and_the_heading_goes_on(speed)
             assert odometry.slipping_for == 0.0
         elif 1.8 < time < 2.5:
             assert odometry.slipping
-            assert SETTINGS.slip_time <= odometry.slipping_for < time - 1.5 + 1e-9
+            assert PARAMETERS.slip_time <= odometry.slipping_for < time - 1.5 + 1e-9
         if time < 2.99:
             traces.append(np.trace(odometry.covariance[:2, :2]))
     growth = np.diff(traces)
@@ -379,9 +379,9 @@ def test_a_blocked_wheel_is_flagged_within_300_ms_and_the_heading_goes_on(speed)
 
 
 @pytest.mark.parametrize('rate', [0.01, 0.1, 1.0])
-def test_a_hand_that_turns_the_standing_robot_does_not_spoil_the_bias(rate):
+def test_external_rotation_at_standstill_keeps_the_bias(rate):
     count = 20
-    robots, odometries = Robots(count, 13), fused(count)
+    robots, odometries = Robots(count, 13), make_odometries(count)
     robots.stand(odometries, 3.0)
     frequency, phase = robots.generator.uniform([[0.1], [0.0]], [[2.0], [6.28]], (2, count))
 
@@ -398,8 +398,8 @@ def test_a_hand_that_turns_the_standing_robot_does_not_spoil_the_bias(rate):
     assert np.abs(robots.yaw_errors(odometries)).max() < 0.02 + 0.01 * rate
 
 
-def test_a_sample_after_a_long_silence_speaks_for_a_short_time():
-    often, seldom, plain = fused(3)
+def test_sample_after_a_long_gap_counts_for_gyro_hold_only():
+    often, seldom, plain = make_odometries(3)
     for odometry in (often, seldom, plain):
         Robots(1, 14).stand([odometry], 2.0)
     for _ in range(200):
@@ -412,11 +412,11 @@ def test_a_sample_after_a_long_silence_speaks_for_a_short_time():
 
 
 @pytest.mark.parametrize('period', [0.01, 0.04])
-def test_heading_variance_is_that_of_the_summed_noise_and_of_the_bias(period):
-    """One sample stands for the whole period, but its noise is that of 9.6 ms."""
-    noise, delay = 1e-3, SETTINGS.gyro_delay
+def test_yaw_variance_is_that_of_noise_and_bias(period):
+    """One sample represents the whole period, but its noise is that of 9.6 ms."""
+    noise, delay = 1e-3, PARAMETERS.gyro_delay
     changes = {'gyro_scale_tolerance': 0.0, 'gyro_bias_drift': 0.0, 'standstill_spread': 0.02}
-    odometry = fused(variance_per_metre=0.1, gyro_noise=noise, **changes)[0]
+    odometry = make_odometries(variance_per_metre=0.1, gyro_noise=noise, **changes)[0]
     Robots(1, 19).stand([odometry], 5.0)
     odometry.reset()
     for _ in range(round(10.0 / period)):
@@ -427,15 +427,15 @@ def test_heading_variance_is_that_of_the_summed_noise_and_of_the_bias(period):
     assert odometry.covariance[2, 2] == pytest.approx(expected, rel=0.01)
 
 
-def test_a_bias_beyond_the_limit_is_not_believed():
-    robots, odometries = Robots(1, 20), fused()
-    robots.bias[:] = SETTINGS.gyro_bias_limit + 0.01
+def test_bias_beyond_the_limit_is_rejected():
+    robots, odometries = Robots(1, 20), make_odometries()
+    robots.bias[:] = PARAMETERS.gyro_bias_limit + 0.01
     robots.stand(odometries, 3.0)
     assert not odometries[0].calibrated
 
 
-def test_slip_ends_at_half_the_threshold():
-    odometry = fused()[0]
+def test_slip_detection_has_hysteresis():
+    odometry = make_odometries()[0]
     Robots(1, 21).stand([odometry], 2.0)
     for disagreement, slipping in ((0.2, False), (0.4, True), (0.2, True), (0.1, False)):
         for _ in range(50):
@@ -444,8 +444,8 @@ def test_slip_ends_at_half_the_threshold():
 
 
 @pytest.mark.parametrize('tolerance', [0.003, 0.03])
-def test_a_gyro_that_may_be_out_of_scale_is_not_taken_for_slip(tolerance):
-    robots, odometries = Robots(1, 22), fused(gyro_scale_tolerance=tolerance)
+def test_scale_error_within_tolerance_is_not_slip(tolerance):
+    robots, odometries = Robots(1, 22), make_odometries(gyro_scale_tolerance=tolerance)
     robots.scale[:] = 0.05
     robots.stand(odometries, 2.0)
     flagged = False
@@ -455,9 +455,9 @@ def test_a_gyro_that_may_be_out_of_scale_is_not_taken_for_slip(tolerance):
 
 
 @pytest.mark.parametrize('period', [0.01, 0.02])
-def test_short_turns_are_heard_to_their_ends(period):
-    """The gyro shows the end of a turn when the steps are over: not heard, each cost 0.2 mrad."""
-    robots, odometries = Robots(1, 23), fused()
+def test_short_turns_include_the_gyro_delay(period):
+    """The gyro outputs the end of a turn after the last step; ignored, each cost 0.2 mrad."""
+    robots, odometries = Robots(1, 23), make_odometries()
     speeds = run(60 * [(8.0, -8.0, 0.2), (0.0, 0.0, 0.3)], acceleration=60.0)[:, :, None]
     robots.stand(odometries, 3.0)
     for _ in robots.drive(odometries, speeds, period=period):
@@ -465,10 +465,10 @@ def test_short_turns_are_heard_to_their_ends(period):
     assert abs(robots.yaw_errors(odometries)[0]) < 60 * 1e-4
 
 
-def test_covariance_stays_symmetric_and_positive_whatever_comes():
+def test_covariance_stays_symmetric_and_positive_definite():
     generator = np.random.default_rng(15)
     for _ in range(20):
-        odometry = fused()[0]
+        odometry = make_odometries()[0]
         for _ in range(60):
             kind, count = generator.integers(5), generator.integers(1, 130)
             size, dt = 10.0 ** generator.uniform(-6.0, 1.0), 10.0 ** generator.uniform(-4.0, 0.0)
@@ -488,8 +488,8 @@ def test_covariance_stays_symmetric_and_positive_whatever_comes():
             assert all(map(math.isfinite, odometry.pose))
 
 
-def test_uncertainty_grows_in_motion_and_not_by_standing():
-    robots, odometries = Robots(1, 16), fused()
+def test_uncertainty_grows_in_motion_not_at_standstill():
+    robots, odometries = Robots(1, 16), make_odometries()
     robots.stand(odometries, 2.5)
     traces = []
     for _ in robots.drive(odometries, run([(6.0, 5.0, 2.0)])[:, :, None]):
@@ -503,8 +503,8 @@ def test_uncertainty_grows_in_motion_and_not_by_standing():
     assert np.trace(odometries[0].covariance) < moved
 
 
-def test_reset_keeps_what_is_known_of_the_bias():
-    robots, odometries = Robots(1, 17), fused()
+def test_reset_keeps_the_bias_estimate():
+    robots, odometries = Robots(1, 17), make_odometries()
     odometry = odometries[0]
     robots.stand(odometries, 3.0)
     for _ in robots.drive(odometries, run([(6.0, 5.0, 2.0)])[:, :, None]):
@@ -518,22 +518,22 @@ def test_reset_keeps_what_is_known_of_the_bias():
     assert odometry.pose == (0.0, 0.0, 0.0)
 
 
-def test_settings_may_change_on_the_way():
-    robots, odometries = Robots(1, 18), fused()
+def test_parameters_change_while_running():
+    robots, odometries = Robots(1, 18), make_odometries()
     robots.stand(odometries, 2.0)
     odometry = odometries[0]
-    odometry.parameters = replace(SETTINGS, use_gyro=False)
+    odometry.parameters = replace(PARAMETERS, use_gyro=False)
     robots.move(0.0, 0.01, PERIOD)
     odometry.update(0.3, 0.3, robots.gyro()[0], PERIOD)
     assert odometry.pose.yaw == 0.0
-    odometry.parameters = SETTINGS
+    odometry.parameters = PARAMETERS
     odometry.update(0.3, 0.3, odometry.bias - 1.0, PERIOD)
     assert odometry.pose.yaw < -0.005
 
 
 @pytest.mark.parametrize('bad', [math.nan, math.inf, -math.inf])
-def test_what_is_not_finite_is_refused_and_changes_nothing(bad):
-    odometry = fused()[0]
+def test_non_finite_input_is_rejected_without_side_effects(bad):
+    odometry = make_odometries()[0]
     odometry.update(1.0, 2.0, 0.1, PERIOD)
     before, covariance = odometry.pose, odometry.covariance
     cases = (
@@ -554,12 +554,12 @@ def test_what_is_not_finite_is_refused_and_changes_nothing(bad):
     assert np.array_equal(odometry.covariance, covariance)
 
 
-def test_a_slip_threshold_within_reach_of_a_hand_is_refused():
+def test_slip_threshold_below_standstill_spread_is_rejected():
     with pytest.raises(ParameterError, match='slip_threshold'):
         GyroOdometryParameters(slip_threshold=0.02, standstill_spread=0.01)
 
 
-def test_the_covariance_handed_out_is_a_copy():
-    odometry = fused()[0]
+def test_returned_covariance_is_a_copy():
+    odometry = make_odometries()[0]
     odometry.covariance[0, 0] = 7.0
     assert not odometry.covariance.any()

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Dead reckoning and how sure it is."""
+"""Wheel odometry: pose and covariance."""
 
 import math
 
@@ -19,17 +19,17 @@ from t3mpc_ros.robot.wheel_odometry import WheelOdometry, WheelOdometryParameter
 GEOMETRY = WheelGeometry()
 
 
-def reckoning(per_metre: float = 1e-5) -> WheelOdometry:
+def make_odometry(per_metre: float = 1e-5) -> WheelOdometry:
     return WheelOdometry(WheelOdometryParameters(variance_per_metre=per_metre), GEOMETRY)
 
 
-def test_any_course_is_followed_along_its_exact_arcs():
+def test_pose_follows_the_exact_arcs():
     generator = np.random.default_rng(1)
-    odometry, pose = reckoning(), Pose(0.0, 0.0, 0.0)
+    odometry, pose = make_odometry(), Pose(0.0, 0.0, 0.0)
     for _ in range(300):
         wheels = WheelSpeeds(*generator.uniform(-10.0, 10.0, 2))
         dt = float(generator.uniform(0.0, 0.5))
-        odometry.drive(wheels, dt)
+        odometry.update_from_speeds(wheels, dt)
         pose = advance_pose(pose, twist_from_wheels(wheels, GEOMETRY), dt)
         assert odometry.pose[:2] == pytest.approx(pose[:2], abs=1e-10)
         assert wrap_angle(odometry.pose.yaw - pose.yaw) == pytest.approx(0.0, abs=1e-10)
@@ -37,32 +37,32 @@ def test_any_course_is_followed_along_its_exact_arcs():
 
 
 @pytest.mark.parametrize('angular', [0.0, 1e-9, 1e-4, 2e-3])
-def test_nearly_straight_courses_keep_full_accuracy(angular):
-    odometry = reckoning()
-    odometry.drive(wheels_from_twist(BodyTwist(0.5, angular), GEOMETRY), 0.1)
+def test_nearly_straight_motion_keeps_full_accuracy(angular):
+    odometry = make_odometry()
+    odometry.update_from_speeds(wheels_from_twist(BodyTwist(0.5, angular), GEOMETRY), 0.1)
     expected = advance_pose(Pose(0.0, 0.0, 0.0), BodyTwist(0.5, angular), 0.1)
     assert odometry.pose == pytest.approx(expected, rel=1e-9, abs=1e-16)
 
 
-def test_a_lost_report_of_the_counters_costs_nothing_on_an_arc():
-    often, seldom = reckoning(), reckoning()
+def test_missing_counter_reading_on_an_arc_costs_no_accuracy():
+    often, seldom = make_odometry(), make_odometry()
     for _ in range(10):
-        often.turn(0.3, 0.2)
-    seldom.turn(3.0, 2.0)
+        often.update(0.3, 0.2)
+    seldom.update(3.0, 2.0)
     assert seldom.pose == pytest.approx(often.pose, abs=1e-12)
 
 
-def test_covariance_step_uses_the_exact_derivatives_of_the_arc():
+def test_covariance_update_uses_exact_arc_derivatives():
     generator = np.random.default_rng(2)
     small = 1e-6
     for case in range(30):
         right, left = generator.uniform(-3.0, 3.0, 2)
         if case < 5:
-            left = right + 1e-6  # nearly straight: the series takes over
+            left = right + 1e-6  # nearly straight: the series applies
         per_metre = 1e-4
-        odometry = reckoning(per_metre)
+        odometry = make_odometry(per_metre)
         odometry.reset(Pose(0.3, -0.1, generator.uniform(-1.0, 1.0)))
-        odometry.turn(*generator.uniform(-2.0, 2.0, 2))
+        odometry.update(*generator.uniform(-2.0, 2.0, 2))
         pose, before = odometry.pose, odometry.covariance
 
         def end(numbers):
@@ -84,17 +84,17 @@ def test_covariance_step_uses_the_exact_derivatives_of_the_arc():
         uncertain = np.zeros((5, 5))
         uncertain[:3, :3] = before
         uncertain[3:, 3:] = np.diag(per_metre * np.abs(runs))
-        odometry.turn(right, left)
+        odometry.update(right, left)
         expected = jacobian @ uncertain @ jacobian.T
         assert odometry.covariance == pytest.approx(expected, rel=1e-6, abs=1e-12)
 
 
-def test_covariance_of_a_nearly_straight_run_follows_the_series_of_the_arc():
-    # From heading 0 an arc ends at x = s sin(2h)/(2h), h half the turn; here h is below 1e-4.
+def test_covariance_of_nearly_straight_motion_follows_the_series():
+    # From yaw 0 an arc ends at x = s sin(2h)/(2h), h half the turn; here h is below 1e-4.
     half_turn, run, per_metre = 0.9e-4, 10.0, 1e-4
     runs = run + half_turn * GEOMETRY.wheel_separation * np.array([1.0, -1.0])
-    odometry = reckoning(per_metre)
-    odometry.turn(*(runs / GEOMETRY.wheel_radius))
+    odometry = make_odometry(per_metre)
+    odometry.update(*(runs / GEOMETRY.wheel_radius))
     ratio, slope = 1.0 - (2.0 * half_turn) ** 2 / 6.0, -4.0 * half_turn / 3.0
     bend = np.array([0.5, -0.5]) / GEOMETRY.wheel_separation
     effects = 0.5 * ratio + run * slope * bend
@@ -102,13 +102,13 @@ def test_covariance_of_a_nearly_straight_run_follows_the_series_of_the_arc():
     assert odometry.covariance[0, 0] == pytest.approx(expected, rel=1e-6)
 
 
-def test_covariance_is_the_spread_of_many_robots_with_such_wheels():
+def test_covariance_matches_a_monte_carlo_sample():
     generator = np.random.default_rng(3)
     per_metre, steps, robots = 2e-5, 60, 4000
     angles = np.array([[0.25, 0.15], [0.1, 0.2]])[np.arange(steps) // 30]
-    honest = reckoning(per_metre)
+    odometry = make_odometry(per_metre)
     for right, left in angles:
-        honest.turn(right, left)
+        odometry.update(right, left)
     runs = GEOMETRY.wheel_radius * angles
     noisy = runs + np.sqrt(per_metre * runs) * generator.standard_normal((robots, steps, 2))
     x, y, yaw = np.zeros((3, robots))
@@ -121,64 +121,64 @@ def test_covariance_is_the_spread_of_many_robots_with_such_wheels():
         yaw += turn
     sample = np.cov(np.array([x, y, yaw]))
     spread = np.sqrt(np.diag(sample))
-    difference = (honest.covariance - sample) / np.outer(spread, spread)
+    difference = (odometry.covariance - sample) / np.outer(spread, spread)
     assert np.abs(difference).max() < 0.1
 
 
-def test_certainty_is_lost_with_distance_and_not_by_standing():
-    odometry, traces = reckoning(), []
+def test_uncertainty_grows_with_distance_not_with_time():
+    odometry, traces = make_odometry(), []
     for _ in range(100):
-        odometry.drive(WheelSpeeds(5.0, 4.0), 0.01)
+        odometry.update_from_speeds(WheelSpeeds(5.0, 4.0), 0.01)
         traces.append(float(np.trace(odometry.covariance)))
         matrix = odometry.covariance
         assert np.array_equal(matrix, matrix.T) or np.allclose(matrix, matrix.T, rtol=1e-12)
         assert np.linalg.eigvalsh(matrix).min() > -1e-18
     assert np.all(np.diff(traces) > 0.0)
-    odometry.drive(WheelSpeeds(0.0, 0.0), 1000.0)
+    odometry.update_from_speeds(WheelSpeeds(0.0, 0.0), 1000.0)
     assert np.trace(odometry.covariance) == traces[-1]
 
 
-def test_heading_variance_is_that_of_the_wheel_paths_over_the_track():
-    odometry = reckoning(1e-4)
-    odometry.turn(10.0, 10.0)
+def test_yaw_variance_follows_from_wheel_path_variance():
+    odometry = make_odometry(1e-4)
+    odometry.update(10.0, 10.0)
     run = 10.0 * GEOMETRY.wheel_radius
     expected = 2.0 * 1e-4 * run / GEOMETRY.wheel_separation**2
     assert odometry.covariance[2, 2] == pytest.approx(expected, rel=1e-12)
     assert odometry.covariance[0, 0] == pytest.approx(0.5 * 1e-4 * run, rel=1e-12)
 
 
-def test_speed_noise_adds_its_part_even_at_rest():
-    odometry = reckoning(0.0)
+def test_speed_noise_adds_variance_at_standstill():
+    odometry = make_odometry(0.0)
     for _ in range(100):
-        odometry.drive(WheelSpeeds(0.0, 0.0), 0.01, variance=0.04)
+        odometry.update_from_speeds(WheelSpeeds(0.0, 0.0), 0.01, variance=0.04)
     per_wheel = 100 * (GEOMETRY.wheel_radius * 0.01) ** 2 * 0.04
     assert odometry.covariance[2, 2] == pytest.approx(
         2.0 * per_wheel / GEOMETRY.wheel_separation**2, rel=1e-9
     )
 
 
-def test_reset_starts_at_a_pose_with_full_certainty():
-    odometry = reckoning()
-    odometry.turn(5.0, 3.0)
+def test_reset_sets_pose_and_clears_covariance():
+    odometry = make_odometry()
+    odometry.update(5.0, 3.0)
     odometry.reset(Pose(1.0, 2.0, 0.5))
     assert odometry.pose == (1.0, 2.0, 0.5)
     assert not odometry.covariance.any()
 
 
 @pytest.mark.parametrize('bad', [math.nan, math.inf])
-def test_what_is_not_finite_is_refused_and_changes_nothing(bad):
-    odometry = reckoning()
-    odometry.turn(1.0, 2.0)
+def test_non_finite_input_is_rejected_without_side_effects(bad):
+    odometry = make_odometry()
+    odometry.update(1.0, 2.0)
     before = odometry.pose
     for arguments in ((bad, 0.0), (0.0, bad), (0.0, 0.0, bad)):
         with pytest.raises(ValueError, match='finite'):
-            odometry.turn(*arguments)
+            odometry.update(*arguments)
     with pytest.raises(ValueError, match='finite'):
         odometry.reset(Pose(0.0, bad, 0.0))
     assert odometry.pose == before
 
 
-def test_the_covariance_handed_out_is_a_copy():
-    odometry = reckoning()
+def test_returned_covariance_is_a_copy():
+    odometry = make_odometry()
     odometry.covariance[0, 0] = 7.0
     assert not odometry.covariance.any()

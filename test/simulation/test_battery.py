@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The battery: charge and energy balance, sag, collapse."""
+"""Simulated battery: charge and energy balance, sag, collapse."""
 
 import math
 
@@ -21,7 +21,7 @@ def battery(**changes: object) -> SimulatedBattery:
     return SimulatedBattery(SimulatedBatteryParameters.from_dict(changes))
 
 
-def test_open_circuit_voltage_rises_with_charge_between_the_ends_of_a_cell():
+def test_open_circuit_voltage_rises_with_charge():
     charges = np.linspace(0.0, 1.0, 501)
     voltages = [open_circuit_voltage(charge) for charge in charges]
     assert np.all(np.diff(voltages) > 0.0)
@@ -33,14 +33,14 @@ def test_open_circuit_voltage_rises_with_charge_between_the_ends_of_a_cell():
 @pytest.mark.parametrize(
     ('charge', 'volts'), [(0.0955, 3.3231), (0.2915, 3.5737), (0.4573, 3.7017), (0.8342, 4.0637)]
 )
-def test_open_circuit_voltage_is_that_of_a_measured_cell(charge, volts):
-    """Molicel INR21700-P42A at C/32, as Sunil et al. (2025) publish it."""
+def test_open_circuit_voltage_matches_a_measured_cell(charge, volts):
+    """Molicel INR21700-P42A at C/32, from Sunil et al. (2025)."""
     assert open_circuit_voltage(charge) == pytest.approx(volts, abs=0.02)
 
 
 @pytest.mark.parametrize('power', [0.0, 1.0, 12.0, 60.0, 150.0])
-def test_voltage_solves_the_circuit(power):
-    """The cell gives E I; the motors take P, the idle load V I_idle, the resistance R I²."""
+def test_voltage_solves_the_circuit_equation(power):
+    """The power E I of the cells is P + V I_idle + R I²."""
     cell = battery(charge=0.7)
     inside = open_circuit_voltage(0.7, 3)
     reading = cell.draw(power, 0.01)
@@ -48,12 +48,12 @@ def test_voltage_solves_the_circuit(power):
     assert volts == pytest.approx(inside - 0.15 * current, rel=1e-12)
     assert volts * (current - 0.3) == pytest.approx(power, rel=1e-9, abs=1e-9)
     assert inside * current == pytest.approx(power + 0.3 * volts + 0.15 * current**2, rel=1e-9)
-    # Of the two solutions the one with the smaller current.
+    # The solution with the smaller current.
     assert volts > 0.5 * inside
 
 
-def test_energy_is_what_lies_under_the_curve():
-    """Delivered, idle and lost in the resistance: together the integral of E over the charge."""
+def test_energy_is_the_integral_of_the_voltage_curve():
+    """Motor, idle and resistive energy together are the integral of E over the charge."""
     cell, dt = battery(charge=1.0), 1.0
     generator = np.random.default_rng(1)
     balance, before = 0.0, cell.charge
@@ -70,7 +70,7 @@ def test_energy_is_what_lies_under_the_curve():
     assert balance == pytest.approx(expected, rel=2e-4)
 
 
-def test_charge_is_the_integral_of_the_current_to_the_last_coulomb():
+def test_charge_integrates_the_current_until_empty():
     cell, generator = battery(charge=0.4), np.random.default_rng(2)
     drawn = 0.0
     while cell.charge > 0.0:
@@ -80,14 +80,14 @@ def test_charge_is_the_integral_of_the_current_to_the_last_coulomb():
     assert drawn == pytest.approx(0.4 * FULL, rel=1e-12)
 
 
-def test_voltage_falls_steadily_under_a_steady_load():
+def test_voltage_falls_monotonically_under_constant_load():
     cell = battery()
     voltages = [cell.draw(15.0, 5.0).voltage for _ in range(900)]
     assert cell.charge < 0.15
     assert np.all(np.diff(voltages) < 0.0)
 
 
-def test_an_empty_battery_gives_nothing_and_stays_so():
+def test_empty_battery_delivers_nothing():
     cell = battery(charge=0.001)
     for _ in range(100):
         cell.draw(10.0, 1.0)
@@ -98,11 +98,11 @@ def test_an_empty_battery_gives_nothing_and_stays_so():
     assert battery(charge=0.0).collapsed
 
 
-def test_more_power_than_the_battery_has_collapses_it_with_finite_numbers():
+def test_excess_power_collapses_the_voltage_with_finite_values():
     """Beyond E²/4R the quadratic has no solution."""
     loaded = open_circuit_voltage(1.0, 3) - 0.15 * 0.3
     limit = loaded**2 / (4.0 * 0.15)
-    changes = {'brown_out': 1.0}  # so that the limit itself is what collapses it
+    changes = {'brown_out': 1.0}  # so that only the power limit causes the collapse
     below = battery(**changes)
     assert below.draw(0.999 * limit, 1e-6).voltage > 0.5 * loaded
     assert not below.collapsed
@@ -114,18 +114,18 @@ def test_more_power_than_the_battery_has_collapses_it_with_finite_numbers():
         assert cell.collapsed
 
 
-def test_a_small_battery_cannot_even_feed_the_board():
+def test_weak_battery_collapses_under_idle_load():
     cell = battery(resistance=10.0, idle_current=2.0)
     assert cell.collapsed
     assert all(map(math.isfinite, cell.draw(5.0, 0.1)))
 
 
-def test_collapse_and_warning_come_at_their_voltages_and_go_a_hysteresis_later():
+def test_collapse_and_low_warning_have_hysteresis():
     cell = battery(charge=0.3, resistance=1.0, idle_current=0.0)
     inside = open_circuit_voltage(0.3, 3)
 
     def at(volts: float) -> None:
-        """Draw what brings the terminals to ``volts``."""
+        """Draw the power that results in ``volts``."""
         assert cell.draw(volts * (inside - volts), 0.0).voltage == pytest.approx(volts)
 
     at(10.21)
@@ -146,12 +146,12 @@ def test_collapse_and_warning_come_at_their_voltages_and_go_a_hysteresis_later()
     assert not cell.low
 
 
-def test_power_fed_back_is_no_charge():
+def test_regenerated_power_does_not_charge():
     cell = battery(charge=0.5)
     assert cell.draw(-20.0, 1.0) == battery(charge=0.5).draw(0.0, 1.0)
 
 
-def test_voltage_is_known_before_anything_is_drawn():
+def test_voltage_is_defined_before_the_first_draw():
     assert battery().voltage == pytest.approx(3 * 4.2 - 0.15 * 0.3)
     assert battery().charge == 1.0
 
@@ -159,7 +159,7 @@ def test_voltage_is_known_before_anything_is_drawn():
 @pytest.mark.parametrize(
     ('power', 'dt'), [(math.nan, 0.1), (math.inf, 0.1), (1.0, -0.1), (1.0, math.nan)]
 )
-def test_numbers_that_cannot_be_are_refused_and_change_nothing(power, dt):
+def test_invalid_input_is_rejected_without_side_effects(power, dt):
     cell = battery(charge=0.5)
     with pytest.raises(ValueError, match='must be finite'):
         cell.draw(power, dt)
@@ -170,13 +170,13 @@ def test_numbers_that_cannot_be_are_refused_and_change_nothing(power, dt):
     ('changes', 'name'),
     [({'brown_out': 11.0}, 'low_voltage'), ({'low_voltage': 12.5}, 'low_voltage')],
 )
-def test_settings_that_do_not_fit_are_refused_by_name(changes, name):
+def test_inconsistent_parameters_are_rejected_by_name(changes, name):
     with pytest.raises(ParameterError, match=f'^{name} '):
         SimulatedBatteryParameters.from_dict(changes)
 
 
-def test_a_sagging_cell_shows_in_the_voltage_and_takes_the_board_down():
-    """Taken from the motors alone, a sag was seen by no reading, no warning and no board."""
+def test_cell_sag_lowers_the_voltage_and_causes_collapse():
+    """A sag of the motor voltage alone would affect no reading, no warning and no board."""
     battery = SimulatedBattery(SimulatedBatteryParameters())
     healthy = battery.draw(5.0, 0.01).voltage
     assert battery.draw(5.0, 0.01, sag=2.0).voltage == pytest.approx(healthy - 2.0, abs=0.05)

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""What walls do to the bumper: along the normal, never a pull, conservative without damping."""
+"""Contact force of walls: along the normal, never a pull, conservative without damping."""
 
 import math
 
@@ -25,7 +25,7 @@ def force(x, y, segments=NO_SEGMENTS, circles=NO_CIRCLES, bumper=SPRING, speed=(
 
 
 def polyline(points, closed=False):
-    """Return the walls along points."""
+    """Return the wall segments between points."""
     points = [tuple(map(float, point)) for point in points]
     pairs = list(zip(points, points[1:], strict=False)) + [(points[-1], points[0])] * closed
     return np.array([[*start, *end] for start, end in pairs])
@@ -37,7 +37,7 @@ def round_room(sides, radius):
 
 
 def work_around(points, segments, circles=NO_CIRCLES):
-    """Return the work along a closed way, and that of the same forces all in one direction."""
+    """Return the work along a closed path, and the sum of the magnitudes of its parts."""
     forces = [force(*point, segments, circles) for point in points.tolist()]
     means = 0.5 * (np.array(forces) + np.roll(forces, -1, axis=0))
     steps = np.roll(points, -1, axis=0) - points
@@ -51,13 +51,13 @@ def largest_jump(path, segments):
     return float(np.linalg.norm(np.diff(forces, axis=0), axis=1).max())
 
 
-def test_defaults_are_those_of_the_vector_and_bounds_are_kept():
+def test_parameter_defaults_match_the_vector_and_bounds_hold():
     assert DAMPED.tolist() == [RADIUS, STIFFNESS, DAMPING]
     with pytest.raises(ParameterError, match='stiffness must be from 1000 to 1e'):
         BumperParameters(stiffness=10.0)
 
 
-def test_there_is_no_force_without_touching():
+def test_no_force_without_contact():
     generator = np.random.default_rng(1)
     world = load_world('room')
     apart = 0
@@ -72,7 +72,7 @@ def test_there_is_no_force_without_touching():
 
 
 @pytest.mark.parametrize('side', [-1.0, 1.0])
-def test_a_wall_pushes_along_its_normal_with_spring_and_damper(side):
+def test_wall_force_is_spring_and_damper_along_the_normal(side):
     depth = 0.004
     for angle in (0.0, 0.7, 2.5):
         along, across = (
@@ -83,7 +83,7 @@ def test_a_wall_pushes_along_its_normal_with_spring_and_damper(side):
         at = 0.3 * along + (RADIUS - depth) * across
         spring = STIFFNESS * depth
         assert force(*at, wall) == pytest.approx(spring * across, abs=1e-9)
-        # Sliding costs nothing, closing costs, and leaving fast never pulls.
+        # Sliding adds no force, closing does, and leaving fast never pulls.
         for closing, sliding in ((0.2, 0.0), (0.2, 1.5), (-0.1, 1.5), (-5.0, 0.3)):
             speed = -closing * across + sliding * along
             expected = max(spring + DAMPING * closing, 0.0)
@@ -92,7 +92,7 @@ def test_a_wall_pushes_along_its_normal_with_spring_and_damper(side):
             )
 
 
-def test_a_pillar_pushes_outwards_however_deep_the_bumper_is():
+def test_circle_force_points_outwards_at_any_depth():
     pillar = np.array([[1.0, 0.0, 0.2]])
     for angle in np.linspace(0.0, 6.0, 20):
         out = np.array([math.cos(angle), math.sin(angle)])
@@ -104,8 +104,8 @@ def test_a_pillar_pushes_outwards_however_deep_the_bumper_is():
     assert force(1.0, 0.0, circles=pillar).tolist() == [0.0, 0.0]
 
 
-def test_the_end_of_a_wall_and_a_corner_push_once_from_that_very_point():
-    """Both sides of a corner have it for nearest point; adding them up doubled the push."""
+def test_wall_end_and_corner_push_once():
+    """The corner is the nearest point of both walls, whose sum would push twice."""
     for angle in np.linspace(math.pi + 0.01, 1.5 * math.pi - 0.01, 30):
         out = np.array([math.cos(angle), math.sin(angle)])
         at = (RADIUS - 0.005) * out
@@ -117,11 +117,11 @@ def test_the_end_of_a_wall_and_a_corner_push_once_from_that_very_point():
         assert force(*at, BOX[:1]) == pytest.approx(STIFFNESS * 0.005 * out, abs=1e-9)
 
 
-def test_any_number_of_walls_that_meet_in_a_point_push_from_it_once():
+def test_walls_sharing_a_point_push_once():
     for count in range(1, 7):
         angles = np.linspace(-1.0, 1.0, count)
         star = np.array([[0.0, 0.0, math.cos(a), math.sin(a)] for a in angles])
-        star[::2] = star[::2][:, [2, 3, 0, 1]]  # whichever way round they were drawn
+        star[::2] = star[::2][:, [2, 3, 0, 1]]  # both orientations
         assert force(-0.1, 0.0, star) == pytest.approx([-STIFFNESS * 0.01, 0.0], abs=1e-9)
 
 
@@ -132,7 +132,7 @@ def test_both_walls_of_an_inner_corner_push():
     )
 
 
-def test_the_joint_of_two_walls_in_line_is_not_felt():
+def test_joint_of_collinear_walls_adds_no_force():
     one, two = FLOOR, polyline([(-1, 0), (0.1, 0), (1, 0)])
     three = two[::-1][:, [2, 3, 0, 1]]
     generator = np.random.default_rng(2)
@@ -145,23 +145,23 @@ def test_the_joint_of_two_walls_in_line_is_not_felt():
         assert force(x, y, three, bumper=DAMPED, speed=speed) == pytest.approx(plain, abs=1e-9)
 
 
-def test_the_force_is_continuous_along_joints_and_past_corners_on_both_sides():
-    """A force that leaps at a joint shakes whoever slides along the wall."""
+def test_force_is_continuous_at_joints_and_corners():
+    """A force that jumps at a joint would shake a robot that slides along the wall."""
     step = 1e-5
-    # No straight piece, corner or sum of two can change faster than this, per metre of way.
+    # Bound of the change per metre of a segment, a corner, or a sum of two.
     bound = 4.0 * STIFFNESS * step
     for turn in (-1.5, -0.5, -0.05, -0.002, 0.0, 0.002, 0.05, 0.5, 1.5):
         walls = polyline([(-0.3, 0), (0, 0), (0.3 * math.cos(turn), 0.3 * math.sin(turn))])
         for depth in (0.0005, 0.004, 0.02):
             path = [(x, RADIUS - depth) for x in np.arange(-0.2, 0.15, step).tolist()]
-            # No further than to where the other wall would be run through.
+            # Up to the contact with the other wall.
             free = [clearance(*point, walls, NO_CIRCLES) > 0.06 for point in path]
             assert largest_jump(path[: [*free, False].index(False)], walls) < bound
 
 
 @pytest.mark.parametrize('sides', [24, 36, 180])
-def test_a_polygon_stands_for_a_circle_from_within_and_from_without(sides):
-    """In a shallow inner corner two walls touch at once, yet must not push like two."""
+def test_polygon_approximates_a_circle_on_both_sides(sides):
+    """In a shallow inner corner two walls touch at once, but must push like one."""
     radius = 0.6
     room = round_room(sides, radius)
     sagitta = radius * (1.0 - math.cos(math.pi / sides))
@@ -170,13 +170,13 @@ def test_a_polygon_stands_for_a_circle_from_within_and_from_without(sides):
         for angle in np.linspace(0.0, 1.0, 500):
             out = np.array([math.cos(angle), math.sin(angle)])
             pushed = force(*((radius + side * (RADIUS - depth)) * out), room)
-            # Where the polygon differs from the circle, so may the depth: on both walls within.
+            # The depth differs by as much as the polygon from the circle, for both walls inside.
             assert abs(side * pushed @ out / STIFFNESS - depth) <= 1.5 * sagitta + 1e-6
             aslant = abs(pushed[0] * out[1] - pushed[1] * out[0])
             assert aslant <= 1.01 * math.tan(math.pi / sides) * abs(pushed @ out)
 
 
-def test_without_damping_no_work_is_left_on_any_closed_way():
+def test_undamped_force_is_conservative():
     generator = np.random.default_rng(3)
     worlds = [
         (BOX, np.array([[0.6, 0.4, 0.05]])),
@@ -194,7 +194,7 @@ def test_without_damping_no_work_is_left_on_any_closed_way():
             corner = corners[generator.integers(len(corners))]
             middle = corner + 0.1 * np.array([math.cos(angle), math.sin(angle)])
             free = clearance(*middle.tolist(), segments, circles)
-            # Through a wall it would come out on the other side, which is no closed way.
+            # A path through a wall would not be closed.
             way = middle + min(0.04, 0.9 * free) * ring * generator.uniform(0.3, 1.0, 2)
             work, total = work_around(way, segments, circles)
             assert abs(work) <= 2e-6 * total + 1e-12
@@ -202,7 +202,7 @@ def test_without_damping_no_work_is_left_on_any_closed_way():
     assert tested > 20
 
 
-def test_the_damper_never_gives_energy():
+def test_damper_never_adds_energy():
     generator = np.random.default_rng(4)
     world = load_world('room')
     rooms = [(world.segments, world.circles), (round_room(24, 0.5), NO_CIRCLES)]
@@ -222,7 +222,7 @@ def test_the_damper_never_gives_energy():
     assert touching > 500
 
 
-def test_no_pull_towards_the_nearest_wall_at_any_speed():
+def test_force_never_pulls_towards_the_wall():
     generator = np.random.default_rng(5)
     world = load_world('corridor')
     touching = 0
@@ -244,9 +244,9 @@ def test_no_pull_towards_the_nearest_wall_at_any_speed():
 
 
 def throw(speed, bumper, dt, angle=0.0, start=0.12, walls=FLOOR, x=0.0):
-    """Return where and how fast a thrown point mass is, the lowest it was, and its time in touch.
+    """Return position and velocity of a thrown point mass, its lowest y and its contact time.
 
-    Semi-implicit Euler, as a simulation would do it.
+    Semi-implicit Euler, as in a simulation.
     """
     y, lowest, touch = start, start, 0.0
     speed_x, speed_y = speed * math.sin(angle), -speed * math.cos(angle)
@@ -264,20 +264,20 @@ def throw(speed, bumper, dt, angle=0.0, start=0.12, walls=FLOOR, x=0.0):
 
 
 @pytest.mark.parametrize('angle', [0.0, 0.6])
-def test_a_mass_thrown_at_a_spring_returns_as_fast_as_it_came_after_half_a_period(angle):
+def test_undamped_bounce_keeps_speed_and_lasts_half_a_period(angle):
     _, (speed_x, speed_y), lowest, touch = throw(0.5, SPRING, 1e-5, angle)
     assert speed_y == pytest.approx(0.5 * math.cos(angle), rel=1e-3)
     assert speed_x == pytest.approx(0.5 * math.sin(angle))  # no friction
-    if angle == 0.0:  # what the text of the setting says
+    if angle == 0.0:  # as in the text of the parameter
         assert RADIUS - lowest == pytest.approx(0.5 * math.sqrt(MASS / STIFFNESS), rel=1e-3)
         assert RADIUS - lowest == pytest.approx(4.3e-3, abs=5e-5)
         assert touch == pytest.approx(math.pi * math.sqrt(MASS / STIFFNESS), rel=2e-3)
         assert touch == pytest.approx(0.027, abs=5e-4)
 
 
-def test_a_damped_bounce_loses_what_the_theory_of_spring_and_damper_says():
+def test_damped_bounce_matches_spring_damper_theory():
     _, (_, speed_y), _, _ = throw(0.5, DAMPED, 1e-5)
-    # m a + c v + k z = 0 from z = 0; the wall lets go where k z + c v = 0.
+    # m a + c v + k z = 0 from z = 0; contact ends where k z + c v = 0.
     decay = 0.5 * DAMPING / MASS
     own = math.sqrt(STIFFNESS / MASS - decay**2)
     time = math.atan2(2.0 * decay * own, decay**2 - own**2) / own
@@ -289,14 +289,14 @@ def test_a_damped_bounce_loses_what_the_theory_of_spring_and_damper_says():
 
 
 @pytest.mark.parametrize('speed', [0.05, 0.5, 1.4, 3.0])
-def test_steps_of_a_millisecond_are_fine_enough_for_the_defaults(speed):
+def test_one_millisecond_steps_suffice_for_the_defaults(speed):
     _, (_, fine), _, _ = throw(speed, DAMPED, 1e-5)
     _, (_, coarse), lowest, _ = throw(speed, DAMPED, 1e-3)
     assert lowest > 0.05
     assert coarse == pytest.approx(fine, abs=0.1 * speed)
 
 
-def test_a_ball_in_a_box_keeps_its_energy_over_many_bounces():
+def test_many_undamped_bounces_keep_energy():
     room = parse_world(
         'walls: [{points: [[0, 0], [0.5, 0], [0.6, 0.4], [0.1, 0.5]], closed: true}]', 'box'
     )
@@ -317,8 +317,8 @@ def test_a_ball_in_a_box_keeps_its_energy_over_many_bounces():
     assert math.hypot(speed_x, speed_y) == pytest.approx(math.hypot(0.41, 0.29), rel=0.01)
 
 
-def test_a_wall_that_ends_on_another_is_not_felt_on_its_far_side():
-    """A partition that only touches the wall would push through it, beside the wall itself."""
+def test_wall_ending_on_a_wall_is_not_felt_on_the_far_side():
+    """A partition that only touches the wall would push through it, in addition to the wall."""
     apart = np.array([[-1.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, -1.0]])
     joined = join_walls(apart)
     assert len(joined) == 3
@@ -327,7 +327,7 @@ def test_a_wall_that_ends_on_another_is_not_felt_on_its_far_side():
     assert force(0.0, 0.105, apart)[1] == pytest.approx(2.0 * STIFFNESS * 0.005)
 
 
-def test_walls_that_overlap_or_stand_twice_push_once():
+def test_overlapping_and_duplicate_walls_push_once():
     floors = np.array([[-1.0, 0, 0.4, 0], [0.6, 0, -0.2, 0], [0.4, 5e-5, 1, 0], [-1, 0, 0.4, 0]])
     joined = join_walls(floors)
     for x in np.linspace(-0.9, 0.9, 61).tolist():
@@ -336,7 +336,7 @@ def test_walls_that_overlap_or_stand_twice_push_once():
         )
 
 
-def test_boxes_side_by_side_make_one_wall():
+def test_adjacent_boxes_form_one_wall():
     world = parse_world(
         'boxes: [{center: [0.1, 0], size: [0.2, 0.2]}, {center: [0.3, 0], size: [0.2, 0.2]}]', 'a'
     )

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The digital twin as a whole: it repeats itself, converges, and goes wrong as a robot does."""
+"""Digital twin: determinism, convergence, and the errors of a real robot."""
 
 import math
 from pathlib import Path
@@ -31,7 +31,7 @@ def parameters(**changes: object) -> DigitalTwinParameters:
 
 
 def course(seed: int, periods: int) -> list[WheelSpeeds]:
-    """Wheel speeds like those of the chaotic reference: smooth, up to 6 rad/s, both signs."""
+    """Return wheel speeds similar to the chaotic reference: smooth, up to 6 rad/s, both signs."""
     generator = np.random.default_rng(seed)
     time = 0.01 * np.arange(periods)
     speeds = np.full((2, periods), 1.5)
@@ -54,28 +54,28 @@ def faulty(robot: DigitalTwin, **faults: object) -> None:
 
 
 def astray(state) -> float:
-    """Return how far (m) odometry is from the truth."""
-    true, told = state.truth.pose, state.odometry.pose
-    return math.hypot(true.x - told.x, true.y - told.y)
+    """Return the distance (m) of the odometry from the ground truth."""
+    true, odometry = state.truth.pose, state.odometry.pose
+    return math.hypot(true.x - odometry.x, true.y - odometry.y)
 
 
-# -- it repeats itself ----------------------------------------------------------------------------
+# -- determinism ----------------------------------------------------------------------------------
 
 
-def test_the_twin_has_every_part_of_the_seam():
+def test_digital_twin_implements_the_robot_interface():
     for name in ('apply', 'advance', 'stop', 'reset_odometry', 'latch_estop', 'release_estop'):
         assert getattr(DigitalTwin, name) is not getattr(RobotInterface, name)
 
 
-def test_the_table_says_which_robot_it_is():
+def test_drive_kind_selects_the_robot_class():
     assert type(make_robot(parameters())) is DigitalTwin
     assert type(make_robot(parameters(drive__kind='velocity'))) is PaperRobot
     with pytest.raises(ValueError, match='stepper is for DigitalTwin'):
         PaperRobot(parameters())
 
 
-def test_many_twins_in_one_process_are_each_what_they_are_alone():
-    """A sweep may step its robots in any order: none knows of another."""
+def test_twins_in_one_process_are_independent():
+    """A sweep may step its robots in any order."""
     tables = [parameters(seed=seed, world='room', noise__variance=0.04) for seed in range(5)]
     speeds = course(1, 150)
     alone = [drive(DigitalTwin(table), speeds)[-1] for table in tables]
@@ -89,7 +89,7 @@ def test_many_twins_in_one_process_are_each_what_they_are_alone():
     assert len({repr(state.imu) for state in alone}) == 5
 
 
-def test_how_often_the_state_is_asked_for_changes_nothing():
+def test_request_rate_does_not_change_the_state():
     speeds = course(2, 200)
     whole, parts = DigitalTwin(parameters()), DigitalTwin(parameters())
     for robot in (whole, parts):
@@ -103,7 +103,7 @@ def test_how_often_the_state_is_asked_for_changes_nothing():
     assert repr(last) == repr(asked)
 
 
-def test_a_setting_of_one_part_does_not_shift_the_random_numbers_of_another():
+def test_parameters_do_not_shift_other_random_numbers():
     speeds = course(3, 100)
     before = drive(DigitalTwin(parameters(world='corridor')), speeds)
     after = drive(
@@ -114,8 +114,8 @@ def test_a_setting_of_one_part_does_not_shift_the_random_numbers_of_another():
     assert [repr(s.ranges) for s in before] != [repr(s.ranges) for s in after]
 
 
-def test_halving_the_integration_step_changes_a_minute_by_less_than_a_tenth_of_a_millimetre():
-    """Seen at the stages alone, pulses came up to half a step late: 0.36 mm after a minute."""
+def test_halving_the_step_changes_a_minute_by_less_than_10_um():
+    """Pulses evaluated at the stages alone were half a step late: 0.36 mm after a minute."""
     speeds = course(4, 6000)
     coarse, fine = (
         np.array(
@@ -126,14 +126,14 @@ def test_halving_the_integration_step_changes_a_minute_by_less_than_a_tenth_of_a
         )
         for step in (0.001, 0.0005)
     )
-    assert np.ptp(coarse, axis=0).max() > 0.5  # it went somewhere
+    assert np.ptp(coarse, axis=0).max() > 0.5  # the robot moved
     assert np.hypot(*(coarse - fine).T).max() < 0.01e-3
 
 
-# -- odometry is wrong exactly when steps are lost or tyres slide ---------------------------------
+# -- odometry errors from lost steps and sliding tyres --------------------------------------------
 
 
-def test_counters_tell_the_way_as_long_as_no_step_is_lost_and_no_tyre_slides():
+def test_counters_give_the_path_without_lost_steps_or_slip():
     robot = DigitalTwin(parameters(odometry__use_gyro=False))
     for state in drive(robot, course(5, 3000)):
         assert state.lost_steps == (0, 0)
@@ -152,7 +152,7 @@ def test_counters_tell_the_way_as_long_as_no_step_is_lost_and_no_tyre_slides():
         ('a held wheel', {'faults__wheel_blocked': 'left'}),
     ],
 )
-def test_odometry_does_not_notice(cause, changes):
+def test_odometry_misses_slip_and_lost_steps(cause, changes):
     robot = DigitalTwin(parameters(odometry__use_gyro=False, slip_stop=0.0, **changes))
     last = drive(robot, course(5, 1000))[-1]
     apart = astray(last)
@@ -164,7 +164,7 @@ def test_odometry_does_not_notice(cause, changes):
 # -- board ----------------------------------------------------------------------------------------
 
 
-def test_a_command_reaches_the_wheels_after_the_dead_time():
+def test_command_reaches_the_wheels_after_the_dead_time():
     robot = DigitalTwin(parameters(drive__dead_time=0.03))
     robot.advance(0)
     speeds = [robot.step(WheelSpeeds(1.0, 1.0)).wheels.right for _ in range(8)]
@@ -172,8 +172,8 @@ def test_a_command_reaches_the_wheels_after_the_dead_time():
     assert speeds[4] > 0.2
 
 
-def test_a_stale_command_is_refused_before_it_is_sent():
-    """Sent, it would reach a board that drops it and has no way to say so."""
+def test_stale_command_is_rejected_before_sending():
+    """The board would drop it without a report to the host."""
     robot = DigitalTwin(parameters())
     now_ns = robot.advance(10**10).stamp_ns
     for age, stale in ((0.0, False), (0.249, False), (0.25, True), (2.0, True), (-1.0, False)):
@@ -181,7 +181,7 @@ def test_a_stale_command_is_refused_before_it_is_sent():
         assert ('too old' in robot.apply(command, now_ns)) == stale, age
 
 
-def test_a_brown_out_resets_the_board_and_new_commands_bring_it_back():
+def test_brown_out_restarts_the_board_and_commands_resume():
     robot = DigitalTwin(parameters(boot_time=0.5))
     drive(robot, [WheelSpeeds(4.0, 4.0)] * 100)
     before = robot.state
@@ -194,16 +194,16 @@ def test_a_brown_out_resets_the_board_and_new_commands_bring_it_back():
         == BROWN_OUT_REASON
     )
     assert states[-1].imu is None
-    assert abs(states[-1].true_wheels.right) < 3.0  # nothing pulls: friction brakes
+    assert abs(states[-1].true_wheels.right) < 3.0  # no torque: friction brakes
     faulty(robot, brown_out=False)
     back = [robot.step(WheelSpeeds(4.0, 4.0)) for _ in range(60)]
     assert back[-1].reason == ''
     assert back[-1].wheels.right == pytest.approx(4.0, abs=0.4)
-    # The host adds up what every board counted: the wheel angle goes on where it was.
+    # The host accumulates the counts over restarts: the wheel angle continues.
     assert back[-1].angles.right > before.angles.right
 
 
-def test_a_battery_that_collapses_is_a_brown_out():
+def test_battery_collapse_causes_a_brown_out():
     full, weak = (DigitalTwin(parameters(battery__resistance=ohms)) for ohms in (0.15, 8.0))
     assert drive(full, [WheelSpeeds(3.0, 3.0)] * 20)[-1].reason == ''
     states = drive(weak, [WheelSpeeds(3.0, 3.0)] * 20)
@@ -212,14 +212,14 @@ def test_a_battery_that_collapses_is_a_brown_out():
 
 def test_lasting_slip_stops_the_robot_with_a_reason():
     robot = DigitalTwin(parameters())
-    drive(robot, [STILL] * 150)  # the gyro learns its bias at a standstill
+    drive(robot, [STILL] * 150)  # the gyro bias is estimated at a standstill
     faulty(robot, wheel_blocked='right')
     states = [robot.step(WheelSpeeds(3.0, 3.0)) for _ in range(250)]
     assert any(state.status.slipping for state in states)
     assert any('a wheel slips, is blocked, or has lost steps' in state.reason for state in states)
 
 
-def test_every_word_of_a_fault_is_in_force_at_once():
+def test_active_faults_are_reported_immediately():
     robot = DigitalTwin(parameters(faults__slippery=0.5, faults__load_change=1.0))
     assert robot.diagnostics.faults == ('load_change 1 kg', 'slippery 0.5')
 
@@ -227,7 +227,7 @@ def test_every_word_of_a_fault_is_in_force_at_once():
 # -- world and sensors ----------------------------------------------------------------------------
 
 
-def test_a_wall_stops_the_body_and_the_sensors_see_it_coming(tmp_path):
+def test_wall_stops_the_body_and_range_sensors_measure_it(tmp_path):
     wall = tmp_path / 'wall.yaml'
     wall.write_text('walls:\n  - points: [[1.0, -2.0], [1.0, 2.0]]\n')
     exact = {'range_sensor__voltage_noise': 0.0, 'range_sensor__voltage_offset': 0.0}
@@ -237,8 +237,8 @@ def test_a_wall_stops_the_body_and_the_sensors_see_it_coming(tmp_path):
     assert states[-1].truth.pose.x == pytest.approx(1.0 - radius, abs=0.005)
     assert max(state.truth.pose.x for state in states) < 1.0 - radius + 0.01
     assert robot.diagnostics.max_contact_force > 3.0
-    assert states[-1].odometry.pose.x > 1.1  # the wheels went on
-    # 0.5 m before the wall, a front sensor on the body's edge reads the rest of the way.
+    assert states[-1].odometry.pose.x > 1.1  # the wheels kept turning
+    # 0.5 m before the wall, a front sensor measures the distance from its face.
     halfway = min(states, key=lambda state: abs(state.truth.pose.x - 0.5))
     front = halfway.ranges[RANGE_SENSORS.index('front_left')]
     assert front == pytest.approx(1.0 - 0.5 - robot.parameters.range_sensor.half_length, abs=0.03)
@@ -246,7 +246,7 @@ def test_a_wall_stops_the_body_and_the_sensors_see_it_coming(tmp_path):
     assert halfway.ranges[RANGE_SENSORS.index('left_front')] == math.inf
 
 
-def test_a_robot_cannot_be_put_into_a_wall(tmp_path):
+def test_set_pose_inside_a_wall_is_rejected(tmp_path):
     box = tmp_path / 'box.yaml'
     box.write_text('boxes:\n  - center: [1.0, 0.0]\n    size: [0.5, 0.5]\n')
     robot = DigitalTwin(parameters(world=str(box)))
@@ -260,7 +260,7 @@ def test_a_robot_cannot_be_put_into_a_wall(tmp_path):
     assert robot.state.truth.pose == pytest.approx((1.0, 1.0, 0.3))
 
 
-def test_a_slippery_patch_is_where_the_world_says(tmp_path):
+def test_tyres_slide_only_on_the_slippery_patch(tmp_path):
     ice = tmp_path / 'ice.yaml'
     ice.write_text('patches:\n  - center: [0.5, 0.0]\n    radius: 0.2\n    grip: 0.0\n')
     robot = DigitalTwin(parameters(world=str(ice)))
@@ -278,7 +278,7 @@ def test_a_slippery_patch_is_where_the_world_says(tmp_path):
     assert max(slid) < 0.76
 
 
-def test_the_gyro_sums_up_to_the_turn_that_was_made():
+def test_integrated_gyro_equals_the_turn():
     quiet = {'imu__gyro_noise': 0.0, 'imu__gyro_offset': 0.0, 'imu__gyro_drift': 0.0}
     robot = DigitalTwin(parameters(imu__gyro_scale_error=0.0, **quiet))
     states = drive(robot, [WheelSpeeds(2.0, -2.0)] * 300 + [STILL] * 100)
@@ -288,7 +288,7 @@ def test_the_gyro_sums_up_to_the_turn_that_was_made():
     assert turned == pytest.approx(truth, rel=0.002)
 
 
-def test_the_accelerometer_feels_acceleration_and_the_bend():
+def test_accelerometer_measures_linear_and_centripetal_parts():
     quiet = {'imu__accel_noise': 0.0, 'imu__accel_offset': 0.0}
     robot = DigitalTwin(parameters(body__com_offset=0.0, **quiet))
     states = drive(robot, [WheelSpeeds(6.0, 4.0)] * 300)
@@ -298,7 +298,7 @@ def test_the_accelerometer_feels_acceleration_and_the_bend():
     assert max(state.imu.forward for state in states[:30]) > 0.5
 
 
-def test_the_battery_pays_for_the_motors():
+def test_motors_discharge_the_battery():
     idle, busy = DigitalTwin(parameters()), DigitalTwin(parameters())
     drive(idle, [STILL] * 200)
     drive(busy, [WheelSpeeds(8.0, 8.0)] * 200)
@@ -307,37 +307,37 @@ def test_the_battery_pays_for_the_motors():
     assert idle.state.battery.current * idle.state.battery.voltage > copper
 
 
-# -- bad settings ---------------------------------------------------------------------------------
+# -- inconsistent parameters ----------------------------------------------------------------------
 
 
-def test_speeds_that_the_pulses_cannot_make_are_refused():
+def test_speed_above_the_pulse_rate_is_rejected():
     with pytest.raises(ParameterError, match=r'wheel.max_velocity must be at most 1\.227 rad/s'):
         parameters(motor__microsteps=256)
     parameters(motor__microsteps=256, wheel__max_velocity=1.2)
 
 
-def test_odometry_must_know_how_late_the_gyro_is():
+def test_gyro_delay_must_match_the_low_pass():
     with pytest.raises(ParameterError, match=r'odometry.gyro_delay must be about 0.041 s'):
         parameters(imu__low_pass='6')
     parameters(imu__low_pass='6', odometry__gyro_delay=0.041)
     parameters(imu__low_pass='6', odometry__use_gyro=False)
 
 
-def test_a_step_too_long_for_the_rotor_is_refused_with_the_longest():
+def test_unstable_rotor_substep_is_rejected_with_the_limit():
     with pytest.raises(ParameterError, match=r'substep must be at most 0\.0018 s'):
         parameters(substep=0.002)
 
 
-def test_what_is_built_in_stays_while_the_robot_runs():
+def test_read_only_parameters_cannot_change_at_run_time():
     robot = DigitalTwin(parameters())
-    with pytest.raises(ParameterError, match='motor.microsteps is fixed while the robot runs'):
+    with pytest.raises(ParameterError, match='motor.microsteps is read-only while the robot runs'):
         robot.configure(parameters(motor__microsteps=8))
 
 
-# -- the page -------------------------------------------------------------------------------------
+# -- documentation --------------------------------------------------------------------------------
 
 
-def test_the_example_on_the_page_runs(capsys):
+def test_documented_twin_example_runs(capsys):
     page = (Path(__file__).resolve().parents[2] / 'docs' / 'twin.md').read_text()
     (example,) = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
     exec(example, {})

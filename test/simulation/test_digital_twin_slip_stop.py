@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""A robot that stops for slip stands, and stands until whoever commands it has let go."""
+"""Slip stop of the digital twin: it lasts until motion commands pause."""
 
 import numpy as np
 import pytest
@@ -14,8 +14,8 @@ FORWARD = WheelSpeeds(5.0, 5.0)
 PERIOD_NS = 10_000_000
 
 
-def a_robot(**changes):
-    """Return a robot whose gyro is calibrated: it has stood for longer than a second."""
+def make_robot(**changes):
+    """Return a robot with a calibrated gyro, after a standstill of more than a second."""
     robot = DigitalTwin(DigitalTwinParameters.from_dict(changes))
     robot.warm_up()
     drive(robot, ZERO_WHEEL_SPEEDS, 1.3)
@@ -28,7 +28,7 @@ def drive(robot, wheels, seconds):
 
 
 def silence(robot, seconds):
-    """Command nothing at all and return all states."""
+    """Send no command and return all states."""
     start = robot.state.stamp_ns
     return [robot.advance(start + PERIOD_NS * (k + 1)) for k in range(round(100 * seconds))]
 
@@ -39,16 +39,16 @@ def fault(robot, **changes):
 
 
 def stopped(**changes):
-    """Return a robot that a held right wheel has stopped."""
-    robot = a_robot(**changes)
+    """Return a robot stopped by a blocked right wheel."""
+    robot = make_robot(**changes)
     drive(robot, FORWARD, 1.0)
     fault(robot, wheel_blocked='right')
     drive(robot, FORWARD, 1.5)
     return robot
 
 
-def test_a_robot_with_a_held_wheel_stops_and_does_not_only_say_so():
-    """The guard took the next command 10 ms after each stop: the robot drove on for ever."""
+def test_blocked_wheel_stops_the_robot():
+    """The limiter accepted the next command 10 ms after each stop, so the robot drove on."""
     robot = stopped()
     states = drive(robot, FORWARD, 5.0)
     assert {state.reason for state in states} == {SLIP_STOP_REASON}
@@ -58,21 +58,21 @@ def test_a_robot_with_a_held_wheel_stops_and_does_not_only_say_so():
     np.testing.assert_allclose(start, end, atol=1e-3)
 
 
-def test_it_stops_once_slip_has_lasted_for_the_time_that_is_set():
-    robot = a_robot(slip_stop=0.6)
+def test_robot_stops_after_the_set_slip_time():
+    robot = make_robot(slip_stop=0.6)
     drive(robot, FORWARD, 1.0)
     fault(robot, wheel_blocked='right')
     states = drive(robot, FORWARD, 2.0)
     first = next(k for k, state in enumerate(states) if state.reason)
-    # Slip is counted from when the smoothed disagreement passes the threshold.
+    # Slip is timed from when the smoothed disagreement exceeds the threshold.
     assert 0.6 < 0.01 * first < 0.8
 
 
-@pytest.mark.parametrize('held', [True, False])
-def test_it_does_not_start_by_itself_when_the_fault_is_gone(held):
-    """No stop and go: with something in the wheel each new try would be another push."""
+@pytest.mark.parametrize('blocked', [True, False])
+def test_robot_stays_stopped_when_the_fault_ends(blocked):
+    """A restart by itself would push against the obstacle again."""
     robot = stopped()
-    if not held:
+    if not blocked:
         fault(robot, wheel_blocked='none')
     states = drive(robot, FORWARD, 6.0)
     assert not any(state.status.slipping for state in states[100:])
@@ -80,20 +80,20 @@ def test_it_does_not_start_by_itself_when_the_fault_is_gone(held):
 
 
 @pytest.mark.parametrize(
-    'let_go', [silence, lambda robot, time: drive(robot, ZERO_WHEEL_SPEEDS, time)]
+    'pause', [silence, lambda robot, time: drive(robot, ZERO_WHEEL_SPEEDS, time)]
 )
-def test_it_obeys_again_once_no_motion_was_commanded_for_a_while(let_go):
+def test_robot_resumes_after_the_release_time(pause):
     robot = stopped()
     fault(robot, wheel_blocked='none')
     drive(robot, FORWARD, 1.0)
-    states = let_go(robot, RELEASE_TIME + 0.05)
+    states = pause(robot, RELEASE_TIME + 0.05)
     assert {state.reason for state in states[:-10]} == {SLIP_STOP_REASON}
     states = drive(robot, FORWARD, 1.0)
     assert states[-1].reason == ''
     assert states[-1].true_wheels == pytest.approx(FORWARD, abs=0.2)
 
 
-def test_a_shorter_pause_does_not_count():
+def test_pause_shorter_than_the_release_time_does_not_count():
     robot = stopped()
     fault(robot, wheel_blocked='none')
     drive(robot, FORWARD, 1.0)
@@ -104,7 +104,7 @@ def test_a_shorter_pause_does_not_count():
     assert states[-1].commanded == ZERO_WHEEL_SPEEDS
 
 
-def test_with_the_wheel_still_held_it_stops_again():
+def test_robot_stops_again_while_the_wheel_is_blocked():
     robot = stopped()
     drive(robot, ZERO_WHEEL_SPEEDS, RELEASE_TIME + 0.05)
     states = drive(robot, FORWARD, 2.0)
@@ -113,8 +113,8 @@ def test_with_the_wheel_still_held_it_stops_again():
     assert states[-1].commanded == ZERO_WHEEL_SPEEDS
 
 
-def test_late_commands_count_when_they_arrive():
-    """What was sent before the stick was let go is not a new wish, but it is not silence."""
+def test_delayed_commands_count_at_their_arrival():
+    """A delayed motion command restarts the pause when it arrives."""
     robot = stopped()
     fault(robot, wheel_blocked='none', command_delay=0.2)
     drive(robot, FORWARD, 0.1)
@@ -125,21 +125,21 @@ def test_late_commands_count_when_they_arrive():
     assert drive(robot, FORWARD, 0.4)[-1].reason == ''
 
 
-def test_taking_the_rule_away_lets_it_go_on():
+def test_disabling_the_slip_stop_resumes_motion():
     robot = stopped()
     robot.configure(robot.parameters.with_values({'slip_stop': 0.0}))
     assert drive(robot, FORWARD, 0.2)[-1].commanded == FORWARD
 
 
-def test_zero_means_that_it_never_stops_for_slip():
-    robot = a_robot(slip_stop=0.0)
+def test_zero_disables_the_slip_stop():
+    robot = make_robot(slip_stop=0.0)
     fault(robot, wheel_blocked='right')
     states = drive(robot, FORWARD, 3.0)
     assert any(state.status.slipping for state in states)
     assert not any(state.reason for state in states)
 
 
-def test_an_emergency_stop_is_not_hidden_and_is_itself_a_time_without_commands():
+def test_emergency_stop_reason_shows_and_releases_the_slip_stop():
     robot = stopped()
     fault(robot, wheel_blocked='none')
     robot.latch_estop('a person', robot.state.stamp_ns)
@@ -149,16 +149,16 @@ def test_an_emergency_stop_is_not_hidden_and_is_itself_a_time_without_commands()
     assert drive(robot, FORWARD, 0.5)[-1].reason == ''
 
 
-def test_a_board_that_restarts_has_forgotten_why_it_stood():
+def test_board_restart_releases_the_slip_stop():
     robot = stopped()
     fault(robot, wheel_blocked='none', brown_out=True)
     assert drive(robot, FORWARD, 0.3)[-1].reason == BROWN_OUT_REASON
     assert drive(robot, FORWARD, 0.8)[-1].reason == ''
 
 
-def test_turning_the_standing_robot_by_hand_ends_with_the_hand():
-    """A gyro that shows a turn which nobody commanded is no reason to refuse the next command."""
-    robot = a_robot()
+def test_external_rotation_stop_ends_with_the_rotation():
+    """An external rotation alone does not reject the next command."""
+    robot = make_robot()
     fault(robot, gyro_bias_jump=1.0)
     assert drive(robot, ZERO_WHEEL_SPEEDS, 1.4)[-1].reason == SLIP_STOP_REASON
     fault(robot, gyro_bias_jump=0.0)

@@ -18,7 +18,7 @@ from t3mpc_ros.simulation.plant.disturbances import (
 )
 
 
-def test_friction_is_odd_and_always_takes_energy_out():
+def test_friction_is_odd_and_dissipative():
     for speed in np.random.default_rng(1).uniform(-50.0, 50.0, 200):
         torque = friction_torque(speed, 2e-4, 0.004, 0.2)
         assert torque == -friction_torque(-speed, 2e-4, 0.004, 0.2)
@@ -26,7 +26,7 @@ def test_friction_is_odd_and_always_takes_energy_out():
     assert friction_torque(0.0, 2e-4, 0.004, 0.2) == 0.0
 
 
-def test_friction_is_viscous_plus_coulomb_away_from_rest_and_smooth_through_it():
+def test_friction_is_viscous_plus_smoothed_coulomb():
     assert friction_torque(10.0, 2e-4, 0.004, 0.2) == pytest.approx(0.004 + 2e-3)
     assert friction_torque(0.2, 0.0, 0.004, 0.2) == pytest.approx(0.76 * 0.004, rel=0.01)
     slope = friction_torque(1e-6, 2e-4, 0.004, 0.2) / 1e-6
@@ -49,7 +49,7 @@ def test_disturbance_never_exceeds_its_bound():
                 assert abs(torque) <= parameters.bound
 
 
-def test_disturbance_comes_near_its_bound_and_acts_on_each_wheel_by_itself():
+def test_disturbance_reaches_its_bound_on_each_wheel():
     parameters = DisturbanceParameters(bound=1.0, walk_share=0.0)
     disturbance = Disturbance(parameters, np.random.default_rng(3))
     torques = np.array([disturbance.torque(0.05 * tick) for tick in range(8000)])
@@ -57,7 +57,7 @@ def test_disturbance_comes_near_its_bound_and_acts_on_each_wheel_by_itself():
     assert abs(np.corrcoef(torques.T)[0, 1]) < 0.9
 
 
-def test_walk_spreads_with_the_square_root_of_time_until_it_meets_the_mirrors():
+def test_random_walk_spreads_with_the_square_root_of_time():
     parameters = DisturbanceParameters(walk_rate=0.1)
     ends = []
     for seed in range(400):
@@ -68,7 +68,7 @@ def test_walk_spreads_with_the_square_root_of_time_until_it_meets_the_mirrors():
     assert np.std(ends) == pytest.approx(0.1, rel=0.1)
 
 
-def test_mirrors_keep_every_value_and_are_continuous():
+def test_reflection_is_bounded_and_continuous():
     for value in np.random.default_rng(4).uniform(-50.0, 50.0, 500):
         assert -1.0 <= reflect(value) <= 1.0
         assert abs(reflect(value + 1e-6) - reflect(value)) == pytest.approx(1e-6, rel=1e-3)
@@ -77,7 +77,7 @@ def test_mirrors_keep_every_value_and_are_continuous():
     assert reflect(-1.2) == pytest.approx(-0.8)
 
 
-def test_equal_seeds_disturb_equally_and_settings_do_not_shift_the_numbers():
+def test_disturbance_parameters_do_not_shift_random_numbers():
     calm = Disturbance(DisturbanceParameters(walk_rate=0.0), np.random.default_rng(5))
     wild = Disturbance(DisturbanceParameters(walk_rate=3.0), np.random.default_rng(5))
     other = Disturbance(DisturbanceParameters(walk_rate=3.0), np.random.default_rng(5))
@@ -95,7 +95,7 @@ def test_equal_seeds_disturb_equally_and_settings_do_not_shift_the_numbers():
     assert calm.walk == pytest.approx(wild.walk - step, abs=1e-12)
 
 
-def test_noise_has_the_variance_that_is_set_and_no_bias():
+def test_noise_has_the_set_variance_and_zero_mean():
     noise = SpeedNoise(NoiseParameters(variance=0.04), np.random.default_rng(6))
     drawn = np.array([noise.measure(WheelSpeeds(5.0, -3.0)) for _ in range(20000)])
     deviations = drawn - [5.0, -3.0]
@@ -105,7 +105,7 @@ def test_noise_has_the_variance_that_is_set_and_no_bias():
     assert abs(np.corrcoef(deviations[1:, 0], deviations[:-1, 0])[0, 1]) < 0.03
 
 
-def test_without_variance_the_measurement_is_exact_and_draws_the_same_numbers():
+def test_zero_variance_is_exact_and_draws_the_same_numbers():
     silent = SpeedNoise(NoiseParameters(), np.random.default_rng(7))
     loud = SpeedNoise(NoiseParameters(variance=0.25), np.random.default_rng(7))
     assert silent.measure(WheelSpeeds(5.0, -3.0)) == (5.0, -3.0)

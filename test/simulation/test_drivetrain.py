@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Rotors, tyres and body together: Newton, momentum and energy, rolling and sliding."""
+"""Drivetrain: Newton, momentum and energy, rolling and sliding."""
 
 import math
 
@@ -118,7 +118,7 @@ def magnetic(robot: Drivetrain, motor: StepperMotorParameters = MOTOR) -> float:
 
 
 def swinging(motor: StepperMotorParameters, step: float) -> Drivetrain:
-    """A robot whose rotors swing freely in fields that have just stopped."""
+    """Return a drivetrain whose rotors oscillate in fields that have just stopped."""
     robot = drivetrain(motor=motor, step=step)
     for _ in range(round(0.02 / step)):
         robot.run(WheelSpeeds(2.0, -1.2), 0.0, VOLTS, calm(), 1)
@@ -129,7 +129,7 @@ def swinging(motor: StepperMotorParameters, step: float) -> Drivetrain:
 # -- pulses ---------------------------------------------------------------------------------------
 
 
-def test_the_mean_place_of_a_field_is_that_of_the_staircase():
+def test_mean_field_position_is_that_of_the_staircase():
     generator = np.random.default_rng(8)
     for _ in range(200):
         start, way = generator.uniform(-5.0, 5.0), generator.uniform(-7.0, 7.0)
@@ -139,8 +139,8 @@ def test_the_mean_place_of_a_field_is_that_of_the_staircase():
     assert mean_pulses(-2.3, -2.3) == -3.0
 
 
-def test_a_rate_that_gets_where_it_should_stays_there():
-    """A ramp that ends within a step: counted as a whole one, pulses would depend on the step."""
+def test_mean_rate_holds_the_target_once_reached():
+    """Counted as a whole step, a ramp that ends within a step would depend on the step."""
     for rate, target, reach in ((0.0, 10.0, 40.0), (3.0, -5.0, 16.0), (2.0, 50.0, 12.0)):
         times = (np.arange(100_000) + 0.5) / 100_000
         way = target - rate
@@ -151,7 +151,7 @@ def test_a_rate_that_gets_where_it_should_stays_there():
 # -- Newton ---------------------------------------------------------------------------------------
 
 
-def test_where_both_tyres_roll_the_coupled_equations_are_equation_10():
+def test_rolling_tyres_reproduce_equation_10():
     generator = np.random.default_rng(1)
     dynamics = dynamics_vector(BODY, GEOMETRY)
     for _ in range(100):
@@ -163,7 +163,7 @@ def test_where_both_tyres_roll_the_coupled_equations_are_equation_10():
 
 
 @pytest.mark.parametrize('modes', [(0, 0), (1, 0), (0, -1), (1, -1), (-1, -1)])
-def test_tyre_forces_are_all_that_moves_the_body(modes):
+def test_body_follows_newton_euler_with_tyre_forces(modes):
     """Newton and Euler of the body: m v' - m_c d w² = F_R + F_L, and the same for turning."""
     generator = np.random.default_rng(2)
     mass, moment = BODY.total_mass, BODY.body_mass * BODY.com_offset
@@ -189,7 +189,7 @@ def test_tyre_forces_are_all_that_moves_the_body(modes):
             assert pushed[wheel] == pytest.approx(own, abs=1e-8)
 
 
-def test_a_tyre_that_takes_hold_keeps_the_momentum_and_gives_off_energy():
+def test_begin_rolling_keeps_momentum_and_dissipates_energy():
     generator = np.random.default_rng(3)
     inertia = wheel_inertia(BODY, GEOMETRY) - BODY.wheel_inertia * np.eye(2)
     tyres = np.array([OWN, OWN, 1.0, 1.0])
@@ -199,7 +199,7 @@ def test_a_tyre_that_takes_hold_keeps_the_momentum_and_gives_off_energy():
             for wheel, mode in enumerate(modes):
                 if mode == ROLLING:
                     state[5 + wheel] = state[7 + wheel]
-                else:  # the slide has just gone through zero
+                else:  # the sliding speed has just crossed zero
                     state[5 + wheel] = state[7 + wheel] - mode * 0.01
             before = inertia @ state[7:9] + OWN * state[5:7]
             energy = 0.5 * state[7:9] @ inertia @ state[7:9] + 0.5 * OWN * state[5:7] @ state[5:7]
@@ -213,7 +213,7 @@ def test_a_tyre_that_takes_hold_keeps_the_momentum_and_gives_off_energy():
             assert after <= energy + 1e-15
 
 
-def test_a_tyre_lets_go_exactly_beyond_its_grip_and_slides_the_way_it_was_pushed():
+def test_tyre_slides_beyond_its_grip_in_the_pushed_direction():
     body = body_vector(BODY, GEOMETRY)
     tyres = np.array([OWN, OWN, 2.0, 2.0])
     for force, mode in ((1.999, 0), (2.001, 1), (-2.001, -1)):
@@ -225,8 +225,8 @@ def test_a_tyre_lets_go_exactly_beyond_its_grip_and_slides_the_way_it_was_pushed
 # -- energy ---------------------------------------------------------------------------------------
 
 
-def test_free_swings_keep_their_energy_to_the_order_of_the_method():
-    """Nothing rubs: kinetic and magnetic energy only change places, to order 4 of the step."""
+def test_undamped_swing_keeps_energy_to_order_four():
+    """Without friction the sum of kinetic and magnetic energy is constant to order 4."""
     motor = StepperMotorParameters(microsteps=256, damping=0.0)
     errors = []
     for step in (0.004, 0.002, 0.001):
@@ -244,7 +244,7 @@ def test_free_swings_keep_their_energy_to_the_order_of_the_method():
     assert errors[1] / errors[2] > 12.0
 
 
-def test_damping_and_friction_only_ever_take_energy_out_while_the_fields_rest():
+def test_damping_and_friction_only_dissipate_energy():
     robot = swinging(StepperMotorParameters(microsteps=256), 0.0005)
     robot.load(StepperMotorParameters(microsteps=256), load(friction=FrictionParameters()))
     energy = kinetic(robot) + magnetic(robot)
@@ -256,8 +256,8 @@ def test_damping_and_friction_only_ever_take_energy_out_while_the_fields_rest():
     assert energy < 1e-6
 
 
-def test_what_the_turning_fields_do_is_what_the_robot_gains():
-    """Fields of 256 microsteps turn all but evenly: their work is the robot's energy."""
+def test_field_work_equals_energy_gain():
+    """Fields of 256 microsteps turn almost smoothly: their work is the energy of the robot."""
     motor = StepperMotorParameters(microsteps=256, damping=0.0, step_rate=1e6)
     robot = drivetrain(motor=motor, step=0.00025)
     for _ in range(400):
@@ -267,8 +267,8 @@ def test_what_the_turning_fields_do_is_what_the_robot_gains():
     assert robot.field_work == pytest.approx(gained, rel=0.003)
 
 
-def test_a_sliding_robot_loses_what_its_tyres_rub_off():
-    """Both wheels are held at speed: the body comes to rest, its energy goes into the floor."""
+def test_sliding_energy_loss_equals_tyre_friction_work():
+    """Both wheels are blocked at speed: tyre friction dissipates the energy of the body."""
     robot = drivetrain(grip=0.6)
     for _ in range(100):
         robot.run(WheelSpeeds(8.0, 8.0), 30.0, VOLTS, calm(), 10)
@@ -286,14 +286,14 @@ def test_a_sliding_robot_loses_what_its_tyres_rub_off():
 # -- momentum -------------------------------------------------------------------------------------
 
 
-def test_on_ice_the_wheels_spin_and_the_body_keeps_its_momentum():
+def test_without_grip_wheels_spin_and_momentum_is_kept():
     robot = drivetrain()
     for _ in range(100):
         robot.run(WheelSpeeds(4.0, 4.0), 10.0, VOLTS, calm(), 10)
     for _ in range(100):
         robot.run(WheelSpeeds(4.0, 4.0), 10.0, VOLTS, calm(), 10)
     robot.load(MOTOR, load(grip_factor=0.0))
-    robot.run(WheelSpeeds(4.0, 4.0), 10.0, VOLTS, calm(), 1)  # at its end the tyres let go
+    robot.run(WheelSpeeds(4.0, 4.0), 10.0, VOLTS, calm(), 1)  # at its end the tyres slide
     ground = robot.ground
     for _ in range(100):
         robot.run(WheelSpeeds(10.0, -10.0), 30.0, VOLTS, calm(), 10)
@@ -302,7 +302,7 @@ def test_on_ice_the_wheels_spin_and_the_body_keeps_its_momentum():
     assert robot.lost_steps == (0, 0)
 
 
-def test_on_ice_a_body_that_turns_keeps_its_energy():
+def test_without_grip_a_turning_body_keeps_its_energy():
     robot = drivetrain()
     for _ in range(200):
         robot.run(WheelSpeeds(6.0, 2.0), 10.0, VOLTS, calm(), 10)
@@ -314,12 +314,12 @@ def test_on_ice_a_body_that_turns_keeps_its_energy():
     for _ in range(200):
         robot.run(WheelSpeeds(6.0, 2.0), 10.0, VOLTS, calm(), 10)
     ground = np.array(robot.ground)
-    assert coriolis_factor(BODY, GEOMETRY) > 0.0  # (12) does work on neither, but swaps v and w
+    assert coriolis_factor(BODY, GEOMETRY) > 0.0  # (12) does no work, but exchanges v and w
     assert ground @ inertia @ ground == pytest.approx(before, rel=1e-9)
 
 
-def test_acceleration_beyond_the_grip_slides_at_the_grip():
-    """The best a robot can do is mu g of the weight on its wheels; the counters do not know."""
+def test_acceleration_is_limited_by_grip():
+    """The acceleration is at most mu g; the step counters do not show it."""
     robot = drivetrain(grip=0.1)
     for _ in range(30):
         robot.run(WheelSpeeds(12.0, 12.0), 120.0, VOLTS, calm(), 10)
@@ -330,7 +330,7 @@ def test_acceleration_beyond_the_grip_slides_at_the_grip():
     assert robot.slid[0] > 0.05
 
 
-def test_a_held_wheel_is_what_the_robot_turns_about():
+def test_robot_pivots_about_a_blocked_wheel():
     robot = drivetrain(grip=2.0, blocked=(True, False))
     for _ in range(200):
         robot.run(WheelSpeeds(3.0, 3.0), 10.0, VOLTS, calm(), 10)

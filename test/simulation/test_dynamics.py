@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The Lagrangian dynamics (4)-(15), against mechanics from first principles."""
+"""Lagrangian dynamics (4)-(15), against mechanics from first principles."""
 
 from collections.abc import Callable
 import math
@@ -48,7 +48,7 @@ def random_robot(generator: np.random.Generator) -> tuple[BodyParameters, WheelG
 def energy_of_the_parts(
     coordinates: np.ndarray, rates: np.ndarray, body: BodyParameters, geometry: WheelGeometry
 ) -> float:
-    """Kinetic energy of one body and two wheels, each by itself: nothing of (5) is used."""
+    """Return the kinetic energy of one body and two wheels, without (5)."""
     yaw = coordinates[2]
     speed, turn, spins = np.array(rates[:2]), rates[2], rates[3:]
     ahead = np.array([math.cos(yaw), math.sin(yaw)])
@@ -56,7 +56,7 @@ def energy_of_the_parts(
     centre = speed + turn * body.com_offset * aside
     energy = 0.5 * body.body_mass * centre @ centre + 0.5 * body.body_inertia * turn**2
     for side, spin in zip((-1.0, 1.0), spins, strict=True):
-        # A point b to the side moves along the heading as the robot turns.
+        # A point b to the side moves forward or backward as the robot turns.
         hub = speed - side * geometry.half_separation * turn * ahead
         energy += 0.5 * body.wheel_mass * hub @ hub
         energy += 0.5 * body.wheel_turn_inertia * turn**2 + 0.5 * body.wheel_inertia * spin**2
@@ -80,11 +80,11 @@ def reduced_rate(dynamics: np.ndarray, torque: tuple[float, float] = (0.0, 0.0))
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_inertia_matrix_is_that_of_the_energy_of_the_parts(seed):
+def test_inertia_matrix_follows_from_the_kinetic_energy(seed):
     """E2, (14): entry (2, 2) is m; and the offset terms carry m_c, not m.
 
     The energy is a quadratic form in the rates, so its matrix follows from it without
-    derivatives. Print has 0 at (2, 2), which lets the robot move along y for free.
+    derivatives. The paper prints 0 at (2, 2), which makes motion along y free.
     """
     generator = np.random.default_rng(seed)
     body, geometry = random_robot(generator)
@@ -103,8 +103,8 @@ def test_inertia_matrix_is_that_of_the_energy_of_the_parts(seed):
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_coriolis_matrix_is_what_lagrange_derives_from_the_energy(seed):
-    """E2, (6): d/dt dT/dq' - dT/dq at q'' = 0; the terms stand in the third column."""
+def test_coriolis_matrix_follows_from_the_lagrangian(seed):
+    """E2, (6): d/dt dT/dq' - dT/dq at q'' = 0; the terms are in the third column."""
     generator = np.random.default_rng(seed)
     body, geometry = random_robot(generator)
     coordinates, rates = generator.uniform(-3.0, 3.0, 5), generator.uniform(-3.0, 3.0, 5)
@@ -128,8 +128,8 @@ def test_coriolis_matrix_is_what_lagrange_derives_from_the_energy(seed):
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_null_space_is_one_and_gives_the_rates_of_the_coordinates(seed):
-    """(7), (8), E3. The printed (7) has -d in its third row and then this product is not 0."""
+def test_null_space_solves_the_constraint_and_gives_rates(seed):
+    """(7), (8), E3. With the printed -d in the third row of (7) this product is not 0."""
     generator = np.random.default_rng(seed)
     _, geometry = random_robot(generator)
     yaw = generator.uniform(-3.0, 3.0)
@@ -145,7 +145,7 @@ def test_null_space_is_one_and_gives_the_rates_of_the_coordinates(seed):
     assert np.abs(printed @ basis).max() > 1e-4
 
 
-def test_rates_of_null_space_and_constraint_are_their_derivatives():
+def test_null_space_and_constraint_rates_are_derivatives():
     geometry, small, yaw, turn = WheelGeometry(), 1e-6, 0.7, 2.3
     for matrix, rate in (
         (null_space, null_space_rate(yaw, turn, geometry)),
@@ -172,7 +172,7 @@ def test_reduction_of_the_full_matrices_is_the_closed_form(seed):
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_kernel_solves_the_reduced_equations_and_the_body_form(seed):
+def test_kernel_solves_the_reduced_equations_and_body_form(seed):
     """(10) and, with u1 = tau_R + tau_L and u2 = b (tau_R - tau_L), (15) with E5."""
     generator = np.random.default_rng(seed)
     body, geometry = random_robot(generator)
@@ -194,8 +194,8 @@ def test_kernel_solves_the_reduced_equations_and_the_body_form(seed):
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_kernel_agrees_with_the_unreduced_equations_and_their_multipliers(seed):
-    """(4) knows nothing of (12): this is where the printed factor of (12) fails (E4)."""
+def test_kernel_agrees_with_the_unreduced_equations(seed):
+    """(4) is independent of (12), so the printed factor of (12) fails here (E4)."""
     generator = np.random.default_rng(seed)
     body, geometry = random_robot(generator)
     yaw = generator.uniform(-3.0, 3.0)
@@ -210,8 +210,8 @@ def test_kernel_agrees_with_the_unreduced_equations_and_their_multipliers(seed):
     assert slip == pytest.approx(np.zeros(3), abs=1e-10)
 
 
-def test_multipliers_are_the_forces_that_newton_asks_for():
-    """On a circle at constant speed the wheels hold m v omega to the side, less nothing else."""
+def test_multipliers_are_the_constraint_forces():
+    """On a circle at constant speed the side force of the wheels is m v omega."""
     body, geometry = BodyParameters(), WheelGeometry()
     wheels = WheelSpeeds(9.0, 5.0)
     twist = twist_from_wheels(wheels, geometry)
@@ -225,11 +225,11 @@ def test_multipliers_are_the_forces_that_newton_asks_for():
     assert -multipliers[0] == pytest.approx(body.total_mass * twist.linear * twist.angular)
 
 
-def test_energy_is_constant_without_torque_to_the_order_of_the_integrator():
-    """E4, first half: energy is kept, but the printed factor would keep it as well.
+def test_energy_is_conserved_to_integrator_order():
+    """E4, first half: energy is conserved, with the printed factor as well.
 
-    The matrix of (12) is skew whatever stands before it, so this test cannot tell the factors
-    apart; the one with the unreduced equations does.
+    The matrix of (12) is skew with any factor, so this test does not distinguish the factors; the
+    one with the unreduced equations does.
     """
     body, geometry = BodyParameters(com_offset=0.05), WheelGeometry()
     dynamics = dynamics_vector(body, geometry)
@@ -245,16 +245,16 @@ def test_energy_is_constant_without_torque_to_the_order_of_the_integrator():
     assert math.log2(drift(0.004, dynamics) / drift(0.002, dynamics)) > 3.9
     assert drift(0.001, dynamics) < 1e-8
     assert drift(0.0001, printed) < 1e-7
-    # It does move: all spinning turns into driving, centre of mass first.
+    # All rotation becomes translation, centre of mass first.
     end = runge_kutta(reduced_rate(dynamics), start, 0.001, 2000)
     assert abs(end[0] - end[1]) < 1e-3 * abs(start[0] - start[1])
     assert end.sum() > 0.0
 
 
-def test_free_motion_follows_the_unreduced_equations_and_the_printed_factor_does_not():
-    """E4, second half: R^2/(2 b), because R^2/(2 b^2) leaves the true motion.
+def test_printed_coriolis_factor_deviates_from_free_motion():
+    """E4, second half: R^2/(2 b), because R^2/(2 b^2) deviates from the true motion.
 
-    The oracle is (4) with its multipliers in all five coordinates, integrated on its own.
+    The oracle is (4) with its multipliers in all five coordinates.
     """
     body, geometry = BodyParameters(com_offset=0.05), WheelGeometry()
     start = np.array([20.0, -12.0])
@@ -280,7 +280,7 @@ def test_free_motion_follows_the_unreduced_equations_and_the_printed_factor_does
 
 
 def test_coriolis_factor_has_the_unit_of_an_inertia():
-    """E4 by the unit alone: doubling every length must make any kg m² four times as large."""
+    """E4 by the unit alone: doubling every length multiplies any kg m² by four."""
     body, geometry = BodyParameters(), WheelGeometry()
     doubled = WheelGeometry(2.0 * geometry.wheel_radius, 2.0 * geometry.wheel_separation)
     heavy = BodyParameters(
@@ -294,7 +294,7 @@ def test_coriolis_factor_has_the_unit_of_an_inertia():
 
 
 @pytest.mark.parametrize('seed', range(5))
-def test_energy_in_the_wheels_is_that_of_the_parts(seed):
+def test_wheel_energy_equals_the_energy_of_the_parts(seed):
     """(11) and (14) together."""
     generator = np.random.default_rng(seed)
     body, geometry = random_robot(generator)
@@ -305,7 +305,7 @@ def test_energy_in_the_wheels_is_that_of_the_parts(seed):
     assert kinetic_energy(wheels, body, geometry) == pytest.approx(parts, rel=1e-12)
 
 
-def test_power_of_the_torques_is_the_rate_of_energy():
+def test_torque_power_equals_the_energy_rate():
     body, geometry = BodyParameters(), WheelGeometry()
     generator = np.random.default_rng(7)
     inertia, dynamics = wheel_inertia(body, geometry), dynamics_vector(body, geometry)
@@ -315,5 +315,5 @@ def test_power_of_the_torques_is_the_rate_of_energy():
         assert speeds @ inertia @ rates == pytest.approx(speeds @ torque, abs=1e-12)
 
 
-def test_torques_reach_only_the_wheel_angles():
+def test_torques_act_only_on_the_wheel_angles():
     assert input_matrix().T @ np.arange(5.0) == pytest.approx([3.0, 4.0])

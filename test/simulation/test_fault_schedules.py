@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Faults by name: each live, each scriptable, and schedules that hold what they say."""
+"""Faults as dynamic parameters and in schedules."""
 
 from dataclasses import replace
 import math
@@ -28,26 +28,26 @@ from t3mpc_ros.simulation.world import WORLDS_FOLDER
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / 'docs' / 'faults.md').read_text()
 NO_FAULT = FaultParameters()
-ROWS = {row.name: row for row in FaultParameters.specs()}
+SPECS = {spec.name: spec for spec in FaultParameters.specs()}
 NAMES = [fault.name for fault in FAULTS]
 
 
 def some_value(name: str, generator: np.random.Generator) -> object:
-    """Return a random value that the table allows."""
-    row = ROWS[name]
-    if row.kind is bool:
+    """Return a random valid value of a fault."""
+    spec = SPECS[name]
+    if spec.kind is bool:
         return bool(generator.integers(2))
-    if row.choices:
-        return str(generator.choice(row.choices))
-    return float(generator.uniform(row.low, row.high))
+    if spec.choices:
+        return str(generator.choice(spec.choices))
+    return float(generator.uniform(spec.low, spec.high))
 
 
 def a_fault(name: str) -> object:
-    """Return a value that is a fault."""
-    row = ROWS[name]
-    if row.kind is bool:
+    """Return a value that makes the fault active."""
+    spec = SPECS[name]
+    if spec.kind is bool:
         return True
-    return 'left' if row.choices else 0.5
+    return 'left' if spec.choices else 0.5
 
 
 def write(folder: Path, text: str) -> Path:
@@ -56,25 +56,27 @@ def write(folder: Path, text: str) -> Path:
     return path
 
 
-# --- the table ----------------------------------------------------------------------------------
+# --- parameters ---------------------------------------------------------------------------------
 
 
-def test_faults_are_the_live_rows_with_their_texts_and_only_the_schedule_is_fixed():
-    assert [row.name for row in FaultParameters.specs() if not row.dynamic] == ['schedule']
-    assert [(row.name, row.text) for row in FaultParameters.specs() if row.dynamic] == list(FAULTS)
+def test_faults_are_the_dynamic_parameters():
+    assert [spec.name for spec in FaultParameters.specs() if not spec.dynamic] == ['schedule']
+    assert [(spec.name, spec.text) for spec in FaultParameters.specs() if spec.dynamic] == list(
+        FAULTS
+    )
     assert all('\n' not in fault.text for fault in FAULTS)
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_every_fault_can_be_set_alone_and_is_told_of(name):
+def test_every_fault_can_be_set_alone_and_is_reported(name):
     assert active_faults(NO_FAULT) == ()
     faulty = NO_FAULT.with_values({name: a_fault(name)})
     (text,) = active_faults(faulty)
     assert text.split()[0] == name
-    assert active_faults(faulty.with_values({name: ROWS[name].default})) == ()
+    assert active_faults(faulty.with_values({name: SPECS[name].default})) == ()
 
 
-def test_words_for_faults_carry_value_and_unit_and_no_word_for_the_schedule():
+def test_active_faults_report_value_and_unit():
     parameters = FaultParameters(
         command_delay=0.1, slippery=0.25, gyro_dead=True, wheel_blocked='left', schedule='x'
     )
@@ -98,12 +100,12 @@ def test_every_fault_can_be_scheduled_and_ends(name):
         assert schedule.active_names(elapsed) == (name,)
 
 
-def test_without_an_end_a_fault_stays():
+def test_fault_without_duration_persists():
     schedule = FaultSchedule([FaultEvent(1.0, 'supply_sag', 2.0)])
     assert schedule.at(1e6, NO_FAULT).supply_sag == 2.0
 
 
-def test_the_later_start_wins_while_it_lasts_whatever_the_order_in_the_list():
+def test_latest_start_takes_precedence_in_any_list_order():
     outer = FaultEvent(1.0, 'command_delay', 0.1, 9.0)
     inner = FaultEvent(3.0, 'command_delay', 0.3, 2.0)
     beyond = FaultEvent(8.0, 'command_delay', 0.8, 4.0)
@@ -113,7 +115,7 @@ def test_the_later_start_wins_while_it_lasts_whatever_the_order_in_the_list():
         assert delays == [0, 0.1, 0.1, 0.3, 0.3, 0.1, 0.1, 0.1, 0.8, 0.8, 0.8, 0.8, 0]
 
 
-def test_of_two_that_start_together_the_later_in_the_list_wins():
+def test_simultaneous_events_use_the_later_in_the_list():
     first = FaultEvent(1.0, 'command_delay', 0.1, 4.0)
     second = FaultEvent(1.0, 'command_delay', 0.2, 2.0)
     assert FaultSchedule([first, second]).at(2.0, NO_FAULT).command_delay == 0.2
@@ -121,15 +123,18 @@ def test_of_two_that_start_together_the_later_in_the_list_wins():
     assert FaultSchedule([second, first]).at(2.0, NO_FAULT).command_delay == 0.1
 
 
-def test_events_of_different_faults_do_not_touch_each_other():
+def test_events_of_different_faults_are_independent():
     schedule = FaultSchedule(
         [FaultEvent(0.0, 'gyro_dead', True, 5.0), FaultEvent(1.0, 'command_loss', 0.5, 1.0)]
     )
-    assert schedule.active_names(1.5) == ('command_loss', 'gyro_dead')  # in the table's order
+    assert schedule.active_names(1.5) == (
+        'command_loss',
+        'gyro_dead',
+    )  # in the order of the parameters
     assert active_faults(schedule.at(1.5, NO_FAULT)) == ('command_loss 0.5', 'gyro_dead')
 
 
-def test_live_values_hold_beside_the_schedule_and_are_back_after_it_as_they_are_then():
+def test_schedule_overrides_dynamic_values_while_it_lasts():
     schedule = FaultSchedule([FaultEvent(1.0, 'command_delay', 0.3, 1.0)])
     before = FaultParameters(command_delay=0.1, gyro_dead=True)
     after = FaultParameters(command_delay=0.2)
@@ -139,19 +144,19 @@ def test_live_values_hold_beside_the_schedule_and_are_back_after_it_as_they_are_
     assert schedule.at(2.0, after) == after
 
 
-def test_a_value_that_is_no_fault_hides_a_live_one():
+def test_scheduled_default_hides_a_dynamic_value():
     schedule = FaultSchedule([FaultEvent(1.0, 'wheel_blocked', 'none', 1.0)])
     assert schedule.at(1.5, FaultParameters(wheel_blocked='both')) == NO_FAULT
 
 
-def test_an_empty_schedule_changes_nothing():
+def test_empty_schedule_changes_nothing():
     dynamic = FaultParameters(command_loss=0.5)
     assert load_schedule('').at(3.0, dynamic) == dynamic
     assert load_schedule('').events == ()
 
 
 def naive(events: list[FaultEvent], elapsed: float, dynamic: FaultParameters) -> FaultParameters:
-    """Return the same by the rule as it is told, one fault after the other."""
+    """Return the active faults by a direct evaluation of the rule, fault by fault."""
     values = {}
     for name in NAMES:
         holding = [
@@ -165,7 +170,7 @@ def naive(events: list[FaultEvent], elapsed: float, dynamic: FaultParameters) ->
 
 
 def random_events(generator: np.random.Generator) -> list[FaultEvent]:
-    """Return events on a grid of 1/4 s, so that many start and end together."""
+    """Return events on a grid of 1/4 s, so that many start and end at the same time."""
     events = []
     for _ in range(generator.integers(0, 25)):
         name = str(generator.choice(NAMES[:4] if generator.random() < 0.7 else NAMES))
@@ -176,22 +181,22 @@ def random_events(generator: np.random.Generator) -> list[FaultEvent]:
     return events
 
 
-def test_random_schedules_equal_a_naive_evaluation_asked_in_any_order():
+def test_random_schedules_match_a_naive_evaluation():
     generator = np.random.default_rng(1)
     differ = 0
     for _ in range(40):
         events = random_events(generator)
         schedule = FaultSchedule(events)
-        lives = [NO_FAULT, FaultParameters(command_delay=0.7, gyro_dead=True)]
+        tables = [NO_FAULT, FaultParameters(command_delay=0.7, gyro_dead=True)]
         for elapsed in generator.permutation(np.arange(-4, 120) / 8)[:40].tolist():
-            dynamic = lives[generator.integers(2)]
+            dynamic = tables[generator.integers(2)]
             expected = naive(events, elapsed, dynamic)
             assert schedule.at(elapsed, dynamic) == expected
             differ += expected != dynamic
     assert differ > 300
 
 
-def test_a_schedule_does_not_depend_on_the_step_at_which_it_is_asked():
+def test_schedule_is_independent_of_the_sampling_step():
     generator = np.random.default_rng(2)
     for _ in range(10):
         events = random_events(generator)
@@ -201,8 +206,8 @@ def test_a_schedule_does_not_depend_on_the_step_at_which_it_is_asked():
             assert coarse.at(0.01 * tick, NO_FAULT) == every_ms[tick]
 
 
-def test_sums_of_floats_neither_prolong_nor_shorten_an_event():
-    """0.1 + 0.2 is more than 0.3 to a float, and 3 * 0.1 too: an event held one step more."""
+def test_rounding_does_not_change_event_duration():
+    """The floats 0.1 + 0.2 and 3 * 0.1 are more than 0.3, which extended an event by a step."""
     schedule = FaultSchedule([FaultEvent(0.2, 'gyro_dead', True, 0.1)])
     assert schedule.at(0.2, NO_FAULT).gyro_dead
     assert not schedule.at(0.3, NO_FAULT).gyro_dead
@@ -213,15 +218,15 @@ def test_sums_of_floats_neither_prolong_nor_shorten_an_event():
         assert ticks[0] == at
 
 
-def test_the_answer_is_kept_until_something_changes():
+def test_result_is_cached_until_something_changes():
     schedule = FaultSchedule([FaultEvent(1.0, 'gyro_dead', True, 2.0)])
     first = schedule.at(1.0, NO_FAULT)
     assert schedule.at(2.9, NO_FAULT) is first
-    assert schedule.at(2.9, FaultParameters()) is first  # an equal table is no change
+    assert schedule.at(2.9, FaultParameters()) is first  # an equal table is not a change
 
 
 @pytest.mark.parametrize('elapsed', [math.nan, math.inf])
-def test_an_instant_that_is_none_is_refused(elapsed):
+def test_non_finite_time_is_rejected(elapsed):
     with pytest.raises(ValueError, match='elapsed must be finite'):
         FaultSchedule().at(elapsed, NO_FAULT)
 
@@ -229,7 +234,7 @@ def test_an_instant_that_is_none_is_refused(elapsed):
 # --- files --------------------------------------------------------------------------------------
 
 
-def test_a_list_and_a_mapping_with_events_are_the_same(tmp_path):
+def test_list_and_mapping_with_events_are_equivalent(tmp_path):
     entry = '- {at: 1, fault: slippery, value: 0, for: 2}\n'
     alone = load_schedule(write(tmp_path, entry)).events
     below = load_schedule(str(write(tmp_path, 'events:\n' + entry))).events
@@ -238,7 +243,7 @@ def test_a_list_and_a_mapping_with_events_are_the_same(tmp_path):
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_every_fault_can_be_written_into_a_file(name, tmp_path):
+def test_every_fault_can_be_written_in_a_file(name, tmp_path):
     value = str(a_fault(name)).lower()
     path = write(tmp_path, f'- {{at: 1.5, fault: {name}, value: {value}, for: 2}}\n')
     (event,) = load_schedule(path).events
@@ -250,14 +255,14 @@ BAD = {
     'empty': ('', ['events must be a list', 'None']),
     'a text': ('hello', ['events must be a list', 'hello']),
     'no list below events': ('events: {at: 1}', ['events must be a list', "{'at': 1}"]),
-    'another key': ('events: []\nfaults: []', ['nothing besides events', 'faults']),
+    'another key': ('events: []\nfaults: []', ['the only key must be events', 'faults']),
     'not YAML': (ENTRY + '- {at: 1', ['not YAML', 'line 2']),
     'a tag': ('!!python/object:os.system {}', ['not YAML', 'line 1', 'python/object']),
     'a date that is none': ('- {at: 2026-13-41, fault: x, value: 1}', ['not YAML', 'month']),
     'too deep': ('[' * 5000, ['not YAML', 'recursion']),
     'a forgotten dash': (
         '- at: 1\n  fault: gyro_dead\n  value: true\n  at: 2\n',
-        ['not YAML', 'line 4', 'at stands twice', '"- "'],
+        ['not YAML', 'line 4', 'at is given twice', '"- "'],
     ),
     'an entry that is a text': (ENTRY + '- gyro_dead', ['events[1] must be a mapping', 'gyro']),
     'no value': ('- {at: 1, fault: gyro_dead}', ['events[0].value is missing']),
@@ -308,9 +313,7 @@ BAD = {
 
 
 @pytest.mark.parametrize('text, words', BAD.values(), ids=BAD)
-def test_a_bad_file_is_refused_with_its_name_the_entry_the_bound_and_the_value(
-    text, words, tmp_path
-):
+def test_invalid_file_error_names_file_entry_bound_and_value(text, words, tmp_path):
     path = write(tmp_path, text)
     with pytest.raises(ScheduleError) as caught:
         load_schedule(path)
@@ -322,7 +325,7 @@ def test_a_bad_file_is_refused_with_its_name_the_entry_the_bound_and_the_value(
         assert word in message
 
 
-def test_files_that_cannot_be_read_are_refused_by_name(tmp_path):
+def test_unreadable_files_are_rejected_by_name(tmp_path):
     for path, words in [(tmp_path / 'no.yaml', 'No such file'), (tmp_path, 'directory')]:
         with pytest.raises(ScheduleError, match=rf'{re.escape(str(path))}: cannot be .*{words}'):
             load_schedule(path)
@@ -331,22 +334,22 @@ def test_files_that_cannot_be_read_are_refused_by_name(tmp_path):
         load_schedule(tmp_path / 'no.yaml')
 
 
-def test_a_name_that_is_not_shipped_is_refused_with_the_nearest():
+def test_unknown_schedule_name_suggests_the_nearest():
     with pytest.raises(ScheduleError, match='rough_ride, or a file.*did you mean rough_ride'):
         load_schedule('rough_rid')
 
 
-def test_an_event_checks_itself_however_it_is_made():
+def test_event_constructor_validates_its_values():
     assert FaultEvent(0, 'gyro_dead', True, MIN_DURATION).until == MIN_DURATION
     for values in [(-1.0, 'gyro_dead', True), (0.0, 'no', True), (0.0, 'gyro_dead', 'yes')]:
         with pytest.raises(ScheduleError):
             FaultEvent(*values)
 
 
-# --- what is shipped, and the page --------------------------------------------------------------
+# --- bundled schedule and documentation ---------------------------------------------------------
 
 
-def test_the_shipped_ride_has_every_fault_and_ends_without_one():
+def test_bundled_schedule_covers_every_fault_and_ends_clean():
     schedule = load_schedule('rough_ride')
     assert schedule.name == 'rough_ride'
     assert {event.fault for event in schedule.events} == set(NAMES)
@@ -375,7 +378,7 @@ def test_schedules_are_installed_with_the_package(monkeypatch):
     }
 
 
-def test_the_example_of_the_page_is_a_schedule_and_does_what_its_comments_say(tmp_path):
+def test_documented_example_is_a_valid_schedule(tmp_path):
     (text,) = re.findall(r'```yaml\n(.*?)```', PAGE, re.DOTALL)
     schedule = load_schedule(write(tmp_path, text))
     delays = [schedule.at(time, NO_FAULT).command_delay for time in (4.9, 5.0, 6.0, 7.0, 9.0)]
@@ -386,7 +389,7 @@ def test_the_example_of_the_page_is_a_schedule_and_does_what_its_comments_say(tm
     assert schedule.at(3600.0, NO_FAULT) == FaultParameters(load_change=0.5)
 
 
-def test_the_message_on_the_page_is_the_one_that_comes(tmp_path, monkeypatch):
+def test_documented_error_message_is_current(tmp_path, monkeypatch):
     (text,) = re.findall(r'```text\n(.*?)\n```', PAGE, re.DOTALL)
     (tmp_path / 'faults.yaml').write_text(BAD['too much'][0])
     monkeypatch.chdir(tmp_path)
@@ -395,12 +398,12 @@ def test_the_message_on_the_page_is_the_one_that_comes(tmp_path, monkeypatch):
     assert str(caught.value) == text
 
 
-def test_the_page_lists_every_fault_with_its_bounds_and_text():
+def test_documentation_lists_every_fault():
     lines = []
-    for row in FaultParameters.specs():
-        if row.dynamic:
-            default = f'{row.default:g}' if row.kind is float else str(row.default).lower()
-            first = f'`{row.name}` | {default} {row.unit}'.rstrip()
-            middle = f'{row.bounds()} ' if row.bounds() else ''
-            lines.append(f'| {first} | {middle}| {row.text} |')
+    for spec in FaultParameters.specs():
+        if spec.dynamic:
+            default = f'{spec.default:g}' if spec.kind is float else str(spec.default).lower()
+            first = f'`{spec.name}` | {default} {spec.unit}'.rstrip()
+            middle = f'{spec.bounds()} ' if spec.bounds() else ''
+            lines.append(f'| {first} | {middle}| {spec.text} |')
     assert '\n'.join(lines) + '\n\n' in PAGE

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The inertial sensor, against its data sheet and against theory."""
+"""Simulated IMU, against its data sheet and against theory."""
 
 import math
 
@@ -42,13 +42,13 @@ def settled(angular: float = 0.0, forward: float = 0.0, sideways: float = 0.0) -
 
 
 def rates(imu: SimulatedImu, count: int, dt: float = 0.01) -> np.ndarray:
-    """Return what a standing sensor measures, deg/s."""
+    """Return yaw rates measured at standstill, deg/s."""
     still = settled()
     return np.degrees([imu.measure(still, dt).angular for _ in range(count)])
 
 
 @pytest.mark.parametrize('span', GYRO)
-def test_counts_of_the_gyro_are_those_of_the_data_sheet(span):
+def test_gyro_counts_match_the_data_sheet(span):
     imu = sensor(**IDEAL, gyro_range=span)
     for degrees in (1.0, -10.0, 0.8 * float(span)):
         imu.measure(settled(math.radians(degrees)), 0.01)
@@ -56,7 +56,7 @@ def test_counts_of_the_gyro_are_those_of_the_data_sheet(span):
 
 
 @pytest.mark.parametrize('span', ACCEL)
-def test_counts_of_the_accelerometer_are_those_of_the_data_sheet(span):
+def test_accelerometer_counts_match_the_data_sheet(span):
     imu = sensor(**IDEAL, accel_range=span)
     for share in (0.1, -0.5, 0.9):
         imu.measure(settled(0.0, share * float(span) * GRAVITY, -share * GRAVITY), 0.01)
@@ -65,7 +65,7 @@ def test_counts_of_the_accelerometer_are_those_of_the_data_sheet(span):
 
 
 @pytest.mark.parametrize('span', GYRO)
-def test_beyond_full_scale_the_registers_stay_at_their_ends(span):
+def test_registers_saturate_at_full_scale(span):
     imu = sensor(**IDEAL, gyro_range=span)
     for sign, end in ((1.0, 32767), (-1.0, -32768)):
         for excess in (1.01, 10.0, math.inf):
@@ -76,7 +76,7 @@ def test_beyond_full_scale_the_registers_stay_at_their_ends(span):
             assert sample.forward == pytest.approx(sign * 2.0 * GRAVITY, rel=1e-3)
 
 
-def test_samples_are_the_counts_at_their_nominal_scale():
+def test_samples_are_counts_times_nominal_scale():
     imu, generator = sensor(), np.random.default_rng(2)
     for _ in range(200):
         sample = imu.measure(settled(*generator.normal(0.0, [3.0, 5.0, 5.0])), 0.01)
@@ -88,10 +88,10 @@ def test_samples_are_the_counts_at_their_nominal_scale():
 
 
 def response(parameters: SimulatedImuParameters, frequency: float) -> complex:
-    """Return gain and phase of the low-pass, from its answer to a sine in short steps."""
+    """Return gain and phase of the low-pass, from its response to a sine in short steps."""
     step = 0.002 / frequency
     share, filtered = parameters.share(step), np.zeros((3, 2))
-    # Held in the middle of each step, the staircase has no lag of its own.
+    # Sampled in the middle of each step, the staircase has no lag.
     times = step * np.arange(5500)
     out = np.empty(times.size)
     for index, time in enumerate(times):
@@ -100,13 +100,13 @@ def response(parameters: SimulatedImuParameters, frequency: float) -> complex:
         out[index] = filtered[0, 1]
         assert filtered[1, 1] == -filtered[0, 1]
         assert filtered[2, 1] == 2.0 * filtered[0, 1]
-    tail = slice(5000, 5500)  # one whole turn, long after the start
+    tail = slice(5000, 5500)  # one period, long after the start
     wave = np.exp(-1j * math.tau * frequency * (times[tail] + step))
     return complex(2j * np.mean(out[tail] * wave))
 
 
 @pytest.mark.parametrize('setting', REGISTER_MAP)
-def test_low_pass_loses_three_decibels_where_the_register_map_says(setting):
+def test_low_pass_cutoff_matches_the_register_map(setting):
     parameters, frequency = SimulatedImuParameters(low_pass=setting), REGISTER_MAP[setting][0]
     gain = response(parameters, frequency)
     assert abs(gain) == pytest.approx(math.sqrt(0.5), rel=1e-3)
@@ -117,7 +117,7 @@ def test_low_pass_loses_three_decibels_where_the_register_map_says(setting):
 
 
 @pytest.mark.parametrize('setting', REGISTER_MAP)
-def test_low_pass_delays_as_long_as_its_settings_say(setting):
+def test_low_pass_delay_matches_its_parameters(setting):
     """The delay of slow signals is the area above the step response."""
     parameters = SimulatedImuParameters(low_pass=setting)
     step, filtered = parameters.delay / 200.0, np.zeros((3, 2))
@@ -129,17 +129,17 @@ def test_low_pass_delays_as_long_as_its_settings_say(setting):
     assert area == pytest.approx(parameters.delay, rel=1e-4)
 
 
-def test_delay_is_the_data_sheets_at_the_default_and_within_a_millisecond_above():
+def test_low_pass_delay_is_close_to_the_data_sheet():
     assert SimulatedImuParameters().delay == pytest.approx(REGISTER_MAP['3'][1], abs=0.1e-3)
     for setting in '0123':
         assert SimulatedImuParameters(low_pass=setting).delay == pytest.approx(
             REGISTER_MAP[setting][1], abs=0.9e-3
         )
-    # One pole alone would already be slower than the sheet at 5 Hz: no such filter has both.
+    # Even one pole is slower than the data sheet at 5 Hz: no such filter matches both figures.
     assert 1.0 / (math.tau * 5.0) > REGISTER_MAP['6'][1]
 
 
-def test_low_pass_does_not_depend_on_the_step():
+def test_low_pass_is_independent_of_the_step():
     parameters, ends = SimulatedImuParameters(), []
     for count in (1, 8, 80):
         filtered = np.array([[0.3, -0.2], [1.0, 2.0], [0.0, 0.0]])
@@ -151,21 +151,21 @@ def test_low_pass_does_not_depend_on_the_step():
     assert ends[2] == pytest.approx(ends[0], abs=1e-12)
 
 
-def test_low_pass_survives_steps_that_are_too_long_to_leave_anything():
+def test_low_pass_handles_very_long_steps():
     filtered, share = np.ones((3, 2)), SimulatedImuParameters(low_pass='0').share(1e3)
     assert share == 1.0
     low_pass(filtered, 5.0, 6.0, 7.0, share)
     assert filtered == pytest.approx(settled(5.0, 6.0, 7.0))
 
 
-def test_noise_at_the_100_hz_low_pass_is_that_of_the_data_sheet():
-    """0.05 deg/s rms there; the density of the same sheet gives 0.0547 behind two poles."""
+def test_gyro_noise_at_100_hz_matches_the_data_sheet():
+    """The data sheet gives 0.05 deg/s rms; its density gives 0.0547 behind two poles."""
     noise = np.std(rates(sensor(gyro_drift=0.0, low_pass='2', gyro_range='250'), 20000))
     assert noise == pytest.approx(0.05, rel=0.15)
     assert noise == pytest.approx(0.005 * math.sqrt(math.tau * 98.0 / 0.643594 / 8.0), rel=0.02)
 
 
-def test_noise_of_the_accelerometer_follows_its_density():
+def test_accelerometer_noise_follows_its_density():
     imu, still = sensor(), settled()
     found = np.array([imu.measure(still, 0.01)[1:] for _ in range(20000)])
     expected = 400e-6 * GRAVITY * math.sqrt(SimulatedImuParameters().noise_bandwidth)
@@ -182,16 +182,16 @@ def allan(samples: np.ndarray, size: int) -> float:
 
 @pytest.mark.parametrize('setting', ['0', '3', '6'])
 @pytest.mark.parametrize('dt', [0.01, 0.002])
-def test_allan_deviation_of_the_noise_is_that_of_its_density(setting, dt):
-    """N/sqrt(2 tau) and what sampling folds in, at any low-pass and rate.
+def test_allan_deviation_matches_the_noise_density(setting, dt):
+    """N/sqrt(2 tau) plus aliasing, at any low-pass and rate.
 
-    White samples of the right spread would average out far too fast at 5 Hz, where neighbours
+    White samples of equal variance would average out too fast at 5 Hz, where consecutive samples
     are nearly equal.
     """
     parameters = SimulatedImuParameters(gyro_drift=0.0, low_pass=setting, gyro_range='250')
     imu, size = SimulatedImu(parameters, np.random.default_rng(1)), round(1.0 / dt)
     found = allan(rates(imu, 400 * size, dt), size)
-    # Sampling folds in what lies beyond half the rate: the sum over the autocorrelation.
+    # Aliasing of the band above half the rate: the sum over the autocorrelation.
     lags = parameters.pole * dt * np.arange(1, 200)
     folded = (
         2.0 * dt * parameters.noise_bandwidth * (1.0 + 2.0 * np.sum((1.0 + lags) * np.exp(-lags)))
@@ -200,8 +200,8 @@ def test_allan_deviation_of_the_noise_is_that_of_its_density(setting, dt):
     assert found == pytest.approx(0.005 * math.sqrt(0.5 * folded), rel=0.15)
 
 
-def test_allan_deviation_rises_again_with_the_drift():
-    """K sqrt(tau/3) for a walk of K, far above what the noise leaves."""
+def test_allan_deviation_rises_with_bias_drift():
+    """K sqrt(tau/3) for a random walk K, far above the remaining noise."""
     imu = sensor(seed=3, gyro_drift=0.05, gyro_offset=0.0)
     found = rates(imu, 100000)
     expected = 0.05 * math.sqrt(10.0 / 3.0)
@@ -209,7 +209,7 @@ def test_allan_deviation_rises_again_with_the_drift():
     assert allan(found, 100) < allan(found, 1000)
 
 
-def test_bias_is_what_the_samples_have_in_excess():
+def test_bias_is_the_mean_excess_of_the_samples():
     imu = sensor(seed=4, **{**IDEAL, 'gyro_offset': 20.0, 'gyro_drift': 0.5})
     for _ in range(50):
         sample = imu.measure(settled(1.0), 0.01)
@@ -221,7 +221,7 @@ def test_bias_is_what_the_samples_have_in_excess():
     assert jumped - imu.bias == pytest.approx(0.2)
 
 
-def test_each_power_up_has_another_offset_within_the_data_sheets():
+def test_each_power_up_draws_an_offset_within_the_data_sheet():
     imu, found = sensor(seed=5), []
     for _ in range(500):
         found.append(math.degrees(imu.bias))
@@ -233,7 +233,7 @@ def test_each_power_up_has_another_offset_within_the_data_sheets():
     assert np.std(found) == pytest.approx(20.0 / math.sqrt(3.0), rel=0.1)
 
 
-def test_scale_and_acceleration_offsets_belong_to_the_sensor_and_not_to_the_power_up():
+def test_scale_and_acceleration_offsets_persist_over_power_up():
     errors = []
     for seed in range(60):
         imu = sensor(seed=seed, **{**IDEAL, 'gyro_scale_error': 0.03, 'accel_offset': 50.0})
@@ -247,7 +247,7 @@ def test_scale_and_acceleration_offsets_belong_to_the_sensor_and_not_to_the_powe
     )
 
 
-def test_equal_seeds_measure_equally_and_settings_do_not_shift_the_numbers():
+def test_imu_parameters_do_not_shift_random_numbers():
     first, second = sensor(seed=6), sensor(seed=6)
     other = sensor(seed=6, gyro_noise=0.05, gyro_offset=0.0, accel_noise=0.0, accel_offset=1.0)
     still = settled(0.5, 1.0, -1.0)
@@ -265,12 +265,12 @@ def test_equal_seeds_measure_equally_and_settings_do_not_shift_the_numbers():
 
 
 @pytest.mark.parametrize('dt', [-0.01, math.nan, math.inf])
-def test_time_that_cannot_pass_is_refused(dt):
+def test_invalid_time_step_is_rejected(dt):
     with pytest.raises(ValueError, match='dt must be finite'):
         sensor().measure(settled(), dt)
 
 
-def test_no_time_at_all_repeats_the_sample():
+def test_zero_time_step_repeats_the_sample():
     imu = sensor()
     first = imu.measure(settled(), 0.01)
     assert imu.measure(settled(), 0.0) == first

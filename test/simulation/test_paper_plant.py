@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""From a command to motion: the drives."""
+"""The paper's plant: velocity and torque drive."""
 
 import math
 
@@ -30,7 +30,7 @@ IDEAL: dict[str, object] = {
     'wheel.max_acceleration': 1e5,
     'wheel.stop_deceleration': 1e5,
 }
-"""Nothing but the lag: every limit out of the way."""
+"""Lag alone: every limit is far away."""
 
 LAG = 0.02
 
@@ -40,11 +40,11 @@ def robot(**changes: object) -> PaperRobot:
     return PaperRobot(PaperRobotParameters.from_dict(IDEAL | dotted))
 
 
-def response(machine: PaperRobot, wheels: WheelSpeeds, count: int) -> np.ndarray:
-    return np.array([machine.step(wheels).true_wheels for _ in range(count)])
+def response(simulated: PaperRobot, wheels: WheelSpeeds, count: int) -> np.ndarray:
+    return np.array([simulated.step(wheels).true_wheels for _ in range(count)])
 
 
-def test_approach_moves_both_wheels_by_one_factor_and_never_past_the_target():
+def test_ramp_uses_one_factor_and_never_overshoots():
     generator = np.random.default_rng(1)
     for _ in range(200):
         right, left, target_right, target_left = generator.uniform(-10.0, 10.0, 4)
@@ -58,7 +58,7 @@ def test_approach_moves_both_wheels_by_one_factor_and_never_past_the_target():
 
 
 @pytest.mark.parametrize('length', [0, 1, 2, 10])
-def test_a_command_comes_out_of_the_line_exactly_so_many_steps_later(length):
+def test_delay_line_delays_by_exactly_its_length(length):
     commands, cursor = np.zeros((length, 2)), np.zeros(1, dtype=np.int64)
     out = [delay_command(float(n), -float(n), commands, cursor) for n in range(1, 40)]
     expected = [0] * length + list(range(1, 40 - length))
@@ -66,8 +66,8 @@ def test_a_command_comes_out_of_the_line_exactly_so_many_steps_later(length):
     assert [-pair[1] for pair in out] == expected
 
 
-def test_the_nominal_robot_follows_a_step_as_an_exact_first_order_lag():
-    # Straight on, so that the offset of the centre of mass does not show.
+def test_nominal_step_response_is_a_first_order_lag():
+    # Straight motion, in which the offset of the centre of mass has no effect.
     times = 0.01 * np.arange(1, 16)
     wheels = response(robot(), WheelSpeeds(10.0, 10.0), 15)
     expected = 10.0 * (1.0 - np.exp(-times / LAG))
@@ -75,7 +75,7 @@ def test_the_nominal_robot_follows_a_step_as_an_exact_first_order_lag():
     assert wheels[:, 1] == pytest.approx(expected, abs=1e-6)
 
 
-def test_the_step_response_converges_with_order_four():
+def test_step_response_converges_with_order_four():
     def error(substep: float) -> float:
         wheels = response(robot(substep=substep), WheelSpeeds(10.0, 10.0), 5)
         return float(np.abs(wheels[-1, 0] - 10.0 * (1.0 - math.exp(-0.05 / LAG))))
@@ -83,7 +83,7 @@ def test_the_step_response_converges_with_order_four():
     assert math.log2(error(0.005) / error(0.0025)) == pytest.approx(4.0, abs=0.4)
 
 
-def test_in_turns_the_lag_is_exact_without_offset_and_the_offset_shows_with_it():
+def test_turning_lag_is_exact_only_without_com_offset():
     times = 0.01 * np.arange(1, 16)
     shape = 1.0 - np.exp(-times / LAG)
     centred = response(robot(body__com_offset=0.0), WheelSpeeds(10.0, -4.0), 15)
@@ -92,14 +92,14 @@ def test_in_turns_the_lag_is_exact_without_offset_and_the_offset_shows_with_it()
     assert np.abs(offset - centred).max() > 0.05
 
 
-def test_nothing_moves_before_the_dead_time_is_over():
+def test_nothing_moves_before_the_dead_time():
     delayed = response(robot(drive__dead_time=0.03), WheelSpeeds(10.0, 10.0), 10)
     prompt = response(robot(), WheelSpeeds(10.0, 10.0), 7)
     assert not delayed[:3].any()
     assert delayed[3:] == pytest.approx(prompt, abs=1e-12)
 
 
-def test_under_the_acceleration_limit_the_wheels_follow_the_ramp_of_a_lag():
+def test_limited_acceleration_gives_a_lagged_ramp():
     rate = 20.0
     changes = {
         'wheel__max_acceleration': rate,
@@ -113,7 +113,7 @@ def test_under_the_acceleration_limit_the_wheels_follow_the_ramp_of_a_lag():
     assert np.diff(wheels[:, 0]).max() <= rate * 0.01 + 1e-9
 
 
-def test_the_drive_limits_acceleration_by_itself_in_both_wheels_by_one_factor():
+def test_drive_limits_acceleration_with_one_factor():
     parameters = PaperRobotParameters.from_dict(
         IDEAL
         | {'drive.acceleration': 50.0, 'wheel.max_acceleration': 30.0}
@@ -136,26 +136,26 @@ def test_the_drive_limits_acceleration_by_itself_in_both_wheels_by_one_factor():
         robot(drive__acceleration=50.0)
 
 
-def test_a_heavier_load_makes_the_same_drive_slower_by_the_ratio_of_inertias():
-    machine = robot()
-    parameters = machine.parameters
-    response(machine, WheelSpeeds(0.0, 0.0), 3)
-    machine.configure(parameters.with_values({'mass_factor': 3.0}))
-    wheels = response(machine, WheelSpeeds(10.0, 10.0), 15)
+def test_heavier_load_slows_the_lag_by_the_inertia_ratio():
+    simulated = robot()
+    parameters = simulated.parameters
+    response(simulated, WheelSpeeds(0.0, 0.0), 3)
+    simulated.configure(parameters.with_values({'mass_factor': 3.0}))
+    wheels = response(simulated, WheelSpeeds(10.0, 10.0), 15)
     nominal = wheel_inertia(parameters.body, parameters.geometry).sum(axis=0)[0]
-    true = wheel_inertia(machine.parameters.true_body, parameters.geometry).sum(axis=0)[0]
+    true = wheel_inertia(simulated.parameters.true_body, parameters.geometry).sum(axis=0)[0]
     assert true > 2.0 * nominal
     times = 0.01 * np.arange(1, 16)
     expected = 10.0 * (1.0 - np.exp(-times * nominal / true / LAG))
     assert wheels[:, 0] == pytest.approx(expected, abs=1e-6)
-    # And back again in mid-run.
-    machine.configure(parameters)
+    # And back during the run.
+    simulated.configure(parameters)
     gap = 10.0 - wheels[-1, 0]
-    lighter = response(machine, WheelSpeeds(10.0, 10.0), 5)
+    lighter = response(simulated, WheelSpeeds(10.0, 10.0), 5)
     assert 10.0 - lighter[:, 0] == pytest.approx(gap * np.exp(-times[:5] / LAG), rel=1e-5)
 
 
-def test_inertia_and_friction_factors_change_the_true_robot_only():
+def test_inertia_and_friction_factors_change_the_true_plant_only():
     parameters = PaperRobotParameters().with_values({'inertia_factor': 2.0, 'mass_factor': 1.5})
     assert parameters.true_body.body_inertia == pytest.approx(2.0 * parameters.body.body_inertia)
     assert parameters.true_body.body_mass == pytest.approx(1.5 * parameters.body.body_mass)
@@ -166,30 +166,30 @@ def test_inertia_and_friction_factors_change_the_true_robot_only():
     assert 5.0 - slow == pytest.approx(5.0 * (5.0 - fast), rel=1e-3)
 
 
-def test_friction_leaves_the_offset_that_the_servo_needs_to_hold_it():
-    machine = robot(friction__viscous=2e-4, friction__coulomb=0.004)
-    parameters = machine.parameters
-    speed = response(machine, WheelSpeeds(8.0, 8.0), 100)[-1, 0]
+def test_friction_causes_the_expected_steady_state_error():
+    simulated = robot(friction__viscous=2e-4, friction__coulomb=0.004)
+    parameters = simulated.parameters
+    speed = response(simulated, WheelSpeeds(8.0, 8.0), 100)[-1, 0]
     inertia = wheel_inertia(parameters.body, parameters.geometry).sum(axis=0)[0]
     assert inertia * (8.0 - speed) / LAG == pytest.approx(0.004 + 2e-4 * speed, rel=1e-6)
 
 
-def test_torque_is_limited_wheel_by_wheel():
-    machine = robot(drive__torque_limit=0.01)
-    parameters = machine.parameters
-    wheels = response(machine, WheelSpeeds(10.0, 10.0), 20)
+def test_torque_is_limited_per_wheel():
+    simulated = robot(drive__torque_limit=0.01)
+    parameters = simulated.parameters
+    wheels = response(simulated, WheelSpeeds(10.0, 10.0), 20)
     inertia = wheel_inertia(parameters.body, parameters.geometry).sum(axis=0)[0]
-    # 0.01 N m is far below what the servo asks for at first: constant acceleration.
+    # 0.01 N m is far below the initial servo torque: constant acceleration.
     times = 0.01 * np.arange(1, 11)
     assert wheels[:10, 0] == pytest.approx(0.01 / inertia * times, rel=1e-9)
 
 
-def test_the_torque_drive_is_the_dynamics_and_nothing_else():
+def test_torque_drive_matches_an_independent_solver():
     """(3) and (10) with friction and disturbance, against an independent solver."""
     changes = {'drive__kind': 'torque', 'friction__viscous': 2e-4, 'friction__coulomb': 0.004}
     changes |= {'disturbance__bound': 0.003, 'disturbance__walk_share': 0.0}
-    machine = robot(**changes)
-    parameters = machine.parameters
+    simulated = robot(**changes)
+    parameters = simulated.parameters
     geometry, friction = parameters.geometry, parameters.friction
     seed = np.random.SeedSequence(parameters.seed).spawn(2)[0]
     disturbance = Disturbance(parameters.disturbance, np.random.default_rng(seed))
@@ -209,7 +209,7 @@ def test_the_torque_drive_is_the_dynamics_and_nothing_else():
     state, end = np.zeros(5), None
     for tick in range(150):
         torque = np.array([0.008 + 0.006 * math.sin(0.07 * tick), 0.008 * math.cos(0.03 * tick)])
-        end = machine.step_torque(*torque)
+        end = simulated.step_torque(*torque)
         state = solve_ivp(rate, (0.01 * tick, 0.01 * (tick + 1)), state, rtol=1e-10, atol=1e-12).y[
             :, -1
         ]
@@ -219,21 +219,21 @@ def test_the_torque_drive_is_the_dynamics_and_nothing_else():
     assert turns == pytest.approx(0.0, abs=1e-8)
 
 
-def test_each_kind_of_drive_takes_its_own_commands_only():
+def test_each_drive_kind_accepts_only_its_own_commands():
     with pytest.raises(ValueError, match='torque'):
         robot().step_torque(0.0, 0.0)
     with pytest.raises(ValueError, match='velocity'):
         robot(drive__kind='torque').step(WheelSpeeds(0.0, 0.0))
 
 
-def test_motors_cannot_exceed_their_ceiling():
-    machine = robot(drive__kind='torque', drive__speed_ceiling=12.0)
+def test_wheel_speed_never_exceeds_the_ceiling():
+    simulated = robot(drive__kind='torque', drive__speed_ceiling=12.0)
     for _ in range(200):
-        state = machine.step_torque(0.4, 0.4)
+        state = simulated.step_torque(0.4, 0.4)
     assert state.true_wheels == (12.0, 12.0)
 
 
-def test_a_substep_too_long_for_the_body_is_refused_with_the_length_that_would_do():
+def test_unstable_substep_is_rejected_with_the_stable_limit():
     with pytest.raises(ParameterError, match='substep must be at most'):
         PaperRobotParameters.from_dict({'friction.coulomb': 1.0, 'friction.coulomb_width': 0.01})
     with pytest.raises(ParameterError, match='substep'):

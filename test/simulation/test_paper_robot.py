@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated robot as a whole: time, stops, determinism, convergence."""
+"""Simulated robot with the paper's plant: time, stops, determinism, convergence."""
 
 import math
 
@@ -50,132 +50,132 @@ def wander(tick: int) -> WheelSpeeds:
 # -- stops ----------------------------------------------------------------------------------------
 
 
-def end_by_silence(machine: PaperRobot, now_ns: int, generator: np.random.Generator) -> None:
+def end_by_silence(simulated: PaperRobot, now_ns: int, generator: np.random.Generator) -> None:
     pass
 
 
-def end_by_estop(machine: PaperRobot, now_ns: int, generator: np.random.Generator) -> None:
-    machine.latch_estop('test', now_ns + int(generator.uniform(0.0, 250.0) * MS))
+def end_by_estop(simulated: PaperRobot, now_ns: int, generator: np.random.Generator) -> None:
+    simulated.latch_estop('test', now_ns + int(generator.uniform(0.0, 250.0) * MS))
 
 
-def end_by_stop(machine: PaperRobot, now_ns: int, generator: np.random.Generator) -> None:
-    machine.stop('test', now_ns)
+def end_by_stop(simulated: PaperRobot, now_ns: int, generator: np.random.Generator) -> None:
+    simulated.stop('test', now_ns)
 
 
-def end_by_zero(machine: PaperRobot, now_ns: int, generator: np.random.Generator) -> None:
-    machine.apply(command(0.0, 0.0, now_ns), now_ns)
+def end_by_zero(simulated: PaperRobot, now_ns: int, generator: np.random.Generator) -> None:
+    simulated.apply(command(0.0, 0.0, now_ns), now_ns)
 
 
-def end_by_nonsense(machine: PaperRobot, now_ns: int, generator: np.random.Generator) -> None:
-    machine.apply(command(math.nan, 1.0, now_ns), now_ns)
+def end_by_nonsense(simulated: PaperRobot, now_ns: int, generator: np.random.Generator) -> None:
+    simulated.apply(command(math.nan, 1.0, now_ns), now_ns)
 
 
 @pytest.mark.parametrize(
     'end', [end_by_silence, end_by_estop, end_by_stop, end_by_zero, end_by_nonsense]
 )
-def test_from_ten_radians_a_second_the_wheels_rest_half_a_second_after_the_last_command(end):
+def test_wheels_stop_within_half_a_second_from_10_rad_s(end):
     generator = np.random.default_rng(11)
     for seed in range(15):
-        machine = robot(seed=seed)
+        simulated = robot(seed=seed)
         now = 0
-        machine.advance(now)
+        simulated.advance(now)
         for _ in range(int(generator.integers(1, 8))):
-            # Anything up to full speed and full reversal, at any instant.
+            # Any speed up to the maximum and any reversal, at any instant.
             wheels = generator.uniform(-10.0, 10.0, 2)
             if generator.uniform() < 0.5:
                 wheels = 10.0 * np.sign(wheels)
-            machine.apply(command(*wheels, now), now)
+            simulated.apply(command(*wheels, now), now)
             last = now
             now += int(generator.uniform(0.0, 240.0) * MS)
-        end(machine, last, generator)
-        after = machine.advance(last + 500 * MS)
+        end(simulated, last, generator)
+        after = simulated.advance(last + 500 * MS)
         assert after.stamp_ns > last + 485 * MS
         assert not after.status.moving, (seed, after)
         assert max(map(abs, after.true_wheels)) < 0.1
         assert after.commanded == (0.0, 0.0)
 
 
-def test_silence_stops_the_robot_and_says_so():
-    machine = robot()
-    machine.apply(command(10.0, 10.0, 0), 0)
-    before = machine.advance(250 * MS)
+def test_command_timeout_stops_the_robot_with_a_reason():
+    simulated = robot()
+    simulated.apply(command(10.0, 10.0, 0), 0)
+    before = simulated.advance(250 * MS)
     assert before.true_wheels.right > 5.0
     assert before.reason == ''
-    after = machine.advance(260 * MS)
+    after = simulated.advance(260 * MS)
     assert after.status.timed_out
     assert 'no command for 0.25 s' in after.reason
-    assert machine.advance(300 * MS).true_wheels.right < before.true_wheels.right
+    assert simulated.advance(300 * MS).true_wheels.right < before.true_wheels.right
 
 
-def test_an_emergency_stop_holds_against_commands_until_it_is_released():
-    machine = robot()
+def test_emergency_stop_overrides_commands_until_release():
+    simulated = robot()
     now = 0
     for _ in range(40):
-        machine.apply(command(10.0, 10.0, now), now)
+        simulated.apply(command(10.0, 10.0, now), now)
         now += PERIOD
-        machine.advance(now)
-    machine.latch_estop('button', now)
+        simulated.advance(now)
+    simulated.latch_estop('button', now)
     for _ in range(100):
-        assert 'button' in machine.apply(command(10.0, 10.0, now), now)
+        assert 'button' in simulated.apply(command(10.0, 10.0, now), now)
         now += PERIOD
-        state = machine.advance(now)
+        state = simulated.advance(now)
     assert state.status.estop
     assert not state.status.enabled
     assert not state.status.moving
     assert 'button' in state.reason
-    assert machine.release_estop(now) == ''
-    assert machine.release_estop(now) != ''
+    assert simulated.release_estop(now) == ''
+    assert simulated.release_estop(now) != ''
     for _ in range(30):
         now += PERIOD
-        state = machine.advance(now)
+        state = simulated.advance(now)
     assert not state.status.moving
-    assert machine.apply(command(10.0, 10.0, now), now) == ''
-    assert machine.advance(now + 200 * MS).status.moving
+    assert simulated.apply(command(10.0, 10.0, now), now) == ''
+    assert simulated.advance(now + 200 * MS).status.moving
 
 
 @pytest.mark.parametrize('bad', [math.nan, math.inf, -math.inf])
-def test_a_command_that_is_not_finite_never_moves_the_robot(bad):
-    machine = robot(disturbance__bound=0.0)
+def test_non_finite_command_never_moves_the_robot(bad):
+    simulated = robot(disturbance__bound=0.0)
     for now in range(0, 500 * MS, PERIOD):
-        assert 'not finite' in machine.apply(command(bad, 5.0, now), now)
-        assert 'not finite' in machine.apply(command(5.0, bad, now), now)
-        state = machine.advance(now + PERIOD)
+        assert 'not finite' in simulated.apply(command(bad, 5.0, now), now)
+        assert 'not finite' in simulated.apply(command(5.0, bad, now), now)
+        state = simulated.advance(now + PERIOD)
     assert state.truth.pose == (0.0, 0.0, 0.0)
     assert state.true_wheels == (0.0, 0.0)
     assert 'not finite' in state.reason
 
 
 @pytest.mark.parametrize('bad', [math.nan, math.inf])
-def test_a_torque_that_is_not_finite_brakes(bad):
-    machine = robot(drive__kind='torque')
+def test_non_finite_torque_brakes(bad):
+    simulated = robot(drive__kind='torque')
     for _ in range(100):
-        state = machine.step_torque(0.02, 0.02)
+        state = simulated.step_torque(0.02, 0.02)
     assert state.true_wheels.right > 5.0
     for _ in range(100):
-        state = machine.step_torque(bad, 0.02)
+        state = simulated.step_torque(bad, 0.02)
     assert not state.status.moving
     assert 'not finite' in state.reason
-    machine.latch_estop('button', state.stamp_ns)
+    simulated.latch_estop('button', state.stamp_ns)
     for _ in range(20):
-        state = machine.step_torque(0.02, 0.02)
+        state = simulated.step_torque(0.02, 0.02)
     assert not state.status.moving
     assert state.status.estop
 
 
-def test_a_torque_that_nobody_renews_is_let_go_by_the_watchdog():
-    machine = robot(drive__kind='torque')
-    machine.step_torque(0.02, 0.02)
-    assert machine.advance(250 * MS).status.moving
-    after = machine.advance(600 * MS)
+def test_torque_command_times_out():
+    simulated = robot(drive__kind='torque')
+    simulated.step_torque(0.02, 0.02)
+    assert simulated.advance(250 * MS).status.moving
+    after = simulated.advance(600 * MS)
     assert after.status.timed_out
     assert not after.status.moving
 
 
-def test_no_finite_command_makes_a_state_that_is_not_finite():
+def test_finite_commands_give_finite_states():
     generator = np.random.default_rng(12)
     extremes = [0.0, 1e-308, 1.0, 1e3, 1e150, 1.7e308]
     for kind in ('velocity', 'torque'):
-        machine = robot(
+        simulated = robot(
             drive__kind=kind,
             drive__torque_limit=100.0,
             wheel__max_velocity=200.0,
@@ -185,52 +185,52 @@ def test_no_finite_command_makes_a_state_that_is_not_finite():
             friction__coulomb=0.0,
             body__com_offset=0.1,
         )
-        step = machine.step_torque if kind == 'torque' else None
+        step = simulated.step_torque if kind == 'torque' else None
         for _ in range(1000):
             pair = generator.choice(extremes, 2) * generator.choice([-1.0, 1.0], 2)
-            state = step(*pair) if step else machine.step(WheelSpeeds(*pair))
+            state = step(*pair) if step else simulated.step(WheelSpeeds(*pair))
             assert np.all(np.isfinite(numbers(state)))
-            assert max(map(abs, state.true_wheels)) <= machine.parameters.drive.speed_ceiling
+            assert max(map(abs, state.true_wheels)) <= simulated.parameters.drive.speed_ceiling
 
 
 # -- time -----------------------------------------------------------------------------------------
 
 
-def test_states_lie_on_the_grid_and_are_never_later_than_asked():
-    machine = robot()
+def test_states_lie_on_the_time_grid_and_not_in_the_future():
+    simulated = robot()
     start = 1_700_000_000_123_456_789
-    assert machine.advance(start).stamp_ns == start
-    assert machine.advance(start + PERIOD - 1).stamp_ns == start
-    assert machine.advance(start + PERIOD).stamp_ns == start + PERIOD
-    assert machine.advance(start + 57 * MS).stamp_ns == start + 50 * MS
-    assert machine.advance(start + 57 * MS).odometry.stamp_ns == start + 50 * MS
+    assert simulated.advance(start).stamp_ns == start
+    assert simulated.advance(start + PERIOD - 1).stamp_ns == start
+    assert simulated.advance(start + PERIOD).stamp_ns == start + PERIOD
+    assert simulated.advance(start + 57 * MS).stamp_ns == start + 50 * MS
+    assert simulated.advance(start + 57 * MS).odometry.stamp_ns == start + 50 * MS
 
 
 @pytest.mark.parametrize('rate', [100.0, 60.0, 128.0, 333.0])
-def test_asked_along_any_grid_of_its_rate_each_state_comes_once(rate):
-    """A grid that rounds its period to whole nanoseconds falls behind one that rounds stamps.
+def test_each_state_is_returned_once_on_a_grid_of_its_rate(rate):
+    """A grid that rounds its period to whole nanoseconds lags one that rounds its stamps.
 
-    At 60 Hz the robot was then one sample behind from the second one on.
+    At 60 Hz the robot was one sample late from the second one on.
     """
-    machine, pace = robot(rate=rate), SampleScheduler(rate)
+    simulated, pace = robot(rate=rate), SampleScheduler(rate)
     start = 1_700_000_000_000_000_000
     stamps = []
     for now in range(start, start + 2_000 * MS, 7 * MS):
-        stamps += [(machine.advance(due).stamp_ns, due) for due in pace.due(now)]
+        stamps += [(simulated.advance(due).stamp_ns, due) for due in pace.due(now)]
     assert all(stamp == due for stamp, due in stamps)
     assert len(stamps) > 1.9 * rate
 
 
-def test_states_asked_for_late_are_still_there_one_by_one():
-    """A command that arrives before a late timer moves the robot on; no sample is lost by it.
+def test_late_requests_return_every_state_in_turn():
+    """A command that arrives before a late timer advances the robot without losing a sample.
 
-    At first the late questions were taken for a clock that had gone back, and stopped the robot.
+    The late requests were once treated as a backward time jump, which stopped the robot.
     """
-    machine, prompt = robot(), robot()
-    machine.advance(0)
+    simulated, prompt = robot(), robot()
+    simulated.advance(0)
     prompt.advance(0)
-    machine.apply(command(5.0, 4.0, 35 * MS), 35 * MS)
-    late = [machine.advance(tick * PERIOD) for tick in range(1, 6)]
+    simulated.apply(command(5.0, 4.0, 35 * MS), 35 * MS)
+    late = [simulated.advance(tick * PERIOD) for tick in range(1, 6)]
     early = [prompt.advance(tick * PERIOD) for tick in range(1, 4)]
     prompt.apply(command(5.0, 4.0, 35 * MS), 35 * MS)
     early += [prompt.advance(tick * PERIOD) for tick in range(4, 6)]
@@ -238,75 +238,75 @@ def test_states_asked_for_late_are_still_there_one_by_one():
     assert list(map(numbers, late)) == list(map(numbers, early))
 
 
-def test_a_command_acts_from_the_integration_step_in_which_it_arrives():
+def test_command_acts_from_its_arrival_step():
     moved = []
     for arrival_us in (0, 400, 3000, 6500):
-        machine = robot(drive__dead_time=0.0, disturbance__bound=0.0)
-        machine.advance(0)
+        simulated = robot(drive__dead_time=0.0, disturbance__bound=0.0)
+        simulated.advance(0)
         now = arrival_us * 1000
-        machine.apply(command(10.0, 10.0, now), now)
-        moved.append(machine.advance(PERIOD).true_wheels.right)
+        simulated.apply(command(10.0, 10.0, now), now)
+        moved.append(simulated.advance(PERIOD).true_wheels.right)
     assert moved[0] == moved[1]
     assert moved[0] > moved[2] > moved[3] > 0.0
 
 
-def test_asking_in_between_changes_nothing():
+def test_intermediate_requests_change_nothing():
     busy, quiet = robot(), robot()
-    for machine in (busy, quiet):
-        machine.apply(command(5.0, 3.0, 0), 0)
+    for simulated in (busy, quiet):
+        simulated.apply(command(5.0, 3.0, 0), 0)
     for now in range(0, 200 * MS, 1_300_000):
         busy.advance(now)
     assert numbers(busy.advance(200 * MS)) == numbers(quiet.advance(200 * MS))
 
 
-def test_stepping_without_a_clock_is_the_same_as_with_one():
+def test_step_equals_apply_and_advance():
     stepped, timed = robot(), robot()
     for tick in range(100):
         timed.apply(command(*wander(tick), tick * PERIOD), tick * PERIOD)
         assert numbers(stepped.step(wander(tick))) == numbers(timed.advance((tick + 1) * PERIOD))
 
 
-def test_a_long_gap_is_made_up_for_in_part_and_leaves_the_robot_standing():
-    machine = robot()
-    machine.apply(command(10.0, 10.0, 0), 0)
-    machine.advance(100 * MS)
+def test_long_gap_is_simulated_in_part_and_ends_at_standstill():
+    simulated = robot()
+    simulated.apply(command(10.0, 10.0, 0), 0)
+    simulated.advance(100 * MS)
     hour = 3_600_000 * MS
-    after = machine.advance(hour)
+    after = simulated.advance(hour)
     assert after.stamp_ns == hour
     assert not after.status.moving
     assert after.truth.pose.x < 0.35 * 0.5
-    assert machine.apply(command(5.0, 5.0, hour), hour) == ''
-    assert machine.advance(hour + 200 * MS).status.moving
+    assert simulated.apply(command(5.0, 5.0, hour), hour) == ''
+    assert simulated.advance(hour + 200 * MS).status.moving
 
 
-def test_a_clock_that_goes_back_stops_the_robot_and_starts_a_new_grid():
-    machine = robot()
+def test_backward_time_jump_stops_and_restarts_the_time_grid():
+    simulated = robot()
     for tick in range(100, 130):
-        machine.apply(command(8.0, 8.0, tick * PERIOD), tick * PERIOD)
-        before = machine.advance((tick + 1) * PERIOD)
-    state = machine.advance(3 * MS)
+        simulated.apply(command(8.0, 8.0, tick * PERIOD), tick * PERIOD)
+        before = simulated.advance((tick + 1) * PERIOD)
+    state = simulated.advance(3 * MS)
     assert state.stamp_ns == 3 * MS
     assert 'clock jumped back' in state.reason
     assert state.truth.pose.x == pytest.approx(before.truth.pose.x)
-    assert not machine.advance(503 * MS).status.moving
-    assert machine.apply(command(8.0, 8.0, 503 * MS), 503 * MS) == ''
-    assert machine.advance(703 * MS).status.moving
+    assert not simulated.advance(503 * MS).status.moving
+    assert simulated.apply(command(8.0, 8.0, 503 * MS), 503 * MS) == ''
+    assert simulated.advance(703 * MS).status.moving
 
 
-# -- numbers --------------------------------------------------------------------------------------
+# -- values ---------------------------------------------------------------------------------------
 
 
-def test_equal_runs_are_equal_bit_for_bit():
+def test_equal_seeds_give_bit_equal_runs():
     runs = []
     for _ in range(2):
-        machine = robot(noise__variance=0.04, seed=5)
-        runs.append([numbers(machine.step(wander(tick))) for tick in range(300)])
+        simulated = robot(noise__variance=0.04, seed=5)
+        runs.append([numbers(simulated.step(wander(tick))) for tick in range(300)])
     assert runs[0] == runs[1]
     other = robot(noise__variance=0.04, seed=6)
     assert [numbers(other.step(wander(tick))) for tick in range(300)] != runs[0]
 
 
-def test_noise_blurs_the_measurement_and_leaves_the_truth_alone():
+def test_noise_affects_the_measurement_only():
     silent, noisy = robot(), robot(noise__variance=0.04)
     deviations = []
     for tick in range(2000):
@@ -317,7 +317,7 @@ def test_noise_blurs_the_measurement_and_leaves_the_truth_alone():
     assert np.var(deviations) == pytest.approx(0.04, rel=0.06)
 
 
-def test_a_change_of_disturbance_does_not_shift_the_noise():
+def test_disturbance_parameters_do_not_shift_the_noise():
     calm, rough = robot(noise__variance=0.04), robot(noise__variance=0.04)
     rough.configure(rough.parameters.with_values({'disturbance.bound': 0.01}))
     for tick in range(50):
@@ -329,29 +329,29 @@ def test_a_change_of_disturbance_does_not_shift_the_noise():
 
 
 def trajectory(substep: float, **changes: object) -> np.ndarray:
-    machine = robot(substep=substep, **changes)
+    simulated = robot(substep=substep, **changes)
     rows = []
     for tick in range(1000):
-        if machine.parameters.drive.kind == 'torque':
-            state = machine.step_torque(
+        if simulated.parameters.drive.kind == 'torque':
+            state = simulated.step_torque(
                 0.006 + 0.01 * math.sin(0.013 * tick), 0.006 + 0.01 * math.cos(0.009 * tick)
             )
         else:
-            state = machine.step(wander(tick))
+            state = simulated.step(wander(tick))
         pose = state.truth.pose
         yaw = (math.cos(pose.yaw), math.sin(pose.yaw))
         rows.append([pose.x, pose.y, *yaw, *state.true_wheels])
     return np.array(rows)
 
 
-def test_ten_seconds_under_torque_converge_with_order_four():
+def test_torque_drive_converges_with_order_four():
     runs = [trajectory(substep, drive__kind='torque') for substep in (0.002, 0.001, 0.0005)]
     coarse, fine = np.abs(runs[0] - runs[1]).max(), np.abs(runs[1] - runs[2]).max()
     assert math.log2(coarse / fine) == pytest.approx(4.0, abs=0.3)
     assert fine < 1e-8
 
 
-def test_ten_seconds_of_the_velocity_drive_change_little_when_the_substep_is_halved():
+def test_velocity_drive_converges_when_substep_is_halved():
     """Order two where the ramp ends within a step, four where the drive does not limit."""
     ramps = [trajectory(substep) for substep in (0.002, 0.001, 0.0005, 0.00025, 0.000125)]
     changes = [np.abs(b - a).max() for a, b in zip(ramps, ramps[1:], strict=False)]
@@ -362,75 +362,75 @@ def test_ten_seconds_of_the_velocity_drive_change_little_when_the_substep_is_hal
     assert order == pytest.approx(4.0, abs=0.3)
 
 
-def test_odometry_without_noise_stays_with_the_truth():
-    machine = robot()
+def test_odometry_without_noise_follows_ground_truth():
+    simulated = robot()
     for tick in range(2000):
-        state = machine.step(wander(tick))
+        state = simulated.step(wander(tick))
     assert state.odometry.pose[:2] == pytest.approx(state.truth.pose[:2], abs=2e-3)
     assert state.odometry.twist == state.truth.twist
-    run = machine.parameters.geometry.wheel_radius * np.array(state.angles)
+    run = simulated.parameters.geometry.wheel_radius * np.array(state.angles)
     assert np.trace(state.covariance) > 0.0
     assert run.max() > 2.0
 
 
-def test_wheel_angles_are_the_integral_of_the_wheel_speeds():
-    machine, total = robot(), np.zeros(2)
+def test_wheel_angles_integrate_the_wheel_speeds():
+    simulated, total = robot(), np.zeros(2)
     before = np.zeros(2)
     for tick in range(500):
-        state = machine.step(wander(tick))
+        state = simulated.step(wander(tick))
         total += 0.005 * (before + np.array(state.true_wheels))
         before = np.array(state.true_wheels)
     assert np.array(state.angles) == pytest.approx(total, abs=5e-3)
 
 
-# -- the rest of the seam -------------------------------------------------------------------------
+# -- robot interface ------------------------------------------------------------------------------
 
 
-def test_odometry_is_reset_at_rest_and_not_while_moving():
-    machine = robot()
+def test_odometry_reset_is_rejected_while_moving():
+    simulated = robot()
     for _ in range(50):
-        state = machine.step(WheelSpeeds(8.0, 8.0))
-    assert 'moves' in machine.reset_odometry(state.stamp_ns)
-    assert machine.state.odometry.pose.x > 0.05
+        state = simulated.step(WheelSpeeds(8.0, 8.0))
+    assert 'moves' in simulated.reset_odometry(state.stamp_ns)
+    assert simulated.state.odometry.pose.x > 0.05
     for _ in range(50):
-        state = machine.step(WheelSpeeds(0.0, 0.0))
-    assert machine.reset_odometry(state.stamp_ns) == ''
-    assert machine.state.odometry.pose == (0.0, 0.0, 0.0)
-    assert not machine.state.covariance.any()
-    assert machine.state.truth.pose.x > 0.05
+        state = simulated.step(WheelSpeeds(0.0, 0.0))
+    assert simulated.reset_odometry(state.stamp_ns) == ''
+    assert simulated.state.odometry.pose == (0.0, 0.0, 0.0)
+    assert not simulated.state.covariance.any()
+    assert simulated.state.truth.pose.x > 0.05
 
 
-def test_the_robot_can_be_put_elsewhere_and_odometry_does_not_notice():
-    machine = robot()
-    machine.step(WheelSpeeds(0.0, 0.0))
-    machine.set_pose(Pose(1.0, -2.0, 7.0))
-    assert machine.state.truth.pose[:2] == (1.0, -2.0)
-    assert machine.state.truth.pose.yaw == pytest.approx(7.0 - math.tau)
-    assert machine.state.odometry.pose[:2] == pytest.approx((0.0, 0.0), abs=1e-3)
+def test_set_pose_leaves_odometry_unchanged():
+    simulated = robot()
+    simulated.step(WheelSpeeds(0.0, 0.0))
+    simulated.set_pose(Pose(1.0, -2.0, 7.0))
+    assert simulated.state.truth.pose[:2] == (1.0, -2.0)
+    assert simulated.state.truth.pose.yaw == pytest.approx(7.0 - math.tau)
+    assert simulated.state.odometry.pose[:2] == pytest.approx((0.0, 0.0), abs=1e-3)
     with pytest.raises(ValueError, match='finite'):
-        machine.set_pose(Pose(math.nan, 0.0, 0.0))
+        simulated.set_pose(Pose(math.nan, 0.0, 0.0))
 
 
-def test_only_live_settings_change_while_running():
-    machine = robot()
+def test_only_dynamic_parameters_change_while_running():
+    simulated = robot()
     for name, value in (('noise.variance', 0.1), ('wheel.max_velocity', 3.0), ('drive.lag', 0.05)):
-        machine.configure(machine.parameters.with_values({name: value}))
-        assert machine.parameters.to_dict()[name] == value
-    before = machine.parameters
+        simulated.configure(simulated.parameters.with_values({name: value}))
+        assert simulated.parameters.to_dict()[name] == value
+    before = simulated.parameters
     for name, value in (('rate', 50.0), ('seed', 9), ('wheel_radius', 0.05)):
         with pytest.raises(ParameterError, match=name):
-            machine.configure(before.with_values({name: value}))
-    assert machine.parameters is before
+            simulated.configure(before.with_values({name: value}))
+    assert simulated.parameters is before
 
 
-def test_warming_up_leaves_the_robot_as_it_was():
+def test_warm_up_leaves_the_robot_unchanged():
     cold, warm = robot(), robot()
     warm.warm_up()
     assert numbers(cold.step(WheelSpeeds(5.0, 4.0))) == numbers(warm.step(WheelSpeeds(5.0, 4.0)))
     robot(drive__kind='torque').warm_up()
 
 
-def test_the_simulated_robot_has_every_part_of_the_seam_itself():
+def test_paper_robot_implements_the_robot_interface():
     assert RobotInterface in PaperRobot.__mro__
     for name in ('apply', 'advance', 'stop', 'reset_odometry', 'latch_estop', 'release_estop'):
         assert name in vars(RobotInterface)

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The distance sensors, against the data sheet and the rules of REP 117."""
+"""Simulated range sensors, against the data sheet and REP 117."""
 
 import math
 
@@ -25,7 +25,7 @@ from t3mpc_ros.simulation.sensors.range_sensor import (
     sensor_mounts,
 )
 
-# Read off the line of figure 2 of sheet E4-A00201EN (white paper, 90 %): cm and V. The values at
+# Values of the curve of figure 2 of sheet E4-A00201EN (white paper, 90 %): cm and V. The values at
 # 5, 6, 7, 8, 10, 15, 20, 25, 30, 40, 50 and 80 cm carry a marker in the lower diagram.
 FAR = {
     10: 2.32,
@@ -57,22 +57,22 @@ def seen_at(true_distance: float) -> float:
 
 
 @pytest.mark.parametrize('centimetres', FAR)
-def test_voltage_is_that_of_the_data_sheet_over_its_range(centimetres):
+def test_voltage_matches_the_data_sheet_in_range(centimetres):
     assert output_voltage(0.01 * centimetres) == pytest.approx(FAR[centimetres], rel=0.025)
 
 
 @pytest.mark.parametrize('centimetres', NEAR)
-def test_voltage_follows_the_data_sheet_where_it_falls_again(centimetres):
+def test_voltage_matches_the_data_sheet_near_the_sensor(centimetres):
     assert output_voltage(0.01 * centimetres) == pytest.approx(NEAR[centimetres], rel=0.03)
 
 
-def test_voltage_is_within_the_limits_that_the_data_sheet_guarantees():
+def test_voltage_is_within_the_guaranteed_limits():
     """0.25 to 0.55 V at 80 cm, and 1.65 to 2.15 V more at 10 cm; typically 0.4 and 1.9 V."""
     assert output_voltage(0.8) == pytest.approx(0.4, abs=0.01)
     assert output_voltage(0.1) - output_voltage(0.8) == pytest.approx(1.9, abs=0.02)
 
 
-def test_voltage_rises_to_one_peak_between_five_and_seven_centimetres_and_falls_from_there_on():
+def test_voltage_has_a_single_peak_between_5_and_7_cm():
     distances = np.linspace(1e-4, 2.0, 20001)
     voltages = np.array([output_voltage(place) for place in distances])
     peak = int(voltages.argmax())
@@ -83,32 +83,32 @@ def test_voltage_rises_to_one_peak_between_five_and_seven_centimetres_and_falls_
 
 
 @pytest.mark.parametrize('place', [0.0, -0.01, 1e-300, 1e-6])
-def test_voltage_at_contact_is_nothing(place):
+def test_voltage_at_contact_is_zero(place):
     assert 0.0 <= output_voltage(place) < 1e-3
 
 
-def test_voltage_without_an_object_is_below_that_of_any_object():
+def test_voltage_without_an_object_is_the_lowest():
     assert 0.0 < output_voltage(math.inf) < output_voltage(100.0) < output_voltage(0.8)
 
 
-def test_board_inverts_the_curve_within_what_its_converter_resolves():
+def test_board_inverts_the_curve_within_adc_resolution():
     parameters = SimulatedRangeSensorParameters()
     for place in np.linspace(0.1005, 0.79, 1500):
         slope = (output_voltage(place - 1e-4) - output_voltage(place + 1e-4)) / 2e-4
         found = distance_from_voltage(parameters.volts(parameters.count(output_voltage(place))))
-        # Half a step, and a tenth for what the formula leaves out near 10 cm.
+        # Half a step, and a tenth for the error of the formula near 10 cm.
         assert abs(found - place) <= 0.6 * STEP / slope + 0.002 * place
 
 
 @pytest.mark.parametrize(('place', 'resolution'), [(0.3, 0.002), (0.8, 0.013)])
-def test_converter_resolves_two_millimetres_at_30_and_about_a_centimetre_at_80(place, resolution):
+def test_adc_resolves_2_mm_at_30_cm_and_13_mm_at_80_cm(place, resolution):
     step = distance_from_voltage(
         output_voltage(place) - STEP, maximum=2.0
     ) - distance_from_voltage(output_voltage(place), maximum=2.0)
     assert step == pytest.approx(resolution, rel=0.1)
 
 
-def test_readings_out_of_range_are_the_infinities_of_rep_117():
+def test_out_of_range_readings_follow_rep_117():
     assert distance_from_voltage(output_voltage(0.1) + STEP) == -math.inf
     assert distance_from_voltage(output_voltage(0.8) - STEP) == math.inf
     assert distance_from_voltage(5.0) == -math.inf
@@ -116,36 +116,36 @@ def test_readings_out_of_range_are_the_infinities_of_rep_117():
         assert distance_from_voltage(volts) == math.inf
 
 
-def test_five_centimetres_would_read_as_seven_and_are_called_too_near():
-    """The fold-over: the far branch, extrapolated, gives a wrong distance for a near object."""
-    # What the sheet's own line says: 3.08 V at 5 cm are met again between 6 and 7 cm.
+def test_object_at_5_cm_reads_as_too_near():
+    """The extrapolated far branch gives a wrong distance for a near object."""
+    # Data sheet: the 3.08 V of 5 cm occur again between 6 and 7 cm.
     assert NEAR[7] < NEAR[5] < NEAR[6]
     extrapolated = distance_from_voltage(output_voltage(0.05), minimum=0.0)
     assert extrapolated == pytest.approx(0.068, abs=0.003)
     assert seen_at(0.05) == -math.inf
-    # 9 cm is what 4 cm look like.
+    # 4 cm reads as 9 cm.
     assert distance_from_voltage(output_voltage(0.04), minimum=0.0) == pytest.approx(
         0.09, abs=0.003
     )
 
 
-def test_nearer_than_three_and_a_half_centimetres_the_board_is_deceived():
-    """No rule on one voltage can tell these apart; only the time before could."""
+def test_objects_below_3_5_cm_are_misread():
+    """A single voltage does not distinguish these distances."""
     for centimetres in np.arange(3.7, 9.9, 0.1):
         assert seen_at(0.01 * centimetres) == -math.inf
     assert seen_at(0.03) == pytest.approx(0.13, abs=0.01)
     assert seen_at(0.02) == pytest.approx(0.23, abs=0.01)
     assert seen_at(0.0) == math.inf
-    # The same from the sheet's points: 3 cm lie between those of 10 and 15 cm.
+    # The same from the data sheet: the voltage of 3 cm is between those of 10 and 15 cm.
     assert FAR[15] < NEAR[3] < FAR[10]
 
 
-def test_every_code_comes_back():
+def test_every_code_round_trips():
     for byte in range(256):
         value = decode_range(byte)
         if byte == FAULT:
             assert math.isnan(value)
-            assert encode_range(value) == NOT_MEASURED  # whoever knows of a fault says so
+            assert encode_range(value) == NOT_MEASURED  # a fault has no reading of its own
         else:
             assert encode_range(value) == byte
     assert math.isnan(decode_range(NOT_MEASURED))
@@ -156,19 +156,19 @@ def test_every_code_comes_back():
 
 
 @pytest.mark.parametrize('byte', [-1, 256])
-def test_what_is_no_byte_is_refused(byte):
+def test_code_outside_a_byte_is_rejected(byte):
     with pytest.raises(ValueError, match=f'from 0 to 255: got {byte}'):
         decode_range(byte)
 
 
-def test_finite_readings_keep_half_a_centimetre_and_never_become_a_special_code():
+def test_finite_readings_round_to_5_mm_and_no_special_code():
     for place in np.linspace(0.01, 1.265, 400):
         assert abs(decode_range(encode_range(place)) - place) <= 0.0025 + 1e-12
     assert encode_range(-1.0) == encode_range(0.0) == TOO_NEAR
     assert encode_range(1e6) == BEYOND
 
 
-def test_mounts_are_two_on_each_side_and_look_outwards():
+def test_mounts_are_two_per_side_and_point_outwards():
     parameters = SimulatedRangeSensorParameters(half_length=0.1, half_width=0.08, offset=0.03)
     places = dict(zip(RANGE_SENSORS, sensor_mounts(parameters), strict=True))
     assert places['front_left'] == pytest.approx([0.1, 0.03, 0.0])
@@ -183,7 +183,7 @@ def test_mounts_are_two_on_each_side_and_look_outwards():
         assert x * math.cos(direction) + y * math.sin(direction) > 0.0
 
 
-def test_each_sensor_measures_at_its_own_rate_within_the_data_sheets():
+def test_sensor_periods_are_within_the_data_sheet():
     sensors = finders()
     counts = np.zeros(8)
     for _ in range(20000):
@@ -194,7 +194,7 @@ def test_each_sensor_measures_at_its_own_rate_within_the_data_sheets():
     assert len(set(sensors.periods)) == 8
 
 
-def test_sensors_are_not_in_step_with_each_other_from_the_start():
+def test_sensors_start_with_random_phases():
     firsts = []
     for seed in range(100):
         sensors = finders(seed=seed)
@@ -203,20 +203,20 @@ def test_sensors_are_not_in_step_with_each_other_from_the_start():
             for index in sensors.due(0.001):
                 first[index] = first[index] or tick + 1
         firsts.append([first[index] / (1e3 * sensors.periods[index]) for index in range(8)])
-    # Anywhere within the first period, one as likely as the other.
+    # Uniform within the first period.
     assert np.mean(firsts) == pytest.approx(0.5, abs=0.05)
     assert np.std(firsts) == pytest.approx(1.0 / math.sqrt(12.0), rel=0.1)
 
 
-def test_what_is_due_does_not_depend_on_how_time_is_cut():
+def test_due_sensors_are_independent_of_the_time_step():
     coarse, fine = finders(), finders()
     for tick in range(2000):
         early = [index for _ in range(10) for index in fine.due(0.001)]
-        # A sensor at the very end of a period may fall into the next one by rounding.
+        # Rounding may move a sensor at the end of a period to the next one.
         assert set(coarse.due(0.01)) == set(early), tick
 
 
-def test_after_a_long_gap_each_sensor_is_due_once_and_goes_on_in_step():
+def test_long_gap_makes_each_sensor_due_once_in_phase():
     jumped, patient = finders(), finders()
     assert list(jumped.due(1.0003)) == list(range(8))
     for _ in range(10003):
@@ -226,7 +226,7 @@ def test_after_a_long_gap_each_sensor_is_due_once_and_goes_on_in_step():
         assert jumped.due(0.007) == patient.due(0.007)
 
 
-def test_sensors_are_unknown_until_first_measured():
+def test_readings_are_nan_until_first_measured():
     sensors = finders(**QUIET)
     assert all(map(math.isnan, sensors.readings))
     sensors.measure(3, 0.3)
@@ -234,12 +234,12 @@ def test_sensors_are_unknown_until_first_measured():
     assert sum(map(math.isnan, sensors.readings)) == 7
 
 
-def test_nothing_there_is_infinitely_far():
+def test_no_object_reads_as_infinity():
     assert seen_at(math.inf) == math.inf
     assert seen_at(1.5) == math.inf
 
 
-def test_noise_blurs_far_readings_as_the_slope_of_the_curve_says():
+def test_reading_noise_follows_the_curve_slope():
     sensors = finders(voltage_noise=0.01, voltage_offset=0.0)
     found = []
     for _ in range(4000):
@@ -250,7 +250,7 @@ def test_noise_blurs_far_readings_as_the_slope_of_the_curve_says():
     assert np.mean(found) == pytest.approx(0.5, abs=0.004)
 
 
-def test_each_sensor_has_an_offset_of_its_own():
+def test_each_sensor_has_its_own_offset():
     sensors = finders(voltage_noise=0.0, voltage_offset=0.05)
     for index in range(8):
         sensors.measure(index, 0.5)
@@ -262,7 +262,7 @@ def test_each_sensor_has_an_offset_of_its_own():
     assert all(low - 0.0025 <= value <= high + 0.0025 for value in sensors.readings)
 
 
-def test_equal_seeds_read_equally_and_settings_do_not_shift_the_numbers():
+def test_range_parameters_do_not_shift_random_numbers():
     first, second = finders(seed=5), finders(seed=5)
     changed = finders(seed=5, voltage_noise=0.0, voltage_offset=0.1, period_spread=0.001)
     for index in (0, 1, 2, 0, 0):
@@ -270,7 +270,7 @@ def test_equal_seeds_read_equally_and_settings_do_not_shift_the_numbers():
             sensors.measure(index, 0.4)
     assert first.readings[:3] == second.readings[:3]
     assert first.periods == second.periods
-    # The periods are the same draws at another spread.
+    # The periods are the same random numbers with another spread.
     stretched = (np.array(first.periods) - 0.0383) / 0.0096
     assert (np.array(changed.periods) - 0.0383) / 0.001 == pytest.approx(stretched)
     changed.parameters = first.parameters
@@ -289,6 +289,6 @@ def test_equal_seeds_read_equally_and_settings_do_not_shift_the_numbers():
         ({'minimum': 0.05}, 'minimum'),
     ],
 )
-def test_settings_that_do_not_fit_are_refused_by_name(changes, name):
+def test_inconsistent_parameters_are_rejected_by_name(changes, name):
     with pytest.raises(ParameterError, match=f'^{name} must be'):
         SimulatedRangeSensorParameters.from_dict(changes)

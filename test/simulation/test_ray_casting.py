@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Distances along rays and all around, against plain geometry and against themselves."""
+"""Ray casting and clearance, against independent geometry."""
 
 import math
 
@@ -30,7 +30,7 @@ def random_walls(generator, segments=12, circles=4):
 
 
 def moved(points, angle, shift):
-    """Return points (n, 2) turned about the origin, then shifted."""
+    """Return points (n, 2) rotated about the origin, then shifted."""
     turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     return points @ turn.T + shift
 
@@ -52,7 +52,7 @@ def algebraic_distance(x, y, direction, segments, circles):
     return min(hits)
 
 
-def test_a_ray_ends_where_algebra_says_in_any_world():
+def test_ray_length_matches_an_algebraic_solution():
     generator = np.random.default_rng(1)
     seen = 0
     for _ in range(40):
@@ -63,10 +63,10 @@ def test_a_ray_ends_where_algebra_says_in_any_world():
                 expected, abs=1e-9
             )
             seen += math.isfinite(expected)
-    assert 300 < seen < 1000  # both answers were asked for
+    assert 300 < seen < 1000  # hits and misses
 
 
-def test_the_clearance_is_that_of_the_nearest_of_many_points_of_the_walls():
+def test_clearance_matches_a_dense_sampling_of_the_walls():
     generator = np.random.default_rng(2)
     shares = np.linspace(0.0, 1.0, 4001)[:, None]
     angles = np.linspace(0.0, math.tau, 4001)
@@ -82,7 +82,7 @@ def test_the_clearance_is_that_of_the_nearest_of_many_points_of_the_walls():
         assert clearance(x, y, segments, circles) == pytest.approx(nearest, abs=2e-3)
 
 
-def test_no_ray_is_shorter_than_the_clearance_and_one_is_as_short():
+def test_shortest_ray_equals_the_clearance():
     generator = np.random.default_rng(3)
     for _ in range(40):
         segments, circles = random_walls(generator)
@@ -95,9 +95,9 @@ def test_no_ray_is_shorter_than_the_clearance_and_one_is_as_short():
         assert min(rays) >= free - 1e-12
         ends = [nearest_on_segment(x, y, *wall) for wall in segments.tolist()]
         ends += [centre for *centre, _ in circles.tolist()]
-        # Walls are met where they are nearest, circles in the direction of their middle, or
-        # opposite to it from within; the tiny turn is for rounding at the very end of a wall,
-        # which may be met at a grazing angle.
+        # The nearest point of a wall is hit there, that of a circle towards its centre, or away
+        # from it from inside; the small rotation allows for rounding at the end of a wall, which
+        # may be hit at a grazing angle.
         towards = [math.atan2(end[1] - y, end[0] - x) for end in ends]
         shortest = min(
             cast_ray(x, y, direction + turn, segments, circles)
@@ -107,7 +107,7 @@ def test_no_ray_is_shorter_than_the_clearance_and_one_is_as_short():
         assert shortest == pytest.approx(free, abs=1e-5)
 
 
-def test_turning_and_moving_world_and_robot_together_changes_no_distance():
+def test_distances_are_invariant_under_rigid_motion():
     generator = np.random.default_rng(4)
     for _ in range(200):
         segments, circles = random_walls(generator)
@@ -124,7 +124,7 @@ def test_turning_and_moving_world_and_robot_together_changes_no_distance():
         )
 
 
-def test_two_points_see_each_other_or_neither_sees_the_other():
+def test_line_of_sight_is_symmetric():
     generator = np.random.default_rng(5)
     seen = 0
     for _ in range(2000):
@@ -140,32 +140,32 @@ def test_two_points_see_each_other_or_neither_sees_the_other():
 
 
 @pytest.mark.parametrize('yaw', [0.0, 0.3, 1.0])
-def test_no_ray_leaks_out_of_a_closed_room_or_into_a_box(yaw):
+def test_no_ray_leaks_through_closed_walls(yaw):
     generator = np.random.default_rng(6)
     room = moved(SQUARE.reshape(-1, 2), yaw, (0.3, -0.7)).reshape(-1, 4)
     for _ in range(4):
         x, y = moved(generator.uniform(-0.99, 0.99, (1, 2)), yaw, (0.3, -0.7))[0].tolist()
         for direction in generator.uniform(-math.pi, math.pi, 2500).tolist():
             assert cast_ray(x, y, direction, room, NO_CIRCLES) < 2.9
-        # Straight at the corners, where rounding decides on which side of the ray they are.
+        # Towards the corners, where rounding decides the side of the ray.
         for corner_x, corner_y in room[:, :2].tolist():
             aim = math.atan2(corner_y - y, corner_x - x)
             apart = math.hypot(corner_x - x, corner_y - y)
             for turn in [0.0, *(generator.normal(0.0, 1e-16, 200))]:
                 ray = cast_ray(x, y, aim + float(turn), room, NO_CIRCLES)
                 assert ray == pytest.approx(apart, abs=1e-7)
-    # From outside: the near face hides the far one.
+    # From outside the near face occludes the far one.
     for _ in range(10_000):
         angle, aim = generator.uniform(-math.pi, math.pi, 2).tolist()
         x, y = 0.3 + 3.0 * math.cos(angle), -0.7 + 3.0 * math.sin(angle)
-        # Aimed at a disc within the box.
+        # Towards a disc inside the box.
         target_x, target_y = 0.3 + 0.9 * math.cos(aim), -0.7 + 0.9 * math.sin(aim)
         direction = math.atan2(target_y - y, target_x - x)
         ray = cast_ray(x, y, direction, room, NO_CIRCLES)
         assert ray < math.hypot(target_x - x, target_y - y)
 
 
-def test_a_ray_along_a_wall_sees_its_end_and_from_on_it_sees_nothing_nearer():
+def test_ray_along_a_wall_hits_its_end():
     wall = np.array([[1.0, 0.5, 3.0, 0.5]])
     assert cast_ray(0.0, 0.5, 0.0, wall, NO_CIRCLES) == 1.0
     assert cast_ray(2.0, 0.5, 0.0, wall, NO_CIRCLES) == 0.0
@@ -174,18 +174,18 @@ def test_a_ray_along_a_wall_sees_its_end_and_from_on_it_sees_nothing_nearer():
     assert cast_ray(0.0, 0.4999, 0.0, SQUARE, NO_CIRCLES) == 1.0
     nearly = np.array([[1.0, -1e-9, 3.0, 1e-9]])
     assert cast_ray(0.0, 0.0, 0.0, nearly, NO_CIRCLES) == pytest.approx(2.0)
-    # Along one wall of a room, a hair inside: the wall ahead is what counts.
+    # Just inside a wall and parallel to it, the ray hits the wall ahead.
     assert cast_ray(0.0, -1.0 + 1e-12, 0.0, SQUARE, NO_CIRCLES) == pytest.approx(1.0)
 
 
-def test_touching_the_end_of_a_wall_is_a_hit():
+def test_ray_touching_a_wall_end_is_a_hit():
     wall = np.array([[1.0, 0.0, 1.0, 1.0]])
     assert cast_ray(0.0, 0.0, 0.0, wall, NO_CIRCLES) == 1.0
     assert cast_ray(0.0, 1.0, 0.0, wall, NO_CIRCLES) == 1.0
     assert cast_ray(0.0, 1.0 + 1e-12, 0.0, wall, NO_CIRCLES) == math.inf
 
 
-def test_a_circle_is_seen_from_outside_from_within_and_not_from_past_it():
+def test_circle_is_hit_from_outside_and_inside_only():
     circle = np.array([[2.0, 0.0, 0.5]])
     assert cast_ray(0.0, 0.0, 0.0, NO_SEGMENTS, circle) == pytest.approx(1.5)
     assert cast_ray(2.1, 0.0, 0.0, NO_SEGMENTS, circle) == pytest.approx(0.4)
@@ -194,13 +194,13 @@ def test_a_circle_is_seen_from_outside_from_within_and_not_from_past_it():
     assert clearance(2.1, 0.0, NO_SEGMENTS, circle) == pytest.approx(0.4)
 
 
-def test_an_empty_plain_shows_nothing():
+def test_empty_world_returns_infinity():
     assert cast_ray(0.0, 0.0, 1.0, NO_SEGMENTS, NO_CIRCLES) == math.inf
     assert clearance(0.0, 0.0, NO_SEGMENTS, NO_CIRCLES) == math.inf
     assert grip_at(0.0, 0.0, np.zeros((0, 4))) == 1.0
 
 
-def test_sensors_look_from_where_they_sit_on_the_body_and_only_those_asked():
+def test_rays_start_at_the_mounts_of_selected_sensors():
     generator = np.random.default_rng(7)
     segments, circles = random_walls(generator)
     mounts = generator.uniform((-0.1, -0.1, -3.0), (0.1, 0.1, 3.0), (8, 3))
@@ -217,7 +217,7 @@ def test_sensors_look_from_where_they_sit_on_the_body_and_only_those_asked():
             assert out[row] == pytest.approx(expected, abs=1e-9)
 
 
-def test_a_patch_takes_grip_up_to_its_rim_and_of_two_the_more_slippery_counts():
+def test_overlapping_patches_use_the_lowest_grip():
     patches = np.array([[0.0, 0.0, 1.0, 0.5], [0.5, 0.0, 1.0, 0.2], [0.0, 0.0, 0.1, 0.9]])
     assert grip_at(-0.9, 0.0, patches) == 0.5
     assert grip_at(-1.0, 0.0, patches) == 0.5
@@ -226,8 +226,8 @@ def test_a_patch_takes_grip_up_to_its_rim_and_of_two_the_more_slippery_counts():
     assert grip_at(1.4, 0.0, patches) == 0.2
 
 
-def test_corners_of_a_box_from_a_file_are_tight():
-    """Sides that each compute their own corner differ in the last bit, and a ray gets through."""
+def test_box_corners_from_a_file_are_tight():
+    """Corners computed per side would differ in the last bit and leak rays."""
     generator = np.random.default_rng(8)
     for _ in range(20):
         x, y, length, width, yaw = generator.uniform(

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""A stepper motor: its torque against theory, and steps that are lost exactly beyond it."""
+"""Stepper motor: torque against theory, and steps that are lost exactly beyond it."""
 
 from dataclasses import replace
 import math
@@ -58,17 +58,17 @@ def needed_torque(
     return acceleration * (share + body.wheel_inertia + motor.rotor_inertia)
 
 
-# -- the motor alone ------------------------------------------------------------------------------
+# -- motor alone ----------------------------------------------------------------------------------
 
 
-def test_a_microstep_moves_a_7_cm_wheel_by_0_0687_mm():
+def test_microstep_moves_a_7_cm_wheel_by_0_0687_mm():
     motor = StepperMotorParameters(microsteps=16)
     assert motor.microstep * GEOMETRY.wheel_radius == pytest.approx(0.0687e-3, abs=5e-8)
     assert 2.0 * math.pi / motor.microstep == pytest.approx(3200)
 
 
 @pytest.mark.parametrize('volts', [5.0, 12.0, 24.0])
-def test_pull_out_torque_satisfies_the_phasor_equation_of_the_winding(volts):
+def test_pull_out_torque_satisfies_the_phasor_equation(volts):
     motor = StepperMotorParameters(phase_current=1.7)
     for speed in np.linspace(0.0, 0.999 * volts / motor.torque_constant, 60):
         torque = pull_out_torque(float(speed), volts, motor.vector())
@@ -82,7 +82,7 @@ def test_pull_out_torque_satisfies_the_phasor_equation_of_the_winding(volts):
             assert needed <= volts * (1.0 + 1e-9)
 
 
-def test_pull_out_torque_never_rises_with_speed_and_ends_where_the_emf_is_the_supply():
+def test_pull_out_torque_falls_to_zero_where_emf_equals_supply():
     motor = StepperMotorParameters()
     speeds = np.linspace(0.0, 1.2 * VOLTS / motor.torque_constant, 400)
     torques = [pull_out_torque(float(s), VOLTS, motor.vector()) for s in speeds]
@@ -95,13 +95,13 @@ def test_pull_out_torque_never_rises_with_speed_and_ends_where_the_emf_is_the_su
     assert pull_out_torque(0.0, 0.0, motor.vector()) == 0.0
 
 
-def test_holding_torque_is_what_both_phases_at_rated_current_give():
+def test_holding_torque_is_that_of_both_phases_at_rated_current():
     motor = StepperMotorParameters()
     field = math.hypot(motor.rated_current, motor.rated_current)
     assert motor.torque_constant * field == pytest.approx(motor.holding_torque)
 
 
-def test_a_loaded_rotor_lags_by_the_angle_that_the_sine_says():
+def test_load_angle_follows_the_sine_law():
     motor = StepperMotorParameters()
     peak = pull_out_torque(0.0, VOLTS, motor.vector())
     for share in (0.1, 0.5, 0.9):
@@ -110,17 +110,17 @@ def test_a_loaded_rotor_lags_by_the_angle_that_the_sine_says():
     assert rotor_torque(0.01, 1.0, 0.0, motor.vector()) == 0.0
 
 
-def test_a_current_that_burns_the_motor_is_refused():
+def test_current_above_the_rating_is_rejected():
     with pytest.raises(
         ParameterError, match=r'phase_current must be at most rated_current \(1.7 A'
     ):
         StepperMotorParameters(phase_current=2.0)
 
 
-# -- steps that are lost --------------------------------------------------------------------------
+# -- lost steps -----------------------------------------------------------------------------------
 
 
-def test_a_field_that_turns_evenly_takes_the_wheels_exactly_as_far_as_its_pulses():
+def test_wheels_turn_exactly_as_far_as_the_pulses():
     motor = StepperMotorParameters()
     robot = drivetrain(motor, friction=FrictionParameters())
     for _ in range(300):
@@ -134,12 +134,12 @@ def test_a_field_that_turns_evenly_takes_the_wheels_exactly_as_far_as_its_pulses
     assert max(map(abs, robot.load_angles)) * GEOMETRY.wheel_radius < 0.1e-3
 
 
-def test_ordinary_commands_within_the_torque_never_lose_a_step():
-    """Random speeds, random ramps that need at most 0.35 of the torque there is.
+def test_commands_within_the_torque_lose_no_steps():
+    """Random speeds and ramps that need at most 0.35 of the available torque.
 
-    A rotor swings to twice its load angle when a ramp begins, and to three times when a ramp is
-    turned round, so about a third of the torque is what can always be used; damping leaves some
-    room. Of 200 programmes at 0.45 none lost a step, at 0.5 three did, at 0.9 all.
+    A rotor overshoots to twice its load angle at the start of a ramp, and to three times when a
+    ramp reverses, so about a third of the torque is always usable; damping adds some margin. Of
+    200 sequences at 0.45 none lost a step, at 0.5 three did, at 0.9 all.
     """
     motor = StepperMotorParameters()
     generator = np.random.default_rng(4)
@@ -157,12 +157,12 @@ def test_ordinary_commands_within_the_torque_never_lose_a_step():
 
 
 @pytest.mark.parametrize('seed', range(20))
-def test_a_ramp_beyond_the_torque_always_loses_steps(seed):
+def test_ramp_beyond_the_torque_always_loses_steps(seed):
     motor = StepperMotorParameters()
     generator = np.random.default_rng(seed)
     peak = pull_out_torque(0.0, VOLTS, motor.vector())
     acceleration = generator.uniform(1.1, 4.0) * peak / needed_torque(motor, 1.0)
-    # Long enough that the missing torque leaves the rotor half a pitch behind.
+    # Long enough for the missing torque to leave the rotor half a pitch behind.
     robot = drivetrain(motor)
     target = float(generator.uniform(15.0, 19.0)) * (-1.0) ** seed
     for _ in range(100):
@@ -173,8 +173,8 @@ def test_a_ramp_beyond_the_torque_always_loses_steps(seed):
     assert math.copysign(1.0, right) == math.copysign(1.0, target)
 
 
-def test_lost_steps_are_whole_tooth_pitches_once_the_rotor_rests():
-    """A rotor can only rest where its teeth face the field: 4, 8, 12 ... full steps behind."""
+def test_lost_steps_at_rest_are_whole_tooth_pitches():
+    """At rest the rotor is 0, 4, 8, 12 ... full steps behind its field."""
     motor = StepperMotorParameters(phase_current=0.5)
     robot = drivetrain(motor, friction=FrictionParameters())
     for _ in range(30):
@@ -188,7 +188,7 @@ def test_lost_steps_are_whole_tooth_pitches_once_the_rotor_rests():
     assert abs(rest) < 0.1 * pitch
 
 
-def test_a_heavier_robot_loses_steps_where_a_light_one_does_not():
+def test_heavier_robot_loses_steps_where_a_light_one_does_not():
     motor = StepperMotorParameters(phase_current=0.6)
     lost = []
     for mass in (1.3, 12.0):
@@ -201,7 +201,7 @@ def test_a_heavier_robot_loses_steps_where_a_light_one_does_not():
     assert lost[1] >= 4
 
 
-def test_half_the_supply_loses_steps_at_a_speed_that_the_whole_supply_holds():
+def test_low_supply_voltage_loses_steps_at_high_speed():
     motor = StepperMotorParameters()
     lost = []
     for volts in (12.0, 3.2):
@@ -213,14 +213,14 @@ def test_half_the_supply_loses_steps_at_a_speed_that_the_whole_supply_holds():
     assert lost[1] >= 4
 
 
-def test_the_rotor_swings_with_the_frequency_of_spring_and_load():
-    """A released rotor rings with sqrt(N T / J) about its place, 15 Hz with this body."""
+def test_rotor_oscillates_at_its_natural_frequency():
+    """A released rotor oscillates with sqrt(N T / J), 15 Hz with this body."""
     motor = StepperMotorParameters(microsteps=256, damping=0.0)
     robot = drivetrain(motor, step=0.0005)
     peak = pull_out_torque(0.0, VOLTS, motor.vector())
     inertia = needed_torque(motor, 1.0)
     expected = math.sqrt(motor.teeth * peak / inertia) / (2.0 * math.pi)
-    # A single pulse, far within the linear part of the sine, kicks the rotor.
+    # A single pulse, well within the linear part of the sine, excites the rotor.
     angles = []
     robot.run(WheelSpeeds(5.0, 5.0), 0.0, VOLTS, calm(), 2)
     robot.run(WheelSpeeds(0.0, 0.0), 0.0, VOLTS, calm(), 1)
@@ -233,7 +233,7 @@ def test_the_rotor_swings_with_the_frequency_of_spring_and_load():
     assert 1.0 / period == pytest.approx(expected, rel=0.01)
 
 
-def test_without_power_nothing_holds_the_wheels():
+def test_wheels_coast_without_power():
     motor = StepperMotorParameters()
     robot = drivetrain(motor, friction=FrictionParameters())
     for _ in range(100):

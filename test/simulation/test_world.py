@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""World files: what they mean, which are refused and with what words."""
+"""World files: contents, validation and error messages."""
 
 import math
 from pathlib import Path
@@ -38,17 +38,17 @@ def lengths(world):
     return np.hypot(*(world.segments[:, 2:] - world.segments[:, :2]).T)
 
 
-# --- what a file means -----------------------------------------------------------------------
+# --- valid files -------------------------------------------------------------------------------
 
 
-def test_the_example_of_the_page_is_a_world_and_holds_what_it_says():
+def test_documented_example_is_a_valid_world():
     world = parse_world(EXAMPLE, 'page.yaml')
     assert world.name == 'workshop'
-    # Four walls, one of them cut where the partition begins, the partition, and two boxes.
+    # Four walls, one of them split where the partition begins, the partition, and two boxes.
     assert world.segments.shape == (4 + 1 + 1 + 8, 4)
     assert world.circles.tolist() == [[-0.6, 0.9, 0.12]]
     assert world.patches.tolist() == [[0.4, -0.6, 0.3, 0.2]]
-    assert world.extent == (-1.5, -1.0, 2.5, 2.0)
+    assert world.bounding_box == (-1.5, -1.0, 2.5, 2.0)
     assert world.is_free(0.0, 0.0, BUMPER)
     assert grip_at(0.4, -0.5, world.patches) == 0.2
     # Along the yaw of the first box its end is half its length away, across half its width.
@@ -57,7 +57,7 @@ def test_the_example_of_the_page_is_a_world_and_holds_what_it_says():
         assert ray == pytest.approx(half)
 
 
-def test_the_page_gives_the_bounds_the_worlds_and_the_error_there_are():
+def test_documentation_lists_bounds_worlds_and_error():
     page = PAGE.read_text()
     assert f'| -{MAX_COORDINATE:g} to {MAX_COORDINATE:g} m |' in page
     assert f'| {MIN_SIZE:g} to {MAX_COORDINATE:g} m |' in page
@@ -72,7 +72,7 @@ def test_the_page_gives_the_bounds_the_worlds_and_the_error_there_are():
 
 
 @pytest.mark.parametrize('name', bundled_worlds())
-def test_a_shipped_world_loads_by_name_and_has_room_for_the_robot_at_its_start(name):
+def test_bundled_world_loads_and_is_free_at_the_origin(name):
     world = load_world(name)
     assert world.name == name
     assert world.is_free(0.0, 0.0, BUMPER + 0.2)
@@ -80,15 +80,15 @@ def test_a_shipped_world_loads_by_name_and_has_room_for_the_robot_at_its_start(n
         assert array.shape[1] == width
         assert array.dtype == np.float64
         assert array.flags.c_contiguous
-    left, bottom, right, top = world.extent
+    left, bottom, right, top = world.bounding_box
     for direction in np.linspace(-3.0, 3.0, 500).tolist():  # it is closed
         ray = cast_ray(0.0, 0.0, direction, world.segments, world.circles)
         assert ray < math.hypot(right - left, top - bottom)
 
 
-def test_the_room_is_four_by_three_metres_with_two_boxes_a_pillar_and_oil():
+def test_room_has_the_documented_size_and_objects():
     world = load_world('room')
-    assert world.extent == (-2.0, -1.5, 2.0, 1.5)
+    assert world.bounding_box == (-2.0, -1.5, 2.0, 1.5)
     assert [len(a) for a in (world.segments, world.boxes, world.circles, world.patches)] == [
         12,
         2,
@@ -97,24 +97,24 @@ def test_the_room_is_four_by_three_metres_with_two_boxes_a_pillar_and_oil():
     ]
 
 
-def test_no_name_is_the_empty_plain():
+def test_empty_name_is_the_empty_plain():
     world = load_world('')
     assert world.segments.shape == (0, 4)
     assert world.circles.shape == (0, 3)
     assert world.patches.shape == (0, 4)
     assert world.is_free(1e6, -1e6, 100.0)
-    assert world.extent == (0.0, 0.0, 0.0, 0.0)
+    assert world.bounding_box == (0.0, 0.0, 0.0, 0.0)
 
 
-def test_a_file_loads_by_its_path_and_names_itself_after_it(tmp_path, monkeypatch):
+def test_file_loads_by_path_and_is_named_after_it(tmp_path, monkeypatch):
     path = tmp_path / 'yard.yaml'
     path.write_text('circles: [{center: [1, 2], radius: 0.5}]\n')
     for given in (path, str(path)):
         world = load_world(given)
         assert world.name == 'yard'
         assert world.circles.tolist() == [[1.0, 2.0, 0.5]]
-        assert world.extent == (0.5, 1.5, 1.5, 2.5)
-    # A file of one's own does not hide a shipped world, nor the other way round.
+        assert world.bounding_box == (0.5, 1.5, 1.5, 2.5)
+    # A local file does not hide a bundled world, nor vice versa.
     monkeypatch.chdir(tmp_path)
     shutil.copy(path, 'room')
     assert len(load_world('room').segments) == 12
@@ -122,21 +122,21 @@ def test_a_file_loads_by_its_path_and_names_itself_after_it(tmp_path, monkeypatc
     assert len(load_world(str(WORLDS_FOLDER / 'room.yaml')).segments) == 12
 
 
-def test_a_closed_wall_has_one_piece_for_each_point_an_open_one_one_less():
+def test_closed_wall_has_one_segment_more_than_an_open_one():
     points = '[[0, 0], [3, 0], [3, 4]]'
     assert lengths(parse_world(f'walls: [{{points: {points}}}]', 'a')).tolist() == [3.0, 4.0]
     closed = parse_world(f'walls: [{{points: {points}, closed: true}}]', 'a')
     assert sorted(lengths(closed)) == [3.0, 4.0, 5.0]
 
 
-def test_what_is_free_agrees_with_a_search_by_points_inside_a_turned_box():
+def test_is_free_matches_a_dense_sampling():
     world = parse_world(
         'boxes: [{center: [1, 2], size: [0.8, 0.4], yaw: 0.5}]\n'
         'circles: [{center: [-1, 0], radius: 0.6}]',
         'a',
     )
     generator = np.random.default_rng(1)
-    # Points that fill box and circle; a disc is free when it covers none of them.
+    # Points that fill box and circle; a free disc covers none of them.
     grid = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 161), np.linspace(-0.2, 0.2, 81)), -1)
     cosine, sine = math.cos(0.5), math.sin(0.5)
     turn = np.array([[cosine, sine], [-sine, cosine]])
@@ -154,7 +154,7 @@ def test_what_is_free_agrees_with_a_search_by_points_inside_a_turned_box():
     assert not world.is_free(-1.0, 0.0, 0.0)
 
 
-def test_the_inside_of_a_closed_wall_is_free_and_what_is_not_finite_is_not():
+def test_inside_of_a_wall_is_free_and_non_finite_is_not():
     world = load_world('room')
     assert world.is_free(0, 0, 0)
     assert world.is_free(9.0, 9.0, 0.1)
@@ -164,7 +164,7 @@ def test_the_inside_of_a_closed_wall_is_free_and_what_is_not_finite_is_not():
         world.is_free(0.0, 0.0, -0.1)
 
 
-def test_a_world_is_frozen_and_needs_no_other_object_to_be_made():
+def test_world_is_frozen_and_self_contained():
     world = World('mine', np.zeros((0, 4)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 5)))
     assert world.is_free(0.0, 0.0, 1.0)
     with pytest.raises(AttributeError):
@@ -174,14 +174,14 @@ def test_a_world_is_frozen_and_needs_no_other_object_to_be_made():
 # --- joints ------------------------------------------------------------------------------------
 
 
-def test_walls_that_should_meet_do_to_the_last_bit():
-    """0.3333 and 1/3 are one corner to whoever wrote the file."""
+def test_nearly_touching_walls_share_exact_end_points():
+    """0.3333 and 1/3 denote the same corner."""
     joined = join_walls(np.array([[0, 0, 1 / 3, 0], [0.3333, 0.00005, 0.3333, 1.0]], dtype=float))
     assert joined[0, 2:].tolist() == joined[1, :2].tolist()
     assert len(joined) == 2
 
 
-def test_a_wall_is_cut_where_others_end_on_it_in_order_and_keeps_its_length():
+def test_wall_is_split_where_other_walls_end_on_it():
     generator = np.random.default_rng(2)
     for _ in range(20):
         shares = generator.uniform(0.05, 0.95, 5)
@@ -202,14 +202,14 @@ def test_a_wall_is_cut_where_others_end_on_it_in_order_and_keeps_its_length():
         assert {tuple(wall[:2]) for wall in joined[6:11]} == {tuple(p) for p in pieces[1:, :2]}
 
 
-def test_walls_apart_are_left_as_they_are():
+def test_separate_walls_stay_unchanged():
     generator = np.random.default_rng(3)
     walls = generator.uniform(-100.0, 100.0, (60, 4))
     assert (join_walls(walls) == walls).all()
     assert join_walls(np.zeros((0, 4))).shape == (0, 4)
 
 
-# --- what is refused ---------------------------------------------------------------------------
+# --- invalid files -----------------------------------------------------------------------------
 
 CIRCLE = 'center: [0, 0], radius: 0.1'
 BAD = {
@@ -225,8 +225,8 @@ BAD = {
     'circles: [{center: [0, 0], radius: .inf}]': 'circles[0].radius must be a number',
     'circles: [{center: [0, 2.0e+9], radius: 1}]': 'got 2000000000.0',
     f'circles: [{{center: [0, {10**400}], radius: 1}}]': 'circles[0].center[1] must be a number',
-    'circles: [{center: [0, 1e-3], radius: 1}]': "got '1e-3', a text to YAML; write numbers like",
-    'circles: [{center: [0, -.5], radius: 1}]': "got '-.5', a text to YAML; write numbers like",
+    'circles: [{center: [0, 1e-3], radius: 1}]': "got '1e-3', which YAML reads as text; write",
+    'circles: [{center: [0, -.5], radius: 1}]': "got '-.5', which YAML reads as text; write",
     'circles: [{center: [0, two], radius: 1}]': "must be a number from -1000 to 1000 m: got 'two'",
     'circles: [{center: [0, true], radius: 1}]': 'circles[0].center[1] must be a number',
     'circles: [{center: [0], radius: 1}]': 'circles[0].center must have 2 entries: got 1',
@@ -269,7 +269,7 @@ BAD = {
 
 
 @pytest.mark.parametrize('text', BAD, ids=lambda text: text[:60])
-def test_a_file_that_does_not_fit_is_refused_by_entry_bound_and_value(text):
+def test_invalid_file_error_names_entry_bound_and_value(text):
     with pytest.raises(WorldError) as caught:
         parse_world(text, 'yard.yaml')
     message = str(caught.value)
@@ -278,7 +278,7 @@ def test_a_file_that_does_not_fit_is_refused_by_entry_bound_and_value(text):
     assert len(message) < 250
 
 
-def test_lists_and_the_pieces_of_all_walls_together_are_bounded():
+def test_list_lengths_and_segment_count_are_bounded():
     def refused(text, words):
         with pytest.raises(WorldError, match=re.escape(words)):
             parse_world(text, 'yard.yaml')
@@ -290,20 +290,20 @@ def test_lists_and_the_pieces_of_all_walls_together_are_bounded():
     refused(f'patches: [{", ".join(101 * ["7"])}]', 'patches must have from 0 to 100 entries')
     refused(f'boxes: [{", ".join(501 * [box])}]', 'boxes must have from 0 to 500 entries')
     assert len(parse_world(wall, 'a').segments) == 2000
-    refused(f'{wall}\nboxes: [{box}]', 'at most 2000 straight pieces together: got 2004')
+    refused(f'{wall}\nboxes: [{box}]', 'at most 2000 segments together: got 2004')
     closed = wall.replace(']]}', ']], closed: true}')
-    refused(closed, 'at most 2000 straight pieces together: got 2001')
+    refused(closed, 'at most 2000 segments together: got 2001')
     refused(wall.replace('points: [', 'points: [[5, 5], '), 'from 2 to 2001 entries: got 2002')
 
 
-def test_cutting_walls_where_they_meet_does_not_pass_the_bound():
+def test_splitting_walls_respects_the_segment_limit():
     feet = ', '.join(f'{{points: [[{0.1 * i:g}, 0], [{0.1 * i:g}, 1]]}}' for i in range(1500))
     text = f'walls: [{{points: [[-1, 0], [999, 0]]}}, {feet}]'
-    with pytest.raises(WorldError, match='at most 2000 straight pieces together: got 3001'):
+    with pytest.raises(WorldError, match='at most 2000 segments together: got 3001'):
         parse_world(text, 'yard.yaml')
 
 
-def test_what_is_no_file_of_text_is_refused_by_its_name(tmp_path):
+def test_unreadable_file_is_rejected_by_name(tmp_path):
     with pytest.raises(WorldError, match=r'there is no world rooom, .* did you mean room\?'):
         load_world('rooom')
     with pytest.raises(WorldError, match='there is no world .*none.yaml, neither a file nor one'):
@@ -324,7 +324,7 @@ def test_what_is_no_file_of_text_is_refused_by_its_name(tmp_path):
         load_world(broken)
 
 
-def test_a_damaged_file_is_read_or_refused_and_nothing_else():
+def test_damaged_file_is_parsed_or_rejected():
     generator = np.random.default_rng(4)
     read = 0
     for _ in range(300):

@@ -256,7 +256,7 @@ class _Log:
         before = self.state.angles
         self.state = state = self.robot.step(wheels)
         now = state.angles
-        self._reckoning.turn(now.right - before.right, now.left - before.left)
+        self._reckoning.update(now.right - before.right, now.left - before.left)
         truth = (0.0, 0.0, 0.0) if state.truth is None else state.truth.pose
         self._rows.append((self.elapsed, *truth, *state.odometry.pose, *self._reckoning.pose))
         self._detected += state.status.slipping

@@ -152,7 +152,7 @@ def room(patrol: Patrol, parameters: DigitalTwinParameters) -> Any:
             color=SHEET, fontsize=8,
         )  # fmt: skip
     axis.plot(*course.truth[0, :2], 'o', color=WANTED, ms=5, label='start')
-    around = world.extent
+    around = world.bounding_box
     axis.set_xlim(around.left - 0.4, around.right + 0.4)
     axis.set_ylim(around.bottom - 0.4, around.top + 0.4)
     axis.set_aspect('equal')

@@ -1,6 +1,19 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Contact force between a round bumper and the walls: spring and damper, no friction."""
+r"""Contact force between a round bumper and the walls: spring and damper, no friction.
+
+Each wall that the bumper (radius :math:`r`) overlaps pushes from its nearest point, at distance
+:math:`d`, with :math:`f = \max(0, k (r - d) + c \dot\delta)`, where :math:`\dot\delta` is the
+closing speed. Walls that share an end point would push from it once each, so the force of the
+shared end is subtracted for every wall but one (inclusion and exclusion):
+
+.. math:: F = \sum_{\text{walls}} f n - \sum_{\text{shared ends}} (\text{walls there} - 1) f n
+
+The nearest point of every wall moves smoothly with the bumper, so without damping the force is
+continuous and the gradient of a potential: along joints, past corners, and in polygons that
+approximate a curve, on either side. Selecting one of the touching walls would have neither
+property.
+"""
 
 from dataclasses import dataclass
 import math
@@ -17,13 +30,13 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class BumperParameters(Parameters):
-    """The ring around the robot that walls touch, its middle at the pose of the robot."""
+    """Circular bumper around the pose of the robot."""
 
     radius: float = parameter(0.11, 'radius of the bumper', unit='m', low=0.01, high=1.0)
     stiffness: float = parameter(
         2e4,
-        'force per depth. A robot of 1.5 kg dents it by 4.3 mm at 0.5 m/s without damping, and '
-        'leaves the wall after 27 ms',
+        'force per depth. Without damping a robot of 1.5 kg at 0.5 m/s reaches a depth of 4.3 mm '
+        'and leaves the wall after 27 ms',
         unit='N/m',
         low=1e3,
         high=1e6,
@@ -31,7 +44,7 @@ class BumperParameters(Parameters):
     damping: float = parameter(100.0, 'force per closing speed', unit='N s/m', low=0.0, high=1e4)
 
     def vector(self) -> Array:
-        """Return what :func:`contact_force` needs, shape (3,): m, N/m, N s/m."""
+        """Return the argument of :func:`contact_force`, shape (3,): m, N/m, N s/m."""
         return np.array([self.radius, self.stiffness, self.damping])
 
 
@@ -39,10 +52,10 @@ class BumperParameters(Parameters):
 def point_force(
     away_x: float, away_y: float, speed_x: float, speed_y: float, bumper: Array
 ) -> tuple[float, float]:
-    """Return the force (N) of one touching point on the bumper; never a pull.
+    """Return the force (N) of one contact point on the bumper; it never pulls.
 
-    away_x, away_y : m, from that point to the middle of the bumper; at (0, 0) there is no
-        direction to push in, and no force
+    away_x, away_y : m, from that point to the centre of the bumper; at (0, 0) the direction is
+        undefined and the force zero
     """
     distance = math.sqrt(away_x * away_x + away_y * away_y)
     if distance >= bumper[0] or distance == 0.0:
@@ -74,13 +87,13 @@ def contact_force(
     segments: Array,
     circles: Array,
 ) -> tuple[float, float]:
-    """Return the force (N, world frame) of all walls on a round bumper; it makes no torque.
+    """Return the force (N, world frame) of all walls on a round bumper; its torque is zero.
 
-    Walls push to the side on which the middle of the bumper is; circles are solid and push
-    outwards however deep it is. Corners need walls that share their end points to the last bit,
-    as a :class:`~t3mpc_ros.simulation.world.World` has them.
+    Walls push to the side of the bumper's centre; circles are solid and push outwards at any
+    depth. Corners require walls with bit-equal end points, as in a
+    :class:`~t3mpc_ros.simulation.world.World`.
 
-    x, y : m, the middle of the bumper; speed_x, speed_y : m/s, both in the world frame
+    x, y : m, the centre of the bumper; speed_x, speed_y : m/s, both in the world frame
     bumper : shape (3,), see :meth:`BumperParameters.vector`
     segments : shape (n, 4), m; circles : shape (m, 3), m
     """
@@ -97,7 +110,7 @@ def contact_force(
         force_y += part_y
         for end_x, end_y in ((ax, ay), (bx, by)):
             away_x, away_y = x - end_x, y - end_y
-            # The search is for the rare bumper that covers an end of a wall.
+            # The search runs only when the bumper covers an end of a wall.
             if away_x * away_x + away_y * away_y < reach and is_end_of_earlier(
                 row, end_x, end_y, segments
             ):

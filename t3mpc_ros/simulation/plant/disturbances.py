@@ -17,11 +17,11 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FrictionParameters(Parameters):
-    """Friction of each wheel: f of (10), which the paper counts among the disturbances."""
+    """Friction of each wheel: f of (10), which the paper includes in the disturbance."""
 
     viscous: float = parameter(
         2e-4,
-        'friction torque per wheel speed',
+        'viscous friction torque per wheel speed',
         unit='N m s/rad',
         low=0.0,
         high=10.0,
@@ -29,7 +29,7 @@ class FrictionParameters(Parameters):
     )
     coulomb: float = parameter(
         0.004,
-        'friction torque that does not depend on speed',
+        'Coulomb friction torque',
         unit='N m',
         low=0.0,
         high=10.0,
@@ -59,17 +59,17 @@ class DisturbanceParameters(Parameters):
     )
     frequencies: tuple[float, ...] = parameter(
         (0.11, 0.37, 1.3),
-        'frequencies of the sines, which share their part of the bound evenly',
+        'frequencies of the sines, which have equal amplitudes',
         unit='Hz',
         low=0.0,
         high=100.0,
     )
     walk_share: float = parameter(
-        0.3, 'part of the bound given to a random walk', low=0.0, high=1.0, dynamic=True
+        0.3, 'part of the bound used by a random walk', low=0.0, high=1.0, dynamic=True
     )
     walk_rate: float = parameter(
         0.5,
-        'spread of the walk after one second, relative to its part of the bound',
+        'standard deviation of the walk after one second, relative to its part of the bound',
         unit='1/√s',
         low=0.0,
         high=100.0,
@@ -95,7 +95,7 @@ class NoiseParameters(Parameters):
 def friction_torque(speed: float, viscous: float, coulomb: float, width: float) -> float:
     """Return the friction torque (N m) that opposes a wheel speed (rad/s): f of (10).
 
-    tanh in place of the sign keeps the dynamics smooth; it always takes energy out.
+    tanh in place of the sign keeps the dynamics smooth and the friction dissipative.
     """
     return viscous * speed + coulomb * math.tanh(speed / width)
 
@@ -106,7 +106,7 @@ def disturbance_torque(
 ) -> float:
     """Return tau_d of one wheel (N m) at ``time`` (s); never more than the bound in size.
 
-    load : shape (2,), the bound (N m) and the part of it given to the walk (1)
+    load : shape (2,), the bound (N m) and the part of it used by the walk (1)
     angular : shape (n,), rad/s; phases : shape (2, n), rad
     walk : shape (2,), each in [-1, 1]
     """
@@ -115,25 +115,25 @@ def disturbance_torque(
         sines += math.sin(angular[index] * time + phases[wheel, index])
     sines /= max(angular.size, 1)
     share = load[1]
-    # The clamp only takes off what rounding may add.
+    # The clamp removes rounding errors only.
     level = min(max((1.0 - share) * sines + share * walk[wheel], -1.0), 1.0)
     return float(load[0] * level)
 
 
 class Disturbance:
-    """Draws and holds what the disturbance torque of a run depends on.
+    """Random part of the disturbance torque of a run.
 
     Parameters
     ----------
-    settings
-        The table; a live change takes effect at the next :meth:`draw`.
+    parameters
+        A change takes effect at the next :meth:`draw`.
     generator
-        Used for nothing else, so that other random numbers do not shift these.
+        Used by this disturbance alone, so that other random numbers do not shift its own.
     """
 
     def __init__(self, parameters: DisturbanceParameters, generator: np.random.Generator) -> None:
         self.parameters = parameters
-        self._of = parameters
+        self._applied = parameters
         self._load: Array = np.array([parameters.bound, parameters.walk_share])
         self.angular: Array = 2.0 * np.pi * np.array(parameters.frequencies, dtype=np.float64)
         self.phases: Array = generator.uniform(0.0, 2.0 * np.pi, (2, self.angular.size))
@@ -143,17 +143,17 @@ class Disturbance:
 
     @property
     def load(self) -> Array:
-        """The bound (N m) and the walk's part of it, as :func:`disturbance_torque` wants them."""
-        if self.parameters is not self._of:
-            self._of = self.parameters
-            self._load = np.array([self._of.bound, self._of.walk_share])
+        """Argument of :func:`disturbance_torque`: the bound (N m) and the part of the walk."""
+        if self.parameters is not self._applied:
+            self._applied = self.parameters
+            self._load = np.array([self._applied.bound, self._applied.walk_share])
         return self._load
 
     def draw(self, dt: float) -> None:
-        """Move the walk of both wheels by ``dt`` seconds; it is reflected at -1 and 1.
+        """Advance the walk of both wheels by ``dt`` seconds; it is reflected at -1 and 1.
 
-        Two numbers are drawn whatever the settings say, so that a live change does not shift
-        the numbers that come after it.
+        Two numbers are drawn whatever the parameters, so that a change does not shift later
+        numbers.
         """
         self._generator.standard_normal(out=self._drawn)
         step = self.parameters.walk_rate * math.sqrt(dt)
@@ -161,9 +161,9 @@ class Disturbance:
             self.walk[wheel] = reflect(float(self.walk[wheel] + step * self._drawn[wheel]))
 
     def draw_ahead(self, dt: float, count: int) -> Array:
-        """Return the walks after each of ``count`` draws in turn, shape (count, 2).
+        """Return the walks after each of ``count`` draws, shape (count, 2).
 
-        The numbers are those that as many calls of :meth:`draw` would leave, one after the other.
+        The result equals that of ``count`` calls of :meth:`draw`.
         """
         walks: Array = np.empty((count, 2))
         step = self.parameters.walk_rate * math.sqrt(dt)
@@ -184,19 +184,19 @@ class Disturbance:
 
 
 def make_generators(seed: int) -> tuple[np.random.Generator, np.random.Generator]:
-    """Return the random numbers of one robot: those of its disturbance, those of its noise."""
+    """Return the random generators of the disturbance and of the noise of one robot."""
     for_disturbance, for_noise = np.random.SeedSequence(seed).spawn(2)
     return np.random.default_rng(for_disturbance), np.random.default_rng(for_noise)
 
 
 def reflect(value: float) -> float:
-    """Return ``value`` folded into [-1, 1] as if by mirrors at both ends."""
+    """Return ``value`` reflected at -1 and 1 into [-1, 1]."""
     unfolded = (value + 1.0) % 4.0
     return 1.0 - abs(unfolded - 2.0)
 
 
 class SpeedNoise:
-    """Blurs wheel speeds as a sensor does; same arguments as :class:`Disturbance`."""
+    """White noise of measured wheel speeds; same arguments as :class:`Disturbance`."""
 
     def __init__(self, parameters: NoiseParameters, generator: np.random.Generator) -> None:
         self.parameters = parameters
@@ -204,14 +204,14 @@ class SpeedNoise:
         self._drawn: Array = np.zeros(2)
 
     def measure(self, wheels: WheelSpeeds) -> WheelSpeeds:
-        """Return what is measured of ``wheels``. Two numbers are drawn, even without noise."""
+        """Return ``wheels`` with noise. Two numbers are drawn, even at zero variance."""
         self._generator.standard_normal(out=self._drawn)
         spread = math.sqrt(self.parameters.variance)
         right, left = self._drawn.tolist()
         return WheelSpeeds(wheels.right + spread * right, wheels.left + spread * left)
 
     def draw_ahead(self, count: int) -> Array:
-        """Return what the next ``count`` measurements would add, rad/s, shape (count, 2)."""
+        """Return the noise of the next ``count`` measurements, rad/s, shape (count, 2)."""
         noise: Array = math.sqrt(self.parameters.variance) * self._generator.standard_normal(
             (count, 2)
         )

@@ -1,6 +1,18 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Drivetrain: two stepper motors, two tyres and the body in one set of equations."""
+r"""Drivetrain: two stepper motors, two tyres and the body in one set of equations.
+
+The rotors turn with chi (rad/s); the ground passes below the wheels with psi, the speeds that
+rolling wheels would have, (1) inverted. A rolling tyre has chi = psi; a sliding one pushes with
+its full grip:
+
+.. math:: \bar\theta_b \dot\psi + \bar\eta \psi = R F + Q, \qquad
+          I_i \dot\chi_i = \tau_i - f(\chi_i) - \tau_{d,i} - R F_i, \qquad |F_i| \le \mu N_i
+
+with theta_bar_b the matrix (11) without the wheels' own inertia and Q the force of a wall. Where
+both tyres roll, the sum of the two is (10). Not modelled: sliding sideways, and load transfer
+between the wheels.
+"""
 
 from dataclasses import dataclass
 import math
@@ -33,8 +45,447 @@ from t3mpc_ros.simulation.world import World, clearance, grip_at
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
+
+_NO_SEGMENTS = np.zeros((0, 4))
+
+
+_NO_CIRCLES = np.zeros((0, 3))
+
+
 ROLLING = 0
-"""Mode of a tyre; +1 and -1 say that it slides, and which way it pushes the body."""
+"""Mode of a rolling tyre; +1 and -1: it slides and pushes the body in that direction."""
+
+
+GRAVITY = 9.81
+
+
+BLOCKED_INERTIA = 1e9
+"""Inertia (kg m²) of a blocked wheel: large enough to be immovable."""
+
+
+@dataclass(frozen=True)
+class TyreParameters(Parameters):
+    """Grip of the tyres."""
+
+    grip: float = parameter(
+        0.6, 'coefficient of friction between tyre and floor', low=0.0, high=5.0, dynamic=True
+    )
+    load_share: float = parameter(
+        0.8, 'part of the weight on the driven axle; the rest is on the caster', low=0.0, high=1.0
+    )
+
+
+class Load(NamedTuple):
+    """Body, friction and tyres that the motors move."""
+
+    body: BodyParameters
+    geometry: WheelGeometry
+    friction: FrictionParameters
+    friction_factor: float
+    tyres: TyreParameters
+    grip_factor: float
+    blocked: tuple[bool, bool]
+    """Blocked wheels, right first."""
+
+
+class Drivetrain:
+    """Motors, tyres and body: the arrays of :func:`integrate_drivetrain`, and their meaning.
+
+    Parameters
+    ----------
+    motor, bumper
+        Both motors, and the disc that touches walls.
+    world
+        Walls and patches.
+    step
+        Length of an integration step, s.
+    share
+        Of the IMU filter, see ``SimulatedImuParameters.share``.
+    """
+
+    def __init__(
+        self,
+        motor: StepperMotorParameters,
+        bumper: BumperParameters,
+        world: World,
+        step: float,
+        share: float,
+    ) -> None:
+        self.step = step
+        self.steps_done = 0
+        """Integration steps since the start: the time base of the disturbances."""
+        self.filtered: Array = np.zeros((3, 2))
+        """Both stages of the IMU filter for yaw rate, forward and sideways acceleration."""
+        self._microstep = motor.microstep
+        self._cycle = 2.0 * math.pi / motor.teeth
+        self._bumper = bumper
+        self._radius = bumper.radius
+        self._world = world
+        self._share = share
+        self._state: Array = np.zeros(9)
+        self._modes: Integers = np.zeros(2, dtype=np.int64)
+        self._field: Array = np.zeros(6)
+        self._totals: Array = np.zeros(4)
+        self._work: Array = np.zeros((4, 9))
+        self._blocked = (False, False)
+        self._read()
+
+    # -- state ------------------------------------------------------------------------------------
+
+    @property
+    def pose(self) -> Pose:
+        """True pose."""
+        return Pose(self._now[0], self._now[1], self._now[2])
+
+    @pose.setter
+    def pose(self, pose: Pose) -> None:
+        self._state[:3] = pose.x, pose.y, wrap_angle(pose.yaw)
+        self._read()
+
+    @property
+    def wheels(self) -> WheelSpeeds:
+        """Speeds of the rotors, chi."""
+        return WheelSpeeds(self._now[5], self._now[6])
+
+    @property
+    def ground(self) -> WheelSpeeds:
+        """Speeds that rolling wheels would have, psi: the true motion of the body."""
+        return WheelSpeeds(self._now[7], self._now[8])
+
+    @property
+    def counters(self) -> tuple[int, int]:
+        """Pulses issued since the start of the board, right first."""
+        return math.floor(self._pulses[0]), math.floor(self._pulses[1])
+
+    @property
+    def pulse_speeds(self) -> WheelSpeeds:
+        """Speeds of the fields, rad/s."""
+        return WheelSpeeds(self._pulses[2] * self._microstep, self._pulses[3] * self._microstep)
+
+    @property
+    def load_angles(self) -> tuple[float, float]:
+        """Angles (rad) of the fields ahead of the rotors, lost pitches included."""
+        state, field = self._now, self._pulses
+        return (
+            field[4] + self._microstep * math.floor(field[0]) - state[3],
+            field[5] + self._microstep * math.floor(field[1]) - state[4],
+        )
+
+    @property
+    def lost_steps(self) -> tuple[int, int]:
+        """Full steps of the rotors behind their fields, a multiple of four."""
+        right, left = self.load_angles
+        return 4 * round(right / self._cycle), 4 * round(left / self._cycle)
+
+    @property
+    def slid(self) -> tuple[float, float]:
+        """Distance (m) slid by each tyre so far."""
+        right, left = self._totals[:2].tolist()
+        return right, left
+
+    @property
+    def field_work(self) -> float:
+        """Work (J) done by the turning fields on the rotors so far."""
+        return float(self._totals[2])
+
+    @property
+    def max_contact_force(self) -> float:
+        """Largest contact force (N) of a wall so far."""
+        return float(self._totals[3])
+
+    @property
+    def sliding(self) -> tuple[bool, bool]:
+        """Whether each tyre slides, right first."""
+        right, left = self._modes.tolist()
+        return right != ROLLING, left != ROLLING
+
+    # -- inputs -----------------------------------------------------------------------------------
+
+    def load(self, motor: StepperMotorParameters, load: Load) -> None:
+        """Set motor and load from now on."""
+        self._robot = robot_vector(motor, load, self._bumper, self._share, self.step)
+        weight = GRAVITY * load.body.total_mass * load.tyres.load_share
+        self._grip = 0.5 * load.tyres.grip * weight * load.grip_factor
+        own = load.body.wheel_inertia + motor.rotor_inertia
+        self._tyres: Array = np.array([own, own, self._grip, self._grip])
+        for wheel, (was, now) in enumerate(zip(self._blocked, load.blocked, strict=True)):
+            if now:
+                self._tyres[wheel] = BLOCKED_INERTIA
+            if now and not was:
+                self._block(wheel)
+        self._blocked = load.blocked
+
+    def restart_board(self) -> None:
+        """Reset the pulse generator to zero, as after a power loss.
+
+        The field of the driver starts in its home position; a rotor moves to the nearest one.
+        """
+        for wheel in (0, 1):
+            cycles = round(float(self._state[3 + wheel]) / self._cycle)
+            self._field[wheel] = 0.0
+            self._field[2 + wheel] = 0.0
+            self._field[4 + wheel] = cycles * self._cycle
+        self._read()
+
+    def run(
+        self,
+        wheels: WheelSpeeds,
+        acceleration: float,
+        volts: float,
+        disturbance: Disturbance,
+        count: int,
+    ) -> None:
+        """Integrate ``count`` steps while the pulse generator ramps to ``wheels`` (rad/s).
+
+        The ramp is linear and ends with the last step, or is limited by ``acceleration`` (rad/s²,
+        0 = no limit); at zero ``volts`` the motors have no torque.
+        """
+        now = self.pulse_speeds
+        gap = max(abs(wheels.right - now.right), abs(wheels.left - now.left))
+        even = max(gap / (count * self.step), 1e-6)
+        reach = min(even, acceleration) if acceleration > 0.0 else even
+        x, y = self._now[0], self._now[1]
+        world = self._world
+        segments, circles = _NO_SEGMENTS, _NO_CIRCLES
+        if world.segments.size or world.circles.size:
+            near = self._radius + 2.0 * self.step * count  # 2 m/s: faster than any wheel
+            if clearance(x, y, world.segments, world.circles) < near:
+                segments, circles = world.segments, world.circles
+        if world.patches.size:
+            self._tyres[2:] = self._grip * grip_at(x, y, world.patches)
+        integrate_drivetrain(
+            self._state,
+            self._modes,
+            self._field,
+            wheels.right / self._microstep,
+            wheels.left / self._microstep,
+            reach / self._microstep,
+            volts,
+            self._robot,
+            self._tyres,
+            disturbance.load,
+            disturbance.angular,
+            disturbance.phases,
+            disturbance.walk,
+            segments,
+            circles,
+            self.filtered,
+            self.steps_done,
+            count,
+            self._totals,
+            self._work,
+        )
+        self._read()
+        self.steps_done += count
+
+    def _block(self, wheel: int) -> None:
+        """Stop a wheel at once; its tyre slides until the body has stopped too."""
+        self._state[5 + wheel] = 0.0
+        ground = float(self._state[7 + wheel])
+        self._modes[wheel] = ROLLING if ground == 0.0 else (-1 if ground > 0.0 else 1)
+        self._read()
+
+    def _read(self) -> None:
+        """Copy the arrays to lists, which are faster to read element by element."""
+        self._now = self._state.tolist()
+        self._pulses = self._field.tolist()
+        if abs(self._now[2]) > math.pi:
+            self._now[2] = self._state[2] = wrap_angle(self._now[2])
+
+
+def max_rate(
+    motor: StepperMotorParameters, load: Load, bumper: BumperParameters, factor: float = 1.0
+) -> float:
+    """Return an upper bound (1/s) of the rates of the coupled equations.
+
+    They are the oscillation of the rotor, which moves the wheel alone when the tyre slides, its
+    damping, and the oscillation of the body on its bumper.
+    """
+    inertia = load.body.wheel_inertia + motor.rotor_inertia
+    stiffness = motor.teeth * motor.torque_constant * motor.rated_current
+    friction = load.friction
+    damping = motor.damping + factor * (
+        friction.viscous + friction.coulomb / friction.coulomb_width
+    )
+    mass = load.body.total_mass
+    return (
+        math.sqrt(stiffness / inertia)
+        + damping / inertia
+        + (math.sqrt(bumper.stiffness / mass) + bumper.damping / mass)
+    )
+
+
+def body_vector(body: BodyParameters, geometry: WheelGeometry) -> Array:
+    """Return the constants of the body for the kernels, shape (6,).
+
+    R (m), R/(2b) (1), diagonal and off-diagonal entry of (11) without the wheels' own inertia
+    (kg m²), c of (12) (kg m²), distance of the centre of mass ahead of the axle (m).
+    """
+    inertia = wheel_inertia(body, geometry)
+    return np.array(
+        [
+            geometry.wheel_radius,
+            0.5 * geometry.wheel_radius / geometry.half_separation,
+            inertia[0, 0] - body.wheel_inertia,
+            inertia[0, 1],
+            coriolis_factor(body, geometry),
+            body.com_offset,
+        ]
+    )
+
+
+def robot_vector(
+    motor: StepperMotorParameters, load: Load, bumper: BumperParameters, share: float, step: float
+) -> Array:
+    """Return all constants of :func:`integrate_drivetrain` in one row, shape (22,).
+
+    body_vector (6); viscous (N m s/rad) and Coulomb friction (N m), its width (rad/s);
+    BumperParameters.vector (3); StepperMotorParameters.vector (7); microstep (rad), share of the
+    IMU filter, length of a step (s).
+    """
+    friction, factor = load.friction, load.friction_factor
+    friction_row = [factor * friction.viscous, factor * friction.coulomb, friction.coulomb_width]
+    return np.concatenate(
+        [
+            body_vector(load.body, load.geometry),
+            friction_row,
+            bumper.vector(),
+            motor.vector(),
+            [motor.microstep, share, step],
+        ]
+    )
+
+
+@kernel
+def integrate_drivetrain(
+    state: Array,
+    modes: Integers,
+    field: Array,
+    target_right: float,
+    target_left: float,
+    reach: float,
+    volts: float,
+    robot: Array,
+    tyres: Array,
+    load: Array,
+    angular: Array,
+    phases: Array,
+    walk: Array,
+    segments: Array,
+    circles: Array,
+    filtered: Array,
+    first: int,
+    count: int,
+    totals: Array,
+    work: Array,
+) -> None:
+    """Integrate rotors, tyres and body over ``count`` steps by the classical Runge-Kutta method.
+
+    The field is constant between two pulses and jumps with each: its position is the whole number
+    of pulses in the phase. Evaluated at the stages alone, the jumps would be late by up to half a
+    step, an error of first order; within a step the staircase is therefore replaced by the
+    straight line with its mean and its slope. Tyres change between rolling and sliding at the end
+    of a step.
+
+    state : shape (9,), see motion_rates; modes : shape (2,); both changed in place
+    field : shape (6,), phase (pulses), rate (pulses/s), position of pulse 0 (rad); right first
+    target_* : target pulse rates (pulses/s); reach : largest change of a rate (pulses/s²)
+    volts : supply voltage; 0 = no power, the rotors turn freely
+    robot : shape (22,), see robot_vector
+    tyres, segments, circles : see motion_rates
+    load, angular, phases, walk : see disturbance_torque
+    filtered : shape (3, 2), the filter of the IMU, see low_pass; changed in place
+    first : number of the first step since the start; the time is first times step
+    totals : shape (4,), accumulated: distance (m) slid by each tyre, work (J) of the fields;
+        largest force (N) of a wall
+    work : shape (4, 9), overwritten
+    """
+    body, friction, bumper, motor = robot[0:6], robot[6:9], robot[9:12], robot[12:19]
+    microstep, share, step = robot[19], robot[20], robot[21]
+    trial, slope, total = work[0], work[1], work[2]
+    torque, pushed = work[3, 0:2], work[3, 2:5]
+    for index in range(first, first + count):
+        rate_right, rate_left = field[2], field[3]
+        slip_right, slip_left = state[5] - state[7], state[6] - state[8]
+        next_right, next_left = ramp_towards(
+            rate_right, rate_left, target_right, target_left, reach * step
+        )
+        widest = max(abs(target_right - rate_right), abs(target_left - rate_left))
+        reached = widest / (reach * step)
+        mean_right = mean_rate(rate_right, target_right, reached)
+        mean_left = mean_rate(rate_left, target_left, reached)
+        end_right, end_left = field[0] + step * mean_right, field[1] + step * mean_left
+        position_right, position_left = (
+            mean_pulses(field[0], end_right),
+            mean_pulses(field[1], end_left),
+        )
+        peak_right = pull_out_torque(mean_right * microstep, volts, motor)
+        peak_left = pull_out_torque(mean_left * microstep, volts, motor)
+        time = (index + 0.5) * step
+        against_right = disturbance_torque(0, time, load, angular, phases, walk)
+        against_left = disturbance_torque(1, time, load, angular, phases, walk)
+        slope[:] = 0.0
+        total[:] = 0.0
+        done = 0.0
+        for stage in range(4):
+            part = 0.5 if stage in (1, 2) else (1.0 if stage == 3 else 0.0)
+            weight = 1.0 / 3.0 if stage in (1, 2) else 1.0 / 6.0
+            for item in range(9):
+                trial[item] = state[item] + part * step * slope[item]
+            since = (part - 0.5) * step
+            pull_right = rotor_torque(
+                field[4] + microstep * (position_right + since * mean_right) - trial[3],
+                microstep * mean_right - trial[5],
+                peak_right,
+                motor,
+            )
+            pull_left = rotor_torque(
+                field[5] + microstep * (position_left + since * mean_left) - trial[4],
+                microstep * mean_left - trial[6],
+                peak_left,
+                motor,
+            )
+            done += weight * microstep * (pull_right * mean_right + pull_left * mean_left)
+            torque[0] = pull_right - against_right
+            torque[1] = pull_left - against_left
+            torque[0] -= friction_torque(trial[5], friction[0], friction[1], friction[2])
+            torque[1] -= friction_torque(trial[6], friction[0], friction[1], friction[2])
+            state_derivative(
+                trial, modes, torque, body, tyres, bumper, segments, circles, slope, pushed
+            )
+            for item in range(9):
+                total[item] += weight * slope[item]
+        for item in range(9):
+            state[item] += step * total[item]
+        field[0], field[1] = end_right, end_left
+        field[2], field[3] = next_right, next_left
+        # The last stage is at the end of the step: its torques decide the modes of the tyres.
+        stopped = stops_sliding(state, modes)
+        state_derivative(
+            state, modes, torque, body, tyres, bumper, segments, circles, slope, pushed
+        )
+        slides = loses_grip(modes, pushed, body, tyres)
+        if stopped:
+            # Only tyres that the grip can hold: without grip no momentum is transferred.
+            begin_rolling(state, modes, body, tyres)
+        if stopped or slides:
+            state_derivative(
+                state, modes, torque, body, tyres, bumper, segments, circles, slope, pushed
+            )
+        radius, offset = body[0], body[5]
+        speed = 0.5 * radius * (state[7] + state[8])
+        turning = body[1] * (state[7] - state[8])
+        low_pass(
+            filtered,
+            turning,
+            0.5 * radius * (slope[7] + slope[8]) - offset * turning * turning,
+            speed * turning + offset * body[1] * (slope[7] - slope[8]),
+            share,
+        )
+        totals[0] += 0.5 * step * radius * abs(slip_right + state[5] - state[7])
+        totals[1] += 0.5 * step * radius * abs(slip_left + state[6] - state[8])
+        totals[2] += step * done
+        totals[3] = max(totals[3], abs(pushed[2]))
 
 
 @kernel
@@ -50,16 +501,16 @@ def state_derivative(
     slope: Array,
     pushed: Array,
 ) -> None:
-    """Write the rates of change of the state, and the forces of tyres and wall.
+    """Write the derivative of the state, and the forces of tyres and wall.
 
     now : shape (9,), x, y (m), P, theta_R, theta_L (rad), chi and psi (rad/s, right first)
-    modes : shape (2,), see ROLLS
-    torque : shape (2,), motor less friction and disturbance, N m
-    body : shape (6,), see ``chassis.body_vector``
-    tyres : shape (4,), inertia of each wheel (kg m²), most force of each tyre (N)
-    bumper, segments, circles : see contact_force; no segments and circles = no wall is near
+    modes : shape (2,), see ROLLING
+    torque : shape (2,), motor minus friction and disturbance, N m
+    body : shape (6,), see body_vector
+    tyres : shape (4,), inertia of each wheel (kg m²), largest force of each tyre (N)
+    bumper, segments, circles : see contact_force; empty arrays = no wall is near
     slope : shape (9,), written
-    pushed : shape (3,), written: R F of both tyres (N m), force of the wall along the heading (N)
+    pushed : shape (3,), written: R F of both tyres (N m), force of the wall along the robot (N)
     """
     radius, turn = body[0], body[1]
     right, left = now[7], now[8]
@@ -104,9 +555,9 @@ def state_derivative(
 
 @kernel
 def begin_rolling(state: Array, modes: Integers, body: Array, tyres: Array) -> None:
-    """Let body and wheel go on with one speed, their momentum kept, where a tyre now rolls.
+    """Give body and wheel of a tyre that begins to roll one speed, with momentum conserved.
 
-    A tyre whose chi and psi are equal already is left as it is.
+    A tyre whose chi and psi are equal is unchanged.
     """
     right = body[2] * state[7] + body[3] * state[8]
     left = body[3] * state[7] + body[2] * state[8]
@@ -128,7 +579,7 @@ def begin_rolling(state: Array, modes: Integers, body: Array, tyres: Array) -> N
 
 @kernel
 def stops_sliding(state: Array, modes: Integers) -> bool:
-    """Return whether a tyre slid to its end, chi - psi changing sign; it rolls from now on."""
+    """Return whether a tyre stopped sliding, chi - psi changing sign; it rolls from now on."""
     changed = False
     for wheel in range(2):
         if modes[wheel] != ROLLING and modes[wheel] * (state[5 + wheel] - state[7 + wheel]) <= 0.0:
@@ -139,7 +590,7 @@ def stops_sliding(state: Array, modes: Integers) -> bool:
 
 @kernel
 def loses_grip(modes: Integers, pushed: Array, body: Array, tyres: Array) -> bool:
-    """Return whether a rolling tyre was asked for more than its grip; it slides from now on."""
+    """Return whether the force of a rolling tyre exceeded its grip; it slides from now on."""
     changed = False
     for wheel in range(2):
         if modes[wheel] == ROLLING and abs(pushed[wheel]) > body[0] * tyres[2 + wheel]:
@@ -150,7 +601,7 @@ def loses_grip(modes: Integers, pushed: Array, body: Array, tyres: Array) -> boo
 
 @kernel
 def mean_pulses(start: float, end: float) -> float:
-    """Return the mean of floor(phase) while the phase (pulses) goes evenly from start to end.
+    """Return the mean of floor(phase) while the phase (pulses) changes linearly from start to end.
 
     The integral of floor is n (n - 1)/2 + n (p - n) with n = floor(p).
     """
@@ -164,440 +615,10 @@ def mean_pulses(start: float, end: float) -> float:
 
 @kernel
 def mean_rate(rate: float, target: float, reached: float) -> float:
-    """Return the mean of a rate that goes evenly to its target within ``reached`` of a step.
+    """Return the mean of a rate that changes linearly to its target within ``reached`` of a step.
 
-    reached : share of the step after which the target is kept; more than 1 if it is not reached
+    reached : part of the step after which the rate is constant; more than 1 if not reached
     """
     if reached >= 1.0:
         return rate + 0.5 * (target - rate) / reached
     return target - 0.5 * reached * (target - rate)
-
-
-@kernel
-def integrate_drivetrain(
-    state: Array,
-    modes: Integers,
-    field: Array,
-    target_right: float,
-    target_left: float,
-    reach: float,
-    volts: float,
-    robot: Array,
-    tyres: Array,
-    load: Array,
-    angular: Array,
-    phases: Array,
-    walk: Array,
-    segments: Array,
-    circles: Array,
-    filtered: Array,
-    first: int,
-    count: int,
-    tally: Array,
-    work: Array,
-) -> None:
-    """Integrate rotors, tyres and body over ``count`` steps by the classical Runge-Kutta method.
-
-    The field stands still between two pulses and jumps with each: its place is the whole number
-    of pulses that the phase has passed. Seen at the stages alone, the jumps would be late by up
-    to half a step, an error of first order; so the staircase is replaced, within a step, by the
-    straight line that has its mean and its slope. Tyres change between rolling and sliding at the
-    end of a step.
-
-    state : shape (9,), see motion_rates; modes : shape (2,); both changed in place
-    field : shape (6,), phase (pulses), rate (pulses/s), place of pulse 0 (rad); each right, left
-    target_* : pulse rates to reach (pulses/s); reach : most change of a rate (pulses/s²)
-    volts : supply; 0 = no power, the rotors turn freely
-    robot : shape (22,), see ``chassis.robot_vector``
-    tyres, segments, circles : see motion_rates
-    load, angular, phases, walk : see disturbance_torque
-    filtered : shape (3, 2), the inertial sensor's filter, see low_pass; changed in place
-    first : number of the first step since the run began; the time is first times step
-    tally : shape (4,), added to: way (m) each tyre slid, work (J) of the fields; largest force (N)
-        of a wall
-    work : shape (4, 9), overwritten
-    """
-    body, friction, bumper, motor = robot[0:6], robot[6:9], robot[9:12], robot[12:19]
-    microstep, share, step = robot[19], robot[20], robot[21]
-    trial, slope, total = work[0], work[1], work[2]
-    torque, pushed = work[3, 0:2], work[3, 2:5]
-    for index in range(first, first + count):
-        rate_right, rate_left = field[2], field[3]
-        slip_right, slip_left = state[5] - state[7], state[6] - state[8]
-        next_right, next_left = ramp_towards(
-            rate_right, rate_left, target_right, target_left, reach * step
-        )
-        widest = max(abs(target_right - rate_right), abs(target_left - rate_left))
-        reached = widest / (reach * step)
-        mean_right = mean_rate(rate_right, target_right, reached)
-        mean_left = mean_rate(rate_left, target_left, reached)
-        end_right, end_left = field[0] + step * mean_right, field[1] + step * mean_left
-        place_right, place_left = mean_pulses(field[0], end_right), mean_pulses(field[1], end_left)
-        peak_right = pull_out_torque(mean_right * microstep, volts, motor)
-        peak_left = pull_out_torque(mean_left * microstep, volts, motor)
-        time = (index + 0.5) * step
-        against_right = disturbance_torque(0, time, load, angular, phases, walk)
-        against_left = disturbance_torque(1, time, load, angular, phases, walk)
-        slope[:] = 0.0
-        total[:] = 0.0
-        done = 0.0
-        for stage in range(4):
-            part = 0.5 if stage in (1, 2) else (1.0 if stage == 3 else 0.0)
-            weight = 1.0 / 3.0 if stage in (1, 2) else 1.0 / 6.0
-            for item in range(9):
-                trial[item] = state[item] + part * step * slope[item]
-            since = (part - 0.5) * step
-            pull_right = rotor_torque(
-                field[4] + microstep * (place_right + since * mean_right) - trial[3],
-                microstep * mean_right - trial[5],
-                peak_right,
-                motor,
-            )
-            pull_left = rotor_torque(
-                field[5] + microstep * (place_left + since * mean_left) - trial[4],
-                microstep * mean_left - trial[6],
-                peak_left,
-                motor,
-            )
-            done += weight * microstep * (pull_right * mean_right + pull_left * mean_left)
-            torque[0] = pull_right - against_right
-            torque[1] = pull_left - against_left
-            torque[0] -= friction_torque(trial[5], friction[0], friction[1], friction[2])
-            torque[1] -= friction_torque(trial[6], friction[0], friction[1], friction[2])
-            state_derivative(
-                trial, modes, torque, body, tyres, bumper, segments, circles, slope, pushed
-            )
-            for item in range(9):
-                total[item] += weight * slope[item]
-        for item in range(9):
-            state[item] += step * total[item]
-        field[0], field[1] = end_right, end_left
-        field[2], field[3] = next_right, next_left
-        # The last stage stood at the end of the step: its torques serve to see what the tyres do.
-        held = stops_sliding(state, modes)
-        state_derivative(
-            state, modes, torque, body, tyres, bumper, segments, circles, slope, pushed
-        )
-        slides = loses_grip(modes, pushed, body, tyres)
-        if held:
-            # Only tyres that the grip can hold: on ice no momentum is passed on.
-            begin_rolling(state, modes, body, tyres)
-        if held or slides:
-            state_derivative(
-                state, modes, torque, body, tyres, bumper, segments, circles, slope, pushed
-            )
-        radius, offset = body[0], body[5]
-        speed = 0.5 * radius * (state[7] + state[8])
-        turning = body[1] * (state[7] - state[8])
-        low_pass(
-            filtered,
-            turning,
-            0.5 * radius * (slope[7] + slope[8]) - offset * turning * turning,
-            speed * turning + offset * body[1] * (slope[7] - slope[8]),
-            share,
-        )
-        tally[0] += 0.5 * step * radius * abs(slip_right + state[5] - state[7])
-        tally[1] += 0.5 * step * radius * abs(slip_left + state[6] - state[8])
-        tally[2] += step * done
-        tally[3] = max(tally[3], abs(pushed[2]))
-
-
-GRAVITY = 9.81
-BLOCKED_INERTIA = 1e9
-"""Inertia (kg m²) of a wheel that something holds: large enough that nothing here moves it."""
-
-_NO_SEGMENTS = np.zeros((0, 4))
-_NO_CIRCLES = np.zeros((0, 3))
-
-
-@dataclass(frozen=True)
-class TyreParameters(Parameters):
-    """How the wheels hold on to the floor."""
-
-    grip: float = parameter(
-        0.6, 'coefficient of friction between tyre and floor', low=0.0, high=5.0, dynamic=True
-    )
-    load_share: float = parameter(
-        0.8, 'part of the weight on the driven axle; the rest is on the caster', low=0.0, high=1.0
-    )
-
-
-class Load(NamedTuple):
-    """What the motors move, and what holds it back."""
-
-    body: BodyParameters
-    geometry: WheelGeometry
-    friction: FrictionParameters
-    friction_factor: float
-    tyres: TyreParameters
-    grip_factor: float
-    blocked: tuple[bool, bool]
-    """Wheels that something holds, right first."""
-
-
-def body_vector(body: BodyParameters, geometry: WheelGeometry) -> Array:
-    """Return what the coupled kernels need of the body, shape (6,).
-
-    R (m), R/(2b) (1), diagonal and off-diagonal entry of (11) without the wheels' own inertia
-    (kg m²), c of (12) (kg m²), how far the centre of mass lies ahead of the axle (m).
-    """
-    inertia = wheel_inertia(body, geometry)
-    return np.array(
-        [
-            geometry.wheel_radius,
-            0.5 * geometry.wheel_radius / geometry.half_separation,
-            inertia[0, 0] - body.wheel_inertia,
-            inertia[0, 1],
-            coriolis_factor(body, geometry),
-            body.com_offset,
-        ]
-    )
-
-
-def robot_vector(
-    motor: StepperMotorParameters, load: Load, bumper: BumperParameters, share: float, step: float
-) -> Array:
-    """Return all constants of :func:`run_coupled` in one row, shape (22,): fewer to hand over.
-
-    body_vector (6); viscous (N m s/rad) and Coulomb friction (N m), its width (rad/s);
-    BumperParameters.vector (3); StepperMotorParameters.vector (7); microstep (rad), share of the inertial
-    sensor's filter, length of a step (s).
-    """
-    friction, factor = load.friction, load.friction_factor
-    rubs = [factor * friction.viscous, factor * friction.coulomb, friction.coulomb_width]
-    return np.concatenate(
-        [
-            body_vector(load.body, load.geometry),
-            rubs,
-            bumper.vector(),
-            motor.vector(),
-            [motor.microstep, share, step],
-        ]
-    )
-
-
-def max_rate(
-    motor: StepperMotorParameters, load: Load, bumper: BumperParameters, factor: float = 1.0
-) -> float:
-    """Return an upper bound (1/s) of how fast the coupled equations can change.
-
-    The rotor's swing, with the wheel alone to move when the tyre slides; what damps it; and the
-    body's swing on its bumper.
-    """
-    inertia = load.body.wheel_inertia + motor.rotor_inertia
-    stiffness = motor.teeth * motor.torque_constant * motor.rated_current
-    friction = load.friction
-    damping = motor.damping + factor * (
-        friction.viscous + friction.coulomb / friction.coulomb_width
-    )
-    mass = load.body.total_mass
-    return (
-        math.sqrt(stiffness / inertia)
-        + damping / inertia
-        + (math.sqrt(bumper.stiffness / mass) + bumper.damping / mass)
-    )
-
-
-class Drivetrain:
-    """The numbers that :func:`run_coupled` works on, and their meaning.
-
-    Parameters
-    ----------
-    motor, bumper
-        Both motors, and the disc that touches walls.
-    world
-        Where the robot drives.
-    step
-        Length of an integration step, s.
-    share
-        Of the inertial sensor's filter, see ``ImuParameters.share``.
-    """
-
-    def __init__(
-        self,
-        motor: StepperMotorParameters,
-        bumper: BumperParameters,
-        world: World,
-        step: float,
-        share: float,
-    ) -> None:
-        self.step = step
-        self.steps_done = 0
-        """Integration steps since the chassis was made: the time that its disturbances know."""
-        self.filtered: Array = np.zeros((3, 2))
-        """Both stages of the inertial sensor's filter for yaw rate, forward, sideways."""
-        self._microstep = motor.microstep
-        self._cycle = 2.0 * math.pi / motor.teeth
-        self._bumper = bumper
-        self._radius = bumper.radius
-        self._world = world
-        self._share = share
-        self._state: Array = np.zeros(9)
-        self._modes: Integers = np.zeros(2, dtype=np.int64)
-        self._field: Array = np.zeros(6)
-        self._tally: Array = np.zeros(4)
-        self._work: Array = np.zeros((4, 9))
-        self._blocked = (False, False)
-        self._read()
-
-    # -- what is so -------------------------------------------------------------------------------
-
-    @property
-    def pose(self) -> Pose:
-        """The true pose."""
-        return Pose(self._now[0], self._now[1], self._now[2])
-
-    @pose.setter
-    def pose(self, pose: Pose) -> None:
-        self._state[:3] = pose.x, pose.y, wrap_angle(pose.yaw)
-        self._read()
-
-    @property
-    def wheels(self) -> WheelSpeeds:
-        """How fast the rotors turn, chi."""
-        return WheelSpeeds(self._now[5], self._now[6])
-
-    @property
-    def ground(self) -> WheelSpeeds:
-        """How fast wheels that roll would turn, psi: what the body really does."""
-        return WheelSpeeds(self._now[7], self._now[8])
-
-    @property
-    def counters(self) -> tuple[int, int]:
-        """Pulses issued since the board was started, right first."""
-        return math.floor(self._pulses[0]), math.floor(self._pulses[1])
-
-    @property
-    def pulse_speeds(self) -> WheelSpeeds:
-        """How fast the fields turn, rad/s."""
-        return WheelSpeeds(self._pulses[2] * self._microstep, self._pulses[3] * self._microstep)
-
-    @property
-    def load_angles(self) -> tuple[float, float]:
-        """How far (rad) the fields are ahead of the rotors, whole lost pitches included."""
-        state, field = self._now, self._pulses
-        return (
-            field[4] + self._microstep * math.floor(field[0]) - state[3],
-            field[5] + self._microstep * math.floor(field[1]) - state[4],
-        )
-
-    @property
-    def lost_steps(self) -> tuple[int, int]:
-        """Full steps the rotors are behind their fields: always a multiple of four."""
-        right, left = self.load_angles
-        return 4 * round(right / self._cycle), 4 * round(left / self._cycle)
-
-    @property
-    def slid(self) -> tuple[float, float]:
-        """Way (m) that each tyre has slid over the floor so far."""
-        right, left = self._tally[:2].tolist()
-        return right, left
-
-    @property
-    def field_work(self) -> float:
-        """Work (J) that the turning fields have done on the rotors so far."""
-        return float(self._tally[2])
-
-    @property
-    def max_contact_force(self) -> float:
-        """Largest force (N) with which a wall has pushed so far."""
-        return float(self._tally[3])
-
-    @property
-    def sliding(self) -> tuple[bool, bool]:
-        """Whether each tyre slides, right first."""
-        right, left = self._modes.tolist()
-        return right != ROLLING, left != ROLLING
-
-    # -- what happens to it -----------------------------------------------------------------------
-
-    def load(self, motor: StepperMotorParameters, load: Load) -> None:
-        """Take what acts from now on."""
-        self._robot = robot_vector(motor, load, self._bumper, self._share, self.step)
-        weight = GRAVITY * load.body.total_mass * load.tyres.load_share
-        self._grip = 0.5 * load.tyres.grip * weight * load.grip_factor
-        own = load.body.wheel_inertia + motor.rotor_inertia
-        self._tyres: Array = np.array([own, own, self._grip, self._grip])
-        for wheel, (was, now) in enumerate(zip(self._blocked, load.blocked, strict=True)):
-            if now:
-                self._tyres[wheel] = BLOCKED_INERTIA
-            if now and not was:
-                self._hold(wheel)
-        self._blocked = load.blocked
-
-    def restart_board(self) -> None:
-        """Let the pulse generator start at zero, as after a loss of power.
-
-        The driver's field starts in its home position; a rotor is pulled to the nearest one.
-        """
-        for wheel in (0, 1):
-            cycles = round(float(self._state[3 + wheel]) / self._cycle)
-            self._field[wheel] = 0.0
-            self._field[2 + wheel] = 0.0
-            self._field[4 + wheel] = cycles * self._cycle
-        self._read()
-
-    def run(
-        self,
-        wheels: WheelSpeeds,
-        acceleration: float,
-        volts: float,
-        disturbance: Disturbance,
-        count: int,
-    ) -> None:
-        """Integrate ``count`` steps while the pulse generator goes for ``wheels`` (rad/s).
-
-        It goes there evenly, to arrive with the last step, unless ``acceleration`` (rad/s², 0 =
-        no limit) lets it not; without ``volts`` nothing pulls.
-        """
-        now = self.pulse_speeds
-        gap = max(abs(wheels.right - now.right), abs(wheels.left - now.left))
-        even = max(gap / (count * self.step), 1e-6)
-        reach = min(even, acceleration) if acceleration > 0.0 else even
-        x, y = self._now[0], self._now[1]
-        world = self._world
-        segments, circles = _NO_SEGMENTS, _NO_CIRCLES
-        if world.segments.size or world.circles.size:
-            near = self._radius + 2.0 * self.step * count  # 2 m/s: no wheel is as fast
-            if clearance(x, y, world.segments, world.circles) < near:
-                segments, circles = world.segments, world.circles
-        if world.patches.size:
-            self._tyres[2:] = self._grip * grip_at(x, y, world.patches)
-        integrate_drivetrain(
-            self._state,
-            self._modes,
-            self._field,
-            wheels.right / self._microstep,
-            wheels.left / self._microstep,
-            reach / self._microstep,
-            volts,
-            self._robot,
-            self._tyres,
-            disturbance.load,
-            disturbance.angular,
-            disturbance.phases,
-            disturbance.walk,
-            segments,
-            circles,
-            self.filtered,
-            self.steps_done,
-            count,
-            self._tally,
-            self._work,
-        )
-        self._read()
-        self.steps_done += count
-
-    def _hold(self, wheel: int) -> None:
-        """Stop a wheel at once; the tyre slides until the body has stopped too."""
-        self._state[5 + wheel] = 0.0
-        passing = float(self._state[7 + wheel])
-        self._modes[wheel] = ROLLING if passing == 0.0 else (-1 if passing > 0.0 else 1)
-        self._read()
-
-    def _read(self) -> None:
-        """Take the numbers out of the arrays: reading them there one by one is slow."""
-        self._now = self._state.tolist()
-        self._pulses = self._field.tolist()
-        if abs(self._now[2]) > math.pi:
-            self._now[2] = self._state[2] = wrap_angle(self._now[2])

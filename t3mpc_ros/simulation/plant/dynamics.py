@@ -1,6 +1,16 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Lagrangian dynamics of a differential drive, equations (4)-(15) with E2-E5."""
+r"""Lagrangian dynamics of a differential drive, equations (4)-(15) with E2-E5.
+
+The generalised coordinates are q = (x, y, P, theta_R, theta_L): (x, y) is the middle of the
+wheel axle in the world frame (m), P the yaw (rad), and the thetas are the angles turned by the
+wheels (rad). chi = (theta_R', theta_L') are the wheel speeds (rad/s), right first.
+
+E16: only the body is off the axle, the wheels are not: every first moment of mass is m_c d. The
+printed (5) and (6) have m d, which is the same number when d there means the distance to the
+centre of mass of the *whole* robot; with the d of (14) it must be m_c d, and only then does the
+reduction give (12).
+"""
 
 from dataclasses import dataclass
 import math
@@ -39,7 +49,7 @@ class BodyParameters(Parameters):
     )
     com_offset: float = parameter(
         0.02,
-        'how far the centre of mass of the body lies ahead of the axle, d',
+        'distance of the centre of mass of the body ahead of the axle, d',
         unit='m',
         low=-1.0,
         high=1.0,
@@ -47,7 +57,7 @@ class BodyParameters(Parameters):
 
     @property
     def total_mass(self) -> float:
-        """The whole mass m of (14), in kg."""
+        """Total mass m of (14), in kg."""
         return self.body_mass + 2.0 * self.wheel_mass
 
     def total_inertia(self, geometry: WheelGeometry) -> float:
@@ -79,7 +89,7 @@ def inertia_matrix(yaw: float, body: BodyParameters, geometry: WheelGeometry) ->
 def coriolis_matrix(yaw: float, yaw_rate: float, body: BodyParameters) -> Array:
     """Return eta(q, q') of (6) with E2: shape (5, 5), so that eta q' is the centrifugal force.
 
-    E2: the terms stand in the third column and carry P', because they come from P'^2. E16: they
+    E2: the terms are in the third column and carry P', because they derive from P'^2. E16: they
     carry m_c, not m.
     """
     pull = body.body_mass * body.com_offset * yaw_rate
@@ -97,7 +107,7 @@ def input_matrix() -> Array:
 
 
 def constraint_matrix(yaw: float, geometry: WheelGeometry) -> Array:
-    """Return Q of (7), shape (3, 5): Q q' = 0 says no side slip, right and left wheel roll.
+    """Return Q of (7), shape (3, 5): Q q' = 0 means no side slip, both wheels roll.
 
     E15: the printed first column holds -d in its third row, which belongs to coordinates at the
     centre of mass. Here (x, y) is on the axle, as (5) and (8) have it, so that entry is 0; with
@@ -126,7 +136,7 @@ def constraint_rate(yaw: float, yaw_rate: float) -> Array:
 def null_space(yaw: float, geometry: WheelGeometry) -> Array:
     """Return varsigma of (8), shape (5, 2), with q' = varsigma chi.
 
-    E3: print says chi' = varsigma chi; what it maps the wheel speeds to is q'.
+    E3: the paper prints chi' = varsigma chi; varsigma maps the wheel speeds to q'.
     """
     half_radius = 0.5 * geometry.wheel_radius
     turn = half_radius / geometry.half_separation
@@ -146,9 +156,9 @@ def null_space_rate(yaw: float, yaw_rate: float, geometry: WheelGeometry) -> Arr
 def reduce_to_wheels(
     yaw: float, yaw_rate: float, body: BodyParameters, geometry: WheelGeometry
 ) -> tuple[Array, Array, Array]:
-    """Return (theta_bar, eta_bar, W_bar) of (10), each (2, 2), by projecting (4) as (9) says.
+    """Return (theta_bar, eta_bar, W_bar) of (10), each (2, 2), by projecting (4) as in (9).
 
-    E3: in (9) it is eta varsigma chi; print lost the chi. The multipliers vanish because
+    E3: in (9) it is eta varsigma chi; the paper omits chi. The multipliers vanish because
     varsigma^T Q^T = 0. The last one is the identity (13).
     """
     basis = null_space(yaw, geometry)
@@ -174,7 +184,7 @@ def constrained_acceleration(
     coordinates, rates
         q and q', shape (5,).
     torque
-        Wheel torques less friction and disturbance, right first, shape (2,), N m.
+        Wheel torques minus friction and disturbance, right first, shape (2,), N m.
 
     Returns
     -------
@@ -208,8 +218,8 @@ def wheel_inertia(body: BodyParameters, geometry: WheelGeometry) -> Array:
 def coriolis_factor(body: BodyParameters, geometry: WheelGeometry) -> float:
     """Return c = R^2 m_c d / (2 b) of (12), in kg m².
 
-    E4: print divides by 2 b^2, which lacks the unit of an inertia. Energy cannot tell the two
-    apart (the matrix is skew either way); the unreduced equations (4) can.
+    E4: the paper divides by 2 b^2, which lacks the unit of an inertia. Energy does not
+    distinguish the two (the matrix is skew either way); the unreduced equations (4) do.
     """
     moment = body.body_mass * body.com_offset
     return geometry.wheel_radius**2 * moment / geometry.wheel_separation
@@ -233,7 +243,7 @@ def body_dynamics(
 ) -> tuple[Array, Array, Array]:
     """Return the inertia, Coriolis and input matrices of (15) with E5, each (2, 2).
 
-    They stand in ``inertia (v', omega') + coriolis (v, omega) = input (u1, u2)`` with
+    They appear in ``inertia (v', omega') + coriolis (v, omega) = input (u1, u2)`` with
     u1 = tau_R + tau_L and u2 = b (tau_R - tau_L), both in N m and N m².
 
     E5: the printed first matrix repeats (12); the inertia in (v, omega) is
@@ -250,7 +260,7 @@ def body_dynamics(
 
 
 def dynamics_vector(body: BodyParameters, geometry: WheelGeometry) -> Array:
-    """Return what :func:`wheel_acceleration` needs of a robot, shape (5,).
+    """Return the constants of :func:`wheel_acceleration`, shape (5,).
 
     R (m), R/(2b) (1), diagonal and off-diagonal entry of (11) (kg m²), c of (12) (kg m²).
     """

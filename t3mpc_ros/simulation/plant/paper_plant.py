@@ -45,12 +45,12 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DriveParameters(Parameters):
-    """How the wheels are driven."""
+    """Drive of the wheels."""
 
     kind: str = parameter(
         'velocity',
-        'stepper: the digital twin, whose motors turn in steps; velocity: wheels follow commanded '
-        'speeds by a servo; torque: the command is the torque itself, as in the paper',
+        'stepper: digital twin with stepper motors; velocity: a servo tracks the commanded wheel '
+        'speeds; torque: the command is the torque, as in the paper',
         choices=('velocity', 'torque', 'stepper'),
     )
     dead_time: float = parameter(
@@ -62,7 +62,7 @@ class DriveParameters(Parameters):
     )
     acceleration: float = parameter(
         60.0,
-        'largest wheel acceleration the drive is asked for; 0 means no limit',
+        'largest wheel acceleration of the drive; 0 = no limit',
         unit='rad/s²',
         low=0.0,
         high=1e5,
@@ -70,7 +70,7 @@ class DriveParameters(Parameters):
     )
     lag: float = parameter(
         0.020,
-        'time constant with which the wheels of the nominal body follow',
+        'time constant of the wheel speed servo with the nominal body',
         unit='s',
         low=1e-3,
         high=2.0,
@@ -87,7 +87,7 @@ class DriveParameters(Parameters):
     )
     speed_ceiling: float = parameter(
         39.6,
-        'wheel speed that the motors cannot exceed whatever the torque',
+        'largest wheel speed of the motors, whatever the torque',
         unit='rad/s',
         low=1.0,
         high=1000.0,
@@ -96,10 +96,350 @@ class DriveParameters(Parameters):
     )
 
 
+STABILITY_LIMIT = 2.0
+"""Largest permitted product of step and fastest rate; Runge-Kutta is stable up to 2.78."""
+
+
+@dataclass(frozen=True)
+class PaperRobotParameters(Parameters):
+    """Parameters of a simulated robot with the paper's plant."""
+
+    geometry: WheelGeometry = group(WheelGeometry, inline=True)
+    body: BodyParameters = group(BodyParameters)
+    friction: FrictionParameters = group(FrictionParameters)
+    disturbance: DisturbanceParameters = group(DisturbanceParameters)
+    noise: NoiseParameters = group(NoiseParameters)
+    drive: DriveParameters = group(DriveParameters)
+    limiter: CommandLimiterParameters = group(CommandLimiterParameters, inline=True)
+    odometry: WheelOdometryParameters = group(WheelOdometryParameters)
+    mass_factor: float = parameter(
+        1.0,
+        'true over nominal body mass; the drive uses the nominal mass',
+        low=0.1,
+        high=10.0,
+        dynamic=True,
+    )
+    inertia_factor: float = parameter(
+        1.0, 'true over nominal body inertia', low=0.1, high=10.0, dynamic=True
+    )
+    friction_factor: float = parameter(
+        1.0, 'true over nominal friction, both kinds', low=0.0, high=10.0, dynamic=True
+    )
+    rate: float = parameter(100.0, 'rate of the reported states', unit='Hz', low=50.0, high=1e3)
+    substep: float = parameter(
+        0.001,
+        'longest integration step; a control period is divided into equal steps',
+        unit='s',
+        low=1e-5,
+        high=0.01,
+    )
+    standstill_speed: float = parameter(
+        0.1,
+        'true wheel speed below which the robot is at standstill',
+        unit='rad/s',
+        low=0.0,
+        high=1.0,
+    )
+    max_catch_up_time: float = parameter(
+        1.0,
+        'longest time simulated after a gap between requests; the rest of the gap is skipped',
+        unit='s',
+        low=0.5,
+        high=60.0,
+    )
+    seed: int = parameter(1, 'seed of disturbance and noise', low=0)
+
+    @property
+    def substeps(self) -> int:
+        """Number of integration steps of a control period."""
+        return max(1, math.ceil(1.0 / (self.rate * self.substep) - 1e-9))
+
+    @property
+    def step(self) -> float:
+        """Length of an integration step, s."""
+        return 1.0 / (self.rate * self.substeps)
+
+    @property
+    def true_body(self) -> BodyParameters:
+        """The true body, with its factors; the drive uses the nominal body."""
+        return replace(
+            self.body,
+            body_mass=self.body.body_mass * self.mass_factor,
+            body_inertia=self.body.body_inertia * self.inertia_factor,
+        )
+
+    def check_consistency(self) -> None:
+        """Raise ParameterError when the integration would be unstable, or stops too slow."""
+        bodies = self.body, self.true_body
+        fastest = max_rate(self.drive, bodies, self.geometry, self.friction, self.friction_factor)
+        if self.step * fastest > STABILITY_LIMIT:
+            raise ParameterError(
+                f'substep must be at most {STABILITY_LIMIT / fastest:.2g} s with this body, drive '
+                f'and friction (fastest rate {fastest:.4g} 1/s): got {self.substep:g}'
+            )
+        if self.drive.kind == 'velocity':
+            self.check_ramp()
+
+    def check_ramp(self) -> None:
+        """Raise ParameterError when the drive would slow down stops."""
+        drive, limiter = self.drive, self.limiter
+        if 0.0 < drive.acceleration < limiter.stop_deceleration:
+            raise ParameterError(
+                'drive.acceleration must be at least wheel.stop_deceleration '
+                f'({limiter.stop_deceleration:g} rad/s²), or 0: got {drive.acceleration:g}'
+            )
+
+
+class PaperRobot(FixedStepRobot[PaperRobotParameters]):
+    """Simulated robot with the paper's plant, without sensors, faults and world.
+
+    Disturbance and noise have separate random generators, which draw the same numbers whatever
+    the parameters: changing one does not shift the other.
+    """
+
+    def __init__(self, parameters: PaperRobotParameters) -> None:
+        if parameters.drive.kind == 'stepper':
+            raise ValueError(
+                'drive.kind must be velocity or torque here: stepper is for DigitalTwin'
+            )
+        limiter = CommandLimiter(parameters.limiter, parameters.geometry)
+        super().__init__(
+            parameters,
+            parameters.rate,
+            parameters.substeps,
+            parameters.max_catch_up_time,
+            limiter,
+        )
+        for_disturbance, for_noise = make_generators(parameters.seed)
+        self._odometry = WheelOdometry(parameters.odometry, parameters.geometry)
+        self._disturbance = Disturbance(parameters.disturbance, for_disturbance)
+        self._noise = SpeedNoise(parameters.noise, for_noise)
+        self._plant = PaperPlant(parameters.drive, parameters.step)
+        self._measured = ZERO_WHEEL_SPEEDS
+        self._torque = (0.0, 0.0)
+        self._limited_command = self._limiter.advance(0, 0.0)
+        self._measured_at = 0
+        """Integration steps at the last measurement."""
+        self._apply_parameters()
+        self._reports.append(self._make_state(0))
+
+    def apply(self, command: RobotCommand, now_ns: int) -> str:
+        """Follow ``command`` from now on, or return why it is rejected.
+
+        Raises
+        ------
+        ValueError
+            The drive accepts torques only, see :meth:`step_torque`.
+        """
+        if self._parameters.drive.kind == 'torque':
+            raise ValueError('drive.kind must be velocity to take wheel speeds: got torque')
+        return super().apply(command, now_ns)
+
+    def step_torque(self, right: float, left: float) -> RobotState:
+        """Apply torques (N m) for one control period and return the state at its end.
+
+        Torques that are not finite brake the wheels, as an emergency stop does.
+
+        Raises
+        ------
+        ValueError
+            The drive accepts wheel speeds only.
+        """
+        if self._parameters.drive.kind != 'torque':
+            raise ValueError('drive.kind must be torque to take torques: got velocity')
+        # The limiter decides only whether the torque may act.
+        finite = math.isfinite(right) and math.isfinite(left)
+        wheels = ZERO_WHEEL_SPEEDS if finite else WheelSpeeds(math.nan, math.nan)
+        now_ns = self._run_to(self._now_ns())
+        self._limiter.accept(RobotCommand(wheels, now_ns), now_ns)
+        self._torque = (float(right), float(left))
+        return self._advance_period()
+
+    def set_pose(self, pose: Pose) -> None:
+        """Move the robot to ``pose``; wheel speeds and odometry are unchanged.
+
+        Raises
+        ------
+        ValueError
+            The pose is not finite.
+        """
+        check_pose(pose)
+        self._plant.pose = pose
+        self._refresh_state()
+
+    def warm_up(self) -> None:
+        """Compile every kernel of a step, on a separate robot."""
+        robot = PaperRobot(self._parameters)
+        if self._parameters.drive.kind == 'torque':
+            robot.step_torque(0.0, 0.0)
+        else:
+            robot.step(ZERO_WHEEL_SPEEDS)
+
+    # -- simulation step --------------------------------------------------------------------------
+
+    def _apply_parameters(self) -> None:
+        parameters = self._parameters
+        self._limiter.parameters = parameters.limiter
+        self._odometry.parameters = parameters.odometry
+        self._disturbance.parameters = parameters.disturbance
+        self._noise.parameters = parameters.noise
+        self._plant.load(
+            parameters.drive,
+            (parameters.body, parameters.true_body),
+            parameters.geometry,
+            parameters.friction,
+            parameters.friction_factor,
+        )
+
+    def _integrate(self, count: int) -> None:
+        """Run ``count`` steps under one command."""
+        self._limited_command = self._limiter.advance(self._now_ns(), count * self._plant.step)
+        braking = bool(self._limited_command.reason)
+        torque_mode = self._parameters.drive.kind == 'torque' and not braking
+        command = self._torque if torque_mode else self._limited_command.wheels
+        self._plant.run(command, braking, self._disturbance, count)
+
+    def _measure(self) -> None:
+        dt = (self._plant.steps_done - self._measured_at) * self._plant.step
+        self._measured_at = self._plant.steps_done
+        before, now = self._measured, self._noise.measure(self._plant.wheels)
+        mean = WheelSpeeds(0.5 * (before.right + now.right), 0.5 * (before.left + now.left))
+        self._odometry.update_from_speeds(mean, dt, self._parameters.noise.variance)
+        self._measured = now
+        self._disturbance.draw(dt)
+
+    def _make_state(self, stamp_ns: int) -> RobotState:
+        geometry, limiter, plant = self._parameters.geometry, self._limiter, self._plant
+        status = RobotStatus(
+            enabled=not limiter.estop,
+            moving=self._moving(),
+            estop=limiter.estop,
+            timed_out=limiter.timed_out,
+            limited=self._limited_command.limited,
+        )
+        return RobotState(
+            stamp_ns=stamp_ns,
+            wheels=self._measured,
+            angles=WheelAngles(*plant.angles),
+            odometry=State(
+                stamp_ns, self._odometry.pose, twist_from_wheels(self._measured, geometry)
+            ),
+            covariance=self._odometry.covariance,
+            commanded=self._limited_command.wheels,
+            status=status,
+            reason=limiter.reason,
+            true_wheels=plant.wheels,
+            truth=State(stamp_ns, plant.pose, twist_from_wheels(plant.wheels, geometry)),
+        )
+
+    def _moving(self) -> bool:
+        return max(map(abs, self._plant.wheels)) > self._parameters.standstill_speed
+
+    def _reset_odometry(self) -> None:
+        self._odometry.reset()
+
+
+class PaperPlant:
+    """Wheels, body and drive: the arrays of :func:`integrate_plant`.
+
+    Parameters
+    ----------
+    parameters
+        Only the kind and the dead time are used here; :meth:`load` sets the rest.
+    step
+        Length of an integration step, s. The dead time is rounded to whole steps.
+    """
+
+    def __init__(self, parameters: DriveParameters, step: float) -> None:
+        self.step = step
+        self.steps_done = 0
+        """Integration steps since the start: the time base of the disturbances."""
+        self._torque_mode = parameters.kind == 'torque'
+        self._commands: Array = np.zeros((round(parameters.dead_time / step), 2))
+        self._cursor = np.zeros(1, dtype=np.int64)
+        self._limited: Array = np.zeros(2)
+        self._state: Array = np.zeros(7)
+        self._work: Array = np.zeros((3, 7))
+
+    @property
+    def pose(self) -> Pose:
+        """True pose."""
+        x, y, yaw = self._state[:3].tolist()
+        return Pose(x, y, yaw)
+
+    @pose.setter
+    def pose(self, pose: Pose) -> None:
+        self._state[:3] = pose.x, pose.y, wrap_angle(pose.yaw)
+
+    @property
+    def angles(self) -> tuple[float, float]:
+        """Angles (rad) turned by the wheels, right first."""
+        return float(self._state[3]), float(self._state[4])
+
+    @property
+    def wheels(self) -> WheelSpeeds:
+        """True wheel speeds chi."""
+        return WheelSpeeds(float(self._state[5]), float(self._state[6]))
+
+    def load(
+        self,
+        parameters: DriveParameters,
+        bodies: tuple[BodyParameters, BodyParameters],
+        geometry: WheelGeometry,
+        friction: FrictionParameters,
+        friction_factor: float,
+    ) -> None:
+        """Set the constants from now on; ``bodies`` are the nominal and the true one."""
+        nominal, true = bodies
+        self._drive = drive_vector(parameters, nominal, geometry)
+        self._dynamics = dynamics_vector(true, geometry)
+        self._friction: Array = np.array(
+            [
+                friction_factor * friction.viscous,
+                friction_factor * friction.coulomb,
+                friction.coulomb_width,
+            ]
+        )
+
+    def run(
+        self,
+        command: tuple[float, float],
+        braking: bool,
+        disturbance: Disturbance,
+        count: int,
+    ) -> None:
+        """Integrate ``count`` steps under one command, right first.
+
+        Torques (N m) for a torque drive unless ``braking``, otherwise wheel speeds (rad/s).
+        """
+        integrate_plant(
+            self._state,
+            self._torque_mode and not braking,
+            command[0],
+            command[1],
+            self._commands,
+            self._cursor,
+            self._limited,
+            self._drive,
+            self._dynamics,
+            self._friction,
+            disturbance.load,
+            disturbance.angular,
+            disturbance.phases,
+            disturbance.walk,
+            self.steps_done,
+            count,
+            self.step,
+            self._work,
+        )
+        self._state[2] = wrap_angle(self._state[2])
+        self.steps_done += count
+
+
 def drive_vector(
     parameters: DriveParameters, body: BodyParameters, geometry: WheelGeometry
 ) -> Array:
-    """Return what the kernels here need, shape (6,).
+    """Return the drive constants of the kernels, shape (6,).
 
     Diagonal and off-diagonal entry of the nominal (11) (kg m²), lag (s), acceleration (rad/s²),
     torque limit (N m), speed ceiling (rad/s).
@@ -117,10 +457,6 @@ def drive_vector(
     )
 
 
-STABILITY_LIMIT = 2.0
-"""Largest product of step and fastest rate that is allowed; Runge-Kutta is stable up to 2.78."""
-
-
 def max_rate(
     parameters: DriveParameters,
     bodies: tuple[BodyParameters, BodyParameters],
@@ -128,12 +464,12 @@ def max_rate(
     friction: FrictionParameters,
     friction_factor: float,
 ) -> float:
-    """Return an upper bound (1/s) of how fast errors of chi die out; see :meth:`Plant.load`."""
+    """Return an upper bound (1/s) of the decay rate of chi; see :meth:`PaperPlant.load`."""
     nominal, true = (wheel_inertia(body, geometry) for body in bodies)
     damping = friction_factor * (friction.viscous + friction.coulomb / friction.coulomb_width)
     turning = geometry.wheel_radius / geometry.half_separation
     coupling = 2.0 * turning * parameters.speed_ceiling * abs(coriolis_factor(bodies[1], geometry))
-    # Both matrices have the eigenvectors (1, 1) and (1, -1): straight on, and on the spot.
+    # Both matrices have the eigenvectors (1, 1), straight motion, and (1, -1), turning.
     rates = [
         ((nominal[0, 0] + sign * nominal[0, 1]) / parameters.lag + damping + coupling)
         / (true[0, 0] + sign * true[0, 1])
@@ -148,8 +484,8 @@ def servo_torque(
 ) -> tuple[float, float]:
     """Return the torques (N m) that bring chi to the wanted speeds with the nominal lag.
 
-    theta_bar_nominal (wanted - chi)/lag: with the nominal body, and nothing else acting, (10)
-    becomes chi' = (wanted - chi)/lag. Any other mass, friction or disturbance shows.
+    theta_bar_nominal (wanted - chi)/lag: with the nominal body and without friction and
+    disturbance, (10) becomes chi' = (wanted - chi)/lag.
 
     drive : shape (6,), see :func:`drive_vector`
     """
@@ -163,7 +499,7 @@ def servo_torque(
 
 @kernel
 def clamp(value: float, bound: float) -> float:
-    """Return ``value`` brought into [-bound, bound]."""
+    """Return ``value`` clamped to [-bound, bound]."""
     return min(max(value, -bound), bound)
 
 
@@ -171,10 +507,10 @@ def clamp(value: float, bound: float) -> float:
 def delay_command(
     right: float, left: float, commands: Array, cursor: npt.NDArray[np.int64]
 ) -> tuple[float, float]:
-    """Return the command (rad/s) given n steps ago, and put this one in its place.
+    """Return the command (rad/s) of n steps ago, and store this one in its place.
 
-    commands : shape (n, 2), a ring; n = 0 means no dead time
-    cursor : shape (1,), the row that is next; both are changed in place
+    commands : shape (n, 2), a ring buffer; n = 0 means no dead time
+    cursor : shape (1,), the next row; both are changed in place
     """
     if commands.shape[0] == 0:
         return right, left
@@ -214,13 +550,13 @@ def integrate_plant(
 
     state : shape (7,), x, y (m), P, theta_R, theta_L (rad), chi (rad/s); changed in place
     torque_mode : whether (right, left) are torques (N m) or wheel speeds for the servo (rad/s)
-    commands : shape (n, 2), wheel speeds on their way to the wheels, see pass_command
-    cursor : shape (1,), the row that comes out next; changed in place
-    limited : shape (2,), what has come out, after the acceleration limit; changed in place
+    commands : shape (n, 2), delayed wheel speeds, see delay_command
+    cursor : shape (1,), the next row of commands; changed in place
+    limited : shape (2,), delayed command after the acceleration limit; changed in place
     drive, dynamics : see drive_vector, dynamics_vector
     friction : shape (3,), viscous (N m s/rad), Coulomb (N m), width (rad/s)
     load, angular, phases, walk : see disturbance_torque
-    first : number of the first substep since the run began; the time is first times step
+    first : number of the first substep since the start; the time is first times step
     step : s
     work : shape (3, 7), overwritten
     """
@@ -245,7 +581,7 @@ def integrate_plant(
                 torque_right = clamp(right, drive[4])
                 torque_left = clamp(left, drive[4])
             else:
-                # The limit is a ramp inside the substep too, not a staircase.
+                # The limit is a ramp within the substep too, not a staircase.
                 reach = drive[3] * part * step if drive[3] > 0.0 else -1.0
                 wanted_right, wanted_left = ramp_towards(
                     limited[0], limited[1], target_right, target_left, reach
@@ -277,337 +613,3 @@ def integrate_plant(
             limited[0], limited[1] = ramp_towards(
                 limited[0], limited[1], target_right, target_left, reach
             )
-
-
-class PaperPlant:
-    """Wheels, body and drive in motion: the numbers that :func:`simulate` works on.
-
-    Parameters
-    ----------
-    settings
-        Only the kind and the dead time are fixed here; the rest comes with :meth:`load`.
-    step
-        Length of an integration step, s. The dead time becomes a whole number of them.
-    """
-
-    def __init__(self, parameters: DriveParameters, step: float) -> None:
-        self.step = step
-        self.steps_done = 0
-        """Integration steps since the plant was made: the time that its disturbances know."""
-        self._torque_mode = parameters.kind == 'torque'
-        self._commands: Array = np.zeros((round(parameters.dead_time / step), 2))
-        self._cursor = np.zeros(1, dtype=np.int64)
-        self._limited: Array = np.zeros(2)
-        self._state: Array = np.zeros(7)
-        self._work: Array = np.zeros((3, 7))
-
-    @property
-    def pose(self) -> Pose:
-        """The true pose."""
-        x, y, yaw = self._state[:3].tolist()
-        return Pose(x, y, yaw)
-
-    @pose.setter
-    def pose(self, pose: Pose) -> None:
-        self._state[:3] = pose.x, pose.y, wrap_angle(pose.yaw)
-
-    @property
-    def angles(self) -> tuple[float, float]:
-        """The angles (rad) the wheels have turned, right first."""
-        return float(self._state[3]), float(self._state[4])
-
-    @property
-    def wheels(self) -> WheelSpeeds:
-        """The true wheel speeds chi."""
-        return WheelSpeeds(float(self._state[5]), float(self._state[6]))
-
-    def load(
-        self,
-        parameters: DriveParameters,
-        bodies: tuple[BodyParameters, BodyParameters],
-        geometry: WheelGeometry,
-        friction: FrictionParameters,
-        friction_factor: float,
-    ) -> None:
-        """Take what acts from now on; ``bodies`` are the nominal one and the true one."""
-        nominal, true = bodies
-        self._drive = drive_vector(parameters, nominal, geometry)
-        self._dynamics = dynamics_vector(true, geometry)
-        self._friction: Array = np.array(
-            [
-                friction_factor * friction.viscous,
-                friction_factor * friction.coulomb,
-                friction.coulomb_width,
-            ]
-        )
-
-    def run(
-        self,
-        command: tuple[float, float],
-        braking: bool,
-        disturbance: Disturbance,
-        count: int,
-    ) -> None:
-        """Integrate ``count`` steps under one command, right first.
-
-        It is a torque (N m) for a torque drive unless ``braking``, else wheel speeds (rad/s).
-        """
-        integrate_plant(
-            self._state,
-            self._torque_mode and not braking,
-            command[0],
-            command[1],
-            self._commands,
-            self._cursor,
-            self._limited,
-            self._drive,
-            self._dynamics,
-            self._friction,
-            disturbance.load,
-            disturbance.angular,
-            disturbance.phases,
-            disturbance.walk,
-            self.steps_done,
-            count,
-            self.step,
-            self._work,
-        )
-        self._state[2] = wrap_angle(self._state[2])
-        self.steps_done += count
-
-
-@dataclass(frozen=True)
-class PaperRobotParameters(Parameters):
-    """Everything that can be set of a simulated robot."""
-
-    geometry: WheelGeometry = group(WheelGeometry, inline=True)
-    body: BodyParameters = group(BodyParameters)
-    friction: FrictionParameters = group(FrictionParameters)
-    disturbance: DisturbanceParameters = group(DisturbanceParameters)
-    noise: NoiseParameters = group(NoiseParameters)
-    drive: DriveParameters = group(DriveParameters)
-    limiter: CommandLimiterParameters = group(CommandLimiterParameters, inline=True)
-    odometry: WheelOdometryParameters = group(WheelOdometryParameters)
-    mass_factor: float = parameter(
-        1.0,
-        'true over nominal body mass; the drive knows the nominal one',
-        low=0.1,
-        high=10.0,
-        dynamic=True,
-    )
-    inertia_factor: float = parameter(
-        1.0, 'true over nominal body inertia', low=0.1, high=10.0, dynamic=True
-    )
-    friction_factor: float = parameter(
-        1.0, 'true over nominal friction, both kinds', low=0.0, high=10.0, dynamic=True
-    )
-    rate: float = parameter(
-        100.0, 'how often the state is reported', unit='Hz', low=50.0, high=1e3
-    )
-    substep: float = parameter(
-        0.001,
-        'longest step of the integration; a control period is cut into equal ones',
-        unit='s',
-        low=1e-5,
-        high=0.01,
-    )
-    rest_speed: float = parameter(
-        0.1,
-        'true wheel speed below which the robot counts as standing',
-        unit='rad/s',
-        low=0.0,
-        high=1.0,
-    )
-    longest_gap: float = parameter(
-        1.0,
-        'time that is made up for when nobody asked for the state; what is longer is skipped',
-        unit='s',
-        low=0.5,
-        high=60.0,
-    )
-    seed: int = parameter(1, 'seed of disturbance and noise', low=0)
-
-    @property
-    def substeps(self) -> int:
-        """How many integration steps a control period takes."""
-        return max(1, math.ceil(1.0 / (self.rate * self.substep) - 1e-9))
-
-    @property
-    def step(self) -> float:
-        """Length of an integration step, s."""
-        return 1.0 / (self.rate * self.substeps)
-
-    @property
-    def true_body(self) -> BodyParameters:
-        """The body with its factors: what moves, as opposed to what the drive believes."""
-        return replace(
-            self.body,
-            body_mass=self.body.body_mass * self.mass_factor,
-            body_inertia=self.body.body_inertia * self.inertia_factor,
-        )
-
-    def check_consistency(self) -> None:
-        """Raise ParameterError when the integration would be unstable, or stops be cut short."""
-        bodies = self.body, self.true_body
-        fastest = max_rate(self.drive, bodies, self.geometry, self.friction, self.friction_factor)
-        if self.step * fastest > STABILITY_LIMIT:
-            raise ParameterError(
-                f'substep must be at most {STABILITY_LIMIT / fastest:.2g} s with this body, drive and '
-                f'friction (fastest rate {fastest:.4g} 1/s): got {self.substep:g}'
-            )
-        if self.drive.kind == 'velocity':
-            self.check_ramp()
-
-    def check_ramp(self) -> None:
-        """Raise ParameterError when the drive would cut stops short."""
-        drive, limiter = self.drive, self.limiter
-        if 0.0 < drive.acceleration < limiter.stop_deceleration:
-            raise ParameterError(
-                'drive.acceleration must be at least wheel.stop_deceleration '
-                f'({limiter.stop_deceleration:g} rad/s²), or 0: got {drive.acceleration:g}'
-            )
-
-
-class PaperRobot(FixedStepRobot[PaperRobotParameters]):
-    """A robot that exists in numbers only: the paper's plant, on a :class:`FixedStepRobot`'s time.
-
-    Disturbance and noise come from generators of their own, and draw the same numbers whatever
-    their settings: changing one does not shift the other.
-    """
-
-    def __init__(self, parameters: PaperRobotParameters) -> None:
-        if parameters.drive.kind == 'stepper':
-            raise ValueError(
-                'drive.kind must be velocity or torque here: stepper is for DigitalTwin'
-            )
-        guard = CommandLimiter(parameters.limiter, parameters.geometry)
-        super().__init__(
-            parameters, parameters.rate, parameters.substeps, parameters.longest_gap, guard
-        )
-        for_disturbance, for_noise = make_generators(parameters.seed)
-        self._odometry = WheelOdometry(parameters.odometry, parameters.geometry)
-        self._disturbance = Disturbance(parameters.disturbance, for_disturbance)
-        self._noise = SpeedNoise(parameters.noise, for_noise)
-        self._plant = PaperPlant(parameters.drive, parameters.step)
-        self._measured = ZERO_WHEEL_SPEEDS
-        self._torque = (0.0, 0.0)
-        self._limited_command = self._limiter.advance(0, 0.0)
-        self._measured_at = 0
-        """Integration steps the plant had done at the last measurement."""
-        self._apply_parameters()
-        self._reports.append(self._make_state(0))
-
-    def apply(self, command: RobotCommand, now_ns: int) -> str:
-        """Follow ``command`` from now on; return why not if it is refused.
-
-        Raises
-        ------
-        ValueError
-            The drive takes torques; then see :meth:`step_torque`.
-        """
-        if self._parameters.drive.kind == 'torque':
-            raise ValueError('drive.kind must be velocity to take wheel speeds: got torque')
-        return super().apply(command, now_ns)
-
-    def step_torque(self, right: float, left: float) -> RobotState:
-        """Apply torques (N m) for one control period and return the state at its end.
-
-        Torques that are not finite brake the wheels, as an emergency stop does.
-
-        Raises
-        ------
-        ValueError
-            The drive takes wheel speeds.
-        """
-        if self._parameters.drive.kind != 'torque':
-            raise ValueError('drive.kind must be torque to take torques: got velocity')
-        # A torque is no wheel speed: the guard only says whether it may act at all.
-        finite = math.isfinite(right) and math.isfinite(left)
-        wheels = ZERO_WHEEL_SPEEDS if finite else WheelSpeeds(math.nan, math.nan)
-        now_ns = self._run_to(self._now_ns())
-        self._limiter.accept(RobotCommand(wheels, now_ns), now_ns)
-        self._torque = (float(right), float(left))
-        return self._advance_period()
-
-    def set_pose(self, pose: Pose) -> None:
-        """Put the robot elsewhere, its wheels turning as before; odometry does not notice.
-
-        Raises
-        ------
-        ValueError
-            The pose is not finite.
-        """
-        check_pose(pose)
-        self._plant.pose = pose
-        self._refresh_state()
-
-    def warm_up(self) -> None:
-        """Compile everything that a step needs, on a robot of its own."""
-        robot = PaperRobot(self._parameters)
-        if self._parameters.drive.kind == 'torque':
-            robot.step_torque(0.0, 0.0)
-        else:
-            robot.step(ZERO_WHEEL_SPEEDS)
-
-    # -- inside -----------------------------------------------------------------------------------
-
-    def _apply_parameters(self) -> None:
-        parameters = self._parameters
-        self._limiter.parameters = parameters.limiter
-        self._odometry.parameters = parameters.odometry
-        self._disturbance.parameters = parameters.disturbance
-        self._noise.parameters = parameters.noise
-        self._plant.load(
-            parameters.drive,
-            (parameters.body, parameters.true_body),
-            parameters.geometry,
-            parameters.friction,
-            parameters.friction_factor,
-        )
-
-    def _integrate(self, count: int) -> None:
-        """Run ``count`` steps under one command."""
-        self._limited_command = self._limiter.advance(self._now_ns(), count * self._plant.step)
-        braking = bool(self._limited_command.reason)
-        torque_mode = self._parameters.drive.kind == 'torque' and not braking
-        command = self._torque if torque_mode else self._limited_command.wheels
-        self._plant.run(command, braking, self._disturbance, count)
-
-    def _measure(self) -> None:
-        dt = (self._plant.steps_done - self._measured_at) * self._plant.step
-        self._measured_at = self._plant.steps_done
-        before, now = self._measured, self._noise.measure(self._plant.wheels)
-        mean = WheelSpeeds(0.5 * (before.right + now.right), 0.5 * (before.left + now.left))
-        self._odometry.drive(mean, dt, self._parameters.noise.variance)
-        self._measured = now
-        self._disturbance.draw(dt)
-
-    def _make_state(self, stamp_ns: int) -> RobotState:
-        geometry, guard, plant = self._parameters.geometry, self._limiter, self._plant
-        status = RobotStatus(
-            enabled=not guard.estop,
-            moving=self._moving(),
-            estop=guard.estop,
-            timed_out=guard.timed_out,
-            limited=self._limited_command.limited,
-        )
-        return RobotState(
-            stamp_ns=stamp_ns,
-            wheels=self._measured,
-            angles=WheelAngles(*plant.angles),
-            odometry=State(
-                stamp_ns, self._odometry.pose, twist_from_wheels(self._measured, geometry)
-            ),
-            covariance=self._odometry.covariance,
-            commanded=self._limited_command.wheels,
-            status=status,
-            reason=guard.reason,
-            true_wheels=plant.wheels,
-            truth=State(stamp_ns, plant.pose, twist_from_wheels(plant.wheels, geometry)),
-        )
-
-    def _moving(self) -> bool:
-        return max(map(abs, self._plant.wheels)) > self._parameters.rest_speed
-
-    def _reset_odometry(self) -> None:
-        self._odometry.reset()

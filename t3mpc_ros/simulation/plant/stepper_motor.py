@@ -1,6 +1,12 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Hybrid stepper motor driven in microsteps: pull-out torque and rotor torque."""
+r"""Hybrid stepper motor driven in microsteps: pull-out torque and rotor torque.
+
+The rotor has ``teeth`` = full steps / 4 stable positions per turn. Its torque is
+:math:`T(\Omega) \sin(N(\varphi - \theta))`, a spring to the field that fails beyond a quarter of
+a tooth pitch: the rotor then falls back by whole pitches, four full steps each, and the steps are
+lost. T falls with the field speed because winding impedance and back-EMF reduce the current.
+"""
 
 from dataclasses import dataclass
 import math
@@ -45,7 +51,7 @@ class StepperMotorParameters(Parameters):
         5.4e-6, 'inertia of the rotor', unit='kg m²', low=1e-9, high=1.0, source=_MOTOR
     )
     phase_current: float = parameter(
-        1.0, 'peak current that the driver is set to', unit='A', low=0.01, high=50.0, dynamic=True
+        1.0, 'peak current set in the driver', unit='A', low=0.01, high=50.0, dynamic=True
     )
     damping: float = parameter(
         0.01,
@@ -56,15 +62,15 @@ class StepperMotorParameters(Parameters):
     )
     damping_width: float = parameter(
         2.0,
-        'speed against the field at which the damping has fallen to a quarter: a rotor that has '
-        'lost its field is not dragged along',
+        'speed relative to the field at which the damping has fallen to a quarter: an unlocked '
+        'rotor is not dragged along',
         unit='rad/s',
         low=0.01,
         high=1000.0,
     )
     step_rate: float = parameter(
         10_000.0,
-        'most pulses a second for each wheel',
+        'largest pulse rate of a wheel',
         unit='1/s',
         low=1.0,
         high=1e6,
@@ -78,25 +84,25 @@ class StepperMotorParameters(Parameters):
 
     @property
     def teeth(self) -> float:
-        """Stable places of the rotor per turn, N."""
+        """Stable positions of the rotor per turn, N."""
         return 0.25 * self.full_steps
 
     @property
     def torque_constant(self) -> float:
         """Torque per ampere (N m/A) of the field.
 
-        Holding torque is measured with rated current in both phases, a field sqrt(2) times as
-        strong as the one that microstepping turns, whose peak is the current of one phase.
+        The holding torque is measured with rated current in both phases, a field sqrt(2) times as
+        strong as that of microstepping, whose peak is the current of one phase.
         """
         return self.holding_torque / (math.sqrt(2.0) * self.rated_current)
 
     @property
     def top_speed(self) -> float:
-        """Fastest wheel speed (rad/s) that the pulse generator can ask for."""
+        """Largest wheel speed (rad/s) of the pulse generator."""
         return self.step_rate * self.microstep
 
     def vector(self) -> Array:
-        """Return what the kernels need, shape (7,).
+        """Return the constants of the kernels, shape (7,).
 
         N (1), torque constant (N m/A), resistance (Ohm), inductance (H), current (A),
         damping (N m s/rad), its width (rad/s).
@@ -114,7 +120,7 @@ class StepperMotorParameters(Parameters):
         )
 
     def check_consistency(self) -> None:
-        """Raise ParameterError when the driver would burn the motor."""
+        """Raise ParameterError when the current exceeds the rating of the motor."""
         if self.phase_current > self.rated_current:
             raise ParameterError(
                 'phase_current must be at most rated_current '
@@ -124,14 +130,14 @@ class StepperMotorParameters(Parameters):
 
 @kernel
 def pull_out_torque(field_speed: float, volts: float, motor: Array) -> float:
-    r"""Return the largest torque (N m) at a speed of the field (rad/s), 0 where none is left.
+    r"""Return the largest torque (N m) at a field speed (rad/s), 0 when the back-EMF is too high.
 
-    At pull-out the current is in phase with the back-EMF, so the supply has to carry
+    At pull-out the current is in phase with the back-EMF, so the supply voltage is
 
     .. math:: V^2 = (R I + k \Omega)^2 + (N \Omega L I)^2
 
-    with the torque constant k. The current is what this leaves, or what the driver is set to if
-    that is less. Source: Acarnley, Stepping Motors, 4th ed., chapter on pull-out torque.
+    with the torque constant k. The current is the smaller of this solution and the current set
+    in the driver. Source: Acarnley, Stepping Motors, 4th ed., chapter on pull-out torque.
 
     volts : supply (V)
     motor : shape (7,), see :meth:`StepperMotorParameters.vector`
@@ -151,7 +157,7 @@ def pull_out_torque(field_speed: float, volts: float, motor: Array) -> float:
 
 @kernel
 def rotor_torque(ahead: float, faster: float, peak: float, motor: Array) -> float:
-    """Return the torque (N m) on a rotor whose field is ``ahead`` (rad) and ``faster`` (rad/s).
+    """Return the torque (N m) on a rotor with its field ``ahead`` (rad) and ``faster`` (rad/s).
 
     peak : the pull-out torque at this speed, 0 without power
     motor : shape (7,), see :meth:`StepperMotorParameters.vector`
