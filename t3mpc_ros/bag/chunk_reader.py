@@ -67,6 +67,8 @@ def read_summary(file: BinaryIO) -> Summary | None:
         raise ValueError('it does not end with a footer')
     if start == 0:
         return None
+    if start > end:  # seek() itself raises OSError beyond 2^63, which is no error of the disk
+        raise ValueError('its summary starts behind its end')
     file.seek(start)
     section = file.read(max(end - start, 0))
     found = Summary()

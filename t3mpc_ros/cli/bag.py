@@ -147,8 +147,8 @@ def add_recover_parser(
         description='Writes what an MCAP file, or every MCAP file of a folder, still holds into '
         'a new folder, with index and metadata.yaml, and reports what was kept and lost. The '
         'input is only read. Exit code 0: nothing was lost; 3: something was, or a file has no '
-        'end, so that its writer may have held more; 1: nothing can be read, or the output cannot be '
-        'written.',
+        'end, so that its writer may have held more; 1: nothing can be read, or the output '
+        'cannot be written.',
     )
     parser.add_argument('bag', type=Path, metavar='FILE', help='an MCAP file, or a folder of such')
     parser.add_argument(

@@ -276,7 +276,7 @@ class MethodSpec:
         expected = self.controller_type.parameters_type
         if not isinstance(self.parameters, expected):
             raise ValueError(
-                f'settings of {self.name} must be {expected.__name__}: '
+                f'parameters of {self.name} must be {expected.__name__}: '
                 f'got {type(self.parameters).__name__}'
             )
 

@@ -51,7 +51,7 @@ class ProposedController(BaselineController):
     def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None:
         if not isinstance(parameters, ProposedParameters):
             raise ValueError(
-                f'settings must be ProposedParameters: got {type(parameters).__name__}'
+                f'parameters must be ProposedParameters: got {type(parameters).__name__}'
             )
         self.preview: bool = parameters.jump_transition.preview  # type: ignore[misc]
         self._period = nominal_model.period

@@ -107,7 +107,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self._journal_publisher = self.create_publisher(Int64MultiArray, '~/journal', qos.JOURNAL)
         self._journal_message = Int64MultiArray(data=self._journal.row)
         self._revision_publisher = self.create_publisher(
-            String, '~/settings', qos.PARAMETER_REVISIONS
+            String, '~/parameters', qos.PARAMETER_REVISIONS
         )
         self._publish_parameters()
         self._load_model()

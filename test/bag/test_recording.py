@@ -115,7 +115,7 @@ def test_a_type_selects_whatever_the_name():
 def test_the_controller_s_journal_is_recorded_by_default():
     parameters = RecordingParameters()
     selection = TopicFilter([], parameters.topics, namespace='/robot')
-    for name in ('controller/journal', 'controller/settings', 'controller/terms/reach/left'):
+    for name in ('controller/journal', 'controller/parameters', 'controller/terms/reach/left'):
         assert selection.matches(f'/robot/{name}')
 
 

@@ -659,7 +659,7 @@ def test_preview_without_a_future_is_refused(kind):
     ],
 )
 def test_settings_of_another_method_are_refused(kind, wrong):
-    with pytest.raises(ValueError, match='settings'):
+    with pytest.raises(ValueError, match='parameters'):
         kind(wrong, _knowledge('velocity'))
 
 

@@ -499,7 +499,7 @@ def test_what_does_not_fit_the_loop_is_refused():
         with pytest.raises(ValueError, match=text):
             run(scenario, P, drive=seam)
     with pytest.raises(
-        ValueError, match='settings of P must be ProportionalParameters: got Limit'
+        ValueError, match='parameters of P must be ProportionalParameters: got Limit'
     ):
         MethodSpec('P', Proportional, scenario.limits)
 

@@ -682,7 +682,7 @@ def folder(tmp_path_factory):
 
 def test_the_json_has_what_is_promised(folder):
     content = json.loads((folder / 'results.json').read_text())
-    assert {'results', 'claims', 'settings', 'version', 'estimation'} <= set(content)
+    assert {'results', 'claims', 'parameters', 'version', 'estimation'} <= set(content)
     keys = {
         'controller', 'baseline', 'preview', 'drive', 'noise', 'case', 'rmse_mean', 'rmse_ci95',
         'settled_mean', 'settled_ci95', 'chatter_mean', 'largest_error', 'finite', 'seeds',
@@ -700,7 +700,7 @@ def test_the_json_has_what_is_promised(folder):
     assert (FULL, 'velocity', 0.04, 'nominal') in situations
     assert {row['kind'] for row in content['estimation']} >= {'type1', 'type3'}
     assert all(claim['held'] in (True, False, None) for claim in content['claims'])
-    assert content['settings']['seeds'] == [101, 102]
+    assert content['parameters']['seeds'] == [101, 102]
     assert (folder / 'copy').read_text() == (folder / 'results.json').read_text()
 
 

@@ -271,7 +271,7 @@ def test_a_run_without_events_is_the_same_without_its_journal(tmp_path):
 
 def test_a_late_recorder_is_noted_and_compared_from_the_reset_on(bag, tmp_path):
     late = without(
-        bag, tmp_path / 'late', lambda topic, n: topic != '/controller/settings' and n < 100
+        bag, tmp_path / 'late', lambda topic, n: topic != '/controller/parameters' and n < 100
     )
     inputs = load_inputs(late)
     assert any('100 events of the controller were before' in note for note in inputs.notes)
@@ -334,7 +334,7 @@ def test_a_lost_command_is_counted_and_harms_nothing_else(bag, tmp_path):
 
 def test_settings_lost_at_the_start_are_said(tmp_path):
     [path] = [path for path in GOLDEN if path.stem == 'changes']
-    lost = without(path, tmp_path / 'copy', lambda *it: it == ('/controller/settings', 0))
+    lost = without(path, tmp_path / 'copy', lambda *it: it == ('/controller/parameters', 0))
     inputs = load_inputs(lost)
     assert any('settings at the start are not in the bag' in note for note in inputs.notes)
     assert not inputs.exact.any()
@@ -358,7 +358,7 @@ def test_a_recorder_that_notes_no_time_of_publication_will_do(bag, tmp_path):
 
 def test_a_lost_change_of_settings_is_said(tmp_path):
     [path] = [path for path in GOLDEN if path.stem == 'changes']
-    lost = without(path, tmp_path / 'copy', lambda *it: it == ('/controller/settings', 3))
+    lost = without(path, tmp_path / 'copy', lambda *it: it == ('/controller/parameters', 3))
     inputs = load_inputs(lost)
     assert any('1 changes of settings are not in the bag' in note for note in inputs.notes)
     third = np.flatnonzero(inputs.events == Event.CONFIGURE)[2]
@@ -368,7 +368,7 @@ def test_a_lost_change_of_settings_is_said(tmp_path):
 
 def test_settings_that_were_only_asked_for_by_the_recorder_do(bag, tmp_path):
     inputs = load_inputs(
-        without(bag, tmp_path / 'copy', lambda topic, _: topic == '/controller/settings')
+        without(bag, tmp_path / 'copy', lambda topic, _: topic == '/controller/parameters')
     )
     assert compare(inputs, replay_controller(inputs)).same
 
@@ -399,7 +399,7 @@ def test_settings_survive_their_topic_to_the_last_bit():
     assert revision == 3
     assert ControllerParameters.from_dict(values) == parameters
     for text in ('', '{}', '[1]', '{"revision": null, "settings": {}}'):
-        with pytest.raises(ValueError, match='no revision of settings'):
+        with pytest.raises(ValueError, match='no revision of parameters'):
             parameters_from_json(text)
 
 
@@ -659,7 +659,7 @@ def test_a_rival_answers_where_the_controller_let_the_robot_move(inputs, again):
 
 def test_the_settings_topic_is_json(bag):
     with open_bag(bag) as recording:
-        [(_, message)] = recording.messages('/controller/settings')
+        [(_, message)] = recording.messages('/controller/parameters')
     content = json.loads(message.data)
     assert content['revision'] == 0
-    assert content['settings']['law.gain'] == loop_controller().law.gain
+    assert content['parameters']['law.gain'] == loop_controller().law.gain

@@ -131,7 +131,7 @@ def test_the_model_file_is_loaded_and_says_where_it_is_from(bags, model, tmp_pat
     for name, values in model.learnt.items():
         np.testing.assert_array_equal(loaded[name], values)
     header = read_model_header(path)
-    assert header['settings']['predictive.dither'] == DITHER
+    assert header['parameters']['predictive.dither'] == DITHER
     origin = header['origin']
     assert [bag['name'] for bag in origin['bags']] == [f'run{seed}/bag' for seed in RECORDED]
     for bag, folder in zip(origin['bags'], bags, strict=True):

@@ -786,7 +786,7 @@ def test_methods_that_cannot_be_tuned_are_refused(tmp_path):
     with pytest.raises(ParameterError, match='no hope: FeedbackParameters has no setting gian'):
         MethodDefinition('no hope', Feedback, FEEDBACK.start, (SearchRange('gian', 1.0, 2.0),))
     with pytest.raises(
-        ParameterError, match='no hope, torque: settings must be FeedbackParameters'
+        ParameterError, match='no hope, torque: parameters must be FeedbackParameters'
     ):
         MethodDefinition('no hope', Feedback, {'torque': Gains()}, FEEDBACK.ranges)
     with pytest.raises(ParameterError, match='no hope: there must be start settings'):

@@ -38,7 +38,7 @@ class Event(enum.IntEnum):
     RESET = 3
     """What was learnt is forgotten; value: 1 where the robot may move, else 0."""
     CONFIGURE = 4
-    """Other live settings; value: their revision, see :func:`settings_text`."""
+    """Other dynamic parameters; value: their revision, see :func:`parameters_to_json`."""
     MODEL = 5
     """A model file was loaded at start; value: CRC-32 of the file."""
     FINISH = 6
@@ -106,12 +106,12 @@ class Journal:
 
 
 def parameters_to_json(revision: int, parameters: Mapping[str, Value]) -> str:
-    """Return what ``controller/settings`` says: JSON of a revision and the flat settings of it."""
-    return json.dumps({'revision': revision, 'settings': dict(parameters)})
+    """Return the JSON text of ``controller/parameters``: a revision and its parameters by name."""
+    return json.dumps({'revision': revision, 'parameters': dict(parameters)})
 
 
 def parameters_from_json(text: str) -> tuple[int, dict[str, object]]:
-    """Return revision and flat settings of what :func:`settings_text` wrote.
+    """Return the revision and the parameters of a text of :func:`parameters_to_json`.
 
     Raises
     ------
@@ -120,6 +120,6 @@ def parameters_from_json(text: str) -> tuple[int, dict[str, object]]:
     """
     try:
         content = json.loads(text)
-        return int(content['revision']), dict(content['settings'])
+        return int(content['revision']), dict(content['parameters'])
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f'no revision of settings: {text[:60]!r}') from error
+        raise ValueError(f'no revision of parameters: {text[:60]!r}') from error

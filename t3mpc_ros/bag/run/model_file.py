@@ -51,7 +51,7 @@ def save_model(
         {
             'format': FORMAT,
             'version': t3mpc_ros.__version__,
-            'settings': dict(parameters),
+            'parameters': dict(parameters),
             'origin': dict(origin or {}),
         }
     )

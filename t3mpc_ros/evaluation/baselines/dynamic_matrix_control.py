@@ -287,7 +287,7 @@ class DynamicMatrix(BaselineController):
             parameters, DynamicMatrixPreviewParameters
         ):
             raise ValueError(
-                f'settings must be {self.parameters_type.__name__}: got {parameters!r}'
+                f'parameters must be {self.parameters_type.__name__}: got {parameters!r}'
             )
         self.parameters = parameters
         self._knowledge = nominal_model

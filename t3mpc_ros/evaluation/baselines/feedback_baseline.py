@@ -121,7 +121,7 @@ def checked_parameters(parameters: Parameters, kind: type[Table]) -> Table:
         They are of another method.
     """
     if not isinstance(parameters, kind):
-        raise ValueError(f'settings must be {kind.__name__}: got {type(parameters).__name__}')
+        raise ValueError(f'parameters must be {kind.__name__}: got {type(parameters).__name__}')
     return parameters
 
 

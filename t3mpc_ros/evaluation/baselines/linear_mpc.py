@@ -317,7 +317,7 @@ class LinearMpc(BaselineController):
             parameters, LinearMpcPreviewParameters
         ):
             raise ValueError(
-                f'settings must be {self.parameters_type.__name__}: got {parameters!r}'
+                f'parameters must be {self.parameters_type.__name__}: got {parameters!r}'
             )
         self.parameters = parameters
         self._knowledge = nominal_model

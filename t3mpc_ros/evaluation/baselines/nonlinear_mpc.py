@@ -268,7 +268,7 @@ class CasadiNmpc(BaselineController):
 
     def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None:
         if not isinstance(parameters, CasadiNmpcParameters):
-            raise ValueError(f'settings must be CasadiNmpcParameters: got {parameters!r}')
+            raise ValueError(f'parameters must be CasadiNmpcParameters: got {parameters!r}')
         try:
             casadi = importlib.import_module('casadi')
         except ImportError as error:

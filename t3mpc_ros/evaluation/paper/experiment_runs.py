@@ -126,7 +126,7 @@ def plain(value: Any) -> Any:
     if isinstance(value, np.ndarray) and value.dtype != object:
         content = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
         return f'array {value.dtype} {value.shape} {content}'
-    raise TypeError(f'settings of a method must be plain data: got {type(value).__name__}')
+    raise TypeError(f'parameters of a method must be plain data: got {type(value).__name__}')
 
 
 @dataclass(frozen=True, slots=True)

@@ -107,7 +107,7 @@ def reproduce(bench: ExperimentSetup, options: PaperOptions, progress: Any = Non
     exact = [row for row in results.rows if EXACT in row.controller]
     content = {
         'version': _version(),
-        'settings': parameters | {'sources': sources},
+        'parameters': parameters | {'sources': sources},
         'results': [row.record() for row in compared],
         'exact_models': [row.record() for row in exact],
         'stage_differences': [pair.record() for pair in results.stage_differences()],

@@ -34,7 +34,7 @@ TYPES: Mapping[str, str] = {
     ODOMETRY: MOTION,
     COMMAND: 'geometry_msgs/msg/Twist',
     f'{CONTROLLER}/journal': 'std_msgs/msg/Int64MultiArray',
-    f'{CONTROLLER}/settings': 'std_msgs/msg/String',
+    f'{CONTROLLER}/parameters': 'std_msgs/msg/String',
     **{f'{CONTROLLER}/{name}': 'std_msgs/msg/Float64' for name in NUMBERS},
 }
 """Types of the topics by relative name."""
@@ -92,7 +92,7 @@ class ControllerBag:
     def parameters(self, now_ns: int, revision: int, values: Mapping[str, Value]) -> None:
         """Write a revision of the settings."""
         text = _text(parameters_to_json(revision, values))
-        self.write(f'{CONTROLLER}/settings', now_ns, _HEAD + text)
+        self.write(f'{CONTROLLER}/parameters', now_ns, _HEAD + text)
 
     def number(self, now_ns: int, name: str, value: float) -> None:
         """Write one scalar of the controller if it is finite."""
@@ -229,7 +229,7 @@ def write_replay(inputs: ControllerInputs, again: ReplayResult, folder: Path) ->
         first = int(times[life.first]) - 2 * LATER
         for revision, parameters in life.parameters.items():
             text = parameters_to_json(revision, parameters.with_values(again.changed).to_dict())
-            messages.append((first, f'{CONTROLLER}/settings', _HEAD + _text(text)))
+            messages.append((first, f'{CONTROLLER}/parameters', _HEAD + _text(text)))
     with ControllerBag(folder, again.parameters) as tape:
         for when, topic, data in sorted(messages, key=lambda message: message[0]):
             tape.write(topic, when, data)

@@ -157,7 +157,7 @@ def load_inputs(
     }
     if missing := [name for name in (REFERENCE, ODOMETRY, COMMAND) if name not in topics]:
         raise ReplayError(f'{bag}: these topics are not in the bag: {", ".join(missing)}')
-    revisions = _revisions(held, f'{prefix}/{CONTROLLER}/settings')
+    revisions = _revisions(held, f'{prefix}/{CONTROLLER}/parameters')
     default = None
     if not revisions:
         with open_bag(bag) as recording:

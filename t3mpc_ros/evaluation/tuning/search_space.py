@@ -166,7 +166,7 @@ class SearchSpace:
         """
         if not isinstance(parameters, self.table):
             raise ParameterError(
-                f'settings must be {self.table.__name__}: got {type(parameters).__name__}'
+                f'parameters must be {self.table.__name__}: got {type(parameters).__name__}'
             )
         to_dict = parameters.to_dict()
         self.point(to_dict)
