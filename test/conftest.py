@@ -46,7 +46,7 @@ def ros(graph):
 
 
 @pytest.fixture
-def fleet(graph, tmp_path):
+def processes(graph, tmp_path):
     """Return a process group; processes that still run at the end are killed."""
     started = ProcessGroup(tmp_path / 'log', private_graph())
     yield started

@@ -131,7 +131,7 @@ def run_demo(options: DemoOptions) -> ReportMetrics:
     bag = options.output / 'bag'
     if bag.exists() and any(bag.iterdir()):
         raise ProcessError(f'{bag} already holds a recording; choose another folder with --output')
-    fleet = ProcessGroup(options.output / 'log', private_graph())
+    processes = ProcessGroup(options.output / 'log', private_graph())
     parameters = options.parameters()
     parameters['recorder']['folder'] = str(bag.resolve())
     # The nodes are stopped one after the other, which is no reason for a snapshot.
@@ -145,18 +145,18 @@ def run_demo(options: DemoOptions) -> ReportMetrics:
     )
     try:
         if board := options.board():
-            fleet.start(BOARD, BOARD, *board, program='t3mpc')
-            fleet.wait_for(BOARD, 'stop with Ctrl-C', 120.0)
+            processes.start(BOARD, BOARD, *board, program='t3mpc')
+            processes.wait_for(BOARD, 'stop with Ctrl-C', 120.0)
             stopped = (*stopped, BOARD)
         for name in options.nodes:
             print(f'  starting {name}', file=sys.stderr, flush=True)
-            fleet.start(name, parameters=parameters[name])
-            fleet.wait_ready(name)
+            processes.start(name, parameters=parameters[name])
+            processes.wait_ready(name)
         print('  waiting for discovery', file=sys.stderr, flush=True)
-        fleet.wait_for('controller', FOLLOWS)
-        _watch(fleet, options)
+        processes.wait_for('controller', FOLLOWS)
+        _watch(processes, options)
     finally:
-        codes = fleet.stop_all(stopped)
+        codes = processes.stop_all(stopped)
     if wrong := {name: code for name, code in codes.items() if code}:
         raise ProcessError(
             'not every node ended cleanly: '
@@ -167,11 +167,11 @@ def run_demo(options: DemoOptions) -> ReportMetrics:
     return write_report(bag, options.output)
 
 
-def _watch(fleet: ProcessGroup, options: DemoOptions) -> None:
+def _watch(processes: ProcessGroup, options: DemoOptions) -> None:
     progress = Progress(options.duration, live=not options.headless and sys.stderr.isatty())
     start = time.monotonic()
     while (elapsed := time.monotonic() - start) < options.duration:
-        fleet.check()
+        processes.check()
         progress.show(elapsed)
         time.sleep(min(0.2, options.duration - elapsed))
     progress.show(options.duration)

@@ -55,16 +55,16 @@ class Operator:
         rclpy.try_shutdown()
 
 
-def live_run(fleet, bag, model):
+def live_run(processes, bag, model):
     """Drive for about 20 s with every event of the controller journal."""
     learnt = Controller(ControllerParameters()).law.get_weights()
     learnt['fuzzy.coefficients'] += 0.25
     save_model(model, learnt, {})
     parameters = {'recorder': {'folder': str(bag)}, 'controller': {'model': str(model)}}
     for name in LOOP:
-        fleet.start(name, parameters=parameters.get(name))
-        fleet.wait_ready(name)
-    fleet.wait_for('controller', 'tracking')
+        processes.start(name, parameters=parameters.get(name))
+        processes.wait_ready(name)
+    processes.wait_for('controller', 'tracking')
     operator = Operator()
     try:
         time.sleep(1.0)
@@ -86,24 +86,24 @@ def live_run(fleet, bag, model):
         time.sleep(0.5)
         assert operator.call(SetBool, '/controller/enable', data=True).success
         time.sleep(1.5)
-        os.kill(fleet.pid('sim_robot'), signal.SIGSTOP)  # odometry timeout
+        os.kill(processes.pid('sim_robot'), signal.SIGSTOP)  # odometry timeout
         time.sleep(0.6)
-        os.kill(fleet.pid('sim_robot'), signal.SIGCONT)
+        os.kill(processes.pid('sim_robot'), signal.SIGCONT)
         time.sleep(2.0)
         assert operator.call(Trigger, '/controller/reset').success
         operator.set('law.gain', 12.0)
         time.sleep(2.0)
-        fleet.check()
+        processes.check()
     finally:
         operator.close()
     # The controller first: the recorder then has all messages that the controller received.
-    codes = fleet.stop_all(('controller', 'reference_generator', 'sim_robot', 'recorder'))
+    codes = processes.stop_all(('controller', 'reference_generator', 'sim_robot', 'recorder'))
     assert set(codes.values()) == {0}
 
 
-def test_a_live_run_replays_bit_for_bit(fleet, tmp_path):
+def test_a_live_run_replays_bit_for_bit(processes, tmp_path):
     """With stops, an unresponsive robot, a timeout, dynamic parameters and a model file."""
-    live_run(fleet, tmp_path / 'bag', tmp_path / 'model.npz')
+    live_run(processes, tmp_path / 'bag', tmp_path / 'model.npz')
     inputs = load_inputs(tmp_path / 'bag')
     assert inputs.journalled
     [life] = inputs.lives
@@ -129,19 +129,19 @@ def test_a_live_run_replays_bit_for_bit(fleet, tmp_path):
     assert all(row.count > 100 and row.absolute == 0.0 for row in numbers), outcome.table()
 
 
-def test_a_late_recorder_can_replay_from_the_beginning(fleet, tmp_path):
+def test_a_late_recorder_can_replay_from_the_beginning(processes, tmp_path):
     """Without the initial inputs of the controller the first odometry messages would be lost."""
     bag = tmp_path / 'bag'
     for name in ('sim_robot', 'reference_generator', 'controller'):
-        fleet.start(name)
-        fleet.wait_ready(name)
-    fleet.wait_for('controller', 'tracking')
-    fleet.start('recorder', parameters={'folder': str(bag)})
-    fleet.wait_ready('recorder')
+        processes.start(name)
+        processes.wait_ready(name)
+    processes.wait_for('controller', 'tracking')
+    processes.start('recorder', parameters={'folder': str(bag)})
+    processes.wait_ready('recorder')
     time.sleep(5.0)
-    fleet.check()
+    processes.check()
     order = ('controller', 'reference_generator', 'sim_robot', 'recorder')
-    assert set(fleet.stop_all(order).values()) == {0}
+    assert set(processes.stop_all(order).values()) == {0}
     inputs = load_inputs(bag)
     assert inputs.journalled
     [life] = inputs.lives

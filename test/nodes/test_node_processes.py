@@ -18,42 +18,44 @@ EXECUTABLES = ('reference_generator', 'controller', 'sim_robot', 'recorder', 'pl
 LOOP = ('recorder', 'controller', 'sim_robot', 'reference_generator')
 
 
-def _start_loop(fleet, bag):
+def _start_loop(processes, bag):
     for name in LOOP:
-        _start(fleet, name, bag)
-    fleet.wait_for('controller', 'tracking')
+        _start(processes, name, bag)
+    processes.wait_for('controller', 'tracking')
 
 
-def _start(fleet, name, bag):
-    fleet.start(name, parameters={'folder': str(bag)} if name == 'recorder' else None)
-    fleet.wait_ready(name)
+def _start(processes, name, bag):
+    processes.start(name, parameters={'folder': str(bag)} if name == 'recorder' else None)
+    processes.wait_ready(name)
 
 
 @pytest.mark.parametrize('name', EXECUTABLES)
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_each_executable_starts_and_ends_with_code_0(name, number, fleet, tmp_path, monkeypatch):
+def test_each_executable_starts_and_ends_with_code_0(
+    name, number, processes, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
-    fleet.start(name)
-    fleet.wait_ready(name)
-    assert fleet.stop(name, number) == 0
-    assert 'Traceback' not in fleet.log(name).read_text()
+    processes.start(name)
+    processes.wait_ready(name)
+    assert processes.stop(name, number) == 0
+    assert 'Traceback' not in processes.log(name).read_text()
 
 
 @pytest.mark.parametrize('delay', [0.4, 0.9, 1.6])
-def test_a_signal_during_start_ends_quietly_with_code_0(delay, fleet):
+def test_a_signal_during_start_ends_quietly_with_code_0(delay, processes):
     """A signal during the slow imports must not end in a traceback."""
-    fleet.start('controller')
+    processes.start('controller')
     time.sleep(delay)
-    assert fleet.stop('controller', signal.SIGINT) == 0
-    assert 'Traceback' not in fleet.log('controller').read_text()
+    assert processes.stop('controller', signal.SIGINT) == 0
+    assert 'Traceback' not in processes.log('controller').read_text()
 
 
-def test_the_loop_runs_at_100_hz_in_four_processes(fleet, tmp_path):
+def test_the_loop_runs_at_100_hz_in_four_processes(processes, tmp_path):
     bag = tmp_path / 'bag'
-    _start_loop(fleet, bag)
+    _start_loop(processes, bag)
     time.sleep(8.0)
-    fleet.check()
-    codes = fleet.stop_all(('reference_generator', 'controller', 'sim_robot', 'recorder'))
+    processes.check()
+    codes = processes.stop_all(('reference_generator', 'controller', 'sim_robot', 'recorder'))
     assert set(codes.values()) == {0}
     with open_bag(bag) as recording:
         for topic in ('/reference', '/odom'):
@@ -93,20 +95,20 @@ def _moving_share(stamps, speed, start_ns, seconds):
 
 
 @pytest.mark.parametrize('victim', ['reference_generator', 'controller'])
-def test_killed_source_stops_robot_in_half_a_second(victim, fleet, tmp_path):
+def test_killed_source_stops_robot_in_half_a_second(victim, processes, tmp_path):
     bag = tmp_path / 'bag'
-    _start_loop(fleet, bag)
+    _start_loop(processes, bag)
     time.sleep(5.0)
     killed_ns = time.time_ns()
-    fleet.kill(victim)
+    processes.kill(victim)
     time.sleep(2.0)
-    fleet.check()  # the other processes run on
-    _start(fleet, victim, bag)
+    processes.check()  # the other processes run on
+    _start(processes, victim, bag)
     restarted_ns = time.time_ns()
     time.sleep(7.0)  # discovery takes up to three seconds
-    fleet.check()
+    processes.check()
     assert set(
-        fleet.stop_all(('reference_generator', 'controller', 'sim_robot', 'recorder')).values()
+        processes.stop_all(('reference_generator', 'controller', 'sim_robot', 'recorder')).values()
     ) == {0}
 
     stamps, speed = _speeds(bag)
@@ -120,20 +122,20 @@ def test_killed_source_stops_robot_in_half_a_second(victim, fleet, tmp_path):
     assert pulses[late].max() < 0.01, 'the motors still turned half a second after the kill'
 
 
-def test_a_killed_robot_zeroes_commands_until_its_restart(fleet, tmp_path):
+def test_a_killed_robot_zeroes_commands_until_its_restart(processes, tmp_path):
     bag = tmp_path / 'bag'
-    _start_loop(fleet, bag)
+    _start_loop(processes, bag)
     time.sleep(5.0)
     killed_ns = time.time_ns()
-    fleet.kill('sim_robot')
+    processes.kill('sim_robot')
     time.sleep(1.5)
-    fleet.check()
-    _start(fleet, 'sim_robot', bag)
+    processes.check()
+    _start(processes, 'sim_robot', bag)
     restarted_ns = time.time_ns()
     time.sleep(7.0)
-    fleet.check()
+    processes.check()
     assert set(
-        fleet.stop_all(('reference_generator', 'controller', 'sim_robot', 'recorder')).values()
+        processes.stop_all(('reference_generator', 'controller', 'sim_robot', 'recorder')).values()
     ) == {0}
 
     with open_bag(bag) as recording:
@@ -147,31 +149,31 @@ def test_a_killed_robot_zeroes_commands_until_its_restart(fleet, tmp_path):
     assert _moving_share(stamps, speed, restarted_ns + 5 * NANOSECONDS, 1.5) > 0.5
 
 
-def test_a_restarted_recorder_continues_the_bag(fleet, tmp_path):
+def test_a_restarted_recorder_continues_the_bag(processes, tmp_path):
     bag = tmp_path / 'bag'
-    _start_loop(fleet, bag)
+    _start_loop(processes, bag)
     time.sleep(3.0)
-    fleet.kill('recorder')
+    processes.kill('recorder')
     time.sleep(1.0)
-    fleet.check()
-    _start(fleet, 'recorder', bag)
+    processes.check()
+    _start(processes, 'recorder', bag)
     restarted_ns = time.time_ns()
     time.sleep(6.0)
-    fleet.check()
+    processes.check()
     assert set(
-        fleet.stop_all(('reference_generator', 'controller', 'sim_robot', 'recorder')).values()
+        processes.stop_all(('reference_generator', 'controller', 'sim_robot', 'recorder')).values()
     ) == {0}
     assert len(list(bag.glob('*.mcap'))) == 2
     stamps, speed = _speeds(bag)
     assert _moving_share(stamps, speed, restarted_ns + 4 * NANOSECONDS, 1.5) > 0.8
 
 
-def test_composed_closes_the_loop_in_one_process(fleet, tmp_path):
+def test_composed_closes_the_loop_in_one_process(processes, tmp_path):
     bag = tmp_path / 'bag'
-    fleet.start('composed', parameters={'folder': str(bag)})
-    fleet.wait_ready('composed')
+    processes.start('composed', parameters={'folder': str(bag)})
+    processes.wait_ready('composed')
     time.sleep(6.0)
-    assert fleet.stop('composed') == 0
+    assert processes.stop('composed') == 0
     stamps, speed = _speeds(bag)
     assert speed.max() > 0.02
     with open_bag(bag) as recording:
@@ -195,24 +197,26 @@ def test_composed_closes_the_loop_in_one_process(fleet, tmp_path):
         ('controller', ['--ros-args', '-p', 'model:=BROKEN'], ['BROKEN', 'not a model file']),
     ],
 )
-def test_invalid_input_at_start_is_one_line_and_code_2(name, arguments, words, fleet, tmp_path):
+def test_invalid_input_at_start_is_one_line_and_code_2(
+    name, arguments, words, processes, tmp_path
+):
     (tmp_path / 'BROKEN').write_text('controller:\n  ros__parameters: [1,\n')
     (tmp_path / 'FILE').write_text('a file where a folder is wanted')
     places = {word: str(tmp_path / word) for word in ('BROKEN', 'FILE', 'MISSING')}
     given = list(arguments)
     for word, path in places.items():
         given = [argument.replace(word, path) for argument in given]
-    fleet.start(name, *given)
+    processes.start(name, *given)
     with pytest.raises(ProcessError, match='code 2'):
-        fleet.wait_ready(name)
-    status = fleet.log(name).read_text()
+        processes.wait_ready(name)
+    status = processes.log(name).read_text()
     assert 'Traceback' not in status
     line = next(line for line in status.splitlines() if line.startswith(f'{name}: '))
     for word in words:
         assert word in line
 
 
-def test_an_integer_for_a_float_parameter_is_accepted(fleet):
-    fleet.start('controller', '--ros-args', '-p', 'law.gain:=5')
-    fleet.wait_ready('controller')
-    assert fleet.stop('controller') == 0
+def test_an_integer_for_a_float_parameter_is_accepted(processes):
+    processes.start('controller', '--ros-args', '-p', 'law.gain:=5')
+    processes.wait_ready('controller')
+    assert processes.stop('controller') == 0

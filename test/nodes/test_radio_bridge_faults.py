@@ -98,27 +98,27 @@ def follows_commands(node):
 
 
 @pytest.mark.slow
-def test_a_killed_bridge_leaves_the_wheels_at_rest(harness, fleet, tmp_path):
+def test_a_killed_bridge_leaves_the_wheels_at_rest(harness, processes, tmp_path):
     """SIGKILL at full speed; the emulator measures the time to standstill."""
     path = tmp_path / 'dongle'
-    fleet.start('emulator', 'emulator', '--link', str(path), program='t3mpc')
-    fleet.wait_for('emulator', 'stop with Ctrl-C', 120.0)
+    processes.start('emulator', 'emulator', '--link', str(path), program='t3mpc')
+    processes.wait_for('emulator', 'stop with Ctrl-C', 120.0)
     odom = harness.subscribe(Odometry, 'odom')
     source = CommandSource(harness)
     for _ in range(2):
-        fleet.start('radio_bridge', parameters={'port': str(path)})
+        processes.start('radio_bridge', parameters={'port': str(path)})
         source.message = twist(FULL)
         odom.clear()
         harness.spin_until(
             lambda: odom and odom[-1].twist.twist.linear.x > 0.98 * FULL, 'full speed'
         )
-        fleet.kill('radio_bridge')
-        before = fleet.log('emulator').read_text().count('at rest')
+        processes.kill('radio_bridge')
+        before = processes.log('emulator').read_text().count('at rest')
         harness.spin_until(
-            lambda before=before: fleet.log('emulator').read_text().count('at rest') > before,
+            lambda before=before: processes.log('emulator').read_text().count('at rest') > before,
             'rest',
         )
-    found = re.findall(r'at rest ([0-9.]+) s', fleet.log('emulator').read_text())
+    found = re.findall(r'at rest ([0-9.]+) s', processes.log('emulator').read_text())
     print(f'\nat rest {", ".join(found)} s after the last command')
     assert len(found) >= 2
     assert max(map(float, found)) <= REST

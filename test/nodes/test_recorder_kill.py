@@ -92,21 +92,21 @@ def kill_in_sequence(root, slot, source):
     result = []
     for turn in range(TURNS):
         name = f'slot_{slot}_{turn}'
-        fleet = ProcessGroup(root / f'log_{name}', private_graph())
+        processes = ProcessGroup(root / f'log_{name}', private_graph())
         bag = root / name
         try:
-            fleet.start(
+            processes.start(
                 'recorder',
                 *('--ros-args', '-r', f'__ns:=/{name}'),
                 parameters={'folder': str(bag), 'topics': ['/odom']},
             )
-            fleet.wait_ready('recorder')
+            processes.wait_ready('recorder')
             wait_until(lambda name=name: source.has_subscriber_in(f'/{name}'))
             subscribed_ns = time.time_ns()
             time.sleep(rng.uniform(2.0, 5.0))
             killed_ns = time.time_ns()
         finally:
-            fleet.kill('recorder')
+            processes.kill('recorder')
         result.append(KilledRecorder(bag, subscribed_ns, killed_ns))
     return result
 

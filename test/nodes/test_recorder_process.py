@@ -24,9 +24,9 @@ pytestmark = pytest.mark.ros
 DEEP = QoSProfile(depth=5000)
 
 
-def test_two_thousand_messages_a_second_are_all_recorded(fleet, tmp_path):
+def test_two_thousand_messages_a_second_are_all_recorded(processes, tmp_path):
     """``recorder_bench.py`` runs this for a minute and prints the processor load."""
-    found = run(tmp_path / 'bag', fleet, seconds=4.0)
+    found = run(tmp_path / 'bag', processes, seconds=4.0)
     assert found.sent == 8000
     assert found.recorded == found.sent
     assert found.in_order
@@ -76,9 +76,9 @@ def publisher(ros):
     made.close()
 
 
-def start(fleet, folder, **more):
-    fleet.start('recorder', parameters={'folder': str(folder), 'topics': ['number'], **more})
-    fleet.wait_ready('recorder')
+def start(processes, folder, **more):
+    processes.start('recorder', parameters={'folder': str(folder), 'topics': ['number'], **more})
+    processes.wait_ready('recorder')
 
 
 def numbers(path):
@@ -87,12 +87,12 @@ def numbers(path):
 
 
 @pytest.mark.parametrize('moment', [1, 2])
-def test_a_killed_recorder_loses_at_most_one_second(moment, fleet, publisher, tmp_path):
-    start(fleet, tmp_path / 'bag')
+def test_a_killed_recorder_loses_at_most_one_second(moment, processes, publisher, tmp_path):
+    start(processes, tmp_path / 'bag')
     publisher.wait_for_recorder()
     publisher.publish(150 + random.Random(moment).randrange(100))
     killed = time.time_ns()
-    fleet.kill('recorder')
+    processes.kill('recorder')
     (path,) = (tmp_path / 'bag').glob('*.mcap')
     finalize_file(path)
     kept = numbers(path)
@@ -101,41 +101,41 @@ def test_a_killed_recorder_loses_at_most_one_second(moment, fleet, publisher, tm
     assert kept == list(range(len(kept)))
 
 
-def test_a_recorder_killed_after_a_pause_has_lost_nothing(fleet, publisher, tmp_path):
-    start(fleet, tmp_path / 'bag')
+def test_a_recorder_killed_after_a_pause_has_lost_nothing(processes, publisher, tmp_path):
+    start(processes, tmp_path / 'bag')
     publisher.wait_for_recorder()
     publisher.publish(20)
     time.sleep(1.0)
-    fleet.kill('recorder')
+    processes.kill('recorder')
     (path,) = (tmp_path / 'bag').glob('*.mcap')
     assert finalize_file(path) == 20
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_messages_before_a_signal_are_in_the_bag(number, fleet, publisher, tmp_path):
-    start(fleet, tmp_path / 'bag')
+def test_messages_before_a_signal_are_in_the_bag(number, processes, publisher, tmp_path):
+    start(processes, tmp_path / 'bag')
     publisher.wait_for_recorder()
     publisher.publish(900, period=0.0)
     assert publisher.acknowledged()
-    assert fleet.stop('recorder', number) == 0
+    assert processes.stop('recorder', number) == 0
     assert numbers(tmp_path / 'bag') == list(range(900))
 
 
-def test_a_file_size_limit_stops_recording_readably(fleet, publisher, tmp_path):
-    start(fleet, tmp_path / 'bag', chunk_time=0.05)
+def test_a_file_size_limit_stops_recording_readably(processes, publisher, tmp_path):
+    start(processes, tmp_path / 'bag', chunk_time=0.05)
     publisher.wait_for_recorder()
     publisher.ballast = 500
     # More than the reserve for the end of a file on a full disk.
-    resource.prlimit(fleet.pid('recorder'), resource.RLIMIT_FSIZE, (400_000, 400_000))
+    resource.prlimit(processes.pid('recorder'), resource.RLIMIT_FSIZE, (400_000, 400_000))
 
     def publish_until_the_end():
         while len(publisher.sent) < 3000:
             publisher.publish(1)
-            fleet.check()
+            processes.check()
 
     with pytest.raises(ProcessError, match='ended with code 1'):
         publish_until_the_end()
-    status = fleet.log('recorder').read_text()
+    status = processes.log('recorder').read_text()
     assert status.count('recording has stopped') == 1
     for words in ('File too large', 'messages are kept', 'restart the recorder'):
         assert words in status

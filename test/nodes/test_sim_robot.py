@@ -323,11 +323,11 @@ def test_the_initial_pose_is_used_unless_within_a_wall(harness):
         ({'real_time_factor': 10.0}, ['publish_clock must be true', 'real_time_factor 10']),
     ],
 )
-def test_unusable_parameters_end_the_process_with_code_2(given, words, fleet):
-    fleet.start('sim_robot', parameters=given)
+def test_unusable_parameters_end_the_process_with_code_2(given, words, processes):
+    processes.start('sim_robot', parameters=given)
     with pytest.raises(ProcessError, match='code 2'):
-        fleet.wait_ready('sim_robot')
-    lines = fleet.log('sim_robot').read_text().splitlines()
+        processes.wait_ready('sim_robot')
+    lines = processes.log('sim_robot').read_text().splitlines()
     (line,) = (line for line in lines if line.startswith('sim_robot: '))
     for word in words:
         assert word in line

@@ -8,7 +8,7 @@ A publisher and the recorder run as processes of their own over DDS on loopback.
 topics are Odometry (about 0.7 kB), half Float64; each message carries its number. Printed are the
 messages sent, recorded and lost, and the processor time of the recorder (user and system, of all
 its threads) as a share of one core, from the first message to the last. Nothing is asserted
-here; ``test_nodes_recorder_run.py`` runs a short one and asserts that nothing is lost.
+here; ``test_recorder_process.py`` runs a short one and asserts that nothing is lost.
 """
 
 import argparse
@@ -52,14 +52,18 @@ def processor_time(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
 
 
-def run(folder: Path, fleet: ProcessGroup, seconds: float, topics: int = 20, rate: float = 100.0):
+def run(
+    folder: Path, processes: ProcessGroup, seconds: float, topics: int = 20, rate: float = 100.0
+):
     """Return the :class:`Outcome` of one recording in ``folder``."""
-    fleet.start('recorder', parameters={'folder': str(folder), 'topics': ['bench/*']})
-    fleet.wait_ready('recorder')
-    pid = fleet.pid('recorder')
+    processes.start('recorder', parameters={'folder': str(folder), 'topics': ['bench/*']})
+    processes.wait_ready('recorder')
+    pid = processes.pid('recorder')
     words = [sys.executable, __file__, '--publish', '--seconds', str(seconds)]
     words += ['--topics', str(topics), '--rate', str(rate)]
-    publisher = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=fleet._environment)
+    publisher = subprocess.Popen(
+        words, stdout=subprocess.PIPE, text=True, env=processes._environment
+    )
     try:
         assert publisher.stdout.readline() == 'begin\n'
         begin, used = time.monotonic(), processor_time(pid)
@@ -69,7 +73,7 @@ def run(folder: Path, fleet: ProcessGroup, seconds: float, topics: int = 20, rat
     finally:
         publisher.kill()
         publisher.wait()
-    code = fleet.stop('recorder')
+    code = processes.stop('recorder')
     assert code == 0, f'the recorder ended with code {code}'
     recorded, in_order = 0, True
     with open_bag(folder) as recording:
@@ -129,8 +133,8 @@ def main() -> int:
         publish(given.seconds, given.topics, given.rate)
         return 0
     with tempfile.TemporaryDirectory() as place:
-        fleet = ProcessGroup(Path(place) / 'log', private_graph())
-        found = run(Path(place) / 'bag', fleet, given.seconds, given.topics, given.rate)
+        processes = ProcessGroup(Path(place) / 'log', private_graph())
+        found = run(Path(place) / 'bag', processes, given.seconds, given.topics, given.rate)
     print(f'sent      {found.sent} in {found.seconds:.1f} s, {found.sent / found.seconds:.0f}/s')
     print(f'recorded  {found.recorded}, in order and complete: {found.in_order}')
     print(f'lost      {found.sent - found.recorded}')
