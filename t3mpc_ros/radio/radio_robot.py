@@ -76,7 +76,7 @@ class RadioRobot(RobotInterface):
 
     Parameters
     ----------
-    settings
+    parameters
         Dynamic ones change through :meth:`configure`.
     key
         Key of the robot, 16 bytes; empty for an open link.
