@@ -31,7 +31,7 @@ class Progress:
         self._total = 0
         self._marks = [(0, 0.0)]
 
-    def say(self, text: str) -> None:
+    def write(self, text: str) -> None:
         """Write a line."""
         print(text, file=self._stream, flush=True)
 

@@ -140,7 +140,7 @@ class FakeRunner:
             self.closed = True
 
 
-def bench(runner=None, methods=fake_methods):
+def fake_setup(runner=None, methods=fake_methods):
     return ExperimentSetup(methods, FakeScenario, runner or FakeRunner(), CASES, SEEDS)
 
 
@@ -148,7 +148,7 @@ SMALL = ExperimentGrid((101, 102, 103), 6.0, ('nominal', 'dead time'), (0.0, 0.0
 
 
 def small_campaign(path, runner, methods=fake_methods, sources='s', progress=None):
-    made = bench(runner, methods)
+    made = fake_setup(runner, methods)
     needed = needed_experiments(made, SMALL)
     return run_missing(made, SMALL, needed, RunFile(path), sources, progress=progress)
 
@@ -157,7 +157,7 @@ def small_campaign(path, runner, methods=fake_methods, sources='s', progress=Non
 
 
 def test_full_grid_holds_exactly_the_needed_experiments():
-    found = needed_experiments(bench(), make_grid(bench()))
+    found = needed_experiments(fake_setup(), make_grid(fake_setup()))
     names = fake_methods('torque')
     baselines = {name for name, method in names.items() if method.baseline}
     missing = {name for name in names if name.startswith('full with')}
@@ -186,25 +186,27 @@ def test_full_grid_holds_exactly_the_needed_experiments():
 
 
 def test_the_quick_plan_is_part_of_the_full_one_and_shorter():
-    quick = make_grid(bench(), quick=True)
-    assert set(needed_experiments(bench(), quick)) < set(
-        needed_experiments(bench(), make_grid(bench()))
+    quick = make_grid(fake_setup(), quick=True)
+    assert set(needed_experiments(fake_setup(), quick)) < set(
+        needed_experiments(fake_setup(), make_grid(fake_setup()))
     )
     assert len(quick.seeds) == 3
     assert quick.duration < 60.0
     for part, case, drives in claiming.INTENDED:  # what a part is meant for is in the quick one
         for drive in drives:
-            assert Experiment(FULL, drive, 0.04, case) in needed_experiments(bench(), quick), part
+            assert Experiment(FULL, drive, 0.04, case) in needed_experiments(
+                fake_setup(), quick
+            ), part
 
 
 @pytest.mark.parametrize('seeds', [0, 21])
 def test_seeds_that_are_not_held_out_cannot_be_asked_for(seeds):
     with pytest.raises(ValueError, match='seeds must be from 1 to 20'):
-        make_grid(bench(), seeds=seeds)
+        make_grid(fake_setup(), seeds=seeds)
 
 
 def test_a_bench_without_the_full_controller_is_refused():
-    lame = bench(methods=lambda drive: {'PI': FakeMethod('PI', True, False)})
+    lame = fake_setup(methods=lambda drive: {'PI': FakeMethod('PI', True, False)})
     with pytest.raises(ValueError, match='must hold full'):
         needed_experiments(lame, SMALL)
 
@@ -214,7 +216,7 @@ def test_a_stage_marked_as_baseline_is_rejected():
         return fake_methods(drive) | {FULL: FakeMethod(FULL, True, True)}
 
     with pytest.raises(ValueError, match='must not be baselines: got full'):
-        needed_experiments(bench(methods=confused), SMALL)
+        needed_experiments(fake_setup(methods=confused), SMALL)
 
 
 # The campaign
@@ -304,12 +306,12 @@ def test_runs_that_never_come_back_are_an_error(tmp_path):
 
 
 def test_numbers_survive_the_file_bit_for_bit(tmp_path):
-    made = bench(FakeRunner())
+    made = fake_setup(FakeRunner())
     needed = needed_experiments(made, SMALL)
     fresh = run_missing(made, SMALL, needed, RunFile(tmp_path / 'r'), 's')
-    again = run_missing(bench(), SMALL, needed, RunFile(tmp_path / 'r'), 's')
-    for cell in needed:
-        for one, other in zip(fresh[cell], again[cell], strict=True):
+    again = run_missing(fake_setup(), SMALL, needed, RunFile(tmp_path / 'r'), 's')
+    for experiment in needed:
+        for one, other in zip(fresh[experiment], again[experiment], strict=True):
             assert one.rmse.hex() == other.rmse.hex()
             assert one.chatter.hex() == other.chatter.hex()
 
@@ -473,7 +475,7 @@ def test_a_method_must_be_of_one_kind_with_both_drives():
         return {FULL: FakeMethod(FULL, False, drive == 'torque')}
 
     with pytest.raises(ValueError, match='same kind'):
-        results_of(bench(methods=mixed), SMALL, {})
+        results_of(fake_setup(methods=mixed), SMALL, {})
 
 
 # Claims
@@ -676,7 +678,7 @@ def test_the_path_on_the_floor_is_exact_for_lines_and_circles():
 def folder(tmp_path_factory):
     output = tmp_path_factory.mktemp('paper')
     options = PaperOptions(output, quick=True, seeds=2, estimation_seeds=1, json=output / 'copy')
-    reproduce(bench(), options)
+    reproduce(fake_setup(), options)
     return output
 
 
@@ -778,7 +780,7 @@ def test_nothing_depends_on_the_order_of_the_runs_or_on_a_resume(folder, tmp_pat
     (tmp_path / RUNS).write_text(''.join(lines[::-3]) + lines[1][:-9])
     options = PaperOptions(tmp_path, quick=True, seeds=2, estimation_seeds=1, workers=3)
     runner = FakeRunner(backwards=True)
-    reproduce(bench(runner), options)
+    reproduce(fake_setup(runner), options)
     assert len(runner.done) < len(lines)
     for name in ('results.json', 'results.csv', 'tables.md'):
         assert (tmp_path / name).read_text() == (folder / name).read_text(), name

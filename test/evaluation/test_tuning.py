@@ -469,7 +469,7 @@ def test_a_damaged_history_is_refused(tmp_path):
         resume(json.dumps(content))
 
 
-# The price of a run
+# The objective of a run
 
 
 @dataclass
@@ -508,16 +508,16 @@ def test_tuning_mixes_noises_and_excludes_held_out_seeds():
 
 
 def test_mean_objective_is_independent_of_run_order():
-    prices = np.random.default_rng(1).uniform(size=12)
-    expected = prices.reshape(3, 4).mean(axis=1)
-    pairs = list(enumerate(prices.tolist()))
+    objectives = np.random.default_rng(1).uniform(size=12)
+    expected = objectives.reshape(3, 4).mean(axis=1)
+    pairs = list(enumerate(objectives.tolist()))
     first = mean_objectives(3, 4, pairs)
     assert first == pytest.approx(expected)
     assert mean_objectives(3, 4, pairs[::-1]) == first
     assert mean_objectives(3, 4, [*pairs[:-1], (11, math.inf)])[:2] == first[:2]
     assert mean_objectives(3, 4, [*pairs[:-1], (11, math.inf)])[2] == math.inf
     for wrong in (pairs[:-1], [*pairs, pairs[0]], [*pairs[:-1], (12, 0.0)]):
-        with pytest.raises(ValueError, match='priced'):
+        with pytest.raises(ValueError, match='evaluated'):
             mean_objectives(3, 4, wrong)
 
 
@@ -565,8 +565,8 @@ def test_closed_loop_objective_is_computed_per_run():
             closed_loop_run(Scenario('torque', noise, 'nominal', seed, 5.0), spec)
             for seed, noise in ((1, 0.0), (2, 0.1))
         ]
-        prices = [record.rmse() + SMOOTHNESS * record.chatter() for record in records]
-        assert value == pytest.approx(np.mean(prices), rel=1e-12)
+        objectives = [record.rmse() + SMOOTHNESS * record.chatter() for record in records]
+        assert value == pytest.approx(np.mean(objectives), rel=1e-12)
     assert found[1] < found[0]
 
 

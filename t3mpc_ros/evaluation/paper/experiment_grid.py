@@ -179,7 +179,7 @@ QUICK_CASES = (NOMINAL, 'mass +30 %', 'friction x3', 'disturbance', DEAD_TIME)
 
 
 def make_grid(
-    bench: ExperimentSetup, *, quick: bool = False, seeds: int | None = None
+    setup: ExperimentSetup, *, quick: bool = False, seeds: int | None = None
 ) -> ExperimentGrid:
     """Return how much is run: everything, or with ``quick`` enough to see that all works.
 
@@ -188,20 +188,20 @@ def make_grid(
     ValueError
         More seeds are asked for than are held out.
     """
-    count = (3 if quick else len(bench.seeds)) if seeds is None else seeds
-    if not 1 <= count <= len(bench.seeds):
-        raise ValueError(f'seeds must be from 1 to {len(bench.seeds)}: got {count}')
+    count = (3 if quick else len(setup.seeds)) if seeds is None else seeds
+    if not 1 <= count <= len(setup.seeds):
+        raise ValueError(f'seeds must be from 1 to {len(setup.seeds)}: got {count}')
     if not quick:
         return ExperimentGrid(
-            bench.seeds[:count], DURATION, bench.cases, perturbed_noises=(0.0, PAPER_NOISE)
+            setup.seeds[:count], DURATION, setup.cases, perturbed_noises=(0.0, PAPER_NOISE)
         )
-    cases = tuple(case for case in QUICK_CASES if case in bench.cases)
+    cases = tuple(case for case in QUICK_CASES if case in setup.cases)
     return ExperimentGrid(
-        bench.seeds[:count], 26.0, cases, (0.0, PAPER_NOISE), (PAPER_NOISE,), (PAPER_NOISE,), ()
+        setup.seeds[:count], 26.0, cases, (0.0, PAPER_NOISE), (PAPER_NOISE,), (PAPER_NOISE,), ()
     )
 
 
-def needed_experiments(bench: ExperimentSetup, extent: ExperimentGrid) -> tuple[Experiment, ...]:
+def needed_experiments(setup: ExperimentSetup, grid: ExperimentGrid) -> tuple[Experiment, ...]:
     """Return every cell that is needed, each once, by drive, case, noise and method.
 
     Every baseline and every stage of the controller in the nominal case at every noise; the stages
@@ -216,8 +216,8 @@ def needed_experiments(bench: ExperimentSetup, extent: ExperimentGrid) -> tuple[
         stage of the controller is called a baseline.
     """
     found = []
-    for drive in extent.drives:
-        methods = bench.methods(drive)
+    for drive in grid.drives:
+        methods = setup.methods(drive)
         if FULL not in methods or any(name != method.name for name, method in methods.items()):
             names = ', '.join(methods)
             raise ValueError(f'methods of {drive} must hold {FULL}, by their names: got {names}')
@@ -225,26 +225,26 @@ def needed_experiments(bench: ExperimentSetup, extent: ExperimentGrid) -> tuple[
             raise ValueError(
                 f'stages of the controller must not be baselines: got {", ".join(wrong)}'
             )
-        for case in extent.cases:
+        for case in grid.cases:
             if case == DEAD_TIME and drive != 'velocity':
                 continue
-            for noise in extent.noises:
+            for noise in grid.noises:
                 for name, method in methods.items():
-                    if noise in _noises(extent, method, case):
+                    if noise in _noises(grid, method, case):
                         found.append(Experiment(name, drive, noise, case))
     return tuple(found)
 
 
-def _noises(extent: ExperimentGrid, method: Method, case: str) -> tuple[float, ...]:
+def _noises(grid: ExperimentGrid, method: Method, case: str) -> tuple[float, ...]:
     """Return the noises at which a method runs a case."""
     if method.name in WITHOUT.values():
         wanted = case == NOMINAL or case in INTENDED_CASES.get(method.name, ())
-        return extent.missing_noises if wanted else ()
+        return grid.missing_noises if wanted else ()
     if case == NOMINAL:
-        return extent.noises
+        return grid.noises
     if method.baseline:
-        return extent.baseline_noises if method.preview and case in extent.baseline_cases else ()
-    return extent.perturbed_noises
+        return grid.baseline_noises if method.preview and case in grid.baseline_cases else ()
+    return grid.perturbed_noises
 
 
 def _is_baseline(methods: Mapping[str, Method], name: str) -> bool:

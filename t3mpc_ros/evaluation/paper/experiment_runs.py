@@ -133,7 +133,7 @@ def plain(value: Any) -> Any:
 class RunKey:
     """Which run a line of the file is about."""
 
-    cell: Experiment
+    experiment: Experiment
     seed: int
     duration: float
     fingerprint: str
@@ -227,7 +227,7 @@ def finite_or_none(value: float) -> float | None:
 
 
 def _encode(key: RunKey, numbers: RunNumbers) -> str:
-    row = asdict(key.cell) | {'seed': key.seed, 'duration': key.duration}
+    row = asdict(key.experiment) | {'seed': key.seed, 'duration': key.duration}
     row |= {
         name: value if isinstance(value, bool) else finite_or_none(value)
         for name, value in asdict(numbers).items()
@@ -237,8 +237,10 @@ def _encode(key: RunKey, numbers: RunNumbers) -> str:
 
 def _decode(line: str) -> tuple[RunKey, RunNumbers]:
     row = json.loads(line)
-    cell = Experiment(str(row['method']), str(row['drive']), float(row['noise']), str(row['case']))
-    key = RunKey(cell, int(row['seed']), float(row['duration']), str(row['fingerprint']))
+    experiment = Experiment(
+        str(row['method']), str(row['drive']), float(row['noise']), str(row['case'])
+    )
+    key = RunKey(experiment, int(row['seed']), float(row['duration']), str(row['fingerprint']))
     names = ('rmse', 'settled', 'chatter', 'largest_error')
     values = [math.nan if row[name] is None else float(row[name]) for name in names]
     if not isinstance(row['finite'], bool):
@@ -251,8 +253,8 @@ Numbers = Mapping[Experiment, tuple[RunNumbers, ...]]
 
 
 def run_missing(
-    bench: ExperimentSetup,
-    extent: ExperimentGrid,
+    setup: ExperimentSetup,
+    grid: ExperimentGrid,
     needed: Sequence[Experiment],
     file: RunFile,
     sources: str,
@@ -268,7 +270,7 @@ def run_missing(
 
     Parameters
     ----------
-    bench
+    setup
         Where methods and runs come from.
     extent, needed
         Seeds and duration, and which cells.
@@ -277,7 +279,7 @@ def run_missing(
     sources
         Digest of the sources, :func:`t3mpc_ros.evaluation.paper.experiment_runs.source_digest`.
     team
-        Who works: how many processes, or what the bench's own ``team`` enters.
+        Who works: how many processes, or what the setup's own ``team`` enters.
     progress
         Progress output; None for none.
 
@@ -286,7 +288,7 @@ def run_missing(
     RuntimeError
         The runner gave fewer runs than it was asked for, or another campaign has the file.
     """
-    methods = {drive: bench.methods(drive) for drive in extent.drives}
+    methods = {drive: setup.methods(drive) for drive in grid.drives}
     prints = {
         (drive, name): fingerprint(method, sources)
         for drive, table in methods.items()
@@ -294,33 +296,33 @@ def run_missing(
     }
     # Seed by seed: cheap and dear methods stay mixed, so the estimate of the time left holds.
     keys = [
-        RunKey(cell, seed, extent.duration, prints[cell.drive, cell.method])
-        for seed in extent.seeds
-        for cell in needed
+        RunKey(experiment, seed, grid.duration, prints[experiment.drive, experiment.method])
+        for seed in grid.seeds
+        for experiment in needed
     ]
     with file:
         known = file.read()
         found = {key: known[key] for key in keys if key in known}
         missing = [key for key in keys if key not in found]
         if progress is not None:
-            progress.say(_resume_message(file, len(keys), len(found), len(known) - len(found)))
+            progress.write(_resume_message(file, len(keys), len(found), len(known) - len(found)))
             progress.begin(len(missing))
         jobs = [
             (
-                bench.scenario(
-                    drive=key.cell.drive,
-                    noise=key.cell.noise,
-                    case=key.cell.case,
+                setup.scenario(
+                    drive=key.experiment.drive,
+                    noise=key.experiment.noise,
+                    case=key.experiment.case,
                     seed=key.seed,
                     duration=key.duration,
                 ),
-                methods[key.cell.drive][key.cell.method],
+                methods[key.experiment.drive][key.experiment.method],
             )
             for key in missing
         ]
         try:
             with contextlib.ExitStack() as stack:
-                runs = bench.measure_many(jobs, measure, team) if jobs else ()
+                runs = setup.measure_many(jobs, measure, team) if jobs else ()
                 if close := getattr(runs, 'close', None):
                     stack.callback(close)  # its processes end with this loop, however it ends
                 for count, (index, numbers) in enumerate(runs, 1):
@@ -331,7 +333,7 @@ def run_missing(
         except BaseException:
             if progress is not None:
                 progress.broken_off()
-                progress.say(
+                progress.write(
                     f'{len(found)} of {len(keys)} runs are kept in {file.path}: '
                     'the same command goes on from there'
                 )
@@ -339,11 +341,15 @@ def run_missing(
     if len(found) != len(keys):
         raise RuntimeError(f'{len(keys) - len(found)} runs never came back')
     return {
-        cell: tuple(
-            found[RunKey(cell, seed, extent.duration, prints[cell.drive, cell.method])]
-            for seed in extent.seeds
+        experiment: tuple(
+            found[
+                RunKey(
+                    experiment, seed, grid.duration, prints[experiment.drive, experiment.method]
+                )
+            ]
+            for seed in grid.seeds
         )
-        for cell in needed
+        for experiment in needed
     }
 
 

@@ -73,7 +73,7 @@ class FigureRuns:
 
 
 def simulate_figure_runs(
-    bench: ExperimentSetup, extent: ExperimentGrid, results: Results, team: Any
+    setup: ExperimentSetup, grid: ExperimentGrid, results: Results, team: Any
 ) -> FigureRuns:
     """Return the runs that are drawn, with the first held-out seed.
 
@@ -82,27 +82,27 @@ def simulate_figure_runs(
     RuntimeError
         The runner gave fewer runs than it was asked for.
     """
-    seed = extent.seeds[0]
+    seed = grid.seeds[0]
     shown = portrait_methods(results)
     requested = [('torque', name) for name in shown] + [('velocity', FULL)]
-    if NO_PREVIEW in bench.methods('velocity'):
+    if NO_PREVIEW in setup.methods('velocity'):
         requested.append(('velocity', NO_PREVIEW))
-    methods = {kind: bench.methods(kind) for kind in ('torque', 'velocity')}
+    methods = {kind: setup.methods(kind) for kind in ('torque', 'velocity')}
     jobs = [
         (
-            bench.scenario(
-                drive=kind, noise=PAPER_NOISE, case=NOMINAL, seed=seed, duration=extent.duration
+            setup.scenario(
+                drive=kind, noise=PAPER_NOISE, case=NOMINAL, seed=seed, duration=grid.duration
             ),
             methods[kind][name],
         )
         for kind, name in requested
     ]
     found: dict[tuple[str, str], RunRecord] = {}
-    for index, run in bench.measure_many(jobs, full_record, team):
+    for index, run in setup.measure_many(jobs, full_record, team):
         found[requested[index]] = run
     if len(found) != len(requested):
         raise RuntimeError(f'{len(requested) - len(found)} runs never came back')
-    alone = simulate_open_loop(torque_robot(PAPER_NOISE, seed), SETTLE + extent.duration, seed)
+    alone = simulate_open_loop(torque_robot(PAPER_NOISE, seed), SETTLE + grid.duration, seed)
     first = round(SETTLE / alone.period)
     return FigureRuns(
         seed=seed,

@@ -47,7 +47,7 @@ def default_setup() -> ExperimentSetup:
     )
 
 
-def reproduce(bench: ExperimentSetup, options: PaperOptions, progress: Any = None) -> str:
+def reproduce(setup: ExperimentSetup, options: PaperOptions, progress: Any = None) -> str:
     """Return a summary in a few lines, after writing everything into the output folder.
 
     ``results.json``, ``results.csv``, ``tables.md``, ``paper.html`` and ``figures/*.png``. None
@@ -55,7 +55,7 @@ def reproduce(bench: ExperimentSetup, options: PaperOptions, progress: Any = Non
 
     Parameters
     ----------
-    bench
+    setup
         Where methods and runs come from.
     options
         What is asked for.
@@ -80,29 +80,29 @@ def reproduce(bench: ExperimentSetup, options: PaperOptions, progress: Any = Non
     from t3mpc_ros.evaluation.paper.result_tables import all_tables, markdown
     from t3mpc_ros.evaluation.paper.results import results_of, write_csv, write_json
 
-    say = progress.say if progress is not None else lambda text: None
-    scope = make_grid(bench, quick=options.quick, seeds=options.seeds)
+    write = progress.write if progress is not None else lambda text: None
+    grid = make_grid(setup, quick=options.quick, seeds=options.seeds)
     file = RunFile(options.output / RUNS, fresh=options.fresh)
     sources = source_digest()
-    with bench.team(options.workers) as team:
-        needed = needed_experiments(bench, scope)
-        numbers = run_missing(bench, scope, needed, file, sources, team=team, progress=progress)
-        results = results_of(bench, scope, numbers)
-        say('  runs for the figures')
-        showcase = simulate_figure_runs(bench, scope, results, team)
-    say('  estimation without a controller (86)')
+    with setup.team(options.workers) as team:
+        needed = needed_experiments(setup, grid)
+        numbers = run_missing(setup, grid, needed, file, sources, team=team, progress=progress)
+        results = results_of(setup, grid, numbers)
+        write('  runs for the figures')
+        showcase = simulate_figure_runs(setup, grid, results, team)
+    write('  estimation without a controller (86)')
     count = options.estimation_seeds or (2 if options.quick else 20)
     variances = (0.0, 0.04) if options.quick else open_loop_estimation.VARIANCES
     estimated = open_loop_estimation.compare(
-        seeds=count, duration=scope.duration, variances=variances
+        seeds=count, duration=grid.duration, variances=variances
     )
-    say('  figures and page')
+    write('  figures and page')
     claims = (*all_claims(results, estimated), *showcase.claims())
     tables = all_tables(results, estimated)
     material = ExhibitData(results, showcase, claims)
     drawn = pictures(material)
 
-    parameters = _parameters(bench, scope, options, count, variances)
+    parameters = _parameters(setup, grid, options, count, variances)
     compared = [row for row in results.rows if EXACT not in row.controller]
     exact = [row for row in results.rows if EXACT in row.controller]
     content = {
@@ -125,14 +125,14 @@ def reproduce(bench: ExperimentSetup, options: PaperOptions, progress: Any = Non
     for stem, png in drawn.items():
         (output / 'figures' / f'{stem}.png').write_bytes(png)
     title = "The paper's figures and tables, reproduced"
-    html = page(title, _origin(scope, options, sources), claims, tables, drawn, findings(material))
+    html = page(title, _origin(grid, options, sources), claims, tables, drawn, findings(material))
     (output / 'paper.html').write_text(html, encoding='utf-8')
     return f'claims: {counted(claims)}\n{output / "paper.html"}'
 
 
 def _parameters(
-    bench: ExperimentSetup,
-    scope: ExperimentGrid,
+    setup: ExperimentSetup,
+    grid: ExperimentGrid,
     options: PaperOptions,
     estimation_seeds: int,
     variances: tuple[float, ...],
@@ -140,15 +140,15 @@ def _parameters(
     from t3mpc_ros.evaluation.paper.experiment_runs import plain
 
     methods: dict[str, Mapping[str, object]] = {
-        drive: {name: plain(method.parameters) for name, method in bench.methods(drive).items()}
-        for drive in scope.drives
+        drive: {name: plain(method.parameters) for name, method in setup.methods(drive).items()}
+        for drive in grid.drives
     }
     return {
         'quick': options.quick,
-        'seeds': list(scope.seeds),
-        'duration': scope.duration,
-        'noises': list(scope.noises),
-        'cases': list(scope.cases),
+        'seeds': list(grid.seeds),
+        'duration': grid.duration,
+        'noises': list(grid.noises),
+        'cases': list(grid.cases),
         'estimation_seeds': estimation_seeds,
         'estimation_noises': list(variances),
         'methods': methods,
@@ -161,10 +161,10 @@ def _version() -> str:
     return t3mpc_ros.__version__
 
 
-def _origin(scope: ExperimentGrid, options: PaperOptions, sources: str) -> str:
+def _origin(grid: ExperimentGrid, options: PaperOptions, sources: str) -> str:
     words = [
         f'version {_version()}, sources {sources}',
-        f'{len(scope.seeds)} held-out seeds, runs of {scope.duration:g} s at 100 Hz',
+        f'{len(grid.seeds)} held-out seeds, runs of {grid.duration:g} s at 100 Hz',
         'RMSE of true wheel speeds, both wheels, first 3 s left out',
     ]
     if options.quick:

@@ -108,8 +108,10 @@ class Results:
     ) -> None:
         self.kinds = dict(kinds)
         self.duration = duration
-        self._numbers = {cell: tuple(runs) for cell, runs in numbers.items()}
-        self._rows = {cell: self._row(cell, runs) for cell, runs in self._numbers.items()}
+        self._numbers = {experiment: tuple(runs) for experiment, runs in numbers.items()}
+        self._rows = {
+            experiment: self._row(experiment, runs) for experiment, runs in self._numbers.items()
+        }
 
     @property
     def rows(self) -> tuple[ResultRow, ...]:
@@ -156,12 +158,12 @@ class Results:
     @property
     def drives(self) -> tuple[str, ...]:
         """The drives there are rows of."""
-        return tuple(dict.fromkeys(cell.drive for cell in self._rows))
+        return tuple(dict.fromkeys(experiment.drive for experiment in self._rows))
 
     @property
     def noises(self) -> tuple[float, ...]:
         """The noises there are rows of, ascending."""
-        return tuple(sorted({cell.noise for cell in self._rows}))
+        return tuple(sorted({experiment.noise for experiment in self._rows}))
 
     def cases(self, drive: str) -> tuple[str, ...]:
         """The cases there are rows of."""
@@ -185,17 +187,17 @@ class Results:
         )
         return [paired for paired in found if paired is not None]
 
-    def _row(self, cell: Experiment, runs: Sequence[RunNumbers]) -> ResultRow:
-        baseline, preview = self.kinds[cell.method]
+    def _row(self, experiment: Experiment, runs: Sequence[RunNumbers]) -> ResultRow:
+        baseline, preview = self.kinds[experiment.method]
         rmse, settled = [run.rmse for run in runs], [run.settled for run in runs]
         finite = all(run.finite for run in runs)
         return ResultRow(
-            controller=cell.method,
+            controller=experiment.method,
             baseline=baseline,
             preview=preview,
-            drive=cell.drive,
-            noise=cell.noise,
-            case=cell.case,
+            drive=experiment.drive,
+            noise=experiment.noise,
+            case=experiment.case,
             rmse_mean=mean(rmse),
             rmse_ci95=interval(rmse),
             settled_mean=mean(settled),
@@ -209,11 +211,11 @@ class Results:
 
 
 def results_of(
-    bench: ExperimentSetup,
-    extent: ExperimentGrid,
+    setup: ExperimentSetup,
+    grid: ExperimentGrid,
     numbers: Mapping[Experiment, Sequence[RunNumbers]],
 ) -> Results:
-    """Return the table of results of a campaign, the methods in the order of the bench.
+    """Return the table of results of a campaign, the methods in the order of the setup.
 
     Raises
     ------
@@ -221,12 +223,12 @@ def results_of(
         A method is a baseline, or has preview, with one drive and not with the other.
     """
     kinds: dict[str, tuple[bool, bool]] = {}
-    for drive in extent.drives:
-        for name, method in bench.methods(drive).items():
+    for drive in grid.drives:
+        for name, method in setup.methods(drive).items():
             kind = (bool(method.baseline), bool(method.preview))
             if kinds.setdefault(name, kind) != kind:
                 raise ValueError(f'{name} must be of the same kind with every drive')
-    return Results(kinds, numbers, extent.duration)
+    return Results(kinds, numbers, grid.duration)
 
 
 def step_to(part: str) -> tuple[str, str]:

@@ -28,7 +28,7 @@ DURATION = 26.0
 
 
 class Measurable(Protocol):
-    """What a price needs of a run."""
+    """What a objective needs of a run."""
 
     def rmse(self) -> float:
         """Return the tracking RMSE, rad/s."""
@@ -85,7 +85,7 @@ class TuningScenarios:
 
 
 class ClosedLoopObjective:
-    """Mean price of settings in the closed loop; several are evaluated at the same time.
+    """Mean objective of settings in the closed loop; several are evaluated at the same time.
 
     To be used in a ``with`` statement: the processes stay warm between generations.
 
@@ -122,7 +122,7 @@ class ClosedLoopObjective:
     def __call__(
         self, method: MethodDefinition, drive: str, candidates: Sequence[Parameters]
     ) -> list[float]:
-        """Return the mean price of each candidate, infinite where a run broke off or failed.
+        """Return the mean objective of each candidate, infinite where a run broke off or failed.
 
         Raises
         ------
@@ -131,20 +131,20 @@ class ClosedLoopObjective:
             then, not the settings. Or a process was lost.
         """
         try:
-            prices: list[float | None] = [*self._prices(method, drive, candidates)]
+            objectives: list[float | None] = [*self._objectives(method, drive, candidates)]
         except JobError as error:
             if isinstance(error.__cause__, BrokenExecutor):
                 raise
-            prices = [self._alone(method, drive, candidate) for candidate in candidates]
-            if (method.name, drive) not in self._ran and all(each is None for each in prices):
+            objectives = [self._alone(method, drive, candidate) for candidate in candidates]
+            if (method.name, drive) not in self._ran and all(each is None for each in objectives):
                 raise
         self._ran.add((method.name, drive))
-        return [math.inf if each is None else each for each in prices]
+        return [math.inf if each is None else each for each in objectives]
 
     def _alone(self, method: MethodDefinition, drive: str, candidate: Parameters) -> float | None:
-        """Return the price of one candidate, None when a run raised an exception."""
+        """Return the objective of one candidate, None when a run raised an exception."""
         try:
-            return self._prices(method, drive, [candidate])[0]
+            return self._objectives(method, drive, [candidate])[0]
         except JobError as error:
             if isinstance(error.__cause__, BrokenExecutor):
                 raise
@@ -152,7 +152,7 @@ class ClosedLoopObjective:
                 self._report(f'  counted as worst: {error}')
             return None
 
-    def _prices(
+    def _objectives(
         self, method: MethodDefinition, drive: str, candidates: Sequence[Parameters]
     ) -> list[float]:
         scenarios = self._training.scenarios(drive)
@@ -165,7 +165,7 @@ class ClosedLoopObjective:
 
 
 def mean_objectives(
-    candidates: int, runs: int, priced: Iterable[tuple[int, float]]
+    candidates: int, runs: int, evaluated: Iterable[tuple[int, float]]
 ) -> list[float]:
     """Return the mean over the runs of each candidate; the same in whatever order they come.
 
@@ -173,20 +173,22 @@ def mean_objectives(
     ----------
     candidates, runs
         Run j of candidate i has index ``i * runs + j``.
-    priced
-        (index, price), each index once.
+    evaluated
+        (index, objective), each index once.
 
     Raises
     ------
     ValueError
         An index is missing, comes twice, or is none.
     """
-    prices: dict[int, float] = {}
-    for index, value in priced:
-        if index in prices or not 0 <= index < candidates * runs:
-            raise ValueError(f'each run must be priced once: got run {index} once more')
-        prices[index] = value
-    if len(prices) != candidates * runs:
-        raise ValueError(f'{candidates * runs} runs must be priced: got {len(prices)}')
+    objectives: dict[int, float] = {}
+    for index, value in evaluated:
+        if index in objectives or not 0 <= index < candidates * runs:
+            raise ValueError(f'each run must be evaluated once: got run {index} once more')
+        objectives[index] = value
+    if len(objectives) != candidates * runs:
+        raise ValueError(f'{candidates * runs} runs must be evaluated: got {len(objectives)}')
     # math.fsum has no order; infinities add to infinity.
-    return [math.fsum(prices[i * runs + j] for j in range(runs)) / runs for i in range(candidates)]
+    return [
+        math.fsum(objectives[i * runs + j] for j in range(runs)) / runs for i in range(candidates)
+    ]

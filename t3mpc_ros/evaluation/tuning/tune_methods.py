@@ -20,7 +20,7 @@ from t3mpc_ros.evaluation.tuning.tuned_parameters import (
 from t3mpc_ros.parameters.table import ParameterError, Parameters
 
 Evaluate = Callable[[MethodDefinition, str, Sequence[Parameters]], Sequence[float]]
-"""Returns the price of each of several settings of a method in a drive."""
+"""Returns the objective of each of several settings of a method in a drive."""
 
 SEARCH_SEED = 1
 """Of the search itself; the same for every method."""
@@ -78,7 +78,7 @@ def tune_methods(
         Methods of the same name; a drive no method is meant for; or a file that holds other
         methods tuned with another budget, so that nothing in it could be compared.
     RuntimeError
-        For some method no settings gave a finite price; all others are kept.
+        For some method no settings gave a finite objective; all others are kept.
     """
     check_names(methods)
     for drive in drives:
@@ -118,7 +118,7 @@ def tune_methods(
             else:
                 failed.append(f'{method.name}, {drive}')
     if failed:
-        raise RuntimeError(f'no settings gave a finite price: {"; ".join(failed)}')
+        raise RuntimeError(f'no settings gave a finite objective: {"; ".join(failed)}')
     return store
 
 
@@ -183,7 +183,7 @@ def _objective(
     start = method.start[drive]
 
     def objective(points: Sequence[Values]) -> list[float]:
-        prices = [math.inf] * len(points)
+        objectives = [math.inf] * len(points)
         candidates: dict[int, Parameters] = {}
         for i, values in enumerate(points):
             try:
@@ -193,8 +193,8 @@ def _objective(
         if candidates:
             values = evaluate(method, drive, list(candidates.values()))
             for i, value in zip(candidates, values, strict=True):
-                prices[i] = value
-        return prices
+                objectives[i] = value
+        return objectives
 
     return objective
 

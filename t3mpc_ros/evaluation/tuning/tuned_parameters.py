@@ -43,7 +43,7 @@ class TuningBudget:
     duration: float
     """Of each run, s."""
     smoothness: float
-    """rho of the price, s²."""
+    """rho of the objective, s²."""
 
     def __str__(self) -> str:
         seeds = ', '.join(map(str, self.training_seeds))
@@ -64,7 +64,7 @@ class TunedEntry:
     tuned: tuple[str, ...]
     """The names among them that were searched."""
     objective: float
-    """Mean price of ``values``, rad/s."""
+    """Mean objective of ``values``, rad/s."""
     start_objective: float | None
     """That of the settings the search began with, rad/s; None when they did not even run."""
     budget: TuningBudget
@@ -221,7 +221,7 @@ class TunedParameters:
     def table(self) -> str:
         """Return what was gained, as a table in Markdown."""
         lines = [
-            '| method | drive | price at start (rad/s) | tuned | settings tuned | evaluations |',
+            '| method | drive | objective at start (rad/s) | tuned | settings tuned | evaluations |',
             '|---|---|---|---|---|---|',
         ]
         for method, drive in self:
