@@ -439,7 +439,7 @@ def rls_step(
     squared = 0.0
     for j in range(n):
         squared += machine.mu1[j] * machine.mu1[j]
-    # Follows a sudden increase at once, which limits the weight of one instant to ten.
+    # Follows a sudden increase at once: one instant has at most ten times the usual weight.
     rls.power[0] = max(
         power_forgetting * rls.power[0] + (1.0 - power_forgetting) * squared, 0.1 * squared
     )
