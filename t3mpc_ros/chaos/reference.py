@@ -76,7 +76,7 @@ class ReferenceParameters(Parameters):
     )
     seed: int = parameter(
         0,
-        'seed of the perturbation of the initial state and of random switching; 0: initial as given',
+        'seed of the initial perturbation and of random switching; 0: no perturbation',
         low=0,
     )
     perturbation: float = parameter(

@@ -29,8 +29,8 @@ class FuzzyParameters(Parameters):
 
     kind: str = parameter(
         'type3',
-        'type of the sets; type1 and interval_type2 are single slices at level one, the latter with '
-        'footprint_of_uncertainty',
+        'type of the sets; type1 and interval_type2 are single slices at level one, the latter '
+        'with footprint_of_uncertainty',
         choices=('type3', 'interval_type2', 'type1'),
         source='paper: NT3FS, compared with the others',
     )
@@ -203,8 +203,8 @@ def _check_size(inputs: int, sets: int, slices: int) -> None:
     size = 2 * sets**inputs * slices
     if size > MAX_COEFFICIENTS:
         raise ValueError(
-            f'inputs must give at most {MAX_COEFFICIENTS} coefficients: got {inputs} inputs of {sets} '
-            f'sets with {slices} slices, {size} in total'
+            f'inputs must give at most {MAX_COEFFICIENTS} coefficients: got {inputs} inputs '
+            f'of {sets} sets with {slices} slices, {size} in total'
         )
 
 

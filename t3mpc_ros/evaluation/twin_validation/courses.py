@@ -71,13 +71,13 @@ class Slip(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """What became of a drive, once a period; headings are unwrapped."""
+    """What became of a drive, once a period; yaw angles are unwrapped."""
 
     name: str
     time: Array
     """s, shape (n,)"""
     truth: Array
-    """x, y (m), heading (rad) of the body, shape (n, 3)"""
+    """x, y (m), yaw (rad) of the body, shape (n, 3)"""
     odometry: Array
     """What the robot reported, shape (n, 3)."""
     steps: Array
@@ -144,7 +144,7 @@ def spin(
 
 
 def yaw_drift(course: Course, by_steps: bool = False) -> float:
-    """Return by how much (rad) the heading is wrong in the end; not wrapped.
+    """Return by how much (rad) the yaw is wrong in the end; not wrapped.
 
     That of the robot's odometry, or that of the step counters alone.
     """
@@ -159,7 +159,7 @@ def place_error(course: Course, by_steps: bool = False) -> float:
 
 
 def gyro_limit(parameters: DigitalTwinParameters, course: Course) -> float:
-    """Return how far off (rad) a heading from this gyro alone may be at the end of a course.
+    """Return how far off (rad) a yaw from this gyro alone may be at the end of a course.
 
     Its error of scale at the largest, three standard deviations of what its bias wanders from
     one standstill to the other, sigma t^1.5 / sqrt 3, and of what its noise leaves in the bias

@@ -69,7 +69,7 @@ def draw_square(axis: Any, course: Course) -> None:
 
 
 def turns(course: Course, slip_events: Sequence[FaultEvent], slip: str) -> Any:
-    """Return how wrong the headings are while the robot turns on the spot."""
+    """Return how wrong the yaw angles are while the robot turns on the spot."""
     figure = new_figure(3.0)
     axis = figure.subplots()
     for number, slip_event in enumerate(slip_events):
@@ -84,14 +84,14 @@ def turns(course: Course, slip_events: Sequence[FaultEvent], slip: str) -> Any:
         wrong = np.degrees(odometry_speed[:, 2] - course.truth[:, 2])
         axis.plot(course.time, wrong, color=colour, lw=1.5, label=label)
     axis.set_xlabel('time / s')
-    axis.set_ylabel('heading error / deg')
+    axis.set_ylabel('yaw error / deg')
     axis.margins(x=0.01)
     figure.legend(*axis.get_legend_handles_labels(), loc='outside upper center', ncols=3)
     return figure
 
 
 def drift(found: Sequence[Drift]) -> Any:
-    """Return the heading errors at the end as bars, and one against the other."""
+    """Return the yaw errors at the end as bars, and one against the other."""
     figure = new_figure(6.0)
     courses = list(dict.fromkeys(item.course for item in found))
     slips = list(dict.fromkeys(item.slip for item in found))
@@ -120,7 +120,7 @@ def drift(found: Sequence[Drift]) -> Any:
     edge = np.array((0.1, 1000.0))
     below.plot(edge, PART * edge, color=WANTED, lw=1.0, ls='--', label='a fifth')
     below.set(xscale='log', yscale='log', xlim=(0.1, 1000.0), ylim=(0.005, 50.0))
-    below.set_xlabel('heading error of the steps alone / deg')
+    below.set_xlabel('yaw error of the steps alone / deg')
     below.set_ylabel('with gyro / deg')
     below.legend(loc='lower right', ncols=2, framealpha=0.9, frameon=True, edgecolor='white')
     return figure
@@ -462,13 +462,13 @@ VALIDATION_FIGURES = (
     ValidationFigure(
         'turns',
         'Ten turns on the spot',
-        'What is wrong with both headings. Shaded: spells in which a wheel slips if it is asked '
+        'What is wrong with both yaw angles. Shaded: spells in which a wheel slips if it is asked '
         'for more than the grip that is left.',
         lambda e: turns(e.turns, e.slip_events, e.slip_shown),
     ),
     ValidationFigure(
         'drift',
-        'Heading errors at the end',
+        'Yaw errors at the end',
         'Above, root mean square over the seeds; below, each course with slip: under the dashed '
         'line the gyro leaves less than a fifth. It cannot where the steps are hardly wrong, '
         'because of its own errors: bias that wanders, and scale, which a turn one way adds up.',

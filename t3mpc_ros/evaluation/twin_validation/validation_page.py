@@ -199,7 +199,7 @@ def _findings(evidence: 'Evidence') -> list[str]:
         least = np.degrees(holds_from(slipped))
         kept = sum(item.holds for item in slipped)
         lines.append(
-            f'{course}: with slip the gyro leaves at most a fifth of the heading error in {kept} '
+            f'{course}: with slip the gyro leaves at most a fifth of the yaw error in {kept} '
             f'of {len(slipped)} runs, in all where the steps are wrong by more than {least:.1f} '
             f'deg; its own errors may come to {bound:.1f} deg.'
         )

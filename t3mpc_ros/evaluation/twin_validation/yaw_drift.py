@@ -50,7 +50,7 @@ COURSES: dict[str, Callable[..., Course]] = {
 
 
 class Drift(NamedTuple):
-    """What one course did to both headings."""
+    """What one course did to both yaw angles."""
 
     course: str
     slip: str
@@ -179,7 +179,7 @@ def drift_table(found: Sequence[Drift]) -> Table:
     return Table(
         'Errors at the end of a course, root mean square over the seeds',
         (
-            'course', 'slip', 'heading by steps / deg', 'with gyro / deg', 'ratio',
+            'course', 'slip', 'yaw by steps / deg', 'with gyro / deg', 'ratio',
             'at most 1/5', 'place by steps / m', 'with gyro / m', 'slid / m', 'lost steps',
         ),
         tuple(rows),
