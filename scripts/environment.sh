@@ -94,7 +94,9 @@ make_environment() {
   say "  installing t3mpc_ros"
   # The files of an earlier pip install would hide new executables.
   "$PYTHON" -m pip uninstall --disable-pip-version-check -q -y t3mpc_ros >>"$LOG" 2>&1 || true
-  # develop installs the executables into lib/t3mpc_ros, the folder that ros2 run searches.
+  # develop installs the executables into lib/t3mpc_ros, the folder that ros2 run searches; those
+  # of an earlier version are removed.
+  rm -rf "$VENV/lib/t3mpc_ros"
   (cd -- "$ROOT" && "$PYTHON" -W ignore setup.py -q develop --no-deps \
     install_data --install-dir "$VENV") >>"$LOG" 2>&1 ||
     fail "the package could not be installed: $(tail -n 1 "$LOG")" "see $LOG"

@@ -191,8 +191,8 @@ def _objective(
             except ParameterError:
                 continue  # each in range, but they do not fit together: as bad as can be
         if candidates:
-            values = evaluate(method, drive, list(candidates.values()))
-            for i, value in zip(candidates, values, strict=True):
+            found = evaluate(method, drive, list(candidates.values()))
+            for i, value in zip(candidates, found, strict=True):
                 objectives[i] = value
         return objectives
 
