@@ -159,7 +159,7 @@ def parse_world(text: str, source: str) -> World:
     Parameters
     ----------
     text
-        See ``docs/worlds.md``.
+        See ``docs/simulation.md``.
     source
         Its name in errors; without ``name`` in the text, its stem is the name of the world.
 

@@ -338,7 +338,7 @@ def test_read_only_parameters_cannot_change_at_run_time():
 
 
 def test_documented_twin_example_runs(capsys):
-    page = (Path(__file__).resolve().parents[2] / 'docs' / 'twin.md').read_text()
+    page = (Path(__file__).resolve().parents[2] / 'docs' / 'simulation.md').read_text()
     (example,) = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
     exec(example, {})
     yaws = eval(capsys.readouterr().out)

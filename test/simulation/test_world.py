@@ -29,7 +29,7 @@ from t3mpc_ros.simulation.world import (
     parse_world,
 )
 
-PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'worlds.md'
+PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'simulation.md'
 EXAMPLE = re.search(r'```yaml\n(.*?)```', PAGE.read_text(), re.DOTALL).group(1)
 BUMPER = BumperParameters().radius
 
