@@ -45,20 +45,12 @@ from t3mpc_ros.simulation.world import World, clearance, grip_at
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-
 _NO_SEGMENTS = np.zeros((0, 4))
-
-
 _NO_CIRCLES = np.zeros((0, 3))
-
-
 ROLLING = 0
 """Mode of a rolling tyre; +1 and -1: it slides and pushes the body in that direction."""
-
-
 GRAVITY = 9.81
-
-
+"""m/s²"""
 BLOCKED_INERTIA = 1e9
 """Inertia (kg m²) of a blocked wheel: large enough to be immovable."""
 
