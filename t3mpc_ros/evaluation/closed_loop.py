@@ -42,18 +42,18 @@ from t3mpc_ros.simulation.plant.paper_plant import PaperPlant, PaperRobotParamet
 Array = NDArray[np.float64]
 
 DRAWN = ('noise.variance', 'disturbance.walk_rate')
-"""Live settings of the robot that are fixed here, because they shape numbers drawn beforehand."""
+"""Dynamic parameters that are fixed here, because they scale random numbers drawn in advance."""
 
 
 class FastPlant:
     """The physics of :class:`~t3mpc_ros.robot.simulated.PaperRobot`, bit for bit.
 
     It has the same plant, the same random numbers and the same time grid from 0 s on. What is
-    left out: the guard, so commands must be within what the guard would pass; odometry; reports.
+    left out: the command limiter, so commands must be within its limits; odometry; reports.
 
     Parameters
     ----------
-    settings
+    parameters
         The robot, its drive of either kind.
     steps
         How many control periods it will run at most: the random numbers of all are drawn now.
@@ -92,12 +92,12 @@ class FastPlant:
         return self._plant
 
     def configure(self, parameters: PaperRobotParameters) -> None:
-        """Go on with other settings from the next period on, a heavier load say.
+        """Change parameters from the next period on, for example to a heavier load.
 
         Raises
         ------
         ParameterError
-            A setting differs that is fixed: those of the robot, and :data:`DRAWN`.
+            A parameter differs that is fixed: those of the robot, and :data:`DRAWN`.
         """
         before, after = self._parameters.to_dict(), parameters.to_dict()
         for row in PaperRobotParameters.specs():
@@ -146,7 +146,7 @@ class FastPlant:
 
 @dataclass(frozen=True, slots=True)
 class LoopRecord:
-    """What happened in one run, one row a control period, right wheel first.
+    """Record of one run, one row per control period, right wheel first.
 
     Row k holds what was known and decided at ``time[k]``, and the state of the robot then. From
     a row on at which the method answered with a number that is not finite, all is NaN but time,
@@ -281,7 +281,7 @@ class MethodSpec:
             )
 
     def __call__(self, nominal_model: NominalModel) -> BaselineController:
-        """Return a new controller that knows of no runs before, but of its practice."""
+        """Return a new controller, with pretrained weights if so specified."""
         controller = self.controller_type(self.parameters, nominal_model)
         if self.pretrained and controller.get_weights():
             controller.set_weights(
@@ -294,7 +294,7 @@ class MethodSpec:
 def pretrain(
     controller_type: type[BaselineController], parameters: Parameters, drive: str
 ) -> Mapping[str, Array]:
-    """Return what a method learns in the runs of :data:`PRACTICE`, one after the other."""
+    """Return the weights of a method after the runs of :data:`PRETRAINING_SEEDS` in sequence."""
     weights: Mapping[str, Array] = {}
     for seed in PRETRAINING_SEEDS:
         scenario = Scenario(drive, PRETRAINING_NOISE, 'nominal', seed, PRETRAINING_DURATION)
@@ -327,7 +327,7 @@ def run(
     *,
     drive: VelocityActuation | None = None,
 ) -> LoopRecord:
-    """Return what happened when a new ``method`` followed the reference of a scenario.
+    """Return the record of a new ``method`` tracking the reference of a scenario.
 
     Each period k: measure, estimate, show the method its :class:`View`, send what it answers.
     The robot stands at the start, and the estimator begins with what is measured then. With a

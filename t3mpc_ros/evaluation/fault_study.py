@@ -68,7 +68,7 @@ class Outcome:
     stopped_for: float
     """Time with a stop reason, s"""
     resumption: str
-    """How the robot resumed: ``by itself``, ``after a pause`` or ``not``; '' if it never stopped."""
+    """Resumption: ``by itself``, ``after a pause`` or ``not``; '' if the robot never stopped."""
     before: float
     """Error of the wheel speeds before the fault, rad/s"""
     during: float
@@ -148,8 +148,8 @@ def evaluate_outcome(
 def time_to_return(record: TwinRecord, undisturbed_run: TwinRecord, end: float) -> float | None:
     """Return the time (s) from ``end`` until the wheel error stays recovered; None if it does not.
 
-    It has recovered if from then on to the end of the run it is at most :data:`ALLOWED` times as large
-    as in the run without the fault, in the same time or before the fault, whichever is larger.
+    It has recovered if from then on to the end it is at most :data:`ALLOWED` times the error of
+    the run without the fault, in the same time or before the fault, whichever is larger.
     """
     errors = record.rotors - record.reference, undisturbed_run.rotors - undisturbed_run.reference
     usual = _rms(errors[1][undisturbed_run.rows(SETTLED, BEGIN)])
@@ -281,8 +281,7 @@ def _undetected(
 DURATION = 40.0
 """s; length of a run."""
 PAUSE = (5.0, 1.0)
-"""Time after the fault at which a person pauses the controller of a stopped robot, and length of the
-pause, s."""
+"""Time from the fault to the pause of the controller of a stopped robot, and its length, s."""
 
 REFERENCE_COURSES: Mapping[str, Callable[[float], Array]] = {
     'chaotic': chaotic_course,
@@ -445,7 +444,8 @@ UNREPORTED = '**no flag, no reason, and the counters advance**: '
 def outcome_sentence(outcome: Outcome) -> str:
     """Return the outcome in words."""
     recovery_time = (
-        'error not recovered' if outcome.recovery_time is None else f'error recovered after {outcome.recovery_time:g} s'
+        'error not recovered' if outcome.recovery_time is None
+        else f'error recovered after {outcome.recovery_time:g} s'
         if outcome.recovery_time > 0.0 else 'error recovered at once'
     )  # fmt: skip
     if outcome.verdict == 'unbounded':
@@ -511,16 +511,16 @@ def page_section(results: Sequence[Outcome]) -> str:
     after, pause = PAUSE
     return f"""{BEGIN_MARK}
 
-The controller drives the twin. Each fault begins at {BEGIN:g} s and lasts 5 s; `brown_out` restarts
-the board, which takes 0.5 s. A run lasts {DURATION:g} s, one into a wall 25 s, of which
+The controller drives the twin. Each fault begins at {BEGIN:g} s and lasts 5 s; `brown_out`
+restarts the board, which takes 0.5 s. A run lasts {DURATION:g} s, one into a wall 25 s, of which
 the robot needs 11 s to get there.
 
 Errors are root mean squares over both wheels, of rotor speed against reference:
-from 3 s on before the fault, during it, and from 2 s after it to the end. The error has *recovered* when
-the rest of the run is no worse than {ALLOWED:g} times the same run without the fault. Where the
-robot stands until commands pause, a person pauses the controller for {pause:g} s, {after:g} s
-after the fault: the error after the fault then counts after the pause, and the odometry is
-that of the run without a pause.
+from 3 s on before the fault, during it, and from 2 s after it to the end. The error has
+*recovered* when the rest of the run is no worse than {ALLOWED:g} times the same run without the
+fault. Where the robot stands until commands pause, a person pauses the controller for {pause:g} s,
+{after:g} s after the fault: the error after the fault then counts after the pause, and the
+odometry is that of the run without a pause.
 
 Ground truth shows full steps lost by the right and the left motor at most, and how much
 faster (root mean square) the wheels turn than they roll.

@@ -44,7 +44,7 @@ from t3mpc_ros.parameters.table import Parameters
 
 FULL = 'full'
 MODEL_ERROR = 1.3
-"""Inertia that the models of the predictive baselines with preview believe in, over the true one."""
+"""Ratio of model inertia to true inertia of the predictive baselines with preview."""
 
 STAGES: Mapping[str, Mapping[str, object]] = {
     'feedback': {
@@ -62,7 +62,7 @@ STAGES: Mapping[str, Mapping[str, object]] = {
     '+MPC': {'jump_transition.preview': False},
     FULL: {},
 }
-"""The controller as it grows, as changes of the full one; the last step adds preview."""
+"""Stages of the controller, as changes of the full one; the last stage adds preview."""
 
 WITHOUT: Mapping[str, Mapping[str, object]] = {
     'full without NT3FS': {'use_fuzzy': False},
@@ -76,12 +76,12 @@ WITHOUT: Mapping[str, Mapping[str, object]] = {
     'full with random predictor': {'random_predictor': True, 'predictive.learning': False},
 }
 """The full controller with one part left out. Without v_p the bound (80) of the compensator is
-lower too; with equal bound it stays, which shows what v_p is worth by itself."""
+lower too; with equal bound it stays, which isolates the effect of v_p."""
 
 
 @dataclass(frozen=True, slots=True)
 class ComparedMethod(MethodSpec):
-    """A method as it is run, and how tables sort it."""
+    """A compared method with its class in the tables."""
 
     baseline: bool = True
     """Whether it is a baseline, not a stage of the proposed controller."""
@@ -94,7 +94,7 @@ def _both(parameters: Parameters) -> dict[str, Parameters]:
 
 
 def method_definitions() -> list[MethodDefinition]:
-    """Return every method that is tuned, each with a handful of settings to search.
+    """Return every tunable method, each with a few search ranges.
 
     A switch is the same for all methods without preview: they cross it as fast as the drive
     allows, and what is left to choose there is fixed at values that do not matter (1 %).
@@ -210,7 +210,7 @@ def method_definitions() -> list[MethodDefinition]:
 
 
 def proposed_parameters() -> dict[str, Parameters]:
-    """Return our settings for each drive before tuning.
+    """Return the parameters of the proposed controller for each drive before tuning.
 
     Torques are not limited as a stepper's acceleration is: switches are crossed faster.
     """
@@ -220,7 +220,7 @@ def proposed_parameters() -> dict[str, Parameters]:
 
 
 def methods(drive: str, store: TunedParameters | None = None) -> dict[str, ComparedMethod]:
-    """Return every method of a comparison by name, with the settings that tuning found.
+    """Return every compared method by name, with its tuned parameters.
 
     CasADi's nonlinear MPC is among them if CasADi is installed.
 

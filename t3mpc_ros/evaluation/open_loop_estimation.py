@@ -30,7 +30,7 @@ from t3mpc_ros.simulation.plant.paper_plant import PaperRobot, PaperRobotParamet
 Array = NDArray[np.float64]
 
 KINDS = ('type3', 'interval_type2', 'type1')
-"""Fuzzy systems compared; the sets, centres, widths and what is learnt per second are equal."""
+"""Fuzzy systems compared; sets, centres, widths and adaptation rate are equal."""
 NO_FUZZY_SYSTEM = 'no fuzzy system'
 """Name of the estimator with g = 0: what output error alone is worth."""
 VARIANCES = (0.0, 0.04, 0.07, 0.1)
@@ -40,7 +40,7 @@ NORMALISED_GAIN = 40.0
 OUTPUT_ERROR_GAIN = 8.0
 """The gain a (1/s): the controller's K."""
 SETTLE = 10.0
-"""Seconds at the start that do not count: all kinds begin with nothing learnt."""
+"""Time at the start that is excluded, s: all kinds start without adaptation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,13 +58,13 @@ class OpenLoopRun:
 
     @property
     def target(self) -> Array:
-        """What g should be, chi' - u of (30) over each period, rad/s², shape (n - 1, 2)."""
+        """Target of g, chi' - u of (30) over each period, rad/s², shape (n - 1, 2)."""
         return np.diff(self.speeds, axis=0) / self.period - self.push[:-1]
 
 
 @dataclass(frozen=True, slots=True)
 class EstimationResult:
-    """How one kind fared at one noise over several seeds, after :data:`SETTLE`, both wheels."""
+    """Result of one kind at one noise over several seeds, after :data:`SETTLE`, both wheels."""
 
     kind: str
     noise_variance: float
@@ -120,12 +120,12 @@ def simulate_open_loop(
 
     Parameters
     ----------
-    settings
+    parameters
         The robot; ``drive.kind`` must be ``'torque'``. theta_bar is the nominal (11).
     duration
         s
     seed
-        Of the excitation; the robot's disturbance and noise have the seed in ``settings``.
+        Of the excitation; the robot's disturbance and noise have the seed in ``parameters``.
 
     Raises
     ------
@@ -180,7 +180,7 @@ def estimate(
 
 
 def estimator(kind: str, noise_variance: float, normalised_gain: float) -> FuzzyEstimator:
-    """Return a fuzzy system of one kind that has learnt nothing yet.
+    """Return a fuzzy system of one kind without adaptation.
 
     Whatever the kind, its inputs are as fuzzy as the noise is wide, and gamma |Phi|² is
     ``normalised_gain`` (1/s²) on average: at equal gamma the kinds would learn at different
@@ -200,7 +200,7 @@ def compare(
     normalised_gain: float = NORMALISED_GAIN,
     progress: Callable[[str], None] | None = None,
 ) -> list[EstimationResult]:
-    """Return how every kind fares in (86), over ``seeds`` seeds from 1; all see the same runs.
+    """Return the results of every kind in (86) over ``seeds`` seeds from 1, on equal runs.
 
     Parameters
     ----------

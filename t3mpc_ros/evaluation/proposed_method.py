@@ -28,7 +28,7 @@ JUMP = 0.3
 
 @dataclass(frozen=True)
 class ProposedParameters(Nt3fsMpcParameters):
-    """The controller's settings, and what a study may change about its predictor."""
+    """Parameters of the controller, and an option of the ablation study."""
 
     random_predictor: bool = parameter(
         False,
@@ -132,7 +132,7 @@ class ProposedController(BaselineController):
             self._tracker.transition.announce(now_ns, jump, slope)
 
     def _randomize_predictor(self, seed: int) -> None:
-        """Give the predictor random output weights of the size of the taught ones."""
+        """Set random output weights with the magnitude of the pretrained ones."""
         predictive = self._tracker.law.predictive
         weights = predictive.get_weights()
         generator = np.random.default_rng((seed, 7))

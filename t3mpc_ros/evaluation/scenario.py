@@ -21,24 +21,24 @@ from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
 Array = NDArray[np.float64]
 
 DRIVES = ('torque', 'velocity')
-"""torque: u is applied as the torque theta_bar u, the paper's way; velocity: the wheels follow
-commanded speeds, late and lagging, as the robot's board does it."""
+"""torque: u is applied as the torque theta_bar u, as in the paper; velocity: the wheels follow
+commanded speeds with delay and lag, as on the robot."""
 
 TUNING_SEEDS = tuple(range(1, 10))
-"""Seeds on which gains are chosen."""
+"""Seeds for tuning."""
 PRETRAINING_SEEDS = (10, 11, 12)
-"""Seeds of the runs that a method which learns may have behind it: the same for all of them."""
+"""Seeds of the pretraining runs, equal for all methods with adaptation."""
 PRETRAINING_NOISE, PRETRAINING_DURATION = 0.04, 40.0
 """Noise ((rad/s)²) and length (s) of those runs; the robot is the nominal one."""
 HELD_OUT_SEEDS = tuple(range(101, 121))
-"""Seeds on which results are reported. No gain was ever chosen on one of them."""
+"""Seeds of the reported results; never used for tuning."""
 
 RATE = 100.0
 """Control periods a second in every run."""
 REFERENCE_DEVIATION = 3.0
 """Standard deviation of every signal of the reference, rad/s."""
 STATE_DEVIATIONS = (10.6, 2.22, 0.937, 22.2)
-"""Those of the raw states of (85), measured at q = 0.98 over 10 000 s."""
+"""Standard deviations of the raw states of (85), measured at q = 0.98 over 10 000 s."""
 LONGEST_DEAD_TIME = 0.05
 """Dead time up to which a reference is computed beyond the end of a run, s."""
 _ROBOT_SEEDS = 10_000  # robot seeds start here: no reference has one of them by accident
@@ -46,19 +46,19 @@ _ROBOT_SEEDS = 10_000  # robot seeds start here: no reference has one of them by
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """How the true robot of a run differs from the nominal one."""
+    """Difference of the true robot of a run from the nominal one."""
 
     text: str
     changes: Mapping[str, float] = field(default_factory=dict)
-    """Settings of the robot from the start, by their flat names."""
+    """Parameters of the robot from the start, by their flat names."""
     later: Mapping[str, float] = field(default_factory=dict)
-    """Settings that change once more in mid-run."""
+    """Parameters that change during the run."""
     when: float = 0.5
-    """The instant of that change, as a share of the run."""
+    """Time of that change, as a share of the run."""
     known: bool = False
     """Whether the estimator and the methods know of ``changes``."""
     drives: tuple[str, ...] = DRIVES
-    """The drives in which the case means something."""
+    """Drives to which the case applies."""
 
 
 CASES: Mapping[str, Case] = {
@@ -109,7 +109,7 @@ class SampledReference:
 
 @dataclass(frozen=True)
 class Scenario:
-    """One run to be: everything but the method.
+    """One run without its method.
 
     Two scenarios with the same seed have the same reference, and the same numbers drawn for
     disturbance and noise, whatever else differs: methods and cases are compared pair by pair.
@@ -168,7 +168,7 @@ class Scenario:
 
     @property
     def steps(self) -> int:
-        """How many control periods the run has."""
+        """Number of control periods of the run."""
         return round(self.duration * RATE)
 
     @property
@@ -178,11 +178,11 @@ class Scenario:
 
     @property
     def limits(self) -> LimitParameters:
-        """What a velocity command may ask; the same in every run."""
+        """Limits of a velocity command, equal in every run."""
         return LimitParameters()
 
     def reference(self) -> SampledReference:
-        """Return the wanted wheel speeds over the run and what preview may see beyond it."""
+        """Return the reference wheel speeds over the run and the preview beyond it."""
         beyond = math.ceil((self.lead + LONGEST_DEAD_TIME) * RATE) + 3
         return _reference(self.seed, self.steps + beyond)
 
@@ -197,7 +197,7 @@ class Scenario:
         )
 
     def changed_robot(self) -> PaperRobotParameters | None:
-        """Return the true robot from :attr:`change_step` on; None when it stays as it was."""
+        """Return the true robot from :attr:`change_step` on; None if it does not change."""
         later = CASES[self.case].later
         return self.robot().with_values(later) if later else None
 

@@ -124,8 +124,8 @@ def run_twin(
 ) -> TwinRecord:
     """Return the record of the controller driving the twin along a course.
 
-    The robot rests for :data:`INITIAL_STANDSTILL` seconds before the controller is enabled; the reference
-    runs from the start. Equal arguments give equal runs, bit for bit.
+    The robot rests for :data:`INITIAL_STANDSTILL` seconds before the controller is enabled; the
+    reference runs from the start. Equal arguments give equal runs, bit for bit.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The predictive baselines: optimal, within bounds, free of offset, and as good as theory allows."""
+"""Predictive baselines: optimality, bounds, offset, agreement with theory."""
 
 import math
 import sys

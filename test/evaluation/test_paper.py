@@ -381,10 +381,11 @@ def test_settings_that_are_not_plain_are_refused():
         plain({'inner': object()})
 
 
-def test_the_digest_sees_what_can_change_a_run_and_nothing_else(tmp_path):
+def test_digest_covers_sources_that_change_a_run(tmp_path):
     names = (
-        'control/law.py', 'lab/baselines/pi.py', 'lab/paper/store.py', 'lab/paper/page.py',
-        'nodes/a.py', 'lab/program.py', 'control/__pycache__/law.pyc', 'control/notes.md',
+        'control/law.py', 'evaluation/baselines/pi.py', 'evaluation/paper/experiment_runs.py',
+        'evaluation/paper/page.py', 'nodes/a.py', 'cli/main.py', 'control/__pycache__/law.pyc',
+        'control/notes.md',
     )  # fmt: skip
     for name in names:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)

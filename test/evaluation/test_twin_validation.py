@@ -156,12 +156,12 @@ def test_a_ramp_beyond_the_torque_loses_pitches_unnoticed():
     limit = component_tests.breaking_acceleration(parameters)
     within, beyond = (component_tests.ramp(parameters, part * limit, 10.0) for part in (0.5, 1.5))
     assert within.lost_steps == (0, 0)
-    assert within.odometry_speed[-1] == pytest.approx(within.driven[-1], abs=1e-3)
+    assert within.counted_distance[-1] == pytest.approx(within.driven[-1], abs=1e-3)
     assert np.abs(within.behind).max() < 1.0
     assert beyond.lost_steps[0] >= 4
     assert beyond.lost_steps[0] % 4 == 0
     way = 0.035 * math.tau * beyond.lost_steps[0] / 200.0
-    assert beyond.odometry_speed[-1] - beyond.driven[-1] == pytest.approx(way, abs=1e-3)
+    assert beyond.counted_distance[-1] - beyond.driven[-1] == pytest.approx(way, abs=1e-3)
 
 
 def test_distance_sensor_matches_its_sheet_wrong_if_too_near():

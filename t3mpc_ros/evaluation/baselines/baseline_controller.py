@@ -83,7 +83,7 @@ class BaselineController(ABC):
 
     Parameters
     ----------
-    settings
+    parameters
         Tunable parameters, an instance of :attr:`settings_type`.
     knowledge
         Nominal model of the robot.

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Box-constrained quadratic program of the predictive baselines: projected Newton, then active set.
+"""Box-constrained quadratic program of the predictive baselines, by projected Newton steps.
 
 The problem, for n moves x of a command:
 
@@ -227,8 +227,8 @@ def solve_active_set(space: Workspace, most: int) -> int:
     """Solve by changing one bound at a time, and return a status.
 
     The primal active-set method (Nocedal and Wright 2006, section 16.5), which always
-    terminates: straight to the optimum of the free moves or to the first bound on the way, which then
-    holds; at that optimum the bound that the slope pulls from most is given up.
+    terminates: it steps to the optimum of the free moves, or to the first bound on the way, which
+    becomes active; at that optimum the bound with the largest wrong-signed slope is released.
     """
     moves, low, high, held = space.moves, space.low, space.high, space.held
     n = moves.size

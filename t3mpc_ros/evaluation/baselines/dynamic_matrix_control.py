@@ -170,7 +170,8 @@ def identify_step_responses(model: WheelModel, inner_gain: float, least: int) ->
         settled = last < 0.9 * MAX_RESPONSE_LENGTH
     if not settled:
         raise ValueError(
-            f'step response must settle within {MAX_RESPONSE_LENGTH} periods: inner_gain is {inner_gain}'
+            f'step response must settle within {MAX_RESPONSE_LENGTH} periods: '
+            f'inner_gain is {inner_gain}'
         )
     length = max(least, last + 2)
     return Responses(steps[:length].copy(), loads[:length].copy())
@@ -225,8 +226,8 @@ def dmc_step(
     """Write the best command (rad/s) for either wheel into ``out``, shape (2,).
 
     speeds, unexplained : chi (rad/s) and d (rad/s²), shape (2,)
-    sent : the command of the last period as it really was, rad/s, shape (2,)
-    reference : shape (2, P + 1), see :func:`t3mpc_ros.evaluation.baselines.linear_mpc.predict_reference`
+    sent : the limited command of the last period, rad/s, shape (2,)
+    reference : shape (2, P + 1), see :func:`.linear_mpc.predict_reference`
     """
     steps, loads = plant.responses
     gains, errors = plant.gains, memory.errors

@@ -45,13 +45,13 @@ ALONE = ((_EQUAL, 'dead time'), (_EQUAL, 'friction x3'), ('trained predictor', '
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """One claim and what came of it."""
+    """One claim with its verdict."""
 
     name: str
     origin: str
     """``'ours'`` or ``'paper'``."""
     text: str
-    """What is claimed, with how it is decided."""
+    """The claim and its criterion."""
     found: str = 'not measured'
     held: bool | None = None
     """None: not measured."""
@@ -80,7 +80,7 @@ class Claim:
 
 
 def all_claims(results: Results, estimated: Sequence[EstimationResult]) -> list[Claim]:
-    """Return every claim, ours first, then the paper's."""
+    """Return all claims: of this package, then of the paper."""
     found = [
         share_of_best(results, 'velocity', PAPER_NOISE, 0.60),
         share_of_best(results, 'velocity', 0.0, 0.50),
@@ -112,9 +112,9 @@ def share_of_best(
     """
     kind = 'baseline' if paper else 'baseline without preview'
     words = 'About 50 % more accurate than other methods: RMSE' if paper else 'RMSE'
+    name = 'half of the best baseline' if paper else 'share of the best baseline without preview'
     claim = Claim(
-        f'{"half of the best baseline" if paper else "share of the best baseline without preview"}, '
-        f'{drive}, noise {noise:g}',
+        f'{name}, {drive}, noise {noise:g}',
         'paper' if paper else 'ours',
         f'{words} at most {limit:.2f} of that of the best {kind} ({drive} drive, nominal, noise '
         f'{noise:g})',
@@ -157,7 +157,8 @@ def no_worse_than_exact_model(results: Results, drive: str) -> Claim:
     claim = Claim(
         f'baselines with preview, wrong inertia of the robot, {drive}',
         'ours',
-        'RMSE no larger than that of any predictive baseline with preview and the nominal model when '
+        'RMSE no larger than that of any predictive baseline with preview and the nominal model '
+        'when '
         f'mass and inertia of the robot are 30 % more or less ({drive} drive, noise '
         f'{PAPER_NOISE:g})',
     )
@@ -285,7 +286,7 @@ def others_grow(results: Results, drive: str) -> Claim:
 
 
 def calm_control(results: Results, drive: str) -> Claim:
-    """Decide whether what is asked of the robot varies no more than the middle baseline's."""
+    """Decide whether the effort varies no more than that of the median baseline."""
     claim = Claim(
         f'no chatter, {drive}',
         'paper',

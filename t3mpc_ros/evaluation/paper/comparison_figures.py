@@ -47,7 +47,7 @@ def colours_of(results: Results) -> dict[str, str]:
 
 
 def rmse_bars(results: Results) -> Any:
-    """Return the RMSE of every baseline and of ours at the paper's noise, with their intervals."""
+    """Return the RMSE with intervals of all methods at the paper's noise."""
     shown = {drive: _ranked(results, drive) for drive in results.drives}
     shown = {drive: rows for drive, rows in shown.items() if rows}
     if not shown:
@@ -76,7 +76,7 @@ def rmse_bars(results: Results) -> Any:
 
 
 def noise_growth(results: Results) -> Any:
-    """Return RMSE against noise of every baseline and of ours, and how much it grows."""
+    """Return RMSE against noise of every baseline and the proposed controller, and its growth."""
     noises = results.noises
     if len(noises) < 2:
         return None
@@ -152,7 +152,7 @@ def ablation_bars(results: Results) -> Any:
 
 
 def parts(results: Results) -> Any:
-    """Return what adding each part and what leaving it out changes, with 95 % intervals."""
+    """Return the effect of adding and of leaving out each part, with 95 % intervals."""
     by_name = {name: part for part, name in WITHOUT.items()}
     added = [(PARTS[STAGES.index(p.first) - 1], p, 1.0) for p in results.stage_differences()]
     left_out = [(by_name[p.first], p, -1.0) for p in results.losses()]
@@ -210,7 +210,7 @@ def _differences(
 
 
 def portraits(showcase: FigureRuns, results: Results) -> Any:
-    """Return phase portraits of several methods beside ours, in closed loop (Fig. 15)."""
+    """Return phase portraits of several methods in closed loop (Fig. 15)."""
     colours = colours_of(results)
     shown = showcase.portraits
     columns = min(3, len(shown))

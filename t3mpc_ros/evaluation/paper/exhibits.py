@@ -39,7 +39,7 @@ class Exhibit:
     """Name of the picture's file; empty for tables."""
     draw: Callable[[ExhibitData], Any] | None = None
     tables: str = ''
-    """The heading of its tables, as in :func:`t3mpc_ros.evaluation.paper.result_tables.all_tables`."""
+    """Heading of its tables, as in :func:`.result_tables.all_tables`."""
     comparable: bool = True
     finding: Callable[[ExhibitData], str] | None = None
     """What was found where there is no claim to decide."""

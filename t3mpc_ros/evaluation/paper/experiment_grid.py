@@ -30,7 +30,7 @@ FULL = 'full'
 STAGES = ('feedback', '+NT3FS', '+compensator', '+MPC', FULL)
 """The controller as it grows; the last step, to :data:`FULL`, adds preview."""
 PARTS = ('NT3FS', 'compensator', 'MPC', 'preview')
-"""What each step from one stage to the next adds."""
+"""Part that each stage adds."""
 WITHOUT = {
     'NT3FS': 'full without NT3FS',
     'compensator': 'full without compensator',
@@ -43,7 +43,7 @@ WITHOUT = {
 
 
 class Method(Protocol):
-    """A method, as plain data: what tables and results read of it; runs may read more."""
+    """Fields of a method that tables and results use."""
 
     @property
     def name(self) -> str:
@@ -59,11 +59,11 @@ class Method(Protocol):
 
     @property
     def parameters(self) -> Any:
-        """What it is made with."""
+        """Parameters of the method."""
 
 
 class RunRecord(Protocol):
-    """What is read of the record of a run; one row a control period, right wheel first."""
+    """Fields of a run record that results use; one row per control period, right wheel first."""
 
     @property
     def time(self) -> Array:
@@ -97,7 +97,7 @@ class RunRecord(Protocol):
         """Return the tracking RMSE over both wheels, rad/s."""
 
     def chatter(self) -> float:
-        """Return the total variation of what is asked, per second and wheel, rad/s³."""
+        """Return the total variation of the effort per second and wheel, rad/s³."""
 
 
 Jobs = Sequence[tuple[Any, Any]]
@@ -167,7 +167,7 @@ class ExperimentGrid:
 
 @dataclass(frozen=True, slots=True)
 class Experiment:
-    """One method in one situation: what a row of the results is about."""
+    """One method in one situation: a row of the results."""
 
     method: str
     drive: str
@@ -202,7 +202,7 @@ def make_grid(
 
 
 def needed_experiments(setup: ExperimentSetup, grid: ExperimentGrid) -> tuple[Experiment, ...]:
-    """Return every cell that is needed, each once, by drive, case, noise and method.
+    """Return all needed experiments without duplicates, by drive, case, noise and method.
 
     Every baseline and every stage of the controller in the nominal case at every noise; the stages
     in every other case at ``perturbed_noises``; the controller with one part left out in the

@@ -32,13 +32,13 @@ SETTLING = 1.0
 START = 3.0
 """Seconds at the start that no number counts: the reference grows from zero."""
 
-# Sources that cannot change the numbers of a run given the method's settings. Everything else
-# counts as able to: to run again what need not be is better than to keep what no longer holds.
+# Sources that cannot change the result of a run with given method parameters. All others
+# invalidate stored runs: a needless repetition is better than an outdated result.
 _IRRELEVANT_SOURCES = (
-    'nodes/', 'record/', 'radio/', 'emulator/', 'lab/bag/', 'lab/rerun/',
-    'lab/report/', 'lab/paper/', 'lab/program.py', 'lab/commands.py', 'lab/demo.py',
-    'lab/processes.py', 'lab/exponents.py', 'lab/estimation.py', 'lab/methods.py',
-    'lab/timing', 'lab/tuning',
+    'nodes/', 'bag/', 'radio/', 'emulator/', 'cli/', 'evaluation/bag_report/',
+    'evaluation/process_replay/', 'evaluation/paper/', 'evaluation/tuning/',
+    'evaluation/plotting.py', 'evaluation/reporting.py', 'evaluation/lyapunov_exponents.py',
+    'evaluation/open_loop_estimation.py', 'evaluation/methods.py',
 )  # fmt: skip
 
 
@@ -51,7 +51,7 @@ class RunNumbers:
     settled: float
     """The same without :data:`SETTLING` about each switch."""
     chatter: float
-    """Total variation of what is asked of the robot, per second and wheel, rad/s³."""
+    """Total variation of the effort per second and wheel, rad/s³."""
     largest_error: float
     """rad/s"""
     finite: bool
@@ -59,7 +59,7 @@ class RunNumbers:
 
 
 def measure(run: RunRecord) -> RunNumbers:
-    """Return what is kept of a run; the first :data:`START` seconds do not count."""
+    """Return the metrics of a run; the first :data:`START` seconds do not count."""
     arrays = run.reference, run.speeds, run.command, run.terms
     if not all(bool(np.isfinite(values).all()) for values in arrays):
         return RunNumbers(math.nan, math.nan, math.nan, math.nan, False)
@@ -74,28 +74,30 @@ def measure(run: RunRecord) -> RunNumbers:
 
 
 def source_digest(package: Path = PACKAGE_DIRECTORY) -> str:
-    """Return a digest of every source that can change what a run gives.
+    """Return a digest of every source file that can change the result of a run.
 
-    That is the package's Python and array files without the rooms that only show, record or
-    choose, and with this file, which measures. Tuned values reach a run through its method's
-    settings, and count there.
+    It covers the Python and array files of the package except those that only display, record or
+    select, and includes this file, which measures. Tuned values are part of the method's
+    parameters.
     """
     digest = hashlib.sha256()
     for path in sorted(package.rglob('*')):
         name = path.relative_to(package).as_posix()
-        kept = name == 'lab/paper/store.py' or not name.startswith(_IRRELEVANT_SOURCES)
+        kept = name == 'evaluation/paper/experiment_runs.py' or not name.startswith(
+            _IRRELEVANT_SOURCES
+        )
         if kept and path.suffix in ('.py', '.npy', '.npz'):
             digest.update(name.encode() + b'\0' + hashlib.sha256(path.read_bytes()).digest())
     return digest.hexdigest()[:16]
 
 
 def fingerprint(method: Method, sources: str) -> str:
-    """Return what a run's numbers hang on beside its scenario: version, sources and the method.
+    """Return a digest of version, sources and method, on which the result of a scenario depends.
 
     Raises
     ------
     TypeError
-        The method, or its settings, hold something that is not plain data.
+        The method, or its parameters, hold something that is not plain data.
     """
     parts = [t3mpc_ros.__version__, sources, plain(method)]
     text = json.dumps(parts, sort_keys=True)
@@ -140,7 +142,7 @@ class RunKey:
 
 
 class RunFile:
-    """Finished runs in a file of JSON lines; a context that one campaign has at a time.
+    """Finished runs in a file of JSON lines; a context that one set of runs has at a time.
 
     A line is written as a whole and flushed. Should a writer be killed within one, what is torn
     is that line alone: reading skips it, and the next writer begins on a line of its own.
@@ -157,7 +159,7 @@ class RunFile:
     OSError
         On entry: the file cannot be written.
     RuntimeError
-        On entry: another campaign is writing to it.
+        On entry: another set of runs is writing to it.
     """
 
     def __init__(self, path: Path, *, fresh: bool = False) -> None:
@@ -262,17 +264,17 @@ def run_missing(
     team: Any = 1,
     progress: Progress | None = None,
 ) -> Numbers:
-    """Return the numbers of every needed cell, one per seed in the extent's order.
+    """Return the numbers of every needed experiment, one per seed in the grid's order.
 
     Runs that ``file`` holds with the same fingerprint are not run again; what is run is added to
-    it at once, so that a campaign that is stopped goes on where it was. The answer does not
+    it at once, so that a set of runs that is stopped goes on where it was. The answer does not
     depend on what was there, nor on how many processes worked.
 
     Parameters
     ----------
     setup
         Where methods and runs come from.
-    extent, needed
+    grid, needed
         Seeds and duration, and which cells.
     file
         Entered by this function.
@@ -286,7 +288,7 @@ def run_missing(
     Raises
     ------
     RuntimeError
-        The runner gave fewer runs than it was asked for, or another campaign has the file.
+        The runner gave fewer runs than it was asked for, or another set of runs has the file.
     """
     methods = {drive: setup.methods(drive) for drive in grid.drives}
     prints = {

@@ -52,20 +52,20 @@ class FigureRuns:
 
     seed: int
     torque: RunRecord
-    """The full controller in the paper's setting."""
+    """The full controller in the paper's parameter."""
     velocity: RunRecord
     """The full controller as the nodes close the loop."""
     blind: RunRecord | None
     """The same without preview."""
     portraits: Mapping[str, RunRecord]
-    """Of several methods in the paper's setting, the full controller first."""
+    """Of several methods in the paper's parameter, the full controller first."""
     pairs: tuple[tuple[int, int], ...]
     """Signals, from 1, that drive right and left wheel in each mode."""
     driven: Array
     """True speeds of a robot without a controller (86) after it has settled, rad/s, shape
     (n, 2)."""
     estimated: Mapping[str, Array]
-    """What each kind of fuzzy system makes of them, alike."""
+    """Their estimates by each kind of fuzzy system."""
 
     def claims(self) -> list[Claim]:
         """Return the paper's claims on single runs, decided for these."""
@@ -120,12 +120,12 @@ def simulate_figure_runs(
 
 
 def full_record(run: RunRecord) -> RunRecord:
-    """Return the record itself: what a figure needs of a run."""
+    """Return the record itself, for figures."""
     return run
 
 
 def portrait_methods(results: Results) -> list[str]:
-    """Return whose phase portraits are compared: ours, other fuzzy kinds, then the best baselines."""
+    """Return the methods of the phase portraits: proposed, other fuzzy kinds, best baselines."""
     rows = results.rows_of('torque', PAPER_NOISE, baseline=True)
     rows.sort(key=lambda row: math.inf if math.isnan(row.rmse_mean) else row.rmse_mean)
     names = [row.controller for row in rows]

@@ -63,8 +63,8 @@ def page(
         Every claim, decided.
     tables
         By heading, :func:`t3mpc_ros.evaluation.paper.result_tables.all_tables`.
-    pictures
-        PNG files by stem, :func:`t3mpc_ros.evaluation.paper.exhibits.pictures`.
+    figures
+        PNG files by stem, :func:`t3mpc_ros.evaluation.paper.exhibits.figures`.
     findings
         Words by stem where no claim decides, by ``findings`` of the same module.
     """

@@ -21,17 +21,17 @@ RUNS = 'runs.jsonl'
 
 @dataclass(frozen=True, slots=True)
 class PaperOptions:
-    """What is asked for."""
+    """Options of the reproduction."""
 
     output: Path
     quick: bool = False
     seeds: int | None = None
-    """Held-out seeds of each cell; None for all, or three when quick."""
+    """Held-out seeds of each experiment; None for all, or three when quick."""
     estimation_seeds: int | None = None
     """The same of the comparison (86)."""
     workers: int = 1
     json: Path | None = None
-    """Where a second copy of the results goes."""
+    """Path of a second copy of the results."""
     fresh: bool = False
     """Whether runs that are there already are thrown away."""
 
@@ -67,7 +67,7 @@ def reproduce(setup: ExperimentSetup, options: PaperOptions, progress: Any = Non
     OSError
         The output cannot be written.
     RuntimeError
-        Another campaign is writing to the same folder.
+        Another set of runs is writing to the same folder.
     ValueError
         More seeds are asked for than there are.
     """

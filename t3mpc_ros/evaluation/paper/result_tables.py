@@ -48,7 +48,7 @@ def comparison(results: Results, drive: str, *, settled: bool = False) -> Table:
 
 
 def chatter(results: Results, drive: str) -> Table:
-    """Return every method's total variation of what it asks against noise."""
+    """Return every method's total variation of the effort against noise."""
     rows = []
     for name in results.kinds:
         found = [results.row(name, drive, noise) for noise in results.noises]
@@ -137,7 +137,7 @@ def estimation(results: Sequence[EstimationResult]) -> list[Table]:
 
 
 def all_tables(results: Results, estimated: Sequence[EstimationResult]) -> dict[str, list[Table]]:
-    """Return every table by the heading it stands under."""
+    """Return all tables by their heading."""
     stages, losses = results.stage_differences(), results.losses()
     found: dict[str, list[Table | None]] = {
         'Methods against noise (Table 3)': [],

@@ -24,7 +24,7 @@ from t3mpc_ros.evaluation.paper.experiment_runs import RunNumbers, finite_or_non
 
 @dataclass(frozen=True, slots=True)
 class ResultRow:
-    """How one method fared in one situation; NaN where a run left the finite numbers."""
+    """Result of one method in one situation; NaN where a run diverged."""
 
     controller: str
     baseline: bool
@@ -41,7 +41,7 @@ class ResultRow:
     """The same without the second about each switch."""
     settled_ci95: float
     chatter_mean: float
-    """Total variation of what is asked of the robot, per second and wheel, rad/s³."""
+    """Total variation of the effort per second and wheel, rad/s³."""
     largest_error: float
     """rad/s, over all seeds."""
     finite: bool
@@ -88,7 +88,7 @@ class PairedDifference:
 
 
 class Results:
-    """Every number of a campaign, by cell.
+    """Every number of a set of runs, by experiment.
 
     Parameters
     ----------
@@ -170,12 +170,12 @@ class Results:
         return tuple(dict.fromkeys(c.case for c in self._rows if c.drive == drive))
 
     def stage_differences(self) -> list[PairedDifference]:
-        """Return what each part changes when it is added, stage by stage, wherever measured."""
+        """Return the effect of adding each part, stage by stage, where measured."""
         pairs = zip(STAGES[1:], STAGES[:-1], strict=True)
         return self._everywhere(list(pairs))
 
     def losses(self) -> list[PairedDifference]:
-        """Return what leaving each part out of the full controller costs, wherever measured."""
+        """Return the cost of leaving each part out of the full controller, where measured."""
         return self._everywhere([(without, STAGES[-1]) for without in WITHOUT.values()])
 
     def _everywhere(self, pairs: Sequence[tuple[str, str]]) -> list[PairedDifference]:
@@ -215,7 +215,7 @@ def results_of(
     grid: ExperimentGrid,
     numbers: Mapping[Experiment, Sequence[RunNumbers]],
 ) -> Results:
-    """Return the table of results of a campaign, the methods in the order of the setup.
+    """Return the table of results of a set of runs, the methods in the order of the setup.
 
     Raises
     ------

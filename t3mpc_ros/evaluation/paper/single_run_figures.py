@@ -102,7 +102,7 @@ def robot_portrait(showcase: FigureRuns) -> Any:
 
 
 def portrait(showcase: FigureRuns) -> Any:
-    """Return the phase portrait of the outputs in the paper's setting, its Fig. 14."""
+    """Return the phase portrait of the outputs in the paper's parameter, its Fig. 14."""
     return _portrait(showcase.torque)
 
 
@@ -181,7 +181,7 @@ def control(showcase: FigureRuns) -> Any:
 
 
 def estimates(showcase: FigureRuns) -> Any:
-    """Return the estimates g with what they should be, the paper's Fig. 13."""
+    """Return the estimates g with their targets, the paper's Fig. 13."""
     run = showcase.torque
     target, found = true_unknown(run), estimated_unknown(run)
     figure, axes = run_and_zoom(run, 'rad/s²', before=2.0, after=4.0)
@@ -270,7 +270,7 @@ def rows_between(run: RunRecord, begin: float, end: float) -> NDArray[np.intp]:
 
 
 def legend_above(figure: Any, axis: Any, extra: Sequence[Any] = (), columns: int = 5) -> None:
-    """Put what ``axis`` shows, and more lines, into one legend above all panels."""
+    """Put the lines of ``axis`` and further ones into one legend above all panels."""
     handles, labels = axis.get_legend_handles_labels()
     handles += list(extra)
     labels += [handle.get_label() for handle in extra]

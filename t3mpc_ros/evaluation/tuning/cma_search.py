@@ -66,10 +66,10 @@ class SearchProgress:
 
 @dataclass(frozen=True, slots=True)
 class SearchResult:
-    """What a search found."""
+    """Result of a search."""
 
     values: Values
-    """The best tuned settings of all evaluations, the start included."""
+    """The best tuned parameters of all evaluations, the start included."""
     value: float
     """Their objective; infinite when no evaluation gave a finite number."""
     history: tuple[Evaluation, ...]
@@ -107,7 +107,7 @@ def search_best(
     space
         What is searched.
     start
-        Where the search begins; its tuned settings lie within the ranges.
+        Where the search begins; its tuned parameters lie within the ranges.
     evaluations
         How many points are evaluated, at least 1.
     seed
@@ -115,7 +115,7 @@ def search_best(
     report
         Called after each generation.
     batch
-        Points of a generation, at least 2; by default 4 + 3 ln n for n settings.
+        Points of a generation, at least 2; by default 4 + 3 ln n for n parameters.
     path
         File for the history, written after each generation.
     resume

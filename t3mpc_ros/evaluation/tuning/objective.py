@@ -19,16 +19,16 @@ SMOOTHNESS = 1e-5
 
 Small: 1000 rad/s³ of total variation of u per second cost 0.01 rad/s. It keeps a method from
 buying the last percent of tracking with a command that shakes the motors, and decides between
-settings that track alike; it is too small to make any method track worse to be smooth.
+parameters that track alike; it is too small to make any method track worse to be smooth.
 """
 NOISE_LEVELS = (0.0, 0.04, 0.1)
-"""Variances of the measured wheel speeds met in training, (rad/s)²: one setting for them all."""
+"""Variances of the measured wheel speeds met in training, (rad/s)²: one parameter for them all."""
 DURATION = 26.0
 """Length of a training run, s: the reference switches twice in it."""
 
 
 class Measurable(Protocol):
-    """What a objective needs of a run."""
+    """What an objective needs of a run."""
 
     def rmse(self) -> float:
         """Return the tracking RMSE, rad/s."""
@@ -85,7 +85,7 @@ class TuningScenarios:
 
 
 class ClosedLoopObjective:
-    """Mean objective of settings in the closed loop; several are evaluated at the same time.
+    """Mean objective of parameters in the closed loop; several are evaluated at the same time.
 
     To be used in a ``with`` statement: the processes stay warm between generations.
 
@@ -128,7 +128,7 @@ class ClosedLoopObjective:
         ------
         JobError
             Runs failed with every candidate of a method that never ran before: it is at fault
-            then, not the settings. Or a process was lost.
+            then, not the parameters. Or a process was lost.
         """
         try:
             objectives: list[float | None] = [*self._objectives(method, drive, candidates)]

@@ -24,19 +24,19 @@ from t3mpc_ros.parameters.table import ParameterError, Parameters, ParameterSpec
 
 Array = NDArray[np.float64]
 Values = dict[str, int | float]
-"""Tuned settings by their dotted names."""
+"""Tuned parameters by their dotted names."""
 
 
 @dataclass(frozen=True, slots=True)
 class SearchRange:
-    """Where one setting is searched.
+    """Where one parameter is searched.
 
     Parameters
     ----------
     name
-        Dotted name of a setting that holds a number.
+        Dotted name of a parameter that holds a number.
     low, high
-        Bounds, both included, in the setting's own unit.
+        Bounds, both included, in the parameter's own unit.
     log
         Whether equal steps are equal factors; ``low`` must then be above 0.
 
@@ -66,20 +66,20 @@ class SearchRange:
 
 
 class SearchSpace:
-    """The tuned settings of one table, as the unit cube.
+    """The tuned parameters of one table, as the unit cube.
 
     Parameters
     ----------
     table
-        The table that the settings belong to.
+        The table that the parameters belong to.
     ranges
         What is tuned, at least one; their order is that of the coordinates.
 
     Raises
     ------
     ParameterError
-        No range at all, a name twice, a name that the table does not have, a setting that is
-        not a number, or a range that goes beyond the setting's own bounds.
+        No range at all, a name twice, a name that the table does not have, a parameter that is
+        not a number, or a range that goes beyond the parameter's own bounds.
     """
 
     def __init__(self, table: type[Parameters], ranges: Sequence[SearchRange]) -> None:
@@ -102,11 +102,11 @@ class SearchSpace:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the tuned settings, in the order of the coordinates."""
+        """Names of the tuned parameters, in the order of the coordinates."""
         return tuple(each.name for each in self.ranges)
 
     def values(self, point: ArrayLike) -> Values:
-        """Return the settings at a point of the unit cube, exactly within their ranges.
+        """Return the parameters at a point of the unit cube, exactly within their ranges.
 
         Raises
         ------
@@ -138,7 +138,7 @@ class SearchSpace:
         Raises
         ------
         ParameterError
-            A tuned setting is missing, not a number, or outside its range.
+            A tuned parameter is missing, not a number, or outside its range.
         """
         result = np.empty(len(self))
         for i, (each, (low, high)) in enumerate(zip(self.ranges, self._ends, strict=True)):
@@ -157,12 +157,12 @@ class SearchSpace:
         return result
 
     def of(self, parameters: Parameters) -> Values:
-        """Return the tuned settings of a table as they are, checked to be in their ranges.
+        """Return the tuned parameters of a table as they are, checked to be in their ranges.
 
         Raises
         ------
         ParameterError
-            Another table, or a setting outside its range.
+            Another table, or a parameter outside its range.
         """
         if not isinstance(parameters, self.table):
             raise ParameterError(
@@ -189,7 +189,7 @@ def _row(name: str, known: Mapping[str, ParameterSpec], table: type[Parameters])
 
 
 def _check(each: SearchRange, row: ParameterSpec) -> bool:
-    """Return whether the setting is a whole number, or raise why it cannot be tuned so."""
+    """Return whether the parameter is a whole number, or raise why it cannot be tuned so."""
     if row.many or row.kind not in (int, float) or row.choices:
         kind = f'a list of {row.kind.__name__}' if row.many else row.kind.__name__
         raise ParameterError(f'{each.name} cannot be tuned: it must be one number, and is {kind}')
@@ -214,10 +214,10 @@ class MethodDefinition:
     ----------
     name
         As it stands in tables and figures, for example ``'linear MPC'``.
-    rival_type
+    controller_type
         The controller.
     start
-        For each drive the method is meant for, the settings its maker would choose: tuning
+        For each drive the method is meant for, the parameters its maker would choose: tuning
         begins there, and never ends worse.
     ranges
         What is tuned, in either drive. All else stays as in ``start``.
@@ -225,7 +225,7 @@ class MethodDefinition:
     Raises
     ------
     ParameterError
-        No drive, settings of another table, or ranges that do not fit; names the method.
+        No drive, parameters of another table, or ranges that do not fit; names the method.
     """
 
     name: str

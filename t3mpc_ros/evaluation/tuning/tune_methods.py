@@ -20,7 +20,7 @@ from t3mpc_ros.evaluation.tuning.tuned_parameters import (
 from t3mpc_ros.parameters.table import ParameterError, Parameters
 
 Evaluate = Callable[[MethodDefinition, str, Sequence[Parameters]], Sequence[float]]
-"""Returns the objective of each of several settings of a method in a drive."""
+"""Returns the objective of each of several parameters of a method in a drive."""
 
 SEARCH_SEED = 1
 """Of the search itself; the same for every method."""
@@ -40,7 +40,7 @@ def tune_methods(
     evaluate: Evaluate | None = None,
     seed: int = SEARCH_SEED,
 ) -> TunedParameters:
-    """Return the best settings of each method in each drive it is meant for.
+    """Return the best parameters of each method in each of its drives.
 
     Each pair has a search of its own with ``evaluations`` evaluations. The file is written after
     each, and the history of each search beside it; what the file holds of other methods stays.
@@ -50,14 +50,15 @@ def tune_methods(
     methods
         Of different names.
     drives
-        Among ``'torque'`` and ``'velocity'``; a method without start settings for one is left out
+        Among ``'torque'`` and ``'velocity'``; a method without start parameters for one
+        is left out
         there.
     evaluations
         Of each search.
     workers
         How many processes run the closed loop.
     path
-        Where the tuned settings are kept.
+        Where the tuned parameters are kept.
     report
         Receives the progress, line by line.
     clock
@@ -78,7 +79,7 @@ def tune_methods(
         Methods of the same name; a drive no method is meant for; or a file that holds other
         methods tuned with another budget, so that nothing in it could be compared.
     RuntimeError
-        For some method no settings gave a finite objective; all others are kept.
+        For some method no parameters gave a finite objective; all others are kept.
     """
     check_names(methods)
     for drive in drives:
@@ -149,7 +150,7 @@ class _Progress:
         self._begin = clock() if clock else 0.0
 
     def report(self, standing: SearchProgress) -> None:
-        """Report how far the search has come; what a resumed one already knew is passed over."""
+        """Report the progress of the search without resumed evaluations."""
         done, left = standing.done, standing.total - standing.done
         if self._report is None or (left and not standing.fresh):
             return

@@ -20,7 +20,7 @@ from typing import Any, Self, TypeVar
 from t3mpc_ros.parameters.table import ParameterError, Parameters
 
 PACKAGED_FILE = Path(__file__).resolve().parent / 'tuned.json'
-"""The file that comes with the package."""
+"""Bundled file of tuned parameters."""
 
 _FORMAT = 1
 T = TypeVar('T', bound=Parameters)
@@ -60,20 +60,20 @@ class TunedEntry:
     """What was found for one method in one drive."""
 
     values: Mapping[str, object]
-    """Every setting of the method by its dotted name."""
+    """Every parameter of the method by its dotted name."""
     tuned: tuple[str, ...]
     """The names among them that were searched."""
     objective: float
     """Mean objective of ``values``, rad/s."""
     start_objective: float | None
-    """That of the settings the search began with, rad/s; None when they did not even run."""
+    """That of the parameters the search began with, rad/s; None when they did not even run."""
     budget: TuningBudget
     version: str
     """Of this package, when it was found."""
 
 
 class TunedParameters:
-    """Tuned settings by method and drive.
+    """Tuned parameters by method and drive.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ class TunedParameters:
     def load(
         cls, path: Path = PACKAGED_FILE, types: Mapping[str, type[Parameters]] | None = None
     ) -> Self:
-        """Return what a file holds.
+        """Return the content of a file.
 
         Parameters
         ----------
@@ -145,7 +145,7 @@ class TunedParameters:
         write_atomically(path, text + '\n')
 
     def put(self, method: str, drive: str, entry: TunedEntry) -> None:
-        """Add what was found, in place of what was there."""
+        """Add or replace an entry."""
         self._entries[method, drive] = entry
 
     def entry(self, method: str, drive: str) -> TunedEntry:
@@ -165,12 +165,12 @@ class TunedParameters:
             ) from None
 
     def parameters(self, method: str, drive: str, table: type[T]) -> T:
-        """Return the tuned settings of a method as its table.
+        """Return the tuned parameters of a method as its table.
 
         Raises
         ------
         StoreError
-            It was not tuned, or what is stored does not fit the table; names the setting.
+            It was not tuned, or what is stored does not fit the table; names the parameter.
         """
         entry = self.entry(method, drive)
         known = [row.name for row in table.specs()]
@@ -187,12 +187,12 @@ class TunedParameters:
             raise StoreError(f'{where}: {error}') from error
 
     def applied(self, method: str, drive: str, start: T) -> T:
-        """Return ``start`` with the settings that were tuned; all others stay as they are.
+        """Return ``start`` with the parameters that were tuned; all others stay as they are.
 
         Raises
         ------
         StoreError
-            It was not tuned, or what is stored does not fit the table; names the setting.
+            It was not tuned, or what is stored does not fit the table; names the parameter.
         """
         entry = self.entry(method, drive)
         try:
@@ -219,9 +219,10 @@ class TunedParameters:
                 )
 
     def table(self) -> str:
-        """Return what was gained, as a table in Markdown."""
+        """Return the improvement by tuning as a Markdown table."""
         lines = [
-            '| method | drive | objective at start (rad/s) | tuned | settings tuned | evaluations |',
+            '| method | drive | objective at start (rad/s) | tuned | tuned parameters '
+            '| evaluations |',
             '|---|---|---|---|---|---|',
         ]
         for method, drive in self:

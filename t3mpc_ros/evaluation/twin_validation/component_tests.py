@@ -40,7 +40,7 @@ GYRO_SHEET = (
 
 @dataclass(frozen=True, eq=False)
 class TorqueCurve:
-    """How much a motor can pull at which speed."""
+    """Pull-out torque of a motor against speed."""
 
     volts: float
     current: float
@@ -55,7 +55,7 @@ class TorqueCurve:
 
 @dataclass(frozen=True, eq=False)
 class Ramp:
-    """A ramp of the field up to a speed and down again, and what the robot makes of it."""
+    """Response of the robot to a ramp of the field up to a speed and down again."""
 
     acceleration: float
     """rad/s²"""
@@ -67,7 +67,7 @@ class Ramp:
     """rad/s at which it turns, shape (n,)"""
     behind: Array
     """Full steps the right rotor is behind its field, shape (n,)."""
-    odometry_speed: Array
+    counted_distance: Array
     """m driven by the step counters, shape (n,)"""
     driven: Array
     """m driven, shape (n,)"""
@@ -77,7 +77,7 @@ class Ramp:
 
 @dataclass(frozen=True, eq=False)
 class LowPass:
-    """What one setting of the gyro's low-pass does, measured with a pulse."""
+    """Response of one low-pass setting of the gyro, measured with a pulse."""
 
     frequency: Array
     """Hz, shape (n,)"""
@@ -112,9 +112,9 @@ def torque_curve(
 
 
 def needed_torque(parameters: DigitalTwinParameters) -> float:
-    """Return the torque (N m) of a motor for the guard's acceleration and the friction.
+    """Return the torque (N m) of a motor for the command limiter's acceleration and the friction.
 
-    The larger of driving straight and turning on the spot, at the guard's top speed.
+    The larger of driving straight and turning on the spot, at the command limiter's top speed.
     """
     inertia = wheel_inertia(parameters.true_body, parameters.geometry)
     own = parameters.motor.rotor_inertia
@@ -162,9 +162,9 @@ def ramp(
             )
         )
     time: Array = step * np.arange(1.0, len(rows) + 1.0)
-    field, rotor, behind, odometry_speed, driven = np.array(rows).T
+    field, rotor, behind, counted_distance, driven = np.array(rows).T
     return Ramp(
-        acceleration, time, field, rotor, behind, odometry_speed, driven, drivetrain.lost_steps
+        acceleration, time, field, rotor, behind, counted_distance, driven, drivetrain.lost_steps
     )
 
 
@@ -176,7 +176,7 @@ def sharp_curve(distances: Sequence[float] | Array) -> Array:
 def sharp_readings(
     parameters: SimulatedRangeSensorParameters, distances: Array, seed: int
 ) -> Array:
-    """Return what the board reads (m, REP 117) of all eight sensors, shape (n, 8)."""
+    """Return the readings (m, REP 117) of all eight sensors, shape (n, 8)."""
     finders = SimulatedRangeSensors(parameters, np.random.default_rng(seed))
     rows = []
     for true_distance in distances.tolist():
@@ -193,7 +193,7 @@ def sharp_deviation() -> float:
 
 
 def low_pass_response(setting: int, step: float = 1e-4, length: int = 8192) -> LowPass:
-    """Return what the low-pass of DLPF_CFG ``setting`` does to a pulse of one ``step`` (s)."""
+    """Return the response of low-pass ``setting`` (DLPF_CFG) to a pulse of one ``step`` (s)."""
     share = SimulatedImuParameters(low_pass=str(setting)).share(step)
     filtered = np.zeros((3, 2))
     answer = np.empty(length)
@@ -211,7 +211,7 @@ def low_pass_response(setting: int, step: float = 1e-4, length: int = 8192) -> L
 def stationary_gyro(
     parameters: SimulatedImuParameters, seconds: float, rate: float, seed: int
 ) -> Array:
-    """Return what a gyro that does not turn tells (deg/s), shape (seconds * rate,)."""
+    """Return the output of a stationary gyro (deg/s), shape (seconds * rate,)."""
     gyro = SimulatedImu(parameters, np.random.default_rng(seed))
     still = np.zeros((3, 2))
     rates = [gyro.measure(still, 1.0 / rate).angular for _ in range(round(seconds * rate))]

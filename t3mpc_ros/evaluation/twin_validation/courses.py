@@ -38,24 +38,24 @@ PAUSE = 0.3
 TOP_SPEED = 8.0
 """rad/s of a wheel on a leg: 0.28 m/s, or a turn of the robot in 1.7 s."""
 DECELERATION_ANGLE = 0.4
-"""Part of the guard's acceleration with which a leg is brought to its end."""
+"""Part of the command limiter's acceleration with which a leg is brought to its end."""
 
 
 class Slip(NamedTuple):
-    """Spells of one fault, at random times and independent of what the robot does just then."""
+    """Slip events of one fault at random times, independent of the motion."""
 
     name: str
     fault: str
     """``slippery`` or ``wheel_blocked``; which wheel is held is drawn each time."""
     grip: float
-    """Part of the tyres' grip that is left during a spell; 1 when a wheel is held."""
+    """Part of the tyres' grip that is left during a slip event; 1 when a wheel is held."""
     pause: float
-    """s from the end of a spell to the next one, on average (exponential)"""
+    """s from the end of a slip event to the next one, on average (exponential)"""
     length: float
-    """s a spell lasts: on average (exponential) for grip, always for a held wheel"""
+    """s a slip event lasts: on average (exponential) for grip, always for a held wheel"""
 
     def slip_events(self, generator: np.random.Generator, until: float) -> tuple[FaultEvent, ...]:
-        """Return the spells that start within ``until`` seconds after the robot has stood."""
+        """Return the slip events that start within ``until`` seconds after the robot has stood."""
         events = []
         at = STANDING + generator.exponential(self.pause)
         while at < STANDING + until:
@@ -71,7 +71,7 @@ class Slip(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """What became of a drive, once a period; yaw angles are unwrapped."""
+    """Record of a drive, one row per period; yaw angles are unwrapped."""
 
     name: str
     time: Array
@@ -81,7 +81,7 @@ class Course:
     odometry: Array
     """What the robot reported, shape (n, 3)."""
     steps: Array
-    """What the step counters alone say, shape (n, 3)."""
+    """Pose from the step counters alone, shape (n, 3)."""
     slid: tuple[float, float]
     """m each tyre has slid, right first"""
     lost_steps: tuple[int, int]
@@ -144,22 +144,22 @@ def spin(
 
 
 def yaw_drift(course: Course, by_steps: bool = False) -> float:
-    """Return by how much (rad) the yaw is wrong in the end; not wrapped.
+    """Return the yaw error (rad) at the end, not wrapped.
 
     That of the robot's odometry, or that of the step counters alone.
     """
-    odometry_speed = course.steps if by_steps else course.odometry
-    return float(odometry_speed[-1, 2] - course.truth[-1, 2])
+    estimate = course.steps if by_steps else course.odometry
+    return float(estimate[-1, 2] - course.truth[-1, 2])
 
 
 def place_error(course: Course, by_steps: bool = False) -> float:
-    """Return how far (m) the robot thinks it is from where it is, in the end."""
-    odometry_speed = course.steps if by_steps else course.odometry
-    return math.dist(odometry_speed[-1, :2].tolist(), course.truth[-1, :2].tolist())
+    """Return the position error (m) at the end."""
+    estimate = course.steps if by_steps else course.odometry
+    return math.dist(estimate[-1, :2].tolist(), course.truth[-1, :2].tolist())
 
 
 def gyro_limit(parameters: DigitalTwinParameters, course: Course) -> float:
-    """Return how far off (rad) a yaw from this gyro alone may be at the end of a course.
+    """Return the bound (rad) of the yaw error of this gyro alone at the end of a course.
 
     Its error of scale at the largest, three standard deviations of what its bias wanders from
     one standstill to the other, sigma t^1.5 / sqrt 3, and of what its noise leaves in the bias
@@ -177,7 +177,7 @@ def gyro_limit(parameters: DigitalTwinParameters, course: Course) -> float:
 def patrol(
     parameters: DigitalTwinParameters, blind_from: float, longest: float, speed: float = 6.0
 ) -> Patrol:
-    """Return a drive through the world of ``settings`` that turns away from what it sees.
+    """Return a drive through the world of ``parameters`` that turns away from obstacles.
 
     It turns to the freer side when something is nearer than 0.3 m in front or 0.15 m beside it,
     until that is 0.4 or 0.2 m away. From ``blind_from`` (s) on no sensor answers, and it drives
@@ -209,7 +209,7 @@ def patrol(
 
 
 def _turn_away(ranges: Sequence[float], turn: float) -> float:
-    """Return 1 to turn to the left, -1 to the right, 0 to go on; ``turn`` is what it does now."""
+    """Return 1 for a left turn, -1 for right, 0 for straight on; ``turn`` is the current one."""
     if not ranges:
         return 0.0
     by_name = dict(zip(RANGE_SENSORS, ranges, strict=True))
@@ -227,7 +227,7 @@ def _turn_away(ranges: Sequence[float], turn: float) -> float:
 
 
 class _Log:
-    """A robot that is driven under a schedule of faults, and what was seen of it."""
+    """A robot driven under a schedule of faults, with its record."""
 
     def __init__(
         self, name: str, parameters: DigitalTwinParameters, slip_events: Iterable[FaultEvent]
@@ -247,7 +247,7 @@ class _Log:
 
     @property
     def place(self) -> tuple[float, float]:
-        """Where the robot is, m."""
+        """Position of the robot, m."""
         truth = self.state.truth
         return (0.0, 0.0) if truth is None else (truth.pose.x, truth.pose.y)
 
@@ -262,12 +262,12 @@ class _Log:
         self._detected += state.status.slipping
 
     def stand(self, seconds: float) -> None:
-        """Let the robot stand."""
+        """Keep the robot at rest."""
         for _ in range(round(seconds * self._parameters.rate)):
             self.step(ZERO_WHEEL_SPEEDS)
 
     def course(self) -> Course:
-        """Return what was seen so far."""
+        """Return the record so far."""
         rows = np.array(self._rows)
         for yaw in (3, 6, 9):
             rows[:, yaw] = np.unwrap(rows[:, yaw])
@@ -285,7 +285,7 @@ class _Log:
 
 
 def _troubled(parameters: DigitalTwinParameters, slip_events: Sequence[FaultEvent]) -> DigitalTwin:
-    """Return a robot that plays ``spells`` instead of the schedule of ``settings``, if any."""
+    """Return a robot with ``slip_events`` in place of its fault schedule, if there are any."""
     if not slip_events:
         return DigitalTwin(parameters)
     entries = []

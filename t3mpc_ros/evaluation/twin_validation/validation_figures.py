@@ -43,7 +43,7 @@ _MARKS = ('o', 's', '^')
 
 
 def squares(courses: Sequence[Course]) -> Any:
-    """Return the squares as driven and as believed."""
+    """Return the squares as driven and by odometry."""
     figure = new_figure(3.6)
     axes = figure.subplots(1, 2)
     for axis, course in zip(axes, courses, strict=True):
@@ -57,7 +57,7 @@ def squares(courses: Sequence[Course]) -> Any:
 
 
 def draw_square(axis: Any, course: Course) -> None:
-    """Draw where a robot was and where it thought it was."""
+    """Draw true path and odometry."""
     for path, colour, width, style, label in (
         (course.steps, STEPS, 1.3, '-', 'odometry, steps alone'),
         (course.truth, TRUE, 2.4, '-', 'where it was'),
@@ -69,19 +69,20 @@ def draw_square(axis: Any, course: Course) -> None:
 
 
 def turns(course: Course, slip_events: Sequence[FaultEvent], slip: str) -> Any:
-    """Return how wrong the yaw angles are while the robot turns on the spot."""
+    """Return the yaw errors while the robot turns on the spot."""
     figure = new_figure(3.0)
     axis = figure.subplots()
     for number, slip_event in enumerate(slip_events):
         if slip_event.at < course.time[-1]:
             label = slip if number == 0 else None
-            axis.axvspan(slip_event.at, min(slip_event.until, course.time[-1]), color='#fde68a', lw=0.0,
+            axis.axvspan(
+                slip_event.at, min(slip_event.until, course.time[-1]), color='#fde68a', lw=0.0,
                          label=label)  # fmt: skip
-    for odometry_speed, colour, label in (
+    for estimate, colour, label in (
         (course.steps, STEPS, 'steps alone'),
         (course.odometry, FUSED, 'with gyro'),
     ):
-        wrong = np.degrees(odometry_speed[:, 2] - course.truth[:, 2])
+        wrong = np.degrees(estimate[:, 2] - course.truth[:, 2])
         axis.plot(course.time, wrong, color=colour, lw=1.5, label=label)
     axis.set_xlabel('time / s')
     axis.set_ylabel('yaw error / deg')
@@ -127,7 +128,7 @@ def drift(found: Sequence[Drift]) -> Any:
 
 
 def room(patrol: Patrol, parameters: DigitalTwinParameters) -> Any:
-    """Return the drive through the room, with what the sensors saw and the crash at the end."""
+    """Return the drive through the room, with range readings and the collision at the end."""
     course = patrol.course
     figure = new_figure(5.0)
     axis = figure.subplots()
@@ -148,7 +149,8 @@ def room(patrol: Patrol, parameters: DigitalTwinParameters) -> Any:
     if math.isfinite(patrol.hit_at):
         hit = course.truth[int(np.searchsorted(course.time, patrol.hit_at))]
         axis.annotate(
-            f'{patrol.max_contact_force:.0f} N', hit[:2], (-34.0, 10.0), textcoords='offset points',
+            f'{patrol.max_contact_force:.0f} N', hit[:2], (-34.0, 10.0),
+            textcoords='offset points',
             color=SHEET, fontsize=8,
         )  # fmt: skip
     axis.plot(*course.truth[0, :2], 'o', color=WANTED, ms=5, label='start')
@@ -185,7 +187,7 @@ def _draw_robot(axis: Any, pose: Array, parameters: DigitalTwinParameters, colou
 
 
 def _draw_rays(axis: Any, pose: Array, faces: Array, ranges: Array) -> None:
-    """Draw a line as long as each reading; a faint one to 0.8 m where nothing was seen."""
+    """Draw a line as long as each reading; a faint one to 0.8 m without a reading."""
     for face, reading in zip(faces, ranges, strict=True):
         start = pose[:2] + _rotation(pose[2]) @ face[:2]
         length = reading if math.isfinite(reading) else (0.8 if reading > 0.0 else 0.1)
@@ -207,7 +209,7 @@ VOLTS = ('#a16207', '#0f766e', '#4338ca')
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Everything that the pictures show."""
+    """Everything that the figures show."""
 
     parameters: DigitalTwinParameters
     torque: Sequence[TorqueCurve]
@@ -224,7 +226,7 @@ class Evidence:
     squares: tuple[Course, Course]
     """Counter-clockwise and clockwise."""
     slip_shown: str
-    """What made them slip."""
+    """Slip of the squares."""
     turns: Course
     slip_events: Sequence[FaultEvent]
     """Of the turns."""
@@ -284,7 +286,7 @@ def stall(evidence: Evidence) -> Any:
         column[1].plot(ramp.time, ramp.behind, color=COLOURS['value'], lw=1.1)
         if ramp.lost_steps[0] == 0:
             column[1].set_ylim(-1.5, 1.5)
-        column[2].plot(ramp.time, ramp.odometry_speed, color=STEPS, lw=1.5, label='by the steps')
+        column[2].plot(ramp.time, ramp.counted_distance, color=STEPS, lw=1.5, label='by the steps')
         column[2].plot(ramp.time, ramp.driven, color=TRUE, lw=1.5, label='true')
         column[2].set_xlabel('time / s')
         column[2].margins(x=0.01)
@@ -310,7 +312,7 @@ def _ramp_title(ramp: Ramp) -> str:
 
 
 def sharp(evidence: Evidence) -> Any:
-    """Return what the distance sensor gives, and what the board reads of it."""
+    """Return output and readings of the distance sensor."""
     figure = new_figure(3.3)
     left, right = figure.subplots(1, 2)
     _sharp_panel(left, evidence)
@@ -391,7 +393,7 @@ def gyro(evidence: Evidence) -> Any:
 
 
 def overview(evidence: Evidence) -> Any:
-    """Return four of the pictures in one."""
+    """Return four of the figures in one."""
     figure = new_figure(5.6)
     axes = figure.subplots(2, 2)
     current = evidence.parameters.motor.phase_current

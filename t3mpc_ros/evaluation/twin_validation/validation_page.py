@@ -39,7 +39,7 @@ th { color: #6b7280; font-weight: 600; }
 
 
 class ValidationSize(NamedTuple):
-    """How much is run."""
+    """Size of the validation."""
 
     seeds: int
     strengths: int
@@ -55,7 +55,7 @@ QUICK = ValidationSize(seeds=1, strengths=1, standing=60.0, patrol=14.0)
 
 
 def write_validation(output: Path, seed: int, amount: ValidationSize, progress: Any = None) -> str:
-    """Return the tables in words and where the page is, after writing it and its pictures.
+    """Write page and figures, and return the tables and the path of the page as text.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def write_validation(output: Path, seed: int, amount: ValidationSize, progress: 
 
 
 def run_validation(seed: int, amount: ValidationSize, progress: Any = None) -> 'Evidence':
-    """Return everything that is measured; ``progress`` receives the number of finished runs."""
+    """Return all measurements; ``progress`` receives the number of finished runs."""
     import numpy as np
 
     from t3mpc_ros.evaluation.twin_validation import component_tests, courses, yaw_drift
@@ -150,7 +150,7 @@ def run_validation(seed: int, amount: ValidationSize, progress: Any = None) -> '
 
 
 def bench_table(evidence: 'Evidence') -> 'Table':
-    """Return what was measured of the parts beside what the data sheets say."""
+    """Return the component measurements beside the data sheets."""
     import numpy as np
 
     from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table
@@ -167,7 +167,7 @@ def bench_table(evidence: 'Evidence') -> 'Table':
         at += f', at {curve.ceiling:.1f} rad/s {pull[1]:.3f}'
         rows.append((name, at, f'needed {evidence.needed:.3f} N m'))
     for ramp in evidence.ramps:
-        wrong = 100.0 * abs(ramp.odometry_speed[-1] - ramp.driven[-1])
+        wrong = 100.0 * abs(ramp.counted_distance[-1] - ramp.driven[-1])
         found = f'{ramp.lost_steps[0]} and {ramp.lost_steps[1]} steps lost, {wrong:.1f} cm wrong'
         rows.append((f'ramp of {ramp.acceleration:.0f} rad/s²', found, EMPTY_CELL))
     deviation = f'at most {100.0 * sharp_deviation():.1f} % off'
@@ -185,7 +185,7 @@ def bench_table(evidence: 'Evidence') -> 'Table':
 
 
 def _findings(evidence: 'Evidence') -> list[str]:
-    """Return in sentences from where on the gyro leaves a fifth of the drift."""
+    """Return in sentences the drift from which the gyro leaves at most a fifth."""
     import numpy as np
 
     from t3mpc_ros.evaluation.twin_validation.yaw_drift import NO_SLIP, holds_from
@@ -212,7 +212,7 @@ def _page(
     tables: 'Sequence[Table]',
     pictures: Mapping[str, bytes],
 ) -> str:
-    """Return the page as HTML that loads nothing from anywhere."""
+    """Return the page as self-contained HTML."""
     from t3mpc_ros.evaluation.twin_validation.validation_figures import VALIDATION_FIGURES
 
     parts = [

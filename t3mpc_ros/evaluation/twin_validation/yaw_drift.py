@@ -23,7 +23,7 @@ from t3mpc_ros.simulation.fault_injection import FaultEvent
 PART = 0.2
 """The gyro shall leave no more than this part of the drift that steps alone have."""
 LONGEST = 100.0
-"""s after which no spell starts; no course here takes as long."""
+"""s after which no slip event starts; no course here takes as long."""
 
 NO_SLIP = Slip('no slip', 'slippery', 1.0, 1e9, 0.0)
 SLIPS = (
@@ -36,7 +36,7 @@ SLIPS = (
 )
 """Two kinds of slip, each in three strengths.
 
-With the default grip of 0.6 a spell leaves 0.12, 0.06 or 0.03: a wet floor, oil, ice. To speed
+With the default grip of 0.6 a slip event leaves 0.12, 0.06 or 0.03: wet floor, oil, ice. To speed
 up by 30 rad/s² takes 0.13 straight ahead, and 0.36 on the spot because of the body's inertia.
 A wheel that is held, by a cable say, stops its motor, which loses steps until the next halt, and
 lets the robot turn about that wheel.
@@ -50,7 +50,7 @@ COURSES: dict[str, Callable[..., Course]] = {
 
 
 class Drift(NamedTuple):
-    """What one course did to both yaw angles."""
+    """Yaw errors of one course."""
 
     course: str
     slip: str
@@ -84,7 +84,7 @@ def robot(seed: int) -> DigitalTwinParameters:
 
 
 def slip_events(name: str, slip: Slip, seed: int) -> tuple[FaultEvent, ...]:
-    """Return when wheels slip on a course; every argument leads to other spells."""
+    """Return the slip events of a course; they depend on every argument."""
     numbers = [seed, list(COURSES).index(name), *slip.name.encode()]
     return slip.slip_events(np.random.default_rng(numbers), LONGEST)
 
