@@ -61,17 +61,17 @@ def test_the_loop_runs_at_100_hz_in_four_processes(processes, tmp_path):
         for topic in ('/reference', '/odom'):
             stamps = recording.series(topic, {})['stamp']
             assert missing_sample_ratio(stamps, 100.0) < 0.01, topic
-        received = recording.series('/cmd_vel', {'v': 'linear.x', 'w': 'angular.z'})
+        commands = recording.series('/cmd_vel', {'v': 'linear.x', 'w': 'angular.z'})
         odometry = recording.series('/odom', {'v': 'twist.twist.linear.x'})
         # One command per odometry message, once both topics are recorded.
-        received = (odometry['received'] >= received['received'][0]) & (
-            odometry['received'] <= received['received'][-1]
+        compared = (odometry['received'] >= commands['received'][0]) & (
+            odometry['received'] <= commands['received'][-1]
         )
-        assert received['v'].size >= 0.99 * received.sum()
-        assert received.sum() >= 0.99 * 800
+        assert commands['v'].size >= 0.99 * compared.sum()
+        assert compared.sum() >= 0.99 * 800
         # The last command is the stop of the controller's shutdown; the robot moved before.
-        assert received['v'][-1] == 0.0
-        assert received['w'][-1] == 0.0
+        assert commands['v'][-1] == 0.0
+        assert commands['w'][-1] == 0.0
         assert np.ptp(odometry['v']) > 0.02
         parameters = recording.metadata_records
         assert parameters['provenance']['version']
