@@ -217,8 +217,8 @@ def test_the_installed_program_computes_lyapunov_exponents(tree):
 
 CHANGED = {
     'controller': ('terms_rate', 12.5),
-    'recorder': ('chunk_bytes', 4096),
-    'player': ('rate', 2.5),
+    'recorder': ('storage.chunk_size', 4096),
+    'player': ('play.rate', 2.5),
     'radio_bridge': ('port', '/dev/other'),
     'reference_generator': ('seed', 77),
     'sim_robot': ('noise.variance', 0.0625),

@@ -1,3 +1,3 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Bags: MCAP writing, reading, playing, recovery."""
+"""ROS 2 bags: recording, reading, playback and recovery of MCAP files."""

@@ -28,18 +28,18 @@ _SQLITE_SUFFIX = '.db3'
 
 @dataclass
 class TopicInfo:
-    """One topic of a bag."""
+    """Topic of a bag."""
 
     name: str
     type_name: str
     message_count: int = 0
     qos_profiles: list[str] = field(default_factory=list)
-    """What publishers offered, each different one once."""
+    """Distinct profiles of the publishers, as text."""
 
 
 @dataclass(frozen=True)
 class AttachmentInfo:
-    """A file inside a bag."""
+    """Attachment of a bag."""
 
     file: str
     name: str
@@ -50,36 +50,36 @@ class AttachmentInfo:
 
 @dataclass(frozen=True)
 class BagInfo:
-    """What a bag holds; times of receipt in nanoseconds since 1970."""
+    """Content of a bag; receive times in nanoseconds since 1970."""
 
     path: str
     storage: str
     files: Mapping[str, int]
-    """Size of each finished file in bytes."""
-    unfinished: Mapping[str, int]
-    """Size of each MCAP file without a sound end in bytes: recovery makes a whole one of it."""
+    """Size of each complete file in bytes."""
+    incomplete_files: Mapping[str, int]
+    """Size of each MCAP file without a valid end in bytes; such files need a recovery."""
     message_count: int
     start_ns: int
-    """0 when there is no message."""
+    """0 without messages."""
     duration_ns: int
     topics: tuple[TopicInfo, ...]
     metadata_records: Mapping[str, Mapping[str, str]]
-    """Tables of text by title; of one title the newest."""
+    """Tables of text by title; the newest of each title."""
     attachments: tuple[AttachmentInfo, ...]
 
     def rate(self, topic: TopicInfo) -> float:
-        """Return messages per second over the whole bag; 0 for a bag without duration."""
+        """Return the mean rate of a topic in messages per second; 0 for a bag without duration."""
         seconds = self.duration_ns / NANOSECONDS
         return topic.message_count / seconds if seconds > 0.0 else 0.0
 
 
 def read_bag_info(path: Path | str) -> BagInfo:
-    """Return what the bag at ``path`` holds: an MCAP file, a folder of such, or an sqlite3 bag.
+    """Return the content of a bag: an MCAP file, a folder of MCAP files, or an sqlite3 bag.
 
     Raises
     ------
     BagError
-        There is no bag, or no file of it can be read without recovery.
+        The bag does not exist, or all of its files need a recovery.
     """
     path = Path(path)
     if not path.exists():
@@ -90,20 +90,22 @@ def read_bag_info(path: Path | str) -> BagInfo:
     if not files:
         return _info_through_rosbags(path)
     summaries = {file: read_file_summary(file) for file in files}
-    finished = {file: summary for file, summary in summaries.items() if summary}
-    broken = [file for file, summary in summaries.items() if summary is None]
-    if not finished:
-        if not any(_has_mcap_magic(file) for file in broken):
-            raise BagError(f'{path} holds no MCAP file and no sqlite3 bag')
-        names = ', '.join(file.name for file in broken)
+    complete = {file: summary for file, summary in summaries.items() if summary}
+    incomplete = [file for file, summary in summaries.items() if summary is None]
+    if not complete:
+        if not any(_has_mcap_magic(file) for file in incomplete):
+            raise BagError(f'{path} contains no MCAP file and no sqlite3 bag')
+        names = ', '.join(file.name for file in incomplete)
         raise BagError(
-            f'no file of {path} has a sound end ({names}): `bag recover {path}` writes what is '
-            'in them into a new bag'
+            f'no file of {path} is complete ({names}): `t3mpc bag recover {path}` writes their '
+            'messages to a new bag'
         )
-    return _mcap_info(path, finished, broken)
+    return _mcap_info(path, complete, incomplete)
 
 
-def _mcap_info(path: Path, files: Mapping[Path, FileSummary], broken: Iterable[Path]) -> BagInfo:
+def _mcap_info(
+    path: Path, files: Mapping[Path, FileSummary], incomplete: Iterable[Path]
+) -> BagInfo:
     spans = [(s.start_ns, s.end_ns) for s in files.values() if s.message_count]
     start = min((first for first, _ in spans), default=0)
     topics: dict[str, TopicInfo] = {}
@@ -120,7 +122,7 @@ def _mcap_info(path: Path, files: Mapping[Path, FileSummary], broken: Iterable[P
         path=str(path),
         storage='mcap',
         files={file.name: file.stat().st_size for file in files},
-        unfinished={file.name: file.stat().st_size for file in broken},
+        incomplete_files={file.name: file.stat().st_size for file in incomplete},
         message_count=sum(summary.message_count for summary in files.values()),
         start_ns=start,
         duration_ns=max((last for _, last in spans), default=0) - start,
@@ -148,17 +150,17 @@ def _qos_texts(channel: ChannelSummary) -> list[str]:
     try:
         profiles = profiles_from_yaml(channel.profiles_text)
     except QosError:
-        return ['not understood']
+        return ['unknown']
     return [_qos_text(profile) for profile in profiles]
 
 
 def _qos_text(profile: Any) -> str:
-    """Return the words that matter of a profile, ours or that of rosbags."""
-    words = [
+    """Return reliability, durability, history and depth of a profile (also of rosbags)."""
+    policies = [
         getattr(value, 'name', str(value)).lower()
         for value in (profile.reliability, profile.durability, profile.history)
     ]
-    return f'{", ".join(words)} {profile.depth}'
+    return f'{", ".join(policies)} {profile.depth}'
 
 
 def _info_through_rosbags(path: Path) -> BagInfo:
@@ -180,7 +182,7 @@ def _info_through_rosbags(path: Path) -> BagInfo:
             path=str(path),
             storage='sqlite3' if any(file.suffix == _SQLITE_SUFFIX for file in paths) else 'other',
             files={file.name: file.stat().st_size for file in paths},
-            unfinished={},
+            incomplete_files={},
             message_count=reader.message_count,
             start_ns=reader.start_time if some else 0,
             duration_ns=reader.end_time - 1 - reader.start_time if some else 0,

@@ -1,6 +1,12 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Index of a bag and its messages as blocks of bytes, read through the chunk indexes of MCAP."""
+"""Index of a bag, and its messages as blocks of undecoded bytes.
+
+MCAP files with chunk indexes are read chunk by chunk; any other bag is read through ``rosbags``
+and converted to the same blocks. The summary section is parsed here because the ``mcap`` library
+reads it number by number, which takes longer than decompressing a short chunk. Record layouts
+follow the MCAP specification (foxglove/mcap, ``website/docs/spec/index.md``).
+"""
 
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -50,13 +56,13 @@ _RECORD_TYPES: Mapping[int, Any] = {
 
 
 def read_summary(file: BinaryIO) -> Summary | None:
-    """Return the summary of a finished file; None when it has none.
+    """Return the summary section of a complete file; None if the file has none.
 
     Raises
     ------
     ValueError
-        The file does not end as a finished one does, or a record is torn. Bytes that are damaged
-        in another way may raise what the library raises.
+        The file does not end with a footer, or a record is truncated. Other damage may raise
+        errors of the library.
     """
     file.seek(0)
     read_magic(ReadDataStream(file))
@@ -64,7 +70,7 @@ def read_summary(file: BinaryIO) -> Summary | None:
     opcode, _ = _HEAD.unpack(file.read(_HEAD.size))
     start, _, _, _ = _FOOTER.unpack(file.read(_FOOTER.size))
     if opcode != Opcode.FOOTER:
-        raise ValueError('it does not end with a footer')
+        raise ValueError('the file does not end with a footer')
     if start == 0:
         return None
     if start > end:  # seek() itself raises OSError beyond 2^63, which is no error of the disk
@@ -77,7 +83,7 @@ def read_summary(file: BinaryIO) -> Summary | None:
         opcode, size = _HEAD.unpack_from(section, at)
         body = section[at + _HEAD.size : at + _HEAD.size + size]
         if len(body) != size:
-            raise ValueError('a record of the summary is torn')
+            raise ValueError('a record of the summary is truncated')
         at += _HEAD.size + size
         if opcode == Opcode.CHUNK_INDEX:
             found.chunk_indexes.append(_chunk_index(body))
@@ -87,12 +93,12 @@ def read_summary(file: BinaryIO) -> Summary | None:
 
 
 def read_metadata_records(file: BinaryIO, summary: Summary) -> dict[str, Mapping[str, str]]:
-    """Return the tables of text of a file by title; of one title the newest.
+    """Return the metadata records of a file by title; the newest of each title.
 
     Raises
     ------
     ValueError
-        An index leads to something else.
+        An index does not point to a metadata record.
     """
     tables: dict[str, Mapping[str, str]] = {}
     for index in summary.metadata_indexes:
@@ -106,9 +112,9 @@ def read_metadata_records(file: BinaryIO, summary: Summary) -> dict[str, Mapping
 
 
 def _chunk_index(body: bytes) -> ChunkIndex:
-    first, last, offset, length, wide = _CHUNK_HEAD.unpack_from(body)
-    rest = _CHUNK_HEAD.size + wide
-    offsets = np.frombuffer(body, _OFFSETS, wide // _OFFSETS.itemsize, _CHUNK_HEAD.size)
+    first, last, offset, length, map_size = _CHUNK_HEAD.unpack_from(body)
+    rest = _CHUNK_HEAD.size + map_size
+    offsets = np.frombuffer(body, _OFFSETS, map_size // _OFFSETS.itemsize, _CHUNK_HEAD.size)
     (index_length,) = struct.unpack_from('<Q', body, rest)
     (size,) = _LENGTH.unpack_from(body, rest + 8)
     text = rest + 8 + _LENGTH.size
@@ -142,9 +148,9 @@ def _add_record(found: Summary, record: Any) -> None:
 
 
 MessageOffsets = list[tuple[str, bytes]]
-"""Topic, and of each of its messages two numbers of 8 bytes, little-endian, as they are in the
-file: time of receipt (ns), and where in a block it begins: opcode and length (9 bytes), channel
-and counter (6), receipt and publication (16), then what was serialised."""
+"""Topic and, for each of its messages, two little-endian 64-bit numbers as in the message index:
+the time of receipt (ns) and the offset of the record in the block. A record has opcode and length
+(9 bytes), channel and sequence number (6), receive and publish stamps (16), then the CDR data."""
 Blocks = Iterator[tuple[bytes, MessageOffsets]]
 
 _INDEX = struct.Struct('<BQHI')
@@ -152,30 +158,30 @@ _INDEX = struct.Struct('<BQHI')
 
 @dataclass(frozen=True)
 class BagIndex:
-    """What a bag holds, as far as it can be told without opening a message."""
+    """Topics, metadata records and files of a bag, read without reading a message."""
 
     types: Mapping[str, str]
     """Message type by topic."""
     counts: Mapping[str, int]
-    """Messages by topic."""
+    """Number of messages by topic."""
     metadata_records: Mapping[str, Mapping[str, str]]
-    """Tables of text by title; of one title the newest."""
+    """Tables of text by title; the newest of each title."""
     start_ns: int
-    """Receipt of the first message."""
+    """Receive time of the first message."""
     files: tuple[tuple[Path, Any], ...]
-    """Each with its MCAP summary; None where messages are not in chunks with indexes."""
+    """Each with its MCAP summary; None for files without chunk indexes."""
 
 
 def read_bag_index(bag: Path) -> BagIndex:
-    """Return what is in a bag: its folder, or a single file.
+    """Return the index of a bag, a folder or a single file.
 
-    Of a folder every finished MCAP file counts, as for
+    All complete MCAP files of a folder are included, as in
     :func:`~t3mpc_ros.bag.reader.open_bag`.
 
     Raises
     ------
     BagError
-        There is no bag, or one that is damaged.
+        The bag does not exist or is damaged.
     """
     paths = [bag] if bag.is_file() else sorted(bag.glob(f'*{MCAP_SUFFIX}'))
     tables: dict[str, Mapping[str, str]] = {}
@@ -199,7 +205,7 @@ def read_bag_index(bag: Path) -> BagIndex:
 
 
 def read_blocks(path: Path, summary: Any, topics: Collection[str]) -> Blocks:
-    """Yield the blocks of one file of a :class:`Catalogue`, and what they hold of some topics.
+    """Yield the blocks of one file of a :class:`BagIndex`, with the messages of ``topics``.
 
     Raises
     ------
@@ -213,10 +219,10 @@ def read_blocks(path: Path, summary: Any, topics: Collection[str]) -> Blocks:
     )
 
 
-def read_attachment_data(held: BagIndex) -> dict[str, bytes]:
-    """Return the files that are kept in a bag, by name; of one name the newest."""
+def read_attachment_data(index: BagIndex) -> dict[str, bytes]:
+    """Return the attachments of a bag by name; the newest of each name."""
     found: dict[str, bytes] = {}
-    for path, summary in held.files:
+    for path, summary in index.files:
         if summary is not None and summary.attachment_indexes:
             with path.open('rb') as file, _read_errors(path):
                 for item in make_reader(file).iter_attachments():
@@ -225,9 +231,9 @@ def read_attachment_data(held: BagIndex) -> dict[str, bytes]:
 
 
 def _summary(path: Path, *, alone: bool) -> tuple[Any, dict[str, Mapping[str, str]]]:
-    """Return the summary of a file, and its tables of text by title.
+    """Return the summary and the metadata records of a file.
 
-    The summary is None for a file of a folder that has none: it broke off.
+    The summary is None for an incomplete file of a folder; ``alone`` makes it an error.
     """
     tables: dict[str, Mapping[str, str]] = {}
     if path.suffix != MCAP_SUFFIX:
@@ -248,12 +254,10 @@ def _summary(path: Path, *, alone: bool) -> tuple[Any, dict[str, Mapping[str, st
 
 
 def _index_through_rosbags(bag: Path) -> BagIndex:
-    with open_bag(bag) as recording:
-        types = {name: topic.type_name for name, topic in recording.topics.items()}
-        counts = {name: topic.message_count for name, topic in recording.topics.items()}
-        return BagIndex(
-            types, counts, recording.metadata_records, recording.start_ns, ((bag, None),)
-        )
+    with open_bag(bag) as reader:
+        types = {name: topic.type_name for name, topic in reader.topics.items()}
+        counts = {name: topic.message_count for name, topic in reader.topics.items()}
+        return BagIndex(types, counts, reader.metadata_records, reader.start_ns, ((bag, None),))
 
 
 def _start_ns(summary: Any) -> int:
@@ -261,12 +265,12 @@ def _start_ns(summary: Any) -> int:
 
 
 def _is_indexed(summary: Any) -> bool:
-    """Decide whether every message is in a chunk with an index."""
-    counted, chunks = summary.statistics, summary.chunk_indexes
-    if counted is None or counted.chunk_count != len(chunks):
+    """Return whether every message is in a chunk with an index."""
+    statistics, chunks = summary.statistics, summary.chunk_indexes
+    if statistics is None or statistics.chunk_count != len(chunks):
         return False
     if not chunks:
-        return bool(counted.message_count == 0)
+        return bool(statistics.message_count == 0)
     return all(chunk.message_index_offsets for chunk in chunks)
 
 
@@ -285,15 +289,15 @@ def _indexed_blocks(path: Path, summary: Any, topics: Collection[str]) -> Blocks
                     at = offset - index.chunk_start_offset
                     opcode, _, owner, size = _INDEX.unpack_from(raw, at)
                     pairs = raw[at + _INDEX.size : at + _INDEX.size + size]
-                    whole = len(pairs) == size and size % 16 == 0
-                    if opcode != Opcode.MESSAGE_INDEX or owner != channel or not whole:
+                    complete = len(pairs) == size and size % 16 == 0
+                    if opcode != Opcode.MESSAGE_INDEX or owner != channel or not complete:
                         raise DataError(f'{path}: the index of {names[channel]} is damaged')
                     found.append((names[channel], pairs))
             yield _decompress_chunk(raw[: index.chunk_length]), found
 
 
 def _decompress_chunk(record: bytes) -> bytes:
-    """Return what a chunk holds, its checksum verified."""
+    """Return the records of a chunk, with its checksum verified."""
     stream, length = get_chunk_data_stream(
         Chunk.read(ReadDataStream(BytesIO(record[9:]))), validate_crc=True
     )
@@ -302,17 +306,17 @@ def _decompress_chunk(record: bytes) -> bytes:
 
 
 def _blocks_through_rosbags(path: Path, topics: Collection[str]) -> Blocks:
-    """Yield one block in the form of a chunk from whatever ``rosbags`` can read."""
+    """Yield the messages of a bag that only ``rosbags`` reads, as one block."""
     rows: dict[str, bytearray] = {}
     data = bytearray()
     with _read_errors(path):
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
         with reader:
-            chosen = [item for item in reader.connections if item.topic in topics]
-            for connection, received_ns, message in reader.messages(chosen):
+            selected = [item for item in reader.connections if item.topic in topics]
+            for connection, received_ns, message in reader.messages(selected):
                 pair = struct.pack('<qq', received_ns, len(data))
                 rows.setdefault(connection.topic, bytearray()).extend(pair)
-                # When it was published nobody says.
+                # rosbags does not return the publish stamp.
                 head = (Opcode.MESSAGE, 22 + len(message), 0, 0, received_ns, received_ns)
                 data += struct.pack('<BQHIQQ', *head) + message
     yield bytes(data), [(name, bytes(pairs)) for name, pairs in rows.items()]
@@ -320,10 +324,10 @@ def _blocks_through_rosbags(path: Path, topics: Collection[str]) -> Blocks:
 
 @contextmanager
 def _read_errors(path: Path) -> Iterator[None]:
-    """Turn what the libraries raise for a damaged file into :class:`BagError`."""
+    """Convert the errors of the libraries for a damaged file to :class:`BagError`."""
     try:
         yield
     except (BagError, OSError):
         raise
-    except Exception as error:  # torn bytes can fail anywhere in parsers and decompressors
+    except Exception as error:  # parsers and decompressors raise anything on damaged bytes
         raise BagError(f'{path} cannot be read: {error}') from error

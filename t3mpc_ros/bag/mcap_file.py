@@ -1,6 +1,10 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Summary of an MCAP file, and completion of a file whose writer was interrupted."""
+"""Summary of an MCAP file, and completion of a file whose writer was interrupted.
+
+A file without its summary section, because the writer was killed or the disk was full, is rejected
+by ordinary readers, although every chunk written so far is intact.
+"""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -36,16 +40,16 @@ from t3mpc_ros.bag.schema import BagError
 
 MCAP_SUFFIX = '.mcap'
 SPARE = 65_536
-"""Bytes that finishing a file leaves free on a full disk: metadata.yaml has to fit, too."""
+"""Bytes that :func:`finalize_file` leaves free on a full disk, for ``metadata.yaml``."""
 MAGIC = b'\x89MCAP0\r\n'
 
-_HEAD = struct.Struct('<BQ')  # opcode and length in front of every record
+_HEAD = struct.Struct('<BQ')  # opcode and length of every record
 _FOOTER_SIZE = _HEAD.size + 20
 
 
 @dataclass(frozen=True)
 class ChannelSummary:
-    """One topic of one file, with the texts of its channel as they stand."""
+    """Topic of a file, with the unparsed metadata of its channel."""
 
     topic: str
     type_name: str
@@ -57,7 +61,7 @@ class ChannelSummary:
 
 @dataclass(frozen=True)
 class FileSummary:
-    """What the end of a finished file says of it."""
+    """Content of the summary section of a complete file."""
 
     message_count: int
     start_ns: int
@@ -68,9 +72,9 @@ class FileSummary:
 
 
 def read_file_summary(path: Path) -> FileSummary | None:
-    """Return what ``path`` holds; None when it has no sound end, because it broke off.
+    """Return the summary of a file; None if it is incomplete or its summary is damaged.
 
-    Only the end of the file is read, and its checksum verified.
+    Only the end of the file is read; its checksum is verified.
     """
     try:
         with path.open('rb') as file:
@@ -101,37 +105,42 @@ def read_file_summary(path: Path) -> FileSummary | None:
                     item.name: dict(item.metadata) for item in reader.iter_metadata()
                 },
             )
-    except Exception:  # whatever a damaged end does to the library's parser
+    except Exception:  # the parser of the library raises anything on damaged bytes
         return None
 
 
 def finalize_file(path: Path) -> int:
-    """Return how many messages ``path`` keeps, after cutting its torn tail and adding an end.
+    """Truncate an incomplete file at its last intact chunk, append the summary, count messages.
 
-    For a file whose writer broke off. Messages of the chunk that was being filled are lost; when
-    the disk is full, chunks are given up from the back until the end fits, with :data:`SPARE`
-    bytes to go on with. A finished file is left as it is.
+    Messages of the last, unwritten chunk are lost. If the disk is full, chunks are removed from
+    the end until the summary fits and :data:`SPARE` bytes remain free. A complete file is not
+    changed.
+
+    Returns
+    -------
+    int
+        Number of messages in the file.
 
     Raises
     ------
     BagError
-        The file is not MCAP at all, or not laid out as :class:`BagWriter` does it.
+        The file is not MCAP, or was not written by :class:`~t3mpc_ros.bag.writer.BagWriter`.
     OSError
-        The file cannot be written to, or there is no room even for an empty summary.
+        The file is not writable, or the disk has no room for an empty summary.
     """
-    if (whole := read_file_summary(path)) is not None:
-        return whole.message_count
+    if (summary := read_file_summary(path)) is not None:
+        return summary.message_count
     with open_unbuffered(path, 'r+b') as file:
         parts = list(_intact_parts(file))
         if not parts:
-            raise BagError(f'{path} does not begin like an MCAP file')
+            raise BagError(f'{path} does not begin with the MCAP magic')
         while True:
             start = parts[-1].end
             try:
                 file.truncate(start)
                 file.seek(start)
                 end = _end_of_file(parts, start)
-                spare = SPARE if len(parts) > 1 else 0  # nothing left to give up: any end will do
+                spare = SPARE if len(parts) > 1 else 0  # the last part cannot be removed
                 write_all(file, end + bytes(spare))
                 os.fsync(file.fileno())
                 file.truncate(start + len(end))
@@ -145,12 +154,12 @@ def finalize_file(path: Path) -> int:
 
 
 def open_unbuffered(path: Path, mode: str) -> Any:
-    """Return ``path`` opened so that each write reaches the system, or fails, at once."""
+    """Open ``path`` without a buffer, so that each write succeeds or fails immediately."""
     return path.open(mode, buffering=0)
 
 
 def write_all(file: Any, data: bytes) -> None:
-    """Write ``data`` to an unbuffered file, which may take it in pieces."""
+    """Write all of ``data`` to an unbuffered file, whose writes may be partial."""
     view = memoryview(data)
     while view:
         view = view[file.write(view) :]
@@ -162,7 +171,7 @@ def _schema_name(schema: Any) -> str:
 
 @dataclass
 class _IntactPart:
-    """A stretch of the file that is sound up to ``end``: head, metadata, attachment, or chunk."""
+    """Intact part of a file that ends at ``end``: header, metadata, attachment or chunk."""
 
     end: int
     schemas: list[Any] = field(default_factory=list)
@@ -192,7 +201,7 @@ def _has_valid_end(file: Any) -> bool:
 
 
 def _records(file: Any) -> Iterator[tuple[int, int, bytes]]:
-    """Yield (start, opcode, content) of each record that is there in full."""
+    """Yield (start, opcode, content) of each complete record."""
     size = file.seek(0, io.SEEK_END)
     position = len(MAGIC)
     while position + _HEAD.size <= size:
@@ -205,13 +214,13 @@ def _records(file: Any) -> Iterator[tuple[int, int, bytes]]:
 
 
 def _intact_parts(file: Any) -> Iterator[_IntactPart]:
-    """Yield the sound parts; a chunk counts once all of its message indexes have followed.
+    """Yield the intact parts; a chunk is intact if all of its message indexes follow it.
 
     Raises
     ------
     BagError
-        The file is of a kind that :class:`BagWriter` does not write: cutting it at the last part
-        known here would throw good messages away.
+        The structure of the file is not that of ``BagWriter``: truncating it at the last known
+        part could remove intact messages.
     """
     file.seek(0)
     if file.read(len(MAGIC)) != MAGIC:
@@ -221,7 +230,9 @@ def _intact_parts(file: Any) -> Iterator[_IntactPart]:
         end = start + _HEAD.size + len(content)
         stream = ReadDataStream(io.BytesIO(content))
         if opcode in _FOREIGN or (opcode == Opcode.CHUNK and waiting):
-            raise BagError('only files of BagWriter can be finished: this one is built otherwise')
+            raise BagError(
+                'only files of BagWriter can be finalized: this file differs in structure'
+            )
         if opcode == Opcode.HEADER:
             yield _IntactPart(end)
         elif opcode == Opcode.METADATA:
@@ -230,12 +241,12 @@ def _intact_parts(file: Any) -> Iterator[_IntactPart]:
         elif opcode == Opcode.ATTACHMENT:
             try:
                 yield _IntactPart(end, attachment=_attachment_index(start, end, content))
-            except Exception:  # torn bytes can fail anywhere in the library's parser
+            except Exception:  # the parser of the library raises anything on damaged bytes
                 return
         elif opcode == Opcode.CHUNK:
             try:
                 waiting = _open_chunk(start, end, Chunk.read(stream))
-            except Exception:  # torn bytes can fail anywhere in the decompressor
+            except Exception:  # the decompressor raises anything on damaged bytes
                 return
         elif opcode == Opcode.MESSAGE_INDEX and waiting:
             channel = MessageIndex.read(stream).channel_id
@@ -247,7 +258,7 @@ def _intact_parts(file: Any) -> Iterator[_IntactPart]:
                 )
                 yield waiting
                 waiting = None
-        else:  # the end of the data, or bytes that were never written
+        else:  # end of the data section, or a preallocated block
             return
 
 
@@ -275,7 +286,7 @@ def _open_chunk(start: int, end: int, chunk: Any) -> _IntactPart:
 
 
 def _attachment_index(start: int, end: int, content: bytes) -> AttachmentIndex:
-    """Return the index of an attachment, or raise ValueError when its checksum is wrong."""
+    """Return the index of an attachment, or raise ValueError if its checksum is wrong."""
     if zlib.crc32(content[:-4]) != int.from_bytes(content[-4:], 'little'):
         raise ValueError('an attachment is damaged')
     item = Attachment.read(ReadDataStream(io.BytesIO(content)))
@@ -291,7 +302,7 @@ def _attachment_index(start: int, end: int, content: bytes) -> AttachmentIndex:
 
 
 def _end_of_file(parts: list[_IntactPart], start: int) -> bytes:
-    """Return the bytes from the end of the data to the end of the file."""
+    """Return the data-end record, the summary section and the footer."""
     chunks = [part.chunk for part in parts if part.chunk]
     schemas = [schema for part in parts for schema in part.schemas]
     channels = [channel for part in parts for channel in part.channels]

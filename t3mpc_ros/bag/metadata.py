@@ -1,6 +1,9 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The metadata.yaml of a bag in the format of rosbag2, version 9."""
+"""The ``metadata.yaml`` of a bag, version 9.
+
+Fields follow ``rosbag2_storage/include/rosbag2_storage/yaml.hpp`` (branch jazzy).
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -18,22 +21,22 @@ from t3mpc_ros.bag.schema import BagError
 METADATA_FILE_NAME = 'metadata.yaml'
 METADATA_VERSION = 9
 NO_START_NS = 2**63 - 1
-"""Starting time of what holds no message, as rosbag2 writes it (nanoseconds since 1970)."""
+"""Starting time of a file or bag without messages, as in rosbag2 (nanoseconds since 1970)."""
 
 _ROOT = 'rosbag2_bagfile_information'
 
 
 class MetadataError(BagError):
-    """A ``metadata.yaml`` that is missing, damaged or of another version."""
+    """``metadata.yaml`` is missing, damaged or of another version."""
 
 
 @dataclass(frozen=True)
 class TopicInformation:
-    """One topic and how many messages of it there are."""
+    """Topic of a bag and its message count."""
 
     name: str
     type_name: str
-    profiles: tuple[QosProfile, ...]
+    offered_qos_profiles: tuple[QosProfile, ...]
     type_hash: str
     message_count: int
     serialization_format: str = 'cdr'
@@ -45,7 +48,9 @@ class TopicInformation:
                 'name': self.name,
                 'type': self.type_name,
                 'serialization_format': self.serialization_format,
-                'offered_qos_profiles': [profile.to_mapping() for profile in self.profiles],
+                'offered_qos_profiles': [
+                    profile.to_mapping() for profile in self.offered_qos_profiles
+                ],
                 'type_description_hash': self.type_hash,
             },
             'message_count': self.message_count,
@@ -58,7 +63,7 @@ class TopicInformation:
         return cls(
             name=str(topic['name']),
             type_name=str(topic['type']),
-            profiles=tuple(
+            offered_qos_profiles=tuple(
                 QosProfile.from_mapping(item) for item in topic['offered_qos_profiles']
             ),
             type_hash=str(topic['type_description_hash']),
@@ -69,10 +74,10 @@ class TopicInformation:
 
 @dataclass(frozen=True)
 class FileInformation:
-    """One file of the bag; times of receipt in nanoseconds."""
+    """File of a bag; receive times in nanoseconds since 1970."""
 
     path: str
-    """Relative to the bag's folder."""
+    """Relative to the folder of the bag."""
     start_ns: int = NO_START_NS
     duration_ns: int = 0
     message_count: int = 0
@@ -99,7 +104,7 @@ class FileInformation:
 
 @dataclass(frozen=True)
 class BagMetadata:
-    """The files and topics of a bag; totals follow from them."""
+    """Files and topics of a bag."""
 
     files: tuple[FileInformation, ...] = ()
     topics: tuple[TopicInformation, ...] = ()
@@ -108,24 +113,24 @@ class BagMetadata:
 
     @property
     def start_ns(self) -> int:
-        """When the first message came; :data:`NEVER` when none did."""
+        """Receive time of the first message; :data:`NO_START_NS` without messages."""
         return min(
             (file.start_ns for file in self.files if file.message_count), default=NO_START_NS
         )
 
     @property
     def duration_ns(self) -> int:
-        """Time from the first message to the last, across all files."""
+        """Time from the first to the last message of all files."""
         ends = [file.start_ns + file.duration_ns for file in self.files if file.message_count]
         return max(ends) - self.start_ns if ends else 0
 
     @property
     def message_count(self) -> int:
-        """Messages in all files."""
+        """Number of messages in all files."""
         return sum(file.message_count for file in self.files)
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return what rosbag2 encodes, in its order, without the root key."""
+        """Return the content below the root key, in the order of rosbag2."""
         return {
             'version': METADATA_VERSION,
             'storage_identifier': 'mcap',
@@ -133,7 +138,7 @@ class BagMetadata:
             'starting_time': {'nanoseconds_since_epoch': self.start_ns},
             'message_count': self.message_count,
             'topics_with_message_count': [topic.to_mapping() for topic in self.topics],
-            # Chunks are compressed inside the MCAP file; rosbag2's own compression stays off.
+            # Chunks are compressed inside the MCAP file; the compression of rosbag2 is off.
             'compression_format': '',
             'compression_mode': '',
             'relative_file_paths': [file.path for file in self.files],
@@ -144,12 +149,12 @@ class BagMetadata:
 
 
 def write_metadata(folder: Path, metadata: BagMetadata) -> None:
-    """Replace the folder's ``metadata.yaml`` in one go: a reader sees the old or the new one.
+    """Replace ``metadata.yaml`` of a folder atomically.
 
     Raises
     ------
     OSError
-        The folder cannot be written to; the old file, if any, is untouched.
+        The folder is not writable; an existing file is unchanged.
     """
     target = folder / METADATA_FILE_NAME
     temporary = folder / f'.{METADATA_FILE_NAME}.{os.getpid()}'
@@ -157,7 +162,7 @@ def write_metadata(folder: Path, metadata: BagMetadata) -> None:
         with temporary.open('w', encoding='utf-8') as file:
             file.write(dump_yaml({_ROOT: metadata.to_mapping()}))
             file.flush()
-            os.fsync(file.fileno())  # or a power cut leaves an empty file under the new name
+            os.fsync(file.fileno())  # without it, a power failure may leave an empty file
         temporary.replace(target)
     except OSError:
         temporary.unlink(missing_ok=True)
@@ -165,12 +170,12 @@ def write_metadata(folder: Path, metadata: BagMetadata) -> None:
 
 
 def read_metadata(folder: Path) -> BagMetadata:
-    """Return what the folder's ``metadata.yaml`` says.
+    """Return the content of ``metadata.yaml`` of a folder.
 
     Raises
     ------
     MetadataError
-        There is none, or it is not one of version 9.
+        The file is missing, damaged or not of version 9.
     """
     path = folder / METADATA_FILE_NAME
     try:
@@ -192,25 +197,26 @@ def read_metadata(folder: Path) -> BagMetadata:
 
 
 def collect_metadata(folder: Path) -> tuple[BagMetadata, tuple[str, ...]]:
-    """Return what the finished MCAP files of ``folder`` hold, and the names of the others.
+    """Return the metadata of the complete MCAP files of ``folder``, and the incomplete files.
 
-    Files are ordered by their first message, as players expect. A topic stands once for each
-    different offer: rosbags only finds a file's messages under the very profiles in that file.
+    Files are sorted by their first message, as players expect. A topic has one entry per distinct
+    list of offered profiles: rosbags finds the messages of a file only under the profiles stored
+    in that file.
     """
-    finished: list[tuple[str, FileSummary]] = []
-    unfinished = []
+    complete: list[tuple[str, FileSummary]] = []
+    incomplete = []
     for path in sorted(
         folder.glob(f'*{MCAP_SUFFIX}'), key=lambda path: _natural_sort_key(path.name)
     ):
         summary = read_file_summary(path)
         if summary is None:
-            unfinished.append(path.name)
+            incomplete.append(path.name)
         else:
-            finished.append((path.name, summary))
-    finished.sort(key=lambda item: item[1].start_ns if item[1].message_count else NO_START_NS)
+            complete.append((path.name, summary))
+    complete.sort(key=lambda item: item[1].start_ns if item[1].message_count else NO_START_NS)
     files = []
     topics: dict[tuple[str, ...], TopicInformation] = {}
-    for name, summary in finished:
+    for name, summary in complete:
         span = summary.end_ns - summary.start_ns
         count = summary.message_count
         files.append(
@@ -229,11 +235,11 @@ def collect_metadata(folder: Path) -> tuple[BagMetadata, tuple[str, ...]]:
                 before + channel.message_count,
                 channel.encoding,
             )
-    return BagMetadata(tuple(files), tuple(topics.values())), tuple(unfinished)
+    return BagMetadata(tuple(files), tuple(topics.values())), tuple(incomplete)
 
 
 def _profiles(text: str) -> tuple[QosProfile, ...]:
-    """Return the profiles of a channel, none when another program wrote what nobody knows."""
+    """Return the profiles of a channel; none if another program wrote unknown policies."""
     try:
         return profiles_from_yaml(text)
     except QosError:
@@ -241,7 +247,7 @@ def _profiles(text: str) -> tuple[QosProfile, ...]:
 
 
 def _natural_sort_key(name: str) -> list[tuple[int, str]]:
-    """Return a key that sorts ``run_10`` after ``run_9``."""
+    """Return a sort key that places ``run_10`` after ``run_9``."""
     return [
         (int(part), '') if part.isdecimal() else (-1, part) for part in re.split(r'(\d+)', name)
     ]

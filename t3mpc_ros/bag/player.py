@@ -1,6 +1,11 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Playback in virtual time: due messages under pause, rate, seek, step and loop; read-ahead and latency statistics."""
+"""Playback of bags: parameters, timeline, read-ahead queue and latency statistics.
+
+:class:`PlaybackTimeline` reads no clock: ``now_ns`` is a time of any monotonic clock. Positions
+are nanoseconds on a timeline of consecutive loops. One anchor and the rate as an exact fraction
+relate position and time, so no error accumulates.
+"""
 
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -19,70 +24,438 @@ from t3mpc_ros.bag.merged_reader import (
     loop_duration_ns,
     open_serialized_bag,
 )
-from t3mpc_ros.bag.topic_filter import PlayTopicFilter, PlayTopicFilterError, parse_remappings
+from t3mpc_ros.bag.topic_filter import PlayTopicFilter, TopicFilterError, parse_remappings
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 
 COMMAND_TOPIC = 'cmd_vel'
-
-
 VELOCITY_TYPES = ('geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistStamped')
-
-
-def velocity_command_risk(recorded: str, name: str, type_name: str) -> str:
-    """Return why a topic could drive a robot, empty when it cannot.
-
-    A robot listens to ``cmd_vel``, or to a velocity of any other name that its launch file gave
-    it: only a velocity that was renamed on purpose, to something else than ``cmd_vel``, is safe.
-    """
-    if name.rsplit('/', 1)[-1] == COMMAND_TOPIC:
-        return f'{name} may drive a robot'
-    if type_name in VELOCITY_TYPES and name == recorded:
-        return f'{name} is a velocity ({type_name}) and may drive a robot'
-    return ''
-
-
-_BIN_RATIO = math.log(1.02)
-_MIN_LATENCY_NS = 1_000
-
-
-class LatencyHistogram:
-    """A histogram of delays whose bins grow by two percent, from one microsecond up."""
-
-    def __init__(self) -> None:
-        self._bins: dict[int, int] = {}
-        self.count = 0
-        self.max_ns = 0
-
-    def note(self, late_ns: int) -> None:
-        """Count one delay; what is not late at all counts as one microsecond."""
-        late_ns = max(late_ns, _MIN_LATENCY_NS)
-        number = math.ceil(math.log(late_ns / _MIN_LATENCY_NS) / _BIN_RATIO)
-        self._bins[number] = self._bins.get(number, 0) + 1
-        self.count += 1
-        self.max_ns = max(self.max_ns, late_ns)
-
-    def percentile_ns(self, percent: float) -> int:
-        """Return the delay that so many percent do not exceed, within two percent; 0 for none."""
-        rank, seen = math.ceil(percent / 100.0 * self.count), 0
-        for number in sorted(self._bins.copy()):
-            seen += self._bins[number]
-            if seen >= max(rank, 1):
-                return min(round(_MIN_LATENCY_NS * math.exp(number * _BIN_RATIO)), self.max_ns)
-        return 0
-
 
 T = TypeVar('T')
 
 _BATCH_SIZE = 50
-"""Items handed over at once: waking the other thread costs more than reading one."""
+"""Items transferred together: waking the other thread costs more than reading one item."""
+_BIN_RATIO = math.log(1.02)
+_MIN_LATENCY_NS = 1_000
+
+
+@dataclass(frozen=True)
+class PlaybackParameters(Parameters):
+    """Bags to play, selection of topics, rate and time range."""
+
+    uris: tuple[str, ...] = parameter(
+        (),
+        'bags to play, merged by time of receipt: folders or files, MCAP or sqlite3',
+        name='storage.uris',
+    )
+    align_bags: bool = parameter(
+        False, 'shift every bag to the start time of the first one', name='play.align_bags'
+    )
+    bag_offsets: tuple[float, ...] = parameter(
+        (),
+        'time offset of each bag, after the alignment; empty = none',
+        name='play.bag_offsets',
+        unit='s',
+    )
+    rate: float = parameter(
+        1.0,
+        'playback rate: seconds of the bag per second',
+        name='play.rate',
+        low=0.01,
+        high=100.0,
+        dynamic=True,
+    )
+    loop: bool = parameter(False, 'restart at the end', name='play.loop')
+    start_offset: float = parameter(
+        0.0,
+        'start of the playback, after the first message; transient-local messages from before it '
+        'are published first',
+        name='play.start_offset',
+        unit='s',
+        low=0.0,
+    )
+    playback_duration: float = parameter(
+        0.0,
+        'duration of the playback in bag time; 0 = to the end',
+        name='play.playback_duration',
+        unit='s',
+        low=0.0,
+    )
+    playback_until: float = parameter(
+        0.0,
+        'end of the playback, after the first message; 0 = the end of the bag',
+        name='play.playback_until',
+        unit='s',
+        low=0.0,
+    )
+    topics: tuple[str, ...] = parameter(
+        (),
+        'topics to play; * matches any text; without topics and regular expression all topics',
+        name='play.topics_to_filter',
+    )
+    regex: str = parameter(
+        '',
+        'also play topics whose full name matches this regular expression; empty = none',
+        name='play.regex_to_filter',
+    )
+    exclude_topics: tuple[str, ...] = parameter(
+        (), 'topics that are not played; * matches any text', name='play.exclude_topics'
+    )
+    exclude_regex: str = parameter(
+        '',
+        'do not play topics whose full name matches this regular expression; empty = none',
+        name='play.exclude_regex',
+    )
+    remappings: tuple[str, ...] = parameter(
+        (), 'new names of topics, each as old:=new', name='play.topic_remapping_options'
+    )
+    clock_publish_frequency: float = parameter(
+        0.0,
+        'rate of /clock; 0 = no /clock',
+        name='play.clock_publish_frequency',
+        unit='Hz',
+        low=0.0,
+        high=1000.0,
+    )
+    clock_publish_on_topic_publish: bool = parameter(
+        False,
+        'publish /clock also before each message',
+        name='play.clock_publish_on_topic_publish',
+    )
+    start_paused: bool = parameter(
+        False,
+        'start paused: wait for ~/resume, ~/play_next or the space bar',
+        name='play.start_paused',
+    )
+    seek_time: float = parameter(
+        0.0,
+        'target of ~/seek, after the first message',
+        name='play.seek_time',
+        unit='s',
+        low=0.0,
+        dynamic=True,
+    )
+    play_next_count: int = parameter(
+        1,
+        'number of messages that ~/play_next plays',
+        name='play.play_next_count',
+        low=1,
+        high=1_000_000,
+        dynamic=True,
+    )
+    read_ahead_queue_size: int = parameter(
+        1000,
+        'number of messages read ahead',
+        name='play.read_ahead_queue_size',
+        low=1,
+        high=1_000_000,
+    )
+
+    def check_consistency(self) -> None:
+        """Raise :class:`ParameterError` for an empty time range or an invalid selection."""
+        super().check_consistency()
+        if self.playback_until and self.playback_until <= self.start_offset:
+            raise ParameterError(
+                'play.playback_until must be later than play.start_offset '
+                f'({self.start_offset:g} s): got {self.playback_until:g} s'
+            )
+        if self.bag_offsets and len(self.bag_offsets) != len(self.uris):
+            raise ParameterError(
+                f'play.bag_offsets must have one number for each of the {len(self.uris)} bags: '
+                f'got {len(self.bag_offsets)}'
+            )
+        try:
+            self.topic_filter()
+        except TopicFilterError as error:
+            raise ParameterError(str(error)) from error
+
+    def topic_filter(self) -> PlayTopicFilter:
+        """Return the selection of topics and their remappings."""
+        return PlayTopicFilter(
+            self.topics,
+            self.regex,
+            self.exclude_topics,
+            self.exclude_regex,
+            parse_remappings(self.remappings),
+        )
+
+    def open_reader(self) -> tuple[MergedReader, tuple[str, ...]]:
+        """Return a reader of all bags, and the incomplete files, which are not played.
+
+        Raises
+        ------
+        BagError
+            A bag cannot be read, or a topic has two types.
+        """
+        bags: list[SerializedBag] = []
+        try:
+            for path in self.uris:
+                bags.append(open_serialized_bag(path))
+            offsets_ns = [round(offset * NANOSECONDS) for offset in self.bag_offsets]
+            offsets_ns = offsets_ns or [0] * len(bags)
+            if self.align_bags and bags:
+                offsets_ns = [
+                    a + b for a, b in zip(alignment_offsets_ns(bags), offsets_ns, strict=True)
+                ]
+            reader = MergedReader(bags, offsets_ns, self.topic_filter())
+        except Exception:
+            for bag in bags:
+                bag.close()
+            raise
+        return reader, tuple(f'{bag.path}/{name}' for bag in bags for name in bag.incomplete_files)
+
+    def time_range_ns(self, reader: MergedReader) -> tuple[int, int]:
+        """Return the first and the last receive time to play.
+
+        Raises
+        ------
+        ParameterError
+            The start is after the end of the bag.
+        """
+        begin_ns = reader.start_ns + round(self.start_offset * NANOSECONDS)
+        if begin_ns > reader.end_ns:
+            length = (reader.end_ns - reader.start_ns) / NANOSECONDS
+            raise ParameterError(
+                f'play.start_offset must be at most the length of the bag, {length:.3f} s: '
+                f'got {self.start_offset:g} s'
+            )
+        ends = [reader.end_ns]
+        if self.playback_duration:
+            ends.append(begin_ns + round(self.playback_duration * NANOSECONDS))
+        if self.playback_until:
+            ends.append(reader.start_ns + round(self.playback_until * NANOSECONDS))
+        return begin_ns, min(ends)
+
+
+class DueMessage(NamedTuple):
+    """Message or clock tick to publish now."""
+
+    due_ns: int
+    """Due time on the clock of the caller."""
+    stamp_ns: int
+    """Bag time."""
+    message: StoredMessage | None
+    """None for a clock tick."""
+
+
+class PlaybackTimeline:
+    """Determines the messages that are due under pause, rate, seek, step and loop.
+
+    Parameters
+    ----------
+    schedule
+        Returns the messages from a bag time, see :meth:`MergedReader.schedule`; an iterator with
+        a ``close`` method is closed after use.
+    begin_ns, end_ns
+        Receive times to play.
+    origin_ns
+        Origin of the seconds in the error text of :meth:`seek`; by default ``begin_ns``.
+    rate
+        Seconds of the bag per second.
+    clock_rate
+        Rate of the clock ticks in Hz of the caller's clock; 0 = no clock ticks.
+    """
+
+    def __init__(
+        self,
+        schedule: Callable[[int], Iterator[ScheduledMessage]],
+        begin_ns: int,
+        end_ns: int,
+        *,
+        origin_ns: int | None = None,
+        rate: float = 1.0,
+        loop: bool = False,
+        paused: bool = False,
+        clock_rate: float = 0.0,
+    ) -> None:
+        self._schedule = schedule
+        self._begin_ns, self._end_ns = begin_ns, max(begin_ns, end_ns)
+        self._origin_ns = begin_ns if origin_ns is None else origin_ns
+        self._loop_ns = loop_duration_ns(begin_ns, end_ns) if loop else 0
+        self._tick_ns = round(NANOSECONDS / clock_rate) if clock_rate else 0
+        self._next_tick_ns: int | None = None
+        self._ratio = _rate_ratio(rate)
+        self.rate = rate
+        self.paused = paused
+        self.finished = False
+        self._steps = 0
+        self._stream = schedule(begin_ns)
+        self._head: ScheduledMessage | None = None
+        self._primed = False
+        self._anchor_ns: int | None = None
+        """Time of the position below; None until the next call of :meth:`due_messages`."""
+        self._position = 0
+
+    # -- due messages -----------------------------------------------------------------------------
+
+    def due_messages(
+        self, now_ns: int, max_count: int = 20
+    ) -> tuple[list[DueMessage], int | None]:
+        """Return at most ``max_count`` due messages, and the time of the next call.
+
+        Messages are in order, and late ones are due immediately. The time of the next call is
+        None if nothing is due before a call of another method. After a start or a seek the first
+        call only reads the first message, so that the time for reading does not delay it.
+
+        Raises
+        ------
+        BagError
+            Reading the bag failed.
+        """
+        if not self._primed:
+            self._advance()
+            self._primed = True
+            return [], now_ns
+        if self._anchor_ns is None:
+            self._anchor_ns = now_ns
+        out: list[DueMessage] = []
+        while len(out) < max_count and (head := self._head) is not None:
+            due_ns = self._due_ns(head, now_ns)
+            if due_ns is None or due_ns > now_ns:
+                break
+            out.append(DueMessage(due_ns, head.stamp_ns, head.message))
+            if self.paused and not head.restored:
+                self._steps -= 1
+                self._position = max(self._position, head.at_ns)
+            self._advance()
+        if self._head is None and not self.finished:
+            self.finished = True
+            self._position, self._anchor_ns = self._position_at(now_ns), now_ns
+        wake_ns = None if self._head is None else self._due_ns(self._head, now_ns)
+        if wake_ns is None or wake_ns > now_ns:
+            wake_ns = self._tick(now_ns, out, wake_ns)
+        return out, wake_ns
+
+    def _due_ns(self, message: ScheduledMessage, now_ns: int) -> int | None:
+        """Return the due time of a message; None while the playback is paused."""
+        if self.paused:
+            immediate = message.restored and message.at_ns <= self._position
+            return now_ns if immediate or self._steps else None
+        anchor_ns = now_ns if self._anchor_ns is None else self._anchor_ns
+        numerator, denominator = self._ratio
+        ahead_ns = -((self._position - message.at_ns) * denominator // numerator)  # rounded up
+        return anchor_ns + max(0, ahead_ns)
+
+    def _tick(self, now_ns: int, out: list[DueMessage], wake_ns: int | None) -> int | None:
+        if not self._tick_ns or self.finished:
+            return wake_ns
+        if self._next_tick_ns is None:
+            self._next_tick_ns = now_ns
+        if self._next_tick_ns <= now_ns:
+            out.append(DueMessage(self._next_tick_ns, self.bag_time_ns(now_ns), None))
+            # Missed ticks are skipped.
+            self._next_tick_ns += self._tick_ns * ((now_ns - self._next_tick_ns) // self._tick_ns)
+            self._next_tick_ns += self._tick_ns
+        return self._next_tick_ns if wake_ns is None else min(wake_ns, self._next_tick_ns)
+
+    def _advance(self) -> None:
+        self._head = next(self._stream, None)
+
+    # -- status -----------------------------------------------------------------------------------
+
+    def bag_time_ns(self, now_ns: int) -> int:
+        """Return the current bag time."""
+        position = self._position_at(now_ns)
+        if self._loop_ns:
+            return self._begin_ns + position % self._loop_ns
+        return min(self._begin_ns + position, self._end_ns)
+
+    def loops(self, now_ns: int) -> int:
+        """Return the number of completed loops."""
+        return self._position_at(now_ns) // self._loop_ns if self._loop_ns else 0
+
+    def remaining_ns(self, now_ns: int) -> int:
+        """Return the time to the end of the bag or of the loop, on the caller's clock."""
+        numerator, denominator = self._ratio
+        return (self._end_ns - self.bag_time_ns(now_ns)) * denominator // numerator
+
+    def _position_at(self, now_ns: int) -> int:
+        if self.paused or self.finished or self._anchor_ns is None:
+            return self._position
+        numerator, denominator = self._ratio
+        return self._position + max(0, now_ns - self._anchor_ns) * numerator // denominator
+
+    # -- control ----------------------------------------------------------------------------------
+
+    def pause(self, now_ns: int) -> None:
+        """Pause, including the due messages that were not returned yet."""
+        self._bind(now_ns)
+        self.paused = True
+
+    def resume(self, now_ns: int) -> None:
+        """Resume; pending steps are cancelled."""
+        self._bind(now_ns)
+        self.paused = False
+        self._steps = 0
+
+    def set_rate(self, now_ns: int, rate: float) -> None:
+        """Change the rate.
+
+        Raises
+        ------
+        ValueError
+            The rate is not a positive number.
+        """
+        ratio = _rate_ratio(rate)
+        self._bind(now_ns)
+        self.rate, self._ratio = rate, ratio
+
+    def seek(self, now_ns: int, stamp_ns: int) -> str:
+        """Continue at a bag time, with the transient-local messages before it.
+
+        Returns
+        -------
+        str
+            The reason of a rejection, or an empty text.
+        """
+        if not self._begin_ns <= stamp_ns <= self._end_ns:
+            begin, end, target = (
+                (each - self._origin_ns) / NANOSECONDS
+                for each in (self._begin_ns, self._end_ns, stamp_ns)
+            )
+            return f'the seek target must be from {begin:.3f} to {end:.3f} s: got {target:.3f} s'
+        self.close()
+        self._stream = self._schedule(stamp_ns)
+        self._head, self._primed, self.finished = None, False, False
+        self._position, self._anchor_ns, self._steps = stamp_ns - self._begin_ns, None, 0
+        return ''
+
+    def play_next(self, now_ns: int, count: int = 1) -> str:
+        """Play the next ``count`` messages immediately while paused.
+
+        Returns
+        -------
+        str
+            The reason of a rejection, or an empty text.
+        """
+        if not self.paused:
+            return 'the player must be paused to play the next message'
+        if self.finished:
+            return 'there is no next message'
+        if count < 1:
+            return f'the number of messages must be at least 1: got {count}'
+        self._steps += count
+        return ''
+
+    def close(self) -> None:
+        """Close the message source."""
+        close = getattr(self._stream, 'close', None)
+        if close is not None:
+            close()
+
+    def _bind(self, now_ns: int) -> None:
+        """Move the anchor to the current time and position."""
+        position = self._position_at(now_ns)
+        if self._anchor_ns is not None:
+            self._anchor_ns = now_ns
+        self._position = position
 
 
 class ReadAheadQueue(Generic[T]):
-    """The items of ``source``, in order, read before they are asked for.
+    """Iterator over ``source`` that reads ahead in a thread.
 
-    What the source raises is raised where its next item would have come. :meth:`close` ends the
-    thread and the source.
+    An exception of the source is raised in place of its next item. :meth:`close` ends the thread
+    and closes the source.
     """
 
     def __init__(self, source: Iterator[T], items: int) -> None:
@@ -113,13 +486,13 @@ class ReadAheadQueue(Generic[T]):
         return self._ready.popleft()
 
     def close(self) -> None:
-        """Stop reading; nothing more comes."""
+        """Stop reading; the iterator is exhausted."""
         self._closing.set()
         self._over = True
         self._ready.clear()
         while self._thread.is_alive():
             try:
-                self._batches.get(timeout=0.01)  # room for what the thread waits to hand over
+                self._batches.get(timeout=0.01)  # unblocks the thread if the queue is full
             except queue.Empty:
                 continue
         self._thread.join()
@@ -127,7 +500,7 @@ class ReadAheadQueue(Generic[T]):
     def _read(self) -> None:
         end: BaseException | None = None
         batch: list[T] = []
-        size = 1  # the first item by itself: somebody is waiting for it
+        size = 1  # the first item is transferred immediately: the player waits for it
         try:
             for item in self._source:
                 batch.append(item)
@@ -136,7 +509,7 @@ class ReadAheadQueue(Generic[T]):
                     batch, size = [], _BATCH_SIZE
                 if self._closing.is_set():
                     break
-        except BaseException as error:  # handed over to whoever reads
+        except BaseException as error:  # transferred to the consumer
             end = error
         finally:
             close = getattr(self._source, 'close', None)
@@ -146,337 +519,46 @@ class ReadAheadQueue(Generic[T]):
             self._batches.put(end)
 
 
-class DueMessage(NamedTuple):
-    """Something to publish now."""
+class LatencyHistogram:
+    """Histogram of latencies with bins that grow by 2 %, from 1 µs."""
 
-    due_ns: int
-    """When it should have been published, on the caller's clock."""
-    stamp_ns: int
-    """What time it is in the bag."""
-    message: StoredMessage | None
-    """None: only the time is to be told."""
+    def __init__(self) -> None:
+        self._bins: dict[int, int] = {}
+        self.count = 0
+        self.max_ns = 0
+
+    def add(self, latency_ns: int) -> None:
+        """Count one latency; values below 1 µs count as 1 µs."""
+        latency_ns = max(latency_ns, _MIN_LATENCY_NS)
+        number = math.ceil(math.log(latency_ns / _MIN_LATENCY_NS) / _BIN_RATIO)
+        self._bins[number] = self._bins.get(number, 0) + 1
+        self.count += 1
+        self.max_ns = max(self.max_ns, latency_ns)
+
+    def percentile_ns(self, percent: float) -> int:
+        """Return a percentile with an error of at most 2 %; 0 without data."""
+        rank, cumulated = math.ceil(percent / 100.0 * self.count), 0
+        for number in sorted(self._bins.copy()):
+            cumulated += self._bins[number]
+            if cumulated >= max(rank, 1):
+                return min(round(_MIN_LATENCY_NS * math.exp(number * _BIN_RATIO)), self.max_ns)
+        return 0
 
 
-class PlaybackTimeline:
-    """Plays the span from ``begin_ns`` to ``end_ns`` of a bag.
+def velocity_command_risk(recorded: str, name: str, type_name: str) -> str:
+    """Return why a topic may drive a robot, or an empty text if it does not.
 
-    Parameters
-    ----------
-    plan
-        Returns what is played from a time in the bag on, see :meth:`Tape.plan`; what has a
-        ``close`` is closed when it is no longer needed.
-    begin_ns, end_ns
-        The span to play.
-    origin_ns
-        From where a refused :meth:`seek` counts seconds; ``begin_ns`` when not given.
-    rate
-        Seconds of the bag in a second.
-    clock_rate
-        How often the time is told, in Hz of the caller's clock; 0 = only with messages.
+    A robot subscribes to ``cmd_vel``, or to a velocity topic remapped by its launch file. A
+    velocity topic is safe only after an explicit remapping to a name other than ``cmd_vel``.
     """
-
-    def __init__(
-        self,
-        plan: Callable[[int], Iterator[ScheduledMessage]],
-        begin_ns: int,
-        end_ns: int,
-        *,
-        origin_ns: int | None = None,
-        rate: float = 1.0,
-        loop: bool = False,
-        paused: bool = False,
-        clock_rate: float = 0.0,
-    ) -> None:
-        self._plan = plan
-        self._begin_ns, self._end_ns = begin_ns, max(begin_ns, end_ns)
-        self._origin_ns = begin_ns if origin_ns is None else origin_ns
-        self._loop_ns = loop_duration_ns(begin_ns, end_ns) if loop else 0
-        self._tick_ns = round(NANOSECONDS / clock_rate) if clock_rate else 0
-        self._next_tick_ns: int | None = None
-        self._ratio = _rate_ratio(rate)
-        self.rate = rate
-        self.paused = paused
-        self.finished = False
-        self._steps = 0
-        self._stream = plan(begin_ns)
-        self._head: ScheduledMessage | None = None
-        self._primed = False
-        self._anchor_ns: int | None = None
-        """When the place below was, or will be; None until time is told again."""
-        self._place = 0
-
-    # -- what to publish --------------------------------------------------------------------------
-
-    def due(self, now_ns: int, most: int = 20) -> tuple[list[DueMessage], int | None]:
-        """Return what is to be published now, at most so much, and when to ask again.
-
-        Messages come in order; late ones come at once, none is left out. The time to ask again is
-        None when nothing will happen unless another method is called. After a start or a seek
-        the first call only waits for the first message to be read, so that reading does not make
-        it late.
-
-        Raises
-        ------
-        BagError
-            The bag cannot be read on.
-        """
-        if not self._primed:
-            self._advance()
-            self._primed = True
-            return [], now_ns
-        if self._anchor_ns is None:
-            self._anchor_ns = now_ns
-        out: list[DueMessage] = []
-        while len(out) < most and (head := self._head) is not None:
-            due_ns = self._due_ns(head, now_ns)
-            if due_ns is None or due_ns > now_ns:
-                break
-            out.append(DueMessage(due_ns, head.stamp_ns, head.message))
-            if self.paused and not head.restored:
-                self._steps -= 1
-                self._place = max(self._place, head.at_ns)
-            self._advance()
-        if self._head is None and not self.finished:
-            self.finished = True
-            self._place, self._anchor_ns = self._place_at(now_ns), now_ns
-        wake_ns = None if self._head is None else self._due_ns(self._head, now_ns)
-        if wake_ns is None or wake_ns > now_ns:
-            wake_ns = self._tick(now_ns, out, wake_ns)
-        return out, wake_ns
-
-    def _due_ns(self, planned: ScheduledMessage, now_ns: int) -> int | None:
-        """Return when a message is due; None while that depends on somebody's asking."""
-        if self.paused:
-            told_at_once = planned.restored and planned.at_ns <= self._place
-            return now_ns if told_at_once or self._steps else None
-        anchor_ns = now_ns if self._anchor_ns is None else self._anchor_ns
-        numerator, denominator = self._ratio
-        ahead_ns = -((self._place - planned.at_ns) * denominator // numerator)  # rounded up
-        return anchor_ns + max(0, ahead_ns)
-
-    def _tick(self, now_ns: int, out: list[DueMessage], wake_ns: int | None) -> int | None:
-        if not self._tick_ns or self.finished:
-            return wake_ns
-        if self._next_tick_ns is None:
-            self._next_tick_ns = now_ns
-        if self._next_tick_ns <= now_ns:
-            out.append(DueMessage(self._next_tick_ns, self.stamp_ns(now_ns), None))
-            # Missed ones are not made up for: there is only one time now.
-            self._next_tick_ns += self._tick_ns * ((now_ns - self._next_tick_ns) // self._tick_ns)
-            self._next_tick_ns += self._tick_ns
-        return self._next_tick_ns if wake_ns is None else min(wake_ns, self._next_tick_ns)
-
-    def _advance(self) -> None:
-        self._head = next(self._stream, None)
-
-    # -- where it is ------------------------------------------------------------------------------
-
-    def stamp_ns(self, now_ns: int) -> int:
-        """Return what time it is in the bag."""
-        place = self._place_at(now_ns)
-        if self._loop_ns:
-            return self._begin_ns + place % self._loop_ns
-        return min(self._begin_ns + place, self._end_ns)
-
-    def loops(self, now_ns: int) -> int:
-        """Return how many times the span has been played to its end, when it is a loop."""
-        return self._place_at(now_ns) // self._loop_ns if self._loop_ns else 0
-
-    def remaining_ns(self, now_ns: int) -> int:
-        """Return how much longer the rest of the span takes, on the caller's clock."""
-        numerator, denominator = self._ratio
-        return (self._end_ns - self.stamp_ns(now_ns)) * denominator // numerator
-
-    def _place_at(self, now_ns: int) -> int:
-        if self.paused or self.finished or self._anchor_ns is None:
-            return self._place
-        numerator, denominator = self._ratio
-        return self._place + max(0, now_ns - self._anchor_ns) * numerator // denominator
-
-    # -- what a user asks for ---------------------------------------------------------------------
-
-    def pause(self, now_ns: int) -> None:
-        """Let time stand; what was due and has not been returned yet waits, too."""
-        self._bind(now_ns)
-        self.paused = True
-
-    def resume(self, now_ns: int) -> None:
-        """Let time go on; steps that were not taken yet are forgotten."""
-        self._bind(now_ns)
-        self.paused = False
-        self._steps = 0
-
-    def set_rate(self, now_ns: int, rate: float) -> None:
-        """Play at another rate from now on.
-
-        Raises
-        ------
-        ValueError
-            The rate is not a positive number.
-        """
-        ratio = _rate_ratio(rate)
-        self._bind(now_ns)
-        self.rate, self._ratio = rate, ratio
-
-    def seek(self, now_ns: int, stamp_ns: int) -> str:
-        """Go on at a time in the bag, with what latched topics held then; or say why not."""
-        if not self._begin_ns <= stamp_ns <= self._end_ns:
-            begin, end, asked = (
-                (each - self._origin_ns) / NANOSECONDS
-                for each in (self._begin_ns, self._end_ns, stamp_ns)
-            )
-            return f'the place must be from {begin:.3f} to {end:.3f} s: got {asked:.3f} s'
-        self.close()
-        self._stream = self._plan(stamp_ns)
-        self._head, self._primed, self.finished = None, False, False
-        self._place, self._anchor_ns, self._steps = stamp_ns - self._begin_ns, None, 0
-        return ''
-
-    def step(self, now_ns: int, count: int = 1) -> str:
-        """Play the next ``count`` messages at once, then stand again; or say why not."""
-        if not self.paused:
-            return 'it must be paused to go step by step'
-        if self.finished:
-            return 'there is no next message'
-        if count < 1:
-            return f'the number of steps must be from 1: got {count}'
-        self._steps += count
-        return ''
-
-    def close(self) -> None:
-        """Let go of what is being read."""
-        close = getattr(self._stream, 'close', None)
-        if close is not None:
-            close()
-
-    def _bind(self, now_ns: int) -> None:
-        """Make now the anchor, wherever that is."""
-        place = self._place_at(now_ns)
-        if self._anchor_ns is not None:
-            self._anchor_ns = now_ns
-        self._place = place
+    if name.rsplit('/', 1)[-1] == COMMAND_TOPIC:
+        return f'{name} may drive a robot'
+    if type_name in VELOCITY_TYPES and name == recorded:
+        return f'{name} is a velocity ({type_name}) and may drive a robot'
+    return ''
 
 
 def _rate_ratio(rate: float) -> tuple[int, int]:
     if not (math.isfinite(rate) and rate > 0.0):
         raise ValueError(f'rate must be a positive number: got {rate}')
     return float(rate).as_integer_ratio()
-
-
-@dataclass(frozen=True)
-class PlaybackParameters(Parameters):
-    """Bags, what of them is played, and how."""
-
-    bags: tuple[str, ...] = parameter(
-        (), 'bags to play, merged by time of receipt: folders or files, MCAP or sqlite3'
-    )
-    align: bool = parameter(False, 'let every bag begin when the first one does')
-    bag_offsets: tuple[float, ...] = parameter(
-        (), 'added to the times of each bag, after align; empty = nothing', unit='s'
-    )
-    rate: float = parameter(
-        1.0, 'seconds of the bag in a second', low=0.01, high=100.0, dynamic=True
-    )
-    loop: bool = parameter(False, 'begin again at the end')
-    start_offset: float = parameter(
-        0.0,
-        'where to begin, after the first message; what latched topics held then comes first',
-        unit='s',
-        low=0.0,
-    )
-    duration: float = parameter(
-        0.0, 'how much to play from there, in time of the bag; 0 = to the end', unit='s', low=0.0
-    )
-    until: float = parameter(
-        0.0, 'where to end, after the first message; 0 = at the end', unit='s', low=0.0
-    )
-    topics: tuple[str, ...] = parameter(
-        (), 'topics to play; * stands for anything; none here and no regex = all'
-    )
-    regex: str = parameter('', 'play topics whose whole name matches, too; empty = none')
-    exclude: tuple[str, ...] = parameter((), 'topics not to play; * stands for anything')
-    exclude_regex: str = parameter('', 'do not play topics whose whole name matches; empty = none')
-    remap: tuple[str, ...] = parameter((), 'new names of topics, each as old:=new')
-    clock_rate: float = parameter(
-        0.0, 'how often /clock is published; 0 = never', unit='Hz', low=0.0, high=1000.0
-    )
-    clock_with_messages: bool = parameter(False, 'publish /clock before each message, too')
-    start_paused: bool = parameter(False, 'wait for ~/resume, ~/step or the space bar')
-    seek_time: float = parameter(
-        0.0, 'where ~/seek goes, after the first message', unit='s', low=0.0, dynamic=True
-    )
-    step_count: int = parameter(
-        1, 'messages that ~/step plays', low=1, high=1_000_000, dynamic=True
-    )
-    read_ahead: int = parameter(1000, 'messages read before they are due', low=1, high=1_000_000)
-
-    def check_consistency(self) -> None:
-        """Raise :class:`ParameterError` for an end before the beginning, or an unusable choice."""
-        super().check_consistency()
-        if self.until and self.until <= self.start_offset:
-            raise ParameterError(
-                f'until must be later than start_offset ({self.start_offset:g} s): '
-                f'got {self.until:g} s'
-            )
-        if self.bag_offsets and len(self.bag_offsets) != len(self.bags):
-            raise ParameterError(
-                f'bag_offsets must have one number for each of the {len(self.bags)} bags: '
-                f'got {len(self.bag_offsets)}'
-            )
-        try:
-            self.selection()
-        except PlayTopicFilterError as error:
-            raise ParameterError(str(error)) from error
-
-    def selection(self) -> PlayTopicFilter:
-        """Return which topics are played, and under which names."""
-        return PlayTopicFilter(
-            self.topics, self.regex, self.exclude, self.exclude_regex, parse_remappings(self.remap)
-        )
-
-    def open_reader(self) -> tuple[MergedReader, tuple[str, ...]]:
-        """Return the opened bags as one, and the files that broke off and are not played.
-
-        Raises
-        ------
-        BagError
-            A bag cannot be read, or a topic has two types.
-        """
-        bags: list[SerializedBag] = []
-        try:
-            for path in self.bags:
-                bags.append(open_serialized_bag(path))
-            offsets_ns = [round(offset * NANOSECONDS) for offset in self.bag_offsets]
-            offsets_ns = offsets_ns or [0] * len(bags)
-            if self.align and bags:
-                offsets_ns = [
-                    a + b for a, b in zip(alignment_offsets_ns(bags), offsets_ns, strict=True)
-                ]
-            tape = MergedReader(bags, offsets_ns, self.selection())
-        except Exception:
-            for bag in bags:
-                bag.close()
-            raise
-        return tape, tuple(f'{bag.path}/{name}' for bag in bags for name in bag.unfinished)
-
-    def span_ns(self, tape: MergedReader) -> tuple[int, int]:
-        """Return the receipt times between which ``tape`` is played.
-
-        Raises
-        ------
-        ParameterError
-            The beginning lies behind the bag's end.
-        """
-        begin_ns = tape.start_ns + round(self.start_offset * NANOSECONDS)
-        if begin_ns > tape.end_ns:
-            length = (tape.end_ns - tape.start_ns) / NANOSECONDS
-            raise ParameterError(
-                f'start_offset must be at most the length of the bag, {length:.3f} s: '
-                f'got {self.start_offset:g} s'
-            )
-        ends = [tape.end_ns]
-        if self.duration:
-            ends.append(begin_ns + round(self.duration * NANOSECONDS))
-        if self.until:
-            ends.append(tape.start_ns + round(self.until * NANOSECONDS))
-        return begin_ns, min(ends)

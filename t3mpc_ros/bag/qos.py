@@ -1,6 +1,14 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""QoS profiles of recorded publishers: encoding of rosbag2, offers for playback, override files."""
+"""QoS profiles: the encoding of rosbag2, offers for playback, override files.
+
+Policy names and numbers follow ``rosbag2_storage/src/rosbag2_storage/qos.cpp`` (branch jazzy,
+metadata version 9) and ``rmw/src/qos_string_conversions.c``. The offer for playback follows
+``rosbag2_transport/src/rosbag2_transport/qos.cpp`` with two differences: if recorded offers
+differ, rosbag2 offers the default profile, whereas :func:`adapt_offer_to_recorded_offers` offers
+the strongest policy of each kind, which is compatible with every subscription to the recorded
+publishers; and a transient-local topic keeps one message per recorded publisher instead of ten.
+"""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -12,13 +20,13 @@ import yaml
 from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.geometry.types import NANOSECONDS
 
-TRANSIENT_LOCAL = 'transient_local'
-
-
 UNLIMITED = 2**63 - 1
-"""Nanoseconds that mean "no limit": 9223372036 s and 854775807 ns, RMW_DURATION_INFINITE."""
+"""RMW_DURATION_INFINITE in nanoseconds: 9223372036 s and 854775807 ns."""
+TRANSIENT_LOCAL = 'transient_local'
+PUBLISHER_DEPTH = 1000
+"""History depth of a publisher of the player."""
 
-# In the order of the enumerations in rmw/types.h: bags before version 9 hold the numbers.
+# In the order of the enumerations in rmw/types.h: metadata before version 9 contains the numbers.
 HISTORY = ('system_default', 'keep_last', 'keep_all', 'unknown')
 RELIABILITY = ('system_default', 'reliable', 'best_effort', 'unknown', 'best_available')
 DURABILITY = ('system_default', 'transient_local', 'volatile', 'unknown', 'best_available')
@@ -31,20 +39,22 @@ LIVELINESS = (
     'best_available',
 )
 
-# What Fast DDS and Connext called infinite when Foxy recorded; rosbag2 translates them too.
+# Infinite durations of Fast DDS and Connext in bags of Foxy; rosbag2 converts them as well.
 _FOXY_UNLIMITED = {(0x7FFFFFFF, 0xFFFFFFFF), (0x7FFFFFFF, 0x7FFFFFFF)}
+_LIVELINESS = ('automatic', 'manual_by_node', 'manual_by_topic')
+"""From the weakest to the strongest."""
+_DURATIONS = ('deadline', 'lifespan', 'liveliness_lease_duration')
 
 
 class QosError(BagError):
-    """A quality-of-service profile that rosbag2 would refuse."""
+    """A QoS profile that rosbag2 rejects."""
 
 
 @dataclass(frozen=True)
 class QosProfile:
-    """What one publisher offers; the words are those of :data:`HISTORY` and its neighbours.
+    """Offered QoS profile of one publisher; policy names as in :data:`HISTORY` and its siblings.
 
-    Durations are ``int`` nanoseconds; :data:`UNLIMITED` is what publishers usually report and
-    0 means unspecified.
+    Durations are ``int`` nanoseconds; 0 means unspecified.
     """
 
     history: str = 'keep_last'
@@ -58,23 +68,23 @@ class QosProfile:
     avoid_ros_namespace_conventions: bool = False
 
     def __post_init__(self) -> None:
-        for name, words in (
+        for name, policies in (
             ('history', HISTORY),
             ('reliability', RELIABILITY),
             ('durability', DURABILITY),
             ('liveliness', LIVELINESS),
         ):
-            if getattr(self, name) not in words:
+            if getattr(self, name) not in policies:
                 raise QosError(
-                    f'{name} must be one of {", ".join(words)}: got {getattr(self, name)!r}'
+                    f'{name} must be one of {", ".join(policies)}: got {getattr(self, name)!r}'
                 )
         for name in ('depth', 'deadline_ns', 'lifespan_ns', 'liveliness_lease_ns'):
             value = getattr(self, name)
             if not isinstance(value, int) or not 0 <= value <= UNLIMITED:
-                raise QosError(f'{name} must be a whole number from 0: got {value!r}')
+                raise QosError(f'{name} must be a non-negative integer: got {value!r}')
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return the mapping that version 9 has for one profile, in rosbag2's order."""
+        """Return the profile as in metadata version 9, in the order of rosbag2."""
         return {
             'history': self.history,
             'depth': self.depth,
@@ -89,12 +99,12 @@ class QosProfile:
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> 'QosProfile':
-        """Return the profile in ``mapping``; numbers in place of words are understood.
+        """Return the profile in ``mapping``; policies are names or numbers.
 
         Raises
         ------
         QosError
-            A field is missing or holds what rosbag2 does not know.
+            A field is missing or has an unknown value.
         """
         try:
             return cls(
@@ -109,16 +119,16 @@ class QosProfile:
                 avoid_ros_namespace_conventions=bool(mapping['avoid_ros_namespace_conventions']),
             )
         except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise QosError(f'not a quality-of-service profile: {error!r}') from error
+            raise QosError(f'not a QoS profile: {error!r}') from error
 
 
 def profiles_to_yaml(profiles: Iterable[QosProfile]) -> str:
-    """Return the text of a channel's ``offered_qos_profiles``."""
+    """Return the value of ``offered_qos_profiles`` in the metadata of a channel."""
     return dump_yaml([profile.to_mapping() for profile in profiles]).rstrip('\n')
 
 
 def profiles_from_yaml(text: str) -> tuple[QosProfile, ...]:
-    """Return the profiles in a channel's ``offered_qos_profiles``; none for an empty text."""
+    """Return the profiles in ``offered_qos_profiles`` of a channel; none for an empty text."""
     try:
         items = yaml.safe_load(text) if text else []
     except yaml.YAMLError as error:
@@ -129,7 +139,7 @@ def profiles_from_yaml(text: str) -> tuple[QosProfile, ...]:
 
 
 def dump_yaml(value: object) -> str:
-    """Return ``value`` as block YAML in the order given, without anchors or folded lines."""
+    """Return ``value`` as block YAML in the given order, without anchors or folded lines."""
     return yaml.dump(
         value,
         Dumper=_PlainDumper,
@@ -140,38 +150,8 @@ def dump_yaml(value: object) -> str:
     )
 
 
-class _PlainDumper(yaml.SafeDumper):
-    """Equal profiles are written out, not as ``*id001``, which few would read in a bag."""
-
-    def ignore_aliases(self, data: Any) -> bool:
-        return True
-
-
-def _duration_to_mapping(duration_ns: int) -> dict[str, int]:
-    return {'sec': duration_ns // NANOSECONDS, 'nsec': duration_ns % NANOSECONDS}
-
-
-def _duration_from_mapping(mapping: Mapping[str, Any]) -> int:
-    seconds, nanoseconds = int(mapping['sec']), int(mapping['nsec'])
-    if (seconds, nanoseconds) in _FOXY_UNLIMITED:
-        return UNLIMITED
-    return min(seconds * NANOSECONDS + nanoseconds, UNLIMITED)
-
-
-def _policy_name(value: Any, words: tuple[str, ...]) -> str:
-    return words[value] if isinstance(value, int) else str(value)
-
-
-PUBLISHER_DEPTH = 1000
-"""Messages that wait for a listener that is busy; DDS gives up the oldest beyond that."""
-
-_LIVELINESS = ('automatic', 'manual_by_node', 'manual_by_topic')
-"""From the weakest to the strongest."""
-_DURATIONS = ('deadline', 'lifespan', 'liveliness_lease_duration')
-
-
 def adapt_offer_to_recorded_offers(recorded: Iterable[QosProfile]) -> QosProfile:
-    """Return a profile that everyone who heard all the recorded publishers is satisfied with."""
+    """Return a profile that is compatible with every subscription to the recorded publishers."""
     profiles = list(recorded)
     if not profiles:
         return QosProfile(depth=PUBLISHER_DEPTH)
@@ -192,14 +172,14 @@ def adapt_offer_to_recorded_offers(recorded: Iterable[QosProfile]) -> QosProfile
 
 
 def read_qos_overrides(path: Path | str) -> dict[str, QosProfile]:
-    """Return profiles by topic from a file as ``--qos-profile-overrides-path`` takes it.
+    """Return profiles by topic from a file in the format of ``--qos-profile-overrides-path``.
 
-    What a topic does not say is that of a default publisher: reliable, volatile, the last 10.
+    Unspecified policies are those of the default publisher: reliable, volatile, keep last 10.
 
     Raises
     ------
     QosError
-        The file cannot be read, or holds what ``ros2 bag`` would refuse.
+        The file cannot be read or is not a file that ``ros2 bag`` accepts.
     """
     path = Path(path).expanduser()
     try:
@@ -209,7 +189,7 @@ def read_qos_overrides(path: Path | str) -> dict[str, QosProfile]:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise QosError(f'{path} is not YAML: {" ".join(str(error).split())}') from error
     if not isinstance(content, dict):
-        raise QosError(f'{path} must hold profiles by topic: got {type(content).__name__}')
+        raise QosError(f'{path} must contain profiles by topic: got {type(content).__name__}')
     return {
         str(topic): _override_profile(str(topic), policies) for topic, policies in content.items()
     }
@@ -222,8 +202,8 @@ def _override_profile(topic: str, policies: Any) -> QosProfile:
     for name, value in policies.items():
         if name not in default:
             raise QosError(f'{topic}: {name!r} is none of {", ".join(default)}')
-        whole = isinstance(value, Mapping) and {'sec', 'nsec'} <= set(value)
-        if name in _DURATIONS and not whole:
+        complete = isinstance(value, Mapping) and {'sec', 'nsec'} <= set(value)
+        if name in _DURATIONS and not complete:
             raise QosError(f'{topic}: {name} must have sec and nsec: got {value!r}')
     try:
         return QosProfile.from_mapping({**default, **policies})
@@ -231,6 +211,28 @@ def _override_profile(topic: str, policies: Any) -> QosProfile:
         raise QosError(f'{topic}: {error}') from error
 
 
+class _PlainDumper(yaml.SafeDumper):
+    """YAML dumper without aliases: equal profiles are repeated instead of ``*id001``."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
 def _shortest(durations_ns: Iterable[int]) -> int:
-    """Return the strictest duration; 0 is none at all."""
+    """Return the strictest duration; 0 means unspecified."""
     return min((duration for duration in durations_ns if duration), default=UNLIMITED)
+
+
+def _duration_to_mapping(duration_ns: int) -> dict[str, int]:
+    return {'sec': duration_ns // NANOSECONDS, 'nsec': duration_ns % NANOSECONDS}
+
+
+def _duration_from_mapping(mapping: Mapping[str, Any]) -> int:
+    seconds, nanoseconds = int(mapping['sec']), int(mapping['nsec'])
+    if (seconds, nanoseconds) in _FOXY_UNLIMITED:
+        return UNLIMITED
+    return min(seconds * NANOSECONDS + nanoseconds, UNLIMITED)
+
+
+def _policy_name(value: Any, policies: tuple[str, ...]) -> str:
+    return policies[value] if isinstance(value, int) else str(value)

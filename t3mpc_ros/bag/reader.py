@@ -33,7 +33,7 @@ _STEP = re.compile(r'(\w+)\[(\d+)\]')
 
 @dataclass(frozen=True, slots=True)
 class TopicSummary:
-    """One topic of a recording."""
+    """Topic of a bag."""
 
     name: str
     type_name: str
@@ -41,27 +41,27 @@ class TopicSummary:
 
 
 class BagReader:
-    """A bag that is open for reading; made by :func:`open_recording`, closed by ``with``.
+    """Open bag with decoded messages; created by :func:`open_bag`, a context manager.
 
-    Times are seconds since :attr:`start_ns`, the receipt of the first message.
+    Times are seconds since :attr:`start_ns`, the receive time of the first message.
     """
 
     def __init__(
         self,
         folder: Path,
         reader: Any,
-        unfinished: tuple[str, ...],
+        incomplete_files: tuple[str, ...],
         metadata_records: Mapping[str, Mapping[str, str]],
     ) -> None:
         self._reader = reader
         self.folder = folder
-        self.unfinished = unfinished
-        """Files that broke off and are not read; ``mcap_file.finish`` mends them."""
+        self.incomplete_files = incomplete_files
+        """Files without a valid end, which are skipped; ``finalize_file`` completes them."""
         self.metadata_records = metadata_records
-        """Tables of text by title, as given to the writer; of one title the newest."""
+        """Tables of text by title; the newest of each title."""
         some = reader.message_count > 0
         self.start_ns: int = reader.start_time if some else 0
-        self.end_ns: int = reader.end_time - 1 if some else 0  # rosbags' end is exclusive
+        self.end_ns: int = reader.end_time - 1 if some else 0  # the end of rosbags is exclusive
         counts: dict[str, int] = {}
         for connection in reader.connections:
             counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
@@ -69,7 +69,7 @@ class BagReader:
         self.topics: dict[str, TopicSummary] = {
             name: TopicSummary(name, types[name], counts[name]) for name in sorted(types)
         }
-        """By name; a topic may have no message."""
+        """By name, including topics without messages."""
 
     @property
     def duration(self) -> float:
@@ -78,7 +78,7 @@ class BagReader:
 
     @property
     def message_count(self) -> int:
-        """Messages on all topics."""
+        """Number of messages of all topics."""
         return sum(topic.message_count for topic in self.topics.values())
 
     def messages(self, topic: str) -> Iterator[tuple[float, Any]]:
@@ -89,41 +89,41 @@ class BagReader:
         UnknownTopicError
             The topic is not in the bag.
         DataError
-            A message cannot be read.
+            A message cannot be decoded.
         """
         if topic not in self.topics:
-            near = ', '.join(self.topics) or 'nothing'
-            raise UnknownTopicError(f'{topic} is not in {self.folder}, which holds {near}')
-        chosen = [item for item in self._reader.connections if item.topic == topic]
+            available = ', '.join(self.topics) or 'no topic'
+            raise UnknownTopicError(f'{topic} is not in {self.folder}, which contains {available}')
+        selected = [item for item in self._reader.connections if item.topic == topic]
         with _read_errors(topic):
-            for connection, received_ns, data in self._reader.messages(chosen):
+            for connection, received_ns, data in self._reader.messages(selected):
                 message = self._reader.deserialize(data, connection.msgtype)
                 yield (received_ns - self.start_ns) / NANOSECONDS, message
 
     def series(self, topic: str, fields: Mapping[str, str]) -> dict[str, Array]:
-        """Return one array for each of ``fields``, and the times they belong to.
+        """Return one array for each of ``fields``, with times of receipt and stamps.
 
         Parameters
         ----------
         topic
             Full name.
         fields
-            Where to find each array in a message, such as ``'twist.twist.linear.x'`` or
-            ``'pose.covariance[7]'``. An element beyond the end of an array reads as NaN.
+            Path of each field in the message, such as ``'twist.twist.linear.x'`` or
+            ``'pose.covariance[7]'``. An element beyond the end of an array is NaN.
 
         Returns
         -------
         dict
-            The fields; ``received``, when each message came; and ``stamp``, what its header says
-            or, for a type without a header, ``received`` again. All are shape (n,), n the
-            number of messages, and in order of receipt; a topic without messages gives n = 0.
+            The fields; ``received``, the time of receipt; and ``stamp``, that of the header or,
+            for a type without a header, ``received``. All have shape (n,), n the number of
+            messages, in order of receipt.
 
         Raises
         ------
         UnknownTopicError
-            The topic is not in the bag: look into :attr:`topics` first where it may be absent.
+            The topic is not in the bag; :attr:`topics` lists the available ones.
         DataError
-            The type has no such field, or it is not a number.
+            The type has no such field, or the field is not a number.
         """
         getters = [_field_getter(path) for path in fields.values()]
         rows = array('d')  # a list of floats would take five times the memory
@@ -140,7 +140,7 @@ class BagReader:
         return {name: np.ascontiguousarray(table[:, i]) for i, name in enumerate(names)}
 
     def close(self) -> None:
-        """Let go of the files; again, do nothing."""
+        """Close the files; idempotent."""
         reader, self._reader = self._reader, None
         if reader is not None:
             reader.close()
@@ -162,23 +162,23 @@ class BagReader:
 
 
 def open_bag(folder: Path | str) -> BagReader:
-    """Return the bag in ``folder``, or in the one file that is given instead.
+    """Open the bag in ``folder``, or a single bag file.
 
-    Every finished MCAP file of the folder is read, whatever ``metadata.yaml`` says, so that a
-    bag whose recorder was killed can be read too; a bag of another storage is read through its
+    All complete MCAP files of the folder are read, independently of ``metadata.yaml``, which is
+    outdated if the recorder was killed. Bags of another storage are read through their
     ``metadata.yaml``.
 
     Raises
     ------
     BagError
-        There is no bag, no finished file in it, or one that is damaged.
+        The folder contains no complete bag file, or a file is damaged.
     """
     folder = Path(folder)
-    unfinished: tuple[str, ...] = ()
+    incomplete_files: tuple[str, ...] = ()
     if folder.is_file():
         paths = [folder]
     else:
-        metadata, unfinished = collect_metadata(folder)
+        metadata, incomplete_files = collect_metadata(folder)
         paths = [folder / file.path for file in metadata.files]
     metadata_records: dict[str, dict[str, str]] = {}
     for path in paths:
@@ -186,31 +186,30 @@ def open_bag(folder: Path | str) -> BagReader:
         for title, table in (summary.metadata_records if summary else {}).items():
             if title != 'rosbag2':
                 metadata_records[title] = dict(table)
-    if not paths and not unfinished and (folder / METADATA_FILE_NAME).is_file():
+    if not paths and not incomplete_files and (folder / METADATA_FILE_NAME).is_file():
         paths = [folder]
     if not paths:
-        broken = f'; unfinished: {", ".join(unfinished)}' if unfinished else ''
-        raise BagError(f'no finished bag file in {folder}{broken}')
+        listing = f'; incomplete: {", ".join(incomplete_files)}' if incomplete_files else ''
+        raise BagError(f'no complete bag file in {folder}{listing}')
     with _read_errors(str(folder)):
         reader = AnyReader(paths, default_typestore=get_typestore(Stores.ROS2_JAZZY))
         reader.open()
-    return BagReader(folder, reader, unfinished, metadata_records)
+    return BagReader(folder, reader, incomplete_files, metadata_records)
 
 
 def missing_sample_ratio(stamps: Array, rate: float) -> float:
-    """Return which share of the samples is missing, from 0 to 1.
+    """Return the ratio of missing samples, from 0 to 1.
 
-    Between the first stamp and the last lies a grid of ``rate`` points per second; what counts
-    is how many different stamps there are for it. So lateness and bursts are not losses, a stamp
-    that came twice does not hide one, and the order does not matter. Not-a-number is no stamp.
-    Fewer than two stamps span no grid: 0.
+    The number of distinct finite stamps is compared with the number of periods of ``rate``
+    between the first and the last one. Latency, bursts and the order have no influence, and a
+    duplicate does not replace a missing sample. The ratio of fewer than two stamps is 0.
 
     Parameters
     ----------
     stamps
         Seconds, shape (n,).
     rate
-        Samples per second that should be there.
+        Nominal samples per second.
 
     Raises
     ------
@@ -219,15 +218,15 @@ def missing_sample_ratio(stamps: Array, rate: float) -> float:
     """
     if not rate > 0.0:
         raise ValueError(f'rate must be positive: got {rate}')
-    there = np.unique(stamps[np.isfinite(stamps)])
-    if there.size < 2:
+    present = np.unique(stamps[np.isfinite(stamps)])
+    if present.size < 2:
         return 0.0
-    expected = round(float(there[-1] - there[0]) * rate) + 1
-    return max(0.0, 1.0 - there.size / expected)
+    expected = round(float(present[-1] - present[0]) * rate) + 1
+    return max(0.0, 1.0 - present.size / expected)
 
 
 def _field_getter(path: str) -> Callable[[Any], Any]:
-    """Return what follows ``path`` into a message."""
+    """Return a function that reads the field ``path`` of a message."""
     if '[' not in path:
         return attrgetter(path)
     steps: list[tuple[str, int | None]] = []
@@ -235,7 +234,7 @@ def _field_getter(path: str) -> Callable[[Any], Any]:
         match = _STEP.fullmatch(word)
         steps.append((match[1], int(match[2])) if match else (word, None))
 
-    def follow(message: Any) -> Any:
+    def get_field(message: Any) -> Any:
         for name, index in steps:
             message = getattr(message, name)
             if index is not None:
@@ -244,12 +243,12 @@ def _field_getter(path: str) -> Callable[[Any], Any]:
                 message = message[index]
         return message
 
-    return follow
+    return get_field
 
 
 @contextmanager
 def _read_errors(what: str) -> Iterator[None]:
-    """Turn the reading library's errors into ours."""
+    """Convert the errors of the reading library to :class:`DataError`."""
     try:
         yield
     except (AnyReaderError, ReaderError, SerdeError, OSError, struct.error, ValueError) as error:

@@ -1,6 +1,10 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Message definitions, schema texts and type hashes of ROS 2 message types."""
+"""Definitions, schema texts and type hashes of ROS 2 message types.
+
+A bag contains the definition of every type in it. The text is read from the installed ``.msg``
+file; types that are not installed are taken from the Jazzy definitions of the ``rosbags`` library.
+"""
 
 from collections.abc import Iterable, Mapping
 from functools import cache
@@ -14,28 +18,29 @@ from typing import Any
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 SEPARATOR = '=' * 80
-"""The line in front of each dependency in ``ros2msg`` text."""
+"""Line before each dependency in ``ros2msg`` text."""
 
 _TYPE = re.compile(r'(?P<package>[A-Za-z]\w*)/(?:msg/)?(?P<name>[A-Za-z]\w*)')
 _PRIMITIVES = re.compile(r'bool|byte|char|float(32|64)|u?int(8|16|32|64)|w?string')
 
 
 class BagError(RuntimeError):
-    """Root of everything that can go wrong with a bag."""
+    """Base class of all errors of this package."""
 
 
 class UnknownTypeError(BagError):
-    """A message type nobody here has a definition of."""
+    """No definition of a message type is available."""
 
 
 class MessageDefinitions:
-    """Finds the definitions of message types and keeps what it found.
+    """Definitions of message types, with a cache.
 
     Parameters
     ----------
     prefixes
-        Installation prefixes, first one wins; a type lies at ``share/PACKAGE/msg/NAME.msg``
-        below them. The default is :func:`installation_prefixes` of the process environment.
+        Installation prefixes in order of precedence; the file of a type is
+        ``PREFIX/share/PACKAGE/msg/NAME.msg``. The default is :func:`installation_prefixes` of the
+        process environment.
     """
 
     def __init__(self, prefixes: Iterable[Path] | None = None) -> None:
@@ -46,13 +51,13 @@ class MessageDefinitions:
     def schema(self, type_name: str) -> str:
         """Return the ``ros2msg`` text of ``type_name``, such as ``geometry_msgs/msg/Twist``.
 
-        The type's own definition comes first, then each type it needs, directly or not, once,
-        after a line of 80 ``=`` and a line ``MSG: package/Type``.
+        The definition of the type is followed by each of its direct and indirect dependencies
+        once, after a line of 80 ``=`` and a line ``MSG: package/Type``.
 
         Raises
         ------
         UnknownTypeError
-            The type, or one it needs, is neither installed nor part of Jazzy.
+            The type or one of its dependencies is neither installed nor part of Jazzy.
         """
         if type_name not in self._schemas:
             own = _full_name(type_name)
@@ -65,9 +70,9 @@ class MessageDefinitions:
         return self._schemas[type_name]
 
     def type_hash(self, type_name: str) -> str:
-        """Return the RIHS01 hash that Jazzy compares when two nodes meet (REP 2016).
+        """Return the RIHS01 hash of a type (REP 2016), which Jazzy compares during discovery.
 
-        Taken from the ``.json`` beside the ``.msg``; computed from the schema when there is none.
+        It is read from the ``.json`` file beside the ``.msg`` file, or computed from the schema.
 
         Raises
         ------
@@ -92,15 +97,15 @@ class MessageDefinitions:
         if name in store.fielddefs:
             text, _ = store.generate_msgdef(name, ros_version=2)
             return str(text).partition(SEPARATOR)[0]
-        looked = ', '.join(str(self._path(prefix, name, '.msg')) for prefix in self._prefixes)
-        because = f' (needed by {needed_by})' if needed_by else ''
+        searched = ', '.join(str(self._path(prefix, name, '.msg')) for prefix in self._prefixes)
+        dependent = f' (needed by {needed_by})' if needed_by else ''
         raise UnknownTypeError(
-            f'no definition of {name}{because}; looked for {looked or "no file"} '
-            "and in the rosbags library's Jazzy types"
+            f'no definition of {name}{dependent}; searched {searched or "no file"} '
+            'and the Jazzy types of the rosbags library'
         )
 
     def _installed_hash(self, name: str) -> str:
-        # Only a hash beside the text that is used counts: an overlay may redefine a type.
+        # The hash must be in the same folder as the definition: an overlay may redefine a type.
         text, description = self._installed(name, '.msg'), self._installed(name, '.json')
         if not text or not description or text.parent != description.parent:
             return ''
@@ -128,7 +133,7 @@ class MessageDefinitions:
 
 
 def installation_prefixes(environment: Mapping[str, str]) -> tuple[Path, ...]:
-    """Return where ROS packages may be installed: ``AMENT_PREFIX_PATH``, then this Python's."""
+    """Return the installation prefixes: ``AMENT_PREFIX_PATH``, then the prefix of this Python."""
     listed = environment.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
     return tuple(Path(entry) for entry in [*listed, sys.prefix] if entry)
 
@@ -136,7 +141,7 @@ def installation_prefixes(environment: Mapping[str, str]) -> tuple[Path, ...]:
 def _full_name(type_name: str) -> str:
     match = _TYPE.fullmatch(type_name)
     if not match:
-        raise UnknownTypeError(f'a message type looks like package/msg/Name: got {type_name!r}')
+        raise UnknownTypeError(f'a message type must be package/msg/Name: got {type_name!r}')
     return f'{match["package"]}/msg/{match["name"]}'
 
 
@@ -149,7 +154,7 @@ def _with_newline(text: str) -> str:
 
 
 def _dependencies(text: str, package: str) -> list[str]:
-    """Return the full names of the message types that fields of ``text`` have, in order."""
+    """Return the full names of the message types of the fields in ``text``, in order."""
     found = []
     for line in text.splitlines():
         words = line.partition('#')[0].split()

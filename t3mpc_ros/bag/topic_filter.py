@@ -1,9 +1,11 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Topic filters of recorder and player: names, wildcards, regular expressions and types."""
+"""Topic filters of recorder and player: names, wildcards, regular expressions and types.
+
+``exclude_topics`` and ``exclude_regex`` have the same meaning in both, see :class:`TopicPatterns`.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 import re
 
@@ -11,52 +13,73 @@ from t3mpc_ros.bag.schema import BagError
 
 
 class TopicFilterError(BagError):
-    """A regular expression that is none."""
+    """A regular expression or a remapping rule is invalid; the text names the parameter."""
 
 
-def compile_regex(name: str, text: str) -> re.Pattern[str] | None:
-    """Return ``text`` as a regular expression, None when it is empty.
-
-    Raises
-    ------
-    SelectionError
-        It is none; the error says where, and names the setting ``name``.
-    """
-    if not text:
-        return None
-    try:
-        return re.compile(text)
-    except re.error as error:
-        raise TopicFilterError(
-            f'{name} must be a regular expression: got {text!r} ({error})'
-        ) from (error)
-
-
-class TopicFilter:
-    """Which topics are wanted.
-
-    A topic is wanted when any of the ways below names it, unless ``exclude`` does. Topics that
-    ROS hides (a part of the name begins with ``_``) are wanted by their full name only.
+class TopicPatterns:
+    """Topic names with wildcards, and a regular expression for the full name.
 
     Parameters
     ----------
     names
-        Full names, as the node resolves them.
-    patterns
-        Names in which ``*`` stands for anything, slashes too; relative ones are of
-        ``namespace``.
-    regex, exclude
-        Regular expressions which the full name has to match from end to end, as
-        ``ros2 bag record`` takes them; empty = none.
-    types
-        Names such as ``nav_msgs/msg/Odometry``.
+        Names in which ``*`` matches any text including slashes. A name that begins with neither
+        ``/`` nor ``*`` is relative to ``namespace``.
+    regex
+        Regular expression that must match the full name from end to end, as in ``ros2 bag``;
+        empty = none.
+    parameter
+        Name of the parameter that sets ``regex``, for the error text.
     namespace
-        Of the node, such as ``/robot``.
+        Such as ``/robot``.
 
     Raises
     ------
-    SelectionError
-        ``regex`` or ``exclude`` is no regular expression.
+    TopicFilterError
+        ``regex`` is not a regular expression.
+    """
+
+    def __init__(
+        self, names: Iterable[str], regex: str, *, parameter: str, namespace: str = '/'
+    ) -> None:
+        self._names = [_resolve(name, namespace) for name in dict.fromkeys(names)]
+        self._regex = compile_regex(parameter, regex)
+
+    def __bool__(self) -> bool:
+        return bool(self._names or self._regex)
+
+    def matches(self, topic: str) -> bool:
+        """Return whether a name or the regular expression matches the full name ``topic``."""
+        if self._regex and self._regex.fullmatch(topic):
+            return True
+        return any(fnmatchcase(topic, name) for name in self._names)
+
+
+class TopicFilter:
+    """Filter of the recorder.
+
+    A topic is recorded if any of the inclusion rules matches and no exclusion rule does. Hidden
+    topics (a part of the name begins with ``_``) are recorded by their full name only.
+
+    Parameters
+    ----------
+    names
+        Full names, as resolved by the node.
+    patterns
+        Names in which ``*`` matches any text including slashes; names without a leading slash
+        are relative to ``namespace``.
+    regex
+        Regular expression that must match the full name from end to end; empty = none.
+    types
+        Message types such as ``nav_msgs/msg/Odometry``.
+    exclude_topics, exclude_regex
+        Exclusion rules, see :class:`TopicPatterns`.
+    namespace
+        Namespace of the node, such as ``/robot``.
+
+    Raises
+    ------
+    TopicFilterError
+        ``regex`` or ``exclude_regex`` is not a regular expression.
     """
 
     def __init__(
@@ -65,8 +88,9 @@ class TopicFilter:
         patterns: Iterable[str] = (),
         *,
         regex: str = '',
-        exclude: str = '',
         types: Iterable[str] = (),
+        exclude_topics: Iterable[str] = (),
+        exclude_regex: str = '',
         namespace: str = '/',
     ) -> None:
         base = namespace.rstrip('/')
@@ -74,13 +98,15 @@ class TopicFilter:
         self._patterns = [
             text if text.startswith('/') else f'{base}/{text}' for text in dict.fromkeys(patterns)
         ]
-        self._regex = compile_regex('regex', regex)
-        self._exclude = compile_regex('exclude', exclude)
+        self._regex = compile_regex('record.regex', regex)
         self._types = frozenset(types)
+        self._excluded = TopicPatterns(
+            exclude_topics, exclude_regex, parameter='record.exclude_regex', namespace=namespace
+        )
 
     def matches(self, topic: str, types: Iterable[str] = ()) -> bool:
-        """Return whether ``topic``, which is published as ``types``, is to be recorded."""
-        if self._exclude and self._exclude.fullmatch(topic):
+        """Return whether ``topic``, published with ``types``, is recorded."""
+        if self._excluded.matches(topic):
             return False
         if topic in self._names:
             return True
@@ -93,72 +119,93 @@ class TopicFilter:
         return not self._types.isdisjoint(types)
 
 
-class PlayTopicFilterError(ValueError):
-    """A pattern or a renaming that cannot be used; the text names it."""
-
-
-@dataclass(frozen=True)
 class PlayTopicFilter:
-    """Which topics are played: those of ``topics`` or ``regex``, less the excluded ones.
+    """Filter and remapping rules of the player.
 
-    Patterns are names in which ``*`` stands for anything; a name without a leading slash is taken
-    to begin with one. Regular expressions have to match the whole name, as in ``ros2 bag``.
-    With neither ``topics`` nor ``regex`` everything is played.
-    """
+    A topic is played if ``topics`` or ``regex`` matches, or if both are empty, and no exclusion
+    rule matches.
 
-    topics: tuple[str, ...] = ()
-    regex: str = ''
-    exclude: tuple[str, ...] = ()
-    exclude_regex: str = ''
-    remap: Mapping[str, str] = field(default_factory=dict)
-    """New names by recorded ones."""
-
-    def __post_init__(self) -> None:
-        for name in ('regex', 'exclude_regex'):
-            try:
-                re.compile(getattr(self, name))
-            except re.error as error:
-                raise PlayTopicFilterError(
-                    f'{name} must be a regular expression: got {getattr(self, name)!r} ({error})'
-                ) from error
-
-    def selects(self, topic: str) -> bool:
-        """Return whether a topic of a bag is wanted."""
-        if _matches(topic, self.exclude, self.exclude_regex):
-            return False
-        return not (self.topics or self.regex) or _matches(topic, self.topics, self.regex)
-
-    def remapped_name(self, topic: str) -> str:
-        """Return the name under which a topic of a bag is played."""
-        return self.remap.get(topic, topic)
-
-
-def parse_remappings(items: Sequence[str]) -> dict[str, str]:
-    """Return new names by old ones from ``old:=new``.
+    Parameters
+    ----------
+    topics, regex
+        Inclusion rules, see :class:`TopicPatterns`.
+    exclude_topics, exclude_regex
+        Exclusion rules.
+    remappings
+        New names by recorded names.
 
     Raises
     ------
-    SelectionError
-        An item is not of that form, or renames a topic a second time.
+    TopicFilterError
+        ``regex`` or ``exclude_regex`` is not a regular expression.
+    """
+
+    def __init__(
+        self,
+        topics: Iterable[str] = (),
+        regex: str = '',
+        exclude_topics: Iterable[str] = (),
+        exclude_regex: str = '',
+        remappings: Mapping[str, str] | None = None,
+    ) -> None:
+        self._included = TopicPatterns(topics, regex, parameter='play.regex_to_filter')
+        self._excluded = TopicPatterns(
+            exclude_topics, exclude_regex, parameter='play.exclude_regex'
+        )
+        self._remappings = dict(remappings or {})
+
+    def matches(self, topic: str) -> bool:
+        """Return whether a recorded topic is played."""
+        if self._excluded.matches(topic):
+            return False
+        return not self._included or self._included.matches(topic)
+
+    def remapped_name(self, topic: str) -> str:
+        """Return the name under which a recorded topic is played."""
+        return self._remappings.get(topic, topic)
+
+
+def parse_remappings(items: Sequence[str]) -> dict[str, str]:
+    """Return new names by recorded names from rules ``old:=new``.
+
+    Raises
+    ------
+    TopicFilterError
+        An item is not a rule, or a topic has two rules.
     """
     result: dict[str, str] = {}
     for item in items:
         old, mark, new = (part.strip() for part in item.partition(':='))
         if not (old and mark and new):
-            raise PlayTopicFilterError(f'remap must be a list of old:=new: got {item!r}')
-        if _absolute_name(old) in result:
-            raise PlayTopicFilterError(
-                f'remap must name a topic once: got {_absolute_name(old)} again'
+            raise TopicFilterError(
+                f'play.topic_remapping_options must be a list of old:=new: got {item!r}'
             )
-        result[_absolute_name(old)] = _absolute_name(new)
+        name = _resolve(old)
+        if name in result:
+            raise TopicFilterError(
+                f'play.topic_remapping_options must have one rule per topic: got {name} again'
+            )
+        result[name] = _resolve(new)
     return result
 
 
-def _matches(topic: str, patterns: tuple[str, ...], regex: str) -> bool:
-    if regex and re.fullmatch(regex, topic):
-        return True
-    return any(fnmatchcase(topic, _absolute_name(pattern)) for pattern in patterns)
+def compile_regex(parameter: str, text: str) -> re.Pattern[str] | None:
+    """Return ``text`` as a regular expression; None if it is empty.
+
+    Raises
+    ------
+    TopicFilterError
+        ``text`` is invalid; the error names ``parameter`` and the position.
+    """
+    if not text:
+        return None
+    try:
+        return re.compile(text)
+    except re.error as error:
+        raise TopicFilterError(
+            f'{parameter} must be a regular expression: got {text!r} ({error})'
+        ) from error
 
 
-def _absolute_name(name: str) -> str:
-    return name if name.startswith(('/', '*')) else f'/{name}'
+def _resolve(name: str, namespace: str = '/') -> str:
+    return name if name.startswith(('/', '*')) else f'{namespace.rstrip("/")}/{name}'

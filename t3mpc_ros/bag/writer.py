@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Bag writer: serialized messages, attachments and metadata records into MCAP files."""
+"""Bag writer: serialized messages, attachments and metadata records in MCAP files of rosbag2."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -21,58 +21,82 @@ from t3mpc_ros.bag.qos import QosProfile, dump_yaml, profiles_to_yaml
 from t3mpc_ros.bag.schema import BagError, MessageDefinitions
 
 _MEDIA_TYPES = {'.npz': 'application/zip', '.yaml': 'application/yaml', '.csv': 'text/csv'}
-"""What ``mimetypes`` does not know everywhere; an npz file is a zip archive of arrays."""
+"""Media types that ``mimetypes`` lacks on some systems; an npz file is a zip archive."""
+MESSAGE_OVERHEAD = 256
+"""Memory of a message in addition to its data, bytes."""
+
+# Publishers of releases before type hashes report "INVALID".
+_TYPE_HASH = re.compile(r'RIHS\d\d_[0-9a-f]{64}')
 
 
 class AttachmentError(BagError):
-    """A file that cannot be put into a bag."""
+    """A file cannot be attached to a bag."""
+
+
+class FolderError(BagError):
+    """The folder or a file in it cannot be created."""
+
+
+class DiskError(BagError):
+    """Writing failed, usually because the disk is full; messages written before are kept."""
+
+
+class UnknownTopicError(BagError):
+    """The topic was not added to, or is not in, the bag."""
+
+
+class DataError(BagError):
+    """A message, stamp or metadata record is invalid."""
 
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
-    """One file, as it was read."""
+    """File stored inside a bag, such as the model file of a controller."""
 
     name: str
     media_type: str
     data: bytes
-    changed_ns: int = 0
-    """When the file was last changed, nanoseconds since 1970; 0 = unknown."""
+    modified_ns: int = 0
+    """Modification time, nanoseconds since 1970; 0 = unknown."""
 
 
 def read_attachment(path: Path, max_bytes: int, name: str = '') -> Attachment:
-    """Return the file at ``path`` under ``name``, its own name by default.
+    """Return the file at ``path`` as an attachment called ``name``, by default its file name.
 
     Raises
     ------
     AttachmentError
-        There is no such file, it cannot be read, or it is larger than ``most_bytes``.
+        The file does not exist, is not readable, or is larger than ``max_bytes``.
     """
     try:
         with path.open('rb') as file:
             data = file.read(max_bytes + 1)
-        changed_ns = path.stat().st_mtime_ns
+        modified_ns = path.stat().st_mtime_ns
     except OSError as error:
         raise AttachmentError(f'{path} cannot be attached: {error.strerror or error}') from error
     if len(data) > max_bytes:
         raise AttachmentError(
-            f'{path} must have at most {max_bytes} bytes to be attached (attach_bytes)'
+            f'{path} must have at most {max_bytes} bytes to be attached '
+            '(record.max_attachment_size)'
         )
-    kind = _MEDIA_TYPES.get(path.suffix) or mimetypes.guess_type(path.name)[0]
-    return Attachment(name or path.name, kind or 'application/octet-stream', data, changed_ns)
+    media_type = _MEDIA_TYPES.get(path.suffix) or mimetypes.guess_type(path.name)[0]
+    return Attachment(
+        name or path.name, media_type or 'application/octet-stream', data, modified_ns
+    )
 
 
 def read_attachments(path: Path) -> dict[str, Attachment]:
-    """Return the files in a finished MCAP file by name; of one name the newest.
+    """Return the attachments of a complete MCAP file by name; the newest of each name.
 
     Raises
     ------
     AttachmentError
-        The file cannot be read, has no sound end, or an attachment is damaged.
+        The file is not readable or incomplete, or an attachment is damaged.
     """
     try:
         with path.open('rb') as file:
             found = list(make_reader(file, validate_crcs=True).iter_attachments())
-    except Exception as error:  # whatever a damaged file does to the library's parser
+    except Exception as error:  # the parser of the library raises anything on damaged bytes
         raise AttachmentError(f'the attachments of {path} cannot be read: {error}') from error
     found.sort(key=lambda item: item.log_time)
     return {
@@ -81,12 +105,8 @@ def read_attachments(path: Path) -> dict[str, Attachment]:
     }
 
 
-MESSAGE_OVERHEAD = 256
-"""Bytes that a message costs in memory besides its data."""
-
-
 class SerializedMessage(NamedTuple):
-    """One serialised message, unopened; stamps in nanoseconds since 1970."""
+    """Message as CDR bytes; stamps in nanoseconds since 1970."""
 
     topic: str
     received_ns: int
@@ -94,40 +114,20 @@ class SerializedMessage(NamedTuple):
     data: bytes
 
     @property
-    def cost(self) -> int:
-        """Bytes that it takes in memory."""
+    def memory_size(self) -> int:
+        """Memory of the message, bytes."""
         return len(self.data) + MESSAGE_OVERHEAD
 
 
 @dataclass(frozen=True, slots=True)
 class TopicMetadata:
-    """What a bag has to know of a topic before its first message."""
+    """Topic declaration that precedes the first message of the topic."""
 
     topic: str
     type_name: str
-    profiles: tuple[QosProfile, ...] = ()
-    """What its publishers offer."""
+    offered_qos_profiles: tuple[QosProfile, ...] = ()
+    """Profiles of the publishers."""
     type_hash: str | None = None
-
-
-# Publishers older than the hashes report "INVALID".
-_TYPE_HASH = re.compile(r'RIHS\d\d_[0-9a-f]{64}')
-
-
-class FolderError(BagError):
-    """The folder, or a file in it, cannot be made."""
-
-
-class DiskError(BagError):
-    """Writing failed, most often because the disk is full; what was written is kept."""
-
-
-class UnknownTopicError(BagError):
-    """A topic that was not added, or is not in the bag."""
-
-
-class DataError(BagError):
-    """A message, stamp or detail that cannot be recorded as it is."""
 
 
 @dataclass
@@ -138,34 +138,34 @@ class _Topic:
 
 
 class BagWriter:
-    """Records serialised messages into ``FOLDER/NAME_N.mcap``, N the next free number.
+    """Writes serialized messages to ``FOLDER/NAME_N.mcap``, N the next free number.
 
-    A recorder that starts again in the same folder goes on beside what is there: earlier files
-    are counted into ``metadata.yaml``; one that broke off is named in :attr:`unfinished` and left
-    alone (:func:`t3mpc_ros.bag.mcap_file.finalize_file` mends it). ``metadata.yaml`` lists finished
-    files only, so the folder can be read at any time, even after the recorder was killed.
+    An existing bag is continued with a new file, and its complete files are included in
+    ``metadata.yaml``. Incomplete files are listed in :attr:`incomplete_files` and left unchanged
+    (:func:`~t3mpc_ros.bag.mcap_file.finalize_file` completes them). ``metadata.yaml`` lists
+    complete files only, so the folder is readable at any time, even after the recorder was killed.
 
     Parameters
     ----------
     folder
-        Made when it is not there, with its parents.
+        Created if missing, with its parents.
     name
-        Stem of the file; the folder's own name by default, as rosbag2 has it.
-    details
-        Tables of text kept in the file as MCAP metadata records: settings, version, commit.
-        The name ``rosbag2`` is taken.
+        Stem of the file name; by default the name of the folder, as in rosbag2.
+    metadata_records
+        Tables of text by record name, stored as MCAP metadata records: parameters, version,
+        commit. The name ``rosbag2`` is reserved.
     chunk_bytes, chunk_ns
-        A chunk is compressed and written when it holds this many bytes, or when its oldest
-        message came this long ago: so much is lost at most when the recorder is killed.
+        A chunk is compressed and written at this size, or at this age of its oldest message.
+        A killed recorder loses at most the current chunk.
     definitions
-        Where schemas and type hashes come from.
+        Source of schemas and type hashes.
 
     Raises
     ------
     FolderError
-        The folder or the file cannot be made.
+        The folder or the file cannot be created.
     DataError
-        ``details`` holds anything but text, or a record called ``rosbag2``.
+        ``metadata_records`` contains values other than text, or a record called ``rosbag2``.
     """
 
     def __init__(
@@ -186,14 +186,14 @@ class BagWriter:
         self._chunk_start: int | None = None
         self._closed = self._failed = False
         self.lost = 0
-        """Messages dropped because writing had failed before."""
-        self.unfinished: tuple[str, ...] = ()
-        """Earlier files that broke off."""
+        """Messages dropped after a write error."""
+        self.incomplete_files: tuple[str, ...] = ()
+        """Existing files without a valid end."""
         check_metadata_records(metadata_records)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            earlier, self.unfinished = collect_metadata(self.folder)
-            write_metadata(self.folder, earlier)
+            existing, self.incomplete_files = collect_metadata(self.folder)
+            write_metadata(self.folder, existing)
             self.path, self._output = _create_next_file(self.folder, name or self.folder.name)
         except OSError as error:
             raise _folder_error(self.folder, error) from error
@@ -205,7 +205,7 @@ class BagWriter:
                 enable_data_crcs=True,
             )
             self._writer.start(profile='ros2', library='t3mpc_ros')
-            # What `ros2 bag info FILE` and `ros2 bag reindex` look for inside the file.
+            # `ros2 bag info FILE` and `ros2 bag reindex` read this record.
             own = BagMetadata(files=(FileInformation(self.path.name),)).to_mapping()
             self._writer.add_metadata('rosbag2', {'serialized_metadata': dump_yaml(own)})
             for title, table in metadata_records.items():
@@ -216,7 +216,7 @@ class BagWriter:
             raise _folder_error(self.folder, error) from error
 
     def add_metadata_record(self, title: str, table: Mapping[str, str]) -> None:
-        """Record one more table of text, or a newer one under the same title.
+        """Write a metadata record; a later record replaces an earlier one of the same title.
 
         Raises
         ------
@@ -232,7 +232,7 @@ class BagWriter:
             self._writer.add_metadata(title, dict(table))
 
     def add_attachment(self, attachment: Attachment, now_ns: int) -> None:
-        """Put a file into the bag; ``now_ns`` is when it was read (nanoseconds since 1970).
+        """Write an attachment; ``now_ns`` is the time it was read (nanoseconds since 1970).
 
         Raises
         ------
@@ -243,7 +243,7 @@ class BagWriter:
             return
         with self._writing():
             self._writer.add_attachment(
-                attachment.changed_ns,
+                attachment.modified_ns,
                 now_ns,
                 attachment.name,
                 attachment.media_type,
@@ -257,15 +257,19 @@ class BagWriter:
         profiles: Iterable[QosProfile] = (),
         type_hash: str | None = None,
     ) -> None:
-        """Announce a topic before its first message; adding it again changes nothing.
+        """Add a topic before its first message; adding it again has no effect.
 
-        ``profiles`` is what its publishers offer. The hash of the installed definition stands in
-        for a ``type_hash`` that is not given or not valid.
+        Parameters
+        ----------
+        profiles
+            QoS profiles that the publishers offer.
+        type_hash
+            RIHS01 hash; if missing or invalid, that of the installed definition is used.
 
         Raises
         ------
         UnknownTypeError
-            Nobody here knows the type.
+            No definition of the type is available.
         DataError
             The topic was added with another type.
         DiskError
@@ -297,7 +301,7 @@ class BagWriter:
         self._topics[name] = _Topic(type_name, channel)
 
     def write(self, topic: str, received_ns: int, published_ns: int, data: bytes) -> None:
-        """Record one message, serialised as CDR, with both stamps in nanoseconds.
+        """Write one CDR message with its stamps in nanoseconds.
 
         Raises
         ------
@@ -306,16 +310,16 @@ class BagWriter:
         DataError
             ``data`` is not bytes, or a stamp is negative.
         DiskError
-            Writing failed. Raised once: the file has been closed as well as possible, and
-            later messages are only counted in :attr:`lost`.
+            Writing failed. Raised once: the file is finalized if possible, and later messages
+            are only counted in :attr:`lost`.
         BagError
-            The writer was closed.
+            The writer is closed.
         """
         if type(data) is not bytes:
             raise DataError(f'a message of {topic} must be bytes: got {type(data).__name__}')
         for stamp in (received_ns, published_ns):
             if not 0 <= stamp < 2**63:
-                raise DataError(f'a stamp of {topic} must be from 0 ns: got {stamp}')
+                raise DataError(f'a stamp of {topic} must not be negative: got {stamp} ns')
         if not self._is_open():
             self.lost += 1
             return
@@ -332,10 +336,10 @@ class BagWriter:
             self._writer.add_message(entry.channel, received_ns, data, published_ns, entry.count)
             if self._output.size != written:
                 self._chunk_start = None
-        entry.count = (entry.count + 1) % 2**32  # the counter's width in the file
+        entry.count = (entry.count + 1) % 2**32  # width of the sequence number in MCAP
 
     def flush(self) -> None:
-        """Put what was recorded so far into the file, as a chunk of its own.
+        """Write the current chunk to the file.
 
         Raises
         ------
@@ -349,9 +353,7 @@ class BagWriter:
             self._chunk_start = None
 
     def sync(self) -> None:
-        """Wait until the disk has what was handed to the system, if anything is new.
-
-        A process that dies loses nothing of it anyway; a machine without power does.
+        """Synchronize the file with the disk if it has grown, against loss by power failure.
 
         Raises
         ------
@@ -365,16 +367,16 @@ class BagWriter:
 
     @property
     def size(self) -> int:
-        """Bytes in the file so far; the chunk that is being filled does not count."""
+        """Size of the file in bytes, without the current chunk."""
         return self._output.size
 
     def close(self) -> None:
-        """Finish the file and count it into ``metadata.yaml``; again, do nothing.
+        """Complete the file and add it to ``metadata.yaml``; idempotent.
 
         Raises
         ------
         DiskError
-            As :meth:`write`; the file has then been closed as well as possible.
+            As :meth:`write`; the file is finalized if possible.
         """
         if self._closed:
             return
@@ -398,29 +400,29 @@ class BagWriter:
         self.close()
 
     def _is_open(self) -> bool:
-        """Return whether to go on; False once writing has failed."""
+        """Return whether the file is writable: False after a write error."""
         if self._closed:
             raise BagError(f'{self.path.name} is closed')
         return not self._failed
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        """Turn the first failure to write into a :class:`DiskError`."""
+        """Convert the first write error to a :class:`DiskError`."""
         try:
             yield
         except OSError as error:
             raise self._fail(error) from error
 
     def _fail(self, error: OSError) -> DiskError:
-        """Close as well as possible, and return what to raise."""
+        """Close and finalize the file if possible; return the error to raise."""
         self._failed = True
         self._output.abandon()
-        kept = 'nothing of it can be read'
+        kept = 'the file is not readable'
         try:
             kept = f'{finalize_file(self.path)} messages are kept'
             write_metadata(self.folder, collect_metadata(self.folder)[0])
         except (OSError, BagError):
-            pass  # the first error is the one to report
+            pass  # the first error is reported
         return DiskError(f'recording into {self.path} failed: {error.strerror or error}; {kept}')
 
 
@@ -432,17 +434,17 @@ def check_metadata_records(metadata_records: Mapping[str, Mapping[str, str]]) ->
     """Raise :class:`DataError` unless every name and value is text."""
     for title, table in metadata_records.items():
         if title == 'rosbag2':
-            raise DataError("details called rosbag2 are the bag format's own")
+            raise DataError('the metadata record rosbag2 is reserved for the bag format')
         for item in (title, *table.keys(), *table.values()):
             if not isinstance(item, str):
-                raise DataError(f'details of {title} must be text: got {item!r}')
+                raise DataError(f'the metadata record {title} must be text: got {item!r}')
 
 
 class _Output:
-    """An unbuffered file that knows its size and stays shut once abandoned."""
+    """Unbuffered file that tracks its size."""
 
     def __init__(self, path: Path) -> None:
-        self._file = open_unbuffered(path, 'xb')  # FileExistsError when another was faster
+        self._file = open_unbuffered(path, 'xb')  # FileExistsError if another process created it
         self.size = 0
         self._synced = 0
 
@@ -455,7 +457,7 @@ class _Output:
         return self.size
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Do nothing: the file is unbuffered."""
 
     def sync(self) -> None:
         if self._synced != self.size:
@@ -471,7 +473,7 @@ class _Output:
 
 
 def _create_next_file(folder: Path, stem: str) -> tuple[Path, _Output]:
-    """Make the file with the next free number."""
+    """Create the file with the next free number."""
     pattern = re.compile(re.escape(stem) + r'_(\d+)' + re.escape(MCAP_SUFFIX))
     taken = [int(match[1]) for path in folder.iterdir() if (match := pattern.fullmatch(path.name))]
     number = max(taken, default=-1) + 1

@@ -88,10 +88,10 @@ def _info_text(held: BagInfo) -> str:
     rows += [(f'file {name}', size_text(size)) for name, size in held.files.items()]
     rows += [
         (f'UNFINISHED {name}', f'{size_text(size)}, not counted above')
-        for name, size in held.unfinished.items()
+        for name, size in held.incomplete_files.items()
     ]
     parts = [columns(rows)]
-    if held.unfinished:
+    if held.incomplete_files:
         parts.append(
             f'A file without its end is still being written, or its writer was interrupted: '
             f'`t3mpc bag recover {held.path}` writes its messages to a new bag.'

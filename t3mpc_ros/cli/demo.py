@@ -133,9 +133,9 @@ def run_demo(options: DemoOptions) -> ReportMetrics:
         raise ProcessError(f'{bag} already holds a recording; choose another folder with --output')
     processes = ProcessGroup(options.output / 'log', private_graph())
     parameters = options.parameters()
-    parameters['recorder']['folder'] = str(bag.resolve())
+    parameters['recorder']['storage.uri'] = str(bag.resolve())
     # The nodes are stopped one after the other, which is no reason for a snapshot.
-    parameters['recorder']['snapshot_time'] = 0.0
+    parameters['recorder']['storage.snapshot_duration'] = 0.0
     # The robot stops after the nodes that command it, then the recorder, then the board.
     stopped: tuple[str, ...] = (
         'reference_generator',

@@ -45,7 +45,11 @@ def run(options: argparse.Namespace) -> int:
             raise ValueError(f'FAULT must be one of {", ".join(known)}: got {name}')
     if options.names and options.output:
         raise ValueError('--output replaces the whole table: give no FAULT with it')
-    fault_runs = [fault_run for fault_run in FAULT_RUNS if not options.names or fault_run.fault in options.names]
+    fault_runs = [
+        fault_run
+        for fault_run in FAULT_RUNS
+        if not options.names or fault_run.fault in options.names
+    ]
     results = study_faults(fault_runs, Progress(options.clock))
     print(console_text(results))
     if options.output:

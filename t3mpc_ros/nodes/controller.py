@@ -157,7 +157,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
 
     def _on_reference(self, message: Odometry) -> None:
         state = conversions.state_from_odometry(message)
-        self._journal.reference(state.stamp_ns)
+        self._journal.count_reference(state.stamp_ns)
         if not self._controller.add_reference(state):
             self._rejected_references += 1
         self._initial_reference.republish(message)
@@ -179,7 +179,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             return
         if self._controller.check_odometry(self._last_odometry_ns, self.steady_ns()):
             self._publish_command(STANDSTILL, self.now_ns())
-            self._publish_journal(self._journal.silent(self._controller.status.stamp_ns))
+            self._publish_journal(self._journal.odometry_timeout(self._controller.status.stamp_ns))
             self._log_reason(self._controller.status)
 
     def _publish_command(self, command: BodyTwist, stamp_ns: int) -> None:

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """``metadata.yaml`` and QoS profiles against rosbag2 of Jazzy.
 
-``ros2 bag`` itself is not installable from PyPI. ``decode_*`` below follow, field by field, what
-rosbag2's decoder does with the file (``rosbag2_storage/yaml.hpp`` and ``qos.cpp``, branch jazzy):
-which keys it demands, and what text yaml-cpp accepts for each type.
+``ros2 bag`` is not available from PyPI. The functions ``decode_*`` follow the decoder of rosbag2
+field by field (``rosbag2_storage/yaml.hpp`` and ``qos.cpp``, branch jazzy): the required keys, and
+the text that yaml-cpp accepts for each type.
 """
 
 import errno
@@ -52,7 +52,7 @@ BAG = BagMetadata(
 )
 
 
-# -- what yaml-cpp makes of a scalar; the loader below leaves every scalar a text ---------------
+# -- scalar types of yaml-cpp; the loader below returns every scalar as text --------------------
 
 
 def _string(node):
@@ -148,7 +148,7 @@ def test_rosbag2_decodes_every_field(tmp_path, bag):
     decode_bag(load_as_texts(tmp_path / 'metadata.yaml'))
 
 
-def test_keys_stand_in_rosbag2_s_order_and_no_others(tmp_path):
+def test_keys_are_those_of_rosbag2_in_its_order(tmp_path):
     write_metadata(tmp_path, BAG)
     root = yaml.safe_load((tmp_path / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
     assert list(root) == [
@@ -168,7 +168,7 @@ def test_keys_stand_in_rosbag2_s_order_and_no_others(tmp_path):
     assert list(root['topics_with_message_count'][0]) == ['topic_metadata', 'message_count']
 
 
-def test_totals_follow_from_the_files_and_an_empty_file_changes_nothing():
+def test_totals_follow_from_the_files_empty_files_add_nothing():
     assert (BAG.start_ns, BAG.duration_ns, BAG.message_count) == (1_000, 1_700, 7)
     empty = BagMetadata(files=(FileInformation('a.mcap'),))
     assert (empty.start_ns, empty.duration_ns, empty.message_count) == (NO_START_NS, 0, 0)
@@ -181,7 +181,7 @@ def test_metadata_comes_back_as_it_was(tmp_path, bag):
 
 
 def test_no_anchors_and_no_folded_lines(tmp_path):
-    """Equal profiles once came out as ``&id001`` and ``*id001``, long texts over two lines."""
+    """Equal profiles must not become ``&id001`` and ``*id001``, nor long texts two lines."""
     long = BagMetadata(topics=BAG.topics * 2, custom_data={'note': 'word ' * 60})
     write_metadata(tmp_path, long)
     text = (tmp_path / 'metadata.yaml').read_text()
@@ -222,7 +222,7 @@ def test_a_missing_file_or_another_version_is_a_clear_error(tmp_path):
         read_metadata(tmp_path)
 
 
-def test_the_channel_s_text_is_what_yaml_cpp_would_write():
+def test_channel_metadata_is_the_text_of_yaml_cpp():
     assert profiles_to_yaml([QosProfile()]) == (
         '- history: keep_last\n'
         '  depth: 10\n'
@@ -264,7 +264,7 @@ def test_rosbags_reads_the_same_profile():
     assert read.avoid_ros_namespace_conventions is True
 
 
-def test_numbers_of_older_bags_and_foxy_s_infinities_are_understood():
+def test_numeric_policies_and_foxy_infinities_are_parsed():
     mapping = QosProfile().to_mapping()
     mapping |= {'history': 2, 'reliability': 2, 'durability': 1, 'liveliness': 3}
     mapping['deadline'] = {'sec': 0x7FFFFFFF, 'nsec': 0xFFFFFFFF}
@@ -285,6 +285,6 @@ def test_a_profile_rosbag2_would_refuse_cannot_be_made(change):
 
 
 @pytest.mark.parametrize('text', ['{', 'a: 1', '- 1', '- {history: keep_last}', '- history: 9'])
-def test_what_is_no_profile_is_a_clear_error(text):
+def test_invalid_profile_text_is_an_error(text):
     with pytest.raises(QosError):
         profiles_from_yaml(text)

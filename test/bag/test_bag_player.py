@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Bags played back in virtual time: nothing skipped, nothing twice, everything in its order."""
+"""Playback of bags in virtual time: every message once, in order, at its time."""
 
 from itertools import pairwise
 import random
@@ -41,7 +41,7 @@ from t3mpc_ros.bag.qos import (
     read_qos_overrides,
 )
 from t3mpc_ros.bag.schema import BagError
-from t3mpc_ros.bag.topic_filter import PlayTopicFilter, PlayTopicFilterError, parse_remappings
+from t3mpc_ros.bag.topic_filter import PlayTopicFilter, TopicFilterError, parse_remappings
 from t3mpc_ros.bag.writer import BagWriter
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -57,7 +57,7 @@ def text(words):
 
 
 def write_mcap(folder, messages, chunk_bytes=2000, latched=('/map',)):
-    """Record ``(topic, received_ns)``; the data say which message it is."""
+    """Write ``(topic, received_ns)``; the data contain the number of the message."""
     topics = {topic for topic, _ in messages}
     with BagWriter(folder, metadata_records={}, chunk_bytes=chunk_bytes) as bag:
         for topic in sorted(topics):
@@ -95,7 +95,7 @@ def write_sqlite(folder, messages, latched=('/map',), **compression):
 
 
 def ticks(count=200, step=SECOND // 100):
-    """Two topics at one time each tick, and a latched one now and then."""
+    """Return two topics with equal times each period, and a latched one every 50 periods."""
     messages = []
     for i in range(count):
         now = START + i * step
@@ -130,7 +130,7 @@ def write(request):
 
 @pytest.fixture
 def tape(tmp_path):
-    """Return a function that opens bags as one tape."""
+    """Return a function that opens bags as one reader."""
     opened = []
 
     def make(*folders, offsets_ns=(), **choice):
@@ -149,19 +149,19 @@ def tape(tmp_path):
 # -- sources --------------------------------------------------------------------------------------
 
 
-def test_every_byte_of_every_format_comes_back_in_the_order_of_the_file(write, tape, tmp_path):
+def test_every_format_returns_every_byte_in_file_order(write, tape, tmp_path):
     written = expected(ticks())
     made = tape(write(tmp_path / 'bag', ticks()))
     assert list(made.messages(START)) == written
     assert (made.start_ns, made.end_ns) == (START, written[-1].stamp_ns)
-    assert {name: track.message_count for name, track in made.tracks.items()} == {
+    assert {name: topic.message_count for name, topic in made.topics.items()} == {
         '/a': 200,
         '/b': 200,
         '/map': 4,
     }
-    assert made.tracks['/map'].latched == 1
-    assert made.tracks['/a'].profiles[0].durability == 'volatile'
-    assert made.tracks['/a'].type_name == TEXT
+    assert made.topics['/map'].transient_local_count == 1
+    assert made.topics['/a'].offered_qos_profiles[0].durability == 'volatile'
+    assert made.topics['/a'].type_name == TEXT
 
 
 def test_reading_from_any_time_on_gives_the_same_messages(write, tape, tmp_path):
@@ -186,7 +186,7 @@ def test_a_single_file_is_a_bag_too(tape, tmp_path):
 
 
 def test_a_continued_bag_is_one_sequence(tape, tmp_path):
-    """Files of a split may overlap: the recorder stamps by receipt, writes in the order heard."""
+    """The time ranges of consecutive files may overlap."""
     one, two = ticks(60), [(topic, at + 55 * SECOND // 100) for topic, at in ticks(60)]
     write_mcap(tmp_path / 'bag', one)
     write_mcap(tmp_path / 'bag', two)
@@ -194,27 +194,27 @@ def test_a_continued_bag_is_one_sequence(tape, tmp_path):
     assert list(tape(tmp_path / 'bag').messages(0)) == sorted(both, key=lambda m: m.stamp_ns)
 
 
-def test_a_file_that_broke_off_is_named_and_the_finished_ones_are_played(tmp_path):
+def test_incomplete_file_is_listed_and_complete_ones_are_played(tmp_path):
     write_mcap(tmp_path / 'bag', ticks(5))
     write_mcap(tmp_path / 'bag', ticks(9))
     torn = tmp_path / 'bag' / 'bag_1.mcap'
     torn.write_bytes(torn.read_bytes()[:-50])
     bag = open_serialized_bag(tmp_path / 'bag')
-    assert bag.unfinished == ('bag_1.mcap',)
+    assert bag.incomplete_files == ('bag_1.mcap',)
     assert bag.end_ns == ticks(5)[-1][1]
     bag.close()
-    with pytest.raises(BagError, match='bag_1.mcap: bag recover'):
+    with pytest.raises(BagError, match='bag_1.mcap: run t3mpc bag recover'):
         open_serialized_bag(torn)
 
 
-def test_what_is_no_bag_is_refused(tmp_path):
+def test_path_without_a_bag_is_rejected(tmp_path):
     (tmp_path / 'notes.txt').write_text('hello')
     (tmp_path / 'empty').mkdir()
     (tmp_path / 'broken.db3').write_bytes(b'no database' * 100)
     for path, words in (
         ('nowhere', 'there is no bag'),
         ('notes.txt', 'cannot be read'),
-        ('empty', 'no finished bag file'),
+        ('empty', 'no complete bag file'),
         ('broken.db3', 'cannot be read'),
     ):
         with pytest.raises(BagError, match=words):
@@ -240,7 +240,7 @@ def test_bags_are_merged_by_time_of_receipt(tape, tmp_path):
     two = write_sqlite(tmp_path / 'two', [('/b', START + i * 1000) for i in range(0, 50, 5)])
     merged = list(tape(one, two).messages(0))
     assert len(merged) == 25 + 10
-    # Equal times: the bag that was named first comes first.
+    # Equal times: in the order of the bags.
     assert merged == sorted(merged, key=lambda m: (m.stamp_ns, m.topic))
     turned = list(tape(two, one).messages(0))
     assert [m.topic for m in turned[:2]] == ['/b', '/a']
@@ -270,10 +270,10 @@ def test_one_name_with_two_types_is_refused(tmp_path):
     bags = [open_serialized_bag(folder) for folder in folders]
     with pytest.raises(BagError, match='/x is std_msgs/msg/String and std_msgs/msg/Float64'):
         MergedReader(bags)
-    MergedReader(bags, selection=PlayTopicFilter(exclude=('x',))).close()
+    MergedReader(bags, topic_filter=PlayTopicFilter(exclude_topics=('x',))).close()
 
 
-# -- choosing and renaming ------------------------------------------------------------------------
+# -- filter and remapping -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -281,42 +281,42 @@ def test_one_name_with_two_types_is_refused(tmp_path):
     [
         ({}, ['/cmd_vel', '/odom', '/range/left', '/range/right', '/tf']),
         ({'topics': ('range/*', 'tf')}, ['/range/left', '/range/right', '/tf']),
-        ({'topics': ('*',), 'exclude': ('/range/*',)}, ['/cmd_vel', '/odom', '/tf']),
+        ({'topics': ('*',), 'exclude_topics': ('/range/*',)}, ['/cmd_vel', '/odom', '/tf']),
         ({'regex': '/(odom|range/l.*)'}, ['/odom', '/range/left']),
         ({'regex': '/odo'}, []),
         ({'regex': '/tf', 'topics': ('odom',)}, ['/odom', '/tf']),
-        ({'exclude_regex': '.*range.*|/tf', 'exclude': ('cmd_vel',)}, ['/odom']),
+        ({'exclude_regex': '.*range.*|/tf', 'exclude_topics': ('cmd_vel',)}, ['/odom']),
     ],
 )
 def test_topics_are_chosen_by_name_pattern_and_expression(choice, played):
     names = ['/cmd_vel', '/odom', '/range/left', '/range/right', '/tf']
-    assert list(filter(PlayTopicFilter(**choice).selects, names)) == played
+    assert list(filter(PlayTopicFilter(**choice).matches, names)) == played
 
 
-def test_renamed_topics_come_under_their_new_name_and_may_meet(tape, tmp_path):
+def test_remapped_topics_have_new_names_and_may_merge(tape, tmp_path):
     folder = write_mcap(tmp_path / 'bag', ticks(3))
-    made = tape(folder, remap=parse_remappings(['a:=/x/y', '/b := x/y']))
+    made = tape(folder, remappings=parse_remappings(['a:=/x/y', '/b := x/y']))
     assert [m.topic for m in made.messages(0)] == ['/x/y'] * 2 + ['/map'] + ['/x/y'] * 4
     assert [m.data for m in made.messages(0)] == [m.data for m in expected(ticks(3))]
-    assert made.recorded['/x/y'] == {'/a', '/b'}
-    assert made.tracks['/x/y'].message_count == 6
+    assert made.recorded_names['/x/y'] == {'/a', '/b'}
+    assert made.topics['/x/y'].message_count == 6
     made.exclude_topic('/x/y')
     assert [m.topic for m in made.messages(0)] == ['/map']
 
 
 @pytest.mark.parametrize('items', [['a'], ['a:='], [':=b'], ['a:=b', '/a:=c']])
-def test_a_renaming_that_says_nothing_is_refused(items):
-    with pytest.raises(PlayTopicFilterError, match='remap must'):
+def test_invalid_remapping_is_rejected(items):
+    with pytest.raises(TopicFilterError, match='play.topic_remapping_options must'):
         parse_remappings(items)
 
 
-def test_a_bad_expression_is_named():
-    with pytest.raises(PlayTopicFilterError, match='exclude_regex must be a regular expression'):
+def test_invalid_regex_of_the_player_is_rejected():
+    with pytest.raises(TopicFilterError, match='play.exclude_regex must be a regular expression'):
         PlayTopicFilter(exclude_regex='(')
 
 
 @pytest.mark.parametrize(
-    'recorded, name, kind, dangerous',
+    'recorded, name, kind, risky',
     [
         ('/cmd_vel', '/cmd_vel', 'geometry_msgs/msg/Twist', True),
         ('/robot_1/cmd_vel', '/robot_1/cmd_vel', 'geometry_msgs/msg/TwistStamped', True),
@@ -328,8 +328,8 @@ def test_a_bad_expression_is_named():
         ('/odom', '/odom', 'nav_msgs/msg/Odometry', False),
     ],
 )
-def test_what_could_drive_a_robot_is_known(recorded, name, kind, dangerous):
-    assert bool(velocity_command_risk(recorded, name, kind)) == dangerous
+def test_topics_that_may_drive_a_robot_are_detected(recorded, name, kind, risky):
+    assert bool(velocity_command_risk(recorded, name, kind)) == risky
 
 
 # -- quality of service ---------------------------------------------------------------------------
@@ -345,15 +345,13 @@ WEAK = QosProfile(reliability='best_effort')
         ([WEAK, QosProfile()], 'reliable', 'volatile', PUBLISHER_DEPTH),
         ([LATCHED], 'reliable', 'transient_local', 1),
         ([LATCHED, WEAK, LATCHED], 'reliable', 'transient_local', 2),
-        # What Fast DDS reports of a latched publisher in another process.
+        # As reported by Fast DDS for a latched publisher of another process.
         ([QosProfile('unknown', 0, 'reliable', LATCHED.durability)],)
         + ('reliable', 'transient_local', 1),
         ([QosProfile(reliability='unknown')], 'reliable', 'volatile', PUBLISHER_DEPTH),
     ],
 )
-def test_the_offer_satisfies_whoever_heard_the_recorded_publishers(
-    recorded, reliability, durability, depth
-):
+def test_offer_is_compatible_with_recorded_subscriptions(recorded, reliability, durability, depth):
     offer = adapt_offer_to_recorded_offers(recorded)
     assert (offer.reliability, offer.durability, offer.depth) == (reliability, durability, depth)
     assert offer.history == 'keep_last'
@@ -391,7 +389,7 @@ def test_overrides_are_read_as_ros2_bag_reads_them(tmp_path):
 @pytest.mark.parametrize(
     'content, words',
     [
-        ('[1, 2]', 'profiles by topic: got list'),
+        ('[1, 2]', 'must contain profiles by topic: got list'),
         ('/a: {reliabilty: reliable}', "/a: 'reliabilty' is none of history"),
         ('/a: {reliability: strong}', '/a: reliability must be one of'),
         ('/a: {deadline: 5}', '/a: deadline must have sec and nsec'),
@@ -409,7 +407,7 @@ def test_overrides_that_ros2_bag_would_refuse_are_refused(content, words, tmp_pa
 # -- latched topics -------------------------------------------------------------------------------
 
 
-def test_what_latched_topics_hold_comes_before_any_later_start(write, tape, tmp_path):
+def test_latched_messages_precede_any_later_start(write, tape, tmp_path):
     made = tape(write(tmp_path / 'bag', ticks()))
     written = [m for m in expected(ticks()) if m.topic == '/map']
     for start in (START, START + 1, START + 2, START + SECOND // 2 + 1, made.end_ns, 2 * START):
@@ -417,8 +415,8 @@ def test_what_latched_topics_hold_comes_before_any_later_start(write, tape, tmp_
         assert made.latched_messages_before(start) == earlier[-1:]
 
 
-def test_several_latched_topics_come_in_the_order_in_which_they_were_received(tape, tmp_path):
-    """A message hours back is found, too: /old was said once, at the very beginning."""
+def test_several_latched_topics_are_in_order_of_receipt(tape, tmp_path):
+    """A message from hours before is found: /old was published once, at the beginning."""
     messages = [('/old', START), ('/map', START + 2)]
     messages += [('/a', START + 10 * i * SECOND) for i in range(1, 400)]
     messages += [('/robot', START + 3000 * SECOND + 1), ('/map', START + 3990 * SECOND + 1)]
@@ -430,27 +428,31 @@ def test_several_latched_topics_come_in_the_order_in_which_they_were_received(ta
     assert [m.topic for m in made.latched_messages_before(2 * START)] == ['/old', '/robot', '/map']
 
 
-def test_a_topic_with_two_latched_publishers_keeps_a_message_of_each(tape, tmp_path):
-    """Of /tf_static one message was restored once, and half of the robot had no frame."""
+def test_two_latched_publishers_keep_a_message_each(tape, tmp_path):
+    """One restored message of /tf_static would leave half of the robot without frames."""
     with BagWriter(tmp_path / 'bag', metadata_records={}) as bag:
         bag.add_topic('/tf_static', TEXT, [LATCHED, LATCHED])
         for i in range(3):
             bag.write('/tf_static', START + i, START, text(str(i)))
-    held = tape(tmp_path / 'bag').latched_messages_before(START + 10)
-    assert [m.data for m in held] == [text('1'), text('2')]
+    kept = tape(tmp_path / 'bag').latched_messages_before(START + 10)
+    assert [m.data for m in kept] == [text('1'), text('2')]
 
 
 # -- playing --------------------------------------------------------------------------------------
 
 
 class Player:
-    """A playback, the time it is driven with, and everything it has said."""
+    """Timeline with a virtual clock and the list of due messages."""
 
     def __init__(self, tape, begin_ns=None, end_ns=None, loop=False, **more):
         begin_ns = tape.start_ns if begin_ns is None else begin_ns
         end_ns = tape.end_ns if end_ns is None else end_ns
         self.made = PlaybackTimeline(
-            lambda at: tape.plan(at, begin_ns, end_ns, loop), begin_ns, end_ns, loop=loop, **more
+            lambda at: tape.schedule(at, begin_ns, end_ns, loop),
+            begin_ns,
+            end_ns,
+            loop=loop,
+            **more,
         )
         self.now = 7 * SECOND
         self.wake = self.now
@@ -465,12 +467,12 @@ class Player:
         return [now - e.due_ns for now, e in self.out if e.message is not None]
 
     def ask(self, most=20):
-        emissions, self.wake = self.made.due(self.now, most)
+        emissions, self.wake = self.made.due_messages(self.now, most)
         assert len([e for e in emissions if e.message]) <= most
         self.out += [(self.now, e) for e in emissions]
 
     def run(self, until_ns=None):
-        """Ask whenever told to, as a caller that is never late; return when nothing is left."""
+        """Call at the returned times, until nothing is due any more."""
         while self.wake is not None and (until_ns is None or self.wake <= until_ns):
             self.now = max(self.now, self.wake)
             self.ask()
@@ -484,7 +486,7 @@ def bag(tape, tmp_path):
     return tape(write_mcap(tmp_path / 'bag', ticks()))
 
 
-def test_each_message_comes_at_its_time(bag):
+def test_each_message_is_due_at_its_time(bag):
     player = Player(bag).run()
     assert player.messages == expected(ticks())
     assert player.made.finished
@@ -494,7 +496,7 @@ def test_each_message_comes_at_its_time(bag):
 
 
 @pytest.mark.parametrize('rate', [0.01, 0.3, 1.0, 1.1**7, 100.0])
-def test_the_rate_stretches_time_exactly(bag, rate):
+def test_rate_scales_time_exactly(bag, rate):
     player = Player(bag, rate=rate).run()
     first = player.out[0][0]
     for now, emission in player.out:
@@ -502,7 +504,7 @@ def test_the_rate_stretches_time_exactly(bag, rate):
     assert player.messages == expected(ticks())
 
 
-def test_late_messages_come_at_once_and_in_order(bag):
+def test_late_messages_are_due_immediately_and_in_order(bag):
     player = Player(bag)
     player.ask()
     player.ask()
@@ -514,33 +516,33 @@ def test_late_messages_come_at_once_and_in_order(bag):
     assert player.errors[-1] == 0
 
 
-def test_start_offset_and_end_cut_the_bag_and_the_map_comes_first(bag):
+def test_start_offset_and_end_select_a_range_after_the_map(bag):
     begin, end = START + SECOND // 2 + 2, START + SECOND
     player = Player(bag, begin, end).run()
     inside = [m for m in expected(ticks()) if begin <= m.stamp_ns <= end]
-    (held,) = bag.latched_messages_before(begin)
-    assert player.messages == [held, *inside]
+    (kept,) = bag.latched_messages_before(begin)
+    assert player.messages == [kept, *inside]
     assert inside[-1].stamp_ns == end
-    assert player.out[0][1].stamp_ns == begin, 'the clock does not tell an earlier time'
+    assert player.out[0][1].stamp_ns == begin, 'the clock does not start earlier'
 
 
-def test_laps_follow_each_other_without_a_gap_or_drift(bag):
+def test_loops_are_consecutive_without_gap_or_drift(bag):
     begin, end = START + SECOND // 2 + 2, START + SECOND + 5_000_000
     player = Player(bag, begin, end, loop=True, rate=0.7)
     player.run(player.now + int(100.5 * (end - begin) / 0.7))
-    lap = [e.message for e in (e for _, e in Player(bag, begin, end).run().out)]
-    assert player.messages[: 100 * len(lap)] == lap * 100
+    loop_messages = [e.message for e in (e for _, e in Player(bag, begin, end).run().out)]
+    assert player.messages[: 100 * len(loop_messages)] == loop_messages * 100
     whole = (end - begin) / 0.7
-    # The first of each lap is what the latched topic held before it.
+    # Each loop begins with the latched message from before it.
     for first in range(2):
-        times = [now for now, _ in player.out[first :: len(lap)]]
+        times = [now for now, _ in player.out[first :: len(loop_messages)]]
         assert len(times) == 101
         for number, now in enumerate(times):
             assert now - times[0] == pytest.approx(number * whole, abs=2)
     assert player.made.loops(player.now) == 100
 
 
-def test_a_single_message_in_a_loop_does_not_play_without_end_at_once(tape, tmp_path):
+def test_loop_of_a_single_message_has_a_minimum_duration(tape, tmp_path):
     made = tape(write_mcap(tmp_path / 'bag', [('/a', START)]))
     player = Player(made, loop=True)
     player.run(player.now + 10 * MIN_LOOP_NS)
@@ -551,7 +553,7 @@ def test_a_single_message_in_a_loop_does_not_play_without_end_at_once(tape, tmp_
     assert player.messages == []
 
 
-def test_a_seek_goes_on_there_with_what_latched_topics_held(bag):
+def test_seek_continues_with_latched_messages(bag):
     player = Player(bag)
     player.run(player.now + SECOND // 4)
     count = len(player.messages)
@@ -569,65 +571,65 @@ def test_a_seek_goes_on_there_with_what_latched_topics_held(bag):
         assert words in player.made.seek(player.now, stamp)
 
 
-def test_a_seek_while_paused_shows_the_latched_topics_and_waits(bag):
+def test_seek_while_paused_plays_only_latched_messages(bag):
     player = Player(bag, paused=True)
     player.made.seek(player.now, START + SECOND)
     player.run()
     assert player.messages == bag.latched_messages_before(START + SECOND)
     assert player.wake is None
-    assert player.made.stamp_ns(player.now + SECOND) == START + SECOND
+    assert player.made.bag_time_ns(player.now + SECOND) == START + SECOND
 
 
-def test_steps_take_one_message_each_and_only_while_paused(bag):
+def test_play_next_plays_messages_only_while_paused(bag):
     player = Player(bag, paused=True).run()
     assert player.messages == []
     for count in (1, 2, 30):
-        assert player.made.step(player.now, count) == ''
+        assert player.made.play_next(player.now, count) == ''
         before = len(player.messages)
         player.wake = player.now
         player.run()
         assert len(player.messages) == before + count
-        assert player.made.stamp_ns(player.now) == player.messages[-1].stamp_ns
+        assert player.made.bag_time_ns(player.now) == player.messages[-1].stamp_ns
         assert player.wake is None
-    assert 'from 1' in player.made.step(player.now, 0)
+    assert 'at least 1' in player.made.play_next(player.now, 0)
     player.made.resume(player.now)
-    assert 'paused' in player.made.step(player.now)
+    assert 'paused' in player.made.play_next(player.now)
     player.wake = player.now
     player.run()
     assert player.messages == expected(ticks())
     player.made.pause(player.now)
-    assert 'no next message' in player.made.step(player.now)
+    assert 'no next message' in player.made.play_next(player.now)
 
 
-def test_stepping_across_the_end_of_a_lap_does_not_show_the_map_too_early(bag):
+def test_stepping_into_the_next_loop_does_not_play_the_map_early(bag):
     begin = START + 2
     player = Player(bag, begin, START + SECOND // 100 + 1000, loop=True, paused=True).run()
-    heard = ['/map']
-    assert [m.topic for m in player.messages] == heard
+    played = ['/map']
+    assert [m.topic for m in player.messages] == played
     for more in (['/a'], ['/b'], ['/map', '/a']):
-        player.made.step(player.now)
+        player.made.play_next(player.now)
         player.wake = player.now
         player.run()
-        heard += more
-        assert [m.topic for m in player.messages] == heard
+        played += more
+        assert [m.topic for m in player.messages] == played
 
 
-def test_a_seek_forgets_steps_that_were_not_taken(bag):
+def test_seek_cancels_pending_steps(bag):
     player = Player(bag, paused=True).run()
-    player.made.step(player.now, 5)
+    player.made.play_next(player.now, 5)
     player.made.seek(player.now, START)
     player.wake = player.now
     assert player.run().messages == []
 
 
 @pytest.mark.parametrize('seed', range(40))
-def test_no_programme_of_pauses_rates_and_steps_skips_or_repeats_a_message(bag, seed):
-    """Whatever is asked for, and however late the caller: between seeks the order is the bag's."""
+def test_no_sequence_of_commands_skips_or_repeats_a_message(bag, seed):
+    """Between seeks the order is that of the bag, for any commands and delays of the caller."""
     rng = random.Random(seed)
     loop = seed % 4 == 0
     player = Player(bag, loop=loop, paused=seed % 3 == 0, clock_rate=rng.choice([0.0, 40.0]))
     made, now = player.made, player.now
-    written, heard, sought = expected(ticks()), [], False
+    written, played, sought = expected(ticks()), [], False
     sequences = []
     for _ in range(150):
         action = rng.randrange(8)
@@ -638,7 +640,7 @@ def test_no_programme_of_pauses_rates_and_steps_skips_or_repeats_a_message(bag, 
         elif action == 2:
             made.set_rate(player.now, rng.choice([0.01, 0.5, 1.0, 3.7, 100.0, rng.random() + 0.1]))
         elif action == 3:
-            made.step(player.now, rng.randrange(1, 6))
+            made.play_next(player.now, rng.randrange(1, 6))
         elif action == 4 and rng.random() < 0.2:
             sequences.append((sought, player.messages))
             player.out.clear()
@@ -657,34 +659,34 @@ def test_no_programme_of_pauses_rates_and_steps_skips_or_repeats_a_message(bag, 
         player.run()
         assert made.finished
     sequences.append((sought, player.messages))
-    for sought, heard in sequences:
+    for sought, played in sequences:
         whole = written
         if sought is not False:
             rest = [m for m in written if m.stamp_ns >= sought]
             whole = [*bag.latched_messages_before(sought), *rest]
         if loop:
             whole = whole + written * 50
-        assert heard == whole[: len(heard)]
+        assert played == whole[: len(played)]
     if not loop:
-        assert len(heard) == len(whole)
+        assert len(played) == len(whole)
 
 
-def test_place_and_time_left_follow_the_rate(bag):
+def test_position_and_remaining_time_follow_the_rate(bag):
     player = Player(bag, rate=2.0)
     player.run(player.now + SECOND // 4)
-    assert player.made.stamp_ns(player.now) == START + SECOND // 2
+    assert player.made.bag_time_ns(player.now) == START + SECOND // 2
     assert player.made.remaining_ns(player.now) == (bag.end_ns - START - SECOND // 2) // 2
     player.made.set_rate(player.now, 0.5)
-    assert player.made.stamp_ns(player.now) == START + SECOND // 2
+    assert player.made.bag_time_ns(player.now) == START + SECOND // 2
     assert player.made.remaining_ns(player.now) == (bag.end_ns - START - SECOND // 2) * 2
     player.made.pause(player.now)
-    assert player.made.stamp_ns(player.now + SECOND) == START + SECOND // 2
+    assert player.made.bag_time_ns(player.now + SECOND) == START + SECOND // 2
     for rate in (0.0, -1.0, float('nan'), float('inf')):
         with pytest.raises(ValueError, match='rate must be a positive number'):
             player.made.set_rate(player.now, rate)
 
 
-def test_the_clock_is_told_at_its_rate_and_never_runs_backwards(bag):
+def test_clock_has_its_rate_and_is_monotonic(bag):
     player = Player(bag, clock_rate=40.0, rate=0.5).run()
     clock = [(now, e.stamp_ns) for now, e in player.out if e.message is None]
     assert {b - a for (a, _), (b, _) in pairwise(clock)} == {SECOND // 40}
@@ -694,7 +696,7 @@ def test_the_clock_is_told_at_its_rate_and_never_runs_backwards(bag):
     assert all(stamp == START + (now - first) // 2 for now, stamp in clock)
 
 
-def test_the_clock_is_told_while_time_stands(bag):
+def test_clock_is_published_while_paused(bag):
     player = Player(bag, clock_rate=10.0, paused=True)
     player.run(player.now + SECOND)
     assert [e.stamp_ns for _, e in player.out] == [START] * 11
@@ -704,7 +706,7 @@ def test_reading_the_first_message_does_not_make_it_late(bag):
     player = Player(bag)
     player.ask()
     assert player.out == []
-    player.now += SECOND // 2  # so long it took to find the first message
+    player.now += SECOND // 2  # time to find the first message
     player.run()
     assert set(player.errors) == {0}
 
@@ -716,7 +718,7 @@ def test_reading_ahead_changes_nothing_and_ends_when_closed(bag):
     before = threading.active_count()
     player = Player(bag)
     made = PlaybackTimeline(
-        lambda at: ReadAheadQueue(bag.plan(at, bag.start_ns, bag.end_ns, True), 100),
+        lambda at: ReadAheadQueue(bag.schedule(at, bag.start_ns, bag.end_ns, True), 100),
         bag.start_ns,
         bag.end_ns,
         loop=True,
@@ -735,7 +737,7 @@ def test_reading_ahead_changes_nothing_and_ends_when_closed(bag):
     assert threading.active_count() == before
 
 
-def test_reading_ahead_is_bounded_and_hands_an_error_over_in_its_place():
+def test_read_ahead_is_bounded_and_raises_errors_in_place():
     taken = []
 
     def source():
@@ -756,15 +758,15 @@ def test_reading_ahead_is_bounded_and_hands_an_error_over_in_its_place():
     stream.close()
 
 
-# -- lateness -------------------------------------------------------------------------------------
+# -- latency --------------------------------------------------------------------------------------
 
 
-def test_percentiles_of_lateness_are_right_within_two_percent():
+def test_latency_percentiles_have_an_error_of_two_percent():
     rng = random.Random(3)
     values = [round(rng.lognormvariate(11.0, 1.5)) for _ in range(5000)]
     statistics = LatencyHistogram()
     for value in values:
-        statistics.note(value)
+        statistics.add(value)
     ranked = sorted(max(value, 1000) for value in values)
     for percent in (1, 50, 90, 99, 100):
         exact = ranked[max(0, -(-percent * len(ranked) // 100) - 1)]
@@ -775,13 +777,16 @@ def test_percentiles_of_lateness_are_right_within_two_percent():
     assert LatencyHistogram().percentile_ns(99) == 0
 
 
-def test_planned_messages_keep_their_place_when_a_seek_starts_a_loop(bag):
+def test_schedule_keeps_positions_when_a_seek_starts_a_loop(bag):
     begin, end = bag.start_ns, bag.end_ns
-    stream = bag.plan(START + SECOND, begin, end, loop=True)
+    stream = bag.schedule(START + SECOND, begin, end, loop=True)
     planned = [next(stream) for _ in range(700)]
     assert planned[0] == ScheduledMessage(
         SECOND, START + SECOND, bag.latched_messages_before(START + SECOND)[0], restored=True
     )
     assert [p.at_ns for p in planned] == sorted(p.at_ns for p in planned)
-    lap = end - begin
-    assert next(p for p in planned if p.at_ns == lap and p.stamp_ns == begin).message.topic == '/a'
+    loop_ns = end - begin
+    assert (
+        next(p for p in planned if p.at_ns == loop_ns and p.stamp_ns == begin).message.topic
+        == '/a'
+    )

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Bags read by Foxglove's Go library, on which its desktop tools rest: ``mcap_check/go``."""
+"""Bags read by the Go library of Foxglove: ``test/support/mcap_check/go``."""
 
 import base64
 import json
@@ -17,7 +17,7 @@ from t3mpc_ros.bag.mcap_file import finalize_file
 from t3mpc_ros.bag.qos import QosProfile, profiles_to_yaml
 from t3mpc_ros.bag.writer import Attachment, BagWriter
 
-SOURCES = Path(__file__).parents[1] / 'mcap_check' / 'go'
+SOURCES = Path(__file__).parents[1] / 'support' / 'mcap_check' / 'go'
 STORE = get_typestore(Stores.ROS2_JAZZY)
 NUMBER, TEXT = 'std_msgs/msg/Float64', 'std_msgs/msg/String'
 START = 1_700_000_000_123_456_789
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.skipif(GO is None, reason='go is not installed')
 
 @pytest.fixture(scope='module')
 def check(tmp_path_factory):
-    """Return a function that runs the program on files; skip where it cannot be built."""
+    """Return a function that runs the program on files; skip if it cannot be built."""
     folder = tmp_path_factory.mktemp('mcap_check_go')
     for path in SOURCES.iterdir():
         shutil.copy(path, folder)
@@ -129,7 +129,7 @@ def test_go_reads_every_file_of_a_bag(tmp_path, check):
     assert values == [digest(number, range(100 * p, 100 * p + 100)) for p in range(3)]
 
 
-def test_go_reads_a_file_that_was_finished_later(tmp_path, check):
+def test_go_reads_a_finalized_file(tmp_path, check):
     with BagWriter(tmp_path / 'run', metadata_records=DETAILS, chunk_bytes=32 * 1024) as bag:
         fill(bag, 900)
     bag.path.write_bytes(bag.path.read_bytes()[: bag.path.stat().st_size // 2])
@@ -163,7 +163,7 @@ def test_attachments_are_read_and_their_checksums_verified(tmp_path, check):
 
 @pytest.mark.parametrize('part', ['chunk', 'summary', 'cut'])
 def test_the_check_notices_damage(tmp_path, check, part):
-    """The program would prove nothing if it did not fail on a damaged bag."""
+    """The program must fail on a damaged bag."""
     with BagWriter(tmp_path / 'run', metadata_records=DETAILS) as bag:
         fill(bag, 300)
     content = bytearray(bag.path.read_bytes())

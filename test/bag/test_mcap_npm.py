@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""A bag read by the JavaScript libraries that web viewers use, in ``mcap_check/check.mjs``."""
+"""Bags read by the JavaScript libraries of web viewers: ``test/support/mcap_check/check.mjs``."""
 
 import base64
 import json
@@ -16,7 +16,7 @@ from t3mpc_ros.bag.mcap_file import finalize_file
 from t3mpc_ros.bag.qos import QosProfile, profiles_to_yaml
 from t3mpc_ros.bag.writer import Attachment, BagWriter
 
-SOURCES = Path(__file__).parents[1] / 'mcap_check'
+SOURCES = Path(__file__).parents[1] / 'support' / 'mcap_check'
 STORE = get_typestore(Stores.ROS2_JAZZY)
 ODOM, NUMBER = 'nav_msgs/msg/Odometry', 'std_msgs/msg/Float64'
 START = 1_700_000_000_123_456_789
@@ -105,7 +105,7 @@ def test_web_viewers_read_the_whole_bag(tmp_path, check):
     assert found['last']['/number'] == {'data': 299}
 
 
-def test_web_viewers_read_a_file_that_was_finished_later(tmp_path, check):
+def test_web_viewers_read_a_finalized_file(tmp_path, check):
     with BagWriter(tmp_path / 'run', metadata_records=DETAILS, chunk_bytes=64 * 1024) as bag:
         fill(bag, 300)
     bag.path.write_bytes(bag.path.read_bytes()[: bag.path.stat().st_size // 2])
@@ -153,7 +153,7 @@ def test_attachments_are_read_and_their_checksums_verified(tmp_path, check):
 
 @pytest.mark.parametrize('part', ['chunk', 'summary'])
 def test_the_check_notices_a_flipped_bit(tmp_path, check, part):
-    """The script would prove nothing if it did not fail on a damaged bag."""
+    """The script must fail on a damaged bag."""
     with BagWriter(tmp_path / 'run', metadata_records=DETAILS) as bag:
         fill(bag, 50)
     content = bytearray(bag.path.read_bytes())

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""What is recorded, what waits, what is kept for a snapshot: all in virtual time."""
+"""Topic filter, message queue, split files, attachments, snapshots, monitor: in virtual time."""
 
 import threading
 
@@ -11,6 +11,7 @@ from rosbags.rosbag2 import Reader
 from t3mpc_ros.bag import writer
 from t3mpc_ros.bag.mcap_file import finalize_file, read_file_summary
 from t3mpc_ros.bag.metadata import read_metadata
+from t3mpc_ros.bag.player import PlaybackParameters
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recording.diagnostics_monitor import (
     REPORT_TIMEOUT_NS,
@@ -22,7 +23,7 @@ from t3mpc_ros.bag.recording.message_queue import MessageQueue
 from t3mpc_ros.bag.recording.recording_parameters import RecordingParameters
 from t3mpc_ros.bag.recording.snapshot import CircularMessageCache, unused_folder, write_snapshot
 from t3mpc_ros.bag.recording.split_writer import SplitWriter, message_loss_record
-from t3mpc_ros.bag.topic_filter import TopicFilter, TopicFilterError
+from t3mpc_ros.bag.topic_filter import PlayTopicFilter, TopicFilter, TopicFilterError
 from t3mpc_ros.bag.writer import (
     MESSAGE_OVERHEAD,
     Attachment,
@@ -51,7 +52,7 @@ def message(topic, seconds, size=12, fill=1):
 
 
 def noise(seconds, size=2000):
-    """Return a message that does not become smaller by compression."""
+    """Return an incompressible message."""
     import random
 
     data = random.Random(seconds).randbytes(size)
@@ -72,11 +73,11 @@ def attachments(path):
         return list(make_reader(file, validate_crcs=True).iter_attachments())
 
 
-# -- selection ------------------------------------------------------------------------------------
+# -- topic filter ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    'topic, wanted',
+    'topic, recorded',
     [
         ('/a/odom', True),
         ('/odom', False),
@@ -92,19 +93,73 @@ def attachments(path):
         ('/a/_named', True),
     ],
 )
-def test_names_patterns_and_expressions_select_and_exclude_has_the_last_word(topic, wanted):
+def test_names_patterns_and_regex_select_exclusion_overrides(topic, recorded):
     selection = TopicFilter(
         ['/a/odom', '/diagnostics', '/a/_named', '/a/imu/secret'],
         ['odom', 'imu/*', '/diagnostics', '_named'],
         regex='/camera/(image|info)',
-        exclude='.*/secret',
+        exclude_regex='.*/secret',
         namespace='/a',
     )
-    assert selection.matches(topic) == wanted
+    assert selection.matches(topic) == recorded
+
+
+@pytest.mark.parametrize(
+    'exclusion, excluded',
+    [
+        ({}, []),
+        ({'exclude_topics': ['odom']}, ['/odom']),
+        ({'exclude_topics': ['/range/*']}, ['/range/left', '/range/right']),
+        ({'exclude_topics': ['range/l*', '/tf']}, ['/range/left', '/tf']),
+        ({'exclude_topics': ['*/left']}, ['/range/left']),
+        ({'exclude_topics': ['range']}, []),
+        ({'exclude_topics': ['/range/(left|right)']}, []),
+        ({'exclude_regex': '/range/(left|right)'}, ['/range/left', '/range/right']),
+        ({'exclude_regex': '/range/*'}, []),
+        ({'exclude_regex': 'odom'}, []),
+        ({'exclude_topics': ['tf'], 'exclude_regex': '.*dom'}, ['/odom', '/tf']),
+    ],
+)
+def test_recorder_and_player_exclude_the_same_topics(exclusion, excluded):
+    """Names with wildcards and a regular expression on the full name, in both."""
+    topics = ['/odom', '/range/left', '/range/right', '/tf']
+    kept = [topic for topic in topics if topic not in excluded]
+    assert [t for t in topics if TopicFilter(topics, **exclusion).matches(t)] == kept
+    assert [t for t in topics if PlayTopicFilter(**exclusion).matches(t)] == kept
+
+
+def test_parameters_exclude_the_same_in_recorder_and_player():
+    names, regex = ['*/left'], '/o.*'
+    record = RecordingParameters.from_dict(
+        {'record.exclude_topics': names, 'record.exclude_regex': regex}
+    )
+    play = PlaybackParameters.from_dict(
+        {'play.exclude_topics': names, 'play.exclude_regex': regex}
+    )
+    assert record.exclude_topics == play.exclude_topics == ('*/left',)
+    assert record.exclude_regex == play.exclude_regex == '/o.*'
+    for topic, kept in {'/odom': False, '/range/left': False, '/range/right': True}.items():
+        assert play.topic_filter().matches(topic) == kept
+        recorded = TopicFilter(
+            [topic],
+            exclude_topics=record.exclude_topics,
+            exclude_regex=record.exclude_regex,
+        )
+        assert recorded.matches(topic) == kept
+
+
+def test_relative_exclusion_is_in_the_namespace_of_the_recorder():
+    selection = TopicFilter(
+        ['/a/odom', '/odom'], exclude_topics=['odom', '*/secret'], namespace='/a'
+    )
+    assert not selection.matches('/a/odom')
+    assert selection.matches('/odom')
+    both = TopicFilter([], ['/*'], exclude_topics=['*/secret'], namespace='/a')
+    assert not both.matches('/b/secret')
 
 
 def test_a_type_selects_whatever_the_name():
-    selection = TopicFilter([], types=[NUMBER], exclude='/not')
+    selection = TopicFilter([], types=[NUMBER], exclude_regex='/not')
     assert selection.matches('/any', ['std_msgs/msg/String', NUMBER])
     assert not selection.matches('/any', ['std_msgs/msg/String'])
     assert not selection.matches('/not', [NUMBER])
@@ -112,87 +167,89 @@ def test_a_type_selects_whatever_the_name():
     assert not selection.matches('/any')
 
 
-def test_the_controller_s_journal_is_recorded_by_default():
+def test_controller_journal_is_recorded_by_default():
     parameters = RecordingParameters()
     selection = TopicFilter([], parameters.topics, namespace='/robot')
     for name in ('controller/journal', 'controller/parameters', 'controller/terms/reach/left'):
         assert selection.matches(f'/robot/{name}')
 
 
-@pytest.mark.parametrize('name', ['regex', 'exclude'])
-def test_what_is_no_regular_expression_is_refused_with_name_place_and_value(name):
-    with pytest.raises(TopicFilterError, match=rf"{name} must be .*'a\(b'.*position 1"):
+@pytest.mark.parametrize('name', ['regex', 'exclude_regex'])
+def test_invalid_regex_is_rejected_with_name_position_and_value(name):
+    with pytest.raises(TopicFilterError, match=rf"record\.{name} must be .*'a\(b'.*position 1"):
         TopicFilter([], **{name: 'a(b'})
-    with pytest.raises(ParameterError, match=rf"{name} must be .*'a\(b'.*position 1"):
-        RecordingParameters.from_dict({name: 'a(b'})
+    with pytest.raises(ParameterError, match=rf"record\.{name} must be .*'a\(b'.*position 1"):
+        RecordingParameters.from_dict({f'record.{name}': 'a(b'})
 
 
-def test_settings_that_record_nothing_or_name_no_type_are_refused():
-    with pytest.raises(ParameterError, match='snapshot_time must be above 0'):
-        RecordingParameters.from_dict({'snapshot_only': True, 'snapshot_time': 0.0})
-    with pytest.raises(ParameterError, match="types must be .* got 'Odometry'"):
-        RecordingParameters.from_dict({'types': ['Odometry']})
+def test_empty_recording_or_invalid_type_is_rejected():
+    with pytest.raises(ParameterError, match='storage.snapshot_duration must be above 0'):
+        RecordingParameters.from_dict(
+            {'storage.snapshot_mode': True, 'storage.snapshot_duration': 0.0}
+        )
+    with pytest.raises(ParameterError, match="record.topic_types must be .* got 'Odometry'"):
+        RecordingParameters.from_dict({'record.topic_types': ['Odometry']})
 
 
-# -- what waits -----------------------------------------------------------------------------------
+# -- message queue --------------------------------------------------------------------------------
 
 
-def test_messages_and_orders_come_out_in_the_order_in_which_they_were_put():
-    backlog = MessageQueue(10_000)
+def test_messages_and_tasks_are_returned_in_order():
+    queue = MessageQueue(10_000)
     one, two, three = (message('/n', i) for i in range(3))
-    order = object()
-    assert backlog.put([one, two]) == {}
-    backlog.order(order)
-    assert backlog.put([three]) == {}
-    assert backlog.take() == [one, two, order, three]
-    assert backlog.take() == []
+    task = object()
+    assert queue.put([one, two]) == {}
+    queue.put_task(task)
+    assert queue.put([three]) == {}
+    assert queue.take() == [one, two, task, three]
+    assert queue.take() == []
 
 
-def test_what_finds_no_room_is_counted_by_topic_and_nothing_after_it_is_let_in():
-    backlog = MessageQueue(3 * (12 + MESSAGE_OVERHEAD))
-    assert backlog.put([message('/a', 0), message('/a', 1)]) == {}
+def test_dropped_messages_are_counted_and_the_rest_dropped_too():
+    queue = MessageQueue(3 * (12 + MESSAGE_OVERHEAD))
+    assert queue.put([message('/a', 0), message('/a', 1)]) == {}
     big, small = message('/b', 2, size=12 + MESSAGE_OVERHEAD + 1), message('/a', 3)
-    assert backlog.put([big, small, small]) == {'/b': 1, '/a': 2}
-    assert backlog.put([small]) == {}
-    assert backlog.put([small]) == {'/a': 1}
-    assert backlog.dropped == {'/b': 1, '/a': 3}
-    backlog.order(print)
-    assert [type(item) for item in backlog.take()[:3]] == [SerializedMessage] * 3
+    assert queue.put([big, small, small]) == {'/b': 1, '/a': 2}
+    assert queue.put([small]) == {}
+    assert queue.put([small]) == {'/a': 1}
+    assert queue.dropped == {'/b': 1, '/a': 3}
+    queue.put_task(print)
+    assert [type(item) for item in queue.take()[:3]] == [SerializedMessage] * 3
 
 
-def test_room_is_free_only_when_what_was_taken_is_done_with():
-    """The bound once held for what waited only: twice as much could be in memory."""
+def test_memory_is_released_by_the_next_take():
+    """The limit includes the batch taken last: its messages are still in memory."""
     item = message('/a', 0)
-    backlog = MessageQueue(2 * item.cost)
-    assert backlog.put([item, item]) == {}
-    assert len(backlog.take()) == 2
-    assert backlog.bytes == 2 * item.cost
-    assert backlog.put([item]) == {'/a': 1}
-    assert backlog.take() == []
-    assert backlog.bytes == 0
-    assert backlog.put([item]) == {}
+    queue = MessageQueue(2 * item.memory_size)
+    assert queue.put([item, item]) == {}
+    assert len(queue.take()) == 2
+    assert queue.bytes == 2 * item.memory_size
+    assert queue.put([item]) == {'/a': 1}
+    assert queue.take() == []
+    assert queue.bytes == 0
+    assert queue.put([item]) == {}
 
 
-def test_every_message_is_either_taken_or_counted_whatever_the_threads_do():
-    backlog = MessageQueue(40 * message('/a', 0).cost)
+def test_every_message_is_taken_or_counted_with_two_threads():
+    queue = MessageQueue(40 * message('/a', 0).memory_size)
     taken, count = [], 4000
 
-    def give():
+    def produce():
         for number in range(count):
-            backlog.put([message('/a', number)])
-        backlog.order('end')
+            queue.put([message('/a', number)])
+        queue.put_task('end')
 
-    giver = threading.Thread(target=give)
-    giver.start()
+    producer = threading.Thread(target=produce)
+    producer.start()
     while 'end' not in taken:
-        taken += backlog.take(0.001)
-    giver.join()
+        taken += queue.take(0.001)
+    producer.join()
     kept = [item.received_ns for item in taken[:-1]]
     assert kept == sorted(kept)
-    assert len(kept) + backlog.dropped.get('/a', 0) == count
+    assert len(kept) + queue.dropped.get('/a', 0) == count
 
 
-# -- files of one recording -----------------------------------------------------------------------
+# -- split files ----------------------------------------------------------------------------------
 
 
 def series(folder, **options):
@@ -201,8 +258,8 @@ def series(folder, **options):
     return made
 
 
-def test_what_is_older_than_the_chunk_time_is_in_the_file_also_in_silence(tmp_path):
-    """A chunk was once closed by the next message only: after the last one none came."""
+def test_messages_older_than_the_chunk_duration_are_in_the_file(tmp_path):
+    """A chunk must be written without a further message."""
     bag = series(tmp_path / 'bag', chunk_ns=SECOND // 2)
     for step in range(40):  # two seconds, ticks of 50 ms
         now = step * SECOND // 20
@@ -217,9 +274,7 @@ def test_what_is_older_than_the_chunk_time_is_in_the_file_also_in_silence(tmp_pa
     assert there == 5
 
 
-def test_the_disk_is_waited_for_at_most_once_a_second_and_only_when_something_is_new(
-    tmp_path, monkeypatch
-):
+def test_disk_sync_at_most_once_per_second_and_only_for_new_data(tmp_path, monkeypatch):
     bag = series(tmp_path / 'bag', chunk_ns=SECOND // 10)
     synced = []
     monkeypatch.setattr(writer.os, 'fsync', synced.append)
@@ -231,8 +286,8 @@ def test_the_disk_is_waited_for_at_most_once_a_second_and_only_when_something_is
     assert 3 <= len(synced) <= 4
 
 
-@pytest.mark.parametrize('options', [{'split_bytes': 20_000}, {'split_ns': SECOND}])
-def test_a_split_recording_has_everything_once_and_each_file_stands_alone(tmp_path, options):
+@pytest.mark.parametrize('options', [{'max_file_bytes': 20_000}, {'max_file_ns': SECOND}])
+def test_split_recording_is_complete_in_self_contained_files(tmp_path, options):
     folder = tmp_path / 'bag'
     bag = series(folder, chunk_bytes=8000, **options)
     bag.add_attachment(Attachment('model.npz', 'application/zip', b'weights', 5), START)
@@ -254,23 +309,23 @@ def test_a_split_recording_has_everything_once_and_each_file_stands_alone(tmp_pa
         assert [(item.name, item.data) for item in attachments(path)] == [
             ('model.npz', b'weights')
         ]
-        if 'split_bytes' in options and path != files[-1]:
+        if 'max_file_bytes' in options and path != files[-1]:
             assert 20_000 <= path.stat().st_size < 20_000 + 12_000
-    if 'split_ns' in options:
+    if 'max_file_ns' in options:
         assert {len(part) for part in parts} == {10}
     with Reader(folder) as reader:
         assert reader.message_count == 50
 
 
 def test_a_silent_recording_is_not_split(tmp_path):
-    bag = series(tmp_path / 'bag', split_ns=SECOND, split_bytes=1)
+    bag = series(tmp_path / 'bag', max_file_ns=SECOND, max_file_bytes=1)
     for step in range(100):
         bag.tick(step * SECOND)
     bag.close()
     assert len(list((tmp_path / 'bag').glob('*.mcap'))) == 1
 
 
-def test_a_disk_that_is_full_at_a_split_leaves_the_file_before_it_complete(tmp_path, monkeypatch):
+def test_full_disk_at_a_split_leaves_the_previous_file_complete(tmp_path, monkeypatch):
     bag = series(tmp_path / 'bag')
     bag.write(message('/n', 0), 0)
 
@@ -280,11 +335,11 @@ def test_a_disk_that_is_full_at_a_split_leaves_the_file_before_it_complete(tmp_p
     monkeypatch.setattr(writer, 'open_unbuffered', full)
     with pytest.raises(FolderError, match='No space left'):
         bag.split()
-    with open_bag(tmp_path / 'bag') as recording:
-        assert recording.message_count == 1
+    with open_bag(tmp_path / 'bag') as reader:
+        assert reader.message_count == 1
 
 
-def test_losses_are_told_by_cause_and_topic():
+def test_losses_are_listed_by_cause_and_topic():
     assert message_loss_record({'/b': 2, '/a': 1}, {'/a': 5}) == {
         'dropped': '3',
         'lost': '5',
@@ -298,7 +353,7 @@ def test_losses_are_told_by_cause_and_topic():
 # -- attachments ----------------------------------------------------------------------------------
 
 
-def test_a_file_comes_back_byte_by_byte_with_its_kind_and_time(tmp_path):
+def test_attachment_is_read_back_with_media_type_and_time(tmp_path):
     path = tmp_path / 'model.npz'
     path.write_bytes(bytes(range(256)))
     item = read_attachment(path, 256, 'controller/model.npz')
@@ -316,7 +371,7 @@ def test_a_file_comes_back_byte_by_byte_with_its_kind_and_time(tmp_path):
         assert reader.message_count == 1
 
 
-def test_of_two_files_of_one_name_the_newer_one_is_meant(tmp_path):
+def test_newest_attachment_of_a_name_is_read(tmp_path):
     with BagWriter(tmp_path / 'bag', metadata_records={}) as bag:
         for i in (1, 2):
             bag.add_attachment(Attachment('a', 'text/plain', b'%d' % i), START + i)
@@ -326,7 +381,7 @@ def test_of_two_files_of_one_name_the_newer_one_is_meant(tmp_path):
         read_attachments(bag.path)
 
 
-def test_a_file_that_is_missing_or_too_large_is_refused_with_the_bound(tmp_path):
+def test_missing_or_too_large_attachment_is_rejected(tmp_path):
     with pytest.raises(AttachmentError, match='none.npz cannot be attached: No such file'):
         read_attachment(tmp_path / 'none.npz', 10)
     (tmp_path / 'big').write_bytes(bytes(11))
@@ -334,7 +389,7 @@ def test_a_file_that_is_missing_or_too_large_is_refused_with_the_bound(tmp_path)
         read_attachment(tmp_path / 'big', 10)
 
 
-def test_finishing_a_torn_file_keeps_its_attachments_and_gives_up_a_torn_one(tmp_path):
+def test_finalizing_keeps_attachments_except_a_truncated_one(tmp_path):
     bag = BagWriter(tmp_path / 'bag', metadata_records={'a': {'b': 'c'}})
     bag.add_topic('/n', NUMBER)
     sizes = []
@@ -376,54 +431,54 @@ def test_a_full_disk_is_reported_by_an_attachment_too(tmp_path, monkeypatch):
 # -- snapshots ------------------------------------------------------------------------------------
 
 
-def test_a_ring_holds_the_last_seconds_and_no_more_memory_than_it_may():
-    ring = CircularMessageCache(10 * SECOND, 10**6)
+def test_cache_is_bounded_in_time_and_memory():
+    cache = CircularMessageCache(10 * SECOND, 10**6)
     for step in range(300):
-        ring.add([message('/n', step / 10)])
+        cache.add([message('/n', step / 10)])
     now = START + 30 * SECOND
-    held = ring.held(now)
-    assert [item.received_ns for item in held] == [
+    kept = cache.messages(now)
+    assert [item.received_ns for item in kept] == [
         START + step * SECOND // 10 for step in range(200, 300)
     ]
-    assert ring.held(now + 5 * SECOND) == held[50:], 'in silence it grows old'
-    small = CircularMessageCache(10 * SECOND, 5 * message('/n', 0).cost)
+    assert cache.messages(now + 5 * SECOND) == kept[50:], 'messages expire without new ones'
+    small = CircularMessageCache(10 * SECOND, 5 * message('/n', 0).memory_size)
     for step in range(300):
         small.add([message('/n', step / 10)])
-        assert small.bytes <= 5 * message('/n', 0).cost
-    assert small.held(now) == held[-5:]
+        assert small.bytes <= 5 * message('/n', 0).memory_size
+    assert small.messages(now) == kept[-5:]
 
 
-def test_latched_messages_are_kept_however_old_one_of_each_publisher():
-    ring = CircularMessageCache(10 * SECOND, 10**6)
-    ring.latch('/map', 1)
-    ring.latch('/static', 2)
-    ring.add([message('/map', 0, fill=1), message('/map', 1, fill=2)])
-    ring.add([message('/static', 2 + i, fill=10 + i) for i in range(3)])
-    ring.add([message('/n', 15 + i) for i in range(30)])
-    held = ring.held(START + 44 * SECOND)
+def test_latched_messages_are_kept_one_per_publisher():
+    cache = CircularMessageCache(10 * SECOND, 10**6)
+    cache.keep_last('/map', 1)
+    cache.keep_last('/static', 2)
+    cache.add([message('/map', 0, fill=1), message('/map', 1, fill=2)])
+    cache.add([message('/static', 2 + i, fill=10 + i) for i in range(3)])
+    cache.add([message('/n', 15 + i) for i in range(30)])
+    kept = cache.messages(START + 44 * SECOND)
     begin = START + 34 * SECOND
-    assert [(item.topic, item.data[-1], item.received_ns) for item in held[:3]] == [
+    assert [(item.topic, item.data[-1], item.received_ns) for item in kept[:3]] == [
         ('/map', 2, begin),
         ('/static', 11, begin),
         ('/static', 12, begin),
     ]
-    assert held[0].published_ns == START + SECOND - 1000, 'the other stamp tells how old it is'
-    assert {item.topic for item in held[3:]} == {'/n'}
-    assert held == sorted(held, key=lambda item: item.received_ns)
+    assert kept[0].published_ns == START + SECOND - 1000, 'the publish stamp is unchanged'
+    assert {item.topic for item in kept[3:]} == {'/n'}
+    assert kept == sorted(kept, key=lambda item: item.received_ns)
 
 
-def test_a_latched_message_that_is_recent_stands_once_with_its_own_time():
-    ring = CircularMessageCache(10 * SECOND, 10**6)
-    ring.latch('/map', 1)
-    ring.add([message('/n', 0), message('/map', 5)])
-    held = ring.held(START + 9 * SECOND)
-    assert [(item.topic, item.received_ns) for item in held] == [
+def test_recent_latched_message_is_kept_once_with_its_own_time():
+    cache = CircularMessageCache(10 * SECOND, 10**6)
+    cache.keep_last('/map', 1)
+    cache.add([message('/n', 0), message('/map', 5)])
+    kept = cache.messages(START + 9 * SECOND)
+    assert [(item.topic, item.received_ns) for item in kept] == [
         ('/n', START),
         ('/map', START + 5 * SECOND),
     ]
 
 
-def test_a_snapshot_is_a_bag_of_its_own_that_says_why(tmp_path):
+def test_snapshot_is_a_bag_with_its_reason(tmp_path):
     messages = [message('/n', i / 10) for i in range(450)] + [message('/unknown', 50)]
     pauses = []
     count = write_snapshot(
@@ -436,10 +491,10 @@ def test_a_snapshot_is_a_bag_of_its_own_that_says_why(tmp_path):
     )
     assert count == 450
     assert len(pauses) == 2
-    with open_bag(tmp_path / 'snap') as recording:
-        assert recording.message_count == 450
-        assert recording.metadata_records['snapshot'] == {'reason': 'link lost'}
-        assert list(recording.topics) == ['/n']
+    with open_bag(tmp_path / 'snap') as reader:
+        assert reader.message_count == 450
+        assert reader.metadata_records['snapshot'] == {'reason': 'link lost'}
+        assert list(reader.topics) == ['/n']
 
 
 def test_snapshots_of_one_second_do_not_share_a_folder(tmp_path):
@@ -450,7 +505,7 @@ def test_snapshots_of_one_second_do_not_share_a_folder(tmp_path):
     assert names == ['x', 'x_2', 'x_3']
 
 
-def test_a_reason_becomes_a_name_that_every_file_system_takes():
+def test_snapshot_reason_becomes_a_portable_folder_name():
     assert snapshot_folder_name('2026', 'sim_robot: e-stop /latched: Ö "x"!') == (
         '2026_sim-robot-e-stop-latched-x'
     )
@@ -458,52 +513,54 @@ def test_a_reason_becomes_a_name_that_every_file_system_takes():
     assert snapshot_folder_name('2026', '…') == '2026'
 
 
-# -- faults ---------------------------------------------------------------------------------------
+# -- diagnostics monitor --------------------------------------------------------------------------
 
 
-def test_one_fault_for_one_change_to_an_error_and_none_while_it_lasts():
-    watch = DiagnosticsMonitor(['robot'])
+def test_one_fault_per_change_to_an_error():
+    monitor = DiagnosticsMonitor(['robot'])
     levels = [OK, WARN, ERROR, ERROR, STALE, ERROR, WARN, ERROR, OK, OK]
-    found = [watch.update('robot', level, 'e-stop', i * SECOND) for i, level in enumerate(levels)]
+    found = [
+        monitor.update('robot', level, 'e-stop', i * SECOND) for i, level in enumerate(levels)
+    ]
     assert [i for i, fault in enumerate(found) if fault] == [2, 7]
     assert found[2].node == 'robot'
     assert found[2].reason == 'e-stop'
-    assert watch.update('stranger', OK, '', 0) is None
-    assert watch.update('stranger', ERROR, '', SECOND) is None
+    assert monitor.update('stranger', OK, '', 0) is None
+    assert monitor.update('stranger', ERROR, '', SECOND) is None
 
 
-def test_what_has_not_begun_to_work_has_no_fault():
-    """A controller says "stopped" as a warning before its first odometry, then as an error."""
-    watch = DiagnosticsMonitor(['controller', 'radio_bridge'])
-    assert watch.update('controller', WARN, 'stopped: waiting', 0) is None
-    assert watch.update('controller', ERROR, 'stopped: no reference', 1) is None
-    assert watch.update('radio_bridge', ERROR, 'handshake', 2) is None
-    assert watch.silent(100 * SECOND) == []
-    assert watch.update('controller', OK, 'tracking', 3) is None
-    assert watch.update('controller', ERROR, 'stopped: no reference', 4)
+def test_node_that_was_never_healthy_has_no_fault():
+    """A controller reports "stopped" as a warning before its first odometry, then as an error."""
+    monitor = DiagnosticsMonitor(['controller', 'radio_bridge'])
+    assert monitor.update('controller', WARN, 'stopped: waiting', 0) is None
+    assert monitor.update('controller', ERROR, 'stopped: no reference', 1) is None
+    assert monitor.update('radio_bridge', ERROR, 'handshake', 2) is None
+    assert monitor.check_timeouts(100 * SECOND) == []
+    assert monitor.update('controller', OK, 'tracking', 3) is None
+    assert monitor.update('controller', ERROR, 'stopped: no reference', 4)
 
 
-def test_a_node_that_falls_silent_is_a_fault_once():
-    watch = DiagnosticsMonitor(['controller'])
-    watch.update('controller', OK, 'tracking', 0)
-    assert watch.silent(REPORT_TIMEOUT_NS) == []
-    (fault,) = watch.silent(REPORT_TIMEOUT_NS + 1)
-    assert (fault.node, fault.reason) == ('controller', 'reports no longer')
-    assert watch.silent(10 * REPORT_TIMEOUT_NS) == []
-    watch.update('controller', OK, 'tracking', 11 * REPORT_TIMEOUT_NS)
-    assert len(watch.silent(13 * REPORT_TIMEOUT_NS)) == 1
+def test_report_timeout_is_one_fault():
+    monitor = DiagnosticsMonitor(['controller'])
+    monitor.update('controller', OK, 'tracking', 0)
+    assert monitor.check_timeouts(REPORT_TIMEOUT_NS) == []
+    (fault,) = monitor.check_timeouts(REPORT_TIMEOUT_NS + 1)
+    assert (fault.node, fault.reason) == ('controller', 'diagnostics timed out')
+    assert monitor.check_timeouts(10 * REPORT_TIMEOUT_NS) == []
+    monitor.update('controller', OK, 'tracking', 11 * REPORT_TIMEOUT_NS)
+    assert len(monitor.check_timeouts(13 * REPORT_TIMEOUT_NS)) == 1
 
 
-def test_a_node_that_was_started_anew_and_waits_is_not_taken_for_dead():
-    watch = DiagnosticsMonitor(['controller'])
-    watch.update('controller', OK, 'tracking', 0)
-    watch.update('controller', WARN, 'stopped: waiting', SECOND)
-    assert watch.silent(20 * SECOND) == []
+def test_restarted_waiting_node_does_not_time_out():
+    monitor = DiagnosticsMonitor(['controller'])
+    monitor.update('controller', OK, 'tracking', 0)
+    monitor.update('controller', WARN, 'stopped: waiting', SECOND)
+    assert monitor.check_timeouts(20 * SECOND) == []
 
 
-def test_snapshots_unasked_for_are_spaced_and_numbered():
-    budget = SnapshotRateLimiter(10 * SECOND, 3)
-    answers = [budget.acquire(second * SECOND) for second in (0, 1, 9.9, 10, 30, 60)]
-    assert [not answer for answer in answers] == [True, False, False, True, True, False]
-    assert '1.0 s ago (snapshot_pause)' in answers[1]
-    assert '3 already (snapshot_most)' in answers[5]
+def test_automatic_snapshots_are_limited_in_rate_and_number():
+    limiter = SnapshotRateLimiter(10 * SECOND, 3)
+    reasons = [limiter.acquire(second * SECOND) for second in (0, 1, 9.9, 10, 30, 60)]
+    assert [not reason for reason in reasons] == [True, False, False, True, True, False]
+    assert '1.0 s ago (snapshot.min_interval)' in reasons[1]
+    assert '3 already (snapshot.max_count)' in reasons[5]

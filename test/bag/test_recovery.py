@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Bags cut off anywhere, with flipped bits, of any writer: what is sound comes back, no more."""
+"""Recovery of truncated and damaged files of any writer: intact messages, and no others."""
 
 from dataclasses import dataclass
 import io
@@ -37,7 +37,7 @@ DETAILS = {'settings': {'law.gain': '8.0'}, 'provenance': {'commit': 'abc', 'not
 
 
 def payload(kind, rng):
-    """Return a message in CDR; random, so that every one differs and none compresses away."""
+    """Return a random, incompressible message in CDR."""
     if kind == NUMBER:
         return b'\0\1\0\0' + rng.randbytes(8)
     text = rng.randbytes(rng.randrange(20, 200)).hex().encode() + b'\0'
@@ -58,7 +58,7 @@ def messages(count, seed=1):
 
 
 def own_bag(folder, count=800, chunk_bytes=4_000):
-    """Return the file of a finished bag by our writer."""
+    """Return the file of a complete bag written by ``BagWriter``."""
     with BagWriter(folder, metadata_records=DETAILS, chunk_bytes=chunk_bytes) as bag:
         for topic, kind in TOPICS.items():
             bag.add_topic(topic, kind, [QosProfile(depth=7)])
@@ -69,10 +69,10 @@ def own_bag(folder, count=800, chunk_bytes=4_000):
 
 
 def foreign_file(count=200, extras=True, **options):
-    """Return the bytes of a file by the mcap library, with attachments and metadata inside."""
+    """Return the bytes of a file of the mcap library, with attachments and metadata records."""
     output = io.BytesIO()
     writer = Writer(output, **{'chunk_size': 3_000} | options)
-    writer.start('ros2', 'somebody')
+    writer.start('ros2', 'other writer')
     definitions = MessageDefinitions()
     channels = {}
     for i, (topic, log_time, publish_time, sequence, data) in enumerate(messages(count)):
@@ -92,7 +92,7 @@ def foreign_file(count=200, extras=True, **options):
 
 @dataclass
 class Inside:
-    """What a whole file holds, in the order of the file."""
+    """Content of a complete file in its order."""
 
     items: list
     """Messages as in :func:`messages`, between them attachments and metadata records."""
@@ -104,23 +104,23 @@ class Inside:
 
 
 def inside(content):
-    """Return what is in ``content``, every checksum looked at by the mcap library."""
-    held = Inside([], {})
+    """Return the records of ``content``; the mcap library verifies every checksum."""
+    found = Inside([], {})
     for record in StreamReader(io.BytesIO(content), validate_crcs=True).records:
         if isinstance(record, Channel):
-            held.channels[record.id] = record
+            found.channels[record.id] = record
         elif isinstance(record, Message):
-            topic = held.channels[record.channel_id].topic
-            held.items.append(
+            topic = found.channels[record.channel_id].topic
+            found.items.append(
                 (topic, record.log_time, record.publish_time, record.sequence, record.data)
             )
         elif isinstance(record, Metadata | Attachment):
-            held.items.append(record)
-    return held
+            found.items.append(record)
+    return found
 
 
 def chunk_ends(content):
-    """Return (end of the chunk in the file, messages up to there) of each chunk."""
+    """Return (end of the chunk in the file, number of messages up to it) of each chunk."""
     ends = [(0, 0)]
     for entry in make_reader(io.BytesIO(content)).get_summary().chunk_indexes:
         start, end = entry.chunk_start_offset, entry.chunk_start_offset + entry.chunk_length
@@ -131,12 +131,12 @@ def chunk_ends(content):
 
 
 def end_of_data(content):
-    """Return where the record that ends the data begins; 13 bytes later comes the summary."""
+    """Return the position of the data-end record; the summary begins 13 bytes later."""
     return int.from_bytes(content[-28:-20], 'little') - 13
 
 
 def salvaged(content):
-    """Return the outcome, and the bytes that were written."""
+    """Return the result and the written bytes."""
     output = io.BytesIO()
     outcome = recover_file(io.BytesIO(content), output, 'file')
     return outcome, output.getvalue()
@@ -147,20 +147,20 @@ def own(tmp_path_factory):
     return own_bag(tmp_path_factory.mktemp('own') / 'run').read_bytes()
 
 
-# -- cut off ------------------------------------------------------------------------------------
+# -- truncated files ----------------------------------------------------------------------------
 
 
-def test_a_bag_cut_off_at_1000_places_keeps_every_complete_chunk_and_invents_nothing(own):
+def test_bag_truncated_at_1000_places_keeps_complete_chunks_only(own):
     whole, ends, end = inside(own).items, chunk_ends(own), end_of_data(own)
     assert len(ends) > 30
     rng = random.Random(6)
     for cut in [8, len(own) - 1, *(rng.randrange(8, len(own)) for _ in range(998))]:
         outcome, content = salvaged(own[:cut])
-        held = inside(content)
-        assert held.items == whole[: len(held.items)], cut
+        found = inside(content)
+        assert found.items == whole[: len(found.items)], cut
         complete = max(count for place, count in ends if place <= cut)
-        assert len(held.messages) >= complete, cut
-        assert len(held.messages) == sum(topic.kept for topic in outcome.topics.values())
+        assert len(found.messages) >= complete, cut
+        assert len(found.messages) == sum(topic.kept for topic in outcome.topics.values())
         assert outcome.clean == (cut > end), cut
         assert make_reader(io.BytesIO(content)).get_summary().statistics is not None
 
@@ -175,24 +175,24 @@ def test_a_bag_cut_off_at_1000_places_keeps_every_complete_chunk_and_invents_not
     ],
     ids=['lz4', 'none', 'unchunked', 'no_checksum'],
 )
-def test_a_file_of_another_writer_cut_off_keeps_all_that_is_whole(options):
+def test_truncated_file_of_another_writer_keeps_whole_records(options):
     content = foreign_file(**options)
     whole, end = inside(content).items, end_of_data(content)
     rng = random.Random(7)
     for cut in [8, *(rng.randrange(8, len(content)) for _ in range(99))]:
         outcome, result = salvaged(content[:cut])
-        held = inside(result)
-        assert held.items == whole[: len(held.items)], cut
+        found = inside(result)
+        assert found.items == whole[: len(found.items)], cut
         if options.get('compression') is CompressionType.NONE or 'use_chunking' in options:
-            # Whatever ends before the cut is there, chunk or not.
-            missing = whole[len(held.items) :]
+            # All complete messages before the cut are kept, inside or outside of a chunk.
+            missing = whole[len(found.items) :]
             bodies = [item[4] if isinstance(item, tuple) else None for item in missing]
             assert not any(body and body in content[:cut] for body in bodies), cut
         assert outcome.clean == (cut > end), cut
 
 
 @pytest.mark.parametrize('compression', [CompressionType.ZSTD, CompressionType.LZ4])
-def test_of_a_compressed_chunk_cut_off_what_comes_out_is_kept_and_called_unchecked(compression):
+def test_truncated_compressed_chunk_is_kept_as_unchecked(compression):
     content = foreign_file(3_000, extras=False, compression=compression, chunk_size=2**20)
     whole = inside(content).messages
     (first, end) = chunk_ends(content)[1:][0]
@@ -222,10 +222,10 @@ def test_headers_channels_and_schemas_come_back_as_they_were():
         summary = make_reader(io.BytesIO(salvaged(content)[1])).get_summary()
         assert summary.schemas == make_reader(io.BytesIO(content)).get_summary().schemas
     header = make_reader(io.BytesIO(salvaged(content)[1])).get_header()
-    assert (header.profile, header.library) == ('ros2', 'somebody; recovered by t3mpc_ros')
+    assert (header.profile, header.library) == ('ros2', 'other writer; recovered by t3mpc_ros')
 
 
-# -- damaged in the middle ----------------------------------------------------------------------
+# -- damaged files ------------------------------------------------------------------------------
 
 
 def flipped(content, rng, count=1):
@@ -241,7 +241,7 @@ def is_subsequence(part, whole):
 
 
 @pytest.mark.parametrize('kind', ['own', 'lz4', 'none'])
-def test_flipped_bits_never_change_a_message_that_a_checksum_covers(own, kind):
+def test_flipped_bits_never_change_a_checksummed_message(own, kind):
     compression = CompressionType.LZ4 if kind == 'lz4' else CompressionType.NONE
     content = own if kind == 'own' else foreign_file(extras=False, compression=compression)
     whole = inside(content).messages
@@ -251,13 +251,13 @@ def test_flipped_bits_never_change_a_message_that_a_checksum_covers(own, kind):
         outcome, result = salvaged(flipped(content, rng))
         kept = inside(result).messages
         assert is_subsequence(kept, whole), trial
-        assert len(kept) >= len(whole) - largest, trial  # one bit costs one chunk at most
+        assert len(kept) >= len(whole) - largest, trial  # one bit damages at most one chunk
         lost = sum(topic.lost for topic in outcome.topics.values())
         assert len(kept) + lost == len(whole), trial
         assert lost == 0 or not outcome.clean
 
 
-def test_many_flipped_bits_and_files_without_chunks_never_crash_it(own):
+def test_many_flipped_bits_never_crash_the_recovery(own):
     rng = random.Random(9)
     unchunked = foreign_file(use_chunking=False)
     for trial in range(100):
@@ -268,15 +268,15 @@ def test_many_flipped_bits_and_files_without_chunks_never_crash_it(own):
 
 
 def test_a_record_length_that_is_garbage_costs_only_that_record(own):
-    """The chunk after it was lost, too, when the walk went on where the length said."""
+    """The scan must not continue at the position given by the damaged length."""
     ends = chunk_ends(own)
     start = make_reader(io.BytesIO(own)).get_summary().chunk_indexes[9].chunk_start_offset
     for length in (0, 5, 2**20, 2**40, 2**64 - 1):
         damaged = bytearray(own)
         damaged[start + 1 : start + 9] = length.to_bytes(8, 'little')
         outcome, result = salvaged(bytes(damaged))
-        assert inside(result).messages == inside(own).messages  # its own fields tell its length
-        # Without those either: the inner length of the data, and with it the whole chunk.
+        assert inside(result).messages == inside(own).messages  # its fields give its length
+        # With the inner length damaged as well, the chunk is lost.
         damaged[start + 45 : start + 53] = (2**50).to_bytes(8, 'little')
         outcome, result = salvaged(bytes(damaged))
         lost = ends[10][1] - ends[9][1]
@@ -303,20 +303,20 @@ def test_a_lost_chunk_is_counted_per_topic_with_its_time(own):
         assert damage.size == outcome.lost_bytes == entry.chunk_length
 
 
-def test_with_the_first_chunk_the_names_are_lost_but_the_summary_has_them(own):
+def test_channels_of_a_lost_first_chunk_are_found_in_the_summary(own):
     entry = make_reader(io.BytesIO(own)).get_summary().chunk_indexes[0]
     damaged = bytearray(own)
     damaged[entry.chunk_start_offset + entry.chunk_length - 1] ^= 1
     first = chunk_ends(own)[1][1]
     _, result = salvaged(bytes(damaged))
     assert inside(result).messages == inside(own).messages[first:]
-    # Cut off as well, nobody knows what the messages are; that is said, not guessed.
+    # Without the summary the channels are unknown, and the messages are reported as lost.
     outcome, result = salvaged(bytes(damaged[:100_000]))
     assert inside(result).messages == []
     assert any('names are lost' in damage.reason for damage in outcome.damages)
 
 
-def test_messages_whose_type_is_lost_are_kept_and_the_bag_still_opens(tmp_path):
+def test_messages_of_a_lost_type_are_kept_and_the_bag_opens(tmp_path):
     content = bytearray(foreign_file(extras=False, use_chunking=False))
     place = content.index(b'std_msgs/msg/String') - 4  # the length of the name, in the schema
     content[place : place + 4] = b'\xff' * 4
@@ -335,7 +335,7 @@ def test_a_file_without_header_or_mark_is_read(own):
         assert inside(result).items == inside(own).items
 
 
-def test_the_way_back_is_found_in_files_without_chunks_or_checksums():
+def test_resynchronization_without_chunks_or_checksums():
     for options in ({'use_chunking': False}, {'enable_crcs': False}):
         content = foreign_file(extras=False, **options)
         whole = inside(content).messages
@@ -350,12 +350,12 @@ def test_the_way_back_is_found_in_files_without_chunks_or_checksums():
             unchecked = sum(topic.unchecked for topic in outcome.topics.values())
             assert unchecked == len(kept), place
             if options == {'use_chunking': False}:
-                # The message that was hit inside is kept as it is: nothing tells. No other.
+                # At most the damaged message is kept unnoticed: it has no checksum.
                 assert len([item for item in kept if item not in whole]) <= 1, place
 
 
-def test_a_chunk_length_that_leads_to_the_summary_does_not_swallow_what_lies_between(own):
-    """What stood there looked like the head of a record that the end of the file had torn."""
+def test_chunk_length_into_the_summary_keeps_records_in_between(own):
+    """Bytes at the wrong position may look like the head of a truncated record."""
     place = make_reader(io.BytesIO(own)).get_summary().chunk_indexes[-3].chunk_start_offset
     (length,) = struct.unpack_from('<Q', own, place + 1)
     for target in range(len(own) - 2_500, len(own), 29):
@@ -366,8 +366,8 @@ def test_a_chunk_length_that_leads_to_the_summary_does_not_swallow_what_lies_bet
         assert inside(result).messages == inside(own).messages, target
 
 
-def test_zeros_where_the_end_should_be_are_no_records(own):
-    """A power cut leaves a file with its size but without its last blocks."""
+def test_zeros_at_the_end_are_no_records(own):
+    """A power failure leaves a file with its full size but without its last blocks."""
     outcome, result = salvaged(own[:30_000] + bytes(40_000))
     kept = inside(result).messages
     assert kept == inside(own).messages[: len(kept)]
@@ -375,14 +375,14 @@ def test_zeros_where_the_end_should_be_are_no_records(own):
     assert not outcome.clean
 
 
-def test_bytes_of_something_else_are_refused():
+def test_other_file_formats_are_rejected():
     for content in (b'', b'\x89PNG\r\n' + bytes(500), random.Random(2).randbytes(20_000)):
-        with pytest.raises(UnreadableError, match='nothing of an MCAP file'):
+        with pytest.raises(UnreadableError, match='contains no MCAP data'):
             salvaged(content)
 
 
 def test_a_message_that_holds_an_mcap_file_is_not_taken_for_one(own):
-    """Found between damaged bytes, the inner file's messages once passed for the outer's."""
+    """Messages of a file inside a message are not messages of the damaged outer file."""
     output = io.BytesIO()
     writer = Writer(output, compression=CompressionType.NONE, chunk_size=10_000)
     writer.start('', '')
@@ -399,7 +399,7 @@ def test_a_message_that_holds_an_mcap_file_is_not_taken_for_one(own):
     assert [item[1] for item in kept] == [0, 2, 3]
 
 
-# -- bags and the program -----------------------------------------------------------------------
+# -- bags and the command line ------------------------------------------------------------------
 
 
 def torn_bag(folder, cut=-20_000):
@@ -413,7 +413,7 @@ def read_anyhow(folder):
         return [(item.topic, stamp, bytes(data)) for item, stamp, data in reader.messages()]
 
 
-def test_a_recovered_bag_opens_everywhere_and_the_input_is_untouched(tmp_path, own):
+def test_recovered_bag_opens_everywhere_and_input_is_unchanged(tmp_path, own):
     path = torn_bag(tmp_path / 'run')
     before = {item: item.read_bytes() for item in path.parent.iterdir()}
     result = recover_bag(path.parent, tmp_path / 'new')
@@ -424,15 +424,15 @@ def test_a_recovered_bag_opens_everywhere_and_the_input_is_untouched(tmp_path, o
     assert read_file_summary(target).message_count == len(kept.messages) == result.kept > 300
     metadata = read_metadata(tmp_path / 'new')
     assert metadata.message_count == result.kept
-    assert metadata.topics[0].profiles == (QosProfile(depth=7),)
-    with open_bag(tmp_path / 'new') as recording:
-        assert recording.metadata_records == DETAILS
-        assert recording.topics['/n'].message_count == result.topics['/n'].kept
-        assert recording.series('/n', {'n': 'data'})['n'].size == result.topics['/n'].kept
+    assert metadata.topics[0].offered_qos_profiles == (QosProfile(depth=7),)
+    with open_bag(tmp_path / 'new') as reader:
+        assert reader.metadata_records == DETAILS
+        assert reader.topics['/n'].message_count == result.topics['/n'].kept
+        assert reader.series('/n', {'n': 'data'})['n'].size == result.topics['/n'].kept
     assert not result.clean
 
 
-def test_of_a_folder_sound_files_are_copied_and_broken_ones_written_anew(tmp_path):
+def test_intact_files_are_copied_and_damaged_ones_rewritten(tmp_path):
     folder = tmp_path / 'run'
     torn_bag(folder)
     sound = own_bag(folder)
@@ -453,12 +453,12 @@ def test_of_a_folder_sound_files_are_copied_and_broken_ones_written_anew(tmp_pat
         assert (tmp_path / 'again' / item.name).read_bytes() == item.read_bytes()
 
 
-def test_a_finished_file_with_a_bad_chunk_is_not_copied_blindly(tmp_path):
+def test_complete_file_with_a_damaged_chunk_is_not_copied(tmp_path):
     path = own_bag(tmp_path / 'run')
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 4
     path.write_bytes(content)
-    assert read_file_summary(path) is not None  # its end is sound
+    assert read_file_summary(path) is not None  # its summary is valid
     result = recover_bag(path, tmp_path / 'new')
     assert not result.files[0].copied
     assert not result.clean
@@ -496,18 +496,18 @@ def test_a_full_disk_leaves_no_half_file(tmp_path, monkeypatch):
     assert list((tmp_path / 'new').iterdir()) == []
 
 
-def test_the_program_says_what_was_kept_and_answers_with_its_exit_code(tmp_path, capsys):
+def test_recover_command_reports_messages_and_exit_code(tmp_path, capsys):
     path = own_bag(tmp_path / 'run')
     assert bag_main(['recover', str(path), '--output', str(tmp_path / 'clean')]) == 0
     assert 'sound, copied' in capsys.readouterr().out
     path.write_bytes(path.read_bytes()[:-20_000])
     assert bag_main(['recover', str(path.parent)]) == 3
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     assert default_output(path.parent) == tmp_path / 'run_recovered'
     assert len(read_anyhow(tmp_path / 'run_recovered')) > 300
-    assert 'the file has no end' in said
-    assert 'std_msgs/msg/String' in said
-    assert bag_main(['recover', str(path.parent)]) == 2  # it is there now
+    assert 'the file has no end' in printed
+    assert 'std_msgs/msg/String' in printed
+    assert bag_main(['recover', str(path.parent)]) == 2  # the output exists now
     assert 'not empty' in capsys.readouterr().err
     (tmp_path / 'text').write_text('hello')
     assert bag_main(['recover', str(tmp_path / 'text')]) == 1
@@ -517,7 +517,7 @@ def test_the_program_says_what_was_kept_and_answers_with_its_exit_code(tmp_path,
         bag_main(['recover'])
 
 
-def test_an_sqlite_bag_is_explained_not_recovered(tmp_path, capsys):
+def test_sqlite_bag_is_rejected_with_advice(tmp_path, capsys):
     (tmp_path / 'bag').mkdir()
     with sqlite3.connect(tmp_path / 'bag' / 'x.db3') as base:
         base.execute('create table topics (id integer)')
@@ -527,11 +527,11 @@ def test_an_sqlite_bag_is_explained_not_recovered(tmp_path, capsys):
     assert not (tmp_path / 'new').exists()
 
 
-def test_info_tells_files_topics_settings_and_what_is_unfinished(tmp_path, capsys):
+def test_info_lists_files_topics_parameters_and_incomplete_files(tmp_path, capsys):
     torn = torn_bag(tmp_path / 'run')
     own_bag(tmp_path / 'run')
     assert bag_main(['info', str(tmp_path / 'run')]) == 0
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     for words in (
         'UNFINISHED run_0.mcap',
         f'bag recover {tmp_path / "run"}',
@@ -541,14 +541,14 @@ def test_info_tells_files_topics_settings_and_what_is_unfinished(tmp_path, capsy
         'law.gain',
         '2023-11-14 22:13:20 UTC',
     ):
-        assert words in said, words
+        assert words in printed, words
     assert bag_main(['info', str(tmp_path / 'run'), '--json']) == 0
-    held = json.loads(capsys.readouterr().out)
-    assert held['message_count'] == 800
-    assert held['details'] == DETAILS
-    counts = {topic['name']: topic['message_count'] for topic in held['topics']}
+    found = json.loads(capsys.readouterr().out)
+    assert found['message_count'] == 800
+    assert found['metadata_records'] == DETAILS
+    counts = {topic['name']: topic['message_count'] for topic in found['topics']}
     assert sum(counts.values()) == 800
-    assert held['rates']['/n'] == pytest.approx(counts['/n'] / 7.99)
+    assert found['rates']['/n'] == pytest.approx(counts['/n'] / 7.99)
     assert bag_main(['info', str(torn)]) == 1
     assert 'bag recover' in capsys.readouterr().err
     assert bag_main(['info', str(tmp_path / 'nothing')]) == 1
@@ -567,6 +567,6 @@ def test_info_reads_files_of_other_writers_and_sqlite_bags(tmp_path, capsys):
         for i in range(5):
             writer.write(connection, START + i * 10**9, payload(NUMBER, random.Random(i)))
     assert bag_main(['info', str(tmp_path / 'old')]) == 0
-    said = capsys.readouterr().out
-    assert 'sqlite3' in said
-    assert '4.000 s' in said
+    printed = capsys.readouterr().out
+    assert 'sqlite3' in printed
+    assert '4.000 s' in printed

@@ -59,7 +59,7 @@ def test_the_hash_is_that_of_jazzy(definitions, name):
     assert definitions.type_hash(name) == JAZZY.hash_rihs01(name)
 
 
-def test_each_dependency_stands_once_after_a_line_of_eighty_equal_signs(definitions):
+def test_each_dependency_is_listed_once_after_a_separator(definitions):
     lines = definitions.schema('nav_msgs/msg/Odometry').splitlines()
     marks = [i for i, line in enumerate(lines) if line.startswith('=')]
     assert all(lines[i] == SEPARATOR == '=' * 80 for i in marks)
@@ -77,7 +77,7 @@ def test_each_dependency_stands_once_after_a_line_of_eighty_equal_signs(definiti
     ]
 
 
-def test_an_installed_definition_wins_over_the_library_and_the_first_prefix_over_the_second(
+def test_installed_definitions_and_first_prefix_take_precedence(
     tmp_path,
 ):
     install(tmp_path / 'overlay', 'std_msgs/msg/Float64', 'float64 data\nfloat64 more\n')
@@ -86,8 +86,8 @@ def test_an_installed_definition_wins_over_the_library_and_the_first_prefix_over
     assert found.schema('std_msgs/msg/Float64') == 'float64 data\nfloat64 more\n'
 
 
-def test_the_hash_beside_another_prefix_s_text_does_not_count(tmp_path):
-    """An overlay that redefines a type must not inherit the hash of what it replaces."""
+def test_hash_of_another_prefix_is_not_used(tmp_path):
+    """An overlay that redefines a type must not inherit the hash of the replaced definition."""
     install(tmp_path / 'overlay', 'own_msgs/msg/Pair', 'float64 a\nfloat64 b\n')
     install(tmp_path / 'underlay', 'own_msgs/msg/Pair', 'float64 a\n', 'RIHS01_old')
     found = MessageDefinitions([tmp_path / 'overlay', tmp_path / 'underlay'])
@@ -95,7 +95,7 @@ def test_the_hash_beside_another_prefix_s_text_does_not_count(tmp_path):
     assert found.type_hash('own_msgs/msg/Pair') != 'RIHS01_old'
 
 
-def test_a_type_of_one_s_own_mixes_files_and_library(tmp_path):
+def test_custom_type_mixes_installed_and_library_definitions(tmp_path):
     text = (
         '# a comment with a Type in it\n'
         'byte OK=0   # a constant\n'
@@ -126,7 +126,7 @@ def test_a_hash_is_computed_where_none_is_installed(tmp_path):
     assert found.type_hash('nav_msgs/msg/Odometry') == JAZZY.hash_rihs01('nav_msgs/msg/Odometry')
 
 
-def test_an_unknown_type_names_itself_and_where_it_was_looked_for(tmp_path):
+def test_unknown_type_error_lists_the_searched_paths(tmp_path):
     install(tmp_path, 'own_msgs/msg/Whole', 'gone_msgs/Lost lost\n')
     with pytest.raises(UnknownTypeError) as caught:
         MessageDefinitions([tmp_path]).schema('own_msgs/msg/Whole')
@@ -137,8 +137,8 @@ def test_an_unknown_type_names_itself_and_where_it_was_looked_for(tmp_path):
 
 
 @pytest.mark.parametrize('name', ['', 'Twist', 'a/b/c/d', '../../etc/passwd', 'a b/msg/C'])
-def test_what_is_no_type_name_is_refused(name):
-    with pytest.raises(UnknownTypeError, match='looks like package/msg/Name'):
+def test_invalid_type_name_is_rejected(name):
+    with pytest.raises(UnknownTypeError, match='must be package/msg/Name'):
         MessageDefinitions([]).schema(name)
 
 

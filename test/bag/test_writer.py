@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Bags written, restarted, broken off, and read by three independent libraries."""
+"""Bags written, continued, interrupted, and read by three independent libraries."""
 
 import errno
 import io
@@ -70,7 +70,7 @@ def serialised(message):
 
 
 def fill(bag, count=200, start=START, step=STEP):
-    """Record ``count`` ticks of three topics; return every (topic, received, data)."""
+    """Write ``count`` periods of three topics; return every (topic, received, data)."""
     bag.add_topic('/robot/odom', ODOM, [QosProfile()])
     bag.add_topic('/robot/cmd_vel', TWIST, [QosProfile(depth=1)])
     bag.add_topic('/quiet', NUMBER)
@@ -102,7 +102,7 @@ def folder(tmp_path):
     return tmp_path / 'run'
 
 
-# -- what is written comes back -----------------------------------------------------------------
+# -- round trip ---------------------------------------------------------------------------------
 
 
 def test_every_byte_comes_back_through_rosbags_and_through_mcap(folder):
@@ -126,11 +126,11 @@ def test_the_data_section_has_a_checksum_and_it_is_right(folder):
         chunk = make_reader(file).get_summary().chunk_indexes[0]
     damaged = bytearray(content)
     damaged[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
-    with pytest.raises(Exception):  # noqa: B017 - the decompressor or the checksum, either will do
+    with pytest.raises(Exception):  # noqa: B017 - of the decompressor or of the checksum
         list(NonSeekingReader(io.BytesIO(bytes(damaged)), validate_crcs=True).iter_messages())
 
 
-def test_messages_can_be_decoded_from_the_bag_s_own_definitions(folder):
+def test_messages_are_decoded_with_the_definitions_in_the_bag(folder):
     with BagWriter(folder, metadata_records={}) as bag:
         fill(bag, 5)
     with AnyReader([folder]) as reader:  # compares the type hashes of metadata.yaml, too
@@ -142,7 +142,7 @@ def test_messages_can_be_decoded_from_the_bag_s_own_definitions(folder):
             assert message.pose.covariance.tolist() == list(range(36))
 
 
-def test_channel_and_header_are_what_rosbag2_s_storage_plugin_writes(folder):
+def test_channel_and_header_equal_those_of_the_rosbag2_plugin(folder):
     with BagWriter(folder, metadata_records=DETAILS) as bag:
         fill(bag)
     with bag.path.open('rb') as file:
@@ -194,7 +194,7 @@ def test_statistics_index_and_metadata_yaml_agree(folder):
 
 
 def test_an_invalid_hash_from_the_graph_is_replaced(folder):
-    """A publisher older than type hashes reports INVALID; rosbags refused such a bag."""
+    """Publishers before type hashes report INVALID; rosbags rejects a bag with this value."""
     with BagWriter(folder, metadata_records={}) as bag:
         bag.add_topic('/a', NUMBER, type_hash='INVALID')
         bag.add_topic('/b', NUMBER, type_hash='RIHS01_' + 'a' * 64)
@@ -202,25 +202,25 @@ def test_an_invalid_hash_from_the_graph_is_replaced(folder):
     assert hashes == {'/a': STORE.hash_rihs01(NUMBER), '/b': 'RIHS01_' + 'a' * 64}
 
 
-def test_details_survive_and_newer_ones_win(folder):
+def test_newest_metadata_records_are_read(folder):
     with BagWriter(folder, metadata_records=DETAILS) as bag:
         fill(bag, 3)
         bag.add_metadata_record('controller', {'law.gain': '9.5'})
         bag.add_metadata_record('settings', {'law.gain': '10.0'})
         fill(bag, 3, START + 10**9)
-    with open_bag(folder) as recording:
-        assert recording.metadata_records == {
+    with open_bag(folder) as reader:
+        assert reader.metadata_records == {
             'settings': {'law.gain': '10.0'},
             'provenance': DETAILS['provenance'],
             'controller': {'law.gain': '9.5'},
         }
-        assert recording.message_count == 12
+        assert reader.message_count == 12
 
 
 # -- files, folders, restarts -------------------------------------------------------------------
 
 
-def test_a_recorder_that_starts_again_continues_beside_what_is_there(folder):
+def test_restarted_recorder_continues_the_bag(folder):
     with BagWriter(folder, metadata_records={'run': {'n': '1'}}) as first:
         one = fill(first, 20)
     with BagWriter(folder, metadata_records={'run': {'n': '2'}}) as second:
@@ -232,21 +232,21 @@ def test_a_recorder_that_starts_again_continues_beside_what_is_there(folder):
     assert metadata.message_count == len(one) + len(two)
     assert len(metadata.topics) == 3
     assert read_with_rosbags(folder) == one + two
-    with open_bag(folder) as recording:
-        assert recording.topics['/robot/odom'].message_count == 50
-        assert recording.metadata_records == {'run': {'n': '2'}}
+    with open_bag(folder) as reader:
+        assert reader.topics['/robot/odom'].message_count == 50
+        assert reader.metadata_records == {'run': {'n': '2'}}
 
 
-def test_a_topic_offered_differently_after_a_restart_keeps_all_its_messages(folder):
-    """A channel whose profile is not in metadata.yaml is dropped by rosbags without a word."""
+def test_topic_with_other_qos_after_restart_keeps_all_messages(folder):
+    """A channel is silently dropped by rosbags if its profile is not in metadata.yaml."""
     for depth in (1, 5):
         with BagWriter(folder, metadata_records={}) as bag:
             bag.add_topic('/n', NUMBER, [QosProfile(depth=depth)])
             bag.write('/n', START + depth, START, serialised(TYPES[NUMBER](data=float(depth))))
     assert [topic.message_count for topic in read_metadata(folder).topics] == [1, 1]
     assert len(read_with_rosbags(folder)) == 2
-    with open_bag(folder) as recording:
-        assert recording.series('/n', {'n': 'data'})['n'].tolist() == [1.0, 5.0]
+    with open_bag(folder) as reader:
+        assert reader.series('/n', {'n': 'data'})['n'].tolist() == [1.0, 5.0]
 
 
 def test_the_next_free_number_comes_after_the_highest(folder):
@@ -257,7 +257,7 @@ def test_the_next_free_number_comes_after_the_highest(folder):
         assert bag.path.name == 'run_11.mcap'
     with BagWriter(folder, 'own', metadata_records={}) as bag:
         assert bag.path.name == 'own_0.mcap'
-    assert bag.unfinished == ('other_40.mcap', 'run_2.mcap', 'run_10.mcap', 'run_x.mcap')
+    assert bag.incomplete_files == ('other_40.mcap', 'run_2.mcap', 'run_10.mcap', 'run_x.mcap')
 
 
 def test_a_truncated_earlier_file_is_named_and_left_alone(folder):
@@ -266,18 +266,18 @@ def test_a_truncated_earlier_file_is_named_and_left_alone(folder):
     torn = bag.path.read_bytes()[:-100]
     bag.path.write_bytes(torn)
     with BagWriter(folder, metadata_records={}) as again:
-        assert again.unfinished == ('run_0.mcap',)
+        assert again.incomplete_files == ('run_0.mcap',)
         written = fill(again, 10)
     assert bag.path.read_bytes() == torn
     assert [file.path for file in read_metadata(folder).files] == ['run_1.mcap']
     assert read_with_rosbags(folder) == written
-    with open_bag(folder) as recording:
-        assert recording.unfinished == ('run_0.mcap',)
-        assert recording.message_count == len(written)
+    with open_bag(folder) as reader:
+        assert reader.incomplete_files == ('run_0.mcap',)
+        assert reader.message_count == len(written)
 
 
 def test_a_killed_recorder_leaves_a_folder_that_can_be_read(folder):
-    """metadata.yaml once listed the file being written: every reader then refused the folder."""
+    """metadata.yaml must not list the current file: readers would reject the folder."""
     with BagWriter(folder, metadata_records={}) as first:
         one = fill(first, 20)
     killed = BagWriter(folder, metadata_records={})
@@ -291,17 +291,17 @@ def test_a_bag_without_messages_is_readable(folder):
         bag.add_topic('/quiet', NUMBER)
     assert read_with_rosbags(folder) == []
     assert read_metadata(folder).duration_ns == 0
-    with open_bag(folder) as recording:
-        assert (recording.start_ns, recording.end_ns, recording.duration) == (0, 0, 0.0)
-        assert recording.series('/quiet', {'n': 'data'})['n'].shape == (0,)
-        assert recording.metadata_records == DETAILS
+    with open_bag(folder) as reader:
+        assert (reader.start_ns, reader.end_ns, reader.duration) == (0, 0, 0.0)
+        assert reader.series('/quiet', {'n': 'data'})['n'].shape == (0,)
+        assert reader.metadata_records == DETAILS
 
 
 def test_a_chunk_is_closed_by_time_as_well_as_by_size(folder):
     bag = BagWriter(folder, metadata_records={}, chunk_bytes=2**30, chunk_ns=500_000_000)
     written = fill(bag, 200)  # two seconds
     torn = folder.parent / 'torn.mcap'
-    torn.write_bytes(bag.path.read_bytes())  # what is on the disk if the process died now
+    torn.write_bytes(bag.path.read_bytes())  # content of the disk if the process is killed now
     assert finalize_file(torn) == 300
     assert read_with_mcap(torn) == written[:300]
     bag.close()
@@ -327,7 +327,7 @@ def test_a_read_only_disk_is_refused_and_nothing_is_left(folder, monkeypatch):
 
 
 class FullDisk:
-    """A file on a disk of so many bytes: takes what fits, then fails, as the kernel does."""
+    """File on a disk of limited size: partial writes up to the limit, then an error."""
 
     room = 0
 
@@ -375,9 +375,9 @@ def test_a_full_disk_is_reported_once_and_whole_chunks_are_kept(folder, disk, ro
     assert len(kept) > 20
     assert sorted(kept) == sorted(read_with_rosbags(folder))  # equal stamps in any order
     assert [stamp for _, stamp, _ in kept] == [START + (i // 2) * STEP for i in range(len(kept))]
-    with open_bag(folder) as recording:
-        assert recording.metadata_records == DETAILS
-        assert recording.message_count == len(kept)
+    with open_bag(folder) as reader:
+        assert reader.metadata_records == DETAILS
+        assert reader.message_count == len(kept)
 
 
 def test_a_disk_that_is_full_at_once_is_refused(folder, disk):
@@ -398,7 +398,7 @@ def test_a_disk_that_fills_at_the_very_end_is_reported_by_close(folder, disk):
     assert read_with_rosbags(folder) == []
 
 
-def test_wrong_use_is_told_apart(folder):
+def test_invalid_calls_raise_distinct_errors(folder):
     bag = BagWriter(folder, metadata_records={})
     bag.add_topic('/n', NUMBER)
     bag.add_topic('/n', NUMBER)
@@ -426,10 +426,10 @@ def test_wrong_use_is_told_apart(folder):
     assert read_metadata(folder).message_count == 0
 
 
-# -- files that broke off -----------------------------------------------------------------------
+# -- incomplete files ---------------------------------------------------------------------------
 
 
-def test_a_file_torn_anywhere_keeps_its_whole_chunks(folder, tmp_path):
+def test_file_truncated_anywhere_keeps_its_complete_chunks(folder, tmp_path):
     with BagWriter(folder, metadata_records=DETAILS, chunk_bytes=8 * 1024) as bag:
         written = fill(bag, 60)
     content = bag.path.read_bytes()
@@ -458,7 +458,7 @@ def test_one_flipped_bit_at_the_end_of_a_file_is_noticed(folder):
         assert read_file_summary(bag.path) is None, place
 
 
-def test_finishing_a_finished_file_changes_nothing(folder):
+def test_finalizing_a_complete_file_changes_nothing(folder):
     with BagWriter(folder, metadata_records=DETAILS) as bag:
         written = fill(bag, 10)
     content = bag.path.read_bytes()
@@ -466,7 +466,7 @@ def test_finishing_a_finished_file_changes_nothing(folder):
     assert bag.path.read_bytes() == content
 
 
-def test_a_tail_of_zeros_as_after_a_power_cut_is_cut_off(folder):
+def test_zeros_after_a_power_failure_are_removed(folder):
     bag = BagWriter(folder, metadata_records={})
     written = fill(bag, 10)
     bag.flush()
@@ -476,8 +476,8 @@ def test_a_tail_of_zeros_as_after_a_power_cut_is_cut_off(folder):
     assert read_with_mcap(bag.path) == written
 
 
-def test_files_laid_out_by_others_are_not_cut(tmp_path):
-    """Cutting at the last part we know would throw away what other writers put behind it."""
+def test_files_of_other_writers_are_not_truncated(tmp_path):
+    """Truncation after the last known part would remove the records of other writers."""
     from mcap.writer import IndexType, Writer
 
     path = tmp_path / 'foreign.mcap'
@@ -503,9 +503,9 @@ def test_files_laid_out_by_others_are_not_cut(tmp_path):
 def test_series_are_arrays_over_time(folder):
     with BagWriter(folder, metadata_records={}) as bag:
         fill(bag, 50)
-    with open_bag(folder) as recording:
-        assert recording.duration == pytest.approx(0.49)
-        found = recording.series(
+    with open_bag(folder) as reader:
+        assert reader.duration == pytest.approx(0.49)
+        found = reader.series(
             '/robot/odom',
             {'v': 'twist.twist.linear.x', 'w': 'twist.twist.angular.z', 'c': 'pose.covariance[7]'},
         )
@@ -514,52 +514,52 @@ def test_series_are_arrays_over_time(folder):
         np.testing.assert_array_equal(found['v'], 0.01 * np.arange(50))
         np.testing.assert_array_equal(found['w'], -0.02 * np.arange(50))
         assert set(found['c']) == {7.0}
-        bare = recording.series('/robot/cmd_vel', {'v': 'linear.x'})
+        bare = reader.series('/robot/cmd_vel', {'v': 'linear.x'})
         np.testing.assert_array_equal(bare['stamp'], bare['received'])  # a Twist has no header
 
 
-def test_an_element_beyond_an_array_is_nan_and_a_wrong_field_an_error(folder):
+def test_element_beyond_an_array_is_nan_wrong_field_an_error(folder):
     with BagWriter(folder, metadata_records={}) as bag:
         fill(bag, 2)
-    with open_bag(folder) as recording:
-        found = recording.series('/robot/odom', {'c': 'pose.covariance[99]'})
+    with open_bag(folder) as reader:
+        found = reader.series('/robot/odom', {'c': 'pose.covariance[99]'})
         assert np.isnan(found['c']).all()
         for path in ('twist.speed', 'header.frame_id', 'pose.covariance', 'twist[0]'):
             with pytest.raises(DataError, match='/robot/odom'):
-                recording.series('/robot/odom', {'x': path})
+                reader.series('/robot/odom', {'x': path})
         with pytest.raises(UnknownTopicError, match=r'/gone is not in .*/robot/odom'):
-            recording.series('/gone', {'x': 'data'})
+            reader.series('/gone', {'x': 'data'})
 
 
 def test_a_message_that_cannot_be_decoded_is_a_clear_error(folder):
     with BagWriter(folder, metadata_records={}) as bag:
         bag.add_topic('/n', NUMBER)
         bag.write('/n', START, START, b'\0\1\0\0\0')
-    with open_bag(folder) as recording, pytest.raises(DataError, match='/n cannot be read'):
-        recording.series('/n', {'x': 'data'})
+    with open_bag(folder) as reader, pytest.raises(DataError, match='/n cannot be read'):
+        reader.series('/n', {'x': 'data'})
 
 
 def test_no_bag_is_a_clear_error(tmp_path):
-    with pytest.raises(BagError, match='no finished bag file'):
+    with pytest.raises(BagError, match='no complete bag file'):
         open_bag(tmp_path)
     (tmp_path / 'a.mcap').write_bytes(b'')
-    with pytest.raises(BagError, match='unfinished: a.mcap'):
+    with pytest.raises(BagError, match='incomplete: a.mcap'):
         open_bag(tmp_path)
 
 
 def test_one_file_can_be_opened_without_its_folder(folder):
     with BagWriter(folder, metadata_records=DETAILS) as bag:
         fill(bag, 5)
-    with open_bag(bag.path) as recording:
-        assert recording.message_count == 10
-        assert recording.metadata_records == DETAILS
+    with open_bag(bag.path) as reader:
+        assert reader.message_count == 10
+        assert reader.metadata_records == DETAILS
 
 
 # -- missing samples ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize('lost', [0, 1, 17, 250])
-def test_missing_share_is_exact_for_lost_samples(lost):
+def test_missing_sample_ratio_is_exact_for_lost_samples(lost):
     generator = np.random.default_rng(5)
     stamps = np.arange(1000) / 100.0
     inner = generator.permutation(np.arange(1, 999))[:lost]
@@ -568,7 +568,7 @@ def test_missing_share_is_exact_for_lost_samples(lost):
     assert missing_sample_ratio(generator.permutation(left), 100.0) == pytest.approx(lost / 1000)
 
 
-def test_lateness_is_no_loss_and_repetition_hides_none():
+def test_latency_is_no_loss_and_duplicates_hide_none():
     generator = np.random.default_rng(6)
     stamps = np.arange(500) / 50.0
     late = stamps.copy()
@@ -578,7 +578,7 @@ def test_lateness_is_no_loss_and_repetition_hides_none():
     assert missing_sample_ratio(np.concatenate([holed, holed]), 50.0) == pytest.approx(0.2)
 
 
-def test_too_few_stamps_or_none_miss_nothing():
+def test_fewer_than_two_stamps_miss_nothing():
     for stamps in ([], [1.0], [np.nan, 1.0], [2.0, 2.0]):
         assert missing_sample_ratio(np.array(stamps), 10.0) == 0.0
     for rate in (0.0, -1.0, float('nan')):

@@ -384,13 +384,13 @@ def test_a_bag_without_commands_is_refused(bag, tmp_path):
 
 def test_the_journal_numbers_events_and_counts_references():
     journal = Journal()
-    journal.reference(7)
-    journal.reference(9)
+    journal.count_reference(7)
+    journal.count_reference(9)
     assert list(journal.step(5)) == [0, Event.STEP, 5, 2, 9]
     assert list(journal.enable(False)) == [1, Event.ENABLE, 0, 2, 0]
     assert list(journal.reset()) == [2, Event.RESET, 0, 2, 0]
     assert list(journal.configure()) == [3, Event.CONFIGURE, 0, 2, 1]
-    assert list(journal.silent(5)) == [4, Event.ODOMETRY_TIMEOUT, 5, 2, 0]
+    assert list(journal.odometry_timeout(5)) == [4, Event.ODOMETRY_TIMEOUT, 5, 2, 0]
 
 
 def test_settings_survive_their_topic_to_the_last_bit():

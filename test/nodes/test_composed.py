@@ -22,7 +22,7 @@ def compose(graph, tmp_path):
     nodes = []
 
     def make(*parameters):
-        words = [f'folder:={tmp_path}', *parameters]
+        words = [f'storage.uri:={tmp_path}', *parameters]
         rclpy.init(args=['--ros-args', *(word for item in words for word in ('-p', item))])
         nodes.extend(composed.make())
         return {node.get_name(): node for node in nodes}

@@ -60,7 +60,7 @@ def live_run(processes, bag, model):
     learnt = Controller(ControllerParameters()).law.get_weights()
     learnt['fuzzy.coefficients'] += 0.25
     save_model(model, learnt, {})
-    parameters = {'recorder': {'folder': str(bag)}, 'controller': {'model': str(model)}}
+    parameters = {'recorder': {'storage.uri': str(bag)}, 'controller': {'model': str(model)}}
     for name in LOOP:
         processes.start(name, parameters=parameters.get(name))
         processes.wait_ready(name)
@@ -136,7 +136,7 @@ def test_a_late_recorder_can_replay_from_the_beginning(processes, tmp_path):
         processes.start(name)
         processes.wait_ready(name)
     processes.wait_for('controller', 'tracking')
-    processes.start('recorder', parameters={'folder': str(bag)})
+    processes.start('recorder', parameters={'storage.uri': str(bag)})
     processes.wait_ready('recorder')
     time.sleep(5.0)
     processes.check()

@@ -79,7 +79,7 @@ def test_every_node_publishes_diagnostics_at_1_hz(harness, tmp_path):
     for name, kind in NODE_CLASSES.items():
         if name != 'recorder':
             harness.add(kind)
-    harness.add(RecorderNode, folder=str(tmp_path / 'bag'))
+    harness.add(RecorderNode, storage__uri=str(tmp_path / 'bag'))
     harness.add(ComposedNode, namespace='two')
     harness.spin_until(lambda: stamps.keys() == {*NODES, 'two/composed'})
     harness.spin_until(lambda: all(len(times) >= 4 for times in stamps.values()))
@@ -128,7 +128,7 @@ def test_tracking_resumes_after_the_clock_jumps_back(harness, tmp_path):
 
     kinds = (SimRobotNode, ControllerNode, ReferenceGeneratorNode)
     robot, controller, reference = (harness.add(kind, use_sim_time=True) for kind in kinds)
-    harness.add(RecorderNode, use_sim_time=True, folder=str(tmp_path / 'bag'))
+    harness.add(RecorderNode, use_sim_time=True, storage__uri=str(tmp_path / 'bag'))
     odom = harness.subscribe(Odometry, 'odom')
     harness.wait_for_subscriber(clock, 4)
     # The nodes run for a while before the clock starts.

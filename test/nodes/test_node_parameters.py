@@ -32,7 +32,7 @@ NODE_CLASSES = {
 
 @pytest.mark.parametrize('name', NODES)
 def test_every_specification_is_a_described_parameter(name, harness, tmp_path):
-    given = {'folder': str(tmp_path / 'bag')} if name == 'recorder' else {}
+    given = {'storage.uri': str(tmp_path / 'bag')} if name == 'recorder' else {}
     node = harness.add(NODE_CLASSES[name], **given)
     rows = parameter_class(name).specs()
     assert rows
@@ -102,7 +102,7 @@ def test_integers_and_empty_lists_are_accepted_at_start(harness, tmp_path):
     controller = harness.add(ControllerNode, ['-p', 'law.gain:=5', '-p', 'rate:=50'])
     assert controller.parameters.law.gain == 5.0
     assert controller.get_parameter('rate').value == 50.0
-    recorder = harness.add(RecorderNode, folder=str(tmp_path), topics=[])
+    recorder = harness.add(RecorderNode, storage__uri=str(tmp_path), record__topics=[])
     assert recorder.parameters.topics == ()
 
 

@@ -25,7 +25,7 @@ def _start_loop(processes, bag):
 
 
 def _start(processes, name, bag):
-    processes.start(name, parameters={'folder': str(bag)} if name == 'recorder' else None)
+    processes.start(name, parameters={'storage.uri': str(bag)} if name == 'recorder' else None)
     processes.wait_ready(name)
 
 
@@ -170,7 +170,7 @@ def test_a_restarted_recorder_continues_the_bag(processes, tmp_path):
 
 def test_composed_closes_the_loop_in_one_process(processes, tmp_path):
     bag = tmp_path / 'bag'
-    processes.start('composed', parameters={'folder': str(bag)})
+    processes.start('composed', parameters={'storage.uri': str(bag)})
     processes.wait_ready('composed')
     time.sleep(6.0)
     assert processes.stop('composed') == 0
@@ -193,7 +193,7 @@ def test_composed_closes_the_loop_in_one_process(processes, tmp_path):
         ('sim_robot', ['--ros-args', '-p', 'drive.kind:=warp'], ['drive.kind', 'one of', 'warp']),
         ('recorder', ['--ros-args', '--params-file', 'MISSING'], ['MISSING', 'cannot read']),
         ('recorder', ['--ros-args', '--params-file', 'BROKEN'], ['BROKEN', 'not valid YAML']),
-        ('recorder', ['--ros-args', '-p', 'folder:=FILE/bag'], ['FILE/bag']),
+        ('recorder', ['--ros-args', '-p', 'storage.uri:=FILE/bag'], ['FILE/bag']),
         ('controller', ['--ros-args', '-p', 'model:=BROKEN'], ['BROKEN', 'not a model file']),
     ],
 )

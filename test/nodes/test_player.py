@@ -76,8 +76,8 @@ def payloads(folder):
 
 
 def play(harness, bag, *arguments, **more):
-    more = {'wait_for_subscribers': 20.0} | more
-    return harness.add(PlayerNode, arguments, bags=[str(bag)], **more)
+    more = {'play__subscriber_timeout': 20.0} | more
+    return harness.add(PlayerNode, arguments, storage__uris=[str(bag)], **more)
 
 
 def call(harness, name):
@@ -87,7 +87,10 @@ def call(harness, name):
 # -- messages and QoS -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('given', [{'allow_commands': True}, {'remap': ['cmd_vel:=velocity']}])
+@pytest.mark.parametrize(
+    'given',
+    [{'play__allow_commands': True}, {'play__topic_remapping_options': ['cmd_vel:=velocity']}],
+)
 def test_a_played_and_recorded_bag_has_the_same_bytes(given, harness, tmp_path):
     messages = [('/map', 0.0, String(data='a map'))]
     for i in range(200):
@@ -99,9 +102,11 @@ def test_a_played_and_recorded_bag_has_the_same_bytes(given, harness, tmp_path):
         ]
     bag = write(tmp_path / 'first', messages, {'/map': ONE_LATCHED, '/text': WEAK})
     first = payloads(bag)
-    if 'remap' in given:
+    if 'play__topic_remapping_options' in given:
         first['/velocity'] = first.pop('/cmd_vel')
-    recorder = harness.add(RecorderNode, folder=str(tmp_path / 'second'), topics=list(first))
+    recorder = harness.add(
+        RecorderNode, storage__uri=str(tmp_path / 'second'), record__topics=list(first)
+    )
     player = play(harness, bag, **given)
     count = len(messages)
     harness.spin_until(lambda: player.exit_requested, 'the bag ends')
@@ -112,9 +117,9 @@ def test_a_played_and_recorded_bag_has_the_same_bytes(given, harness, tmp_path):
     second = payloads(tmp_path / 'second')
     assert second == first
     tape = MergedReader([open_serialized_bag(tmp_path / 'second')])
-    assert tape.tracks['/map'].profiles[0].durability == 'transient_local'
-    assert tape.tracks['/text'].profiles[0].reliability == 'best_effort'
-    assert tape.tracks['/odom'].profiles[0].reliability == 'reliable'
+    assert tape.topics['/map'].offered_qos_profiles[0].durability == 'transient_local'
+    assert tape.topics['/text'].offered_qos_profiles[0].reliability == 'best_effort'
+    assert tape.topics['/odom'].offered_qos_profiles[0].reliability == 'reliable'
     # The recorded interval of one second is published within one second.
     assert (tape.end_ns - tape.start_ns) / SECOND == pytest.approx(0.996, abs=0.2)
     tape.close()
@@ -123,7 +128,7 @@ def test_a_played_and_recorded_bag_has_the_same_bytes(given, harness, tmp_path):
 def test_a_late_subscriber_gets_the_latched_message(harness, tmp_path):
     messages = [('/map', 0.0, String(data='old')), *texts(), ('/map', 0.3, String(data='new'))]
     bag = write(tmp_path / 'bag', messages, {'/map': ONE_LATCHED})
-    player = play(harness, bag, wait_for_subscribers=0.0, exit_at_end=False)
+    player = play(harness, bag, play__subscriber_timeout=0.0, play__exit_at_end=False)
     harness.spin_until(lambda: reason(player) == 'finished')
     late = harness.subscribe(String, 'map', LATCHED)
     harness.spin_until(lambda: late)
@@ -134,7 +139,7 @@ def test_a_start_offset_publishes_earlier_latched_messages(harness, tmp_path):
     messages = [('/map', 0.0, String(data='a map')), *texts(20)]
     bag = write(tmp_path / 'bag', messages, {'/map': ONE_LATCHED})
     received = harness.subscribe(String, 'map', LATCHED), harness.subscribe(String, 'text')
-    play(harness, bag, start_offset=0.1, until=0.2)
+    play(harness, bag, play__start_offset=0.1, play__playback_until=0.2)
     harness.spin_until(lambda: len(received[1]) == 6)
     assert [message.data for message in received[0]] == ['a map']
     assert [int(message.data) for message in received[1]] == [5, 6, 7, 8, 9, 10]
@@ -144,7 +149,7 @@ def test_qos_overrides_replace_the_recorded_qos(harness, tmp_path):
     bag = write(tmp_path / 'bag', [*texts(), ('/other', 0.5, String())], {'/other': WEAK})
     overrides = tmp_path / 'overrides.yaml'
     overrides.write_text('/text: {reliability: best_effort, durability: transient_local}')
-    play(harness, bag, quality_overrides=str(overrides))
+    play(harness, bag, play__qos_profile_overrides_path=str(overrides))
 
     def offered(topic):
         infos = harness.probe.get_publishers_info_by_topic(topic)
@@ -160,7 +165,7 @@ def test_the_time_of_the_bag_is_published_as_clock(harness, tmp_path):
     log = harness.subscribe(Log, '/rosout', LATCHED)
     clock = harness.subscribe(Clock, '/clock', QoSProfile(depth=100))
     text = harness.subscribe(String, 'text')
-    player = play(harness, bag, clock_rate=100.0, rate=2.0)
+    player = play(harness, bag, play__clock_publish_frequency=100.0, play__rate=2.0)
     assert harness.probe.get_publishers_info_by_topic('/clock')
     harness.spin_until(lambda: player.exit_requested)
     harness.spin_until(lambda: len(text) == 50)
@@ -205,17 +210,17 @@ def test_a_velocity_is_played_with_allow_commands_only(arguments, topic, harness
     bag = write(tmp_path / 'bag', messages)
     name = arguments[1].split(':=')[1] if arguments else topic
     moved, received = harness.subscribe(Twist, name), harness.subscribe(String, 'text')
-    given = {'remap': ['cmd_vel:=velocity']} if arguments else {}
+    given = {'play__topic_remapping_options': ['cmd_vel:=velocity']} if arguments else {}
     player = play(harness, bag, *arguments, **given)
     harness.spin_until(lambda: len(received) == 10 and player.exit_requested)
     assert not moved
     assert diagnostic(player, 'excluded') == topic
     (entry,) = [entry for entry in log if f'{topic} is not played' in entry.msg]
     assert entry.level == 30
-    assert 'allow_commands' in entry.msg
-    assert 'remap' in entry.msg
+    assert 'play.allow_commands' in entry.msg
+    assert 'play.topic_remapping_options' in entry.msg
     harness.remove(player)
-    again = play(harness, bag, *arguments, allow_commands=True, **given)
+    again = play(harness, bag, *arguments, play__allow_commands=True, **given)
     harness.spin_until(lambda: len(moved) == 10 and again.exit_requested)
 
 
@@ -223,7 +228,7 @@ def test_a_remapped_velocity_does_not_reach_a_robot(harness, tmp_path):
     robot = harness.add(SimRobotNode, ['-r', 'cmd_vel:=/steer'])
     log = harness.subscribe(Log, '/rosout', LATCHED)
     bag = write(tmp_path / 'bag', [(t, 0.02 * i, twist(0.3)) for i in range(20) for t in ['/v']])
-    player = play(harness, bag, remap=['v:=steer'])
+    player = play(harness, bag, play__topic_remapping_options=['v:=steer'])
     harness.spin_until(lambda: player.exit_requested)
     assert any('/steer is disabled: it would move /sim_robot' in e.msg for e in log)
     assert diagnostic(robot, 'commands') == 0
@@ -250,18 +255,20 @@ def test_another_publisher_of_a_topic_is_a_warning(harness, tmp_path):
 def test_services_pause_play_next_seek_and_set_the_rate(harness, tmp_path):
     bag = write(tmp_path / 'bag', texts(2000, 0.01))
     received = harness.subscribe(String, 'text', 2000)
-    player = play(harness, bag, start_paused=True, step_count=3)
+    player = play(harness, bag, play__start_paused=True, play__play_next_count=3)
     assert call(harness, 'play_next').success
     harness.spin_until(lambda: len(received) == 3)
-    player.set_parameters([Parameter('seek_time', value=15.0), Parameter('step_count', value=1)])
+    player.set_parameters(
+        [Parameter('play.seek_time', value=15.0), Parameter('play.play_next_count', value=1)]
+    )
     assert 'paused at 15.000 s' in call(harness, 'seek').message
     assert call(harness, 'play_next').success
     harness.spin_until(lambda: len(received) == 4)
     assert [message.data for message in received] == ['0', '1', '2', '1500']
-    player.set_parameters([Parameter('seek_time', value=20.0)])
+    player.set_parameters([Parameter('play.seek_time', value=20.0)])
     response = call(harness, 'seek')
     assert not response.success
-    assert response.message == 'the place must be from 0.000 to 19.990 s: got 20.000 s'
+    assert response.message == 'the seek target must be from 0.000 to 19.990 s: got 20.000 s'
     assert 'playing' in call(harness, 'resume').message
     harness.spin_until(lambda: len(received) > 20)
     response = call(harness, 'play_next')
@@ -269,7 +276,7 @@ def test_services_pause_play_next_seek_and_set_the_rate(harness, tmp_path):
     assert 'must be paused' in response.message
     assert 'paused' in call(harness, 'pause').message
     assert 'playing' in call(harness, 'toggle_paused').message
-    player.set_parameters([Parameter('rate', value=50.0)])
+    player.set_parameters([Parameter('play.rate', value=50.0)])
     assert 'rate 50' in call(harness, 'set_rate').message
     harness.spin_until(lambda: player.exit_requested, 'the end of the bag at that rate')
     harness.spin_until(lambda: len(received) == 503)
@@ -280,9 +287,9 @@ def test_services_pause_play_next_seek_and_set_the_rate(harness, tmp_path):
 def test_without_a_bag_the_player_warns(harness):
     player = harness.add(PlayerNode)
     status = harness.next_status('player')
-    assert (status.level, status.message) == (WARN, 'no bag is open: set bags')
+    assert (status.level, status.message) == (WARN, 'no bag is open: set storage.uris')
     response = call(harness, 'resume')
-    assert (response.success, response.message) == (False, 'no bag is open: set bags')
+    assert (response.success, response.message) == (False, 'no bag is open: set storage.uris')
     assert not player.exit_requested
 
 
@@ -310,10 +317,12 @@ def test_playback_works_without_the_realtime_priority(allowed, harness, tmp_path
     monkeypatch.setattr(os, 'sched_setscheduler', scheduler)
     log = harness.subscribe(Log, '/rosout', LATCHED)
     received = harness.subscribe(String, 'text')
-    player = play(harness, write(tmp_path / 'bag', texts(30)), realtime_priority=5)
+    player = play(harness, write(tmp_path / 'bag', texts(30)), play__realtime_priority=5)
     harness.spin_until(lambda: player.exit_requested and len(received) == 30)
     assert asked == [('player', os.SCHED_FIFO, 5)]
-    words = 'realtime_priority 5 is not available: Operation not permitted; playing without it'
+    words = (
+        'play.realtime_priority 5 is not available: Operation not permitted; playing without it'
+    )
     if not allowed:
         harness.spin_until(lambda: any(entry.msg == words for entry in log))
     assert allowed or sum(entry.msg == words for entry in log) == 1
@@ -328,7 +337,7 @@ def test_a_damaged_bag_ends_playback_with_an_error(harness, tmp_path):
         content.seek(chunks[3].chunk_start_offset + chunks[3].chunk_length - 60)
         content.write(bytes(60))
     log = harness.subscribe(Log, '/rosout', LATCHED)
-    player = play(harness, bag, wait_for_subscribers=0.0)
+    player = play(harness, bag, play__subscriber_timeout=0.0)
     harness.spin_until(lambda: player.exit_code == 1)
     assert diagnostic(player, 'messages') > 30, 'the messages before the damage are played'
     words = r'playback has ended early: .*bag_0.mcap cannot be read'
@@ -338,23 +347,43 @@ def test_a_damaged_bag_ends_playback_with_an_error(harness, tmp_path):
 @pytest.mark.parametrize(
     'given, error, words',
     [
-        ({'bags': ['/nowhere/at/all']}, BagError, 'there is no bag /nowhere/at/all'),
+        ({'storage__uris': ['/nowhere/at/all']}, BagError, 'there is no bag /nowhere/at/all'),
         (
-            {'start_offset': 9.0},
+            {'play__start_offset': 9.0},
             ParameterError,
-            'start_offset must be at most .* 0.180 s: got 9 s',
+            'play.start_offset must be at most .* 0.180 s: got 9 s',
         ),
-        ({'start_offset': 0.1, 'until': 0.1}, ParameterError, 'until must be later than'),
-        ({'remap': ['a=b']}, ParameterError, "remap must be a list of old:=new: got 'a=b'"),
-        ({'regex': '['}, ParameterError, 'regex must be a regular expression'),
-        ({'bag_offsets': [1.0, 2.0]}, ParameterError, 'one number for each of the 1 bags: got 2'),
-        ({'quality_overrides': '/none.yaml'}, BagError, '/none.yaml cannot be read'),
+        (
+            {'play__start_offset': 0.1, 'play__playback_until': 0.1},
+            ParameterError,
+            'play.playback_until must be later than',
+        ),
+        (
+            {'play__topic_remapping_options': ['a=b']},
+            ParameterError,
+            "play.topic_remapping_options must be a list of old:=new: got 'a=b'",
+        ),
+        (
+            {'play__regex_to_filter': '['},
+            ParameterError,
+            'play.regex_to_filter must be a regular expression',
+        ),
+        (
+            {'play__bag_offsets': [1.0, 2.0]},
+            ParameterError,
+            'one number for each of the 1 bags: got 2',
+        ),
+        (
+            {'play__qos_profile_overrides_path': '/none.yaml'},
+            BagError,
+            '/none.yaml cannot be read',
+        ),
     ],
 )
 def test_unusable_parameters_are_rejected_at_start(given, error, words, harness, tmp_path):
     bag = write(tmp_path / 'bag', texts())
     with pytest.raises(error, match=words):
-        harness.add(PlayerNode, **({'bags': [bag]} | given))
+        harness.add(PlayerNode, **({'storage__uris': [bag]} | given))
 
 
 # -- in a terminal --------------------------------------------------------------------------------
@@ -429,7 +458,7 @@ def terminal(graph):
 
 def test_keys_pause_play_next_and_change_the_rate(terminal, tmp_path):
     bag = write(tmp_path / 'bag', texts(100, 1.0))
-    shell = terminal(f'bags:=["{bag}"]')
+    shell = terminal(f'storage.uris:=["{bag}"]')
     shell.until(r'playing .* x1 ')
     assert not shell.settings()[3] & (termios.ICANON | termios.ECHO)
     shell.press(b' ')
@@ -453,7 +482,7 @@ def test_keys_pause_play_next_and_change_the_rate(terminal, tmp_path):
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_the_terminal_is_restored_after_a_signal(number, terminal, tmp_path):
     bag = write(tmp_path / 'bag', texts(100, 0.1))
-    shell = terminal(f'bags:=["{bag}"]', 'start_paused:=true')
+    shell = terminal(f'storage.uris:=["{bag}"]', 'play.start_paused:=true')
     shell.until('paused')
     assert shell.settings() != shell.before
     shell.process.send_signal(number)
@@ -464,7 +493,7 @@ def test_the_terminal_is_restored_after_a_signal(number, terminal, tmp_path):
 
 def test_the_terminal_is_restored_at_the_end_of_the_bag(terminal, tmp_path):
     bag = write(tmp_path / 'bag', texts(5))
-    shell = terminal(f'bags:=["{bag}"]')
+    shell = terminal(f'storage.uris:=["{bag}"]')
     shell.until('5 messages, timing error 50/99 %')
     assert shell.wait() == 0
     assert shell.settings() == shell.before
@@ -476,7 +505,7 @@ def test_the_terminal_is_restored_after_an_error(terminal, tmp_path):
         'from t3mpc_ros.nodes.player.node import PlayerNode as node; '
         'node._monitor = lambda self: 1 / (self._keyboard is None); '
     )
-    shell = terminal(f'bags:=["{bag}"]', program=fault + PROGRAM)
+    shell = terminal(f'storage.uris:=["{bag}"]', program=fault + PROGRAM)
     assert shell.wait() == 1
     assert 'ZeroDivisionError' in shell.text
     assert shell.settings() == shell.before
@@ -486,13 +515,19 @@ def test_without_a_terminal_the_player_plays_to_the_end(graph, tmp_path):
     bag = write(tmp_path / 'bag', texts(5))
     command = [sys.executable, '-c', PROGRAM, '--ros-args', '-p']
     done = subprocess.run(
-        [*command, f'bags:=["{bag}"]'], stdin=subprocess.DEVNULL, capture_output=True, text=True
+        [*command, f'storage.uris:=["{bag}"]'],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stderr
     assert '5 messages, timing error 50/99 %' in done.stderr
     assert done.stdout == '', 'no progress line without a terminal'
     refused = subprocess.run(
-        [*command, 'bags:=["/nowhere"]'], stdin=subprocess.DEVNULL, capture_output=True, text=True
+        [*command, 'storage.uris:=["/nowhere"]'],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
     )
     assert refused.returncode == 2
     assert refused.stderr == 'player: there is no bag /nowhere\n'

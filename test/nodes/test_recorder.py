@@ -36,7 +36,7 @@ DEEP = QoSProfile(depth=5000)
 
 
 def record(harness, folder, *topics, **more):
-    return harness.add(RecorderNode, folder=str(folder), topics=list(topics), **more)
+    return harness.add(RecorderNode, storage__uri=str(folder), record__topics=list(topics), **more)
 
 
 def values(recorder):
@@ -76,7 +76,7 @@ def test_reception_is_stamped_on_arrival_not_on_taking(harness, tmp_path):
 
 def test_messages_beyond_the_queue_are_dropped_and_counted(harness, tmp_path, monkeypatch):
     log = harness.subscribe(Log, '/rosout', LATCHED)
-    recorder = record(harness, tmp_path, 'text', 'number', queue_bytes=65_536)
+    recorder = record(harness, tmp_path, 'text', 'number', storage__max_cache_size=65_536)
     text, number = (
         harness.create_publisher(String, 'text', DEEP),
         harness.create_publisher(Int32, 'number', DEEP),
@@ -112,7 +112,7 @@ def test_messages_beyond_the_queue_are_dropped_and_counted(harness, tmp_path, mo
 
 def test_messages_replaced_in_the_dds_queue_are_counted(harness, tmp_path):
     """A full KEEP_LAST queue replaces its oldest samples, which DDS does not count as lost."""
-    recorder = record(harness, tmp_path, 'text', chunk_time=0.05)
+    recorder = record(harness, tmp_path, 'text', storage__chunk_duration=0.05)
     text = harness.create_publisher(String, 'text', DEEP)
     harness.wait_for_subscriber(text)
     text.publish(String(data='first'))
@@ -134,7 +134,11 @@ def test_messages_replaced_in_the_dds_queue_are_counted(harness, tmp_path):
 
 def test_expressions_and_types_select_in_the_graph(harness, tmp_path):
     recorder = record(
-        harness, tmp_path, regex='/cam_[0-9]', exclude='/.*secret', types=['std_msgs/msg/Int32']
+        harness,
+        tmp_path,
+        record__regex='/cam_[0-9]',
+        record__exclude_regex='/.*secret',
+        record__topic_types=['std_msgs/msg/Int32'],
     )
     texts_by_topic = {
         name: harness.create_publisher(String, name) for name in ('cam_1', 'cam_x', 'other')
@@ -154,7 +158,7 @@ def test_expressions_and_types_select_in_the_graph(harness, tmp_path):
 
 def test_an_invalid_regular_expression_is_rejected(harness, tmp_path):
     with pytest.raises(ParameterError, match=r'regex must be a regular expression.*position 0'):
-        record(harness, tmp_path, regex='*')
+        record(harness, tmp_path, record__regex='*')
 
 
 def test_an_expected_latched_topic_is_recorded_from_its_start(harness, tmp_path):
@@ -229,7 +233,7 @@ def test_a_fault_starts_one_snapshot_with_its_reason(harness, tmp_path):
     harness.spin_until(lambda: values(recorder)['snapshots'] == 1)
     report(OK, 'following commands')
     report(ERROR, 'e-stop latched')  # again within snapshot_pause
-    harness.spin_until(lambda: any('snapshot_pause' in entry.msg for entry in log))
+    harness.spin_until(lambda: any('snapshot.min_interval' in entry.msg for entry in log))
     harness.remove(recorder)
     (folder,) = snapshots(tmp_path)
     assert 'sim-robot-e-stop-latched' in folder.name
@@ -282,7 +286,9 @@ def test_a_stop_of_the_controller_starts_a_snapshot(harness, tmp_path):
 
 
 def test_snapshot_mode_writes_snapshots_only(harness, tmp_path):
-    recorder = record(harness, tmp_path, 'text', snapshot_only=True, snapshot_time=60.0)
+    recorder = record(
+        harness, tmp_path, 'text', storage__snapshot_mode=True, storage__snapshot_duration=60.0
+    )
     assert harness.call(Trigger, 'recorder/split_bagfile').success is False
     response = harness.call(Trigger, 'recorder/snapshot')
     assert not response.success
@@ -300,10 +306,10 @@ def test_snapshot_mode_writes_snapshots_only(harness, tmp_path):
 
 
 def test_snapshots_can_be_turned_off(harness, tmp_path):
-    record(harness, tmp_path, 'text', snapshot_time=0.0)
+    record(harness, tmp_path, 'text', storage__snapshot_duration=0.0)
     response = harness.call(Trigger, 'recorder/snapshot')
     assert not response.success
-    assert 'snapshot_time must be above 0' in response.message
+    assert 'storage.snapshot_duration must be above 0' in response.message
 
 
 def test_a_failed_snapshot_is_reported_and_recording_continues(harness, tmp_path):
@@ -337,7 +343,7 @@ def test_model_files_are_attached_to_every_file(harness, tmp_path):
     world_map = tmp_path / 'room.yaml'
     world_map.write_text('walls: []')
     bag = tmp_path / 'bag'
-    recorder = record(harness, bag, 'odom', attach=[str(world_map)])
+    recorder = record(harness, bag, 'odom', record__attachments=[str(world_map)])
     harness.add(ControllerNode, model=str(model), model_output=str(output))
     harness.spin_until(lambda: 'controller' in recorder._metadata.records)
     assert harness.call(Trigger, 'recorder/split_bagfile').success

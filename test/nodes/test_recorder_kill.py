@@ -98,7 +98,7 @@ def kill_in_sequence(root, slot, source):
             processes.start(
                 'recorder',
                 *('--ros-args', '-r', f'__ns:=/{name}'),
-                parameters={'folder': str(bag), 'topics': ['/odom']},
+                parameters={'storage.uri': str(bag), 'record.topics': ['/odom']},
             )
             processes.wait_ready('recorder')
             wait_until(lambda name=name: source.has_subscriber_in(f'/{name}'))

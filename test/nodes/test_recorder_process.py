@@ -77,7 +77,9 @@ def publisher(ros):
 
 
 def start(processes, folder, **more):
-    processes.start('recorder', parameters={'folder': str(folder), 'topics': ['number'], **more})
+    processes.start(
+        'recorder', parameters={'storage.uri': str(folder), 'record.topics': ['number'], **more}
+    )
     processes.wait_ready('recorder')
 
 
@@ -122,7 +124,7 @@ def test_messages_before_a_signal_are_in_the_bag(number, processes, publisher, t
 
 
 def test_a_file_size_limit_stops_recording_readably(processes, publisher, tmp_path):
-    start(processes, tmp_path / 'bag', chunk_time=0.05)
+    start(processes, tmp_path / 'bag', **{'storage.chunk_duration': 0.05})
     publisher.wait_for_recorder()
     publisher.ballast = 500
     # More than the reserve for the end of a file on a full disk.

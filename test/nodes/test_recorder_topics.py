@@ -38,7 +38,7 @@ def _count(harness, recorder, count):
 
 
 def _recorder(harness, folder, *topics, **more):
-    return harness.add(RecorderNode, folder=str(folder), topics=list(topics), **more)
+    return harness.add(RecorderNode, storage__uri=str(folder), record__topics=list(topics), **more)
 
 
 def test_a_type_that_is_not_installed_is_a_warning(harness, tmp_path, monkeypatch):
@@ -207,4 +207,4 @@ def test_parameters_are_recorded_by_namespace(harness, tmp_path):
     with open_bag(tmp_path) as recording:
         assert recording.metadata_records['controller']['law.gain'] == '3.0'
         assert recording.metadata_records['/b/controller']['law.gain'] == '4.0'
-        assert recording.metadata_records['recorder']['folder'] == str(tmp_path)
+        assert recording.metadata_records['recorder']['storage.uri'] == str(tmp_path)

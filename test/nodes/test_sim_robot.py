@@ -183,7 +183,7 @@ def test_the_paper_plant_has_no_sensors(harness):
 
 def test_sensor_topics_are_recorded_by_default(harness, tmp_path):
     harness.add(SimRobotNode)
-    recorder = harness.add(RecorderNode, folder=str(tmp_path / 'bag'))
+    recorder = harness.add(RecorderNode, storage__uri=str(tmp_path / 'bag'))
     wanted = {'/imu/data_raw', '/battery_state', *(f'/range/{name}' for name in RANGE_SENSORS)}
     harness.spin_until(lambda: wanted <= recorder._recorded_types.keys(), 'all are recorded')
 

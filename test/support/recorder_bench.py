@@ -1,14 +1,15 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""How much the recorder loses, and what it costs, at many messages a second.
+"""Benchmark of the recorder: lost messages and processor time at a high message rate.
 
-    PYTHONPATH=. .venv/bin/python test/support/recorder_bench.py [--seconds 60] [--topics 20] [--rate 100]
+    PYTHONPATH=. .venv/bin/python test/support/recorder_bench.py [--seconds 60] [--topics 20]
+        [--rate 100]
 
-A publisher and the recorder run as processes of their own over DDS on loopback. Half of the
-topics are Odometry (about 0.7 kB), half Float64; each message carries its number. Printed are the
-messages sent, recorded and lost, and the processor time of the recorder (user and system, of all
-its threads) as a share of one core, from the first message to the last. Nothing is asserted
-here; ``test_recorder_process.py`` runs a short one and asserts that nothing is lost.
+A publisher and the recorder run as separate processes over DDS on loopback. Half of the topics
+are Odometry (about 0.7 kB), half Float64; each message contains its number. The output is the
+number of messages sent, recorded and lost, and the processor time of the recorder (user and
+system, all threads) as a fraction of one core, from the first to the last message.
+``test/nodes/test_recorder_process.py`` runs a short benchmark and asserts that nothing is lost.
 """
 
 import argparse
@@ -28,26 +29,26 @@ FIELDS = {
     'std_msgs/msg/Float64': 'data',
 }
 DEPTH = 1000
-"""Of the publishers' queues: what DDS may hold back for a recorder that is late."""
+"""History depth of the publishers, which covers delays of the recorder."""
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What came of one run."""
+class BenchmarkResult:
+    """Result of one run."""
 
     sent: int
     recorded: int
     in_order: bool
-    """Whether each topic's messages are there once each, in the order in which they were sent."""
+    """Whether every message of each topic was recorded once, in the order of publication."""
     share: float
-    """Processor time of the recorder per time, 1 = one core."""
+    """Processor time of the recorder per elapsed time, 1 = one core."""
     seconds: float
     size: int
     """Bytes of the bag."""
 
 
 def processor_time(pid: int) -> float:
-    """Return the seconds of processor time, user and system, that a process has used."""
+    """Return the processor time of a process, user and system, s."""
     fields = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
 
@@ -55,14 +56,16 @@ def processor_time(pid: int) -> float:
 def run(
     folder: Path, processes: ProcessGroup, seconds: float, topics: int = 20, rate: float = 100.0
 ):
-    """Return the :class:`Outcome` of one recording in ``folder``."""
-    processes.start('recorder', parameters={'folder': str(folder), 'topics': ['bench/*']})
+    """Return the :class:`BenchmarkResult` of one recording in ``folder``."""
+    processes.start(
+        'recorder', parameters={'storage.uri': str(folder), 'record.topics': ['bench/*']}
+    )
     processes.wait_ready('recorder')
     pid = processes.pid('recorder')
-    words = [sys.executable, __file__, '--publish', '--seconds', str(seconds)]
-    words += ['--topics', str(topics), '--rate', str(rate)]
+    command = [sys.executable, __file__, '--publish', '--seconds', str(seconds)]
+    command += ['--topics', str(topics), '--rate', str(rate)]
     publisher = subprocess.Popen(
-        words, stdout=subprocess.PIPE, text=True, env=processes._environment
+        command, stdout=subprocess.PIPE, text=True, env=processes._environment
     )
     try:
         assert publisher.stdout.readline() == 'begin\n'
@@ -76,17 +79,17 @@ def run(
     code = processes.stop('recorder')
     assert code == 0, f'the recorder ended with code {code}'
     recorded, in_order = 0, True
-    with open_bag(folder) as recording:
-        for name, topic in recording.topics.items():
+    with open_bag(folder) as reader:
+        for name, topic in reader.topics.items():
             recorded += topic.message_count
-            numbers = recording.series(name, {'n': FIELDS[topic.type_name]})['n']
+            numbers = reader.series(name, {'n': FIELDS[topic.type_name]})['n']
             in_order &= numbers.tolist() == list(range(sent // topics))
     size = sum(path.stat().st_size for path in folder.glob('*.mcap'))
-    return Outcome(sent, recorded, in_order, used / elapsed, elapsed, size)
+    return BenchmarkResult(sent, recorded, in_order, used / elapsed, elapsed, size)
 
 
 def publish(seconds: float, topics: int, rate: float) -> None:
-    """Publish on all topics, evenly over each period, once somebody listens to every one."""
+    """Publish on all topics, evenly over each period, after all of them have a subscriber."""
     from nav_msgs.msg import Odometry
     import rclpy
     from rclpy.duration import Duration
@@ -99,7 +102,7 @@ def publish(seconds: float, topics: int, rate: float) -> None:
     publishers = [node.create_publisher(k, f'bench/n{i}', DEPTH) for i, k in enumerate(kinds)]
     while not all(publisher.get_subscription_count() for publisher in publishers):
         time.sleep(0.1)
-    time.sleep(1.0)  # both ends have found each other
+    time.sleep(1.0)  # discovery is complete on both sides
     messages = [kind() for kind in kinds]
     print('begin', flush=True)
     count = round(seconds * rate)
@@ -111,7 +114,7 @@ def publish(seconds: float, topics: int, rate: float) -> None:
             else:
                 messages[i].pose.pose.position.x = float(number)
             publisher.publish(messages[i])
-            if i % 5 == 4:  # in bursts of five, as an executor would
+            if i % 5 == 4:  # in bursts of five, as from an executor
                 due = begin + (number + (i + 1) / topics) / rate
                 time.sleep(max(0.0, due - time.monotonic()))
     print('end', flush=True)
@@ -122,19 +125,19 @@ def publish(seconds: float, topics: int, rate: float) -> None:
 
 
 def main() -> int:
-    """Run one, and print what came of it."""
+    """Run one benchmark and print its result."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--seconds', type=float, default=60.0)
     parser.add_argument('--topics', type=int, default=20)
     parser.add_argument('--rate', type=float, default=100.0)
     parser.add_argument('--publish', action='store_true', help=argparse.SUPPRESS)
-    given = parser.parse_args()
-    if given.publish:
-        publish(given.seconds, given.topics, given.rate)
+    options = parser.parse_args()
+    if options.publish:
+        publish(options.seconds, options.topics, options.rate)
         return 0
-    with tempfile.TemporaryDirectory() as place:
-        processes = ProcessGroup(Path(place) / 'log', private_graph())
-        found = run(Path(place) / 'bag', processes, given.seconds, given.topics, given.rate)
+    with tempfile.TemporaryDirectory() as folder:
+        processes = ProcessGroup(Path(folder) / 'log', private_graph())
+        found = run(Path(folder) / 'bag', processes, options.seconds, options.topics, options.rate)
     print(f'sent      {found.sent} in {found.seconds:.1f} s, {found.sent / found.seconds:.0f}/s')
     print(f'recorded  {found.recorded}, in order and complete: {found.in_order}')
     print(f'lost      {found.sent - found.recorded}')

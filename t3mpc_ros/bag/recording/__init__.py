@@ -1,3 +1,3 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Recorder logic: queue, split files, snapshots, diagnostics monitor."""
+"""Recording: message queue, split files, snapshots and the diagnostics monitor."""

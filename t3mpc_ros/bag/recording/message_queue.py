@@ -1,6 +1,9 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Bounded queue of messages between the subscriptions and the writer thread."""
+"""Bounded queue of messages between the subscriptions and the writer thread.
+
+The queue bridges pauses of the disk. A full queue drops new messages and keeps the oldest ones.
+"""
 
 from collections.abc import Callable, Iterable
 import threading
@@ -10,17 +13,16 @@ from t3mpc_ros.bag.writer import SerializedMessage
 
 T = TypeVar('T')
 WriterTask = Callable[[T], None]
-"""Something to be done with the bag between two messages."""
+"""Operation on the bag, executed between two messages."""
 
 
 class MessageQueue(Generic[T]):
-    """Messages and orders from one thread to another, in the order in which they were given.
+    """Messages and writer tasks in first-in, first-out order, between two threads.
 
     Parameters
     ----------
-    most_bytes
-        What messages may take in memory, those in the hands of the taker included. Orders are
-        always taken in.
+    max_bytes
+        Maximum memory of the messages, including the batch taken last. Tasks are not limited.
     """
 
     def __init__(self, max_bytes: int) -> None:
@@ -28,60 +30,62 @@ class MessageQueue(Generic[T]):
         self._condition = threading.Condition()
         self._waiting: list[SerializedMessage | WriterTask[T]] = []
         self._bytes = 0
-        self._in_hand = 0
+        self._taken_bytes = 0
         self._urgent = False
         self._dropped: dict[str, int] = {}
 
     @property
     def bytes(self) -> int:
-        """Memory that the messages take."""
+        """Memory of the messages."""
         return self._bytes
 
     @property
     def dropped(self) -> dict[str, int]:
-        """How many messages of each topic found no room so far."""
+        """Number of dropped messages by topic."""
         with self._condition:
             return dict(self._dropped)
 
     def put(self, messages: Iterable[SerializedMessage]) -> dict[str, int]:
-        """Return how many of ``messages`` found no room, by topic; empty when all did.
+        """Append messages; return the number of dropped messages by topic.
 
-        From the first one that does not fit on, the rest is dropped as well: a bag in which big
-        messages are missing but small ones are there would look as if nothing had happened.
+        After the first message that does not fit, the rest of ``messages`` is dropped as well:
+        dropping only large messages would hide the gap.
         """
-        lost: dict[str, int] = {}
+        dropped: dict[str, int] = {}
         with self._condition:
             for message in messages:
-                if lost or self._bytes + message.cost > self._max_bytes:
-                    lost[message.topic] = lost.get(message.topic, 0) + 1
+                if dropped or self._bytes + message.memory_size > self._max_bytes:
+                    dropped[message.topic] = dropped.get(message.topic, 0) + 1
                 else:
-                    self._bytes += message.cost
+                    self._bytes += message.memory_size
                     self._waiting.append(message)
-            for topic, count in lost.items():
+            for topic, count in dropped.items():
                 self._dropped[topic] = self._dropped.get(topic, 0) + count
             if self._bytes > self._max_bytes // 2:
                 self._wake()
-        return lost
+        return dropped
 
-    def order(self, order: WriterTask[T]) -> None:
-        """Let the taker do ``order`` after what was put before, and soon."""
+    def put_task(self, task: WriterTask[T]) -> None:
+        """Append a task and wake the consumer."""
         with self._condition:
-            self._waiting.append(order)
+            self._waiting.append(task)
             self._wake()
 
     def take(self, timeout: float = 0.0) -> list[SerializedMessage | WriterTask[T]]:
-        """Return all that waits; what was taken the time before is done, and its room free.
+        """Return all items, and release the memory of the batch taken before.
 
-        Waits up to ``patience`` seconds, less when there is an order or much waits: to be woken
-        for each message would cost more than to write it.
+        Waits up to ``timeout`` seconds; a task or a half-full queue ends the wait. A message does
+        not: waking the consumer for each one would cost more than writing it.
         """
         with self._condition:
-            self._bytes -= self._in_hand
+            self._bytes -= self._taken_bytes
             if not self._urgent and timeout > 0.0:
                 self._condition.wait(timeout)
             self._urgent = False
             taken, self._waiting = self._waiting, []
-            self._in_hand = sum(item.cost for item in taken if isinstance(item, SerializedMessage))
+            self._taken_bytes = sum(
+                item.memory_size for item in taken if isinstance(item, SerializedMessage)
+            )
         return taken
 
     def _wake(self) -> None:

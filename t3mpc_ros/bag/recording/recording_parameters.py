@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of a recording: topics, files, queue, snapshots and attachments."""
+"""Parameters of a recording: topics, files, write queue, snapshots and attachments."""
 
 from dataclasses import dataclass
 
@@ -12,10 +12,13 @@ MEBIBYTE = 2**20
 
 @dataclass(frozen=True)
 class RecordingParameters(Parameters):
-    """A recording."""
+    """Parameters of a recording."""
 
-    folder: str = parameter(
-        '', 'folder of the bag; empty = bag_<time> here; one that exists is continued'
+    uri: str = parameter(
+        '',
+        'folder of the bag; empty = bag_<time> in the working directory; an existing bag is '
+        'continued',
+        name='storage.uri',
     )
     topics: tuple[str, ...] = parameter(
         (
@@ -31,109 +34,153 @@ class RecordingParameters(Parameters):
             'controller/*',
             '/diagnostics',
         ),
-        'topics to record; * stands for anything; relative names are of this namespace',
+        'topics to record; * matches any text; relative names are in the namespace of the node',
+        name='record.topics',
     )
     regex: str = parameter(
         '',
         'also record topics whose full name matches this regular expression from end to end, '
         'such as /camera/.*; empty = none',
+        name='record.regex',
     )
-    exclude: str = parameter(
+    exclude_topics: tuple[str, ...] = parameter(
+        (),
+        'topics that are not recorded; * matches any text; relative names are in the namespace '
+        'of the node',
+        name='record.exclude_topics',
+    )
+    exclude_regex: str = parameter(
         '',
-        'never record topics whose full name matches this regular expression from end to end; '
+        'do not record topics whose full name matches this regular expression from end to end; '
         'empty = none',
+        name='record.exclude_regex',
     )
-    types: tuple[str, ...] = parameter(
-        (), 'also record every topic of these message types, such as nav_msgs/msg/Odometry'
+    topic_types: tuple[str, ...] = parameter(
+        (),
+        'also record all topics of these message types, such as nav_msgs/msg/Odometry',
+        name='record.topic_types',
     )
-    chunk_bytes: int = parameter(
-        262_144, 'size at which a compressed chunk is closed', unit='B', low=1024, high=2**26
+    chunk_size: int = parameter(
+        262_144,
+        'size at which a chunk is compressed and written',
+        name='storage.chunk_size',
+        unit='B',
+        low=1024,
+        high=2**26,
     )
-    chunk_time: float = parameter(
+    chunk_duration: float = parameter(
         0.5,
-        'age of its oldest message at which a chunk is closed and handed to the disk: what a '
-        'killed recorder loses, but for a tenth of a second',
+        'age of the oldest message at which a chunk is compressed and written; a killed recorder '
+        'loses the messages of this time plus at most 0.1 s',
+        name='storage.chunk_duration',
         unit='s',
         low=0.05,
         high=60.0,
     )
-    split_bytes: int = parameter(
-        0, 'size at which a file of the bag is followed by another; 0 = never', unit='B', low=0
+    max_bagfile_size: int = parameter(
+        0,
+        'size at which the next file of the bag begins; 0 = never',
+        name='storage.max_bagfile_size',
+        unit='B',
+        low=0,
     )
-    split_time: float = parameter(
+    max_bagfile_duration: float = parameter(
         0.0,
-        'time of recording after which a file of the bag is followed by another; 0 = never',
+        'duration at which the next file of the bag begins; 0 = never',
+        name='storage.max_bagfile_duration',
         unit='s',
         low=0.0,
     )
-    queue_bytes: int = parameter(
+    max_cache_size: int = parameter(
         64 * MEBIBYTE,
-        'memory for messages that wait for the disk; what finds no room is dropped, counted, '
-        'and told',
+        'maximum memory of the write queue; further messages are dropped, counted and reported',
+        name='storage.max_cache_size',
         unit='B',
         low=65_536,
         high=2**34,
     )
-    snapshot_time: float = parameter(
+    snapshot_mode: bool = parameter(
+        False,
+        'record snapshots only, to wait for rare events over days',
+        name='storage.snapshot_mode',
+    )
+    snapshot_duration: float = parameter(
         30.0,
-        'how far back a snapshot reaches: ~/snapshot, or a fault, writes what came in this time '
-        'as a bag of its own into snapshots; 0 = no snapshots',
+        'time that a snapshot covers: ~/snapshot or a fault writes the messages received in this '
+        'time to a bag in the folder snapshots; 0 = no snapshots',
+        name='storage.snapshot_duration',
         unit='s',
         low=0.0,
         high=3600.0,
     )
-    snapshot_bytes: int = parameter(
+    snapshot_cache_size: int = parameter(
         128 * MEBIBYTE,
-        'memory for the messages of a snapshot; it reaches less far back when they need more',
+        'maximum memory of the messages of a snapshot; at this limit a snapshot covers less time',
+        name='storage.snapshot_cache_size',
         unit='B',
         low=65_536,
         high=2**34,
     )
-    snapshot_only: bool = parameter(
-        False, 'record nothing but the snapshots: for days of waiting for something rare'
-    )
-    snapshot_nodes: tuple[str, ...] = parameter(
+    monitored_nodes: tuple[str, ...] = parameter(
         ('controller', 'sim_robot', 'radio_bridge'),
-        'nodes whose change to an error in /diagnostics, or whose silence there, takes a '
-        'snapshot: a controller that stops, an emergency stop, a lost link; relative names are '
-        'of this namespace; empty = none',
+        'nodes whose change to an error in /diagnostics, or whose missing report, triggers a '
+        'snapshot: a stopped controller, an emergency stop, a lost link; relative names are in '
+        'the namespace of the node; empty = none',
+        name='snapshot.monitored_nodes',
     )
-    snapshot_pause: float = parameter(
+    snapshot_min_interval: float = parameter(
         10.0,
-        'shortest time between two snapshots that nobody asked for',
+        'minimum time between two automatic snapshots',
+        name='snapshot.min_interval',
         unit='s',
         low=0.0,
         high=86_400.0,
     )
-    snapshot_most: int = parameter(
-        50, 'most snapshots that nobody asked for in one run', low=0, high=100_000
+    snapshot_max_count: int = parameter(
+        50,
+        'maximum number of automatic snapshots per run',
+        name='snapshot.max_count',
+        low=0,
+        high=100_000,
     )
-    attach: tuple[str, ...] = parameter(
-        (), 'files to put into the bag as attachments, such as the description of a world'
+    attachments: tuple[str, ...] = parameter(
+        (),
+        'files attached to the bag, such as the description of a world',
+        name='record.attachments',
     )
     attach_models: bool = parameter(
         True,
-        'put the model file that a controller starts from, and the one it saves during the '
-        'recording, into the bag, where the recorder can read them',
+        'attach the model file that a controller loads at the start, and the one it saves during '
+        'the recording, if the recorder can read them',
+        name='record.attach_models',
     )
-    attach_bytes: int = parameter(
-        16 * MEBIBYTE, 'largest file that is attached', unit='B', low=1, high=2**30
+    max_attachment_size: int = parameter(
+        16 * MEBIBYTE,
+        'maximum size of an attached file',
+        name='record.max_attachment_size',
+        unit='B',
+        low=1,
+        high=2**30,
     )
 
     def check_consistency(self) -> None:
-        """Raise :class:`ParameterError` for what is no expression, no type, or records nothing."""
+        """Raise :class:`ParameterError` for an invalid filter or an empty recording."""
         super().check_consistency()
-        for name in ('regex', 'exclude'):
+        for name, text in (
+            ('record.regex', self.regex),
+            ('record.exclude_regex', self.exclude_regex),
+        ):
             try:
-                compile_regex(name, getattr(self, name))
+                compile_regex(name, text)
             except TopicFilterError as error:
                 raise ParameterError(str(error)) from error
-        for name in self.types:
+        for name in self.topic_types:
             if name.count('/') != 2 or '/msg/' not in name:
                 raise ParameterError(
-                    f'types must be names like nav_msgs/msg/Odometry: got {name!r}'
+                    f'record.topic_types must be names like nav_msgs/msg/Odometry: got {name!r}'
                 )
-        if self.snapshot_only and not self.snapshot_time:
+        if self.snapshot_mode and not self.snapshot_duration:
             raise ParameterError(
-                'snapshot_time must be above 0 with snapshot_only, or nothing is recorded: got 0'
+                'storage.snapshot_duration must be above 0 with storage.snapshot_mode, because '
+                'nothing would be recorded: got 0'
             )

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Cache of the last seconds of all topics, and snapshots written from it."""
+"""Circular cache of the last seconds of all topics, and the snapshot bags written from it."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -10,20 +10,20 @@ from t3mpc_ros.bag.schema import MessageDefinitions, UnknownTypeError
 from t3mpc_ros.bag.writer import Attachment, BagWriter, DataError, SerializedMessage, TopicMetadata
 
 SNAPSHOT_RECORD = 'snapshot'
-"""Title of the details that say why a snapshot was taken."""
+"""Title of the metadata record that contains the reason of a snapshot."""
 MESSAGES_PER_SLICE = 200
-"""Messages between two calls of ``pause``: the recording must go on meanwhile."""
+"""Messages between two calls of ``pause``, which yields to the running recording."""
 
 
 class CircularMessageCache:
-    """Messages of the last seconds, and the latched ones that still held when those began.
+    """Messages of the last seconds, and the last transient-local messages before them.
 
     Parameters
     ----------
     span_ns
-        How far back it reaches, nanoseconds of receipt.
-    most_bytes
-        What the messages may take in memory; beyond it, it reaches less far back.
+        Time of receipt that the cache covers, nanoseconds.
+    max_bytes
+        Maximum memory of the messages; at this limit the cache covers less time.
     """
 
     def __init__(self, span_ns: int, max_bytes: int) -> None:
@@ -36,30 +36,30 @@ class CircularMessageCache:
 
     @property
     def bytes(self) -> int:
-        """Memory that it takes, without the latched messages."""
+        """Memory of the cached messages, without the transient-local messages before the span."""
         return self._bytes
 
-    def latch(self, topic: str, count: int) -> None:
-        """Keep the last ``count`` messages of ``topic`` however old: one of each publisher."""
+    def keep_last(self, topic: str, count: int) -> None:
+        """Keep the last ``count`` messages of a transient-local topic regardless of their age."""
         kept = self._latched.get(topic, ())
         self._latched[topic] = deque(kept, maxlen=max(1, count))
 
     def add(self, messages: Iterable[SerializedMessage]) -> None:
-        """Keep ``messages``, in order of receipt, and let go of what has become too old."""
+        """Add ``messages`` in order of receipt, and remove the expired ones."""
         for message in messages:
             self._messages.append(message)
-            self._bytes += message.cost
+            self._bytes += message.memory_size
             self._newest_ns = max(self._newest_ns, message.received_ns)
         oldest_ns = self._newest_ns - self._span_ns
-        held = self._messages
-        while held and (self._bytes > self._max_bytes or held[0].received_ns < oldest_ns):
-            self._let_go(held.popleft())
+        cached = self._messages
+        while cached and (self._bytes > self._max_bytes or cached[0].received_ns < oldest_ns):
+            self._expire(cached.popleft())
 
-    def held(self, now_ns: int) -> list[SerializedMessage]:
-        """Return what was received in the span before ``now_ns``, latched messages first.
+    def messages(self, now_ns: int) -> list[SerializedMessage]:
+        """Return the messages received in the span before ``now_ns``, transient-local ones first.
 
-        A latched message from before the span is given the receipt stamp of the span's begin,
-        so that the bag is no longer than the span; its other stamp tells how old it is.
+        A transient-local message from before the span gets the beginning of the span as its time
+        of receipt, so that the bag is not longer than the span; its publish stamp is unchanged.
         """
         start_ns = max(0, now_ns - self._span_ns)
         recent = [message for message in self._messages if message.received_ns >= start_ns]
@@ -78,14 +78,14 @@ class CircularMessageCache:
         first = [item._replace(received_ns=start_ns) for kept in newest.values() for item in kept]
         return [*first, *recent]
 
-    def _let_go(self, message: SerializedMessage) -> None:
-        self._bytes -= message.cost
+    def _expire(self, message: SerializedMessage) -> None:
+        self._bytes -= message.memory_size
         if message.topic in self._latched:
             self._latched[message.topic].append(message)
 
 
 def unused_folder(parent: Path, name: str) -> Path:
-    """Return a folder in ``parent`` that is not there yet: ``name``, or with a number behind."""
+    """Return a path in ``parent`` that does not exist: ``name``, or ``name`` with a number."""
     path, number = parent / name, 2
     while path.exists():
         path, number = parent / f'{name}_{number}', number + 1
@@ -102,28 +102,28 @@ def write_snapshot(
     definitions: MessageDefinitions | None = None,
     pause: Callable[[], object] = lambda: None,
 ) -> int:
-    """Return how many messages the bag in ``folder`` got: those of announced topics.
+    """Write the messages of ``topics`` to a bag in ``folder``; return their number.
 
     Raises
     ------
     FolderError
-        The folder cannot be made.
+        The folder cannot be created.
     DiskError
-        Writing failed; what was written before is kept.
+        Writing failed; messages written before are kept.
     """
     count = 0
     with BagWriter(folder, metadata_records=metadata_records, definitions=definitions) as bag:
         for attachment, read_ns in attachments:
             bag.add_attachment(attachment, read_ns)
-        there = {message.topic for message in messages}
-        for name in [name for name in topics if name in there]:
+        present = {message.topic for message in messages}
+        for name in [name for name in topics if name in present]:
             topic = topics[name]
             try:
-                bag.add_topic(name, topic.type_name, topic.profiles, topic.type_hash)
+                bag.add_topic(name, topic.type_name, topic.offered_qos_profiles, topic.type_hash)
             except (UnknownTypeError, DataError):
-                there.discard(name)  # the recorder has said so when the topic came
+                present.discard(name)  # the recorder reported it when the topic appeared
         for message in messages:
-            if message.topic in there and message.topic in topics:
+            if message.topic in present and message.topic in topics:
                 bag.write(*message)
                 count += 1
                 if count % MESSAGES_PER_SLICE == 0:

@@ -1,6 +1,12 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Recording over several files, split by size or duration."""
+"""Recording over several files, split by size, by duration or on request.
+
+Each file is complete in itself: schemas and channels of its messages, all metadata records, all
+attachments. Transient-local messages of earlier files are not repeated: a reader of the folder
+would receive them twice. A player that starts in the middle reads the last ones from the earlier
+files.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,36 +16,36 @@ from t3mpc_ros.bag.writer import Attachment, BagWriter, SerializedMessage, Topic
 from t3mpc_ros.geometry.types import NANOSECONDS
 
 SYNC_PERIOD_NS = NANOSECONDS
-"""Shortest time between two waits for the disk itself."""
+"""Minimum time between two synchronizations with the disk."""
 
 
 class SplitWriter:
-    """Writes a recording, into one file after the other.
+    """Writes a recording to consecutive files of one bag.
 
-    A process that is killed loses what came within ``chunk_ns`` before, as far as :meth:`tick` is
-    called often; a machine without power what came within that and :data:`SYNC_NS`.
+    A killed process loses the messages of the last ``chunk_ns``, provided that :meth:`tick` is
+    called often; a power failure loses those of the last ``chunk_ns`` and
+    :data:`SYNC_PERIOD_NS`.
 
     Parameters
     ----------
     folder
-        Of the bag; one that exists is continued.
-    details
-        Tables of text for every file.
+        Folder of the bag; an existing bag is continued.
+    metadata_records
+        Tables of text by record name, written to every file.
     chunk_bytes, chunk_ns
-        A chunk goes to the file when it holds so much, and when its oldest message came so long
-        ago.
-    split_bytes, split_ns
-        A file is followed by another when it is at least so long, and when its first message was
-        received so long before the one to write; 0 = never.
+        Size of a chunk, and age of its oldest message, at which it is written to the file.
+    max_file_bytes, max_file_ns
+        Size of a file, and age of its first message, after which the next file begins; 0 = no
+        limit.
     definitions
-        Where schemas and type hashes come from.
+        Source of schemas and type hashes.
 
     Raises
     ------
     FolderError
-        The folder or the file cannot be made.
+        The folder or the file cannot be created.
     DataError
-        The details are not text.
+        ``metadata_records`` contains values other than text.
     """
 
     def __init__(
@@ -49,8 +55,8 @@ class SplitWriter:
         *,
         chunk_bytes: int = 256 * 1024,
         chunk_ns: int = NANOSECONDS // 2,
-        split_bytes: int = 0,
-        split_ns: int = 0,
+        max_file_bytes: int = 0,
+        max_file_ns: int = 0,
         definitions: MessageDefinitions | None = None,
     ) -> None:
         self._folder = folder
@@ -59,7 +65,7 @@ class SplitWriter:
         self._topics: dict[str, TopicMetadata] = {}
         self._definitions = definitions or MessageDefinitions()
         self._chunk_bytes, self._chunk_ns = chunk_bytes, chunk_ns
-        self._split_bytes, self._split_ns = split_bytes, split_ns
+        self._max_file_bytes, self._max_file_ns = max_file_bytes, max_file_ns
         self._bag = self._open()
         self._first_ns: int | None = None
         self._oldest_ns: int | None = None
@@ -67,37 +73,37 @@ class SplitWriter:
 
     @property
     def path(self) -> Path:
-        """The file that is being written."""
+        """Current file."""
         return self._bag.path
 
     def add_metadata_record(self, title: str, table: Mapping[str, str]) -> None:
-        """Put one more table of text into this and all later files, or a newer one."""
+        """Write a metadata record to the current file and all later ones."""
         self._metadata_records[title] = dict(table)
         self._bag.add_metadata_record(title, table)
 
     def add_attachment(self, attachment: Attachment, read_ns: int) -> None:
-        """Put a file into this and all later files of the bag."""
+        """Write an attachment to the current file and all later ones."""
         self._attachments[attachment.name] = attachment, read_ns
         self._bag.add_attachment(attachment, read_ns)
 
     def add_topic(self, topic: TopicMetadata) -> None:
-        """Announce a topic before its first message."""
-        self._announce(topic)
+        """Add a topic before its first message."""
+        self._add_topic(topic)
         self._topics[topic.topic] = topic
 
     def write(self, message: SerializedMessage, now_ns: int) -> None:
-        """Record one message; ``now_ns`` is of the clock of :meth:`tick`.
+        """Write one message; ``now_ns`` is a time of the clock of :meth:`tick`.
 
         Raises
         ------
         DiskError
-            Writing failed; what was written before is kept.
+            Writing failed; messages written before are kept.
         FolderError
-            The next file cannot be made.
+            The next file cannot be created.
         DataError, UnknownTopicError
             As :meth:`BagWriter.write`.
         """
-        if self._is_long(message.received_ns):
+        if self._exceeds_limit(message.received_ns):
             self.split()
         if self._first_ns is None:
             self._first_ns = message.received_ns
@@ -106,9 +112,9 @@ class SplitWriter:
         self._bag.write(*message)
 
     def tick(self, now_ns: int) -> None:
-        """Bring to the file, and to the disk, what has waited long enough.
+        """Write the chunk to the file and synchronize with the disk when their time has passed.
 
-        ``now_ns`` is of any clock that only runs forward.
+        ``now_ns`` is a time of any monotonic clock.
 
         Raises
         ------
@@ -123,7 +129,7 @@ class SplitWriter:
             self._synced_ns = now_ns
 
     def split(self) -> Path:
-        """Return the next file, in which the recording goes on; the one before is complete.
+        """Complete the current file, begin the next one and return its path.
 
         Raises
         ------
@@ -136,11 +142,11 @@ class SplitWriter:
         for attachment, read_ns in self._attachments.values():
             self._bag.add_attachment(attachment, read_ns)
         for topic in self._topics.values():
-            self._announce(topic)
+            self._add_topic(topic)
         return self.path
 
     def close(self) -> None:
-        """Complete the last file; again, do nothing.
+        """Complete the current file; idempotent.
 
         Raises
         ------
@@ -158,26 +164,28 @@ class SplitWriter:
             definitions=self._definitions,
         )
 
-    def _announce(self, topic: TopicMetadata) -> None:
-        self._bag.add_topic(topic.topic, topic.type_name, topic.profiles, topic.type_hash)
+    def _add_topic(self, topic: TopicMetadata) -> None:
+        self._bag.add_topic(
+            topic.topic, topic.type_name, topic.offered_qos_profiles, topic.type_hash
+        )
 
-    def _is_long(self, received_ns: int) -> bool:
-        if self._split_bytes and self._bag.size >= self._split_bytes:
+    def _exceeds_limit(self, received_ns: int) -> bool:
+        if self._max_file_bytes and self._bag.size >= self._max_file_bytes:
             return self._first_ns is not None
-        if self._split_ns and self._first_ns is not None:
-            return received_ns - self._first_ns >= self._split_ns
+        if self._max_file_ns and self._first_ns is not None:
+            return received_ns - self._first_ns >= self._max_file_ns
         return False
 
 
 def message_loss_record(dropped: Mapping[str, int], lost: Mapping[str, int]) -> dict[str, str]:
-    """Return the table of details that says what a bag lacks, by cause and by topic.
+    """Return the metadata record of missing messages, by cause and topic.
 
     Parameters
     ----------
     dropped
-        Messages of each topic that found no room while the disk was busy.
+        Messages by topic that the full write queue dropped.
     lost
-        Messages of each topic that the middleware lost before the recorder had them.
+        Messages by topic that the middleware lost.
     """
     table = {'dropped': str(sum(dropped.values())), 'lost': str(sum(lost.values()))}
     for cause, counts in (('dropped', dropped), ('lost', lost)):

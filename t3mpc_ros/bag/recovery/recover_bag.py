@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Recovery of a bag: every MCAP file of a folder into a new bag."""
+"""Recovery of a bag: all MCAP files of a folder, or a single one, into a new bag."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,76 +17,75 @@ from t3mpc_ros.bag.recovery.result import Damage, FileResult, RecoveryResult
 from t3mpc_ros.bag.schema import BagError
 
 Progress = Callable[[str, int, int], None]
-"""Called now and then with a file's name and how many bytes of how many are done."""
+"""Callback with the name of a file, the number of processed bytes and its size."""
 
 _SQLITE = b'SQLite format 3\0'
 
 
 class RecoveryOutputError(BagError):
-    """A folder that recovery must not write into."""
+    """The output folder is not permitted."""
 
 
 def recover_bag(
     source: Path | str, output: Path | str, progress: Progress | None = None
 ) -> RecoveryResult:
-    """Return what was kept and lost, with everything kept written into the folder ``output``.
+    """Recover a bag into the folder ``output``; return the kept and lost messages.
 
-    Files that are sound are copied; the others are read record by record and written anew, with
-    index and end. Messages keep bytes, order, both times and sequence; channels, schemas,
-    attachments and metadata records are kept as well, and ``metadata.yaml`` is made from the
-    result. The input is only read.
+    Intact files are copied after a verification of their checksums. Damaged files are rewritten
+    record by record, with a summary section. Messages keep their bytes, order, stamps and
+    sequence numbers; channels, schemas, attachments and metadata records are kept as well, and
+    ``metadata.yaml`` is generated. The input is not changed.
 
     Parameters
     ----------
     source
-        One MCAP file of any writer, or a folder whose MCAP files are all taken; sub-folders are
-        left alone.
+        An MCAP file of any writer, or a folder of MCAP files; sub-folders are ignored.
     output
-        A folder that does not exist, or is empty.
+        A folder that is empty or does not exist.
 
     Raises
     ------
     RecoveryOutputError
-        ``output`` is, or lies in, the folder of the bag, or is not empty.
+        ``output`` is, or is in, the folder of the bag, or is not empty.
     UnreadableError
-        There is no MCAP file, or nothing of one in it.
+        There is no MCAP file, or the only one contains no MCAP data.
     OSError
-        Reading or writing failed; a file that was begun is removed.
+        Reading or writing failed; an incomplete output file is removed.
     """
     source, output = Path(source), Path(output)
     files = _files(source)
     _check_output(source, output)
     _reject_sqlite(files)
-    made = not output.exists()
+    created = not output.exists()
     output.mkdir(parents=True, exist_ok=True)
-    tell = progress or (lambda name, done, size: None)
-    outcomes = []
+    report = progress or (lambda name, done, size: None)
+    results = []
     for path in files:
         try:
-            outcomes.append(_recover_file(path, output / _target_name(path), tell))
+            results.append(_recover_file(path, output / _target_name(path), report))
         except UnreadableError as error:
             if len(files) == 1:
-                if made:
+                if created:
                     output.rmdir()
                 raise
             size = path.stat().st_size
-            nothing = Damage(0, size, str(error))
-            outcomes.append(FileResult(path.name, size, damages=[nothing]))
+            entire_file = Damage(0, size, str(error))
+            results.append(FileResult(path.name, size, damages=[entire_file]))
     metadata, _ = collect_metadata(output)
     try:
-        earlier = read_metadata(files[0].parent)
+        original = read_metadata(files[0].parent)
     except MetadataError:
-        pass  # most often there is none; then the defaults stand
+        pass  # usually missing: the defaults apply
     else:
         metadata = replace(
-            metadata, custom_data=earlier.custom_data, ros_distro=earlier.ros_distro
+            metadata, custom_data=original.custom_data, ros_distro=original.ros_distro
         )
     write_metadata(output, metadata)
-    return RecoveryResult(output, tuple(outcomes))
+    return RecoveryResult(output, tuple(results))
 
 
 def default_output(source: Path | str) -> Path:
-    """Return the folder for a recovery when none is given: beside the input, under its name."""
+    """Return the default output folder: beside the input, with the suffix ``_recovered``."""
     source = Path(source).absolute()
     stem = source.name if source.is_dir() else source.name.removesuffix(MCAP_SUFFIX)
     return source.with_name(f'{stem}_recovered')
@@ -114,8 +113,8 @@ def _reject_sqlite(files: list[Path]) -> None:
 
 def _sqlite_advice(path: Path) -> str:
     return (
-        f'{path} is an sqlite3 bag: sqlite3 bags are recovered by sqlite itself, whenever they '
-        'are opened; when that fails, `sqlite3 FILE.db3 .recover | sqlite3 NEW.db3`, then '
+        f'{path} is an sqlite3 bag: sqlite3 bags are recovered by sqlite itself when they are '
+        'opened; if that fails, run `sqlite3 FILE.db3 .recover | sqlite3 NEW.db3`, then '
         '`ros2 bag reindex FOLDER`'
     )
 
@@ -126,7 +125,7 @@ def _check_output(source: Path, output: Path) -> None:
     if target == folder:
         raise RecoveryOutputError(f'{output} is the folder of the input: choose another one')
     if source.is_dir() and target.is_relative_to(folder):
-        raise RecoveryOutputError(f'{output} lies in the bag {source}: choose a folder elsewhere')
+        raise RecoveryOutputError(f'{output} is inside the bag {source}: choose another folder')
     if output.exists() and not output.is_dir():
         raise RecoveryOutputError(f'{output} is a file: choose a new folder')
     if output.is_dir() and any(output.iterdir()):
@@ -138,28 +137,28 @@ def _target_name(path: Path) -> str:
 
 
 def _recover_file(path: Path, target: Path, progress: Progress) -> FileResult:
-    def tell(done: int, size: int) -> None:
+    def report(done: int, size: int) -> None:
         progress(path.name, done, size)
 
     with path.open('rb') as source:
         if read_file_summary(path) is not None:
-            # Its end is sound; whether its chunks are, only reading them tells.
-            outcome = recover_file(
-                source, cast(BinaryIO, _NullOutput()), path.name, tell, compress=False
+            # The summary is valid; the chunks are verified by a recovery without output.
+            result = recover_file(
+                source, cast(BinaryIO, _NullOutput()), path.name, report, compress=False
             )
-            if outcome.clean and not outcome.damages and not outcome.notes:
-                outcome.copied = True
+            if result.clean and not result.damages and not result.notes:
+                result.copied = True
                 source.seek(0)
                 with _new_file(target) as output:
                     shutil.copyfileobj(source, output)
-                return outcome
+                return result
         with _new_file(target) as output:
-            return recover_file(source, output, path.name, tell)
+            return recover_file(source, output, path.name, report)
 
 
 @contextmanager
 def _new_file(path: Path) -> Iterator[BinaryIO]:
-    """Open a new file for writing; remove it when the writing does not get to its end."""
+    """Open a new file for writing; remove it if writing fails."""
     with path.open('xb') as output:
         try:
             yield output
@@ -171,7 +170,7 @@ def _new_file(path: Path) -> Iterator[BinaryIO]:
 
 
 class _NullOutput:
-    """An output that only knows how much was written to it."""
+    """Output that discards the data and counts the bytes."""
 
     def __init__(self) -> None:
         self._size = 0
@@ -184,4 +183,4 @@ class _NullOutput:
         return self._size
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Do nothing."""

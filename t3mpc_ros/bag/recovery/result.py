@@ -11,68 +11,68 @@ from t3mpc_ros.geometry.types import NANOSECONDS
 
 @dataclass(frozen=True)
 class Damage:
-    """A stretch of a file that could not be used, or only in part."""
+    """Range of a file that was not usable, or only in part."""
 
     start: int
     end: int
     reason: str
     harmless: bool = False
-    """Nothing was lost with it: it only repeated what stands elsewhere."""
+    """Whether no information was lost, because it is duplicated elsewhere in the file."""
     messages: int | None = None
-    """How many messages were lost in it; None when nobody knows."""
+    """Number of lost messages; None if unknown."""
     span_ns: tuple[int, int] | None = None
-    """Times of receipt between which messages were lost; None when nobody knows."""
+    """Receive times between which messages were lost; None if unknown."""
 
     @property
     def size(self) -> int:
-        """Bytes of the file."""
+        """Size of the range, bytes."""
         return self.end - self.start
 
 
 @dataclass
 class TopicResult:
-    """What became of one topic."""
+    """Messages of one topic."""
 
     name: str
     type_name: str
     kept: int = 0
     unchecked: int = 0
-    """How many of the kept ones no checksum vouches for."""
+    """Number of kept messages that no checksum covers."""
     lost: int = 0
-    """How many are known to be lost."""
+    """Number of messages known to be lost."""
 
 
 @dataclass
 class FileResult:
-    """What became of one file."""
+    """Result of one file."""
 
     name: str
     size: int
     """Bytes."""
     copied: bool = False
-    """It was sound, and copied as it is."""
+    """Whether the file was intact and copied."""
     ended: bool = False
-    """The end of its data was there: its writer had nothing more to write."""
+    """Whether the end of the data section was found: the writer completed the file."""
     topics: dict[str, TopicResult] = field(default_factory=dict)
     damages: list[Damage] = field(default_factory=list)
     exact: bool = False
-    """The file says how many messages there were, so :attr:`TopicResult.lost` is all."""
+    """Whether :attr:`TopicResult.lost` is complete, because the file has its statistics."""
     notes: list[str] = field(default_factory=list)
 
     @property
     def clean(self) -> bool:
-        """Whether nothing was lost; never so when the end of the data was not there."""
+        """Whether nothing was lost; False without the end of the data section."""
         return self.ended and all(damage.harmless for damage in self.damages)
 
     @property
     def lost_bytes(self) -> int:
-        """Bytes of the file that could not be used, or only in part."""
+        """Bytes of the file that were not usable, or only in part."""
         return sum(damage.size for damage in self.damages if not damage.harmless)
 
 
 @dataclass(frozen=True)
 class RecoveryResult:
-    """What became of a bag."""
+    """Result of a bag."""
 
     output: Path
     files: tuple[FileResult, ...]
@@ -99,12 +99,12 @@ class RecoveryResult:
 
     @property
     def lost_bytes(self) -> int:
-        """Bytes of the input that could not be used, or only in part."""
+        """Bytes of the input that were not usable, or only in part."""
         return sum(file.lost_bytes for file in self.files)
 
     @property
     def lost_seconds(self) -> float | None:
-        """Seconds of recording in which messages were lost; None when nobody knows."""
+        """Seconds of the recording in which messages were lost; None if unknown."""
         damages = [d for file in self.files for d in file.damages if not d.harmless]
         spans = [damage.span_ns for damage in damages if damage.span_ns is not None]
         if len(spans) < len(damages) or not all(file.ended for file in self.files):
@@ -113,7 +113,7 @@ class RecoveryResult:
 
     @property
     def topics(self) -> dict[str, TopicResult]:
-        """Topics of all files together, by name."""
+        """Topics of all files by name."""
         merged: dict[str, TopicResult] = {}
         for file in self.files:
             for topic in file.topics.values():
@@ -125,7 +125,7 @@ class RecoveryResult:
 
 
 def _union_length(spans: Iterable[tuple[int, int]]) -> int:
-    """Return how long the spans are together; where they overlap, once."""
+    """Return the length of the union of the spans."""
     total = 0
     reached = -1
     for first, last in sorted(spans):

@@ -1,6 +1,11 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Scanner for damaged MCAP files: record classification, chunk decoding, resynchronization."""
+"""Scanner for damaged MCAP files: record classification, chunk decoding, resynchronization.
+
+The length of most records follows from two sources: the length in their head and the lengths of
+their fields. A damaged length is detected because the two disagree. Record layouts follow the MCAP
+specification (foxglove/mcap, ``website/docs/spec/index.md``).
+"""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -17,34 +22,54 @@ import zstandard
 from t3mpc_ros.bag.mcap_file import MAGIC
 
 HEAD = struct.Struct('<BQ')
-"""Opcode and length of the content, in front of every record."""
+"""Opcode and content length of every record."""
 MESSAGE_HEAD = struct.Struct('<HIQQ')
-"""Channel, sequence, log time and publish time, in front of a message's data."""
+"""Channel, sequence, log time and publish time before the data of a message."""
 
-_TEXT, _TABLE, _BLOB, _REST = 'text', 'table', 'blob', 'rest'
-# Numbers are bytes of fixed fields; text and table have a length of 4 bytes, a blob one of 8.
+INDEX_RECORDS = frozenset(
+    {
+        Opcode.MESSAGE_INDEX,
+        Opcode.CHUNK_INDEX,
+        Opcode.ATTACHMENT_INDEX,
+        Opcode.METADATA_INDEX,
+        Opcode.STATISTICS,
+        Opcode.SUMMARY_OFFSET,
+        Opcode.FOOTER,
+        Opcode.DATA_END,
+    }
+)
+"""Records that duplicate information of other records; their loss is harmless."""
+
+_STRING, _MAP, _BLOB, _REST = 'string', 'map', 'blob', 'rest'
+# Numbers are bytes of fixed fields; strings and maps have a length of 4 bytes, a blob one of 8.
 _RECORD_LAYOUTS: dict[int, tuple[int | str, ...]] = {
-    Opcode.HEADER: (_TEXT, _TEXT),
+    Opcode.HEADER: (_STRING, _STRING),
     Opcode.FOOTER: (20,),
-    Opcode.SCHEMA: (2, _TEXT, _TEXT, _TEXT),
-    Opcode.CHANNEL: (4, _TEXT, _TEXT, _TABLE),
+    Opcode.SCHEMA: (2, _STRING, _STRING, _STRING),
+    Opcode.CHANNEL: (4, _STRING, _STRING, _MAP),
     Opcode.MESSAGE: (MESSAGE_HEAD.size, _REST),
-    Opcode.CHUNK: (28, _TEXT, _BLOB),
-    Opcode.MESSAGE_INDEX: (2, _TEXT),
-    Opcode.CHUNK_INDEX: (32, _TEXT, 8, _TEXT, 16),
-    Opcode.ATTACHMENT: (16, _TEXT, _TEXT, _BLOB, 4),
-    Opcode.METADATA: (_TEXT, _TABLE),
+    Opcode.CHUNK: (28, _STRING, _BLOB),
+    Opcode.MESSAGE_INDEX: (2, _STRING),
+    Opcode.CHUNK_INDEX: (32, _STRING, 8, _STRING, 16),
+    Opcode.ATTACHMENT: (16, _STRING, _STRING, _BLOB, 4),
+    Opcode.METADATA: (_STRING, _MAP),
     Opcode.DATA_END: (4,),
-    Opcode.ATTACHMENT_INDEX: (40, _TEXT, _TEXT),
-    Opcode.METADATA_INDEX: (16, _TEXT),
-    Opcode.STATISTICS: (42, _TEXT),
+    Opcode.ATTACHMENT_INDEX: (40, _STRING, _STRING),
+    Opcode.METADATA_INDEX: (16, _STRING),
+    Opcode.STATISTICS: (42, _STRING),
     Opcode.SUMMARY_OFFSET: (17,),
 }
-_MAP_SIZE_LIMIT = 2**26  # bytes of a table that are looked into before its length is believed
+_MAP_SIZE_LIMIT = 2**26  # maximum size of a map whose content is verified, bytes
+_CHUNK_HEAD = struct.Struct('<QQQII')  # start, end, size, checksum, length of the compression name
+_NAME_LIMIT = 32
+_BLOCK = 2**20
+# A known opcode and a length below 2^40 bytes; a lookahead, because candidates may overlap.
+_CANDIDATE = re.compile(rb'(?=[\x01-\x0f].{5}\x00\x00\x00|' + re.escape(MAGIC) + rb')', re.DOTALL)
+_TRUNCATED_SIZE_LIMIT = 2**28  # maximum plausible size of a possibly truncated record, bytes
 
 
 class FileWindow:
-    """A file of fixed size that can be read anywhere; what lies behind its end is empty."""
+    """Random access to a file of fixed size; reads after its end are empty."""
 
     def __init__(self, file: BinaryIO, size: int) -> None:
         self._file = file
@@ -60,76 +85,79 @@ class FileWindow:
 
 
 class RecordFit(Enum):
-    """How well a place of a file fits a record."""
+    """Agreement of bytes with the layout of a record."""
 
-    SOUND = 'both lengths agree'
-    LIKELY = 'nothing speaks against it, but only its own length says where it ends'
-    TORN = 'it goes on behind the end of the file'
-    MAYBE_TORN = 'it would go on behind the end of the file, if its length can be believed'
-    CONTRADICTORY = 'its lengths disagree'
-    NONE = 'not a record'
+    VALID = 'both lengths agree'
+    PLAUSIBLE = 'valid, but only the length in the head gives its end'
+    TRUNCATED = 'the file ends inside the record'
+    POSSIBLY_TRUNCATED = 'the file ends inside the record if its length is correct'
+    INCONSISTENT = 'the lengths disagree'
+    NO_RECORD = 'not a record'
 
 
 class Classification(NamedTuple):
-    """What a place of a file looks like."""
+    """Result of :func:`classify_record`."""
 
     fit: RecordFit
     opcode: int
     end: int
-    """Where the record ends by the length in front of it."""
+    """End of the record according to its head."""
     inner_end: int
-    """Where it ends by its fields; 0 when they do not say."""
+    """End of the record according to its fields; 0 if unknown."""
 
 
 def classify_record(window: FileWindow, start: int) -> Classification:
-    """Return what the bytes at ``start`` look like, without reading large fields."""
+    """Classify the bytes at ``start`` without reading large fields."""
     head = window.read(start, HEAD.size)
     if not head or head[0] == 0:
-        return Classification(RecordFit.NONE, 0, 0, 0)
+        return Classification(RecordFit.NO_RECORD, 0, 0, 0)
     opcode = head[0]
     layout = _RECORD_LAYOUTS.get(opcode)
     if len(head) < HEAD.size:
-        return Classification(RecordFit.TORN if layout else RecordFit.NONE, opcode, 0, 0)
+        return Classification(RecordFit.TRUNCATED if layout else RecordFit.NO_RECORD, opcode, 0, 0)
     end = start + HEAD.size + HEAD.unpack(head)[1]
     if layout is None:
         return Classification(
-            RecordFit.LIKELY if end <= window.size else RecordFit.NONE, opcode, end, 0
+            RecordFit.PLAUSIBLE if end <= window.size else RecordFit.NO_RECORD, opcode, end, 0
         )
     inner_end = _end_by_fields(window, start + HEAD.size, layout, end)
-    if inner_end < 0:  # a table that is none
-        fit = RecordFit.CONTRADICTORY if end <= window.size else RecordFit.NONE
+    if inner_end < 0:  # an invalid map
+        fit = RecordFit.INCONSISTENT if end <= window.size else RecordFit.NO_RECORD
         return Classification(fit, opcode, end, 0)
     if end > window.size:
         agree = inner_end in (0, end)
         if layout[-1] == _REST or inner_end == 0:
             return Classification(
-                RecordFit.MAYBE_TORN if agree else RecordFit.NONE, opcode, end, inner_end
+                RecordFit.POSSIBLY_TRUNCATED if agree else RecordFit.NO_RECORD,
+                opcode,
+                end,
+                inner_end,
             )
         return Classification(
-            RecordFit.TORN if agree else RecordFit.CONTRADICTORY, opcode, end, inner_end
+            RecordFit.TRUNCATED if agree else RecordFit.INCONSISTENT, opcode, end, inner_end
         )
     if inner_end == end:
         return Classification(
-            RecordFit.LIKELY if layout[-1] == _REST else RecordFit.SOUND, opcode, end, inner_end
+            RecordFit.PLAUSIBLE if layout[-1] == _REST else RecordFit.VALID, opcode, end, inner_end
         )
-    # Later versions of the format may append fields, so the inner end may come first.
+    # Later versions of the format may append fields, so the inner end may be smaller.
     fit = (
-        RecordFit.LIKELY
+        RecordFit.PLAUSIBLE
         if 0 < inner_end < end and opcode != Opcode.CHUNK
-        else RecordFit.CONTRADICTORY
+        else RecordFit.INCONSISTENT
     )
     return Classification(fit, opcode, end, inner_end)
 
 
 def record_name(opcode: int) -> str:
-    """Return what a record is called."""
+    """Return the name of a record type."""
     if opcode not in _RECORD_LAYOUTS:
-        return f'record of unknown kind 0x{opcode:02x}'
+        return f'record of unknown type 0x{opcode:02x}'
     return str(Opcode(opcode).name).lower().replace('_', ' ')
 
 
 def _end_by_fields(window: FileWindow, start: int, layout: tuple[int | str, ...], end: int) -> int:
-    """Return where the fields end: 0 when the file ends before it can be told, -1 never."""
+    """Return the end of the fields; 0 if the file ends before it, -1 for invalid fields."""
     position = start
     for part in layout:
         if isinstance(part, int):
@@ -143,15 +171,15 @@ def _end_by_fields(window: FileWindow, start: int, layout: tuple[int | str, ...]
                 return 0
             length = int.from_bytes(prefix, 'little')
             position += width
-            there = length <= _MAP_SIZE_LIMIT and position + length <= window.size
-            if part == _TABLE and there and not _is_string_map(window.read(position, length)):
+            readable = length <= _MAP_SIZE_LIMIT and position + length <= window.size
+            if part == _MAP and readable and not _is_string_map(window.read(position, length)):
                 return -1
             position += length
     return position
 
 
 def _is_string_map(data: bytes) -> bool:
-    """Return whether ``data`` is a sequence of an even number of whole texts."""
+    """Return whether ``data`` is a sequence of an even number of complete strings."""
     position = count = 0
     while position < len(data):
         position += 4 + int.from_bytes(data[position : position + 4], 'little')
@@ -159,30 +187,21 @@ def _is_string_map(data: bytes) -> bool:
     return position == len(data) and count % 2 == 0
 
 
-_CHUNK_HEAD = struct.Struct(
-    '<QQQII'
-)  # start, end, size, checksum, length of the compression's name
-_NAME_LIMIT = 32
-
-
 class ChunkError(ValueError):
-    """A chunk of which nothing can be trusted; the text says why."""
+    """No part of a chunk is usable."""
 
 
 @dataclass(frozen=True)
 class DecodedChunk:
-    """The records of one chunk, decompressed."""
+    """Decompressed records of one chunk."""
 
     data: bytes
-    whole: bool
+    complete: bool
     checked: bool
-    """Whether a checksum vouches for the data."""
+    """Whether a checksum covers the data."""
 
     def records(self) -> Iterator[tuple[int, memoryview]]:
-        """Yield (opcode, content) of each record that is there in full.
-
-        What is left over behind them comes last, as opcode 0.
-        """
+        """Yield (opcode, content) of each complete record, then the rest as opcode 0."""
         view = memoryview(self.data)
         position = 0
         while position + HEAD.size <= len(view):
@@ -197,10 +216,7 @@ class DecodedChunk:
 
 
 def chunk_time_range(window: FileWindow, start: int) -> tuple[int, int] | None:
-    """Return the times of the first and last message as the chunk at ``start`` says, in ns.
-
-    None when it does not say, or says what cannot be.
-    """
+    """Return first and last message time in the head of a chunk, ns; None if invalid."""
     head = window.read(start + HEAD.size, 16)
     if len(head) < 16:
         return None
@@ -209,13 +225,13 @@ def chunk_time_range(window: FileWindow, start: int) -> tuple[int, int] | None:
 
 
 def decode_chunk(window: FileWindow, start: int) -> DecodedChunk:
-    """Return the content of the chunk at ``start``; of one cut off, what can be had.
+    """Return the content of the chunk at ``start``; of a truncated chunk, the beginning.
 
     Raises
     ------
     ChunkError
-        The compression is not known, the data do not decompress, or they are not what the
-        checksum, or for want of one the size, says.
+        The compression is unknown, decompression fails, or the checksum, or without a checksum
+        the size, is wrong.
     """
     position = start + HEAD.size
     head = window.read(position, _CHUNK_HEAD.size)
@@ -232,21 +248,21 @@ def decode_chunk(window: FileWindow, start: int) -> DecodedChunk:
     stored = window.read(position + 8, length)
     data, finished = _decompress(name, stored)
     if len(stored) < length:
-        return DecodedChunk(data, whole=False, checked=False)
+        return DecodedChunk(data, complete=False, checked=False)
     if not finished:
-        raise ChunkError('the data of a chunk stop before their end')
+        raise ChunkError('the compressed data of a chunk are incomplete')
     if checksum:
         if zlib.crc32(data) != checksum:
             raise ChunkError('the checksum of a chunk is wrong')
     elif len(data) != size:
         raise ChunkError(f'a chunk has {len(data)} bytes instead of {size}')
-    return DecodedChunk(data, whole=True, checked=checksum != 0)
+    return DecodedChunk(data, complete=True, checked=checksum != 0)
 
 
 def _decompress(name: bytes, stored: bytes) -> tuple[bytes, bool]:
-    """Return what can be had of ``stored``, and whether that is all of it.
+    """Return the decompressed bytes of ``stored``, and whether they are complete.
 
-    Sizes written in the chunk are not believed: nothing is allocated that does not come out.
+    Memory is allocated by the actual output, not by the sizes in the chunk, which may be damaged.
     """
     if name == b'':
         return stored, True
@@ -266,58 +282,40 @@ def _decompress(name: bytes, stored: bytes) -> tuple[bytes, bool]:
     return data, bool(decoder.eof)
 
 
-INDEX_RECORDS = frozenset(
-    {
-        Opcode.MESSAGE_INDEX,
-        Opcode.CHUNK_INDEX,
-        Opcode.ATTACHMENT_INDEX,
-        Opcode.METADATA_INDEX,
-        Opcode.STATISTICS,
-        Opcode.SUMMARY_OFFSET,
-        Opcode.FOOTER,
-        Opcode.DATA_END,
-    }
-)
-"""Records that only repeat what others say: their loss costs nothing."""
-
-_BLOCK = 2**20
-# A known opcode, and a length below 2^40 bytes; looking ahead, because candidates may overlap.
-_CANDIDATE = re.compile(rb'(?=[\x01-\x0f].{5}\x00\x00\x00|' + re.escape(MAGIC) + rb')', re.DOTALL)
-_TORN_LIMIT = 2**28  # bytes of a record that the end of the file may have torn in its head
-
-
 class Span(NamedTuple):
-    """A stretch of the file: one record, or one that is damaged or torn, with the reason."""
+    """Range of a file: a record, or damaged or truncated bytes with the reason."""
 
     start: int
     end: int
     opcode: int
-    """0 when the bytes are no record at all."""
+    """0 for bytes that are not a record."""
     reason: str = ''
-    torn: bool = False
+    truncated: bool = False
     """The file ends inside this record."""
 
 
 class Scanner:
-    """The pieces of a file, without gap or overlap, from ``start`` to its end.
+    """Divides a file from ``start`` into consecutive spans.
 
     Parameters
     ----------
-    knows
-        Whether a channel of this number was announced. Between damaged bytes a message is only
-        believed when its channel is known.
+    is_known_channel
+        Whether a channel number is defined. After damaged bytes, a message is accepted only if
+        its channel is known.
     """
 
-    def __init__(self, window: FileWindow, start: int, knows: Callable[[int], bool]) -> None:
+    def __init__(
+        self, window: FileWindow, start: int, is_known_channel: Callable[[int], bool]
+    ) -> None:
         self._window = window
         self._start = start
-        self._knows = knows
-        # What looks like a message between the chunks of a file is the inside of a chunk whose
-        # own length was damaged: no checksum would vouch for it.
+        self._is_known_channel = is_known_channel
+        # In a file with chunks, a message outside of a chunk is the content of a chunk with a
+        # damaged length; no checksum covers it.
         self._chunked = False
 
     def spans(self) -> Iterator[Span]:
-        """Yield the pieces in order; nothing follows the end mark of the file."""
+        """Yield the spans in order, up to the magic at the end of the file."""
         size = self._window.size
         position = self._start
         while position < size:
@@ -328,78 +326,78 @@ class Scanner:
                 if self._window.read(position, len(MAGIC)) == MAGIC:
                     position += len(MAGIC)
                 if position < size:
-                    yield Span(position, size, 0, 'bytes behind the end mark')
+                    yield Span(position, size, 0, 'bytes after the end of the file')
                 return
 
     def _span_at(self, start: int) -> Span:
         found = classify_record(self._window, start)
-        if found.opcode == Opcode.CHUNK and found.fit is not RecordFit.NONE:
+        if found.opcode == Opcode.CHUNK and found.fit is not RecordFit.NO_RECORD:
             self._chunked = True
         name = record_name(found.opcode)
-        if found.fit is RecordFit.SOUND or (
-            found.fit is RecordFit.LIKELY and self._goes_on(found.end)
+        if found.fit is RecordFit.VALID or (
+            found.fit is RecordFit.PLAUSIBLE and self._continues_at(found.end)
         ):
             if name.startswith('record of'):
                 return Span(start, found.end, found.opcode, f'a {name} is not copied')
             return Span(start, found.end, found.opcode)
-        if found.fit is RecordFit.TORN:
-            return self._torn(start, found)
-        if found.fit is RecordFit.CONTRADICTORY:
-            chunk = self._opened(start) if found.opcode == Opcode.CHUNK else None
+        if found.fit is RecordFit.TRUNCATED:
+            return self._truncated_span(start, found)
+        if found.fit is RecordFit.INCONSISTENT:
+            chunk = self._decode_complete(start) if found.opcode == Opcode.CHUNK else None
             if chunk is not None and chunk.checked:
                 return Span(start, found.inner_end, found.opcode)
             for end in (found.end, found.inner_end):
-                if end > start and self._goes_on(end):
-                    return Span(start, end, found.opcode, f'the {name} contradicts itself')
-        back = self._find(start + 1)
-        if back is None and found.fit is RecordFit.MAYBE_TORN:
-            return self._torn(start, found)
-        reason = 'no record can be made out'
+                if end > start and self._continues_at(end):
+                    return Span(start, end, found.opcode, f'the {name} is inconsistent')
+        back = self._next_record(start + 1)
+        if back is None and found.fit is RecordFit.POSSIBLY_TRUNCATED:
+            return self._truncated_span(start, found)
+        reason = 'no record found'
         return Span(start, self._window.size if back is None else back, 0, reason)
 
-    def _torn(self, start: int, found: Classification) -> Span:
+    def _truncated_span(self, start: int, found: Classification) -> Span:
         size = self._window.size
         reason = f'the file ends inside a {record_name(found.opcode)}'
-        return Span(start, size, found.opcode, reason, torn=True)
+        return Span(start, size, found.opcode, reason, truncated=True)
 
-    def _goes_on(self, position: int, depth: int = 1) -> bool:
-        """Return whether a record, or the end of the file, may begin at ``position``."""
+    def _continues_at(self, position: int, depth: int = 1) -> bool:
+        """Return whether a record or the end of the file is plausible at ``position``."""
         if position > self._window.size:
             return False
         if position == self._window.size:
             return True
         found = classify_record(self._window, position)
-        if found.opcode == Opcode.MESSAGE and not self._is_known(position):
+        if found.opcode == Opcode.MESSAGE and not self._channel_is_known(position):
             return False
-        if found.fit is RecordFit.TORN:
+        if found.fit is RecordFit.TRUNCATED:
             return True
-        if found.fit is RecordFit.MAYBE_TORN:
-            return found.end - position < _TORN_LIMIT
-        if found.fit not in (RecordFit.SOUND, RecordFit.LIKELY):
+        if found.fit is RecordFit.POSSIBLY_TRUNCATED:
+            return found.end - position < _TRUNCATED_SIZE_LIMIT
+        if found.fit not in (RecordFit.VALID, RecordFit.PLAUSIBLE):
             return self._window.read(position, len(MAGIC)) == MAGIC
-        return depth <= 1 or self._goes_on(found.end, depth - 1)
+        return depth <= 1 or self._continues_at(found.end, depth - 1)
 
-    def _is_known(self, position: int) -> bool:
+    def _channel_is_known(self, position: int) -> bool:
         channel = self._window.read(position + HEAD.size, 2)
-        return len(channel) < 2 or self._knows(int.from_bytes(channel, 'little'))
+        return len(channel) < 2 or self._is_known_channel(int.from_bytes(channel, 'little'))
 
-    def _find(self, start: int) -> int | None:
-        """Return where the next record begins that can be trusted; None when there is none.
+    def _next_record(self, start: int) -> int | None:
+        """Return the start of the next reliable record, or None.
 
-        A message or attachment may hold an MCAP file of its own, all of it sound: what stands
-        between two marks of the format is not ours.
+        A message or attachment may contain a valid MCAP file: bytes between two MCAP magics are
+        skipped.
         """
         within = False
         while start < self._window.size:
             block = self._window.read(start, _BLOCK + HEAD.size - 1)
             for match in _CANDIDATE.finditer(block):
-                place = match.start()
-                if place >= _BLOCK:
+                offset = match.start()
+                if offset >= _BLOCK:
                     continue
-                if block.startswith(MAGIC, place):
+                if block.startswith(MAGIC, offset):
                     within = not within
-                elif not within and self._is_anchor(start + place):
-                    return start + place
+                elif not within and self._is_anchor(start + offset):
+                    return start + offset
             start += _BLOCK
         return None
 
@@ -408,34 +406,34 @@ class Scanner:
         if found.end > self._window.size or found.inner_end != found.end:
             return False
         if found.opcode == Opcode.CHUNK:
-            chunk = self._opened(position)
-            return chunk is not None and (chunk.checked or self._goes_on(found.end, 2))
+            chunk = self._decode_complete(position)
+            return chunk is not None and (chunk.checked or self._continues_at(found.end, 2))
         if found.opcode == Opcode.FOOTER:
             return self._window.read(found.end, len(MAGIC)) == MAGIC
-        if found.opcode == Opcode.ATTACHMENT and not self._attachment_is_sound(position, found):
+        if found.opcode == Opcode.ATTACHMENT and not self._attachment_is_valid(position, found):
             return False
         if found.opcode == Opcode.MESSAGE:
-            if self._chunked or not self._is_known(position):
+            if self._chunked or not self._channel_is_known(position):
                 return False
         elif self._chunked and found.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             return False
-        return self._goes_on(found.end, 2)
+        return self._continues_at(found.end, 2)
 
-    def _opened(self, position: int) -> DecodedChunk | None:
-        """Return the whole, sound chunk that begins at ``position``, if one does."""
+    def _decode_complete(self, position: int) -> DecodedChunk | None:
+        """Return the complete and valid chunk at ``position``, or None."""
         try:
             chunk = decode_chunk(self._window, position)
         except ChunkError:
             return None
-        return chunk if chunk.whole else None
+        return chunk if chunk.complete else None
 
-    def _attachment_is_sound(self, position: int, found: Classification) -> bool:
+    def _attachment_is_valid(self, position: int, found: Classification) -> bool:
         return attachment_is_valid(
             self._window.read(position + HEAD.size, found.end - position - HEAD.size)
         )
 
 
 def attachment_is_valid(content: bytes) -> bool:
-    """Return whether the checksum at the end of an attachment is right, or there is none."""
+    """Return whether the checksum of an attachment is correct or absent."""
     checksum = int.from_bytes(content[-4:], 'little')
     return checksum in (0, zlib.crc32(content[:-4]))

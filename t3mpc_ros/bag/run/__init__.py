@@ -1,3 +1,3 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Contents of a recorded controller run: journal and model file."""
+"""Reproducible controller runs: journal and model file."""

@@ -1,6 +1,11 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Journal of a controller: the order of its inputs, which makes a run exactly reproducible."""
+"""Journal of a controller: the order of its inputs, which makes a run exactly reproducible.
+
+A recorder may receive odometry and references in another order than the controller did. The
+topic ``controller/journal`` has one row of five integers per event of the controller and thus
+defines the order.
+"""
 
 from array import array
 from collections.abc import Mapping
@@ -10,94 +15,94 @@ import json
 from t3mpc_ros.parameters.table import Value
 
 JOURNAL_COLUMNS = ('number', 'event', 'stamp_ns', 'references', 'value')
-"""What the numbers of a row are:
+"""Columns of a row:
 
 number
-    0, 1, 2 ... since the node was started: a gap is a row that was lost.
+    0, 1, 2 ... since the start of the node; a gap is a lost row.
 event
-    One of :class:`Event`.
+    An :class:`Event`.
 stamp_ns
-    Of a STEP the stamp of its odometry message, of a SILENT that of the last one, else 0.
+    Stamp of the odometry message of a STEP, or of the last one before an ODOMETRY_TIMEOUT; else 0.
 references
-    How many reference messages had been handed to the controller since the start of the node.
+    Number of reference messages that the controller received since the start of the node.
 value
-    As said at each :class:`Event`.
+    See :class:`Event`.
 """
 
 
 class Event(enum.IntEnum):
-    """What happened to the controller."""
+    """Event of the controller."""
 
     STEP = 0
-    """It took an odometry message and commanded; value: the stamp of the newest reference that
-    it had been handed, 0 without one."""
+    """Odometry was processed and a command published; value: the stamp of the newest reference,
+    0 without one."""
     ODOMETRY_TIMEOUT = 1
-    """It was found that the odometry had gone silent, and a stop was commanded."""
+    """The odometry timed out and a stop was commanded."""
     ENABLE = 2
-    """The robot may move (value 1) or must not (value 0)."""
+    """Motion was enabled (value 1) or disabled (value 0)."""
     RESET = 3
-    """What was learnt is forgotten; value: 1 where the robot may move, else 0."""
+    """Learned weights were reset; value: 1 if motion is enabled, else 0."""
     CONFIGURE = 4
-    """Other dynamic parameters; value: their revision, see :func:`parameters_to_json`."""
+    """Dynamic parameters changed; value: their revision, see :func:`parameters_to_json`."""
     MODEL = 5
-    """A model file was loaded at start; value: CRC-32 of the file."""
+    """A model file was loaded at the start; value: CRC-32 of the file."""
     FINISH = 6
-    """The node ended and commanded a last stop."""
+    """The node shut down and commanded a stop."""
 
 
 COMMAND_EVENTS = (Event.STEP, Event.ODOMETRY_TIMEOUT, Event.FINISH)
-"""Events with which a command is sent, before the row of the journal is."""
+"""Events that publish a command, before the row of the journal is published."""
 
 
 class Journal:
-    """Numbers the events of one controller, and counts the references it was handed."""
+    """Numbers the events of one controller and counts its references."""
 
     def __init__(self) -> None:
         self.row = array('q', [0] * len(JOURNAL_COLUMNS))
-        """The newest row, as in :data:`COLUMNS`; overwritten by each event."""
+        """Last row, as in :data:`JOURNAL_COLUMNS`; overwritten by each event."""
         self.revision = 0
-        """Of the settings: how often they have been changed."""
+        """Revision of the parameters: the number of their changes."""
         self._number = 0
         self._references = 0
         self._newest_ns = 0
         self._enabled = True
 
-    def reference(self, stamp_ns: int) -> None:
-        """Count a reference message handed to the controller, whether it was refused or not."""
+    def count_reference(self, stamp_ns: int) -> None:
+        """Count a reference message, accepted or rejected by the controller."""
         self._references += 1
         self._newest_ns = stamp_ns
 
     def step(self, stamp_ns: int) -> 'array[int]':
-        """Return the row of a step on the odometry message with this stamp."""
-        return self._note(Event.STEP, stamp_ns, self._newest_ns)
+        """Return the row of a step with the stamp of its odometry message."""
+        return self._append(Event.STEP, stamp_ns, self._newest_ns)
 
-    def silent(self, stamp_ns: int) -> 'array[int]':
-        """Return the row of a stop for want of odometry, the last of which had this stamp."""
-        return self._note(Event.ODOMETRY_TIMEOUT, stamp_ns, 0)
+    def odometry_timeout(self, stamp_ns: int) -> 'array[int]':
+        """Return the row of a stop after an odometry timeout, with the last odometry stamp."""
+        return self._append(Event.ODOMETRY_TIMEOUT, stamp_ns, 0)
 
     def enable(self, on: bool) -> 'array[int]':
-        """Return the row of the robot being let move, or stopped."""
+        """Return the row of enabled or disabled motion."""
         self._enabled = on
-        return self._note(Event.ENABLE, 0, int(on))
+        return self._append(Event.ENABLE, 0, int(on))
 
     def reset(self) -> 'array[int]':
-        """Return the row of everything learnt being forgotten."""
-        return self._note(Event.RESET, 0, int(self._enabled))
+        """Return the row of a reset of the learned weights."""
+        return self._append(Event.RESET, 0, int(self._enabled))
 
     def configure(self) -> 'array[int]':
-        """Return the row of other settings, and raise :attr:`revision`."""
+        """Increment :attr:`revision` and return the row of changed parameters."""
         self.revision += 1
-        return self._note(Event.CONFIGURE, 0, self.revision)
+        return self._append(Event.CONFIGURE, 0, self.revision)
 
     def model(self, checksum: int) -> 'array[int]':
-        """Return the row of a model file with this CRC-32."""
-        return self._note(Event.MODEL, 0, checksum)
+        """Return the row of a loaded model file with its CRC-32."""
+        return self._append(Event.MODEL, 0, checksum)
 
     def finish(self) -> 'array[int]':
-        """Return the row of the end."""
-        return self._note(Event.FINISH, 0, 0)
+        """Return the row of the shutdown."""
+        return self._append(Event.FINISH, 0, 0)
 
-    def _note(self, event: Event, stamp_ns: int, value: int) -> 'array[int]':
+    def _append(self, event: Event, stamp_ns: int, value: int) -> 'array[int]':
         row = self.row
         row[0], row[1], row[2] = self._number, event, stamp_ns
         row[3], row[4] = self._references, value
@@ -116,7 +121,7 @@ def parameters_from_json(text: str) -> tuple[int, dict[str, object]]:
     Raises
     ------
     ValueError
-        The text is something else.
+        The text has another format.
     """
     try:
         content = json.loads(text)

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Model files: trained weights of a controller with the parameters they were trained under."""
+"""Model files: learned weights of a controller and the parameters of their training."""
 
 from collections.abc import Mapping
 import json
@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 import t3mpc_ros
 
 FORMAT = 1
-"""Raised whenever the meaning of an array changes."""
+"""Version of the format; incremented if the meaning of an array changes."""
 
 _HEADER = 'header'
 
 
 class ModelError(RuntimeError):
-    """A model file that cannot be written, read or used."""
+    """A model file cannot be written, read or used."""
 
 
 def save_model(
@@ -29,23 +29,23 @@ def save_model(
     parameters: Mapping[str, object],
     origin: Mapping[str, object] | None = None,
 ) -> None:
-    """Write what was learnt, with the settings it was learnt under.
+    """Write a model file.
 
     Parameters
     ----------
     path
         The file.
     arrays
-        What was learnt.
-    settings
-        By flat name.
+        Learned weights by name.
+    parameters
+        Parameters of the controller by name.
     origin
-        Where it comes from, as plain data for JSON: bags and their hashes, say.
+        Origin of the weights as JSON data, such as bags and their hashes.
 
     Raises
     ------
     ModelError
-        The file cannot be written; the text names it and the reason.
+        The file is not writable; the text names the file and the reason.
     """
     header = json.dumps(
         {
@@ -69,13 +69,13 @@ def load_model(path: Path) -> dict[str, NDArray[np.float64]]:
     Raises
     ------
     ModelError
-        The file cannot be read, is no model, or is of another format; the text says which.
+        The file is not readable, not a model file, or of another format.
     """
     return _read(path)[1]
 
 
 def read_model_header(path: Path) -> dict[str, Any]:
-    """Return what a model file says of itself: format, version, settings, and its origin.
+    """Return the header of a model file: format, version, settings and origin.
 
     Raises
     ------
@@ -99,6 +99,6 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
     found = header.get('format') if isinstance(header, dict) else None
     if found != FORMAT:
         raise ModelError(
-            f'{path} has model format {found}, this is format {FORMAT}: train or save it anew'
+            f'{path} has model format {found}, this is format {FORMAT}: train or save it again'
         )
     return header, arrays

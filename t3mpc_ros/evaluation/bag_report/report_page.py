@@ -300,8 +300,8 @@ def _notes(recording: BagReader, run: Run) -> str:
     notes = list(run.notes)
     if run.absent:
         notes.append(f'Not in the bag, or without a message: {", ".join(run.absent)}.')
-    if recording.unfinished:
-        notes.append(f'Unfinished files, not read: {", ".join(recording.unfinished)}.')
+    if recording.incomplete_files:
+        notes.append(f'Unfinished files, not read: {", ".join(recording.incomplete_files)}.')
     if len(run.namespaces) > 1:
         others = ', '.join(space or '/' for space in run.namespaces[1:])
         notes.append(f'The bag also holds topics of {others}.')

@@ -153,7 +153,7 @@ class RecordedController:
     def add_reference(self, now_ns: int, motion: State) -> None:
         """Pass a reference to the controller."""
         self._tape.motion(REFERENCE, now_ns, motion)
-        self._journal.reference(motion.stamp_ns)
+        self._journal.count_reference(motion.stamp_ns)
         self.controller.add_reference(motion)
 
     def step(self, now_ns: int, measured: State) -> tuple[BodyTwist, Status]:
@@ -172,7 +172,8 @@ class RecordedController:
         """Handle missing odometry: stop."""
         self.controller.check_odometry(None, now_ns)
         self._tape.command(now_ns, STANDSTILL)
-        self._tape.row(now_ns + LATER, self._journal.silent(self.controller.status.stamp_ns))
+        row = self._journal.odometry_timeout(self.controller.status.stamp_ns)
+        self._tape.row(now_ns + LATER, row)
 
     def enable(self, now_ns: int, on: bool) -> None:
         """Enable or disable motion."""

@@ -36,7 +36,7 @@ ACK_TIMEOUT = 1.0
 RATE_FACTOR, SEEK_BACK = 1.1, 5.0
 """Change of the rate by one key press; time that a key seeks back, s."""
 
-NO_BAG = 'no bag is open: set bags'
+NO_BAG = 'no bag is open: set storage.uris'
 
 
 @dataclass(frozen=True)
@@ -44,29 +44,45 @@ class PlayerParameters(PlaybackParameters):
     """Parameters of the player node."""
 
     allow_commands: bool = parameter(
-        False, 'publish cmd_vel and other velocities under their own name: a robot may move'
+        False,
+        'publish cmd_vel and other velocities under their own name: a robot may move',
+        name='play.allow_commands',
     )
-    quality_overrides: str = parameter(
-        '', 'YAML file with QoS profiles by topic, in the format of ros2 bag play'
+    qos_profile_overrides_path: str = parameter(
+        '',
+        'YAML file with QoS profiles by topic, in the format of ros2 bag play',
+        name='play.qos_profile_overrides_path',
     )
-    wait_for_subscribers: float = parameter(
-        0.5, 'maximum wait for a subscriber to every topic before playing', unit='s', low=0.0
+    subscriber_timeout: float = parameter(
+        0.5,
+        'maximum wait for a subscriber to every topic before playing',
+        unit='s',
+        low=0.0,
+        name='play.subscriber_timeout',
     )
-    delay: float = parameter(0.0, 'minimum wait before playing', unit='s', low=0.0)
+    delay: float = parameter(
+        0.0, 'minimum wait before playing', unit='s', low=0.0, name='play.delay'
+    )
     realtime_priority: int = parameter(
         0,
         'real-time priority (SCHED_FIFO) of the thread that publishes; 0 = none. Needs the '
         'permission rtprio in limits.conf',
         low=0,
         high=99,
+        name='play.realtime_priority',
     )
-    keyboard: bool = parameter(
+    enable_keyboard_controls: bool = parameter(
         True,
         'keyboard control in a terminal: space pauses, right plays the next message, left seeks '
         'back 5 s, up and down (+ and -) change the rate',
+        name='play.enable_keyboard_controls',
     )
-    progress: bool = parameter(True, 'show the progress in a terminal')
-    exit_at_end: bool = parameter(True, 'end the process at the end of the bag')
+    enable_progress_bar: bool = parameter(
+        True, 'show the progress in a terminal', name='play.enable_progress_bar'
+    )
+    exit_at_end: bool = parameter(
+        True, 'end the process at the end of the bag', name='play.exit_at_end'
+    )
 
 
 class PlayerNode(BaseNode[PlayerParameters]):
@@ -81,7 +97,7 @@ class PlayerNode(BaseNode[PlayerParameters]):
         self._other_publishers: dict[str, str] = {}
         self._logged: set[str] = set()
         self._started = self._ended = False
-        if self.parameters.bags:
+        if self.parameters.uris:
             self._open()
         else:
             self.get_logger().warning(NO_BAG)
@@ -98,12 +114,14 @@ class PlayerNode(BaseNode[PlayerParameters]):
 
     def _open(self) -> None:
         parameters = self.parameters
-        path = parameters.quality_overrides
+        path = parameters.qos_profile_overrides_path
         overrides = read_qos_overrides(path) if path else {}
         self._reader, unfinished = parameters.open_reader()
         reader = self._reader
-        publishes_clock = parameters.clock_rate > 0.0 or parameters.clock_with_messages
-        self._span = begin_ns, end_ns = parameters.span_ns(reader)
+        publishes_clock = (
+            parameters.clock_publish_frequency > 0.0 or parameters.clock_publish_on_topic_publish
+        )
+        self._span = begin_ns, end_ns = parameters.time_range_ns(reader)
         self._topic_publishers = TopicPublishers(
             self, reader, PublishingRules(parameters.allow_commands, publishes_clock, overrides)
         )
@@ -111,20 +129,21 @@ class PlayerNode(BaseNode[PlayerParameters]):
             self.get_logger().error(f'{topic} is not played: {reason}')
         for topic, reason in self._topic_publishers.blocked.items():
             self.get_logger().warning(
-                f'{topic} is not played: {reason}; set allow_commands to true, or remap it to '
-                'another name (remap: ["old:=new"])'
+                f'{topic} is not played: {reason}; set play.allow_commands to true, or remap it '
+                'to another name (play.topic_remapping_options: ["old:=new"])'
             )
         if unfinished:
             self.get_logger().warning(
                 f'incomplete files are not played: {", ".join(unfinished)}; t3mpc bag recover '
                 'repairs them'
             )
-        if not reader.tracks:
+        if not reader.topics:
             self.get_logger().warning('the bags have no topic to play')
         clock = self.create_publisher(Clock, CLOCK, qos.LATEST) if publishes_clock else None
         timeline = PlaybackTimeline(
             lambda at_ns: ReadAheadQueue(
-                reader.plan(at_ns, begin_ns, end_ns, parameters.loop), parameters.read_ahead
+                reader.schedule(at_ns, begin_ns, end_ns, parameters.loop),
+                parameters.read_ahead_queue_size,
             ),
             begin_ns,
             end_ns,
@@ -132,23 +151,23 @@ class PlayerNode(BaseNode[PlayerParameters]):
             rate=parameters.rate,
             loop=parameters.loop,
             paused=parameters.start_paused,
-            clock_rate=parameters.clock_rate,
+            clock_rate=parameters.clock_publish_frequency,
         )
         self._thread = PlayerThread(
             timeline,
             self._topic_publishers.by_topic,
             clock,
-            parameters.clock_with_messages,
+            parameters.clock_publish_on_topic_publish,
             parameters.realtime_priority,
         )
-        if parameters.progress:
+        if parameters.enable_progress_bar:
             self._progress = ProgressLine(sys.stdout, begin_ns, end_ns)
         self._opened_ns = time.monotonic_ns()
         self._start_timer = self.create_steady_timer(0.02, self._start)
         self.create_steady_timer(0.2, self._monitor)
         self.create_steady_timer(1.0, self._check_other_publishers)
         self.get_logger().info(
-            f'{len(reader.tracks)} topics, {(end_ns - begin_ns) / NANOSECONDS:.3f} s'
+            f'{len(reader.topics)} topics, {(end_ns - begin_ns) / NANOSECONDS:.3f} s'
         )
 
     def _start(self) -> None:
@@ -157,12 +176,15 @@ class PlayerNode(BaseNode[PlayerParameters]):
         if thread is None:
             return
         # Only while the process spins: a signal before would leave the terminal unrestored.
-        if parameters.keyboard and self._keyboard is None and KeyboardHandler.usable():
+        if (
+            parameters.enable_keyboard_controls
+            and self._keyboard is None
+            and KeyboardHandler.usable()
+        ):
             self._keyboard = KeyboardHandler(self._on_key)
         waited = (time.monotonic_ns() - self._opened_ns) / NANOSECONDS
         waiting = (
-            waited < parameters.wait_for_subscribers
-            and not self._topic_publishers.all_subscribed()
+            waited < parameters.subscriber_timeout and not self._topic_publishers.all_subscribed()
         )
         if waited < parameters.delay or waiting:
             return
@@ -191,7 +213,7 @@ class PlayerNode(BaseNode[PlayerParameters]):
             self._progress.show(status)
         if thread.priority_problem and self._is_new('priority'):
             self.get_logger().warning(
-                f'realtime_priority {self.parameters.realtime_priority} is not available: '
+                f'play.realtime_priority {self.parameters.realtime_priority} is not available: '
                 f'{thread.priority_problem}; playing without it'
             )
         if thread.failure:
@@ -209,8 +231,8 @@ class PlayerNode(BaseNode[PlayerParameters]):
             if self._is_new(f'robot {topic}'):
                 thread.disable(topic)
                 self.get_logger().error(
-                    f'{topic} is disabled: it would move {robot}; set allow_commands to true to '
-                    'play it'
+                    f'{topic} is disabled: it would move {robot}; set play.allow_commands to true '
+                    'to play it'
                 )
 
     def _check_other_publishers(self) -> None:
@@ -324,17 +346,17 @@ class PlayerNode(BaseNode[PlayerParameters]):
 
     def _seek_back(self) -> str:
         def seek_back(timeline: PlaybackTimeline, now_ns: int) -> str:
-            target_ns = timeline.stamp_ns(now_ns) - round(SEEK_BACK * NANOSECONDS)
+            target_ns = timeline.bag_time_ns(now_ns) - round(SEEK_BACK * NANOSECONDS)
             return timeline.seek(now_ns, max(target_ns, self._span[0]))
 
         return self._control(seek_back)
 
     def _play_next(self) -> str:
-        count = self.parameters.step_count
-        return self._control(lambda timeline, now_ns: timeline.step(now_ns, count))
+        count = self.parameters.play_next_count
+        return self._control(lambda timeline, now_ns: timeline.play_next(now_ns, count))
 
     def _play_one(self) -> str:
-        return self._control(lambda timeline, now_ns: timeline.step(now_ns, 1))
+        return self._control(lambda timeline, now_ns: timeline.play_next(now_ns, 1))
 
     def _set_rate(self) -> str:
         rate = self.parameters.rate
@@ -342,7 +364,7 @@ class PlayerNode(BaseNode[PlayerParameters]):
 
     def _multiply_rate(self, factor: float) -> str:
         rate = round(self.parameters.rate * factor, 6)
-        (result,) = self.set_parameters([Parameter('rate', value=rate)])
+        (result,) = self.set_parameters([Parameter('play.rate', value=rate)])
         return '' if result.successful else str(result.reason)
 
     def _on_key(self, key: str) -> None:

@@ -107,7 +107,7 @@ class PlayerThread:
         with self._lock:
             now_ns, timeline = time.monotonic_ns(), self._timeline
             return PlaybackStatus(
-                timeline.stamp_ns(now_ns),
+                timeline.bag_time_ns(now_ns),
                 timeline.remaining_ns(now_ns),
                 timeline.loops(now_ns),
                 timeline.rate,
@@ -130,7 +130,7 @@ class PlayerThread:
             while not self._closing:
                 self._wake.clear()
                 with self._lock:
-                    due, wake_ns = self._timeline.due(time.monotonic_ns())
+                    due, wake_ns = self._timeline.due_messages(time.monotonic_ns())
                 for item in due:
                     self._publish(item)
                 if wake_ns is None:
@@ -148,6 +148,6 @@ class PlayerThread:
             return
         publisher = self._publishers.get(message.topic)
         if publisher is not None:
-            self.latency.note(time.monotonic_ns() - due.due_ns)
+            self.latency.add(time.monotonic_ns() - due.due_ns)
             publisher.publish(message.data)
             self.published += 1

@@ -66,7 +66,7 @@ class TopicPublishers:
         """Reasons by topic that cannot be published."""
         self.blocked: dict[str, str] = {}
         """Reasons by topic that is not published because it could move a robot."""
-        for topic in list(reader.tracks):
+        for topic in list(reader.topics):
             try:
                 if problem := self._velocity_risk(reader, topic):
                     self.blocked[topic] = problem
@@ -88,19 +88,21 @@ class TopicPublishers:
         if self._allow_commands:
             return ''
         name = self._node.resolve_topic_name(topic)
-        type_name = reader.tracks[topic].type_name
-        problems = (velocity_command_risk(old, name, type_name) for old in reader.recorded[topic])
+        type_name = reader.topics[topic].type_name
+        problems = (
+            velocity_command_risk(old, name, type_name) for old in reader.recorded_names[topic]
+        )
         return next(filter(None, problems), '')
 
     def _create(self, reader: MergedReader, topic: str, rules: PublishingRules) -> Publisher:
-        track = reader.tracks[topic]
+        track = reader.topics[topic]
         require_cdr(track)
         if rules.publishes_clock and self._node.resolve_topic_name(topic) == CLOCK:
-            raise BagError('the player publishes its own clock (clock_rate)')
-        names = [topic, *reader.recorded[topic]]
+            raise BagError('the player publishes its own clock (play.clock_publish_frequency)')
+        names = [topic, *reader.recorded_names[topic]]
         overrides = rules.qos_overrides
         override = next((overrides[name] for name in names if name in overrides), None)
-        offer = override or adapt_offer_to_recorded_offers(track.profiles)
+        offer = override or adapt_offer_to_recorded_offers(track.offered_qos_profiles)
         message = introspection.message_class(track.type_name)
         return self._node.create_publisher(message, topic, qos_profile(offer))
 

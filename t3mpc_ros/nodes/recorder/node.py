@@ -59,16 +59,17 @@ class RecorderNode(BaseNode[RecordingParameters]):
     def __init__(self, **options: Any) -> None:
         super().__init__('recorder', RecordingParameters, **options)
         parameters = self.parameters
-        self._folder = Path(
-            parameters.folder or f'bag_{datetime.now():%Y_%m_%d-%H_%M_%S}'
-        ).resolve()
+        self._folder = Path(parameters.uri or f'bag_{datetime.now():%Y_%m_%d-%H_%M_%S}').resolve()
         self._metadata = RecordingMetadata(
-            parameters.attach, parameters.attach_bytes, parameters.attach_models, time.time_ns()
+            parameters.attachments,
+            parameters.max_attachment_size,
+            parameters.attach_models,
+            time.time_ns(),
         )
         self._definitions = MessageDefinitions()
-        self._queue: MessageQueue[SplitWriter] = MessageQueue(parameters.queue_bytes)
-        self._writer = None if parameters.snapshot_only else self._make_writer()
-        self._snapshots = self._make_snapshot_writer() if parameters.snapshot_time else None
+        self._queue: MessageQueue[SplitWriter] = MessageQueue(parameters.max_cache_size)
+        self._writer = None if parameters.snapshot_mode else self._make_writer()
+        self._snapshots = self._make_snapshot_writer() if parameters.snapshot_duration else None
         self._recorded_types: dict[str, str] = {}
         self._raw_subscriptions = RawSubscriptions(self)
         self._discovery = TopicDiscovery(
@@ -81,9 +82,9 @@ class RecorderNode(BaseNode[RecordingParameters]):
         self._received = self._dropped = 0
         self._dropped_ns: int | None = None
         self._failure = ''
-        self._monitor = DiagnosticsMonitor(map(self._diagnostic_name, parameters.snapshot_nodes))
+        self._monitor = DiagnosticsMonitor(map(self._diagnostic_name, parameters.monitored_nodes))
         self._rate_limiter = SnapshotRateLimiter(
-            round(parameters.snapshot_pause * NANOSECONDS), parameters.snapshot_most
+            round(parameters.snapshot_min_interval * NANOSECONDS), parameters.snapshot_max_count
         )
         self._discovery.subscribe_expected()
         self._collector = ParameterCollector(self, self._on_node_parameters)
@@ -99,7 +100,8 @@ class RecorderNode(BaseNode[RecordingParameters]):
         self.get_logger().info(
             f'recording to {self._folder}'
             if self._writer
-            else f'caching the last {parameters.snapshot_time:g} s for snapshots in {self._folder}'
+            else f'caching the last {parameters.snapshot_duration:g} s for snapshots in '
+            f'{self._folder}'
         )
 
     # -- parts ------------------------------------------------------------------------------------
@@ -109,10 +111,10 @@ class RecorderNode(BaseNode[RecordingParameters]):
         writer = SplitWriter(
             self._folder,
             self._metadata.records,
-            chunk_bytes=parameters.chunk_bytes,
-            chunk_ns=round(parameters.chunk_time * NANOSECONDS),
-            split_bytes=parameters.split_bytes,
-            split_ns=round(parameters.split_time * NANOSECONDS),
+            chunk_bytes=parameters.chunk_size,
+            chunk_ns=round(parameters.chunk_duration * NANOSECONDS),
+            max_file_bytes=parameters.max_bagfile_size,
+            max_file_ns=round(parameters.max_bagfile_duration * NANOSECONDS),
             definitions=self._definitions,
         )
         for attachment, read_ns in self._metadata.attachments.values():
@@ -124,8 +126,8 @@ class RecorderNode(BaseNode[RecordingParameters]):
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise FolderError(f'cannot record into {self._folder}: {error.strerror}') from error
-        span_ns = round(self.parameters.snapshot_time * NANOSECONDS)
-        cache = CircularMessageCache(span_ns, self.parameters.snapshot_bytes)
+        span_ns = round(self.parameters.snapshot_duration * NANOSECONDS)
+        cache = CircularMessageCache(span_ns, self.parameters.snapshot_cache_size)
         return SnapshotWriter(self._folder, cache, self._definitions)
 
     def _make_topic_filter(self) -> TopicFilter:
@@ -136,8 +138,9 @@ class RecorderNode(BaseNode[RecordingParameters]):
             names,
             topics,
             regex=self.parameters.regex,
-            exclude=self.parameters.exclude,
-            types=self.parameters.types,
+            exclude_topics=self.parameters.exclude_topics,
+            exclude_regex=self.parameters.exclude_regex,
+            types=self.parameters.topic_types,
             namespace=self.get_namespace(),
         )
 
@@ -168,7 +171,8 @@ class RecorderNode(BaseNode[RecordingParameters]):
             self._dropped_ns = self.steady_ns()
             self.get_logger().error(
                 f'the disk is too slow: {self._dropped} messages dropped so far, the last of '
-                f'{", ".join(dropped)} (queue_bytes is {self.parameters.queue_bytes})',
+                f'{", ".join(dropped)} '
+                f'(storage.max_cache_size is {self.parameters.max_cache_size})',
                 throttle_duration_sec=1.0,
             )
 
@@ -235,7 +239,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
     def _on_split(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._take_messages()
         if self._writer is None:
-            response.message = 'no recording to split: snapshot_only is set'
+            response.message = 'no recording to split: storage.snapshot_mode is set'
             return response
         table = self._losses()
 
@@ -278,7 +282,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
 
     def _start_snapshot(self, reason: str) -> Path:
         if self._snapshots is None:
-            raise BagError('snapshot_time must be above 0 for snapshots: got 0')
+            raise BagError('storage.snapshot_duration must be above 0 for snapshots: got 0')
         self._take_messages()
         files = list(self._metadata.attachments.values())
         records = {name: dict(table) for name, table in self._metadata.records.items()}
@@ -295,7 +299,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
 
     def _monitor_graph(self) -> None:
         self._raw_subscriptions.count_lost()
-        for fault in self._monitor.silent(self.steady_ns()):
+        for fault in self._monitor.check_timeouts(self.steady_ns()):
             self._on_fault(fault)
 
     def _losses(self) -> dict[str, str]:

@@ -58,7 +58,7 @@ class SnapshotWriter:
         """Add the metadata of a topic with ``latched`` transient-local publishers."""
         self._topics[topic.topic] = topic
         if latched:
-            self._cache.latch(topic.topic, latched)
+            self._cache.keep_last(topic.topic, latched)
 
     def add(self, messages: list[SerializedMessage]) -> None:
         """Add messages to the cache, in order of reception."""
@@ -92,7 +92,7 @@ class SnapshotWriter:
         """
         if self.busy:
             raise BagError('another snapshot is being written: try again after it')
-        messages = self._cache.held(now_ns)
+        messages = self._cache.messages(now_ns)
         if not messages:
             raise BagError('no message was received within snapshot_time')
         time = datetime.fromtimestamp(now_ns / 1e9)

@@ -65,13 +65,13 @@ class WriterThread:
             else:
                 self._pending = [item for item in self._pending if not item.done()]
                 self._pending.append(future)
-                self._queue.order(run)
+                self._queue.put_task(run)
         return future
 
     def close(self) -> str:
         """Write the queue, close the file and return the failure, or an empty text."""
         self._closing.set()
-        self._queue.order(lambda writer: None)  # wakes the thread
+        self._queue.put_task(lambda writer: None)  # wakes the thread
         self._thread.join(SHUTDOWN_TIMEOUT)
         if self._thread.is_alive():
             return f'the disk did not accept the last messages within {SHUTDOWN_TIMEOUT:g} s'

@@ -1,10 +1,10 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
 //
-// node check.mjs FILE.mcap ...: reads files of a bag through the libraries of web viewers and
-// prints what was found as JSON, one entry a file. Everything is verified on the way: the
-// checksums of the summary, of every chunk, of the attachments and of the data section, the
-// index, and that each message decodes with the bag's own schema.
+// node check.mjs FILE.mcap ...: reads files of a bag with the libraries of web viewers and
+// prints their content as JSON, one entry per file. It verifies the checksums of the summary,
+// the chunks, the attachments and the data section, the message indexes, and that each message
+// decodes with the schema in the bag.
 
 import { readFile } from 'node:fs/promises';
 
@@ -17,10 +17,10 @@ const decompressHandlers = {
   zstd: (data, size) => decompress(data, new Uint8Array(Number(size))),
 };
 
-async function look(path) {
+async function checkFile(path) {
   const content = await readFile(path);
 
-  // Front to back: McapStreamReader checks chunk checksums and that of the data section.
+  // Sequential: McapStreamReader verifies the checksums of the chunks and of the data section.
   const streamReader = new McapStreamReader({ decompressHandlers, validateCrcs: true });
   streamReader.append(content);
   let streamed = 0;
@@ -38,7 +38,7 @@ async function look(path) {
   }
   if (!streamReader.done()) throw new Error('the file does not end where it should');
 
-  // Through the index: McapIndexedReader checks the summary's checksum when it opens the file.
+  // Indexed: McapIndexedReader verifies the checksum of the summary when it opens the file.
   const readable = {
     size: async () => BigInt(content.length),
     read: async (offset, size) =>
@@ -95,5 +95,5 @@ const plain = (_, value) => {
   return ArrayBuffer.isView(value) ? Array.from(value) : value;
 };
 const found = [];
-for (const path of process.argv.slice(2)) found.push(await look(path));
+for (const path of process.argv.slice(2)) found.push(await checkFile(path));
 console.log(JSON.stringify(found, plain));

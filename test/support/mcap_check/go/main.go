@@ -1,9 +1,9 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
 
-// go run . FILE.mcap ...: reads files of a bag through Foxglove's Go library and prints what was
-// found as JSON, one entry a file. Everything is verified on the way: the checksums of chunks,
-// attachments, data section and summary, and that the index leads to every message, in order.
+// go run . FILE.mcap ...: reads files of a bag with the Go library of Foxglove and prints their
+// content as JSON, one entry per file. It verifies the checksums of chunks, attachments, data
+// section and summary, and that the message indexes point to every message, in order.
 package main
 
 import (
@@ -68,7 +68,7 @@ func main() {
 	}
 }
 
-// stream reads front to back, as for a pipe; the lexer verifies the checksum of each chunk.
+// stream reads the file sequentially; the lexer verifies the checksum of each chunk.
 func stream(path string, to *found) error {
 	file, err := os.Open(path)
 	if err != nil {
@@ -141,7 +141,7 @@ func (to *found) attach(reader *mcap.AttachmentReader) error {
 	return nil
 }
 
-// index reads through the summary, as a viewer does that jumps about.
+// index reads through the summary, as a viewer with random access does.
 func index(path string, to *found) error {
 	file, err := os.Open(path)
 	if err != nil {
@@ -216,7 +216,7 @@ func index(path string, to *found) error {
 	}
 }
 
-// checksums verifies what the library leaves to its user: the data section and the summary.
+// checksums verifies the data section and the summary, which the library does not.
 func checksums(path string, to *found) error {
 	content, err := os.ReadFile(path)
 	if err != nil {
@@ -228,7 +228,7 @@ func checksums(path string, to *found) error {
 	if computed := crc32.ChecksumIEEE(content[start : footer+16]); to.SummaryCrc != computed {
 		return fmt.Errorf("summary: checksum %x, not %x", computed, to.SummaryCrc)
 	}
-	if to.DataCrc != 0 { // 0: not told, as in a file that was finished later
+	if to.DataCrc != 0 { // 0: no checksum, as in a finalized file
 		dataEnd := int(start) - 9 - 4
 		if computed := crc32.ChecksumIEEE(content[:dataEnd]); to.DataCrc != computed {
 			return fmt.Errorf("data section: checksum %x, not %x", computed, to.DataCrc)
