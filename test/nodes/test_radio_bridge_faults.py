@@ -57,14 +57,14 @@ class ServedEmulator:
         self._thread.start()
 
     def _serve(self):
-        serve(self.emulator, self.port, 1.0, self._stopped, look=self._look)
+        serve(self.emulator, self.port, 1.0, self._stopped, on_update=self._on_update)
 
     def _stopped(self):
         while self._todo:
             self.emulator.inject(*self._todo.pop(0))
         return self._ended
 
-    def _look(self):
+    def _on_update(self):
         if status := self.watch.poll():
             self.news.append(status)
         if not self.emulator.port_open:
