@@ -23,7 +23,7 @@ from t3mpc_ros.control.controller import Controller, ControllerParameters, Statu
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist
-from t3mpc_ros.nodes.common import conversions, introspection, qos
+from t3mpc_ros.nodes.common import conversions, graph_introspection, qos
 from t3mpc_ros.nodes.common.base_node import ERROR, OK, WARN, BaseNode, publish_and_wait_for_acked
 from t3mpc_ros.parameters.table import group, parameter
 
@@ -274,7 +274,9 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         stopped = f'stopped: {status.reason.value}'
         if not status.reason.moves and not waiting:
             return ERROR, stopped, values
-        if problem := introspection.command_type_problem(self, self._command_type, publish=True):
+        if problem := graph_introspection.command_type_problem(
+            self, self._command_type, publish=True
+        ):
             return WARN, problem, values
         if waiting:
             return WARN, stopped, values

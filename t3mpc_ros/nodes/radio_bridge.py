@@ -19,7 +19,7 @@ from typing import Any
 from geometry_msgs.msg import Twist, TwistStamped
 
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes.common import conversions, diagnostics, introspection, qos
+from t3mpc_ros.nodes.common import conversions, diagnostics, graph_introspection, qos
 from t3mpc_ros.nodes.common.base_node import ERROR, OK, WARN, BaseNode
 from t3mpc_ros.nodes.common.robot_publishers import (
     RobotDescription,
@@ -217,7 +217,9 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
             return ERROR, state.reason or link_state.value, values
         if quality.level is DiagnosticLevel.ERROR:
             return ERROR, quality.text, values
-        if problem := introspection.command_type_problem(self, self._command_type, publish=False):
+        if problem := graph_introspection.command_type_problem(
+            self, self._command_type, publish=False
+        ):
             return WARN, problem, values
         found = [*diagnostics.warnings(state), *([quality.text] if quality.text else [])]
         if found:

@@ -12,7 +12,7 @@ from std_srvs.srv import Trigger
 
 from t3mpc_ros.geometry.timing import RealTimeFactor, SampleScheduler, SimulatedTime
 from t3mpc_ros.geometry.types import NANOSECONDS, Pose
-from t3mpc_ros.nodes.common import conversions, diagnostics, introspection, qos
+from t3mpc_ros.nodes.common import conversions, diagnostics, graph_introspection, qos
 from t3mpc_ros.nodes.common.base_node import ERROR, NO_CLOCK, OK, WARN, BaseNode
 from t3mpc_ros.nodes.common.robot_publishers import (
     RobotDescription,
@@ -276,7 +276,9 @@ class SimRobotNode(BaseNode[SimRobotParameters]):
         values |= diagnostics.values(state, twin)
         if state.status.estop:
             return ERROR, state.reason, values
-        if problem := introspection.command_type_problem(self, self._command_type, publish=False):
+        if problem := graph_introspection.command_type_problem(
+            self, self._command_type, publish=False
+        ):
             return WARN, problem, values
         if overload := self._overload():
             return WARN, f'processor overloaded: {overload}', values

@@ -40,7 +40,7 @@ from t3mpc_ros.evaluation.process_replay.controller_inputs import (
 from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller
 from t3mpc_ros.evaluation.process_replay.divergence_figure import write_divergence_figure
 from t3mpc_ros.evaluation.process_replay.golden_bags import GOLDEN_SCENARIOS, run_golden_scenario
-from t3mpc_ros.evaluation.process_replay.message_alignment import match
+from t3mpc_ros.evaluation.process_replay.journal_alignment import match
 from t3mpc_ros.evaluation.process_replay.method_replay import replay_method
 from t3mpc_ros.evaluation.twin_closed_loop import loop_controller
 from t3mpc_ros.geometry.types import BodyTwist, Pose, State

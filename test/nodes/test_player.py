@@ -31,7 +31,7 @@ from t3mpc_ros.bag.merged_reader import MergedReader, open_serialized_bag
 from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.bag.writer import BagWriter
-from t3mpc_ros.nodes.common import conversions, introspection
+from t3mpc_ros.nodes.common import conversions, graph_introspection
 from t3mpc_ros.nodes.common.base_node import OK, WARN
 from t3mpc_ros.nodes.player.node import PlayerNode
 from t3mpc_ros.nodes.player.terminal import parse_keys
@@ -52,7 +52,7 @@ def write(folder, messages, profiles=None, **more):
     with BagWriter(folder, metadata_records={}, **more) as bag:
         for topic, seconds, message in messages:
             offered = (profiles or {}).get(topic, QosProfile())
-            bag.add_topic(topic, introspection.type_name(type(message)), [offered])
+            bag.add_topic(topic, graph_introspection.type_name(type(message)), [offered])
             stamp_ns = START + round(seconds * SECOND)
             bag.write(topic, stamp_ns, stamp_ns, serialize_message(message))
     return str(folder)

@@ -27,7 +27,7 @@ from t3mpc_ros.evaluation.bag_report.topic_roles import (
     WHEELS,
     find_topics,
 )
-from t3mpc_ros.evaluation.process_replay.message_alignment import (
+from t3mpc_ros.evaluation.process_replay.journal_alignment import (
     ConsumedMessages,
     by_receipt,
     commands_of,

@@ -22,7 +22,7 @@ from t3mpc_ros.evaluation.twin_validation.component_tests import (
     TorqueCurve,
 )
 from t3mpc_ros.evaluation.twin_validation.courses import Course, Patrol
-from t3mpc_ros.evaluation.twin_validation.yaw_drift import (
+from t3mpc_ros.evaluation.twin_validation.slip_drift import (
     NO_SLIP,
     PART,
     Drift,

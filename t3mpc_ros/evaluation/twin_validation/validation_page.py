@@ -64,11 +64,11 @@ def write_validation(output: Path, seed: int, amount: ValidationSize, progress: 
     """
     from t3mpc_ros.evaluation.plotting import png_of
     from t3mpc_ros.evaluation.reporting import Table
-    from t3mpc_ros.evaluation.twin_validation import yaw_drift
+    from t3mpc_ros.evaluation.twin_validation import slip_drift
     from t3mpc_ros.evaluation.twin_validation.validation_figures import VALIDATION_FIGURES
 
     evidence = run_validation(seed, amount, progress)
-    tables: list[Table] = [yaw_drift.drift_table(evidence.drifts), bench_table(evidence)]
+    tables: list[Table] = [slip_drift.drift_table(evidence.drifts), bench_table(evidence)]
     # Outcomes of driving the twin in a closed loop, as one more Table, belong here.
     pictures = {
         drawing.stem: png_of(drawing.draw, evidence) or b'' for drawing in VALIDATION_FIGURES
@@ -90,19 +90,19 @@ def run_validation(seed: int, amount: ValidationSize, progress: Any = None) -> '
     """Return all measurements; ``progress`` receives the number of finished runs."""
     import numpy as np
 
-    from t3mpc_ros.evaluation.twin_validation import component_tests, courses, yaw_drift
+    from t3mpc_ros.evaluation.twin_validation import component_tests, courses, slip_drift
     from t3mpc_ros.evaluation.twin_validation.validation_figures import Evidence
     from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 
     parameters = DigitalTwinParameters.from_dict({'seed': seed, 'world': 'room'})
     seeds = range(seed, seed + amount.seeds)
     kinds = [
-        [slip for slip in yaw_drift.SLIPS if slip.fault == kind][-amount.strengths :]
-        for kind in dict.fromkeys(slip.fault for slip in yaw_drift.SLIPS)
+        [slip for slip in slip_drift.SLIPS if slip.fault == kind][-amount.strengths :]
+        for kind in dict.fromkeys(slip.fault for slip in slip_drift.SLIPS)
     ]
-    slips = [yaw_drift.NO_SLIP, *(slip for kind in kinds for slip in kind)]
-    shown = yaw_drift.SLIPS[1]
-    count = _ProgressCounter(progress, len(seeds) * len(slips) * len(yaw_drift.COURSES) + 4)
+    slips = [slip_drift.NO_SLIP, *(slip for kind in kinds for slip in kind)]
+    shown = slip_drift.SLIPS[1]
+    count = _ProgressCounter(progress, len(seeds) * len(slips) * len(slip_drift.COURSES) + 4)
 
     fastest, motor = 140.0, parameters.motor
     torque = [
@@ -119,14 +119,14 @@ def run_validation(seed: int, amount: ValidationSize, progress: Any = None) -> '
     rates = component_tests.stationary_gyro(parameters.imu, amount.standing, rate, seed)
     low_pass = [component_tests.low_pass_response(number) for number in range(7)]
     count()
-    found = yaw_drift.measure_drifts(seeds, slips, count)
+    found = slip_drift.measure_drifts(seeds, slips, count)
     squares = tuple(
-        yaw_drift.drive_course(name, shown, seed) for name in ('square ccw', 'square cw')
+        slip_drift.drive_course(name, shown, seed) for name in ('square ccw', 'square cw')
     )
     count()
     turns, slip_events = (
-        yaw_drift.drive_course('10 turns', shown, seed),
-        yaw_drift.slip_events('10 turns', shown, seed),
+        slip_drift.drive_course('10 turns', shown, seed),
+        slip_drift.slip_events('10 turns', shown, seed),
     )
     count()
     patrol = courses.patrol(parameters, amount.patrol, 30.0)
@@ -188,7 +188,7 @@ def _findings(evidence: 'Evidence') -> list[str]:
     """Return in sentences the drift from which the gyro leaves at most a fifth."""
     import numpy as np
 
-    from t3mpc_ros.evaluation.twin_validation.yaw_drift import NO_SLIP, holds_from
+    from t3mpc_ros.evaluation.twin_validation.slip_drift import NO_SLIP, holds_from
 
     lines = []
     for course in dict.fromkeys(item.course for item in evidence.drifts):

@@ -24,7 +24,7 @@ from t3mpc_ros.bag.player import VELOCITY_TYPES, velocity_command_risk
 from t3mpc_ros.bag.qos import UNLIMITED, QosProfile, adapt_offer_to_recorded_offers
 from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes.common import introspection
+from t3mpc_ros.nodes.common import graph_introspection
 
 CLOCK = '/clock'
 ROBOT_NODES = ('radio_bridge', 'sim_robot')
@@ -77,7 +77,7 @@ class TopicPublishers:
                 BagError,
                 ImportError,
                 NameValidationException,
-                introspection.RCLError,
+                graph_introspection.RCLError,
             ) as error:
                 self.unusable[topic] = str(error)
             except ValueError as error:
@@ -103,7 +103,7 @@ class TopicPublishers:
         overrides = rules.qos_overrides
         override = next((overrides[name] for name in names if name in overrides), None)
         offer = override or adapt_offer_to_recorded_offers(track.offered_qos_profiles)
-        message = introspection.message_class(track.type_name)
+        message = graph_introspection.message_class(track.type_name)
         return self._node.create_publisher(message, topic, qos_profile(offer))
 
     def all_subscribed(self) -> bool:
@@ -116,7 +116,7 @@ class TopicPublishers:
         for topic, publisher in self.by_topic.items():
             if (
                 self._allow_commands
-                or introspection.type_name(publisher.msg_type) not in VELOCITY_TYPES
+                or graph_introspection.type_name(publisher.msg_type) not in VELOCITY_TYPES
             ):
                 continue
             for info in self._node.get_subscriptions_info_by_topic(publisher.topic_name):

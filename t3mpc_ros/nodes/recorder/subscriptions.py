@@ -34,7 +34,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.topic_filter import TopicFilter
 from t3mpc_ros.bag.writer import SerializedMessage, TopicMetadata
-from t3mpc_ros.nodes.common import introspection, qos
+from t3mpc_ros.nodes.common import graph_introspection, qos
 
 EXPECTED_TOPICS = {
     'reference': 'nav_msgs/msg/Odometry',
@@ -124,7 +124,7 @@ class RawSubscriptions:
         RCLError
             This process uses the topic with another type.
         """
-        message = introspection.message_class(type_name)
+        message = graph_introspection.message_class(type_name)
         self.unsubscribe(topic)
         subscription = self._node.create_subscription(
             message,
@@ -245,7 +245,7 @@ class TopicDiscovery:
             profile = qos.RECORDER_LATCHED if name in LATCHED_TOPICS else qos.RECORDER
             try:
                 self._subscriptions.subscribe(topic, type_name, profile)
-            except introspection.RCLError:
+            except graph_introspection.RCLError:
                 # A node of this process uses another type; discovery finds its publisher.
                 continue
 
@@ -283,7 +283,7 @@ class TopicDiscovery:
         self._take_messages()
         try:
             self._subscriptions.subscribe(topic, type_name, request)
-        except (ImportError, introspection.RCLError) as error:
+        except (ImportError, graph_introspection.RCLError) as error:
             self.exclude(topic, str(error))
 
 
