@@ -550,7 +550,7 @@ def update_page(page: Path, results: Sequence[Outcome]) -> None:
 
 def _short(reason: str) -> str:
     return '; '.join(
-        part.split(':')[0] for part in reason.split('; ') if 'command ' not in part[:8]
+        part.split(':')[0] for part in reason.split('; ') if not part.startswith('stop commanding ')
     )
 
 
