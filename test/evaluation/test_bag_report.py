@@ -349,7 +349,7 @@ def test_an_empty_bag_and_no_bag_are_errors(tmp_path, capsys):
     assert bag_main(['report', str(folder)]) == 1
     assert 'nothing to report' in capsys.readouterr().err
     assert bag_main(['report', str(tmp_path / 'gone')]) == 1
-    assert 'no finished bag file' in capsys.readouterr().err
+    assert 'no complete bag file' in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ['bag']
 
 

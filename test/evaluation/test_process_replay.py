@@ -551,7 +551,7 @@ def test_a_message_that_is_cut_short_is_refused(length, tmp_path):
     with BagWriter(tmp_path / 'bag', metadata_records={}) as writer:
         writer.add_topic('/odom', 'nav_msgs/msg/Odometry')
         writer.write('/odom', 1, 1, (b'\x00\x01\x00\x00' + bytes(800))[:length])
-    with pytest.raises(DataError, match='not laid out'):
+    with pytest.raises(DataError, match='does not have the layout'):
         read_columns(read_bag_index(tmp_path / 'bag'), ['/odom'])
 
 

@@ -535,7 +535,7 @@ def test_bags_made_under_different_settings_are_not_mixed(run, calm, tmp_path):
         fit_bags([one, other.write(tmp_path / 'other')])
     with pytest.raises(TrainingError, match='at least one bag'):
         fit_bags([])
-    with pytest.raises(BagError, match='no finished bag file'):
+    with pytest.raises(BagError, match='no complete bag file'):
         fit_bags([tmp_path / 'nowhere'])
 
 
@@ -684,7 +684,7 @@ def test_bags_on_the_command_line(bag, trained, tmp_path, capsys):
         (['--seeds', '0'], 'seeds must be from 1 to 20: got 0'),
         (['--keep-predictor'], 'is for bags'),
         (['bag', '--drive', 'torque'], 'drive must be velocity for bags'),
-        (['nowhere'], 'no finished bag file'),
+        (['nowhere'], 'no complete bag file'),
     ],
     ids=str,
 )
