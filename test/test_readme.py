@@ -74,7 +74,9 @@ def _commands(page):
     return [line for block in blocks for line in block.splitlines() if line.strip()]
 
 
-@pytest.mark.parametrize('page', ['README.md', 'docs/tutorial.md'])
+@pytest.mark.parametrize(
+    'page', ['README.md', *sorted(f'docs/{path.name}' for path in (ROOT / 'docs').glob('*.md'))]
+)
 def test_every_command_of_the_page_is_run_here(page):
     assert set(_commands(ROOT / page)) <= set(SHORTENED)
 
