@@ -75,7 +75,7 @@ def load_model(path: Path) -> dict[str, NDArray[np.float64]]:
 
 
 def read_model_header(path: Path) -> dict[str, Any]:
-    """Return the header of a model file: format, version, settings and origin.
+    """Return the header of a model file: format, version, parameters and origin.
 
     Raises
     ------
