@@ -675,7 +675,7 @@ def test_the_recorded_geometry_is_used(run, report):
     'metadata_records, complaint',
     [
         ({}, 'are assumed'),
-        ({'robot': {'a.wheel_radius': 'big'}}, 'is no number'),
+        ({'robot': {'a.wheel_radius': 'big'}}, 'is not a number'),
         ({'robot': {'a.wheel_radius': '-1.0', 'a.wheel_separation': '0.2'}}, 'cannot be used'),
     ],
 )

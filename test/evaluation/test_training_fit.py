@@ -414,7 +414,7 @@ def test_too_little_movement_of_v_p_is_refused_with_its_size(calm):
 def test_the_coefficients_can_be_learnt_without_the_predictor(calm):
     kept = fit_bags([calm], keep_predictor=True)
     learnt = kept.learnt
-    assert 'kept as the nominal loop has taught it' in kept.text
+    assert 'pre-trained on the nominal loop, unchanged' in kept.text
     assert 'skill,' not in kept.text
     assert 'skill' not in kept.origin['cross_validation']
     law = Controller(kept.parameters).law
