@@ -549,9 +549,8 @@ def update_page(page: Path, results: Sequence[Outcome]) -> None:
 
 
 def _short(reason: str) -> str:
-    return '; '.join(
-        part.split(':')[0] for part in reason.split('; ') if not part.startswith('stop commanding ')
-    )
+    parts = [part for part in reason.split('; ') if not part.startswith('stop commanding ')]
+    return '; '.join(part.split(':')[0] for part in parts)
 
 
 def _length(metres: float) -> str:
