@@ -58,7 +58,7 @@ def add_info_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParse
     """Add ``info`` to the commands of ``bag``."""
     parser = commands.add_parser(
         'info',
-        help='files, time, topics, settings of a bag',
+        help='files, time, topics, parameters of a bag',
         description='Prints the contents of a bag. Exit code 0, or 1 when nothing can be read.',
     )
     parser.add_argument('bag', type=Path, help='an MCAP file, or the folder of a bag')
@@ -309,7 +309,7 @@ def add_replay_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPar
         help='compute a recorded run again',
         description='Gives the recorded odometry and reference to the controller of today, '
         'offline and as fast as it goes, in the order in which the recorded controller took them. '
-        'With other settings, or with another method, it computes what would have been '
+        'With other parameters, or with another method, it computes what would have been '
         'commanded; the robot does not answer to that.',
     )
     parser.add_argument('bag', type=Path, metavar='BAG', help='folder of the bag, or its file')
@@ -515,9 +515,9 @@ def add_train_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPars
         'train',
         help='learn a model file that the controller starts from',
         description='Learns the weights of the predictor and the first fuzzy coefficients from '
-        "one or more bags that were recorded with this package's controller, and tells by "
-        'cross-validation what they are worth on runs that they were not learnt from. The '
-        'controller loads the file by its parameter model. While the bags are recorded, '
+        "one or more bags that were recorded with this package's controller, and reports their "
+        'cross-validated skill on held-out runs. The controller loads the file by its parameter '
+        'model. While the bags are recorded, '
         "the controller's predictive.dither should be a few rad/s².",
     )
     parser.add_argument('bags', nargs='+', type=Path, metavar='BAG', help='folder of a bag')

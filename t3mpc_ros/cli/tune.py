@@ -30,7 +30,7 @@ def add_parser(
 ) -> None:
     """Add the subcommand ``tune``."""
     parser = commands.add_parser(
-        'tune', help='search the settings of every method, with equally many evaluations'
+        'tune', help='tune the parameters of every method, with equally many evaluations'
     )
     parser.add_argument('methods', nargs='*', metavar='METHOD', help='by name (default all)')
     parser.add_argument('--drive', choices=DRIVES, help='(default both)')

@@ -55,7 +55,7 @@ def _as_the_nodes_close_it(scenario):
 
 @pytest.mark.parametrize('noise', [0.0, 0.04])
 def test_the_offline_loop_is_the_loop_of_the_nodes(noise):
-    """What the lab reports of the full controller is what the node does, jump for jump."""
+    """The evaluation of the full controller equals the behaviour of the node, jump for jump."""
     scenario = Scenario('velocity', noise, 'nominal', 2, 30.0)
     record = run(scenario, _spec(**{'speed_filter.noise_variance': noise}))
     assert np.abs(np.diff(record.reference, axis=0)).max() > 2.0  # there is a real jump in it

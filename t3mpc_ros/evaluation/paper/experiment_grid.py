@@ -206,8 +206,8 @@ def needed_experiments(setup: ExperimentSetup, grid: ExperimentGrid) -> tuple[Ex
 
     Every baseline and every stage of the controller in the nominal case at every noise; the stages
     in every other case at ``perturbed_noises``; the controller with one part left out in the
-    cases that part is for, at ``missing_noises``; baselines with preview in ``rival_cases`` at
-    ``rival_noises``.
+    cases that part is for, at ``missing_noises``; baselines with preview in ``baseline_cases``
+    at ``baseline_noises``.
 
     Raises
     ------

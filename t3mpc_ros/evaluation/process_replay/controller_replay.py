@@ -106,11 +106,11 @@ def make_controllers(
             controller.law.set_weights(life.model)
         controllers.append(controller)
     if controllers:
-        _compile_march(controllers[0].parameters)
+        _compile_batch_kernels(controllers[0].parameters)
     return controllers
 
 
-def _compile_march(parameters: ControllerParameters) -> None:
+def _compile_batch_kernels(parameters: ControllerParameters) -> None:
     """Compile the batch kernels too, with a robot at standstill."""
     count = 20
     stamps = np.arange(1, count + 1) * round(NANOSECONDS / parameters.rate)
