@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from t3mpc_ros.bag.bag_info import BagInfo, read_bag_info
 from t3mpc_ros.bag.recovery.recover_bag import RecoveryOutputError, default_output, recover_bag
 from t3mpc_ros.bag.recovery.result import Damage, FileResult, RecoveryResult
-from t3mpc_ros.cli.command import run_command
+from t3mpc_ros.cli.command import ArgumentParser, run_command
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.parameters.command_line import parse_assignments
 
@@ -534,7 +534,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _bag_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog='t3mpc bag', description='Bags without a ROS graph.')
+    parser: argparse.ArgumentParser = ArgumentParser(
+        prog='t3mpc bag', description='Bags without a ROS graph.'
+    )
     commands = parser.add_subparsers(dest='command', required=True)
     add_info_parser(commands)
     add_recover_parser(commands, time.monotonic)

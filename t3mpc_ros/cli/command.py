@@ -1,10 +1,25 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Runs a subcommand and converts errors into exit codes."""
+"""Parser of the program and its subcommands; runs one and converts errors into exit codes."""
 
 import argparse
 from collections.abc import Sequence
 import sys
+from typing import Any
+
+import t3mpc_ros
+
+
+class ArgumentParser(argparse.ArgumentParser):
+    """A parser with ``--version``, which its subcommands have, too."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        if self.add_help:  # a subcommand without help leaves its arguments to another parser
+            version = f't3mpc_ros {t3mpc_ros.__version__}'
+            self.add_argument(
+                '--version', action='version', version=version, help='show the version and exit'
+            )
 
 
 def run_command(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> int:

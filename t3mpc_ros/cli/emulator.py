@@ -10,6 +10,7 @@ import os
 from pathlib import Path
 import sys
 
+from t3mpc_ros.cli.command import ArgumentParser
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters, StopTimeMonitor
 from t3mpc_ros.emulator.fault_injection import FAULT_KINDS, Fault, FaultError, parse_fault
 from t3mpc_ros.emulator.pty_port import PtyPort, PtyPortError, serve
@@ -91,7 +92,7 @@ def _parser() -> argparse.ArgumentParser:
         f'  {kind.name:<16} {kind.text}' + ('' if math.isnan(kind.value) else f' ({kind.value:g})')
         for kind in FAULT_KINDS
     )
-    parser = argparse.ArgumentParser(
+    parser: argparse.ArgumentParser = ArgumentParser(
         prog='t3mpc emulator',
         description='Emulated dongle and robot board behind a serial port, for radio_bridge.',
         epilog=f'faults, with the default value in parentheses:\n{faults}',

@@ -13,8 +13,7 @@ import time
 from typing import TYPE_CHECKING
 import webbrowser
 
-import t3mpc_ros
-from t3mpc_ros.cli.command import run_command
+from t3mpc_ros.cli.command import ArgumentParser, run_command
 from t3mpc_ros.cli.faults import add_outcomes_parser
 from t3mpc_ros.cli.paper import add_parser as add_paper
 from t3mpc_ros.cli.train import add_parser as add_train
@@ -119,11 +118,8 @@ def _method_definitions() -> 'Sequence[MethodDefinition]':
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser: argparse.ArgumentParser = ArgumentParser(
         prog='t3mpc', description='Everything of t3mpc_ros that needs no ROS graph.'
-    )
-    parser.add_argument(
-        '--version', action='version', version=f't3mpc_ros {t3mpc_ros.__version__}'
     )
     commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
 

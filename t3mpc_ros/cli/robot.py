@@ -11,6 +11,7 @@ import select
 import sys
 from typing import TypeVar
 
+from t3mpc_ros.cli.command import ArgumentParser
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, parse_assignments
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
@@ -200,7 +201,7 @@ def _revolutions(text: str) -> float:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser: argparse.ArgumentParser = ArgumentParser(
         prog='t3mpc robot',
         description='Key, link and wheels of the real robot, on the bench.',
         epilog='exit code: 0 good, 1 poor result, 2 failed, 130 interrupted',

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Registry of the nodes: module and parameter class by executable name, parameter tables.
+"""Registry of the nodes: module, parameter class and interface by executable name; docs tables.
 
 Node modules are imported on request only: an entry point installs its signal handlers first, and
 one node does not load the code of the others.
@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 import sys
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from t3mpc_ros.parameters.table import Parameters
@@ -27,6 +27,79 @@ _NODES = {
 
 NODES = tuple(_NODES)
 """Names of the nodes, which are those of their executables."""
+
+
+class NodeInterface(NamedTuple):
+    """What a node is for, its topics and its services; ``*`` stands for several names."""
+
+    summary: str
+    subscribes: tuple[str, ...] = ()
+    publishes: tuple[str, ...] = ()
+    services: tuple[str, ...] = ()
+
+
+_ROBOT_TOPICS = ('odom', 'joint_states', 'imu/data_raw', 'range/*', 'battery_state', '/tf')
+_ROBOT_SERVICES = ('reset_odometry', 'e_stop')
+
+INTERFACES = {
+    'reference_generator': NodeInterface(
+        'Publishes the chaotic reference.',
+        publishes=('reference', 'reference/path', 'reference/signals', '/diagnostics'),
+        services=('~/reseed', '~/pause'),
+    ),
+    'controller': NodeInterface(
+        'Tracks the reference with the odometry of a robot and publishes its velocity commands.',
+        subscribes=('reference', 'odom'),
+        publishes=(
+            'cmd_vel',
+            '~/error/*',
+            '~/estimate/*',
+            '~/skill/*',
+            '~/terms/*',
+            '~/lyapunov/*',
+            '~/journal',
+            '~/parameters',
+            '~/initial_inputs/*',
+            '/diagnostics',
+        ),
+        services=('~/enable', '~/reset', '~/save_model'),
+    ),
+    'sim_robot': NodeInterface(
+        'Simulates the robot: executes velocity commands, publishes odometry and sensors.',
+        subscribes=('cmd_vel',),
+        publishes=(*_ROBOT_TOPICS, 'ground_truth/odom', '/clock', '/diagnostics'),
+        services=(*_ROBOT_SERVICES, '~/set_pose', '~/step'),
+    ),
+    'radio_bridge': NodeInterface(
+        'Connects the real robot: sends velocity commands, publishes odometry and sensors.',
+        subscribes=('cmd_vel',),
+        publishes=(*_ROBOT_TOPICS, '/diagnostics'),
+        services=_ROBOT_SERVICES,
+    ),
+    'recorder': NodeInterface(
+        'Records topics into an MCAP bag that rosbag2 reads.',
+        subscribes=('*', '/diagnostics'),
+        publishes=('/diagnostics',),
+        services=('~/split_bagfile', '~/snapshot'),
+    ),
+    'player': NodeInterface(
+        'Publishes the messages of bags at the recorded times; storage.uris names the bags.',
+        publishes=('*', '/clock', '/diagnostics'),
+        services=(
+            '~/pause',
+            '~/resume',
+            '~/toggle_paused',
+            '~/seek',
+            '~/play_next',
+            '~/set_rate',
+        ),
+    ),
+    'composed': NodeInterface(
+        'Runs the nodes that its parameter nodes lists in one process.',
+        publishes=('/diagnostics',),
+    ),
+}
+"""Interface of each node, for ``--help``."""
 
 MARK = '<!-- generated from here on: python -m t3mpc_ros.nodes.registry docs/nodes.md -->'
 """First line of the generated part of ``docs/nodes.md``."""

@@ -9,12 +9,12 @@ functions.
 
 from collections.abc import Sequence
 import os
-from pathlib import Path
 import signal
 import sys
 from types import FrameType
 from typing import TYPE_CHECKING
 
+from t3mpc_ros.nodes.arguments import information, parameter_file_problem, unknown_arguments
 from t3mpc_ros.nodes.registry import node_module
 
 if TYPE_CHECKING:
@@ -89,10 +89,15 @@ def _main(name: str) -> int:
 def run(name: str, request: StopRequest, argv: Sequence[str]) -> int:
     """Spin the nodes of an executable until a stop request; return the exit code of the process.
 
-    0 after SIGINT or SIGTERM, with the robot stopped, or after a node has requested the exit; 2
-    for an unusable parameter, parameter file or command line, with one line on standard error
-    that names it and the reason.
+    0 after SIGINT or SIGTERM, with the robot stopped, after a node has requested the exit, and
+    for ``--help`` and ``--version``; 2 for an unusable parameter, parameter file or command line,
+    with one line on standard error that names it and the reason.
     """
+    if text := information(name, argv):
+        print(text)
+        return 0
+    if problem := unknown_arguments(name, argv):
+        return _usage_error(name, problem)
     import rclpy
     from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
     from rclpy.executors import ExternalShutdownException
@@ -131,27 +136,6 @@ def run(name: str, request: StopRequest, argv: Sequence[str]) -> int:
             node.destroy_node()
         rclpy.try_shutdown()
     return max((node.exit_code for node in nodes), default=0)
-
-
-def parameter_file_problem(argv: Sequence[str]) -> str:
-    """Return why a ``--params-file`` of the command line is unusable; empty if usable."""
-    import yaml
-
-    for flag, name in zip(argv, list(argv)[1:], strict=False):
-        if flag != '--params-file':
-            continue
-        try:
-            content = yaml.safe_load(Path(name).read_text(encoding='utf-8'))
-        except OSError as error:
-            return f'cannot read the parameter file {name}: {error.strerror}'
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
-            place = ' '.join(str(error).split())
-            return f'the parameter file {name} is not valid YAML: {place}'
-        if not isinstance(content, dict):
-            return (
-                f'the parameter file {name} must hold "<node>: ros__parameters: ...": got nothing'
-            )
-    return ''
 
 
 def _spin(nodes: Sequence['BaseNode'], request: StopRequest) -> None:

@@ -1,0 +1,123 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Command line of the node executables: ``--help``, ``--version``, rejection of anything else.
+
+rcl parses what stands between ``--ros-args`` and ``--`` and ignores the rest.
+"""
+
+from collections.abc import Sequence
+import difflib
+from pathlib import Path
+import textwrap
+
+import t3mpc_ros
+from t3mpc_ros.nodes.registry import INTERFACES, parameter_class
+
+ROS_ARGUMENTS = (
+    ('-p NAME:=VALUE', 'set a parameter'),
+    ('--params-file FILE', 'set the parameters of a YAML file'),
+    ('-r OLD:=NEW', 'rename a topic or service; -r __ns:=/robot_1 sets the namespace'),
+    ('--log-level LEVEL', 'debug, info, warn, error or fatal'),
+)
+"""The usual arguments after ``--ros-args``."""
+
+_WIDTH = 99
+
+
+def user_arguments(argv: Sequence[str]) -> list[str]:
+    """Return the arguments that are not ROS arguments, without the name of the executable."""
+    words: list[str] = []
+    ros = False
+    for word in argv[1:]:
+        if word == '--ros-args':
+            ros = True
+        elif ros and word == '--':
+            ros = False
+        elif not ros:
+            words.append(word)
+    return words
+
+
+def information(node: str, argv: Sequence[str]) -> str:
+    """Return the text that ``--help`` or ``--version`` asks for; empty without them."""
+    words = user_arguments(argv)
+    if {'-h', '--help'} & set(words):
+        return help_text(node)
+    return f't3mpc_ros {t3mpc_ros.__version__}' if '--version' in words else ''
+
+
+def unknown_arguments(node: str, argv: Sequence[str]) -> str:
+    """Return why the command line is rejected; empty if it holds ROS arguments only."""
+    words = user_arguments(argv)
+    if not words:
+        return ''
+    plural = 's' if len(words) > 1 else ''
+    return (
+        f'unknown argument{plural} {" ".join(words)}: parameters are set with '
+        f'--ros-args -p NAME:=VALUE{_hint(node, words[0])} (--help lists them)'
+    )
+
+
+def _hint(node: str, word: str) -> str:
+    """Return the parameter that an argument such as ``--gain`` may mean."""
+    wanted = word.lstrip('-').partition('=')[0].rstrip(':').replace('-', '_')
+    names = [spec.name for spec in parameter_class(node).specs()]
+    by_leaf = {name.rpartition('.')[2]: name for name in reversed(names)}
+    near = difflib.get_close_matches(wanted, [*names, *by_leaf], n=1)
+    return f', for example -p {by_leaf.get(near[0], near[0])}:=...' if near else ''
+
+
+def help_text(node: str) -> str:
+    """Return usage, topics, services and parameters of a node."""
+    interface = INTERFACES[node]
+    lines = [
+        f'usage: ros2 run t3mpc_ros {node} [--help] [--version] [--ros-args ARGUMENT ...]',
+        '',
+        interface.summary,
+        '',
+    ]
+    for title in ('subscribes', 'publishes', 'services'):
+        names: tuple[str, ...] = getattr(interface, title)
+        lines += _wrapped(f'{title:<12}', ', '.join(names) or 'none')
+    lines += ['', 'arguments after --ros-args:']
+    lines += [f'  {argument:<20}{text}' for argument, text in ROS_ARGUMENTS]
+    lines += ['', 'parameters, with default and range (* can be set while the node runs):']
+    for spec in parameter_class(node).specs():
+        default = ', '.join(map(str, spec.default)) if spec.many else spec.default  # type: ignore[arg-type]
+        unit = f' {spec.unit}' if spec.unit else ''
+        facts = f'{default}{unit}' if default != '' else '(empty)'
+        bounds = f', {spec.bounds()}' if spec.bounds() else ''
+        mark = '*' if spec.dynamic else ' '
+        lines += [
+            *_wrapped(f'{mark} {spec.name} = ', facts + bounds),
+            *_wrapped('      ', spec.text),
+        ]
+    return '\n'.join(lines)
+
+
+def _wrapped(head: str, text: str) -> list[str]:
+    indent = ' ' * (12 if len(head) == 12 else 6)
+    return textwrap.wrap(
+        text, _WIDTH, initial_indent=head, subsequent_indent=indent, break_long_words=False
+    )
+
+
+def parameter_file_problem(argv: Sequence[str]) -> str:
+    """Return why a ``--params-file`` of the command line is unusable; empty if usable."""
+    import yaml
+
+    for flag, name in zip(argv, list(argv)[1:], strict=False):
+        if flag != '--params-file':
+            continue
+        try:
+            content = yaml.safe_load(Path(name).read_text(encoding='utf-8'))
+        except OSError as error:
+            return f'cannot read the parameter file {name}: {error.strerror}'
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            place = ' '.join(str(error).split())
+            return f'the parameter file {name} is not valid YAML: {place}'
+        if not isinstance(content, dict):
+            return (
+                f'the parameter file {name} must hold "<node>: ros__parameters: ...": got nothing'
+            )
+    return ''
