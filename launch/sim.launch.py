@@ -19,6 +19,8 @@ def generate_launch_description():
     share = Path(get_package_share_directory('t3mpc_ros'))
     namespace = LaunchConfiguration('namespace')
     use_sim_time = {'use_sim_time': LaunchConfiguration('use_sim_time')}
+    # The simulated robot is the source of the simulated time.
+    clock = {'publish_clock': LaunchConfiguration('use_sim_time')}
     nodes = [
         Node(
             package='t3mpc_ros',
@@ -26,7 +28,10 @@ def generate_launch_description():
             name=name,
             namespace=namespace,
             output='screen',
-            parameters=[str(share / 'config' / f'{name}.yaml'), use_sim_time],
+            parameters=[
+                str(share / 'config' / f'{name}.yaml'),
+                use_sim_time | (clock if name == 'sim_robot' else {}),
+            ],
         )
         for name in NODES
     ]
@@ -44,7 +49,11 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 'namespace', default_value='', description='namespace of all nodes'
             ),
-            DeclareLaunchArgument('use_sim_time', default_value='false', description='use /clock'),
+            DeclareLaunchArgument(
+                'use_sim_time',
+                default_value='false',
+                description='simulated time on /clock, from the simulated robot',
+            ),
             DeclareLaunchArgument('record', default_value='true', description='record a bag'),
             *nodes,
             recorder,

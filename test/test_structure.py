@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 import t3mpc_ros
+from t3mpc_ros.missing_library import REQUIREMENTS
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / 't3mpc_ros'
@@ -24,6 +25,7 @@ PACKAGES = {
     'parameters': set(),
     'kernels': set(),
     'stop_signal': set(),
+    'missing_library': set(),
     'geometry': {'parameters', 'kernels'},
     'chaos': BASE,
     'fuzzy': BASE,
@@ -36,9 +38,31 @@ PACKAGES = {
     'emulator': BASE | {'robot', 'simulation', 'radio'},
     'evaluation': BASE | {'chaos', 'fuzzy', 'mpc', 'robot', 'bag', 'control', 'simulation'},
     'nodes': BASE
-    | {'chaos', 'fuzzy', 'mpc', 'robot', 'bag', 'control', 'simulation', 'radio', 'stop_signal'},
+    | {
+        'chaos',
+        'fuzzy',
+        'mpc',
+        'robot',
+        'bag',
+        'control',
+        'simulation',
+        'radio',
+        'stop_signal',
+        'missing_library',
+    },
     'cli': BASE
-    | {'chaos', 'fuzzy', 'mpc', 'robot', 'bag', 'control', 'simulation', 'radio', 'stop_signal'}
+    | {
+        'chaos',
+        'fuzzy',
+        'mpc',
+        'robot',
+        'bag',
+        'control',
+        'simulation',
+        'radio',
+        'stop_signal',
+        'missing_library',
+    }
     | {'emulator', 'evaluation'},
 }
 # Libraries that each package may import.
@@ -210,8 +234,30 @@ def test_package_xml_names_every_ros_package_that_is_imported():
     for path in [*SOURCES, *(ROOT / 'launch').glob('*.py')]:
         for name in _imports(path):
             top = name.split('.')[0]
-            if ROS.match(top) and top != 'tf2_ros':  # optional: used where it is installed
-                assert top in declared, f'{path.name} imports {top}, package.xml does not name it'
+            if ROS.match(top):
+                package = {'tf2_ros': 'tf2_ros_py'}.get(top, top)
+                assert package in declared, f'{path.name} imports {top}, absent in package.xml'
+
+
+def test_package_xml_names_the_rosdep_keys_of_the_libraries():
+    """Without them ``rosdep install`` left every node without its libraries."""
+    text = (ROOT / 'package.xml').read_text()
+    keys = {
+        'numpy': 'python3-numpy',
+        'yaml': 'python3-yaml',
+        'serial': 'python3-serial',
+        'matplotlib': 'python3-matplotlib',
+        'mcap': 'mcap-ros2-support',
+        'rosbags': 'python3-rosbags-pip',
+    }
+    for key in keys.values():
+        assert f'<exec_depend>{key}</exec_depend>' in text
+    # Those without a key that fits are installed by the line of the README for apt ROS 2.
+    readme = (ROOT / 'README.md').read_text()
+    (line,) = re.findall(r'^.*pip install .*numba.*$', readme, re.MULTILINE)
+    for library in {'numba', 'cma'}:
+        assert REQUIREMENTS[library] in line
+    assert set(REQUIREMENTS) - set(keys) == {'numba', 'cma', 'lz4', 'zstandard', 'casadi'}
 
 
 def test_no_global_random_numbers_and_no_clock_in_libraries():

@@ -19,6 +19,7 @@ from t3mpc_ros.cli.paper import add_parser as add_paper
 from t3mpc_ros.cli.train import add_parser as add_train
 from t3mpc_ros.cli.tune import add_parser as add_tune
 from t3mpc_ros.cli.twin import add_parser as add_twin
+from t3mpc_ros.missing_library import remedy
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int
 
 if TYPE_CHECKING:
@@ -38,6 +39,16 @@ PROGRAMS = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Return the exit code: 0 done, 1 failed with a reason, 2 wrong command line."""
     words = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        return _run(words)
+    except ModuleNotFoundError as error:
+        if not (problem := remedy(error)):
+            raise
+        print(f'error: {problem}', file=sys.stderr)
+        return 1
+
+
+def _run(words: Sequence[str]) -> int:
     if words and words[0] in PROGRAMS:
         # Imported only when it is used: `t3mpc --help` stays fast.
         code: int = import_module(f't3mpc_ros.cli.{words[0]}').main(words[1:])

@@ -3,6 +3,7 @@
 """Base class of the nodes: ROS parameters from a parameter class, diagnostics, shutdown hook."""
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 import difflib
 import sys
 from typing import Any, Generic, TypeVar
@@ -215,7 +216,12 @@ def _names_of_nodes() -> frozenset[str]:
     """Return the parameter names of all nodes: one file or command line may serve several."""
     from t3mpc_ros.nodes.registry import NODES, parameter_class
 
-    return frozenset(spec.name for node in NODES for spec in parameter_class(node).specs())
+    names: set[str] = set()
+    for node in NODES:
+        # Only recorder and player need the bag libraries.
+        with suppress(ModuleNotFoundError):
+            names |= {spec.name for spec in parameter_class(node).specs()}
+    return frozenset(names)
 
 
 def _ros_value(spec: ParameterSpec, value: object) -> object:

@@ -14,6 +14,7 @@ import sys
 from types import FrameType
 from typing import TYPE_CHECKING
 
+from t3mpc_ros.missing_library import remedy
 from t3mpc_ros.nodes.arguments import information, parameter_file_problem, unknown_arguments
 from t3mpc_ros.nodes.registry import node_module
 
@@ -83,7 +84,13 @@ class StopRequest:
 def _main(name: str) -> int:
     request = StopRequest()
     request.install()
-    return run(name, request, sys.argv)
+    try:
+        return run(name, request, sys.argv)
+    except ModuleNotFoundError as error:
+        if not (problem := remedy(error)):
+            raise
+        print(f'{name}: {problem}', file=sys.stderr, flush=True)
+        return 1
 
 
 def run(name: str, request: StopRequest, argv: Sequence[str]) -> int:

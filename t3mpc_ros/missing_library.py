@@ -1,0 +1,31 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""What to install when a library is missing."""
+
+REQUIREMENTS = {
+    'numpy': 'numpy>=1.26',
+    'numba': 'numba>=0.60',
+    'mcap': 'mcap>=1.5',
+    'zstandard': 'zstandard>=0.22',
+    'lz4': 'lz4>=4.3',
+    'rosbags': 'rosbags>=0.11',
+    'yaml': 'PyYAML>=6.0',
+    'serial': 'pyserial>=3.5',
+    'matplotlib': 'matplotlib>=3.8',
+    'cma': 'cma>=4.0',
+    'casadi': 'casadi>=3.6',
+}
+"""Requirement of each imported library, as in the requirements files."""
+
+
+def remedy(error: ModuleNotFoundError) -> str:
+    """Return one line that names a missing library and the remedy; empty for other modules."""
+    library = (error.name or '').partition('.')[0]
+    if requirement := REQUIREMENTS.get(library):
+        return f'the library {library} is missing: python3 -m pip install "{requirement}"'
+    if library in ('rclpy', 'rcl_interfaces') or library.endswith('_msgs'):
+        return (
+            f'the ROS 2 package {library} is missing: source the setup file of ROS 2 Jazzy, or '
+            'start through scripts/run'
+        )
+    return ''

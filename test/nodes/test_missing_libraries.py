@@ -1,0 +1,80 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Executables without the libraries that rosdep does not install."""
+
+from pathlib import Path
+import re
+import subprocess
+
+import pytest
+
+from t3mpc_ros.cli.process_group import executable
+from t3mpc_ros.missing_library import REQUIREMENTS, remedy
+
+pytestmark = pytest.mark.ros
+
+ROOT = Path(__file__).resolve().parents[2]
+BAG_LIBRARIES = ('mcap', 'rosbags', 'zstandard', 'lz4', 'matplotlib', 'cma', 'casadi')
+
+
+@pytest.fixture
+def without(monkeypatch, tmp_path):
+    """Return a function that removes libraries from processes started afterwards."""
+
+    def remove(*libraries):
+        for name in libraries:
+            text = f"raise ModuleNotFoundError('No module named {name}', name='{name}')\n"
+            (tmp_path / f'{name}.py').write_text(text)
+        monkeypatch.setenv('PYTHONPATH', str(tmp_path))
+
+    return remove
+
+
+@pytest.mark.parametrize(
+    'name', ['reference_generator', 'controller', 'sim_robot', 'radio_bridge']
+)
+def test_nodes_without_bags_need_no_bag_library(name, without, graph, request):
+    """The parameters of other nodes, which a file may hold, were looked up in their modules."""
+    without(*BAG_LIBRARIES)
+    processes = request.getfixturevalue('processes')  # reads the environment
+    processes.start(name, '--ros-args', '-p', 'publish_clock:=false')
+    processes.wait_ready(name)
+    assert processes.stop(name) == 0
+    assert 'Traceback' not in processes.log(name).read_text()
+
+
+@pytest.mark.parametrize(
+    'library, name, arguments',
+    [
+        ('rosbags', 'player', []),
+        ('mcap', 'recorder', []),
+        ('mcap', 'composed', []),
+        ('numba', 'controller', []),
+        ('serial', 'radio_bridge', []),
+        ('rclpy', 'sim_robot', []),
+        ('mcap', 't3mpc', ['bag', 'info', 'bag']),
+        ('matplotlib', 't3mpc', ['paper', '--quick', '--output', 'out']),
+    ],
+)
+def test_a_missing_library_is_one_line_with_its_remedy(
+    library, name, arguments, without, graph, tmp_path
+):
+    """It was a traceback."""
+    without(library)
+    done = subprocess.run(
+        [executable(name), *arguments], capture_output=True, text=True, timeout=60, cwd=tmp_path
+    )
+    assert done.returncode == 1
+    lines = [line for line in done.stderr.splitlines() if not line.startswith('[')]
+    assert len(lines) == 1, done.stderr
+    assert f' {library} is missing: ' in lines[0]
+
+
+def test_remedies_are_the_requirements_of_the_package():
+    files = [*ROOT.glob('requirements*.txt')]
+    wanted = {line.strip() for file in files for line in file.read_text().splitlines()}
+    assert set(REQUIREMENTS.values()) <= wanted
+    listed = re.findall(r"^        '([\w-]+)',$", (ROOT / 'setup.py').read_text(), re.MULTILINE)
+    names = {re.split('[<>=]', requirement)[0] for requirement in REQUIREMENTS.values()}
+    assert set(listed) - {'setuptools'} <= names
+    assert remedy(ModuleNotFoundError(name='t3mpc_ros.no_such_module')) == ''
