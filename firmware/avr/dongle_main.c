@@ -14,6 +14,10 @@
 
 static struct t3_dongle dongle;
 
+// Bytes from USB per pass. A full line brings more while these are processed: without a bound neither
+// the radio nor the watchdog would get their turn.
+#define SERIAL_SHARE 32u
+
 // A chip that had lost its supply wakes slowly; what is to be sent meanwhile waits here.
 static bool waking;
 static uint32_t waking_us;
@@ -107,7 +111,7 @@ int main(void)
     for (;;) {
         wdt_reset();
         uint8_t byte;
-        while (serial_take(&byte))
+        for (uint8_t i = 0; i < SERIAL_SHARE && serial_take(&byte); i++)
             t3_dongle_byte(&dongle, byte);
         for (uint8_t count = serial_lost(); count; count--)
             t3_dongle_overrun(&dongle);

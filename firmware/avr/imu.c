@@ -11,6 +11,8 @@
 #define ADDRESS 0x68u
 #define FIRST_REGISTER 0x3Bu
 #define SAMPLE_SIZE 14u
+#define POWER_REGISTER 0x6Bu
+#define AWAKE 0x01u  // clocked by the gyro's PLL
 
 #define PERIOD_US 2000u
 #define PATIENCE_US 3000u  // a transfer takes 0.4 ms
@@ -28,7 +30,7 @@
 #define GO (_BV(TWINT) | _BV(TWEN) | _BV(TWIE))
 
 static const uint8_t SETTINGS[][2] = {
-    {0x6B, 0x01},  // awake, clocked by the gyro's PLL
+    {POWER_REGISTER, AWAKE},
     {0x19, 0x04},  // 200 Hz
     {0x1A, 0x03},  // 44 Hz low pass
     {0x1B, 0x08},  // +-500 deg/s
@@ -39,12 +41,13 @@ static const uint8_t SETTINGS[][2] = {
 static volatile enum { IDLE, BUSY, DONE, FAILED } transfer;
 static volatile uint8_t at;  // in the transfer
 static uint8_t reg, value;   // of it
-static bool reading;
+static uint8_t to_read;      // bytes; 0: a write
 static volatile uint8_t bytes[SAMPLE_SIZE];
 
 static uint8_t settled;  // how many of SETTINGS are written
+static bool sampled;     // a sample waits for its check
 static bool answers;
-static struct t3_imu newest;
+static struct t3_imu newest, unchecked;
 static uint32_t begun_us, wait_us;
 
 static void stop(uint8_t how)
@@ -62,7 +65,7 @@ static void send(uint8_t byte)
 static void receive(void)
 {
     // The last byte is not acknowledged.
-    TWCR = at + 1u < SAMPLE_SIZE ? GO | _BV(TWEA) : GO;
+    TWCR = at + 1u < to_read ? GO | _BV(TWEA) : GO;
 }
 
 ISR(TWI_vect)
@@ -75,7 +78,7 @@ ISR(TWI_vect)
         send(reg);
         break;
     case BYTE_HEARD:
-        if (reading)
+        if (to_read)
             TWCR = GO | _BV(TWSTA);
         else if (at++ == 0)
             send(value);
@@ -104,9 +107,14 @@ ISR(TWI_vect)
 
 static void begin(uint32_t now_us)
 {
-    reading = settled == SETTINGS_COUNT;
-    reg = reading ? FIRST_REGISTER : SETTINGS[settled][0];
-    value = reading ? 0 : SETTINGS[settled][1];
+    if (settled < SETTINGS_COUNT) {
+        to_read = 0;
+        reg = SETTINGS[settled][0];
+        value = SETTINGS[settled][1];
+    } else {
+        to_read = sampled ? 1 : SAMPLE_SIZE;
+        reg = sampled ? POWER_REGISTER : FIRST_REGISTER;
+    }
     at = 0;
     begun_us = now_us;
     transfer = BUSY;
@@ -122,8 +130,7 @@ static void take_sample(void)
 {
     const struct t3_imu sample = {number(0), number(2), number(4), number(6),
                                   number(8), number(10), number(12)};
-    newest = sample;
-    answers = true;
+    unchecked = sample;
 }
 
 // A sensor that lost count in the middle of a byte holds the data line until it gets its clocks.
@@ -143,8 +150,29 @@ static void give_up(void)
     free_the_bus();
     transfer = IDLE;
     answers = false;
+    sampled = false;
     settled = 0;  // a sensor that responds again has lost its configuration
     wait_us = RETRY_US;
+}
+
+static void finish(void)
+{
+    transfer = IDLE;
+    wait_us = PERIOD_US;
+    if (!to_read) {
+        settled++;
+    } else if (!sampled) {
+        take_sample();
+        sampled = true;
+        wait_us = 0;
+    } else if (bytes[0] != AWAKE) {
+        // It has reset itself: it sleeps, and the sample is of zeros.
+        give_up();
+    } else {
+        sampled = false;
+        newest = unchecked;
+        answers = true;
+    }
 }
 
 void imu_start(void)
@@ -170,12 +198,7 @@ void imu_work(uint32_t now_us)
         give_up();
         return;
     case DONE:
-        transfer = IDLE;
-        wait_us = PERIOD_US;
-        if (reading)
-            take_sample();
-        else
-            settled++;
+        finish();
     }
 }
 

@@ -208,9 +208,14 @@ uint8_t nrf24_take_flags(void)
     return raised;
 }
 
+bool nrf24_waits(void)
+{
+    return !(get(FIFO_STATUS) & RX_EMPTY);
+}
+
 uint8_t nrf24_read(uint8_t payload[T3_RADIO_LIMIT])
 {
-    if (get(FIFO_STATUS) & RX_EMPTY)
+    if (!nrf24_waits())
         return 0;
     const uint8_t width = ask(R_RX_PL_WID);
     if (!width || width > T3_RADIO_LIMIT) {

@@ -37,6 +37,9 @@ void nrf24_listen(void);
 // Return the raised flags and take them back.
 uint8_t nrf24_take_flags(void);
 
+// Return whether a payload waits in the RX FIFO.
+bool nrf24_waits(void);
+
 // Read the next payload; return its width, 0 if there is none. A width over 32 is what the chip
 // claims of a packet that was meant to break it: nothing of it is read, the FIFO is emptied.
 uint8_t nrf24_read(uint8_t payload[T3_RADIO_LIMIT]);

@@ -22,6 +22,9 @@
 
 // Silence after which the configuration of the chip is checked.
 #define RADIO_CHECK_US UINT32_C(500000)
+// Period at which the RX FIFO is checked. Full, with its flag clear, it raises no interrupt any more,
+// and the chip acknowledges nothing.
+#define FIFO_CHECK_US UINT32_C(5000)
 
 // The answer is sampled at once; then it waits for a quiet moment of the radio.
 #define SETTLE_US 0u
@@ -39,7 +42,7 @@
 static const struct t3_radio_settings radio = T3_RADIO_DEFAULTS;
 static volatile bool radio_interrupt;  // set by the interrupt of the radio
 static volatile uint32_t heard_us;
-static uint32_t checked_us;
+static uint32_t checked_us, fifo_checked_us;
 static bool waking;
 static uint8_t packet_size;  // of the last packet, and when it came
 static uint32_t packet_us;
@@ -226,10 +229,14 @@ static void load_answer(void)
 
 static void watch_radio(void)
 {
-    // The pin too: an edge that was missed must not silence the robot for ever.
-    if (radio_interrupt || !RADIO_IRQ_HIGH)
-        receive();
     const uint32_t now_us = stepping_time_us();
+    bool waits = radio_interrupt || !RADIO_IRQ_HIGH;  // the pin too: an edge may be missed
+    if (!waits && now_us - fifo_checked_us >= FIFO_CHECK_US) {
+        fifo_checked_us = now_us;
+        waits = nrf24_waits();
+    }
+    if (waits)
+        receive();
     const uint32_t since_us = now_us - checked_us;
     if (waking && since_us >= NRF24_WAKE_US) {
         waking = false;

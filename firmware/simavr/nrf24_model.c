@@ -256,3 +256,11 @@ bool nrf24_inject(struct nrf24 *radio, const uint8_t *data, uint8_t size, uint8_
     nrf24_flag(radio, RX_DR);
     return true;
 }
+
+void nrf24_deafen(struct nrf24 *radio, const uint8_t *data, uint8_t size)
+{
+    while (nrf24_inject(radio, data, size, size))
+        ;
+    radio->registers[STATUS] &= (uint8_t)~RX_DR;
+    update_irq(radio);
+}

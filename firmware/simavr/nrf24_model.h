@@ -72,6 +72,8 @@ void nrf24_enable(struct nrf24 *radio, bool ce, uint64_t now);
 uint8_t nrf24_swap(struct nrf24 *radio, uint8_t byte, uint64_t now);
 // Deliver a packet to the receiver, as from another transmitter.
 bool nrf24_inject(struct nrf24 *radio, const uint8_t *data, uint8_t size, uint8_t width);
+// Fill the RX FIFO with copies of a payload, and clear RX_DR.
+void nrf24_deafen(struct nrf24 *radio, const uint8_t *data, uint8_t size);
 
 // Advance the channel to `now`.
 void radio_channel_run(struct radio_channel *channel, uint64_t now);

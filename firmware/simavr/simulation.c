@@ -266,6 +266,11 @@ bool t3_sim_inject(struct simulation *sim, const uint8_t *data, uint8_t size, ui
     return nrf24_inject(&sim->boards[ROBOT].radio, data, size, width);
 }
 
+void t3_sim_deafen(struct simulation *sim, const uint8_t *data, uint8_t size)
+{
+    nrf24_deafen(&sim->boards[ROBOT].radio, data, size);
+}
+
 void t3_sim_answer(struct simulation *sim, const uint8_t *data, uint8_t size)
 {
     struct nrf24_fifo *waiting = &sim->boards[ROBOT].radio.tx;
@@ -353,6 +358,15 @@ void t3_sim_imu(struct simulation *sim, bool present, const int16_t *seven)
         imu->registers[0x3B + 2 * i] = (uint8_t)((uint16_t)seven[i] >> 8);
         imu->registers[0x3C + 2 * i] = (uint8_t)seven[i];
     }
+}
+
+void t3_sim_imu_reset(struct simulation *sim)
+{
+    static const uint8_t CONFIGURED[] = {0x19, 0x1A, 0x1B, 0x1C};
+    struct imu_model *imu = &sim->boards[ROBOT].imu;
+    for (size_t i = 0; i < sizeof CONFIGURED; i++)
+        imu->registers[CONFIGURED[i]] = 0;
+    imu->registers[0x6B] = 0x40;
 }
 
 uint8_t t3_sim_imu_register(const struct simulation *sim, uint8_t which)

@@ -31,6 +31,8 @@ void t3_sim_loss(struct simulation *sim, double down, double up);
 void t3_sim_jam(struct simulation *sim, bool jammed);
 void t3_sim_radio_power(struct simulation *sim, int board, bool on);
 bool t3_sim_inject(struct simulation *sim, const uint8_t *data, uint8_t size, uint8_t width);
+// Fill the RX FIFO of the robot's radio with copies of a payload while its RX_DR flag is clear.
+void t3_sim_deafen(struct simulation *sim, const uint8_t *data, uint8_t size);
 // Let this be what the robot's radio answers next, whatever its firmware has loaded.
 void t3_sim_answer(struct simulation *sim, const uint8_t *data, uint8_t size);
 // The last packet that the radio of the robot received; its width, 0 if there is none.
@@ -52,6 +54,8 @@ void t3_sim_eeprom(struct simulation *sim, uint16_t address, uint8_t *data, uint
 // The robot's surroundings.
 void t3_sim_press(struct simulation *sim, bool pressed);
 void t3_sim_imu(struct simulation *sim, bool present, const int16_t *seven);
+// The MPU6050 resets itself: it sleeps with the registers of its power-on.
+void t3_sim_imu_reset(struct simulation *sim);
 uint8_t t3_sim_imu_register(const struct simulation *sim, uint8_t which);
 void t3_sim_millivolts(struct simulation *sim, uint8_t channel, uint16_t millivolts);
 bool t3_sim_powered(const struct simulation *sim);

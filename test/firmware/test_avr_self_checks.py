@@ -1,0 +1,75 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Faults that the firmware has to find by itself, in simavr: no error bit reports them."""
+
+from collections.abc import Iterator
+
+import pytest
+from support.avr_boards import DONGLE, IMU, Boards, booted, build, missing_tools
+
+from t3mpc_ros.radio.protocol import codec
+from t3mpc_ros.radio.protocol.frames import Ping, Poll, Pong, StatusFlag
+from t3mpc_ros.radio.protocol.framing import encode_frame
+
+pytestmark = pytest.mark.skipif(bool(missing_tools()), reason=f'not installed: {missing_tools()}')
+
+LINE_RATE = 50_000
+"""Bytes per second."""
+TTL = 0.2
+"""s"""
+
+
+@pytest.fixture
+def boards() -> Iterator[Boards]:
+    yield from booted()
+
+
+def test_a_saturated_line_does_not_reset_the_dongle() -> None:
+    """It once read bytes until none waited: on a full line the watchdog ended that."""
+    build()
+    boards = Boards()
+    boards.start()
+    resets = boards.call('resets', DONGLE)
+    ping = encode_frame(codec.encode(Ping(1, b'ping')))
+    boards.write((ping * LINE_RATE)[:LINE_RATE])
+    boards.run(1.0)
+    assert boards.call('resets', DONGLE) == resets
+    boards.run(0.05)
+    answered = 0
+    while frames := boards.read():
+        answered += len(frames)
+    print(f'\n{answered} of {LINE_RATE // len(ping)} requests answered')
+    boards.write(b'\0')
+    assert isinstance(boards.ask(Ping(2, b'ping')), Pong)
+    assert boards.drive().session == boards.session
+    boards.close()
+
+
+def test_a_full_receiver_without_its_flag_is_read(boards: Boards) -> None:
+    """No interrupt comes any more and every packet is lost: once, until the power was cut."""
+    boards.start()
+    boards.drive()
+    stuck = codec.encode(Poll(0, 0, 0))
+    boards.call('deafen', stuck, len(stuck))
+    begun = boards.now_us
+    while boards.drive() is None:
+        assert boards.now_us - begun < 1e6 * TTL
+    print(f'\nanswers again after {(boards.now_us - begun) / 1000:.1f} ms')
+    assert boards.drive().seq == boards.seq
+
+
+def test_a_reset_of_the_imu_is_flagged_and_repaired(boards: Boards) -> None:
+    """A sensor that resets itself sleeps and answers zeros: once, for ever and without a flag."""
+    boards.start()
+    boards.drive()
+    boards.call('imu_reset')
+    begun, faults = boards.now_us, 0
+    while boards.now_us - begun < 100_000:
+        state = boards.drive()
+        faults += bool(state.status & StatusFlag.IMU_FAULT)
+        assert state.status & StatusFlag.IMU_FAULT or state.gyro_z == IMU[6]
+        boards.run(0.002)
+    assert faults
+    assert not state.status & StatusFlag.IMU_FAULT
+    registers = [boards.call('imu_register', at) for at in (0x6B, 0x19, 0x1A, 0x1B, 0x1C)]
+    assert registers == [0x01, 0x04, 0x03, 0x08, 0x00]
