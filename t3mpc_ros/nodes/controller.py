@@ -25,6 +25,7 @@ from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist
 from t3mpc_ros.nodes.common import conversions, graph_introspection, qos
 from t3mpc_ros.nodes.common.base_node import ERROR, OK, WARN, BaseNode, publish_and_wait_for_acked
+from t3mpc_ros.nodes.common.command_subscription import age_problem, message_age_ns
 from t3mpc_ros.parameters.table import group, parameter
 
 CONFIGURATION_ERRORS = (ModelError,)
@@ -114,6 +115,8 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self._last_odometry_ns: int | None = None
         self._steps = 0
         self._rejected_references = 0
+        self._rejected_odometry = 0
+        self._odometry_problem = ''
         self._logged_reason = self._controller.status.reason
         self._command_type = TwistStamped if self.parameters.enable_stamped_cmd_vel else Twist
         self._command_publisher = self.create_publisher(self._command_type, 'cmd_vel', qos.COMMAND)
@@ -162,7 +165,13 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             self._rejected_references += 1
         self._initial_reference.republish(message)
 
-    def _on_odometry(self, message: Odometry) -> None:
+    def _on_odometry(self, message: Odometry, info: dict[str, Any]) -> None:
+        # Without a step, the watchdog stops the robot and the journal has no row.
+        timeout = self.parameters.watchdog.odometry_timeout
+        self._odometry_problem = age_problem(message_age_ns(info), timeout)
+        if self._odometry_problem:
+            self._rejected_odometry += 1
+            return
         self._last_odometry_ns = self.steady_ns()
         measured = conversions.state_from_odometry(message)
         command, status = self._controller.step(measured)
@@ -269,7 +278,10 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             'skill_right': float(status.skill[0]),
             'skill_left': float(status.skill[1]),
             'references_rejected': self._rejected_references,
+            'odometry_rejected': self._rejected_odometry,
         }
+        if self._odometry_problem:
+            return ERROR, f'stopped: odom {self._odometry_problem}', values
         waiting = self._steps == 0
         stopped = f'stopped: {status.reason.value}'
         if not status.reason.moves and not waiting:

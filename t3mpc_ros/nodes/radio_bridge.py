@@ -16,11 +16,10 @@ import select
 import threading
 from typing import Any
 
-from geometry_msgs.msg import Twist, TwistStamped
-
-from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes.common import conversions, diagnostics, graph_introspection, qos
+from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist
+from t3mpc_ros.nodes.common import diagnostics, graph_introspection
 from t3mpc_ros.nodes.common.base_node import ERROR, OK, WARN, BaseNode
+from t3mpc_ros.nodes.common.command_subscription import CommandSubscription
 from t3mpc_ros.nodes.common.robot_publishers import (
     RobotDescription,
     RobotPublishers,
@@ -50,6 +49,9 @@ SHUTDOWN_TIMEOUT = 2.0
 
 MAX_WAIT = 0.5
 """Maximum time of one wait for the port, s."""
+
+MAX_WRITE_DELAY_NS = NANOSECONDS // 20
+"""Age at which a frame is discarded instead of written: the process was suspended."""
 
 
 @dataclass(frozen=True)
@@ -81,12 +83,15 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
         self._lock = threading.Lock()
         self._robot = RadioRobot(parameters, key)
         self._port: SerialPort | None = None
-        self._commands = self._rejected_commands = 0
-        self._last_problem = ''
         self._logged_reason = 'starting'
         self._robot_publishers = RobotPublishers(self, parameters, _robot_description(parameters))
-        self._command_type = TwistStamped if parameters.enable_stamped_cmd_vel else Twist
-        self.create_subscription(self._command_type, 'cmd_vel', self._on_command, qos.LATEST)
+        self._commands = CommandSubscription(
+            self,
+            parameters.enable_stamped_cmd_vel,
+            lambda: self.parameters.limiter.command_timeout,
+            self._apply_command,
+            (self.now_ns, self.steady_ns),
+        )
         RobotServices(self, self._robot, self.steady_ns, self._lock)
         self._wake_read, self._wake_write = os.pipe()
         self._port_thread = threading.Thread(target=self._serve_port, name='radio', daemon=True)
@@ -102,23 +107,10 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
             self._robot.configure(parameters)
         self._robot_publishers.configure(parameters, _robot_description(parameters))
 
-    def _on_command(self, message: Twist | TwistStamped) -> None:
-        self._commands += 1
-        now_ns, steady_ns = self.now_ns(), self.steady_ns()
-        twist, stamp_ns = conversions.twist_and_stamp(message, now_ns)
-        # The link uses steady time: only the age of the command matters.
-        command = RobotCommand.from_twist(
-            twist, self.parameters.geometry, steady_ns - (now_ns - stamp_ns)
-        )
+    def _apply_command(self, twist: BodyTwist, stamp_ns: int) -> str:
+        command = RobotCommand.from_twist(twist, self.parameters.geometry, stamp_ns)
         with self._lock:
-            problem = self._robot.apply(command, steady_ns)
-        if problem:
-            self._rejected_commands += 1
-            if problem != self._last_problem:
-                self.get_logger().warning(
-                    f'cmd_vel rejected: {problem}', throttle_duration_sec=1.0
-                )
-        self._last_problem = problem
+            return self._robot.apply(command, self.steady_ns())
 
     # -- thread of the serial port ----------------------------------------------------------------
 
@@ -126,8 +118,9 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
         try:
             received = b''
             while True:
+                step_ns = self.steady_ns()
                 with self._lock:
-                    actions = self._robot.step(self.steady_ns(), received)
+                    actions = self._robot.step(step_ns, received)
                     states = self._robot.take_states()
                     done = self._robot.link.state is LinkState.DONE
                     reason = self._robot.reason(self.steady_ns())
@@ -137,7 +130,7 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
                     if isinstance(action, Wait):
                         until_ns = action.until_ns
                     else:
-                        self._execute(action)
+                        self._execute(action, step_ns)
                 if any(isinstance(action, Open) for action in actions):
                     until_ns = self.steady_ns()  # the result of opening the port is known
                 for state in states:
@@ -152,14 +145,15 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
             if self._port is not None:
                 self._port.close()
 
-    def _execute(self, action: Open | Write | Close) -> None:
+    def _execute(self, action: Open | Write | Close, step_ns: int) -> None:
         try:
             if isinstance(action, Open):
                 self._port = SerialPort(self.parameters.port)
                 with self._lock:
                     self._robot.link.port_opened(self.steady_ns())
             elif isinstance(action, Write) and self._port is not None:
-                self._port.write(action.data)
+                if self.steady_ns() - step_ns <= MAX_WRITE_DELAY_NS:
+                    self._port.write(action.data)
             elif isinstance(action, Close) and self._port is not None:
                 self._port.close()
                 self._port = None
@@ -208,8 +202,8 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
             'port': self.parameters.port,
             'link': link_state.value,
             'authenticated': authenticated,
-            'commands': self._commands,
-            'commands_rejected': self._rejected_commands,
+            'commands': self._commands.received,
+            'commands_rejected': self._commands.rejected,
             **_link_values(quality),
             **diagnostics.values(state),
         }
@@ -218,10 +212,12 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
         if quality.level is DiagnosticLevel.ERROR:
             return ERROR, quality.text, values
         if problem := graph_introspection.command_type_problem(
-            self, self._command_type, publish=False
+            self, self._commands.message_type, publish=False
         ):
             return WARN, problem, values
-        found = [*diagnostics.warnings(state), *([quality.text] if quality.text else [])]
+        found = [*diagnostics.warnings(state, command_problem=self._commands.problem)]
+        if quality.text:
+            found.append(quality.text)
         if found:
             return WARN, '; '.join(found), values
         suffix = '' if authenticated else ', unauthenticated'

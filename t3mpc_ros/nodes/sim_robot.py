@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from geometry_msgs.msg import Twist, TwistStamped
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from t3mpc_ros.geometry.timing import RealTimeFactor, SampleScheduler, SimulatedTime
-from t3mpc_ros.geometry.types import NANOSECONDS, Pose
+from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose
 from t3mpc_ros.nodes.common import conversions, diagnostics, graph_introspection, qos
 from t3mpc_ros.nodes.common.base_node import ERROR, NO_CLOCK, OK, WARN, BaseNode
+from t3mpc_ros.nodes.common.command_subscription import CommandSubscription
 from t3mpc_ros.nodes.common.robot_publishers import (
     RobotDescription,
     RobotPublishers,
@@ -146,14 +146,18 @@ class SimRobotNode(BaseNode[SimRobotParameters]):
         )
         self._real_time_factor = RealTimeFactor()
         self._state: RobotState | None = None
-        self._commands = self._rejected_commands = 0
-        self._last_problem = ''
         self._logged_reason = ''
         self._robot_publishers = RobotPublishers(self, parameters, _robot_description(parameters))
         if parameters.publish_clock:
             self._clock_publisher = self.create_publisher(Clock, '/clock', qos.LATEST)
-        self._command_type = TwistStamped if parameters.enable_stamped_cmd_vel else Twist
-        self.create_subscription(self._command_type, 'cmd_vel', self._on_command, qos.LATEST)
+        self._commands = CommandSubscription(
+            self,
+            parameters.enable_stamped_cmd_vel,
+            lambda: self.parameters.limiter.command_timeout,
+            self._apply_command,
+            (self._robot_now_ns, self._robot_now_ns),
+            lambda: self._simulated_time is not None or self.get_clock().ros_time_is_active,
+        )
         RobotServices(self, self._robot, self._robot_now_ns)
         self.create_service(Trigger, '~/set_pose', self._on_set_pose)
         self.create_service(Trigger, '~/step', self._on_step)
@@ -176,19 +180,9 @@ class SimRobotNode(BaseNode[SimRobotParameters]):
             min(max(1.0 / rate, MIN_TIMER_PERIOD), MAX_TIMER_PERIOD) if rate else MAX_TIMER_PERIOD
         )
 
-    def _on_command(self, message: Twist | TwistStamped) -> None:
-        self._commands += 1
-        now_ns = self._robot_now_ns()
-        twist, stamp_ns = conversions.twist_and_stamp(message, now_ns)
+    def _apply_command(self, twist: BodyTwist, stamp_ns: int) -> str:
         command = RobotCommand.from_twist(twist, self.parameters.geometry, stamp_ns)
-        if problem := self._robot.apply(command, now_ns):
-            self._rejected_commands += 1
-            if problem != self._last_problem:
-                # Texts with the age of a command differ each time.
-                self.get_logger().warning(
-                    f'cmd_vel rejected: {problem}', throttle_duration_sec=1.0
-                )
-        self._last_problem = problem
+        return self._robot.apply(command, self._robot_now_ns())
 
     def _on_timer(self) -> None:
         if self._simulated_time is None:
@@ -263,8 +257,8 @@ class SimRobotNode(BaseNode[SimRobotParameters]):
         """Return whether the robot follows commands, or the reason of its standstill."""
         state, twin = self._state, self._twin_diagnostics()
         values: dict[str, object] = {
-            'commands': self._commands,
-            'commands_rejected': self._rejected_commands,
+            'commands': self._commands.received,
+            'commands_rejected': self._commands.rejected,
         }
         if self._simulated_time is None:
             values['lateness_s'] = self._scheduler.lateness(self._robot_now_ns())
@@ -277,12 +271,12 @@ class SimRobotNode(BaseNode[SimRobotParameters]):
         if state.status.estop:
             return ERROR, state.reason, values
         if problem := graph_introspection.command_type_problem(
-            self, self._command_type, publish=False
+            self, self._commands.message_type, publish=False
         ):
             return WARN, problem, values
         if overload := self._overload():
             return WARN, f'processor overloaded: {overload}', values
-        if found := diagnostics.warnings(state, twin):
+        if found := diagnostics.warnings(state, twin, self._commands.problem):
             return WARN, '; '.join(found), values
         return OK, 'following commands', values
 

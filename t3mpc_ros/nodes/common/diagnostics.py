@@ -9,7 +9,9 @@ from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON
 from t3mpc_ros.simulation.digital_twin import TwinDiagnostics
 
 
-def warnings(state: RobotState, twin: TwinDiagnostics | None = None) -> tuple[str, ...]:
+def warnings(
+    state: RobotState, twin: TwinDiagnostics | None = None, command_problem: str = ''
+) -> tuple[str, ...]:
     """Return the warnings about a robot state, most important first.
 
     Parameters
@@ -18,9 +20,13 @@ def warnings(state: RobotState, twin: TwinDiagnostics | None = None) -> tuple[st
         The state of a simulated or real robot.
     twin
         Quantities that only the digital twin has.
+    command_problem
+        Why the last command was rejected; empty if it was accepted.
     """
     status = state.status
     found = [state.reason] if state.reason else []
+    if command_problem and command_problem != state.reason:
+        found.append(f'cmd_vel rejected: {command_problem}')
     if status.slipping and state.reason != SLIP_STOP_REASON:
         found.append('a wheel slips, is blocked, or has lost steps')
     if status.imu_fault:

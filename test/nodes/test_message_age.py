@@ -1,0 +1,124 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""A message that has waited, or that comes from another clock, moves no robot.
+
+An executor that does not run is, for its nodes, the same as a suspended process: the middleware
+receives, and what has waited is taken afterwards.
+"""
+
+import time
+from types import SimpleNamespace
+
+from geometry_msgs.msg import Twist, TwistStamped
+from nav_msgs.msg import Odometry
+import pytest
+from support.ros_graph import (
+    CommandSource,
+    ControllerHarness,
+    diagnostic,
+    diagnostic_level,
+    odometry,
+    reason,
+    speed,
+    twist,
+)
+
+from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.nodes.common import command_subscription
+from t3mpc_ros.nodes.common.base_node import ERROR
+from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
+from t3mpc_ros.nodes.sim_robot import SimRobotNode
+from t3mpc_ros.radio.link.port_actions import Write
+
+pytestmark = pytest.mark.ros
+
+SUSPENDED = 0.4
+"""Longer than the command timeout of 0.25 s and the odometry timeout of the test, s."""
+
+
+def suspend():
+    """Let time pass while no callback of the test's process runs."""
+    time.sleep(SUSPENDED)
+
+
+@pytest.mark.parametrize('simulated_time', [False, True])
+def test_a_command_that_waited_does_not_move_sim_robot(harness, simulated_time):
+    """An unstamped command counted as new when it was taken: the robot drove after a pause."""
+    robot = harness.add(SimRobotNode, publish_clock=simulated_time)
+    odom = harness.subscribe(Odometry, 'odom')
+    commands = harness.create_publisher(Twist, 'cmd_vel')
+    harness.wait_for_subscriber(commands)
+    harness.spin_until(lambda: odom)
+    commands.publish(twist(0.3))
+    suspend()
+    harness.spin_until(lambda: diagnostic(robot, 'commands') == 1)
+    count = len(odom)
+    harness.spin_until(lambda: len(odom) > count + 40)
+    assert max(map(speed, odom)) < 1e-3
+    assert diagnostic(robot, 'commands_rejected') == 1
+    assert 'command is too old' in reason(robot)
+    source = CommandSource(harness)
+    source.message = twist(0.3)
+    harness.spin_until(lambda: speed(odom[-1]) > 0.28, 'a new command moves the robot')
+
+
+@pytest.mark.parametrize('kind', [Twist, TwistStamped])
+def test_a_command_that_waited_is_rejected_by_the_bridge(harness, tmp_path, kind):
+    stamped = kind is TwistStamped
+    node = harness.add(
+        RadioBridgeNode, port=str(tmp_path / 'none'), enable_stamped_cmd_vel=stamped
+    )
+    commands = harness.create_publisher(kind, 'cmd_vel')
+    harness.wait_for_subscriber(commands)
+    commands.publish(TwistStamped(twist=twist(0.3)) if stamped else twist(0.3))
+    suspend()
+    harness.spin_until(lambda: diagnostic(node, 'commands') == 1)
+    assert diagnostic(node, 'commands_rejected') == 1
+    assert node._robot.reason(node.steady_ns())
+    assert node._commands.problem.startswith('command is too old: 0.')
+
+
+def test_a_command_from_the_future_is_rejected(harness, monkeypatch):
+    """A clock that leads hides the time that a command has waited."""
+    robot = harness.add(SimRobotNode)
+    odom = harness.subscribe(Odometry, 'odom')
+    source = CommandSource(harness)
+    now_ns, lead_ns = time.time_ns, NANOSECONDS
+    monkeypatch.setattr(command_subscription.time, 'time_ns', lambda: now_ns() - lead_ns)
+    source.message = twist(0.3)
+    harness.spin_until(lambda: diagnostic(robot, 'commands_rejected') > 20)
+    assert max(map(speed, odom)) < 1e-3
+    assert 'the clocks of the computers differ' in reason(robot)
+    lead_ns = 0
+    harness.spin_until(lambda: speed(odom[-1]) > 0.28, 'equal clocks')
+    assert 'clocks' not in reason(robot)
+
+
+def test_a_frame_of_a_suspended_bridge_is_not_written(harness, tmp_path):
+    """A process may be suspended between the decision on a command and its write."""
+    node = harness.add(RadioBridgeNode, port=str(tmp_path / 'none'))
+    written = []
+    port = SimpleNamespace(write=written.append)
+    with node._lock:
+        before, node._port = node._port, port
+        for late_ns in (0, 3 * NANOSECONDS):
+            node._execute(Write(b'%d' % late_ns), node.steady_ns() - late_ns)
+        node._port = before
+    assert written == [b'0']
+
+
+def test_odometry_that_waited_is_no_step_of_the_controller(harness):
+    """A suspended controller computed fresh commands from the odometry of seconds ago."""
+    bench = ControllerHarness(harness, odometry_timeout=0.3)
+    controller = bench.controller
+    bench.publish_reference(seconds=1.0)
+    bench.stamp_ns += NANOSECONDS // 100
+    bench.odom_publisher.publish(odometry(bench.stamp_ns))
+    suspend()
+    harness.spin_until(lambda: diagnostic(controller, 'odometry_rejected') == 1)
+    assert diagnostic(controller, 'steps') == 0
+    assert bench.commands == []
+    assert diagnostic_level(controller) == ERROR
+    assert 'odom is too old' in reason(controller)
+    bench.publish_odometry()
+    assert 'odom' not in reason(controller)
