@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from t3mpc_ros.geometry.kinematics import twist_from_wheels
+from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
 from t3mpc_ros.geometry.types import Pose, State, WheelSpeeds, check_pose
 from t3mpc_ros.parameters.table import ParameterError, group, parameter
 from t3mpc_ros.robot.command_limiter import CommandLimiter
@@ -74,6 +74,15 @@ class DigitalTwinParameters(PaperRobotParameters):
     world: str = parameter(
         '', 'world: name of a bundled world, or path of a YAML file; empty = endless plain'
     )
+    right_wheel_radius_multiplier: float = parameter(
+        1.0, 'true over nominal radius of the right wheel', low=0.8, high=1.25
+    )
+    left_wheel_radius_multiplier: float = parameter(
+        1.0, 'true over nominal radius of the left wheel', low=0.8, high=1.25
+    )
+    wheel_separation_multiplier: float = parameter(
+        1.0, 'true over nominal wheel separation', low=0.8, high=1.25
+    )
     boot_time: float = parameter(
         0.5, 'restart time of the board after a power loss', unit='s', low=0.0, high=10.0
     )
@@ -87,6 +96,15 @@ class DigitalTwinParameters(PaperRobotParameters):
         dynamic=True,
     )
 
+    @property
+    def true_geometry(self) -> WheelGeometry:
+        """Nominal wheel radius and true wheel separation: how the speeds of the ground turn."""
+        nominal = self.geometry
+        return WheelGeometry(
+            wheel_radius=nominal.wheel_radius,
+            wheel_separation=nominal.wheel_separation * self.wheel_separation_multiplier,
+        )
+
     def body_with_faults(self, faults: FaultParameters) -> BodyParameters:
         """Return the true body with the load of a fault."""
         true = self.true_body
@@ -97,12 +115,13 @@ class DigitalTwinParameters(PaperRobotParameters):
         blocked = faults.wheel_blocked
         return Load(
             self.body_with_faults(faults),
-            self.geometry,
+            self.true_geometry,
             self.friction,
             self.friction_factor,
             self.tyres,
             faults.slippery,
             (blocked in ('right', 'both'), blocked in ('left', 'both')),
+            (self.right_wheel_radius_multiplier, self.left_wheel_radius_multiplier),
         )
 
     def check_consistency(self) -> None:
@@ -455,7 +474,11 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
             status=status,
             reason=limiter.reason,
             true_wheels=drivetrain.wheels,
-            truth=State(stamp_ns, drivetrain.pose, twist_from_wheels(drivetrain.ground, geometry)),
+            truth=State(
+                stamp_ns,
+                drivetrain.pose,
+                twist_from_wheels(drivetrain.ground, self._parameters.true_geometry),
+            ),
             imu=self._sample,
             ranges=() if self._faults.ranges_dead else self._ranges.readings,
             battery=self._supply,

@@ -344,3 +344,36 @@ def test_documented_twin_example_runs(capsys):
     yaws = eval(capsys.readouterr().out)
     assert len(yaws) == 8
     assert all(math.isfinite(yaw) for yaw in yaws)
+
+
+def test_body_moves_by_true_radii_and_separation():
+    """Wheels that differ from the nominal ones turn the body by equation (1) with their own R."""
+    true = {
+        'right_wheel_radius_multiplier': 1.02,
+        'left_wheel_radius_multiplier': 0.99,
+        'wheel_separation_multiplier': 1.03,
+        'disturbance__bound': 0.0,
+    }
+    wheels = WheelSpeeds(4.0, 2.5)
+    state = drive(DigitalTwin(parameters(**true)), [wheels] * 150)[-1]
+    geometry = parameters().geometry
+    right, left = 1.02 * geometry.wheel_radius * 4.0, 0.99 * geometry.wheel_radius * 2.5
+    assert state.true_wheels == pytest.approx(wheels, abs=0.01)
+    assert state.truth.twist.linear == pytest.approx(0.5 * (right + left), abs=2e-4)
+    assert state.truth.twist.angular == pytest.approx(
+        (right - left) / (1.03 * geometry.wheel_separation), abs=2e-3
+    )
+
+
+def test_odometry_assumes_the_nominal_geometry():
+    """Without a gyro the steps alone cannot see a wrong separation: yaw is off by its ratio."""
+    state = drive(
+        DigitalTwin(parameters(wheel_separation_multiplier=1.05, odometry__use_gyro=False)),
+        [WheelSpeeds(1.0, -1.0)] * 300,
+    )[-1]
+    assert state.odometry.pose.yaw / state.truth.pose.yaw == pytest.approx(1.05, rel=2e-3)
+
+
+def test_wrong_radii_lose_no_steps():
+    state = drive(DigitalTwin(parameters(right_wheel_radius_multiplier=1.1)), course(3, 1000))[-1]
+    assert state.lost_steps == (0, 0)

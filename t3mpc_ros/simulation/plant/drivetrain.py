@@ -10,8 +10,9 @@ its full grip:
           I_i \dot\chi_i = \tau_i - f(\chi_i) - \tau_{d,i} - R F_i, \qquad |F_i| \le \mu N_i
 
 with theta_bar_b the matrix (11) without the wheels' own inertia and Q the force of a wall. Where
-both tyres roll, the sum of the two is (10). Not modelled: sliding sideways, and load transfer
-between the wheels.
+both tyres roll, the sum of the two is (10). A rotor whose wheel is g times as large as the nominal
+one turns with chi/g: with I_i/g² and torques divided by g the equations are the same. Not
+modelled: sliding sideways, and load transfer between the wheels.
 """
 
 from dataclasses import dataclass
@@ -78,6 +79,8 @@ class Load(NamedTuple):
     grip_factor: float
     blocked: tuple[bool, bool]
     """Blocked wheels, right first."""
+    radius_multipliers: tuple[float, float] = (1.0, 1.0)
+    """True wheel radii over the nominal one, right first."""
 
 
 class Drivetrain:
@@ -120,6 +123,7 @@ class Drivetrain:
         self._totals: Array = np.zeros(4)
         self._work: Array = np.zeros((4, 9))
         self._blocked = (False, False)
+        self._multipliers = (1.0, 1.0)
         self._read()
 
     # -- state ------------------------------------------------------------------------------------
@@ -137,7 +141,8 @@ class Drivetrain:
     @property
     def wheels(self) -> WheelSpeeds:
         """Speeds of the rotors, chi."""
-        return WheelSpeeds(self._now[5], self._now[6])
+        right, left = self._multipliers
+        return WheelSpeeds(self._now[5] / right, self._now[6] / left)
 
     @property
     def ground(self) -> WheelSpeeds:
@@ -158,9 +163,10 @@ class Drivetrain:
     def load_angles(self) -> tuple[float, float]:
         """Angles (rad) of the fields ahead of the rotors, lost pitches included."""
         state, field = self._now, self._pulses
+        right, left = self._multipliers
         return (
-            field[4] + self._microstep * math.floor(field[0]) - state[3],
-            field[5] + self._microstep * math.floor(field[1]) - state[4],
+            field[4] + self._microstep * math.floor(field[0]) - state[3] / right,
+            field[5] + self._microstep * math.floor(field[1]) - state[4] / left,
         )
 
     @property
@@ -199,7 +205,8 @@ class Drivetrain:
         weight = GRAVITY * load.body.total_mass * load.tyres.load_share
         self._grip = 0.5 * load.tyres.grip * weight * load.grip_factor
         own = load.body.wheel_inertia + motor.rotor_inertia
-        self._tyres: Array = np.array([own, own, self._grip, self._grip])
+        self._multipliers = right, left = load.radius_multipliers
+        self._tyres: Array = np.array([own / right**2, own / left**2, self._grip, self._grip])
         for wheel, (was, now) in enumerate(zip(self._blocked, load.blocked, strict=True)):
             if now:
                 self._tyres[wheel] = BLOCKED_INERTIA
@@ -213,7 +220,8 @@ class Drivetrain:
         The field of the driver starts in its home position; a rotor moves to the nearest one.
         """
         for wheel in (0, 1):
-            cycles = round(float(self._state[3 + wheel]) / self._cycle)
+            rotor = float(self._state[3 + wheel]) / self._multipliers[wheel]
+            cycles = round(rotor / self._cycle)
             self._field[wheel] = 0.0
             self._field[2 + wheel] = 0.0
             self._field[4 + wheel] = cycles * self._cycle
@@ -329,11 +337,11 @@ def body_vector(body: BodyParameters, geometry: WheelGeometry) -> Array:
 def robot_vector(
     motor: StepperMotorParameters, load: Load, bumper: BumperParameters, share: float, step: float
 ) -> Array:
-    """Return all constants of :func:`integrate_drivetrain` in one row, shape (22,).
+    """Return all constants of :func:`integrate_drivetrain` in one row, shape (24,).
 
     body_vector (6); viscous (N m s/rad) and Coulomb friction (N m), its width (rad/s);
     BumperParameters.vector (3); StepperMotorParameters.vector (7); microstep (rad), share of the
-    IMU filter, length of a step (s).
+    IMU filter, length of a step (s); true over nominal radius of each wheel, right first.
     """
     friction, factor = load.friction, load.friction_factor
     friction_row = [factor * friction.viscous, factor * friction.coulomb, friction.coulomb_width]
@@ -343,7 +351,7 @@ def robot_vector(
             friction_row,
             bumper.vector(),
             motor.vector(),
-            [motor.microstep, share, step],
+            [motor.microstep, share, step, *load.radius_multipliers],
         ]
     )
 
@@ -379,11 +387,12 @@ def integrate_drivetrain(
     straight line with its mean and its slope. Tyres change between rolling and sliding at the end
     of a step.
 
-    state : shape (9,), see motion_rates; modes : shape (2,); both changed in place
+    state : shape (9,), see state_derivative; wheel angles and chi are those of the rotors times
+        the radius multipliers; modes : shape (2,); both changed in place
     field : shape (6,), phase (pulses), rate (pulses/s), position of pulse 0 (rad); right first
     target_* : target pulse rates (pulses/s); reach : largest change of a rate (pulses/s²)
     volts : supply voltage; 0 = no power, the rotors turn freely
-    robot : shape (22,), see robot_vector
+    robot : shape (24,), see robot_vector
     tyres, segments, circles : see motion_rates
     load, angular, phases, walk : see disturbance_torque
     filtered : shape (3, 2), the filter of the IMU, see low_pass; changed in place
@@ -394,6 +403,7 @@ def integrate_drivetrain(
     """
     body, friction, bumper, motor = robot[0:6], robot[6:9], robot[9:12], robot[12:19]
     microstep, share, step = robot[19], robot[20], robot[21]
+    wider_right, wider_left = robot[22], robot[23]
     trial, slope, total = work[0], work[1], work[2]
     torque, pushed = work[3, 0:2], work[3, 2:5]
     for index in range(first, first + count):
@@ -425,23 +435,28 @@ def integrate_drivetrain(
             for item in range(9):
                 trial[item] = state[item] + part * step * slope[item]
             since = (part - 0.5) * step
+            rotor_right, rotor_left = trial[5] / wider_right, trial[6] / wider_left
             pull_right = rotor_torque(
-                field[4] + microstep * (position_right + since * mean_right) - trial[3],
-                microstep * mean_right - trial[5],
+                field[4]
+                + microstep * (position_right + since * mean_right)
+                - trial[3] / wider_right,
+                microstep * mean_right - rotor_right,
                 peak_right,
                 motor,
             )
             pull_left = rotor_torque(
-                field[5] + microstep * (position_left + since * mean_left) - trial[4],
-                microstep * mean_left - trial[6],
+                field[5] + microstep * (position_left + since * mean_left) - trial[4] / wider_left,
+                microstep * mean_left - rotor_left,
                 peak_left,
                 motor,
             )
             done += weight * microstep * (pull_right * mean_right + pull_left * mean_left)
             torque[0] = pull_right - against_right
             torque[1] = pull_left - against_left
-            torque[0] -= friction_torque(trial[5], friction[0], friction[1], friction[2])
-            torque[1] -= friction_torque(trial[6], friction[0], friction[1], friction[2])
+            torque[0] -= friction_torque(rotor_right, friction[0], friction[1], friction[2])
+            torque[1] -= friction_torque(rotor_left, friction[0], friction[1], friction[2])
+            torque[0] /= wider_right
+            torque[1] /= wider_left
             state_derivative(
                 trial, modes, torque, body, tyres, bumper, segments, circles, slope, pushed
             )
