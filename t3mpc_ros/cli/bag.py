@@ -13,6 +13,7 @@ import time
 from typing import TYPE_CHECKING
 
 from t3mpc_ros.bag.bag_info import BagInfo, read_bag_info
+from t3mpc_ros.bag.recording.split_writer import message_loss_notes
 from t3mpc_ros.bag.recovery.recover_bag import RecoveryOutputError, default_output, recover_bag
 from t3mpc_ros.bag.recovery.result import Damage, FileResult, RecoveryResult
 from t3mpc_ros.cli.command import ArgumentParser, run_command
@@ -96,6 +97,8 @@ def _info_text(held: BagInfo) -> str:
             f'A file without its end is still being written, or its writer was interrupted: '
             f'`t3mpc bag recover {held.path}` writes its messages to a new bag.'
         )
+    if notes := message_loss_notes(held.metadata_records):
+        parts.append('\n'.join(notes))
     if held.topics:
         parts.append(_topic_table(held))
     for title, table in held.metadata_records.items():

@@ -446,6 +446,8 @@ def replay_steps(
     command, limits, command_period, command_gain, applied = actuation
     timeout, reference_timeout, speed_bound, error_bound, response, window, dead, due = bounds
     for k in range(first, until):
+        # References before the range of the step are those that the controller did not receive.
+        state[REFERENCES] = max(state[REFERENCES], rows[k, 1])
         if not add_references(rows[k, 2], state, references, trajectory):
             return k - first
         received = rows[k, 0]

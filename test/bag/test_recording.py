@@ -22,7 +22,11 @@ from t3mpc_ros.bag.recording.diagnostics_monitor import (
 from t3mpc_ros.bag.recording.message_queue import MessageQueue
 from t3mpc_ros.bag.recording.recording_parameters import RecordingParameters
 from t3mpc_ros.bag.recording.snapshot import CircularMessageCache, unused_folder, write_snapshot
-from t3mpc_ros.bag.recording.split_writer import SplitWriter, message_loss_record
+from t3mpc_ros.bag.recording.split_writer import (
+    SplitWriter,
+    message_loss_notes,
+    message_loss_record,
+)
 from t3mpc_ros.bag.topic_filter import PlayTopicFilter, TopicFilter, TopicFilterError
 from t3mpc_ros.bag.writer import (
     MESSAGE_OVERHEAD,
@@ -340,14 +344,21 @@ def test_full_disk_at_a_split_leaves_the_previous_file_complete(tmp_path, monkey
 
 
 def test_losses_are_listed_by_cause_and_topic():
-    assert message_loss_record({'/b': 2, '/a': 1}, {'/a': 5}) == {
+    record = message_loss_record({'/b': 2, '/a': 1}, {'/a': 5}, {'/c': 7})
+    assert record == {
         'dropped': '3',
         'lost': '5',
+        'undiscovered': '7',
         'dropped /a': '1',
         'dropped /b': '2',
         'lost /a': '5',
+        'undiscovered /c': '7',
     }
-    assert message_loss_record({}, {}) == {'dropped': '0', 'lost': '0'}
+    notes = message_loss_notes({'losses': record})
+    assert len(notes) == 4
+    assert notes[-1].startswith('7 messages of /c are missing: published before')
+    assert message_loss_notes({'losses': message_loss_record({}, {}, {})}) == []
+    assert message_loss_notes({}) == []
 
 
 # -- attachments ----------------------------------------------------------------------------------

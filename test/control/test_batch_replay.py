@@ -197,6 +197,18 @@ def test_a_run_with_jitter_and_an_unresponsive_robot(seed):
     assert same_results(results, again)
 
 
+def test_references_that_only_the_recorder_received_are_left_out():
+    """On a busy machine the queue of the controller overflows, that of the recorder does not.
+
+    The batch once added every recorded reference, so a bag of such a run did not replay exactly.
+    """
+    run = Run(4, 600, smooth)
+    overflown = np.arange(50, 600, 45)[:, None] + np.arange(4)
+    run.rows[overflown.ravel(), 1] = run.rows[overflown.ravel(), 2]
+    _, regular = run.check()
+    assert regular > 400
+
+
 @pytest.mark.parametrize(
     'changes',
     [

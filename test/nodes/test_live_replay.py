@@ -14,6 +14,7 @@ import rclpy
 from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
+from t3mpc_ros.bag.chunk_reader import read_bag_index
 from t3mpc_ros.bag.run.journal import Event
 from t3mpc_ros.bag.run.model_file import save_model
 from t3mpc_ros.control.controller import Controller, ControllerParameters
@@ -101,6 +102,12 @@ def live_run(processes, bag, model):
     assert set(codes.values()) == {0}
 
 
+def listed_as_missing(bag, topic):
+    """Return the number of messages of a topic that the bag lacks by its own record."""
+    losses = read_bag_index(bag).metadata_records['losses']
+    return sum(int(count) for key, count in losses.items() if key.endswith(f' {topic}'))
+
+
 def test_a_live_run_replays_bit_for_bit(processes, tmp_path):
     """With stops, an unresponsive robot, a timeout, dynamic parameters and a model file."""
     live_run(processes, tmp_path / 'bag', tmp_path / 'model.npz')
@@ -118,11 +125,15 @@ def test_a_live_run_replays_bit_for_bit(processes, tmp_path):
     assert {Reason.TRACKING, Reason.NOT_FOLLOWING, Reason.DISABLED, Reason.NO_ODOMETRY} <= reasons
     outcome = compare(inputs, again, Tolerances(absolute=1e-9, relative=0.0))
     assert outcome.same, outcome.table()
+    held = np.isfinite(inputs.recorded['cmd_vel.linear.x'])
+    # On a busy machine the recorder discovers cmd_vel after the first commands, or does not
+    # acknowledge a command within the 0.5 s for which the controller keeps it.
+    missing = np.count_nonzero(inputs.commanding & ~held)
+    assert missing == listed_as_missing(tmp_path / 'bag', '/cmd_vel'), inputs.notes
     for name in ('cmd_vel.linear.x', 'cmd_vel.angular.z'):
-        compared = inputs.commanding & inputs.exact
+        compared = inputs.commanding & inputs.exact & held
+        assert np.count_nonzero(compared) > 1200
         recorded, computed = inputs.recorded[name][compared], again.fields[name][compared]
-        assert np.isfinite(recorded).all(), 'a command of the run is not in the bag'
-        assert recorded.size > 1200
         np.testing.assert_array_equal(computed, recorded)
     numbers = [row for row in outcome.rows if not row.field.startswith('cmd_vel')]
     assert len(numbers) == 20
@@ -147,6 +158,10 @@ def test_a_late_recorder_can_replay_from_the_beginning(processes, tmp_path):
     [life] = inputs.lives
     assert life.rows[0, 0] == 0, 'the journal begins with the first event'
     assert life.exact.all(), inputs.notes
+    held = np.isfinite(inputs.recorded['cmd_vel.linear.x'])
+    missing = np.count_nonzero(inputs.commanding & ~held)
+    assert 0 < missing == listed_as_missing(bag, '/cmd_vel')
+    assert any(note.startswith(f'{missing} commands of the controller') for note in inputs.notes)
     assert (life.events == Event.STEP).sum() > 500
     outcome = compare(inputs, replay_controller(inputs), Tolerances(absolute=1e-9, relative=0.0))
     assert outcome.same, outcome.table()

@@ -129,6 +129,28 @@ def test_messages_replaced_in_the_dds_queue_are_counted(harness, tmp_path):
         assert recording.metadata_records['losses']['lost /text'] == '500'
 
 
+def test_messages_from_before_the_discovery_are_counted(harness, tmp_path):
+    """A volatile publisher keeps nothing for the time until the recorder discovers it."""
+    text = harness.create_publisher(String, 'text', DEEP)
+    latched = harness.create_publisher(String, 'latched', LATCHED)
+    for i in range(37):
+        text.publish(String(data=str(i)))
+        latched.publish(String(data=str(i)))
+    recorder = record(harness, tmp_path, 'text', 'latched')
+    harness.wait_for_subscriber(text)
+    harness.wait_for_subscriber(latched)
+    text.publish(String(data='seen'))
+    harness.spin_until(lambda: values(recorder)['messages'] == 38)
+    assert values(recorder)['undiscovered'] == 37
+    assert (values(recorder)['lost'], diagnostic_level(recorder)) == (0, OK)
+    harness.remove(recorder)
+    with open_bag(tmp_path) as recording:
+        losses = recording.metadata_records['losses']
+    assert {key: value for key, value in losses.items() if '/' in key} == {
+        'undiscovered /text': '37'
+    }
+
+
 # -- selection ------------------------------------------------------------------------------------
 
 

@@ -31,7 +31,7 @@ def test_two_thousand_messages_a_second_are_all_recorded(processes, tmp_path):
     assert found.recorded == found.sent
     assert found.in_order
     with open_bag(tmp_path / 'bag') as recording:
-        assert recording.metadata_records['losses'] == {'dropped': '0', 'lost': '0'}
+        assert set(recording.metadata_records['losses'].values()) == {'0'}
 
 
 class NumberPublisher:

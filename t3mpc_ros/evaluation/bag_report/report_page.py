@@ -10,6 +10,7 @@ import math
 from pathlib import Path
 
 from t3mpc_ros.bag.reader import BagReader, open_bag
+from t3mpc_ros.bag.recording.split_writer import message_loss_notes
 from t3mpc_ros.evaluation.bag_report.link_history import LinkMetrics
 from t3mpc_ros.evaluation.bag_report.metrics import (
     SETTLING,
@@ -297,7 +298,7 @@ def _tiles(figures: ReportMetrics) -> str:
 
 
 def _notes(recording: BagReader, run: Run) -> str:
-    notes = list(run.notes)
+    notes = [*message_loss_notes(recording.metadata_records), *run.notes]
     if run.absent:
         notes.append(f'Not in the bag, or without a message: {", ".join(run.absent)}.')
     if recording.incomplete_files:

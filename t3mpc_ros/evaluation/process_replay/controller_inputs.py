@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from t3mpc_ros.bag.chunk_reader import BagIndex, read_attachment_data, read_bag_index
 from t3mpc_ros.bag.columns import TopicColumns, read_columns, read_strings
 from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.bag.recording.split_writer import message_loss_notes
 from t3mpc_ros.bag.run.journal import COMMAND_EVENTS, JOURNAL_COLUMNS, Event, parameters_from_json
 from t3mpc_ros.bag.run.model_file import load_model
 from t3mpc_ros.control.control_law import TERM_NAMES
@@ -144,8 +145,8 @@ def load_inputs(
     BagError
         The bag cannot be read.
     """
-    notes: list[str] = []
     held = read_bag_index(bag)
+    notes = message_loss_notes(held.metadata_records)
     known, namespaces = find_topics(held.types, namespace)
     prefix = namespaces[0]
     names = (f'{CONTROLLER}/{name}' for name in ('journal', *NUMBERS))
@@ -280,9 +281,13 @@ class _Reader:
                 continue
             rows = rows_of(self._published, column.published_ns, steps)
             recorded[name][rows[rows >= 0]] = column.numbers[rows >= 0, 0]
-        without = np.count_nonzero(np.isin(events, COMMAND_EVENTS) & ~there)
-        if without:
-            self._notes.append(f'{without} commands are not in the bag')
+        without = np.flatnonzero(np.isin(events, COMMAND_EVENTS) & ~there)
+        if without.size:
+            span = (self._published[without[[0, -1]]] - self._held.start_ns) / NANOSECONDS
+            self._notes.append(
+                f'{without.size} commands of the controller, from {span[0]:.3f} s to '
+                f'{span[1]:.3f} s, are not in the bag and not compared'
+            )
         return recorded
 
     def _one_life(self) -> tuple[list[ControllerSession], Integers, Integers]:

@@ -25,7 +25,7 @@ from t3mpc_ros.bag.recording.diagnostics_monitor import (
 from t3mpc_ros.bag.recording.message_queue import MessageQueue
 from t3mpc_ros.bag.recording.recording_parameters import RecordingParameters
 from t3mpc_ros.bag.recording.snapshot import CircularMessageCache
-from t3mpc_ros.bag.recording.split_writer import SplitWriter, message_loss_record
+from t3mpc_ros.bag.recording.split_writer import LOSSES, SplitWriter, message_loss_record
 from t3mpc_ros.bag.schema import BagError, MessageDefinitions, UnknownTypeError
 from t3mpc_ros.bag.topic_filter import TopicFilter
 from t3mpc_ros.bag.writer import Attachment, FolderError
@@ -241,14 +241,10 @@ class RecorderNode(BaseNode[RecordingParameters]):
         if self._writer is None:
             response.message = 'no recording to split: storage.snapshot_mode is set'
             return response
-        table = self._losses()
-
-        def split(writer: SplitWriter) -> Path:
-            writer.add_metadata_record('losses', table)
-            return writer.split()
+        self._write_losses()
 
         try:
-            path = self._writer.submit(split).result(SPLIT_TIMEOUT)
+            path = self._writer.submit(SplitWriter.split).result(SPLIT_TIMEOUT)
         except BagError as error:
             response.message = str(error)
         except TimeoutError:
@@ -299,11 +295,19 @@ class RecorderNode(BaseNode[RecordingParameters]):
 
     def _monitor_graph(self) -> None:
         self._raw_subscriptions.count_lost()
+        self._write_losses()
         for fault in self._monitor.check_timeouts(self.steady_ns()):
             self._on_fault(fault)
 
-    def _losses(self) -> dict[str, str]:
-        return message_loss_record(self._queue.dropped, self._raw_subscriptions.lost)
+    def _write_losses(self) -> None:
+        """Write the loss record if it has changed: a killed recorder leaves it, too."""
+        subscriptions = self._raw_subscriptions
+        table = message_loss_record(
+            self._queue.dropped, subscriptions.lost, subscriptions.undiscovered
+        )
+        if table != self._metadata.records.get(LOSSES):
+            self._metadata.records[LOSSES] = table
+            self._submit(lambda writer: writer.add_metadata_record(LOSSES, table))
 
     def produce_diagnostics(self) -> tuple[bytes, str, Mapping[str, object]]:
         """Return whether the recording runs and is complete, with its place and size."""
@@ -315,6 +319,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
             'topics': len(self._recorded_types),
             'dropped': self._dropped,
             'lost': lost,
+            'undiscovered': sum(self._raw_subscriptions.undiscovered.values()),
             'queue_bytes': self._queue.bytes,
             'snapshots': len(self._snapshots.completed) if self._snapshots else 0,
         }
@@ -343,8 +348,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
 
     def _close(self) -> None:
         self._attach(self._metadata.saved_models(time.time_ns()))
-        table = self._losses()
-        self._submit(lambda writer: writer.add_metadata_record('losses', table))
+        self._write_losses()
         problem = self._writer.close() if self._writer else ''
         if self._snapshots:
             self._snapshots.close(SNAPSHOT_TIMEOUT)

@@ -11,7 +11,9 @@ times of reception and publication with each message.
 
 A reader with KEEP_LAST replaces its oldest samples when its queue is full, which DDS does not
 report as lost. The sequence numbers of the publisher reveal these losses. Losses in transport are
-reported by the message-lost event, which is polled, too.
+reported by the message-lost event, which is polled, too. A volatile publisher keeps nothing for
+the time until it and the recorder have discovered each other, which takes up to seconds on a busy
+machine: the sequence number of the first message received is one more than their number.
 """
 
 from collections.abc import Callable, Sequence
@@ -100,11 +102,17 @@ class RawSubscriptions:
         self._group = PolledCallbackGroup()
         self._subscriptions: dict[str, RawSubscription] = {}
         self._lost: dict[str, int] = {}
+        self._undiscovered: dict[str, int] = {}
 
     @property
     def lost(self) -> dict[str, int]:
         """Lost messages by topic, up to the last :meth:`count_lost`."""
         return dict(self._lost)
+
+    @property
+    def undiscovered(self) -> dict[str, int]:
+        """Messages by topic that were published before their publisher was discovered."""
+        return dict(self._undiscovered)
 
     def get(self, topic: str) -> RawSubscription | None:
         """Return the subscription to a topic, None without one."""
@@ -125,6 +133,7 @@ class RawSubscriptions:
             This process uses the topic with another type.
         """
         message = graph_introspection.message_class(type_name)
+        replaced = self._subscriptions.get(topic)
         self.unsubscribe(topic)
         subscription = self._node.create_subscription(
             message,
@@ -137,7 +146,11 @@ class RawSubscriptions:
             raw=True,
         )
         self._subscriptions[topic] = RawSubscription(
-            type_name, profile, subscription, _lost_event(subscription)
+            type_name,
+            profile,
+            subscription,
+            _lost_event(subscription),
+            replaced.sequence if replaced else None,
         )
 
     def unsubscribe(self, topic: str) -> None:
@@ -177,6 +190,7 @@ class RawSubscriptions:
                 continue
             if count >= held.qos.depth:
                 self._add_lost(topic, self._replaced(held, first))
+            self._count_undiscovered(topic, held, first)
             held.sequence = sequence
         found.sort(key=_RECEIVE_TIME)
         return found
@@ -194,6 +208,16 @@ class RawSubscriptions:
     def _add_lost(self, topic: str, count: int) -> None:
         if count > 0:
             self._lost[topic] = self._lost.get(topic, 0) + count
+
+    def _count_undiscovered(self, topic: str, held: RawSubscription, first: int | None) -> None:
+        """Count what was published before the first message of a new publisher.
+
+        Only one publisher at a time can be counted: each has its own sequence, and a message does
+        not identify it.
+        """
+        is_new = held.sequence is None or (first is not None and first <= held.sequence)
+        if is_new and first and first > 1 and held.subscription.get_publisher_count() <= 1:
+            self._undiscovered[topic] = self._undiscovered.get(topic, 0) + first - 1
 
     @staticmethod
     def _replaced(held: RawSubscription, first: int | None) -> int:
