@@ -97,11 +97,14 @@ class RadioRobot(RobotInterface):
         self._odometry = GyroOdometry(parameters.odometry, parameters.geometry)
         self._slip_monitor = SlipMonitor()
         self._period_ns = round(NANOSECONDS / parameters.link.cycle_rate)
+        self._ttl_ns = round(NANOSECONDS * parameters.link.ttl)
         self._next_ns = 0
         self._now_ns = 0
         self._telemetry: Telemetry | None = None
         self._resets = 0
         self._limited = False
+        self._expiry_ns = 0
+        """Time at which the robot stops by itself without another command."""
         self._commanded = ZERO_WHEEL_SPEEDS
         self._new_states: deque[RobotState] = deque(maxlen=1024)
         self._state = self._initial_state()
@@ -191,6 +194,11 @@ class RadioRobot(RobotInterface):
 
     def _send_command(self, now_ns: int) -> None:
         """Pass the limited command to the link, once per cycle."""
+        if self.link.is_silent(now_ns):
+            self._limiter.stop(self.link.reason(now_ns), now_ns)
+        if now_ns > self._expiry_ns + 2 * self._period_ns:
+            # This process was suspended: the end of the ramp would move a robot that has stopped.
+            self._limiter.assume_standstill()
         limited_command = self._limiter.advance(now_ns, self._period_ns / NANOSECONDS)
         self._limited = limited_command.limited
         # The ramp of the limiter is sent as well: it stops more gently than the board.
@@ -198,8 +206,13 @@ class RadioRobot(RobotInterface):
             self.link.stop(limited_command.reason)
             self._commanded = ZERO_WHEEL_SPEEDS
         else:
-            self.link.command(RobotCommand(limited_command.wheels, now_ns), now_ns)
+            # The end of a stop expires after two cycles, and the board continues it by itself.
+            stops = limited_command.target == ZERO_WHEEL_SPEEDS
+            valid_ns = 2 * self._period_ns if stops else self._limiter.remaining_ns(now_ns)
+            valid_ns = min(valid_ns, self._ttl_ns)
+            self.link.command(RobotCommand(limited_command.wheels, now_ns), now_ns, valid_ns)
             self._commanded = limited_command.wheels
+            self._expiry_ns = now_ns + valid_ns
 
     def _update(self, telemetry: Telemetry) -> None:
         before, self._telemetry = self._telemetry, telemetry

@@ -156,6 +156,17 @@ class CommandLimiter:
         """Why the robot is stopped; empty while it follows a command."""
         return self._reason
 
+    def remaining_ns(self, now_ns: int) -> int:
+        """Return the time until the current command expires, ns; 0 without one."""
+        if self._command is None:
+            return 0
+        timeout_ns = round(self.parameters.command_timeout * NANOSECONDS)
+        return max(self._command.stamp_ns + timeout_ns - now_ns, 0)
+
+    def assume_standstill(self) -> None:
+        """Begin the next ramp at standstill: the robot has stopped by itself."""
+        self._ramp = self._ramp._replace(start=ZERO_WHEEL_SPEEDS, target=ZERO_WHEEL_SPEEDS)
+
     def accept(self, command: RobotCommand, now_ns: int) -> str:
         """Accept a command, or return why it is rejected.
 

@@ -517,7 +517,7 @@ def test_release_is_sent_before_the_robot_reports_the_latch():
 def test_nothing_is_commanded_while_the_robot_is_latched():
     arbiter = SetpointArbiter(LinkParameters())
     assert arbiter.accept(RobotCommand(WheelSpeeds(1.0, 2.0), 0), 0) == ''
-    assert arbiter.next_setpoint(True, MS) == (CommandFlag.ENABLE, 0, 0)
+    assert arbiter.next_setpoint(True, MS)[:3] == (CommandFlag.ENABLE, 0, 0)
     assert arbiter.sent_wheels == (0.0, 0.0)
     assert arbiter.next_setpoint(False, MS) == (CommandFlag.ENABLE, 2000, 1000)
 

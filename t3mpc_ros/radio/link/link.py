@@ -101,7 +101,9 @@ class ActiveSession:
         self._due_ns = now_ns
         self._aux_ns = self._ping_ns = now_ns
         self._cycles = 0
-        self._accepted_ns = now_ns
+        self._accepted_ns = self._answered_ns = now_ns
+        # With slow cycles a single answer is a cycle old when the next command is due.
+        self._silence_ns = max(round(parameters.ttl * NANOSECONDS), 2 * self._period_ns)
         self._status = StatusFlag(0)
         self._lost = 0
         self._stops: int | None = None
@@ -112,6 +114,10 @@ class ActiveSession:
     def due_ns(self) -> int:
         """Time of the next cycle."""
         return self._due_ns
+
+    def is_silent(self, now_ns: int) -> bool:
+        """Return whether the robot has not answered for the time to live of a command."""
+        return now_ns - self._answered_ns > self._silence_ns
 
     @property
     def finished(self) -> bool:
@@ -139,6 +145,8 @@ class ActiveSession:
 
     def handle(self, result: TransactionResult) -> str:
         """Process a result; return the reason for a new handshake, empty if none is needed."""
+        if result.uplink is not None:
+            self._answered_ns = result.returned_ns
         if isinstance(result.request, Action):
             self._arbiter.handle_action_result(result.request, result.uplink)
         if isinstance(result.request, Command):
@@ -174,10 +182,11 @@ class ActiveSession:
             self._stops = min(self._stops - 1, -1 if disable else self._stops)
             flags = CommandFlag(0) if disable else CommandFlag.ENABLE
             return self._session.command(flags, 0, 0, 0, now_ns)
-        setpoint = self._arbiter.next_setpoint(bool(self._status & StatusFlag.ESTOP), now_ns)
-        return self._session.command(
-            setpoint.flags, self._parameters.ttl_units, setpoint.left, setpoint.right, now_ns
+        setpoint = self._arbiter.next_setpoint(
+            bool(self._status & StatusFlag.ESTOP), now_ns, self.is_silent(now_ns)
         )
+        flags, left, right, ttl = setpoint
+        return self._session.command(flags, ttl, left, right, now_ns)
 
     def _count_disable(self, result: TransactionResult) -> None:
         """Count commands that disable the drives; one acknowledgement completes the stop."""
@@ -310,6 +319,13 @@ class Link:
         """Number of detected restarts of the robot."""
         return self._statistics.robot_resets
 
+    def is_silent(self, now_ns: int) -> bool:
+        """Return whether the robot has not answered for the time to live of a command.
+
+        Commands may still reach it. The link then sends standstill.
+        """
+        return self._active is not None and self._active.is_silent(now_ns)
+
     def action_result(self, verb: int) -> str | None:
         """Return the result of the last request: None pending, empty done, else the error."""
         return self._arbiter.action_results.get(verb)
@@ -336,9 +352,13 @@ class Link:
 
     # -- commands ---------------------------------------------------------------------------------
 
-    def command(self, command: RobotCommand, now_ns: int) -> str:
-        """Follow a command until the next one or its timeout; return why it is rejected."""
-        return self._arbiter.accept(command, now_ns)
+    def command(self, command: RobotCommand, now_ns: int, valid_ns: int | None = None) -> str:
+        """Follow a command until the next one or its timeout; return why it is rejected.
+
+        ``valid_ns``: time for which it is valid at most; the robot follows it no longer, even if
+        the host dies.
+        """
+        return self._arbiter.accept(command, now_ns, valid_ns)
 
     def stop(self, reason: str) -> None:
         """Stop until the next command."""

@@ -4,6 +4,7 @@
 
 from dataclasses import dataclass
 
+from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
 from t3mpc_ros.radio.protocol.frames import BOARD_PARAMETERS, Configure, Downlink, Hello
 
@@ -14,7 +15,8 @@ _GAPS = {'250k': 2.75e-3, '1M': 1.5e-3, '2M': 1.75e-3}
 """s; at 250k acknowledgements are long, at 2M the tag check takes longer than 1.5 ms."""
 _HELLO_GAP = 5e-3
 """s; the robot computes four hashes at 16 MHz"""
-_TTL_UNIT = 0.01
+TTL_UNIT_NS = NANOSECONDS // 100
+"""Unit of the time to live of a command, ns."""
 
 
 @dataclass(frozen=True)
@@ -154,7 +156,7 @@ class LinkParameters(Parameters):
     @property
     def ttl_units(self) -> int:
         """TTL of a CMD, unit 10 ms."""
-        return round(self.ttl / _TTL_UNIT)
+        return round(self.ttl * NANOSECONDS / TTL_UNIT_NS)
 
     def configure(self, number: int) -> Configure:
         """Return the frame that configures the radio of the dongle."""

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from t3mpc_ros.geometry.types import NANOSECONDS, WheelSpeeds
 from t3mpc_ros.radio.link import standstill_reasons as reasons
-from t3mpc_ros.radio.link.link_parameters import LinkParameters
+from t3mpc_ros.radio.link.link_parameters import TTL_UNIT_NS, LinkParameters
 from t3mpc_ros.radio.protocol.frames import BUSY, OK, Ack, Action, CommandFlag, Uplink
 from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, RobotCommand
 
@@ -25,6 +25,8 @@ class Setpoint(NamedTuple):
     flags: CommandFlag
     left: int
     right: int
+    ttl: int
+    """Time to live, unit 10 ms: it ends with the command that the setpoint is made from."""
 
 
 class SetpointArbiter:
@@ -39,6 +41,7 @@ class SetpointArbiter:
     def __init__(self, parameters: LinkParameters) -> None:
         self._parameters = parameters
         self._command: RobotCommand | None = None
+        self._valid_until_ns = 0
         self._reason = reasons.NO_COMMAND
         self._estop = ''
         self._release_until_ns: int | None = None
@@ -60,10 +63,12 @@ class SetpointArbiter:
         """Wheel speeds of the last setpoint, after every limit."""
         return self._sent_wheels
 
-    def accept(self, command: RobotCommand, now_ns: int) -> str:
+    def accept(self, command: RobotCommand, now_ns: int, valid_ns: int | None = None) -> str:
         """Replace the current command; return the reason for a rejection.
 
         A command that is not finite stops the robot, because the intended value is unknown.
+        ``valid_ns`` limits the time for which it is valid, which ends ``cmd_vel_timeout`` after
+        its stamp in any case.
         """
         if not all(map(math.isfinite, command.wheels)):
             right, left = command.wheels
@@ -77,6 +82,9 @@ class SetpointArbiter:
         if now_ns - stamp_ns >= self._timeout_ns:
             return f'command is too old: {(now_ns - stamp_ns) / NANOSECONDS:.3f} s'
         self._command = command._replace(stamp_ns=stamp_ns)
+        self._valid_until_ns = stamp_ns + self._timeout_ns
+        if valid_ns is not None:
+            self._valid_until_ns = min(self._valid_until_ns, now_ns + valid_ns)
         return ''
 
     def clear(self, reason: str) -> None:
@@ -101,28 +109,43 @@ class SetpointArbiter:
         self.clear('no command since the emergency stop was released')
         return ''
 
-    def next_setpoint(self, robot_latched: bool, now_ns: int) -> Setpoint:
-        """Return the setpoint; ``robot_latched``: the last status reports an emergency stop."""
+    def next_setpoint(
+        self, robot_latched: bool, now_ns: int, robot_silent: bool = False
+    ) -> Setpoint:
+        """Return the setpoint.
+
+        Parameters
+        ----------
+        robot_latched
+            Whether the last status reports an emergency stop.
+        now_ns
+            Host time.
+        robot_silent
+            Whether the robot does not answer: it may still receive, and would move unobserved.
+        """
         self._sent_wheels = ZERO_WHEEL_SPEEDS
+        ttl = self._parameters.ttl_units
         if self._estop:
-            return Setpoint(CommandFlag.ESTOP, 0, 0)
+            return Setpoint(CommandFlag.ESTOP, 0, 0, ttl)
         if self._release_until_ns is not None:
             self._release_frames -= 1
             if self._release_frames >= 0 or (robot_latched and now_ns < self._release_until_ns):
-                return Setpoint(CommandFlag.ESTOP_CLEAR, 0, 0)
+                return Setpoint(CommandFlag.ESTOP_CLEAR, 0, 0, ttl)
             self._button_held = robot_latched
             self._release_until_ns = None
-        if self._command is not None and now_ns - self._command.stamp_ns >= self._timeout_ns:
+        if self._command is not None and now_ns >= self._valid_until_ns:
             self.clear(f'no command for {self._parameters.cmd_vel_timeout:g} s')
-        if self._command is None or robot_latched:
-            return Setpoint(CommandFlag.ENABLE, 0, 0)
+        if self._command is None or robot_latched or robot_silent:
+            return Setpoint(CommandFlag.ENABLE, 0, 0, ttl)
         wheels = self._command.wheels
         fastest = max(map(abs, wheels))
         limit = self._parameters.robot.max_speed
         scale = 1.0 if fastest <= limit else limit / fastest
         right, left = (round(1000.0 * scale * speed) for speed in wheels)
         self._sent_wheels = WheelSpeeds(right / 1000.0, left / 1000.0)
-        return Setpoint(CommandFlag.ENABLE, left, right)
+        # If the host dies now, the robot stops when the command expires, not later.
+        ttl = min(ttl, max(1, (self._valid_until_ns - now_ns) // TTL_UNIT_NS))
+        return Setpoint(CommandFlag.ENABLE, left, right, ttl)
 
     def reason(self, robot_latched: bool) -> str:
         """Return why standstill is selected; empty while a command is followed."""
