@@ -54,8 +54,8 @@ class RadioRobotParameters(Parameters):
     )
 
     def check_consistency(self) -> None:
-        """Raise ParameterError when a limit of the host exceeds that of the board."""
-        limiter, board = self.limiter, self.link.robot
+        """Raise ParameterError for a limit above that of the board, or a stop that is too slow."""
+        limiter, link, board = self.limiter, self.link, self.link.robot
         for name, host, board_limit in (
             ('wheel.max_velocity', limiter.wheel_speed, board.max_speed),
             ('wheel.max_acceleration', limiter.acceleration, board.acceleration),
@@ -66,6 +66,14 @@ class RadioRobotParameters(Parameters):
                     f'{name} must be at most the limit of the board, {board_limit:g} '
                     f'(link.robot): got {host:g}'
                 )
+        # The end of a command is noticed at the next cycle; the end of the host after the TTL.
+        silence = max(limiter.command_timeout + 1.0 / link.cycle_rate, link.ttl)
+        limiter.check_stopping_time(
+            silence,
+            min(limiter.stop_deceleration, board.deceleration),
+            'cmd_vel_timeout, link.cycle_rate, link.ttl, wheel.stop_deceleration, '
+            'link.robot.deceleration',
+        )
 
 
 class RadioRobot(RobotInterface):

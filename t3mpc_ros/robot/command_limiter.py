@@ -12,6 +12,9 @@ from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, RobotCommand
 
+ESTOP_DECELERATION = 60.0
+"""Least deceleration of an emergency stop, rad/s²; that of the board is the same."""
+
 
 @dataclass(frozen=True)
 class CommandLimiterParameters(Parameters):
@@ -37,8 +40,8 @@ class CommandLimiterParameters(Parameters):
     )
     wheel_speed: float = parameter(
         10.0,
-        'largest wheel speed of a command; from here a robot without commands stops within 0.5 s. '
-        'The board steps at up to 19.6 rad/s (10 000 microsteps a second)',
+        'largest wheel speed of a command; from here a robot without commands stops within '
+        'max_stopping_time. The board steps at up to 19.6 rad/s (10 000 microsteps a second)',
         name='wheel.max_velocity',
         unit='rad/s',
         low=0.0,
@@ -56,7 +59,8 @@ class CommandLimiterParameters(Parameters):
     )
     stop_deceleration: float = parameter(
         60.0,
-        'largest deceleration of the faster changing wheel in a stop, whatever its reason',
+        'deceleration of the faster changing wheel in a stop, whatever its reason; an emergency '
+        'stop uses at least 60 rad/s²',
         name='wheel.stop_deceleration',
         unit='rad/s²',
         low=0.1,
@@ -73,13 +77,47 @@ class CommandLimiterParameters(Parameters):
         dynamic=True,
     )
 
+    max_stopping_time: float = parameter(
+        0.5,
+        'longest time from the last command to rest that other parameters may lead to: '
+        'cmd_vel_timeout plus the stop from wheel.max_velocity; a higher value weakens every stop '
+        'but the emergency stop',
+        unit='s',
+        low=0.1,
+        high=10.0,
+    )
+
+    def check_stopping_time(self, silence: float, deceleration: float, names: str) -> None:
+        """Raise ParameterError when the robot could take longer than allowed to stop.
+
+        Parameters
+        ----------
+        silence
+            Time from the last command to the beginning of the stop, s.
+        deceleration
+            Deceleration of the stop, rad/s².
+        names
+            What these depend on, for the error text.
+        """
+        time = silence + self.wheel_speed / deceleration
+        if time > self.max_stopping_time + 1e-9:
+            raise ParameterError(
+                f'{names} and wheel.max_velocity must stop the robot within max_stopping_time, '
+                f'{self.max_stopping_time:g} s after the last command: got {time:.3g} s'
+            )
+
     def check_consistency(self) -> None:
-        """Raise ParameterError when a stop would be slower than ordinary deceleration."""
+        """Raise ParameterError when a stop is slower than ordinary deceleration, or too slow."""
         if self.stop_deceleration < self.acceleration:
             raise ParameterError(
                 'wheel.stop_deceleration must be at least wheel.max_acceleration '
                 f'({self.acceleration:g} rad/s²): got {self.stop_deceleration:g}'
             )
+        self.check_stopping_time(
+            self.command_timeout,
+            self.stop_deceleration,
+            'cmd_vel_timeout, wheel.stop_deceleration',
+        )
 
 
 class LimitedCommand(NamedTuple):
@@ -221,6 +259,10 @@ class CommandLimiter:
             target, limited = self._within_limits(self._command.wheels)
         stops = target == ZERO_WHEEL_SPEEDS
         rate = parameters.stop_deceleration if stops else parameters.acceleration
+        # max_stopping_time presumes that the wheels are not faster than wheel.max_velocity.
+        too_fast = max(map(abs, wheels)) > parameters.wheel_speed
+        if self._estop or (stops and too_fast):
+            rate = max(rate, ESTOP_DECELERATION)
         self._ramp = _Ramp(wheels, target, rate, now_ns, hold)
         return LimitedCommand(
             self._ramp.at(hold), target, self.estop, self._timed_out, limited, self._reason

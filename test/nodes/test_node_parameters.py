@@ -92,7 +92,11 @@ def test_inconsistent_parameters_are_rejected_with_the_reason(harness):
     )
     assert robot.parameters.limiter.stop_deceleration == 60.0
     both = [Parameter('wheel.max_acceleration', value=5.0), slow]
-    assert robot.set_parameters_atomically(both).successful, 'together they fit'
+    response = robot.set_parameters_atomically(both)
+    assert not response.successful
+    assert 'within max_stopping_time, 0.5 s after the last command: got 1.25 s' in response.reason
+    all_three = [*both, Parameter('wheel.max_velocity', value=2.0)]
+    assert robot.set_parameters_atomically(all_three).successful, 'together they fit'
     assert robot.parameters.limiter.stop_deceleration == 10.0
     with pytest.raises(ParameterError, match='drive.kind must be stepper or velocity'):
         harness.add(SimRobotNode, namespace='other', drive__kind='torque')

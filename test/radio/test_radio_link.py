@@ -519,7 +519,7 @@ def test_nothing_is_commanded_while_the_robot_is_latched():
     assert arbiter.accept(RobotCommand(WheelSpeeds(1.0, 2.0), 0), 0) == ''
     assert arbiter.next_setpoint(True, MS)[:3] == (CommandFlag.ENABLE, 0, 0)
     assert arbiter.sent_wheels == (0.0, 0.0)
-    assert arbiter.next_setpoint(False, MS) == (CommandFlag.ENABLE, 2000, 1000)
+    assert arbiter.next_setpoint(False, MS) == (CommandFlag.ENABLE, 2000, 1000, 20)
 
 
 def test_an_emergency_stop_survives_a_jammed_link(bench):

@@ -207,3 +207,18 @@ def test_shutdown_ends_at_standstill_with_a_closed_port():
 def test_limits_above_those_of_the_board_are_rejected(name, value):
     with pytest.raises(ParameterError, match=f'{name} must be at most the limit of the board'):
         RadioRobotParameters.from_dict({name: value})
+
+
+@pytest.mark.parametrize(
+    'changes',
+    [
+        {'link.robot.deceleration': 40.0, 'wheel.stop_deceleration': 40.0},
+        {'link.ttl': 0.4, 'link.robot.ttl_max': 0.4},
+        {'link.cycle_rate': 5.0},
+        {'cmd_vel_timeout': 0.32},
+    ],
+)
+def test_settings_of_board_and_host_that_stop_too_late_are_rejected(changes):
+    with pytest.raises(ParameterError, match='within max_stopping_time'):
+        RadioRobotParameters.from_dict(changes)
+    RadioRobotParameters.from_dict(changes | {'max_stopping_time': 1.0})

@@ -240,6 +240,68 @@ def test_stop_deceleration_is_at_least_the_acceleration():
         CommandLimiterParameters(acceleration=80.0)
 
 
+def stop_time(limiter, now, begin):
+    """Return the time from ``begin`` (ms) to the end of the ramp, s."""
+    while limiter.advance(now * MS, 0.01).wheels != (0.0, 0.0):
+        now += 10
+    return (now - begin) / 1e3
+
+
+def test_settings_that_stop_too_late_are_rejected():
+    """Silence and ramp were bounded one by one: 0.5 s and 3.3 s were possible together."""
+    for changes in (
+        {'acceleration': 30.0, 'stop_deceleration': 30.0, 'command_timeout': 0.5},
+        {'acceleration': 3.0, 'stop_deceleration': 3.3},
+        {'wheel_speed': 20.0},
+        {'command_timeout': 0.4},
+        {'max_stopping_time': 0.4},
+    ):
+        with pytest.raises(ParameterError, match='within max_stopping_time'):
+            CommandLimiterParameters(**changes)
+    assert CommandLimiterParameters(command_timeout=0.4, max_stopping_time=0.6)
+    generator = np.random.default_rng(2)
+    accepted = 0
+    for _ in range(200):
+        changes = {
+            'wheel_speed': generator.uniform(0.5, 30.0),
+            'acceleration': (rate := generator.uniform(5.0, 100.0)),
+            'stop_deceleration': rate * generator.uniform(1.0, 3.0),
+            'command_timeout': generator.uniform(0.05, 0.5),
+        }
+        try:
+            limiter = make_limiter(linear_speed=5.0, **changes)
+        except ParameterError:
+            continue
+        accepted += 1
+        for now in range(0, 3000, 10):
+            limiter.accept(command(40.0, 40.0, now), now * MS)
+            limiter.advance(now * MS, 0.01)
+        # The output holds for a period, and the age is checked once in it.
+        assert stop_time(limiter, 3000, 2990) <= 0.5 + 0.02
+    assert accepted > 20
+
+
+def test_an_emergency_stop_has_a_fixed_least_deceleration():
+    limiter = make_limiter(acceleration=5.0, stop_deceleration=5.0, max_stopping_time=10.0)
+    for now in range(0, 3000, 10):
+        limiter.accept(command(10.0, 10.0, now), now * MS)
+        limiter.advance(now * MS, 0.01)
+    limiter.latch('test', 3000 * MS)
+    assert stop_time(limiter, 3000, 3000) <= 10.0 / 60.0 + 0.01
+
+
+def test_a_lower_speed_limit_does_not_slow_the_stop_from_a_higher_speed():
+    limiter = make_limiter()
+    for now in range(0, 1000, 10):
+        limiter.accept(command(10.0, 10.0, now), now * MS)
+        limiter.advance(now * MS, 0.01)
+    limiter.parameters = CommandLimiterParameters(
+        wheel_speed=0.5, acceleration=2.0, stop_deceleration=2.0
+    )
+    limiter.stop('test', 1000 * MS)
+    assert stop_time(limiter, 1000, 1000) <= 9.5 / 60.0 + 0.25 + 0.02
+
+
 def test_ramp_is_independent_of_the_update_rate():
     ends = []
     for period in (1, 5, 10, 50):

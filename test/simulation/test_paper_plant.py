@@ -105,6 +105,7 @@ def test_limited_acceleration_gives_a_lagged_ramp():
         'wheel__max_acceleration': rate,
         'wheel__stop_deceleration': rate,
         'drive__acceleration': rate,
+        'max_stopping_time': 1.0,
     }
     wheels = response(robot(**changes), WheelSpeeds(10.0, 10.0), 40)
     times = 0.01 * np.arange(1, 41)

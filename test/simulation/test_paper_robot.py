@@ -179,6 +179,7 @@ def test_finite_commands_give_finite_states():
             drive__kind=kind,
             drive__torque_limit=100.0,
             wheel__max_velocity=200.0,
+            max_stopping_time=10.0,
             linear__x__max_velocity=5.0,
             angular__z__max_velocity=50.0,
             friction__viscous=0.0,
