@@ -125,8 +125,12 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         )
         self._initial_reference = InitialInputs(self, 'reference')
         self._initial_odometry = InitialInputs(self, 'odom')
-        self.create_subscription(Odometry, 'reference', self._on_reference, qos.STREAM)
-        self.create_subscription(Odometry, 'odom', self._on_odometry, qos.STREAM)
+        self._references = self.create_matching_subscription(
+            Odometry, 'reference', self._on_reference, qos.STREAM
+        )
+        self._odometry = self.create_matching_subscription(
+            Odometry, 'odom', self._on_odometry, qos.STREAM
+        )
         self.create_service(SetBool, '~/enable', self._on_enable)
         self.create_service(Trigger, '~/reset', self._on_reset)
         self.create_service(Trigger, '~/save_model', self._on_save_model)
@@ -159,18 +163,19 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self._journal_publisher.publish(self._journal_message)
 
     def _on_reference(self, message: Odometry) -> None:
-        state = conversions.state_from_odometry(message)
-        self._journal.count_reference(state.stamp_ns)
-        if not self._controller.add_reference(state):
-            self._rejected_references += 1
-        self._initial_reference.republish(message)
+        for each in (message, *self._references.take_waiting()):
+            state = conversions.state_from_odometry(each)
+            self._journal.count_reference(state.stamp_ns)
+            if not self._controller.add_reference(state):
+                self._rejected_references += 1
+            self._initial_reference.republish(each)
 
     def _on_odometry(self, message: Odometry, info: dict[str, Any]) -> None:
         # Without a step, the watchdog stops the robot and the journal has no row.
         timeout = self.parameters.watchdog.odometry_timeout
         self._odometry_problem = age_problem(message_age_ns(info), timeout)
         if self._odometry_problem:
-            self._rejected_odometry += 1
+            self._rejected_odometry += 1 + len(self._odometry.take_waiting())
             return
         self._last_odometry_ns = self.steady_ns()
         measured = conversions.state_from_odometry(message)

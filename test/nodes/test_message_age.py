@@ -26,6 +26,7 @@ from support.ros_graph import (
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.common import command_subscription
 from t3mpc_ros.nodes.common.base_node import ERROR
+from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
 from t3mpc_ros.radio.link.port_actions import Write
@@ -122,3 +123,31 @@ def test_odometry_that_waited_is_no_step_of_the_controller(harness):
     assert 'odom is too old' in reason(controller)
     bench.publish_odometry()
     assert 'odom' not in reason(controller)
+
+
+def test_the_controller_recovers_from_a_backlog_of_odometry(harness):
+    """One message per cycle of the executor, and one more arriving: a queue once full stayed so.
+
+    In a process shared with other nodes the controller ran on odometry of a second ago.
+    """
+    controller = harness.add(ControllerNode)
+    odom = harness.create_publisher(Odometry, 'odom')
+    reference = harness.create_publisher(Odometry, 'reference')
+    for publisher in (odom, reference):
+        harness.wait_for_subscriber(publisher)
+        for _ in range(100):
+            publisher.publish(odometry(controller.now_ns(), 0.05))
+    suspend()
+    # Work between two cycles, as of a robot in the same process.
+    harness.publish_periodically(odom, lambda: odometry(controller.now_ns(), 0.05), 0.01)
+    lead_ns = 4 * NANOSECONDS // 10
+    harness.publish_periodically(
+        reference, lambda: odometry(controller.now_ns() + lead_ns, 0.05), 0.01
+    )
+
+    def tracking():
+        time.sleep(0.005)
+        return reason(controller) == 'tracking'
+
+    harness.spin_until(tracking)
+    assert diagnostic(controller, 'odometry_rejected') == 100

@@ -2,9 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Base class of the nodes: ROS parameters from a parameter class, diagnostics, shutdown hook."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from copy import copy
 import difflib
+from itertools import islice
 import sys
 from typing import Any, Generic, TypeVar
 
@@ -20,8 +22,10 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
 
-from t3mpc_ros.nodes.common import qos
+from t3mpc_ros.nodes.common import endpoints, qos
 from t3mpc_ros.parameters.table import ParameterError, Parameters, ParameterSpec
 
 P = TypeVar('P', bound=Parameters)
@@ -31,6 +35,12 @@ WARN = DiagnosticStatus.WARN
 ERROR = DiagnosticStatus.ERROR
 
 NO_CLOCK = 'no message on /clock yet'
+
+COMMON_TOPICS = ('/rosout', '/parameter_events', '/diagnostics')
+"""Topics that every node publishes."""
+
+ADAPT_PERIOD = 0.5
+"""Time between two comparisons of subscriptions with the offers of publishers, s."""
 
 ACK_TIMEOUT = Duration(nanoseconds=200_000_000)
 """Maximum wait of :func:`publish_and_wait_for_acked`."""
@@ -68,6 +78,9 @@ class BaseNode(Node, Generic[P]):
         # Steady time: diagnostics continue while the simulated clock is paused.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_steady_timer(1.0, self._publish_diagnostics)
+        self._matching: list[endpoints.MatchingSubscription] = []
+        self.create_steady_timer(ADAPT_PERIOD, self._adapt_subscriptions)
+        self._unused_overrides: list[str] | None = None
 
     def now_ns(self) -> int:
         """Return the node's time, ns: system time, or simulated time with ``use_sim_time``."""
@@ -85,6 +98,49 @@ class BaseNode(Node, Generic[P]):
         """Return a timer that calls ``callback`` every ``period`` seconds of steady time."""
         return self.create_timer(period, callback, clock=self._steady)
 
+    def create_publisher(
+        self, msg_type: type, topic: str, *args: Any, **options: Any
+    ) -> Publisher:
+        """Return a publisher with the QoS overrides of the user."""
+        return super().create_publisher(
+            msg_type, topic, *self._with_overrides(topic, 'publisher', args, options), **options
+        )
+
+    def create_subscription(
+        self, msg_type: type, topic: str, callback: Callable[..., None], *args: Any, **options: Any
+    ) -> Subscription:
+        """Return a subscription with the QoS overrides of the user."""
+        return super().create_subscription(
+            msg_type,
+            topic,
+            callback,
+            *self._with_overrides(topic, 'subscription', args, options),
+            **options,
+        )
+
+    def create_matching_subscription(
+        self, msg_type: type, topic: str, callback: Callable[..., None], profile: QoSProfile
+    ) -> endpoints.MatchingSubscription:
+        """Return a subscription whose request follows the offers of the publishers."""
+        made = endpoints.MatchingSubscription(self, msg_type, topic, callback, profile)
+        self._matching.append(made)
+        return made
+
+    def _with_overrides(
+        self, topic: str, kind: endpoints.Kind, args: tuple[Any, ...], options: dict[str, Any]
+    ) -> tuple[Any, ...]:
+        """Return the positional arguments, with a copy of the profile that rclpy may change."""
+        overriding = endpoints.overriding_options(self, topic, kind)
+        if overriding is None or 'qos_overriding_options' in options:
+            return args
+        options['qos_overriding_options'] = overriding
+        profile, *rest = args
+        return QoSProfile(depth=profile) if isinstance(profile, int) else copy(profile), *rest
+
+    def _adapt_subscriptions(self) -> None:
+        for subscription in self._matching:
+            subscription.adapt()
+
     def on_parameters_changed(self, parameters: P) -> None:
         """Apply changed dynamic parameters."""
 
@@ -101,6 +157,9 @@ class BaseNode(Node, Generic[P]):
 
     def _publish_diagnostics(self) -> None:
         level, message, values = self.produce_diagnostics()
+        if found := [text for text in self._graph_warnings() if text not in message]:
+            texts = found if level == OK else [message, *found]
+            level, message = max(level, WARN), '; '.join(texts)
         status = DiagnosticStatus(
             level=level,
             name=self.get_fully_qualified_name().lstrip('/'),
@@ -111,6 +170,28 @@ class BaseNode(Node, Generic[P]):
         array = DiagnosticArray(status=[status])
         array.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array)
+
+    def _graph_warnings(self) -> list[str]:
+        """Return what prevents this node and the others from working together."""
+        if self._unused_overrides is None:  # all endpoints exist by now
+            self._unused_overrides = endpoints.unused_overrides(self)
+            for name in self._unused_overrides:
+                self.get_logger().warning(f'{name} has no effect: this node has no such endpoint')
+        found = [
+            endpoints.qos_problem(self, (each.held for each in self._matching), 'subscription'),
+            endpoints.qos_problem(self, islice(self._public_publishers(), 20), 'publisher'),
+        ]
+        if self.get_clock().ros_time_is_active and not self.clock_started():
+            found.append(f'use_sim_time is set: {NO_CLOCK}')
+        return [text for text in found if text]
+
+    def _public_publishers(self) -> Iterator[Publisher]:
+        """Return the publishers of topics that other nodes use."""
+        own = self.get_fully_qualified_name() + '/'
+        for publisher in self.publishers:
+            name = publisher.topic_name
+            if name not in COMMON_TOPICS and not name.startswith(own):
+                yield publisher
 
 
 def publish_and_wait_for_acked(publisher: Publisher, message: Any) -> None:

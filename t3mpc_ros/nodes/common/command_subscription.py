@@ -12,10 +12,10 @@ import time
 from typing import Any
 
 from geometry_msgs.msg import Twist, TwistStamped
-from rclpy.node import Node
 
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist
 from t3mpc_ros.nodes.common import conversions, qos
+from t3mpc_ros.nodes.common.base_node import BaseNode
 
 MAX_CLOCK_LEAD_NS = NANOSECONDS // 20
 """Lead of the publisher's clock beyond which the age of a message is unknown."""
@@ -70,7 +70,7 @@ class CommandSubscription:
 
     def __init__(
         self,
-        node: Node,
+        node: BaseNode[Any],
         stamped: bool,
         timeout: Callable[[], float],
         apply: Callable[[BodyTwist, int], str],
@@ -89,7 +89,9 @@ class CommandSubscription:
         self._apply = apply
         self._clock_ns, self._robot_ns = clocks
         self._simulated = simulated
-        node.create_subscription(self.message_type, 'cmd_vel', self._on_message, qos.LATEST)
+        node.create_matching_subscription(
+            self.message_type, 'cmd_vel', self._on_message, qos.LATEST
+        )
 
     def _on_message(self, message: Twist | TwistStamped, info: dict[str, Any]) -> None:
         # First of all: if the process is suspended from here on, the command ages.

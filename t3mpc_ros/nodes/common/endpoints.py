@@ -1,0 +1,177 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""QoS of publishers and subscriptions: overrides of the user, adaptation to offers, mismatches."""
+
+from collections.abc import Callable, Iterable
+import copy
+from typing import Any, Literal
+
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.qos import QoSCompatibility, QoSPolicyKind, QoSProfile, qos_check_compatible
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+from t3mpc_ros.nodes.common import qos
+from t3mpc_ros.parameters.table import ParameterError
+
+Kind = Literal['publisher', 'subscription']
+
+UNLIMITED = 2**63 - 1
+"""RMW_DURATION_INFINITE, ns."""
+
+PREFIX = 'qos_overrides.'
+
+
+def overriding_options(node: Node, topic: str, kind: Kind) -> QoSOverridingOptions | None:
+    """Return the policies of an endpoint that the user overrides, None without any.
+
+    Parameters are declared for these policies only, as ``qos_overrides.<topic>.<kind>.<policy>``.
+
+    Raises
+    ------
+    ParameterError
+        An override names no policy or a value that the policy does not have.
+    """
+    prefix = f'{PREFIX}{node.resolve_topic_name(topic)}.{kind}.'
+    overrides = node._parameter_overrides  # rclpy has no public access to them
+    given = [name for name in overrides if name.startswith(prefix)]
+    kinds = [
+        _policy_kind(name, name.removeprefix(prefix), overrides[name].value) for name in given
+    ]
+    return QoSOverridingOptions(kinds) if kinds else None
+
+
+def _policy_kind(parameter: str, policy: str, value: object) -> QoSPolicyKind:
+    known = [kind.name.lower() for kind in QoSPolicyKind if kind is not QoSPolicyKind.INVALID]
+    if policy not in known:
+        raise ParameterError(f'{parameter} must end with one of {", ".join(known)}: got {policy}')
+    choices = {
+        'reliability': qos.ReliabilityPolicy,
+        'durability': qos.DurabilityPolicy,
+        'history': qos.HistoryPolicy,
+    }
+    if policy in choices:
+        names = [choice.lower() for choice in choices[policy].__members__ if choice != 'UNKNOWN']
+        if value not in names:
+            raise ParameterError(f'{parameter} must be one of {", ".join(names)}: got {value!r}')
+    return QoSPolicyKind[policy.upper()]
+
+
+def unused_overrides(node: Node) -> list[str]:
+    """Return the QoS overrides that match no publisher and no subscription of the node."""
+    return [
+        name
+        for name in node._parameter_overrides
+        if name.startswith(PREFIX) and not node.has_parameter(name)
+    ]
+
+
+class MatchingSubscription:
+    """A subscription that requests what all publishers of its topic offer.
+
+    Robots on micro-ROS and TurtleBot 4 publish best effort, which a reliable subscription does
+    not receive. The request is weakened when such a publisher appears. A QoS that the user
+    overrides is kept.
+
+    Parameters
+    ----------
+    node
+        Node that subscribes.
+    message
+        Message class.
+    topic
+        Topic name.
+    callback
+        Called with each message.
+    profile
+        Request while all publishers offer it.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        message: type,
+        topic: str,
+        callback: Callable[..., None],
+        profile: QoSProfile,
+    ) -> None:
+        self._node = node
+        self._arguments = message, topic, callback
+        self._overridden = overriding_options(node, topic, 'subscription') is not None
+        self.held: Subscription = node.create_subscription(*self._arguments, profile)
+        """The present subscription."""
+
+    def adapt(self) -> None:
+        """Subscribe again if a publisher does not offer what is requested."""
+        if self._overridden:
+            return
+        held, name = self.held, self.held.topic_name
+        offers = [info.qos_profile for info in self._node.get_publishers_info_by_topic(name)]
+        if qos.compatible_with_all(held.qos_profile, offers):
+            return
+        profile = copy.copy(held.qos_profile)
+        profile.reliability = qos.adapt_request_to_offers(offers).reliability
+        if profile.reliability == held.qos_profile.reliability:
+            return  # the mismatch is another one, which the diagnostics name
+        self._node.destroy_subscription(held)
+        self.held = self._node.create_subscription(*self._arguments, profile)
+        self._node.get_logger().info(f'{name} is published best effort')
+
+    def take_waiting(self) -> list[Any]:
+        """Return the messages that wait in the queue.
+
+        The executor takes one message of a subscription per cycle: a queue that has filled while
+        it was busy would otherwise stay full, and every message would wait as long.
+        """
+        held = self.held
+        messages: list[Any] = []
+        with held.handle:
+            while len(messages) < held.qos_profile.depth:
+                if (item := held.handle.take_message(held.msg_type, False)) is None:
+                    break
+                messages.append(item[0])
+        return messages
+
+
+def qos_problem(node: Node, endpoints: Iterable[Any], kind: Kind) -> str:
+    """Return the first QoS mismatch between endpoints of a node and their peers, or nothing.
+
+    Parameters
+    ----------
+    node
+        The node.
+    endpoints
+        Its publishers, or its subscriptions.
+    kind
+        Which of both they are.
+    """
+    for endpoint in endpoints:
+        name, own = endpoint.topic_name, endpoint.qos_profile
+        if kind == 'publisher':
+            peers = node.get_subscriptions_info_by_topic(name)
+            pairs = [(own, peer.qos_profile) for peer in peers]
+        else:
+            peers = node.get_publishers_info_by_topic(name)
+            pairs = [(peer.qos_profile, own) for peer in peers]
+        for peer, (offered, requested) in zip(peers, pairs, strict=True):
+            result, reason = qos_check_compatible(_comparable(offered), _comparable(requested))
+            if result == QoSCompatibility.ERROR:
+                return _mismatch(name, peer, reason)
+    return ''
+
+
+def _comparable(profile: QoSProfile) -> QoSProfile:
+    """Return a profile with 0, as in a default profile, for the infinite times of the graph."""
+    result = copy.copy(profile)
+    for name in ('deadline', 'lifespan', 'liveliness_lease_duration'):
+        if getattr(profile, name).nanoseconds == UNLIMITED:
+            setattr(result, name, Duration())
+    return result
+
+
+def _mismatch(topic: str, peer: TopicEndpointInfo, reason: str) -> str:
+    name = f'{peer.node_namespace.rstrip("/")}/{peer.node_name}'
+    policies = reason.removeprefix('ERROR: ').strip('; ').replace('; ERROR:', ',')
+    return f'no message passes between {name} and this node on {topic}: {policies}'

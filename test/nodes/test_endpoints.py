@@ -1,0 +1,104 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""QoS of the endpoints: best-effort robots, overrides, mismatches in the diagnostics."""
+
+from geometry_msgs.msg import Twist
+from nav_msgs.msg import Odometry
+import pytest
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from support.ros_graph import diagnostic, odometry, reason, twist
+
+from t3mpc_ros.nodes.common import qos
+from t3mpc_ros.nodes.common.base_node import WARN
+from t3mpc_ros.nodes.controller import ControllerNode
+from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
+from t3mpc_ros.nodes.sim_robot import SimRobotNode
+from t3mpc_ros.parameters.table import ParameterError
+
+pytestmark = pytest.mark.ros
+
+BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+ODOM_OVERRIDE = 'qos_overrides./odom.{}.reliability:={}'
+
+
+def test_the_controller_receives_best_effort_inputs(harness):
+    """A reliable subscription does not receive them: TurtleBot 4 and micro-ROS were ignored."""
+    controller = harness.add(ControllerNode)
+    reference = harness.create_publisher(Odometry, 'reference', BEST_EFFORT)
+    odom = harness.create_publisher(Odometry, 'odom', BEST_EFFORT)
+    for publisher, lead_ns in ((reference, 400_000_000), (odom, 0)):
+        harness.publish_periodically(
+            publisher, lambda lead=lead_ns: odometry(controller.now_ns() + lead, 0.05), 0.01
+        )
+    harness.spin_until(lambda: diagnostic(controller, 'steps') > 0, 'no odometry received')
+    harness.spin_until(lambda: reason(controller) == 'tracking', 'no reference received')
+
+
+def test_a_robot_executes_best_effort_commands(harness):
+    robot = harness.add(SimRobotNode)
+    commands = harness.create_publisher(Twist, 'cmd_vel', BEST_EFFORT)
+    harness.publish_periodically(commands, lambda: twist(0.05))
+    harness.spin_until(lambda: diagnostic(robot, 'commands') > 0, 'no command received')
+
+
+def test_a_later_best_effort_publisher_is_received_as_well(harness):
+    controller = harness.add(ControllerNode)
+    reliable = harness.create_publisher(Odometry, 'odom')
+    harness.publish_periodically(reliable, lambda: odometry(controller.now_ns()), 0.01)
+    harness.spin_until(lambda: diagnostic(controller, 'steps') > 0)
+    late = harness.create_publisher(Odometry, 'odom', BEST_EFFORT)
+    harness.spin_until(lambda: late.get_subscription_count() > 0, 'the publisher has no match')
+    assert reliable.get_subscription_count() > 0
+
+
+@pytest.mark.parametrize('reliability', ['reliable', 'best_effort'])
+def test_overrides_of_the_user_are_the_qos_of_the_publisher(reliability, harness):
+    """They were accepted without effect."""
+    offered = qos.STREAM.reliability
+    harness.add(SimRobotNode, ['-p', ODOM_OVERRIDE.format('publisher', reliability)])
+    (offer,) = harness.probe.get_publishers_info_by_topic('/odom')
+    assert offer.qos_profile.reliability == ReliabilityPolicy[reliability.upper()]
+    assert qos.STREAM.reliability == offered, 'the profile of the other endpoints is unchanged'
+
+
+def test_an_overridden_request_is_kept_and_its_mismatch_named(harness):
+    controller = harness.add(
+        ControllerNode, ['-p', ODOM_OVERRIDE.format('subscription', 'reliable')]
+    )
+    harness.create_publisher(Odometry, 'odom', BEST_EFFORT)
+    words = 'no message passes between /probe and this node on /odom: best effort publisher'
+
+    def named():
+        status = harness.next_status('controller')
+        return status.level >= WARN and words in status.message.lower()
+
+    harness.spin_until(named)
+    assert diagnostic(controller, 'steps') == 0
+
+
+def test_a_subscriber_that_requests_too_much_is_named(harness):
+    harness.add(ReferenceGeneratorNode)
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    harness.subscribe(Odometry, 'reference', latched)
+    words = '/probe and this node on /reference: volatile publisher and transient local'
+    harness.spin_until(lambda: words in harness.next_status('reference_generator').message.lower())
+
+
+@pytest.mark.parametrize(
+    'override, words',
+    [
+        ('publisher.reliability:=sometimes', 'must be one of .*best_effort.*: got .sometimes'),
+        ('publisher.relibility:=reliable', 'must end with one of .*reliability'),
+    ],
+)
+def test_an_invalid_override_is_rejected_with_the_reason(override, words, harness):
+    with pytest.raises(ParameterError, match=words):
+        harness.add(SimRobotNode, ['-p', f'qos_overrides./odom.{override}'])
+
+
+def test_an_override_without_endpoint_is_a_warning(processes):
+    processes.start(
+        'sim_robot', '--ros-args', '-p', ODOM_OVERRIDE.format('subscription', 'reliable')
+    )
+    processes.wait_for('sim_robot', 'qos_overrides./odom.subscription.reliability has no effect')
+    assert processes.stop('sim_robot') == 0
