@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 # Sourced by every script: creates or updates the local environment .venv, and sets $PYTHON.
 # Requires Python 3.11 to 3.14 and a package index; a system ROS is neither required nor used.
+# $ROOT is the folder of the checkout: the scripts resolve a symlink to themselves before.
 
 set -euo pipefail
 
@@ -70,6 +71,34 @@ wanted_stamp() {
 
 is_current() { [ "$(cat "$VENV/stamp" 2>/dev/null)" = "$(wanted_stamp)" ]; }
 
+# Run a command of the set-up with its output in the log, and show that it takes time.
+CHILD=''
+run() {
+  local code=0 tenths=0
+  # A session of its own: a signal to the script ends everything that the command has started.
+  setsid "$@" >>"$LOG" 2>&1 9>&- &
+  CHILD=$!
+  while kill -0 "$CHILD" 2>/dev/null; do
+    sleep 0.2
+    tenths=$((tenths + 2))
+    if ((tenths % 100 == 0)); then say "    $((tenths / 10)) s"; fi
+  done
+  wait "$CHILD" || code=$?
+  CHILD=''
+  return "$code"
+}
+
+stop_set_up() {
+  if [ -n "$CHILD" ]; then
+    kill -TERM -- "-$CHILD" 2>/dev/null || true
+    sleep 0.5
+    kill -KILL -- "-$CHILD" 2>/dev/null || true
+    wait "$CHILD" 2>/dev/null || true
+  fi
+  say 'stopped; run the script again to complete the set-up'
+  exit "$1"
+}
+
 make_environment() {
   local origin
   rm -f "$VENV/stamp"
@@ -79,29 +108,29 @@ make_environment() {
     say "updating the local environment .venv (log: $LOG)"
   else
     say "creating the local environment .venv (once, about a minute; log: $LOG)"
-    "$BASE_PYTHON" -m venv --clear "$VENV" >>"$LOG" 2>&1 ||
+    run "$BASE_PYTHON" -m venv --clear "$VENV" ||
       fail "the environment could not be created with $BASE_PYTHON: $(tail -n 1 "$LOG")" \
         "install Python's venv module (Debian and Ubuntu: apt install python3-venv), then run $0 again"
     printf '%s\n' "$origin" >"$VENV/origin"
   fi
   say "  installing ROS 2 Jazzy and the libraries from the package index"
-  if ! "$PYTHON" -m pip install --disable-pip-version-check \
-    -r "$ROOT/requirements.txt" -r "$ROOT/requirements-dev.txt" >>"$LOG" 2>&1; then
+  if ! run "$PYTHON" -m pip install --disable-pip-version-check \
+    -r "$ROOT/requirements.txt" -r "$ROOT/requirements-dev.txt"; then
     say "$(grep -iE 'error|could not|no matching' "$LOG" | tail -n 3)"
     fail "the libraries could not be installed with $("$PYTHON" --version) on $(uname -sm)" \
       "check the network and the package index (\"$PYTHON -m pip config list\"; proxies: HTTPS_PROXY), then run $0 again; the wheels of ROS 2 exist for Linux on x86_64"
   fi
   say "  installing t3mpc_ros"
   # The files of an earlier pip install would hide new executables.
-  "$PYTHON" -m pip uninstall --disable-pip-version-check -q -y t3mpc_ros >>"$LOG" 2>&1 || true
+  run "$PYTHON" -m pip uninstall --disable-pip-version-check -q -y t3mpc_ros || true
   # develop installs the executables into lib/t3mpc_ros, the folder that ros2 run searches; those
   # of an earlier version are removed.
   rm -rf "$VENV/lib/t3mpc_ros"
-  (cd -- "$ROOT" && "$PYTHON" -W ignore setup.py -q develop --no-deps \
-    install_data --install-dir "$VENV") >>"$LOG" 2>&1 ||
+  run env -C "$ROOT" "$PYTHON" -W ignore setup.py -q develop --no-deps \
+    install_data --install-dir "$VENV" ||
     fail "the package could not be installed: $(tail -n 1 "$LOG")" "see $LOG"
-  say "  compiling the kernels"
-  (cd -- "$ROOT" && "$PYTHON" -m t3mpc_ros.cli.main compile) >>"$LOG" 2>&1 ||
+  say "  compiling the kernels (about a minute)"
+  run env -C "$ROOT" "$PYTHON" -m t3mpc_ros.cli.main compile ||
     fail "the kernels could not be compiled: $(tail -n 1 "$LOG")" "see $LOG"
   wanted_stamp >"$VENV/stamp"
 }
@@ -126,14 +155,18 @@ BASE_PYTHON="$(choose_python)"
 if ! is_current; then
   [ -w "$ROOT" ] || fail "$ROOT is not writable; .venv is created there" \
     "copy the folder to a writable location and run $0 there"
-  (
-    # One script at a time creates the environment; the others wait.
-    flock --nonblock 9 || {
-      say "waiting for another script that creates the local environment"
-      flock 9
-    }
-    is_current || make_environment
-  ) 9>"$ROOT/.venv.lock"
+  trap 'stop_set_up 130' INT
+  trap 'stop_set_up 143' TERM
+  trap 'stop_set_up 129' HUP
+  # One script at a time creates the environment; the others wait.
+  exec 9>"$ROOT/.venv.lock"
+  flock --nonblock 9 || {
+    say "waiting for another script that creates the local environment"
+    until flock --nonblock 9; do sleep 0.2; done
+  }
+  is_current || make_environment
+  exec 9>&-
+  trap - INT TERM HUP
 fi
 
 export PATH="$VENV/bin:$PATH"

@@ -14,6 +14,8 @@ class StopSignal:
 
     def __init__(self) -> None:
         self._received = False
+        self.number = 0
+        """Number of the first signal; 0 before."""
 
     def __call__(self) -> bool:
         """Return whether a signal was received."""
@@ -29,3 +31,4 @@ class StopSignal:
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self._received = True
+        self.number = self.number or number

@@ -19,6 +19,7 @@ import types
 import pytest
 import yaml
 
+from t3mpc_ros.cli.main import _parser as cli_parser
 from t3mpc_ros.nodes.registry import NODES, parameter_class
 
 # All tests share one build.
@@ -347,6 +348,10 @@ exec(sys.argv[2])' "$here" "$2" ;;
   echo "$here" >"$target/bin/version" ;;
 *'pip install'*)
   echo pip >>"$notes"
+  if [ -e "$(dirname "$notes")/slow" ]; then
+    echo "$BASHPID" >"$(dirname "$notes")/slow"
+    sleep 60
+  fi
   if [ -e "$(dirname "$notes")/no_index" ]; then
     echo 'ERROR: Could not find a version that satisfies the requirement numpy'
     exit 1
@@ -371,7 +376,8 @@ class Checkout:
         self.notes = folder / 'notes'
         self.bin = folder / 'bin'
         self.python(self.bin, '3.12.3')
-        tools = 'bash cat chmod cp cut dirname env flock grep mkdir rm sha256sum tail uname'
+        tools = 'bash cat chmod cp cut dirname env flock grep mkdir readlink rm setsid sha256sum'
+        tools += ' sleep tail uname'
         for tool in tools.split():
             (self.bin / tool).symlink_to(shutil.which(tool))
 
@@ -511,6 +517,46 @@ def test_an_interrupted_setup_is_repaired_by_the_next_run(checkout):
     (checkout.notes.parent / 'no_index').unlink()
     assert checkout.run('t3mpc').returncode == 0
     assert checkout.done() == ['pip', 'setup', 'compile']
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_the_set_up_and_its_commands(number, checkout):
+    """A signal to the script once left pip running, with the lock of the set-up."""
+    slow = checkout.notes.parent / 'slow'
+    slow.touch()
+    script = subprocess.Popen(**checkout.command('t3mpc'))
+    deadline = time.monotonic() + 30.0
+    while not (pid := slow.read_text().strip()):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    script.send_signal(number)
+    _, errors = script.communicate(timeout=30)  # the pipe ends with the last process of the set-up
+    assert script.returncode == 128 + number
+    assert 'stopped' in errors
+    assert not Path('/proc', pid).exists()
+    assert not checkout.stamped
+
+
+def test_the_help_of_the_demo_needs_no_environment(checkout):
+    for word in ('--help', '-h'):
+        command = checkout.command()
+        command['args'] = [checkout.root / 'scripts' / 'demo', '--headless', word]
+        done = subprocess.run(**command)
+        assert (done.returncode, done.stderr) == (0, '')
+        options = vars(cli_parser().parse_args(['demo'])).keys() - {'command', 'run'}
+        assert all(f'--{name}' in done.stdout for name in options)
+    assert checkout.done() == []
+    assert not (checkout.root / '.venv').exists()
+
+
+def test_a_symlink_to_a_script_works(checkout, tmp_path):
+    link = tmp_path / 'run'
+    link.symlink_to(checkout.root / 'scripts' / 'run')
+    command = checkout.command('t3mpc', 'x')
+    command['args'][0] = link
+    done = subprocess.run(**command)
+    assert (done.returncode, done.stdout) == (0, 't3mpc got x\n'), done.stderr
+    assert checkout.stamped
 
 
 def test_a_failed_update_does_not_count_as_an_environment(checkout):

@@ -12,8 +12,6 @@ import time
 
 import pytest
 
-from t3mpc_ros.cli.process_group import private_graph
-
 pytestmark = pytest.mark.ros
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -55,14 +53,14 @@ SHORTENED = {
     'scripts/run t3mpc robot ping --port dongle': ([], False),
     'scripts/run t3mpc robot jog left 1 --port dongle --key robot.key --yes': ([], False),
     'scripts/run radio_bridge --ros-args -p port:=dongle -p key_file:=robot.key': ([], True),
-    'scripts/run t3mpc bag info runs/<time>/bag': ([], False),
-    'scripts/run t3mpc bag report runs/<time>/bag': (['--output', 'OUTPUT/report'], False),
-    'scripts/run t3mpc bag replay runs/<time>/bag': ([], False),
-    'scripts/run t3mpc bag replay runs/<time>/bag --set law.gain=20.0': ([], False),
-    'scripts/run t3mpc bag compare runs/<time>/bag --picture divergence.png': ([], False),
-    'scripts/run t3mpc bag recover runs/<time>/bag --output recovered': ([], False),
-    'scripts/run t3mpc bag train runs/<time>/bag --keep-predictor --output model.npz': ([], False),
-    'scripts/run player --ros-args -p storage.uris:=[runs/<time>/bag]': (
+    'scripts/run t3mpc bag info runs/latest/bag': ([], False),
+    'scripts/run t3mpc bag report runs/latest/bag': (['--output', 'OUTPUT/report'], False),
+    'scripts/run t3mpc bag replay runs/latest/bag': ([], False),
+    'scripts/run t3mpc bag replay runs/latest/bag --set law.gain=20.0': ([], False),
+    'scripts/run t3mpc bag compare runs/latest/bag --picture divergence.png': ([], False),
+    'scripts/run t3mpc bag recover runs/latest/bag --output recovered': ([], False),
+    'scripts/run t3mpc bag train runs/latest/bag --keep-predictor --output model.npz': ([], False),
+    'scripts/run player --ros-args -p storage.uris:=[runs/latest/bag]': (
         ['-p', 'play.rate:=10.0'],
         False,
     ),
@@ -128,7 +126,7 @@ def boards(command, output):
 @pytest.mark.parametrize('command', list(SHORTENED))
 def test_the_command_works(command, output, tmp_path, graph, boards):
     extra, endless = SHORTENED[command]
-    arguments = command.replace('runs/<time>', 'run').split()
+    arguments = command.replace('runs/latest', 'run').split()
     arguments += [word.replace('OUTPUT', str(output)) for word in extra]
     log = tmp_path / 'output.txt'
     with _started(arguments, output, log) as process:
@@ -151,7 +149,6 @@ def _started(arguments, folder, log):
         process = subprocess.Popen(
             [str(ROOT / arguments[0]), *arguments[1:]],
             cwd=folder,
-            env=private_graph(),
             stdin=subprocess.DEVNULL,
             stdout=target,
             stderr=subprocess.STDOUT,

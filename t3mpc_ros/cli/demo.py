@@ -6,12 +6,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 import shutil
+import signal
 import sys
 import time
+from typing import TYPE_CHECKING
 
-from t3mpc_ros.cli.process_group import ProcessError, ProcessGroup, private_graph
-from t3mpc_ros.evaluation.bag_report.metrics import ReportMetrics
-from t3mpc_ros.evaluation.bag_report.report_page import write_report
+from t3mpc_ros.cli.private_graph import PrivateGraph
+from t3mpc_ros.cli.process_group import ProcessError, ProcessGroup, StopRequestedError
+from t3mpc_ros.stop_signal import StopSignal
+
+if TYPE_CHECKING:
+    from t3mpc_ros.evaluation.bag_report.metrics import ReportMetrics
 
 BOARD = 'emulator'
 """Not a node: it has no parameters and its own ready message."""
@@ -34,6 +39,10 @@ ROBOTS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
 the twin on an emulated board behind a serial port and a radio."""
 FOLLOWS = 'tracking'
 """Log message of the controller when it follows the reference; discovery takes seconds."""
+DISCOVERY_TIMEOUT = 60.0
+"""Maximum time from the start of the last node to this message, s."""
+END_TIMEOUT = 1.2
+"""Time that the nodes, and then the recorder, have to end after a signal, s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +124,30 @@ class Progress:
             self._next_line += max(10.0, self._seconds / 6)
 
 
-def run_demo(options: DemoOptions) -> ReportMetrics:
+class DemoInterruptedError(RuntimeError):
+    """A signal has ended the demo; the text says what was recorded.
+
+    Parameters
+    ----------
+    number
+        The signal.
+    bag
+        Folder of the recording; need not exist.
+    """
+
+    def __init__(self, number: int, bag: Path) -> None:
+        self.number = number
+        text = 'stopped before anything was recorded'
+        if any(bag.glob('*.mcap')):
+            text = (
+                f'stopped; the recording so far is {bag}\n'
+                f'its report: scripts/run t3mpc bag report {bag}\n'
+                f'if a file of it is unfinished: scripts/run t3mpc bag recover {bag}'
+            )
+        super().__init__(text)
+
+
+def run_demo(options: DemoOptions) -> 'ReportMetrics':
     """Run reference generator, controller, robot and recorder; return the report metrics.
 
     The bag is in ``output/bag``, the nodes' logs in ``output/log``, the report beside them.
@@ -124,6 +156,10 @@ def run_demo(options: DemoOptions) -> ReportMetrics:
     ------
     ProcessError
         A node did not start, ended during the run, or did not end cleanly; all are stopped.
+    DemoInterruptedError
+        SIGINT, SIGTERM or SIGHUP has ended the run; all nodes are stopped.
+    NoDomainError
+        Every ROS domain of this machine is in use.
     OSError
         The output folder cannot be made.
     """
@@ -131,40 +167,57 @@ def run_demo(options: DemoOptions) -> ReportMetrics:
     bag = options.output / 'bag'
     if bag.exists() and any(bag.iterdir()):
         raise ProcessError(f'{bag} already holds a recording; choose another folder with --output')
-    processes = ProcessGroup(options.output / 'log', private_graph())
+    with StopSignal() as stop:
+        try:
+            with PrivateGraph() as graph:
+                _show(f'  ROS_DOMAIN_ID {graph.domain}, on loopback')
+                _run_nodes(options, graph, stop)
+        except StopRequestedError:
+            raise DemoInterruptedError(stop.number, bag) from None
+    _show('  drawing the report from the bag')
+    try:
+        from t3mpc_ros.evaluation.bag_report.report_page import write_report  # takes seconds
+
+        return write_report(bag, options.output)
+    except KeyboardInterrupt:
+        raise DemoInterruptedError(signal.SIGINT, bag) from None
+
+
+def _run_nodes(options: DemoOptions, graph: PrivateGraph, stop: StopSignal) -> None:
+    """Start the nodes, wait for the duration of the run, and stop them."""
+    logs = options.output / 'log'
+    processes = ProcessGroup(logs, graph.environment(), stop, lambda line: _show(f'    {line}'))
     parameters = options.parameters()
-    parameters['recorder']['storage.uri'] = str(bag.resolve())
+    parameters['recorder']['storage.uri'] = str((options.output / 'bag').resolve())
     # The nodes are stopped one after the other, which is no reason for a snapshot.
     parameters['recorder']['storage.snapshot_duration'] = 0.0
     # The robot stops after the nodes that command it, then the recorder, then the board.
-    stopped: tuple[str, ...] = (
-        'reference_generator',
-        'controller',
-        options.robot_node,
-        'recorder',
-    )
+    order = 'reference_generator', 'controller', options.robot_node, 'recorder', BOARD
     try:
         if board := options.board():
             processes.start(BOARD, BOARD, *board, program='t3mpc')
             processes.wait_for(BOARD, 'stop with Ctrl-C', 120.0)
-            stopped = (*stopped, BOARD)
         for name in options.nodes:
-            print(f'  starting {name}', file=sys.stderr, flush=True)
+            _show(f'  starting {name}')
             processes.start(name, parameters=parameters[name])
             processes.wait_ready(name)
-        print('  waiting for discovery', file=sys.stderr, flush=True)
-        processes.wait_for('controller', FOLLOWS)
+        _show('  waiting for discovery')
+        processes.wait_for('controller', FOLLOWS, DISCOVERY_TIMEOUT)
         _watch(processes, options)
+        codes = processes.stop_all(order)
     finally:
-        codes = processes.stop_all(stopped)
+        # Nothing is left after a normal end.
+        processes.end_all(('recorder', BOARD), END_TIMEOUT if stop() else 10.0)
     if wrong := {name: code for name, code in codes.items() if code}:
         raise ProcessError(
             'not every node ended cleanly: '
             + ', '.join(f'{name} with code {code}' for name, code in wrong.items())
-            + f'; see {options.output / "log"}'
+            + f'; see {logs}'
         )
-    print('  drawing the report from the bag', file=sys.stderr, flush=True)
-    return write_report(bag, options.output)
+
+
+def _show(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
 
 
 def _watch(processes: ProcessGroup, options: DemoOptions) -> None:

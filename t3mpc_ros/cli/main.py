@@ -57,23 +57,38 @@ def _run(words: Sequence[str]) -> int:
 
 
 def _demo(options: argparse.Namespace) -> int:
-    from t3mpc_ros.cli.demo import DemoOptions, run_demo
+    from t3mpc_ros.cli.demo import DemoInterruptedError, DemoOptions, run_demo
 
-    output = options.output or Path('runs') / f'{datetime.now():%Y%m%d-%H%M%S}'
-    figures = run_demo(
-        DemoOptions(
-            options.duration,
-            output,
-            options.headless,
-            options.seed,
-            options.robot,
-            options.loss,
+    output = options.output or _new_run(Path('runs'))
+    try:
+        figures = run_demo(
+            DemoOptions(
+                options.duration,
+                output,
+                options.headless,
+                options.seed,
+                options.robot,
+                options.loss,
+            )
         )
-    )
+    except DemoInterruptedError as interruption:
+        print(interruption, file=sys.stderr)
+        return 128 + interruption.number
     print(figures.summary())
     if not options.headless:
         webbrowser.open(figures.report.resolve().as_uri())
     return 0
+
+
+def _new_run(folder: Path) -> Path:
+    """Return a new folder named after the time; the link ``latest`` beside it leads to it."""
+    output = folder / f'{datetime.now():%Y%m%d-%H%M%S}'
+    output.mkdir(parents=True)
+    link, new_link = folder / 'latest', output / 'link'
+    if link.is_symlink() or not link.exists():
+        new_link.symlink_to(output.name)
+        new_link.replace(link)  # at once, also for a second demo
+    return output
 
 
 def _estimation(options: argparse.Namespace) -> int:

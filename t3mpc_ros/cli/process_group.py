@@ -2,18 +2,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """Starts, monitors and stops the package's executables as processes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+import ctypes
+from functools import partial
 import os
 from pathlib import Path
-import random
 import signal
 import subprocess
 import sys
 import time
 
+READY_TIMEOUT = 300.0
+"""Maximum start of a node, s: a busy machine takes minutes to compile the kernels."""
+PROGRESS_PERIOD = 5.0
+"""Time between two lines of progress in a wait, s."""
+
 
 class ProcessError(RuntimeError):
     """An executable that did not start, or ended when it should not have."""
+
+
+class StopRequestedError(ProcessError):
+    """A stop was requested while the processes were being started, watched or stopped."""
 
 
 def executable(name: str) -> Path:
@@ -24,7 +34,7 @@ def executable(name: str) -> Path:
     ProcessError
         It is not installed; the text gives the remedy.
     """
-    path = _installed(Path('lib') / 't3mpc_ros' / name)
+    path = installed_file(Path('lib') / 't3mpc_ros' / name)
     if path is None or not os.access(path, os.X_OK):
         raise ProcessError(
             f'the executable {name} is not installed below any of '
@@ -34,35 +44,26 @@ def executable(name: str) -> Path:
     return path
 
 
-def private_graph() -> dict[str, str]:
-    """Return environment variables that isolate a run on this machine.
-
-    Variables that are set already are kept. Otherwise a ``ROS_DOMAIN_ID`` is drawn, so that two
-    runs do not share a graph, and Fast DDS uses UDP on loopback only: its shared memory may block
-    a publisher for a third of a second when a subscriber joins (Fast-DDS issue 6535).
-    """
-    environment = dict(os.environ)
-    environment.setdefault('ROS_DOMAIN_ID', str(random.SystemRandom().randint(1, 101)))
-    environment.setdefault('RCUTILS_COLORIZED_OUTPUT', '0')
-    profile = _installed(Path('share') / 't3mpc_ros' / 'config' / 'fastdds_loopback.xml')
-    chosen = {'ROS_AUTOMATIC_DISCOVERY_RANGE', 'FASTRTPS_DEFAULT_PROFILES_FILE'} & set(environment)
-    if not chosen:
-        if profile is None:
-            environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-        else:
-            environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'SYSTEM_DEFAULT'
-            environment['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(profile)
-    return environment
-
-
 def _prefixes() -> list[Path]:
     # A workspace that was sourced comes before the environment it runs in, as for `ros2 run`.
     found = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
     return [Path(prefix) for prefix in dict.fromkeys(found) if prefix]
 
 
-def _installed(path: Path) -> Path | None:
+def installed_file(path: Path) -> Path | None:
+    """Return the installed file of a path relative to the prefix, None without one."""
     return next((prefix / path for prefix in _prefixes() if (prefix / path).exists()), None)
+
+
+_LIBC = ctypes.CDLL(None)
+_PR_SET_PDEATHSIG = 1
+
+
+def _end_with_parent(parent: int) -> None:
+    """Let the kernel send SIGTERM to this process when its parent ends, whatever ends it."""
+    _LIBC.prctl(_PR_SET_PDEATHSIG, int(signal.SIGTERM))
+    if os.getppid() != parent:  # it has ended already
+        os._exit(1)
 
 
 class ProcessGroup:
@@ -73,13 +74,26 @@ class ProcessGroup:
     logs
         Folder for the log files, made if missing.
     environment
-        Environment of the processes, see :func:`private_graph`.
+        Environment of the processes.
+    stop_requested
+        Returns whether everything is to end; every wait then raises
+        :class:`StopRequestedError`.
+    progress
+        Called with a line of text about every 5 s of a wait.
     """
 
-    def __init__(self, logs: Path, environment: Mapping[str, str]) -> None:
+    def __init__(
+        self,
+        logs: Path,
+        environment: Mapping[str, str],
+        stop_requested: Callable[[], bool] = lambda: False,
+        progress: Callable[[str], None] = lambda line: None,
+    ) -> None:
         logs.mkdir(parents=True, exist_ok=True)
         self._logs = logs
         self._environment = dict(environment)
+        self._stop_requested = stop_requested
+        self._progress = progress
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._log_start: dict[str, int] = {}
 
@@ -91,6 +105,8 @@ class ProcessGroup:
         program: str = '',
     ) -> None:
         """Start one executable with ROS parameters and append its output to its log.
+
+        It ends when this process ends, even if it is killed.
 
         ``program`` is the executable if ``name`` is not: ``start('emulator', 'emulator',
         '--link', 'x', program='t3mpc')``.
@@ -112,13 +128,14 @@ class ProcessGroup:
                 # Ctrl-C in a terminal reaches the whole group: here the processes are stopped
                 # in order instead, the recorder last.
                 start_new_session=True,
+                preexec_fn=partial(_end_with_parent, os.getpid()),
             )
 
     def log(self, name: str) -> Path:
         """Return the log file of one executable."""
         return self._logs / f'{name}.log'
 
-    def wait_ready(self, name: str, seconds: float = 120.0) -> None:
+    def wait_ready(self, name: str, seconds: float = READY_TIMEOUT) -> None:
         """Wait for the ready message of the executable, see :meth:`wait_for`."""
         self.wait_for(name, f'{name} ready', seconds)
 
@@ -130,9 +147,15 @@ class ProcessGroup:
         ProcessError
             It ended, or did not print them within ``seconds``; the text ends with its last lines.
         """
-        deadline = time.monotonic() + seconds
+        begin = time.monotonic()
+        deadline, shown = begin + seconds, begin
         process = self._processes[name]
-        while words not in self._fresh_output(name):
+        while words not in (output := self._fresh_output(name)):
+            self._raise_if_requested()
+            if time.monotonic() - shown > PROGRESS_PERIOD:
+                shown = time.monotonic()
+                last = output.rstrip().rpartition('\n')[2].rpartition(']: ')[2]
+                self._progress(f'{name}, {shown - begin:.0f} s: {last or "importing"}')
             if process.poll() is not None:
                 raise ProcessError(
                     f'{name} ended with code {process.returncode} before it printed '
@@ -146,6 +169,7 @@ class ProcessGroup:
 
     def check(self) -> None:
         """Raise :class:`ProcessError` when one of the processes has ended by itself."""
+        self._raise_if_requested()
         for name, process in self._processes.items():
             if process.poll() is not None:
                 raise ProcessError(
@@ -175,22 +199,52 @@ class ProcessGroup:
         ProcessError
             It did not end in time and was killed.
         """
-        process = self._processes.pop(name)
+        process = self._processes[name]
         process.send_signal(number)
-        try:
-            return process.wait(seconds)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-            raise ProcessError(
-                f'{name} did not end within {seconds:g} s of signal {number}:\n' + self._tail(name)
-            ) from None
+        deadline = time.monotonic() + seconds
+        while process.poll() is None:
+            self._raise_if_requested()
+            if time.monotonic() > deadline:
+                self.kill(name)
+                raise ProcessError(
+                    f'{name} did not end within {seconds:g} s of signal {number}:\n'
+                    + self._tail(name)
+                )
+            time.sleep(0.01)
+        del self._processes[name]
+        return process.returncode
 
     def stop_all(self, order: Sequence[str] = ()) -> dict[str, int]:
         """Stop all running executables, first in the given order; return exit codes."""
         names = [name for name in order if name in self._processes]
         names += [name for name in self._processes if name not in names]
         return {name: self.stop(name) for name in names}
+
+    def end_all(self, last: Sequence[str] = (), seconds: float = 10.0) -> None:
+        """End all running executables, at once except for the ``last``; kill those that remain.
+
+        Parameters
+        ----------
+        last
+            Executables that end after the others, in this order.
+        seconds
+            Time that the first ones together, and each of the last ones, are given.
+        """
+        first = tuple(name for name in self._processes if name not in last)
+        for names in (first, *((name,) for name in last if name in self._processes)):
+            for name in names:
+                self._processes[name].send_signal(signal.SIGINT)
+            deadline = time.monotonic() + seconds
+            for name in names:
+                try:
+                    self._processes[name].wait(max(0.0, deadline - time.monotonic()))
+                    del self._processes[name]
+                except subprocess.TimeoutExpired:
+                    self.kill(name)
+
+    def _raise_if_requested(self) -> None:
+        if self._stop_requested():
+            raise StopRequestedError('stopped')
 
     def _fresh_output(self, name: str) -> str:
         with self.log(name).open('rb') as source:

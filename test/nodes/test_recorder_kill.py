@@ -4,6 +4,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+import os
 from pathlib import Path
 import random
 import threading
@@ -16,7 +17,7 @@ from rclpy.serialization import serialize_message
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recovery.recover_bag import recover_bag
-from t3mpc_ros.cli.process_group import ProcessGroup, private_graph
+from t3mpc_ros.cli.process_group import ProcessGroup
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.common import qos
 
@@ -92,7 +93,7 @@ def kill_in_sequence(root, slot, source):
     result = []
     for turn in range(TURNS):
         name = f'slot_{slot}_{turn}'
-        processes = ProcessGroup(root / f'log_{name}', private_graph())
+        processes = ProcessGroup(root / f'log_{name}', os.environ)
         bag = root / name
         try:
             processes.start(

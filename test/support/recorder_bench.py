@@ -22,7 +22,8 @@ import tempfile
 import time
 
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.cli.process_group import ProcessGroup, private_graph
+from t3mpc_ros.cli.private_graph import PrivateGraph
+from t3mpc_ros.cli.process_group import ProcessGroup
 
 FIELDS = {
     'nav_msgs/msg/Odometry': 'pose.pose.position.x',
@@ -135,8 +136,8 @@ def main() -> int:
     if options.publish:
         publish(options.seconds, options.topics, options.rate)
         return 0
-    with tempfile.TemporaryDirectory() as folder:
-        processes = ProcessGroup(Path(folder) / 'log', private_graph())
+    with tempfile.TemporaryDirectory() as folder, PrivateGraph() as graph:
+        processes = ProcessGroup(Path(folder) / 'log', graph.environment())
         found = run(Path(folder) / 'bag', processes, options.seconds, options.topics, options.rate)
     print(f'sent      {found.sent} in {found.seconds:.1f} s, {found.sent / found.seconds:.0f}/s')
     print(f'recorded  {found.recorded}, in order and complete: {found.in_order}')

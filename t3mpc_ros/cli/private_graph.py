@@ -1,0 +1,117 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""A ROS graph of its own for a demo or a test, in which no other robot is met.
+
+Two processes of one machine meet if they use the same ``ROS_DOMAIN_ID``. A private graph has a
+domain that is not the caller's, in which no participant of any ROS program runs, and that no other
+private graph of the machine reserves.
+"""
+
+import os
+from pathlib import Path
+import random
+import socket
+from types import TracebackType
+from typing import Self
+
+from t3mpc_ros.cli.process_group import installed_file
+
+DOMAINS = range(1, 102)
+"""Domains of private graphs: 0 is the default of all robots, those above use ephemeral ports."""
+_PORT_BASE, _DOMAIN_PORTS = 7400, 250
+"""UDP ports of a domain by the DDSI-RTPS specification (9.6.1.1)."""
+_LOOPBACK_PROFILE = Path('share') / 't3mpc_ros' / 'config' / 'fastdds_loopback.xml'
+_NETWORK_VARIABLES = ('ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS', 'ROS_DISCOVERY_SERVER')
+
+
+class NoDomainError(RuntimeError):
+    """Every domain is in use on this machine."""
+
+
+class PrivateGraph:
+    """A reserved domain and the environment of its processes; a context manager.
+
+    The reservation is a socket with an abstract name, which exists once per network of the
+    machine, for all users and checkouts. It ends with the process at the latest.
+
+    Raises
+    ------
+    NoDomainError
+        Every domain is reserved or in use.
+    """
+
+    def __init__(self) -> None:
+        avoided = used_domains(Path('/proc/net')) | _domain_of_caller()
+        candidates = [domain for domain in DOMAINS if domain not in avoided]
+        for domain in random.SystemRandom().sample(candidates, len(candidates)):
+            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+            try:
+                self._socket.bind(f'\0t3mpc_ros_domain_{domain}')
+            except OSError:
+                self._socket.close()
+                continue
+            self.domain = domain
+            return
+        raise NoDomainError(
+            'every ROS domain from 1 to 101 is in use on this machine; stop other ROS programs'
+        )
+
+    def environment(self) -> dict[str, str]:
+        """Return the environment of the processes of this graph.
+
+        Fast DDS uses UDP on loopback only: its shared memory may block a publisher for a third of
+        a second when a subscriber joins (Fast-DDS issue 6535).
+        """
+        profile = installed_file(_LOOPBACK_PROFILE)
+        environment = {k: v for k, v in os.environ.items() if k not in _NETWORK_VARIABLES}
+        environment.setdefault('RCUTILS_COLORIZED_OUTPUT', '0')
+        environment['ROS_DOMAIN_ID'] = str(self.domain)
+        environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+        environment.pop('FASTRTPS_DEFAULT_PROFILES_FILE', None)
+        is_fast = 'fastrtps' in environment.get('RMW_IMPLEMENTATION', 'rmw_fastrtps_cpp')
+        if profile is not None and is_fast:
+            environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'SYSTEM_DEFAULT'
+            environment['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(profile)
+        return environment
+
+    def close(self) -> None:
+        """End the reservation."""
+        self._socket.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def used_domains(tables: Path) -> set[int]:
+    """Return the domains in which a participant runs: its UDP ports are bound on this machine.
+
+    Parameters
+    ----------
+    tables
+        Folder of the kernel's tables ``udp`` and ``udp6``; a missing table counts as empty.
+    """
+    found = set()
+    for table in (tables / 'udp', tables / 'udp6'):
+        try:
+            lines = table.read_text().splitlines()[1:]
+        except OSError:
+            continue
+        for line in lines:
+            port = int(line.split()[1].rpartition(':')[2], 16)
+            if port >= _PORT_BASE:
+                found.add((port - _PORT_BASE) // _DOMAIN_PORTS)
+    return found
+
+
+def _domain_of_caller() -> set[int]:
+    """Return the domain in which a robot of the caller may run."""
+    text = os.environ.get('ROS_DOMAIN_ID', '')
+    return {int(text)} if text.isdigit() else set()

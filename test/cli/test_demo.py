@@ -1,0 +1,244 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``t3mpc demo``: signals end everything at every phase; private graphs never meet."""
+
+from contextlib import ExitStack, suppress
+import os
+from pathlib import Path
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+
+from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.cli.main import _new_run
+from t3mpc_ros.cli.private_graph import DOMAINS, NoDomainError, PrivateGraph, used_domains
+
+NODES = ('recorder', 'controller', 'sim_robot', 'reference_generator')
+TIMEOUT = 30.0
+
+STAND_IN = """#!{python}
+import os, pathlib, signal, sys, time
+name = pathlib.Path(sys.argv[0]).name
+pathlib.Path('{folder}', name + '.pid').write_text(str(os.getpid()))
+for number in {ignored}:
+    signal.signal(number, lambda *_: pathlib.Path('{folder}', name + '.asked').touch())
+for text in {output}.get(name, ()):
+    print(text, flush=True)
+while True:
+    time.sleep(0.1)
+"""
+"""A node without ROS: writes its process id, prints, and sleeps."""
+
+
+def stand_ins(folder, silent=(), ignored=()):
+    """Return the environment of a demo whose nodes are stand-ins.
+
+    Parameters
+    ----------
+    folder
+        Folder of the executables and of the files with their process ids.
+    silent
+        Nodes that never print that they are ready or track.
+    ignored
+        Signals that the stand-ins ignore.
+    """
+    programs = folder / 'lib' / 't3mpc_ros'
+    programs.mkdir(parents=True)
+    output = {name: [f'{name} ready'] for name in NODES if name not in silent}
+    if 'tracking' not in silent and 'controller' in output:
+        output['controller'].append('tracking')
+    for name in NODES:
+        program = programs / name
+        text = STAND_IN.format(
+            python=sys.executable, folder=folder, ignored=[int(n) for n in ignored], output=output
+        )
+        program.write_text(text)
+        program.chmod(0o755)
+    return {**os.environ, 'AMENT_PREFIX_PATH': str(folder)}
+
+
+def start_demo(folder, environment, *arguments):
+    """Return a running ``t3mpc demo``."""
+    command = [sys.executable, '-m', 't3mpc_ros.cli.main', 'demo', '--headless']
+    return subprocess.Popen(
+        [*command, '--output', str(folder / 'run'), *arguments],
+        env=environment,
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+
+
+def read_until(demo, text):
+    """Read the progress of a demo up to a line that contains ``text``."""
+    while text not in (line := demo.stderr.readline()):
+        assert line, f'the demo has ended without "{text}"'
+
+
+def wait_until(condition):
+    deadline = time.monotonic() + TIMEOUT
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def alive(folder):
+    """Return the names of the stand-ins that still run."""
+    found = []
+    for path in folder.glob('*.pid'):
+        text = path.read_text()
+        state = Path('/proc', text, 'stat')
+        if text and state.exists() and state.read_text().rpartition(')')[2].split()[0] != 'Z':
+            found.append(path.stem)
+    return found
+
+
+PHASES = {
+    'start': (('controller',), 'starting controller'),
+    'discovery': (('tracking',), 'waiting for discovery'),
+    'run': ((), 'running: 0'),
+}
+"""Silent nodes, and the line of the demo after which the signal is sent, by phase."""
+
+
+@pytest.mark.parametrize(
+    ('phase', 'number'),
+    [
+        *((phase, signal.SIGTERM) for phase in PHASES),
+        ('run', signal.SIGINT),
+        ('run', signal.SIGHUP),
+    ],
+)
+def test_a_signal_ends_the_demo_and_all_nodes(phase, number, tmp_path):
+    """SIGTERM and SIGHUP once left four processes that recorded for ever."""
+    silent, line = PHASES[phase]
+    demo = start_demo(tmp_path, stand_ins(tmp_path, silent))
+    read_until(demo, line)
+    expected = 2 if phase == 'start' else 4
+    wait_until(lambda: len(list(tmp_path.glob('*.pid'))) == expected)
+    demo.send_signal(number)
+    _, errors = demo.communicate(timeout=TIMEOUT)
+    assert demo.returncode == 128 + number
+    assert 'Traceback' not in errors
+    assert 'stopped' in errors
+    assert alive(tmp_path) == []
+
+
+def test_nodes_that_ignore_the_signal_are_killed(tmp_path):
+    environment = stand_ins(tmp_path, ignored=(signal.SIGINT, signal.SIGTERM))
+    demo = start_demo(tmp_path, environment)
+    read_until(demo, 'running')
+    demo.send_signal(signal.SIGTERM)
+    demo.communicate(timeout=TIMEOUT)
+    assert demo.returncode == 128 + signal.SIGTERM
+    assert alive(tmp_path) == []
+
+
+def test_a_signal_while_the_nodes_are_stopped_ends_the_demo(tmp_path):
+    """The nodes do not end at the end of the run; the demo would wait 10 s for each."""
+    demo = start_demo(tmp_path, stand_ins(tmp_path, ignored=(signal.SIGINT,)), '--duration', '1')
+    wait_until((tmp_path / 'reference_generator.asked').exists)
+    demo.send_signal(signal.SIGHUP)
+    demo.communicate(timeout=TIMEOUT)
+    assert demo.returncode == 128 + signal.SIGHUP
+    assert alive(tmp_path) == []
+
+
+def test_the_nodes_of_a_killed_demo_end_with_it(tmp_path):
+    demo = start_demo(tmp_path, stand_ins(tmp_path))
+    read_until(demo, 'running')
+    assert sorted(alive(tmp_path)) == sorted(NODES)
+    demo.kill()
+    demo.communicate(timeout=TIMEOUT)
+    wait_until(lambda: not alive(tmp_path))
+
+
+def test_an_interrupted_demo_says_how_to_get_the_report(tmp_path):
+    demo = start_demo(tmp_path, stand_ins(tmp_path))
+    read_until(demo, 'running')
+    bag = tmp_path / 'run' / 'bag'
+    bag.mkdir()
+    (bag / 'bag_0.mcap').write_bytes(b'')
+    demo.send_signal(signal.SIGINT)
+    _, errors = demo.communicate(timeout=TIMEOUT)
+    assert f't3mpc bag report {bag}' in errors
+
+
+def test_the_link_latest_leads_to_the_last_run(tmp_path):
+    """So that every command of the documentation can be pasted."""
+    first = _new_run(tmp_path / 'runs')
+    assert (tmp_path / 'runs' / 'latest').resolve() == first.resolve()
+    (tmp_path / 'runs' / 'latest').unlink()
+    (tmp_path / 'runs' / 'latest').symlink_to('older')
+    first.rename(tmp_path / 'other')
+    assert (tmp_path / 'runs' / 'latest').readlink() == Path('older')
+    second = _new_run(tmp_path / 'runs')
+    assert (tmp_path / 'runs' / 'latest').resolve() == second.resolve()
+    assert list(second.iterdir()) == []
+
+
+# -- private graphs -------------------------------------------------------------------------------
+
+
+def test_a_private_graph_is_not_in_the_domain_of_the_caller(monkeypatch):
+    """The domain was once that of the caller, in which a robot may listen to cmd_vel."""
+    monkeypatch.setenv('ROS_DOMAIN_ID', '42')
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SUBNET')
+    monkeypatch.setenv('ROS_STATIC_PEERS', '192.0.2.1')
+    with ExitStack() as stack:
+        graphs = []
+        with suppress(NoDomainError):
+            while True:
+                graphs.append(stack.enter_context(PrivateGraph()))
+        with pytest.raises(NoDomainError, match='every ROS domain'):
+            PrivateGraph()
+        domains = [graph.domain for graph in graphs]
+        assert len(set(domains)) == len(domains) > 50
+        assert 42 not in domains
+        environment = graphs[0].environment()
+        assert environment['ROS_DOMAIN_ID'] == str(domains[0])
+        assert environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] != 'SUBNET'
+        assert 'ROS_STATIC_PEERS' not in environment
+        # Another process, of another checkout perhaps, gets none of them.
+        code = 'from t3mpc_ros.cli.private_graph import PrivateGraph; PrivateGraph()'
+        other = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+        assert 'NoDomainError' in other.stderr
+        free = graphs[0]
+        free.close()
+        assert stack.enter_context(PrivateGraph()).domain == free.domain
+
+
+def test_a_domain_with_a_participant_is_left_out():
+    """Any ROS program of the machine binds UDP ports that follow from its domain."""
+    before = used_domains(Path('/proc/net'))
+    domain = next(each for each in DOMAINS if each not in before)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as participant:
+        participant.bind(('127.0.0.1', 7400 + 250 * domain + 11))
+        assert domain in used_domains(Path('/proc/net'))
+    assert used_domains(Path('/nowhere')) == set()
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+def test_two_demos_at_once_do_not_meet(graph, tmp_path):
+    demos = []
+    for i in range(2):
+        (tmp_path / str(i)).mkdir()
+        demos.append(start_demo(tmp_path / str(i), os.environ, '--duration', '3'))
+    bags = []
+    for i, demo in enumerate(demos):
+        _, errors = demo.communicate(timeout=240)
+        assert 'drawing the report' in errors, errors
+        bags.append(tmp_path / str(i) / 'run' / 'bag')
+    stamps = []
+    for bag in bags:
+        with open_bag(bag) as recording:
+            # A second generator would have published at the same stamps' distance, too.
+            times = recording.series('/reference', {'v': 'twist.twist.linear.x'})['stamp']
+            assert (times[1:] > times[:-1]).all()
+            stamps.append(set(times + recording.start_ns * 1e-9))
+    assert not stamps[0] & stamps[1]
