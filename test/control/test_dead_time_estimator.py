@@ -1,0 +1,272 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Estimate of the dead time, and detection of a disturbed response."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from t3mpc_ros.control.dead_time_estimator import (
+    ADOPTION_TIME,
+    MAX_DEAD_TIME,
+    PRIOR_DEVIATION,
+    DeadTimeEstimator,
+)
+from t3mpc_ros.control.speed_filter import SpeedFilterParameters
+from t3mpc_ros.evaluation.twin_closed_loop import (
+    INITIAL_STANDSTILL,
+    chaotic_course,
+    loop_controller,
+    loop_robot,
+    run_twin,
+)
+
+PERIOD = 0.01
+SUBSTEPS = 20
+"""Substeps of the simulated robot in a control period."""
+LAG = 0.003
+NOISE_VARIANCE = 0.04
+
+
+@dataclass
+class Drive:
+    """Commands of a run and the measured response, one row for each control period."""
+
+    command: np.ndarray
+    measured: np.ndarray
+
+
+def smooth_commands(duration: float, seed: int, rate: float = 4.0) -> np.ndarray:
+    """Return wheel speeds (rad/s) whose rate of change has an RMS of ``rate`` (rad/s²)."""
+    rng = np.random.default_rng(seed)
+    time = PERIOD * np.arange(round(duration / PERIOD))[:, None, None]
+    pulsation = rng.uniform(0.5, 6.0, size=(6, 2))
+    phase = rng.uniform(0.0, 2.0 * np.pi, size=(6, 2))
+    amplitude = rate * np.sqrt(2.0 / 6.0) / pulsation
+    return np.sum(amplitude * np.sin(pulsation * time + phase), axis=1)
+
+
+def simulate(
+    command: np.ndarray,
+    dead_time: float | np.ndarray,
+    seed: int,
+    *,
+    lag: float = LAG,
+    noise_variance: float = NOISE_VARIANCE,
+) -> Drive:
+    """Return the response to commands that arrive ``dead_time`` late; the newest one counts.
+
+    The measured speeds are means over a period, as those from counters of steps.
+    """
+    count = len(command)
+    step = PERIOD / SUBSTEPS
+    arrival = np.round((PERIOD * np.arange(count) + dead_time) / step).astype(int)
+    newest = np.full(count * SUBSTEPS, -1)
+    inside = arrival < newest.size
+    np.maximum.at(newest, arrival[inside], np.flatnonzero(inside))
+    newest = np.maximum.accumulate(newest)
+    active = np.where(newest[:, None] >= 0, command[newest], 0.0)
+    decay = np.exp(-step / lag)
+    speeds = lfilter([1.0 - decay], [1.0, -decay], active, axis=0)
+    mean = speeds.reshape(count, SUBSTEPS, 2).mean(axis=1)
+    measured = np.vstack([np.zeros((1, 2)), mean[:-1]])
+    noise = np.random.default_rng(1000 + seed).normal(size=measured.shape)
+    return Drive(command, measured + np.sqrt(noise_variance) * noise)
+
+
+def run(
+    drive: Drive,
+    *,
+    configured: float = 0.01,
+    lag: float = LAG,
+    noise_variance: float = NOISE_VARIANCE,
+    rows: np.ndarray | None = None,
+) -> tuple[DeadTimeEstimator, np.ndarray]:
+    """Return the estimator after a run, and dead time, deviation and disturbance of each row."""
+    estimator = DeadTimeEstimator(
+        SpeedFilterParameters(lag=lag, dead_time=configured, noise_variance=noise_variance), PERIOD
+    )
+    rows = np.arange(len(drive.command)) if rows is None else rows
+    record = np.zeros((len(rows), 3))
+    for k in range(1, len(rows)):
+        dt = PERIOD * (rows[k] - rows[k - 1])
+        estimator.step(drive.measured[rows[k]], drive.command[rows[k - 1]], dt)
+        record[k] = estimator.dead_time, estimator.standard_deviation, estimator.disturbed
+    return estimator, record
+
+
+def at(seconds: float) -> int:
+    return round(seconds / PERIOD)
+
+
+@pytest.mark.parametrize('dead_time', [0.01, 0.03, 0.0375, 0.06, 0.12])
+def test_the_dead_time_is_found_within_its_deviation(dead_time):
+    errors = []
+    for seed in range(6):
+        drive = simulate(smooth_commands(60.0, seed), dead_time, seed)
+        estimator, record = run(drive)
+        assert estimator.identified
+        assert abs(record[at(2.0), 0] - dead_time) < 0.008
+        assert np.abs(record[at(40.0) :, 0] - dead_time).max() < 0.0025
+        assert not record[:, 2].any()
+        for seconds in (5.0, 20.0, 59.0):
+            row = record[at(seconds)]
+            errors.append((row[0] - dead_time) / row[1])
+    assert np.sqrt(np.mean(np.square(errors))) < 1.7
+    assert abs(np.mean(errors)) < 1.0
+    # The deviation is that of the noise: it neither hides the error nor exaggerates it.
+    assert np.sqrt(np.mean(np.square(errors))) > 0.4
+
+
+def test_dead_time_and_lag_are_identified_as_a_sum():
+    command = smooth_commands(60.0, 3)
+    drive = simulate(command, 0.03, 3, lag=0.02)
+    sums = [run(drive, lag=lag)[0].dead_time + lag for lag in (0.015, 0.02, 0.03)]
+    np.testing.assert_allclose(sums, 0.05, atol=0.002)
+
+
+def test_the_estimate_is_invariant_to_the_scale_of_the_speeds():
+    drive = simulate(smooth_commands(10.0, 5), 0.04, 5)
+    scaled = Drive(10.0 * drive.command, 10.0 * drive.measured)
+    _, record = run(drive)
+    _, record_scaled = run(scaled, noise_variance=100.0 * NOISE_VARIANCE)
+    np.testing.assert_allclose(record_scaled, record, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize('speed', [0.0, 3.0])
+def test_constant_commands_identify_nothing(speed):
+    command = np.full((at(60.0), 2), speed)
+    drive = simulate(command, 0.05, 7)
+    estimator = DeadTimeEstimator(SpeedFilterParameters(lag=LAG), PERIOD)
+    estimator.reset(command[0])
+    for k in range(at(1.0), len(command)):
+        estimator.step(drive.measured[k], command[k - 1], PERIOD)
+    assert not estimator.identified
+    assert not estimator.disturbed
+    assert estimator.standard_deviation > 0.6 * PRIOR_DEVIATION
+    assert abs(estimator.dead_time - 0.01) < 1e-9
+
+
+def test_an_undisturbed_response_raises_no_alarm():
+    for seed in range(3):
+        _, record = run(simulate(smooth_commands(200.0, 20 + seed), 0.015, 20 + seed))
+        assert not record[:, 2].any()
+
+
+@pytest.mark.parametrize('duration', [1.0, 4.0, 10.0])
+def test_late_commands_leave_no_trace(duration):
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        count = at(30.0 + duration + 20.0)
+        dead_time = np.full(count, 0.01)
+        late = slice(at(30.0), at(30.0 + duration))
+        dead_time[late] += rng.uniform(0.02, 0.12, size=late.stop - late.start)
+        _, record = run(simulate(smooth_commands(count * PERIOD, 40 + seed), dead_time, seed))
+        disturbed = record[:, 2].astype(bool)
+        assert not disturbed[: at(30.0)].any()
+        assert disturbed[at(30.0) : at(31.0)].any()
+        assert disturbed[at(31.0) : late.stop + 1].mean() > 0.9 or duration <= 1.0
+        assert not disturbed[late.stop + at(3.0) :].any()
+        before = record[at(30.0), 0]
+        assert np.abs(record[late.start : late.stop + at(5.0), 0] - before).max() < 0.001
+        assert abs(record[-1, 0] - 0.01) < 0.002
+
+
+def test_a_persistent_change_is_adopted():
+    count = at(80.0)
+    dead_time = np.where(np.arange(count) < at(30.0), 0.01, 0.045)
+    for seed in range(3):
+        _, record = run(simulate(smooth_commands(80.0, 60 + seed), dead_time, seed))
+        assert abs(record[at(30.0 + 0.8 * ADOPTION_TIME), 0] - 0.01) < 0.004
+        assert abs(record[at(30.0 + ADOPTION_TIME + 5.0), 0] - 0.045) < 0.003
+        assert abs(record[-1, 0] - 0.045) < 0.002
+        assert not record[at(30.0 + ADOPTION_TIME + 5.0) :, 2].any()
+
+
+def test_gaps_in_the_odometry_are_no_disturbance():
+    """The robot keeps its command while a message is lost, and the model does, too."""
+    drive = simulate(smooth_commands(40.0, 70), 0.0, 70)
+    kept = np.random.default_rng(70).random(len(drive.command)) > 0.2
+    rows = np.flatnonzero(kept)
+    held = rows[np.maximum(np.cumsum(kept) - 1, 0)]
+    drive = simulate(drive.command[held], 0.035, 70)
+    estimator, record = run(drive, rows=rows)
+    assert not record[:, 2].any()
+    assert abs(estimator.dead_time - 0.035) < 0.002
+
+
+def test_a_constant_offset_is_no_delay_and_no_disturbance():
+    drive = simulate(smooth_commands(40.0, 80), 0.03, 80)
+    drive.measured += np.array([0.15, -0.1])
+    estimator, record = run(drive)
+    assert abs(estimator.dead_time - 0.03) < 0.002
+    assert not record[at(5.0) :, 2].any()
+
+
+def test_a_dead_time_beyond_the_bounds_is_not_identified():
+    drive = simulate(smooth_commands(40.0, 90), MAX_DEAD_TIME + 0.03, 90)
+    estimator, _ = run(drive, configured=0.14)
+    assert not estimator.identified
+    assert estimator.dead_time <= MAX_DEAD_TIME
+
+
+def test_a_reset_keeps_the_estimate_and_ends_the_disturbance():
+    drive = simulate(smooth_commands(20.0, 95), 0.04, 95)
+    estimator, _ = run(drive)
+    for k in range(50):
+        estimator.step(drive.measured[k] + 5.0 * (-1.0) ** k, drive.command[k], PERIOD)
+    assert estimator.disturbed
+    before = estimator.dead_time, estimator.standard_deviation, estimator.noise_ratio
+    estimator.reset(np.zeros(2))
+    assert not estimator.disturbed
+    assert (estimator.dead_time, estimator.standard_deviation, estimator.noise_ratio) == before
+
+
+def test_a_copy_of_the_state_continues_bit_equal():
+    drive = simulate(smooth_commands(10.0, 99), 0.04, 99)
+    original = DeadTimeEstimator(SpeedFilterParameters(lag=LAG), PERIOD)
+    copy = DeadTimeEstimator(SpeedFilterParameters(lag=LAG), PERIOD)
+    for k in range(1, len(drive.command)):
+        if k == 513:
+            copy.state[:] = original.state
+        original.step(drive.measured[k], drive.command[k - 1], PERIOD)
+        if k >= 513:
+            copy.step(drive.measured[k], drive.command[k - 1], PERIOD)
+    assert copy.state.tobytes() == original.state.tobytes()
+
+
+def test_speeds_at_the_stamp_need_the_other_model():
+    """The mean over a period is half a period older than the speed at its end."""
+    command = smooth_commands(40.0, 97)
+    decay = np.exp(-PERIOD / 0.02)
+    response = lfilter([0.0, 1.0 - decay], [1.0, -decay], command, axis=0)
+    response = np.vstack([np.zeros((3, 2)), response[:-3]])  # three periods of dead time
+    noise = np.random.default_rng(97).normal(scale=0.2, size=response.shape)
+    errors = []
+    for mean_speeds in (False, True):
+        estimator = DeadTimeEstimator(
+            SpeedFilterParameters(lag=0.02), PERIOD, mean_speeds=mean_speeds
+        )
+        for k in range(1, len(command)):
+            estimator.step(response[k] + noise[k], command[k - 1], PERIOD)
+        errors.append(estimator.dead_time - 0.03)
+    np.testing.assert_allclose(errors, [0.0, -0.5 * PERIOD], atol=0.002)
+
+
+def test_the_stepper_twin_with_an_unknown_dead_time():
+    robot = loop_robot(seed=7).with_values({'drive.dead_time': 0.06})
+    duration = 20.0
+    record = run_twin(robot, loop_controller(), chaotic_course(duration, 7), duration)
+    drive = Drive(record.requested, record.measured)
+    estimator, trace = run(drive, rows=np.arange(at(INITIAL_STANDSTILL), at(duration)))
+    assert estimator.identified
+    # The motors respond some milliseconds later than the lag of the model.
+    assert 0.058 < estimator.dead_time < 0.066
+    assert not trace[:, 2].any()
+
+
+def test_a_period_that_is_not_positive_is_rejected():
+    with pytest.raises(ValueError, match='period'):
+        DeadTimeEstimator(SpeedFilterParameters(), 0.0)
