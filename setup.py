@@ -23,6 +23,7 @@ setup(
         (f'share/{NAME}/launch', sorted(glob('launch/*.launch.py'))),
     ],
     package_data={
+        f'{NAME}.evaluation.method_comparison': ['*.yaml'],
         f'{NAME}.evaluation.tuning': ['*.json'],
         f'{NAME}.simulation': ['worlds/*.yaml', 'schedules/*.yaml'],
     },

@@ -40,6 +40,10 @@ SHORTENED = {
     'scripts/run reference_generator --ros-args -p seed:=7': ([], True),
     'scripts/run composed': (['--ros-args', '-p', 'storage.uri:=OUTPUT/bag'], True),
     'scripts/run t3mpc paper --quick': (['--seeds', '1', '--output', 'OUTPUT/paper'], False),
+    'scripts/run t3mpc compare': (
+        ['--seeds', '201', '--duration', '3', '--methods', 'full', '--cases', 'nominal'],
+        False,
+    ),
     'scripts/run t3mpc tune': (
         ['PI + feed-forward', '--evaluations', '2', '--output', 'OUTPUT/tuned.json'],
         False,

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import webbrowser
 
 from t3mpc_ros.cli.command import ArgumentParser, run_command
+from t3mpc_ros.cli.compare import add_parser as add_compare
 from t3mpc_ros.cli.faults import add_outcomes_parser
 from t3mpc_ros.cli.paper import add_parser as add_paper
 from t3mpc_ros.cli.train import add_parser as add_train
@@ -193,6 +194,7 @@ def _parser() -> argparse.ArgumentParser:
     exponents.set_defaults(run=_exponents)
 
     add_paper(commands)
+    add_compare(commands, time.monotonic)
     add_tune(commands, _method_definitions)
     add_train(commands)
     add_twin(commands, time.monotonic)

@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 import math
 import multiprocessing
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -240,8 +240,7 @@ class LoopRecord:
         """
         if self.time.size < 2:
             raise ValueError(f'a record must have at least 2 rows: got {self.time.size}')
-        span = self.time[-1] - self.time[0]
-        return float(np.abs(np.diff(self.effort, axis=0)).sum() / (2.0 * span))
+        return total_variation(self.time, self.effort)
 
     def _counted(self, after: float, cut: float) -> NDArray[np.bool_]:
         counted: NDArray[np.bool_] = self.time >= after
@@ -256,7 +255,25 @@ class LoopRecord:
         return counted
 
 
+def total_variation(time: Array, signal: Array) -> float:
+    """Return the total variation of a signal, shape (n, 2), per second and wheel."""
+    span = time[-1] - time[0]
+    return float(np.abs(np.diff(signal, axis=0)).sum() / (2.0 * span))
+
+
 T = TypeVar('T')
+
+
+class NamedMethod(Protocol):
+    """A method of any loop."""
+
+    @property
+    def name(self) -> str:
+        """Name in tables and errors."""
+        ...
+
+
+J = TypeVar('J', bound=tuple[Any, NamedMethod])
 
 
 @dataclass(frozen=True, slots=True)
@@ -539,20 +556,37 @@ class WorkerPool:
         JobError
             A run raised an exception; the jobs not begun are dropped.
         """
+        return self.map(partial(_measure_job, measure), jobs)
+
+    def map(self, task: Callable[[J], T], jobs: Iterable[J]) -> Iterator[tuple[int, T]]:
+        """Yield (index of the job, ``task`` of it) as the jobs are finished.
+
+        Parameters
+        ----------
+        task
+            A function of a module.
+        jobs
+            Pairs of a scenario and a method with a name.
+
+        Raises
+        ------
+        JobError
+            A run raised an exception; the jobs not begun are dropped.
+        """
         if self._pool is None:
             for index, job in enumerate(jobs):
                 try:
-                    result = run_job(job, measure)
+                    result = task(job)
                 except Exception as error:
                     raise _job_error(job, error) from error
                 yield index, result
             return
         waiting = iter(enumerate(jobs))
-        begun: dict[Future[T], tuple[int, Job]] = {}
+        begun: dict[Future[T], tuple[int, J]] = {}
         try:
             while True:
                 while len(begun) < 2 * self._count and (entry := next(waiting, None)):
-                    begun[self._pool.submit(run_job, entry[1], measure)] = entry
+                    begun[self._pool.submit(task, entry[1])] = entry
                 if not begun:
                     return
                 finished, _ = wait(begun, return_when=FIRST_COMPLETED)
@@ -591,11 +625,15 @@ def run_job(job: Job, measure: Callable[[LoopRecord], T]) -> T:
     return measure(run(*job))
 
 
+def _measure_job(measure: Callable[[LoopRecord], T], job: Job) -> T:
+    return run_job(job, measure)
+
+
 def full_record(record: LoopRecord) -> LoopRecord:
     """Return the record itself: the measure that leaves nothing out."""
     return record
 
 
-def _job_error(job: Job, error: BaseException) -> JobError:
+def _job_error(job: 'tuple[Any, NamedMethod]', error: BaseException) -> JobError:
     scenario, method = job
     return JobError(f'{method.name} on {scenario} failed: {error!r}')

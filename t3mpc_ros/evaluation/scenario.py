@@ -209,7 +209,7 @@ class Scenario:
             drive=self.drive,
             period=1.0 / rate,
             lag=robot.drive.lag,
-            acceleration=_isotropic_acceleration(self.limits, robot.geometry)
+            acceleration=isotropic_acceleration(self.limits, robot.geometry)
             if velocity
             else math.inf,
             robot=robot,
@@ -243,9 +243,14 @@ def reference_parameters(seed: int) -> ReferenceParameters:
     return ReferenceParameters.from_dict({'rate': RATE, 'amplitude': amplitude, 'seed': seed})
 
 
-@lru_cache(maxsize=128)  # about 0.3 MB for a run of a minute
 def _reference(seed: int, rows: int) -> SampledReference:
-    chaos = ChaoticReference(reference_parameters(seed), WheelGeometry())
+    return sample_reference(reference_parameters(seed), rows)
+
+
+@lru_cache(maxsize=128)  # about 0.3 MB for a run of a minute
+def sample_reference(parameters: ReferenceParameters, rows: int) -> SampledReference:
+    """Return the first ``rows`` samples of a reference; its rate must be :data:`RATE`."""
+    chaos = ChaoticReference(parameters, WheelGeometry())
     run = SampledReference(
         time=np.arange(rows) / RATE,
         speeds=np.empty((rows, 2)),
@@ -264,7 +269,46 @@ def _reference(seed: int, rows: int) -> SampledReference:
     return run
 
 
-def _isotropic_acceleration(limits: LimitParameters, geometry: WheelGeometry) -> float:
+def settled_rows(
+    time: Array, switches: Array, after: float, margins: tuple[float, float]
+) -> NDArray[np.bool_]:
+    """Return which rows of a run count: from ``after`` on, without those about a switch.
+
+    Parameters
+    ----------
+    time, switches
+        Instant of each row and of each switch, s.
+    after
+        Seconds left out at the start.
+    margins
+        Seconds left out before each switch, where methods with preview have already left the old
+        reference, and after it.
+
+    Raises
+    ------
+    ValueError
+        Nothing is left to be counted.
+    """
+    counted: NDArray[np.bool_] = time >= after
+    before, behind = margins
+    for switch in switches.tolist():
+        counted &= (time < switch - before) | (time >= switch + behind)
+    if not counted.any():
+        end = time[-1] if time.size else 0.0
+        raise ValueError(
+            f'after and margins must leave rows of a run that ends at {end:g} s: '
+            f'got {after:g} s, {before:g} s and {behind:g} s'
+        )
+    return counted
+
+
+def switch_times(time: Array, modes: NDArray[np.int64]) -> Array:
+    """Return the instants (s) of the first row of each new mode."""
+    instants: Array = time[1:][np.diff(modes) != 0]
+    return instants
+
+
+def isotropic_acceleration(limits: LimitParameters, geometry: WheelGeometry) -> float:
     """Return the acceleration (rad/s²) that both wheels may have at once, in any direction."""
     straight = limits.linear_acceleration / geometry.wheel_radius
     turning = limits.angular_acceleration * geometry.half_separation / geometry.wheel_radius

@@ -4,22 +4,30 @@
 
 The loop has the timing of the nodes. Each report of the robot carries its stamp to the controller;
 the command computed from it leaves at once, carries that stamp to the command limiter, and arrives
-after the delay of the twin's channel.
+after the delay of the twin's channel. Reports may be late or lost on their way to the controller.
 """
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import math
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.control.controller import Controller, ControllerParameters
+from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation.scenario import RATE, Scenario
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, BodyTwist, State, WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError
-from t3mpc_ros.robot.interface import RobotCommand, RobotState, RobotStatus
+from t3mpc_ros.robot.interface import (
+    ZERO_WHEEL_SPEEDS,
+    RobotCommand,
+    RobotState,
+    RobotStatus,
+)
 from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
 from t3mpc_ros.simulation.fault_injection import FaultSchedule
 
@@ -61,6 +69,52 @@ def loop_controller() -> ControllerParameters:
 def loop_robot(world: str = '', seed: int = 1) -> DigitalTwinParameters:
     """Return the twin with the wheel speed noise that the controller assumes."""
     return DigitalTwinParameters.from_dict({'noise.variance': 0.04, 'world': world, 'seed': seed})
+
+
+class LoopStatus(Protocol):
+    """Part of a controller's status that the loop uses."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the odometry that the command follows from, ns."""
+        ...
+
+    @property
+    def reason(self) -> Reason:
+        """Whether the controller drives, or why not."""
+        ...
+
+
+class LoopController(Protocol):
+    """A controller that can drive the twin; :class:`Controller` is one."""
+
+    def enable(self, on: bool) -> None:
+        """Enable the robot's motion, or stop the robot."""
+        ...
+
+    def add_reference(self, reference: State) -> bool:
+        """Add a sample of the reference."""
+        ...
+
+    def step(self, odometry: State) -> tuple[BodyTwist, LoopStatus]:
+        """Return the command that follows from a report of the robot."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryFaults:
+    """Faults of the reports on their way to the controller; they arrive in order."""
+
+    loss: float = 0.0
+    """Fraction of the reports that is lost."""
+    delay: tuple[float, float] = (0.0, 0.0)
+    """Least and largest delay of a report, s; uniform between them."""
+    begin: float = 0.0
+    """s"""
+    end: float = math.inf
+    """s"""
+    seed: int = 0
+    """Two numbers are drawn for each report, so that a change of loss does not shift delays."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,14 +204,47 @@ def run_twin(
     ParameterError
         The robot is no stepper, or robot and controller differ in their rate.
     """
-    if robot_parameters.drive.kind != 'stepper':
-        raise ParameterError(f'drive.kind must be stepper: got {robot_parameters.drive.kind}')
     rate = robot_parameters.rate
     if controller_parameters.rate != rate:
         raise ParameterError(
             f'rate of the controller must be that of the robot ({rate:g} Hz): '
             f'got {controller_parameters.rate:g}'
         )
+    controller = Controller(controller_parameters)
+    controller.warm_up()
+    return drive_twin(robot_parameters, controller, course, duration, schedule, pauses)
+
+
+def drive_twin(
+    robot_parameters: DigitalTwinParameters,
+    controller: LoopController,
+    course: Array,
+    duration: float,
+    schedule: FaultSchedule | None = None,
+    pauses: Sequence[tuple[float, float]] = (),
+    odometry_faults: OdometryFaults | None = None,
+) -> TwinRecord:
+    """Return the record of any controller driving the twin, see :func:`run_twin`.
+
+    Parameters
+    ----------
+    robot_parameters, course, duration, schedule, pauses
+        As for :func:`run_twin`.
+    controller
+        A new controller, for the rate of the robot.
+    odometry_faults
+        Reports that are late or lost; none by default.
+
+    Raises
+    ------
+    ValueError
+        The course is too short, or has another shape.
+    ParameterError
+        The robot is no stepper.
+    """
+    if robot_parameters.drive.kind != 'stepper':
+        raise ParameterError(f'drive.kind must be stepper: got {robot_parameters.drive.kind}')
+    rate = robot_parameters.rate
     count, lead = round(duration * rate), round(LEAD * rate)
     if course.ndim != 2 or course.shape[1] != 2 or len(course) < count + lead:
         raise ValueError(
@@ -165,8 +252,7 @@ def run_twin(
         )
     geometry = robot_parameters.geometry
     robot = DigitalTwin(robot_parameters, schedule)
-    controller = Controller(controller_parameters)
-    controller.warm_up()
+    reports = _ReportQueue(odometry_faults or OdometryFaults())
     writer = _RecordWriter(count)
 
     def stamp(k: int) -> int:
@@ -180,17 +266,46 @@ def run_twin(
 
     for k in range(lead):
         add_reference(k)
+    wheels, reason = ZERO_WHEEL_SPEEDS, ''
     for k in range(count):
         add_reference(k + lead)
         state = robot.advance(stamp(k))
         now = state.stamp_ns / NANOSECONDS
         controller.enable(not any(begin <= now < end for begin, end in paused))
-        twist, status = controller.step(state.odometry)
-        wheels = wheels_from_twist(twist, geometry)
-        robot.apply(RobotCommand(wheels, status.stamp_ns), state.stamp_ns)
-        reason = '' if status.reason.moves else status.reason.value
+        reports.send(state.odometry)
+        for arrival_ns, odometry in reports.arrived(stamp(k + 1)):
+            twist, status = controller.step(odometry)
+            wheels = wheels_from_twist(twist, geometry)
+            reason = '' if status.reason.moves else status.reason.value
+            robot.apply(RobotCommand(wheels, status.stamp_ns), arrival_ns)
         writer.add_row(k, state, wheels, reason, geometry, robot.diagnostics.max_contact_force)
     return writer.record(course[:count])
+
+
+class _ReportQueue:
+    """Reports on their way to the controller."""
+
+    def __init__(self, faults: OdometryFaults) -> None:
+        self._faults = faults
+        self._generator = np.random.default_rng((faults.seed, 3))
+        self._queue: deque[tuple[int, State]] = deque()
+        self._last_ns = 0
+
+    def send(self, odometry: State) -> None:
+        faults = self._faults
+        lost, late = self._generator.random(2).tolist()
+        arrival_ns = odometry.stamp_ns
+        if faults.begin <= arrival_ns / NANOSECONDS < faults.end:
+            if lost < faults.loss:
+                return
+            least, most = faults.delay
+            arrival_ns += round((least + (most - least) * late) * NANOSECONDS)
+        self._last_ns = max(self._last_ns, arrival_ns)
+        self._queue.append((self._last_ns, odometry))
+
+    def arrived(self, before_ns: int) -> Iterator[tuple[int, State]]:
+        while self._queue and self._queue[0][0] < before_ns:
+            yield self._queue.popleft()
 
 
 class _RecordWriter:

@@ -76,6 +76,8 @@ class Observation:
     future: Array | None
     """Preview: r at that instant and each period after it, shape (n, 2), n >= 2.
     None for a method without preview."""
+    elapsed: int = 1
+    """Control periods since the observation before; more than 1 after lost measurements."""
 
 
 class BaselineController(ABC):

@@ -37,6 +37,7 @@ START = 3.0
 _IRRELEVANT_SOURCES = (
     'nodes/', 'bag/', 'radio/', 'emulator/', 'cli/', 'evaluation/bag_report/',
     'evaluation/process_replay/', 'evaluation/paper/', 'evaluation/tuning/',
+    'evaluation/method_comparison/', 'evaluation/baselines/feed_forward.py',
     'evaluation/plotting.py', 'evaluation/reporting.py', 'evaluation/lyapunov_exponents.py',
     'evaluation/open_loop_estimation.py', 'evaluation/methods.py',
 )  # fmt: skip

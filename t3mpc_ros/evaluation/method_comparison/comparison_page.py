@@ -1,0 +1,348 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Tables, HTML page and JSON record of a comparison."""
+
+import base64
+from collections.abc import Mapping, Sequence
+from html import escape
+import math
+from typing import Any
+
+import numpy as np
+
+import t3mpc_ros
+from t3mpc_ros.evaluation.confidence_intervals import Difference, interval, mean, paired
+from t3mpc_ros.evaluation.method_comparison.compared_runs import (
+    DRIFT,
+    DRIVES,
+    FEED_FORWARD,
+    METRICS,
+    OVERALL,
+    SETTLED,
+    SETTLING,
+    START,
+    STOPPED,
+    TWIN_ADVANCE,
+    YAW_RATE,
+    YAW_RATE_SETTLED,
+    ComparisonPlan,
+    Metric,
+    Results,
+    case_texts,
+    methods_for,
+)
+from t3mpc_ros.evaluation.method_comparison.twin_scenario import CASES as TWIN_CASES
+from t3mpc_ros.evaluation.method_comparison.twin_scenario import TwinScenario
+from t3mpc_ros.evaluation.methods import FULL
+from t3mpc_ros.evaluation.paper.experiment_runs import SETTLING as PAPER_SETTLING
+from t3mpc_ros.evaluation.plotting import new_figure, png_of
+from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table, format_interval
+from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, TUNING_SEEDS
+
+BETTER, WORSE, INCONCLUSIVE = 'better', 'worse', 'inconclusive'
+"""Verdicts on a paired difference: its 95 % interval lies below zero, above it, or contains it."""
+
+_CSS = """
+:root { color-scheme: light; }
+body { margin: 0 auto; max-width: 72rem; padding: 1.2rem 1rem 4rem; color: #1f2937;
+  background: #fff; font: 1rem/1.5 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
+h1 { font-size: 1.5rem; margin: 0 0 .2rem; }
+h2 { font-size: 1.1rem; margin: 2.4rem 0 .4rem; }
+p { margin: .3rem 0; }
+.quiet { color: #6b7280; font-size: .9rem; }
+figure { margin: .4rem 0 0; max-width: 50rem; }
+figure img { display: block; width: 100%; height: auto; }
+.wide { overflow-x: auto; margin: 1rem 0; }
+table { border-collapse: collapse; width: 100%; font-size: .85rem; }
+caption { text-align: left; font-weight: 600; padding: .2rem 0; }
+th, td { text-align: right; padding: .22rem .6rem; border-bottom: 1px solid #e5e7eb;
+  font-variant-numeric: tabular-nums; }
+th:first-child, td:first-child { text-align: left; white-space: nowrap; }
+th { color: #6b7280; font-weight: 600; }
+tr.own td { background: #fff1f2; font-weight: 600; }
+"""
+
+
+def values(results: Results, case: str, method: str, metric: Metric) -> list[float]:
+    """Return a metric of all seeds; empty where the case does not have it."""
+    runs = results[case, method]
+    return [run[metric.name] for run in runs] if metric.name in runs[0] else []
+
+
+def difference(results: Results, case: str, method: str, metric: Metric) -> Difference | None:
+    """Return the paired difference from feed-forward; None for itself or without it."""
+    if method == FEED_FORWARD or (case, FEED_FORWARD) not in results:
+        return None
+    mine = values(results, case, method, metric)
+    other = values(results, case, FEED_FORWARD, metric)
+    return paired(mine, other) if mine and other else None
+
+
+def verdict(found: Difference) -> str:
+    """Return the verdict on a paired difference; a run that broke off is worse."""
+    if math.isnan(found.mean):
+        return WORSE
+    if not found.certain:
+        return INCONCLUSIVE
+    return BETTER if found.mean < 0.0 else WORSE
+
+
+def judged_metrics(robot: str, case: str) -> tuple[Metric, ...]:
+    """Return the metrics that decide a case: of the wheels, or of the body if it is unknown."""
+    if robot == 'twin' and TWIN_CASES[case].gyro:
+        return YAW_RATE_SETTLED, YAW_RATE, DRIFT
+    return SETTLED, OVERALL
+
+
+def summary_table(plan: ComparisonPlan, results: Results) -> Table:
+    """Return the first judged metric of every method and case, with its verdict."""
+    rows = []
+    for method in plan.methods:
+        cells = [method]
+        for case in plan.cases:
+            metric = judged_metrics(plan.robot, case)[0]
+            found = difference(results, case, method, metric)
+            average = mean(values(results, case, method, metric))
+            text = 'diverged' if math.isnan(average) else f'{average:.{metric.digits}f}'
+            cells.append(text if found is None else f'{text} {verdict(found)}')
+        rows.append(tuple(cells))
+    body = [case for case in plan.cases if judged_metrics(plan.robot, case)[0] is not SETTLED]
+    title = 'Settled RMSE of the wheel speeds, rad/s'
+    if body:
+        title += f' ({", ".join(body)}: of the yaw rate of the body)'
+    return Table(
+        f'{title}; verdict against {FEED_FORWARD}',
+        ('method', *plan.cases),
+        tuple(rows),
+        (FULL,),
+    )
+
+
+def case_table(plan: ComparisonPlan, results: Results, case: str) -> Table:
+    """Return every metric of a case, and the paired differences of those that decide it."""
+    first = results[case, plan.methods[0]][0]
+    metrics = [
+        metric
+        for metric in METRICS
+        if metric.name in first
+        and (metric is not STOPPED or any(_stopped(results, case, m) for m in plan.methods))
+    ]
+    judged = judged_metrics(plan.robot, case)
+    head = ['method', *(f'{metric.heading}, {metric.unit}' for metric in metrics)]
+    compared = FEED_FORWARD in plan.methods and len(plan.methods) > 1
+    if compared:
+        for metric in judged:
+            head += [f'{metric.heading} − {FEED_FORWARD}', 'verdict']
+    rows = []
+    for method in plan.methods:
+        cells = [method]
+        for metric in metrics:
+            numbers = values(results, case, method, metric)
+            cells.append(format_interval(mean(numbers), interval(numbers), '', metric.digits))
+        for metric in judged if compared else ():
+            found = difference(results, case, method, metric)
+            if found is None:
+                cells += [EMPTY_CELL, EMPTY_CELL]
+            else:
+                text = format_interval(found.mean, found.half, '+', metric.digits)
+                cells += [text, verdict(found)]
+        rows.append(tuple(cells))
+    return Table(f'{case}: {case_texts(plan.robot)[case]}', tuple(head), tuple(rows), (FULL,))
+
+
+def knowledge_table(plan: ComparisonPlan) -> Table:
+    """Return what each kind of method knows."""
+    rows = {
+        'all': 'noise variance, limits, lag and dead time of the estimator (the true dead time '
+        'only where the case says that it is known); state estimate and limits are the same for '
+        'all',
+        'with preview': 'the reference 0.4 s ahead: feed-forward, full, and what has preview in '
+        'its name or is an NMPC',
+        'predictive with preview': 'a model with 1.3 times the inertia of the body; "exact '
+        'model": that of the nominal robot',
+    }
+    if plan.robot == 'twin':
+        scenario = TwinScenario('nominal', 0)
+        model = scenario.nominal_model()
+        gyro = [name for name in plan.cases if plan.gyro or TWIN_CASES[name].gyro] or ['no case']
+        rows |= {
+            FULL: 'the controller of the node with the parameters of the node for this robot, and '
+            'no learnt weights at the start; its stages and ablations likewise. It receives the '
+            'odometry as it is published: wheel speeds of the step counters, and a pose whose yaw '
+            'contains the gyro',
+            FEED_FORWARD: f'no measurement; the reference {1e3 * TWIN_ADVANCE:g} ms beyond the '
+            'dead time',
+            'baselines': 'parameters tuned for the velocity drive of the paper, not for this '
+            'robot; gain is the one at which the measured speed cancels in the command, '
+            f'{model.share / model.period:.1f} 1/s; no learnt weights at the start. The model is '
+            f'a servo with a lag of {1e3 * model.lag:g} ms without friction, which is exact for '
+            'a stepper motor but for the oscillation of its rotor',
+            'gyro': f'{", ".join(gyro)}: every baseline takes the difference of its wheel speeds '
+            'from the yaw of the odometry, which contains the gyro; in other cases from the step '
+            'counters',
+        }
+    else:
+        rows |= {
+            FULL: 'the tuned parameters of this drive, and the weights of three practice runs on '
+            'the nominal robot; its stages and ablations likewise',
+            FEED_FORWARD: 'no measurement',
+            'baselines': 'the tuned parameters of this drive, with equal effort; adaptive ones '
+            'start with the weights of the same practice runs',
+        }
+    return Table('What each method knows', ('method', 'knows'), tuple(rows.items()))
+
+
+def description(plan: ComparisonPlan) -> str:
+    """Return in one paragraph what was run and how it is counted."""
+    names = {
+        'twin': 'Digital twin',
+        'servo': "The paper's plant with velocity drive",
+        'torque': "The paper's plant with torque drive",
+    }
+    seeds = ', '.join(map(str, plan.seeds))
+    outside = ' (none is used for tuning or in another table)' if _are_outside(plan.seeds) else ''
+    text = (
+        f'{names[plan.robot]}, {plan.duration:g} s, noise variance {plan.noise:g} (rad/s)², '
+        f'seeds {seeds}{outside}. '
+        'True wheel speeds against the reference; mean ± half the 95 % interval over the seeds. '
+    )
+    if plan.robot == 'twin':
+        text += (
+            f'The first {START:g} s of control do not count. Settled: without {SETTLING[0]:g} s '
+            f'before and {SETTLING[1]:g} s after each switch. Yaw rate and yaw drift are those of '
+            'the body, from ground truth, against the reference; the drift is that at the end. '
+        )
+    else:
+        text += (
+            f'The first {START:g} s do not count. Settled: without {0.4 * PAPER_SETTLING:g} s '
+            f'before and {0.6 * PAPER_SETTLING:g} s after each switch. '
+        )
+    return text + (
+        'Variation: total variation of the commanded acceleration per second and wheel. '
+        f'Differences from {FEED_FORWARD} are paired by seed; better or worse: their 95 % '
+        'interval excludes zero.'
+    )
+
+
+def _are_outside(seeds: Sequence[int]) -> bool:
+    return not {*seeds} & {*TUNING_SEEDS, *PRETRAINING_SEEDS, *HELD_OUT_SEEDS}
+
+
+def markdown(plan: ComparisonPlan, results: Results) -> str:
+    """Return all tables in Markdown."""
+    tables = [
+        summary_table(plan, results),
+        *(case_table(plan, results, case) for case in plan.cases),
+        knowledge_table(plan),
+    ]
+    return '\n\n'.join([description(plan), *(table.markdown() for table in tables)])
+
+
+def page(plan: ComparisonPlan, results: Results) -> str:
+    """Return the page as self-contained HTML."""
+    title = f'Comparison of all methods: {plan.robot}'
+    parts = [
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f'<title>{escape(title)}</title>\n<style>{_CSS}</style>\n</head>\n<body>',
+        f'<h1>{escape(title)}</h1>\n<p>{escape(description(plan))}</p>',
+        knowledge_table(plan).html(),
+        summary_table(plan, results).html(),
+    ]
+    for case in plan.cases:
+        parts.append(f'<h2>{escape(case)}</h2>')
+        if picture := png_of(lambda of: _draw_differences(plan, results, of), case):
+            data = base64.b64encode(picture).decode()
+            caption = f'Difference from {FEED_FORWARD}, with 95 % interval'
+            parts.append(
+                f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{data}">'
+                f'<figcaption class="quiet">{escape(caption)}</figcaption></figure>'
+            )
+        parts.append(case_table(plan, results, case).html())
+    return '\n'.join([*parts, '</body>\n</html>\n'])
+
+
+def record(plan: ComparisonPlan, results: Results) -> dict[str, Any]:
+    """Return plan, runs and differences for a JSON file; null where a run broke off."""
+    cases: dict[str, Any] = {}
+    for case, text in case_texts(plan.robot).items():
+        if case in plan.cases:
+            found = {name: _method_record(results, case, name) for name in plan.methods}
+            cases[case] = {'text': text, 'methods': found}
+    return {
+        'format': 1,
+        'version': t3mpc_ros.__version__,
+        'robot': plan.robot,
+        'drive_of_tuning': DRIVES[plan.robot],
+        'seeds': list(plan.seeds),
+        'duration': plan.duration,
+        'noise': plan.noise,
+        'gyro': plan.gyro,
+        'units': {metric.name: metric.unit for metric in METRICS},
+        'parameters': {name: _parameters(plan, name) for name in plan.methods},
+        'cases': cases,
+    }
+
+
+def _parameters(plan: ComparisonPlan, name: str) -> Mapping[str, object]:
+    method = methods_for(plan.robot)[name]
+    parameters = getattr(method, 'parameters', None)
+    if parameters is None:
+        baseline = getattr(method, 'baseline', None)
+        if baseline is None:
+            own = TwinScenario('nominal', 0).controller_parameters()
+            parameters = own.with_values(getattr(method, 'changes', None) or {})
+        else:
+            parameters = baseline.parameters
+    return dict(parameters.to_dict())
+
+
+def _method_record(results: Results, case: str, method: str) -> dict[str, Any]:
+    runs = results[case, method]
+    differences = {}
+    for metric in METRICS:
+        found = difference(results, case, method, metric)
+        if found is not None:
+            differences[metric.name] = {
+                'mean': _finite(found.mean),
+                'half_interval': _finite(found.half),
+                'verdict': verdict(found),
+            }
+    return {
+        'mean': {name: _finite(mean([run[name] for run in runs])) for name in runs[0]},
+        'runs': [{name: _finite(number) for name, number in run.items()} for run in runs],
+        f'difference_from_{FEED_FORWARD.replace("-", "_")}': differences,
+    }
+
+
+def _stopped(results: Results, case: str, method: str) -> bool:
+    return any(number > 0.0 for number in values(results, case, method, STOPPED))
+
+
+def _finite(number: float) -> float | None:
+    return number if math.isfinite(number) else None
+
+
+def _draw_differences(plan: ComparisonPlan, results: Results, case: str) -> Any:
+    """Return a figure of the paired differences of the first judged metric, or None."""
+    metric = judged_metrics(plan.robot, case)[0]
+    rows: Sequence[tuple[str, Difference]] = [
+        (method, found)
+        for method in plan.methods
+        if (found := difference(results, case, method, metric)) and math.isfinite(found.mean)
+    ]
+    if not rows:
+        return None
+    figure = new_figure(0.9 + 0.2 * len(rows))
+    axis = figure.subplots()
+    places = np.arange(len(rows))[::-1]
+    colours = {BETTER: '#15803d', WORSE: '#be123c', INCONCLUSIVE: '#6b7280'}
+    for place, (_, found) in zip(places, rows, strict=True):
+        half = found.half if math.isfinite(found.half) else 0.0
+        colour = colours[verdict(found)]
+        axis.errorbar(found.mean, place, xerr=half, fmt='o', color=colour, markersize=4)
+    axis.axvline(0.0, color='#1f2937', linewidth=0.8)
+    axis.set_yticks(places, [name for name, _ in rows])
+    axis.set_xscale('symlog', linthresh=0.01)
+    axis.set_xlabel(f'{metric.heading} / ({metric.unit})')
+    return figure

@@ -1,0 +1,270 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Scenario of one run on the digital twin: what is different, and what the methods know of it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+import difflib
+import math
+from pathlib import Path
+
+from t3mpc_ros.chaos.reference import ReferenceParameters
+from t3mpc_ros.control.actuation import LimitParameters
+from t3mpc_ros.control.controller import ControllerParameters
+from t3mpc_ros.control.speed_filter import SpeedFilterParameters
+from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel
+from t3mpc_ros.evaluation.scenario import (
+    RATE,
+    SampledReference,
+    isotropic_acceleration,
+    sample_reference,
+)
+from t3mpc_ros.evaluation.twin_closed_loop import (
+    INITIAL_STANDSTILL,
+    LEAD,
+    OdometryFaults,
+    loop_controller,
+    loop_robot,
+)
+from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
+from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule
+from t3mpc_ros.simulation.plant.disturbances import DisturbanceParameters
+from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
+
+SHORTEST, LONGEST = 2.0, 3600.0
+"""Bounds of the duration of a run, s."""
+PATCHES = Path(__file__).with_name('patches.yaml')
+"""World with slippery patches."""
+OVERLOAD = 4.0
+"""Duration of the overload, s."""
+
+
+@dataclass(frozen=True, slots=True)
+class TwinCase:
+    """Difference of the true robot and its links from what every method assumes."""
+
+    text: str
+    robot: Mapping[str, object] = field(default_factory=dict)
+    """Parameters of the robot from the start."""
+    faults: Mapping[str, float] = field(default_factory=dict)
+    """Faults of robot and command link, from :attr:`begin` on for :attr:`lasting`."""
+    odometry_loss: float = 0.0
+    """Fraction of the reports that is lost in that time."""
+    odometry_delay: tuple[float, float] = (0.0, 0.0)
+    """Least and largest delay of a report in that time, s."""
+    begin: float = 0.0
+    """Begin of the faults, as a share of the run."""
+    lasting: float = math.inf
+    """Duration of the faults, s."""
+    assumed_dead_time: float = 0.01
+    """Dead time that every method assumes, s."""
+    gyro: bool = False
+    """Whether the baselines take the yaw rate from the odometry with its gyro."""
+
+
+CASES: Mapping[str, TwinCase] = {
+    'nominal': TwinCase('the default twin'),
+    'miscalibrated': TwinCase(
+        'wheel radii +2 % and -1 %, track +3 %, slippery patches, 30 % more mass and inertia with '
+        'the centre of mass 6 cm ahead of the axle instead of 2 cm',
+        {
+            'right_wheel_radius_multiplier': 1.02,
+            'left_wheel_radius_multiplier': 0.99,
+            'wheel_separation_multiplier': 1.03,
+            'world': str(PATCHES),
+            'mass_factor': 1.3,
+            'inertia_factor': 1.3,
+            'body.com_offset': 0.06,
+        },
+        gyro=True,
+    ),
+    'friction x3': TwinCase('three times the friction', {'friction_factor': 3.0}),
+    'disturbance': TwinCase(
+        'three times the bound of the disturbance torque',
+        {'disturbance.bound': 3.0 * DisturbanceParameters().bound},
+    ),
+    'load change': TwinCase(
+        'at half of the run 1 kg is added to the body', faults={'load_change': 1.0}, begin=0.5
+    ),
+    'dead time': TwinCase(
+        'a command takes 30 ms instead of 10 ms, and every method knows it',
+        {'drive.dead_time': 0.03},
+        assumed_dead_time=0.03,
+    ),
+    'dead time 60 ms': TwinCase(
+        'a command takes 60 ms instead of 10 ms, and every method knows it',
+        {'drive.dead_time': 0.06},
+        assumed_dead_time=0.06,
+    ),
+    'unknown dead time': TwinCase(
+        'a command takes 30 ms; every method assumes 10 ms', {'drive.dead_time': 0.03}
+    ),
+    'unknown dead time 60 ms': TwinCase(
+        'a command takes 60 ms; every method assumes 10 ms', {'drive.dead_time': 0.06}
+    ),
+    'dropouts': TwinCase(
+        '10 % of the commands and 10 % of the odometry are lost',
+        faults={'command_loss': 0.1},
+        odometry_loss=0.1,
+    ),
+    'jitter': TwinCase(
+        'each command is up to 20 ms late, and each odometry message up to 10 ms',
+        faults={'command_jitter': 0.02},
+        odometry_delay=(0.0, 0.01),
+    ),
+    'overload': TwinCase(
+        f'for {OVERLOAD:g} s from half of the run on, each command and each odometry message is '
+        '20 to 120 ms late',
+        faults={'command_delay': 0.02, 'command_jitter': 0.1},
+        odometry_delay=(0.02, 0.12),
+        begin=0.5,
+        lasting=OVERLOAD,
+    ),
+}
+"""Every case by name, in the order of the tables."""
+
+
+@dataclass(frozen=True)
+class TwinScenario:
+    """One run on the twin without its method.
+
+    The reference is that of ``scripts/demo`` with the seed, which is also the robot's. Scenarios
+    with equal seeds have equal references, and equal numbers drawn for noise and disturbance.
+
+    Parameters
+    ----------
+    case
+        One of :data:`CASES`.
+    seed
+        Of reference and robot.
+    duration
+        s; the robot stands for the first 1.5 s.
+    noise
+        Variance of the measured wheel speeds, (rad/s)², which every method knows.
+    gyro
+        Whether the baselines take the yaw rate from the odometry with its gyro in every case.
+
+    Raises
+    ------
+    ValueError
+        A value out of its range.
+    """
+
+    case: str
+    seed: int
+    duration: float = 60.0
+    noise: float = 0.04
+    gyro: bool = False
+
+    def __post_init__(self) -> None:
+        check_name('case', self.case, CASES)
+        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
+            raise ValueError(f'seed must be a whole number of at least 0: got {self.seed!r}')
+        for name, low, high, unit in (
+            ('noise', 0.0, 100.0, '(rad/s)²'),
+            ('duration', SHORTEST, LONGEST, 's'),
+        ):
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ValueError(f'{name} must be from {low:g} to {high:g} {unit}: got {value}')
+
+    def __str__(self) -> str:
+        return f'twin, noise {self.noise:g}, {self.case}, seed {self.seed}'
+
+    @property
+    def uses_gyro(self) -> bool:
+        """Whether the baselines take the yaw rate from the odometry with its gyro."""
+        return self.gyro or CASES[self.case].gyro
+
+    @property
+    def fault_span(self) -> tuple[float, float] | None:
+        """Begin and end (s) of the faults that do not last for the whole run; None without."""
+        case = CASES[self.case]
+        if case.begin == 0.0 and case.lasting == math.inf:
+            return None
+        begin = self._fault_begin
+        return begin, begin + case.lasting
+
+    @property
+    def limits(self) -> LimitParameters:
+        """Limits of the command, equal for all methods."""
+        return self.controller_parameters().limits
+
+    def reference(self) -> SampledReference:
+        """Return the reference over the run and the preview beyond it."""
+        parameters = ReferenceParameters.from_dict({'rate': RATE, 'seed': self.seed})
+        return sample_reference(parameters, round((self.duration + LEAD) * RATE) + 1)
+
+    def robot(self) -> DigitalTwinParameters:
+        """Return the true robot."""
+        return loop_robot(seed=self.seed).with_values(
+            {'noise.variance': float(self.noise), **CASES[self.case].robot}
+        )
+
+    def schedule(self) -> FaultSchedule:
+        """Return the faults of robot and command link."""
+        case = CASES[self.case]
+        return FaultSchedule(
+            [
+                FaultEvent(self._fault_begin, name, value, case.lasting)
+                for name, value in case.faults.items()
+            ],
+            self.case,
+        )
+
+    def odometry_faults(self) -> OdometryFaults:
+        """Return the faults of the odometry on its way to the controller."""
+        case, begin = CASES[self.case], self._fault_begin
+        return OdometryFaults(
+            case.odometry_loss, case.odometry_delay, begin, begin + case.lasting, self.seed
+        )
+
+    def controller_parameters(self) -> ControllerParameters:
+        """Return the parameters of the controller node for the twin, with the known values."""
+        return loop_controller().with_values(
+            {
+                'speed_filter.noise_variance': float(self.noise),
+                'speed_filter.dead_time': CASES[self.case].assumed_dead_time,
+            }
+        )
+
+    def estimate(self) -> SpeedFilterParameters:
+        """Return the parameters of the state estimator, equal for all methods."""
+        return self.controller_parameters().speed_filter
+
+    def nominal_model(self) -> NominalModel:
+        """Return the nominal model for a baseline: a servo with the lag that the node assumes.
+
+        It has no friction: a stepper motor that loses no step keeps its speed under load.
+        """
+        estimate = self.estimate()
+        robot = PaperRobotParameters.from_dict(
+            {
+                'drive.kind': 'velocity',
+                'drive.lag': estimate.lag,
+                'drive.dead_time': estimate.dead_time,
+                'friction.viscous': 0.0,
+                'friction.coulomb': 0.0,
+                'rate': RATE,
+            }
+        )
+        return NominalModel(
+            drive='velocity',
+            period=1.0 / RATE,
+            lag=estimate.lag,
+            acceleration=isotropic_acceleration(self.limits, robot.geometry),
+            robot=robot,
+        )
+
+    @property
+    def _fault_begin(self) -> float:
+        case = CASES[self.case]
+        return max(case.begin * self.duration, INITIAL_STANDSTILL if case.begin else 0.0)
+
+
+def check_name(kind: str, name: str, known: Mapping[str, object]) -> None:
+    """Raise ValueError, with the nearest name, when ``name`` is not known."""
+    if name not in known:
+        near = difflib.get_close_matches(name, list(known), n=1)
+        hint = f'; did you mean {near[0]}?' if near else ''
+        raise ValueError(f'{kind} must be one of {", ".join(known)}: got {name!r}{hint}')

@@ -1,0 +1,411 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Comparison: equal runs, pairing, what each case changes, feed-forward against its plan."""
+
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.cli.compare import ROBOTS, seed_range
+from t3mpc_ros.cli.main import main
+from t3mpc_ros.control.controller import Controller
+from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
+from t3mpc_ros.evaluation.baselines.feed_forward import FeedForward, FeedForwardParameters
+from t3mpc_ros.evaluation.baselines.proportional_integral import (
+    ProportionalIntegral,
+    ProportionalIntegralParameters,
+)
+from t3mpc_ros.evaluation.closed_loop import MethodSpec
+from t3mpc_ros.evaluation.method_comparison.compared_runs import (
+    DRIFT,
+    DRIVES,
+    FEED_FORWARD,
+    QUICK_SEEDS,
+    SETTLED,
+    STOPPED,
+    YAW_RATE,
+    ComparisonPlan,
+    TwinMethod,
+    cases_for,
+    compare,
+    default_methods,
+    measured_run,
+    methods_for,
+    twin_numbers,
+    twin_run,
+)
+from t3mpc_ros.evaluation.method_comparison.comparison_page import (
+    BETTER,
+    INCONCLUSIVE,
+    WORSE,
+    difference,
+    judged_metrics,
+    verdict,
+)
+from t3mpc_ros.evaluation.method_comparison.twin_baseline import TwinBaseline
+from t3mpc_ros.evaluation.method_comparison.twin_scenario import CASES, TwinScenario
+from t3mpc_ros.evaluation.methods import FULL
+from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, TUNING_SEEDS
+from t3mpc_ros.evaluation.twin_closed_loop import (
+    INITIAL_STANDSTILL,
+    OdometryFaults,
+    drive_twin,
+    loop_controller,
+    loop_robot,
+    run_twin,
+)
+from t3mpc_ros.geometry.kinematics import twist_from_wheels
+from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, Pose, State, WheelSpeeds
+from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
+
+T = 0.01
+PI = 'PI + feed-forward'
+
+
+def twin(case='nominal', method=FEED_FORWARD, seed=201, duration=4.0, **changes):
+    """Return scenario and record of a short run on the twin."""
+    scenario = TwinScenario(case, seed, duration, **changes)
+    return scenario, twin_run(scenario, methods_for('twin')[method])
+
+
+def ideal_drive(commands, lag, late, steps, substeps=20):
+    """Return the speeds of a servo whose command arrives ``late`` periods after it is sent."""
+    chi, keep = np.zeros(2), math.exp(-T / substeps / lag)
+    speeds = np.empty((steps * substeps, 2))
+    for k in range(steps):
+        command = commands[k - late] if k >= late else np.zeros(2)
+        for i in range(substeps):
+            speeds[k * substeps + i] = chi
+            chi = command + keep * (chi - command)
+    return speeds
+
+
+def commands_of(forward, model, reference, late, skip=()):
+    """Return the commands of feed-forward along a reference; no measurement enters them."""
+    rows = len(reference) - 45
+    commands, last = np.empty((rows, 2)), -1
+    for k in range(rows):
+        if k in skip:
+            commands[k] = commands[k - 1]
+            continue
+        future = reference[k + late : k + 41]
+        observation = Observation(
+            np.full(2, 7.0), np.zeros(2), future[0], future[1], np.zeros(2), future, k - last
+        )
+        u = forward.step(observation)
+        commands[k] = observation.speeds + T * u / model.share
+        last = k
+    return commands
+
+
+def servo_model(lag=0.02):
+    return NominalModel('velocity', T, lag, 28.0, PaperRobotParameters())
+
+
+# --- pure feed-forward --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(('lag', 'late'), [(0.003, 1), (0.02, 1), (0.02, 3)])
+def test_on_an_ideal_drive_feed_forward_is_the_reference(lag, late):
+    """The mean error of a ramp and a slow sine is far below what one period of delay costs."""
+    time = T * np.arange(600)
+    sine = np.column_stack([2.0 * np.sin(3.0 * time), 1.0 * time])
+    model = servo_model(lag)
+    commands = commands_of(FeedForward(FeedForwardParameters(), model), model, sine, late)
+    speeds = ideal_drive(commands, lag, late, len(commands))
+    fine = (T / 20) * np.arange(len(speeds))
+    truth = np.column_stack([2.0 * np.sin(3.0 * fine), 1.0 * fine])
+    error = (speeds - truth)[fine > 1.0]
+    one_period = T * np.sqrt(np.mean(np.diff(truth, axis=0)[2000:] ** 2)) / (T / 20)
+    assert abs(error.mean(axis=0)).max() < 0.03 * one_period
+    assert np.sqrt(np.mean(error**2)) < 0.5 * one_period
+
+
+def test_feed_forward_crosses_a_jump_half_way_by_its_ramp():
+    reference = np.zeros((300, 2))
+    reference[150:] = 3.0, -3.0
+    model = servo_model()
+    commands = commands_of(FeedForward(FeedForwardParameters(), model), model, reference, 1)
+    change = np.diff(commands, axis=0) / T
+    assert np.abs(change).max() <= 30.0 + 1e-6
+    assert np.abs(commands[:100]).max() < 1e-9
+    assert commands[-1] == pytest.approx([3.0, -3.0])
+    speeds = ideal_drive(commands, model.lag, 1, len(commands))
+    right = speeds[:, 0]
+    middle = np.argmax(right >= 1.5) * T / 20
+    # The jump of the samples lies between rows 149 and 150; the servo's lag rounds the ramp.
+    assert middle == pytest.approx(1.495, abs=0.004)
+
+
+def test_feed_forward_uses_no_measurement():
+    wave = np.column_stack([np.sin(0.03 * np.arange(200)), np.cos(0.03 * np.arange(200))])
+    model = servo_model()
+    both = []
+    for speed in (0.0, 5.0):
+        forward, future = FeedForward(FeedForwardParameters(), model), wave[1:41]
+        chi = np.full(2, speed)
+        seen = Observation(chi, chi, future[0], future[1], chi, future)
+        both.append(chi + T * forward.step(seen) / model.share)
+    assert both[0] == pytest.approx(both[1], abs=1e-12)
+
+
+def test_lost_measurements_do_not_delay_the_ramp():
+    """After a gap within a ramp the commands are those of the run without it."""
+    reference = np.zeros((300, 2))
+    reference[150:] = 4.0, 2.0
+    model = servo_model()
+    whole, gap = (
+        commands_of(FeedForward(FeedForwardParameters(), model), model, reference, 1, skip)
+        for skip in ((), range(140, 147))
+    )
+    assert np.array_equal(whole[:140], gap[:140])
+    assert np.abs(whole[147:] - gap[147:]).max() < 1e-9
+    assert np.abs(whole[140:147] - gap[140:147]).max() > 0.1
+
+
+def test_feed_forward_of_torques_is_the_rate_of_the_plan():
+    wave = np.column_stack([np.sin(0.03 * np.arange(60)), np.zeros(60)])
+    model = NominalModel('torque', T, 0.02, math.inf, PaperRobotParameters())
+    u = FeedForward(FeedForwardParameters(), model).step(
+        Observation(np.ones(2), np.ones(2), wave[0], wave[1], np.zeros(2), wave[:41])
+    )
+    assert u == pytest.approx((wave[1] - wave[0]) / T)
+
+
+def test_feed_forward_needs_a_future():
+    forward = FeedForward(FeedForwardParameters(), servo_model())
+    zero = np.zeros(2)
+    with pytest.raises(ValueError, match='future must have at least 5 rows: got 0'):
+        forward.step(Observation(zero, zero, zero, zero, zero, None))
+
+
+# --- the loop on the twin -----------------------------------------------------------------------
+
+
+def test_the_loop_of_a_controller_is_that_of_run_twin():
+    scenario = TwinScenario('nominal', 201, 3.0)
+    mine = twin_run(scenario, methods_for('twin')[FULL])
+    robot = loop_robot(seed=201)
+    other = run_twin(robot, loop_controller(), scenario.reference().speeds, 3.0)
+    assert np.array_equal(mine.requested, other.requested)
+    assert np.array_equal(mine.truth, other.truth)
+
+
+@pytest.mark.parametrize('method', [FULL, PI])
+@pytest.mark.parametrize('case', ['miscalibrated', 'overload', 'dropouts'])
+def test_equal_seeds_give_equal_runs(case, method):
+    (_, first), (_, second) = (twin(case, method, duration=3.0) for _ in range(2))
+    assert np.array_equal(first.requested, second.requested)
+    assert np.array_equal(first.rotors, second.rotors)
+
+
+def test_methods_are_paired():
+    """Reference, noise and lost messages are the same for every method of a seed."""
+    (scenario, mine), (_, other) = (twin('dropouts', method) for method in (FEED_FORWARD, PI))
+    assert np.array_equal(mine.reference, other.reference)
+    still = mine.rows(0.0, INITIAL_STANDSTILL)
+    assert np.array_equal(mine.measured[still], other.measured[still])
+    assert scenario.robot().noise.variance == 0.04
+    _, another = twin('dropouts', seed=202)
+    assert not np.array_equal(mine.reference, another.reference)
+
+
+@pytest.mark.parametrize('case', list(CASES))
+def test_every_case_of_the_twin_drives(case):
+    """The robot follows in every case: worse than usual, but it does not stop or diverge."""
+    scenario, record = twin(case, FEED_FORWARD)
+    numbers = twin_numbers(scenario, record)
+    assert numbers[SETTLED.name] < 2.0
+    assert numbers[STOPPED.name] == 0.0
+    assert np.abs(record.requested).max() > 0.5
+
+
+def test_feed_forward_does_not_depend_on_noise():
+    scenario, quiet = twin(noise=0.0)
+    _, noisy = twin(noise=0.1)
+    moving = quiet.time > INITIAL_STANDSTILL + 1.0  # before: from the measured speed to the plan
+    assert np.abs(quiet.requested - noisy.requested)[moving].max() < 1e-9
+    assert scenario.noise == 0.0
+
+
+def test_the_miscalibrated_twin_turns_otherwise():
+    (_, good), (_, bad) = twin(), twin('miscalibrated')
+    moving = good.time > INITIAL_STANDSTILL + 1.0
+    assert np.abs(good.requested - bad.requested)[moving].max() < 1e-9
+    numbers = [twin_numbers(TwinScenario(case, 201, 4.0), run) for case, run in
+               (('nominal', good), ('miscalibrated', bad))]  # fmt: skip
+    assert numbers[1][YAW_RATE.name] > 2.0 * numbers[0][YAW_RATE.name]
+    assert numbers[1][SETTLED.name] < 0.1
+
+
+def test_a_known_dead_time_is_known_to_all():
+    for case, assumed in (('dead time 60 ms', 0.06), ('unknown dead time 60 ms', 0.01)):
+        scenario = TwinScenario(case, 201)
+        assert scenario.robot().drive.dead_time == 0.06
+        assert scenario.estimate().dead_time == assumed
+        assert scenario.controller_parameters().speed_filter.dead_time == assumed
+        assert scenario.nominal_model().robot.drive.dead_time == assumed
+    (_, known), (_, unknown) = twin('dead time 60 ms'), twin('unknown dead time 60 ms')
+    shift = known.requested[250:350] - unknown.requested[255:355]
+    assert np.abs(shift).max() < 1e-9
+
+
+def test_the_yaw_of_the_odometry_is_the_gyro_measurement():
+    """The measured wheel speeds have the mean of the counters and the turn of the yaw."""
+    spec = MethodSpec('PI', ProportionalIntegral, ProportionalIntegralParameters())
+    geometry = loop_robot().geometry
+    for gyro in (False, True):
+        baseline = TwinBaseline(spec, TwinScenario('nominal', 201, 4.0, gyro=gyro))
+        baseline.step(State(2_000_000_000, ORIGIN, BodyTwist(0.1, 0.5)))
+        odometry = State(2_010_000_000, Pose(0.001, 0.0, 0.003), BodyTwist(0.1, 0.5))
+        measured = baseline._measured(odometry, T)
+        twist = twist_from_wheels(WheelSpeeds(*measured), geometry)
+        assert twist.linear == pytest.approx(0.1)
+        assert twist.angular == pytest.approx(0.3 if gyro else 0.5)
+
+
+def test_reports_arrive_late_in_order_and_not_at_all():
+    """A controller receives what the faults leave, in order and no earlier than its delay."""
+    received = []
+
+    class Spy:
+        def __init__(self):
+            self.inner = Controller(loop_controller())
+
+        def enable(self, on):
+            self.inner.enable(on)
+
+        def add_reference(self, reference):
+            self.newest = reference.stamp_ns
+            return self.inner.add_reference(reference)
+
+        def step(self, odometry):
+            now_ns = self.newest - 400_000_000
+            received.append((odometry.stamp_ns, now_ns))
+            return self.inner.step(odometry)
+
+    faults = OdometryFaults(0.2, (0.02, 0.12), begin=1.0, end=2.0, seed=3)
+    course = TwinScenario('nominal', 201, 3.0).reference().speeds
+    drive_twin(loop_robot(), Spy(), course, 3.0, odometry_faults=faults)
+    stamps = [stamp for stamp, _ in received]
+    assert stamps == sorted(stamps)
+    during = [now - stamp for stamp, now in received if 1_000_000_000 <= stamp < 2_000_000_000]
+    assert 60 < len(during) < 95
+    assert min(during) >= 10_000_000
+    assert 80_000_000 < max(during) <= 120_000_000
+    assert all(now == stamp for stamp, now in received if stamp < 1_000_000_000)
+    assert received[-1][0] == received[-1][1]
+
+
+# --- methods, plans, results --------------------------------------------------------------------
+
+
+def test_the_quick_seeds_are_in_no_other_table():
+    assert not set(QUICK_SEEDS) & {*TUNING_SEEDS, *PRETRAINING_SEEDS, *HELD_OUT_SEEDS}
+
+
+@pytest.mark.parametrize('robot', ROBOTS)
+def test_every_robot_has_feed_forward_and_the_full_controller(robot):
+    assert default_methods(robot)[:2] == (FULL, FEED_FORWARD)
+    assert set(default_methods(robot)) < set(methods_for(robot))
+    assert cases_for(robot)[0] == 'nominal'
+    assert set(DRIVES) == set(ROBOTS)
+
+
+def test_the_gain_of_the_baselines_cancels_the_noise():
+    """On the twin the command of PI without integral does not contain the measured speed."""
+    method = methods_for('twin')[PI]
+    scenario = TwinScenario('nominal', 201)
+    model = scenario.nominal_model()
+    assert isinstance(method, TwinMethod)
+    parameters = method.baseline.parameters.with_values({'integral': 0.1})
+    commands = []
+    for speed in (1.0, 1.2):
+        pi = ProportionalIntegral(parameters, model)
+        for chi in (1.0, speed):  # the first error counts as a jump
+            here = np.full(2, chi)
+            u = pi.step(Observation(here, np.zeros(2), np.ones(2), np.ones(2), here, None))
+        commands.append(here + T * u / model.share)
+    assert abs(commands[1] - commands[0]).max() < 0.001
+
+
+def test_differences_are_paired_with_their_verdict():
+    def results(mine, other):
+        return {
+            ('nominal', 'mine'): [{SETTLED.name: value} for value in mine],
+            ('nominal', FEED_FORWARD): [{SETTLED.name: value} for value in other],
+        }
+
+    def judged(mine, other):
+        return verdict(difference(results(mine, other), 'nominal', 'mine', SETTLED))
+
+    assert judged([1.1, 2.1, 3.1], [1.0, 2.0, 3.0]) == WORSE
+    assert judged([0.9, 1.91, 2.9], [1.0, 2.0, 3.0]) == BETTER
+    assert judged([0.9, 2.1, 3.0], [1.0, 2.0, 3.0]) == INCONCLUSIVE
+    assert judged([math.nan, 2.0, 3.0], [1.0, 2.0, 3.0]) == WORSE
+    assert judged([0.5], [1.0]) == INCONCLUSIVE
+    assert difference(results([1.0], [1.0]), 'nominal', FEED_FORWARD, SETTLED) is None
+
+
+def test_the_body_decides_where_it_is_not_known():
+    assert judged_metrics('twin', 'nominal')[0] is SETTLED
+    assert DRIFT in judged_metrics('twin', 'miscalibrated')
+    assert judged_metrics('servo', 'nominal')[0] is SETTLED
+
+
+@pytest.mark.parametrize('robot', ['servo', 'torque'])
+def test_the_plant_of_the_paper_is_compared_too(robot):
+    plan = ComparisonPlan(robot, ('nominal',), (FEED_FORWARD, PI), (201,), 2.0)
+    results = compare(plan)
+    assert set(results) == {('nominal', FEED_FORWARD), ('nominal', PI)}
+    assert results['nominal', PI][0] == measured_run(plan.job('nominal', PI, 201))
+    assert all(math.isfinite(value) for value in results['nominal', PI][0].values())
+
+
+def test_the_command_writes_tables_json_and_page(tmp_path, capsys):
+    files = tmp_path / 'new' / 'c.json', tmp_path / 'new' / 'c.html'
+    words = 'compare --robot twin --seeds 201-202 --duration 2 --workers 1'
+    words += ' --cases nominal miscalibrated --methods feed-forward pi-feed-forward'
+    assert main([*words.split(), '--json', str(files[0]), '--html', str(files[1])]) == 0
+    text = capsys.readouterr()
+    assert '8 of 8 runs' in text.err
+    record = json.loads(files[0].read_text())
+    runs = record['cases']['nominal']['methods'][PI]['runs']
+    assert len(runs) == 2
+    mean = record['cases']['nominal']['methods'][PI]['mean'][SETTLED.name]
+    assert mean == pytest.approx(sum(run[SETTLED.name] for run in runs) / 2)
+    assert re.search(rf'\| {re.escape(PI)} \| {mean:.4f} ', text.out)
+    page = files[1].read_text()
+    assert page.count('<img ') == 2
+    assert 'http' not in page.replace('http-equiv', '')
+    assert 'What each method knows' in page
+
+
+@pytest.mark.parametrize(
+    ('words', 'text'),
+    [
+        (['--cases', 'nominel'], 'case must be one of .*did you mean nominal'),
+        (['--methods', 'feedforward'], 'method must be one of .*did you mean feed-forward'),
+        (['--robot', 'servo', '--cases', 'miscalibrated'], 'case must be one of nominal, mass'),
+        (['--robot', 'servo', '--gyro'], 'gyro is for the twin alone'),
+    ],
+)
+def test_unknown_words_are_errors_before_any_run(words, text, capsys):
+    assert main(['compare', *words]) == 1
+    assert re.search(text, capsys.readouterr().err)
+
+
+@pytest.mark.parametrize('text', ['', 'a-b', '5-3', '-3', '1-20000'])
+def test_wrong_seeds_are_refused(text, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(['compare', f'--seeds={text}'])
+    assert stopped.value.code == 2
+    assert 'must be A-B' in capsys.readouterr().err
+
+
+def test_seeds_are_a_range_or_one():
+    assert seed_range('201-203') == (201, 202, 203)
+    assert seed_range('7') == (7,)
