@@ -12,7 +12,7 @@ import os
 import signal
 import sys
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from t3mpc_ros.missing_library import remedy
 from t3mpc_ros.nodes.arguments import information, parameter_file_problem, unknown_arguments
@@ -25,39 +25,39 @@ USAGE_ERROR = 2
 """Exit code for an unusable parameter, parameter file or command line."""
 
 
-def reference_generator() -> int:
+def reference_generator() -> NoReturn:
     """Run the fractional-order chaotic reference generator."""
-    return _main('reference_generator')
+    _main('reference_generator')
 
 
-def controller() -> int:
+def controller() -> NoReturn:
     """Run the NT3FS-BM-MPC controller."""
-    return _main('controller')
+    _main('controller')
 
 
-def sim_robot() -> int:
+def sim_robot() -> NoReturn:
     """Run the simulated robot."""
-    return _main('sim_robot')
+    _main('sim_robot')
 
 
-def radio_bridge() -> int:
+def radio_bridge() -> NoReturn:
     """Run the bridge to the real robot."""
-    return _main('radio_bridge')
+    _main('radio_bridge')
 
 
-def recorder() -> int:
+def recorder() -> NoReturn:
     """Run the MCAP recorder."""
-    return _main('recorder')
+    _main('recorder')
 
 
-def player() -> int:
+def player() -> NoReturn:
     """Run the bag player."""
-    return _main('player')
+    _main('player')
 
 
-def composed() -> int:
+def composed() -> NoReturn:
     """Run several nodes in one process."""
-    return _main('composed')
+    _main('composed')
 
 
 class StopRequest:
@@ -81,16 +81,24 @@ class StopRequest:
             os._exit(0)
 
 
-def _main(name: str) -> int:
+def _main(name: str) -> NoReturn:
+    """Run an executable and end the process at once.
+
+    The robot is stopped and the files are closed when :func:`run` returns. The teardown of the
+    interpreter would take half a second more, in which launch sends SIGTERM on a busy machine.
+    """
     request = StopRequest()
     request.install()
     try:
-        return run(name, request, sys.argv)
+        code = run(name, request, sys.argv)
     except ModuleNotFoundError as error:
         if not (problem := remedy(error)):
             raise
         print(f'{name}: {problem}', file=sys.stderr, flush=True)
-        return 1
+        code = 1
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 def run(name: str, request: StopRequest, argv: Sequence[str]) -> int:
