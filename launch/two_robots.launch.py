@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Launch two simulated robots: ``ros2 launch t3mpc_ros two_robots.launch.py``.
 
-Each robot has a namespace. With ``use_sim_time`` the first robot publishes the clock for all
-nodes. The robots do not collide with each other, only with the walls of the world.
+Each robot has a namespace, which prefixes its topics and frames. With ``use_sim_time`` the first
+robot publishes the clock for all nodes. The robots do not collide with each other, only with the
+walls of the world.
 """
 
 from pathlib import Path
@@ -29,27 +30,15 @@ def generate_launch_description():
     use_sim_time = LaunchConfiguration('use_sim_time')
     nodes = []
     for name, robot in ROBOTS.items():
-        odom, base = f'{name}/odom', f'{name}/base_link'
         clock = {'publish_clock': use_sim_time} if name == min(ROBOTS) else {}
         parameters = {
             'sim_robot': {
                 'world': world,
-                'odom_frame_id': odom,
-                'base_frame_id': base,
-                'world_frame': 'world',
-                'imu_frame_id': f'{name}/imu_link',
-                'range_frame_prefix': f'{name}/',
-                'right_wheel_name': f'{name}/right_wheel_joint',
-                'left_wheel_name': f'{name}/left_wheel_joint',
                 **robot,
                 **clock,
             },
-            'controller': {'frame_id': base},
-            'reference_generator': {
-                'frame_id': odom,
-                'child_frame_id': base,
-                'seed': robot['seed'],
-            },
+            'controller': {},
+            'reference_generator': {'seed': robot['seed']},
         }
         nodes += [
             Node(

@@ -26,6 +26,7 @@ from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist
 from t3mpc_ros.nodes.common import conversions, graph_introspection, qos
 from t3mpc_ros.nodes.common.base_node import ERROR, OK, WARN, BaseNode, publish_and_wait_for_acked
 from t3mpc_ros.nodes.common.command_subscription import age_problem, message_age_ns
+from t3mpc_ros.nodes.common.frame_prefix import FrameParameters
 from t3mpc_ros.parameters.table import group, parameter
 
 CONFIGURATION_ERRORS = (ModelError,)
@@ -49,6 +50,7 @@ class ControllerNodeParameters(ControllerParameters):
         False, 'publish cmd_vel as TwistStamped instead of Twist'
     )
     frame_id: str = parameter('base_link', 'frame of a stamped command')
+    frames: FrameParameters = group(FrameParameters, inline=True)
     terms_rate: float = parameter(
         20.0,
         'rate of the scalar topics (~/error, ~/estimate, ~/terms, ~/lyapunov, ~/skill); 0 = none',
@@ -122,6 +124,9 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self._command_publisher = self.create_publisher(self._command_type, 'cmd_vel', qos.COMMAND)
         self._scalar_publishers = (
             self._create_scalar_publishers() if self.parameters.terms_rate else {}
+        )
+        self._frame_id = self.parameters.frames.prefixed(
+            self.parameters.frame_id, self.get_namespace()
         )
         self._initial_reference = InitialInputs(self, 'reference')
         self._initial_odometry = InitialInputs(self, 'odom')
@@ -201,7 +206,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
 
     def _command_message(self, command: BodyTwist, stamp_ns: int) -> Twist | TwistStamped:
         if self.parameters.enable_stamped_cmd_vel:
-            return conversions.stamped_twist(command, stamp_ns, self.parameters.frame_id)
+            return conversions.stamped_twist(command, stamp_ns, self._frame_id)
         return conversions.twist_from_body(command)
 
     def _log_reason(self, status: Status) -> None:

@@ -191,6 +191,11 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
 
     # -- diagnostics and shutdown -----------------------------------------------------------------
 
+    @property
+    def hardware_id(self) -> str:
+        """The serial port of the dongle."""
+        return self.parameters.port
+
     def produce_diagnostics(self) -> tuple[bytes, str, Mapping[str, object]]:
         """Return whether the robot follows commands, the reason if not, and the link quality."""
         now_ns = self.steady_ns()

@@ -18,6 +18,7 @@ from t3mpc_ros.geometry.timing import SampleScheduler
 from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, STANDSTILL, State
 from t3mpc_ros.nodes.common import conversions, qos
 from t3mpc_ros.nodes.common.base_node import ACK_TIMEOUT, NO_CLOCK, OK, WARN, BaseNode
+from t3mpc_ros.nodes.common.frame_prefix import FrameParameters
 from t3mpc_ros.parameters.table import ParameterError, group, parameter
 
 CONFIGURATION_ERRORS: tuple[type[Exception], ...] = ()
@@ -48,6 +49,7 @@ class ReferenceGeneratorParameters(ReferenceParameters):
     )
     frame_id: str = parameter('odom', 'frame of the reference pose')
     child_frame_id: str = parameter('base_link', 'frame of the reference twist')
+    frames: FrameParameters = group(FrameParameters, inline=True)
     path_points: int = parameter(
         600,
         'maximum number of poses in reference/path (one every 0.1 s); 0 = no path',
@@ -81,9 +83,13 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         self._paused = False
         self._pose = ORIGIN
         self._path = Path()
-        self._path.header.frame_id = parameters.frame_id
-        self._message = Odometry(child_frame_id=parameters.child_frame_id)
-        self._message.header.frame_id = parameters.frame_id
+        frame, child = (
+            parameters.frames.prefixed(name, self.get_namespace())
+            for name in (parameters.frame_id, parameters.child_frame_id)
+        )
+        self._path.header.frame_id = frame
+        self._message = Odometry(child_frame_id=child)
+        self._message.header.frame_id = frame
         self._reference_publisher = self.create_publisher(Odometry, 'reference', qos.STREAM)
         self._path_publisher = self.create_publisher(Path, 'reference/path', qos.LATCHED)
         self._signals_publisher = self.create_publisher(
@@ -121,7 +127,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
 
     def _append_to_path(self, state: State) -> None:
         if self.parameters.path_points:
-            self._path.poses.append(conversions.pose_stamped(state, self.parameters.frame_id))
+            self._path.poses.append(conversions.pose_stamped(state, self._path.header.frame_id))
             del self._path.poses[: -self.parameters.path_points]
 
     def _publish_path(self) -> None:

@@ -253,6 +253,11 @@ class SimRobotNode(BaseNode[SimRobotParameters]):
             response.message = f'simulated time {self._robot_now_ns() / NANOSECONDS:.9f} s'
         return response
 
+    @property
+    def hardware_id(self) -> str:
+        """The simulated robot, with its seed."""
+        return f'simulated robot {self.parameters.seed}'
+
     def produce_diagnostics(self) -> tuple[bytes, str, Mapping[str, object]]:
         """Return whether the robot follows commands, or the reason of its standstill."""
         state, twin = self._state, self._twin_diagnostics()

@@ -212,7 +212,7 @@ def test_an_imu_sample_sets_its_axes_only():
     assert message.header.frame_id == 'a/imu'
     turn, push = message.angular_velocity, message.linear_acceleration
     assert (turn.x, turn.y, turn.z) == (0.0, 0.0, 0.5)
-    assert (push.x, push.y, push.z) == (1.0, -2.0, 0.0)
+    assert (push.x, push.y, push.z) == (1.0, -2.0, 9.80665)
 
 
 FLOATS = np.float32

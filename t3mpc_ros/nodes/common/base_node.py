@@ -148,6 +148,11 @@ class BaseNode(Node, Generic[P]):
         """Return level, message and values for ``/diagnostics``."""
         return OK, 'running', {}
 
+    @property
+    def hardware_id(self) -> str:
+        """Device that the diagnostics are about, 'none' for a node without hardware."""
+        return 'none'
+
     def on_shutdown(self) -> None:
         """Stop the robot, publish final messages, close files."""
 
@@ -164,7 +169,7 @@ class BaseNode(Node, Generic[P]):
             level=level,
             name=self.get_fully_qualified_name().lstrip('/'),
             message=message,
-            hardware_id='t3mpc_ros',
+            hardware_id=self.hardware_id,
             values=[KeyValue(key=key, value=_text(value)) for key, value in values.items()],
         )
         array = DiagnosticArray(status=[status])

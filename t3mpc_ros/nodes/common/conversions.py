@@ -16,6 +16,10 @@ UNKNOWN_VARIANCE = 1e6
 """Variance of a quantity that is not measured, in any unit."""
 
 
+MIN_POSE_VARIANCE = 1e-6
+"""Least published variance of a pose: 1 mm and 1 mrad."""
+
+
 def time_from_ns(stamp_ns: int) -> Time:
     """Return a stamp in nanoseconds as a message."""
     seconds, rest = divmod(stamp_ns, NANOSECONDS)
@@ -64,6 +68,17 @@ def fill_odometry(message: Odometry, state: State) -> Odometry:
     message.twist.twist.linear.x = state.twist.linear
     message.twist.twist.angular.z = state.twist.angular
     return message
+
+
+def pose_covariance(pose: Sequence[Sequence[float]]) -> list[float]:
+    """Return the 36 numbers for the covariance (3, 3) of a pose, without a variance of 0.
+
+    After a reset the pose is exact by definition, but filters invert its covariance.
+    """
+    full = planar_covariance(pose)
+    for i in (0, 1, 5):
+        full[7 * i] = max(full[7 * i], MIN_POSE_VARIANCE)
+    return full
 
 
 def planar_covariance(pose: Sequence[Sequence[float]]) -> list[float]:

@@ -12,7 +12,8 @@ from sensor_msgs.msg import BatteryState, Imu, JointState, Range
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.nodes.common import conversions, qos, sensor_messages
-from t3mpc_ros.parameters.table import Parameters, parameter
+from t3mpc_ros.nodes.common.frame_prefix import FrameParameters
+from t3mpc_ros.parameters.table import parameter
 from t3mpc_ros.robot.interface import RANGE_SENSORS, RobotState
 from t3mpc_ros.robot.sensor_conversions import (
     BatteryParameters,
@@ -25,7 +26,7 @@ BATTERY_RATE = 1.0
 
 
 @dataclass(frozen=True)
-class RobotTopicParameters(Parameters):
+class RobotTopicParameters(FrameParameters):
     """Names, frames and rates of the topics of a simulated or real robot."""
 
     enable_stamped_cmd_vel: bool = parameter(
@@ -90,10 +91,13 @@ class RobotPublishers:
     ) -> None:
         self._node = node
         self._published = 0
-        self._odom_message = _odometry_message(parameters.odom_frame_id, parameters)
+        self._namespace = node.get_namespace()
+        self._topic_parameters = parameters
+        base = self._frame(parameters.base_frame_id)
+        self._odom_message = _odometry_message(self._frame(parameters.odom_frame_id), base)
         self._odom_publisher = node.create_publisher(Odometry, 'odom', qos.STREAM)
         if robot.truth_frame:
-            self._truth_message = _odometry_message(robot.truth_frame, parameters)
+            self._truth_message = _odometry_message(robot.truth_frame, base)
             self._truth_publisher = node.create_publisher(
                 Odometry, 'ground_truth/odom', qos.STREAM
             )
@@ -111,7 +115,8 @@ class RobotPublishers:
                 (
                     node.create_publisher(Range, f'range/{name}', qos.SCALARS),
                     sensor_messages.range_message(
-                        range_sensor, f'{parameters.range_frame_prefix}{name}_range_link'
+                        range_sensor,
+                        self._frame(f'{parameters.range_frame_prefix}{name}_range_link'),
                     ),
                 )
                 for name in (RANGE_SENSORS if parameters.range_rate else ())
@@ -123,7 +128,9 @@ class RobotPublishers:
         self._topic_parameters, self._rate = parameters, robot.rate
         if robot.sensors is not None:
             imu = robot.sensors[0]
-            self._imu_message = sensor_messages.imu_message(imu, parameters.imu_frame_id)
+            self._imu_message = sensor_messages.imu_message(
+                imu, self._frame(parameters.imu_frame_id)
+            )
         self._twist_covariances = {
             slipping: sensor_messages.twist_covariance(
                 robot.geometry, math.inf if slipping else robot.variance
@@ -131,6 +138,9 @@ class RobotPublishers:
             for slipping in (False, True)
         }
         self._slipping: bool | None = None
+
+    def _frame(self, name: str) -> str:
+        return self._topic_parameters.prefixed(name, self._namespace)
 
     def publish(self, state: RobotState) -> None:
         """Publish one state, each topic at its rate."""
@@ -141,7 +151,7 @@ class RobotPublishers:
 
     def _publish_motion(self, state: RobotState) -> None:
         parameters = self._topic_parameters
-        self._odom_message.pose.covariance = conversions.planar_covariance(state.covariance)
+        self._odom_message.pose.covariance = conversions.pose_covariance(state.covariance)
         if state.status.slipping is not self._slipping:
             self._slipping = state.status.slipping
             self._odom_message.twist.covariance = self._twist_covariances[self._slipping]
@@ -151,7 +161,8 @@ class RobotPublishers:
                 conversions.fill_odometry(self._truth_message, state.truth)
             )
         if self._broadcaster is not None:
-            frames = parameters.odom_frame_id, parameters.base_frame_id
+            message = self._odom_message
+            frames = message.header.frame_id, message.child_frame_id
             self._broadcaster.sendTransform(conversions.transform(state.odometry, *frames))
         if self._is_due(parameters.joint_rate):
             names = parameters.right_wheel_name, parameters.left_wheel_name
@@ -192,7 +203,7 @@ class RobotPublishers:
         return TransformBroadcaster(self._node)
 
 
-def _odometry_message(frame: str, parameters: RobotTopicParameters) -> Odometry:
-    message = Odometry(child_frame_id=parameters.base_frame_id)
+def _odometry_message(frame: str, child: str) -> Odometry:
+    message = Odometry(child_frame_id=child)
     message.header.frame_id = frame
     return message

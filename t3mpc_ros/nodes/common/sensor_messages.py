@@ -22,11 +22,14 @@ def imu_message(parameters: ImuParameters, frame: str) -> Imu:
     """Return an Imu message with frame and covariances, without a sample.
 
     Orientation is not measured (its covariance begins with -1, REP 145), nor are quantities out
-    of the plane. The variances are those of noise and quantisation, without bias and scale error.
+    of the plane. The acceleration contains gravity (REP 145): its z is that of a level robot, with
+    the variance of an unknown. The other variances are those of noise and quantisation, without
+    bias and scale error.
     """
     message = Imu()
     message.header.frame_id = frame
     message.orientation_covariance[0] = -1.0
+    message.linear_acceleration.z = GRAVITY
     rate = _noise_variance(math.radians(parameters.gyro_noise), parameters.rate_step, parameters)
     acceleration = _noise_variance(
         1e-6 * GRAVITY * parameters.accel_noise, parameters.acceleration_step, parameters

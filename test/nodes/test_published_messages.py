@@ -1,0 +1,102 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""What consumers of the messages rely on: frames, gravity, covariances, hardware names."""
+
+from geometry_msgs.msg import TwistStamped
+from nav_msgs.msg import Odometry, Path
+import numpy as np
+import pytest
+from sensor_msgs.msg import Imu, Range
+from std_srvs.srv import Trigger
+from support.ros_graph import LATCHED
+
+from t3mpc_ros.nodes.common.frame_prefix import FrameParameters
+from t3mpc_ros.nodes.controller import ControllerNode
+from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
+from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
+from t3mpc_ros.nodes.sim_robot import SimRobotNode
+
+
+@pytest.mark.parametrize(
+    'values, namespace, expected',
+    [
+        ({}, '/', 'odom'),
+        ({}, '/robot_1', 'robot_1/odom'),
+        ({}, '/fleet/robot_1', 'fleet/robot_1/odom'),
+        ({'tf_frame_prefix': 'left'}, '/', 'left/odom'),
+        ({'tf_frame_prefix': '/left/'}, '/robot_1', 'left/odom'),
+        ({'tf_frame_prefix_enable': False}, '/robot_1', 'odom'),
+    ],
+)
+def test_a_frame_is_prefixed_by_the_namespace(values, namespace, expected):
+    frames = FrameParameters.from_dict(values)
+    assert frames.prefixed('odom', namespace) == expected
+    assert frames.prefixed(expected, namespace) == expected, 'not twice'
+
+
+@pytest.mark.ros
+def test_the_frames_of_a_namespace_have_its_prefix(harness):
+    """Two robots published the transforms of one frame ``odom``."""
+    for kind, values in (
+        (SimRobotNode, {'enable_stamped_cmd_vel': True}),
+        (ControllerNode, {'enable_stamped_cmd_vel': True}),
+        (ReferenceGeneratorNode, {}),
+    ):
+        harness.add(kind, namespace='one', **values)
+    wanted = {
+        'odom': (Odometry, 'one/odom'),
+        'ground_truth/odom': (Odometry, 'map'),
+        'reference': (Odometry, 'one/odom'),
+        'cmd_vel': (TwistStamped, 'one/base_link'),
+        'imu/data_raw': (Imu, 'one/imu_link'),
+        'range/front_left': (Range, 'one/front_left_range_link'),
+    }
+    received = {name: harness.subscribe(kind, f'one/{name}') for name, (kind, _) in wanted.items()}
+    paths = harness.subscribe(Path, 'one/reference/path', LATCHED)
+    harness.spin_until(lambda: all(received.values()) and paths)
+    for name, (kind, frame) in wanted.items():
+        message = received[name][-1]
+        assert message.header.frame_id == frame, name
+        if kind is Odometry:
+            assert message.child_frame_id == 'one/base_link', name
+    assert {paths[-1].header.frame_id, paths[-1].poses[-1].header.frame_id} == {'one/odom'}
+
+
+@pytest.mark.ros
+def test_the_acceleration_contains_gravity(harness):
+    """REP 145; filters that take the direction of gravity from it saw free fall."""
+    imu = harness.subscribe(Imu, 'imu/data_raw')
+    harness.add(SimRobotNode)
+    harness.spin_until(lambda: len(imu) > 20)
+    vector = imu[-1].linear_acceleration
+    assert vector.z == pytest.approx(9.81, abs=0.01)
+    assert np.hypot(vector.x, vector.y) < 1.0
+
+
+@pytest.mark.ros
+def test_the_covariance_of_a_reset_pose_is_positive_definite(harness):
+    """It was exactly 0, which filters cannot invert."""
+    odom = harness.subscribe(Odometry, 'odom')
+    harness.add(SimRobotNode)
+    harness.spin_until(lambda: odom)
+    assert harness.call(Trigger, 'reset_odometry').success
+    count = len(odom)
+    harness.spin_until(lambda: len(odom) > count)
+    for message in (odom[0], odom[-1]):
+        covariance = np.reshape(message.pose.covariance, (6, 6))
+        assert np.linalg.eigvalsh(covariance).min() > 1e-7
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(
+    'kind, values, expected',
+    [
+        (ControllerNode, {}, 'none'),
+        (SimRobotNode, {'seed': 7}, 'simulated robot 7'),
+        (RadioBridgeNode, {'port': '/dev/no_dongle'}, '/dev/no_dongle'),
+    ],
+)
+def test_hardware_id_names_the_device(kind, values, expected, harness):
+    """It was the name of the package."""
+    node = harness.add(kind, **values)
+    assert harness.next_status(node.get_name()).hardware_id == expected
