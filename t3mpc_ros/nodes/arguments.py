@@ -5,13 +5,14 @@
 rcl parses what stands between ``--ros-args`` and ``--`` and ignores the rest.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 import difflib
 from pathlib import Path
+import re
 import textwrap
 
 import t3mpc_ros
-from t3mpc_ros.nodes.registry import INTERFACES, parameter_class
+from t3mpc_ros.nodes.registry import INTERFACES, NODES, parameter_class
 
 ROS_ARGUMENTS = (
     ('-p NAME:=VALUE', 'set a parameter'),
@@ -106,9 +107,7 @@ def parameter_file_problem(argv: Sequence[str]) -> str:
     """Return why a ``--params-file`` of the command line is unusable; empty if usable."""
     import yaml
 
-    for flag, name in zip(argv, list(argv)[1:], strict=False):
-        if flag != '--params-file':
-            continue
+    for name in _parameter_files(argv):
         try:
             content = yaml.safe_load(Path(name).read_text(encoding='utf-8'))
         except OSError as error:
@@ -121,3 +120,55 @@ def parameter_file_problem(argv: Sequence[str]) -> str:
                 f'the parameter file {name} must hold "<node>: ros__parameters: ...": got nothing'
             )
     return ''
+
+
+def unmatched_files(argv: Sequence[str], nodes: Sequence[str]) -> list[str]:
+    """Return a warning for each parameter file that matches none of the nodes of the process.
+
+    A file for other nodes of the package is no mistake: launch files pass one to every node.
+
+    Parameters
+    ----------
+    argv
+        Command line, with usable parameter files.
+    nodes
+        Full names of the nodes.
+    """
+    import yaml
+
+    names = [name.rpartition('/')[2] for name in nodes]
+    problems = []
+    for file in _parameter_files(argv):
+        keys = list(_node_keys(yaml.safe_load(Path(file).read_text(encoding='utf-8')), ''))
+        matched = any(_key_pattern(key).fullmatch(node) for key in keys for node in nodes)
+        others = set(NODES) - set(names)
+        if matched or (keys and all(key.rpartition('/')[2] in others for key in keys)):
+            continue
+        problems.append(
+            f'the parameter file {file} sets nothing: its keys {", ".join(keys) or "(none)"} do '
+            f'not match {", ".join(nodes)}'
+        )
+    return problems
+
+
+def _parameter_files(argv: Sequence[str]) -> list[str]:
+    return [
+        name for flag, name in zip(argv, list(argv)[1:], strict=False) if flag == '--params-file'
+    ]
+
+
+def _node_keys(tree: object, prefix: str) -> Iterator[str]:
+    """Yield the node names of a parameter file, whose namespaces may be nested keys."""
+    if not isinstance(tree, dict):
+        return
+    for key, value in tree.items():
+        if key == 'ros__parameters':
+            yield prefix
+        else:
+            yield from _node_keys(value, f'{prefix}/{str(key).strip("/")}')
+
+
+def _key_pattern(key: str) -> 're.Pattern[str]':
+    """Return the pattern of a node name: ``*`` is one part of it, ``**`` any number."""
+    text = re.escape(key).replace(r'/\*\*', '(/[^/]+)*').replace(r'\*', '[^/]+')
+    return re.compile(text)

@@ -20,6 +20,7 @@ from t3mpc_ros.bag.run.journal import Journal, parameters_to_json
 from t3mpc_ros.bag.run.model_file import ModelError, load_model, save_model
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.control.controller import Controller, ControllerParameters, Status
+from t3mpc_ros.control.input_monitor import InputMonitor
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist
@@ -115,6 +116,8 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self._publish_parameters()
         self._load_model()
         self._last_odometry_ns: int | None = None
+        self._input_monitor = InputMonitor(self.parameters.rate)
+        self._last_command: BodyTwist | None = None
         self._steps = 0
         self._rejected_references = 0
         self._rejected_odometry = 0
@@ -186,6 +189,10 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         measured = conversions.state_from_odometry(message)
         command, status = self._controller.step(measured)
         self._publish_command(command, status.stamp_ns)
+        self._input_monitor.update(
+            measured.stamp_ns, self.now_ns(), measured.twist, self._last_command
+        )
+        self._last_command = command if status.reason.moves else None
         self._publish_journal(self._journal.step(measured.stamp_ns))
         self._initial_odometry.republish(message)
         self._steps += 1
@@ -307,6 +314,11 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         if self._rejected_references:
             return WARN, 'reference messages with non-finite values were ignored', values
         return OK, status.reason.value, values
+
+    def warnings(self) -> list[str]:
+        """Return what does not fit in the odometry or in its response to the commands."""
+        simulated = self.get_clock().ros_time_is_active
+        return self._input_monitor.warnings(simulated_time=simulated)
 
     def on_shutdown(self) -> None:
         """Publish a zero command and the last row of the journal."""

@@ -9,7 +9,7 @@ import pytest
 
 import t3mpc_ros
 from t3mpc_ros.cli.process_group import executable
-from t3mpc_ros.nodes.arguments import unknown_arguments, user_arguments
+from t3mpc_ros.nodes.arguments import unknown_arguments, unmatched_files, user_arguments
 from t3mpc_ros.nodes.composed import ComposedNode
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.player.node import PlayerNode
@@ -58,6 +58,31 @@ def test_unknown_arguments_are_named(node, words, expected):
     problem = unknown_arguments(node, [node, *words])
     for text in expected:
         assert text in problem
+
+
+@pytest.mark.parametrize(
+    'content, node, matches',
+    [
+        ('controller: {ros__parameters: {rate: 50.0}}', '/controller', True),
+        ('/**/controller: {ros__parameters: {rate: 50.0}}', '/controller', True),
+        ('/**/controller: {ros__parameters: {rate: 50.0}}', '/a/robot_1/controller', True),
+        ('/**: {ros__parameters: {rate: 50.0}}', '/robot_1/controller', True),
+        ('/*/controller: {ros__parameters: {rate: 50.0}}', '/robot_1/controller', True),
+        ('robot_1: {controller: {ros__parameters: {rate: 5.0}}}', '/robot_1/controller', True),
+        ('sim_robot: {ros__parameters: {rate: 50.0}}', '/controller', True),
+        ('controller: {ros__parameters: {rate: 50.0}}', '/robot_1/controller', False),
+        ('contoller: {ros__parameters: {rate: 50.0}}', '/controller', False),
+        ('controller: {rate: 50.0}', '/controller', False),
+    ],
+)
+def test_a_parameter_file_without_effect_is_named(content, node, matches, tmp_path):
+    """A key without the namespace of the node, or misspelt, was ignored."""
+    file = tmp_path / 'own.yaml'
+    file.write_text(content)
+    problems = unmatched_files(['x', '--ros-args', '--params-file', str(file)], [node])
+    assert [str(file) in problem and node in problem for problem in problems] == (
+        [] if matches else [True]
+    )
 
 
 @pytest.mark.ros

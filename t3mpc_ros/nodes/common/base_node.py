@@ -71,6 +71,8 @@ class BaseNode(Node, Generic[P]):
         super().__init__(name, **kwargs)
         self.exit_code = 0
         """Exit code of the process; a value other than 0 ends the process."""
+        self.start_warnings: list[str] = []
+        """Warnings about the start of the process, repeated in the diagnostics."""
         self.exit_requested = False
         """Set to True to end the process with :attr:`exit_code`."""
         self.parameters: P = declare_parameters(self, parameter_class, self._on_change)
@@ -176,6 +178,10 @@ class BaseNode(Node, Generic[P]):
         array.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array)
 
+    def warnings(self) -> list[str]:
+        """Return warnings for the diagnostics beside :meth:`produce_diagnostics`."""
+        return []
+
     def _graph_warnings(self) -> list[str]:
         """Return what prevents this node and the others from working together."""
         if self._unused_overrides is None:  # all endpoints exist by now
@@ -183,6 +189,9 @@ class BaseNode(Node, Generic[P]):
             for name in self._unused_overrides:
                 self.get_logger().warning(f'{name} has no effect: this node has no such endpoint')
         found = [
+            *self.start_warnings,
+            *self.warnings(),
+            endpoints.command_publishers_problem(self),
             endpoints.qos_problem(self, (each.held for each in self._matching), 'subscription'),
             endpoints.qos_problem(self, islice(self._public_publishers(), 20), 'publisher'),
         ]

@@ -135,6 +135,16 @@ class MatchingSubscription:
         return messages
 
 
+def command_publishers_problem(node: Node) -> str:
+    """Return the publishers of ``cmd_vel`` if several compete for the robot, or nothing."""
+    topic = node.resolve_topic_name('cmd_vel')
+    own = {each.topic_name for each in (*node.subscriptions, *node.publishers)}
+    if topic not in own:
+        return ''
+    names = sorted(map(_full_name, node.get_publishers_info_by_topic(topic)))
+    return f'{topic} has {len(names)} publishers: {", ".join(names)}' if len(names) > 1 else ''
+
+
 def qos_problem(node: Node, endpoints: Iterable[Any], kind: Kind) -> str:
     """Return the first QoS mismatch between endpoints of a node and their peers, or nothing.
 
@@ -172,6 +182,9 @@ def _comparable(profile: QoSProfile) -> QoSProfile:
 
 
 def _mismatch(topic: str, peer: TopicEndpointInfo, reason: str) -> str:
-    name = f'{peer.node_namespace.rstrip("/")}/{peer.node_name}'
     policies = reason.removeprefix('ERROR: ').strip('; ').replace('; ERROR:', ',')
-    return f'no message passes between {name} and this node on {topic}: {policies}'
+    return f'no message passes between {_full_name(peer)} and this node on {topic}: {policies}'
+
+
+def _full_name(info: TopicEndpointInfo) -> str:
+    return f'{info.node_namespace.rstrip("/")}/{info.node_name}'

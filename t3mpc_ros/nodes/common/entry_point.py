@@ -15,7 +15,12 @@ from types import FrameType
 from typing import TYPE_CHECKING, NoReturn
 
 from t3mpc_ros.missing_library import remedy
-from t3mpc_ros.nodes.arguments import information, parameter_file_problem, unknown_arguments
+from t3mpc_ros.nodes.arguments import (
+    information,
+    parameter_file_problem,
+    unknown_arguments,
+    unmatched_files,
+)
 from t3mpc_ros.nodes.registry import node_module
 
 if TYPE_CHECKING:
@@ -136,6 +141,10 @@ def run(name: str, request: StopRequest, argv: Sequence[str]) -> int:
     nodes: Sequence[BaseNode] = ()
     try:
         nodes = module.make()
+        for problem in unmatched_files(argv, [node.get_fully_qualified_name() for node in nodes]):
+            for node in nodes:
+                node.get_logger().warning(problem)
+                node.start_warnings.append(problem)
         request.starting = False
         if not request.received:
             _spin(nodes, request)
