@@ -229,8 +229,10 @@ static void move_on(struct t3_robot *robot, uint32_t elapsed_us)
 {
     if (t3_ramp_settled(&robot->ramp))
         return;  // and the increments are what they were: most periods cost nothing
-    t3_ramp_step(&robot->ramp, parameter(robot, T3_ACCELERATION),
-                 parameter(robot, T3_DECELERATION), elapsed_us);
+    int32_t deceleration = parameter(robot, T3_DECELERATION);
+    if (robot->estop && deceleration < T3_ESTOP_DECELERATION)
+        deceleration = T3_ESTOP_DECELERATION;
+    t3_ramp_step(&robot->ramp, parameter(robot, T3_ACCELERATION), deceleration, elapsed_us);
     int32_t increments[T3_WHEELS];
     for (uint8_t i = 0; i < T3_WHEELS; i++)
         increments[i] = t3_steps_increment(&robot->steps, robot->ramp.speed[i]);

@@ -26,6 +26,8 @@
 #define T3_REFRESH_US UINT32_C(100000)
 // Period of the ramp, and of reading one range sensor.
 #define T3_PERIOD_US UINT32_C(1000)
+// Least deceleration of an emergency stop, mrad/s^2, whatever the parameter: no host can weaken it.
+#define T3_ESTOP_DECELERATION INT32_C(60000)
 // Silence that ends a session: after a longer one, 32-bit clocks are ambiguous.
 #define T3_SESSION_SILENCE_US UINT32_C(1800000000)
 

@@ -161,6 +161,27 @@ def test_any_sender_may_stop_and_only_the_session_clears(robot, session, seq):
     assert robot.status == 0
 
 
+def test_no_parameter_weakens_the_emergency_stop(robot):
+    """An emergency stop used the deceleration that a host may set: down to 0.1 rad/s²."""
+    assert robot.set(2, 100).rc == frames.OK
+    stops = (
+        lambda: robot.command(flags=CommandFlag.ESTOP),
+        lambda: robot.board.press_button(True),
+    )
+    for stop in stops:
+        robot.hello()
+        for _ in range(60):
+            robot.command(8000, -6000)
+            robot.run(15_000)
+        assert robot.board.speeds == (8_000_000, -6_000_000)
+        stop()
+        robot.run(int(8.0 / 60.0 * 1e6) + 3000)
+        assert robot.board.speeds == (0, 0)
+        robot.board.press_button(False)
+        robot.command(flags=CommandFlag.ESTOP_CLEAR)
+        assert not robot.status & StatusFlag.ESTOP
+
+
 def test_a_foreign_estop_keeps_the_sequence_of_the_host(robot):
     robot.command(1000, 1000)
     robot.command(flags=CommandFlag.ESTOP, session=7, seq=(robot.seq + 100) % 256)

@@ -108,6 +108,15 @@ def test_stop_time_is_ttl_plus_ramp(robot, ttl, deceleration, limit):
     assert limit - 0.01 < rest_time(robot, ttl) <= limit
 
 
+def test_an_emergency_stop_is_not_weakened_by_a_parameter(robot):
+    """It used the deceleration that a host may set: from 10 rad/s it took 100 s at the lowest."""
+    assert robot.set(DECELERATION, 100) == (OK, 100)
+    robot.drive(10_000, 10_000, 2_000_000)
+    robot.send(robot.command(flags=ESTOP))
+    robot.run(170_000)
+    assert robot.speeds == (0.0, 0.0)
+
+
 def test_the_robot_limits_the_ttl(robot):
     robot.send(robot.command(1000, 1000, ttl=255))
     robot.run(249_000)

@@ -17,6 +17,8 @@ from t3mpc_ros.emulator.board.parameter_store import (
 
 PERIOD_US = 1_000
 """Period of the ramp."""
+ESTOP_DECELERATION = 60_000
+"""Least deceleration of an emergency stop, mrad/s²."""
 MAX_STEP_US = 20_000
 """Longest step of the ramp: after a stall of the main loop the speed does not jump."""
 
@@ -88,15 +90,21 @@ class Wheels:
             self._hardware.set_power(on)
         self.powered = on
 
-    def update_ramp(self, now_us: int) -> bool:
-        """Advance the ramp if its period is over; return whether the speeds changed."""
+    def update_ramp(self, now_us: int, estop: bool) -> bool:
+        """Advance the ramp if its period is over; return whether the speeds changed.
+
+        ``estop``: the emergency stop is latched, which has a least deceleration.
+        """
         elapsed = now_us - self._period_us
         if elapsed < PERIOD_US:
             return False
         self._period_us = now_us
         if self.ramp.settled:
             return False
-        self.ramp.step(self._parameters[ACCELERATION], self._parameters[DECELERATION], elapsed)
+        deceleration = self._parameters[DECELERATION]
+        if estop:
+            deceleration = max(deceleration, ESTOP_DECELERATION)
+        self.ramp.step(self._parameters[ACCELERATION], deceleration, elapsed)
         left, right = (
             sign * speed for sign, speed in zip(self._signs(), self.ramp.speed, strict=True)
         )

@@ -230,7 +230,7 @@ class RobotBoard:
             self.verifier.end_session()
             self._disable()
         self._wheels.update_power(self._enabled, now)
-        self._pass_needed = self._wheels.update_ramp(now)
+        self._pass_needed = self._wheels.update_ramp(now, self._estop)
         self._load_reply()
         self.console.update()
 
