@@ -66,7 +66,7 @@ class RadioRobotParameters(Parameters):
                     f'{name} must be at most the limit of the board, {board_limit:g} '
                     f'(link.robot): got {host:g}'
                 )
-        # The end of a command is noticed at the next cycle; the end of the host after the TTL.
+        # A stop begins and ends with a cycle; the end of the host is noticed after the TTL.
         silence = max(limiter.command_timeout + 1.0 / link.cycle_rate, link.ttl)
         limiter.check_stopping_time(
             silence,
@@ -204,23 +204,30 @@ class RadioRobot(RobotInterface):
         """Pass the limited command to the link, once per cycle."""
         if self.link.is_silent(now_ns):
             self._limiter.stop(self.link.reason(now_ns), now_ns)
+        if 0 < self._limiter.remaining_ns(now_ns) < self._period_ns:
+            self._limiter.expire()  # within this cycle
         if now_ns > self._expiry_ns + 2 * self._period_ns:
             # This process was suspended: the end of the ramp would move a robot that has stopped.
             self._limiter.assume_standstill()
         limited_command = self._limiter.advance(now_ns, self._period_ns / NANOSECONDS)
         self._limited = limited_command.limited
-        # The ramp of the limiter is sent as well: it stops more gently than the board.
-        if limited_command.reason and limited_command.wheels == ZERO_WHEEL_SPEEDS:
+        wheels = self._commanded = limited_command.wheels
+        stops = limited_command.target == ZERO_WHEEL_SPEEDS
+        if stops and not self._stops_gently():
+            wheels = ZERO_WHEEL_SPEEDS  # the board has the same ramp, and no late cycle delays it
+        # A step of a stop expires after two cycles, and the board continues by itself.
+        valid_ns = 2 * self._period_ns if stops else self._limiter.remaining_ns(now_ns)
+        valid_ns = min(valid_ns, self._ttl_ns)
+        self._expiry_ns = now_ns + valid_ns
+        if limited_command.reason and wheels == ZERO_WHEEL_SPEEDS:
             self.link.stop(limited_command.reason)
-            self._commanded = ZERO_WHEEL_SPEEDS
         else:
-            # The end of a stop expires after two cycles, and the board continues it by itself.
-            stops = limited_command.target == ZERO_WHEEL_SPEEDS
-            valid_ns = 2 * self._period_ns if stops else self._limiter.remaining_ns(now_ns)
-            valid_ns = min(valid_ns, self._ttl_ns)
-            self.link.command(RobotCommand(limited_command.wheels, now_ns), now_ns, valid_ns)
-            self._commanded = limited_command.wheels
-            self._expiry_ns = now_ns + valid_ns
+            self.link.command(RobotCommand(wheels, now_ns), now_ns, valid_ns)
+
+    def _stops_gently(self) -> bool:
+        """Return whether the stop of the host is slower than that of the board."""
+        board = self._parameters.link.robot
+        return self._limiter.parameters.stop_deceleration < board.deceleration
 
     def _update(self, telemetry: Telemetry) -> None:
         before, self._telemetry = self._telemetry, telemetry

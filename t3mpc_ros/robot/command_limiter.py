@@ -252,8 +252,7 @@ class CommandLimiter:
         if self._command is not None:
             age = (now_ns - self._command.stamp_ns) / NANOSECONDS
             if age >= parameters.command_timeout:
-                self._drop_command(f'no command for {parameters.command_timeout:g} s')
-                self._timed_out = True
+                self.expire()
         target, limited = ZERO_WHEEL_SPEEDS, False
         if self._command is not None:
             target, limited = self._within_limits(self._command.wheels)
@@ -267,6 +266,11 @@ class CommandLimiter:
         return LimitedCommand(
             self._ramp.at(hold), target, self.estop, self._timed_out, limited, self._reason
         )
+
+    def expire(self) -> None:
+        """Stop because the command has expired."""
+        self._drop_command(f'no command for {self.parameters.command_timeout:g} s')
+        self._timed_out = True
 
     def stop(self, reason: str, now_ns: int) -> None:
         """Drop the command; the next one is accepted again."""

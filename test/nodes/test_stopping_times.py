@@ -1,0 +1,29 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The table of docs/safety.md in its short form: one trial of each kind, with real processes."""
+
+import pytest
+from support import stopping_bench
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow]
+
+
+@pytest.mark.parametrize('kind', ['suspend', 'uplink', 'downlink', 'unplug', 'publisher', 'kill'])
+def test_the_robot_rests_in_time_whatever_fails(kind, processes, ros, tmp_path):
+    """A bridge suspended for seconds executed an old command when it went on.
+
+    A trial in which the emulator itself was interrupted is repeated: its times are then wrong.
+    """
+    import rclpy
+
+    node = rclpy.create_node('stopping_bench')
+    try:
+        for name, trials, _ in stopping_bench.rows(
+            node, processes, tmp_path, 1, durations=(0.2, 1.0), kinds=(kind,)
+        ):
+            (trial,) = trials
+            print(f'\n{name}: {trial}')
+            assert trial.rest is None or trial.rest <= stopping_bench.LIMIT
+            assert trial.after <= stopping_bench.CREEP
+    finally:
+        node.destroy_node()

@@ -1,0 +1,419 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Measures how fast the robot stops: real bridge processes, and emulated boards on a pty.
+
+``cd test && python -m support.stopping_bench --trials 20`` prints the table of docs/safety.md.
+Times are those of the emulator, which knows when the motors pulse. It is in this process and may
+be interrupted on a busy machine: a trial in which its time has lagged is repeated.
+"""
+
+import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+import math
+import os
+from pathlib import Path
+import random
+import signal
+import tempfile
+import threading
+import time
+from typing import NamedTuple
+
+from geometry_msgs.msg import Twist
+from nav_msgs.msg import Odometry
+import rclpy
+
+from t3mpc_ros.cli.process_group import ProcessGroup, private_graph
+from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters
+from t3mpc_ros.emulator.pty_port import PtyPort, serve
+from t3mpc_ros.geometry.types import NANOSECONDS
+
+FULL = 0.35
+"""Speed with both wheels at their maximum of 10 rad/s, m/s."""
+LIMIT = 0.45
+"""Time to rest that no trial may exceed, s."""
+TIMEOUT = 0.25
+"""``cmd_vel_timeout`` of the bridge, s."""
+CREEP = 0.002
+"""Way of the rotors while they settle at the field that stands, m."""
+DURATIONS = (0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0)
+"""Durations of a suspension, s."""
+_MAX_LAG = 0.01
+"""Lag of the emulator's time during a trial, s."""
+_SETTLING = 1.0
+"""Time observed after the last event of a trial, s."""
+
+
+class Sample(NamedTuple):
+    """State of the emulated robot at one update."""
+
+    wall: float
+    """Monotonic clock of this process, s."""
+    time: float
+    """Time of the emulator, s."""
+    speed: float
+    """Speed of the faster motor, rad/s."""
+    x: float
+    y: float
+
+
+class Trial(NamedTuple):
+    """Result of one trial."""
+
+    rest: float | None
+    """Time from the last valid command to rest, s; None if it is not known, or did not stop."""
+    way: float
+    """Distance from there to rest, m."""
+    after: float = 0.0
+    """Distance on commands that had expired, m."""
+
+
+class Disturbed(RuntimeError):
+    """The measurement itself was interrupted."""
+
+
+class DrivenRobot:
+    """A bridge process in a namespace, its emulated boards, and the publisher of its commands."""
+
+    def __init__(self, node, processes, folder, name=''):
+        self.name = f'bridge{name}'
+        self._path = folder / f'dongle{name}'
+        self._namespace = f'/robot{name}'
+        self._processes = processes
+        self._emulator = Emulator(EmulatorParameters())
+        self._emulator.plant.warm_up()
+        self._samples = []
+        self._faults = []
+        self._ended = False
+        self._publisher = node.create_publisher(Twist, f'{self._namespace}/cmd_vel', 1)
+        self.speed = None
+        """Commanded speed, m/s; None: the publisher is gone."""
+        self._published = []
+        port = PtyPort(self._path)
+        self._threads = [
+            threading.Thread(target=self._serve, args=(port,), daemon=True),
+            threading.Thread(target=self._publish, daemon=True),
+        ]
+        for thread in self._threads:
+            thread.start()
+        self.start_bridge()
+
+    def start_bridge(self):
+        self._processes.start(
+            self.name,
+            '--ros-args',
+            '-r',
+            f'__ns:={self._namespace}',
+            parameters={'port': str(self._path)},
+            program='radio_bridge',
+        )
+
+    @property
+    def pid(self):
+        return self._processes.pid(self.name)
+
+    def kill_bridge(self):
+        self._processes.kill(self.name)
+
+    def inject(self, *fault):
+        """Begin a fault of the emulator at its next update."""
+        self._faults.append(fault)
+
+    def drive(self, timeout=40.0):
+        """Drive at full speed, from a random phase of the cycle on."""
+        self.speed = FULL
+        end = time.monotonic() + timeout
+        while not all(sample.speed > 9.99 for sample in self._samples[-20:]):
+            if time.monotonic() > end:
+                raise TimeoutError(f'{self.name} does not reach full speed')
+            time.sleep(0.02)
+        time.sleep(random.uniform(0.0, 0.04))
+
+    def last_publication(self, until):
+        """Return the time of the last command published until then."""
+        return max(when for when in self._published if when <= until)
+
+    def observe(self, begin, end):
+        """Return the samples between two times of the monotonic clock."""
+        samples = [sample for sample in self._samples if begin <= sample.wall <= end]
+        lag = (samples[-1].wall - samples[0].wall) - (samples[-1].time - samples[0].time)
+        if lag > _MAX_LAG or samples[0].wall - begin > 0.05:
+            raise Disturbed(f'the emulator lagged by {lag:.3f} s')
+        return samples
+
+    def forget(self):
+        """Discard old samples."""
+        del self._samples[:-100], self._published[:-100]
+
+    def close(self):
+        self._ended = True
+        for thread in self._threads:
+            thread.join()
+        with suppress(KeyError):
+            self._processes.kill(self.name)
+
+    def _serve(self, port):
+        serve(self._emulator, port, 1.0, self._stopped, on_update=self._on_update)
+        port.close()
+
+    def _stopped(self):
+        while self._faults:
+            name, *rest = self._faults.pop(0)
+            if rest:
+                self._emulator.inject(name, *rest)
+            else:
+                self._emulator.end_fault(name)
+        return self._ended
+
+    def _on_update(self):
+        now, pose = self._emulator.now_ns / NANOSECONDS, self._emulator.plant.pose
+        speed = max(map(abs, self._emulator.board.speeds)) / 1e6
+        self._samples.append(Sample(time.monotonic(), now, speed, pose.x, pose.y))
+
+    def _publish(self):
+        message = Twist()
+        while not self._ended:
+            if self.speed is not None:
+                message.linear.x = self.speed
+                self._published.append(time.monotonic())
+                self._publisher.publish(message)
+            time.sleep(0.02)
+
+
+def way(samples):
+    """Return the distance between the first and the last sample, m."""
+    return math.hypot(samples[-1].x - samples[0].x, samples[-1].y - samples[0].y)
+
+
+def first_rest(samples):
+    """Return the time to the first rest and the distance until then; None if there is none."""
+    for count, sample in enumerate(samples):
+        if not sample.speed:
+            # The rotors settle within a tenth of a second.
+            later = [each for each in samples[count:] if each.time - sample.time < 0.1]
+            return sample.time - samples[0].time, way([samples[0], later[-1]])
+    return None, 0.0
+
+
+def last_rest(samples):
+    """Return the time to the last motion and the whole distance."""
+    moving = [sample for sample in samples if sample.speed]
+    return (moving[-1].time - samples[0].time if moving else 0.0), way(samples)
+
+
+def suspend(robot, duration, publishing):
+    """Suspend the bridge; without ``publishing`` the publisher ends during the suspension."""
+    robot.drive()
+    begin = time.monotonic()
+    os.kill(robot.pid, signal.SIGSTOP)
+    try:
+        if not publishing:
+            time.sleep(random.uniform(0.0, duration))
+            robot.speed = None
+        time.sleep(max(begin + duration - time.monotonic(), 0.0))
+    finally:
+        os.kill(robot.pid, signal.SIGCONT)
+    resumed = time.monotonic()
+    time.sleep(_SETTLING)
+    end = time.monotonic()
+    valid = robot.last_publication(begin)
+    if publishing:
+        return Trial(*first_rest(robot.observe(valid, resumed)))
+    # A command that was young enough when the bridge resumed was still valid.
+    if resumed - (last := robot.last_publication(end)) < TIMEOUT:
+        valid = last
+    rest, distance = last_rest(robot.observe(valid, end))
+    after = 0.0
+    if resumed - valid > LIMIT:
+        after = way(robot.observe(resumed, end))
+    return Trial(rest, distance, after)
+
+
+def break_link(robot, fault, *values):
+    """Inject a fault that lasts 1.5 s while the publisher goes on."""
+    robot.drive()
+    valid = robot.last_publication(time.monotonic())
+    robot.inject(fault, 1.5, *values)
+    time.sleep(1.3)
+    return Trial(*first_rest(robot.observe(valid, time.monotonic())))
+
+
+def end_publisher(robot):
+    robot.drive()
+    robot.speed = None
+    time.sleep(_SETTLING)
+    end = time.monotonic()
+    return Trial(*last_rest(robot.observe(robot.last_publication(end), end)))
+
+
+def kill_host(robot, other=None):
+    """Kill the bridge of a robot; another robot goes on."""
+    robot.drive()
+    if other is not None:
+        other.drive()
+    begin = time.monotonic()
+    robot.kill_bridge()
+    time.sleep(_SETTLING)
+    end = time.monotonic()
+    robot.speed = None
+    robot.start_bridge()
+    samples = robot.observe(robot.last_publication(begin), end)
+    if other is not None and any(each.speed < 5.0 for each in other.observe(begin, end)):
+        raise Disturbed('the other robot was slowed down')
+    return Trial(*last_rest(samples))
+
+
+class SimulatedRobot:
+    """A sim_robot process: the suspension stops the robot together with its node."""
+
+    def __init__(self, node, processes):
+        self._node, self._processes = node, processes
+        self._publisher = node.create_publisher(Twist, '/twin/cmd_vel', 1)
+        self._truth = []
+        node.create_subscription(Odometry, '/twin/ground_truth/odom', self._truth.append, 100)
+        processes.start('twin', '--ros-args', '-r', '__ns:=/twin', program='sim_robot')
+
+    def suspend(self, duration):
+        """Suspend the process; its publisher ends meanwhile."""
+        message = Twist()
+        message.linear.x = FULL
+        end = time.monotonic() + 40.0
+        while not self._truth or self._truth[-1].twist.twist.linear.x < 0.98 * FULL:
+            if time.monotonic() > end:
+                raise TimeoutError('sim_robot does not reach full speed')
+            self._publisher.publish(message)
+            self._spin(0.02)
+        pid = self._processes.pid('twin')
+        os.kill(pid, signal.SIGSTOP)
+        try:
+            begin = time.monotonic()
+            until = begin + random.uniform(0.0, duration)
+            while time.monotonic() < until:
+                self._publisher.publish(message)
+                self._spin(0.02)
+            last = time.monotonic()
+            self._spin(max(begin + duration - time.monotonic(), 0.0))
+        finally:
+            before = self._truth[-1]
+            del self._truth[:]
+            os.kill(pid, signal.SIGCONT)
+        resumed = time.monotonic()
+        self._spin(1.5)
+        poses = [message.pose.pose.position for message in (before, *self._truth)]
+        distance = math.hypot(poses[-1].x - poses[0].x, poses[-1].y - poses[0].y)
+        if resumed - last < LIMIT:
+            raise Disturbed('the publisher ended too late')
+        # Its time goes on with the process, but leaves out what is more than 0.5 s late.
+        return Trial(None, distance)
+
+    def _spin(self, seconds):
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0.0:
+            rclpy.spin_once(self._node, timeout_sec=left)
+
+
+def repeat(measure, trials, robots=()):
+    """Return the results of undisturbed trials, and the number of disturbed ones."""
+    results, disturbed = [], 0
+    while len(results) < trials:
+        if disturbed > 3 * trials + 10:
+            raise TimeoutError('the machine is too busy to measure')
+        for robot in robots:
+            robot.forget()
+        try:
+            results.append(measure())
+        except Disturbed:
+            disturbed += 1
+    return results, disturbed
+
+
+@contextmanager
+def bench(folder: Path, environment: dict[str, str]) -> Iterator[tuple[object, ProcessGroup]]:
+    """Yield a node and a process group; the processes end at the end."""
+    os.environ.update(environment)
+    processes = ProcessGroup(folder / 'log', environment)
+    rclpy.init(args=[])
+    node = rclpy.create_node('stopping_bench')
+    try:
+        yield node, processes
+    finally:
+        for name in list(processes.running()):
+            with suppress(ProcessLookupError):
+                os.kill(processes.pid(name), signal.SIGCONT)
+            processes.kill(name)
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def rows(node, processes, folder, trials, durations=DURATIONS, kinds=('all',)):
+    """Yield the name of each row with its trials and the number of disturbed ones."""
+
+    def wanted(kind):
+        return 'all' in kinds or kind in kinds
+
+    robot = DrivenRobot(node, processes, folder)
+    links = (
+        ('robot to host dead (uplink)', 'uplink', ('loss_up', 1.0)),
+        ('host to robot dead (downlink)', 'downlink', ('loss_down', 1.0)),
+        ('dongle unplugged', 'unplug', ('close_port',)),
+    )
+    try:
+        for publishing, who in ((False, 'publisher ends meanwhile'), (True, 'publisher goes on')):
+            for duration in durations if wanted('suspend') else ():
+                yield (
+                    f'bridge suspended {duration:g} s, {who}',
+                    *repeat(partial(suspend, robot, duration, publishing), trials, [robot]),
+                )
+        for name, kind, fault in links:
+            if wanted(kind):
+                yield name, *repeat(partial(break_link, robot, *fault), trials, [robot])
+        if wanted('publisher'):
+            yield 'publisher ends', *repeat(partial(end_publisher, robot), trials, [robot])
+        if wanted('kill'):
+            yield 'bridge killed', *repeat(partial(kill_host, robot), trials, [robot])
+        if wanted('two'):
+            other = DrivenRobot(node, processes, folder, '_b')
+            both = [robot, other]
+            try:
+                yield (
+                    'two robots, one bridge killed; the other robot goes on',
+                    *repeat(partial(kill_host, robot, other), trials, both),
+                )
+            finally:
+                other.close()
+    finally:
+        robot.close()
+    if wanted('sim'):
+        twin = SimulatedRobot(node, processes)
+        for duration in [each for each in durations if each >= 1.0]:
+            yield (
+                f'sim_robot suspended {duration:g} s, publisher ends meanwhile',
+                *repeat(partial(twin.suspend, duration), trials),
+            )
+
+
+def format_row(name, trials, disturbed):
+    """Return a row of the table: worst time, way, and way on expired commands."""
+    times = [trial.rest for trial in trials if trial.rest is not None]
+    worst = f'{max(times):.3f}' if times else '-'
+    distance = f'{max(trial.way for trial in trials):.3f}'
+    after = f'{max(trial.after for trial in trials):.4f}'
+    return f'| {name} | {worst} | {distance} | {after} | {len(trials)} | {disturbed} |'
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--trials', type=int, default=20)
+    parser.add_argument('kinds', nargs='*', default=['all'])
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name, bench(Path(name), private_graph()) as made:
+        print('| fault | rest, s | way, m | after, m | trials | repeated |')
+        print('|---' * 6 + '|')
+        for row in rows(*made, Path(name), options.trials, kinds=options.kinds):
+            print(format_row(*row), flush=True)
+
+
+if __name__ == '__main__':
+    main()
