@@ -62,8 +62,6 @@ def _check_key(options: argparse.Namespace, stop: StopSignal) -> int:
 
 def _write_key(options: argparse.Namespace, stop: StopSignal) -> int:
     key = read_key(options.file)
-    if key == key_provisioning.ERASE_KEY:
-        raise KeyFileError(f'{options.file} holds zeros only, which are no valid key')
     key_state = _run_at_board(key_provisioning.write_key(key), options, stop)
     print(key_provisioning.format_key_state(key_state) + ', equal to the file')
     return EXIT_OK

@@ -3,6 +3,7 @@
 """Authentication: a keyed robot accepts signed frames only, each of them once."""
 
 import json
+import os
 from pathlib import Path
 import random
 
@@ -297,6 +298,7 @@ def test_a_key_file_of_32_digits_is_read(tmp_path, text):
         ('6465' * 7, 0o600, 'must hold 32 hexadecimal digits: got 28'),
         ('secret' * 5 + 'zz', 0o600, 'must hold hexadecimal digits only'),
         ('schlüssel', 0o600, 'must hold hexadecimal digits only'),
+        ('00' * 16, 0o600, 'holds zeros only, which is no key'),
     ],
 )
 def test_an_invalid_key_file_is_rejected_without_quoting_it(tmp_path, text, mode, expected):
@@ -307,6 +309,25 @@ def test_an_invalid_key_file_is_rejected_without_quoting_it(tmp_path, text, mode
         read_key(path)
     assert text[:6] not in str(error.value)
     assert error.value.__cause__ is None
+
+
+def test_a_key_file_in_the_home_folder_is_found(tmp_path, monkeypatch):
+    """A launch argument such as ``key_file:=~/key`` is not expanded by the shell."""
+    monkeypatch.setenv('HOME', str(tmp_path))
+    path = tmp_path / 'key'
+    path.write_text('6465' * 8)
+    path.chmod(0o600)
+    assert read_key(Path('~/key')) == b'de' * 8
+    with pytest.raises(KeyFileError, match='cannot be read'):
+        read_key(Path('~no_such_user/key'))
+
+
+def test_a_key_file_that_is_no_regular_file_is_rejected(tmp_path):
+    """A FIFO without a writer blocked the start for ever."""
+    os.mkfifo(tmp_path / 'fifo', 0o600)
+    for path in (tmp_path / 'fifo', tmp_path, Path('/dev/zero')):
+        with pytest.raises(KeyFileError, match='must be a regular file|cannot be read'):
+            read_key(path)
 
 
 def test_a_missing_key_file_is_reported(tmp_path):

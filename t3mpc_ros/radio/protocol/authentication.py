@@ -42,18 +42,27 @@ class KeyFileError(ValueError):
 def read_key(path: Path) -> bytes:
     """Return the key in a file of 32 hexadecimal digits that only its owner can read.
 
+    A leading ``~`` is the home folder: a shell does not expand it in ``key_file:=~/key``.
+
     Raises
     ------
     KeyFileError
         The file is unreadable, readable by others, or holds no key. The text never quotes it.
     """
     try:
-        with path.open('rb') as source:
+        path = path.expanduser()
+        # Not blocking: a FIFO would wait for its writer.
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), 'rb') as source:
             # Mode of the open file: the path may lead to another file meanwhile.
-            mode = stat.S_IMODE(os.fstat(source.fileno()).st_mode)
-            content = source.read(1024)
+            status = os.fstat(source.fileno())
+            regular, mode = stat.S_ISREG(status.st_mode), stat.S_IMODE(status.st_mode)
+            content = source.read(1024) if regular else b''
     except OSError as error:
         raise KeyFileError(f'key file {path} cannot be read: {error.strerror}') from error
+    except RuntimeError as error:  # a home folder that is not known
+        raise KeyFileError(f'key file {path} cannot be read: {error}') from error
+    if not regular:
+        raise KeyFileError(f'key file {path} must be a regular file')
     if mode & 0o077:
         raise KeyFileError(
             f'key file {path} must be closed to all but its owner: got mode {mode:04o}; '
@@ -66,6 +75,10 @@ def read_key(path: Path) -> bytes:
     if len(key) != KEY_SIZE:
         raise KeyFileError(
             f'key file {path} must hold {2 * KEY_SIZE} hexadecimal digits: got {2 * len(key)}'
+        )
+    if not any(key):
+        raise KeyFileError(
+            f'key file {path} holds zeros only, which is no key; t3mpc robot key create makes one'
         )
     return key
 
