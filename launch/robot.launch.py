@@ -36,7 +36,9 @@ def generate_launch_description():
     return LaunchDescription(
         [
             DeclareLaunchArgument(
-                'port', default_value='/dev/t3mpc_dongle', description='serial port of the dongle'
+                'port',
+                default_value='/dev/t3mpc_dongle*',
+                description='serial port of the dongle, or a pattern of several',
             ),
             DeclareLaunchArgument(
                 'key_file', default_value='', description='key of the robot; empty: no key'

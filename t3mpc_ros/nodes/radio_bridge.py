@@ -29,11 +29,12 @@ from t3mpc_ros.nodes.common.robot_services import RobotServices
 from t3mpc_ros.nodes.common.sensor_messages import count_variance
 from t3mpc_ros.parameters.table import group, parameter
 from t3mpc_ros.radio.link.port_actions import Close, LinkState, Open, Wait, Write
+from t3mpc_ros.radio.link.standstill_reasons import ROBOT_USB
 from t3mpc_ros.radio.link.statistics import DiagnosticLevel, LinkQuality
 from t3mpc_ros.radio.link.telemetry import MICROSTEPS, STEPS_PER_REV
 from t3mpc_ros.radio.protocol.authentication import KeyFileError, read_key
 from t3mpc_ros.radio.radio_robot import RadioRobot, RadioRobotParameters
-from t3mpc_ros.radio.serial_port import PortError, SerialPort
+from t3mpc_ros.radio.serial_port import PortError, SerialPort, find_ports
 from t3mpc_ros.robot.interface import RobotCommand, RobotState
 from t3mpc_ros.robot.sensor_conversions import (
     BatteryParameters,
@@ -59,9 +60,9 @@ class RadioBridgeParameters(RobotTopicParameters, RadioRobotParameters):
     """Parameters of the radio bridge node."""
 
     port: str = parameter(
-        '/dev/t3mpc_dongle',
-        'serial port of the dongle: the name that the udev rule of the package sets, or one of '
-        '/dev/serial/by-id',
+        '/dev/t3mpc_dongle*',
+        'serial port of the dongle, or a pattern: of several ports, the one that answers as a '
+        'dongle is used. The default are the names that the udev rule of the package sets',
     )
     key_file: str = parameter(
         '',
@@ -83,6 +84,9 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
         self._lock = threading.Lock()
         self._robot = RadioRobot(parameters, key)
         self._port: SerialPort | None = None
+        self._path = parameters.port
+        self._choice = 0
+        """Number of the port to open next, among those of the pattern."""
         self._logged_reason = 'starting'
         self._robot_publishers = RobotPublishers(self, parameters, _robot_description(parameters))
         self._commands = CommandSubscription(
@@ -125,6 +129,11 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
                     done = self._robot.link.state is LinkState.DONE
                     reason = self._robot.reason(self.steady_ns())
                 self._log_reason(reason)
+                if reason == ROBOT_USB and self._port is not None and len(self._ports()) > 1:
+                    self._port.close()
+                    self._choice += 1
+                    self._on_port_error(PortError(reason, absent=True))
+                    continue
                 until_ns = self.steady_ns()
                 for action in actions:
                     if isinstance(action, Wait):
@@ -148,7 +157,9 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
     def _execute(self, action: Open | Write | Close, step_ns: int) -> None:
         try:
             if isinstance(action, Open):
-                self._port = SerialPort(self.parameters.port)
+                ports = self._ports()
+                self._path = ports[self._choice % len(ports)]
+                self._port = SerialPort(self._path)
                 with self._lock:
                     self._robot.link.port_opened(self.steady_ns())
             elif isinstance(action, Write) and self._port is not None:
@@ -157,8 +168,12 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
             elif isinstance(action, Close) and self._port is not None:
                 self._port.close()
                 self._port = None
+                self._choice += 1
         except PortError as error:
             self._on_port_error(error)
+
+    def _ports(self) -> list[str]:
+        return find_ports(self.parameters.port)
 
     def _read_until(self, until_ns: int) -> bytes:
         """Return the bytes that arrive before the next step of the link is due."""
@@ -204,7 +219,7 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
             quality = self._robot.quality(now_ns)
             link_state, authenticated = link.state, link.authenticated
         values: dict[str, object] = {
-            'port': self.parameters.port,
+            'port': self._path,
             'link': link_state.value,
             'authenticated': authenticated,
             'commands': self._commands.received,

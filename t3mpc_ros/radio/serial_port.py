@@ -9,6 +9,7 @@ pyserial raises four kinds of errors: ``OSError`` (``SerialException`` is one), 
 
 from contextlib import suppress
 import errno
+import glob
 import os
 import termios
 from typing import NoReturn
@@ -20,6 +21,12 @@ BAUD_RATE = 500_000
 _WRITE_TIMEOUT = 0.1
 """s; a complete transaction takes 2 ms on the line"""
 _PORT_ERRORS = (OSError, termios.error, ValueError, TypeError)
+
+
+def find_ports(pattern: str) -> list[str]:
+    """Return the devices of a path or pattern, each once; the pattern itself if there are none."""
+    found = {os.path.realpath(path): path for path in sorted(glob.glob(pattern), reverse=True)}
+    return sorted(found.values()) or [pattern]
 
 
 class PortError(Exception):

@@ -14,7 +14,7 @@ import threading
 
 from nav_msgs.msg import Odometry
 import pytest
-from support.ros_graph import CommandSource, reason, twist
+from support.ros_graph import CommandSource, diagnostic, reason, twist
 
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters, StopTimeMonitor
 from t3mpc_ros.emulator.pty_port import PtyPort, serve
@@ -34,12 +34,13 @@ FULL = 0.35
 class ServedEmulator:
     """An emulator behind a pseudo-terminal, in a thread on the wall clock."""
 
-    def __init__(self, path, **flat):
+    def __init__(self, path, console=None, **flat):
         self.path = str(path)
         names = {name.replace('__', '.'): value for name, value in flat.items()}
         self.emulator = Emulator(EmulatorParameters.from_dict(names))
         self.emulator.plant.warm_up()
         self.port = PtyPort(path)
+        self.console = None if console is None else PtyPort(console)
         self.watch = StopTimeMonitor(self.emulator)
         note = self.emulator.board.on_command
         self.followed = []
@@ -57,7 +58,14 @@ class ServedEmulator:
         self._thread.start()
 
     def _serve(self):
-        serve(self.emulator, self.port, 1.0, self._stopped, on_update=self._on_update)
+        serve(
+            self.emulator,
+            self.port,
+            1.0,
+            self._stopped,
+            console_port=self.console,
+            on_update=self._on_update,
+        )
 
     def _stopped(self):
         while self._todo:
@@ -77,6 +85,8 @@ class ServedEmulator:
         self._ended = True
         self._thread.join()
         self.port.close()
+        if self.console is not None:
+            self.console.close()
 
 
 @pytest.fixture
@@ -145,6 +155,18 @@ def test_a_replugged_dongle_drives_within_a_second(harness, served):
     print(f'\nfollows commands {took:.2f} s after the port is back')
     assert took <= 2.0  # 0.2 s in virtual time: see test_firmware_avr_faults.py
     harness.spin_until(lambda: follows_commands(node), 'status OK')
+
+
+def test_of_several_ports_the_dongle_is_used(harness, served, tmp_path):
+    """The udev rule names every chip of a kind: the robot board may have the same one."""
+    robot_usb = tmp_path / 'a_robot'  # before the dongle in order
+    served(console=robot_usb, dongle_boot_time=0.0)
+    node = harness.add(RadioBridgeNode, port=str(robot_usb))
+    harness.spin_until(lambda: 'USB port of the robot board' in reason(node))
+    harness.remove(node)
+    node = harness.add(RadioBridgeNode, port=str(tmp_path / '*'))
+    harness.spin_until(lambda: diagnostic(node, 'link') == 'running', 'the link')
+    assert diagnostic(node, 'port') == str(tmp_path / 'dongle')
 
 
 def test_a_second_reader_of_the_port_causes_no_wrong_command(harness, served):

@@ -212,6 +212,22 @@ def test_an_absent_device_is_retried_five_times_a_second():
     assert bench.connect() < 0.4
 
 
+def test_the_usb_port_of_the_robot_is_recognised():
+    """Its console answers PING, too: the dongle was said to reject the radio configuration."""
+    bench = LinkBench()
+    reply = bench.dongle.reply
+
+    def console(frame, now_ns):
+        at, answer = reply(frame, now_ns)
+        known = isinstance(frame, frames.Ping)
+        return at, answer if known else frames.Refusal(frames.UNKNOWN, 2)
+
+    bench.dongle.reply = console
+    bench.run(5.0)
+    assert bench.link.reason(bench.now_ns) == reasons.ROBOT_USB
+    assert len(bench.opens) == 1, 'opening the port resets the robot'
+
+
 def test_a_rejected_radio_configuration_is_reported():
     """Its radio would reach no robot, or another one."""
     bench = LinkBench()

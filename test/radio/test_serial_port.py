@@ -11,7 +11,7 @@ import tty
 import pytest
 
 from t3mpc_ros.radio import serial_port as module
-from t3mpc_ros.radio.serial_port import PortError, SerialPort
+from t3mpc_ros.radio.serial_port import PortError, SerialPort, find_ports
 
 
 @pytest.fixture
@@ -32,6 +32,18 @@ def unplug(ends, path):
     """Remove the device, as when the dongle is unplugged."""
     os.close(ends.pop())
     os.unlink(path)
+
+
+def test_ports_of_a_pattern_are_listed_once(tmp_path):
+    """The udev rule gives a device two names."""
+    for name in ('ttyUSB0', 'ttyUSB1'):
+        (tmp_path / name).touch()
+        (tmp_path / f'dongle_{name}').symlink_to(tmp_path / name)
+    (tmp_path / 'dongle').symlink_to(tmp_path / 'ttyUSB1')
+    found = find_ports(str(tmp_path / 'dongle*'))
+    assert found == [str(tmp_path / name) for name in ('dongle', 'dongle_ttyUSB0')]
+    assert find_ports('/dev/no_such_port*') == ['/dev/no_such_port*']
+    assert find_ports(str(tmp_path / 'ttyUSB0')) == [str(tmp_path / 'ttyUSB0')]
 
 
 def test_bytes_pass_unchanged_both_ways(line):

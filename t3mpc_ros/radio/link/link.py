@@ -30,6 +30,7 @@ from t3mpc_ros.radio.protocol.frames import (
     Configured,
     Downlink,
     Info,
+    Refusal,
     Result,
     State,
     StatusFlag,
@@ -539,6 +540,11 @@ class Link:
                 self._start_handshake(reasons.robot_absent(self._parameters.channel), now_ns)
                 return
             self._reason = reasons.RADIO_NOT_CONFIGURED
+        elif isinstance(reply, Refusal) and reply.code == frames.UNKNOWN:
+            # Its console answers PING as well. The port stays open: opening it resets the robot.
+            self._reason = reasons.ROBOT_USB
+            self._due_ns = now_ns + _DEFECT_RETRY_NS
+            return
         self._due_ns = now_ns + _CONFIGURE_RETRY_NS
 
     def _search_dongle(self, reason: str, now_ns: int) -> None:

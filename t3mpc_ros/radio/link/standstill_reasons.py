@@ -7,6 +7,10 @@ DONGLE_STARTING = 'the dongle does not answer yet: it takes 1.5 s to start'
 DONGLE_TIMEOUT = 'the dongle stopped answering: did it restart?'
 NO_DONGLE = 'no dongle answers on this port: is it the right port?'
 NO_CHIP = 'the radio chip of the dongle does not answer: check its wiring and supply'
+ROBOT_USB = (
+    'this is the USB port of the robot board, not of the dongle; '
+    'ls -l /dev/serial/by-id lists both'
+)
 RADIO_NOT_CONFIGURED = 'the dongle rejects the radio configuration'
 HOST_KEY_MISSING = 'the robot requires signed commands: give the host the key'
 ROBOT_KEY_MISSING = (

@@ -228,10 +228,7 @@ def wait_for_dongle() -> Script[Pong]:
     pong = yield from wait_for_board(reasons.NO_DONGLE)
     response = yield Request(Configure(0), _PING_TIMEOUT)
     if isinstance(response.reply, Refusal):
-        raise ProcedureError(
-            'this is the USB port of the robot board, not of the dongle; '
-            'ls -l /dev/serial/by-id lists both'
-        )
+        raise ProcedureError(reasons.ROBOT_USB)
     if not pong.chip_ok:
         raise ProcedureError(reasons.NO_CHIP)
     return pong
