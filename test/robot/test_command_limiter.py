@@ -290,7 +290,7 @@ def test_an_emergency_stop_has_a_fixed_least_deceleration():
     assert stop_time(limiter, 3000, 3000) <= 10.0 / 60.0 + 0.01
 
 
-def test_a_lower_speed_limit_does_not_slow_the_stop_from_a_higher_speed():
+def test_a_lowered_speed_limit_does_not_slow_a_stop():
     limiter = make_limiter()
     for now in range(0, 1000, 10):
         limiter.accept(command(10.0, 10.0, now), now * MS)
