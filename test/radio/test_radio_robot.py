@@ -218,7 +218,7 @@ def test_limits_above_those_of_the_board_are_rejected(name, value):
         {'cmd_vel_timeout': 0.32},
     ],
 )
-def test_settings_of_board_and_host_that_stop_too_late_are_rejected(changes):
+def test_settings_of_board_that_stop_too_late_are_rejected(changes):
     with pytest.raises(ParameterError, match='within max_stopping_time'):
         RadioRobotParameters.from_dict(changes)
     RadioRobotParameters.from_dict(changes | {'max_stopping_time': 1.0})

@@ -25,7 +25,8 @@ from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 import rclpy
 
-from t3mpc_ros.cli.process_group import ProcessGroup, private_graph
+from t3mpc_ros.cli.private_graph import PrivateGraph
+from t3mpc_ros.cli.process_group import ProcessGroup
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters
 from t3mpc_ros.emulator.pty_port import PtyPort, serve
 from t3mpc_ros.geometry.types import NANOSECONDS
@@ -125,11 +126,17 @@ class DrivenRobot:
         """Drive at full speed, from a random phase of the cycle on."""
         self.speed = FULL
         end = time.monotonic() + timeout
-        while not all(sample.speed > 9.99 for sample in self._samples[-20:]):
+        while not self._at_full_speed():
             if time.monotonic() > end:
                 raise TimeoutError(f'{self.name} does not reach full speed')
             time.sleep(0.02)
         time.sleep(random.uniform(0.0, 0.04))
+
+    def _at_full_speed(self):
+        """Return whether the robot has driven at full speed for a while."""
+        since = time.monotonic() - 0.2
+        speeds = [sample.speed for sample in self._samples[-2000:] if sample.wall >= since]
+        return len(speeds) > 5 and min(speeds) > 9.99
 
     def last_publication(self, until):
         """Return the time of the last command published until then."""
@@ -145,7 +152,7 @@ class DrivenRobot:
 
     def forget(self):
         """Discard old samples."""
-        del self._samples[:-100], self._published[:-100]
+        del self._samples[:-2000], self._published[:-100]
 
     def close(self):
         self._ended = True
@@ -398,7 +405,7 @@ def format_row(name, trials, disturbed):
     """Return a row of the table: worst time, way, and way on expired commands."""
     times = [trial.rest for trial in trials if trial.rest is not None]
     worst = f'{max(times):.3f}' if times else '-'
-    distance = f'{max(trial.way for trial in trials):.3f}'
+    distance = f'{max(trial.way for trial in trials):.3f}' if any(t.way for t in trials) else '-'
     after = f'{max(trial.after for trial in trials):.4f}'
     return f'| {name} | {worst} | {distance} | {after} | {len(trials)} | {disturbed} |'
 
@@ -408,7 +415,11 @@ def main():
     parser.add_argument('--trials', type=int, default=20)
     parser.add_argument('kinds', nargs='*', default=['all'])
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as name, bench(Path(name), private_graph()) as made:
+    with (
+        tempfile.TemporaryDirectory() as name,
+        PrivateGraph() as graph,
+        bench(Path(name), graph.environment()) as made,
+    ):
         print('| fault | rest, s | way, m | after, m | trials | repeated |')
         print('|---' * 6 + '|')
         for row in rows(*made, Path(name), options.trials, kinds=options.kinds):
