@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from t3mpc_ros.bag.reader import missing_sample_ratio, open_bag
-from t3mpc_ros.cli.process_group import ProcessError, ProcessGroup, private_graph
+from t3mpc_ros.cli.process_group import ProcessError
 from t3mpc_ros.geometry.types import NANOSECONDS
 
 pytestmark = pytest.mark.ros
@@ -222,13 +222,13 @@ def test_an_integer_for_a_float_parameter_is_accepted(processes):
     assert processes.stop('controller') == 0
 
 
-def test_a_process_ends_without_interpreter_teardown(graph, tmp_path, monkeypatch):
+def test_a_process_ends_without_interpreter_teardown(tmp_path, monkeypatch, request):
     """The teardown took 0.5 to 1 s after the shutdown, up to 2 s on a busy machine."""
     (tmp_path / 'sitecustomize.py').write_text(
         'import atexit\natexit.register(print, "interpreter teardown")\n'
     )
     monkeypatch.setenv('PYTHONPATH', str(tmp_path))
-    group = ProcessGroup(tmp_path / 'log', private_graph())
+    group = request.getfixturevalue('processes')  # reads the environment
     group.start('reference_generator')
     group.wait_ready('reference_generator')
     assert group.stop('reference_generator') == 0
