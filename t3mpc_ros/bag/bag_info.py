@@ -23,7 +23,7 @@ from t3mpc_ros.bag.qos import QosError, profiles_from_yaml
 from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.geometry.types import NANOSECONDS
 
-_SQLITE_SUFFIX = '.db3'
+_SQLITE_SUFFIX, _ROS1_SUFFIX = '.db3', '.bag'
 
 
 @dataclass
@@ -85,7 +85,7 @@ def read_bag_info(path: Path | str) -> BagInfo:
     if not path.exists():
         raise BagError(f'{path} does not exist')
     files = sorted(path.glob(f'*{MCAP_SUFFIX}')) if path.is_dir() else [path]
-    if path.is_file() and path.suffix == _SQLITE_SUFFIX:
+    if path.is_file() and path.suffix in (_SQLITE_SUFFIX, _ROS1_SUFFIX):
         files = []
     if not files:
         return _info_through_rosbags(path)
@@ -163,6 +163,14 @@ def _qos_text(profile: Any) -> str:
     return f'{", ".join(policies)} {profile.depth}'
 
 
+def _storage(paths: Iterable[Path]) -> str:
+    """Return the name of the format of files that are not MCAP."""
+    suffixes = {path.suffix for path in paths}
+    if _SQLITE_SUFFIX in suffixes:
+        return 'sqlite3'
+    return 'ROS 1' if _ROS1_SUFFIX in suffixes else 'other'
+
+
 def _info_through_rosbags(path: Path) -> BagInfo:
     try:
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
@@ -180,7 +188,7 @@ def _info_through_rosbags(path: Path) -> BagInfo:
         paths = sorted(path.glob(f'*{_SQLITE_SUFFIX}')) if path.is_dir() else [path]
         return BagInfo(
             path=str(path),
-            storage='sqlite3' if any(file.suffix == _SQLITE_SUFFIX for file in paths) else 'other',
+            storage=_storage(paths),
             files={file.name: file.stat().st_size for file in paths},
             incomplete_files={},
             message_count=reader.message_count,

@@ -301,7 +301,11 @@ def run_report(options: argparse.Namespace) -> int:
         track=options.track,
     )
     output = options.output or options.bag.resolve().parent
-    print(write_report(options.bag, output, wanted).summary())
+    print('reading the bag and drawing its figures', file=sys.stderr, flush=True)
+    figures = write_report(options.bag, output, wanted)
+    if figures.verdict is not None:
+        print(figures.verdict.text())
+    print(figures.summary())
     return 0
 
 

@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 
 SECONDS = bounded_float(1.0, 86_400.0, 'seconds')
 
+UNSOUND = 3
+"""Exit code of a demo that was recorded but is no valid measurement."""
+
 PROGRAMS = {
     'bag': 'inspect, report, recover, replay, compare bags, and train from them',
     'robot': 'key, link test, channel scan, wheel jog, parameters of the real robot',
@@ -75,10 +78,13 @@ def _demo(options: argparse.Namespace) -> int:
     except DemoInterruptedError as interruption:
         print(interruption, file=sys.stderr)
         return 128 + interruption.number
+    verdict = figures.verdict
+    if verdict is not None:
+        print(verdict.text())
     print(figures.summary())
     if not options.headless:
         webbrowser.open(figures.report.resolve().as_uri())
-    return 0
+    return 0 if verdict is not None and verdict.sound else UNSOUND
 
 
 def _new_run(folder: Path) -> Path:

@@ -12,8 +12,8 @@ import subprocess
 import sys
 import time
 
-READY_TIMEOUT = 300.0
-"""Maximum start of a node, s: a busy machine takes minutes to compile the kernels."""
+READY_TIMEOUT = 1200.0
+"""Maximum start of a node, s: a busy machine compiles the kernels for minutes."""
 PROGRESS_PERIOD = 5.0
 """Time between two lines of progress in a wait, s."""
 

@@ -11,9 +11,12 @@ import errno
 import re
 
 import pytest
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2.metadata import parse_qos
+from rosbags.typesys import Stores, get_typestore
 import yaml
 
+from t3mpc_ros.bag.bag_info import read_bag_info
 from t3mpc_ros.bag.metadata import (
     NO_START_NS,
     BagMetadata,
@@ -24,6 +27,7 @@ from t3mpc_ros.bag.metadata import (
     write_metadata,
 )
 from t3mpc_ros.bag.qos import UNLIMITED, QosError, QosProfile, profiles_from_yaml, profiles_to_yaml
+from t3mpc_ros.bag.reader import open_bag
 
 LATCHED = QosProfile(
     history='keep_all',
@@ -288,3 +292,19 @@ def test_a_profile_rosbag2_would_refuse_cannot_be_made(change):
 def test_invalid_profile_text_is_an_error(text):
     with pytest.raises(QosError):
         profiles_from_yaml(text)
+
+
+def test_info_reads_a_ros_1_bag_as_the_report_does(tmp_path):
+    """``bag info`` said that it was no bag, while ``bag report`` read it."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    text = store.types['std_msgs/msg/String']
+    path = tmp_path / 'old.bag'
+    with Ros1Writer(path) as writer:
+        connection = writer.add_connection('/text', 'std_msgs/msg/String', typestore=store)
+        for k in range(3):
+            data = store.serialize_ros1(text(str(k)), 'std_msgs/msg/String')
+            writer.write(connection, 10**18 + k, data)
+    held = read_bag_info(path)
+    assert (held.storage, held.message_count) == ('ROS 1', 3)
+    with open_bag(path) as recording:
+        assert recording.message_count == 3

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import io
 import itertools
 import json
+import os
 import random
 import sqlite3
 import struct
@@ -20,7 +21,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_typestore
 
-from t3mpc_ros.bag.mcap_file import read_file_summary
+from t3mpc_ros.bag.mcap_file import MAGIC, read_file_summary
 from t3mpc_ros.bag.metadata import read_metadata
 from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.reader import open_bag
@@ -570,3 +571,26 @@ def test_info_reads_files_of_other_writers_and_sqlite_bags(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert 'sqlite3' in printed
     assert '4.000 s' in printed
+
+
+def test_a_file_that_is_a_hole_is_unreadable_and_shows_its_progress(tmp_path):
+    """A hole of 2 GB took a minute and a half in silence and gave an empty bag."""
+    path = tmp_path / 'hole.mcap'
+    path.write_bytes(MAGIC)
+    os.truncate(path, 2**26)
+    calls = []
+    with pytest.raises(UnreadableError, match='no message that can be read'):
+        recover_bag(path, tmp_path / 'out', lambda *call: calls.append(call))
+    assert not (tmp_path / 'out').exists()
+    places = [done for _, done, _ in calls]
+    assert places == sorted(places)
+    assert len(places) > 50
+    assert bag_main(['recover', str(path)]) == 1
+
+
+def test_records_behind_a_hole_are_found(own, tmp_path):
+    half = chunk_ends(own)[len(chunk_ends(own)) // 2][0]
+    path = tmp_path / 'hole.mcap'
+    path.write_bytes(own[:half] + bytes(3 * 2**20 + 17) + own[half:])
+    result = recover_bag(path, tmp_path / 'out')
+    assert result.kept == len(inside(own).messages)

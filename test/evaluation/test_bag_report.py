@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``bag report`` of bags that this package did not make, and of links, delays and long runs."""
 
+import copy
 from dataclasses import astuple
 import math
 import re
@@ -16,6 +17,7 @@ import yaml
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.bag import main as bag_main
 from t3mpc_ros.cli.main import main as t3mpc
+from t3mpc_ros.evaluation.bag_report.continuity import continuity_notes, parts
 from t3mpc_ros.evaluation.bag_report.link_history import link_metrics
 from t3mpc_ros.evaluation.bag_report.report_page import write_report
 from t3mpc_ros.evaluation.bag_report.response import (
@@ -404,6 +406,37 @@ def test_stamps_that_do_not_tell_the_time_do_no_harm(rows, tmp_path, stamp, word
     assert motion.time[-1] - motion.time[0] == pytest.approx(39.96, abs=0.2)
     fit = fit_response(run.motions[COMMAND], motion, 'linear')
     assert fit.dead_time + fit.lag == pytest.approx(DEAD_TIME + LAG, abs=0.03)
+
+
+def test_a_gap_of_a_month_is_listed_and_splits_the_response(rows, tmp_path):
+    """The response over the gap was 186 ms with 99.7 % explained, of a speed held for a month."""
+    month = 30 * 86_400.0
+    later = []
+    for t, topic, message in rows:
+        if t > 20.0 and topic == '/odom':
+            message = copy.deepcopy(message)
+            message.header.stamp.sec += int(month)
+        later.append((t + (month if t > 20.0 else 0.0), topic, message))
+    plain = write_report(write(tmp_path / 'plain', rows), tmp_path / 'one')
+    torn = write_report(write(tmp_path / 'torn', later), tmp_path / 'two')
+    page = (tmp_path / 'two' / 'report.html').read_text(encoding='utf-8')
+    assert 'No message of /odom for 2592000.' in page
+    one, other = (figures.responses['linear'] for figures in (plain, torn))
+    assert other.dead_time + other.lag == pytest.approx(one.dead_time + one.lag, abs=0.02)
+
+
+def test_a_jump_of_the_pose_and_disorder_are_listed():
+    time = 0.1 * np.arange(100)
+    places = np.stack([0.2 * time, np.zeros(100)], axis=1)
+    speeds = np.full(100, 0.2)
+    assert continuity_notes('/odom', time, time, places, speeds) == []
+    places[50:, 0] += 1e6
+    received = time.copy()
+    received[[70, 71]] = received[[71, 70]]
+    jump, disorder = continuity_notes('/odom', received, time, places, speeds)
+    assert jump == 'The position of /odom jumps by 1e+06 m at 5.0 s.'
+    assert disorder.startswith('1 messages of /odom are in the bag before earlier ones')
+    assert parts(time, np.delete(time, np.s_[20:60])) == [(0.0, time[19]), (time[60], time[99])]
 
 
 def test_a_recorder_whose_clock_was_set_is_told(rows, tmp_path):

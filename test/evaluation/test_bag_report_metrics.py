@@ -482,6 +482,28 @@ def test_settled_excludes_the_window_around_each_switch():
 # -- which errors count -------------------------------------------------------------------------
 
 
+def test_a_stopped_robot_gives_no_valid_measurement(rows, report, tmp_path):
+    """A run on a machine that was too slow ended with exit code 0 and good-looking numbers."""
+    assert report.verdict.sound
+    assert report.verdict.stopped == 0.0
+    sheet = sheet_of(rows, terms=False)
+    for _, topic, message in sheet.rows:
+        if topic == '/cmd_vel':
+            command = message
+    stops = [k for k, row in enumerate(sheet.rows) if row[1] == '/cmd_vel' and 6.0 < row[0] < 9.0]
+    still = type(command)(
+        *(type(part)(0.0, 0.0, 0.0) for part in (command.linear, command.angular))
+    )
+    for k in stops:
+        sheet.rows[k] = (*sheet.rows[k][:2], still)
+    figures = write_report(sheet.write(tmp_path / 'bag'), tmp_path)
+    assert not figures.verdict.sound
+    assert figures.verdict.stopped == pytest.approx(3.0, abs=0.03)
+    page = page_of(figures).text()
+    assert 'NO VALID MEASUREMENT: the robot was stopped for 3.0 of' in page
+    assert page.index('NO VALID') < page.index('RMSE')
+
+
 @pytest.mark.parametrize('command', [True, False])
 def test_standstill_before_and_after_does_not_change_statistics(rows, tmp_path, command):
     """A robot that followed within 0.04 rad/s was once said to miss by 0.2.

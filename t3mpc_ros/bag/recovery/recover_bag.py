@@ -153,7 +153,11 @@ def _recover_file(path: Path, target: Path, progress: Progress) -> FileResult:
                     shutil.copyfileobj(source, output)
                 return result
         with _new_file(target) as output:
-            return recover_file(source, output, path.name, report)
+            result = recover_file(source, output, path.name, report)
+            if not result.ended and not result.topics:
+                # An empty bag would look like a recovery.
+                raise UnreadableError(f'{path.name} contains no message that can be read')
+            return result
 
 
 @contextmanager

@@ -116,8 +116,18 @@ class _FileRecovery:
         if start > len(MAGIC):
             reason = 'bytes before the MCAP magic'
             self._result.damages.append(Damage(0, start - len(MAGIC), reason))
-        for span in Scanner(self._window, start, self._is_known_channel).spans():
-            progress(span.start, self._window.size)
+        size = self._window.size
+        reached = 0
+
+        def report(position: int) -> None:
+            nonlocal reached
+            if position > reached:
+                reached = position
+                progress(position, size)
+
+        progress(0, size)
+        for span in Scanner(self._window, start, self._is_known_channel, report).spans():
+            report(span.start)
             self._position = span.end
             if span.opcode != Opcode.MESSAGE_INDEX:
                 self._close_lost_chunk()

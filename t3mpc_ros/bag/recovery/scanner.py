@@ -65,6 +65,7 @@ _NAME_LIMIT = 32
 _BLOCK = 2**20
 # A known opcode and a length below 2^40 bytes; a lookahead, because candidates may overlap.
 _CANDIDATE = re.compile(rb'(?=[\x01-\x0f].{5}\x00\x00\x00|' + re.escape(MAGIC) + rb')', re.DOTALL)
+_ZEROS = bytes(_BLOCK + HEAD.size - 1)
 _TRUNCATED_SIZE_LIMIT = 2**28  # maximum plausible size of a possibly truncated record, bytes
 
 
@@ -302,14 +303,21 @@ class Scanner:
     is_known_channel
         Whether a channel number is defined. After damaged bytes, a message is accepted only if
         its channel is known.
+    progress
+        Called with the position in the search after damaged bytes, about once per megabyte.
     """
 
     def __init__(
-        self, window: FileWindow, start: int, is_known_channel: Callable[[int], bool]
+        self,
+        window: FileWindow,
+        start: int,
+        is_known_channel: Callable[[int], bool],
+        progress: Callable[[int], None] = lambda position: None,
     ) -> None:
         self._window = window
         self._start = start
         self._is_known_channel = is_known_channel
+        self._progress = progress
         # In a file with chunks, a message outside of a chunk is the content of a chunk with a
         # damaged length; no checksum covers it.
         self._chunked = False
@@ -389,7 +397,11 @@ class Scanner:
         """
         within = False
         while start < self._window.size:
+            self._progress(start)
             block = self._window.read(start, _BLOCK + HEAD.size - 1)
+            if block == _ZEROS:  # a hole; no record begins with a zero
+                start += _BLOCK
+                continue
             for match in _CANDIDATE.finditer(block):
                 offset = match.start()
                 if offset >= _BLOCK:

@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.evaluation.bag_report.continuity import within_gaps
 from t3mpc_ros.evaluation.bag_report.link_history import LinkMetrics, link_metrics
 from t3mpc_ros.evaluation.bag_report.response import ResponseFit, responses
 from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series
 from t3mpc_ros.evaluation.bag_report.topic_roles import COMMAND, ODOMETRY, REFERENCE
+from t3mpc_ros.evaluation.bag_report.verdict import Verdict, judge
 
 Array = NDArray[np.float64]
 
@@ -57,12 +59,13 @@ def tracking_error(run: Run, measured: str) -> Series | None:
     """Return measured minus reference of both channels at the stamps of the ``measured`` motion.
 
     The reference is interpolated linearly; across a switch its earlier sample is held. Outside the
-    reference the error is undefined. None when either motion is missing.
+    reference, and in its gaps, the error is undefined. None when either motion is missing.
     """
     motion, reference = run.motions.get(measured), run.motions.get(REFERENCE)
     if motion is None or reference is None:
         return None
     inside = (motion.time >= reference.time[0]) & (motion.time <= reference.time[-1])
+    inside &= ~within_gaps(motion.time, reference.time)
     time = motion.time[inside]
     before = np.clip(np.searchsorted(reference.time, time, 'right') - 1, 0, None)
     following = np.minimum(before + 1, len(reference) - 1)
@@ -231,6 +234,8 @@ class ReportMetrics:
     """Share of missing samples by relative topic name."""
     absent: tuple[str, ...]
     """Topics that are missing in the bag."""
+    verdict: Verdict | None
+    """Whether the numbers measure the controller; None for a bag without a closed loop."""
 
     def summary(self) -> str:
         """Return the metrics in one line."""
@@ -277,6 +282,15 @@ def compute_metrics(
     }
     delay = latencies(run)
     delays = np.array([math.nan]) if delay is None else delay['value']
+    missing = {name: timing.missing for name, timing in run.timing.items()}
+    verdict = judge(
+        run,
+        driving(run),
+        max(each.settled.rmse for each in wheels.values()),
+        max(each.overall.seconds for each in wheels.values()),
+        missing.get(ODOMETRY, math.nan),
+        float(np.percentile(delays, 99.0)),
+    )
     return ReportMetrics(
         report=report,
         pictures=pictures,
@@ -290,8 +304,9 @@ def compute_metrics(
         links={link.name: link_metrics(link) for link in run.links},
         latency=float(np.percentile(delays, 50.0)),
         latency_99=float(np.percentile(delays, 99.0)),
-        missing={name: timing.missing for name, timing in run.timing.items()},
+        missing=missing,
         absent=run.absent,
+        verdict=verdict,
     )
 
 

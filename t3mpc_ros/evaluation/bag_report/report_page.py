@@ -174,6 +174,9 @@ h1 { font-size: 1.5rem; margin: 0 0 .2rem; overflow-wrap: anywhere; }
 h2 { font-size: 1.1rem; margin: 2.4rem 0 .4rem; }
 p { margin: .3rem 0; }
 .quiet { color: #6b7280; font-size: .9rem; }
+.verdict { border-radius: .5rem; padding: .5rem 1rem; margin: 1rem 0; font-weight: 600; }
+.sound { background: #ecfdf5; }
+.unsound { background: #fee2e2; }
 .tiles { display: grid; grid-template-columns: repeat(3, 1fr); gap: .6rem; margin: 1.2rem 0;
   padding: 0; list-style: none; }
 @media (max-width: 40rem) { .tiles { grid-template-columns: repeat(2, 1fr); } }
@@ -207,6 +210,7 @@ def _page(
         f'<title>{escape(name)}</title>\n<style>{_CSS}</style>\n</head>\n<body>',
         f'<h1>{escape(name)}</h1>',
         f'<p class="quiet">{escape(_origin(recording, run))}</p>',
+        _verdict(figures),
         _tiles(figures),
         _notes(recording, run),
         *(['<h2>Tracking error</h2>', _error_table(run)] if run.ours or figures.measured else []),
@@ -240,6 +244,14 @@ def _origin(recording: BagReader, run: Run) -> str:
     return ' · '.join(words)
 
 
+def _verdict(figures: ReportMetrics) -> str:
+    verdict = figures.verdict
+    if verdict is None:
+        return ''
+    kind = 'sound' if verdict.sound else 'unsound'
+    return f'<p class="verdict {kind}">{escape(verdict.text())}</p>'
+
+
 def _tiles(figures: ReportMetrics) -> str:
     channels = figures.channels
     right, left = (figures.wheels[each.name] for each in channels)
@@ -259,6 +271,9 @@ def _tiles(figures: ReportMetrics) -> str:
                 f'RMSE settled, away from switches; {right.settled.seconds:.1f} s counted',
             ),
         ]
+    if figures.verdict is not None:
+        stopped = f'{figures.verdict.stopped:.1f} s'
+        tiles.append((stopped, 'stopped between the first and the last command to move'))
     fits = [figures.responses.get(each.name) for each in channels]
     if any(fit is not None and fit.clear for fit in fits):
         delays = [

@@ -9,6 +9,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.evaluation.bag_report.continuity import parts
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
 from t3mpc_ros.evaluation.bag_report.topic_roles import COMMAND
 from t3mpc_ros.kernels import kernel
@@ -75,6 +76,8 @@ def fit_response(command: Series, motion: Series, name: str) -> ResponseFit | No
     gap = float(np.median(np.diff(motion.time)))
     step = min(max(0.25 * gap, 0.002), 0.01)
     start, end = busiest(command, motion, name, MOST * step)
+    if not end > start:
+        return None
     count = int((end - start) / step) + 1
     shifts = int(LONGEST_DEAD_TIME / step) + 1
     if count < shifts + FEWEST:
@@ -94,16 +97,22 @@ def fit_response(command: Series, motion: Series, name: str) -> ResponseFit | No
 
 
 def busiest(command: Series, motion: Series, name: str, most: float) -> tuple[float, float]:
-    """Return the times of both, or the window of ``most`` s in which the command varies most."""
-    start = float(max(command.time[0], motion.time[0]))
-    end = float(min(command.time[-1], motion.time[-1]))
-    if end - start <= most:
-        return start, end
+    """Return the time span without a gap, at most ``most`` s, in which the command varies most.
+
+    Start and end are equal where both series overlap nowhere.
+    """
     moved = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(command[name])))])
-    starts = np.append(np.arange(start, end - most, 0.25 * most), end - most)
-    varied = np.interp(starts + most, command.time, moved) - np.interp(starts, command.time, moved)
-    first = float(starts[int(np.argmax(varied))])
-    return first, first + most
+    best, span = -1.0, (0.0, 0.0)
+    for start, end in parts(command.time, motion.time):
+        starts = np.array([start])
+        if end - start > most:
+            starts = np.append(np.arange(start, end - most, 0.25 * most), end - most)
+        ends = np.minimum(starts + most, end)
+        varied = np.interp(ends, command.time, moved) - np.interp(starts, command.time, moved)
+        k = int(np.argmax(varied))
+        if varied[k] > best:
+            best, span = float(varied[k]), (float(starts[k]), float(ends[k]))
+    return span
 
 
 def _best(u: Array, y: Array, step: float, shifts: int, lags: list[float]) -> ResponseFit:

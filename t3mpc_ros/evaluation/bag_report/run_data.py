@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.bag.reader import BagReader, missing_sample_ratio
+from t3mpc_ros.evaluation.bag_report.continuity import continuity_notes
 from t3mpc_ros.evaluation.bag_report.link_history import (
     DiagnosticEvent,
     LinkHistory,
@@ -248,6 +249,9 @@ def _read(recording: BagReader, name: str, topic: str, notes: list[str]) -> dict
                      'finite; they are excluded.')  # fmt: skip
     table = {key: column[sound] for key, column in table.items()}
     if fields is _ODOMETRY_FIELDS:
+        places = np.stack([table['x'], table['y']], axis=1)
+        times = table['received'], table['stamp']
+        notes += continuity_notes(topic, *times, places, table['linear'])
         _mend_stamps(table, topic, notes)
     return table
 
