@@ -573,7 +573,7 @@ def test_info_reads_files_of_other_writers_and_sqlite_bags(tmp_path, capsys):
     assert '4.000 s' in printed
 
 
-def test_a_file_that_is_a_hole_is_unreadable_and_shows_its_progress(tmp_path):
+def test_a_hole_is_unreadable_and_shows_its_progress(tmp_path):
     """A hole of 2 GB took a minute and a half in silence and gave an empty bag."""
     path = tmp_path / 'hole.mcap'
     path.write_bytes(MAGIC)
