@@ -14,11 +14,13 @@ from pathlib import Path
 import struct
 from typing import Any, NamedTuple
 
+from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader, ReaderError
 
 from t3mpc_ros.bag.mcap_file import MCAP_SUFFIX, read_file_summary
 from t3mpc_ros.bag.metadata import METADATA_FILE_NAME, collect_metadata
 from t3mpc_ros.bag.qos import TRANSIENT_LOCAL, UNLIMITED, QosProfile
+from t3mpc_ros.bag.recovery.scanner import ChunkError, FileWindow, decode_chunk
 from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.bag.topic_filter import PlayTopicFilter
 from t3mpc_ros.geometry.types import NANOSECONDS
@@ -68,11 +70,21 @@ class ScheduledMessage(NamedTuple):
     """Whether it is a transient-local message from before the start of the playback."""
 
 
+class ChunkSpan(NamedTuple):
+    """Times of the first and the last message of a chunk, and the number of its messages."""
+
+    start_ns: int
+    end_ns: int
+    message_count: int
+
+
 class BagFile:
     """Open file of a bag, or open folder of a bag that rosbag2 compressed."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.damaged: dict[tuple[int, int], int] = {}
+        """Messages, of all topics, in damaged chunks that were skipped, by first and last time."""
         with _read_errors(path):
             self._reader = Reader(path)
             self._reader.open()
@@ -86,17 +98,51 @@ class BagFile:
     ) -> Iterator[StoredMessage]:
         """Yield the messages of ``topics`` from ``start_ns`` until before ``stop_ns``.
 
+        A damaged chunk is skipped and counted in :attr:`damaged`.
+
         Raises
         ------
         BagError
-            The file is damaged.
+            The file is damaged elsewhere.
         """
         selected = [item for item in self._reader.connections if item.topic in topics]
         if not selected or start_ns > self.end_ns:
             return  # the library would read all topics for an empty selection
-        with _read_errors(self.path):
-            for item, stamp_ns, data in self._reader.messages(selected, start_ns, stop_ns):
-                yield StoredMessage(stamp_ns, item.topic, bytes(data))
+        while True:
+            last_ns = start_ns
+            try:
+                with _read_errors(self.path):
+                    for item, stamp_ns, data in self._reader.messages(selected, start_ns, stop_ns):
+                        last_ns = stamp_ns
+                        yield StoredMessage(stamp_ns, item.topic, bytes(data))
+                return
+            except BagError:
+                chunk = self._damaged_chunk(last_ns)
+                if chunk is None:
+                    raise
+                self.damaged[chunk.start_ns, chunk.end_ns] = chunk.message_count
+                start_ns = chunk.end_ns + 1
+
+    def _damaged_chunk(self, from_ns: int) -> ChunkSpan | None:
+        """Return the first damaged chunk with messages from a time on; None if it is unknown."""
+        if self.path.suffix != MCAP_SUFFIX:
+            return None
+        with self.path.open('rb') as file:
+            summary = make_reader(file).get_summary()
+            window = FileWindow(file, self.path.stat().st_size)
+            indexes = summary.chunk_indexes if summary is not None else []
+            for item in sorted(indexes, key=lambda each: each.message_start_time):
+                if item.message_end_time < from_ns:
+                    continue
+                try:
+                    decode_chunk(window, item.chunk_start_offset)
+                except ChunkError:
+                    count = sum(
+                        (int.from_bytes(window.read(offset + 1, 8), 'little') - 6) // 16
+                        for offset in item.message_index_offsets.values()
+                    )
+                    return ChunkSpan(item.message_start_time, item.message_end_time, count)
+        return None
 
     def last_before(self, topic: str, stamp_ns: int, count: int) -> list[StoredMessage]:
         """Return the last ``count`` messages of a topic before a time, or fewer if there are."""
@@ -184,6 +230,11 @@ class MergedReader:
             remapped, ' and '.join(str(b.path) for b in bags)
         )
         """By remapped name."""
+
+    @property
+    def damaged_count(self) -> int:
+        """Number of messages in damaged chunks that were skipped so far."""
+        return sum(sum(file.damaged.values()) for file, _ in self._files())
 
     def exclude_topic(self, topic: str) -> None:
         """Exclude a topic, given by its remapped name."""

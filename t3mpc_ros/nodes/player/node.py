@@ -97,6 +97,7 @@ class PlayerNode(BaseNode[PlayerParameters]):
         self._other_publishers: dict[str, str] = {}
         self._logged: set[str] = set()
         self._started = self._ended = False
+        self._damaged = 0
         if self.parameters.uris:
             self._open()
         else:
@@ -208,6 +209,7 @@ class PlayerNode(BaseNode[PlayerParameters]):
         if thread is None or self._ended:
             return
         self._block_robots(thread)
+        self._warn_of_damage()
         status = thread.status()
         if self._progress is not None and self._started:
             self._progress.show(status)
@@ -224,6 +226,16 @@ class PlayerNode(BaseNode[PlayerParameters]):
             self._ended = True
             self._topic_publishers.wait_for_acked(ACK_TIMEOUT)
             self.exit_requested = True
+
+    def _warn_of_damage(self) -> None:
+        """Warn when further messages of damaged chunks are not played."""
+        count = self._reader.damaged_count if self._reader is not None else 0
+        if count > self._damaged:
+            self._damaged = count
+            self.get_logger().warning(
+                f'the bag is damaged: {count} messages so far are not played; t3mpc bag recover '
+                'reports the loss'
+            )
 
     def _block_robots(self, thread: PlayerThread) -> None:
         """Disable renamed velocity topics that a robot subscribes to."""
@@ -268,12 +280,15 @@ class PlayerNode(BaseNode[PlayerParameters]):
             'latency_p50_ms': thread.latency.percentile_ns(50) / 1e6,
             'latency_p99_ms': thread.latency.percentile_ns(99) / 1e6,
             'latency_max_ms': thread.latency.max_ns / 1e6,
+            'damaged': self._damaged,
             'excluded': ', '.join([*topics.unusable, *topics.blocked]),
         }
         if thread.failure:
             return ERROR, thread.failure, values
         if not self._started:
             return OK, 'waiting for subscribers', values
+        if self._damaged:
+            return WARN, f'{self._damaged} messages of damaged chunks are not played', values
         if self._other_publishers:
             shared = ', '.join(self._other_publishers)
             return WARN, f'also published by other nodes: {shared}', values
@@ -288,6 +303,7 @@ class PlayerNode(BaseNode[PlayerParameters]):
             self._progress.close()
         thread, self._thread = self._thread, None
         if thread is not None:
+            self._warn_of_damage()
             thread.stop()
             latency = thread.latency
             self.get_logger().info(
