@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 #
 # make avr        both boards' firmware, build/dongle.elf and build/robot.elf, and their sizes;
-#                 RADIO_CHANNEL=0…125 and RADIO_RATE=0|1|2 (250 kbit/s, 1, 2 Mbit/s) are options
+#                 RADIO_RATE=0|1|2 (250 kbit/s, 1, 2 Mbit/s) is an option, and RADIO_CHANNEL=0…125,
+#                 the channel of a dongle before CFG and of a robot without settings
 # make simavr     both boards in a simulator with their peripherals, as a library for ctypes
 
 AVR_OBJCOPY ?= avr-objcopy
@@ -10,6 +11,9 @@ AVR_BOARD_FLAGS := $(AVR_FLAGS) -DF_CPU=16000000UL -Icore -Iavr -Wl,--gc-section
                    $(if $(RADIO_CHANNEL),-DT3_RADIO_CHANNEL=$(RADIO_CHANNEL)) \
                    $(if $(RADIO_RATE),-DT3_RADIO_RATE=$(RADIO_RATE))
 AVR_HEADERS := $(wildcard core/*.h avr/*.h)
+# Digest of sources and settings, reported in INFO and PONG.
+AVR_ID = $(shell (echo '$(AVR_CC) $(AVR_BOARD_FLAGS)'; cat $(sort $(wildcard core/*.[ch] avr/*.[ch]))) \
+           | sha256sum | cut -c1-8)
 
 DONGLE_FILES := avr/dongle_main.c avr/reset.c avr/nrf24.c avr/serial.c avr/clock.c \
                 $(DONGLE_PARTS:%=core/t3_%.c)
@@ -18,16 +22,20 @@ ROBOT_FILES := avr/robot_main.c avr/reset.c avr/nrf24.c avr/stepping.c avr/analo
 
 .PHONY: simavr
 
+$(AVR_SETTINGS): always
+	@$(call keep,avr.settings,$(AVR_CC) $(AVR_BOARD_FLAGS) $(ROBOT_MCU) $(DONGLE_MCU))
+
 avr: $(BUILD)/dongle.elf $(BUILD)/robot.elf $(BUILD)/dongle.hex $(BUILD)/robot.hex
+	@echo 'build $(AVR_ID)'
 	$(AVR_SIZE) $(BUILD)/dongle.elf $(BUILD)/robot.elf
 
-$(BUILD)/dongle.elf: $(DONGLE_FILES) $(AVR_HEADERS)
+$(BUILD)/dongle.elf: $(DONGLE_FILES) $(AVR_HEADERS) $(AVR_SETTINGS)
 	@mkdir -p $(BUILD)
-	$(AVR_CC) -mmcu=$(DONGLE_MCU) $(AVR_BOARD_FLAGS) -o $@ $(DONGLE_FILES)
+	$(AVR_CC) -mmcu=$(DONGLE_MCU) $(AVR_BOARD_FLAGS) -DT3_BUILD=0x$(AVR_ID) -o $@ $(DONGLE_FILES)
 
-$(BUILD)/robot.elf: $(ROBOT_FILES) $(AVR_HEADERS)
+$(BUILD)/robot.elf: $(ROBOT_FILES) $(AVR_HEADERS) $(AVR_SETTINGS)
 	@mkdir -p $(BUILD)
-	$(AVR_CC) -mmcu=$(ROBOT_MCU) $(AVR_BOARD_FLAGS) -o $@ $(ROBOT_FILES)
+	$(AVR_CC) -mmcu=$(ROBOT_MCU) $(AVR_BOARD_FLAGS) -DT3_BUILD=0x$(AVR_ID) -o $@ $(ROBOT_FILES)
 
 $(BUILD)/%.hex: $(BUILD)/%.elf
 	$(AVR_OBJCOPY) -O ihex -R .eeprom $< $@

@@ -39,7 +39,7 @@
 #define WAIT_US 200u  // for this long the main loop stands still rather than miss the moment
 #define FLUSH_US 110u // what the flush takes, with the interrupts that may come meanwhile
 
-static const struct t3_radio_settings radio = T3_RADIO_DEFAULTS;
+static struct t3_radio_settings radio = T3_RADIO_DEFAULTS;  // channel and address: of the settings
 static volatile bool radio_interrupt;  // set by the interrupt of the radio
 static volatile uint32_t heard_us;
 static uint32_t checked_us, fifo_checked_us;
@@ -50,9 +50,10 @@ static uint8_t answer[T3_RADIO_LIMIT], answer_size;  // waits for its moment
 static bool chip_held;  // whether the radio chip held its settings at the last check
 static struct t3_console console;
 
-// Of the bytes from USB no more are looked at in one round, and of frames one. The line can bring
-// more: of a flood most is lost, and nothing else is late.
+// Of the bytes from USB no more are looked at in one round, and none for a while after a frame, whose
+// reply takes time. The line can bring more: of a flood most is lost, and nothing else is late.
 #define SERIAL_SHARE 8u
+#define FRAME_PAUSE_US UINT32_C(2000)
 
 ISR(RADIO_IRQ_VECTOR)
 {
@@ -69,11 +70,14 @@ static uint32_t time_us(void *context)
     return stepping_time_us();
 }
 
+static void load_answer(void);
+
 static void load_ack(void *context, const uint8_t *payload, uint8_t size)
 {
     (void)context;
     memcpy(answer, payload, size);
     answer_size = size;
+    load_answer();  // the rest of the tick may take longer than the window that is open now
 }
 
 static void drivers(void *context, bool on)
@@ -158,10 +162,16 @@ static void eeprom_cells(void *context, uint8_t address, uint8_t *data, uint8_t 
 
 static void serve_console(void)
 {
+    static uint32_t frame_us;
+    const uint32_t now_us = stepping_time_us();
+    const bool pauses = now_us - frame_us < FRAME_PAUSE_US;
     uint8_t byte;
-    for (uint8_t i = 0; i < SERIAL_SHARE && serial_take(&byte); i++)
-        if (t3_console_byte(&console, byte))
+    for (uint8_t i = 0; !pauses && i < SERIAL_SHARE && serial_take(&byte); i++) {
+        if (t3_console_byte(&console, byte)) {
+            frame_us = now_us;
             break;
+        }
+    }
     for (uint8_t count = serial_lost(); count; count--)
         t3_console_overrun(&console);
     t3_console_tick(&console);
@@ -169,8 +179,16 @@ static void serve_console(void)
 
 // -- radio ---------------------------------------------------------------------------------------
 
+static bool settings_differ(void)
+{
+    const struct t3_setup *now = &robot.settings.now;
+    return radio.channel != now->channel || memcmp(radio.address, now->address, 5);
+}
+
 static void configure_radio(uint32_t now_us)
 {
+    radio.channel = robot.settings.now.channel;
+    memcpy(radio.address, robot.settings.now.address, 5);
     chip_held = nrf24_configure(&radio, NRF24_ROBOT, &waking);
     if (!waking)
         nrf24_listen();
@@ -241,6 +259,8 @@ static void watch_radio(void)
     if (waking && since_us >= NRF24_WAKE_US) {
         waking = false;
         nrf24_listen();
+    } else if (settings_differ()) {
+        configure_radio(now_us);
     } else if (since_us >= RADIO_CHECK_US) {
         checked_us = now_us;
         chip_held = nrf24_holds(&radio, NRF24_ROBOT);
@@ -256,6 +276,9 @@ static bool hurries(void)
 {
     return robot.answer_waits || answer_size;
 }
+
+static uint8_t postponed;  // passes in a row without sensors, EEPROM and USB
+#define POSTPONED_LIMIT 6u
 
 // Return whether a pass of the main loop is due.
 static bool sleep_until_due(void)
@@ -308,10 +331,15 @@ int main(void)
         if (!due)
             continue;
         wdt_reset();
+        // An answer has windows of 0.2 ms to be loaded in: the rest waits, but not for ever if packets
+        // keep coming.
+        if (hurries() && ++postponed < POSTPONED_LIMIT)
+            continue;
+        postponed = 0;
         analog_work();
         memory_work();
         imu_work(stepping_time_us());
-        if (!hurries() && (serial_waits() || console.step != T3_KEY_RESTS))
+        if (!hurries() && (serial_waits() || t3_console_writes(&console)))
             serve_console();
     }
 }

@@ -10,6 +10,9 @@
 #define KEY_ASK_SIZE 2u
 #define KEY_SIZE (KEY_ASK_SIZE + T3_KEY_SIZE)
 #define KEY_IS_SIZE 8u
+#define SETTINGS_ASK_SIZE 2u
+#define SETTINGS_SIZE 10u
+#define SETTINGS_ARE_SIZE 12u
 #define RECORD_SIZE (T3_KEY_SIZE + T3_CRC_SIZE)
 
 static void reply(struct t3_console *console, const uint8_t *frame, uint8_t size)
@@ -39,6 +42,9 @@ static void take_ping(struct t3_console *console, const uint8_t *frame, uint8_t 
         .frame_errors = console->splitter.frame_errors,
         .overruns = console->overruns,
         .reset_cause = console->robot->reset_cause,
+        .settings = console->robot->settings.state,
+        .channel = console->robot->settings.now.channel,
+        .address = console->robot->settings.now.address,
     };
     uint8_t answer[T3_PONG_SIZE];
     reply(console, answer, t3_encode_pong(frame, &pong, answer));
@@ -76,7 +82,7 @@ static void take_key(struct t3_console *console, const uint8_t *frame, uint8_t s
         refuse(console, T3_ERR_MALFORMED, T3_KEY);
         return;
     }
-    if (console->step != T3_KEY_RESTS || !t3_robot_rests(console->robot)) {
+    if (t3_console_writes(console) || !t3_robot_rests(console->robot)) {
         tell_key(console, frame[1], T3_RC_BUSY);
         return;
     }
@@ -87,18 +93,49 @@ static void take_key(struct t3_console *console, const uint8_t *frame, uint8_t s
     console->step = T3_KEY_MARKED;
 }
 
-// Return whether the cells hold what was written; if they do not, let that be what was.
-static bool verify(const struct t3_console *console, uint8_t address, uint8_t size)
+static void tell_settings(struct t3_console *console, uint8_t id, uint8_t rc)
 {
-    const struct t3_port *board = console->robot->port;
-    uint8_t wanted[RECORD_SIZE], found[RECORD_SIZE];
-    board->eeprom_read(board->context, address, wanted, size);
-    console->port->eeprom_cells(console->port->context, address, found, size);
-    if (!memcmp(wanted, found, size))
-        return true;
-    // Else a cell that does not hold would be written over and over again.
-    board->eeprom_write(board->context, address, found, size);
-    return false;
+    const struct t3_settings *settings = &console->robot->settings;
+    uint8_t frame[SETTINGS_ARE_SIZE];
+    uint8_t *to = t3_put8(frame, T3_SETTINGS_ARE);
+    to = t3_put8(to, id);
+    to = t3_put8(to, rc);
+    to = t3_put8(to, settings->state);
+    to = t3_put8(to, settings->now.channel);
+    to = t3_put16(to, settings->now.microsteps);
+    memcpy(to, settings->now.address, sizeof settings->now.address);
+    reply(console, frame, sizeof frame);
+}
+
+static void take_settings(struct t3_console *console, const uint8_t *frame, uint8_t size)
+{
+    if (size == SETTINGS_ASK_SIZE) {
+        tell_settings(console, frame[1], T3_RC_OK);
+        return;
+    }
+    if (size != SETTINGS_SIZE) {
+        refuse(console, T3_ERR_MALFORMED, T3_SETTINGS);
+        return;
+    }
+    struct t3_setup setup = {.channel = frame[2], .microsteps = t3_get16(frame + 3)};
+    memcpy(setup.address, frame + 5, sizeof setup.address);
+    if (!t3_setup_valid(&setup)) {
+        tell_settings(console, frame[1], T3_RC_RANGE);
+        return;
+    }
+    if (t3_console_writes(console) || !t3_robot_rests(console->robot)) {
+        tell_settings(console, frame[1], T3_RC_BUSY);
+        return;
+    }
+    t3_session_end(&console->robot->session);
+    t3_settings_write(&console->robot->settings, console->robot->port, &setup);
+    console->id = frame[1];
+    console->sets = true;
+}
+
+bool t3_console_writes(const struct t3_console *console)
+{
+    return console->step != T3_KEY_RESTS || console->robot->settings.step != T3_SETTINGS_IDLE;
 }
 
 static void end_key(struct t3_console *console, uint8_t rc)
@@ -114,10 +151,20 @@ static void end_key(struct t3_console *console, uint8_t rc)
 void t3_console_tick(struct t3_console *console)
 {
     const struct t3_port *board = console->robot->port;
+    const enum t3_progress progress =
+        t3_settings_tick(&console->robot->settings, board, console->port);
+    if (progress != T3_PROGRESS_NONE && console->sets) {
+        console->sets = false;
+        if (progress == T3_PROGRESS_DONE)
+            t3_robot_use_settings(console->robot);
+        tell_settings(console, console->id,
+                      progress == T3_PROGRESS_DONE ? T3_RC_OK : T3_RC_FAILED);
+    }
     if (console->step == T3_KEY_RESTS || !console->port->eeprom_settled(console->port->context))
         return;
     const bool record = console->step == T3_KEY_WRITTEN;
-    if (!verify(console, record ? T3_STORE_KEY : T3_STORE_KEY_MARK, record ? RECORD_SIZE : 1)) {
+    if (!t3_store_verify(board, console->port, record ? T3_STORE_KEY : T3_STORE_KEY_MARK,
+                         record ? RECORD_SIZE : 1)) {
         end_key(console, T3_RC_FAILED);
         return;
     }
@@ -148,6 +195,9 @@ bool t3_console_byte(struct t3_console *console, uint8_t byte)
         break;
     case T3_KEY:
         take_key(console, frame, size);
+        break;
+    case T3_SETTINGS:
+        take_settings(console, frame, size);
         break;
     default:
         refuse(console, T3_ERR_UNKNOWN, frame[0]);

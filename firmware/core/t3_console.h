@@ -20,7 +20,8 @@ struct t3_console {
     struct t3_splitter splitter;
     uint16_t overruns;
     enum { T3_KEY_RESTS, T3_KEY_MARKED, T3_KEY_WRITTEN, T3_KEY_VERIFIED } step;
-    uint8_t id;  // of the frame whose key is being written
+    bool sets;   // settings from a frame are being written, not a repair
+    uint8_t id;  // of the frame whose key or settings are being written
     uint8_t key[T3_KEY_SIZE];
 };
 
@@ -34,7 +35,10 @@ bool t3_console_byte(struct t3_console *console, uint8_t byte);
 // Count a byte lost to an overrun.
 void t3_console_overrun(struct t3_console *console);
 
-// Call in each pass of the main loop: the EEPROM write of a key takes many passes.
+// Return whether a key or settings are being written.
+bool t3_console_writes(const struct t3_console *console);
+
+// Call in each pass of the main loop: an EEPROM write takes many passes.
 void t3_console_tick(struct t3_console *console);
 
 #endif

@@ -161,6 +161,8 @@ static void take_ping(struct t3_dongle *dongle, const uint8_t *frame, uint8_t si
         .frame_errors = dongle->splitter.frame_errors,
         .overruns = dongle->overruns,
         .reset_cause = dongle->reset_cause,
+        .channel = dongle->radio.channel,
+        .address = dongle->radio.address,
     };
     uint8_t answer[T3_PONG_SIZE];
     reply(dongle, answer, t3_encode_pong(frame, &pong, answer));

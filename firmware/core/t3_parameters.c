@@ -4,6 +4,7 @@
 
 #include <stddef.h>
 
+#include "t3_port.h"
 #include "t3_protocol.h"
 
 // Silence at full speed brings the wheels to rest after TTL + speed / deceleration: with these and
@@ -14,12 +15,13 @@ static const struct t3_bounds BOUNDS[T3_PARAMETERS] = {
     [T3_ACCELERATION] = {30000, 100, 100000, false, false},
     [T3_DECELERATION] = {60000, 100, 200000, false, false},
     [T3_TTL_MAX] = {250, 20, 500, false, false},
-    [T3_MICROSTEPS] = {16, 1, 256, false, true},
+    [T3_MICROSTEPS] = {T3_DEFAULT_MICROSTEPS, 1, 256, true, false},
     [T3_STEPS_PER_REV] = {200, 200, 200, true, false},
     [T3_GYRO_RANGE] = {500, 500, 500, true, false},
     [T3_BATTERY_LOW] = {10200, 0, 30000, false, false},
     [T3_IDLE_OFF] = {0, 0, 600000, false, false},
     [T3_INVERT_WHEELS] = {0, 0, 3, false, true},
+    [T3_BATTERY_CUTOFF] = {9000, 0, 30000, false, false},
 };
 
 const struct t3_bounds *t3_parameter_bounds(uint8_t id)

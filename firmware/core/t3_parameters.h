@@ -13,12 +13,13 @@ enum t3_parameter {
     T3_ACCELERATION,   // mrad/s^2
     T3_DECELERATION,   // mrad/s^2
     T3_TTL_MAX,        // ms
-    T3_MICROSTEPS,     // per full step; stored, effective from the next boot
+    T3_MICROSTEPS,     // per full step; of the settings
     T3_STEPS_PER_REV,  // full steps
     T3_GYRO_RANGE,     // deg/s
     T3_BATTERY_LOW,    // mV
     T3_IDLE_OFF,       // ms at rest until the drivers switch off; 0: never
     T3_INVERT_WHEELS,  // bit 0 left, bit 1 right
+    T3_BATTERY_CUTOFF,  // mV below which the robot does not drive; 0: none
     T3_PARAMETERS
 };
 

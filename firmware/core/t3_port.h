@@ -69,19 +69,23 @@ struct t3_radio_settings {
     uint8_t address[5];  // lowest first
 };
 
-// Channel and rate are build options (make avr RADIO_CHANNEL=100 RADIO_RATE=0); those of a robot are
-// constant.
+// The rate is a build option of both boards (make avr RADIO_RATE=0). RADIO_CHANNEL is that of a dongle
+// before CFG, and of a robot without settings (t3_settings.h).
 #ifndef T3_RADIO_CHANNEL
 #define T3_RADIO_CHANNEL 82
 #endif
 #ifndef T3_RADIO_RATE
 #define T3_RADIO_RATE 1
 #endif
+#if T3_RADIO_CHANNEL < 0 || T3_RADIO_CHANNEL > 125 || T3_RADIO_RATE < 0 || T3_RADIO_RATE > 2
+#error "RADIO_CHANNEL is 0 to 125, RADIO_RATE 0 (250 kbit/s), 1 or 2 (Mbit/s)"
+#endif
 // A shorter delay cuts off acknowledgements of 32 bytes at 250 kbit/s (data sheet 7.4.2).
 #define T3_RETRY_DELAY (T3_RADIO_RATE == 0 ? 5 : 1)
-// Defaults of both ends; CFG may change those of the dongle.
+// Defaults of both ends: CFG changes those of the dongle, settings those of the robot.
 #define T3_RADIO_DEFAULTS                                                                         \
     {T3_RADIO_CHANNEL, T3_RADIO_RATE, 3, T3_RETRY_DELAY, 4, {'T', '3', 'M', 'P', 'C'}}
+#define T3_DEFAULT_MICROSTEPS 16u
 
 // Hardware of the dongle. The radio ends each `send` with one call of t3_dongle_exchange.
 struct t3_dongle_port {

@@ -140,6 +140,14 @@ uint8_t t3_encode_param(const struct t3_param *param, uint8_t *to)
     return T3_PARAM_SIZE;
 }
 
+static uint8_t *put_radio(uint8_t *to, uint8_t channel, const uint8_t *address)
+{
+    to = t3_put8(to, channel);
+    for (uint8_t i = 0; i < 5; i++)
+        to = t3_put8(to, address[i]);
+    return to;
+}
+
 uint8_t t3_encode_info(const struct t3_info *info, uint8_t *to)
 {
     to = put_header(to, T3_INFO, info->session, info->seq);
@@ -150,8 +158,10 @@ uint8_t t3_encode_info(const struct t3_info *info, uint8_t *to)
     to = t3_put8(to, info->parameters);
     to = t3_put16(to, info->steps_per_rev);
     to = t3_put16(to, info->microsteps);
-    to = t3_put32(to, info->time_us);
     to = t3_put8(to, info->status);
+    to = t3_put8(to, info->settings);
+    to = put_radio(to, info->channel, info->address);
+    to = t3_put32(to, info->build);
     if (!info->nonce)
         return T3_INFO_SIZE;
     for (uint8_t i = 0; i < T3_NONCE_SIZE; i++)
@@ -201,7 +211,10 @@ uint8_t t3_encode_pong(const uint8_t *ping, const struct t3_pong *pong, uint8_t 
     to = t3_put16(to, pong->crc_errors);
     to = t3_put16(to, pong->frame_errors);
     to = t3_put16(to, pong->overruns);
-    t3_put8(to, pong->reset_cause);
+    to = t3_put8(to, pong->reset_cause);
+    to = t3_put8(to, pong->settings);
+    to = put_radio(to, pong->channel, pong->address);
+    t3_put32(to, T3_BUILD);
     return T3_PONG_SIZE;
 }
 

@@ -10,7 +10,11 @@
 
 #define T3_VERSION 1u
 #define T3_FIRMWARE_MAJOR 1u
-#define T3_FIRMWARE_MINOR 0u
+#define T3_FIRMWARE_MINOR 1u
+// Set by the Makefile: a digest of the sources and of the build settings.
+#ifndef T3_BUILD
+#define T3_BUILD 0
+#endif
 
 #define T3_RADIO_LIMIT 32u  // bytes: maximum of the chip; a larger width is an attack
 #define T3_FRAME_LIMIT 78u  // bytes of a serial frame without CRC: a TX with two payloads has 68
@@ -29,7 +33,7 @@ enum { T3_STATE = 1, T3_PARAM, T3_INFO, T3_ACK, T3_AUX };
 #define T3_CMD_SIZE 14u
 #define T3_STATE_SIZE 32u
 #define T3_PARAM_SIZE 17u
-#define T3_INFO_SIZE 17u  // plus a nonce from a keyed robot
+#define T3_INFO_SIZE 24u  // plus a nonce from a keyed robot
 #define T3_ACK_SIZE 5u
 #define T3_AUX_SIZE 32u
 
@@ -98,8 +102,11 @@ struct t3_param {
 struct t3_info {
     uint8_t session, seq, protocol, major, minor, reset_cause, parameters;
     uint16_t steps_per_rev, microsteps;
-    uint32_t time_us;
     uint8_t status;
+    uint8_t settings;  // state of the record
+    uint8_t channel;
+    const uint8_t *address;  // 5 bytes
+    uint32_t build;
     const uint8_t *nonce;  // NULL from a robot without a key
 };
 
@@ -125,15 +132,22 @@ uint8_t t3_encode_aux(const struct t3_aux *aux, uint8_t *to);
 
 // -- serial line: COBS( frame | CRC-16 ), then a zero byte ---------------------------------------
 
-// Frames from the host: TX and CFG to a dongle only, KEY to a robot only.
-enum { T3_TX = 0x01, T3_CFG = 0x02, T3_PING = 0x03, T3_KEY = 0x04 };
+// Frames from the host: TX and CFG to a dongle only, KEY and SETTINGS to a robot only.
+enum { T3_TX = 0x01, T3_CFG = 0x02, T3_PING = 0x03, T3_KEY = 0x04, T3_SETTINGS = 0x05 };
 // Frames to the host.
-enum { T3_RESULT = 0x81, T3_CFG_IS = 0x82, T3_PONG = 0x83, T3_KEY_IS = 0x84, T3_ERR = 0x8F };
+enum {
+    T3_RESULT = 0x81,
+    T3_CFG_IS = 0x82,
+    T3_PONG = 0x83,
+    T3_KEY_IS = 0x84,
+    T3_SETTINGS_ARE = 0x85,
+    T3_ERR = 0x8F
+};
 // Codes of ERR, whose argument is the first byte of the frame, or for BUSY its id.
 enum { T3_ERR_UNKNOWN = 1, T3_ERR_MALFORMED, T3_ERR_BUSY };
 
 #define T3_PING_SIZE 6u
-#define T3_PONG_SIZE 21u
+#define T3_PONG_SIZE 32u
 
 // Status of a board in PONG, after the id and echo of the PING.
 struct t3_pong {
@@ -141,6 +155,9 @@ struct t3_pong {
     bool chip_ok;
     uint16_t crc_errors, frame_errors, overruns;
     uint8_t reset_cause;
+    uint8_t settings;  // state of the robot's record; 0 from a dongle
+    uint8_t channel;
+    const uint8_t *address;  // 5 bytes
 };
 
 // Write the reply to a PING of T3_PING_SIZE bytes; return its size.

@@ -4,19 +4,6 @@
 
 #include <string.h>
 
-#include "t3_bytes.h"
-#include "t3_store.h"
-
-static void store_microsteps(const struct t3_robot *robot)
-{
-    uint8_t wanted[2], stored[2];
-    t3_put16(wanted, (uint16_t)robot->parameters.values[T3_MICROSTEPS]);
-    // Written only if it changes: the host repeats its settings at each connection.
-    if (t3_store_read(robot->port, T3_STORE_MICROSTEPS, stored, sizeof stored) !=
-            T3_RECORD_GOOD ||
-        t3_get16(stored) != t3_get16(wanted))
-        t3_store_write(robot->port, T3_STORE_MICROSTEPS, wanted, sizeof wanted);
-}
 
 static void set_inverted(struct t3_robot *robot)
 {
@@ -36,8 +23,6 @@ static void set_parameter(struct t3_robot *robot, const struct t3_packet *packet
     const uint8_t id = packet->what;
     const uint8_t rc =
         t3_parameter_set(&robot->parameters, id, packet->value, t3_ramp_busy(&robot->ramp));
-    if (rc == T3_RC_OK && id == T3_MICROSTEPS)
-        store_microsteps(robot);
     if (rc == T3_RC_OK && id == T3_INVERT_WHEELS)
         set_inverted(robot);
     t3_answer_with(robot, T3_PARAM, packet->seq, id, rc);

@@ -7,10 +7,10 @@
 #include "t3_bytes.h"
 #include "t3_requests.h"
 #include "t3_sensors.h"
-#include "t3_store.h"
 #include "t3_telemetry.h"
 
 #define TTL_UNIT_US UINT32_C(10000)
+#define BATTERY_WEIGHT 8u
 
 void t3_answer_with(struct t3_robot *robot, uint8_t kind, uint8_t seq, uint8_t id, uint8_t rc)
 {
@@ -47,8 +47,14 @@ static bool button(const struct t3_robot *robot)
 static void take_hello(struct t3_robot *robot, const struct t3_packet *packet,
                        const uint8_t *data, uint32_t received_us)
 {
-    // Even after a rejection, INFO reports the current session and whether a key is stored.
+    // Even after a rejection, INFO reports the current session, the state of the settings, and
+    // whether a key is stored.
     t3_answer_with(robot, T3_INFO, packet->seq, 0, 0);
+    if (!t3_settings_usable(&robot->settings)) {
+        // Its address is that of every such board, and its microsteps are unknown.
+        robot->counters.bad_session++;
+        return;
+    }
     switch (t3_session_greet(&robot->session, robot->port, packet, data)) {
     case T3_GREETING_REFUSED:
         robot->counters.bad_session++;
@@ -71,7 +77,7 @@ static void take_hello(struct t3_robot *robot, const struct t3_packet *packet,
 static bool clears_estop(const struct t3_robot *robot, const struct t3_packet *packet)
 {
     return packet->what == T3_FLAG_ESTOP_CLEAR && !packet->left && !packet->right &&
-           !button(robot);
+           !robot->pressed && !button(robot);
 }
 
 static void follow(struct t3_robot *robot, const struct t3_packet *packet, uint32_t received_us,
@@ -80,7 +86,7 @@ static void follow(struct t3_robot *robot, const struct t3_packet *packet, uint3
     robot->expired = robot->limited = false;
     if (clears_estop(robot, packet))
         robot->estop = false;
-    if (robot->estop || !(packet->what & T3_FLAG_ENABLE)) {
+    if (robot->estop || robot->flat || !(packet->what & T3_FLAG_ENABLE)) {
         disable(robot);
         return;
     }
@@ -213,6 +219,49 @@ static void watch_ttl(struct t3_robot *robot, uint32_t now_us)
     t3_ramp_halt(&robot->ramp);
 }
 
+static void watch_button(struct t3_robot *robot, uint32_t now_us)
+{
+    const bool input = button(robot);
+    if (input == robot->pressed)
+        robot->button_us = now_us;
+    else if (now_us - robot->button_us >= (input ? T3_PRESS_US : T3_RELEASE_US))
+        robot->pressed = input;
+    if (robot->pressed)
+        latch_estop(robot);
+}
+
+uint16_t t3_robot_battery(const struct t3_robot *robot)
+{
+    return (uint16_t)(robot->battery_sum / BATTERY_WEIGHT);
+}
+
+static void measure_battery(struct t3_robot *robot)
+{
+    const uint32_t supply = t3_battery_mv(robot->port->adc(robot->port->context, T3_ADC_BATTERY));
+    if (!supply || !robot->battery_sum)
+        robot->battery_sum = BATTERY_WEIGHT * supply;
+    else
+        robot->battery_sum += supply - robot->battery_sum / BATTERY_WEIGHT;
+    const int32_t filtered = t3_robot_battery(robot);
+    const int32_t cutoff = parameter(robot, T3_BATTERY_CUTOFF);
+    const int32_t low = parameter(robot, T3_BATTERY_LOW);
+    // The voltage rises as soon as the motors rest: below the warning, the robot stays off.
+    if (!filtered || (filtered >= cutoff && filtered >= low))
+        robot->flat = false;
+    else if (filtered < cutoff)
+        robot->flat = true;
+}
+
+static void watch_battery(struct t3_robot *robot, uint32_t now_us)
+{
+    if (now_us - robot->battery_us < T3_BATTERY_PERIOD_US)
+        return;
+    robot->battery_us = now_us;
+    measure_battery(robot);
+    if (robot->flat)
+        disable(robot);
+}
+
 static void watch_clock(struct t3_robot *robot, uint32_t now_us)
 {
     // An age beyond its field is none, also when the clock has come round.
@@ -306,13 +355,29 @@ static void load(struct t3_robot *robot, uint32_t now_us)
 void t3_robot_tick(struct t3_robot *robot)
 {
     const uint32_t now_us = robot->port->time_us(robot->port->context);
-    if (button(robot))
-        latch_estop(robot);
+    watch_button(robot, now_us);
+    watch_battery(robot, now_us);
     watch_ttl(robot, now_us);
     watch_clock(robot, now_us);
     power(robot, now_us);  // before the ramp: no step reaches a driver without power
+    load(robot, now_us);  // the POLL comes soon; the ramp can wait for as long as this takes
     keep_period(robot, now_us);
-    load(robot, now_us);
+}
+
+static void scale_steps(struct t3_robot *robot)
+{
+    robot->microsteps = robot->settings.now.microsteps;
+    robot->parameters.values[T3_MICROSTEPS] = robot->microsteps;
+    const uint32_t steps_per_rev = (uint32_t)parameter(robot, T3_STEPS_PER_REV);
+    t3_steps_scale(&robot->steps, steps_per_rev * robot->microsteps);
+    robot->top_speed = (int32_t)(robot->steps.top_speed / 1000u);
+}
+
+void t3_robot_use_settings(struct t3_robot *robot)
+{
+    robot->port->lock(robot->port->context);
+    scale_steps(robot);
+    robot->port->unlock(robot->port->context);
 }
 
 void t3_robot_boot(struct t3_robot *robot, const struct t3_port *port, uint8_t reset_cause,
@@ -324,14 +389,11 @@ void t3_robot_boot(struct t3_robot *robot, const struct t3_port *port, uint8_t r
     robot->reset_cause = reset_cause;
     robot->settle_us = settle_us;
     robot->period_us = robot->loaded_us = port->time_us(port->context);
+    robot->button_us = robot->battery_us = robot->loaded_us;
     t3_parameters_start(&robot->parameters);
-    uint8_t stored[2];
-    if (t3_store_read(port, T3_STORE_MICROSTEPS, stored, sizeof stored) == T3_RECORD_GOOD)
-        t3_parameter_set(&robot->parameters, T3_MICROSTEPS, t3_get16(stored), false);
-    robot->microsteps = (uint16_t)parameter(robot, T3_MICROSTEPS);
-    const uint32_t steps_per_rev = (uint32_t)parameter(robot, T3_STEPS_PER_REV);
-    t3_steps_start(&robot->steps, steps_per_rev * robot->microsteps);
-    robot->top_speed = (int32_t)(robot->steps.top_speed / 1000u);
+    measure_battery(robot);
+    t3_settings_boot(&robot->settings, port);
+    scale_steps(robot);  // the step interrupt does not run yet
     t3_session_boot(&robot->session, port);
     // The first packet fetches a state too.
     t3_answer_with(robot, T3_STATE, 0, 0, 0);

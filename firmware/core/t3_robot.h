@@ -15,6 +15,7 @@
 #include "t3_protocol.h"
 #include "t3_ramp.h"
 #include "t3_session.h"
+#include "t3_settings.h"
 #include "t3_steps.h"
 
 // `settle_us` of a port whose load_ack writes to the radio at once: a reply is loaded after the
@@ -28,6 +29,11 @@
 #define T3_PERIOD_US UINT32_C(1000)
 // Least deceleration of an emergency stop, mrad/s^2, whatever the parameter: no host can weaken it.
 #define T3_ESTOP_DECELERATION INT32_C(60000)
+// The button counts as pressed, or as released, after this time without a bounce or a spike.
+#define T3_PRESS_US UINT32_C(5000)
+#define T3_RELEASE_US UINT32_C(50000)
+// Period of the battery measurement, whose low pass has a time constant of 8 periods.
+#define T3_BATTERY_PERIOD_US UINT32_C(100000)
 // Silence that ends a session: after a longer one, 32-bit clocks are ambiguous.
 #define T3_SESSION_SILENCE_US UINT32_C(1800000000)
 
@@ -41,6 +47,7 @@ struct t3_robot {
     struct t3_steps steps;  // shared with the step interrupt: see t3_steps.h
     struct t3_ramp ramp;
     struct t3_session session;
+    struct t3_settings settings;
     struct t3_stale_filter stale_filter;
     struct t3_parameters parameters;
     struct t3_counters counters;
@@ -52,6 +59,11 @@ struct t3_robot {
     bool limited;   // the last command was scaled down
     bool powered;   // drivers are on
     bool imu_fault;
+    bool pressed;         // the button, debounced
+    uint32_t button_us;   // last time at which its input agreed with `pressed`
+    uint32_t battery_us;  // last measurement of the battery
+    uint32_t battery_sum;  // 8 times its filtered voltage, mV; 0: not measured
+    bool flat;             // below the cut-off, and not yet charged
     bool resting, idle;  // wheels at rest; idle time exceeded
     uint32_t rest_us;    // start of the rest
 
@@ -88,6 +100,12 @@ void t3_robot_packet(struct t3_robot *robot, const uint8_t *data, uint8_t size,
 
 // Call in each pass of the main loop, at least every 2 ms.
 void t3_robot_tick(struct t3_robot *robot);
+
+// Return the filtered voltage of the battery, mV; 0 if it is not measured.
+uint16_t t3_robot_battery(const struct t3_robot *robot);
+
+// Apply settings that were written at rest: microsteps; counters continue.
+void t3_robot_use_settings(struct t3_robot *robot);
 
 // Return whether the robot is disabled and stopped, and its drivers are off.
 bool t3_robot_rests(const struct t3_robot *robot);

@@ -11,6 +11,20 @@
 #define EPOCH_SIZE 4u
 #define NO_MARK 0xFFu
 
+// Uses of the long-term key. The byte precedes what is hashed: no output of one use is ever valid, or
+// known, in another.
+enum { USE_HELLO = 1, USE_SESSION_KEY, USE_NONCE, USE_CHECK };
+#define USE_LIMIT (2u * T3_NONCE_SIZE + 1u)
+
+static void hash(const struct t3_session *session, uint8_t use, const uint8_t *data, uint8_t size,
+                 uint8_t out[T3_TAG_SIZE])
+{
+    uint8_t text[1u + USE_LIMIT];
+    text[0] = use;
+    memcpy(text + 1, data, size);
+    t3_siphash(session->key, text, (uint8_t)(size + 1u), out);
+}
+
 static void count_boot(struct t3_session *session, const struct t3_port *port)
 {
     uint8_t bytes[4];
@@ -48,10 +62,10 @@ void t3_session_boot(struct t3_session *session, const struct t3_port *port)
     case T3_RECORD_GOOD:
         break;
     }
-    uint8_t hash[T3_TAG_SIZE];
+    uint8_t digest[T3_TAG_SIZE];
     static const uint8_t NAME[] = {'t', '3', 'm', 'p', 'c'};
-    t3_siphash(session->key, NAME, sizeof NAME, hash);
-    session->check = t3_get32(hash);
+    hash(session, USE_CHECK, NAME, sizeof NAME, digest);
+    session->check = t3_get32(digest);
     session->keyed = true;
     count_boot(session, port);
 }
@@ -77,7 +91,7 @@ static void draw_nonce(struct t3_session *session, const struct t3_port *port)
     to = t3_put32(to, ++session->greetings);
     to = t3_put32(to, port->time_us(port->context));
     t3_put32(to, port->noise(port->context));
-    t3_siphash(session->key, seed, sizeof seed, session->robot_nonce);
+    hash(session, USE_NONCE, seed, sizeof seed, session->robot_nonce);
 }
 
 void t3_session_derive_key(struct t3_session *session)
@@ -87,7 +101,7 @@ void t3_session_derive_key(struct t3_session *session)
     memcpy(text + T3_NONCE_SIZE, session->robot_nonce, T3_NONCE_SIZE);
     for (uint8_t half = 0; half < 2; half++) {
         text[2 * T3_NONCE_SIZE] = half;
-        t3_siphash(session->key, text, sizeof text, session->session_key + 8 * half);
+        hash(session, USE_SESSION_KEY, text, sizeof text, session->session_key + 8 * half);
     }
 }
 
@@ -99,7 +113,7 @@ enum t3_greeting t3_session_greet(struct t3_session *session, const struct t3_po
         return T3_GREETING_REFUSED;
     if (session->keyed) {
         uint8_t tag[T3_TAG_SIZE];
-        t3_siphash(session->key, data, HELLO_SIGNED_SIZE, tag);
+        hash(session, USE_HELLO, data, HELLO_SIGNED_SIZE, tag);
         if (!same(tag, packet->tag, T3_TAG_SIZE))
             return T3_GREETING_REFUSED;
         if (session->id && same(session->host_nonce, packet->nonce, T3_NONCE_SIZE))

@@ -13,6 +13,12 @@
 void t3_steps_start(struct t3_steps *steps, uint32_t microsteps_per_rev)
 {
     memset(steps, 0, sizeof *steps);
+    t3_steps_scale(steps, microsteps_per_rev);
+}
+
+void t3_steps_scale(struct t3_steps *steps, uint32_t microsteps_per_rev)
+{
+    steps->gain_shift = 0;
     steps->top_speed = (uint32_t)(TOP_SPEED_OF_ONE / microsteps_per_rev);
     // As many bits as fit, so that a product of 32 bits each is enough later.
     uint64_t gain = (uint64_t)microsteps_per_rev * GAIN_PER_MICROSTEP;

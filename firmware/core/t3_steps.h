@@ -41,6 +41,9 @@ struct t3_steps {
 // Reset to zero at rest, for a number of microsteps per revolution of the wheel.
 void t3_steps_start(struct t3_steps *steps, uint32_t microsteps_per_rev);
 
+// Change the microsteps per revolution at rest; counters and time continue.
+void t3_steps_scale(struct t3_steps *steps, uint32_t microsteps_per_rev);
+
 // Return the increment of a speed in urad/s, limited by the step rate.
 int32_t t3_steps_increment(const struct t3_steps *steps, int32_t speed);
 

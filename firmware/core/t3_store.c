@@ -44,3 +44,15 @@ void t3_store_erase(const struct t3_port *port, uint8_t address, uint8_t size)
     memset(record, 0xFF, sizeof record);
     port->eeprom_write(port->context, address, record, (uint8_t)(size + T3_CRC_SIZE));
 }
+
+bool t3_store_verify(const struct t3_port *port, const struct t3_console_port *console,
+                     uint8_t address, uint8_t size)
+{
+    uint8_t wanted[ROOM], found[ROOM];
+    port->eeprom_read(port->context, address, wanted, size);
+    console->eeprom_cells(console->context, address, found, size);
+    if (!memcmp(wanted, found, size))
+        return true;
+    port->eeprom_write(port->context, address, found, size);
+    return false;
+}

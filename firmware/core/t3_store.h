@@ -7,12 +7,14 @@
 
 #include "t3_port.h"
 
-#define T3_STORE_MICROSTEPS 0u  // u16
 #define T3_STORE_KEY 8u         // 16 bytes
 #define T3_STORE_KEY_MARK 26u   // a byte: 0xFF, or another value during the write of a key
                                 // until it is verified
 #define T3_STORE_BOOTS 32u      // u32
-#define T3_STORE_END 40u
+#define T3_STORE_SETTINGS 40u       // see t3_settings.h
+#define T3_STORE_SETTINGS_COPY 56u  // the same
+#define T3_STORE_SETTINGS_SIZE 11u  // with its CRC
+#define T3_STORE_END 72u
 #define T3_STORE_RECORD_LIMIT 16u
 
 enum t3_record { T3_RECORD_BLANK, T3_RECORD_DAMAGED, T3_RECORD_GOOD };
@@ -21,6 +23,10 @@ enum t3_record t3_store_read(const struct t3_port *port, uint8_t address, uint8_
                              uint8_t size);
 void t3_store_write(const struct t3_port *port, uint8_t address, const uint8_t *data,
                     uint8_t size);
+// Return whether the cells of an area hold what was written; if they do not, their content is from now
+// on what was written: else a cell that is worn out would be written over and over again.
+bool t3_store_verify(const struct t3_port *port, const struct t3_console_port *console,
+                     uint8_t address, uint8_t size);
 // Erase a record.
 void t3_store_erase(const struct t3_port *port, uint8_t address, uint8_t size);
 

@@ -9,14 +9,9 @@
 
 #define AGE_UNIT_US 10u
 
-static uint16_t battery(const struct t3_robot *robot)
-{
-    return t3_battery_mv(robot->port->adc(robot->port->context, T3_ADC_BATTERY));
-}
-
 uint8_t t3_robot_status(const struct t3_robot *robot)
 {
-    const uint16_t supply = battery(robot);
+    const uint16_t supply = t3_robot_battery(robot);
     uint8_t status = 0;
     if (robot->enabled)
         status |= T3_STATUS_ENABLED;
@@ -89,7 +84,7 @@ static uint8_t tell_aux(struct t3_robot *robot, uint32_t now_us, uint8_t *to)
         .session = robot->session.id,
         .seq = robot->answer.seq,
         .status = t3_robot_status(robot),
-        .battery = battery(robot),
+        .battery = t3_robot_battery(robot),
         .temperature = imu.temperature,
         .accel_z = imu.accel_z,
         .gyro_x = imu.gyro_x,
@@ -100,7 +95,7 @@ static uint8_t tell_aux(struct t3_robot *robot, uint32_t now_us, uint8_t *to)
     return t3_encode_aux(&aux, to);
 }
 
-static uint8_t tell_info(const struct t3_robot *robot, uint32_t now_us, uint8_t *to)
+static uint8_t tell_info(const struct t3_robot *robot, uint8_t *to)
 {
     const struct t3_info info = {
         .session = robot->session.id,
@@ -112,8 +107,11 @@ static uint8_t tell_info(const struct t3_robot *robot, uint32_t now_us, uint8_t 
         .parameters = T3_PARAMETERS,
         .steps_per_rev = (uint16_t)robot->parameters.values[T3_STEPS_PER_REV],
         .microsteps = robot->microsteps,
-        .time_us = now_us,
         .status = t3_robot_status(robot),
+        .settings = robot->settings.state,
+        .channel = robot->settings.now.channel,
+        .address = robot->settings.now.address,
+        .build = T3_BUILD,
         .nonce = robot->session.keyed ? robot->session.robot_nonce : NULL,
     };
     return t3_encode_info(&info, to);
@@ -144,7 +142,7 @@ uint8_t t3_telemetry(struct t3_robot *robot, uint32_t now_us, uint8_t *to)
     case T3_AUX:
         return tell_aux(robot, now_us, to);
     case T3_INFO:
-        return tell_info(robot, now_us, to);
+        return tell_info(robot, to);
     case T3_PARAM:
         return tell_param(robot, to);
     case T3_ACK:

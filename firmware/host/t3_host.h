@@ -12,10 +12,16 @@
 
 struct t3_host_robot;
 
-struct t3_host_robot *t3_host_robot_new(void);  // EEPROM blank, not booted
+// Not booted; its EEPROM holds the default settings and no key.
+struct t3_host_robot *t3_host_robot_new(void);
 void t3_host_robot_free(struct t3_host_robot *host);
 // Key (16 bytes; NULL: none) as if written over USB; holds from the next boot on.
 void t3_host_robot_store_key(struct t3_host_robot *host, const uint8_t *key);
+// Settings as if written over USB; they hold from the next boot on.
+void t3_host_robot_store_settings(struct t3_host_robot *host, uint8_t channel,
+                                  uint16_t microsteps, const uint8_t *address);
+// Erase the whole EEPROM, as in a new chip.
+void t3_host_robot_erase(struct t3_host_robot *host);
 // Reset: EEPROM and the pulses counted outside stay, the clock of the board starts at `time_us`.
 void t3_host_robot_boot(struct t3_host_robot *host, uint8_t reset_cause, uint32_t time_us);
 // A payload comes out of the radio now.
@@ -50,6 +56,8 @@ void t3_host_robot_wear(struct t3_host_robot *host, uint8_t address, bool worn);
 // USB console: feed bytes; take its output (at most `room`).
 void t3_host_robot_usb(struct t3_host_robot *host, const uint8_t *data, uint32_t size);
 uint32_t t3_host_robot_usb_take(struct t3_host_robot *host, uint8_t *to, uint32_t room);
+// Whether a key or settings of a frame are being written, during which nothing moves.
+bool t3_host_robot_changing(const struct t3_host_robot *host);
 bool t3_host_robot_writing(const struct t3_host_robot *host);  // a key, that came over USB
 void t3_host_robot_usb_overrun(struct t3_host_robot *host);
 void t3_host_robot_set_chip(struct t3_host_robot *host, bool ok);

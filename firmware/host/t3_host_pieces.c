@@ -69,13 +69,15 @@ static uint8_t encode_param(const int64_t *f, uint8_t *to)
 
 static uint8_t encode_info(const int64_t *f, bool with_nonce, uint8_t *to)
 {
-    uint8_t nonce[T3_NONCE_SIZE];
+    uint8_t nonce[T3_NONCE_SIZE], address[5];
+    for (unsigned i = 0; i < sizeof address; i++)
+        address[i] = (uint8_t)f[12 + i];
     for (unsigned i = 0; with_nonce && i < T3_NONCE_SIZE; i++)
-        nonce[i] = (uint8_t)f[11 + i];
+        nonce[i] = (uint8_t)f[18 + i];
     const struct t3_info info = {
         (uint8_t)f[0],  (uint8_t)f[1],  (uint8_t)f[2],  (uint8_t)f[3],  (uint8_t)f[4],
-        (uint8_t)f[5],  (uint8_t)f[6],  (uint16_t)f[7], (uint16_t)f[8], (uint32_t)f[9],
-        (uint8_t)f[10], with_nonce ? nonce : NULL,
+        (uint8_t)f[5],  (uint8_t)f[6],  (uint16_t)f[7], (uint16_t)f[8], (uint8_t)f[9],
+        (uint8_t)f[10], (uint8_t)f[11], address,        (uint32_t)f[17], with_nonce ? nonce : NULL,
     };
     return t3_encode_info(&info, to);
 }

@@ -187,6 +187,8 @@ struct t3_host_robot *t3_host_robot_new(void)
         host->adc[i] = T3_ADC_NOT_MEASURED;
     host->imu_answers = true;
     host->closest = NEVER;
+    const struct t3_radio_settings radio = T3_RADIO_DEFAULTS;
+    t3_host_robot_store_settings(host, radio.channel, T3_DEFAULT_MICROSTEPS, radio.address);
     return host;
 }
 
@@ -199,6 +201,28 @@ void t3_host_robot_store_key(struct t3_host_robot *host, const uint8_t *key)
 {
     t3_session_store_key(&host->port, key);
     memcpy(host->cells, host->eeprom, sizeof host->cells);
+}
+
+void t3_host_robot_store_settings(struct t3_host_robot *host, uint8_t channel,
+                                  uint16_t microsteps, const uint8_t *address)
+{
+    struct t3_settings settings;
+    struct t3_setup setup = {.channel = channel, .microsteps = microsteps};
+    const uint32_t cell_us = host->cell_us;
+    memcpy(setup.address, address, sizeof setup.address);
+    host->cell_us = 0;  // at once
+    t3_settings_boot(&settings, &host->port);
+    t3_settings_write(&settings, &host->port, &setup);
+    while (t3_settings_tick(&settings, &host->port, &host->usb) == T3_PROGRESS_NONE)
+        ;
+    host->cell_us = cell_us;
+    host->eeprom_writes = 0;
+}
+
+void t3_host_robot_erase(struct t3_host_robot *host)
+{
+    memset(host->eeprom, 0xFF, sizeof host->eeprom);
+    memset(host->cells, 0xFF, sizeof host->cells);
 }
 
 void t3_host_robot_boot(struct t3_host_robot *host, uint8_t reset_cause, uint32_t start_us)
@@ -295,6 +319,8 @@ void t3_host_robot_poke_time(struct t3_host_robot *host, uint32_t to_us)
     robot->heard_us += by;
     robot->answer_from_us += by;
     robot->loaded_us += by;
+    robot->button_us += by;
+    robot->battery_us += by;
     robot->stale_filter.window_start += by;
     robot->stale_filter.previous_start += by;
     robot->stale_filter.minimum += by;
@@ -404,9 +430,14 @@ uint32_t t3_host_robot_usb_take(struct t3_host_robot *host, uint8_t *to, uint32_
     return size;
 }
 
+bool t3_host_robot_changing(const struct t3_host_robot *host)
+{
+    return host->console.step != T3_KEY_RESTS || host->console.sets;
+}
+
 bool t3_host_robot_writing(const struct t3_host_robot *host)
 {
-    return host->console.step != T3_KEY_RESTS;
+    return t3_console_writes(&host->console);
 }
 
 void t3_host_robot_usb_overrun(struct t3_host_robot *host)

@@ -18,12 +18,12 @@
 #define CELL_US 3400u
 
 static uint8_t wanted[T3_KEY_SIZE];  // by the last KEY frame that was sent undamaged
-static uint8_t written, refused, damaged_starts;
+static uint8_t written, refused, damaged_starts, set;
 
 static uint32_t check_of(const uint8_t *key)
 {
     uint8_t hash[8];
-    t3_siphash(key, (const uint8_t *)"t3mpc", 5, hash);
+    t3_siphash(key, (const uint8_t *)"\4t3mpc", 6, hash);  // 4: the use as a check value
     return t3_get32(hash);
 }
 
@@ -48,6 +48,11 @@ static uint8_t make_frame(uint8_t *frame)
     case 4:
         frame[0] = T3_KEY;
         return size;
+    case 5:
+        frame[0] = T3_SETTINGS;
+        frame[2] &= 0x7F;
+        t3_put16(frame + 3, (uint16_t)(1u << fuzz_below(10)));
+        return fuzz_below(4) ? 10 : size;
     default:
         return size;
     }
@@ -97,6 +102,10 @@ static void read_console(struct t3_host_robot *robot, struct t3_splitter *splitt
         if (!got)
             continue;
         CHECK(frame[0] & 0x80);
+        if (frame[0] == T3_SETTINGS_ARE) {
+            CHECK(got == 12 && frame[3] <= T3_SETTINGS_DAMAGED && frame[4] <= 125);
+            set = (uint8_t)(set | (frame[2] == T3_RC_OK));
+        }
         if (frame[0] != T3_KEY_IS)
             continue;
         CHECK(got == 8 && frame[3] <= T3_KEY_DAMAGED);
@@ -138,7 +147,7 @@ int main(void)
         if (fuzz_below(3) == 0)
             drive(robot, ack[1] ? ack[1] : 7);
         t3_host_robot_run(robot, fuzz_below(fuzz_below(10) ? 2000 : 100000));
-        CHECK(!t3_host_robot_writing(robot) ||
+        CHECK(!t3_host_robot_changing(robot) ||
               !(t3_host_robot_status(robot) & (T3_STATUS_ENABLED | T3_STATUS_MOVING)));
         check_cells(robot, before);
         read_console(robot, &splitter);
@@ -155,7 +164,7 @@ int main(void)
     printf("console: %lu frames, %lu EEPROM writes\n", FRAMES,
            (unsigned long)t3_host_robot_eeprom_writes(robot));
     CHECK(splitter.crc_errors == 0 && splitter.frame_errors == 0);
-    CHECK(written && refused && damaged_starts);
+    CHECK(written && refused && damaged_starts && set);
     CHECK(t3_host_robot_eeprom_writes(robot) > FRAMES / 100);
     CHECK(t3_host_robot_unpowered_pulses(robot) == 0);
     t3_host_robot_free(robot);

@@ -329,12 +329,24 @@ static void pass(uint32_t us)
     note((uint32_t)robot.steps.wheels[T3_LEFT].increment);
 }
 
+static void store_settings(void)
+{
+    static const struct t3_setup setup = {82, 16, {'T', '3', 'M', 'P', 'C'}};
+    struct t3_settings settings;
+    t3_settings_boot(&settings, &PORT);
+    t3_settings_write(&settings, &PORT, &setup);
+    while (t3_settings_tick(&settings, &PORT, &CONSOLE_PORT) == T3_PROGRESS_NONE)
+        ;
+    note_bytes(eeprom, sizeof eeprom);
+}
+
 static void live(bool keyed)
 {
     uint8_t data[T3_RADIO_LIMIT + T3_TAG_SIZE];
     uint8_t key[T3_KEY_SIZE];
     memset(key, 0x3C, sizeof key);
     memset(eeprom, 0xFF, sizeof eeprom);
+    store_settings();
     if (keyed)
         t3_session_store_key(&PORT, key);
     t3_robot_boot(&robot, &PORT, 1, T3_SETTLE_US);
@@ -370,7 +382,7 @@ static void relay(void)
     say("good frames", dongle.splitter.frames);
 }
 
-// Pings, questions, keys and nonsense over the robot's own USB.
+// Pings, questions, keys, settings and nonsense over the robot's own USB.
 static void wire_up(void)
 {
     static struct t3_console console;
@@ -378,12 +390,14 @@ static void wire_up(void)
     t3_robot_boot(&robot, &PORT, 1, T3_SETTLE_US);
     t3_console_boot(&console, &CONSOLE_PORT, &robot);
     for (uint16_t i = 0; i < PACKETS; i++) {
-        static const uint8_t SIZES[] = {6, 2, 18, 5};
+        static const uint8_t SIZES[] = {6, 2, 18, 5, 10};
         uint8_t frame[T3_FRAME_LIMIT], wire[T3_WIRE_LIMIT];
         for (uint8_t j = 0; j < sizeof frame; j++)
             frame[j] = (uint8_t)draw();
         frame[0] = (uint8_t)(3 + draw() % 3);
-        const uint8_t length = t3_to_wire(frame, SIZES[draw() % 4], wire);
+        if (draw() % 2)
+            t3_put16(frame + 3, (uint16_t)(1u << draw() % 9));  // possible microsteps
+        const uint8_t length = t3_to_wire(frame, SIZES[draw() % 5], wire);
         for (uint8_t j = 0; j < length; j++)
             t3_console_byte(&console, wire[j]);
         now_us += 200;

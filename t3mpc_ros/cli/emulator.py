@@ -26,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         key = read_key(options.key) if options.key is not None else b''
-        emulator = Emulator(_parameters(options), key, options.seed)
+        emulator = Emulator(_parameters(options), key, options.seed, erased=options.erased)
         if options.loss:
             emulator.schedule_fault(Fault('loss', 0.0, math.inf, options.loss))
         for text in options.fault:
@@ -116,6 +116,7 @@ def _parser() -> argparse.ArgumentParser:
         help='fault with start (s), duration (s) and value; repeatable',
     )
     add('--key', type=Path, help='file with the key of the robot; default: open link')
+    add('--erased', action='store_true', help='new board: no settings, so it does not move yet')
     add('--seed', type=int, default=1, help='seed of all random generators')
     add(
         '--real-time-factor',

@@ -1,9 +1,9 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""``t3mpc robot``: link test, channel scan, wheel jog, key and parameters of the real robot."""
+"""``t3mpc robot``: settings, key, link test, channel scan, wheel jog of the real robot."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 import math
 import os
 from pathlib import Path
@@ -11,13 +11,23 @@ import select
 import sys
 from typing import TypeVar
 
+import yaml
+
 from t3mpc_ros.cli.command import ArgumentParser
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, parse_assignments
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
+from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import KeyFileError, key_check, read_key
 from t3mpc_ros.radio.protocol.codec import decode_from_board, decode_from_dongle
-from t3mpc_ros.radio.tool import channel_scan, jog, key_provisioning, link_test, robot_info
+from t3mpc_ros.radio.tool import (
+    channel_scan,
+    jog,
+    key_provisioning,
+    link_test,
+    robot_info,
+    robot_settings,
+)
 from t3mpc_ros.radio.tool.procedure import Procedure, ProcedureError, Script, run_at_port
 from t3mpc_ros.stop_signal import StopSignal
 
@@ -84,6 +94,25 @@ def _show_key_state(options: argparse.Namespace, stop: StopSignal) -> int:
 
 
 # -- the link -------------------------------------------------------------------------------------
+
+
+def _set(options: argparse.Namespace, stop: StopSignal) -> int:
+    changes = robot_settings.Changes(options.address, options.channel, options.microsteps)
+    settings = _run_at_board(robot_settings.write_settings(changes, os.urandom), options, stop)
+    print(robot_settings.format_settings(settings))
+    if options.save is not None:
+        options.save.write_text(robot_settings.parameter_file(settings))
+        print(
+            f'{options.save}: radio_bridge --ros-args --params-file {options.save}, '
+            f't3mpc robot ping --params-file {options.save}'
+        )
+    return EXIT_OK
+
+
+def _show_settings(options: argparse.Namespace, stop: StopSignal) -> int:
+    settings = _run_at_board(robot_settings.read_settings(), options, stop)
+    print(robot_settings.format_settings(settings))
+    return EXIT_OK if settings.state == frames.SETTINGS_GOOD else EXIT_POOR
 
 
 def _ping(options: argparse.Namespace, stop: StopSignal) -> int:
@@ -187,8 +216,49 @@ def _key_option(options: argparse.Namespace) -> bytes:
 
 
 def _link_parameters(options: argparse.Namespace) -> LinkParameters:
+    values: dict[str, object] = {}
+    if options.params_file is not None:
+        values.update(_read_link_parameters(options.params_file))
     texts = [text.removeprefix('link.') for text in options.set]
-    return LinkParameters.from_dict(parse_assignments(LinkParameters, texts))
+    return LinkParameters.from_dict(values | parse_assignments(LinkParameters, texts))
+
+
+def _read_link_parameters(path: Path) -> dict[str, object]:
+    """Return the parameters below ``link`` of a ROS parameter file, names with dots."""
+    try:
+        content = yaml.safe_load(path.read_text())
+        group = content['/**']['ros__parameters']['link']
+        return dict(_flat_items(group))
+    except OSError as error:
+        raise ParameterError(f'{path} cannot be read: {error.strerror}') from error
+    except (yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
+        raise ParameterError(
+            f'{path} must be a parameter file of t3mpc robot set, with link below /**'
+        ) from error
+
+
+def _flat_items(group: dict[str, object]) -> Iterator[tuple[str, object]]:
+    for name, value in group.items():
+        if isinstance(value, dict):
+            yield from ((f'{name}.{inner}', item) for inner, item in _flat_items(value))
+        else:
+            yield name, value
+
+
+def _address(text: str) -> bytes:
+    address = bytes.fromhex(text)
+    if len(text) != 2 * robot_settings.ADDRESS_SIZE or len(set(address)) < 2:
+        raise argparse.ArgumentTypeError(
+            f'must be 10 hexadecimal digits, not of equal bytes: got {text}'
+        )
+    return address
+
+
+def _microsteps(text: str) -> int:
+    value = int(text)
+    if value not in [1 << power for power in range(9)]:
+        raise argparse.ArgumentTypeError(f'must be a power of two from 1 to 256: got {text}')
+    return value
 
 
 def _revolutions(text: str) -> float:
@@ -205,6 +275,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog='exit code: 0 good, 1 poor result, 2 failed, 130 interrupted',
     )
     commands = parser.add_subparsers(required=True, metavar='COMMAND')
+    _add_settings_commands(commands)
     _add_key_commands(commands)
 
     ping = commands.add_parser('ping', help='test the link to dongle and robot')
@@ -229,6 +300,12 @@ def _parser() -> argparse.ArgumentParser:
         command.set_defaults(run=run)
         command.add_argument('--port', required=True, help='port of the dongle, /dev/…')
         command.add_argument(
+            '--params-file',
+            type=Path,
+            metavar='FILE',
+            help='link parameters: a ROS parameter file',
+        )
+        command.add_argument(
             '--set',
             action='append',
             default=[],
@@ -238,6 +315,28 @@ def _parser() -> argparse.ArgumentParser:
     for command in (jogging, table):
         command.add_argument('--key', type=Path, help='file with the key of the robot')
     return parser
+
+
+def _add_settings_commands(
+    commands: 'argparse._SubParsersAction[argparse.ArgumentParser]',
+) -> None:
+    setting = commands.add_parser(
+        'set', help='store address, channel and microsteps in the robot, over its own USB'
+    )
+    add = setting.add_argument
+    add(
+        '--address',
+        type=_address,
+        metavar='HEX',
+        help='10 hexadecimal digits; default: as stored, on a new board random',
+    )
+    add('--channel', type=bounded_int(0, 125), help='2400 MHz plus this')
+    add('--microsteps', type=_microsteps, help='as set by the jumpers of the drivers')
+    add('--save', type=Path, metavar='FILE', help='write a parameter file for the host')
+    showing = commands.add_parser('settings', help='print the settings of the robot')
+    for command, run in ((setting, _set), (showing, _show_settings)):
+        command.set_defaults(run=run)
+        command.add_argument('--port', required=True, help='USB port of the robot board')
 
 
 def _add_key_commands(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:

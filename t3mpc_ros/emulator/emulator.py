@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import math
 import random
 
+from t3mpc_ros.emulator.board.eeprom import Setup
 from t3mpc_ros.emulator.board.robot_board import LOOP_US, SETTLE_SLOW_US, SETTLE_US, RobotBoard
 from t3mpc_ros.emulator.event_queue import MICROSECOND, EventQueue
 from t3mpc_ros.emulator.fault_injection import Fault, FaultInjection
@@ -41,7 +42,7 @@ class EmulatorParameters(Parameters):
         1.5, 'duration of the boot loader of the dongle', unit='s', low=0.0, high=10.0
     )
     channel: int = parameter(
-        82, 'radio channel of the robot, offset from 2400 MHz', unit='MHz', low=0, high=125
+        82, 'channel in the settings of the robot: 2400 MHz plus this', unit='MHz', low=0, high=125
     )
     rate: str = parameter('1M', 'bit rate of the radio of the robot', choices=_RATES)
 
@@ -70,6 +71,8 @@ class Emulator:
         Seed of all random generators except those of the plant.
     now_ns
         Start of virtual time: both boards have booted, the robot is at rest.
+    erased
+        The EEPROM of the robot is blank: it has neither settings nor a key.
     """
 
     def __init__(
@@ -78,6 +81,7 @@ class Emulator:
         key: bytes = b'',
         seed: int = 1,
         now_ns: int = 0,
+        erased: bool = False,
     ) -> None:
         self._parameters = parameters
         self._start_ns = now_ns
@@ -95,7 +99,12 @@ class Emulator:
             random.Random(f'air {seed}'),
         )
         settle_us = SETTLE_SLOW_US if parameters.rate == '250k' else SETTLE_US
-        self.board = RobotBoard(self.plant, key, nonces.randbytes, self._channel.load, settle_us)
+        setup = None if erased else Setup(channel=parameters.channel)
+        self.board = RobotBoard(
+            self.plant, key, nonces.randbytes, self._channel.load, settle_us, setup
+        )
+        self.board.on_setup = self._follow_settings
+        self._follow_settings(self.board.settings_store.setup)
         self._boot_ns = now_ns
         self._robot_off = False
         """Whether the robot board is without power or in its boot loader."""
@@ -177,7 +186,7 @@ class Emulator:
         if not self._advance_robot():
             return
         self.board.console.feed(data)
-        if (done_us := self.board.key_store.done_us) is not None:
+        if (done_us := self.board.eeprom_done_us) is not None:
             # One pass of the main loop later, on a clock that may be slow.
             later_us = 1.02 * (done_us - self.board.now_us) + LOOP_US
 
@@ -256,6 +265,10 @@ class Emulator:
     def _press_button(self, pressed: bool) -> None:
         self._advance_robot()
         self.board.press_button(pressed)
+
+    def _follow_settings(self, setup: Setup) -> None:
+        radio = self._channel.robot
+        self._channel.robot = radio._replace(channel=setup.channel, address=setup.address)
 
     def _chip_ok(self) -> bool:
         return not self.faults.active('radio_dead')

@@ -10,7 +10,7 @@ import pytest
 from support.emulator_bench import SAMPLE, PulseCounter
 from support.firmware_core import FIRMWARE, KEY, compile_core
 
-from t3mpc_ros.emulator.board.console import CELL_US
+from t3mpc_ros.emulator.board.eeprom import CELL_US, Setup
 from t3mpc_ros.emulator.board.robot_board import RobotBoard
 from t3mpc_ros.radio.protocol.authentication import frame_tag, key_check, session_key, sign_hello
 from t3mpc_ros.radio.protocol.codec import decode_from_board, encode
@@ -21,6 +21,11 @@ from t3mpc_ros.radio.protocol.frames import (
     KEY_HELD,
     NO_KEY,
     OK,
+    OUT_OF_RANGE,
+    SETTINGS_DAMAGED,
+    SETTINGS_GOOD,
+    SETTINGS_MISSING,
+    SETTINGS_ONE_COPY,
     Action,
     Command,
     CommandFlag,
@@ -33,6 +38,8 @@ from t3mpc_ros.radio.protocol.frames import (
     Poll,
     Pong,
     Refusal,
+    Settings,
+    SettingsState,
     StatusFlag,
 )
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
@@ -52,13 +59,18 @@ def library(tmp_path_factory):
 class Pair:
     """The firmware core and the emulated board with the same input."""
 
-    def __init__(self, library, key=b''):
+    def __init__(self, library, key=b'', erased=False):
         self.library = library
         self.robot = ctypes.c_void_p(library.t3_host_robot_new())
         self.hardware = PulseCounter()
         self.nonce = bytes(8)
         self.loaded = b''
-        self.board = RobotBoard(self.hardware, key, lambda size: self.nonce, self._load)
+        setup = None if erased else Setup()
+        self.board = RobotBoard(
+            self.hardware, key, lambda size: self.nonce, self._load, setup=setup
+        )
+        if erased:
+            self.call('erase')
         if key:
             self.call('store_key', key)
         self.call('set_cell_us', ctypes.c_uint32(CELL_US))
@@ -120,6 +132,11 @@ class Pair:
     def imu(self, present):
         self.call('set_imu', ctypes.c_bool(present), (ctypes.c_int16 * 7)(*SAMPLE))
         self.hardware.registers = SAMPLE if present else None
+
+    def supply(self, count):
+        """Set the count of the battery measurement."""
+        self.call('set_adc', ctypes.c_uint8(8), ctypes.c_uint16(count))
+        self.hardware.battery = count * 20_000 // 1024
 
     def reset(self):
         self.run(-self.now % 1000)
@@ -191,13 +208,12 @@ class Driver:
 
     def request(self):
         rng = self.rng
-        number = rng.randrange(12)
+        number = rng.randrange(13)
         session = rng.choices((self.session, rng.randrange(256)), (20, 1))[0]
         match rng.randrange(6):
             case 0:
                 return encode(ParamGet(session, rng.randrange(256), number))
             case 1 | 2:
-                # Values that keep the microsteps of the next boot in the usual range.
                 value = rng.choice((0, 1, 3, 16, 32, 100, 250, 5000, 9000, 30000, 10**6))
                 return self.signed(ParamSet(session, rng.randrange(256), number, value))
             case 3:
@@ -223,7 +239,7 @@ class Driver:
 
     def act(self):
         pair, rng = self.pair, self.rng
-        match rng.choices(range(8), (60, 15, 6, 1, 1, 1, 1, 0.4))[0]:
+        match rng.choices(range(9), (60, 15, 6, 1, 1, 1, 1, 0.4, 2))[0]:
             case 0:
                 self.send(self.command())
             case 1:
@@ -240,6 +256,8 @@ class Driver:
                 pair.run(rng.choice((300_000, 1_000_000, 6_000_000)))
             case 7:
                 pair.reset()
+            case 8:
+                pair.supply(rng.choice((0, 400, 500, 520, 600, 600, 600)))
 
     def send(self, data):
         self.sent.append(data)
@@ -408,12 +426,14 @@ def test_no_damaged_console_frame_changes_the_key(pair, seed):
 
 
 def test_frames_for_a_dongle_are_refused(pair):
-    for frame in (b'\x01\x00\x00\x01\x15', b'\x02\x00', b'\x05'):
+    for frame in (b'\x01\x00\x00\x01\x15', b'\x02\x00', b'\x06'):
         pair.usb(encode_frame(frame))
         (state,) = FrameDecoder().feed(pair.console_replies())
         assert decode_from_board(state) == Refusal(1, frame[0])
-    pair.usb(encode_frame(b'\x04'))
-    assert decode_from_board(FrameDecoder().feed(pair.console_replies())[0]) == Refusal(2, 4)
+    for kind in (4, 5):
+        pair.usb(encode_frame(bytes([kind])))
+        (state,) = FrameDecoder().feed(pair.console_replies())
+        assert decode_from_board(state) == Refusal(2, kind)
 
 
 def test_a_worn_cell_is_reported_and_locks_the_robot(library):
@@ -428,3 +448,68 @@ def test_a_worn_cell_is_reported_and_locks_the_robot(library):
         size = pair.call('usb_take', room, ctypes.c_uint32(64))
         (state,) = FrameDecoder().feed(room.raw[:size])
         assert decode_from_board(state) == KeyState(1, FAILED, KEY_DAMAGED, 0)
+
+
+# -- settings -------------------------------------------------------------------------------------
+
+NEW = Settings(2, 100, 32, bytes.fromhex('c25a33a6e1'))
+SET_US = 30 * CELL_US
+"""Time to write both copies of the settings."""
+
+
+@pytest.mark.parametrize('key', [b'', KEY], ids=['open', 'keyed'])
+def test_a_robot_without_settings_is_locked_until_they_are_set(library, key):
+    pair = Pair(library, key, erased=True)
+    pair.run(50_000)
+    driver = Driver(pair, key, 1)
+    driver.hello()
+    pair.packet(driver.command())
+    pair.run(1000)
+    pair.compare()
+    assert pair.board.session == 0
+    missing = SettingsState(1, OK, SETTINGS_MISSING, 82, 16, b'T3MPC')
+    assert pair.request(Settings(1)) == [missing]
+    assert pair.request(NEW._replace(microsteps=3)) == [missing._replace(id=2, rc=OUT_OF_RANGE)]
+    assert pair.request(NEW) == []
+    busy = SettingsState(3, BUSY, SETTINGS_DAMAGED, 82, 16, b'T3MPC')
+    assert pair.request(NEW._replace(id=3)) == [busy]
+    assert pair.request(Key(4, OTHER))[0].rc == BUSY
+    driver.hello()
+    assert pair.board.session == 0
+    stored = SettingsState(2, OK, SETTINGS_GOOD, *NEW[1:])
+    pair.run(SET_US)
+    (reply,) = FrameDecoder().feed(pair.console_replies())
+    assert decode_from_board(reply) == stored
+    (pong,) = pair.request(Ping(5, b'ping'))
+    assert pong[-4:-1] == (SETTINGS_GOOD, 100, NEW.address)
+    driver.hello()
+    pair.run(1000)
+    pair.compare()
+    assert pair.board.session == driver.session
+
+
+@pytest.mark.parametrize('erased', [False, True])
+def test_power_loss_leaves_old_settings_new_ones_or_a_lock(library, erased):
+    """Power fails at every cell; both boards agree on what is left, and on the repair."""
+    states = set()
+    for cut_us in range(CELL_US // 2, SET_US, CELL_US):
+        pair = Pair(library, erased=erased)
+        pair.run(1000)
+        pair.request(NEW, cut_us)
+        pair.console_replies()
+        pair.reset()
+        pair.run(1000)
+        (found,) = pair.request(Settings(1))
+        states.add(found.state)
+        assert found[3:] in (Setup(), NEW[1:])
+        driver = Driver(pair, b'', 1)
+        driver.hello()
+        pair.run(1000)
+        pair.compare()
+        assert bool(pair.board.session) == (found.state in (SETTINGS_GOOD, SETTINGS_ONE_COPY))
+        pair.run(SET_US)
+        (repaired,) = pair.request(Settings(1))
+        assert repaired.state in (SETTINGS_GOOD, found.state)
+        assert repaired[3:] == found[3:]
+    lost = {SETTINGS_MISSING, SETTINGS_DAMAGED} if erased else set()
+    assert states == {SETTINGS_GOOD, SETTINGS_ONE_COPY} | lost

@@ -5,7 +5,8 @@
 import pytest
 from support.emulator_bench import PulseCounter
 
-from t3mpc_ros.emulator.board.robot_board import RobotBoard
+from t3mpc_ros.emulator.board.eeprom import Setup
+from t3mpc_ros.emulator.board.robot_board import PRESS_US, RELEASE_US, RobotBoard
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import decode_uplink, encode
 from t3mpc_ros.radio.protocol.frames import (
@@ -175,9 +176,10 @@ def test_no_parameter_weakens_the_emergency_stop(robot):
             robot.run(15_000)
         assert robot.board.speeds == (8_000_000, -6_000_000)
         stop()
-        robot.run(int(8.0 / 60.0 * 1e6) + 3000)
+        robot.run(int(8.0 / 60.0 * 1e6) + 3000 + PRESS_US)
         assert robot.board.speeds == (0, 0)
         robot.board.press_button(False)
+        robot.run(RELEASE_US)
         robot.command(flags=CommandFlag.ESTOP_CLEAR)
         assert not robot.status & StatusFlag.ESTOP
 
@@ -199,23 +201,50 @@ def test_estop_is_not_cleared_while_the_button_is_pressed(robot):
     robot.run(1000)
     assert robot.status == StatusFlag.ESTOP
     robot.board.press_button(False)
-    robot.run(1000)
+    robot.run(40_000)
+    robot.command(flags=CommandFlag.ESTOP_CLEAR)
     assert robot.status == StatusFlag.ESTOP
+    robot.run(10_000)
     robot.command(flags=CommandFlag.ESTOP_CLEAR)
     assert robot.status == 0
 
 
-def test_only_the_microsteps_survive_a_reboot(robot):
+def test_a_spike_on_the_wire_of_the_button_does_not_stop(robot):
+    robot.command(5000, 5000, ttl=25)
+    robot.board.press_button(True)
+    robot.run(4_000)
+    robot.board.press_button(False)
+    robot.run(1_000)
+    assert not robot.status & StatusFlag.ESTOP
+    robot.board.press_button(True)
+    robot.run(5_200)
+    assert robot.status & StatusFlag.ESTOP
+
+
+def test_an_empty_battery_stops_the_robot_until_charged(robot):
+    for millivolts, status in (
+        (11_000, StatusFlag.ENABLED | StatusFlag.MOVING),
+        (9_500, StatusFlag.ENABLED | StatusFlag.MOVING | StatusFlag.LOW_BATTERY),
+        (8_500, StatusFlag.LOW_BATTERY),
+        (9_900, StatusFlag.LOW_BATTERY),
+        (10_500, StatusFlag.ENABLED | StatusFlag.MOVING),
+    ):
+        robot.hardware.battery = millivolts
+        for _ in range(500):
+            robot.command(5000, 5000)
+            robot.run(10_000)
+        assert robot.status == status
+
+
+def test_only_the_settings_survive_a_reboot(robot):
     assert robot.set(0, 19_601).rc == frames.OUT_OF_RANGE
     assert robot.set(5, 200).rc == frames.READ_ONLY
-    assert robot.set(10, 1).rc == frames.UNKNOWN
-    robot.command(5000, 5000)
-    assert robot.set(4, 32).rc == frames.BUSY
-    robot.run_to_rest()
-    for number, value in ((0, 5000), (4, 32)):
-        reply = robot.set(number, value)
-        assert (reply.rc, reply.value) == (frames.OK, value)
-    assert robot.request(Poll(0, 0, frames.INFO)).microsteps == 16
+    assert robot.set(4, 32).rc == frames.READ_ONLY
+    assert robot.set(11, 1).rc == frames.UNKNOWN
+    reply = robot.set(0, 5000)
+    assert (reply.rc, reply.value) == (frames.OK, 5000)
+    robot.board.settings_store.store(Setup(82, 32), robot.board.now_us)
+    robot.run(200_000)
     robot.board.boot(4, robot.board.now_us)
     robot.hello()
     info = robot.request(Poll(0, 0, frames.INFO))

@@ -154,7 +154,7 @@ def test_a_blocked_wheel_is_detected_and_stops_the_robot(build, blocked, sign):
 def test_low_battery_and_imu_fault_are_reported(build):
     bench = build(flat={'twin.faults.gyro_dead': True, 'twin.faults.supply_sag': 2.5})
     bench.connect()
-    bench.run(1.1)
+    bench.run(5.0)  # the battery measurement is filtered
     state = bench.states[-1]
     assert state.imu is None
     assert state.status.imu_fault

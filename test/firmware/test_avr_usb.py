@@ -6,7 +6,6 @@ Simulation only: simavr executes the programs of both boards.
 """
 
 from collections.abc import Iterator
-from ctypes import c_uint8, c_uint64
 from functools import cache
 from pathlib import Path
 import random
@@ -21,10 +20,12 @@ from support.avr_boards import (
     ROBOT,
     Boards,
     booted,
+    console_output,
     cycle,
     drive,
     missing_tools,
     odometry_agrees,
+    request,
 )
 
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
@@ -47,7 +48,7 @@ from t3mpc_ros.radio.protocol.frames import (
     Refusal,
     StatusFlag,
 )
-from t3mpc_ros.radio.protocol.framing import FrameDecoder, crc16, encode_frame
+from t3mpc_ros.radio.protocol.framing import crc16, encode_frame
 
 pytestmark = pytest.mark.skipif(bool(missing_tools()), reason=f'not installed: {missing_tools()}')
 
@@ -61,21 +62,6 @@ HOST_NONCE = b'hostnonc'
 @pytest.fixture
 def boards() -> Iterator[Boards]:
     yield from booted()
-
-
-def console_output(boards: Boards) -> list[Any]:
-    """Return the frames that the console has sent."""
-    data, at = (c_uint8 * 4096)(), (c_uint64 * 4096)()
-    count = boards.call('usb_read', data, at, 4096)
-    return [codec.decode_from_board(frame) for frame in FrameDecoder().feed(bytes(data[:count]))]
-
-
-def request(boards: Boards, frame: Any, seconds: float = 0.005) -> list[Any]:
-    """Send a frame to the console; return the replies within a time."""
-    wire = encode_frame(codec.encode(frame))
-    boards.call('usb_write', wire, len(wire))
-    boards.run(seconds)
-    return console_output(boards)
 
 
 def begin_session(boards: Boards, key: bytes, gap: int = 20) -> Signer | None:
@@ -161,14 +147,14 @@ def test_no_key_is_written_while_the_drivers_of_the_avr_are_on(boards: Boards) -
 def test_no_flipped_bit_on_the_console_has_an_effect(boards: Boards) -> None:
     boards.start()
     wire = encode_frame(codec.encode(Key(1, KEY)))
-    before = boards.eeprom(0, 40)
+    before = boards.eeprom(0, 72)
     for bit in range(8 * (len(wire) - 1)):
         flipped = bytearray(wire)
         flipped[bit // 8] ^= 1 << bit % 8
         boards.call('usb_write', bytes(flipped), len(flipped))
         boards.run(0.002)
     boards.run(0.02)
-    assert boards.eeprom(0, 40) == before
+    assert boards.eeprom(0, 72) == before
     console_output(boards)
     assert request(boards, Key(2)) == [KeyState(2, OK, NO_KEY, 0)]
     (pong,) = request(boards, Ping(3, b'ping'))
@@ -240,10 +226,11 @@ def test_a_flood_on_the_console_does_not_delay_replies(boards: Boards) -> None:
     assert max(times) <= 7.0
     assert late <= 1
     assert boards.call('resets', ROBOT) == 0
-    console_output(boards)
     boards.run(0.01)
-    console_output(boards)
     boards.call('usb_write', b'\0', 1)  # ends the partial frame
+    boards.run(0.01)
+    while console_output(boards):
+        pass
     (pong,) = request(boards, Ping(9, b'ping'))
     print(f'console overruns: {pong.overruns} counted, {boards.call("usb_overruns")} bytes')
     assert pong.overruns > 0

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Firmware core: signed sessions and attacks on them."""
 
+from binascii import crc_hqx
 import ctypes
 import random
 import struct
@@ -10,6 +11,7 @@ from support.firmware_core import (
     CLEAR,
     ENABLED,
     ESTOP,
+    INFO_SIZE,
     KEY,
     LATCHED,
     MAX_SPEED,
@@ -21,14 +23,16 @@ from support.firmware_core import (
     siphash,
 )
 
+BOOTS_ADDRESS = 32
+
 
 def test_a_key_at_one_end_only_is_rejected_and_reported(library, robot, keyed):
     unsigned = struct.pack('<BBBBI', 0x14, 7, 0, 0, 0)
     info = keyed.request(unsigned)
-    assert (info[0], info[1], len(info)) == (0x13, SESSION, 25)
+    assert (info[0], info[1], len(info)) == (0x13, SESSION, INFO_SIZE + 8)
     signed = struct.pack('<BBBBI', 0x14, 7, 0, 1, 0) + bytes(8)
     info = robot.request(signed + siphash(KEY, signed))
-    assert (info[0], info[1], len(info)) == (0x13, SESSION, 17)
+    assert (info[0], info[1], len(info)) == (0x13, SESSION, INFO_SIZE)
     assert keyed.counters()['bad_session'] == robot.counters()['bad_session'] == 1
     keyed.session_key = b''
     keyed.drive(5000, 5000, 100_000)
@@ -53,16 +57,37 @@ def test_a_signed_session_drives_and_writes_parameters(keyed):
 def test_a_new_hello_draws_a_nonce_and_a_repeated_one_does_not(keyed):
     first = keyed.hello()
     keyed.drive(5000, 5000, 500_000)
-    assert keyed.hello()[17:] == first[17:]
+    assert keyed.hello()[INFO_SIZE:] == first[INFO_SIZE:]
     assert keyed.status == ENABLED | MOVING
     keyed.drive(5000, 5000, 100_000)
     assert keyed.status == ENABLED | MOVING
-    seen = {first[17:]}
+    seen = {first[INFO_SIZE:]}
     for index in range(200):
-        seen.add(keyed.hello(nonce=index.to_bytes(8, 'big'))[17:])
+        seen.add(keyed.hello(nonce=index.to_bytes(8, 'big'))[INFO_SIZE:])
         if index % 20 == 0:
             keyed.call('boot', 1, 0)  # same time, empty RAM
     assert len(seen) == 201
+
+
+def test_a_nonce_of_the_robot_is_no_tag_of_a_hello(library):
+    """Both are hashes under the long-term key; without a separation this HELLO was accepted.
+
+    The robot draws its nonce from its counters and clock, 16 bytes as many as a HELLO has before
+    its tag: some values of the counter of boots are the beginning of a HELLO.
+    """
+    robot = Robot(library, KEY)
+    session, first_noise = 0x5B, 1013904223
+    boots = 0x0100_0014 | session << 8
+    record = struct.pack('<I', boots - 1)
+    record += crc_hqx(record, 0xFFFF).to_bytes(2, 'little')
+    for at, byte in enumerate(record, BOOTS_ADDRESS):
+        robot.call('poke_eeprom', ctypes.c_uint8(at), ctypes.c_uint8(byte))
+    robot.call('boot', 4, 0)
+    robot.run(1000)
+    forged = struct.pack('<IIII', boots, 1, robot.now, first_noise)
+    info = robot.hello()
+    assert info[1] == SESSION
+    assert robot.request(forged + info[INFO_SIZE:])[1] == SESSION
 
 
 def test_a_damaged_key_locks_the_robot(library):
@@ -71,7 +96,7 @@ def test_a_damaged_key_locks_the_robot(library):
         robot.call('poke_eeprom', ctypes.c_uint8(address), ctypes.c_uint8(0x55))
         robot.call('boot', 1, 0)
         info = robot.hello()
-        assert (info[1], len(info)) == (0, 25)
+        assert (info[1], len(info)) == (0, INFO_SIZE + 8)
         robot.key, robot.session_key = b'', b''
         assert robot.hello()[1] == 0
         robot.drive(5000, 5000, 100_000)

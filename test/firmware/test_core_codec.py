@@ -10,6 +10,7 @@ import struct
 import pytest
 from support.firmware_core import (
     ESTOP,
+    INFO_SIZE,
     LATCHED,
     OK,
     SESSION,
@@ -228,7 +229,7 @@ def test_golden_session_of_a_keyed_robot(library, golden):
         assert robot.counters()['bad_session'] == rejected, event['name']
         info = robot.request(b'\x15\0\0\2')
         assert info[1] == event['session'], event['name']
-        assert info[17:].hex() == event['robot_nonce'], event['name']
+        assert info[INFO_SIZE:].hex() == event['robot_nonce'], event['name']
 
 
 def test_golden_emergency_stops_are_counted(library, golden):
@@ -253,13 +254,13 @@ def test_golden_console_frames(library, golden):
     for vector in golden['to_board']:
         robot = Robot(library)
         robot.run(1000)
-        (reply,) = robot.console(bytes.fromhex(vector['bytes']))
+        (reply,) = robot.console(bytes.fromhex(vector['bytes']), 5000)
         frame = bytes.fromhex(vector['bytes'])
         assert c_encode_frame(library, frame).hex() == vector['wire']
         if frame[0] == 3:
             assert reply[:6] == b'\x83' + frame[1:]
         else:
-            assert reply[:3] == bytes([0x84, frame[1], OK])
+            assert reply[:3] == bytes([frame[0] | 0x80, frame[1], OK])
     for row in golden['key_checks']:
         robot = Robot(library, bytes.fromhex(row['key']))
         assert robot.console(b'\x04\x09') == [b'\x84\x09\0\1' + struct.pack('<I', row['check'])]

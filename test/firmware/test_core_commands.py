@@ -9,12 +9,14 @@ import struct
 import pytest
 from support.firmware_core import (
     CLEAR,
+    CUTOFF,
     DECELERATION,
     ENABLE,
     ENABLED,
     ESTOP,
     EXPIRED,
     LATCHED,
+    LOW_BATTERY,
     MAX_SPEED,
     MOVING,
     NO_SESSION,
@@ -22,6 +24,9 @@ from support.firmware_core import (
     SESSION,
     Robot,
 )
+
+PRESS, RELEASE = 5_200, 50_200
+"""Debounce times of the button and a period of the main loop, us."""
 
 
 def test_nothing_moves_before_hello_and_enable(library):
@@ -45,7 +50,7 @@ def test_hello_starts_a_session_at_rest_and_keeps_the_counters(robot):
     robot.drive(5000, 5000, 500_000)
     steps = robot.steps
     info = robot.hello(session=77)
-    assert (info[0], info[1], info[3], info[7]) == (0x13, 77, 1, 10)
+    assert (info[0], info[1], info[3], info[7]) == (0x13, 77, 1, 11)
     assert struct.unpack_from('<HH', info, 8) == (200, 16)
     robot.run(300_000)
     assert robot.status == 0
@@ -196,21 +201,70 @@ def test_only_a_valid_clear_of_the_session_clears_the_estop(robot):
     robot.call('press', ctypes.c_bool(True))
     robot.send(robot.command(flags=CLEAR))
     assert robot.status & LATCHED
+    robot.run(PRESS)
     robot.call('press', ctypes.c_bool(False))
+    robot.run(RELEASE - 1000)
+    robot.send(robot.command(flags=CLEAR))
+    assert robot.status & LATCHED
+    robot.run(1000)
     robot.send(robot.command(flags=CLEAR))
     assert robot.status == 0
     robot.drive(1000, 1000, 200_000)
     assert robot.status == ENABLED | MOVING
 
 
-def test_the_button_latches_after_the_shortest_press(robot):
+@pytest.mark.parametrize('pressed', [PRESS // 2, PRESS])
+def test_the_button_latches_after_its_debounce_time_only(robot, pressed):
+    """A spike on its wire once stopped the robot for good."""
     robot.drive(5000, 5000, 500_000)
-    robot.call('press', ctypes.c_bool(True))
-    robot.run(200)
-    robot.call('press', ctypes.c_bool(False))
+    for _ in range(20):
+        robot.call('press', ctypes.c_bool(True))
+        robot.run(pressed)
+        robot.call('press', ctypes.c_bool(False))
+        robot.run(1000)
+    latched = robot.status & LATCHED
+    assert bool(latched) == (pressed == PRESS)
     robot.drive(5000, 5000, 500_000)
-    assert robot.status == LATCHED
+    assert robot.status == (LATCHED if latched else ENABLED | MOVING)
+    assert robot.call('powered') == (not latched)
+
+
+# -- battery --------------------------------------------------------------------------------------
+
+
+def supply(robot, millivolts, us):
+    """Set the voltage of the battery for a time."""
+    robot.call('set_adc', 8, ctypes.c_uint16(millivolts * 1024 // 20_000))
+    robot.drive(3000, 3000, us)
+
+
+def test_a_dip_of_the_supply_is_no_low_battery(robot):
+    """The warning once flickered with every start of the motors."""
+    supply(robot, 11_000, 500_000)
+    for _ in range(10):
+        supply(robot, 8_000, 60_000)
+        assert not robot.status & LOW_BATTERY
+        supply(robot, 11_000, 940_000)
+    assert robot.status == ENABLED | MOVING
+
+
+def test_an_empty_battery_stops_the_robot_until_charged(robot):
+    supply(robot, 11_000, 500_000)
+    supply(robot, 9_500, 5_000_000)
+    assert robot.status == ENABLED | MOVING | LOW_BATTERY
+    supply(robot, 8_500, 5_000_000)
+    assert robot.status == LOW_BATTERY
     assert not robot.call('powered')
+    supply(robot, 9_900, 5_000_000)  # without load the voltage rises
+    assert robot.status == LOW_BATTERY
+    supply(robot, 10_500, 5_000_000)
+    assert robot.status == ENABLED | MOVING
+    robot.call('set_adc', 8, ctypes.c_uint16(0))  # nothing is connected
+    robot.drive(3000, 3000, 1_000_000)
+    assert robot.status == ENABLED | MOVING
+    assert robot.set(CUTOFF, 0)[0] == OK
+    supply(robot, 5_000, 5_000_000)
+    assert robot.status == ENABLED | MOVING | LOW_BATTERY
 
 
 # -- stale commands -------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ from support.firmware_core import (
     MICROSTEPS,
     MOVING,
     OK,
+    READ_ONLY,
     STEP,
     Robot,
 )
@@ -73,17 +74,17 @@ def test_step_rate_is_limited_to_10_000_per_second(robot):
 
 
 @pytest.mark.parametrize('microsteps', [1, 8, 32, 256])
-def test_microsteps_take_effect_at_boot_and_keep_the_speed(library, microsteps):
+@pytest.mark.parametrize('reboot', [False, True])
+def test_microsteps_of_the_settings_keep_the_speed(library, microsteps, reboot):
     robot = Robot(library)
+    robot.run(1000)
     robot.hello()
-    assert robot.set(MICROSTEPS, microsteps) == (OK, microsteps)
-    assert robot.set(MICROSTEPS, microsteps) == (OK, microsteps)
-    assert robot.call('eeprom_writes') == 1
-    assert struct.unpack_from('<H', robot.request(b'\x15\0\0\2'), 10) == (16,)
-    robot.call('boot', 1, 0)
+    assert robot.settings(82, microsteps)[0] == OK
+    if reboot:
+        robot.call('boot', 1, 0)
     info = robot.hello()
-    assert info[6] == 1
     assert struct.unpack_from('<H', info, 10) == (microsteps,)
+    assert robot.set(MICROSTEPS, microsteps) == (READ_ONLY, microsteps)
     robot.drive(10_000, 5_000, 1_000_000)
     before = robot.pulses
     robot.drive(10_000, 5_000, 1_000_000)

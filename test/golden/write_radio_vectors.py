@@ -45,6 +45,9 @@ GOLDEN_STATE = frames.State(
 )
 NONCE, TAG = bytes(range(0x10, 0x18)), bytes(range(0x20, 0x28))
 ADDRESS = bytes.fromhex('c25a33a6e1')
+PONG = frames.Pong(
+    4, b'\x00\x11\x22\x33', 4711, 1, 1, 2, 1, 10, 20, 65535, 0x02, 1, 100, ADDRESS, 0xFEDCBA98
+)
 
 DOWN = {
     'radio.md': GOLDEN_COMMAND,
@@ -80,8 +83,10 @@ UP = {
     'ttl_max': frames.Param(0x5A, 10, 3, frames.OK, 250, 20, 500),
     'out of range': frames.Param(0x5A, 11, 0, frames.OUT_OF_RANGE, 10000, 0, 19600),
     'unknown': frames.Param(0x5A, 12, 255, frames.UNKNOWN, 0, 0, 0),
-    'info': frames.Info(0x5A, 14, 1, 1, 2, 0x02, 10, 200, 16, 123456789, 1),
-    'info of a keyed robot': frames.Info(0, 0, 1, 1, 2, 0x08, 10, 200, 16, 0, 64, NONCE),
+    'info': frames.Info(0x5A, 14, 1, 1, 2, 0x02, 11, 200, 16, 1, 0, 82, ADDRESS, 0xFEDCBA98),
+    'info of a keyed robot': frames.Info(
+        0, 0, 1, 1, 2, 0x08, 11, 200, 16, 64, 3, 125, b'T3MPC', 0, NONCE
+    ),
     'done': frames.Ack(0x5A, 16, frames.RESET_ODOMETRY, frames.OK),
     'busy': frames.Ack(0x5A, 17, frames.RESET_ODOMETRY, frames.BUSY),
     'aux': frames.Aux(
@@ -105,7 +110,7 @@ FROM_DONGLE = {
     'payload of the first only': frames.Result(0x2D, 0x03, 0x34, 2, b'\x00\x00\x00'),
     'the radio configuration': frames.Configured(2, 82, 1, 0, 1, 3, ADDRESS, 1),
     'no radio chip': frames.Configured(2, 0, 0, 0, 0, 0, bytes(5), 0),
-    'pong': frames.Pong(3, b'\x00\x11\x22\x33', 4711, 1, 1, 2, 1, 10, 20, 65535, 0x02),
+    'pong': PONG._replace(id=3, settings=0),
     'busy': frames.Refusal(3, 0x2A),
 }
 
@@ -113,6 +118,8 @@ TO_BOARD = {
     'read the state of the key': frames.Key(1),
     'store a key': frames.Key(2, bytes(range(0x80, 0x90))),
     'erase the key': frames.Key(3, bytes(16)),
+    'read the settings': frames.Settings(1),
+    'store settings': frames.Settings(2, 100, 32, ADDRESS),
     'ping': frames.Ping(4, b'\x00\x11\x22\x33'),
 }
 FROM_BOARD = {
@@ -122,7 +129,15 @@ FROM_BOARD = {
     ),
     'busy': frames.KeyState(3, frames.BUSY, frames.KEY_HELD, 0xFFFFFFFF),
     'EEPROM failed': frames.KeyState(4, frames.FAILED, frames.KEY_DAMAGED, 0),
-    'pong': frames.Pong(4, b'\x00\x11\x22\x33', 4711, 1, 1, 2, 1, 10, 20, 65535, 0x02),
+    'settings': frames.SettingsState(1, frames.OK, frames.SETTINGS_GOOD, 82, 16, ADDRESS),
+    'no settings': frames.SettingsState(2, frames.OK, frames.SETTINGS_MISSING, 82, 16, b'T3MPC'),
+    'settings out of range': frames.SettingsState(
+        3, frames.OUT_OF_RANGE, frames.SETTINGS_ONE_COPY, 0, 256, ADDRESS
+    ),
+    'damaged settings': frames.SettingsState(
+        4, frames.FAILED, frames.SETTINGS_DAMAGED, 125, 1, ADDRESS
+    ),
+    'pong': PONG,
     'unknown to the robot board': frames.Refusal(1, 0x01),
 }
 KEYS = (bytes(range(0x80, 0x90)), bytes(range(16)), b'\xff' * 16)
@@ -160,11 +175,14 @@ REJECTED = (
     ('to board', '04', 'length'),
     ('to board', '0401' + 15 * '11', 'length'),
     ('to board', '0401' + 17 * '11', 'length'),
+    ('to board', '05', 'length'),
+    ('to board', '0501' + 7 * '11', 'length'),
     ('to board', '0200', 'kind'),
     ('to board', '0100000115', 'kind'),
     ('from board', '84010000000000', 'length'),
     ('from board', '8401060000000000', 'value'),
     ('from board', '8401000300000000', 'value'),
+    ('from board', '8501000452100054334d5043', 'value'),
     ('from board', '8100010000000000', 'kind'),
 )
 

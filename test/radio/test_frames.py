@@ -45,8 +45,8 @@ WAYS = {
     decode_uplink: (frames.State, frames.Param, frames.Info, frames.Ack, frames.Aux),
     decode_to_dongle: (frames.Transmit, frames.Configure, frames.Ping),
     decode_from_dongle: (frames.Result, frames.Configured, frames.Pong, frames.Refusal),
-    decode_to_board: (frames.Ping, frames.Key),
-    decode_from_board: (frames.Pong, frames.KeyState, frames.Refusal),
+    decode_to_board: (frames.Ping, frames.Key, frames.Settings),
+    decode_from_board: (frames.Pong, frames.KeyState, frames.SettingsState, frames.Refusal),
 }
 KINDS = [(kind, decode) for decode, kinds in WAYS.items() for kind in kinds]
 
@@ -55,9 +55,10 @@ SHORTER = {
     frames.Command: 14,
     frames.ParamSet: 8,
     frames.Action: 6,
-    frames.Info: 17,
+    frames.Info: 24,
     frames.Configure: 2,
     frames.Key: 2,
+    frames.Settings: 2,
 }
 
 

@@ -105,6 +105,7 @@ def test_board_parameters_are_written_and_read_back():
             'robot.deceleration': 22.0,
             'robot.ttl_max': 0.3,
             'robot.battery_low': 9.9,
+            'robot.battery_cutoff': 8.8,
             'robot.idle_off': 60.0,
             'robot.invert_right': True,
         }
@@ -122,6 +123,7 @@ def test_board_parameters_are_written_and_read_back():
         'battery_low': 9900,
         'idle_off': 60000,
         'invert_wheels': 2,
+        'battery_cutoff': 8800,
     }
     assert bench.link.board_parameters == expected
     assert bench.robot.parameters == list(expected.values())
@@ -131,7 +133,7 @@ def test_board_parameters_are_written_and_read_back():
 
 def test_parameter_defaults_equal_those_of_the_board():
     wire = LinkParameters().robot.to_wire()
-    assert len(wire) == 7
+    assert len(wire) == 8
     for number, value in wire.items():
         row = BOARD_PARAMETERS[number]
         assert value == row.default
@@ -806,7 +808,7 @@ def test_a_late_reply_is_not_matched_to_the_next_request():
     assert result.round_trip == 0.004
     assert transactions.timeouts == 0
     transactions.ping(50 * MS, 70 * MS)
-    pong = frames.Pong(3, b'late', 0, 1, 1, 0, 1, 0, 0, 0, 0)
+    pong = frames.Pong(3, b'late', 0, 1, 1, 0, 1, 0, 0, 0, 0, 0, 82, b'T3MPC', 0)
     assert transactions.feed(encode_frame(encode(pong)), 71 * MS) == []
     assert transactions.deadline_ns == 120 * MS
 

@@ -8,105 +8,26 @@ import random
 import stat
 
 import pytest
+from support.tool_bench import START_NS, ToolBench
+import yaml
 
-from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
-from t3mpc_ros.radio.link.port_actions import Close, Open, Wait, Write
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import KeyFileError, key_check, read_key
-from t3mpc_ros.radio.protocol.codec import decode_from_board, decode_from_dongle
-from t3mpc_ros.radio.protocol.frames import CommandFlag, StatusFlag
-from t3mpc_ros.radio.tool import channel_scan, jog, key_provisioning, link_test, robot_info
+from t3mpc_ros.radio.protocol.codec import decode_from_dongle, encode
+from t3mpc_ros.radio.protocol.frames import Command, CommandFlag, Hello, StatusFlag
+from t3mpc_ros.radio.tool import (
+    channel_scan,
+    jog,
+    key_provisioning,
+    link_test,
+    robot_info,
+    robot_settings,
+)
 from t3mpc_ros.radio.tool.procedure import Procedure, ProcedureError
 
 KEY, OTHER = bytes(range(16)), bytes(range(1, 17))
-START_NS = 5_000_000_000
 TURN = 3200
-
-
-class ToolBench:
-    """Runs a task at one of the two ports of an emulator, in virtual time."""
-
-    def __init__(self, key=b'', seed=1, **flat):
-        self.emulator = Emulator(EmulatorParameters.from_dict(flat), key, seed, START_NS)
-        self.now_ns = START_NS
-        self.each = None
-
-    @property
-    def board(self):
-        return self.emulator.board
-
-    def run(self, task, robot=False, seconds=120.0):
-        """Run a task at the port of the dongle, or of the robot; return it."""
-        end, self.is_open, received = self.now_ns + round(seconds * 1e9), False, b''
-        while not task.done:
-            wake = self._do(task, task.step(self.now_ns, received), robot)
-            received = b''
-            while self.now_ns < wake and not received:
-                following = self.emulator.next_ns
-                self.now_ns = min(wake, max(following or wake, self.now_ns + 1000))
-                arrived = self.emulator.run_to(self.now_ns)
-                cable = self.emulator.take_console()
-                if self.is_open:
-                    received = b''.join(data for _, data in (cable if robot else arrived))
-                if self.is_open and not robot and not self.emulator.port_open:
-                    self.is_open = False
-                    task.port_failed('dongle is not there', True, self.now_ns)
-                    break
-            if self.each is not None:
-                self.each(self)
-            assert self.now_ns < end, 'it must come to an end'
-        self._do(task, task.step(self.now_ns), robot)
-        assert not self.is_open
-        return task
-
-    def _do(self, task, actions, robot):
-        wake = self.now_ns
-        for action in actions:
-            if isinstance(action, Wait):
-                wake = action.until_ns
-            elif isinstance(action, Open):
-                self.is_open = True
-                task.port_opened(self.now_ns)
-                return self.now_ns
-            elif isinstance(action, Write) and self.is_open and robot:
-                self.emulator.feed_console(action.data, self.now_ns)
-            elif isinstance(action, Write) and self.is_open:
-                self.emulator.feed(action.data, self.now_ns)
-            elif isinstance(action, Close):
-                self.is_open = False
-        return wake
-
-    def at_dongle(self, script):
-        """Return the result of a script at the port of the dongle."""
-        return self._result(self.run(Procedure(script, decode_from_dongle)))
-
-    def at_robot(self, script):
-        """Return the result of a script at the USB port of the robot board."""
-        return self._result(self.run(Procedure(script, decode_from_board), robot=True))
-
-    def _result(self, procedure):
-        if procedure.error:
-            raise ProcedureError(procedure.error)
-        return procedure.result
-
-    def radio(self):
-        """Return the radio configuration of the dongle."""
-        return self.emulator.dongle.radio
-
-    def jog(self, wheel, revolutions, key=b'', speed=2.0, link=None):
-        reported = []
-        task = jog.Jog(
-            link or LinkParameters(),
-            key,
-            random.Random(1).randbytes,
-            wheel,
-            revolutions,
-            speed,
-            reported.append,
-        )
-        self.run(task)
-        return task, reported
 
 
 # -- key ------------------------------------------------------------------------------------------
@@ -195,6 +116,87 @@ def test_a_silent_port_fails_with_a_remedy():
     with pytest.raises(ProcedureError, match='right port'):
         bench.at_dongle(link_test.run_link_test(LinkParameters(), 1))
     assert 4e9 < bench.now_ns - START_NS < 7e9
+
+
+# -- settings -------------------------------------------------------------------------------------
+
+
+def write(bench, seed=1, **changes):
+    script = robot_settings.write_settings(
+        robot_settings.Changes(**changes), random.Random(seed).randbytes
+    )
+    return bench.at_robot(script)
+
+
+def host_of(settings):
+    """Return link parameters from the parameter file of a robot."""
+    content = yaml.safe_load(robot_settings.parameter_file(settings))
+    return LinkParameters.from_dict(content['/**']['ros__parameters']['link'])
+
+
+def test_a_new_robot_gets_a_random_address_and_keeps_it():
+    addresses = set()
+    for seed in range(20):
+        bench = ToolBench(erased=True)
+        assert bench.at_robot(robot_settings.read_settings()).state == frames.SETTINGS_MISSING
+        settings = write(bench, seed)
+        assert settings[1:5] == (frames.OK, frames.SETTINGS_GOOD, 82, 16)
+        addresses.add(settings.address)
+        changed = write(bench, seed + 100, channel=100, microsteps=8)
+        assert changed[3:] == (100, 8, settings.address)
+        assert bench.at_robot(robot_settings.read_settings())[2:] == changed[2:]
+    assert len(addresses) == 20
+
+
+def test_drawn_addresses_are_receivable_and_no_numbers():
+    source = random.Random(1)
+    for _ in range(2000):
+        text = robot_settings.draw_address(source.randbytes).hex()
+        assert not {'00', '55', 'aa', 'ff'} & {text[at : at + 2] for at in range(0, 10, 2)}
+        assert isinstance(yaml.safe_load(text), str)
+        with pytest.raises(ValueError):
+            float(text)
+
+
+def test_settings_survive_a_restart_of_the_robot():
+    bench = ToolBench(erased=True)
+    settings = write(bench)
+    bench.emulator.restart_robot()
+    assert bench.at_robot(robot_settings.read_settings())[2:] == settings[2:]
+
+
+def test_settings_are_never_sent_to_the_dongle():
+    bench = ToolBench()
+    entropy = random.Random(1).randbytes
+    writing = robot_settings.write_settings(robot_settings.Changes(), entropy)
+    for script in (robot_settings.read_settings(), writing):
+        with pytest.raises(ProcedureError, match='this is the dongle'):
+            bench.at_dongle(script)
+
+
+def test_impossible_or_untimely_settings_have_a_remedy():
+    bench = ToolBench()
+    with pytest.raises(ProcedureError, match='power of two'):
+        write(bench, microsteps=3)
+    bench.board.receive(encode(Hello(7, 0, 0)))
+    bench.board.receive(encode(Command(7, 1, CommandFlag.ENABLE, 20, 0, 0, 0)))
+    with pytest.raises(ProcedureError, match='stop the bridge'):
+        write(bench)
+
+
+def test_each_of_two_robots_follows_its_own_host_only():
+    """Both receive every packet of the dongle; before they are set up, neither moves."""
+    benches = [ToolBench(erased=True) for _ in range(2)]
+    for bench in benches:
+        bench.jog(jog.LEFT, 0.2)
+        assert bench.board.counters == (0, 0)
+    hosts = [host_of(write(bench, seed)) for seed, bench in enumerate(benches)]
+    for number, host in enumerate(hosts):
+        before = [bench.board.counters for bench in benches]
+        for bench in benches:
+            bench.jog(jog.LEFT, 0.2, link=host)
+        moved = [bench.board.counters != old for bench, old in zip(benches, before, strict=True)]
+        assert moved == [number == 0, number == 1]
 
 
 # -- ping -----------------------------------------------------------------------------------------

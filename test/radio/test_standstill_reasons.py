@@ -14,6 +14,7 @@ from support.radio_bench import FakeRobot, LinkBench
 from t3mpc_ros.nodes.common import diagnostics
 from t3mpc_ros.radio.link import standstill_reasons as reasons
 from t3mpc_ros.radio.link.port_actions import LinkState
+from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import encode
 from t3mpc_ros.radio.protocol.frames import Command, CommandFlag, Pong, StatusFlag
 from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON
@@ -157,6 +158,21 @@ def the_robot_has_no_key(bench):
     bench.run(1.0)
 
 
+@cause('the robot has no settings', erased=True)
+def the_robot_was_never_set_up(bench):
+    bench.drive(3.0, 3.0)
+    bench.run(1.0)
+    assert bench.board.counters == (0, 0)
+
+
+@cause('below its cut-off', flat={'twin.faults.supply_sag': 3.8})
+def the_battery_is_empty(bench):
+    bench.connect()
+    bench.drive(3.0, 3.0)
+    bench.run(3.0)
+    assert not bench.board.powered
+
+
 @cause('the inertial sensor does not answer', flat={'twin.faults.gyro_dead': True})
 def the_inertial_sensor_is_dead(bench):
     driving_with_complaints(bench)
@@ -193,7 +209,7 @@ def the_bridge_ends(bench):
 def driving_with_complaints(bench):
     bench.connect()
     bench.drive(2.0, 2.0)
-    bench.run(1.3)
+    bench.run(5.0)  # the battery measurement is filtered
     assert bench.followed[-1][1].left == 2000  # a warning, no reason to stand
 
 
@@ -229,6 +245,7 @@ class UnusualRobot(FakeRobot):
         ({'drop': StatusFlag.ENABLED}, reasons.DRIVES_DISABLED),
         ({'protocol': 2}, 'the robot must speak protocol 1: it speaks 2'),
         ({'accepts': False}, reasons.HELLO_REJECTED),
+        ({'settings': frames.SETTINGS_DAMAGED, 'accepts': False}, reasons.SETTINGS_DAMAGED),
     ],
 )
 def test_an_unusual_robot_is_reported(odd, reason):

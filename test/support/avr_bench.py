@@ -7,6 +7,7 @@ twin, and the values of its sensors are applied to the pins of the robot board.
 """
 
 from contextlib import contextmanager
+from ctypes import c_uint8, c_uint64
 from functools import cache
 import math
 import subprocess
@@ -81,7 +82,8 @@ def field_offsets():
 def on_avr(bench=Bench, **given):
     """Yield a bench with both boards in simavr; check the boards at the end."""
     parameters = {name: given.pop(name) for name in ('flat', 'seed') if name in given}
-    with contextmanager(booted)(parameters.get('seed', 1)) as boards:
+    erased = given.pop('erased', False)
+    with contextmanager(booted)(parameters.get('seed', 1), erased) as boards:
         emulator = AvrEmulator(boards, key=given.get('key', b''), **parameters)
         yield bench(emulator=emulator, **given)
 
@@ -186,6 +188,17 @@ class AvrEmulator:
         if self.port_open:
             self._to_dongle.send(data)
             self._events.run_to(now_ns)
+
+    def feed_console(self, data, now_ns):
+        """Send bytes to the USB console of the robot board at this time."""
+        self.run_until(now_ns)
+        self.boards.call('usb_write', data, len(data))
+
+    def take_console(self):
+        """Return the bytes that the console has sent, with the current time."""
+        data, at = (c_uint8 * 4096)(), (c_uint64 * 4096)()
+        count = self.boards.call('usb_read', data, at, 4096)
+        return [(self.now_ns, bytes(data[:count]))] if count else []
 
     def run_to(self, now_ns):
         self.run_until(now_ns)

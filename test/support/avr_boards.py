@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 from t3mpc_ros.radio.protocol import codec
 from t3mpc_ros.radio.protocol.frames import Command, Hello, Poll, Result, Transmit
-from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
+from t3mpc_ros.radio.protocol.framing import FrameDecoder, crc16, encode_frame
 
 FIRMWARE = Path(__file__).parents[2] / 'firmware'
 BUILD = FIRMWARE / 'build'
@@ -34,6 +34,10 @@ DONGLE, ROBOT = 0, 1
 CYCLES_PER_US = 16
 GAP = 6
 """Gap between the exchanges of a transaction, in 250 us."""
+BATTERY, DIVIDER = 12_000, 4
+"""Supply, mV, and the divider before the converter."""
+SETTINGS_ADDRESSES = (40, 56)
+"""Cells of both copies."""
 IMU = (100, 200, 16384, 3000, 10, 20, -131)
 """accel x, y, z, temperature, gyro x, y, z"""
 
@@ -103,6 +107,12 @@ def build() -> str:
     return sizes.stdout
 
 
+def settings_record(channel: int = 82, microsteps: int = 16, address: bytes = b'T3MPC') -> bytes:
+    """Return a copy of the settings as it stands in EEPROM."""
+    body = bytes([1, channel, *microsteps.to_bytes(2, 'little'), *address])
+    return body + crc16(body).to_bytes(2, 'little')
+
+
 class Wheel(NamedTuple):
     """Statistics of the pins of a stepper driver; times in cycles."""
 
@@ -133,7 +143,7 @@ class RadioCounts(NamedTuple):
 class Boards:
     """A dongle and a robot, and a host that exchanges whole frames with them."""
 
-    def __init__(self, seed: int = 1) -> None:
+    def __init__(self, seed: int = 1, erased: bool = False) -> None:
         self._library = ctypes.CDLL(str(BUILD / 'libt3simavr.so'))
         for name, (result, arguments) in _SIGNATURES.items():
             function = getattr(self._library, name)
@@ -148,10 +158,13 @@ class Boards:
         self.seq = 0
         self.id = 0
         self.rules_broken = False  # the test itself violated the data sheet of the radio
+        if not erased:
+            for address in SETTINGS_ADDRESSES:
+                self.store(address, settings_record())
         self.imu(True)
         for channel in range(8):
             self.call('millivolts', channel, 1000)
-        self.call('millivolts', 8, 3000)
+        self.call('millivolts', 8, BATTERY // DIVIDER)
 
     def close(self) -> None:
         self._library.t3_sim_free(self._sim)
@@ -293,10 +306,10 @@ class Boards:
         raise KeyError(f'{elf.name} must have the symbol: got {name!r}')
 
 
-def booted(seed: int = 1) -> Iterator[Boards]:
+def booted(seed: int = 1, erased: bool = False) -> Iterator[Boards]:
     """Yield a new pair of boards; then check the conditions that hold after every test."""
     build()
-    pair = Boards(seed)
+    pair = Boards(seed, erased)
     yield pair
     # No data sheet is violated, and no step is lost.
     for board in (DONGLE, ROBOT):
@@ -307,6 +320,21 @@ def booted(seed: int = 1) -> Iterator[Boards]:
         assert pair.wheel(wheel).unpowered == pair.wheel(wheel).hasty == 0
     assert pair.call('overruns') == 0
     pair.close()
+
+
+def console_output(boards: Boards) -> list[Any]:
+    """Return the frames that the USB console of the robot has sent."""
+    data, at = (c_uint8 * 4096)(), (c_uint64 * 4096)()
+    count = boards.call('usb_read', data, at, 4096)
+    return [codec.decode_from_board(frame) for frame in FrameDecoder().feed(bytes(data[:count]))]
+
+
+def request(boards: Boards, frame: Any, seconds: float = 0.005) -> list[Any]:
+    """Send a frame to the console; return the replies within a time."""
+    wire = encode_frame(codec.encode(frame))
+    boards.call('usb_write', wire, len(wire))
+    boards.run(seconds)
+    return console_output(boards)
 
 
 def cycle(boards: Boards, period: float, left: int = 0, right: int = 0) -> object:

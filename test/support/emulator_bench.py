@@ -27,11 +27,13 @@ SAMPLE = Registers(164, -5, 8192, -4000, -12, 13, -131)
 class Bench:
     """Runs a link against an emulator; faults are injected by name."""
 
-    def __init__(self, flat=None, key=b'', robot_key=None, link=None, seed=1, emulator=None):
+    def __init__(
+        self, flat=None, key=b'', robot_key=None, link=None, seed=1, emulator=None, erased=False
+    ):
         robot_key = key if robot_key is None else robot_key
         if emulator is None:
             parameters = EmulatorParameters.from_dict(flat or {})
-            emulator = Emulator(parameters, robot_key, seed, START_NS)
+            emulator = Emulator(parameters, robot_key, seed, START_NS, erased)
         self.emulator = emulator
         """The emulator, or an object with its interface such as ``avr_bench.AvrEmulator``."""
         self.link = Link(link or LinkParameters(), key, random.Random(seed).randbytes)

@@ -18,13 +18,17 @@ ENABLE, ESTOP, CLEAR = 1, 2, 4
 ENABLED, MOVING, LATCHED, EXPIRED, IMU_FAULT, LOW_BATTERY, NO_SESSION, LIMITED = (
     1 << bit for bit in range(8)
 )
-OK, UNKNOWN, RANGE, READ_ONLY, BUSY = range(5)
+OK, UNKNOWN, RANGE, READ_ONLY, BUSY, FAILED = range(6)
 MAX_SPEED, ACCELERATION, DECELERATION, TTL_MAX, MICROSTEPS = range(5)
-STEPS_PER_REV, GYRO_RANGE, BATTERY_LOW, IDLE_OFF, INVERT = range(5, 10)
+STEPS_PER_REV, GYRO_RANGE, BATTERY_LOW, IDLE_OFF, INVERT, CUTOFF = range(5, 11)
 COUNTERS = ('received', 'duplicates', 'bad_session', 'stale', 'expired', 'bad_version', 'short')
 PACKET = ('kind', 'session', 'seq', 'what', 'ttl', 'left', 'right', 'value', 'host_us')
 STEP = math.tau / 3200
 SESSION = 0x5A
+INFO_SIZE = 24
+"""Without a nonce."""
+USE_HELLO, USE_SESSION_KEY = b'\1', b'\2'
+ADDRESS = b'T3MPC'
 
 
 def compile_core(target):
@@ -91,8 +95,10 @@ class Robot(Part):
 
     kind = 'robot'
 
-    def __init__(self, library, key=b'', time=0):
+    def __init__(self, library, key=b'', time=0, erased=False):
         super().__init__(library)
+        if erased:
+            self.call('erase')
         self.key = key
         self.session_key = b''
         self.seq = 0
@@ -164,10 +170,10 @@ class Robot(Part):
         head = struct.pack('<BBBBI', 0x14, session, 0, bool(self.key), self.host_us)
         if self.key:
             head += nonce
-            head += siphash(self.key, head)
+            head += siphash(self.key, USE_HELLO + head)
         info = self.request(head)
         if self.key:
-            nonces = nonce + info[17:]
+            nonces = USE_SESSION_KEY + nonce + info[INFO_SIZE:]
             self.session_key = b''.join(siphash(self.key, nonces + bytes([i])) for i in (0, 1))
         return info
 
@@ -209,6 +215,21 @@ class Robot(Part):
         room = ctypes.create_string_buffer(4096)
         size = self.call('usb_take', room, ctypes.c_uint32(4096))
         return [decode_frame(piece) for piece in room.raw[:size].split(b'\0')[:-1]]
+
+    def settings(self, channel=None, microsteps=16, address=ADDRESS, us=200_000):
+        """Store settings over USB, or read them.
+
+        Return result, state, channel, microsteps and address.
+        """
+        frame = b'\x05\x09'
+        if channel is not None:
+            frame += struct.pack('<BH', channel, microsteps) + address
+        replies = self.console(frame, us)
+        if not replies:
+            return None
+        kind, number, *values = struct.unpack('<BBBBBH5s', replies[0])
+        assert (kind, number) == (0x85, 9)
+        return tuple(values)
 
     def act(self, verb, seq, session=SESSION):
         body = struct.pack('<BBBBH', 0x16, session, seq, verb, 0)

@@ -57,6 +57,9 @@ class FakeRobot:
     def time_us(self, now_ns):
         return int((now_ns - self.booted_ns) / 1000 * (1.0 + self.skew) + self.clock_us) % WRAP
 
+    settings = frames.SETTINGS_GOOD
+    """State of the settings in INFO."""
+
     def run_to(self, now_ns):
         end = now_ns if self.until_ns is None else min(max(self.until_ns, self.reached_ns), now_ns)
         for wheel in (0, 1):
@@ -145,8 +148,11 @@ class FakeRobot:
             len(BOARD_PARAMETERS),
             200,
             16,
-            self.time_us(now_ns),
             self.status(),
+            self.settings,
+            82,
+            b'T3MPC',
+            0,
             self.verifier.nonce,
         )
 
@@ -238,7 +244,9 @@ class FakeDongle:
             chip = int(self.chip_ok)
             clock = self.time_us(now_ns)
             counts = self.decoder.counts[1:]
-            pong = frames.Pong(frame.id, frame.echo, clock, 1, 1, 0, chip, *counts, 0, 2)
+            pong = frames.Pong(
+                frame.id, frame.echo, clock, 1, 1, 0, chip, *counts, 0, 2, 0, 82, b'T3MPC', 0
+            )
             return now_ns + MS, pong
         if isinstance(frame, frames.Configure):
             self.configured = True

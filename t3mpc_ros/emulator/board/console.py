@@ -1,11 +1,11 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""USB console of the robot board: status, and the key in EEPROM, written cell by cell."""
+"""USB console of the robot board: status, key and settings."""
 
-from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
+from t3mpc_ros.emulator.board.eeprom import KeyStore, SettingsStore, Setup
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import KEY_SIZE, CommandVerifier, key_check
 from t3mpc_ros.radio.protocol.codec import decode_to_board, encode
@@ -17,73 +17,26 @@ from t3mpc_ros.radio.protocol.frames import (
     Ping,
     Pong,
     Refusal,
+    Settings,
+    SettingsState,
 )
-from t3mpc_ros.radio.protocol.framing import FrameDecoder, crc16, encode_frame
+from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
 
-CELL_US = 3_400
-"""Time to erase and write one EEPROM cell of an AVR."""
-FIRMWARE_MAJOR, FIRMWARE_MINOR = 1, 0
+FIRMWARE_MAJOR, FIRMWARE_MINOR = 1, 1
+BUILD = 0
+"""The emulator is no build of the firmware."""
 _UNKNOWN, _MALFORMED = 1, 2
-_KINDS = (0x03, 0x04)
+_KINDS = (0x03, 0x04, 0x05)
 _ERASE = bytes(KEY_SIZE)
 """Key value that requests erasure."""
-_BLANK, _MARK = 0xFF, 0
 _HALF, _WORD = 0xFFFF, 0xFFFFFFFF
-
-
-class KeyStore:
-    """Key in EEPROM: a record with a CRC, and a cell that marks an unfinished write.
-
-    Parameters
-    ----------
-    key
-        Stored key, 16 bytes; empty: none.
-    """
-
-    def __init__(self, key: bytes = b'') -> None:
-        self._cells = bytearray([*_record(key), _BLANK])
-        self._writes: deque[tuple[int, int]] = deque()
-        self._next_us = 0
-
-    @property
-    def done_us(self) -> int | None:
-        """Time at which the write is complete; None: no write in progress."""
-        return self._next_us + CELL_US * (len(self._writes) - 1) if self._writes else None
-
-    def store(self, key: bytes, now_us: int) -> None:
-        """Begin to write a key; an empty key erases the record."""
-        mark = len(self._cells) - 1
-        record = _record(key)
-        changes = [(at, to) for at, to in enumerate(record) if to != self._cells[at]]
-        self._writes.extend([(mark, _MARK), *changes, (mark, _BLANK)])
-        self._next_us = now_us + CELL_US
-
-    def update(self, now_us: int) -> None:
-        """Write the cells that are due."""
-        while self._writes and now_us >= self._next_us:
-            at, self._cells[at] = self._writes.popleft()
-            self._next_us += CELL_US
-
-    def lose_power(self, now_us: int) -> None:
-        """Abort the write: cells not written by now keep their content."""
-        self.update(now_us)
-        self._writes.clear()
-
-    def create_verifier(self) -> CommandVerifier:
-        """Return a verifier with the stored key; locked if the record is damaged."""
-        *record, mark = self._cells
-        key, crc = bytes(record[:KEY_SIZE]), bytes(record[KEY_SIZE:])
-        if mark != _BLANK:
-            return CommandVerifier(locked=True)
-        if bytes(record) == _record(b''):
-            return CommandVerifier()
-        return CommandVerifier(key) if crc == _crc(key) else CommandVerifier(locked=True)
 
 
 class _Board(Protocol):
     """Attributes of the board that the console uses."""
 
     key_store: KeyStore
+    settings_store: SettingsStore
     verifier: CommandVerifier
 
     @property
@@ -94,6 +47,8 @@ class _Board(Protocol):
 
     @property
     def reset_cause(self) -> int: ...
+
+    def apply_settings(self) -> None: ...
 
 
 class Console:
@@ -115,6 +70,7 @@ class Console:
         """Discard partial input and the reply to a write in progress."""
         self._decoder = FrameDecoder()
         self._write_id: int | None = None
+        self._settings_id: int | None = None
 
     def feed(self, data: bytes) -> None:
         """Process bytes that arrive now."""
@@ -122,8 +78,13 @@ class Console:
             self._process(frame)
 
     def update(self) -> None:
-        """Write due EEPROM cells; reply when the key is complete."""
+        """Write due EEPROM cells; reply when the key or the settings are complete."""
         board = self._board
+        board.settings_store.update(board.now_us)
+        if self._settings_id is not None and not board.settings_store.writing:
+            number, self._settings_id = self._settings_id, None
+            board.apply_settings()
+            self._send_settings(number, frames.OK)
         board.key_store.update(board.now_us)
         if self._write_id is None or board.key_store.done_us is not None:
             return
@@ -142,15 +103,40 @@ class Console:
             return
         if isinstance(frame, Ping):
             self._send_pong(frame)
+        elif isinstance(frame, Settings):
+            self._process_settings(frame)
         elif not frame.key:
             self._send_key_state(frame.id, frames.OK)
-        elif self._write_id is not None or not self._board.at_rest:
+        elif self._busy:
             self._send_key_state(frame.id, frames.BUSY)
         else:
             self._write_id = frame.id
             self._board.verifier = CommandVerifier(locked=True)
             key = b'' if frame.key == _ERASE else frame.key
             self._board.key_store.store(key, self._board.now_us)
+
+    @property
+    def _busy(self) -> bool:
+        board = self._board
+        return self._write_id is not None or board.settings_store.writing or not board.at_rest
+
+    def _process_settings(self, frame: Settings) -> None:
+        board = self._board
+        setup = Setup(frame.channel, frame.microsteps, frame.address)
+        if not frame.address:
+            self._send_settings(frame.id, frames.OK)
+        elif not setup.valid:
+            self._send_settings(frame.id, frames.OUT_OF_RANGE)
+        elif self._busy:
+            self._send_settings(frame.id, frames.BUSY)
+        else:
+            self._settings_id = frame.id
+            board.verifier.end_session()
+            board.settings_store.store(setup, board.now_us)
+
+    def _send_settings(self, number: int, rc: int) -> None:
+        store = self._board.settings_store
+        self._send_frame(SettingsState(number, rc, store.state, *store.setup))
 
     def _send_key_state(self, number: int, rc: int) -> None:
         verifier = self._board.verifier
@@ -166,15 +152,10 @@ class Console:
         version = VERSION, FIRMWARE_MAJOR, FIRMWARE_MINOR, 1
         errors = counts.crc_errors & _HALF, counts.frame_errors & _HALF, 0
         now = board.now_us & _WORD
-        self._send_frame(Pong(ping.id, ping.echo, now, *version, *errors, board.reset_cause))
+        store = board.settings_store
+        radio = store.setup.channel, store.setup.address
+        cause = board.reset_cause, store.state
+        self._send_frame(Pong(ping.id, ping.echo, now, *version, *errors, *cause, *radio, BUILD))
 
     def _send_frame(self, frame: FromBoard) -> None:
         self.reply(encode_frame(encode(frame)))
-
-
-def _crc(key: bytes) -> bytes:
-    return crc16(key).to_bytes(2, 'little')
-
-
-def _record(key: bytes) -> bytes:
-    return key + _crc(key) if key else bytes([_BLANK]) * (KEY_SIZE + 2)

@@ -11,14 +11,15 @@ of the firmware core.
 from collections.abc import Callable
 from typing import NamedTuple
 
-from t3mpc_ros.emulator.board.console import FIRMWARE_MAJOR, FIRMWARE_MINOR, Console, KeyStore
+from t3mpc_ros.emulator.board.console import BUILD, FIRMWARE_MAJOR, FIRMWARE_MINOR, Console
+from t3mpc_ros.emulator.board.eeprom import KeyStore, SettingsStore, Setup
 from t3mpc_ros.emulator.board.hardware import Hardware, Registers
 from t3mpc_ros.emulator.board.motion import Wheels
 from t3mpc_ros.emulator.board.parameter_store import (
+    BATTERY_CUTOFF,
     BATTERY_LOW,
     INVERT_WHEELS,
     MAX_SPEED,
-    MICROSTEPS,
     STEPS_PER_REV,
     TTL_MAX,
     ParameterStore,
@@ -53,6 +54,11 @@ REFRESH_US = 100_000
 """Period at which the loaded reply is renewed without packets."""
 SESSION_TIMEOUT_US = 1_800_000_000
 """Silence that ends a session: after a longer one, 32-bit clocks are ambiguous."""
+PRESS_US, RELEASE_US = 5_000, 50_000
+"""The button counts as pressed, or as released, after this time without a bounce."""
+BATTERY_PERIOD_US = 100_000
+"""Period of the battery measurement, whose low pass has a time constant of 8 periods."""
+_BATTERY_WEIGHT = 8
 MAX_STEP_RATE = 10_000
 """Maximum microsteps per second of a wheel: one per two ticks of a 20 kHz interrupt."""
 _REVOLUTION = 6_283_185.3071795865
@@ -76,6 +82,8 @@ class RobotBoard:
         Loads the payload that the next packet fetches.
     settle_us
         Delay from a packet to its reply.
+    setup
+        Stored settings; None: a board that was never set up.
     """
 
     def __init__(
@@ -85,15 +93,19 @@ class RobotBoard:
         entropy: Callable[[int], bytes],
         load: Callable[[bytes], None],
         settle_us: int = SETTLE_US,
+        setup: Setup | None = Setup(),  # noqa: B008 (immutable)
     ) -> None:
         self._hardware = hardware
         self.key_store = KeyStore(key)
+        self.settings_store = SettingsStore(setup)
+        self.on_setup: Callable[[Setup], None] = lambda setup: None
+        """Called with the settings in effect, at boot and after a change."""
         self._entropy = entropy
         self._load_payload = load
         self._settle_us = settle_us
         self._parameters = ParameterStore()
         self.button_pressed = False
-        """Whether the emergency stop button is pressed."""
+        """Level of the emergency stop button, before it is debounced."""
         self.on_command: Callable[[int, Command], None] = lambda now_us, command: None
         """Called with time and content of each command that sets the wheel speeds."""
         self.console = Console(self)
@@ -103,15 +115,20 @@ class RobotBoard:
     def boot(self, reset_cause: int, time_us: int = 0) -> None:
         """Boot: at rest, drivers off, no session; the RAM is cleared."""
         self.key_store.lose_power(self._now)
+        self.settings_store.lose_power(self._now)
         self._now = self._booted = time_us
         self.reset_cause = reset_cause
         """Reset flags as in the MCUSR register of an AVR."""
         self.verifier = self.key_store.create_verifier()
         self.console.reset()
         self._parameters.reset()
-        self._microsteps = self._parameters[MICROSTEPS]
-        steps = self._parameters[STEPS_PER_REV] * self._microsteps
-        self._max_speed = int(MAX_STEP_RATE * _REVOLUTION / steps / 1000)
+        self.settings_store.boot(time_us)
+        self._use_microsteps()
+        self._pressed = False
+        self._button_us = self._battery_us = time_us
+        self._battery_sum = 0
+        self._flat = False
+        self._measure_battery()
         self._counters = PacketCounters()
         self._wheels = Wheels(self._hardware, self._parameters, time_us)
         self._ramp = self._wheels.ramp
@@ -131,6 +148,21 @@ class RobotBoard:
         self._hardware.boot(self._microsteps)
         self._hardware.set_power(False)
         self._hardware.set_speeds(0, 0)
+        self.on_setup(self.settings_store.setup)
+
+    def apply_settings(self) -> None:
+        """Apply settings that were written at rest; the counters continue."""
+        counters = self._wheels.counters
+        self._use_microsteps()
+        self._hardware.boot(self._microsteps)
+        self._wheels.counters = counters
+        self.on_setup(self.settings_store.setup)
+
+    def _use_microsteps(self) -> None:
+        self._microsteps = self.settings_store.setup.microsteps
+        self._parameters.use_microsteps(self._microsteps)
+        steps = self._parameters[STEPS_PER_REV] * self._microsteps
+        self._max_speed = int(MAX_STEP_RATE * _REVOLUTION / steps / 1000)
 
     @property
     def now_us(self) -> int:
@@ -146,6 +178,12 @@ class RobotBoard:
     def at_rest(self) -> bool:
         """Whether the robot is disabled and stopped, and its drivers are off."""
         return not (self._enabled or self._wheels.powered or self._ramp.busy)
+
+    @property
+    def eeprom_done_us(self) -> int | None:
+        """Time at which the EEPROM writes are complete; None: no write in progress."""
+        times = (self.key_store.done_us, self.settings_store.done_us)
+        return max((time for time in times if time is not None), default=None)
 
     @property
     def speeds(self) -> tuple[int, int]:
@@ -171,7 +209,7 @@ class RobotBoard:
     @property
     def status(self) -> StatusFlag:
         """Status flags of the uplink frames."""
-        supply = self._hardware.battery
+        supply = self._battery
         bits = (
             (StatusFlag.ENABLED, self._enabled),
             (StatusFlag.MOVING, self._ramp.moving),
@@ -195,6 +233,9 @@ class RobotBoard:
 
     def press_button(self, pressed: bool) -> None:
         """Press or release the emergency stop button."""
+        if self.button_pressed == self._pressed:
+            # The last pass saw no difference.
+            self._button_us = self._now - (self._now - self._booted) % LOOP_US
         self.button_pressed = pressed
         self._pass_needed = True
 
@@ -212,7 +253,10 @@ class RobotBoard:
         if self._ttl_end is not None:
             times.append(self._ttl_end)
         times += self._wheels.due_times()
-        if (done_us := self.key_store.done_us) is not None:
+        times.append(self._battery_us + BATTERY_PERIOD_US)
+        if self.button_pressed != self._pressed:
+            times.append(self._button_us + (PRESS_US if self.button_pressed else RELEASE_US))
+        if (done_us := self.eeprom_done_us) is not None:
             times.append(done_us)
         return max(after, min(times) + (self._booted - min(times)) % LOOP_US)
 
@@ -220,8 +264,8 @@ class RobotBoard:
         """Run one pass of the main loop."""
         now = self._now
         self._wheels.skip_periods(now - LOOP_US)
-        if self.button_pressed:
-            self._latch_estop()
+        self._watch_button()
+        self._watch_battery()
         if self._ttl_end is not None and now >= self._ttl_end:
             self._ttl_end, self._expired = None, True
             self._counters.increment('expired')
@@ -230,9 +274,44 @@ class RobotBoard:
             self.verifier.end_session()
             self._disable()
         self._wheels.update_power(self._enabled, now)
-        self._pass_needed = self._wheels.update_ramp(now, self._estop)
         self._load_reply()
+        self._pass_needed = self._wheels.update_ramp(now, self._estop)
         self.console.update()
+
+    def _watch_button(self) -> None:
+        now, delay = self._now, PRESS_US if self.button_pressed else RELEASE_US
+        if self.button_pressed == self._pressed:
+            self._button_us = now
+        elif now - self._button_us >= delay:
+            self._pressed = self.button_pressed
+        if self._pressed:
+            self._latch_estop()
+
+    @property
+    def _battery(self) -> int:
+        """Filtered voltage of the battery, mV; 0: not measured."""
+        return self._battery_sum // _BATTERY_WEIGHT
+
+    def _watch_battery(self) -> None:
+        if self._now - self._battery_us < BATTERY_PERIOD_US:
+            return
+        self._battery_us = self._now
+        self._measure_battery()
+        if self._flat:
+            self._disable()
+
+    def _measure_battery(self) -> None:
+        supply = self._hardware.battery
+        if not supply or not self._battery_sum:
+            self._battery_sum = _BATTERY_WEIGHT * supply
+        else:
+            self._battery_sum += supply - self._battery
+        cutoff, low = self._parameters[BATTERY_CUTOFF], self._parameters[BATTERY_LOW]
+        # The voltage rises as soon as the motors rest: below the warning, the robot stays off.
+        if not self._battery or self._battery >= max(cutoff, low):
+            self._flat = False
+        elif self._battery < cutoff:
+            self._flat = True
 
     def _load_reply(self) -> None:
         if self._reply_due is not None:
@@ -288,8 +367,13 @@ class RobotBoard:
         return self.verifier.accept(frame) == ''
 
     def _process_hello(self, hello: Hello) -> None:
-        # Even after a rejection, INFO reports the current session and whether a key is stored.
+        # Even after a rejection, INFO reports the current session, the state of the settings, and
+        # whether a key is stored.
         self._reply = PendingReply(frames.Info, hello.seq)
+        if self.settings_store.state not in (frames.SETTINGS_GOOD, frames.SETTINGS_ONE_COPY):
+            # Its address is that of every such board, and its microsteps are unknown.
+            self._counters.increment('bad_session')
+            return
         before = self.verifier.nonce
         if self.verifier.begin_session(hello, self._entropy(NONCE_SIZE)):
             self._counters.increment('bad_session')
@@ -343,10 +427,10 @@ class RobotBoard:
         if (
             command.flags == CommandFlag.ESTOP_CLEAR
             and not (command.left or command.right)
-            and not self.button_pressed
+            and not (self._pressed or self.button_pressed)
         ):
             self._estop = False
-        if self._estop or not command.flags & CommandFlag.ENABLE:
+        if self._estop or self._flat or not command.flags & CommandFlag.ENABLE:
             self._disable()
             return
         self._enabled = True
@@ -395,7 +479,7 @@ class RobotBoard:
         session, seq = self.verifier.session, reply.seq
         time_us = self._now & 0xFFFFFFFF
         if reply.kind is frames.Info:
-            return self._info(seq, time_us)
+            return self._info(seq)
         if reply.kind is frames.Param:
             return self._parameter(reply)
         if reply.kind is frames.Ack:
@@ -407,7 +491,8 @@ class RobotBoard:
             return self._aux(seq, time_us, sample)
         return self._state(time_us, sample)
 
-    def _info(self, seq: int, time_us: int) -> frames.Info:
+    def _info(self, seq: int) -> frames.Info:
+        store = self.settings_store
         return frames.Info(
             self.verifier.session,
             seq,
@@ -418,8 +503,11 @@ class RobotBoard:
             len(BOARD_PARAMETERS),
             self._parameters[STEPS_PER_REV],
             self._microsteps,
-            time_us,
             self.status,
+            store.state,
+            store.setup.channel,
+            store.setup.address,
+            BUILD,
             self.verifier.nonce,
         )
 
@@ -437,7 +525,7 @@ class RobotBoard:
             self.verifier.session,
             seq,
             self.status,
-            self._hardware.battery,
+            self._battery,
             sample.temperature,
             sample.accel_z,
             sample.gyro_x,

@@ -24,7 +24,9 @@ from t3mpc_ros.radio.protocol.frames import (
 )
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
 
-FIRMWARE_MAJOR, FIRMWARE_MINOR = 1, 0
+FIRMWARE_MAJOR, FIRMWARE_MINOR = 1, 1
+BUILD = 0
+"""The emulator is no build of the firmware."""
 DECODE_US = 140.0
 """Delay from the last byte of a frame to the start of the exchange."""
 WAKE_US = 200.0
@@ -125,6 +127,10 @@ class Dongle:
             counts.frame_errors & _HALF,
             0,
             self._reset_cause,
+            0,
+            self._radio.channel,
+            self._radio.address,
+            BUILD,
         )
         self._send_frame(pong)
 

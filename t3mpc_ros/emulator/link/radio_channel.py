@@ -82,7 +82,8 @@ class RadioChannel:
         generator: random.Random,
     ) -> None:
         self._events = events
-        self._robot = robot
+        self.robot = robot
+        """Configuration of the robot's transceiver, which follows its settings."""
         self._advance_robot = advance_robot
         self._deliver = deliver
         self._faults = faults
@@ -108,7 +109,7 @@ class RadioChannel:
         A repeated packet (same PID and CRC) is acknowledged and dropped. A fetched payload stays
         in the FIFO until a packet with a new PID confirms its reception.
         """
-        receives = self._advance_robot() and radio.matches(self._robot)
+        receives = self._advance_robot() and radio.matches(self.robot)
         lost = self._generator.random() < self._faults.combined_probability('loss', 'loss_down')
         if not receives or lost or self._faults.active('jam'):
             return None

@@ -100,6 +100,10 @@ class Session:
         """Start the session with the INFO of the robot; return the problem if there is one."""
         if info.protocol != VERSION:
             return f'the robot must speak protocol {VERSION}: it speaks {info.protocol}'
+        if info.settings == frames.SETTINGS_MISSING:
+            return reasons.SETTINGS_MISSING
+        if info.settings == frames.SETTINGS_DAMAGED:
+            return reasons.SETTINGS_DAMAGED
         if self._key and not info.nonce:
             return reasons.ROBOT_KEY_MISSING
         if info.nonce and not self._key:

@@ -349,7 +349,10 @@ class Link:
             return reason
         if status & StatusFlag.TTL_EXPIRED:
             return reasons.TTL_EXPIRED
-        return '' if status & StatusFlag.ENABLED else reasons.DRIVES_DISABLED
+        if status & StatusFlag.ENABLED:
+            return ''
+        low = status & StatusFlag.LOW_BATTERY
+        return reasons.BATTERY_CUTOFF if low else reasons.DRIVES_DISABLED
 
     # -- commands ---------------------------------------------------------------------------------
 

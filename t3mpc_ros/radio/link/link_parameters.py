@@ -54,6 +54,14 @@ class RobotParameters(Parameters):
     battery_low: float = parameter(
         10.2, 'supply voltage below which the robot warns', unit='V', low=0.0, high=30.0
     )
+    battery_cutoff: float = parameter(
+        9.0,
+        'supply voltage below which the robot stops, until it is above battery_low; 0: none',
+        unit='V',
+        low=0.0,
+        high=30.0,
+        source='3 V per Li-ion cell',
+    )
     idle_off: float = parameter(
         0.0,
         'standstill after which the drivers switch off, without holding torque; 0: never',
@@ -74,6 +82,7 @@ class RobotParameters(Parameters):
                 'deceleration',
                 'ttl_max',
                 'battery_low',
+                'battery_cutoff',
                 'idle_off',
             )
         }

@@ -19,6 +19,14 @@ ROBOT_KEY_MISSING = (
 KEY_MISMATCH = (
     'the robot rejects HELLO: the keys differ, or its own is damaged (t3mpc robot key state)'
 )
+SETTINGS_MISSING = (
+    'the robot has no settings, so it accepts no session: t3mpc robot set, over its own USB'
+)
+SETTINGS_DAMAGED = (
+    'the settings of the robot are damaged, so it accepts no session: t3mpc robot set, over its '
+    'own USB'
+)
+BATTERY_CUTOFF = 'the battery of the robot is below its cut-off: charge it'
 HELLO_REJECTED = 'the robot rejects HELLO'
 COMMANDS_REJECTED = 'the robot receives commands but accepts none'
 DRIVES_DISABLED = 'the drives of the robot are not enabled yet'

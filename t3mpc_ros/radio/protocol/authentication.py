@@ -31,6 +31,12 @@ NONCE_SIZE = 8
 SignedFrame = Command | ParamSet | Action
 """Frames that change the robot, signed under the session key."""
 
+_USE_HELLO, _USE_SESSION_KEY, _USE_CHECK = b'\x01', b'\x02', b'\x04'
+"""Uses of the long-term key, before what is hashed: no output of one use is valid in another.
+
+3 is the generation of nonces in the robot.
+"""
+
 AnySignedFrame = TypeVar('AnySignedFrame', Command, ParamSet, Action)
 _EMPTY_TAG = bytes(TAG_SIZE)
 
@@ -88,7 +94,7 @@ def key_check(key: bytes) -> int:
 
     It allows a candidate key to be tested offline: the key must be random, not a passphrase.
     """
-    return int.from_bytes(siphash(key, b't3mpc')[:4], 'little')
+    return int.from_bytes(siphash(key, _USE_CHECK + b't3mpc')[:4], 'little')
 
 
 def session_key(key: bytes, host_nonce: bytes, robot_nonce: bytes) -> bytes:
@@ -96,19 +102,23 @@ def session_key(key: bytes, host_nonce: bytes, robot_nonce: bytes) -> bytes:
     for name, nonce in (('host_nonce', host_nonce), ('robot_nonce', robot_nonce)):
         if len(nonce) != NONCE_SIZE:
             raise ValueError(f'{name} must be {NONCE_SIZE} bytes long: got {len(nonce)}')
-    nonces = host_nonce + robot_nonce
+    nonces = _USE_SESSION_KEY + host_nonce + robot_nonce
     return siphash(key, nonces + b'\x00') + siphash(key, nonces + b'\x01')
 
 
 def sign_hello(key: bytes, session: int, seq: int, host_us: int, nonce: bytes) -> Hello:
     """Return a HELLO signed under the long-term key."""
     hello = Hello(session, seq, host_us, nonce, _EMPTY_TAG)
-    return hello._replace(tag=siphash(key, encode(hello)[:-TAG_SIZE]))
+    return hello._replace(tag=_hello_tag(key, hello))
 
 
 def verify_hello(key: bytes, hello: Hello) -> bool:
     """Return whether a HELLO carries the tag of the long-term key."""
-    return bool(hello.tag) and _tags_match(siphash(key, encode(hello)[:-TAG_SIZE]), hello.tag)
+    return bool(hello.tag) and _tags_match(_hello_tag(key, hello), hello.tag)
+
+
+def _hello_tag(key: bytes, hello: Hello) -> bytes:
+    return siphash(key, _USE_HELLO + encode(hello)[:-TAG_SIZE])
 
 
 def frame_tag(frame: SignedFrame, key: bytes, epoch: int) -> bytes:

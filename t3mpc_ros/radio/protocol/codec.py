@@ -36,6 +36,8 @@ from t3mpc_ros.radio.protocol.frames import (
     Pong,
     Refusal,
     Result,
+    Settings,
+    SettingsState,
     State,
     ToBoard,
     ToDongle,
@@ -299,7 +301,7 @@ _COMMAND = 'session B, seq B, flags B 0 7, ttl B, reserved B 0 0, left h, right 
 _PARAM_SET, _ACTION = 'session B, seq B, id B, value i', 'session B, seq B, verb B, reserved H 0 0'
 _INFO = (
     'session B, seq B, protocol B, major B, minor B, reset_cause B, parameters B, '
-    'steps_per_rev H, microsteps H, time_us I, status B'
+    'steps_per_rev H, microsteps H, status B, settings B 0 3, channel B 0 125, address 5s, build I'
 )
 _RADIO_SETUP = (
     'id B, channel B 0 125, rate B 0 2, power B 0 3, retry_delay B 0 15, retries B 0 15, '
@@ -356,16 +358,24 @@ _FROM_DONGLE = {
         'PONG',
         0x83,
         'id B, echo 4s, time_us I, protocol B, major B, minor B, chip_ok B 0 1, '
-        'crc_errors H, frame_errors H, overruns H, reset_cause B',
+        'crc_errors H, frame_errors H, overruns H, reset_cause B, settings B 0 3, '
+        'channel B 0 125, address 5s, build I',
     ),
     0x8F: _layout(Refusal, 'ERR', 0x8F, 'code B 1 3, argument B'),
 }
 _TO_BOARD = {
     0x03: _TO_DONGLE[0x03],
     0x04: _layout(Key, 'KEY', 0x04, 'id B', 'id B, key 16s'),
+    0x05: _layout(Settings, 'SETTINGS', 0x05, 'id B', 'id B, channel B, microsteps H, address 5s'),
 }
 _FROM_BOARD = {
     0x83: _FROM_DONGLE[0x83],
     0x84: _layout(KeyState, 'KEY', 0x84, 'id B, rc B 0 5, state B 0 2, check I'),
+    0x85: _layout(
+        SettingsState,
+        'SETTINGS',
+        0x85,
+        'id B, rc B 0 5, state B 0 3, channel B 0 125, microsteps H, address 5s',
+    ),
     0x8F: _FROM_DONGLE[0x8F],
 }

@@ -57,9 +57,11 @@ STATE, AUX, INFO = 0, 1, 2
 RESET_ODOMETRY, CLEAR_COUNTERS = 1, 2
 """Verbs of an ACTION; RESET_ODOMETRY is rejected while the robot moves."""
 OK, UNKNOWN, OUT_OF_RANGE, READ_ONLY, BUSY, FAILED = range(6)
-"""Result codes of PARAM, ACK and KEY; FAILED only in KEY."""
+"""Result codes of PARAM, ACK, KEY and SETTINGS; FAILED only in the last two."""
 NO_KEY, KEY_HELD, KEY_DAMAGED = range(3)
 """State of the key in KEY from the robot."""
+SETTINGS_GOOD, SETTINGS_ONE_COPY, SETTINGS_MISSING, SETTINGS_DAMAGED = range(4)
+"""State of the settings of the robot; with the last two it accepts no session."""
 AGE_NONE = 0xFFFF
 """Age in a STATE before the first CMD of a session."""
 
@@ -186,8 +188,14 @@ class Info(NamedTuple):
     """Number of board parameters."""
     steps_per_rev: int
     microsteps: int
-    time_us: int
     status: int
+    settings: int
+    """SETTINGS_GOOD, …"""
+    channel: int
+    """Like the address: in effect."""
+    address: bytes
+    build: int
+    """Digest of the sources and build settings of the firmware."""
     nonce: bytes = b''
     """8 bytes from a keyed robot, zeros before its first HELLO; otherwise empty."""
 
@@ -306,6 +314,13 @@ class Pong(NamedTuple):
     frame_errors: int
     overruns: int
     reset_cause: int
+    settings: int
+    """State of the settings of a robot board; 0 from a dongle."""
+    channel: int
+    """Of the radio, like the address."""
+    address: bytes
+    build: int
+    """Digest of the sources and build settings of the firmware."""
 
 
 class Refusal(NamedTuple):
@@ -337,13 +352,38 @@ class KeyState(NamedTuple):
     """``authentication.key_check`` of the stored key, else 0."""
 
 
+class Settings(NamedTuple):
+    """SETTINGS, host to the USB of the robot board: store settings; without an address, read."""
+
+    id: int
+    channel: int = 0
+    """2400 MHz plus this."""
+    microsteps: int = 0
+    """A power of two up to 256."""
+    address: bytes = b''
+    """5 bytes that are not all equal, last transmitted byte first."""
+
+
+class SettingsState(NamedTuple):
+    """SETTINGS, robot board to host over its USB: result, state and values in effect."""
+
+    id: int
+    rc: int
+    """OK; OUT_OF_RANGE; BUSY: moving, drivers on, or writing; FAILED: the EEPROM did not hold."""
+    state: int
+    """SETTINGS_GOOD, …"""
+    channel: int
+    microsteps: int
+    address: bytes
+
+
 Downlink = Command | ParamGet | ParamSet | Hello | Poll | Action
 Uplink = State | Param | Info | Ack | Aux
 ToDongle = Transmit | Configure | Ping
 FromDongle = Result | Configured | Pong | Refusal
-ToBoard = Ping | Key
+ToBoard = Ping | Key | Settings
 """Over the USB of the robot board, like the next."""
-FromBoard = Pong | KeyState | Refusal
+FromBoard = Pong | KeyState | SettingsState | Refusal
 
 
 # -- board parameters -----------------------------------------------------------------------------
@@ -358,6 +398,7 @@ class BoardParameter(NamedTuple):
     low: int
     high: int
     text: str
+    read_only: bool = False
 
 
 BOARD_PARAMETERS = (
@@ -365,11 +406,12 @@ BOARD_PARAMETERS = (
     BoardParameter('acceleration', 'mrad/s2', 30000, 100, 100000, 'of the faster changing wheel'),
     BoardParameter('deceleration', 'mrad/s2', 60000, 100, 200000, 'the same while stopping'),
     BoardParameter('ttl_max', 'ms', 250, 20, 500, 'maximum time to live of a command'),
-    BoardParameter('microsteps', '', 16, 1, 256, 'applied at the next start; set at standstill'),
-    BoardParameter('steps_per_rev', '', 200, 200, 200, 'full steps of the motor'),
-    BoardParameter('gyro_range', 'deg/s', 500, 500, 500, 'full scale of the gyro'),
+    BoardParameter('microsteps', '', 16, 1, 256, 'of the settings: t3mpc robot set', True),
+    BoardParameter('steps_per_rev', '', 200, 200, 200, 'full steps of the motor', True),
+    BoardParameter('gyro_range', 'deg/s', 500, 500, 500, 'full scale of the gyro', True),
     BoardParameter('battery_low', 'mV', 10200, 0, 30000, 'status bit LOW_BATTERY below this'),
     BoardParameter('idle_off', 'ms', 0, 0, 600000, 'drivers off after this standstill; 0: never'),
     BoardParameter('invert_wheels', 'bits', 0, 0, 3, '1: left, 2: right'),
+    BoardParameter('battery_cutoff', 'mV', 9000, 0, 30000, 'no driving below this; 0: no limit'),
 )
-"""Board parameters by id; one with ``low == high`` is read-only."""
+"""Board parameters by id."""

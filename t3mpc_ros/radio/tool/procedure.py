@@ -29,12 +29,14 @@ from t3mpc_ros.radio.protocol.frames import (
     Pong,
     Refusal,
     Result,
+    Settings,
+    SettingsState,
     Transmit,
 )
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
 from t3mpc_ros.radio.serial_port import PortError, SerialPort
 
-RequestFrame = Ping | Configure | Transmit | Key
+RequestFrame = Ping | Configure | Transmit | Key | Settings
 ReplyFrame = FromDongle | FromBoard
 
 _PING_TIMEOUT = 0.1
@@ -208,7 +210,13 @@ class Procedure(Generic[Value]):
 def _is_reply_to(reply: ReplyFrame, request: RequestFrame) -> bool:
     if isinstance(reply, Refusal):
         return True  # without an id, but only one request is in flight
-    kinds = {Ping: Pong, Configure: Configured, Transmit: Result, Key: KeyState}
+    kinds = {
+        Ping: Pong,
+        Configure: Configured,
+        Transmit: Result,
+        Key: KeyState,
+        Settings: SettingsState,
+    }
     if not isinstance(reply, kinds[type(request)]) or reply.id != request.id:
         return False
     return not isinstance(request, Ping) or getattr(reply, 'echo', b'') == request.echo

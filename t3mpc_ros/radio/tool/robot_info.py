@@ -31,6 +31,7 @@ from t3mpc_ros.radio.tool.procedure import (
     read_radio_setup,
     wait_for_dongle,
 )
+from t3mpc_ros.radio.tool.robot_settings import SETTINGS_TEXTS
 
 _REPLY_TIMEOUT = 0.25
 """s"""
@@ -118,6 +119,8 @@ def format_robot_info(robot: RobotInfo, parameters: LinkParameters) -> str:
     lines = [
         f'firmware {info.major}.{info.minor}, {info.steps_per_rev} steps of {info.microsteps} '
         f'microsteps, {signed}',
+        f'build {info.build:08x}, address {info.address.hex()}, channel {info.channel}, '
+        f'{SETTINGS_TEXTS[info.settings]}',
         '',
         f'{"parameter":<14}  {"value":>7}  {"unit":<7}  {"allowed":<16}  {"bridge sets":>11}',
     ]
@@ -130,7 +133,7 @@ def _format_parameter(value: Param, target: int | None) -> str:
     known: Sequence[frames.BoardParameter] = BOARD_PARAMETERS
     row = known[value.id] if value.id < len(known) else None
     name, unit = (row.name, row.unit) if row else (f'number {value.id}', '')
-    bounds = 'fixed' if value.low == value.high else f'{value.low} to {value.high}'
+    bounds = 'fixed' if row and row.read_only else f'{value.low} to {value.high}'
     sets = '' if target is None else str(target)
     text = f'{name:<14}  {value.value:>7}  {unit:<7}  {bounds:<16}  {sets:>11}'
     return text.rstrip()

@@ -1,0 +1,150 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""From an erased board to a driving robot with the commands of docs/robot.md, and no other.
+
+Virtual time, on the emulated boards and on the firmware of both boards in simavr.
+"""
+
+from contextlib import ExitStack
+from pathlib import Path
+import re
+import shlex
+
+import pytest
+from support.avr_bench import on_avr
+from support.avr_boards import missing_tools
+from support.emulator_bench import RobotBench
+from support.tool_bench import START_NS, ToolBench
+import yaml
+
+from t3mpc_ros.cli import emulator as emulator_cli
+from t3mpc_ros.cli import robot as cli
+from t3mpc_ros.emulator.emulator import Emulator
+from t3mpc_ros.radio.protocol.authentication import read_key
+from t3mpc_ros.radio.radio_robot import RadioRobotParameters
+
+ROOT = Path(__file__).resolve().parents[2]
+WHEEL_CIRCUMFERENCE = 0.2199
+"""m"""
+
+
+def documented_commands():
+    """Return the commands of the section that needs no robot, each as a list of words."""
+    text = (ROOT / 'docs' / 'robot.md').read_text()
+    (block,) = re.findall(
+        r'^## Try it without a robot\n.*?```console\n(.*?)```', text, re.M | re.S
+    )
+    return [shlex.split(line.removeprefix('scripts/run ')) for line in block.splitlines()]
+
+
+class Walk:
+    """Executes the commands at the ports of one robot.
+
+    Parameters
+    ----------
+    emulator
+        Both boards, with erased EEPROM.
+    """
+
+    def __init__(self, emulator, monkeypatch, capsys):
+        self.bench = ToolBench(emulator=emulator)
+        self._capsys = capsys
+        self._ports = {}
+        monkeypatch.setattr(cli, 'run_at_port', self._run_at_port)
+
+    def _run_at_port(self, task, path, interrupted, device='the dongle'):
+        self.bench.run(task, robot=path == self._ports['robot_link'])
+
+    def emulator(self, arguments):
+        options = emulator_cli._parser().parse_args(arguments)
+        assert options.erased
+        assert options.key is None
+        self._ports = {'link': str(options.link), 'robot_link': str(options.robot_link)}
+
+    def robot(self, arguments):
+        """Execute a command of the bench tool; return its output."""
+        assert cli.main(arguments) == 0, self._capsys.readouterr()
+        return self._capsys.readouterr().out
+
+    def bridge(self, arguments):
+        """Return the host of radio_bridge with these arguments, at the same boards."""
+        marker, *rest = arguments
+        assert marker == '--ros-args'
+        values, key = {}, b''
+        for option, text in zip(rest[::2], rest[1::2], strict=True):
+            if option == '--params-file':
+                content = yaml.safe_load(Path(text).read_text())['/**']['ros__parameters']
+                values |= {f'link.{name}': value for name, value in content['link'].items()}
+                continue
+            name, value = text.split(':=')
+            assert option == '-p'
+            if name == 'key_file':
+                key = read_key(Path(value))
+            else:
+                assert (name, value) == ('port', self._ports['link'])
+        RadioRobotParameters.from_dict(values)
+        return RobotBench(values, key=key, emulator=self.bench.emulator)
+
+
+@pytest.fixture(
+    params=[
+        'emulator',
+        pytest.param(
+            'avr',
+            marks=[
+                pytest.mark.slow,
+                pytest.mark.skipif(
+                    bool(missing_tools()), reason=f'not installed: {missing_tools()}'
+                ),
+            ],
+        ),
+    ]
+)
+def walk(request, monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    with ExitStack() as stack:
+        if request.param == 'avr':
+            emulator = stack.enter_context(on_avr(erased=True)).emulator
+        else:
+            parameters = emulator_cli.EmulatorParameters()
+            emulator = Emulator(parameters, b'', 1, START_NS, erased=True)
+        yield Walk(emulator, monkeypatch, capsys)
+
+
+def test_documented_commands_lead_to_a_driving_robot(walk):
+    unset = RobotBench(emulator=walk.bench.emulator)
+    unset.drive(4.0, 4.0)
+    unset.run(2.0)
+    assert 'no settings' in unset.link.reason(unset.now_ns)
+    assert walk.bench.board.counters == (0, 0)
+    unset.kill()
+    walk.bench.now_ns = unset.now_ns
+
+    outputs = {}
+    for words in documented_commands():
+        match words:
+            case ['t3mpc', 'emulator', *arguments]:
+                walk.emulator(arguments)
+            case ['t3mpc', 'robot', *arguments]:
+                outputs[arguments[0]] = walk.robot(arguments)
+            case ['radio_bridge', *arguments]:
+                bench = walk.bridge(arguments)
+            case _:
+                raise AssertionError(f'the command must be known: got {words}')
+    assert 'target 3200' in outputs['jog']
+    left, right = walk.bench.board.counters
+    assert (left, right) == (pytest.approx(3200, abs=2), 0)
+
+    start = bench.plant.pose
+    bench.connect()
+    bench.run(1.5)
+    bench.drive(4.0, 4.0)
+    bench.run(2.0)
+    assert bench.link.reason(bench.now_ns) == ''
+    assert bench.link.authenticated
+    bench.drive(0.0, 0.0)
+    bench.run(0.5)
+    end = bench.plant.pose
+    driven = ((end.x - start.x) ** 2 + (end.y - start.y) ** 2) ** 0.5
+    assert driven == pytest.approx(2.0 * 4.0 * WHEEL_CIRCUMFERENCE / 6.2832, rel=0.1)
+    assert bench.link.telemetry.status.enabled
