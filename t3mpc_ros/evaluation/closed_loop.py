@@ -402,8 +402,12 @@ def run(
         if rows:
             observation.future = now[k : k + rows]
         asked = controller.step(observation)
-        if k == 0 and np.shape(asked) != (2,):
-            raise ValueError(f'a method must answer with shape (2,): got {np.shape(asked)}')
+        if k == 0 and not (isinstance(asked, np.ndarray) and asked.shape == (2,)):
+            what = f'shape {asked.shape}' if isinstance(asked, np.ndarray) else repr(asked)
+            raise ValueError(
+                f'step() of {type(controller).__name__} must return a numpy array of shape (2,), '
+                f'the accelerations of the right and the left wheel: got {what}'
+            )
         right, left = asked.tolist()
         if not (math.isfinite(right) and math.isfinite(left)):
             _break_off(record, k)

@@ -290,7 +290,9 @@ def _rms(values: Array) -> float:
 
 
 def _spread(values: Sequence[float], sign: str = '') -> str:
-    return f'{mean(values):{sign}.4f} ± {interval(values):.4f}'
+    half = interval(values)
+    # One seed has no interval.
+    return f'{mean(values):{sign}.4f}' + (f' ± {half:.4f}' if math.isfinite(half) else ' ± –')
 
 
 def _growth(row: Sequence[Sequence[float]]) -> str:

@@ -661,3 +661,17 @@ def test_a_method_that_does_not_learn_needs_no_practice():
         MethodSpec('P', Proportional, ProportionalParameters(), True)(nominal_model).get_weights()
         == {}
     )
+
+
+class Listing(Proportional):
+    """A method that returns a list."""
+
+    def step(self, observation):
+        return super().step(observation).tolist()
+
+
+def test_a_method_that_returns_a_list_gets_a_clear_error():
+    """It ended in ``'list' object has no attribute 'tolist'``."""
+    method = MethodSpec('listing', Listing, ProportionalParameters())
+    with pytest.raises(ValueError, match=r'step\(\) of Listing must return a numpy array .* \['):
+        run(Scenario('velocity', 0.0, 'nominal', 5, 1.0), method)

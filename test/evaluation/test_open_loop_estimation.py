@@ -13,6 +13,7 @@ from t3mpc_ros.evaluation.open_loop_estimation import (
     KINDS,
     NO_FUZZY_SYSTEM,
     OUTPUT_ERROR_GAIN,
+    EstimationResult,
     OpenLoopRun,
     compare,
     difference,
@@ -182,3 +183,11 @@ def test_what_cannot_be_driven_is_refused():
         simulate_open_loop(parameters, 0.01, 1)
     with pytest.raises(ValueError, match='torque'):
         simulate_open_loop(parameters.with_values({'drive.kind': 'velocity'}), 1.0, 1)
+
+
+def test_one_seed_has_no_interval():
+    """The table once contained an infinite one."""
+    results = [EstimationResult(kind, 0.04, (0.1,), (0.2,)) for kind in KINDS]
+    text = table(results)
+    assert 'inf' not in text
+    assert '0.1000 ± –' in text
