@@ -40,7 +40,8 @@ setup(
         'matplotlib',
         'cma',
     ],
-    extras_require={'nmpc': ['casadi']},
+    # colcon test runs pytest only where it is a test dependency.
+    extras_require={'nmpc': ['casadi'], 'test': ['pytest']},
     python_requires='>=3.11',
     zip_safe=False,
     maintainer='The t3mpc_ros developers',

@@ -1,13 +1,33 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Fixtures: an isolated ROS graph for each test that needs one."""
+"""Short default set of tests; fixtures: an isolated ROS graph for each test that needs one."""
 
 import os
+from pathlib import Path
 
 import pytest
 
 from t3mpc_ros.cli.private_graph import PrivateGraph
 from t3mpc_ros.cli.process_group import ProcessGroup
+
+ROOT = Path(__file__).resolve().parent
+DEFAULT = ('geometry', 'parameters', 'fuzzy', 'control', 'robot', 'test_launch.py')
+"""What ``colcon test``, and pytest without arguments, runs in less than two minutes."""
+
+
+def pytest_collection_modifyitems(config, items):
+    """Run the default set unless paths, markers or names select tests; scripts/check runs all."""
+    chosen = config.args_source is config.ArgsSource.ARGS or config.option.markexpr
+    if chosen or config.option.keyword or hasattr(config, 'workerinput'):
+        return
+    default = [
+        item
+        for item in items
+        if {*item.path.relative_to(ROOT).parts} & {*DEFAULT}
+        and not item.get_closest_marker('slow')
+    ]
+    config.hook.pytest_deselected(items=[item for item in items if item not in default])
+    items[:] = default
 
 
 @pytest.fixture

@@ -214,6 +214,45 @@ def test_the_installed_program_computes_lyapunov_exponents(tree):
     )
 
 
+def test_colcon_test_runs_the_tests_and_reports_them(copied):
+    """Without pytest as a test dependency it ran nothing and reported success."""
+    colcon, workspace = Path(sys.prefix) / 'bin' / 'colcon', copied.source.parent.parent
+    some = ['--pytest-args', 'test/geometry/test_timing.py']
+    for words in (['test', *some], ['test-result', '--all']):
+        done = subprocess.run(
+            [colcon, *words],
+            cwd=workspace,
+            env=copied.environment,
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+    (count,) = re.findall(
+        r'^Summary: (\d+) tests, 0 errors, 0 failures', done.stdout, re.MULTILINE
+    )
+    assert int(count) > 10
+
+
+def test_the_default_set_is_a_part_that_needs_no_selection(copied):
+    """``colcon test`` gives no selection; scripts/check selects by marker and runs everything."""
+
+    def collected(*words):
+        done = subprocess.run(
+            [sys.executable, '-m', 'pytest', '--collect-only', '-q', *words],
+            cwd=copied.source,
+            env=copied.environment,
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        return {line.partition(':')[0] for line in done.stdout.splitlines() if '.py:' in line}
+
+    default = collected()
+    assert 'test/control/test_control_law.py' in default
+    assert 'test/test_readme.py' not in default
+    assert 'test/test_readme.py' in collected('test/test_readme.py')
+
+
 # --- configuration and launch -------------------------------------------------------------------
 
 CHANGED = {
