@@ -25,7 +25,14 @@ from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist
 from t3mpc_ros.nodes.common import conversions, graph_introspection, qos
-from t3mpc_ros.nodes.common.base_node import ERROR, OK, WARN, BaseNode, publish_and_wait_for_acked
+from t3mpc_ros.nodes.common.base_node import (
+    ADAPT_PERIOD,
+    ERROR,
+    OK,
+    WARN,
+    BaseNode,
+    publish_and_wait_for_acked,
+)
 from t3mpc_ros.nodes.common.command_subscription import age_problem, message_age_ns
 from t3mpc_ros.nodes.common.frame_prefix import FrameParameters
 from t3mpc_ros.parameters.table import group, parameter
@@ -49,6 +56,11 @@ class ControllerNodeParameters(ControllerParameters):
     speed_filter: SpeedFilterParameters = group(SpeedFilterParameters, lag=0.003)
     enable_stamped_cmd_vel: bool = parameter(
         False, 'publish cmd_vel as TwistStamped instead of Twist'
+    )
+    detect_cmd_vel_type: bool = parameter(
+        True,
+        'publish cmd_vel with the type that its subscribers expect, Twist or TwistStamped, if '
+        'none expects that of enable_stamped_cmd_vel',
     )
     frame_id: str = parameter('base_link', 'frame of a stamped command')
     frames: FrameParameters = group(FrameParameters, inline=True)
@@ -143,6 +155,8 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self.create_service(Trigger, '~/reset', self._on_reset)
         self.create_service(Trigger, '~/save_model', self._on_save_model)
         self.create_steady_timer(WATCHDOG_PERIOD, self._on_watchdog)
+        if self.parameters.detect_cmd_vel_type:
+            self.create_steady_timer(ADAPT_PERIOD, self._adapt_command_type)
 
     def _load_model(self) -> None:
         path = self.parameters.model
@@ -200,6 +214,25 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             self._publish_scalars(status)
         self._log_reason(status)
 
+    def _adapt_command_type(self) -> None:
+        """Publish the other type if it is the only one that a subscriber expects."""
+        other = Twist if self._command_type is TwistStamped else TwistStamped
+        topic = self.resolve_topic_name('cmd_vel')
+        expected = graph_introspection.command_types(self, topic)
+        if expected != {graph_introspection.type_name(other)}:
+            return
+        # A participant has one type for a topic: the old publisher goes first.
+        self.destroy_publisher(self._command_publisher)
+        try:
+            self._command_publisher = self.create_publisher(other, 'cmd_vel', qos.COMMAND)
+        except graph_introspection.RCLError:  # this process uses the topic with the old type
+            self._command_publisher = self.create_publisher(
+                self._command_type, 'cmd_vel', qos.COMMAND
+            )
+            return
+        self._command_type = other
+        self.get_logger().info(f'the robot expects {graph_introspection.type_name(other)}')
+
     def _on_watchdog(self) -> None:
         if self._last_odometry_ns is None:
             return
@@ -212,7 +245,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self._command_publisher.publish(self._command_message(command, stamp_ns))
 
     def _command_message(self, command: BodyTwist, stamp_ns: int) -> Twist | TwistStamped:
-        if self.parameters.enable_stamped_cmd_vel:
+        if self._command_type is TwistStamped:
             return conversions.stamped_twist(command, stamp_ns, self._frame_id)
         return conversions.twist_from_body(command)
 

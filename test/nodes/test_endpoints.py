@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """QoS of the endpoints: best-effort robots, overrides, mismatches in the diagnostics."""
 
-from geometry_msgs.msg import Twist
+from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -102,3 +102,30 @@ def test_an_override_without_endpoint_is_a_warning(processes):
     )
     processes.wait_for('sim_robot', 'qos_overrides./odom.subscription.reliability has no effect')
     assert processes.stop('sim_robot') == 0
+
+
+@pytest.mark.parametrize('expected', [Twist, TwistStamped])
+def test_the_command_has_the_type_that_the_robot_expects(expected, harness):
+    """A robot that expects the other type received nothing; the recorder expects either."""
+    foreign = harness.foreign_node()
+    received = []
+    foreign.create_subscription(expected, 'cmd_vel', received.append, 10)
+    controller = harness.add(ControllerNode, enable_stamped_cmd_vel=expected is Twist)
+    harness.spin_until(
+        lambda: any(
+            info.topic_type.endswith(f'/{expected.__name__}')
+            for info in foreign.get_publishers_info_by_topic('/cmd_vel')
+        ),
+        'the type has not changed',
+    )
+    assert reason(controller) == 'stopped: no odometry'
+
+
+def test_the_type_is_kept_while_another_robot_expects_it(harness):
+    harness.subscribe(Twist, 'cmd_vel')
+    foreign = harness.foreign_node()
+    foreign.create_subscription(TwistStamped, 'cmd_vel', print, 10)
+    controller = harness.add(ControllerNode)
+    words = 'expects geometry_msgs/msg/TwistStamped'
+    harness.spin_until(lambda: words in harness.next_status('controller').message)
+    assert controller._command_type is Twist

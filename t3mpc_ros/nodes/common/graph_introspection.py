@@ -34,6 +34,16 @@ def message_class(name: str) -> type:
     return found
 
 
+RECORDERS = ('recorder', 'rosbag2_recorder')
+"""Nodes that subscribe to a topic with the type that they find or expect."""
+
+
+def command_types(node: Node, topic: str) -> set[str]:
+    """Return the message types that the robots on a command topic expect."""
+    peers: list[TopicEndpointInfo] = node.get_subscriptions_info_by_topic(topic)
+    return {peer.topic_type for peer in peers if peer.node_name not in RECORDERS}
+
+
 def command_type_problem(node: Node, message: type, *, publish: bool) -> str:
     """Return why a node and its peers use ``cmd_vel`` with different types; empty if equal.
 
