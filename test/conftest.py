@@ -11,7 +11,7 @@ from t3mpc_ros.cli.private_graph import PrivateGraph
 from t3mpc_ros.cli.process_group import ProcessGroup
 
 ROOT = Path(__file__).resolve().parent
-DEFAULT = ('geometry', 'parameters', 'fuzzy', 'control', 'robot', 'test_launch.py')
+DEFAULT = ('geometry', 'parameters', 'robot', 'fuzzy')
 """What ``colcon test``, and pytest without arguments, runs in less than two minutes."""
 
 

@@ -248,7 +248,7 @@ def test_the_default_set_is_a_part_that_needs_no_selection(copied):
         return {line.partition(':')[0] for line in done.stdout.splitlines() if '.py:' in line}
 
     default = collected()
-    assert 'test/control/test_control_law.py' in default
+    assert 'test/robot/test_command_limiter.py' in default
     assert 'test/test_readme.py' not in default
     assert 'test/test_readme.py' in collected('test/test_readme.py')
 
