@@ -26,7 +26,7 @@ ROBOTS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
     'twin': {'sim_robot': {'drive.kind': 'stepper'}},
     'servo': {
         'sim_robot': {'drive.kind': 'velocity'},
-        'controller': {'speed_filter.lag': 0.02},
+        'controller': {'composition': 'paper', 'speed_filter.lag': 0.02, 'mean_speeds': False},
     },
     'emulator': {
         'radio_bridge': {},

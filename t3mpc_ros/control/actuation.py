@@ -164,20 +164,13 @@ class VelocityActuation:
         return self._filter
 
     @property
-    def kernel_arguments(self) -> tuple[Array, Array, float, float, Array]:
-        """State and constants of :func:`actuation_command`, in its order."""
-        return (
-            self.command,
-            self._limits,
-            self._period,
-            self._period / self._servo_step,
-            self.applied,
-        )
-
-    @property
     def dead_time(self) -> float:
         """Time until the next command takes effect, s."""
         return self._filter.dead_time
+
+    def set_dead_time(self, dead_time: float) -> None:
+        """Use another dead time (s) from the next step on."""
+        self._filter.set_dead_time(dead_time)
 
     @property
     def twist(self) -> BodyTwist:

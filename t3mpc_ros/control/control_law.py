@@ -37,11 +37,11 @@ class LawParameters(Parameters):
 
     gain: float = parameter(
         15.2,
-        'feedback gain K of the tracking error (66)-(67), tuned for the velocity drive; K plus '
-        'the slope of the compensator, (omega-bar + v_p-bar)/epsilon, is 41, close to '
-        '(1 - exp(-T/lag))/T = 39.3, at which measurement noise cancels in the command',
+        'feedback gain K of the tracking error (66)-(67); 0: by the drive, such that K plus the '
+        'slope of the compensator, (omega-bar + v_p-bar)/epsilon, is (1 - exp(-T/lag))/T, at '
+        'which measurement noise cancels in the command. 15.2 is tuned for a lag of 0.02 s',
         unit='1/s',
-        low=0.1,
+        low=0.0,
         high=100.0,
         dynamic=True,
     )
@@ -96,6 +96,41 @@ class Nt3fsMpcParameters(Parameters):
         """Sum omega-bar + v_p-bar of (80)-(82), rad/s², which the compensator outweighs."""
         predictive = self.predictive.v_max if self.predictive.enabled else 0.0
         return self.law.error_bound + predictive
+
+
+def fitting_gain(parameters: Nt3fsMpcParameters, drive: str) -> tuple[float, float]:
+    """Return the gain K (1/s) and the width epsilon (rad/s) that fit drive and noise.
+
+    The slope of the command in the speed error is K plus that of the compensator in its middle,
+    (omega-bar + v_p-bar)/epsilon. Their sum is
+
+    - with a velocity drive (1 - exp(-T/lag))/T: by E19 the measured speed then cancels in the
+      command, because the servo has the better measurement;
+    - with a torque drive half of the bandwidth sqrt(q/(sigma sqrt(T))) of the Kalman filter of the
+      wheel speeds, with q the spectral density of the disturbance and sigma² the variance of the
+      noise: faster feedback passes noise, slower feedback wastes what the filter knows. It is at
+      most 0.3/T.
+
+    Epsilon is ``law.smoothing``, or larger: the compensator has at most half of the slope.
+
+    Parameters
+    ----------
+    parameters
+        Compensator, filter and rate.
+    drive
+        ``'velocity'`` or ``'torque'``.
+    """
+    period, filtered = 1.0 / parameters.rate, parameters.speed_filter
+    if drive == 'velocity':
+        total = (1.0 - math.exp(-period / filtered.lag)) / period
+    else:
+        noise = math.sqrt(max(filtered.noise_variance, 1e-9) * period)
+        total = min(0.5 * math.sqrt(filtered.disturbance / noise), 0.3 / period)
+    smoothing, bound = parameters.law.smoothing, parameters.compensated_bound
+    if not parameters.law.compensator:
+        return total, smoothing
+    smoothing = min(max(smoothing, 2.0 * bound / total), 100.0)
+    return total - bound / smoothing, smoothing
 
 
 # -- law (66)-(67) and compensator (81)-(82) --------------------------------------------------
@@ -413,12 +448,6 @@ class Nt3fsMpcController:
         self.predictive.reset()
         self._certificate.reset()
         self.saturated = False
-
-    @property
-    def kernel_arguments(self) -> tuple[Array, ...]:
-        """State and constants of :func:`step_law`, in its order."""
-        certificate = self._certificate.state
-        return self._gains, *self.fuzzy.tables, self._work, self.terms, self.command, certificate
 
     @property
     def certificate_state(self) -> Array:

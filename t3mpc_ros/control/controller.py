@@ -3,20 +3,26 @@
 """Controller of one robot: odometry and reference in, limited twist and status out."""
 
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from itertools import count
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.control.actuation import LimitParameters, VelocityActuation
+from t3mpc_ros.control.body_correction import BodyCorrection, BodyCorrectionParameters
+from t3mpc_ros.control.command_shaper import CommandShaper, CommandShaperParameters
 from t3mpc_ros.control.control_law import (
     CertificateReading,
+    LawParameters,
     Nt3fsMpcController,
     Nt3fsMpcParameters,
+    fitting_gain,
 )
+from t3mpc_ros.control.dead_time_estimator import DeadTimeEstimator
 from t3mpc_ros.control.jump_transition import JumpTransition
 from t3mpc_ros.control.watchdog import InputWatchdog, Reason, ResponseMonitor, WatchdogParameters
 from t3mpc_ros.geometry import kinematics
@@ -31,12 +37,22 @@ from t3mpc_ros.geometry.types import (
     WheelSpeeds,
 )
 from t3mpc_ros.kernels import kernel
-from t3mpc_ros.parameters.table import group
+from t3mpc_ros.parameters.table import group, parameter
 
 Array = NDArray[np.float64]
 
 JUMP_DETECTION_FACTOR = 2.2
 """A reference acceleration above this multiple of the acceleration limit is a jump."""
+
+BODY_WEIGHTS = 'body.coefficients'
+"""Name of the weights of the body correction."""
+
+DEAD_TIME_TOLERANCE = 0.004
+"""Difference (s) up to which the configured dead time is kept: so much the estimate is off if the
+drive responds otherwise than the lag describes."""
+
+MIN_DEAD_TIME_CHANGE = 0.0005
+"""Smallest change (s) of the dead time in use."""
 
 SNAPSHOT_PERIOD = 0.25
 """Time between two snapshots of the weights, s."""
@@ -48,9 +64,45 @@ SNAPSHOT_COUNT = 3
 class ControllerParameters(Nt3fsMpcParameters):
     """Parameters of the controller: control law, wheel geometry, limits and time-outs."""
 
+    composition: str = parameter(
+        'body',
+        'body: the wheels follow the plan by feed-forward, and NT3FS and compensator correct the '
+        'yaw rate of the body; for a robot whose wheels follow commands exactly. paper: NT3FS, '
+        'compensator and v_p act on the wheel speeds, as in the paper; for a drive with errors',
+        choices=('body', 'paper'),
+    )
+    estimate_dead_time: bool = parameter(
+        True,
+        'whether the dead time of the robot is estimated from commands and measured speeds, and '
+        'used in place of speed_filter.dead_time where it differs by more than 4 ms',
+        dynamic=True,
+    )
+    mean_speeds: bool = parameter(
+        True,
+        'whether a measured wheel speed is the mean over the last period, as from counters of '
+        'steps; false: the speed at its stamp',
+    )
+    law: LawParameters = group(LawParameters, gain=0.0)
     geometry: WheelGeometry = group(WheelGeometry, inline=True)
     limits: LimitParameters = group(LimitParameters, inline=True)
     watchdog: WatchdogParameters = group(WatchdogParameters)
+    command_shaper: CommandShaperParameters = group(CommandShaperParameters)
+    body: BodyCorrectionParameters = group(BodyCorrectionParameters)
+
+    def resolved(self) -> Self:
+        """Return the parameters with the parts of the composition, and the gain that fits."""
+        changes: dict[str, object] = {}
+        if self.composition == 'body':
+            changes = {
+                'use_fuzzy': False,
+                'law.compensator': False,
+                'predictive.enabled': False,
+            }
+        parts = self.with_values(changes)
+        if parts.law.gain > 0.0:
+            return parts
+        gain, smoothing = fitting_gain(parts, 'velocity')
+        return parts.with_values({'law.gain': gain, 'law.smoothing': smoothing})
 
 
 class Status(NamedTuple):
@@ -91,7 +143,7 @@ class Controller:
 
     def __init__(self, parameters: ControllerParameters) -> None:
         self.parameters = parameters
-        self._tracker = SwitchingTracker(parameters, 'velocity')
+        self._tracker = SwitchingTracker(parameters.resolved(), 'velocity')
         self._period = 1.0 / parameters.rate
         self._period_ns = round(self._period * NANOSECONDS)
         self._actuation = VelocityActuation(
@@ -102,6 +154,21 @@ class Controller:
             self._period,
         )
         self._dead_time_ns = round(self._actuation.dead_time * NANOSECONDS)
+        # The pulses of a stepper ramp over a period, half a period late on average.
+        filtered = parameters.speed_filter
+        self._dead_time = DeadTimeEstimator(
+            replace(filtered, lag=max(filtered.lag, 0.5 * self._period)),
+            self._period,
+            mean_speeds=parameters.mean_speeds,
+        )
+        self._before_disturbance: tuple[Any, Any] | None = None
+        self._shaper = CommandShaper(parameters.command_shaper, self._period)
+        geometry = parameters.geometry
+        self._body = BodyCorrection(
+            parameters.body, geometry.wheel_radius, geometry.half_separation, self._period
+        )
+        self._ahead_ns = 0
+        """Time by which the plan is ahead of the command, ns; 0 without a known future."""
         self._sampling = self._sampling_arguments()
         self._speeds, self._reference = np.zeros((2, 2))
         self._reference_begin, self._reference_end = np.zeros((2, 2))
@@ -114,7 +181,7 @@ class Controller:
                 JUMP_DETECTION_FACTOR * limits.angular_acceleration,
             )
         )
-        self._snapshots: deque[tuple[Array, list[Array]]] = deque(maxlen=SNAPSHOT_COUNT)
+        self._snapshots: deque[tuple[Any, Any]] = deque(maxlen=SNAPSHOT_COUNT)
         """Weights, oldest first."""
         self._steps_since_snapshot = 0
         self._snapshot_steps = next(n for n in count(1) if n * self._period >= SNAPSHOT_PERIOD)
@@ -130,6 +197,38 @@ class Controller:
         return self._tracker.law
 
     @property
+    def body(self) -> BodyCorrection:
+        """The correction of the yaw rate with its map."""
+        return self._body
+
+    @property
+    def dead_time(self) -> DeadTimeEstimator:
+        """Estimate of the dead time, and whether the response is disturbed."""
+        return self._dead_time
+
+    @property
+    def gain(self) -> float:
+        """Feedback gain K in use, 1/s."""
+        return self._tracker.parameters.law.gain
+
+    def get_weights(self) -> dict[str, Array]:
+        """Return all adapted arrays by name: those of the law, and the map of the body."""
+        return self.law.get_weights() | {BODY_WEIGHTS: self._body.fuzzy.coefficients}
+
+    def set_weights(self, weights: Mapping[str, Array]) -> None:
+        """Use weights as returned by :meth:`get_weights`; those of the body may be missing.
+
+        Raises
+        ------
+        ValueError
+            See :meth:`Nt3fsMpcController.set_weights`.
+        """
+        body = weights.get(BODY_WEIGHTS)
+        if body is not None:
+            self._body.fuzzy.coefficients = body
+        self.law.set_weights({name: v for name, v in weights.items() if name != BODY_WEIGHTS})
+
+    @property
     def actuation(self) -> VelocityActuation:
         """Speed filter and last command; a replay sets the recorded commands here."""
         return self._actuation
@@ -137,18 +236,24 @@ class Controller:
     def warm_up(self) -> None:
         """Compile and pretrain, so that no step has to; the state of the controller is kept."""
         self.law.warm_up()
+        memory = self._body.snapshot()
+        still = np.zeros(2)
+        self._body.step(0.0, self._period, still, still, still, 0.0)
+        self._body.reset()
+        self._body.rollback(memory)
         other, jump = Controller(self.parameters), 2.0 * JUMP_DETECTION_FACTOR * self._period
         jumped = BodyTwist(jump * self.parameters.limits.linear_acceleration, 0.0)
-        for k in range(10):
-            reference = STANDSTILL if k < 4 else jumped
+        for k in range(24):
+            reference = STANDSTILL if k < 14 else jumped
             other.add_reference(State(k * self._period_ns, ORIGIN, reference))
-        for k in range(6):
+        for k in range(16):
             other.step(State(k * self._period_ns, ORIGIN, STANDSTILL))
 
     def configure(self, parameters: ControllerParameters) -> None:
         """Use new values of the dynamic parameters from the next step on."""
         self.parameters = parameters
-        self._tracker.configure(parameters)
+        self._tracker.configure(parameters.resolved())
+        self._body.configure(parameters.body)
         self._actuation.configure(parameters.limits)
         self._sampling = self._sampling_arguments()
 
@@ -164,6 +269,7 @@ class Controller:
         self._clear_reference()
         self.law.fuzzy.reset()
         self.law.predictive.pretrain()
+        self._body.reset()
         self._stop()
         self._last_stamp_ns = None
 
@@ -203,6 +309,9 @@ class Controller:
 
         finite = odometry.is_finite()
         effect_ns = stamp + self._dead_time_ns
+        if not self._moving:
+            self._ahead_ns = self._plan_ahead(effect_ns)
+        plan_ns = effect_ns + self._ahead_ns
         speeds, reference = self._speeds, self._reference
         begin, end = self._reference_begin, self._reference_end
         trajectory, twist = self._trajectory, odometry.twist
@@ -213,7 +322,7 @@ class Controller:
             trajectory.end,
             trajectory.jump,
             stamp,
-            effect_ns,
+            plan_ns,
             *self._sampling,
             twist.linear,
             twist.angular,
@@ -245,15 +354,22 @@ class Controller:
         actuation = self._actuation
         actuation.observe(speeds, elapsed or self._period)
         if restart:
-            self._tracker.begin(effect_ns, actuation.predicted, begin)
+            self._dead_time.reset(speeds)
+            self._before_disturbance = None
+        else:
+            self._update_dead_time(speeds, elapsed or self._period)
+        if restart:
+            self._tracker.begin(plan_ns, actuation.predicted, begin)
+            self._shaper.reset(actuation.predicted)
+            self._body.restart()
             self._moving = True
             self._announced.clear()
-            known_ns = effect_ns if self.parameters.jump_transition.preview else stamp
+            known_ns = plan_ns if self.parameters.jump_transition.preview else stamp
             self._jumps = [jump for jump in self._jumps if jump.stamp_ns > known_ns]
         if self._jumps or self._announced:
-            self._announce_jumps(stamp, effect_ns)
-        acceleration = self._tracker.step(
-            effect_ns, actuation.predicted, begin, end, elapsed or self._period
+            self._announce_jumps(stamp, plan_ns)
+        acceleration = self._acceleration(
+            plan_ns, odometry.pose.yaw, begin, end, elapsed or self._period
         )
         applied = actuation.send_acceleration(acceleration).copy()
         self._tracker.set_applied(applied, saturated=actuation.limited)
@@ -261,6 +377,43 @@ class Controller:
         self._take_snapshot()
         self.status = self._make_status(stamp, reason, actuation.speeds - reference, applied)
         return actuation.twist, self.status
+
+    def _acceleration(
+        self, plan_ns: int, yaw: float, begin: Array, end: Array, elapsed: float
+    ) -> Array:
+        """Return u (rad/s²), shape (2,), for the plan from ``begin`` to ``end`` (rad/s)."""
+        tracker, speeds = self._tracker, self._actuation.predicted
+        if self._ahead_ns == 0 and not self._corrects_body:
+            return tracker.step(plan_ns, speeds, begin, end, elapsed)
+        planned, rate = tracker.plan(plan_ns, begin, end)
+        if self._ahead_ns > 0:
+            self._shaper.step(planned, elapsed)
+            planned, rate = self._shaper.reference, self._shaper.rate
+        if self._corrects_body:
+            filtered = self.parameters.speed_filter
+            correction = self._body.step(
+                yaw,
+                elapsed,
+                self._reference,
+                planned,
+                self._actuation.command,
+                self._actuation.dead_time + filtered.lag + 0.5 * self._period,
+                learn=not self._dead_time.disturbed,
+            )
+            planned = planned + np.array([correction, -correction])
+        return self.law.step(speeds, planned, rate, elapsed)
+
+    @property
+    def _corrects_body(self) -> bool:
+        parameters = self.parameters
+        return parameters.composition == 'body' and parameters.body.enabled
+
+    def _plan_ahead(self, effect_ns: int) -> int:
+        """Return the lead of the shaper, ns; 0 if the reference is not known that far ahead."""
+        parameters, newest = self.parameters.jump_transition, self._trajectory.newest_ns
+        lead = self._shaper.lead_ns
+        usable = parameters.preview and parameters.method == 'ramp' and newest is not None
+        return lead if usable and (newest or 0) >= effect_ns + lead + self._period_ns else 0
 
     def check_odometry(self, last_received_ns: int | None, now_ns: int) -> bool:
         """Whether the odometry has timed out, so that a stop must be commanded.
@@ -286,7 +439,7 @@ class Controller:
         if self.status.reason is not Reason.NOT_FOLLOWING:
             self._tracker.reset()
             if self._snapshots:
-                self.law.rollback(self._snapshots[0])
+                self._rollback(self._snapshots[0])
                 self._snapshots.clear()
         self._actuation.send_speeds(self._reference)
         self._response.add_command(*self._actuation.command.tolist())
@@ -294,12 +447,42 @@ class Controller:
         self.status = self._make_status(stamp_ns, Reason.NOT_FOLLOWING, error)
         return self._actuation.twist, self.status
 
-    def _take_snapshot(self, steps: int = 1) -> None:
-        """Store a snapshot of the weights once per SNAPSHOT_PERIOD."""
-        self._steps_since_snapshot += steps
+    def _update_dead_time(self, speeds: Array, elapsed: float) -> None:
+        """Update the dead time in use; after a disturbance, discard what was learnt during it."""
+        estimator, actuation = self._dead_time, self._actuation
+        disturbed = estimator.step(speeds, actuation.command, elapsed)
+        if disturbed and self._before_disturbance is None and self._snapshots:
+            self._before_disturbance = self._snapshots[0]
+            self._snapshots.clear()
+        elif not disturbed and self._before_disturbance is not None:
+            self._rollback(self._before_disturbance)
+            self._before_disturbance = None
+        dead_time = self.parameters.speed_filter.dead_time
+        if (
+            self.parameters.estimate_dead_time
+            and abs(estimator.dead_time - dead_time) > DEAD_TIME_TOLERANCE
+            and abs(estimator.dead_time - dead_time) > 3.0 * estimator.standard_deviation
+        ):
+            dead_time = estimator.dead_time
+        if abs(dead_time - actuation.dead_time) > MIN_DEAD_TIME_CHANGE:
+            actuation.set_dead_time(dead_time)
+            self._dead_time_ns = round(dead_time * NANOSECONDS)
+
+    def _rollback(self, snapshot: tuple[Any, Any]) -> None:
+        """Restore the weights of a snapshot."""
+        weights, body = snapshot
+        if self.parameters.composition == 'paper':
+            self.law.rollback(weights)
+        self._body.rollback(body)
+
+    def _take_snapshot(self) -> None:
+        """Store a snapshot of the weights once per SNAPSHOT_PERIOD, except while disturbed."""
+        if self._dead_time.disturbed:
+            return
+        self._steps_since_snapshot += 1
         if self._steps_since_snapshot >= self._snapshot_steps:
             self._steps_since_snapshot = 0
-            self._snapshots.append(self.law.snapshot())
+            self._snapshots.append((self.law.snapshot(), self._body.snapshot()))
 
     def _sampling_arguments(self) -> tuple[float, float, bool, float, float]:
         """Return the parameters of :func:`sample_reference`, in its order."""
@@ -377,7 +560,7 @@ class SwitchingTracker:
     """
 
     def __init__(self, parameters: Nt3fsMpcParameters, drive: str) -> None:
-        self._parameters = parameters
+        self.parameters = parameters
         self._period = 1.0 / parameters.rate
         self.law = Nt3fsMpcController(parameters)
         lag = parameters.speed_filter.lag if drive == 'velocity' else 0.0
@@ -385,7 +568,7 @@ class SwitchingTracker:
 
     def configure(self, parameters: Nt3fsMpcParameters) -> None:
         """Use new values of the dynamic parameters from the next step on."""
-        self._parameters = parameters
+        self.parameters = parameters
         self.law.configure(parameters)
         self.transition.configure(parameters.jump_transition)
 
@@ -415,11 +598,15 @@ class SwitchingTracker:
         dt
             Time since the last step, s.
         """
-        transition = self.transition
-        if self._parameters.jump_transition.method == 'predictive':
+        if self.parameters.jump_transition.method == 'predictive':
             return self._step_predictive(now_ns, speeds, reference, reference_next, dt)
+        return self.law.step(speeds, *self.plan(now_ns, reference, reference_next), dt)
+
+    def plan(self, now_ns: int, reference: Array, reference_next: Array) -> tuple[Array, Array]:
+        """Return reachable reference (rad/s) and its rate (rad/s²) at ``now_ns``, shape (2,)."""
+        transition = self.transition
         transition.step(now_ns, reference, reference_next)
-        return self.law.step(speeds, transition.reachable, transition.rate, dt)
+        return transition.reachable, transition.rate
 
     def _step_predictive(
         self, now_ns: int, speeds: Array, reference: Array, reference_next: Array, dt: float

@@ -100,23 +100,6 @@ class JumpTransition:
         self._sums[:] = 0.0
 
     @property
-    def kernel_arguments(
-        self,
-    ) -> tuple[Array, Stamps, Flags, Array, float, float, float, Array, Array]:
-        """State and constants of :func:`step_transitions`, in its order."""
-        return (
-            self._transitions,
-            self._instants,
-            self._passed,
-            self._sums,
-            self._period,
-            self._lag,
-            self._parameters.acceleration,
-            self.reachable,
-            self.rate,
-        )
-
-    @property
     def offset(self) -> Array:
         """Offset h at the last step, rad/s, shape (2,)."""
         row: Array = self._sums[OFFSET]

@@ -75,10 +75,8 @@ class SpeedKalmanFilter:
         self._velocity = drive == 'velocity'
         self._period = period
         self._gain = stationary_gain(self._transition(period), parameters, period)
-        # Rounded: a dead time of exactly one period must not count as 0.999... periods.
-        periods = round(parameters.dead_time / period, 9)
-        self._late = periods % 1.0
-        self._commands: Array = np.zeros((int(periods) + 2, 2))
+        self._commands: Array = np.zeros((2, 2))
+        self.set_dead_time(parameters.dead_time)
         self.state: Array = np.zeros((3, 2))
         """Rows SPEEDS, DISTURBANCE and PREDICTED."""
 
@@ -103,13 +101,6 @@ class SpeedKalmanFilter:
         return row
 
     @property
-    def kernel_arguments(self) -> tuple[Array, Array, bool, Array, bool, float, float, float]:
-        """State and constants of :func:`update_filter`, in its order."""
-        parameters, velocity = self._parameters, self._velocity
-        filtered = self.state, self._commands, parameters.enabled, self._gain
-        return *filtered, velocity, self._late, parameters.lag, self._period
-
-    @property
     def gain(self) -> Array:
         """Stationary Kalman gain of chi (1) and of d (1/s)."""
         return self._gain
@@ -117,7 +108,17 @@ class SpeedKalmanFilter:
     @property
     def dead_time(self) -> float:
         """Time between sending a command and its effect, s; 0 with a torque drive."""
-        return self._parameters.dead_time if self._velocity else 0.0
+        return self._dead_time if self._velocity else 0.0
+
+    def set_dead_time(self, dead_time: float) -> None:
+        """Use another dead time (s) from the next step on; the estimates are kept."""
+        self._dead_time = dead_time
+        # Rounded: a dead time of exactly one period must not count as 0.999... periods.
+        periods = round(dead_time / self._period, 9)
+        self._late = periods % 1.0
+        before, count = self._commands, int(periods) + 2
+        first = np.repeat(before[:1], max(count - len(before), 0), axis=0)
+        self._commands = np.concatenate((first, before))[-count:]
 
     def reset(self, speeds: Array) -> None:
         """Restart at measured wheel speeds (rad/s) with equal commands and no disturbance."""

@@ -178,11 +178,6 @@ class InputWatchdog:
         """Odometry stamp of the last reference (ns), and whether a newer reference is pending."""
         return self._reference_ns, self._reference_pending
 
-    def synchronize(self, odometry_ns: int, reference_ns: int, *, pending: bool) -> None:
-        """Set the last odometry stamp and :attr:`last_reference` after a batch of steps."""
-        self._odometry_ns = odometry_ns
-        self._reference_ns, self._reference_pending = reference_ns, pending
-
     def odometry_timed_out(self, last_received_ns: int | None, now_ns: int) -> bool:
         """Whether the odometry is older than the time-out; both times are from one clock."""
         if last_received_ns is None:
@@ -232,11 +227,6 @@ class ResponseMonitor:
     def counts(self) -> tuple[int, int]:
         """Number of stored commands, and evidence against the present decision."""
         return len(self._commands), self._evidence
-
-    def synchronize(self, commands: Array, evidence: int) -> None:
-        """Set the state after a batch of steps with these commands, rad/s, shape (n, 2)."""
-        self._commands.extend(map(tuple, commands[-self.window :].tolist()))
-        self._evidence = evidence
 
     def add_command(self, right: float, left: float) -> None:
         """Store the wheel speeds commanded at this step, rad/s."""

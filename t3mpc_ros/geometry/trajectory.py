@@ -100,11 +100,6 @@ class ReferenceTrajectory:
         """Maximum number of samples."""
         return self._capacity
 
-    def synchronize(self, first: int, end: int) -> None:
-        """Set the range of samples after a kernel has added some, none of them a jump."""
-        self.first, self.end = first, end
-        self.newest_ns = int(self.stamps[end - 1])
-
     @property
     def has_jumps(self) -> bool:
         """Whether :meth:`pop_jumps` returns any."""

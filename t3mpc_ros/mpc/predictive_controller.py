@@ -5,7 +5,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 import math
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -546,36 +546,6 @@ class PredictiveController:
         self.parameters = parameters
         self.configure(parameters, feedback_gain)
         self.pretrain()
-
-    @property
-    def tables(self) -> tuple[Any, ...]:
-        """Arguments of :func:`predictive_step` except ``samples``, in its order.
-
-        They contain no future jumps.
-        """
-        timing, change = self._timing, self._no_change
-        seen = self._stores, self._sizes, self.rows, self._tables, self._nominal_response
-        learning = (
-            timing.average,
-            timing.decimation,
-            self._decay,
-            self._move_row,
-            self._learning_row,
-        )
-        return (
-            *seen,
-            self._decays,
-            change,
-            *learning,
-            self._float_work,
-            self._int_work,
-            self.status,
-        )
-
-    def synchronize(self, phase: int, samples: int) -> None:
-        """Set phase and number of samples after kernels have advanced :attr:`tables`."""
-        self.phase, self.samples = phase, samples
-        self._skill = self.rows[_SKILLS].copy()
 
     @property
     def skill(self) -> Array:

@@ -163,7 +163,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         if not path:
             return
         try:
-            self._controller.law.set_weights(load_model(Path(path)))
+            self._controller.set_weights(load_model(Path(path)))
         except ValueError as error:
             raise ModelError(f'{path} does not fit the parameters: {error}') from error
         self._publish_journal(self._journal.model(zlib.crc32(Path(path).read_bytes())))
@@ -306,7 +306,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
     ) -> Trigger.Response:
         path = Path(self.parameters.model_output)
         try:
-            save_model(path, self._controller.law.get_weights(), self.parameters.to_dict())
+            save_model(path, self._controller.get_weights(), self.parameters.to_dict())
         except ModelError as error:
             response.success = False
             response.message = str(error)
@@ -325,6 +325,12 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             'certificate_margin': status.certificate.margin,
             'certificate_holds': status.certificate.holds,
             'ultimate_bound_rad_s': self._controller.law.ultimate_bound,
+            'gain_1_s': self._controller.gain,
+            'dead_time_s': self._controller.dead_time.dead_time,
+            'dead_time_std_s': self._controller.dead_time.standard_deviation,
+            'disturbed': self._controller.dead_time.disturbed,
+            'body_authority': self._controller.body.authority,
+            'body_yaw_error_rad': self._controller.body.yaw_error,
             'skill_right': float(status.skill[0]),
             'skill_left': float(status.skill[1]),
             'references_rejected': self._rejected_references,

@@ -215,7 +215,7 @@ def test_the_output_is_a_function_of_the_messages():
 
 
 def test_dynamic_parameters_reach_every_part():
-    loop = Loop()
+    loop = Loop(composition='paper')
     loop.run(50)
     changed = loop.controller.parameters.with_values(
         {
@@ -235,12 +235,64 @@ def test_dynamic_parameters_reach_every_part():
 
 
 def test_reset_discards_the_weights():
-    loop = Loop()
+    loop = Loop(composition='paper')
     loop.run(200)
     assert np.any(loop.controller.law.fuzzy.coefficients)
     loop.controller.reset()
     assert not np.any(loop.controller.law.fuzzy.coefficients)
     assert loop.run(60)[-1].reason is Reason.TRACKING
+
+
+def test_wheel_parts_are_off_in_the_composition_of_the_body():
+    """On a stepper the wheels follow exactly: there is nothing to learn about them."""
+    loop = Loop()
+    statuses = loop.run(200)
+    assert not np.any(loop.controller.law.fuzzy.coefficients)
+    assert not np.any([statuses[-1].terms[row] for row in (0, 3, 4)])
+
+
+@pytest.mark.parametrize('lag', [0.003, 0.02, 0.1])
+@pytest.mark.parametrize('composition', ['body', 'paper'])
+def test_noise_of_the_measurement_cancels_in_the_command(lag, composition):
+    """A fixed gain of 15.2 passed 57 % of the noise to the motors of the default robot."""
+    commands = []
+    for noise in (0.0, 0.02):
+        loop = Loop(
+            lambda t: (0.1 * math.sin(t), 0.5),
+            **{'composition': composition, 'speed_filter.lag': lag, 'use_fuzzy': False,
+               'predictive.enabled': False, 'speed_filter.enabled': False},
+        )  # fmt: skip
+        generator = np.random.default_rng(1)
+        sent = []
+        for _ in range(200):
+            speeds = BodyTwist(*(np.array(loop.twist) + generator.normal(0.0, noise, 2)))
+            loop.step(State(loop.now, ORIGIN, speeds))
+            sent.append(loop.twist.linear)
+        commands.append(np.array(sent))
+    passed = np.std((commands[1] - commands[0])[60:]) / 0.02
+    assert passed < 0.1
+
+
+def test_a_dead_time_that_nobody_configured_is_found():
+    """Robot with 50 ms in place of 10 ms: the plan is then early by the missing 40 ms."""
+
+    def reference(t):
+        return 0.12 + 0.1 * math.sin(2.1 * t), 1.5 * math.sin(1.7 * t)
+
+    loop = Loop(
+        reference,
+        mean_speeds=False,
+        **{'speed_filter.noise_variance': 0.04, 'speed_filter.lag': 0.003},
+    )
+    sent = [BodyTwist(0.0, 0.0)] * 5
+    generator = np.random.default_rng(2)
+    for _ in range(1500):
+        wheels = np.array(wheels_from_twist(sent[-5], GEOMETRY)) + generator.normal(0.0, 0.2, 2)
+        loop.step(State(loop.now, ORIGIN, twist_from_wheels(WheelSpeeds(*wheels), GEOMETRY)))
+        sent.append(loop.twist)
+    estimate = loop.controller.dead_time
+    assert loop.controller.actuation.dead_time == pytest.approx(0.0425, abs=0.004)
+    assert abs(estimate.dead_time - 0.0425) < 4.0 * estimate.standard_deviation + 0.003
 
 
 # --- the control law -----------------------------------------------------------------------------

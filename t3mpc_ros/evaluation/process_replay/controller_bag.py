@@ -147,7 +147,7 @@ class RecordedController:
         self.controller.warm_up()
         tape.parameters(now_ns, 0, parameters.to_dict())
         if model is not None:
-            self.controller.law.set_weights(load_model(model))
+            self.controller.set_weights(load_model(model))
             tape.row(now_ns, self._journal.model(zlib.crc32(model.read_bytes())))
 
     def add_reference(self, now_ns: int, motion: State) -> None:

@@ -4,14 +4,15 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+import math
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.bag.run.journal import Event
-from t3mpc_ros.control.batch_replay import StepResults, replay_batch
-from t3mpc_ros.control.control_law import TERM_NAMES
-from t3mpc_ros.control.controller import Controller, ControllerParameters
+from t3mpc_ros.control.control_law import BOUND, RATE, TERM_NAMES, VALUE
+from t3mpc_ros.control.controller import Controller, ControllerParameters, Status
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation.bag_report.topic_roles import WHEELS
 from t3mpc_ros.evaluation.process_replay.controller_inputs import (
@@ -21,7 +22,7 @@ from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     ControllerSession,
     motions,
 )
-from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, StateArray
+from t3mpc_ros.geometry.types import STANDSTILL, BodyTwist, StateArray
 
 Array = NDArray[np.float64]
 
@@ -33,6 +34,74 @@ OPEN_LOOP = (
 """Remark on every replay with changes."""
 
 
+TWIST, ERROR, SKILL, APPLIED, TERMS, CERTIFICATE, COMMAND, LIMITED = 0, 2, 4, 6, 8, 18, 22, 24
+"""First columns of the quantities in a row of results; LIMITED is a single column."""
+WIDTH = 25
+
+
+class StepResults(NamedTuple):
+    """Twist and status of each step, NaN where there is none."""
+
+    numbers: Array
+    """Shape (n, WIDTH), columns from TWIST to LIMITED."""
+    reasons: NDArray[np.object_]
+    """:class:`Reason` of each step, None where there is none, shape (n,)."""
+
+    @classmethod
+    def empty(cls, count: int) -> Self:
+        """Return ``count`` empty rows."""
+        return cls(np.full((count, WIDTH), math.nan), np.full(count, None, dtype=np.object_))
+
+    def part(self, begin: int, end: int) -> 'StepResults':
+        """Return a view of some of the rows."""
+        return StepResults(self.numbers[begin:end], self.reasons[begin:end])
+
+    def set_row(self, row: int, twist: BodyTwist, status: Status) -> None:
+        """Write the result of :meth:`Controller.step` into a row."""
+        self.numbers[row] = (
+            *twist,
+            *status.error.tolist(),
+            *status.skill.tolist(),
+            *status.applied.tolist(),
+            *status.terms.ravel().tolist(),
+            *status.certificate_state.tolist(),
+            math.nan,
+            math.nan,
+            float(status.limited),
+        )
+        self.reasons[row] = status.reason
+
+    @property
+    def twists(self) -> Array:
+        """Commanded twists, m/s and rad/s, shape (n, 2)."""
+        return self.numbers[:, TWIST : TWIST + 2]
+
+    @property
+    def pairs(self) -> dict[str, Array]:
+        """Quantities of both wheels by name, shape (n, 2), as in :class:`Status`."""
+        numbers = self.numbers
+        found = {
+            'error': numbers[:, ERROR : ERROR + 2],
+            'skill': numbers[:, SKILL : SKILL + 2],
+            'applied': numbers[:, APPLIED : APPLIED + 2],
+            'estimate': 0.0 - numbers[:, TERMS : TERMS + 2],
+        }
+        for k, name in enumerate(TERM_NAMES):
+            found[name] = numbers[:, TERMS + 2 * k : TERMS + 2 * k + 2]
+        return found
+
+    @property
+    def certificate(self) -> Array:
+        """Value and margin of the certificate, see :class:`CertificateReading`, shape (n, 2)."""
+        state = self.numbers[:, CERTIFICATE:]
+        return np.stack([state[:, VALUE], state[:, BOUND] - state[:, RATE]], axis=1)
+
+    @property
+    def limited(self) -> NDArray[np.bool_]:
+        """Whether a limit changed the command, shape (n,)."""
+        return np.equal(self.numbers[:, LIMITED], 1.0)
+
+
 @dataclass(frozen=True)
 class ReplayResult:
     """Outputs of a replay, one row per event as in :class:`Inputs`; NaN where none."""
@@ -42,8 +111,6 @@ class ReplayResult:
     reasons: tuple[Reason | None, ...]
     """Stop reasons; None at rows that are neither a step nor a timeout."""
     steps: int
-    plain: int
-    """Number of steps computed in compiled batches, see :func:`replay_batch`."""
     parameters: ControllerParameters
     """Parameters at the end."""
     changed: Mapping[str, object]
@@ -78,14 +145,13 @@ def replay_controller(
     answers = StepResults.empty(inputs.events.size)
     odometry, references = motions(inputs.odometry), motions(inputs.references)
     parameters = ControllerParameters()
-    plain = 0
     for life, controller in zip(inputs.lives, controllers, strict=True):
         own = answers.part(life.first, life.first + len(life.rows))
-        plain += _replay_session(controller, life, changes, odometry, references, own)
+        _replay_session(controller, life, changes, odometry, references, own)
         parameters = controller.parameters
     reasons = tuple(answers.reasons.tolist())
     steps = len(reasons) - reasons.count(None)
-    return ReplayResult(_fields(answers), reasons, steps, plain, parameters, dict(changes))
+    return ReplayResult(_fields(answers), reasons, steps, parameters, dict(changes))
 
 
 def make_controllers(
@@ -103,22 +169,9 @@ def make_controllers(
         controller = Controller(life.parameters[life.start].with_values(changes or {}))
         controller.warm_up()
         if life.model is not None:
-            controller.law.set_weights(life.model)
+            controller.set_weights(life.model)
         controllers.append(controller)
-    if controllers:
-        _compile_batch_kernels(controllers[0].parameters)
     return controllers
-
-
-def _compile_batch_kernels(parameters: ControllerParameters) -> None:
-    """Compile the batch kernels too, with a robot at standstill."""
-    count = 20
-    stamps = np.arange(1, count + 1) * round(NANOSECONDS / parameters.rate)
-    standing = StateArray(stamps, np.zeros((count, 3)), np.zeros((count, 2)))
-    rows = np.zeros((count, 3), dtype=np.int64)
-    rows[:, 0] = np.arange(count)
-    rows[0, 2], rows[1:, 1:] = count, count
-    replay_batch(Controller(parameters), standing, standing, rows, StepResults.empty(count))
 
 
 def _replay_session(
@@ -128,23 +181,18 @@ def _replay_session(
     odometry: StateArray,
     references: StateArray,
     answers: StepResults,
-) -> int:
-    """Process the events of one life; return the number of steps computed in batches."""
-    taken, events = life.taken, life.events
-    rows = np.stack([taken.odometry, taken.begin, taken.end], axis=1)
-    steps = (events == _STEP) & (taken.odometry >= 0)
-    plain = done = 0
-    for k in [*np.flatnonzero(~steps).tolist(), len(events)]:
-        if done < k:
-            part = rows[done:k]
-            plain += replay_batch(controller, odometry, references, part, answers.part(done, k))
-        done = k + 1
-        if k == len(events):
-            break
-        for j in range(int(taken.begin[k]), int(taken.end[k])):
+) -> None:
+    """Process the events of one life in their order."""
+    taken = life.taken
+    inputs = np.stack([taken.odometry, taken.begin, taken.end], axis=1).tolist()
+    rows = zip(life.events.tolist(), life.rows[:, 4].tolist(), inputs, strict=True)
+    for k, (event, value, (received, begin, end)) in enumerate(rows):
+        for j in range(begin, end):
             controller.add_reference(references[j])
-        event, value = int(events[k]), int(life.rows[k, 4])
-        if event == Event.ODOMETRY_TIMEOUT:
+        if event == _STEP:
+            if received >= 0:
+                answers.set_row(k, *controller.step(odometry[received]))
+        elif event == Event.ODOMETRY_TIMEOUT:
             controller.check_odometry(None, 0)
             answers.set_row(k, STANDSTILL, controller.status)
         elif event == Event.FINISH:
@@ -157,7 +205,6 @@ def _replay_session(
             controller.reset()
         elif event == Event.ENABLE:
             controller.enable(bool(value))
-    return plain
 
 
 def _fields(answers: StepResults) -> dict[str, Array]:

@@ -3,7 +3,7 @@
 """Golden bags: short closed-loop runs whose commands must replay bit-equal."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import math
 from pathlib import Path
 import tempfile
@@ -43,6 +43,8 @@ class GoldenScenario:
     """Interval without odometry, s."""
     bad_odometry: tuple[float, ...] = ()
     """Times of odometry messages that are not finite, s."""
+    parameters: Mapping[str, object] = field(default_factory=dict)
+    """Parameters of the controller other than those of :func:`loop_controller`."""
 
 
 GOLDEN_SCENARIOS: Mapping[str, GoldenScenario] = {
@@ -78,6 +80,7 @@ GOLDEN_SCENARIOS: Mapping[str, GoldenScenario] = {
             FaultEvent(6.0, 'command_delay', 0.03, 1.0),
             FaultEvent(7.5, 'brown_out', True, 0.1),
         ),
+        parameters={'composition': 'paper'},
     ),
 }
 """Golden runs by the name of their file."""
@@ -106,7 +109,7 @@ def write_golden(folder: Path, progress: Callable[[str], None] = print) -> list[
 
 def run_golden_scenario(recipe: GoldenScenario, folder: Path) -> Path:
     """Return the bag file of a run in ``folder``; equal recipes give equal messages."""
-    parameters = loop_controller()
+    parameters = loop_controller().with_values(recipe.parameters)
     robot = DigitalTwin(loop_robot(seed=recipe.seed), FaultSchedule(recipe.faults))
     whole = chaotic_course(recipe.stretches[-1][1], recipe.seed)
     course = np.concatenate(

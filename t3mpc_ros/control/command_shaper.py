@@ -1,0 +1,158 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+r"""Input shaper: a reference that does not excite the oscillation of the rotors.
+
+A stepper's rotor hangs on its field like a mass on a spring. Straight motion and turning have
+different inertias, so the mean of both wheels and half of their difference oscillate each with its
+own frequency, 14.6 and 9.1 Hz for the default robot. Two impulses of one half, half a period of
+the oscillation apart, cancel each other's response (zero-vibration shaper; Singer and Seering
+1990, doi 10.1115/1.2894142). With a known future they stand before and after the instant,
+
+.. math:: \bar r_s(t) = \tfrac12\left(\bar r(t + d) + \bar r(t - d)\right), \qquad d = 1/(4f),
+
+so the shaper has no delay: its response cos(2 pi f_r d) is zero at f_r = f and real everywhere.
+At low frequencies it is 1 - 1.23 (f_r/f)², close to 1 - (f_r/f)², the inverse of the oscillator.
+The impulses are positive: a reference within limits of speed and acceleration remains within.
+"""
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.kernels import kernel
+from t3mpc_ros.parameters.table import Parameters, parameter
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CommandShaperParameters(Parameters):
+    """Frequencies that the command does not excite."""
+
+    straight_frequency: float = parameter(
+        14.6,
+        'frequency at which the robot oscillates along its path, sqrt(k/J)/(2 pi) with the '
+        'stiffness k of a motor and the inertia J that it accelerates; 0: none',
+        unit='Hz',
+        low=0.0,
+        high=1000.0,
+        source='motor and body of the default robot',
+    )
+    turning_frequency: float = parameter(
+        9.1,
+        'frequency at which the robot oscillates in yaw; 0: none',
+        unit='Hz',
+        low=0.0,
+        high=1000.0,
+        source='motor and body of the default robot',
+    )
+
+    @property
+    def delays(self) -> tuple[float, float]:
+        """Time d (s) of the impulses before and after the instant: straight, turning."""
+        straight, turning = self.straight_frequency, self.turning_frequency
+        return (
+            0.25 / straight if straight > 0.0 else 0.0,
+            0.25 / turning if turning > 0.0 else 0.0,
+        )
+
+
+class CommandShaper:
+    """Shapes the reference of both wheels; it needs the reference :attr:`lead` in advance.
+
+    Parameters
+    ----------
+    parameters
+        Frequencies; both 0: the reference is unchanged and the lead is 0.
+    period
+        Control period, s.
+    """
+
+    def __init__(self, parameters: CommandShaperParameters, period: float) -> None:
+        self._period = period
+        self._delays = np.array(parameters.delays) / period
+        latest = float(self._delays.max())
+        self._ahead = math.ceil(latest - 1e-9) + 1 if latest > 0.0 else 0
+        self._planned: Array = np.zeros((2 * self._ahead + 2, 2))
+        self.reference: Array = np.zeros(2)
+        """Shaped reference at the instant, rad/s, shape (2,)."""
+        self.rate: Array = np.zeros(2)
+        """Its derivative until one period later, rad/s², shape (2,)."""
+
+    @property
+    def active(self) -> bool:
+        """Whether there is a frequency."""
+        return self._ahead > 0
+
+    @property
+    def lead_ns(self) -> int:
+        """Time by which the reference of :meth:`step` is ahead of the shaped one, ns."""
+        return round(self._ahead * self._period * NANOSECONDS)
+
+    def reset(self, speeds: Array) -> None:
+        """Start at wheel speeds (rad/s), shape (2,), held up to now and for the lead."""
+        self._planned[:, 0] = 0.5 * (speeds[0] + speeds[1])
+        self._planned[:, 1] = 0.5 * (speeds[0] - speeds[1])
+
+    def step(self, planned: Array, elapsed: float) -> None:
+        """Update :attr:`reference` and :attr:`rate`.
+
+        Parameters
+        ----------
+        planned
+            Reachable reference one lead after the instant, rad/s, shape (2,).
+        elapsed
+            Time since the last step (s); over a gap the reference is interpolated.
+        """
+        count = min(max(round(elapsed / self._period), 1), len(self._planned))
+        shape(self._planned, planned, count, self._ahead, self._delays, self.reference, self.rate)
+        self.rate /= self._period
+
+
+@kernel
+def shape(
+    rows: Array,
+    planned: Array,
+    count: int,
+    ahead: int,
+    delays: Array,
+    reference: Array,
+    change: Array,
+) -> None:
+    """Append a row, and write the shaped reference and its change in one period.
+
+    rows      : shape (2 ahead + 2, 2), newest first: mean of the wheels, half their difference
+    planned   : shape (2,), newest reference, right wheel first, rad/s
+    count     : number of periods since the last row; rows between are interpolated
+    ahead     : number of periods by which the newest row is ahead of the instant
+    delays    : shape (2,), d of both columns in periods
+    reference, change : shape (2,), overwritten, right wheel first, rad/s
+    """
+    newest = (0.5 * (planned[0] + planned[1]), 0.5 * (planned[0] - planned[1]))
+    for i in range(2):
+        before = rows[0, i]
+        for j in range(rows.shape[0] - 1, count - 1, -1):
+            rows[j, i] = rows[j - count, i]
+        for j in range(count):
+            rows[j, i] = newest[i] + (before - newest[i]) * j / count
+    now = np.zeros(2)
+    after = np.zeros(2)
+    for i in range(2):
+        now[i] = 0.5 * (row_at(rows, i, ahead - delays[i]) + row_at(rows, i, ahead + delays[i]))
+        after[i] = 0.5 * (
+            row_at(rows, i, ahead - 1.0 - delays[i]) + row_at(rows, i, ahead - 1.0 + delays[i])
+        )
+    reference[0], reference[1] = now[0] + now[1], now[0] - now[1]
+    change[0] = after[0] + after[1] - reference[0]
+    change[1] = after[0] - after[1] - reference[1]
+
+
+@kernel
+def row_at(rows: Array, column: int, position: float) -> float:
+    """Return a column of ``rows`` at a position between two rows, linearly interpolated."""
+    first = min(max(int(math.floor(position)), 0), rows.shape[0] - 2)
+    fraction = position - first
+    return float((1.0 - fraction) * rows[first, column] + fraction * rows[first + 1, column])

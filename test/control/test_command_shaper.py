@@ -1,0 +1,115 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Input shaper: what it cancels, what it preserves, and its timing."""
+
+import math
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.control.command_shaper import CommandShaper, CommandShaperParameters
+from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
+from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
+
+PERIOD = 0.01
+PARAMETERS = CommandShaperParameters()
+
+
+def shaped(function, steps, parameters=PARAMETERS, gaps=()):
+    """Return the shaped reference at the times k PERIOD of a function of time, shape (n, 2)."""
+    shaper = CommandShaper(parameters, PERIOD)
+    lead = shaper.lead_ns / 1e9
+    shaper.reset(function(0.0))
+    result, elapsed = [], PERIOD
+    for k in range(steps):
+        if k in gaps:
+            elapsed += PERIOD
+            result.append(np.full(2, math.nan))
+            continue
+        shaper.step(function(k * PERIOD + lead), elapsed)
+        elapsed = PERIOD
+        result.append(shaper.reference.copy())
+    return np.array(result)
+
+
+def test_default_frequencies_are_those_of_the_default_robot():
+    """sqrt(k/J)/(2 pi) of straight motion and turning, from motor and body."""
+    robot = DigitalTwinParameters()
+    motor = robot.motor
+    stiffness = motor.teeth * motor.torque_constant * motor.phase_current
+    inertia = wheel_inertia(robot.body, robot.geometry) + np.eye(2) * motor.rotor_inertia
+    straight, turning = inertia[0, 0] + inertia[0, 1], inertia[0, 0] - inertia[0, 1]
+    assert PARAMETERS.straight_frequency == pytest.approx(
+        math.sqrt(stiffness / straight) / (2.0 * math.pi), rel=0.01
+    )
+    assert PARAMETERS.turning_frequency == pytest.approx(
+        math.sqrt(stiffness / turning) / (2.0 * math.pi), rel=0.01
+    )
+
+
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+def test_the_frequency_of_a_mode_is_cancelled(sign):
+    frequency = PARAMETERS.straight_frequency if sign > 0.0 else PARAMETERS.turning_frequency
+
+    def sine(time):
+        value = math.sin(2.0 * math.pi * frequency * time)
+        return np.array([value, sign * value])
+
+    assert np.max(np.abs(shaped(sine, 300)[50:])) < 0.15
+    other = PARAMETERS.turning_frequency if sign > 0.0 else PARAMETERS.straight_frequency
+    assert abs(math.cos(0.5 * math.pi * other / frequency)) > 0.1
+
+
+def test_an_oscillator_rests_after_a_shaped_ramp():
+    """Undamped rotor on its field: the ring after a ramp is below a tenth of the unshaped one."""
+    omega = 2.0 * math.pi * PARAMETERS.straight_frequency
+
+    def ramp(time):
+        return np.full(2, 30.0 * min(max(time - 0.5, 0.0), 0.1))
+
+    rings = []
+    for commands in (shaped(ramp, 150)[:, 0], np.array([ramp(k * PERIOD)[0] for k in range(150)])):
+        speed = rate = 0.0
+        substeps, ring = 50, []
+        for before, after in zip(commands, commands[1:], strict=False):
+            for j in range(substeps):
+                command = before + (after - before) * (j + 0.5) / substeps
+                rate += omega**2 * (command - speed) * PERIOD / substeps
+                speed += rate * PERIOD / substeps
+            ring.append(speed - commands[-1])
+        rings.append(np.max(np.abs(ring[90:])))
+    assert rings[0] < 0.1 * rings[1]
+
+
+def test_slopes_and_limits_are_preserved():
+    """Straight lines pass unchanged, without delay; no speed or slope exceeds the input's."""
+    line = shaped(lambda t: np.array([3.0 * t, 1.0 - 2.0 * t]), 100)
+    times = PERIOD * np.arange(100)
+    expected = np.stack([3.0 * times, 1.0 - 2.0 * times], axis=1)
+    np.testing.assert_allclose(line[20:], expected[20:], atol=1e-12)
+    generator = np.random.default_rng(3)
+    knots = np.cumsum(generator.uniform(-0.3, 0.3, (400, 2)), axis=0)
+
+    def walk(time):
+        return np.array([np.interp(time / PERIOD, np.arange(400), knots[:, i]) for i in range(2)])
+
+    result = shaped(walk, 300)[10:]
+    mean, half = result @ [0.5, 0.5], result @ [0.5, -0.5]
+    assert np.max(np.abs(np.diff(mean))) <= np.max(np.abs(np.diff(knots @ [0.5, 0.5]))) + 1e-12
+    assert np.max(np.abs(np.diff(half))) <= np.max(np.abs(np.diff(knots @ [0.5, -0.5]))) + 1e-12
+
+
+def test_a_lost_step_is_bridged():
+    def smooth(time):
+        return np.array([math.sin(2.0 * time), math.cos(3.0 * time)])
+
+    whole, bridged = shaped(smooth, 200), shaped(smooth, 200, gaps=(80, 81, 120))
+    known = ~np.isnan(bridged[:, 0])
+    np.testing.assert_allclose(bridged[known], whole[known], atol=2e-3)
+
+
+def test_without_frequencies_nothing_changes():
+    none = CommandShaperParameters(straight_frequency=0.0, turning_frequency=0.0)
+    shaper = CommandShaper(none, PERIOD)
+    assert not shaper.active
+    assert shaper.lead_ns == 0
