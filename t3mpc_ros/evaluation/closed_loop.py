@@ -6,6 +6,7 @@ Worker processes import the main module again: a script that uses more than one 
 work by ``if __name__ == '__main__':``.
 """
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import nullcontext
@@ -32,6 +33,7 @@ from t3mpc_ros.evaluation.scenario import (
     PRETRAINING_NOISE,
     PRETRAINING_SEEDS,
     RATE,
+    LinkFaults,
     Scenario,
 )
 from t3mpc_ros.parameters.table import ParameterError, Parameters
@@ -386,56 +388,127 @@ def run(
     )
 
     last: Array = np.zeros(2)
+    links = _Links(scenario) if scenario.links != LinkFaults() else None
+    observed = -1
     for k in range(scenario.steps):
         if k == change_step and changed_robot is not None:
             plant.configure(changed_robot)
-        seam.observe(plant.measured, period)
         record.measured[k] = plant.measured
         record.speeds[k] = plant.speeds
+        if k > 0:  # unless a measurement arrives, all that it decides stays as it is
+            for kept in (record.command, record.sent, record.limited):
+                kept[k] = kept[k - 1]
+        arrived = ((k, plant.measured),) if links is None else links.measured(k, plant.measured)
+        for j, measured in arrived:
+            elapsed, observed = (j - observed if observed >= 0 else 1), j
+            seam.observe(measured, elapsed * period)
+            observation.speeds = seam.predicted
+            observation.unexplained = seam.disturbance
+            observation.reference = now[j]
+            observation.next_reference = following[j]
+            observation.command = seam.command
+            observation.elapsed = elapsed
+            if rows:
+                observation.future = now[j : j + rows]
+            asked = controller.step(observation)
+            if k == 0 and not (isinstance(asked, np.ndarray) and asked.shape == (2,)):
+                what = f'shape {asked.shape}' if isinstance(asked, np.ndarray) else repr(asked)
+                raise ValueError(
+                    f'step() of {type(controller).__name__} must return a numpy array of shape '
+                    f'(2,), the accelerations of the right and the left wheel: got {what}'
+                )
+            right, left = asked.tolist()
+            if not (math.isfinite(right) and math.isfinite(left)):
+                _break_off(record, k)
+                return record
+            cut = torque_limit < max(
+                abs(diagonal * right + beside * left), abs(beside * right + diagonal * left)
+            )
+            if cut:
+                torque = np.clip(inertia @ asked, -torque_limit, torque_limit)
+                asked = np.asarray(np.linalg.solve(inertia, torque), dtype=np.float64)
+            command = record.command[k]
+            command[:] = seam.send_acceleration(asked)
+            limited = seam.limited or cut
+            record.limited[k] = limited
+            controller.applied(command, limited=limited)
+            if has_terms:
+                record.terms[k] = controller.terms  # type: ignore[attr-defined]
+            sent = record.sent[k]
+            if torque_drive:
+                np.dot(inertia, command, out=sent)
+            else:
+                sent[:] = seam.command
+            if links is not None:
+                links.send(k, j, sent)
         record.estimated[k] = seam.speeds
         record.unexplained[k] = seam.disturbance
-        observation.speeds = seam.predicted
-        observation.unexplained = seam.disturbance
-        observation.reference = now[k]
-        observation.next_reference = following[k]
-        observation.command = seam.command
-        if rows:
-            observation.future = now[k : k + rows]
-        asked = controller.step(observation)
-        if k == 0 and not (isinstance(asked, np.ndarray) and asked.shape == (2,)):
-            what = f'shape {asked.shape}' if isinstance(asked, np.ndarray) else repr(asked)
-            raise ValueError(
-                f'step() of {type(controller).__name__} must return a numpy array of shape (2,), '
-                f'the accelerations of the right and the left wheel: got {what}'
-            )
-        right, left = asked.tolist()
-        if not (math.isfinite(right) and math.isfinite(left)):
-            _break_off(record, k)
-            break
-        cut = torque_limit < max(
-            abs(diagonal * right + beside * left), abs(beside * right + diagonal * left)
-        )
-        if cut:
-            torque = np.clip(inertia @ asked, -torque_limit, torque_limit)
-            asked = np.asarray(np.linalg.solve(inertia, torque), dtype=np.float64)
-        command = record.command[k]
-        command[:] = seam.send_acceleration(asked)
-        limited = seam.limited or cut
-        record.limited[k] = limited
-        controller.applied(command, limited=limited)
-        if has_terms:
-            record.terms[k] = controller.terms  # type: ignore[attr-defined]
-        sent = record.sent[k]
         if torque_drive:
-            np.dot(inertia, command, out=sent)
-            record.effort[k] = command
+            record.effort[k] = record.command[k]
         else:
-            sent[:] = seam.command
-            record.effort[k] = (seam.command - last) / period
-            last[:] = seam.command
-        right, left = sent.tolist()
+            record.effort[k] = (record.sent[k] - last) / period
+            last[:] = record.sent[k]
+        right, left = (record.sent[k] if links is None else links.command(k)).tolist()
         plant.step(right, left)
     return record
+
+
+class _Links:
+    """Links with faults between plant and controller, in whole periods."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        faults = self._faults = scenario.links
+        begin = round(faults.begin * scenario.steps)
+        end = min(begin + faults.lasting * RATE, scenario.steps)
+        period = np.arange(scenario.steps)
+        self._active: NDArray[np.bool_] = (period >= begin) & (period < end)
+        # The same numbers for every method, whatever it sends.
+        self._drawn: Array = np.random.default_rng((scenario.seed, 4)).random((scenario.steps, 4))
+        self._measurements: deque[tuple[int, int, Array]] = deque()
+        self._latest = 0
+        self._commands: list[tuple[int, int, Array]] = []
+        self._newest = -1
+        self._command: Array = np.zeros(2)
+
+    def measured(self, k: int, measured: Array) -> Iterator[tuple[int, Array]]:
+        """Send the measurement of period k; yield those that arrive in it, with their periods."""
+        lost, late = self._drawn[k, :2].tolist()
+        faults, delay = self._faults, 0
+        if self._active[k]:
+            delay = _periods(faults.odometry_delay, late)
+        if not self._active[k] or lost >= faults.odometry_loss:
+            self._latest = max(self._latest, k + delay)
+            self._measurements.append((self._latest, k, measured.copy()))
+        while self._measurements and self._measurements[0][0] <= k:
+            _, j, arrived = self._measurements.popleft()
+            yield j, arrived
+
+    def send(self, k: int, j: int, command: Array) -> None:
+        """Send in period k the command that follows from the measurement of period j."""
+        lost, late = self._drawn[j, 2:].tolist()
+        faults, delay = self._faults, 0
+        if self._active[k]:
+            if lost < faults.command_loss:
+                return
+            delay = _periods(faults.command_delay, late)
+        self._commands.append((k + delay, j, command.copy()))
+
+    def command(self, k: int) -> Array:
+        """Return the command that has arrived by period k, of the newest measurement."""
+        waiting = []
+        for arrival, j, command in self._commands:
+            if arrival > k:
+                waiting.append((arrival, j, command))
+            elif j > self._newest:
+                self._newest, self._command = j, command
+        self._commands = waiting
+        return self._command
+
+
+def _periods(bounds: tuple[float, float], share: float) -> int:
+    """Return a delay in whole periods."""
+    least, most = bounds
+    return round((least + (most - least) * share) * RATE)
 
 
 def _prepare(scenario: Scenario) -> LoopRecord:

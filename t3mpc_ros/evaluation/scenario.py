@@ -39,9 +39,42 @@ REFERENCE_DEVIATION = 3.0
 """Standard deviation of every signal of the reference, rad/s."""
 STATE_DEVIATIONS = (10.6, 2.22, 0.937, 22.2)
 """Standard deviations of the raw states of (85), measured at q = 0.98 over 10 000 s."""
-LONGEST_DEAD_TIME = 0.05
+LONGEST_DEAD_TIME = 0.06
 """Dead time up to which a reference is computed beyond the end of a run, s."""
 _ROBOT_SEEDS = 10_000  # robot seeds start here: no reference has one of them by accident
+
+
+@dataclass(frozen=True, slots=True)
+class LinkFaults:
+    """Faults of the links between robot and controller."""
+
+    command_loss: float = 0.0
+    """Fraction of the commands that is lost."""
+    command_delay: tuple[float, float] = (0.0, 0.0)
+    """Least and largest additional delay of a command, s; uniform between them. A command that
+    arrives after a later one is ignored."""
+    odometry_loss: float = 0.0
+    """Fraction of the measurements that is lost."""
+    odometry_delay: tuple[float, float] = (0.0, 0.0)
+    """Least and largest delay of a measurement, s; they arrive in order."""
+    begin: float = 0.0
+    """Begin of the faults, as a share of the run."""
+    lasting: float = math.inf
+    """Duration of the faults, s."""
+
+
+DROPOUTS = LinkFaults(command_loss=0.1, odometry_loss=0.1)
+JITTER = LinkFaults(command_delay=(0.0, 0.02), odometry_delay=(0.0, 0.01))
+OVERLOAD = LinkFaults(
+    command_delay=(0.02, 0.12), odometry_delay=(0.02, 0.12), begin=0.5, lasting=4.0
+)
+LINK_TEXTS: Mapping[LinkFaults, str] = {
+    DROPOUTS: '10 % of the commands and 10 % of the measurements are lost',
+    JITTER: 'each command is up to 20 ms late, and each measurement up to 10 ms',
+    OVERLOAD: 'for 4 s from half of the run on, each command and each measurement is 20 to 120 ms '
+    'late',
+}
+"""What these faults are, in words."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +92,10 @@ class Case:
     """Whether the estimator and the methods know of ``changes``."""
     drives: tuple[str, ...] = DRIVES
     """Drives to which the case applies."""
+    links: LinkFaults = LinkFaults()
+    """Faults of the links, in whole periods; unknown to all methods."""
+    reproduced: bool = True
+    """Whether it belongs to the reproduction of the paper."""
 
 
 CASES: Mapping[str, Case] = {
@@ -84,6 +121,28 @@ CASES: Mapping[str, Case] = {
         known=True,
         drives=('velocity',),
     ),
+    'dead time 60 ms': Case(
+        'a command takes 60 ms instead of 10 ms to reach the wheels, and everyone knows it',
+        {'drive.dead_time': 0.06},
+        known=True,
+        drives=('velocity',),
+        reproduced=False,
+    ),
+    'unknown dead time': Case(
+        'a command takes 30 ms to reach the wheels; everyone assumes 10 ms',
+        {'drive.dead_time': 0.03},
+        drives=('velocity',),
+        reproduced=False,
+    ),
+    'unknown dead time 60 ms': Case(
+        'a command takes 60 ms to reach the wheels; everyone assumes 10 ms',
+        {'drive.dead_time': 0.06},
+        drives=('velocity',),
+        reproduced=False,
+    ),
+    'dropouts': Case(LINK_TEXTS[DROPOUTS], links=DROPOUTS, reproduced=False),
+    'jitter': Case(LINK_TEXTS[JITTER], links=JITTER, reproduced=False),
+    'overload': Case(LINK_TEXTS[OVERLOAD], links=OVERLOAD, reproduced=False),
 }
 """Every case by name, in the order of the tables."""
 
@@ -175,6 +234,11 @@ class Scenario:
     def change_step(self) -> int:
         """The period at whose start :meth:`changed_robot` takes over."""
         return round(CASES[self.case].when * self.steps)
+
+    @property
+    def links(self) -> LinkFaults:
+        """Faults of the links between robot and controller."""
+        return CASES[self.case].links
 
     @property
     def limits(self) -> LimitParameters:

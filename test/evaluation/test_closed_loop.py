@@ -33,6 +33,7 @@ from t3mpc_ros.evaluation.scenario import (
     PRETRAINING_SEEDS,
     RATE,
     TUNING_SEEDS,
+    LinkFaults,
     Scenario,
 )
 from t3mpc_ros.geometry.types import WheelSpeeds
@@ -224,6 +225,12 @@ EXPECTED = {
     'load change': {},
     'disturbance': {'disturbance.bound': 0.006},
     'dead time': {'drive.dead_time': 0.03},
+    'dead time 60 ms': {'drive.dead_time': 0.06},
+    'unknown dead time': {'drive.dead_time': 0.03},
+    'unknown dead time 60 ms': {'drive.dead_time': 0.06},
+    'dropouts': {},
+    'jitter': {},
+    'overload': {},
 }
 
 
@@ -242,11 +249,12 @@ def test_only_the_dead_time_of_a_case_is_known_to_methods(case, drive):
     told = scenario.nominal_model().robot
     nominal = PaperRobotParameters.from_dict({'drive.kind': drive}).to_dict()
     known = {name: value for name, value in told.to_dict().items() if value != nominal[name]}
-    assert known == (EXPECTED[case] if case == 'dead time' else {})
+    is_known = case in ('dead time', 'dead time 60 ms')
+    assert known == (EXPECTED[case] if is_known else {})
     estimate = scenario.estimate()
     assert estimate.noise_variance == 0.07
     assert estimate.lag == told.drive.lag
-    assert estimate.dead_time == (0.03 if case == 'dead time' else 0.01)
+    assert estimate.dead_time == (EXPECTED[case]['drive.dead_time'] if is_known else 0.01)
 
 
 @pytest.mark.parametrize('drive', DRIVES)
@@ -254,7 +262,7 @@ def test_every_case_affects_the_run_load_change_from_half(drive):
     runs = {
         case: run(Scenario(drive, 0.04, case, 2, 2.0), P)
         for case in CASES
-        if drive in CASES[case].drives
+        if drive in CASES[case].drives and CASES[case].links == LinkFaults()
     }
     nominal = runs.pop('nominal')
     for case, changed in runs.items():
@@ -265,6 +273,46 @@ def test_every_case_affects_the_run_load_change_from_half(drive):
             changed.measured - changed.speeds, nominal.measured - nominal.speeds, atol=1e-12
         )
         assert differs[0] == 101 if case == 'load change' else differs[0] < 10
+
+
+@pytest.mark.parametrize('drive', DRIVES)
+def test_faults_of_the_links_begin_in_time(drive):
+    nominal, overload = (
+        run(Scenario(drive, 0.04, case, 2, 12.0), P) for case in ('nominal', 'overload')
+    )
+    begin = 600
+    np.testing.assert_array_equal(nominal.speeds[: begin + 1], overload.speeds[: begin + 1])
+    np.testing.assert_array_equal(nominal.reference, overload.reference)
+    span = slice(begin + 50, begin + 400)
+    error = [np.sqrt(np.mean(record.error[span] ** 2)) for record in (nominal, overload)]
+    assert error[1] > 1.5 * error[0]
+    assert overload.finite
+
+
+class ElapsedNoting(Proportional):
+    """Notes the periods between its observations."""
+
+    def __init__(self, parameters, nominal_model):
+        super().__init__(parameters, nominal_model)
+        self.elapsed = []
+
+    def step(self, observation):
+        self.elapsed.append(observation.elapsed)
+        return super().step(observation)
+
+
+def test_a_method_knows_how_many_measurements_were_lost():
+    scenario = Scenario('velocity', 0.04, 'dropouts', 2, 20.0)
+    record, method = noted(ElapsedNoting, scenario)
+    again, _ = noted(ElapsedNoting, scenario)
+    assert_equal_records(record, again)
+    assert 1700 < len(method.elapsed) < 1900
+    assert 1990 < sum(method.elapsed) <= scenario.steps
+    assert max(method.elapsed) > 1
+    held = (record.sent[1:] == record.sent[:-1]).all(axis=1).sum()
+    assert held == scenario.steps - len(method.elapsed)
+    _, method = noted(ElapsedNoting, Scenario('velocity', 0.04, 'nominal', 2, 2.0))
+    assert set(method.elapsed) == {1}
 
 
 def test_the_load_change_makes_the_robot_heavier_and_rougher():
@@ -507,7 +555,7 @@ def test_what_does_not_fit_the_loop_is_refused():
         def step(self, observation):
             return np.zeros(3)
 
-    with pytest.raises(ValueError, match=r'shape \(2,\): got \(3,\)'):
+    with pytest.raises(ValueError, match=r'shape \(2,\), .*: got shape \(3,\)'):
         run(scenario, partial(Scalar, ProportionalParameters()))
 
 

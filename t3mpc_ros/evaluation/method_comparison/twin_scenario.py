@@ -14,13 +14,17 @@ from t3mpc_ros.control.controller import ControllerParameters
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel
 from t3mpc_ros.evaluation.scenario import (
+    DROPOUTS,
+    JITTER,
+    LINK_TEXTS,
+    OVERLOAD,
     RATE,
+    LinkFaults,
     SampledReference,
     isotropic_acceleration,
     sample_reference,
 )
 from t3mpc_ros.evaluation.twin_closed_loop import (
-    INITIAL_STANDSTILL,
     LEAD,
     OdometryFaults,
     loop_controller,
@@ -35,8 +39,6 @@ SHORTEST, LONGEST = 2.0, 3600.0
 """Bounds of the duration of a run, s."""
 PATCHES = Path(__file__).with_name('patches.yaml')
 """World with slippery patches."""
-OVERLOAD = 4.0
-"""Duration of the overload, s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,16 +48,10 @@ class TwinCase:
     text: str
     robot: Mapping[str, object] = field(default_factory=dict)
     """Parameters of the robot from the start."""
-    faults: Mapping[str, float] = field(default_factory=dict)
-    """Faults of robot and command link, from :attr:`begin` on for :attr:`lasting`."""
-    odometry_loss: float = 0.0
-    """Fraction of the reports that is lost in that time."""
-    odometry_delay: tuple[float, float] = (0.0, 0.0)
-    """Least and largest delay of a report in that time, s."""
-    begin: float = 0.0
-    """Begin of the faults, as a share of the run."""
-    lasting: float = math.inf
-    """Duration of the faults, s."""
+    load_change: float = 0.0
+    """Mass added to the body at half of the run, kg."""
+    links: LinkFaults = LinkFaults()
+    """Faults of the links; unknown to all methods."""
     assumed_dead_time: float = 0.01
     """Dead time that every method assumes, s."""
     gyro: bool = False
@@ -83,9 +79,7 @@ CASES: Mapping[str, TwinCase] = {
         'three times the bound of the disturbance torque',
         {'disturbance.bound': 3.0 * DisturbanceParameters().bound},
     ),
-    'load change': TwinCase(
-        'at half of the run 1 kg is added to the body', faults={'load_change': 1.0}, begin=0.5
-    ),
+    'load change': TwinCase('at half of the run 1 kg is added to the body', load_change=1.0),
     'dead time': TwinCase(
         'a command takes 30 ms instead of 10 ms, and every method knows it',
         {'drive.dead_time': 0.03},
@@ -102,24 +96,9 @@ CASES: Mapping[str, TwinCase] = {
     'unknown dead time 60 ms': TwinCase(
         'a command takes 60 ms; every method assumes 10 ms', {'drive.dead_time': 0.06}
     ),
-    'dropouts': TwinCase(
-        '10 % of the commands and 10 % of the odometry are lost',
-        faults={'command_loss': 0.1},
-        odometry_loss=0.1,
-    ),
-    'jitter': TwinCase(
-        'each command is up to 20 ms late, and each odometry message up to 10 ms',
-        faults={'command_jitter': 0.02},
-        odometry_delay=(0.0, 0.01),
-    ),
-    'overload': TwinCase(
-        f'for {OVERLOAD:g} s from half of the run on, each command and each odometry message is '
-        '20 to 120 ms late',
-        faults={'command_delay': 0.02, 'command_jitter': 0.1},
-        odometry_delay=(0.02, 0.12),
-        begin=0.5,
-        lasting=OVERLOAD,
-    ),
+    'dropouts': TwinCase(LINK_TEXTS[DROPOUTS], links=DROPOUTS),
+    'jitter': TwinCase(LINK_TEXTS[JITTER], links=JITTER),
+    'overload': TwinCase(LINK_TEXTS[OVERLOAD], links=OVERLOAD),
 }
 """Every case by name, in the order of the tables."""
 
@@ -178,12 +157,11 @@ class TwinScenario:
 
     @property
     def fault_span(self) -> tuple[float, float] | None:
-        """Begin and end (s) of the faults that do not last for the whole run; None without."""
+        """Begin and end (s) of what does not last for the whole run; None without."""
         case = CASES[self.case]
-        if case.begin == 0.0 and case.lasting == math.inf:
-            return None
-        begin = self._fault_begin
-        return begin, begin + case.lasting
+        if case.load_change:
+            return 0.5 * self.duration, math.inf
+        return self._link_span if case.links.begin else None
 
     @property
     def limits(self) -> LimitParameters:
@@ -203,21 +181,27 @@ class TwinScenario:
 
     def schedule(self) -> FaultSchedule:
         """Return the faults of robot and command link."""
-        case = CASES[self.case]
-        return FaultSchedule(
-            [
-                FaultEvent(self._fault_begin, name, value, case.lasting)
-                for name, value in case.faults.items()
-            ],
-            self.case,
-        )
+        case, links = CASES[self.case], CASES[self.case].links
+        begin, _ = self._link_span
+        least, most = links.command_delay
+        values = {
+            'command_loss': links.command_loss,
+            'command_delay': least,
+            'command_jitter': most - least,
+        }
+        events = [
+            FaultEvent(begin, name, value, links.lasting)
+            for name, value in values.items()
+            if value
+        ]
+        if case.load_change:
+            events.append(FaultEvent(0.5 * self.duration, 'load_change', case.load_change))
+        return FaultSchedule(events, self.case)
 
     def odometry_faults(self) -> OdometryFaults:
         """Return the faults of the odometry on its way to the controller."""
-        case, begin = CASES[self.case], self._fault_begin
-        return OdometryFaults(
-            case.odometry_loss, case.odometry_delay, begin, begin + case.lasting, self.seed
-        )
+        links, (begin, end) = CASES[self.case].links, self._link_span
+        return OdometryFaults(links.odometry_loss, links.odometry_delay, begin, end, self.seed)
 
     def controller_parameters(self) -> ControllerParameters:
         """Return the parameters of the controller node for the twin, with the known values."""
@@ -257,9 +241,10 @@ class TwinScenario:
         )
 
     @property
-    def _fault_begin(self) -> float:
-        case = CASES[self.case]
-        return max(case.begin * self.duration, INITIAL_STANDSTILL if case.begin else 0.0)
+    def _link_span(self) -> tuple[float, float]:
+        links = CASES[self.case].links
+        begin = links.begin * self.duration
+        return begin, begin + links.lasting
 
 
 def check_name(kind: str, name: str, known: Mapping[str, object]) -> None:
