@@ -21,6 +21,11 @@ MS = 1_000_000
 START_NS = 5_000_000_000
 TTL_AND_SLACK = 0.25
 """s"""
+SHORTEST_DELAY = 0.002
+"""Bound of the delay of a command with nothing in its way, s: it is the reference of the robot."""
+REFERENCE_AGE = 10.0
+"""Longest time, s, from the reference to a command, during which the clocks drift apart. A silence
+adds to it; the robot then allows more, too."""
 SAMPLE = Registers(164, -5, 8192, -4000, -12, 13, -131)
 
 
@@ -31,8 +36,10 @@ class Bench:
         self, flat=None, key=b'', robot_key=None, link=None, seed=1, emulator=None, erased=False
     ):
         robot_key = key if robot_key is None else robot_key
+        self.clock_error = 0.0
         if emulator is None:
             parameters = EmulatorParameters.from_dict(flat or {})
+            self.clock_error = parameters.robot_clock_error
             emulator = Emulator(parameters, robot_key, seed, START_NS, erased)
         self.emulator = emulator
         """The emulator, or an object with its interface such as ``avr_bench.AvrEmulator``."""
@@ -185,7 +192,11 @@ def sent_commands(*benches):
 
 
 def check_followed(bench, *others):
-    """Check the executed commands: sent by a host, unique, in order, and not stale."""
+    """Check the executed commands: sent by a host, unique, in order, and not stale.
+
+    The robot counts TTL and slack from the shortest recent delay, by its own clock.
+    """
+    bound = TTL_AND_SLACK + SHORTEST_DELAY + abs(bench.clock_error) * REFERENCE_AGE
     sent = sent_commands(bench, *others)
     position = {command: index for index, command in enumerate(sent)}
     assert len(position) == len(sent)
@@ -193,7 +204,7 @@ def check_followed(bench, *others):
     for now_ns, command in bench.followed:
         order.setdefault(command.session, []).append(position[command])
         age = (now_ns // 1000 - command.host_us) % (1 << 32) / 1e6
-        assert age <= TTL_AND_SLACK, f'{command} was executed after {age} s'
+        assert age <= bound, f'{command} was executed after {age} s'
     for followed in order.values():
         assert followed == sorted(set(followed))
 
