@@ -239,7 +239,8 @@ static bool is_quiet(void)
 
 static void load_answer(void)
 {
-    if (!answer_size || !is_quiet())
+    // A packet that came since the last look at the radio is being acknowledged with what is loaded.
+    if (!answer_size || !is_quiet() || radio_interrupt)
         return;
     nrf24_answer(answer, answer_size);
     answer_size = 0;
