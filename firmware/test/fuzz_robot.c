@@ -132,6 +132,14 @@ static void check_rules(struct t3_host_robot *robot, bool keyed)
         CHECK(!left && !right && (status & T3_STATUS_NO_SESSION));
 }
 
+// With other microsteps: they come from the settings only, and not from packets.
+static void boot_anew(struct t3_host_robot *robot)
+{
+    static const uint8_t ADDRESS[] = {'T', '3', 'M', 'P', 'C'};
+    t3_host_robot_store_settings(robot, 82, (uint16_t)(1u << fuzz_below(9)), ADDRESS);
+    t3_host_robot_boot(robot, fuzz_byte(), fuzz_next());
+}
+
 static void fuzz(const char *what, bool keyed)
 {
     struct t3_host_robot *robot = t3_host_robot_new();
@@ -153,7 +161,7 @@ static void fuzz(const char *what, bool keyed)
         if (fuzz_below(20) == 0)
             disturb(robot);
         if (fuzz_below(20000) == 0)
-            t3_host_robot_boot(robot, fuzz_byte(), fuzz_next());
+            boot_anew(robot);
         check_rules(robot, keyed);
         moving += (t3_host_robot_status(robot) & T3_STATUS_MOVING) != 0;
     }
