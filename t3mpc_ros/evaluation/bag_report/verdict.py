@@ -16,7 +16,7 @@ MAX_MISSING = 0.02
 MAX_ERROR = 0.25
 """Largest RMSE, settled, as a share of the root mean square of the reference."""
 MIN_COUNTED = 0.5
-"""Least share of the recording in which errors count."""
+"""Least share of the drive in which errors count."""
 MAX_LATENCY = 0.02
 """99th percentile of the time from odometry to command that shows a slow machine, s."""
 COMMAND_TIMEOUT = 0.5
@@ -82,8 +82,8 @@ def judge(
         problems.append(f'the robot was stopped for {stopped:.1f} of {length:.1f} s')
     if missing > MAX_MISSING:
         problems.append(f'{100.0 * missing:.1f} % of {ODOMETRY} is missing')
-    if counted < MIN_COUNTED * run.duration:
-        problems.append(f'only {counted:.1f} of {run.duration:.1f} s count')
+    if counted < MIN_COUNTED * length:
+        problems.append(f'only {counted:.1f} of {length:.1f} s count')
     size = max(float(np.sqrt(np.mean(reference[each.name] ** 2))) for each in run.channels)
     if not np.isfinite(rmse):
         problems.append('no settled motion was measured')
