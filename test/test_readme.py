@@ -63,7 +63,6 @@ SHORTENED = {
     'scripts/run t3mpc bag replay runs/latest/bag --set law.gain=20.0': ([], False),
     'scripts/run t3mpc bag compare runs/latest/bag --picture divergence.png': ([], False),
     'scripts/run t3mpc bag recover runs/latest/bag --output recovered': ([], False),
-    'scripts/run t3mpc bag train runs/latest/bag --keep-predictor --output model.npz': ([], False),
     'scripts/run player --ros-args -p storage.uris:=[runs/latest/bag]': (
         ['-p', 'play.rate:=10.0'],
         False,

@@ -26,7 +26,13 @@ ROBOTS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
     'twin': {'sim_robot': {'drive.kind': 'stepper'}},
     'servo': {
         'sim_robot': {'drive.kind': 'velocity'},
-        'controller': {'composition': 'paper', 'speed_filter.lag': 0.02, 'mean_speeds': False},
+        'controller': {
+            'composition': 'paper',
+            'speed_filter.lag': 0.02,
+            'mean_speeds': False,
+            'command_shaper.straight_frequency': 0.0,
+            'command_shaper.turning_frequency': 0.0,
+        },
     },
     'emulator': {
         'radio_bridge': {},

@@ -129,7 +129,7 @@ def _exponents(options: argparse.Namespace) -> int:
 
 
 def _compile(options: argparse.Namespace) -> int:
-    from t3mpc_ros.control.controller import Controller, ControllerParameters
+    from t3mpc_ros.control.controller import Controller, StepperControllerParameters
     from t3mpc_ros.evaluation.closed_loop import MethodSpec, run
     from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
     from t3mpc_ros.evaluation.scenario import DRIVES, Scenario
@@ -138,7 +138,7 @@ def _compile(options: argparse.Namespace) -> int:
     for drive in DRIVES:
         spec = MethodSpec('full', ProposedController, ProposedParameters())
         run(Scenario(drive, 0.04, 'nominal', 1, 1.0), spec)
-    Controller(ControllerParameters()).warm_up()
+    Controller(StepperControllerParameters()).warm_up()
     for kind in ('velocity', 'stepper'):
         make_robot(DigitalTwinParameters.from_dict({'drive.kind': kind})).warm_up()
     return 0

@@ -24,6 +24,7 @@ from t3mpc_ros.control.control_law import (
 )
 from t3mpc_ros.control.dead_time_estimator import DeadTimeEstimator
 from t3mpc_ros.control.jump_transition import JumpTransition
+from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.control.watchdog import InputWatchdog, Reason, ResponseMonitor, WatchdogParameters
 from t3mpc_ros.geometry import kinematics
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
@@ -37,7 +38,7 @@ from t3mpc_ros.geometry.types import (
     WheelSpeeds,
 )
 from t3mpc_ros.kernels import kernel
-from t3mpc_ros.parameters.table import group, parameter
+from t3mpc_ros.parameters.table import group, parameter, with_default
 
 Array = NDArray[np.float64]
 
@@ -65,16 +66,17 @@ class ControllerParameters(Nt3fsMpcParameters):
     """Parameters of the controller: control law, wheel geometry, limits and time-outs."""
 
     composition: str = parameter(
-        'body',
+        'paper',
         'body: the wheels follow the plan by feed-forward, and NT3FS and compensator correct the '
         'yaw rate of the body; for a robot whose wheels follow commands exactly. paper: NT3FS, '
         'compensator and v_p act on the wheel speeds, as in the paper; for a drive with errors',
         choices=('body', 'paper'),
     )
     estimate_dead_time: bool = parameter(
-        True,
+        False,
         'whether the dead time of the robot is estimated from commands and measured speeds, and '
-        'used in place of speed_filter.dead_time where it differs by more than 4 ms',
+        'used in place of speed_filter.dead_time where it differs by more than 4 ms; what is '
+        'learnt while the response is disturbed is then discarded',
         dynamic=True,
     )
     mean_speeds: bool = parameter(
@@ -82,11 +84,12 @@ class ControllerParameters(Nt3fsMpcParameters):
         'whether a measured wheel speed is the mean over the last period, as from counters of '
         'steps; false: the speed at its stamp',
     )
-    law: LawParameters = group(LawParameters, gain=0.0)
     geometry: WheelGeometry = group(WheelGeometry, inline=True)
     limits: LimitParameters = group(LimitParameters, inline=True)
     watchdog: WatchdogParameters = group(WatchdogParameters)
-    command_shaper: CommandShaperParameters = group(CommandShaperParameters)
+    command_shaper: CommandShaperParameters = group(
+        CommandShaperParameters, straight_frequency=0.0, turning_frequency=0.0
+    )
     body: BodyCorrectionParameters = group(BodyCorrectionParameters)
 
     def resolved(self) -> Self:
@@ -103,6 +106,18 @@ class ControllerParameters(Nt3fsMpcParameters):
             return parts
         gain, smoothing = fitting_gain(parts, 'velocity')
         return parts.with_values({'law.gain': gain, 'law.smoothing': smoothing})
+
+
+@dataclass(frozen=True)
+class StepperControllerParameters(ControllerParameters):
+    """Parameters whose defaults are for a robot with stepper motors and a gyro."""
+
+    composition: str = with_default(ControllerParameters, 'composition', 'body')
+    estimate_dead_time: bool = with_default(ControllerParameters, 'estimate_dead_time', True)
+    law: LawParameters = group(LawParameters, gain=0.0)
+    # A rotor follows its field at once; the lag of 0.02 s is that of the velocity drive.
+    speed_filter: SpeedFilterParameters = group(SpeedFilterParameters, lag=0.003)
+    command_shaper: CommandShaperParameters = group(CommandShaperParameters)
 
 
 class Status(NamedTuple):
@@ -449,6 +464,8 @@ class Controller:
 
     def _update_dead_time(self, speeds: Array, elapsed: float) -> None:
         """Update the dead time in use; after a disturbance, discard what was learnt during it."""
+        if not self.parameters.estimate_dead_time:
+            return
         estimator, actuation = self._dead_time, self._actuation
         disturbed = estimator.step(speeds, actuation.command, elapsed)
         if disturbed and self._before_disturbance is None and self._snapshots:
@@ -458,11 +475,8 @@ class Controller:
             self._rollback(self._before_disturbance)
             self._before_disturbance = None
         dead_time = self.parameters.speed_filter.dead_time
-        if (
-            self.parameters.estimate_dead_time
-            and abs(estimator.dead_time - dead_time) > DEAD_TIME_TOLERANCE
-            and abs(estimator.dead_time - dead_time) > 3.0 * estimator.standard_deviation
-        ):
+        difference = abs(estimator.dead_time - dead_time)
+        if difference > max(DEAD_TIME_TOLERANCE, 3.0 * estimator.standard_deviation):
             dead_time = estimator.dead_time
         if abs(dead_time - actuation.dead_time) > MIN_DEAD_TIME_CHANGE:
             actuation.set_dead_time(dead_time)

@@ -16,7 +16,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.control.controller import Controller, ControllerParameters
+from t3mpc_ros.control.controller import (
+    Controller,
+    ControllerParameters,
+    StepperControllerParameters,
+)
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation.scenario import RATE, Scenario
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
@@ -61,9 +65,7 @@ def straight_course(duration: float, speed: float = 0.2, turn: float = 0.0) -> A
 
 def loop_controller() -> ControllerParameters:
     """Return the controller parameters for the stepper twin."""
-    return ControllerParameters.from_dict(
-        {'speed_filter.lag': 0.003, 'speed_filter.noise_variance': 0.04}
-    )
+    return StepperControllerParameters()
 
 
 def loop_robot(world: str = '', seed: int = 1) -> DigitalTwinParameters:

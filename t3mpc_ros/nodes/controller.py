@@ -19,9 +19,8 @@ from std_srvs.srv import SetBool, Trigger
 from t3mpc_ros.bag.run.journal import Journal, parameters_to_json
 from t3mpc_ros.bag.run.model_file import ModelError, load_model, save_model
 from t3mpc_ros.control.control_law import TERM_NAMES
-from t3mpc_ros.control.controller import Controller, ControllerParameters, Status
+from t3mpc_ros.control.controller import Controller, Status, StepperControllerParameters
 from t3mpc_ros.control.input_monitor import InputMonitor
-from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist
 from t3mpc_ros.nodes.common import conversions, graph_introspection, qos
@@ -48,12 +47,9 @@ WATCHDOG_PERIOD = 0.05
 
 
 @dataclass(frozen=True)
-class ControllerNodeParameters(ControllerParameters):
+class ControllerNodeParameters(StepperControllerParameters):
     """Parameters of the controller node."""
 
-    # The rotor of a stepper motor follows its field at once; the lag of 0.02 s is that of the
-    # velocity drive.
-    speed_filter: SpeedFilterParameters = group(SpeedFilterParameters, lag=0.003)
     enable_stamped_cmd_vel: bool = parameter(
         False, 'publish cmd_vel as TwistStamped instead of Twist'
     )

@@ -123,6 +123,12 @@ def parameter(
     return field(default=default, metadata={'spec': details, 'name': name})
 
 
+def with_default(table: type['Parameters'], attribute: str, default: Value) -> Any:
+    """Return the field of a parameter of a base table, with another default."""
+    inherited = next(each for each in fields(table) if each.name == attribute)
+    return field(default=default, metadata=inherited.metadata)
+
+
 def group(table: type['Parameters'], *, inline: bool = False, **defaults: Value) -> Any:
     """Return a dataclass field that holds another table, with some of its defaults replaced.
 

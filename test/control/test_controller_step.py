@@ -215,7 +215,7 @@ def test_the_output_is_a_function_of_the_messages():
 
 
 def test_dynamic_parameters_reach_every_part():
-    loop = Loop(composition='paper')
+    loop = Loop()
     loop.run(50)
     changed = loop.controller.parameters.with_values(
         {
@@ -235,7 +235,7 @@ def test_dynamic_parameters_reach_every_part():
 
 
 def test_reset_discards_the_weights():
-    loop = Loop(composition='paper')
+    loop = Loop()
     loop.run(200)
     assert np.any(loop.controller.law.fuzzy.coefficients)
     loop.controller.reset()
@@ -245,7 +245,7 @@ def test_reset_discards_the_weights():
 
 def test_wheel_parts_are_off_in_the_composition_of_the_body():
     """On a stepper the wheels follow exactly: there is nothing to learn about them."""
-    loop = Loop()
+    loop = Loop(composition='body')
     statuses = loop.run(200)
     assert not np.any(loop.controller.law.fuzzy.coefficients)
     assert not np.any([statuses[-1].terms[row] for row in (0, 3, 4)])
@@ -259,8 +259,8 @@ def test_noise_of_the_measurement_cancels_in_the_command(lag, composition):
     for noise in (0.0, 0.02):
         loop = Loop(
             lambda t: (0.1 * math.sin(t), 0.5),
-            **{'composition': composition, 'speed_filter.lag': lag, 'use_fuzzy': False,
-               'predictive.enabled': False, 'speed_filter.enabled': False},
+            **{'composition': composition, 'law.gain': 0.0, 'speed_filter.lag': lag,
+               'use_fuzzy': False, 'predictive.enabled': False, 'speed_filter.enabled': False},
         )  # fmt: skip
         generator = np.random.default_rng(1)
         sent = []
@@ -281,8 +281,10 @@ def test_a_dead_time_that_nobody_configured_is_found():
 
     loop = Loop(
         reference,
+        composition='body',
+        estimate_dead_time=True,
         mean_speeds=False,
-        **{'speed_filter.noise_variance': 0.04, 'speed_filter.lag': 0.003},
+        **{'law.gain': 0.0, 'speed_filter.noise_variance': 0.04, 'speed_filter.lag': 0.003},
     )
     sent = [BodyTwist(0.0, 0.0)] * 5
     generator = np.random.default_rng(2)

@@ -539,6 +539,12 @@ def test_bags_made_under_different_settings_are_not_mixed(run, calm, tmp_path):
         fit_bags([tmp_path / 'nowhere'])
 
 
+def test_a_bag_without_learning_of_the_wheels_is_refused(run, tmp_path):
+    bag = run.tape.changed(composition='body').write(tmp_path / 'bag')
+    with pytest.raises(TrainingError, match='composition must be paper: got body'):
+        fit_bags([bag])
+
+
 # -- the pieces it rests on ---------------------------------------------------------------------
 
 

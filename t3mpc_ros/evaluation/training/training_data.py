@@ -108,6 +108,12 @@ def load_training_data(folder: Path) -> tuple[TrainingData, ControllerParameters
             )
         notes: list[str] = []
         parameters = recorded_parameters(recording, namespaces[0], notes)
+        if parameters.composition != 'paper':
+            raise TrainingError(
+                f'{folder}: composition must be paper: got {parameters.composition}, in which '
+                'nothing is learnt about the wheels; record a bag with composition: paper'
+            )
+        parameters = parameters.resolved()
         messages = {name: _read(recording, name, topics[name], notes) for name in NEEDED}
     if empty := [name for name, table in messages.items() if not table['received'].size]:
         raise TrainingError(f'{folder}: no message of {", ".join(empty)} is finite')
