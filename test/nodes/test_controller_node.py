@@ -159,7 +159,9 @@ def test_stamped_commands_have_frame_and_stamp_of_the_odometry(harness):
 
 
 def test_weights_survive_in_a_model_file_and_not_a_reset(harness, tmp_path):
-    bench = ControllerHarness(harness, model_output=str(tmp_path / 'model.npz'))
+    bench = ControllerHarness(
+        harness, composition='paper', model_output=str(tmp_path / 'model.npz')
+    )
 
     def saved():
         response = harness.call(Trigger, 'controller/save_model')
@@ -176,7 +178,13 @@ def test_weights_survive_in_a_model_file_and_not_a_reset(harness, tmp_path):
     assert np.abs(change).max() > 1e-3
 
     files = {name: str(tmp_path / f'{name}.npz') for name in ('model', 'copy')}
-    harness.add(ControllerNode, namespace='copy', model=files['model'], model_output=files['copy'])
+    harness.add(
+        ControllerNode,
+        namespace='copy',
+        composition='paper',
+        model=files['model'],
+        model_output=files['copy'],
+    )
     assert harness.call(Trigger, 'copy/controller/save_model').success
     loaded = load_model(tmp_path / 'copy.npz')
     assert loaded.keys() == learnt.keys()

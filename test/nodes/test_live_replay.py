@@ -80,7 +80,9 @@ def live_run(processes, bag, model):
         assert operator.call(
             SetBool, '/e_stop', data=True
         ).success  # the robot does not follow commands
-        time.sleep(1.0)
+        # As soon as the reference is faster than a robot at rest explains.
+        processes.wait_for('controller', Reason.NOT_FOLLOWING.value)
+        time.sleep(0.5)
         assert operator.call(SetBool, '/e_stop', data=False).success
         time.sleep(2.0)
         assert operator.call(SetBool, '/controller/enable', data=False).success
