@@ -169,13 +169,7 @@ class Controller:
             self._period,
         )
         self._dead_time_ns = round(self._actuation.dead_time * NANOSECONDS)
-        # The pulses of a stepper ramp over a period, half a period late on average.
-        filtered = parameters.speed_filter
-        self._dead_time = DeadTimeEstimator(
-            replace(filtered, lag=max(filtered.lag, 0.5 * self._period)),
-            self._period,
-            mean_speeds=parameters.mean_speeds,
-        )
+        self._dead_time = self._make_dead_time_estimator()
         self._before_disturbance: tuple[Any, Any] | None = None
         self._shaper = CommandShaper(parameters.command_shaper, self._period)
         geometry = parameters.geometry
@@ -285,6 +279,10 @@ class Controller:
         self.law.fuzzy.reset()
         self.law.predictive.pretrain()
         self._body.reset()
+        self._dead_time = self._make_dead_time_estimator()
+        self._before_disturbance = None
+        self._snapshots.clear()
+        self._set_dead_time(self.parameters.speed_filter.dead_time)
         self._stop()
         self._last_stamp_ns = None
 
@@ -479,8 +477,20 @@ class Controller:
         if difference > max(DEAD_TIME_TOLERANCE, 3.0 * estimator.standard_deviation):
             dead_time = estimator.dead_time
         if abs(dead_time - actuation.dead_time) > MIN_DEAD_TIME_CHANGE:
-            actuation.set_dead_time(dead_time)
-            self._dead_time_ns = round(dead_time * NANOSECONDS)
+            self._set_dead_time(dead_time)
+
+    def _set_dead_time(self, dead_time: float) -> None:
+        self._actuation.set_dead_time(dead_time)
+        self._dead_time_ns = round(dead_time * NANOSECONDS)
+
+    def _make_dead_time_estimator(self) -> DeadTimeEstimator:
+        # The pulses of a stepper ramp over a period, half a period late on average.
+        filtered = self.parameters.speed_filter
+        return DeadTimeEstimator(
+            replace(filtered, lag=max(filtered.lag, 0.5 * self._period)),
+            self._period,
+            mean_speeds=self.parameters.mean_speeds,
+        )
 
     def _rollback(self, snapshot: tuple[Any, Any]) -> None:
         """Restore the weights of a snapshot."""

@@ -5,6 +5,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+import math
 from pathlib import Path
 import tempfile
 import zlib
@@ -195,7 +196,8 @@ def motions(column: TopicColumns) -> StateArray:
     with np.errstate(over='ignore', invalid='ignore'):
         sine = 2.0 * (qw * qz + qx * qy)
         cosine = 1.0 - 2.0 * (qy * qy + qz * qz)
-        yaw = np.arctan2(sine, cosine)
+    # NumPy's arctan2 differs from that of the node in the last bit.
+    yaw = np.array([*map(math.atan2, sine.tolist(), cosine.tolist())], dtype=np.float64)
     yaw[~(np.isfinite(sine) & np.isfinite(cosine))] = np.nan
     poses, twists = np.stack([x, y, yaw], axis=1), np.stack([linear, angular], axis=1)
     return StateArray(column.stamps_ns, poses, twists)
