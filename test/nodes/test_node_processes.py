@@ -183,7 +183,7 @@ def test_composed_closes_the_loop_in_one_process(processes, tmp_path):
 @pytest.mark.parametrize(
     'name, arguments, words',
     [
-        ('controller', ['--ros-args', '-p', 'law.gain:=-1.0'], ['law.gain', '0.1', '-1']),
+        ('controller', ['--ros-args', '-p', 'law.gain:=-1.0'], ['law.gain', '0', '-1']),
         (
             'controller',
             ['--ros-args', '-p', 'law.gian:=1.0'],

@@ -358,7 +358,7 @@ def test_a_failed_snapshot_is_reported_and_recording_continues(harness, tmp_path
 def test_model_files_are_attached_to_every_file(harness, tmp_path):
     model, output = tmp_path / 'start.npz', tmp_path / 'learnt.npz'
     first = harness.add(ControllerNode)
-    save_model(model, first._controller.law.get_weights(), first.parameters.to_dict())
+    save_model(model, first._controller.get_weights(), first.parameters.to_dict())
     harness.remove(first)
     shutil.copy(model, output)
     os.utime(output, (1, 1))  # saved by an earlier run
