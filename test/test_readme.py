@@ -16,9 +16,11 @@ pytestmark = pytest.mark.ros
 
 ROOT = Path(__file__).resolve().parent.parent
 
-BOARDS = 'scripts/run t3mpc emulator --link dongle --robot-link robot_usb'
+BOARDS = 'scripts/run t3mpc emulator --link dongle --robot-link robot_usb --erased'
 
 # For each command: the additional arguments, and whether it runs until it is stopped.
+PARAMETERS, KEY_FILE = '--params-file robot.yaml', '-p key_file:=robot.key'
+SET = 'scripts/run t3mpc robot set --port robot_usb --save robot.yaml'
 SHORTENED = {
     # Long enough for training.
     'scripts/demo': (['--duration', '20', '--headless', '--output', 'OUTPUT/run'], False),
@@ -52,11 +54,15 @@ SHORTENED = {
     'scripts/run t3mpc exponents': (['--duration', '20'], False),
     'scripts/run t3mpc estimation': (['--seeds', '2'], False),
     BOARDS: ([], True),
+    SET: ([], False),
     'scripts/run t3mpc robot key create robot.key': ([], False),
     'scripts/run t3mpc robot key write robot.key --port robot_usb': ([], False),
-    'scripts/run t3mpc robot ping --port dongle': ([], False),
-    'scripts/run t3mpc robot jog left 1 --port dongle --key robot.key --yes': ([], False),
-    'scripts/run radio_bridge --ros-args -p port:=dongle -p key_file:=robot.key': ([], True),
+    'scripts/run t3mpc robot ping --port dongle --params-file robot.yaml': ([], False),
+    f'scripts/run t3mpc robot jog left 1 --port dongle {PARAMETERS} --key robot.key --yes': (
+        [],
+        False,
+    ),
+    f'scripts/run radio_bridge --ros-args {PARAMETERS} -p port:=dongle {KEY_FILE}': ([], True),
     'scripts/run t3mpc bag info runs/latest/bag': ([], False),
     'scripts/run t3mpc bag report runs/latest/bag': (['--output', 'OUTPUT/report'], False),
     'scripts/run t3mpc bag replay runs/latest/bag': ([], False),
@@ -121,6 +127,9 @@ def boards(command, output):
     log = output / 'boards.txt'
     with _started([*BOARDS.split(), *key], output, log) as process:
         _wait_until(process, log, 'stop with Ctrl-C')
+        if command != SET:  # the boards are erased at every start
+            (output / 'robot.yaml').unlink(missing_ok=True)
+            subprocess.run([ROOT / SET.split()[0], *SET.split()[1:]], cwd=output, check=True)
         yield
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=30) == 0, log.read_text()
