@@ -10,10 +10,10 @@ AVR_OBJCOPY ?= avr-objcopy
 AVR_BOARD_FLAGS := $(AVR_FLAGS) -DF_CPU=16000000UL -Icore -Iavr -Wl,--gc-sections \
                    $(if $(RADIO_CHANNEL),-DT3_RADIO_CHANNEL=$(RADIO_CHANNEL)) \
                    $(if $(RADIO_RATE),-DT3_RADIO_RATE=$(RADIO_RATE))
-AVR_HEADERS := $(wildcard core/*.h avr/*.h)
-# Digest of sources and settings, reported in INFO and PONG.
-AVR_ID = $(shell (echo '$(AVR_CC) $(AVR_BOARD_FLAGS)'; cat $(sort $(wildcard core/*.[ch] avr/*.[ch]))) \
-           | sha256sum | cut -c1-8)
+# Both programs carry the digest of all sources and settings, reported in INFO and PONG: a change
+# of one file rebuilds both.
+AVR_SOURCES := $(sort $(wildcard core/*.[ch] avr/*.[ch]))
+AVR_ID = $(shell (echo '$(AVR_CC) $(AVR_BOARD_FLAGS)'; cat $(AVR_SOURCES)) | sha256sum | cut -c1-8)
 
 DONGLE_FILES := avr/dongle_main.c avr/reset.c avr/nrf24.c avr/serial.c avr/clock.c \
                 $(DONGLE_PARTS:%=core/t3_%.c)
@@ -29,11 +29,11 @@ avr: $(BUILD)/dongle.elf $(BUILD)/robot.elf $(BUILD)/dongle.hex $(BUILD)/robot.h
 	@echo 'build $(AVR_ID)'
 	$(AVR_SIZE) $(BUILD)/dongle.elf $(BUILD)/robot.elf
 
-$(BUILD)/dongle.elf: $(DONGLE_FILES) $(AVR_HEADERS) $(AVR_SETTINGS)
+$(BUILD)/dongle.elf: $(AVR_SOURCES) $(AVR_SETTINGS)
 	@mkdir -p $(BUILD)
 	$(AVR_CC) -mmcu=$(DONGLE_MCU) $(AVR_BOARD_FLAGS) -DT3_BUILD=0x$(AVR_ID) -o $@ $(DONGLE_FILES)
 
-$(BUILD)/robot.elf: $(ROBOT_FILES) $(AVR_HEADERS) $(AVR_SETTINGS)
+$(BUILD)/robot.elf: $(AVR_SOURCES) $(AVR_SETTINGS)
 	@mkdir -p $(BUILD)
 	$(AVR_CC) -mmcu=$(ROBOT_MCU) $(AVR_BOARD_FLAGS) -DT3_BUILD=0x$(AVR_ID) -o $@ $(ROBOT_FILES)
 

@@ -233,7 +233,7 @@ static uint8_t read_udr(avr_t *avr, avr_io_addr_t address, void *param)
     if (serial->unread)
         avr_raise_interrupt(avr, &serial->uart->rxc);
     else
-        avr_regbit_clear(avr, serial->uart->rxc.raised);
+        avr_clear_interrupt(avr, &serial->uart->rxc);
     return value;
 }
 
@@ -271,13 +271,13 @@ void board_run_uart(struct board *board, uint64_t now)
         if (serial->unread == 2) {
             avr_regbit_set(board->avr, serial->uart->dor);
             serial->overruns++;
-            // The flag is a level: it asks again as soon as its interrupt is allowed.
-            avr_raise_interrupt(board->avr, &serial->uart->rxc);
             continue;
         }
         serial->received[serial->unread++] = byte;
-        avr_raise_interrupt(board->avr, &serial->uart->rxc);
     }
+    // The flag is a level: an interrupt allowed later finds what came before.
+    if (serial->unread)
+        avr_raise_interrupt(board->avr, &serial->uart->rxc);
 }
 
 // -- TWI and MPU6050 -----------------------------------------------------------------------------
