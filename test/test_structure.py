@@ -76,7 +76,7 @@ LIBRARIES = {
     'cli': {'yaml'},
 }
 ROS = re.compile(
-    r'^(rclpy|rcl_interfaces|builtin_interfaces|tf2_ros|std_srvs|\w+_msgs|launch\w*)$'
+    r'^(rclpy|rcl_interfaces|builtin_interfaces|tf2_ros|std_srvs|\w+_msgs|launch\w*|ament_index_python)$'
 )
 # Basenames of several modules that belong to one concept.
 SHARED_BASENAMES = {

@@ -1,13 +1,10 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The digital twin as a node: sensors, faults, initial pose, simulated time, launch files."""
+"""The digital twin as a node: sensors, faults, initial pose, simulated time."""
 
 import math
 from pathlib import Path
-import runpy
-import sys
 import time
-import types
 
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
@@ -18,6 +15,7 @@ from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState, Imu, Range
 from std_srvs.srv import Trigger
+from support.launch_files import nodes_of
 from support.ros_graph import (
     CommandSource,
     diagnostic,
@@ -28,7 +26,6 @@ from support.ros_graph import (
     stamp,
     twist,
 )
-import yaml
 
 from t3mpc_ros.cli.demo import DemoOptions
 from t3mpc_ros.cli.main import _parser
@@ -465,83 +462,20 @@ def test_an_unreachable_real_time_factor_is_a_warning(harness, monkeypatch):
     assert harness.call(Trigger, 'reset_odometry').success, 'services are served'
 
 
-# -- launch files ---------------------------------------------------------------------------------
+# -- two robots -----------------------------------------------------------------------------------
 
 
-class _Recorded:
-    """Replaces the classes of the launch packages; stores the arguments."""
-
-    def __init__(self, *arguments, **named):
-        self.arguments = arguments
-        self.named = named
-
-
-@pytest.fixture
-def launched(monkeypatch):
-    """Return a function that returns the nodes of a launch file, without the launch packages."""
-    words = {
-        'launch': ['LaunchDescription'],
-        'launch.actions': ['DeclareLaunchArgument'],
-        'launch.conditions': ['IfCondition'],
-        'launch.substitutions': ['LaunchConfiguration'],
-        'launch_ros': [],
-        'launch_ros.actions': ['Node'],
-        'launch_ros.parameter_descriptions': ['ParameterValue'],
-        'ament_index_python.packages': [],
-    }
-    for name, classes in words.items():
-        module = types.ModuleType(name)
-        for word in classes:
-            setattr(module, word, type(word, (_Recorded,), {}))
-        monkeypatch.setitem(sys.modules, name, module)
-    sys.modules['ament_index_python.packages'].get_package_share_directory = lambda name: ROOT
-
-    def nodes(name):
-        file = runpy.run_path(str(ROOT / 'launch' / name))
-        items = file['generate_launch_description']().arguments[0]
-        defaults = {
-            item.arguments[0]: yaml.safe_load(item.named['default_value'] or '""')
-            for item in items
-            if type(item).__name__ == 'DeclareLaunchArgument'
-        }
-
-        def value(given):
-            if type(given).__name__ == 'ParameterValue':
-                return given.named['value_type'](value(given.arguments[0]))
-            return defaults[given.arguments[0]] if isinstance(given, _Recorded) else given
-
-        found = []
-        for item in items:
-            if type(item).__name__ == 'Node':
-                file, given = item.named['parameters']
-                assert Path(file).is_file()
-                values = {key: value(one) for key, one in given.items()}
-                found.append(
-                    (value(item.named.get('namespace', '')), item.named['executable'], values)
-                )
-        return found
-
-    return nodes
-
-
-@pytest.mark.parametrize('file', ['sim.launch.py', 'two_robots.launch.py', 'robot.launch.py'])
-def test_launch_file_parameters_fit_their_nodes(file, launched):
-    for _, name, values in launched(file):
-        given = {key: value for key, value in values.items() if key != 'use_sim_time'}
-        parameters = parameter_class(name).from_dict(given)
-        if name == 'controller':
-            assert parameters.speed_filter.lag == 0.003  # the lag of the stepper drive
-
-
-def test_two_robots_launch_file_separates_the_robots(harness, launched):
-    nodes = launched('two_robots.launch.py')
-    assert sorted(name for _, name, _ in nodes) == sorted(
+def test_two_robots_launch_file_separates_the_robots(harness):
+    nodes = nodes_of(ROOT / 'launch' / 'two_robots.launch.py', share=ROOT)
+    assert sorted(node.executable for node in nodes) == sorted(
         2 * ['controller', 'reference_generator', 'sim_robot']
     )
     robots = {}
-    for namespace, name, values in nodes:
-        if name == 'sim_robot':
-            robots[namespace] = harness.add(SimRobotNode, namespace=namespace, **values)
+    for node in nodes:
+        if node.executable == 'sim_robot':
+            robots[node.namespace] = harness.add(
+                SimRobotNode, namespace=node.namespace, **node.values
+            )
     one, two = robots.values()
     assert one.parameters.seed != two.parameters.seed
     states = {name: published_states(robot) for name, robot in robots.items()}

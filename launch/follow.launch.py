@@ -1,0 +1,57 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Let a differential-drive robot that runs already follow a reference.
+
+``ros2 launch t3mpc_ros follow.launch.py params_file:=turtlebot3.yaml``; the robot subscribes to
+``cmd_vel`` (Twist or TwistStamped) and publishes ``odom``. See docs/your_robot.md.
+"""
+
+from launch.actions import DeclareLaunchArgument
+
+from t3mpc_ros.nodes.launch_files import (
+    FLAG,
+    RECORD,
+    SEED,
+    USE_SIM_TIME,
+    describe,
+    params_file,
+)
+
+
+def nodes(launched):
+    rate = launched.given('rate', float)
+    remappings = [(name, launched.text(f'{name}_topic')) for name in ('odom', 'cmd_vel')]
+    made = [launched.node('controller', rate, remappings=remappings)]
+    if launched.flag('generate_reference'):
+        seed = launched.given('seed', int)
+        made.append(launched.node('reference_generator', {**rate, **seed}))
+    if launched.flag('record'):
+        made.append(launched.node('recorder', remappings=remappings))
+    return made
+
+
+def generate_launch_description():
+    return describe(
+        nodes,
+        params_file('generic.yaml'),
+        DeclareLaunchArgument(
+            'odom_topic', default_value='odom', description='odometry of the robot'
+        ),
+        DeclareLaunchArgument(
+            'cmd_vel_topic', default_value='cmd_vel', description='velocity commands of the robot'
+        ),
+        DeclareLaunchArgument(
+            'rate',
+            default_value='',
+            description='rate of the odometry, Hz; empty: that of params_file',
+        ),
+        DeclareLaunchArgument(
+            'generate_reference',
+            default_value='true',
+            choices=FLAG,
+            description='start the reference generator; false: another node publishes reference',
+        ),
+        SEED,
+        USE_SIM_TIME,
+        RECORD,
+    )

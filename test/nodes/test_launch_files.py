@@ -1,0 +1,297 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Launch files: their arguments, and the processes that they start, from start to Ctrl-C."""
+
+from contextlib import contextmanager
+import os
+from pathlib import Path
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from support.launch_files import arguments_of, nodes_of
+import yaml
+
+from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.cli.process_group import installed_file
+from t3mpc_ros.nodes.registry import parameter_class
+
+ROOT = Path(__file__).resolve().parents[2]
+FILES = sorted(path.name for path in (ROOT / 'launch').glob('*.launch.py'))
+FOLLOW = 'follow.launch.py'
+
+
+def launched(name, **given):
+    return nodes_of(ROOT / 'launch' / name, given, share=ROOT)
+
+
+def only(nodes, executable):
+    (found,) = (node for node in nodes if node.executable == executable)
+    return found
+
+
+# -- arguments ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('file', FILES)
+def test_every_launch_file_takes_the_common_arguments(file):
+    arguments = arguments_of(ROOT / 'launch' / file, share=ROOT)
+    assert {'namespace', 'params_file', 'log_level', 'seed'} <= set(arguments)
+    assert ('world' in arguments) == ('robot' not in file.split('.') and file != FOLLOW)
+    for node in launched(file, namespace='/east/', log_level='warn'):
+        assert node.namespace.startswith('east')
+        assert node.ros_arguments == ['--log-level', 'warn']
+
+
+@pytest.mark.parametrize('file', FILES)
+def test_launch_file_parameters_fit_their_nodes(file):
+    for node in launched(file):
+        values = {key: value for key, value in node.all_values.items() if key != 'use_sim_time'}
+        parameter_class(node.executable).from_dict(values)
+        assert node.name == node.executable
+
+
+@pytest.mark.parametrize('file', FILES)
+def test_the_params_file_overrides_all_but_given_arguments(file, tmp_path):
+    path = tmp_path / 'mine.yaml'
+    path.write_text(
+        '/**/reference_generator: {ros__parameters: {seed: 11, rate: 40.0}}\n'
+        '/**/sim_robot: {ros__parameters: {seed: 11, world: corridor}}\n'
+        '/**/controller: {ros__parameters: {rate: 40.0, speed_filter: {dead_time: 0.07}}}\n'
+    )
+    for given, seed in (({}, 11), ({'seed': '5'}, 5)):
+        nodes = launched(file, params_file=str(path), **given)
+        for node in nodes:
+            if node.executable == 'controller':
+                assert node.all_values['rate'] == 40.0
+                assert node.all_values['speed_filter.dead_time'] == 0.07
+            if node.executable in ('sim_robot', 'reference_generator'):
+                second = given and node.namespace == 'robot_2'
+                assert node.all_values['seed'] == seed + bool(second)
+            if node.executable == 'sim_robot':
+                assert node.all_values['world'] == 'corridor'
+    if 'world' in arguments_of(ROOT / 'launch' / file, share=ROOT):
+        for node in launched(file, params_file=str(path), world='room'):
+            assert node.executable != 'sim_robot' or node.all_values['world'] == 'room'
+
+
+@pytest.mark.parametrize(
+    'given, error, words',
+    [
+        ({'params_file': 'missing.yaml'}, FileNotFoundError, 'params_file .* missing.yaml'),
+        ({'seed': 'seven'}, ValueError, 'seed must be of type int: got seven'),
+    ],
+)
+@pytest.mark.parametrize('file', FILES)
+def test_an_unusable_argument_is_an_error(file, given, error, words):
+    """Launch itself passes over a missing parameter file with a warning."""
+    with pytest.raises(error, match=words):
+        launched(file, **given)
+
+
+def test_texts_of_arguments_stay_texts():
+    """Launch takes 12345 as a number, which is no valid port and no valid file."""
+    bridge = only(launched('robot.launch.py', port='12345', key_file='99'), 'radio_bridge')
+    assert (bridge.values['port'], bridge.values['key_file']) == ('12345', '99')
+
+
+@pytest.mark.parametrize('file', ['turtlebot3.yaml', 'generic.yaml'])
+def test_robot_files_agree_within_and_with_their_limits(file):
+    nodes = launched(FOLLOW, params_file=file)
+    controller = only(nodes, 'controller').all_values
+    reference = only(nodes, 'reference_generator').all_values
+    for name in ('rate', 'wheel_radius', 'wheel_separation'):
+        assert controller[name] == reference[name]
+    # Standard deviations of the states, and peaks of a day of 13 rad/s at 2.8 rad/s.
+    spread = np.array([10.6, 2.22, 0.937, 22.2]) * reference['amplitude']
+    assert spread == pytest.approx(np.full(4, spread[0]), rel=0.02)
+    peak = spread[0] / 2.8 * 13.0
+    assert peak <= controller['wheel.max_velocity']
+    assert peak * controller['wheel_radius'] <= controller['linear.x.max_velocity']
+    # The wheels are no tighter limit than the velocities of the body.
+    turning = controller['angular.z.max_velocity'] * controller['wheel_separation'] / 2
+    fastest = max(turning, controller['linear.x.max_velocity'])
+    assert controller['wheel.max_velocity'] >= 0.99 * fastest / controller['wheel_radius']
+    periods = controller['watchdog.odometry_timeout'] * controller['rate']
+    assert periods >= 4
+    drive = controller['speed_filter.dead_time'] + 3 * controller['speed_filter.lag']
+    assert controller['watchdog.response_window'] >= drive
+
+
+def test_follow_remaps_the_topics_of_the_robot():
+    nodes = launched(
+        FOLLOW, odom_topic='/base/odom', cmd_vel_topic='drive', rate='30', record='True'
+    )
+    expected = [('odom', '/base/odom'), ('cmd_vel', 'drive')]
+    assert only(nodes, 'controller').remappings == only(nodes, 'recorder').remappings == expected
+    assert {node.all_values['rate'] for node in nodes if 'rate' in node.all_values} == {30.0}
+    some = launched(FOLLOW, generate_reference='false', record='false')
+    assert [node.executable for node in some] == ['controller']
+
+
+# -- processes ------------------------------------------------------------------------------------
+
+
+class Launch:
+    """A running launch process, and what it has printed."""
+
+    def __init__(self, process, log):
+        self.process = process
+        self._log = log
+
+    def output(self):
+        return self._log.read_text(errors='replace')
+
+    def pids(self):
+        """Return the processes that it has started, by executable."""
+        found = re.findall(r'\[(\w+)-\d+\]: process started with pid \[(\d+)\]', self.output())
+        return {name: int(pid) for name, pid in found}
+
+    def ends(self):
+        """Return executables that have ended, with their exit codes."""
+        clean = re.findall(r'\[(\w+)-\d+\]: process has finished cleanly', self.output())
+        died = re.findall(r'\[(\w+)-\d+\]: process has died \[.*exit code (-?\d+)', self.output())
+        return dict.fromkeys(clean, 0) | {name: int(code) for name, code in died}
+
+    def wait_for(self, words, seconds=180.0):
+        deadline = time.monotonic() + seconds
+        while words not in self.output():
+            assert self.process.poll() is None, self.output()
+            assert time.monotonic() < deadline, self.output()
+            time.sleep(0.05)
+
+
+@pytest.fixture
+def start(graph, tmp_path):
+    """Return a function that starts a module of the tests as a process in the graph."""
+    environment = os.environ | {
+        'PYTHONPATH': os.pathsep.join(
+            [str(ROOT / 'test'), *filter(None, [os.environ.get('PYTHONPATH')])]
+        ),
+        'PYTHONUNBUFFERED': '1',
+        'AMENT_PREFIX_PATH': os.environ.get('AMENT_PREFIX_PATH') or sys.prefix,
+    }
+
+    @contextmanager
+    def started(module, *words):
+        log = tmp_path / f'{module}.log'
+        with log.open('wb') as output:
+            process = subprocess.Popen(
+                [sys.executable, '-m', f'support.{module}', *words],
+                cwd=tmp_path,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        launch = Launch(process, log)
+        try:
+            yield launch
+        finally:
+            for pid in (process.pid, *launch.pids().values()):
+                if process.poll() is None or Path('/proc', str(pid)).exists():
+                    os.kill(pid, signal.SIGKILL)
+            process.wait()
+
+    return started
+
+
+def launch_file(name):
+    return str(installed_file(Path('share/t3mpc_ros/launch') / name))
+
+
+def end(launch, to_group=False):
+    """Interrupt a launch; return the exit codes after checking that nothing is left."""
+    pids = launch.pids()
+    (os.killpg if to_group else os.kill)(launch.process.pid, signal.SIGINT)
+    assert launch.process.wait(timeout=30.0) == 0, launch.output()
+    assert not [name for name, pid in pids.items() if Path('/proc', str(pid)).exists()]
+    codes = launch.ends()
+    assert set(codes) == set(pids)
+    assert 'Traceback' not in launch.output()
+    return codes
+
+
+def tracking_error(bag, wheel_radius, wheel_separation, *topics):
+    """Return the RMS error and the RMS of the reference at a wheel, rad/s, after a start.
+
+    ``topics`` are those of the reference and of the measured velocities.
+    """
+    with open_bag(bag) as recording:
+        names = {'v': 'twist.twist.linear.x', 'w': 'twist.twist.angular.z'}
+        reference, measured = (recording.series(topic, names) for topic in topics)
+    wheels = np.array([[1.0, 0.5 * wheel_separation], [1.0, -0.5 * wheel_separation]])
+    at = measured['stamp']
+    at = at[(at > at[0] + 5.0) & (at < reference['stamp'][-1])]
+    speeds = [
+        wheels @ [np.interp(at, data['stamp'], data[name]) for name in 'vw'] / wheel_radius
+        for data in (measured, reference)
+    ]
+    assert at[-1] - at[0] > 4.0
+    rms = [float(np.sqrt(np.mean(some**2))) for some in (speeds[0] - speeds[1], speeds[1])]
+    return rms[0], rms[1]
+
+
+def only_bag(folder):
+    (bag,) = folder.glob('bag_*')
+    return bag
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize('to_group', [False, True], ids=['launch', 'group'])
+def test_sim_starts_tracks_and_ends_with_ctrl_c(to_group, start, tmp_path):
+    """SIGINT to launch alone, and to the whole group as from a terminal."""
+    words = [launch_file('sim.launch.py'), 'namespace:=east', 'world:=room', 'seed:=3']
+    with start('launch_files', *words) as launch:
+        launch.wait_for('tracking')
+        time.sleep(12.0)
+        codes = end(launch, to_group)
+    names = ('sim_robot', 'controller', 'reference_generator', 'recorder')
+    assert codes == dict.fromkeys(names, 0)
+    bag = only_bag(tmp_path)
+    with open_bag(bag) as recording:
+        assert recording.metadata_records['sim_robot']['world'] == 'room'
+        assert int(recording.metadata_records['reference_generator']['seed']) == 3
+    topics = ('/east/reference', '/east/ground_truth/odom')
+    error, reference = tracking_error(bag, 0.035, 0.147, *topics)
+    assert reference > 1.0
+    assert error < 0.25 * reference
+
+
+@pytest.mark.ros
+def test_a_robot_of_another_make_follows_the_reference(start, tmp_path):
+    """TurtleBot3 figures: 30 Hz best-effort odometry, stamped commands, own topic names."""
+    words = [launch_file(FOLLOW), 'params_file:=turtlebot3.yaml', 'rate:=30']
+    words += ['odom_topic:=base/odom', 'cmd_vel_topic:=base/cmd_vel']
+    remaps = ['--ros-args', '-r', 'odom:=base/odom', '-r', 'cmd_vel:=base/cmd_vel']
+    with start('velocity_robot_node', '30', *remaps) as robot:
+        robot.wait_for('velocity_robot ready')
+        with start('launch_files', *words) as launch:
+            launch.wait_for('tracking')
+            time.sleep(16.0)
+            codes = end(launch, to_group=True)
+        assert codes == dict.fromkeys(('controller', 'reference_generator', 'recorder'), 0)
+        assert 'the robot expects geometry_msgs/msg/TwistStamped' in launch.output()
+    error, reference = tracking_error(only_bag(tmp_path), 0.033, 0.160, '/reference', '/base/odom')
+    assert reference > 0.5
+    assert error < 0.25 * reference
+
+
+@pytest.mark.ros
+def test_a_node_with_a_wrong_parameter_ends_with_code_2(start, tmp_path):
+    wrong = tmp_path / 'wrong.yaml'
+    wrong.write_text(yaml.safe_dump({'/**/controller': {'ros__parameters': {'law.gian': 1.0}}}))
+    words = [launch_file('sim.launch.py'), f'params_file:={wrong}', 'record:=false']
+    with start('launch_files', *words) as launch:
+        launch.wait_for('process has died')
+        assert launch.ends() == {'controller': 2}
+        assert 'did you mean law.gain' in launch.output()
+        launch.wait_for('sim_robot ready')
+        launch.wait_for('reference_generator ready')
+        codes = end(launch)
+    assert codes == {'controller': 2, 'sim_robot': 0, 'reference_generator': 0}
