@@ -3,9 +3,7 @@
 """``t3mpc compare``: the controller and every baseline on one robot, case by case."""
 
 import argparse
-from collections.abc import Callable, Iterable, Sequence
-import difflib
-import json
+from collections.abc import Callable
 import os
 from pathlib import Path
 from typing import Any
@@ -96,15 +94,15 @@ def run(options: argparse.Namespace) -> int:
         default_methods,
         methods_for,
     )
-    from t3mpc_ros.evaluation.reporting import Progress
+    from t3mpc_ros.evaluation.reporting import Progress, strict_json
+    from t3mpc_ros.evaluation.tuning.search_space import find_names
 
     known = methods_for(options.robot)
-    names = (
-        tuple(known) if options.methods == ['all'] else chosen('method', options.methods, known)
-    )
+    wanted = list(known) if options.methods == ['all'] else options.methods
+    names = find_names('method', wanted, known)
     plan = ComparisonPlan(
         options.robot,
-        chosen('case', options.cases, cases_for(options.robot)) or cases_for(options.robot),
+        find_names('case', options.cases, cases_for(options.robot)) or cases_for(options.robot),
         names or default_methods(options.robot),
         options.seeds,
         options.duration,
@@ -118,7 +116,7 @@ def run(options: argparse.Namespace) -> int:
     print(comparison_page.markdown(plan, results))
     if options.json:
         content = comparison_page.record(plan, results)
-        options.json.write_text(json.dumps(content, indent=1) + '\n', encoding='utf-8')
+        options.json.write_text(strict_json(content), encoding='utf-8')
     if options.html:
         options.html.write_text(comparison_page.page(plan, results), encoding='utf-8')
     return 0
@@ -137,23 +135,3 @@ def seed_range(text: str) -> tuple[int, ...]:
             f'must be A-B with 0 <= A <= B and at most 10000 seeds: got {text}'
         )
     return tuple(range(low, high + 1))
-
-
-def chosen(kind: str, names: Sequence[str], known: Iterable[str]) -> tuple[str, ...]:
-    """Return the named entries of ``known`` in its order; case and punctuation are ignored.
-
-    Raises
-    ------
-    ValueError
-        An unknown name; the text holds all, and the nearest one.
-    """
-    from t3mpc_ros.evaluation.tuning.search_space import short_name
-
-    by_name = {short_name(name): name for name in known}
-    for name in names:
-        if short_name(name) not in by_name:
-            near = difflib.get_close_matches(short_name(name), by_name, n=1)
-            hint = f'; did you mean {near[0]}?' if near else ''
-            raise ValueError(f'{kind} must be one of {", ".join(by_name)}: got {name}{hint}')
-    wanted = {short_name(name) for name in names}
-    return tuple(name for short, name in by_name.items() if short in wanted)

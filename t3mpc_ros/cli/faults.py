@@ -5,7 +5,6 @@
 import argparse
 from collections.abc import Callable
 from dataclasses import asdict
-import json
 from pathlib import Path
 
 
@@ -37,7 +36,7 @@ def run(options: argparse.Namespace) -> int:
         study_faults,
         update_page,
     )
-    from t3mpc_ros.evaluation.reporting import Progress
+    from t3mpc_ros.evaluation.reporting import Progress, strict_json
 
     known = dict.fromkeys(fault_run.fault for fault_run in FAULT_RUNS)
     for name in options.names:
@@ -55,5 +54,6 @@ def run(options: argparse.Namespace) -> int:
     if options.output:
         update_page(options.output, results)
     if options.json:
-        options.json.write_text(json.dumps([asdict(one) for one in results], indent=1) + '\n')
+        text = strict_json([asdict(one) for one in results])
+        options.json.write_text(text, encoding='utf-8')
     return 1 if any(one.verdict == 'unbounded' for one in results) else 0

@@ -6,7 +6,6 @@ import argparse
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 from importlib import import_module
-import json
 from pathlib import Path
 import sys
 import time
@@ -114,7 +113,9 @@ def _estimation(options: argparse.Namespace) -> int:
 def _keep(records: Sequence[Mapping[str, object]], path: Path | None) -> int:
     """Write the records to the given file, if any, and return 0."""
     if path:
-        path.write_text(json.dumps(records, indent=1) + '\n')
+        from t3mpc_ros.evaluation.reporting import strict_json
+
+        path.write_text(strict_json(records), encoding='utf-8')
     return 0
 
 

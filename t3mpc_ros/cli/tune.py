@@ -4,7 +4,6 @@
 
 import argparse
 from collections.abc import Callable, Sequence
-import difflib
 import os
 from pathlib import Path
 import sys
@@ -63,11 +62,13 @@ def run(options: argparse.Namespace) -> int:
     ValueError
         An unknown method.
     """
+    from t3mpc_ros.evaluation.tuning.search_space import find_names
     from t3mpc_ros.evaluation.tuning.tune_methods import tune_methods
 
     known = options.table()
+    names = find_names('method', options.methods, [method.name for method in known])
     drives = (options.drive,) if options.drive else DRIVES
-    methods = chosen(known, options.methods)
+    methods = [method for method in known if method.name in names or not names]
     store = tune_methods(
         methods,
         [drive for drive in drives if options.drive or any(drive in m.start for m in methods)],
@@ -80,23 +81,3 @@ def run(options: argparse.Namespace) -> int:
     )
     print(store.table())
     return 0
-
-
-def chosen(known: 'Sequence[MethodDefinition]', names: Sequence[str]) -> 'list[MethodDefinition]':
-    """Return the named methods, all without a name; case and punctuation are ignored.
-
-    Raises
-    ------
-    ValueError
-        An unknown name; the text holds the nearest one, or all.
-    """
-    from t3mpc_ros.evaluation.tuning.search_space import short_name
-
-    by_name = {method.short: method for method in known}
-    for name in names:
-        if short_name(name) not in by_name:
-            near = difflib.get_close_matches(short_name(name), by_name, n=1)
-            hint = f'did you mean {near[0]}?' if near else f'known are {", ".join(by_name)}'
-            raise ValueError(f'there is no method {name!r}; {hint}')
-    wanted = {short_name(name) for name in names} or set(by_name)
-    return [method for method in known if method.short in wanted]

@@ -3,9 +3,10 @@
 """Shared parts of reports: table, number format and progress line."""
 
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
+import json
 import math
 import sys
 from typing import TextIO
@@ -67,6 +68,19 @@ class Progress:
         """End the rewritten line."""
         if self._live:
             print(file=self._stream, flush=True)
+
+
+def strict_json(content: object) -> str:
+    """Return JSON that every reader accepts: null for numbers that are not finite."""
+    return json.dumps(_finite(content), indent=1, ensure_ascii=False, allow_nan=False) + '\n'
+
+
+def _finite(value: object) -> object:
+    if isinstance(value, Mapping):
+        return {name: _finite(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def format_duration(seconds: float) -> str:

@@ -191,3 +191,15 @@ def test_one_seed_has_no_interval():
     text = table(results)
     assert 'inf' not in text
     assert '0.1000 ± –' in text
+
+
+def test_the_json_of_one_seed_is_valid(tmp_path, capsys):
+    """It once held Infinity, which no other reader of JSON accepts."""
+    path = tmp_path / 'figures.json'
+    assert main(['estimation', '--seeds', '1', '--duration', '11', '--json', str(path)]) == 0
+
+    def refuse(word):
+        raise AssertionError(word)
+
+    records = json.loads(path.read_text(), parse_constant=refuse)
+    assert {record['speed_ci95'] for record in records} == {None}

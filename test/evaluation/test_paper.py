@@ -10,6 +10,7 @@ import io
 import json
 import math
 from pathlib import Path
+import re
 
 import matplotlib.image
 import numpy as np
@@ -46,10 +47,12 @@ from t3mpc_ros.evaluation.paper.experiment_runs import (
 )
 from t3mpc_ros.evaluation.paper.figure_runs import (
     explained,
+    follows_claim,
     largest_switch,
     switches_claim,
     switches_of,
 )
+from t3mpc_ros.evaluation.paper.paper_page import counted
 from t3mpc_ros.evaluation.paper.reproduce import RUNS, PaperOptions, reproduce
 from t3mpc_ros.evaluation.paper.result_tables import all_tables, markdown
 from t3mpc_ros.evaluation.paper.results import Results, results_of
@@ -408,7 +411,7 @@ def numbers_of(*rmse, chatter=100.0, settled=0.01):
     return tuple(RunNumbers(value, settled, chatter, 2.0 * value, True) for value in rmse)
 
 
-def table_of(entries, settled=0.01, chatter=None):
+def table_of(entries, settled=0.01, chatter=None, complete=True):
     """Return results from {(method, drive, noise, case): RMSE of each seed}."""
     kinds = {name: (method.baseline, method.preview) for name, method in fake_methods('').items()}
     chatter = chatter or {}
@@ -416,7 +419,7 @@ def table_of(entries, settled=0.01, chatter=None):
         Experiment(*key): numbers_of(*rmse, settled=settled, chatter=chatter.get(key[0], 100.0))
         for key, rmse in entries.items()
     }
-    return Results(kinds, numbers, 60.0)
+    return Results(kinds, numbers, 60.0, complete=complete)
 
 
 def test_paired_differences_agree_with_the_paired_t_test():
@@ -610,6 +613,68 @@ def test_estimation_claims_of_the_paper(type3, half, slight):
     assert {claim.held for claim in claiming.estimation_claims([])} == {None}
 
 
+@pytest.mark.parametrize(
+    'full, word',
+    [
+        ((0.50, 0.51, 0.49), 'held'),
+        ((0.50, 0.68, 0.61), 'inconclusive'),
+        ((0.50, 0.75, 0.70), 'inconclusive'),
+        ((0.80, 0.82, 0.81), 'not held'),
+        ((0.50,), 'inconclusive'),
+        ((0.99,), 'inconclusive'),
+        ((math.nan, 0.1, 0.1), 'not held'),
+    ],
+)
+def test_few_seeds_decide_only_what_their_interval_does(full, word):
+    """``paper --quick`` once reported claims as not held that three seeds cannot decide."""
+    values = {FULL: full, 'PI + feed-forward': (1.0, 1.0, 1.0)[: len(full)]}
+    few = table_of(in_all('velocity', 0.04, values), complete=False)
+    claim = claiming.share_of_best(few, 'velocity', 0.04, 0.60)
+    assert claim.record()['verdict'] == claim.verdict == word
+    assert claim.held is {'held': True, 'not held': False, 'inconclusive': None}[word]
+    # The criterion decides when all seeds are there.
+    whole = table_of(in_all('velocity', 0.04, values))
+    assert claiming.share_of_best(whole, 'velocity', 0.04, 0.60).verdict in ('held', 'not held')
+
+
+def test_one_seed_leaves_every_claim_inconclusive():
+    """A complete grid of one seed: nothing is held, nothing is not held."""
+    setup = fake_setup()
+    grid = make_grid(setup, quick=True, seeds=1)
+    generator = np.random.default_rng(7)
+    numbers = {
+        experiment: (RunNumbers(*generator.uniform(0.01, 1.0, 4).tolist(), True),)
+        for experiment in needed_experiments(setup, grid)
+    }
+    results = results_of(setup, grid, numbers)
+    assert not results.complete
+    estimated = [
+        EstimationResult(kind, noise, (0.3,), (1.0,))
+        for kind in ('type3', 'interval_type2', 'type1')
+        for noise in (0.0, 0.04, 0.1)
+    ]
+    claims = claiming.all_claims(results, estimated)
+    assert {claim.verdict for claim in claims} == {'inconclusive', 'not measured'}
+    assert {claim.verdict for claim in claims[-2:]} == {'inconclusive'}  # estimation
+    assert re.match(r'0 held, 0 not held, [1-9]\d* inconclusive, ', counted(claims))
+
+
+def test_all_seeds_with_the_whole_duration_are_complete():
+    setup = fake_setup()
+    runs = numbers_of(*np.linspace(0.1, 0.2, 20))
+    for quick, seeds, complete in ((False, None, True), (False, 19, False), (True, 20, False)):
+        grid = make_grid(setup, quick=quick, seeds=seeds)
+        results = results_of(setup, grid, {Experiment(FULL, 'torque', 0.0, 'nominal'): runs})
+        assert results.complete is complete
+
+
+@pytest.mark.parametrize('length, word', [(26.0, 'inconclusive'), (60.0, 'not held')])
+def test_a_short_run_refutes_no_claim_about_a_run(length, word):
+    scenario = FakeScenario('torque', 0.04, 'nominal', 101, length)
+    run = fake_run(scenario, fake_methods('')['PI + feed-forward'])
+    assert follows_claim(run).verdict == word
+
+
 def test_without_results_every_claim_is_not_measured():
     found = claiming.all_claims(table_of({}), [])
     assert {claim.verdict for claim in found} == {'not measured'}
@@ -633,6 +698,8 @@ def test_the_mark_of_an_exhibit_is_that_of_its_worst_claim():
     assert exhibit.mark(made) == 'held'
     assert exhibit.mark([*made[:-1], replace(made[-1], held=None)]) == 'not measured'
     assert exhibit.mark([*made[:-1], replace(made[-1], held=False)]) == 'not held'
+    unknown = replace(made[-1], held=None, inconclusive=True)
+    assert exhibit.mark([*made[:-1], unknown]) == 'inconclusive'
     assert exhibit.mark([]) == 'not measured'
     assert replace(exhibit, comparable=False).mark(made) == 'not comparable'
 
@@ -757,7 +824,7 @@ def test_the_page_is_self_contained_and_shows_everything(folder):
     assert '@import' not in text
     assert page.tags.count('img') == sum(exhibit.draw is not None for exhibit in EXHIBITS)
     assert page.tags.count('section') == len(EXHIBITS)
-    for mark in ('held', 'not held', 'not measured', 'not comparable'):
+    for mark in ('held', 'not held', 'inconclusive', 'not measured', 'not comparable'):
         assert f'">{mark}</span>' in text
     for claim in json.loads((folder / 'results.json').read_text())['claims']:
         assert claim['found'].split('<')[0][:30] in text.replace('&#x27;', "'")

@@ -654,7 +654,9 @@ def test_a_rival_answers_where_the_controller_let_the_robot_move(inputs, again):
         assert np.nanmax(np.abs((there[name] - was)[tracking])) > 1e-4, 'it is another method'
         stopped = inputs.commanding & ~tracking
         np.testing.assert_array_equal(there[name][stopped], 0.0)
-    with pytest.raises(ReplayError, match='there is no method'):
+    for name, values in replay_method(inputs, 'pi feed-forward').fields.items():
+        np.testing.assert_array_equal(values, there[name])
+    with pytest.raises(ReplayError, match='method must be one of PI'):
         replay_method(inputs, 'nobody')
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import itertools
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from t3mpc_ros.cli import tune
 from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController
 from t3mpc_ros.evaluation.closed_loop import JobError, MethodSpec
 from t3mpc_ros.evaluation.closed_loop import run as closed_loop_run
+from t3mpc_ros.evaluation.methods import method_definitions, methods
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, TUNING_SEEDS, Scenario
 from t3mpc_ros.evaluation.tuning.cma_search import SearchProgress, search_best
 from t3mpc_ros.evaluation.tuning.objective import (
@@ -24,10 +26,16 @@ from t3mpc_ros.evaluation.tuning.objective import (
     mean_objectives,
     objective,
 )
-from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition, SearchRange, SearchSpace
+from t3mpc_ros.evaluation.tuning.search_space import (
+    MethodDefinition,
+    SearchRange,
+    SearchSpace,
+    find_names,
+)
 import t3mpc_ros.evaluation.tuning.tune_methods as tune_module
 from t3mpc_ros.evaluation.tuning.tune_methods import history_path, time_left, tune_methods
 from t3mpc_ros.evaluation.tuning.tuned_parameters import (
+    PACKAGED_FILE,
     StoreError,
     TunedEntry,
     TunedParameters,
@@ -976,12 +984,38 @@ class _Instead:
 
 
 def test_names_that_are_not_known_are_refused_with_the_nearest():
-    with pytest.raises(ValueError, match="no method 'p fedback'; did you mean p-feedback"):
-        tune.chosen([FEEDBACK, WIDER], ['p fedback'])
-    with pytest.raises(ValueError, match="no method 'xyz'; known are p-feedback, wider-2nd"):
-        tune.chosen([FEEDBACK, WIDER], ['xyz'])
-    assert tune.chosen([FEEDBACK, WIDER], []) == [FEEDBACK, WIDER]
-    assert tune.chosen([FEEDBACK, WIDER], ['wider-2nd', 'Wider 2nd']) == [WIDER]
+    known = ['PI + feed-forward', 'linear MPC preview', 'DMC']
+    words = r'must be one of PI \+ feed-forward, linear MPC preview, DMC: got linear mpc p; '
+    with pytest.raises(ValueError, match=words + 'did you mean linear MPC preview'):
+        find_names('method', ['linear mpc p'], known)
+    with pytest.raises(ValueError, match='got xyz$'):
+        find_names('method', ['xyz'], known)
+    assert find_names('method', [], known) == ()
+    assert find_names('method', ['dmc', 'pi-feed-forward'], known) == ('PI + feed-forward', 'DMC')
+
+
+def test_the_packaged_tuning_has_the_names_of_the_methods():
+    stored = json.loads(PACKAGED_FILE.read_text())['methods']
+    assert set(stored) <= set(methods('velocity'))
+    assert set(stored) == {each.name for each in method_definitions()}
+
+
+def test_the_tables_of_the_pages_have_the_names_of_the_methods():
+    """results.md once called them "linear MPC, preview", bags.md "dmc"."""
+    docs = PACKAGED_FILE.parents[3] / 'docs'
+    known = {name.partition(', exact')[0] for name in methods('velocity')}
+    for page in ('results.md', 'results_tables.md'):
+        text = (docs / page).read_text()
+        rows = re.findall(r'^\| ([^|]+?) \|(?: [-+–\d.][^|]*\|){3,}', text, re.MULTILINE)
+        named = {re.sub(r'\*\*| \(.*\)| [¹²]|, exact model', '', row) for row in rows}
+        methods_there = {name for name in named if name in known}
+        assert len(methods_there) >= 11, page
+        similar = {
+            name
+            for name in {part for each in named for part in each.split(' less ')} - known
+            if re.search(r'MPC|DMC|FLS|ADRC|sliding|torque|feed-forward', name)
+        }
+        assert not similar, page
 
 
 @pytest.mark.parametrize(

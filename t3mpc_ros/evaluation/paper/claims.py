@@ -2,16 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Claims of the paper and of this package, decided from the results.
 
-A method that diverged satisfies no claim.
+A method that diverged satisfies no claim. Results of fewer seeds or shorter runs than those of the
+claims decide only what their interval over the seeds leaves no doubt about; other claims are
+inconclusive.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import math
 import re
 from statistics import median
 
+import numpy as np
+from numpy.typing import NDArray
+
 from t3mpc_ros.evaluation.bag_report.metrics import format_number
+from t3mpc_ros.evaluation.confidence_intervals import interval, mean
 from t3mpc_ros.evaluation.open_loop_estimation import KINDS, EstimationResult
 from t3mpc_ros.evaluation.paper.experiment_grid import (
     DRIVES,
@@ -20,9 +26,12 @@ from t3mpc_ros.evaluation.paper.experiment_grid import (
     NOMINAL,
     PAPER_NOISE,
     WITHOUT,
+    Experiment,
 )
 from t3mpc_ros.evaluation.paper.experiment_runs import finite_or_none
 from t3mpc_ros.evaluation.paper.results import PairedDifference, ResultRow, Results, step_to
+
+Array = NDArray[np.float64]
 
 SLIGHTLY = 0.10
 """Relative growth of an RMSE that still is "only slightly"; the paper gives no number."""
@@ -31,6 +40,8 @@ REFERENCE_SPREAD = 3.0
 WRONG_INERTIA = ('mass +30 %', 'mass -30 %')
 LOUDEST = 0.1
 """The largest noise variance of the paper, (rad/s)²."""
+ESTIMATION_SEEDS = 20
+"""Seeds of the comparison (86) that the claims are about."""
 INTENDED = (
     ('NT3FS', 'mass +30 %', DRIVES),
     ('NT3FS', 'friction x3', DRIVES),
@@ -54,13 +65,17 @@ class Claim:
     """The claim and its criterion."""
     found: str = 'not measured'
     held: bool | None = None
-    """None: not measured."""
+    """None: not measured, or inconclusive."""
     numbers: dict[str, object] = field(default_factory=dict)
+    inconclusive: bool = False
+    """Whether too little was measured to decide."""
 
     @property
     def verdict(self) -> str:
-        """``'held'``, ``'not held'`` or ``'not measured'``."""
-        return 'not measured' if self.held is None else 'held' if self.held else 'not held'
+        """``'held'``, ``'not held'``, ``'inconclusive'`` or ``'not measured'``."""
+        if self.held is None:
+            return 'inconclusive' if self.inconclusive else 'not measured'
+        return 'held' if self.held else 'not held'
 
     def record(self) -> dict[str, object]:
         """Return the claim as plain data."""
@@ -99,7 +114,8 @@ def all_claims(results: Results, estimated: Sequence[EstimationResult]) -> list[
     found += [grows_slightly(results, drive) for drive in DRIVES]
     found += [others_grow(results, drive) for drive in DRIVES]
     found += [calm_control(results, drive) for drive in DRIVES]
-    return found + estimation_claims(estimated)
+    enough = all(len(each.speed) >= ESTIMATION_SEEDS for each in estimated)
+    return found + estimation_claims(estimated, complete=results.complete and enough)
 
 
 def share_of_best(
@@ -126,7 +142,8 @@ def share_of_best(
     if full is None or best is None:
         return claim
     share = full.rmse_mean / best.rmse_mean
-    return _answer(
+    margin = limit * _rmses(results, best) - _rmses(results, full)
+    return _decide(
         claim,
         share <= limit,
         f'{_rmse(full)} against {_rmse(best)} of {best.controller}, the best of {len(baselines)}: '
@@ -138,6 +155,7 @@ def share_of_best(
             'share': share,
             'limit': limit,
         },
+        Evidence(results.complete, (margin,)),
     )
 
 
@@ -174,7 +192,7 @@ def part_helps(results: Results, part: str, case: str, drive: str) -> Claim:
         f'Adding {part} lowers RMSE in the case {case} ({drive} drive, noise {PAPER_NOISE:g}; '
         f'{more} less {less}, same seeds, 95 % interval below zero)',
     )
-    return _paired(claim, results.paired(more, less, drive, PAPER_NOISE, case))
+    return _paired(claim, results, results.paired(more, less, drive, PAPER_NOISE, case))
 
 
 def part_is_missed(results: Results, part: str, case: str, drive: str) -> Claim:
@@ -186,7 +204,7 @@ def part_is_missed(results: Results, part: str, case: str, drive: str) -> Claim:
         f'Leaving {part} out of the full controller costs RMSE in the case {case} ({drive} '
         f'drive, noise {PAPER_NOISE:g}; {FULL} less {less}, same seeds, interval below zero)',
     )
-    return _paired(claim, results.paired(FULL, less, drive, PAPER_NOISE, case))
+    return _paired(claim, results, results.paired(FULL, less, drive, PAPER_NOISE, case))
 
 
 def no_larger_than_pi(results: Results, drive: str) -> Claim:
@@ -202,11 +220,12 @@ def no_larger_than_pi(results: Results, drive: str) -> Claim:
     )
     if full is None or pi is None:
         return claim
-    return _answer(
+    return _decide(
         claim,
         full.rmse_mean <= pi.rmse_mean,
         f'{_rmse(full)} against {_rmse(pi)} of {pi.controller}',
         {'full': full.rmse_mean, 'pi': pi.rmse_mean},
+        Evidence(results.complete, (_rmses(results, pi) - _rmses(results, full),)),
     )
 
 
@@ -224,11 +243,15 @@ def smallest_growth(results: Results, drive: str) -> Claim:
         return claim
     own = grown[FULL][1] - grown[FULL][0]
     least = min(others, key=lambda name: others[name])
-    return _answer(
+    growth = _growth(results, drive, FULL)
+    return _decide(
         claim,
         math.isfinite(own) and own <= others[least],
         f'{own:+.3f} rad/s against {others[least]:+.3f} of {least}, the least of {len(others)}',
         {'full': own, 'least_rival': least, 'least': others[least]},
+        Evidence(
+            results.complete, tuple(_growth(results, drive, name) - growth for name in others)
+        ),
     )
 
 
@@ -247,7 +270,9 @@ def settled(results: Results, drive: str) -> Claim:
     share = full.settled_mean / REFERENCE_SPREAD
     found = f'{format_number(full.settled_mean)} rad/s, {100.0 * share:.1f} %'
     numbers: dict[str, object] = {'settled': full.settled_mean, 'limit': limit}
-    return _answer(claim, full.settled_mean <= limit, found, numbers)
+    margin = limit - np.array([run.settled for run in results.runs(full.experiment)])
+    evidence = Evidence(results.complete, (margin,))
+    return _decide(claim, full.settled_mean <= limit, found, numbers, evidence)
 
 
 def grows_slightly(results: Results, drive: str) -> Claim:
@@ -262,7 +287,9 @@ def grows_slightly(results: Results, drive: str) -> Claim:
     if FULL not in grown:
         return claim
     share = grown[FULL][1] / grown[FULL][0] - 1.0
-    return _answer(claim, share <= SLIGHTLY, f'{100 * share:+.0f} %', {'growth': share})
+    evidence = Evidence(results.complete, (-_growth(results, drive, FULL, SLIGHTLY),))
+    found = f'{100 * share:+.0f} %'
+    return _decide(claim, share <= SLIGHTLY, found, {'growth': share}, evidence)
 
 
 def others_grow(results: Results, drive: str) -> Claim:
@@ -282,7 +309,10 @@ def others_grow(results: Results, drive: str) -> Claim:
         return claim
     low, high = (f(shares, key=lambda name: shares[name]) for f in (min, max))
     found = f'from {100 * shares[low]:+.0f} % ({low}) to {100 * shares[high]:+.0f} % ({high})'
-    return _answer(claim, min(shares.values()) > 0.5, found, {**shares})
+    evidence = Evidence(
+        results.complete, tuple(_growth(results, drive, name, 0.5) for name in shares)
+    )
+    return _decide(claim, min(shares.values()) > 0.5, found, {**shares}, evidence)
 
 
 def calm_control(results: Results, drive: str) -> Claim:
@@ -295,21 +325,28 @@ def calm_control(results: Results, drive: str) -> Claim:
         f'noise {PAPER_NOISE:g})',
     )
     full = results.row(FULL, drive, PAPER_NOISE)
-    others = [row.chatter_mean for row in results.rows_of(drive, PAPER_NOISE, baseline=True)]
-    others = [value for value in others if math.isfinite(value)]
+    rows = results.rows_of(drive, PAPER_NOISE, baseline=True)
+    rows = [row for row in rows if math.isfinite(row.chatter_mean)]
+    others = [row.chatter_mean for row in rows]
     if full is None or not others:
         return claim
     middle = median(others)
-    return _answer(
+    by_seed = np.array(
+        [[run.chatter for run in results.runs(row.experiment)] for row in (full, *rows)]
+    )
+    return _decide(
         claim,
         full.chatter_mean <= middle,
         f'{full.chatter_mean:.0f} rad/s³ against a median of {middle:.0f}, from '
         f'{min(others):.0f} to {max(others):.0f}',
         {'full': full.chatter_mean, 'median': middle},
+        Evidence(results.complete, (np.median(by_seed[1:], axis=0) - by_seed[0],)),
     )
 
 
-def estimation_claims(estimated: Sequence[EstimationResult]) -> list[Claim]:
+def estimation_claims(
+    estimated: Sequence[EstimationResult], *, complete: bool = True
+) -> list[Claim]:
     """Decide the paper's claims on the fuzzy system without a controller, (86)."""
     ours, *others = KINDS
     half = Claim(
@@ -324,24 +361,31 @@ def estimation_claims(estimated: Sequence[EstimationResult]) -> list[Claim]:
         'Without a controller (86), the RMSE of type 3 grows only slightly with noise up to '
         f'{LOUDEST:g} (here: by at most {100 * SLIGHTLY:.0f} %), that of the others by over 50 %',
     )
-    records = {(result.kind, result.noise_variance): result.record() for result in estimated}
-    means = {key: float(str(record['speed_mean'])) for key, record in records.items()}
+    speeds = {(each.kind, each.noise_variance): np.array(each.speed) for each in estimated}
+    means = {key: mean(each.tolist()) for key, each in speeds.items()}
     if all((kind, PAPER_NOISE) in means for kind in KINDS):
         best = min(others, key=lambda kind: means[kind, PAPER_NOISE])
         own, other = means[ours, PAPER_NOISE], means[best, PAPER_NOISE]
-        half = _answer(
+        margin = 0.5 * speeds[best, PAPER_NOISE] - speeds[ours, PAPER_NOISE]
+        half = _decide(
             half,
             own <= 0.5 * other,
             f'{own:.4f} rad/s against {other:.4f} of {best}: {own / other:.2f} of it',
             {'type3': own, 'best': best, 'share': own / other},
+            Evidence(complete, (margin,)),
         )
     if all((kind, noise) in means for kind in KINDS for noise in (0.0, LOUDEST)):
         grown = {kind: means[kind, LOUDEST] / means[kind, 0.0] - 1.0 for kind in KINDS}
-        slight = _answer(
+        margins = (
+            (1.0 + SLIGHTLY) * speeds[ours, 0.0] - speeds[ours, LOUDEST],
+            *(speeds[kind, LOUDEST] - 1.5 * speeds[kind, 0.0] for kind in others),
+        )
+        slight = _decide(
             slight,
             grown[ours] <= SLIGHTLY and all(grown[kind] > 0.5 for kind in others),
             ', '.join(f'{kind} {100 * share:+.0f} %' for kind, share in grown.items()),
             {**grown},
+            Evidence(complete, margins),
         )
     return [half, slight]
 
@@ -349,7 +393,7 @@ def estimation_claims(estimated: Sequence[EstimationResult]) -> list[Claim]:
 def _against_preview(
     claim: Claim, results: Results, drive: str, cases: Sequence[str], *, exact: bool
 ) -> Claim:
-    held, words, numbers = True, [], {}
+    held, words, numbers, margins = True, [], {}, []
     for case in cases:
         full = results.row(FULL, drive, PAPER_NOISE, case)
         baselines = results.rows_of(drive, PAPER_NOISE, case, baseline=True, preview=True)
@@ -364,7 +408,9 @@ def _against_preview(
         )
         numbers[f'{case}, full'] = full.rmse_mean
         numbers[f'{case}, best'] = best.rmse_mean
-    return _answer(claim, held, '; '.join(words), {**numbers})
+        margins.append(_rmses(results, best) - _rmses(results, full))
+    evidence = Evidence(results.complete, tuple(margins))
+    return _decide(claim, held, '; '.join(words), {**numbers}, evidence)
 
 
 def _best(rows: Sequence[ResultRow]) -> ResultRow | None:
@@ -389,21 +435,70 @@ def _growths(results: Results, drive: str) -> dict[str, tuple[float, float]]:
     return found
 
 
-def _paired(claim: Claim, pair: PairedDifference | None) -> Claim:
-    if pair is None or pair.seeds < 2:
+def _growth(results: Results, drive: str, name: str, share: float = 0.0) -> Array:
+    """Return the growth of RMSE with the most noise beyond a share of its start, by seed."""
+    first, last = (
+        np.array([run.rmse for run in results.runs(Experiment(name, drive, noise, NOMINAL))])
+        for noise in (0.0, LOUDEST)
+    )
+    growth: Array = last - (1.0 + share) * first
+    return growth
+
+
+def _paired(claim: Claim, results: Results, pair: PairedDifference | None) -> Claim:
+    if pair is None or (pair.seeds < 2 and results.complete):
         return claim
     if not math.isfinite(pair.difference):
         return _answer(claim, False, 'a run left the finite numbers', {'seeds': pair.seeds})
-    return _answer(
+    known = math.isfinite(pair.ci95)
+    found = f'{pair.difference:+.4f}' + (f' ± {pair.ci95:.4f}' if known else '')
+    return _decide(
         claim,
         pair.below,
-        f'{pair.difference:+.4f} ± {pair.ci95:.4f} rad/s over {pair.seeds} seeds',
+        f'{found} rad/s over {pair.seeds} seed' + ('s' if pair.seeds > 1 else ''),
         {'difference': pair.difference, 'ci95': pair.ci95, 'seeds': pair.seeds},
+        Evidence(results.complete, (), ((-pair.difference, pair.ci95),)),
     )
 
 
 def _rmse(row: ResultRow) -> str:
     return f'{format_number(row.rmse_mean)} rad/s'
+
+
+def _rmses(results: Results, row: ResultRow) -> Array:
+    """Return the RMSE of each seed, rad/s."""
+    return np.array([run.rmse for run in results.runs(row.experiment)])
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What a claim is decided from."""
+
+    complete: bool
+    """Whether as much was measured as the claim is about; its criterion then decides."""
+    margins: tuple[Array, ...]
+    """For each part of the claim, by how much each seed satisfies it."""
+    intervals: tuple[tuple[float, float], ...] = ()
+    """More parts, as mean and half the interval."""
+
+    @property
+    def decides(self) -> bool:
+        """Whether all parts are satisfied, or one is not, beyond doubt."""
+        parts = [(mean(each.tolist()), interval(each.tolist())) for each in self.margins]
+        parts += self.intervals
+        if self.complete or not all(math.isfinite(middle) for middle, _ in parts):
+            return True
+        return all(middle > half for middle, half in parts) or any(
+            middle < -half for middle, half in parts
+        )
+
+
+def _decide(
+    claim: Claim, held: bool, found: str, numbers: dict[str, object], evidence: Evidence
+) -> Claim:
+    if evidence.decides:
+        return _answer(claim, held, found, numbers)
+    return replace(_answer(claim, held, found, numbers), held=None, inconclusive=True)
 
 
 def _answer(claim: Claim, held: bool, found: str, numbers: dict[str, object]) -> Claim:

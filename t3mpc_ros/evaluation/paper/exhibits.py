@@ -50,12 +50,13 @@ class Exhibit:
 
     def mark(self, claims: Sequence[Claim]) -> str:
         """Decide: held when all its claims are, not held when one is not, else unknown."""
-        verdicts = {claim.held for claim in self.decided_by(claims)}
+        verdicts = {claim.verdict for claim in self.decided_by(claims)}
         if not self.comparable:
             return 'not comparable'
-        if False in verdicts:
-            return 'not held'
-        return 'held' if verdicts == {True} else 'not measured'
+        for verdict in ('not held', 'inconclusive'):
+            if verdict in verdicts:
+                return verdict
+        return 'held' if verdicts == {'held'} else 'not measured'
 
 
 EXHIBITS = (

@@ -10,7 +10,13 @@ from t3mpc_ros.evaluation.paper.claims import Claim
 from t3mpc_ros.evaluation.paper.exhibits import EXHIBITS, Exhibit
 from t3mpc_ros.evaluation.reporting import Table
 
-_CLASS = {'held': 'yes', 'not held': 'no', 'not measured': 'open', 'not comparable': 'apart'}
+_CLASS = {
+    'held': 'yes',
+    'not held': 'no',
+    'inconclusive': 'open',
+    'not measured': 'open',
+    'not comparable': 'apart',
+}
 
 _CSS = """
 :root { color-scheme: light; }
@@ -83,9 +89,9 @@ def page(
 
 
 def counted(claims: Sequence[Claim]) -> str:
-    """Return how many claims are held, not held and not measured."""
+    """Return how many claims are held, not held, inconclusive and not measured."""
     verdicts = [claim.verdict for claim in claims]
-    return ', '.join(f'{verdicts.count(kind)} {kind}' for kind in list(_CLASS)[:3])
+    return ', '.join(f'{verdicts.count(kind)} {kind}' for kind in list(_CLASS)[:4])
 
 
 def _claims(title: str, claims: Sequence[Claim]) -> str:

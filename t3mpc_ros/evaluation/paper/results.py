@@ -5,12 +5,12 @@
 from collections.abc import Iterable, Mapping, Sequence
 import csv
 from dataclasses import asdict, dataclass, fields
-import json
 import math
 from pathlib import Path
 
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
 from t3mpc_ros.evaluation.paper.experiment_grid import (
+    DURATION,
     NOMINAL,
     PARTS,
     STAGES,
@@ -20,6 +20,7 @@ from t3mpc_ros.evaluation.paper.experiment_grid import (
     ExperimentSetup,
 )
 from t3mpc_ros.evaluation.paper.experiment_runs import RunNumbers, finite_or_none
+from t3mpc_ros.evaluation.reporting import strict_json
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +51,11 @@ class ResultRow:
     """How many."""
     duration: float
     """s of each run."""
+
+    @property
+    def experiment(self) -> Experiment:
+        """Method and situation."""
+        return Experiment(self.controller, self.drive, self.noise, self.case)
 
     def record(self) -> dict[str, object]:
         """Return the row as plain data, None for what is not finite."""
@@ -98,6 +104,8 @@ class Results:
         One entry per seed, in the same order of seeds in all cells.
     duration
         s of each run.
+    complete
+        Whether these are all seeds, with the whole duration.
     """
 
     def __init__(
@@ -105,9 +113,12 @@ class Results:
         kinds: Mapping[str, tuple[bool, bool]],
         numbers: Mapping[Experiment, Sequence[RunNumbers]],
         duration: float,
+        *,
+        complete: bool = True,
     ) -> None:
         self.kinds = dict(kinds)
         self.duration = duration
+        self.complete = complete
         self._numbers = {experiment: tuple(runs) for experiment, runs in numbers.items()}
         self._rows = {
             experiment: self._row(experiment, runs) for experiment, runs in self._numbers.items()
@@ -123,6 +134,10 @@ class Results:
     ) -> ResultRow | None:
         """Return a row, None when it was not measured."""
         return self._rows.get(Experiment(controller, drive, noise, case))
+
+    def runs(self, experiment: Experiment) -> tuple[RunNumbers, ...]:
+        """Return the runs of an experiment, one per seed, in the same order in all of them."""
+        return self._numbers[experiment]
 
     def rows_of(
         self,
@@ -228,7 +243,8 @@ def results_of(
             kind = (bool(method.baseline), bool(method.preview))
             if kinds.setdefault(name, kind) != kind:
                 raise ValueError(f'{name} must be of the same kind with every drive')
-    return Results(kinds, numbers, grid.duration)
+    complete = grid.seeds == tuple(setup.seeds) and grid.duration >= DURATION
+    return Results(kinds, numbers, grid.duration, complete=complete)
 
 
 def step_to(part: str) -> tuple[str, str]:
@@ -245,9 +261,9 @@ def write_json(path: Path, content: Mapping[str, object]) -> None:
     OSError
         The file cannot be written.
     """
-    text = json.dumps(_strict(content), indent=1, ensure_ascii=False, allow_nan=False)
+    text = strict_json(content)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text + '\n', encoding='utf-8')
+    path.write_text(text, encoding='utf-8')
 
 
 def write_csv(path: Path, rows: Iterable[ResultRow]) -> None:
@@ -265,14 +281,6 @@ def write_csv(path: Path, rows: Iterable[ResultRow]) -> None:
         writer.writeheader()
         for row in rows:
             writer.writerow({name: _csv_cell(value) for name, value in row.record().items()})
-
-
-def _strict(value: object) -> object:
-    if isinstance(value, Mapping):
-        return {name: _strict(item) for name, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_strict(item) for item in value]
-    return finite_or_none(value) if isinstance(value, float) else value
 
 
 def _csv_cell(value: object) -> object:

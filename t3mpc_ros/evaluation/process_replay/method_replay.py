@@ -27,6 +27,7 @@ from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     motions,
 )
 from t3mpc_ros.evaluation.process_replay.controller_replay import ReplayResult, replay_controller
+from t3mpc_ros.evaluation.tuning.search_space import find_names
 from t3mpc_ros.geometry.kinematics import wheels_from_twist
 from t3mpc_ros.geometry.trajectory import ReferenceTrajectory
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, State, StateArray
@@ -52,8 +53,10 @@ def replay_method(
         The method is unknown.
     """
     known = methods('velocity')
-    if name not in known:
-        raise ReplayError(f'there is no method {name!r}; there are: {", ".join(known)}')
+    try:
+        (name,) = find_names('method', [name], known)
+    except ValueError as error:
+        raise ReplayError(str(error)) from error
     ours = replay_controller(inputs, changes)
     answers = {speed: ours.fields[speed].copy() for speed in SPEEDS}
     odometry, references = motions(inputs.odometry), motions(inputs.references)

@@ -10,7 +10,7 @@ so that equal steps are equal factors for gains and weights, whose order of magn
 An integer has an interval of equal length around each value: a and b are extended by one half.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 import difflib
 import math
@@ -264,6 +264,25 @@ class MethodDefinition:
 def short_name(name: str) -> str:
     """Return ``name`` in lower case with one hyphen for whatever is no letter or digit."""
     return re.sub(r'[^a-z0-9]+', '-', name.lower()).strip('-')
+
+
+def find_names(kind: str, names: Sequence[str], known: Iterable[str]) -> tuple[str, ...]:
+    """Return the named entries of ``known`` in its order; case and punctuation are ignored.
+
+    Raises
+    ------
+    ValueError
+        An unknown name; the text holds all, and the nearest one.
+    """
+    by_short_name = {short_name(name): name for name in known}
+    for name in names:
+        if short_name(name) not in by_short_name:
+            near = difflib.get_close_matches(short_name(name), by_short_name, n=1)
+            hint = f'; did you mean {by_short_name[near[0]]}?' if near else ''
+            all_names = ', '.join(by_short_name.values())
+            raise ValueError(f'{kind} must be one of {all_names}: got {name}{hint}')
+    wanted = {short_name(name) for name in names}
+    return tuple(name for short, name in by_short_name.items() if short in wanted)
 
 
 def check_names(methods: Sequence[MethodDefinition]) -> None:
