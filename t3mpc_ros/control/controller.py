@@ -38,7 +38,7 @@ from t3mpc_ros.geometry.types import (
     WheelSpeeds,
 )
 from t3mpc_ros.kernels import kernel
-from t3mpc_ros.parameters.table import group, parameter, with_default
+from t3mpc_ros.parameters.table import ParameterError, group, parameter, with_default
 
 Array = NDArray[np.float64]
 
@@ -91,6 +91,15 @@ class ControllerParameters(Nt3fsMpcParameters):
         CommandShaperParameters, straight_frequency=0.0, turning_frequency=0.0
     )
     body: BodyCorrectionParameters = group(BodyCorrectionParameters)
+
+    def check_consistency(self) -> None:
+        """Raise :class:`ParameterError` if the composition cannot treat jumps so."""
+        super().check_consistency()
+        if self.composition == 'body' and self.jump_transition.method == 'predictive':
+            raise ParameterError(
+                'jump_transition.method must be ramp with composition body, which has no '
+                'predictive term: got predictive; or set composition to paper'
+            )
 
     def resolved(self) -> Self:
         """Return the parameters with the parts of the composition, and the gain that fits."""
@@ -170,6 +179,7 @@ class Controller:
         )
         self._dead_time_ns = round(self._actuation.dead_time * NANOSECONDS)
         self._dead_time = self._make_dead_time_estimator()
+        self._disturbed = False
         self._before_disturbance: tuple[Any, Any] | None = None
         self._shaper = CommandShaper(parameters.command_shaper, self._period)
         geometry = parameters.geometry
@@ -212,8 +222,13 @@ class Controller:
 
     @property
     def dead_time(self) -> DeadTimeEstimator:
-        """Estimate of the dead time, and whether the response is disturbed."""
+        """Estimate of the dead time."""
         return self._dead_time
+
+    @property
+    def disturbed(self) -> bool:
+        """Whether the response is disturbed, so that nothing is learned from it."""
+        return self._disturbed
 
     @property
     def gain(self) -> float:
@@ -245,11 +260,6 @@ class Controller:
     def warm_up(self) -> None:
         """Compile and pretrain, so that no step has to; the state of the controller is kept."""
         self.law.warm_up()
-        memory = self._body.snapshot()
-        still = np.zeros(2)
-        self._body.step(0.0, self._period, still, still, still, 0.0)
-        self._body.reset()
-        self._body.rollback(memory)
         other, jump = Controller(self.parameters), 2.0 * JUMP_DETECTION_FACTOR * self._period
         jumped = BodyTwist(jump * self.parameters.limits.linear_acceleration, 0.0)
         for k in range(24):
@@ -260,6 +270,8 @@ class Controller:
 
     def configure(self, parameters: ControllerParameters) -> None:
         """Use new values of the dynamic parameters from the next step on."""
+        if parameters.estimate_dead_time and not self.parameters.estimate_dead_time:
+            self._dead_time.reset(self._actuation.speeds)
         self.parameters = parameters
         self._tracker.configure(parameters.resolved())
         self._body.configure(parameters.body)
@@ -280,7 +292,7 @@ class Controller:
         self.law.predictive.pretrain()
         self._body.reset()
         self._dead_time = self._make_dead_time_estimator()
-        self._before_disturbance = None
+        self._disturbed, self._before_disturbance = False, None
         self._snapshots.clear()
         self._set_dead_time(self.parameters.speed_filter.dead_time)
         self._stop()
@@ -368,7 +380,7 @@ class Controller:
         actuation.observe(speeds, elapsed or self._period)
         if restart:
             self._dead_time.reset(speeds)
-            self._before_disturbance = None
+            self._disturbed, self._before_disturbance = False, None
         else:
             self._update_dead_time(speeds, elapsed or self._period)
         if restart:
@@ -411,7 +423,7 @@ class Controller:
                 planned,
                 self._actuation.command,
                 self._actuation.dead_time + filtered.lag + 0.5 * self._period,
-                learn=not self._dead_time.disturbed,
+                learn=not self._disturbed,
             )
             planned = planned + np.array([correction, -correction])
         return self.law.step(speeds, planned, rate, elapsed)
@@ -462,20 +474,19 @@ class Controller:
 
     def _update_dead_time(self, speeds: Array, elapsed: float) -> None:
         """Update the dead time in use; after a disturbance, discard what was learnt during it."""
-        if not self.parameters.estimate_dead_time:
-            return
         estimator, actuation = self._dead_time, self._actuation
-        disturbed = estimator.step(speeds, actuation.command, elapsed)
-        if disturbed and self._before_disturbance is None and self._snapshots:
+        dead_time, self._disturbed = self.parameters.speed_filter.dead_time, False
+        if self.parameters.estimate_dead_time:
+            self._disturbed = estimator.step(speeds, actuation.command, elapsed)
+            difference = abs(estimator.dead_time - dead_time)
+            if difference > max(DEAD_TIME_TOLERANCE, 3.0 * estimator.standard_deviation):
+                dead_time = estimator.dead_time
+        if self._disturbed and self._before_disturbance is None and self._snapshots:
             self._before_disturbance = self._snapshots[0]
             self._snapshots.clear()
-        elif not disturbed and self._before_disturbance is not None:
+        elif not self._disturbed and self._before_disturbance is not None:
             self._rollback(self._before_disturbance)
             self._before_disturbance = None
-        dead_time = self.parameters.speed_filter.dead_time
-        difference = abs(estimator.dead_time - dead_time)
-        if difference > max(DEAD_TIME_TOLERANCE, 3.0 * estimator.standard_deviation):
-            dead_time = estimator.dead_time
         if abs(dead_time - actuation.dead_time) > MIN_DEAD_TIME_CHANGE:
             self._set_dead_time(dead_time)
 
@@ -501,7 +512,7 @@ class Controller:
 
     def _take_snapshot(self) -> None:
         """Store a snapshot of the weights once per SNAPSHOT_PERIOD, except while disturbed."""
-        if self._dead_time.disturbed:
+        if self._disturbed:
             return
         self._steps_since_snapshot += 1
         if self._steps_since_snapshot >= self._snapshot_steps:

@@ -191,12 +191,6 @@ class DeadTimeEstimator:
         """Variance of the innovation as a multiple of the noise variance, at least 1."""
         return float(self.state[SCALARS, NOISE_RATIO])
 
-    @property
-    def kernel_arguments(self) -> tuple[Array, float, float, float, bool]:
-        """State and constants of :func:`update_dead_time`, in its order."""
-        constants = self._lag, self._period, self._noise_variance, self._mean_speeds
-        return self.state, *constants
-
     def reset(self, speeds: Array) -> None:
         """Restart at measured wheel speeds (rad/s) with equal commands; the estimate is kept.
 

@@ -324,7 +324,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             'gain_1_s': self._controller.gain,
             'dead_time_s': self._controller.dead_time.dead_time,
             'dead_time_std_s': self._controller.dead_time.standard_deviation,
-            'disturbed': self._controller.dead_time.disturbed,
+            'disturbed': self._controller.disturbed,
             'body_authority': self._controller.body.authority,
             'body_yaw_error_rad': self._controller.body.yaw_error,
             'skill_right': float(status.skill[0]),

@@ -12,10 +12,12 @@ import pytest
 
 from t3mpc_ros.control.control_law import Nt3fsMpcController, Nt3fsMpcParameters
 from t3mpc_ros.control.controller import Controller, ControllerParameters, SwitchingTracker
+from t3mpc_ros.control.dead_time_estimator import DISTURBED, SCALARS
 from t3mpc_ros.control.jump_transition import JumpTransitionParameters
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, State, WheelSpeeds
+from t3mpc_ros.parameters.table import ParameterError
 
 MS = 1_000_000
 PERIOD = 10 * MS
@@ -295,6 +297,26 @@ def test_a_dead_time_that_nobody_configured_is_found():
     estimate = loop.controller.dead_time
     assert loop.controller.actuation.dead_time == pytest.approx(0.0425, abs=0.004)
     assert abs(estimate.dead_time - 0.0425) < 4.0 * estimate.standard_deviation + 0.003
+    # Without the estimate, the configured dead time is back and nothing is disturbed.
+    estimate.state[SCALARS, DISTURBED] = 1.0
+    loop.step(State(loop.now, ORIGIN, loop.twist))
+    assert loop.controller.disturbed
+    parameters = loop.controller.parameters
+    loop.controller.configure(parameters.with_values({'estimate_dead_time': False}))
+    loop.step(State(loop.now, ORIGIN, loop.twist))
+    assert not loop.controller.disturbed
+    assert loop.controller.actuation.dead_time == parameters.speed_filter.dead_time
+    loop.controller.configure(parameters)
+    loop.step(State(loop.now, ORIGIN, loop.twist))
+    assert not loop.controller.disturbed
+
+
+def test_the_body_composition_refuses_predictive_jumps():
+    """It was once silently treated as a ramp."""
+    with pytest.raises(ParameterError, match='composition body'):
+        ControllerParameters.from_dict(
+            {'composition': 'body', 'jump_transition.method': 'predictive'}
+        )
 
 
 # --- the control law -----------------------------------------------------------------------------
@@ -473,7 +495,7 @@ def test_wheels_to_twist_and_back_is_the_identity():
 
 COMPILES = """
 import sys
-from t3mpc_ros.control.controller import Controller, ControllerParameters
+from t3mpc_ros.control import controller as control
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, State
 
 def signatures():
@@ -482,7 +504,7 @@ def signatures():
                if hasattr(one, 'signatures')}
     return {(one.__module__, one.__name__): len(one.signatures) for one in kernels}
 
-controller = Controller(ControllerParameters())
+controller = control.Controller(getattr(control, sys.argv[1])())
 controller.warm_up()
 before = signatures()
 twist = BodyTwist(0.0, 0.0)
@@ -496,9 +518,14 @@ print({name for name in after if after[name] != before[name]} or 'nothing')
 """
 
 
-def test_after_the_warm_up_no_step_compiles():
+@pytest.mark.parametrize('parameters', ['ControllerParameters', 'StepperControllerParameters'])
+def test_after_the_warm_up_no_step_compiles(parameters):
     """A separate process, because other tests compile in this one."""
     done = subprocess.run(
-        [sys.executable, '-c', COMPILES], capture_output=True, text=True, timeout=300, check=False
+        [sys.executable, '-c', COMPILES, parameters],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
     )
     assert done.stdout.strip() == 'nothing', done.stdout + done.stderr
