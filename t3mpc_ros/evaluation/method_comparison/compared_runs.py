@@ -68,6 +68,19 @@ START = 3.0
 TWIN_ADVANCE = 0.0095
 """Lead of feed-forward over the dead time on the twin, s: its pulse generator ramps to a command
 during the whole period that follows, and its rotors have hardly any lag."""
+TWIN_PARTS: Mapping[str, Mapping[str, object]] = {
+    'full without NT3FS': {'body.learning_rate': 0.0},
+    'full without compensator': {'body.yaw_gain': 0.0},
+    'full without shaper': {
+        'command_shaper.straight_frequency': 0.0,
+        'command_shaper.turning_frequency': 0.0,
+    },
+    'full without dead-time estimate': {'estimate_dead_time': False},
+    'full without preview': {'jump_transition.preview': False},
+    "full, the paper's composition": {'composition': 'paper'},
+}
+"""The node's controller on the twin with one part left out, and with NT3FS, compensator and v_p on
+the wheel speeds. The compensator acts with the authority of NT3FS: without it, neither does."""
 AFTER = 2.0
 """Time after faults before the error after them counts, s."""
 
@@ -170,17 +183,13 @@ def _twin_methods(
                 parameters = parameters.with_values({'gain': cancelling})
             spec = MethodSpec(name, method.controller_type, parameters)
             found[name] = TwinMethod(name, baseline=spec)
-    for name, changes in {**STAGES, **WITHOUT}.items():
-        if name != FULL and 'random_predictor' not in changes:
-            found[name] = TwinMethod(name, changes)
-    return found
+    return found | {name: TwinMethod(name, changes) for name, changes in TWIN_PARTS.items()}
 
 
 def default_methods(robot: str) -> tuple[str, ...]:
     """Return the full controller and every baseline, without stages and ablations."""
-    return tuple(
-        name for name in methods_for(robot) if name not in (*STAGES, *WITHOUT) or name == FULL
-    )
+    parts = {*STAGES, *WITHOUT, *TWIN_PARTS} - {FULL}
+    return tuple(name for name in methods_for(robot) if name not in parts)
 
 
 def cases_for(robot: str) -> tuple[str, ...]:

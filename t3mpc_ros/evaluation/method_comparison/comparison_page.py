@@ -167,7 +167,7 @@ def knowledge_table(plan: ComparisonPlan) -> Table:
         gyro = [name for name in plan.cases if plan.gyro or TWIN_CASES[name].gyro] or ['no case']
         rows |= {
             FULL: 'the controller of the node with the parameters of the node for this robot, and '
-            'no learnt weights at the start; its stages and ablations likewise. It receives the '
+            'no learnt weights at the start; likewise with a part left out. It receives the '
             'odometry as it is published: wheel speeds of the step counters, and a pose whose yaw '
             'contains the gyro',
             FEED_FORWARD: f'no measurement; the reference {1e3 * TWIN_ADVANCE:g} ms beyond the '
