@@ -24,6 +24,7 @@ setup(
     ],
     package_data={
         f'{NAME}.evaluation.method_comparison': ['*.yaml'],
+        f'{NAME}.evaluation.training': ['*.npz'],
         f'{NAME}.evaluation.tuning': ['*.json'],
         f'{NAME}.simulation': ['worlds/*.yaml', 'schedules/*.yaml'],
     },

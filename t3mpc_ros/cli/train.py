@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 import sys
 
-DRIVES = ('velocity', 'torque')
+DRIVES = {'servo': 'velocity', 'torque': 'torque'}
 OUTPUT = Path('model.npz')
 SEEDS = 5
 FOLDS = 5
@@ -23,7 +23,7 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     )
     parser.add_argument('bags', nargs='*', type=Path, metavar='BAG', help='folder of a bag')
     parser.add_argument(
-        '--drive', choices=DRIVES, default='velocity', help='of the practice (default velocity)'
+        '--robot', choices=DRIVES, default='servo', help='of the practice (default servo)'
     )
     parser.add_argument(
         '--seeds',
@@ -69,21 +69,23 @@ def run(options: argparse.Namespace) -> int:
     from t3mpc_ros.bag.run.model_file import save_model
 
     if options.bags:
-        if options.drive != 'velocity':
-            raise ValueError(f'drive must be velocity for bags: got {options.drive}')
+        if options.robot != 'servo':
+            raise ValueError(f'robot must be servo for bags: got {options.robot}')
         return run_bags(options)
     from t3mpc_ros.evaluation.training.simulated_runs import (
         assess,
         fit_simulated_runs,
         held_out_seeds,
+        origin,
     )
 
     if options.keep_predictor:
         raise ValueError('--keep-predictor is for bags')
     seeds = held_out_seeds(options.seeds)
-    pretrained, used = fit_simulated_runs(options.drive)
-    save_model(options.output, pretrained, {**used.to_dict(), 'drive': options.drive})
-    print(assess(options.drive, used, pretrained, seeds, _print_progress))
+    drive = DRIVES[options.robot]
+    pretrained, used = fit_simulated_runs(drive)
+    save_model(options.output, pretrained, {**used.to_dict(), 'drive': drive}, origin(drive))
+    print(assess(drive, used, pretrained, seeds, _print_progress))
     print(f'saved {options.output.resolve()}')
     return 0
 

@@ -17,7 +17,7 @@ from std_msgs.msg import Float64, Int64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
 from t3mpc_ros.bag.run.journal import Journal, parameters_to_json
-from t3mpc_ros.bag.run.model_file import ModelError, load_model, save_model
+from t3mpc_ros.bag.run.model_file import ModelError, find_model, load_model, save_model
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.control.controller import Controller, Status, StepperControllerParameters
 from t3mpc_ros.control.input_monitor import InputMonitor
@@ -67,7 +67,11 @@ class ControllerNodeParameters(StepperControllerParameters):
         low=0.0,
         high=1000.0,
     )
-    model: str = parameter('', 'model file to load at start; empty = start without learnt weights')
+    model: str = parameter(
+        '',
+        'model file to load at start, or servo: the model of the package for the simulated robot '
+        'with drive.kind velocity; empty = start without learnt weights',
+    )
     model_output: str = parameter('controller_model.npz', 'file that ~/save_model writes')
 
 
@@ -155,14 +159,14 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             self.create_steady_timer(ADAPT_PERIOD, self._adapt_command_type)
 
     def _load_model(self) -> None:
-        path = self.parameters.model
-        if not path:
+        if not self.parameters.model:
             return
+        path = find_model(self.parameters.model)
         try:
-            self._controller.set_weights(load_model(Path(path)))
+            self._controller.set_weights(load_model(path))
         except ValueError as error:
             raise ModelError(f'{path} does not fit the parameters: {error}') from error
-        self._publish_journal(self._journal.model(zlib.crc32(Path(path).read_bytes())))
+        self._publish_journal(self._journal.model(zlib.crc32(path.read_bytes())))
 
     def on_parameters_changed(self, parameters: ControllerNodeParameters) -> None:
         """Apply dynamic parameters to the controller and record them in the journal."""

@@ -11,7 +11,13 @@ from support.training_runs import GEOMETRY, STORE, ClosedLoopObjective, Tape
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.run import model_file
-from t3mpc_ros.bag.run.model_file import ModelError, load_model, save_model
+from t3mpc_ros.bag.run.model_file import (
+    ModelError,
+    find_model,
+    load_model,
+    read_model_header,
+    save_model,
+)
 from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.control.actuation import LimitParameters, VelocityActuation
@@ -645,14 +651,20 @@ def test_dither_moves_v_p_by_itself_and_keeps_its_bound():
 
 def test_practice_on_the_command_line(tmp_path, capsys):
     path = tmp_path / 'model.npz'
-    assert main(['train', '--drive', 'torque', '--seeds', '2', '--output', str(path)]) == 0
+    assert main(['train', '--robot', 'servo', '--seeds', '2', '--output', str(path)]) == 0
     said = capsys.readouterr().out
-    pretrained, parameters = fit_simulated_runs('torque')
+    pretrained, parameters = fit_simulated_runs('velocity')
     loaded = load_model(path)
     assert set(loaded) == set(pretrained)
     for name, values in pretrained.items():
         np.testing.assert_array_equal(loaded[name], values)
-    assert parameters == full_parameters('torque')
+    assert parameters == full_parameters('velocity')
+    # The model of the package is the one that the command makes, with its origin inside.
+    packaged = find_model('servo')
+    assert read_model_header(packaged) == read_model_header(path)
+    for name, values in load_model(packaged).items():
+        np.testing.assert_allclose(values, loaded[name], rtol=1e-6, atol=1e-9, err_msg=name)
+    Controller(ControllerParameters()).set_weights(loaded)
     for word in (
         f'seeds {", ".join(map(str, PRETRAINING_SEEDS))}',
         'next step',
@@ -689,7 +701,7 @@ def test_bags_on_the_command_line(bag, trained, tmp_path, capsys):
         (['--seeds', '21'], 'seeds must be from 1 to 20: got 21'),
         (['--seeds', '0'], 'seeds must be from 1 to 20: got 0'),
         (['--keep-predictor'], 'is for bags'),
-        (['bag', '--drive', 'torque'], 'drive must be velocity for bags'),
+        (['bag', '--robot', 'torque'], 'robot must be servo for bags'),
         (['nowhere'], 'no complete bag file'),
     ],
     ids=str,

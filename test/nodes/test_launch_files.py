@@ -17,8 +17,11 @@ from support.launch_files import arguments_of, nodes_of
 import yaml
 
 from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.bag.run.model_file import find_model, load_model, read_model_header
 from t3mpc_ros.cli.process_group import installed_file
+from t3mpc_ros.control.controller import Controller
 from t3mpc_ros.nodes.registry import parameter_class
+from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
 
 ROOT = Path(__file__).resolve().parents[2]
 FILES = sorted(path.name for path in (ROOT / 'launch').glob('*.launch.py'))
@@ -120,6 +123,20 @@ def test_robot_files_agree_within_and_with_their_limits(file):
     assert periods >= 4
     drive = controller['speed_filter.dead_time'] + 3 * controller['speed_filter.lag']
     assert controller['watchdog.response_window'] >= drive
+
+
+def test_the_file_of_the_paper_fits_its_plant_and_model():
+    nodes = launched('sim.launch.py', params_file='paper_robot.yaml')
+    robot, values = only(nodes, 'sim_robot').all_values, only(nodes, 'controller').all_values
+    assert robot['drive.kind'] == 'velocity'
+    del values['use_sim_time']
+    parameters = parameter_class('controller').from_dict(values)
+    plant = PaperRobotParameters()
+    assert parameters.speed_filter.lag == plant.drive.lag
+    assert parameters.speed_filter.dead_time == plant.drive.dead_time
+    Controller(parameters).set_weights(load_model(find_model(parameters.model)))
+    used = read_model_header(find_model(parameters.model))['parameters']
+    assert parameters.law.gain == pytest.approx(used['law.gain'], rel=0.01)
 
 
 def test_follow_remaps_the_topics_of_the_robot():

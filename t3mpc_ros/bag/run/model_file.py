@@ -16,6 +16,9 @@ import t3mpc_ros
 FORMAT = 1
 """Version of the format; incremented if the meaning of an array changes."""
 
+PACKAGED = Path(t3mpc_ros.__file__).resolve().parent / 'evaluation' / 'training'
+"""Folder of the model files that come with the package."""
+
 _HEADER = 'header'
 
 
@@ -61,6 +64,12 @@ def save_model(
             np.savez_compressed(target, **content)
     except OSError as error:
         raise ModelError(f'cannot write the model file {path}: {error.strerror}') from error
+
+
+def find_model(name: str) -> Path:
+    """Return the file of a model: that of the package with this name, else ``name`` as a path."""
+    packaged = PACKAGED / f'{name}.npz'
+    return packaged if packaged.parent == PACKAGED and packaged.is_file() else Path(name)
 
 
 def load_model(path: Path) -> dict[str, NDArray[np.float64]]:

@@ -58,6 +58,17 @@ def fit_simulated_runs(drive: str) -> tuple[Mapping[str, Array], ProposedParamet
     return pretrain(ProposedController, parameters, drive), parameters
 
 
+def origin(drive: str) -> Mapping[str, object]:
+    """Return the origin of the model fitted to the training runs, for the model file."""
+    return {
+        'command': f't3mpc train --robot {"servo" if drive == "velocity" else drive}',
+        'drive': drive,
+        'seeds': list(PRETRAINING_SEEDS),
+        'duration': PRETRAINING_DURATION,
+        'noise_variance': PRETRAINING_NOISE,
+    }
+
+
 def assess(
     drive: str,
     parameters: ProposedParameters,
