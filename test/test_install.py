@@ -543,6 +543,27 @@ def test_a_signal_ends_the_set_up_and_its_commands(number, checkout):
     assert not checkout.stamped
 
 
+def test_a_long_step_of_the_set_up_shows_the_time(checkout):
+    """Compilation alone takes a minute, in which the script would print nothing."""
+    sleep = checkout.bin / 'sleep'
+    sleep.unlink()
+    # Of the two sleeps, that between two looks at the command is shortened.
+    real = shutil.which('sleep')
+    text = f'[ "$1" = 0.2 ] && exec {real} 0.005\nexec {real} "$1"\n'
+    sleep.write_text(f'#!{shutil.which("bash")}\n{text}')
+    sleep.chmod(0o755)
+    (checkout.notes.parent / 'slow').touch()
+    with subprocess.Popen(**checkout.command('t3mpc')) as script:
+        shown = []
+        for line in script.stderr:
+            shown.append(line.strip())
+            if line.strip() == '30 s':
+                break
+        script.send_signal(signal.SIGTERM)
+    step = shown.index('installing ROS 2 Jazzy and the libraries from the package index')
+    assert shown[step + 1 :] == ['10 s', '20 s', '30 s']
+
+
 def test_the_help_of_the_demo_needs_no_environment(checkout):
     for word in ('--help', '-h'):
         command = checkout.command()

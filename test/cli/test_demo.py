@@ -5,6 +5,7 @@
 from contextlib import ExitStack, suppress
 import os
 from pathlib import Path
+import re
 import signal
 import socket
 import subprocess
@@ -14,6 +15,7 @@ import time
 import pytest
 
 from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.cli import process_group
 from t3mpc_ros.cli.main import _new_run
 from t3mpc_ros.cli.private_graph import DOMAINS, NoDomainError, PrivateGraph, used_domains
 
@@ -166,6 +168,32 @@ def test_an_interrupted_demo_says_how_to_get_the_report(tmp_path):
     demo.send_signal(signal.SIGINT)
     _, errors = demo.communicate(timeout=TIMEOUT)
     assert f't3mpc bag report {bag}' in errors
+
+
+def test_a_wait_shows_progress(tmp_path, monkeypatch):
+    """Compilation takes a minute, discovery seconds: the last line of the node is shown."""
+    monkeypatch.setattr(process_group, 'PROGRESS_PERIOD', 0.05)
+    environment = stand_ins(tmp_path, silent=('tracking',))
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
+    shown = []
+    group = process_group.ProcessGroup(
+        tmp_path / 'log', environment, lambda: 'ready' in str(shown[-1:]), shown.append
+    )
+    group.start('controller')
+    with pytest.raises(process_group.StopRequestedError):
+        group.wait_for('controller', 'tracking')
+    group.kill('controller')
+    assert re.fullmatch(r'controller, \d+ s: (importing|controller ready)', shown[0])
+    assert re.fullmatch(r'controller, \d+ s: controller ready', shown[-1])
+
+
+def test_the_demo_names_what_it_waits_for(tmp_path):
+    demo = start_demo(tmp_path, stand_ins(tmp_path), '--duration', '1')
+    _, errors = demo.communicate(timeout=TIMEOUT)
+    lines = [line.strip() for line in errors.splitlines()]
+    expected = [f'starting {name}' for name in NODES] + ['waiting for discovery']
+    assert [line for line in lines if line in expected] == expected
+    assert any(re.search(r'running: ', line) for line in lines)
 
 
 def test_the_link_latest_leads_to_the_last_run(tmp_path):

@@ -236,7 +236,9 @@ def test_one_file_is_a_bag_too(rows, tmp_path, capsys):
     folder = write(tmp_path / 'bag', rows[:300])
     (file,) = folder.glob('*.mcap')
     assert bag_main(['report', str(file), '--output', str(tmp_path / 'out')]) == 0
-    assert 'out/report.html' in capsys.readouterr().out
+    printed = capsys.readouterr()
+    assert 'out/report.html' in printed.out
+    assert 'drawing its figures' in printed.err, 'the wait of some seconds is named'
 
 
 def test_dead_time_lag_and_gain_of_the_robot_are_found(rows, tmp_path):

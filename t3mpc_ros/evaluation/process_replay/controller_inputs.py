@@ -24,8 +24,10 @@ from t3mpc_ros.control.controller import ControllerParameters
 from t3mpc_ros.evaluation.bag_report.topic_roles import (
     COMMAND,
     INITIAL_INPUTS,
+    KINDS,
     ODOMETRY,
     REFERENCE,
+    TRUTH,
     WHEELS,
     find_topics,
 )
@@ -157,6 +159,10 @@ def load_inputs(
         for name, full in (wanted | known).items()
         if name in wanted and held.counts.get(full)
     }
+    for name in (ODOMETRY, COMMAND):
+        if name not in topics and (full := _renamed_topic(held, name, [*topics.values()])):
+            topics[name] = full
+            notes.append(f'{name} is taken from {full}')
     if missing := [name for name in (REFERENCE, ODOMETRY, COMMAND) if name not in topics]:
         raise ReplayError(f'{bag}: these topics are not in the bag: {", ".join(missing)}')
     revisions = _revisions(held, f'{prefix}/{CONTROLLER}/parameters')
@@ -188,6 +194,24 @@ def load_inputs(
         start_ns=held.start_ns,
         notes=tuple(notes),
     )
+
+
+def _renamed_topic(held: BagIndex, name: str, used: Sequence[str]) -> str:
+    """Return the only topic that can be the odometry or command of a robot with other names.
+
+    Empty if there is none, or several. Topics of another controller's namespace do not count.
+    """
+    others = [
+        full
+        for full, type_name in held.types.items()
+        if type_name in KINDS[name]
+        and held.counts.get(full)
+        and full not in used
+        and f'/{INITIAL_INPUTS}' not in full
+        and not full.endswith((f'/{REFERENCE}', f'/{TRUTH}'))
+        and f'{full.removesuffix(f"/{name}")}/{CONTROLLER}/journal' not in held.types
+    ]
+    return others[0] if len(others) == 1 else ''
 
 
 def motions(column: TopicColumns) -> StateArray:
