@@ -316,7 +316,7 @@ def test_each_yaml_reaches_its_node_with_and_without_a_namespace(name, copied, r
 
 def test_every_yaml_is_tested():
     # The files of other robots: test_launch_files.py
-    tested = set(CHANGED) | {'generic', 'turtlebot3'}
+    tested = set(CHANGED) | {'generic', 'paper_robot', 'turtlebot3'}
     assert {path.stem for path in (ROOT / 'config').glob('*.yaml')} == tested
 
 
