@@ -11,8 +11,9 @@ from t3mpc_ros.cli.private_graph import PrivateGraph
 from t3mpc_ros.cli.process_group import ProcessGroup
 
 ROOT = Path(__file__).resolve().parent
-DEFAULT = ('geometry', 'parameters', 'robot', 'fuzzy')
-"""What ``colcon test``, and pytest without arguments, runs in less than two minutes."""
+DEFAULT = ('geometry', 'parameters', 'robot', 'fuzzy', 'test_launch_files.py')
+"""What ``colcon test``, and pytest without arguments, runs in less than two minutes; kernels that
+have to be compiled first take another one."""
 
 
 def pytest_collection_modifyitems(config, items):

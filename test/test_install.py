@@ -248,6 +248,7 @@ def test_the_default_set_is_a_part_that_needs_no_selection(copied):
 
     default = collected()
     assert 'test/robot/test_command_limiter.py' in default
+    assert 'test/nodes/test_launch_files.py' in default
     assert 'test/test_readme.py' not in default
     assert 'test/test_readme.py' in collected('test/test_readme.py')
 
