@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""``t3mpc tune``: tunes the compared methods."""
+"""``t3mpc tune``: tunes the compared methods, or identifies the drive of a robot from a bag."""
 
 import argparse
 from collections.abc import Callable, Sequence
@@ -16,8 +16,11 @@ if TYPE_CHECKING:
     from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition
 
 
-DRIVES = ('torque', 'velocity')
+DRIVES = {'torque': 'torque', 'servo': 'velocity'}
+"""Drives of the paper's plant by robot."""
+TWIN = 'twin'
 EVALUATIONS = 120
+TWIN_EVALUATIONS = 30
 OUTPUT = Path('runs') / 'tuned.json'
 
 Table = Callable[[], 'Sequence[MethodDefinition]']
@@ -29,15 +32,24 @@ def add_parser(
 ) -> None:
     """Add the subcommand ``tune``."""
     parser = commands.add_parser(
-        'tune', help='tune the parameters of every method, with equally many evaluations'
+        'tune',
+        help='tune the parameters of every method with equally many evaluations, or those of the '
+        'controller to the robot in a bag',
+        description='With a simulated robot: tunes every method with equally many evaluations. '
+        'With a bag of any robot with cmd_vel and odom: identifies lag, dead time and noise of '
+        'the drive, and prints a parameter file of the controller with the gain that fits.',
     )
     parser.add_argument('methods', nargs='*', metavar='METHOD', help='by name (default all)')
-    parser.add_argument('--drive', choices=DRIVES, help='(default both)')
+    parser.add_argument(
+        '--robot',
+        metavar='twin|servo|torque|BAG',
+        help="twin: the stepper robot; servo, torque: the paper's plant with that drive; or the "
+        'folder or file of a bag (default servo and torque)',
+    )
     parser.add_argument(
         '--evaluations',
         type=bounded_int(1, 100_000),
-        default=EVALUATIONS,
-        help=f'of each method in each drive (default {EVALUATIONS})',
+        help=f'of each method with each robot (default {EVALUATIONS}; twin {TWIN_EVALUATIONS})',
     )
     parser.add_argument(
         '--workers',
@@ -46,38 +58,104 @@ def add_parser(
         help='processes (default all cores)',
     )
     parser.add_argument(
-        '--output', type=Path, default=OUTPUT, help=f'file to write (default {OUTPUT})'
+        '--output',
+        type=Path,
+        help=f'file to write (default {OUTPUT}; with a bag none but the standard output)',
     )
     parser.add_argument(
         '--resume', action='store_true', help='go on where the last tuning was interrupted'
+    )
+    bag = parser.add_argument_group('with a bag')
+    bag.add_argument('--namespace', help='whose topics (default: those of most known topics)')
+    bag.add_argument('--odom', default='', metavar='TOPIC', help='odometry')
+    bag.add_argument('--cmd-vel', default='', metavar='TOPIC', help='commands')
+    bag.add_argument('--wheel-radius', type=float, metavar='M', help='in m (default: as recorded)')
+    bag.add_argument(
+        '--track', type=float, metavar='M', help='distance between the wheels in m, likewise'
     )
     parser.set_defaults(run=run, table=table)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Tune every method, print the improvement and return 0.
+    """Tune every method, or identify the drive in a bag; print the result and return 0.
 
     Raises
     ------
     ValueError
-        An unknown method.
+        An unknown method or robot, or options that contradict.
+    IdentificationError
+        The bag does not determine the drive.
+    ReportError
+        The bag holds no topic of a robot, or a given topic cannot be used.
+    BagError
+        The bag cannot be read.
     """
     from t3mpc_ros.evaluation.tuning.search_space import find_names
-    from t3mpc_ros.evaluation.tuning.tune_methods import tune_methods
 
+    if options.robot not in (None, TWIN, *DRIVES):
+        return _identify(options)
     known = options.table()
     names = find_names('method', options.methods, [method.name for method in known])
-    drives = (options.drive,) if options.drive else DRIVES
     methods = [method for method in known if method.name in names or not names]
-    store = tune_methods(
-        methods,
-        [drive for drive in drives if options.drive or any(drive in m.start for m in methods)],
-        options.evaluations,
-        options.workers,
-        options.output,
-        lambda line: print(line, file=sys.stderr, flush=True),
-        clock=time.monotonic,
-        resume=options.resume,
-    )
+    output = options.output or OUTPUT
+    if options.robot == TWIN:
+        from t3mpc_ros.evaluation.method_comparison.twin_tuning import tune_twin, twin_definitions
+
+        store = tune_twin(
+            twin_definitions(methods),
+            options.evaluations or TWIN_EVALUATIONS,
+            options.workers,
+            output,
+            _print_progress,
+            clock=time.monotonic,
+            resume=options.resume,
+        )
+    else:
+        from t3mpc_ros.evaluation.tuning.tune_methods import tune_methods
+
+        drives = [DRIVES[options.robot]] if options.robot else list(DRIVES.values())
+        store = tune_methods(
+            methods,
+            [drive for drive in drives if options.robot or any(drive in m.start for m in methods)],
+            options.evaluations or EVALUATIONS,
+            options.workers,
+            output,
+            _print_progress,
+            clock=time.monotonic,
+            resume=options.resume,
+        )
     print(store.table())
     return 0
+
+
+def _identify(options: argparse.Namespace) -> int:
+    """Print the parameter file for the robot in the bag ``options.robot`` and return 0."""
+    from t3mpc_ros.evaluation.bag_report.topic_roles import ReportOptions, bag_display_name
+    from t3mpc_ros.evaluation.tuning.drive_identification import identify_bag, parameter_file
+
+    bag = Path(options.robot)
+    if not bag.exists():
+        raise ValueError(
+            f'robot must be {TWIN}, {", ".join(sorted(DRIVES))} or an existing bag: got {bag}'
+        )
+    if options.methods or options.evaluations or options.resume:
+        raise ValueError('methods, --evaluations and --resume are for simulated robots: got a bag')
+    if (options.wheel_radius is None) != (options.track is None):
+        raise ValueError('--wheel-radius and --track must be given together')
+    wanted = ReportOptions(
+        namespace=options.namespace,
+        odom=options.odom,
+        cmd_vel=options.cmd_vel,
+        wheel_radius=options.wheel_radius,
+        track=options.track,
+    )
+    text = parameter_file(*identify_bag(bag, wanted), bag_display_name(bag))
+    print(text)
+    if options.output:
+        options.output.parent.mkdir(parents=True, exist_ok=True)
+        options.output.write_text(text + '\n', encoding='utf-8')
+    return 0
+
+
+def _print_progress(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)

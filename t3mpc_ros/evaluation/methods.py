@@ -43,6 +43,8 @@ from t3mpc_ros.evaluation.tuning.tuned_parameters import PACKAGED_FILE, TunedPar
 from t3mpc_ros.parameters.table import Parameters
 
 FULL = 'full'
+EXACT_MODEL = ', exact model'
+"""Suffix of the name of a method whose model has no error."""
 MODEL_ERROR = 1.3
 """Ratio of model inertia to true inertia of the predictive baselines with preview."""
 
@@ -244,7 +246,7 @@ def methods(drive: str, store: TunedParameters | None = None) -> dict[str, Compa
         )
     for name in ('linear MPC preview', 'CasADi NMPC'):
         if name in found:
-            wrong, exact = found[name], f'{name}, exact model'
+            wrong, exact = found[name], f'{name}{EXACT_MODEL}'
             parameters = wrong.parameters.with_values({'model_error': 1.0})
             found[exact] = ComparedMethod(
                 exact, wrong.controller_type, parameters, True, True, True

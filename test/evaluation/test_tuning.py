@@ -502,7 +502,7 @@ def test_a_thousand_of_chatter_costs_a_hundredth():
 def test_tuning_mixes_noises_and_excludes_held_out_seeds():
     training = TuningScenarios()
     assert not set(training.seeds) & set(HELD_OUT_SEEDS)
-    counts = [[noise for _, noise in training.runs()].count(x) for x in (0.0, 0.04, 0.1)]
+    counts = [[noise for _, noise, _ in training.runs()].count(x) for x in (0.0, 0.04, 0.1)]
     assert len(set(counts)) == 1
     assert sum(counts) == len(TUNING_SEEDS)
     for scenario in training.scenarios('torque'):
@@ -513,6 +513,11 @@ def test_tuning_mixes_noises_and_excludes_held_out_seeds():
         TuningScenarios(seeds=(1, 1), noise_levels=(0.0,))
     with pytest.raises(ValueError, match='a seed for each'):
         TuningScenarios(seeds=(1, 2))
+    with pytest.raises(ValueError, match='2 cases and 1 seeds'):
+        TuningScenarios(seeds=(1,), noise_levels=(0.0,), cases=('nominal', 'mass +30 %'))
+    mixed = TuningScenarios((1, 2, 3), (0.04,), 3.0, ('nominal', 'mass +30 %'))
+    cases = [scenario.case for scenario in mixed.scenarios('velocity')]
+    assert cases == ['nominal', 'mass +30 %', 'nominal']
 
 
 def test_mean_objective_is_independent_of_run_order():
@@ -882,6 +887,7 @@ def _one(content):
         (lambda c: _one(c)['budget'].update(training_seeds=[1.5]), ['training_seeds', '1.5']),
         (lambda c: _one(c)['budget'].update(noise_levels=[]), ['noise_levels', 'not empty']),
         (lambda c: _one(c)['budget'].pop('duration'), ['budget', 'lacks duration']),
+        (lambda c: _one(c)['budget'].update(cases=[3]), ['budget: cases', 'text', '3']),
         (lambda c: c.update(format=2), ['format must be 1', '2']),
         (lambda c: c.pop('methods'), ['lacks methods']),
         (lambda c: c.update(methods=[]), ['methods must be an object']),
@@ -919,6 +925,8 @@ def test_unequal_budgets_are_distinguished():
         StoreError, match='two, torque was tuned with 90 eval.*one, torque with 80'
     ):
         store.check_equal()
+    elsewhere = TunedParameters({('one', 'torque'): ENTRY, ('two', 'twin'): other})
+    elsewhere.check_equal()  # compared with nothing but methods on the twin
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
@@ -960,7 +968,7 @@ def test_the_command_tunes_what_was_named(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(tune_module, 'ClosedLoopObjective', instead)
     path = tmp_path / 'tuned.json'
     line = ['tune', 'P-feedback', '--evaluations', '12', '--workers', '3', '--output', str(path)]
-    options = parser().parse_args([*line, '--drive', 'velocity'])
+    options = parser().parse_args([*line, '--robot', 'servo'])
     assert options.run(options) == 0
     store = TunedParameters.load(path)
     assert list(store) == [('P feedback', 'velocity')]
@@ -1019,7 +1027,7 @@ def test_the_tables_of_the_pages_have_the_names_of_the_methods():
 
 
 @pytest.mark.parametrize(
-    'line', [['--evaluations', '0'], ['--workers', '-1'], ['--drive', 'wheels']]
+    'line', [['--evaluations', '0'], ['--workers', '-1'], ['--evaluations', 'many']]
 )
 def test_wrong_command_lines_are_refused(line, capsys):
     with pytest.raises(SystemExit):

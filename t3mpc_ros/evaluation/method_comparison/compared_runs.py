@@ -31,7 +31,14 @@ from t3mpc_ros.evaluation.method_comparison.twin_scenario import (
     TwinScenario,
     check_name,
 )
-from t3mpc_ros.evaluation.methods import FULL, STAGES, WITHOUT, ComparedMethod, methods
+from t3mpc_ros.evaluation.methods import (
+    EXACT_MODEL,
+    FULL,
+    STAGES,
+    WITHOUT,
+    ComparedMethod,
+    methods,
+)
 from t3mpc_ros.evaluation.paper.experiment_runs import SETTLING as PAPER_SETTLING
 from t3mpc_ros.evaluation.reporting import Progress
 from t3mpc_ros.evaluation.scenario import (
@@ -43,6 +50,7 @@ from t3mpc_ros.evaluation.scenario import (
     settled_rows,
     switch_times,
 )
+from t3mpc_ros.evaluation.tuning.tuned_parameters import TunedParameters
 from t3mpc_ros.evaluation.twin_closed_loop import (
     INITIAL_STANDSTILL,
     LoopController,
@@ -51,11 +59,14 @@ from t3mpc_ros.evaluation.twin_closed_loop import (
 )
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
 from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.parameters.table import Parameters
 
 Array = NDArray[np.float64]
 
 DRIVES: Mapping[str, str] = {'twin': 'velocity', 'servo': 'velocity', 'torque': 'torque'}
-"""Robots, and the drive for which the stored parameters of the methods were tuned."""
+"""Robots, and the drive of each."""
+TUNED_FOR: Mapping[str, str] = {**DRIVES, 'twin': 'twin'}
+"""Robots, and the drive under which the parameters tuned for them are stored."""
 FEED_FORWARD = 'feed-forward'
 """The method with which every other is compared."""
 QUICK_SEEDS = tuple(range(201, 207))
@@ -167,23 +178,35 @@ def _twin_methods(
 ) -> Mapping[str, AnyMethod]:
     """Return the methods on the twin.
 
-    Baselines have the parameters tuned for the velocity drive. Their feedback gain ``gain`` is
-    the one at which the measured speed cancels in the command, (1 - exp(-T/lag))/T.
+    Baselines have the parameters tuned for the twin; those of a baseline that was not are its
+    :func:`twin_start`.
     """
-    model = TwinScenario('nominal', 0).nominal_model()
-    cancelling = model.share / model.period
+    tuned = TunedParameters.load()
     found: dict[str, AnyMethod] = {
         FULL: TwinMethod(FULL, {}),
         FEED_FORWARD: TwinMethod(FEED_FORWARD, baseline=forward),
     }
     for name, method in table.items():
         if method.baseline:
-            parameters = method.parameters
-            if 'gain' in parameters.to_dict():
-                parameters = parameters.with_values({'gain': cancelling})
+            parameters = twin_start(method.parameters)
+            tuned_name = name.removesuffix(EXACT_MODEL)
+            if (tuned_name, TUNED_FOR['twin']) in tuned:
+                parameters = tuned.applied(tuned_name, TUNED_FOR['twin'], parameters)
             spec = MethodSpec(name, method.controller_type, parameters)
             found[name] = TwinMethod(name, baseline=spec)
     return found | {name: TwinMethod(name, changes) for name, changes in TWIN_PARTS.items()}
+
+
+def twin_start(parameters: Parameters) -> Parameters:
+    """Return the parameters of a baseline before tuning on the twin.
+
+    They are those tuned for the velocity drive, with the feedback gain ``gain`` at which the
+    measured speed cancels in the command, (1 - exp(-T/lag))/T.
+    """
+    if 'gain' not in parameters.to_dict():
+        return parameters
+    model = TwinScenario('nominal', 0).nominal_model()
+    return parameters.with_values({'gain': model.share / model.period})
 
 
 def default_methods(robot: str) -> tuple[str, ...]:

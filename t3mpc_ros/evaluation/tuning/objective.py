@@ -55,11 +55,14 @@ class TuningScenarios:
         Run i has level i, counted round; there are seeds enough for each.
     duration
         s
+    cases
+        Run i has case i, counted round.
     """
 
     seeds: tuple[int, ...] = TUNING_SEEDS
     noise_levels: tuple[float, ...] = NOISE_LEVELS
     duration: float = DURATION
+    cases: tuple[str, ...] = ('nominal',)
 
     def __post_init__(self) -> None:
         if len(set(self.seeds)) != len(self.seeds):
@@ -69,18 +72,27 @@ class TuningScenarios:
                 f'there must be noise levels, and a seed for each: got {len(self.noise_levels)} '
                 f'levels and {len(self.seeds)} seeds'
             )
+        if not 1 <= len(self.cases) <= len(self.seeds):
+            raise ValueError(
+                f'there must be cases, and a seed for each: got {len(self.cases)} cases and '
+                f'{len(self.seeds)} seeds'
+            )
 
-    def runs(self) -> tuple[tuple[int, float], ...]:
-        """Return (seed, noise variance) of each run."""
+    def runs(self) -> tuple[tuple[int, float, str], ...]:
+        """Return (seed, noise variance, case) of each run."""
         return tuple(
-            (seed, self.noise_levels[i % len(self.noise_levels)])
+            (
+                seed,
+                self.noise_levels[i % len(self.noise_levels)],
+                self.cases[i % len(self.cases)],
+            )
             for i, seed in enumerate(self.seeds)
         )
 
     def scenarios(self, drive: str) -> tuple[Scenario, ...]:
-        """Return the runs with the nominal robot in a drive."""
+        """Return the runs on the paper's plant with a drive."""
         return tuple(
-            Scenario(drive, noise, 'nominal', seed, self.duration) for seed, noise in self.runs()
+            Scenario(drive, noise, case, seed, self.duration) for seed, noise, case in self.runs()
         )
 
 
@@ -102,13 +114,13 @@ class ClosedLoopObjective:
     def __init__(
         self, training: TuningScenarios, workers: int, report: Callable[[str], None] | None = None
     ) -> None:
-        self._training = training
-        self._workers = WorkerPool(workers)
+        self.training = training
+        self.workers = WorkerPool(workers)
         self._report = report
         self._ran: set[tuple[str, str]] = set()
 
     def __enter__(self) -> Self:
-        self._workers.__enter__()
+        self.workers.__enter__()
         return self
 
     def __exit__(
@@ -117,7 +129,7 @@ class ClosedLoopObjective:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._workers.__exit__(kind, error, trace)
+        self.workers.__exit__(kind, error, trace)
 
     def __call__(
         self, method: MethodDefinition, drive: str, candidates: Sequence[Parameters]
@@ -131,7 +143,7 @@ class ClosedLoopObjective:
             then, not the parameters. Or a process was lost.
         """
         try:
-            objectives: list[float | None] = [*self._objectives(method, drive, candidates)]
+            objectives: list[float | None] = [*self.objectives(method, drive, candidates)]
         except JobError as error:
             if isinstance(error.__cause__, BrokenExecutor):
                 raise
@@ -144,7 +156,7 @@ class ClosedLoopObjective:
     def _alone(self, method: MethodDefinition, drive: str, candidate: Parameters) -> float | None:
         """Return the objective of one candidate, None when a run raised an exception."""
         try:
-            return self._objectives(method, drive, [candidate])[0]
+            return self.objectives(method, drive, [candidate])[0]
         except JobError as error:
             if isinstance(error.__cause__, BrokenExecutor):
                 raise
@@ -152,16 +164,23 @@ class ClosedLoopObjective:
                 self._report(f'  counted as worst: {error}')
             return None
 
-    def _objectives(
+    def objectives(
         self, method: MethodDefinition, drive: str, candidates: Sequence[Parameters]
     ) -> list[float]:
-        scenarios = self._training.scenarios(drive)
+        """Return the mean objective of each candidate, infinite where a run broke off.
+
+        Raises
+        ------
+        JobError
+            A run raised an exception.
+        """
+        scenarios = self.training.scenarios(drive)
         jobs: list[Job] = [
             (scenario, MethodSpec(method.name, method.controller_type, candidate, pretrained=True))
             for candidate in candidates
             for scenario in scenarios
         ]
-        return mean_objectives(len(candidates), len(scenarios), self._workers.run(jobs, objective))
+        return mean_objectives(len(candidates), len(scenarios), self.workers.run(jobs, objective))
 
 
 def mean_objectives(

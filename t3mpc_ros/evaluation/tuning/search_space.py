@@ -217,10 +217,12 @@ class MethodDefinition:
     controller_type
         The controller.
     start
-        For each drive the method is meant for, the parameters its maker would choose: tuning
-        begins there, and never ends worse.
+        For each drive, or the twin, the method is meant for, the parameters its maker would
+        choose: tuning begins there, and never ends worse.
     ranges
         What is tuned, in either drive. All else stays as in ``start``.
+    table
+        The table of the parameters; by default that of the controller.
 
     Raises
     ------
@@ -232,6 +234,7 @@ class MethodDefinition:
     controller_type: type[BaselineController]
     start: Mapping[str, Parameters]
     ranges: tuple[SearchRange, ...]
+    table: type[Parameters] | None = None
 
     def __post_init__(self) -> None:
         if not short_name(self.name):
@@ -253,7 +256,7 @@ class MethodDefinition:
     @property
     def space(self) -> SearchSpace:
         """What is searched."""
-        return SearchSpace(self.controller_type.parameters_type, self.ranges)
+        return SearchSpace(self.table or self.controller_type.parameters_type, self.ranges)
 
     @property
     def short(self) -> str:

@@ -50,9 +50,8 @@ def tune_methods(
     methods
         Of different names.
     drives
-        Among ``'torque'`` and ``'velocity'``; a method without start parameters for one
-        is left out
-        there.
+        Keys of the start parameters: ``'torque'``, ``'velocity'``, or ``'twin'`` with its own
+        ``evaluate``; a method without start parameters for one is left out there.
     evaluations
         Of each search.
     workers
@@ -77,7 +76,7 @@ def tune_methods(
     ------
     ValueError
         Methods of the same name; a drive no method is meant for; or a file that holds other
-        methods tuned with another budget, so that nothing in it could be compared.
+        methods tuned in the same drive with another budget, which could not be compared.
     RuntimeError
         For some method no parameters gave a finite objective; all others are kept.
     """
@@ -93,9 +92,10 @@ def tune_methods(
         training.noise_levels,
         training.duration,
         SMOOTHNESS,
+        training.cases,
     )
     pairs = [(each, drive) for each in methods for drive in drives if drive in each.start]
-    store = _load_existing(path, {(method.name, drive) for method, drive in pairs}, budget)
+    store = _load_existing(path, [(method.name, drive) for method, drive in pairs], budget)
     failed = []
     with ExitStack() as stack:
         if evaluate is None:
@@ -162,13 +162,16 @@ class _Progress:
 
 
 def _load_existing(
-    path: Path, replaced: set[tuple[str, str]], budget: TuningBudget
+    path: Path, replaced: Sequence[tuple[str, str]], budget: TuningBudget
 ) -> TunedParameters:
     """Return what the file holds besides what is tuned now, if the two can be compared."""
     if not path.exists():
         return TunedParameters()
     store = TunedParameters.load(path)
+    drives = {drive for _, drive in replaced}
     for method, drive in store:
+        if drive not in drives:
+            continue
         other = store.entry(method, drive).budget
         if (method, drive) not in replaced and other != budget:
             raise StoreError(
@@ -209,6 +212,7 @@ def _about(method: MethodDefinition, drive: str, budget: TuningBudget) -> dict[s
         'noise_levels': budget.noise_levels,
         'duration': budget.duration,
         'smoothness': budget.smoothness,
+        'cases': budget.cases,
         'version': t3mpc_ros.__version__,
     }
 

@@ -44,20 +44,22 @@ class TuningBudget:
     """Of each run, s."""
     smoothness: float
     """rho of the objective, s²."""
+    cases: tuple[str, ...] = ('nominal',)
+    """Run i has case i, counted round."""
 
     def __str__(self) -> str:
         seeds = ', '.join(map(str, self.training_seeds))
         levels = ', '.join(f'{level:g}' for level in self.noise_levels)
         return (
             f'{self.evaluations} evaluations (search seed {self.search_seed}) of '
-            f'{self.duration:g} s on seeds {seeds} at noise {levels}, '
+            f'{self.duration:g} s on seeds {seeds} at noise {levels}, {", ".join(self.cases)}, '
             f'rho = {self.smoothness:g} s²'
         )
 
 
 @dataclass(frozen=True, slots=True)
 class TunedEntry:
-    """What was found for one method in one drive."""
+    """What was found for one method in one drive, or on the twin."""
 
     values: Mapping[str, object]
     """Every parameter of the method by its dotted name."""
@@ -73,7 +75,7 @@ class TunedEntry:
 
 
 class TunedParameters:
-    """Tuned parameters by method and drive.
+    """Tuned parameters by method and drive; those for the digital twin have drive ``twin``.
 
     Parameters
     ----------
@@ -208,14 +210,15 @@ class TunedParameters:
             self.parameters(method, drive, types[method])
 
     def check_equal(self) -> None:
-        """Raise :class:`StoreError` unless all that is stored was given the same budget."""
-        keys = list(self)
-        for key in keys[1:]:
-            ours, others = self._entries[key].budget, self._entries[keys[0]].budget
+        """Raise :class:`StoreError` unless all entries of a drive were given the same budget."""
+        first: dict[str, tuple[str, str]] = {}
+        for key in self:
+            other = first.setdefault(key[1], key)
+            ours, others = self._entries[key].budget, self._entries[other].budget
             if ours != others:
                 raise StoreError(
                     f'{key[0]}, {key[1]} was tuned with {ours}; '
-                    f'{keys[0][0]}, {keys[0][1]} with {others}'
+                    f'{other[0]}, {other[1]} with {others}'
                 )
 
     def table(self) -> str:
@@ -294,6 +297,9 @@ def _budget(content: object, where: str) -> TuningBudget:
         noise_levels=tuple(_number(level, f'{where}: noise_levels') for level in levels),
         duration=_number(read['duration'], f'{where}: duration'),
         smoothness=_number(read['smoothness'], f'{where}: smoothness'),
+        cases=tuple(
+            _text(case, f'{where}: cases') for case in _list(read['cases'], f'{where}: cases')
+        ),
     )
 
 

@@ -1,0 +1,207 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Tuning of the methods on the digital twin, in the closed loop of its comparison.
+
+Half of the runs of an evaluation are on the default twin, half on the miscalibrated one, on which
+the baselines have the gyro.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from t3mpc_ros.control.controller import ControllerParameters, StepperControllerParameters
+from t3mpc_ros.evaluation.closed_loop import MethodSpec
+from t3mpc_ros.evaluation.confidence_intervals import Difference, paired
+from t3mpc_ros.evaluation.method_comparison.compared_runs import (
+    START,
+    TUNED_FOR,
+    VARIATION,
+    TwinMethod,
+    twin_numbers,
+    twin_run,
+    twin_start,
+)
+from t3mpc_ros.evaluation.method_comparison.twin_scenario import TwinScenario
+from t3mpc_ros.evaluation.methods import FULL, methods
+from t3mpc_ros.evaluation.proposed_method import ProposedController
+from t3mpc_ros.evaluation.scenario import TUNING_SEEDS
+from t3mpc_ros.evaluation.tuning.objective import (
+    SMOOTHNESS,
+    ClosedLoopObjective,
+    TuningScenarios,
+    mean_objectives,
+)
+from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition, SearchRange
+from t3mpc_ros.evaluation.tuning.tune_methods import tune_methods
+from t3mpc_ros.evaluation.tuning.tuned_parameters import TunedEntry, TunedParameters
+from t3mpc_ros.evaluation.twin_closed_loop import INITIAL_STANDSTILL
+from t3mpc_ros.parameters.table import Parameters
+
+TWIN = TUNED_FOR['twin']
+CASES = ('nominal', 'miscalibrated')
+TRAINING = TuningScenarios(TUNING_SEEDS[:2], (0.04,), 26.0, CASES)
+"""Runs of one evaluation."""
+VALIDATION_SEEDS = TUNING_SEEDS[2:]
+"""Seeds on which the tuned parameters of the full controller are compared with its defaults."""
+FULL_RANGES = (
+    SearchRange('body.learning_rate', 0.3, 20.0),
+    SearchRange('body.skill_time', 1.0, 60.0),
+    SearchRange('body.dead_zone', 0.003, 0.1),
+    SearchRange('body.yaw_gain', 0.1, 10.0),
+)
+"""What is free in the full controller after the rule for the gains."""
+GAIN_RANGE = SearchRange('gain', 5.0, 100.0)
+"""Range of the feedback gain of a baseline; it includes that of :func:`twin_start`."""
+
+
+def twin_definitions(known: Iterable[MethodDefinition]) -> list[MethodDefinition]:
+    """Return the methods as they are tuned on the twin.
+
+    Baselines start from the parameters for the velocity drive, see :func:`twin_start`; the full
+    controller from the defaults of the node.
+    """
+    tuned = methods('velocity')
+    found = []
+    for each in known:
+        if each.name == FULL:
+            start: Parameters = StepperControllerParameters()
+            found.append(
+                MethodDefinition(
+                    FULL, ProposedController, {TWIN: start}, FULL_RANGES, ControllerParameters
+                )
+            )
+            continue
+        ranges = tuple(GAIN_RANGE if one.name == 'gain' else one for one in each.ranges)
+        start = twin_start(tuned[each.name].parameters)
+        found.append(replace(each, start={TWIN: start}, ranges=ranges))
+    return found
+
+
+class TwinObjective(ClosedLoopObjective):
+    """Mean objective of parameters on the twin."""
+
+    def objectives(
+        self, method: MethodDefinition, drive: str, candidates: Sequence[Parameters]
+    ) -> list[float]:
+        """Return the mean objective of each candidate, infinite where a run broke off.
+
+        Raises
+        ------
+        JobError
+            A run raised an exception.
+        """
+        training = self.training
+        scenarios = [
+            TwinScenario(case, seed, training.duration, noise)
+            for seed, noise, case in training.runs()
+        ]
+        jobs = [
+            (scenario, twin_method(method, candidate))
+            for candidate in candidates
+            for scenario in scenarios
+        ]
+        found = self.workers.map(twin_objective, jobs)
+        return mean_objectives(len(candidates), len(scenarios), found)
+
+
+def twin_method(method: MethodDefinition, parameters: Parameters) -> TwinMethod:
+    """Return a method with parameters, for the closed loop with the twin."""
+    if method.name == FULL:
+        values = parameters.to_dict()
+        return TwinMethod(FULL, {name: values[name] for name in method.space.names})
+    spec = MethodSpec(method.name, method.controller_type, parameters)
+    return TwinMethod(method.name, baseline=spec)
+
+
+def twin_objective(job: tuple[TwinScenario, Any]) -> float:
+    """Return RMSE + rho times the variation of a run, rad/s; infinite if it is not finite.
+
+    On the default twin the error is that of the rotors. Where the baselines have the gyro it is
+    that of wheels rolling without slip under the true motion of the body: a method that corrects
+    the body must not lose by it.
+    """
+    scenario, method = job
+    record = twin_run(scenario, method)
+    counted = record.time >= INITIAL_STANDSTILL + START
+    speeds = record.ground if scenario.uses_gyro else record.rotors
+    rmse = float(np.sqrt(np.mean((speeds - record.reference)[counted] ** 2)))
+    value = rmse + SMOOTHNESS * twin_numbers(scenario, record)[VARIATION.name]
+    return value if math.isfinite(value) else math.inf
+
+
+def validate(
+    method: MethodDefinition, tuned: TunedEntry, objective: ClosedLoopObjective
+) -> Difference:
+    """Return the paired difference (rad/s) of the objective, tuned parameters less start.
+
+    Each of :data:`VALIDATION_SEEDS` is driven in every case.
+    """
+    start = method.start[TWIN]
+    found = start.with_values({name: tuned.values[name] for name in tuned.tuned})
+    jobs = [
+        (TwinScenario(case, seed, TRAINING.duration), twin_method(method, parameters))
+        for seed in VALIDATION_SEEDS
+        for case in CASES
+        for parameters in (found, start)
+    ]
+    values = np.array([value for _, value in sorted(objective.workers.map(twin_objective, jobs))])
+    with_tuned, with_start = values.reshape(-1, len(CASES), 2).mean(axis=1).T.tolist()
+    return paired(with_tuned, with_start)
+
+
+def kept_start(method: MethodDefinition, tuned: TunedEntry) -> TunedEntry:
+    """Return the entry with the start parameters in place of the tuned ones."""
+    if tuned.start_objective is None:
+        raise ValueError(f'{method.name}: the start parameters must have an objective')
+    values = method.start[TWIN].to_dict()
+    return replace(tuned, values=values, objective=tuned.start_objective)
+
+
+def tune_twin(
+    selected: Sequence[MethodDefinition],
+    evaluations: int,
+    workers: int,
+    path: Path,
+    report: Callable[[str], None],
+    *,
+    clock: Callable[[], float] | None = None,
+    resume: bool = False,
+) -> TunedParameters:
+    """Return the best parameters of each method on the twin; arguments as :func:`tune_methods`.
+
+    The full controller keeps its defaults unless the tuned parameters are better on seeds that
+    they were not tuned on, by more than the 95 % interval of the paired difference.
+    """
+    with TwinObjective(TRAINING, workers, report) as objective:
+        store = tune_methods(
+            selected,
+            [TWIN],
+            evaluations,
+            workers,
+            path,
+            report,
+            clock=clock,
+            resume=resume,
+            training=TRAINING,
+            evaluate=objective,
+        )
+        for method in selected:
+            if method.name != FULL:
+                continue
+            tuned = store.entry(FULL, TWIN)
+            difference = validate(method, tuned, objective)
+            better = difference.certain and difference.mean < 0.0
+            report(
+                f'  {FULL}, {TWIN}: on seeds {VALIDATION_SEEDS[0]} to {VALIDATION_SEEDS[-1]} the '
+                f'tuned parameters differ from the defaults by {difference.mean:+.5f} ± '
+                f'{difference.half:.5f} rad/s: {"they are stored" if better else "kept defaults"}'
+            )
+            if not better:
+                store.put(FULL, TWIN, kept_start(method, tuned))
+                store.save(path)
+    return store

@@ -1,0 +1,263 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Drives identified from bags: of known robots, and bags that do not determine them."""
+
+import argparse
+import math
+
+import numpy as np
+import pytest
+from support.training_runs import Tape, odometry_message, twist_message
+from support.velocity_robot import VelocityRobot
+import yaml
+
+from t3mpc_ros.cli import tune
+from t3mpc_ros.control.controller import StepperControllerParameters
+from t3mpc_ros.control.dead_time_estimator import IDENTIFIED_DEVIATION
+from t3mpc_ros.evaluation.bag_report.topic_roles import ReportOptions
+from t3mpc_ros.evaluation.tuning.drive_identification import (
+    MAX_RELATIVE_DEVIATION,
+    IdentificationError,
+    fitting_parameters,
+    identify_bag,
+    parameter_file,
+)
+from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
+from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, State, WheelSpeeds
+from t3mpc_ros.simulation.plant.paper_plant import PaperRobot, PaperRobotParameters
+
+START = 1_700_000_000_000_000_000
+GEOMETRY = WheelGeometry()
+RATE = 100.0
+METADATA = {
+    'sim_robot': {
+        'wheel_radius': str(GEOMETRY.wheel_radius),
+        'wheel_separation': str(GEOMETRY.wheel_separation),
+    }
+}
+
+
+def ramps(seed, count, rate=RATE, middle=3.0, span=2.5, slope=15.0):
+    """Return wheel speeds (rad/s) with ramps between random levels, shape (count, 2)."""
+    random = np.random.default_rng(seed)
+    speeds = np.empty((count, 2))
+    for wheel in range(2):
+        k, speed = 0, middle
+        while k < count:
+            goal = middle + random.uniform(-span, span)
+            while k < count and speed != goal:
+                speed += float(np.clip(goal - speed, -slope / rate, slope / rate))
+                speeds[k, wheel] = speed
+                k += 1
+            hold = round(random.uniform(0.05, 0.6) * rate)
+            speeds[k : k + hold, wheel] = speed
+            k += hold
+    return speeds
+
+
+def recorded(wheels, seed=1, metadata_records=METADATA, **parameters):
+    """Return the messages of the simulated robot that is sent wheel speeds (rad/s)."""
+    robot = PaperRobot(
+        PaperRobotParameters.from_dict(
+            {
+                'drive.kind': 'velocity',
+                'rate': RATE,
+                'seed': seed,
+                **{name.replace('__', '.'): value for name, value in parameters.items()},
+            }
+        )
+    )
+    tape = Tape(metadata_records)
+    state = robot.advance(START)
+    for speeds in wheels:
+        command = WheelSpeeds(*speeds.tolist())
+        tape.add('/odom', state.stamp_ns + 1000, odometry_message(state.odometry))
+        tape.add('/cmd_vel', state.stamp_ns, twist_message(twist_from_wheels(command, GEOMETRY)))
+        state = robot.step(command)
+    return tape
+
+
+def identified(tape, folder, **options):
+    return identify_bag(tape.write(folder), ReportOptions(**options))
+
+
+def assert_within(estimate, truth):
+    assert abs(estimate.value - truth) <= 3.0 * estimate.deviation, (estimate, truth)
+
+
+@pytest.mark.parametrize(
+    'lag, dead_time, noise, seed',
+    [
+        (0.02, 0.01, 0.04, 1),
+        (0.02, 0.03, 0.04, 2),
+        (0.05, 0.03, 0.0, 3),
+        (0.1, 0.05, 0.1, 4),
+        (0.2, 0.1, 0.04, 5),
+        (0.01, 0.0, 0.01, 6),
+        (0.03, 0.06, 0.01, 7),
+    ],
+)
+def test_a_known_drive_is_recovered(tmp_path, lag, dead_time, noise, seed):
+    tape = recorded(
+        ramps(seed, 4000), seed, drive__lag=lag, drive__dead_time=dead_time, noise__variance=noise
+    )
+    drive, composition = identified(tape, tmp_path / 'bag')
+    assert_within(drive.lag, lag)
+    assert_within(drive.dead_time, dead_time)
+    assert_within(drive.noise_variance, noise)
+    assert drive.dead_time.deviation <= IDENTIFIED_DEVIATION
+    assert drive.lag.deviation <= max(IDENTIFIED_DEVIATION, MAX_RELATIVE_DEVIATION * lag)
+    assert drive.rate == RATE
+    assert composition == 'paper'
+    assert drive.duration == pytest.approx(40.0, abs=0.1)
+
+
+def test_more_noise_gives_a_larger_deviation(tmp_path):
+    found = []
+    for noise in (0.002, 0.1):
+        tape = recorded(ramps(1, 4000), drive__lag=0.1, noise__variance=noise)
+        found.append(identified(tape, tmp_path / f'{noise}')[0])
+    assert found[1].lag.deviation > 1.1 * found[0].lag.deviation
+    assert found[1].noise_variance.value > 40.0 * found[0].noise_variance.value
+
+
+@pytest.mark.parametrize('lag, dead_time', [(0.1, 0.04), (0.2, 0.1)])
+def test_a_robot_of_another_make_is_identified(tmp_path, lag, dead_time):
+    """Odometry with 30 Hz of mean speeds, commands with 25 Hz in steps, without geometry."""
+    robot = VelocityRobot(lag=lag, dead_time=dead_time)
+    geometry = WheelGeometry(wheel_radius=0.033, wheel_separation=0.16)
+    wheels = ramps(3, 1500, 25.0, middle=2.5, span=2.0, slope=8.0)
+    tape = Tape({})
+    for k in range(60_000):
+        now = START + k * 1_000_000
+        if k % 40 == 0:
+            twist = twist_from_wheels(WheelSpeeds(*wheels[k // 40].tolist()), geometry)
+            robot.command(twist.linear, twist.angular)
+            tape.add('/cmd_vel', now, twist_message(twist))
+        robot.advance(0.001)
+        if k % 33 == 32:
+            _, linear, angular = robot.odometry()
+            state = State(now + 1_000_000, ORIGIN, BodyTwist(linear, angular))
+            tape.add('/odom', now + 1_500_000, odometry_message(state))
+    folder = tape.write(tmp_path / 'bag')
+    drive, _ = identify_bag(folder, ReportOptions(wheel_radius=0.033, track=0.16))
+    assert drive.mean_speeds
+    assert_within(drive.lag, lag)
+    assert_within(drive.dead_time, dead_time)
+    with pytest.raises(IdentificationError, match='give --wheel-radius and --track'):
+        identify_bag(folder, ReportOptions())
+
+
+def test_the_parameter_file_has_the_gain_by_the_rule(tmp_path):
+    tape = recorded(ramps(1, 4000), drive__lag=0.03, noise__variance=0.04)
+    drive, _ = identified(tape, tmp_path / 'bag')
+    for composition in ('paper', 'body'):
+        text = parameter_file(drive, composition, 'bag')
+        values = yaml.safe_load(text)['/**/controller']['ros__parameters']
+        parameters = StepperControllerParameters.from_dict(values)
+        fitting = fitting_parameters(drive, composition).to_dict()
+        assert {'rate', 'mean_speeds', 'law.gain', 'speed_filter.dead_time'} <= set(values)
+        for name, value in values.items():
+            rounded = value if isinstance(value, str) else pytest.approx(value, rel=1e-4)
+            assert fitting[name] == rounded, name
+        parameters = parameters.resolved()
+        total = (1.0 - math.exp(-0.01 / drive.lag.value)) * RATE
+        slope = 0.0
+        if parameters.law.compensator:
+            slope = parameters.compensated_bound / parameters.law.smoothing
+        assert parameters.law.gain + slope == pytest.approx(total, rel=1e-3)
+        assert parameters.law.compensator == (composition == 'paper')
+        assert f'{drive.lag.value:.5g}  # standard deviation {drive.lag.deviation:.2g} s' in text
+        assert text.count('standard deviation') == 5
+
+
+def test_the_recorded_composition_is_kept(tmp_path):
+    wheels = ramps(1, 2500)
+    records = METADATA | {'/robot/controller': {'composition': 'body'}}
+    tape = recorded(wheels, metadata_records=records, drive__lag=0.02)
+    assert identified(tape, tmp_path / 'bag')[1] == 'body'
+
+
+# Bags that do not determine the drive
+
+
+@pytest.fixture(scope='module')
+def driven():
+    return recorded(ramps(1, 3000), drive__lag=0.02, noise__variance=0.04)
+
+
+def test_a_bag_at_rest_is_refused(tmp_path):
+    tape = recorded(np.zeros((2000, 2)), noise__variance=0.04)
+    with pytest.raises(IdentificationError, match=r'vary by at least 0\.1 rad/s .*: got 0 rad/s$'):
+        identified(tape, tmp_path / 'bag')
+
+
+def test_a_robot_that_does_not_follow_is_refused(tmp_path):
+    commanded = recorded(ramps(1, 2000))
+    still = recorded(np.zeros((2000, 2)), noise__variance=0.04)
+    rows = [row for row in commanded.rows if row[1] == '/cmd_vel']
+    rows += [row for row in still.rows if row[1] == '/odom']
+    with pytest.raises(IdentificationError, match=r'explain at least 50 % .*: got \d %$'):
+        identified(Tape(METADATA, rows), tmp_path / 'bag')
+
+
+def test_a_short_bag_is_refused(tmp_path, driven):
+    short = driven.where(lambda seconds, topic, count: seconds < 6.0)
+    with pytest.raises(IdentificationError, match=r'at least 10 s without a gap: got 6\.0 s'):
+        identified(short, tmp_path / 'bag')
+
+
+@pytest.mark.parametrize('topic', ['/odom', '/cmd_vel'])
+def test_a_gap_divides_a_bag(tmp_path, driven, topic):
+    torn = driven.where(lambda seconds, name, _: name != topic or not 9.0 < seconds < 21.5)
+    with pytest.raises(IdentificationError, match=r'at least 10 s without a gap: got [89]\.\d s'):
+        identified(torn, tmp_path / 'bag')
+
+
+def test_slow_commands_do_not_tell_lag_from_dead_time(tmp_path):
+    time = np.arange(3000)[:, np.newaxis] / RATE
+    slow = 3.0 + np.sin(0.5 * time + np.array([0.0, 1.0]))
+    tape = recorded(slow, drive__lag=0.02, noise__variance=0.04)
+    with pytest.raises(
+        IdentificationError, match=r'deviation of the .* at most \d+\.\d ms: got \d+\.\d ms'
+    ):
+        identified(tape, tmp_path / 'bag')
+
+
+@pytest.mark.parametrize('topic, name', [('/odom', 'odom'), ('/cmd_vel', 'cmd_vel')])
+def test_a_bag_without_a_topic_is_refused(tmp_path, driven, topic, name):
+    tape = Tape(METADATA, [row for row in driven.rows if row[1] != topic])
+    with pytest.raises(IdentificationError, match=f'cmd_vel and odom: no {name}$'):
+        identified(tape, tmp_path / 'bag')
+
+
+# The command line
+
+
+def run(*words):
+    parser = argparse.ArgumentParser(prog='t3mpc')
+    tune.add_parser(parser.add_subparsers(required=True), list)
+    options = parser.parse_args(['tune', *map(str, words)])
+    return options.run(options)
+
+
+def test_the_command_prints_and_writes_the_file(tmp_path, driven, capsys):
+    folder, output = driven.write(tmp_path / 'drive'), tmp_path / 'new' / 'robot.yaml'
+    assert run('--robot', folder, '--output', output) == 0
+    text = capsys.readouterr().out
+    assert output.read_text() == text
+    assert text.startswith('# Drive identified from drive: 30.0 s, ')
+    values = yaml.safe_load(text)['/**/controller']['ros__parameters']
+    assert values['speed_filter.lag'] == pytest.approx(0.02, abs=0.006)
+    assert values['wheel_radius'] == GEOMETRY.wheel_radius
+
+
+def test_options_that_contradict_are_refused(tmp_path):
+    missing = tmp_path / 'missing'
+    with pytest.raises(ValueError, match=f'twin, servo, torque or an existing bag: got {missing}'):
+        run('--robot', missing)
+    for words in (['PI + feed-forward'], ['--evaluations', '3'], ['--resume']):
+        with pytest.raises(ValueError, match='for simulated robots'):
+            run('--robot', tmp_path, *words)
+    with pytest.raises(ValueError, match='given together'):
+        run('--robot', tmp_path, '--track', '0.2')
