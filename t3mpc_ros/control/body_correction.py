@@ -11,11 +11,12 @@ the difference of the wheel speeds, w = b omega / R, the body obeys
 for the commanded wheel speeds U of one dead time before, with an unknown map g_b* and the noise nu
 of the gyro. g_b(U|alpha) is a fuzzy system (31) with the adaptation (77) of its coefficients,
 
-.. math:: \dot\alpha = \gamma \Phi (w_a - w_c - g_b(U|\alpha)),
+.. math:: \dot\alpha = \gamma \Phi \, \mathrm{clip}(w_a - w_c - g_b(U|\alpha)),
 
-which the product gamma |Phi|² = ``learning_rate`` normalises. With V = |alpha* - alpha|²/(2 gamma)
-and g_b* = alpha*ᵀ Phi, V' = -(g_b* - g_b)² + (g_b* - g_b) nu: V decreases outside the noise. The
-reference of the law becomes
+clipped to 0.08 rad/s, so that a slide of the tyres is hardly learnt; the product gamma |Phi|² =
+``learning_rate`` normalises. With V = |alpha* - alpha|²/(2 gamma), e = g_b* - g_b and
+g_b* = alpha*ᵀ Phi, V' = -e clip(e + nu): V decreases outside the noise. The reference of the law
+becomes
 
 .. math:: w_r - a\,g_b(U_r|\alpha) - a\,v_\psi, \qquad v_\psi = \bar v \tanh(k e_\psi/\bar v)  E21
 
@@ -50,6 +51,9 @@ IMPLAUSIBLE = 0.2
 no yaw, or the wheels do not move the robot."""
 OUTLIER = 1.0
 """Error of a single step (rad/s) that is no property of the robot: a push, or a slip."""
+CLIP = 0.08
+"""Largest error that is learnt at once, rad/s. A slide of the tyres, which depends on the floor
+and not on the commands, changes the map no more than an error of this size does."""
 FULL_SKILL, NO_SKILL = 0.6, 0.2
 """Skill from which on the authority is 1, and up to which it is 0."""
 
@@ -84,7 +88,7 @@ class BodyCorrectionParameters(Parameters):
         dynamic=True,
     )
     yaw_gain: float = parameter(
-        1.0, 'gain k of the yaw error', unit='1/s', low=0.0, high=20.0, dynamic=True
+        0.3, 'gain k of the yaw error', unit='1/s', low=0.0, high=20.0, dynamic=True
     )
     max_correction: float = parameter(
         1.0,
@@ -102,8 +106,10 @@ class BodyCorrectionParameters(Parameters):
 (
     YAW, STARTED, BLOCK_TIME, RAW_SUM, RESIDUAL_SUM, RAW_POWER, RESIDUAL_POWER,
     AUTHORITY, YAW_ERROR, LAST_REFERENCE, COMMANDS, COMMAND_SUM, COMMAND_POWER,
-) = range(13)  # fmt: skip
-"""Entries of the memory: yaw, and the rest in wheel speeds (rad/s) and s."""
+    ERROR_SUM, ERROR_POWER,
+) = range(15)  # fmt: skip
+"""Entries of the memory: yaw, and the rest in wheel speeds (rad/s) and s. RAW is w_a - w_c with
+the residual clipped, ERROR without."""
 (
     TURN, PERIOD, RATE, SHARE, YAW_GAIN, BOUND, DEAD_ZONE,
     YAW_NOW, ELAPSED, REFERENCE, NEXT_RIGHT, NEXT_LEFT, SENT_RIGHT, SENT_LEFT, LEARN, DELAY,
@@ -135,7 +141,7 @@ class BodyCorrection:
         self._period = period
         self.fuzzy = FuzzyEstimator(parameters.fuzzy, AdaptationParameters(), outputs=1)
         self._history: Array = np.zeros((HISTORY, 2))
-        self._memory: Array = np.zeros(COMMAND_POWER + 1)
+        self._memory: Array = np.zeros(ERROR_POWER + 1)
         self._inputs: Array = np.zeros(DELAY + 1)
         self._work: Array = np.zeros(3)
         self.configure(parameters)
@@ -170,6 +176,7 @@ class BodyCorrection:
             YAW_ERROR,
             COMMANDS,
             COMMAND_SUM,
+            ERROR_SUM,
         ):
             self._memory[entry] = 0.0
 
@@ -187,7 +194,7 @@ class BodyCorrection:
         """Restore the map and its skill; the yaw error since is kept."""
         coefficients, memory = snapshot
         self.fuzzy.coefficients = coefficients
-        for entry in (RAW_POWER, RESIDUAL_POWER, COMMAND_POWER, AUTHORITY):
+        for entry in (RAW_POWER, RESIDUAL_POWER, COMMAND_POWER, ERROR_POWER, AUTHORITY):
             self._memory[entry] = memory[entry]
 
     def step(
@@ -287,6 +294,9 @@ def correct_body(
             for k in range(phi.size):
                 power += phi[k] * phi[k]
             if inputs[LEARN] > 0.0 and power > 0.0 and abs(residual) < OUTLIER:
+                memory[ERROR_SUM] += raw * elapsed
+                residual = min(max(residual, -CLIP), CLIP)
+                raw = residual + output[0]
                 gain = min(inputs[RATE] * elapsed, 1.0) * residual / power
                 for k in range(phi.size):
                     coefficients[0, k] += gain * phi[k]
@@ -321,8 +331,11 @@ def update_authority(memory: Array, share: float, dead_zone: float) -> None:
     memory[RESIDUAL_POWER] += share * (residual * residual - memory[RESIDUAL_POWER])
     commanded = memory[COMMAND_SUM] / memory[BLOCK_TIME]
     memory[COMMAND_POWER] += share * (commanded - memory[COMMAND_POWER])
+    error = memory[ERROR_SUM] / memory[BLOCK_TIME]
+    memory[ERROR_POWER] += share * (error * error - memory[ERROR_POWER])
     memory[BLOCK_TIME] = memory[RAW_SUM] = memory[RESIDUAL_SUM] = memory[COMMAND_SUM] = 0.0
-    if memory[RAW_POWER] > IMPLAUSIBLE**2 * memory[COMMAND_POWER]:
+    memory[ERROR_SUM] = 0.0
+    if memory[ERROR_POWER] > IMPLAUSIBLE**2 * memory[COMMAND_POWER]:
         memory[AUTHORITY] = 0.0
         return
     if memory[RAW_POWER] > 0.0:

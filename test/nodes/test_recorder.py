@@ -19,7 +19,7 @@ from std_srvs.srv import SetBool, Trigger
 from support.ros_graph import LATCHED, CommandSource, diagnostic_level, reason, twist
 
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.bag.run.model_file import load_model, save_model
+from t3mpc_ros.bag.run.model_file import find_model, load_model, save_model
 from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.chaos.seed_fingerprint import matches_fingerprint
 from t3mpc_ros.nodes.common.base_node import ERROR, OK, WARN
@@ -367,7 +367,10 @@ def test_model_files_are_attached_to_every_file(harness, tmp_path):
     bag = tmp_path / 'bag'
     recorder = record(harness, bag, 'odom', record__attachments=[str(world_map)])
     harness.add(ControllerNode, model=str(model), model_output=str(output))
-    harness.spin_until(lambda: 'controller' in recorder._metadata.records)
+    harness.add(ControllerNode, namespace='paper', model='servo')
+    harness.spin_until(
+        lambda: {'controller', '/paper/controller'} <= set(recorder._metadata.records)
+    )
     assert harness.call(Trigger, 'recorder/split_bagfile').success
     assert harness.call(Trigger, 'controller/save_model').success
     harness.remove(recorder)
@@ -375,6 +378,7 @@ def test_model_files_are_attached_to_every_file(harness, tmp_path):
     assert files(one) == {
         'room.yaml': b'walls: []',
         'controller/start.npz': model.read_bytes(),
+        'paper/controller/servo.npz': find_model('servo').read_bytes(),
     }
     assert files(two) == files(one) | {'controller/saved_learnt.npz': output.read_bytes()}
     (tmp_path / 'again.npz').write_bytes(files(two)['controller/saved_learnt.npz'])

@@ -12,6 +12,7 @@ from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 
+from t3mpc_ros.bag.run.model_file import find_model
 from t3mpc_ros.bag.writer import Attachment, AttachmentError, read_attachment
 from t3mpc_ros.nodes.registry import NODES
 from t3mpc_ros.parameters.provenance import provenance
@@ -66,8 +67,9 @@ class RecordingMetadata:
             self._model_outputs[record] = Path(output)
         if not (model := values.get('model', '')):
             return [], ''
+        path = find_model(model)
         try:
-            found = read_attachment(Path(model), self._max_bytes, _attachment_name(record, model))
+            found = read_attachment(path, self._max_bytes, _attachment_name(record, path.name))
         except AttachmentError as error:
             return [], str(error)
         self._attach(found, now_ns)
