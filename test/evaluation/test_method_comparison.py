@@ -36,6 +36,7 @@ from t3mpc_ros.evaluation.method_comparison.compared_runs import (
     methods_for,
     twin_numbers,
     twin_run,
+    twin_start,
 )
 from t3mpc_ros.evaluation.method_comparison.comparison_page import (
     BETTER,
@@ -315,13 +316,13 @@ def test_every_robot_has_feed_forward_and_the_full_controller(robot):
     assert set(DRIVES) == set(ROBOTS)
 
 
-def test_the_gain_of_the_baselines_cancels_the_noise():
+def test_the_gain_that_tuning_starts_with_cancels_the_noise():
     """On the twin the command of PI without integral does not contain the measured speed."""
     method = methods_for('twin')[PI]
     scenario = TwinScenario('nominal', 201)
     model = scenario.nominal_model()
     assert isinstance(method, TwinMethod)
-    parameters = method.baseline.parameters.with_values({'integral': 0.1})
+    parameters = twin_start(method.baseline.parameters).with_values({'integral': 0.1})
     commands = []
     for speed in (1.0, 1.2):
         pi = ProportionalIntegral(parameters, model)

@@ -14,7 +14,6 @@ import t3mpc_ros
 from t3mpc_ros.evaluation.confidence_intervals import Difference, interval, mean, paired
 from t3mpc_ros.evaluation.method_comparison.compared_runs import (
     DRIFT,
-    DRIVES,
     FEED_FORWARD,
     METRICS,
     OVERALL,
@@ -22,6 +21,7 @@ from t3mpc_ros.evaluation.method_comparison.compared_runs import (
     SETTLING,
     START,
     STOPPED,
+    TUNED_FOR,
     TWIN_ADVANCE,
     YAW_RATE,
     YAW_RATE_SETTLED,
@@ -172,9 +172,8 @@ def knowledge_table(plan: ComparisonPlan) -> Table:
             'contains the gyro',
             FEED_FORWARD: f'no measurement; the reference {1e3 * TWIN_ADVANCE:g} ms beyond the '
             'dead time',
-            'baselines': 'parameters tuned for the velocity drive of the paper, not for this '
-            'robot; gain is the one at which the measured speed cancels in the command, '
-            f'{model.share / model.period:.1f} 1/s; no learnt weights at the start. The model is '
+            'baselines': 'parameters tuned for this robot, with equal effort (t3mpc tune --robot '
+            'twin); no learnt weights at the start. The model is '
             f'a servo with a lag of {1e3 * model.lag:g} ms without friction, which is exact for '
             'a stepper motor but for the oscillation of its rotor',
             'gyro': f'{", ".join(gyro)}: every baseline takes the difference of its wheel speeds '
@@ -273,7 +272,7 @@ def record(plan: ComparisonPlan, results: Results) -> dict[str, Any]:
         'format': 1,
         'version': t3mpc_ros.__version__,
         'robot': plan.robot,
-        'drive_of_tuning': DRIVES[plan.robot],
+        'drive_of_tuning': TUNED_FOR[plan.robot],
         'seeds': list(plan.seeds),
         'duration': plan.duration,
         'noise': plan.noise,

@@ -1,0 +1,158 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Tuning on the digital twin: what an evaluation counts, and what the comparison uses of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.control.controller import StepperControllerParameters
+from t3mpc_ros.evaluation.baselines.proportional_integral import ProportionalIntegralParameters
+from t3mpc_ros.evaluation.confidence_intervals import Difference
+from t3mpc_ros.evaluation.method_comparison import twin_tuning
+from t3mpc_ros.evaluation.method_comparison.compared_runs import (
+    OVERALL,
+    VARIATION,
+    methods_for,
+    twin_numbers,
+    twin_run,
+)
+from t3mpc_ros.evaluation.method_comparison.twin_scenario import TwinScenario
+from t3mpc_ros.evaluation.method_comparison.twin_tuning import (
+    CASES,
+    FULL_RANGES,
+    TRAINING,
+    TWIN,
+    VALIDATION_SEEDS,
+    TwinObjective,
+    kept_start,
+    tune_twin,
+    twin_definitions,
+    twin_method,
+    twin_objective,
+)
+from t3mpc_ros.evaluation.methods import EXACT_MODEL, FULL, method_definitions
+from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, TUNING_SEEDS
+from t3mpc_ros.evaluation.tuning.objective import SMOOTHNESS, TuningScenarios
+from t3mpc_ros.evaluation.tuning.tuned_parameters import TunedParameters
+
+PI = 'PI + feed-forward'
+
+
+@pytest.fixture(scope='module')
+def definitions():
+    return {each.name: each for each in twin_definitions(method_definitions())}
+
+
+def test_every_method_starts_from_what_it_has_on_the_twin(definitions):
+    assert list(definitions) == [each.name for each in method_definitions()]
+    assert definitions[PI].start[TWIN].gain == pytest.approx(96.43, abs=0.01)
+    assert definitions[FULL].start[TWIN] == StepperControllerParameters()
+    assert definitions[FULL].space.names == tuple(each.name for each in FULL_RANGES)
+
+
+def test_no_seed_of_the_tuning_is_reported():
+    seeds = {*TRAINING.seeds, *VALIDATION_SEEDS}
+    assert seeds <= {*TUNING_SEEDS}
+    assert not seeds & {*HELD_OUT_SEEDS}
+    assert not {*TRAINING.seeds} & {*VALIDATION_SEEDS}
+    assert [case for _, _, case in TRAINING.runs()] == list(CASES)
+
+
+def test_the_body_counts_where_baselines_have_the_gyro(definitions):
+    method = twin_method(definitions[PI], definitions[PI].start[TWIN])
+    for case, body in (('nominal', False), ('miscalibrated', True)):
+        scenario = TwinScenario(case, 1, 8.0)
+        record = twin_run(scenario, method)
+        numbers = twin_numbers(scenario, record)
+        cost = twin_objective((scenario, method)) - SMOOTHNESS * numbers[VARIATION.name]
+        counted = record.time >= 4.5
+        ground = np.sqrt(np.mean((record.ground - record.reference)[counted] ** 2))
+        assert cost == pytest.approx(ground if body else numbers[OVERALL.name], rel=0.02)
+        assert (cost == pytest.approx(numbers[OVERALL.name], rel=0.001)) != body
+
+
+def test_an_evaluation_is_the_mean_of_its_runs(definitions):
+    training = TuningScenarios((1, 2), (0.04,), 6.0, CASES)
+    method = definitions[PI]
+    candidates = [method.start[TWIN], method.start[TWIN].with_values({'gain': 20.0})]
+    with TwinObjective(training, 1) as objective:
+        found = objective(method, TWIN, candidates)
+    for value, parameters in zip(found, candidates, strict=True):
+        runs = [
+            twin_objective((TwinScenario(case, seed, 6.0), twin_method(method, parameters)))
+            for seed, case in zip((1, 2), CASES, strict=True)
+        ]
+        assert value == pytest.approx(np.mean(runs), rel=1e-12)
+
+
+def test_the_full_controller_is_that_of_the_node(definitions):
+    changed = definitions[FULL].start[TWIN].with_values({'body.yaw_gain': 3.0})
+    controller = twin_method(definitions[FULL], changed).controller(TwinScenario('nominal', 1))
+    assert controller.parameters.body.yaw_gain == 3.0
+    assert controller.parameters == TwinScenario('nominal', 1).controller_parameters().with_values(
+        {'body.yaw_gain': 3.0}
+    )
+
+
+@pytest.mark.parametrize(
+    'mean, half, kept', [(-0.002, 0.001, False), (-0.001, 0.002, True), (0.002, 0.001, True)]
+)
+def test_defaults_stay_unless_others_are_better(
+    definitions, monkeypatch, tmp_path, mean, half, kept
+):
+    method = definitions[FULL]
+    default = method.start[TWIN].to_dict()['body.yaw_gain']
+
+    class Instead(TwinObjective):
+        def objectives(self, method, drive, candidates):
+            return [each.to_dict()['body.yaw_gain'] for each in candidates]
+
+    monkeypatch.setattr(twin_tuning, 'TwinObjective', Instead)
+    monkeypatch.setattr(twin_tuning, 'validate', lambda *_: Difference(mean, half))
+    lines = []
+    path = tmp_path / 'tuned.json'
+    store = tune_twin([method], 12, 1, path, lines.append)
+    assert ('kept defaults' in lines[-1]) == kept
+    entry = TunedParameters.load(path).entry(FULL, TWIN)
+    assert entry == store.entry(FULL, TWIN)
+    assert (entry.values['body.yaw_gain'] == default) == kept
+    assert (entry.objective == entry.start_objective) == kept
+
+
+def test_defaults_that_do_not_run_are_not_kept(definitions):
+    entry = TunedParameters.load().entry(PI, TWIN)
+    with pytest.raises(ValueError, match='full: the start parameters must have an objective'):
+        kept_start(definitions[FULL], replace(entry, start_objective=None))
+
+
+# The packaged entries
+
+
+def test_every_baseline_was_tuned_on_the_twin_alike(definitions):
+    store = TunedParameters.load()
+    store.check_equal()
+    for name, method in definitions.items():
+        if name == FULL:
+            continue  # the comparison drives it with the defaults of the node
+        entry = store.entry(name, TWIN)
+        assert entry.tuned == method.space.names
+        assert (entry.budget.training_seeds, entry.budget.cases) == (TRAINING.seeds, CASES)
+        assert entry.objective <= entry.start_objective
+        method.space.point(entry.values)  # within the ranges
+
+
+def test_the_comparison_uses_the_parameters_for_the_twin():
+    store, found = TunedParameters.load(), methods_for('twin')
+    for name, method in found.items():
+        if method.baseline is None or name == 'feed-forward':
+            continue
+        entry = store.entry(name.removesuffix(EXACT_MODEL), TWIN)
+        values = method.baseline.parameters.to_dict()
+        assert {one: values[one] for one in entry.tuned} == {
+            one: entry.values[one] for one in entry.tuned
+        }
+        if name.endswith(EXACT_MODEL):
+            assert values['model_error'] == 1.0
+    assert isinstance(found[PI].baseline.parameters, ProportionalIntegralParameters)
