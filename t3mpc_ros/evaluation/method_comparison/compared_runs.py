@@ -178,6 +178,7 @@ def _twin_methods(
 ) -> Mapping[str, AnyMethod]:
     """Return the methods on the twin.
 
+    The full controller has the defaults of the node, whatever is stored as tuned for it.
     Baselines have the parameters tuned for the twin; those of a baseline that was not are its
     :func:`twin_start`.
     """
