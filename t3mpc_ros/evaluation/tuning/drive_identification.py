@@ -95,7 +95,7 @@ class IdentifiedDrive:
 def identify_bag(folder: Path, options: ReportOptions) -> tuple[IdentifiedDrive, str]:
     """Return the drive of the robot in a bag, and the composition of its controller.
 
-    The composition is the recorded one; ``paper`` without, because a bag does not tell whether
+    The composition is the recorded one; ``paper`` without, because a bag does not show whether
     the yaw of the odometry comes from a gyro.
 
     Raises
