@@ -31,10 +31,10 @@ WHEEL_CIRCUMFERENCE = 0.2199
 def documented_commands():
     """Return the commands of the section that needs no robot, each as a list of words."""
     text = (ROOT / 'docs' / 'robot.md').read_text()
-    (block,) = re.findall(
-        r'^## Try it without a robot\n.*?```console\n(.*?)```', text, re.M | re.S
-    )
-    return [shlex.split(line.removeprefix('scripts/run ')) for line in block.splitlines()]
+    (section,) = re.findall(r'^## Try it without a robot\n(.*?)^## ', text, re.M | re.S)
+    blocks = re.findall(r'```console\n(.*?)```', section, re.S)
+    lines = ''.join(blocks).splitlines()
+    return [shlex.split(line.removeprefix('scripts/run ')) for line in lines]
 
 
 class Walk:
