@@ -1,6 +1,7 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
 # Sourced by every script: creates or updates the local environment .venv, and sets $PYTHON.
+# PARTS are the parts of it that the script needs: run, and check for lint, types and tests.
 # Requires Python 3.11 to 3.14 and a package index; a system ROS is neither required nor used.
 # $ROOT is the folder of the checkout: the scripts resolve a symlink to themselves before.
 
@@ -10,9 +11,13 @@ ROOT="$(CDPATH='' cd -- "$(dirname -- "${BASH_SOURCE[0]}")/.." && pwd)"
 VENV="$ROOT/.venv"
 PYTHON="$VENV/bin/python"
 LOG="$ROOT/.venv.log"
+PARTS=("${PARTS[@]:-run}")
+declare -A REQUIREMENTS=([run]=requirements.txt [check]=requirements-dev.txt)
+CHILDREN=()
 
 say() { printf '%s\n' "$*" >&2; }
 fail() {
+  stop_children
   say "error: $1"
   say "remedy: $2"
   exit 1
@@ -60,79 +65,156 @@ version_of() {
   if command -v "$1" >/dev/null; then "$1" --version 2>&1 | tail -n 1 || true; else echo 'not found'; fi
 }
 
-# Print the hash of everything that determines the content of the environment.
+# Print the name of a part and the hash of everything that determines its content.
 wanted_stamp() {
-  {
+  local hash
+  hash="$({
     origin_of "$BASE_PYTHON"
-    cat "$ROOT"/{requirements*.txt,setup.py,setup.cfg,package.xml,t3mpc_ros/__init__.py} \
-      "$ROOT"/{config/*.*,launch/*.launch.py}
-  } | sha256sum | cut -d' ' -f1
+    case "$1" in
+    run) cat "$ROOT"/{requirements.txt,setup.py,setup.cfg,package.xml,t3mpc_ros/__init__.py} \
+      "$ROOT"/{config/*.*,launch/*.launch.py} "$ROOT"/scripts/{environment.sh,finish_install.py} ;;
+    check) cat "$ROOT"/requirements-*.txt ;;
+    esac
+  } | sha256sum)"
+  printf '%s\n' "$1 ${hash%% *}"
 }
 
-is_current() { [ "$(cat "$VENV/stamp" 2>/dev/null)" = "$(wanted_stamp)" ]; }
+is_current() {
+  local part
+  for part in "${PARTS[@]}"; do
+    grep -qxF "$(wanted_stamp "$part")" "$VENV/stamp" 2>/dev/null || return 1
+  done
+}
 
-# Run a command of the set-up with its output in the log, and show that it takes time.
-CHILD=''
-run() {
-  local code=0 tenths=0
+# Start a command of the set-up with its output in the log; its process is $!.
+start() {
   # A session of its own: a signal to the script ends everything that the command has started.
   setsid "$@" >>"$LOG" 2>&1 9>&- &
-  CHILD=$!
-  while kill -0 "$CHILD" 2>/dev/null; do
+  CHILDREN+=("$!")
+}
+
+# Wait for the command with process $1 and show that it takes time; then the time since second $2.
+finish() {
+  local code=0 tenths=0
+  while kill -0 "$1" 2>/dev/null; do
     sleep 0.2
     tenths=$((tenths + 2))
     if ((tenths % 100 == 0)); then say "    $((tenths / 10)) s"; fi
   done
-  wait "$CHILD" || code=$?
-  CHILD=''
+  wait "$1" || code=$?
+  if [ "$code" = 0 ]; then say "    done in $((SECONDS - $2)) s"; fi
   return "$code"
 }
 
+# Run a command of the set-up; $1 says what it does.
+run() {
+  local since=$SECONDS
+  say "  $1"
+  start "${@:2}"
+  finish "$!" "$since"
+}
+
+stop_children() {
+  local child running=()
+  for child in "${CHILDREN[@]}"; do
+    if kill -TERM -- "-$child" 2>/dev/null; then running+=("$child"); fi
+  done
+  [ ${#running[@]} = 0 ] || sleep 0.5
+  for child in "${running[@]}"; do
+    kill -KILL -- "-$child" 2>/dev/null || true
+    wait "$child" 2>/dev/null || true
+  done
+}
+
 stop_set_up() {
-  if [ -n "$CHILD" ]; then
-    kill -TERM -- "-$CHILD" 2>/dev/null || true
-    sleep 0.5
-    kill -KILL -- "-$CHILD" 2>/dev/null || true
-    wait "$CHILD" 2>/dev/null || true
-  fi
+  stop_children
   say 'stopped; run the script again to complete the set-up'
   exit "$1"
 }
 
+# Set UV to the installer uv, from PATH or else from the index: with it the set-up takes a fraction
+# of the time. It remains empty where there is none.
+find_uv() {
+  if UV="$(command -v uv)"; then return; fi
+  UV="$VENV/uv/bin/uv"
+  run 'fetching the installer uv' "$BASE_PYTHON" -m pip install --disable-pip-version-check \
+    --no-compile -q --target "$VENV/uv" uv || UV=''
+}
+
+# Pass the settings of pip to uv, which does not read them.
+configure_uv() {
+  local key value
+  while IFS='=' read -r key value; do
+    value="${value:1:-1}"
+    value="${value//\\n/ }"
+    case "$key" in
+    *.index-url) export UV_DEFAULT_INDEX="${UV_DEFAULT_INDEX:-$value}" ;;
+    *.extra-index-url) export UV_INDEX="${UV_INDEX:-$value}" UV_INDEX_STRATEGY=unsafe-best-match ;;
+    *.find-links) [ ! -d "$value" ] || export UV_FIND_LINKS="${UV_FIND_LINKS:-$value}" ;;
+    *.no-index) export UV_NO_INDEX="${UV_NO_INDEX:-$value}" ;;
+    *.trusted-host) export UV_INSECURE_HOST="${UV_INSECURE_HOST:-$value}" ;;
+    *.cert) export SSL_CERT_FILE="${SSL_CERT_FILE:-$value}" ;;
+    *.proxy) export ALL_PROXY="${ALL_PROXY:-$value}" ;;
+    esac
+  done < <("$BASE_PYTHON" -m pip config list 2>/dev/null)
+}
+
+# Install $1, named by the other arguments in the language of pip.
+install() {
+  if [ -n "$UV" ]; then
+    run "installing $1" "$UV" pip install --python "$PYTHON" "${@:2}" && return
+    say '    uv has failed; trying pip'
+  fi
+  if ! "$PYTHON" -m pip --version >/dev/null 2>&1; then
+    run 'unpacking pip' "$PYTHON" -m ensurepip ||
+      fail "pip could not be installed with $BASE_PYTHON: $(tail -n 1 "$LOG")" \
+        "install Python's venv module (Debian and Ubuntu: apt install python3-venv), then run $0 again"
+  fi
+  run "installing $1 with pip" "$PYTHON" -m pip install --disable-pip-version-check --no-compile "${@:2}"
+}
+
 make_environment() {
-  local origin
-  rm -f "$VENV/stamp"
+  local origin part files=() others='' compiler since
+  SECONDS=0
   : >"$LOG"
   origin="$(origin_of "$BASE_PYTHON")"
   if [ "$(cat "$VENV/origin" 2>/dev/null)" = "$origin" ]; then
     say "updating the local environment .venv (log: $LOG)"
+    others="$(cat "$VENV/stamp" 2>/dev/null || true)"
+    rm -f "$VENV/stamp"
   else
     say "creating the local environment .venv (once, about a minute; log: $LOG)"
-    run "$BASE_PYTHON" -m venv --clear "$VENV" ||
+    run 'making a virtual environment' "$BASE_PYTHON" -m venv --without-pip --clear "$VENV" ||
       fail "the environment could not be created with $BASE_PYTHON: $(tail -n 1 "$LOG")" \
         "install Python's venv module (Debian and Ubuntu: apt install python3-venv), then run $0 again"
     printf '%s\n' "$origin" >"$VENV/origin"
   fi
-  say "  installing ROS 2 Jazzy and the libraries from the package index"
-  if ! run "$PYTHON" -m pip install --disable-pip-version-check \
-    -r "$ROOT/requirements.txt" -r "$ROOT/requirements-dev.txt"; then
+  for part in "${PARTS[@]}"; do files+=(-r "$ROOT/${REQUIREMENTS[$part]}"); done
+  find_uv
+  configure_uv
+  if ! install "ROS 2 Jazzy and the libraries from the package index" "${files[@]}"; then
     say "$(grep -iE 'error|could not|no matching' "$LOG" | tail -n 3)"
     fail "the libraries could not be installed with $("$PYTHON" --version) on $(uname -sm)" \
-      "check the network and the package index (\"$PYTHON -m pip config list\"; proxies: HTTPS_PROXY), then run $0 again; the wheels of ROS 2 exist for Linux on x86_64"
+      "check the network and the package index (\"$BASE_PYTHON -m pip config list\"; proxies: HTTPS_PROXY), then run $0 again; the wheels of ROS 2 exist for Linux on x86_64"
   fi
-  say "  installing t3mpc_ros"
-  # The files of an earlier pip install would hide new executables.
-  run "$PYTHON" -m pip uninstall --disable-pip-version-check -q -y t3mpc_ros || true
-  # develop installs the executables into lib/t3mpc_ros, the folder that ros2 run searches; those
-  # of an earlier version are removed.
-  rm -rf "$VENV/lib/t3mpc_ros"
-  run env -C "$ROOT" "$PYTHON" -W ignore setup.py -q develop --no-deps \
-    install_data --install-dir "$VENV" ||
+  # The kernels need the libraries only: they are compiled while the package is installed.
+  since=$SECONDS
+  start env -C "$ROOT" "$PYTHON" -m t3mpc_ros.cli.main compile
+  compiler=$!
+  { install 't3mpc_ros' --no-deps --no-build-isolation -e "$ROOT" &&
+    run 'moving its executables to lib/t3mpc_ros, where ros2 run looks' \
+      "$PYTHON" "$ROOT/scripts/finish_install.py"; } ||
     fail "the package could not be installed: $(tail -n 1 "$LOG")" "see $LOG"
-  say "  compiling the kernels (about a minute)"
-  run env -C "$ROOT" "$PYTHON" -m t3mpc_ros.cli.main compile ||
+  say '  compiling the kernels for this processor, since the libraries are there'
+  finish "$compiler" "$since" ||
     fail "the kernels could not be compiled: $(tail -n 1 "$LOG")" "see $LOG"
-  wanted_stamp >"$VENV/stamp"
+  for part in "${PARTS[@]}"; do
+    others="$(grep -v "^$part " <<<"$others" || true)"
+    others+=$'\n'"$(wanted_stamp "$part")"
+  done
+  rm -rf "$VENV/uv"
+  printf '%s\n' "$others" >"$VENV/stamp"
+  say "the local environment is complete after $SECONDS s"
 }
 
 # Remove a sourced ROS 2 or workspace from the environment: its modules, its libraries and its

@@ -7,10 +7,10 @@ import hashlib
 import os
 from pathlib import Path
 import tempfile
-from typing import ParamSpec, TypeVar, cast
+from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
-import numba.core.config
+from numba.core import caching, config
 
 P = ParamSpec('P')
 R = TypeVar('R')
@@ -56,8 +56,11 @@ def cache_directory(environment: Mapping[str, str], sources: Path = PACKAGE_DIRE
 
 
 def source_fingerprint(sources: Path) -> str:
-    """Return 16 hexadecimal digits that change with any file below ``sources`` with a kernel."""
-    digest = hashlib.sha256()
+    """Return 16 hexadecimal digits that change with any file below ``sources`` with a kernel.
+
+    They change with the compiler, too: several environments share a folder.
+    """
+    digest = hashlib.sha256(numba.__version__.encode())
     for path in sorted(sources.rglob('*.py')):
         content = path.read_bytes()
         if b'@kernel' in content or path.name == 'kernels.py':
@@ -76,9 +79,36 @@ def _base_directories(environment: Mapping[str, str]) -> Iterator[Path]:
     yield Path(tempfile.gettempdir()) / f't3mpc_ros-{os.getuid()}'
 
 
-# Set before the first kernel is made: numba reads the setting when it decorates.
-if not numba.core.config.CACHE_DIR:
-    numba.core.config.CACHE_DIR = str(cache_directory(os.environ))
+_Locators: Any = caching.CacheImpl._locator_classes
+"""What the compiler asks in turn; the first is for ``CACHE_DIR``, with a name that varies."""
+
+
+class KernelLocator(_Locators[0]):  # type: ignore[misc]
+    """Where the compiler caches a kernel: by the name of its module, not by the path of the file.
+
+    Equal sources share the compiled code wherever they are: clones, workspaces, installations.
+    """
+
+    def __init__(self, function: Callable[..., object], file: str) -> None:
+        super().__init__(function, file)
+        self._cache_path = str(Path(config.CACHE_DIR, *function.__module__.split('.')))
+
+    @classmethod
+    def from_function(cls, function: Callable[..., object], file: str) -> 'KernelLocator | None':
+        """Return the locator of a kernel of this package; None for any other function."""
+        if not Path(file).is_relative_to(PACKAGE_DIRECTORY):
+            return None
+        return cast('KernelLocator | None', super().from_function(function, file))
+
+    def get_source_stamp(self) -> str:
+        """Return what changes with the sources: the fingerprint in the name of the folder."""
+        return Path(config.CACHE_DIR).name
+
+
+# Set before the first kernel is made: numba reads the settings when it decorates.
+if not config.CACHE_DIR:
+    config.CACHE_DIR = str(cache_directory(os.environ))
+    _Locators.insert(0, KernelLocator)
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What to install when a library is missing."""
 
+import sys
+
 REQUIREMENTS = {
     'numpy': 'numpy>=1.26',
     'numba': 'numba>=0.60',
@@ -22,7 +24,7 @@ def remedy(error: ModuleNotFoundError) -> str:
     """Return one line that names a missing library and the remedy; empty for other modules."""
     library = (error.name or '').partition('.')[0]
     if requirement := REQUIREMENTS.get(library):
-        return f'the library {library} is missing: python3 -m pip install "{requirement}"'
+        return f'the library {library} is missing: {sys.executable} -m pip install "{requirement}"'
     if library in ('rclpy', 'rcl_interfaces') or library.endswith('_msgs'):
         return (
             f'the ROS 2 package {library} is missing: source the setup file of ROS 2 Jazzy, or '

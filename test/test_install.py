@@ -7,6 +7,7 @@ import functools
 import os
 from pathlib import Path
 import re
+import runpy
 import shutil
 import signal
 import socket
@@ -59,8 +60,6 @@ class Tree:
         self.environment = clean_environment(
             AMENT_PREFIX_PATH=sys.prefix,
             COLCON_HOME=folder / 'colcon',
-            # The cache of the kernels is keyed by source path: keep the user's own cache clean.
-            T3MPC_CACHE_DIR=folder / 'kernels',
         )
         built = subprocess.run(
             [colcon, 'build', *options],
@@ -335,11 +334,13 @@ def test_the_launch_file_names_only_what_is_installed(copied, monkeypatch):
 
 # --- scripts ------------------------------------------------------------------------------------
 
-# Fake Python: reports a version, logs its calls, and fails to install while a file `no_index`
-# exists beside the log.
+# Fake Python and, in its place, uv: report a version, log their calls and what they install. While
+# a file no_index exists beside the log they install nothing; no_uv: uv is not in the index.
 FAKE_PYTHON = r"""#!/usr/bin/env bash
 notes="$FAKE_NOTES"
-here="$(cat "$(dirname "$0")/version")"
+beside="$(dirname "$notes")"
+here="$(cat "$(dirname "$0")/version" 2>/dev/null)"
+note() { echo "$1" >>"$notes"; }
 case "$*" in
 --version) echo "Python $here" ;;
 -c*)
@@ -347,32 +348,49 @@ case "$*" in
 sys.version_info = tuple(map(int, sys.argv[1].split(".")))
 exec(sys.argv[2])' "$here" "$2" ;;
 '-m venv'*)
-  echo venv >>"$notes"
+  note venv
   target="${!#}"
   [[ "$*" != *--clear* ]] || rm -rf "$target"
   mkdir -p "$target/bin"
   cp "$0" "$target/bin/python"
   echo "$here" >"$target/bin/version" ;;
-*'pip install'*)
-  echo pip >>"$notes"
-  if [ -e "$(dirname "$notes")/slow" ]; then
-    echo "$BASHPID" >"$(dirname "$notes")/slow"
+'-m pip --version') [ -e "$(dirname "$0")/pip" ] ;;
+'-m ensurepip')
+  note ensurepip
+  >"$(dirname "$0")/pip" ;;
+'-m pip config list') [ ! -e "$beside/pip_settings" ] || cat "$beside/pip_settings" ;;
+*'pip install'*'--target '*' uv')
+  note uv
+  [ ! -e "$beside/no_uv" ] || exit 1
+  mkdir -p "$VENV/uv/bin"
+  cp "$0" "$VENV/uv/bin/uv" ;;
+*'pip install'*' -r '*)
+  note libraries
+  echo "$0 $*" >>"$beside/installed"
+  env | grep '^UV_' >"$beside/uv_settings"
+  if [ -e "$beside/slow" ]; then
+    echo "$BASHPID" >"$beside/slow"
     sleep 60
   fi
-  if [ -e "$(dirname "$notes")/no_index" ]; then
+  if [ -e "$beside/no_index" ]; then
     echo 'ERROR: Could not find a version that satisfies the requirement numpy'
     exit 1
   fi ;;
-*'setup.py'*)
-  echo setup >>"$notes"
-  mkdir -p "${!#}/lib/t3mpc_ros"
-  printf '#!/bin/sh\necho "t3mpc got $*"\n' >"${!#}/lib/t3mpc_ros/t3mpc"
-  chmod +x "${!#}/lib/t3mpc_ros/t3mpc" ;;
-*main\ compile) echo compile >>"$notes" ;;
+*'pip install'*' -e '*)
+  note package
+  printf '#!/bin/sh\necho "t3mpc got $*"\n' >"$VENV/bin/t3mpc"
+  chmod +x "$VENV/bin/t3mpc" ;;
+*finish_install.py)
+  mkdir -p "$VENV/lib/t3mpc_ros"
+  mv "$VENV/bin/t3mpc" "$VENV/lib/t3mpc_ros/t3mpc" ;;
+*main\ compile)
+  note compile
+  [ ! -e "$beside/slow_kernels" ] || exec sleep 60 ;;
 *) echo "unexpected: $*" >&2; exit 99 ;;
 esac
 """
-SET_UP = ['venv', 'pip', 'setup', 'compile']
+UPDATE = ['uv', 'libraries', 'compile', 'package']
+SET_UP = ['venv', *UPDATE]
 
 
 class Checkout:
@@ -383,7 +401,7 @@ class Checkout:
         self.notes = folder / 'notes'
         self.bin = folder / 'bin'
         self.python(self.bin, '3.12.3')
-        tools = 'bash cat chmod cp cut dirname env flock grep mkdir readlink rm setsid sha256sum'
+        tools = 'bash cat chmod cp dirname env flock grep mkdir mv readlink rm setsid sha256sum'
         tools += ' sleep tail uname'
         for tool in tools.split():
             (self.bin / tool).symlink_to(shutil.which(tool))
@@ -399,7 +417,10 @@ class Checkout:
 
     def command(self, *arguments, **extra):
         environment = clean_environment(
-            PATH=self.bin, FAKE_NOTES=self.notes, REAL_PYTHON=sys.executable
+            PATH=self.bin,
+            FAKE_NOTES=self.notes,
+            REAL_PYTHON=sys.executable,
+            VENV=self.root / '.venv',
         )
         return {
             'args': [self.root / 'scripts' / 'run', *arguments],
@@ -413,10 +434,16 @@ class Checkout:
         return subprocess.run(**self.command(*arguments, **extra))
 
     def done(self):
-        """Return the logged calls of the fake Python since the last call."""
+        """Return the logged calls since the last call; kernels and package go side by side."""
         steps = self.notes.read_text().split() if self.notes.exists() else []
         self.notes.unlink(missing_ok=True)
+        if steps[-2:] == ['package', 'compile']:
+            steps[-2:] = ['compile', 'package']
         return steps
+
+    def beside(self, name):
+        """Return a file that steers or reports on the fake Python."""
+        return self.notes.parent / name
 
     @property
     def stamped(self):
@@ -449,7 +476,7 @@ def test_run_with_an_unknown_name_lists_the_names(arguments, checkout):
 
 @pytest.mark.parametrize(
     'file',
-    ['requirements.txt', 'requirements-colcon.txt', 'setup.py', 'config/fastdds_loopback.xml'],
+    ['requirements.txt', 'setup.py', 'config/fastdds_loopback.xml', 'scripts/environment.sh'],
 )
 def test_a_stale_environment_is_updated(file, checkout):
     checkout.run('t3mpc')
@@ -457,7 +484,7 @@ def test_a_stale_environment_is_updated(file, checkout):
     with (checkout.root / file).open('a') as text:
         text.write('# changed\n')
     assert checkout.run('t3mpc').returncode == 0
-    assert checkout.done() == ['pip', 'setup', 'compile']
+    assert checkout.done() == UPDATE
     checkout.run('t3mpc')
     assert checkout.done() == []
 
@@ -513,23 +540,23 @@ def test_an_unusable_requested_python_is_an_error(version, named, checkout, tmp_
 
 
 def test_an_interrupted_setup_is_repaired_by_the_next_run(checkout):
-    (checkout.notes.parent / 'no_index').touch()
+    checkout.beside('no_index').touch()
     done = checkout.run('t3mpc')
     assert done.returncode == 1
     assert 'ERROR: Could not find a version' in done.stderr
     assert 'error: the libraries could not be installed' in done.stderr
     assert 'remedy: check the network' in done.stderr
-    assert checkout.done() == ['venv', 'pip']
+    assert checkout.done() == ['venv', 'uv', 'libraries', 'ensurepip', 'libraries']
     assert not checkout.stamped
-    (checkout.notes.parent / 'no_index').unlink()
+    checkout.beside('no_index').unlink()
     assert checkout.run('t3mpc').returncode == 0
-    assert checkout.done() == ['pip', 'setup', 'compile']
+    assert checkout.done() == UPDATE
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_the_set_up_and_its_commands(number, checkout):
     """A signal to the script once left pip running, with the lock of the set-up."""
-    slow = checkout.notes.parent / 'slow'
+    slow = checkout.beside('slow')
     slow.touch()
     script = subprocess.Popen(**checkout.command('t3mpc'))
     deadline = time.monotonic() + 30.0
@@ -553,7 +580,7 @@ def test_a_long_step_of_the_set_up_shows_the_time(checkout):
     text = f'[ "$1" = 0.2 ] && exec {real} 0.005\nexec {real} "$1"\n'
     sleep.write_text(f'#!{shutil.which("bash")}\n{text}')
     sleep.chmod(0o755)
-    (checkout.notes.parent / 'slow').touch()
+    checkout.beside('slow').touch()
     with subprocess.Popen(**checkout.command('t3mpc')) as script:
         shown = []
         for line in script.stderr:
@@ -562,7 +589,94 @@ def test_a_long_step_of_the_set_up_shows_the_time(checkout):
                 break
         script.send_signal(signal.SIGTERM)
     step = shown.index('installing ROS 2 Jazzy and the libraries from the package index')
+    assert re.fullmatch(r'done in \d+ s', shown[step - 1])
     assert shown[step + 1 :] == ['10 s', '20 s', '30 s']
+
+
+def test_each_part_of_the_environment_is_installed_when_needed(checkout):
+    """Tests, types and the nonlinear MPC are no part of what a demo needs: 1.2 GB were."""
+    checkout.run('t3mpc')
+    [libraries] = checkout.beside('installed').read_text().splitlines()
+    assert re.findall(r'/(requirements[\w.-]*)', libraries) == ['requirements.txt']
+    checkout.done()
+    check = checkout.command('--version')
+    check['args'][0] = checkout.root / 'scripts' / 'check'
+    with (checkout.root / 'requirements-colcon.txt').open('a') as text:
+        text.write('# changed\n')
+    assert checkout.run('t3mpc').returncode == 0
+    assert checkout.done() == []
+    subprocess.run(**check)  # the fake Python has no ruff
+    assert checkout.done() == UPDATE
+    installed = checkout.beside('installed').read_text().splitlines()[-1]
+    assert re.findall(r'/(requirements[\w.-]*)', installed) == [
+        'requirements.txt',
+        'requirements-dev.txt',
+    ]
+    checkout.run('t3mpc')
+    subprocess.run(**check)
+    assert checkout.done() == []
+
+
+def test_the_installer_is_uv_and_without_it_pip(checkout):
+    uv = checkout.bin / 'uv'
+    uv.write_text(FAKE_PYTHON)
+    uv.chmod(0o755)
+    checkout.beside('pip_settings').write_text(
+        "global.extra-index-url='https://a.example/simple\\nhttps://b.example/simple'\n"
+        f"global.find-links='{checkout.root}'\nglobal.timeout='60'\n"
+        "global.index-url='https://mirror.example/simple?a=b'\n"
+    )
+    checkout.run('t3mpc')
+    assert checkout.done() == ['venv', 'libraries', 'compile', 'package']
+    assert set(checkout.beside('uv_settings').read_text().splitlines()) == {
+        'UV_DEFAULT_INDEX=https://mirror.example/simple?a=b',
+        'UV_INDEX=https://a.example/simple https://b.example/simple',
+        'UV_INDEX_STRATEGY=unsafe-best-match',
+        f'UV_FIND_LINKS={checkout.root}',
+    }
+    uv.unlink()
+    checkout.beside('no_uv').touch()
+    (checkout.root / '.venv' / 'stamp').unlink()
+    done = checkout.run('t3mpc')
+    assert (done.returncode, done.stdout) == (0, 't3mpc got \n'), done.stderr
+    assert checkout.done() == ['uv', 'ensurepip', 'libraries', 'compile', 'package']
+    assert f'{checkout.root}/.venv/bin/python -m pip' in checkout.beside('installed').read_text()
+    assert not (checkout.root / '.venv' / 'uv').exists()
+
+
+def test_executables_are_moved_and_copies_of_libraries_linked(tmp_path, monkeypatch):
+    finish = runpy.run_path(str(ROOT / 'scripts' / 'finish_install.py'))
+    bin_folder, target = tmp_path / 'bin', tmp_path / 'lib' / 't3mpc_ros'
+    for folder in (bin_folder, target):
+        folder.mkdir(parents=True)
+    (target / 'of_an_earlier_version').touch()
+    for name in (*EXECUTABLES, 'python'):
+        (bin_folder / name).touch()
+    finish['move_executables'](tmp_path)
+    assert {path.name for path in target.iterdir()} == EXECUTABLES
+    assert [path.name for path in bin_folder.iterdir()] == ['python']
+
+    size = finish['LARGE']
+    contents = {'a.so': b'1' * size, 'a.so.2': b'1' * size, 'b.so': b'2' * size, 'c.so': b'1'}
+    contents['d.so.1'] = b'1'
+    for name, content in contents.items():
+        (tmp_path / name).write_bytes(content)
+    finish['link_copies'](tmp_path)
+    assert {name: (tmp_path / name).read_bytes() for name in contents} == contents
+    assert (tmp_path / 'a.so').samefile(tmp_path / 'a.so.2')
+    assert not (tmp_path / 'c.so').samefile(tmp_path / 'd.so.1')  # not worth it
+    assert not list(tmp_path.glob('*.link'))
+
+
+def test_a_failed_installation_ends_the_compilation(checkout):
+    """It goes on beside the installation, and would keep a processor busy after the error."""
+    checkout.beside('slow_kernels').touch()
+    text = (checkout.bin / 'python3').read_text().replace('note package', 'exit 1')
+    (checkout.bin / 'python3').write_text(text)
+    # The pipe ends with the last process.
+    done = subprocess.run(**checkout.command('t3mpc'), timeout=50)
+    assert done.returncode == 1
+    assert 'error: the package could not be installed' in done.stderr
 
 
 def test_the_help_of_the_demo_needs_no_environment(checkout):
@@ -591,7 +705,7 @@ def test_a_failed_update_does_not_count_as_an_environment(checkout):
     checkout.run('t3mpc')
     with (checkout.root / 'requirements.txt').open('a') as text:
         text.write('# changed\n')
-    (checkout.notes.parent / 'no_index').touch()
+    checkout.beside('no_index').touch()
     assert checkout.run('t3mpc').returncode == 1
     assert not checkout.stamped
     assert checkout.run('t3mpc').returncode == 1

@@ -4,6 +4,7 @@
 
 import os
 from pathlib import Path
+import shutil
 import subprocess
 import sys
 
@@ -32,6 +33,34 @@ def test_fingerprint_depends_on_files_with_kernels_only(tmp_path):
     assert source_fingerprint(tmp_path) == before
     file.write_text('@kernel\ndef f(): return 2\n')
     assert source_fingerprint(tmp_path) != before
+
+
+def test_equal_sources_share_compiled_code_wherever_they_are(tmp_path):
+    """The compiler's cache is by path: each clone and each workspace compiled everything again."""
+    package = Path(__file__).resolve().parent.parent / 't3mpc_ros'
+    code = (
+        'import numpy as np, sys\n'
+        'from t3mpc_ros.fuzzy import inference\n'
+        'from t3mpc_ros.kernels import kernel\n'
+        'kernels = [k for k in vars(inference).values() if hasattr(k, "stats")]\n'
+        'print(kernels[0].stats.cache_path)\n'
+    )
+    folders = []
+    for name in ('one', 'two'):
+        copy = tmp_path / name
+        shutil.copytree(package, copy / 't3mpc_ros')
+        if name == 'two':
+            with (copy / 't3mpc_ros' / '__init__.py').open('a') as text:
+                text.write('# no kernel\n')
+        output = subprocess.check_output(
+            [sys.executable, '-c', code],
+            cwd=copy,
+            env=dict(os.environ, T3MPC_CACHE_DIR=str(tmp_path), PYTHONPATH=str(copy)),
+            text=True,
+        )
+        folders.append(Path(output.strip()))
+    assert folders[0] == folders[1]
+    assert folders[0].is_relative_to(tmp_path)
 
 
 def test_an_unwritable_folder_is_skipped(tmp_path):

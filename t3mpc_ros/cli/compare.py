@@ -85,6 +85,8 @@ def run(options: argparse.Namespace) -> int:
     ------
     ValueError
         An unknown case or method.
+    ModuleNotFoundError
+        A method needs a library that is not installed.
     """
     from t3mpc_ros.evaluation.method_comparison import comparison_page
     from t3mpc_ros.evaluation.method_comparison.compared_runs import (
@@ -94,6 +96,7 @@ def run(options: argparse.Namespace) -> int:
         default_methods,
         methods_for,
     )
+    from t3mpc_ros.evaluation.methods import require_libraries
     from t3mpc_ros.evaluation.reporting import Progress, strict_json
     from t3mpc_ros.evaluation.tuning.search_space import find_names
 
@@ -109,6 +112,7 @@ def run(options: argparse.Namespace) -> int:
         options.noise,
         options.gyro,
     )
+    require_libraries(plan.methods)
     for path in (options.json, options.html):
         if path:  # a folder that cannot be made is an error before the runs, not after them
             path.parent.mkdir(parents=True, exist_ok=True)

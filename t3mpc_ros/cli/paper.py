@@ -46,9 +46,17 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write everything and return 0."""
+    """Write everything and return 0.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        A compared method needs a library that is not installed.
+    """
+    from t3mpc_ros.evaluation.methods import NMPC, require_libraries
     from t3mpc_ros.evaluation.reporting import Progress
 
+    require_libraries([NMPC])
     output = options.output or Path('runs') / ('paper-quick' if options.quick else 'paper')
     chosen = PaperOptions(
         output=output,

@@ -89,7 +89,10 @@ def run(options: argparse.Namespace) -> int:
         The bag holds no topic of a robot, or a given topic cannot be used.
     BagError
         The bag cannot be read.
+    ModuleNotFoundError
+        A method needs a library that is not installed.
     """
+    from t3mpc_ros.evaluation.methods import require_libraries
     from t3mpc_ros.evaluation.tuning.search_space import find_names
 
     if options.robot not in (None, TWIN, *DRIVES):
@@ -97,6 +100,7 @@ def run(options: argparse.Namespace) -> int:
     known = options.table()
     names = find_names('method', options.methods, [method.name for method in known])
     methods = [method for method in known if method.name in names or not names]
+    require_libraries(method.name for method in methods)
     output = options.output or OUTPUT
     if options.robot == TWIN:
         from t3mpc_ros.evaluation.method_comparison.twin_tuning import tune_twin, twin_definitions

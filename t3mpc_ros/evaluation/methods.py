@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Table of compared methods: the baselines, and the proposed controller with its ablations."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from importlib.util import find_spec
+from importlib import import_module
 
 from t3mpc_ros.evaluation.baselines.adaptive_fuzzy import (
     AdaptiveIntervalType2,
@@ -43,6 +43,7 @@ from t3mpc_ros.evaluation.tuning.tuned_parameters import PACKAGED_FILE, TunedPar
 from t3mpc_ros.parameters.table import Parameters
 
 FULL = 'full'
+NMPC = 'CasADi NMPC'
 EXACT_MODEL = ', exact model'
 """Suffix of the name of a method whose model has no error."""
 MODEL_ERROR = 1.3
@@ -91,6 +92,12 @@ class ComparedMethod(MethodSpec):
     """Whether it has preview."""
 
 
+def require_libraries(names: Iterable[str]) -> None:
+    """Raise ModuleNotFoundError if one of these methods needs a library that is not installed."""
+    if any(name.startswith(NMPC) for name in names):
+        import_module('casadi')
+
+
 def _both(parameters: Parameters) -> dict[str, Parameters]:
     return dict.fromkeys(DRIVES, parameters)
 
@@ -119,10 +126,6 @@ def method_definitions() -> list[MethodDefinition]:
         SearchRange('bias_time', 0.005, 15.0),
         SearchRange('disturbance_share', 0.01, 1.5),
     )
-    nonlinear = []
-    if find_spec('casadi') is not None:
-        start = _both(CasadiNmpcParameters(model_error=MODEL_ERROR))
-        nonlinear = [MethodDefinition('CasADi NMPC', CasadiNmpc, start, mpc)]
     return [
         MethodDefinition(
             'PI + feed-forward',
@@ -194,7 +197,9 @@ def method_definitions() -> list[MethodDefinition]:
             _both(LinearMpcPreviewParameters(load_share=0.0, model_error=MODEL_ERROR)),
             mpc,
         ),
-        *nonlinear,
+        MethodDefinition(
+            NMPC, CasadiNmpc, _both(CasadiNmpcParameters(model_error=MODEL_ERROR)), mpc
+        ),
         MethodDefinition(
             FULL,
             ProposedController,
@@ -224,8 +229,6 @@ def proposed_parameters() -> dict[str, Parameters]:
 def methods(drive: str, store: TunedParameters | None = None) -> dict[str, ComparedMethod]:
     """Return every compared method by name, with its tuned parameters.
 
-    CasADi's nonlinear MPC is among them if CasADi is installed.
-
     Raises
     ------
     StoreError
@@ -244,7 +247,7 @@ def methods(drive: str, store: TunedParameters | None = None) -> dict[str, Compa
         found[each.name] = ComparedMethod(
             each.name, each.controller_type, parameters, True, True, previews
         )
-    for name in ('linear MPC preview', 'CasADi NMPC'):
+    for name in ('linear MPC preview', NMPC):
         if name in found:
             wrong, exact = found[name], f'{name}{EXACT_MODEL}'
             parameters = wrong.parameters.with_values({'model_error': 1.0})

@@ -613,7 +613,7 @@ def test_one_linearisation_a_step_follows_the_converged_plan():
 
 def test_without_casadi_only_making_one_fails(monkeypatch):
     monkeypatch.setitem(sys.modules, 'casadi', None)
-    with pytest.raises(ImportError, match='pip install casadi'):
+    with pytest.raises(ModuleNotFoundError, match='casadi'):
         CasadiNmpc(CasadiNmpcParameters(), _knowledge('velocity'))
 
 

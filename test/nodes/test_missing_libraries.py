@@ -54,6 +54,9 @@ def test_nodes_without_bags_need_no_bag_library(name, without, graph, request):
         ('rclpy', 'sim_robot', []),
         ('mcap', 't3mpc', ['bag', 'info', 'bag']),
         ('matplotlib', 't3mpc', ['paper', '--quick', '--output', 'out']),
+        ('casadi', 't3mpc', ['paper', '--quick', '--output', 'out']),
+        ('casadi', 't3mpc', ['compare']),
+        ('casadi', 't3mpc', ['tune', '--output', 'out.json']),
     ],
 )
 def test_a_missing_library_is_one_line_with_its_remedy(

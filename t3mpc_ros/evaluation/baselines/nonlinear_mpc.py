@@ -259,7 +259,7 @@ class CasadiNmpc(BaselineController):
 
     Raises
     ------
-    ImportError
+    ModuleNotFoundError
         CasADi is not installed.
     """
 
@@ -269,10 +269,7 @@ class CasadiNmpc(BaselineController):
     def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None:
         if not isinstance(parameters, CasadiNmpcParameters):
             raise ValueError(f'parameters must be CasadiNmpcParameters: got {parameters!r}')
-        try:
-            casadi = importlib.import_module('casadi')
-        except ImportError as error:
-            raise ImportError('CasadiNmpc needs CasADi: pip install casadi') from error
+        casadi = importlib.import_module('casadi')
         self.parameters = parameters
         self._knowledge = nominal_model
         self._torque = nominal_model.drive == 'torque'

@@ -1,0 +1,42 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Finish the installation of t3mpc_ros into the environment of this Python."""
+
+from collections import defaultdict
+from hashlib import sha256
+from importlib.metadata import distribution
+from pathlib import Path
+import shutil
+import sys
+
+LARGE = 500_000
+"""Size from which equal files are linked, bytes."""
+
+
+def move_executables(environment: Path) -> None:
+    """Move the executables from bin to lib/t3mpc_ros, the folder that ros2 run searches."""
+    folder = environment / 'lib' / 't3mpc_ros'
+    shutil.rmtree(folder, ignore_errors=True)  # with those of an earlier version
+    folder.mkdir()
+    for entry in distribution('t3mpc_ros').entry_points.select(group='console_scripts'):
+        (environment / 'bin' / entry.name).rename(folder / entry.name)
+
+
+def link_copies(environment: Path) -> None:
+    """Keep one file of equal shared libraries: wheels cannot contain links, and hold copies."""
+    libraries = defaultdict(list)
+    for path in sorted(environment.rglob('*.so*')):
+        if not path.is_symlink() and path.stat().st_size >= LARGE:
+            libraries[path.stat().st_size].append(path)
+    first = {}
+    for path in (path for group in libraries.values() if len(group) > 1 for path in group):
+        kept = first.setdefault(sha256(path.read_bytes()).digest(), path)
+        if not kept.samefile(path):
+            link = path.with_name(f'{path.name}.link')
+            link.hardlink_to(kept)
+            link.replace(path)
+
+
+if __name__ == '__main__':
+    move_executables(Path(sys.prefix))
+    link_copies(Path(sys.prefix))
