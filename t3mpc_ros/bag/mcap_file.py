@@ -1,357 +1,423 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Summary of an MCAP file, and completion of a file whose writer was interrupted.
+"""Complete MCAP files: topics, messages, metadata records and attachments.
 
-A file without its summary section, because the writer was killed or the disk was full, is rejected
-by ordinary readers, although every chunk written so far is intact.
+The ``mcap`` library parses the records. It does not verify the checksum of the summary, it ends at
+the first damaged chunk, it rejects the intact beginning of a truncated chunk, and it constructs an
+object for each record of a chunk, which takes three times as long as :meth:`DecodedChunk.records`.
 """
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-import io
-import os
+from bisect import bisect_left
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import SEEK_END
+from operator import attrgetter
 from pathlib import Path
+import re
 import struct
-from typing import Any
+from typing import Any, BinaryIO, NamedTuple
 import zlib
 
-from mcap.data_stream import ReadDataStream, RecordBuilder
+import lz4.frame
 from mcap.opcode import Opcode
-from mcap.reader import make_reader
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Message,
-    MessageIndex,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-    SummaryOffset,
-)
-from mcap.stream_reader import breakup_chunk
+from mcap.reader import NonSeekingReader, SeekingReader
+from mcap.summary import Summary
+import zstandard
 
+from t3mpc_ros.bag.metadata import NO_START_NS, BagMetadata, FileInformation, TopicInformation
+from t3mpc_ros.bag.qos import QosError, QosProfile, profiles_from_yaml
 from t3mpc_ros.bag.schema import BagError
 
 MCAP_SUFFIX = '.mcap'
-SPARE = 65_536
-"""Bytes that :func:`finalize_file` leaves free on a full disk, for ``metadata.yaml``."""
 MAGIC = b'\x89MCAP0\r\n'
+HEAD = struct.Struct('<BQ')
+"""Opcode and content length of every record."""
+MESSAGE_HEAD = struct.Struct('<HIQQ')
+"""Channel, sequence, log time and publish time before the data of a message."""
+FOOTER = struct.Struct('<QQI')
+"""Start of the summary, start of its offsets, checksum of the summary."""
+END_NS = 2**64
+"""After every stamp."""
+MESSAGE_OVERHEAD = 256
+"""Memory of a message in addition to its data, bytes."""
 
-_HEAD = struct.Struct('<BQ')  # opcode and length of every record
-_FOOTER_SIZE = _HEAD.size + 20
+_CHUNK_HEAD = struct.Struct('<QQQII')  # start, end, size, checksum, length of the compression name
+_NAME_LIMIT = 32
 
 
-@dataclass(frozen=True)
-class ChannelSummary:
-    """Topic of a file, with the unparsed metadata of its channel."""
+class SerializedMessage(NamedTuple):
+    """Message as CDR bytes; stamps in nanoseconds since 1970."""
 
     topic: str
-    type_name: str
-    profiles_text: str
-    type_hash: str
-    encoding: str
-    message_count: int
+    received_ns: int
+    published_ns: int
+    data: bytes
+
+    @property
+    def memory_size(self) -> int:
+        """Memory of the message, bytes."""
+        return len(self.data) + MESSAGE_OVERHEAD
+
+
+RECEIVE_TIME = attrgetter('received_ns')
+
+
+@dataclass(frozen=True, slots=True)
+class Attachment:
+    """File stored inside a bag, such as the model file of a controller."""
+
+    name: str
+    media_type: str
+    data: bytes
+    modified_ns: int = 0
+    """Modification time, nanoseconds since 1970; 0 = unknown."""
+
+
+class FileWindow:
+    """Random access to a file of fixed size; reads after its end are empty."""
+
+    def __init__(self, file: BinaryIO, size: int) -> None:
+        self._file = file
+        self.size = size
+
+    def read(self, start: int, count: int) -> bytes:
+        """Return up to ``count`` bytes from ``start``."""
+        count = min(count, self.size - start)
+        if count <= 0:
+            return b''
+        self._file.seek(start)
+        return self._file.read(count)
+
+
+class ChunkError(ValueError):
+    """No part of a chunk is usable."""
 
 
 @dataclass(frozen=True)
-class FileSummary:
-    """Content of the summary section of a complete file."""
+class DecodedChunk:
+    """Decompressed records of one chunk."""
 
-    message_count: int
-    start_ns: int
-    end_ns: int
-    channels: tuple[ChannelSummary, ...]
-    metadata_records: Mapping[str, Mapping[str, str]]
-    """Metadata records by name."""
+    data: bytes
+    complete: bool
+    checked: bool
+    """Whether a checksum covers the data."""
+
+    def records(self) -> Iterator[tuple[int, memoryview]]:
+        """Yield (opcode, content) of each complete record, then the rest as opcode 0."""
+        view = memoryview(self.data)
+        position = 0
+        while position + HEAD.size <= len(view):
+            opcode, length = HEAD.unpack_from(view, position)
+            end = position + HEAD.size + length
+            if end > len(view):
+                break
+            yield opcode, view[position + HEAD.size : end]
+            position = end
+        if position < len(view):
+            yield 0, view[position:]
 
 
-def read_file_summary(path: Path) -> FileSummary | None:
-    """Return the summary of a file; None if it is incomplete or its summary is damaged.
+def decode_chunk(window: FileWindow, start: int) -> DecodedChunk:
+    """Return the content of the chunk at ``start``; of a truncated chunk, the beginning.
 
-    Only the end of the file is read; its checksum is verified.
+    Raises
+    ------
+    ChunkError
+        The compression is unknown, decompression fails, or the checksum, or without a checksum
+        the size, is wrong.
+    """
+    position = start + HEAD.size
+    head = window.read(position, _CHUNK_HEAD.size)
+    if len(head) < _CHUNK_HEAD.size:
+        raise ChunkError('the file ends inside the head of a chunk')
+    _, _, size, checksum, name_length = _CHUNK_HEAD.unpack(head)
+    position += _CHUNK_HEAD.size
+    name = window.read(position, min(name_length, _NAME_LIMIT))
+    position += name_length
+    prefix = window.read(position, 8)
+    if len(prefix) < 8:
+        raise ChunkError('the file ends inside the head of a chunk')
+    length = int.from_bytes(prefix, 'little')
+    stored = window.read(position + 8, length)
+    data, finished = _decompress(name, stored)
+    if len(stored) < length:
+        return DecodedChunk(data, complete=False, checked=False)
+    if not finished:
+        raise ChunkError('the compressed data of a chunk are incomplete')
+    if checksum:
+        if zlib.crc32(data) != checksum:
+            raise ChunkError('the checksum of a chunk is wrong')
+    elif len(data) != size:
+        raise ChunkError(f'a chunk has {len(data)} bytes instead of {size}')
+    return DecodedChunk(data, complete=True, checked=checksum != 0)
+
+
+def _decompress(name: bytes, stored: bytes) -> tuple[bytes, bool]:
+    """Return the decompressed bytes of ``stored``, and whether they are complete.
+
+    Memory is allocated by the actual output, not by the sizes in the chunk, which may be damaged.
+    """
+    if name == b'':
+        return stored, True
+    decoder: Any
+    if name == b'zstd':
+        decoder = zstandard.ZstdDecompressor().decompressobj()
+    elif name == b'lz4':
+        decoder = lz4.frame.LZ4FrameDecompressor()
+    else:
+        raise ChunkError(f'the compression of a chunk is unknown: {name!r}')
+    if not stored:
+        return b'', False
+    try:
+        data = bytes(decoder.decompress(stored))
+    except (zstandard.ZstdError, RuntimeError, MemoryError) as error:
+        raise ChunkError(f'a chunk does not decompress: {error}') from error
+    return data, bool(decoder.eof)
+
+
+def summary_is_valid(window: FileWindow, footer_end: int) -> bool:
+    """Return whether the checksum of the summary is correct or absent."""
+    start, _, checksum = FOOTER.unpack(window.read(footer_end - FOOTER.size, FOOTER.size))
+    start = start or footer_end - FOOTER.size - HEAD.size
+    return not checksum or zlib.crc32(window.read(start, footer_end - 4 - start)) == checksum
+
+
+class McapFile:
+    """Complete MCAP file; returned by :func:`read_mcap_file`. It is open only while it is read."""
+
+    def __init__(
+        self, path: Path, summary: Summary, metadata_records: Mapping[str, Mapping[str, str]]
+    ) -> None:
+        self.path = path
+        self._summary = summary
+        self.metadata_records = metadata_records
+        """Tables of text by title; the newest of each title."""
+        statistics: Any = summary.statistics
+        self.message_count: int = statistics.message_count
+        some = self.message_count > 0
+        self.start_ns: int = statistics.message_start_time if some else 0
+        self.end_ns: int = statistics.message_end_time if some else -1
+        """Receive time of the last message; before the start if there is no message."""
+        counts = statistics.channel_message_counts
+        self.topics = [
+            TopicInformation(
+                channel.topic,
+                summary.schemas[channel.schema_id].name if channel.schema_id else '',
+                _profiles(channel.metadata.get('offered_qos_profiles', '')),
+                channel.metadata.get('topic_type_hash', ''),
+                counts.get(channel.id, 0),
+                channel.message_encoding,
+            )
+            for channel in summary.channels.values()
+        ]
+        self.damaged: dict[int, int] = {}
+        """Number of messages, of all topics, in skipped chunks, by position of the chunk."""
+
+    def messages(
+        self,
+        topics: Collection[str] | None = None,
+        start_ns: int = 0,
+        stop_ns: int = END_NS,
+        skip_damaged: bool = False,
+    ) -> Iterator[SerializedMessage]:
+        """Yield the messages of ``topics`` from ``start_ns`` until before ``stop_ns``.
+
+        They are in order of receipt, with equal times in the order of the file. Damaged chunks
+        are an error, or with ``skip_damaged`` counted in :attr:`damaged`.
+
+        Raises
+        ------
+        BagError
+            The file is damaged.
+        """
+        channels = self._summary.channels.values()
+        names = {
+            each.id: each.topic for each in channels if topics is None or each.topic in topics
+        }
+        with self.path.open('rb') as file, read_errors(str(self.path)):
+            if not self._indexed():
+                for _, channel, message in NonSeekingReader(file).iter_messages(
+                    set(names.values()), starting_at=max(start_ns, 0), ending_before=stop_ns
+                ):
+                    stamps = message.log_time, message.publish_time
+                    yield SerializedMessage(channel.topic, *stamps, bytes(message.data))
+                return
+            window = FileWindow(file, file.seek(0, SEEK_END))
+            chunks = [
+                each
+                for each in self._summary.chunk_indexes
+                if each.message_end_time >= start_ns
+                and each.message_start_time < stop_ns
+                and not names.keys().isdisjoint(each.message_index_offsets or names)
+            ]
+            chunks.sort(key=lambda each: (each.message_start_time, each.chunk_start_offset))
+            starts = [each.message_start_time for each in chunks[1:]] + [END_NS]
+            pending: list[SerializedMessage] = []
+            for chunk, next_start_ns in zip(chunks, starts, strict=False):
+                try:
+                    pending += _chunk_messages(window, chunk, names, start_ns, stop_ns)
+                except ChunkError:
+                    if not skip_damaged:
+                        raise
+                    self.damaged[chunk.chunk_start_offset] = _message_count(window, chunk)
+                pending.sort(key=RECEIVE_TIME)
+                count = bisect_left(pending, next_start_ns, key=RECEIVE_TIME)
+                yield from pending[:count]
+                del pending[:count]
+
+    def attachments(self) -> list[tuple[int, Attachment]]:
+        """Return the attachments, each with the time at which it was read.
+
+        Raises
+        ------
+        BagError
+            An attachment is damaged.
+        """
+        with self.path.open('rb') as file, read_errors(f'the attachments of {self.path}'):
+            window = FileWindow(file, file.seek(0, SEEK_END))
+            for index in self._summary.attachment_indexes:
+                start, length = index.offset + HEAD.size, index.length - HEAD.size
+                if not attachment_is_valid(window.read(start, length)):
+                    raise BagError(f'the attachment {index.name} of {self.path} is damaged')
+            file.seek(0)
+            found = list(SeekingReader(file, record_size_limit=window.size).iter_attachments())
+        return [
+            (
+                item.log_time,
+                Attachment(item.name, item.media_type, bytes(item.data), item.create_time),
+            )
+            for item in found
+        ]
+
+    def attachment_sizes(self) -> list[tuple[str, str, int]]:
+        """Return name, media type and size in bytes of each attachment."""
+        indexes = self._summary.attachment_indexes
+        return [(item.name, item.media_type, item.data_size) for item in indexes]
+
+    def _indexed(self) -> bool:
+        """Return whether every message is in a chunk with an index."""
+        statistics: Any = self._summary.statistics
+        return bool(statistics.chunk_count == len(self._summary.chunk_indexes) > 0)
+
+
+def _chunk_messages(
+    window: FileWindow, index: Any, names: Mapping[int, str], start_ns: int, stop_ns: int
+) -> list[SerializedMessage]:
+    """Return the selected messages of one chunk."""
+    chunk = decode_chunk(window, index.chunk_start_offset)
+    if not chunk.complete:
+        raise ChunkError('the file ends inside a chunk')
+    found = []
+    for opcode, content in chunk.records():
+        if opcode == Opcode.MESSAGE:
+            channel, _, received_ns, published_ns = MESSAGE_HEAD.unpack_from(content)
+            if channel in names and start_ns <= received_ns < stop_ns:
+                data = bytes(content[MESSAGE_HEAD.size :])
+                found.append(SerializedMessage(names[channel], received_ns, published_ns, data))
+    return found
+
+
+def _message_count(window: FileWindow, index: Any) -> int:
+    """Return the number of messages of a chunk by its message indexes."""
+    return sum(
+        (int.from_bytes(window.read(offset + 1, 8), 'little') - 6) // 16
+        for offset in index.message_index_offsets.values()
+    )
+
+
+def attachment_is_valid(content: bytes) -> bool:
+    """Return whether the checksum of an attachment is correct or absent."""
+    checksum = int.from_bytes(content[-4:], 'little')
+    return checksum in (0, zlib.crc32(content[:-4]))
+
+
+def read_mcap_file(path: Path) -> McapFile | None:
+    """Return a complete file; None if it is incomplete or its summary is damaged.
+
+    Only the end of the file and its metadata records are read.
     """
     try:
         with path.open('rb') as file:
-            if not _has_valid_end(file):
+            window = FileWindow(file, file.seek(0, SEEK_END))
+            end = window.size - len(MAGIC)
+            tail = window.read(end - FOOTER.size - HEAD.size, window.size)
+            footer = tail[: HEAD.size] == HEAD.pack(Opcode.FOOTER, FOOTER.size)
+            if not footer or tail[-len(MAGIC) :] != MAGIC or not summary_is_valid(window, end):
                 return None
             file.seek(0)
-            reader = make_reader(file)
+            reader = SeekingReader(file, record_size_limit=window.size)
             summary = reader.get_summary()
             if summary is None or summary.statistics is None:
                 return None
-            counts = summary.statistics.channel_message_counts
-            return FileSummary(
-                message_count=summary.statistics.message_count,
-                start_ns=summary.statistics.message_start_time,
-                end_ns=summary.statistics.message_end_time,
-                channels=tuple(
-                    ChannelSummary(
-                        channel.topic,
-                        _schema_name(summary.schemas.get(channel.schema_id)),
-                        channel.metadata.get('offered_qos_profiles', ''),
-                        channel.metadata.get('topic_type_hash', ''),
-                        channel.message_encoding,
-                        counts.get(channel.id, 0),
-                    )
-                    for channel in summary.channels.values()
-                ),
-                metadata_records={
-                    item.name: dict(item.metadata) for item in reader.iter_metadata()
-                },
-            )
+            records = {item.name: dict(item.metadata) for item in reader.iter_metadata()}
+            records.pop('rosbag2', None)
+            return McapFile(path, summary, records)
     except Exception:  # the parser of the library raises anything on damaged bytes
         return None
 
 
-def finalize_file(path: Path) -> int:
-    """Truncate an incomplete file at its last intact chunk, append the summary, count messages.
+def has_mcap_magic(path: Path) -> bool:
+    """Return whether a file begins as an MCAP file."""
+    with path.open('rb') as file:
+        return file.read(len(MAGIC)) == MAGIC
 
-    Messages of the last, unwritten chunk are lost. If the disk is full, chunks are removed from
-    the end until the summary fits and :data:`SPARE` bytes remain free. A complete file is not
-    changed.
 
-    Returns
-    -------
-    int
-        Number of messages in the file.
+def find_files(folder: Path) -> tuple[list[McapFile], tuple[str, ...]]:
+    """Return the complete MCAP files of a folder, and the names of the incomplete ones.
 
-    Raises
-    ------
-    BagError
-        The file is not MCAP, or was not written by :class:`~t3mpc_ros.bag.writer.BagWriter`.
-    OSError
-        The file is not writable, or the disk has no room for an empty summary.
+    Files are sorted by their first message, as players expect.
     """
-    if (summary := read_file_summary(path)) is not None:
-        return summary.message_count
-    with open_unbuffered(path, 'r+b') as file:
-        parts = list(_intact_parts(file))
-        if not parts:
-            raise BagError(f'{path} does not begin with the MCAP magic')
-        while True:
-            start = parts[-1].end
-            try:
-                file.truncate(start)
-                file.seek(start)
-                end = _end_of_file(parts, start)
-                spare = SPARE if len(parts) > 1 else 0  # the last part cannot be removed
-                write_all(file, end + bytes(spare))
-                os.fsync(file.fileno())
-                file.truncate(start + len(end))
-            except OSError:
-                file.truncate(start)
-                if len(parts) == 1:
-                    raise
-                parts.pop()
-                continue
-            return sum(sum(part.counts.values()) for part in parts)
+    paths = sorted(folder.glob(f'*{MCAP_SUFFIX}'), key=lambda path: _natural_sort_key(path.name))
+    found = {path: read_mcap_file(path) for path in paths}
+    complete = [file for file in found.values() if file is not None]
+    complete.sort(key=lambda file: file.start_ns if file.message_count else NO_START_NS)
+    return complete, tuple(path.name for path, file in found.items() if file is None)
 
 
-def open_unbuffered(path: Path, mode: str) -> Any:
-    """Open ``path`` without a buffer, so that each write succeeds or fails immediately."""
-    return path.open(mode, buffering=0)
+def collect_metadata(folder: Path) -> tuple[BagMetadata, tuple[str, ...]]:
+    """Return the metadata of the complete MCAP files of ``folder``, and the incomplete files.
 
-
-def write_all(file: Any, data: bytes) -> None:
-    """Write all of ``data`` to an unbuffered file, whose writes may be partial."""
-    view = memoryview(data)
-    while view:
-        view = view[file.write(view) :]
-
-
-def _schema_name(schema: Any) -> str:
-    return '' if schema is None else str(schema.name)
-
-
-@dataclass
-class _IntactPart:
-    """Intact part of a file that ends at ``end``: header, metadata, attachment or chunk."""
-
-    end: int
-    schemas: list[Any] = field(default_factory=list)
-    channels: list[Any] = field(default_factory=list)
-    counts: dict[int, int] = field(default_factory=dict)
-    chunk: Any = None
-    metadata: Any = None
-    attachment: Any = None
-
-
-def _has_valid_end(file: Any) -> bool:
-    size = file.seek(0, io.SEEK_END)
-    end = _FOOTER_SIZE + len(MAGIC)
-    if size < len(MAGIC) + end:
-        return False
-    file.seek(size - end)
-    tail = file.read(end)
-    opcode, length = _HEAD.unpack_from(tail)
-    start, _, crc = struct.unpack_from('<QQI', tail, _HEAD.size)
-    if tail[-8:] != MAGIC or opcode != Opcode.FOOTER or length != 20 or start == 0:
-        return False
-    file.seek(start)
-    covered = file.read(size - start - len(MAGIC) - 4)  # all but the checksum itself
-    sound = crc in (0, zlib.crc32(covered))
-    file.seek(0)
-    return sound and file.read(len(MAGIC)) == MAGIC
-
-
-def _records(file: Any) -> Iterator[tuple[int, int, bytes]]:
-    """Yield (start, opcode, content) of each complete record."""
-    size = file.seek(0, io.SEEK_END)
-    position = len(MAGIC)
-    while position + _HEAD.size <= size:
-        file.seek(position)
-        opcode, length = _HEAD.unpack(file.read(_HEAD.size))
-        if position + _HEAD.size + length > size:
-            return
-        yield position, opcode, file.read(length)
-        position += _HEAD.size + length
-
-
-def _intact_parts(file: Any) -> Iterator[_IntactPart]:
-    """Yield the intact parts; a chunk is intact if all of its message indexes follow it.
-
-    Raises
-    ------
-    BagError
-        The structure of the file is not that of ``BagWriter``: truncating it at the last known
-        part could remove intact messages.
+    A topic has one entry per distinct list of offered profiles: rosbags finds the messages of a
+    file only under the profiles stored in that file.
     """
-    file.seek(0)
-    if file.read(len(MAGIC)) != MAGIC:
-        return
-    waiting: _IntactPart | None = None
-    for start, opcode, content in _records(file):
-        end = start + _HEAD.size + len(content)
-        stream = ReadDataStream(io.BytesIO(content))
-        if opcode in _FOREIGN or (opcode == Opcode.CHUNK and waiting):
-            raise BagError(
-                'only files of BagWriter can be finalized: this file differs in structure'
-            )
-        if opcode == Opcode.HEADER:
-            yield _IntactPart(end)
-        elif opcode == Opcode.METADATA:
-            name = Metadata.read(stream).name
-            yield _IntactPart(end, metadata=MetadataIndex(start, end - start, name))
-        elif opcode == Opcode.ATTACHMENT:
-            try:
-                yield _IntactPart(end, attachment=_attachment_index(start, end, content))
-            except Exception:  # the parser of the library raises anything on damaged bytes
-                return
-        elif opcode == Opcode.CHUNK:
-            try:
-                waiting = _open_chunk(start, end, Chunk.read(stream))
-            except Exception:  # the decompressor raises anything on damaged bytes
-                return
-        elif opcode == Opcode.MESSAGE_INDEX and waiting:
-            channel = MessageIndex.read(stream).channel_id
-            waiting.chunk.message_index_offsets[channel] = start
-            waiting.end = end
-            if waiting.chunk.message_index_offsets.keys() == waiting.counts.keys():
-                waiting.chunk.message_index_length = (
-                    end - waiting.chunk.chunk_start_offset - waiting.chunk.chunk_length
-                )
-                yield waiting
-                waiting = None
-        else:  # end of the data section, or a preallocated block
-            return
+    complete, incomplete = find_files(folder)
+    files = []
+    topics: dict[tuple[object, ...], TopicInformation] = {}
+    for file in complete:
+        count, span = file.message_count, file.end_ns - file.start_ns
+        name = file.path.name
+        files.append(
+            FileInformation(name, file.start_ns, span, count) if count else FileInformation(name)
+        )
+        for topic in file.topics:
+            key = (topic.name, topic.type_name, topic.offered_qos_profiles, topic.type_hash)
+            topics[key] = topics[key].merged(topic) if key in topics else topic
+    return BagMetadata(tuple(files), tuple(topics.values())), incomplete
 
 
-def _open_chunk(start: int, end: int, chunk: Any) -> _IntactPart:
-    part = _IntactPart(end)
-    for record in breakup_chunk(chunk, validate_crc=True):
-        if isinstance(record, Message):
-            part.counts[record.channel_id] = part.counts.get(record.channel_id, 0) + 1
-        elif isinstance(record, Channel):
-            part.channels.append(record)
-        elif isinstance(record, Schema):
-            part.schemas.append(record)
-    part.chunk = ChunkIndex(
-        chunk_length=end - start,
-        chunk_start_offset=start,
-        compression=chunk.compression,
-        compressed_size=len(chunk.data),
-        message_end_time=chunk.message_end_time,
-        message_index_length=0,
-        message_index_offsets={},
-        message_start_time=chunk.message_start_time,
-        uncompressed_size=chunk.uncompressed_size,
-    )
-    return part
+@contextmanager
+def read_errors(what: str, error_type: Callable[[str], BagError] = BagError) -> Iterator[None]:
+    """Convert the errors of the libraries for damaged files to a :class:`BagError`."""
+    try:
+        yield
+    except BagError:
+        raise
+    except Exception as error:  # parsers and decompressors raise anything on damaged bytes
+        text = str(error) or type(error).__name__
+        raise error_type(f'{what} cannot be read: {text}') from error
 
 
-def _attachment_index(start: int, end: int, content: bytes) -> AttachmentIndex:
-    """Return the index of an attachment, or raise ValueError if its checksum is wrong."""
-    if zlib.crc32(content[:-4]) != int.from_bytes(content[-4:], 'little'):
-        raise ValueError('an attachment is damaged')
-    item = Attachment.read(ReadDataStream(io.BytesIO(content)))
-    return AttachmentIndex(
-        create_time=item.create_time,
-        data_size=len(item.data),
-        length=end - start,
-        log_time=item.log_time,
-        media_type=item.media_type,
-        name=item.name,
-        offset=start,
-    )
+def _profiles(text: str) -> tuple[QosProfile, ...]:
+    """Return the profiles of a channel; none if another program wrote unknown policies."""
+    try:
+        return profiles_from_yaml(text)
+    except QosError:
+        return ()
 
 
-def _end_of_file(parts: list[_IntactPart], start: int) -> bytes:
-    """Return the data-end record, the summary section and the footer."""
-    chunks = [part.chunk for part in parts if part.chunk]
-    schemas = [schema for part in parts for schema in part.schemas]
-    channels = [channel for part in parts for channel in part.channels]
-    metadata = [part.metadata for part in parts if part.metadata]
-    attachments = [part.attachment for part in parts if part.attachment]
-    counts: dict[int, int] = {}
-    for part in parts:
-        for channel, count in part.counts.items():
-            counts[channel] = counts.get(channel, 0) + count
-    statistics = Statistics(
-        attachment_count=len(attachments),
-        channel_count=len(channels),
-        channel_message_counts=counts,
-        chunk_count=len(chunks),
-        message_count=sum(counts.values()),
-        message_end_time=max((chunk.message_end_time for chunk in chunks), default=0),
-        message_start_time=min((chunk.message_start_time for chunk in chunks), default=0),
-        metadata_count=len(metadata),
-        schema_count=len(schemas),
-    )
-    head, body = RecordBuilder(), RecordBuilder()
-    DataEnd(0).write(head)
-    head_bytes = head.end()
-    summary_start = start + len(head_bytes)
-    offsets = []
-    for group in (schemas, channels, [statistics], chunks, attachments, metadata):
-        before = body.count
-        for record in group:
-            record.write(body)
-        if group:
-            opcode = _OPCODES[type(group[0])]
-            offsets.append(SummaryOffset(opcode, summary_start + before, body.count - before))
-    offset_start = summary_start + body.count
-    for offset in offsets:
-        offset.write(body)
-    body_bytes = body.end()
-    footer = _HEAD.pack(Opcode.FOOTER, 20) + struct.pack('<QQ', summary_start, offset_start)
-    crc = zlib.crc32(footer, zlib.crc32(body_bytes))
-    tail = RecordBuilder()
-    Footer(summary_start, offset_start, crc).write(tail)
-    return bytes(head_bytes + body_bytes + tail.end() + MAGIC)
-
-
-_FOREIGN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
-_OPCODES = {
-    Schema: Opcode.SCHEMA,
-    Channel: Opcode.CHANNEL,
-    Statistics: Opcode.STATISTICS,
-    ChunkIndex: Opcode.CHUNK_INDEX,
-    AttachmentIndex: Opcode.ATTACHMENT_INDEX,
-    MetadataIndex: Opcode.METADATA_INDEX,
-}
+def _natural_sort_key(name: str) -> list[tuple[int, str]]:
+    """Return a sort key that places ``run_10`` after ``run_9``."""
+    return [
+        (int(part), '') if part.isdecimal() else (-1, part) for part in re.split(r'(\d+)', name)
+    ]

@@ -6,16 +6,14 @@ Fields follow ``rosbag2_storage/include/rosbag2_storage/yaml.hpp`` (branch jazzy
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import os
 from pathlib import Path
-import re
 from typing import Any
 
 import yaml
 
-from t3mpc_ros.bag.mcap_file import MCAP_SUFFIX, FileSummary, read_file_summary
-from t3mpc_ros.bag.qos import QosError, QosProfile, dump_yaml, profiles_from_yaml
+from t3mpc_ros.bag.qos import QosProfile, dump_yaml
 from t3mpc_ros.bag.schema import BagError
 
 METADATA_FILE_NAME = 'metadata.yaml'
@@ -36,10 +34,23 @@ class TopicInformation:
 
     name: str
     type_name: str
-    offered_qos_profiles: tuple[QosProfile, ...]
-    type_hash: str
-    message_count: int
+    offered_qos_profiles: tuple[QosProfile, ...] = ()
+    """Profiles of the publishers."""
+    type_hash: str = ''
+    message_count: int = 0
     serialization_format: str = 'cdr'
+
+    def merged(self, other: 'TopicInformation') -> 'TopicInformation':
+        """Return this topic with the messages, and the other profiles, of ``other``."""
+        own = self.offered_qos_profiles
+        cdr = self.serialization_format == 'cdr'
+        return replace(
+            self,
+            offered_qos_profiles=own
+            + tuple(p for p in other.offered_qos_profiles if p not in own),
+            message_count=self.message_count + other.message_count,
+            serialization_format=other.serialization_format if cdr else self.serialization_format,
+        )
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the entry of ``topics_with_message_count``."""
@@ -194,60 +205,3 @@ def read_metadata(folder: Path) -> BagMetadata:
         raise MetadataError(f'{path} cannot be read: {error.strerror}') from error
     except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise MetadataError(f'{path} is damaged: {error!r}') from error
-
-
-def collect_metadata(folder: Path) -> tuple[BagMetadata, tuple[str, ...]]:
-    """Return the metadata of the complete MCAP files of ``folder``, and the incomplete files.
-
-    Files are sorted by their first message, as players expect. A topic has one entry per distinct
-    list of offered profiles: rosbags finds the messages of a file only under the profiles stored
-    in that file.
-    """
-    complete: list[tuple[str, FileSummary]] = []
-    incomplete = []
-    for path in sorted(
-        folder.glob(f'*{MCAP_SUFFIX}'), key=lambda path: _natural_sort_key(path.name)
-    ):
-        summary = read_file_summary(path)
-        if summary is None:
-            incomplete.append(path.name)
-        else:
-            complete.append((path.name, summary))
-    complete.sort(key=lambda item: item[1].start_ns if item[1].message_count else NO_START_NS)
-    files = []
-    topics: dict[tuple[str, ...], TopicInformation] = {}
-    for name, summary in complete:
-        span = summary.end_ns - summary.start_ns
-        count = summary.message_count
-        files.append(
-            FileInformation(name, summary.start_ns, span, count)
-            if count
-            else FileInformation(name)
-        )
-        for channel in summary.channels:
-            key = (channel.topic, channel.type_name, channel.profiles_text, channel.type_hash)
-            before = topics[key].message_count if key in topics else 0
-            topics[key] = TopicInformation(
-                channel.topic,
-                channel.type_name,
-                _profiles(channel.profiles_text),
-                channel.type_hash,
-                before + channel.message_count,
-                channel.encoding,
-            )
-    return BagMetadata(tuple(files), tuple(topics.values())), tuple(incomplete)
-
-
-def _profiles(text: str) -> tuple[QosProfile, ...]:
-    """Return the profiles of a channel; none if another program wrote unknown policies."""
-    try:
-        return profiles_from_yaml(text)
-    except QosError:
-        return ()
-
-
-def _natural_sort_key(name: str) -> list[tuple[int, str]]:
-    """Return a sort key that places ``run_10`` after ``run_9``."""
-    return [
-        (int(part), '') if part.isdecimal() else (-1, part) for part in re.split(r'(\d+)', name)
-    ]

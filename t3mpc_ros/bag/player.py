@@ -15,15 +15,14 @@ import queue
 import threading
 from typing import Generic, NamedTuple, Self, TypeVar
 
+from t3mpc_ros.bag.mcap_file import SerializedMessage
 from t3mpc_ros.bag.merged_reader import (
     MergedReader,
     ScheduledMessage,
-    SerializedBag,
-    StoredMessage,
     alignment_offsets_ns,
     loop_duration_ns,
-    open_serialized_bag,
 )
+from t3mpc_ros.bag.reader import BagReader, open_bag
 from t3mpc_ros.bag.topic_filter import PlayTopicFilter, TopicFilterError, parse_remappings
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
@@ -187,10 +186,10 @@ class PlaybackParameters(Parameters):
         BagError
             A bag cannot be read, or a topic has two types.
         """
-        bags: list[SerializedBag] = []
+        bags: list[BagReader] = []
         try:
             for path in self.uris:
-                bags.append(open_serialized_bag(path))
+                bags.append(open_bag(path))
             offsets_ns = [round(offset * NANOSECONDS) for offset in self.bag_offsets]
             offsets_ns = offsets_ns or [0] * len(bags)
             if self.align_bags and bags:
@@ -202,7 +201,9 @@ class PlaybackParameters(Parameters):
             for bag in bags:
                 bag.close()
             raise
-        return reader, tuple(f'{bag.path}/{name}' for bag in bags for name in bag.incomplete_files)
+        return reader, tuple(
+            f'{bag.folder}/{name}' for bag in bags for name in bag.incomplete_files
+        )
 
     def time_range_ns(self, reader: MergedReader) -> tuple[int, int]:
         """Return the first and the last receive time to play.
@@ -234,7 +235,7 @@ class DueMessage(NamedTuple):
     """Due time on the clock of the caller."""
     stamp_ns: int
     """Bag time."""
-    message: StoredMessage | None
+    message: SerializedMessage | None
     """None for a clock tick."""
 
 

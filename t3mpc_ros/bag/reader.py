@@ -1,75 +1,131 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Bag reader: decoded messages and time series of numbers from MCAP and sqlite3 bags."""
+"""The bag reader: contents, serialized and decoded messages, and time series of any bag."""
 
 from array import array
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from functools import partial
+import heapq
 from operator import attrgetter
 from pathlib import Path
 import re
-import struct
 from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.highlevel import AnyReader, AnyReaderError
-from rosbags.rosbag2 import ReaderError
-from rosbags.serde import SerdeError
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Reader as Ros1Reader
+from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from t3mpc_ros.bag.mcap_file import MCAP_SUFFIX, read_file_summary
-from t3mpc_ros.bag.metadata import METADATA_FILE_NAME, collect_metadata
-from t3mpc_ros.bag.schema import BagError
-from t3mpc_ros.bag.writer import DataError, UnknownTopicError
+from t3mpc_ros.bag.mcap_file import (
+    END_NS,
+    MCAP_SUFFIX,
+    Attachment,
+    McapFile,
+    SerializedMessage,
+    find_files,
+    has_mcap_magic,
+    read_errors,
+    read_mcap_file,
+)
+from t3mpc_ros.bag.metadata import METADATA_FILE_NAME, TopicInformation
+from t3mpc_ros.bag.qos import UNLIMITED, QosProfile
+from t3mpc_ros.bag.schema import BagError, DataError, UnknownTopicError
 from t3mpc_ros.geometry.types import NANOSECONDS
 
 Array = NDArray[np.float64]
 
+SQLITE_SUFFIX, ROS1_SUFFIX = '.db3', '.bag'
+
+_STORAGES = {MCAP_SUFFIX: 'mcap', SQLITE_SUFFIX: 'sqlite3', ROS1_SUFFIX: 'ROS 1'}
 _STEP = re.compile(r'(\w+)\[(\d+)\]')
 
 
-@dataclass(frozen=True, slots=True)
-class TopicSummary:
-    """Topic of a bag."""
+class RosbagsFile:
+    """File that ``rosbags`` reads: sqlite3, ROS 1, or a folder that rosbag2 compressed.
 
-    name: str
-    type_name: str
-    message_count: int
+    The library does not return publish stamps: they are the receive stamps.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.metadata_records: Mapping[str, Mapping[str, str]] = {}
+        self.damaged: dict[int, int] = {}
+        with read_errors(str(path), DataError):
+            self._reader: Any = (Ros1Reader if path.suffix == ROS1_SUFFIX else Reader)(path)
+            self._reader.open()
+        self.message_count: int = self._reader.message_count
+        some = self.message_count > 0
+        self.start_ns: int = self._reader.start_time if some else 0
+        self.end_ns: int = self._reader.end_time - 1 if some else -1  # its end is exclusive
+        self.topics = [_topic_information(each) for each in self._reader.connections]
+
+    def messages(
+        self,
+        topics: Collection[str] | None = None,
+        start_ns: int = 0,
+        stop_ns: int = END_NS,
+        skip_damaged: bool = False,
+    ) -> Iterator[SerializedMessage]:
+        """Yield messages as :meth:`McapFile.messages`; damaged ones are always an error."""
+        selected = [x for x in self._reader.connections if topics is None or x.topic in topics]
+        if not selected or start_ns > self.end_ns:
+            return  # the library would read all topics for an empty selection
+        last_ns = min(stop_ns, UNLIMITED)  # the largest integer of sqlite3
+        with read_errors(str(self.path), DataError):
+            for item, stamp_ns, data in self._reader.messages(selected, start_ns, last_ns):
+                yield SerializedMessage(item.topic, stamp_ns, stamp_ns, bytes(data))
+
+    def attachments(self) -> list[tuple[int, Attachment]]:
+        """Return no attachment: these formats have none."""
+        return []
+
+    def attachment_sizes(self) -> list[tuple[str, str, int]]:
+        """Return no attachment."""
+        return []
+
+    def close(self) -> None:
+        """Close the file; idempotent."""
+        reader, self._reader = self._reader, None
+        if reader is not None:
+            reader.close()
+
+
+BagFile = McapFile | RosbagsFile
 
 
 class BagReader:
-    """Open bag with decoded messages; created by :func:`open_bag`, a context manager.
+    """Open bag; created by :func:`open_bag`, a context manager.
 
-    Times are seconds since :attr:`start_ns`, the receive time of the first message.
+    Stamps are nanoseconds since 1970, times are seconds since :attr:`start_ns`. The time ranges
+    of the files of a split or continued bag may overlap.
     """
 
     def __init__(
-        self,
-        folder: Path,
-        reader: Any,
-        incomplete_files: tuple[str, ...],
-        metadata_records: Mapping[str, Mapping[str, str]],
+        self, path: Path, files: Collection[BagFile], incomplete_files: tuple[str, ...]
     ) -> None:
-        self._reader = reader
-        self.folder = folder
+        self.folder = path
+        """Folder, or file, of the bag."""
+        self.files = tuple(files)
         self.incomplete_files = incomplete_files
-        """Files without a valid end, which are skipped; ``finalize_file`` completes them."""
-        self.metadata_records = metadata_records
-        """Tables of text by title; the newest of each title."""
-        some = reader.message_count > 0
-        self.start_ns: int = reader.start_time if some else 0
-        self.end_ns: int = reader.end_time - 1 if some else 0  # the end of rosbags is exclusive
-        counts: dict[str, int] = {}
-        for connection in reader.connections:
-            counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
-        types = {connection.topic: connection.msgtype for connection in reader.connections}
-        self.topics: dict[str, TopicSummary] = {
-            name: TopicSummary(name, types[name], counts[name]) for name in sorted(types)
-        }
+        """MCAP files without a valid end, which are skipped; they need a recovery."""
+        some = [file for file in files if file.message_count]
+        self.start_ns = min((file.start_ns for file in some), default=0)
+        """Receive time of the first message."""
+        self.end_ns = max((file.end_ns for file in some), default=0)
+        """Receive time of the last message."""
+        self.message_count = sum(file.message_count for file in files)
+        self.topics: dict[str, TopicInformation] = merge_topics(
+            topic for file in files for topic in file.topics
+        )
         """By name, including topics without messages."""
+        self.metadata_records: dict[str, Mapping[str, str]] = {}
+        """Tables of text by title; the newest of each title."""
+        for file in files:
+            self.metadata_records |= file.metadata_records
+        self._decoder: AnyReader | None = None
 
     @property
     def duration(self) -> float:
@@ -77,12 +133,26 @@ class BagReader:
         return (self.end_ns - self.start_ns) / NANOSECONDS
 
     @property
-    def message_count(self) -> int:
-        """Number of messages of all topics."""
-        return sum(topic.message_count for topic in self.topics.values())
+    def storage(self) -> str:
+        """Name of the file format."""
+        return _STORAGES.get(self.files[0].path.suffix, 'other')
+
+    def serialized_messages(
+        self, topics: Collection[str] | None = None
+    ) -> Iterator[SerializedMessage]:
+        """Yield the serialized messages of ``topics``, or of all, in order of receipt.
+
+        Raises
+        ------
+        BagError
+            The bag is damaged.
+        """
+        return merge_streams(
+            (file.start_ns, partial(file.messages, topics)) for file in self.files
+        )
 
     def messages(self, topic: str) -> Iterator[tuple[float, Any]]:
-        """Yield (received, message) in order of receipt.
+        """Yield (received, decoded message) in order of receipt.
 
         Raises
         ------
@@ -94,11 +164,27 @@ class BagReader:
         if topic not in self.topics:
             available = ', '.join(self.topics) or 'no topic'
             raise UnknownTopicError(f'{topic} is not in {self.folder}, which contains {available}')
-        selected = [item for item in self._reader.connections if item.topic == topic]
-        with _read_errors(topic):
-            for connection, received_ns, data in self._reader.messages(selected):
-                message = self._reader.deserialize(data, connection.msgtype)
-                yield (received_ns - self.start_ns) / NANOSECONDS, message
+        for message in self.serialized_messages([topic]):
+            yield (message.received_ns - self.start_ns) / NANOSECONDS, self.decode(message)
+
+    def decode(self, message: SerializedMessage) -> Any:
+        """Return a message of this bag as an object.
+
+        Raises
+        ------
+        DataError
+            It cannot be decoded.
+        """
+        with read_errors(message.topic, DataError):
+            if self._decoder is None:
+                decoder = AnyReader(
+                    [file.path for file in self.files],
+                    default_typestore=get_typestore(Stores.ROS2_JAZZY),
+                )
+                decoder.open()
+                self._decoder = decoder
+            type_name = self.topics[message.topic].type_name
+            return self._decoder.deserialize(message.data, type_name)
 
     def series(self, topic: str, fields: Mapping[str, str]) -> dict[str, Array]:
         """Return one array for each of ``fields``, with times of receipt and stamps.
@@ -139,11 +225,26 @@ class BagReader:
         names = ['received', 'stamp', *fields]
         return {name: np.ascontiguousarray(table[:, i]) for i, name in enumerate(names)}
 
+    def attachments(self) -> dict[str, Attachment]:
+        """Return the attachments by name; the newest of each name.
+
+        Raises
+        ------
+        BagError
+            An attachment is damaged.
+        """
+        found = [pair for file in self.files for pair in file.attachments()]
+        found.sort(key=lambda pair: pair[0])
+        return {item.name: item for _, item in found}
+
     def close(self) -> None:
         """Close the files; idempotent."""
-        reader, self._reader = self._reader, None
-        if reader is not None:
-            reader.close()
+        decoder, self._decoder = self._decoder, None
+        if decoder is not None:
+            decoder.close()
+        for file in self.files:
+            if isinstance(file, RosbagsFile):
+                file.close()
 
     def __enter__(self) -> Self:
         return self
@@ -161,40 +262,90 @@ class BagReader:
         return float((nanoseconds - self.start_ns) / NANOSECONDS)
 
 
-def open_bag(folder: Path | str) -> BagReader:
-    """Open the bag in ``folder``, or a single bag file.
+def open_bag(path: Path | str) -> BagReader:
+    """Open the bag in a folder, or a single bag file.
 
-    All complete MCAP files of the folder are read, independently of ``metadata.yaml``, which is
-    outdated if the recorder was killed. Bags of another storage are read through their
-    ``metadata.yaml``.
+    All complete MCAP files of a folder are read, independently of ``metadata.yaml``, which is
+    outdated if the recorder was killed. Bags that rosbag2 compressed, by file or by message, are
+    read through their ``metadata.yaml``.
 
     Raises
     ------
     BagError
-        The folder contains no complete bag file, or a file is damaged.
+        The bag does not exist, has no complete file, or is damaged.
     """
-    folder = Path(folder)
-    incomplete_files: tuple[str, ...] = ()
-    if folder.is_file():
-        paths = [folder]
+    path = Path(path).expanduser()
+    if not path.exists():
+        raise BagError(f'there is no bag {path}')
+    files: list[BagFile] = []
+    incomplete: tuple[str, ...] = ()
+    others: list[Path] = []
+    if path.is_dir():
+        if _is_compressed(path):
+            others = [path]
+        else:
+            complete, incomplete = find_files(path)
+            files.extend(complete)
+            others = sorted(path.glob(f'*{SQLITE_SUFFIX}'))
+    elif path.suffix == MCAP_SUFFIX or has_mcap_magic(path):
+        if (file := read_mcap_file(path)) is not None:
+            files.append(file)
+        else:
+            incomplete = (path.name,)
+    elif path.suffix in (SQLITE_SUFFIX, ROS1_SUFFIX):
+        others = [path]
     else:
-        metadata, incomplete_files = collect_metadata(folder)
-        paths = [folder / file.path for file in metadata.files]
-    metadata_records: dict[str, dict[str, str]] = {}
-    for path in paths:
-        summary = read_file_summary(path) if path.suffix == MCAP_SUFFIX else None
-        for title, table in (summary.metadata_records if summary else {}).items():
-            if title != 'rosbag2':
-                metadata_records[title] = dict(table)
-    if not paths and not incomplete_files and (folder / METADATA_FILE_NAME).is_file():
-        paths = [folder]
-    if not paths:
-        listing = f'; incomplete: {", ".join(incomplete_files)}' if incomplete_files else ''
-        raise BagError(f'no complete bag file in {folder}{listing}')
-    with _read_errors(str(folder)):
-        reader = AnyReader(paths, default_typestore=get_typestore(Stores.ROS2_JAZZY))
-        reader.open()
-    return BagReader(folder, reader, incomplete_files, metadata_records)
+        raise BagError(f'{path} is no MCAP file and no sqlite3 bag')
+    files += [RosbagsFile(each) for each in others]
+    if not files:
+        advice = (
+            f'; incomplete: {", ".join(incomplete)}: `t3mpc bag recover {path}` writes their '
+            'messages to a new bag'
+        )
+        raise BagError(f'no complete bag file in {path}{advice if incomplete else ""}')
+    return BagReader(path, files, incomplete)
+
+
+def merge_topics(topics: Iterable[TopicInformation]) -> dict[str, TopicInformation]:
+    """Return one entry per topic by name, with the sum of the counts and all distinct profiles."""
+    result: dict[str, TopicInformation] = {}
+    for topic in topics:
+        before = result.get(topic.name)
+        result[topic.name] = topic if before is None else before.merged(topic)
+    return dict(sorted(result.items()))
+
+
+def merge_streams(
+    streams: Iterable[tuple[int, Callable[[], Iterator[SerializedMessage]]]],
+) -> Iterator[SerializedMessage]:
+    """Merge sorted streams of messages by receive time; equal times keep the order of streams.
+
+    Parameters
+    ----------
+    streams
+        Each stream with a lower bound of its receive times, at which it is opened.
+    """
+    waiting = sorted((start_ns, number, make) for number, (start_ns, make) in enumerate(streams))
+    waiting.reverse()
+    running: list[tuple[int, int, SerializedMessage, Iterator[SerializedMessage]]] = []
+    while waiting or running:
+        while waiting and (not running or waiting[-1][0] <= running[0][0]):
+            _, number, make = waiting.pop()
+            stream = make()
+            if (first := next(stream, None)) is not None:
+                heapq.heappush(running, (first.received_ns, number, first, stream))
+        if not running:
+            continue
+        if len(running) == 1 and not waiting:
+            yield running[0][2]
+            yield from running[0][3]
+            return
+        _, number, message, stream = running[0]
+        yield message
+        if (following := next(stream, None)) is not None:
+            heapq.heapreplace(running, (following.received_ns, number, following, stream))
+        else:
+            heapq.heappop(running)
 
 
 def missing_sample_ratio(stamps: Array, rate: float) -> float:
@@ -225,6 +376,46 @@ def missing_sample_ratio(stamps: Array, rate: float) -> float:
     return max(0.0, 1.0 - present.size / expected)
 
 
+def _is_compressed(folder: Path) -> bool:
+    """Return whether rosbag2 compressed files or messages, according to ``metadata.yaml``."""
+    if not (folder / METADATA_FILE_NAME).is_file():
+        return False
+    try:
+        with Reader(folder) as reader:
+            return bool(reader.compression_format)
+    except Exception:  # damaged or outdated: the files are read without it
+        return False
+
+
+def _topic_information(connection: Any) -> TopicInformation:
+    return TopicInformation(
+        connection.topic,
+        connection.msgtype,
+        tuple(map(_qos_profile, getattr(connection.ext, 'offered_qos_profiles', ()))),
+        connection.digest,
+        connection.msgcount,
+        getattr(connection.ext, 'serialization_format', 'ros1'),
+    )
+
+
+def _qos_profile(offered: Any) -> QosProfile:
+    return QosProfile(
+        history=offered.history.name.lower(),
+        depth=max(0, offered.depth),
+        reliability=offered.reliability.name.lower(),
+        durability=offered.durability.name.lower(),
+        deadline_ns=_nanoseconds(offered.deadline),
+        lifespan_ns=_nanoseconds(offered.lifespan),
+        liveliness=offered.liveliness.name.lower(),
+        liveliness_lease_ns=_nanoseconds(offered.liveliness_lease_duration),
+        avoid_ros_namespace_conventions=offered.avoid_ros_namespace_conventions,
+    )
+
+
+def _nanoseconds(time: Any) -> int:
+    return int(min(time.sec * NANOSECONDS + time.nsec, UNLIMITED))
+
+
 def _field_getter(path: str) -> Callable[[Any], Any]:
     """Return a function that reads the field ``path`` of a message."""
     if '[' not in path:
@@ -244,12 +435,3 @@ def _field_getter(path: str) -> Callable[[Any], Any]:
         return message
 
     return get_field
-
-
-@contextmanager
-def _read_errors(what: str) -> Iterator[None]:
-    """Convert the errors of the reading library to :class:`DataError`."""
-    try:
-        yield
-    except (AnyReaderError, ReaderError, SerdeError, OSError, struct.error, ValueError) as error:
-        raise DataError(f'{what} cannot be read: {error}') from error

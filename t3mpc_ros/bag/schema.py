@@ -32,6 +32,14 @@ class UnknownTypeError(BagError):
     """No definition of a message type is available."""
 
 
+class UnknownTopicError(BagError):
+    """The topic was not added to, or is not in, the bag."""
+
+
+class DataError(BagError):
+    """A message, stamp or metadata record is invalid."""
+
+
 class MessageDefinitions:
     """Definitions of message types, with a cache.
 

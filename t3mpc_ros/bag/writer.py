@@ -10,20 +10,18 @@ import os
 from pathlib import Path
 import re
 from types import TracebackType
-from typing import NamedTuple, Self
+from typing import Self
 
-from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from t3mpc_ros.bag.mcap_file import MCAP_SUFFIX, finalize_file, open_unbuffered, write_all
-from t3mpc_ros.bag.metadata import BagMetadata, FileInformation, collect_metadata, write_metadata
+from t3mpc_ros.bag.mcap_file import MCAP_SUFFIX, Attachment, collect_metadata
+from t3mpc_ros.bag.metadata import BagMetadata, FileInformation, write_metadata
 from t3mpc_ros.bag.qos import QosProfile, dump_yaml, profiles_to_yaml
-from t3mpc_ros.bag.schema import BagError, MessageDefinitions
+from t3mpc_ros.bag.recovery.finalize_file import finalize_file, open_unbuffered, write_all
+from t3mpc_ros.bag.schema import BagError, DataError, MessageDefinitions, UnknownTopicError
 
 _MEDIA_TYPES = {'.npz': 'application/zip', '.yaml': 'application/yaml', '.csv': 'text/csv'}
 """Media types that ``mimetypes`` lacks on some systems; an npz file is a zip archive."""
-MESSAGE_OVERHEAD = 256
-"""Memory of a message in addition to its data, bytes."""
 
 # Publishers of releases before type hashes report "INVALID".
 _TYPE_HASH = re.compile(r'RIHS\d\d_[0-9a-f]{64}')
@@ -39,25 +37,6 @@ class FolderError(BagError):
 
 class DiskError(BagError):
     """Writing failed, usually because the disk is full; messages written before are kept."""
-
-
-class UnknownTopicError(BagError):
-    """The topic was not added to, or is not in, the bag."""
-
-
-class DataError(BagError):
-    """A message, stamp or metadata record is invalid."""
-
-
-@dataclass(frozen=True, slots=True)
-class Attachment:
-    """File stored inside a bag, such as the model file of a controller."""
-
-    name: str
-    media_type: str
-    data: bytes
-    modified_ns: int = 0
-    """Modification time, nanoseconds since 1970; 0 = unknown."""
 
 
 def read_attachment(path: Path, max_bytes: int, name: str = '') -> Attachment:
@@ -85,51 +64,6 @@ def read_attachment(path: Path, max_bytes: int, name: str = '') -> Attachment:
     )
 
 
-def read_attachments(path: Path) -> dict[str, Attachment]:
-    """Return the attachments of a complete MCAP file by name; the newest of each name.
-
-    Raises
-    ------
-    AttachmentError
-        The file is not readable or incomplete, or an attachment is damaged.
-    """
-    try:
-        with path.open('rb') as file:
-            found = list(make_reader(file, validate_crcs=True).iter_attachments())
-    except Exception as error:  # the parser of the library raises anything on damaged bytes
-        raise AttachmentError(f'the attachments of {path} cannot be read: {error}') from error
-    found.sort(key=lambda item: item.log_time)
-    return {
-        item.name: Attachment(item.name, item.media_type, bytes(item.data), item.create_time)
-        for item in found
-    }
-
-
-class SerializedMessage(NamedTuple):
-    """Message as CDR bytes; stamps in nanoseconds since 1970."""
-
-    topic: str
-    received_ns: int
-    published_ns: int
-    data: bytes
-
-    @property
-    def memory_size(self) -> int:
-        """Memory of the message, bytes."""
-        return len(self.data) + MESSAGE_OVERHEAD
-
-
-@dataclass(frozen=True, slots=True)
-class TopicMetadata:
-    """Topic declaration that precedes the first message of the topic."""
-
-    topic: str
-    type_name: str
-    offered_qos_profiles: tuple[QosProfile, ...] = ()
-    """Profiles of the publishers."""
-    type_hash: str | None = None
-
-
 @dataclass
 class _Topic:
     type_name: str
@@ -142,7 +76,7 @@ class BagWriter:
 
     An existing bag is continued with a new file, and its complete files are included in
     ``metadata.yaml``. Incomplete files are listed in :attr:`incomplete_files` and left unchanged
-    (:func:`~t3mpc_ros.bag.mcap_file.finalize_file` completes them). ``metadata.yaml`` lists
+    (``t3mpc bag recover`` reads them). ``metadata.yaml`` lists
     complete files only, so the folder is readable at any time, even after the recorder was killed.
 
     Parameters
@@ -255,7 +189,7 @@ class BagWriter:
         name: str,
         type_name: str,
         profiles: Iterable[QosProfile] = (),
-        type_hash: str | None = None,
+        type_hash: str = '',
     ) -> None:
         """Add a topic before its first message; adding it again has no effect.
 
@@ -285,7 +219,7 @@ class BagWriter:
         channel_details = {
             'offered_qos_profiles': profiles_to_yaml(profiles),
             'topic_type_hash': type_hash
-            if _TYPE_HASH.fullmatch(type_hash or '')
+            if _TYPE_HASH.fullmatch(type_hash)
             else self._definitions.type_hash(type_name),
         }
         if not self._is_open():

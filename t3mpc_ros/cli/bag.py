@@ -4,15 +4,16 @@
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from datetime import UTC, datetime
 import json
 from pathlib import Path
 import sys
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from t3mpc_ros.bag.bag_info import BagInfo, read_bag_info
+from t3mpc_ros.bag.metadata import TopicInformation
+from t3mpc_ros.bag.qos import QosProfile
+from t3mpc_ros.bag.reader import BagReader, open_bag
 from t3mpc_ros.bag.recording.split_writer import message_loss_notes
 from t3mpc_ros.bag.recovery.recover_bag import RecoveryOutputError, default_output, recover_bag
 from t3mpc_ros.bag.recovery.result import Damage, FileResult, RecoveryResult
@@ -68,54 +69,95 @@ def add_info_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParse
 
 
 def _run_info(options: argparse.Namespace) -> int:
-    held = read_bag_info(options.bag)
-    if options.json:
-        rates = {topic.name: held.rate(topic) for topic in held.topics}
-        print(json.dumps(asdict(held) | {'rates': rates}, indent=1, ensure_ascii=False))
-    else:
-        print(_info_text(held))
+    with open_bag(options.bag) as bag:
+        if options.json:
+            print(json.dumps(_info(bag), indent=1, ensure_ascii=False))
+        else:
+            print(_info_text(bag))
     return 0
 
 
-def _info_text(held: BagInfo) -> str:
-    size = size_text(sum(held.files.values()))
+def _info(bag: BagReader) -> dict[str, Any]:
+    """Return the contents of a bag as JSON data."""
+    return {
+        'path': str(bag.folder),
+        'storage': bag.storage,
+        'files': {file.path.name: _size(file.path) for file in bag.files},
+        'incomplete_files': {name: _size(bag.folder / name) for name in bag.incomplete_files},
+        'message_count': bag.message_count,
+        'start_ns': bag.start_ns,
+        'duration_ns': bag.end_ns - bag.start_ns,
+        'topics': [
+            {
+                'name': topic.name,
+                'type_name': topic.type_name,
+                'message_count': topic.message_count,
+                'qos_profiles': [*dict.fromkeys(map(_qos_text, topic.offered_qos_profiles))],
+            }
+            for topic in bag.topics.values()
+        ],
+        'metadata_records': bag.metadata_records,
+        'attachments': [
+            {'file': file.path.name, 'name': name, 'media_type': media_type, 'size': size}
+            for file in bag.files
+            for name, media_type, size in file.attachment_sizes()
+        ],
+        'rates': {topic.name: _rate(bag, topic) for topic in bag.topics.values()},
+    }
+
+
+def _info_text(bag: BagReader) -> str:
+    held = _info(bag)
+    size = size_text(sum(held['files'].values()))
     rows = [
-        ('bag', held.path),
-        ('storage', f'{held.storage}, {size} in {len(held.files)} file(s)'),
-        ('start', _date(held.start_ns) if held.message_count else 'no message'),
-        ('duration', f'{held.duration_ns / NANOSECONDS:.3f} s'),
-        ('messages', str(held.message_count)),
+        ('bag', held['path']),
+        ('storage', f'{bag.storage}, {size} in {len(bag.files)} file(s)'),
+        ('start', _date(bag.start_ns) if bag.message_count else 'no message'),
+        ('duration', f'{bag.duration:.3f} s'),
+        ('messages', str(bag.message_count)),
     ]
-    rows += [(f'file {name}', size_text(size)) for name, size in held.files.items()]
+    rows += [(f'file {name}', size_text(size)) for name, size in held['files'].items()]
     rows += [
         (f'UNFINISHED {name}', f'{size_text(size)}, not counted above')
-        for name, size in held.incomplete_files.items()
+        for name, size in held['incomplete_files'].items()
     ]
     parts = [columns(rows)]
-    if held.incomplete_files:
+    if bag.incomplete_files:
         parts.append(
             f'A file without its end is still being written, or its writer was interrupted: '
-            f'`t3mpc bag recover {held.path}` writes its messages to a new bag.'
+            f'`t3mpc bag recover {bag.folder}` writes its messages to a new bag.'
         )
-    if notes := message_loss_notes(held.metadata_records):
+    if notes := message_loss_notes(bag.metadata_records):
         parts.append('\n'.join(notes))
-    if held.topics:
-        parts.append(_topic_table(held))
-    for title, table in held.metadata_records.items():
-        parts.append(_info_table(title, table))
-    if held.attachments:
-        items = [(item.name, item.media_type, size_text(item.size)) for item in held.attachments]
+    if bag.topics:
+        topics = [('topic', 'type', 'messages', 'Hz', 'quality of service')]
+        for topic in held['topics']:
+            name, count = topic['name'], str(topic['message_count'])
+            quality = '; '.join(topic['qos_profiles']) or '-'
+            topics.append((name, topic['type_name'], count, f'{held["rates"][name]:.2f}', quality))
+        parts.append(columns(topics, right=(2, 3)))
+    parts += [_info_table(title, table) for title, table in bag.metadata_records.items()]
+    if held['attachments']:
+        items = [(e['name'], e['media_type'], size_text(e['size'])) for e in held['attachments']]
         parts.append('attachments\n' + columns(items, right=(2,)))
     return '\n\n'.join(parts)
 
 
-def _topic_table(held: BagInfo) -> str:
-    rows = [('topic', 'type', 'messages', 'Hz', 'quality of service')]
-    for topic in held.topics:
-        quality = '; '.join(topic.qos_profiles) or '-'
-        rate = f'{held.rate(topic):.2f}'
-        rows.append((topic.name, topic.type_name, str(topic.message_count), rate, quality))
-    return columns(rows, right=(2, 3))
+def _size(path: Path) -> int:
+    """Return the size of a file, or of the files in a folder, in bytes."""
+    files = path.iterdir() if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files)
+
+
+def _rate(bag: BagReader, topic: TopicInformation) -> float:
+    """Return the mean rate of a topic in Hz; 0 for a bag without duration."""
+    return topic.message_count / bag.duration if bag.duration > 0.0 else 0.0
+
+
+def _qos_text(profile: QosProfile) -> str:
+    """Return reliability, durability, history and depth of a profile."""
+    policies = ', '.join([profile.reliability, profile.durability, profile.history])
+    return f'{policies} {profile.depth}'
 
 
 def _info_table(title: str, table: Mapping[str, str]) -> str:

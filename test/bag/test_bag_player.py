@@ -18,13 +18,13 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from t3mpc_ros.bag.mcap_file import SerializedMessage
 from t3mpc_ros.bag.merged_reader import (
     MIN_LOOP_NS,
     MergedReader,
     ScheduledMessage,
-    StoredMessage,
     alignment_offsets_ns,
-    open_serialized_bag,
+    transient_local_count,
 )
 from t3mpc_ros.bag.player import (
     LatencyHistogram,
@@ -40,6 +40,7 @@ from t3mpc_ros.bag.qos import (
     adapt_offer_to_recorded_offers,
     read_qos_overrides,
 )
+from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.bag.topic_filter import PlayTopicFilter, TopicFilterError, parse_remappings
 from t3mpc_ros.bag.writer import BagWriter
@@ -107,7 +108,8 @@ def ticks(count=200, step=SECOND // 100):
 
 def expected(messages):
     return [
-        StoredMessage(at, topic, text(f'{topic} {n}')) for n, (topic, at) in enumerate(messages)
+        SerializedMessage(topic, at, at, text(f'{topic} {n}'))
+        for n, (topic, at) in enumerate(messages)
     ]
 
 
@@ -135,9 +137,7 @@ def tape(tmp_path):
 
     def make(*folders, offsets_ns=(), **choice):
         opened.append(
-            MergedReader(
-                [open_serialized_bag(f) for f in folders], offsets_ns, PlayTopicFilter(**choice)
-            )
+            MergedReader([open_bag(f) for f in folders], offsets_ns, PlayTopicFilter(**choice))
         )
         return opened[-1]
 
@@ -153,13 +153,13 @@ def test_every_format_returns_every_byte_in_file_order(write, tape, tmp_path):
     written = expected(ticks())
     made = tape(write(tmp_path / 'bag', ticks()))
     assert list(made.messages(START)) == written
-    assert (made.start_ns, made.end_ns) == (START, written[-1].stamp_ns)
+    assert (made.start_ns, made.end_ns) == (START, written[-1].received_ns)
     assert {name: topic.message_count for name, topic in made.topics.items()} == {
         '/a': 200,
         '/b': 200,
         '/map': 4,
     }
-    assert made.topics['/map'].transient_local_count == 1
+    assert transient_local_count(made.topics['/map']) == 1
     assert made.topics['/a'].offered_qos_profiles[0].durability == 'volatile'
     assert made.topics['/a'].type_name == TEXT
 
@@ -171,7 +171,7 @@ def test_reading_from_any_time_on_gives_the_same_messages(write, tape, tmp_path)
     for start in [START - 5, START, made.end_ns, made.end_ns + 1] + [
         START + rng.randrange(2 * SECOND) for _ in range(10)
     ]:
-        assert list(made.messages(start)) == [m for m in written if m.stamp_ns >= start]
+        assert list(made.messages(start)) == [m for m in written if m.received_ns >= start]
 
 
 def test_a_single_file_is_a_bag_too(tape, tmp_path):
@@ -191,7 +191,7 @@ def test_a_continued_bag_is_one_sequence(tape, tmp_path):
     write_mcap(tmp_path / 'bag', one)
     write_mcap(tmp_path / 'bag', two)
     both = [*expected(one), *expected(two)]
-    assert list(tape(tmp_path / 'bag').messages(0)) == sorted(both, key=lambda m: m.stamp_ns)
+    assert list(tape(tmp_path / 'bag').messages(0)) == sorted(both, key=lambda m: m.received_ns)
 
 
 def test_incomplete_file_is_listed_and_complete_ones_are_played(tmp_path):
@@ -199,12 +199,12 @@ def test_incomplete_file_is_listed_and_complete_ones_are_played(tmp_path):
     write_mcap(tmp_path / 'bag', ticks(9))
     torn = tmp_path / 'bag' / 'bag_1.mcap'
     torn.write_bytes(torn.read_bytes()[:-50])
-    bag = open_serialized_bag(tmp_path / 'bag')
+    bag = open_bag(tmp_path / 'bag')
     assert bag.incomplete_files == ('bag_1.mcap',)
     assert bag.end_ns == ticks(5)[-1][1]
     bag.close()
-    with pytest.raises(BagError, match='bag_1.mcap: run t3mpc bag recover'):
-        open_serialized_bag(torn)
+    with pytest.raises(BagError, match='bag_1.mcap: `t3mpc bag recover'):
+        open_bag(torn)
 
 
 def test_path_without_a_bag_is_rejected(tmp_path):
@@ -213,12 +213,12 @@ def test_path_without_a_bag_is_rejected(tmp_path):
     (tmp_path / 'broken.db3').write_bytes(b'no database' * 100)
     for path, words in (
         ('nowhere', 'there is no bag'),
-        ('notes.txt', 'cannot be read'),
+        ('notes.txt', 'is no MCAP file and no sqlite3 bag'),
         ('empty', 'no complete bag file'),
         ('broken.db3', 'cannot be read'),
     ):
         with pytest.raises(BagError, match=words):
-            open_serialized_bag(tmp_path / path)
+            open_bag(tmp_path / path)
 
 
 def test_a_damaged_chunk_is_skipped_and_counted(tape, tmp_path):
@@ -232,7 +232,7 @@ def test_a_damaged_chunk_is_skipped_and_counted(tape, tmp_path):
     played = list(reader.messages(0))
     assert 0 < len(played) < len(ticks())
     assert len(played) + reader.damaged_count == len(ticks())
-    stamps = [message.stamp_ns for message in played]
+    stamps = [message.received_ns for message in played]
     assert stamps == sorted(stamps)
     # A second loop does not count them again.
     assert len(list(reader.messages(0))) == len(played)
@@ -248,7 +248,7 @@ def test_bags_are_merged_by_time_of_receipt(tape, tmp_path):
     merged = list(tape(one, two).messages(0))
     assert len(merged) == 25 + 10
     # Equal times: in the order of the bags.
-    assert merged == sorted(merged, key=lambda m: (m.stamp_ns, m.topic))
+    assert merged == sorted(merged, key=lambda m: (m.received_ns, m.topic))
     turned = list(tape(two, one).messages(0))
     assert [m.topic for m in turned[:2]] == ['/b', '/a']
 
@@ -256,12 +256,12 @@ def test_bags_are_merged_by_time_of_receipt(tape, tmp_path):
 def test_a_bag_can_be_shifted_in_time(tape, tmp_path):
     one = write_mcap(tmp_path / 'one', [('/a', START + i * SECOND) for i in range(3)])
     two = write_mcap(tmp_path / 'two', [('/b', 5 * START + i * SECOND) for i in range(3)])
-    bags = [open_serialized_bag(one), open_serialized_bag(two)]
+    bags = [open_bag(one), open_bag(two)]
     offsets = alignment_offsets_ns(bags)
     for bag in bags:
         bag.close()
     made = tape(one, two, offsets_ns=[offsets[0], offsets[1] + 1])
-    assert [(m.stamp_ns - START, m.topic) for m in made.messages(0)] == [
+    assert [(m.received_ns - START, m.topic) for m in made.messages(0)] == [
         (i * SECOND + shift, topic) for i in range(3) for shift, topic in ((0, '/a'), (1, '/b'))
     ]
     assert (made.start_ns, made.end_ns) == (START, START + 2 * SECOND + 1)
@@ -274,7 +274,7 @@ def test_one_name_with_two_types_is_refused(tmp_path):
         with BagWriter(folders[-1], metadata_records={}) as bag:
             bag.add_topic('/x', kind)
             bag.write('/x', START, START, b'\0\1\0\0')
-    bags = [open_serialized_bag(folder) for folder in folders]
+    bags = [open_bag(folder) for folder in folders]
     with pytest.raises(BagError, match='/x is std_msgs/msg/String and std_msgs/msg/Float64'):
         MergedReader(bags)
     MergedReader(bags, topic_filter=PlayTopicFilter(exclude_topics=('x',))).close()
@@ -418,7 +418,7 @@ def test_latched_messages_precede_any_later_start(write, tape, tmp_path):
     made = tape(write(tmp_path / 'bag', ticks()))
     written = [m for m in expected(ticks()) if m.topic == '/map']
     for start in (START, START + 1, START + 2, START + SECOND // 2 + 1, made.end_ns, 2 * START):
-        earlier = [m for m in written if m.stamp_ns < start]
+        earlier = [m for m in written if m.received_ns < start]
         assert made.latched_messages_before(start) == earlier[-1:]
 
 
@@ -499,7 +499,7 @@ def test_each_message_is_due_at_its_time(bag):
     assert player.made.finished
     assert set(player.errors) == {0}
     first = player.out[0][0]
-    assert all(now - first == e.message.stamp_ns - START for now, e in player.out)
+    assert all(now - first == e.message.received_ns - START for now, e in player.out)
 
 
 @pytest.mark.parametrize('rate', [0.01, 0.3, 1.0, 1.1**7, 100.0])
@@ -518,7 +518,7 @@ def test_late_messages_are_due_immediately_and_in_order(bag):
     player.now += SECOND
     while player.wake is not None and player.wake <= player.now:
         player.ask(most=7)
-    assert player.messages == [m for m in expected(ticks()) if m.stamp_ns <= START + SECOND]
+    assert player.messages == [m for m in expected(ticks()) if m.received_ns <= START + SECOND]
     assert max(player.errors) == SECOND - 1, 'the map, 1 ns after the first tick'
     assert player.errors[-1] == 0
 
@@ -526,10 +526,10 @@ def test_late_messages_are_due_immediately_and_in_order(bag):
 def test_start_offset_and_end_select_a_range_after_the_map(bag):
     begin, end = START + SECOND // 2 + 2, START + SECOND
     player = Player(bag, begin, end).run()
-    inside = [m for m in expected(ticks()) if begin <= m.stamp_ns <= end]
+    inside = [m for m in expected(ticks()) if begin <= m.received_ns <= end]
     (kept,) = bag.latched_messages_before(begin)
     assert player.messages == [kept, *inside]
-    assert inside[-1].stamp_ns == end
+    assert inside[-1].received_ns == end
     assert player.out[0][1].stamp_ns == begin, 'the clock does not start earlier'
 
 
@@ -569,7 +569,7 @@ def test_seek_continues_with_latched_messages(bag):
     player.wake = player.now
     player.run()
     written = expected(ticks())
-    after = [m for m in written if m.stamp_ns >= target]
+    after = [m for m in written if m.received_ns >= target]
     assert player.messages[count:] == [*bag.latched_messages_before(target), *after]
     assert player.made.finished
     assert player.made.seek(player.now, START) == ''
@@ -596,7 +596,7 @@ def test_play_next_plays_messages_only_while_paused(bag):
         player.wake = player.now
         player.run()
         assert len(player.messages) == before + count
-        assert player.made.bag_time_ns(player.now) == player.messages[-1].stamp_ns
+        assert player.made.bag_time_ns(player.now) == player.messages[-1].received_ns
         assert player.wake is None
     assert 'at least 1' in player.made.play_next(player.now, 0)
     player.made.resume(player.now)
@@ -669,7 +669,7 @@ def test_no_sequence_of_commands_skips_or_repeats_a_message(bag, seed):
     for sought, played in sequences:
         whole = written
         if sought is not False:
-            rest = [m for m in written if m.stamp_ns >= sought]
+            rest = [m for m in written if m.received_ns >= sought]
             whole = [*bag.latched_messages_before(sought), *rest]
         if loop:
             whole = whole + written * 50
@@ -739,7 +739,7 @@ def test_reading_ahead_changes_nothing_and_ends_when_closed(bag):
     player.run(player.now + SECOND)
     loops = expected(ticks()) * 3
     assert player.messages[:count] == loops[:count]
-    assert player.messages[count + 1].stamp_ns == START + SECOND // 20 * 19
+    assert player.messages[count + 1].received_ns == START + SECOND // 20 * 19
     made.close()
     assert threading.active_count() == before
 

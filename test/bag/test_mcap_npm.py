@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from t3mpc_ros.bag.mcap_file import finalize_file
+from t3mpc_ros.bag.mcap_file import Attachment
 from t3mpc_ros.bag.qos import QosProfile, profiles_to_yaml
-from t3mpc_ros.bag.writer import Attachment, BagWriter
+from t3mpc_ros.bag.recovery.finalize_file import finalize_file
+from t3mpc_ros.bag.writer import BagWriter
 
 SOURCES = Path(__file__).parents[1] / 'support' / 'mcap_check'
 STORE = get_typestore(Stores.ROS2_JAZZY)

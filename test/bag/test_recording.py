@@ -9,8 +9,13 @@ import pytest
 from rosbags.rosbag2 import Reader
 
 from t3mpc_ros.bag import writer
-from t3mpc_ros.bag.mcap_file import finalize_file, read_file_summary
-from t3mpc_ros.bag.metadata import read_metadata
+from t3mpc_ros.bag.mcap_file import (
+    MESSAGE_OVERHEAD,
+    Attachment,
+    SerializedMessage,
+    read_mcap_file,
+)
+from t3mpc_ros.bag.metadata import TopicInformation, read_metadata
 from t3mpc_ros.bag.player import PlaybackParameters
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recording.diagnostics_monitor import (
@@ -27,18 +32,15 @@ from t3mpc_ros.bag.recording.split_writer import (
     message_loss_notes,
     message_loss_record,
 )
+from t3mpc_ros.bag.recovery.finalize_file import finalize_file
+from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.bag.topic_filter import PlayTopicFilter, TopicFilter, TopicFilterError
 from t3mpc_ros.bag.writer import (
-    MESSAGE_OVERHEAD,
-    Attachment,
     AttachmentError,
     BagWriter,
     DiskError,
     FolderError,
-    SerializedMessage,
-    TopicMetadata,
     read_attachment,
-    read_attachments,
 )
 from t3mpc_ros.parameters.table import ParameterError
 
@@ -258,7 +260,7 @@ def test_every_message_is_taken_or_counted_with_two_threads():
 
 def series(folder, **options):
     made = SplitWriter(folder, {'provenance': {'commit': 'abc'}}, **options)
-    made.add_topic(TopicMetadata('/n', NUMBER))
+    made.add_topic(TopicInformation('/n', NUMBER))
     return made
 
 
@@ -308,8 +310,8 @@ def test_split_recording_is_complete_in_self_contained_files(tmp_path, options):
     parts = [read(path) for path in files]
     assert [item for part in parts for item in part] == written
     for path in files:
-        assert read_file_summary(path).metadata_records['controller'] == {'law.gain': '8.0'}
-        assert read_file_summary(path).metadata_records['provenance'] == {'commit': 'abc'}
+        assert read_mcap_file(path).metadata_records['controller'] == {'law.gain': '8.0'}
+        assert read_mcap_file(path).metadata_records['provenance'] == {'commit': 'abc'}
         assert [(item.name, item.data) for item in attachments(path)] == [
             ('model.npz', b'weights')
         ]
@@ -376,7 +378,8 @@ def test_attachment_is_read_back_with_media_type_and_time(tmp_path):
     assert (found.name, found.media_type) == ('controller/model.npz', 'application/zip')
     assert found.data == bytes(range(256))
     assert (found.create_time, found.log_time) == (path.stat().st_mtime_ns, START)
-    assert read_attachments(bag.path) == {item.name: item}
+    with open_bag(bag.path) as reader:
+        assert reader.attachments() == {item.name: item}
     assert len(read(bag.path)) == 1
     with Reader(tmp_path / 'bag') as reader:
         assert reader.message_count == 1
@@ -386,10 +389,16 @@ def test_newest_attachment_of_a_name_is_read(tmp_path):
     with BagWriter(tmp_path / 'bag', metadata_records={}) as bag:
         for i in (1, 2):
             bag.add_attachment(Attachment('a', 'text/plain', b'%d' % i), START + i)
-    assert read_attachments(bag.path)['a'].data == b'2'
-    bag.path.write_bytes(bag.path.read_bytes()[:-20])
-    with pytest.raises(AttachmentError, match='cannot be read'):
-        read_attachments(bag.path)
+    with open_bag(bag.path) as reader:
+        assert reader.attachments()['a'].data == b'2'
+        content = bag.path.read_bytes()
+        bag.path.write_bytes(
+            content.replace(
+                b'text/plain\1\0\0\0\0\0\0\0002', b'text/plain' + b'\1' + bytes(7) + b'3'
+            )
+        )
+        with pytest.raises(BagError, match='the attachment a of .* is damaged'):
+            reader.attachments()
 
 
 def test_missing_or_too_large_attachment_is_rejected(tmp_path):
@@ -495,7 +504,10 @@ def test_snapshot_is_a_bag_with_its_reason(tmp_path):
     count = write_snapshot(
         tmp_path / 'snap',
         messages,
-        topics={'/n': TopicMetadata('/n', NUMBER), '/quiet': TopicMetadata('/quiet', NUMBER)},
+        topics={
+            '/n': TopicInformation('/n', NUMBER),
+            '/quiet': TopicInformation('/quiet', NUMBER),
+        },
         metadata_records={'snapshot': {'reason': 'link lost'}},
         attachments=[(Attachment('a', 'text/plain', b'x'), START)],
         pause=lambda: pauses.append(1),

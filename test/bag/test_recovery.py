@@ -21,7 +21,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_typestore
 
-from t3mpc_ros.bag.mcap_file import MAGIC, read_file_summary
+from t3mpc_ros.bag.mcap_file import MAGIC, read_mcap_file
 from t3mpc_ros.bag.metadata import read_metadata
 from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.reader import open_bag
@@ -422,7 +422,7 @@ def test_recovered_bag_opens_everywhere_and_input_is_unchanged(tmp_path, own):
     target = tmp_path / 'new' / path.name
     kept = inside(target.read_bytes())
     assert [(m[0], m[1], m[4]) for m in kept.messages] == read_anyhow(tmp_path / 'new')
-    assert read_file_summary(target).message_count == len(kept.messages) == result.kept > 300
+    assert read_mcap_file(target).message_count == len(kept.messages) == result.kept > 300
     metadata = read_metadata(tmp_path / 'new')
     assert metadata.message_count == result.kept
     assert metadata.topics[0].offered_qos_profiles == (QosProfile(depth=7),)
@@ -459,7 +459,7 @@ def test_complete_file_with_a_damaged_chunk_is_not_copied(tmp_path):
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 4
     path.write_bytes(content)
-    assert read_file_summary(path) is not None  # its summary is valid
+    assert read_mcap_file(path) is not None  # its summary is valid
     result = recover_bag(path, tmp_path / 'new')
     assert not result.files[0].copied
     assert not result.clean
@@ -555,7 +555,7 @@ def test_info_lists_files_topics_parameters_and_incomplete_files(tmp_path, capsy
     assert bag_main(['info', str(tmp_path / 'nothing')]) == 1
     (tmp_path / 'text').write_text('hello')
     assert bag_main(['info', str(tmp_path / 'text')]) == 1
-    assert 'no MCAP file' in capsys.readouterr().err
+    assert 'is no MCAP file' in capsys.readouterr().err
 
 
 def test_info_reads_files_of_other_writers_and_sqlite_bags(tmp_path, capsys):

@@ -16,13 +16,15 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 import yaml
 
-from t3mpc_ros.bag import mcap_file, writer
-from t3mpc_ros.bag.mcap_file import finalize_file, read_file_summary
+from t3mpc_ros.bag import writer
+from t3mpc_ros.bag.mcap_file import read_mcap_file
 from t3mpc_ros.bag.metadata import read_metadata
 from t3mpc_ros.bag.qos import QosProfile, profiles_from_yaml
 from t3mpc_ros.bag.reader import missing_sample_ratio, open_bag
-from t3mpc_ros.bag.schema import BagError, UnknownTypeError
-from t3mpc_ros.bag.writer import BagWriter, DataError, DiskError, FolderError, UnknownTopicError
+from t3mpc_ros.bag.recovery import finalize_file as finalization
+from t3mpc_ros.bag.recovery.finalize_file import finalize_file
+from t3mpc_ros.bag.schema import BagError, DataError, UnknownTopicError, UnknownTypeError
+from t3mpc_ros.bag.writer import BagWriter, DiskError, FolderError
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPES = STORE.types
@@ -352,9 +354,9 @@ class FullDisk:
 
 @pytest.fixture
 def disk(monkeypatch):
-    for module in (writer, mcap_file):
+    for module in (writer, finalization):
         monkeypatch.setattr(module, 'open_unbuffered', FullDisk)
-    monkeypatch.setattr(mcap_file, 'SPARE', 2_000)
+    monkeypatch.setattr(finalization, 'SPARE', 2_000)
     return FullDisk
 
 
@@ -440,7 +442,7 @@ def test_file_truncated_anywhere_keeps_its_complete_chunks(folder, tmp_path):
         kept = finalize_file(torn)
         assert read_with_mcap(torn) == written[:kept]
         assert kept >= before
-        assert read_file_summary(torn).message_count == kept
+        assert read_mcap_file(torn).message_count == kept
         before = kept
     assert before == len(written)
 
@@ -455,7 +457,7 @@ def test_one_flipped_bit_at_the_end_of_a_file_is_noticed(folder):
         damaged = bytearray(content)
         damaged[place] ^= 1 << place % 8
         bag.path.write_bytes(bytes(damaged))
-        assert read_file_summary(bag.path) is None, place
+        assert read_mcap_file(bag.path) is None, place
 
 
 def test_finalizing_a_complete_file_changes_nothing(folder):
@@ -476,22 +478,8 @@ def test_zeros_after_a_power_failure_are_removed(folder):
     assert read_with_mcap(bag.path) == written
 
 
-def test_files_of_other_writers_are_not_truncated(tmp_path):
-    """Truncation after the last known part would remove the records of other writers."""
-    from mcap.writer import IndexType, Writer
-
-    path = tmp_path / 'foreign.mcap'
-    for options in ({'use_chunking': False}, {'index_types': IndexType.CHUNK, 'chunk_size': 10}):
-        with path.open('wb') as file:
-            foreign = Writer(file, **options)
-            foreign.start()
-            channel = foreign.register_channel('/n', 'cdr', 0)
-            for i in range(5):
-                foreign.add_message(channel, i, bytes(20), i)
-        content = path.read_bytes()
-        with pytest.raises(BagError, match='BagWriter'):
-            finalize_file(path)
-        assert path.read_bytes() == content
+def test_a_file_of_another_format_is_not_finalized(tmp_path):
+    path = tmp_path / 'text.mcap'
     path.write_bytes(b'not mcap at all')
     with pytest.raises(BagError, match='does not begin'):
         finalize_file(path)

@@ -353,7 +353,7 @@ def test_an_empty_bag_and_no_bag_are_errors(tmp_path, capsys):
     assert bag_main(['report', str(folder)]) == 1
     assert 'nothing to report' in capsys.readouterr().err
     assert bag_main(['report', str(tmp_path / 'gone')]) == 1
-    assert 'no complete bag file' in capsys.readouterr().err
+    assert 'there is no bag' in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ['bag']
 
 

@@ -14,7 +14,7 @@ import rclpy
 from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
-from t3mpc_ros.bag.chunk_reader import read_bag_index
+from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.run.journal import Event
 from t3mpc_ros.bag.run.model_file import save_model
 from t3mpc_ros.control.controller import Controller, ControllerParameters
@@ -106,7 +106,8 @@ def live_run(processes, bag, model):
 
 def listed_as_missing(bag, topic):
     """Return the number of messages of a topic that the bag lacks by its own record."""
-    losses = read_bag_index(bag).metadata_records['losses']
+    with open_bag(bag) as recording:
+        losses = recording.metadata_records['losses']
     return sum(int(count) for key, count in losses.items() if key.endswith(f' {topic}'))
 
 

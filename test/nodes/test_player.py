@@ -27,8 +27,9 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from support.ros_graph import LATCHED, diagnostic, diagnostic_level, odometry, reason, twist
 
-from t3mpc_ros.bag.merged_reader import MergedReader, open_serialized_bag
+from t3mpc_ros.bag.merged_reader import MergedReader
 from t3mpc_ros.bag.qos import QosProfile
+from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.nodes.common import conversions, graph_introspection
@@ -67,7 +68,7 @@ def texts(count=10, period=0.02, topic='/text', first=0):
 
 def payloads(folder):
     """Return the serialized messages of each topic, in order."""
-    bag = open_serialized_bag(folder)
+    bag = open_bag(folder)
     tape, found = MergedReader([bag]), {}
     for message in tape.messages(0):
         found.setdefault(message.topic, []).append(message.data)
@@ -116,7 +117,7 @@ def test_a_played_and_recorded_bag_has_the_same_bytes(given, harness, tmp_path):
     harness.remove(recorder)
     second = payloads(tmp_path / 'second')
     assert second == first
-    tape = MergedReader([open_serialized_bag(tmp_path / 'second')])
+    tape = MergedReader([open_bag(tmp_path / 'second')])
     assert tape.topics['/map'].offered_qos_profiles[0].durability == 'transient_local'
     assert tape.topics['/text'].offered_qos_profiles[0].reliability == 'best_effort'
     assert tape.topics['/odom'].offered_qos_profiles[0].reliability == 'reliable'

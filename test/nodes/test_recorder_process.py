@@ -14,8 +14,8 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64MultiArray
 from support.recorder_bench import run
 
-from t3mpc_ros.bag.mcap_file import finalize_file
 from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.bag.recovery.finalize_file import finalize_file
 from t3mpc_ros.cli.process_group import ProcessError
 from t3mpc_ros.geometry.types import NANOSECONDS
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 import threading
 from typing import Generic, TypeVar
 
-from t3mpc_ros.bag.writer import SerializedMessage
+from t3mpc_ros.bag.mcap_file import SerializedMessage
 
 T = TypeVar('T')
 WriterTask = Callable[[T], None]

@@ -6,8 +6,10 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
-from t3mpc_ros.bag.schema import MessageDefinitions, UnknownTypeError
-from t3mpc_ros.bag.writer import Attachment, BagWriter, DataError, SerializedMessage, TopicMetadata
+from t3mpc_ros.bag.mcap_file import Attachment, SerializedMessage
+from t3mpc_ros.bag.metadata import TopicInformation
+from t3mpc_ros.bag.schema import DataError, MessageDefinitions, UnknownTypeError
+from t3mpc_ros.bag.writer import BagWriter
 
 SNAPSHOT_RECORD = 'snapshot'
 """Title of the metadata record that contains the reason of a snapshot."""
@@ -96,7 +98,7 @@ def write_snapshot(
     folder: Path,
     messages: Sequence[SerializedMessage],
     *,
-    topics: Mapping[str, TopicMetadata],
+    topics: Mapping[str, TopicInformation],
     metadata_records: Mapping[str, Mapping[str, str]],
     attachments: Iterable[tuple[Attachment, int]] = (),
     definitions: MessageDefinitions | None = None,

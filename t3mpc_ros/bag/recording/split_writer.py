@@ -11,8 +11,10 @@ files.
 from collections.abc import Mapping
 from pathlib import Path
 
+from t3mpc_ros.bag.mcap_file import Attachment, SerializedMessage
+from t3mpc_ros.bag.metadata import TopicInformation
 from t3mpc_ros.bag.schema import MessageDefinitions
-from t3mpc_ros.bag.writer import Attachment, BagWriter, SerializedMessage, TopicMetadata
+from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.geometry.types import NANOSECONDS
 
 SYNC_PERIOD_NS = NANOSECONDS
@@ -62,7 +64,7 @@ class SplitWriter:
         self._folder = folder
         self._metadata_records = {title: dict(table) for title, table in metadata_records.items()}
         self._attachments: dict[str, tuple[Attachment, int]] = {}
-        self._topics: dict[str, TopicMetadata] = {}
+        self._topics: dict[str, TopicInformation] = {}
         self._definitions = definitions or MessageDefinitions()
         self._chunk_bytes, self._chunk_ns = chunk_bytes, chunk_ns
         self._max_file_bytes, self._max_file_ns = max_file_bytes, max_file_ns
@@ -86,10 +88,10 @@ class SplitWriter:
         self._attachments[attachment.name] = attachment, read_ns
         self._bag.add_attachment(attachment, read_ns)
 
-    def add_topic(self, topic: TopicMetadata) -> None:
+    def add_topic(self, topic: TopicInformation) -> None:
         """Add a topic before its first message."""
         self._add_topic(topic)
-        self._topics[topic.topic] = topic
+        self._topics[topic.name] = topic
 
     def write(self, message: SerializedMessage, now_ns: int) -> None:
         """Write one message; ``now_ns`` is a time of the clock of :meth:`tick`.
@@ -164,9 +166,9 @@ class SplitWriter:
             definitions=self._definitions,
         )
 
-    def _add_topic(self, topic: TopicMetadata) -> None:
+    def _add_topic(self, topic: TopicInformation) -> None:
         self._bag.add_topic(
-            topic.topic, topic.type_name, topic.offered_qos_profiles, topic.type_hash
+            topic.name, topic.type_name, topic.offered_qos_profiles, topic.type_hash
         )
 
     def _exceeds_limit(self, received_ns: int) -> bool:

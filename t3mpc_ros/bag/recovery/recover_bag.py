@@ -10,8 +10,8 @@ from pathlib import Path
 import shutil
 from typing import BinaryIO, cast
 
-from t3mpc_ros.bag.mcap_file import MCAP_SUFFIX, read_file_summary
-from t3mpc_ros.bag.metadata import MetadataError, collect_metadata, read_metadata, write_metadata
+from t3mpc_ros.bag.mcap_file import MCAP_SUFFIX, collect_metadata, read_mcap_file
+from t3mpc_ros.bag.metadata import MetadataError, read_metadata, write_metadata
 from t3mpc_ros.bag.recovery.recover_file import UnreadableError, recover_file
 from t3mpc_ros.bag.recovery.result import Damage, FileResult, RecoveryResult
 from t3mpc_ros.bag.schema import BagError
@@ -141,7 +141,7 @@ def _recover_file(path: Path, target: Path, progress: Progress) -> FileResult:
         progress(path.name, done, size)
 
     with path.open('rb') as source:
-        if read_file_summary(path) is not None:
+        if read_mcap_file(path) is not None:
             # The summary is valid; the chunks are verified by a recovery without output.
             result = recover_file(
                 source, cast(BinaryIO, _NullOutput()), path.name, report, compress=False

@@ -25,22 +25,26 @@ from mcap.records import (
 )
 from mcap.writer import CompressionType, Writer
 
-from t3mpc_ros.bag.mcap_file import MAGIC
-from t3mpc_ros.bag.recovery.result import Damage, FileResult, TopicResult
-from t3mpc_ros.bag.recovery.scanner import (
+from t3mpc_ros.bag.mcap_file import (
+    FOOTER,
     HEAD,
-    INDEX_RECORDS,
+    MAGIC,
     MESSAGE_HEAD,
     ChunkError,
     DecodedChunk,
     FileWindow,
+    attachment_is_valid,
+    decode_chunk,
+    summary_is_valid,
+)
+from t3mpc_ros.bag.recovery.result import Damage, FileResult, TopicResult
+from t3mpc_ros.bag.recovery.scanner import (
+    INDEX_RECORDS,
     RecordFit,
     Scanner,
     Span,
-    attachment_is_valid,
     chunk_time_range,
     classify_record,
-    decode_chunk,
 )
 from t3mpc_ros.bag.schema import BagError
 
@@ -55,7 +59,6 @@ Progress = Callable[[int, int], None]
 """Callback with the number of processed bytes and the size of the file."""
 
 _BLOCK = 2**20
-_FOOTER = struct.Struct('<QQI')  # start of the summary, of its offsets, checksum
 _SUMMARY_RECORDS = INDEX_RECORDS - {Opcode.MESSAGE_INDEX}
 _PARSE_ERRORS = (McapError, ValueError, struct.error)  # errors of a record that cannot be parsed
 
@@ -173,7 +176,7 @@ class _FileRecovery:
                 self._take_record(span.opcode, memoryview(self._content(span)), checked=False)
                 if span.opcode == Opcode.DATA_END:
                     self._verify_data_checksum(span)
-                elif span.opcode == Opcode.FOOTER and not _summary_is_valid(self._window, span):
+                elif span.opcode == Opcode.FOOTER and not summary_is_valid(self._window, span.end):
                     self._statistics = None
                     self._add_note('the summary of the file is damaged')
         except _PARSE_ERRORS as error:
@@ -481,25 +484,16 @@ class RecoveredFileWriter:
         self.start('ros2', '')
 
 
-def _summary_is_valid(window: FileWindow, span: Span) -> bool:
-    """Return whether the checksum of the summary is correct or absent."""
-    start, _, checksum = _FOOTER.unpack(window.read(span.end - _FOOTER.size, _FOOTER.size))
-    if not checksum:
-        return True
-    start = start or span.start
-    return bool(zlib.crc32(window.read(start, span.end - 4 - start)) == checksum)
-
-
 def _find_definitions(window: FileWindow, position: int) -> dict[tuple[int, int], Any]:
     """Return schemas and channels after ``position`` by opcode and number.
 
     They are usually in the summary; a summary with a wrong checksum is ignored.
     """
     end = window.size - len(MAGIC)
-    footer = Span(end - HEAD.size - _FOOTER.size, end, Opcode.FOOTER)
+    footer = Span(end - HEAD.size - FOOTER.size, end, Opcode.FOOTER)
     head = window.read(max(0, footer.start), HEAD.size)
-    if footer.start >= position and head == HEAD.pack(Opcode.FOOTER, _FOOTER.size):
-        if not _summary_is_valid(window, footer):
+    if footer.start >= position and head == HEAD.pack(Opcode.FOOTER, FOOTER.size):
+        if not summary_is_valid(window, end):
             return {}
         (start,) = struct.unpack('<Q', window.read(footer.start + HEAD.size, 8))
         position = max(position, start)

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Scanner for damaged MCAP files: record classification, chunk decoding, resynchronization.
+"""Scanner for damaged MCAP files: record classification and resynchronization.
 
 The length of most records follows from two sources: the length in their head and the lengths of
 their fields. A damaged length is detected because the two disagree. Record layouts follow the MCAP
@@ -8,23 +8,23 @@ specification (foxglove/mcap, ``website/docs/spec/index.md``).
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from enum import Enum
 import re
 import struct
-from typing import Any, BinaryIO, NamedTuple
-import zlib
+from typing import NamedTuple
 
-import lz4.frame
 from mcap.opcode import Opcode
-import zstandard
 
-from t3mpc_ros.bag.mcap_file import MAGIC
-
-HEAD = struct.Struct('<BQ')
-"""Opcode and content length of every record."""
-MESSAGE_HEAD = struct.Struct('<HIQQ')
-"""Channel, sequence, log time and publish time before the data of a message."""
+from t3mpc_ros.bag.mcap_file import (
+    HEAD,
+    MAGIC,
+    MESSAGE_HEAD,
+    ChunkError,
+    DecodedChunk,
+    FileWindow,
+    attachment_is_valid,
+    decode_chunk,
+)
 
 INDEX_RECORDS = frozenset(
     {
@@ -60,29 +60,11 @@ _RECORD_LAYOUTS: dict[int, tuple[int | str, ...]] = {
     Opcode.SUMMARY_OFFSET: (17,),
 }
 _MAP_SIZE_LIMIT = 2**26  # maximum size of a map whose content is verified, bytes
-_CHUNK_HEAD = struct.Struct('<QQQII')  # start, end, size, checksum, length of the compression name
-_NAME_LIMIT = 32
 _BLOCK = 2**20
 # A known opcode and a length below 2^40 bytes; a lookahead, because candidates may overlap.
 _CANDIDATE = re.compile(rb'(?=[\x01-\x0f].{5}\x00\x00\x00|' + re.escape(MAGIC) + rb')', re.DOTALL)
 _ZEROS = bytes(_BLOCK + HEAD.size - 1)
 _TRUNCATED_SIZE_LIMIT = 2**28  # maximum plausible size of a possibly truncated record, bytes
-
-
-class FileWindow:
-    """Random access to a file of fixed size; reads after its end are empty."""
-
-    def __init__(self, file: BinaryIO, size: int) -> None:
-        self._file = file
-        self.size = size
-
-    def read(self, start: int, count: int) -> bytes:
-        """Return up to ``count`` bytes from ``start``."""
-        count = min(count, self.size - start)
-        if count <= 0:
-            return b''
-        self._file.seek(start)
-        return self._file.read(count)
 
 
 class RecordFit(Enum):
@@ -188,34 +170,6 @@ def _is_string_map(data: bytes) -> bool:
     return position == len(data) and count % 2 == 0
 
 
-class ChunkError(ValueError):
-    """No part of a chunk is usable."""
-
-
-@dataclass(frozen=True)
-class DecodedChunk:
-    """Decompressed records of one chunk."""
-
-    data: bytes
-    complete: bool
-    checked: bool
-    """Whether a checksum covers the data."""
-
-    def records(self) -> Iterator[tuple[int, memoryview]]:
-        """Yield (opcode, content) of each complete record, then the rest as opcode 0."""
-        view = memoryview(self.data)
-        position = 0
-        while position + HEAD.size <= len(view):
-            opcode, length = HEAD.unpack_from(view, position)
-            end = position + HEAD.size + length
-            if end > len(view):
-                break
-            yield opcode, view[position + HEAD.size : end]
-            position = end
-        if position < len(view):
-            yield 0, view[position:]
-
-
 def chunk_time_range(window: FileWindow, start: int) -> tuple[int, int] | None:
     """Return first and last message time in the head of a chunk, ns; None if invalid."""
     head = window.read(start + HEAD.size, 16)
@@ -223,64 +177,6 @@ def chunk_time_range(window: FileWindow, start: int) -> tuple[int, int] | None:
         return None
     first, last = struct.unpack('<QQ', head)
     return (first, last) if first <= last < 2**63 else None
-
-
-def decode_chunk(window: FileWindow, start: int) -> DecodedChunk:
-    """Return the content of the chunk at ``start``; of a truncated chunk, the beginning.
-
-    Raises
-    ------
-    ChunkError
-        The compression is unknown, decompression fails, or the checksum, or without a checksum
-        the size, is wrong.
-    """
-    position = start + HEAD.size
-    head = window.read(position, _CHUNK_HEAD.size)
-    if len(head) < _CHUNK_HEAD.size:
-        raise ChunkError('the file ends inside the head of a chunk')
-    _, _, size, checksum, name_length = _CHUNK_HEAD.unpack(head)
-    position += _CHUNK_HEAD.size
-    name = window.read(position, min(name_length, _NAME_LIMIT))
-    position += name_length
-    prefix = window.read(position, 8)
-    if len(prefix) < 8:
-        raise ChunkError('the file ends inside the head of a chunk')
-    length = int.from_bytes(prefix, 'little')
-    stored = window.read(position + 8, length)
-    data, finished = _decompress(name, stored)
-    if len(stored) < length:
-        return DecodedChunk(data, complete=False, checked=False)
-    if not finished:
-        raise ChunkError('the compressed data of a chunk are incomplete')
-    if checksum:
-        if zlib.crc32(data) != checksum:
-            raise ChunkError('the checksum of a chunk is wrong')
-    elif len(data) != size:
-        raise ChunkError(f'a chunk has {len(data)} bytes instead of {size}')
-    return DecodedChunk(data, complete=True, checked=checksum != 0)
-
-
-def _decompress(name: bytes, stored: bytes) -> tuple[bytes, bool]:
-    """Return the decompressed bytes of ``stored``, and whether they are complete.
-
-    Memory is allocated by the actual output, not by the sizes in the chunk, which may be damaged.
-    """
-    if name == b'':
-        return stored, True
-    decoder: Any
-    if name == b'zstd':
-        decoder = zstandard.ZstdDecompressor().decompressobj()
-    elif name == b'lz4':
-        decoder = lz4.frame.LZ4FrameDecompressor()
-    else:
-        raise ChunkError(f'the compression of a chunk is unknown: {name!r}')
-    if not stored:
-        return b'', False
-    try:
-        data = bytes(decoder.decompress(stored))
-    except (zstandard.ZstdError, RuntimeError, MemoryError) as error:
-        raise ChunkError(f'a chunk does not decompress: {error}') from error
-    return data, bool(decoder.eof)
 
 
 class Span(NamedTuple):
@@ -443,9 +339,3 @@ class Scanner:
         return attachment_is_valid(
             self._window.read(position + HEAD.size, found.end - position - HEAD.size)
         )
-
-
-def attachment_is_valid(content: bytes) -> bool:
-    """Return whether the checksum of an attachment is correct or absent."""
-    checksum = int.from_bytes(content[-4:], 'little')
-    return checksum in (0, zlib.crc32(content[:-4]))

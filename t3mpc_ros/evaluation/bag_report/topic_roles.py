@@ -6,7 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from t3mpc_ros.bag.reader import BagReader, TopicSummary
+from t3mpc_ros.bag.metadata import TopicInformation
+from t3mpc_ros.bag.reader import BagReader
 
 WHEELS = ('right', 'left')
 TERMS = ('fuzzy', 'feedback', 'feedforward', 'compensator', 'predictive')
@@ -155,7 +156,7 @@ def _listing(recording: BagReader, most: int = 20) -> str:
     return ', '.join(words + more) or 'no topic at all'
 
 
-def _rank(name: str, topic: TopicSummary, space: str) -> tuple[int, int, int, int, str]:
+def _rank(name: str, topic: TopicInformation, space: str) -> tuple[int, int, int, int, str]:
     """Return a sort key that puts the likeliest topic first."""
     low = topic.name.lower()
     words = ('odom',) if name == ODOMETRY else ('cmd_vel', 'cmd', 'command')

@@ -13,9 +13,8 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.bag.chunk_reader import BagIndex, read_attachment_data, read_bag_index
-from t3mpc_ros.bag.columns import TopicColumns, read_columns, read_strings
-from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.bag.columns import TopicColumns, read_columns
+from t3mpc_ros.bag.reader import BagReader, open_bag
 from t3mpc_ros.bag.recording.split_writer import message_loss_notes
 from t3mpc_ros.bag.run.journal import COMMAND_EVENTS, JOURNAL_COLUMNS, Event, parameters_from_json
 from t3mpc_ros.bag.run.model_file import load_model
@@ -148,16 +147,24 @@ def load_inputs(
     BagError
         The bag cannot be read.
     """
-    held = read_bag_index(bag)
+    with open_bag(bag) as held:
+        return _load_inputs(held, namespace, model)
+
+
+def _load_inputs(
+    held: BagReader, namespace: str | None, model: Mapping[str, Array] | None
+) -> ControllerInputs:
+    bag = held.folder
     notes = message_loss_notes(held.metadata_records)
-    known, namespaces = find_topics(held.types, namespace)
+    recorded_topics = {name for name, topic in held.topics.items() if topic.message_count}
+    known, namespaces = find_topics(held.topics, namespace)
     prefix = namespaces[0]
     names = (f'{CONTROLLER}/{name}' for name in ('journal', *NUMBERS))
     wanted = {name: f'{prefix}/{name}' for name in (REFERENCE, ODOMETRY, COMMAND, *names)}
     topics = {
         name: full
         for name, full in (wanted | known).items()
-        if name in wanted and held.counts.get(full)
+        if name in wanted and full in recorded_topics
     }
     for name in (ODOMETRY, COMMAND):
         if name not in topics and (full := _renamed_topic(held, name, [*topics.values()])):
@@ -166,14 +173,11 @@ def load_inputs(
     if missing := [name for name in (REFERENCE, ODOMETRY, COMMAND) if name not in topics]:
         raise ReplayError(f'{bag}: these topics are not in the bag: {", ".join(missing)}')
     revisions = _revisions(held, f'{prefix}/{CONTROLLER}/parameters')
-    default = None
-    if not revisions:
-        with open_bag(bag) as recording:
-            default = recorded_parameters(recording, prefix, notes)
+    default = None if revisions else recorded_parameters(held, prefix, notes)
     initial = {
         name: full
         for name in (REFERENCE, ODOMETRY)
-        if held.counts.get(full := f'{prefix}/{INITIAL_INPUTS}{name}')
+        if (full := f'{prefix}/{INITIAL_INPUTS}{name}') in recorded_topics
     }
     columns = read_columns(held, [*topics.values(), *initial.values()])
     by_name = {name: columns[full] for name, full in topics.items()}
@@ -196,20 +200,20 @@ def load_inputs(
     )
 
 
-def _renamed_topic(held: BagIndex, name: str, used: Sequence[str]) -> str:
+def _renamed_topic(held: BagReader, name: str, used: Sequence[str]) -> str:
     """Return the only topic that can be the odometry or command of a robot with other names.
 
     Empty if there is none, or several. Topics of another controller's namespace do not count.
     """
     others = [
         full
-        for full, type_name in held.types.items()
-        if type_name in KINDS[name]
-        and held.counts.get(full)
+        for full, topic in held.topics.items()
+        if topic.type_name in KINDS[name]
+        and topic.message_count
         and full not in used
         and f'/{INITIAL_INPUTS}' not in full
         and not full.endswith((f'/{REFERENCE}', f'/{TRUTH}'))
-        and f'{full.removesuffix(f"/{name}")}/{CONTROLLER}/journal' not in held.types
+        and f'{full.removesuffix(f"/{name}")}/{CONTROLLER}/journal' not in held.topics
     ]
     return others[0] if len(others) == 1 else ''
 
@@ -230,12 +234,15 @@ def motions(column: TopicColumns) -> StateArray:
 Revision = tuple[int, int, Mapping[str, object]]
 
 
-def _revisions(held: BagIndex, topic: str) -> list[Revision]:
+def _revisions(held: BagReader, topic: str) -> list[Revision]:
     """Return (receive time, revision, parameters) in order of receipt."""
-    if not held.counts.get(topic):
+    if topic not in held.topics:
         return []
+    messages = [
+        (each.received_ns, held.decode(each)) for each in held.serialized_messages([topic])
+    ]
     try:
-        return [(when, *parameters_from_json(text)) for when, text in read_strings(held, topic)]
+        return [(when, *parameters_from_json(message.data)) for when, message in messages]
     except ValueError as error:
         raise ReplayError(f'{topic}: {error}') from error
 
@@ -257,7 +264,7 @@ class _Reader:
     def __init__(
         self,
         bag: Path,
-        held: BagIndex,
+        held: BagReader,
         columns: Mapping[str, TopicColumns],
         revisions: Sequence[Revision],
         default: ControllerParameters | None,
@@ -415,7 +422,7 @@ class _Reader:
         name = self._model_name()
         if not wanted.size and (self.journalled or not name):
             return None
-        kept = list(read_attachment_data(self._held).values())
+        kept = [item.data for item in self._held.attachments().values()]
         if name and Path(name).is_file():
             kept.append(Path(name).read_bytes())
         for content in kept:

@@ -19,7 +19,7 @@ from rclpy.qos import (
 )
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from t3mpc_ros.bag.merged_reader import MergedReader, require_cdr
+from t3mpc_ros.bag.merged_reader import MergedReader
 from t3mpc_ros.bag.player import VELOCITY_TYPES, velocity_command_risk
 from t3mpc_ros.bag.qos import UNLIMITED, QosProfile, adapt_offer_to_recorded_offers
 from t3mpc_ros.bag.schema import BagError
@@ -96,7 +96,8 @@ class TopicPublishers:
 
     def _create(self, reader: MergedReader, topic: str, rules: PublishingRules) -> Publisher:
         track = reader.topics[topic]
-        require_cdr(track)
+        if track.serialization_format != 'cdr':
+            raise BagError(f'its messages are {track.serialization_format}, not cdr')
         if rules.publishes_clock and self._node.resolve_topic_name(topic) == CLOCK:
             raise BagError('the player publishes its own clock (play.clock_publish_frequency)')
         names = [topic, *reader.recorded_names[topic]]

@@ -12,8 +12,9 @@ from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 
+from t3mpc_ros.bag.mcap_file import Attachment
 from t3mpc_ros.bag.run.model_file import find_model
-from t3mpc_ros.bag.writer import Attachment, AttachmentError, read_attachment
+from t3mpc_ros.bag.writer import AttachmentError, read_attachment
 from t3mpc_ros.nodes.registry import NODES
 from t3mpc_ros.parameters.provenance import provenance
 

@@ -17,6 +17,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from std_srvs.srv import Trigger
 
+from t3mpc_ros.bag.mcap_file import Attachment
 from t3mpc_ros.bag.recording.diagnostics_monitor import (
     DiagnosticsMonitor,
     NodeFault,
@@ -28,7 +29,7 @@ from t3mpc_ros.bag.recording.snapshot import CircularMessageCache
 from t3mpc_ros.bag.recording.split_writer import LOSSES, SplitWriter, message_loss_record
 from t3mpc_ros.bag.schema import BagError, MessageDefinitions, UnknownTypeError
 from t3mpc_ros.bag.topic_filter import TopicFilter
-from t3mpc_ros.bag.writer import Attachment, FolderError
+from t3mpc_ros.bag.writer import FolderError
 from t3mpc_ros.chaos.seed_fingerprint import FINGERPRINT_KEY
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.common import qos

@@ -7,6 +7,8 @@ from datetime import datetime
 from pathlib import Path
 import threading
 
+from t3mpc_ros.bag.mcap_file import Attachment, SerializedMessage
+from t3mpc_ros.bag.metadata import TopicInformation
 from t3mpc_ros.bag.recording.diagnostics_monitor import snapshot_folder_name
 from t3mpc_ros.bag.recording.snapshot import (
     SNAPSHOT_RECORD,
@@ -15,7 +17,6 @@ from t3mpc_ros.bag.recording.snapshot import (
     write_snapshot,
 )
 from t3mpc_ros.bag.schema import BagError, MessageDefinitions
-from t3mpc_ros.bag.writer import Attachment, SerializedMessage, TopicMetadata
 
 FOLDER = 'snapshots'
 SLICE_PAUSE = 0.01
@@ -41,7 +42,7 @@ class SnapshotWriter:
         self._folder = folder / FOLDER
         self._cache = cache
         self._definitions = definitions
-        self._topics: dict[str, TopicMetadata] = {}
+        self._topics: dict[str, TopicInformation] = {}
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         self.completed: list[Path] = []
@@ -54,11 +55,11 @@ class SnapshotWriter:
         """Whether a snapshot is being written."""
         return self._thread is not None and self._thread.is_alive()
 
-    def add_topic(self, topic: TopicMetadata, latched: int) -> None:
+    def add_topic(self, topic: TopicInformation, latched: int) -> None:
         """Add the metadata of a topic with ``latched`` transient-local publishers."""
-        self._topics[topic.topic] = topic
+        self._topics[topic.name] = topic
         if latched:
-            self._cache.keep_last(topic.topic, latched)
+            self._cache.keep_last(topic.name, latched)
 
     def add(self, messages: list[SerializedMessage]) -> None:
         """Add messages to the cache, in order of reception."""

@@ -33,9 +33,10 @@ from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from t3mpc_ros.bag.mcap_file import SerializedMessage
+from t3mpc_ros.bag.metadata import TopicInformation
 from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.topic_filter import TopicFilter
-from t3mpc_ros.bag.writer import SerializedMessage, TopicMetadata
 from t3mpc_ros.nodes.common import graph_introspection, qos
 
 EXPECTED_TOPICS = {
@@ -313,12 +314,12 @@ class TopicDiscovery:
 
 def offered_qos(
     topic: str, type_name: str, publishers: Sequence[TopicEndpointInfo]
-) -> tuple[TopicMetadata, int]:
+) -> tuple[TopicInformation, int]:
     """Return the metadata of a topic for the bag, and its number of transient-local publishers."""
     profiles = tuple(_bag_profile(info.qos_profile) for info in publishers)
-    type_hash = str(publishers[-1].topic_type_hash) if publishers else None
+    type_hash = str(publishers[-1].topic_type_hash) if publishers else ''
     latched = sum(qos.is_transient_local(info.qos_profile) for info in publishers)
-    return TopicMetadata(topic, type_name, profiles, type_hash), latched
+    return TopicInformation(topic, type_name, profiles, type_hash), latched
 
 
 def _bag_profile(offered: QoSProfile) -> QosProfile:

@@ -8,10 +8,10 @@ import contextlib
 import threading
 from typing import Any, TypeVar
 
+from t3mpc_ros.bag.mcap_file import SerializedMessage
 from t3mpc_ros.bag.recording.message_queue import MessageQueue
 from t3mpc_ros.bag.recording.split_writer import SplitWriter
 from t3mpc_ros.bag.schema import BagError
-from t3mpc_ros.bag.writer import SerializedMessage
 
 T = TypeVar('T')
 
