@@ -871,6 +871,6 @@ def test_a_reference_that_starts_again_does_no_harm(rows, tmp_path):
 
 
 def test_no_bag_is_an_error_and_writes_nothing(tmp_path):
-    with pytest.raises(BagError, match='no complete bag file'):
+    with pytest.raises(BagError, match='there is no bag'):
         write_report(tmp_path / 'gone')
     assert list(tmp_path.iterdir()) == []

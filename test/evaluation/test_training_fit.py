@@ -541,7 +541,7 @@ def test_bags_made_under_different_settings_are_not_mixed(run, calm, tmp_path):
         fit_bags([one, other.write(tmp_path / 'other')])
     with pytest.raises(TrainingError, match='at least one bag'):
         fit_bags([])
-    with pytest.raises(BagError, match='no complete bag file'):
+    with pytest.raises(BagError, match='there is no bag'):
         fit_bags([tmp_path / 'nowhere'])
 
 
@@ -702,7 +702,7 @@ def test_bags_on_the_command_line(bag, trained, tmp_path, capsys):
         (['--seeds', '0'], 'seeds must be from 1 to 20: got 0'),
         (['--keep-predictor'], 'is for bags'),
         (['bag', '--robot', 'torque'], 'robot must be servo for bags'),
-        (['nowhere'], 'no complete bag file'),
+        (['nowhere'], 'there is no bag'),
     ],
     ids=str,
 )
