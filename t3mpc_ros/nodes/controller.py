@@ -62,7 +62,8 @@ class ControllerNodeParameters(StepperControllerParameters):
     frames: FrameParameters = group(FrameParameters, inline=True)
     terms_rate: float = parameter(
         20.0,
-        'rate of the scalar topics (~/error, ~/estimate, ~/terms, ~/lyapunov, ~/skill); 0 = none',
+        'rate of the scalar topics (~/error, ~/estimate, ~/terms, ~/lyapunov, ~/skill), which '
+        'are published only while they have subscribers; 0 = none',
         unit='Hz',
         low=0.0,
         high=1000.0,
@@ -284,8 +285,10 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self._publish_scalar('lyapunov/margin', status.certificate.margin)
 
     def _publish_scalar(self, name: str, value: float) -> None:
-        if math.isfinite(value):  # the error is NaN while there is no reference
-            self._scalar_publishers[name].publish(Float64(data=float(value)))
+        publisher = self._scalar_publishers[name]
+        # The error is NaN while there is no reference.
+        if math.isfinite(value) and publisher.get_subscription_count():
+            publisher.publish(Float64(data=float(value)))
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._controller.enable(request.data)

@@ -111,6 +111,22 @@ def test_names_patterns_and_regex_select_exclusion_overrides(topic, recorded):
 
 
 @pytest.mark.parametrize(
+    'topic, recorded',
+    [
+        ('controller/journal', True),
+        ('controller/parameters', True),
+        ('controller/initial_inputs/odom', True),
+        ('controller/error/right', False),
+        ('controller/terms/fuzzy/left', False),
+        ('reference/mode', True),
+    ],
+)
+def test_scalars_of_the_controller_are_left_out_by_default(topic, recorded):
+    selection = TopicFilter([], RecordingParameters().topics, namespace='/a')
+    assert selection.matches(f'/a/{topic}') == recorded
+
+
+@pytest.mark.parametrize(
     'exclusion, excluded',
     [
         ({}, []),

@@ -22,6 +22,8 @@ from t3mpc_ros.bag.writer import BagWriter, DataError
 from t3mpc_ros.cli.bag import add_compare_parser, add_replay_parser
 from t3mpc_ros.control.controller import ControllerParameters
 from t3mpc_ros.control.watchdog import Reason
+from t3mpc_ros.evaluation.bag_report.run_data import load_run
+from t3mpc_ros.evaluation.bag_report.topic_roles import SCALARS
 from t3mpc_ros.evaluation.process_replay.comparison import (
     ELSEWHERE,
     Tolerances,
@@ -38,9 +40,14 @@ from t3mpc_ros.evaluation.process_replay.controller_inputs import (
 )
 from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller
 from t3mpc_ros.evaluation.process_replay.divergence_figure import write_divergence_figure
-from t3mpc_ros.evaluation.process_replay.golden_bags import GOLDEN_SCENARIOS, run_golden_scenario
+from t3mpc_ros.evaluation.process_replay.golden_bags import (
+    GOLDEN_SCENARIOS,
+    GoldenScenario,
+    run_golden_scenario,
+)
 from t3mpc_ros.evaluation.process_replay.journal_alignment import match
 from t3mpc_ros.evaluation.process_replay.method_replay import replay_method
+from t3mpc_ros.evaluation.training.training_data import load_training_data
 from t3mpc_ros.evaluation.twin_closed_loop import loop_controller
 from t3mpc_ros.geometry.types import BodyTwist, Pose, State
 from t3mpc_ros.parameters.table import ParameterError
@@ -110,6 +117,58 @@ def test_golden_runs_come_out_as_they_were_recorded(path):
     outcome = compare(inputs, replay_controller(inputs), Tolerances(ELSEWHERE, ELSEWHERE))
     assert outcome.same, outcome.table()
     assert {row.field for row in outcome.rows} == set(FIELDS)
+
+
+@pytest.mark.parametrize('path', GOLDEN, ids=lambda path: path.stem)
+def test_a_report_without_scalars_has_those_of_the_journal(path, tmp_path):
+    """The recorder leaves them out; the golden bags hold every second one of them."""
+    bare = without(path, tmp_path / 'bare', lambda topic, k: topic.removeprefix('/') in SCALARS)
+    with open_bag(path) as recording, open_bag(bare) as rest:
+        recorded, found = load_run(recording), load_run(rest)
+    assert not SCALARS & found.topics.keys()
+    assert found.absent == recorded.absent
+    assert found.numbers.keys() == recorded.numbers.keys()
+    for name in SCALARS:
+        was, now = recorded.numbers[name], found.numbers[name]
+        near = np.abs(now.time[:, None] - was.time).argmin(axis=0)
+        np.testing.assert_allclose(now.time[near], was.time, atol=1e-4)
+        np.testing.assert_allclose(
+            now['value'][near], was['value'], rtol=ELSEWHERE, atol=ELSEWHERE
+        )
+        assert len(now) >= 2 * len(was)
+    assert any('recomputed from its journal' in note for note in found.notes)
+    assert not any('approximate' in note for note in found.notes)
+
+
+def test_scalars_after_a_lost_input_are_called_approximate(bag, tmp_path):
+    torn = without(
+        bag,
+        tmp_path / 'torn',
+        lambda topic, k: topic[1:] in SCALARS or (topic, k) == ('/odom', 300),
+    )
+    with open_bag(torn) as recording:
+        notes = load_run(recording).notes
+    assert any(' s on they are approximate' in note for note in notes)
+    gone = without(
+        bag, tmp_path / 'gone', lambda topic, k: topic[1:] in SCALARS or topic == JOURNAL
+    )
+    with open_bag(gone) as recording:
+        run = load_run(recording)
+    assert set(run.absent) >= SCALARS
+    assert not any('journal' in note for note in run.notes)
+
+
+def test_training_data_without_scalars_are_those_of_the_journal(tmp_path):
+    changes = {'composition': 'paper', 'predictive.dither': 4.0}
+    scenario = GoldenScenario(2, ((8.0, 12.0),), {}, parameters=changes)
+    path = run_golden_scenario(scenario, tmp_path / 'whole')
+    bare = without(path, tmp_path / 'bare', lambda topic, k: topic[1:] in SCALARS)
+    (whole, *_), (rest, *_) = load_training_data(path), load_training_data(bare)
+    published = np.isfinite(whole.moves)
+    np.testing.assert_allclose(rest.moves[published], whole.moves[published], atol=ELSEWHERE)
+    assert np.count_nonzero(np.isfinite(rest.moves)) >= 2 * np.count_nonzero(published) > 50
+    for name in ('errors', 'rest', 'speeds', 'unexplained'):
+        np.testing.assert_array_equal(getattr(rest, name), getattr(whole, name))
 
 
 def test_golden_bags_are_there_and_small():

@@ -238,6 +238,28 @@ def test_scalars_are_published_at_terms_rate(harness):
         assert math.isfinite(received[f'/controller/{name}'][-1].data), name
 
 
+def test_a_scalar_without_subscribers_is_not_published(harness):
+    bench = ControllerHarness(harness, terms_rate=20.0)
+    published = []
+
+    class Scalar:
+        def __init__(self, name):
+            self.name = name
+
+        def get_subscription_count(self):
+            return int(self.name == 'skill/left')
+
+        def publish(self, message):
+            published.append(self.name)
+
+    names = list(bench.controller._scalar_publishers)
+    bench.controller._scalar_publishers = {name: Scalar(name) for name in names}
+    bench.publish_odometry()
+    bench.publish_reference(seconds=0.9)
+    bench.run(10)
+    assert published == ['skill/left'] * 2
+
+
 def test_dynamic_controller_parameters_take_effect(harness):
     bench = ControllerHarness(harness)
 

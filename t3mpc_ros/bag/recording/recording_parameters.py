@@ -31,10 +31,13 @@ class RecordingParameters(Parameters):
             'range/*',
             'battery_state',
             'cmd_vel',
-            'controller/*',
+            'controller/journal',
+            'controller/parameters',
+            'controller/initial_inputs/*',
             '/diagnostics',
         ),
-        'topics to record; * matches any text; relative names are in the namespace of the node',
+        'topics to record; * matches any text; relative names are in the namespace of the node; '
+        'the scalars of the controller are recomputed from its journal',
         name='record.topics',
     )
     regex: str = parameter(

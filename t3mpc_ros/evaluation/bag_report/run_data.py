@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Data of a recorded run: motions, commands and control terms on one time axis."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 import math
 from typing import Any, NamedTuple
@@ -19,16 +19,20 @@ from t3mpc_ros.evaluation.bag_report.link_history import (
 )
 from t3mpc_ros.evaluation.bag_report.topic_roles import (
     COMMAND,
+    JOURNAL,
     NAMES,
     NUMBERS,
     ODOMETRY,
     REFERENCE,
+    SCALARS,
     SIGNALS,
     TRUTH,
     WHEELS,
     ReportOptions,
+    TopicChoice,
     choose_topics,
 )
+from t3mpc_ros.evaluation.process_replay.controller_replay import recompute_scalars
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
 from t3mpc_ros.geometry.types import BodyTwist
 from t3mpc_ros.parameters.table import ParameterError
@@ -159,8 +163,9 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
     raw = {name: _read(recording, name, topic, notes) for name, topic in topics.items()}
     raw = {name: table for name, table in raw.items() if table['stamp'].size}
     clock = _Clock(raw, notes)
+    scalars = _recomputed_scalars(recording, choice, notes)
     motions, numbers = {}, {}
-    for name, table in raw.items():
+    for name, table in {**raw, **scalars}.items():
         if name == 'reference/signals':
             for i, signal in enumerate(SIGNALS):
                 numbers[signal] = Series(
@@ -177,7 +182,7 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
     return Run(
         duration=recording.duration,
         topics=topics,
-        absent=_absent(topics, choice.ours),
+        absent=_absent({*topics, *scalars}, choice.ours),
         namespaces=choice.namespaces,
         ours=choice.ours,
         geometry=geometry,
@@ -196,6 +201,32 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
         links=links,
         notes=tuple(notes),
     )
+
+
+def _recomputed_scalars(
+    recording: BagReader, choice: TopicChoice, notes: list[str]
+) -> dict[str, dict[str, Array]]:
+    """Return the scalars of the controller if the bag holds its journal instead of them."""
+    namespace = choice.namespaces[0]
+    journal = recording.topics.get(f'{namespace}/{JOURNAL}')
+    if journal is None or not journal.message_count or SCALARS & choice.topics.keys():
+        return {}
+    try:
+        found, inputs = recompute_scalars(recording, namespace)
+    except (RuntimeError, ValueError) as error:
+        notes.append(
+            f'The terms of the controller cannot be recomputed from its journal: {error}.'
+        )
+        return {}
+    text = 'The terms of the controller were recomputed from its journal'
+    inexact = np.flatnonzero(~inputs.exact)
+    if inexact.size:
+        text += (
+            f'; from {inputs.time[inexact[0]]:.1f} s on they are approximate, because inputs of '
+            'the controller are missing'
+        )
+    notes.append(f'{text}.')
+    return {name: table for name, table in found.items() if table['value'].size}
 
 
 class _Clock:
@@ -380,7 +411,7 @@ def _geometry(
     return geometry
 
 
-def _absent(topics: Mapping[str, str], ours: bool) -> tuple[str, ...]:
+def _absent(topics: Collection[str], ours: bool) -> tuple[str, ...]:
     if not ours:
         return tuple(name for name in (REFERENCE, ODOMETRY, COMMAND) if name not in topics)
     names = set(NAMES) - set(topics)

@@ -20,6 +20,9 @@ NUMBERS = (
     'controller/lyapunov/value',
     'controller/lyapunov/margin',
 )
+SCALARS = frozenset(NUMBERS) - frozenset(SIGNALS)
+"""Scalars of the controller, which follow from its journal."""
+JOURNAL = 'controller/journal'
 INITIAL_INPUTS = 'controller/initial_inputs/'
 """Topics on which the controller republishes its first inputs; they are no topics of a robot."""
 NAMES = (REFERENCE, ODOMETRY, TRUTH, COMMAND, 'reference/signals', *NUMBERS)

@@ -97,6 +97,8 @@ class ControllerInputs:
     """Time of each row, s since the first message of the bag, shape (n,)."""
     recorded: Mapping[str, Array]
     """Recorded outputs by :data:`FIELDS`, NaN where missing, shape (n,) each."""
+    commands_ns: Integers
+    """Receive time of the command of each row, 0 without one, shape (n,)."""
     journalled: bool
     """Whether the order is that of the journal instead of receive times."""
     start_ns: int
@@ -148,12 +150,13 @@ def load_inputs(
         The bag cannot be read.
     """
     with open_bag(bag) as held:
-        return _load_inputs(held, namespace, model)
+        return inputs_of(held, namespace, model)
 
 
-def _load_inputs(
-    held: BagReader, namespace: str | None, model: Mapping[str, Array] | None
+def inputs_of(
+    held: BagReader, namespace: str | None = None, model: Mapping[str, Array] | None = None
 ) -> ControllerInputs:
+    """Return inputs and recorded outputs of an open bag, see :func:`load_inputs`."""
     bag = held.folder
     notes = message_loss_notes(held.metadata_records)
     recorded_topics = {name for name, topic in held.topics.items() if topic.message_count}
@@ -194,6 +197,7 @@ def _load_inputs(
         lives=tuple(lives),
         time=(time_ns - held.start_ns) / NANOSECONDS,
         recorded=recorded,
+        commands_ns=np.where(commands >= 0, by_name[COMMAND].received_ns[commands], 0),
         journalled=reader.journalled,
         start_ns=held.start_ns,
         notes=tuple(notes),

@@ -10,21 +10,29 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.bag.reader import BagReader
 from t3mpc_ros.bag.run.journal import Event
 from t3mpc_ros.control.control_law import BOUND, RATE, TERM_NAMES, VALUE
 from t3mpc_ros.control.controller import Controller, ControllerParameters, Status
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation.bag_report.topic_roles import WHEELS
 from t3mpc_ros.evaluation.process_replay.controller_inputs import (
+    CONTROLLER,
     FIELDS,
+    NUMBERS,
     PAIRS,
     ControllerInputs,
     ControllerSession,
+    ReplayError,
+    inputs_of,
     motions,
 )
-from t3mpc_ros.geometry.types import STANDSTILL, BodyTwist, StateArray
+from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist, StateArray
 
 Array = NDArray[np.float64]
+
+SCALAR_RATE = 20.0
+"""Default of the node's parameter ``terms_rate``, Hz."""
 
 _STEP = int(Event.STEP)  # an enumeration is slower to compare
 OPEN_LOOP = (
@@ -172,6 +180,43 @@ def make_controllers(
             controller.set_weights(life.model)
         controllers.append(controller)
     return controllers
+
+
+def recompute_scalars(
+    recording: BagReader, namespace: str
+) -> tuple[dict[str, dict[str, Array]], ControllerInputs]:
+    """Return the scalars of a controller from its journal, and the inputs that they follow from.
+
+    They are those that its node publishes, at the same rate: by relative topic name, the arrays
+    that :meth:`BagReader.series` would return for the field ``value``, and ``exact``, which is 1
+    where all inputs of the controller are in the bag, else 0.
+
+    Raises
+    ------
+    ReplayError, TrainingError, ValueError
+        The bag has no journal, or its inputs, parameters or model are incomplete.
+    BagError
+        The bag is damaged.
+    """
+    inputs = inputs_of(recording, namespace)
+    if not inputs.journalled:
+        raise ReplayError(f'{recording.folder}: there is no journal of the controller')
+    result = replay_controller(inputs)
+    steps = np.flatnonzero(inputs.events == Event.STEP)
+    every = max(1, round(result.parameters.rate / SCALAR_RATE))
+    rows = steps[every - 1 :: every]
+    rows = rows[inputs.commands_ns[rows] > 0]
+    # A scalar is published right after the command of its step.
+    received = (inputs.commands_ns[rows] - recording.start_ns) / NANOSECONDS
+    exact = inputs.exact[rows].astype(np.float64)
+    found = {}
+    for name in NUMBERS:
+        values = result.fields[name][rows]
+        known = np.isfinite(values)
+        times = received[known]
+        table = {'received': times, 'stamp': times, 'value': values[known], 'exact': exact[known]}
+        found[f'{CONTROLLER}/{name}'] = table
+    return found, inputs
 
 
 def _replay_session(

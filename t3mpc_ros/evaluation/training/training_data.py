@@ -4,7 +4,7 @@
 
 import ast
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 import math
 from pathlib import Path
@@ -18,8 +18,10 @@ from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.evaluation.bag_report.topic_roles import (
     COMMAND,
+    JOURNAL,
     ODOMETRY,
     REFERENCE,
+    SCALARS,
     WHEELS,
     find_topics,
 )
@@ -102,7 +104,8 @@ def load_training_data(folder: Path) -> tuple[TrainingData, ControllerParameters
         topics, namespaces = find_topics(recording.topics)
         topics = {name: t for name, t in topics.items() if recording.topics[t].message_count}
         missing = [name for name in NEEDED if name not in topics]
-        if missing:
+        recomputed = _recomputed(recording, namespaces[0], missing)
+        if missing := [name for name in missing if name not in recomputed]:
             raise TrainingError(
                 f'{folder}: these topics are missing, or have no message: {", ".join(missing)}'
             )
@@ -114,7 +117,12 @@ def load_training_data(folder: Path) -> tuple[TrainingData, ControllerParameters
                 'nothing is learnt about the wheels; record a bag with composition: paper'
             )
         parameters = parameters.resolved()
-        messages = {name: _read(recording, name, topics[name], notes) for name in NEEDED}
+        messages = {
+            name: recomputed[name]
+            if name in recomputed
+            else _read(recording, name, topics[name], notes)
+            for name in NEEDED
+        }
     if empty := [name for name, table in messages.items() if not table['received'].size]:
         raise TrainingError(f'{folder}: no message of {", ".join(empty)} is finite')
     replay = _rebuild(parameters, messages, notes)
@@ -130,6 +138,27 @@ def load_training_data(folder: Path) -> tuple[TrainingData, ControllerParameters
             'published: the run was made under other settings, or by another version'
         )
     return replay, parameters, [f'{folder}: {note}' for note in notes]
+
+
+def _recomputed(
+    recording: BagReader, namespace: str, missing: Sequence[str]
+) -> dict[str, Mapping[str, Array]]:
+    """Return the missing topics that follow exactly from the journal of the controller."""
+    # Replay reads the recorded parameters with this module.
+    from t3mpc_ros.evaluation.process_replay.controller_inputs import ReplayError
+    from t3mpc_ros.evaluation.process_replay.controller_replay import recompute_scalars
+
+    if not set(missing) & SCALARS or f'{namespace}/{JOURNAL}' not in recording.topics:
+        return {}
+    try:
+        scalars, _ = recompute_scalars(recording, namespace)
+    except ReplayError:
+        return {}
+    return {
+        name: {key: column[scalars[name]['exact'] > 0.0] for key, column in scalars[name].items()}
+        for name in missing
+        if name in scalars
+    }
 
 
 def recorded_parameters(
