@@ -25,6 +25,7 @@ setup(
         (f'share/{NAME}/launch', sorted(glob('launch/*.launch.py'))),
     ],
     package_data={
+        f'{NAME}.evaluation': ['*.html'],
         f'{NAME}.evaluation.method_comparison': ['*.yaml'],
         f'{NAME}.evaluation.training': ['*.npz'],
         f'{NAME}.evaluation.tuning': ['*.json'],
@@ -42,6 +43,8 @@ setup(
         'pyserial',
         'matplotlib',
         'cma',
+        'jinja2',
+        'tqdm',
     ],
     # colcon test runs pytest only where it is a test dependency.
     extras_require={'nmpc': ['casadi'], 'test': ['pytest']},

@@ -15,6 +15,8 @@ REQUIREMENTS = {
     'serial': 'pyserial>=3.5',
     'matplotlib': 'matplotlib>=3.8',
     'cma': 'cma>=4.0',
+    'jinja2': 'jinja2>=3.1',
+    'tqdm': 'tqdm>=4.66',
     'casadi': 'casadi>=3.6',
 }
 """Requirement of each imported library, as in the requirements files."""

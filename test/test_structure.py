@@ -71,7 +71,7 @@ LIBRARIES = {
     'simulation': {'yaml'},
     'radio': {'serial'},
     'bag': {'mcap', 'rosbags', 'yaml', 'zstandard', 'lz4'},
-    'evaluation': {'matplotlib', 'yaml', 'cma', 'casadi'},
+    'evaluation': {'matplotlib', 'yaml', 'cma', 'casadi', 'jinja2', 'tqdm'},
     'nodes': {'yaml'},
     'cli': {'yaml'},
 }
@@ -247,6 +247,8 @@ def test_package_xml_names_the_rosdep_keys_of_the_libraries():
         'yaml': 'python3-yaml',
         'serial': 'python3-serial',
         'matplotlib': 'python3-matplotlib',
+        'jinja2': 'python3-jinja2',
+        'tqdm': 'python3-tqdm',
         'mcap': 'mcap-ros2-support',
         'rosbags': 'python3-rosbags-pip',
     }

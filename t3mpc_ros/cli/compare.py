@@ -3,7 +3,6 @@
 """``t3mpc compare``: the controller and every baseline on one robot, case by case."""
 
 import argparse
-from collections.abc import Callable
 import os
 from pathlib import Path
 from typing import Any
@@ -14,11 +13,8 @@ ROBOTS = ('twin', 'servo', 'torque')
 DEFAULT_SEEDS = '201-206'
 
 
-def add_parser(commands: Any, clock: Callable[[], float]) -> argparse.ArgumentParser:
-    """Return the parser of ``compare``, added to the sub-parsers of a program.
-
-    ``clock`` returns seconds from any origin, for the time left.
-    """
+def add_parser(commands: Any) -> argparse.ArgumentParser:
+    """Return the parser of ``compare``, added to the sub-parsers of a program."""
     parser: argparse.ArgumentParser = commands.add_parser(
         'compare', help='the controller and every baseline on one robot, case by case'
     )
@@ -74,7 +70,7 @@ def add_parser(commands: Any, clock: Callable[[], float]) -> argparse.ArgumentPa
     )
     parser.add_argument('--json', type=Path, help='write every number to this file')
     parser.add_argument('--html', type=Path, help='write one page to this file')
-    parser.set_defaults(run=run, clock=clock)
+    parser.set_defaults(run=run)
     return parser
 
 
@@ -97,7 +93,7 @@ def run(options: argparse.Namespace) -> int:
         methods_for,
     )
     from t3mpc_ros.evaluation.methods import require_libraries
-    from t3mpc_ros.evaluation.reporting import Progress, strict_json
+    from t3mpc_ros.evaluation.reporting import strict_json
     from t3mpc_ros.evaluation.tuning.search_space import find_names
 
     known = methods_for(options.robot)
@@ -116,7 +112,7 @@ def run(options: argparse.Namespace) -> int:
     for path in (options.json, options.html):
         if path:  # a folder that cannot be made is an error before the runs, not after them
             path.parent.mkdir(parents=True, exist_ok=True)
-    results = compare(plan, options.workers, Progress(options.clock))
+    results = compare(plan, options.workers, progress=True)
     print(comparison_page.markdown(plan, results))
     if options.json:
         content = comparison_page.record(plan, results)

@@ -3,18 +3,12 @@
 """``t3mpc faults``: fault study of the closed loop."""
 
 import argparse
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
 
-def add_outcomes_parser(
-    commands: 'argparse._SubParsersAction[argparse.ArgumentParser]', clock: Callable[[], float]
-) -> None:
-    """Add the subcommand ``faults``.
-
-    ``clock`` returns seconds from any origin, for the time left.
-    """
+def add_outcomes_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
+    """Add the subcommand ``faults``."""
     parser = commands.add_parser(
         'faults', help='drive the digital twin under every named fault, and say what comes of it'
     )
@@ -25,7 +19,7 @@ def add_outcomes_parser(
         '--output', type=Path, help='page whose table is to be replaced, docs/faults.md say'
     )
     parser.add_argument('--json', type=Path, help='also write the numbers to this file')
-    parser.set_defaults(run=run, clock=clock)
+    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -36,7 +30,7 @@ def run(options: argparse.Namespace) -> int:
         study_faults,
         update_page,
     )
-    from t3mpc_ros.evaluation.reporting import Progress, strict_json
+    from t3mpc_ros.evaluation.reporting import strict_json
 
     known = dict.fromkeys(fault_run.fault for fault_run in FAULT_RUNS)
     for name in options.names:
@@ -49,7 +43,7 @@ def run(options: argparse.Namespace) -> int:
         for fault_run in FAULT_RUNS
         if not options.names or fault_run.fault in options.names
     ]
-    results = study_faults(fault_runs, Progress(options.clock))
+    results = study_faults(fault_runs, progress=True)
     print(console_text(results))
     if options.output:
         update_page(options.output, results)

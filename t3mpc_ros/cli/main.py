@@ -3,12 +3,11 @@
 """``t3mpc``: the command-line program for everything that needs no ROS graph."""
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import datetime
 from importlib import import_module
 from pathlib import Path
 import sys
-import time
 from typing import TYPE_CHECKING
 import webbrowser
 
@@ -99,23 +98,15 @@ def _new_run(folder: Path) -> Path:
 
 def _estimation(options: argparse.Namespace) -> int:
     from t3mpc_ros.evaluation.open_loop_estimation import compare, table
+    from t3mpc_ros.evaluation.reporting import strict_json
 
     results = compare(
-        seeds=options.seeds,
-        duration=options.duration,
-        normalised_gain=options.gain,
-        progress=lambda text: print(f'  {text}', file=sys.stderr, flush=True),
+        seeds=options.seeds, duration=options.duration, normalised_gain=options.gain, progress=True
     )
     print(table(results))
-    return _keep([result.record() for result in results], options.json)
-
-
-def _keep(records: Sequence[Mapping[str, object]], path: Path | None) -> int:
-    """Write the records to the given file, if any, and return 0."""
-    if path:
-        from t3mpc_ros.evaluation.reporting import strict_json
-
-        path.write_text(strict_json(records), encoding='utf-8')
+    if options.json:
+        text = strict_json([result.record() for result in results])
+        options.json.write_text(text, encoding='utf-8')
     return 0
 
 
@@ -201,11 +192,11 @@ def _parser() -> argparse.ArgumentParser:
     exponents.set_defaults(run=_exponents)
 
     add_paper(commands)
-    add_compare(commands, time.monotonic)
+    add_compare(commands)
     add_tune(commands, _method_definitions)
     add_train(commands)
-    add_twin(commands, time.monotonic)
-    add_outcomes_parser(commands, time.monotonic)
+    add_twin(commands)
+    add_outcomes_parser(commands)
 
     compiling = commands.add_parser('compile', help='compile every kernel into the cache')
     compiling.set_defaults(run=_compile)

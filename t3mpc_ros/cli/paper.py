@@ -5,7 +5,7 @@
 import argparse
 import os
 from pathlib import Path
-import time
+import sys
 from typing import Any
 
 from t3mpc_ros.evaluation.paper.reproduce import PaperOptions, default_setup, reproduce
@@ -54,7 +54,6 @@ def run(options: argparse.Namespace) -> int:
         A compared method needs a library that is not installed.
     """
     from t3mpc_ros.evaluation.methods import NMPC, require_libraries
-    from t3mpc_ros.evaluation.reporting import Progress
 
     require_libraries([NMPC])
     output = options.output or Path('runs') / ('paper-quick' if options.quick else 'paper')
@@ -67,8 +66,12 @@ def run(options: argparse.Namespace) -> int:
         json=options.json,
         fresh=options.fresh,
     )
-    print(reproduce(default_setup(), chosen, Progress(time.monotonic)))
+    print(reproduce(default_setup(), chosen, _report))
     return 0
+
+
+def _report(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
 
 
 def _processors() -> int:

@@ -4,7 +4,6 @@
 
 import argparse
 from pathlib import Path
-import sys
 
 DRIVES = {'servo': 'velocity', 'torque': 'torque'}
 OUTPUT = Path('model.npz')
@@ -85,7 +84,7 @@ def run(options: argparse.Namespace) -> int:
     drive = DRIVES[options.robot]
     pretrained, used = fit_simulated_runs(drive)
     save_model(options.output, pretrained, {**used.to_dict(), 'drive': drive}, origin(drive))
-    print(assess(drive, used, pretrained, seeds, _print_progress))
+    print(assess(drive, used, pretrained, seeds, progress=True))
     print(f'saved {options.output.resolve()}')
     return 0
 
@@ -103,7 +102,3 @@ def run_bags(options: argparse.Namespace) -> int:
     save_model(options.output, model.learnt, model.parameters.to_dict(), model.origin)
     print(f'saved {options.output.resolve()}')
     return 0
-
-
-def _print_progress(text: str) -> None:
-    print(f'  {text}', file=sys.stderr, flush=True)

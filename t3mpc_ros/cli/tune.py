@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 import os
 from pathlib import Path
 import sys
-import time
 from typing import TYPE_CHECKING
 
 from t3mpc_ros.parameters.command_line import bounded_int
@@ -111,7 +110,6 @@ def run(options: argparse.Namespace) -> int:
             options.workers,
             output,
             _print_progress,
-            clock=time.monotonic,
             resume=options.resume,
         )
     else:
@@ -125,7 +123,6 @@ def run(options: argparse.Namespace) -> int:
             options.workers,
             output,
             _print_progress,
-            clock=time.monotonic,
             resume=options.resume,
         )
     print(store.table())

@@ -3,30 +3,17 @@
 """``t3mpc twin``: validates the digital twin."""
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from t3mpc_ros.parameters.command_line import bounded_int
 
-if TYPE_CHECKING:
-    pass
-
-from typing import TYPE_CHECKING
-
-from t3mpc_ros.evaluation.twin_validation.validation_page import OUTPUT, SEED
-
-if TYPE_CHECKING:
-    pass
-
-from t3mpc_ros.evaluation.twin_validation.validation_page import FULL, QUICK, write_validation
+SEED = 1
+OUTPUT = Path('runs') / 'twin'
 
 
-def add_parser(commands: Any, clock: Callable[[], float]) -> argparse.ArgumentParser:
-    """Return the parser of ``twin``, added to the sub-parsers of a program.
-
-    ``clock`` returns seconds from any origin, for the time left.
-    """
+def add_parser(commands: Any) -> argparse.ArgumentParser:
+    """Return the parser of ``twin``, added to the sub-parsers of a program."""
     parser: argparse.ArgumentParser = commands.add_parser(
         'twin', help='the simulated robot against data sheets, and its odometry under slip'
     )
@@ -40,14 +27,14 @@ def add_parser(commands: Any, clock: Callable[[], float]) -> argparse.ArgumentPa
         default=SEED,
         help=f'of the first of the robots (default {SEED})',
     )
-    parser.set_defaults(run=run, clock=clock)
+    parser.set_defaults(run=run)
     return parser
 
 
 def run(options: argparse.Namespace) -> int:
     """Write figures, page and tables and return 0."""
-    from t3mpc_ros.evaluation.reporting import Progress
+    from t3mpc_ros.evaluation.twin_validation.validation_page import FULL, QUICK, write_validation
 
     amount = QUICK if options.quick else FULL
-    print(write_validation(options.output, options.seed, amount, Progress(options.clock)))
+    print(write_validation(options.output, options.seed, amount, progress=True))
     return 0

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.reporting import Progress
+from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table, progress_bar
 from t3mpc_ros.evaluation.twin_closed_loop import (
     INITIAL_STANDSTILL,
     STATUS_FLAGS,
@@ -345,17 +345,13 @@ FAULT_RUNS = _fault_runs()
 """Every run, grouped by course."""
 
 
-def study_faults(
-    fault_runs: Sequence[FaultRun], progress: Progress | None = None
-) -> list[Outcome]:
-    """Return the outcome of each run; ``progress`` receives the number of finished runs."""
-    if progress is not None:
-        progress.begin(len(fault_runs))
+def study_faults(fault_runs: Sequence[FaultRun], *, progress: bool = False) -> list[Outcome]:
+    """Return the outcome of each run."""
     results = []
-    for fault_run in fault_runs:
-        results.append(run_fault(fault_run))
-        if progress is not None:
-            progress.done(len(results))
+    with progress_bar(len(fault_runs), show=progress) as bar:
+        for fault_run in fault_runs:
+            results.append(run_fault(fault_run))
+            bar.update()
     return results
 
 
@@ -432,10 +428,12 @@ TITLES = {
     'arc': 'Along an arc at 0.2 m/s',
 }
 TABLE_HEAD = (
-    '| fault | outcome | error of the wheels before, during, after (rad/s) '
-    '| odometry error before, at the end | detected by robot or controller '
-    '| shown by ground truth only |\n'
-    '|---|---|---|---|---|---|\n'
+    'fault',
+    'outcome',
+    'error of the wheels before, during, after (rad/s)',
+    'odometry error before, at the end',
+    'detected by robot or controller',
+    'shown by ground truth only',
 )
 UNDETECTED = '**undetected by the robot**: '
 UNREPORTED = '**no flag, no reason, and the counters advance**: '
@@ -462,24 +460,23 @@ def outcome_sentence(outcome: Outcome) -> str:
     return f'{text}, and remains stopped'
 
 
-def table_row(outcome: Outcome) -> str:
-    """Return the line of a Markdown table."""
-    after = '–' if outcome.after is None else f'{outcome.after:.2f}'
+def table_row(outcome: Outcome) -> tuple[str, ...]:
+    """Return the cells of a table."""
+    after = EMPTY_CELL if outcome.after is None else f'{outcome.after:.2f}'
     before_m, before_rad = outcome.odometry_before
     after_m, after_rad = outcome.odometry_after
-    undetected = ', '.join(outcome.undetected) or '–'
+    undetected = ', '.join(outcome.undetected) or EMPTY_CELL
     if outcome.undetected and not outcome.detected:
         undetected = (UNREPORTED if outcome.ranges else UNDETECTED) + undetected
     known = [*outcome.detected, outcome.ranges] if outcome.ranges else outcome.detected
-    cells = (
+    return (
         f'`{outcome.name}`',
         outcome_sentence(outcome),
         f'{outcome.before:.2f}, {outcome.during:.2f}, {after}',
         f'{_length(before_m)}, {_degrees(before_rad)}; {_length(after_m)}, {_degrees(after_rad)}',
-        ', '.join(known) or '–',
+        ', '.join(known) or EMPTY_CELL,
         undetected,
     )
-    return '| ' + ' | '.join(cells) + ' |\n'
 
 
 def markdown_tables(results: Sequence[Outcome]) -> str:
@@ -488,7 +485,7 @@ def markdown_tables(results: Sequence[Outcome]) -> str:
     for course, title in TITLES.items():
         rows = [table_row(result) for result in results if result.course == course]
         if rows:
-            parts.append(f'### {title}\n\n{TABLE_HEAD}{"".join(rows)}')
+            parts.append(f'### {title}\n\n{Table("", TABLE_HEAD, rows).markdown()}\n')
     return '\n'.join(parts)
 
 

@@ -14,7 +14,7 @@ which is the error system (72)-(73) of the law with :math:`\hat\chi` in place of
 of K, adapted by (77)-(78); V of (74) decreases by the same argument.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
 
@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
+from t3mpc_ros.evaluation.reporting import Table, progress_bar
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, gamma_for
 from t3mpc_ros.fuzzy.sets import FuzzyParameters
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
@@ -198,7 +199,7 @@ def compare(
     duration: float = 60.0,
     variances: Sequence[float] = VARIANCES,
     normalised_gain: float = NORMALISED_GAIN,
-    progress: Callable[[str], None] | None = None,
+    progress: bool = False,
 ) -> list[EstimationResult]:
     """Return the results of every kind in (86) over ``seeds`` seeds from 1, on equal runs.
 
@@ -211,7 +212,7 @@ def compare(
     normalised_gain
         Mean of gamma |Phi|² for every kind, 1/s².
     progress
-        Called with a line of text before each noise.
+        Whether a progress line is shown.
 
     Raises
     ------
@@ -221,9 +222,8 @@ def compare(
     if duration <= SETTLE:
         raise ValueError(f'duration must be more than {SETTLE:g} s: got {duration}')
     results = []
+    bar = progress_bar(len(variances) * seeds, show=progress)
     for variance in variances:
-        if progress is not None:
-            progress(f'noise variance {variance:g}, {seeds} seeds')
         figures: dict[str, list[tuple[float, float]]] = {
             name: [] for name in (*KINDS, NO_FUZZY_SYSTEM)
         }
@@ -241,9 +241,11 @@ def compare(
                         _rms((unknown[:-1] - run.target)[first:]),
                     )
                 )
+            bar.update()
         for name, found in figures.items():
             speed, unknown_part = zip(*found, strict=True)
             results.append(EstimationResult(name, variance, speed, unknown_part))
+    bar.close()
     return results
 
 
@@ -256,28 +258,38 @@ def table(results: Sequence[EstimationResult]) -> str:
     variances = list(dict.fromkeys(result.noise_variance for result in results))
     kinds = list(dict.fromkeys(result.kind for result in results))
     by = {(result.kind, result.noise_variance): result for result in results}
-    head = ''.join(f' noise {variance:g} |' for variance in variances)
-    rule = '|---' * (len(variances) + 1)
-    measured = ''.join(f' {math.sqrt(variance):.4f} |' for variance in variances)
-    lines = [f'| RMSE of chi_hat (rad/s) |{head} growth |', f'{rule}|---|']
-    for kind in kinds:
-        row = [by[kind, variance].speed for variance in variances]
-        cells = ''.join(f' {_spread(values)} |' for values in row)
-        lines.append(f'| {kind} |{cells} {_growth(row)} |')
-    lines += [f'| the measurement itself |{measured} |', '']
-    lines += [f'| more than type3, same seeds (rad/s) |{head}', f'{rule}|']
-    for kind in kinds:
-        if kind == 'type3':
-            continue
+    noises = [f'noise {variance:g}' for variance in variances]
+
+    def measured(kind: str, name: str) -> list[str]:
+        row = [getattr(by[kind, variance], name) for variance in variances]
+        return [kind, *map(_spread, row), _growth(row)]
+
+    def excess(kind: str) -> list[str]:
         pairs = [(by[kind, variance], by['type3', variance]) for variance in variances]
-        cells = ''.join(f' {_spread(difference(one, base), "+")} |' for one, base in pairs)
-        lines.append(f'| {kind} |{cells}')
-    lines += ['', f"| RMSE of g against chi' - u (rad/s²) |{head} growth |", f'{rule}|---|']
-    for kind in kinds:
-        row = [by[kind, variance].unknown for variance in variances]
-        cells = ''.join(f' {_spread(values)} |' for values in row)
-        lines.append(f'| {kind} |{cells} {_growth(row)} |')
-    return '\n'.join(lines)
+        return [kind, *(_spread(difference(one, base), '+') for one, base in pairs)]
+
+    noise = [f'{math.sqrt(variance):.4f}' for variance in variances]
+    tables = [
+        Table(
+            '',
+            ('RMSE of chi_hat (rad/s)', *noises, 'growth'),
+            [
+                *(measured(kind, 'speed') for kind in kinds),
+                ['the measurement itself', *noise, ''],
+            ],
+        ),
+        Table(
+            '',
+            ('more than type3, same seeds (rad/s)', *noises),
+            [excess(kind) for kind in kinds if kind != 'type3'],
+        ),
+        Table(
+            '',
+            ("RMSE of g against chi' - u (rad/s²)", *noises, 'growth'),
+            [measured(kind, 'unknown') for kind in kinds],
+        ),
+    ]
+    return '\n\n'.join(table.markdown() for table in tables)
 
 
 def difference(result: EstimationResult, base: EstimationResult) -> tuple[float, ...]:

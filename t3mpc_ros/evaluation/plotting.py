@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Style and layout of all figures."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 import io
-from typing import Any, TypeGuard, TypeVar
+from pathlib import Path
+from typing import Any, Protocol, TypeGuard, TypeVar
 
 import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -18,6 +19,7 @@ from t3mpc_ros.evaluation.bag_report.topic_roles import COMMAND, ODOMETRY, REFER
 
 Array = NDArray[np.float64]
 Subject = TypeVar('Subject')
+Subject_contra = TypeVar('Subject_contra', contravariant=True)
 
 WIDTH = 6.2
 """Inches: narrow enough that 9-point text stays legible on a phone at half the size."""
@@ -78,6 +80,37 @@ def png_of(draw: Callable[[Subject], Any], subject: Subject) -> bytes | None:
         buffer = io.BytesIO()
         figure.savefig(buffer, format='png', dpi=150)
         return buffer.getvalue()
+
+
+class Drawing(Protocol[Subject_contra]):
+    """A figure of a report."""
+
+    @property
+    def stem(self) -> str:
+        """Name of its file."""
+
+    @property
+    def draw(self) -> Callable[[Subject_contra], Any] | None:
+        """Return the figure of a subject; None when there is nothing to draw."""
+
+
+def write_pictures(
+    drawings: Iterable[Drawing[Subject]], subject: Subject, folder: Path
+) -> dict[str, bytes]:
+    """Write the figures with something to draw as PNG files, and return them by their stems.
+
+    Raises
+    ------
+    OSError
+        A file cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    found = {}
+    for drawing in drawings:
+        if drawing.draw is not None and (png := png_of(drawing.draw, subject)) is not None:
+            found[drawing.stem] = png
+            (folder / f'{drawing.stem}.png').write_bytes(png)
+    return found
 
 
 def new_figure(height: float) -> Any:

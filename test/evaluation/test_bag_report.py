@@ -445,7 +445,7 @@ def test_a_recorder_whose_clock_was_set_is_told(rows, tmp_path):
     later = [(t + (3600.0 if t > 20.0 else 0.0), topic, message) for t, topic, message in rows]
     figures = write_report(write(tmp_path / 'bag', later), tmp_path / 'out')
     page = (tmp_path / 'out' / 'report.html').read_text(encoding='utf-8')
-    assert 'the recorder&#x27;s clock was set, or the recording was paused' in page
+    assert 'the recorder&#39;s clock was set, or the recording was paused' in page
     assert figures.responses['linear'].clear
 
 

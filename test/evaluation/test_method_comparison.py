@@ -372,7 +372,7 @@ def test_the_command_writes_tables_json_and_page(tmp_path, capsys):
     words += ' --cases nominal miscalibrated --methods feed-forward pi-feed-forward'
     assert main([*words.split(), '--json', str(files[0]), '--html', str(files[1])]) == 0
     text = capsys.readouterr()
-    assert '8 of 8 runs' in text.err
+    assert '8/8 [' in text.err
     record = json.loads(files[0].read_text())
     runs = record['cases']['nominal']['methods'][PI]['runs']
     assert len(runs) == 2

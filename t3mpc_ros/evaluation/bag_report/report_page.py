@@ -2,10 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """HTML report of a recorded run."""
 
-import base64
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
-from html import escape
 import math
 from pathlib import Path
 
@@ -35,30 +33,39 @@ from t3mpc_ros.evaluation.bag_report.topic_roles import (
     ReportOptions,
     bag_display_name,
 )
-from t3mpc_ros.evaluation.plotting import LABELS, png_of
+from t3mpc_ros.evaluation.plotting import LABELS, write_pictures
+from t3mpc_ros.evaluation.reporting import (
+    EMPTY_CELL,
+    Block,
+    Details,
+    Heading,
+    Items,
+    Paragraph,
+    Picture,
+    Table,
+    Tiles,
+    html_page,
+)
 from t3mpc_ros.geometry.types import NANOSECONDS
 
-TableRows = tuple[list[str], list[list[str]]]
-"""Header cells and rows."""
 
-
-def response_table(run: Run, fits: Mapping[str, ResponseFit]) -> TableRows:
+def response_table(run: Run, fits: Mapping[str, ResponseFit]) -> Table:
     """Return delay, lag and gain of each channel."""
     head = ['speed', 'dead time / ms', 'lag / ms', 'sum / ms', 'gain', 'explained / %']
     rows = []
     for each in run.channels:
         fit = fits.get(each.name)
         if fit is None:
-            rows.append([each.title, *['–'] * 5])
+            rows.append([each.title, *[EMPTY_CELL] * 5])
             continue
         times = fit.dead_time, fit.lag, fit.dead_time + fit.lag
-        numbers = [f'{1e3 * value:.0f}' for value in times] if fit.clear else ['–'] * 3
-        gain = format_number(fit.gain) if fit.clear else '–'
+        numbers = [f'{1e3 * value:.0f}' for value in times] if fit.clear else [EMPTY_CELL] * 3
+        gain = format_number(fit.gain) if fit.clear else EMPTY_CELL
         rows.append([each.title, *numbers, gain, format_number(100.0 * max(fit.explained, 0.0))])
-    return head, rows
+    return Table('', head, rows)
 
 
-def roughness_table(run: Run) -> TableRows:
+def roughness_table(run: Run) -> Table:
     """Return acceleration and jerk of command and motion."""
     head = ['of', 'speed', 'acceleration RMS', '99 % below', 'jerk RMS', '99 % below', 'unit']
     rows = []
@@ -71,14 +78,14 @@ def roughness_table(run: Run) -> TableRows:
             numbers = found.acceleration, found.acceleration_99, found.jerk, found.jerk_99
             unit = f'{each.unit}², {each.unit}³'
             rows.append([words, each.title, *map(format_number, numbers), unit])
-    return head, rows
+    return Table('', head, rows, text=2)
 
 
-def motion_table(run: Run) -> TableRows:
+def motion_table(run: Run) -> Table:
     """Return path length, turning, stops and speeds; no row when they are unknown."""
     found = motion_summary(run)
     if found is None:
-        return ['quantity', 'value'], []
+        return Table('', ['quantity', 'value'], [])
     longest = max((end - start for start, end in found.stops), default=0.0)
     stood = sum(end - start for start, end in found.stops)
     where = ', '.join(f'{start:.1f} to {end:.1f}' for start, end in found.stops[:5])
@@ -95,10 +102,10 @@ def motion_table(run: Run) -> TableRows:
         rows.append(['standstill at', f'{where}{more} s'])
     if COMMAND in run.motions:
         rows.append(['of that, motion was commanded', f'{found.disobeyed:.1f} s'])
-    return ['quantity', 'value'], rows
+    return Table('', ['quantity', 'value'], rows)
 
 
-def link_table(links: Mapping[str, LinkMetrics]) -> TableRows:
+def link_table(links: Mapping[str, LinkMetrics]) -> Table:
     """Return the metrics of each link, one column each."""
     each = list(links.values())
     rows = [
@@ -117,11 +124,11 @@ def link_table(links: Mapping[str, LinkMetrics]) -> TableRows:
         ['sessions begun after the first report', *(_whole(one.sessions) for one in each)],
         ['frames damaged between dongle and host', *(_whole(one.damaged) for one in each)],
     ]
-    return ['quantity', *links], rows if each else []
+    return Table('', ['quantity', *links], rows if each else [])
 
 
 def _whole(value: float) -> str:
-    return f'{value:.0f}' if math.isfinite(value) else '–'
+    return f'{value:.0f}' if math.isfinite(value) else EMPTY_CELL
 
 
 def write_report(
@@ -151,80 +158,29 @@ def write_report(
     output = folder.parent if output is None else Path(output)
     with open_bag(folder) as recording:
         run = load_run(recording, wanted)
-        pictures = {item.stem: png_of(item.draw, run) for item in REPORT_FIGURES}
-        (output / 'figures').mkdir(parents=True, exist_ok=True)
-        paths = []
-        for stem, png in pictures.items():
-            if png is not None:
-                paths.append(output / 'figures' / f'{stem}.png')
-                paths[-1].write_bytes(png)
-        figures = compute_metrics(
-            run, output / 'report.html', tuple(paths), recording.message_count
-        )
-        figures.report.write_text(_page(recording, run, figures, pictures), encoding='utf-8')
+        pictures = write_pictures(REPORT_FIGURES, run, output / 'figures')
+        paths = tuple(output / 'figures' / f'{stem}.png' for stem in pictures)
+        figures = compute_metrics(run, output / 'report.html', paths, recording.message_count)
+        page = _page(recording, run, figures, pictures)
+        figures.report.write_text(page, encoding='utf-8')
     return figures
 
 
-_CSS = """
-:root { color-scheme: light; }
-* { box-sizing: border-box; }
-body { margin: 0 auto; max-width: 60rem; padding: 1.2rem 1rem 4rem; color: #1f2937;
-  background: #fff; font: 1rem/1.5 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
-h1 { font-size: 1.5rem; margin: 0 0 .2rem; overflow-wrap: anywhere; }
-h2 { font-size: 1.1rem; margin: 2.4rem 0 .4rem; }
-p { margin: .3rem 0; }
-.quiet { color: #6b7280; font-size: .9rem; }
-.verdict { border-radius: .5rem; padding: .5rem 1rem; margin: 1rem 0; font-weight: 600; }
-.sound { background: #ecfdf5; }
-.unsound { background: #fee2e2; }
-.tiles { display: grid; grid-template-columns: repeat(3, 1fr); gap: .6rem; margin: 1.2rem 0;
-  padding: 0; list-style: none; }
-@media (max-width: 40rem) { .tiles { grid-template-columns: repeat(2, 1fr); } }
-.tiles li { border: 1px solid #e5e7eb; border-radius: .5rem; padding: .6rem .8rem; }
-.tiles b { display: block; font-size: 1.15rem; font-variant-numeric: tabular-nums; }
-.tiles span { color: #6b7280; font-size: .82rem; }
-.notes { border-left: 3px solid #d97706; background: #fffbeb; padding: .5rem 1rem;
-  margin: 1rem 0; }
-.notes ul { margin: .2rem 0; padding-left: 1.1rem; }
-figure { margin: .4rem 0 0; }
-figure img { display: block; width: 100%; height: auto; }
-.wide { overflow-x: auto; }
-table { border-collapse: collapse; width: 100%; font-size: .92rem; }
-th, td { text-align: right; padding: .25rem .7rem; border-bottom: 1px solid #e5e7eb;
-  white-space: nowrap; font-variant-numeric: tabular-nums; }
-th { color: #6b7280; font-weight: 600; }
-th.text, td.text { text-align: left; }
-td.long { white-space: normal; overflow-wrap: anywhere; min-width: 8rem; }
-details { margin: .6rem 0; }
-summary { cursor: pointer; font-weight: 600; }
-"""
-
-
 def _page(
-    recording: BagReader, run: Run, figures: ReportMetrics, pictures: Mapping[str, bytes | None]
+    recording: BagReader, run: Run, figures: ReportMetrics, pictures: Mapping[str, bytes]
 ) -> str:
-    name = bag_display_name(recording.folder)
-    parts = [
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f'<title>{escape(name)}</title>\n<style>{_CSS}</style>\n</head>\n<body>',
-        f'<h1>{escape(name)}</h1>',
-        f'<p class="quiet">{escape(_origin(recording, run))}</p>',
-        _verdict(figures),
-        _tiles(figures),
-        _notes(recording, run),
-        *(['<h2>Tracking error</h2>', _error_table(run)] if run.ours or figures.measured else []),
-        *_response(run, figures),
-        _pictures(run, pictures),
-        '<h2>Timing by topic</h2>',
-        _timing_table(run),
-        _complaint_table(run),
-        '<h2>Contents of the bag</h2>',
-        _topic_table(recording),
-        *(_details(title, table) for title, table in sorted(recording.metadata_records.items())),
-        '</body>\n</html>\n',
-    ]
-    return '\n'.join(part for part in parts if part)
+    blocks: list[Block] = [Paragraph(_origin(recording, run), 'quiet')]
+    if verdict := figures.verdict:
+        blocks.append(Paragraph(verdict.text(), f'verdict {"yes" if verdict.sound else "no"}'))
+    blocks.append(Tiles(_tiles(figures)))
+    if notes := _notes(recording, run):
+        blocks.append(Items([[note] for note in notes]))
+    if run.ours or figures.measured:
+        blocks += [Heading('Tracking error'), *_errors(run)]
+    blocks += [*_response(run, figures), *_pictures(run, pictures)]
+    blocks += [Heading('Timing by topic'), *_timing(run), *_complaints(run)]
+    blocks += [Heading('Contents of the bag'), *_contents(recording)]
+    return html_page(bag_display_name(recording.folder), blocks)
 
 
 def _origin(recording: BagReader, run: Run) -> str:
@@ -244,15 +200,8 @@ def _origin(recording: BagReader, run: Run) -> str:
     return ' · '.join(words)
 
 
-def _verdict(figures: ReportMetrics) -> str:
-    verdict = figures.verdict
-    if verdict is None:
-        return ''
-    kind = 'sound' if verdict.sound else 'unsound'
-    return f'<p class="verdict {kind}">{escape(verdict.text())}</p>'
-
-
-def _tiles(figures: ReportMetrics) -> str:
+def _tiles(figures: ReportMetrics) -> list[tuple[str, str]]:
+    """Return the main figures."""
     channels = figures.channels
     right, left = (figures.wheels[each.name] for each in channels)
     names = ' / '.join(each.short for each in channels)
@@ -276,11 +225,11 @@ def _tiles(figures: ReportMetrics) -> str:
         tiles.append((stopped, 'stopped between the first and the last command to move'))
     fits = [figures.responses.get(each.name) for each in channels]
     if any(fit is not None and fit.clear for fit in fits):
-        delays = [
-            f'{1e3 * (fit.dead_time + fit.lag):.0f}' if fit is not None and fit.clear else '–'
+        delays = ' / '.join(
+            f'{1e3 * (fit.dead_time + fit.lag):.0f}' if fit and fit.clear else EMPTY_CELL
             for fit in fits
-        ]
-        tiles.append((f'{" / ".join(delays)} ms', f'from command to motion, {names}'))
+        )
+        tiles.append((f'{delays} ms', f'from command to motion, {names}'))
     for name, link in figures.links.items():
         tiles.append(
             (
@@ -308,11 +257,10 @@ def _tiles(figures: ReportMetrics) -> str:
             'of the odometry missing',
         ),
     ]
-    items = (f'<li><b>{escape(b)}</b><span>{escape(text)}</span></li>' for b, text in tiles)
-    return f'<ul class="tiles">{"".join(items)}</ul>'
+    return tiles
 
 
-def _notes(recording: BagReader, run: Run) -> str:
+def _notes(recording: BagReader, run: Run) -> list[str]:
     notes = [*message_loss_notes(recording.metadata_records), *run.notes]
     if run.absent:
         notes.append(f'Not in the bag, or without a message: {", ".join(run.absent)}.')
@@ -321,11 +269,10 @@ def _notes(recording: BagReader, run: Run) -> str:
     if len(run.namespaces) > 1:
         others = ', '.join(space or '/' for space in run.namespaces[1:])
         notes.append(f'The bag also holds topics of {others}.')
-    items = ''.join(f'<li>{escape(note)}</li>' for note in notes)
-    return f'<div class="notes"><ul>{items}</ul></div>' if items else ''
+    return notes
 
 
-def _error_table(run: Run) -> str:
+def _errors(run: Run) -> list[Block]:
     rows = []
     for source in (TRUTH, ODOMETRY):
         if source not in run.motions or REFERENCE not in run.motions:
@@ -339,10 +286,9 @@ def _error_table(run: Run) -> str:
                 cells += [f'{values.seconds:.1f}', str(values.count)]
                 rows.append([LABELS[source], channel.title, extent, *cells, channel.unit])
     if not rows:
-        return '<p>The bag lacks a reference, or odometry to compare with it.</p>'
+        return [Paragraph('The bag lacks a reference, or odometry to compare with it.')]
     head = ['motion', 'speed', 'extent', 'RMSE', 'MAE', 'max', 'counted / s', 'samples', 'unit']
-    note = f'<p class="quiet">{escape(_extents(run))}</p>'
-    return _html_table(head, rows, text=3, wrap=False) + note
+    return [Table('', head, rows, text=3), Paragraph(_extents(run), 'quiet')]
 
 
 def _extents(run: Run) -> str:
@@ -371,57 +317,44 @@ def _extents(run: Run) -> str:
     return f'{extent} Settled: also without {ahead}the {SETTLING:g} s after each switch.'
 
 
-def _response(run: Run, figures: ReportMetrics) -> list[str]:
-    """Return the tables of response, motion and radio link, with their titles."""
-    parts = []
-
-    def add(title: str, table: TableRows, text: int, note: str = '') -> None:
-        if table[1]:
-            parts.append(f'<h2>{escape(title)}</h2>')
-            parts.append(_html_table(*table, text=text, wrap=False))
-            if note:
-                parts.append(f'<p class="quiet">{escape(note)}</p>')
-
+def _response(run: Run, figures: ReportMetrics) -> Iterator[Block]:
+    """Yield the tables of response, motion and radio link, with their titles."""
+    tables = [
+        ('Acceleration and jerk', roughness_table(run)),
+        ('Path and stops', motion_table(run)),
+        ('Radio link', link_table(figures.links)),
+    ]
     if figures.responses:
-        add(
-            'From command to motion',
-            response_table(run, figures.responses),
-            1,
+        yield Heading('From command to motion')
+        yield response_table(run, figures.responses)
+        yield Paragraph(
             'Dead time, first-order lag and gain that explain most of the measured speed; their '
             'sum is better determined than either. A dash: no clear response to the command.',
+            'quiet',
         )
-    add('Acceleration and jerk', roughness_table(run), 2)
-    add('Path and stops', motion_table(run), 1)
-    add('Radio link', link_table(figures.links), 1)
-    return parts
+    for title, table in tables:
+        if table.rows:
+            yield Heading(title)
+            yield table
 
 
-def _pictures(run: Run, pictures: Mapping[str, bytes | None]) -> str:
-    parts = []
+def _pictures(run: Run, pictures: Mapping[str, bytes]) -> Iterator[Block]:
     for item in REPORT_FIGURES:
-        png = pictures[item.stem]
+        png = pictures.get(item.stem)
         if png is None and item.stem in PACKAGE_FIGURES and not run.ours:
             continue  # only bags of this package hold them
         if png is None and item.stem == 'link' and not run.links:
             continue
-        title = escape(item.title)
-        parts.append(f'<h2>{title}</h2>')
-        if png is None:
-            lacking = [name for name in item.needs if name in run.absent]
-            why = (
-                f'the bag lacks {", ".join(lacking)}' if lacking else 'there are too few messages'
-            )
-            parts.append(f'<p class="quiet">Left out: {escape(why)}.</p>')
+        yield Heading(item.title)
+        if png is not None:
+            yield Picture(item.title, png, item.caption)
             continue
-        data = base64.b64encode(png).decode()
-        parts.append(
-            f'<figure><img alt="{title}" src="data:image/png;base64,{data}">'
-            f'<figcaption class="quiet">{escape(item.caption)}</figcaption></figure>'
-        )
-    return '\n'.join(parts)
+        lacking = ', '.join(name for name in item.needs if name in run.absent)
+        why = f'the bag lacks {lacking}' if lacking else 'there are too few messages'
+        yield Paragraph(f'Left out: {why}.', 'quiet')
 
 
-def _timing_table(run: Run) -> str:
+def _timing(run: Run) -> list[Block]:
     head = ['topic', 'messages', 'rate / Hz', 'jitter / ms', 'missing / %']
     rows: dict[bool, list[list[str]]] = {True: [], False: []}
     for name, timing in run.timing.items():
@@ -430,55 +363,37 @@ def _timing_table(run: Run) -> str:
         rows[name in run.motions].append(
             [run.topics[name], str(timing.count), rate, jitter, missing]
         )
+    motions, scalars = (Table('', head, rows[kind], wrap=True) for kind in (True, False))
+    blocks: list[Block] = [motions] if motions.rows else []
+    if scalars.rows:
+        blocks.append(Details(f'Scalar topics, {len(scalars.rows)} topics', [scalars]))
+    if not blocks:
+        return [Paragraph('No topic has enough messages.')]
     note = (
-        '<p class="quiet">Rate: from the median time between receipts. Jitter: 99 % of these '
-        'times are closer to the median than this. Missing: against that rate, by stamp where '
-        'there is one.</p>'
+        'Rate: from the median time between receipts. Jitter: 99 % of these times are closer to '
+        'the median than this. Missing: against that rate, by stamp where there is one.'
     )
-    parts = [_html_table(head, rows[True], text=1)] if rows[True] else []
-    if rows[False]:
-        summary = f'<summary>Scalar topics, {len(rows[False])} topics</summary>'
-        parts.append(f'<details>{summary}{_html_table(head, rows[False], text=1)}</details>')
-    return '\n'.join([*parts, note]) if parts else '<p>No topic has enough messages.</p>'
+    return [*blocks, Paragraph(note, 'quiet')]
 
 
-def _complaint_table(run: Run) -> str:
+def _complaints(run: Run) -> list[Block]:
     if not run.complaints:
-        return ''
+        return []
     rows = [[level, who, what, format_number(when)] for when, level, who, what in run.complaints]
     head = ['level', 'node', 'message', 'first at / s']
-    return '<h2>Warnings and errors of the nodes</h2>' + _html_table(head, rows, text=3)
+    return [
+        Heading('Warnings and errors of the nodes'),
+        Table('', head, rows, text=3, wrap=True),
+    ]
 
 
-def _topic_table(recording: BagReader) -> str:
+def _contents(recording: BagReader) -> Iterator[Block]:
     rows = [[t.name, t.type_name, str(t.message_count)] for t in recording.topics.values()]
-    if not rows:
-        return '<p>No topic.</p>'
-    summary = f'<summary>Topics, {len(rows)}</summary>'
-    return (
-        f'<details>{summary}{_html_table(["topic", "type", "messages"], rows, text=2)}</details>'
-    )
-
-
-def _details(title: str, table: Mapping[str, str]) -> str:
-    rows = [[key, value] for key, value in table.items()]
-    summary = f'<summary>{escape(title)}, {len(rows)} values</summary>'
-    return f'<details>{summary}{_html_table(["name", "value"], rows, text=2)}</details>'
-
-
-def _html_table(
-    head: Sequence[str], rows: Iterable[Sequence[str]], text: int, wrap: bool = True
-) -> str:
-    """Return a table whose first ``text`` columns are text, the others numbers."""
-    words = ' class="text long"' if wrap else ' class="text"'
-    kinds = [words if i < text else '' for i in range(len(head))]
-    top = ''.join(f'<th{k}>{escape(word)}</th>' for k, word in zip(kinds, head, strict=True))
-    body = ''.join(
-        '<tr>' + ''.join(f'<td{k}>{escape(c)}</td>' for k, c in zip(kinds, row, strict=True))
-        + '</tr>\n'
-        for row in rows
-    )  # fmt: skip
-    return f'<div class="wide"><table><tr>{top}</tr>\n{body}</table></div>'
+    table = Table('', ['topic', 'type', 'messages'], rows, text=2, wrap=True)
+    yield Details(f'Topics, {len(rows)}', [table]) if rows else Paragraph('No topic.')
+    for title, values in sorted(recording.metadata_records.items()):
+        table = Table('', ['name', 'value'], list(values.items()), text=2, wrap=True)
+        yield Details(f'{title}, {len(values)} values', [table])
 
 
 def _rmse(right: ErrorStatistics, left: ErrorStatistics, channels: tuple[Channel, Channel]) -> str:

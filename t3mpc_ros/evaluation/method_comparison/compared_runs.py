@@ -40,7 +40,7 @@ from t3mpc_ros.evaluation.methods import (
     methods,
 )
 from t3mpc_ros.evaluation.paper.experiment_runs import SETTLING as PAPER_SETTLING
-from t3mpc_ros.evaluation.reporting import Progress
+from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.scenario import (
     CASES as PAPER_CASES,
 )
@@ -289,7 +289,7 @@ Results = Mapping[tuple[str, str], Sequence[Numbers]]
 """Metrics by case and method, one entry for each seed in the order of the plan."""
 
 
-def compare(plan: ComparisonPlan, workers: int = 1, progress: Progress | None = None) -> Results:
+def compare(plan: ComparisonPlan, workers: int = 1, *, progress: bool = False) -> Results:
     """Return the metrics of every run of a plan.
 
     Raises
@@ -299,13 +299,10 @@ def compare(plan: ComparisonPlan, workers: int = 1, progress: Progress | None = 
     """
     keys = plan.jobs()
     numbers: dict[tuple[str, str, int], Numbers] = {}
-    if progress is not None:
-        progress.begin(len(keys))
-    with WorkerPool(workers) as pool:
+    with WorkerPool(workers) as pool, progress_bar(len(keys), show=progress) as bar:
         for index, found in pool.map(measured_run, (plan.job(*key) for key in keys)):
             numbers[keys[index]] = found
-            if progress is not None:
-                progress.done(len(numbers))
+            bar.update()
     return {
         (case, method): [numbers[case, method, seed] for seed in plan.seeds]
         for case in plan.cases

@@ -2,9 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables, HTML page and JSON record of a comparison."""
 
-import base64
 from collections.abc import Mapping, Sequence
-from html import escape
 import math
 from typing import Any
 
@@ -36,31 +34,20 @@ from t3mpc_ros.evaluation.method_comparison.twin_scenario import TwinScenario
 from t3mpc_ros.evaluation.methods import FULL
 from t3mpc_ros.evaluation.paper.experiment_runs import SETTLING as PAPER_SETTLING
 from t3mpc_ros.evaluation.plotting import new_figure, png_of
-from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table, format_interval
+from t3mpc_ros.evaluation.reporting import (
+    EMPTY_CELL,
+    Block,
+    Heading,
+    Paragraph,
+    Picture,
+    Table,
+    format_interval,
+    html_page,
+)
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, TUNING_SEEDS
 
 BETTER, WORSE, INCONCLUSIVE = 'better', 'worse', 'inconclusive'
 """Verdicts on a paired difference: its 95 % interval lies below zero, above it, or contains it."""
-
-_CSS = """
-:root { color-scheme: light; }
-body { margin: 0 auto; max-width: 72rem; padding: 1.2rem 1rem 4rem; color: #1f2937;
-  background: #fff; font: 1rem/1.5 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
-h1 { font-size: 1.5rem; margin: 0 0 .2rem; }
-h2 { font-size: 1.1rem; margin: 2.4rem 0 .4rem; }
-p { margin: .3rem 0; }
-.quiet { color: #6b7280; font-size: .9rem; }
-figure { margin: .4rem 0 0; max-width: 50rem; }
-figure img { display: block; width: 100%; height: auto; }
-.wide { overflow-x: auto; margin: 1rem 0; }
-table { border-collapse: collapse; width: 100%; font-size: .85rem; }
-caption { text-align: left; font-weight: 600; padding: .2rem 0; }
-th, td { text-align: right; padding: .22rem .6rem; border-bottom: 1px solid #e5e7eb;
-  font-variant-numeric: tabular-nums; }
-th:first-child, td:first-child { text-align: left; white-space: nowrap; }
-th { color: #6b7280; font-weight: 600; }
-tr.own td { background: #fff1f2; font-weight: 600; }
-"""
 
 
 def values(results: Results, case: str, method: str, metric: Metric) -> list[float]:
@@ -110,12 +97,8 @@ def summary_table(plan: ComparisonPlan, results: Results) -> Table:
     title = 'Settled RMSE of the wheel speeds, rad/s'
     if body:
         title += f' ({", ".join(body)}: of the yaw rate of the body)'
-    return Table(
-        f'{title}; verdict against {FEED_FORWARD}',
-        ('method', *plan.cases),
-        tuple(rows),
-        (FULL,),
-    )
+    title += f'; verdict against {FEED_FORWARD}'
+    return Table(title, ('method', *plan.cases), rows, (FULL,), wrap=True)
 
 
 def case_table(plan: ComparisonPlan, results: Results, case: str) -> Table:
@@ -147,7 +130,8 @@ def case_table(plan: ComparisonPlan, results: Results, case: str) -> Table:
                 text = format_interval(found.mean, found.half, '+', metric.digits)
                 cells += [text, verdict(found)]
         rows.append(tuple(cells))
-    return Table(f'{case}: {case_texts(plan.robot)[case]}', tuple(head), tuple(rows), (FULL,))
+    title = f'{case}: {case_texts(plan.robot)[case]}'
+    return Table(title, head, rows, (FULL,), wrap=True)
 
 
 def knowledge_table(plan: ComparisonPlan) -> Table:
@@ -188,7 +172,9 @@ def knowledge_table(plan: ComparisonPlan) -> Table:
             'baselines': 'the tuned parameters of this drive, with equal effort; adaptive ones '
             'start with the weights of the same practice runs',
         }
-    return Table('What each method knows', ('method', 'knows'), tuple(rows.items()))
+    return Table(
+        'What each method knows', ('method', 'knows'), list(rows.items()), text=2, wrap=True
+    )
 
 
 def description(plan: ComparisonPlan) -> str:
@@ -239,30 +225,22 @@ def markdown(plan: ComparisonPlan, results: Results) -> str:
 
 def page(plan: ComparisonPlan, results: Results) -> str:
     """Return the page as self-contained HTML."""
-    title = f'Comparison of all methods: {plan.robot}'
-    parts = [
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f'<title>{escape(title)}</title>\n<style>{_CSS}</style>\n</head>\n<body>',
-        f'<h1>{escape(title)}</h1>\n<p>{escape(description(plan))}</p>',
-        knowledge_table(plan).html(),
-        summary_table(plan, results).html(),
+    blocks: list[Block] = [
+        Paragraph(description(plan)),
+        knowledge_table(plan),
+        summary_table(plan, results),
     ]
+    caption = f'Difference from {FEED_FORWARD}, with 95 % interval'
     for case in plan.cases:
-        parts.append(f'<h2>{escape(case)}</h2>')
+        blocks.append(Heading(case))
         if picture := png_of(lambda of: _draw_differences(plan, results, of), case):
-            data = base64.b64encode(picture).decode()
-            caption = f'Difference from {FEED_FORWARD}, with 95 % interval'
-            parts.append(
-                f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{data}">'
-                f'<figcaption class="quiet">{escape(caption)}</figcaption></figure>'
-            )
-        parts.append(case_table(plan, results, case).html())
-    return '\n'.join([*parts, '</body>\n</html>\n'])
+            blocks.append(Picture(caption, picture, caption))
+        blocks.append(case_table(plan, results, case))
+    return html_page(f'Comparison of all methods: {plan.robot}', blocks)
 
 
 def record(plan: ComparisonPlan, results: Results) -> dict[str, Any]:
-    """Return plan, runs and differences for a JSON file; null where a run broke off."""
+    """Return plan, runs and differences for a JSON file; NaN where a run broke off."""
     cases: dict[str, Any] = {}
     for case, text in case_texts(plan.robot).items():
         if case in plan.cases:
@@ -303,23 +281,19 @@ def _method_record(results: Results, case: str, method: str) -> dict[str, Any]:
         found = difference(results, case, method, metric)
         if found is not None:
             differences[metric.name] = {
-                'mean': _finite(found.mean),
-                'half_interval': _finite(found.half),
+                'mean': found.mean,
+                'half_interval': found.half,
                 'verdict': verdict(found),
             }
     return {
-        'mean': {name: _finite(mean([run[name] for run in runs])) for name in runs[0]},
-        'runs': [{name: _finite(number) for name, number in run.items()} for run in runs],
+        'mean': {name: mean([run[name] for run in runs]) for name in runs[0]},
+        'runs': [dict(run) for run in runs],
         f'difference_from_{FEED_FORWARD.replace("-", "_")}': differences,
     }
 
 
 def _stopped(results: Results, case: str, method: str) -> bool:
     return any(number > 0.0 for number in values(results, case, method, STOPPED))
-
-
-def _finite(number: float) -> float | None:
-    return number if math.isfinite(number) else None
 
 
 def _draw_differences(plan: ComparisonPlan, results: Results, case: str) -> Any:

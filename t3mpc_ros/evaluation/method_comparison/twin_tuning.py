@@ -169,7 +169,6 @@ def tune_twin(
     path: Path,
     report: Callable[[str], None],
     *,
-    clock: Callable[[], float] | None = None,
     resume: bool = False,
 ) -> TunedParameters:
     """Return the best parameters of each method on the twin; arguments as :func:`tune_methods`.
@@ -185,7 +184,6 @@ def tune_twin(
             workers,
             path,
             report,
-            clock=clock,
             resume=resume,
             training=TRAINING,
             evaluate=objective,

@@ -8,7 +8,7 @@ inconclusive.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 import math
 import re
 from statistics import median
@@ -28,7 +28,6 @@ from t3mpc_ros.evaluation.paper.experiment_grid import (
     WITHOUT,
     Experiment,
 )
-from t3mpc_ros.evaluation.paper.experiment_runs import finite_or_none
 from t3mpc_ros.evaluation.paper.results import PairedDifference, ResultRow, Results, step_to
 
 Array = NDArray[np.float64]
@@ -79,19 +78,9 @@ class Claim:
 
     def record(self) -> dict[str, object]:
         """Return the claim as plain data."""
-        numbers = {
-            name: finite_or_none(value) if isinstance(value, float) else value
-            for name, value in self.numbers.items()
-        }
-        return {
-            'name': self.name,
-            'origin': self.origin,
-            'text': self.text,
-            'found': self.found,
-            'held': self.held,
-            'verdict': self.verdict,
-            'numbers': numbers,
-        }
+        found = asdict(self) | {'verdict': self.verdict}
+        del found['inconclusive']
+        return found
 
 
 def all_claims(results: Results, estimated: Sequence[EstimationResult]) -> list[Claim]:

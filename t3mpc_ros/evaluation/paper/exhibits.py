@@ -11,7 +11,6 @@ from t3mpc_ros.evaluation.paper.claims import Claim
 from t3mpc_ros.evaluation.paper.experiment_grid import WITHOUT
 from t3mpc_ros.evaluation.paper.figure_runs import FigureRuns
 from t3mpc_ros.evaluation.paper.results import Results
-from t3mpc_ros.evaluation.plotting import png_of
 
 BEYOND = 'Not in the paper.'
 
@@ -211,14 +210,3 @@ def findings(material: ExhibitData) -> dict[str, str]:
         for exhibit in EXHIBITS
         if exhibit.finding is not None
     }
-
-
-def pictures(material: ExhibitData) -> dict[str, bytes]:
-    """Return every figure there is something to draw for, as PNG files by their stems."""
-    found = {}
-    for exhibit in EXHIBITS:
-        if exhibit.draw is not None:
-            png = png_of(exhibit.draw, material)
-            if png is not None:
-                found[exhibit.stem] = png
-    return found

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs the missing experiments and keeps finished runs in a JSON lines file."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import contextlib
 from dataclasses import asdict, dataclass, fields, is_dataclass
 import fcntl
@@ -24,7 +24,7 @@ from t3mpc_ros.evaluation.paper.experiment_grid import (
     Method,
     RunRecord,
 )
-from t3mpc_ros.evaluation.reporting import Progress
+from t3mpc_ros.evaluation.reporting import finite, progress_bar
 from t3mpc_ros.parameters.provenance import PACKAGE_DIRECTORY
 
 SETTLING = 1.0
@@ -224,18 +224,10 @@ class RunFile:
             self._stream = None
 
 
-def finite_or_none(value: float) -> float | None:
-    """Return ``value``, or None for what JSON has no number for."""
-    return value if math.isfinite(value) else None
-
-
 def _encode(key: RunKey, numbers: RunNumbers) -> str:
     row = asdict(key.experiment) | {'seed': key.seed, 'duration': key.duration}
-    row |= {
-        name: value if isinstance(value, bool) else finite_or_none(value)
-        for name, value in asdict(numbers).items()
-    }
-    return json.dumps(row | {'fingerprint': key.fingerprint}, ensure_ascii=False)
+    row |= asdict(numbers) | {'fingerprint': key.fingerprint}
+    return json.dumps(finite(row), ensure_ascii=False)
 
 
 def _decode(line: str) -> tuple[RunKey, RunNumbers]:
@@ -263,7 +255,7 @@ def run_missing(
     sources: str,
     *,
     team: Any = 1,
-    progress: Progress | None = None,
+    report: Callable[[str], None] | None = None,
 ) -> Numbers:
     """Return the numbers of every needed experiment, one per seed in the grid's order.
 
@@ -283,8 +275,8 @@ def run_missing(
         Digest of the sources, :func:`t3mpc_ros.evaluation.paper.experiment_runs.source_digest`.
     team
         Who works: how many processes, or what the setup's own ``team`` enters.
-    progress
-        Progress output; None for none.
+    report
+        Receives messages; with None there is no progress line either.
 
     Raises
     ------
@@ -307,9 +299,8 @@ def run_missing(
         known = file.read()
         found = {key: known[key] for key in keys if key in known}
         missing = [key for key in keys if key not in found]
-        if progress is not None:
-            progress.write(_resume_message(file, len(keys), len(found), len(known) - len(found)))
-            progress.begin(len(missing))
+        write = report or (lambda text: None)
+        write(_resume_message(file, len(keys), len(found), len(known) - len(found)))
         jobs = [
             (
                 setup.scenario(
@@ -325,21 +316,19 @@ def run_missing(
         ]
         try:
             with contextlib.ExitStack() as stack:
+                bar = stack.enter_context(progress_bar(len(missing), show=report is not None))
                 runs = setup.measure_many(jobs, measure, team) if jobs else ()
                 if close := getattr(runs, 'close', None):
                     stack.callback(close)  # its processes end with this loop, however it ends
-                for count, (index, numbers) in enumerate(runs, 1):
+                for index, numbers in runs:
                     file.add(missing[index], numbers)
                     found[missing[index]] = numbers
-                    if progress is not None:
-                        progress.done(count)
+                    bar.update()
         except BaseException:
-            if progress is not None:
-                progress.broken_off()
-                progress.write(
-                    f'{len(found)} of {len(keys)} runs are kept in {file.path}: '
-                    'the same command goes on from there'
-                )
+            write(
+                f'{len(found)} of {len(keys)} runs are kept in {file.path}: '
+                'the same command goes on from there'
+            )
             raise
     if len(found) != len(keys):
         raise RuntimeError(f'{len(keys) - len(found)} runs never came back')

@@ -2,10 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reproduction of the paper: runs experiments, writes results, tables, figures and the page."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from t3mpc_ros.evaluation.paper.experiment_grid import (
     EXACT,
@@ -52,7 +51,9 @@ def default_setup() -> ExperimentSetup:
     )
 
 
-def reproduce(setup: ExperimentSetup, options: PaperOptions, progress: Any = None) -> str:
+def reproduce(
+    setup: ExperimentSetup, options: PaperOptions, report: Callable[[str], None] | None = None
+) -> str:
     """Return a summary in a few lines, after writing everything into the output folder.
 
     ``results.json``, ``results.csv``, ``tables.md``, ``paper.html`` and ``figures/*.png``. None
@@ -64,8 +65,8 @@ def reproduce(setup: ExperimentSetup, options: PaperOptions, progress: Any = Non
         Where methods and runs come from.
     options
         What is asked for.
-    progress
-        A :class:`t3mpc_ros.evaluation.reporting.Progress`; None keeps silent.
+    report
+        Receives a line for each step; with None there is no progress line either.
 
     Raises
     ------
@@ -78,20 +79,22 @@ def reproduce(setup: ExperimentSetup, options: PaperOptions, progress: Any = Non
     """
     from t3mpc_ros.evaluation import open_loop_estimation
     from t3mpc_ros.evaluation.paper.claims import all_claims
-    from t3mpc_ros.evaluation.paper.exhibits import ExhibitData, findings, pictures
+    from t3mpc_ros.evaluation.paper.exhibits import EXHIBITS, ExhibitData, findings
     from t3mpc_ros.evaluation.paper.experiment_runs import RunFile, run_missing, source_digest
     from t3mpc_ros.evaluation.paper.figure_runs import simulate_figure_runs
     from t3mpc_ros.evaluation.paper.paper_page import counted, page
     from t3mpc_ros.evaluation.paper.result_tables import all_tables, markdown
-    from t3mpc_ros.evaluation.paper.results import results_of, write_csv, write_json
+    from t3mpc_ros.evaluation.paper.results import results_of, write_csv
+    from t3mpc_ros.evaluation.plotting import write_pictures
+    from t3mpc_ros.evaluation.reporting import strict_json
 
-    write = progress.write if progress is not None else lambda text: None
+    write = report or (lambda text: None)
     grid = make_grid(setup, quick=options.quick, seeds=options.seeds)
     file = RunFile(options.output / RUNS, fresh=options.fresh)
     sources = source_digest()
     with setup.team(options.workers) as team:
         needed = needed_experiments(setup, grid)
-        numbers = run_missing(setup, grid, needed, file, sources, team=team, progress=progress)
+        numbers = run_missing(setup, grid, needed, file, sources, team=team, report=report)
         results = results_of(setup, grid, numbers)
         write('  runs for the figures')
         showcase = simulate_figure_runs(setup, grid, results, team)
@@ -105,7 +108,6 @@ def reproduce(setup: ExperimentSetup, options: PaperOptions, progress: Any = Non
     claims = (*all_claims(results, estimated), *showcase.claims())
     tables = all_tables(results, estimated)
     material = ExhibitData(results, showcase, claims)
-    drawn = pictures(material)
 
     parameters = _parameters(setup, grid, options, count, variances)
     compared = [row for row in results.rows if EXACT not in row.controller]
@@ -123,12 +125,11 @@ def reproduce(setup: ExperimentSetup, options: PaperOptions, progress: Any = Non
     output = options.output
     for path in (output / 'results.json', options.json):
         if path is not None:
-            write_json(path, content)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(strict_json(content), encoding='utf-8')
     write_csv(output / 'results.csv', [*compared, *exact])
     (output / 'tables.md').write_text(markdown(tables, claims), encoding='utf-8')
-    (output / 'figures').mkdir(exist_ok=True)
-    for stem, png in drawn.items():
-        (output / 'figures' / f'{stem}.png').write_bytes(png)
+    drawn = write_pictures(EXHIBITS, material, output / 'figures')
     title = "The paper's figures and tables, reproduced"
     html = page(title, _origin(grid, options, sources), claims, tables, drawn, findings(material))
     (output / 'paper.html').write_text(html, encoding='utf-8')

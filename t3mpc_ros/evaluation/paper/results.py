@@ -19,8 +19,7 @@ from t3mpc_ros.evaluation.paper.experiment_grid import (
     ExperimentGrid,
     ExperimentSetup,
 )
-from t3mpc_ros.evaluation.paper.experiment_runs import RunNumbers, finite_or_none
-from t3mpc_ros.evaluation.reporting import strict_json
+from t3mpc_ros.evaluation.paper.experiment_runs import RunNumbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,11 +57,8 @@ class ResultRow:
         return Experiment(self.controller, self.drive, self.noise, self.case)
 
     def record(self) -> dict[str, object]:
-        """Return the row as plain data, None for what is not finite."""
-        return {
-            name: finite_or_none(value) if isinstance(value, float) else value
-            for name, value in asdict(self).items()
-        }
+        """Return the row as plain data."""
+        return asdict(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,11 +82,8 @@ class PairedDifference:
         return self.difference + self.ci95 < 0.0
 
     def record(self) -> dict[str, object]:
-        """Return the comparison as plain data, None for what is not finite."""
-        return {
-            name: finite_or_none(value) if isinstance(value, float) else value
-            for name, value in asdict(self).items()
-        }
+        """Return the comparison as plain data."""
+        return asdict(self)
 
 
 class Results:
@@ -253,19 +246,6 @@ def step_to(part: str) -> tuple[str, str]:
     return STAGES[index + 1], STAGES[index]
 
 
-def write_json(path: Path, content: Mapping[str, object]) -> None:
-    """Write strict JSON, null for numbers that are not finite.
-
-    Raises
-    ------
-    OSError
-        The file cannot be written.
-    """
-    text = strict_json(content)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding='utf-8')
-
-
 def write_csv(path: Path, rows: Iterable[ResultRow]) -> None:
     """Write the rows with the names of the JSON's keys on top; empty for what is not finite.
 
@@ -284,4 +264,6 @@ def write_csv(path: Path, rows: Iterable[ResultRow]) -> None:
 
 
 def _csv_cell(value: object) -> object:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
     return str(value).lower() if isinstance(value, bool) else value

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Model fitted to simulated runs, assessed on held-out seeds."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from t3mpc_ros.evaluation.closed_loop import LoopRecord, MethodSpec, pretrain, r
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean, paired
 from t3mpc_ros.evaluation.methods import FULL, methods, proposed_parameters
 from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
+from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.scenario import (
     HELD_OUT_SEEDS,
     PRETRAINING_DURATION,
@@ -74,7 +75,8 @@ def assess(
     parameters: ProposedParameters,
     learnt: Mapping[str, Array],
     seeds: Sequence[int],
-    progress: Callable[[str], None] = lambda text: None,
+    *,
+    progress: bool = False,
 ) -> str:
     """Return a report on the model on held-out seeds.
 
@@ -87,7 +89,7 @@ def assess(
     seeds
         Seeds of the runs with and without the model.
     progress
-        Called with a progress message.
+        Whether a progress line is shown.
     """
     without = MethodSpec(FULL, ProposedController, parameters)
 
@@ -97,11 +99,12 @@ def assess(
         return controller
 
     fresh, taught = [], []
-    for seed in seeds:
-        scenario = Scenario(drive, PRETRAINING_NOISE, 'nominal', seed, PRETRAINING_DURATION)
-        fresh.append(run(scenario, without))
-        taught.append(run(scenario, with_model))
-        progress(f'seed {seed} of {seeds[0]} to {seeds[-1]}')
+    with progress_bar(2 * len(seeds), show=progress) as bar:
+        for seed in seeds:
+            scenario = Scenario(drive, PRETRAINING_NOISE, 'nominal', seed, PRETRAINING_DURATION)
+            fresh.append(run(scenario, without))
+            taught.append(run(scenario, with_model))
+            bar.update(2)
     early, late = (
         [[measure(record) for record in records] for records in (fresh, taught)]
         for measure in (early_rmse, LoopRecord.rmse)

@@ -60,8 +60,6 @@ class SearchProgress:
     done: int
     total: int
     best: float
-    fresh: int
-    """How many of ``done`` were not taken from the history of an interrupted search."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,7 +174,6 @@ class _Evaluator:
         self._report = report
         self._history = history
         self._done: list[Evaluation] = []
-        self._fresh = 0
 
     @property
     def left(self) -> int:
@@ -196,14 +193,13 @@ class _Evaluator:
                     f'objective must return one value a point, {len(points)}: got {len(returned)}'
                 )
             known = [value if math.isfinite(value) else math.inf for value in returned]
-            self._fresh += len(points)
             self._history.add(points, known)
         self._done += [
             Evaluation(dict(each), value) for each, value in zip(asked, known, strict=True)
         ]
         if self._report is not None:
             best = self.result().value
-            self._report(SearchProgress(len(self._done), self._total, best, self._fresh))
+            self._report(SearchProgress(len(self._done), self._total, best))
         return known
 
     def result(self) -> SearchResult:

@@ -4,10 +4,14 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from functools import partial
 import math
 from pathlib import Path
 
+from tqdm import tqdm
+
 import t3mpc_ros
+from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.tuning.cma_search import SearchProgress, SearchResult, search_best
 from t3mpc_ros.evaluation.tuning.objective import SMOOTHNESS, ClosedLoopObjective, TuningScenarios
 from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition, Values, check_names
@@ -34,7 +38,6 @@ def tune_methods(
     path: Path,
     report: Callable[[str], None] | None = None,
     *,
-    clock: Callable[[], float] | None = None,
     resume: bool = False,
     training: TuningScenarios | None = None,
     evaluate: Evaluate | None = None,
@@ -59,10 +62,7 @@ def tune_methods(
     path
         Where the tuned parameters are kept.
     report
-        Receives the progress, line by line.
-    clock
-        Returns seconds that only go on, for the estimate of the time left; without it there is
-        none.
+        Receives messages; with None there is no progress line either.
     resume
         Go on with searches that were interrupted.
     training
@@ -101,18 +101,19 @@ def tune_methods(
         if evaluate is None:
             evaluate = stack.enter_context(ClosedLoopObjective(training, workers, report))
         for method, drive in pairs:
-            progress = _Progress(f'{method.name}, {drive}', report, clock)
-            found = search_best(
-                _objective(method, drive, evaluate),
-                method.space,
-                method.start[drive],
-                evaluations,
-                seed,
-                progress.report,
-                path=history_path(path, method, drive),
-                resume=resume,
-                about=_about(method, drive, budget),
-            )
+            with progress_bar(evaluations, 'evaluations', show=report is not None) as bar:
+                bar.set_description(f'{method.name}, {drive}')
+                found = search_best(
+                    _objective(method, drive, evaluate),
+                    method.space,
+                    method.start[drive],
+                    evaluations,
+                    seed,
+                    partial(_show_progress, bar),
+                    path=history_path(path, method, drive),
+                    resume=resume,
+                    about=_about(method, drive, budget),
+                )
             if math.isfinite(found.value):
                 store.put(method.name, drive, _entry(method, drive, found, budget))
                 store.save(path)
@@ -128,37 +129,9 @@ def history_path(path: Path, method: MethodDefinition, drive: str) -> Path:
     return path.with_suffix('.history') / f'{method.short}.{drive}.json'
 
 
-def time_left(seconds: float) -> str:
-    """Return a duration in words, no more exact than an estimate can be."""
-    if seconds < 90.0:
-        return f'{max(10, 10 * round(seconds / 10.0))} s'
-    if seconds < 5400.0:
-        return f'{round(seconds / 60.0)} min'
-    return f'{seconds / 3600.0:.1f} h'
-
-
-class _Progress:
-    """One line a generation, with the time left by the pace of this session."""
-
-    def __init__(
-        self,
-        name: str,
-        report: Callable[[str], None] | None,
-        clock: Callable[[], float] | None,
-    ) -> None:
-        self._name, self._report, self._clock = name, report, clock
-        self._begin = clock() if clock else 0.0
-
-    def report(self, standing: SearchProgress) -> None:
-        """Report the progress of the search without resumed evaluations."""
-        done, left = standing.done, standing.total - standing.done
-        if self._report is None or (left and not standing.fresh):
-            return
-        line = f'  {self._name}: {done} of {standing.total} evaluations, best {standing.best:.4f}'
-        if self._clock and left:
-            pace = (self._clock() - self._begin) / standing.fresh
-            line += f', about {time_left(left * pace)} left'
-        self._report(line)
+def _show_progress(bar: 'tqdm[int]', standing: SearchProgress) -> None:
+    bar.set_postfix_str(f'best {standing.best:.4f}', refresh=False)
+    bar.update(standing.done - bar.n)
 
 
 def _load_existing(

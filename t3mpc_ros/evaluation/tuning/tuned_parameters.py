@@ -17,6 +17,7 @@ import tempfile
 from types import MappingProxyType
 from typing import Any, Self, TypeVar
 
+from t3mpc_ros.evaluation.reporting import Table
 from t3mpc_ros.parameters.table import ParameterError, Parameters
 
 PACKAGED_FILE = Path(__file__).resolve().parent / 'tuned.json'
@@ -223,19 +224,15 @@ class TunedParameters:
 
     def table(self) -> str:
         """Return the improvement by tuning as a Markdown table."""
-        lines = [
-            '| method | drive | objective at start (rad/s) | tuned | tuned parameters '
-            '| evaluations |',
-            '|---|---|---|---|---|---|',
-        ]
+        head = 'method', 'drive', 'objective at start (rad/s)', 'tuned', 'tuned parameters'
+        rows = []
         for method, drive in self:
             entry = self._entries[method, drive]
             start = entry.start_objective
-            lines.append(
-                f'| {method} | {drive} | {"none" if start is None else f"{start:.4f}"} '
-                f'| {entry.objective:.4f} | {len(entry.tuned)} | {entry.budget.evaluations} |'
-            )
-        return '\n'.join(lines)
+            first = 'none' if start is None else f'{start:.4f}'
+            numbers = f'{entry.objective:.4f}', str(len(entry.tuned))
+            rows.append((method, drive, first, *numbers, str(entry.budget.evaluations)))
+        return Table('', (*head, 'evaluations'), rows).markdown()
 
 
 def write_atomically(path: Path, text: str) -> None:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table
+from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table, progress_bar
 from t3mpc_ros.evaluation.twin_validation.courses import (
     Course,
     Slip,
@@ -118,18 +118,18 @@ def measure_drift(
 def measure_drifts(
     seeds: Sequence[int],
     slips: Sequence[Slip],
-    done: Callable[[], None] = lambda: None,
     courses: Sequence[str] = tuple(COURSES),
+    *,
+    progress: bool = False,
 ) -> list[Drift]:
-    """Return every course under every slip with every seed; ``done`` is called after each."""
+    """Return every course under every slip with every seed."""
     found = []
-    for name in courses:
-        for slip in slips:
-            for seed in seeds:
-                found.append(
-                    measure_drift(drive_course(name, slip, seed), slip, seed, robot(seed))
-                )
-                done()
+    runs = [(name, slip, seed) for name in courses for slip in slips for seed in seeds]
+    with progress_bar(len(runs), show=progress) as bar:
+        for name, slip, seed in runs:
+            course = drive_course(name, slip, seed)
+            found.append(measure_drift(course, slip, seed, robot(seed)))
+            bar.update()
     return found
 
 
@@ -182,5 +182,5 @@ def drift_table(found: Sequence[Drift]) -> Table:
             'course', 'slip', 'yaw by steps / deg', 'with gyro / deg', 'ratio',
             'at most 1/5', 'place by steps / m', 'with gyro / m', 'slid / m', 'lost steps',
         ),
-        tuple(rows),
+        rows,
     )  # fmt: skip

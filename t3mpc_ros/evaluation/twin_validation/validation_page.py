@@ -2,40 +2,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """Twin validation: runs all tests and writes page, figures and tables."""
 
-import base64
-from collections.abc import Mapping, Sequence
-from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
-if TYPE_CHECKING:
-    from t3mpc_ros.evaluation.reporting import Table
-    from t3mpc_ros.evaluation.twin_validation.validation_figures import Evidence
+import numpy as np
 
+from t3mpc_ros.evaluation.plotting import write_pictures
+from t3mpc_ros.evaluation.reporting import (
+    EMPTY_CELL,
+    Block,
+    Heading,
+    Paragraph,
+    Picture,
+    Table,
+    html_page,
+)
+from t3mpc_ros.evaluation.twin_validation import component_tests, courses, slip_drift
+from t3mpc_ros.evaluation.twin_validation.component_tests import GYRO_SHEET, sharp_deviation
+from t3mpc_ros.evaluation.twin_validation.slip_drift import NO_SLIP, holds_from
+from t3mpc_ros.evaluation.twin_validation.validation_figures import VALIDATION_FIGURES, Evidence
+from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 
-SEED = 1
-OUTPUT = Path('runs') / 'twin'
 PAGE = 'twin.html'
 TITLE = 'The digital twin, put to the test'
-
-_CSS = """
-:root { color-scheme: light; }
-body { margin: 0 auto; max-width: 60rem; padding: 1.2rem 1rem 4rem; color: #1f2937;
-  background: #fff; font: 1rem/1.5 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
-h1 { font-size: 1.5rem; margin: 0 0 .2rem; }
-h2 { font-size: 1.1rem; margin: 2.4rem 0 .4rem; }
-p { margin: .3rem 0; }
-.quiet { color: #6b7280; font-size: .9rem; }
-figure { margin: .4rem 0 0; max-width: 50rem; }
-figure img { display: block; width: 100%; height: auto; }
-.wide { overflow-x: auto; margin: 1rem 0; }
-table { border-collapse: collapse; width: 100%; font-size: .88rem; }
-caption { text-align: left; font-weight: 600; padding: .2rem 0; }
-th, td { text-align: right; padding: .22rem .6rem; border-bottom: 1px solid #e5e7eb;
-  font-variant-numeric: tabular-nums; }
-th:first-child, td:first-child { text-align: left; }
-th { color: #6b7280; font-weight: 600; }
-"""
 
 
 class ValidationSize(NamedTuple):
@@ -54,7 +43,9 @@ FULL = ValidationSize(seeds=8, strengths=3, standing=600.0, patrol=60.0)
 QUICK = ValidationSize(seeds=1, strengths=1, standing=60.0, patrol=14.0)
 
 
-def write_validation(output: Path, seed: int, amount: ValidationSize, progress: Any = None) -> str:
+def write_validation(
+    output: Path, seed: int, amount: ValidationSize, *, progress: bool = False
+) -> str:
     """Write page and figures, and return the tables and the path of the page as text.
 
     Raises
@@ -62,38 +53,24 @@ def write_validation(output: Path, seed: int, amount: ValidationSize, progress: 
     OSError
         The output cannot be written.
     """
-    from t3mpc_ros.evaluation.plotting import png_of
-    from t3mpc_ros.evaluation.reporting import Table
-    from t3mpc_ros.evaluation.twin_validation import slip_drift
-    from t3mpc_ros.evaluation.twin_validation.validation_figures import VALIDATION_FIGURES
-
-    evidence = run_validation(seed, amount, progress)
-    tables: list[Table] = [slip_drift.drift_table(evidence.drifts), bench_table(evidence)]
-    # Outcomes of driving the twin in a closed loop, as one more Table, belong here.
-    pictures = {
-        drawing.stem: png_of(drawing.draw, evidence) or b'' for drawing in VALIDATION_FIGURES
-    }
-    output.mkdir(parents=True, exist_ok=True)
-    for stem, png in pictures.items():
-        (output / f'{stem}.png').write_bytes(png)
+    evidence = run_validation(seed, amount, progress=progress)
+    tables = [slip_drift.drift_table(evidence.drifts), bench_table(evidence)]
+    pictures = write_pictures(VALIDATION_FIGURES, evidence, output)
     origin = f'seeds {seed} to {seed + amount.seeds - 1}; simulation only'
     if amount == QUICK:
         origin = f'a quick look, {origin}'
     findings = _findings(evidence)
-    page = _page(origin, findings, tables, pictures)
-    (output / PAGE).write_text(page, encoding='utf-8')
+    blocks: list[Block] = [Paragraph(origin, 'quiet'), *map(Paragraph, findings), *tables]
+    for drawing in VALIDATION_FIGURES[:-1]:
+        picture = Picture(drawing.title, pictures[drawing.stem], drawing.caption)
+        blocks += [Heading(drawing.title), picture]
+    (output / PAGE).write_text(html_page(TITLE, blocks), encoding='utf-8')
     texts = [table.markdown() for table in tables]
     return '\n\n'.join([*texts, '\n'.join(findings), str(output / PAGE)])
 
 
-def run_validation(seed: int, amount: ValidationSize, progress: Any = None) -> 'Evidence':
-    """Return all measurements; ``progress`` receives the number of finished runs."""
-    import numpy as np
-
-    from t3mpc_ros.evaluation.twin_validation import component_tests, courses, slip_drift
-    from t3mpc_ros.evaluation.twin_validation.validation_figures import Evidence
-    from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
-
+def run_validation(seed: int, amount: ValidationSize, *, progress: bool = False) -> Evidence:
+    """Return all measurements."""
     parameters = DigitalTwinParameters.from_dict({'seed': seed, 'world': 'room'})
     seeds = range(seed, seed + amount.seeds)
     kinds = [
@@ -102,8 +79,6 @@ def run_validation(seed: int, amount: ValidationSize, progress: Any = None) -> '
     ]
     slips = [slip_drift.NO_SLIP, *(slip for kind in kinds for slip in kind)]
     shown = slip_drift.SLIPS[1]
-    count = _ProgressCounter(progress, len(seeds) * len(slips) * len(slip_drift.COURSES) + 4)
-
     fastest, motor = 140.0, parameters.motor
     torque = [
         component_tests.torque_curve(motor, volts, current, fastest)
@@ -118,19 +93,13 @@ def run_validation(seed: int, amount: ValidationSize, progress: Any = None) -> '
     rate = parameters.rate
     rates = component_tests.stationary_gyro(parameters.imu, amount.standing, rate, seed)
     low_pass = [component_tests.low_pass_response(number) for number in range(7)]
-    count()
-    found = slip_drift.measure_drifts(seeds, slips, count)
+    found = slip_drift.measure_drifts(seeds, slips, progress=progress)
     squares = tuple(
         slip_drift.drive_course(name, shown, seed) for name in ('square ccw', 'square cw')
     )
-    count()
-    turns, slip_events = (
-        slip_drift.drive_course('10 turns', shown, seed),
-        slip_drift.slip_events('10 turns', shown, seed),
-    )
-    count()
+    turns = slip_drift.drive_course('10 turns', shown, seed)
+    slip_events = slip_drift.slip_events('10 turns', shown, seed)
     patrol = courses.patrol(parameters, amount.patrol, 30.0)
-    count()
     return Evidence(
         parameters=parameters,
         torque=torque,
@@ -149,13 +118,8 @@ def run_validation(seed: int, amount: ValidationSize, progress: Any = None) -> '
     )
 
 
-def bench_table(evidence: 'Evidence') -> 'Table':
+def bench_table(evidence: Evidence) -> Table:
     """Return the component measurements beside the data sheets."""
-    import numpy as np
-
-    from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table
-    from t3mpc_ros.evaluation.twin_validation.component_tests import GYRO_SHEET, sharp_deviation
-
     parameters, patrol = evidence.parameters, evidence.patrol
     rows = []
     for curve in evidence.torque:
@@ -181,15 +145,11 @@ def bench_table(evidence: 'Evidence') -> 'Table':
     measured = f'{density[-1]:.4f} deg/s/√Hz'
     rows.append(('noise of the gyro', measured, f'{parameters.imu.gyro_noise:g} deg/s/√Hz'))
     rows.append(('hardest push of a wall', f'{patrol.max_contact_force:.0f} N', EMPTY_CELL))
-    return Table('Parts', ('what', 'twin', 'to compare'), tuple(rows))
+    return Table('Parts', ('what', 'twin', 'to compare'), rows)
 
 
-def _findings(evidence: 'Evidence') -> list[str]:
+def _findings(evidence: Evidence) -> list[str]:
     """Return in sentences the drift from which the gyro leaves at most a fifth."""
-    import numpy as np
-
-    from t3mpc_ros.evaluation.twin_validation.slip_drift import NO_SLIP, holds_from
-
     lines = []
     for course in dict.fromkeys(item.course for item in evidence.drifts):
         slipped = [
@@ -204,45 +164,3 @@ def _findings(evidence: 'Evidence') -> list[str]:
             f'deg; its own errors may come to {bound:.1f} deg.'
         )
     return lines
-
-
-def _page(
-    origin: str,
-    findings: Sequence[str],
-    tables: 'Sequence[Table]',
-    pictures: Mapping[str, bytes],
-) -> str:
-    """Return the page as self-contained HTML."""
-    from t3mpc_ros.evaluation.twin_validation.validation_figures import VALIDATION_FIGURES
-
-    parts = [
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f'<title>{TITLE}</title>\n<style>{_CSS}</style>\n</head>\n<body>',
-        f'<h1>{TITLE}</h1>\n<p class="quiet">{escape(origin)}</p>',
-        *(f'<p>{escape(finding)}</p>' for finding in findings),
-        *(table.html() for table in tables),
-    ]
-    for drawing in VALIDATION_FIGURES[:-1]:
-        data = base64.b64encode(pictures[drawing.stem]).decode()
-        parts.append(
-            f'<h2>{escape(drawing.title)}</h2>\n<figure><img alt="{escape(drawing.title)}" '
-            f'src="data:image/png;base64,{data}">'
-            f'<figcaption class="quiet">{escape(drawing.caption)}</figcaption></figure>'
-        )
-    return '\n'.join([*parts, '</body>\n</html>\n'])
-
-
-class _ProgressCounter:
-    """Counts finished runs for the progress output."""
-
-    def __init__(self, progress: Any, total: int) -> None:
-        self._progress = progress
-        self._count = 0
-        if progress is not None:
-            progress.begin(total)
-
-    def __call__(self) -> None:
-        self._count += 1
-        if self._progress is not None:
-            self._progress.done(self._count)
