@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Short default set of tests; fixtures: an isolated ROS graph for each test that needs one."""
 
+import argparse
 import os
 from pathlib import Path
 
@@ -12,23 +13,51 @@ from t3mpc_ros.cli.process_group import ProcessGroup
 
 ROOT = Path(__file__).resolve().parent
 DEFAULT = ('geometry', 'parameters', 'robot', 'fuzzy', 'test_launch_files.py')
-"""What ``colcon test``, and pytest without arguments, runs in less than two minutes; kernels that
-have to be compiled first take another one."""
+"""What ``colcon test``, and pytest without arguments, runs; scripts/check runs all."""
 
 
-def pytest_collection_modifyitems(config, items):
-    """Run the default set unless paths, markers or names select tests; scripts/check runs all."""
+def pytest_addoption(parser):
+    parser.addoption(
+        '--part', type=_part, metavar='K/N', help='run part K of N of the selected tests'
+    )
+
+
+def _part(text):
+    """Return number and count of ``K/N``."""
+    number, _, count = text.partition('/')
+    if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+        raise argparse.ArgumentTypeError(f'must be K/N with 1 <= K <= N: got {text}')
+    return int(number), int(count)
+
+
+def _is_default(config):
+    """Return whether nothing selects tests: neither paths, nor markers, nor names."""
     chosen = config.args_source is config.ArgsSource.ARGS or config.option.markexpr
-    if chosen or config.option.keyword or hasattr(config, 'workerinput'):
-        return
-    default = [
-        item
-        for item in items
-        if {*item.path.relative_to(ROOT).parts} & {*DEFAULT}
-        and not item.get_closest_marker('slow')
-    ]
-    config.hook.pytest_deselected(items=[item for item in items if item not in default])
-    items[:] = default
+    return not (chosen or config.option.keyword or hasattr(config, 'workerinput'))
+
+
+def pytest_ignore_collect(collection_path, config):
+    """Import the files of the default set only: the import of all others takes as long as it."""
+    parts = {*collection_path.relative_to(ROOT).parts}
+    return (
+        collection_path.suffix == '.py' and _is_default(config) and not parts & {*DEFAULT} or None
+    )
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config, items):
+    """Keep a part of the tests; of the default set, those that take neither long nor slow."""
+    if config.option.part:
+        number, count = config.option.part
+        _keep(config, items, items[number - 1 :: count])
+    elif _is_default(config):
+        times = {'slow', 'long'}
+        _keep(config, items, [i for i in items if not times & {m.name for m in i.iter_markers()}])
+
+
+def _keep(config, items, kept):
+    config.hook.pytest_deselected(items=[*{*items} - {*kept}])
+    items[:] = kept
 
 
 @pytest.fixture

@@ -231,27 +231,6 @@ def test_colcon_test_runs_the_tests_and_reports_them(copied):
     assert int(count) > 10
 
 
-def test_the_default_set_is_a_part_that_needs_no_selection(copied):
-    """``colcon test`` gives no selection; scripts/check selects by marker and runs everything."""
-
-    def collected(*words):
-        done = subprocess.run(
-            [sys.executable, '-m', 'pytest', '--collect-only', '-q', *words],
-            cwd=copied.source,
-            env=copied.environment,
-            capture_output=True,
-            text=True,
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
-        return {line.partition(':')[0] for line in done.stdout.splitlines() if '.py:' in line}
-
-    default = collected()
-    assert 'test/robot/test_command_limiter.py' in default
-    assert 'test/nodes/test_launch_files.py' in default
-    assert 'test/test_readme.py' not in default
-    assert 'test/test_readme.py' in collected('test/test_readme.py')
-
-
 # --- configuration and launch -------------------------------------------------------------------
 
 CHANGED = {
@@ -383,6 +362,7 @@ exec(sys.argv[2])' "$here" "$2" ;;
 *finish_install.py)
   mkdir -p "$VENV/lib/t3mpc_ros"
   mv "$VENV/bin/t3mpc" "$VENV/lib/t3mpc_ros/t3mpc" ;;
+-m\ ruff* | -m\ mypy* | -m\ pytest*) echo "$*" >>"$beside/checks" ;;
 *main\ compile)
   note compile
   [ ! -e "$beside/slow_kernels" ] || exec sleep 60 ;;
@@ -605,7 +585,7 @@ def test_each_part_of_the_environment_is_installed_when_needed(checkout):
         text.write('# changed\n')
     assert checkout.run('t3mpc').returncode == 0
     assert checkout.done() == []
-    subprocess.run(**check)  # the fake Python has no ruff
+    assert subprocess.run(**check).returncode == 0
     assert checkout.done() == UPDATE
     installed = checkout.beside('installed').read_text().splitlines()[-1]
     assert re.findall(r'/(requirements[\w.-]*)', installed) == [
@@ -615,6 +595,31 @@ def test_each_part_of_the_environment_is_installed_when_needed(checkout):
     checkout.run('t3mpc')
     subprocess.run(**check)
     assert checkout.done() == []
+
+
+@pytest.mark.parametrize(
+    'arguments, linted, selected',
+    [
+        ((), True, ['not (ros or long)', 'ros and not long']),
+        (('--quick',), True, ['not (ros or slow or long)']),
+        (('--long',), False, ['long']),
+        (('--long', '3/7'), False, ['long --part 3/7']),
+        (('-k', 'name'), True, None),
+    ],
+)
+def test_check_runs_what_is_asked_for(arguments, linted, selected, checkout):
+    command = checkout.command(*arguments)
+    command['args'][0] = checkout.root / 'scripts' / 'check'
+    done = subprocess.run(**command)
+    assert done.returncode == 0, done.stderr
+    lines = checkout.beside('checks').read_text().splitlines()
+    tests = [line.removeprefix('-m pytest ') for line in lines if 'pytest' in line]
+    assert len(lines) - len(tests) == (3 if linted else 0)
+    if selected is None:
+        assert tests == ['-k name']
+    else:
+        found = [re.fullmatch(r'-m (.*?)(?: --ignore-glob .*| -n .*)?', test) for test in tests]
+        assert [match.group(1) for match in found] == selected
 
 
 def test_the_installer_is_uv_and_without_it_pip(checkout):

@@ -92,7 +92,7 @@ class Walk:
         pytest.param(
             'avr',
             marks=[
-                pytest.mark.slow,
+                pytest.mark.long,
                 pytest.mark.skipif(
                     bool(missing_tools()), reason=f'not installed: {missing_tools()}'
                 ),

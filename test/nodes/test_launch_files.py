@@ -265,10 +265,11 @@ def only_bag(folder):
     return bag
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 @pytest.mark.parametrize(
     'to_group',
-    [pytest.param(False, id='launch'), pytest.param(True, id='group', marks=pytest.mark.slow)],
+    [pytest.param(False, id='launch'), pytest.param(True, id='group', marks=pytest.mark.long)],
 )
 def test_sim_starts_tracks_and_ends_with_ctrl_c(to_group, start, tmp_path):
     """SIGINT to launch alone, and to the whole group as from a terminal."""

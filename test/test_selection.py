@@ -1,0 +1,65 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Which tests a run selects: default set, parts, quick and long tests; none is left out of all."""
+
+import itertools
+from pathlib import Path
+import re
+import subprocess
+import sys
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def collect(*words):
+    """Return the names of the selected tests, in order."""
+    done = subprocess.run(
+        [sys.executable, '-m', 'pytest', '--collect-only', *words],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return [line for line in done.stdout.splitlines() if '.py::' in line]
+
+
+@pytest.mark.slow
+def test_the_default_set_is_a_part_that_needs_no_selection():
+    """``colcon test`` gives no selection; scripts/check selects by marker and runs everything."""
+    default = {name.partition(':')[0] for name in collect()}
+    assert 'test/robot/test_command_limiter.py' in default
+    assert 'test/nodes/test_launch_files.py' in default
+    assert 'test/test_docs.py' not in default
+    assert collect('test/test_docs.py') != []
+
+
+def test_the_runs_of_check_select_every_test_once():
+    """A test that no marker expression matches would run nowhere."""
+    quick, *runs = re.findall(r"-m '([^']+)'", (ROOT / 'scripts' / 'check').read_text())
+    for marks in itertools.product((False, True), repeat=3):
+        values = dict(zip(('ros', 'slow', 'long'), marks, strict=True))
+        matches = [eval(expression, {}, values) for expression in (*runs, 'long')]
+        assert sum(matches) == 1
+        assert matches[0] or not eval(quick, {}, values)
+
+
+def test_the_parts_of_a_run_are_the_run():
+    parts = [collect('test/geometry', '--part', f'{k}/3') for k in (1, 2, 3)]
+    whole = collect('test/geometry')
+    assert sorted(name for part in parts for name in part) == sorted(whole) != []
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+
+
+def test_ci_runs_each_part_of_the_long_tests_in_turn():
+    text = (ROOT / '.ci' / 'run').read_text()
+    [line] = re.findall(r'^part=.*', text, re.MULTILINE)
+    parts = {
+        subprocess.check_output(
+            ['bash', '-c', f'date() {{ echo {day:03}; }}; {line}; echo $part'], text=True
+        ).strip()
+        for day in (1, 8, 9, 80, 115, 257, 361, 363, 364)
+    }
+    assert parts == {f'{k}/7' for k in range(1, 8)}
+    assert 'scripts/check --long "$part"' in text
