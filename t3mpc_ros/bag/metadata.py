@@ -14,7 +14,6 @@ from typing import Any
 import yaml
 
 from t3mpc_ros.bag.qos import QosProfile, dump_yaml
-from t3mpc_ros.bag.schema import BagError
 
 METADATA_FILE_NAME = 'metadata.yaml'
 METADATA_VERSION = 9
@@ -22,10 +21,6 @@ NO_START_NS = 2**63 - 1
 """Starting time of a file or bag without messages, as in rosbag2 (nanoseconds since 1970)."""
 
 _ROOT = 'rosbag2_bagfile_information'
-
-
-class MetadataError(BagError):
-    """``metadata.yaml`` is missing, damaged or of another version."""
 
 
 @dataclass(frozen=True)
@@ -67,21 +62,6 @@ class TopicInformation:
             'message_count': self.message_count,
         }
 
-    @classmethod
-    def from_mapping(cls, mapping: Mapping[str, Any]) -> 'TopicInformation':
-        """Return the topic of one entry of ``topics_with_message_count``."""
-        topic = mapping['topic_metadata']
-        return cls(
-            name=str(topic['name']),
-            type_name=str(topic['type']),
-            offered_qos_profiles=tuple(
-                QosProfile.from_mapping(item) for item in topic['offered_qos_profiles']
-            ),
-            type_hash=str(topic['type_description_hash']),
-            message_count=int(mapping['message_count']),
-            serialization_format=str(topic['serialization_format']),
-        )
-
 
 @dataclass(frozen=True)
 class FileInformation:
@@ -101,16 +81,6 @@ class FileInformation:
             'duration': {'nanoseconds': self.duration_ns},
             'message_count': self.message_count,
         }
-
-    @classmethod
-    def from_mapping(cls, mapping: Mapping[str, Any]) -> 'FileInformation':
-        """Return the file of one entry of ``files``."""
-        return cls(
-            path=str(mapping['path']),
-            start_ns=int(mapping['starting_time']['nanoseconds_since_epoch']),
-            duration_ns=int(mapping['duration']['nanoseconds']),
-            message_count=int(mapping['message_count']),
-        )
 
 
 @dataclass(frozen=True)
@@ -180,28 +150,11 @@ def write_metadata(folder: Path, metadata: BagMetadata) -> None:
         raise
 
 
-def read_metadata(folder: Path) -> BagMetadata:
-    """Return the content of ``metadata.yaml`` of a folder.
-
-    Raises
-    ------
-    MetadataError
-        The file is missing, damaged or not of version 9.
-    """
-    path = folder / METADATA_FILE_NAME
+def read_origin(folder: Path) -> tuple[dict[str, str], str] | None:
+    """Return custom data and ROS distribution in ``metadata.yaml``; None if it is unusable."""
     try:
-        root = yaml.safe_load(path.read_text(encoding='utf-8'))[_ROOT]
-        if root['version'] != METADATA_VERSION:
-            raise MetadataError(f'{path} is version {root["version"]}, not {METADATA_VERSION}')
-        return BagMetadata(
-            files=tuple(FileInformation.from_mapping(item) for item in root['files']),
-            topics=tuple(
-                TopicInformation.from_mapping(item) for item in root['topics_with_message_count']
-            ),
-            custom_data={str(key): str(v) for key, v in (root['custom_data'] or {}).items()},
-            ros_distro=str(root['ros_distro']),
-        )
-    except OSError as error:
-        raise MetadataError(f'{path} cannot be read: {error.strerror}') from error
-    except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise MetadataError(f'{path} is damaged: {error!r}') from error
+        root = yaml.safe_load((folder / METADATA_FILE_NAME).read_text(encoding='utf-8'))[_ROOT]
+        custom_data = {str(key): str(v) for key, v in (root['custom_data'] or {}).items()}
+        return custom_data, str(root['ros_distro'])
+    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError):
+        return None

@@ -64,11 +64,8 @@ class TopicFilter:
     ----------
     names
         Full names, as resolved by the node.
-    patterns
-        Names in which ``*`` matches any text including slashes; names without a leading slash
-        are relative to ``namespace``.
-    regex
-        Regular expression that must match the full name from end to end; empty = none.
+    patterns, regex
+        Inclusion rules, see :class:`TopicPatterns`, but a name that begins with ``*`` is relative.
     types
         Message types such as ``nav_msgs/msg/Odometry``.
     exclude_topics, exclude_regex
@@ -94,11 +91,9 @@ class TopicFilter:
         namespace: str = '/',
     ) -> None:
         base = namespace.rstrip('/')
+        full = [text if text.startswith('/') else f'{base}/{text}' for text in patterns]
         self._names = frozenset(names)
-        self._patterns = [
-            text if text.startswith('/') else f'{base}/{text}' for text in dict.fromkeys(patterns)
-        ]
-        self._regex = compile_regex('record.regex', regex)
+        self._included = TopicPatterns(full, regex, parameter='record.regex')
         self._types = frozenset(types)
         self._excluded = TopicPatterns(
             exclude_topics, exclude_regex, parameter='record.exclude_regex', namespace=namespace
@@ -106,33 +101,17 @@ class TopicFilter:
 
     def matches(self, topic: str, types: Iterable[str] = ()) -> bool:
         """Return whether ``topic``, published with ``types``, is recorded."""
-        if self._excluded.matches(topic):
-            return False
-        if topic in self._names:
-            return True
-        if '/_' in topic:
-            return False
-        if any(fnmatchcase(topic, pattern) for pattern in self._patterns):
-            return True
-        if self._regex and self._regex.fullmatch(topic):
-            return True
-        return not self._types.isdisjoint(types)
+        if topic in self._names or '/_' in topic:
+            return topic in self._names and not self._excluded.matches(topic)
+        wanted = self._included.matches(topic) or not self._types.isdisjoint(types)
+        return wanted and not self._excluded.matches(topic)
 
 
 class PlayTopicFilter:
     """Filter and remapping rules of the player.
 
     A topic is played if ``topics`` or ``regex`` matches, or if both are empty, and no exclusion
-    rule matches.
-
-    Parameters
-    ----------
-    topics, regex
-        Inclusion rules, see :class:`TopicPatterns`.
-    exclude_topics, exclude_regex
-        Exclusion rules.
-    remappings
-        New names by recorded names.
+    rule matches, see :class:`TopicPatterns`. ``remappings`` are new names by recorded names.
 
     Raises
     ------
@@ -156,9 +135,8 @@ class PlayTopicFilter:
 
     def matches(self, topic: str) -> bool:
         """Return whether a recorded topic is played."""
-        if self._excluded.matches(topic):
-            return False
-        return not self._included or self._included.matches(topic)
+        included = not self._included or self._included.matches(topic)
+        return included and not self._excluded.matches(topic)
 
     def remapped_name(self, topic: str) -> str:
         """Return the name under which a recorded topic is played."""

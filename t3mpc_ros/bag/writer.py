@@ -4,7 +4,6 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 import mimetypes
 import os
 from pathlib import Path
@@ -15,13 +14,22 @@ from typing import Self
 from mcap.writer import CompressionType, Writer
 
 from t3mpc_ros.bag.mcap_file import MCAP_SUFFIX, Attachment, collect_metadata
-from t3mpc_ros.bag.metadata import BagMetadata, FileInformation, write_metadata
+from t3mpc_ros.bag.metadata import (
+    BagMetadata,
+    FileInformation,
+    TopicInformation,
+    write_metadata,
+)
 from t3mpc_ros.bag.qos import QosProfile, dump_yaml, profiles_to_yaml
 from t3mpc_ros.bag.recovery.finalize_file import finalize_file, open_unbuffered, write_all
 from t3mpc_ros.bag.schema import BagError, DataError, MessageDefinitions, UnknownTopicError
+from t3mpc_ros.geometry.types import NANOSECONDS
 
 _MEDIA_TYPES = {'.npz': 'application/zip', '.yaml': 'application/yaml', '.csv': 'text/csv'}
 """Media types that ``mimetypes`` lacks on some systems; an npz file is a zip archive."""
+
+SYNC_PERIOD_NS = NANOSECONDS
+"""Minimum time between two synchronizations with the disk."""
 
 # Publishers of releases before type hashes report "INVALID".
 _TYPE_HASH = re.compile(r'RIHS\d\d_[0-9a-f]{64}')
@@ -64,20 +72,17 @@ def read_attachment(path: Path, max_bytes: int, name: str = '') -> Attachment:
     )
 
 
-@dataclass
-class _Topic:
-    type_name: str
-    channel: int
-    count: int = 0
-
-
 class BagWriter:
     """Writes serialized messages to ``FOLDER/NAME_N.mcap``, N the next free number.
 
     An existing bag is continued with a new file, and its complete files are included in
     ``metadata.yaml``. Incomplete files are listed in :attr:`incomplete_files` and left unchanged
-    (``t3mpc bag recover`` reads them). ``metadata.yaml`` lists
-    complete files only, so the folder is readable at any time, even after the recorder was killed.
+    (``t3mpc bag recover`` reads them). ``metadata.yaml`` lists complete files only, so the folder
+    is readable at any time, even after the recorder was killed.
+
+    Each file is complete in itself: schemas and channels of its messages, all metadata records,
+    all attachments. Transient-local messages of earlier files are not repeated: a reader of the
+    folder would receive them twice.
 
     Parameters
     ----------
@@ -89,8 +94,12 @@ class BagWriter:
         Tables of text by record name, stored as MCAP metadata records: parameters, version,
         commit. The name ``rosbag2`` is reserved.
     chunk_bytes, chunk_ns
-        A chunk is compressed and written at this size, or at this age of its oldest message.
-        A killed recorder loses at most the current chunk.
+        A chunk is compressed and written at this size, or at this age of its oldest message,
+        by receive time or between two calls of :meth:`tick`. A killed recorder loses at most the
+        current chunk.
+    max_file_bytes, max_file_ns
+        Size of a file, and age of its first message, after which the next file begins; 0 = no
+        limit.
     definitions
         Source of schemas and type hashes.
 
@@ -102,6 +111,11 @@ class BagWriter:
         ``metadata_records`` contains values other than text, or a record called ``rosbag2``.
     """
 
+    path: Path
+    """Current file."""
+    incomplete_files: tuple[str, ...]
+    """Existing files without a valid end."""
+
     def __init__(
         self,
         folder: Path | str,
@@ -109,32 +123,48 @@ class BagWriter:
         *,
         metadata_records: Mapping[str, Mapping[str, str]],
         chunk_bytes: int = 256 * 1024,
-        chunk_ns: int = 1_000_000_000,
+        chunk_ns: int = NANOSECONDS,
+        max_file_bytes: int = 0,
+        max_file_ns: int = 0,
         definitions: MessageDefinitions | None = None,
     ) -> None:
         self.folder = Path(folder).absolute()
-        self._chunk_ns = chunk_ns
+        self._stem = name or self.folder.name
+        self._chunk_bytes, self._chunk_ns = chunk_bytes, chunk_ns
+        self._max_file_bytes, self._max_file_ns = max_file_bytes, max_file_ns
         self._definitions = definitions or MessageDefinitions()
-        self._topics: dict[str, _Topic] = {}
-        self._schemas: dict[str, int] = {}
-        self._chunk_start: int | None = None
+        check_metadata_records(metadata_records)
+        self._metadata_records = {title: dict(table) for title, table in metadata_records.items()}
+        self._attachments: dict[str, tuple[Attachment, int]] = {}
+        self._topics: dict[str, TopicInformation] = {}
         self._closed = self._failed = False
+        self._synced_ns = 0
         self.lost = 0
         """Messages dropped after a write error."""
-        self.incomplete_files: tuple[str, ...] = ()
-        """Existing files without a valid end."""
-        check_metadata_records(metadata_records)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             existing, self.incomplete_files = collect_metadata(self.folder)
             write_metadata(self.folder, existing)
-            self.path, self._output = _create_next_file(self.folder, name or self.folder.name)
+        except OSError as error:
+            raise _folder_error(self.folder, error) from error
+        self._open_file()
+
+    def _open_file(self) -> None:
+        """Begin the next file with all metadata records, attachments and topics."""
+        self._channels: dict[str, int] = {}
+        self._counts: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        self._first_ns: int | None = None
+        self._chunk_start_ns: int | None = None
+        self._chunk_seen: tuple[int, int] | None = None
+        try:
+            self.path, self._output = _create_next_file(self.folder, self._stem)
         except OSError as error:
             raise _folder_error(self.folder, error) from error
         try:
             self._writer = Writer(
                 self._output,
-                chunk_size=chunk_bytes,
+                chunk_size=self._chunk_bytes,
                 compression=CompressionType.ZSTD,
                 enable_data_crcs=True,
             )
@@ -142,15 +172,19 @@ class BagWriter:
             # `ros2 bag info FILE` and `ros2 bag reindex` read this record.
             own = BagMetadata(files=(FileInformation(self.path.name),)).to_mapping()
             self._writer.add_metadata('rosbag2', {'serialized_metadata': dump_yaml(own)})
-            for title, table in metadata_records.items():
-                self._writer.add_metadata(title, dict(table))
+            for title, table in self._metadata_records.items():
+                self._writer.add_metadata(title, table)
         except OSError as error:
             self._output.abandon()
             self.path.unlink(missing_ok=True)
             raise _folder_error(self.folder, error) from error
+        for attachment, read_ns in self._attachments.values():
+            self.add_attachment(attachment, read_ns)
+        for topic in self._topics.values():
+            self._register(topic)
 
     def add_metadata_record(self, title: str, table: Mapping[str, str]) -> None:
-        """Write a metadata record; a later record replaces an earlier one of the same title.
+        """Write a metadata record to this and all later files; it replaces one of its title.
 
         Raises
         ------
@@ -160,29 +194,26 @@ class BagWriter:
             As :meth:`write`.
         """
         check_metadata_records({title: table})
-        if not self._is_open():
-            return
-        with self._writing():
-            self._writer.add_metadata(title, dict(table))
+        self._metadata_records[title] = dict(table)
+        if self._is_open():
+            with self._writing():
+                self._writer.add_metadata(title, dict(table))
 
-    def add_attachment(self, attachment: Attachment, now_ns: int) -> None:
-        """Write an attachment; ``now_ns`` is the time it was read (nanoseconds since 1970).
+    def add_attachment(self, attachment: Attachment, read_ns: int) -> None:
+        """Write an attachment to this and all later files, with the time at which it was read.
 
         Raises
         ------
         DiskError
             As :meth:`write`.
         """
-        if not self._is_open():
-            return
-        with self._writing():
-            self._writer.add_attachment(
-                attachment.modified_ns,
-                now_ns,
-                attachment.name,
-                attachment.media_type,
-                attachment.data,
-            )
+        self._attachments[attachment.name] = attachment, read_ns
+        if self._is_open():
+            item = attachment
+            with self._writing():
+                self._writer.add_attachment(
+                    item.modified_ns, read_ns, item.name, item.media_type, item.data
+                )
 
     def add_topic(
         self,
@@ -209,19 +240,20 @@ class BagWriter:
         DiskError
             As :meth:`write`.
         """
-        if name in self._topics:
-            if self._topics[name].type_name != type_name:
-                raise DataError(
-                    f'{name} is recorded as {self._topics[name].type_name}, not {type_name}'
-                )
+        if known := self._topics.get(name):
+            if known.type_name != type_name:
+                raise DataError(f'{name} is recorded as {known.type_name}, not {type_name}')
             return
+        if not _TYPE_HASH.fullmatch(type_hash):
+            type_hash = self._definitions.type_hash(type_name)
+        topic = TopicInformation(name, type_name, tuple(profiles), type_hash)
+        self._register(topic)
+        self._topics[name] = topic
+
+    def _register(self, topic: TopicInformation) -> None:
+        """Write schema and channel of a topic to the current file."""
+        name, type_name = topic.name, topic.type_name
         schema = self._definitions.schema(type_name)
-        channel_details = {
-            'offered_qos_profiles': profiles_to_yaml(profiles),
-            'topic_type_hash': type_hash
-            if _TYPE_HASH.fullmatch(type_hash)
-            else self._definitions.type_hash(type_name),
-        }
         if not self._is_open():
             return
         with self._writing():
@@ -229,10 +261,14 @@ class BagWriter:
                 self._schemas[type_name] = self._writer.register_schema(
                     type_name, 'ros2msg', schema.encode()
                 )
-            channel = self._writer.register_channel(
+            channel_details = {
+                'offered_qos_profiles': profiles_to_yaml(topic.offered_qos_profiles),
+                'topic_type_hash': topic.type_hash,
+            }
+            self._channels[name] = self._writer.register_channel(
                 name, 'cdr', self._schemas[type_name], channel_details
             )
-        self._topics[name] = _Topic(type_name, channel)
+        self._counts[name] = 0
 
     def write(self, topic: str, received_ns: int, published_ns: int, data: bytes) -> None:
         """Write one CDR message with its stamps in nanoseconds.
@@ -246,6 +282,8 @@ class BagWriter:
         DiskError
             Writing failed. Raised once: the file is finalized if possible, and later messages
             are only counted in :attr:`lost`.
+        FolderError
+            The next file cannot be created.
         BagError
             The writer is closed.
         """
@@ -257,20 +295,52 @@ class BagWriter:
         if not self._is_open():
             self.lost += 1
             return
-        entry = self._topics.get(topic)
-        if entry is None:
+        if topic not in self._channels:
             raise UnknownTopicError(f'{topic} was not added to {self.path.name}')
+        if self._exceeds_limit(received_ns):
+            self.split()
+        if self._first_ns is None:
+            self._first_ns = received_ns
         with self._writing():
-            if self._chunk_start is None:
-                self._chunk_start = received_ns
-            elif received_ns - self._chunk_start >= self._chunk_ns:
+            if self._chunk_start_ns is None:
+                self._chunk_start_ns = received_ns
+            elif received_ns - self._chunk_start_ns >= self._chunk_ns:
                 self._writer.flush()
-                self._chunk_start = received_ns
-            written = self._output.size
-            self._writer.add_message(entry.channel, received_ns, data, published_ns, entry.count)
+                self._chunk_start_ns = received_ns
+            written, count = self._output.size, self._counts[topic]
+            self._writer.add_message(self._channels[topic], received_ns, data, published_ns, count)
             if self._output.size != written:
-                self._chunk_start = None
-        entry.count = (entry.count + 1) % 2**32  # width of the sequence number in MCAP
+                self._chunk_start_ns = None
+        self._counts[topic] = (count + 1) % 2**32  # width of the sequence number in MCAP
+
+    def _exceeds_limit(self, received_ns: int) -> bool:
+        if self._first_ns is None:
+            return False
+        if self._max_file_bytes and self.size >= self._max_file_bytes:
+            return True
+        return bool(self._max_file_ns) and received_ns - self._first_ns >= self._max_file_ns
+
+    def tick(self, now_ns: int) -> None:
+        """Write the chunk to the file and synchronize with the disk when their time has passed.
+
+        A power failure loses the messages of ``chunk_ns`` and :data:`SYNC_PERIOD_NS`, provided
+        that this is called often. ``now_ns`` is a time of any monotonic clock.
+
+        Raises
+        ------
+        DiskError
+            As :meth:`write`.
+        """
+        if self._chunk_start_ns is None:
+            self._chunk_seen = None
+        elif self._chunk_seen is None or self._chunk_seen[0] != self._chunk_start_ns:
+            self._chunk_seen = self._chunk_start_ns, now_ns
+        elif now_ns - self._chunk_seen[1] >= self._chunk_ns:
+            self.flush()
+        if now_ns - self._synced_ns >= SYNC_PERIOD_NS and self._is_open():
+            with self._writing():
+                self._output.sync()
+            self._synced_ns = now_ns
 
     def flush(self) -> None:
         """Write the current chunk to the file.
@@ -280,29 +350,33 @@ class BagWriter:
         DiskError
             As :meth:`write`.
         """
-        if not self._is_open():
-            return
-        with self._writing():
-            self._writer.flush()
-            self._chunk_start = None
-
-    def sync(self) -> None:
-        """Synchronize the file with the disk if it has grown, against loss by power failure.
-
-        Raises
-        ------
-        DiskError
-            As :meth:`write`.
-        """
-        if not self._is_open():
-            return
-        with self._writing():
-            self._output.sync()
+        if self._is_open():
+            with self._writing():
+                self._writer.flush()
+                self._chunk_start_ns = None
 
     @property
     def size(self) -> int:
         """Size of the file in bytes, without the current chunk."""
         return self._output.size
+
+    def split(self) -> Path:
+        """Complete the current file, begin the next one and return its path.
+
+        Raises
+        ------
+        DiskError, FolderError
+            As :meth:`write`.
+        """
+        if self._is_open():
+            self.close()
+            self._closed = False
+            try:
+                self._open_file()
+            except FolderError:
+                self._closed = True
+                raise
+        return self.path
 
     def close(self) -> None:
         """Complete the file and add it to ``metadata.yaml``; idempotent.

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from t3mpc_ros.bag.metadata import TopicInformation
 from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.reader import BagReader, open_bag
-from t3mpc_ros.bag.recording.split_writer import message_loss_notes
+from t3mpc_ros.bag.recording.message_losses import message_loss_notes
 from t3mpc_ros.bag.recovery.recover_bag import RecoveryOutputError, default_output, recover_bag
 from t3mpc_ros.bag.recovery.result import Damage, FileResult, RecoveryResult
 from t3mpc_ros.cli.command import ArgumentParser, run_command

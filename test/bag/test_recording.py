@@ -7,6 +7,7 @@ import threading
 from mcap.reader import make_reader
 import pytest
 from rosbags.rosbag2 import Reader
+from support.bag_files import metadata_of
 
 from t3mpc_ros.bag import writer
 from t3mpc_ros.bag.mcap_file import (
@@ -15,22 +16,22 @@ from t3mpc_ros.bag.mcap_file import (
     SerializedMessage,
     read_mcap_file,
 )
-from t3mpc_ros.bag.metadata import TopicInformation, read_metadata
+from t3mpc_ros.bag.metadata import TopicInformation
 from t3mpc_ros.bag.player import PlaybackParameters
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recording.diagnostics_monitor import (
     REPORT_TIMEOUT_NS,
     DiagnosticsMonitor,
     SnapshotRateLimiter,
-    snapshot_folder_name,
 )
+from t3mpc_ros.bag.recording.message_losses import message_loss_notes, message_loss_record
 from t3mpc_ros.bag.recording.message_queue import MessageQueue
 from t3mpc_ros.bag.recording.recording_parameters import RecordingParameters
-from t3mpc_ros.bag.recording.snapshot import CircularMessageCache, unused_folder, write_snapshot
-from t3mpc_ros.bag.recording.split_writer import (
-    SplitWriter,
-    message_loss_notes,
-    message_loss_record,
+from t3mpc_ros.bag.recording.snapshot import (
+    CircularMessageCache,
+    snapshot_folder_name,
+    unused_folder,
+    write_snapshot,
 )
 from t3mpc_ros.bag.recovery.finalize_file import finalize_file
 from t3mpc_ros.bag.schema import BagError
@@ -189,13 +190,6 @@ def test_a_type_selects_whatever_the_name():
     assert not selection.matches('/any')
 
 
-def test_controller_journal_is_recorded_by_default():
-    parameters = RecordingParameters()
-    selection = TopicFilter([], parameters.topics, namespace='/robot')
-    for name in ('controller/journal', 'controller/parameters', 'controller/terms/reach/left'):
-        assert selection.matches(f'/robot/{name}')
-
-
 @pytest.mark.parametrize('name', ['regex', 'exclude_regex'])
 def test_invalid_regex_is_rejected_with_name_position_and_value(name):
     with pytest.raises(TopicFilterError, match=rf"record\.{name} must be .*'a\(b'.*position 1"):
@@ -275,8 +269,8 @@ def test_every_message_is_taken_or_counted_with_two_threads():
 
 
 def series(folder, **options):
-    made = SplitWriter(folder, {'provenance': {'commit': 'abc'}}, **options)
-    made.add_topic(TopicInformation('/n', NUMBER))
+    made = BagWriter(folder, metadata_records={'provenance': {'commit': 'abc'}}, **options)
+    made.add_topic('/n', NUMBER)
     return made
 
 
@@ -286,7 +280,7 @@ def test_messages_older_than_the_chunk_duration_are_in_the_file(tmp_path):
     for step in range(40):  # two seconds, ticks of 50 ms
         now = step * SECOND // 20
         if step % 2 == 0 and step < 10:
-            bag.write(message('/n', step / 20), now)
+            bag.write(*message('/n', step / 20))
         bag.tick(now)
         torn = tmp_path / f'torn_{step}.mcap'
         torn.write_bytes(bag.path.read_bytes())
@@ -303,7 +297,7 @@ def test_disk_sync_at_most_once_per_second_and_only_for_new_data(tmp_path, monke
     for step in range(100):  # five seconds; messages in the first half of them
         now = SECOND + step * SECOND // 20
         if step < 50:
-            bag.write(message('/n', step / 20), now)
+            bag.write(*message('/n', step / 20))
         bag.tick(now)
     assert 3 <= len(synced) <= 4
 
@@ -316,12 +310,12 @@ def test_split_recording_is_complete_in_self_contained_files(tmp_path, options):
     bag.add_metadata_record('controller', {'law.gain': '8.0'})
     written = [noise(i / 10) for i in range(50)]
     for i, item in enumerate(written):
-        bag.write(item, i * SECOND // 10)
+        bag.write(*item)
         if i % 10 == 9:  # metadata.yaml is written with each split
             files = sorted(path.name for path in folder.glob('*.mcap'))
-            assert len(read_metadata(folder).files) == len(files) - 1
+            assert len(metadata_of(folder)['files']) == len(files) - 1
     bag.close()
-    files = [folder / file.path for file in read_metadata(folder).files]
+    files = [folder / path for path in metadata_of(folder)['relative_file_paths']]
     assert len(files) >= 5
     parts = [read(path) for path in files]
     assert [item for part in parts for item in part] == written
@@ -349,7 +343,7 @@ def test_a_silent_recording_is_not_split(tmp_path):
 
 def test_full_disk_at_a_split_leaves_the_previous_file_complete(tmp_path, monkeypatch):
     bag = series(tmp_path / 'bag')
-    bag.write(message('/n', 0), 0)
+    bag.write(*message('/n', 0))
 
     def full(path, mode):
         raise OSError(28, 'No space left on device')

@@ -20,9 +20,9 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_typestore
+from support.bag_files import metadata_of, topics_of
 
 from t3mpc_ros.bag.mcap_file import MAGIC, read_mcap_file
-from t3mpc_ros.bag.metadata import read_metadata
 from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recovery.recover_bag import RecoveryOutputError, default_output, recover_bag
@@ -423,9 +423,8 @@ def test_recovered_bag_opens_everywhere_and_input_is_unchanged(tmp_path, own):
     kept = inside(target.read_bytes())
     assert [(m[0], m[1], m[4]) for m in kept.messages] == read_anyhow(tmp_path / 'new')
     assert read_mcap_file(target).message_count == len(kept.messages) == result.kept > 300
-    metadata = read_metadata(tmp_path / 'new')
-    assert metadata.message_count == result.kept
-    assert metadata.topics[0].offered_qos_profiles == (QosProfile(depth=7),)
+    assert metadata_of(tmp_path / 'new')['message_count'] == result.kept
+    assert topics_of(tmp_path / 'new')[0][2] == [QosProfile(depth=7).to_mapping()]
     with open_bag(tmp_path / 'new') as reader:
         assert reader.metadata_records == DETAILS
         assert reader.topics['/n'].message_count == result.topics['/n'].kept

@@ -14,11 +14,11 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
+from support.bag_files import metadata_of, topics_of
 import yaml
 
 from t3mpc_ros.bag import writer
 from t3mpc_ros.bag.mcap_file import read_mcap_file
-from t3mpc_ros.bag.metadata import read_metadata
 from t3mpc_ros.bag.qos import QosProfile, profiles_from_yaml
 from t3mpc_ros.bag.reader import missing_sample_ratio, open_bag
 from t3mpc_ros.bag.recovery import finalize_file as finalization
@@ -180,11 +180,7 @@ def test_statistics_index_and_metadata_yaml_agree(folder):
     assert statistics.message_end_time == written[-1][1]
     assert {chunk.compression for chunk in summary.chunk_indexes} == {'zstd'}
     assert all(chunk.message_index_length > 0 for chunk in summary.chunk_indexes)
-    metadata = read_metadata(folder)
-    assert metadata.message_count == len(written)
-    assert metadata.start_ns == START
-    assert metadata.duration_ns == written[-1][1] - START
-    assert {topic.name: topic.message_count for topic in metadata.topics} == {
+    assert {name: count for name, _, _, count in topics_of(folder)} == {
         '/robot/odom': 200,
         '/robot/cmd_vel': 200,
         '/quiet': 0,
@@ -200,7 +196,7 @@ def test_an_invalid_hash_from_the_graph_is_replaced(folder):
     with BagWriter(folder, metadata_records={}) as bag:
         bag.add_topic('/a', NUMBER, type_hash='INVALID')
         bag.add_topic('/b', NUMBER, type_hash='RIHS01_' + 'a' * 64)
-    hashes = {topic.name: topic.type_hash for topic in read_metadata(folder).topics}
+    hashes = {name: type_hash for name, type_hash, _, _ in topics_of(folder)}
     assert hashes == {'/a': STORE.hash_rihs01(NUMBER), '/b': 'RIHS01_' + 'a' * 64}
 
 
@@ -226,13 +222,13 @@ def test_restarted_recorder_continues_the_bag(folder):
     with BagWriter(folder, metadata_records={'run': {'n': '1'}}) as first:
         one = fill(first, 20)
     with BagWriter(folder, metadata_records={'run': {'n': '2'}}) as second:
-        assert read_metadata(folder).message_count == len(one)  # counted from the start
+        assert metadata_of(folder)['message_count'] == len(one)  # counted from the start
         two = fill(second, 30, START + 10**10)
     assert (first.path.name, second.path.name) == ('run_0.mcap', 'run_1.mcap')
-    metadata = read_metadata(folder)
-    assert [file.path for file in metadata.files] == ['run_0.mcap', 'run_1.mcap']
-    assert metadata.message_count == len(one) + len(two)
-    assert len(metadata.topics) == 3
+    metadata = metadata_of(folder)
+    assert metadata['relative_file_paths'] == ['run_0.mcap', 'run_1.mcap']
+    assert metadata['message_count'] == len(one) + len(two)
+    assert len(topics_of(folder)) == 3
     assert read_with_rosbags(folder) == one + two
     with open_bag(folder) as reader:
         assert reader.topics['/robot/odom'].message_count == 50
@@ -245,7 +241,7 @@ def test_topic_with_other_qos_after_restart_keeps_all_messages(folder):
         with BagWriter(folder, metadata_records={}) as bag:
             bag.add_topic('/n', NUMBER, [QosProfile(depth=depth)])
             bag.write('/n', START + depth, START, serialised(TYPES[NUMBER](data=float(depth))))
-    assert [topic.message_count for topic in read_metadata(folder).topics] == [1, 1]
+    assert [count for *_, count in topics_of(folder)] == [1, 1]
     assert len(read_with_rosbags(folder)) == 2
     with open_bag(folder) as reader:
         assert reader.series('/n', {'n': 'data'})['n'].tolist() == [1.0, 5.0]
@@ -271,7 +267,7 @@ def test_a_truncated_earlier_file_is_named_and_left_alone(folder):
         assert again.incomplete_files == ('run_0.mcap',)
         written = fill(again, 10)
     assert bag.path.read_bytes() == torn
-    assert [file.path for file in read_metadata(folder).files] == ['run_1.mcap']
+    assert metadata_of(folder)['relative_file_paths'] == ['run_1.mcap']
     assert read_with_rosbags(folder) == written
     with open_bag(folder) as reader:
         assert reader.incomplete_files == ('run_0.mcap',)
@@ -292,7 +288,7 @@ def test_a_bag_without_messages_is_readable(folder):
     with BagWriter(folder, metadata_records=DETAILS) as bag:
         bag.add_topic('/quiet', NUMBER)
     assert read_with_rosbags(folder) == []
-    assert read_metadata(folder).duration_ns == 0
+    assert metadata_of(folder)['duration'] == {'nanoseconds': 0}
     with open_bag(folder) as reader:
         assert (reader.start_ns, reader.end_ns, reader.duration) == (0, 0, 0.0)
         assert reader.series('/quiet', {'n': 'data'})['n'].shape == (0,)
@@ -425,7 +421,7 @@ def test_invalid_calls_raise_distinct_errors(folder):
     bag.close()
     with pytest.raises(BagError, match='closed'):
         bag.write('/n', START, START, b'')
-    assert read_metadata(folder).message_count == 0
+    assert metadata_of(folder)['message_count'] == 0
 
 
 # -- incomplete files ---------------------------------------------------------------------------

@@ -7,7 +7,6 @@ Nodes report once per second. A shorter fault is not detected, but its messages 
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-import re
 
 from t3mpc_ros.geometry.types import NANOSECONDS
 
@@ -95,9 +94,3 @@ class SnapshotRateLimiter:
         self._count += 1
         self._last_ns = now_ns
         return ''
-
-
-def snapshot_folder_name(time: str, reason: str) -> str:
-    """Return the folder name of a snapshot: ``time`` and ``reason`` in ASCII letters."""
-    words = re.sub(r'[^a-z0-9]+', '-', reason.lower()).strip('-')[:48].rstrip('-')
-    return f'{time}_{words}' if words else time

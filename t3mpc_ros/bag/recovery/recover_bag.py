@@ -11,7 +11,7 @@ import shutil
 from typing import BinaryIO, cast
 
 from t3mpc_ros.bag.mcap_file import MCAP_SUFFIX, collect_metadata, read_mcap_file
-from t3mpc_ros.bag.metadata import MetadataError, read_metadata, write_metadata
+from t3mpc_ros.bag.metadata import read_origin, write_metadata
 from t3mpc_ros.bag.recovery.recover_file import UnreadableError, recover_file
 from t3mpc_ros.bag.recovery.result import Damage, FileResult, RecoveryResult
 from t3mpc_ros.bag.schema import BagError
@@ -72,14 +72,8 @@ def recover_bag(
             entire_file = Damage(0, size, str(error))
             results.append(FileResult(path.name, size, damages=[entire_file]))
     metadata, _ = collect_metadata(output)
-    try:
-        original = read_metadata(files[0].parent)
-    except MetadataError:
-        pass  # usually missing: the defaults apply
-    else:
-        metadata = replace(
-            metadata, custom_data=original.custom_data, ros_distro=original.ros_distro
-        )
+    if (origin := read_origin(files[0].parent)) is not None:  # usually missing
+        metadata = replace(metadata, custom_data=origin[0], ros_distro=origin[1])
     write_metadata(output, metadata)
     return RecoveryResult(output, tuple(results))
 

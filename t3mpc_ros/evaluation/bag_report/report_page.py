@@ -8,7 +8,7 @@ import math
 from pathlib import Path
 
 from t3mpc_ros.bag.reader import BagReader, open_bag
-from t3mpc_ros.bag.recording.split_writer import message_loss_notes
+from t3mpc_ros.bag.recording.message_losses import message_loss_notes
 from t3mpc_ros.evaluation.bag_report.link_history import LinkMetrics
 from t3mpc_ros.evaluation.bag_report.metrics import (
     SETTLING,

@@ -14,17 +14,17 @@ import numpy as np
 from t3mpc_ros.bag.run.journal import Journal, parameters_to_json
 from t3mpc_ros.bag.run.model_file import load_model
 from t3mpc_ros.bag.writer import BagWriter
-from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.control.controller import Controller, ControllerParameters, Status
-from t3mpc_ros.evaluation.bag_report.topic_roles import COMMAND, ODOMETRY, REFERENCE, WHEELS
+from t3mpc_ros.evaluation.bag_report.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     CONTROLLER,
+    FIELDS,
     NUMBERS,
     SPEEDS,
     ControllerInputs,
     motions,
 )
-from t3mpc_ros.evaluation.process_replay.controller_replay import ReplayResult
+from t3mpc_ros.evaluation.process_replay.controller_replay import ReplayResult, output_row
 from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist, State
 from t3mpc_ros.parameters.table import Value
 
@@ -164,8 +164,9 @@ class RecordedController:
         self._tape.row(now_ns + 2 * LATER, self._journal.step(measured.stamp_ns))
         self._steps += 1
         if self._steps % self._every == 0:
-            for name, value in numbers(status).items():
-                self._tape.number(now_ns + 3 * LATER, name, value)
+            for name, value in zip(FIELDS, output_row(command, status), strict=True):
+                if name in NUMBERS:
+                    self._tape.number(now_ns + 3 * LATER, name, value)
         return command, status
 
     def silent(self, now_ns: int) -> None:
@@ -235,25 +236,6 @@ def write_replay(inputs: ControllerInputs, again: ReplayResult, folder: Path) ->
         for when, topic, data in sorted(messages, key=lambda message: message[0]):
             tape.write(topic, when, data)
         return tape.path
-
-
-def numbers(status: Status) -> dict[str, float]:
-    """Return the scalars of a step by the names of ``NUMBERS``."""
-    pairs = {
-        'error': status.error,
-        'estimate': status.estimate,
-        'skill': status.skill,
-        'terms/applied': status.applied,
-        **{f'terms/{name}': status.terms[k] for k, name in enumerate(TERM_NAMES)},
-    }
-    found = {
-        f'{name}/{wheel}': float(pair[z])
-        for name, pair in pairs.items()
-        for z, wheel in enumerate(WHEELS)
-    }
-    found['lyapunov/value'] = status.certificate.value
-    found['lyapunov/margin'] = status.certificate.margin
-    return found
 
 
 def twist_bytes(twist: BodyTwist) -> bytes:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.bag.columns import TopicColumns, read_columns
 from t3mpc_ros.bag.reader import BagReader, open_bag
-from t3mpc_ros.bag.recording.split_writer import message_loss_notes
+from t3mpc_ros.bag.recording.message_losses import message_loss_notes
 from t3mpc_ros.bag.run.journal import COMMAND_EVENTS, JOURNAL_COLUMNS, Event, parameters_from_json
 from t3mpc_ros.bag.run.model_file import load_model
 from t3mpc_ros.control.control_law import TERM_NAMES

@@ -2,25 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recomputes recorded inputs with the current controller, offline."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 import math
-from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.bag.reader import BagReader
 from t3mpc_ros.bag.run.journal import Event
-from t3mpc_ros.control.control_law import BOUND, RATE, TERM_NAMES, VALUE
 from t3mpc_ros.control.controller import Controller, ControllerParameters, Status
 from t3mpc_ros.control.watchdog import Reason
-from t3mpc_ros.evaluation.bag_report.topic_roles import WHEELS
 from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     CONTROLLER,
     FIELDS,
     NUMBERS,
-    PAIRS,
     ControllerInputs,
     ControllerSession,
     ReplayError,
@@ -42,72 +38,11 @@ OPEN_LOOP = (
 """Remark on every replay with changes."""
 
 
-TWIST, ERROR, SKILL, APPLIED, TERMS, CERTIFICATE, COMMAND, LIMITED = 0, 2, 4, 6, 8, 18, 22, 24
-"""First columns of the quantities in a row of results; LIMITED is a single column."""
-WIDTH = 25
-
-
-class StepResults(NamedTuple):
-    """Twist and status of each step, NaN where there is none."""
-
-    numbers: Array
-    """Shape (n, WIDTH), columns from TWIST to LIMITED."""
-    reasons: NDArray[np.object_]
-    """:class:`Reason` of each step, None where there is none, shape (n,)."""
-
-    @classmethod
-    def empty(cls, count: int) -> Self:
-        """Return ``count`` empty rows."""
-        return cls(np.full((count, WIDTH), math.nan), np.full(count, None, dtype=np.object_))
-
-    def part(self, begin: int, end: int) -> 'StepResults':
-        """Return a view of some of the rows."""
-        return StepResults(self.numbers[begin:end], self.reasons[begin:end])
-
-    def set_row(self, row: int, twist: BodyTwist, status: Status) -> None:
-        """Write the result of :meth:`Controller.step` into a row."""
-        self.numbers[row] = (
-            *twist,
-            *status.error.tolist(),
-            *status.skill.tolist(),
-            *status.applied.tolist(),
-            *status.terms.ravel().tolist(),
-            *status.certificate_state.tolist(),
-            math.nan,
-            math.nan,
-            float(status.limited),
-        )
-        self.reasons[row] = status.reason
-
-    @property
-    def twists(self) -> Array:
-        """Commanded twists, m/s and rad/s, shape (n, 2)."""
-        return self.numbers[:, TWIST : TWIST + 2]
-
-    @property
-    def pairs(self) -> dict[str, Array]:
-        """Quantities of both wheels by name, shape (n, 2), as in :class:`Status`."""
-        numbers = self.numbers
-        found = {
-            'error': numbers[:, ERROR : ERROR + 2],
-            'skill': numbers[:, SKILL : SKILL + 2],
-            'applied': numbers[:, APPLIED : APPLIED + 2],
-            'estimate': 0.0 - numbers[:, TERMS : TERMS + 2],
-        }
-        for k, name in enumerate(TERM_NAMES):
-            found[name] = numbers[:, TERMS + 2 * k : TERMS + 2 * k + 2]
-        return found
-
-    @property
-    def certificate(self) -> Array:
-        """Value and margin of the certificate, see :class:`CertificateReading`, shape (n, 2)."""
-        state = self.numbers[:, CERTIFICATE:]
-        return np.stack([state[:, VALUE], state[:, BOUND] - state[:, RATE]], axis=1)
-
-    @property
-    def limited(self) -> NDArray[np.bool_]:
-        """Whether a limit changed the command, shape (n,)."""
-        return np.equal(self.numbers[:, LIMITED], 1.0)
+def output_row(twist: BodyTwist, status: Status) -> list[float]:
+    """Return the outputs of one step in the order of ``controller_inputs.FIELDS``."""
+    pairs = status.error, status.estimate, status.skill, *status.terms, status.applied
+    certificate = status.certificate
+    return [*twist, *np.concatenate(pairs).tolist(), certificate.value, certificate.margin]
 
 
 @dataclass(frozen=True)
@@ -150,16 +85,18 @@ def replay_controller(
     """
     changes = changes or {}
     controllers = make_controllers(inputs, changes) if controllers is None else controllers
-    answers = StepResults.empty(inputs.events.size)
+    answers = np.full((inputs.events.size, len(FIELDS)), math.nan)
+    reasons: list[Reason | None] = [None] * len(answers)
     odometry, references = motions(inputs.odometry), motions(inputs.references)
     parameters = ControllerParameters()
     for life, controller in zip(inputs.lives, controllers, strict=True):
-        own = answers.part(life.first, life.first + len(life.rows))
-        _replay_session(controller, life, changes, odometry, references, own)
+        for row, twist, status in _session_steps(controller, life, changes, odometry, references):
+            answers[row] = output_row(twist, status)
+            reasons[row] = status.reason
         parameters = controller.parameters
-    reasons = tuple(answers.reasons.tolist())
+    fields = dict(zip(FIELDS, np.ascontiguousarray(answers.T), strict=True))
     steps = len(reasons) - reasons.count(None)
-    return ReplayResult(_fields(answers), reasons, steps, parameters, dict(changes))
+    return ReplayResult(fields, tuple(reasons), steps, parameters, dict(changes))
 
 
 def make_controllers(
@@ -219,46 +156,31 @@ def recompute_scalars(
     return found, inputs
 
 
-def _replay_session(
+def _session_steps(
     controller: Controller,
     life: ControllerSession,
     changes: Mapping[str, object],
     odometry: StateArray,
     references: StateArray,
-    answers: StepResults,
-) -> None:
-    """Process the events of one life in their order."""
+) -> Iterator[tuple[int, BodyTwist, Status]]:
+    """Process the events of one life in their order; yield row, command and status of each."""
     taken = life.taken
     inputs = np.stack([taken.odometry, taken.begin, taken.end], axis=1).tolist()
     rows = zip(life.events.tolist(), life.rows[:, 4].tolist(), inputs, strict=True)
-    for k, (event, value, (received, begin, end)) in enumerate(rows):
+    for row, (event, value, (received, begin, end)) in enumerate(rows, life.first):
         for j in range(begin, end):
             controller.add_reference(references[j])
         if event == _STEP:
             if received >= 0:
-                answers.set_row(k, *controller.step(odometry[received]))
-        elif event == Event.ODOMETRY_TIMEOUT:
-            controller.check_odometry(None, 0)
-            answers.set_row(k, STANDSTILL, controller.status)
-        elif event == Event.FINISH:
-            answers.set_row(k, STANDSTILL, controller.status)
+                yield row, *controller.step(odometry[received])
+        elif event in (Event.ODOMETRY_TIMEOUT, Event.FINISH):
+            if event == Event.ODOMETRY_TIMEOUT:
+                controller.check_odometry(None, 0)
+            yield row, STANDSTILL, controller.status
         elif event == Event.CONFIGURE:
             if value in life.parameters:
                 controller.configure(life.parameters[value].with_values(changes))
-        elif event == Event.RESET:
+        elif event in (Event.RESET, Event.ENABLE):
             controller.enable(bool(value))
-            controller.reset()
-        elif event == Event.ENABLE:
-            controller.enable(bool(value))
-
-
-def _fields(answers: StepResults) -> dict[str, Array]:
-    """Return the outputs by field name (``controller_inputs.FIELDS``)."""
-    pairs = answers.pairs
-    pairs |= {f'terms/{name}': pairs[name] for name in (*TERM_NAMES, 'applied')}
-    columns = [*answers.twists.T]
-    columns += [pairs[name][:, z] for name in PAIRS for z in range(len(WHEELS))]
-    columns += [*answers.certificate.T]
-    return {
-        name: np.ascontiguousarray(column) for name, column in zip(FIELDS, columns, strict=True)
-    }
+            if event == Event.RESET:
+                controller.reset()

@@ -23,19 +23,18 @@ from t3mpc_ros.bag.recording.diagnostics_monitor import (
     NodeFault,
     SnapshotRateLimiter,
 )
+from t3mpc_ros.bag.recording.message_losses import LOSSES, message_loss_record
 from t3mpc_ros.bag.recording.message_queue import MessageQueue
 from t3mpc_ros.bag.recording.recording_parameters import RecordingParameters
-from t3mpc_ros.bag.recording.snapshot import CircularMessageCache
-from t3mpc_ros.bag.recording.split_writer import LOSSES, SplitWriter, message_loss_record
+from t3mpc_ros.bag.recording.snapshot import CircularMessageCache, SnapshotWriter
 from t3mpc_ros.bag.schema import BagError, MessageDefinitions, UnknownTypeError
 from t3mpc_ros.bag.topic_filter import TopicFilter
-from t3mpc_ros.bag.writer import FolderError
+from t3mpc_ros.bag.writer import BagWriter, FolderError
 from t3mpc_ros.chaos.seed_fingerprint import FINGERPRINT_KEY
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.common import qos
 from t3mpc_ros.nodes.common.base_node import ERROR, OK, WARN, BaseNode
 from t3mpc_ros.nodes.recorder.metadata import SEED_RECORD, ParameterCollector, RecordingMetadata
-from t3mpc_ros.nodes.recorder.snapshot_writer import SnapshotWriter
 from t3mpc_ros.nodes.recorder.subscriptions import RawSubscriptions, TopicDiscovery, offered_qos
 from t3mpc_ros.nodes.recorder.writer_thread import WriterThread
 
@@ -68,7 +67,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
             time.time_ns(),
         )
         self._definitions = MessageDefinitions()
-        self._queue: MessageQueue[SplitWriter] = MessageQueue(parameters.max_cache_size)
+        self._queue: MessageQueue[BagWriter] = MessageQueue(parameters.max_cache_size)
         self._writer = None if parameters.snapshot_mode else self._make_writer()
         self._snapshots = self._make_snapshot_writer() if parameters.snapshot_duration else None
         self._recorded_types: dict[str, str] = {}
@@ -109,9 +108,9 @@ class RecorderNode(BaseNode[RecordingParameters]):
 
     def _make_writer(self) -> WriterThread:
         parameters = self.parameters
-        writer = SplitWriter(
+        writer = BagWriter(
             self._folder,
-            self._metadata.records,
+            metadata_records=self._metadata.records,
             chunk_bytes=parameters.chunk_size,
             chunk_ns=round(parameters.chunk_duration * NANOSECONDS),
             max_file_bytes=parameters.max_bagfile_size,
@@ -189,11 +188,14 @@ class RecorderNode(BaseNode[RecordingParameters]):
             self._discovery.exclude(topic, str(error))
             return
         self._recorded_types[topic] = type_name
-        self._submit(lambda writer: writer.add_topic(metadata))
+        name, profiles = metadata.name, metadata.offered_qos_profiles
+        self._submit(
+            lambda writer: writer.add_topic(name, type_name, profiles, metadata.type_hash)
+        )
         if self._snapshots:
             self._snapshots.add_topic(metadata, latched)
 
-    def _submit(self, task: Callable[[SplitWriter], object]) -> None:
+    def _submit(self, task: Callable[[BagWriter], object]) -> None:
         if self._writer:
             self._writer.submit(task)
 
@@ -217,7 +219,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
     def _attach(self, files: list[Attachment]) -> None:
         for item in files:
             self._submit(
-                partial(SplitWriter.add_attachment, attachment=item, read_ns=time.time_ns())
+                partial(BagWriter.add_attachment, attachment=item, read_ns=time.time_ns())
             )
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
@@ -245,7 +247,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
         self._write_losses()
 
         try:
-            path = self._writer.submit(SplitWriter.split).result(SPLIT_TIMEOUT)
+            path = self._writer.submit(BagWriter.split).result(SPLIT_TIMEOUT)
         except BagError as error:
             response.message = str(error)
         except TimeoutError:

@@ -10,8 +10,8 @@ from typing import Any, TypeVar
 
 from t3mpc_ros.bag.mcap_file import SerializedMessage
 from t3mpc_ros.bag.recording.message_queue import MessageQueue
-from t3mpc_ros.bag.recording.split_writer import SplitWriter
 from t3mpc_ros.bag.schema import BagError
+from t3mpc_ros.bag.writer import BagWriter
 
 T = TypeVar('T')
 
@@ -35,7 +35,7 @@ class WriterThread:
     """
 
     def __init__(
-        self, writer: SplitWriter, queue: MessageQueue[SplitWriter], clock: Callable[[], int]
+        self, writer: BagWriter, queue: MessageQueue[BagWriter], clock: Callable[[], int]
     ) -> None:
         self._writer = writer
         self._queue = queue
@@ -49,14 +49,14 @@ class WriterThread:
         self._thread = threading.Thread(target=self._run, name='writer', daemon=True)
         self._thread.start()
 
-    def submit(self, task: Callable[[SplitWriter], T]) -> 'Future[T]':
+    def submit(self, task: Callable[[BagWriter], T]) -> 'Future[T]':
         """Return the future result of a task that runs after all queued messages are written.
 
         The future raises :class:`BagError` if writing has stopped.
         """
         future: Future[T] = Future()
 
-        def run(writer: SplitWriter) -> None:
+        def run(writer: BagWriter) -> None:
             future.set_result(task(writer))
 
         with self._lock:
@@ -96,7 +96,7 @@ class WriterThread:
 
     def _process(self, item: Any) -> None:
         if isinstance(item, SerializedMessage):
-            self._writer.write(item, self._clock())
+            self._writer.write(*item)
         else:
             item(self._writer)
 
