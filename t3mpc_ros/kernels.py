@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decorator for compiled functions, and the folder that holds the compiled code."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import hashlib
 import os
 from pathlib import Path
@@ -11,6 +11,8 @@ from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
 from numba.core import caching, config
+from numba.core.registry import CPUDispatcher
+from numba.core.types.misc import unliteral
 
 P = ParamSpec('P')
 R = TypeVar('R')
@@ -111,14 +113,29 @@ if not config.CACHE_DIR:
     _Locators.insert(0, KernelLocator)
 
 
+class _Kernel(CPUDispatcher):  # type: ignore[misc]
+    """Compiled function without a second version for constant arguments of a calling kernel."""
+
+    def get_call_template(
+        self, args: Sequence[object], kws: Mapping[str, object]
+    ) -> tuple[Any, ...]:
+        """Return how a kernel calls this one, with the type of a constant, not its value."""
+        plain = tuple(map(unliteral, args))
+        template: tuple[Any, ...] = super().get_call_template(
+            plain, {name: unliteral(kind) for name, kind in kws.items()}
+        )
+        return template
+
+
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Return ``function``, compiled to machine code on its first call and cached on disk.
 
-    A kernel takes arrays and numbers only. Division by zero gives inf or NaN as in IEEE 754
-    instead of an exception; arguments are validated before the kernel is called. Constants that
-    may change are passed as arguments, because the cache does not detect a changed global.
+    A kernel takes arrays, numbers and named tuples of both only. Division by zero gives inf or
+    NaN as in IEEE 754 instead of an exception; arguments are validated before the kernel is
+    called. Constants that may change are passed as arguments, because the cache does not detect
+    a changed global.
     """
-    return cast(
-        'Callable[P, R]',
-        numba.njit(cache=True, nogil=True, error_model='numpy', fastmath=False)(function),
-    )
+    options = {'nopython': True, 'nogil': True, 'error_model': 'numpy'}
+    compiled = _Kernel(py_func=function, targetoptions=options)
+    compiled.enable_caching()
+    return cast('Callable[P, R]', compiled)

@@ -212,6 +212,14 @@ def test_names_of_tests_have_at_most_60_characters():
             assert len(name) <= 60, f'{path}: {name}'
 
 
+def test_functions_have_at_most_12_parameters():
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                names = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
+                assert len(names) <= 12, f'{path}: {node.name} has {len(names)} parameters'
+
+
 def test_every_source_file_carries_the_licence():
     files = [*SOURCES, *(ROOT / 'test').rglob('*.py'), *(ROOT / 'launch').glob('*.py')]
     files += [path for path in (ROOT / 'scripts').iterdir() if path.is_file()]

@@ -31,11 +31,13 @@ distance only.
 
 from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, estimate
+from t3mpc_ros.fuzzy.inference import FuzzyTables
 from t3mpc_ros.fuzzy.sets import FuzzyParameters
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import Parameters, group, parameter
@@ -110,11 +112,38 @@ class BodyCorrectionParameters(Parameters):
 ) = range(15)  # fmt: skip
 """Entries of the memory: yaw, and the rest in wheel speeds (rad/s) and s. RAW is w_a - w_c with
 the residual clipped, ERROR without."""
-(
-    TURN, PERIOD, RATE, SHARE, YAW_GAIN, BOUND, DEAD_ZONE,
-    YAW_NOW, ELAPSED, REFERENCE, NEXT_RIGHT, NEXT_LEFT, SENT_RIGHT, SENT_LEFT, LEARN, DELAY,
-) = range(16)  # fmt: skip
-"""Entries of the inputs: constants first."""
+
+
+class BodyConstants(NamedTuple):
+    """Constants of :func:`correct_body`."""
+
+    turn: float
+    """R/b"""
+    period: float
+    """s"""
+    learning_rate: float
+    """gamma |Phi|², 1/s"""
+    share: float
+    """Part of the powers that a block replaces."""
+    yaw_gain: float
+    """k, 1/s"""
+    bound: float
+    """v-bar, rad/s"""
+    dead_zone: float
+    """rad/s"""
+
+
+class BodyMemory(NamedTuple):
+    """State of :func:`correct_body`, changed in place."""
+
+    sums: Array
+    """Entries YAW ... ERROR_POWER."""
+    history: Array
+    """Commands, newest first, rad/s, shape (n, 2)."""
+    point: Array
+    """Work space: inputs of the map, shape (2,)."""
+    output: Array
+    """Work space: output of the map, shape (1,)."""
 
 
 class BodyCorrection:
@@ -140,20 +169,24 @@ class BodyCorrection:
         self._turn = wheel_radius / half_separation
         self._period = period
         self.fuzzy = FuzzyEstimator(parameters.fuzzy, AdaptationParameters(), outputs=1)
-        self._history: Array = np.zeros((HISTORY, 2))
-        self._memory: Array = np.zeros(ERROR_POWER + 1)
-        self._inputs: Array = np.zeros(DELAY + 1)
-        self._work: Array = np.zeros(3)
+        self._state = BodyMemory(
+            np.zeros(ERROR_POWER + 1), np.zeros((HISTORY, 2)), np.zeros(2), np.zeros(1)
+        )
+        self._memory = self._state.sums
         self.configure(parameters)
 
     def configure(self, parameters: BodyCorrectionParameters) -> None:
         """Use new values of the dynamic parameters from the next step on."""
         self.parameters = parameters
-        inputs = self._inputs
-        inputs[TURN], inputs[PERIOD] = self._turn, self._period
-        inputs[RATE], inputs[SHARE] = parameters.learning_rate, BLOCK / parameters.skill_time
-        inputs[YAW_GAIN], inputs[BOUND] = parameters.yaw_gain, parameters.max_correction
-        inputs[DEAD_ZONE] = parameters.dead_zone
+        self._constants = BodyConstants(
+            self._turn,
+            self._period,
+            parameters.learning_rate,
+            BLOCK / parameters.skill_time,
+            parameters.yaw_gain,
+            parameters.max_correction,
+            parameters.dead_zone,
+        )
 
     @property
     def authority(self) -> float:
@@ -167,7 +200,7 @@ class BodyCorrection:
 
     def restart(self) -> None:
         """Start a drive: clear yaw error and history; map and skill are kept."""
-        self._history[:] = 0.0
+        self._state.history[:] = 0.0
         for entry in (
             STARTED,
             BLOCK_TIME,
@@ -227,95 +260,89 @@ class BodyCorrection:
         learn
             Whether the map adapts.
         """
-        inputs = self._inputs
-        inputs[YAW_NOW], inputs[ELAPSED] = yaw, elapsed
-        inputs[REFERENCE] = 0.5 * (reference[0] - reference[1])
-        inputs[NEXT_RIGHT], inputs[NEXT_LEFT] = planned[0], planned[1]
-        inputs[SENT_RIGHT], inputs[SENT_LEFT] = sent[0], sent[1]
-        inputs[LEARN], inputs[DELAY] = float(learn), delay
         return float(
-            correct_body(inputs, self._memory, self._history, self._work, *self.fuzzy.tables)
+            correct_body(
+                yaw,
+                elapsed,
+                reference,
+                planned,
+                sent,
+                delay,
+                learn,
+                self._constants,
+                self._state,
+                self.fuzzy.tables,
+            )
         )
 
 
 @kernel
 def correct_body(
-    inputs: Array,
-    memory: Array,
-    history: Array,
-    work: Array,
-    centres: Array,
-    nonsingleton_gain: Array,
-    sharpness: Array,
-    shares: Array,
-    grades: Array,
-    firings: Array,
-    phi: Array,
-    coefficients: Array,
+    yaw: float,
+    elapsed: float,
+    reference: Array,
+    planned: Array,
+    sent: Array,
+    delay: float,
+    learn: bool,
+    constants: BodyConstants,
+    state: BodyMemory,
+    fuzzy: FuzzyTables,
 ) -> float:
     """Learn from the last period (E20) and return the correction (E21), rad/s.
 
-    inputs    : entries TURN ... DELAY
-    memory    : entries YAW ... COMMANDS, updated
-    history   : commands, newest first, rad/s, shape (n, 2), updated
-    work      : shape (3,), overwritten
-    centres ... coefficients : as in :func:`t3mpc_ros.fuzzy.estimator.estimate`
+    Arguments as in :meth:`BodyCorrection.step`.
     """
-    turn, period, elapsed = inputs[TURN], inputs[PERIOD], inputs[ELAPSED]
-    point, output = work[0:2], work[2:3]
+    turn, period = constants.turn, constants.period
+    memory, history, point, output = state
+    coefficients, phi = fuzzy.coefficients, fuzzy.phi
     # A gap of n periods repeats the last command n times: nothing else was sent.
     count = min(max(int(round(elapsed / period)), 1), history.shape[0])
     for j in range(history.shape[0] - 1, count - 1, -1):
         history[j] = history[j - count]
     for j in range(count):
-        history[j, 0], history[j, 1] = inputs[SENT_RIGHT], inputs[SENT_LEFT]
+        history[j, 0], history[j, 1] = sent[0], sent[1]
     memory[COMMANDS] = min(memory[COMMANDS] + count, 1.0 * history.shape[0])
-    reference = inputs[REFERENCE]
+    turning = 0.5 * (reference[0] - reference[1])
     if memory[STARTED] > 0.0 and elapsed > 0.0:
-        change = inputs[YAW_NOW] - memory[YAW]
+        change = yaw - memory[YAW]
         change -= 2.0 * math.pi * math.floor(change / (2.0 * math.pi) + 0.5)
         achieved = change / (elapsed * turn)
-        memory[YAW_ERROR] += elapsed * (achieved - 0.5 * (reference + memory[LAST_REFERENCE]))
+        memory[YAW_ERROR] += elapsed * (achieved - 0.5 * (turning + memory[LAST_REFERENCE]))
         # Middle of the last period, one delay earlier; row 0 was sent one period ago.
-        position = (inputs[DELAY] + 0.5 * elapsed) / period - 1.0
+        position = (delay + 0.5 * elapsed) / period - 1.0
         if position + 2.0 < memory[COMMANDS] and count == 1:
             position = max(position, 0.0)
             row = int(position)
             part = position - row
             for i in range(2):
                 point[i] = (1.0 - part) * history[row, i] + part * history[row + 1, i]
-            estimate(
-                point, centres, nonsingleton_gain, sharpness, shares, grades, firings, phi,
-                coefficients, output,
-            )  # fmt: skip
+            estimate(point, fuzzy, output)
             raw = achieved - 0.5 * (point[0] - point[1])
             residual = raw - output[0]
             power = 0.0
             for k in range(phi.size):
                 power += phi[k] * phi[k]
-            if inputs[LEARN] > 0.0 and power > 0.0 and abs(residual) < OUTLIER:
+            if learn and power > 0.0 and abs(residual) < OUTLIER:
                 memory[ERROR_SUM] += raw * elapsed
                 residual = min(max(residual, -CLIP), CLIP)
                 raw = residual + output[0]
-                gain = min(inputs[RATE] * elapsed, 1.0) * residual / power
+                gain = min(constants.learning_rate * elapsed, 1.0) * residual / power
                 for k in range(phi.size):
                     coefficients[0, k] += gain * phi[k]
                 memory[RAW_SUM] += raw * elapsed
                 memory[RESIDUAL_SUM] += residual * elapsed
                 memory[COMMAND_SUM] += 0.5 * (point[0] ** 2 + point[1] ** 2) * elapsed
                 memory[BLOCK_TIME] += elapsed
-    memory[YAW], memory[STARTED], memory[LAST_REFERENCE] = inputs[YAW_NOW], 1.0, reference
+    memory[YAW], memory[STARTED], memory[LAST_REFERENCE] = yaw, 1.0, turning
     if memory[BLOCK_TIME] >= BLOCK:
-        update_authority(memory, inputs[SHARE], inputs[DEAD_ZONE])
-    point[0], point[1] = inputs[NEXT_RIGHT], inputs[NEXT_LEFT]
-    estimate(
-        point, centres, nonsingleton_gain, sharpness, shares, grades, firings, phi, coefficients,
-        output,
-    )  # fmt: skip
-    bound = inputs[BOUND]
+        update_authority(memory, constants.share, constants.dead_zone)
+    point[0], point[1] = planned[0], planned[1]
+    estimate(point, fuzzy, output)
+    bound = constants.bound
     correction = -min(max(output[0], -bound), bound)
     if bound > 0.0:
-        correction -= bound * math.tanh(inputs[YAW_GAIN] * memory[YAW_ERROR] / bound)
+        correction -= bound * math.tanh(constants.yaw_gain * memory[YAW_ERROR] / bound)
     return float(memory[AUTHORITY] * correction)
 
 

@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from t3mpc_ros.control.jump_transition import JumpTransitionParameters
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, adapt, estimate
+from t3mpc_ros.fuzzy.inference import FuzzyTables
 from t3mpc_ros.fuzzy.sets import FuzzyParameters
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.mpc.predictive_controller import (
     PredictiveController,
     PredictiveParameters,
-    signals_view,
+    Signals,
 )
 from t3mpc_ros.parameters.table import Parameters, group, parameter
 
@@ -377,14 +378,16 @@ class Nt3fsMpcController:
             parameters.predictive, self._period, parameters.law.gain, outputs=2
         )
         self._certificate = Certificate()
-        self._work: Array = np.zeros((2, 2))
-        self.terms: Array = np.zeros((len(TERM_NAMES), 2))
-        """Terms of the last step, rows as in ``TERM_NAMES``, rad/s²."""
-        self.command: Array = np.zeros(2)
-        """Their sum u, rad/s²."""
+        self._output = LawOutput(
+            np.zeros(2),
+            np.zeros(2),
+            np.zeros((len(TERM_NAMES), 2)),
+            np.zeros(2),
+            self._certificate.state,
+        )
         self.saturated = False
         """Whether a limit changed the last command."""
-        self._gains = self._pack_gains()
+        self._gains = self._law_gains()
         self.reset()
 
     def warm_up(self) -> None:
@@ -405,7 +408,7 @@ class Nt3fsMpcController:
         self._parameters = parameters
         self.fuzzy.configure(parameters.adaptation)
         self.predictive.configure(parameters.predictive, parameters.law.gain)
-        self._gains = self._pack_gains()
+        self._gains = self._law_gains()
 
     def get_weights(self) -> dict[str, Array]:
         """Return all adapted arrays by name: fuzzy coefficients and predictor weights."""
@@ -433,21 +436,21 @@ class Nt3fsMpcController:
         self.fuzzy.coefficients = weights['fuzzy.coefficients']
         self.predictive.set_weights(predictive)
 
-    def snapshot(self) -> tuple[Array, list[Array]]:
-        """Return a copy of the weights for :meth:`rollback`, faster than :meth:`get_weights`."""
-        return self.fuzzy.coefficients, self.predictive.snapshot()
-
-    def rollback(self, snapshot: tuple[Array, list[Array]]) -> None:
-        """Restore the weights of a :meth:`snapshot`."""
-        coefficients, predictors = snapshot
-        self.fuzzy.coefficients = coefficients
-        self.predictive.rollback(predictors)
-
     def reset(self) -> None:
         """Start a new run; the weights are kept."""
         self.predictive.reset()
         self._certificate.reset()
         self.saturated = False
+
+    @property
+    def terms(self) -> Array:
+        """Terms of the last step, rows as in ``TERM_NAMES``, rad/s²."""
+        return self._output.terms
+
+    @property
+    def command(self) -> Array:
+        """Their sum u, rad/s²."""
+        return self._output.command
 
     @property
     def certificate_state(self) -> Array:
@@ -492,15 +495,12 @@ class Nt3fsMpcController:
             speeds,
             reference,
             reference_rate,
-            self.predictive.rows,
             dt,
             self.saturated,
             self._gains,
-            *self.fuzzy.tables,
-            self._work,
-            self.terms,
-            self.command,
-            self._certificate.state,
+            self.predictive.signals,
+            self.fuzzy.tables,
+            self._output,
         ):
             raise ValueError(f'speeds must be finite: got {speeds}')
         return self.command
@@ -517,30 +517,25 @@ class Nt3fsMpcController:
             not an estimation error, and the predictor uses the applied part of v_p.
         """
         self.saturated = saturated
-        if saturated and not set_applied_term(
-            self.terms, acceleration, self.command, self.predictive.rows
-        ):
+        if saturated and not set_applied_term(acceleration, self._output, self.predictive.signals):
             raise ValueError(f'acceleration must be finite: got {acceleration}')
 
-    def _pack_gains(self) -> Array:
+    def _law_gains(self) -> 'LawGains':
         parameters, law = self._parameters, self._parameters.law
         adaptation = parameters.adaptation
-        return np.array(
-            LawGains(
-                use_fuzzy=parameters.use_fuzzy,
-                adapted=parameters.use_fuzzy and adaptation.enabled,
-                integral_transfer=parameters.integral_transfer,
-                gain=law.gain,
-                bound=self._bound(),
-                smoothing=law.smoothing,
-                window=self._certificate.window,
-                gamma=adaptation.gamma,
-                radius=self.fuzzy.radius,
-                leakage=adaptation.sigma_modification,
-                dead_zone=adaptation.dead_zone,
-                step_limit=adaptation.step_limit,
-            ),
-            dtype=np.float64,
+        return LawGains(
+            use_fuzzy=parameters.use_fuzzy,
+            adapted=parameters.use_fuzzy and adaptation.enabled,
+            integral_transfer=parameters.integral_transfer,
+            gain=law.gain,
+            bound=self._bound(),
+            smoothing=law.smoothing,
+            window=self._certificate.window,
+            gamma=adaptation.gamma,
+            radius=self.fuzzy.radius,
+            leakage=adaptation.sigma_modification,
+            dead_zone=adaptation.dead_zone,
+            step_limit=adaptation.step_limit,
         )
 
     def _bound(self) -> float:
@@ -549,7 +544,7 @@ class Nt3fsMpcController:
 
 
 class LawGains(NamedTuple):
-    """Parameters of :func:`step_law` as plain numbers."""
+    """Parameters of :func:`step_law`."""
 
     use_fuzzy: bool
     adapted: bool
@@ -565,23 +560,19 @@ class LawGains(NamedTuple):
     step_limit: float
 
 
-@kernel
-def unpack_gains(row: Array) -> LawGains:
-    """Return the numbers of a row by name."""
-    return LawGains(
-        row[0] != 0.0,
-        row[1] != 0.0,
-        row[2],
-        row[3],
-        row[4],
-        row[5],
-        row[6],
-        row[7],
-        row[8],
-        row[9],
-        row[10],
-        row[11],
-    )
+class LawOutput(NamedTuple):
+    """Results of :func:`step_law`."""
+
+    estimate: Array
+    """g, rad/s², shape (n,)."""
+    adaptation_error: Array
+    """Error from which the fuzzy systems learn, rad/s, shape (n,)."""
+    terms: Array
+    """Terms of u, rows as in ``TERM_NAMES``, rad/s², shape (5, n)."""
+    command: Array
+    """u, rad/s², shape (n,)."""
+    certificate: Array
+    """State of :func:`update_certificate`."""
 
 
 @kernel
@@ -589,52 +580,26 @@ def step_law(
     speeds: Array,
     reference: Array,
     reference_rate: Array,
-    rows: Array,
     dt: float,
     saturated: bool,
-    packed_gains: Array,
-    centres: Array,
-    nonsingleton_gain: Array,
-    sharpness: Array,
-    shares: Array,
-    grades: Array,
-    firings: Array,
-    phi: Array,
-    coefficients: Array,
-    work: Array,
-    terms: Array,
-    command: Array,
-    certificate: Array,
+    gains: LawGains,
+    predictive: Signals,
+    fuzzy: FuzzyTables,
+    output: LawOutput,
 ) -> bool:
     """Write terms and command of the law, adapt the fuzzy systems, update the certificate.
 
     Returns False, and changes nothing, if a speed is not finite.
 
     speeds ... reference_rate : as in :func:`law_terms`
-    rows           : :class:`t3mpc_ros.mpc.predictive_controller.Signals` of the predictive term
-    dt             : time since the last step, s
-    saturated      : whether a limit changed the last command
-    packed_gains   : the numbers of :class:`LawGains`
-    centres ... coefficients : as in :func:`t3mpc_ros.fuzzy.estimator.estimate`
-    work           : shape (2, n), overwritten: g, and the error of the adaptation
-    terms, command : overwritten
-    certificate    : as in :func:`update_certificate`
+    dt         : time since the last step, s
+    saturated  : whether a limit changed the last command
+    predictive : signals of the predictive term
+    output     : overwritten
     """
-    gains, predictive = unpack_gains(packed_gains), signals_view(rows)
-    fuzzy_estimate, adaptation_error = work[0], work[1]
+    fuzzy_estimate, adaptation_error = output.estimate, output.adaptation_error
     fuzzy_estimate[:] = 0.0
-    if gains.use_fuzzy and not estimate(
-        speeds,
-        centres,
-        nonsingleton_gain,
-        sharpness,
-        shares,
-        grades,
-        firings,
-        phi,
-        coefficients,
-        fuzzy_estimate,
-    ):
+    if gains.use_fuzzy and not estimate(speeds, fuzzy, fuzzy_estimate):
         return False
     law_terms(
         speeds,
@@ -645,8 +610,8 @@ def step_law(
         gains.gain,
         gains.bound,
         gains.smoothing,
-        terms,
-        command,
+        output.terms,
+        output.command,
     )
     if gains.adapted and not saturated:
         # The residual of an announced jump is excluded from adaptation.
@@ -655,8 +620,8 @@ def step_law(
                 predictive.jump_free_errors[i] - gains.integral_transfer * predictive.v[i]
             )
         adapt(
-            coefficients,
-            phi,
+            fuzzy.coefficients,
+            fuzzy.phi,
             adaptation_error,
             dt,
             gains.gamma,
@@ -666,22 +631,27 @@ def step_law(
             gains.step_limit,
         )
     update_certificate(
-        predictive.errors, gains.gain, gains.bound, gains.smoothing, dt, gains.window, certificate
+        predictive.errors,
+        gains.gain,
+        gains.bound,
+        gains.smoothing,
+        dt,
+        gains.window,
+        output.certificate,
     )
     return True
 
 
 @kernel
-def set_applied_term(terms: Array, acceleration: Array, command: Array, rows: Array) -> bool:
+def set_applied_term(acceleration: Array, output: LawOutput, predictive: Signals) -> bool:
     """Write the v_p that was applied when a limit changed u; return False if it is not finite.
 
-    terms, command : of :func:`step_law`
-    acceleration   : shape (2,), the command after the limits, rad/s²
-    rows           : :class:`t3mpc_ros.mpc.predictive_controller.Signals` of the predictive term
+    acceleration : shape (2,), the command after the limits, rad/s²
+    output       : of :func:`step_law`
+    predictive   : signals of the predictive term
     """
-    predictive = signals_view(rows)
     for i in range(acceleration.size):
-        predictive.applied[i] = terms[4, i] + (acceleration[i] - command[i])
+        predictive.applied[i] = output.terms[4, i] + (acceleration[i] - output.command[i])
         if not math.isfinite(predictive.applied[i]):
             return False
     return True

@@ -28,7 +28,12 @@ from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.control.watchdog import InputWatchdog, Reason, ResponseMonitor, WatchdogParameters
 from t3mpc_ros.geometry import kinematics
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
-from t3mpc_ros.geometry.trajectory import Jump, ReferenceTrajectory, Stamps, interpolate
+from t3mpc_ros.geometry.trajectory import (
+    Jump,
+    ReferenceTrajectory,
+    TrajectorySamples,
+    interpolate,
+)
 from t3mpc_ros.geometry.types import (
     NANOSECONDS,
     ORIGIN,
@@ -188,9 +193,8 @@ class Controller:
         )
         self._ahead_ns = 0
         """Time by which the plan is ahead of the command, ns; 0 without a known future."""
-        self._sampling = self._sampling_arguments()
-        self._speeds, self._reference = np.zeros((2, 2))
-        self._reference_begin, self._reference_end = np.zeros((2, 2))
+        self._sampling = Sampling.of(parameters)
+        self._sampled = SampledReference(*np.zeros((4, 2)))
         self._watchdog = InputWatchdog(parameters.watchdog)
         self._response = ResponseMonitor(parameters.watchdog, self._period)
         limits = parameters.limits
@@ -276,7 +280,7 @@ class Controller:
         self._tracker.configure(parameters.resolved())
         self._body.configure(parameters.body)
         self._actuation.configure(parameters.limits)
-        self._sampling = self._sampling_arguments()
+        self._sampling = Sampling.of(parameters)
 
     def enable(self, on: bool) -> None:
         """Enable the robot's motion, or stop the robot until it is enabled again."""
@@ -337,24 +341,16 @@ class Controller:
         if not self._moving:
             self._ahead_ns = self._plan_ahead(effect_ns)
         plan_ns = effect_ns + self._ahead_ns
-        speeds, reference = self._speeds, self._reference
-        begin, end = self._reference_begin, self._reference_end
-        trajectory, twist = self._trajectory, odometry.twist
+        speeds, reference, begin, end = self._sampled
+        twist = odometry.twist
         known, speed, error = sample_reference(
-            trajectory.stamps,
-            trajectory.samples,
-            trajectory.first,
-            trajectory.end,
-            trajectory.jump,
+            self._trajectory.buffer,
             stamp,
             plan_ns,
-            *self._sampling,
             twist.linear,
             twist.angular,
-            speeds,
-            reference,
-            begin,
-            end,
+            self._sampling,
+            self._sampled,
         )
         reason = self._watchdog.decide(
             stamp, finite=finite, known=known, speed=speed, error=error if finite else 0.0
@@ -419,7 +415,7 @@ class Controller:
             correction = self._body.step(
                 yaw,
                 elapsed,
-                self._reference,
+                self._sampled.reference,
                 planned,
                 self._actuation.command,
                 self._actuation.dead_time + filtered.lag + 0.5 * self._period,
@@ -466,9 +462,9 @@ class Controller:
             if self._snapshots:
                 self._rollback(self._snapshots[0])
                 self._snapshots.clear()
-        self._actuation.send_speeds(self._reference)
+        self._actuation.send_speeds(self._sampled.reference)
         self._response.add_command(*self._actuation.command.tolist())
-        error = self._speeds - self._reference
+        error = self._sampled.speeds - self._sampled.reference
         self.status = self._make_status(stamp_ns, Reason.NOT_FOLLOWING, error)
         return self._actuation.twist, self.status
 
@@ -507,7 +503,7 @@ class Controller:
         """Restore the weights of a snapshot."""
         weights, body = snapshot
         if self.parameters.composition == 'paper':
-            self.law.rollback(weights)
+            self.law.set_weights(weights)
         self._body.rollback(body)
 
     def _take_snapshot(self) -> None:
@@ -517,18 +513,7 @@ class Controller:
         self._steps_since_snapshot += 1
         if self._steps_since_snapshot >= self._snapshot_steps:
             self._steps_since_snapshot = 0
-            self._snapshots.append((self.law.snapshot(), self._body.snapshot()))
-
-    def _sampling_arguments(self) -> tuple[float, float, bool, float, float]:
-        """Return the parameters of :func:`sample_reference`, in its order."""
-        parameters, geometry = self.parameters, self.parameters.geometry
-        return (
-            self._period,
-            parameters.watchdog.reference_timeout * NANOSECONDS,
-            parameters.jump_transition.preview,
-            geometry.wheel_radius,
-            geometry.half_separation,
-        )
+            self._snapshots.append((self.law.get_weights(), self._body.snapshot()))
 
     def _announce_jumps(self, stamp_ns: int, effect_ns: int) -> None:
         """Announce jumps to the transition: in advance with preview, else when they occur."""
@@ -666,67 +651,95 @@ class SwitchingTracker:
 wheel_speeds = kernel(kinematics.wheel_speeds)
 
 
+class Sampling(NamedTuple):
+    """Parameters of :func:`sample_reference`."""
+
+    period: float
+    """Control period, s."""
+    hold_ns: float
+    """How long the newest sample is held."""
+    preview: bool
+    """Whether to use future samples; else the slope extrapolates the reference."""
+    radius: float
+    """Wheel radius, m."""
+    half: float
+    """Half of the wheel separation, m."""
+
+    @classmethod
+    def of(cls, parameters: ControllerParameters) -> Self:
+        """Return those of a controller."""
+        return cls(
+            1.0 / parameters.rate,
+            parameters.watchdog.reference_timeout * NANOSECONDS,
+            parameters.jump_transition.preview,
+            parameters.geometry.wheel_radius,
+            parameters.geometry.half_separation,
+        )
+
+
+class SampledReference(NamedTuple):
+    """Results of :func:`sample_reference`: wheel speeds, rad/s, shape (2,) each."""
+
+    speeds: Array
+    """Measured, at the stamp of the odometry."""
+    reference: Array
+    """Reference at that stamp."""
+    begin: Array
+    """Reference when the next command takes effect."""
+    end: Array
+    """Reference one period later."""
+
+
 @kernel
 def sample_reference(
-    stamps: Stamps,
-    samples: Array,
-    first: int,
-    end: int,
-    jump: Array,
+    trajectory: TrajectorySamples,
     stamp_ns: int,
     effect_ns: int,
-    period: float,
-    hold_ns: float,
-    preview: bool,
-    radius: float,
-    half: float,
     linear: float,
     angular: float,
-    speeds: Array,
-    reference: Array,
-    reference_begin: Array,
-    reference_end: Array,
+    sampling: Sampling,
+    result: SampledReference,
 ) -> tuple[bool, float, float]:
-    """Write measured and reference wheel speeds (rad/s); return whether the reference is known.
+    """Write measured and reference wheel speeds; return whether the reference is known.
 
     Also returned: the largest magnitudes of the measured speeds and of the tracking error.
 
-    stamps ... jump   : a trajectory, as in :func:`t3mpc_ros.geometry.trajectory.interpolate`
-    stamp_ns          : stamp of the odometry with twist ``linear``, ``angular``
-    effect_ns         : instant at which the next command takes effect
-    period            : control period, s
-    hold_ns           : how long the newest sample is held
-    preview           : whether to use future samples; else the slope extrapolates the reference
-    radius, half      : wheel radius and half of the wheel separation, m
-    speeds, reference : shape (2,), overwritten, at ``stamp_ns``
-    reference_begin, reference_end : shape (2,), overwritten, reference at ``effect_ns`` and one
-                        period later
+    stamp_ns  : stamp of the odometry with twist ``linear``, ``angular``
+    effect_ns : instant at which the next command takes effect
+    result    : overwritten
     """
+    speeds, reference, begin, end = result
+    radius, half, period, hold_ns = (
+        sampling.radius,
+        sampling.half,
+        sampling.period,
+        sampling.hold_ns,
+    )
     speeds[0], speeds[1] = wheel_speeds(linear, angular, radius, half)
     speed = max(abs(speeds[0]), abs(speeds[1]))
-    newest = stamps[end - 1] if end > first else 0
-    trajectory = (stamps, samples, first, end, jump)
-    known, v, w, v_rate, w_rate = interpolate(*trajectory, hold_newest(stamp_ns, newest, hold_ns))
+    first, last = trajectory.bounds[0], trajectory.bounds[1] - 1
+    newest = trajectory.stamps[last] if last >= first else 0
+    known, v, w, v_rate, w_rate = interpolate(trajectory, hold_newest(stamp_ns, newest, hold_ns))
     if not known:
         reference[:] = math.nan
         return False, speed, 0.0
     reference[0], reference[1] = wheel_speeds(v, w, radius, half)
     error = max(abs(speeds[0] - reference[0]), abs(speeds[1] - reference[1]))
-    if preview:
+    if sampling.preview:
         until_ns = effect_ns + round(period * NANOSECONDS)
         begin_ns = hold_newest(effect_ns, newest, hold_ns)
         end_ns = hold_newest(until_ns, newest, hold_ns)
-        begin_known, v_begin, w_begin, _, _ = interpolate(*trajectory, begin_ns)
-        end_known, v_end, w_end, _, _ = interpolate(*trajectory, end_ns)
+        begin_known, v_begin, w_begin, _, _ = interpolate(trajectory, begin_ns)
+        end_known, v_end, w_end, _, _ = interpolate(trajectory, end_ns)
         if begin_known and end_known:
-            reference_begin[0], reference_begin[1] = wheel_speeds(v_begin, w_begin, radius, half)
-            reference_end[0], reference_end[1] = wheel_speeds(v_end, w_end, radius, half)
+            begin[0], begin[1] = wheel_speeds(v_begin, w_begin, radius, half)
+            end[0], end[1] = wheel_speeds(v_end, w_end, radius, half)
             return True, speed, error
     slopes = wheel_speeds(v_rate, w_rate, radius, half)
     ahead = (effect_ns - stamp_ns) / NANOSECONDS
     for i in range(2):
-        reference_begin[i] = reference[i] + ahead * slopes[i]
-        reference_end[i] = reference[i] + (ahead + period) * slopes[i]
+        begin[i] = reference[i] + ahead * slopes[i]
+        end[i] = reference[i] + (ahead + period) * slopes[i]
     return True, speed, error
 
 

@@ -4,6 +4,7 @@
 
 from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,14 +82,20 @@ class JumpTransition:
         self._period = period
         self.count = 0
         """Number of unfinished transitions."""
-        self._transitions: Array = np.zeros((8, 3, 2))
-        self._instants: Stamps = np.zeros(8, dtype=np.int64)
-        self._passed: Flags = np.zeros(8, dtype=np.bool_)
-        self._sums: Array = np.zeros((4, 2))
-        self.reachable: Array = np.zeros(2)
-        """rbar at the last step, rad/s, shape (2,)."""
-        self.rate: Array = np.zeros(2)
+        self._transitions = Transitions(
+            np.zeros((8, 3, 2)), np.zeros(8, dtype=np.int64), np.zeros(8, dtype=np.bool_)
+        )
+        self._plan = Plan(np.zeros(2), np.zeros(2), np.zeros((4, 2)))
+
+    @property
+    def reachable(self) -> Array:
+        """Return rbar at the last step, rad/s, shape (2,)."""
+        return self._plan.reachable
+
+    @property
+    def rate(self) -> Array:
         """Derivative of rbar until the next step, rad/s², shape (2,)."""
+        return self._plan.rate
 
     def configure(self, parameters: JumpTransitionParameters) -> None:
         """Use new values of the dynamic parameters from the next step on."""
@@ -97,18 +104,18 @@ class JumpTransition:
     def reset(self) -> None:
         """Discard all jumps: rbar is r."""
         self.count = 0
-        self._sums[:] = 0.0
+        self._plan.sums[:] = 0.0
 
     @property
     def offset(self) -> Array:
         """Offset h at the last step, rad/s, shape (2,)."""
-        row: Array = self._sums[OFFSET]
+        row: Array = self._plan.sums[OFFSET]
         return row
 
     @property
     def offset_next(self) -> Array:
         """Offset h one period later, rad/s, shape (2,)."""
-        row: Array = self._sums[OFFSET_NEXT]
+        row: Array = self._plan.sums[OFFSET_NEXT]
         return row
 
     @property
@@ -124,19 +131,19 @@ class JumpTransition:
         """
         change = np.zeros((rows, 2))
         for k in range(self.count):
-            ahead = (int(self._instants[k]) - now_ns) / NANOSECONDS
+            ahead = (int(self._transitions.instants[k]) - now_ns) / NANOSECONDS
             row = math.ceil(ahead / span - 1e-9) - 1
             if 0 <= row < rows:
-                change[row] -= self._transitions[k, JUMP]
+                change[row] -= self._transitions.ramps[k, JUMP]
         return change
 
     def pop_passed(self, now_ns: int) -> Array:
         """Remove the jumps up to ``now_ns`` and return their sum, rad/s, shape (2,)."""
         total = np.zeros(2)
         for k in reversed(range(self.count)):
-            if self._instants[k] <= now_ns:
-                total += self._transitions[k, JUMP]
-                for rows in (self._transitions, self._instants, self._passed):
+            if self._transitions.instants[k] <= now_ns:
+                total += self._transitions.ramps[k, JUMP]
+                for rows in self._transitions:
                     rows[k : self.count - 1] = rows[k + 1 : self.count].copy()
                 self.count -= 1
         return total
@@ -154,24 +161,23 @@ class JumpTransition:
             r' after the jump, rad/s², shape (2,).
         """
         k = self.count
-        if k == len(self._instants):
-            self._transitions = np.concatenate(
-                (self._transitions, np.zeros_like(self._transitions))
-            )
-            self._instants = np.concatenate((self._instants, np.zeros_like(self._instants)))
-            self._passed = np.concatenate((self._passed, np.zeros_like(self._passed)))
-        self._transitions[k] = (jump, slope_after, (0.0, 0.0))
-        self._instants[k] = instant_ns
-        self._passed[k] = False
+        if k == len(self._transitions.instants):
+            longer = (np.concatenate((rows, np.zeros_like(rows))) for rows in self._transitions)
+            self._transitions = Transitions._make(longer)
+        ramps, instants, passed = self._transitions
+        ramps[k] = (jump, slope_after, (0.0, 0.0))
+        instants[k] = instant_ns
+        passed[k] = False
         self.count += 1
 
     def withdraw(self, instant_ns: int) -> None:
         """Cancel the jumps announced for ``instant_ns`` or later."""
+        ramps, instants, passed = self._transitions
         for k in range(self.count):
-            if not self._passed[k] and self._instants[k] >= instant_ns:
-                self._transitions[k, JUMP] = 0.0
-                self._instants[k] = instant_ns
-                self._passed[k] = True
+            if not passed[k] and instants[k] >= instant_ns:
+                ramps[k, JUMP] = 0.0
+                instants[k] = instant_ns
+                passed[k] = True
 
     def step(self, now_ns: int, reference: Array, reference_next: Array) -> None:
         """Update ``reachable``, ``rate`` and the offsets for the period that starts at ``now_ns``.
@@ -185,18 +191,14 @@ class JumpTransition:
         """
         self.count = step_transitions(
             self._transitions,
-            self._instants,
-            self._passed,
             self.count,
-            self._sums,
             now_ns,
             reference,
             reference_next,
             self._period,
             self._lag,
             self._parameters.acceleration,
-            self.reachable,
-            self.rate,
+            self._plan,
         )
 
 
@@ -207,34 +209,50 @@ RESPONSE, PASSED, OFFSET, OFFSET_NEXT = range(4)
 that r has made, and h now and one period later."""
 
 
+class Transitions(NamedTuple):
+    """Jumps that are known, for kernels; the first ``count`` rows are valid."""
+
+    ramps: Array
+    """Rows JUMP, SLOPE_AFTER and COVERED of each, shape (n, 3, 2)."""
+    instants: Stamps
+    """When r jumps, ns, shape (n,)."""
+    passed: Flags
+    """Whether it has, shape (n,)."""
+
+
+class Plan(NamedTuple):
+    """Results of :func:`step_transitions`."""
+
+    reachable: Array
+    """rbar now, rad/s, shape (2,)."""
+    rate: Array
+    """Its derivative until the next step, rad/s², shape (2,)."""
+    sums: Array
+    """Rows RESPONSE, PASSED, OFFSET and OFFSET_NEXT, shape (4, 2)."""
+
+
 @kernel
 def step_transitions(
-    transitions: Array,
-    instants: Stamps,
-    passed: Flags,
+    transitions: Transitions,
     count: int,
-    sums: Array,
     now_ns: int,
     reference: Array,
     reference_next: Array,
     period: float,
     lag: float,
     acceleration: float,
-    reachable: Array,
-    rate: Array,
+    plan: Plan,
 ) -> int:
     """Update h for the period that starts at ``now_ns``; return the number of transitions left.
 
-    transitions  : shape (n, 3, 2), rows JUMP, SLOPE_AFTER, COVERED; the first ``count`` are valid
-    instants     : shape (n,), when r jumps, ns
-    passed       : shape (n,), whether it has
-    sums         : shape (4, 2), rows RESPONSE, PASSED, OFFSET, OFFSET_NEXT
+    count        : number of transitions
     reference, reference_next : r now and one period later, with its jumps, rad/s, shape (2,)
     period, lag  : of control and of the servo, s
     acceleration : of the ramp, rad/s²
-    reachable    : shape (2,), overwritten, rbar now, rad/s
-    rate         : shape (2,), overwritten, its derivative until the next step, rad/s²
+    plan         : updated
     """
+    sums = plan.sums
+    ramps, instants, passed = transitions.ramps, transitions.instants, transitions.passed
     if count > 0:
         keep = math.exp(-period / lag) if lag > 0.0 else 0.0
         until_ns = now_ns + round(period * NANOSECONDS)
@@ -242,44 +260,43 @@ def step_transitions(
         # period before the instant, on average in its middle.
         lead = period * (keep / (1.0 - keep) + 0.5)
         for k in range(count):
-            mark_passed(transitions, instants, passed, k, sums, now_ns)
+            mark_passed(transitions, k, sums, now_ns)
         for i in range(2):
             sums[OFFSET, i] = sums[RESPONSE, i] - sums[PASSED, i]
             rise = reference_next[i] - reference[i]
             for k in range(count):
                 if not passed[k] and until_ns >= instants[k]:
-                    rise -= transitions[k, JUMP, i]
+                    rise -= ramps[k, JUMP, i]
             commanded = 0.0
             for k in range(count):
                 left = (instants[k] - now_ns) / NANOSECONDS - lead
-                advance(transitions[k], i, passed[k], left, rise / period, period, acceleration)
-                commanded += transitions[k, COVERED, i]
+                advance(ramps[k], i, passed[k], left, rise / period, period, acceleration)
+                commanded += ramps[k, COVERED, i]
             sums[RESPONSE, i] += (1.0 - keep) * (commanded - sums[RESPONSE, i])
         for k in range(count):
-            mark_passed(transitions, instants, passed, k, sums, until_ns)
+            mark_passed(transitions, k, sums, until_ns)
         for i in range(2):
             sums[OFFSET_NEXT, i] = sums[RESPONSE, i] - sums[PASSED, i]
         # After 30 lags the remaining response is below rounding.
         over_ns = now_ns - round(30.0 * lag * NANOSECONDS)
-        count = remove_finished(transitions, instants, passed, count, sums, over_ns)
+        count = remove_finished(transitions, count, sums, over_ns)
     else:
         sums[OFFSET] = 0.0
         sums[OFFSET_NEXT] = 0.0
     for i in range(2):
-        reachable[i] = reference[i] + sums[OFFSET, i]
-        rate[i] = (reference_next[i] + sums[OFFSET_NEXT, i] - reachable[i]) / period
+        plan.reachable[i] = reference[i] + sums[OFFSET, i]
+        after = reference_next[i] + sums[OFFSET_NEXT, i]
+        plan.rate[i] = (after - plan.reachable[i]) / period
     return count
 
 
 @kernel
-def mark_passed(
-    transitions: Array, instants: Stamps, passed: Flags, k: int, sums: Array, now_ns: int
-) -> None:
+def mark_passed(transitions: Transitions, k: int, sums: Array, now_ns: int) -> None:
     """Add jump ``k`` to the passed ones once its instant is reached."""
-    if not passed[k] and now_ns >= instants[k]:
-        passed[k] = True
+    if not transitions.passed[k] and now_ns >= transitions.instants[k]:
+        transitions.passed[k] = True
         for i in range(2):
-            sums[PASSED, i] += transitions[k, JUMP, i]
+            sums[PASSED, i] += transitions.ramps[k, JUMP, i]
 
 
 @kernel
@@ -317,21 +334,20 @@ def advance(
 
 
 @kernel
-def remove_finished(
-    transitions: Array, instants: Stamps, passed: Flags, count: int, sums: Array, over_ns: int
-) -> int:
+def remove_finished(transitions: Transitions, count: int, sums: Array, over_ns: int) -> int:
     """Remove the transitions finished since ``over_ns``; return the number of the others."""
+    ramps, instants, passed = transitions.ramps, transitions.instants, transitions.passed
     kept = 0
     for k in range(count):
         done = passed[k] and instants[k] <= over_ns
         for i in range(2):
-            done = done and transitions[k, COVERED, i] == transitions[k, JUMP, i]
+            done = done and ramps[k, COVERED, i] == ramps[k, JUMP, i]
         if done:
             for i in range(2):
-                sums[RESPONSE, i] -= transitions[k, JUMP, i]
-                sums[PASSED, i] -= transitions[k, JUMP, i]
+                sums[RESPONSE, i] -= ramps[k, JUMP, i]
+                sums[PASSED, i] -= ramps[k, JUMP, i]
         else:
-            transitions[kept] = transitions[k]
+            ramps[kept] = ramps[k]
             instants[kept] = instants[k]
             passed[kept] = passed[k]
             kept += 1

@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.fuzzy.inference import combine, compute_basis, evaluate_basis
+from t3mpc_ros.fuzzy.inference import FuzzyTables, combine, compute_basis, evaluate_basis
 from t3mpc_ros.fuzzy.sets import FuzzyParameters, FuzzySets, build_sets
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
@@ -154,33 +154,18 @@ def adapt(
     return True
 
 
-Tables = tuple[Array, Array, Array, Array, Array, Array, Array, Array]
-
-
 @kernel
-def estimate(
-    inputs: Array,
-    centres: Array,
-    nonsingleton_gain: Array,
-    sharpness: Array,
-    shares: Array,
-    grades: Array,
-    firings: Array,
-    phi: Array,
-    coefficients: Array,
-    outputs: Array,
-) -> bool:
+def estimate(inputs: Array, tables: FuzzyTables, outputs: Array) -> bool:
     """Write basis and outputs (31); return False, and change nothing, unless inputs are finite.
 
-    inputs        : shape (n,), U, rad/s
-    centres ... phi : as in :func:`t3mpc_ros.fuzzy.inference.evaluate_basis`
-    coefficients, outputs : as in :func:`t3mpc_ros.fuzzy.inference.combine`
+    inputs  : shape (n,), U, rad/s
+    outputs : shape (m,), overwritten, g, rad/s²
     """
     for i in range(inputs.size):
         if not math.isfinite(inputs[i]):
             return False
-    evaluate_basis(inputs, centres, nonsingleton_gain, sharpness, shares, grades, firings, phi)
-    combine(coefficients, phi, outputs)
+    evaluate_basis(inputs, tables)
+    combine(tables.coefficients, tables.phi, outputs)
     return True
 
 
@@ -218,21 +203,9 @@ class FuzzyEstimator:
         if outputs < 1:
             raise ValueError(f'outputs must be at least 1: got {outputs}')
         self._sets = build_sets(parameters, inputs)
-        self._grades = np.zeros(self._sets.widths.shape)
-        self._firings = np.zeros((self._sets.rules, self._sets.slices, 2, 2))
-        self._phi: Array = np.zeros(self._sets.size)
-        self._coefficients: Array = np.zeros((outputs, self._sets.size))
-        self.tables: Tables = (
-            self._sets.centres,
-            self._sets.nonsingleton_gain,
-            self._sets.sharpness,
-            self._sets.shares,
-            self._grades,
-            self._firings,
-            self._phi,
-            self._coefficients,
-        )
-        """Arguments of :func:`estimate` between inputs and outputs, in its order."""
+        self.tables = FuzzyTables.of(self._sets, outputs)
+        """Sets, basis and coefficients, for kernels."""
+        self._phi, self._coefficients = self.tables.phi, self.tables.coefficients
         self.configure(adaptation)
 
     def configure(self, adaptation: AdaptationParameters) -> None:
@@ -268,7 +241,7 @@ class FuzzyEstimator:
         values = np.ascontiguousarray(inputs, dtype=np.float64)
         sets = self._sets
         outputs = np.empty(self._coefficients.shape[0])
-        if values.shape != (sets.inputs,) or not estimate(values, *self.tables, outputs):
+        if values.shape != (sets.inputs,) or not estimate(values, self.tables, outputs):
             raise ValueError(f'inputs must be {sets.inputs} finite numbers: got {inputs}')
         return outputs
 

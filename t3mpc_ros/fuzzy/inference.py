@@ -8,6 +8,7 @@ rules (r, lambda, 2, 2). On the last two axes 0 is lower and 1 is upper, as in
 """
 
 import math
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,39 @@ from t3mpc_ros.fuzzy.sets import LOWER, UPPER, FuzzySets
 from t3mpc_ros.kernels import kernel
 
 Array = NDArray[np.float64]
+
+
+class FuzzyTables(NamedTuple):
+    """Sets, work space and coefficients of a fuzzy system, for kernels."""
+
+    centres: Array
+    """Tables of :class:`FuzzySets`, as the next three."""
+    nonsingleton_gain: Array
+    sharpness: Array
+    shares: Array
+    grades: Array
+    """Work space, shape (n, M, lambda, 2, 2)."""
+    firings: Array
+    """Work space, shape (r, lambda, 2, 2)."""
+    phi: Array
+    """Basis Phi of the last evaluation, shape (2 r lambda,)."""
+    coefficients: Array
+    """alpha, shape (m, 2 r lambda), rad/s²."""
+
+    @classmethod
+    def of(cls, sets: FuzzySets, outputs: int) -> Self:
+        """Return the tables of fuzzy sets with zero coefficients."""
+        return cls(
+            # Copies: an array that cannot be written to is another type for compiled functions.
+            sets.centres.copy(),
+            sets.nonsingleton_gain.copy(),
+            sets.sharpness.copy(),
+            sets.shares.copy(),
+            np.zeros(sets.widths.shape),
+            np.zeros((sets.rules, sets.slices, 2, 2)),
+            np.zeros(sets.size),
+            np.zeros((outputs, sets.size)),
+        )
 
 
 @kernel
@@ -190,31 +224,20 @@ def basis(firings: Array, shares: Array, phi: Array) -> None:
 
 
 @kernel
-def evaluate_basis(
-    inputs: Array,
-    centres: Array,
-    nonsingleton_gain: Array,
-    sharpness: Array,
-    shares: Array,
-    grades: Array,
-    firings: Array,
-    phi: Array,
-) -> None:
+def evaluate_basis(inputs: Array, tables: FuzzyTables) -> None:
     """Write the basis Phi of the inputs in one call: (16)-(27), (33) with E7 and E8.
 
     Exponentials are computed per input and set, not per rule. For any finite inputs the basis is
     not negative and adds up to one; ``grades`` and ``firings`` are relative to the largest.
 
     inputs : shape (n,), U, rad/s, finite
-    centres, nonsingleton_gain, sharpness, shares : tables of :class:`FuzzySets`
-    grades, firings : shapes (n, M, lambda, 2, 2) and (r, lambda, 2, 2), overwritten
-    phi : shape (2 r lambda,), overwritten, order of (32)
+    tables : work space and phi are overwritten
     """
-    fuzzify(inputs, centres, nonsingleton_gain, grades)
-    square_distances(grades, centres, sharpness, grades)
-    relative_memberships(grades)
-    firing_strengths(grades, firings)
-    basis(firings, shares, phi)
+    fuzzify(inputs, tables.centres, tables.nonsingleton_gain, tables.grades)
+    square_distances(tables.grades, tables.centres, tables.sharpness, tables.grades)
+    relative_memberships(tables.grades)
+    firing_strengths(tables.grades, tables.firings)
+    basis(tables.firings, tables.shares, tables.phi)
 
 
 @kernel
@@ -245,20 +268,9 @@ def compute_basis(inputs: Array, sets: FuzzySets) -> Array:
     values = np.ascontiguousarray(inputs, dtype=np.float64)
     if values.shape != (sets.inputs,) or not np.isfinite(values).all():
         raise ValueError(f'inputs must be {sets.inputs} finite numbers: got {inputs}')
-    grades = np.empty(sets.widths.shape)
-    firings = np.empty((sets.rules, sets.slices, 2, 2))
-    phi = np.empty(sets.size)
-    evaluate_basis(
-        values,
-        sets.centres,
-        sets.nonsingleton_gain,
-        sets.sharpness,
-        sets.shares,
-        grades,
-        firings,
-        phi,
-    )
-    return phi
+    tables = FuzzyTables.of(sets, 1)
+    evaluate_basis(values, tables)
+    return tables.phi
 
 
 def output_by_double_sum(inputs: Array, sets: FuzzySets, lower: Array, upper: Array) -> float:

@@ -31,6 +31,19 @@ class Jump(NamedTuple):
     """Twist after the jump minus the extrapolated twist before it."""
 
 
+class TrajectorySamples(NamedTuple):
+    """Samples of a trajectory, for kernels."""
+
+    stamps: Stamps
+    """ns, ascending, shape (n,)."""
+    samples: Array
+    """Linear, angular (m/s, rad/s), and their slopes from the sample before, shape (n, 4)."""
+    bounds: Stamps
+    """Index of the first sample and of the one after the last, shape (2,)."""
+    jump: Array
+    """Slopes above which a sample is a jump (m/s², rad/s²), shape (2,)."""
+
+
 class ReferenceTrajectory:
     """Interpolates a reference between stamped samples, and detects its jumps.
 
@@ -47,19 +60,20 @@ class ReferenceTrajectory:
     """
 
     def __init__(self, jump: BodyTwist, capacity: int = 512) -> None:
-        self.jump: Array = np.array(jump, dtype=np.float64)
-        """These accelerations, shape (2,)."""
         self._capacity = capacity
         # Twice as long as needed: every ``capacity`` samples the newest ones move to the front.
-        self.stamps: Stamps = np.zeros(2 * capacity, dtype=np.int64)
-        """Stamps (ns) of the samples, from :attr:`first` to before :attr:`end`."""
-        self.samples: Array = np.zeros((2 * capacity, 4))
-        """Twist of each sample and its slope from the one before, see :func:`write_sample`."""
+        self.buffer = TrajectorySamples(
+            np.zeros(2 * capacity, dtype=np.int64),
+            np.zeros((2 * capacity, 4)),
+            np.zeros(2, dtype=np.int64),
+            np.array(jump, dtype=np.float64),
+        )
+        """The samples."""
         self.clear()
 
     def clear(self) -> None:
         """Remove every sample."""
-        self.first = self.end = 0
+        self.buffer.bounds[:] = 0
         self.newest_ns: int | None = None
         """Stamp of the newest sample, None without samples."""
         self._jumps: list[Jump] = []
@@ -75,23 +89,17 @@ class ReferenceTrajectory:
         stamp_ns = sample.stamp_ns
         if self.newest_ns is not None and stamp_ns <= self.newest_ns:
             self._remove_from(stamp_ns)
-        if self.end == len(self.stamps):
+        stamps, _, bounds, _ = self.buffer
+        first, last = bounds.tolist()
+        if last == len(stamps):
             self._move_to_front()
-        if self.end - self.first == self._capacity:
-            self.first += 1
-        last = self.end
-        self.newest_ns, self.end = stamp_ns, last + 1
+            first, last = bounds.tolist()
+        if last - first == self._capacity:
+            first += 1
+        bounds[:] = first, last + 1
+        self.newest_ns = stamp_ns
         twist = sample.twist
-        if write_sample(
-            self.stamps,
-            self.samples,
-            self.first,
-            last,
-            stamp_ns,
-            twist.linear,
-            twist.angular,
-            self.jump,
-        ):
+        if write_sample(self.buffer, stamp_ns, twist.linear, twist.angular):
             self._add_jump(last)
         return True
 
@@ -115,33 +123,34 @@ class ReferenceTrajectory:
 
         At the last sample the rate is zero; later values are unknown.
         """
-        known, *numbers = interpolate(
-            self.stamps, self.samples, self.first, self.end, self.jump, now_ns
-        )
+        known, *numbers = interpolate(self.buffer, now_ns)
         if not known:
             return None
         return TrajectoryPoint(BodyTwist(*numbers[:2]), BodyTwist(*numbers[2:]))
 
     def _remove_from(self, stamp_ns: int) -> None:
         """Remove the samples and the jumps from a stamp on."""
-        before = np.searchsorted(self.stamps[self.first : self.end], stamp_ns)
-        self.end = self.first + int(before)
+        stamps, _, bounds, _ = self.buffer
+        before = np.searchsorted(stamps[bounds[0] : bounds[1]], stamp_ns)
+        bounds[1] = bounds[0] + int(before)
         self._jumps = [jump for jump in self._jumps if jump.stamp_ns < stamp_ns]
 
     def _move_to_front(self) -> None:
-        count = self.end - self.first
-        self.stamps[:count] = self.stamps[self.first : self.end]
-        self.samples[:count] = self.samples[self.first : self.end]
-        self.first, self.end = 0, count
+        stamps, samples, bounds, _ = self.buffer
+        first, end = bounds.tolist()
+        stamps[: end - first] = stamps[first:end]
+        samples[: end - first] = samples[first:end]
+        bounds[:] = 0, end - first
 
     def _add_jump(self, last: int) -> None:
         """Add the jump between the sample at ``last`` and the one before."""
-        span = int(self.stamps[last] - self.stamps[last - 1]) / NANOSECONDS
-        rate, slope = self.samples[last, 2:].tolist(), [0.0, 0.0]
-        if last - 1 > self.first and not is_jump(self.samples, last - 1, self.jump):
-            slope = self.samples[last - 1, 2:].tolist()
+        stamps, samples, bounds, limit = self.buffer
+        span = int(stamps[last] - stamps[last - 1]) / NANOSECONDS
+        rate, slope = samples[last, 2:].tolist(), [0.0, 0.0]
+        if last - 1 > bounds[0] and not is_jump(samples, last - 1, limit):
+            slope = samples[last - 1, 2:].tolist()
         change = BodyTwist(span * (rate[0] - slope[0]), span * (rate[1] - slope[1]))
-        self._jumps.append(Jump(int(self.stamps[last]), change))
+        self._jumps.append(Jump(int(stamps[last]), change))
 
 
 @kernel
@@ -152,22 +161,10 @@ def is_jump(samples: Array, index: int, jump: Array) -> bool:
 
 
 @kernel
-def write_sample(
-    stamps: Stamps,
-    samples: Array,
-    first: int,
-    last: int,
-    stamp_ns: int,
-    linear: float,
-    angular: float,
-    jump: Array,
-) -> bool:
-    """Write a sample at ``last``, with its slope; return whether it is a jump.
-
-    stamps  : ns, ascending from ``first`` on
-    samples : shape (n, 4): linear, angular (m/s, rad/s), and their slopes from the sample before
-    jump    : shape (2,), slopes above which it is a jump (m/s², rad/s²)
-    """
+def write_sample(buffer: TrajectorySamples, stamp_ns: int, linear: float, angular: float) -> bool:
+    """Write the last sample, with its slope; return whether it is a jump."""
+    stamps, samples = buffer.stamps, buffer.samples
+    first, last = buffer.bounds[0], buffer.bounds[1] - 1
     stamps[last] = stamp_ns
     samples[last, 0] = linear
     samples[last, 1] = angular
@@ -176,23 +173,14 @@ def write_sample(
     span = (stamp_ns - stamps[last - 1]) / NANOSECONDS
     samples[last, 2] = (linear - samples[last - 1, 0]) / span
     samples[last, 3] = (angular - samples[last - 1, 1]) / span
-    return is_jump(samples, last, jump)
+    return is_jump(samples, last, buffer.jump)
 
 
 @kernel
-def interpolate(
-    stamps: Stamps,
-    samples: Array,
-    first: int,
-    end: int,
-    jump: Array,
-    now_ns: int,
-) -> tuple[bool, float, float, float, float]:
-    """Return whether the twist at ``now_ns`` is known, the twist, and its rate.
-
-    stamps, samples, jump : as in :func:`write_sample`
-    first, end            : range of the samples
-    """
+def interpolate(buffer: TrajectorySamples, now_ns: int) -> tuple[bool, float, float, float, float]:
+    """Return whether the twist at ``now_ns`` is known, the twist, and its rate."""
+    stamps, samples, jump = buffer.stamps, buffer.samples, buffer.jump
+    first, end = buffer.bounds[0], buffer.bounds[1]
     if first == end or now_ns < stamps[first] or now_ns > stamps[end - 1]:
         return False, 0.0, 0.0, 0.0, 0.0
     low, high = first, end  # bisection for the first stamp after now_ns

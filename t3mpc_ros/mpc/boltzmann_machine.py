@@ -96,94 +96,6 @@ class RlsState(NamedTuple):
     """Shape (3,): running mean of |mu_1|², its mean in pretraining, and that of noise alone."""
 
 
-@kernel
-def table_view(store: Array, first: int, rows: int, columns: int) -> Array:
-    """Return a part of a flat store as a view of shape (rows, columns)."""
-    return store[first : first + rows * columns].reshape((rows, columns))
-
-
-@kernel
-def machine_size(delta_lags: int, move_lags: int, hidden: int) -> int:
-    """Return the size of the store of a machine."""
-    return (delta_lags + move_lags) * (hidden + 2) + 3 * hidden + 2
-
-
-@kernel
-def machine_view(store: Array, delta_lags: int, move_lags: int, hidden: int) -> BoltzmannMachine:
-    """Return the views of a flat store that form a machine.
-
-    Each array argument of a kernel costs time when Python calls it, so frequent calls pass one
-    store instead of a dozen arrays.
-    """
-    visible = delta_lags + move_lags
-    hidden_rows = table_view(store, visible * hidden, 3, hidden)
-    visible_rows = table_view(store, (visible + 3) * hidden, 2, visible)
-    return BoltzmannMachine(
-        table_view(store, 0, visible, hidden),
-        hidden_rows[0],
-        delta_lags,
-        store[store.size - 2 :],
-        visible_rows[0],
-        hidden_rows[1],
-        visible_rows[1],
-        hidden_rows[2],
-    )
-
-
-@kernel
-def rls_state_size(hidden: int) -> int:
-    """Return the size of the store of an RLS state."""
-    return 4 * hidden * hidden + 2 * hidden + 3
-
-
-@kernel
-def rls_state_view(store: Array, hidden: int) -> RlsState:
-    """Return the views of a flat store that form an RLS state."""
-    square = hidden * hidden
-    rows = table_view(store, 4 * square, 2, hidden)
-    return RlsState(
-        table_view(store, 0, hidden, hidden),
-        table_view(store, square, hidden, hidden),
-        rows[0],
-        table_view(store, 2 * square, hidden, hidden),
-        table_view(store, 3 * square, hidden, hidden),
-        rows[1],
-        store[store.size - 3 :],
-    )
-
-
-@kernel
-def history_size(delta_lags: int, move_lags: int, horizon: int) -> int:
-    """Return the size of the store of a history."""
-    middle = max(horizon // 2, 1)
-    length = max(delta_lags, move_lags) + middle
-    return 2 * length + 2 * middle + max(horizon, middle) + delta_lags + move_lags + 10
-
-
-@kernel
-def history_view(store: Array, delta_lags: int, move_lags: int, horizon: int) -> History:
-    """Return the views of a flat store that form a history for predicting half a horizon."""
-    middle = max(horizon // 2, 1)
-    length = max(delta_lags, move_lags) + middle
-    lengths = table_view(store, 0, 2, length)
-    middles = table_view(store, 2 * length, 2, middle)
-    pairs = table_view(store, 2 * (length + middle), 5, 2)
-    rest = store[2 * (length + middle) + 10 :]
-    return History(
-        lengths[0],
-        lengths[1],
-        middles[0],
-        store[2 * (length + middle) : 2 * (length + middle) + 4],
-        pairs[2],
-        pairs[3],
-        pairs[4],
-        rest[delta_lags + move_lags :],
-        rest[:delta_lags],
-        rest[delta_lags : delta_lags + move_lags],
-        middles[1],
-    )
-
-
 def make_machine(
     shape: LayerSizes,
     delta_scale: float,
@@ -226,28 +138,49 @@ def make_machine(
             f'scales and spread must be positive: got {delta_scale}, {move_scale}, {spread}'
         )
     square, _ = np.linalg.qr(generator.standard_normal((shape.hidden, shape.visible)))
-    size = machine_size(shape.delta_lags, shape.move_lags, shape.hidden)
-    machine = machine_view(np.zeros(size), shape.delta_lags, shape.move_lags, shape.hidden)
-    machine.visible_weights[:] = spread * square.T
-    machine.scales[:] = (delta_scale, move_scale)
-    return machine
+    visible, hidden = shape.visible, shape.hidden
+    return BoltzmannMachine(
+        visible_weights=np.ascontiguousarray(spread * square.T),
+        output_weights=np.zeros(hidden),
+        delta_lags=shape.delta_lags,
+        scales=np.array([delta_scale, move_scale], dtype=np.float64),
+        lags=np.zeros(visible),
+        mu0=np.zeros(hidden),
+        eta1=np.zeros(visible),
+        mu1=np.zeros(hidden),
+    )
 
 
 def make_rls_state(hidden: int) -> RlsState:
     """Return an initial RLS state; pretraining sets its prior."""
-    rls = rls_state_view(np.zeros(rls_state_size(hidden)), hidden)
-    rls.prior[:] = np.eye(hidden)
-    rls.power[:] = 1.0
-    return rls
+    return RlsState(
+        information=np.zeros((hidden, hidden)),
+        prior=np.eye(hidden),
+        anchor=np.zeros(hidden),
+        total=np.zeros((hidden, hidden)),
+        lower=np.zeros((hidden, hidden)),
+        move=np.zeros(hidden),
+        power=np.ones(3),
+    )
 
 
 def make_history(delta_lags: int, move_lags: int, horizon: int) -> History:
     """Return an empty history that is long enough to predict from half a horizon ago."""
-    size = history_size(delta_lags, move_lags, horizon)
-    history = history_view(np.zeros(size), delta_lags, move_lags, horizon)
-    history.prediction_mse[:] = 1.0
-    history.persistence_mse[:] = 1.0
-    return history
+    middle = max(horizon // 2, 1)
+    length = max(delta_lags, move_lags) + middle
+    return History(
+        errors=np.zeros(length),
+        moves=np.zeros(length),
+        offsets=np.zeros(middle),
+        residuals=np.zeros(4),
+        prediction_mse=np.ones(2),
+        persistence_mse=np.ones(2),
+        recent_mse=np.zeros(2),
+        planned_moves=np.zeros(max(horizon, middle)),
+        lagged_errors=np.zeros(delta_lags),
+        lagged_moves=np.zeros(move_lags),
+        half_horizon=np.zeros(middle),
+    )
 
 
 @kernel

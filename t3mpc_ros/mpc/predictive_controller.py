@@ -20,11 +20,10 @@ from t3mpc_ros.mpc.prediction import predict_responses, predicted_errors, toepli
 from t3mpc_ros.mpc.predictor import (
     LearningConstants,
     Predictor,
+    WheelState,
     authority,
-    learning_constants_view,
     observe,
     skill_score,
-    wheel_state_view,
 )
 from t3mpc_ros.mpc.pretraining import (
     ExcitationParameters,
@@ -38,9 +37,8 @@ from t3mpc_ros.mpc.quadratic_program import (
     OPTIMAL,
     Indices,
     Workspace,
+    make_workspace,
     solve_quadratic_program,
-    workspace_size,
-    workspace_view,
 )
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
 
@@ -209,45 +207,67 @@ class MoveConstants(NamedTuple):
     skill_high: float
     gain_low: float
     gain_high: float
+    average: int
+    """Control periods in the mean of a sample."""
+    decimation: int
+    """Control periods in a period T."""
+    nominal_response: float
+    """Nominal step response in the middle of the horizon."""
+    decay: float
+    """Decay of a known jump per control period."""
+    decays: Array
+    """Decay of a known jump after 0, 1, ... periods T, shape (n_p + 1,)."""
 
     @classmethod
-    def of(cls, parameters: PredictiveParameters) -> Self:
-        """Return the constants of the parameters."""
+    def of(
+        cls, parameters: PredictiveParameters, loop: NominalLoopParameters, timing: SampleTiming
+    ) -> Self:
+        """Return the constants of the parameters with the feedback of the nominal loop."""
+        horizon, feedback = parameters.horizon, loop.feedback_gain
+        steps = nominal_step_response(loop, timing, horizon)
         return cls(
-            parameters.enabled,
-            parameters.learning,
-            parameters.enabled and parameters.dither > 0.0,
-            0.1 * parameters.delta_scale,
-            parameters.probe,
-            parameters.error_weight,
-            parameters.move_weight,
-            parameters.v_max,
-            parameters.dv_max,
-            parameters.skill_low,
-            parameters.skill_high,
-            parameters.gain_low,
-            parameters.gain_high,
+            enabled=parameters.enabled,
+            learning=parameters.learning,
+            dithered=parameters.enabled and parameters.dither > 0.0,
+            quiet_threshold=0.1 * parameters.delta_scale,
+            probe=parameters.probe,
+            error_weight=parameters.error_weight,
+            move_weight=parameters.move_weight,
+            v_max=parameters.v_max,
+            dv_max=parameters.dv_max,
+            skill_low=parameters.skill_low,
+            skill_high=parameters.skill_high,
+            gain_low=parameters.gain_low,
+            gain_high=parameters.gain_high,
+            average=timing.average,
+            decimation=timing.decimation,
+            nominal_response=float(steps[max(horizon // 2, 1) - 1]),
+            decay=math.exp(-feedback * timing.period),
+            decays=np.exp(-feedback * timing.span * np.arange(horizon + 1)),
         )
 
 
-@kernel
-def move_constants_view(row: Array) -> MoveConstants:
-    """Return the constants by name, see :func:`learning_constants_view`."""
-    return MoveConstants(
-        row[0] != 0.0,
-        row[1] != 0.0,
-        row[2] != 0.0,
-        row[3],
-        row[4],
-        row[5],
-        row[6],
-        row[7],
-        row[8],
-        row[9],
-        row[10],
-        row[11],
-        row[12],
-    )
+class Responses(NamedTuple):
+    """Responses of each output over the horizon, shape (outputs, n_p) each."""
+
+    steps: Array
+    """Step responses (48), (rad/s)/(rad/s²)."""
+    free: Array
+    """Psi_free (56), rad/s."""
+    prediction: Array
+    """Predictions Psi (52), rad/s."""
+    known: Array
+    """Future errors of known jumps, rad/s."""
+
+
+class PlanWork(NamedTuple):
+    """Work space and results of the quadratic programs."""
+
+    matrix: Array
+    """S (54), shape (n_p, n_c)."""
+    program: Workspace
+    status: Indices
+    """Status of each last solution, shape (outputs,)."""
 
 
 class Signals(NamedTuple):
@@ -278,24 +298,6 @@ class Signals(NamedTuple):
 
 
 @kernel
-def signals_view(rows: Array) -> Signals:
-    """Return the rows of an array, shape (11, outputs), as signals."""
-    return Signals(
-        rows[0],
-        rows[1],
-        rows[2],
-        rows[3],
-        rows[4],
-        rows[5],
-        rows[6],
-        rows[7],
-        rows[8],
-        rows[9],
-        rows[10],
-    )
-
-
-@kernel
 def end_control_period(signals: Signals, decay: float) -> None:
     """End a control period: known jumps decay, and v_p is assumed to be applied."""
     for z in range(signals.v.size):
@@ -305,7 +307,7 @@ def end_control_period(signals: Signals, decay: float) -> None:
 
 @kernel
 def accumulate_sample(
-    speeds: Array, reference: Array, sampled: bool, due: bool, decay: float, rows: Array
+    speeds: Array, reference: Array, sampled: bool, due: bool, decay: float, signals: Signals
 ) -> bool:
     """Add a control period to the sums of the sample; return False if an error is not finite.
 
@@ -313,9 +315,7 @@ def accumulate_sample(
     sampled : whether this period's errors belong to the sample
     due     : whether the sample is complete; :func:`predictive_step` then ends the period
     decay   : decay of a known jump per control period
-    rows    : the :class:`Signals`
     """
-    signals = signals_view(rows)
     for z in range(speeds.size):
         if not math.isfinite(speeds[z] - reference[z]):
             return False
@@ -351,80 +351,62 @@ def plan_moves(
     steps: Array,
     free: Array,
     v_previous: float,
-    error_weight: float,
-    move_weight: float,
-    dv_max: float,
     v_max: float,
-    matrix: Array,
-    work: Workspace,
+    constants: MoveConstants,
+    work: PlanWork,
     prediction: Array,
 ) -> int:
     """Write the optimal changes and the predicted errors; return the status of the solver.
 
     steps, free  : the step response (48) and Psi_free (56)
     v_previous   : v_p(t-1), inside v_max (rad/s²)
-    error_weight, move_weight, dv_max, v_max : mu, pi and the bounds (rad/s²) of the program
-    matrix       : S (54), shape (n_p, n_c), overwritten
+    v_max        : bound of v_p (rad/s²)
     work         : overwritten, with the optimal changes
     prediction   : Psi (52), shape (n_p,), overwritten
     """
+    matrix, program = work.matrix, work.program
     toeplitz(steps, matrix)
-    max_iterations = 20 * work.gradient.size
     status = solve_quadratic_program(
-        matrix, free, error_weight, move_weight, v_previous, dv_max, v_max, max_iterations, work
+        matrix,
+        free,
+        constants.error_weight,
+        constants.move_weight,
+        v_previous,
+        constants.dv_max,
+        v_max,
+        20 * program.gradient.size,
+        program,
     )
-    predicted_errors(matrix, work.changes, free, prediction)
+    predicted_errors(matrix, program.changes, free, prediction)
     return status
 
 
 @kernel
 def predictive_step(
-    stores: tuple[Array, ...],
-    sizes: Indices,
-    rows: Array,
-    tables: Array,
-    nominal: float,
-    decays: Array,
+    wheels: tuple[WheelState, ...],
+    signals: Signals,
+    responses: Responses,
     change: Array,
     samples: int,
-    average: int,
-    decimation: int,
-    decay: float,
-    move_row: Array,
-    learning_row: Array,
-    float_work: Array,
-    int_work: Indices,
-    status: Indices,
+    constants: MoveConstants,
+    learning: LearningConstants,
+    work: PlanWork,
 ) -> None:
     """Process the sample of each output, and update its v_p: (34)-(63) in one call.
 
-    stores, sizes : the :class:`WheelState` of each output, and :attr:`Predictor.sizes`
-    rows          : the :class:`Signals`
-    tables        : shape (4, outputs, n_p), overwritten: step responses (48), Psi_free (56),
-                    predictions Psi (52), and future errors of known jumps
-    nominal       : nominal step response in the middle of the horizon
-    decays        : shape (n_p + 1,), decay of a known jump after 0, 1, ... periods T
-    change        : shape (n_p, outputs), jumps in each future period T, rad/s
-    samples       : number of previous samples
-    average, decimation : control periods in the mean of a sample, and in a period T
-    decay         : decay of a known jump per control period
-    move_row, learning_row : :class:`MoveConstants` and :class:`LearningConstants` as arrays
-    float_work, int_work : work space: S and the :class:`Workspace` of the solver
-    status        : shape (outputs,), overwritten, status of each solution
+    wheels    : state of each output
+    responses : overwritten
+    change    : shape (n_p, outputs), jumps in each future period T, rad/s
+    samples   : number of previous samples
+    work      : overwritten
     """
-    constants, learning = move_constants_view(move_row), learning_constants_view(learning_row)
-    signals = signals_view(rows)
-    horizon = decays.size - 1
-    moves = int_work.shape[1] - 1
-    matrix = float_work[: horizon * moves].reshape((horizon, moves))
-    work = workspace_view(float_work[horizon * moves :], int_work, moves)
-    for z in range(len(stores)):
-        wheel = wheel_state_view(stores[z], sizes[0], sizes[1], sizes[2], sizes[3])
+    for z in range(len(wheels)):
+        wheel = wheels[z]
         machine, history = wheel.machine, wheel.history
-        steps, free, known = tables[0, z], tables[1, z], tables[3, z]
-        predict_known_errors(signals.jumps[z], decays, change[:, z], known)
+        steps, free, known = responses.steps[z], responses.free[z], responses.known[z]
+        predict_known_errors(signals.jumps[z], constants.decays, change[:, z], known)
         # The first sample has one measurement and no history.
-        sample = signals.sums[z] / (average if samples > 0 else 1)
+        sample = signals.sums[z] / (constants.average if samples > 0 else 1)
         if samples == 0:
             reset_history(history, sample)
         enough = samples > history.errors.size
@@ -433,7 +415,7 @@ def predictive_step(
             wheel.rls,
             history,
             sample,
-            signals.applied_sums[z] / decimation,
+            signals.applied_sums[z] / constants.decimation,
             enough,
             enough and abs(signals.jumps[z]) < constants.quiet_threshold and constants.learning,
             learning,
@@ -449,7 +431,7 @@ def predictive_step(
         signals.skills[z] = skill_score(history, 1)
         share = authority(
             min(skill_score(history, 0), signals.skills[z]),
-            steps[history.offsets.size - 1] / nominal,
+            steps[history.offsets.size - 1] / constants.nominal_response,
             constants.skill_low,
             constants.skill_high,
             constants.gain_low,
@@ -458,32 +440,18 @@ def predictive_step(
         signals.authorities[z] = share if constants.enabled else 0.0
         # A decreasing authority reduces v_p by at most dv_max per period, without a step.
         bound = max(signals.authorities[z] * constants.v_max, abs(v_previous) - constants.dv_max)
-        status[z] = plan_moves(
-            steps,
-            free,
-            v_previous,
-            constants.error_weight,
-            constants.move_weight,
-            constants.dv_max,
-            bound,
-            matrix,
-            work,
-            tables[2, z],
+        work.status[z] = plan_moves(
+            steps, free, v_previous, bound, constants, work, responses.prediction[z]
         )
         # Rounding must not move v_p beyond its bound, or leave a residual when it is zero.
-        v = min(max(v_previous + work.changes[0], -bound), bound)
+        v = min(max(v_previous + work.program.changes[0], -bound), bound)
         signals.v[z] = v
         if constants.dithered:
             signals.v[z] = min(max(v + signals.next_dither[z], -constants.v_max), constants.v_max)
         signals.dither[z] = signals.v[z] - v
         signals.sums[z] = 0.0
         signals.applied_sums[z] = 0.0
-    end_control_period(signals, decay)
-
-
-_APPLIED, _V, _NEXT_DITHER, _JUMPS, _AUTHORITIES, _SKILLS = map(
-    Signals._fields.index, ('applied', 'v', 'next_dither', 'jumps', 'authorities', 'skills')
-)
+    end_control_period(signals, constants.decay)
 
 
 class PredictiveController:
@@ -533,19 +501,25 @@ class PredictiveController:
                 f'move_lags must cover the dead time of {parameters.nominal.dead_time} s and one '
                 f'period of {span:g} s: got {parameters.move_lags}'
             )
-        self.rows: Array = np.zeros((len(Signals._fields), outputs))
-        """The :class:`Signals`, for kernels."""
-        self._tables: Array = np.zeros((4, outputs, parameters.horizon))
+        self.signals = Signals(*np.zeros((len(Signals._fields), outputs)))
+        """The signals, for kernels."""
+        self._responses = Responses(*np.zeros((4, outputs, parameters.horizon)))
         self._zeros = np.zeros(outputs)
         self._no_change = np.zeros((parameters.horizon, outputs))
         moves = parameters.control_horizon
-        self._float_work = np.zeros(parameters.horizon * moves + workspace_size(moves))
-        self._int_work = np.zeros((2, moves + 1), dtype=np.int64)
-        self.status: NDArray[np.int64] = np.zeros(outputs, dtype=np.int64)
-        """Status of each last solution, see :mod:`t3mpc_ros.mpc.quadratic_program`."""
+        self._work = PlanWork(
+            np.zeros((parameters.horizon, moves)),
+            make_workspace(moves),
+            np.zeros(outputs, dtype=np.int64),
+        )
         self.parameters = parameters
         self.configure(parameters, feedback_gain)
         self.pretrain()
+
+    @property
+    def status(self) -> Indices:
+        """Status of each last solution, see :mod:`t3mpc_ros.mpc.quadratic_program`."""
+        return self._work.status
 
     @property
     def skill(self) -> Array:
@@ -561,20 +535,17 @@ class PredictiveController:
     @property
     def authority(self) -> Array:
         """Fraction of the bound of v_p in use, in [0, 1], shape (outputs,)."""
-        values: Array = self.rows[_AUTHORITIES]
-        return values.copy()
+        return self.signals.authorities.copy()
 
     @property
     def prediction(self) -> Array:
         """Predicted errors Psi (52) under the planned moves, rad/s, shape (outputs, n_p)."""
-        values: Array = self._tables[2]
-        return values.copy()
+        return self._responses.prediction.copy()
 
     @property
     def step_response(self) -> Array:
         """Latest s_0 ... s_{n_p-1} (48), (rad/s)/(rad/s²), shape (outputs, n_p)."""
-        values: Array = self._tables[0]
-        return values.copy()
+        return self._responses.steps.copy()
 
     def configure(
         self, parameters: PredictiveParameters, feedback_gain: float | None = None
@@ -599,17 +570,9 @@ class PredictiveController:
             if not feedback_gain > 0.0:
                 raise ValueError(f'feedback_gain must be positive: got {feedback_gain}')
             self._loop = replace(parameters.nominal, feedback_gain=feedback_gain)
-            self._decay = math.exp(-feedback_gain * self._timing.period)
-            self._decays = np.exp(
-                -feedback_gain * self._timing.span * np.arange(parameters.horizon + 1)
-            )
-            steps = nominal_step_response(self._loop, self._timing, parameters.horizon)
-            self._nominal_response = float(steps[max(parameters.horizon // 2, 1) - 1])
         self.parameters = parameters
         self._learning = learning_constants(parameters, self._timing.span)
-        self._learning_row = np.array(self._learning, dtype=np.float64)
-        self._move_row = np.array(MoveConstants.of(parameters), dtype=np.float64)
-        self.dithered = parameters.enabled and parameters.dither > 0.0
+        self._constants = MoveConstants.of(parameters, self._loop, self._timing)
 
     def pretrain(self, errors: Array | None = None, moves: Array | None = None) -> None:
         """Create new machines and pretrain them, then :meth:`reset`.
@@ -658,14 +621,13 @@ class PredictiveController:
             )
             predictors.append(predictor)
         self._predictors = predictors
-        self._stores = tuple(predictor.store for predictor in predictors)
-        self._sizes = np.array(predictors[0].sizes)
+        self._wheels = tuple(predictor.state for predictor in predictors)
         self.reset()
 
     def reset(self) -> None:
         """Clear the history and set v_p to 0; keep weights and skill."""
-        self.rows[:] = 0.0
-        self._tables[:] = 0.0
+        for array in (*self.signals, *self._responses):
+            array[:] = 0.0
         self._generator = np.random.default_rng((self.parameters.seed, 1))
         self.status[:] = OPTIMAL
         self.phase = 0
@@ -677,7 +639,7 @@ class PredictiveController:
         self._skill = np.array(
             [skill_score(predictor.history, 1) for predictor in self._predictors]
         )
-        self.rows[_SKILLS] = self._skill
+        self.signals.skills[:] = self._skill
 
     def warm_up(self) -> None:
         """Compile every kernel now instead of in the first step, then :meth:`reset`."""
@@ -719,17 +681,6 @@ class PredictiveController:
             )
         self.reset()
 
-    def snapshot(self) -> list[Array]:
-        """Return a copy of the state for :meth:`rollback`, much faster than the weights."""
-        return [store.copy() for store in self._stores]
-
-    def rollback(self, snapshot: list[Array]) -> None:
-        """Restore a :meth:`snapshot`, and measure its skill on the trial run."""
-        for predictor, copy in zip(self._predictors, snapshot, strict=True):
-            predictor.store[:] = copy
-            predictor.evaluate(self._learning)
-        self.reset()
-
     def notify_applied(self, v_p: Array) -> None:
         """Set the v_p (rad/s²) that was applied, when it differs from the last one returned.
 
@@ -738,7 +689,7 @@ class PredictiveController:
         """
         if np.shape(v_p) != self.status.shape or not np.isfinite(v_p).all():
             raise ValueError(f'v_p must be {self.status.size} finite numbers: got {v_p}')
-        self.rows[_APPLIED] = v_p
+        self.signals.applied[:] = v_p
 
     def notify_jump(self, jump: Array) -> None:
         """Add a known jump of the error by ``jump`` (rad/s) at the next step.
@@ -747,7 +698,7 @@ class PredictiveController:
         """
         if np.shape(jump) != self.status.shape or not np.isfinite(jump).all():
             raise ValueError(f'jump must be {self.status.size} finite numbers: got {jump}')
-        self.rows[_JUMPS] += jump
+        self.signals.jumps[:] += jump
 
     def step(self, errors: Array, known_change: Array | None = None) -> Array:
         """Return v_p (rad/s²), shape (outputs,), equation (63).
@@ -777,14 +728,15 @@ class PredictiveController:
                 )
             known_change = np.asarray(known_change, dtype=np.float64)
         self.advance(errors, self._zeros, known_change)
-        v_p: Array = self.rows[_V]
-        return v_p.copy()
+        return self.signals.v.copy()
 
     def advance(self, speeds: Array, reference: Array, known_change: Array | None = None) -> None:
-        """Update ``rows`` like :meth:`step`, without shape checks."""
+        """Update ``signals`` like :meth:`step`, without shape checks."""
         timing, phase = self._timing, self.phase
         sampled = phase == 0 or phase > timing.decimation - timing.average
-        if not accumulate_sample(speeds, reference, sampled, phase == 0, self._decay, self.rows):
+        if not accumulate_sample(
+            speeds, reference, sampled, phase == 0, self._constants.decay, self.signals
+        ):
             raise ValueError(f'errors must be finite: got {speeds - reference}')
         if phase == 0:
             self._predictive_step(self._no_change if known_change is None else known_change)
@@ -793,8 +745,7 @@ class PredictiveController:
     @property
     def known_error(self) -> Array:
         """Residual of the known jumps, rad/s, shape (outputs,)."""
-        left: Array = self.rows[_JUMPS]
-        return left
+        return self.signals.jumps
 
     @property
     def span(self) -> float:
@@ -808,27 +759,18 @@ class PredictiveController:
 
     def _predictive_step(self, change: Array) -> None:
         """Process the sample of each output, and update its v_p."""
-        if self.dithered:
+        if self._constants.dithered:
             next_dither = self._generator.uniform(-1.0, 1.0, self.status.size)
-            self.rows[_NEXT_DITHER] = self.parameters.dither * next_dither
-        timing = self._timing
+            self.signals.next_dither[:] = self.parameters.dither * next_dither
         predictive_step(
-            self._stores,
-            self._sizes,
-            self.rows,
-            self._tables,
-            self._nominal_response,
-            self._decays,
+            self._wheels,
+            self.signals,
+            self._responses,
             change,
             self.samples,
-            timing.average,
-            timing.decimation,
-            self._decay,
-            self._move_row,
-            self._learning_row,
-            self._float_work,
-            self._int_work,
-            self.status,
+            self._constants,
+            self._learning,
+            self._work,
         )
-        self._skill = self.rows[_SKILLS].copy()
+        self._skill = self.signals.skills.copy()
         self.samples += 1

@@ -19,16 +19,10 @@ from t3mpc_ros.mpc.boltzmann_machine import (
     RlsState,
     contrastive_divergence_step,
     gradient_step,
-    history_size,
-    history_view,
-    machine_size,
-    machine_view,
     make_history,
     make_rls_state,
     predict_error,
     reset_history,
-    rls_state_size,
-    rls_state_view,
     rls_step,
     set_visible,
 )
@@ -55,12 +49,6 @@ class LearningConstants(NamedTuple):
     """Gain of the offset e on the last prediction error."""
     noise: float
     """Standard deviation of the noise of an error (rad/s)."""
-
-
-@kernel
-def learning_constants_view(row: Array) -> LearningConstants:
-    """Return the constants by name; Python passes them to kernels as one array."""
-    return LearningConstants(row[0] != 0.0, row[1], row[2], row[3], row[4], row[5], row[6], row[7])
 
 
 @kernel
@@ -205,34 +193,13 @@ class WheelState(NamedTuple):
     history: History
 
 
-@kernel
-def wheel_state_size(delta_lags: int, move_lags: int, hidden: int, horizon: int) -> int:
-    """Return the size of the store of a wheel state."""
-    machine = machine_size(delta_lags, move_lags, hidden)
-    return machine + rls_state_size(hidden) + history_size(delta_lags, move_lags, horizon)
-
-
-@kernel
-def wheel_state_view(
-    store: Array, delta_lags: int, move_lags: int, hidden: int, horizon: int
-) -> WheelState:
-    """Return the views of a flat store that form a wheel state."""
-    first = machine_size(delta_lags, move_lags, hidden)
-    second = first + rls_state_size(hidden)
-    return WheelState(
-        machine_view(store[:first], delta_lags, move_lags, hidden),
-        rls_state_view(store[first:second], hidden),
-        history_view(store[second:], delta_lags, move_lags, horizon),
-    )
-
-
 class Predictor:
     """Machine of one output, with its learning state, its history and a trial run.
 
     Parameters
     ----------
     machine
-        Layer sizes and initial weights.
+        Initial weights; the arrays are changed in place.
     horizon
         n_p.
     trial
@@ -248,36 +215,29 @@ class Predictor:
         self, machine: BoltzmannMachine, horizon: int, trial: tuple[Array, Array]
     ) -> None:
         delta_lags, hidden = machine.delta_lags, machine.output_weights.size
-        self.sizes = (delta_lags, machine.lags.size - delta_lags, hidden, horizon)
-        """Lags of the error and of v_p, hidden units, and n_p."""
-        self.store: Array = np.zeros(wheel_state_size(*self.sizes))
-        """State that the kernels change; :func:`wheel_state_view` gives its parts."""
-        given = WheelState(machine, make_rls_state(hidden), make_history(*self.sizes[:2], horizon))
-        for mine, other in zip(wheel_state_view(self.store, *self.sizes), given, strict=True):
-            for here, there in zip(mine, other, strict=True):
-                if isinstance(here, np.ndarray):
-                    here[:] = there
-        if trial[0].size <= self.history.errors.size + 1:
+        history = make_history(delta_lags, machine.lags.size - delta_lags, horizon)
+        self.state = WheelState(machine, make_rls_state(hidden), history)
+        """State that the kernels change."""
+        if trial[0].size <= history.errors.size + 1:
             raise ValueError(
-                f'trial must be longer than {self.history.errors.size + 1}: got {trial[0].size}'
+                f'trial must be longer than {history.errors.size + 1}: got {trial[0].size}'
             )
         self._trial = trial
 
-    # Created on access: deep copies of views would not be views of the copied store.
     @property
     def machine(self) -> BoltzmannMachine:
-        """The machine, as views of ``store``."""
-        return wheel_state_view(self.store, *self.sizes).machine
+        """The machine."""
+        return self.state.machine
 
     @property
     def rls(self) -> RlsState:
-        """State of the recursive least squares, as views of ``store``."""
-        return wheel_state_view(self.store, *self.sizes).rls
+        """State of the recursive least squares."""
+        return self.state.rls
 
     @property
     def history(self) -> History:
-        """History of errors and moves, as views of ``store``."""
-        return wheel_state_view(self.store, *self.sizes).history
+        """History of errors and moves."""
+        return self.state.history
 
     def fit(
         self,
@@ -308,7 +268,7 @@ class Predictor:
         self.evaluate(learning)
 
     def _arrays(self) -> dict[str, Array]:
-        machine, rls, _ = wheel_state_view(self.store, *self.sizes)
+        machine, rls, _ = self.state
         return {
             'visible_weights': machine.visible_weights,
             'output_weights': machine.output_weights,

@@ -71,37 +71,22 @@ def make_workspace(moves: int) -> Workspace:
     """Return the work space for ``moves`` (n_c) unknowns."""
     if moves < 1:
         raise ValueError(f'moves must be at least 1: got {moves}')
-    return workspace_view(
-        np.zeros(workspace_size(moves)), np.zeros((2, moves + 1), dtype=np.int64), moves
-    )
-
-
-@kernel
-def workspace_size(moves: int) -> int:
-    """Return the size of the float store of a work space."""
-    return 4 * moves * moves + 11 * moves
-
-
-@kernel
-def workspace_view(store: Array, whole: Indices, moves: int) -> Workspace:
-    """Return the views of a float store and an integer store (2, n + 1) that form a work space."""
-    tables = store[: 4 * moves * moves].reshape((4, moves, moves))
-    rows = store[4 * moves * moves :].reshape((11, moves))
+    square, row = (moves, moves), moves
     return Workspace(
-        tables[0],
-        rows[0],
-        tables[1],
-        rows[1],
-        rows[7:].reshape((2, 2 * moves)),
-        whole[0, :moves],
-        rows[2],
-        rows[3],
-        tables[2],
-        tables[3],
-        rows[4],
-        rows[5],
-        rows[6],
-        whole[1],
+        hessian=np.zeros(square),
+        gradient=np.zeros(row),
+        lower=np.zeros(square),
+        changes=np.zeros(row),
+        multipliers=np.zeros((2, 2 * moves)),
+        active=np.zeros(row, dtype=np.int64),
+        sides=np.zeros(row),
+        active_multipliers=np.zeros(row),
+        basis=np.zeros(square),
+        triangle=np.zeros(square),
+        normal=np.zeros(row),
+        projection=np.zeros(row),
+        unconstrained=np.zeros(row),
+        components=np.zeros(moves + 1, dtype=np.int64),
     )
 
 

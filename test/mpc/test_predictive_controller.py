@@ -465,7 +465,6 @@ def test_lags_shorter_than_the_dead_time_are_rejected():
 
 
 def test_a_deep_copy_is_independent():
-    """Stored views of a flat store would not be views of it in a deep copy."""
     controller, errors = PredictiveController(DEFAULT, PERIOD, GAIN), np.array([0.3, -0.2])
     for k in range(60):
         controller.step(errors * np.sin(0.1 * k))
@@ -478,19 +477,3 @@ def test_a_deep_copy_is_independent():
     np.testing.assert_array_equal(twin.skill, controller.skill)
     for name, value in controller.get_weights().items():
         np.testing.assert_array_equal(twin.get_weights()[name], value)
-
-
-def test_rollback_equals_restoring_the_weights():
-    controller, errors = PredictiveController(DEFAULT, PERIOD, GAIN), np.array([0.3, -0.2])
-    for k in range(400):
-        controller.step(errors * np.sin(0.1 * k))
-    snapshot, weights = controller.snapshot(), controller.get_weights()
-    for k in range(400):
-        controller.step(errors * np.cos(0.3 * k))
-    restored = deepcopy(controller)
-    restored.set_weights(weights)
-    controller.rollback(snapshot)
-    np.testing.assert_array_equal(controller.skill, restored.skill)
-    for k in range(100):
-        sample = errors * np.sin(0.2 * k)
-        np.testing.assert_array_equal(controller.step(sample), restored.step(sample))

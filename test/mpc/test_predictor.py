@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Predictor: skill against persistence, authority, online learning, state views."""
+"""Predictor: skill against persistence, authority, online learning, state."""
 
 import numpy as np
 import pytest
@@ -21,8 +21,6 @@ from t3mpc_ros.mpc.predictor import (
     skill_score,
     smooth_step,
     update_mse,
-    wheel_state_size,
-    wheel_state_view,
 )
 from t3mpc_ros.mpc.pretraining import (
     ExcitationParameters,
@@ -166,24 +164,9 @@ def test_a_trial_run_that_is_too_short_is_rejected():
     assert make_rls_state(12).power.size == 3
 
 
-def _arrays(parts):
-    """Return every array of nested named tuples."""
-    if isinstance(parts, np.ndarray):
-        return [parts]
-    return [array for part in parts for array in _arrays(part)] if isinstance(parts, tuple) else []
-
-
-@pytest.mark.parametrize('sizes', [(4, 4, 12, 10), (1, 1, 2, 1), (6, 3, 9, 7), (2, 5, 8, 2)])
-def test_the_parts_of_a_wheel_state_fill_its_store_once(sizes):
-    store = np.zeros(wheel_state_size(*sizes))
-    for array in _arrays(wheel_state_view(store, *sizes)):
-        assert array.size
-        array += 1.0
-    np.testing.assert_array_equal(store, 1.0)
-
-
 def test_a_wheel_state_has_the_expected_shapes():
-    wheel = wheel_state_view(np.zeros(wheel_state_size(4, 3, 9, 10)), 4, 3, 9, 10)
+    machine = make_machine(LayerSizes(4, 3, 9), 3.0, 20.0, 1.0, np.random.default_rng(0))
+    wheel = Predictor(machine, 10, (np.zeros(40), np.zeros(40))).state
     assert wheel.machine.visible_weights.shape == (7, 9)
     assert wheel.machine.lags.shape == wheel.machine.eta1.shape == (7,)
     assert wheel.machine.mu0.shape == wheel.machine.output_weights.shape == (9,)

@@ -20,8 +20,6 @@ from t3mpc_ros.mpc.quadratic_program import (
     normal_equations,
     solve_quadratic_program,
     unconstrained_optimum,
-    workspace_size,
-    workspace_view,
 )
 
 
@@ -263,15 +261,3 @@ def test_v_slightly_outside_its_bound_is_brought_back():
     assert solve_quadratic_program(matrix, free, 1.0, 0.01, 1.05, 0.1, 1.0, 100, work) == OPTIMAL
     assert work.changes[0] == pytest.approx(-0.05)
     assert kkt_residuals(work, 1.05, 0.1, 1.0, out) < 1e-10
-
-
-@pytest.mark.parametrize('moves', [1, 2, 5, 11])
-def test_the_parts_of_a_work_space_fill_its_stores_once(moves):
-    store, whole = np.zeros(workspace_size(moves)), np.zeros((2, moves + 1), dtype=np.int64)
-    work = workspace_view(store, whole, moves)
-    for array in work:
-        array += 1
-    np.testing.assert_array_equal(store, 1.0)
-    assert whole.sum() == 2 * moves + 1
-    assert work.multipliers.shape == (2, 2 * moves)
-    assert work.basis.shape == (moves, moves)

@@ -13,8 +13,8 @@ from t3mpc_ros.simulation.world import clearance, join_walls, load_world, parse_
 
 NO_SEGMENTS, NO_CIRCLES = np.zeros((0, 4)), np.zeros((0, 3))
 RADIUS, STIFFNESS, DAMPING = 0.11, 2e4, 100.0
-SPRING = BumperParameters(damping=0.0).vector()
-DAMPED = BumperParameters().vector()
+SPRING = BumperParameters(damping=0.0).constants()
+DAMPED = BumperParameters().constants()
 MASS = 1.5
 FLOOR = np.array([[-1.0, 0.0, 1.0, 0.0]])
 BOX = np.array([[0.0, 0.0, 0.5, 0.0], [0.5, 0, 0.5, 0.3], [0.5, 0.3, 0, 0.3], [0, 0.3, 0, 0]])
@@ -51,8 +51,8 @@ def largest_jump(path, segments):
     return float(np.linalg.norm(np.diff(forces, axis=0), axis=1).max())
 
 
-def test_parameter_defaults_match_the_vector_and_bounds_hold():
-    assert DAMPED.tolist() == [RADIUS, STIFFNESS, DAMPING]
+def test_parameter_defaults_match_constants_and_bounds_hold():
+    assert tuple(DAMPED) == (RADIUS, STIFFNESS, DAMPING)
     with pytest.raises(ParameterError, match='stiffness must be from 1000 to 1e'):
         BumperParameters(stiffness=10.0)
 

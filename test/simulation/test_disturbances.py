@@ -86,7 +86,7 @@ def test_disturbance_parameters_do_not_shift_random_numbers():
         wild.draw(0.01)
         other.draw(0.01)
     assert np.array_equal(wild.walk, other.walk)
-    assert np.array_equal(calm.phases, wild.phases)
+    assert np.array_equal(calm.signals.phases, wild.signals.phases)
     assert not calm.walk.any()
     calm.parameters = wild.parameters
     step = wild.walk.copy()

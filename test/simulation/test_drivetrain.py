@@ -21,7 +21,7 @@ from t3mpc_ros.simulation.plant.drivetrain import (
     Load,
     TyreParameters,
     begin_rolling,
-    body_vector,
+    body_constants,
     loses_grip,
     mean_pulses,
     mean_rate,
@@ -43,7 +43,7 @@ BODY = BodyParameters(com_offset=0.03)
 MOTOR = StepperMotorParameters()
 NO_FRICTION = FrictionParameters(viscous=0.0, coulomb=0.0)
 RADIUS, HALF = GEOMETRY.wheel_radius, GEOMETRY.half_separation
-BUMPER = BumperParameters().vector()
+BUMPER = BumperParameters().constants()
 NOWHERE = np.zeros((0, 4)), np.zeros((0, 3))
 VOLTS = 12.0
 OWN = BODY.wheel_inertia
@@ -56,7 +56,7 @@ def rates(state, modes, torque, grip=1e9):
         state,
         np.array(modes, dtype=np.int64),
         np.array(torque),
-        body_vector(BODY, GEOMETRY),
+        body_constants(BODY, GEOMETRY),
         tyres,
         BUMPER,
         *NOWHERE,
@@ -205,7 +205,7 @@ def test_begin_rolling_keeps_momentum_and_dissipates_energy():
             energy = 0.5 * state[7:9] @ inertia @ state[7:9] + 0.5 * OWN * state[5:7] @ state[5:7]
             now = np.array(modes, dtype=np.int64)
             assert stops_sliding(state, now)
-            begin_rolling(state, now, body_vector(BODY, GEOMETRY), tyres)
+            begin_rolling(state, now, body_constants(BODY, GEOMETRY), tyres)
             np.testing.assert_array_equal(now, (ROLLING, ROLLING))
             np.testing.assert_array_equal(state[5:7], state[7:9])
             np.testing.assert_allclose(inertia @ state[7:9] + OWN * state[5:7], before, rtol=1e-12)
@@ -214,7 +214,7 @@ def test_begin_rolling_keeps_momentum_and_dissipates_energy():
 
 
 def test_tyre_slides_beyond_its_grip_in_the_pushed_direction():
-    body = body_vector(BODY, GEOMETRY)
+    body = body_constants(BODY, GEOMETRY)
     tyres = np.array([OWN, OWN, 2.0, 2.0])
     for force, mode in ((1.999, 0), (2.001, 1), (-2.001, -1)):
         modes = np.zeros(2, dtype=np.int64)

@@ -71,7 +71,7 @@ def test_microstep_moves_a_7_cm_wheel_by_0_0687_mm():
 def test_pull_out_torque_satisfies_the_phasor_equation(volts):
     motor = StepperMotorParameters(phase_current=1.7)
     for speed in np.linspace(0.0, 0.999 * volts / motor.torque_constant, 60):
-        torque = pull_out_torque(float(speed), volts, motor.vector())
+        torque = pull_out_torque(float(speed), volts, motor.constants())
         current = torque / motor.torque_constant
         electric = motor.teeth * speed
         impedance = complex(motor.resistance, electric * motor.inductance)
@@ -85,14 +85,14 @@ def test_pull_out_torque_satisfies_the_phasor_equation(volts):
 def test_pull_out_torque_falls_to_zero_where_emf_equals_supply():
     motor = StepperMotorParameters()
     speeds = np.linspace(0.0, 1.2 * VOLTS / motor.torque_constant, 400)
-    torques = [pull_out_torque(float(s), VOLTS, motor.vector()) for s in speeds]
+    torques = [pull_out_torque(float(s), VOLTS, motor.constants()) for s in speeds]
     assert torques[0] == pytest.approx(motor.torque_constant * motor.phase_current)
     assert all(b <= a + 1e-15 for a, b in zip(torques, torques[1:], strict=False))
     assert torques[-1] == 0.0
-    assert pull_out_torque(-20.0, VOLTS, motor.vector()) == pull_out_torque(
-        20.0, VOLTS, motor.vector()
+    assert pull_out_torque(-20.0, VOLTS, motor.constants()) == pull_out_torque(
+        20.0, VOLTS, motor.constants()
     )
-    assert pull_out_torque(0.0, 0.0, motor.vector()) == 0.0
+    assert pull_out_torque(0.0, 0.0, motor.constants()) == 0.0
 
 
 def test_holding_torque_is_that_of_both_phases_at_rated_current():
@@ -103,11 +103,11 @@ def test_holding_torque_is_that_of_both_phases_at_rated_current():
 
 def test_load_angle_follows_the_sine_law():
     motor = StepperMotorParameters()
-    peak = pull_out_torque(0.0, VOLTS, motor.vector())
+    peak = pull_out_torque(0.0, VOLTS, motor.constants())
     for share in (0.1, 0.5, 0.9):
         angle = math.asin(share) / motor.teeth
-        assert rotor_torque(angle, 0.0, peak, motor.vector()) == pytest.approx(share * peak)
-    assert rotor_torque(0.01, 1.0, 0.0, motor.vector()) == 0.0
+        assert rotor_torque(angle, 0.0, peak, motor.constants()) == pytest.approx(share * peak)
+    assert rotor_torque(0.01, 1.0, 0.0, motor.constants()) == 0.0
 
 
 def test_current_above_the_rating_is_rejected():
@@ -147,7 +147,7 @@ def test_commands_within_the_torque_lose_no_steps():
         robot = drivetrain(motor, friction=FrictionParameters())
         for _ in range(12):
             speed = generator.uniform(-12.0, 12.0)
-            peak = pull_out_torque(12.0, VOLTS, motor.vector())
+            peak = pull_out_torque(12.0, VOLTS, motor.constants())
             acceleration = 0.35 * (peak - 0.007) / needed_torque(motor, 1.0)
             share = generator.uniform(0.05, 1.0)
             ramp = share * acceleration
@@ -160,7 +160,7 @@ def test_commands_within_the_torque_lose_no_steps():
 def test_ramp_beyond_the_torque_always_loses_steps(seed):
     motor = StepperMotorParameters()
     generator = np.random.default_rng(seed)
-    peak = pull_out_torque(0.0, VOLTS, motor.vector())
+    peak = pull_out_torque(0.0, VOLTS, motor.constants())
     acceleration = generator.uniform(1.1, 4.0) * peak / needed_torque(motor, 1.0)
     # Long enough for the missing torque to leave the rotor half a pitch behind.
     robot = drivetrain(motor)
@@ -217,7 +217,7 @@ def test_rotor_oscillates_at_its_natural_frequency():
     """A released rotor oscillates with sqrt(N T / J), 15 Hz with this body."""
     motor = StepperMotorParameters(microsteps=256, damping=0.0)
     robot = drivetrain(motor, step=0.0005)
-    peak = pull_out_torque(0.0, VOLTS, motor.vector())
+    peak = pull_out_torque(0.0, VOLTS, motor.constants())
     inertia = needed_torque(motor, 1.0)
     expected = math.sqrt(motor.teeth * peak / inertia) / (2.0 * math.pi)
     # A single pulse, well within the linear part of the sine, excites the rotor.

@@ -105,7 +105,7 @@ def torque_curve(
     """Return the pull-out torque from standstill to ``fastest`` rad/s."""
     set_up = replace(motor, phase_current=current)
     speed = np.linspace(0.0, fastest, 301)
-    numbers = set_up.vector()
+    numbers = set_up.constants()
     torque = np.array([pull_out_torque(float(value), volts, numbers) for value in speed])
     steps = volts / (2.0 * motor.inductance * current)
     return TorqueCurve(volts, current, speed, torque, steps * 2.0 * math.pi / motor.full_steps)

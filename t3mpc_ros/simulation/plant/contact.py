@@ -17,6 +17,7 @@ property.
 
 from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +27,14 @@ from t3mpc_ros.parameters.table import Parameters, parameter
 from t3mpc_ros.simulation.world import nearest_on_segment
 
 Array = npt.NDArray[np.float64]
+
+
+class Bumper(NamedTuple):
+    """Bumper, for kernels: m, N/m and N s/m."""
+
+    radius: float
+    stiffness: float
+    damping: float
 
 
 @dataclass(frozen=True)
@@ -43,14 +52,14 @@ class BumperParameters(Parameters):
     )
     damping: float = parameter(100.0, 'force per closing speed', unit='N s/m', low=0.0, high=1e4)
 
-    def vector(self) -> Array:
-        """Return the argument of :func:`contact_force`, shape (3,): m, N/m, N s/m."""
-        return np.array([self.radius, self.stiffness, self.damping])
+    def constants(self) -> Bumper:
+        """Return the argument of :func:`contact_force`."""
+        return Bumper(self.radius, self.stiffness, self.damping)
 
 
 @kernel
 def point_force(
-    away_x: float, away_y: float, speed_x: float, speed_y: float, bumper: Array
+    away_x: float, away_y: float, speed_x: float, speed_y: float, bumper: Bumper
 ) -> tuple[float, float]:
     """Return the force (N) of one contact point on the bumper; it never pulls.
 
@@ -58,11 +67,11 @@ def point_force(
         undefined and the force zero
     """
     distance = math.sqrt(away_x * away_x + away_y * away_y)
-    if distance >= bumper[0] or distance == 0.0:
+    if distance >= bumper.radius or distance == 0.0:
         return 0.0, 0.0
     normal_x, normal_y = away_x / distance, away_y / distance
     closing = -(speed_x * normal_x + speed_y * normal_y)
-    size = max(bumper[1] * (bumper[0] - distance) + bumper[2] * closing, 0.0)
+    size = max(bumper.stiffness * (bumper.radius - distance) + bumper.damping * closing, 0.0)
     return size * normal_x, size * normal_y
 
 
@@ -83,7 +92,7 @@ def contact_force(
     y: float,
     speed_x: float,
     speed_y: float,
-    bumper: Array,
+    bumper: Bumper,
     segments: Array,
     circles: Array,
 ) -> tuple[float, float]:
@@ -94,10 +103,9 @@ def contact_force(
     :class:`~t3mpc_ros.simulation.world.World`.
 
     x, y : m, the centre of the bumper; speed_x, speed_y : m/s, both in the world frame
-    bumper : shape (3,), see :meth:`BumperParameters.vector`
     segments : shape (n, 4), m; circles : shape (m, 3), m
     """
-    reach = bumper[0] * bumper[0]
+    reach = bumper.radius * bumper.radius
     force_x, force_y = 0.0, 0.0
     for row in range(segments.shape[0]):
         ax, ay, bx, by = segments[row, 0], segments[row, 1], segments[row, 2], segments[row, 3]
@@ -119,13 +127,13 @@ def contact_force(
                 force_y -= part_y
     for row in range(circles.shape[0]):
         away_x, away_y = x - circles[row, 0], y - circles[row, 1]
-        touch = bumper[0] + circles[row, 2]
+        touch = bumper.radius + circles[row, 2]
         square = away_x * away_x + away_y * away_y
         if square < touch * touch and square > 0.0:
             distance = math.sqrt(square)
             normal_x, normal_y = away_x / distance, away_y / distance
             closing = -(speed_x * normal_x + speed_y * normal_y)
-            size = max(bumper[1] * (touch - distance) + bumper[2] * closing, 0.0)
+            size = max(bumper.stiffness * (touch - distance) + bumper.damping * closing, 0.0)
             force_x += size * normal_x
             force_y += size * normal_y
     return force_x, force_y

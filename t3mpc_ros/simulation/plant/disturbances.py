@@ -4,6 +4,7 @@
 
 from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -91,6 +92,39 @@ class NoiseParameters(Parameters):
     )
 
 
+class FrictionConstants(NamedTuple):
+    """Friction of a wheel, for kernels."""
+
+    viscous: float
+    """N m s/rad"""
+    coulomb: float
+    """N m"""
+    width: float
+    """rad/s"""
+
+
+class DisturbanceSignals(NamedTuple):
+    """Disturbance torques of both wheels, for kernels."""
+
+    bound: float
+    """N m"""
+    walk_share: float
+    """Part of the bound used by the walk."""
+    angular: Array
+    """Angular frequencies of the sines, rad/s, shape (n,)."""
+    phases: Array
+    """Phases of each wheel, rad, shape (2, n)."""
+    walk: Array
+    """Random walk of each wheel, in [-1, 1], shape (2,)."""
+
+
+def friction_constants(parameters: FrictionParameters, factor: float) -> FrictionConstants:
+    """Return the constants of a wheel with ``factor`` times both kinds of friction."""
+    return FrictionConstants(
+        factor * parameters.viscous, factor * parameters.coulomb, parameters.coulomb_width
+    )
+
+
 @kernel
 def friction_torque(speed: float, viscous: float, coulomb: float, width: float) -> float:
     """Return the friction torque (N m) that opposes a wheel speed (rad/s): f of (10).
@@ -101,23 +135,16 @@ def friction_torque(speed: float, viscous: float, coulomb: float, width: float) 
 
 
 @kernel
-def disturbance_torque(
-    wheel: int, time: float, load: Array, angular: Array, phases: Array, walk: Array
-) -> float:
-    """Return tau_d of one wheel (N m) at ``time`` (s); never more than the bound in size.
-
-    load : shape (2,), the bound (N m) and the part of it used by the walk (1)
-    angular : shape (n,), rad/s; phases : shape (2, n), rad
-    walk : shape (2,), each in [-1, 1]
-    """
+def disturbance_torque(wheel: int, time: float, signals: DisturbanceSignals) -> float:
+    """Return tau_d of one wheel (N m) at ``time`` (s); never more than the bound in size."""
     sines = 0.0
-    for index in range(angular.size):
-        sines += math.sin(angular[index] * time + phases[wheel, index])
-    sines /= max(angular.size, 1)
-    share = load[1]
+    for index in range(signals.angular.size):
+        sines += math.sin(signals.angular[index] * time + signals.phases[wheel, index])
+    sines /= max(signals.angular.size, 1)
+    share = signals.walk_share
     # The clamp removes rounding errors only.
-    level = min(max((1.0 - share) * sines + share * walk[wheel], -1.0), 1.0)
-    return float(load[0] * level)
+    level = min(max((1.0 - share) * sines + share * signals.walk[wheel], -1.0), 1.0)
+    return float(signals.bound * level)
 
 
 class Disturbance:
@@ -133,21 +160,28 @@ class Disturbance:
 
     def __init__(self, parameters: DisturbanceParameters, generator: np.random.Generator) -> None:
         self.parameters = parameters
-        self._applied = parameters
-        self._load: Array = np.array([parameters.bound, parameters.walk_share])
-        self.angular: Array = 2.0 * np.pi * np.array(parameters.frequencies, dtype=np.float64)
-        self.phases: Array = generator.uniform(0.0, 2.0 * np.pi, (2, self.angular.size))
-        self.walk: Array = np.zeros(2)
+        angular = 2.0 * np.pi * np.array(parameters.frequencies, dtype=np.float64)
+        phases = generator.uniform(0.0, 2.0 * np.pi, (2, angular.size))
+        self._signals = DisturbanceSignals(
+            parameters.bound, parameters.walk_share, angular, phases, np.zeros(2)
+        )
         self._generator = generator
         self._drawn: Array = np.zeros(2)
 
     @property
-    def load(self) -> Array:
-        """Argument of :func:`disturbance_torque`: the bound (N m) and the part of the walk."""
-        if self.parameters is not self._applied:
-            self._applied = self.parameters
-            self._load = np.array([self._applied.bound, self._applied.walk_share])
-        return self._load
+    def signals(self) -> DisturbanceSignals:
+        """Argument of :func:`disturbance_torque`."""
+        parameters, signals = self.parameters, self._signals
+        if (parameters.bound, parameters.walk_share) != signals[:2]:
+            self._signals = signals._replace(
+                bound=parameters.bound, walk_share=parameters.walk_share
+            )
+        return self._signals
+
+    @property
+    def walk(self) -> Array:
+        """Random walk of each wheel, shape (2,), in [-1, 1]."""
+        return self._signals.walk
 
     def draw(self, dt: float) -> None:
         """Advance the walk of both wheels by ``dt`` seconds; it is reflected at -1 and 1.
@@ -176,11 +210,8 @@ class Disturbance:
 
     def torque(self, time: float) -> tuple[float, float]:
         """Return the torques (N m) on the right and left wheel at ``time`` (s)."""
-        load = self.load
-        return (
-            disturbance_torque(0, time, load, self.angular, self.phases, self.walk),
-            disturbance_torque(1, time, load, self.angular, self.phases, self.walk),
-        )
+        signals = self.signals
+        return disturbance_torque(0, time, signals), disturbance_torque(1, time, signals)
 
 
 def make_generators(seed: int) -> tuple[np.random.Generator, np.random.Generator]:

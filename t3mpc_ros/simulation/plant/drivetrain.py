@@ -27,15 +27,19 @@ from t3mpc_ros.geometry.types import Pose, WheelSpeeds, wrap_angle
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
 from t3mpc_ros.robot.command_limiter import ramp_towards
-from t3mpc_ros.simulation.plant.contact import BumperParameters, contact_force
+from t3mpc_ros.simulation.plant.contact import Bumper, BumperParameters, contact_force
 from t3mpc_ros.simulation.plant.disturbances import (
     Disturbance,
+    DisturbanceSignals,
+    FrictionConstants,
     FrictionParameters,
     disturbance_torque,
+    friction_constants,
     friction_torque,
 )
 from t3mpc_ros.simulation.plant.dynamics import BodyParameters, coriolis_factor, wheel_inertia
 from t3mpc_ros.simulation.plant.stepper_motor import (
+    StepperMotor,
     StepperMotorParameters,
     pull_out_torque,
     rotor_torque,
@@ -109,24 +113,31 @@ class Drivetrain:
         self.step = step
         self.steps_done = 0
         """Integration steps since the start: the time base of the disturbances."""
-        self.filtered: Array = np.zeros((3, 2))
-        """Both stages of the IMU filter for yaw rate, forward and sideways acceleration."""
         self._microstep = motor.microstep
         self._cycle = 2.0 * math.pi / motor.teeth
         self._bumper = bumper
         self._radius = bumper.radius
         self._world = world
         self._share = share
-        self._state: Array = np.zeros(9)
-        self._modes: Integers = np.zeros(2, dtype=np.int64)
-        self._field: Array = np.zeros(6)
-        self._totals: Array = np.zeros(4)
-        self._work: Array = np.zeros((4, 9))
+        self._arrays = DrivetrainArrays(
+            state=np.zeros(9),
+            modes=np.zeros(2, dtype=np.int64),
+            field=np.zeros(6),
+            filtered=np.zeros((3, 2)),
+            totals=np.zeros(4),
+            work=np.zeros((4, 9)),
+        )
+        self._state, self._modes, self._field = self._arrays[:3]
         self._blocked = (False, False)
         self._multipliers = (1.0, 1.0)
         self._read()
 
     # -- state ------------------------------------------------------------------------------------
+
+    @property
+    def filtered(self) -> Array:
+        """Both stages of the IMU filter for yaw rate, forward and sideways acceleration."""
+        return self._arrays.filtered
 
     @property
     def pose(self) -> Pose:
@@ -178,18 +189,18 @@ class Drivetrain:
     @property
     def slid(self) -> tuple[float, float]:
         """Distance (m) slid by each tyre so far."""
-        right, left = self._totals[:2].tolist()
+        right, left = self._arrays.totals[:2].tolist()
         return right, left
 
     @property
     def field_work(self) -> float:
         """Work (J) done by the turning fields on the rotors so far."""
-        return float(self._totals[2])
+        return float(self._arrays.totals[2])
 
     @property
     def max_contact_force(self) -> float:
         """Largest contact force (N) of a wall so far."""
-        return float(self._totals[3])
+        return float(self._arrays.totals[3])
 
     @property
     def sliding(self) -> tuple[bool, bool]:
@@ -201,7 +212,16 @@ class Drivetrain:
 
     def load(self, motor: StepperMotorParameters, load: Load) -> None:
         """Set motor and load from now on."""
-        self._robot = robot_vector(motor, load, self._bumper, self._share, self.step)
+        self._constants = DrivetrainConstants(
+            body_constants(load.body, load.geometry),
+            friction_constants(load.friction, load.friction_factor),
+            self._bumper.constants(),
+            motor.constants(),
+            motor.microstep,
+            self._share,
+            self.step,
+            *load.radius_multipliers,
+        )
         weight = GRAVITY * load.body.total_mass * load.tyres.load_share
         self._grip = 0.5 * load.tyres.grip * weight * load.grip_factor
         own = load.body.wheel_inertia + motor.rotor_inertia
@@ -254,26 +274,18 @@ class Drivetrain:
         if world.patches.size:
             self._tyres[2:] = self._grip * grip_at(x, y, world.patches)
         integrate_drivetrain(
-            self._state,
-            self._modes,
-            self._field,
+            self._arrays,
             wheels.right / self._microstep,
             wheels.left / self._microstep,
             reach / self._microstep,
             volts,
-            self._robot,
+            self._constants,
             self._tyres,
-            disturbance.load,
-            disturbance.angular,
-            disturbance.phases,
-            disturbance.walk,
+            disturbance.signals,
             segments,
             circles,
-            self.filtered,
             self.steps_done,
             count,
-            self._totals,
-            self._work,
         )
         self._read()
         self.steps_done += count
@@ -315,69 +327,87 @@ def max_rate(
     )
 
 
-def body_vector(body: BodyParameters, geometry: WheelGeometry) -> Array:
-    """Return the constants of the body for the kernels, shape (6,).
+class Body(NamedTuple):
+    """Constants of the body, for kernels."""
 
-    R (m), R/(2b) (1), diagonal and off-diagonal entry of (11) without the wheels' own inertia
-    (kg m²), c of (12) (kg m²), distance of the centre of mass ahead of the axle (m).
-    """
-    inertia = wheel_inertia(body, geometry)
-    return np.array(
-        [
-            geometry.wheel_radius,
-            0.5 * geometry.wheel_radius / geometry.half_separation,
-            inertia[0, 0] - body.wheel_inertia,
-            inertia[0, 1],
-            coriolis_factor(body, geometry),
-            body.com_offset,
-        ]
-    )
+    radius: float
+    """R, m"""
+    turn: float
+    """R/(2b)"""
+    diagonal: float
+    """Diagonal entry of (11) without the wheels' own inertia, kg m²."""
+    beside: float
+    """Off-diagonal entry of (11), kg m²."""
+    coriolis: float
+    """c of (12), kg m²"""
+    offset: float
+    """Distance of the centre of mass ahead of the axle, m."""
 
 
-def robot_vector(
-    motor: StepperMotorParameters, load: Load, bumper: BumperParameters, share: float, step: float
-) -> Array:
-    """Return all constants of :func:`integrate_drivetrain` in one row, shape (24,).
+class DrivetrainConstants(NamedTuple):
+    """Constants of :func:`integrate_drivetrain`."""
 
-    body_vector (6); viscous (N m s/rad) and Coulomb friction (N m), its width (rad/s);
-    BumperParameters.vector (3); StepperMotorParameters.vector (7); microstep (rad), share of the
-    IMU filter, length of a step (s); true over nominal radius of each wheel, right first.
-    """
-    friction, factor = load.friction, load.friction_factor
-    friction_row = [factor * friction.viscous, factor * friction.coulomb, friction.coulomb_width]
-    return np.concatenate(
-        [
-            body_vector(load.body, load.geometry),
-            friction_row,
-            bumper.vector(),
-            motor.vector(),
-            [motor.microstep, share, step, *load.radius_multipliers],
-        ]
+    body: Body
+    friction: FrictionConstants
+    bumper: Bumper
+    motor: StepperMotor
+    microstep: float
+    """rad"""
+    share: float
+    """Of the IMU filter."""
+    step: float
+    """s"""
+    wider_right: float
+    """True over nominal radius of the right wheel."""
+    wider_left: float
+
+
+class DrivetrainArrays(NamedTuple):
+    """State of :func:`integrate_drivetrain`, changed in place."""
+
+    state: Array
+    """See :func:`state_derivative`, shape (9,); wheel angles and chi are those of the rotors
+    times the radius multipliers."""
+    modes: Integers
+    """See :data:`ROLLING`, shape (2,)."""
+    field: Array
+    """Phase (pulses), rate (pulses/s), position of pulse 0 (rad), right first, shape (6,)."""
+    filtered: Array
+    """Filter of the IMU, see :func:`low_pass`, shape (3, 2)."""
+    totals: Array
+    """Accumulated, shape (4,): distance (m) slid by each tyre, work (J) of the fields; largest
+    force (N) of a wall."""
+    work: Array
+    """Work space, shape (4, 9)."""
+
+
+def body_constants(body: BodyParameters, geometry: WheelGeometry) -> Body:
+    """Return the constants of the body for the kernels."""
+    diagonal, beside = wheel_inertia(body, geometry)[0].tolist()
+    return Body(
+        geometry.wheel_radius,
+        0.5 * geometry.wheel_radius / geometry.half_separation,
+        diagonal - body.wheel_inertia,
+        beside,
+        coriolis_factor(body, geometry),
+        body.com_offset,
     )
 
 
 @kernel
 def integrate_drivetrain(
-    state: Array,
-    modes: Integers,
-    field: Array,
+    arrays: DrivetrainArrays,
     target_right: float,
     target_left: float,
     reach: float,
     volts: float,
-    robot: Array,
+    constants: DrivetrainConstants,
     tyres: Array,
-    load: Array,
-    angular: Array,
-    phases: Array,
-    walk: Array,
+    disturbance: DisturbanceSignals,
     segments: Array,
     circles: Array,
-    filtered: Array,
     first: int,
     count: int,
-    totals: Array,
-    work: Array,
 ) -> None:
     """Integrate rotors, tyres and body over ``count`` steps by the classical Runge-Kutta method.
 
@@ -387,23 +417,17 @@ def integrate_drivetrain(
     straight line with its mean and its slope. Tyres change between rolling and sliding at the end
     of a step.
 
-    state : shape (9,), see state_derivative; wheel angles and chi are those of the rotors times
-        the radius multipliers; modes : shape (2,); both changed in place
-    field : shape (6,), phase (pulses), rate (pulses/s), position of pulse 0 (rad); right first
     target_* : target pulse rates (pulses/s); reach : largest change of a rate (pulses/s²)
     volts : supply voltage; 0 = no power, the rotors turn freely
-    robot : shape (24,), see robot_vector
-    tyres, segments, circles : see motion_rates
-    load, angular, phases, walk : see disturbance_torque
-    filtered : shape (3, 2), the filter of the IMU, see low_pass; changed in place
+    tyres, segments, circles : see state_derivative
     first : number of the first step since the start; the time is first times step
-    totals : shape (4,), accumulated: distance (m) slid by each tyre, work (J) of the fields;
-        largest force (N) of a wall
-    work : shape (4, 9), overwritten
     """
-    body, friction, bumper, motor = robot[0:6], robot[6:9], robot[9:12], robot[12:19]
-    microstep, share, step = robot[19], robot[20], robot[21]
-    wider_right, wider_left = robot[22], robot[23]
+    state, modes, field, totals = arrays.state, arrays.modes, arrays.field, arrays.totals
+    body, motor = constants.body, constants.motor
+    viscous, coulomb, width = constants.friction
+    bumper, microstep, step = constants.bumper, constants.microstep, constants.step
+    wider_right, wider_left = constants.wider_right, constants.wider_left
+    work = arrays.work
     trial, slope, total = work[0], work[1], work[2]
     torque, pushed = work[3, 0:2], work[3, 2:5]
     for index in range(first, first + count):
@@ -424,8 +448,8 @@ def integrate_drivetrain(
         peak_right = pull_out_torque(mean_right * microstep, volts, motor)
         peak_left = pull_out_torque(mean_left * microstep, volts, motor)
         time = (index + 0.5) * step
-        against_right = disturbance_torque(0, time, load, angular, phases, walk)
-        against_left = disturbance_torque(1, time, load, angular, phases, walk)
+        against_right = disturbance_torque(0, time, disturbance)
+        against_left = disturbance_torque(1, time, disturbance)
         slope[:] = 0.0
         total[:] = 0.0
         done = 0.0
@@ -453,8 +477,8 @@ def integrate_drivetrain(
             done += weight * microstep * (pull_right * mean_right + pull_left * mean_left)
             torque[0] = pull_right - against_right
             torque[1] = pull_left - against_left
-            torque[0] -= friction_torque(rotor_right, friction[0], friction[1], friction[2])
-            torque[1] -= friction_torque(rotor_left, friction[0], friction[1], friction[2])
+            torque[0] -= friction_torque(rotor_right, viscous, coulomb, width)
+            torque[1] -= friction_torque(rotor_left, viscous, coulomb, width)
             torque[0] /= wider_right
             torque[1] /= wider_left
             state_derivative(
@@ -479,15 +503,15 @@ def integrate_drivetrain(
             state_derivative(
                 state, modes, torque, body, tyres, bumper, segments, circles, slope, pushed
             )
-        radius, offset = body[0], body[5]
+        radius, offset = body.radius, body.offset
         speed = 0.5 * radius * (state[7] + state[8])
-        turning = body[1] * (state[7] - state[8])
+        turning = body.turn * (state[7] - state[8])
         low_pass(
-            filtered,
+            arrays.filtered,
             turning,
             0.5 * radius * (slope[7] + slope[8]) - offset * turning * turning,
-            speed * turning + offset * body[1] * (slope[7] - slope[8]),
-            share,
+            speed * turning + offset * body.turn * (slope[7] - slope[8]),
+            constants.share,
         )
         totals[0] += 0.5 * step * radius * abs(slip_right + state[5] - state[7])
         totals[1] += 0.5 * step * radius * abs(slip_left + state[6] - state[8])
@@ -500,9 +524,9 @@ def state_derivative(
     now: Array,
     modes: Integers,
     torque: Array,
-    body: Array,
+    body: Body,
     tyres: Array,
-    bumper: Array,
+    bumper: Bumper,
     segments: Array,
     circles: Array,
     slope: Array,
@@ -513,13 +537,12 @@ def state_derivative(
     now : shape (9,), x, y (m), P, theta_R, theta_L (rad), chi and psi (rad/s, right first)
     modes : shape (2,), see ROLLING
     torque : shape (2,), motor minus friction and disturbance, N m
-    body : shape (6,), see body_vector
     tyres : shape (4,), inertia of each wheel (kg m²), largest force of each tyre (N)
     bumper, segments, circles : see contact_force; empty arrays = no wall is near
     slope : shape (9,), written
     pushed : shape (3,), written: R F of both tyres (N m), force of the wall along the robot (N)
     """
-    radius, turn = body[0], body[1]
+    radius, turn = body.radius, body.turn
     right, left = now[7], now[8]
     along, angular = 0.5 * radius * (right + left), turn * (right - left)
     cosine, sine = math.cos(now[2]), math.sin(now[2])
@@ -529,12 +552,12 @@ def state_derivative(
             now[0], now[1], along * cosine, along * sine, bumper, segments, circles
         )
         wall = push_x * cosine + push_y * sine
-    pull = body[4] * angular
+    pull = body.coriolis * angular
     outer_right = 0.5 * radius * wall - pull * left
     outer_left = 0.5 * radius * wall + pull * right
     grip_right = radius * tyres[2] * modes[0]
     grip_left = radius * tyres[3] * modes[1]
-    own_right, own_left = body[2], body[2]
+    own_right, own_left = body.diagonal, body.diagonal
     drive_right, drive_left = outer_right + grip_right, outer_left + grip_left
     if modes[0] == ROLLING:
         own_right += tyres[0]
@@ -542,7 +565,7 @@ def state_derivative(
     if modes[1] == ROLLING:
         own_left += tyres[1]
         drive_left = outer_left + torque[1]
-    beside = body[3]
+    beside = body.beside
     determinant = own_right * own_left - beside * beside
     rate_right = (own_left * drive_right - beside * drive_left) / determinant
     rate_left = (own_right * drive_left - beside * drive_right) / determinant
@@ -555,29 +578,29 @@ def state_derivative(
     slope[6] = rate_left if modes[1] == ROLLING else (torque[1] - grip_left) / tyres[1]
     slope[7] = rate_right
     slope[8] = rate_left
-    pushed[0] = body[2] * rate_right + beside * rate_left - outer_right
-    pushed[1] = beside * rate_right + body[2] * rate_left - outer_left
+    pushed[0] = body.diagonal * rate_right + beside * rate_left - outer_right
+    pushed[1] = beside * rate_right + body.diagonal * rate_left - outer_left
     pushed[2] = wall
 
 
 @kernel
-def begin_rolling(state: Array, modes: Integers, body: Array, tyres: Array) -> None:
+def begin_rolling(state: Array, modes: Integers, body: Body, tyres: Array) -> None:
     """Give body and wheel of a tyre that begins to roll one speed, with momentum conserved.
 
     A tyre whose chi and psi are equal is unchanged.
     """
-    right = body[2] * state[7] + body[3] * state[8]
-    left = body[3] * state[7] + body[2] * state[8]
-    own_right, own_left = body[2], body[2]
+    right = body.diagonal * state[7] + body.beside * state[8]
+    left = body.beside * state[7] + body.diagonal * state[8]
+    own_right, own_left = body.diagonal, body.diagonal
     if modes[0] == ROLLING:
         right += tyres[0] * state[5]
         own_right += tyres[0]
     if modes[1] == ROLLING:
         left += tyres[1] * state[6]
         own_left += tyres[1]
-    determinant = own_right * own_left - body[3] * body[3]
-    state[7] = (own_left * right - body[3] * left) / determinant
-    state[8] = (own_right * left - body[3] * right) / determinant
+    determinant = own_right * own_left - body.beside * body.beside
+    state[7] = (own_left * right - body.beside * left) / determinant
+    state[8] = (own_right * left - body.beside * right) / determinant
     if modes[0] == ROLLING:
         state[5] = state[7]
     if modes[1] == ROLLING:
@@ -596,11 +619,11 @@ def stops_sliding(state: Array, modes: Integers) -> bool:
 
 
 @kernel
-def loses_grip(modes: Integers, pushed: Array, body: Array, tyres: Array) -> bool:
+def loses_grip(modes: Integers, pushed: Array, body: Body, tyres: Array) -> bool:
     """Return whether the force of a rolling tyre exceeded its grip; it slides from now on."""
     changed = False
     for wheel in range(2):
-        if modes[wheel] == ROLLING and abs(pushed[wheel]) > body[0] * tyres[2 + wheel]:
+        if modes[wheel] == ROLLING and abs(pushed[wheel]) > body.radius * tyres[2 + wheel]:
             modes[wheel] = 1 if pushed[wheel] > 0.0 else -1
             changed = True
     return changed

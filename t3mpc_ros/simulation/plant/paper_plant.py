@@ -4,6 +4,7 @@
 
 from dataclasses import dataclass, replace
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -25,10 +26,13 @@ from t3mpc_ros.simulation.fixed_step import FixedStepRobot
 from t3mpc_ros.simulation.plant.disturbances import (
     Disturbance,
     DisturbanceParameters,
+    DisturbanceSignals,
+    FrictionConstants,
     FrictionParameters,
     NoiseParameters,
     SpeedNoise,
     disturbance_torque,
+    friction_constants,
     friction_torque,
     make_generators,
 )
@@ -355,11 +359,14 @@ class PaperPlant:
         self.steps_done = 0
         """Integration steps since the start: the time base of the disturbances."""
         self._torque_mode = parameters.kind == 'torque'
-        self._commands: Array = np.zeros((round(parameters.dead_time / step), 2))
-        self._cursor = np.zeros(1, dtype=np.int64)
-        self._limited: Array = np.zeros(2)
-        self._state: Array = np.zeros(7)
-        self._work: Array = np.zeros((3, 7))
+        self._arrays = PlantArrays(
+            state=np.zeros(7),
+            commands=np.zeros((round(parameters.dead_time / step), 2)),
+            cursor=np.zeros(1, dtype=np.int64),
+            limited=np.zeros(2),
+            work=np.zeros((3, 7)),
+        )
+        self._state = self._arrays.state
 
     @property
     def pose(self) -> Pose:
@@ -391,14 +398,10 @@ class PaperPlant:
     ) -> None:
         """Set the constants from now on; ``bodies`` are the nominal and the true one."""
         nominal, true = bodies
-        self._drive = drive_vector(parameters, nominal, geometry)
-        self._dynamics = dynamics_vector(true, geometry)
-        self._friction: Array = np.array(
-            [
-                friction_factor * friction.viscous,
-                friction_factor * friction.coulomb,
-                friction.coulomb_width,
-            ]
+        self._constants = PlantConstants(
+            drive_constants(parameters, nominal, geometry),
+            dynamics_vector(true, geometry),
+            friction_constants(friction, friction_factor),
         )
 
     def run(
@@ -413,47 +416,73 @@ class PaperPlant:
         Torques (N m) for a torque drive unless ``braking``, otherwise wheel speeds (rad/s).
         """
         integrate_plant(
-            self._state,
+            self._arrays,
             self._torque_mode and not braking,
             command[0],
             command[1],
-            self._commands,
-            self._cursor,
-            self._limited,
-            self._drive,
-            self._dynamics,
-            self._friction,
-            disturbance.load,
-            disturbance.angular,
-            disturbance.phases,
-            disturbance.walk,
+            self._constants,
+            disturbance.signals,
             self.steps_done,
             count,
             self.step,
-            self._work,
         )
         self._state[2] = wrap_angle(self._state[2])
         self.steps_done += count
 
 
-def drive_vector(
-    parameters: DriveParameters, body: BodyParameters, geometry: WheelGeometry
-) -> Array:
-    """Return the drive constants of the kernels, shape (6,).
+class DriveConstants(NamedTuple):
+    """Constants of the drive, for kernels."""
 
-    Diagonal and off-diagonal entry of the nominal (11) (kg m²), lag (s), acceleration (rad/s²),
-    torque limit (N m), speed ceiling (rad/s).
-    """
-    nominal = wheel_inertia(body, geometry)
-    return np.array(
-        [
-            nominal[0, 0],
-            nominal[0, 1],
-            parameters.lag,
-            parameters.acceleration,
-            parameters.torque_limit,
-            parameters.speed_ceiling,
-        ]
+    diagonal: float
+    """Diagonal entry of the nominal (11), kg m²."""
+    beside: float
+    """Off-diagonal entry of the nominal (11), kg m²."""
+    lag: float
+    """s"""
+    acceleration: float
+    """rad/s², 0 = no limit."""
+    torque_limit: float
+    """N m"""
+    speed_ceiling: float
+    """rad/s"""
+
+
+class PlantConstants(NamedTuple):
+    """Constants of :func:`integrate_plant`."""
+
+    drive: DriveConstants
+    dynamics: Array
+    """See :func:`dynamics_vector`."""
+    friction: FrictionConstants
+
+
+class PlantArrays(NamedTuple):
+    """State of :func:`integrate_plant`, changed in place."""
+
+    state: Array
+    """x, y (m), P, theta_R, theta_L (rad), chi (rad/s), shape (7,)."""
+    commands: Array
+    """Delayed wheel speeds, shape (n, 2), see :func:`delay_command`."""
+    cursor: npt.NDArray[np.int64]
+    """The next row of ``commands``, shape (1,)."""
+    limited: Array
+    """Delayed command after the acceleration limit, shape (2,)."""
+    work: Array
+    """Work space, shape (3, 7)."""
+
+
+def drive_constants(
+    parameters: DriveParameters, body: BodyParameters, geometry: WheelGeometry
+) -> DriveConstants:
+    """Return the drive constants of the kernels for the nominal body."""
+    diagonal, beside = wheel_inertia(body, geometry)[0].tolist()
+    return DriveConstants(
+        diagonal,
+        beside,
+        parameters.lag,
+        parameters.acceleration,
+        parameters.torque_limit,
+        parameters.speed_ceiling,
     )
 
 
@@ -480,20 +509,18 @@ def max_rate(
 
 @kernel
 def servo_torque(
-    right: float, left: float, wanted_right: float, wanted_left: float, drive: Array
+    right: float, left: float, wanted_right: float, wanted_left: float, drive: DriveConstants
 ) -> tuple[float, float]:
     """Return the torques (N m) that bring chi to the wanted speeds with the nominal lag.
 
     theta_bar_nominal (wanted - chi)/lag: with the nominal body and without friction and
     disturbance, (10) becomes chi' = (wanted - chi)/lag.
-
-    drive : shape (6,), see :func:`drive_vector`
     """
-    pull_right = (wanted_right - right) / drive[2]
-    pull_left = (wanted_left - left) / drive[2]
+    pull_right = (wanted_right - right) / drive.lag
+    pull_left = (wanted_left - left) / drive.lag
     return (
-        clamp(drive[0] * pull_right + drive[1] * pull_left, drive[4]),
-        clamp(drive[0] * pull_left + drive[1] * pull_right, drive[4]),
+        clamp(drive.diagonal * pull_right + drive.beside * pull_left, drive.torque_limit),
+        clamp(drive.diagonal * pull_left + drive.beside * pull_right, drive.torque_limit),
     )
 
 
@@ -524,42 +551,28 @@ def delay_command(
 
 @kernel
 def integrate_plant(
-    state: Array,
+    arrays: PlantArrays,
     torque_mode: bool,
     right: float,
     left: float,
-    commands: Array,
-    cursor: npt.NDArray[np.int64],
-    limited: Array,
-    drive: Array,
-    dynamics: Array,
-    friction: Array,
-    load: Array,
-    angular: Array,
-    phases: Array,
-    walk: Array,
+    constants: PlantConstants,
+    disturbance: DisturbanceSignals,
     first: int,
     count: int,
     step: float,
-    work: Array,
 ) -> None:
     r"""Integrate (3), (8) and (10) over ``count`` substeps by the classical Runge-Kutta method.
 
     .. math:: \dot q = \varsigma(q) \chi, \qquad
               \bar\theta \dot\chi = \tau - \bar\eta \chi - f(\chi) - \tau_d(t)
 
-    state : shape (7,), x, y (m), P, theta_R, theta_L (rad), chi (rad/s); changed in place
     torque_mode : whether (right, left) are torques (N m) or wheel speeds for the servo (rad/s)
-    commands : shape (n, 2), delayed wheel speeds, see delay_command
-    cursor : shape (1,), the next row of commands; changed in place
-    limited : shape (2,), delayed command after the acceleration limit; changed in place
-    drive, dynamics : see drive_vector, dynamics_vector
-    friction : shape (3,), viscous (N m s/rad), Coulomb (N m), width (rad/s)
-    load, angular, phases, walk : see disturbance_torque
     first : number of the first substep since the start; the time is first times step
     step : s
-    work : shape (3, 7), overwritten
     """
+    state, limited, work = arrays.state, arrays.limited, arrays.work
+    drive, dynamics = constants.drive, constants.dynamics
+    viscous, coulomb, width = constants.friction
     trial, slope, total = work[0], work[1], work[2]
     radius, turn = dynamics[0], dynamics[1]
     for index in range(first, first + count):
@@ -567,7 +580,7 @@ def integrate_plant(
         if torque_mode:
             limited[0], limited[1] = state[5], state[6]
         else:
-            target_right, target_left = delay_command(right, left, commands, cursor)
+            target_right, target_left = delay_command(right, left, arrays.commands, arrays.cursor)
         slope[:] = 0.0
         total[:] = 0.0
         for stage in range(4):
@@ -578,21 +591,21 @@ def integrate_plant(
                 trial[item] = state[item] + part * step * slope[item]
             chi_right, chi_left = trial[5], trial[6]
             if torque_mode:
-                torque_right = clamp(right, drive[4])
-                torque_left = clamp(left, drive[4])
+                torque_right = clamp(right, drive.torque_limit)
+                torque_left = clamp(left, drive.torque_limit)
             else:
                 # The limit is a ramp within the substep too, not a staircase.
-                reach = drive[3] * part * step if drive[3] > 0.0 else -1.0
+                reach = drive.acceleration * part * step if drive.acceleration > 0.0 else -1.0
                 wanted_right, wanted_left = ramp_towards(
                     limited[0], limited[1], target_right, target_left, reach
                 )
                 torque_right, torque_left = servo_torque(
                     chi_right, chi_left, wanted_right, wanted_left, drive
                 )
-            torque_right -= friction_torque(chi_right, friction[0], friction[1], friction[2])
-            torque_left -= friction_torque(chi_left, friction[0], friction[1], friction[2])
-            torque_right -= disturbance_torque(0, time, load, angular, phases, walk)
-            torque_left -= disturbance_torque(1, time, load, angular, phases, walk)
+            torque_right -= friction_torque(chi_right, viscous, coulomb, width)
+            torque_left -= friction_torque(chi_left, viscous, coulomb, width)
+            torque_right -= disturbance_torque(0, time, disturbance)
+            torque_left -= disturbance_torque(1, time, disturbance)
             along = 0.5 * radius * (chi_right + chi_left)
             slope[0] = along * math.cos(trial[2])
             slope[1] = along * math.sin(trial[2])
@@ -606,10 +619,10 @@ def integrate_plant(
                 total[item] += weight * slope[item]
         for item in range(7):
             state[item] += step * total[item]
-        state[5] = clamp(state[5], drive[5])
-        state[6] = clamp(state[6], drive[5])
+        state[5] = clamp(state[5], drive.speed_ceiling)
+        state[6] = clamp(state[6], drive.speed_ceiling)
         if not torque_mode:
-            reach = drive[3] * step if drive[3] > 0.0 else -1.0
+            reach = drive.acceleration * step if drive.acceleration > 0.0 else -1.0
             limited[0], limited[1] = ramp_towards(
                 limited[0], limited[1], target_right, target_left, reach
             )

@@ -10,16 +10,31 @@ lost. T falls with the field speed because winding impedance and back-EMF reduce
 
 from dataclasses import dataclass
 import math
-
-import numpy as np
-import numpy.typing as npt
+from typing import NamedTuple
 
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 
-Array = npt.NDArray[np.float64]
-
 _MOTOR = '17HS4401 data sheet'
+
+
+class StepperMotor(NamedTuple):
+    """Constants of a motor, for kernels."""
+
+    teeth: float
+    """N, stable positions per turn."""
+    torque_constant: float
+    """N m/A"""
+    resistance: float
+    """Ohm"""
+    inductance: float
+    """H"""
+    current: float
+    """Set in the driver, A."""
+    damping: float
+    """N m s/rad"""
+    damping_width: float
+    """rad/s"""
 
 
 @dataclass(frozen=True)
@@ -101,22 +116,16 @@ class StepperMotorParameters(Parameters):
         """Largest wheel speed (rad/s) of the pulse generator."""
         return self.step_rate * self.microstep
 
-    def vector(self) -> Array:
-        """Return the constants of the kernels, shape (7,).
-
-        N (1), torque constant (N m/A), resistance (Ohm), inductance (H), current (A),
-        damping (N m s/rad), its width (rad/s).
-        """
-        return np.array(
-            [
-                self.teeth,
-                self.torque_constant,
-                self.resistance,
-                self.inductance,
-                self.phase_current,
-                self.damping,
-                self.damping_width,
-            ]
+    def constants(self) -> StepperMotor:
+        """Return the constants of the kernels."""
+        return StepperMotor(
+            self.teeth,
+            self.torque_constant,
+            self.resistance,
+            self.inductance,
+            self.phase_current,
+            self.damping,
+            self.damping_width,
         )
 
     def check_consistency(self) -> None:
@@ -129,7 +138,7 @@ class StepperMotorParameters(Parameters):
 
 
 @kernel
-def pull_out_torque(field_speed: float, volts: float, motor: Array) -> float:
+def pull_out_torque(field_speed: float, volts: float, motor: StepperMotor) -> float:
     r"""Return the largest torque (N m) at a field speed (rad/s), 0 when the back-EMF is too high.
 
     At pull-out the current is in phase with the back-EMF, so the supply voltage is
@@ -140,29 +149,27 @@ def pull_out_torque(field_speed: float, volts: float, motor: Array) -> float:
     in the driver. Source: Acarnley, Stepping Motors, 4th ed., chapter on pull-out torque.
 
     volts : supply (V)
-    motor : shape (7,), see :meth:`StepperMotorParameters.vector`
     """
     speed = abs(field_speed)
-    teeth, constant, resistance, inductance = motor[0], motor[1], motor[2], motor[3]
+    constant, resistance = motor.torque_constant, motor.resistance
     emf = constant * speed
     if emf >= volts:
         return 0.0
-    reactance = teeth * speed * inductance
+    reactance = motor.teeth * speed * motor.inductance
     impedance = resistance * resistance + reactance * reactance
     drop = resistance * emf
     room = drop * drop + impedance * (volts * volts - emf * emf)
     current = (math.sqrt(room) - drop) / impedance
-    return float(constant * min(current, motor[4]))
+    return float(constant * min(current, motor.current))
 
 
 @kernel
-def rotor_torque(ahead: float, faster: float, peak: float, motor: Array) -> float:
+def rotor_torque(ahead: float, faster: float, peak: float, motor: StepperMotor) -> float:
     """Return the torque (N m) on a rotor with its field ``ahead`` (rad) and ``faster`` (rad/s).
 
     peak : the pull-out torque at this speed, 0 without power
-    motor : shape (7,), see :meth:`StepperMotorParameters.vector`
     """
     if peak <= 0.0:
         return 0.0
-    fade = 1.0 + (faster / motor[6]) * (faster / motor[6])
-    return float(peak * math.sin(motor[0] * ahead) + motor[5] * faster / (fade * fade))
+    fade = 1.0 + (faster / motor.damping_width) * (faster / motor.damping_width)
+    return float(peak * math.sin(motor.teeth * ahead) + motor.damping * faster / (fade * fade))
