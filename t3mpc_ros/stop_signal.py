@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stop signal: SIGINT, SIGTERM and SIGHUP as a flag that a program polls."""
 
+import os
 import signal
 from types import FrameType
 from typing import Self
@@ -10,25 +11,35 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopSignal:
-    """True after the first signal; installs its handlers for the length of a ``with`` block."""
+    """True after the first signal; a ``with`` block restores the handlers from before."""
 
     def __init__(self) -> None:
-        self._received = False
         self.number = 0
         """Number of the first signal; 0 before."""
+        self.exit_at_once = False
+        """While True a signal ends the process with code 0: there is nothing to clean up."""
 
     def __call__(self) -> bool:
         """Return whether a signal was received."""
-        return self._received
+        return self.number != 0
 
-    def __enter__(self) -> Self:
-        self._previous = [signal.signal(number, self._handle) for number in SIGNALS]
+    def install(self) -> Self:
+        """Install the handlers; a hangup that is ignored, as after nohup, stays ignored."""
+        self._previous = {
+            number: signal.signal(number, self._handle)
+            for number in SIGNALS
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN
+        }
         return self
 
+    __enter__ = install
+
     def __exit__(self, *error: object) -> None:
-        for number, handler in zip(SIGNALS, self._previous, strict=True):
+        for number, handler in self._previous.items():
             signal.signal(number, handler)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        self._received = True
         self.number = self.number or number
+        if self.exit_at_once:
+            # An exception would be lost, with a traceback, if Python is in a __del__.
+            os._exit(0)

@@ -222,7 +222,7 @@ class RadioRobot(RobotInterface):
         if limited_command.reason and wheels == ZERO_WHEEL_SPEEDS:
             self.link.stop(limited_command.reason)
         else:
-            self.link.command(RobotCommand(wheels, now_ns), now_ns, valid_ns)
+            self.link.command(wheels, self._expiry_ns)
 
     def _stops_gently(self) -> bool:
         """Return whether the stop of the host is slower than that of the board."""

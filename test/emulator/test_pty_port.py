@@ -21,7 +21,6 @@ from t3mpc_ros.radio.link.link import Link
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.port_actions import Close, LinkState, Open, Wait, Write
 from t3mpc_ros.radio.serial_port import PortError, SerialPort
-from t3mpc_ros.robot.interface import RobotCommand
 
 ROOT = Path(__file__).resolve().parents[2]
 KEY = bytes(range(16))
@@ -43,7 +42,7 @@ class Host:
         while time.monotonic() < end:
             now = time.monotonic_ns()
             if self.wheels is not None:
-                self.link.command(RobotCommand(self.wheels, now), now)
+                self.link.command(self.wheels, now + 250_000_000)
             wake = now
             actions = self.link.step(now, received)
             received = b''

@@ -29,8 +29,13 @@ def _start(processes, name, bag):
     processes.wait_ready(name)
 
 
-@pytest.mark.parametrize('name', EXECUTABLES)
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    'name, number',
+    [
+        *((name, number) for name in EXECUTABLES for number in (signal.SIGINT, signal.SIGTERM)),
+        ('sim_robot', signal.SIGHUP),
+    ],
+)
 def test_each_executable_starts_and_ends_with_code_0(
     name, number, processes, tmp_path, monkeypatch
 ):

@@ -6,7 +6,7 @@ import math
 import random
 
 import pytest
-from support.radio_bench import LinkBench
+from support.radio_bench import COMMAND_TIME, LinkBench
 
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError
@@ -31,8 +31,9 @@ class RobotAsLink:
         self.states += self.host.take_states()
         return actions
 
-    def command(self, command, now_ns):
-        return self.host.apply(command, now_ns)
+    def command(self, wheels, until_ns):
+        now_ns = until_ns - COMMAND_TIME
+        self.host.apply(RobotCommand(wheels, now_ns), now_ns)
 
     def __getattr__(self, name):
         return getattr(self.host.link, name)

@@ -138,7 +138,7 @@ class Bench:
         return self.link.step(self.now_ns, received)
 
     def _send_setpoint(self, command):
-        self.link.command(command, self.now_ns)
+        self.link.command(command.wheels, command.stamp_ns + 250 * MS)
 
     def drive(self, right, left):
         """Command these wheel speeds 50 times a second from now on."""

@@ -14,9 +14,9 @@ from t3mpc_ros.radio.protocol.authentication import CommandVerifier
 from t3mpc_ros.radio.protocol.codec import decode_downlink, decode_to_dongle, encode
 from t3mpc_ros.radio.protocol.frames import BOARD_PARAMETERS, CommandFlag, StatusFlag
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
-from t3mpc_ros.robot.interface import RobotCommand
 
 MS = 1_000_000
+COMMAND_TIME = 250 * MS
 STEP = math.tau / 3200
 WRAP = 1 << 32
 
@@ -340,7 +340,7 @@ class LinkBench:
     def _command(self):
         if self.wheels is not None and self.now_ns >= self.commanded_ns + 20 * MS:
             self.commanded_ns = self.now_ns
-            self.link.command(RobotCommand(self.wheels, self.now_ns), self.now_ns)
+            self.link.command(self.wheels, self.now_ns + COMMAND_TIME)
 
     def _do(self, actions):
         assert isinstance(actions[-1], Wait)

@@ -9,9 +9,7 @@ functions.
 
 from collections.abc import Sequence
 import os
-import signal
 import sys
-from types import FrameType
 from typing import TYPE_CHECKING, NoReturn
 
 from t3mpc_ros.missing_library import remedy
@@ -22,6 +20,7 @@ from t3mpc_ros.nodes.arguments import (
     unmatched_files,
 )
 from t3mpc_ros.nodes.registry import node_module
+from t3mpc_ros.stop_signal import StopSignal
 
 if TYPE_CHECKING:
     from t3mpc_ros.nodes.common.base_node import BaseNode
@@ -65,37 +64,16 @@ def composed() -> NoReturn:
     _main('composed')
 
 
-class StopRequest:
-    """Whether SIGINT or SIGTERM was received."""
-
-    def __init__(self) -> None:
-        self.received = False
-        self.starting = True
-        """While True a signal ends the process at once: no robot moves and no file is open."""
-
-    def install(self) -> None:
-        """Install the handler of SIGINT and SIGTERM."""
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._handle)
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        self.received = True
-        if self.starting:
-            # An exception would be lost, with a traceback, if Python is in a __del__; there is
-            # nothing to clean up yet.
-            os._exit(0)
-
-
 def _main(name: str) -> NoReturn:
     """Run an executable and end the process at once.
 
     The robot is stopped and the files are closed when :func:`run` returns. The teardown of the
     interpreter would take half a second more, in which launch sends SIGTERM on a busy machine.
     """
-    request = StopRequest()
-    request.install()
+    stop = StopSignal().install()
+    stop.exit_at_once = True  # no robot moves yet, and no file is open
     try:
-        code = run(name, request, sys.argv)
+        code = run(name, stop, sys.argv)
     except ModuleNotFoundError as error:
         if not (problem := remedy(error)):
             raise
@@ -106,12 +84,12 @@ def _main(name: str) -> NoReturn:
     os._exit(code)
 
 
-def run(name: str, request: StopRequest, argv: Sequence[str]) -> int:
-    """Spin the nodes of an executable until a stop request; return the exit code of the process.
+def run(name: str, stop: StopSignal, argv: Sequence[str]) -> int:
+    """Spin the nodes of an executable until a signal; return the exit code of the process.
 
-    0 after SIGINT or SIGTERM, with the robot stopped, after a node has requested the exit, and
-    for ``--help`` and ``--version``; 2 for an unusable parameter, parameter file or command line,
-    with one line on standard error that names it and the reason.
+    0 after SIGINT, SIGTERM or SIGHUP, with the robot stopped, after a node has requested the
+    exit, and for ``--help`` and ``--version``; 2 for an unusable parameter, parameter file or
+    command line, with one line on standard error that names it and the reason.
     """
     if text := information(name, argv):
         print(text)
@@ -145,15 +123,15 @@ def run(name: str, request: StopRequest, argv: Sequence[str]) -> int:
             for node in nodes:
                 node.get_logger().warning(problem)
                 node.start_warnings.append(problem)
-        request.starting = False
-        if not request.received:
-            _spin(nodes, request)
+        stop.exit_at_once = False
+        if not stop():
+            _spin(nodes, stop)
     except configuration_errors as error:
         return _usage_error(name, str(error))
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
-        request.starting = False
+        stop.exit_at_once = False
         for node in nodes:
             node.on_shutdown()
         for node in nodes:
@@ -162,7 +140,7 @@ def run(name: str, request: StopRequest, argv: Sequence[str]) -> int:
     return max((node.exit_code for node in nodes), default=0)
 
 
-def _spin(nodes: Sequence['BaseNode'], request: StopRequest) -> None:
+def _spin(nodes: Sequence['BaseNode'], stop: StopSignal) -> None:
     from rclpy.executors import SingleThreadedExecutor
 
     executor = SingleThreadedExecutor()
@@ -171,9 +149,7 @@ def _spin(nodes: Sequence['BaseNode'], request: StopRequest) -> None:
         node.get_logger().info(f'{node.get_name()} ready')
     try:
         # A Python signal handler runs only between two calls of the executor.
-        while not request.received and not any(
-            node.exit_code or node.exit_requested for node in nodes
-        ):
+        while not stop() and not any(node.exit_code or node.exit_requested for node in nodes):
             executor.spin_once(timeout_sec=0.1)
     finally:
         for node in nodes:

@@ -35,7 +35,7 @@ from t3mpc_ros.radio.protocol.frames import (
     State,
     StatusFlag,
 )
-from t3mpc_ros.robot.interface import BatteryReading, RobotCommand
+from t3mpc_ros.robot.interface import BatteryReading
 
 _MIN_REOPEN_NS, _MAX_REOPEN_NS = NANOSECONDS // 5, 2 * NANOSECONDS
 _PING_TIMEOUT_NS = _CONFIGURE_RETRY_NS = NANOSECONDS // 10
@@ -356,13 +356,12 @@ class Link:
 
     # -- commands ---------------------------------------------------------------------------------
 
-    def command(self, command: RobotCommand, now_ns: int, valid_ns: int | None = None) -> str:
-        """Follow a command until the next one or its timeout; return why it is rejected.
+    def command(self, wheels: WheelSpeeds, until_ns: int) -> None:
+        """Follow finite wheel speeds (rad/s) until the next ones, or until ``until_ns``.
 
-        ``valid_ns``: time for which it is valid at most; the robot follows it no longer, even if
-        the host dies.
+        The robot follows them no longer, even if the host dies.
         """
-        return self._arbiter.accept(command, now_ns, valid_ns)
+        self._arbiter.command(wheels, until_ns)
 
     def stop(self, reason: str) -> None:
         """Stop until the next command."""

@@ -130,13 +130,6 @@ class LinkParameters(Parameters):
         low=0.02,
         high=0.5,
     )
-    cmd_vel_timeout: float = parameter(
-        0.25,
-        'age of a command at which the link sends standstill instead',
-        unit='s',
-        low=0.02,
-        high=0.5,
-    )
     robot: RobotParameters = group(RobotParameters)
 
     def check_consistency(self) -> None:

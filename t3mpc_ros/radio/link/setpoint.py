@@ -2,14 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Setpoint arbitration: the newest wheel speeds, standstill, or emergency stop."""
 
-import math
 from typing import NamedTuple
 
 from t3mpc_ros.geometry.types import NANOSECONDS, WheelSpeeds
 from t3mpc_ros.radio.link import standstill_reasons as reasons
 from t3mpc_ros.radio.link.link_parameters import TTL_UNIT_NS, LinkParameters
 from t3mpc_ros.radio.protocol.frames import BUSY, OK, Ack, Action, CommandFlag, Uplink
-from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, RobotCommand
+from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS
 
 _RELEASE_TIMEOUT_NS = NANOSECONDS
 """Maximum duration of ESTOP_CLEAR frames."""
@@ -30,18 +29,20 @@ class Setpoint(NamedTuple):
 
 
 class SetpointArbiter:
-    """Selects the setpoint from the newest command, its age and the emergency stop.
+    """Selects the setpoint from the newest wheel speeds and the emergency stop.
+
+    Which commands are followed, and for how long, is decided by the command limiter.
 
     Parameters
     ----------
     parameters
-        Contains ``cmd_vel_timeout`` and ``robot.max_speed``.
+        Contains ``ttl`` and ``robot.max_speed``.
     """
 
     def __init__(self, parameters: LinkParameters) -> None:
         self._parameters = parameters
-        self._command: RobotCommand | None = None
-        self._valid_until_ns = 0
+        self._wheels: WheelSpeeds | None = None
+        self._until_ns = 0
         self._reason = reasons.NO_COMMAND
         self._estop = ''
         self._release_until_ns: int | None = None
@@ -63,33 +64,13 @@ class SetpointArbiter:
         """Wheel speeds of the last setpoint, after every limit."""
         return self._sent_wheels
 
-    def accept(self, command: RobotCommand, now_ns: int, valid_ns: int | None = None) -> str:
-        """Replace the current command; return the reason for a rejection.
-
-        A command that is not finite stops the robot, because the intended value is unknown.
-        ``valid_ns`` limits the time for which it is valid, which ends ``cmd_vel_timeout`` after
-        its stamp in any case.
-        """
-        if not all(map(math.isfinite, command.wheels)):
-            right, left = command.wheels
-            self.clear(f'command is not finite: got {right}, {left} rad/s')
-            return self._reason
-        if self._estop:
-            return self._estop
-        stamp_ns = min(command.stamp_ns, now_ns)
-        if self._command is not None and stamp_ns < self._command.stamp_ns <= now_ns:
-            return 'command is older than the one before it'
-        if now_ns - stamp_ns >= self._timeout_ns:
-            return f'command is too old: {(now_ns - stamp_ns) / NANOSECONDS:.3f} s'
-        self._command = command._replace(stamp_ns=stamp_ns)
-        self._valid_until_ns = stamp_ns + self._timeout_ns
-        if valid_ns is not None:
-            self._valid_until_ns = min(self._valid_until_ns, now_ns + valid_ns)
-        return ''
+    def command(self, wheels: WheelSpeeds, until_ns: int) -> None:
+        """Select finite wheel speeds (rad/s) until ``until_ns``, unless others replace them."""
+        self._wheels, self._until_ns = wheels, until_ns
 
     def clear(self, reason: str) -> None:
         """Select standstill until the next command."""
-        self._command = None
+        self._wheels = None
         self._reason = reason
 
     def latch(self, reason: str) -> None:
@@ -133,18 +114,17 @@ class SetpointArbiter:
                 return Setpoint(CommandFlag.ESTOP_CLEAR, 0, 0, ttl)
             self._button_held = robot_latched
             self._release_until_ns = None
-        if self._command is not None and now_ns >= self._valid_until_ns:
-            self.clear(f'no command for {self._parameters.cmd_vel_timeout:g} s')
-        if self._command is None or robot_latched or robot_silent:
+        if self._wheels is not None and now_ns >= self._until_ns:
+            self.clear(reasons.COMMAND_EXPIRED)
+        if self._wheels is None or robot_latched or robot_silent:
             return Setpoint(CommandFlag.ENABLE, 0, 0, ttl)
-        wheels = self._command.wheels
-        fastest = max(map(abs, wheels))
+        fastest = max(map(abs, self._wheels))
         limit = self._parameters.robot.max_speed
         scale = 1.0 if fastest <= limit else limit / fastest
-        right, left = (round(1000.0 * scale * speed) for speed in wheels)
+        right, left = (round(1000.0 * scale * speed) for speed in self._wheels)
         self._sent_wheels = WheelSpeeds(right / 1000.0, left / 1000.0)
         # If the host dies now, the robot stops when the command expires, not later.
-        ttl = min(ttl, max(1, (self._valid_until_ns - now_ns) // TTL_UNIT_NS))
+        ttl = min(ttl, max(1, (self._until_ns - now_ns) // TTL_UNIT_NS))
         return Setpoint(CommandFlag.ENABLE, left, right, ttl)
 
     def reason(self, robot_latched: bool) -> str:
@@ -153,7 +133,7 @@ class SetpointArbiter:
             return self._estop
         if robot_latched:
             return reasons.ESTOP_BUTTON_HELD if self._button_held else reasons.ROBOT_ESTOP
-        return '' if self._command is not None else self._reason
+        return '' if self._wheels is not None else self._reason
 
     @property
     def pending_action(self) -> int | None:
@@ -182,7 +162,3 @@ class SetpointArbiter:
         self.action_results[action.verb] = reason
         self._requests.pop(0)
         self._attempts = 0
-
-    @property
-    def _timeout_ns(self) -> int:
-        return round(self._parameters.cmd_vel_timeout * NANOSECONDS)

@@ -11,12 +11,14 @@ from t3mpc_ros.geometry.types import NANOSECONDS, WheelSpeeds
 from t3mpc_ros.radio.link.link import Link
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.port_actions import LinkState, PortAction, Wait
-from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, RobotCommand, WheelAngles
+from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, WheelAngles
 
 LEFT, RIGHT = 'left', 'right'
 _CONNECT_TIMEOUT = 15.0
 """Timeout for the start of the dongle and the handshake, s."""
 _PERIOD_NS = NANOSECONDS // 50
+_COMMAND_NS = NANOSECONDS // 4
+"""Time for which a command is followed."""
 _REPORT_DELAY_NS = NANOSECONDS
 """A reason that lasts this long is reported."""
 _ACCELERATION = 8.0
@@ -169,13 +171,13 @@ class Jog:
         size = min(self._speed, max(_FINAL_SPEED, _APPROACH_GAIN * abs(remaining)))
         speed = math.copysign(size, self._angle)
         wheels = WheelSpeeds(speed, 0.0) if self._right else WheelSpeeds(0.0, speed)
-        self.link.command(RobotCommand(wheels, now_ns), now_ns)
+        self.link.command(wheels, now_ns + _COMMAND_NS)
 
     def _finish(self, moving: bool, now_ns: int) -> None:
         """Wait for standstill, then shut the link down."""
         if now_ns >= self._next_ns:
             self._next_ns = now_ns + _PERIOD_NS
-            self.link.command(RobotCommand(ZERO_WHEEL_SPEEDS, now_ns), now_ns)
+            self.link.command(ZERO_WHEEL_SPEEDS, now_ns + _COMMAND_NS)
         if moving or self._standstill_ns is None:
             self._standstill_ns = now_ns
         elif now_ns - self._standstill_ns > _SETTLING_TIME * NANOSECONDS:
