@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 
 import pytest
+from support.processor_wait import ProcessorWait
 
 from t3mpc_ros.cli.private_graph import PrivateGraph
 from t3mpc_ros.cli.process_group import ProcessGroup
@@ -14,6 +15,11 @@ from t3mpc_ros.cli.process_group import ProcessGroup
 ROOT = Path(__file__).resolve().parent
 DEFAULT = ('geometry', 'parameters', 'robot', 'fuzzy', 'test_launch_files.py')
 """What ``colcon test``, and pytest without arguments, runs; scripts/check runs all."""
+
+MAX_WAIT = 0.3
+"""Largest share of the time with work to do that the nodes of a test may wait for a processor."""
+WAIT = pytest.StashKey[ProcessorWait]()
+INCONCLUSIVE = pytest.StashKey[list]()
 
 
 def pytest_addoption(parser):
@@ -58,6 +64,29 @@ def pytest_collection_modifyitems(config, items):
 def _keep(config, items, kept):
     config.hook.pytest_deselected(items=[*{*items} - {*kept}])
     items[:] = kept
+
+
+def pytest_runtest_setup(item):
+    item.stash[WAIT] = ProcessorWait()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item):
+    """A failure of nodes that had no processor is inconclusive: their time is that of the wall."""
+    report = yield
+    share = item.stash[WAIT].share() if report.failed and item.get_closest_marker('ros') else 0.0
+    if share > MAX_WAIT:
+        text = f'{item.nodeid}: its nodes waited for a processor for {share:.0%} of their time'
+        item.config.stash.setdefault(INCONCLUSIVE, []).append(f'{text}\n{report.longreprtext}')
+        report.outcome, report.longrepr = 'skipped', (str(item.path), 0, f'inconclusive: {text}')
+    return report
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    """List what was inconclusive."""
+    if texts := config.stash.get(INCONCLUSIVE, []):
+        terminalreporter.section('inconclusive: the machine is too busy; repeat when it is not')
+        terminalreporter.write_line('\n\n'.join(texts))
 
 
 @pytest.fixture

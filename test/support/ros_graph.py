@@ -20,7 +20,7 @@ from t3mpc_ros.nodes.common import conversions
 from t3mpc_ros.nodes.common.base_node import OK
 from t3mpc_ros.nodes.controller import ControllerNode
 
-TIMEOUT = 30.0
+TIMEOUT = 90.0
 """Timeout of a condition on a busy machine, s; usually a fraction of it passes."""
 
 LATCHED = QoSProfile(
