@@ -17,6 +17,7 @@ import time
 
 import pytest
 from support.launch_files import nodes_of
+from support.long_tests import few_of
 import yaml
 
 from t3mpc_ros.cli.main import _parser as cli_parser
@@ -194,6 +195,7 @@ def test_a_sourced_workspace_runs_its_own_complete_code(tree):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize('tree', few_of(['copied', 'symlinked']), indirect=True)
 def test_every_installed_node_starts_and_exits_with_0(tree, graph):
     for name in NODES:
         with tree.start(name) as node:
@@ -203,6 +205,7 @@ def test_every_installed_node_starts_and_exits_with_0(tree, graph):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize('tree', few_of(['copied', 'symlinked']), indirect=True)
 def test_the_installed_program_computes_lyapunov_exponents(tree):
     done = tree.run('t3mpc', 'exponents', '--duration', '20')
     assert done.returncode == 0, done.stderr
@@ -283,9 +286,12 @@ def test_each_yaml_reaches_its_node_with_and_without_a_namespace(name, copied, r
     files = ['--params-file', str(installed), '--params-file', str(changed)]
     reader = rclpy.create_node('reader')
     try:
-        for namespace in ('', '/robot_1'):
-            remap = ['-r', f'__ns:={namespace}'] if namespace else []
-            with copied.start(name, '--ros-args', *remap, *files) as node:
+        other = ['-r', '__ns:=/robot_1']
+        with (
+            copied.start(name, '--ros-args', *files) as plain,
+            copied.start(name, '--ros-args', *other, *files) as inside,
+        ):
+            for node, namespace in ((plain, ''), (inside, '/robot_1')):
                 node.wait_ready()
                 assert _read_parameter(reader, f'{namespace}/{name}', parameter) == value
                 assert node.interrupt() == 0, node.output()
@@ -600,7 +606,11 @@ def test_each_part_of_the_environment_is_installed_when_needed(checkout):
 @pytest.mark.parametrize(
     'arguments, linted, selected',
     [
-        ((), True, ['not (ros or long)', 'ros and not long']),
+        (
+            (),
+            True,
+            ['not (ros or long)', 'ros and not (alone or long)', 'ros and alone and not long'],
+        ),
         (('--quick',), True, ['not (ros or slow or long)']),
         (('--long',), False, ['long']),
         (('--long', '3/7'), False, ['long --part 3/7']),

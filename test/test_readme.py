@@ -1,9 +1,10 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Every command of the pages works from a shell, in the order of its block.
+"""Every command of the pages works from a shell, in the order of its page.
 
-Blocks marked ``console`` are run. Blocks marked ``sh`` need tools of ROS or apt, hardware, or
-many minutes: their commands are parsed by the program that they start, as are those in the text.
+Blocks marked ``console`` are run: those of the README and the tutorial by every check, those of
+the other pages as long tests. All are parsed by the program that they start, as are the commands
+in the text and in blocks marked ``sh``: these need tools of ROS or apt, hardware, or many minutes.
 """
 
 from contextlib import contextmanager, suppress
@@ -29,6 +30,7 @@ pytestmark = pytest.mark.ros
 
 ROOT = Path(__file__).resolve().parent.parent
 
+DEMO = 'scripts/demo'
 BOARDS = 'scripts/run t3mpc emulator --link dongle --robot-link robot_usb --erased'
 
 # For each command: the additional arguments, and whether it runs until it is stopped.
@@ -40,7 +42,7 @@ CHANGES = '--set twin.faults.load_change=1.5 --set robot_clock_error=0.005'
 FAULTS = '--fault jam:10:1 --fault robot_reset:20 --fault loss:30:10:0.3'
 SHORTENED = {
     # Long enough for training.
-    'scripts/demo': (['--duration', '20', '--headless', '--output', 'OUTPUT/run'], False),
+    DEMO: (['--duration', '20', '--headless', '--output', 'OUTPUT/run'], False),
     'scripts/check': (['--version'], False),  # runs this test
     'scripts/run sim_robot --ros-args -p world:=room': ([], True),
     'scripts/run sim_robot --ros-args -p world:=room -p faults.schedule:=rough_ride': ([], True),
@@ -108,6 +110,8 @@ SHORTENED = {
 }
 
 
+FIRST = ('README.md', 'docs/tutorial.md')
+"""Pages whose commands every check runs."""
 PAGES = ['README.md', *sorted(f'docs/{path.name}' for path in (ROOT / 'docs').glob('*.md'))]
 
 
@@ -228,8 +232,8 @@ def _check(command, capsys, complete=True):
 
 
 @pytest.mark.parametrize('page', PAGES)
-def test_commands_that_are_not_run_are_accepted(page, capsys):
-    for block in _blocks(page, 'sh'):
+def test_the_commands_of_the_page_are_accepted(page, capsys):
+    for block in [*_blocks(page, 'sh'), *_blocks(page, 'console')]:
         for line in block:
             for command in line.split('&&'):
                 _check(command.strip(), capsys)
@@ -288,11 +292,12 @@ def test_the_controller_of_the_tutorial_runs(tmp_path):
 
 @pytest.fixture(scope='module')
 def output(tmp_path_factory):
+    """Return the folder in which the commands of all pages run."""
     return tmp_path_factory.mktemp('readme')
 
 
-@pytest.fixture
-def boards(command, output):
+@contextmanager
+def _boards(command, output):
     """Run the emulated boards for a command that connects to them."""
     if 'emulator' in command or not re.search(r'dongle|robot_usb', command):
         yield
@@ -314,8 +319,34 @@ def boards(command, output):
         assert process.wait(timeout=30) == 0, log.read_text()
 
 
-@pytest.mark.parametrize('command', list(SHORTENED))
-def test_the_command_works(command, output, tmp_path, graph, boards):
+def _commands_by_page():
+    """Return the commands of each page; what several pages have in blocks, of the first alone."""
+    found = {page: [] for page in (*FIRST, *PAGES)}
+    for command in SHORTENED:
+        in_blocks = [p for p in found if any(command in b for b in _blocks(p, 'console'))]
+        in_text = [p for p in found if p not in FIRST and command in (ROOT / p).read_text()]
+        found[[*in_blocks, *in_text][0]].append(command)
+    return {page: commands for page, commands in found.items() if commands}
+
+
+@pytest.mark.parametrize(
+    'page, commands',
+    [
+        pytest.param(page, commands, id=page, marks=() if page in FIRST else pytest.mark.long)
+        for page, commands in _commands_by_page().items()
+    ],
+)
+def test_the_commands_of_the_page_work(page, commands, output, tmp_path, graph):
+    needs_bag = any('runs/latest' in command for command in commands)
+    if needs_bag and DEMO not in commands and not (output / 'run').exists():
+        _work(DEMO, output, tmp_path)
+    for command in commands:
+        with _boards(command, output):
+            _work(command, output, tmp_path)
+
+
+def _work(command, output, tmp_path):
+    """Run a command, and stop one that does not end by itself; fail if it does."""
     extra, endless = SHORTENED[command]
     arguments = shlex.split(command.replace('runs/latest', 'run'))
     arguments += [word.replace('OUTPUT', str(output)) for word in extra]
@@ -331,9 +362,9 @@ def test_the_command_works(command, output, tmp_path, graph, boards):
     # On a busy machine the round trip is long, and ping fails with a report.
     slow = 'ping' in command and 'robot answers' in log.read_text()
     # 3: the file has no end, as the page says.
-    assert code == (3 if 'broken' in command else 0) or slow, log.read_text()
+    assert code == (3 if 'broken' in command else 0) or slow, f'{command}: {log.read_text()}'
     assert 'Traceback' not in log.read_text()
-    if command == 'scripts/demo':
+    if command == DEMO:
         assert (output / 'run' / 'report.html').stat().st_size > 100_000
 
 

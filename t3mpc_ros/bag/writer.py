@@ -106,9 +106,7 @@ class BagWriter:
     Raises
     ------
     FolderError
-        The folder or the file cannot be created; also by :meth:`split` and :meth:`write`.
-    DiskError
-        Writing failed; by every method, once.
+        The folder or the file cannot be created.
     DataError
         ``metadata_records`` contains values other than text, or a record called ``rosbag2``.
     """
@@ -186,7 +184,15 @@ class BagWriter:
             self._register(topic)
 
     def add_metadata_record(self, title: str, table: Mapping[str, str]) -> None:
-        """Write a metadata record to this and all later files; it replaces one of its title."""
+        """Write a metadata record to this and all later files; it replaces one of its title.
+
+        Raises
+        ------
+        DataError
+            As the constructor.
+        DiskError
+            As :meth:`write`.
+        """
         check_metadata_records({title: table})
         self._metadata_records[title] = dict(table)
         if self._is_open():
@@ -194,7 +200,13 @@ class BagWriter:
                 self._writer.add_metadata(title, dict(table))
 
     def add_attachment(self, attachment: Attachment, read_ns: int) -> None:
-        """Write an attachment to this and all later files, with the time at which it was read."""
+        """Write an attachment to this and all later files, with the time at which it was read.
+
+        Raises
+        ------
+        DiskError
+            As :meth:`write`.
+        """
         self._attachments[attachment.name] = attachment, read_ns
         if self._is_open():
             item = attachment
@@ -225,6 +237,8 @@ class BagWriter:
             No definition of the type is available.
         DataError
             The topic was added with another type.
+        DiskError
+            As :meth:`write`.
         """
         if known := self._topics.get(name):
             if known.type_name != type_name:
@@ -311,6 +325,11 @@ class BagWriter:
 
         A power failure loses the messages of ``chunk_ns`` and :data:`SYNC_PERIOD_NS`, provided
         that this is called often. ``now_ns`` is a time of any monotonic clock.
+
+        Raises
+        ------
+        DiskError
+            As :meth:`write`.
         """
         if self._chunk_start_ns is None:
             self._chunk_seen = None
@@ -324,7 +343,13 @@ class BagWriter:
             self._synced_ns = now_ns
 
     def flush(self) -> None:
-        """Write the current chunk to the file."""
+        """Write the current chunk to the file.
+
+        Raises
+        ------
+        DiskError
+            As :meth:`write`.
+        """
         if self._is_open():
             with self._writing():
                 self._writer.flush()
@@ -336,7 +361,13 @@ class BagWriter:
         return self._output.size
 
     def split(self) -> Path:
-        """Complete the current file, begin the next one and return its path."""
+        """Complete the current file, begin the next one and return its path.
+
+        Raises
+        ------
+        DiskError, FolderError
+            As :meth:`write`.
+        """
         if self._is_open():
             self.close()
             self._closed = False
@@ -350,7 +381,10 @@ class BagWriter:
     def close(self) -> None:
         """Complete the file and add it to ``metadata.yaml``; idempotent.
 
-        The file is finalized if possible when writing fails.
+        Raises
+        ------
+        DiskError
+            As :meth:`write`; the file is finalized if possible.
         """
         if self._closed:
             return

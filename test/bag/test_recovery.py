@@ -21,6 +21,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_typestore
 from support.bag_files import metadata_of, topics_of
+from support.long_tests import few_of
 
 from t3mpc_ros.bag.mcap_file import MAGIC, read_mcap_file
 from t3mpc_ros.bag.qos import QosProfile
@@ -151,11 +152,12 @@ def own(tmp_path_factory):
 # -- truncated files ----------------------------------------------------------------------------
 
 
-def test_bag_truncated_at_1000_places_keeps_complete_chunks_only(own):
+@pytest.mark.parametrize('places', few_of([150, 1000]))
+def test_a_truncated_bag_keeps_its_complete_chunks_only(places, own):
     whole, ends, end = inside(own).items, chunk_ends(own), end_of_data(own)
     assert len(ends) > 30
     rng = random.Random(6)
-    for cut in [8, len(own) - 1, *(rng.randrange(8, len(own)) for _ in range(998))]:
+    for cut in [8, len(own) - 1, *(rng.randrange(8, len(own)) for _ in range(places - 2))]:
         outcome, content = salvaged(own[:cut])
         found = inside(content)
         assert found.items == whole[: len(found.items)], cut

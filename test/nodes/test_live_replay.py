@@ -23,7 +23,7 @@ from t3mpc_ros.evaluation.process_replay.comparison import Tolerances, compare
 from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
 from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow]
+pytestmark = [pytest.mark.ros, pytest.mark.alone, pytest.mark.slow]
 
 LOOP = ('recorder', 'controller', 'sim_robot', 'reference_generator')
 

@@ -19,7 +19,7 @@ from t3mpc_ros.bag.recovery.finalize_file import finalize_file
 from t3mpc_ros.cli.process_group import ProcessError
 from t3mpc_ros.geometry.types import NANOSECONDS
 
-pytestmark = pytest.mark.ros
+pytestmark = [pytest.mark.ros, pytest.mark.alone]
 
 DEEP = QoSProfile(depth=5000)
 

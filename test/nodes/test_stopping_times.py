@@ -4,11 +4,14 @@
 
 import pytest
 from support import stopping_bench
+from support.long_tests import few_of
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow]
+pytestmark = [pytest.mark.ros, pytest.mark.alone, pytest.mark.slow]
 
 
-@pytest.mark.parametrize('kind', ['suspend', 'uplink', 'downlink', 'unplug', 'publisher', 'kill'])
+@pytest.mark.parametrize(
+    'kind', few_of(['suspend', 'publisher', 'uplink', 'downlink', 'unplug', 'kill'], 2)
+)
 def test_the_robot_rests_in_time_whatever_fails(kind, processes, ros, tmp_path):
     """A bridge suspended for seconds executed an old command when it went on.
 

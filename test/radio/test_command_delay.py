@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Delay of a command over the radio, the basis of ``speed_filter.dead_time``."""
 
+import itertools
 import random
 
 import numpy as np
 import pytest
 from support.emulator_bench import MS, RobotBench
+from support.long_tests import few_of
 
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.robot.interface import RobotCommand
@@ -45,9 +47,13 @@ class Controlled(RobotBench):
             self.robot.apply(RobotCommand(WheelSpeeds(speed, speed), self.now_ns), self.now_ns)
 
 
-@pytest.mark.parametrize('thinking', [1.0, 3.0, 8.0])
-@pytest.mark.parametrize('lateness', [0.0, 0.3, 1.0])
-@pytest.mark.parametrize('loss', [0.0, 0.1])
+CASES = [*itertools.product((1.0, 3.0, 8.0), (0.0, 0.3, 1.0), (0.0, 0.1))]
+EXTREMES = [(1.0, 0.0, 0.0), (8.0, 0.0, 0.0), (1.0, 1.0, 0.1), (8.0, 1.0, 0.1)]
+
+
+@pytest.mark.parametrize(
+    'thinking, lateness, loss', few_of([*EXTREMES, *(c for c in CASES if c not in EXTREMES)], 4)
+)
 def test_a_command_is_executed_one_cycle_after_its_state(thinking, lateness, loss):
     """Regression: the limiter had a period of its own, independent of the link cycle.
 
