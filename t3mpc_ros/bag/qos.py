@@ -10,7 +10,7 @@ the strongest policy of each kind, which is compatible with every subscription t
 publishers; and a transient-local topic keeps one message per recorded publisher instead of ten.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,13 @@ LIVELINESS = (
     'unknown',
     'best_available',
 )
+
+_POLICIES = {
+    'history': HISTORY,
+    'reliability': RELIABILITY,
+    'durability': DURABILITY,
+    'liveliness': LIVELINESS,
+}
 
 # Infinite durations of Fast DDS and Connext in bags of Foxy; rosbag2 converts them as well.
 _FOXY_UNLIMITED = {(0x7FFFFFFF, 0xFFFFFFFF), (0x7FFFFFFF, 0x7FFFFFFF)}
@@ -68,12 +75,7 @@ class QosProfile:
     avoid_ros_namespace_conventions: bool = False
 
     def __post_init__(self) -> None:
-        for name, policies in (
-            ('history', HISTORY),
-            ('reliability', RELIABILITY),
-            ('durability', DURABILITY),
-            ('liveliness', LIVELINESS),
-        ):
+        for name, policies in _POLICIES.items():
             if getattr(self, name) not in policies:
                 raise QosError(
                     f'{name} must be one of {", ".join(policies)}: got {getattr(self, name)!r}'
@@ -98,6 +100,16 @@ class QosProfile:
         }
 
     @classmethod
+    def from_object(cls, profile: Any, nanoseconds: Callable[[Any], int]) -> 'QosProfile':
+        """Return a profile of rclpy or rosbags, given how to convert its durations."""
+        fields: dict[str, Any] = {name: getattr(profile, name).name.lower() for name in _POLICIES}
+        for name in _DURATIONS:
+            value = min(nanoseconds(getattr(profile, name)), UNLIMITED)
+            fields[f'{name.removesuffix("_duration")}_ns'] = value
+        fields['avoid_ros_namespace_conventions'] = profile.avoid_ros_namespace_conventions
+        return cls(depth=max(0, profile.depth), **fields)
+
+    @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> 'QosProfile':
         """Return the profile in ``mapping``; policies are names or numbers.
 
@@ -108,15 +120,12 @@ class QosProfile:
         """
         try:
             return cls(
-                history=_policy_name(mapping['history'], HISTORY),
                 depth=int(mapping['depth']),
-                reliability=_policy_name(mapping['reliability'], RELIABILITY),
-                durability=_policy_name(mapping['durability'], DURABILITY),
                 deadline_ns=_duration_from_mapping(mapping['deadline']),
                 lifespan_ns=_duration_from_mapping(mapping['lifespan']),
-                liveliness=_policy_name(mapping['liveliness'], LIVELINESS),
                 liveliness_lease_ns=_duration_from_mapping(mapping['liveliness_lease_duration']),
                 avoid_ros_namespace_conventions=bool(mapping['avoid_ros_namespace_conventions']),
+                **{name: _policy_name(mapping[name], _POLICIES[name]) for name in _POLICIES},
             )
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise QosError(f'not a QoS profile: {error!r}') from error

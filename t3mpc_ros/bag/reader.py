@@ -388,32 +388,19 @@ def _is_compressed(folder: Path) -> bool:
 
 
 def _topic_information(connection: Any) -> TopicInformation:
+    offers = getattr(connection.ext, 'offered_qos_profiles', ())
     return TopicInformation(
         connection.topic,
         connection.msgtype,
-        tuple(map(_qos_profile, getattr(connection.ext, 'offered_qos_profiles', ()))),
+        tuple(QosProfile.from_object(each, _nanoseconds) for each in offers),
         connection.digest,
         connection.msgcount,
         getattr(connection.ext, 'serialization_format', 'ros1'),
     )
 
 
-def _qos_profile(offered: Any) -> QosProfile:
-    return QosProfile(
-        history=offered.history.name.lower(),
-        depth=max(0, offered.depth),
-        reliability=offered.reliability.name.lower(),
-        durability=offered.durability.name.lower(),
-        deadline_ns=_nanoseconds(offered.deadline),
-        lifespan_ns=_nanoseconds(offered.lifespan),
-        liveliness=offered.liveliness.name.lower(),
-        liveliness_lease_ns=_nanoseconds(offered.liveliness_lease_duration),
-        avoid_ros_namespace_conventions=offered.avoid_ros_namespace_conventions,
-    )
-
-
 def _nanoseconds(time: Any) -> int:
-    return int(min(time.sec * NANOSECONDS + time.nsec, UNLIMITED))
+    return int(time.sec * NANOSECONDS + time.nsec)
 
 
 def _field_getter(path: str) -> Callable[[Any], Any]:

@@ -106,7 +106,9 @@ class BagWriter:
     Raises
     ------
     FolderError
-        The folder or the file cannot be created.
+        The folder or the file cannot be created; also by :meth:`split` and :meth:`write`.
+    DiskError
+        Writing failed; by every method, once.
     DataError
         ``metadata_records`` contains values other than text, or a record called ``rosbag2``.
     """
@@ -184,15 +186,7 @@ class BagWriter:
             self._register(topic)
 
     def add_metadata_record(self, title: str, table: Mapping[str, str]) -> None:
-        """Write a metadata record to this and all later files; it replaces one of its title.
-
-        Raises
-        ------
-        DataError
-            As the constructor.
-        DiskError
-            As :meth:`write`.
-        """
+        """Write a metadata record to this and all later files; it replaces one of its title."""
         check_metadata_records({title: table})
         self._metadata_records[title] = dict(table)
         if self._is_open():
@@ -200,13 +194,7 @@ class BagWriter:
                 self._writer.add_metadata(title, dict(table))
 
     def add_attachment(self, attachment: Attachment, read_ns: int) -> None:
-        """Write an attachment to this and all later files, with the time at which it was read.
-
-        Raises
-        ------
-        DiskError
-            As :meth:`write`.
-        """
+        """Write an attachment to this and all later files, with the time at which it was read."""
         self._attachments[attachment.name] = attachment, read_ns
         if self._is_open():
             item = attachment
@@ -237,8 +225,6 @@ class BagWriter:
             No definition of the type is available.
         DataError
             The topic was added with another type.
-        DiskError
-            As :meth:`write`.
         """
         if known := self._topics.get(name):
             if known.type_name != type_name:
@@ -325,11 +311,6 @@ class BagWriter:
 
         A power failure loses the messages of ``chunk_ns`` and :data:`SYNC_PERIOD_NS`, provided
         that this is called often. ``now_ns`` is a time of any monotonic clock.
-
-        Raises
-        ------
-        DiskError
-            As :meth:`write`.
         """
         if self._chunk_start_ns is None:
             self._chunk_seen = None
@@ -343,13 +324,7 @@ class BagWriter:
             self._synced_ns = now_ns
 
     def flush(self) -> None:
-        """Write the current chunk to the file.
-
-        Raises
-        ------
-        DiskError
-            As :meth:`write`.
-        """
+        """Write the current chunk to the file."""
         if self._is_open():
             with self._writing():
                 self._writer.flush()
@@ -361,13 +336,7 @@ class BagWriter:
         return self._output.size
 
     def split(self) -> Path:
-        """Complete the current file, begin the next one and return its path.
-
-        Raises
-        ------
-        DiskError, FolderError
-            As :meth:`write`.
-        """
+        """Complete the current file, begin the next one and return its path."""
         if self._is_open():
             self.close()
             self._closed = False
@@ -381,10 +350,7 @@ class BagWriter:
     def close(self) -> None:
         """Complete the file and add it to ``metadata.yaml``; idempotent.
 
-        Raises
-        ------
-        DiskError
-            As :meth:`write`; the file is finalized if possible.
+        The file is finalized if possible when writing fails.
         """
         if self._closed:
             return

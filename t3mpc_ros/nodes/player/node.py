@@ -33,8 +33,13 @@ SWITCH_INTERVAL = 0.0005
 the thread that reads ahead."""
 ACK_TIMEOUT = 1.0
 """Maximum wait at the end of the bag for the acknowledgements of subscribers, s."""
-RATE_FACTOR, SEEK_BACK = 1.1, 5.0
-"""Change of the rate by one key press; time that a key seeks back, s."""
+RATE_KEYS = {'up': 1.1, 'down': 1.0 / 1.1}
+"""Factor of the rate by key."""
+SEEK_BACK = 5.0
+"""Time that a key seeks back, s."""
+
+Action = Callable[[PlaybackTimeline, int], str | None]
+"""Changes the playback at a time of the monotonic clock; returns a problem."""
 
 NO_BAG = 'no bag is open: set storage.uris'
 
@@ -102,10 +107,10 @@ class PlayerNode(BaseNode[PlayerParameters]):
             self._open()
         else:
             self.get_logger().warning(NO_BAG)
-        actions: dict[str, Callable[[], str]] = {
-            'pause': self._pause,
-            'resume': self._resume,
-            'toggle_paused': self._toggle_paused,
+        actions: dict[str, Action] = {
+            'pause': PlaybackTimeline.pause,
+            'resume': PlaybackTimeline.resume,
+            'toggle_paused': _toggle_paused,
             'seek': self._seek,
             'play_next': self._play_next,
             'set_rate': self._set_rate,
@@ -199,10 +204,7 @@ class PlayerNode(BaseNode[PlayerParameters]):
 
     def on_parameters_changed(self, parameters: PlayerParameters) -> None:
         """Apply the rate."""
-        if self._thread is not None:
-            self._thread.control(
-                lambda timeline, now_ns: timeline.set_rate(now_ns, parameters.rate)
-            )
+        self._control(lambda timeline, now_ns: timeline.set_rate(now_ns, parameters.rate))
 
     def _monitor(self) -> None:
         thread = self._thread
@@ -318,10 +320,10 @@ class PlayerNode(BaseNode[PlayerParameters]):
     # -- services and keys ------------------------------------------------------------------------
 
     def _service_callback(
-        self, action: Callable[[], str]
+        self, action: Action
     ) -> Callable[[Trigger.Request, Trigger.Response], Trigger.Response]:
         def callback(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-            problem = action() if self._thread is not None else NO_BAG
+            problem = self._control(action)
             response.success = not problem
             response.message = problem or self._status_text()
             return response
@@ -340,43 +342,22 @@ class PlayerNode(BaseNode[PlayerParameters]):
         """Time of the first message of the bags, the origin of positions."""
         return self._reader.start_ns if self._reader is not None else 0
 
-    def _control(self, action: Callable[[PlaybackTimeline, int], str | None]) -> str:
+    def _control(self, action: Action) -> str:
         return self._thread.control(action) if self._thread is not None else NO_BAG
 
-    def _pause(self) -> str:
-        return self._control(PlaybackTimeline.pause)
-
-    def _resume(self) -> str:
-        return self._control(PlaybackTimeline.resume)
-
-    def _toggle_paused(self) -> str:
-        return self._control(
-            lambda timeline, now_ns: (
-                timeline.resume(now_ns) if timeline.paused else timeline.pause(now_ns)
-            )
-        )
-
-    def _seek(self) -> str:
+    def _seek(self, timeline: PlaybackTimeline, now_ns: int) -> str:
         target_ns = self._first_ns + round(self.parameters.seek_time * NANOSECONDS)
-        return self._control(lambda timeline, now_ns: timeline.seek(now_ns, target_ns))
+        return timeline.seek(now_ns, target_ns)
 
-    def _seek_back(self) -> str:
-        def seek_back(timeline: PlaybackTimeline, now_ns: int) -> str:
-            target_ns = timeline.bag_time_ns(now_ns) - round(SEEK_BACK * NANOSECONDS)
-            return timeline.seek(now_ns, max(target_ns, self._span[0]))
+    def _seek_back(self, timeline: PlaybackTimeline, now_ns: int) -> str:
+        target_ns = timeline.bag_time_ns(now_ns) - round(SEEK_BACK * NANOSECONDS)
+        return timeline.seek(now_ns, max(target_ns, self._span[0]))
 
-        return self._control(seek_back)
+    def _play_next(self, timeline: PlaybackTimeline, now_ns: int) -> str:
+        return timeline.play_next(now_ns, self.parameters.play_next_count)
 
-    def _play_next(self) -> str:
-        count = self.parameters.play_next_count
-        return self._control(lambda timeline, now_ns: timeline.play_next(now_ns, count))
-
-    def _play_one(self) -> str:
-        return self._control(lambda timeline, now_ns: timeline.play_next(now_ns, 1))
-
-    def _set_rate(self) -> str:
-        rate = self.parameters.rate
-        return self._control(lambda timeline, now_ns: timeline.set_rate(now_ns, rate))
+    def _set_rate(self, timeline: PlaybackTimeline, now_ns: int) -> None:
+        timeline.set_rate(now_ns, self.parameters.rate)
 
     def _multiply_rate(self, factor: float) -> str:
         rate = round(self.parameters.rate * factor, 6)
@@ -390,15 +371,21 @@ class PlayerNode(BaseNode[PlayerParameters]):
             executor.create_task(self._execute_key, key)
 
     def _execute_key(self, key: str) -> None:
-        problem = {
-            'space': self._toggle_paused,
-            'right': self._play_one,
-            'left': self._seek_back,
-            'up': lambda: self._multiply_rate(RATE_FACTOR),
-            'down': lambda: self._multiply_rate(1.0 / RATE_FACTOR),
-        }[key]()
+        if key in RATE_KEYS:
+            problem = self._multiply_rate(RATE_KEYS[key])
+        else:
+            actions: dict[str, Action] = {
+                'space': _toggle_paused,
+                'right': PlaybackTimeline.play_next,
+                'left': self._seek_back,
+            }
+            problem = self._control(actions[key])
         if problem:
             self.get_logger().warning(problem)
+
+
+def _toggle_paused(timeline: PlaybackTimeline, now_ns: int) -> None:
+    (timeline.resume if timeline.paused else timeline.pause)(now_ns)
 
 
 def make() -> list[PlayerNode]:

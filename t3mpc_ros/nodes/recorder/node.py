@@ -41,7 +41,7 @@ from t3mpc_ros.nodes.recorder.writer_thread import WriterThread
 CONFIGURATION_ERRORS = (BagError,)
 """Errors of :func:`make` other than :class:`ParameterError`."""
 
-TAKE_PERIOD = 0.02
+TAKE_PERIOD = 0.04
 """Time between two reads of the subscriptions, s; each queues up to 1000 messages meanwhile."""
 DISCOVERY_PERIOD = 0.2
 """Time between two queries of the graph, s."""

@@ -58,6 +58,9 @@ LATCHED_TOPICS = (
 """Expected topics with transient-local publishers: their messages from before discovery, without
 which a run cannot be replayed, are received, too."""
 
+FULL_DISCOVERY = 10
+"""Calls of :meth:`TopicDiscovery.discover` after which all publishers are queried again."""
+
 _RECEIVE_TIME = attrgetter('received_ns')
 
 
@@ -258,6 +261,8 @@ class TopicDiscovery:
         self._subscriptions = subscriptions
         self._take_messages = take_messages
         self._recorded = recorded
+        self._calls = 0
+        self._publisher_counts: dict[str, int] = {}
         self.excluded: set[str] = set()
         """Selected topics that cannot be recorded."""
 
@@ -275,9 +280,23 @@ class TopicDiscovery:
                 continue
 
     def discover(self) -> None:
-        """Subscribe to the selected topics that have publishers."""
+        """Subscribe to the selected topics that have publishers.
+
+        The publishers of a topic are queried when their number changes, and at each
+        :data:`FULL_DISCOVERY`-th call: for all topics the query takes most of the processor time
+        of the recorder.
+        """
+        self._calls += 1
+        if self._calls % FULL_DISCOVERY == 0:
+            self._publisher_counts.clear()
         for topic, type_names in self._node.get_topic_names_and_types():
-            if topic in self.excluded or not self._topic_filter.matches(topic, type_names):
+            if topic in self.excluded:
+                continue
+            count = self._node.count_publishers(topic)
+            if self._publisher_counts.get(topic) == count:
+                continue
+            self._publisher_counts[topic] = count
+            if not count or not self._topic_filter.matches(topic, type_names):
                 continue
             if publishers := self._node.get_publishers_info_by_topic(topic):
                 self._adapt(topic, publishers)
@@ -316,24 +335,12 @@ def offered_qos(
     topic: str, type_name: str, publishers: Sequence[TopicEndpointInfo]
 ) -> tuple[TopicInformation, int]:
     """Return the metadata of a topic for the bag, and its number of transient-local publishers."""
-    profiles = tuple(_bag_profile(info.qos_profile) for info in publishers)
+    profiles = tuple(
+        QosProfile.from_object(info.qos_profile, attrgetter('nanoseconds')) for info in publishers
+    )
     type_hash = str(publishers[-1].topic_type_hash) if publishers else ''
     latched = sum(qos.is_transient_local(info.qos_profile) for info in publishers)
     return TopicInformation(topic, type_name, profiles, type_hash), latched
-
-
-def _bag_profile(offered: QoSProfile) -> QosProfile:
-    return QosProfile(
-        history=offered.history.name.lower(),
-        depth=offered.depth,
-        reliability=offered.reliability.name.lower(),
-        durability=offered.durability.name.lower(),
-        deadline_ns=offered.deadline.nanoseconds,
-        lifespan_ns=offered.lifespan.nanoseconds,
-        liveliness=offered.liveliness.name.lower(),
-        liveliness_lease_ns=offered.liveliness_lease_duration.nanoseconds,
-        avoid_ros_namespace_conventions=offered.avoid_ros_namespace_conventions,
-    )
 
 
 def _lost_event(subscription: Subscription) -> Any:
