@@ -98,7 +98,7 @@ class InitialInputs:
         self._remaining = qos.INITIAL_INPUTS.depth
         self._end_ns: int | None = None
 
-    def republish(self, message: Odometry) -> None:
+    def republish(self, message: bytes) -> None:
         """Publish a message received within the first 10 s, as long as all of them are kept."""
         if not self._remaining:
             return
@@ -147,10 +147,10 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self._initial_reference = InitialInputs(self, 'reference')
         self._initial_odometry = InitialInputs(self, 'odom')
         self._references = self.create_matching_subscription(
-            Odometry, 'reference', self._on_reference, qos.STREAM
+            Odometry, 'reference', self._on_reference, qos.STREAM, raw=True
         )
         self._odometry = self.create_matching_subscription(
-            Odometry, 'odom', self._on_odometry, qos.STREAM
+            Odometry, 'odom', self._on_odometry, qos.STREAM, raw=True
         )
         self.create_service(SetBool, '~/enable', self._on_enable)
         self.create_service(Trigger, '~/reset', self._on_reset)
@@ -185,7 +185,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self._journal_message.data = row
         self._journal_publisher.publish(self._journal_message)
 
-    def _on_reference(self, message: Odometry) -> None:
+    def _on_reference(self, message: bytes) -> None:
         for each in (message, *self._references.take_waiting()):
             state = conversions.state_from_odometry(each)
             self._journal.count_reference(state.stamp_ns)
@@ -193,7 +193,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
                 self._rejected_references += 1
             self._initial_reference.republish(each)
 
-    def _on_odometry(self, message: Odometry, info: dict[str, Any]) -> None:
+    def _on_odometry(self, message: bytes, info: dict[str, Any]) -> None:
         # Without a step, the watchdog stops the robot and the journal has no row.
         timeout = self.parameters.watchdog.odometry_timeout
         self._odometry_problem = age_problem(message_age_ns(info), timeout)

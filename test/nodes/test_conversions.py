@@ -4,6 +4,7 @@
 
 from dataclasses import replace
 import math
+import struct
 
 from geometry_msgs.msg import Quaternion, Twist, TwistStamped
 from nav_msgs.msg import Odometry
@@ -46,6 +47,14 @@ def motions(count=200):
         )
 
 
+def from_odometry(message):
+    return conversions.state_from_odometry(serialize_message(message))
+
+
+def yaw_of(rotation):
+    return conversions.yaw_from_quaternion(rotation.x, rotation.y, rotation.z, rotation.w)
+
+
 @pytest.mark.parametrize('stamp_ns', STAMPS)
 def test_a_stamp_survives_to_the_nanosecond(stamp_ns):
     stamp = conversions.time_from_ns(stamp_ns)
@@ -56,11 +65,39 @@ def test_a_stamp_survives_to_the_nanosecond(stamp_ns):
 def test_a_state_survives_a_reused_odometry_message():
     message = Odometry()
     for motion in motions():
-        back = conversions.state_from_odometry(conversions.fill_odometry(message, motion))
+        back = from_odometry(conversions.fill_odometry(message, motion))
         assert back.stamp_ns == motion.stamp_ns
         assert back.twist == motion.twist
         assert back.pose[:2] == motion.pose[:2]
         assert abs(wrap_angle(back.pose.yaw - motion.pose.yaw)) < 1e-14
+
+
+@pytest.mark.parametrize('frame', range(9))
+@pytest.mark.parametrize('child', range(9))
+def test_serialized_odometry_is_read_whatever_its_frames(frame, child):
+    """Texts of any length precede the numbers, which lie at multiples of eight."""
+    (motion,) = motions(1)
+    message = conversions.fill_odometry(Odometry(child_frame_id='b' * child), motion)
+    message.header.frame_id = 'a' * frame
+    message.pose.covariance[:] = message.twist.covariance[:] = math.nan
+    message.pose.pose.position.z = math.nan
+    back = from_odometry(message)
+    assert (back.stamp_ns, back.twist, back.pose[:2]) == (
+        motion.stamp_ns,
+        motion.twist,
+        motion.pose[:2],
+    )
+    with pytest.raises(struct.error):
+        conversions.state_from_odometry(serialize_message(message)[:-350])
+
+
+def test_big_endian_odometry_is_read():
+    header = bytes(4) + struct.pack('>iI', 7, 8) + 2 * struct.pack('>I4s', 4, b'abc')
+    numbers = struct.pack(
+        '>7d36d6d36d', 1, 2, 3, 0, 0, 0, 1, *36 * [9], 4, 0, 0, 0, 0, 5, *36 * [9]
+    )
+    state = conversions.state_from_odometry(header + numbers)
+    assert state == State(7 * NANOSECONDS + 8, Pose(1.0, 2.0, 0.0), BodyTwist(4.0, 5.0))
 
 
 @pytest.mark.parametrize('yaw', YAWS)
@@ -68,16 +105,16 @@ def test_yaw_survives_the_conversion_to_a_quaternion(yaw):
     rotation = conversions.quaternion_from_yaw(yaw)
     assert (rotation.x, rotation.y) == (0.0, 0.0)
     assert math.hypot(rotation.z, rotation.w) == pytest.approx(1.0, abs=1e-15)
-    back = conversions.yaw_from_quaternion(rotation)
+    back = yaw_of(rotation)
     assert abs(wrap_angle(back - yaw)) < 1e-15 * 4
     # q and -q are the same rotation.
     opposite = Quaternion(z=-rotation.z, w=-rotation.w)
-    assert abs(wrap_angle(conversions.yaw_from_quaternion(opposite) - yaw)) < 1e-15 * 4
+    assert abs(wrap_angle(yaw_of(opposite) - yaw)) < 1e-15 * 4
 
 
 def test_yaw_beyond_a_turn_is_wrapped():
     for yaw in np.linspace(-30.0, 30.0, 61):
-        back = conversions.yaw_from_quaternion(conversions.quaternion_from_yaw(yaw))
+        back = yaw_of(conversions.quaternion_from_yaw(yaw))
         assert abs(wrap_angle(back - yaw)) < 1e-13
 
 
@@ -87,9 +124,7 @@ def test_roll_and_pitch_do_not_change_the_yaw():
         yaw = generator.uniform(-math.pi, math.pi)
         pitch, roll = generator.uniform(-1.4, 1.4), generator.uniform(-math.pi, math.pi)
         x, y, z, w = Rotation.from_euler('ZYX', [yaw, pitch, roll]).as_quat()
-        assert conversions.yaw_from_quaternion(Quaternion(x=x, y=y, z=z, w=w)) == pytest.approx(
-            yaw, abs=1e-12
-        )
+        assert conversions.yaw_from_quaternion(x, y, z, w) == pytest.approx(yaw, abs=1e-12)
 
 
 @pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf, 1e200])
@@ -98,7 +133,7 @@ def test_an_invalid_rotation_has_no_yaw(axis, value):
     """atan2 of infinite components is finite, and powers of 1e200 raise OverflowError."""
     rotation = Quaternion(x=0.5, y=0.5, z=0.5, w=0.5)
     setattr(rotation, axis, value)
-    yaw = conversions.yaw_from_quaternion(rotation)
+    yaw = yaw_of(rotation)
     assert math.isnan(yaw) or (value == 1e200 and axis in 'xw')
 
 
@@ -162,7 +197,7 @@ def test_a_command_without_a_stamp_has_the_present_time():
 @pytest.mark.parametrize('value', [math.nan, math.inf])
 def test_non_finite_odometry_stays_non_finite(place, value):
     message = conversions.fill_odometry(Odometry(), State(0, Pose(1, 2, 3), BodyTwist(4, 5)))
-    assert conversions.state_from_odometry(message).is_finite()
+    assert from_odometry(message).is_finite()
     pose, twist = message.pose.pose, message.twist.twist
     owner, name = {
         'x': (pose.position, 'x'),
@@ -172,7 +207,7 @@ def test_non_finite_odometry_stays_non_finite(place, value):
         'angular': (twist.angular, 'z'),
     }[place]
     setattr(owner, name, value)
-    assert not conversions.state_from_odometry(message).is_finite()
+    assert not from_odometry(message).is_finite()
 
 
 def test_wheel_joints_keep_their_order():

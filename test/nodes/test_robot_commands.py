@@ -9,6 +9,7 @@ from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
 from rclpy.parameter import Parameter
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from support.ros_graph import (
@@ -175,9 +176,12 @@ def test_set_pose_moves_the_true_pose_only(harness):
         assert robot.set_parameters([Parameter(name, value=value)])[0].successful
     assert harness.call(Trigger, 'sim_robot/set_pose').success
     harness.spin_until(lambda: truth and abs(truth[-1].pose.pose.position.x - 1.5) < 1e-3)
-    pose = conversions.state_from_odometry(truth[-1]).pose
-    assert pose == pytest.approx((1.5, -2.0, 0.5), abs=1e-3)
-    assert conversions.state_from_odometry(odom[-1]).pose == pytest.approx((0, 0, 0), abs=1e-3)
+    true_pose, pose = (
+        conversions.state_from_odometry(serialize_message(messages[-1])).pose
+        for messages in (truth, odom)
+    )
+    assert true_pose == pytest.approx((1.5, -2.0, 0.5), abs=1e-3)
+    assert pose == pytest.approx((0, 0, 0), abs=1e-3)
     response = robot.set_parameters([Parameter('initial_pose.x', value=math.nan)])[0]
     assert not response.successful
     assert 'initial_pose.x must be finite' in response.reason

@@ -19,6 +19,7 @@ from rcl_interfaces.msg import (
 )
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -55,6 +56,9 @@ _PARAMETER_TYPES = {
     (float, True): Parameter.Type.DOUBLE_ARRAY,
     (str, True): Parameter.Type.STRING_ARRAY,
 }
+
+_NO_PUBLISHER_EVENTS = PublisherEventCallbacks(use_default_callbacks=False)
+_NO_SUBSCRIPTION_EVENTS = SubscriptionEventCallbacks(use_default_callbacks=False)
 
 _RCLPY_PARAMETERS = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
 """Parameters (or their first name part) that rclpy declares for every node."""
@@ -103,7 +107,12 @@ class BaseNode(Node, Generic[P]):
     def create_publisher(
         self, msg_type: type, topic: str, *args: Any, **options: Any
     ) -> Publisher:
-        """Return a publisher with the QoS overrides of the user."""
+        """Return a publisher with the QoS overrides of the user.
+
+        The event callbacks of rclpy are left out: the executor would examine all of them in every
+        cycle, which takes longer than a control step. The diagnostics name QoS mismatches.
+        """
+        options.setdefault('event_callbacks', _NO_PUBLISHER_EVENTS)
         return super().create_publisher(
             msg_type, topic, *self._with_overrides(topic, 'publisher', args, options), **options
         )
@@ -111,7 +120,8 @@ class BaseNode(Node, Generic[P]):
     def create_subscription(
         self, msg_type: type, topic: str, callback: Callable[..., None], *args: Any, **options: Any
     ) -> Subscription:
-        """Return a subscription with the QoS overrides of the user."""
+        """Return a subscription with the QoS overrides of the user, without event callbacks."""
+        options.setdefault('event_callbacks', _NO_SUBSCRIPTION_EVENTS)
         return super().create_subscription(
             msg_type,
             topic,
@@ -121,10 +131,16 @@ class BaseNode(Node, Generic[P]):
         )
 
     def create_matching_subscription(
-        self, msg_type: type, topic: str, callback: Callable[..., None], profile: QoSProfile
+        self,
+        msg_type: type,
+        topic: str,
+        callback: Callable[..., None],
+        profile: QoSProfile,
+        *,
+        raw: bool = False,
     ) -> endpoints.MatchingSubscription:
         """Return a subscription whose request follows the offers of the publishers."""
-        made = endpoints.MatchingSubscription(self, msg_type, topic, callback, profile)
+        made = endpoints.MatchingSubscription(self, msg_type, topic, callback, profile, raw=raw)
         self._matching.append(made)
         return made
 

@@ -4,6 +4,7 @@
 
 from collections.abc import Sequence
 import math
+import struct
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, Quaternion, TransformStamped, Twist, TwistStamped
@@ -36,25 +37,41 @@ def quaternion_from_yaw(yaw: float) -> Quaternion:
     return Quaternion(z=math.sin(0.5 * yaw), w=math.cos(0.5 * yaw))
 
 
-def yaw_from_quaternion(rotation: Quaternion) -> float:
+def yaw_from_quaternion(x: float, y: float, z: float, w: float) -> float:
     """Return the yaw (rad) of a rotation with any roll and pitch; NaN if not finite."""
     # Products, not powers, which raise OverflowError.
-    sine = 2.0 * (rotation.w * rotation.z + rotation.x * rotation.y)
-    cosine = 1.0 - 2.0 * (rotation.y * rotation.y + rotation.z * rotation.z)
+    sine = 2.0 * (w * z + x * y)
+    cosine = 1.0 - 2.0 * (y * y + z * z)
     # atan2 of an infinite vector is finite.
     if not (math.isfinite(sine) and math.isfinite(cosine)):
         return math.nan
     return math.atan2(sine, cosine)
 
 
-def state_from_odometry(message: Odometry) -> State:
-    """Return the planar state in an odometry message."""
-    position = message.pose.pose.position
-    twist = message.twist.twist
+def state_from_odometry(data: bytes) -> State:
+    """Return the planar state in a serialized odometry message.
+
+    To construct the message, with its 72 covariances, would take ten times as long. The layout
+    is that of CDR: four bytes of header, then each value at a multiple of its size.
+
+    Raises
+    ------
+    struct.error
+        The data ends before the message does.
+    """
+    order = '<' if data[1] & 1 else '>'
+    seconds, nanoseconds, length = struct.unpack_from(f'{order}iII', data, 4)
+    child = 16 + length + -length % 4
+    (length,) = struct.unpack_from(f'{order}I', data, child)
+    end = child + 4 + length
+    # 7 numbers of the pose, 36 of its covariance, 6 of the twist.
+    x, y, _, *rotation, linear, _, _, _, _, angular = struct.unpack_from(
+        f'{order}7d288x6d', data, end + (4 - end) % 8
+    )
     return State(
-        ns_from_time(message.header.stamp),
-        Pose(position.x, position.y, yaw_from_quaternion(message.pose.pose.orientation)),
-        BodyTwist(twist.linear.x, twist.angular.z),
+        seconds * NANOSECONDS + nanoseconds,
+        Pose(x, y, yaw_from_quaternion(*rotation)),
+        BodyTwist(linear, angular),
     )
 
 

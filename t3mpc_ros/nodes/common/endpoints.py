@@ -87,6 +87,8 @@ class MatchingSubscription:
         Called with each message.
     profile
         Request while all publishers offer it.
+    raw
+        Whether the messages stay serialized.
     """
 
     def __init__(
@@ -96,11 +98,14 @@ class MatchingSubscription:
         topic: str,
         callback: Callable[..., None],
         profile: QoSProfile,
+        *,
+        raw: bool = False,
     ) -> None:
         self._node = node
         self._arguments = message, topic, callback
+        self._raw = raw
         self._overridden = overriding_options(node, topic, 'subscription') is not None
-        self.held: Subscription = node.create_subscription(*self._arguments, profile)
+        self.held: Subscription = node.create_subscription(*self._arguments, profile, raw=raw)
         """The present subscription."""
 
     def adapt(self) -> None:
@@ -116,7 +121,7 @@ class MatchingSubscription:
         if profile.reliability == held.qos_profile.reliability:
             return  # the mismatch is another one, which the diagnostics name
         self._node.destroy_subscription(held)
-        self.held = self._node.create_subscription(*self._arguments, profile)
+        self.held = self._node.create_subscription(*self._arguments, profile, raw=self._raw)
         self._node.get_logger().info(f'{name} is published best effort')
 
     def take_waiting(self) -> list[Any]:
@@ -129,7 +134,7 @@ class MatchingSubscription:
         messages: list[Any] = []
         with held.handle:
             while len(messages) < held.qos_profile.depth:
-                if (item := held.handle.take_message(held.msg_type, False)) is None:
+                if (item := held.handle.take_message(held.msg_type, self._raw)) is None:
                     break
                 messages.append(item[0])
         return messages
