@@ -789,6 +789,7 @@ def test_run_starts_the_real_program():
     )
     assert done.returncode == 0, done.stderr
     assert 'trace of the Jacobian: -38' in done.stdout
+    subprocess.run([*run, 't3mpc', 'compile'], check=True)
     done = subprocess.run(run, capture_output=True, text=True)
     assert done.returncode == 2
     assert done.stderr.endswith(f'NAME one of: {" ".join(sorted(EXECUTABLES))}\n')

@@ -121,19 +121,33 @@ def _exponents(options: argparse.Namespace) -> int:
 
 
 def _compile(options: argparse.Namespace) -> int:
+    """Compile the kernels of controllers and those of robots, in a process each."""
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    with ProcessPoolExecutor(2, get_context('spawn')) as pool:
+        for part in [pool.submit(_compile_controllers), pool.submit(_compile_robots)]:
+            part.result()
+    return 0
+
+
+def _compile_controllers() -> None:
     from t3mpc_ros.control.controller import Controller, StepperControllerParameters
     from t3mpc_ros.evaluation.closed_loop import MethodSpec, run
     from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
     from t3mpc_ros.evaluation.scenario import DRIVES, Scenario
-    from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters, make_robot
 
+    Controller(StepperControllerParameters()).warm_up()
     for drive in DRIVES:
         spec = MethodSpec('full', ProposedController, ProposedParameters())
         run(Scenario(drive, 0.04, 'nominal', 1, 1.0), spec)
-    Controller(StepperControllerParameters()).warm_up()
-    for kind in ('velocity', 'stepper'):
+
+
+def _compile_robots() -> None:
+    from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters, make_robot
+
+    for kind in ('stepper', 'velocity'):
         make_robot(DigitalTwinParameters.from_dict({'drive.kind': kind})).warm_up()
-    return 0
 
 
 def _method_definitions() -> 'Sequence[MethodDefinition]':
