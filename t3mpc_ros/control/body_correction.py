@@ -299,7 +299,7 @@ def correct_body(
     # A gap of n periods repeats the last command n times: nothing else was sent.
     count = min(max(int(round(elapsed / period)), 1), history.shape[0])
     for j in range(history.shape[0] - 1, count - 1, -1):
-        history[j] = history[j - count]
+        history[j, 0], history[j, 1] = history[j - count, 0], history[j - count, 1]
     for j in range(count):
         history[j, 0], history[j, 1] = sent[0], sent[1]
     memory[COMMANDS] = min(memory[COMMANDS] + count, 1.0 * history.shape[0])

@@ -347,7 +347,9 @@ def remove_finished(transitions: Transitions, count: int, sums: Array, over_ns: 
                 sums[RESPONSE, i] -= ramps[k, JUMP, i]
                 sums[PASSED, i] -= ramps[k, JUMP, i]
         else:
-            ramps[kept] = ramps[k]
+            for row in range(3):
+                for i in range(2):
+                    ramps[kept, row, i] = ramps[k, row, i]
             instants[kept] = instants[k]
             passed[kept] = passed[k]
             kept += 1

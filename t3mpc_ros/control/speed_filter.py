@@ -237,7 +237,8 @@ def predict_actuation(
     commands : shape (n + 2, 2), newest last, rad/s; n whole periods of dead time
     late     : the remaining dead time, as a fraction of a period
     """
-    out[:] = speeds
+    for i in range(speeds.size):
+        out[i] = speeds[i]
     whole = commands.shape[0] - 2
     for j in range(whole):
         delayed_servo_response(out, commands, j + 1, late, disturbance, lag, period, out)
@@ -264,10 +265,11 @@ def predict(
     """
     speeds, disturbance = state[SPEEDS], state[DISTURBANCE]
     if velocity:
-        for j in range(commands.shape[0] - 1):
-            for i in range(speeds.size):
+        last = commands.shape[0] - 1
+        for i in range(speeds.size):
+            for j in range(last):
                 commands[j, i] = commands[j + 1, i]
-        commands[-1] = applied
+            commands[last, i] = applied[i]
         delayed_servo_response(speeds, commands, 0, late, disturbance, lag, dt, speeds)
     else:
         for i in range(speeds.size):

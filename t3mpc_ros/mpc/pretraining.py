@@ -105,12 +105,18 @@ def contrastive_divergence_epoch(
     """
     n_errors, n_moves = machine.delta_lags, machine.lags.size - machine.delta_lags
     for i in range(features.shape[0] - 1, -1, -1):
-        features[i] = errors[i : i + 1 + n_errors].sum() + moves[i + 1 : i + 1 + n_moves].sum()
-        if math.isnan(features[i, 0]):
+        known = 0.0
+        for j in range(n_errors + 1):
+            known += errors[i + j]
+        for j in range(n_moves):
+            known += moves[i + 1 + j]
+        if math.isnan(known):
+            features[i] = math.nan
             continue
         set_visible(machine, errors, moves, i + 1)
         predict_error(machine)
-        features[i] = machine.mu1
+        for j in range(machine.mu1.size):
+            features[i, j] = machine.mu1[j]
         contrastive_divergence_step(machine, rate)
 
 

@@ -438,9 +438,11 @@ def solve_with_active_rows(
     n = work.gradient.size
     # The component of the unconstrained optimum that is orthogonal to the active rows, computed
     # first: the rounding of a distant optimum must not affect a much smaller solution.
-    work.normal[:] = work.unconstrained
+    for i in range(n):
+        work.normal[i] = work.unconstrained[i]
     project_out(work, count)
-    work.changes[:] = work.normal
+    for i in range(n):
+        work.changes[i] = work.normal[i]
     for k in range(count):
         along = bound(work.active[k], work.sides[k], n, v_previous, dv_max, v_max)
         for j in range(k):
