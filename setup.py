@@ -43,6 +43,7 @@ setup(
         'pyserial',
         'matplotlib',
         'cma',
+        'daqp',
         'jinja2',
         'tqdm',
     ],

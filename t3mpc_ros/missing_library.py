@@ -15,6 +15,7 @@ REQUIREMENTS = {
     'serial': 'pyserial>=3.5',
     'matplotlib': 'matplotlib>=3.8',
     'cma': 'cma>=4.0',
+    'daqp': 'daqp>=0.11',
     'jinja2': 'jinja2>=3.1',
     'tqdm': 'tqdm>=4.66',
     'casadi': 'casadi>=3.6',

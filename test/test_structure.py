@@ -71,7 +71,7 @@ LIBRARIES = {
     'simulation': {'yaml'},
     'radio': {'serial'},
     'bag': {'mcap', 'rosbags', 'yaml', 'zstandard', 'lz4'},
-    'evaluation': {'matplotlib', 'yaml', 'cma', 'casadi', 'jinja2', 'tqdm'},
+    'evaluation': {'matplotlib', 'yaml', 'cma', 'casadi', 'jinja2', 'tqdm', 'daqp'},
     'nodes': {'yaml'},
     'cli': {'yaml'},
 }
@@ -265,9 +265,16 @@ def test_package_xml_names_the_rosdep_keys_of_the_libraries():
     # Those without a key that fits are installed by the line of the README for apt ROS 2.
     readme = (ROOT / 'README.md').read_text()
     (line,) = re.findall(r'^.*pip install .*numba.*$', readme, re.MULTILINE)
-    for library in {'numba', 'cma'}:
+    for library in {'numba', 'cma', 'daqp'}:
         assert REQUIREMENTS[library] in line
-    assert set(REQUIREMENTS) - set(keys) == {'numba', 'cma', 'lz4', 'zstandard', 'casadi'}
+    assert set(REQUIREMENTS) - set(keys) == {
+        'numba',
+        'cma',
+        'daqp',
+        'lz4',
+        'zstandard',
+        'casadi',
+    }
 
 
 def test_no_global_random_numbers_and_no_clock_in_libraries():

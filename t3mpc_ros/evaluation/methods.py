@@ -12,16 +12,21 @@ from t3mpc_ros.evaluation.baselines.adaptive_fuzzy import (
     AdaptiveType1,
     AdaptiveType1Parameters,
 )
-from t3mpc_ros.evaluation.baselines.computed_torque import ComputedTorque, ComputedTorqueParameters
-from t3mpc_ros.evaluation.baselines.disturbance_rejection import (
-    DisturbanceRejection,
-    DisturbanceRejectionParameters,
-)
 from t3mpc_ros.evaluation.baselines.dynamic_matrix_control import (
     DynamicMatrix,
     DynamicMatrixParameters,
     DynamicMatrixPreview,
     DynamicMatrixPreviewParameters,
+)
+from t3mpc_ros.evaluation.baselines.feedback_control import (
+    ComputedTorque,
+    ComputedTorqueParameters,
+    DisturbanceRejection,
+    DisturbanceRejectionParameters,
+    ProportionalIntegral,
+    ProportionalIntegralParameters,
+    SlidingMode,
+    SlidingModeParameters,
 )
 from t3mpc_ros.evaluation.baselines.linear_mpc import (
     LinearMpc,
@@ -30,11 +35,6 @@ from t3mpc_ros.evaluation.baselines.linear_mpc import (
     LinearMpcPreviewParameters,
 )
 from t3mpc_ros.evaluation.baselines.nonlinear_mpc import CasadiNmpc, CasadiNmpcParameters
-from t3mpc_ros.evaluation.baselines.proportional_integral import (
-    ProportionalIntegral,
-    ProportionalIntegralParameters,
-)
-from t3mpc_ros.evaluation.baselines.sliding_mode import SlidingMode, SlidingModeParameters
 from t3mpc_ros.evaluation.closed_loop import MethodSpec
 from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
 from t3mpc_ros.evaluation.scenario import DRIVES

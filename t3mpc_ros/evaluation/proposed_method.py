@@ -49,15 +49,13 @@ class ProposedController(BaselineController):
     parameters_type = ProposedParameters
 
     def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None:
-        if not isinstance(parameters, ProposedParameters):
-            raise ValueError(
-                f'parameters must be ProposedParameters: got {type(parameters).__name__}'
-            )
-        self.preview: bool = parameters.jump_transition.preview  # type: ignore[misc]
+        super().__init__(parameters, nominal_model)
+        table: ProposedParameters = self.parameters
+        self.preview: bool = table.jump_transition.preview  # type: ignore[misc]
         self._period = nominal_model.period
         self._period_ns = round(nominal_model.period * NANOSECONDS)
-        self._tracker = deepcopy(_template(parameters, nominal_model.drive))
-        self._random = parameters.predictive.seed if parameters.random_predictor else None
+        self._tracker = deepcopy(_template(table, nominal_model.drive))
+        self._random = table.predictive.seed if table.random_predictor else None
         if self._random is not None:
             self._randomize_predictor(self._random)
         self._steps = 0

@@ -10,13 +10,13 @@ import pytest
 
 from t3mpc_ros.evaluation.baselines.adaptive_fuzzy import AdaptiveIntervalType2, AdaptiveType1
 from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
-from t3mpc_ros.evaluation.baselines.computed_torque import ComputedTorque
-from t3mpc_ros.evaluation.baselines.disturbance_rejection import (
+from t3mpc_ros.evaluation.baselines.feedback_control import (
+    ComputedTorque,
     DisturbanceRejection,
+    ProportionalIntegral,
+    SlidingMode,
     observer_gains,
 )
-from t3mpc_ros.evaluation.baselines.proportional_integral import ProportionalIntegral
-from t3mpc_ros.evaluation.baselines.sliding_mode import SlidingMode
 from t3mpc_ros.fuzzy.inference import compute_basis
 from t3mpc_ros.fuzzy.sets import build_sets
 from t3mpc_ros.geometry.types import WheelSpeeds

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
-from t3mpc_ros.evaluation.baselines.box_qp import make_workspace, solve
+from t3mpc_ros.evaluation.baselines.baseline_controller import (
+    NominalModel,
+    Observation,
+    WheelLoads,
+)
 from t3mpc_ros.evaluation.baselines.dynamic_matrix_control import (
     DynamicMatrix,
     DynamicMatrixParameters,
@@ -23,9 +26,6 @@ from t3mpc_ros.evaluation.baselines.linear_mpc import (
     LinearMpcParameters,
     LinearMpcPreview,
     LinearMpcPreviewParameters,
-    load_acceleration,
-    predict_reference,
-    wheel_model,
 )
 from t3mpc_ros.evaluation.baselines.nonlinear_mpc import (
     CasadiNmpc,
@@ -33,9 +33,14 @@ from t3mpc_ros.evaluation.baselines.nonlinear_mpc import (
     condense,
     wheel_dynamics,
 )
-from t3mpc_ros.mpc.quadratic_program import NOT_POSITIVE, OPTIMAL
+from t3mpc_ros.evaluation.baselines.predictive_baseline import (
+    BoxProgram,
+    predict_reference,
+    response_matrix,
+    wheel_model,
+)
 from t3mpc_ros.simulation.plant.disturbances import Disturbance, DisturbanceParameters
-from t3mpc_ros.simulation.plant.dynamics import dynamics_vector, wheel_inertia
+from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
 from t3mpc_ros.simulation.plant.paper_plant import PaperPlant, PaperRobotParameters
 
 PERIOD, LAG, REACH = 0.01, 0.02, 28.0
@@ -126,98 +131,62 @@ def _wander(steps, seed=3):
 
 
 def _random_program(generator):
-    """Return H, g, low, high: sizes, scales and the degenerate cases of the field."""
+    """Return a program, and H, g, low, high: sizes and scales of the field."""
     n = int(generator.integers(1, 41))
-    steps = generator.standard_normal(n)
-    kind = generator.integers(0, 3)
-    if kind == 0:
-        steps = 1.0 - KEPT ** np.arange(1, n + 1)
-    elif kind == 1:
-        steps = np.full(n, PERIOD)
-    matrix = np.array([[steps[j - i] if j >= i else 0.0 for i in range(n)] for j in range(n)])
+    steps = (generator.standard_normal(n), 1.0 - KEPT ** np.arange(1, n + 1), np.full(n, PERIOD))
+    matrix = response_matrix(steps[generator.integers(0, 3)], n)
     hessian = matrix.T @ matrix + 10 ** generator.uniform(-5, 1) * np.eye(n)
     slope = matrix.T @ (generator.standard_normal(n).cumsum() * 10 ** generator.uniform(-2, 2))
-    reach = 10 ** generator.uniform(-2, 2, n)
-    high = np.where(generator.random(n) < 0.1, np.inf, reach)
-    low = np.where(generator.random(n) < 0.1, -np.inf, -reach)
-    fixed = generator.random(n) < 0.05
-    low[fixed] = high[fixed] = 0.01
-    return hessian, slope, low, high
+    program = BoxProgram(hessian, 1.0)
+    program.high[:] = 10 ** generator.uniform(-2, 2, n)
+    program.low[:] = -program.high
+    program.high[generator.random(n) < 0.1] = math.inf
+    return program, hessian, slope
 
 
-def _fill(space, hessian, slope, low, high):
-    space.hessian[:], space.slope[:], space.low[:], space.high[:] = hessian, slope, low, high
-    space.factored[0] = -1
-
-
-def test_three_thousand_programs_satisfy_karush_kuhn_tucker():
+def test_programs_satisfy_karush_kuhn_tucker():
     generator = np.random.default_rng(8)
-    for _ in range(3000):
-        hessian, slope, low, high = _random_program(generator)
-        space = make_workspace(slope.size)
-        _fill(space, hessian, slope, low, high)
-        space.moves[:] = generator.standard_normal(slope.size)
-        assert solve(space, 1000) == OPTIMAL
-        x = space.moves
-        assert np.all(x >= low)
-        assert np.all(x <= high)
-        scale = np.abs(slope).max() + (np.abs(hessian) @ np.abs(x)).max()
-        gradient = (hessian @ x + slope) / scale
-        inside = (x > low) & (x < high)
-        assert np.abs(gradient[inside]).max(initial=0.0) < 1e-11
-        assert gradient[(x == low) & (x < high)].min(initial=0.0) > -1e-11
-        assert gradient[(x == high) & (x > low)].max(initial=0.0) < 1e-11
+    for _ in range(300):
+        program, hessian, slope = _random_program(generator)
+        for last in (0.3 * slope, slope):  # the second one starts from the first
+            x = program.solve(last)
+            scale = np.abs(last).max() + (np.abs(hessian) @ np.abs(x)).max()
+            gradient = (hessian @ x + last) / scale
+            low, high = program.low, program.high
+            assert np.all((x >= low) & (x <= high))
+            at_low, at_high = np.isclose(x, low, 1e-9, 0.0), np.isclose(x, high, 1e-9, 0.0)
+            assert np.abs(gradient[~at_low & ~at_high]).max(initial=0.0) < 1e-10
+            assert gradient[at_low].min(initial=0.0) > -1e-10
+            assert gradient[at_high].max(initial=0.0) < 1e-10
 
 
-def test_box_qp_agrees_with_an_independent_solver():
-    generator = np.random.default_rng(4)
-    for _ in range(40):
-        hessian, slope, low, high = _random_program(generator)
-        high = np.maximum(high, low + 1e-3)  # the other solver wants some room
-        root = np.linalg.cholesky(hessian).T
-        target = -np.linalg.solve(root.T, slope)
-        other = lsq_linear(root, target, (low, high), 'bvls', tol=1e-14, max_iter=500)
-        for start in (0.0, 1.0, math.nan):
-            space = make_workspace(slope.size)
-            _fill(space, hessian, slope, low, high)
-            space.moves[:] = start
-            assert solve(space, 1000) == OPTIMAL
-            gap = root @ (space.moves - other.x)
-            assert np.linalg.norm(gap) < 1e-6 * max(np.linalg.norm(target), 1e-6)
-
-
-def test_box_qp_without_optimum_is_rejected_within_bounds():
-    for hessian, slope in (
-        (np.diag([1.0, -1.0]), np.ones(2)),
-        (np.eye(2), np.array([1.0, math.nan])),
-    ):
-        space = make_workspace(2)
-        _fill(space, hessian, slope, -np.ones(2), np.ones(2))
-        assert solve(space, 1000) == NOT_POSITIVE
-        assert np.all(np.abs(space.moves) <= 1.0)
+def test_a_program_without_optimum_leaves_the_last_moves():
+    program = BoxProgram(np.eye(2), 1.0)
+    kept = program.solve(np.array([-0.5, 3.0]))
+    assert kept == pytest.approx([0.5, -1.0])
+    assert program.solve(np.array([1.0, math.nan])) == pytest.approx(kept)
+    assert program.solve(np.array([0.5, 0.0])) == pytest.approx([-0.5, 0.0])
 
 
 # -- what is expected of the reference ------------------------------------------------------------
 
 
 def test_future_goes_on_by_its_slope_but_a_jump_is_no_slope():
-    out = np.zeros((2, 8))
     ramp = np.array([[0.0, 5.0], [1.0, 5.0], [2.0, 5.0], [3.0, 9.0]])
-    predict_reference(np.zeros(2), np.zeros(2), ramp, 1.0, out)
-    assert np.array_equal(out[0], np.arange(8.0))
-    assert np.array_equal(out[1], [5, 5, 5, 9, 9, 9, 9, 9])
-    predict_reference(np.zeros(2), np.zeros(2), np.outer(np.arange(20.0), [1, 2]), 1.0, out)
-    assert np.array_equal(out[1], 2 * np.arange(8.0))
+    found = predict_reference(ramp, 1.0, 8, preview=True)
+    assert np.array_equal(found[:, 0], np.arange(8.0))
+    assert np.array_equal(found[:, 1], [5, 5, 5, 9, 9, 9, 9, 9])
+    known = np.outer(np.arange(20.0), [1, 2])
+    assert np.array_equal(predict_reference(known, 1.0, 8, preview=True), known[:8])
 
 
 def test_slope_dies_away_without_preview():
-    out = np.zeros((2, 400))
     fade = math.exp(-PERIOD / 0.2)
-    nothing = np.zeros((0, 2))
-    predict_reference(np.array([1.0, 0.0]), np.array([1.1, 0.0]), nothing, fade, out)
-    assert out[0, 1] == 1.1
-    assert out[0, -1] == pytest.approx(1.0 + 0.1 / (1.0 - fade), rel=1e-6)
-    assert not out[1].any()
+    known = np.array([[1.0, 0.0], [1.1, 0.0]])
+    found = predict_reference(known, fade, 400, preview=False)
+    assert found[1, 0] == 1.1
+    assert found[-1, 0] == pytest.approx(1.0 + 0.1 / (1.0 - fade), rel=1e-6)
+    assert not found[:, 1].any()
 
 
 # -- optimality -----------------------------------------------------------------------------------
@@ -347,7 +316,9 @@ def test_move_time_sets_the_symmetric_smoothing_filter(drive):
 @pytest.mark.parametrize('kind', EVERY)
 def test_bounds_are_never_left(kind, drive):
     baseline = _make(kind, drive, robot={}, move_time=0.003)
-    inertia = wheel_inertia(baseline._knowledge.robot.body, baseline._knowledge.robot.geometry)
+    inertia = wheel_inertia(
+        baseline._nominal_model.robot.body, baseline._nominal_model.robot.geometry
+    )
     _, command, u = _run(baseline, drive, _wander(300), noise=0.3)
     if drive == 'velocity':
         moves = np.diff(command, axis=0, prepend=0.0)
@@ -391,27 +362,16 @@ def test_offset_stays_while_its_own_errors_are_ignored(kind):
 def test_knowing_the_friction_helps_where_the_estimate_is_late(kind, drive):
     """The estimate of a filter comes late by a tenth of a second, the sign of r does not."""
     robot = {'body.com_offset': 0.0}
-    parameters = PaperRobotParameters().with_values(robot)
-    friction = parameters.friction
-    table = np.array([friction.viscous, friction.coulomb, friction.coulomb_width])
-    dynamics = dynamics_vector(parameters.body, parameters.geometry)
+    loads = WheelLoads(_knowledge(drive, robot))
     reference = _wander(500, seed=1)
     reference[:] = 3.0 * np.sin(6.0 * PERIOD * np.arange(len(reference)))[:, None] * [1.0, -0.7]
-    late = np.array(
-        [load_acceleration(*reference[max(k - 10, 0)], table, dynamics) for k in range(500)]
-    )
+    late = loads(reference[np.maximum(np.arange(500) - 10, 0)])
     errors = []
     for known in (robot, {**robot, 'friction.coulomb': 0.0, 'friction.viscous': 0.0}):
         baseline = _make(
             kind, drive, robot=known, disturbance_share=0.3 if known is robot else 1.0
         )
-        speeds, *_ = _run(
-            baseline,
-            drive,
-            reference,
-            lambda chi: np.array(load_acceleration(*chi, table, dynamics)),
-            late,
-        )
+        speeds, *_ = _run(baseline, drive, reference, loads, late)
         errors.append(np.sqrt(np.mean((speeds - reference[:500])[100:] ** 2)))
     assert errors[0] < 0.7 * errors[1]
 
@@ -479,14 +439,11 @@ def test_known_loads_are_compensated_by_a_shift_of_the_command():
     reference = 2.0 * np.sin(0.05 * np.arange(100))[:, None] * [1.0, -0.5]
     rough = _make(DynamicMatrixPreview, 'velocity', robot={})
     smooth = _make(DynamicMatrixPreview, 'velocity')
-    robot = PaperRobotParameters()
-    friction = robot.friction
-    table = np.array([friction.viscous, friction.coulomb, friction.coulomb_width])
-    dynamics = dynamics_vector(robot.body, robot.geometry)
-    first = np.array(load_acceleration(*reference[1], table, dynamics))
+    loads = WheelLoads(_knowledge('velocity', {}))
+    first = loads(reference[1])
     commands = np.array([-LAG * first, np.zeros(2)])
     for k in range(55):
-        load = np.array(load_acceleration(*reference[k + 1], table, dynamics))
+        load = loads(reference[k + 1])
         future = reference[k : k + AHEAD]
         for i, (baseline, seen) in enumerate(((rough, load), (smooth, np.zeros(2)))):
             observation = Observation(
@@ -566,23 +523,21 @@ def test_period_of_the_model_is_that_of_the_simulated_robot(drive, factor):
         assert np.abs(reached - chi).max() > 5e-3
 
 
-@pytest.mark.parametrize('lasting', [0.0, 1.0])
+@pytest.mark.parametrize('lasting', [False, True])
 def test_condensing_closes_the_gaps_and_superposes(lasting):
     """Against a run of the linearised model, with commands changed at will."""
     generator = np.random.default_rng(6)
     n = 7
-    guess, reached = generator.standard_normal((2, n + 1, 2))
     by_speed, by_command = generator.standard_normal((2, n, 2, 2))
-    units, reference = generator.standard_normal((2, 2)), generator.standard_normal((2, n + 1))
-    errors, response = np.zeros(2 * n), np.zeros((2 * n, 2 * n))
-    condense(guess, reached[:n], by_speed, by_command, reference, units, lasting, errors, response)
+    units, gaps = generator.standard_normal((2, 2)), generator.standard_normal((n, 2))
+    response, transition = condense(by_speed, by_command, units, lasting=lasting)
     moves = generator.standard_normal((n, 2))
-    change, speeds = np.zeros(2), guess[0].copy()
+    change, speeds = np.zeros(2), np.zeros(2)
+    there = (response @ moves.ravel() + transition @ gaps.ravel()).reshape(n, 2)
     for j in range(n):
         change = lasting * change + units @ moves[j]
-        speeds = reached[j] + (speeds - guess[j]) @ by_speed[j] + change @ by_command[j]
-        there = errors[2 * j : 2 * j + 2] + response[2 * j : 2 * j + 2] @ moves.ravel()
-        assert there == pytest.approx(speeds - reference[:, j + 1], rel=1e-9, abs=1e-9)
+        speeds = by_speed[j] @ speeds + by_command[j] @ change + gaps[j]
+        assert there[j] == pytest.approx(speeds, rel=1e-9, abs=1e-9)
 
 
 @pytest.mark.parametrize('drive', DRIVES)

@@ -14,7 +14,7 @@ from t3mpc_ros.cli.main import main
 from t3mpc_ros.control.controller import Controller
 from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
 from t3mpc_ros.evaluation.baselines.feed_forward import FeedForward, FeedForwardParameters
-from t3mpc_ros.evaluation.baselines.proportional_integral import (
+from t3mpc_ros.evaluation.baselines.feedback_control import (
     ProportionalIntegral,
     ProportionalIntegralParameters,
 )

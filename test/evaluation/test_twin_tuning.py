@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from t3mpc_ros.control.controller import StepperControllerParameters
-from t3mpc_ros.evaluation.baselines.proportional_integral import ProportionalIntegralParameters
+from t3mpc_ros.evaluation.baselines.feedback_control import ProportionalIntegralParameters
 from t3mpc_ros.evaluation.confidence_intervals import Difference
 from t3mpc_ros.evaluation.method_comparison import twin_tuning
 from t3mpc_ros.evaluation.method_comparison.compared_runs import (

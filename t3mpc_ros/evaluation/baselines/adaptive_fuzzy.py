@@ -5,32 +5,22 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.control.control_law import compensator
 from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
-from t3mpc_ros.evaluation.baselines.feedback_baseline import (
-    CLOSING,
-    OWN,
-    FeedbackBaseline,
-    JumpTransientParameters,
-    checked_parameters,
-    disturbance_error,
-    write_acceleration,
-)
+from t3mpc_ros.evaluation.baselines.feedback_control import FeedbackBaseline, FeedbackParameters
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, gamma_for
 from t3mpc_ros.fuzzy.sets import FuzzyParameters
-from t3mpc_ros.kernels import kernel
-from t3mpc_ros.parameters.table import Parameters, group, parameter
+from t3mpc_ros.parameters.table import Parameters, parameter
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class AdaptiveParameters(Parameters):
+class AdaptiveParameters(FeedbackParameters):
     """What both adaptive fuzzy controllers have; the sets cover -10 to 10 rad/s."""
 
     gain: float = parameter(30.0, 'feedback K on the error', unit='1/s', low=0.5, high=100.0)
@@ -71,7 +61,6 @@ class AdaptiveParameters(Parameters):
     centre_exponent: float = parameter(
         2.0, 'how much closer together the centres are in the middle', low=0.2, high=5.0
     )
-    jump_transient: JumpTransientParameters = group(JumpTransientParameters)
 
     def fuzzy(self) -> FuzzyParameters:
         """Return the shape of the fuzzy system, type-1; the fuzzifier is a singleton."""
@@ -115,37 +104,7 @@ def _unit_gamma(fuzzy: FuzzyParameters) -> float:
     return gamma_for(fuzzy, 1.0)
 
 
-@kernel
-def _find_errors(
-    speeds: Array, reference: Array, period: float, gains: Array, memory: Array
-) -> None:
-    """Write e into the first own row of memory. gains : as in :func:`_oppose`."""
-    for i in range(2):
-        memory[OWN, i] = disturbance_error(
-            i, speeds, reference, period, 1.0, gains[3], gains[4], memory
-        )
-
-
-@kernel
-def _oppose(
-    estimate: Array,
-    reference: Array,
-    next_reference: Array,
-    period: float,
-    gains: Array,
-    memory: Array,
-    command: Array,
-) -> None:
-    """Write the answer. gains : K, bound, smoothing, closing share and acceleration."""
-    for i in range(2):
-        error = memory[OWN, i]
-        feedforward = (next_reference[i] - reference[i]) / period + memory[CLOSING, i]
-        u = feedforward - estimate[i] - gains[0] * error
-        u += compensator(error, gains[1], gains[2])
-        write_acceleration(i, u, next_reference, memory, command)
-
-
-class _Adaptive(FeedbackBaseline):
+class _Adaptive(FeedbackBaseline[AdaptiveParameters]):
     r"""The law both share: u = r' + v(h) - g(chi|alpha) - K e - bound tanh(e/epsilon).
 
     The coefficients learn by alpha' = gamma Phi e from the error that their own estimate has
@@ -159,11 +118,9 @@ class _Adaptive(FeedbackBaseline):
     adaptation is put there.
     """
 
-    _table: ClassVar[type[AdaptiveParameters]]
-
     def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None:
-        table = checked_parameters(parameters, self._table)
-        super().__init__(nominal_model, table.jump_transient, own=1)
+        super().__init__(parameters, nominal_model)
+        table = self.parameters
         fuzzy = table.fuzzy()
         steps = table.gain * nominal_model.period
         self.fuzzy = FuzzyEstimator(
@@ -174,33 +131,18 @@ class _Adaptive(FeedbackBaseline):
                 step_limit=max(0.001, table.gain * min(1.0, 2.0 - steps)),
             ),
         )
-        self._gains: Array = np.array(
-            [table.gain, table.error_bound, table.smoothing, *self._closing]
-        )
+        self.error: Array = np.zeros(2)
+        """e, the error that is learnt from, rad/s, shape (2,)."""
         self._limited = False
 
-    @property
-    def error(self) -> Array:
-        """e, the error that is learnt from, rad/s, shape (2,)."""
-        error: Array = self._memory[OWN].copy()
-        return error
-
-    def step(self, observation: Observation) -> Array:
+    def feedback(self, observation: Observation, feedforward: Array, error: Array) -> Array:
         """Return u, rad/s², shape (2,)."""
-        memory = self._memory
-        _find_errors(observation.speeds, observation.reference, self._period, self._gains, memory)
+        table, self.error = self.parameters, error
         if not self._limited:
-            self.fuzzy.adapt(memory[OWN], self._period)
-        _oppose(
-            self.fuzzy.evaluate(observation.speeds),
-            observation.reference,
-            observation.next_reference,
-            self._period,
-            self._gains,
-            memory,
-            self._command,
-        )
-        return self._command
+            self.fuzzy.adapt(error, self._period)
+        estimate = self.fuzzy.evaluate(observation.speeds)
+        robust = [compensator(e, table.error_bound, table.smoothing) for e in error.tolist()]
+        return np.asarray(feedforward - estimate - table.gain * error + robust)
 
     def applied(self, acceleration: Array, *, limited: bool) -> None:
         """Take note of the u that was applied; adaptation pauses while the drive is limited."""
@@ -219,7 +161,7 @@ class _Adaptive(FeedbackBaseline):
 class AdaptiveType1(_Adaptive):
     """Adaptive control with a type-1 fuzzy system (Wang 1993), see :class:`_Adaptive`."""
 
-    parameters_type = _table = AdaptiveType1Parameters
+    parameters_type = AdaptiveType1Parameters
 
 
 class AdaptiveIntervalType2(_Adaptive):
@@ -228,4 +170,4 @@ class AdaptiveIntervalType2(_Adaptive):
     See :class:`_Adaptive`.
     """
 
-    parameters_type = _table = AdaptiveIntervalType2Parameters
+    parameters_type = AdaptiveIntervalType2Parameters

@@ -16,12 +16,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import Parameters
+from t3mpc_ros.simulation.plant.disturbances import friction_torque
+from t3mpc_ros.simulation.plant.dynamics import BodyParameters, dynamics_vector, wheel_acceleration
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
 
 Array = NDArray[np.float64]
@@ -56,6 +59,59 @@ class NominalModel:
         return u
 
 
+class WheelLoads:
+    """What friction and turning do to the nominal wheels, rad/s², with no drive.
+
+    Parameters
+    ----------
+    nominal_model
+        Nominal model of the robot.
+    body
+        A body in place of the nominal one.
+    inertia_factor
+        Inertia of the wheels over that of the body: a heavier body is moved less by the same
+        friction.
+    """
+
+    def __init__(
+        self,
+        nominal_model: NominalModel,
+        body: BodyParameters | None = None,
+        inertia_factor: float = 1.0,
+    ) -> None:
+        robot = nominal_model.robot
+        friction = robot.friction
+        self._friction: Array = np.array(
+            [friction.viscous, friction.coulomb, friction.coulomb_width]
+        )
+        self._dynamics = dynamics_vector(body or robot.body, robot.geometry)
+        self._dynamics[2:4] *= inertia_factor
+
+    def __call__(self, speeds: Array) -> Array:
+        """Return the accelerations at wheel speeds (rad/s), shape (2,) or (n, 2) each."""
+        found = np.empty((speeds.size // 2, 2))
+        _load_accelerations(speeds.reshape(-1, 2), self._friction, self._dynamics, found)
+        return found.reshape(speeds.shape)
+
+
+@kernel
+def _load_accelerations(speeds: Array, friction: Array, dynamics: Array, out: Array) -> None:
+    """Write (10) without drive into ``out``, shape (n, 2) as ``speeds``.
+
+    friction : shape (3,), viscous (N m s/rad), Coulomb (N m), width (rad/s)
+    dynamics : shape (5,), see :func:`t3mpc_ros.simulation.plant.dynamics.dynamics_vector`
+    """
+    for k in range(out.shape[0]):
+        right, left = speeds[k, 0], speeds[k, 1]
+        out[k, 0], out[k, 1] = wheel_acceleration(
+            right,
+            left,
+            -friction_torque(right, friction[0], friction[1], friction[2]),
+            -friction_torque(left, friction[0], friction[1], friction[2]),
+            dynamics,
+        )
+
+
 @dataclass(slots=True)
 class Observation:
     """Input of a method at one step; right wheel first, valid until the next step.
@@ -86,17 +142,28 @@ class BaselineController(ABC):
     Parameters
     ----------
     parameters
-        Tunable parameters, an instance of :attr:`settings_type`.
-    knowledge
+        Tunable parameters, an instance of :attr:`parameters_type`.
+    nominal_model
         Nominal model of the robot.
+
+    Raises
+    ------
+    ValueError
+        The parameters are of another method.
     """
 
     parameters_type: ClassVar[type[Parameters]]
     preview: ClassVar[bool] = False
     """Whether it uses :attr:`Observation.future`."""
 
-    @abstractmethod
-    def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None: ...
+    def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None:
+        if type(parameters) is not self.parameters_type:
+            raise ValueError(
+                f'parameters must be {self.parameters_type.__name__}: '
+                f'got {type(parameters).__name__}'
+            )
+        self.parameters: Any = parameters
+        self._nominal_model = nominal_model
 
     @abstractmethod
     def step(self, observation: Observation) -> Array:

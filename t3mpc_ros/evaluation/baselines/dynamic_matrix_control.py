@@ -29,29 +29,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
-    BaselineController,
     NominalModel,
     Observation,
+    WheelLoads,
 )
-from t3mpc_ros.evaluation.baselines.box_qp import (
-    Workspace,
-    make_workspace,
-    response_matrix,
-    shift_plan,
-    solve,
-)
-from t3mpc_ros.evaluation.baselines.linear_mpc import (
-    MAX_ITERATIONS,
+from t3mpc_ros.evaluation.baselines.predictive_baseline import (
+    BoxProgram,
+    ExtrapolationParameters,
+    PredictiveBaseline,
+    PredictiveParameters,
     WheelModel,
-    known_future,
-    load_acceleration,
-    load_parameters,
-    predict_reference,
+    response_matrix,
     torque_units,
     wheel_model,
 )
-from t3mpc_ros.kernels import kernel
-from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
+from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter, with_default
 
 Array = NDArray[np.float64]
 
@@ -62,22 +54,11 @@ MAX_RESPONSE_LENGTH = 1000
 
 
 @dataclass(frozen=True)
-class DynamicMatrixPreviewParameters(Parameters):
+class DynamicMatrixPreviewParameters(PredictiveParameters):
     """Parameters of dynamic matrix control with preview."""
 
-    model_error: float = parameter(
-        1.0, 'inertia that the model believes in over the nominal one', low=0.1, high=10.0
-    )
-    horizon: int = parameter(40, 'P, periods looked ahead', low=2, high=200)
     moves: int = parameter(
         40, 'M, moves planned; the command stays where they lead', low=1, high=200
-    )
-    move_time: float = parameter(
-        0.01,
-        'time over which it smooths, about; the move suppression is (move_time/T)²',
-        unit='s',
-        low=0.001,
-        high=0.5,
     )
     bias_time: float = parameter(
         0.3,
@@ -85,9 +66,6 @@ class DynamicMatrixPreviewParameters(Parameters):
         unit='s',
         low=0.001,
         high=20.0,
-    )
-    disturbance_share: float = parameter(
-        0.3, 'share of the shared disturbance estimate fed forward', low=0.01, high=2.0
     )
     load_share: float = parameter(
         1.0,
@@ -112,19 +90,10 @@ class DynamicMatrixPreviewParameters(Parameters):
 
 
 @dataclass(frozen=True)
-class DynamicMatrixParameters(DynamicMatrixPreviewParameters):
+class DynamicMatrixParameters(ExtrapolationParameters, DynamicMatrixPreviewParameters):
     """Parameters of dynamic matrix control without preview."""
 
-    moves: int = parameter(
-        12, 'M, moves planned; the command stays where they lead', low=1, high=200
-    )
-    slope_time: float = parameter(
-        0.2,
-        'time constant with which the slope of the reference is expected to die away',
-        unit='s',
-        low=0.002,
-        high=10.0,
-    )
+    moves: int = with_default(DynamicMatrixPreviewParameters, 'moves', 12)
 
 
 class Responses(NamedTuple):
@@ -177,207 +146,93 @@ def identify_step_responses(model: WheelModel, inner_gain: float, least: int) ->
     return Responses(steps[:length].copy(), loads[:length].copy())
 
 
-class PlantModel(NamedTuple):
-    """Model of the robot, read-only."""
-
-    responses: Responses
-    static: float
-    """Steady speed (rad/s) by which a wheel misses its set point per rad/s² that acts on it."""
-    gains: Array
-    """Shape (3,): share of the disturbance, share of a miss that the bias takes in, share of the
-    loads that is compensated."""
-    friction: Array
-    """Shape (3,), see :func:`t3mpc_ros.evaluation.baselines.linear_mpc.load_acceleration`."""
-    dynamics: Array
-    reach: float
-    """Largest move that the drive follows, rad/s."""
-
-
-class ControllerState(NamedTuple):
-    """State between steps, one row or entry per wheel."""
-
-    outputs: Array
-    """Y_0 ... Y_(n-1), rad/s, shape (2, n)."""
-    command: Array
-    """c that Y knows of, rad/s, shape (2,)."""
-    disturbance: Array
-    """Disturbance that Y knows of, rad/s², shape (2,)."""
-    bias: Array
-    """b, rad/s, shape (2,)."""
-    offset: Array
-    """c less what was sent: what compensates the loads, rad/s, shape (2,)."""
-    begun: Array
-    """Shape (1,): 1 when there was a step before."""
-    errors: Array
-    """Working memory, shape (P,)."""
-
-
-@kernel
-def dmc_step(
-    speeds: Array,
-    unexplained: Array,
-    sent: Array,
-    reference: Array,
-    plant: PlantModel,
-    memory: ControllerState,
-    wheels: tuple[Workspace, Workspace],
-    out: Array,
-) -> None:
-    """Write the best command (rad/s) for either wheel into ``out``, shape (2,).
-
-    speeds, unexplained : chi (rad/s) and d (rad/s²), shape (2,)
-    sent : the limited command of the last period, rad/s, shape (2,)
-    reference : shape (2, P + 1), see :func:`.linear_mpc.predict_reference`
-    """
-    steps, loads = plant.responses
-    gains, errors = plant.gains, memory.errors
-    here = load_acceleration(reference[0, 1], reference[1, 1], plant.friction, plant.dynamics)
-    for z in range(2):
-        space, ahead = wheels[z], memory.outputs[z]
-        compensated = gains[2] * here[z]
-        offset = plant.static * compensated
-        if memory.begun[0] > 0.0:
-            command = sent[z] + memory.offset[z]
-            for j in range(ahead.size - 1):
-                ahead[j] = ahead[j + 1]
-            change = command - memory.command[z]
-            for j in range(ahead.size):
-                ahead[j] += steps[j] * change
-        else:
-            command = sent[z] + offset
-            memory.offset[z] = offset
-            ahead[:] = speeds[z]
-        memory.command[z] = command
-        # A disturbance that begins to act now is in the output one period later.
-        change = gains[0] * (unexplained[z] - compensated) - memory.disturbance[z]
-        memory.disturbance[z] += change
-        for j in range(1, ahead.size):
-            ahead[j] += loads[j - 1] * change
-        memory.bias[z] += gains[1] * (speeds[z] - ahead[0] - memory.bias[z])
-        for j in range(errors.size):
-            errors[j] = ahead[j + 1] + memory.bias[z] - reference[z, j + 1]
-        for i in range(space.slope.size):
-            total = 0.0
-            for j in range(i, errors.size):
-                total += steps[j - i] * errors[j]
-            space.slope[i] = total
-        # What is sent moves by the first move less the change of the compensation.
-        shifted = offset - memory.offset[z]
-        space.low[0], space.high[0] = shifted - plant.reach, shifted + plant.reach
-        memory.offset[z] = offset
-        shift_plan(space.moves, 0.0)
-        solve(space, MAX_ITERATIONS)
-        change = min(max(space.moves[0] - shifted, -plant.reach), plant.reach)
-        out[z] = sent[z] + change
-    memory.begun[0] = 1.0
-
-
-class DynamicMatrix(BaselineController):
-    """Dynamic matrix control without preview: it extrapolates the reference by its slope.
-
-    Raises
-    ------
-    ValueError
-        With preview: a view without a future.
-    """
+class DynamicMatrix(PredictiveBaseline):
+    """Dynamic matrix control without preview: it extrapolates the reference by its slope."""
 
     parameters_type: ClassVar[type[Parameters]] = DynamicMatrixParameters
 
     def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None:
-        if type(parameters) is not self.parameters_type or not isinstance(
-            parameters, DynamicMatrixPreviewParameters
-        ):
-            raise ValueError(
-                f'parameters must be {self.parameters_type.__name__}: got {parameters!r}'
-            )
-        self.parameters = parameters
-        self._knowledge = nominal_model
-        self._inner_gain = parameters.inner_gain if nominal_model.drive == 'torque' else 0.0
-        period, n = nominal_model.period, parameters.horizon
-        model = wheel_model(nominal_model, parameters.model_error)
+        super().__init__(parameters, nominal_model)
+        table, period = self.parameters, nominal_model.period
+        self._inner_gain = table.inner_gain if self._torque else 0.0
+        model = wheel_model(nominal_model, table.model_error)
+        n = table.horizon
         self.responses = identify_step_responses(model, self._inner_gain, n + 1)
         """Step responses of the wheel model."""
-        response = response_matrix(self.responses.steps[:n], parameters.moves)
-        weight = (parameters.move_time / period) ** 2
-        reach = nominal_model.acceleration * period
+        self._static = float(self.responses.loads[-1])
+        """Steady speed (rad/s) by which a wheel misses its set point per rad/s² on it."""
+        self._response = response_matrix(self.responses.steps[:n], table.moves)
+        weight = (table.move_time / period) ** 2
+        self._reach = nominal_model.acceleration * period
         if self._inner_gain and self.preview:
             # A set point that is planned ahead should not outrun the motors, going straight on.
-            reach = float(torque_units(nominal_model)[0].sum()) * period
-        self._wheels = (make_workspace(parameters.moves), make_workspace(parameters.moves))
-        for space in self._wheels:
-            space.hessian[:] = response.T @ response + weight * np.eye(parameters.moves)
-            space.low[:], space.high[:] = -reach, reach
-        self._fade = 1.0
-        if isinstance(parameters, DynamicMatrixParameters):
-            self._fade = math.exp(-period / parameters.slope_time)
-        friction, dynamics = load_parameters(nominal_model, parameters.model_error)
-        self._plant = PlantModel(
-            responses=self.responses,
-            static=float(self.responses.loads[-1]),
-            gains=np.array(
-                [
-                    parameters.disturbance_share,
-                    -math.expm1(-period / parameters.bias_time),
-                    parameters.load_share,
-                ]
-            ),
-            friction=friction,
-            dynamics=dynamics,
-            reach=reach,
-        )
-        self._memory = ControllerState(
-            outputs=np.zeros((2, self.responses.steps.size)),
-            command=np.zeros(2),
-            disturbance=np.zeros(2),
-            bias=np.zeros(2),
-            offset=np.zeros(2),
-            begun=np.zeros(1),
-            errors=np.zeros(n),
-        )
-        self._reference = np.zeros((2, n + 1))
-        self._answer = np.zeros(2)
-        self._speeds = np.zeros(2)
-        self._begun = False
-
-    @property
-    def bias(self) -> Array:
+            self._reach = float(torque_units(nominal_model)[0].sum()) * period
+        hessian = self._response.T @ self._response + weight * np.eye(table.moves)
+        self._wheels = [BoxProgram(hessian, self._reach) for _ in range(2)]
+        self._loads = WheelLoads(nominal_model, inertia_factor=table.model_error)
+        self._bias_share = -math.expm1(-period / table.bias_time)
+        self._outputs: Array | None = None
+        """Y_0 ... Y_(n-1), rad/s, shape (n, 2)."""
+        self._known_command: Array = np.zeros(2)
+        """c that Y knows of, rad/s."""
+        self._disturbance: Array = np.zeros(2)
+        """Disturbance that Y knows of, rad/s²."""
+        self.bias: Array = np.zeros(2)
         """Prediction error of the model, b, rad/s, shape (2,)."""
-        return self._memory.bias.copy()
+        self._offset: Array = np.zeros(2)
+        """c less what was sent: what compensates the loads, rad/s."""
 
     @property
     def plan(self) -> Array:
         """The planned changes of c, rad/s, shape (2, M), right wheel first."""
-        return np.array([space.moves for space in self._wheels])
+        return np.array([program.moves for program in self._wheels])
 
     def step(self, observation: Observation) -> Array:
         """Return u, rad/s², shape (2,)."""
-        future = known_future(observation, self.preview)
-        predict_reference(
-            observation.reference, observation.next_reference, future, self._fade, self._reference
-        )
-        if self._inner_gain and not self._begun:
-            self._answer[:] = observation.speeds
-            self._begun = True
-        dmc_step(
-            observation.speeds,
-            observation.unexplained,
-            self._answer if self._inner_gain else observation.command,
-            self._reference,
-            self._plant,
-            self._memory,
-            self._wheels,
-            self._answer,
-        )
-        if self._inner_gain:
-            self._speeds[:] = observation.speeds
-            u: Array = self._inner_gain * (self._answer - observation.speeds)
-            return u
-        return self._knowledge.acceleration_for(self._answer, observation.speeds)
+        if not self._inner_gain:
+            return super().step(observation)
+        self._speeds = observation.speeds.copy()
+        if self._outputs is None:
+            self._command = self._speeds
+        self._command = self.advise(observation, self._command, self._expected(observation))
+        return np.asarray(self._inner_gain * (self._command - self._speeds))
 
     def applied(self, acceleration: Array, *, limited: bool) -> None:
         """Go on from the set point that would have made the u that was let through."""
         if self._inner_gain and limited:
-            self._answer[:] = self._speeds + acceleration / self._inner_gain
+            self._command = self._speeds + acceleration / self._inner_gain
+
+    def advise(self, observation: Observation, before: Array, reference: Array) -> Array:
+        """Return the best command after the limited one of the last period, rad/s."""
+        table, (steps, loads) = self.parameters, self.responses
+        compensated = table.load_share * self._loads(reference[1])
+        offset = self._static * compensated
+        if self._outputs is None:
+            self._offset = offset
+            self._known_command = before + offset
+            ahead = np.tile(observation.speeds, (steps.size, 1))
+        else:
+            command = before + self._offset
+            ahead = np.vstack([self._outputs[1:], self._outputs[-1:]])
+            ahead += np.outer(steps, command - self._known_command)
+            self._known_command = command
+        # A disturbance that begins to act now is in the output one period later.
+        change = table.disturbance_share * (observation.unexplained - compensated)
+        change -= self._disturbance
+        self._disturbance = self._disturbance + change
+        ahead[1:] += np.outer(loads[:-1], change)
+        self._outputs = ahead
+        self.bias = self.bias + self._bias_share * (observation.speeds - ahead[0] - self.bias)
+        errors = ahead[1 : len(reference)] + self.bias - reference[1:]
+        slopes = self._response.T @ errors
+        # What is sent moves by the first move less the change of the compensation.
+        shifted = offset - self._offset
+        self._offset = offset
+        first = np.empty(2)
+        for z, program in enumerate(self._wheels):
+            program.low[0], program.high[0] = shifted[z] - self._reach, shifted[z] + self._reach
+            first[z] = program.solve(slopes[:, z].copy())[0]
+        return np.asarray(before + np.clip(first - shifted, -self._reach, self._reach))
 
 
 class DynamicMatrixPreview(DynamicMatrix):

@@ -22,7 +22,6 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import (
     NominalModel,
     Observation,
 )
-from t3mpc_ros.evaluation.baselines.feedback_baseline import checked_parameters
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.parameters.table import Parameters, group, parameter
 
@@ -54,8 +53,8 @@ class FeedForward(BaselineController):
     preview = True
 
     def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None:
-        table = checked_parameters(parameters, FeedForwardParameters)
-        self._nominal_model = nominal_model
+        super().__init__(parameters, nominal_model)
+        table: FeedForwardParameters = self.parameters
         self._torque = nominal_model.drive == 'torque'
         period = nominal_model.period
         self._period_ns = round(period * NANOSECONDS)

@@ -21,40 +21,30 @@ moves is solved to optimality.
 
 from dataclasses import dataclass, replace
 import importlib
-import math
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
-    BaselineController,
     NominalModel,
     Observation,
+    WheelLoads,
 )
-from t3mpc_ros.evaluation.baselines.box_qp import Workspace, make_workspace, multiply, solve
-from t3mpc_ros.evaluation.baselines.linear_mpc import (
-    MAX_ITERATIONS,
-    known_future,
-    load_acceleration,
-    move_weight,
-    predict_reference,
-    torque_units,
+from t3mpc_ros.evaluation.baselines.predictive_baseline import (
+    BoxProgram,
+    ObserverBaseline,
+    ObserverParameters,
+    PredictiveParameters,
 )
-from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
-from t3mpc_ros.simulation.plant.dynamics import (
-    BodyParameters,
-    coriolis_factor,
-    dynamics_vector,
-    wheel_inertia,
-)
+from t3mpc_ros.simulation.plant.dynamics import BodyParameters, coriolis_factor, wheel_inertia
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class CasadiNmpcParameters(Parameters):
+class CasadiNmpcParameters(ObserverParameters, PredictiveParameters):
     """Parameters of nonlinear MPC."""
 
     model_error: float = parameter(
@@ -65,34 +55,11 @@ class CasadiNmpcParameters(Parameters):
     )
     horizon: int = parameter(40, 'N, periods looked ahead and free moves', low=2, high=100)
     iterations: int = parameter(1, 'linearisations per step', low=1, high=20)
-    move_time: float = parameter(
-        0.01,
-        'time over which it smooths, about; the weight rho of a move is (move_time/T)² with the '
-        'velocity drive, and (move_time²/T)² with the torque drive',
-        unit='s',
-        low=0.001,
-        high=0.5,
-    )
     disturbance_share: float = parameter(
         0.3,
         'share taken of the part of the disturbance estimate that the model does not explain',
         low=0.01,
         high=2.0,
-    )
-    integral_time: float = parameter(
-        1.0,
-        'time constant with which its own prediction errors become part of the disturbance',
-        unit='s',
-        low=0.02,
-        high=50.0,
-    )
-    filter_time: float = parameter(
-        0.1,
-        'time constant with which its own prediction of the speed is drawn to the estimate; the '
-        'least takes the estimate as it is',
-        unit='s',
-        low=0.001,
-        high=5.0,
     )
 
 
@@ -151,110 +118,42 @@ def scaled_body(nominal_model: NominalModel, factor: float) -> BodyParameters:
     )
 
 
-@kernel
 def condense(
-    speeds: Array,
-    reached: Array,
-    by_speed: Array,
-    by_command: Array,
-    reference: Array,
-    units: Array,
-    lasting: float,
-    errors: Array,
-    response: Array,
-) -> None:
-    """Eliminate the states: write errors and responses of the linearised horizon.
+    by_speed: Array, by_command: Array, units: Array, *, lasting: bool
+) -> tuple[Array, Array]:
+    """Eliminate the states of the linearised horizon.
 
-    speeds : shape (N + 1, 2), the states guessed
-    reached : shape (N, 2), where the model gets from each in one period
-    by_speed, by_command : shape (N, 2, 2), its derivatives; ``[j, k, i]`` is that of wheel i by
-        entry k
-    reference : shape (2, N + 1)
-    units : shape (2, 2), change of the command by each of the two unknowns of a period
-    lasting : 1 when a change of the command lasts to the end of the horizon, else 0
-    errors : shape (2N,), overwritten: chi - r of periods 1 ... N, right and left in turn, where
-        the linearised model leads with the guessed commands, the gaps between states closed
-    response : shape (2N, 2N), overwritten below its diagonal blocks: column 2j + m is what
-        unknown m of period j adds to the errors
+    Parameters
+    ----------
+    by_speed, by_command
+        Derivatives of the model at each period, shape (N, 2, 2).
+    units
+        Change of the command by each of the two unknowns of a period, shape (2, 2).
+    lasting
+        Whether a change of the command lasts to the end of the horizon.
+
+    Returns
+    -------
+    response
+        Shape (2N, 2N): column 2j + m is what unknown m of period j adds to the speeds of periods
+        1 ... N, right and left in turn.
+    transition
+        Shape (N, 2, 2N): what a gap between two periods adds to the speeds of all later ones.
     """
-    n = reached.shape[0]
-    right, left = 0.0, 0.0
+    n = len(by_speed)
+    response, transition = np.zeros((n, 2, n, 2)), np.zeros((n, 2, n, 2))
     for j in range(n):
-        slope = by_speed[j]
-        right, left = (
-            slope[0, 0] * right + slope[1, 0] * left + reached[j, 0] - speeds[j + 1, 0],
-            slope[0, 1] * right + slope[1, 1] * left + reached[j, 1] - speeds[j + 1, 1],
-        )
-        errors[2 * j] = speeds[j + 1, 0] + right - reference[0, j + 1]
-        errors[2 * j + 1] = speeds[j + 1, 1] + left - reference[1, j + 1]
-    for first in range(n):
-        for m in range(2):
-            right, left = 0.0, 0.0
-            for j in range(first, n):
-                slope, push = by_speed[j], by_command[j]
-                on = 1.0 if j == first else lasting
-                c_right, c_left = on * units[0, m], on * units[1, m]
-                right, left = (
-                    slope[0, 0] * right
-                    + slope[1, 0] * left
-                    + push[0, 0] * c_right
-                    + push[1, 0] * c_left,
-                    slope[0, 1] * right
-                    + slope[1, 1] * left
-                    + push[0, 1] * c_right
-                    + push[1, 1] * c_left,
-                )
-                response[2 * j, 2 * first + m] = right
-                response[2 * j + 1, 2 * first + m] = left
+        if j:
+            response[j] = np.tensordot(by_speed[j], response[j - 1], 1)
+            transition[j] = np.tensordot(by_speed[j], transition[j - 1], 1)
+        push = by_command[j] @ units
+        first = 0 if lasting else j
+        response[j, :, first : j + 1] += push[:, np.newaxis]
+        transition[j, :, j] += np.eye(2)
+    return response.reshape(2 * n, 2 * n), transition.reshape(2 * n, 2 * n)
 
 
-@kernel
-def solve_linearised(
-    errors: Array, response: Array, damping: Array, first: Array, space: Workspace
-) -> int:
-    """Write the best moves of the linearised horizon, and the errors they lead to.
-
-    errors, response : see :func:`condense`; the errors are changed in place
-    damping : shape (2N, 2N), what the weight of the moves adds to the Hessian
-    first : shape (2,), and to the slope of the first two, because of the command before
-    space : its moves are the guess at which ``errors`` hold
-    """
-    n = space.slope.size
-    hessian, slope, moves, guess = space.hessian, space.slope, space.moves, space.product
-    slope[:] = 0.0
-    for i in range(n):
-        for k in range(i + 1):
-            hessian[i, k] = 0.0
-    for j in range(n):
-        # Later moves than this period's do nothing to it.
-        for i in range(2 * (j // 2) + 2):
-            entry = response[j, i]
-            slope[i] += entry * errors[j]
-            for k in range(i + 1):
-                hessian[i, k] += entry * response[j, k]
-    for i in range(n):
-        for k in range(i):
-            hessian[k, i] = hessian[i, k]
-    # The unknowns are the moves themselves, not what they differ from the guess.
-    multiply(hessian, moves, guess)
-    for i in range(n):
-        slope[i] -= guess[i]
-        for k in range(n):
-            hessian[i, k] += damping[i, k]
-    slope[0] += first[0]
-    slope[1] += first[1]
-    space.factored[0] = -1
-    for j in range(n):
-        for i in range(2 * (j // 2) + 2):
-            errors[j] -= response[j, i] * moves[i]
-    status = solve(space, MAX_ITERATIONS)
-    for j in range(n):
-        for i in range(2 * (j // 2) + 2):
-            errors[j] += response[j, i] * moves[i]
-    return status
-
-
-class CasadiNmpc(BaselineController):
+class CasadiNmpc(ObserverBaseline):
     """Nonlinear MPC with preview.
 
     Raises
@@ -267,139 +166,71 @@ class CasadiNmpc(BaselineController):
     preview: ClassVar[bool] = True
 
     def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None:
-        if not isinstance(parameters, CasadiNmpcParameters):
-            raise ValueError(f'parameters must be CasadiNmpcParameters: got {parameters!r}')
+        super().__init__(parameters, nominal_model)
         casadi = importlib.import_module('casadi')
-        self.parameters = parameters
-        self._knowledge = nominal_model
-        self._torque = nominal_model.drive == 'torque'
-        robot, n = nominal_model.robot, parameters.horizon
-        friction = robot.friction
-        self._friction = np.array([friction.viscous, friction.coulomb, friction.coulomb_width])
-        self._dynamics = dynamics_vector(
-            scaled_body(nominal_model, parameters.model_error), robot.geometry
-        )
-        weight = move_weight(nominal_model, parameters.move_time)
-        self._space = make_workspace(2 * n)
-        if self._torque:
-            # As in the linear one: unknowns are torques, shares of their limit.
-            self._units = torque_units(nominal_model)
-            changes = np.eye(n) - np.eye(n, k=-1)
-            squares = np.kron(changes.T @ changes, self._units.T @ self._units)
-            self._damping: Array = np.asarray(weight * squares, dtype=np.float64)
-            reach = 1.0
-        else:
-            self._units = np.eye(2)
-            self._damping = weight * np.eye(2 * n)
-            reach = nominal_model.acceleration * nominal_model.period
-        self._first: Array = weight * self._units if self._torque else np.zeros((2, 2))
-        self._space.low[:], self._space.high[:] = -reach, reach
-
-        self._speeds = np.zeros((n + 1, 2))
-        self._commands = np.zeros((n, 2))
-        self._loads = np.zeros((n, 2))
-        self._reached = np.zeros((n, 2))
-        self._by_speed = np.zeros((n, 2, 2))
-        self._by_command = np.zeros((n, 2, 2))
-        self._function = wheel_dynamics(nominal_model, parameters.model_error, casadi).map(n)
-        self._buffer, self._evaluate = self._function.buffer()
-        for i, array in enumerate((self._speeds[:n], self._commands, self._loads)):
-            self._buffer.set_arg(i, array.reshape(-1).data)
-        for i, array in enumerate((self._reached, self._by_speed, self._by_command)):
-            self._buffer.set_res(i, array.reshape(-1).data)
-
-        self._reference = np.zeros((2, n + 1))
-        self._errors = np.zeros(2 * n)
-        self._response = np.zeros((2 * n, 2 * n))
-        self._integral = np.zeros(2)
-        self._shares = tuple(
-            -math.expm1(-nominal_model.period / time)
-            for time in (parameters.integral_time, parameters.filter_time)
-        )
+        table = self.parameters
+        n = table.horizon
+        self._loads = WheelLoads(nominal_model, scaled_body(nominal_model, table.model_error))
+        # Here the unknowns of one period, right and left, stand next to each other.
+        self._weights = np.kron(self._damping, self._units.T @ self._units)
+        self._program = BoxProgram(self._weights + np.eye(2 * n), self._reach)
         self._give = nominal_model.period
         if not self._torque:
             self._give = nominal_model.share * nominal_model.lag
-        self._answer = np.zeros(2)
-        self._begun = False
+        self._speeds: Array | None = None
+        """States guessed, shape (N + 1, 2)."""
+        self._commands: Array = np.zeros((n, 2))
+        self._by_command: Array = np.zeros((n, 2, 2))
+        self._model = wheel_dynamics(nominal_model, table.model_error, casadi).map(n)
 
     @property
     def plan(self) -> Array:
         """The commands planned, c (rad/s) or u (rad/s²), shape (2, N), right wheel first."""
-        planned: Array = self._commands.T.copy()
-        return planned
+        return self._commands.T.copy()
 
-    def step(self, observation: Observation) -> Array:
-        """Return u, rad/s², shape (2,)."""
-        future = known_future(observation, self.preview)
-        predict_reference(
-            observation.reference, observation.next_reference, future, 1.0, self._reference
-        )
-        before = self._answer if self._torque else observation.command
-        speeds = self._learn(observation, before)
-        moves = self._space.moves
-        moves[:-2] = moves[2:]
-        if not self._torque:
-            moves[-2:] = 0.0
-        self._speeds[:-1] = self._speeds[1:]
-        if not self._begun:
-            self._speeds[:] = speeds
-            self._begun = True
-        self._speeds[0] = speeds
-        np.clip(moves, self._space.low, self._space.high, out=moves)
-        self._command(before)
-        for _ in range(self.parameters.iterations):
-            self._iterate(before)
-        self._answer[:] = self._commands[0]
-        if self._torque:
-            return self._answer.copy()
-        return self._knowledge.acceleration_for(self._answer, observation.speeds)
-
-    def applied(self, acceleration: Array, *, limited: bool) -> None:
-        """Continue from the u after the limits."""
-        if self._torque:
-            self._answer[:] = acceleration
-
-    def _learn(self, observation: Observation, before: Array) -> Array:
-        """Update the disturbance and return the initial speeds of the horizon, rad/s."""
-        speeds = observation.speeds
-        if self._begun:
+    def advise(self, observation: Observation, before: Array, reference: Array) -> Array:
+        """Return the best command, c (rad/s) or u (rad/s²)."""
+        expected = None
+        if self._speeds is not None:
             unlike = before - self._commands[0]
-            expected = self._speeds[1] + unlike @ self._by_command[0]
-            missed = observation.speeds - expected
-            self._integral += self._shares[0] * missed / self._give
-            speeds = expected + self._shares[1] * missed
-        explained = load_acceleration(
-            float(speeds[0]), float(speeds[1]), self._friction, self._dynamics
-        )
-        share = self.parameters.disturbance_share
-        self._loads[:] = self._integral + share * (observation.unexplained - explained)
-        return speeds
+            expected = self._speeds[1] + self._by_command[0] @ unlike
+        speeds = self._correct(expected, observation.speeds, self._give)
+        unexplained = observation.unexplained - self._loads(speeds)
+        loads = self._integral + self.parameters.disturbance_share * unexplained
+        # The plan, shifted by a period.
+        moves = self._program.moves.reshape(-1, 2)
+        moves = np.vstack([moves[1:], moves[-1:] if self._torque else np.zeros((1, 2))])
+        if self._speeds is None:
+            self._speeds = np.tile(speeds, (len(reference), 1))
+        self._speeds = np.vstack([speeds, self._speeds[2:], self._speeds[-1:]])
+        self._commands = self._commanded(moves, before)
+        for _ in range(self.parameters.iterations):
+            moves = self._improve(moves.ravel(), loads, before, reference).reshape(-1, 2)
+            self._commands = self._commanded(moves, before)
+        return np.asarray(self._commands[0].copy())
 
-    def _command(self, before: Array) -> None:
-        """Write the commands that the moves mean."""
-        changes = self._space.moves.reshape(-1, 2) @ self._units.T
-        if self._torque:
-            self._commands[:] = changes
-        else:
-            np.cumsum(changes, axis=0, out=self._commands)
-            self._commands += before
+    def _commanded(self, moves: Array, before: Array) -> Array:
+        """Return the commands that the moves mean, shape (N, 2)."""
+        changes: Array = moves @ self._units.T
+        return changes if self._torque else np.cumsum(changes, axis=0) + before
 
-    def _iterate(self, before: Array) -> None:
-        """Linearise about the guess, solve for the moves, and take where they lead as guess."""
-        errors, response = self._errors, self._response
-        self._evaluate()
-        condense(
-            self._speeds,
-            self._reached,
-            self._by_speed,
-            self._by_command,
-            self._reference,
-            self._units,
-            0.0 if self._torque else 1.0,
-            errors,
-            response,
+    def _improve(self, moves: Array, loads: Array, before: Array, reference: Array) -> Array:
+        """Return the best moves of the model linearised about the guess; renew the guess."""
+        assert self._speeds is not None
+        n = len(self._commands)
+        held = np.repeat(loads[:, np.newaxis], n, axis=1)
+        found = self._model(self._speeds[:-1].T, self._commands.T, held)
+        reached = np.array(found[0]).T
+        by_speed, self._by_command = (
+            np.array(each).reshape(2, n, 2).transpose(1, 0, 2) for each in found[1:]
         )
-        first: Array = -self._first @ before
-        solve_linearised(errors, response, self._damping, first, self._space)
-        self._speeds[1:] = errors.reshape(-1, 2) + self._reference[:, 1:].T
-        self._command(before)
+        response, transition = condense(
+            by_speed, self._by_command, self._units, lasting=not self._torque
+        )
+        gaps = (reached - self._speeds[1:]).ravel()
+        there = self._speeds[1:].ravel() + transition @ gaps - response @ moves
+        slope = response.T @ (there - reference[1:].ravel())
+        slope[:2] -= self._first * self._units.T @ before
+        best = self._program.solve(slope, response.T @ response + self._weights)
+        self._speeds = np.vstack([self._speeds[:1], (there + response @ best).reshape(-1, 2)])
+        return best

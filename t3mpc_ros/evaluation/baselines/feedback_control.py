@@ -1,0 +1,381 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+r"""Feedback baselines: PI, disturbance rejection, sliding mode and computed torque.
+
+All of them see the tracking error without what jumps and limits explain of it.
+
+The plant is chi_(k+1) = chi_k + T (u_k + d_k) in each wheel, see :mod:`.baseline_controller`. The
+error delta = chi - r then evolves as
+
+.. math:: \delta_{k+1} = \delta_k + T(a_k - \dot r_k + d_k) - \rho_{k+1},
+
+with a the acceleration after the limits, r'_k = (r_(k+1) - r_k)/T as known at step k, and rho the
+later deviation of the reference from that: its jumps. All terms but d are known, so a model
+computes their part of the error,
+
+.. math:: h_{k+1} = h_k + T v(h_k) + T(a_k - u_k) - \rho_{k+1}, \qquad
+          u = \dot r + v(h) + \text{feedback of } e, \qquad e = \delta - h,
+
+and the error of the feedback, e_(k+1) = e_k + T (feedback + d_k), contains neither jumps nor
+limits: an integral, a sliding variable or an adapted coefficient that uses e cannot wind up.
+This is model recovery anti-windup, back-calculation through the plant's own model (Galeani,
+Tarbouriech, Turner and Zaccarian 2009), with the jumps of the reference entering like a deficit
+of the drive. v closes h at its own rate, because h contains no noise: two degrees of freedom.
+"""
+
+from abc import abstractmethod
+from dataclasses import dataclass
+import math
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.evaluation.baselines.baseline_controller import (
+    BaselineController,
+    NominalModel,
+    Observation,
+    WheelLoads,
+)
+from t3mpc_ros.parameters.table import Parameters, group, parameter
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class JumpTransientParameters(Parameters):
+    """Parameters of the transient h after a jump of the reference."""
+
+    rate: float = parameter(
+        100.0,
+        'rate at which the error closes that a jump of the reference or a limit has made',
+        unit='1/s',
+        low=1.0,
+        high=500.0,
+    )
+    acceleration: float = parameter(
+        200.0,
+        'largest acceleration requested for it; a torque limit is not reported back, so that with '
+        'a torque drive this should be what the motors can do',
+        unit='rad/s²',
+        low=1.0,
+        high=1000.0,
+    )
+
+
+@dataclass(frozen=True)
+class FeedbackParameters(Parameters):
+    """Parameters of every feedback baseline."""
+
+    jump_transient: JumpTransientParameters = group(JumpTransientParameters)
+
+
+Table = TypeVar('Table', bound=FeedbackParameters)
+
+
+class FeedbackBaseline(BaselineController, Generic[Table]):
+    """Base of baselines that separate the effect of disturbances from that of jumps and limits."""
+
+    parameters: Table
+    input_gain = 1.0
+    """Acceleration per unit of u."""
+
+    def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None:
+        super().__init__(parameters, nominal_model)
+        self._period = nominal_model.period
+        # So that h never overshoots zero, however large the rate.
+        self._share = 1.0 - math.exp(-self.parameters.jump_transient.rate * self._period)
+        self.transient: Array = np.zeros(2)
+        """h, the part of the error that jumps and limits explain, rad/s, shape (2,)."""
+        self._closing: Array = np.zeros(2)
+        self._requested: Array = np.zeros(2)
+        self._applied: Array = np.zeros(2)
+        self._predicted_reference: Array | None = None
+
+    @abstractmethod
+    def feedback(self, observation: Observation, feedforward: Array, error: Array) -> Array:
+        """Return u (rad/s²) by r' + v(h) and e (rad/s), shape (2,) each."""
+
+    def step(self, observation: Observation) -> Array:
+        """Return u, rad/s², shape (2,)."""
+        error = self._disturbance_error(observation)
+        slope = (observation.next_reference - observation.reference) / self._period
+        u = self.feedback(observation, slope + self._closing, error)
+        # All of u counts as applied until a limit is reported.
+        self._requested = self._applied = u
+        self._predicted_reference = observation.next_reference.copy()
+        return u.copy()
+
+    def applied(self, acceleration: Array, *, limited: bool) -> None:
+        """Store the u after the drive's limits: the remainder adds to h."""
+        self._applied = acceleration.copy()
+
+    def _disturbance_error(self, observation: Observation) -> Array:
+        """Return e (rad/s), the error that neither jumps nor limits explain; renew h and v(h)."""
+        reference = observation.reference
+        error = observation.speeds - reference
+        if self._predicted_reference is None:
+            # All of the error is h at first: the wheels start from where they are.
+            self.transient = error.copy()
+        else:
+            deficit = self._applied - self._requested
+            push = self._closing + self.input_gain * deficit
+            known = self.transient + self._period * push
+            self.transient = known - (reference - self._predicted_reference)
+        closing = -self._share * self.transient / self._period
+        limit = self.parameters.jump_transient.acceleration
+        self._closing = np.clip(closing, -limit, limit)
+        return np.asarray(error - self.transient)
+
+
+@dataclass(frozen=True)
+class ProportionalIntegralParameters(FeedbackParameters):
+    """Gains of the PI controller."""
+
+    gain: float = parameter(
+        30.0, 'proportional gain K on the error', unit='1/s', low=0.5, high=100.0
+    )
+    integral: float = parameter(
+        200.0,
+        'integral gain; K²/4 is critical damping in continuous time',
+        unit='1/s²',
+        low=0.1,
+        high=5000.0,
+    )
+
+
+class ProportionalIntegral(FeedbackBaseline[ProportionalIntegralParameters]):
+    r"""PI with feed-forward: u = r' + v(h) - K e - I, I_k = I_(k-1) + T K_i e_k.
+
+    The feedback sees e alone, whose poles are the roots of
+
+    .. math:: z^2 - (2 - KT - K_iT^2)\,z + (1 - KT) = 0,
+
+    whatever jumps and limits do (two degrees of freedom, Åström and Hägglund 2006). A constant
+    disturbance leaves no error.
+    """
+
+    parameters_type = ProportionalIntegralParameters
+
+    def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None:
+        super().__init__(parameters, nominal_model)
+        self.integral: Array = np.zeros(2)
+        """I, what the controller opposes to the disturbance, rad/s², shape (2,)."""
+
+    def feedback(self, observation: Observation, feedforward: Array, error: Array) -> Array:
+        """Return u, rad/s², shape (2,)."""
+        self.integral = self.integral + self._period * self.parameters.integral * error
+        return np.asarray(feedforward - self.parameters.gain * error - self.integral)
+
+
+@dataclass(frozen=True)
+class DisturbanceRejectionParameters(FeedbackParameters):
+    """Gains of active disturbance rejection."""
+
+    gain: float = parameter(
+        30.0, 'bandwidth of the controller, k', unit='1/s', low=0.5, high=100.0
+    )
+    observer_bandwidth: float = parameter(
+        30.0,
+        'bandwidth of the extended state observer, omega_o: both poles at exp(-omega_o T)',
+        unit='1/s',
+        low=0.5,
+        high=300.0,
+    )
+    input_gain: float = parameter(
+        1.0, 'what an acceleration that is asked for brings about, b_0', low=0.3, high=3.0
+    )
+    shared_disturbance: float = parameter(
+        0.0,
+        "share of the filter's unexplained acceleration, common to all methods, in what is "
+        "cancelled; the rest is the observer's own",
+        low=0.0,
+        high=1.0,
+    )
+    shared_speed: float = parameter(
+        0.0,
+        "share of the filter's speed in the feedback; the rest is the observer's own",
+        low=0.0,
+        high=1.0,
+    )
+
+
+def observer_gains(bandwidth: float, period: float) -> tuple[float, float]:
+    r"""Return (l_1, l_2), in 1 and 1/s, that put both observer poles at beta = exp(-omega_o T).
+
+    Prediction with the model, then correction by L times the surprise, makes the error of the
+    estimate follow (I - L C) A with A = [[1, T], [0, 1]], whose trace is 2 - l_1 - l_2 T and
+    whose determinant is 1 - l_1; hence l_1 = 1 - beta² and l_2 = (1 - beta)²/T
+    (Miklosovic, Radke and Gao 2006).
+    """
+    beta = math.exp(-bandwidth * period)
+    return 1.0 - beta**2, (1.0 - beta) ** 2 / period
+
+
+class DisturbanceRejection(FeedbackBaseline[DisturbanceRejectionParameters]):
+    """Active disturbance rejection: u = (r' + v(h) - k e - f)/b_0 (Han 2009).
+
+    All that is not b_0 u is one number f, which an extended state observer of
+    chi' = b_0 u + f estimates from the speed and from the u that was really applied, so that it
+    cannot wind up. Both observer poles are at one place (Gao 2003). v(h) is Han's arranged
+    transient. doi 10.1109/TIE.2008.2011621.
+    """
+
+    parameters_type = DisturbanceRejectionParameters
+
+    def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None:
+        super().__init__(parameters, nominal_model)
+        self.input_gain = self.parameters.input_gain
+        self._gains = observer_gains(self.parameters.observer_bandwidth, self._period)
+        self.observed: Array = np.zeros((2, 2))
+        """The observer's own chi (rad/s) and f (rad/s²), shape (2, 2), a wheel a column."""
+
+    def feedback(self, observation: Observation, feedforward: Array, error: Array) -> Array:
+        """Return u, rad/s², shape (2,)."""
+        table = self.parameters
+        self._observe(observation.speeds)
+        speed, load = self.observed
+        error = error + (1.0 - table.shared_speed) * (speed - observation.speeds)
+        load = load + table.shared_disturbance * (observation.unexplained - load)
+        return np.asarray((feedforward - table.gain * error - load) / self.input_gain)
+
+    def _observe(self, speeds: Array) -> None:
+        """Predict by the u that was applied, and correct by the measured speeds."""
+        if self._predicted_reference is None:
+            self.observed = np.stack([speeds, np.zeros(2)])
+            return
+        speed, disturbance = self.observed
+        speed = speed + self._period * (self.input_gain * self._applied + disturbance)
+        surprise = np.outer(self._gains, speeds - speed)
+        self.observed = np.stack([speed, disturbance]) + surprise
+
+
+@dataclass(frozen=True)
+class SlidingModeParameters(FeedbackParameters):
+    """Gains of the sliding mode controller.
+
+    Within the boundary layer it is a PI controller with the proportional gain
+    surface + reaching + switching/boundary, which should stay below 1/T.
+    """
+
+    surface: float = parameter(
+        8.0,
+        'slope lambda of the surface s = e + lambda ∫e: the rate of the error on it',
+        unit='1/s',
+        low=0.1,
+        high=100.0,
+    )
+    reaching: float = parameter(
+        8.0, 'linear term of the reaching law, k', unit='1/s', low=0.1, high=100.0
+    )
+    switching: float = parameter(
+        6.0,
+        'switching gain eta: outweighs any disturbance that is smaller',
+        unit='rad/s²',
+        low=0.1,
+        high=40.0,
+    )
+    boundary: float = parameter(
+        0.5,
+        'boundary layer phi, within which the switching term is linear',
+        unit='rad/s',
+        low=0.02,
+        high=5.0,
+    )
+    shared_disturbance: float = parameter(
+        0.0,
+        "share of the filter's unexplained acceleration, common to all methods, in the "
+        'equivalent control; what is left is for the switching gain to outweigh',
+        low=0.0,
+        high=1.0,
+    )
+
+
+class SlidingMode(FeedbackBaseline[SlidingModeParameters]):
+    r"""Integral sliding mode: u = u_eq - k s - eta sat(s/phi), s = e + lambda ∫e.
+
+    The equivalent control u_eq = r' + v(h) - lambda e, less the known share of the disturbance,
+    keeps the nominal plant on s = 0. With S_k the sum of T e_j over j < k, s_k = e_k + lambda S_k
+    moves exactly by
+
+    .. math:: s_{k+1} = s_k + T(-k s_k - \eta\,\mathrm{sat}(s_k/\phi) + d_k),
+
+    d being what is left of the disturbance: while |d| < eta and outside the boundary layer, |s|
+    falls by at least T (eta - |d|) a step (reaching law of Gao and Hung 1993; boundary layer of
+    Slotine and Sastry 1983). A jump of the reference does not leave the surface: e starts at
+    zero and contains no jumps, which is integral sliding mode (Utkin and Shi 1996). Within the
+    layer, a constant disturbance leaves no error. The share of an estimated disturbance allows a
+    smaller eta (Yang, Li and Yu 2013).
+    """
+
+    parameters_type = SlidingModeParameters
+
+    def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None:
+        super().__init__(parameters, nominal_model)
+        self.surface: Array = np.zeros(2)
+        """The sliding variable s of the last step, rad/s, shape (2,)."""
+        self._sum: Array = np.zeros(2)
+
+    def feedback(self, observation: Observation, feedforward: Array, error: Array) -> Array:
+        """Return u, rad/s², shape (2,)."""
+        table = self.parameters
+        self.surface = error + table.surface * self._sum
+        self._sum = self._sum + self._period * error
+        saturated = np.clip(self.surface / table.boundary, -1.0, 1.0)
+        known = table.shared_disturbance * observation.unexplained
+        equivalent = feedforward - table.surface * error - known
+        return np.asarray(equivalent - table.reaching * self.surface - table.switching * saturated)
+
+
+@dataclass(frozen=True)
+class ComputedTorqueParameters(FeedbackParameters):
+    """Gains of computed torque, and where and how far its model is believed."""
+
+    gain: float = parameter(30.0, 'feedback K on the error', unit='1/s', low=0.5, high=100.0)
+    integral: float = parameter(
+        20.0,
+        'integral gain, for what the model does not know',
+        unit='1/s²',
+        low=0.1,
+        high=5000.0,
+    )
+    belief: float = parameter(
+        1.0, "share of the model's forces that is cancelled", low=0.0, high=1.5
+    )
+    measured: float = parameter(
+        0.5,
+        'where the model is evaluated: 1 at the estimated speeds, which are noisy, 0 at the '
+        'followed ones r + h, which the wheels may not have',
+        low=0.0,
+        high=1.0,
+    )
+
+
+class ComputedTorque(FeedbackBaseline[ComputedTorqueParameters]):
+    """Computed torque of the nominal robot: u = r' + v(h) - K e - I - m(chi).
+
+    m is what (10) of the nominal robot leaves of chi' - u when u is applied as the torque
+    theta_bar u: theta_bar^-1 (-eta_bar chi - f(chi)), with viscous and Coulomb friction. A servo
+    with lag tau holds against it within the period: the speed then changes by
+    tau (1 - exp(-T/tau)) m instead of T m, so that much less is to be cancelled. On the nominal
+    robot the error decays as (1 - K T)^k (without the integral, which is for the rest).
+    """
+
+    parameters_type = ComputedTorqueParameters
+
+    def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None:
+        super().__init__(parameters, nominal_model)
+        self._loads = WheelLoads(nominal_model)
+        self._felt = self.parameters.belief
+        if nominal_model.drive == 'velocity':
+            self._felt *= nominal_model.lag * nominal_model.share / nominal_model.period
+        self.integral: Array = np.zeros(2)
+        """I, what is opposed beyond the model, rad/s², shape (2,)."""
+
+    def feedback(self, observation: Observation, feedforward: Array, error: Array) -> Array:
+        """Return u, rad/s², shape (2,)."""
+        table = self.parameters
+        self.integral = self.integral + self._period * table.integral * error
+        at = observation.reference + self.transient + table.measured * error
+        without_model = feedforward - table.gain * error - self.integral
+        return np.asarray(without_model - self._felt * self._loads(at))
