@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache, partial
 import math
 import multiprocessing
@@ -35,6 +35,8 @@ from t3mpc_ros.evaluation.scenario import (
     RATE,
     LinkFaults,
     Scenario,
+    settled_rows,
+    switch_times,
 )
 from t3mpc_ros.parameters.table import ParameterError, Parameters
 from t3mpc_ros.simulation.plant.disturbances import Disturbance, SpeedNoise, make_generators
@@ -185,20 +187,14 @@ class LoopRecord:
     @classmethod
     def empty(cls, steps: int) -> Self:
         """Return a record of ``steps`` rows of zeros, to be filled."""
-        return cls(
-            time=np.zeros(steps),
-            reference=np.zeros((steps, 2)),
-            measured=np.zeros((steps, 2)),
-            speeds=np.zeros((steps, 2)),
-            estimated=np.zeros((steps, 2)),
-            unexplained=np.zeros((steps, 2)),
-            command=np.zeros((steps, 2)),
-            sent=np.zeros((steps, 2)),
-            effort=np.zeros((steps, 2)),
-            limited=np.zeros(steps, dtype=np.bool_),
-            terms=np.zeros((steps, len(TERM_NAMES), 2)),
-            modes=np.zeros(steps, dtype=np.int64),
-        )
+        arrays: dict[str, Any] = {each.name: np.zeros((steps, 2)) for each in fields(cls)}
+        arrays |= {
+            'time': np.zeros(steps),
+            'limited': np.zeros(steps, dtype=np.bool_),
+            'terms': np.zeros((steps, len(TERM_NAMES), 2)),
+            'modes': np.zeros(steps, dtype=np.int64),
+        }
+        return cls(**arrays)
 
     @property
     def error(self) -> Array:
@@ -245,16 +241,8 @@ class LoopRecord:
         return total_variation(self.time, self.effort)
 
     def _counted(self, after: float, cut: float) -> NDArray[np.bool_]:
-        counted: NDArray[np.bool_] = self.time >= after
-        for switch in self.time[1:][np.diff(self.modes) != 0]:
-            counted &= (self.time < switch - 0.4 * cut) | (self.time >= switch + 0.6 * cut)
-        if not counted.any():
-            end = self.time[-1] if self.time.size else 0.0
-            raise ValueError(
-                f'after and cut must leave rows of a run that ends at {end:g} s: '
-                f'got {after:g} s and {cut:g} s'
-            )
-        return counted
+        switches = switch_times(self.time, self.modes)
+        return settled_rows(self.time, switches, after, (0.4 * cut, 0.6 * cut))
 
 
 def total_variation(time: Array, signal: Array) -> float:
@@ -548,17 +536,10 @@ def _observed_reference(
 
 def _break_off(record: LoopRecord, k: int) -> None:
     """Mark rows from ``k`` on as never run."""
-    record.terms[k:] = math.nan
-    for values in (
-        record.measured,
-        record.speeds,
-        record.estimated,
-        record.unexplained,
-        record.command,
-        record.sent,
-        record.effort,
-    ):
-        values[k:] = math.nan
+    kept = 'time', 'reference', 'modes', 'limited'
+    for each in fields(record):
+        if each.name not in kept:
+            getattr(record, each.name)[k:] = math.nan
 
 
 def warm_up() -> None:
@@ -633,7 +614,7 @@ class WorkerPool:
         JobError
             A run raised an exception; the jobs not begun are dropped.
         """
-        return self.map(partial(_measure_job, measure), jobs)
+        return self.map(partial(_measured, measure), jobs)
 
     def map(self, task: Callable[[J], T], jobs: Iterable[J]) -> Iterator[tuple[int, T]]:
         """Yield (index of the job, ``task`` of it) as the jobs are finished.
@@ -678,13 +659,6 @@ class WorkerPool:
                 future.cancel()
 
 
-def run_many(
-    jobs: Iterable[Job], workers: int | WorkerPool = 1
-) -> Iterator[tuple[int, LoopRecord]]:
-    """Yield (index of the job, its record) as the jobs are finished, see :meth:`Workers.run`."""
-    return measure_many(jobs, full_record, workers)
-
-
 def measure_many(
     jobs: Iterable[Job], measure: Callable[[LoopRecord], T], workers: int | WorkerPool = 1
 ) -> Iterator[tuple[int, T]]:
@@ -697,13 +671,8 @@ def measure_many(
         yield from running.run(jobs, measure)
 
 
-def run_job(job: Job, measure: Callable[[LoopRecord], T]) -> T:
-    """Return the measure of one job's record."""
+def _measured(measure: Callable[[LoopRecord], T], job: Job) -> T:
     return measure(run(*job))
-
-
-def _measure_job(measure: Callable[[LoopRecord], T], job: Job) -> T:
-    return run_job(job, measure)
 
 
 def full_record(record: LoopRecord) -> LoopRecord:

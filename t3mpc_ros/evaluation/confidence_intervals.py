@@ -8,6 +8,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 
 class Difference(NamedTuple):
@@ -34,6 +35,11 @@ def mean(values: Sequence[float]) -> float:
     if len(values) == 0:
         raise ValueError('values must not be empty')
     return float(np.mean(values))
+
+
+def rms(values: ArrayLike) -> float:
+    """Return the root mean square of all numbers."""
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def interval(values: Sequence[float], confidence: float = 0.95) -> float:

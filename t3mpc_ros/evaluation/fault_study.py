@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table, progress_bar
 from t3mpc_ros.evaluation.twin_closed_loop import (
     INITIAL_STANDSTILL,
@@ -152,10 +153,10 @@ def time_to_return(record: TwinRecord, undisturbed_run: TwinRecord, end: float) 
     the run without the fault, in the same time or before the fault, whichever is larger.
     """
     errors = record.rotors - record.reference, undisturbed_run.rotors - undisturbed_run.reference
-    usual = _rms(errors[1][undisturbed_run.rows(SETTLED, BEGIN)])
+    usual = rms(errors[1][undisturbed_run.rows(SETTLED, BEGIN)])
     last = float(record.time[-1])
     for wait in np.arange(0.0, last - REST - end, 0.5).tolist():
-        mine, other = (_rms(error[record.rows(end + wait, last)]) for error in errors)
+        mine, other = (rms(error[record.rows(end + wait, last)]) for error in errors)
         if mine <= ALLOWED * max(usual, other):
             return float(wait)
     return None
@@ -163,11 +164,7 @@ def time_to_return(record: TwinRecord, undisturbed_run: TwinRecord, end: float) 
 
 def wheel_error(record: TwinRecord, begin: float, end: float) -> float:
     """Return the error (rad/s) of the rotors from ``begin`` to ``end`` (s)."""
-    return _rms((record.rotors - record.reference)[record.rows(begin, end)])
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+    return rms((record.rotors - record.reference)[record.rows(begin, end)])
 
 
 def _odometry_error(record: TwinRecord, time: float) -> tuple[float, float]:
@@ -236,8 +233,8 @@ def _detected(
     during = record.rows(begin, end)
     if np.isnan(record.nearest[during]).all():
         found.append('no distances')
-    error = _rms((record.measured - record.reference)[during])
-    usual = _rms((undisturbed_run.measured - undisturbed_run.reference)[during])
+    error = rms((record.measured - record.reference)[during])
+    usual = rms((undisturbed_run.measured - undisturbed_run.reference)[during])
     if error > ALLOWED * usual and not any(record.robot_reasons[during]):
         found.append(f'tracking error {error:.2f} rad/s')
     return tuple(found)
@@ -270,7 +267,7 @@ def _undetected(
     lost = np.abs(record.lost_steps[record.rows(begin, float(record.time[-1]))]).max(axis=0)
     if lost.any():
         found.append(f'lost steps {lost[0]}, {lost[1]}')
-    slide = _rms((record.ground - record.rotors)[rows])
+    slide = rms((record.ground - record.rotors)[rows])
     if slide > 0.2:
         found.append(f'tyres slide ({slide:.1f} rad/s)')
     if off[0] > usual[0] + 0.02 or off[1] > usual[1] + 0.05:

@@ -21,7 +21,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.confidence_intervals import interval, mean
+from t3mpc_ros.evaluation.confidence_intervals import interval, mean, rms
 from t3mpc_ros.evaluation.reporting import Table, progress_bar
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, gamma_for
 from t3mpc_ros.fuzzy.sets import FuzzyParameters
@@ -237,8 +237,8 @@ def compare(
                 speeds, unknown = estimate(run, fuzzy)
                 found.append(
                     (
-                        _rms((speeds - run.speeds)[first:]),
-                        _rms((unknown[:-1] - run.target)[first:]),
+                        rms((speeds - run.speeds)[first:]),
+                        rms((unknown[:-1] - run.target)[first:]),
                     )
                 )
             bar.update()
@@ -295,10 +295,6 @@ def table(results: Sequence[EstimationResult]) -> str:
 def difference(result: EstimationResult, base: EstimationResult) -> tuple[float, ...]:
     """Return how much more RMSE of chi_hat ``result`` has than ``base``, seed by seed, rad/s."""
     return tuple(a - b for a, b in zip(result.speed, base.speed, strict=True))
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def _spread(values: Sequence[float], sign: str = '') -> str:

@@ -132,10 +132,14 @@ class ProposedController(BaselineController):
     def _randomize_predictor(self, seed: int) -> None:
         """Set random output weights with the magnitude of the pretrained ones."""
         predictive = self._tracker.law.predictive
-        weights = predictive.get_weights()
-        generator = np.random.default_rng((seed, 7))
-        for name in ('output_weights', 'anchor'):
-            taught = weights[name]
-            size = float(np.sqrt(np.mean(taught**2)))
-            weights[name] = generator.normal(scale=size, size=taught.shape)
-        predictive.set_weights(weights)
+        predictive.set_weights(random_output_weights(predictive.get_weights(), seed))
+
+
+def random_output_weights(weights: Mapping[str, Array], seed: int) -> dict[str, Array]:
+    """Return weights with a random output layer of the same size as the fitted one."""
+    generator = np.random.default_rng((seed, 7))
+    drawn = dict(weights)
+    for name in ('output_weights', 'anchor'):
+        size = float(np.sqrt(np.mean(weights[name] ** 2)))
+        drawn[name] = generator.normal(scale=size, size=weights[name].shape)
+    return drawn

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -211,16 +212,12 @@ class Scenario:
             raise ValueError(
                 f'drive must be {" or ".join(drives)} in case {self.case!r}: got {self.drive!r}'
             )
-        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
-            raise ValueError(f'seed must be a whole number of at least 0: got {self.seed!r}')
-        for name, low, high, unit in (
+        check_run(
+            self,
             ('noise', 0.0, 100.0, '(rad/s)²'),
             ('duration', 1.0 / RATE, 3600.0, 's'),
             ('lead', 0.0, 10.0, 's'),
-        ):
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise ValueError(f'{name} must be from {low:g} to {high:g} {unit}: got {value}')
+        )
 
     def __str__(self) -> str:
         return f'{self.drive}, noise {self.noise:g}, {self.case}, seed {self.seed}'
@@ -299,6 +296,16 @@ class Scenario:
     def _known_robot(self) -> PaperRobotParameters:
         case, nominal = CASES[self.case], self._nominal()
         return nominal.with_values(case.changes) if case.known else nominal
+
+
+def check_run(run: Any, *ranges: tuple[str, float, float, str]) -> None:
+    """Raise ValueError for a bad seed, or an attribute outside its (name, low, high, unit)."""
+    if isinstance(run.seed, bool) or not isinstance(run.seed, int) or run.seed < 0:
+        raise ValueError(f'seed must be a whole number of at least 0: got {run.seed!r}')
+    for name, low, high, unit in ranges:
+        value = getattr(run, name)
+        if not low <= value <= high:
+            raise ValueError(f'{name} must be from {low:g} to {high:g} {unit}: got {value}')
 
 
 def reference_parameters(seed: int) -> ReferenceParameters:

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import math
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -255,7 +255,7 @@ def drive_twin(
     geometry = robot_parameters.geometry
     robot = DigitalTwin(robot_parameters, schedule)
     reports = _ReportQueue(odometry_faults or OdometryFaults())
-    writer = _RecordWriter(count)
+    times, rows, reasons = [], [], []
 
     def stamp(k: int) -> int:
         return round(k * NANOSECONDS / rate)
@@ -280,8 +280,12 @@ def drive_twin(
             wheels = wheels_from_twist(twist, geometry)
             reason = '' if status.reason.moves else status.reason.value
             robot.apply(RobotCommand(wheels, status.stamp_ns), arrival_ns)
-        writer.add_row(k, state, wheels, reason, geometry, robot.diagnostics.max_contact_force)
-    return writer.record(course[:count])
+        times.append(now)
+        rows.append(_row(state, wheels, geometry, robot.diagnostics.max_contact_force))
+        reasons.append((state.reason, reason))
+    columns: list[Any] = [np.array(column) for column in zip(*rows, strict=True)]
+    columns = [np.array(times), course[:count], *columns, *zip(*reasons, strict=True)]
+    return TwinRecord(*columns)
 
 
 class _ReportQueue:
@@ -310,59 +314,22 @@ class _ReportQueue:
             yield self._queue.popleft()
 
 
-class _RecordWriter:
-    """Collects the rows of a record."""
-
-    def __init__(self, count: int) -> None:
-        self._time = np.empty(count)
-        self._wheels = np.empty((5, count, 2))
-        self._poses = np.empty((2, count, 3))
-        self._lost = np.empty((count, 2), dtype=np.int64)
-        self._contact_force = np.empty(count)
-        self._flags = np.empty((count, len(STATUS_FLAGS)), dtype=np.bool_)
-        self._nearest = np.empty(count)
-        self._robot_reasons: list[str] = []
-        self._controller_reasons: list[str] = []
-
-    def add_row(
-        self,
-        k: int,
-        state: RobotState,
-        requested: WheelSpeeds,
-        reason: str,
-        geometry: WheelGeometry,
-        contact_force: float,
-    ) -> None:
-        if state.truth is None or state.true_wheels is None or state.lost_steps is None:
-            raise ValueError('the state of a simulated robot must hold the truth')
-        self._time[k] = state.stamp_ns / NANOSECONDS
-        ground = wheels_from_twist(state.truth.twist, geometry)
-        self._wheels[:, k] = requested, state.commanded, state.wheels, state.true_wheels, ground
-        self._poses[:, k] = state.odometry.pose, state.truth.pose
-        self._lost[k] = state.lost_steps
-        self._contact_force[k] = contact_force
-        self._flags[k] = state.status
-        self._nearest[k] = min((one for one in state.ranges if one == one), default=math.nan)
-        self._robot_reasons.append(state.reason)
-        self._controller_reasons.append(reason)
-
-    def record(self, reference: Array) -> TwinRecord:
-        requested, commanded, measured, rotors, ground = self._wheels
-        odometry, truth = self._poses
-        return TwinRecord(
-            time=self._time,
-            reference=reference,
-            requested=requested,
-            commanded=commanded,
-            measured=measured,
-            rotors=rotors,
-            ground=ground,
-            odometry=odometry,
-            truth=truth,
-            lost_steps=self._lost,
-            contact_force=self._contact_force,
-            flags=self._flags,
-            nearest=self._nearest,
-            robot_reasons=tuple(self._robot_reasons),
-            controller_reasons=tuple(self._controller_reasons),
-        )
+def _row(
+    state: RobotState, requested: WheelSpeeds, geometry: WheelGeometry, contact_force: float
+) -> tuple[object, ...]:
+    """Return one report in the order of :class:`TwinRecord`, after the reference."""
+    if state.truth is None or state.true_wheels is None or state.lost_steps is None:
+        raise ValueError('the state of a simulated robot must hold the truth')
+    return (
+        requested,
+        state.commanded,
+        state.wheels,
+        state.true_wheels,
+        wheels_from_twist(state.truth.twist, geometry),
+        state.odometry.pose,
+        state.truth.pose,
+        state.lost_steps,
+        contact_force,
+        state.status,
+        min((one for one in state.ranges if one == one), default=math.nan),
+    )

@@ -7,7 +7,7 @@ the documentation and recorded bags all use that one table. Tables nest: a field
 :func:`group` holds another table, whose parameters get dotted names (``law.gain``).
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 import difflib
 from functools import partial
@@ -28,6 +28,12 @@ Value = (
 
 class ParameterError(ValueError):
     """An invalid parameter; the text contains its name, the bound and the value."""
+
+
+def nearest_hint(name: str, known: Iterable[str]) -> str:
+    """Return a hint at the known name that is nearest to an unknown one, '' without one."""
+    near = difflib.get_close_matches(name, list(known), n=1)
+    return f'; did you mean {near[0]}?' if near else ''
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,9 +190,7 @@ class Parameters:
         checked: dict[tuple[str, ...], Value] = {}
         for name in values:
             if name not in known:
-                near = difflib.get_close_matches(name, known, n=1)
-                hint = f'; did you mean {near[0]}?' if near else ''
-                raise ParameterError(f'there is no parameter {name}{hint}')
+                raise ParameterError(f'there is no parameter {name}{nearest_hint(name, known)}')
         for name, value in values.items():
             # Checked before the group checks itself, so that the error contains the full name.
             checked[known[name].path] = known[name].spec.check(value)

@@ -21,9 +21,9 @@ from t3mpc_ros.evaluation.closed_loop import (
     MethodSpec,
     WorkerPool,
     drive_for,
+    full_record,
     measure_many,
     run,
-    run_many,
 )
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean, paired, student_quantile
 from t3mpc_ros.evaluation.scenario import (
@@ -572,11 +572,11 @@ def test_many_runs_are_the_same_in_one_process_and_in_two():
         for seed in (1, 2)
         for method in gains
     ]
-    alone = dict(run_many(jobs, 1))
+    alone = dict(measure_many(jobs, full_record, 1))
     assert sorted(alone) == list(range(len(jobs)))
     bad = (jobs[0][0], MethodSpec('bad', Proportional, ProportionalParameters(fails=True)))
     with WorkerPool(2) as workers:
-        together = dict(run_many(iter(jobs), workers))
+        together = dict(measure_many(iter(jobs), full_record, workers))
         assert sorted(together) == sorted(alone)
         for index, record in together.items():
             assert_equal_records(record, alone[index])
@@ -586,12 +586,12 @@ def test_many_runs_are_the_same_in_one_process_and_in_two():
             index: record.rmse(1.0) for index, record in alone.items()
         }
         with pytest.raises(JobError, match=r'bad on torque, .*, load change, seed 1 failed: Zero'):
-            list(run_many([jobs[1], bad, *jobs], workers))
-        assert len(dict(run_many(jobs[:3], workers))) == 3
+            list(measure_many([jobs[1], bad, *jobs], full_record, workers))
+        assert len(dict(measure_many(jobs[:3], full_record, workers))) == 3
     with pytest.raises(JobError, match=r'bad on torque.*on purpose'):
-        list(run_many([jobs[1], bad]))
+        list(measure_many([jobs[1], bad], full_record))
     with pytest.raises(ValueError, match='workers must be at least 1: got 0'):
-        list(run_many(jobs, 0))
+        list(measure_many(jobs, full_record, 0))
 
 
 def test_a_record_and_a_method_survive_being_sent():

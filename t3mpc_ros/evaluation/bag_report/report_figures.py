@@ -107,8 +107,7 @@ def acceleration(run: Run) -> Any:
             (axes[2 * row + 1], bend, 'jerk', '³'),
         ):
             axis.plot(*thinned(time, values), color=COLOURS[run.measured], linewidth=0.9)
-            axis.set_title(f'{each.title}: {what}')
-            axis.set_ylabel(f'{each.unit}{power}')
+            axis.set(title=f'{each.title}: {what}', ylabel=f'{each.unit}{power}')
     return over_time(figure, axes, run)
 
 
@@ -144,8 +143,7 @@ def link(run: Run) -> Any:
         axis = next(free)
         style = {'color': COLOURS['answered'], 'linewidth': 1.1, 'drawstyle': 'steps-pre'}
         axis.plot(shown.time, 100.0 * answered, **style)
-        axis.set_title(f'{shown.name}: cycles answered since the report before')
-        axis.set_ylabel('%')
+        axis.set(title=f'{shown.name}: cycles answered since the report before', ylabel='%')
         axis.set_ylim(min(90.0, 100.0 * float(np.nanmin(answered)) - 2.0), 101.0)
     if trips:
         axis = next(free)
@@ -153,8 +151,7 @@ def link(run: Run) -> Any:
             label = 'median' if 'median' in key else '99 % below'
             style = {'color': COLOURS['round trip'], 'alpha': strength, 'linewidth': 1.1}
             axis.plot(shown.time, values[key], label=label, **style)
-        axis.set_title('round trip')
-        axis.set_ylabel('ms')
+        axis.set(title='round trip', ylabel='ms')
         axis.set_ylim(bottom=0.0)
         add_legend(axis)
     if counted:
@@ -163,8 +160,7 @@ def link(run: Run) -> Any:
             since = values[key] - values[key][np.isfinite(values[key])][0]
             style = {'color': COLOURS['resets'], 'linewidth': 1.1, 'linestyle': dash}
             axis.step(shown.time, since, where='post', label=COUNTED[key], **style)
-        axis.set_title('faults since the first report')
-        axis.set_ylabel('number')
+        axis.set(title='faults since the first report', ylabel='number')
         axis.set_ylim(-0.05, max(1.0, 1.6 * axis.get_ylim()[1]))
         axis.legend(loc='upper left', ncols=3)
     name_time(axes)
@@ -182,8 +178,7 @@ def tracking(run: Run) -> Any:
         for name, motion in shown.items():
             draw_line(axis, motion, wheel, COLOURS[name], LABELS[name])
         draw_line(axis, reference, wheel, COLOURS[REFERENCE], LABELS[REFERENCE], width=0.8)
-        axis.set_title(title)
-        axis.set_ylabel(f'speed / {unit}')
+        axis.set(title=title, ylabel=f'speed / {unit}')
     return over_time(figure, axes, run)
 
 
@@ -198,8 +193,7 @@ def error(run: Run) -> Any:
         draw_line(axis, series, wheel, COLOURS['error'], 'speed minus reference')
         rmse = statistics(series[wheel][moving]).rmse
         size = f'{rmse:.3g} {unit} while driven' if moving.any() else UNMEASURED
-        axis.set_title(f'{title}, RMSE {size}')
-        axis.set_ylabel(f'error / {unit}')
+        axis.set(title=f'{title}, RMSE {size}', ylabel=f'error / {unit}')
     return over_time(figure, axes, run)
 
 
@@ -219,8 +213,7 @@ def switching(run: Run) -> Any:
         value = np.append(series['value'], series['value'][-1])
         time = np.append(series.time, end)
         axis.step(time, value, where='post', color=COLOURS['switch'], linewidth=1.6)
-        axis.set_title(titles[name])
-        axis.set_ylabel('number')
+        axis.set(title=titles[name], ylabel='number')
         axis.yaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
         axis.margins(y=0.2)
     name_time(axes)
@@ -236,12 +229,10 @@ def control(run: Run) -> Any:
     figure, axes = new_panels(len(WHEELS) + len(applied), 1.5)
     for axis, (wheel, title, _, unit) in zip(axes, run.channels, strict=False):
         draw_line(axis, command, wheel, COLOURS[COMMAND], 'command')
-        axis.set_title(f'commanded: {title}')
-        axis.set_ylabel(unit)
+        axis.set(title=f'commanded: {title}', ylabel=unit)
     for axis, (wheel, series) in zip(axes[len(WHEELS) :], applied.items(), strict=True):
         draw_line(axis, series, 'value', COLOURS['applied'])
-        axis.set_title(f'acceleration u applied to the {wheel} wheel')
-        axis.set_ylabel('rad/s²')
+        axis.set(title=f'acceleration u applied to the {wheel} wheel', ylabel='rad/s²')
     return over_time(figure, axes, run)
 
 
@@ -259,8 +250,7 @@ def terms(run: Run) -> Any:
                 colour, strength = COLOURS[name], STRENGTH[wheel]
                 label = f'{wheel} wheel'
                 draw_line(axis, series, 'value', colour, label, strength=strength)
-        axis.set_title(f'{name}, {symbol[name]}')
-        axis.set_ylabel('rad/s²')
+        axis.set(title=f'{name}, {symbol[name]}', ylabel='rad/s²')
     return over_time(figure, axes, run)
 
 
@@ -279,8 +269,7 @@ def estimates(run: Run) -> Any:
         if target is not None:
             draw_line(axis, target, 'value', COLOURS['target'], 'target')
         draw_line(axis, series, 'value', COLOURS['estimate'], 'estimate g')
-        axis.set_title(f'{wheel} wheel')
-        axis.set_ylabel('rad/s²')
+        axis.set(title=f'{wheel} wheel', ylabel='rad/s²')
     return over_time(figure, axes, run)
 
 
@@ -297,8 +286,7 @@ def portrait(run: Run) -> Any:
             jumps = np.flatnonzero(np.isin(motion.time, run.switches))
             right, left = np.insert(right, jumps, np.nan), np.insert(left, jumps, np.nan)
         axis.plot(every_nth(left), every_nth(right), color=COLOURS[name], linewidth=0.8)
-        axis.set_title(LABELS[name])
-        axis.set_xlabel(f'{run.channels[1].title} / {run.channels[1].unit}')
+        axis.set(title=LABELS[name], xlabel=f'{run.channels[1].title} / {run.channels[1].unit}')
     axes[0].set_ylabel(f'{run.channels[0].title} / {run.channels[0].unit}')
     return figure
 
@@ -324,8 +312,7 @@ def path(run: Run) -> Any:
         axis.plot(x, y, color=COLOURS[name], lw=width, label=LABELS[name])
     axis.plot(driven['x'][0], driven['y'][0], 'o', color=COLOURS[REFERENCE], label='start')
     axis.set_aspect('equal', adjustable='datalim')
-    axis.set_xlabel('x / m')
-    axis.set_ylabel('y / m')
+    axis.set(xlabel='x / m', ylabel='y / m')
     add_legend(axis)
     return figure
 
@@ -344,8 +331,7 @@ def certificate(run: Run) -> Any:
     if is_long(value):
         axis = next(free)
         draw_line(axis, value, 'value', COLOURS['value'])
-        axis.set_title('V, half the squared error')
-        axis.set_ylabel('rad²/s²')
+        axis.set(title='V, half the squared error', ylabel='rad²/s²')
     if is_long(margin):
         axis = next(free)
         draw_line(axis, margin, 'value', COLOURS['margin'])
@@ -358,8 +344,7 @@ def certificate(run: Run) -> Any:
         for wheel, series in skill.items():
             colour, strength = COLOURS['skill'], STRENGTH[wheel]
             draw_line(axis, series, 'value', colour, f'{wheel} wheel', strength=strength)
-        axis.set_title('skill of the predictor')
-        axis.set_ylabel('share')
+        axis.set(title='skill of the predictor', ylabel='share')
         add_legend(axis)
     return over_time(figure, axes, run)
 
@@ -379,8 +364,7 @@ def timing(run: Run) -> Any:
     for axis, (time, gap, title, quantity) in zip(axes, rows, strict=True):
         few, some = thinned(time, gap)
         axis.plot(few, 1e3 * some, '.', color=COLOURS[quantity], markersize=2)
-        axis.set_title(title)
-        axis.set_ylabel('ms')
+        axis.set(title=title, ylabel='ms')
         axis.set_ylim(0.0, 1.1e3 * max(float(gap.max()), 1e-6))
     name_time(axes, 'receive time')
     return figure

@@ -23,6 +23,7 @@ from t3mpc_ros.evaluation.closed_loop import (
     run,
     total_variation,
 )
+from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.method_comparison.twin_baseline import TwinBaseline
 from t3mpc_ros.evaluation.method_comparison.twin_scenario import (
     CASES as TWIN_CASES,
@@ -361,11 +362,11 @@ def twin_numbers(scenario: TwinScenario, record: TwinRecord) -> Numbers:
     reasons = zip(record.robot_reasons, record.controller_reasons, strict=True)
     stopped = np.array([bool(robot or controller) for robot, controller in reasons])
     found = {
-        SETTLED.name: _rms(error[settled]),
-        OVERALL.name: _rms(error[counted]),
+        SETTLED.name: rms(error[settled]),
+        OVERALL.name: rms(error[counted]),
         VARIATION.name: total_variation(time[1:][counted[1:]], effort[counted[1:]]),
-        YAW_RATE_SETTLED.name: _rms(rate[settled]),
-        YAW_RATE.name: _rms(rate[counted]),
+        YAW_RATE_SETTLED.name: rms(rate[settled]),
+        YAW_RATE.name: rms(rate[counted]),
         DRIFT.name: abs(float(np.sum(turned[counted[1:]]))),
         STOPPED.name: float(np.mean(stopped[counted]) * (time[-1] - start)),
     }
@@ -376,7 +377,7 @@ def twin_numbers(scenario: TwinScenario, record: TwinRecord) -> Numbers:
             DURING.name: settled & (time >= begin) & (time < end),
             RECOVERED.name: settled & (time >= end + AFTER),
         }
-        found |= {name: _rms(error[rows]) for name, rows in parts.items() if rows.any()}
+        found |= {name: rms(error[rows]) for name, rows in parts.items() if rows.any()}
     return found
 
 
@@ -385,7 +386,3 @@ def _yaw_rates(wheels: Array, geometry: WheelGeometry) -> Array:
     per_difference = twist_from_wheels(WheelSpeeds(1.0, 0.0), geometry).angular
     rates: Array = per_difference * (wheels[:, 0] - wheels[:, 1])
     return rates
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))

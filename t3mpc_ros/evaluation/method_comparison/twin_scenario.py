@@ -4,7 +4,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-import difflib
 import math
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from t3mpc_ros.evaluation.scenario import (
     RATE,
     LinkFaults,
     SampledReference,
+    check_run,
     isotropic_acceleration,
     sample_reference,
 )
@@ -30,6 +30,7 @@ from t3mpc_ros.evaluation.twin_closed_loop import (
     loop_controller,
     loop_robot,
 )
+from t3mpc_ros.parameters.table import nearest_hint
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule
 from t3mpc_ros.simulation.plant.disturbances import DisturbanceParameters
@@ -137,15 +138,7 @@ class TwinScenario:
 
     def __post_init__(self) -> None:
         check_name('case', self.case, CASES)
-        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
-            raise ValueError(f'seed must be a whole number of at least 0: got {self.seed!r}')
-        for name, low, high, unit in (
-            ('noise', 0.0, 100.0, '(rad/s)²'),
-            ('duration', SHORTEST, LONGEST, 's'),
-        ):
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise ValueError(f'{name} must be from {low:g} to {high:g} {unit}: got {value}')
+        check_run(self, ('noise', 0.0, 100.0, '(rad/s)²'), ('duration', SHORTEST, LONGEST, 's'))
 
     def __str__(self) -> str:
         return f'twin, noise {self.noise:g}, {self.case}, seed {self.seed}'
@@ -250,6 +243,5 @@ class TwinScenario:
 def check_name(kind: str, name: str, known: Mapping[str, object]) -> None:
     """Raise ValueError, with the nearest name, when ``name`` is not known."""
     if name not in known:
-        near = difflib.get_close_matches(name, list(known), n=1)
-        hint = f'; did you mean {near[0]}?' if near else ''
+        hint = nearest_hint(name, known)
         raise ValueError(f'{kind} must be one of {", ".join(known)}: got {name!r}{hint}')

@@ -16,7 +16,7 @@ import numpy as np
 
 from t3mpc_ros.control.controller import ControllerParameters, StepperControllerParameters
 from t3mpc_ros.evaluation.closed_loop import MethodSpec
-from t3mpc_ros.evaluation.confidence_intervals import Difference, paired
+from t3mpc_ros.evaluation.confidence_intervals import Difference, paired, rms
 from t3mpc_ros.evaluation.method_comparison.compared_runs import (
     START,
     TUNED_FOR,
@@ -129,7 +129,7 @@ def twin_objective(job: tuple[TwinScenario, Any]) -> float:
     record = twin_run(scenario, method)
     counted = record.time >= INITIAL_STANDSTILL + START
     speeds = record.ground if scenario.uses_gyro else record.rotors
-    rmse = float(np.sqrt(np.mean((speeds - record.reference)[counted] ** 2)))
+    rmse = rms((speeds - record.reference)[counted])
     value = rmse + SMOOTHNESS * twin_numbers(scenario, record)[VARIATION.name]
     return value if math.isfinite(value) else math.inf
 

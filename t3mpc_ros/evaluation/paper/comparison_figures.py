@@ -145,8 +145,7 @@ def ablation_bars(results: Results) -> Any:
         axis.grid(axis='x', visible=False)
         axis.set_axisbelow(True)
         axis.set_ylim(bottom=0.0)
-        axis.set_title(f'{drive} drive, noise {PAPER_NOISE:g}')
-        axis.set_ylabel('RMSE / rad/s')
+        axis.set(title=f'{drive} drive, noise {PAPER_NOISE:g}', ylabel='RMSE / rad/s')
     legend_above(figure, panels[0])
     return figure
 

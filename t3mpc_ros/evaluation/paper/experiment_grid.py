@@ -5,12 +5,10 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
+if TYPE_CHECKING:
+    from t3mpc_ros.evaluation.methods import ComparedMethod
 
 DRIVES = ('torque', 'velocity')
 """How u reaches the wheels: as a torque, the paper's way, or as a wheel speed command."""
@@ -42,64 +40,6 @@ WITHOUT = {
 """The full controller with one part left out, by that part."""
 
 
-class Method(Protocol):
-    """Fields of a method that tables and results use."""
-
-    @property
-    def name(self) -> str:
-        """Its name in tables and results."""
-
-    @property
-    def baseline(self) -> bool:
-        """Whether it is a baseline, not a stage of the proposed controller."""
-
-    @property
-    def preview(self) -> bool:
-        """Whether it reads the future of the reference."""
-
-    @property
-    def parameters(self) -> Any:
-        """Parameters of the method."""
-
-
-class RunRecord(Protocol):
-    """Fields of a run record that results use; one row per control period, right wheel first."""
-
-    @property
-    def time(self) -> Array:
-        """s, shape (n,)."""
-
-    @property
-    def reference(self) -> Array:
-        """r, rad/s, shape (n, 2)."""
-
-    @property
-    def measured(self) -> Array:
-        """The measured chi with its noise, rad/s, shape (n, 2)."""
-
-    @property
-    def speeds(self) -> Array:
-        """True chi, rad/s, shape (n, 2)."""
-
-    @property
-    def command(self) -> Array:
-        """u, rad/s², shape (n, 2)."""
-
-    @property
-    def terms(self) -> Array:
-        """Terms of u, rad/s², shape (n, 5, 2), rows as in ``TERM_NAMES``."""
-
-    @property
-    def modes(self) -> Array:
-        """Active switching mode, shape (n,)."""
-
-    def rmse(self, after: float = 3.0, *, cut: float = 0.0) -> float:
-        """Return the tracking RMSE over both wheels, rad/s."""
-
-    def chatter(self) -> float:
-        """Return the total variation of the effort per second and wheel, rad/s³."""
-
-
 Jobs = Sequence[tuple[Any, Any]]
 
 
@@ -107,7 +47,7 @@ Jobs = Sequence[tuple[Any, Any]]
 class ExperimentSetup:
     """Where methods and runs come from."""
 
-    methods: Callable[[str], Mapping[str, Method]]
+    methods: Callable[[str], Mapping[str, 'ComparedMethod']]
     """The methods of a drive by name."""
     scenario: Callable[..., Any]
     """Called with drive, noise, case, seed and duration, by name; what
@@ -235,7 +175,7 @@ def needed_experiments(setup: ExperimentSetup, grid: ExperimentGrid) -> tuple[Ex
     return tuple(found)
 
 
-def _noises(grid: ExperimentGrid, method: Method, case: str) -> tuple[float, ...]:
+def _noises(grid: ExperimentGrid, method: 'ComparedMethod', case: str) -> tuple[float, ...]:
     """Return the noises at which a method runs a case."""
     if method.name in WITHOUT.values():
         wanted = case == NOMINAL or case in INTENDED_CASES.get(method.name, ())
@@ -247,5 +187,5 @@ def _noises(grid: ExperimentGrid, method: Method, case: str) -> tuple[float, ...
     return grid.perturbed_noises
 
 
-def _is_baseline(methods: Mapping[str, Method], name: str) -> bool:
+def _is_baseline(methods: Mapping[str, 'ComparedMethod'], name: str) -> bool:
     return name in methods and methods[name].baseline

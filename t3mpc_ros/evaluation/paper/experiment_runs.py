@@ -17,12 +17,12 @@ from typing import Any, Self
 import numpy as np
 
 import t3mpc_ros
+from t3mpc_ros.evaluation.closed_loop import LoopRecord
+from t3mpc_ros.evaluation.methods import ComparedMethod
 from t3mpc_ros.evaluation.paper.experiment_grid import (
     Experiment,
     ExperimentGrid,
     ExperimentSetup,
-    Method,
-    RunRecord,
 )
 from t3mpc_ros.evaluation.reporting import finite, progress_bar
 from t3mpc_ros.parameters.provenance import PACKAGE_DIRECTORY
@@ -59,7 +59,7 @@ class RunNumbers:
     """Whether every number of the run is finite."""
 
 
-def measure(run: RunRecord) -> RunNumbers:
+def measure(run: LoopRecord) -> RunNumbers:
     """Return the metrics of a run; the first :data:`START` seconds do not count."""
     arrays = run.reference, run.speeds, run.command, run.terms
     if not all(bool(np.isfinite(values).all()) for values in arrays):
@@ -92,7 +92,7 @@ def source_digest(package: Path = PACKAGE_DIRECTORY) -> str:
     return digest.hexdigest()[:16]
 
 
-def fingerprint(method: Method, sources: str) -> str:
+def fingerprint(method: ComparedMethod, sources: str) -> str:
     """Return a digest of version, sources and method, on which the result of a scenario depends.
 
     Raises

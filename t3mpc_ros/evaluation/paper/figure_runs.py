@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.control.control_law import TERM_NAMES
+from t3mpc_ros.evaluation.closed_loop import LoopRecord, full_record
 from t3mpc_ros.evaluation.open_loop_estimation import (
     KINDS,
     NORMALISED_GAIN,
@@ -30,10 +31,10 @@ from t3mpc_ros.evaluation.paper.experiment_grid import (
     WITHOUT,
     ExperimentGrid,
     ExperimentSetup,
-    RunRecord,
 )
 from t3mpc_ros.evaluation.paper.experiment_runs import SETTLING, START
 from t3mpc_ros.evaluation.paper.results import Results
+from t3mpc_ros.evaluation.scenario import switch_times
 
 Array = NDArray[np.float64]
 
@@ -53,13 +54,13 @@ class FigureRuns:
     """One run of each kind, all with the same seed and the paper's noise."""
 
     seed: int
-    torque: RunRecord
+    torque: LoopRecord
     """The full controller in the paper's parameter."""
-    velocity: RunRecord
+    velocity: LoopRecord
     """The full controller as the nodes close the loop."""
-    blind: RunRecord | None
+    blind: LoopRecord | None
     """The same without preview."""
-    portraits: Mapping[str, RunRecord]
+    portraits: Mapping[str, LoopRecord]
     """Of several methods in the paper's parameter, the full controller first."""
     pairs: tuple[tuple[int, int], ...]
     """Signals, from 1, that drive right and left wheel in each mode."""
@@ -99,7 +100,7 @@ def simulate_figure_runs(
         )
         for kind, name in requested
     ]
-    found: dict[tuple[str, str], RunRecord] = {}
+    found: dict[tuple[str, str], LoopRecord] = {}
     for index, run in setup.measure_many(jobs, full_record, team):
         found[requested[index]] = run
     if len(found) != len(requested):
@@ -121,11 +122,6 @@ def simulate_figure_runs(
     )
 
 
-def full_record(run: RunRecord) -> RunRecord:
-    """Return the record itself, for figures."""
-    return run
-
-
 def portrait_methods(results: Results) -> list[str]:
     """Return the methods of the phase portraits: proposed, other fuzzy kinds, best baselines."""
     rows = results.rows_of('torque', PAPER_NOISE, baseline=True)
@@ -137,13 +133,12 @@ def portrait_methods(results: Results) -> list[str]:
     return list(dict.fromkeys([FULL, *measured, *names]))[:PORTRAITS]
 
 
-def switches_of(run: RunRecord) -> Array:
+def switches_of(run: LoopRecord) -> Array:
     """Return the times (s) at which the reference switches."""
-    times: Array = run.time[1:][np.diff(run.modes) != 0]
-    return times
+    return switch_times(run.time, run.modes)
 
 
-def largest_switch(run: RunRecord) -> int | None:
+def largest_switch(run: LoopRecord) -> int | None:
     """Return the row of the switch with the largest jump, None when there is none.
 
     Switches so near the end that nothing of what follows could be shown do not count, unless
@@ -158,20 +153,20 @@ def largest_switch(run: RunRecord) -> int | None:
     return int(rows[int(np.argmax(jumps))])
 
 
-def estimated_unknown(run: RunRecord) -> Array:
+def estimated_unknown(run: LoopRecord) -> Array:
     """Return g of (31) as the law used it, rad/s², shape (n, 2): its term in (66) is -g."""
     found: Array = -run.terms[:, TERM_NAMES.index('fuzzy')]
     return found
 
 
-def true_unknown(run: RunRecord) -> Array:
+def true_unknown(run: LoopRecord) -> Array:
     """Return chi' - u of (30), from the true speeds over each period, rad/s², shape (n - 1, 2)."""
     period = (run.time[-1] - run.time[0]) / (run.time.size - 1)
     found: Array = np.diff(run.speeds, axis=0) / period - run.command[:-1]
     return found
 
 
-def explained(run: RunRecord) -> tuple[float, float]:
+def explained(run: LoopRecord) -> tuple[float, float]:
     """Return the share of the unknown acceleration that g explains, of right and left wheel.
 
     1 - mean((unknown - g)²)/var(unknown) after the start: 1 is perfect, 0 no better than the
@@ -184,7 +179,7 @@ def explained(run: RunRecord) -> tuple[float, float]:
     return float(shares[0]), float(shares[1])
 
 
-def switches_claim(run: RunRecord) -> Claim:
+def switches_claim(run: LoopRecord) -> Claim:
     """Decide whether the reference changes its signals as often as in the paper's run."""
     count = switches_of(run).size
     text = 'The reference changes its signals four times in a run, suddenly (60 s here)'
@@ -199,7 +194,7 @@ def switches_claim(run: RunRecord) -> Claim:
     )
 
 
-def follows_claim(run: RunRecord) -> Claim:
+def follows_claim(run: LoopRecord) -> Claim:
     """Decide whether the outputs follow between switches, in the run that is drawn."""
     text = (
         'The outputs track the switching references very well (here: settled RMSE at most '
@@ -225,13 +220,13 @@ def estimate_claim(showcase: FigureRuns) -> Claim:
     return _of_run(showcase.torque, claim)
 
 
-def _of_run(run: RunRecord, claim: Claim) -> Claim:
+def _of_run(run: LoopRecord, claim: Claim) -> Claim:
     if claim.held or run.time[-1] > LONG_ENOUGH:
         return claim
     return replace(claim, held=None, inconclusive=True)
 
 
-def broken_at_switches(run: RunRecord, values: Sequence[Array] | Array) -> Array:
+def broken_at_switches(run: LoopRecord, values: Sequence[Array] | Array) -> Array:
     """Return ``values`` (n, 2) with a gap before each switch: a jump is no line in a portrait."""
     rows = np.flatnonzero(np.diff(run.modes) != 0) + 1
     broken: Array = np.insert(np.asarray(values, dtype=np.float64), rows, np.nan, axis=0)

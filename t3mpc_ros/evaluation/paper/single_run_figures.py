@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.bag_report.topic_roles import ODOMETRY, REFERENCE, TRUTH, WHEELS
-from t3mpc_ros.evaluation.paper.experiment_grid import RunRecord
+from t3mpc_ros.evaluation.closed_loop import LoopRecord
 from t3mpc_ros.evaluation.paper.experiment_runs import SETTLING
 from t3mpc_ros.evaluation.paper.figure_runs import (
     FigureRuns,
@@ -43,8 +43,7 @@ def path(showcase: FigureRuns) -> Any:
     at = driven[1:][np.diff(run.modes) != 0]
     axis.plot(*at.T, 'D', color=COLOURS['switch'], markersize=5, label='switch')
     axis.set_aspect('equal', adjustable='datalim')
-    axis.set_xlabel('x / m')
-    axis.set_ylabel('y / m')
+    axis.set(xlabel='x / m', ylabel='y / m')
     legend_above(figure, axis)
     return figure
 
@@ -106,7 +105,7 @@ def portrait(showcase: FigureRuns) -> Any:
     return _portrait(showcase.torque)
 
 
-def _portrait(run: RunRecord) -> Any:
+def _portrait(run: LoopRecord) -> Any:
     figure = new_figure(3.4)
     axes = figure.subplots(1, 2, sharex=True, sharey=True)
     for axis, values, colour, title in zip(
@@ -119,8 +118,7 @@ def _portrait(run: RunRecord) -> Any:
         # The robot's way through a switch is part of its portrait, the reference's jump is not.
         shown = broken_at_switches(run, values) if values is run.reference else values
         axis.plot(shown[:, 1], shown[:, 0], color=colour, linewidth=0.8)
-        axis.set_title(title)
-        axis.set_xlabel('left wheel / rad/s')
+        axis.set(title=title, xlabel='left wheel / rad/s')
     axes[0].set_ylabel('right wheel / rad/s')
     return figure
 
@@ -224,15 +222,14 @@ def preview(showcase: FigureRuns) -> Any:
         )
         axis.plot(time, run.speeds[rows, i], color=DRIVEN, lw=1.6, label='with preview')
         axis.plot(time, blind.speeds[rows, i], color='#ea580c', lw=1.6, label='without preview')
-        axis.set_title(f'{WHEELS[i]} wheel')
-        axis.set_ylabel('speed / rad/s')
+        axis.set(title=f'{WHEELS[i]} wheel', ylabel='speed / rad/s')
         axis.margins(x=0.0)
     axes[-1].set_xlabel(f'time from the switch at {run.time[middle]:.0f} s / s')
     legend_above(figure, axes[0])
     return figure
 
 
-def run_and_zoom(run: RunRecord, unit: str, before: float, after: float) -> tuple[Any, Any]:
+def run_and_zoom(run: LoopRecord, unit: str, before: float, after: float) -> tuple[Any, Any]:
     """Return a figure with a row per wheel: the whole run, and about its largest switch."""
     figure = new_figure(4.6)
     zoomed = largest_switch(run) is not None
@@ -240,8 +237,7 @@ def run_and_zoom(run: RunRecord, unit: str, before: float, after: float) -> tupl
     columns = 2 if zoomed else 1
     axes = figure.subplots(2, columns, sharex='col', squeeze=False, gridspec_kw=widths)
     for row, wheel in zip(axes, WHEELS, strict=True):
-        row[0].set_title(f'{wheel} wheel')
-        row[0].set_ylabel(unit)
+        row[0].set(title=f'{wheel} wheel', ylabel=unit)
         for axis in row:
             for switch in switches_of(run):
                 style = {'color': COLOURS['switch'], 'linewidth': 0.8, 'linestyle': (0, (4, 3))}
@@ -255,7 +251,7 @@ def run_and_zoom(run: RunRecord, unit: str, before: float, after: float) -> tupl
     return figure, axes
 
 
-def windows(run: RunRecord, before: float, after: float) -> list[NDArray[np.intp]]:
+def windows(run: LoopRecord, before: float, after: float) -> list[NDArray[np.intp]]:
     """Return the rows of the whole run, and those about its largest switch if it has one."""
     found = [np.arange(run.time.size)]
     middle = largest_switch(run)
@@ -264,7 +260,7 @@ def windows(run: RunRecord, before: float, after: float) -> list[NDArray[np.intp
     return found
 
 
-def rows_between(run: RunRecord, begin: float, end: float) -> NDArray[np.intp]:
+def rows_between(run: LoopRecord, begin: float, end: float) -> NDArray[np.intp]:
     """Return the rows with a time (s) in a stretch."""
     return np.flatnonzero((run.time >= begin - 1e-9) & (run.time <= end + 1e-9))
 

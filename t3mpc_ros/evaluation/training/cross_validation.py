@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.control.control_law import Nt3fsMpcParameters
+from t3mpc_ros.evaluation.proposed_method import random_output_weights
 from t3mpc_ros.evaluation.training.fit import (
     explained,
     fit_coefficients,
@@ -116,16 +117,6 @@ def cross_validate(
     if not keep_predictor and not any(fold.judged for fold in found):
         raise TrainingError('there must be a stretch without a gap to judge by: there is none')
     return found
-
-
-def random_output_weights(weights: Mapping[str, Array], seed: int) -> dict[str, Array]:
-    """Return weights with a random output layer of the same size as the fitted one."""
-    generator = np.random.default_rng((seed, 7))
-    drawn = dict(weights)
-    for name in ('output_weights', 'anchor'):
-        size = float(np.sqrt(np.mean(weights[name] ** 2)))
-        drawn[name] = generator.normal(scale=size, size=weights[name].shape)
-    return drawn
 
 
 def mean_and_spread(values: Sequence[Array]) -> tuple[Array, Array]:

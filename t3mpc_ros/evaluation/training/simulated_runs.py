@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.closed_loop import LoopRecord, MethodSpec, pretrain, run
-from t3mpc_ros.evaluation.confidence_intervals import interval, mean, paired
+from t3mpc_ros.evaluation.confidence_intervals import interval, mean, paired, rms
 from t3mpc_ros.evaluation.methods import FULL, methods, proposed_parameters
 from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
 from t3mpc_ros.evaluation.reporting import progress_bar
@@ -129,7 +129,7 @@ def assess(
 
 def early_rmse(record: LoopRecord) -> float:
     """Return the tracking RMSE over both wheels in the initial phase, rad/s."""
-    return float(np.sqrt(np.mean(record.error[record.time < EARLY] ** 2)))
+    return rms(record.error[record.time < EARLY])
 
 
 def held_out_skills(

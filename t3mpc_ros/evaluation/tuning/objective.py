@@ -7,9 +7,9 @@ from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass
 import math
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Self
 
-from t3mpc_ros.evaluation.closed_loop import Job, JobError, MethodSpec, WorkerPool
+from t3mpc_ros.evaluation.closed_loop import Job, JobError, LoopRecord, MethodSpec, WorkerPool
 from t3mpc_ros.evaluation.scenario import TUNING_SEEDS, Scenario
 from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition
 from t3mpc_ros.parameters.table import Parameters
@@ -27,17 +27,7 @@ DURATION = 26.0
 """Length of a training run, s: the reference switches twice in it."""
 
 
-class Measurable(Protocol):
-    """What an objective needs of a run."""
-
-    def rmse(self) -> float:
-        """Return the tracking RMSE, rad/s."""
-
-    def chatter(self) -> float:
-        """Return the total variation of u per second and wheel, rad/s³."""
-
-
-def objective(record: Measurable) -> float:
+def objective(record: LoopRecord) -> float:
     """Return RMSE + rho chatter of a run, rad/s; infinite for a run that broke off."""
     value = record.rmse() + SMOOTHNESS * record.chatter()
     return value if math.isfinite(value) else math.inf

@@ -12,7 +12,7 @@ An integer has an interval of equal length around each value: a and b are extend
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-import difflib
+from difflib import get_close_matches
 import math
 import re
 
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController
-from t3mpc_ros.parameters.table import ParameterError, Parameters, ParameterSpec
+from t3mpc_ros.parameters.table import ParameterError, Parameters, ParameterSpec, nearest_hint
 
 Array = NDArray[np.float64]
 Values = dict[str, int | float]
@@ -182,8 +182,7 @@ class SearchSpace:
 
 def _row(name: str, known: Mapping[str, ParameterSpec], table: type[Parameters]) -> ParameterSpec:
     if name not in known:
-        near = difflib.get_close_matches(name, known, n=1)
-        hint = f'; did you mean {near[0]}?' if near else ''
+        hint = nearest_hint(name, known)
         raise ParameterError(f'{table.__name__} has no setting {name}{hint}')
     return known[name]
 
@@ -280,7 +279,7 @@ def find_names(kind: str, names: Sequence[str], known: Iterable[str]) -> tuple[s
     by_short_name = {short_name(name): name for name in known}
     for name in names:
         if short_name(name) not in by_short_name:
-            near = difflib.get_close_matches(short_name(name), by_short_name, n=1)
+            near = get_close_matches(short_name(name), by_short_name, n=1)
             hint = f'; did you mean {by_short_name[near[0]]}?' if near else ''
             all_names = ', '.join(by_short_name.values())
             raise ValueError(f'{kind} must be one of {all_names}: got {name}{hint}')

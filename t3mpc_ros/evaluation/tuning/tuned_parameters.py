@@ -7,18 +7,17 @@ does not change what was compared. A file that does not fit the parameter tables
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
-import difflib
+from dataclasses import asdict, dataclass, replace
 import json
 import math
 import os
 from pathlib import Path
 import tempfile
-from types import MappingProxyType
-from typing import Any, Self, TypeVar
+from types import MappingProxyType, NoneType
+from typing import Any, Self, TypeVar, get_args, get_origin, get_type_hints
 
 from t3mpc_ros.evaluation.reporting import Table
-from t3mpc_ros.parameters.table import ParameterError, Parameters
+from t3mpc_ros.parameters.table import ParameterError, Parameters, nearest_hint
 
 PACKAGED_FILE = Path(__file__).resolve().parent / 'tuned.json'
 """Bundled file of tuned parameters."""
@@ -136,13 +135,8 @@ class TunedParameters:
         methods: dict[str, dict[str, Any]] = {}
         for method, drive in self:
             entry = self._entries[method, drive]
-            methods.setdefault(method, {})[drive] = {
-                **{each.name: getattr(entry, each.name) for each in fields(TunedEntry)},
-                'values': dict(entry.values),
-                'budget': {
-                    each.name: getattr(entry.budget, each.name) for each in fields(TuningBudget)
-                },
-            }
+            found = asdict(replace(entry, values=dict(entry.values)))
+            methods.setdefault(method, {})[drive] = found
         content = {'format': _FORMAT, 'methods': methods}
         text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
         write_atomically(path, text + '\n')
@@ -180,7 +174,7 @@ class TunedParameters:
         where = f'{method}, {drive}'
         for name in [*entry.values, *entry.tuned]:
             if name not in known:
-                raise StoreError(f'{where}: there is no setting {name}{_near(name, known)}')
+                raise StoreError(f'{where}: there is no setting {name}{nearest_hint(name, known)}')
         missing = [name for name in known if name not in entry.values]
         if missing:
             raise StoreError(f'{where}: settings are missing: {", ".join(missing)}')
@@ -207,7 +201,7 @@ class TunedParameters:
         """Raise :class:`StoreError` unless every entry fits the table of its method."""
         for method, drive in self:
             if method not in types:
-                raise StoreError(f'there is no method {method}{_near(method, list(types))}')
+                raise StoreError(f'there is no method {method}{nearest_hint(method, types)}')
             self.parameters(method, drive, types[method])
 
     def check_equal(self) -> None:
@@ -264,40 +258,42 @@ def _entries(content: object) -> dict[tuple[str, str], TunedEntry]:
 
 
 def _entry(content: object, where: str) -> TunedEntry:
-    read = _object(content, where, {each.name for each in fields(TunedEntry)})
-    start = read['start_objective']
-    values = _object(read['values'], f'{where}: values')
-    tuned = tuple(
-        _text(name, f'{where}: tuned') for name in _list(read['tuned'], f'{where}: tuned')
-    )
-    for name in tuned:
-        if name not in values:
+    entry: TunedEntry = _decoded(TunedEntry, content, where)
+    for name in entry.tuned:
+        if name not in entry.values:
             raise StoreError(f'{where}: {name} was tuned, but has no value')
-    return TunedEntry(
-        values=MappingProxyType(values),
-        tuned=tuned,
-        objective=_number(read['objective'], f'{where}: objective'),
-        start_objective=None if start is None else _number(start, f'{where}: start_objective'),
-        budget=_budget(read['budget'], f'{where}: budget'),
-        version=_text(read['version'], f'{where}: version'),
-    )
+    if entry.budget.evaluations < 1:
+        raise StoreError(f'{where}: budget: evaluations must be at least 1: got 0')
+    return entry
 
 
-def _budget(content: object, where: str) -> TuningBudget:
-    read = _object(content, where, {each.name for each in fields(TuningBudget)})
-    seeds = _list(read['training_seeds'], f'{where}: training_seeds')
-    levels = _list(read['noise_levels'], f'{where}: noise_levels')
-    return TuningBudget(
-        evaluations=_count(read['evaluations'], f'{where}: evaluations', 1),
-        search_seed=_count(read['search_seed'], f'{where}: search_seed', 0),
-        training_seeds=tuple(_count(seed, f'{where}: training_seeds', 0) for seed in seeds),
-        noise_levels=tuple(_number(level, f'{where}: noise_levels') for level in levels),
-        duration=_number(read['duration'], f'{where}: duration'),
-        smoothness=_number(read['smoothness'], f'{where}: smoothness'),
-        cases=tuple(
-            _text(case, f'{where}: cases') for case in _list(read['cases'], f'{where}: cases')
-        ),
-    )
+def _decoded(kind: Any, content: Any, where: str) -> Any:
+    """Return JSON content as an annotated type, or raise :class:`StoreError` with its place."""
+    if kind in (TunedEntry, TuningBudget):
+        hints = get_type_hints(kind)
+        read = _object(content, where, set(hints))
+        return kind(
+            **{name: _decoded(hints[name], read[name], f'{where}: {name}') for name in hints}
+        )
+    arguments = get_args(kind)
+    if NoneType in arguments:
+        return None if content is None else _decoded(arguments[0], content, where)
+    if get_origin(kind) is tuple:
+        if not isinstance(content, list) or not content:
+            raise StoreError(f'{where} must be a list that is not empty: got {content!r}')
+        return tuple(_decoded(arguments[0], each, where) for each in content)
+    if kind is str:
+        if not isinstance(content, str) or not content:
+            raise StoreError(f'{where} must be a text: got {content!r}')
+        return content
+    if kind in (int, float):
+        what, allowed = ('a whole number', int) if kind is int else ('a number', int | float)
+        if isinstance(content, bool) or not isinstance(content, allowed):
+            raise StoreError(f'{where} must be {what}: got {content!r}')
+        if not (math.isfinite(content) and content >= 0):
+            raise StoreError(f'{where} must be at least 0 and finite: got {content}')
+        return kind(content)
+    return MappingProxyType(_object(content, where))
 
 
 def _object(content: object, where: str, names: set[str] | None = None) -> dict[str, Any]:
@@ -308,37 +304,6 @@ def _object(content: object, where: str, names: set[str] | None = None) -> dict[
             if found:
                 raise StoreError(f'{where} {problem} {", ".join(sorted(found))}')
     return content
-
-
-def _list(content: object, where: str) -> list[Any]:
-    if not isinstance(content, list) or not content:
-        raise StoreError(f'{where} must be a list that is not empty: got {content!r}')
-    return content
-
-
-def _number(content: object, where: str) -> float:
-    if isinstance(content, bool) or not isinstance(content, int | float):
-        raise StoreError(f'{where} must be a number: got {content!r}')
-    if not (math.isfinite(content) and content >= 0.0):
-        raise StoreError(f'{where} must be at least 0 and finite: got {content}')
-    return float(content)
-
-
-def _count(content: object, where: str, low: int) -> int:
-    if isinstance(content, bool) or not isinstance(content, int) or content < low:
-        raise StoreError(f'{where} must be a whole number of at least {low}: got {content!r}')
-    return content
-
-
-def _text(content: object, where: str) -> str:
-    if not isinstance(content, str) or not content:
-        raise StoreError(f'{where} must be a text: got {content!r}')
-    return content
-
-
-def _near(name: str, known: list[str]) -> str:
-    near = difflib.get_close_matches(name, known, n=1)
-    return f'; did you mean {near[0]}?' if near else ''
 
 
 def _refuse_constant(text: str) -> float:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table, progress_bar
 from t3mpc_ros.evaluation.twin_validation.courses import (
     Course,
@@ -133,11 +134,6 @@ def measure_drifts(
     return found
 
 
-def root_mean_square(values: Iterable[float]) -> float:
-    """Return the root mean square."""
-    return float(np.sqrt(np.mean(np.square(list(values)))))
-
-
 def select_drifts(found: Iterable[Drift], course: str, slip: str) -> list[Drift]:
     """Return those of one course under one slip."""
     return [drift for drift in found if drift.course == course and drift.slip == slip]
@@ -159,8 +155,8 @@ def drift_table(found: Sequence[Drift]) -> Table:
             members = select_drifts(found, course, slip)
             if not members:
                 continue
-            steps = root_mean_square(drift.steps for drift in members)
-            fused = root_mean_square(drift.fused for drift in members)
+            steps = rms([drift.steps for drift in members])
+            fused = rms([drift.fused for drift in members])
             slips = slip != NO_SLIP.name
             rows.append(
                 (
@@ -170,8 +166,8 @@ def drift_table(found: Sequence[Drift]) -> Table:
                     f'{np.degrees(fused):.1f}',
                     f'{fused / steps:.3f}' if slips else EMPTY_CELL,
                     f'{sum(d.holds for d in members)} of {len(members)}' if slips else EMPTY_CELL,
-                    f'{root_mean_square(d.steps_place for d in members):.2f}',
-                    f'{root_mean_square(d.fused_place for d in members):.2f}',
+                    f'{rms([d.steps_place for d in members]):.2f}',
+                    f'{rms([d.fused_place for d in members]):.2f}',
                     f'{np.mean([d.slid for d in members]):.2f}',
                     f'{np.mean([d.lost for d in members]):.0f}',
                 )

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from t3mpc_ros.evaluation.bag_report.topic_roles import REFERENCE, TRUTH
+from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.plotting import COLOURS, new_figure
 from t3mpc_ros.evaluation.twin_validation.component_tests import (
     GYRO_SHEET,
@@ -26,7 +27,6 @@ from t3mpc_ros.evaluation.twin_validation.slip_drift import (
     NO_SLIP,
     PART,
     Drift,
-    root_mean_square,
     select_drifts,
 )
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
@@ -48,8 +48,7 @@ def squares(courses: Sequence[Course]) -> Any:
     axes = figure.subplots(1, 2)
     for axis, course in zip(axes, courses, strict=True):
         draw_square(axis, course)
-        axis.set_title(course.name)
-        axis.set_xlabel('x / m')
+        axis.set(title=course.name, xlabel='x / m')
     axes[0].set_ylabel('y / m')
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc='outside upper center', ncols=3)
@@ -84,8 +83,7 @@ def turns(course: Course, slip_events: Sequence[FaultEvent], slip: str) -> Any:
     ):
         wrong = np.degrees(estimate[:, 2] - course.truth[:, 2])
         axis.plot(course.time, wrong, color=colour, lw=1.5, label=label)
-    axis.set_xlabel('time / s')
-    axis.set_ylabel('yaw error / deg')
+    axis.set(xlabel='time / s', ylabel='yaw error / deg')
     axis.margins(x=0.01)
     figure.legend(*axis.get_legend_handles_labels(), loc='outside upper center', ncols=3)
     return figure
@@ -102,8 +100,8 @@ def drift(found: Sequence[Drift]) -> Any:
     rows = np.arange(len(slips))
     for axis, course in zip(panels, courses, strict=True):
         groups = [select_drifts(found, course, slip) for slip in slips]
-        steps = [math.degrees(root_mean_square(item.steps for item in each)) for each in groups]
-        fused = [math.degrees(root_mean_square(item.fused for item in each)) for each in groups]
+        steps = [math.degrees(rms([item.steps for item in each])) for each in groups]
+        fused = [math.degrees(rms([item.fused for item in each])) for each in groups]
         axis.barh(rows - 0.2, steps, 0.4, color=STEPS, label='steps alone')
         axis.barh(rows + 0.2, fused, 0.4, color=FUSED, label='with gyro')
         axis.set_title(course)
@@ -121,8 +119,7 @@ def drift(found: Sequence[Drift]) -> Any:
     edge = np.array((0.1, 1000.0))
     below.plot(edge, PART * edge, color=WANTED, lw=1.0, ls='--', label='a fifth')
     below.set(xscale='log', yscale='log', xlim=(0.1, 1000.0), ylim=(0.005, 50.0))
-    below.set_xlabel('yaw error of the steps alone / deg')
-    below.set_ylabel('with gyro / deg')
+    below.set(xlabel='yaw error of the steps alone / deg', ylabel='with gyro / deg')
     below.legend(loc='lower right', ncols=2, framealpha=0.9, frameon=True, edgecolor='white')
     return figure
 
@@ -158,8 +155,7 @@ def room(patrol: Patrol, parameters: DigitalTwinParameters) -> Any:
     axis.set_xlim(around.left - 0.4, around.right + 0.4)
     axis.set_ylim(around.bottom - 0.4, around.top + 0.4)
     axis.set_aspect('equal')
-    axis.set_xlabel('x / m')
-    axis.set_ylabel('y / m')
+    axis.set(xlabel='x / m', ylabel='y / m')
     figure.legend(*axis.get_legend_handles_labels(), loc='outside upper center', ncols=4)
     return figure
 
@@ -269,8 +265,7 @@ def _torque_panel(axis: Any, evidence: Evidence, current: float) -> None:
         at = float(np.interp(curve.ceiling, curve.speed, curve.torque))
         axis.plot(curve.ceiling, at, 'v', color=colour, ms=6, mec='white', mew=0.6)
     axis.plot([], [], 'v', color=FAINT, ms=6, label='V / (2 L I) steps a second')
-    axis.set_title(f'{current:g} A')
-    axis.set_xlabel('wheel speed / rad/s')
+    axis.set(title=f'{current:g} A', xlabel='wheel speed / rad/s')
     axis.set_xlim(0.0, chosen[0].speed[-1])
     axis.set_ylim(0.0, 1.1 * max(curve.torque[0] for curve in evidence.torque))
 
@@ -330,9 +325,7 @@ def sharp(evidence: Evidence) -> Any:
         at = true[(readings == value).any(axis=1)]
         right.plot(at, np.full(at.size, row), '|', color=STEPS, ms=4, mew=1.0)
         right.text(beside, row, name, color=STEPS, va='center', fontsize=8)
-    right.set_title('what the board reads')
-    right.set_xlabel('true distance / cm')
-    right.set_ylabel('read / cm')
+    right.set(title='what the board reads', xlabel='true distance / cm', ylabel='read / cm')
     right.set_xlim(0.0, 100.0)
     right.set_ylim(-10.0, 100.0)
     right.legend(loc='upper left', bbox_to_anchor=(0.1, 0.85), markerscale=4)
@@ -342,9 +335,7 @@ def sharp(evidence: Evidence) -> Any:
 def _sharp_panel(axis: Any, evidence: Evidence) -> None:
     axis.plot(100.0 * evidence.sharp[:, 0], evidence.sharp[:, 1], color=TRUE, lw=1.5, label='twin')
     axis.plot(*np.array(SHARP_SHEET).T, 'o', color=SHEET, ms=4, mfc='white', label='data sheet')
-    axis.set_title('voltage')
-    axis.set_xlabel('distance / cm')
-    axis.set_ylabel('V')
+    axis.set(title='voltage', xlabel='distance / cm', ylabel='V')
     axis.set_xlim(0.0, 100.0)
     axis.set_ylim(bottom=0.0)
     axis.legend(loc='upper right')
@@ -365,17 +356,13 @@ def gyro(evidence: Evidence) -> Any:
     marks = {'color': SHEET, 'ms': 4.5, 'mfc': 'white', 'label': 'data sheet'}
     gain.plot(cutoffs, np.full(cutoffs.size, -3.01), 'o', **marks)
     gain.set(xscale='log', xlim=(1.0, 600.0), ylim=(-25.0, 2.0))
-    gain.set_title('low-pass')
-    gain.set_xlabel('frequency / Hz')
-    gain.set_ylabel('gain / dB')
+    gain.set(title='low-pass', xlabel='frequency / Hz', ylabel='gain / dB')
     gain.legend(loc='lower left')
     delay.plot(cutoffs, delays, 'o', **marks)
     found = [(response.cutoff, response.delay) for response in evidence.low_pass]
     delay.plot(*np.array(found).T, 'x', color=TRUE, ms=5, label='twin')
     delay.set(xscale='log', yscale='log')
-    delay.set_title('delay')
-    delay.set_xlabel('frequency at -3 dB / Hz')
-    delay.set_ylabel('ms')
+    delay.set(title='delay', xlabel='frequency at -3 dB / Hz', ylabel='ms')
     delay.legend(loc='upper right')
     span = evidence.allan.span
     noise.plot(span, evidence.allan.deviation, color=TRUE, lw=1.6, label='twin, standing')
@@ -385,9 +372,7 @@ def gyro(evidence: Evidence) -> Any:
     noise.plot(span, white, color=SHEET, lw=1.0, ls='--', label=shown)
     noise.plot(span, walk, color=COLOURS['estimate'], lw=1.0, ls=':', label='wandering bias')
     noise.set(xscale='log', yscale='log', ylim=(0.5 * white[-1], None))
-    noise.set_title('Allan deviation')
-    noise.set_xlabel('averaged over / s')
-    noise.set_ylabel('deg/s')
+    noise.set(title='Allan deviation', xlabel='averaged over / s', ylabel='deg/s')
     noise.legend(loc='lower center')
     return figure
 
@@ -404,16 +389,12 @@ def overview(evidence: Evidence) -> Any:
     beyond = evidence.ramps[1]
     _speeds(axes[0, 1], beyond)
     axes[0, 1].set_ylim(-2.0, 13.0)
-    axes[0, 1].set_title(f'stall, {_ramp_title(beyond)}')
-    axes[0, 1].set_xlabel('time / s')
-    axes[0, 1].set_ylabel('rad/s')
+    axes[0, 1].set(title=f'stall, {_ramp_title(beyond)}', xlabel='time / s', ylabel='rad/s')
     axes[0, 1].legend(fontsize=6.5, loc='upper right', ncols=2)
     _sharp_panel(axes[1, 0], evidence)
     axes[1, 0].set_title('distance sensor')
     draw_square(axes[1, 1], evidence.squares[0])
-    axes[1, 1].set_title(f'square, {evidence.slip_shown}')
-    axes[1, 1].set_xlabel('x / m')
-    axes[1, 1].set_ylabel('y / m')
+    axes[1, 1].set(title=f'square, {evidence.slip_shown}', xlabel='x / m', ylabel='y / m')
     low, high = axes[1, 1].dataLim.intervaly
     axes[1, 1].plot(0.0, high + 0.3 * (high - low), alpha=0.0)  # room for the legend
     axes[1, 1].legend(fontsize=6.5, loc='upper left')
