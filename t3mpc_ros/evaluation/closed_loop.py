@@ -14,8 +14,7 @@ from dataclasses import dataclass, fields
 from functools import lru_cache, partial
 import math
 import multiprocessing
-from types import TracebackType
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +33,7 @@ from t3mpc_ros.evaluation.scenario import (
     PRETRAINING_SEEDS,
     RATE,
     LinkFaults,
+    SampledReference,
     Scenario,
     settled_rows,
     switch_times,
@@ -368,16 +368,16 @@ def run(
     torque_limit = nominal_model.robot.drive.torque_limit if torque_drive else math.inf
     period = nominal_model.period
     record = _prepare(scenario)
-    now, following, rows = _observed_reference(scenario, seam.dead_time, controller.preview)
+    rows = max(2, round(scenario.lead * RATE))
+    reference = observed_reference(
+        scenario.reference(), scenario.steps, rows, seam.dead_time, preview=controller.preview
+    )
+    loop = MethodLoop(controller, seam, period, reference)
     terms: object = getattr(controller, 'terms', None)
     has_terms = isinstance(terms, np.ndarray) and terms.shape == record.terms.shape[1:]
-    observation = Observation(
-        seam.predicted, seam.disturbance, now[0], following[0], seam.command, None
-    )
 
     last: Array = np.zeros(2)
     links = _Links(scenario) if scenario.links != LinkFaults() else None
-    observed = -1
     for k in range(scenario.steps):
         if k == change_step and changed_robot is not None:
             plant.configure(changed_robot)
@@ -388,17 +388,7 @@ def run(
                 kept[k] = kept[k - 1]
         arrived = ((k, plant.measured),) if links is None else links.measured(k, plant.measured)
         for j, measured in arrived:
-            elapsed, observed = (j - observed if observed >= 0 else 1), j
-            seam.observe(measured, elapsed * period)
-            observation.speeds = seam.predicted
-            observation.unexplained = seam.disturbance
-            observation.reference = now[j]
-            observation.next_reference = following[j]
-            observation.command = seam.command
-            observation.elapsed = elapsed
-            if rows:
-                observation.future = now[j : j + rows]
-            asked = controller.step(observation)
+            asked = loop.step(j, measured)
             if k == 0 and not (isinstance(asked, np.ndarray) and asked.shape == (2,)):
                 what = f'shape {asked.shape}' if isinstance(asked, np.ndarray) else repr(asked)
                 raise ValueError(
@@ -416,10 +406,8 @@ def run(
                 torque = np.clip(inertia @ asked, -torque_limit, torque_limit)
                 asked = np.asarray(np.linalg.solve(inertia, torque), dtype=np.float64)
             command = record.command[k]
-            command[:] = seam.send_acceleration(asked)
-            limited = seam.limited or cut
-            record.limited[k] = limited
-            controller.applied(command, limited=limited)
+            command[:] = loop.send(asked, cut=cut)
+            record.limited[k] = seam.limited or cut
             if has_terms:
                 record.terms[k] = controller.terms  # type: ignore[attr-defined]
             sent = record.sent[k]
@@ -508,30 +496,99 @@ def _prepare(scenario: Scenario) -> LoopRecord:
     return record
 
 
-def _observed_reference(
-    scenario: Scenario, dead_time: float, preview: bool
-) -> tuple[Array, Array, int]:
-    """Return reference and next reference of each observation, and the length of ``future``.
+class ObservedReference(NamedTuple):
+    """Reference as a method observes it in each period, rad/s."""
 
-    With preview they are rows of the reference after the dead time, and go on beyond the run.
-    Without, r is extrapolated over the dead time by the slope it has now: a switch is seen when
-    it happens, and not before. These are copies that can be written to, because compiled
-    functions take an array that cannot for another type.
+    now: Array
+    """r when the answer takes effect, shape (n, 2)."""
+    following: Array
+    """r one period later, shape (n, 2)."""
+    rows: int
+    """Rows of ``now`` that preview gives; 0 without preview."""
+
+
+def observed_reference(
+    sampled: SampledReference, steps: int, rows: int, dead_time: float, *, preview: bool
+) -> ObservedReference:
+    """Return what a method observes of a reference over a run of ``steps`` periods.
+
+    With preview of ``rows`` periods these are rows of the reference after the dead time, and go on
+    beyond the run. Without, r is extrapolated over the dead time by the slope it has now: a switch
+    is seen when it happens, and not before. These are copies that can be written to, because
+    compiled functions take an array that cannot for another type.
+
+    Raises
+    ------
+    ValueError
+        The dead time is not a whole number of periods, or longer than the reference reaches.
     """
     late = round(dead_time * RATE)
     if not math.isclose(dead_time * RATE, late, abs_tol=1e-6):
         raise ValueError(f'dead time must be whole periods of {1.0 / RATE:g} s: got {dead_time} s')
-    sampled, steps = scenario.reference(), scenario.steps
-    rows = max(2, round(scenario.lead * RATE))
     if steps + late + rows > sampled.time.size:
         raise ValueError(
             f'dead time must be at most {(sampled.time.size - steps - rows) / RATE:g} s, '
             f'as far as the reference reaches: got {dead_time} s'
         )
+    speeds, slope = sampled.speeds, sampled.rate / RATE
     if preview:
-        return sampled.speeds[late:].copy(), sampled.speeds[late + 1 :].copy(), rows
-    reference, slope = sampled.speeds[:steps], sampled.rate[:steps] / RATE
-    return reference + late * slope, reference + (late + 1) * slope, 0
+        return ObservedReference(speeds[late:].copy(), speeds[late + 1 :].copy(), rows)
+    return ObservedReference(speeds + late * slope, speeds + (late + 1) * slope, 0)
+
+
+class MethodLoop:
+    """A method between the state estimate and the limits that all methods share.
+
+    Parameters
+    ----------
+    controller
+        The method.
+    actuation
+        Estimator and limits; it was reset to the first measurement.
+    period
+        Control period, s.
+    reference
+        What the method observes of the reference.
+    """
+
+    def __init__(
+        self,
+        controller: BaselineController,
+        actuation: VelocityActuation,
+        period: float,
+        reference: ObservedReference,
+    ) -> None:
+        self._controller, self._actuation, self._period = controller, actuation, period
+        self._reference = reference
+        self._observed = -1
+        """Period of the last measurement."""
+
+    def step(self, k: int, measured: Array) -> Array:
+        """Return the answer (rad/s²) to the speeds (rad/s) measured in period ``k``."""
+        elapsed = k - self._observed if self._observed >= 0 else 1
+        self._observed = k
+        actuation, (now, following, rows) = self._actuation, self._reference
+        actuation.observe(measured, elapsed * self._period)
+        return self._controller.step(
+            Observation(
+                actuation.predicted,
+                actuation.disturbance,
+                now[k],
+                following[k],
+                actuation.command,
+                now[k : k + rows] if rows else None,
+                elapsed,
+            )
+        )
+
+    def send(self, asked: Array, *, cut: bool = False) -> Array:
+        """Return the acceleration (rad/s²) that the limits let through of an answer.
+
+        ``cut``: it has been limited before.
+        """
+        applied = self._actuation.send_acceleration(asked)
+        self._controller.applied(applied, limited=self._actuation.limited or cut)
+        return applied
 
 
 def _break_off(record: LoopRecord, k: int) -> None:
@@ -584,12 +641,7 @@ class WorkerPool:
             )
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
             self._pool = None

@@ -11,11 +11,8 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.control.actuation import VelocityActuation
 from t3mpc_ros.control.watchdog import Reason
-from t3mpc_ros.evaluation.baselines.baseline_controller import (
-    BaselineController,
-    NominalModel,
-    Observation,
-)
+from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController, NominalModel
+from t3mpc_ros.evaluation.closed_loop import MethodLoop, observed_reference
 from t3mpc_ros.evaluation.method_comparison.twin_scenario import TwinScenario
 from t3mpc_ros.evaluation.scenario import RATE
 from t3mpc_ros.evaluation.twin_closed_loop import LEAD
@@ -60,18 +57,9 @@ class TwinBaseline:
             'velocity',
             self._model.period,
         )
-        late = self._actuation.dead_time * RATE
-        self._late = round(late)
-        if not math.isclose(late, self._late, abs_tol=1e-6):
-            raise ValueError(
-                f'dead time must be whole periods of {1.0 / RATE:g} s: '
-                f'got {self._actuation.dead_time} s'
-            )
-        reference = scenario.reference()
-        # Copies: compiled functions take an array that cannot be written to for another type.
-        self._speeds, self._rate = reference.speeds.copy(), reference.rate.copy()
+        self._scenario = scenario
         self._enabled = True
-        self._controller: BaselineController | None = None
+        self._loop: MethodLoop | None = None
         self._last: tuple[int, float] = (0, 0.0)
         """Period and yaw of the last report."""
 
@@ -87,25 +75,28 @@ class TwinBaseline:
         """Return the command that follows from a report of the robot."""
         stamp_ns = odometry.stamp_ns
         if not self._enabled:
-            self._controller = None
+            self._loop = None
             return STANDSTILL, BaselineStatus(stamp_ns, Reason.DISABLED)
         k = round(stamp_ns * RATE / NANOSECONDS)
-        if self._controller is None:
-            self._controller = self._method(self._model)
-            self._last = k - 1, odometry.pose.yaw
+        if self._loop is None:
             measured = self._measured(odometry, math.nan)
             self._actuation.reset(measured)
-            elapsed = 1
+            self._loop = self._new_loop()
         else:
-            elapsed = k - self._last[0]
-            measured = self._measured(odometry, elapsed * self._model.period)
+            measured = self._measured(odometry, (k - self._last[0]) * self._model.period)
         self._last = k, odometry.pose.yaw
-        actuation, controller = self._actuation, self._controller
-        actuation.observe(measured, elapsed * self._model.period)
-        answer = controller.step(self._observation(k, elapsed, controller.preview))
-        applied = actuation.send_acceleration(answer)
-        controller.applied(applied, limited=actuation.limited)
-        return actuation.twist, BaselineStatus(stamp_ns, Reason.TRACKING)
+        self._loop.send(self._loop.step(k, measured))
+        return self._actuation.twist, BaselineStatus(stamp_ns, Reason.TRACKING)
+
+    def _new_loop(self) -> MethodLoop:
+        controller, dead_time = self._method(self._model), self._actuation.dead_time
+        # What a reference with this lead has made known at the stamp of the report.
+        rows = round((LEAD - dead_time) * RATE) + 1
+        steps = round(self._scenario.duration * RATE)
+        reference = observed_reference(
+            self._scenario.reference(), steps, rows, dead_time, preview=controller.preview
+        )
+        return MethodLoop(controller, self._actuation, self._model.period, reference)
 
     def _measured(self, odometry: State, dt: float) -> Array:
         """Return the measured wheel speeds, rad/s, shape (2,).
@@ -117,24 +108,3 @@ class TwinBaseline:
             turned = wrap_angle(odometry.pose.yaw - self._last[1])
             twist = BodyTwist(twist.linear, turned / dt)
         return np.array(wheels_from_twist(twist, self._geometry))
-
-    def _observation(self, k: int, elapsed: int, preview: bool) -> Observation:
-        actuation, late = self._actuation, self._late
-        future = None
-        if preview:
-            # What a reference with this lead has made known at the stamp of the report.
-            future = self._speeds[k + late : k + round(LEAD * RATE) + 1]
-            reference, following = future[0], future[1]
-        else:
-            slope = self._rate[k] * self._model.period
-            reference = self._speeds[k] + late * slope
-            following = reference + slope
-        return Observation(
-            actuation.predicted,
-            actuation.disturbance,
-            reference,
-            following,
-            actuation.command,
-            future,
-            elapsed,
-        )

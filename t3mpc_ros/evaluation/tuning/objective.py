@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass
 import math
-from types import TracebackType
 from typing import Self
 
 from t3mpc_ros.evaluation.closed_loop import Job, JobError, LoopRecord, MethodSpec, WorkerPool
@@ -113,13 +112,8 @@ class ClosedLoopObjective:
         self.workers.__enter__()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.workers.__exit__(kind, error, trace)
+    def __exit__(self, *_: object) -> None:
+        self.workers.__exit__()
 
     def __call__(
         self, method: MethodDefinition, drive: str, candidates: Sequence[Parameters]
