@@ -6,35 +6,20 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 
-from t3mpc_ros.evaluation.baselines.adaptive_fuzzy import (
-    AdaptiveIntervalType2,
-    AdaptiveIntervalType2Parameters,
-    AdaptiveType1,
-    AdaptiveType1Parameters,
-)
+from t3mpc_ros.evaluation.baselines.adaptive_fuzzy import AdaptiveIntervalType2, AdaptiveType1
+from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController
 from t3mpc_ros.evaluation.baselines.dynamic_matrix_control import (
     DynamicMatrix,
-    DynamicMatrixParameters,
     DynamicMatrixPreview,
-    DynamicMatrixPreviewParameters,
 )
 from t3mpc_ros.evaluation.baselines.feedback_control import (
     ComputedTorque,
-    ComputedTorqueParameters,
     DisturbanceRejection,
-    DisturbanceRejectionParameters,
     ProportionalIntegral,
-    ProportionalIntegralParameters,
     SlidingMode,
-    SlidingModeParameters,
 )
-from t3mpc_ros.evaluation.baselines.linear_mpc import (
-    LinearMpc,
-    LinearMpcParameters,
-    LinearMpcPreview,
-    LinearMpcPreviewParameters,
-)
-from t3mpc_ros.evaluation.baselines.nonlinear_mpc import CasadiNmpc, CasadiNmpcParameters
+from t3mpc_ros.evaluation.baselines.linear_mpc import LinearMpc, LinearMpcPreview
+from t3mpc_ros.evaluation.baselines.nonlinear_mpc import CasadiNmpc
 from t3mpc_ros.evaluation.closed_loop import MethodSpec
 from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
 from t3mpc_ros.evaluation.scenario import DRIVES
@@ -98,8 +83,53 @@ def require_libraries(names: Iterable[str]) -> None:
         import_module('casadi')
 
 
-def _both(parameters: Parameters) -> dict[str, Parameters]:
-    return dict.fromkeys(DRIVES, parameters)
+_GAIN = SearchRange('gain', 5.0, 80.0)
+_INTEGRAL = SearchRange('integral', 0.3, 3000.0)
+_MOVES = SearchRange('move_time', 0.001, 0.1), SearchRange('disturbance_share', 0.01, 1.5)
+_ADAPTIVE = (
+    _GAIN,
+    SearchRange('normalised_gain', 1.0, 2000.0),
+    SearchRange('dead_zone', 0.003, 0.3),
+    SearchRange('error_bound', 0.0, 8.0, log=False),
+)
+_MPC = *_MOVES, SearchRange('integral_time', 0.1, 40.0), SearchRange('filter_time', 0.003, 2.0)
+_DMC = _MOVES[0], SearchRange('bias_time', 0.005, 15.0), _MOVES[1]
+_ADRC = (
+    _GAIN,
+    SearchRange('observer_bandwidth', 1.0, 150.0),
+    SearchRange('shared_disturbance', 0.0, 1.0, log=False),
+    SearchRange('shared_speed', 0.0, 1.0, log=False),
+)
+_SLIDING = (
+    SearchRange('surface', 0.3, 60.0),
+    SearchRange('reaching', 1.0, 80.0),
+    SearchRange('switching', 0.3, 30.0),
+    SearchRange('boundary', 0.03, 3.0),
+)
+_WRONG = {'model_error': MODEL_ERROR}
+_PLAIN = {'load_share': 0.0}
+_INNER = {'load_share': 0.0, 'inner_gain': 15.0}
+_BASELINES: tuple[
+    tuple[str, type[BaselineController], Mapping[str, float], tuple[SearchRange, ...]], ...
+] = (
+    ('PI + feed-forward', ProportionalIntegral, {}, (_GAIN, _INTEGRAL)),
+    ('ADRC', DisturbanceRejection, {}, _ADRC),
+    ('sliding mode', SlidingMode, {}, _SLIDING),
+    (
+        'computed torque',
+        ComputedTorque,
+        {},
+        (_GAIN, _INTEGRAL, SearchRange('belief', 0.0, 1.3, log=False)),
+    ),
+    ('adaptive T1-FLS', AdaptiveType1, {}, _ADAPTIVE),
+    ('adaptive IT2-FLS', AdaptiveIntervalType2, {}, _ADAPTIVE),
+    ('DMC', DynamicMatrix, _INNER, _DMC),
+    ('DMC preview', DynamicMatrixPreview, _INNER | _WRONG, _DMC),
+    ('linear MPC', LinearMpc, _PLAIN, _MPC),
+    ('linear MPC preview', LinearMpcPreview, _PLAIN | _WRONG, _MPC),
+    (NMPC, CasadiNmpc, _WRONG, _MPC),
+)
+"""Name, class, parameters other than the defaults, and search ranges."""
 
 
 def method_definitions() -> list[MethodDefinition]:
@@ -108,112 +138,19 @@ def method_definitions() -> list[MethodDefinition]:
     A switch is the same for all methods without preview: they cross it as fast as the drive
     allows, and what is left to choose there is fixed at values that do not matter (1 %).
     """
-    gain = SearchRange('gain', 5.0, 80.0)
-    adaptive = (
-        gain,
-        SearchRange('normalised_gain', 1.0, 2000.0),
-        SearchRange('dead_zone', 0.003, 0.3),
-        SearchRange('error_bound', 0.0, 8.0, log=False),
+    full = (
+        SearchRange('law.gain', 5.0, 80.0),
+        SearchRange('law.smoothing', 0.1, 10.0),
+        SearchRange('adaptation.gamma', 30.0, 30000.0),
+        SearchRange('integral_transfer', 0.01, 1.0),
+        SearchRange('predictive.move_weight', 1e-4, 1.0),
+        SearchRange('predictive.offset_gain', 0.003, 0.5),
     )
-    mpc = (
-        SearchRange('move_time', 0.001, 0.1),
-        SearchRange('disturbance_share', 0.01, 1.5),
-        SearchRange('integral_time', 0.1, 40.0),
-        SearchRange('filter_time', 0.003, 2.0),
-    )
-    dmc = (
-        SearchRange('move_time', 0.001, 0.1),
-        SearchRange('bias_time', 0.005, 15.0),
-        SearchRange('disturbance_share', 0.01, 1.5),
-    )
-    return [
-        MethodDefinition(
-            'PI + feed-forward',
-            ProportionalIntegral,
-            _both(ProportionalIntegralParameters()),
-            (gain, SearchRange('integral', 0.3, 3000.0)),
-        ),
-        MethodDefinition(
-            'ADRC',
-            DisturbanceRejection,
-            _both(DisturbanceRejectionParameters()),
-            (
-                gain,
-                SearchRange('observer_bandwidth', 1.0, 150.0),
-                SearchRange('shared_disturbance', 0.0, 1.0, log=False),
-                SearchRange('shared_speed', 0.0, 1.0, log=False),
-            ),
-        ),
-        MethodDefinition(
-            'sliding mode',
-            SlidingMode,
-            _both(SlidingModeParameters()),
-            (
-                SearchRange('surface', 0.3, 60.0),
-                SearchRange('reaching', 1.0, 80.0),
-                SearchRange('switching', 0.3, 30.0),
-                SearchRange('boundary', 0.03, 3.0),
-            ),
-        ),
-        MethodDefinition(
-            'computed torque',
-            ComputedTorque,
-            _both(ComputedTorqueParameters()),
-            (
-                gain,
-                SearchRange('integral', 0.3, 3000.0),
-                SearchRange('belief', 0.0, 1.3, log=False),
-            ),
-        ),
-        MethodDefinition(
-            'adaptive T1-FLS', AdaptiveType1, _both(AdaptiveType1Parameters()), adaptive
-        ),
-        MethodDefinition(
-            'adaptive IT2-FLS',
-            AdaptiveIntervalType2,
-            _both(AdaptiveIntervalType2Parameters()),
-            adaptive,
-        ),
-        MethodDefinition(
-            'DMC',
-            DynamicMatrix,
-            _both(DynamicMatrixParameters(load_share=0.0, inner_gain=15.0)),
-            dmc,
-        ),
-        MethodDefinition(
-            'DMC preview',
-            DynamicMatrixPreview,
-            _both(
-                DynamicMatrixPreviewParameters(
-                    load_share=0.0, inner_gain=15.0, model_error=MODEL_ERROR
-                )
-            ),
-            dmc,
-        ),
-        MethodDefinition('linear MPC', LinearMpc, _both(LinearMpcParameters(load_share=0.0)), mpc),
-        MethodDefinition(
-            'linear MPC preview',
-            LinearMpcPreview,
-            _both(LinearMpcPreviewParameters(load_share=0.0, model_error=MODEL_ERROR)),
-            mpc,
-        ),
-        MethodDefinition(
-            NMPC, CasadiNmpc, _both(CasadiNmpcParameters(model_error=MODEL_ERROR)), mpc
-        ),
-        MethodDefinition(
-            FULL,
-            ProposedController,
-            proposed_parameters(),
-            (
-                SearchRange('law.gain', 5.0, 80.0),
-                SearchRange('law.smoothing', 0.1, 10.0),
-                SearchRange('adaptation.gamma', 30.0, 30000.0),
-                SearchRange('integral_transfer', 0.01, 1.0),
-                SearchRange('predictive.move_weight', 1e-4, 1.0),
-                SearchRange('predictive.offset_gain', 0.003, 0.5),
-            ),
-        ),
-    ]
+    found = []
+    for name, kind, changes, ranges in _BASELINES:
+        start = kind.parameters_type().with_values(changes)
+        found.append(MethodDefinition(name, kind, dict.fromkeys(DRIVES, start), ranges))
+    return [*found, MethodDefinition(FULL, ProposedController, proposed_parameters(), full)]
 
 
 def proposed_parameters() -> dict[str, Parameters]:
