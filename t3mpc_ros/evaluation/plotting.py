@@ -158,6 +158,16 @@ def add_legend(axis: Any) -> None:
         axis.legend(handles, labels, **place, **spacing)
 
 
+def legend_above(figure: Any, *axes: Any, columns: int = 5) -> None:
+    """Put the lines of some axes into one legend above all panels."""
+    entries: dict[str, Any] = {}
+    for axis in axes:
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    columns = min(columns, len(entries))
+    figure.legend(entries.values(), entries.keys(), loc='outside upper center', ncols=columns)
+
+
 def draw_line(
     axis: Any,
     series: Series,

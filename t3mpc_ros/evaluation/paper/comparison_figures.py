@@ -21,8 +21,8 @@ from t3mpc_ros.evaluation.paper.experiment_grid import (
 from t3mpc_ros.evaluation.paper.experiment_runs import SETTLING, START
 from t3mpc_ros.evaluation.paper.figure_runs import FigureRuns, broken_at_switches
 from t3mpc_ros.evaluation.paper.results import PairedDifference, ResultRow, Results
-from t3mpc_ros.evaluation.paper.single_run_figures import REFERENCE_COLOUR, legend_above
-from t3mpc_ros.evaluation.plotting import COLOURS, new_figure
+from t3mpc_ros.evaluation.paper.single_run_figures import REFERENCE_COLOUR
+from t3mpc_ros.evaluation.plotting import COLOURS, legend_above, new_figure
 
 OURS = '#be123c'
 """The full controller, in every figure."""
@@ -113,7 +113,7 @@ def noise_growth(results: Results) -> Any:
     axes[0, 0].set_ylim(bottom=0.0)  # not before every line is there: it fixes the top, too
     axes[0, 0].set_ylabel('RMSE / rad/s')
     axes[1, 0].set_ylabel('RMSE less that without noise / rad/s')
-    _shared_legend(figure, axes[0])
+    legend_above(figure, *axes[0], columns=3)
     return figure
 
 
@@ -273,11 +273,3 @@ def _with_mark(name: str, baseline: bool, preview: bool) -> str:
 
 def _whisker(ci95: float) -> float:
     return ci95 if math.isfinite(ci95) else 0.0
-
-
-def _shared_legend(figure: Any, axes: Sequence[Any]) -> None:
-    entries: dict[str, Any] = {}
-    for axis in axes:
-        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
-            entries.setdefault(label, handle)
-    figure.legend(entries.values(), entries.keys(), loc='outside upper center', ncols=3)

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Figures 8 to 14: one run each."""
 
-from collections.abc import Sequence
 from typing import Any
 
 from matplotlib.ticker import MaxNLocator
@@ -21,7 +20,13 @@ from t3mpc_ros.evaluation.paper.figure_runs import (
     switches_of,
     true_unknown,
 )
-from t3mpc_ros.evaluation.plotting import COLOURS, new_figure, new_panels, thinned
+from t3mpc_ros.evaluation.plotting import (
+    COLOURS,
+    legend_above,
+    new_figure,
+    new_panels,
+    thinned,
+)
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, twist_from_wheels
 from t3mpc_ros.geometry.types import ORIGIN, WheelSpeeds
 
@@ -263,14 +268,6 @@ def windows(run: LoopRecord, before: float, after: float) -> list[NDArray[np.int
 def rows_between(run: LoopRecord, begin: float, end: float) -> NDArray[np.intp]:
     """Return the rows with a time (s) in a stretch."""
     return np.flatnonzero((run.time >= begin - 1e-9) & (run.time <= end + 1e-9))
-
-
-def legend_above(figure: Any, axis: Any, extra: Sequence[Any] = (), columns: int = 5) -> None:
-    """Put the lines of ``axis`` and further ones into one legend above all panels."""
-    handles, labels = axis.get_legend_handles_labels()
-    handles += list(extra)
-    labels += [handle.get_label() for handle in extra]
-    figure.legend(handles, labels, loc='outside upper center', ncols=min(columns, len(labels)))
 
 
 def _name_time(axis: Any) -> None:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from t3mpc_ros.evaluation.bag_report.topic_roles import REFERENCE, TRUTH
 from t3mpc_ros.evaluation.confidence_intervals import rms
-from t3mpc_ros.evaluation.plotting import COLOURS, new_figure
+from t3mpc_ros.evaluation.plotting import COLOURS, legend_above, new_figure
 from t3mpc_ros.evaluation.twin_validation.component_tests import (
     GYRO_SHEET,
     SHARP_SHEET,
@@ -50,8 +50,7 @@ def squares(courses: Sequence[Course]) -> Any:
         draw_square(axis, course)
         axis.set(title=course.name, xlabel='x / m')
     axes[0].set_ylabel('y / m')
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc='outside upper center', ncols=3)
+    legend_above(figure, axes[0], columns=3)
     return figure
 
 
@@ -85,7 +84,7 @@ def turns(course: Course, slip_events: Sequence[FaultEvent], slip: str) -> Any:
         axis.plot(course.time, wrong, color=colour, lw=1.5, label=label)
     axis.set(xlabel='time / s', ylabel='yaw error / deg')
     axis.margins(x=0.01)
-    figure.legend(*axis.get_legend_handles_labels(), loc='outside upper center', ncols=3)
+    legend_above(figure, axis, columns=3)
     return figure
 
 
@@ -111,7 +110,7 @@ def drift(found: Sequence[Drift]) -> Any:
         axis.grid(False, axis='y')
     panels[0].set_yticks(rows, slips)
     panels[0].invert_yaxis()
-    figure.legend(*panels[0].get_legend_handles_labels(), loc='outside upper center', ncols=2)
+    legend_above(figure, panels[0], columns=2)
     for course, mark in zip(courses, _MARKS, strict=False):
         members = [item for item in found if item.course == course and item.slip != NO_SLIP.name]
         wrong = np.degrees(np.abs([(item.steps, item.fused) for item in members]))
@@ -156,7 +155,7 @@ def room(patrol: Patrol, parameters: DigitalTwinParameters) -> Any:
     axis.set_ylim(around.bottom - 0.4, around.top + 0.4)
     axis.set_aspect('equal')
     axis.set(xlabel='x / m', ylabel='y / m')
-    figure.legend(*axis.get_legend_handles_labels(), loc='outside upper center', ncols=4)
+    legend_above(figure, axis, columns=4)
     return figure
 
 
@@ -247,8 +246,7 @@ def torque(evidence: Evidence) -> Any:
     for axis, current in zip(axes, currents, strict=True):
         _torque_panel(axis, evidence, current)
     axes[0].set_ylabel('pull-out torque / N m')
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc='outside upper center', ncols=3)
+    legend_above(figure, axes[0], columns=3)
     return figure
 
 
