@@ -530,10 +530,11 @@ def test_condensing_closes_the_gaps_and_superposes(lasting):
     n = 7
     by_speed, by_command = generator.standard_normal((2, n, 2, 2))
     units, gaps = generator.standard_normal((2, 2)), generator.standard_normal((n, 2))
-    response, transition = condense(by_speed, by_command, units, lasting=lasting)
+    response, closing = np.zeros((2 * n, 2 * n)), gaps.copy()
+    condense(by_speed, by_command @ units, lasting, response, closing)
     moves = generator.standard_normal((n, 2))
     change, speeds = np.zeros(2), np.zeros(2)
-    there = (response @ moves.ravel() + transition @ gaps.ravel()).reshape(n, 2)
+    there = (response @ moves.ravel()).reshape(n, 2) + closing
     for j in range(n):
         change = lasting * change + units @ moves[j]
         speeds = by_speed[j] @ speeds + by_command[j] @ change + gaps[j]

@@ -37,6 +37,7 @@ from t3mpc_ros.evaluation.baselines.predictive_baseline import (
     ObserverParameters,
     PredictiveParameters,
 )
+from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
 from t3mpc_ros.simulation.plant.dynamics import BodyParameters, coriolis_factor, wheel_inertia
 
@@ -118,39 +119,29 @@ def scaled_body(nominal_model: NominalModel, factor: float) -> BodyParameters:
     )
 
 
-def condense(
-    by_speed: Array, by_command: Array, units: Array, *, lasting: bool
-) -> tuple[Array, Array]:
+@kernel
+def condense(by_speed: Array, push: Array, lasting: bool, response: Array, closing: Array) -> None:
     """Eliminate the states of the linearised horizon.
 
-    Parameters
-    ----------
-    by_speed, by_command
-        Derivatives of the model at each period, shape (N, 2, 2).
-    units
-        Change of the command by each of the two unknowns of a period, shape (2, 2).
-    lasting
-        Whether a change of the command lasts to the end of the horizon.
-
-    Returns
-    -------
-    response
-        Shape (2N, 2N): column 2j + m is what unknown m of period j adds to the speeds of periods
-        1 ... N, right and left in turn.
-    transition
-        Shape (N, 2, 2N): what a gap between two periods adds to the speeds of all later ones.
+    by_speed : shape (N, 2, 2), derivative of the model at each period
+    push : shape (N, 2, 2), speeds by each of the two unknowns of a period
+    lasting : whether a change of the command lasts to the end of the horizon
+    response : shape (2N, 2N), zeros, written: column 2j + m is what unknown m of period j adds to
+        the speeds of periods 1 ... N, right and left in turn
+    closing : shape (N, 2), the gaps from each guessed state to where the model leads; overwritten
+        by what closing them adds to these speeds
     """
-    n = len(by_speed)
-    response, transition = np.zeros((n, 2, n, 2)), np.zeros((n, 2, n, 2))
-    for j in range(n):
-        if j:
-            response[j] = np.tensordot(by_speed[j], response[j - 1], 1)
-            transition[j] = np.tensordot(by_speed[j], transition[j - 1], 1)
-        push = by_command[j] @ units
-        first = 0 if lasting else j
-        response[j, :, first : j + 1] += push[:, np.newaxis]
-        transition[j, :, j] += np.eye(2)
-    return response.reshape(2 * n, 2 * n), transition.reshape(2 * n, 2 * n)
+    for j in range(by_speed.shape[0]):
+        slope = by_speed[j]
+        for i in range(2):
+            if j > 0:
+                closing[j, i] += slope[i, 0] * closing[j - 1, 0] + slope[i, 1] * closing[j - 1, 1]
+            for column in range(2 * j + 2):
+                total = push[j, i, column % 2] if lasting or column >= 2 * j else 0.0
+                if j > 0:
+                    total += slope[i, 0] * response[2 * j - 2, column]
+                    total += slope[i, 1] * response[2 * j - 1, column]
+                response[2 * j + i, column] = total
 
 
 class CasadiNmpc(ObserverBaseline):
@@ -224,13 +215,15 @@ class CasadiNmpc(ObserverBaseline):
         by_speed, self._by_command = (
             np.array(each).reshape(2, n, 2).transpose(1, 0, 2) for each in found[1:]
         )
-        response, transition = condense(
-            by_speed, self._by_command, self._units, lasting=not self._torque
-        )
-        gaps = (reached - self._speeds[1:]).ravel()
-        there = self._speeds[1:].ravel() + transition @ gaps - response @ moves
+        response, closing = np.zeros((2 * n, 2 * n)), reached - self._speeds[1:]
+        push = self._by_command @ self._units
+        condense(by_speed.copy(), push, not self._torque, response, closing)
+        there = self._speeds[1:].ravel() + closing.ravel() - response @ moves
         slope = response.T @ (there - reference[1:].ravel())
         slope[:2] -= self._first * self._units.T @ before
-        best = self._program.solve(slope, response.T @ response + self._weights)
+        # In two parts: the threads of a larger product would compete with the other runs.
+        upper, lower = response[:n], response[n:]
+        squares = upper.T @ upper + lower.T @ lower
+        best = self._program.solve(slope, squares + self._weights)
         self._speeds = np.vstack([self._speeds[:1], (there + response @ best).reshape(-1, 2)])
         return best
