@@ -233,15 +233,15 @@ def test_a_second_start_runs_nothing_and_gives_the_same(tmp_path):
 
 
 def test_a_stopped_campaign_goes_on_with_exactly_what_is_missing(tmp_path):
-    whole, said = FakeRunner(), []
+    whole, lines = FakeRunner(), []
     numbers = small_campaign(tmp_path / 'whole', whole)
     stopped, rest = FakeRunner(stop_after=7), FakeRunner(backwards=True)
     with pytest.raises(KeyboardInterrupt):
-        small_campaign(tmp_path / 'r', stopped, report=said.append)
+        small_campaign(tmp_path / 'r', stopped, report=lines.append)
     assert stopped.closed
-    assert said[-1].startswith(f'7 of {len(whole.done)} runs are kept')
-    assert small_campaign(tmp_path / 'r', rest, report=said.append) == numbers
-    assert '7 are there already' in said[-1]
+    assert lines[-1].startswith(f'7 of {len(whole.done)} runs are kept')
+    assert small_campaign(tmp_path / 'r', rest, report=lines.append) == numbers
+    assert '7 are there already' in lines[-1]
     assert sorted(map(repr, stopped.done + rest.done)) == sorted(map(repr, whole.done))
 
 

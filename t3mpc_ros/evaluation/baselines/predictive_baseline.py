@@ -180,7 +180,6 @@ class BoxProgram:
         self._model = daqp.Model()
         self._model.settings = TOLERANCES
         self._model.setup(hessian, np.zeros(n), np.zeros((0, n)), self.high, self.low)
-        self._model.settings = TOLERANCES
 
     def solve(self, slope: Array, hessian: Array | None = None) -> Array:
         """Return x for another g, the present bounds, and another H if one is given.
