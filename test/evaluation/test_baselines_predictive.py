@@ -515,7 +515,7 @@ def test_period_of_the_model_is_that_of_the_simulated_robot(drive, factor):
             robot.friction_factor,
         )
         plant._state[5:] = chi
-        plant._limited[:] = told
+        plant._arrays.limited[:] = told
         plant.run(tuple(told), False, disturbance, 50)
         given = command if drive == 'torque' else told
         reached = np.array(model(chi, given, np.zeros(2))[0]).ravel()
