@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from t3mpc_ros.bag.mcap_file import (
     END_NS,
@@ -40,6 +40,7 @@ Array = NDArray[np.float64]
 SQLITE_SUFFIX, ROS1_SUFFIX = '.db3', '.bag'
 
 _STORAGES = {MCAP_SUFFIX: 'mcap', SQLITE_SUFFIX: 'sqlite3', ROS1_SUFFIX: 'ROS 1'}
+_COMPRESSION = re.compile(r'^\s*compression_format:\s*[\'"]?\w', re.MULTILINE)
 _STEP = re.compile(r'(\w+)\[(\d+)\]')
 
 
@@ -125,7 +126,7 @@ class BagReader:
         """Tables of text by title; the newest of each title."""
         for file in files:
             self.metadata_records |= file.metadata_records
-        self._decoder: AnyReader | None = None
+        self._decoders: dict[str, Callable[[bytes, str], Any]] = {}
 
     @property
     def duration(self) -> float:
@@ -175,16 +176,25 @@ class BagReader:
         DataError
             It cannot be decoded.
         """
+        type_name = self.topics[message.topic].type_name
         with read_errors(message.topic, DataError):
-            if self._decoder is None:
-                decoder = AnyReader(
-                    [file.path for file in self.files],
-                    default_typestore=get_typestore(Stores.ROS2_JAZZY),
-                )
-                decoder.open()
-                self._decoder = decoder
-            type_name = self.topics[message.topic].type_name
-            return self._decoder.deserialize(message.data, type_name)
+            if type_name not in self._decoders:
+                self._decoders[type_name] = self._make_decoder(type_name)
+            return self._decoders[type_name](message.data, type_name)
+
+    def _make_decoder(self, type_name: str) -> Callable[[bytes, str], Any]:
+        """Return the function that decodes messages of a type by its definition in the bag."""
+        definitions = [f.definition(type_name) for f in self.files if isinstance(f, McapFile)]
+        if text := next(filter(None, definitions), ''):
+            store: Any = get_typestore(Stores.EMPTY)
+            store.register(get_types_from_msg(text, type_name))
+            is_ros1 = False
+        else:
+            default = get_typestore(Stores.ROS2_JAZZY)
+            with AnyReader([f.path for f in self.files], default_typestore=default) as reader:
+                store, is_ros1 = reader.typestore, not reader.is2
+        decode: Callable[[bytes, str], Any] = store.deserialize_cdr
+        return store.deserialize_ros1 if is_ros1 else decode
 
     def series(self, topic: str, fields: Mapping[str, str]) -> dict[str, Array]:
         """Return one array for each of ``fields``, with times of receipt and stamps.
@@ -239,9 +249,6 @@ class BagReader:
 
     def close(self) -> None:
         """Close the files; idempotent."""
-        decoder, self._decoder = self._decoder, None
-        if decoder is not None:
-            decoder.close()
         for file in self.files:
             if isinstance(file, RosbagsFile):
                 file.close()
@@ -378,13 +385,11 @@ def missing_sample_ratio(stamps: Array, rate: float) -> float:
 
 def _is_compressed(folder: Path) -> bool:
     """Return whether rosbag2 compressed files or messages, according to ``metadata.yaml``."""
-    if not (folder / METADATA_FILE_NAME).is_file():
-        return False
     try:
-        with Reader(folder) as reader:
-            return bool(reader.compression_format)
-    except Exception:  # damaged or outdated: the files are read without it
+        text = (folder / METADATA_FILE_NAME).read_text(encoding='utf-8')
+    except (OSError, UnicodeDecodeError):
         return False
+    return _COMPRESSION.search(text) is not None
 
 
 def _topic_information(connection: Any) -> TopicInformation:

@@ -23,11 +23,13 @@ from support.ros_graph import (
 from visualization_msgs.msg import Marker
 
 from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.bag.topic_filter import TopicFilter
 from t3mpc_ros.bag.writer import BagWriter, DiskError
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.common.base_node import ERROR, OK
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.recorder.node import RecorderNode
+from t3mpc_ros.nodes.recorder.subscriptions import FULL_DISCOVERY, TopicDiscovery
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
 
 pytestmark = pytest.mark.ros
@@ -208,3 +210,31 @@ def test_parameters_are_recorded_by_namespace(harness, tmp_path):
         assert recording.metadata_records['controller']['law.gain'] == '3.0'
         assert recording.metadata_records['/b/controller']['law.gain'] == '4.0'
         assert recording.metadata_records['recorder']['storage.uri'] == str(tmp_path)
+
+
+def test_publishers_are_queried_when_their_number_changes_and_now_and_then():
+    """The query of all topics at each discovery took most of the time of the recorder."""
+
+    class Graph:
+        publishers, queries = 1, 0
+
+        def get_topic_names_and_types(self):
+            return [('/a', ['std_msgs/msg/String']), ('/other', ['std_msgs/msg/String'])]
+
+        def count_publishers(self, topic):
+            return self.publishers
+
+        def get_publishers_info_by_topic(self, topic):
+            self.queries += topic == '/a'
+            return []
+
+    graph = Graph()
+    discovery = TopicDiscovery(graph, TopicFilter(['/a']), None, None, None)
+    for _ in range(FULL_DISCOVERY - 2):
+        discovery.discover()
+    assert graph.queries == 1
+    graph.publishers = 2
+    discovery.discover()
+    assert graph.queries == 2
+    discovery.discover()
+    assert graph.queries == 3, 'another publisher may have taken the place of one'

@@ -187,7 +187,7 @@ def inputs_of(
     if f'{CONTROLLER}/journal' in by_name:
         for name, full in initial.items():
             by_name[name] = with_initial_inputs(by_name[name], columns[full])
-    reader = _Reader(bag, held, by_name, revisions, default, model, notes)
+    reader = _Reader(held, by_name, revisions, default, model, notes)
     lives, time_ns, commands = reader.lives()
     recorded = reader.answers(lives, commands)
     return ControllerInputs(
@@ -262,31 +262,29 @@ def _names() -> frozenset[str]:
     return frozenset(row.name for row in ControllerParameters.specs())
 
 
+@dataclass
 class _Reader:
     """Assembles the lives of the controller of one bag and reports losses."""
 
-    def __init__(
-        self,
-        bag: Path,
-        held: BagReader,
-        columns: Mapping[str, TopicColumns],
-        revisions: Sequence[Revision],
-        default: ControllerParameters | None,
-        model: Mapping[str, Array] | None,
-        notes: list[str],
-    ) -> None:
-        self._bag, self._held, self._columns, self._notes = bag, held, columns, notes
-        self._revisions, self._default = list(revisions), default
-        self._model = model
-        journal = columns.get(f'{CONTROLLER}/journal')
-        self.journalled = journal is not None and len(journal) > 0
-        self._published: Integers = np.zeros(0, dtype=np.int64)
+    held: BagReader
+    columns: Mapping[str, TopicColumns]
+    revisions: Sequence[Revision]
+    default: ControllerParameters | None
+    model: Mapping[str, Array] | None
+    notes: list[str]
+    published: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """Publication time of each row."""
+
+    @property
+    def journalled(self) -> bool:
+        """Whether the bag has a journal of the controller."""
+        return len(self.columns.get(f'{CONTROLLER}/journal', ())) > 0
 
     def lives(self) -> tuple[list[ControllerSession], Integers, Integers]:
         """Return the lives, the publication time of their rows, and the command of each row."""
         if not self.journalled:
             return self._one_life()
-        journal = self._columns[f'{CONTROLLER}/journal']
+        journal = self.columns[f'{CONTROLLER}/journal']
         # A previous life, kept by the latched publisher: in order of publication.
         order = np.argsort(journal.published_ns, kind='stable')
         rows, published = journal.integers[order], journal.published_ns[order]
@@ -296,12 +294,12 @@ class _Reader:
             published[fresh],
             journal.received_ns[order][fresh],
         )
-        self._published = published
+        self.published = published
         bounds = [0, *(np.flatnonzero(np.diff(rows[:, 0]) < 0) + 1).tolist(), len(rows)]
         lives = []
         for first, last in zip(bounds, bounds[1:], strict=False):
             lives.append(self._life(rows[first:last], received[first:last], first))
-        commands = self._columns[COMMAND]
+        commands = self.columns[COMMAND]
         return lives, published, commands_of(rows, published, commands.published_ns)
 
     def answers(self, lives: Sequence[ControllerSession], commands: Integers) -> dict[str, Array]:
@@ -310,18 +308,18 @@ class _Reader:
         recorded = {name: np.full(len(events), np.nan) for name in FIELDS}
         there = commands >= 0
         for i, name in enumerate(SPEEDS):
-            recorded[name][there] = self._columns[COMMAND].numbers[commands[there], i]
+            recorded[name][there] = self.columns[COMMAND].numbers[commands[there], i]
         steps = events == Event.STEP
         for name in NUMBERS:
-            column = self._columns.get(f'{CONTROLLER}/{name}')
+            column = self.columns.get(f'{CONTROLLER}/{name}')
             if column is None or not len(column):
                 continue
-            rows = rows_of(self._published, column.published_ns, steps)
+            rows = rows_of(self.published, column.published_ns, steps)
             recorded[name][rows[rows >= 0]] = column.numbers[rows >= 0, 0]
         without = np.flatnonzero(np.isin(events, COMMAND_EVENTS) & ~there)
         if without.size:
-            span = (self._published[without[[0, -1]]] - self._held.start_ns) / NANOSECONDS
-            self._notes.append(
+            span = (self.published[without[[0, -1]]] - self.held.start_ns) / NANOSECONDS
+            self.notes.append(
                 f'{without.size} commands of the controller, from {span[0]:.3f} s to '
                 f'{span[1]:.3f} s, are not in the bag and not compared'
             )
@@ -329,13 +327,13 @@ class _Reader:
 
     def _one_life(self) -> tuple[list[ControllerSession], Integers, Integers]:
         """Return the single life that is visible without a journal."""
-        odometry, commands = self._columns[ODOMETRY], self._columns[COMMAND]
+        odometry, commands = self.columns[ODOMETRY], self.columns[COMMAND]
         taken, found = by_receipt(
-            odometry.received_ns, self._columns[REFERENCE].received_ns, commands.received_ns
+            odometry.received_ns, self.columns[REFERENCE].received_ns, commands.received_ns
         )
         if not found.size:
-            raise ReplayError(f'{self._bag}: no command follows an odometry message')
-        self._notes.append(
+            raise ReplayError(f'{self.held.folder}: no command follows an odometry message')
+        self.notes.append(
             'the bag has no journal of the controller: the order in which messages were received '
             'replaces the order of processing'
         )
@@ -344,12 +342,12 @@ class _Reader:
         rows[:, 2] = odometry.stamps_ns[taken.odometry]
         received = odometry.received_ns[taken.odometry]
         # Scalars are published right after the command of their step.
-        self._published = np.where(found >= 0, commands.published_ns[found], received)
+        self.published = np.where(found >= 0, commands.published_ns[found], received)
         life = self._made(rows, taken, np.zeros(found.size, dtype=np.bool_), 0, received)
         return [life], received, found
 
     def _life(self, rows: Integers, received: Integers, first: int) -> ControllerSession:
-        taken = match(rows, self._columns[ODOMETRY].stamps_ns, self._columns[REFERENCE].stamps_ns)
+        taken = match(rows, self.columns[ODOMETRY].stamps_ns, self.columns[REFERENCE].stamps_ns)
         for count, what in (
             (int(rows[0, 0]), 'events of the controller were before the recording'),
             (taken.lost_events, 'events are missing in the journal of the controller'),
@@ -357,7 +355,7 @@ class _Reader:
             (taken.lost_references, 'references that the controller had are not in the bag'),
         ):
             if count:
-                self._notes.append(f'{count} {what}')
+                self.notes.append(f'{count} {what}')
         exact = np.zeros(len(rows), dtype=np.bool_)
         sound = rows[0, 0] == 0
         marks = np.flatnonzero(taken.broken | taken.restarts).tolist()
@@ -376,12 +374,12 @@ class _Reader:
         parameters, start = self._parameters_of(rows, received)
         if start not in parameters:
             start = min(parameters)
-            self._notes.append('the settings at the start are not in the bag, later ones are used')
+            self.notes.append('the settings at the start are not in the bag, later ones are used')
             exact[:] = False
         known = np.isin(rows[:, 4], list(parameters))
         unknown = (rows[:, 1] == Event.CONFIGURE) & ~known
         if unknown.any():
-            self._notes.append(
+            self.notes.append(
                 f'{np.count_nonzero(unknown)} changes of settings are not in the bag'
             )
             exact[np.flatnonzero(unknown)[0] :] = False
@@ -394,14 +392,14 @@ class _Reader:
         self, rows: Integers, received: Integers
     ) -> tuple[dict[int, ControllerParameters], int]:
         """Return the parameters of one life by revision, and its initial revision."""
-        if self._default is not None:
-            return {0: self._default}, 0
+        if self.default is not None:
+            return {0: self.default}, 0
         # The initial parameters are published before the first event.
-        starts = [i for i, entry in enumerate(self._revisions) if entry[1] == 0]
-        before = [i for i in starts if self._revisions[i][0] <= received[-1]]
+        starts = [i for i, entry in enumerate(self.revisions) if entry[1] == 0]
+        before = [i for i in starts if self.revisions[i][0] <= received[-1]]
         begin = before[-1] if before else 0
         later = [i for i in starts if i > begin]
-        own = self._revisions[begin : later[0] if later else len(self._revisions)]
+        own = self.revisions[begin : later[0] if later else len(self.revisions)]
         found = {revision: _parameters(values) for _, revision, values in own}
         changes = rows[rows[:, 1] == Event.CONFIGURE, 4]
         start = 0
@@ -411,22 +409,22 @@ class _Reader:
 
     def _model_name(self) -> str:
         """Return the path of the model file, as far as it is recorded."""
-        if self._revisions:
-            return str(self._revisions[0][2].get('model', ''))
+        if self.revisions:
+            return str(self.revisions[0][2].get('model', ''))
         tables = (
-            table for title, table in self._held.metadata_records.items() if CONTROLLER in title
+            table for title, table in self.held.metadata_records.items() if CONTROLLER in title
         )
         return next((table['model'] for table in tables if 'model' in table), '')
 
     def _model_of(self, rows: Integers) -> Mapping[str, Array] | None:
         """Return the initial model; None without one, or where it is lost."""
-        if self._model is not None:
-            return self._model
+        if self.model is not None:
+            return self.model
         wanted = rows[rows[:, 1] == Event.MODEL, 4]
         name = self._model_name()
         if not wanted.size and (self.journalled or not name):
             return None
-        kept = [item.data for item in self._held.attachments().values()]
+        kept = [item.data for item in self.held.attachments().values()]
         if name and Path(name).is_file():
             kept.append(Path(name).read_bytes())
         for content in kept:
@@ -435,7 +433,7 @@ class _Reader:
                     file.write(content)
                     file.flush()
                     return load_model(Path(file.name))
-        self._notes.append(
+        self.notes.append(
             f'the model {name or "file"} that the controller began with is not in the bag: '
             'give it by --model'
         )
