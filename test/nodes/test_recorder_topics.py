@@ -212,7 +212,7 @@ def test_parameters_are_recorded_by_namespace(harness, tmp_path):
         assert recording.metadata_records['recorder']['storage.uri'] == str(tmp_path)
 
 
-def test_publishers_are_queried_when_their_number_changes_and_now_and_then():
+def test_publishers_are_queried_when_their_number_changes():
     """The query of all topics at each discovery took most of the time of the recorder."""
 
     class Graph:
