@@ -15,6 +15,7 @@ from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
 from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.bag.recording.recording_parameters import RecordingParameters
 from t3mpc_ros.bag.run.journal import Event
 from t3mpc_ros.bag.run.model_file import save_model
 from t3mpc_ros.control.controller import Controller, ControllerParameters
@@ -61,7 +62,12 @@ def live_run(processes, bag, model):
     learnt = Controller(ControllerParameters()).law.get_weights()
     learnt['fuzzy.coefficients'] += 0.25
     save_model(model, learnt, {})
-    parameters = {'recorder': {'storage.uri': str(bag)}, 'controller': {'model': str(model)}}
+    # Scalars are not recorded by default.
+    topics = [*RecordingParameters().topics, 'controller/*']
+    parameters = {
+        'recorder': {'storage.uri': str(bag), 'record.topics': topics},
+        'controller': {'model': str(model)},
+    }
     for name in LOOP:
         processes.start(name, parameters=parameters.get(name))
         processes.wait_ready(name)
