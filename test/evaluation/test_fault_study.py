@@ -9,6 +9,7 @@ import re
 
 import numpy as np
 import pytest
+from support.long_tests import few_of
 
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.evaluation import fault_study as fault_runs
@@ -139,7 +140,7 @@ EXPECTED = {
 }
 
 
-@pytest.mark.parametrize('name', EXPECTED)
+@pytest.mark.parametrize('name', few_of(EXPECTED, 4))
 def test_the_loop_stays_bounded_or_stops_with_a_reason(name):
     """One strength of each fault, and the page says of it what comes out here."""
     result = run_fault(fault_run('chaotic', name))

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.long_tests import few_of
 
 from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.evaluation.closed_loop import MethodSpec, run
@@ -84,7 +85,7 @@ PARTS = {
 
 
 @pytest.mark.parametrize('drive', ['torque', 'velocity'])
-@pytest.mark.parametrize('part', PARTS)
+@pytest.mark.parametrize('part', few_of(PARTS))
 def test_leaving_out_a_part_costs_accuracy_on_the_same_seeds(part, drive):
     more = paired(_errors(drive, 0.0, **PARTS[part]), _errors(drive, 0.0))
     assert more.mean > 0.0

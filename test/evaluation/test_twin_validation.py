@@ -38,6 +38,7 @@ def check_a_fifth(members, at_least):
     assert rms([item.fused for item in members]) <= steps / 5.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('slip', GRIPS, ids=lambda slip: slip.name)
 def test_gyro_cuts_square_drift_to_a_fifth_at_any_slip(slipped, slip):
     chosen = [item for item in slipped if item.course in SQUARES and item.slip == slip.name]
@@ -45,6 +46,7 @@ def test_gyro_cuts_square_drift_to_a_fifth_at_any_slip(slipped, slip):
     check_a_fifth(chosen, math.radians(10.0))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('course', SQUARES)
 def test_gyro_cuts_square_drift_to_a_fifth_both_ways(slipped, course):
     chosen = [item for item in slipped if item.course == course]
@@ -55,6 +57,7 @@ def test_gyro_cuts_square_drift_to_a_fifth_both_ways(slipped, course):
     assert all(item.holds for item in strong)
 
 
+@pytest.mark.long
 def test_the_gyro_leaves_a_fifth_of_the_drift_of_ten_turns(slipped):
     chosen = [item for item in slipped if item.course == '10 turns']
     check_a_fifth(chosen, math.radians(60.0))
@@ -64,6 +67,7 @@ def test_the_gyro_leaves_a_fifth_of_the_drift_of_ten_turns(slipped):
     assert all(item.holds for item in strong)
 
 
+@pytest.mark.long
 def test_gyro_drift_stays_within_its_own_error_bound(slipped):
     """Scale and bias bound it, so a fifth is certain once steps drift by five times as much."""
     for item in slipped:

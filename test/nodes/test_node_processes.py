@@ -115,7 +115,7 @@ def test_the_loop_runs_at_100_hz_in_four_processes(run):
         assert np.ptp(odometry['v'][compared]) > 0.02
         parameters = recording.metadata_records
         assert parameters['provenance']['version']
-        assert float(parameters['controller']['law.gain']) > 0.0
+        assert float(parameters['controller']['rate']) == 100.0
         assert float(parameters['sim_robot']['rate']) == 100.0
         assert int(parameters['reference_generator']['seed']) >= 0
     # The last command is the stop of the controller's shutdown; the robot moved before.

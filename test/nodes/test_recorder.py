@@ -303,7 +303,7 @@ def test_a_stop_of_the_controller_starts_a_snapshot(harness, tmp_path):
     harness.remove(recorder)
     with open_bag(snapshots(tmp_path)[0]) as recording:
         assert recording.metadata_records['snapshot']['reason'] == f'controller: {stopped}'
-        assert float(recording.metadata_records['controller']['law.gain']) > 0.0
+        assert float(recording.metadata_records['controller']['rate']) == 100.0
         assert '/controller/error/left' in recording.topics
 
 
