@@ -19,7 +19,8 @@ DEFAULT = ('geometry', 'parameters', 'robot', 'fuzzy', 'test_launch_files.py')
 MAX_WAIT = 0.3
 """Largest share of the time with work to do that the nodes of a test may wait for a processor."""
 WAIT = pytest.StashKey[ProcessorWait]()
-INCONCLUSIVE = pytest.StashKey[list]()
+INCONCLUSIVE = 'inconclusive'
+"""Title of the section of a report that holds the failure."""
 
 
 def pytest_addoption(parser):
@@ -44,10 +45,9 @@ def _is_default(config):
 
 def pytest_ignore_collect(collection_path, config):
     """Import the files of the default set only: the import of all others takes as long as it."""
-    parts = {*collection_path.relative_to(ROOT).parts}
-    return (
-        collection_path.suffix == '.py' and _is_default(config) and not parts & {*DEFAULT} or None
-    )
+    if not _is_default(config) or collection_path.suffix != '.py':
+        return None
+    return not {*collection_path.relative_to(ROOT).parts} & {*DEFAULT} or None
 
 
 @pytest.hookimpl(trylast=True)
@@ -76,15 +76,18 @@ def pytest_runtest_makereport(item):
     report = yield
     share = item.stash[WAIT].share() if report.failed and item.get_closest_marker('ros') else 0.0
     if share > MAX_WAIT:
-        text = f'{item.nodeid}: its nodes waited for a processor for {share:.0%} of their time'
-        item.config.stash.setdefault(INCONCLUSIVE, []).append(f'{text}\n{report.longreprtext}')
+        text = f'its nodes waited for a processor for {share:.0%} of their time'
+        failure = f'{item.nodeid}: {text}\n{report.longreprtext}'
+        # Worker processes send reports, and nothing else, to the process that writes the summary.
+        report.sections.append((INCONCLUSIVE, failure))
         report.outcome, report.longrepr = 'skipped', (str(item.path), 0, f'inconclusive: {text}')
     return report
 
 
-def pytest_terminal_summary(terminalreporter, config):
+def pytest_terminal_summary(terminalreporter):
     """List what was inconclusive."""
-    if texts := config.stash.get(INCONCLUSIVE, []):
+    skipped = terminalreporter.stats.get('skipped', [])
+    if texts := [text for report in skipped for _, text in report.get_sections(INCONCLUSIVE)]:
         terminalreporter.section('inconclusive: the machine is too busy; repeat when it is not')
         terminalreporter.write_line('\n\n'.join(texts))
 

@@ -3,6 +3,7 @@
 """The measure by which a failure on an overloaded machine is called inconclusive."""
 
 import os
+from pathlib import Path
 import subprocess
 import sys
 import time
@@ -10,6 +11,24 @@ import time
 import pytest
 from support.processor_wait import ProcessorWait, descendants
 
+TESTS = Path(__file__).resolve().parent
+STARVED = """
+import time
+import pytest
+
+def fail_slowly():
+    end = time.monotonic() + 1.0
+    while time.monotonic() < end:
+        pass
+    raise RuntimeError('the story of the failure')
+
+@pytest.mark.ros
+def test_with_nodes():
+    fail_slowly()
+
+def test_without_nodes():
+    fail_slowly()
+"""
 BUSY = 'import time\nwhile True: time.monotonic()'
 
 
@@ -31,6 +50,26 @@ def test_processes_that_share_a_processor_wait_for_it(busy):
         pass
     assert busy <= {*descendants(os.getpid())}
     assert 0.3 < wait.share() < 1.0
+
+
+@pytest.mark.parametrize('workers', [0, 1])
+def test_only_a_failure_of_nodes_is_inconclusive(busy, workers, tmp_path):
+    """With worker processes nothing was listed at the end: the failure was a mere skip."""
+    path = tmp_path / 'test_starved.py'
+    path.write_text(STARVED)
+    words = ['-c', TESTS.parent / 'pyproject.toml', '-p', 'conftest', '-n', workers, path]
+    done = subprocess.run(
+        [sys.executable, '-m', 'pytest', *map(str, words)],
+        cwd=tmp_path,
+        env=os.environ | {'PYTHONPATH': f'{TESTS}{os.pathsep}{TESTS.parent}'},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 1
+    assert '1 failed, 1 skipped' in done.stdout
+    listed = done.stdout.partition('inconclusive: the machine is too busy')[2]
+    assert '::test_with_nodes: its nodes waited for a processor' in listed
+    assert 'the story of the failure' in listed
 
 
 def test_what_sleeps_does_not_wait():
