@@ -26,6 +26,7 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import (
     NominalModel,
     Observation,
 )
+from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.scenario import (
     DRIVES,
     PRETRAINING_DURATION,
@@ -222,7 +223,7 @@ class LoopRecord:
         ValueError
             Nothing is left to be counted.
         """
-        return float(np.sqrt(np.mean(self.error[self._counted(after, cut)] ** 2)))
+        return rms(self.error[self._counted(after, cut)])
 
     def largest_error(self, after: float = 3.0, *, cut: float = 0.0) -> float:
         """Return the largest tracking error of a wheel, rad/s; arguments as :meth:`rmse`."""

@@ -17,6 +17,7 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import (
     NominalModel,
     Observation,
 )
+from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.parameters.table import Parameters, parameter
 
@@ -140,6 +141,6 @@ def random_output_weights(weights: Mapping[str, Array], seed: int) -> dict[str, 
     generator = np.random.default_rng((seed, 7))
     drawn = dict(weights)
     for name in ('output_weights', 'anchor'):
-        size = float(np.sqrt(np.mean(weights[name] ** 2)))
+        size = rms(weights[name])
         drawn[name] = generator.normal(scale=size, size=weights[name].shape)
     return drawn

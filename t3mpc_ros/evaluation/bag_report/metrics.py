@@ -16,6 +16,7 @@ from t3mpc_ros.evaluation.bag_report.response import ResponseFit, responses
 from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series
 from t3mpc_ros.evaluation.bag_report.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict, judge
+from t3mpc_ros.evaluation.confidence_intervals import rms
 
 Array = NDArray[np.float64]
 
@@ -47,7 +48,7 @@ def statistics(error: Array, period: float = math.nan) -> ErrorStatistics:
     if not size.size:
         return ErrorStatistics(math.nan, math.nan, math.nan, 0, 0.0)
     return ErrorStatistics(
-        float(np.sqrt(np.mean(size**2))),
+        rms(size),
         float(size.mean()),
         float(size.max()),
         int(size.size),

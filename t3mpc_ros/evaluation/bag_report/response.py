@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from t3mpc_ros.evaluation.bag_report.continuity import parts
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
 from t3mpc_ros.evaluation.bag_report.topic_roles import COMMAND
+from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.kernels import kernel
 
 Array = NDArray[np.float64]
@@ -206,7 +207,7 @@ def roughness(series: Series, name: str, held: bool = False) -> Roughness:
     for each in (rate, bend):
         size = np.abs(each[np.isfinite(each)])
         if size.size:
-            numbers += [float(np.sqrt(np.mean(size**2))), float(np.percentile(size, 99.0))]
+            numbers += [rms(size), float(np.percentile(size, 99.0))]
         else:
             numbers += [math.nan, math.nan]
     return Roughness(*numbers)

@@ -8,6 +8,7 @@ import numpy as np
 
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
 from t3mpc_ros.evaluation.bag_report.topic_roles import COMMAND, ODOMETRY, REFERENCE
+from t3mpc_ros.evaluation.confidence_intervals import rms
 
 MAX_STOPPED = 0.01
 """Largest share of the drive without a command to move."""
@@ -84,7 +85,7 @@ def judge(
         problems.append(f'{100.0 * missing:.1f} % of {ODOMETRY} is missing')
     if counted < MIN_COUNTED * length:
         problems.append(f'only {counted:.1f} of {length:.1f} s count')
-    size = max(float(np.sqrt(np.mean(reference[each.name] ** 2))) for each in run.channels)
+    size = max(rms(reference[each.name]) for each in run.channels)
     if not np.isfinite(rmse):
         problems.append('no settled motion was measured')
     elif rmse > MAX_ERROR * size:

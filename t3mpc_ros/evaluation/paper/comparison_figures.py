@@ -10,6 +10,7 @@ from typing import Any
 from matplotlib.ticker import MaxNLocator
 import numpy as np
 
+from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.paper.experiment_grid import (
     FULL,
     NOMINAL,
@@ -238,7 +239,7 @@ def estimation_portraits(showcase: FigureRuns) -> Any:
     true = showcase.driven
     palette = (OURS, COLOURS['estimate'], COLOURS['feedforward'])
     for axis, (kind, found), colour in zip(axes.flat, shown.items(), palette, strict=False):
-        miss = float(np.sqrt(np.mean((found - true) ** 2)))
+        miss = rms(found - true)
         axis.plot(found[:, 1], found[:, 0], color=colour, linewidth=0.7, label='estimated')
         axis.plot(true[:, 1], true[:, 0], color=REFERENCE_COLOUR, linewidth=0.8, label='true')
         axis.set_title(f'{KIND_NAMES.get(kind, kind)}\nRMSE {miss:.3f} rad/s')
