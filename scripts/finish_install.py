@@ -3,11 +3,17 @@
 """Finish the installation of t3mpc_ros into the environment of this Python."""
 
 from collections import defaultdict
+import contextlib
 from hashlib import sha256
 from importlib.metadata import distribution
 from pathlib import Path
 import shutil
 import sys
+
+import setuptools  # noqa: F401
+
+# Brought by setuptools: Python 3.12 has none of its own.
+from distutils.core import run_setup  # isort: skip
 
 LARGE = 500_000
 """Size from which equal files are linked, bytes."""
@@ -20,6 +26,19 @@ def move_executables(environment: Path) -> None:
     folder.mkdir()
     for entry in distribution('t3mpc_ros').entry_points.select(group='console_scripts'):
         (environment / 'bin' / entry.name).rename(folder / entry.name)
+
+
+def link_data_files(environment: Path, source: Path) -> None:
+    """Link the data files of setup.py, which an editable installation leaves out."""
+    shutil.rmtree(environment / 'share' / 't3mpc_ros', ignore_errors=True)
+    with contextlib.chdir(source):  # its paths are relative
+        data_files = run_setup('setup.py', stop_after='init').data_files
+    for folder, files in data_files:
+        (environment / folder).mkdir(parents=True, exist_ok=True)
+        for file in map(Path, files):
+            link = environment / folder / file.name
+            link.unlink(missing_ok=True)
+            link.symlink_to(source / file)
 
 
 def link_copies(environment: Path) -> None:
@@ -39,4 +58,5 @@ def link_copies(environment: Path) -> None:
 
 if __name__ == '__main__':
     move_executables(Path(sys.prefix))
+    link_data_files(Path(sys.prefix), Path(__file__).resolve().parent.parent)
     link_copies(Path(sys.prefix))

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.ros
 ROOT = Path(__file__).resolve().parent.parent
 EXECUTABLES = set(re.findall(r"f'(\w+) = \{NAME\}", (ROOT / 'setup.py').read_text()))
 # Variables of the user's ROS, workspace and pip, removed for the tests.
-FOREIGN = ('PYTHONPATH', 'AMENT_PREFIX_PATH', 'COLCON_', 'PIP_', 'T3MPC_')
+FOREIGN = ('PYTHONPATH', 'AMENT_PREFIX_PATH', 'COLCON_', 'PIP_', 'UV_', 'T3MPC_')
 
 
 def clean_environment(**extra):
@@ -659,7 +659,7 @@ def test_the_installer_is_uv_and_without_it_pip(checkout):
     assert not (checkout.root / '.venv' / 'uv').exists()
 
 
-def test_executables_are_moved_and_copies_of_libraries_linked(tmp_path, monkeypatch):
+def test_executables_are_moved_and_files_linked(tmp_path, monkeypatch):
     finish = runpy.run_path(str(ROOT / 'scripts' / 'finish_install.py'))
     bin_folder, target = tmp_path / 'bin', tmp_path / 'lib' / 't3mpc_ros'
     for folder in (bin_folder, target):
@@ -670,6 +670,13 @@ def test_executables_are_moved_and_copies_of_libraries_linked(tmp_path, monkeypa
     finish['move_executables'](tmp_path)
     assert {path.name for path in target.iterdir()} == EXECUTABLES
     assert [path.name for path in bin_folder.iterdir()] == ['python']
+
+    finish['link_data_files'](tmp_path, ROOT)
+    share = tmp_path / 'share'
+    assert (share / 'ament_index/resource_index/packages/t3mpc_ros').exists()
+    for name in ('launch', 'config'):
+        names = {path.name for path in (ROOT / name).iterdir() if path.is_file()}
+        assert {path.name for path in (share / 't3mpc_ros' / name).iterdir()} == names
 
     size = finish['LARGE']
     contents = {'a.so': b'1' * size, 'a.so.2': b'1' * size, 'b.so': b'2' * size, 'c.so': b'1'}

@@ -62,16 +62,15 @@ class PrivateGraph:
         Fast DDS uses UDP on loopback only: its shared memory may block a publisher for a third of
         a second when a subscriber joins (Fast-DDS issue 6535).
         """
-        profile = installed_file(_LOOPBACK_PROFILE)
         environment = {k: v for k, v in os.environ.items() if k not in _NETWORK_VARIABLES}
         environment.setdefault('RCUTILS_COLORIZED_OUTPUT', '0')
         environment['ROS_DOMAIN_ID'] = str(self.domain)
         environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
         environment.pop('FASTRTPS_DEFAULT_PROFILES_FILE', None)
-        is_fast = 'fastrtps' in environment.get('RMW_IMPLEMENTATION', 'rmw_fastrtps_cpp')
-        if profile is not None and is_fast:
+        if 'fastrtps' in environment.get('RMW_IMPLEMENTATION', 'rmw_fastrtps_cpp'):
             environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'SYSTEM_DEFAULT'
-            environment['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(profile)
+            profile = str(installed_file(_LOOPBACK_PROFILE))
+            environment['FASTRTPS_DEFAULT_PROFILES_FILE'] = profile
         return environment
 
     def close(self) -> None:

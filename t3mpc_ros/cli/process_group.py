@@ -34,14 +34,7 @@ def executable(name: str) -> Path:
     ProcessError
         It is not installed; the text gives the remedy.
     """
-    path = installed_file(Path('lib') / 't3mpc_ros' / name)
-    if path is None or not os.access(path, os.X_OK):
-        raise ProcessError(
-            f'the executable {name} is not installed below any of '
-            f'{", ".join(map(str, _prefixes()))}; run it through scripts/run, or build the '
-            'workspace and source its setup file'
-        )
-    return path
+    return installed_file(Path('lib') / 't3mpc_ros' / name)
 
 
 def _prefixes() -> list[Path]:
@@ -50,9 +43,21 @@ def _prefixes() -> list[Path]:
     return [Path(prefix) for prefix in dict.fromkeys(found) if prefix]
 
 
-def installed_file(path: Path) -> Path | None:
-    """Return the installed file of a path relative to the prefix, None without one."""
-    return next((prefix / path for prefix in _prefixes() if (prefix / path).exists()), None)
+def installed_file(path: Path) -> Path:
+    """Return the installed file of a path relative to the prefix.
+
+    Raises
+    ------
+    ProcessError
+        It is not installed; the text gives the remedy.
+    """
+    for prefix in _prefixes():
+        if (prefix / path).exists():
+            return prefix / path
+    raise ProcessError(
+        f'{path} is not installed below any of {", ".join(map(str, _prefixes()))}; run the '
+        'command through scripts/run, or build the workspace and source its setup file'
+    )
 
 
 _LIBC = ctypes.CDLL(None)
