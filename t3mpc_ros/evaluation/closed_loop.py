@@ -6,7 +6,6 @@ Worker processes import the main module again: a script that uses more than one 
 work by ``if __name__ == '__main__':``.
 """
 
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import nullcontext
@@ -27,126 +26,23 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import (
     Observation,
 )
 from t3mpc_ros.evaluation.confidence_intervals import rms
+from t3mpc_ros.evaluation.link_faults import PeriodicLinks
 from t3mpc_ros.evaluation.scenario import (
     DRIVES,
     PRETRAINING_DURATION,
     PRETRAINING_NOISE,
     PRETRAINING_SEEDS,
     RATE,
-    LinkFaults,
     SampledReference,
     Scenario,
     settled_rows,
     switch_times,
 )
-from t3mpc_ros.parameters.table import ParameterError, Parameters
-from t3mpc_ros.simulation.plant.disturbances import Disturbance, SpeedNoise, make_generators
+from t3mpc_ros.parameters.table import Parameters
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
-from t3mpc_ros.simulation.plant.paper_plant import PaperPlant, PaperRobotParameters
+from t3mpc_ros.simulation.plant.paper_plant import DisturbedPlant
 
 Array = NDArray[np.float64]
-
-DRAWN = ('noise.variance', 'disturbance.walk_rate')
-"""Dynamic parameters that are fixed here, because they scale random numbers drawn in advance."""
-
-
-class FastPlant:
-    """The physics of :class:`~t3mpc_ros.robot.simulated.PaperRobot`, bit for bit.
-
-    It has the same plant, the same random numbers and the same time grid from 0 s on. What is
-    left out: the command limiter, so commands must be within its limits; odometry; reports.
-
-    Parameters
-    ----------
-    parameters
-        The robot, its drive of either kind.
-    steps
-        How many control periods it will run at most: the random numbers of all are drawn now.
-
-    Raises
-    ------
-    ValueError
-        Fewer than one step.
-    """
-
-    def __init__(self, parameters: PaperRobotParameters, steps: int) -> None:
-        if steps < 1:
-            raise ValueError(f'steps must be at least 1: got {steps}')
-        for_disturbance, for_noise = make_generators(parameters.seed)
-        self._parameters = parameters
-        self._substeps = parameters.substeps
-        self._plant = PaperPlant(parameters.drive, parameters.step)
-        self._disturbance = Disturbance(parameters.disturbance, for_disturbance)
-        self._disturbance.draw(0.0)  # as the robot does when its grid starts
-        first = self._disturbance.walk.copy()
-        later = self._disturbance.draw_ahead(self._substeps * self._plant.step, steps - 1)
-        self._walks: Array = np.vstack([first, later])
-        self._noise = SpeedNoise(parameters.noise, for_noise).draw_ahead(steps + 1)
-        self._steps = steps
-        self.steps_done = 0
-        """Control periods run so far."""
-        self.speeds: Array = np.zeros(2)
-        """True chi, rad/s, right wheel first, shape (2,); overwritten by each step."""
-        self.measured: Array = self._noise[0].copy()
-        """chi with its noise, rad/s, shape (2,); overwritten by each step."""
-        self._load()
-
-    @property
-    def plant(self) -> PaperPlant:
-        """Pose, wheel angles and wheel speeds, for who needs more than :attr:`speeds`."""
-        return self._plant
-
-    def configure(self, parameters: PaperRobotParameters) -> None:
-        """Change parameters from the next period on, for example to a heavier load.
-
-        Raises
-        ------
-        ParameterError
-            A parameter differs that is fixed: those of the robot, and :data:`DRAWN`.
-        """
-        before, after = self._parameters.to_dict(), parameters.to_dict()
-        for row in PaperRobotParameters.specs():
-            fixed = not row.dynamic or row.name in DRAWN
-            if fixed and before[row.name] != after[row.name]:
-                raise ParameterError(
-                    f'{row.name} is fixed while the plant runs '
-                    f'(it is {before[row.name]}): got {after[row.name]}'
-                )
-        self._parameters = parameters
-        self._load()
-
-    def step(self, right: float, left: float) -> None:
-        """Run one control period under one command, and measure at its end.
-
-        Parameters
-        ----------
-        right, left
-            Torques (N m) with a torque drive, wheel speeds (rad/s) with a velocity drive.
-
-        Raises
-        ------
-        ValueError
-            There are no random numbers left.
-        """
-        done = self.steps_done
-        if done == self._steps:
-            raise ValueError(f'steps must be at least {done + 1} to go on: got {self._steps}')
-        self._disturbance.walk[:] = self._walks[done]
-        self._plant.run((right, left), False, self._disturbance, self._substeps)
-        self.speeds[0], self.speeds[1] = self._plant.wheels
-        self.steps_done = done + 1
-        np.add(self.speeds, self._noise[done + 1], out=self.measured)
-
-    def _load(self) -> None:
-        parameters = self._parameters
-        self._disturbance.parameters = parameters.disturbance
-        self._plant.load(
-            parameters.drive,
-            (parameters.body, parameters.true_body),
-            parameters.geometry,
-            parameters.friction,
-            parameters.friction_factor,
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -360,8 +256,10 @@ def run(
     nominal_model = scenario.nominal_model()
     controller = method(nominal_model)
     seam = drive_for(scenario) if drive is None else drive
-    plant = FastPlant(scenario.robot(), scenario.steps)
-    seam.reset(plant.measured)
+    robot = scenario.robot()
+    plant = DisturbedPlant(robot)
+    measured_now = np.array(plant.measure(0.0))
+    seam.reset(measured_now)
     changed_robot, change_step = scenario.changed_robot(), scenario.change_step
     inertia = wheel_inertia(nominal_model.robot.body, nominal_model.robot.geometry)
     torque_drive = scenario.drive == 'torque'
@@ -378,17 +276,16 @@ def run(
     has_terms = isinstance(terms, np.ndarray) and terms.shape == record.terms.shape[1:]
 
     last: Array = np.zeros(2)
-    links = _Links(scenario) if scenario.links != LinkFaults() else None
+    links = PeriodicLinks(scenario.links, scenario.seed, scenario.steps, RATE)
     for k in range(scenario.steps):
         if k == change_step and changed_robot is not None:
             plant.configure(changed_robot)
-        record.measured[k] = plant.measured
-        record.speeds[k] = plant.speeds
+        record.measured[k] = measured_now
+        record.speeds[k] = plant.plant.wheels
         if k > 0:  # unless a measurement arrives, all that it decides stays as it is
             for kept in (record.command, record.sent, record.limited):
                 kept[k] = kept[k - 1]
-        arrived = ((k, plant.measured),) if links is None else links.measured(k, plant.measured)
-        for j, measured in arrived:
+        for j, measured in links.measured(k, measured_now):
             asked = loop.step(j, measured)
             if k == 0 and not (isinstance(asked, np.ndarray) and asked.shape == (2,)):
                 what = f'shape {asked.shape}' if isinstance(asked, np.ndarray) else repr(asked)
@@ -416,8 +313,7 @@ def run(
                 np.dot(inertia, command, out=sent)
             else:
                 sent[:] = seam.command
-            if links is not None:
-                links.send(k, j, sent)
+            links.send(k, j, sent)
         record.estimated[k] = seam.speeds
         record.unexplained[k] = seam.disturbance
         if torque_drive:
@@ -425,67 +321,10 @@ def run(
         else:
             record.effort[k] = (record.sent[k] - last) / period
             last[:] = record.sent[k]
-        right, left = (record.sent[k] if links is None else links.command(k)).tolist()
-        plant.step(right, left)
+        right, left = links.command(k).tolist()
+        plant.run((right, left), robot.substeps)
+        measured_now = np.array(plant.measure(robot.substeps * robot.step))
     return record
-
-
-class _Links:
-    """Links with faults between plant and controller, in whole periods."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        faults = self._faults = scenario.links
-        begin = round(faults.begin * scenario.steps)
-        end = min(begin + faults.lasting * RATE, scenario.steps)
-        period = np.arange(scenario.steps)
-        self._active: NDArray[np.bool_] = (period >= begin) & (period < end)
-        # The same numbers for every method, whatever it sends.
-        self._drawn: Array = np.random.default_rng((scenario.seed, 4)).random((scenario.steps, 4))
-        self._measurements: deque[tuple[int, int, Array]] = deque()
-        self._latest = 0
-        self._commands: list[tuple[int, int, Array]] = []
-        self._newest = -1
-        self._command: Array = np.zeros(2)
-
-    def measured(self, k: int, measured: Array) -> Iterator[tuple[int, Array]]:
-        """Send the measurement of period k; yield those that arrive in it, with their periods."""
-        lost, late = self._drawn[k, :2].tolist()
-        faults, delay = self._faults, 0
-        if self._active[k]:
-            delay = _periods(faults.odometry_delay, late)
-        if not self._active[k] or lost >= faults.odometry_loss:
-            self._latest = max(self._latest, k + delay)
-            self._measurements.append((self._latest, k, measured.copy()))
-        while self._measurements and self._measurements[0][0] <= k:
-            _, j, arrived = self._measurements.popleft()
-            yield j, arrived
-
-    def send(self, k: int, j: int, command: Array) -> None:
-        """Send in period k the command that follows from the measurement of period j."""
-        lost, late = self._drawn[j, 2:].tolist()
-        faults, delay = self._faults, 0
-        if self._active[k]:
-            if lost < faults.command_loss:
-                return
-            delay = _periods(faults.command_delay, late)
-        self._commands.append((k + delay, j, command.copy()))
-
-    def command(self, k: int) -> Array:
-        """Return the command that has arrived by period k, of the newest measurement."""
-        waiting = []
-        for arrival, j, command in self._commands:
-            if arrival > k:
-                waiting.append((arrival, j, command))
-            elif j > self._newest:
-                self._newest, self._command = j, command
-        self._commands = waiting
-        return self._command
-
-
-def _periods(bounds: tuple[float, float], share: float) -> int:
-    """Return a delay in whole periods."""
-    least, most = bounds
-    return round((least + (most - least) * share) * RATE)
 
 
 def _prepare(scenario: Scenario) -> LoopRecord:
@@ -608,7 +447,7 @@ def warm_up() -> None:
         seam.observe(np.zeros(2), 1.0 / RATE)
         seam.send_acceleration(np.zeros(2))
         seam.observe(np.zeros(2), 1.0 / RATE)
-        FastPlant(scenario.robot(), 1).step(0.0, 0.0)
+        DisturbedPlant(scenario.robot()).run((0.0, 0.0), 1)
 
 
 class WorkerPool:

@@ -15,6 +15,14 @@ from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceParameters
 from t3mpc_ros.control.actuation import LimitParameters
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel
+from t3mpc_ros.evaluation.link_faults import (
+    DROPOUTS,
+    JITTER,
+    LINK_TEXTS,
+    NO_FAULTS,
+    OVERLOAD,
+    LinkFaults,
+)
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.simulation.plant.disturbances import DisturbanceParameters
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
@@ -46,39 +54,6 @@ _ROBOT_SEEDS = 10_000  # robot seeds start here: no reference has one of them by
 
 
 @dataclass(frozen=True, slots=True)
-class LinkFaults:
-    """Faults of the links between robot and controller."""
-
-    command_loss: float = 0.0
-    """Fraction of the commands that is lost."""
-    command_delay: tuple[float, float] = (0.0, 0.0)
-    """Least and largest additional delay of a command, s; uniform between them. A command that
-    arrives after a later one is ignored."""
-    odometry_loss: float = 0.0
-    """Fraction of the measurements that is lost."""
-    odometry_delay: tuple[float, float] = (0.0, 0.0)
-    """Least and largest delay of a measurement, s; they arrive in order."""
-    begin: float = 0.0
-    """Begin of the faults, as a share of the run."""
-    lasting: float = math.inf
-    """Duration of the faults, s."""
-
-
-DROPOUTS = LinkFaults(command_loss=0.1, odometry_loss=0.1)
-JITTER = LinkFaults(command_delay=(0.0, 0.02), odometry_delay=(0.0, 0.01))
-OVERLOAD = LinkFaults(
-    command_delay=(0.02, 0.12), odometry_delay=(0.02, 0.12), begin=0.5, lasting=4.0
-)
-LINK_TEXTS: Mapping[LinkFaults, str] = {
-    DROPOUTS: '10 % of the commands and 10 % of the measurements are lost',
-    JITTER: 'each command is up to 20 ms late, and each measurement up to 10 ms',
-    OVERLOAD: 'for 4 s from half of the run on, each command and each measurement is 20 to 120 ms '
-    'late',
-}
-"""What these faults are, in words."""
-
-
-@dataclass(frozen=True, slots=True)
 class Case:
     """Difference of the true robot of a run from the nominal one."""
 
@@ -93,7 +68,7 @@ class Case:
     """Whether the estimator and the methods know of ``changes``."""
     drives: tuple[str, ...] = DRIVES
     """Drives to which the case applies."""
-    links: LinkFaults = LinkFaults()
+    links: LinkFaults = NO_FAULTS
     """Faults of the links, in whole periods; unknown to all methods."""
     reproduced: bool = True
     """Whether it belongs to the reproduction of the paper."""

@@ -7,8 +7,7 @@ the command computed from it leaves at once, carries that stamp to the command l
 after the delay of the twin's channel. Reports may be late or lost on their way to the controller.
 """
 
-from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 from typing import Any, Protocol
@@ -22,6 +21,7 @@ from t3mpc_ros.control.controller import (
     StepperControllerParameters,
 )
 from t3mpc_ros.control.watchdog import Reason
+from t3mpc_ros.evaluation.link_faults import NO_FAULTS, LinkFaults, OrderedLink, delay_between
 from t3mpc_ros.evaluation.scenario import RATE, Scenario
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, BodyTwist, State, WheelSpeeds
@@ -101,22 +101,6 @@ class LoopController(Protocol):
     def step(self, odometry: State) -> tuple[BodyTwist, LoopStatus]:
         """Return the command that follows from a report of the robot."""
         ...
-
-
-@dataclass(frozen=True, slots=True)
-class OdometryFaults:
-    """Faults of the reports on their way to the controller; they arrive in order."""
-
-    loss: float = 0.0
-    """Fraction of the reports that is lost."""
-    delay: tuple[float, float] = (0.0, 0.0)
-    """Least and largest delay of a report, s; uniform between them."""
-    begin: float = 0.0
-    """s"""
-    end: float = math.inf
-    """s"""
-    seed: int = 0
-    """Two numbers are drawn for each report, so that a change of loss does not shift delays."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,7 +208,7 @@ def drive_twin(
     duration: float,
     schedule: FaultSchedule | None = None,
     pauses: Sequence[tuple[float, float]] = (),
-    odometry_faults: OdometryFaults | None = None,
+    links: LinkFaults = NO_FAULTS,
 ) -> TwinRecord:
     """Return the record of any controller driving the twin, see :func:`run_twin`.
 
@@ -234,8 +218,9 @@ def drive_twin(
         As for :func:`run_twin`.
     controller
         A new controller, for the rate of the robot.
-    odometry_faults
-        Reports that are late or lost; none by default.
+    links
+        Faults of the reports on their way to the controller, with the seed of the robot. Those of
+        the commands belong to the ``schedule``.
 
     Raises
     ------
@@ -254,7 +239,9 @@ def drive_twin(
         )
     geometry = robot_parameters.geometry
     robot = DigitalTwin(robot_parameters, schedule)
-    reports = _ReportQueue(odometry_faults or OdometryFaults())
+    reports: OrderedLink[State] = OrderedLink()
+    generator = np.random.default_rng((robot_parameters.seed, 3))
+    faults_begin, faults_end = links.span(duration)
     times, rows, reasons = [], [], []
 
     def stamp(k: int) -> int:
@@ -274,8 +261,13 @@ def drive_twin(
         state = robot.advance(stamp(k))
         now = state.stamp_ns / NANOSECONDS
         controller.enable(not any(begin <= now < end for begin, end in paused))
-        reports.send(state.odometry)
-        for arrival_ns, odometry in reports.arrived(stamp(k + 1)):
+        # Two numbers for each report, so that a change of loss does not shift delays.
+        lost, late = generator.random(2).tolist()
+        active = faults_begin <= now < faults_end
+        if not active or lost >= links.odometry_loss:
+            delay = delay_between(links.odometry_delay, late) if active else 0.0
+            reports.send(state.odometry, state.stamp_ns + round(delay * NANOSECONDS))
+        for arrival_ns, odometry in reports.arrived(stamp(k + 1) - 1):
             twist, status = controller.step(odometry)
             wheels = wheels_from_twist(twist, geometry)
             reason = '' if status.reason.moves else status.reason.value
@@ -286,32 +278,6 @@ def drive_twin(
     columns: list[Any] = [np.array(column) for column in zip(*rows, strict=True)]
     columns = [np.array(times), course[:count], *columns, *zip(*reasons, strict=True)]
     return TwinRecord(*columns)
-
-
-class _ReportQueue:
-    """Reports on their way to the controller."""
-
-    def __init__(self, faults: OdometryFaults) -> None:
-        self._faults = faults
-        self._generator = np.random.default_rng((faults.seed, 3))
-        self._queue: deque[tuple[int, State]] = deque()
-        self._last_ns = 0
-
-    def send(self, odometry: State) -> None:
-        faults = self._faults
-        lost, late = self._generator.random(2).tolist()
-        arrival_ns = odometry.stamp_ns
-        if faults.begin <= arrival_ns / NANOSECONDS < faults.end:
-            if lost < faults.loss:
-                return
-            least, most = faults.delay
-            arrival_ns += round((least + (most - least) * late) * NANOSECONDS)
-        self._last_ns = max(self._last_ns, arrival_ns)
-        self._queue.append((self._last_ns, odometry))
-
-    def arrived(self, before_ns: int) -> Iterator[tuple[int, State]]:
-        while self._queue and self._queue[0][0] < before_ns:
-            yield self._queue.popleft()
 
 
 def _row(

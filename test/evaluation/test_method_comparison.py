@@ -19,6 +19,7 @@ from t3mpc_ros.evaluation.baselines.feedback_control import (
     ProportionalIntegralParameters,
 )
 from t3mpc_ros.evaluation.closed_loop import MethodSpec
+from t3mpc_ros.evaluation.link_faults import LinkFaults
 from t3mpc_ros.evaluation.method_comparison.compared_runs import (
     DRIFT,
     DRIVES,
@@ -52,7 +53,6 @@ from t3mpc_ros.evaluation.methods import FULL
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, TUNING_SEEDS
 from t3mpc_ros.evaluation.twin_closed_loop import (
     INITIAL_STANDSTILL,
-    OdometryFaults,
     drive_twin,
     loop_controller,
     loop_robot,
@@ -288,9 +288,11 @@ def test_reports_arrive_late_in_order_and_not_at_all():
             received.append((odometry.stamp_ns, now_ns))
             return self.inner.step(odometry)
 
-    faults = OdometryFaults(0.2, (0.02, 0.12), begin=1.0, end=2.0, seed=3)
+    faults = LinkFaults(
+        odometry_loss=0.2, odometry_delay=(0.02, 0.12), begin=1.0 / 3.0, lasting=1.0
+    )
     course = TwinScenario('nominal', 201, 3.0).reference().speeds
-    drive_twin(loop_robot(), Spy(), course, 3.0, odometry_faults=faults)
+    drive_twin(loop_robot(seed=3), Spy(), course, 3.0, links=faults)
     stamps = [stamp for stamp, _ in received]
     assert stamps == sorted(stamps)
     during = [now - stamp for stamp, now in received if 1_000_000_000 <= stamp < 2_000_000_000]

@@ -329,7 +329,7 @@ def twin_run(scenario: TwinScenario, method: TwinMethod) -> TwinRecord:
         scenario.reference().speeds,
         scenario.duration,
         scenario.schedule(),
-        odometry_faults=scenario.odometry_faults(),
+        links=scenario.links,
     )
 
 

@@ -12,24 +12,22 @@ from t3mpc_ros.control.actuation import LimitParameters
 from t3mpc_ros.control.controller import ControllerParameters
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel
-from t3mpc_ros.evaluation.scenario import (
+from t3mpc_ros.evaluation.link_faults import (
     DROPOUTS,
     JITTER,
     LINK_TEXTS,
+    NO_FAULTS,
     OVERLOAD,
-    RATE,
     LinkFaults,
+)
+from t3mpc_ros.evaluation.scenario import (
+    RATE,
     SampledReference,
     check_run,
     isotropic_acceleration,
     sample_reference,
 )
-from t3mpc_ros.evaluation.twin_closed_loop import (
-    LEAD,
-    OdometryFaults,
-    loop_controller,
-    loop_robot,
-)
+from t3mpc_ros.evaluation.twin_closed_loop import LEAD, loop_controller, loop_robot
 from t3mpc_ros.parameters.table import nearest_hint
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule
@@ -51,7 +49,7 @@ class TwinCase:
     """Parameters of the robot from the start."""
     load_change: float = 0.0
     """Mass added to the body at half of the run, kg."""
-    links: LinkFaults = LinkFaults()
+    links: LinkFaults = NO_FAULTS
     """Faults of the links; unknown to all methods."""
     assumed_dead_time: float = 0.01
     """Dead time that every method assumes, s."""
@@ -154,7 +152,12 @@ class TwinScenario:
         case = CASES[self.case]
         if case.load_change:
             return 0.5 * self.duration, math.inf
-        return self._link_span if case.links.begin else None
+        return case.links.span(self.duration) if case.links.begin else None
+
+    @property
+    def links(self) -> LinkFaults:
+        """Faults of the links between robot and controller."""
+        return CASES[self.case].links
 
     @property
     def limits(self) -> LimitParameters:
@@ -175,7 +178,7 @@ class TwinScenario:
     def schedule(self) -> FaultSchedule:
         """Return the faults of robot and command link."""
         case, links = CASES[self.case], CASES[self.case].links
-        begin, _ = self._link_span
+        begin, _ = links.span(self.duration)
         least, most = links.command_delay
         values = {
             'command_loss': links.command_loss,
@@ -190,11 +193,6 @@ class TwinScenario:
         if case.load_change:
             events.append(FaultEvent(0.5 * self.duration, 'load_change', case.load_change))
         return FaultSchedule(events, self.case)
-
-    def odometry_faults(self) -> OdometryFaults:
-        """Return the faults of the odometry on its way to the controller."""
-        links, (begin, end) = CASES[self.case].links, self._link_span
-        return OdometryFaults(links.odometry_loss, links.odometry_delay, begin, end, self.seed)
 
     def controller_parameters(self) -> ControllerParameters:
         """Return the parameters of the controller node for the twin, with the known values."""
@@ -232,12 +230,6 @@ class TwinScenario:
             acceleration=isotropic_acceleration(self.limits, robot.geometry),
             robot=robot,
         )
-
-    @property
-    def _link_span(self) -> tuple[float, float]:
-        links = CASES[self.case].links
-        begin = links.begin * self.duration
-        return begin, begin + links.lasting
 
 
 def check_name(kind: str, name: str, known: Mapping[str, object]) -> None:

@@ -194,20 +194,6 @@ class Disturbance:
         for wheel in (0, 1):
             self.walk[wheel] = reflect(float(self.walk[wheel] + step * self._drawn[wheel]))
 
-    def draw_ahead(self, dt: float, count: int) -> Array:
-        """Return the walks after each of ``count`` draws, shape (count, 2).
-
-        The result equals that of ``count`` calls of :meth:`draw`.
-        """
-        walks: Array = np.empty((count, 2))
-        step = self.parameters.walk_rate * math.sqrt(dt)
-        right, left = self.walk.tolist()
-        for row, drawn in enumerate((step * self._generator.standard_normal((count, 2))).tolist()):
-            right, left = reflect(right + drawn[0]), reflect(left + drawn[1])
-            walks[row] = right, left
-        self.walk[:] = right, left
-        return walks
-
     def torque(self, time: float) -> tuple[float, float]:
         """Return the torques (N m) on the right and left wheel at ``time`` (s)."""
         signals = self.signals
@@ -240,10 +226,3 @@ class SpeedNoise:
         spread = math.sqrt(self.parameters.variance)
         right, left = self._drawn.tolist()
         return WheelSpeeds(wheels.right + spread * right, wheels.left + spread * left)
-
-    def draw_ahead(self, count: int) -> Array:
-        """Return the noise of the next ``count`` measurements, rad/s, shape (count, 2)."""
-        noise: Array = math.sqrt(self.parameters.variance) * self._generator.standard_normal(
-            (count, 2)
-        )
-        return noise

@@ -195,11 +195,7 @@ class PaperRobotParameters(Parameters):
 
 
 class PaperRobot(FixedStepRobot[PaperRobotParameters]):
-    """Simulated robot with the paper's plant, without sensors, faults and world.
-
-    Disturbance and noise have separate random generators, which draw the same numbers whatever
-    the parameters: changing one does not shift the other.
-    """
+    """Simulated robot with the paper's plant, without sensors, faults and world."""
 
     def __init__(self, parameters: PaperRobotParameters) -> None:
         if parameters.drive.kind == 'stepper':
@@ -214,11 +210,9 @@ class PaperRobot(FixedStepRobot[PaperRobotParameters]):
             parameters.max_catch_up_time,
             limiter,
         )
-        for_disturbance, for_noise = make_generators(parameters.seed)
         self._odometry = WheelOdometry(parameters.odometry, parameters.geometry)
-        self._disturbance = Disturbance(parameters.disturbance, for_disturbance)
-        self._noise = SpeedNoise(parameters.noise, for_noise)
-        self._plant = PaperPlant(parameters.drive, parameters.step)
+        self._physics = DisturbedPlant(parameters)
+        self._plant = self._physics.plant
         self._measured = ZERO_WHEEL_SPEEDS
         self._torque = (0.0, 0.0)
         self._limited_command = self._limiter.advance(0, 0.0)
@@ -285,15 +279,7 @@ class PaperRobot(FixedStepRobot[PaperRobotParameters]):
         parameters = self._parameters
         self._limiter.parameters = parameters.limiter
         self._odometry.parameters = parameters.odometry
-        self._disturbance.parameters = parameters.disturbance
-        self._noise.parameters = parameters.noise
-        self._plant.load(
-            parameters.drive,
-            (parameters.body, parameters.true_body),
-            parameters.geometry,
-            parameters.friction,
-            parameters.friction_factor,
-        )
+        self._physics.configure(parameters)
 
     def _integrate(self, count: int) -> None:
         """Run ``count`` steps under one command."""
@@ -301,16 +287,15 @@ class PaperRobot(FixedStepRobot[PaperRobotParameters]):
         braking = bool(self._limited_command.reason)
         torque_mode = self._parameters.drive.kind == 'torque' and not braking
         command = self._torque if torque_mode else self._limited_command.wheels
-        self._plant.run(command, braking, self._disturbance, count)
+        self._physics.run(command, count, braking=braking)
 
     def _measure(self) -> None:
         dt = (self._plant.steps_done - self._measured_at) * self._plant.step
         self._measured_at = self._plant.steps_done
-        before, now = self._measured, self._noise.measure(self._plant.wheels)
+        before, now = self._measured, self._physics.measure(dt)
         mean = WheelSpeeds(0.5 * (before.right + now.right), 0.5 * (before.left + now.left))
         self._odometry.update_from_speeds(mean, dt, self._parameters.noise.variance)
         self._measured = now
-        self._disturbance.draw(dt)
 
     def _make_state(self, stamp_ns: int) -> RobotState:
         geometry, limiter, plant = self._parameters.geometry, self._limiter, self._plant
@@ -341,6 +326,44 @@ class PaperRobot(FixedStepRobot[PaperRobotParameters]):
 
     def _reset_odometry(self) -> None:
         self._odometry.reset()
+
+
+class DisturbedPlant:
+    """The plant with its random disturbance and the noise of its measured speeds.
+
+    The physics of :class:`PaperRobot` without limiter, odometry and reports. Disturbance and noise
+    have separate random generators, which draw the same numbers whatever the parameters: changing
+    one does not shift the other.
+    """
+
+    def __init__(self, parameters: PaperRobotParameters) -> None:
+        for_disturbance, for_noise = make_generators(parameters.seed)
+        self.plant = PaperPlant(parameters.drive, parameters.step)
+        self._disturbance = Disturbance(parameters.disturbance, for_disturbance)
+        self._noise = SpeedNoise(parameters.noise, for_noise)
+        self.configure(parameters)
+
+    def configure(self, parameters: PaperRobotParameters) -> None:
+        """Continue with other dynamic parameters."""
+        self._disturbance.parameters = parameters.disturbance
+        self._noise.parameters = parameters.noise
+        self.plant.load(
+            parameters.drive,
+            (parameters.body, parameters.true_body),
+            parameters.geometry,
+            parameters.friction,
+            parameters.friction_factor,
+        )
+
+    def run(self, command: tuple[float, float], count: int, *, braking: bool = False) -> None:
+        """Integrate ``count`` steps under one command, see :meth:`PaperPlant.run`."""
+        self.plant.run(command, braking, self._disturbance, count)
+
+    def measure(self, dt: float) -> WheelSpeeds:
+        """Return chi with noise, and draw the disturbance, ``dt`` seconds after the last time."""
+        measured = self._noise.measure(self.plant.wheels)
+        self._disturbance.draw(dt)
+        return measured
 
 
 class PaperPlant:
