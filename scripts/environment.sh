@@ -233,6 +233,8 @@ unset_other_ros() {
 }
 
 unset_other_ros
+# With it every start would compile the package again, and every run of pytest all tests.
+unset PYTHONDONTWRITEBYTECODE
 BASE_PYTHON="$(choose_python)"
 if ! is_current; then
   [ -w "$ROOT" ] || fail "$ROOT is not writable; .venv is created there" \

@@ -3,8 +3,11 @@
 """Short default set of tests; fixtures: an isolated ROS graph for each test that needs one."""
 
 import argparse
+import functools
+import itertools
 import os
 from pathlib import Path
+import re
 
 import pytest
 from support.processor_wait import ProcessorWait
@@ -37,6 +40,31 @@ def _part(text):
     return int(number), int(count)
 
 
+MARKS = ('ros', 'alone', 'slow', 'long')
+"""Marks by which a run selects."""
+
+
+@functools.cache
+def _marks_in(path):
+    """Return the marks that all tests of a file have, and those that some of them may have."""
+    text = path.read_text().replace('few_of(', 'mark.long(')
+    of_all = ''.join(re.findall(r'^pytestmark = .*$', text, re.MULTILINE))
+    named = ({*re.findall(r'\bmark\.(\w+)', words)} & {*MARKS} for words in (of_all, text))
+    return tuple(named)
+
+
+def _may_match(expression, path):
+    """Return whether a test of a file may match a marker expression."""
+    if {*re.findall(r'[\w.]+', expression)} - {*MARKS, 'and', 'or', 'not'}:
+        return True
+    certain, possible = _marks_in(path)
+    return any(
+        eval(expression, {}, {mark: mark in certain or mark in chosen for mark in MARKS})
+        for count in range(len(MARKS) + 1)
+        for chosen in itertools.combinations(possible, count)
+    )
+
+
 def _is_default(config):
     """Return whether nothing selects tests: neither paths, nor markers, nor names."""
     chosen = config.args_source is config.ArgsSource.ARGS or config.option.markexpr
@@ -44,15 +72,24 @@ def _is_default(config):
 
 
 def pytest_ignore_collect(collection_path, config):
-    """Import the files of the default set only: the import of all others takes as long as it."""
-    if not _is_default(config) or collection_path.suffix != '.py':
+    """Import only files whose tests may be selected: the import of all takes many seconds."""
+    if collection_path.suffix != '.py' or not collection_path.is_relative_to(ROOT):
         return None
-    return not {*collection_path.relative_to(ROOT).parts} & {*DEFAULT} or None
+    if _is_default(config):
+        return not {*collection_path.relative_to(ROOT).parts} & {*DEFAULT} or None
+    if not (expression := config.option.markexpr):
+        return None
+    return not _may_match(expression, collection_path) or None
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config, items):
     """Keep a part of the tests; of the default set, those that take neither long nor slow."""
+    for item in items:
+        certain, possible = _marks_in(item.path)
+        marks = {mark.name for mark in item.iter_markers()} & {*MARKS}
+        if not certain <= marks <= possible:
+            raise pytest.UsageError(f'{item.nodeid}: its file must name its marks, mark.NAME')
     if config.option.part:
         number, count = config.option.part
         _keep(config, items, items[number - 1 :: count])

@@ -777,12 +777,13 @@ def test_a_sourced_ros_does_not_enter_the_local_environment(checkout, tmp_path):
         LD_LIBRARY_PATH=f'{libraries}:{tmp_path / "own"}',
         RMW_IMPLEMENTATION='rmw_cyclonedds_cpp',
         ROS_DOMAIN_ID='7',
+        PYTHONDONTWRITEBYTECODE='1',
     ).stdout
     environment = dict(line.split('=', 1) for line in output.splitlines() if '=' in line)
     assert environment['AMENT_PREFIX_PATH'] == str(checkout.root / '.venv')
     assert environment['LD_LIBRARY_PATH'] == str(tmp_path / 'own')
     assert environment['ROS_DOMAIN_ID'] == '7'
-    assert not {'PYTHONPATH', 'RMW_IMPLEMENTATION'} & set(environment)
+    assert not {'PYTHONPATH', 'RMW_IMPLEMENTATION', 'PYTHONDONTWRITEBYTECODE'} & set(environment)
 
 
 @pytest.mark.slow
