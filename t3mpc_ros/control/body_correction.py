@@ -94,7 +94,16 @@ class BodyCorrectionParameters(Parameters):
     )
     max_correction: float = parameter(
         1.0,
-        'bound of the correction of a wheel by the map, and v-bar of the yaw error',
+        'bound of the correction of a wheel by the map',
+        unit='rad/s',
+        low=0.0,
+        high=10.0,
+        dynamic=True,
+    )
+    max_yaw_correction: float = parameter(
+        0.1,
+        'v-bar: bound of the correction of a wheel by the yaw error, so that a robot that was '
+        'turned by a slide turns back slowly: its error is the less',
         unit='rad/s',
         low=0.0,
         high=10.0,
@@ -128,6 +137,8 @@ class BodyConstants(NamedTuple):
     yaw_gain: float
     """k, 1/s"""
     bound: float
+    """Bound of the map's correction, rad/s"""
+    yaw_bound: float
     """v-bar, rad/s"""
     dead_zone: float
     """rad/s"""
@@ -185,6 +196,7 @@ class BodyCorrection:
             BLOCK / parameters.skill_time,
             parameters.yaw_gain,
             parameters.max_correction,
+            parameters.max_yaw_correction,
             parameters.dead_zone,
         )
 
@@ -341,6 +353,7 @@ def correct_body(
     estimate(point, fuzzy, output)
     bound = constants.bound
     correction = -min(max(output[0], -bound), bound)
+    bound = constants.yaw_bound
     if bound > 0.0:
         correction -= bound * math.tanh(constants.yaw_gain * memory[YAW_ERROR] / bound)
     return float(memory[AUTHORITY] * correction)

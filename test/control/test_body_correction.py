@@ -139,15 +139,19 @@ def test_a_yaw_that_is_never_measured_changes_nothing():
     assert body.correction.authority == 0.0
 
 
-@pytest.mark.parametrize('bound', [0.0, 0.1])
-def test_the_correction_is_bounded(bound):
-    body = Body(lambda right, left: 1.15 * exact(right, left), max_correction=bound)
+@pytest.mark.parametrize(('of_map', 'of_yaw'), [(0.0, 0.0), (0.1, 0.0), (0.0, 0.1), (0.1, 0.2)])
+def test_the_corrections_are_bounded(of_map, of_yaw):
+    body = Body(
+        lambda right, left: 1.15 * exact(right, left),
+        max_correction=of_map,
+        max_yaw_correction=of_yaw,
+    )
     body.run(30.0)
     corrections = [
         abs(0.5 * (sent[0] - sent[1]) - 0.5 * np.subtract(*body.reference(k + 2)))
         for k, sent in enumerate(body.sent[3:])
     ]
-    assert max(corrections) <= 2.0 * bound + 1e-12
+    assert 0.3 * (of_map + of_yaw) <= max(corrections) <= of_map + of_yaw + 1e-12
 
 
 def test_a_rollback_restores_map_and_authority():
