@@ -2,17 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Host link against the emulated dongle and robot: motion, packet loss, stops, recovery."""
 
+from itertools import product
 import math
 import random
 
 import pytest
-from support.emulator_bench import Bench, check_followed, sent_commands
+from support.emulator_bench import Bench, check_followed
+from support.long_tests import few_of
 
 from t3mpc_ros.emulator.fault_injection import FAULT_KINDS
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.port_actions import LinkState
-from t3mpc_ros.radio.protocol.codec import encode
-from t3mpc_ros.radio.protocol.frames import Command, CommandFlag
 
 KEY = bytes(range(16))
 STEP = math.tau / 3200
@@ -24,10 +24,10 @@ def run_to_rest(bench):
     bench.run(2.0)
 
 
-def test_counters_equal_the_pulses_of_the_plant_over_60_s():
+def test_counters_equal_the_pulses_of_the_plant():
     bench = Bench({'robot_clock_error': 0.005})
     assert bench.connect() < 0.2
-    for second in range(60):
+    for second in range(20):
         bench.drive(5.0 * math.sin(0.7 * second), 6.0 * math.cos(0.4 * second))
         bench.run(1.0)
         assert bench.link.reason(bench.now_ns) == ''
@@ -39,7 +39,7 @@ def test_counters_equal_the_pulses_of_the_plant_over_60_s():
     assert min(map(abs, pulses)) > 1000
     quality = bench.link.quality(bench.now_ns)
     assert (quality.lost, quality.malformed, quality.sessions) == (0, 0, 1)
-    assert quality.cycles >= 3000
+    assert quality.cycles >= 1000
     assert quality.robot.stale == quality.robot.duplicates == quality.robot.bad_session == 0
     check_followed(bench)
 
@@ -58,14 +58,14 @@ def test_round_trip_time_is_that_of_line_radio_and_gap():
     assert 60 <= bench.link.telemetry.raw.age <= 80
 
 
-@pytest.mark.parametrize('loss, most', [(0.1, 0.005), (0.3, 0.10), (0.5, 0.45)])
+@pytest.mark.parametrize('loss, most', few_of([(0.3, 0.10), (0.1, 0.005), (0.5, 0.45)]))
 def test_share_of_lost_cycles_with_four_retries(loss, most):
     """Whole: the command was taken, and the state that it led to came back with it."""
     bench = Bench()
     bench.inject('loss', math.inf, loss)
     bench.run(20.0, lambda: bench.link.state is LinkState.RUN)
     bench.drive(4.0, 4.0)
-    bench.run(60.0)
+    bench.run(30.0)
     quality = bench.link.quality(bench.now_ns)
     # Either exchange fails with its fifth try; a CMD that came twice may have fetched the state.
     one = (1.0 - (1.0 - loss) ** 2) ** 5
@@ -80,29 +80,13 @@ def test_share_of_lost_cycles_with_four_retries(loss, most):
     check_followed(bench)
 
 
-def test_loss_in_one_direction_costs_fewer_cycles():
-    lost = {}
-    for name in ('loss_down', 'loss_up'):
-        bench = Bench()
-        bench.connect()
-        bench.inject(name, math.inf, 0.3)
-        bench.drive(4.0, 4.0)
-        bench.run(20.0)
-        quality = bench.link.quality(bench.now_ns)
-        lost[name] = quality.lost
-        assert quality.lost / quality.cycles < 0.03
-        # A retransmission after a lost acknowledgement is acknowledged, not executed again.
-        assert quality.robot.duplicates == 0
-        check_followed(bench)
-
-
 # -- stopping -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     'fault', ['silence', 'jam', 'stall', 'radio_dead', 'dongle_reset', 'close_port', 'button']
 )
-@pytest.mark.parametrize('speed, deceleration', [(7.0, 30.0), (10.0, 50.0)])
+@pytest.mark.parametrize('speed, deceleration', few_of([(7.0, 30.0), (10.0, 50.0)]))
 def test_wheels_rest_within_045_s_of_the_last_command(fault, speed, deceleration):
     """For every fault that interrupts the commands; ``silence`` also covers a dead host."""
     link = LinkParameters.from_dict({'robot.deceleration': deceleration})
@@ -155,51 +139,13 @@ def test_shutdown_leaves_the_robot_at_rest_with_drivers_off():
     assert not bench.board.powered
 
 
-def test_a_burst_held_for_a_second_does_not_move_the_robot():
-    """Fifteen commands, delayed by 1 s and released at once, are rejected."""
-    bench = Bench()
-    bench.connect()
-    bench.run(1.0)
-    session = bench.board.session
-    held_us = bench.now_ns // 1000
-    bench.run(1.0)
-    bench.inject('silence')  # no prompt command in between
-    bench.run(1.0)
-    before = bench.board.counters
-    assert not bench.followed or bench.followed[-1][1].left == 0
-    for index in range(15):
-        seq = (bench.link.telemetry.raw.seq + 1 + index) % 256
-        host_us = (held_us + 1_000_000 + 20_000 * index) % (1 << 32)
-        bench.board.receive(encode(Command(session, seq, 1, 20, 8000, 8000, host_us)))
-        bench.run(0.001)
-    bench.run(0.5)
-    assert bench.board.counters == before
-    bench.emulator.end_fault('silence')
-    bench.run(2.0, lambda: bench.link.state is LinkState.RUN)
-    bench.run(2.0)
-    assert bench.link.quality(bench.now_ns).robot.stale == 15
-
-
-def test_no_stale_command_is_executed_after_a_stalled_line():
-    for begin in (0.5, 0.503, 0.507, 0.511, 0.515):
-        bench = Bench()
-        bench.connect()
-        bench.drive(6.0, 6.0)
-        bench.run(begin)
-        bench.inject('stall', 1.0)
-        bench.run(6.0)
-        check_followed(bench)
-        assert bench.link.reason(bench.now_ns) == ''
-        assert bench.now_ns - bench.followed[-1][0] < 30_000_000
-
-
 # -- every fault ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('key', [b'', KEY], ids=['open', 'keyed'])
+@pytest.mark.parametrize('keyed', few_of([True, False]))
 @pytest.mark.parametrize('name', [kind.name for kind in FAULT_KINDS])
-def test_the_link_recovers_from_every_fault(name, key):
-    bench = Bench(key=key)
+def test_the_link_recovers_from_every_fault(name, keyed):
+    bench = Bench(key=KEY if keyed else b'')
     bench.connect()
     bench.drive(4.0, 4.0)
     bench.run(1.0)
@@ -213,12 +159,13 @@ def test_the_link_recovers_from_every_fault(name, key):
     check_followed(bench)
 
 
-@pytest.mark.parametrize('key', [b'', KEY], ids=['open', 'keyed'])
-@pytest.mark.parametrize('seed', range(8))
-def test_no_wrong_or_stale_command_is_executed(seed, key):
+@pytest.mark.parametrize('seed, keyed', few_of(product(range(8), (True, False))))
+def test_no_wrong_or_stale_command_is_executed(seed, keyed):
     """A fault every half second for half a minute, most of them overlapping."""
     rng = random.Random(seed)
-    bench = Bench({'robot_clock_error': rng.uniform(-0.005, 0.005)}, key=key, seed=seed)
+    bench = Bench(
+        {'robot_clock_error': rng.uniform(-0.005, 0.005)}, key=KEY if keyed else b'', seed=seed
+    )
     bench.connect()
     names = [kind.name for kind in FAULT_KINDS]
     # Commands resume only seconds after these faults.
@@ -240,36 +187,6 @@ def test_no_wrong_or_stale_command_is_executed(seed, key):
 # -- telemetry ------------------------------------------------------------------------------------
 
 
-def test_wheel_angles_continue_over_a_reboot_of_the_robot():
-    bench = Bench()
-    bench.connect()
-    bench.drive(5.0, 5.0)
-    bench.run(2.0)
-    run_to_rest(bench)
-    before = bench.link.telemetry.angles
-    bench.inject('robot_reset')
-    bench.run(3.0)
-    bench.drive(5.0, 5.0)
-    bench.run(2.0)
-    run_to_rest(bench)
-    assert bench.link.quality(bench.now_ns).robot_resets == 1
-    turned = bench.link.telemetry.angles.right - before.right
-    assert round(turned / STEP) == bench.plant.pulses[1] > 3000
-
-
-def test_an_absent_imu_is_reported_and_recovers():
-    bench = Bench()
-    bench.connect()
-    bench.run(1.0)
-    assert bench.link.telemetry.imu is not None
-    bench.inject('imu_absent', 1.0)
-    bench.run(0.5)
-    assert bench.link.telemetry.imu is None
-    assert bench.link.telemetry.status.imu_fault
-    bench.run(1.0)
-    assert bench.link.telemetry.imu is not None
-
-
 def test_gyro_ranges_and_battery_are_those_of_the_plant():
     bench = Bench({'twin.world': 'corridor', 'twin.imu.gyro_offset': 0.0})
     bench.connect()
@@ -284,13 +201,6 @@ def test_gyro_ranges_and_battery_are_those_of_the_plant():
     plain.connect()
     plain.run(1.0)
     assert plain.link.telemetry.ranges == (math.inf,) * 8
-
-
-def test_a_robot_on_another_channel_is_not_found():
-    bench = Bench({'channel': 83})
-    bench.run(2.0)
-    assert 'does not answer' in bench.link.reason(bench.now_ns)
-    assert bench.link.state is LinkState.HELLO
 
 
 def test_an_empty_battery_switches_the_board_off():
@@ -328,23 +238,6 @@ def test_inverted_wheels_count_in_the_commanded_direction():
 # -- emergency stop -------------------------------------------------------------------------------
 
 
-def test_the_button_latches_until_released_and_cleared():
-    bench = Bench()
-    bench.connect()
-    bench.drive(5.0, 5.0)
-    bench.run(1.0)
-    bench.inject('button')
-    bench.run(1.0)
-    assert bench.link.telemetry.status.estop
-    bench.link.release_estop(bench.now_ns)
-    bench.run(2.0)
-    assert 'button' in bench.link.reason(bench.now_ns)
-    bench.emulator.end_fault('button')
-    bench.link.release_estop(bench.now_ns)
-    bench.run(2.0)
-    assert bench.link.reason(bench.now_ns) == ''
-
-
 def test_a_host_with_another_key_cannot_drive_but_can_stop():
     bench = Bench(key=KEY, robot_key=bytes(16))
     bench.drive(5.0, 5.0)
@@ -355,56 +248,3 @@ def test_a_host_with_another_key_cannot_drive_but_can_stop():
     bench.run(0.2)
     assert bench.board.status & 4
     assert not bench.followed
-
-
-def test_a_sender_without_the_key_can_stop_a_moving_robot():
-    bench = Bench(key=KEY)
-    bench.connect()
-    bench.drive(5.0, 5.0)
-    bench.run(1.0)
-    for flags in (CommandFlag.ENABLE, CommandFlag.ESTOP_CLEAR):
-        bench.board.receive(encode(Command(9, 200, flags, 20, -5000, -5000, 0)))
-    bench.run(0.5)
-    assert bench.link.reason(bench.now_ns) == ''
-    bench.board.receive(encode(Command(9, 200, CommandFlag.ESTOP, 0, 0, 0, 0)))
-    bench.run(0.5)
-    assert bench.board.speeds == (0, 0)
-    assert bench.link.telemetry.status.estop
-    bench.link.release_estop(bench.now_ns)
-    bench.run(1.0)
-    assert bench.link.reason(bench.now_ns) == ''
-    check_followed(bench)
-
-
-def test_replayed_or_forged_frames_do_not_move_a_keyed_robot():
-    """Replays, inverted bits, forged tags and stamps, between the packets of the host."""
-    rng = random.Random(3)
-    bench = Bench(key=KEY)
-    bench.connect()
-    bench.drive(4.0, -3.0)
-    tried = 0
-    for _ in range(100):
-        bench.run(0.05)
-        recorded = [encode(command) for command in sent_commands(bench)]
-        for _ in range(30):
-            data = bytearray(rng.choice(recorded))
-            match rng.randrange(5):
-                case 1 | 2:
-                    for _ in range(rng.choice((1, 1, 2, 3))):
-                        bit = rng.randrange(8 * len(data))
-                        data[bit // 8] ^= 1 << bit % 8
-                case 3:
-                    data[-8:] = rng.randbytes(8)
-                case 4:
-                    data[10:14] = ((bench.now_ns // 1000) & 0xFFFFFFFF).to_bytes(4, 'little')
-                    data[2] = (data[2] + rng.randrange(128)) % 256
-            if data[0] == 0x11 and data[3] & CommandFlag.ESTOP:
-                continue  # an emergency stop is always accepted
-            bench.board.receive(bytes(data))
-            tried += 1
-    bench.run(0.1)
-    assert tried > 2000
-    check_followed(bench)
-    assert bench.link.reason(bench.now_ns) == ''
-    # The commands of the host are executed nevertheless.
-    assert len(bench.followed) > 0.95 * len(sent_commands(bench))

@@ -3,7 +3,7 @@
 """Each fault on two targets: the Python emulator, and the firmware of both boards in simavr.
 
 The host is the real link, a pure function of time and bytes. The assertions are the same for
-both targets.
+both targets. In simavr a second takes a quarter of a minute: most of its tests are long.
 """
 
 from contextlib import ExitStack
@@ -24,14 +24,22 @@ HALF_STEP = 0.035 * math.tau / 400
 """m"""
 REST = 0.45
 """s after the last executed command"""
-AVR = pytest.param(
-    'avr',
-    marks=pytest.mark.skipif(bool(missing_tools()), reason=f'not installed: {missing_tools()}'),
-)
+NEEDS_TOOLS = pytest.mark.skipif(bool(missing_tools()), reason=f'not installed: {missing_tools()}')
+LONG_AVR = pytest.param('avr', marks=[NEEDS_TOOLS, pytest.mark.long])
 KEY = bytes(range(16))
 
 
-@pytest.fixture(params=['emulator', AVR])
+def on_both_targets(names, faults):
+    """Parametrize a test: each fault on both targets, all but the first on the boards as long."""
+    rows = [pytest.param('emulator', *fault) for fault in faults]
+    rows.append(pytest.param('avr', *faults[0], marks=NEEDS_TOOLS))
+    rows += [
+        pytest.param('avr', *fault, marks=[NEEDS_TOOLS, pytest.mark.long]) for fault in faults[1:]
+    ]
+    return pytest.mark.parametrize(f'build, {names}', rows, indirect=['build'])
+
+
+@pytest.fixture(params=['emulator', LONG_AVR])
 def build(request):
     """Return a factory of benches for each target; the boards are checked at the end."""
     with ExitStack() as stack:
@@ -94,7 +102,7 @@ def check_odometry(bench):
 # -- serial line ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@on_both_targets(
     'name, share',
     [
         ('drop_bytes', 0.01),
@@ -174,11 +182,11 @@ def stale(bench):
 # -- boards, radio, port --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@on_both_targets(
     'name, seconds',
     [
-        ('jam', 0.6),
         ('silence', 0.6),
+        ('jam', 0.6),
         ('robot_reset', 0.3),
         ('dongle_reset', 0.001),
         ('radio_dead', 0.5),

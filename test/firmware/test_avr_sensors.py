@@ -75,6 +75,7 @@ def test_gyro_rate_and_delay(build):
     assert ratio == pytest.approx(1.0, abs=0.03)
 
 
+@pytest.mark.long
 def test_gyro_odometry_agrees_with_the_true_pose(build):
     bench = build(flat={'twin.imu.gyro_offset': 0.0})
     bench.connect()
@@ -127,6 +128,7 @@ def test_ranges_agree_with_the_distance_to_a_wall(build):
     assert all(after <= before for before, after in zip(finite, finite[1:], strict=False))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('blocked, sign', [('right', 1.0), ('left', -1.0)])
 def test_a_blocked_wheel_is_detected_and_stops_the_robot(build, blocked, sign):
     """The steps are those of straight motion; the body turns about the blocked wheel."""
@@ -149,14 +151,3 @@ def test_a_blocked_wheel_is_detected_and_stops_the_robot(build, blocked, sign):
     assert bench.robot.reason(bench.now_ns) == SLIP_STOP_REASON
     bench.run(0.5)
     assert bench.board.speeds == (0, 0)
-
-
-def test_low_battery_and_imu_fault_are_reported(build):
-    bench = build(flat={'twin.faults.gyro_dead': True, 'twin.faults.supply_sag': 2.5})
-    bench.connect()
-    bench.run(5.0)  # the battery measurement is filtered
-    state = bench.states[-1]
-    assert state.imu is None
-    assert state.status.imu_fault
-    assert state.status.low_battery
-    assert state.battery.voltage == pytest.approx(bench.plant.battery / 1000.0, abs=0.04)

@@ -20,6 +20,7 @@ from support.avr_boards import (
     request,
     settings_record,
 )
+from support.long_tests import few_of
 
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.frames import (
@@ -82,12 +83,14 @@ def test_an_erased_robot_moves_only_after_its_settings() -> None:
         assert pong[-4:-1] == (frames.SETTINGS_GOOD, NEW.channel, NEW.address)
 
 
-@pytest.mark.slow
-def test_power_loss_during_a_write_leaves_no_mixture() -> None:
-    """Power fails at six times: the old settings or the new ones, in both places."""
+@pytest.mark.parametrize(
+    'cuts', few_of([[0.01, WRITING], [0.002, 0.01, 0.03, 0.05, 0.08, WRITING]])
+)
+def test_power_loss_during_a_write_leaves_no_mixture(cuts: list[float]) -> None:
+    """Power fails at several times: the old settings or the new ones, in both places."""
     build()
     seen = set()
-    for cut in (0.002, 0.01, 0.03, 0.05, 0.08, WRITING):
+    for cut in cuts:
         boards = Boards()
         boards.start()
         request(boards, NEW, cut)
@@ -132,6 +135,7 @@ def make(folder: Any, *options: str) -> tuple[str, dict[str, tuple[int, bytes]]]
     return number, {file.name: (file.stat().st_mtime_ns, file.read_bytes()) for file in files}
 
 
+@pytest.mark.long
 def test_a_build_follows_its_options(tmp_path: Any) -> None:
     """`make avr RADIO_CHANNEL=100` after `make avr` once rebuilt nothing."""
     plain, before = make(tmp_path)

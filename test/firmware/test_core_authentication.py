@@ -20,8 +20,9 @@ from support.firmware_core import (
     OK,
     SESSION,
     Robot,
-    siphash,
 )
+
+from t3mpc_ros.radio.protocol.authentication import siphash
 
 BOOTS_ADDRESS = 32
 

@@ -20,11 +20,11 @@ from support.firmware_core import (
     c_decode,
     c_encode,
     c_encode_frame,
-    encode_frame,
-    siphash,
-    split_stream,
 )
+from support.long_tests import few_of
 
+from t3mpc_ros.radio.protocol.authentication import siphash
+from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
 from t3mpc_ros.robot.sensor_conversions import encode_range
 from t3mpc_ros.simulation.sensors import range_sensor
 
@@ -52,7 +52,7 @@ def test_encoded_frames_equal_the_reference(library):
     assert c_encode_frame(library, b'') == c_encode_frame(library, bytes(79)) == b''
 
 
-@pytest.mark.parametrize('seed', range(40))
+@pytest.mark.parametrize('seed', few_of(range(40), 4))
 def test_decoder_equals_the_reference_on_a_damaged_stream(library, seed):
     generator = random.Random(seed)
     stream = bytearray()
@@ -73,8 +73,9 @@ def test_decoder_equals_the_reference_on_a_damaged_stream(library, seed):
         stream += wire
     stream += b'\0'
     decoder = Decoder(library)
-    found, counts = split_stream(bytes(stream))
-    assert decoder.feed(bytes(stream)) == found
+    reference = FrameDecoder()
+    assert decoder.feed(bytes(stream)) == reference.feed(bytes(stream))
+    counts = reference.counts
     assert decoder.counts() == counts
     assert counts[0] > 100
     assert min(counts[1:]) > 10
@@ -125,19 +126,6 @@ def test_clock_is_exact_around_a_timer_overflow(library):
 
 
 # -- golden vectors -------------------------------------------------------------------------------
-
-
-def test_first_golden_vectors_byte_for_byte(library):
-    fault, packet = c_decode(library, COMMAND)
-    assert fault == 0
-    assert (packet['session'], packet['seq'], packet['what'], packet['ttl']) == (0x5A, 7, 1, 20)
-    assert (packet['left'], packet['right']) == (5000, -2500)
-    assert packet['host_us'] == 0x01020304
-    numbers = (0x5A, 7, 3, 123456789, 1000, -1000, -131, 164, 0, 76)
-    assert c_encode(library, 1, (*numbers, *bytes.fromhex('a0fe013c00145078'))) == STATE
-    assert (
-        c_encode_frame(library, bytes.fromhex('012a060e') + COMMAND + b'\x15\x5a\x07\0') == TX_WIRE
-    )
 
 
 def test_transaction_with_the_golden_result(library):

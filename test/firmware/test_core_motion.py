@@ -237,6 +237,7 @@ def test_clock_wrap_of_any_width_has_no_effect(robot, wrap, before):
     assert robot.status == ENABLED | MOVING
 
 
+@pytest.mark.long
 def test_driving_for_more_than_71_minutes(robot):
     for _ in range(4400):
         robot.drive(100, 100, 1_000_000, period=200_000, ttl=25)

@@ -11,7 +11,6 @@ from support.firmware_core import (
     BUSY,
     ENABLED,
     FAILED,
-    KEY,
     LATCHED,
     MOVING,
     NO_SESSION,
@@ -120,48 +119,6 @@ def test_settings_are_written_only_at_rest_with_drivers_off(robot):
     assert robot.settings(*NEW) == (OK, GOOD, *NEW)
     assert robot.status & NO_SESSION
     assert robot.steps == steps
-
-
-def test_no_session_starts_while_settings_are_written(robot):
-    robot.call('set_cell_us', ctypes.c_uint32(CELL_US))
-    assert robot.settings(*NEW, us=1000) is None
-    assert robot.hello()[1] == 0
-    assert robot.settings(*NEW, us=1000)[:2] == (BUSY, DAMAGED)
-    assert robot.console(b'\x04\x02' + KEY)[0][2] == BUSY
-    (reply,) = robot.console(b'\x03\x01ping', WRITE_US)[:1]
-    assert reply[:4] == bytes([0x85, 9, OK, GOOD]) or reply[0] == 0x83
-    assert moves(robot)
-
-
-@pytest.mark.parametrize('before', [None, OLD], ids=['erased', 'set'])
-def test_power_loss_at_any_cell_leaves_no_mixture(library, before):
-    """Old values, new values, or a lock: at every cell of the write."""
-    found = set()
-    for cut_us in range(CELL_US // 2, WRITE_US, CELL_US):
-        robot = Robot(library, erased=before is None)
-        robot.call('set_cell_us', ctypes.c_uint32(CELL_US))
-        robot.run(1000)
-        robot.settings(*NEW, us=cut_us)
-        robot.call('boot', 4, ctypes.c_uint32(0))
-        robot.run(1000)
-        state, *values = identity(robot)
-        values = tuple(values)
-        found.add((state, values))
-        usable = state in (GOOD, ONE_COPY)
-        assert values in (OLD, NEW)
-        assert usable or before is None
-        assert moves(robot) == usable
-        robot.run(WRITE_US)  # the other copy is repaired
-        assert robot.settings()[1] == (GOOD if usable else state)
-        cells = [
-            bytes(robot.call('cell', ctypes.c_uint8(at + i)) for i in range(RECORD_SIZE))
-            for at in COPIES
-        ]
-        assert not usable or cells[0] == cells[1]
-        assert robot.settings(*NEW, us=WRITE_US) == (OK, GOOD, *NEW)
-    wanted = {(GOOD, NEW), (ONE_COPY, NEW)}
-    wanted |= {(GOOD, OLD), (ONE_COPY, OLD)} if before else {(MISSING, OLD), (DAMAGED, OLD)}
-    assert found == wanted
 
 
 @pytest.mark.parametrize('copy', COPIES)

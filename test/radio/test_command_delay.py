@@ -48,11 +48,11 @@ class Controlled(RobotBench):
 
 
 CASES = [*itertools.product((1.0, 3.0, 8.0), (0.0, 0.3, 1.0), (0.0, 0.1))]
-EXTREMES = [(1.0, 0.0, 0.0), (8.0, 0.0, 0.0), (1.0, 1.0, 0.1), (8.0, 1.0, 0.1)]
+EXTREMES = [(1.0, 0.0, 0.0), (8.0, 1.0, 0.1)]
 
 
 @pytest.mark.parametrize(
-    'thinking, lateness, loss', few_of([*EXTREMES, *(c for c in CASES if c not in EXTREMES)], 4)
+    'thinking, lateness, loss', few_of([*EXTREMES, *(c for c in CASES if c not in EXTREMES)], 2)
 )
 def test_a_command_is_executed_one_cycle_after_its_state(thinking, lateness, loss):
     """Regression: the limiter had a period of its own, independent of the link cycle.
@@ -63,13 +63,13 @@ def test_a_command_is_executed_one_cycle_after_its_state(thinking, lateness, los
     bench = Controlled(round(thinking * MS), round(lateness * MS))
     bench.connect()
     bench.inject('loss', 100.0, loss)
-    bench.run(20.0)
+    bench.run(12.0)
     found = [
         (now_ns - bench.answers[command.left]) / 1e9
         for now_ns, command in bench.followed[50:]
         if command.left in bench.answers
     ]
-    assert len(found) > 800
+    assert len(found) > 450
     middle, late = np.median(found), np.quantile(found, 0.95)
     print(f'\n{1e3 * middle:.1f} ms, {1e3 * late:.1f} ms (95 %) after the sample')
     assert middle == pytest.approx(DEAD_TIME, abs=0.0015)

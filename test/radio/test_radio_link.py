@@ -7,6 +7,7 @@ import random
 
 import numpy as np
 import pytest
+from support.long_tests import few_of
 from support.radio_bench import MS, FakeRobot, LinkBench
 
 from t3mpc_ros.geometry.types import WheelSpeeds
@@ -25,13 +26,12 @@ from t3mpc_ros.radio.protocol.frames import BOARD_PARAMETERS, CommandFlag
 from t3mpc_ros.radio.protocol.framing import encode_frame
 
 KEY = bytes(range(60, 76))
-ALIEN = bytes(range(61, 77))
 
 
-@pytest.fixture(params=[b'', KEY], ids=['open', 'keyed'])
-def bench(request):
-    """Return a bench with a running link and a moving robot."""
-    made = LinkBench(key=request.param)
+@pytest.fixture
+def bench():
+    """Return a bench with a running link, commands with tags, and a moving robot."""
+    made = LinkBench(key=KEY)
     made.connect()
     made.drive(3.0, -2.0)
     made.run(0.5)
@@ -203,16 +203,6 @@ def test_a_replugged_port_is_retried_at_once():
     assert bench.connect() < 2.2
 
 
-def test_an_absent_device_is_retried_five_times_a_second():
-    """The robot drives within a second of the return of the dongle, after any absence."""
-    bench = LinkBench()
-    bench.plugged = False
-    bench.run(60.0)
-    np.testing.assert_allclose(np.diff(bench.opens) / 1e9, 0.2)
-    bench.plug()
-    assert bench.connect() < 0.4
-
-
 def test_the_usb_port_of_the_robot_is_recognised():
     """Its console answers PING, too: the dongle was said to reject the radio configuration."""
     bench = LinkBench()
@@ -246,46 +236,6 @@ def test_a_rejected_radio_configuration_is_reported():
     assert LinkState.HELLO not in bench.link_states
     bench.dongle.reply = reply
     assert bench.connect() < 0.3
-
-
-def test_a_missing_radio_chip_and_its_repair_are_detected():
-    bench = LinkBench()
-    bench.dongle.chip_ok = False
-    bench.run(10.0)
-    assert bench.link.reason(bench.now_ns) == reasons.NO_CHIP
-    assert len(bench.opens) == 1
-    bench.dongle.chip_ok = True
-    assert bench.connect() < 1.2
-
-
-def test_an_absent_robot_is_reported_and_found_when_on():
-    bench = LinkBench()
-    bench.dongle.jam_until_ns = bench.now_ns + 20_000 * MS
-    bench.run(19.9)
-    assert bench.link.state is LinkState.HELLO
-    assert bench.link.reason(bench.now_ns) == (
-        'the robot does not answer: is it on, in range, on channel 82?'
-    )
-    assert bench.run(2.0, lambda: running(bench)) < 0.5
-
-
-@pytest.mark.parametrize(
-    'host, robot, reason',
-    [
-        (KEY, ALIEN, reasons.KEY_MISMATCH),
-        (KEY, b'', reasons.ROBOT_KEY_MISSING),
-        (b'', KEY, reasons.HOST_KEY_MISSING),
-    ],
-)
-def test_key_mismatch_is_reported_and_nothing_moves(host, robot, reason):
-    bench = LinkBench(key=host, robot_key=robot)
-    bench.drive(1.0, 1.0)
-    bench.run(3.0)
-    assert bench.link.reason(bench.now_ns) == reason
-    assert not bench.link.authenticated
-    assert LinkState.RUN not in bench.link_states
-    assert bench.robot.speeds == (0.0, 0.0)
-    assert bench.robot.verifier.session == 0 or not host
 
 
 def test_a_rejected_parameter_is_reported_and_nothing_moves():
@@ -361,7 +311,7 @@ def test_a_state_not_newer_than_the_last_is_dropped():
     assert not decoder.rebooted
 
 
-@pytest.mark.parametrize('skew', [0.005, -0.005])
+@pytest.mark.parametrize('skew', few_of([0.005, -0.005]))
 def test_angles_match_their_stamps_over_a_jittery_lossy_link(skew):
     bench = LinkBench()
     bench.robot.skew = skew
@@ -539,17 +489,6 @@ def test_the_button_of_the_robot_is_reported_and_released(bench):
     assert moving(bench)
 
 
-def test_a_robot_with_another_key_still_executes_estop():
-    """An emergency stop needs no key."""
-    bench = LinkBench(key=ALIEN, robot_key=KEY)
-    bench.run(1.0)
-    assert not bench.robot.estop
-    bench.link.latch_estop('asked for')
-    bench.run(0.1)
-    assert bench.robot.estop
-    assert bench.link.state is LinkState.HELLO
-
-
 # -- faults of the link ---------------------------------------------------------------------------
 
 
@@ -582,7 +521,7 @@ def test_sequence_numbers_are_valid_after_a_long_jam(bench):
         assert bench.run(2.0, lambda: moving(bench)) < 0.4
 
 
-@pytest.mark.parametrize('loss', [0.1, 0.3])
+@pytest.mark.parametrize('loss', few_of([0.3, 0.1]))
 def test_lost_packets_cost_their_own_cycle_only(bench, loss):
     bench.dongle.loss = loss
     bench.run(10.0)
@@ -924,32 +863,20 @@ def test_the_link_does_not_poll_busily(bench):
     assert calls < 10 * 5 * 4
 
 
-def test_equal_runs_are_equal_byte_for_byte():
-    logs = []
-    for _ in range(2):
-        bench = LinkBench(key=KEY, seed=3)
-        bench.dongle.loss = 0.2
-        bench.drive(1.0, 2.0)
-        bench.run(5.0)
-        logs.append(bench.robot.log)
-    assert logs[0] == logs[1]
-    assert len(logs[0]) > 300
-
-
 def test_session_numbers_are_random_and_never_repeated():
     numbers = []
     bench = LinkBench(robot=FakeRobot(), seed=9)
     bench.connect()
-    for _ in range(150):
+    for _ in range(60):
         bench.run(0.3)
         numbers.append(bench.robot.verifier.session)
         bench.robot.boot(bench.now_ns)
         bench.run(0.05, lambda: not running(bench))
         bench.connect()
     assert all(a != b for a, b in zip(numbers, numbers[1:], strict=False))
-    assert len(set(numbers)) > 90
+    assert len(set(numbers)) > 45
     assert min(numbers) >= 1
-    assert bench.link.quality(bench.now_ns).robot_resets == 150
+    assert bench.link.quality(bench.now_ns).robot_resets == 60
 
 
 def test_stamps_increase_strictly_with_a_stopped_clock():

@@ -370,9 +370,9 @@ def test_key_mismatch_is_reported(here, there, expected):
 # -- jog ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('key', [b'', KEY], ids=['open', 'keyed'])
-@pytest.mark.parametrize('wheel', [jog.LEFT, jog.RIGHT])
-@pytest.mark.parametrize('revolutions', [1.0, -0.3])
+@pytest.mark.parametrize(
+    'key, wheel, revolutions', [(b'', jog.LEFT, 1.0), (KEY, jog.LEFT, -0.3), (KEY, jog.RIGHT, 0.5)]
+)
 def test_jog_turns_one_wheel_and_disables_the_drives(key, wheel, revolutions):
     bench = ToolBench(key)
     task, reported = bench.jog(wheel, revolutions, key)

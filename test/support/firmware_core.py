@@ -1,16 +1,19 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The firmware core as a library for this machine, its driver, and reference implementations.
+"""The firmware core as a library for this machine, and its driver.
 
-Time is virtual: the step interrupt runs every 50 us, the main loop every 200 us.
+Time is virtual: the step interrupt runs every 50 us, the main loop every 200 us. Framing and
+SipHash of the host are the reference of those of the firmware.
 """
 
-from binascii import crc_hqx
 import ctypes
 import math
 from pathlib import Path
 import struct
 import subprocess
+
+from t3mpc_ros.radio.protocol.authentication import siphash
+from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
 
 FIRMWARE = Path(__file__).resolve().parents[2] / 'firmware'
 KEY = bytes(range(0x80, 0x90))
@@ -214,7 +217,7 @@ class Robot(Part):
         self.run(us)
         room = ctypes.create_string_buffer(4096)
         size = self.call('usb_take', room, ctypes.c_uint32(4096))
-        return [decode_frame(piece) for piece in room.raw[:size].split(b'\0')[:-1]]
+        return FrameDecoder().feed(room.raw[:size])
 
     def settings(self, channel=None, microsteps=16, address=ADDRESS, us=200_000):
         """Store settings over USB, or read them.
@@ -270,7 +273,7 @@ class Dongle(Part):
         return room.raw[:size]
 
     def frames(self):
-        return [decode_frame(piece) for piece in self.read().split(b'\0')[:-1]]
+        return FrameDecoder().feed(self.read())
 
 
 class Decoder(Part):
@@ -308,76 +311,3 @@ def c_encode(library, kind, numbers, nonce=False):
     room = ctypes.create_string_buffer(32)
     size = library.t3_host_encode(ctypes.c_uint8(kind), fields, ctypes.c_bool(nonce), room)
     return room.raw[:size]
-
-
-# -- reference implementations --------------------------------------------------------------------
-
-
-def cobs_encode(data):
-    return b''.join(bytes([len(run) + 1]) + run for run in data.split(b'\0'))
-
-
-def cobs_decode(encoded):
-    runs, rest = [], encoded
-    while rest:
-        run, rest = rest[1 : rest[0]], rest[rest[0] :] if len(rest) >= rest[0] else None
-        if rest is None:
-            return None
-        runs.append(run)
-    return b'\0'.join(runs)
-
-
-def encode_frame(frame):
-    return cobs_encode(frame + crc_hqx(frame, 0xFFFF).to_bytes(2, 'little')) + b'\0'
-
-
-def decode_frame(piece):
-    data = cobs_decode(piece)
-    assert crc_hqx(data[:-2], 0xFFFF) == int.from_bytes(data[-2:], 'little')
-    return data[:-2]
-
-
-def siphash(key, message):
-    """SipHash-2-4 from the paper, in integers of unlimited size."""
-    limit = 1 << 64
-
-    def rotate(word, by):
-        return (word << by | word >> (64 - by)) % limit
-
-    def rounds(v0, v1, v2, v3, count):
-        for _ in range(count):
-            v0, v2 = (v0 + v1) % limit, (v2 + v3) % limit
-            v1, v3 = rotate(v1, 13) ^ v0, rotate(v3, 16) ^ v2
-            v0 = rotate(v0, 32)
-            v2, v0 = (v2 + v1) % limit, (v0 + v3) % limit
-            v1, v3 = rotate(v1, 17) ^ v2, rotate(v3, 21) ^ v0
-            v2 = rotate(v2, 32)
-        return v0, v1, v2, v3
-
-    k0, k1 = struct.unpack('<QQ', key)
-    start = struct.unpack('>4Q', b'somepseudorandomlygeneratedbytes')
-    v = [word ^ half for word, half in zip(start, (k0, k1, k0, k1), strict=True)]
-    padded = message + bytes(-(len(message) + 1) % 8) + bytes([len(message) % 256])
-    for (word,) in struct.iter_unpack('<Q', padded):
-        v[3] ^= word
-        v = list(rounds(*v, 2))
-        v[0] ^= word
-    v[2] ^= 0xFF
-    v0, v1, v2, v3 = rounds(*v, 4)
-    return (v0 ^ v1 ^ v2 ^ v3).to_bytes(8, 'little')
-
-
-def split_stream(data):
-    """Return the valid frames of a stream, and (valid, CRC errors, frame errors)."""
-    found, crc_errors, frame_errors = [], 0, 0
-    for piece in data.split(b'\0')[:-1]:
-        if not piece:
-            continue
-        body = cobs_decode(piece) if len(piece) <= 81 else None
-        if body is None or len(body) < 3:
-            frame_errors += 1
-        elif crc_hqx(body[:-2], 0xFFFF) != int.from_bytes(body[-2:], 'little'):
-            crc_errors += 1
-        else:
-            found.append(body[:-2])
-    return found, (len(found), crc_errors, frame_errors)
