@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures of the node tests."""
 
+from types import SimpleNamespace
+
 import pytest
 
 
@@ -13,3 +15,23 @@ def harness(ros):
     made = NodeHarness()
     yield made
     made.close()
+
+
+@pytest.fixture
+def execute(graph, capfd):
+    """Return a function that runs an executable in this process until its nodes have started."""
+    from t3mpc_ros.nodes.common.entry_point import run
+
+    class Stop:
+        exit_at_once = False
+
+        def __call__(self):
+            return True
+
+    def execute(name, *arguments):
+        """Return the exit code, and what was written to standard output and error."""
+        code = run(name, Stop(), [name, *arguments])
+        output = capfd.readouterr()
+        return SimpleNamespace(code=code, out=output.out, err=output.err)
+
+    return execute

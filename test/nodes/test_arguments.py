@@ -2,42 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Command line of the node executables: help, version, rejection of unknown arguments."""
 
-from fnmatch import fnmatch
-import subprocess
-
 import pytest
 
 import t3mpc_ros
-from t3mpc_ros.cli.process_group import executable
 from t3mpc_ros.nodes.arguments import unknown_arguments, unmatched_files, user_arguments
-from t3mpc_ros.nodes.composed import ComposedNode
-from t3mpc_ros.nodes.controller import ControllerNode
-from t3mpc_ros.nodes.player.node import PlayerNode
-from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
-from t3mpc_ros.nodes.recorder.node import RecorderNode
-from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
 from t3mpc_ros.nodes.registry import INTERFACES, NODES, parameter_class
-from t3mpc_ros.nodes.sim_robot import SimRobotNode
-
-NODE_CLASSES = {
-    'reference_generator': ReferenceGeneratorNode,
-    'controller': ControllerNode,
-    'sim_robot': SimRobotNode,
-    'radio_bridge': RadioBridgeNode,
-    'recorder': RecorderNode,
-    'player': PlayerNode,
-    'composed': ComposedNode,
-}
-CONDITIONAL = ('/clock', '/tf')
-"""Topics that a node publishes only with some parameters or libraries."""
-FROM_RCLPY = ('/rosout', '/parameter_events', '~/*parameter*', '~/get_type_description', '/clock')
-"""Topics and services that rclpy adds to every node."""
-
-
-def _run(name, *arguments):
-    return subprocess.run(
-        [executable(name), *arguments], capture_output=True, text=True, timeout=60
-    )
 
 
 def test_ros_arguments_end_at_a_double_dash():
@@ -86,57 +55,68 @@ def test_a_parameter_file_without_effect_is_named(content, node, matches, tmp_pa
 
 
 @pytest.mark.ros
-@pytest.mark.parametrize(
-    'name, words', [('controller', ['--gain', '30']), ('player', ['mybag']), ('composed', ['-x'])]
-)
-def test_unknown_arguments_end_the_process_with_code_2(name, words, graph):
-    """The words were ignored and the node started."""
-    done = _run(name, *words)
-    assert done.returncode == 2
-    assert done.stderr.startswith(f'{name}: unknown argument')
-    assert done.stderr.count('\n') == 1
+def test_a_parameter_file_without_effect_is_a_warning(execute, tmp_path):
+    file = tmp_path / 'own.yaml'
+    file.write_text('contoller: {ros__parameters: {rate: 50.0}}')
+    done = execute('controller', '--ros-args', '--params-file', str(file))
+    assert done.code == 0
+    assert f'{file} sets nothing: its keys /contoller' in done.err
+
+
+INVALID = [
+    ('controller', '--gain 30', 'unknown argument'),
+    ('player', 'mybag', 'unknown argument'),
+    ('composed', '-x', 'unknown argument'),
+    ('controller', '--ros-args -p law.gain:=-1.0', 'law.gain', '0', '-1'),
+    ('controller', '--ros-args -p law.gian:=1.0', 'law.gian', 'did you mean law.gain'),
+    ('controller', '--ros-args -p model:=BROKEN', 'BROKEN', 'not a model file'),
+    ('reference_generator', '--ros-args -p rate:=fast', 'rate', 'a number', 'fast'),
+    ('sim_robot', '--ros-args -p drive.kind:=warp', 'drive.kind', 'one of', 'warp'),
+    ('sim_robot', '--ros-args -p world:=rome', 'rome', 'did you mean room?'),
+    (
+        'sim_robot',
+        '--ros-args -p faults.schedule:=rough_rid',
+        'rough_rid',
+        'did you mean rough_ride?',
+    ),
+    (
+        'sim_robot',
+        '--ros-args -p real_time_factor:=10.0',
+        'publish_clock must be true',
+        'real_time_factor 10',
+    ),
+    ('recorder', '--ros-args --params-file MISSING', 'MISSING', 'cannot read'),
+    ('recorder', '--ros-args --params-file BROKEN', 'BROKEN', 'not valid YAML'),
+    ('recorder', '--ros-args -p storage.uri:=FILE/bag', 'FILE/bag'),
+]
+"""Executable, arguments, and the words of the one line that it prints."""
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize('case', INVALID, ids=' '.join)
+def test_invalid_input_at_start_is_one_line_and_code_2(case, execute, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'BROKEN').write_text('controller:\n  ros__parameters: [1,\n')
+    (tmp_path / 'FILE').write_text('a file where a folder is wanted')
+    name, arguments, *words = case
+    done = execute(name, *arguments.split())
+    assert done.code == 2
+    (line,) = (line for line in done.err.splitlines() if not line.startswith('['))
+    assert line.startswith(f'{name}: ')
+    for word in words:
+        assert word in line
 
 
 @pytest.mark.ros
 @pytest.mark.parametrize('name', NODES)
-def test_help_lists_topics_services_and_parameters(name, graph):
+def test_help_lists_topics_services_and_parameters(name, execute):
     """``--help`` started the node."""
-    done = _run(name, '--help')
-    assert (done.returncode, done.stderr) == (0, '')
+    done = execute(name, '--help')
+    assert (done.code, done.err) == (0, '')
     interface = INTERFACES[name]
     for word in (*interface.subscribes, *interface.publishes, *interface.services):
-        assert word in done.stdout
+        assert word in done.out
     for spec in parameter_class(name).specs():
-        assert f' {spec.name} = ' in done.stdout
-
-
-@pytest.mark.parametrize('name', [*NODES, 't3mpc'])
-def test_version_is_printed(name):
-    done = _run(name, '--version')
-    assert (done.returncode, done.stdout) == (0, f't3mpc_ros {t3mpc_ros.__version__}\n')
-
-
-@pytest.mark.ros
-@pytest.mark.parametrize('name', NODES)
-def test_interfaces_describe_the_running_nodes(name, harness, tmp_path):
-    given = {'storage.uri': str(tmp_path / 'bag')} if name == 'recorder' else {}
-    node = harness.add(NODE_CLASSES[name], **given)
-    own = node.get_name(), node.get_namespace()
-    found = {
-        'subscribes': node.get_subscriber_names_and_types_by_node(*own),
-        'publishes': node.get_publisher_names_and_types_by_node(*own),
-        'services': node.get_service_names_and_types_by_node(*own),
-    }
-
-    def full_name(pattern):
-        return pattern.replace('~', f'/{node.get_name()}') if pattern[0] in '~/' else f'/{pattern}'
-
-    for kind, endpoints in found.items():
-        patterns = [full_name(pattern) for pattern in getattr(INTERFACES[name], kind)]
-        ignored = [full_name(pattern) for pattern in FROM_RCLPY]
-        names = [topic for topic, _ in endpoints]
-        for topic in names:
-            assert any(fnmatch(topic, each) for each in (*patterns, *ignored)), f'{kind} {topic}'
-        for pattern in patterns:
-            wanted = pattern not in CONDITIONAL and pattern != '/*'
-            assert not wanted or any(fnmatch(topic, pattern) for topic in names), pattern
+        assert f' {spec.name} = ' in done.out
+    done = execute(name, '--version')
+    assert (done.code, done.out) == (0, f't3mpc_ros {t3mpc_ros.__version__}\n')

@@ -49,12 +49,3 @@ def test_two_publishers_of_commands_are_named(harness):
 def test_simulated_time_without_a_clock_is_named(kind, harness):
     node = harness.add(kind, use_sim_time=True)
     wait_for_warning(harness, node.get_name(), 'no message on /clock yet')
-
-
-def test_a_parameter_file_without_effect_is_named(processes, tmp_path):
-    file = tmp_path / 'own.yaml'
-    file.write_text('contoller: {ros__parameters: {rate: 50.0}}')
-    processes.start('controller', '--ros-args', '--params-file', str(file))
-    processes.wait_ready('controller')
-    assert f'{file} sets nothing: its keys /contoller' in processes.log('controller').read_text()
-    assert processes.stop('controller') == 0

@@ -5,8 +5,9 @@
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 import pytest
+from rcl_interfaces.msg import Log
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from support.ros_graph import diagnostic, odometry, reason, twist
+from support.ros_graph import LATCHED, diagnostic, odometry, reason, twist
 
 from t3mpc_ros.nodes.common import qos
 from t3mpc_ros.nodes.common.base_node import WARN
@@ -96,12 +97,11 @@ def test_an_invalid_override_is_rejected_with_the_reason(override, words, harnes
         harness.add(SimRobotNode, ['-p', f'qos_overrides./odom.{override}'])
 
 
-def test_an_override_without_endpoint_is_a_warning(processes):
-    processes.start(
-        'sim_robot', '--ros-args', '-p', ODOM_OVERRIDE.format('subscription', 'reliable')
-    )
-    processes.wait_for('sim_robot', 'qos_overrides./odom.subscription.reliability has no effect')
-    assert processes.stop('sim_robot') == 0
+def test_an_override_without_endpoint_is_a_warning(harness):
+    log = harness.subscribe(Log, '/rosout', LATCHED)
+    harness.add(SimRobotNode, ['-p', ODOM_OVERRIDE.format('subscription', 'reliable')])
+    words = 'qos_overrides./odom.subscription.reliability has no effect'
+    harness.spin_until(lambda: any(words in entry.msg for entry in log))
 
 
 @pytest.mark.parametrize('expected', [Twist, TwistStamped])

@@ -11,31 +11,19 @@ import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
-from support.ros_graph import diagnostic, is_ok, on_grid, reason, speed, stamp
+from support.ros_graph import NODE_CLASSES, diagnostic, is_ok, on_grid, reason, speed, stamp
 
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.common import conversions
 from t3mpc_ros.nodes.common.base_node import OK, WARN
 from t3mpc_ros.nodes.composed import ComposedNode
 from t3mpc_ros.nodes.controller import ControllerNode
-from t3mpc_ros.nodes.player.node import PlayerNode
-from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
 from t3mpc_ros.nodes.recorder.node import RecorderNode
 from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
 from t3mpc_ros.nodes.registry import NODES
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
 
 pytestmark = pytest.mark.ros
-
-NODE_CLASSES = {
-    'reference_generator': ReferenceGeneratorNode,
-    'controller': ControllerNode,
-    'sim_robot': SimRobotNode,
-    'radio_bridge': RadioBridgeNode,
-    'recorder': RecorderNode,
-    'player': PlayerNode,
-    'composed': ComposedNode,
-}
 
 LATE_DURABILITIES = (DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL)
 

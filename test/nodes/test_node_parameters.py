@@ -2,57 +2,73 @@
 # SPDX-License-Identifier: Apache-2.0
 """ROS parameters of all nodes."""
 
+from fnmatch import fnmatch
 import math
 
 import pytest
 from rclpy.parameter import Parameter
+from support.ros_graph import NODE_CLASSES
 
-from t3mpc_ros.nodes.composed import ComposedNode
 from t3mpc_ros.nodes.controller import ControllerNode
-from t3mpc_ros.nodes.player.node import PlayerNode
-from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
 from t3mpc_ros.nodes.recorder.node import RecorderNode
-from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
-from t3mpc_ros.nodes.registry import NODES, parameter_class
+from t3mpc_ros.nodes.registry import INTERFACES, NODES, parameter_class
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
 from t3mpc_ros.parameters.table import ParameterError
 
 pytestmark = pytest.mark.ros
 
-NODE_CLASSES = {
-    'reference_generator': ReferenceGeneratorNode,
-    'controller': ControllerNode,
-    'sim_robot': SimRobotNode,
-    'radio_bridge': RadioBridgeNode,
-    'recorder': RecorderNode,
-    'player': PlayerNode,
-    'composed': ComposedNode,
-}
+CONDITIONAL = ('/clock', '/tf')
+"""Topics that a node publishes only with some parameters or libraries."""
+FROM_RCLPY = ('/rosout', '/parameter_events', '~/*parameter*', '~/get_type_description', '/clock')
+"""Topics and services that rclpy adds to every node."""
 
 
 @pytest.mark.parametrize('name', NODES)
-def test_every_specification_is_a_described_parameter(name, harness, tmp_path):
+def test_a_running_node_is_as_it_is_described(name, harness, tmp_path):
+    """Its topics, services and parameters."""
     given = {'storage.uri': str(tmp_path / 'bag')} if name == 'recorder' else {}
     node = harness.add(NODE_CLASSES[name], **given)
+    _check_interface(node, INTERFACES[name])
     rows = parameter_class(name).specs()
     assert rows
     for row in rows:
-        described = node.describe_parameter(row.name)
-        assert described.description.startswith(row.text)
-        if row.unit:
-            assert f'[{row.unit}]' in described.description, row.name
-        assert described.additional_constraints == row.bounds()
-        assert described.read_only == (not row.dynamic)
-        if not row.many and (row.low is not None or row.high is not None):
-            ranges = described.floating_point_range or described.integer_range
-            assert len(ranges) == 1, row.name
-            if row.low is not None:
-                assert ranges[0].from_value == row.low, row.name
-            if row.high is not None:
-                assert ranges[0].to_value == row.high, row.name
+        _check_description(node.describe_parameter(row.name), row)
         value = node.get_parameter(row.name).value
         if row.name not in given:
             assert (tuple(value) if row.many else value) == row.default, row.name
+
+
+def _check_interface(node, interface):
+    own = node.get_name(), node.get_namespace()
+    found = {
+        'subscribes': node.get_subscriber_names_and_types_by_node(*own),
+        'publishes': node.get_publisher_names_and_types_by_node(*own),
+        'services': node.get_service_names_and_types_by_node(*own),
+    }
+
+    def full_name(pattern):
+        return pattern.replace('~', f'/{node.get_name()}') if pattern[0] in '~/' else f'/{pattern}'
+
+    ignored = [full_name(pattern) for pattern in FROM_RCLPY]
+    for kind, endpoints in found.items():
+        patterns = [full_name(pattern) for pattern in getattr(interface, kind)]
+        names = [topic for topic, _ in endpoints]
+        for topic in names:
+            assert any(fnmatch(topic, each) for each in (*patterns, *ignored)), f'{kind} {topic}'
+        for pattern in patterns:
+            wanted = pattern not in CONDITIONAL and pattern != '/*'
+            assert not wanted or any(fnmatch(topic, pattern) for topic in names), pattern
+
+
+def _check_description(described, row):
+    assert described.description.startswith(row.text)
+    assert not row.unit or f'[{row.unit}]' in described.description, row.name
+    assert described.additional_constraints == row.bounds()
+    assert described.read_only == (not row.dynamic)
+    if not row.many and (row.low is not None or row.high is not None):
+        (limits,) = described.floating_point_range or described.integer_range
+        assert row.low is None or limits.from_value == row.low, row.name
+        assert row.high is None or limits.to_value == row.high, row.name
 
 
 @pytest.mark.parametrize('name', ['controller', 'sim_robot'])

@@ -10,7 +10,7 @@ import pytest
 
 from t3mpc_ros.bag.reader import missing_sample_ratio, open_bag
 from t3mpc_ros.cli.private_graph import PrivateGraph
-from t3mpc_ros.cli.process_group import ProcessError, ProcessGroup
+from t3mpc_ros.cli.process_group import ProcessGroup
 from t3mpc_ros.geometry.types import NANOSECONDS
 
 pytestmark = [pytest.mark.ros, pytest.mark.alone]
@@ -184,48 +184,6 @@ def test_composed_closes_the_loop_in_one_process(processes, tmp_path):
     assert speed.max() > 0.02
     with open_bag(bag) as recording:
         assert missing_sample_ratio(recording.series('/odom', {})['stamp'], 100.0) < 0.01
-
-
-@pytest.mark.parametrize(
-    'name, arguments, words',
-    [
-        ('controller', ['--ros-args', '-p', 'law.gain:=-1.0'], ['law.gain', '0', '-1']),
-        (
-            'controller',
-            ['--ros-args', '-p', 'law.gian:=1.0'],
-            ['law.gian', 'did you mean law.gain'],
-        ),
-        ('reference_generator', ['--ros-args', '-p', 'rate:=fast'], ['rate', 'a number', 'fast']),
-        ('sim_robot', ['--ros-args', '-p', 'drive.kind:=warp'], ['drive.kind', 'one of', 'warp']),
-        ('recorder', ['--ros-args', '--params-file', 'MISSING'], ['MISSING', 'cannot read']),
-        ('recorder', ['--ros-args', '--params-file', 'BROKEN'], ['BROKEN', 'not valid YAML']),
-        ('recorder', ['--ros-args', '-p', 'storage.uri:=FILE/bag'], ['FILE/bag']),
-        ('controller', ['--ros-args', '-p', 'model:=BROKEN'], ['BROKEN', 'not a model file']),
-    ],
-)
-def test_invalid_input_at_start_is_one_line_and_code_2(
-    name, arguments, words, processes, tmp_path
-):
-    (tmp_path / 'BROKEN').write_text('controller:\n  ros__parameters: [1,\n')
-    (tmp_path / 'FILE').write_text('a file where a folder is wanted')
-    places = {word: str(tmp_path / word) for word in ('BROKEN', 'FILE', 'MISSING')}
-    given = list(arguments)
-    for word, path in places.items():
-        given = [argument.replace(word, path) for argument in given]
-    processes.start(name, *given)
-    with pytest.raises(ProcessError, match='code 2'):
-        processes.wait_ready(name)
-    status = processes.log(name).read_text()
-    assert 'Traceback' not in status
-    line = next(line for line in status.splitlines() if line.startswith(f'{name}: '))
-    for word in words:
-        assert word in line
-
-
-def test_an_integer_for_a_float_parameter_is_accepted(processes):
-    processes.start('controller', '--ros-args', '-p', 'law.gain:=5')
-    processes.wait_ready('controller')
-    assert processes.stop('controller') == 0
 
 
 def test_a_process_ends_without_interpreter_teardown(tmp_path, monkeypatch, request):

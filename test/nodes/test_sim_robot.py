@@ -29,7 +29,6 @@ from support.ros_graph import (
 
 from t3mpc_ros.cli.demo import DemoOptions
 from t3mpc_ros.cli.main import _parser
-from t3mpc_ros.cli.process_group import ProcessError
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.common.base_node import OK, WARN
 from t3mpc_ros.nodes.recorder.node import RecorderNode
@@ -316,25 +315,6 @@ def test_the_initial_pose_is_used_unless_within_a_wall(harness):
     words = r'initial_pose.x and initial_pose.y: pose must be .* got x 1.95 m'
     with pytest.raises(ParameterError, match=words):
         harness.add(SimRobotNode, namespace='other', world='room', initial_pose__x=1.95)
-
-
-@pytest.mark.parametrize(
-    'given, words',
-    [
-        ({'world': 'rome'}, ['rome', 'did you mean room?']),
-        ({'faults.schedule': 'rough_rid'}, ['rough_rid', 'did you mean rough_ride?']),
-        ({'real_time_factor': 10.0}, ['publish_clock must be true', 'real_time_factor 10']),
-    ],
-)
-def test_unusable_parameters_end_the_process_with_code_2(given, words, processes):
-    processes.start('sim_robot', parameters=given)
-    with pytest.raises(ProcessError, match='code 2'):
-        processes.wait_ready('sim_robot')
-    lines = processes.log('sim_robot').read_text().splitlines()
-    (line,) = (line for line in lines if line.startswith('sim_robot: '))
-    for word in words:
-        assert word in line
-    assert not any('Traceback' in line for line in lines)
 
 
 # -- simulated time -------------------------------------------------------------------------------

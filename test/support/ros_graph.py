@@ -18,7 +18,24 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.common import conversions
 from t3mpc_ros.nodes.common.base_node import OK
+from t3mpc_ros.nodes.composed import ComposedNode
 from t3mpc_ros.nodes.controller import ControllerNode
+from t3mpc_ros.nodes.player.node import PlayerNode
+from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
+from t3mpc_ros.nodes.recorder.node import RecorderNode
+from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
+from t3mpc_ros.nodes.sim_robot import SimRobotNode
+
+NODE_CLASSES = {
+    'reference_generator': ReferenceGeneratorNode,
+    'controller': ControllerNode,
+    'sim_robot': SimRobotNode,
+    'radio_bridge': RadioBridgeNode,
+    'recorder': RecorderNode,
+    'player': PlayerNode,
+    'composed': ComposedNode,
+}
+"""Classes of all nodes by executable."""
 
 TIMEOUT = 90.0
 """Timeout of a condition on a busy machine, s; usually a fraction of it passes."""
