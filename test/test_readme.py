@@ -41,9 +41,8 @@ BRIDGE = 'scripts/run radio_bridge --ros-args -p port:=dongle'
 CHANGES = '--set twin.faults.load_change=1.5 --set robot_clock_error=0.005'
 FAULTS = '--fault jam:10:1 --fault robot_reset:20 --fault loss:30:10:0.3'
 SHORTENED = {
-    # Long enough for training.
-    DEMO: (['--duration', '20', '--headless', '--output', 'OUTPUT/run'], False),
-    'scripts/check': (['--version'], False),  # runs this test
+    DEMO: (['--duration', '8', '--headless', '--output', 'OUTPUT/run'], False),
+    'scripts/check': ([], False),
     'scripts/run sim_robot --ros-args -p world:=room': ([], True),
     'scripts/run sim_robot --ros-args -p world:=room -p faults.schedule:=rough_ride': ([], True),
     'scripts/run t3mpc --help': ([], False),
@@ -347,6 +346,8 @@ def test_the_commands_of_the_page_work(page, commands, output, tmp_path, graph):
 
 def _work(command, output, tmp_path):
     """Run a command, and stop one that does not end by itself; fail if it does."""
+    if command == 'scripts/check':
+        return  # it is what runs this test
     extra, endless = SHORTENED[command]
     arguments = shlex.split(command.replace('runs/latest', 'run'))
     arguments += [word.replace('OUTPUT', str(output)) for word in extra]

@@ -26,6 +26,7 @@ STAND_IN = """#!{python}
 import os, pathlib, signal, sys, time
 name = pathlib.Path(sys.argv[0]).name
 pathlib.Path('{folder}', name + '.pid').write_text(str(os.getpid()))
+pathlib.Path('{folder}', name + '.domain').write_text(os.environ.get('ROS_DOMAIN_ID', ''))
 for number in {ignored}:
     signal.signal(number, lambda *_: pathlib.Path('{folder}', name + '.asked').touch())
 for text in {output}.get(name, ()):
@@ -187,13 +188,21 @@ def test_a_wait_shows_progress(tmp_path, monkeypatch):
     assert re.fullmatch(r'controller, \d+ s: controller ready', shown[-1])
 
 
-def test_the_demo_names_what_it_waits_for(tmp_path):
-    demo = start_demo(tmp_path, stand_ins(tmp_path), '--duration', '1')
-    _, errors = demo.communicate(timeout=TIMEOUT)
-    lines = [line.strip() for line in errors.splitlines()]
-    expected = [f'starting {name}' for name in NODES] + ['waiting for discovery']
-    assert [line for line in lines if line in expected] == expected
-    assert any(re.search(r'running: ', line) for line in lines)
+def test_the_demo_names_what_it_waits_for_and_its_own_domain(tmp_path):
+    """Two demos at once; their nodes once met in the domain of the caller."""
+    folders = [tmp_path / 'one', tmp_path / 'two']
+    demos = [start_demo(each, stand_ins(each), '--duration', '1') for each in folders]
+    domains = []
+    for folder, demo in zip(folders, demos, strict=True):
+        _, errors = demo.communicate(timeout=TIMEOUT)
+        lines = [line.strip() for line in errors.splitlines()]
+        expected = [f'starting {name}' for name in NODES] + ['waiting for discovery']
+        assert [line for line in lines if line in expected] == expected
+        assert any(re.search(r'running: ', line) for line in lines)
+        (domain,) = {(folder / f'{name}.domain').read_text() for name in NODES}
+        assert f'ROS_DOMAIN_ID {domain}, on loopback' in lines
+        domains.append(domain)
+    assert domains[0] != domains[1]
 
 
 def test_the_link_latest_leads_to_the_last_run(tmp_path):
@@ -252,6 +261,7 @@ def test_a_domain_with_a_participant_is_left_out():
 
 @pytest.mark.ros
 @pytest.mark.slow
+@pytest.mark.long
 def test_two_demos_at_once_do_not_meet(graph, tmp_path):
     demos = []
     for i in range(2):

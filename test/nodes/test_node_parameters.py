@@ -4,10 +4,12 @@
 
 from fnmatch import fnmatch
 import math
+from pathlib import Path
 
 import pytest
 from rclpy.parameter import Parameter
 from support.ros_graph import NODE_CLASSES
+import yaml
 
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.recorder.node import RecorderNode
@@ -16,6 +18,8 @@ from t3mpc_ros.nodes.sim_robot import SimRobotNode
 from t3mpc_ros.parameters.table import ParameterError
 
 pytestmark = pytest.mark.ros
+
+ROOT = Path(__file__).resolve().parents[2]
 
 CONDITIONAL = ('/clock', '/tf')
 """Topics that a node publishes only with some parameters or libraries."""
@@ -131,3 +135,48 @@ def test_an_unknown_parameter_is_rejected_with_a_suggestion(harness):
         harness.add(ControllerNode, law__gian=5.0)
     # One parameter file may hold the parameters of several nodes.
     harness.add(ControllerNode, publish_clock=True)
+
+
+# -- files of config/ -----------------------------------------------------------------------------
+
+CHANGED = {
+    'controller': ('terms_rate', 12.5),
+    'recorder': ('storage.chunk_size', 4096),
+    'player': ('play.rate', 2.5),
+    'radio_bridge': ('port', '/dev/other'),
+    'reference_generator': ('seed', 77),
+    'sim_robot': ('noise.variance', 0.0625),
+}
+"""One parameter of each node with a value that is not its default."""
+
+
+@pytest.mark.parametrize('name', CHANGED)
+def test_each_yaml_reaches_its_node_with_and_without_a_namespace(name, harness, tmp_path):
+    """The key matches ``/controller`` and ``/robot_1/controller``.
+
+    The file is loaded, then a copy with one value that differs from the default: a key that
+    matches no node fails.
+    """
+    installed = ROOT / 'config' / f'{name}.yaml'
+    parameter, value = CHANGED[name]
+    assert parameter_class(name).from_dict({}).to_dict()[parameter] != value
+    content = yaml.safe_load(installed.read_text())
+    (entry,) = content.values()
+    *parents, leaf = parameter.split('.')
+    branch = entry['ros__parameters']
+    for parent in parents:
+        branch = branch.setdefault(parent, {})
+    branch[leaf] = value
+    changed = tmp_path / 'changed.yaml'
+    changed.write_text(yaml.safe_dump(content))
+    files = ['--params-file', str(installed), '--params-file', str(changed)]
+    given = {'storage.uri': str(tmp_path / 'bag')} if name == 'recorder' else {}
+    for namespace in ('/', '/robot_1'):
+        node = harness.add(NODE_CLASSES[name], files, namespace=namespace, **given)
+        assert node.get_parameter(parameter).value == value
+
+
+def test_every_yaml_is_tested():
+    # The files of other robots: test_launch_files.py
+    tested = set(CHANGED) | {'generic', 'paper_robot', 'turtlebot3'}
+    assert {path.stem for path in (ROOT / 'config').glob('*.yaml')} == tested

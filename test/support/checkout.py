@@ -1,0 +1,26 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Copies of the package, and an environment without the variables of the user's setup."""
+
+import os
+from pathlib import Path
+import re
+import shutil
+
+ROOT = Path(__file__).resolve().parents[2]
+EXECUTABLES = set(re.findall(r"f'(\w+) = \{NAME\}", (ROOT / 'setup.py').read_text()))
+# Variables of the user's ROS, workspace and pip, removed for the tests.
+FOREIGN = ('PYTHONPATH', 'AMENT_PREFIX_PATH', 'COLCON_', 'PIP_', 'UV_', 'T3MPC_')
+
+
+def clean_environment(**extra):
+    """Return the environment of this process without the variables of the user's setup."""
+    kept = {key: value for key, value in os.environ.items() if not key.startswith(FOREIGN)}
+    return kept | {key: str(value) for key, value in extra.items()}
+
+
+def copy_package(destination):
+    """Copy the package without the files that version control ignores."""
+    ignored = [line.rstrip('/') for line in (ROOT / '.gitignore').read_text().split()]
+    shutil.copytree(ROOT, destination, ignore=shutil.ignore_patterns('.git', *ignored))
+    return destination
