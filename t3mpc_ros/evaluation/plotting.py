@@ -77,8 +77,12 @@ def png_of(draw: Callable[[Subject], Any], subject: Subject) -> bytes | None:
         figure = draw(subject)
         if figure is None:
             return None
+        figure.set_dpi(150)
+        # savefig would draw the whole figure once more for its layout.
+        figure.get_layout_engine().execute(figure)
+        figure.set_layout_engine('none')
         buffer = io.BytesIO()
-        figure.savefig(buffer, format='png', dpi=150)
+        figure.canvas.print_png(buffer)
         return buffer.getvalue()
 
 

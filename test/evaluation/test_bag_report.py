@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
+from support.unrendered import RENDERED, unrendered  # noqa: F401 - a fixture
 import yaml
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.bag import main as bag_main
 from t3mpc_ros.cli.main import main as t3mpc
+from t3mpc_ros.evaluation import plotting
 from t3mpc_ros.evaluation.bag_report.continuity import continuity_notes, parts
 from t3mpc_ros.evaluation.bag_report.link_history import link_metrics
 from t3mpc_ros.evaluation.bag_report.report_page import write_report
@@ -36,6 +38,8 @@ from t3mpc_ros.evaluation.bag_report.topic_roles import (
     ReportOptions,
 )
 from t3mpc_ros.evaluation.plotting import every_nth
+
+pytestmark = pytest.mark.usefixtures('unrendered')
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 TYPES = STORE.types
@@ -232,7 +236,8 @@ def test_a_bag_of_another_robot_has_a_report(rows, tmp_path, capsys, kind):
     assert 'wheel' not in page.split('<h2>From command')[1].split('<figure>')[0]
 
 
-def test_one_file_is_a_bag_too(rows, tmp_path, capsys):
+def test_one_file_is_a_bag_too(rows, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(plotting, 'png_of', RENDERED)
     folder = write(tmp_path / 'bag', rows[:300])
     (file,) = folder.glob('*.mcap')
     assert bag_main(['report', str(file), '--output', str(tmp_path / 'out')]) == 0

@@ -140,7 +140,10 @@ EXPECTED = {
 }
 
 
-@pytest.mark.parametrize('name', few_of(EXPECTED, 4))
+SHORT = ('command_delay 0.1 s', 'gyro_bias_jump 0.35 rad/s')
+
+
+@pytest.mark.parametrize('name', few_of(dict.fromkeys((*SHORT, *EXPECTED)), len(SHORT)))
 def test_the_loop_stays_bounded_or_stops_with_a_reason(name):
     """One strength of each fault, and the page says of it what comes out here."""
     result = run_fault(fault_run('chaotic', name))
@@ -154,12 +157,15 @@ def test_every_fault_is_among_those_expected():
 
 @pytest.mark.parametrize(
     'course, name',
-    [
-        ('straight', 'wheel_blocked both'),
-        ('straight', 'gyro_bias_jump 0.02 rad/s'),
-        ('straight', 'collision, head-on'),
-        ('arc', 'collision, at a slant'),
-    ],
+    few_of(
+        [
+            ('straight', 'wheel_blocked both'),
+            ('straight', 'collision, head-on'),
+            ('straight', 'gyro_bias_jump 0.02 rad/s'),
+            ('arc', 'collision, at a slant'),
+        ],
+        2,
+    ),
 )
 def test_undetected_faults_are_named(course, name):
     result = run_fault(fault_run(course, name))
@@ -281,8 +287,6 @@ def test_command_writes_the_table_between_the_marks(two, tmp_path, capsys):
     assert 'old' not in text
     assert text.count('| `gyro_dead` |') == 2
     assert [one['course'] for one in json.loads(numbers.read_text())] == ['chaotic', 'straight']
-    assert main(['faults', '--output', str(page)]) == 0
-    assert page.read_text() == text
 
 
 @pytest.mark.parametrize('text', ['', BEGIN_MARK, f'{END_MARK}{BEGIN_MARK}', 2 * BEGIN_MARK])

@@ -16,6 +16,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 from scipy import stats
+from support.unrendered import unrendered  # noqa: F401 - a fixture
 
 from t3mpc_ros.cli.paper import add_parser
 from t3mpc_ros.evaluation.closed_loop import LoopRecord
@@ -834,6 +835,7 @@ def test_the_markdown_holds_the_numbers_of_the_json(folder):
         assert len({line.count('|') for line in block}) == 1
 
 
+@pytest.mark.usefixtures('unrendered')
 def test_nothing_depends_on_the_order_of_the_runs_or_on_a_resume(folder, tmp_path):
     lines = (folder / RUNS).read_text().splitlines(keepends=True)
     (tmp_path / RUNS).write_text(''.join(lines[::-3]) + lines[1][:-9])

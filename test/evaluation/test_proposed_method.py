@@ -3,6 +3,7 @@
 """Our controller in the offline loop: the same as the node's, and better with each part."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -66,6 +67,7 @@ def test_the_offline_loop_is_the_loop_of_the_nodes(noise):
 SEEDS = (1, 2, 3, 4, 5)
 
 
+@cache
 def _errors(drive, noise, case='nominal', **changes):
     given = {'speed_filter.noise_variance': noise}
     if drive == 'torque':

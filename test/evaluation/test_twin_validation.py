@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``t3mpc twin``: courses under slip, parts against their sheets, and the command."""
 
+from dataclasses import replace
 import math
 
 import matplotlib.image
@@ -226,7 +227,20 @@ def test_a_blind_robot_hits_the_wall_its_odometry_passes_it():
     assert patrol.course.odometry[-1, 0] > patrol.course.truth[-1, 0] + 0.1
 
 
-def test_the_command_draws_every_picture_and_prints_the_table(tmp_path, capsys):
+def test_the_command_draws_every_picture_and_prints_the_table(tmp_path, capsys, monkeypatch):
+    short = {
+        'square ccw': lambda parameters, events: courses.umbmark(parameters, False, events, 0.5),
+        'square cw': lambda parameters, events: courses.umbmark(parameters, True, events, 0.5),
+        '10 turns': lambda parameters, events: courses.spin(parameters, 2, events),
+    }
+    for name, drive in short.items():
+        monkeypatch.setitem(
+            slip_drift.COURSES,
+            name,
+            lambda parameters, events, drive=drive, name=name: replace(
+                drive(parameters, events), name=name
+            ),
+        )
     assert main.main(['twin', '--quick', '--seed', '7', '--output', str(tmp_path)]) == 0
     said = capsys.readouterr()
     assert '| 10 turns | wheel held every 7.5 s |' in said.out
