@@ -403,13 +403,13 @@ def run_replay(options: argparse.Namespace) -> int:
     from t3mpc_ros.bag.run.model_file import load_model
     from t3mpc_ros.control.controller import ControllerParameters
     from t3mpc_ros.evaluation.process_replay.comparison import compare
-    from t3mpc_ros.evaluation.process_replay.controller_bag import write_replay
     from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
     from t3mpc_ros.evaluation.process_replay.controller_replay import (
         OPEN_LOOP,
         make_controllers,
         replay_controller,
     )
+    from t3mpc_ros.evaluation.process_replay.golden_bags import write_replay
     from t3mpc_ros.evaluation.process_replay.method_replay import replay_method
 
     changes = parse_assignments(ControllerParameters, options.parameters)

@@ -8,7 +8,6 @@ from pathlib import Path
 import sys
 from typing import Any
 
-from t3mpc_ros.evaluation.paper.reproduce import PaperOptions, default_setup, reproduce
 from t3mpc_ros.parameters.command_line import bounded_int
 
 
@@ -54,6 +53,7 @@ def run(options: argparse.Namespace) -> int:
         A compared method needs a library that is not installed.
     """
     from t3mpc_ros.evaluation.methods import NMPC, require_libraries
+    from t3mpc_ros.evaluation.paper.reproduce import PaperOptions, default_setup, reproduce
 
     require_libraries([NMPC])
     output = options.output or Path('runs') / ('paper-quick' if options.quick else 'paper')

@@ -19,7 +19,6 @@ from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.bag import main as bag_main
 from t3mpc_ros.cli.main import main as t3mpc
 from t3mpc_ros.evaluation import plotting
-from t3mpc_ros.evaluation.bag_report.continuity import continuity_notes, parts
 from t3mpc_ros.evaluation.bag_report.link_history import link_metrics
 from t3mpc_ros.evaluation.bag_report.report_page import write_report
 from t3mpc_ros.evaluation.bag_report.response import (
@@ -29,7 +28,14 @@ from t3mpc_ros.evaluation.bag_report.response import (
     roughness,
     smooth,
 )
-from t3mpc_ros.evaluation.bag_report.run_data import BY_BODY, BY_WHEEL, Series, load_run
+from t3mpc_ros.evaluation.bag_report.run_data import (
+    BY_BODY,
+    BY_WHEEL,
+    Series,
+    continuity_notes,
+    load_run,
+    parts,
+)
 from t3mpc_ros.evaluation.bag_report.topic_roles import (
     COMMAND,
     ODOMETRY,

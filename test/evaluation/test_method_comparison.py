@@ -47,8 +47,7 @@ from t3mpc_ros.evaluation.method_comparison.comparison_page import (
     judged_metrics,
     verdict,
 )
-from t3mpc_ros.evaluation.method_comparison.twin_baseline import TwinBaseline
-from t3mpc_ros.evaluation.method_comparison.twin_scenario import CASES, TwinScenario
+from t3mpc_ros.evaluation.method_comparison.twin_scenario import CASES, TwinBaseline, TwinScenario
 from t3mpc_ros.evaluation.methods import FULL
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, TUNING_SEEDS
 from t3mpc_ros.evaluation.twin_closed_loop import (

@@ -22,8 +22,8 @@ from t3mpc_ros.cli.paper import add_parser
 from t3mpc_ros.evaluation.closed_loop import LoopRecord
 from t3mpc_ros.evaluation.open_loop_estimation import EstimationResult
 from t3mpc_ros.evaluation.paper import claims as claiming
-from t3mpc_ros.evaluation.paper.exhibits import EXHIBITS
-from t3mpc_ros.evaluation.paper.experiment_grid import (
+from t3mpc_ros.evaluation.paper.claims import markdown
+from t3mpc_ros.evaluation.paper.experiment_runs import (
     FULL,
     INTENDED_CASES,
     NOISES,
@@ -33,14 +33,12 @@ from t3mpc_ros.evaluation.paper.experiment_grid import (
     Experiment,
     ExperimentGrid,
     ExperimentSetup,
-    make_grid,
-    needed_experiments,
-)
-from t3mpc_ros.evaluation.paper.experiment_runs import (
     RunFile,
     RunNumbers,
     fingerprint,
+    make_grid,
     measure,
+    needed_experiments,
     plain,
     run_missing,
     source_digest,
@@ -52,11 +50,10 @@ from t3mpc_ros.evaluation.paper.figure_runs import (
     switches_claim,
     switches_of,
 )
-from t3mpc_ros.evaluation.paper.paper_page import counted
+from t3mpc_ros.evaluation.paper.paper_figures import floor_path
+from t3mpc_ros.evaluation.paper.paper_page import EXHIBITS, counted
 from t3mpc_ros.evaluation.paper.reproduce import RUNS, PaperOptions, reproduce
-from t3mpc_ros.evaluation.paper.result_tables import all_tables, markdown
-from t3mpc_ros.evaluation.paper.results import Results, results_of
-from t3mpc_ros.evaluation.paper.single_run_figures import floor_path
+from t3mpc_ros.evaluation.paper.results import Results, all_tables, results_of
 from t3mpc_ros.evaluation.reporting import finite, progress_bar
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 

@@ -31,7 +31,6 @@ from t3mpc_ros.evaluation.process_replay.comparison import (
     compare_bags,
     compare_columns,
 )
-from t3mpc_ros.evaluation.process_replay.controller_bag import ControllerBag, RecordedController
 from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     FIELDS,
     SPEEDS,
@@ -42,7 +41,9 @@ from t3mpc_ros.evaluation.process_replay.controller_replay import replay_control
 from t3mpc_ros.evaluation.process_replay.divergence_figure import write_divergence_figure
 from t3mpc_ros.evaluation.process_replay.golden_bags import (
     GOLDEN_SCENARIOS,
+    ControllerBag,
     GoldenScenario,
+    RecordedController,
     run_golden_scenario,
 )
 from t3mpc_ros.evaluation.process_replay.journal_alignment import match

@@ -15,7 +15,6 @@ from t3mpc_ros.control.controller import Controller
 from t3mpc_ros.evaluation.closed_loop import MethodSpec, run
 from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, Scenario
-from t3mpc_ros.evaluation.training.cross_validation import mean_and_spread, spread_in_words
 from t3mpc_ros.evaluation.training.fit import (
     explained,
     fit_coefficients,
@@ -24,7 +23,7 @@ from t3mpc_ros.evaluation.training.fit import (
     skills,
     stretches,
 )
-from t3mpc_ros.evaluation.training.recorded_runs import fit_bags
+from t3mpc_ros.evaluation.training.recorded_runs import fit_bags, mean_and_spread, spread_in_words
 from t3mpc_ros.evaluation.training.simulated_runs import full_parameters, training_data_of
 from t3mpc_ros.evaluation.training.training_data import TrainingData, TrainingError
 

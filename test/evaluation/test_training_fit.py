@@ -23,8 +23,8 @@ from t3mpc_ros.cli.main import main
 from t3mpc_ros.control.actuation import LimitParameters, VelocityActuation
 from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
+from t3mpc_ros.evaluation.process_replay.journal_alignment import match_commands
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, RATE
-from t3mpc_ros.evaluation.training.cross_validation import blocks
 from t3mpc_ros.evaluation.training.fit import (
     UNCERTAIN,
     estimate_move_effect,
@@ -36,7 +36,7 @@ from t3mpc_ros.evaluation.training.fit import (
     skills,
     stretches,
 )
-from t3mpc_ros.evaluation.training.recorded_runs import fit_bags
+from t3mpc_ros.evaluation.training.recorded_runs import blocks, fit_bags
 from t3mpc_ros.evaluation.training.simulated_runs import (
     fit_simulated_runs,
     full_parameters,
@@ -47,7 +47,6 @@ from t3mpc_ros.evaluation.training.training_data import (
     TrainingData,
     TrainingError,
     load_training_data,
-    match_commands,
 )
 from t3mpc_ros.fuzzy.estimator import FuzzyEstimator
 from t3mpc_ros.mpc.boltzmann_machine import (

@@ -19,13 +19,6 @@ from t3mpc_ros.evaluation.closed_loop import run as closed_loop_run
 from t3mpc_ros.evaluation.methods import method_definitions, methods
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, TUNING_SEEDS, Scenario
 from t3mpc_ros.evaluation.tuning.cma_search import SearchProgress, search_best
-from t3mpc_ros.evaluation.tuning.objective import (
-    SMOOTHNESS,
-    ClosedLoopObjective,
-    TuningScenarios,
-    mean_objectives,
-    objective,
-)
 from t3mpc_ros.evaluation.tuning.search_space import (
     MethodDefinition,
     SearchRange,
@@ -33,7 +26,15 @@ from t3mpc_ros.evaluation.tuning.search_space import (
     find_names,
 )
 import t3mpc_ros.evaluation.tuning.tune_methods as tune_module
-from t3mpc_ros.evaluation.tuning.tune_methods import history_path, tune_methods
+from t3mpc_ros.evaluation.tuning.tune_methods import (
+    SMOOTHNESS,
+    ClosedLoopObjective,
+    TuningScenarios,
+    history_path,
+    mean_objectives,
+    objective,
+    tune_methods,
+)
 from t3mpc_ros.evaluation.tuning.tuned_parameters import (
     PACKAGED_FILE,
     StoreError,

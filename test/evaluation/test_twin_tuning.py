@@ -34,7 +34,7 @@ from t3mpc_ros.evaluation.method_comparison.twin_tuning import (
 )
 from t3mpc_ros.evaluation.methods import EXACT_MODEL, FULL, method_definitions
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, TUNING_SEEDS
-from t3mpc_ros.evaluation.tuning.objective import SMOOTHNESS, TuningScenarios
+from t3mpc_ros.evaluation.tuning.tune_methods import SMOOTHNESS, TuningScenarios
 from t3mpc_ros.evaluation.tuning.tuned_parameters import TunedParameters
 
 PI = 'PI + feed-forward'

@@ -13,7 +13,7 @@ from t3mpc_ros.cli import main
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.plotting import WIDTH
 from t3mpc_ros.evaluation.twin_validation import component_tests, courses, slip_drift
-from t3mpc_ros.evaluation.twin_validation.validation_figures import VALIDATION_FIGURES
+from t3mpc_ros.evaluation.twin_validation.validation_page import VALIDATION_FIGURES
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 from t3mpc_ros.simulation.sensors.range_sensor import SimulatedRangeSensorParameters
 

@@ -24,11 +24,11 @@ from t3mpc_ros.evaluation.closed_loop import (
     total_variation,
 )
 from t3mpc_ros.evaluation.confidence_intervals import rms
-from t3mpc_ros.evaluation.method_comparison.twin_baseline import TwinBaseline
 from t3mpc_ros.evaluation.method_comparison.twin_scenario import (
     CASES as TWIN_CASES,
 )
 from t3mpc_ros.evaluation.method_comparison.twin_scenario import (
+    TwinBaseline,
     TwinScenario,
     check_name,
 )

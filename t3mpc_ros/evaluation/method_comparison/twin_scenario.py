@@ -1,17 +1,22 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Scenario of one run on the digital twin: what is different, and what the methods know of it."""
+"""Scenario of one run on the digital twin, and a baseline as its controller."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 import math
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from t3mpc_ros.chaos.reference import ReferenceParameters
-from t3mpc_ros.control.actuation import LimitParameters
+from t3mpc_ros.control.actuation import LimitParameters, VelocityActuation
 from t3mpc_ros.control.controller import ControllerParameters
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
-from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel
+from t3mpc_ros.control.watchdog import Reason
+from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController, NominalModel
+from t3mpc_ros.evaluation.closed_loop import MethodLoop, observed_reference
 from t3mpc_ros.evaluation.link_faults import (
     DROPOUTS,
     JITTER,
@@ -28,6 +33,8 @@ from t3mpc_ros.evaluation.scenario import (
     sample_reference,
 )
 from t3mpc_ros.evaluation.twin_closed_loop import LEAD, loop_controller, loop_robot
+from t3mpc_ros.geometry.kinematics import wheels_from_twist
+from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist, State, wrap_angle
 from t3mpc_ros.parameters.table import nearest_hint
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule
@@ -237,3 +244,94 @@ def check_name(kind: str, name: str, known: Mapping[str, object]) -> None:
     if name not in known:
         hint = nearest_hint(name, known)
         raise ValueError(f'{kind} must be one of {", ".join(known)}: got {name!r}{hint}')
+
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class BaselineStatus:
+    """Status of one step."""
+
+    stamp_ns: int
+    reason: Reason
+
+
+class TwinBaseline:
+    """Drives the twin with a baseline, behind the state estimate and limits of the controller.
+
+    It has no watchdog. A lost report is bridged by the estimator, as in the controller.
+
+    Parameters
+    ----------
+    method
+        Makes the baseline from the nominal model.
+    scenario
+        Reference, nominal model, estimator and measurement.
+    """
+
+    def __init__(
+        self, method: Callable[[NominalModel], BaselineController], scenario: TwinScenario
+    ) -> None:
+        self._method = method
+        self._model = scenario.nominal_model()
+        self._geometry = self._model.robot.geometry
+        self._uses_gyro = scenario.uses_gyro
+        self._actuation = VelocityActuation(
+            scenario.estimate(),
+            scenario.limits,
+            self._geometry,
+            'velocity',
+            self._model.period,
+        )
+        self._scenario = scenario
+        self._enabled = True
+        self._loop: MethodLoop | None = None
+        self._last: tuple[int, float] = (0, 0.0)
+        """Period and yaw of the last report."""
+
+    def enable(self, on: bool) -> None:
+        """Enable the robot's motion, or stop the robot."""
+        self._enabled = on
+
+    def add_reference(self, reference: State) -> bool:
+        """Ignore the sample: the scenario has the reference."""
+        return True
+
+    def step(self, odometry: State) -> tuple[BodyTwist, BaselineStatus]:
+        """Return the command that follows from a report of the robot."""
+        stamp_ns = odometry.stamp_ns
+        if not self._enabled:
+            self._loop = None
+            return STANDSTILL, BaselineStatus(stamp_ns, Reason.DISABLED)
+        k = round(stamp_ns * RATE / NANOSECONDS)
+        if self._loop is None:
+            measured = self._measured(odometry, math.nan)
+            self._actuation.reset(measured)
+            self._loop = self._new_loop()
+        else:
+            measured = self._measured(odometry, (k - self._last[0]) * self._model.period)
+        self._last = k, odometry.pose.yaw
+        self._loop.send(self._loop.step(k, measured))
+        return self._actuation.twist, BaselineStatus(stamp_ns, Reason.TRACKING)
+
+    def _new_loop(self) -> MethodLoop:
+        controller, dead_time = self._method(self._model), self._actuation.dead_time
+        # What a reference with this lead has made known at the stamp of the report.
+        rows = round((LEAD - dead_time) * RATE) + 1
+        steps = round(self._scenario.duration * RATE)
+        reference = observed_reference(
+            self._scenario.reference(), steps, rows, dead_time, preview=controller.preview
+        )
+        return MethodLoop(controller, self._actuation, self._model.period, reference)
+
+    def _measured(self, odometry: State, dt: float) -> Array:
+        """Return the measured wheel speeds, rad/s, shape (2,).
+
+        With the gyro, their difference is that of the yaw rate of the odometry's pose.
+        """
+        twist = odometry.twist
+        if self._uses_gyro and not math.isnan(dt):
+            turned = wrap_angle(odometry.pose.yaw - self._last[1])
+            twist = BodyTwist(twist.linear, turned / dt)
+        return np.array(wheels_from_twist(twist, self._geometry))

@@ -30,14 +30,14 @@ from t3mpc_ros.evaluation.method_comparison.twin_scenario import TwinScenario
 from t3mpc_ros.evaluation.methods import FULL, methods
 from t3mpc_ros.evaluation.proposed_method import ProposedController
 from t3mpc_ros.evaluation.scenario import TUNING_SEEDS
-from t3mpc_ros.evaluation.tuning.objective import (
+from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition, SearchRange
+from t3mpc_ros.evaluation.tuning.tune_methods import (
     SMOOTHNESS,
     ClosedLoopObjective,
     TuningScenarios,
     mean_objectives,
+    tune_methods,
 )
-from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition, SearchRange
-from t3mpc_ros.evaluation.tuning.tune_methods import tune_methods
 from t3mpc_ros.evaluation.tuning.tuned_parameters import TunedEntry, TunedParameters
 from t3mpc_ros.evaluation.twin_closed_loop import INITIAL_STANDSTILL
 from t3mpc_ros.parameters.table import Parameters

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from t3mpc_ros.evaluation.bag_report.metrics import format_number
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
 from t3mpc_ros.evaluation.open_loop_estimation import KINDS, EstimationResult
-from t3mpc_ros.evaluation.paper.experiment_grid import (
+from t3mpc_ros.evaluation.paper.experiment_runs import (
     DRIVES,
     EXACT,
     FULL,
@@ -29,6 +29,7 @@ from t3mpc_ros.evaluation.paper.experiment_grid import (
     Experiment,
 )
 from t3mpc_ros.evaluation.paper.results import PairedDifference, ResultRow, Results, step_to
+from t3mpc_ros.evaluation.reporting import Table
 
 Array = NDArray[np.float64]
 
@@ -377,6 +378,30 @@ def estimation_claims(
             Evidence(complete, margins),
         )
     return [half, slight]
+
+
+def claims_table(claims: Sequence[Claim], origin: str) -> Table:
+    """Return the claims of one origin, ``'ours'`` or ``'paper'``, with what was found."""
+    title = 'Claims of this package' if origin == 'ours' else 'Claims of the paper'
+    rows = [(claim.text, claim.found, claim.verdict) for claim in claims if claim.origin == origin]
+    return Table(title, ('claim', 'found', 'verdict'), tuple(rows))
+
+
+def markdown(tables: dict[str, list[Table]], claims: Sequence[Claim] = ()) -> str:
+    """Return all tables, and claims if there are any, as one Markdown text."""
+    parts = [
+        'Means over held-out seeds ± half the 95 % interval (Student\'s t). RMSE: true wheel '
+        'speeds less reference, both wheels, without the first 3 s. Noise: variance of the '
+        'measured wheel speeds, (rad/s)². An asterisk: the interval of a paired difference '
+        'excludes zero.'
+    ]  # fmt: skip
+    if claims:
+        judged = [claims_table(claims, origin) for origin in ('ours', 'paper')]
+        parts += ['## Claims', *(table.markdown() for table in judged)]
+    for heading, group in tables.items():
+        if group:
+            parts += [f'## {heading}', *(table.markdown() for table in group)]
+    return '\n\n'.join(parts) + '\n'
 
 
 def _against_preview(

@@ -24,15 +24,16 @@ from t3mpc_ros.evaluation.open_loop_estimation import (
     torque_robot,
 )
 from t3mpc_ros.evaluation.paper.claims import REFERENCE_SPREAD, Claim
-from t3mpc_ros.evaluation.paper.experiment_grid import (
+from t3mpc_ros.evaluation.paper.experiment_runs import (
     FULL,
     NOMINAL,
     PAPER_NOISE,
+    SETTLING,
+    START,
     WITHOUT,
     ExperimentGrid,
     ExperimentSetup,
 )
-from t3mpc_ros.evaluation.paper.experiment_runs import SETTLING, START
 from t3mpc_ros.evaluation.paper.results import Results
 from t3mpc_ros.evaluation.scenario import switch_times
 

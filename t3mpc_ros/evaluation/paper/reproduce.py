@@ -6,13 +6,28 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from t3mpc_ros.evaluation.paper.experiment_grid import (
+import t3mpc_ros
+from t3mpc_ros.evaluation import open_loop_estimation
+from t3mpc_ros.evaluation.closed_loop import WorkerPool, measure_many
+from t3mpc_ros.evaluation.methods import methods
+from t3mpc_ros.evaluation.paper.claims import all_claims, markdown
+from t3mpc_ros.evaluation.paper.experiment_runs import (
     EXACT,
     ExperimentGrid,
     ExperimentSetup,
+    RunFile,
     make_grid,
     needed_experiments,
+    plain,
+    run_missing,
+    source_digest,
 )
+from t3mpc_ros.evaluation.paper.figure_runs import simulate_figure_runs
+from t3mpc_ros.evaluation.paper.paper_page import EXHIBITS, ExhibitData, counted, findings, page
+from t3mpc_ros.evaluation.paper.results import all_tables, results_of, write_csv
+from t3mpc_ros.evaluation.plotting import write_pictures
+from t3mpc_ros.evaluation.reporting import strict_json
+from t3mpc_ros.evaluation.scenario import CASES, HELD_OUT_SEEDS, Scenario
 
 RUNS = 'runs.jsonl'
 """Finished runs, in the folder of the output."""
@@ -37,10 +52,6 @@ class PaperOptions:
 
 def default_setup() -> ExperimentSetup:
     """Return the methods and the closed loop of this package."""
-    from t3mpc_ros.evaluation.closed_loop import WorkerPool, measure_many
-    from t3mpc_ros.evaluation.methods import methods
-    from t3mpc_ros.evaluation.scenario import CASES, HELD_OUT_SEEDS, Scenario
-
     return ExperimentSetup(
         methods,
         Scenario,
@@ -77,17 +88,6 @@ def reproduce(
     ValueError
         More seeds are asked for than there are.
     """
-    from t3mpc_ros.evaluation import open_loop_estimation
-    from t3mpc_ros.evaluation.paper.claims import all_claims
-    from t3mpc_ros.evaluation.paper.exhibits import EXHIBITS, ExhibitData, findings
-    from t3mpc_ros.evaluation.paper.experiment_runs import RunFile, run_missing, source_digest
-    from t3mpc_ros.evaluation.paper.figure_runs import simulate_figure_runs
-    from t3mpc_ros.evaluation.paper.paper_page import counted, page
-    from t3mpc_ros.evaluation.paper.result_tables import all_tables, markdown
-    from t3mpc_ros.evaluation.paper.results import results_of, write_csv
-    from t3mpc_ros.evaluation.plotting import write_pictures
-    from t3mpc_ros.evaluation.reporting import strict_json
-
     write = report or (lambda text: None)
     grid = make_grid(setup, quick=options.quick, seeds=options.seeds)
     file = RunFile(options.output / RUNS, fresh=options.fresh)
@@ -113,7 +113,7 @@ def reproduce(
     compared = [row for row in results.rows if EXACT not in row.controller]
     exact = [row for row in results.rows if EXACT in row.controller]
     content = {
-        'version': _version(),
+        'version': t3mpc_ros.__version__,
         'parameters': parameters | {'sources': sources},
         'results': [row.record() for row in compared],
         'exact_models': [row.record() for row in exact],
@@ -143,9 +143,7 @@ def _parameters(
     estimation_seeds: int,
     variances: tuple[float, ...],
 ) -> dict[str, object]:
-    from t3mpc_ros.evaluation.paper.experiment_runs import plain
-
-    methods: dict[str, Mapping[str, object]] = {
+    parameters: dict[str, Mapping[str, object]] = {
         drive: {name: plain(method.parameters) for name, method in setup.methods(drive).items()}
         for drive in grid.drives
     }
@@ -157,19 +155,13 @@ def _parameters(
         'cases': list(grid.cases),
         'estimation_seeds': estimation_seeds,
         'estimation_noises': list(variances),
-        'methods': methods,
+        'methods': parameters,
     }
-
-
-def _version() -> str:
-    import t3mpc_ros
-
-    return t3mpc_ros.__version__
 
 
 def _origin(grid: ExperimentGrid, options: PaperOptions, sources: str) -> str:
     words = [
-        f'version {_version()}, sources {sources}',
+        f'version {t3mpc_ros.__version__}, sources {sources}',
         f'{len(grid.seeds)} held-out seeds, runs of {grid.duration:g} s at 100 Hz',
         'RMSE of true wheel speeds, both wheels, first 3 s left out',
     ]

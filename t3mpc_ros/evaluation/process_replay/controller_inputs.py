@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Inputs and recorded outputs of a bag's controller, in the order of processing."""
 
+import ast
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -38,8 +39,8 @@ from t3mpc_ros.evaluation.process_replay.journal_alignment import (
     rows_of,
     with_initial_inputs,
 )
-from t3mpc_ros.evaluation.training.training_data import recorded_parameters
 from t3mpc_ros.geometry.types import NANOSECONDS, StateArray
+from t3mpc_ros.parameters.table import ParameterError, ParameterSpec
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -143,9 +144,7 @@ def load_inputs(
     Raises
     ------
     ReplayError
-        Topics or parameters are missing.
-    TrainingError
-        The recorded parameters cannot be used.
+        Topics or parameters are missing, or cannot be used.
     BagError
         The bag cannot be read.
     """
@@ -202,6 +201,47 @@ def inputs_of(
         start_ns=held.start_ns,
         notes=tuple(notes),
     )
+
+
+def recorded_parameters(
+    recording: BagReader, namespace: str, notes: list[str]
+) -> ControllerParameters:
+    """Return the controller's parameters as recorded.
+
+    Raises
+    ------
+    ReplayError
+        They are not in the bag, or invalid.
+    """
+    own = f'{namespace}/controller'
+    table = recording.metadata_records.get(
+        'controller' if own not in recording.metadata_records else own
+    )
+    if table is None:
+        raise ReplayError(f"{recording.folder}: the controller's settings are not in the bag")
+    values: dict[str, object] = {}
+    for row in ControllerParameters.specs():
+        if row.name in table:
+            values[row.name] = _value(row, table[row.name])
+    absent = [row.name for row in ControllerParameters.specs() if row.name not in values]
+    if absent:
+        notes.append(f'not in the bag, taken at their defaults: {", ".join(absent)}')
+    try:
+        return ControllerParameters.from_dict(values)
+    except ParameterError as error:
+        raise ReplayError(
+            f'{recording.folder}: the recorded settings cannot be used: {error}'
+        ) from error
+
+
+def _value(row: ParameterSpec, text: str) -> object:
+    """Return a value written by the recorder with ``str``; other text is rejected later."""
+    if row.kind is str:
+        return text
+    try:
+        return ast.literal_eval(text)
+    except (SyntaxError, ValueError):
+        return text
 
 
 def _renamed_topic(held: BagReader, name: str, used: Sequence[str]) -> str:

@@ -130,7 +130,7 @@ def recompute_scalars(
 
     Raises
     ------
-    ReplayError, TrainingError, ValueError
+    ReplayError, ValueError
         The bag has no journal, or its inputs, parameters or model are incomplete.
     BagError
         The bag is damaged.

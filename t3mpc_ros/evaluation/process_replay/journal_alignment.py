@@ -9,12 +9,15 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.bag.columns import TopicColumns
 from t3mpc_ros.bag.run.journal import COMMAND_EVENTS, Event
-from t3mpc_ros.evaluation.training.training_data import match_commands
 from t3mpc_ros.geometry.types import NANOSECONDS
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
+
+
+ALIKE = 100
+"""Commands on each side that determine which message a command belongs to."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +96,29 @@ def match(rows: Integers, odometry_ns: Integers, reference_ns: Integers) -> Cons
         int(lost.sum()),
         int(gaps.sum()),
     )
+
+
+def match_commands(asked: Array, answered: Array) -> NDArray[np.int64]:
+    """Return the odometry message of each command, -1 without one, shape (m,).
+
+    The controller responds to each message it processes, in order: command j belongs to message
+    j + s, where s is the number of earlier messages without a command, from before the first
+    command or lost. Receive times alone mislead: on a busy processor the next message arrives
+    before the command, and of two publishers the second may even be received first. Both pass,
+    so s is the median over two seconds.
+
+    Parameters
+    ----------
+    asked, answered
+        Receive times, ascending, s.
+    """
+    numbers = np.arange(answered.size)
+    behind = np.searchsorted(asked, answered, side='right') - 1 - numbers
+    padded = np.pad(behind, ALIKE, mode='symmetric')
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * ALIKE + 1)
+    found: NDArray[np.int64] = numbers + np.median(windows, axis=1).astype(np.int64)
+    found[(found < 0) | (found >= asked.size)] = -1
+    return found
 
 
 def by_receipt(

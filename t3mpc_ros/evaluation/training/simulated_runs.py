@@ -21,8 +21,8 @@ from t3mpc_ros.evaluation.scenario import (
     RATE,
     Scenario,
 )
-from t3mpc_ros.evaluation.training.cross_validation import MIDDLE, NEXT_STEP, pair
 from t3mpc_ros.evaluation.training.fit import periods, skills
+from t3mpc_ros.evaluation.training.recorded_runs import MIDDLE, NEXT_STEP, pair
 from t3mpc_ros.evaluation.training.training_data import TrainingData
 from t3mpc_ros.evaluation.tuning.tuned_parameters import PACKAGED_FILE
 from t3mpc_ros.mpc.predictive_controller import PredictiveController

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Training data from a recorded run: errors, moves and residuals of each controller step."""
 
-import ast
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -25,9 +24,14 @@ from t3mpc_ros.evaluation.bag_report.topic_roles import (
     WHEELS,
     find_topics,
 )
+from t3mpc_ros.evaluation.process_replay.controller_inputs import (
+    ReplayError,
+    recorded_parameters,
+)
+from t3mpc_ros.evaluation.process_replay.controller_replay import recompute_scalars
+from t3mpc_ros.evaluation.process_replay.journal_alignment import match_commands
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, BodyTwist, State
-from t3mpc_ros.parameters.table import ParameterError, ParameterSpec
 
 Array = NDArray[np.float64]
 
@@ -40,8 +44,6 @@ NEEDED = (
 )
 """Topics that a bag must hold."""
 
-ALIKE = 100
-"""Commands on each side that determine which message a command belongs to."""
 DISAGREES = 0.2
 """Difference between a reconstructed and the published error that counts as wrong, as a share of
 the error; without losses they agree to rounding."""
@@ -110,7 +112,10 @@ def load_training_data(folder: Path) -> tuple[TrainingData, ControllerParameters
                 f'{folder}: these topics are missing, or have no message: {", ".join(missing)}'
             )
         notes: list[str] = []
-        parameters = recorded_parameters(recording, namespaces[0], notes)
+        try:
+            parameters = recorded_parameters(recording, namespaces[0], notes)
+        except ReplayError as error:
+            raise TrainingError(str(error)) from error
         if parameters.composition != 'paper':
             raise TrainingError(
                 f'{folder}: composition must be paper: got {parameters.composition}, in which '
@@ -144,10 +149,6 @@ def _recomputed(
     recording: BagReader, namespace: str, missing: Sequence[str]
 ) -> dict[str, Mapping[str, Array]]:
     """Return the missing topics that follow exactly from the journal of the controller."""
-    # Replay reads the recorded parameters with this module.
-    from t3mpc_ros.evaluation.process_replay.controller_inputs import ReplayError
-    from t3mpc_ros.evaluation.process_replay.controller_replay import recompute_scalars
-
     if not set(missing) & SCALARS or f'{namespace}/{JOURNAL}' not in recording.topics:
         return {}
     try:
@@ -159,47 +160,6 @@ def _recomputed(
         for name in missing
         if name in scalars
     }
-
-
-def recorded_parameters(
-    recording: BagReader, namespace: str, notes: list[str]
-) -> ControllerParameters:
-    """Return the controller's parameters as recorded.
-
-    Raises
-    ------
-    TrainingError
-        They are not in the bag, or invalid.
-    """
-    own = f'{namespace}/controller'
-    table = recording.metadata_records.get(
-        'controller' if own not in recording.metadata_records else own
-    )
-    if table is None:
-        raise TrainingError(f"{recording.folder}: the controller's settings are not in the bag")
-    values: dict[str, object] = {}
-    for row in ControllerParameters.specs():
-        if row.name in table:
-            values[row.name] = _value(row, table[row.name])
-    absent = [row.name for row in ControllerParameters.specs() if row.name not in values]
-    if absent:
-        notes.append(f'not in the bag, taken at their defaults: {", ".join(absent)}')
-    try:
-        return ControllerParameters.from_dict(values)
-    except ParameterError as error:
-        raise TrainingError(
-            f'{recording.folder}: the recorded settings cannot be used: {error}'
-        ) from error
-
-
-def _value(row: ParameterSpec, text: str) -> object:
-    """Return a value written by the recorder with ``str``; other text is rejected later."""
-    if row.kind is str:
-        return text
-    try:
-        return ast.literal_eval(text)
-    except (SyntaxError, ValueError):
-        return text
 
 
 def _read(recording: BagReader, name: str, topic: str, notes: list[str]) -> Mapping[str, Array]:
@@ -216,29 +176,6 @@ def _read(recording: BagReader, name: str, topic: str, notes: list[str]) -> Mapp
     if name in (REFERENCE, ODOMETRY):
         return columns  # rejected by the controller itself, as in the run
     return {key: column[~bad] for key, column in columns.items()}
-
-
-def match_commands(asked: Array, answered: Array) -> NDArray[np.int64]:
-    """Return the odometry message of each command, -1 without one, shape (m,).
-
-    The controller responds to each message it processes, in order: command j belongs to message
-    j + s, where s is the number of earlier messages without a command, from before the first
-    command or lost. Receive times alone mislead: on a busy processor the next message arrives
-    before the command, and of two publishers the second may even be received first. Both pass,
-    so s is the median over two seconds.
-
-    Parameters
-    ----------
-    asked, answered
-        Receive times, ascending, s.
-    """
-    numbers = np.arange(answered.size)
-    behind = np.searchsorted(asked, answered, side='right') - 1 - numbers
-    padded = np.pad(behind, ALIKE, mode='symmetric')
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * ALIKE + 1)
-    found: NDArray[np.int64] = numbers + np.median(windows, axis=1).astype(np.int64)
-    found[(found < 0) | (found >= asked.size)] = -1
-    return found
 
 
 def _rebuild(
