@@ -104,21 +104,7 @@ class LoopRecord:
         return bool(np.isfinite(self.speeds).all() and np.isfinite(self.command).all())
 
     def rmse(self, after: float = 3.0, *, cut: float = 0.0) -> float:
-        """Return the tracking RMSE over both wheels, rad/s; NaN when the run broke off.
-
-        Parameters
-        ----------
-        after
-            Seconds left out at the start, while the reference grows.
-        cut
-            Seconds left out at each switch: 40 % of them before it, where methods with preview
-            have already left the old reference, the rest after it.
-
-        Raises
-        ------
-        ValueError
-            Nothing is left to be counted.
-        """
+        """Return the tracking RMSE over both wheels, rad/s; NaN when the run broke off."""
         return rms(self.error[self._counted(after, cut)])
 
     def largest_error(self, after: float = 3.0, *, cut: float = 0.0) -> float:
@@ -126,13 +112,7 @@ class LoopRecord:
         return float(np.max(np.abs(self.error[self._counted(after, cut)])))
 
     def chatter(self) -> float:
-        """Return the total variation of the effort per second and wheel, rad/s³.
-
-        Raises
-        ------
-        ValueError
-            The record has fewer than two rows.
-        """
+        """Return the total variation of the effort per second and wheel, rad/s³."""
         if self.time.size < 2:
             raise ValueError(f'a record must have at least 2 rows: got {self.time.size}')
         return total_variation(self.time, self.effort)
@@ -233,25 +213,17 @@ def run(
 ) -> LoopRecord:
     """Return the record of a new ``method`` tracking the reference of a scenario.
 
-    Each period k: measure, estimate, show the method its :class:`View`, send what it answers.
+    Each period k: measure, estimate, show the method its :class:`Observation`, send its answer.
     The robot stands at the start, and the estimator begins with what is measured then. With a
     torque drive, u is cut where its torque would be beyond what the motors have, so that
     estimator and method get the limited u. Equal arguments give equal runs, bit for bit.
 
     Parameters
     ----------
-    scenario
-        Drive, noise, case and seed.
     method
         Makes the controller from the nominal model, for example a :class:`MethodSpec`.
     drive
         A drive seam in place of :func:`drive_for`, of the same kind; it is reset first.
-
-    Raises
-    ------
-    ValueError
-        The dead time is not a whole number of periods, or longer than the reference reaches; or
-        the method answers with anything but two numbers.
     """
     nominal_model = scenario.nominal_model()
     controller = method(nominal_model)
@@ -356,11 +328,6 @@ def observed_reference(
     beyond the run. Without, r is extrapolated over the dead time by the slope it has now: a switch
     is seen when it happens, and not before. These are copies that can be written to, because
     compiled functions take an array that cannot for another type.
-
-    Raises
-    ------
-    ValueError
-        The dead time is not a whole number of periods, or longer than the reference reaches.
     """
     late = round(dead_time * RATE)
     if not math.isclose(dead_time * RATE, late, abs_tol=1e-6):
@@ -379,16 +346,7 @@ def observed_reference(
 class MethodLoop:
     """A method between the state estimate and the limits that all methods share.
 
-    Parameters
-    ----------
-    controller
-        The method.
-    actuation
-        Estimator and limits; it was reset to the first measurement.
-    period
-        Control period, s.
-    reference
-        What the method observes of the reference.
+    The estimator of ``actuation`` was reset to the first measurement.
     """
 
     def __init__(
@@ -455,16 +413,6 @@ class WorkerPool:
 
     Jobs share nothing, so results do not depend on how many workers there are. One worker is
     this process itself. To be used in a ``with`` statement.
-
-    Parameters
-    ----------
-    count
-        How many, at least 1.
-
-    Raises
-    ------
-    ValueError
-        ``count`` is below 1.
     """
 
     def __init__(self, count: int) -> None:
@@ -491,32 +439,15 @@ class WorkerPool:
     ) -> Iterator[tuple[int, T]]:
         """Yield (index of the job, measure of its record) as the jobs are finished.
 
-        Jobs are taken from ``jobs`` only as workers become free.
-
-        Parameters
-        ----------
-        jobs
-            Scenario and method of each run.
-        measure
-            Applied in the worker, so that whole records need not travel; a function of a module,
-            or ``operator.methodcaller('rmse')``.
-
-        Raises
-        ------
-        JobError
-            A run raised an exception; the jobs not begun are dropped.
+        ``measure`` is applied in the worker, so that whole records need not travel: a function of
+        a module, or ``operator.methodcaller('rmse')``. For errors see :meth:`map`.
         """
         return self.map(partial(_measured, measure), jobs)
 
     def map(self, task: Callable[[J], T], jobs: Iterable[J]) -> Iterator[tuple[int, T]]:
         """Yield (index of the job, ``task`` of it) as the jobs are finished.
 
-        Parameters
-        ----------
-        task
-            A function of a module.
-        jobs
-            Pairs of a scenario and a method with a name.
+        ``task`` is a function of a module; jobs are taken only as workers become free.
 
         Raises
         ------

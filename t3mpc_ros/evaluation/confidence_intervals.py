@@ -25,13 +25,7 @@ class Difference(NamedTuple):
 
 
 def mean(values: Sequence[float]) -> float:
-    """Return the mean.
-
-    Raises
-    ------
-    ValueError
-        There are no values.
-    """
+    """Return the mean."""
     if len(values) == 0:
         raise ValueError('values must not be empty')
     return float(np.mean(values))
@@ -57,11 +51,6 @@ def paired(a: Sequence[float], b: Sequence[float], confidence: float = 0.95) -> 
     """Return how much larger ``a`` is than ``b``, value by value.
 
     What both have from a seed, an easy reference say, drops out of the difference.
-
-    Raises
-    ------
-    ValueError
-        The two have different lengths, or none.
     """
     if len(a) != len(b):
         raise ValueError(f'paired values must be equally many: got {len(a)} and {len(b)}')
@@ -88,11 +77,6 @@ def student_quantile(degrees: int, confidence: float = 0.95) -> float:
         Degrees of freedom n, at least 1.
     confidence
         Above 0 and below 1.
-
-    Raises
-    ------
-    ValueError
-        An argument out of its range.
     """
     if degrees < 1:
         raise ValueError(f'degrees must be at least 1: got {degrees}')

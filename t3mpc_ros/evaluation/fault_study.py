@@ -98,18 +98,9 @@ def evaluate_outcome(
     end: float,
     parameters: DigitalTwinParameters,
 ) -> Outcome:
-    """Return the outcome of a recorded run.
+    """Return the outcome of a recorded run, beside the same one without the fault.
 
-    Parameters
-    ----------
-    name, course
-        Name of the run, and its reference course.
-    record, healthy
-        The run, and the same one without the fault.
-    begin, end
-        Begin and end of the fault, s; the end may lie beyond the record.
-    parameters
-        Parameters of the robot, for its limits.
+    ``begin`` and ``end`` (s) are those of the fault; the end may lie beyond the record.
     """
     last = float(record.time[-1])
     stays = end >= last
@@ -525,13 +516,7 @@ faster (root mean square) the wheels turn than they roll.
 
 
 def update_page(page: Path, results: Sequence[Outcome]) -> None:
-    """Replace the section between the marks of a page.
-
-    Raises
-    ------
-    ValueError
-        The page does not have both marks, once and in this order.
-    """
+    """Replace the section between the marks of a page, which has both once and in this order."""
     text = page.read_text(encoding='utf-8')
     head, begun, rest = text.partition(BEGIN_MARK)
     _, ended, tail = rest.partition(END_MARK)

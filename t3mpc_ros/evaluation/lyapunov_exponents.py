@@ -40,11 +40,6 @@ def lyapunov_exponents(
         s.
     interval
         Steps between two orthonormalisations; short enough that vectors stay independent.
-
-    Raises
-    ------
-    ValueError
-        An order below 1, a wrong shape, a length of time that is not positive.
     """
     if any(order != 1.0 for order in system.orders):
         raise ValueError(f'orders must all be 1: got {system.orders}')

@@ -119,19 +119,8 @@ def simulate_open_loop(
 ) -> OpenLoopRun:
     """Return a run of the robot (10) under the torque theta_bar u, with no controller.
 
-    Parameters
-    ----------
-    parameters
-        The robot; ``drive.kind`` must be ``'torque'``. theta_bar is the nominal (11).
-    duration
-        s
-    seed
-        Of the excitation; the robot's disturbance and noise have the seed in ``parameters``.
-
-    Raises
-    ------
-    ValueError
-        The robot takes velocities, or the run is not longer than a period.
+    The robot has a torque drive; theta_bar is the nominal (11). ``seed`` is that of the
+    excitation, that of disturbance and noise is in ``parameters``.
     """
     period = 1.0 / parameters.rate
     steps = round(duration / period)
@@ -157,16 +146,8 @@ def estimate(
 ) -> tuple[Array, Array]:
     """Return (chi_hat, g) of (86) with E18 along a run, rad/s and rad/s², shape (n, 2) each.
 
-    chi_hat[k] has seen measurements up to k - 1 only: it is a prediction of one period.
-
-    Parameters
-    ----------
-    run
-        Only its push and its measured speeds are used.
-    fuzzy
-        The fuzzy system; it learns on the way. None is g = 0.
-    gain
-        a of the output error, 1/s.
+    chi_hat[k] has seen measurements up to k - 1 only: it is a prediction of one period. The fuzzy
+    system learns on the way; None is g = 0. ``gain`` is a of the output error, 1/s.
     """
     found = run.measured[0].copy()
     speeds, unknown = np.empty_like(run.measured), np.zeros_like(run.measured)
@@ -203,21 +184,8 @@ def compare(
 ) -> list[EstimationResult]:
     """Return the results of every kind in (86) over ``seeds`` seeds from 1, on equal runs.
 
-    Parameters
-    ----------
-    seeds, duration
-        Runs each, and their length (s).
-    variances
-        Noise of the measured wheel speeds, (rad/s)².
-    normalised_gain
-        Mean of gamma |Phi|² for every kind, 1/s².
-    progress
-        Whether a progress line is shown.
-
-    Raises
-    ------
-    ValueError
-        The duration leaves nothing after :data:`SETTLE`.
+    ``variances`` are those of the measured wheel speeds, (rad/s)²; ``normalised_gain`` is the mean
+    of gamma |Phi|² for every kind, 1/s².
     """
     if duration <= SETTLE:
         raise ValueError(f'duration must be more than {SETTLE:g} s: got {duration}')

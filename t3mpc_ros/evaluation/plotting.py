@@ -101,13 +101,7 @@ class Drawing(Protocol[Subject_contra]):
 def write_pictures(
     drawings: Iterable[Drawing[Subject]], subject: Subject, folder: Path
 ) -> dict[str, bytes]:
-    """Write the figures with something to draw as PNG files, and return them by their stems.
-
-    Raises
-    ------
-    OSError
-        A file cannot be written.
-    """
+    """Write the figures with something to draw as PNG files, and return them by their stems."""
     folder.mkdir(parents=True, exist_ok=True)
     found = {}
     for drawing in drawings:

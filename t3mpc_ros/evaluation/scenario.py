@@ -151,23 +151,13 @@ class Scenario:
 
     Parameters
     ----------
-    drive
-        One of :data:`DRIVES`.
+    drive, case, seed
+        One of :data:`DRIVES`, one of :data:`CASES`, and the seed of the reference, from which the
+        robot's own is derived.
     noise
         Variance of the measured wheel speeds, (rad/s)².
-    case
-        One of :data:`CASES`.
-    seed
-        Of the reference; the robot's own is derived from it.
-    duration
-        s
-    lead
-        How far ahead methods with preview see the reference, s.
-
-    Raises
-    ------
-    ValueError
-        A value out of its range, or a case that the drive does not have.
+    duration, lead
+        s; ``lead`` is how far ahead methods with preview see the reference.
     """
 
     drive: str
@@ -320,20 +310,8 @@ def settled_rows(
 ) -> NDArray[np.bool_]:
     """Return which rows of a run count: from ``after`` on, without those about a switch.
 
-    Parameters
-    ----------
-    time, switches
-        Instant of each row and of each switch, s.
-    after
-        Seconds left out at the start.
-    margins
-        Seconds left out before each switch, where methods with preview have already left the old
-        reference, and after it.
-
-    Raises
-    ------
-    ValueError
-        Nothing is left to be counted.
+    All in s; ``margins`` are left out before each switch, where methods with preview have already
+    left the old reference, and after it.
     """
     counted: NDArray[np.bool_] = time >= after
     before, behind = margins

@@ -162,34 +162,7 @@ def run_twin(
     schedule: FaultSchedule | None = None,
     pauses: Sequence[tuple[float, float]] = (),
 ) -> TwinRecord:
-    """Return the record of the controller driving the twin along a course.
-
-    The robot rests for :data:`INITIAL_STANDSTILL` seconds before the controller is enabled; the
-    reference runs from the start. Equal arguments give equal runs, bit for bit.
-
-    Parameters
-    ----------
-    robot_parameters
-        Parameters of the stepper twin, with its world.
-    controller_parameters
-        Parameters of the controller; its rate is that of the robot.
-    course
-        Reference wheel speeds (rad/s) of each period, shape (n, 2), up to :data:`LEAD` seconds
-        beyond the end.
-    duration
-        s
-    schedule
-        Faults in place of those of the robot's parameters.
-    pauses
-        Times at which a person disables and re-enables the controller, s.
-
-    Raises
-    ------
-    ValueError
-        The course is too short, or has another shape.
-    ParameterError
-        The robot is no stepper, or robot and controller differ in their rate.
-    """
+    """Return the record of the controller driving the twin, see :func:`drive_twin`."""
     rate = robot_parameters.rate
     if controller_parameters.rate != rate:
         raise ParameterError(
@@ -210,24 +183,26 @@ def drive_twin(
     pauses: Sequence[tuple[float, float]] = (),
     links: LinkFaults = NO_FAULTS,
 ) -> TwinRecord:
-    """Return the record of any controller driving the twin, see :func:`run_twin`.
+    """Return the record of any controller driving the twin.
+
+    The robot rests for :data:`INITIAL_STANDSTILL` seconds before the controller is enabled; the
+    reference runs from the start. Equal arguments give equal runs, bit for bit.
 
     Parameters
     ----------
-    robot_parameters, course, duration, schedule, pauses
-        As for :func:`run_twin`.
-    controller
-        A new controller, for the rate of the robot.
+    robot_parameters, controller
+        The stepper twin with its world, and a new controller of the same rate.
+    course
+        Reference wheel speeds (rad/s) of each period, shape (n, 2), up to :data:`LEAD` seconds
+        beyond the end.
+    duration
+        s
+    schedule
+        Faults in place of those of the robot's parameters, those of the commands included.
+    pauses
+        Times at which a person disables and re-enables the controller, s.
     links
-        Faults of the reports on their way to the controller, with the seed of the robot. Those of
-        the commands belong to the ``schedule``.
-
-    Raises
-    ------
-    ValueError
-        The course is too short, or has another shape.
-    ParameterError
-        The robot is no stepper.
+        Faults of the reports on their way to the controller, with the seed of the robot.
     """
     if robot_parameters.drive.kind != 'stepper':
         raise ParameterError(f'drive.kind must be stepper: got {robot_parameters.drive.kind}')

@@ -65,18 +65,15 @@ def judge(
 
     Parameters
     ----------
-    run
-        The run.
     drive
         First and last command other than zero, s.
     rmse
         Largest settled RMSE of the wheels, in the unit of the reference; NaN if not measured.
     counted
         Time in which errors count, s.
-    missing
-        Share of missing odometry; NaN if unknown.
-    latency_99
-        99th percentile of the time from odometry to command, s; NaN if unknown.
+    missing, latency_99
+        Share of missing odometry, and 99th percentile of the time from odometry to command, s; NaN
+        if unknown.
     """
     command, reference = run.motions.get(COMMAND), run.motions.get(REFERENCE)
     if not run.ours or command is None or reference is None or not run.measured:
@@ -192,8 +189,8 @@ def driving(run: Run) -> tuple[float, float]:
 def driven(time: Array, run: Run) -> NDArray[np.bool_]:
     """Return the mask of ``time`` (stamps of an error, s) in which the robot was driven.
 
-    The first :data:`SETTLING` seconds with a command and a reference are excluded as transient.
-    has yet to catch up.
+    The first :data:`SETTLING` seconds with a command and a reference are excluded: the robot has
+    yet to catch up.
     """
     first, last = driving(run)
     since: Array = time - np.maximum(first, time[:1])

@@ -138,8 +138,6 @@ def write_report(
 
     Parameters
     ----------
-    folder
-        The bag.
     output
         Folder of ``report.html`` and ``figures/*.png``; beside the bag by default.
     wanted
@@ -151,8 +149,6 @@ def write_report(
         The bag is missing or cannot be read.
     ReportError
         The bag holds nothing to report, or a given topic cannot be used.
-    OSError
-        The output cannot be written.
     """
     folder = Path(folder)
     output = folder.parent if output is None else Path(output)

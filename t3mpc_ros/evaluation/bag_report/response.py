@@ -150,16 +150,8 @@ def smooth(series: Series, name: str, held: bool = False) -> tuple[Array, Array,
     """Return evenly spaced times with the speed and its first and second derivatives.
 
     Parabolas are fitted to windows of :data:`WINDOW` or of eight samples, whichever is longer.
-    Empty arrays when the series is too short; NaN across gaps longer than a window.
-
-    Parameters
-    ----------
-    series
-        Series that holds the speed.
-    name
-        Name of the quantity.
-    held
-        Whether each value holds until the next, as a command does.
+    Empty arrays when the series is too short; NaN across gaps longer than a window. ``held``:
+    each value holds until the next, as a command does.
     """
     nothing = np.empty(0)
     if len(series) < 3:

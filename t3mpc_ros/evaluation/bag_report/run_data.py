@@ -84,16 +84,7 @@ def continuity_notes(
 ) -> list[str]:
     """Return sentences on gaps, jumps of the pose and disorder of an odometry topic.
 
-    Parameters
-    ----------
-    topic
-        Name of the topic.
-    received, stamps
-        Receive times and stamps in the order of the bag, s, shape (n,).
-    positions
-        x and y, m, shape (n, 2).
-    speeds
-        Forward speed, m/s, shape (n,).
+    Times (s), positions (m, shape (n, 2)) and forward speeds (m/s) are in the order of the bag.
     """
     notes = [
         f'No message of {topic} for {high - low:.1f} s from {low:.1f} s on.'
@@ -230,10 +221,6 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
     ------
     ReportError
         The bag holds nothing to report, or an option does not fit it.
-    DataError
-        A message cannot be read.
-    ParameterError
-        The wheel geometry cannot be used.
     """
     wanted = wanted or ReportOptions()
     choice = choose_topics(recording, wanted)

@@ -77,13 +77,7 @@ class TopicChoice:
 
 
 def choose_topics(recording: BagReader, wanted: ReportOptions) -> TopicChoice:
-    """Return the topic of each role.
-
-    Raises
-    ------
-    ReportError
-        The bag holds nothing to report, or a given topic is missing or of another type.
-    """
+    """Return the topic of each role."""
     names, namespaces = find_topics(recording.topics, wanted.namespace)
     held = {name: topic for name, topic in recording.topics.items() if topic.message_count}
     chosen = {

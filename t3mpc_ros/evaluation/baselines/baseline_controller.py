@@ -62,15 +62,8 @@ class NominalModel:
 class WheelLoads:
     """What friction and turning do to the nominal wheels, rad/s², with no drive.
 
-    Parameters
-    ----------
-    nominal_model
-        Nominal model of the robot.
-    body
-        A body in place of the nominal one.
-    inertia_factor
-        Inertia of the wheels over that of the body: a heavier body is moved less by the same
-        friction.
+    Of another ``body`` if one is given; ``inertia_factor`` is the inertia of the wheels over that
+    of the body: a heavier body is moved less by the same friction.
     """
 
     def __init__(
@@ -137,20 +130,7 @@ class Observation:
 
 
 class BaselineController(ABC):
-    """Interface of a compared controller; each run creates a new one.
-
-    Parameters
-    ----------
-    parameters
-        Tunable parameters, an instance of :attr:`parameters_type`.
-    nominal_model
-        Nominal model of the robot.
-
-    Raises
-    ------
-    ValueError
-        The parameters are of another method.
-    """
+    """Interface of a compared controller; each run creates a new one."""
 
     parameters_type: ClassVar[type[Parameters]]
     preview: ClassVar[bool] = False

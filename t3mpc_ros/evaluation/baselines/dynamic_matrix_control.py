@@ -108,19 +108,8 @@ class Responses(NamedTuple):
 def identify_step_responses(model: WheelModel, inner_gain: float, least: int) -> Responses:
     """Return the step responses of a wheel from two simulations of ``model``.
 
-    Parameters
-    ----------
-    model
-        Wheel model.
-    inner_gain
-        K0 of the loop that is closed around it first, 1/s; 0 when it settles by itself.
-    least
-        At least so many periods are recorded.
-
-    Raises
-    ------
-    ValueError
-        The responses do not settle, because K0 is too high for the period or there is none.
+    ``inner_gain`` is K0 of the loop that is closed around it first, 1/s, 0 when it settles by
+    itself; at least ``least`` periods are recorded.
     """
     runs: list[list[float]] = []
     for command, load in ((1.0, 0.0), (0.0, 1.0)):

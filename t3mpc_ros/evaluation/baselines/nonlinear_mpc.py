@@ -145,13 +145,7 @@ def condense(by_speed: Array, push: Array, lasting: bool, response: Array, closi
 
 
 class CasadiNmpc(ObserverBaseline):
-    """Nonlinear MPC with preview.
-
-    Raises
-    ------
-    ModuleNotFoundError
-        CasADi is not installed.
-    """
+    """Nonlinear MPC with preview; needs CasADi."""
 
     parameters_type: ClassVar[type[Parameters]] = CasadiNmpcParameters
     preview: ClassVar[bool] = True

@@ -139,15 +139,13 @@ def predict_reference(known: Array, fade: float, rows: int, *, preview: bool) ->
     Parameters
     ----------
     known
-        The first rows, shape (n, 2), n >= 2. With preview they are continued by their last
-        slope, or by the one before where that is flatter, so that a jump in the last row is not
-        taken for a slope.
+        The first rows, shape (n, 2), n >= 2. With preview, in which they may contain jumps, they
+        are continued by their last slope, or by the one before where that is flatter, so that a
+        jump in the last row is not taken for a slope.
     fade
         Share of the slope that is left after a period, beyond what is known.
     rows
         N + 1.
-    preview
-        Whether ``known`` may contain jumps.
     """
     missing = rows - len(known)
     if missing <= 0:
@@ -164,12 +162,7 @@ def predict_reference(known: Array, fade: float, rows: int, *, preview: bool) ->
 class BoxProgram:
     """Quadratic program minimise x'Hx/2 + g'x subject to low <= x <= high, solved many times.
 
-    Parameters
-    ----------
-    hessian
-        H, positive definite, shape (n, n).
-    reach
-        -low and high of every move.
+    H is positive definite, shape (n, n); ``reach`` is -low and high of every move.
     """
 
     def __init__(self, hessian: Array, reach: float) -> None:
@@ -209,13 +202,7 @@ class PredictiveBaseline(BaselineController):
         """First command of the plan, or the u that the limits let through."""
 
     def step(self, observation: Observation) -> Array:
-        """Return u, rad/s², shape (2,).
-
-        Raises
-        ------
-        ValueError
-            With preview: an observation without a future.
-        """
+        """Return u, rad/s², shape (2,)."""
         before = self._command if self._torque else observation.command
         self._command = self.advise(observation, before, self._expected(observation))
         if self._torque:

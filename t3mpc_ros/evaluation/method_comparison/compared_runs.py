@@ -234,13 +234,7 @@ def case_texts(robot: str) -> Mapping[str, str]:
 
 @dataclass(frozen=True)
 class ComparisonPlan:
-    """What is compared.
-
-    Raises
-    ------
-    ValueError
-        An unknown robot, case or method, or nothing to compare.
-    """
+    """What is compared."""
 
     robot: str
     cases: tuple[str, ...]
@@ -291,13 +285,7 @@ Results = Mapping[tuple[str, str], Sequence[Numbers]]
 
 
 def compare(plan: ComparisonPlan, workers: int = 1, *, progress: bool = False) -> Results:
-    """Return the metrics of every run of a plan.
-
-    Raises
-    ------
-    JobError
-        A run raised an exception.
-    """
+    """Return the metrics of every run of a plan."""
     keys = plan.jobs()
     numbers: dict[tuple[str, str, int], Numbers] = {}
     with WorkerPool(workers) as pool, progress_bar(len(keys), show=progress) as bar:

@@ -118,21 +118,14 @@ class TwinScenario:
 
     Parameters
     ----------
-    case
-        One of :data:`CASES`.
-    seed
-        Of reference and robot.
+    case, seed
+        One of :data:`CASES`, and the seed of reference and robot.
     duration
         s; the robot stands for the first 1.5 s.
     noise
         Variance of the measured wheel speeds, (rad/s)², which every method knows.
     gyro
         Whether the baselines take the yaw rate from the odometry with its gyro in every case.
-
-    Raises
-    ------
-    ValueError
-        A value out of its range.
     """
 
     case: str
@@ -261,13 +254,6 @@ class TwinBaseline:
     """Drives the twin with a baseline, behind the state estimate and limits of the controller.
 
     It has no watchdog. A lost report is bridged by the estimator, as in the controller.
-
-    Parameters
-    ----------
-    method
-        Makes the baseline from the nominal model.
-    scenario
-        Reference, nominal model, estimator and measurement.
     """
 
     def __init__(

@@ -88,13 +88,7 @@ class TwinObjective(ClosedLoopObjective):
     def objectives(
         self, method: MethodDefinition, drive: str, candidates: Sequence[Parameters]
     ) -> list[float]:
-        """Return the mean objective of each candidate, infinite where a run broke off.
-
-        Raises
-        ------
-        JobError
-            A run raised an exception.
-        """
+        """Return the mean objective of each candidate, infinite where a run broke off."""
         training = self.training
         scenarios = [
             TwinScenario(case, seed, training.duration, noise)

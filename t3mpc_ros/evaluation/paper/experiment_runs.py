@@ -136,13 +136,7 @@ QUICK_CASES = (NOMINAL, 'mass +30 %', 'friction x3', 'disturbance', DEAD_TIME)
 def make_grid(
     setup: ExperimentSetup, *, quick: bool = False, seeds: int | None = None
 ) -> ExperimentGrid:
-    """Return how much is run: everything, or with ``quick`` enough to see that all works.
-
-    Raises
-    ------
-    ValueError
-        More seeds are asked for than are held out.
-    """
+    """Return how much is run: everything, or with ``quick`` enough to see that all works."""
     count = (3 if quick else len(setup.seeds)) if seeds is None else seeds
     if not 1 <= count <= len(setup.seeds):
         raise ValueError(f'seeds must be from 1 to {len(setup.seeds)}: got {count}')
@@ -163,12 +157,6 @@ def needed_experiments(setup: ExperimentSetup, grid: ExperimentGrid) -> tuple[Ex
     in every other case at ``perturbed_noises``; the controller with one part left out in the
     cases that part is for, at ``missing_noises``; baselines with preview in ``baseline_cases``
     at ``baseline_noises``.
-
-    Raises
-    ------
-    ValueError
-        A drive has no controller named :data:`FULL`, a method another name than its key, or a
-        stage of the controller is called a baseline.
     """
     found = []
     for drive in grid.drives:
@@ -272,13 +260,7 @@ def source_digest(package: Path = PACKAGE_DIRECTORY) -> str:
 
 
 def fingerprint(method: ComparedMethod, sources: str) -> str:
-    """Return a digest of version, sources and method, on which the result of a scenario depends.
-
-    Raises
-    ------
-    TypeError
-        The method, or its parameters, hold something that is not plain data.
-    """
+    """Return a digest of version, sources and method: what the result of a scenario needs."""
     parts = [t3mpc_ros.__version__, sources, plain(method)]
     text = json.dumps(parts, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -287,11 +269,8 @@ def fingerprint(method: ComparedMethod, sources: str) -> str:
 def plain(value: Any) -> Any:
     """Return ``value`` as JSON can hold it; long arrays by their digest.
 
-    Raises
-    ------
-    TypeError
-        It is not made of dataclasses, mappings, sequences, arrays, types, numbers and words:
-        two equal ones might then look different, or two different ones alike.
+    What is no plain data is refused: two equal values might then look different, or two different
+    ones alike.
     """
     if value is None or isinstance(value, str | bool | int | float):
         return value
@@ -325,21 +304,8 @@ class RunFile:
     """Finished runs in a file of JSON lines; a context that one set of runs has at a time.
 
     A line is written as a whole and flushed. Should a writer be killed within one, what is torn
-    is that line alone: reading skips it, and the next writer begins on a line of its own.
-
-    Parameters
-    ----------
-    path
-        The file; it and its folder are made when they are needed.
-    fresh
-        Whether what the file holds is thrown away on first entry.
-
-    Raises
-    ------
-    OSError
-        On entry: the file cannot be written.
-    RuntimeError
-        On entry: another set of runs is writing to it.
+    is that line alone: reading skips it, and the next writer begins on a line of its own. With
+    ``fresh``, what the file holds is thrown away on first entry.
     """
 
     def __init__(self, path: Path, *, fresh: bool = False) -> None:
@@ -439,23 +405,12 @@ def run_missing(
 
     Parameters
     ----------
-    setup
-        Where methods and runs come from.
-    grid, needed
-        Seeds and duration, and which cells.
-    file
-        Entered by this function.
     sources
-        Digest of the sources, :func:`t3mpc_ros.evaluation.paper.experiment_runs.source_digest`.
+        Digest of the sources, :func:`source_digest`.
     team
         Who works: how many processes, or what the setup's own ``team`` enters.
     report
         Receives messages; with None there is no progress line either.
-
-    Raises
-    ------
-    RuntimeError
-        The runner gave fewer runs than it was asked for, or another set of runs has the file.
     """
     methods = {drive: setup.methods(drive) for drive in grid.drives}
     prints = {

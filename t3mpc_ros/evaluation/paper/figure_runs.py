@@ -79,13 +79,7 @@ class FigureRuns:
 def simulate_figure_runs(
     setup: ExperimentSetup, grid: ExperimentGrid, results: Results, team: Any
 ) -> FigureRuns:
-    """Return the runs that are drawn, with the first held-out seed.
-
-    Raises
-    ------
-    RuntimeError
-        The runner gave fewer runs than it was asked for.
-    """
+    """Return the runs that are drawn, with the first held-out seed."""
     seed = grid.seeds[0]
     shown = portrait_methods(results)
     requested = [('torque', name) for name in shown] + [('velocity', FULL)]

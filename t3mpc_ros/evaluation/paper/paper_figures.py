@@ -64,17 +64,8 @@ def path(showcase: FigureRuns) -> Any:
 def floor_path(speeds: Array, time: Array, geometry: WheelGeometry | None = None) -> Array:
     """Return places (m) on the way of a robot whose wheels turn so, shape (n, 2), from (0, 0).
 
-    The body motion (1)-(3) is integrated in exact arcs, a wheel's speed held at the mean of
-    both ends of a period.
-
-    Parameters
-    ----------
-    speeds
-        Right and left wheel, rad/s, shape (n, 2).
-    time
-        s, shape (n,).
-    geometry
-        Of the robot; the default one when None.
+    The body motion (1)-(3) is integrated in exact arcs, a wheel's speed (rad/s, right first) held
+    at the mean of both ends of a period. The default geometry when None.
     """
     geometry = WheelGeometry() if geometry is None else geometry
     places = np.zeros((time.size, 2))

@@ -243,18 +243,8 @@ def page(
 ) -> str:
     """Return the page as HTML that loads nothing from anywhere.
 
-    Parameters
-    ----------
-    title, origin
-        What it is about, and where its numbers come from.
-    claims
-        Every claim, decided.
-    tables
-        By heading, :func:`t3mpc_ros.evaluation.paper.results.all_tables`.
-    pictures
-        PNG files by stem.
-    findings
-        Words by stem where no claim decides, by ``findings`` of the same module.
+    ``origin`` says where the numbers come from; tables are by heading, pictures (PNG) and findings
+    by the stem of their exhibit.
     """
     return html_page(
         title,

@@ -68,25 +68,8 @@ def reproduce(
     """Return a summary in a few lines, after writing everything into the output folder.
 
     ``results.json``, ``results.csv``, ``tables.md``, ``paper.html`` and ``figures/*.png``. None
-    of them depends on how many processes worked, or on which runs were there already.
-
-    Parameters
-    ----------
-    setup
-        Where methods and runs come from.
-    options
-        What is asked for.
-    report
-        Receives a line for each step; with None there is no progress line either.
-
-    Raises
-    ------
-    OSError
-        The output cannot be written.
-    RuntimeError
-        Another set of runs is writing to the same folder.
-    ValueError
-        More seeds are asked for than there are.
+    of them depends on how many processes worked, or on which runs were there already. ``report``
+    receives a line for each step; with None there is no progress line either.
     """
     write = report or (lambda text: None)
     grid = make_grid(setup, quick=options.quick, seeds=options.seeds)

@@ -99,10 +99,8 @@ class Results:
         Of each method: whether it is a baseline, and whether it has preview; in the tables' order.
     numbers
         One entry per seed, in the same order of seeds in all cells.
-    duration
-        s of each run.
-    complete
-        Whether these are all seeds, with the whole duration.
+    duration, complete
+        s of each run, and whether these are all seeds with the whole duration.
     """
 
     def __init__(
@@ -227,13 +225,7 @@ def results_of(
     grid: ExperimentGrid,
     numbers: Mapping[Experiment, Sequence[RunNumbers]],
 ) -> Results:
-    """Return the table of results of a set of runs, the methods in the order of the setup.
-
-    Raises
-    ------
-    ValueError
-        A method is a baseline, or has preview, with one drive and not with the other.
-    """
+    """Return the table of results of a set of runs, the methods in the order of the setup."""
     kinds: dict[str, tuple[bool, bool]] = {}
     for drive in grid.drives:
         for name, method in setup.methods(drive).items():
@@ -251,13 +243,7 @@ def step_to(part: str) -> tuple[str, str]:
 
 
 def write_csv(path: Path, rows: Iterable[ResultRow]) -> None:
-    """Write the rows with the names of the JSON's keys on top; empty for what is not finite.
-
-    Raises
-    ------
-    OSError
-        The file cannot be written.
-    """
+    """Write the rows with the names of the JSON's keys on top; empty for what is not finite."""
     with path.open('w', newline='', encoding='utf-8') as stream:
         writer = csv.DictWriter(
             stream, [item.name for item in fields(ResultRow)], lineterminator='\n'

@@ -32,13 +32,7 @@ differs; adaptation accumulates the differences."""
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Allowed difference of two numbers: absolute + relative |recorded|, in SI units.
-
-    Raises
-    ------
-    ValueError
-        A tolerance is negative or not finite, or a name matches no field.
-    """
+    """Allowed difference of two numbers: absolute + relative |recorded|, in SI units."""
 
     absolute: float = ABSOLUTE
     relative: float = RELATIVE
@@ -155,11 +149,6 @@ def compare(
 
     Only events with complete inputs count. Without any, as in a bag without a journal, all are
     compared, and a remark states it.
-
-    Raises
-    ------
-    ReplayError
-        The recording holds nothing to compare.
     """
     remarks = list(inputs.notes)
     compared = inputs.exact
@@ -192,11 +181,6 @@ def compare_bags(
 
     Events are matched by their number where both have a journal, else by the stamp of the
     odometry.
-
-    Raises
-    ------
-    ReplayError
-        They have no event in common.
     """
     keys = [_keys(inputs, one.journalled and other.journalled) for inputs in (one, other)]
     places = {key: row for row, key in enumerate(keys[1])}

@@ -134,8 +134,6 @@ def load_inputs(
 
     Parameters
     ----------
-    bag
-        Folder or file of the bag.
     namespace
         Namespace of the robot; the one with most topics by default.
     model
@@ -145,8 +143,6 @@ def load_inputs(
     ------
     ReplayError
         Topics or parameters are missing, or cannot be used.
-    BagError
-        The bag cannot be read.
     """
     with open_bag(bag) as held:
         return inputs_of(held, namespace, model)
@@ -206,13 +202,7 @@ def inputs_of(
 def recorded_parameters(
     recording: BagReader, namespace: str, notes: list[str]
 ) -> ControllerParameters:
-    """Return the controller's parameters as recorded.
-
-    Raises
-    ------
-    ReplayError
-        They are not in the bag, or invalid.
-    """
+    """Return the controller's parameters as recorded."""
     own = f'{namespace}/controller'
     table = recording.metadata_records.get(
         'controller' if own not in recording.metadata_records else own

@@ -67,14 +67,8 @@ def replay_controller(
 ) -> ReplayResult:
     """Return the outputs of today's controller for recorded inputs.
 
-    Parameters
-    ----------
-    inputs
-        Recorded inputs.
-    changes
-        Parameters by name that replace the recorded ones throughout the run.
-    controllers
-        Controllers made by :func:`make_controllers`; consumed by the call.
+    ``changes`` are parameters by name that replace the recorded ones throughout the run;
+    ``controllers``, made by :func:`make_controllers`, are consumed by the call.
 
     Raises
     ------
@@ -102,13 +96,7 @@ def replay_controller(
 def make_controllers(
     inputs: ControllerInputs, changes: Mapping[str, object] | None = None
 ) -> list[Controller]:
-    """Return one compiled controller for each recorded life, initialised as its node did.
-
-    Raises
-    ------
-    ParameterError, ValueError
-        See :func:`replay_controller`.
-    """
+    """Return one compiled controller for each recorded life, initialised as its node did."""
     controllers = []
     for life in inputs.lives:
         controller = Controller(life.parameters[life.start].with_values(changes or {}))
@@ -127,13 +115,6 @@ def recompute_scalars(
     They are those that its node publishes, at the same rate: by relative topic name, the arrays
     that :meth:`BagReader.series` would return for the field ``value``, and ``exact``, which is 1
     where all inputs of the controller are in the bag, else 0.
-
-    Raises
-    ------
-    ReplayError, ValueError
-        The bag has no journal, or its inputs, parameters or model are incomplete.
-    BagError
-        The bag is damaged.
     """
     inputs = inputs_of(recording, namespace)
     if not inputs.journalled:

@@ -21,13 +21,7 @@ STRIPS = 400
 
 
 def write_divergence_figure(outcome: Comparison, path: Path) -> None:
-    """Write a PNG of the first divergence of the replay from the recording.
-
-    Raises
-    ------
-    OSError
-        The file cannot be written.
-    """
+    """Write a PNG of the first divergence of the replay from the recording."""
     content = png_of(_draw, outcome)
     if content is not None:
         path.write_bytes(content)

@@ -56,14 +56,7 @@ _NO_COVARIANCE = bytes(36 * 8)
 class ControllerBag:
     """Writes messages into a bag; receive time and publish time are equal.
 
-    Parameters
-    ----------
-    folder
-        Folder of the bag.
-    settings
-        Parameters of the controller, stored as metadata record as by the recorder.
-    details
-        Further metadata records.
+    The parameters of the controller are stored as metadata record as by the recorder.
     """
 
     def __init__(
@@ -125,20 +118,8 @@ class ControllerBag:
 class RecordedController:
     """A controller whose inputs and outputs are written to a bag, as by node and recorder.
 
-    Every event has its time, which must not decrease.
-
-    Parameters
-    ----------
-    settings
-        Parameters of the controller.
-    tape
-        Bag for its topics.
-    now_ns
-        Start time.
-    every
-        Steps between two publications of its scalars.
-    model
-        Model file to start from.
+    Every event has its time, which must not decrease. ``every`` is how many steps lie between two
+    publications of its scalars; ``model`` is the file to start from.
     """
 
     def __init__(
@@ -213,11 +194,6 @@ def write_replay(inputs: ControllerInputs, again: ReplayResult, folder: Path) ->
 
     Scalars are written at every step. Messages have the times of the recorded run, so that both
     bags can be viewed together.
-
-    Raises
-    ------
-    BagError
-        The bag cannot be written.
     """
     messages: list[tuple[int, str, bytes]] = []
     for topic, column in ((REFERENCE, inputs.references), (ODOMETRY, inputs.odometry)):
@@ -348,15 +324,7 @@ GOLDEN_SCENARIOS: Mapping[str, GoldenScenario] = {
 
 
 def write_golden(folder: Path, progress: Callable[[str], None] = print) -> list[Path]:
-    """Write the golden bags to ``folder`` with the current controller, and return their paths.
-
-    Raises
-    ------
-    OSError
-        A file cannot be written.
-    BagError
-        A bag cannot be written.
-    """
+    """Write the golden bags to ``folder`` with the current controller, and return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for name, recipe in GOLDEN_SCENARIOS.items():

@@ -44,13 +44,6 @@ def with_initial_inputs(received: TopicColumns, initial: TopicColumns) -> TopicC
 
     The controller republishes its first inputs on a transient-local topic. A message with a stamp
     that the plain topic lacks is inserted in front of the first message with a later stamp.
-
-    Parameters
-    ----------
-    received
-        Recorded messages of the input, in order of receipt.
-    initial
-        Messages that the controller has republished, in order of publication.
     """
     missing = np.flatnonzero(~np.isin(initial.stamps_ns, received.stamps_ns))
     if not missing.size:
@@ -70,12 +63,8 @@ def with_initial_inputs(received: TopicColumns, initial: TopicColumns) -> TopicC
 def match(rows: Integers, odometry_ns: Integers, reference_ns: Integers) -> ConsumedMessages:
     """Return the messages that the controller processed, by its journal.
 
-    Parameters
-    ----------
-    rows
-        The journal of one life of the controller, shape (n, 5), see :mod:`record.run.journal`.
-    odometry_ns, reference_ns
-        Stamps of the recorded messages, in order of receipt.
+    ``rows`` is the journal of one life of the controller, shape (n, 5), see
+    :mod:`t3mpc_ros.bag.run.journal`; stamps of the messages are in order of receipt.
     """
     number, event, stamp, handed, value = rows.T
     steps = event == Event.STEP
@@ -103,14 +92,9 @@ def match_commands(asked: Array, answered: Array) -> NDArray[np.int64]:
 
     The controller responds to each message it processes, in order: command j belongs to message
     j + s, where s is the number of earlier messages without a command, from before the first
-    command or lost. Receive times alone mislead: on a busy processor the next message arrives
-    before the command, and of two publishers the second may even be received first. Both pass,
-    so s is the median over two seconds.
-
-    Parameters
-    ----------
-    asked, answered
-        Receive times, ascending, s.
+    command or lost. Receive times (ascending, s) alone mislead: on a busy processor the next
+    message arrives before the command, and of two publishers the second may even be received
+    first. Both pass, so s is the median over two seconds.
     """
     numbers = np.arange(answered.size)
     behind = np.searchsorted(asked, answered, side='right') - 1 - numbers
@@ -124,15 +108,10 @@ def match_commands(asked: Array, answered: Array) -> NDArray[np.int64]:
 def by_receipt(
     odometry: Integers, references: Integers, commands: Integers
 ) -> tuple[ConsumedMessages, Integers]:
-    """Return the messages that the controller probably processed, by receive times.
+    """Return the messages that the controller probably processed, by receive times, ns, ascending.
 
     Odometry messages followed by a command count as steps, and those between them.
     The second result is the command of each step, -1 where unknown, shape (n,).
-
-    Parameters
-    ----------
-    odometry, references, commands
-        Receive times, ns, ascending; at least one of each.
     """
     first = min(int(odometry[0]), int(commands[0]))
     answered = match_commands((odometry - first) / NANOSECONDS, (commands - first) / NANOSECONDS)
@@ -148,16 +127,10 @@ def by_receipt(
 
 
 def commands_of(rows: Integers, published: Integers, sent: Integers) -> Integers:
-    """Return the recorded command of each row, -1 without one, shape (n,).
+    """Return the recorded command of each row of the journal, -1 without one, shape (n,).
 
-    The controller publishes a command and then its journal row.
-
-    Parameters
-    ----------
-    rows
-        The journal, shape (n, 5).
-    published, sent
-        Publication times of rows and commands, by the clock of the controller, ns.
+    The controller publishes a command and then its journal row: ``published`` and ``sent`` are
+    these times by its clock, ns.
     """
     found = np.full(len(rows), -1, dtype=np.int64)
     commanding = np.isin(rows[:, 1], COMMAND_EVENTS)
@@ -175,12 +148,7 @@ def commands_of(rows: Integers, published: Integers, sent: Integers) -> Integers
 def rows_of(published: Integers, scalars: Integers, steps: Flags) -> Integers:
     """Return the journal row that each scalar follows, -1 without one, shape (m,).
 
-    Parameters
-    ----------
-    published, scalars
-        Publication times of rows and scalars, ns.
-    steps
-        Whether a row is a step: only steps are followed by scalars.
+    ``published`` and ``scalars`` are publication times, ns; only ``steps`` precede scalars.
     """
     rows = np.searchsorted(published, scalars, side='right') - 1
     rows[(rows >= 0) & ~steps[rows]] = -1

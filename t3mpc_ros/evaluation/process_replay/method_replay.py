@@ -46,11 +46,6 @@ def replay_method(
 
     The controller decides when that is, on the same inputs: all methods stop alike. The result
     holds the commands only.
-
-    Raises
-    ------
-    ReplayError
-        The method is unknown.
     """
     known = methods('velocity')
     try:

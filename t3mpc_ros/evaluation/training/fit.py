@@ -44,14 +44,7 @@ def estimate_move_effect(
     1999, chapter 9). In a closed loop v_p is nearly a function of the errors, so XᵀX is nearly
     singular unless something else moves it.
 
-    Parameters
-    ----------
-    errors, moves
-        *Newest first*, NaN where unknown, shape (N,).
-    delta_lags, move_lags
-        n_a and n_b.
-    ahead
-        Periods.
+    Errors and moves are *newest first*, NaN where unknown, shape (N,).
     """
     count = errors.size - max(delta_lags, move_lags)
     nothing = MoveEffect(math.nan, math.inf, 0.0)
@@ -137,20 +130,6 @@ def periods(
     at all, v_p in periods in which limits mostly cut u, and a whole row wherever a period has no
     message, or runs are not contiguous. Nothing is fitted across such a gap, nor to an
     error whose lags reach into one; all other rows count.
-
-    Parameters
-    ----------
-    replay
-        One or several runs.
-    settings
-        Parameters of the predictive controller.
-    rate
-        Control rate, Hz.
-
-    Raises
-    ------
-    TrainingError
-        v_p was published too rarely.
     """
     decimation, average, span = (
         parameters.decimation,
@@ -266,15 +245,7 @@ def _machine(parameters: PredictiveParameters, generator: np.random.Generator) -
 def stretches(errors: Array, moves: Array) -> list[list[tuple[Array, Array]]]:
     """Return the segments of a run without a gap, of at least :data:`JUDGED` periods.
 
-    Parameters
-    ----------
-    errors, moves
-        As :func:`periods` returns them, shape (N, 2).
-
-    Returns
-    -------
-    list
-        For each part (errors, moves) of each wheel, *newest first*.
+    Of what :func:`periods` returns, (errors, moves) of each wheel, *newest first*.
     """
     gaps = np.flatnonzero(np.isnan(errors + moves).any(axis=1))
     edges = [-1, *gaps.tolist(), len(errors)]
@@ -311,17 +282,9 @@ def skills(
 ) -> Array:
     """Return the skill of weights on a run: next step and middle of the horizon, (2, m).
 
-    1 is perfect; 0 equals persistence, the prediction that the error stays constant. The
-    squared errors of all segments are summed. NaN without a segment.
-
-    Parameters
-    ----------
-    settings, span
-        Of the predictive controller, and its period, s.
-    weights
-        As :meth:`PredictiveController.get_weights` returns them.
-    parts
-        As :func:`stretches` returns them.
+    1 is perfect; 0 equals persistence, the prediction that the error stays constant. The squared
+    errors of all ``parts``, see :func:`stretches`, are summed. NaN without one. ``span`` is the
+    predictive period, s.
     """
     learning = learning_constants(parameters, span)
     outputs = len(weights['scales'])
@@ -350,11 +313,6 @@ def fit_coefficients(parameters: Nt3fsMpcParameters, replay: TrainingData) -> Ar
     decreases with the passes, so that what is not a function of chi averages out. P is the
     projection of the adaptation. d is the estimator residual, as seen by the control
     law; g is to cancel it.
-
-    Raises
-    ------
-    TrainingError
-        The run is too short.
     """
     rows = _informative_rows(parameters, replay)
     decimation = parameters.predictive.decimation

@@ -55,13 +55,7 @@ class Fold:
 
 
 def blocks(replay: TrainingData, count: int) -> list[TrainingData]:
-    """Return a run in ``count`` parts of equal length, each a run of its own.
-
-    Raises
-    ------
-    ValueError
-        ``count`` is below 2.
-    """
+    """Return a run in ``count`` parts of equal length, each a run of its own."""
     if count < 2:
         raise ValueError(f'folds must be at least 2: got {count}')
     edges = np.linspace(0, len(replay), count + 1).round().astype(int).tolist()
@@ -84,19 +78,8 @@ def cross_validate(
 ) -> list[Fold]:
     """Return for each run the model of all others, evaluated on it.
 
-    Parameters
-    ----------
-    settings
-        Common parameters of all runs.
-    runs
-        Runs by displayed name; at least 2.
-    keep_predictor
-        Evaluate the fuzzy coefficients only.
-
-    Raises
-    ------
-    TrainingError
-        Without one of the runs too little data is left, or no run can be evaluated.
+    With ``keep_predictor`` the fuzzy coefficients only. There are at least two runs, with common
+    parameters.
     """
     predictive = parameters.predictive
     span = predictive.decimation / parameters.rate
@@ -207,18 +190,9 @@ def fit_bags(
 ) -> FittedModel:
     """Return the model of all bags, and its cross-validated skill.
 
-    Of several bags each is a fold. A single bag is cut into consecutive blocks: they are
-    less independent than bags, so the skill is slightly optimistic.
-
-    Parameters
-    ----------
-    folders
-        Bags with the same parameters.
-    keep_predictor
-        Fit the fuzzy coefficients only. The predictor stays pre-trained on the nominal loop: for
-        bags in which v_p moved too little.
-    count
-        Number of blocks of a single bag, at least 2.
+    Of several bags each is a fold. A single bag is cut into ``count`` consecutive blocks: they are
+    less independent than bags, so the skill is slightly optimistic. With ``keep_predictor`` the
+    predictor stays pre-trained on the nominal loop: for bags in which v_p moved too little.
 
     Raises
     ------
@@ -315,13 +289,7 @@ def _both(values: Sequence[Array]) -> dict[str, list[float] | list[list[float]]]
 
 
 def origin_of(folder: Path) -> dict[str, object]:
-    """Return the files of a bag (SHA-256 by name) and their provenance, as plain data.
-
-    Raises
-    ------
-    BagError
-        The bag cannot be read.
-    """
+    """Return the files of a bag (SHA-256 by name) and their provenance, as plain data."""
     paths = [folder] if folder.is_file() else sorted(folder.iterdir())
     files = {}
     for path in paths:

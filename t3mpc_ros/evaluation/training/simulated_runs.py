@@ -36,13 +36,7 @@ _FOLLOWED = [TERM_NAMES.index(name) for name in ('feedback', 'feedforward', 'com
 
 
 def full_parameters(drive: str) -> ProposedParameters:
-    """Return the parameters of our full controller: the tuned ones of the package, if any.
-
-    Raises
-    ------
-    StoreError
-        The stored parameters do not fit this version.
-    """
+    """Return the parameters of our full controller: the tuned ones of the package, if any."""
     parameters = (
         methods(drive)[FULL].parameters
         if PACKAGED_FILE.is_file()
@@ -78,19 +72,7 @@ def assess(
     *,
     progress: bool = False,
 ) -> str:
-    """Return a report on the model on held-out seeds.
-
-    Parameters
-    ----------
-    drive
-        One of ``scenario.DRIVES``.
-    settings, learnt
-        Parameters of the controller, and its initial model.
-    seeds
-        Seeds of the runs with and without the model.
-    progress
-        Whether a progress line is shown.
-    """
+    """Return a report on a model: runs on held-out seeds with it and without."""
     without = MethodSpec(FULL, ProposedController, parameters)
 
     def with_model(*given: object) -> ProposedController:
@@ -175,13 +157,7 @@ def training_data_of(record: LoopRecord, parameters: ProposedParameters) -> Trai
 
 
 def held_out_seeds(count: int) -> Sequence[int]:
-    """Return the first seeds of those used for results.
-
-    Raises
-    ------
-    ValueError
-        There are not as many.
-    """
+    """Return the first seeds of those used for results."""
     if not 1 <= count <= len(HELD_OUT_SEEDS):
         raise ValueError(f'seeds must be from 1 to {len(HELD_OUT_SEEDS)}: got {count}')
     return HELD_OUT_SEEDS[:count]

@@ -102,29 +102,18 @@ def search_best(
     ----------
     objective
         To be made small. Called once for the start and once for each generation.
-    space
-        What is searched.
-    start
-        Where the search begins; its tuned parameters lie within the ranges.
-    evaluations
-        How many points are evaluated, at least 1.
-    seed
-        Of every random number drawn.
     report
         Called after each generation.
     batch
         Points of a generation, at least 2; by default 4 + 3 ln n for n parameters.
-    path
-        File for the history, written after each generation.
-    resume
-        Take what ``path`` holds as already evaluated. Without such a file it begins anew.
+    path, resume
+        File for the history, written after each generation, and whether what it holds is taken as
+        already evaluated. Without such a file the search begins anew.
     about
         Plain data that tells this objective from others; a history with another is refused.
 
     Raises
     ------
-    ParameterError
-        ``start`` is another table, or outside the ranges.
     ValueError
         Counts that are too small; an objective that returns another number of values; a
         history that is damaged or belongs to another search.

@@ -124,13 +124,7 @@ def _recorded_composition(records: Mapping[str, Mapping[str, str]]) -> str:
 
 
 def identify_drive(run: Run) -> IdentifiedDrive:
-    """Return the drive of the robot in a recorded run.
-
-    Raises
-    ------
-    IdentificationError
-        The run does not determine it.
-    """
+    """Return the drive of the robot in a recorded run."""
     for name in (COMMAND, ODOMETRY):
         if name not in run.motions or len(run.motions[name]) < 3:
             raise IdentificationError(f'the bag must hold {COMMAND} and {ODOMETRY}: no {name}')
@@ -183,16 +177,10 @@ def _held(command: Series, name: str, time: Array) -> Array:
 
 
 class _Response:
-    """Response of the model at the measured stamps.
+    """Response of the model at the measured stamps, in ``rows`` of ``motion``.
 
-    Parameters
-    ----------
-    command, motion
-        Commanded and measured wheel speeds.
-    rows
-        Rows of ``motion`` that are used, shape (n,).
-    window
-        Time before a stamp over which the measured speed is the mean, s; 0: the speed at it.
+    ``window`` is the time before a stamp over which the measured speed is the mean, s; 0: the
+    speed at it.
     """
 
     def __init__(
@@ -399,13 +387,7 @@ def _rounded_rate(rate: float) -> float:
 
 
 def fitting_parameters(drive: IdentifiedDrive, composition: str) -> ControllerParameters:
-    """Return the parameters of the controller for a drive, with the gain by the rule.
-
-    Raises
-    ------
-    ParameterError
-        A value is out of the range of its parameter.
-    """
+    """Return the parameters of the controller for a drive, with the gain by the rule."""
     return _resolved(drive, composition, drive.lag.value)
 
 
@@ -427,17 +409,7 @@ def _resolved(drive: IdentifiedDrive, composition: str, lag: float) -> Controlle
 
 
 def parameter_file(drive: IdentifiedDrive, composition: str, source: str) -> str:
-    """Return the parameter file (YAML) of the controller for a drive.
-
-    Parameters
-    ----------
-    drive
-        The identified drive.
-    composition
-        Of the controller.
-    source
-        Name of the bag.
-    """
+    """Return the parameter file (YAML) of the controller for a drive; ``source`` names the bag."""
     values = fitting_parameters(drive, composition).to_dict()
     slower = _resolved(drive, composition, drive.lag.value + drive.lag.deviation).to_dict()
 

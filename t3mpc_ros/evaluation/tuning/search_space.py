@@ -29,21 +29,9 @@ Values = dict[str, int | float]
 
 @dataclass(frozen=True, slots=True)
 class SearchRange:
-    """Where one parameter is searched.
+    """Where one parameter is searched: bounds, both included, in the unit of the parameter.
 
-    Parameters
-    ----------
-    name
-        Dotted name of a parameter that holds a number.
-    low, high
-        Bounds, both included, in the parameter's own unit.
-    log
-        Whether equal steps are equal factors; ``low`` must then be above 0.
-
-    Raises
-    ------
-    ParameterError
-        Bounds that are not finite, not in order, or not above 0 where they must be.
+    With ``log`` equal steps are equal factors; ``low`` must then be above 0.
     """
 
     name: str
@@ -66,14 +54,7 @@ class SearchRange:
 
 
 class SearchSpace:
-    """The tuned parameters of one table, as the unit cube.
-
-    Parameters
-    ----------
-    table
-        The table that the parameters belong to.
-    ranges
-        What is tuned, at least one; their order is that of the coordinates.
+    """The tuned parameters of one table, as the unit cube; coordinates are in order of ``ranges``.
 
     Raises
     ------
@@ -106,13 +87,7 @@ class SearchSpace:
         return tuple(each.name for each in self.ranges)
 
     def values(self, point: ArrayLike) -> Values:
-        """Return the parameters at a point of the unit cube, exactly within their ranges.
-
-        Raises
-        ------
-        ValueError
-            The point has another number of coordinates, or one outside 0 to 1.
-        """
+        """Return the parameters at a point of the unit cube, exactly within their ranges."""
         where = np.asarray(point, dtype=np.float64)
         if where.shape != (len(self),):
             raise ValueError(f'point must have shape ({len(self)},): got {where.shape}')
@@ -134,11 +109,6 @@ class SearchSpace:
         """Return the point of the unit cube that stands for ``values``, shape (n,).
 
         Names that are not tuned are passed over, so a whole flat table may be given.
-
-        Raises
-        ------
-        ParameterError
-            A tuned parameter is missing, not a number, or outside its range.
         """
         result = np.empty(len(self))
         for i, (each, (low, high)) in enumerate(zip(self.ranges, self._ends, strict=True)):
@@ -157,13 +127,7 @@ class SearchSpace:
         return result
 
     def of(self, parameters: Parameters) -> Values:
-        """Return the tuned parameters of a table as they are, checked to be in their ranges.
-
-        Raises
-        ------
-        ParameterError
-            Another table, or a parameter outside its range.
-        """
+        """Return the tuned parameters of a table as they are, checked to be in their ranges."""
         if not isinstance(parameters, self.table):
             raise ParameterError(
                 f'parameters must be {self.table.__name__}: got {type(parameters).__name__}'
@@ -213,8 +177,6 @@ class MethodDefinition:
     ----------
     name
         As it stands in tables and figures, for example ``'linear MPC'``.
-    controller_type
-        The controller.
     start
         For each drive, or the twin, the method is meant for, the parameters its maker would
         choose: tuning begins there, and never ends worse.
@@ -222,11 +184,6 @@ class MethodDefinition:
         What is tuned, in either drive. All else stays as in ``start``.
     table
         The table of the parameters; by default that of the controller.
-
-    Raises
-    ------
-    ParameterError
-        No drive, parameters of another table, or ranges that do not fit; names the method.
     """
 
     name: str
@@ -269,13 +226,7 @@ def short_name(name: str) -> str:
 
 
 def find_names(kind: str, names: Sequence[str], known: Iterable[str]) -> tuple[str, ...]:
-    """Return the named entries of ``known`` in its order; case and punctuation are ignored.
-
-    Raises
-    ------
-    ValueError
-        An unknown name; the text holds all, and the nearest one.
-    """
+    """Return the named entries of ``known`` in its order; case and punctuation are ignored."""
     by_short_name = {short_name(name): name for name in known}
     for name in names:
         if short_name(name) not in by_short_name:

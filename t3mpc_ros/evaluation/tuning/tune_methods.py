@@ -48,18 +48,9 @@ def objective(record: LoopRecord) -> float:
 
 @dataclass(frozen=True, slots=True)
 class TuningScenarios:
-    """The runs of one evaluation.
+    """The runs of one evaluation: one for each seed, none of which is one of the results.
 
-    Parameters
-    ----------
-    seeds
-        One run each; a seed is never one on which results are reported.
-    noise_levels
-        Run i has level i, counted round; there are seeds enough for each.
-    duration
-        s
-    cases
-        Run i has case i, counted round.
+    Run i has noise level i and case i, both counted round; there are seeds enough for each.
     """
 
     seeds: tuple[int, ...] = TUNING_SEEDS
@@ -102,16 +93,8 @@ class TuningScenarios:
 class ClosedLoopObjective:
     """Mean objective of parameters in the closed loop; several are evaluated at the same time.
 
-    To be used in a ``with`` statement: the processes stay warm between generations.
-
-    Parameters
-    ----------
-    training
-        The runs of one evaluation.
-    workers
-        How many processes.
-    report
-        Receives the error text of parameters with which a run raised an exception.
+    To be used in a ``with`` statement: the processes stay warm between generations. ``report``
+    receives the error text of parameters with which a run raised an exception.
     """
 
     def __init__(
@@ -165,13 +148,7 @@ class ClosedLoopObjective:
     def objectives(
         self, method: MethodDefinition, drive: str, candidates: Sequence[Parameters]
     ) -> list[float]:
-        """Return the mean objective of each candidate, infinite where a run broke off.
-
-        Raises
-        ------
-        JobError
-            A run raised an exception.
-        """
+        """Return the mean objective of each candidate, infinite where a run broke off."""
         scenarios = self.training.scenarios(drive)
         jobs: list[Job] = [
             (scenario, MethodSpec(method.name, method.controller_type, candidate, pretrained=True))
@@ -186,17 +163,8 @@ def mean_objectives(
 ) -> list[float]:
     """Return the mean over the runs of each candidate; the same in whatever order they come.
 
-    Parameters
-    ----------
-    candidates, runs
-        Run j of candidate i has index ``i * runs + j``.
-    evaluated
-        (index, objective), each index once.
-
-    Raises
-    ------
-    ValueError
-        An index is missing, comes twice, or is none.
+    ``evaluated`` are (index, objective), each index once: that of run j of candidate i is
+    ``i * runs + j``.
     """
     objectives: dict[int, float] = {}
     for index, value in evaluated:
@@ -238,25 +206,17 @@ def tune_methods(
 
     Parameters
     ----------
-    methods
-        Of different names.
     drives
         Keys of the start parameters: ``'torque'``, ``'velocity'``, or ``'twin'`` with its own
         ``evaluate``; a method without start parameters for one is left out there.
-    evaluations
-        Of each search.
-    workers
-        How many processes run the closed loop.
     path
         Where the tuned parameters are kept.
     report
         Receives messages; with None there is no progress line either.
     resume
         Go on with searches that were interrupted.
-    training
-        The runs of an evaluation.
-    evaluate
-        In place of the closed loop.
+    training, evaluate
+        The runs of an evaluation, and what evaluates in place of the closed loop.
     seed
         Of every search.
 

@@ -75,13 +75,7 @@ class TunedEntry:
 
 
 class TunedParameters:
-    """Tuned parameters by method and drive; those for the digital twin have drive ``twin``.
-
-    Parameters
-    ----------
-    entries
-        By (method, drive).
-    """
+    """Tuned parameters by (method, drive); those for the digital twin have drive ``twin``."""
 
     def __init__(self, entries: Mapping[tuple[str, str], TunedEntry] | None = None) -> None:
         self._entries = dict(entries or {})
@@ -102,20 +96,13 @@ class TunedParameters:
     ) -> Self:
         """Return the content of a file.
 
-        Parameters
-        ----------
-        path
-            The file.
-        types
-            The table of each method. When given, every value is checked, and a method that is
-            not in it is refused.
+        With ``types``, the table of each method, every value is checked, and a method that is not
+        in it is refused.
 
         Raises
         ------
         StoreError
             What it holds is not what :meth:`save` writes, or does not fit the tables.
-        OSError
-            It cannot be read.
         """
         try:
             content = json.loads(
@@ -146,13 +133,7 @@ class TunedParameters:
         self._entries[method, drive] = entry
 
     def entry(self, method: str, drive: str) -> TunedEntry:
-        """Return what was found for a method in a drive.
-
-        Raises
-        ------
-        StoreError
-            Nothing was.
-        """
+        """Return what was found for a method in a drive."""
         try:
             return self._entries[method, drive]
         except KeyError:
@@ -162,13 +143,7 @@ class TunedParameters:
             ) from None
 
     def parameters(self, method: str, drive: str, table: type[T]) -> T:
-        """Return the tuned parameters of a method as its table.
-
-        Raises
-        ------
-        StoreError
-            It was not tuned, or what is stored does not fit the table; names the parameter.
-        """
+        """Return the tuned parameters of a method as its table."""
         entry = self.entry(method, drive)
         known = [row.name for row in table.specs()]
         where = f'{method}, {drive}'
@@ -184,13 +159,7 @@ class TunedParameters:
             raise StoreError(f'{where}: {error}') from error
 
     def applied(self, method: str, drive: str, start: T) -> T:
-        """Return ``start`` with the parameters that were tuned; all others stay as they are.
-
-        Raises
-        ------
-        StoreError
-            It was not tuned, or what is stored does not fit the table; names the parameter.
-        """
+        """Return ``start`` with the parameters that were tuned; all others stay as they are."""
         entry = self.entry(method, drive)
         try:
             return start.with_values({name: entry.values[name] for name in entry.tuned})

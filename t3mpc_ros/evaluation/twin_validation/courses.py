@@ -131,13 +131,7 @@ def umbmark(
 def spin(
     parameters: DigitalTwinParameters, turns: int, slip_events: Iterable[FaultEvent] = ()
 ) -> Course:
-    """Return the course of ``turns`` turns on the spot, counter-clockwise, with a stop after each.
-
-    Raises
-    ------
-    RuntimeError
-        The robot does not get to the end of a leg.
-    """
+    """Return the course of turns on the spot, counter-clockwise, with a stop after each."""
     geometry = parameters.geometry
     turn = 2.0 * math.pi * geometry.half_separation / geometry.wheel_radius
     return _driven(f'{turns} turns', parameters, [(turn, -turn)] * turns, slip_events)
@@ -181,12 +175,8 @@ def patrol(
 
     It turns to the freer side when something is nearer than 0.3 m in front or 0.15 m beside it,
     until that is 0.4 or 0.2 m away. From ``blind_from`` (s) on no sensor answers, and it drives
-    straight on, until it has been at a wall for a second, or for ``longest`` seconds.
-
-    Parameters
-    ----------
-    speed
-        Of the wheels, rad/s.
+    straight on, until it has been at a wall for a second, or for ``longest`` seconds. ``speed`` is
+    that of the wheels, rad/s.
     """
     log = _Log('patrol', parameters, [FaultEvent(blind_from, 'ranges_dead', True)])
     world, radius = load_world(parameters.world), parameters.bumper.radius

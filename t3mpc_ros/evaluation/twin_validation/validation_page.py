@@ -509,13 +509,7 @@ QUICK = ValidationSize(seeds=1, strengths=1, standing=60.0, patrol=14.0)
 def write_validation(
     output: Path, seed: int, amount: ValidationSize, *, progress: bool = False
 ) -> str:
-    """Write page and figures, and return the tables and the path of the page as text.
-
-    Raises
-    ------
-    OSError
-        The output cannot be written.
-    """
+    """Write page and figures, and return the tables and the path of the page as text."""
     evidence = run_validation(seed, amount, progress=progress)
     tables = [slip_drift.drift_table(evidence.drifts), bench_table(evidence)]
     pictures = write_pictures(VALIDATION_FIGURES, evidence, output)
