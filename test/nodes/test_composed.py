@@ -4,11 +4,13 @@
 
 import time
 
+import numpy as np
 import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
-from support.ros_graph import TIMEOUT, is_ok
+from support.ros_graph import TIMEOUT, diagnostic, is_ok
 
+from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.nodes import composed
 from t3mpc_ros.nodes.registry import NODES
 from t3mpc_ros.parameters.table import ParameterError
@@ -39,19 +41,29 @@ def compose(graph, tmp_path):
 )
 def test_composed_runs_with_stamped_commands_in_any_order(order, compose, tmp_path):
     """An early subscription of the recorder must not fix the type of cmd_vel in the process."""
+
+    def spin_until(condition):
+        while not condition():
+            assert time.monotonic() < deadline
+            executor.spin_once(timeout_sec=0.05)
+
     nodes = compose('enable_stamped_cmd_vel:=true', *filter(None, [order]))
     assert nodes.keys() == set(NODES) - {'radio_bridge', 'player'}
     executor = SingleThreadedExecutor()
     for node in nodes.values():
         executor.add_node(node)
     deadline = time.monotonic() + TIMEOUT
-    while not is_ok(nodes['sim_robot'], 'following commands'):
-        assert time.monotonic() < deadline
-        executor.spin_once(timeout_sec=0.05)
-    while not nodes['recorder'].count_subscribers('cmd_vel') > 1:
-        assert time.monotonic() < deadline
-        executor.spin_once(timeout_sec=0.05)
+    spin_until(lambda: is_ok(nodes['sim_robot'], 'following commands'))
+    spin_until(lambda: nodes['recorder'].count_subscribers('cmd_vel') > 1)
+    spin_until(lambda: diagnostic(nodes['recorder'], 'messages') > 500)
     executor.shutdown()
+    nodes['recorder'].on_shutdown()
+    with open_bag(tmp_path) as recording:
+        odometry = recording.series('/odom', {'v': 'twist.twist.linear.x'})
+        steps = np.diff(odometry['stamp']) / 0.01
+        assert np.allclose(steps, np.round(steps), atol=1e-4) and steps.min() > 0.5
+        assert np.ptp(odometry['v']) > 0.0
+        assert recording.topics['/cmd_vel'].type_name.endswith('TwistStamped')
 
 
 def test_two_types_on_one_topic_cannot_share_a_process(compose):

@@ -246,7 +246,7 @@ def tracking_error(bag, wheel_radius, wheel_separation, *topics):
         reference, measured = (recording.series(topic, names) for topic in topics)
     wheels = np.array([[1.0, 0.5 * wheel_separation], [1.0, -0.5 * wheel_separation]])
     at = measured['stamp']
-    at = at[(at > at[0] + 5.0) & (at < reference['stamp'][-1])]
+    at = at[(at > at[0] + 3.0) & (at < reference['stamp'][-1])]
     found, wanted = (
         wheels @ [np.interp(at, data['stamp'], data[name]) for name in 'vw'] / wheel_radius
         for data in (measured, reference)
@@ -256,7 +256,7 @@ def tracking_error(bag, wheel_radius, wheel_separation, *topics):
         float(np.sqrt(np.mean((found - wanted)[:, whole == second] ** 2)))
         for second in range(int(whole[-1]))
     ]
-    assert len(seconds) >= 4
+    assert len(seconds) >= 3
     return min(seconds), float(np.sqrt(np.mean(wanted**2)))
 
 
@@ -283,7 +283,7 @@ def test_sim_starts_tracks_and_ends_with_ctrl_c(to_group, start, tmp_path):
     words.append(f'params_file:={slow}')
     with start('launch_files', *words) as launch:
         launch.wait_for('tracking')
-        time.sleep(12.0)
+        time.sleep(8.0)
         codes = end(launch, to_group)
     assert codes == dict.fromkeys((*nodes, 'recorder'), 0)
     bag = only_bag(tmp_path)
@@ -309,7 +309,7 @@ def test_a_robot_of_another_make_follows_the_reference(start, tmp_path, capsys):
         robot.wait_for('velocity_robot ready')
         with start('launch_files', *words) as launch:
             launch.wait_for('tracking')
-            time.sleep(14.0)
+            time.sleep(9.0)
             codes = end(launch, to_group=True)
         assert codes == dict.fromkeys(('controller', 'reference_generator', 'recorder'), 0)
         assert 'the robot expects geometry_msgs/msg/TwistStamped' in launch.output()
@@ -330,7 +330,5 @@ def test_a_node_with_a_wrong_parameter_ends_with_code_2(start, tmp_path):
         launch.wait_for('process has died')
         assert launch.ends() == {'controller': 2}
         assert 'did you mean law.gain' in launch.output()
-        launch.wait_for('sim_robot ready')
-        launch.wait_for('reference_generator ready')
-        codes = end(launch)
+        codes = end(launch)  # the others run on
     assert codes == {'controller': 2, 'sim_robot': 0, 'reference_generator': 0}

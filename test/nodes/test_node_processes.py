@@ -5,47 +5,53 @@
 import signal
 import time
 
+from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from support.long_tests import few_of
+from support.ros_graph import TIMEOUT, speed
 
 from t3mpc_ros.bag.reader import missing_sample_ratio, open_bag
+from t3mpc_ros.bag.run.journal import Event
 from t3mpc_ros.cli.private_graph import PrivateGraph
 from t3mpc_ros.cli.process_group import ProcessGroup
+from t3mpc_ros.evaluation.process_replay.comparison import Tolerances, compare
+from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
+from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller
 from t3mpc_ros.geometry.types import NANOSECONDS
 
-pytestmark = [pytest.mark.ros, pytest.mark.alone]
+pytestmark = pytest.mark.ros
 
-EXECUTABLES = ('reference_generator', 'controller', 'sim_robot', 'recorder', 'player', 'composed')
-LOOP = ('recorder', 'controller', 'sim_robot', 'reference_generator')
-
-
-def _start_loop(processes, bag):
-    for name in LOOP:
-        _start(processes, name, bag)
-    processes.wait_for('controller', 'tracking')
+VICTIMS = ('reference_generator', 'controller', 'sim_robot')
+MOVING = 0.01
+"""Smallest speed of a robot that moves, m/s."""
 
 
-def _start(processes, name, bag):
-    processes.start(name, parameters={'storage.uri': str(bag)} if name == 'recorder' else None)
-    processes.wait_ready(name)
-
-
+# One handler serves all signals in all executables.
 @pytest.mark.parametrize(
-    # One handler serves all signals in all executables.
-    'name, number',
-    [*zip(EXECUTABLES, 2 * [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], strict=True)],
+    'name, number', [('controller', signal.SIGTERM), ('player', signal.SIGHUP)]
 )
-def test_each_executable_starts_and_ends_with_code_0(
-    name, number, processes, tmp_path, monkeypatch
+def test_a_signal_ends_an_executable_at_once_with_code_0(
+    name, number, tmp_path, monkeypatch, request
 ):
-    monkeypatch.chdir(tmp_path)
+    """The teardown of the interpreter took 0.5 to 1 s after the shutdown."""
+    (tmp_path / 'sitecustomize.py').write_text(
+        'import atexit\natexit.register(print, "interpreter teardown")\n'
+    )
+    monkeypatch.setenv('PYTHONPATH', str(tmp_path))
+    processes = request.getfixturevalue('processes')  # reads the environment
     processes.start(name)
     processes.wait_ready(name)
     assert processes.stop(name, number) == 0
-    assert 'Traceback' not in processes.log(name).read_text()
+    output = processes.log(name).read_text()
+    assert 'Traceback' not in output
+    assert 'teardown' not in output
 
 
-@pytest.mark.parametrize('delay', [0.4, 0.9, 1.6])
+@pytest.mark.parametrize('delay', few_of([0.4, 0.9, 1.6], 2))
 def test_a_signal_during_start_ends_quietly_with_code_0(delay, processes):
     """A signal during the slow imports must not end in a traceback."""
     processes.start('controller')
@@ -54,50 +60,95 @@ def test_a_signal_during_start_ends_quietly_with_code_0(delay, processes):
     assert 'Traceback' not in processes.log('controller').read_text()
 
 
+class Observer:
+    """Receives the true motion of the robot in the process of the test."""
+
+    def __init__(self):
+        self._context = rclpy.Context()
+        rclpy.init(args=[], context=self._context)
+        self._node = Node('observer', context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._moved = 0
+        self._node.create_subscription(Odometry, 'ground_truth/odom', self._take, 100)
+
+    def _take(self, message):
+        self._moved = self._moved + 1 if speed(message) > MOVING else 0
+
+    def wait_for_motion(self, seconds):
+        """Wait until the robot has moved without a stop for some seconds."""
+        self._moved = 0
+        deadline = time.monotonic() + TIMEOUT
+        while self._moved < 100 * seconds:
+            assert time.monotonic() < deadline, 'the robot does not move'
+            self._executor.spin_once(timeout_sec=0.1)
+
+    def close(self):
+        self._executor.shutdown()
+        self._node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+
 class Run:
     """A recorded run in which each process was killed and started again in turn.
 
-    The recorder, which leaves a file without its end, is killed in a bag of its own.
+    The recorder is started last, and killed in a bag of its own, for it leaves a file without
+    its end.
     """
 
-    def __init__(self, folder, environment):
+    def __init__(self, folder, processes, observer):
         self.bag, self.last_bag = folder / 'bag', folder / 'last_bag'
-        self.killed_ns, self.restarted_ns = {}, {}
-        processes = ProcessGroup(folder / 'log', environment)
-        try:
-            _start_loop(processes, self.bag)
-            time.sleep(8.0)
-            self._replace('reference_generator', 2.0, 7.0, processes)
-            self._replace('controller', 2.0, 7.0, processes)  # discovery takes up to three seconds
-            self._replace('sim_robot', 1.5, 7.0, processes)
-            self.codes = [processes.stop('recorder')]
-            _start(processes, 'recorder', self.last_bag)
-            time.sleep(3.0)
-            self._replace('recorder', 1.0, 6.0, processes)
-            order = ('reference_generator', 'controller', 'sim_robot', 'recorder')
-            self.codes += processes.stop_all(order).values()
-        finally:
-            for name in list(processes.running()):
-                processes.kill(name)
+        self.killed_ns = {}
+        self._processes = processes
+        for name in VICTIMS:
+            processes.start(name)
+        for name in VICTIMS:
+            processes.wait_ready(name)
+        processes.wait_for('controller', 'tracking')
+        self._start('recorder', self.bag)
+        observer.wait_for_motion(4.0)
+        for victim in VICTIMS:
+            self._kill(victim, 1.5)
+            self._start(victim)
+            observer.wait_for_motion(1.5)
+        self.codes = [processes.stop('recorder')]
+        self._start('recorder', self.last_bag)
+        observer.wait_for_motion(1.0)
+        self._kill('recorder', 0.5)
+        self._start('recorder', self.last_bag)
+        observer.wait_for_motion(2.5)  # discovery takes up to a second
+        self.end_ns = time.time_ns()
+        order = ('reference_generator', 'controller', 'sim_robot', 'recorder')
+        self.codes += processes.stop_all(order).values()
 
-    def _replace(self, victim, pause, drive, processes):
-        """Kill a process, and start it again after a pause; then drive for some seconds."""
+    def _start(self, name, bag=None):
+        self._processes.start(name, parameters=None if bag is None else {'storage.uri': str(bag)})
+        self._processes.wait_ready(name)
+
+    def _kill(self, victim, pause):
+        """Kill a process and wait; the other ones run on."""
         self.killed_ns[victim] = time.time_ns()
-        processes.kill(victim)
+        self._processes.kill(victim)
         time.sleep(pause)
-        processes.check()  # the other processes run on
-        _start(processes, victim, self.last_bag)
-        self.restarted_ns[victim] = time.time_ns()
-        time.sleep(drive)
-        processes.check()
+        self._processes.check()
 
 
 @pytest.fixture(scope='module')
 def run(tmp_path_factory):
-    with PrivateGraph() as private:
-        return Run(tmp_path_factory.mktemp('run'), private.environment())
+    folder = tmp_path_factory.mktemp('run')
+    with PrivateGraph() as private, pytest.MonkeyPatch.context() as patch:
+        for name, value in private.environment().items():
+            patch.setenv(name, value)
+        processes, observer = ProcessGroup(folder / 'log', private.environment()), Observer()
+        try:
+            return Run(folder, processes, observer)
+        finally:
+            observer.close()
+            for name in list(processes.running()):
+                processes.kill(name)
 
 
+@pytest.mark.alone
 def test_the_loop_runs_at_100_hz_in_four_processes(run):
     assert set(run.codes) == {0}
     with open_bag(run.bag) as recording:
@@ -105,14 +156,8 @@ def test_the_loop_runs_at_100_hz_in_four_processes(run):
         for topic in ('/reference', '/odom'):
             stamps = recording.series(topic, {})['stamp']
             assert missing_sample_ratio(stamps[stamps < end], 100.0) < 0.01, topic
-        commands = recording.series('/cmd_vel', {'v': 'linear.x', 'w': 'angular.z'})
-        odometry = recording.series('/odom', {'v': 'twist.twist.linear.x'})
-        # One command per odometry message, once both topics are recorded.
-        first, received = commands['received'][0], commands['received']
-        compared = (odometry['received'] >= first) & (odometry['received'] < end)
-        assert np.count_nonzero(received < end) >= 0.99 * compared.sum()
-        assert compared.sum() >= 0.99 * 800
-        assert np.ptp(odometry['v'][compared]) > 0.02
+        velocity = recording.series('/odom', {'v': 'twist.twist.linear.x'})
+        assert np.ptp(velocity['v'][velocity['stamp'] < end]) > 0.02
         parameters = recording.metadata_records
         assert parameters['provenance']['version']
         assert float(parameters['controller']['rate']) == 100.0
@@ -125,6 +170,20 @@ def test_the_loop_runs_at_100_hz_in_four_processes(run):
     assert commands['v'][-1] == commands['w'][-1] == 0.0
 
 
+@pytest.mark.alone
+def test_each_controller_of_the_run_replays_bit_for_bit(run):
+    """Before the kill and after it; its first inputs reached the late recorder."""
+    inputs = load_inputs(run.bag)
+    assert len(inputs.lives) == 2
+    first = inputs.lives[0]
+    assert first.rows[0, 0] == 0, 'the journal begins with the first event'
+    assert first.exact.all(), inputs.notes
+    assert np.count_nonzero(first.events == Event.STEP) > 400
+    outcome = compare(inputs, replay_controller(inputs), Tolerances(absolute=1e-9, relative=0.0))
+    assert outcome.same, outcome.table()
+    assert np.count_nonzero(inputs.exact) > 800
+
+
 def _speeds(bag, topic='/ground_truth/odom'):
     """Return stamps (ns) and |v| plus the share of |omega| in a wheel speed, m/s."""
     with open_bag(bag) as recording:
@@ -133,67 +192,39 @@ def _speeds(bag, topic='/ground_truth/odom'):
     return stamps, np.abs(data['v']) + 0.0735 * np.abs(data['w'])
 
 
-def _moving_share(stamps, speed, start_ns, seconds):
-    chosen = (stamps >= start_ns) & (stamps < start_ns + seconds * NANOSECONDS)
+def _during(stamps, values, start_ns, begin, end):
+    """Return the values from ``begin`` to ``end`` s after a time; there are some."""
+    chosen = (stamps > start_ns + begin * NANOSECONDS) & (stamps < start_ns + end * NANOSECONDS)
     assert chosen.any()
-    return float(np.mean(speed[chosen] > 0.01))
+    return values[chosen]
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize('victim', ['reference_generator', 'controller'])
 def test_killed_source_stops_robot_in_half_a_second(victim, run):
-    killed_ns, restarted_ns = run.killed_ns[victim], run.restarted_ns[victim]
-    stamps, speed = _speeds(run.bag)
-    assert _moving_share(stamps, speed, killed_ns - NANOSECONDS, 1.0) > 0.8
-    assert _moving_share(stamps, speed, restarted_ns + 5 * NANOSECONDS, 1.5) > 0.5
-    late = (stamps > killed_ns + NANOSECONDS) & (stamps < killed_ns + 2 * NANOSECONDS)
-    assert speed[late].max() < 0.01, 'the robot still moved a second after the kill'
+    killed_ns = run.killed_ns[victim]
+    stamps, speeds = _speeds(run.bag)
+    assert np.mean(_during(stamps, speeds, killed_ns, -1.0, 0.0) > MOVING) > 0.8
+    still = _during(stamps, speeds, killed_ns, 1.0, 1.5)
+    assert still.max() < MOVING, 'the robot still moved a second after the kill'
     # The body oscillates by about a millimetre after the stepper motors have stopped.
-    stamps, pulses = _speeds(run.bag, '/odom')
-    late = (stamps > killed_ns + NANOSECONDS // 2) & (stamps < killed_ns + 2 * NANOSECONDS)
-    assert pulses[late].max() < 0.01, 'the motors still turned half a second after the kill'
+    pulses = _during(*_speeds(run.bag, '/odom'), killed_ns, 0.5, 1.5)
+    assert pulses.max() < MOVING, 'the motors still turned half a second after the kill'
 
 
+@pytest.mark.alone
 def test_a_killed_robot_zeroes_commands_until_its_restart(run):
-    killed_ns = run.killed_ns['sim_robot']
     with open_bag(run.bag) as recording:
         commands = recording.series('/cmd_vel', {'v': 'linear.x', 'w': 'angular.z'})
         stamps = recording.start_ns + np.round(commands['received'] * NANOSECONDS).astype(np.int64)
-    silent = (stamps > killed_ns + NANOSECONDS // 2) & (stamps < killed_ns + 1.4 * NANOSECONDS)
-    assert silent.sum() >= 5, 'zero commands during the odometry timeout'
-    assert not commands['v'][silent].any()
-    assert not commands['w'][silent].any()
-    stamps, speed = _speeds(run.bag)
-    restarted_ns = run.restarted_ns['sim_robot']
-    assert _moving_share(stamps, speed, restarted_ns + 5 * NANOSECONDS, 1.5) > 0.5
+    for name in 'vw':
+        silent = _during(stamps, commands[name], run.killed_ns['sim_robot'], 0.5, 1.4)
+        assert silent.size >= 5, 'zero commands during the odometry timeout'
+        assert not silent.any()
 
 
+@pytest.mark.alone
 def test_a_restarted_recorder_continues_the_bag(run):
     assert len(list(run.last_bag.glob('*.mcap'))) == 2
-    stamps, speed = _speeds(run.last_bag)
-    restarted_ns = run.restarted_ns['recorder']
-    assert _moving_share(stamps, speed, restarted_ns + 4 * NANOSECONDS, 1.5) > 0.8
-
-
-def test_composed_closes_the_loop_in_one_process(processes, tmp_path):
-    bag = tmp_path / 'bag'
-    processes.start('composed', parameters={'storage.uri': str(bag)})
-    processes.wait_ready('composed')
-    time.sleep(6.0)
-    assert processes.stop('composed') == 0
-    stamps, speed = _speeds(bag)
-    assert speed.max() > 0.02
-    with open_bag(bag) as recording:
-        assert missing_sample_ratio(recording.series('/odom', {})['stamp'], 100.0) < 0.01
-
-
-def test_a_process_ends_without_interpreter_teardown(tmp_path, monkeypatch, request):
-    """The teardown took 0.5 to 1 s after the shutdown, up to 2 s on a busy machine."""
-    (tmp_path / 'sitecustomize.py').write_text(
-        'import atexit\natexit.register(print, "interpreter teardown")\n'
-    )
-    monkeypatch.setenv('PYTHONPATH', str(tmp_path))
-    group = request.getfixturevalue('processes')  # reads the environment
-    group.start('reference_generator')
-    group.wait_ready('reference_generator')
-    assert group.stop('reference_generator') == 0
-    assert 'teardown' not in group.log('reference_generator').read_text()
+    stamps, speeds = _speeds(run.last_bag)
+    assert np.mean(_during(stamps, speeds, run.end_ns, -1.0, 0.0) > MOVING) > 0.8

@@ -21,7 +21,7 @@ from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
 from t3mpc_ros.radio.protocol.authentication import KeyFileError
 from t3mpc_ros.robot.interface import RANGE_SENSORS
 
-pytestmark = [pytest.mark.ros, pytest.mark.alone]
+pytestmark = pytest.mark.ros
 
 
 class Plug:
