@@ -18,7 +18,6 @@ from t3mpc_ros.control.control_law import (
     law_terms,
     lyapunov_rate_bound,
     lyapunov_value,
-    ultimate_bound,
 )
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator
 from t3mpc_ros.fuzzy.sets import FuzzyParameters
@@ -200,7 +199,7 @@ def test_the_compensated_bound_is_the_smallest_that_80_permits():
     assert off.compensated_bound == omega_bar < bound
 
 
-@pytest.mark.parametrize('seed', range(2))
+@pytest.mark.parametrize('seed', few_of(range(4)))
 def test_e17_the_integral_of_84_holds_with_the_initial_v_only(seed):
     """V(t) - V(0) is at most the integral of the bound; the printed (84) omits V(0).
 
@@ -261,69 +260,6 @@ def test_e14_print_83_is_violated_where_the_correction_holds():
     )
     assert rate > -law.gain * float(delta @ delta)
     assert rate <= lyapunov_rate_bound(delta, law.gain, law.error_bound, law.smoothing)
-
-
-def test_e13_the_predictive_term_of_a_wheel_acts_on_its_error():
-    """(76) and (79) print delta_1 v_p2; the derivative of (74) along (73) holds delta_2 v_p2."""
-    rng = np.random.default_rng(2)
-    delta, v_p, residual = rng.normal(size=(3, 2))
-    gain = 4.0
-    delta_rate = residual - gain * delta + v_p  # (72)-(73) with v_c = 0
-    step = 1e-6
-    value = lyapunov_value(delta, np.zeros(1), 1.0)
-    moved = lyapunov_value(delta + step * delta_rate, np.zeros(1), 1.0)
-    right = -gain * delta @ delta + delta @ residual + delta[0] * v_p[0] + delta[1] * v_p[1]
-    wrong = -gain * delta @ delta + delta @ residual + delta[0] * v_p[0] + delta[0] * v_p[1]
-    measured = (moved - value) / step
-    assert measured == pytest.approx(right, abs=1e-4)
-    assert abs(measured - wrong) > 1e-2
-
-
-@pytest.mark.parametrize('seed', few_of(range(4)))
-def test_e14_bound_holds_at_every_step_of_a_noise_free_run(seed):
-    """Plant (64)-(65) with known alpha*, bounded disturbance and bounded v_p, law and adaptation.
-
-    The run meets all assumptions of the proof: V is (74) with the true alpha*, the plant has a
-    fuzzy system of the same family with other coefficients, the disturbance reaches its bound,
-    and v_p is the worst within its bound. The steps are small, so that V' is the derivative.
-    """
-    rng = np.random.default_rng(seed)
-    adaptation = AdaptationParameters(sigma_modification=0.0, dead_zone=0.0)
-    learner = FuzzyEstimator(Sets(), adaptation, outputs=2)
-    plant = FuzzyEstimator(Sets(), adaptation, outputs=2)
-    plant.coefficients = rng.uniform(-3.0, 3.0, plant.coefficients.shape)
-    gamma = adaptation.gamma
-    law = LawParameters(gain=6.0, error_bound=2.0, smoothing=0.4)
-    v_bound = 1.5
-    bound = law.error_bound + v_bound
-    dt = 2e-5
-    chi = rng.uniform(-3.0, 3.0, 2)
-    terms, u = np.zeros((5, 2)), np.zeros(2)
-    phases = rng.uniform(0.0, 2.0 * math.pi, 6)
-    worst, ball = -math.inf, ultimate_bound(law.gain, bound, law.smoothing)
-    previous = None
-    largest_late = 0.0
-    for k in range(150_000):
-        t = k * dt
-        r = np.array([3.0 * math.sin(2 * t + phases[0]), 2.0 * math.cos(3 * t + phases[1])])
-        rate = np.array([6.0 * math.cos(2 * t + phases[0]), -6.0 * math.sin(3 * t + phases[1])])
-        delta = chi - r
-        coefficient_errors = plant.coefficients - learner.coefficients
-        value = lyapunov_value(delta, coefficient_errors, gamma)
-        if previous is not None:
-            worst = max(worst, (value - previous[0]) / dt - previous[1])
-        previous = value, lyapunov_rate_bound(delta, law.gain, bound, law.smoothing)
-        w = law.error_bound * np.sin(np.array([7.0, 11.0]) * t + phases[2:4])
-        v_p = v_bound * np.sign(delta)  # opposite to its purpose, at its bound
-        truth = plant.evaluate(chi).copy()
-        g = learner.evaluate(chi)
-        law_terms(chi, r, rate, g, v_p, law.gain, bound, law.smoothing, terms, u)
-        learner.adapt(delta, dt)
-        chi = chi + dt * (truth + u + w)
-        if t > 2.0:
-            largest_late = max(largest_late, float(np.linalg.norm(delta)))
-    assert worst < 0.05, 'V rose faster than E14 allows'
-    assert largest_late < 3.0 * ball
 
 
 def test_certificate_holds_for_a_decaying_error_only():

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from support.long_tests import few_of
 
 from t3mpc_ros.control.dead_time_estimator import (
     ADOPTION_TIME,
@@ -101,7 +102,7 @@ def at(seconds: float) -> int:
     return round(seconds / PERIOD)
 
 
-@pytest.mark.parametrize('dead_time', [0.01, 0.03, 0.0375, 0.06, 0.12])
+@pytest.mark.parametrize('dead_time', few_of([0.0375, 0.12, 0.01, 0.03, 0.06], 2))
 def test_the_dead_time_is_found_within_its_deviation(dead_time):
     errors = []
     for seed in range(6):
@@ -149,13 +150,7 @@ def test_constant_commands_identify_nothing(speed):
     assert abs(estimator.dead_time - 0.01) < 1e-9
 
 
-def test_an_undisturbed_response_raises_no_alarm():
-    for seed in range(3):
-        _, record = run(simulate(smooth_commands(200.0, 20 + seed), 0.015, 20 + seed))
-        assert not record[:, 2].any()
-
-
-@pytest.mark.parametrize('duration', [1.0, 4.0, 10.0])
+@pytest.mark.parametrize('duration', few_of([4.0, 1.0, 10.0]))
 def test_late_commands_leave_no_trace(duration):
     for seed in range(4):
         rng = np.random.default_rng(seed)
@@ -195,14 +190,6 @@ def test_gaps_in_the_odometry_are_no_disturbance():
     estimator, record = run(drive, rows=rows)
     assert not record[:, 2].any()
     assert abs(estimator.dead_time - 0.035) < 0.002
-
-
-def test_a_constant_offset_is_no_delay_and_no_disturbance():
-    drive = simulate(smooth_commands(40.0, 80), 0.03, 80)
-    drive.measured += np.array([0.15, -0.1])
-    estimator, record = run(drive)
-    assert abs(estimator.dead_time - 0.03) < 0.002
-    assert not record[at(5.0) :, 2].any()
 
 
 def test_a_dead_time_beyond_the_bounds_is_not_identified():

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.long_tests import few_of
 from support.velocity_robot import VelocityRobot
 import yaml
 
@@ -67,17 +68,20 @@ def follow(file, rate, lag, dead_time):
 
 @pytest.mark.parametrize(
     'file, rate, lag, dead_time',
-    [
-        ('turtlebot3.yaml', 20.0, 0.05, 0.03),
-        ('turtlebot3.yaml', 30.0, 0.05, 0.03),
-        ('turtlebot3.yaml', 30.0, 0.02, 0.01),
-        ('turtlebot3.yaml', 30.0, 0.1, 0.01),
-        ('turtlebot3.yaml', 30.0, 0.02, 0.08),
-        ('turtlebot3.yaml', 30.0, 0.1, 0.08),
-        ('generic.yaml', 50.0, 0.1, 0.05),
-        ('generic.yaml', 50.0, 0.03, 0.02),
-        ('generic.yaml', 25.0, 0.2, 0.05),
-    ],
+    few_of(
+        [
+            ('turtlebot3.yaml', 20.0, 0.05, 0.03),
+            ('turtlebot3.yaml', 30.0, 0.1, 0.08),
+            ('generic.yaml', 25.0, 0.2, 0.05),
+            ('turtlebot3.yaml', 30.0, 0.05, 0.03),
+            ('turtlebot3.yaml', 30.0, 0.02, 0.01),
+            ('turtlebot3.yaml', 30.0, 0.1, 0.01),
+            ('turtlebot3.yaml', 30.0, 0.02, 0.08),
+            ('generic.yaml', 50.0, 0.1, 0.05),
+            ('generic.yaml', 50.0, 0.03, 0.02),
+        ],
+        3,
+    ),
 )
 def test_another_robot_follows_without_exact_time_constants(file, rate, lag, dead_time):
     error, reference, reasons, warnings = follow(file, rate, lag, dead_time)

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from support.long_tests import few_of
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import Pose
@@ -118,7 +119,7 @@ def nees(robots, odometries):
 
 
 def test_normalized_estimation_error_matches_the_covariance():
-    count = 200
+    count = 80
     robots, odometries = Robots(count, 1), make_odometries(count)
     generator = robots.generator
     robots.scale = PARAMETERS.gyro_scale_tolerance * generator.standard_normal(count)
@@ -133,14 +134,14 @@ def test_normalized_estimation_error_matches_the_covariance():
             odometries[index].update(angles[0, index], angles[1, index], sample, PERIOD)
     before = nees(robots, odometries)
     robots.stand(odometries, 2.0)
-    # 95 % of chi-square with 600 degrees of freedom, divided by 200 robots
-    assert 2.67 < before < 3.35
-    assert 2.67 < nees(robots, odometries) < 3.35
+    # 95 % of chi-square with 240 degrees of freedom, divided by 80 robots
+    assert 2.49 < before < 3.56
+    assert 2.49 < nees(robots, odometries) < 3.56
     assert not any(odometry.slipping for odometry in odometries)
 
 
 def test_standstill_corrects_half_of_the_yaw_drift():
-    count = 60
+    count = 40
     changes = {'gyro_scale_tolerance': 0.0, 'gyro_bias_drift': 5e-4}
     robots, odometries = Robots(count, 2), make_odometries(count, **changes)
     robots.stand(odometries, 3.0)
@@ -218,7 +219,7 @@ def slip_in_bursts(speeds):
     return grip
 
 
-@pytest.mark.parametrize('course', [square, ten_turns])
+@pytest.mark.parametrize('course', few_of([ten_turns, square]))
 def test_gyro_reduces_slip_yaw_error_to_a_fifth(course):
     """Both directions; the scale error of 0.1 % is the remaining error of the turns."""
     speeds = np.stack([course(1.0), course(-1.0)], axis=-1)
@@ -271,7 +272,7 @@ def test_bias_is_estimated_at_standstill_and_again_after_a_jump():
     assert np.abs(misses()).max() < 0.01 * DEGREE
 
 
-@pytest.mark.parametrize('part', [0.25, 0.5, 0.75])
+@pytest.mark.parametrize('part', few_of([0.25, 0.5, 0.75]))
 def test_bias_jump_in_motion_is_half_corrected_at_standstill(part):
     """A jump of 1 deg/s is not flagged; the next standstill measures it, but not its time."""
     robots, odometries = Robots(1, 8), make_odometries()
@@ -328,7 +329,7 @@ def reversals(acceleration=200.0, top=8.0):
     return np.stack([run + turn, run - turn], axis=1)[:, :, None] / RADIUS
 
 
-@pytest.mark.parametrize('period, error', [(0.005, 0.001), (0.01, 0.001), (0.02, 0.015)])
+@pytest.mark.parametrize('period, error', few_of([(0.01, 0.001), (0.005, 0.001), (0.02, 0.015)]))
 def test_fast_reversals_are_not_detected_as_slip(period, error):
     """The gyro lags by 4.8 ms: 1 rad/s at 200 rad/s², which without delay would indicate slip.
 
@@ -351,7 +352,7 @@ def test_fast_reversals_are_not_detected_as_slip(period, error):
     assert not np.array_equal(covariances[1e-4, 1.0], covariances[1e-4, 3000.0])
 
 
-@pytest.mark.parametrize('speed', [0.05, 0.1, 0.3])
+@pytest.mark.parametrize('speed', few_of([0.05, 0.1, 0.3]))
 def test_blocked_wheel_is_flagged_within_300_ms(speed):
     wheel = speed / RADIUS
     speeds = run([(wheel, wheel, 3.0), (0.0, 0.0, 0.5)])[:, :, None]
@@ -378,7 +379,7 @@ def test_blocked_wheel_is_flagged_within_300_ms(speed):
     assert error @ np.linalg.solve(odometry.covariance[:2, :2], error) < 9.0
 
 
-@pytest.mark.parametrize('rate', [0.01, 0.1, 1.0])
+@pytest.mark.parametrize('rate', few_of([1.0, 0.1, 0.01]))
 def test_external_rotation_at_standstill_keeps_the_bias(rate):
     count = 20
     robots, odometries = Robots(count, 13), make_odometries(count)
@@ -454,7 +455,7 @@ def test_scale_error_within_tolerance_is_not_slip(tolerance):
     assert flagged == (tolerance < 0.01)
 
 
-@pytest.mark.parametrize('period', [0.01, 0.02])
+@pytest.mark.parametrize('period', few_of([0.01, 0.02]))
 def test_short_turns_include_the_gyro_delay(period):
     """The gyro outputs the end of a turn after the last step; ignored, each cost 0.2 mrad."""
     robots, odometries = Robots(1, 23), make_odometries()
@@ -557,9 +558,3 @@ def test_non_finite_input_is_rejected_without_side_effects(bad):
 def test_slip_threshold_below_standstill_spread_is_rejected():
     with pytest.raises(ParameterError, match='slip_threshold'):
         GyroOdometryParameters(slip_threshold=0.02, standstill_spread=0.01)
-
-
-def test_returned_covariance_is_a_copy():
-    odometry = make_odometries()[0]
-    odometry.covariance[0, 0] = 7.0
-    assert not odometry.covariance.any()

@@ -9,7 +9,7 @@ import pytest
 
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.simulation.plant.contact import BumperParameters, contact_force
-from t3mpc_ros.simulation.world import clearance, join_walls, load_world, parse_world
+from t3mpc_ros.simulation.world import clearance, join_walls, load_world
 
 NO_SEGMENTS, NO_CIRCLES = np.zeros((0, 4)), np.zeros((0, 3))
 RADIUS, STIFFNESS, DAMPING = 0.11, 2e4, 100.0
@@ -222,27 +222,6 @@ def test_damper_never_adds_energy():
     assert touching > 500
 
 
-def test_force_never_pulls_towards_the_wall():
-    generator = np.random.default_rng(5)
-    world = load_world('corridor')
-    touching = 0
-    for wall in world.segments.tolist() * 300:
-        foot = np.array(wall[:2]) + generator.uniform() * (np.array(wall[2:]) - wall[:2])
-        x, y = (foot + generator.normal(0.0, 0.08, 2)).tolist()
-        free = clearance(x, y, world.segments, world.circles)
-        if not 0.09 < free < RADIUS:
-            continue
-        speed = generator.normal(0.0, 3.0, 2)
-        pushed = force(x, y, world.segments, world.circles, DAMPED, speed)
-        slope = [
-            clearance(x + dx, y + dy, world.segments, world.circles) - free
-            for dx, dy in ((1e-7, 0.0), (0.0, 1e-7))
-        ]
-        assert pushed @ slope >= -1e-12
-        touching += 1
-    assert touching > 200
-
-
 def throw(speed, bumper, dt, angle=0.0, start=0.12, walls=FLOOR, x=0.0):
     """Return position and velocity of a thrown point mass, its lowest y and its contact time.
 
@@ -296,27 +275,6 @@ def test_one_millisecond_steps_suffice_for_the_defaults(speed):
     assert coarse == pytest.approx(fine, abs=0.1 * speed)
 
 
-def test_many_undamped_bounces_keep_energy():
-    room = parse_world(
-        'walls: [{points: [[0, 0], [0.5, 0], [0.6, 0.4], [0.1, 0.5]], closed: true}]', 'box'
-    )
-    x, y, speed_x, speed_y, dt = 0.3, 0.25, 0.41, 0.29, 2e-4
-    reversals = 0
-    for _ in range(50_000):
-        force_x, force_y = contact_force(x, y, 0.0, 0.0, SPRING, room.segments, room.circles)
-        before = speed_x
-        speed_x, speed_y = speed_x + dt * force_x / MASS, speed_y + dt * force_y / MASS
-        x, y = x + dt * speed_x, y + dt * speed_y
-        reversals += before * speed_x < 0.0
-        assert clearance(x, y, room.segments, room.circles) > 0.1
-    while not room.is_free(x, y, RADIUS):
-        force_x, force_y = contact_force(x, y, 0.0, 0.0, SPRING, room.segments, room.circles)
-        speed_x, speed_y = speed_x + dt * force_x / MASS, speed_y + dt * force_y / MASS
-        x, y = x + dt * speed_x, y + dt * speed_y
-    assert reversals > 10
-    assert math.hypot(speed_x, speed_y) == pytest.approx(math.hypot(0.41, 0.29), rel=0.01)
-
-
 def test_wall_ending_on_a_wall_is_not_felt_on_the_far_side():
     """A partition that only touches the wall would push through it, in addition to the wall."""
     apart = np.array([[-1.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, -1.0]])
@@ -334,11 +292,3 @@ def test_overlapping_and_duplicate_walls_push_once():
         assert force(x, 0.105, joined) == pytest.approx(
             [0.0, STIFFNESS * 0.005], abs=STIFFNESS * 1e-4
         )
-
-
-def test_adjacent_boxes_form_one_wall():
-    world = parse_world(
-        'boxes: [{center: [0.1, 0], size: [0.2, 0.2]}, {center: [0.3, 0], size: [0.2, 0.2]}]', 'a'
-    )
-    for x in np.linspace(0.0, 0.4, 41).tolist():
-        assert force(x, 0.205, world.segments) == pytest.approx([0.0, STIFFNESS * 0.005], abs=1e-6)

@@ -196,16 +196,6 @@ def test_random_schedules_match_a_naive_evaluation():
     assert differ > 300
 
 
-def test_schedule_is_independent_of_the_sampling_step():
-    generator = np.random.default_rng(2)
-    for _ in range(10):
-        events = random_events(generator)
-        fine, coarse = FaultSchedule(events), FaultSchedule(events)
-        every_ms = [fine.at(0.001 * tick, NO_FAULT) for tick in range(0, 12000, 10)]
-        for tick in range(0, 1200, 7):
-            assert coarse.at(0.01 * tick, NO_FAULT) == every_ms[tick]
-
-
 def test_rounding_does_not_change_event_duration():
     """The floats 0.1 + 0.2 and 3 * 0.1 are more than 0.3, which extended an event by a step."""
     schedule = FaultSchedule([FaultEvent(0.2, 'gyro_dead', True, 0.1)])

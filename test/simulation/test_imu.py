@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from support.long_tests import few_of
 
 from t3mpc_ros.robot.sensor_conversions import GRAVITY
 from t3mpc_ros.simulation.sensors.imu import SimulatedImu, SimulatedImuParameters, low_pass
@@ -181,7 +182,7 @@ def allan(samples: np.ndarray, size: int) -> float:
 
 
 @pytest.mark.parametrize('setting', ['0', '3', '6'])
-@pytest.mark.parametrize('dt', [0.01, 0.002])
+@pytest.mark.parametrize('dt', few_of([0.01, 0.002]))
 def test_allan_deviation_matches_the_noise_density(setting, dt):
     """N/sqrt(2 tau) plus aliasing, at any low-pass and rate.
 
