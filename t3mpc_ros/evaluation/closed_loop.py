@@ -107,9 +107,9 @@ class LoopRecord:
         """Return the tracking RMSE over both wheels, rad/s; NaN when the run broke off."""
         return rms(self.error[self._counted(after, cut)])
 
-    def largest_error(self, after: float = 3.0, *, cut: float = 0.0) -> float:
-        """Return the largest tracking error of a wheel, rad/s; arguments as :meth:`rmse`."""
-        return float(np.max(np.abs(self.error[self._counted(after, cut)])))
+    def largest_error(self, after: float) -> float:
+        """Return the largest tracking error of a wheel from ``after`` (s) on, rad/s."""
+        return float(np.max(np.abs(self.error[self._counted(after, 0.0)])))
 
     def chatter(self) -> float:
         """Return the total variation of the effort per second and wheel, rad/s³."""

@@ -227,13 +227,13 @@ class Scenario:
         later = CASES[self.case].later
         return self.robot().with_values(later) if later else None
 
-    def nominal_model(self, rate: float = RATE) -> NominalModel:
-        """Return the nominal model for a method with ``rate`` steps per second."""
+    def nominal_model(self) -> NominalModel:
+        """Return the nominal model for a method."""
         robot = self._known_robot()
         velocity = self.drive == 'velocity'
         return NominalModel(
             drive=self.drive,
-            period=1.0 / rate,
+            period=1.0 / RATE,
             lag=robot.drive.lag,
             acceleration=isotropic_acceleration(self.limits, robot.geometry)
             if velocity

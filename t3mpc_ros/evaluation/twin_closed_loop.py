@@ -26,12 +26,7 @@ from t3mpc_ros.evaluation.scenario import RATE, Scenario
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, BodyTwist, State, WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError
-from t3mpc_ros.robot.interface import (
-    ZERO_WHEEL_SPEEDS,
-    RobotCommand,
-    RobotState,
-    RobotStatus,
-)
+from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, RobotCommand, RobotState, RobotStatus
 from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
 from t3mpc_ros.simulation.fault_injection import FaultSchedule
 

@@ -12,6 +12,14 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
+from support.bag_messages import (
+    START,
+    TYPES,
+    diagnostics,
+    header,
+    odometry_message,
+    twist_message,
+)
 from support.unrendered import RENDERED, unrendered  # noqa: F401 - a fixture
 import yaml
 
@@ -48,38 +56,12 @@ from t3mpc_ros.evaluation.plotting import every_nth
 pytestmark = pytest.mark.usefixtures('unrendered')
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
-TYPES = STORE.types
-START = 1_700_000_000_000_000_000
 ODOM, TWIST = 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/Twist'
 STAMPED, SCAN = 'geometry_msgs/msg/TwistStamped', 'std_msgs/msg/String'
 DEAD_TIME, LAG, GAIN = 0.12, 0.18, 0.9
 
 
 # -- bags of other robots -----------------------------------------------------------------------
-
-
-def header(stamp_ns, frame):
-    stamp = TYPES['builtin_interfaces/msg/Time'](stamp_ns // 10**9, stamp_ns % 10**9)
-    return TYPES['std_msgs/msg/Header'](stamp, frame)
-
-
-def twist(linear, angular):
-    vector = TYPES['geometry_msgs/msg/Vector3']
-    return TYPES[TWIST](vector(linear, 0.0, 0.0), vector(0.0, 0.0, angular))
-
-
-def odometry(stamp_ns, linear, angular, pose):
-    x, y, yaw = pose
-    place = TYPES['geometry_msgs/msg/Pose'](
-        TYPES['geometry_msgs/msg/Point'](x, y, 0.0),
-        TYPES['geometry_msgs/msg/Quaternion'](0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)),
-    )
-    return TYPES[ODOM](
-        header(stamp_ns, 'odom'),
-        'base_footprint',
-        TYPES['geometry_msgs/msg/PoseWithCovariance'](place, np.zeros(36)),
-        TYPES['geometry_msgs/msg/TwistWithCovariance'](twist(linear, angular), np.zeros(36)),
-    )
 
 
 def drive(duration=40.0, command_rate=10.0, odom_rate=25.0, seed=0):
@@ -114,10 +96,10 @@ def rows_of(names=('/odom', '/cmd_vel'), stamped=False, space='', **given):
     rows = []
     for t, speed, pose in zip(seen_at, seen, poses, strict=True):
         stamp = START + round(t * 1e9)
-        message = odometry(stamp, *map(float, speed), tuple(map(float, pose)))
+        message = odometry_message(stamp, speed, pose, 'base_footprint')
         rows.append((t + 0.001, space + names[0], message))
     for t, command in zip(told_at, told, strict=True):
-        message = twist(*map(float, command))
+        message = twist_message(command)
         if stamped:
             message = TYPES[STAMPED](header(START + round(t * 1e9), 'base_link'), message)
         rows.append((t, space + names[1], message))
@@ -516,14 +498,7 @@ def test_acceleration_and_jerk_are_the_derivatives():
 
 
 def status(second, name='radio_bridge', **values):
-    entry = TYPES['diagnostic_msgs/msg/KeyValue']
-    pairs = [entry(key=key, value=str(value)) for key, value in values.items()]
-    one = TYPES['diagnostic_msgs/msg/DiagnosticStatus'](
-        level=0, name=name, message='', hardware_id='', values=pairs
-    )
-    stamp = START + round(second * 1e9)
-    message = TYPES['diagnostic_msgs/msg/DiagnosticArray'](header(stamp, ''), [one])
-    return second, '/diagnostics', message
+    return second, '/diagnostics', diagnostics(START + round(second * 1e9), name, **values)
 
 
 def test_the_link_s_figures_come_from_its_diagnostics(rows, tmp_path, capsys):

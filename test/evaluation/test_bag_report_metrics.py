@@ -9,7 +9,16 @@ import re
 
 import numpy as np
 import pytest
-from rosbags.typesys import Stores, get_typestore
+from support.bag_messages import (
+    START,
+    STORE,
+    TYPES,
+    diagnostics,
+    header,
+    number,
+    odometry_message,
+    twist_message,
+)
 from support.long_tests import few_of
 from support.unrendered import RENDERED, unrendered  # noqa: F401 - a fixture
 
@@ -48,13 +57,10 @@ from t3mpc_ros.evaluation.bag_report.topic_roles import (
 )
 from t3mpc_ros.evaluation.plotting import thinned
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, twist_from_wheels
-from t3mpc_ros.geometry.types import BodyTwist, Pose, WheelSpeeds
+from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, Pose, WheelSpeeds
 
 pytestmark = pytest.mark.usefixtures('unrendered')  # but for the report of the module
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
-TYPES = STORE.types
-START = 1_700_000_000_000_000_000
 GEOMETRY = WheelGeometry(wheel_radius=0.04, wheel_separation=0.16)
 LEAD = 0.2
 SWITCHES = (4.0, 8.0, 12.0, 16.0)
@@ -63,6 +69,7 @@ DETAILS = {
     'sim_robot': {'wheel_radius': '0.04', 'wheel_separation': '0.16'},
     'controller': {'law.gain': '8.0'},
 }
+LOOP = 'controller: loop'
 TERMS = ('fuzzy', 'feedback', 'feedforward', 'compensator', 'predictive', 'applied')
 
 
@@ -130,55 +137,19 @@ def simulate(duration=20.0, rate=100.0, seed=0):
     return rows
 
 
-def vector(x=0.0, y=0.0, z=0.0):
-    return TYPES['geometry_msgs/msg/Vector3'](x=x, y=y, z=z)
-
-
 def twist_of(wheels):
+    return twist_message(twist_from_wheels(WheelSpeeds(*map(float, wheels)), GEOMETRY))
+
+
+def odometry(stamp_ns, wheels, pose=ORIGIN):
     body = twist_from_wheels(WheelSpeeds(*map(float, wheels)), GEOMETRY)
-    return TYPES['geometry_msgs/msg/Twist'](vector(body.linear), vector(z=body.angular))
-
-
-def header(stamp_ns):
-    stamp = TYPES['builtin_interfaces/msg/Time'](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-    return TYPES['std_msgs/msg/Header'](stamp=stamp, frame_id='odom')
-
-
-def odometry(stamp_ns, wheels, pose=Pose(0.0, 0.0, 0.0)):  # noqa: B008 - a tuple
-    half = 0.5 * pose.yaw
-    place = TYPES['geometry_msgs/msg/Pose'](
-        TYPES['geometry_msgs/msg/Point'](x=pose.x, y=pose.y, z=0.0),
-        TYPES['geometry_msgs/msg/Quaternion'](0.0, 0.0, float(np.sin(half)), float(np.cos(half))),
-    )
-    none = np.zeros(36)
-    return TYPES['nav_msgs/msg/Odometry'](
-        header(stamp_ns),
-        'base_link',
-        TYPES['geometry_msgs/msg/PoseWithCovariance'](place, none),
-        TYPES['geometry_msgs/msg/TwistWithCovariance'](twist_of(wheels), none),
-    )
-
-
-def number(value):
-    return TYPES['std_msgs/msg/Float64'](data=float(value))
+    return odometry_message(stamp_ns, body, pose)
 
 
 def signals(mode, chosen):
     layout = TYPES['std_msgs/msg/MultiArrayLayout'](dim=[], data_offset=0)
     data = np.array([mode, *chosen], dtype=np.int32)
     return TYPES['std_msgs/msg/Int32MultiArray'](layout, data)
-
-
-def diagnostics(stamp_ns, level, text, name='controller: loop', **values):
-    entry = TYPES['diagnostic_msgs/msg/KeyValue']
-    status = TYPES['diagnostic_msgs/msg/DiagnosticStatus'](
-        level=level,
-        name=name,
-        message=text,
-        hardware_id='',
-        values=[entry(key=key, value=str(value)) for key, value in values.items()],
-    )
-    return TYPES['diagnostic_msgs/msg/DiagnosticArray'](header(stamp_ns), [status])
 
 
 class Sheet:
@@ -242,10 +213,10 @@ def sheet_of(rows, namespace='', epoch_ns=START, announce='signals', terms=True,
     for second in range(len(rows) // 100 if terms else 0):
         link = {'cycles': 50 * second, 'cycles_lost': 2 * (second // 5), 'crc_errors': second // 9}
         link |= {'round_trip_median_ms': 6.0, 'round_trip_p99_ms': 9.0 + second, 'link': 'running'}
-        sheet.add('/diagnostics', 1.0 + second, diagnostics(START, 0, '', 'radio_bridge', **link))
-    sheet.add('/diagnostics', 1.0, diagnostics(START, 0, 'fine'))
-    sheet.add('/diagnostics', 5.0, diagnostics(START, 1, 'late <b>& later</b>'))
-    sheet.add('/diagnostics', 6.0, diagnostics(START, 1, 'late <b>& later</b>'))
+        sheet.add('/diagnostics', 1.0 + second, diagnostics(START, 'radio_bridge', **link))
+    sheet.add('/diagnostics', 1.0, diagnostics(START, LOOP, 0, 'fine'))
+    sheet.add('/diagnostics', 5.0, diagnostics(START, LOOP, 1, 'late <b>& later</b>'))
+    sheet.add('/diagnostics', 6.0, diagnostics(START, LOOP, 1, 'late <b>& later</b>'))
     return sheet
 
 

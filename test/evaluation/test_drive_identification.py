@@ -7,7 +7,9 @@ import math
 
 import numpy as np
 import pytest
-from support.training_runs import Tape, odometry_message, twist_message
+from support.bag_messages import START, odometry_message, twist_message
+from support.long_tests import few_of
+from support.training_runs import Tape
 from support.velocity_robot import VelocityRobot
 import yaml
 
@@ -26,7 +28,6 @@ from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, State, WheelSpeeds
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobot, PaperRobotParameters
 
-START = 1_700_000_000_000_000_000
 GEOMETRY = WheelGeometry()
 RATE = 100.0
 METADATA = {
@@ -71,7 +72,9 @@ def recorded(wheels, seed=1, metadata_records=METADATA, **parameters):
     state = robot.advance(START)
     for speeds in wheels:
         command = WheelSpeeds(*speeds.tolist())
-        tape.add('/odom', state.stamp_ns + 1000, odometry_message(state.odometry))
+        tape.add(
+            '/odom', state.stamp_ns + 1000, odometry_message(state.stamp_ns, state.odometry.twist)
+        )
         tape.add('/cmd_vel', state.stamp_ns, twist_message(twist_from_wheels(command, GEOMETRY)))
         state = robot.step(command)
     return tape
@@ -87,15 +90,18 @@ def assert_within(estimate, truth):
 
 @pytest.mark.parametrize(
     'lag, dead_time, noise, seed',
-    [
-        (0.02, 0.01, 0.04, 1),
-        (0.02, 0.03, 0.04, 2),
-        (0.05, 0.03, 0.0, 3),
-        (0.1, 0.05, 0.1, 4),
-        (0.2, 0.1, 0.04, 5),
-        (0.01, 0.0, 0.01, 6),
-        (0.03, 0.06, 0.01, 7),
-    ],
+    few_of(
+        [
+            (0.02, 0.03, 0.04, 2),
+            (0.2, 0.1, 0.04, 5),
+            (0.01, 0.0, 0.01, 6),
+            (0.02, 0.01, 0.04, 1),
+            (0.05, 0.03, 0.0, 3),
+            (0.1, 0.05, 0.1, 4),
+            (0.03, 0.06, 0.01, 7),
+        ],
+        3,
+    ),
 )
 def test_a_known_drive_is_recovered(tmp_path, lag, dead_time, noise, seed):
     tape = recorded(
@@ -138,7 +144,7 @@ def test_a_robot_of_another_make_is_identified(tmp_path, lag, dead_time):
         if k % 33 == 32:
             _, linear, angular = robot.odometry()
             state = State(now + 1_000_000, ORIGIN, BodyTwist(linear, angular))
-            tape.add('/odom', now + 1_500_000, odometry_message(state))
+            tape.add('/odom', now + 1_500_000, odometry_message(state.stamp_ns, state.twist))
     folder = tape.write(tmp_path / 'bag')
     drive, _ = identify_bag(folder, ReportOptions(wheel_radius=0.033, track=0.16))
     assert drive.mean_speeds

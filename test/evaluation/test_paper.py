@@ -718,11 +718,11 @@ def test_switches_are_counted_and_only_a_whole_run_decides():
 def test_the_path_on_the_floor_is_exact_for_lines_and_circles():
     geometry = WheelGeometry()
     time = np.arange(2001) / 100.0
-    straight = floor_path(np.full((2001, 2), 2.0), time, geometry)
+    straight = floor_path(np.full((2001, 2), 2.0), time)
     assert straight[-1] == pytest.approx((20.0 * 2.0 * geometry.wheel_radius, 0.0))
     rate = 2.0 * math.pi / 20.0  # once round in the whole run, wheels 1 rad/s on average
     turn = rate * geometry.half_separation / geometry.wheel_radius
-    circle = floor_path(np.tile((1.0 + turn, 1.0 - turn), (2001, 1)), time, geometry)
+    circle = floor_path(np.tile((1.0 + turn, 1.0 - turn), (2001, 1)), time)
     radius = geometry.wheel_radius / rate
     assert circle[-1] == pytest.approx((0.0, 0.0), abs=1e-9)
     assert circle[1000] == pytest.approx((0.0, 2.0 * radius))

@@ -73,7 +73,7 @@ def _errors(drive, noise, case='nominal', **changes):
     if drive == 'torque':
         given |= {'law.gain': 8.0, 'jump_transition.acceleration': 100.0}
     return [
-        run(Scenario(drive, noise, case, seed, 30.0), _spec(**(given | changes))).rmse()
+        run(Scenario(drive, noise, case, seed, 20.0), _spec(**(given | changes))).rmse()
         for seed in SEEDS
     ]
 

@@ -377,7 +377,7 @@ def test_several_bags_teach_together_and_each_is_a_fold(run, tmp_path):
         both.learnt['predictive.output_weights'], lesson.weights['output_weights']
     )
     with pytest.raises(TrainingError, match='two have the same content'):
-        fit_bags([halves[0], halves[0]])
+        fit_bags([halves[0], halves[0]])  # before anything is fitted
 
 
 def test_the_effect_is_found_within_its_standard_error():

@@ -361,23 +361,10 @@ def test_whole_numbers_are_searched_too():
     assert found.values['a'] == pytest.approx(7.0, rel=1e-2)
 
 
-def test_batch_sets_how_many_points_are_asked_for_at_once():
-    sizes = []
-
-    def objective(points):
-        sizes.append(len(points))
-        return each(sphere)(points)
-
-    search_best(objective, linear(3), Gains(), 50, 1, batch=12)
-    assert sizes == [1, 12, 12, 12, 12, 1]
-
-
 def test_what_cannot_be_searched_is_refused():
     for count in (0, -3):
         with pytest.raises(ValueError, match=f'evaluations must be at least 1: got {count}'):
             search_best(each(sphere), linear(2), Gains(), count, 1)
-    with pytest.raises(ValueError, match='batch must be at least 2: got 1'):
-        search_best(each(sphere), linear(2), Gains(), 10, 1, batch=1)
     with pytest.raises(ParameterError, match='a must be in its range'):
         search_best(each(sphere), linear(2), Gains(a=5.0), 10, 1)
     with pytest.raises(ValueError, match='one value a point, 1: got 2'):
@@ -437,7 +424,6 @@ def test_a_finished_search_is_recalled_without_an_evaluation(tmp_path):
     [
         ({'seed': 5}, 'seed'),
         ({'evaluations': 41}, 'evaluations'),
-        ({'batch': 9}, 'batch'),
         ({'space': linear(2, high=5.0)}, 'space'),
         ({'start': Gains(h=3.0)}, 'start'),
         ({'about': {'drive': 'velocity'}}, 'about'),

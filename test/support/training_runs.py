@@ -3,8 +3,8 @@
 """Closed loops as the nodes make them, without the nodes, and the bags of them."""
 
 import numpy as np
-from rosbags.typesys import Stores, get_typestore
 
+from support.bag_messages import START, STORE, number, odometry_message, twist_message
 from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.control.controller import Controller, ControllerParameters
@@ -13,34 +13,10 @@ from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, whee
 from t3mpc_ros.geometry.types import ORIGIN, State, WheelSpeeds
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobot
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
-TYPES = STORE.types
-START = 1_700_000_000_000_000_000
 STEP = 10_000_000
 LEAD = 40
 WHEELS = ('right', 'left')
 GEOMETRY = WheelGeometry()
-
-
-def twist_message(twist):
-    vector = TYPES['geometry_msgs/msg/Vector3']
-    return TYPES['geometry_msgs/msg/Twist'](
-        vector(float(twist.linear), 0.0, 0.0), vector(0.0, 0.0, float(twist.angular))
-    )
-
-
-def odometry_message(motion):
-    stamp = TYPES['builtin_interfaces/msg/Time'](motion.stamp_ns // 10**9, motion.stamp_ns % 10**9)
-    place = TYPES['geometry_msgs/msg/Pose'](
-        TYPES['geometry_msgs/msg/Point'](0.0, 0.0, 0.0),
-        TYPES['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0),
-    )
-    return TYPES['nav_msgs/msg/Odometry'](
-        TYPES['std_msgs/msg/Header'](stamp, 'odom'),
-        'base_link',
-        TYPES['geometry_msgs/msg/PoseWithCovariance'](place, np.zeros(36)),
-        TYPES['geometry_msgs/msg/TwistWithCovariance'](twist_message(motion.twist), np.zeros(36)),
-    )
 
 
 class Tape:
@@ -121,10 +97,12 @@ class ClosedLoopObjective:
         motion = State(START + k * STEP, ORIGIN, twist)
         self.controller.add_reference(motion)
         if self.taped:
-            self.tape.add('/reference', heard_ns or START, odometry_message(motion))
+            self.tape.add(
+                '/reference', heard_ns or START, odometry_message(motion.stamp_ns, motion.twist)
+            )
 
     def _record(self, k, heard_ns, odometry, twist, status):
-        self.tape.add('/odom', heard_ns, odometry_message(odometry))
+        self.tape.add('/odom', heard_ns, odometry_message(odometry.stamp_ns, odometry.twist))
         self.tape.add('/cmd_vel', heard_ns + 1_000_000, twist_message(twist))
         if (k + 1) % 5:
             return
@@ -133,7 +111,7 @@ class ClosedLoopObjective:
                 self.tape.add(
                     f'/controller/terms/{term}/{wheel}',
                     heard_ns + 2_000_000,
-                    TYPES['std_msgs/msg/Float64'](float(status.terms[row, z])),
+                    number(status.terms[row, z]),
                 )
 
     def rmse(self, seconds):

@@ -24,9 +24,7 @@ from t3mpc_ros.evaluation.closed_loop import (
     total_variation,
 )
 from t3mpc_ros.evaluation.confidence_intervals import rms
-from t3mpc_ros.evaluation.method_comparison.twin_scenario import (
-    CASES as TWIN_CASES,
-)
+from t3mpc_ros.evaluation.method_comparison.twin_scenario import CASES as TWIN_CASES
 from t3mpc_ros.evaluation.method_comparison.twin_scenario import (
     TwinBaseline,
     TwinScenario,
@@ -42,15 +40,8 @@ from t3mpc_ros.evaluation.methods import (
 )
 from t3mpc_ros.evaluation.paper.experiment_runs import SETTLING as PAPER_SETTLING
 from t3mpc_ros.evaluation.reporting import progress_bar
-from t3mpc_ros.evaluation.scenario import (
-    CASES as PAPER_CASES,
-)
-from t3mpc_ros.evaluation.scenario import (
-    RATE,
-    Scenario,
-    settled_rows,
-    switch_times,
-)
+from t3mpc_ros.evaluation.scenario import CASES as PAPER_CASES
+from t3mpc_ros.evaluation.scenario import RATE, Scenario, settled_rows, switch_times
 from t3mpc_ros.evaluation.tuning.tuned_parameters import TunedParameters
 from t3mpc_ros.evaluation.twin_closed_loop import (
     INITIAL_STANDSTILL,

@@ -7,7 +7,7 @@ claims decide only what their interval over the seeds leaves no doubt about; oth
 inconclusive.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 import math
 import re
@@ -135,6 +135,7 @@ def share_of_best(
     margin = limit * _rmses(results, best) - _rmses(results, full)
     return _decide(
         claim,
+        results.complete,
         share <= limit,
         f'{_rmse(full)} against {_rmse(best)} of {best.controller}, the best of {len(baselines)}: '
         f'{share:.2f} of it',
@@ -145,7 +146,7 @@ def share_of_best(
             'share': share,
             'limit': limit,
         },
-        Evidence(results.complete, (margin,)),
+        (margin,),
     )
 
 
@@ -212,10 +213,11 @@ def no_larger_than_pi(results: Results, drive: str) -> Claim:
         return claim
     return _decide(
         claim,
+        results.complete,
         full.rmse_mean <= pi.rmse_mean,
         f'{_rmse(full)} against {_rmse(pi)} of {pi.controller}',
         {'full': full.rmse_mean, 'pi': pi.rmse_mean},
-        Evidence(results.complete, (_rmses(results, pi) - _rmses(results, full),)),
+        (_rmses(results, pi) - _rmses(results, full),),
     )
 
 
@@ -236,12 +238,11 @@ def smallest_growth(results: Results, drive: str) -> Claim:
     growth = _growth(results, drive, FULL)
     return _decide(
         claim,
+        results.complete,
         math.isfinite(own) and own <= others[least],
         f'{own:+.3f} rad/s against {others[least]:+.3f} of {least}, the least of {len(others)}',
         {'full': own, 'least_rival': least, 'least': others[least]},
-        Evidence(
-            results.complete, tuple(_growth(results, drive, name) - growth for name in others)
-        ),
+        [_growth(results, drive, name) - growth for name in others],
     )
 
 
@@ -259,10 +260,14 @@ def settled(results: Results, drive: str) -> Claim:
         return claim
     share = full.settled_mean / REFERENCE_SPREAD
     found = f'{format_number(full.settled_mean)} rad/s, {100.0 * share:.1f} %'
-    numbers: dict[str, object] = {'settled': full.settled_mean, 'limit': limit}
-    margin = limit - np.array([run.settled for run in results.runs(full.experiment)])
-    evidence = Evidence(results.complete, (margin,))
-    return _decide(claim, full.settled_mean <= limit, found, numbers, evidence)
+    return _decide(
+        claim,
+        results.complete,
+        full.settled_mean <= limit,
+        found,
+        {'settled': full.settled_mean, 'limit': limit},
+        (limit - np.array([run.settled for run in results.runs(full.experiment)]),),
+    )
 
 
 def grows_slightly(results: Results, drive: str) -> Claim:
@@ -277,9 +282,14 @@ def grows_slightly(results: Results, drive: str) -> Claim:
     if FULL not in grown:
         return claim
     share = grown[FULL][1] / grown[FULL][0] - 1.0
-    evidence = Evidence(results.complete, (-_growth(results, drive, FULL, SLIGHTLY),))
-    found = f'{100 * share:+.0f} %'
-    return _decide(claim, share <= SLIGHTLY, found, {'growth': share}, evidence)
+    return _decide(
+        claim,
+        results.complete,
+        share <= SLIGHTLY,
+        f'{100 * share:+.0f} %',
+        {'growth': share},
+        (-_growth(results, drive, FULL, SLIGHTLY),),
+    )
 
 
 def others_grow(results: Results, drive: str) -> Claim:
@@ -299,10 +309,8 @@ def others_grow(results: Results, drive: str) -> Claim:
         return claim
     low, high = (f(shares, key=lambda name: shares[name]) for f in (min, max))
     found = f'from {100 * shares[low]:+.0f} % ({low}) to {100 * shares[high]:+.0f} % ({high})'
-    evidence = Evidence(
-        results.complete, tuple(_growth(results, drive, name, 0.5) for name in shares)
-    )
-    return _decide(claim, min(shares.values()) > 0.5, found, {**shares}, evidence)
+    margins = [_growth(results, drive, name, 0.5) for name in shares]
+    return _decide(claim, results.complete, min(shares.values()) > 0.5, found, shares, margins)
 
 
 def calm_control(results: Results, drive: str) -> Claim:
@@ -326,11 +334,12 @@ def calm_control(results: Results, drive: str) -> Claim:
     )
     return _decide(
         claim,
+        results.complete,
         full.chatter_mean <= middle,
         f'{full.chatter_mean:.0f} rad/s³ against a median of {middle:.0f}, from '
         f'{min(others):.0f} to {max(others):.0f}',
         {'full': full.chatter_mean, 'median': middle},
-        Evidence(results.complete, (np.median(by_seed[1:], axis=0) - by_seed[0],)),
+        (np.median(by_seed[1:], axis=0) - by_seed[0],),
     )
 
 
@@ -359,10 +368,11 @@ def estimation_claims(
         margin = 0.5 * speeds[best, PAPER_NOISE] - speeds[ours, PAPER_NOISE]
         half = _decide(
             half,
+            complete,
             own <= 0.5 * other,
             f'{own:.4f} rad/s against {other:.4f} of {best}: {own / other:.2f} of it',
             {'type3': own, 'best': best, 'share': own / other},
-            Evidence(complete, (margin,)),
+            (margin,),
         )
     if all((kind, noise) in means for kind in KINDS for noise in (0.0, LOUDEST)):
         grown = {kind: means[kind, LOUDEST] / means[kind, 0.0] - 1.0 for kind in KINDS}
@@ -372,10 +382,11 @@ def estimation_claims(
         )
         slight = _decide(
             slight,
+            complete,
             grown[ours] <= SLIGHTLY and all(grown[kind] > 0.5 for kind in others),
             ', '.join(f'{kind} {100 * share:+.0f} %' for kind, share in grown.items()),
-            {**grown},
-            Evidence(complete, margins),
+            grown,
+            margins,
         )
     return [half, slight]
 
@@ -407,7 +418,8 @@ def markdown(tables: dict[str, list[Table]], claims: Sequence[Claim] = ()) -> st
 def _against_preview(
     claim: Claim, results: Results, drive: str, cases: Sequence[str], *, exact: bool
 ) -> Claim:
-    held, words, numbers, margins = True, [], {}, []
+    held, words, margins = True, [], []
+    numbers: dict[str, object] = {}
     for case in cases:
         full = results.row(FULL, drive, PAPER_NOISE, case)
         baselines = results.rows_of(drive, PAPER_NOISE, case, baseline=True, preview=True)
@@ -423,8 +435,7 @@ def _against_preview(
         numbers[f'{case}, full'] = full.rmse_mean
         numbers[f'{case}, best'] = best.rmse_mean
         margins.append(_rmses(results, best) - _rmses(results, full))
-    evidence = Evidence(results.complete, tuple(margins))
-    return _decide(claim, held, '; '.join(words), {**numbers}, evidence)
+    return _decide(claim, results.complete, held, '; '.join(words), numbers, margins)
 
 
 def _best(rows: Sequence[ResultRow]) -> ResultRow | None:
@@ -463,15 +474,17 @@ def _paired(claim: Claim, results: Results, pair: PairedDifference | None) -> Cl
     if pair is None or (pair.seeds < 2 and results.complete):
         return claim
     if not math.isfinite(pair.difference):
-        return _answer(claim, False, 'a run left the finite numbers', {'seeds': pair.seeds})
+        found = 'a run left the finite numbers'
+        return replace(claim, found=found, held=False, numbers={'seeds': pair.seeds})
     known = math.isfinite(pair.ci95)
     found = f'{pair.difference:+.4f}' + (f' ± {pair.ci95:.4f}' if known else '')
     return _decide(
         claim,
+        results.complete,
         pair.below,
         f'{found} rad/s over {pair.seeds} seed' + ('s' if pair.seeds > 1 else ''),
         {'difference': pair.difference, 'ci95': pair.ci95, 'seeds': pair.seeds},
-        Evidence(results.complete, (), ((-pair.difference, pair.ci95),)),
+        intervals=[(-pair.difference, pair.ci95)],
     )
 
 
@@ -484,36 +497,38 @@ def _rmses(results: Results, row: ResultRow) -> Array:
     return np.array([run.rmse for run in results.runs(row.experiment)])
 
 
-@dataclass(frozen=True, slots=True)
-class Evidence:
-    """What a claim is decided from."""
-
-    complete: bool
-    """Whether as much was measured as the claim is about; its criterion then decides."""
-    margins: tuple[Array, ...]
-    """For each part of the claim, by how much each seed satisfies it."""
-    intervals: tuple[tuple[float, float], ...] = ()
-    """More parts, as mean and half the interval."""
-
-    @property
-    def decides(self) -> bool:
-        """Whether all parts are satisfied, or one is not, beyond doubt."""
-        parts = [(mean(each.tolist()), interval(each.tolist())) for each in self.margins]
-        parts += self.intervals
-        if self.complete or not all(math.isfinite(middle) for middle, _ in parts):
-            return True
-        return all(middle > half for middle, half in parts) or any(
-            middle < -half for middle, half in parts
-        )
-
-
 def _decide(
-    claim: Claim, held: bool, found: str, numbers: dict[str, object], evidence: Evidence
+    claim: Claim,
+    complete: bool,
+    held: bool,
+    found: str,
+    numbers: Mapping[str, object],
+    margins: Sequence[Array] = (),
+    intervals: Sequence[tuple[float, float]] = (),
 ) -> Claim:
-    if evidence.decides:
-        return _answer(claim, held, found, numbers)
-    return replace(_answer(claim, held, found, numbers), held=None, inconclusive=True)
+    """Return the claim as decided, or as inconclusive.
 
-
-def _answer(claim: Claim, held: bool, found: str, numbers: dict[str, object]) -> Claim:
-    return Claim(claim.name, claim.origin, claim.text, found, bool(held), numbers)
+    Parameters
+    ----------
+    complete
+        Whether as much was measured as the claim is about; its criterion then decides. Otherwise
+        all parts must be satisfied beyond doubt, or one must not be.
+    margins, intervals
+        For each part of the claim, by how much each seed satisfies it, or mean and half the
+        interval of that.
+    """
+    parts = [(mean(each.tolist()), interval(each.tolist())) for each in margins]
+    parts += intervals
+    sure = (
+        complete
+        or not all(math.isfinite(middle) for middle, _ in parts)
+        or all(middle > half for middle, half in parts)
+        or any(middle < -half for middle, half in parts)
+    )
+    return replace(
+        claim,
+        found=found,
+        held=bool(held) if sure else None,
+        numbers=dict(numbers),
+        inconclusive=not sure,
+    )

@@ -231,14 +231,8 @@ def measure(run: LoopRecord) -> RunNumbers:
     arrays = run.reference, run.speeds, run.command, run.terms
     if not all(bool(np.isfinite(values).all()) for values in arrays):
         return RunNumbers(math.nan, math.nan, math.nan, math.nan, False)
-    counted = np.abs(run.speeds - run.reference)[run.time >= START]
-    return RunNumbers(
-        float(run.rmse(START)),
-        float(run.rmse(START, cut=SETTLING)),
-        float(run.chatter()),
-        float(np.max(counted, initial=0.0)),
-        True,
-    )
+    settled = run.rmse(START, cut=SETTLING)
+    return RunNumbers(run.rmse(START), settled, run.chatter(), run.largest_error(START), True)
 
 
 def source_digest(package: Path = PACKAGE_DIRECTORY) -> str:

@@ -61,13 +61,13 @@ def path(showcase: FigureRuns) -> Any:
     return figure
 
 
-def floor_path(speeds: Array, time: Array, geometry: WheelGeometry | None = None) -> Array:
+def floor_path(speeds: Array, time: Array) -> Array:
     """Return places (m) on the way of a robot whose wheels turn so, shape (n, 2), from (0, 0).
 
     The body motion (1)-(3) is integrated in exact arcs, a wheel's speed (rad/s, right first) held
-    at the mean of both ends of a period. The default geometry when None.
+    at the mean of both ends of a period.
     """
-    geometry = WheelGeometry() if geometry is None else geometry
+    geometry = WheelGeometry()
     places = np.zeros((time.size, 2))
     pose = ORIGIN
     middles = 0.5 * (speeds[1:] + speeds[:-1])

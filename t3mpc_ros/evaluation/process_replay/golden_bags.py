@@ -59,17 +59,9 @@ class ControllerBag:
     The parameters of the controller are stored as metadata record as by the recorder.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        parameters: ControllerParameters,
-        metadata_records: Mapping[str, Mapping[str, str]] | None = None,
-        name: str | None = None,
-    ) -> None:
+    def __init__(self, folder: Path, parameters: ControllerParameters) -> None:
         own = {CONTROLLER: {key: str(value) for key, value in parameters.to_dict().items()}}
-        self._writer = BagWriter(
-            folder, name, metadata_records={**own, **(metadata_records or {})}
-        )
+        self._writer = BagWriter(folder, metadata_records=own)
         for topic, kind in TYPES.items():
             self._writer.add_topic(f'/{topic}', kind)
 

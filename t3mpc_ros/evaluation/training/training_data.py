@@ -24,10 +24,7 @@ from t3mpc_ros.evaluation.bag_report.topic_roles import (
     WHEELS,
     find_topics,
 )
-from t3mpc_ros.evaluation.process_replay.controller_inputs import (
-    ReplayError,
-    recorded_parameters,
-)
+from t3mpc_ros.evaluation.process_replay.controller_inputs import ReplayError, recorded_parameters
 from t3mpc_ros.evaluation.process_replay.controller_replay import recompute_scalars
 from t3mpc_ros.evaluation.process_replay.journal_alignment import match_commands
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist

@@ -86,7 +86,6 @@ def search_best(
     evaluations: int,
     seed: int,
     report: Callable[[SearchProgress], None] | None = None,
-    batch: int | None = None,
     *,
     path: Path | None = None,
     resume: bool = False,
@@ -104,8 +103,6 @@ def search_best(
         To be made small. Called once for the start and once for each generation.
     report
         Called after each generation.
-    batch
-        Points of a generation, at least 2; by default 4 + 3 ln n for n parameters.
     path, resume
         File for the history, written after each generation, and whether what it holds is taken as
         already evaluated. Without such a file the search begins anew.
@@ -120,21 +117,18 @@ def search_best(
     """
     if evaluations < 1:
         raise ValueError(f'evaluations must be at least 1: got {evaluations}')
-    if batch is not None and batch < 2:
-        raise ValueError(f'batch must be at least 2: got {batch}')
     first = space.of(start)
     head: dict[str, object] = {
         'space': space.describe(),
         'start': start.to_dict(),
         'evaluations': evaluations,
         'seed': seed,
-        'batch': batch,
         'about': dict(about or {}),
     }
     course = _Evaluator(objective, space, evaluations, report, _History(path, head, resume))
     origin = space.point(first)
     course.evaluate([origin], [first])
-    generations = _Generations(origin, seed, batch)
+    generations = _Generations(origin, seed)
     while course.left > generations.size:
         values = course.evaluate(generations.ask())
         generations.update(values, course.left)
@@ -199,11 +193,11 @@ class _Evaluator:
 class _Generations:
     """Points to be tried next, by CMA-ES; begun anew elsewhere once it has converged."""
 
-    def __init__(self, origin: Array, seed: int, batch: int | None) -> None:
+    def __init__(self, origin: Array, seed: int) -> None:
         self._n = origin.size
         self._random = np.random.default_rng(seed)
         self._largest = 0.0
-        self._smallest = batch or 4 + int(3.0 * math.log(max(self._n, 2)))
+        self._smallest = 4 + int(3.0 * math.log(max(self._n, 2)))
         self._begin(origin, self._smallest)
 
     @property

@@ -197,7 +197,6 @@ def tune_methods(
     resume: bool = False,
     training: TuningScenarios | None = None,
     evaluate: Evaluate | None = None,
-    seed: int = SEARCH_SEED,
 ) -> TunedParameters:
     """Return the best parameters of each method in each of its drives.
 
@@ -217,8 +216,6 @@ def tune_methods(
         Go on with searches that were interrupted.
     training, evaluate
         The runs of an evaluation, and what evaluates in place of the closed loop.
-    seed
-        Of every search.
 
     Raises
     ------
@@ -235,7 +232,7 @@ def tune_methods(
     training = training or TuningScenarios()
     budget = TuningBudget(
         evaluations,
-        seed,
+        SEARCH_SEED,
         training.seeds,
         training.noise_levels,
         training.duration,
@@ -256,7 +253,7 @@ def tune_methods(
                     method.space,
                     method.start[drive],
                     evaluations,
-                    seed,
+                    SEARCH_SEED,
                     partial(_show_progress, bar),
                     path=history_path(path, method, drive),
                     resume=resume,

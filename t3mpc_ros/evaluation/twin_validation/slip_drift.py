@@ -90,11 +90,9 @@ def slip_events(name: str, slip: Slip, seed: int) -> tuple[FaultEvent, ...]:
     return slip.slip_events(np.random.default_rng(numbers), LONGEST)
 
 
-def drive_course(
-    name: str, slip: Slip, seed: int, parameters: DigitalTwinParameters | None = None
-) -> Course:
-    """Return one of :data:`COURSES` under ``slip``, with :func:`robot` unless one is given."""
-    return COURSES[name](parameters or robot(seed), slip_events(name, slip, seed))
+def drive_course(name: str, slip: Slip, seed: int) -> Course:
+    """Return one of :data:`COURSES` under ``slip``, driven by :func:`robot`."""
+    return COURSES[name](robot(seed), slip_events(name, slip, seed))
 
 
 def measure_drift(
