@@ -12,21 +12,21 @@ import pytest
 from t3mpc_ros.cli import main
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.plotting import WIDTH
-from t3mpc_ros.evaluation.twin_validation import component_tests, courses, slip_drift
+from t3mpc_ros.evaluation.twin_validation import component_tests, courses
 from t3mpc_ros.evaluation.twin_validation.validation_page import VALIDATION_FIGURES
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 from t3mpc_ros.simulation.sensors.range_sensor import SimulatedRangeSensorParameters
 
 SEEDS = (1, 2, 3, 4)
-GRIPS = slip_drift.SLIPS[:3]
-MIDDLE, STRONG, HELD = slip_drift.SLIPS[1], slip_drift.SLIPS[2], slip_drift.SLIPS[5]
+GRIPS = courses.SLIPS[:3]
+MIDDLE, STRONG, HELD = courses.SLIPS[1], courses.SLIPS[2], courses.SLIPS[5]
 SQUARES = ('square ccw', 'square cw')
 
 
 @pytest.fixture(scope='module')
 def slipped():
     """Every course under lost grip in three strengths, four robots each."""
-    return slip_drift.measure_drifts(SEEDS, GRIPS)
+    return courses.measure_drifts(SEEDS, GRIPS)
 
 
 def check_a_fifth(members, at_least):
@@ -62,7 +62,7 @@ def test_gyro_cuts_square_drift_to_a_fifth_both_ways(slipped, course):
 def test_the_gyro_leaves_a_fifth_of_the_drift_of_ten_turns(slipped):
     chosen = [item for item in slipped if item.course == '10 turns']
     check_a_fifth(chosen, math.radians(60.0))
-    check_a_fifth(slip_drift.select_drifts(chosen, '10 turns', STRONG.name), math.radians(60.0))
+    check_a_fifth(courses.select_drifts(chosen, '10 turns', STRONG.name), math.radians(60.0))
     strong = [item for item in chosen if abs(item.steps) > 5.0 * item.limit]
     assert len(strong) >= 3
     assert all(item.holds for item in strong)
@@ -73,20 +73,20 @@ def test_gyro_drift_stays_within_its_own_error_bound(slipped):
     """Scale and bias bound it, so a fifth is certain once steps drift by five times as much."""
     for item in slipped:
         assert abs(item.fused) <= 1.5 * item.limit, item
-    assert slip_drift.holds_from(slipped) < 7.5 * max(item.limit for item in slipped)
+    assert courses.holds_from(slipped) < 7.5 * max(item.limit for item in slipped)
 
 
 def test_a_held_wheel_loses_steps_the_gyro_measures_the_turn():
-    (found,) = slip_drift.measure_drifts((1,), (HELD,), courses=('square ccw',))
+    (found,) = courses.measure_drifts((1,), (HELD,), courses=('square ccw',))
     assert found.lost > 100
     assert abs(found.steps) > math.radians(30.0)
     assert abs(found.fused) <= abs(found.steps) / 5.0
     assert found.fused_place < 0.2 * found.steps_place
 
 
-@pytest.mark.parametrize('course', list(slip_drift.COURSES))
+@pytest.mark.parametrize('course', list(courses.COURSES))
 def test_without_slip_both_headings_are_good(course):
-    (found,) = slip_drift.measure_drifts((1,), (slip_drift.NO_SLIP,), courses=(course,))
+    (found,) = courses.measure_drifts((1,), (courses.NO_SLIP,), courses=(course,))
     assert abs(found.steps) < math.radians(4.0)
     assert abs(found.fused) <= found.limit
     assert found.lost == 0
@@ -94,9 +94,9 @@ def test_without_slip_both_headings_are_good(course):
 
 
 def test_odometry_without_gyro_equals_the_step_odometry():
-    parameters = slip_drift.robot(1)
+    parameters = courses.robot(1)
     blind = parameters.with_values({'odometry.use_gyro': False})
-    slip_events = slip_drift.slip_events('10 turns', STRONG, 1)
+    slip_events = courses.slip_events('10 turns', STRONG, 1)
     with_gyro, without = (courses.spin(table, 2, slip_events) for table in (parameters, blind))
     np.testing.assert_array_equal(with_gyro.truth, without.truth)
     np.testing.assert_allclose(without.odometry, without.steps, atol=1e-9)
@@ -107,8 +107,8 @@ def test_odometry_without_gyro_equals_the_step_odometry():
 @pytest.mark.parametrize('clockwise', [False, True])
 def test_a_square_is_one_to_the_steps_even_while_wheels_slip(clockwise):
     """It is driven by counting: what the floor makes of it does not show in the counters."""
-    slip_events = slip_drift.slip_events('square cw', STRONG, 2)
-    course = courses.umbmark(slip_drift.robot(2), clockwise, slip_events, side=0.5)
+    slip_events = courses.slip_events('square cw', STRONG, 2)
+    course = courses.umbmark(courses.robot(2), clockwise, slip_events, side=0.5)
     sign = -1.0 if clockwise else 1.0
     assert course.steps[-1, :2] == pytest.approx([0.0, 0.0], abs=5e-3)
     assert course.steps[-1, 2] == pytest.approx(sign * math.tau, abs=1e-3)
@@ -119,21 +119,21 @@ def test_a_square_is_one_to_the_steps_even_while_wheels_slip(clockwise):
 
 
 def test_an_impossible_course_is_rejected():
-    stuck = slip_drift.robot(1).with_values({'wheel.max_velocity': 0.0})
+    stuck = courses.robot(1).with_values({'wheel.max_velocity': 0.0})
     with pytest.raises(RuntimeError, match=r'leg 1 did not end within .* rad to go'):
         courses.spin(stuck, 1)
 
 
 def test_slip_events_depend_on_their_seed_without_overlap():
-    shown = slip_drift.slip_events('10 turns', MIDDLE, 1)
-    assert shown == slip_drift.slip_events('10 turns', MIDDLE, 1)
-    assert shown != slip_drift.slip_events('10 turns', MIDDLE, 2)
-    assert shown != slip_drift.slip_events('square cw', MIDDLE, 1)
+    shown = courses.slip_events('10 turns', MIDDLE, 1)
+    assert shown == courses.slip_events('10 turns', MIDDLE, 1)
+    assert shown != courses.slip_events('10 turns', MIDDLE, 2)
+    assert shown != courses.slip_events('square cw', MIDDLE, 1)
     assert {event.value for event in shown} == {0.1}
     assert shown[0].at > courses.STANDING
     for event, following in zip(shown, shown[1:], strict=False):
         assert event.until < following.at
-    assert {event.value for event in slip_drift.slip_events('10 turns', HELD, 1)} == {
+    assert {event.value for event in courses.slip_events('10 turns', HELD, 1)} == {
         'right',
         'left',
     }
@@ -141,9 +141,7 @@ def test_slip_events_depend_on_their_seed_without_overlap():
 
 def test_same_seed_same_table():
     first, again, other = (
-        slip_drift.drift_table(
-            slip_drift.measure_drifts((seed,), (MIDDLE,), courses=('10 turns',))
-        )
+        courses.drift_table(courses.measure_drifts((seed,), (MIDDLE,), courses=('10 turns',)))
         for seed in (4, 4, 5)
     )
     assert first == again
@@ -235,7 +233,7 @@ def test_the_command_draws_every_picture_and_prints_the_table(tmp_path, capsys, 
     }
     for name, drive in short.items():
         monkeypatch.setitem(
-            slip_drift.COURSES,
+            courses.COURSES,
             name,
             lambda parameters, events, drive=drive, name=name: replace(
                 drive(parameters, events), name=name

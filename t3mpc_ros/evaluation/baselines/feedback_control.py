@@ -328,10 +328,9 @@ class SlidingMode(FeedbackBaseline[SlidingModeParameters]):
 
 
 @dataclass(frozen=True)
-class ComputedTorqueParameters(FeedbackParameters):
+class ComputedTorqueParameters(ProportionalIntegralParameters):
     """Gains of computed torque, and where and how far its model is believed."""
 
-    gain: float = parameter(30.0, 'feedback K on the error', unit='1/s', low=0.5, high=100.0)
     integral: float = parameter(
         20.0,
         'integral gain, for what the model does not know',
@@ -351,7 +350,7 @@ class ComputedTorqueParameters(FeedbackParameters):
     )
 
 
-class ComputedTorque(FeedbackBaseline[ComputedTorqueParameters]):
+class ComputedTorque(ProportionalIntegral):
     """Computed torque of the nominal robot: u = r' + v(h) - K e - I - m(chi).
 
     m is what (10) of the nominal robot leaves of chi' - u when u is applied as the torque
@@ -366,16 +365,13 @@ class ComputedTorque(FeedbackBaseline[ComputedTorqueParameters]):
     def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None:
         super().__init__(parameters, nominal_model)
         self._loads = WheelLoads(nominal_model)
-        self._felt = self.parameters.belief
+        assert isinstance(self.parameters, ComputedTorqueParameters)
+        self._felt, self._measured = self.parameters.belief, self.parameters.measured
         if nominal_model.drive == 'velocity':
             self._felt *= nominal_model.lag * nominal_model.share / nominal_model.period
-        self.integral: Array = np.zeros(2)
-        """I, what is opposed beyond the model, rad/s², shape (2,)."""
 
     def feedback(self, observation: Observation, feedforward: Array, error: Array) -> Array:
         """Return u, rad/s², shape (2,)."""
-        table = self.parameters
-        self.integral = self.integral + self._period * table.integral * error
-        at = observation.reference + self.transient + table.measured * error
-        without_model = feedforward - table.gain * error - self.integral
+        without_model = super().feedback(observation, feedforward, error)
+        at = observation.reference + self.transient + self._measured * error
         return np.asarray(without_model - self._felt * self._loads(at))

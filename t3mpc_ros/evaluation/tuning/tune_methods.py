@@ -5,7 +5,7 @@
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import BrokenExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 import math
 from pathlib import Path
@@ -322,17 +322,12 @@ def _objective(
 
 
 def _about(method: MethodDefinition, drive: str, budget: TuningBudget) -> dict[str, object]:
-    return {
-        'method': method.name,
-        'controller': method.controller_type.__qualname__,
-        'drive': drive,
-        'training_seeds': budget.training_seeds,
-        'noise_levels': budget.noise_levels,
-        'duration': budget.duration,
-        'smoothness': budget.smoothness,
-        'cases': budget.cases,
-        'version': t3mpc_ros.__version__,
-    }
+    """Return what tells this search from others, beside its evaluations and seed."""
+    scenarios = asdict(budget)
+    del scenarios['evaluations'], scenarios['search_seed']
+    controller = method.controller_type.__qualname__
+    origin = {'drive': drive, 'version': t3mpc_ros.__version__}
+    return {'method': method.name, 'controller': controller, **origin, **scenarios}
 
 
 def _entry(

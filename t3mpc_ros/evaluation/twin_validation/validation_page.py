@@ -24,7 +24,7 @@ from t3mpc_ros.evaluation.reporting import (
     Table,
     html_page,
 )
-from t3mpc_ros.evaluation.twin_validation import component_tests, courses, slip_drift
+from t3mpc_ros.evaluation.twin_validation import component_tests, courses
 from t3mpc_ros.evaluation.twin_validation.component_tests import (
     GYRO_SHEET,
     SHARP_SHEET,
@@ -34,11 +34,12 @@ from t3mpc_ros.evaluation.twin_validation.component_tests import (
     TorqueCurve,
     sharp_deviation,
 )
-from t3mpc_ros.evaluation.twin_validation.courses import Course, Patrol
-from t3mpc_ros.evaluation.twin_validation.slip_drift import (
+from t3mpc_ros.evaluation.twin_validation.courses import (
     NO_SLIP,
     PART,
+    Course,
     Drift,
+    Patrol,
     holds_from,
     select_drifts,
 )
@@ -511,7 +512,7 @@ def write_validation(
 ) -> str:
     """Write page and figures, and return the tables and the path of the page as text."""
     evidence = run_validation(seed, amount, progress=progress)
-    tables = [slip_drift.drift_table(evidence.drifts), bench_table(evidence)]
+    tables = [courses.drift_table(evidence.drifts), bench_table(evidence)]
     pictures = write_pictures(VALIDATION_FIGURES, evidence, output)
     origin = f'seeds {seed} to {seed + amount.seeds - 1}; simulation only'
     if amount == QUICK:
@@ -531,11 +532,11 @@ def run_validation(seed: int, amount: ValidationSize, *, progress: bool = False)
     parameters = DigitalTwinParameters.from_dict({'seed': seed, 'world': 'room'})
     seeds = range(seed, seed + amount.seeds)
     kinds = [
-        [slip for slip in slip_drift.SLIPS if slip.fault == kind][-amount.strengths :]
-        for kind in dict.fromkeys(slip.fault for slip in slip_drift.SLIPS)
+        [slip for slip in courses.SLIPS if slip.fault == kind][-amount.strengths :]
+        for kind in dict.fromkeys(slip.fault for slip in courses.SLIPS)
     ]
-    slips = [slip_drift.NO_SLIP, *(slip for kind in kinds for slip in kind)]
-    shown = slip_drift.SLIPS[1]
+    slips = [courses.NO_SLIP, *(slip for kind in kinds for slip in kind)]
+    shown = courses.SLIPS[1]
     fastest, motor = 140.0, parameters.motor
     torque = [
         component_tests.torque_curve(motor, volts, current, fastest)
@@ -550,12 +551,12 @@ def run_validation(seed: int, amount: ValidationSize, *, progress: bool = False)
     rate = parameters.rate
     rates = component_tests.stationary_gyro(parameters.imu, amount.standing, rate, seed)
     low_pass = [component_tests.low_pass_response(number) for number in range(7)]
-    found = slip_drift.measure_drifts(seeds, slips, progress=progress)
+    found = courses.measure_drifts(seeds, slips, progress=progress)
     squares = tuple(
-        slip_drift.drive_course(name, shown, seed) for name in ('square ccw', 'square cw')
+        courses.drive_course(name, shown, seed) for name in ('square ccw', 'square cw')
     )
-    turns = slip_drift.drive_course('10 turns', shown, seed)
-    slip_events = slip_drift.slip_events('10 turns', shown, seed)
+    turns = courses.drive_course('10 turns', shown, seed)
+    slip_events = courses.slip_events('10 turns', shown, seed)
     patrol = courses.patrol(parameters, amount.patrol, 30.0)
     return Evidence(
         parameters=parameters,
