@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.bag.columns import TopicColumns, read_columns
 from t3mpc_ros.bag.reader import BagReader, open_bag
 from t3mpc_ros.control.actuation import wheel_limits
 from t3mpc_ros.control.control_law import TERM_NAMES
@@ -45,7 +46,6 @@ DISAGREES = 0.2
 """Difference between a reconstructed and the published error that counts as wrong, as a share of
 the error; without losses they agree to rounding."""
 
-_TWIST = {'linear': 'twist.twist.linear.x', 'angular': 'twist.twist.angular.z'}
 _FEEDBACK = TERM_NAMES.index('feedback')
 _FOLLOWED = [TERM_NAMES.index(name) for name in ('feedback', 'feedforward', 'compensator')]
 
@@ -119,11 +119,12 @@ def load_training_data(folder: Path) -> tuple[TrainingData, ControllerParameters
                 'nothing is learnt about the wheels; record a bag with composition: paper'
             )
         parameters = parameters.resolved()
-        messages = {
-            name: recomputed[name]
-            if name in recomputed
-            else _read(recording, name, topics[name], notes)
-            for name in NEEDED
+        recorded = {name: topics[name] for name in NEEDED if name not in recomputed}
+        columns = read_columns(recording, recorded.values())
+        start_ns = recording.start_ns
+        messages = recomputed | {
+            name: _table(name, topic, columns[topic], start_ns, notes)
+            for name, topic in recorded.items()
         }
     if empty := [name for name, table in messages.items() if not table['received'].size]:
         raise TrainingError(f'{folder}: no message of {", ".join(empty)} is finite')
@@ -159,20 +160,22 @@ def _recomputed(
     }
 
 
-def _read(recording: BagReader, name: str, topic: str, notes: list[str]) -> Mapping[str, Array]:
-    """Return the messages of one topic in order of receipt."""
-    if name == COMMAND:
-        inner = 'twist.' if recording.topics[topic].type_name.endswith('Stamped') else ''
-        table = {'linear': f'{inner}linear.x', 'angular': f'{inner}angular.z'}
+def _table(
+    name: str, topic: str, column: TopicColumns, start_ns: int, notes: list[str]
+) -> Mapping[str, Array]:
+    """Return the messages of one topic in order of receipt; times count from ``start_ns``."""
+    times = {'received': column.received_ns, 'stamp': column.stamps_ns}
+    columns = {key: (each - start_ns) / NANOSECONDS for key, each in times.items()}
+    if name in (REFERENCE, ODOMETRY, COMMAND):
+        columns |= {'linear': column.numbers[:, -2], 'angular': column.numbers[:, -1]}
     else:
-        table = _TWIST if name in (REFERENCE, ODOMETRY) else {'value': 'data'}
-    columns = recording.series(topic, table)
-    bad = ~np.all([np.isfinite(column) for column in columns.values()], axis=0)
+        columns['value'] = column.numbers[:, 0]
+    bad = ~np.all([np.isfinite(values) for values in columns.values()], axis=0)
     if bad.any():
         notes.append(f'{np.count_nonzero(bad)} messages of {topic} are not finite')
     if name in (REFERENCE, ODOMETRY):
         return columns  # rejected by the controller itself, as in the run
-    return {key: column[~bad] for key, column in columns.items()}
+    return {key: values[~bad] for key, values in columns.items()}
 
 
 def _rebuild(
