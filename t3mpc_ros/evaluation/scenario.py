@@ -229,17 +229,7 @@ class Scenario:
 
     def nominal_model(self) -> NominalModel:
         """Return the nominal model for a method."""
-        robot = self._known_robot()
-        velocity = self.drive == 'velocity'
-        return NominalModel(
-            drive=self.drive,
-            period=1.0 / RATE,
-            lag=robot.drive.lag,
-            acceleration=isotropic_acceleration(self.limits, robot.geometry)
-            if velocity
-            else math.inf,
-            robot=robot,
-        )
+        return nominal_model(self.drive, self._known_robot(), self.limits)
 
     def estimate(self) -> SpeedFilterParameters:
         """Return the parameters of the state estimator, equal for all methods.
@@ -330,6 +320,20 @@ def switch_times(time: Array, modes: NDArray[np.int64]) -> Array:
     """Return the instants (s) of the first row of each new mode."""
     instants: Array = time[1:][np.diff(modes) != 0]
     return instants
+
+
+def nominal_model(
+    drive: str, robot: PaperRobotParameters, limits: LimitParameters
+) -> NominalModel:
+    """Return the nominal model of a robot; with a torque drive, its acceleration is unlimited."""
+    velocity = drive == 'velocity'
+    return NominalModel(
+        drive=drive,
+        period=1.0 / RATE,
+        lag=robot.drive.lag,
+        acceleration=isotropic_acceleration(limits, robot.geometry) if velocity else math.inf,
+        robot=robot,
+    )
 
 
 def isotropic_acceleration(limits: LimitParameters, geometry: WheelGeometry) -> float:

@@ -29,7 +29,7 @@ from t3mpc_ros.evaluation.scenario import (
     RATE,
     SampledReference,
     check_run,
-    isotropic_acceleration,
+    nominal_model,
     sample_reference,
 )
 from t3mpc_ros.evaluation.twin_closed_loop import LEAD, loop_controller, loop_robot
@@ -223,13 +223,7 @@ class TwinScenario:
                 'rate': RATE,
             }
         )
-        return NominalModel(
-            drive='velocity',
-            period=1.0 / RATE,
-            lag=estimate.lag,
-            acceleration=isotropic_acceleration(self.limits, robot.geometry),
-            robot=robot,
-        )
+        return nominal_model('velocity', robot, self.limits)
 
 
 def check_name(kind: str, name: str, known: Mapping[str, object]) -> None:
