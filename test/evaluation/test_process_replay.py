@@ -58,6 +58,11 @@ JOURNAL = '/controller/journal'
 STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
+def golden(stem):
+    (path,) = (path for path in GOLDEN if path.stem == stem)
+    return path
+
+
 def bag_program(*arguments):
     """Run a command of ``bag`` as its program does; return the exit code."""
     parser = argparse.ArgumentParser(prog='bag')
@@ -75,8 +80,7 @@ def columns_of(path, topics):
 
 @pytest.fixture(scope='module')
 def bag():
-    [path] = [path for path in GOLDEN if path.stem == 'stops']
-    return path
+    return golden('stops')
 
 
 @pytest.fixture(scope='module')
@@ -182,11 +186,11 @@ def test_the_golden_runs_have_all_that_they_are_for(inputs, again):
         again.reasons
     )
     assert {Reason.NO_REFERENCE, Reason.ODOMETRY_BAD} <= set(again.reasons)
-    [changes] = [path for path in GOLDEN if path.stem == 'changes']
+    changes = golden('changes')
     changed = load_inputs(changes)
     assert list(changed.events).count(Event.CONFIGURE) == 5
     assert Reason.NOT_FOLLOWING in replay_controller(changed).reasons
-    [switches] = [path for path in GOLDEN if path.stem == 'switches']
+    switches = golden('switches')
     linear, angular = np.abs(np.diff(load_inputs(switches).references.numbers[:, 6:], axis=0)).T
     assert np.count_nonzero((linear > 0.022) | (angular > 0.31)) >= 3, 'jumps as the track has it'
 
@@ -244,7 +248,7 @@ def test_a_setting_that_does_not_exist_is_refused(inputs):
 
 
 def test_live_settings_are_those_of_their_time():
-    [path] = [path for path in GOLDEN if path.stem == 'changes']
+    path = golden('changes')
     inputs = load_inputs(path)
     found = {name: table.law.gain for name, table in inputs.lives[0].parameters.items()}
     assert found[0] != 20.0
@@ -317,7 +321,7 @@ def test_without_a_journal_receive_order_is_used_and_noted(bag, tmp_path):
 
 
 def test_a_run_without_events_is_the_same_without_its_journal(tmp_path):
-    [path] = [path for path in GOLDEN if path.stem == 'switches']
+    path = golden('switches')
     inputs = load_inputs(without(path, tmp_path / 'copy', lambda topic, _: topic == JOURNAL))
     outcome = compare(inputs, replay_controller(inputs), Tolerances(ELSEWHERE, ELSEWHERE))
     assert outcome.same, outcome.table()
@@ -379,21 +383,6 @@ def test_odometry_lost_before_the_first_reference_is_harmless(tmp_path):
     assert compare(inputs, replay_controller(inputs)).same
 
 
-def test_a_lost_command_is_counted_and_harms_nothing_else(bag, tmp_path):
-    inputs = load_inputs(without(bag, tmp_path / 'copy', lambda *it: it == ('/cmd_vel', 120)))
-    assert any('1 commands of the controller' in note for note in inputs.notes)
-    assert inputs.exact.all()
-    assert compare(inputs, replay_controller(inputs)).same
-
-
-def test_settings_lost_at_the_start_are_said(tmp_path):
-    [path] = [path for path in GOLDEN if path.stem == 'changes']
-    lost = without(path, tmp_path / 'copy', lambda *it: it == ('/controller/parameters', 0))
-    inputs = load_inputs(lost)
-    assert any('settings at the start are not in the bag' in note for note in inputs.notes)
-    assert not inputs.exact.any()
-
-
 def test_a_recorder_that_notes_no_time_of_publication_will_do(bag, tmp_path):
     """Heard after its row of the journal, a command is still the one of that row."""
     moved = tmp_path / 'moved'
@@ -410,14 +399,24 @@ def test_a_recorder_that_notes_no_time_of_publication_will_do(bag, tmp_path):
     assert not any(row.differing for row in outcome.rows[:2]), outcome.table()
 
 
-def test_a_lost_change_of_settings_is_said(tmp_path):
-    [path] = [path for path in GOLDEN if path.stem == 'changes']
-    lost = without(path, tmp_path / 'copy', lambda *it: it == ('/controller/parameters', 3))
-    inputs = load_inputs(lost)
-    assert any('1 changes of settings are not in the bag' in note for note in inputs.notes)
-    third = np.flatnonzero(inputs.events == Event.CONFIGURE)[2]
-    assert inputs.exact[:third].all()
-    assert not inputs.exact[third:].any()
+@pytest.mark.parametrize(
+    'stem, lost, words, kept',
+    [
+        ('stops', ('/cmd_vel', 120), '1 commands of the controller', None),
+        ('changes', ('/controller/parameters', 0), 'settings at the start are not in the bag', 0),
+        ('changes', ('/controller/parameters', 3), '1 changes of settings are not in the bag', 3),
+    ],
+)
+def test_what_is_lost_is_said_and_harms_nothing_before(stem, lost, words, kept, tmp_path):
+    """Exact are all events, or those before the first change of settings that is not known."""
+    inputs = load_inputs(without(golden(stem), tmp_path / 'copy', lambda *it: it == lost))
+    assert any(words in note for note in inputs.notes)
+    changes = [0, *np.flatnonzero(inputs.events == Event.CONFIGURE).tolist()]
+    exact = len(inputs.events) if kept is None else changes[kept]
+    assert inputs.exact[:exact].all()
+    assert not inputs.exact[exact:].any()
+    if kept is None:
+        assert compare(inputs, replay_controller(inputs)).same
 
 
 def test_settings_that_were_only_asked_for_by_the_recorder_do(bag, tmp_path):
