@@ -212,12 +212,6 @@ def test_settings_are_ready_for_a_logarithmic_search(kind):
     assert gain.low <= share / T <= gain.high
 
 
-def test_settings_of_another_method_are_refused():
-    nominal_model = NominalModel('torque', T, 0.02, math.inf, PaperRobotParameters())
-    with pytest.raises(ValueError, match='must be SlidingModeParameters'):
-        SlidingMode(ProportionalIntegral.parameters_type(), nominal_model)
-
-
 # -- PI -------------------------------------------------------------------------------------------
 
 

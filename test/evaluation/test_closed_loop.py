@@ -6,7 +6,6 @@ from dataclasses import dataclass, fields
 from functools import partial
 import math
 from operator import methodcaller
-import pickle
 
 import numpy as np
 import pytest
@@ -572,12 +571,6 @@ def test_many_runs_are_the_same_in_one_process_and_in_two():
         list(measure_many([jobs[1], bad], full_record))
     with pytest.raises(ValueError, match='workers must be at least 1: got 0'):
         list(measure_many(jobs, full_record, 0))
-
-
-def test_a_record_and_a_method_survive_being_sent():
-    record = run(Scenario('torque', 0.04, 'nominal', 1, 0.5), P)
-    assert_equal_records(pickle.loads(pickle.dumps(record)), record)
-    assert pickle.loads(pickle.dumps(P)) == P
 
 
 # -- records ----------------------------------------------------------------------------------

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Metrics of a recorded run: tracking errors, chatter, latencies."""
+"""Metrics of a recorded run, tracking errors, chatter and latencies, and the verdict on it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
