@@ -20,11 +20,11 @@ from support.unrendered import unrendered  # noqa: F401 - a fixture
 
 from t3mpc_ros.cli.paper import add_parser
 from t3mpc_ros.evaluation.closed_loop import LoopRecord
+from t3mpc_ros.evaluation.methods import FULL
 from t3mpc_ros.evaluation.open_loop_estimation import EstimationResult
 from t3mpc_ros.evaluation.paper import claims as claiming
 from t3mpc_ros.evaluation.paper.claims import markdown
 from t3mpc_ros.evaluation.paper.experiment_runs import (
-    FULL,
     INTENDED_CASES,
     NOISES,
     PARTS,

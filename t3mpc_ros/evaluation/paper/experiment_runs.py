@@ -12,21 +12,18 @@ from io import TextIOWrapper
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 
 import t3mpc_ros
 from t3mpc_ros.evaluation.closed_loop import LoopRecord
-from t3mpc_ros.evaluation.methods import ComparedMethod
+from t3mpc_ros.evaluation.methods import FULL, ComparedMethod
+from t3mpc_ros.evaluation.methods import STAGES as METHOD_STAGES
 from t3mpc_ros.evaluation.reporting import finite, progress_bar
+from t3mpc_ros.evaluation.scenario import DRIVES
 from t3mpc_ros.parameters.provenance import PACKAGE_DIRECTORY
 
-if TYPE_CHECKING:
-    from t3mpc_ros.evaluation.methods import ComparedMethod
-
-DRIVES = ('torque', 'velocity')
-"""How u reaches the wheels: as a torque, the paper's way, or as a wheel speed command."""
 NOISES = (0.0, 0.01, 0.04, 0.1)
 """Noise variance of the measured wheel speeds, (rad/s)²: the paper's range."""
 PAPER_NOISE = 0.04
@@ -37,10 +34,7 @@ EXACT = 'exact model'
 with preview believe in one that is 30 % off."""
 DEAD_TIME = 'dead time'
 """The case that only the velocity drive has."""
-FULL = 'full'
-"""The controller with every part."""
-
-STAGES = ('feedback', '+NT3FS', '+compensator', '+MPC', FULL)
+STAGES = tuple(METHOD_STAGES)
 """The controller as it grows; the last step, to :data:`FULL`, adds preview."""
 PARTS = ('NT3FS', 'compensator', 'MPC', 'preview')
 """Part that each stage adds."""
@@ -54,7 +48,6 @@ WITHOUT = {
 }
 """The full controller with one part left out, by that part."""
 
-
 Jobs = Sequence[tuple[Any, Any]]
 
 
@@ -62,7 +55,7 @@ Jobs = Sequence[tuple[Any, Any]]
 class ExperimentSetup:
     """Where methods and runs come from."""
 
-    methods: Callable[[str], Mapping[str, 'ComparedMethod']]
+    methods: Callable[[str], Mapping[str, ComparedMethod]]
     """The methods of a drive by name."""
     scenario: Callable[..., Any]
     """Called with drive, noise, case, seed and duration, by name; what
@@ -178,7 +171,7 @@ def needed_experiments(setup: ExperimentSetup, grid: ExperimentGrid) -> tuple[Ex
     return tuple(found)
 
 
-def _noises(grid: ExperimentGrid, method: 'ComparedMethod', case: str) -> tuple[float, ...]:
+def _noises(grid: ExperimentGrid, method: ComparedMethod, case: str) -> tuple[float, ...]:
     """Return the noises at which a method runs a case."""
     if method.name in WITHOUT.values():
         wanted = case == NOMINAL or case in INTENDED_CASES.get(method.name, ())
@@ -190,7 +183,7 @@ def _noises(grid: ExperimentGrid, method: 'ComparedMethod', case: str) -> tuple[
     return grid.perturbed_noises
 
 
-def _is_baseline(methods: Mapping[str, 'ComparedMethod'], name: str) -> bool:
+def _is_baseline(methods: Mapping[str, ComparedMethod], name: str) -> bool:
     return name in methods and methods[name].baseline
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.closed_loop import LoopRecord, full_record
+from t3mpc_ros.evaluation.methods import FULL
 from t3mpc_ros.evaluation.open_loop_estimation import (
     KINDS,
     NORMALISED_GAIN,
@@ -25,7 +26,6 @@ from t3mpc_ros.evaluation.open_loop_estimation import (
 )
 from t3mpc_ros.evaluation.paper.claims import REFERENCE_SPREAD, Claim
 from t3mpc_ros.evaluation.paper.experiment_runs import (
-    FULL,
     NOMINAL,
     PAPER_NOISE,
     SETTLING,

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from t3mpc_ros.evaluation.bag_report.topic_roles import ODOMETRY, REFERENCE, TRUTH, WHEELS
 from t3mpc_ros.evaluation.closed_loop import LoopRecord
 from t3mpc_ros.evaluation.confidence_intervals import rms
+from t3mpc_ros.evaluation.methods import FULL
 from t3mpc_ros.evaluation.paper.experiment_runs import (
-    FULL,
     NOMINAL,
     PAPER_NOISE,
     PARTS,

@@ -9,10 +9,10 @@ import math
 from pathlib import Path
 
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
+from t3mpc_ros.evaluation.methods import FULL
 from t3mpc_ros.evaluation.open_loop_estimation import EstimationResult, difference
 from t3mpc_ros.evaluation.paper.experiment_runs import (
     DURATION,
-    FULL,
     NOMINAL,
     PAPER_NOISE,
     PARTS,
