@@ -130,13 +130,17 @@ def new_panels(count: int, height: float, *, shared: bool = True) -> tuple[Any, 
 def over_time(figure: Any, axes: list[Any], run: Run) -> Any:
     """Return ``figure`` with switches marked, the time axis labelled and one legend on top."""
     for axis in axes:
-        for i, switch in enumerate(run.switches):
-            label = 'switch' if i == 0 else None
-            style = {'color': COLOURS['switch'], 'linewidth': 0.8, 'linestyle': (0, (4, 3))}
-            axis.axvline(switch, label=label, zorder=1.5, **style)
+        mark_switches(axis, run.switches, 'switch')
     name_time(axes)
     add_legend(axes[0])
     return figure
+
+
+def mark_switches(axis: Any, times: Array, label: str | None = None) -> None:
+    """Mark the switches with dashed lines, of which the first one has the label."""
+    style = {'color': COLOURS['switch'], 'linewidth': 0.8, 'linestyle': (0, (4, 3))}
+    for i, switch in enumerate(times):
+        axis.axvline(switch, label=None if i else label, zorder=1.5, **style)
 
 
 def name_time(axes: list[Any], name: str = 'time') -> None:

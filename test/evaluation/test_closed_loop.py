@@ -326,7 +326,10 @@ def test_a_method_knows_how_fast_both_wheels_may_change_at_once():
 
 def test_reference_deviation_is_three_rad_per_second():
     values = np.array(
-        [Scenario('torque', 0.0, 'nominal', s).reference().speeds[300:6000] for s in TUNING_SEEDS]
+        [
+            Scenario('torque', 0.0, 'nominal', s).reference().speeds[300:6000]
+            for s in TUNING_SEEDS[:5]
+        ]
     )
     assert values.std(axis=(0, 1)) == pytest.approx([3.0, 3.0], rel=0.08)
     assert np.abs(values.mean(axis=(0, 1))).max() < 0.5

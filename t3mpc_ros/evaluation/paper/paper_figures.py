@@ -34,7 +34,14 @@ from t3mpc_ros.evaluation.paper.figure_runs import (
     true_unknown,
 )
 from t3mpc_ros.evaluation.paper.results import PairedDifference, ResultRow, Results
-from t3mpc_ros.evaluation.plotting import COLOURS, legend_above, new_figure, new_panels, thinned
+from t3mpc_ros.evaluation.plotting import (
+    COLOURS,
+    legend_above,
+    mark_switches,
+    new_figure,
+    new_panels,
+    thinned,
+)
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, twist_from_wheels
 from t3mpc_ros.geometry.types import ORIGIN, WheelSpeeds
 
@@ -243,9 +250,7 @@ def run_and_zoom(run: LoopRecord, unit: str, before: float, after: float) -> tup
     for row, wheel in zip(axes, WHEELS, strict=True):
         row[0].set(title=f'{wheel} wheel', ylabel=unit)
         for axis in row:
-            for switch in switches_of(run):
-                style = {'color': COLOURS['switch'], 'linewidth': 0.8, 'linestyle': (0, (4, 3))}
-                axis.axvline(switch, zorder=1.5, **style)
+            mark_switches(axis, switches_of(run))
     for axis, rows in zip(axes[-1], windows(run, before, after), strict=True):
         axis.set_xlim(run.time[rows[0]], run.time[rows[-1]])
         axis.xaxis.set_major_locator(MaxNLocator(nbins=6, steps=(1, 2, 5, 10)))
