@@ -30,6 +30,7 @@ setup(
         f'{NAME}.evaluation.training': ['*.npz'],
         f'{NAME}.evaluation.tuning': ['*.json'],
         f'{NAME}.simulation': ['worlds/*.yaml', 'schedules/*.yaml'],
+        f'{NAME}.view': ['page/*'],
     },
     install_requires=[
         'setuptools',

@@ -59,6 +59,8 @@ SHORTENED = {
     'scripts/run controller --ros-args -p law.gain:=20.0': ([], True),
     'scripts/run reference_generator --ros-args -p seed:=7': ([], True),
     'scripts/run composed': (['--ros-args', '-p', 'storage.uri:=OUTPUT/bag'], True),
+    'scripts/demo --view': (['--duration', '2', '--headless', '--output', 'OUTPUT/view'], False),
+    'scripts/run t3mpc view': (['--headless', '--port', '0'], True),
     'scripts/run t3mpc paper --quick': (['--seeds', '1', '--output', 'OUTPUT/paper'], False),
     'scripts/run t3mpc compare': (
         ['--seeds', '201', '--duration', '3', '--methods', 'full', '--cases', 'nominal'],
@@ -355,8 +357,7 @@ def _work(command, output, tmp_path):
     log = tmp_path / 'output.txt'
     with _started(arguments, output, log) as process:
         if endless:
-            emulator = 'emulator' in arguments
-            ready = 'stop with Ctrl-C' if emulator else f'{arguments[1]} ready'
+            ready = 'stop with Ctrl-C' if 't3mpc' in arguments else f'{arguments[1]} ready'
             _wait_until(process, log, ready)
             process.send_signal(signal.SIGINT)
         code = process.wait(timeout=240)

@@ -63,7 +63,8 @@ PACKAGES = {
         'stop_signal',
         'missing_library',
     }
-    | {'emulator', 'evaluation'},
+    | {'emulator', 'evaluation', 'nodes', 'view'},
+    'view': set(),
 }
 # Libraries that each package may import.
 LIBRARIES = {

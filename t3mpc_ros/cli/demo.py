@@ -10,9 +10,11 @@ import signal
 import sys
 import time
 from typing import TYPE_CHECKING
+import webbrowser
 
 from t3mpc_ros.cli.private_graph import PrivateGraph
 from t3mpc_ros.cli.process_group import ProcessError, ProcessGroup, StopRequestedError
+from t3mpc_ros.cli.view import PAGE_AT
 from t3mpc_ros.stop_signal import StopSignal
 
 if TYPE_CHECKING:
@@ -43,6 +45,8 @@ ROBOTS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
 }
 """Robots, and the parameters of each node for them: the digital twin, the paper's plant, and
 the twin on an emulated board behind a serial port and a radio."""
+VIEW = 'view'
+"""The live page."""
 FOLLOWS = 'tracking'
 """Log message of the controller when it follows the reference; discovery takes seconds."""
 DISCOVERY_TIMEOUT = 60.0
@@ -63,6 +67,8 @@ class DemoOptions:
     """One of :data:`ROBOTS`."""
     loss: float = 0.0
     """Share of lost radio packets in each direction; for the emulator only."""
+    view: bool = False
+    """Whether the run is shown on a live page."""
 
     @property
     def robot_node(self) -> str:
@@ -198,7 +204,7 @@ def _run_nodes(options: DemoOptions, graph: PrivateGraph, stop: StopSignal) -> N
     # The nodes are stopped one after the other, which is no reason for a snapshot.
     parameters['recorder']['storage.snapshot_duration'] = 0.0
     # The robot stops after the nodes that command it, then the recorder, then the board.
-    order = 'reference_generator', 'controller', options.robot_node, 'recorder', BOARD
+    order = VIEW, 'reference_generator', 'controller', options.robot_node, 'recorder', BOARD
     try:
         if board := options.board():
             processes.start(BOARD, BOARD, *board, program='t3mpc')
@@ -209,6 +215,8 @@ def _run_nodes(options: DemoOptions, graph: PrivateGraph, stop: StopSignal) -> N
             processes.wait_ready(name)
         _show('  waiting for discovery')
         processes.wait_for('controller', FOLLOWS, DISCOVERY_TIMEOUT)
+        if options.view:
+            _open_view(processes, options)
         _watch(processes, options)
         codes = processes.stop_all(order)
     finally:
@@ -220,6 +228,16 @@ def _run_nodes(options: DemoOptions, graph: PrivateGraph, stop: StopSignal) -> N
             + ', '.join(f'{name} with code {code}' for name, code in wrong.items())
             + f'; see {logs}'
         )
+
+
+def _open_view(processes: ProcessGroup, options: DemoOptions) -> None:
+    processes.start(VIEW, VIEW, '--headless', '--port', '0', program='t3mpc')
+    processes.wait_for(VIEW, '(stop with', 60.0)
+    text = processes.log(VIEW).read_text()
+    url = text[text.rindex(PAGE_AT) :].removeprefix(PAGE_AT).split()[0]
+    _show(f'  {PAGE_AT}{url}')
+    if not options.headless:
+        webbrowser.open(url)
 
 
 def _show(line: str) -> None:

@@ -18,6 +18,7 @@ from t3mpc_ros.cli.paper import add_parser as add_paper
 from t3mpc_ros.cli.train import add_parser as add_train
 from t3mpc_ros.cli.tune import add_parser as add_tune
 from t3mpc_ros.cli.twin import add_parser as add_twin
+from t3mpc_ros.cli.view import add_parser as add_view
 from t3mpc_ros.missing_library import remedy
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int
 
@@ -71,6 +72,7 @@ def _demo(options: argparse.Namespace) -> int:
                 options.seed,
                 options.robot,
                 options.loss,
+                options.view,
             )
         )
     except DemoInterruptedError as interruption:
@@ -187,6 +189,7 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument('--duration', type=SECONDS, default=60.0, help='seconds (default 60)')
     demo.add_argument('--output', type=Path, help='folder (default runs/<time>)')
     demo.add_argument('--headless', action='store_true', help='no bar, no browser')
+    demo.add_argument('--view', action='store_true', help='show the run on a live page')
     demo.add_argument('--seed', type=int, help='seed of reference and robot')
     demo.add_argument(
         '--robot',
@@ -232,6 +235,7 @@ def _parser() -> argparse.ArgumentParser:
     add_train(commands)
     add_twin(commands)
     add_outcomes_parser(commands)
+    add_view(commands)
 
     compiling = commands.add_parser('compile', help='compile every kernel into the cache')
     compiling.set_defaults(run=_compile)

@@ -87,6 +87,11 @@ class NodeHarness:
         self._foreign_nodes.append(Node('foreign', context=context))
         return self._foreign_nodes[-1]
 
+    def add_foreign(self, node):
+        """Spin a node that is not one of the package's executables."""
+        self._executor.add_node(node)
+        self._foreign_nodes.append(node)
+
     def spin_until(self, condition, description=''):
         """Spin until ``condition`` holds."""
         deadline = time.monotonic() + TIMEOUT
@@ -150,7 +155,8 @@ class NodeHarness:
         self.probe.destroy_node()
         for node in self._foreign_nodes:
             node.destroy_node()
-            rclpy.try_shutdown(context=node.context)
+            if node.context is not self.probe.context:
+                rclpy.try_shutdown(context=node.context)
 
 
 class CommandSource:

@@ -1,0 +1,513 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Node of the live page: collects what the graph publishes, and executes the page's commands.
+
+Its subscriptions are polled, not executed: every twentieth of a second it takes the messages that
+wait, so that two hundred messages a second cost about as much as twenty. Streams are requested
+best effort, which every publisher offers.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import contextmanager, suppress
+from functools import partial
+import math
+from queue import Empty, SimpleQueue
+import struct
+import time
+from typing import Any, Literal, NamedTuple, Protocol
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Log, ParameterEvent
+import rclpy
+from rclpy.callback_groups import CallbackGroup
+from rclpy.exceptions import InvalidNamespaceException
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.impl.logging_severity import LoggingSeverity
+from rclpy.node import Node
+from rclpy.parameter import parameter_value_to_python
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import Range
+from std_msgs.msg import Float64, Int32MultiArray
+from std_srvs.srv import SetBool, Trigger
+
+from t3mpc_ros.control.control_law import TERM_NAMES
+from t3mpc_ros.control.watchdog import Reason
+from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
+from t3mpc_ros.geometry.types import NANOSECONDS, State
+from t3mpc_ros.nodes.common import conversions
+from t3mpc_ros.nodes.common.remote_parameters import RemoteParameters
+from t3mpc_ros.robot.interface import RANGE_SENSORS
+from t3mpc_ros.simulation.sensors.range_sensor import (
+    SimulatedRangeSensorParameters,
+    sensor_mounts,
+)
+from t3mpc_ros.simulation.world import WorldError, load_world
+
+Condition = Literal['normal', 'warning', 'stopped']
+
+PERIOD = 0.05
+"""Time between two polls, s."""
+GRAPH_PERIOD = 1.0
+"""Time between two looks at the nodes of the graph, s."""
+REPLY_TIMEOUT = 3.0
+"""Longest wait for the answer of a service, s."""
+STEP = 0.019
+"""Least time between two samples of a stream, s: at 100 Hz every second one is shown."""
+ROBOTS = ('sim_robot', 'radio_bridge')
+"""Nodes that are a robot."""
+LOOP_NODES = ('controller', *ROBOTS, 'reference_generator')
+"""Nodes whose reports, parameters and services the page shows."""
+WHEELS = ('right', 'left')
+WARN = LoggingSeverity.WARN.value
+"""Level of a log message from which on it is an event."""
+
+SERVICES: Mapping[str, tuple[type, str]] = {
+    'e_stop': (SetBool, 'e_stop'),
+    'reset_odometry': (Trigger, 'reset_odometry'),
+    'enable': (SetBool, 'controller/enable'),
+    'reset': (Trigger, 'controller/reset'),
+    'pause': (SetBool, 'reference_generator/pause'),
+    'reseed': (Trigger, 'reference_generator/reseed'),
+}
+"""Commands that are a service: its type and name."""
+
+
+class CommandFailedError(RuntimeError):
+    """A command that was not executed; the text says why and what to do."""
+
+
+class Sink(Protocol):
+    """Receives what the node collects."""
+
+    def add(self, stream: str, time: float, values: Sequence[float]) -> None:
+        """Add a sample."""
+        ...
+
+    def set(self, fact: str, value: Any) -> None:
+        """Set a fact."""
+        ...
+
+    def report(self, time: float, kind: str, text: str) -> None:
+        """Add an event."""
+        ...
+
+    def node_report(self, name: str, text: str, condition: Condition) -> None:
+        """Replace the newest report of a node."""
+        ...
+
+    def node_gone(self, name: str) -> None:
+        """Discard the report of a node."""
+        ...
+
+    def tick(self, now: float) -> None:
+        """Update what depends on the time since the last message."""
+        ...
+
+
+class PolledGroup(CallbackGroup):
+    """Entities that no executor waits for: the node takes their messages itself."""
+
+    def can_execute(self, entity: Any) -> bool:
+        """Return False: an executor leaves them alone."""
+        return False
+
+    def beginning_execution(self, entity: Any) -> bool:
+        """Return False, see :meth:`can_execute`."""
+        return False
+
+    def ending_execution(self, entity: Any) -> None:
+        """Do nothing."""
+
+
+class _Source(NamedTuple):
+    """A subscription and the method that takes its messages."""
+
+    subscription: Subscription
+    take: Callable[[Any], None]
+    raw: bool
+
+
+class ViewNode(Node):
+    """Shows a robot: hands samples, facts and reports to a sink, and executes commands.
+
+    Parameters
+    ----------
+    sink
+        Receives everything, in the thread of :meth:`spin`.
+    namespace
+        Namespace of the robot.
+    """
+
+    def __init__(self, sink: Sink, namespace: str = '') -> None:
+        super().__init__(
+            'view', namespace=namespace, start_parameter_services=False, enable_rosout=False
+        )
+        self._sink = sink
+        self._group = PolledGroup()
+        self._pending: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self._geometry = WheelGeometry()
+        self._origin_ns: int | None = None
+        self._newest = 0.0
+        self._shown: dict[str, float] = {}
+        self._remote: dict[str, RemoteParameters] = {}
+        self._rows: dict[str, dict[str, dict[str, Any]]] = {}
+        self._signals: tuple[int, ...] = ()
+        self._faults = 'none'
+        self._ranges = [math.nan] * len(RANGE_SENSORS)
+        self._terms = [math.nan] * (len(WHEELS) * len(TERM_NAMES))
+        self._command_clients = {
+            name: self.create_client(kind, service) for name, (kind, service) in SERVICES.items()
+        }
+        self._sources: dict[str, _Source] = {}
+        self._subscribe_all()
+        sink.set('terms', list(TERM_NAMES))
+        sink.set('mounts', sensor_mounts(SimulatedRangeSensorParameters()).tolist())
+
+    # -- loop -------------------------------------------------------------------------------------
+
+    def spin(self, stop: Callable[[], bool]) -> None:
+        """Collect and execute until ``stop`` returns True."""
+        executor = SingleThreadedExecutor()
+        executor.add_node(self)
+        next_poll = next_look = time.monotonic()
+        try:
+            while not stop():
+                executor.spin_once(max(0.0, next_poll - time.monotonic()))
+                if (now := time.monotonic()) < next_poll:
+                    continue
+                next_poll = max(next_poll + PERIOD, now)
+                if now >= next_look:
+                    next_look = now + GRAPH_PERIOD
+                    self.look_at_graph()
+                self.poll()
+                self._sink.tick(now)
+        finally:
+            executor.remove_node(self)
+            executor.shutdown()
+
+    def poll(self) -> None:
+        """Take the messages that wait, and start the commands that wait."""
+        for source in list(self._sources.values()):
+            held = source.subscription
+            with held.handle:
+                for _ in range(held.qos_profile.depth):
+                    if (item := held.handle.take_message(held.msg_type, source.raw)) is None:
+                        break
+                    source.take(item[0])
+        self._add_collected('ranges', self._ranges)
+        self._add_collected('terms', self._terms)
+        with suppress(Empty):
+            while True:
+                self._pending.get_nowait()()
+
+    def _add_collected(self, stream: str, values: list[float]) -> None:
+        """Add the newest values of several topics as one sample, and forget them."""
+        if not all(map(math.isnan, values)):
+            self._sink.add(stream, self._newest, values)
+            values[:] = [math.nan] * len(values)
+
+    # -- messages ---------------------------------------------------------------------------------
+
+    def _subscribe_all(self) -> None:
+        for topic, stream in (
+            ('odom', 'odometry'),
+            ('ground_truth/odom', 'truth'),
+            ('reference', 'reference'),
+        ):
+            self._subscribe(Odometry, topic, partial(self._on_state, stream), raw=True)
+        for number, name in enumerate(RANGE_SENSORS):
+            self._subscribe(Range, f'range/{name}', partial(self._on_range, number), depth=1)
+        for row, term in enumerate(TERM_NAMES):
+            for column, wheel in enumerate(WHEELS):
+                take = partial(self._on_term, len(WHEELS) * row + column)
+                self._subscribe(Float64, f'controller/terms/{term}/{wheel}', take, depth=1)
+        self._subscribe(Int32MultiArray, 'reference/signals', self._on_signals, latched=True)
+        self._subscribe(DiagnosticArray, '/diagnostics', self._on_diagnostics)
+        self._subscribe(Log, '/rosout', self._on_log)
+        self._subscribe(ParameterEvent, '/parameter_events', self._on_parameter_event)
+
+    def _subscribe(
+        self,
+        kind: type,
+        topic: str,
+        take: Callable[[Any], None],
+        *,
+        depth: int = 20,
+        raw: bool = False,
+        latched: bool = False,
+    ) -> None:
+        profile = QoSProfile(
+            depth=depth,
+            reliability=ReliabilityPolicy.RELIABLE if latched else ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        )
+        subscription = self.create_subscription(
+            kind, topic, take, profile, callback_group=self._group, raw=raw
+        )
+        self._sources[topic] = _Source(subscription, take, raw)
+
+    def _seconds(self, stamp_ns: int) -> float:
+        if self._origin_ns is None:
+            self._origin_ns = stamp_ns
+            self._sink.set('origin', stamp_ns / NANOSECONDS)
+        return (stamp_ns - self._origin_ns) / NANOSECONDS
+
+    def _on_state(self, stream: str, data: bytes) -> None:
+        try:
+            state: State = conversions.state_from_odometry(data)
+        except struct.error:  # a truncated message
+            return
+        seconds = self._seconds(state.stamp_ns)
+        if 0.0 <= seconds - self._shown.get(stream, -math.inf) < STEP:
+            return
+        self._shown[stream] = seconds
+        if stream == 'odometry':
+            self._newest = seconds
+        wheels = wheels_from_twist(state.twist, self._geometry)
+        self._sink.add(stream, seconds, (*wheels, *state.pose))
+
+    def _on_command(self, message: Twist | TwistStamped) -> None:
+        twist = conversions.body_twist(getattr(message, 'twist', message))
+        if self._origin_ns is not None:
+            self._sink.add('command', self._newest, wheels_from_twist(twist, self._geometry))
+
+    def _on_range(self, number: int, message: Range) -> None:
+        beyond = message.range > message.max_range  # infinite, or max_range as REP 117 allows
+        self._ranges[number] = message.max_range if beyond else max(message.range, 0.0)
+
+    def _on_term(self, number: int, message: Float64) -> None:
+        self._terms[number] = message.data
+
+    def _on_signals(self, message: Int32MultiArray) -> None:
+        signals = tuple(message.data)
+        if self._signals and signals != self._signals and len(signals) == 3:
+            mode, right, left = signals
+            text = f'switch to mode {mode}: signals {right} and {left}'
+            self._sink.report(self._newest, 'switch', text)
+        self._signals = signals
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        prefix = self.get_namespace().strip('/')
+        for status in message.status:
+            namespace, _, name = status.name.rpartition('/')
+            if namespace != prefix or name not in LOOP_NODES:
+                continue
+            level = int.from_bytes(status.level, 'little')
+            condition = _stop_condition(name, status.message) or _CONDITIONS[min(level, 2)]
+            self._sink.node_report(name, status.message, condition)
+            values = {each.key: each.value for each in status.values}
+            self._sink.set(f'diagnostics/{name}', values)
+            if name in ROBOTS:
+                self._on_faults(values.get('faults', 'none'))
+
+    def _on_faults(self, faults: str) -> None:
+        if faults != self._faults:
+            text = 'faults end' if faults == 'none' else f'fault: {faults}'
+            self._sink.report(self._newest, 'fault', text)
+        self._faults = faults
+
+    def _on_log(self, message: Log) -> None:
+        prefix = self.get_namespace().strip('/').replace('/', '.')
+        namespace, _, name = message.name.rpartition('.')
+        if namespace != prefix or name not in LOOP_NODES:
+            return
+        if condition := _stop_condition(name, message.msg):
+            self._sink.node_report(name, message.msg, condition)
+        elif message.level >= WARN:
+            self._sink.report(self._newest, 'note', f'{name}: {message.msg}')
+
+    # -- nodes and parameters ---------------------------------------------------------------------
+
+    def look_at_graph(self) -> None:
+        """Find nodes that have come or gone, and the type of ``cmd_vel``."""
+        namespace = self.get_namespace()
+        present = {
+            name
+            for name, where in self.get_node_names_and_namespaces()
+            if where == namespace and name in LOOP_NODES
+        }
+        for name in self._remote.keys() - present:
+            self._remote.pop(name).destroy()
+            self._rows.pop(name, None)
+            self._sink.set(f'parameters/{name}', None)
+            self._sink.node_gone(name)
+        for name in sorted(present):
+            if name not in self._remote:
+                full = f'{namespace.rstrip("/")}/{name}'
+                self._remote[name] = RemoteParameters(self, full)
+            if name not in self._rows and self._remote[name].ready():
+                self._rows[name] = {}
+                self._remote[name].read(partial(self._on_parameters, name))
+        self._sink.set('nodes', sorted(present))
+        self._subscribe_command()
+
+    def _subscribe_command(self) -> None:
+        topic = self.resolve_topic_name('cmd_vel')
+        offered = {info.topic_type for info in self.get_publishers_info_by_topic(topic)}
+        for kind in (TwistStamped, Twist):
+            if offered == {f'geometry_msgs/msg/{kind.__name__}'}:
+                source = self._sources.get('cmd_vel')
+                if source is None or source.subscription.msg_type is not kind:
+                    if source is not None:
+                        self.destroy_subscription(source.subscription)
+                    self._subscribe(kind, 'cmd_vel', self._on_command, depth=1)
+
+    def _on_parameters(self, name: str, rows: Sequence[dict[str, Any]]) -> None:
+        self._rows[name] = {row['name']: row for row in rows}
+        self._show_parameters(name)
+
+    def _show_parameters(self, name: str) -> None:
+        rows = self._rows[name]
+        self._sink.set(f'parameters/{name}', [dict(row) for row in rows.values()])
+        if 'wheel_radius' in rows and 'wheel_separation' in rows:
+            radius, separation = (
+                rows[each]['value'] for each in ('wheel_radius', 'wheel_separation')
+            )
+            self._geometry = WheelGeometry(radius, separation)
+            self._sink.set('robot', {'wheel_radius': radius, 'wheel_separation': separation})
+        if name == 'sim_robot' and (world := rows.get('world')):
+            self._show_world(world['value'])
+
+    def _show_world(self, name: str) -> None:
+        try:
+            world = load_world(name) if name else None
+        except (OSError, WorldError):  # a file of another machine
+            world = None
+        shown = world and {
+            'segments': world.segments.tolist(),
+            'circles': world.circles.tolist(),
+            'patches': world.patches.tolist(),
+        }
+        self._sink.set('world', shown)
+
+    def _on_parameter_event(self, message: ParameterEvent) -> None:
+        namespace, _, name = message.node.rpartition('/')
+        rows = self._rows.get(name) if namespace == self.get_namespace().rstrip('/') else None
+        for changed in message.changed_parameters if rows else ():
+            if rows and changed.name in rows:
+                value = parameter_value_to_python(changed.value)
+                plain = value if isinstance(value, bool | int | float | str) else list(value)
+                rows[changed.name] = {**rows[changed.name], 'value': plain}
+                self._sink.report(self._newest, 'command', f'{name}: {changed.name} = {plain}')
+        if rows:
+            self._show_parameters(name)
+
+    # -- commands ---------------------------------------------------------------------------------
+
+    def command(self, name: str, arguments: Mapping[str, Any]) -> str:
+        """Execute a command from another thread while :meth:`spin` runs; return what was done.
+
+        ``set`` takes node, name and value of a parameter; the services in :data:`SERVICES` with
+        a SetBool take ``on``.
+
+        Raises
+        ------
+        CommandFailedError
+            It was refused, there is no answer, or nothing offers the service.
+        """
+        reply: Future[str] = Future()
+        self._pending.put(partial(self._start, name, arguments, reply))
+        try:
+            text = reply.result(REPLY_TIMEOUT)
+        except TimeoutError:
+            raise CommandFailedError(
+                f'no answer to {name} within {REPLY_TIMEOUT:g} s: is the node alive?'
+            ) from None
+        return text
+
+    def _start(self, name: str, arguments: Mapping[str, Any], reply: 'Future[str]') -> None:
+        try:
+            if name == 'set':
+                self._set_parameter(arguments, reply)
+            elif name in self._command_clients:
+                self._call_service(name, arguments, reply)
+            else:
+                known = ', '.join(('set', *self._command_clients))
+                raise CommandFailedError(f'the commands are {known}: got {name}')
+        except (CommandFailedError, ValueError) as error:
+            reply.set_exception(CommandFailedError(str(error)))
+
+    def _call_service(self, name: str, arguments: Mapping[str, Any], reply: 'Future[str]') -> None:
+        client, (kind, service) = self._command_clients[name], SERVICES[name]
+        request, words = kind.Request(), name
+        if kind is SetBool:
+            if not isinstance(on := arguments.get('on'), bool):
+                raise CommandFailedError(f'{name} needs on, true or false: got {on!r}')
+            request.data, words = on, f'{name} {"on" if on else "off"}'
+        if not client.service_is_ready():
+            raise CommandFailedError(f'no node offers the service {service}: is it running?')
+
+        def answered(future: Any) -> None:
+            answer = future.result()
+            if not answer.success:
+                reply.set_exception(CommandFailedError(f'{words}: {answer.message}'))
+                return
+            self._sink.report(self._newest, 'command', f'{words}: {answer.message}')
+            reply.set_result(answer.message)
+
+        client.call_async(request).add_done_callback(answered)
+
+    def _set_parameter(self, arguments: Mapping[str, Any], reply: 'Future[str]') -> None:
+        node, name = (arguments.get(word) for word in ('node', 'name'))
+        if not isinstance(node, str) or not isinstance(name, str) or node not in self._remote:
+            raise CommandFailedError(f'no node {node!r} with parameters is running')
+
+        def answered(problem: str) -> None:
+            if problem:
+                reply.set_exception(CommandFailedError(problem))
+            else:
+                reply.set_result(f'{name} is set')
+
+        self._remote[node].set(name, arguments.get('value'), answered)
+
+
+@contextmanager
+def view_node(sink: Sink, namespace: str = '') -> Iterator[ViewNode]:
+    """Return a node in a context of its own, and end both after the ``with`` block.
+
+    Raises
+    ------
+    ValueError
+        The namespace is not valid in ROS.
+    """
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        try:
+            node = ViewNode(sink, namespace)
+        except InvalidNamespaceException:
+            raise ValueError(
+                f'namespace must be letters, digits, _ and / only: got {namespace!r}'
+            ) from None
+        try:
+            yield node
+        finally:
+            node.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+
+
+_CONDITIONS: Sequence[Condition] = ('normal', 'warning', 'stopped')
+_CONTROLLER_CONDITIONS: Mapping[str, Condition] = {
+    reason.value: 'normal'
+    if reason is Reason.TRACKING
+    else 'warning'
+    if reason.moves
+    else 'stopped'
+    for reason in Reason
+}
+
+
+def _stop_condition(name: str, text: str) -> Condition | None:
+    """Return whether a text of a node is a reason to stand; None if it is about something else."""
+    if name == 'controller':
+        return _CONTROLLER_CONDITIONS.get(text.removeprefix('stopped: '))
+    if name in ROBOTS:
+        if text.startswith(('emergency stop', 'no command')):
+            return 'stopped'
+        return 'normal' if text == 'following commands' else None
+    return None

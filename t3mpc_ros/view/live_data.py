@@ -1,0 +1,120 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Recent samples, facts and events of a run, for any number of readers in other threads."""
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+import math
+from threading import Condition
+from typing import NamedTuple
+
+Json = None | bool | int | float | str | Sequence['Json'] | Mapping[str, 'Json']
+
+SPAN = 120.0
+"""Samples are kept for this long, s."""
+MAX_EVENTS = 500
+"""Number of events that are kept."""
+
+
+class Sample(NamedTuple):
+    """Values of a stream at an instant."""
+
+    number: int
+    """Number of the change."""
+    time: float
+    """s"""
+    values: tuple[float | None, ...]
+    """None for a value that is not finite: JSON has no other word for it."""
+
+
+class LiveData:
+    """Collects what happens in a run; each reader asks for what is new to it.
+
+    Every change has a number, ascending from 1. A reader remembers the number up to which it has
+    read, its *cursor*; a new reader begins with 0 and gets all that is kept.
+    """
+
+    def __init__(self) -> None:
+        self._changed = Condition()
+        self._number = 0
+        self._streams: dict[str, deque[Sample]] = {}
+        self._facts: dict[str, tuple[int, Json]] = {}
+        self._events: deque[tuple[int, Json]] = deque(maxlen=MAX_EVENTS)
+
+    def add(self, stream: str, time: float, values: Sequence[float]) -> None:
+        """Add a sample; what is older than :data:`SPAN`, or newer than this sample, is dropped.
+
+        Time goes back when a bag is played again, or a robot starts anew.
+        """
+        finite = tuple(float(value) if math.isfinite(value) else None for value in values)
+        with self._changed:
+            kept = self._streams.setdefault(stream, deque())
+            if kept and kept[-1].time > time:
+                kept.clear()
+            while kept and kept[0].time < time - SPAN:
+                kept.popleft()
+            kept.append(Sample(self._next(), time, finite))
+
+    def set(self, fact: str, value: Json) -> None:
+        """Set a fact; readers get it if it has changed."""
+        with self._changed:
+            if fact not in self._facts or self._facts[fact][1] != value:
+                self._facts[fact] = self._next(), value
+
+    def report(self, time: float, kind: str, text: str) -> None:
+        """Add an event.
+
+        Parameters
+        ----------
+        time
+            s
+        kind
+            ``switch``, ``fault``, ``stop``, ``command`` or ``note``.
+        text
+            One line.
+        """
+        with self._changed:
+            self._events.append((self._next(), {'time': time, 'kind': kind, 'text': text}))
+
+    def read(self, cursor: int) -> tuple[Mapping[str, Json], int]:
+        """Return what has changed since the cursor, as JSON values, and the new cursor.
+
+        The keys are ``streams`` (for each its times and columns), ``facts`` and ``events``; one
+        without content is left out.
+        """
+        with self._changed:
+            streams = {
+                name: _columns(new)
+                for name, kept in self._streams.items()
+                if (new := _newer(kept, cursor))
+            }
+            facts = {
+                name: value for name, (number, value) in self._facts.items() if number > cursor
+            }
+            events = [value for number, value in self._events if number > cursor]
+            found: dict[str, Json] = {'streams': streams, 'facts': facts, 'events': events}
+            return {name: value for name, value in found.items() if value}, self._number
+
+    def wait(self, cursor: int, timeout: float) -> bool:
+        """Wait until something has changed since the cursor, at most ``timeout`` seconds."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self._number > cursor, timeout)
+
+    def _next(self) -> int:
+        self._number += 1
+        self._changed.notify_all()
+        return self._number
+
+
+def _newer(kept: deque[Sample], cursor: int) -> list[Sample]:
+    new = []
+    for sample in reversed(kept):
+        if sample.number <= cursor:
+            break
+        new.append(sample)
+    return new[::-1]
+
+
+def _columns(samples: Sequence[Sample]) -> Json:
+    values = zip(*(sample.values for sample in samples), strict=True)
+    return {'time': [sample.time for sample in samples], 'values': [list(each) for each in values]}

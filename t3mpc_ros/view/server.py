@@ -1,0 +1,278 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Web server of the live page, for this machine only.
+
+The page reads ``/events``, a stream of server-sent events, and sends commands to ``/command``. A
+page of another origin can do neither: requests with a foreign ``Host`` are refused (a name that
+another site lets point to this machine), and so are commands with a foreign ``Origin`` or without
+the token that this start of the server has written into its own page.
+"""
+
+from collections.abc import Callable, Mapping
+from functools import cache
+import hmac
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
+import json
+import secrets
+from threading import BoundedSemaphore, Event, Thread
+from types import TracebackType
+from typing import Any, Self
+from urllib.parse import parse_qs, urlsplit
+
+from t3mpc_ros.view.live_data import Json, LiveData
+
+ADDRESS = '127.0.0.1'
+DEFAULT_PORT = 8765
+PERIOD = 0.05
+"""Least time between two events of a stream, s."""
+HEARTBEAT = 1.0
+"""Longest time between two events of a stream, s: the page notices a lost connection."""
+MAX_READERS = 8
+"""Number of pages that may be open at once."""
+MAX_BODY = 4096
+"""Largest command, bytes."""
+
+_TYPES = {'.html': 'text/html', '.js': 'text/javascript', '.css': 'text/css'}
+_PAGE = ('view.html', 'view.js', 'charts.js', 'view.css', 'uplot.js', 'uplot.css')
+_HEADERS = {
+    'Cache-Control': 'no-store',
+    'Content-Security-Policy': "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "connect-src 'self'; img-src 'self' data:; frame-ancestors 'none'; base-uri 'none'; "
+    "form-action 'none'",
+    'Cross-Origin-Opener-Policy': 'same-origin',
+    'Cross-Origin-Resource-Policy': 'same-origin',
+    'Referrer-Policy': 'no-referrer',
+    'X-Content-Type-Options': 'nosniff',
+}
+
+Command = Callable[[str, Mapping[str, Json]], str]
+"""Executes a command: name and arguments; returns what was done."""
+
+
+class CommandError(RuntimeError):
+    """A command that was not executed; the text says why and what to do."""
+
+
+class RefusedError(Exception):
+    """A request that is refused.
+
+    Parameters
+    ----------
+    status
+        HTTP status.
+    text
+        Reason, for the sender.
+    """
+
+    def __init__(self, status: HTTPStatus, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+
+
+class PageServer:
+    """Serves the live page of one run, in threads of its own; a context manager.
+
+    Parameters
+    ----------
+    data
+        What the page shows.
+    command
+        Executes a command of the page, in a thread of the server; raises :class:`CommandError`.
+        None: the page shows, and commands are refused.
+    port
+        TCP port on :data:`ADDRESS`; 0: a free one.
+
+    Raises
+    ------
+    OSError
+        The port is in use.
+    """
+
+    def __init__(
+        self, data: LiveData, command: Command | None = None, port: int = DEFAULT_PORT
+    ) -> None:
+        self.data = data
+        self.command = command
+        self.token = secrets.token_urlsafe(24)
+        self.readers = BoundedSemaphore(MAX_READERS)
+        self.closing = Event()
+        try:
+            self._server = _Server((ADDRESS, port), self)
+        except OSError as error:
+            raise OSError(
+                error.errno, f'port {port} of {ADDRESS} is not free ({error.strerror}); choose '
+                'another one with --port, 0 for any free port'
+            ) from None  # fmt: skip
+        self.port: int = self._server.server_address[1]
+        self._thread = Thread(target=self._server.serve_forever, args=(0.1,), daemon=True)
+
+    @property
+    def url(self) -> str:
+        """Address of the page."""
+        return f'http://{ADDRESS}:{self.port}/'
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.closing.set()
+        self._server.shutdown()
+        self._server.server_close()
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    block_on_close = False
+
+    def __init__(self, address: tuple[str, int], page: PageServer) -> None:
+        self.page = page
+        super().__init__(address, _Handler)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Ignore what a browser does when it closes a connection."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = 'HTTP/1.1'
+    server: _Server
+    timeout = 30.0
+
+    def log_message(self, format: str, *values: Any) -> None:
+        """Print nothing: a page asks often."""
+
+    def do_GET(self) -> None:
+        self._answer(self._get)
+
+    def do_POST(self) -> None:
+        self._answer(self._post)
+
+    def _answer(self, method: Callable[[], None]) -> None:
+        try:
+            self._check_host()
+            method()
+        except RefusedError as refusal:
+            self.close_connection = True  # the rest of the request was not read
+            self._send(json.dumps({'error': str(refusal)}), 'application/json', refusal.status)
+        except (BrokenPipeError, ConnectionResetError, TimeoutError):
+            self.close_connection = True
+
+    def _check_host(self) -> None:
+        port = self.server.page.port
+        if self.headers.get('Host') not in (f'{ADDRESS}:{port}', f'localhost:{port}'):
+            raise RefusedError(
+                HTTPStatus.FORBIDDEN, f'this page is served as {self.server.page.url} only'
+            )
+
+    def _get(self) -> None:
+        page, url = self.server.page, urlsplit(self.path)
+        if url.path == '/events':
+            self._stream(url.query)
+            return
+        name = url.path.removeprefix('/') or 'view.html'
+        if name not in _PAGE:
+            raise RefusedError(HTTPStatus.NOT_FOUND, f'there is no {url.path}')
+        text = _file(name)
+        if name == 'view.html':
+            text = text.replace('{{ token }}', page.token if page.command else '')
+        self._send(text, _TYPES[name[name.rindex('.') :]])
+
+    def _stream(self, query: str) -> None:
+        page = self.server.page
+        if not page.readers.acquire(blocking=False):
+            raise RefusedError(
+                HTTPStatus.SERVICE_UNAVAILABLE,
+                f'at most {MAX_READERS} pages may be open at once; close one',
+            )
+        try:
+            self._send_headers('text/event-stream', None)
+            self.close_connection = True
+            cursor = self._cursor(query)
+            while not page.closing.is_set():
+                page.data.wait(cursor, HEARTBEAT)
+                changes, cursor = page.data.read(cursor)
+                text = json.dumps(changes, separators=(',', ':'), allow_nan=False)
+                self.wfile.write(f'id: {page.token[:8]}-{cursor}\ndata: {text}\n\n'.encode())
+                self.wfile.flush()
+                page.closing.wait(PERIOD)
+        finally:
+            page.readers.release()
+
+    def _cursor(self, query: str) -> int:
+        """Return the number up to which the page has read; 0 for a page of an earlier start."""
+        last = self.headers.get('Last-Event-ID') or parse_qs(query).get('last', [''])[0]
+        start, _, number = last.partition('-')
+        return int(number) if start == self.server.page.token[:8] and number.isdecimal() else 0
+
+    def _post(self) -> None:
+        page = self.server.page
+        if urlsplit(self.path).path != '/command':
+            raise RefusedError(HTTPStatus.NOT_FOUND, f'there is no {self.path}')
+        if page.command is None:
+            raise RefusedError(
+                HTTPStatus.FORBIDDEN, 'this page was started with --read-only: commands are off'
+            )
+        name, arguments = self._read_command(page)
+        try:
+            done = page.command(name, arguments)
+        except CommandError as error:
+            self._send(json.dumps({'error': str(error)}), 'application/json', HTTPStatus.CONFLICT)
+        else:
+            self._send(json.dumps({'done': done}), 'application/json')
+
+    def _read_command(self, page: PageServer) -> tuple[str, Mapping[str, Json]]:
+        """Return name and arguments of a command of this very page."""
+        origin = self.headers.get('Origin', f'http://{self.headers["Host"]}')
+        if origin != f'http://{self.headers["Host"]}':
+            raise RefusedError(HTTPStatus.FORBIDDEN, f'commands from {origin} are refused')
+        if not hmac.compare_digest(self.headers.get('X-Token', ''), page.token):
+            raise RefusedError(
+                HTTPStatus.FORBIDDEN, 'the token is not that of this start: load the page again'
+            )
+        length = self.headers.get('Content-Length', '')
+        if not length.isdecimal() or int(length) > MAX_BODY:
+            raise RefusedError(
+                HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+                f'a command must have at most {MAX_BODY} bytes: got {length or "no length"}',
+            )
+        try:
+            content = json.loads(self.rfile.read(int(length)))
+            name, arguments = content['command'], content.get('arguments', {})
+        except (ValueError, KeyError, TypeError, RecursionError):
+            name = arguments = None
+        if not isinstance(name, str) or not isinstance(arguments, dict):
+            raise RefusedError(
+                HTTPStatus.BAD_REQUEST,
+                'a command must be {"command": NAME, "arguments": {…}} in JSON',
+            )
+        return name, arguments
+
+    def _send(self, text: str, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
+        content = text.encode()
+        self._send_headers(f'{kind}; charset=utf-8', len(content), status)
+        self.wfile.write(content)
+
+    def _send_headers(
+        self, kind: str, length: int | None, status: HTTPStatus = HTTPStatus.OK
+    ) -> None:
+        self.send_response(status)
+        self.send_header('Content-Type', kind)
+        if length is None or self.close_connection:
+            self.send_header('Connection', 'close')
+        if length is not None:
+            self.send_header('Content-Length', str(length))
+        for name, value in _HEADERS.items():
+            self.send_header(name, value)
+        self.end_headers()
+
+
+@cache
+def _file(name: str) -> str:
+    return (files('t3mpc_ros.view') / 'page' / name).read_text(encoding='utf-8')

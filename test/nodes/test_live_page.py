@@ -1,0 +1,234 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The live page of a running graph in a headless browser, as a person uses it."""
+
+import json
+from pathlib import Path
+import shutil
+import time
+
+import pytest
+
+from t3mpc_ros.cli.view import PAGE_AT
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.alone]
+
+WAIT = 60.0
+"""Longest wait for a change of the page on a busy machine, s."""
+ROBOT = {'world': 'room', 'noise.variance': 0.04}
+SIZES = {360: 800, 768: 1024, 1440: 1000}
+
+
+class Browser:
+    """Chromium with the page, and waits for what it shows."""
+
+    def __init__(self):
+        chromedriver, chromium = map(shutil.which, ('chromedriver', 'chromium'))
+        if not chromedriver or not chromium:
+            pytest.skip('chromium and chromedriver are not installed')
+        from selenium import webdriver
+
+        options = webdriver.ChromeOptions()
+        options.binary_location = chromium
+        for word in ('headless=new', 'no-sandbox', 'disable-gpu', 'disable-dev-shm-usage'):
+            options.add_argument(f'--{word}')
+        options.set_capability('goog:loggingPrefs', {'browser': 'ALL', 'performance': 'ALL'})
+        service = webdriver.ChromeService(chromedriver)
+        self.driver = webdriver.Chrome(options=options, service=service)
+
+    def text(self, name):
+        return self.find(name).text
+
+    def find(self, name):
+        return self.driver.find_element('id', name)
+
+    def run(self, script, *values):
+        return self.driver.execute_script(script, *values)
+
+    def wait(self, condition, what):
+        deadline = time.monotonic() + WAIT
+        while not condition():
+            assert time.monotonic() < deadline, f'{what}; the banner: {self.text("headline")}'
+            time.sleep(0.1)
+
+    def wait_for_headline(self, *words):
+        self.wait(lambda: self.text('headline').startswith(words), f'no headline {words}')
+
+    def show_as(self, width, height, scheme='light'):
+        metrics = {'width': width, 'height': height, 'deviceScaleFactor': 1, 'mobile': width < 500}
+        self.driver.execute_cdp_cmd('Emulation.setDeviceMetricsOverride', metrics)
+        feature = {'name': 'prefers-color-scheme', 'value': scheme}
+        self.driver.execute_cdp_cmd('Emulation.setEmulatedMedia', {'features': [feature]})
+
+    def requests(self):
+        """Return the addresses of all requests so far."""
+        messages = [
+            json.loads(entry['message'])['message'] for entry in self.driver.get_log('performance')
+        ]
+        return [
+            message['params']['request']['url']
+            for message in messages
+            if message['method'] == 'Network.requestWillBeSent'
+        ]
+
+
+@pytest.fixture
+def browser():
+    browser = Browser()
+    yield browser
+    browser.driver.quit()
+
+
+@pytest.fixture
+def page(processes, browser):
+    """Start graph and page, and open it."""
+    processes.start('sim_robot', parameters=ROBOT)
+    processes.start('reference_generator')
+    processes.start('controller')
+    processes.start('view', 'view', '--headless', '--port', '0', program='t3mpc')
+    processes.wait_for('view', '(stop with', 120.0)
+    processes.wait_for('controller', 'tracking', 600.0)
+    text = processes.log('view').read_text()
+    url = text[text.index(PAGE_AT) + len(PAGE_AT) :].split()[0]
+    browser.driver.get(url)
+    browser.wait_for_headline('Tracking', 'Driving')
+    return url
+
+
+def newest(browser, stream='odometry'):
+    return browser.run(f'return streams.{stream}.time.at(-1)')
+
+
+# WCAG 2: relative luminance of a colour, contrast ratio of text and background.
+CONTRAST = """
+const weights = [0.2126, 0.7152, 0.0722];
+const linear = (c) => (c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4);
+const light = (text) => text.match(/[\\d.]+/g).slice(0, 3)
+  .reduce((sum, each, i) => sum + weights[i] * linear(each / 255), 0);
+let box = arguments[0];
+const ink = light(getComputedStyle(box).color);
+const paper = () => getComputedStyle(box).backgroundColor;
+while (paper() === 'rgba(0, 0, 0, 0)') box = box.parentElement;
+const [a, b] = [ink, light(paper())].sort((x, y) => y - x);
+return (a + 0.05) / (b + 0.05);
+"""
+
+
+def contrast(browser, name):
+    """Return the contrast ratio of an element's text."""
+    return browser.run(CONTRAST, browser.find(name))
+
+
+def test_a_person_watches_and_commands_a_robot(page, browser, processes, tmp_path):
+    from selenium.webdriver import ActionChains, Keys
+
+    # A moving value.
+    before = newest(browser)
+    browser.wait(lambda: newest(browser) > before + 1.0, 'no new samples')
+    browser.wait(lambda: 'wheels' in browser.text('pose'), 'no pose')
+
+    # The cursor of one chart moves in all of them, and shows its time.
+    charts = browser.driver.find_elements('css selector', '.u-over')
+    assert len(charts) == 4
+    ActionChains(browser.driver).move_to_element(charts[0]).perform()
+    browser.wait(lambda: 'cursor at' in browser.text('cursor-time'), 'no cursor')
+    assert browser.run('return charts.charts.every((each) => each.uplot.cursor.left > 0)')
+
+    # A selected span is held; a double click follows the run again.
+    drag = ActionChains(browser.driver).move_to_element(charts[1]).click_and_hold()
+    drag.move_by_offset(80, 0).release().perform()
+    browser.wait(lambda: browser.text('hold') == 'Follow', 'no zoom')
+    low, high = browser.run(
+        'const {min, max} = charts.charts[0].uplot.scales.x; return [min, max]'
+    )
+    assert 0.0 < high - low < 25.0
+    ActionChains(browser.driver).double_click(charts[1]).perform()
+    browser.wait(lambda: browser.text('hold') == 'Hold', 'zoom not undone')
+
+    # A parameter: found by a search, set, and refused beyond its bound.
+    name = 'sim_robot/faults.command_loss'
+    browser.wait(lambda: browser.run('return Boolean(place(arguments[0]))', name), 'no parameter')
+    browser.find('search').send_keys('command_loss')
+    entry = browser.find(name).find_element('css selector', 'input')
+    entry.clear()
+    entry.send_keys('0.2', Keys.ENTER)
+    browser.wait(lambda: 'is set' in browser.text('answer'), 'not set')
+    entry.clear()
+    entry.send_keys('7', Keys.ENTER)
+    browser.wait(lambda: 'not done' in browser.text('answer'), 'not refused')
+    assert 'Max: 1.0' in browser.text('answer')
+    browser.wait(lambda: entry.get_attribute('value') == '0.2', 'a refused value is shown')
+
+    # E-stop by the keyboard: the robot rests, and the banner says why.
+    browser.run('document.activeElement.blur()')
+    ActionChains(browser.driver).send_keys(' ').perform()
+    browser.wait_for_headline('E-STOP')
+    assert 'emergency stop' in browser.text('detail')
+    speeds = 'return streams.truth.values.slice(0, 2).map((each) => Math.abs(each.at(-1)))'
+    browser.wait(lambda: max(browser.run(speeds)) < 0.01, 'the robot moves')
+    browser.find('release').click()
+    browser.wait_for_headline('Tracking', 'Driving')
+
+    # Every control is reached with the keyboard.
+    browser.find('e-stop').send_keys(Keys.TAB)
+    reached = set()
+    for _ in range(60):
+        active = browser.driver.switch_to.active_element
+        reached.add(active.get_attribute('id') or active.text)
+        active.send_keys(Keys.TAB)
+    assert {'span', 'hold', 'search', 'Enable', 'Reseed', 'events'} <= reached
+
+    # Legible in every size and scheme.
+    for scheme in ('light', 'dark'):
+        for width, height in SIZES.items():
+            browser.show_as(width, height, scheme)
+            assert browser.run('return document.documentElement.scrollWidth') <= width
+            for part in ('headline', 'e-stop', 'floor-title', 'pose', 'answer', 'hold'):
+                assert contrast(browser, part) >= 4.5, (part, scheme)
+
+    # The graph stops and starts again.
+    for node in ('controller', 'reference_generator', 'sim_robot'):
+        processes.stop(node)
+    browser.wait_for_headline('Connection lost')
+    processes.start('sim_robot', parameters=ROBOT)
+    processes.start('reference_generator')
+    processes.start('controller')
+    browser.wait_for_headline('Tracking', 'Driving')
+
+    # The page ends and starts again: it says so, and loads itself anew.
+    port = page.rstrip('/').rpartition(':')[2]
+    processes.stop('view')
+    browser.wait_for_headline('This page has lost its program')
+    browser.driver.get_log('browser')  # failed attempts to connect are no errors of the page
+    processes.start('view', 'view', '--headless', '--port', port, program='t3mpc')
+    browser.wait_for_headline('Tracking', 'Driving')
+
+    severe = [entry for entry in browser.driver.get_log('browser') if entry['level'] == 'SEVERE']
+    assert [entry for entry in severe if 'ERR_CONNECTION_REFUSED' not in entry['message']] == []
+    assert {url for url in browser.requests() if not url.startswith((page, 'data:'))} == set()
+
+
+def test_a_page_of_another_origin_commands_nothing(page, browser, tmp_path):
+    """A page that the user has open beside it, on a server or a file of somebody else."""
+    token = browser.run('return token')
+    foreign = Path(tmp_path) / 'foreign.html'
+    foreign.write_text('<!doctype html><title>foreign</title>')
+    browser.driver.get(foreign.as_uri())
+    browser.driver.set_script_timeout(20)
+    for mode in ('cors', 'no-cors'):
+        result = browser.driver.execute_async_script(
+            """
+            const [url, token, mode, done] = arguments;
+            const body = JSON.stringify({command: 'e_stop', arguments: {on: true}});
+            const headers = mode === 'cors' ? {'X-Token': token} : {};
+            fetch(`${url}command`, {method: 'POST', body, headers, mode})
+              .then((answer) => done(`${answer.status}`), () => done('refused'));
+            """,
+            page,
+            token,
+            mode,
+        )
+        assert result in ('refused', '0', '403')
+    browser.driver.get(page)
+    browser.wait_for_headline('Tracking', 'Driving')
+    assert browser.run("return events.every((each) => !each.text.startsWith('e_stop'))")

@@ -1,0 +1,167 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The node of the live page: what it collects from a running robot, and its commands."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from support.ros_graph import CommandSource, twist
+
+from t3mpc_ros.nodes.common.remote_parameters import parameter_row
+from t3mpc_ros.nodes.sim_robot import SimRobotNode, SimRobotParameters
+from t3mpc_ros.nodes.viewer import CommandFailedError, ViewNode
+from t3mpc_ros.view.live_run import LiveRun
+
+pytestmark = pytest.mark.ros
+
+
+class Viewer:
+    """A viewer of a robot, polled while the harness spins."""
+
+    def __init__(self, harness, namespace=''):
+        self.harness = harness
+        self.run = LiveRun()
+        self.node = ViewNode(self.run, namespace)
+        harness.add_foreign(self.node)
+        self._now = 0.0
+
+    def changes(self):
+        return self.run.read(0)[0]
+
+    def facts(self):
+        return self.changes().get('facts', {})
+
+    def spin_until(self, condition):
+        def met():
+            self._now += 0.05
+            self.node.look_at_graph()
+            self.node.poll()
+            self.run.tick(self._now)
+            return condition()
+
+        self.harness.spin_until(met)
+
+    def command(self, name, /, **arguments):
+        with ThreadPoolExecutor(1) as pool:
+            reply = pool.submit(self.node.command, name, arguments)
+            self.spin_until(reply.done)
+        return reply.result()
+
+    def parameter(self, name):
+        rows = self.facts().get('parameters/sim_robot') or ()
+        return next((row for row in rows if row['name'] == name), None)
+
+
+@pytest.fixture
+def robot(harness):
+    return harness.add(SimRobotNode, world='room')
+
+
+@pytest.fixture
+def viewer(robot, harness):
+    viewer = Viewer(harness)
+    viewer.spin_until(lambda: viewer.parameter('wheel_radius'))
+    return viewer
+
+
+def test_a_moving_robot_is_shown(viewer, harness):
+    source = CommandSource(harness)
+    source.message = twist(0.14)
+
+    def moving():
+        streams = viewer.changes().get('streams', {})
+        wanted = {'odometry', 'truth', 'command', 'ranges'}
+        return wanted <= streams.keys() and streams['odometry']['values'][0][-1] > 3.9
+
+    viewer.spin_until(moving)
+    streams, facts = viewer.changes()['streams'], viewer.facts()
+    # 0.14 m/s with wheels of 35 mm
+    assert streams['command']['values'][0][-1] == pytest.approx(4.0)
+    assert len(facts['world']['segments']) > 4
+    assert facts['robot'] == {'wheel_radius': 0.035, 'wheel_separation': 0.147}
+    viewer.spin_until(lambda: viewer.facts()['banner']['headline'] == 'Following commands')
+    source.message = None
+    viewer.spin_until(lambda: viewer.facts()['banner']['headline'] == 'Stopped')
+    assert 'no command' in viewer.facts()['banner']['detail']
+
+
+def test_the_e_stop_latches_and_is_shown(viewer, robot):
+    assert viewer.command('e_stop', on=True) == 'latched'
+    viewer.spin_until(lambda: viewer.facts()['banner']['headline'] == 'E-STOP')
+    assert 'emergency stop' in viewer.facts()['banner']['detail']
+    assert viewer.command('e_stop', on=False) == 'released'
+    viewer.spin_until(lambda: viewer.facts()['banner']['headline'] != 'E-STOP')
+    texts = [event['text'] for event in viewer.changes()['events']]
+    assert {'e_stop on: latched', 'e_stop off: released'} <= set(texts)
+
+
+def test_a_parameter_is_set_and_its_change_is_shown(viewer, robot, harness):
+    viewer.command('set', node='sim_robot', name='faults.command_loss', value=0.25)
+    viewer.spin_until(lambda: viewer.parameter('faults.command_loss')['value'] == 0.25)
+    assert robot.parameters.faults.command_loss == 0.25
+    viewer.spin_until(lambda: any(each['kind'] == 'fault' for each in viewer.changes()['events']))
+
+
+@pytest.mark.parametrize(
+    ('name', 'arguments', 'words'),
+    [
+        ('e_stop', {}, 'e_stop needs on, true or false: got None'),
+        ('dance', {}, 'the commands are set, e_stop,'),
+        ('reseed', {}, 'no node offers the service reference_generator/reseed'),
+        ('set', {'node': 'x', 'name': 'y', 'value': 1}, "no node 'x'"),
+        ('set', {'node': 'sim_robot', 'name': 'y', 'value': 1}, 'has no parameter y'),
+        (
+            'set',
+            {'node': 'sim_robot', 'name': 'faults.command_loss', 'value': 'much'},
+            "faults.command_loss must be float: got 'much'",
+        ),
+        (
+            'set',
+            {'node': 'sim_robot', 'name': 'faults.command_loss', 'value': 2.0},
+            'faults.command_loss',
+        ),
+    ],
+)
+def test_a_command_that_cannot_be_executed_has_a_reason(name, arguments, words, viewer):
+    with pytest.raises(CommandFailedError, match=words):
+        viewer.command(name, **arguments)
+
+
+def test_a_node_that_leaves_takes_its_parameters_along(viewer, robot, harness):
+    harness.remove(robot)
+    viewer.spin_until(lambda: not viewer.facts().get('parameters/sim_robot'))
+    with pytest.raises(CommandFailedError, match='no node offers the service e_stop'):
+        viewer.command('e_stop', on=True)
+
+
+def test_robots_of_other_namespaces_are_left_alone(robot, harness):
+    other = harness.add(SimRobotNode, namespace='east', world='corridor')
+    viewer = Viewer(harness, 'east')
+    viewer.spin_until(lambda: viewer.parameter('world'))
+    assert viewer.parameter('world')['value'] == 'corridor'
+    viewer.command('e_stop', on=True)
+    viewer.spin_until(lambda: viewer.facts()['banner']['headline'] == 'E-STOP')
+    assert other._state.status.estop
+    assert not robot._state.status.estop
+
+
+def test_parameters_of_other_packages_have_rows_too(harness):
+    """A foreign node has descriptions without unit, and ranges without bounds."""
+    harness.probe.declare_parameter('speed', 1.5)
+    row = parameter_row(
+        harness.probe.describe_parameter('speed'),
+        harness.probe.get_parameter('speed').get_parameter_value(),
+    )
+    assert (row['type'], row['value'], row['low'], row['high']) == ('float', 1.5, None, None)
+    assert (row['unit'], row['text'], row['dynamic']) == ('', '', True)
+
+
+def test_rows_have_unit_range_and_text_of_the_table(viewer):
+    for spec in SimRobotParameters.specs():
+        row = viewer.parameter(spec.name)
+        source = '' if spec.source == 'assumed' else f' ({spec.source})'
+        assert (row['unit'], row['text']) == (spec.unit, f'{spec.text}{source}')
+        assert row['dynamic'] == spec.dynamic
+        assert row['choices'] == list(spec.choices)
+        if spec.kind in (int, float) and not spec.many:
+            assert (row['low'], row['high']) == (spec.low, spec.high)

@@ -1,0 +1,147 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Samples, facts and events for readers of their own pace; the banner."""
+
+import json
+import math
+from threading import Thread
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.view.banner import LOST, NodeReport, banner
+from t3mpc_ros.view.live_data import MAX_EVENTS, SPAN, LiveData
+from t3mpc_ros.view.live_run import LiveRun
+
+
+def test_readers_of_any_pace_get_every_sample_once_and_in_order():
+    data = LiveData()
+    generator = np.random.default_rng(1)
+    cursors, found = [0, 0, 0], [[], [], []]
+    for k in range(600):
+        data.add('a' if k % 3 else 'b', 0.01 * k, [k, -k])
+        for reader in np.flatnonzero(generator.random(3) < (1.0, 0.1, 0.01)):
+            changes, cursors[reader] = data.read(cursors[reader])
+            for stream in changes.get('streams', {}).values():
+                found[reader] += stream['values'][0]
+    for reader in range(3):
+        for stream in data.read(cursors[reader])[0].get('streams', {}).values():
+            found[reader] += stream['values'][0]
+        assert sorted(found[reader]) == list(range(600))
+    assert data.read(600) == ({}, 600)
+
+
+def test_what_is_kept_is_bounded():
+    data = LiveData()
+    for k in range(3 * round(SPAN)):
+        data.add('a', float(k), [0.0])
+        data.report(float(k), 'note', str(k))
+    for k in range(2 * MAX_EVENTS):
+        data.report(0.0, 'note', str(k))
+    changes, _ = data.read(0)
+    times = changes['streams']['a']['time']
+    assert (times[0], times[-1]) == (times[-1] - SPAN, 3 * round(SPAN) - 1)
+    assert len(changes['events']) == MAX_EVENTS
+
+
+def test_time_that_goes_back_starts_the_stream_anew():
+    """A robot that restarts, or a bag that is played again."""
+    data = LiveData()
+    for time in (5.0, 6.0, 0.0, 1.0):
+        data.add('a', time, [time])
+    assert data.read(0)[0]['streams']['a']['time'] == [0.0, 1.0]
+
+
+def test_numbers_that_are_not_finite_become_null():
+    data = LiveData()
+    data.add('a', 0.0, [math.nan, math.inf, -math.inf, 1.0])
+    text = json.dumps(data.read(0)[0], allow_nan=False)
+    assert json.loads(text)['streams']['a']['values'] == [[None], [None], [None], [1.0]]
+
+
+def test_a_fact_is_read_again_only_when_it_has_changed():
+    data = LiveData()
+    data.set('world', {'walls': [1]})
+    changes, cursor = data.read(0)
+    assert changes == {'facts': {'world': {'walls': [1]}}}
+    data.set('world', {'walls': [1]})
+    assert data.read(cursor)[0] == {}
+    data.set('world', None)
+    assert data.read(cursor)[0] == {'facts': {'world': None}}
+
+
+def test_a_reader_that_waits_wakes_with_the_next_change():
+    data = LiveData()
+    assert not data.wait(0, 0.01)
+    woken = []
+    reader = Thread(target=lambda: woken.append(data.wait(0, 30.0)))
+    reader.start()
+    data.add('a', 0.0, [1.0])
+    reader.join(30.0)
+    assert woken == [True]
+
+
+TRACKING = {'controller': NodeReport('tracking'), 'sim_robot': NodeReport('following commands')}
+ESTOP = NodeReport('emergency stop: requested by service e_stop', 'stopped')
+
+
+@pytest.mark.parametrize(
+    ('reports', 'age', 'expected'),
+    [
+        ({}, None, ('lost', 'Waiting for a robot', 'no odometry on the graph yet')),
+        ({}, 0.1, ('good', 'Receiving odometry', '')),
+        (TRACKING, 0.1, ('good', 'Tracking the reference', '')),
+        (TRACKING, LOST + 1.6, ('lost', 'Connection lost', 'no odometry for 3 s')),
+        (
+            {**TRACKING, 'sim_robot': NodeReport('the battery is low', 'warning')},
+            0.1,
+            ('warning', 'Driving, with a warning', 'sim_robot: the battery is low'),
+        ),
+        (
+            {**TRACKING, 'controller': NodeReport('no odometry', 'stopped')},
+            0.1,
+            ('stopped', 'Stopped', 'controller: no odometry'),
+        ),
+        # What follows from the stop is not its reason.
+        (
+            {'controller': NodeReport('does not follow', 'warning'), 'sim_robot': ESTOP},
+            0.1,
+            ('stopped', 'E-STOP', f'sim_robot: {ESTOP.text}'),
+        ),
+    ],
+)
+def test_the_banner_says_what_matters_most(reports, age, expected):
+    assert banner(reports, age) == expected
+
+
+def test_stops_and_their_ends_are_events():
+    run = LiveRun()
+    run.tick(0.0)
+    for name, report in TRACKING.items():
+        run.node_report(name, *report)
+    for k in range(30):
+        run.add('odometry', 0.1 * k, [0.0])
+        if k == 10:
+            run.node_report('sim_robot', *ESTOP)
+        if k == 20:
+            run.node_report('sim_robot', 'following commands', 'normal')
+        run.tick(0.1 * k)
+    run.tick(2.9 + LOST + 0.1)
+    events = run.read(0)[0]['events']
+    assert [(event['kind'], event['text'].split(':')[0]) for event in events] == [
+        ('note', 'Tracking the reference'),
+        ('stop', 'E-STOP'),
+        ('note', 'Tracking the reference'),
+        ('stop', 'Connection lost'),
+    ]
+    assert events[1]['time'] == pytest.approx(1.0)
+    assert run.read(0)[0]['facts']['banner']['kind'] == 'lost'
+
+
+def test_the_report_of_a_node_that_has_left_is_discarded():
+    run = LiveRun()
+    run.add('odometry', 0.0, [0.0])
+    run.node_report('sim_robot', *ESTOP)
+    run.node_gone('sim_robot')
+    run.tick(0.0)
+    assert run.read(0)[0]['facts']['banner']['kind'] == 'good'

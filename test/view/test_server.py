@@ -1,0 +1,155 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The server of the live page: what it serves, and whom it refuses."""
+
+from contextlib import closing
+from http.client import HTTPConnection
+import json
+import re
+
+import pytest
+
+from t3mpc_ros.view.live_data import LiveData
+from t3mpc_ros.view.server import ADDRESS, MAX_BODY, MAX_READERS, CommandError, PageServer
+
+
+class Page:
+    """A server, its commands, and requests as a browser sends them."""
+
+    def __init__(self, server, done):
+        self.server, self.done = server, done
+        self.host = f'{ADDRESS}:{server.port}'
+
+    def request(self, method, path, body=None, **headers):
+        """Return status, headers and text of an answer; ``x_token`` sets X-Token."""
+        sent = {'Host': self.host} | {
+            name.replace('_', '-').title(): value for name, value in headers.items()
+        }
+        with closing(HTTPConnection(ADDRESS, self.server.port, timeout=20)) as connection:
+            connection.request(method, path, body, sent)
+            answer = connection.getresponse()
+            return answer.status, answer.headers, answer.read().decode()
+
+    def command(self, body=b'{"command": "e_stop", "arguments": {"on": true}}', **headers):
+        """Return status and answer of a command of the page itself, but for the headers."""
+        own = {'x_token': self.server.token, 'origin': f'http://{self.host}'}
+        status, _, text = self.request('POST', '/command', body, **own | headers)
+        return status, json.loads(text)
+
+    def events(self, last=''):
+        """Yield id and content of each event from now on."""
+        with closing(HTTPConnection(ADDRESS, self.server.port, timeout=20)) as connection:
+            connection.request('GET', f'/events?last={last}', headers={'Host': self.host})
+            answer = connection.getresponse()
+            assert answer.status == 200
+            while line := answer.readline().decode():
+                if match := re.match(r'id: (.*)', line):
+                    content = answer.readline().decode().removeprefix('data: ')
+                    yield match[1], json.loads(content)
+
+
+@pytest.fixture
+def page():
+    done = []
+
+    def command(name, arguments):
+        if name == 'fail':
+            raise CommandError('no node offers it')
+        done.append((name, arguments))
+        return 'latched'
+
+    with PageServer(LiveData(), command, 0) as server:
+        yield Page(server, done)
+
+
+def test_page_and_scripts_are_served_and_nothing_else(page):
+    status, headers, text = page.request('GET', '/')
+    assert status == 200
+    assert page.server.token in text
+    assert "default-src 'none'" in headers['Content-Security-Policy']
+    for name in re.findall(r'(?:src|href)="([^":]+)"', text):
+        assert page.request('GET', f'/{name}')[0] == 200, name
+    for path in ('/server.py', '/../server.py', '/page/view.js', '/view.html/x', '/%2e%2e/x'):
+        assert page.request('GET', path)[0] == 404, path
+    # A page that works offline loads nothing from elsewhere.
+    for name in ('view.html', 'view.js', 'charts.js', 'view.css'):
+        assert not re.search(r'https?://(?!www\.w3\.org)', page.request('GET', f'/{name}')[2])
+
+
+def test_a_command_of_the_page_is_executed(page):
+    assert page.command() == (200, {'done': 'latched'})
+    assert page.done == [('e_stop', {'on': True})]
+    assert page.command(b'{"command": "fail"}') == (409, {'error': 'no node offers it'})
+
+
+@pytest.mark.parametrize(
+    ('headers', 'status', 'words'),
+    [
+        ({'host': 'evil.example'}, 403, 'is served as'),
+        ({'host': 'evil.example:80', 'origin': 'http://evil.example:80'}, 403, 'is served as'),
+        ({'origin': 'http://evil.example'}, 403, 'commands from http://evil.example'),
+        ({'origin': 'null'}, 403, 'commands from null'),
+        ({'x_token': ''}, 403, 'load the page again'),
+        ({'x_token': 'x' * 32}, 403, 'load the page again'),
+        ({'content_length': str(MAX_BODY + 1)}, 413, f'at most {MAX_BODY} bytes'),
+        ({'content_length': '-1'}, 413, 'at most'),
+    ],
+)
+def test_commands_of_others_are_refused(headers, status, words, page):
+    found, answer = page.command(**headers)
+    assert found == status
+    assert words in answer['error']
+    assert page.done == []
+
+
+def test_a_foreign_host_reads_nothing(page):
+    for path in ('/', '/events', '/view.js'):
+        assert page.request('GET', path, host='evil.example')[0] == 403
+
+
+@pytest.mark.parametrize(
+    'body',
+    [b'', b'[]', b'{"command": 1}', b'{"command": "x", "arguments": 3}', b'[' * 3000, b'\xff'],
+)
+def test_a_malformed_command_is_refused(body, page):
+    status, answer = page.command(body)
+    assert status == 400
+    assert 'a command must be' in answer['error']
+
+
+def test_a_read_only_page_has_no_token_and_takes_no_command():
+    with PageServer(LiveData(), None, 0) as server:
+        page = Page(server, [])
+        assert server.token not in page.request('GET', '/')[2]
+        status, answer = page.command()
+        assert (status, '--read-only' in answer['error']) == (403, True)
+
+
+def test_events_go_on_where_a_page_has_stopped(page):
+    data = page.server.data
+    data.add('a', 0.0, [1.0])
+    last, content = next(page.events())
+    assert content['streams']['a']['values'] == [[1.0]]
+    data.add('a', 1.0, [2.0])
+    assert next(page.events(last))[1]['streams']['a']['values'] == [[2.0]]
+    # The page of an earlier start has seen nothing of this one.
+    assert next(page.events('other-7'))[1]['streams']['a']['values'] == [[1.0, 2.0]]
+
+
+def test_an_idle_stream_has_a_heartbeat(page):
+    events = page.events()
+    assert [next(events)[1] for _ in range(2)] == [{}, {}]
+
+
+def test_one_page_too_many_is_refused(page):
+    page.server.data.add('a', 0.0, [1.0])
+    streams = [page.events() for _ in range(MAX_READERS)]
+    for stream in streams:
+        next(stream)
+    status, _, text = page.request('GET', '/events')
+    assert (status, 'close one' in text) == (503, True)
+
+
+def test_a_port_in_use_is_an_error_with_a_remedy(page):
+    with pytest.raises(OSError, match=r'port \d+ of 127.0.0.1 is not free .*--port'):
+        PageServer(LiveData(), None, page.server.port)
