@@ -16,6 +16,7 @@ from t3mpc_ros.control.actuation import LimitParameters, VelocityActuation
 from t3mpc_ros.control.body_correction import BodyCorrection, BodyCorrectionParameters
 from t3mpc_ros.control.command_shaper import CommandShaper, CommandShaperParameters
 from t3mpc_ros.control.control_law import (
+    TERM_NAMES,
     CertificateReading,
     LawParameters,
     Nt3fsMpcController,
@@ -134,6 +135,16 @@ class StepperControllerParameters(ControllerParameters):
     command_shaper: CommandShaperParameters = group(CommandShaperParameters)
 
 
+WHEELS = ('right', 'left')
+_OF_WHEELS = ('error', 'estimate', 'skill', *(f'terms/{t}' for t in (*TERM_NAMES, 'applied')))
+SCALAR_NAMES = (
+    *(f'{name}/{wheel}' for name in _OF_WHEELS for wheel in WHEELS),
+    'lyapunov/value',
+    'lyapunov/margin',
+)
+"""Names of the scalars of a step, below the name of the node, as in :attr:`Status.scalars`."""
+
+
 class Status(NamedTuple):
     """Result of one step beside the command; arrays are right wheel first."""
 
@@ -162,6 +173,13 @@ class Status(NamedTuple):
     def certificate(self) -> CertificateReading:
         """Reading of the run-time certificate."""
         return CertificateReading.from_state(self.certificate_state)
+
+    @property
+    def scalars(self) -> list[float]:
+        """Values of the :data:`SCALAR_NAMES`; NaN where there is none."""
+        pairs = self.error, self.estimate, self.skill, *self.terms, self.applied
+        certificate = self.certificate
+        return [*np.concatenate(pairs).tolist(), certificate.value, certificate.margin]
 
 
 class Controller:

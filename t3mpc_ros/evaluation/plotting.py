@@ -14,8 +14,14 @@ from matplotlib.ticker import MaxNLocator
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
-from t3mpc_ros.evaluation.bag_report.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH, WHEELS
+from t3mpc_ros.evaluation.bag_report.topic_roles import (
+    COMMAND,
+    ODOMETRY,
+    REFERENCE,
+    TRUTH,
+)
 
 Array = NDArray[np.float64]
 Subject = TypeVar('Subject')

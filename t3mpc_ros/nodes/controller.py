@@ -18,8 +18,12 @@ from std_srvs.srv import SetBool, Trigger
 
 from t3mpc_ros.bag.run.journal import Journal, parameters_to_json
 from t3mpc_ros.bag.run.model_file import ModelError, find_model, load_model, save_model
-from t3mpc_ros.control.control_law import TERM_NAMES
-from t3mpc_ros.control.controller import Controller, Status, StepperControllerParameters
+from t3mpc_ros.control.controller import (
+    SCALAR_NAMES,
+    Controller,
+    Status,
+    StepperControllerParameters,
+)
 from t3mpc_ros.control.input_monitor import InputMonitor
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist
@@ -39,7 +43,6 @@ from t3mpc_ros.parameters.table import group, parameter
 CONFIGURATION_ERRORS = (ModelError,)
 """Errors of :func:`make` other than :class:`ParameterError`."""
 
-WHEELS = ('right', 'left')
 INITIAL_INPUT_TIME_NS = 10 * NANOSECONDS
 """Time from the first input for which inputs are republished on ``~/initial_inputs/*``."""
 WATCHDOG_PERIOD = 0.05
@@ -259,36 +262,16 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         return max(1, round(self.parameters.rate / self.parameters.terms_rate))
 
     def _create_scalar_publishers(self) -> dict[str, Publisher]:
-        wheels = [
-            f'{name}/{wheel}'
-            for name in (
-                'error',
-                'estimate',
-                'skill',
-                'terms/applied',
-                *map('terms/{}'.format, TERM_NAMES),
-            )
-            for wheel in WHEELS
-        ]
-        names = [*wheels, 'lyapunov/value', 'lyapunov/margin']
-        return {name: self.create_publisher(Float64, f'~/{name}', qos.SCALARS) for name in names}
+        return {
+            name: self.create_publisher(Float64, f'~/{name}', qos.SCALARS) for name in SCALAR_NAMES
+        }
 
     def _publish_scalars(self, status: Status) -> None:
-        for i, wheel in enumerate(WHEELS):
-            self._publish_scalar(f'error/{wheel}', status.error[i])
-            self._publish_scalar(f'estimate/{wheel}', status.estimate[i])
-            self._publish_scalar(f'skill/{wheel}', status.skill[i])
-            self._publish_scalar(f'terms/applied/{wheel}', status.applied[i])
-            for row, term in enumerate(TERM_NAMES):
-                self._publish_scalar(f'terms/{term}/{wheel}', status.terms[row, i])
-        self._publish_scalar('lyapunov/value', status.certificate.value)
-        self._publish_scalar('lyapunov/margin', status.certificate.margin)
-
-    def _publish_scalar(self, name: str, value: float) -> None:
-        publisher = self._scalar_publishers[name]
-        # The error is NaN while there is no reference.
-        if math.isfinite(value) and publisher.get_subscription_count():
-            publisher.publish(Float64(data=float(value)))
+        for name, value in zip(SCALAR_NAMES, status.scalars, strict=True):
+            publisher = self._scalar_publishers[name]
+            # The error is NaN while there is no reference.
+            if math.isfinite(value) and publisher.get_subscription_count():
+                publisher.publish(Float64(data=value))
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._controller.enable(request.data)

@@ -25,6 +25,7 @@ from support.unrendered import RENDERED, unrendered  # noqa: F401 - a fixture
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.bag.writer import BagWriter
+from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.evaluation import plotting
 from t3mpc_ros.evaluation.bag_report.metrics import (
     SETTLING,
@@ -51,7 +52,6 @@ from t3mpc_ros.evaluation.bag_report.topic_roles import (
     ODOMETRY,
     REFERENCE,
     TRUTH,
-    WHEELS,
     ReportOptions,
     find_topics,
 )

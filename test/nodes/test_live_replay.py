@@ -16,11 +16,17 @@ from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation.process_replay.comparison import Tolerances, compare
 from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
-from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller
+from t3mpc_ros.evaluation.process_replay.controller_replay import (
+    recompute_scalars,
+    replay_controller,
+)
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.recorder.node import RecorderNode
 
 pytestmark = pytest.mark.ros
+
+TERMS_RATE = 50.0
+"""Rate of the scalars, not the default, Hz."""
 
 
 def listed_as_missing(bag, topic):
@@ -53,7 +59,9 @@ def eventful_run(harness, bag, model, late):
     learnt['fuzzy.coefficients'] += 0.25
     save_model(model, learnt, {})
     recorder = None if late else start_recorder(harness, bag)
-    bench = ControllerHarness(harness, odometry_timeout=1.0, model=str(model))
+    bench = ControllerHarness(
+        harness, odometry_timeout=1.0, model=str(model), terms_rate=TERMS_RATE
+    )
     controller = bench.controller
     drive(bench, 50)
     recorder = recorder or start_recorder(harness, bag)
@@ -113,3 +121,9 @@ def test_a_recorded_controller_replays_bit_for_bit(late, harness, tmp_path):
     numbers = [row for row in outcome.rows if not row.field.startswith('cmd_vel')]
     assert len(numbers) == 20
     assert all(row.count > 50 and row.absolute == 0.0 for row in numbers), outcome.table()
+    with open_bag(bag) as recording:
+        scalars, _ = recompute_scalars(recording, '')
+        for name in ('controller/error/left', 'controller/lyapunov/margin'):
+            recorded = recording.series(f'/{name}', {'value': 'data'})['value']
+            assert recorded.size > 200
+            assert recorded.tolist() == scalars[name]['value'][-recorded.size :].tolist()

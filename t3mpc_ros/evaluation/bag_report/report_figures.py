@@ -9,6 +9,8 @@ from typing import Any
 from matplotlib.ticker import MaxNLocator
 import numpy as np
 
+from t3mpc_ros.control.control_law import TERM_NAMES
+from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.evaluation.bag_report.metrics import (
     UNMEASURED,
     WINDOW,
@@ -26,9 +28,7 @@ from t3mpc_ros.evaluation.bag_report.topic_roles import (
     ODOMETRY,
     REFERENCE,
     SIGNALS,
-    TERMS,
     TRUTH,
-    WHEELS,
 )
 from t3mpc_ros.evaluation.plotting import (
     COLOURS,
@@ -238,11 +238,11 @@ def control(run: Run) -> Any:
 
 def terms(run: Run) -> Any:
     """Return each term of the control law, (66)-(67)."""
-    names = [n for n in (*TERMS, 'applied') if any(is_long(_term(run, n, w)) for w in WHEELS)]
+    names = [n for n in (*TERM_NAMES, 'applied') if any(is_long(_term(run, n, w)) for w in WHEELS)]
     if not names:
         return None
     symbols = ('$-g$', r'$-K\delta$', r'$\dot r$', '$v_c$', '$v_p$', '$u$')
-    symbol = dict(zip((*TERMS, 'applied'), symbols, strict=True))
+    symbol = dict(zip((*TERM_NAMES, 'applied'), symbols, strict=True))
     figure, axes = new_panels(len(names), 1.15)
     for axis, name in zip(axes, names, strict=True):
         for wheel in WHEELS:
@@ -444,7 +444,7 @@ REPORT_FIGURES = (
         'Terms of the control law (Fig. 12)',
         'The terms of (66)-(67) with E12, and the applied acceleration.',
         terms,
-        tuple(f'controller/terms/{name}/{w}' for name in (*TERMS, 'applied') for w in WHEELS),
+        tuple(f'controller/terms/{name}/{w}' for name in (*TERM_NAMES, 'applied') for w in WHEELS),
     ),
     ReportFigure(
         'estimates',

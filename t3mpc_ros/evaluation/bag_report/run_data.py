@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.bag.reader import BagReader, missing_sample_ratio
+from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.evaluation.bag_report.link_history import (
     DiagnosticEvent,
     LinkHistory,
@@ -26,7 +27,6 @@ from t3mpc_ros.evaluation.bag_report.topic_roles import (
     SCALARS,
     SIGNALS,
     TRUTH,
-    WHEELS,
     ReportOptions,
     TopicChoice,
     choose_topics,

@@ -8,20 +8,13 @@ from pathlib import Path
 
 from t3mpc_ros.bag.metadata import TopicInformation
 from t3mpc_ros.bag.reader import BagReader
+from t3mpc_ros.control.controller import SCALAR_NAMES
 
-WHEELS = ('right', 'left')
-TERMS = ('fuzzy', 'feedback', 'feedforward', 'compensator', 'predictive')
 TRUTH, ODOMETRY, REFERENCE, COMMAND = 'ground_truth/odom', 'odom', 'reference', 'cmd_vel'
 SIGNALS = ('reference/mode', 'reference/signal/right', 'reference/signal/left')
-NUMBERS = (
-    *SIGNALS,
-    *(f'controller/{name}/{w}' for name in ('error', 'estimate', 'skill') for w in WHEELS),
-    *(f'controller/terms/{name}/{w}' for name in (*TERMS, 'applied') for w in WHEELS),
-    'controller/lyapunov/value',
-    'controller/lyapunov/margin',
-)
-SCALARS = frozenset(NUMBERS) - frozenset(SIGNALS)
+SCALARS = frozenset(f'controller/{name}' for name in SCALAR_NAMES)
 """Scalars of the controller, which follow from its journal."""
+NUMBERS = (*SIGNALS, *(f'controller/{name}' for name in SCALAR_NAMES))
 JOURNAL = 'controller/journal'
 INITIAL_INPUTS = 'controller/initial_inputs/'
 """Topics on which the controller republishes its first inputs; they are no topics of a robot."""

@@ -11,7 +11,12 @@ from matplotlib.ticker import MaxNLocator
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.bag_report.topic_roles import ODOMETRY, REFERENCE, TRUTH, WHEELS
+from t3mpc_ros.control.controller import WHEELS
+from t3mpc_ros.evaluation.bag_report.topic_roles import (
+    ODOMETRY,
+    REFERENCE,
+    TRUTH,
+)
 from t3mpc_ros.evaluation.closed_loop import LoopRecord
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.methods import FULL

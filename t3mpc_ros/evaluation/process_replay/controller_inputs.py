@@ -19,8 +19,7 @@ from t3mpc_ros.bag.reader import BagReader, open_bag
 from t3mpc_ros.bag.recording.message_losses import message_loss_notes
 from t3mpc_ros.bag.run.journal import COMMAND_EVENTS, JOURNAL_COLUMNS, Event, parameters_from_json
 from t3mpc_ros.bag.run.model_file import load_model
-from t3mpc_ros.control.control_law import TERM_NAMES
-from t3mpc_ros.control.controller import ControllerParameters
+from t3mpc_ros.control.controller import SCALAR_NAMES, ControllerParameters
 from t3mpc_ros.evaluation.bag_report.topic_roles import (
     COMMAND,
     INITIAL_INPUTS,
@@ -28,7 +27,6 @@ from t3mpc_ros.evaluation.bag_report.topic_roles import (
     ODOMETRY,
     REFERENCE,
     TRUTH,
-    WHEELS,
     find_topics,
 )
 from t3mpc_ros.evaluation.process_replay.journal_alignment import (
@@ -47,15 +45,8 @@ Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 CONTROLLER = 'controller'
-PAIRS = ('error', 'estimate', 'skill', *(f'terms/{name}' for name in (*TERM_NAMES, 'applied')))
-"""Scalar topics of the controller for both wheels."""
 SPEEDS = ('cmd_vel.linear.x', 'cmd_vel.angular.z')
-NUMBERS = (
-    *(f'{name}/{wheel}' for name in PAIRS for wheel in WHEELS),
-    'lyapunov/value',
-    'lyapunov/margin',
-)
-FIELDS = (*SPEEDS, *NUMBERS)
+FIELDS = (*SPEEDS, *SCALAR_NAMES)
 """Compared fields, as columns."""
 
 
@@ -157,7 +148,7 @@ def inputs_of(
     recorded_topics = {name for name, topic in held.topics.items() if topic.message_count}
     known, namespaces = find_topics(held.topics, namespace)
     prefix = namespaces[0]
-    names = (f'{CONTROLLER}/{name}' for name in ('journal', *NUMBERS))
+    names = (f'{CONTROLLER}/{name}' for name in ('journal', *SCALAR_NAMES))
     wanted = {name: f'{prefix}/{name}' for name in (REFERENCE, ODOMETRY, COMMAND, *names)}
     topics = {
         name: full
@@ -199,15 +190,18 @@ def inputs_of(
     )
 
 
+def controller_record(recording: BagReader, namespace: str) -> Mapping[str, str]:
+    """Return the recorded parameters of the controller node as text; empty if there are none."""
+    records = recording.metadata_records
+    return records.get(f'{namespace}/{CONTROLLER}', records.get(CONTROLLER, {}))
+
+
 def recorded_parameters(
     recording: BagReader, namespace: str, notes: list[str]
 ) -> ControllerParameters:
     """Return the controller's parameters as recorded."""
-    own = f'{namespace}/controller'
-    table = recording.metadata_records.get(
-        'controller' if own not in recording.metadata_records else own
-    )
-    if table is None:
+    table = controller_record(recording, namespace)
+    if not table:
         raise ReplayError(f"{recording.folder}: the controller's settings are not in the bag")
     values: dict[str, object] = {}
     for row in ControllerParameters.specs():
@@ -340,7 +334,7 @@ class _Reader:
         for i, name in enumerate(SPEEDS):
             recorded[name][there] = self.columns[COMMAND].numbers[commands[there], i]
         steps = events == Event.STEP
-        for name in NUMBERS:
+        for name in SCALAR_NAMES:
             column = self.columns.get(f'{CONTROLLER}/{name}')
             if column is None or not len(column):
                 continue

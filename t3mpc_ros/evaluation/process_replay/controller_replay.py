@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.bag.reader import BagReader
 from t3mpc_ros.bag.run.journal import Event
-from t3mpc_ros.control.controller import Controller, ControllerParameters, Status
+from t3mpc_ros.control.controller import SCALAR_NAMES, Controller, ControllerParameters, Status
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     CONTROLLER,
     FIELDS,
-    NUMBERS,
     ControllerInputs,
     ControllerSession,
     ReplayError,
+    controller_record,
     inputs_of,
     motions,
 )
@@ -28,7 +28,7 @@ from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist, StateAr
 Array = NDArray[np.float64]
 
 SCALAR_RATE = 20.0
-"""Default of the node's parameter ``terms_rate``, Hz."""
+"""Rate of the scalars if the controller published none, or if its parameters are unknown, Hz."""
 
 _STEP = int(Event.STEP)  # an enumeration is slower to compare
 OPEN_LOOP = (
@@ -40,9 +40,7 @@ OPEN_LOOP = (
 
 def output_row(twist: BodyTwist, status: Status) -> list[float]:
     """Return the outputs of one step in the order of ``controller_inputs.FIELDS``."""
-    pairs = status.error, status.estimate, status.skill, *status.terms, status.applied
-    certificate = status.certificate
-    return [*twist, *np.concatenate(pairs).tolist(), certificate.value, certificate.margin]
+    return [*twist, *status.scalars]
 
 
 @dataclass(frozen=True)
@@ -112,23 +110,24 @@ def recompute_scalars(
 ) -> tuple[dict[str, dict[str, Array]], ControllerInputs]:
     """Return the scalars of a controller from its journal, and the inputs that they follow from.
 
-    They are those that its node publishes, at the same rate: by relative topic name, the arrays
-    that :meth:`BagReader.series` would return for the field ``value``, and ``exact``, which is 1
-    where all inputs of the controller are in the bag, else 0.
+    They are those that its node publishes, at its ``terms_rate``: by relative topic name, the
+    arrays that :meth:`BagReader.series` would return for the field ``value``, and ``exact``,
+    which is 1 where all inputs of the controller are in the bag, else 0.
     """
     inputs = inputs_of(recording, namespace)
     if not inputs.journalled:
         raise ReplayError(f'{recording.folder}: there is no journal of the controller')
     result = replay_controller(inputs)
     steps = np.flatnonzero(inputs.events == Event.STEP)
-    every = max(1, round(result.parameters.rate / SCALAR_RATE))
+    rate = float(controller_record(recording, namespace).get('terms_rate', 0.0)) or SCALAR_RATE
+    every = max(1, round(result.parameters.rate / rate))
     rows = steps[every - 1 :: every]
     rows = rows[inputs.commands_ns[rows] > 0]
     # A scalar is published right after the command of its step.
     received = (inputs.commands_ns[rows] - recording.start_ns) / NANOSECONDS
     exact = inputs.exact[rows].astype(np.float64)
     found = {}
-    for name in NUMBERS:
+    for name in SCALAR_NAMES:
         values = result.fields[name][rows]
         known = np.isfinite(values)
         times = received[known]

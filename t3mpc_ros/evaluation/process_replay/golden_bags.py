@@ -16,12 +16,11 @@ import numpy as np
 from t3mpc_ros.bag.run.journal import Journal, parameters_to_json
 from t3mpc_ros.bag.run.model_file import load_model
 from t3mpc_ros.bag.writer import BagWriter
-from t3mpc_ros.control.controller import Controller, ControllerParameters, Status
+from t3mpc_ros.control.controller import SCALAR_NAMES, Controller, ControllerParameters, Status
 from t3mpc_ros.evaluation.bag_report.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     CONTROLLER,
     FIELDS,
-    NUMBERS,
     SPEEDS,
     ControllerInputs,
     motions,
@@ -43,7 +42,7 @@ TYPES: Mapping[str, str] = {
     COMMAND: 'geometry_msgs/msg/Twist',
     f'{CONTROLLER}/journal': 'std_msgs/msg/Int64MultiArray',
     f'{CONTROLLER}/parameters': 'std_msgs/msg/String',
-    **{f'{CONTROLLER}/{name}': 'std_msgs/msg/Float64' for name in NUMBERS},
+    **{f'{CONTROLLER}/{name}': 'std_msgs/msg/Float64' for name in SCALAR_NAMES},
 }
 """Types of the topics by relative name."""
 LATER = 20_000
@@ -146,7 +145,7 @@ class RecordedController:
         self._steps += 1
         if self._steps % self._every == 0:
             for name, value in zip(FIELDS, output_row(command, status), strict=True):
-                if name in NUMBERS:
+                if name in SCALAR_NAMES:
                     self._tape.number(now_ns + 3 * LATER, name, value)
         return command, status
 
@@ -196,7 +195,7 @@ def write_replay(inputs: ControllerInputs, again: ReplayResult, folder: Path) ->
     for when, twist in zip(times.tolist(), commands, strict=True):
         if all(map(math.isfinite, twist)):
             messages.append((when - LATER, COMMAND, twist_bytes(BodyTwist(*twist))))
-    for name in (name for name in NUMBERS if name in again.fields):
+    for name in (name for name in SCALAR_NAMES if name in again.fields):
         for when, value in zip(times.tolist(), again.fields[name].tolist(), strict=True):
             if math.isfinite(value):
                 messages.append((when + LATER, f'{CONTROLLER}/{name}', float_bytes(value)))

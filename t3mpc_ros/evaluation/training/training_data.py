@@ -15,14 +15,13 @@ from t3mpc_ros.bag.columns import TopicColumns, read_columns
 from t3mpc_ros.bag.reader import BagReader, open_bag
 from t3mpc_ros.control.actuation import wheel_limits
 from t3mpc_ros.control.control_law import TERM_NAMES
-from t3mpc_ros.control.controller import Controller, ControllerParameters
+from t3mpc_ros.control.controller import WHEELS, Controller, ControllerParameters
 from t3mpc_ros.evaluation.bag_report.topic_roles import (
     COMMAND,
     JOURNAL,
     ODOMETRY,
     REFERENCE,
     SCALARS,
-    WHEELS,
     find_topics,
 )
 from t3mpc_ros.evaluation.process_replay.controller_inputs import ReplayError, recorded_parameters
@@ -147,7 +146,7 @@ def _recomputed(
     recording: BagReader, namespace: str, missing: Sequence[str]
 ) -> dict[str, Mapping[str, Array]]:
     """Return the missing topics that follow exactly from the journal of the controller."""
-    if not set(missing) & SCALARS or f'{namespace}/{JOURNAL}' not in recording.topics:
+    if not {*missing} & SCALARS or f'{namespace}/{JOURNAL}' not in recording.topics:
         return {}
     try:
         scalars, _ = recompute_scalars(recording, namespace)

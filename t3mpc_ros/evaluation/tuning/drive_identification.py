@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.control.controller import ControllerParameters, StepperControllerParameters
+from t3mpc_ros.control.controller import WHEELS, ControllerParameters, StepperControllerParameters
 from t3mpc_ros.control.dead_time_estimator import (
     IDENTIFIED_DEVIATION,
     MIN_DEVIATION,
@@ -31,7 +31,11 @@ from t3mpc_ros.control.dead_time_estimator import (
 )
 from t3mpc_ros.evaluation.bag_report.response import busiest, fit_response
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series, load_run
-from t3mpc_ros.evaluation.bag_report.topic_roles import COMMAND, ODOMETRY, WHEELS, ReportOptions
+from t3mpc_ros.evaluation.bag_report.topic_roles import (
+    COMMAND,
+    ODOMETRY,
+    ReportOptions,
+)
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.kernels import kernel
 
