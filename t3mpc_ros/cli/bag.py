@@ -3,7 +3,7 @@
 """``t3mpc bag``: info, recover, report, replay, compare and train."""
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 import json
 from pathlib import Path
@@ -179,13 +179,8 @@ EXIT_USAGE = 2
 _MAX_LISTED_DAMAGES = 20  # further damaged spans are only counted
 
 
-def add_recover_parser(
-    commands: 'argparse._SubParsersAction[argparse.ArgumentParser]', clock: Callable[[], float]
-) -> None:
-    """Add ``recover`` to the commands of ``bag``.
-
-    ``clock`` returns seconds from any origin, for the time left.
-    """
+def add_recover_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
+    """Add ``recover`` to the commands of ``bag``."""
     parser = commands.add_parser(
         'recover',
         help='write what a damaged bag still holds into a new one',
@@ -199,16 +194,19 @@ def add_recover_parser(
     parser.add_argument(
         '--output', type=Path, help='new or empty folder (default: FILE_recovered beside FILE)'
     )
-    parser.set_defaults(run=_run_recover, clock=clock)
+    parser.set_defaults(run=_run_recover)
 
 
 def _run_recover(options: argparse.Namespace) -> int:
     output = options.output or default_output(options.bag)
+    progress = _RecoveryProgress()
     try:
-        result = recover_bag(options.bag, output, _RecoveryProgress(options.clock))
+        result = recover_bag(options.bag, output, progress)
     except RecoveryOutputError as error:
         print(f'error: {error}', file=sys.stderr)
         return EXIT_USAGE
+    finally:
+        progress.close()
     print(_recovery_text(result))
     return 0 if result.clean else EXIT_LOSS
 
@@ -264,23 +262,23 @@ def _verdict(result: RecoveryResult, least: str) -> str:
 
 
 class _RecoveryProgress:
-    """Prints the progress of a large file to stderr about once a second."""
+    """A progress bar for each file that takes longer than a second."""
 
-    def __init__(self, clock: Callable[[], float]) -> None:
-        self._clock = clock
+    def __init__(self) -> None:
         self._name = ''
-        self._start = self._next = 0.0
+        self._bar: Any = None
 
     def __call__(self, name: str, done: int, size: int) -> None:
-        now = self._clock()
-        if name != self._name or done == 0:
-            self._name, self._start, self._next = name, now, now + 1.0
-        if now < self._next or not done:
-            return
-        self._next = now + 1.0
-        left = (now - self._start) * (size - done) / done
-        text = f'{name}: {100.0 * done / size:.0f} % of {size_text(size)}, {left:.0f} s left'
-        print(text, file=sys.stderr, flush=True)
+        from t3mpc_ros.evaluation.reporting import progress_bar
+
+        if self._bar is None or name != self._name or done < self._bar.n:
+            self.close()
+            self._name, self._bar = name, progress_bar(size, 'B', title=name, delay=1.0)
+        self._bar.update(done - self._bar.n)
+
+    def close(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
 
 
 def add_report_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
@@ -588,7 +586,7 @@ def _bag_parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(dest='command', required=True)
     add_info_parser(commands)
-    add_recover_parser(commands, time.monotonic)
+    add_recover_parser(commands)
     add_report_parser(commands)
     add_replay_parser(commands)
     add_compare_parser(commands)

@@ -5,7 +5,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-import shutil
 import signal
 import sys
 import time
@@ -106,34 +105,6 @@ class DemoOptions:
             return ()
         words = ['--link', str(self.port), '--loss', str(self.loss)]
         return tuple(words if self.seed is None else [*words, '--seed', str(self.seed)])
-
-
-class Progress:
-    """Progress bar with the time left on a terminal, a line at intervals elsewhere."""
-
-    def __init__(self, seconds: float, *, live: bool) -> None:
-        self._seconds = seconds
-        self._live = live
-        self._next_line = 0.0
-
-    def show(self, elapsed: float) -> None:
-        """Show that ``elapsed`` seconds have passed."""
-        share = min(1.0, elapsed / self._seconds)
-        left = max(0.0, self._seconds - elapsed)
-        if self._live:
-            width = max(10, min(40, shutil.get_terminal_size().columns - 40))
-            bar = '█' * round(width * share)
-            print(
-                f'\r  running  {bar:░<{width}} {100 * share:3.0f} %  {left:4.0f} s left ',
-                end='' if share < 1.0 else '\n',
-                file=sys.stderr,
-                flush=True,
-            )
-        elif elapsed >= self._next_line:
-            print(
-                f'  running: {elapsed:.0f} of {self._seconds:.0f} s', file=sys.stderr, flush=True
-            )
-            self._next_line += max(10.0, self._seconds / 6)
 
 
 class DemoInterruptedError(RuntimeError):
@@ -245,10 +216,17 @@ def _show(line: str) -> None:
 
 
 def _watch(processes: ProcessGroup, options: DemoOptions) -> None:
-    progress = Progress(options.duration, live=not options.headless and sys.stderr.isatty())
-    start = time.monotonic()
-    while (elapsed := time.monotonic() - start) < options.duration:
-        processes.check()
-        progress.show(elapsed)
-        time.sleep(min(0.2, options.duration - elapsed))
-    progress.show(options.duration)
+    """Wait for the duration of the run; a terminal gets a bar, anything else some lines."""
+    from t3mpc_ros.evaluation.reporting import progress_bar
+
+    live = not options.headless and sys.stderr.isatty()
+    start, next_line = time.monotonic(), 0.0
+    with progress_bar(round(options.duration), 's', show=live) as bar:
+        while (elapsed := time.monotonic() - start) < options.duration:
+            processes.check()
+            bar.update(int(elapsed) - bar.n)
+            if not live and elapsed >= next_line:
+                _show(f'  running: {elapsed:.0f} of {options.duration:.0f} s')
+                next_line += max(10.0, options.duration / 6)
+            time.sleep(min(0.2, options.duration - elapsed))
+        bar.update(round(options.duration) - bar.n)

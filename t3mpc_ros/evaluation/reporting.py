@@ -135,14 +135,20 @@ def _template() -> jinja2.Template:
     return jinja2.Environment(loader=loader, autoescape=True).get_template('report_page.html')
 
 
-def progress_bar(total: int, unit: str = 'runs', *, show: bool = True) -> 'tqdm[int]':
+def progress_bar(
+    total: int, unit: str = 'runs', *, show: bool = True, title: str = '', delay: float = 0.0
+) -> 'tqdm[int]':
     """Return a line on standard error with pace and time left; ``update()`` counts.
 
-    A terminal gets one line that is rewritten, anything else a line at intervals.
+    A terminal gets one line that is rewritten, anything else a line at intervals; nothing is
+    shown before ``delay``, s.
     """
     return tqdm(
         total=total,
         unit=f' {unit}',
+        unit_scale=unit == 'B',
+        desc=title or None,
+        delay=delay,
         disable=not show,
         dynamic_ncols=True,
         mininterval=0.5 if sys.stderr.isatty() else 15.0,

@@ -5,7 +5,6 @@
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-import difflib
 import math
 import os
 from pathlib import Path
@@ -13,7 +12,14 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from t3mpc_ros.parameters.table import ParameterError, Parameters, ParameterSpec, Value, parameter
+from t3mpc_ros.parameters.table import (
+    ParameterError,
+    Parameters,
+    ParameterSpec,
+    Value,
+    nearest_hint,
+    parameter,
+)
 
 SCHEDULES_FOLDER = Path(__file__).resolve().parent / 'schedules'
 """Folder of the bundled schedules."""
@@ -146,7 +152,7 @@ class FaultEvent:
         if not isinstance(self.fault, str) or self.fault not in _SPECS:
             raise ScheduleError(
                 f'fault must be one of {", ".join(_SPECS)}: '
-                f'got {_shortened(self.fault)}{_nearest(self.fault, _SPECS)}'
+                f'got {_shortened(self.fault)}{nearest_hint(str(self.fault), _SPECS)}'
             )
         spec = _SPECS[self.fault]
         try:
@@ -253,7 +259,7 @@ def load_schedule(name_or_path: str | Path) -> FaultSchedule:
         if name not in bundled:
             raise ScheduleError(
                 f'schedule must be one of {", ".join(bundled)}, or a file that ends in .yaml: '
-                f'got {name}{_nearest(name, bundled)}'
+                f'got {name}{nearest_hint(str(name), bundled)}'
             )
         path = SCHEDULES_FOLDER / f'{name}.yaml'
     try:
@@ -311,7 +317,7 @@ def _event(name: str, entry: object) -> FaultEvent:
         )
     for key in entry:
         if key not in _KEYS:
-            near = _nearest(key, _KEYS)
+            near = nearest_hint(str(key), _KEYS)
             raise ScheduleError(
                 f'{name} must have no more than {", ".join(_KEYS)}: got {key}{near}'
             )
@@ -332,11 +338,6 @@ def _seconds(name: str, value: object, low: float) -> float:
     if not low <= value <= _MAX_TIME:  # not so for NaN either
         raise ScheduleError(f'{bound} and at most {_MAX_TIME:g}: got {_shortened(value)}')
     return float(value)
-
-
-def _nearest(word: object, known: Iterable[str]) -> str:
-    near = difflib.get_close_matches(str(word), list(known), n=1)
-    return f'; did you mean {near[0]}?' if near else ''
 
 
 def _shortened(value: object) -> str:

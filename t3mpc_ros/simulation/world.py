@@ -10,7 +10,6 @@ may be empty.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-import difflib
 import math
 from pathlib import Path
 import re
@@ -22,6 +21,7 @@ import numpy.typing as npt
 import yaml
 
 from t3mpc_ros.kernels import kernel
+from t3mpc_ros.parameters.table import nearest_hint
 
 Array = npt.NDArray[np.float64]
 
@@ -144,7 +144,7 @@ def load_world(path_or_name: str | Path) -> World:
     except FileNotFoundError:
         raise WorldError(
             f'there is no world {path_or_name}, neither a file nor one of '
-            f'{", ".join(names)}{_near(str(path_or_name), names)}'
+            f'{", ".join(names)}{nearest_hint(str(path_or_name), names)}'
         ) from None
     except OSError as error:
         raise WorldError(f'{path} cannot be read: {error.strerror}') from error
@@ -286,7 +286,7 @@ def _entry(
         )
     for name in content:
         if name not in known:
-            near = _near(str(name), known) or f'; known are {", ".join(known)}'
+            near = nearest_hint(str(name), known) or f'; known are {", ".join(known)}'
             raise WorldError(f'{where} has no {reprlib.repr(name)}{near}')
     for name in needed:
         if name not in content:
@@ -338,11 +338,6 @@ def _check_count(count: int) -> None:
 
 def _rows(rows: list[tuple[float, ...]], width: int) -> Array:
     return np.array(rows, dtype=np.float64).reshape(-1, width)
-
-
-def _near(name: str, known: tuple[str, ...]) -> str:
-    near = difflib.get_close_matches(name, known, n=1)
-    return f'; did you mean {near[0]}?' if near else ''
 
 
 def join_walls(segments: Array) -> Array:

@@ -5,7 +5,6 @@
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from copy import copy
-import difflib
 from itertools import islice
 import sys
 from typing import Any, Generic, TypeVar
@@ -27,7 +26,7 @@ from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
 from t3mpc_ros.nodes.common import endpoints, qos
-from t3mpc_ros.parameters.table import ParameterError, Parameters, ParameterSpec
+from t3mpc_ros.parameters.table import ParameterError, Parameters, ParameterSpec, nearest_hint
 
 P = TypeVar('P', bound=Parameters)
 
@@ -315,10 +314,8 @@ def _reject_unknown(
     for name in overrides:
         if name in specs or name.split('.')[0] in _RCLPY_PARAMETERS or name in _names_of_nodes():
             continue
-        near = difflib.get_close_matches(name, specs, n=1)
-        hint = f'; did you mean {near[0]}?' if near else ''
         raise ParameterError(
-            f'{node.get_name()} has no parameter {name}{hint} '
+            f'{node.get_name()} has no parameter {name}{nearest_hint(name, specs)} '
             f'(`ros2 param list /{node.get_name()}` lists them)'
         )
 
