@@ -14,6 +14,7 @@ import webbrowser
 from t3mpc_ros.cli.command import ArgumentParser, run_command
 from t3mpc_ros.cli.compare import add_parser as add_compare
 from t3mpc_ros.cli.faults import add_outcomes_parser
+from t3mpc_ros.cli.graph import add_parsers as add_graph_parsers
 from t3mpc_ros.cli.paper import add_parser as add_paper
 from t3mpc_ros.cli.train import add_parser as add_train
 from t3mpc_ros.cli.tune import add_parser as add_tune
@@ -236,6 +237,7 @@ def _parser() -> argparse.ArgumentParser:
     add_twin(commands)
     add_outcomes_parser(commands)
     add_view(commands)
+    add_graph_parsers(commands)
 
     compiling = commands.add_parser('compile', help='compile every kernel into the cache')
     compiling.set_defaults(run=_compile)

@@ -22,7 +22,6 @@ from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Log, ParameterEvent
 import rclpy
-from rclpy.callback_groups import CallbackGroup
 from rclpy.exceptions import InvalidNamespaceException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.logging_severity import LoggingSeverity
@@ -40,6 +39,7 @@ from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, State
 from t3mpc_ros.nodes.common import conversions
+from t3mpc_ros.nodes.common.endpoints import PolledCallbackGroup
 from t3mpc_ros.nodes.common.remote_parameters import RemoteParameters
 from t3mpc_ros.robot.interface import RANGE_SENSORS
 from t3mpc_ros.simulation.sensors.range_sensor import (
@@ -109,21 +109,6 @@ class Sink(Protocol):
         ...
 
 
-class PolledGroup(CallbackGroup):
-    """Entities that no executor waits for: the node takes their messages itself."""
-
-    def can_execute(self, entity: Any) -> bool:
-        """Return False: an executor leaves them alone."""
-        return False
-
-    def beginning_execution(self, entity: Any) -> bool:
-        """Return False, see :meth:`can_execute`."""
-        return False
-
-    def ending_execution(self, entity: Any) -> None:
-        """Do nothing."""
-
-
 class _Source(NamedTuple):
     """A subscription and the method that takes its messages."""
 
@@ -148,7 +133,7 @@ class ViewNode(Node):
             'view', namespace=namespace, start_parameter_services=False, enable_rosout=False
         )
         self._sink = sink
-        self._group = PolledGroup()
+        self._group = PolledCallbackGroup()
         self._pending: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._geometry = WheelGeometry()
         self._origin_ns: int | None = None

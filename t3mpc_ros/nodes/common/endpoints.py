@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 import copy
 from typing import Any, Literal
 
+from rclpy.callback_groups import CallbackGroup
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import QoSCompatibility, QoSPolicyKind, QoSProfile, qos_check_compatible
@@ -66,6 +67,21 @@ def unused_overrides(node: Node) -> list[str]:
         for name in node._parameter_overrides
         if name.startswith(PREFIX) and not node.has_parameter(name)
     ]
+
+
+class PolledCallbackGroup(CallbackGroup):
+    """A callback group whose entities the executor never waits for."""
+
+    def can_execute(self, entity: object) -> bool:
+        """Return False: the executor does not wait for the entity."""
+        return False
+
+    def beginning_execution(self, entity: object) -> bool:
+        """Return False: the executor does not run the entity."""
+        return False
+
+    def ending_execution(self, entity: object) -> None:
+        """Do nothing: no entity is executed."""
 
 
 class MatchingSubscription:

@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any
 
-from rclpy.callback_groups import CallbackGroup
 from rclpy.event_handler import (
     QoSSubscriptionEventType,
     SubscriptionEventCallbacks,
@@ -38,6 +37,7 @@ from t3mpc_ros.bag.metadata import TopicInformation
 from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.topic_filter import TopicFilter
 from t3mpc_ros.nodes.common import graph_introspection, qos
+from t3mpc_ros.nodes.common.endpoints import PolledCallbackGroup
 
 EXPECTED_TOPICS = {
     'reference': 'nav_msgs/msg/Odometry',
@@ -62,21 +62,6 @@ FULL_DISCOVERY = 10
 """Calls of :meth:`TopicDiscovery.discover` after which all publishers are queried again."""
 
 _RECEIVE_TIME = attrgetter('received_ns')
-
-
-class PolledCallbackGroup(CallbackGroup):
-    """A callback group whose entities the executor never waits for."""
-
-    def can_execute(self, entity: object) -> bool:
-        """Return False: the executor does not wait for the entity."""
-        return False
-
-    def beginning_execution(self, entity: object) -> bool:
-        """Return False: the executor does not run the entity."""
-        return False
-
-    def ending_execution(self, entity: object) -> None:
-        """Do nothing: no entity is executed."""
 
 
 @dataclass

@@ -1,0 +1,146 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``t3mpc topic``, ``param``, ``call`` and ``stop``: for a graph without a ROS installation."""
+
+import argparse
+from collections.abc import Callable
+import sys
+import time
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from t3mpc_ros.stop_signal import StopSignal
+
+if TYPE_CHECKING:
+    from t3mpc_ros.nodes.graph_tools import Graph
+
+REPORT_PERIOD = 1.0
+"""Time between two lines of a rate, s."""
+
+
+def add_parsers(commands: Any) -> None:
+    """Add the subcommands for topics, parameters and services."""
+    topic = commands.add_parser('topic', help='topics of the graph, as ros2 topic')
+    words = topic.add_subparsers(dest='word', required=True, metavar='list|echo|hz')
+    listing = words.add_parser('list', help='names of the topics')
+    listing.add_argument('-t', '--show-types', action='store_true', help='with their types')
+    listing.set_defaults(run=_with_graph(_list_topics))
+    echo = words.add_parser('echo', help='messages of a topic')
+    echo.add_argument('topic')
+    echo.add_argument('--field', default='', help='one field, for example pose.pose.position')
+    echo.add_argument('--once', action='store_true', help='the first message only')
+    echo.set_defaults(run=_with_graph(_echo))
+    rate = words.add_parser('hz', help='rate of a topic')
+    rate.add_argument('topic')
+    rate.set_defaults(run=_with_graph(_rate))
+
+    param = commands.add_parser('param', help='parameters of the nodes, as ros2 param')
+    words = param.add_subparsers(dest='word', required=True, metavar='list|get|set')
+    listing = words.add_parser('list', help='names of the parameters')
+    listing.add_argument('node', nargs='?', help='of this node only, for example /controller')
+    listing.set_defaults(run=_with_graph(_list_parameters))
+    getting = words.add_parser('get', help='value of a parameter')
+    setting = words.add_parser('set', help='set a dynamic parameter')
+    for parser in (getting, setting):
+        parser.add_argument('node')
+        parser.add_argument('name')
+    getting.set_defaults(run=_with_graph(_get_parameter))
+    setting.add_argument('value', help='in YAML: 0.3, true, [1.0, 2.0], text')
+    setting.set_defaults(run=_with_graph(_set_parameter))
+
+    call = commands.add_parser('call', help='call a service, as ros2 service call')
+    call.add_argument('service', help='for example /reference_generator/reseed')
+    call.add_argument('values', nargs='?', default='{}', help='fields in YAML: "{data: true}"')
+    call.set_defaults(run=_with_graph(_call))
+
+    stop = commands.add_parser('stop', help='latch the e-stop of every robot in reach')
+    stop.set_defaults(run=_with_graph(_stop))
+
+
+def _with_graph(
+    run: Callable[['Graph', argparse.Namespace], int],
+) -> Callable[[argparse.Namespace], int]:
+    def run_in_graph(options: argparse.Namespace) -> int:
+        from t3mpc_ros.nodes.graph_tools import graph  # takes a second
+
+        with StopSignal() as stop, graph(stop) as opened:
+            return run(opened, options)
+
+    return run_in_graph
+
+
+def _list_topics(graph: 'Graph', options: argparse.Namespace) -> int:
+    for name, kinds in graph.topics().items():
+        print(f'{name} [{", ".join(kinds)}]' if options.show_types else name)
+    return 0
+
+
+def _echo(graph: 'Graph', options: argparse.Namespace) -> int:
+    from t3mpc_ros.nodes.graph_tools import message_text
+
+    for message in graph.messages(options.topic):
+        if message is not None:
+            print(f'{message_text(message, options.field)}---', flush=True)
+            if options.once:
+                break
+    return 0
+
+
+def _rate(graph: 'Graph', options: argparse.Namespace) -> int:
+    from t3mpc_ros.nodes.graph_tools import RateMeter
+
+    meter, due = RateMeter(), time.monotonic() + REPORT_PERIOD
+    for message in graph.messages(options.topic):
+        now = time.monotonic()
+        if message is not None:
+            meter.arrived(now)
+        elif now >= due:
+            due += REPORT_PERIOD
+            if text := meter.text():
+                print(text, flush=True)
+    return 0
+
+
+def _list_parameters(graph: 'Graph', options: argparse.Namespace) -> int:
+    if options.node:
+        print('\n'.join(graph.parameter_names(options.node)))
+        return 0
+    for node in graph.nodes():
+        print('\n  '.join([f'{node}:', *graph.parameter_names(node)]))
+    return 0
+
+
+def _get_parameter(graph: 'Graph', options: argparse.Namespace) -> int:
+    print(graph.parameter_text(options.node, options.name))
+    return 0
+
+
+def _set_parameter(graph: 'Graph', options: argparse.Namespace) -> int:
+    value = yaml.safe_load(options.value)
+    if problem := graph.set_parameter(options.node, options.name, value):
+        print(f'Setting parameter failed: {problem}', file=sys.stderr)
+        return 1
+    print('Set parameter successful')
+    return 0
+
+
+def _call(graph: 'Graph', options: argparse.Namespace) -> int:
+    from t3mpc_ros.nodes.graph_tools import message_text
+
+    values = yaml.safe_load(options.values)
+    if not isinstance(values, dict):
+        raise ValueError(f'the fields must be a YAML mapping, like {{data: true}}: got {values!r}')
+    print(message_text(graph.call_by_name(options.service, values)), end='')
+    return 0
+
+
+def _stop(graph: 'Graph', options: argparse.Namespace) -> int:
+    problems = graph.stop_robots()
+    for name, problem in problems.items():
+        print(f'{name}: {problem or "latched"}', file=sys.stderr if problem else sys.stdout)
+    if not problems:
+        print(
+            'no robot in reach offers e_stop; is ROS_DOMAIN_ID that of the robot?', file=sys.stderr
+        )
+    return 0 if problems and not any(problems.values()) else 1

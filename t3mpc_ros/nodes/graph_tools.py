@@ -1,0 +1,357 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Tools for a graph without a ROS installation: topics, parameters, services, e-stop.
+
+Words and output are those of ``ros2 topic``, ``ros2 param`` and ``ros2 service call``.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+import importlib
+import math
+import statistics
+import time
+from typing import Any
+
+from rcl_interfaces.msg import ParameterType
+from rcl_interfaces.srv import GetParameters, ListParameters
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import parameter_value_to_python
+from rclpy.signals import SignalHandlerOptions
+from std_srvs.srv import SetBool
+import yaml
+
+from t3mpc_ros.nodes.common import qos
+from t3mpc_ros.nodes.common.graph_introspection import message_class
+from t3mpc_ros.nodes.common.remote_parameters import RemoteParameters
+
+LISTING = 1.5
+"""Time in which nodes are discovered before they are listed, s."""
+DISCOVERY = 6.0
+"""Longest wait for something that is asked for by name, s."""
+REPLY = 5.0
+"""Longest wait for the answer of a service, s."""
+E_STOP = 'e_stop'
+WINDOW = 10_000
+"""Number of messages over which a rate is averaged."""
+
+_VALUE_TEXTS = {
+    ParameterType.PARAMETER_BOOL: 'Boolean value is',
+    ParameterType.PARAMETER_INTEGER: 'Integer value is',
+    ParameterType.PARAMETER_DOUBLE: 'Double value is',
+    ParameterType.PARAMETER_STRING: 'String value is',
+    ParameterType.PARAMETER_BOOL_ARRAY: 'Boolean values are',
+    ParameterType.PARAMETER_INTEGER_ARRAY: 'Integer values are',
+    ParameterType.PARAMETER_DOUBLE_ARRAY: 'Double values are',
+    ParameterType.PARAMETER_STRING_ARRAY: 'String values are',
+}
+
+
+class GraphError(RuntimeError):
+    """Something asked of the graph that it does not have, or an answer that did not come."""
+
+
+class Graph:
+    """A node that looks at the graph and asks other nodes.
+
+    Parameters
+    ----------
+    node
+        The node; not spun by anything else.
+    stop
+        Returns whether to end a wait.
+    """
+
+    def __init__(self, node: Node, stop: Callable[[], bool] = lambda: False) -> None:
+        self._node = node
+        self._stop = stop
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(node)
+
+    def discover(self, found: Callable[[], bool] | None = None) -> None:
+        """Wait until ``found`` returns True; without it, until a list is as good as complete."""
+        if found is None:
+            self._spin_until(lambda: False, LISTING)
+        else:
+            self._spin_until(found, DISCOVERY)
+
+    def close(self) -> None:
+        """End the executor."""
+        self._executor.remove_node(self._node)
+        self._executor.shutdown()
+
+    def _spin_until(self, done: Callable[[], bool], seconds: float) -> bool:
+        deadline = time.monotonic() + seconds
+        while not self._stop() and time.monotonic() < deadline:
+            if done():
+                return True
+            self._executor.spin_once(timeout_sec=0.05)
+        return done()
+
+    # -- topics -----------------------------------------------------------------------------------
+
+    def topics(self) -> Mapping[str, Sequence[str]]:
+        """Return the types of each topic, without those of this node alone."""
+        self.discover()
+        own = {'/rosout', '/parameter_events'}
+        found = dict(self._node.get_topic_names_and_types())
+        return {
+            name: kinds
+            for name, kinds in sorted(found.items())
+            if name not in own or self._node.count_publishers(name) > 0
+        }
+
+    def messages(self, topic: str) -> Iterator[Any]:
+        """Yield the messages of a topic from now on, and None about twenty times a second.
+
+        The request matches the offers of the publishers.
+
+        Raises
+        ------
+        GraphError
+            Nothing publishes the topic, or its type is not installed or not unique.
+        """
+        name = self._node.resolve_topic_name(topic)
+        self.discover(lambda: self._node.count_publishers(name) > 0)
+        offers = self._node.get_publishers_info_by_topic(name)
+        kinds = sorted({info.topic_type for info in offers})
+        if len(kinds) != 1:
+            known = f'its types are {", ".join(kinds)}' if kinds else 'nothing publishes it'
+            raise GraphError(f'no messages of {name}: {known} (t3mpc topic list)')
+        try:
+            kind = message_class(kinds[0])
+        except ImportError as error:
+            raise GraphError(f'the type of {name} is not installed: {error}') from None
+        waiting: deque[Any] = deque()
+        profile = qos.adapt_request_to_offers([info.qos_profile for info in offers])
+        subscription = self._node.create_subscription(
+            kind, name, lambda message: waiting.append(message), profile
+        )
+        try:
+            while not self._stop():
+                self._executor.spin_once(timeout_sec=0.05)
+                while waiting:
+                    yield waiting.popleft()
+                yield None
+        finally:
+            self._node.destroy_subscription(subscription)
+
+    # -- parameters -------------------------------------------------------------------------------
+
+    def nodes(self) -> Sequence[str]:
+        """Return the full names of the other nodes."""
+        self.discover()
+        names = {
+            f'{where.rstrip("/")}/{name}'
+            for name, where in self._node.get_node_names_and_namespaces()
+        }
+        return sorted(names - {self._node.get_fully_qualified_name()})
+
+    def parameter_names(self, node: str) -> Sequence[str]:
+        """Return the names of the parameters of a node, sorted."""
+        answer = self.call(f'{node}/list_parameters', ListParameters, ListParameters.Request())
+        return sorted(answer.result.names)
+
+    def parameter_text(self, node: str, name: str) -> str:
+        """Return a value with its type in words.
+
+        Raises
+        ------
+        GraphError
+            The node has no such parameter, or does not answer.
+        """
+        request = GetParameters.Request(names=[name])
+        values = self.call(f'{node}/get_parameters', GetParameters, request).values
+        value = values[0] if values else None
+        if value is None or value.type not in _VALUE_TEXTS:
+            raise GraphError(f'{node} has no parameter {name} (t3mpc param list {node})')
+        plain = parameter_value_to_python(value)
+        shown = plain if isinstance(plain, bool | int | float | str) else list(plain)
+        return f'{_VALUE_TEXTS[value.type]}: {shown}'
+
+    def set_parameter(self, node: str, name: str, value: object) -> str:
+        """Set a parameter; return the reason of a refusal, or nothing.
+
+        Raises
+        ------
+        GraphError
+            The node has no such parameter, or does not answer.
+        ValueError
+            The value cannot be one of its type.
+        """
+        remote = RemoteParameters(self._node, node)
+        answers: list[Any] = []
+        try:
+            if not self._spin_until(remote.ready, DISCOVERY):
+                raise GraphError(f'{node} is no node with parameters (t3mpc param list)')
+            remote.read(answers.append)
+            if self._spin_until(lambda: len(answers) > 0, REPLY):
+                remote.set(name, value, answers.append)
+            if not self._spin_until(lambda: len(answers) > 1, REPLY):
+                raise GraphError(f'no answer of {node} within {REPLY:g} s: is it alive?')
+        finally:
+            remote.destroy()
+        return str(answers[1])
+
+    # -- services ---------------------------------------------------------------------------------
+
+    def services(self) -> Mapping[str, Sequence[str]]:
+        """Return the types of each service."""
+        return dict(sorted(self._node.get_service_names_and_types()))
+
+    def call(self, name: str, kind: type, request: Any) -> Any:
+        """Return the answer of a service.
+
+        Raises
+        ------
+        GraphError
+            No node offers it, or the answer does not come.
+        """
+        client = self._node.create_client(kind, name)
+        try:
+            if not self._spin_until(client.service_is_ready, DISCOVERY):
+                raise GraphError(f'no node offers the service {client.srv_name}')
+            future = client.call_async(request)
+            if not self._spin_until(future.done, REPLY):
+                raise GraphError(f'no answer of {client.srv_name} within {REPLY:g} s')
+            return future.result()
+        finally:
+            self._node.destroy_client(client)
+
+    def call_by_name(self, name: str, values: Mapping[str, object]) -> Any:
+        """Return the answer of a service whose type the graph knows; fields by name.
+
+        Raises
+        ------
+        GraphError
+            No node offers it, its type is not installed, or a field does not fit.
+        """
+        full = self._node.resolve_service_name(name)
+        self.discover(lambda: full in self.services())
+        kinds = self.services().get(full)
+        if not kinds:
+            raise GraphError(f'no node offers the service {full}')
+        package, _, word = kinds[0].split('/')
+        try:
+            kind = getattr(importlib.import_module(f'{package}.srv'), word)
+        except (ImportError, AttributeError):
+            raise GraphError(f'the type of {full} is not installed: {kinds[0]}') from None
+        request = kind.Request(check_fields=True)
+        for field, value in values.items():
+            if field not in request.get_fields_and_field_types():
+                known = ', '.join(request.get_fields_and_field_types()) or 'none'
+                raise GraphError(f'{kinds[0]} has no field {field}; its fields: {known}')
+            try:
+                setattr(request, field, value)
+            except AssertionError as error:
+                raise GraphError(f'{field} of {kinds[0]}: {error}') from None
+        return self.call(full, kind, request)
+
+    def stop_robots(self) -> Mapping[str, str]:
+        """Latch the e-stop of every robot in reach; return the problem of each, or nothing."""
+        self.discover(lambda: bool(self._e_stops()))
+        self.discover()  # the others
+        clients = {name: self._node.create_client(SetBool, name) for name in self._e_stops()}
+        self._spin_until(
+            lambda: all(client.service_is_ready() for client in clients.values()), LISTING
+        )
+        # All at once: a robot that does not answer holds up no other one.
+        sent = {
+            name: client.call_async(SetBool.Request(data=True)) for name, client in clients.items()
+        }
+        self._spin_until(lambda: all(future.done() for future in sent.values()), REPLY)
+        problems = {}
+        for name, future in sent.items():
+            answer = future.result() if future.done() else None
+            problems[name] = (
+                f'no answer within {REPLY:g} s'
+                if answer is None
+                else ''
+                if answer.success
+                else answer.message
+            )
+        for client in clients.values():
+            self._node.destroy_client(client)
+        return problems
+
+    def _e_stops(self) -> Sequence[str]:
+        return [
+            name
+            for name, kinds in self.services().items()
+            if name.rpartition('/')[2] == E_STOP and 'std_srvs/srv/SetBool' in kinds
+        ]
+
+
+@contextmanager
+def graph(stop: Callable[[], bool] = lambda: False) -> Iterator[Graph]:
+    """Return a graph in a context of its own, which ends with the ``with`` block."""
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    node = Node('t3mpc', start_parameter_services=False, enable_rosout=False)
+    opened = Graph(node, stop)
+    try:
+        yield opened
+    finally:
+        opened.close()
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def plain(message: Any) -> Any:
+    """Return a message as dictionaries, lists and numbers, fields in their order."""
+    if hasattr(message, 'get_fields_and_field_types'):
+        names = message.get_fields_and_field_types()
+        return {name: plain(getattr(message, name)) for name in names}
+    if isinstance(message, bytes):
+        return int.from_bytes(message, 'little')
+    if isinstance(message, bool | int | float | str):
+        return message
+    return [plain(each) for each in message]
+
+
+def message_text(message: Any, field: str = '') -> str:
+    """Return a message, or one of its fields (``pose.pose.position``), as YAML.
+
+    Raises
+    ------
+    GraphError
+        It has no such field.
+    """
+    for name in field.split('.') if field else ():
+        known = getattr(message, 'get_fields_and_field_types', dict)()
+        if name not in known:
+            raise GraphError(f'no field {name}; its fields: {", ".join(known) or "none"}')
+        message = getattr(message, name)
+    shown = plain(message)
+    if not isinstance(shown, dict | list):
+        return f'{shown}\n'
+    text: str = yaml.safe_dump(shown, sort_keys=False, allow_unicode=True)
+    return text
+
+
+class RateMeter:
+    """Rate of the messages of a topic, by the times of their arrival."""
+
+    def __init__(self) -> None:
+        self._last: float | None = None
+        self._periods: deque[float] = deque(maxlen=WINDOW)
+
+    def arrived(self, now: float) -> None:
+        """Count a message at time ``now``, s."""
+        if self._last is not None:
+            self._periods.append(now - self._last)
+        self._last = now
+
+    def text(self) -> str:
+        """Return rate, least and largest period and their deviation; '' before two messages."""
+        if not self._periods:
+            return ''
+        mean = statistics.fmean(self._periods)
+        rate = 1.0 / mean if mean > 0.0 else math.inf
+        return (
+            f'average rate: {rate:.3f}\n'
+            f'\tmin: {min(self._periods):.3f}s max: {max(self._periods):.3f}s '
+            f'std dev: {statistics.pstdev(self._periods):.5f}s window: {len(self._periods) + 1}'
+        )

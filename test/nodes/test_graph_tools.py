@@ -1,0 +1,132 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Topics, parameters, services and e-stop without a ROS installation."""
+
+from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
+
+import pytest
+from rclpy.node import Node
+from std_srvs.srv import SetBool
+import yaml
+
+from t3mpc_ros.nodes.common.conversions import quaternion_from_yaw
+from t3mpc_ros.nodes.graph_tools import Graph, GraphError, RateMeter, message_text
+from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
+from t3mpc_ros.nodes.sim_robot import SimRobotNode
+
+
+class Asked:
+    """Asks the graph in a thread while the harness spins its nodes."""
+
+    def __init__(self, harness):
+        self._harness = harness
+        self._node = Node('asking')
+        self._graph = Graph(self._node)
+
+    def __call__(self, method, *arguments):
+        with ThreadPoolExecutor(1) as pool:
+            reply = pool.submit(getattr(self._graph, method), *arguments)
+            self._harness.spin_until(reply.done)
+        return reply.result()
+
+    def messages(self, topic, count):
+        with ThreadPoolExecutor(1) as pool:
+            found = filter(None, self._graph.messages(topic))
+            reply = pool.submit(lambda: list(islice(found, count)))
+            self._harness.spin_until(reply.done)
+        return reply.result()
+
+    def close(self):
+        self._graph.close()
+        self._node.destroy_node()
+
+
+@pytest.fixture
+def asked(harness):
+    asked = Asked(harness)
+    yield asked
+    asked.close()
+
+
+@pytest.mark.ros
+def test_topics_have_types_and_messages(asked, harness):
+    harness.add(SimRobotNode)
+    assert asked('topics')['/odom'] == ['nav_msgs/msg/Odometry']
+    first, second = asked.messages('odom', 2)
+    assert yaml.safe_load(message_text(first, 'header.frame_id')) == 'odom'
+    assert second.header.stamp != first.header.stamp
+    with pytest.raises(GraphError, match='no messages of /odam: nothing publishes it'):
+        asked.messages('odam', 1)
+
+
+@pytest.mark.ros
+def test_parameters_are_listed_read_and_set(asked, harness):
+    robot = harness.add(SimRobotNode)
+    assert '/sim_robot' in asked('nodes')
+    assert 'faults.command_loss' in asked('parameter_names', '/sim_robot')
+    text = asked('parameter_text', '/sim_robot', 'drive.kind')
+    assert text == f'String value is: {robot.parameters.drive.kind}'
+    assert asked('set_parameter', '/sim_robot', 'faults.command_loss', 0.5) == ''
+    assert robot.parameters.faults.command_loss == 0.5
+    assert 'read-only' in asked('set_parameter', '/sim_robot', 'drive.kind', 'velocity')
+    for node, name, words in (
+        ('/sim_robot', 'no_such', 'has no parameter no_such'),
+        ('/nobody', 'rate', 'no node offers the service /nobody/get_parameters'),
+    ):
+        with pytest.raises(GraphError, match=words):
+            asked('parameter_text', node, name)
+
+
+@pytest.mark.ros
+def test_services_are_called_with_the_type_of_the_graph(asked, harness):
+    generator = harness.add(ReferenceGeneratorNode)
+    assert asked('call_by_name', 'reference_generator/pause', {'data': True}).success
+    assert generator.produce_diagnostics()[1] == 'paused'
+    for name, values, words in (
+        ('reference_generator/pause', {'on': True}, 'has no field on; its fields: data'),
+        ('reference_generator/pause', {'data': 'yes'}, 'data of std_srvs/srv/SetBool: '),
+        ('pause', {}, 'no node offers the service /pause'),
+    ):
+        with pytest.raises(GraphError, match=words):
+            asked('call_by_name', name, values)
+
+
+@pytest.mark.ros
+def test_stop_stops_every_robot_whatever_its_namespace(asked, harness):
+    assert asked('stop_robots') == {}
+    robots = [harness.add(SimRobotNode, namespace=name) for name in (None, 'east', 'far/west')]
+
+    def refuse(request, response):
+        response.message = 'out of order'
+        return response
+
+    harness.probe.create_service(SetBool, 'broken/e_stop', refuse)
+    harness.spin_until(lambda: len(asked('stop_robots')) == 4)
+    problems = asked('stop_robots')
+    assert problems == {
+        '/e_stop': '',
+        '/east/e_stop': '',
+        '/far/west/e_stop': '',
+        '/broken/e_stop': 'out of order',
+    }
+    for robot in robots:
+        harness.spin_until(lambda each=robot: each._state.status.estop)
+
+
+def test_messages_are_yaml_with_fields_in_their_order():
+    message = quaternion_from_yaw(0.0)
+    assert message_text(message) == 'x: 0.0\ny: 0.0\nz: 0.0\nw: 1.0\n'
+    assert message_text(message, 'w') == '1.0\n'
+    with pytest.raises(GraphError, match='no field v; its fields: x, y, z, w'):
+        message_text(message, 'v')
+
+
+def test_the_rate_is_that_of_the_arrivals():
+    meter = RateMeter()
+    assert meter.text() == ''
+    for k in range(11):
+        meter.arrived(0.01 * k + (0.001 if k % 2 else 0.0))
+    assert meter.text() == (
+        'average rate: 100.000\n\tmin: 0.009s max: 0.011s std dev: 0.00100s window: 11'
+    )
