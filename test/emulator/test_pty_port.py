@@ -10,82 +10,15 @@ import signal
 import subprocess
 import sys
 import termios
-import time
 
 import pytest
 
-from t3mpc_ros.cli import emulator
+from t3mpc_ros.cli import emulator, robot
 from t3mpc_ros.emulator.pty_port import PtyPort, PtyPortError
-from t3mpc_ros.geometry.types import WheelSpeeds
-from t3mpc_ros.radio.link.link import Link
-from t3mpc_ros.radio.link.link_parameters import LinkParameters
-from t3mpc_ros.radio.link.port_actions import Close, LinkState, Open, Wait, Write
 from t3mpc_ros.radio.serial_port import PortError, SerialPort
 
 ROOT = Path(__file__).resolve().parents[2]
 KEY = bytes(range(16))
-
-
-class Host:
-    """Host link over a real port, on the wall clock."""
-
-    def __init__(self, path, key=b''):
-        self.path = str(path)
-        self.link = Link(LinkParameters(), key)
-        self.port = None
-        self.wheels = None
-
-    def run(self, seconds, until=None):
-        """Run for a time or until ``until`` holds; return whether it holds."""
-        end = time.monotonic() + seconds
-        received = b''
-        while time.monotonic() < end:
-            now = time.monotonic_ns()
-            if self.wheels is not None:
-                self.link.command(self.wheels, now + 250_000_000)
-            wake = now
-            actions = self.link.step(now, received)
-            received = b''
-            for action in actions:
-                wake = self._do(action, wake)
-            if until is not None and until():
-                return True
-            received = self._read(min((wake - time.monotonic_ns()) / 1e9, 0.02))
-        return until is None
-
-    def _do(self, action, wake):
-        now = time.monotonic_ns()
-        try:
-            if isinstance(action, Wait):
-                return action.until_ns
-            if isinstance(action, Open):
-                self.port = SerialPort(self.path)
-                self.link.port_opened(now)
-            elif isinstance(action, Close):
-                self.close()
-            elif isinstance(action, Write) and self.port is not None:
-                self.port.write(action.data)
-        except PortError as error:
-            self.port = None
-            self.link.port_failed(str(error), error.absent, now)
-        return now
-
-    def _read(self, seconds):
-        if self.port is None:
-            time.sleep(max(seconds, 0.001))
-            return b''
-        try:
-            select.select([self.port.fileno()], [], [], max(seconds, 0.0))
-            return self.port.read()
-        except PortError as error:
-            self.port = None
-            self.link.port_failed(str(error), error.absent, time.monotonic_ns())
-            return b''
-
-    def close(self):
-        if self.port is not None:
-            self.port.close()
-            self.port = None
 
 
 class Process:
@@ -127,34 +60,25 @@ def start():
 
 
 @pytest.mark.slow
-def test_a_host_drives_the_process_over_a_pty_with_a_key(start, tmp_path):
+def test_a_command_drives_the_process_over_a_pty_with_a_key(start, tmp_path, capsys):
     key_file = tmp_path / 'key'
     key_file.write_text(KEY.hex())
     key_file.chmod(0o600)
     path = tmp_path / 'dongle'
-    # Faults on the clock of the emulator: on a busy machine it is slower than that of the host.
-    process = start('--link', path, '--key', key_file, '--loss', '0.05', '--fault', 'close_port:4')
+    process = start('--link', path, '--key', key_file, '--loss', '0.05', '--fault', 'jam:0:0.2')
     ready = process.ready()
     assert str(path) in ready
     assert f'kill {process.child.pid}' in ready
-    host = Host(path, KEY)
-    link = host.link
-    assert host.run(10.0, lambda: link.state is LinkState.RUN)
-    host.wheels = WheelSpeeds(4.0, 4.0)
-    assert host.run(5.0, lambda: link.telemetry is not None and link.telemetry.wheels.right > 3.5)
-    assert link.authenticated
-    assert host.run(10.0, lambda: link.state is LinkState.CLOSED)
-    assert host.run(15.0, lambda: link.state is LinkState.RUN)
-    link.shut_down()
-    assert host.run(5.0, lambda: link.state is LinkState.DONE)
-    host.close()
+    jog = ['jog', 'left', '0.2', '--port', str(path), '--yes']
+    assert robot.main(jog) == 2
+    assert 'give the host the key' in capsys.readouterr().err
+    assert robot.main([*jog, '--key', str(key_file)]) == 0
     code, output = process.stop(signal.SIGTERM)
     assert code == 0
     *reports, last = output.splitlines()
     assert last == 't3mpc emulator: stopped'
-    # One stop when the dongle is unplugged, and one at the end if the wheels turned again.
     times = [re.search('at rest ([0-9.]+) s after the last command', line)[1] for line in reports]
-    assert max(map(float, times)) <= 0.45
+    assert max(map(float, times), default=0.0) <= 0.45
     assert not path.is_symlink()
 
 

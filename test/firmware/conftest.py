@@ -7,6 +7,7 @@ from pathlib import Path
 import shutil
 
 import pytest
+from support.avr_boards import booted
 from support.firmware_core import ACCELERATION, DECELERATION, KEY, OK, Robot, compile_core
 
 GOLDEN = Path(__file__).resolve().parents[1] / 'golden' / 'radio_vectors.json'
@@ -51,3 +52,9 @@ def golden():
     if not GOLDEN.exists():
         pytest.skip('test/golden/radio_vectors.json is not there')
     return json.loads(GOLDEN.read_text())
+
+
+@pytest.fixture
+def boards():
+    """Yield both boards in simavr; at the end their data sheets were kept."""
+    yield from booted()

@@ -6,7 +6,6 @@ Nothing here has touched silicon: simavr executes both programs, a register-leve
 nRF24L01+ joins them. Time is virtual, all losses are seeded.
 """
 
-from collections.abc import Iterator
 import json
 from pathlib import Path
 import statistics
@@ -17,7 +16,6 @@ from support.avr_boards import (
     DONGLE,
     ROBOT,
     Boards,
-    booted,
     build,
     drive,
     missing_tools,
@@ -35,11 +33,6 @@ pytestmark = pytest.mark.skipif(bool(missing_tools()), reason=f'not installed: {
 FIRST_PHASE = 1700
 """us; the next command reaches the robot 2.7 ms after the last state was sampled"""
 VECTORS = json.loads((Path(__file__).parents[1] / 'golden' / 'radio_vectors.json').read_text())
-
-
-@pytest.fixture
-def boards() -> Iterator[Boards]:
-    yield from booted()
 
 
 # -- frames ---------------------------------------------------------------------------------------

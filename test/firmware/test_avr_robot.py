@@ -2,15 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The real firmware of both boards in simavr: motion, stops, failures, sensors."""
 
-from collections.abc import Iterator
-
 import pytest
 from support.avr_boards import (
     DONGLE,
     GAP,
     ROBOT,
     Boards,
-    booted,
     drive,
     missing_tools,
     odometry_agrees,
@@ -32,11 +29,6 @@ EXTERNAL_RESET, WATCHDOG_RESET = 2, 8
 TIMER_0_INTERRUPTS = 0x6E  # TIMSK0 of the ATmega2560
 KEY_ADDRESS = 8
 SLOW_GAP = 20  # 5 ms: a signed HELLO takes four hashes
-
-
-@pytest.fixture
-def boards() -> Iterator[Boards]:
-    yield from booted()
 
 
 # -- motion and stops -----------------------------------------------------------------------------

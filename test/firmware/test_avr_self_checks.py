@@ -2,10 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Faults that the firmware has to find by itself, in simavr: no error bit reports them."""
 
-from collections.abc import Iterator
-
 import pytest
-from support.avr_boards import DONGLE, IMU, Boards, booted, build, missing_tools
+from support.avr_boards import DONGLE, IMU, Boards, build, missing_tools
 from support.long_tests import few_of
 
 from t3mpc_ros.radio.protocol import codec
@@ -18,11 +16,6 @@ LINE_RATE = 50_000
 """Bytes per second."""
 TTL = 0.2
 """s"""
-
-
-@pytest.fixture
-def boards() -> Iterator[Boards]:
-    yield from booted()
 
 
 def _drained(boards: Boards) -> int:

@@ -19,7 +19,6 @@ from support.avr_boards import (
     FIRMWARE,
     ROBOT,
     Boards,
-    booted,
     console_output,
     cycle,
     missing_tools,
@@ -53,11 +52,6 @@ KEY_ADDRESS, MARK_ADDRESS = 8, 26
 WRITING = 0.3
 """Sufficient time to write a key, s: about 25 cells of 3.4 ms, started in passes of 0.4 ms."""
 HOST_NONCE = b'hostnonc'
-
-
-@pytest.fixture
-def boards() -> Iterator[Boards]:
-    yield from booted()
 
 
 def begin_session(boards: Boards, key: bytes, gap: int = 20) -> Signer | None:

@@ -70,23 +70,6 @@ def test_energy_is_the_integral_of_the_voltage_curve():
     assert balance == pytest.approx(expected, rel=2e-4)
 
 
-def test_charge_integrates_the_current_until_empty():
-    cell, generator = battery(charge=0.4), np.random.default_rng(2)
-    drawn = 0.0
-    while cell.charge > 0.0:
-        dt = generator.uniform(0.1, 10.0)
-        drawn += cell.draw(generator.uniform(0.0, 20.0), dt).current * dt
-        assert cell.charge == pytest.approx(0.4 - drawn / FULL, abs=1e-12)
-    assert drawn == pytest.approx(0.4 * FULL, rel=1e-12)
-
-
-def test_voltage_falls_monotonically_under_constant_load():
-    cell = battery()
-    voltages = [cell.draw(15.0, 5.0).voltage for _ in range(900)]
-    assert cell.charge < 0.15
-    assert np.all(np.diff(voltages) < 0.0)
-
-
 def test_empty_battery_delivers_nothing():
     cell = battery(charge=0.001)
     for _ in range(100):

@@ -147,7 +147,7 @@ def test_joint_of_collinear_walls_adds_no_force():
 
 def test_force_is_continuous_at_joints_and_corners():
     """A force that jumps at a joint would shake a robot that slides along the wall."""
-    step = 1e-5
+    step = 5e-5
     # Bound of the change per metre of a segment, a corner, or a sum of two.
     bound = 4.0 * STIFFNESS * step
     for turn in (-1.5, -0.5, -0.05, -0.002, 0.0, 0.002, 0.05, 0.5, 1.5):

@@ -210,15 +210,6 @@ def test_battery_collapse_causes_a_brown_out():
     assert BROWN_OUT_REASON in {state.reason for state in states}
 
 
-def test_lasting_slip_stops_the_robot_with_a_reason():
-    robot = DigitalTwin(parameters())
-    drive(robot, [STILL] * 150)  # the gyro bias is estimated at a standstill
-    faulty(robot, wheel_blocked='right')
-    states = [robot.step(WheelSpeeds(3.0, 3.0)) for _ in range(250)]
-    assert any(state.status.slipping for state in states)
-    assert any('a wheel slips, is blocked, or has lost steps' in state.reason for state in states)
-
-
 def test_active_faults_are_reported_immediately():
     robot = DigitalTwin(parameters(faults__slippery=0.5, faults__load_change=1.0))
     assert robot.diagnostics.faults == ('load_change 1 kg', 'slippery 0.5')

@@ -75,14 +75,6 @@ def test_nominal_step_response_is_a_first_order_lag():
     assert wheels[:, 1] == pytest.approx(expected, abs=1e-6)
 
 
-def test_step_response_converges_with_order_four():
-    def error(substep: float) -> float:
-        wheels = response(robot(substep=substep), WheelSpeeds(10.0, 10.0), 5)
-        return float(np.abs(wheels[-1, 0] - 10.0 * (1.0 - math.exp(-0.05 / LAG))))
-
-    assert math.log2(error(0.005) / error(0.0025)) == pytest.approx(4.0, abs=0.4)
-
-
 def test_turning_lag_is_exact_only_without_com_offset():
     times = 0.01 * np.arange(1, 16)
     shape = 1.0 - np.exp(-times / LAG)

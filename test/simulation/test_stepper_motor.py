@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from support.long_tests import few_of
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import WheelSpeeds
@@ -156,7 +157,7 @@ def test_commands_within_the_torque_lose_no_steps():
                 assert robot.lost_steps == (0, 0)
 
 
-@pytest.mark.parametrize('seed', range(20))
+@pytest.mark.parametrize('seed', few_of(range(20), 4))
 def test_ramp_beyond_the_torque_always_loses_steps(seed):
     motor = StepperMotorParameters()
     generator = np.random.default_rng(seed)
