@@ -188,7 +188,7 @@ def test_a_replugged_port_is_retried_at_once():
     bench.run(8.0)
     assert np.diff(bench.opens)[-1] / 1e9 == pytest.approx(2.0)
     bench.problem = ('/dev/ttyUSB0 is not there', True)
-    bench.plugged = False
+    bench.unplug()
     bench.run(6.0)
     np.testing.assert_allclose(np.diff(bench.opens[-10:]) / 1e9, 0.2)
     assert bench.link.reason(bench.now_ns) == '/dev/ttyUSB0 is not there'

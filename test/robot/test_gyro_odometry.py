@@ -515,6 +515,12 @@ def test_reset_keeps_the_bias_estimate():
     assert odometry.pose == (1.0, 2.0, 0.5)
     assert not odometry.covariance.any()
     assert (odometry.bias, odometry.bias_std, odometry.calibrated) == (bias, sure, True)
+    # What is learnt of the bias from now on corrects no drift from before the reset.
+    robots.bias += DEGREE
+    robots.stand(odometries, 3.0)
+    assert odometry.bias - bias > 0.5 * DEGREE
+    assert odometry.pose[:2] == (1.0, 2.0)
+    assert 0.0 <= odometry.pose.yaw - 0.5 < 0.6 * DEGREE  # until the standstill is detected
     odometry.reset()
     assert odometry.pose == (0.0, 0.0, 0.0)
 

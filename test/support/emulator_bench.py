@@ -54,6 +54,13 @@ class Bench:
         """Each write of the host, with its time."""
         self.followed = []
         """Each command that the robot has executed, with its time."""
+        self.problem = ('dongle is not there', True)
+        """Why the port cannot be opened, and whether it is absent."""
+        self.opens = []
+        """Time of each attempt to open the port."""
+        self.closes = 0
+        self.link_states = []
+        """States of the link, in order."""
         self.each = None
         self.emulator.board.on_command = self._record_command
 
@@ -111,23 +118,29 @@ class Bench:
             self.wake_ns = self.now_ns + 1000 * MS
             return
         actions = self._step_link(received)
-        while actions:
-            action = actions.pop(0)
-            if isinstance(action, Wait):
-                self.wake_ns = action.until_ns
-            elif isinstance(action, Write) and self.is_open:
+        assert [isinstance(action, Wait) for action in actions].index(True) == len(actions) - 1
+        assert actions[-1].until_ns >= self.now_ns
+        self.wake_ns = actions[-1].until_ns
+        for action in actions[:-1]:
+            if isinstance(action, Write) and self.is_open:
                 self.written.append((self.now_ns, action.data))
                 self.emulator.feed(action.data, self.now_ns)
             elif isinstance(action, Close):
+                self.closes += 1
                 self.is_open = False
             elif isinstance(action, Open):
-                self.is_open = self.emulator.port_open
-                if self.is_open:
-                    self.link.port_opened(self.now_ns)
-                else:
-                    self.link.port_failed('dongle is not there', True, self.now_ns)
-                self.wake_ns = self.now_ns
-                actions = []
+                self._open()
+        if not self.link_states or self.link_states[-1] is not self.link.state:
+            self.link_states.append(self.link.state)
+
+    def _open(self):
+        self.opens.append(self.now_ns)
+        self.wake_ns = self.now_ns
+        self.is_open = self.emulator.port_open and self.problem[1]
+        if self.is_open:
+            self.link.port_opened(self.now_ns)
+        else:
+            self.link.port_failed(*self.problem, self.now_ns)
 
     def _command(self):
         if self.wheels is not None and self.now_ns >= self.commanded_ns + 20 * MS:

@@ -5,17 +5,13 @@
 import math
 import random
 
-from t3mpc_ros.geometry.types import WheelSpeeds
-from t3mpc_ros.radio.link.link import Link
-from t3mpc_ros.radio.link.link_parameters import LinkParameters
-from t3mpc_ros.radio.link.port_actions import Close, LinkState, Open, Wait, Write
+from support.emulator_bench import MS, START_NS, Bench
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import CommandVerifier
 from t3mpc_ros.radio.protocol.codec import decode_downlink, decode_to_dongle, encode
 from t3mpc_ros.radio.protocol.frames import BOARD_PARAMETERS, CommandFlag, StatusFlag
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
 
-MS = 1_000_000
 COMMAND_TIME = 250 * MS
 STEP = math.tau / 3200
 WRAP = 1 << 32
@@ -190,7 +186,10 @@ class FakeRobot:
 
 
 class FakeDongle:
-    """Answers each frame after its real duration; faults are attributes and methods."""
+    """Answers each frame after its real duration; faults are attributes and methods.
+
+    It has the interface of the emulator.
+    """
 
     def __init__(self, robot, seed=1):
         self.robot = robot
@@ -204,6 +203,8 @@ class FakeDongle:
         self.jitter_ns = 0
         self.requests = []
         self.boot_delay_ns = 0
+        self.board, self.now_ns = robot, START_NS
+        self.port_open, self.replies = True, []
         self.restart(0)
 
     def restart(self, now_ns):
@@ -224,6 +225,19 @@ class FakeDongle:
             and now_ns >= self.jam_until_ns
             and self.source.random() >= self.loss
         )
+
+    @property
+    def next_ns(self):
+        return self.replies[0][0] if self.replies else None
+
+    def feed(self, data, now_ns):
+        self.replies = sorted(self.replies + self.receive(data, now_ns))
+
+    def run_to(self, now_ns):
+        self.now_ns = now_ns
+        due = [reply for reply in self.replies if reply[0] <= now_ns]
+        del self.replies[: len(due)]
+        return due
 
     def receive(self, data, now_ns):
         """Return (time, bytes) of each reply."""
@@ -275,97 +289,20 @@ class FakeDongle:
         return now_ns + 3 * MS, frames.Result(frame.id, first, second, clock, payload)
 
 
-class LinkBench:
-    """Runs a link against a scripted port in virtual time."""
+class LinkBench(Bench):
+    """Runs a link against the scripted dongle and robot in virtual time."""
 
     def __init__(self, parameters=None, key=b'', robot=None, seed=1, robot_key=None):
-        entropy = random.Random(seed)
         self.robot = robot or FakeRobot(key if robot_key is None else robot_key)
         self.dongle = FakeDongle(self.robot)
-        self.link = Link(parameters or LinkParameters(), key, entropy.randbytes)
-        self.now_ns = 5_000_000_000
-        self.plugged = True
-        self.problem = ('dongle is not there', True)
-        self.is_open = False
-        self.replies = []
-        self.wake_ns = 0
-        self.link_states = []
-        self.opens = []
-        self.closes = 0
-        self.wheels = None
-        self.commanded_ns = 0
-        self.before_each = None
+        super().__init__(key=key, link=parameters, seed=seed, emulator=self.dongle)
 
     def unplug(self):
         """Unplug the dongle: the next use of the port fails."""
-        self.plugged = False
-        self.replies.clear()
+        self.dongle.port_open = False
+        self.dongle.replies.clear()
 
     def plug(self):
         """Plug the dongle in; it restarts."""
-        self.plugged = True
+        self.dongle.port_open = True
         self.dongle.restart(self.now_ns)
-
-    def run(self, seconds, until=None):
-        """Advance time; return the duration until ``until`` holds, s."""
-        start, end = self.now_ns, self.now_ns + round(seconds * 1e9)
-        while self.now_ns < end:
-            self._command()
-            received = b''
-            while self.replies and self.replies[0][0] <= self.now_ns:
-                received += self.replies.pop(0)[1]
-            if self.is_open and not self.plugged:
-                self.is_open = False
-                self.link.port_failed('dongle is not there', True, self.now_ns)
-            self._do(self.link.step(self.now_ns, received))
-            if until is not None and until():
-                break
-            times = [self.wake_ns, end, *(at for at, _ in self.replies[:1])]
-            if self.wheels is not None:
-                times.append(self.commanded_ns + 20 * MS)
-            self.now_ns = max(min(times), self.now_ns + 1000)
-        else:
-            if until is not None:
-                raise AssertionError(f'not within {seconds} s: {self.link.reason(self.now_ns)}')
-        return (self.now_ns - start) / 1e9
-
-    def drive(self, right, left):
-        """Command these wheel speeds fifty times a second."""
-        self.wheels = WheelSpeeds(right, left)
-
-    def release_controls(self):
-        """Stop sending commands."""
-        self.wheels = None
-
-    def _command(self):
-        if self.wheels is not None and self.now_ns >= self.commanded_ns + 20 * MS:
-            self.commanded_ns = self.now_ns
-            self.link.command(self.wheels, self.now_ns + COMMAND_TIME)
-
-    def _do(self, actions):
-        assert isinstance(actions[-1], Wait)
-        assert sum(isinstance(action, Wait) for action in actions) == 1
-        assert actions[-1].until_ns >= self.now_ns
-        self.wake_ns = actions[-1].until_ns
-        for action in actions:
-            if isinstance(action, Open):
-                self.opens.append(self.now_ns)
-                self.wake_ns = self.now_ns
-                if self.plugged and self.problem[1]:
-                    self.is_open = True
-                    self.replies.clear()
-                    self.link.port_opened(self.now_ns)
-                else:
-                    self.link.port_failed(*self.problem, self.now_ns)
-            elif isinstance(action, Close):
-                self.closes += 1
-                self.is_open = False
-            elif isinstance(action, Write) and self.is_open and self.plugged:
-                self.replies += self.dongle.receive(action.data, self.now_ns)
-                self.replies.sort()
-        if not self.link_states or self.link_states[-1] is not self.link.state:
-            self.link_states.append(self.link.state)
-
-    def connect(self):
-        """Advance until the link is running; return the duration, s."""
-        return self.run(10.0, lambda: self.link.state is LinkState.RUN)
