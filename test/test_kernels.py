@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 
+from numba.core.errors import TypingError
 import numpy as np
 import pytest
 
@@ -22,6 +23,31 @@ def test_division_by_zero_gives_infinity_not_an_exception():
     out = np.zeros(1)
     ratio(np.array([1.0, 0.0]), out)
     assert np.isposinf(out[0])
+
+
+def test_a_kernel_that_others_call_is_compiled_with_them():
+    @kernel
+    def square(x):
+        return x * x
+
+    @kernel
+    def sum_of_squares(values):
+        return square(values[0]) + square(values[1])
+
+    assert sum_of_squares(np.array([3.0, 4.0])) == 25.0
+    assert not square.signatures
+    assert square(3) == 9
+    assert len(square.signatures) == 1
+
+
+def test_a_kernel_that_allocates_an_array_is_rejected():
+    @kernel
+    def total(values):
+        copy = np.zeros(values.size)
+        return copy[0]
+
+    with pytest.raises(TypingError, match='zeros'):
+        total(np.ones(2))
 
 
 def test_fingerprint_depends_on_files_with_kernels_only(tmp_path):

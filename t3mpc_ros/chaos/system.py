@@ -89,7 +89,8 @@ def right_hand_side(terms: Terms, state: NDArray[np.float64], out: NDArray[np.fl
 
     state, out : shape (d,); ``out`` is overwritten and must not be ``state``
     """
-    out[:] = terms.constant
+    for i in range(out.size):
+        out[i] = terms.constant[i]
     for n in range(terms.linear_gain.size):
         out[terms.linear_index[n, 0]] += terms.linear_gain[n] * state[terms.linear_index[n, 1]]
     for n in range(terms.quadratic_gain.size):

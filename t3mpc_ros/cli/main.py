@@ -124,42 +124,37 @@ def _exponents(options: argparse.Namespace) -> int:
 
 
 def _compile(options: argparse.Namespace) -> int:
-    """Compile the kernels in two processes, each with about half of the work, then the rest."""
+    """Compile the kernels in two processes, each with about half of the work."""
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
 
     with ProcessPoolExecutor(2, get_context('spawn')) as pool:
-        for part in [pool.submit(_compile_predictor), pool.submit(_compile_robots)]:
+        for part in [pool.submit(_compile_controllers), pool.submit(_compile_robots)]:
             part.result()
-    _compile_controllers()
     return 0
 
 
-def _compile_predictor() -> None:
-    from t3mpc_ros.mpc.predictive_controller import PredictiveController, PredictiveParameters
-
-    PredictiveController(PredictiveParameters(), 0.01, 15.2).warm_up()
-
-
 def _compile_robots() -> None:
-    """Compile robots, reference, and those parts of a controller that take longest."""
+    """Compile those parts of a controller that it uses last, robots and reference."""
     import numpy as np
 
     from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceParameters
     from t3mpc_ros.control.body_correction import BodyCorrection, BodyCorrectionParameters
     from t3mpc_ros.control.dead_time_estimator import DeadTimeEstimator
+    from t3mpc_ros.control.jump_transition import JumpTransition, JumpTransitionParameters
     from t3mpc_ros.control.speed_filter import SpeedFilterParameters
     from t3mpc_ros.geometry.kinematics import WheelGeometry
     from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters, make_robot
 
-    for kind in ('stepper', 'velocity'):
-        make_robot(DigitalTwinParameters.from_dict({'drive.kind': kind})).warm_up()
-    ChaoticReference(ReferenceParameters(), WheelGeometry()).advance()
     zero = np.zeros(2)
     DeadTimeEstimator(SpeedFilterParameters(), 0.01).step(zero, zero, 0.01)
     BodyCorrection(BodyCorrectionParameters(), 0.04, 0.1, 0.01).step(
         0.0, 0.01, zero, zero, zero, 0.0
     )
+    JumpTransition(JumpTransitionParameters(), 0.1, 0.01).step(0, zero, zero)
+    for kind in ('stepper', 'velocity'):
+        make_robot(DigitalTwinParameters.from_dict({'drive.kind': kind})).warm_up()
+    ChaoticReference(ReferenceParameters(), WheelGeometry()).advance()
 
 
 def _compile_controllers() -> None:

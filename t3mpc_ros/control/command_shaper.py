@@ -138,16 +138,19 @@ def shape(
             rows[j, i] = rows[j - count, i]
         for j in range(count):
             rows[j, i] = newest[i] + (before - newest[i]) * j / count
-    now = np.zeros(2)
-    after = np.zeros(2)
-    for i in range(2):
-        now[i] = 0.5 * (row_at(rows, i, ahead - delays[i]) + row_at(rows, i, ahead + delays[i]))
-        after[i] = 0.5 * (
-            row_at(rows, i, ahead - 1.0 - delays[i]) + row_at(rows, i, ahead - 1.0 + delays[i])
-        )
-    reference[0], reference[1] = now[0] + now[1], now[0] - now[1]
-    change[0] = after[0] + after[1] - reference[0]
-    change[1] = after[0] - after[1] - reference[1]
+    mean, half = shaped_row(rows, float(ahead), delays)
+    reference[0], reference[1] = mean + half, mean - half
+    mean, half = shaped_row(rows, ahead - 1.0, delays)
+    change[0] = mean + half - reference[0]
+    change[1] = mean - half - reference[1]
+
+
+@kernel
+def shaped_row(rows: Array, position: float, delays: Array) -> tuple[float, float]:
+    """Return the shaped columns of ``rows`` at a position between two rows."""
+    mean = row_at(rows, 0, position - delays[0]) + row_at(rows, 0, position + delays[0])
+    half = row_at(rows, 1, position - delays[1]) + row_at(rows, 1, position + delays[1])
+    return 0.5 * mean, 0.5 * half
 
 
 @kernel
