@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Data of a recorded run: motions, commands and control terms on one time axis."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 import math
 from typing import Any, NamedTuple
@@ -10,7 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.bag.columns import CDR_LAYOUTS, TopicColumns, read_columns
 from t3mpc_ros.bag.reader import BagReader, missing_sample_ratio
+from t3mpc_ros.bag.schema import DataError
 from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.evaluation.bag_report.link_history import (
     DiagnosticEvent,
@@ -33,7 +35,7 @@ from t3mpc_ros.evaluation.bag_report.topic_roles import (
 )
 from t3mpc_ros.evaluation.process_replay.controller_replay import recompute_scalars
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
-from t3mpc_ros.geometry.types import BodyTwist
+from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist
 from t3mpc_ros.parameters.table import ParameterError
 
 Array = NDArray[np.float64]
@@ -227,7 +229,11 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
     topics = choice.topics
     notes = [*choice.notes]
     geometry = _geometry(recording.metadata_records, wanted, choice.ours, notes)
-    raw = {name: _read(recording, name, topic, notes) for name, topic in topics.items()}
+    columns = _columns(recording, topics.values())
+    raw = {
+        name: _read(recording, name, topic, columns.get(topic), notes)
+        for name, topic in topics.items()
+    }
     raw = {name: table for name, table in raw.items() if table['stamp'].size}
     clock = _Clock(raw, notes)
     scalars = _recomputed_scalars(recording, choice, notes)
@@ -330,7 +336,23 @@ class _Clock:
         return self.local(received) + self.lead
 
 
-def _read(recording: BagReader, name: str, topic: str, notes: list[str]) -> dict[str, Array]:
+def _columns(recording: BagReader, topics: Iterable[str]) -> Mapping[str, TopicColumns]:
+    """Return the topics that can be read at once; none where a message has another layout."""
+    simple = [
+        topic
+        for topic in topics
+        if recording.topics[topic].type_name in CDR_LAYOUTS
+        and recording.topics[topic].message_count
+    ]
+    try:
+        return read_columns(recording, simple)
+    except DataError:
+        return {}  # of another encoding: each message is decoded
+
+
+def _read(
+    recording: BagReader, name: str, topic: str, column: TopicColumns | None, notes: list[str]
+) -> dict[str, Array]:
     """Return the arrays of one topic, without the rows that are not finite."""
     kind = recording.topics[topic].type_name
     if kind.endswith(('/Twist', '/TwistStamped')):
@@ -340,7 +362,16 @@ def _read(recording: BagReader, name: str, topic: str, notes: list[str]) -> dict
         fields = {f'{i}': f'data[{i}]' for i in range(3)}
     else:
         fields = {'value': 'data'} if name in NUMBERS else _ODOMETRY_FIELDS
-    table = recording.series(topic, fields)
+    if column is None:
+        table = recording.series(topic, fields)
+    else:
+        stamps = column.stamps_ns if CDR_LAYOUTS[kind].stamped else column.received_ns
+        instants = {'received': column.received_ns, 'stamp': stamps}
+        table = {key: (each - recording.start_ns) / NANOSECONDS for key, each in instants.items()}
+        numbers = column.numbers.T
+        if fields is _ODOMETRY_FIELDS:  # without the orientation about the other axes
+            numbers = np.delete(numbers, (2, 3), axis=0)
+        table |= dict(zip(fields, numbers, strict=True))
     sound = np.all([np.isfinite(column) for column in table.values()], axis=0)
     if not sound.all():
         notes.append(f'{np.count_nonzero(~sound)} messages of {topic} hold a number that is not '
