@@ -47,8 +47,7 @@ def test_a_command_that_waited_does_not_move_sim_robot(harness, simulated_time):
     """An unstamped command counted as new when it was taken: the robot drove after a pause."""
     robot = harness.add(SimRobotNode, publish_clock=simulated_time)
     odom = harness.subscribe(Odometry, 'odom')
-    commands = harness.create_publisher(Twist, 'cmd_vel')
-    harness.wait_for_subscriber(commands)
+    commands = harness.connected_publisher(Twist, 'cmd_vel')
     harness.spin_until(lambda: odom)
     commands.publish(twist(0.3))
     suspend()
@@ -69,8 +68,7 @@ def test_a_command_that_waited_is_rejected_by_the_bridge(harness, tmp_path, kind
     node = harness.add(
         RadioBridgeNode, port=str(tmp_path / 'none'), enable_stamped_cmd_vel=stamped
     )
-    commands = harness.create_publisher(kind, 'cmd_vel')
-    harness.wait_for_subscriber(commands)
+    commands = harness.connected_publisher(kind, 'cmd_vel')
     commands.publish(TwistStamped(twist=twist(0.3)) if stamped else twist(0.3))
     suspend()
     harness.spin_until(lambda: diagnostic(node, 'commands') == 1)

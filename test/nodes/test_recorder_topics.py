@@ -86,8 +86,7 @@ def test_best_effort_publishers_are_recorded(harness, tmp_path):
 
 def test_a_second_best_effort_publisher_is_recorded(harness, tmp_path):
     recorder = _recorder(harness, tmp_path, 'text')
-    strong = harness.create_publisher(String, 'text')
-    harness.wait_for_subscriber(strong)
+    strong = harness.connected_publisher(String, 'text')
     strong.publish(String(data='strong'))
     _count(harness, recorder, 1)
     weak = harness.create_publisher(
@@ -152,8 +151,7 @@ def test_earlier_latched_messages_are_recorded(harness, tmp_path):
 
 def test_a_split_bag_loses_no_message(harness, tmp_path):
     recorder = _recorder(harness, tmp_path, 'text')
-    text = harness.create_publisher(String, 'text')
-    harness.wait_for_subscriber(text)
+    text = harness.connected_publisher(String, 'text')
     for part in range(3):
         for number in range(5):
             text.publish(String(data=f'{part} {number}'))

@@ -16,6 +16,7 @@ from support.ros_graph import (
     CommandSource,
     diagnostic,
     diagnostic_level,
+    driving_robot,
     is_ok,
     on_grid,
     reason,
@@ -39,8 +40,7 @@ def test_a_non_finite_command_never_moves_the_robot(harness):
     """Fields that have no effect on a differential drive count, too."""
     robot = harness.add(SimRobotNode)
     odom = harness.subscribe(Odometry, 'odom')
-    commands = harness.create_publisher(Twist, 'cmd_vel')
-    harness.wait_for_subscriber(commands)
+    commands = harness.connected_publisher(Twist, 'cmd_vel')
     rejected = 0
     for part, axis in FIELDS:
         for value in (math.nan, math.inf, -math.inf):
@@ -65,11 +65,7 @@ def test_a_non_finite_command_never_moves_the_robot(harness):
 
 
 def test_a_non_finite_command_stops_a_moving_robot(harness):
-    robot = harness.add(SimRobotNode)
-    odom = harness.subscribe(Odometry, 'odom')
-    source = CommandSource(harness)
-    source.message = twist(0.3)
-    harness.spin_until(lambda: odom and speed(odom[-1]) > 0.28)
+    robot, odom, source = driving_robot(harness, 0.3)
     harness.spin_until(lambda: is_ok(robot, 'following commands'))
     source.message = twist(0.3, math.nan)
     harness.spin_until(lambda: speed(odom[-1]) < 1e-3, 'the robot stops')
@@ -95,11 +91,7 @@ def test_lateral_and_vertical_commands_are_ignored(harness):
 
 
 def test_a_command_timeout_stops_the_robot_with_the_reason(harness):
-    harness.add(SimRobotNode)
-    odom = harness.subscribe(Odometry, 'odom')
-    source = CommandSource(harness)
-    source.message = twist(0.3)
-    harness.spin_until(lambda: odom and speed(odom[-1]) > 0.28)
+    _, odom, source = driving_robot(harness, 0.3)
     source.message = None
     harness.spin_until(lambda: speed(odom[-1]) < 1e-3, 'the robot stops')
     status = harness.next_status('sim_robot')
@@ -109,11 +101,7 @@ def test_a_command_timeout_stops_the_robot_with_the_reason(harness):
 
 
 def test_e_stop_latches_and_release_needs_a_new_command(harness):
-    robot = harness.add(SimRobotNode)
-    odom = harness.subscribe(Odometry, 'odom')
-    source = CommandSource(harness)
-    source.message = twist(0.3)
-    harness.spin_until(lambda: odom and speed(odom[-1]) > 0.28)
+    robot, odom, source = driving_robot(harness, 0.3)
     assert harness.call(SetBool, 'e_stop', data=True).success
     harness.spin_until(lambda: speed(odom[-1]) < 1e-3, 'the robot stops')
     status = harness.next_status('sim_robot')
@@ -215,8 +203,7 @@ def test_stamped_commands_are_accepted_and_stale_ones_rejected(harness):
     """A played or delayed stamped command must not move a robot."""
     robot = harness.add(SimRobotNode, enable_stamped_cmd_vel=True)
     odom = harness.subscribe(Odometry, 'odom')
-    commands = harness.create_publisher(TwistStamped, 'cmd_vel')
-    harness.wait_for_subscriber(commands)
+    commands = harness.connected_publisher(TwistStamped, 'cmd_vel')
 
     def say(stamp_ns):
         message = TwistStamped(twist=twist(0.3))
@@ -251,11 +238,7 @@ def test_huge_commands_stay_within_the_limits(harness):
 
 
 def test_dynamic_limits_of_the_robot_take_effect(harness):
-    robot = harness.add(SimRobotNode)
-    odom = harness.subscribe(Odometry, 'odom')
-    source = CommandSource(harness)
-    source.message = twist(0.3)
-    harness.spin_until(lambda: odom and speed(odom[-1]) > 0.28)
+    robot, odom, source = driving_robot(harness, 0.3)
     assert robot.set_parameters([Parameter('linear.x.max_velocity', value=0.1)])[0].successful
     harness.spin_until(lambda: abs(speed(odom[-1]) - 0.1) < 0.01)
     assert diagnostic(robot, 'limited')

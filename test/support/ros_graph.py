@@ -116,6 +116,12 @@ class NodeHarness:
             f'{publisher.topic} has no subscriber',
         )
 
+    def connected_publisher(self, message_type, topic, qos=100):
+        """Return a publisher of the probe node once it has a subscriber."""
+        publisher = self.create_publisher(message_type, topic, qos)
+        self.wait_for_subscriber(publisher)
+        return publisher
+
     def publish_periodically(self, publisher, make, period=0.02):
         """Publish ``make()`` periodically, except while it is None."""
 
@@ -166,6 +172,16 @@ class CommandSource:
         self.message = None
         self.publisher = harness.create_publisher(message_type, topic)
         harness.publish_periodically(self.publisher, lambda: self.message)
+
+
+def driving_robot(harness, linear):
+    """Return a simulated robot, its odometry and the source of its commands, once it drives."""
+    robot = harness.add(SimRobotNode)
+    odom = harness.subscribe(Odometry, 'odom')
+    source = CommandSource(harness)
+    source.message = twist(linear)
+    harness.spin_until(lambda: odom and speed(odom[-1]) > 0.9 * linear, 'the robot drives')
+    return robot, odom, source
 
 
 class ControllerHarness:
