@@ -88,8 +88,9 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             for name in (parameters.frame_id, parameters.child_frame_id)
         )
         self._path.header.frame_id = frame
-        self._message = Odometry(child_frame_id=child)
-        self._message.header.frame_id = frame
+        message = Odometry(child_frame_id=child)
+        message.header.frame_id = frame
+        self._serialized = conversions.SerializedOdometry(message)
         self._reference_publisher = self.create_publisher(Odometry, 'reference', qos.STREAM)
         self._path_publisher = self.create_publisher(Path, 'reference/path', qos.LATCHED)
         self._signals_publisher = self.create_publisher(
@@ -116,7 +117,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             if sample.index % max(1, round(PATH_PERIOD * self.parameters.rate)) == 0:
                 self._append_to_path(State(stamp_ns, self._pose, twist))
         state = State(stamp_ns, self._pose, twist)
-        self._reference_publisher.publish(conversions.fill_odometry(self._message, state))
+        self._reference_publisher.publish(self._serialized.with_state(state))
         self._pose = advance_pose(self._pose, twist, 1.0 / self.parameters.rate)
 
     def _publish_signals(self, signals: tuple[int, ...]) -> None:

@@ -72,6 +72,19 @@ def test_a_state_survives_a_reused_odometry_message():
         assert abs(wrap_angle(back.pose.yaw - motion.pose.yaw)) < 1e-14
 
 
+@pytest.mark.parametrize('texts', [(0, 0), (1, 9), (6, 2), (3, 8), (4, 7), (5, 5)])
+def test_a_serialized_message_with_a_state_equals_the_message(texts):
+    frame, child = texts
+    message = Odometry(child_frame_id='b' * child)
+    message.header.frame_id = 'a' * frame
+    message.pose.covariance[:] = np.arange(36.0)
+    message.twist.covariance[:] = -np.arange(36.0)
+    serialized = conversions.SerializedOdometry(message)
+    for motion in motions(20):
+        back = deserialize_message(serialized.with_state(motion), Odometry)
+        assert back == conversions.fill_odometry(message, motion)
+
+
 @pytest.mark.parametrize('frame', range(9))
 @pytest.mark.parametrize('child', range(9))
 def test_serialized_odometry_is_read_whatever_its_frames(frame, child):

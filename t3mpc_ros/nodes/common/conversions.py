@@ -9,6 +9,7 @@ import struct
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, Quaternion, TransformStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose, State
@@ -59,20 +60,50 @@ def state_from_odometry(data: bytes) -> State:
     struct.error
         The data ends before the message does.
     """
-    order = '<' if data[1] & 1 else '>'
-    seconds, nanoseconds, length = struct.unpack_from(f'{order}iII', data, 4)
-    child = 16 + length + -length % 4
-    (length,) = struct.unpack_from(f'{order}I', data, child)
-    end = child + 4 + length
+    order, start = _layout(data)
+    seconds, nanoseconds = struct.unpack_from(f'{order}iI', data, 4)
     # 7 numbers of the pose, 36 of its covariance, 6 of the twist.
     x, y, _, *rotation, linear, _, _, _, _, angular = struct.unpack_from(
-        f'{order}7d288x6d', data, end + (4 - end) % 8
+        f'{order}7d288x6d', data, start
     )
     return State(
         seconds * NANOSECONDS + nanoseconds,
         Pose(x, y, yaw_from_quaternion(*rotation)),
         BodyTwist(linear, angular),
     )
+
+
+def _layout(data: bytes | bytearray) -> tuple[str, int]:
+    """Return the byte order of a serialized odometry message and the offset of its pose."""
+    order = '<' if data[1] & 1 else '>'
+    (length,) = struct.unpack_from(f'{order}I', data, 12)
+    child = 16 + length + -length % 4
+    (length,) = struct.unpack_from(f'{order}I', data, child)
+    end = child + 4 + length
+    return order, end + (4 - end) % 8
+
+
+class SerializedOdometry:
+    """Serialized odometry messages that differ in their state only."""
+
+    def __init__(self, message: Odometry) -> None:
+        self._data = bytearray(serialize_message(message))
+        order, start = _layout(self._data)
+        self._stamp = struct.Struct(f'{order}iI')
+        self._pose = struct.Struct(f'{order}7d')
+        self._twist = struct.Struct(f'{order}6d')
+        self._pose_start, self._twist_start = start, start + self._pose.size + 8 * 36
+
+    def with_state(self, state: State) -> bytes:
+        """Return the message with the stamp, the pose and the twist of ``state``."""
+        pose, twist, half = state.pose, state.twist, 0.5 * state.pose.yaw
+        rotation = 0.0, 0.0, math.sin(half), math.cos(half)
+        self._stamp.pack_into(self._data, 4, *divmod(state.stamp_ns, NANOSECONDS))
+        self._pose.pack_into(self._data, self._pose_start, pose.x, pose.y, 0.0, *rotation)
+        self._twist.pack_into(
+            self._data, self._twist_start, twist.linear, 0.0, 0.0, 0.0, 0.0, twist.angular
+        )
+        return bytes(self._data)
 
 
 def fill_odometry(message: Odometry, state: State) -> Odometry:

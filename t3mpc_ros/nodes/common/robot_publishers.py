@@ -97,7 +97,9 @@ class RobotPublishers:
         self._odom_message = _odometry_message(self._frame(parameters.odom_frame_id), base)
         self._odom_publisher = node.create_publisher(Odometry, 'odom', qos.STREAM)
         if robot.truth_frame:
-            self._truth_message = _odometry_message(robot.truth_frame, base)
+            self._truth = conversions.SerializedOdometry(
+                _odometry_message(robot.truth_frame, base)
+            )
             self._truth_publisher = node.create_publisher(
                 Odometry, 'ground_truth/odom', qos.STREAM
             )
@@ -157,9 +159,7 @@ class RobotPublishers:
             self._odom_message.twist.covariance = self._twist_covariances[self._slipping]
         self._odom_publisher.publish(conversions.fill_odometry(self._odom_message, state.odometry))
         if state.truth is not None:
-            self._truth_publisher.publish(
-                conversions.fill_odometry(self._truth_message, state.truth)
-            )
+            self._truth_publisher.publish(self._truth.with_state(state.truth))
         if self._broadcaster is not None:
             message = self._odom_message
             frames = message.header.frame_id, message.child_frame_id
