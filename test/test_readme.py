@@ -61,6 +61,7 @@ SHORTENED = {
     'scripts/run composed': (['--ros-args', '-p', 'storage.uri:=OUTPUT/bag'], True),
     'scripts/demo --view': (['--duration', '2', '--headless', '--output', 'OUTPUT/view'], False),
     'scripts/run t3mpc view': (['--headless', '--port', '0'], True),
+    'scripts/run t3mpc view --bag runs/latest/bag': (['--headless', '--port', '0'], True),
     'scripts/run t3mpc paper --quick': (['--seeds', '1', '--output', 'OUTPUT/paper'], False),
     'scripts/run t3mpc compare': (
         ['--seeds', '201', '--duration', '3', '--methods', 'full', '--cases', 'nominal'],

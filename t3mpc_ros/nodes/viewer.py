@@ -46,7 +46,7 @@ from t3mpc_ros.simulation.sensors.range_sensor import (
     SimulatedRangeSensorParameters,
     sensor_mounts,
 )
-from t3mpc_ros.simulation.world import WorldError, load_world
+from t3mpc_ros.simulation.world import world_outline
 
 Condition = Literal['normal', 'warning', 'stopped']
 
@@ -356,19 +356,7 @@ class ViewNode(Node):
             self._geometry = WheelGeometry(radius, separation)
             self._sink.set('robot', {'wheel_radius': radius, 'wheel_separation': separation})
         if name == 'sim_robot' and (world := rows.get('world')):
-            self._show_world(world['value'])
-
-    def _show_world(self, name: str) -> None:
-        try:
-            world = load_world(name) if name else None
-        except (OSError, WorldError):  # a file of another machine
-            world = None
-        shown = world and {
-            'segments': world.segments.tolist(),
-            'circles': world.circles.tolist(),
-            'patches': world.patches.tolist(),
-        }
-        self._sink.set('world', shown)
+            self._sink.set('world', world_outline(world['value']))
 
     def _on_parameter_event(self, message: ParameterEvent) -> None:
         namespace, _, name = message.node.rpartition('/')

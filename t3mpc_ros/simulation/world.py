@@ -113,6 +113,24 @@ class World:
         return BoundingBox(*points.min(axis=0).tolist(), *points.max(axis=0).tolist())
 
 
+def world_outline(name: str) -> dict[str, list[list[float]]] | None:
+    """Return segments, circles and patches of a world as lists, for a picture.
+
+    None for an empty name, and for a file that is not here: it belongs to another machine.
+    """
+    try:
+        world = load_world(name) if name else None
+    except (OSError, WorldError):
+        world = None
+    if world is None:
+        return None
+    return {
+        'segments': world.segments.tolist(),
+        'circles': world.circles.tolist(),
+        'patches': world.patches.tolist(),
+    }
+
+
 def bundled_worlds() -> tuple[str, ...]:
     """Return the names of the bundled worlds."""
     return tuple(sorted(path.stem for path in WORLDS_FOLDER.glob('*.yaml')))

@@ -11,7 +11,7 @@ from typing import NamedTuple
 Json = None | bool | int | float | str | Sequence['Json'] | Mapping[str, 'Json']
 
 SPAN = 120.0
-"""Samples are kept for this long, s."""
+"""Time for which the samples of a live run are kept, s."""
 MAX_EVENTS = 500
 """Number of events that are kept."""
 
@@ -32,9 +32,15 @@ class LiveData:
 
     Every change has a number, ascending from 1. A reader remembers the number up to which it has
     read, its *cursor*; a new reader begins with 0 and gets all that is kept.
+
+    Parameters
+    ----------
+    span
+        Time for which samples are kept, s.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, span: float = SPAN) -> None:
+        self._span = span
         self._changed = Condition()
         self._number = 0
         self._streams: dict[str, deque[Sample]] = {}
@@ -42,7 +48,7 @@ class LiveData:
         self._events: deque[tuple[int, Json]] = deque(maxlen=MAX_EVENTS)
 
     def add(self, stream: str, time: float, values: Sequence[float]) -> None:
-        """Add a sample; what is older than :data:`SPAN`, or newer than this sample, is dropped.
+        """Add a sample; what is older than the span, or newer than this sample, is dropped.
 
         Time goes back when a bag is played again, or a robot starts anew.
         """
@@ -51,7 +57,7 @@ class LiveData:
             kept = self._streams.setdefault(stream, deque())
             if kept and kept[-1].time > time:
                 kept.clear()
-            while kept and kept[0].time < time - SPAN:
+            while kept and kept[0].time < time - self._span:
                 kept.popleft()
             kept.append(Sample(self._next(), time, finite))
 

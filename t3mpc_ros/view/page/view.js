@@ -3,7 +3,7 @@
 // The live page: reads the stream of events, draws it, and sends commands.
 'use strict';
 
-const KEPT = 125; // s of samples
+const KEPT = 125; // s of samples of a live run
 const FRAME = 100; // ms between two pictures
 const SILENCE = 3500; // ms without an event after which the program counts as lost
 
@@ -49,6 +49,7 @@ function take(news) {
     facts[name] = value;
     if (name === 'banner') showBanner();
     if (name === 'nodes') showButtons();
+    if (name === 'recording') showRecording();
     if (name.startsWith('parameters/')) showParameters(name.slice('parameters/'.length));
     if (name === 'terms') makeCharts();
   }
@@ -65,7 +66,7 @@ function add(name, time, values) {
   kept.time.push(...time);
   kept.values.forEach((column, i) => column.push(...values[i]));
   let old = 0;
-  while (kept.time[old] < kept.time.at(-1) - KEPT) old++;
+  while (!facts.recording && kept.time[old] < kept.time.at(-1) - KEPT) old++;
   if (old > 200) [kept.time, ...kept.values].forEach((column) => column.splice(0, old));
 }
 
@@ -143,6 +144,16 @@ document.addEventListener('keydown', (key) => {
   if (key.code === 'Space' && !readOnly) { key.preventDefault(); command('e_stop', { on: true }); }
   if (key.key === 'h') hold(selection ? null : visibleRange());
 });
+
+// A recording has no commands; all of it is shown, and the cursor moves the robot.
+function showRecording() {
+  for (const id of ['stop-box', 'drawer']) place(id).hidden = true;
+  document.querySelector('main').classList.add('recording');
+  if (!place('span').querySelector('[value="Infinity"]')) {
+    place('span').prepend(element('option', { value: 'Infinity', textContent: 'all' }));
+    place('span').value = 'Infinity';
+  }
+}
 
 // -- parameters ----------------------------------------------------------------------------------
 
@@ -304,7 +315,9 @@ const table = (name, ...columns) => {
 
 function visibleRange() {
   const newest = streams.odometry?.time.at(-1);
-  return newest === undefined ? null : [newest - Number(place('span').value), newest + 0.5];
+  const span = Number(place('span').value);
+  if (newest === undefined) return null;
+  return [span < Infinity ? newest - span : streams.odometry.time[0], newest + 0.5];
 }
 
 function hold(range) {

@@ -1,0 +1,49 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``t3mpc view --bag``: a recorded run on the page."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.cli.view import STEP, _recorded
+from t3mpc_ros.evaluation.bag_report.run_data import load_run
+
+GOLDEN = Path(__file__).parents[1] / 'golden' / 'changes.mcap'
+
+
+@pytest.fixture(scope='module')
+def shown():
+    return _recorded(GOLDEN).read(0)[0]
+
+
+def test_the_samples_are_those_of_the_bag(shown):
+    fields = {'v': 'twist.twist.linear.x', 'w': 'twist.twist.angular.z'}
+    with open_bag(GOLDEN) as recording:
+        odom = recording.series('/odom', fields)
+    found = shown['streams']['odometry']
+    robot = shown['facts']['robot']
+    radius, half = robot['wheel_radius'], 0.5 * robot['wheel_separation']
+    at = np.array(found['time'])
+    assert np.min(np.diff(at)) >= STEP
+    assert at[-1] - at[0] == pytest.approx(np.ptp(odom['stamp']), abs=2.0 * STEP)
+    right = np.interp(at, odom['stamp'] - odom['stamp'][0], odom['v'] + half * odom['w']) / radius
+    np.testing.assert_allclose(np.interp(at, at - at[0], found['values'][0]), right, atol=1e-6)
+
+
+def test_terms_are_recomputed_from_the_journal(shown):
+    terms = shown['streams']['terms']
+    assert len(terms['values']) == 2 * len(shown['facts']['terms'])
+    assert np.max(np.abs(np.array(terms['values'], dtype=float))) > 1.0
+
+
+def test_banner_and_switches_are_those_of_the_report(shown):
+    facts = shown['facts']
+    assert facts['banner']['headline'].startswith('Recording changes.mcap, ')
+    assert facts['recording']['duration'] > 1.0
+    with open_bag(GOLDEN) as recording:
+        switches = load_run(recording).switches
+    found = [each['time'] for each in shown.get('events', ()) if each['kind'] == 'switch']
+    assert found == switches.tolist()
