@@ -6,7 +6,7 @@ import sys
 
 REQUIREMENTS = {
     'numpy': 'numpy>=1.26',
-    'numba': 'numba>=0.60',
+    'numba': 'numba>=0.68',
     'mcap': 'mcap>=1.5',
     'zstandard': 'zstandard>=0.22',
     'lz4': 'lz4>=4.3',
