@@ -123,6 +123,8 @@ class Checkout:
             'stdout': subprocess.PIPE,
             'stderr': subprocess.PIPE,
             'text': True,
+            # A background process of a shell ignores SIGINT, and so would the script.
+            'preexec_fn': lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         }
 
     def run(self, *arguments, timeout=None, **extra):

@@ -13,6 +13,7 @@ pytestmark = pytest.mark.skipif(shutil.which('gcc') is None, reason='needs gcc')
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_fuzzers_find_no_error(tmp_path):
     """Ten million bytes and a million packets with sanitizers."""
     if shutil.which('make') is None:
