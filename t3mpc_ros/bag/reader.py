@@ -9,7 +9,6 @@ import heapq
 from operator import attrgetter
 from pathlib import Path
 import re
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -256,12 +255,7 @@ class BagReader:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def _seconds(self, stamp: Any) -> float:

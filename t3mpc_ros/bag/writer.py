@@ -8,7 +8,6 @@ import mimetypes
 import os
 from pathlib import Path
 import re
-from types import TracebackType
 from typing import Self
 
 from mcap.writer import CompressionType, Writer
@@ -365,12 +364,7 @@ class BagWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def _is_open(self) -> bool:

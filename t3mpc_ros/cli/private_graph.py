@@ -11,7 +11,6 @@ import os
 from pathlib import Path
 import random
 import socket
-from types import TracebackType
 from typing import Self
 
 from t3mpc_ros.cli.process_group import installed_file
@@ -80,12 +79,7 @@ class PrivateGraph:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
 

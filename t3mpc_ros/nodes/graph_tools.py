@@ -19,14 +19,13 @@ from rcl_interfaces.srv import GetParameters, ListParameters
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.parameter import parameter_value_to_python
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool
 import yaml
 
 from t3mpc_ros.nodes.common import qos
 from t3mpc_ros.nodes.common.graph_introspection import message_class
-from t3mpc_ros.nodes.common.remote_parameters import RemoteParameters
+from t3mpc_ros.nodes.common.remote_parameters import RemoteParameters, plain_value
 
 LISTING = 1.5
 """Time in which nodes are discovered before they are listed, s."""
@@ -168,9 +167,7 @@ class Graph:
         value = values[0] if values else None
         if value is None or value.type not in _VALUE_TEXTS:
             raise GraphError(f'{node} has no parameter {name} (t3mpc param list {node})')
-        plain = parameter_value_to_python(value)
-        shown = plain if isinstance(plain, bool | int | float | str) else list(plain)
-        return f'{_VALUE_TEXTS[value.type]}: {shown}'
+        return f'{_VALUE_TEXTS[value.type]}: {plain_value(value)}'
 
     def set_parameter(self, node: str, name: str, value: object) -> str:
         """Set a parameter; return the reason of a refusal, or nothing.

@@ -26,7 +26,6 @@ from rclpy.exceptions import InvalidNamespaceException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.logging_severity import LoggingSeverity
 from rclpy.node import Node
-from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
@@ -35,12 +34,13 @@ from std_msgs.msg import Float64, Int32MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from t3mpc_ros.control.control_law import TERM_NAMES
+from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, State
 from t3mpc_ros.nodes.common import conversions
 from t3mpc_ros.nodes.common.endpoints import PolledCallbackGroup
-from t3mpc_ros.nodes.common.remote_parameters import RemoteParameters
+from t3mpc_ros.nodes.common.remote_parameters import RemoteParameters, plain_value
 from t3mpc_ros.robot.interface import RANGE_SENSORS
 from t3mpc_ros.simulation.sensors.range_sensor import (
     SimulatedRangeSensorParameters,
@@ -56,13 +56,10 @@ GRAPH_PERIOD = 1.0
 """Time between two looks at the nodes of the graph, s."""
 REPLY_TIMEOUT = 3.0
 """Longest wait for the answer of a service, s."""
-STEP = 0.019
-"""Least time between two samples of a stream, s: at 100 Hz every second one is shown."""
 ROBOTS = ('sim_robot', 'radio_bridge')
 """Nodes that are a robot."""
 LOOP_NODES = ('controller', *ROBOTS, 'reference_generator')
 """Nodes whose reports, parameters and services the page shows."""
-WHEELS = ('right', 'left')
 WARN = LoggingSeverity.WARN.value
 """Level of a log message from which on it is an event."""
 
@@ -138,7 +135,6 @@ class ViewNode(Node):
         self._geometry = WheelGeometry()
         self._origin_ns: int | None = None
         self._newest = 0.0
-        self._shown: dict[str, float] = {}
         self._remote: dict[str, RemoteParameters] = {}
         self._rows: dict[str, dict[str, dict[str, Any]]] = {}
         self._signals: tuple[int, ...] = ()
@@ -239,7 +235,6 @@ class ViewNode(Node):
     def _seconds(self, stamp_ns: int) -> float:
         if self._origin_ns is None:
             self._origin_ns = stamp_ns
-            self._sink.set('origin', stamp_ns / NANOSECONDS)
         return (stamp_ns - self._origin_ns) / NANOSECONDS
 
     def _on_state(self, stream: str, data: bytes) -> None:
@@ -248,9 +243,6 @@ class ViewNode(Node):
         except struct.error:  # a truncated message
             return
         seconds = self._seconds(state.stamp_ns)
-        if 0.0 <= seconds - self._shown.get(stream, -math.inf) < STEP:
-            return
-        self._shown[stream] = seconds
         if stream == 'odometry':
             self._newest = seconds
         wheels = wheels_from_twist(state.twist, self._geometry)
@@ -286,7 +278,6 @@ class ViewNode(Node):
             condition = _stop_condition(name, status.message) or _CONDITIONS[min(level, 2)]
             self._sink.node_report(name, status.message, condition)
             values = {each.key: each.value for each in status.values}
-            self._sink.set(f'diagnostics/{name}', values)
             if name in ROBOTS:
                 self._on_faults(values.get('faults', 'none'))
 
@@ -363,10 +354,9 @@ class ViewNode(Node):
         rows = self._rows.get(name) if namespace == self.get_namespace().rstrip('/') else None
         for changed in message.changed_parameters if rows else ():
             if rows and changed.name in rows:
-                value = parameter_value_to_python(changed.value)
-                plain = value if isinstance(value, bool | int | float | str) else list(value)
-                rows[changed.name] = {**rows[changed.name], 'value': plain}
-                self._sink.report(self._newest, 'command', f'{name}: {changed.name} = {plain}')
+                value = plain_value(changed.value)
+                rows[changed.name] = {**rows[changed.name], 'value': value}
+                self._sink.report(self._newest, 'command', f'{name}: {changed.name} = {value}')
         if rows:
             self._show_parameters(name)
 
@@ -388,12 +378,15 @@ class ViewNode(Node):
         try:
             text = reply.result(REPLY_TIMEOUT)
         except TimeoutError:
+            reply.cancel()  # what has waited that long is not executed any more
             raise CommandFailedError(
                 f'no answer to {name} within {REPLY_TIMEOUT:g} s: is the node alive?'
             ) from None
         return text
 
     def _start(self, name: str, arguments: Mapping[str, Any], reply: 'Future[str]') -> None:
+        if not reply.set_running_or_notify_cancel():
+            return
         try:
             if name == 'set':
                 self._set_parameter(arguments, reply)

@@ -14,6 +14,8 @@ SPAN = 120.0
 """Time for which the samples of a live run are kept, s."""
 MAX_EVENTS = 500
 """Number of events that are kept."""
+STEP = 0.019
+"""Least time between two samples that a page is shown, s: every second one at 100 Hz."""
 
 
 class Sample(NamedTuple):
@@ -37,10 +39,12 @@ class LiveData:
     ----------
     span
         Time for which samples are kept, s.
+    step
+        Least time between two samples of a stream, s; those between are left out.
     """
 
-    def __init__(self, span: float = SPAN) -> None:
-        self._span = span
+    def __init__(self, span: float = SPAN, step: float = 0.0) -> None:
+        self._span, self._step = span, step
         self._changed = Condition()
         self._number = 0
         self._streams: dict[str, deque[Sample]] = {}
@@ -55,6 +59,8 @@ class LiveData:
         finite = tuple(float(value) if math.isfinite(value) else None for value in values)
         with self._changed:
             kept = self._streams.setdefault(stream, deque())
+            if kept and 0.0 <= time - kept[-1].time < self._step:
+                return
             if kept and kept[-1].time > time:
                 kept.clear()
             while kept and kept[0].time < time - self._span:

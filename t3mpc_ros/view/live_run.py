@@ -5,7 +5,7 @@
 from collections.abc import Sequence
 
 from t3mpc_ros.view.banner import Banner, Condition, NodeReport, banner
-from t3mpc_ros.view.live_data import LiveData
+from t3mpc_ros.view.live_data import STEP, LiveData
 
 ODOMETRY = 'odometry'
 """Stream whose samples show that a robot is connected."""
@@ -19,7 +19,7 @@ class LiveRun(LiveData):
     """
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__(step=STEP)
         self._reports: dict[str, NodeReport] = {}
         self._odometry_pending = False
         self._last_odometry: float | None = None

@@ -17,14 +17,12 @@ from importlib.resources import files
 import json
 import secrets
 from threading import BoundedSemaphore, Event, Thread
-from types import TracebackType
 from typing import Any, Self
 from urllib.parse import parse_qs, urlsplit
 
 from t3mpc_ros.view.live_data import Json, LiveData
 
 ADDRESS = '127.0.0.1'
-DEFAULT_PORT = 8765
 PERIOD = 0.05
 """Least time between two events of a stream, s."""
 HEARTBEAT = 1.0
@@ -90,9 +88,7 @@ class PageServer:
         The port is in use.
     """
 
-    def __init__(
-        self, data: LiveData, command: Command | None = None, port: int = DEFAULT_PORT
-    ) -> None:
+    def __init__(self, data: LiveData, command: Command | None, port: int) -> None:
         self.data = data
         self.command = command
         self.token = secrets.token_urlsafe(24)
@@ -117,12 +113,7 @@ class PageServer:
         self._thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.closing.set()
         self._server.shutdown()
         self._server.server_close()

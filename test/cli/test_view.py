@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.cli.view import STEP, _recorded
+from t3mpc_ros.cli.recorded_run import recorded_run
 from t3mpc_ros.evaluation.bag_report.run_data import load_run
+from t3mpc_ros.view.live_data import STEP
 
 GOLDEN = Path(__file__).parents[1] / 'golden' / 'changes.mcap'
 
 
 @pytest.fixture(scope='module')
 def shown():
-    return _recorded(GOLDEN).read(0)[0]
+    return recorded_run(GOLDEN).read(0)[0]
 
 
 def test_the_samples_are_those_of_the_bag(shown):

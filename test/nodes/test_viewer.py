@@ -115,6 +115,13 @@ def test_a_parameter_is_set_and_its_change_is_shown(viewer, robot, harness):
             {'node': 'sim_robot', 'name': 'faults.command_loss', 'value': 'much'},
             "faults.command_loss must be float: got 'much'",
         ),
+        # Neither reaches the serialization, which would end the node.
+        ('set', {'node': 'sim_robot', 'name': 'seed', 'value': 2**70}, 'seed must be int'),
+        (
+            'set',
+            {'node': 'sim_robot', 'name': 'disturbance.frequencies', 'value': ['a']},
+            'disturbance.frequencies must be list of float',
+        ),
         (
             'set',
             {'node': 'sim_robot', 'name': 'faults.command_loss', 'value': 2.0},
@@ -125,6 +132,16 @@ def test_a_parameter_is_set_and_its_change_is_shown(viewer, robot, harness):
 def test_a_command_that_cannot_be_executed_has_a_reason(name, arguments, words, viewer):
     with pytest.raises(CommandFailedError, match=words):
         viewer.command(name, **arguments)
+
+
+def test_a_command_that_has_waited_too_long_is_not_executed(viewer, robot, monkeypatch):
+    """A page whose program was suspended must not enable a robot much later."""
+    monkeypatch.setattr('t3mpc_ros.nodes.viewer.REPLY_TIMEOUT', 0.01)
+    with pytest.raises(CommandFailedError, match='no answer to e_stop'):
+        viewer.node.command('e_stop', {'on': True})  # nothing is polled meanwhile
+    monkeypatch.undo()
+    with pytest.raises(CommandFailedError, match='no emergency stop is latched'):
+        viewer.command('e_stop', on=False)
 
 
 def test_a_node_that_leaves_takes_its_parameters_along(viewer, robot, harness):

@@ -44,6 +44,13 @@ def test_what_is_kept_is_bounded():
     assert len(changes['events']) == MAX_EVENTS
 
 
+def test_samples_between_two_steps_are_left_out():
+    data = LiveData(step=0.019)
+    for k in range(101):
+        data.add('a', 0.01 * k, [k])
+    assert data.read(0)[0]['streams']['a']['values'] == [list(range(0, 101, 2))]
+
+
 def test_time_that_goes_back_starts_the_stream_anew():
     """A robot that restarts, or a bag that is played again."""
     data = LiveData()

@@ -109,7 +109,7 @@ class RemoteParameters:
         if name not in self._types:
             raise ValueError(f'{self.name} has no parameter {name}')
         kind = self._types[name]
-        message = ParameterValue(type=kind)
+        message = ParameterValue(type=kind, check_fields=True)
         try:
             setattr(message, _FIELDS[kind], _converted(kind, value))
         except (AssertionError, TypeError, ValueError):
@@ -151,7 +151,7 @@ def parameter_row(descriptor: ParameterDescriptor, value: ParameterValue) -> Map
     return {
         'name': descriptor.name,
         'type': TYPE_NAMES.get(descriptor.type, 'unset'),
-        'value': _plain(parameter_value_to_python(value)),
+        'value': plain_value(value),
         'unit': unit,
         'low': low,
         'high': high,
@@ -173,7 +173,9 @@ def _choices(constraints: str) -> list[str]:
     return constraints.removeprefix(prefix).split(', ') if constraints.startswith(prefix) else []
 
 
-def _plain(value: Any) -> Any:
+def plain_value(message: ParameterValue) -> Any:
+    """Return the value of a parameter: a number, a text, a list, or None."""
+    value = parameter_value_to_python(message)
     return value if value is None or isinstance(value, bool | int | float | str) else list(value)
 
 

@@ -375,13 +375,22 @@ const PATHS = [
   ['truth', 'true path (simulation only)', { colour: 'truth', dash: [2, 3] }],
 ];
 
+// The frame of the odometry is laid on the true pose once, at the begin of what is kept: later,
+// their distance is the drift. A real robot has no true pose.
+function layBase() {
+  const [odometry, truth] = [streams.odometry, streams.truth];
+  if (!odometry || (base && (base.known || !truth))) return;
+  const row = truth ? odometry.time.findIndex((each) => each >= truth.time[0]) : 0;
+  if (row < 0) return;
+  const pose = ({ values }, i) => values.slice(2, 5).map((column) => column[i]);
+  const frame = truth ? compose(pose(truth, 0), inverse(pose(odometry, row))) : [0, 0, 0];
+  base = Object.assign(frame, { known: Boolean(truth) });
+}
+
 function drawFloor() {
   const truth = last('truth', 2, 3);
   const odometry = last('odometry', 2, 3);
-  if (!base && odometry) base = truth ? compose(truth, inverse(odometry)) : [0, 0, 0];
-  if (base && truth && facts.world !== undefined && base.every((each) => each === 0)) {
-    base = compose(truth, inverse(odometry));
-  }
+  layBase();
   const paths = PATHS.map(([name, , look]) => path(name, look, name === 'truth' ? null : base)).filter(Boolean);
   const robot = truth || (odometry && base && compose(base, odometry));
   floor.draw({ world: facts.world, paths, robot, mounts: facts.mounts,
