@@ -4,23 +4,28 @@
 # make avr        both boards' firmware, build/dongle.elf and build/robot.elf, and their sizes;
 #                 RADIO_RATE=0|1|2 (250 kbit/s, 1, 2 Mbit/s) is an option, and RADIO_CHANNEL=0…125,
 #                 the channel of a dongle before CFG and of a robot without settings
+# make flash, make flash-dongle
+#                 flash the robot or the dongle with the programmer that is plugged in; PORT=/dev/… names
+#                 a serial port, DRY_RUN=1 only prints the command
 # make simavr     both boards in a simulator with their peripherals, as a library for ctypes
 
 AVR_OBJCOPY ?= avr-objcopy
-AVR_BOARD_FLAGS := $(AVR_FLAGS) -DF_CPU=16000000UL -Icore -Iavr -Wl,--gc-sections \
+AVR_BOARD_FLAGS := $(AVR_FLAGS) -DF_CPU=16000000UL -Icore -Ihal -Wl,--gc-sections \
                    $(if $(RADIO_CHANNEL),-DT3_RADIO_CHANNEL=$(RADIO_CHANNEL)) \
                    $(if $(RADIO_RATE),-DT3_RADIO_RATE=$(RADIO_RATE))
 # Both programs carry the digest of all sources and settings, reported in INFO and PONG: a change
 # of one file rebuilds both.
-AVR_SOURCES := $(sort $(wildcard core/*.[ch] avr/*.[ch]))
+AVR_SOURCES := $(sort $(wildcard core/*.[ch] hal/*.[ch] avr/*.[ch]))
 AVR_ID = $(shell (echo '$(AVR_CC) $(AVR_BOARD_FLAGS)'; cat $(AVR_SOURCES)) | sha256sum | cut -c1-8)
 
-DONGLE_FILES := avr/dongle_main.c avr/reset.c avr/nrf24.c avr/serial.c avr/clock.c \
+DONGLE_FILES := avr/dongle_main.c hal/reset.c hal/nrf24.c hal/serial.c hal/clock.c \
                 $(DONGLE_PARTS:%=core/t3_%.c)
-ROBOT_FILES := avr/robot_main.c avr/reset.c avr/nrf24.c avr/stepping.c avr/analog.c avr/imu.c \
-               avr/memory.c avr/serial.c $(ROBOT_PARTS:%=core/t3_%.c)
+ROBOT_FILES := avr/robot_main.c hal/reset.c hal/nrf24.c hal/stepping.c hal/analog.c hal/imu.c \
+               hal/memory.c hal/serial.c $(ROBOT_PARTS:%=core/t3_%.c)
 
-.PHONY: simavr
+PYTHON ?= python3
+
+.PHONY: simavr flash flash-dongle
 
 $(AVR_SETTINGS): always
 	@$(call keep,avr.settings,$(AVR_CC) $(AVR_BOARD_FLAGS) $(ROBOT_MCU) $(DONGLE_MCU))
@@ -39,6 +44,12 @@ $(BUILD)/robot.elf: $(AVR_SOURCES) $(AVR_SETTINGS)
 
 $(BUILD)/%.hex: $(BUILD)/%.elf
 	$(AVR_OBJCOPY) -O ihex -R .eeprom $< $@
+
+flash: $(BUILD)/robot.hex
+	$(PYTHON) flash.py robot $< $(if $(PORT),--port $(PORT)) $(if $(DRY_RUN),--dry-run) $(FLASH)
+
+flash-dongle: $(BUILD)/dongle.hex
+	$(PYTHON) flash.py dongle $< $(if $(PORT),--port $(PORT)) $(if $(DRY_RUN),--dry-run) $(FLASH)
 
 SIMAVR_FILES := $(sort $(wildcard simavr/*.c))
 

@@ -56,7 +56,7 @@ static bool configure(void *context, const struct t3_radio_settings *settings)
 {
     (void)context;
     delayed = 0;
-    const bool ok = nrf24_configure(settings, NRF24_HOST, &waking);
+    const bool ok = nrf24_configure(settings, NRF24_PTX, &waking);
     waking_us = clock_us();
     return ok;
 }
@@ -75,13 +75,13 @@ static void finish_exchange(void)
 {
     uint8_t answer[T3_RADIO_LIMIT];
     uint8_t size = 0;
-    const uint8_t raised = nrf24_flags();
-    if (!(raised & (NRF24_SENT | NRF24_GAVE_UP)))
+    const uint8_t raised = nrf24_status();
+    if (!(raised & (NRF24_TX_DS | NRF24_MAX_RT)))
         return;
-    if (raised & NRF24_SENT)
+    if (raised & NRF24_TX_DS)
         size = nrf24_read(answer);
     const uint8_t retransmits = nrf24_finish();
-    t3_dongle_exchange(&dongle, raised & NRF24_SENT, retransmits, answer, size);
+    t3_dongle_exchange(&dongle, raised & NRF24_TX_DS, retransmits, answer, size);
 }
 
 static void sleep_if_idle(void)

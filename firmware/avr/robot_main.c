@@ -28,20 +28,14 @@
 
 // The answer is sampled at once; then it waits for a quiet moment of the radio.
 #define SETTLE_US 0u
-// What n bytes take in the air: preamble 1, address 5, CRC 2, control 9 bit.
-#define AIR_US(n) ((8u * (8u + (n)) + 9u) * 4u >> (T3_RADIO_RATE == 0 ? 0 : 1 + T3_RADIO_RATE))
-// An acknowledgement of 32 bytes is over so long after its packet (settling 130 us, and 3 for the
-// clocks). When it was lost, the dongle sends the packet again one retry delay after it, and so on:
-// so far lie the ends of two copies. The robot sees only the first.
-#define ACK_US (130u + AIR_US(T3_RADIO_LIMIT) + 3u)
-#define COPY_US(n) (250u * (T3_RETRY_DELAY + 1u) + AIR_US(n))
 #define COPIES 4u
 #define WAIT_US 200u  // for this long the main loop stands still rather than miss the moment
 #define FLUSH_US 110u // what the flush takes, with the interrupts that may come meanwhile
 
-static struct t3_radio_settings radio = T3_RADIO_DEFAULTS;  // channel and address: of the settings
+static struct t3_radio_settings radio = T3_RADIO_DEFAULTS;  // what may differ: of the settings
+static uint16_t ack_us;  // of the rate; see air_us
 static volatile bool radio_interrupt;  // set by the interrupt of the radio
-static volatile uint32_t heard_us;
+static volatile uint32_t arrived_us;
 static uint32_t checked_us, fifo_checked_us;
 static bool waking;
 static uint8_t packet_size;  // of the last packet, and when it came
@@ -58,7 +52,7 @@ static struct t3_console console;
 ISR(RADIO_IRQ_VECTOR)
 {
     if (!radio_interrupt)
-        heard_us = stepping_time_us();
+        arrived_us = stepping_time_us();
     radio_interrupt = true;
 }
 
@@ -104,13 +98,13 @@ static uint16_t adc(void *context, uint8_t channel)
     return analog_count(channel);
 }
 
-static void eeprom_read(void *context, uint8_t address, uint8_t *data, uint8_t size)
+static void eeprom_read(void *context, uint16_t address, uint8_t *data, uint8_t size)
 {
     (void)context;
     memory_read(address, data, size);
 }
 
-static void eeprom_write(void *context, uint8_t address, const uint8_t *data, uint8_t size)
+static void eeprom_write(void *context, uint16_t address, const uint8_t *data, uint8_t size)
 {
     (void)context;
     memory_write(address, data, size);
@@ -154,7 +148,7 @@ static bool eeprom_settled(void *context)
     return memory_settled();
 }
 
-static void eeprom_cells(void *context, uint8_t address, uint8_t *data, uint8_t size)
+static void eeprom_cells(void *context, uint16_t address, uint8_t *data, uint8_t size)
 {
     (void)context;
     memory_cells(address, data, size);
@@ -177,19 +171,56 @@ static void serve_console(void)
     t3_console_tick(&console);
 }
 
+// Every 6 ms: an eye sees 0.1 s, and a pass has 0.4 ms.
+static void show_signal(void)
+{
+    static uint8_t passes;
+    if (++passes % 16u)
+        return;
+    const uint8_t levels = t3_console_watch(&console);
+    if (levels & T3_SIGNAL_LED)
+        SIGNAL_PORT |= _BV(SIGNAL_LED);
+    else
+        SIGNAL_PORT &= (uint8_t)~_BV(SIGNAL_LED);
+    if (levels & T3_SIGNAL_BUZZER)
+        SIGNAL_PORT |= _BV(SIGNAL_BUZZER);
+    else
+        SIGNAL_PORT &= (uint8_t)~_BV(SIGNAL_BUZZER);
+}
+
 // -- radio ---------------------------------------------------------------------------------------
+
+// Return what n bytes take in the air: preamble 1, address 5, CRC 2, control 9 bit.
+static uint16_t air_us(uint8_t bytes)
+{
+    return (uint16_t)((8u * (8u + bytes) + 9u) * 4u >> (radio.rate ? 1u + radio.rate : 0u));
+}
+
+// Return how far apart the ends of two copies of a packet lie. When an acknowledgement was lost, the
+// dongle sends the packet again one retry delay after it, and so on; the robot receives only the first.
+static uint16_t copies_us(uint8_t bytes)
+{
+    return (uint16_t)(250u * (T3_RETRY_DELAY_AT(radio.rate) + 1u) + air_us(bytes));
+}
 
 static bool settings_differ(void)
 {
     const struct t3_setup *now = &robot.settings.now;
-    return radio.channel != now->channel || memcmp(radio.address, now->address, 5);
+    return radio.channel != now->channel || radio.rate != now->rate ||
+           radio.power != now->power || memcmp(radio.address, now->address, 5);
 }
 
 static void configure_radio(uint32_t now_us)
 {
-    radio.channel = robot.settings.now.channel;
-    memcpy(radio.address, robot.settings.now.address, 5);
-    chip_held = nrf24_configure(&radio, NRF24_ROBOT, &waking);
+    const struct t3_setup *now = &robot.settings.now;
+    radio.channel = now->channel;
+    radio.rate = now->rate;
+    radio.power = now->power;
+    memcpy(radio.address, now->address, 5);
+    // An acknowledgement of 32 bytes is over so long after its packet (settling 130 us, and 3 for the
+    // clocks).
+    ack_us = (uint16_t)(130u + air_us(T3_RADIO_LIMIT) + 3u);
+    chip_held = nrf24_configure(&radio, NRF24_PRX, &waking);
     if (!waking)
         nrf24_listen();
     checked_us = now_us;
@@ -201,11 +232,11 @@ static void receive(void)
     ATOMIC_BLOCK(ATOMIC_RESTORESTATE)
     {
         if (radio_interrupt)
-            at_us = heard_us;
+            at_us = arrived_us;
         radio_interrupt = false;
     }
     // Flags first: a packet that comes while the FIFO is read raises them again.
-    nrf24_take_flags();
+    nrf24_clear_status();
     uint8_t payload[T3_RADIO_LIMIT];
     for (uint8_t i = 0; i < NRF24_DEPTH; i++) {
         const uint8_t size = nrf24_read(payload);
@@ -230,11 +261,11 @@ static uint16_t since_copy_us(uint16_t copy_us)
 // Return whether no acknowledgement that uses the loaded payload is being sent.
 static bool is_quiet(void)
 {
-    const uint16_t copy_us = (uint16_t)COPY_US(packet_size);
+    const uint16_t copy_us = copies_us(packet_size);
     uint16_t since_us = since_copy_us(copy_us);
-    while (since_us >= ACK_US - WAIT_US && since_us < ACK_US)
+    while (since_us >= ack_us - WAIT_US && since_us < ack_us)
         since_us = since_copy_us(copy_us);
-    return since_us > copy_us || (since_us >= ACK_US && since_us + FLUSH_US <= copy_us);
+    return since_us > copy_us || (since_us >= ack_us && since_us + FLUSH_US <= copy_us);
 }
 
 static void load_answer(void)
@@ -242,7 +273,7 @@ static void load_answer(void)
     // A packet that came since the last look at the radio is being acknowledged with what is loaded.
     if (!answer_size || !is_quiet() || radio_interrupt)
         return;
-    nrf24_answer(answer, answer_size);
+    nrf24_load_ack(answer, answer_size);
     answer_size = 0;
 }
 
@@ -252,7 +283,7 @@ static void watch_radio(void)
     bool waits = radio_interrupt || !RADIO_IRQ_HIGH;  // the pin too: an edge may be missed
     if (!waits && now_us - fifo_checked_us >= FIFO_CHECK_US) {
         fifo_checked_us = now_us;
-        waits = nrf24_waits();
+        waits = nrf24_rx_waiting();
     }
     if (waits)
         receive();
@@ -264,7 +295,7 @@ static void watch_radio(void)
         configure_radio(now_us);
     } else if (since_us >= RADIO_CHECK_US) {
         checked_us = now_us;
-        chip_held = nrf24_holds(&radio, NRF24_ROBOT);
+        chip_held = nrf24_holds(&radio, NRF24_PRX);
         if (!chip_held)
             configure_radio(now_us);
     }
@@ -309,6 +340,7 @@ int main(void)
     wdt_enable(WDTO_120MS);
     memory_start();
     nrf24_start();
+    SIGNAL_DDR |= _BV(SIGNAL_LED) | _BV(SIGNAL_BUZZER);
     analog_start();
     imu_start();
     // The radio needs this after power; the converter gathers its first counts, and noise.
@@ -340,6 +372,7 @@ int main(void)
         analog_work();
         memory_work();
         imu_work(stepping_time_us());
+        show_signal();
         if (!hurries() && (serial_waits() || t3_console_writes(&console)))
             serve_console();
     }

@@ -10,10 +10,13 @@
 #define KEY_ASK_SIZE 2u
 #define KEY_SIZE (KEY_ASK_SIZE + T3_KEY_SIZE)
 #define KEY_IS_SIZE 8u
-#define SETTINGS_ASK_SIZE 2u
-#define SETTINGS_SIZE 10u
-#define SETTINGS_ARE_SIZE 12u
-#define RECORD_SIZE (T3_KEY_SIZE + T3_CRC_SIZE)
+#define KEY_RECORD_SIZE (T3_KEY_SIZE + T3_CRC_SIZE)
+#define READ_SIZE 4u
+#define STAGE_SIZE (READ_SIZE + T3_PART_SIZE)
+#define STORE_SIZE 5u
+#define RECORD_IS_SIZE (7u + T3_PART_SIZE)
+#define SENSE_SIZE 2u
+#define SENSE_IS_SIZE 32u
 
 static void reply(struct t3_console *console, const uint8_t *frame, uint8_t size)
 {
@@ -42,7 +45,7 @@ static void take_ping(struct t3_console *console, const uint8_t *frame, uint8_t 
         .frame_errors = console->splitter.frame_errors,
         .overruns = console->overruns,
         .reset_cause = console->robot->reset_cause,
-        .settings = console->robot->settings.state,
+        .settings = t3_robot_records(console->robot),
         .channel = console->robot->settings.now.channel,
         .address = console->robot->settings.now.address,
     };
@@ -50,7 +53,7 @@ static void take_ping(struct t3_console *console, const uint8_t *frame, uint8_t 
     reply(console, answer, t3_encode_pong(frame, &pong, answer));
 }
 
-static void tell_key(struct t3_console *console, uint8_t id, uint8_t rc)
+static void send_key_state(struct t3_console *console, uint8_t id, uint8_t rc)
 {
     const struct t3_session *session = &console->robot->session;
     uint8_t frame[KEY_IS_SIZE];
@@ -75,7 +78,7 @@ static bool all_zero(const uint8_t *data, uint8_t size)
 static void take_key(struct t3_console *console, const uint8_t *frame, uint8_t size)
 {
     if (size == KEY_ASK_SIZE) {
-        tell_key(console, frame[1], T3_RC_OK);
+        send_key_state(console, frame[1], T3_RC_OK);
         return;
     }
     if (size != KEY_SIZE) {
@@ -83,7 +86,7 @@ static void take_key(struct t3_console *console, const uint8_t *frame, uint8_t s
         return;
     }
     if (t3_console_writes(console) || !t3_robot_rests(console->robot)) {
-        tell_key(console, frame[1], T3_RC_BUSY);
+        send_key_state(console, frame[1], T3_RC_BUSY);
         return;
     }
     t3_session_lock(&console->robot->session);
@@ -93,49 +96,149 @@ static void take_key(struct t3_console *console, const uint8_t *frame, uint8_t s
     console->step = T3_KEY_MARKED;
 }
 
-static void tell_settings(struct t3_console *console, uint8_t id, uint8_t rc)
+static void begin_write(struct t3_console *console, uint8_t record, uint8_t id)
 {
-    const struct t3_settings *settings = &console->robot->settings;
-    uint8_t frame[SETTINGS_ARE_SIZE];
-    uint8_t *to = t3_put8(frame, T3_SETTINGS_ARE);
+    t3_session_end(&console->robot->session);
+    console->sets = true;
+    console->record = record;
+    console->id = id;
+}
+
+// Return the state of a record, and its body in effect: t3_record_size bytes.
+static uint8_t read_record(const struct t3_robot *robot, uint8_t record, uint8_t *body)
+{
+    if (record == T3_RECORD_SETTINGS) {
+        t3_setup_encode(&robot->settings.now, body);
+        return robot->settings.copies.state;
+    }
+    memcpy(body, robot->calibration.now, T3_CALIBRATION_BODY);
+    return robot->calibration.copies.state;
+}
+
+static uint8_t record_size(uint8_t record)
+{
+    return record == T3_RECORD_SETTINGS ? T3_SETUP_BODY : T3_CALIBRATION_BODY;
+}
+
+static void send_part(struct t3_console *console, uint8_t id, uint8_t record, uint8_t part,
+                        uint8_t rc)
+{
+    uint8_t body[T3_PARTS * T3_PART_SIZE] = {0};
+    uint8_t frame[RECORD_IS_SIZE];
+    uint8_t *to = t3_put8(frame, T3_RECORD_IS);
     to = t3_put8(to, id);
     to = t3_put8(to, rc);
-    to = t3_put8(to, settings->state);
-    to = t3_put8(to, settings->now.channel);
-    to = t3_put16(to, settings->now.microsteps);
-    memcpy(to, settings->now.address, sizeof settings->now.address);
+    to = t3_put8(to, record);
+    if (record < T3_RECORDS) {
+        to = t3_put8(to, read_record(console->robot, record, body));
+        to = t3_put8(to, record_size(record));
+    } else {
+        to = t3_put16(to, 0);
+    }
+    to = t3_put8(to, part);
+    if (part < T3_PARTS)
+        memcpy(to, body + part * T3_PART_SIZE, T3_PART_SIZE);
+    else
+        memset(to, 0, T3_PART_SIZE);
     reply(console, frame, sizeof frame);
 }
 
-static void take_settings(struct t3_console *console, const uint8_t *frame, uint8_t size)
+static void send_log_entry(struct t3_console *console, uint8_t id, uint8_t place)
 {
-    if (size == SETTINGS_ASK_SIZE) {
-        tell_settings(console, frame[1], T3_RC_OK);
+    uint8_t frame[RECORD_IS_SIZE];
+    uint8_t *to = t3_put8(frame, T3_RECORD_IS);
+    to = t3_put8(to, id);
+    to = t3_put8(to, T3_RC_OK);
+    to = t3_put8(to, T3_RECORD_LOG);
+    to = t3_put8(to, T3_SETTINGS_GOOD);
+    to = t3_put8(to, T3_STORE_LOG_ENTRIES * T3_STORE_LOG_SIZE - 1u);
+    to = t3_put8(to, place);
+    t3_log_read(console->robot->port, place, to);
+    reply(console, frame, sizeof frame);
+}
+
+static void take_record(struct t3_console *console, const uint8_t *frame, uint8_t size)
+{
+    if (size != READ_SIZE && size != STAGE_SIZE) {
+        refuse(console, T3_ERR_MALFORMED, T3_RECORD);
         return;
     }
-    if (size != SETTINGS_SIZE) {
-        refuse(console, T3_ERR_MALFORMED, T3_SETTINGS);
+    const uint8_t record = frame[2], part = frame[3];
+    if (record == T3_RECORD_LOG && part < T3_STORE_LOG_ENTRIES && size == READ_SIZE) {
+        send_log_entry(console, frame[1], part);
         return;
     }
-    struct t3_setup setup = {.channel = frame[2], .microsteps = t3_get16(frame + 3)};
-    memcpy(setup.address, frame + 5, sizeof setup.address);
-    if (!t3_setup_valid(&setup)) {
-        tell_settings(console, frame[1], T3_RC_RANGE);
+    const bool known = record < T3_RECORDS && part * T3_PART_SIZE < record_size(record);
+    if (known && size == STAGE_SIZE) {
+        if (record != console->staged_record)
+            memset(console->staged, 0, sizeof console->staged);
+        console->staged_record = record;
+        memcpy(console->staged + part * T3_PART_SIZE, frame + READ_SIZE, T3_PART_SIZE);
+    }
+    send_part(console, frame[1], record, part, known ? T3_RC_OK : T3_RC_UNKNOWN);
+}
+
+// Return T3_RC_OK if the staged bytes may be written.
+static uint8_t check_staged(const struct t3_console *console, uint8_t record, uint16_t crc)
+{
+    if (record >= T3_RECORDS || record != console->staged_record ||
+        crc != t3_crc16(console->staged, record_size(record)))
+        return T3_RC_UNKNOWN;
+    const bool valid = record == T3_RECORD_SETTINGS ? t3_setup_valid(console->staged)
+                                                    : t3_calibration_valid(console->staged);
+    if (!valid)
+        return T3_RC_RANGE;
+    return t3_console_writes(console) || !t3_robot_rests(console->robot) ? T3_RC_BUSY : T3_RC_OK;
+}
+
+static void take_store(struct t3_console *console, const uint8_t *frame, uint8_t size)
+{
+    if (size != STORE_SIZE) {
+        refuse(console, T3_ERR_MALFORMED, T3_STORE);
         return;
     }
-    if (t3_console_writes(console) || !t3_robot_rests(console->robot)) {
-        tell_settings(console, frame[1], T3_RC_BUSY);
+    const uint8_t record = frame[2];
+    const uint8_t rc = check_staged(console, record, t3_get16(frame + 3));
+    if (rc != T3_RC_OK) {
+        send_part(console, frame[1], record, 0, rc);
         return;
     }
-    t3_session_end(&console->robot->session);
-    t3_settings_write(&console->robot->settings, console->robot->port, &setup);
-    console->id = frame[1];
-    console->sets = true;
+    struct t3_robot *robot = console->robot;
+    if (record == T3_RECORD_SETTINGS)
+        t3_settings_write(&robot->settings, robot->port, console->staged);
+    else
+        t3_calibration_write(&robot->calibration, robot->port, console->staged);
+    begin_write(console, record, frame[1]);
+}
+
+// The newest samples of the converter and of the inertial sensor, raw; zeros while that does not answer.
+static void take_sense(struct t3_console *console, const uint8_t *frame, uint8_t size)
+{
+    if (size != SENSE_SIZE) {
+        refuse(console, T3_ERR_MALFORMED, T3_SENSE);
+        return;
+    }
+    const struct t3_port *port = console->robot->port;
+    struct t3_imu imu;
+    if (!port->imu(port->context, &imu))
+        memset(&imu, 0, sizeof imu);
+    uint8_t answer[SENSE_IS_SIZE];
+    uint8_t *to = t3_put8(answer, T3_SENSE_IS);
+    to = t3_put8(to, frame[1]);
+    for (uint8_t i = 0; i <= T3_ADC_BATTERY; i++)
+        to = t3_put16(to, port->adc(port->context, i));
+    const int16_t six[] = {imu.accel_x, imu.accel_y, imu.accel_z,
+                           imu.gyro_x,  imu.gyro_y,  imu.gyro_z};
+    for (uint8_t i = 0; i < 6; i++)
+        to = t3_put16(to, (uint16_t)six[i]);
+    reply(console, answer, sizeof answer);
 }
 
 bool t3_console_writes(const struct t3_console *console)
 {
-    return console->step != T3_KEY_RESTS || console->robot->settings.step != T3_SETTINGS_IDLE;
+    const struct t3_robot *robot = console->robot;
+    return console->step != T3_KEY_RESTS || robot->settings.copies.step != T3_COPIES_IDLE ||
+           robot->calibration.copies.step != T3_COPIES_IDLE;
 }
 
 static void end_key(struct t3_console *console, uint8_t rc)
@@ -145,26 +248,32 @@ static void end_key(struct t3_console *console, uint8_t rc)
     // After a failure the session remains locked, and the mark remains for the next boot.
     if (rc == T3_RC_OK)
         t3_session_boot(&console->robot->session, console->robot->port);
-    tell_key(console, console->id, rc);
+    send_key_state(console, console->id, rc);
+}
+
+static void end_write(struct t3_console *console, uint8_t record, enum t3_progress progress)
+{
+    if (progress == T3_PROGRESS_NONE || !console->sets || record != console->record)
+        return;
+    console->sets = false;
+    const uint8_t rc = progress == T3_PROGRESS_DONE ? T3_RC_OK : T3_RC_FAILED;
+    if (rc == T3_RC_OK)
+        t3_robot_use_settings(console->robot);
+    send_part(console, console->id, record, 0, rc);
 }
 
 void t3_console_tick(struct t3_console *console)
 {
     const struct t3_port *board = console->robot->port;
-    const enum t3_progress progress =
-        t3_settings_tick(&console->robot->settings, board, console->port);
-    if (progress != T3_PROGRESS_NONE && console->sets) {
-        console->sets = false;
-        if (progress == T3_PROGRESS_DONE)
-            t3_robot_use_settings(console->robot);
-        tell_settings(console, console->id,
-                      progress == T3_PROGRESS_DONE ? T3_RC_OK : T3_RC_FAILED);
-    }
+    end_write(console, T3_RECORD_SETTINGS,
+              t3_settings_tick(&console->robot->settings, board, console->port));
+    end_write(console, T3_RECORD_CALIBRATION,
+              t3_calibration_tick(&console->robot->calibration, board, console->port));
     if (console->step == T3_KEY_RESTS || !console->port->eeprom_settled(console->port->context))
         return;
     const bool record = console->step == T3_KEY_WRITTEN;
     if (!t3_store_verify(board, console->port, record ? T3_STORE_KEY : T3_STORE_KEY_MARK,
-                         record ? RECORD_SIZE : 1)) {
+                         record ? KEY_RECORD_SIZE : 1)) {
         end_key(console, T3_RC_FAILED);
         return;
     }
@@ -182,6 +291,16 @@ void t3_console_tick(struct t3_console *console)
     }
 }
 
+uint8_t t3_console_watch(struct t3_console *console)
+{
+    const struct t3_robot *robot = console->robot;
+    const struct t3_console_port *port = console->port;
+    const bool chip_ok = port->chip_ok(port->context);
+    t3_log_tick(&console->log, robot, chip_ok, port->eeprom_settled(port->context));
+    return t3_signal_tick(&console->signal, robot, chip_ok,
+                          robot->port->time_us(robot->port->context));
+}
+
 bool t3_console_byte(struct t3_console *console, uint8_t byte)
 {
     const uint8_t size = t3_splitter_byte(&console->splitter, byte);
@@ -196,8 +315,14 @@ bool t3_console_byte(struct t3_console *console, uint8_t byte)
     case T3_KEY:
         take_key(console, frame, size);
         break;
-    case T3_SETTINGS:
-        take_settings(console, frame, size);
+    case T3_RECORD:
+        take_record(console, frame, size);
+        break;
+    case T3_STORE:
+        take_store(console, frame, size);
+        break;
+    case T3_SENSE:
+        take_sense(console, frame, size);
         break;
     default:
         refuse(console, T3_ERR_UNKNOWN, frame[0]);
@@ -217,4 +342,6 @@ void t3_console_boot(struct t3_console *console, const struct t3_console_port *p
     console->port = port;
     console->robot = robot;
     t3_splitter_start(&console->splitter);
+    t3_log_boot(&console->log, robot->port, robot);
+    t3_signal_boot(&console->signal, robot->port->time_us(robot->port->context));
 }

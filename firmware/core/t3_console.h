@@ -1,18 +1,27 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
-// USB console of the robot board: status and key. The key is written over this port only and is never
-// sent; a check value of 32 bits identifies it.
+// USB console of the robot board: status, key, records, raw sensors. The key is written over this port
+// only and is never sent; a check value of 32 bits identifies it. A record (settings, calibration) is
+// read and staged in parts of 16 bytes; STORE writes it if its CRC is that of all staged bytes.
 //
-// During the write of a key no session is accepted and nothing moves. After a loss of power during the
+// During a write no session is accepted and nothing moves. After a loss of power during the
 // write, the board has the old key, the new key or a damaged key; with a damaged key it accepts only
 // emergency stops until a key is written.
 #ifndef T3_CONSOLE_H
 #define T3_CONSOLE_H
 
+#include "t3_log.h"
 #include "t3_robot.h"
+#include "t3_signal.h"
 
 // States of the key in KEY.
 enum { T3_KEY_NONE, T3_KEY_HELD, T3_KEY_DAMAGED };
+
+// Records of RECORD and STORE.
+// The parts of the log are its entries, in no order; it can only be read.
+enum { T3_RECORD_SETTINGS, T3_RECORD_CALIBRATION, T3_RECORDS, T3_RECORD_LOG = T3_RECORDS };
+#define T3_PART_SIZE 16u
+#define T3_PARTS ((T3_BODY_LIMIT + T3_PART_SIZE - 1u) / T3_PART_SIZE)
 
 struct t3_console {
     const struct t3_console_port *port;
@@ -20,8 +29,13 @@ struct t3_console {
     struct t3_splitter splitter;
     uint16_t overruns;
     enum { T3_KEY_RESTS, T3_KEY_MARKED, T3_KEY_WRITTEN, T3_KEY_VERIFIED } step;
-    bool sets;   // settings from a frame are being written, not a repair
-    uint8_t id;  // of the frame whose key or settings are being written
+    bool sets;       // a record from a frame is being written, not a repair
+    uint8_t record;  // which
+    uint8_t id;      // of the frame whose key or record is being written
+    struct t3_log log;
+    struct t3_signal signal;
+    uint8_t staged_record;
+    uint8_t staged[T3_PARTS * T3_PART_SIZE];
     uint8_t key[T3_KEY_SIZE];
 };
 
@@ -35,10 +49,13 @@ bool t3_console_byte(struct t3_console *console, uint8_t byte);
 // Count a byte lost to an overrun.
 void t3_console_overrun(struct t3_console *console);
 
-// Return whether a key or settings are being written.
+// Return whether a key or a record is being written.
 bool t3_console_writes(const struct t3_console *console);
 
 // Call in each pass of the main loop: an EEPROM write takes many passes.
 void t3_console_tick(struct t3_console *console);
+
+// Call in each pass of the main loop: log what is new; return the levels of LED and buzzer.
+uint8_t t3_console_watch(struct t3_console *console);
 
 #endif

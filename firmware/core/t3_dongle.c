@@ -120,7 +120,7 @@ static bool read_settings(const uint8_t *frame, struct t3_radio_settings *settin
            settings->retry_delay <= 15 && settings->retries <= 15;
 }
 
-static void tell_settings(struct t3_dongle *dongle, uint8_t id)
+static void send_configuration(struct t3_dongle *dongle, uint8_t id)
 {
     const struct t3_radio_settings *radio = &dongle->radio;
     uint8_t frame[CFG_SIZE + 1] = {T3_CFG_IS,    id,           radio->channel,     radio->rate,
@@ -145,7 +145,7 @@ static void take_cfg(struct t3_dongle *dongle, const uint8_t *frame, uint8_t siz
         dongle->radio = wanted;
         configure(dongle);
     }
-    tell_settings(dongle, frame[1]);
+    send_configuration(dongle, frame[1]);
 }
 
 static void take_ping(struct t3_dongle *dongle, const uint8_t *frame, uint8_t size)

@@ -1,6 +1,6 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
-// Parameters of the robot. All but the microsteps are in RAM only: the host writes them after each
+// Parameters of the robot. All but microsteps and steps per turn are in RAM only: the host writes them after each
 // HELLO.
 #ifndef T3_PARAMETERS_H
 #define T3_PARAMETERS_H
@@ -14,11 +14,11 @@ enum t3_parameter {
     T3_DECELERATION,   // mrad/s^2
     T3_TTL_MAX,        // ms
     T3_MICROSTEPS,     // per full step; of the settings
-    T3_STEPS_PER_REV,  // full steps
+    T3_STEPS_PER_REV,  // full steps; of the settings
     T3_GYRO_RANGE,     // deg/s
     T3_BATTERY_LOW,    // mV
     T3_IDLE_OFF,       // ms at rest until the drivers switch off; 0: never
-    T3_INVERT_WHEELS,  // bit 0 left, bit 1 right
+    T3_INVERT_WHEELS,  // bit 0 left, bit 1 right: against the settings
     T3_BATTERY_CUTOFF,  // mV below which the robot does not drive; 0: none
     T3_PARAMETERS
 };

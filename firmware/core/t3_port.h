@@ -36,8 +36,8 @@ struct t3_port {
     bool (*imu)(void *context, struct t3_imu *sample);
     // Newest 10-bit count of a channel.
     uint16_t (*adc)(void *context, uint8_t channel);
-    void (*eeprom_read)(void *context, uint8_t address, uint8_t *data, uint8_t size);
-    void (*eeprom_write)(void *context, uint8_t address, const uint8_t *data, uint8_t size);
+    void (*eeprom_read)(void *context, uint16_t address, uint8_t *data, uint8_t size);
+    void (*eeprom_write)(void *context, uint16_t address, const uint8_t *data, uint8_t size);
     // Unpredictable bits (converter noise, timer jitter); used for nonces only.
     uint32_t (*noise)(void *context);
     // Disable and enable the step interrupt around accesses to the counters.
@@ -56,7 +56,7 @@ struct t3_console_port {
     // Whether all EEPROM writes are complete.
     bool (*eeprom_settled)(void *context);
     // Read the cells themselves, not the requested values.
-    void (*eeprom_cells)(void *context, uint8_t address, uint8_t *data, uint8_t size);
+    void (*eeprom_cells)(void *context, uint16_t address, uint8_t *data, uint8_t size);
 };
 
 // Configuration of the radio chip, with the fields of a CFG frame.
@@ -69,8 +69,8 @@ struct t3_radio_settings {
     uint8_t address[5];  // lowest first
 };
 
-// The rate is a build option of both boards (make avr RADIO_RATE=0). RADIO_CHANNEL is that of a dongle
-// before CFG, and of a robot without settings (t3_settings.h).
+// Of a dongle before CFG, and of a robot without settings (t3_settings.h); build options of both
+// boards (make avr RADIO_RATE=0 RADIO_CHANNEL=100).
 #ifndef T3_RADIO_CHANNEL
 #define T3_RADIO_CHANNEL 82
 #endif
@@ -81,7 +81,8 @@ struct t3_radio_settings {
 #error "RADIO_CHANNEL is 0 to 125, RADIO_RATE 0 (250 kbit/s), 1 or 2 (Mbit/s)"
 #endif
 // A shorter delay cuts off acknowledgements of 32 bytes at 250 kbit/s (data sheet 7.4.2).
-#define T3_RETRY_DELAY (T3_RADIO_RATE == 0 ? 5 : 1)
+#define T3_RETRY_DELAY_AT(rate) ((rate) == 0 ? 5u : 1u)
+#define T3_RETRY_DELAY T3_RETRY_DELAY_AT(T3_RADIO_RATE)
 // Defaults of both ends: CFG changes those of the dongle, settings those of the robot.
 #define T3_RADIO_DEFAULTS                                                                         \
     {T3_RADIO_CHANNEL, T3_RADIO_RATE, 3, T3_RETRY_DELAY, 4, {'T', '3', 'M', 'P', 'C'}}

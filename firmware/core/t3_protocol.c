@@ -8,33 +8,32 @@
 
 // -- radio payloads ------------------------------------------------------------------------------
 
-// Sizes by kind; a signed one ends with a tag, and has its clock before it where the unsigned one
-// carries none. 0: there is no signed form.
+// Sizes by kind; a signed one ends with the clock of the host and a tag (in HELLO with a nonce
+// between them). 0: there is no signed form.
 struct form {
     uint8_t plain, tagged;
 };
 
 static const struct form FORMS[] = {
-    [T3_CMD] = {14, 22},
+    [T3_CMD] = {T3_CMD_SIZE, 26},
     [T3_PARAM_GET] = {4, 0},
     [T3_PARAM_SET] = {8, 20},
-    [T3_HELLO] = {8, 24},
+    [T3_HELLO] = {4, 24},
     [T3_POLL] = {4, 0},
     [T3_ACTION] = {6, 18},
 };
 
-static uint8_t header(uint8_t kind)
-{
-    return (uint8_t)(T3_VERSION << 4 | kind);
-}
-
+// Sizes of a CMD of version 1.
+static const struct form COMMAND_1 = {14, 22};
 // Return whether every value is valid.
 static bool read_command(const uint8_t *data, struct t3_packet *packet)
 {
     packet->ttl = data[4];
     packet->left = t3_signed16(t3_get16(data + 6));
     packet->right = t3_signed16(t3_get16(data + 8));
-    packet->host_us = t3_get32(data + 10);
+    packet->echo_us = t3_get32(data + 10);
+    if (packet->tag)
+        packet->host_us = t3_get32(data + 14);
     return packet->what <= (T3_FLAG_ENABLE | T3_FLAG_ESTOP | T3_FLAG_ESTOP_CLEAR) && !data[5];
 }
 
@@ -48,9 +47,10 @@ static bool read_param_set(const uint8_t *data, struct t3_packet *packet)
 
 static bool read_hello(const uint8_t *data, struct t3_packet *packet)
 {
-    packet->host_us = t3_get32(data + 4);
-    if (packet->tag)
+    if (packet->tag) {
+        packet->host_us = t3_get32(data + 4);
         packet->nonce = data + 8;
+    }
     // Flag and length agree; session 0 means none and cannot be started.
     return packet->session && packet->what == (packet->tag ? 1 : 0);
 }
@@ -60,6 +60,11 @@ static bool read_action(const uint8_t *data, struct t3_packet *packet)
     if (packet->tag)
         packet->host_us = t3_get32(data + 6);
     return !t3_get16(data + 4);
+}
+
+static bool has_form(struct form form, uint8_t size)
+{
+    return size == form.plain || (form.tagged && size == form.tagged);
 }
 
 static bool read_body(const uint8_t *data, struct t3_packet *packet)
@@ -80,35 +85,47 @@ static bool read_body(const uint8_t *data, struct t3_packet *packet)
     }
 }
 
-enum t3_fault t3_decode(const uint8_t *data, uint8_t size, struct t3_packet *packet)
+enum t3_refusal t3_decode(const uint8_t *data, uint8_t size, struct t3_packet *packet)
 {
     memset(packet, 0, sizeof *packet);
     if (size < 1 || size > T3_RADIO_LIMIT)
-        return T3_BAD_LENGTH;
+        return T3_REFUSED_FORM;
     packet->kind = data[0] & 0x0F;
-    if (data[0] >> 4 != T3_VERSION || packet->kind < T3_CMD || packet->kind > T3_ACTION)
-        return T3_BAD_VERSION;
+    if (data[0] >> 4 != T3_VERSION)
+        return T3_REFUSED_VERSION;
+    if (packet->kind < T3_CMD || packet->kind > T3_ACTION)
+        return T3_REFUSED_FORM;
     const struct form form = FORMS[packet->kind];
-    if (size != form.plain && (size != form.tagged || !form.tagged))
-        return T3_BAD_LENGTH;
+    if (!has_form(form, size))
+        return T3_REFUSED_FORM;
     packet->session = data[1];
     packet->seq = data[2];
     packet->what = data[3];
     if (size == form.tagged)
         packet->tag = data + size - T3_TAG_SIZE;
-    return read_body(data, packet) ? T3_GOOD : T3_BAD_LENGTH;
+    return read_body(data, packet) ? T3_ADMITTED : T3_REFUSED_FORM;
 }
 
 bool t3_asks_to_stop(const uint8_t *data, uint8_t size)
 {
-    return (size == FORMS[T3_CMD].plain || size == FORMS[T3_CMD].tagged) &&
-           data[0] == header(T3_CMD) && (data[3] & T3_FLAG_ESTOP);
+    if (!has_form(FORMS[T3_CMD], size) && !has_form(COMMAND_1, size))
+        return false;
+    const uint8_t version = data[0] >> 4;
+    return version >= 1 && version <= T3_VERSION && (data[0] & 0x0F) == T3_CMD &&
+           (data[3] & T3_FLAG_ESTOP);
 }
 
+bool t3_asks_for_identity(const uint8_t *data, uint8_t size)
+{
+    if (size <= T3_HEADER_SIZE || size > T3_RADIO_LIMIT || data[0] >> 4 == T3_VERSION)
+        return false;
+    const uint8_t kind = data[0] & 0x0F;
+    return kind == T3_HELLO || (kind == T3_POLL && data[3] == T3_POLL_INFO);
+}
 // Write what every payload begins with.
 static uint8_t *put_header(uint8_t *to, uint8_t kind, uint8_t session, uint8_t seq)
 {
-    to = t3_put8(to, header(kind));
+    to = t3_put8(to, (uint8_t)(T3_VERSION << 4 | kind));
     to = t3_put8(to, session);
     return t3_put8(to, seq);
 }
@@ -150,7 +167,9 @@ static uint8_t *put_radio(uint8_t *to, uint8_t channel, const uint8_t *address)
 
 uint8_t t3_encode_info(const struct t3_info *info, uint8_t *to)
 {
-    to = put_header(to, T3_INFO, info->session, info->seq);
+    to = t3_put8(to, (uint8_t)(info->version << 4 | T3_INFO));
+    to = t3_put8(to, info->session);
+    to = t3_put8(to, info->seq);
     to = t3_put8(to, info->protocol);
     to = t3_put8(to, info->major);
     to = t3_put8(to, info->minor);
@@ -158,7 +177,7 @@ uint8_t t3_encode_info(const struct t3_info *info, uint8_t *to)
     to = t3_put8(to, info->parameters);
     to = t3_put16(to, info->steps_per_rev);
     to = t3_put16(to, info->microsteps);
-    to = t3_put8(to, info->status);
+    to = t3_put8(to, info->refusal);
     to = t3_put8(to, info->settings);
     to = put_radio(to, info->channel, info->address);
     to = t3_put32(to, info->build);
@@ -191,9 +210,11 @@ uint8_t t3_encode_aux(const struct t3_aux *aux, uint8_t *to)
     to = t3_put16(to, aux->counters.bad_session);
     to = t3_put16(to, aux->counters.stale);
     to = t3_put16(to, aux->counters.expired);
-    to = t3_put32(to, aux->time_us);
     to = t3_put16(to, aux->counters.bad_version);
-    t3_put16(to, aux->counters.bad_length);
+    to = t3_put16(to, aux->counters.malformed);
+    to = t3_put8(to, aux->refusal);
+    for (uint8_t i = 0; i < T3_HEADER_SIZE; i++)
+        to = t3_put8(to, aux->refused[i]);
     return T3_AUX_SIZE;
 }
 

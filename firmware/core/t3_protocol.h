@@ -1,6 +1,6 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
-// Protocol 1 byte by byte: radio payloads, and the frames of the serial line around them. All
+// Protocol 2 byte by byte: radio payloads, and the frames of the serial line around them. All
 // numbers are little endian. docs/radio.md has the byte tables.
 #ifndef T3_PROTOCOL_H
 #define T3_PROTOCOL_H
@@ -8,9 +8,9 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-#define T3_VERSION 1u
-#define T3_FIRMWARE_MAJOR 1u
-#define T3_FIRMWARE_MINOR 1u
+#define T3_VERSION 2u
+#define T3_FIRMWARE_MAJOR 2u
+#define T3_FIRMWARE_MINOR 0u
 // Set by the Makefile: a digest of the sources and of the build settings.
 #ifndef T3_BUILD
 #define T3_BUILD 0
@@ -56,15 +56,27 @@ enum { T3_STATE = 1, T3_PARAM, T3_INFO, T3_ACK, T3_AUX };
 enum { T3_POLL_STATE, T3_POLL_AUX, T3_POLL_INFO };
 // Verbs of an ACTION.
 enum { T3_RESET_ODOMETRY = 1, T3_CLEAR_COUNTERS };
-// Results in PARAM, ACK and KEY; the last one in KEY only.
+// Results in PARAM, ACK, KEY, SETTINGS and RECORD; the last one not in PARAM and ACK.
 enum { T3_RC_OK, T3_RC_UNKNOWN, T3_RC_RANGE, T3_RC_READ_ONLY, T3_RC_BUSY, T3_RC_FAILED };
 
 #define T3_AGE_NONE 0xFFFFu
 #define T3_RANGES 8u
 
-// Kinds of invalid payloads; the robot counts them separately.
-enum t3_fault { T3_GOOD, T3_BAD_VERSION, T3_BAD_LENGTH };
-
+// Why the robot refuses a payload, in INFO and AUX.
+enum t3_refusal {
+    T3_ADMITTED,
+    T3_REFUSED_VERSION,   // another version of the protocol
+    T3_REFUSED_FORM,      // unknown kind, wrong length, or a value out of range
+    T3_REFUSED_SETTINGS,  // HELLO: the robot has no valid settings
+    T3_REFUSED_KEY,       // HELLO: the key of the robot is damaged, or being written
+    T3_REFUSED_UNSIGNED,  // no tag, but the robot has a key
+    T3_REFUSED_SIGNED,    // a tag, but the robot has no key
+    T3_REFUSED_SESSION,   // no session, or not the current one
+    T3_REFUSED_TAG,       // bad tag, or a replay
+    T3_REFUSED_SEQUENCE,  // CMD: repeated, or overtaken by a newer one
+    T3_REFUSED_STALE      // CMD: its echo is too old
+};
+#define T3_HEADER_SIZE 3u  // bytes that every payload begins with: version and kind, session, seq
 // A radio payload from the host. The valid fields depend on the kind.
 struct t3_packet {
     uint8_t kind, session, seq;
@@ -72,19 +84,20 @@ struct t3_packet {
     uint8_t ttl;   // 10 ms
     int16_t left, right;  // mrad/s
     int32_t value;
-    uint32_t host_us;
+    uint32_t echo_us;  // CMD: robot time of the newest STATE that the host has
+    uint32_t host_us;  // of a signed frame
     const uint8_t *nonce;  // a signed HELLO's, else NULL
     const uint8_t *tag;    // after the signed bytes; NULL if there is none
 };
 
-// Decode a payload completely or not at all: a wrong length or an invalid value is T3_BAD_LENGTH;
-// another version or an unknown kind is T3_BAD_VERSION.
-enum t3_fault t3_decode(const uint8_t *data, uint8_t size, struct t3_packet *packet);
-
-// Return whether a CMD requests an emergency stop, even if it is otherwise invalid: stopping is always
-// allowed.
+// Decode a payload completely or not at all: T3_ADMITTED, T3_REFUSED_VERSION or T3_REFUSED_FORM.
+enum t3_refusal t3_decode(const uint8_t *data, uint8_t size, struct t3_packet *packet);
+// Return whether a CMD of any version requests an emergency stop, even if it is otherwise invalid:
+// stopping is always allowed.
 bool t3_asks_to_stop(const uint8_t *data, uint8_t size);
-
+// Return whether a payload of another version asks for the identity of the robot: a HELLO, or a POLL
+// for INFO.
+bool t3_asks_for_identity(const uint8_t *data, uint8_t size);
 struct t3_state {
     uint8_t session, seq, status;
     uint32_t time_us;
@@ -100,9 +113,10 @@ struct t3_param {
 };
 
 struct t3_info {
+    uint8_t version;  // of the request, in byte 0
     uint8_t session, seq, protocol, major, minor, reset_cause, parameters;
     uint16_t steps_per_rev, microsteps;
-    uint8_t status;
+    uint8_t refusal;   // enum t3_refusal, of the newest refused payload
     uint8_t settings;  // state of the record
     uint8_t channel;
     const uint8_t *address;  // 5 bytes
@@ -112,15 +126,16 @@ struct t3_info {
 
 // Counters of the robot, in the order of AUX, modulo 2**16.
 struct t3_counters {
-    uint16_t received, duplicates, bad_session, stale, expired, bad_version, bad_length;
+    uint16_t received, duplicates, bad_session, stale, expired, bad_version, malformed;
 };
 
 struct t3_aux {
     uint8_t session, seq, status;
     uint16_t battery;  // mV
     int16_t temperature, accel_z, gyro_x, gyro_y;
-    uint32_t time_us;
     struct t3_counters counters;
+    uint8_t refusal;                  // as in INFO
+    uint8_t refused[T3_HEADER_SIZE];  // first bytes of the newest refused payload
 };
 
 // Each writes one payload and returns its size.
@@ -132,15 +147,24 @@ uint8_t t3_encode_aux(const struct t3_aux *aux, uint8_t *to);
 
 // -- serial line: COBS( frame | CRC-16 ), then a zero byte ---------------------------------------
 
-// Frames from the host: TX and CFG to a dongle only, KEY and SETTINGS to a robot only.
-enum { T3_TX = 0x01, T3_CFG = 0x02, T3_PING = 0x03, T3_KEY = 0x04, T3_SETTINGS = 0x05 };
+// Frames from the host: TX and CFG to a dongle only, those from KEY on to a robot only.
+enum {
+    T3_TX = 0x01,
+    T3_CFG = 0x02,
+    T3_PING = 0x03,
+    T3_KEY = 0x04,
+    T3_RECORD = 0x06,
+    T3_STORE = 0x07,
+    T3_SENSE = 0x08
+};
 // Frames to the host.
 enum {
     T3_RESULT = 0x81,
     T3_CFG_IS = 0x82,
     T3_PONG = 0x83,
     T3_KEY_IS = 0x84,
-    T3_SETTINGS_ARE = 0x85,
+    T3_RECORD_IS = 0x86,
+    T3_SENSE_IS = 0x88,
     T3_ERR = 0x8F
 };
 // Codes of ERR, whose argument is the first byte of the frame, or for BUSY its id.

@@ -5,13 +5,6 @@
 #include <string.h>
 
 
-static void set_inverted(struct t3_robot *robot)
-{
-    robot->port->lock(robot->port->context);
-    robot->steps.inverted = (uint8_t)robot->parameters.values[T3_INVERT_WHEELS];
-    robot->port->unlock(robot->port->context);
-}
-
 static void get_parameter(struct t3_robot *robot, const struct t3_packet *packet)
 {
     const bool known = t3_parameter_bounds(packet->what) != 0;
@@ -24,7 +17,7 @@ static void set_parameter(struct t3_robot *robot, const struct t3_packet *packet
     const uint8_t rc =
         t3_parameter_set(&robot->parameters, id, packet->value, t3_ramp_busy(&robot->ramp));
     if (rc == T3_RC_OK && id == T3_INVERT_WHEELS)
-        set_inverted(robot);
+        t3_robot_invert(robot);
     t3_answer_with(robot, T3_PARAM, packet->seq, id, rc);
 }
 
@@ -45,6 +38,8 @@ static uint8_t act(struct t3_robot *robot, uint8_t verb)
         return reset_odometry(robot);
     case T3_CLEAR_COUNTERS:
         memset(&robot->counters, 0, sizeof robot->counters);
+        memset(robot->refused, 0, sizeof robot->refused);
+        robot->refusal = T3_ADMITTED;
         return T3_RC_OK;
     default:
         return T3_RC_UNKNOWN;

@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "t3_robot.h"
 
+#include <stddef.h>
 #include <string.h>
 
 #include "t3_bytes.h"
@@ -14,7 +15,7 @@
 
 void t3_answer_with(struct t3_robot *robot, uint8_t kind, uint8_t seq, uint8_t id, uint8_t rc)
 {
-    const struct t3_answer wanted = {kind, seq, id, rc};
+    const struct t3_answer wanted = {kind, seq, id, rc, T3_VERSION};
     robot->answer = wanted;
 }
 
@@ -44,34 +45,53 @@ static bool button(const struct t3_robot *robot)
 
 // -- packets -------------------------------------------------------------------------------------
 
-static void take_hello(struct t3_robot *robot, const struct t3_packet *packet,
-                       const uint8_t *data, uint32_t received_us)
+// Note why a payload is refused, and count it. Its first bytes identify it; what it lacks is 0.
+static void refuse(struct t3_robot *robot, enum t3_refusal why, const uint8_t *data, uint8_t size)
 {
-    // Even after a rejection, INFO reports the current session, the state of the settings, and
-    // whether a key is stored.
+    robot->refusal = (uint8_t)why;
+    for (uint8_t i = 0; i < T3_HEADER_SIZE; i++)
+        robot->refused[i] = i < size ? data[i] : 0;
+    switch (why) {
+    case T3_REFUSED_VERSION:
+        robot->counters.bad_version++;
+        return;
+    case T3_REFUSED_FORM:
+        robot->counters.malformed++;
+        return;
+    case T3_REFUSED_SEQUENCE:
+        robot->counters.duplicates++;
+        return;
+    case T3_REFUSED_STALE:
+        robot->counters.stale++;
+        return;
+    default:
+        robot->counters.bad_session++;
+    }
+}
+
+static enum t3_refusal take_hello(struct t3_robot *robot, const struct t3_packet *packet,
+                                  const uint8_t *data, uint32_t received_us)
+{
+    // Even after a rejection, INFO reports the reason, the current session, the state of the settings,
+    // and whether a key is stored.
     t3_answer_with(robot, T3_INFO, packet->seq, 0, 0);
-    if (!t3_settings_usable(&robot->settings)) {
-        // Its address is that of every such board, and its microsteps are unknown.
-        robot->counters.bad_session++;
-        return;
-    }
-    switch (t3_session_greet(&robot->session, robot->port, packet, data)) {
-    case T3_GREETING_REFUSED:
-        robot->counters.bad_session++;
-        return;
-    case T3_GREETING_REPEATED:
-        return;
-    case T3_GREETING_NEW:
-        break;
-    }
+    // Its address is that of every such board, and its microsteps are unknown.
+    if (!t3_settings_usable(&robot->settings) || !t3_calibration_usable(&robot->calibration))
+        return T3_REFUSED_SETTINGS;
+    bool repeated;
+    const enum t3_refusal why =
+        t3_session_greet(&robot->session, robot->port, packet, data, &repeated);
+    if (why != T3_ADMITTED)
+        return why;
+    robot->refusal = T3_ADMITTED;  // what was refused before does not concern this session
+    if (repeated)
+        return T3_ADMITTED;
     disable(robot);
     robot->expired = robot->limited = false;
     robot->seq_known = robot->command_seen = robot->action_done = false;
     robot->seq = 0;
-    robot->heard_us = received_us;
-    t3_stale_filter_start(&robot->stale_filter);
-    // HELLO's own delay is the first one known: a burst held back right behind it is found.
-    t3_stale_filter_check(&robot->stale_filter, received_us, packet->host_us, 0);
+    robot->last_frame_us = received_us;
+    return T3_ADMITTED;
 }
 
 static bool clears_estop(const struct t3_robot *robot, const struct t3_packet *packet)
@@ -109,29 +129,38 @@ static bool wants_to_stand(const struct t3_packet *packet)
     return !(packet->what & T3_FLAG_ENABLE) || !packet->ttl || (!packet->left && !packet->right);
 }
 
-static void take_command(struct t3_robot *robot, const struct t3_packet *packet,
-                         uint32_t received_us)
+// Return for how long a CMD may be followed, by the age of its echo: its TTL, less what the echo is
+// older than usual; UINT32_MAX if nothing is left. An echo from the future has an age near 2**32 us.
+static uint32_t time_to_follow(uint32_t ttl_us, uint32_t age_us)
+{
+    if (age_us <= T3_ECHO_AGE_US)
+        return ttl_us;
+    const uint32_t excess_us = age_us - T3_ECHO_AGE_US;
+    return excess_us < ttl_us ? ttl_us - excess_us : UINT32_MAX;
+}
+
+static enum t3_refusal take_command(struct t3_robot *robot, const struct t3_packet *packet,
+                                    uint32_t received_us)
 {
     const uint8_t ahead = (uint8_t)(packet->seq - robot->seq);
-    if (robot->seq_known && (ahead == 0 || ahead >= 0x80)) {
-        robot->counters.duplicates++;
-        return;
-    }
-    robot->seq_known = robot->command_seen = true;
-    robot->seq = packet->seq;
-    robot->command_us = received_us;
+    if (robot->seq_known && (ahead == 0 || ahead >= 0x80))
+        return T3_REFUSED_SEQUENCE;
     uint32_t ttl_us = packet->ttl * TTL_UNIT_US;
     const uint32_t longest = (uint32_t)parameter(robot, T3_TTL_MAX) * 1000u;
     if (ttl_us > longest)
         ttl_us = longest;
-    if (t3_stale_filter_check(&robot->stale_filter, received_us, packet->host_us, ttl_us)) {
-        robot->counters.stale++;
+    ttl_us = time_to_follow(ttl_us, received_us - packet->echo_us);
+    if (ttl_us == UINT32_MAX) {
         // A wish to stand is never too late; it does not count as a command otherwise.
         if (wants_to_stand(packet))
             t3_ramp_halt(&robot->ramp);
-        return;
+        return T3_REFUSED_STALE;
     }
+    robot->seq_known = robot->command_seen = true;
+    robot->seq = packet->seq;
+    robot->command_us = received_us;
     follow(robot, packet, received_us, ttl_us);
+    return T3_ADMITTED;
 }
 
 static void take_poll(struct t3_robot *robot, const struct t3_packet *packet)
@@ -142,43 +171,36 @@ static void take_poll(struct t3_robot *robot, const struct t3_packet *packet)
 }
 
 // What only the host of the session may do. PARAM_GET changes nothing, so it needs no tag.
-static bool admitted(struct t3_robot *robot, const struct t3_packet *packet, const uint8_t *data,
-                     uint8_t size, uint32_t received_us)
+static enum t3_refusal admit(struct t3_robot *robot, const struct t3_packet *packet,
+                             const uint8_t *data, uint8_t size)
 {
-    const bool mine =
-        packet->kind == T3_PARAM_GET
-            ? robot->session.id && packet->session == robot->session.id
-            : t3_session_admits(&robot->session, packet, data, size);
-    if (!mine)
-        robot->counters.bad_session++;
-    else
-        robot->heard_us = received_us;
-    return mine;
+    if (packet->kind != T3_PARAM_GET)
+        return t3_session_admit(&robot->session, packet, data, size);
+    const bool mine = robot->session.id && packet->session == robot->session.id;
+    return mine ? T3_ADMITTED : T3_REFUSED_SESSION;
 }
 
-static void take(struct t3_robot *robot, const uint8_t *data, uint8_t size, uint32_t received_us)
+static enum t3_refusal take(struct t3_robot *robot, const uint8_t *data, uint8_t size,
+                            uint32_t received_us)
 {
     struct t3_packet packet;
-    switch (t3_decode(data, size, &packet)) {
-    case T3_BAD_VERSION:
-        robot->counters.bad_version++;
-        return;
-    case T3_BAD_LENGTH:
-        robot->counters.bad_length++;
-        return;
-    case T3_GOOD:
-        break;
-    }
-    if (packet.kind == T3_HELLO) {
-        take_hello(robot, &packet, data, received_us);
-    } else if (packet.kind == T3_POLL) {
+    enum t3_refusal why = t3_decode(data, size, &packet);
+    if (why != T3_ADMITTED)
+        return why;
+    if (packet.kind == T3_HELLO)
+        return take_hello(robot, &packet, data, received_us);
+    if (packet.kind == T3_POLL) {
         take_poll(robot, &packet);
-    } else if (admitted(robot, &packet, data, size, received_us)) {
-        if (packet.kind == T3_CMD)
-            take_command(robot, &packet, received_us);
-        else
-            t3_request(robot, &packet);
+        return T3_ADMITTED;
     }
+    why = admit(robot, &packet, data, size);
+    if (why != T3_ADMITTED)
+        return why;
+    robot->last_frame_us = received_us;
+    if (packet.kind == T3_CMD)
+        return take_command(robot, &packet, received_us);
+    t3_request(robot, &packet);
+    return T3_ADMITTED;
 }
 
 void t3_robot_packet(struct t3_robot *robot, const uint8_t *data, uint8_t size,
@@ -187,7 +209,7 @@ void t3_robot_packet(struct t3_robot *robot, const uint8_t *data, uint8_t size,
     robot->counters.received++;
     if (size > T3_RADIO_LIMIT) {
         // The chip never gives more; whatever claims to be wider is not even looked at.
-        robot->counters.bad_length++;
+        refuse(robot, T3_REFUSED_FORM, data, 0);
         return;
     }
     if (t3_asks_to_stop(data, size))
@@ -196,7 +218,14 @@ void t3_robot_packet(struct t3_robot *robot, const uint8_t *data, uint8_t size,
     t3_answer_with(robot, T3_STATE, 0, 0, 0);
     robot->answer_waits = true;
     robot->answer_from_us = received_us;
-    take(robot, data, size, received_us);
+    const enum t3_refusal why = take(robot, data, size, received_us);
+    if (why != T3_ADMITTED)
+        refuse(robot, why, data, size);
+    // A host of another version learns the version of the robot, in a frame that it can read.
+    if (why == T3_REFUSED_VERSION && t3_asks_for_identity(data, size)) {
+        t3_answer_with(robot, T3_INFO, data[2], 0, 0);
+        robot->answer.version = data[0] >> 4;
+    }
 }
 
 bool t3_robot_rests(const struct t3_robot *robot)
@@ -237,7 +266,9 @@ uint16_t t3_robot_battery(const struct t3_robot *robot)
 
 static void measure_battery(struct t3_robot *robot)
 {
-    const uint32_t supply = t3_battery_mv(robot->port->adc(robot->port->context, T3_ADC_BATTERY));
+    const uint16_t count = robot->port->adc(robot->port->context, T3_ADC_BATTERY);
+    const uint32_t supply = t3_calibration_battery(
+        &robot->calibration, t3_battery_mv_of(robot->settings.now.divider, count));
     if (!supply || !robot->battery_sum)
         robot->battery_sum = BATTERY_WEIGHT * supply;
     else
@@ -268,7 +299,7 @@ static void watch_clock(struct t3_robot *robot, uint32_t now_us)
     if (robot->command_seen && t3_later_by(now_us, robot->command_us) > INT32_C(1000000))
         robot->command_seen = false;
     if (robot->session.id &&
-        t3_later_by(now_us, robot->heard_us) > (int32_t)T3_SESSION_SILENCE_US) {
+        t3_later_by(now_us, robot->last_frame_us) > (int32_t)T3_SESSION_SILENCE_US) {
         t3_session_end(&robot->session);
         disable(robot);
     }
@@ -296,7 +327,11 @@ static void move_on(struct t3_robot *robot, uint32_t elapsed_us)
 static void read_range(struct t3_robot *robot)
 {
     const uint8_t channel = robot->next_range;
-    robot->ranges[channel] = t3_range_code(robot->port->adc(robot->port->context, channel));
+    struct t3_curve curve;
+    const bool calibrated = t3_calibration_curve(&robot->calibration, channel, &curve);
+    robot->ranges[channel] =
+        t3_range_code_of(robot->settings.now.sensors[channel], calibrated ? &curve : NULL,
+                         robot->port->adc(robot->port->context, channel));
     robot->next_range = (uint8_t)((channel + 1u) % T3_RANGES);
 }
 
@@ -355,6 +390,10 @@ static void load(struct t3_robot *robot, uint32_t now_us)
 void t3_robot_tick(struct t3_robot *robot)
 {
     const uint32_t now_us = robot->port->time_us(robot->port->context);
+    const uint32_t pass_us = now_us - robot->tick_us;
+    if (pass_us > robot->longest_us)
+        robot->longest_us = pass_us < UINT16_MAX ? (uint16_t)pass_us : UINT16_MAX;
+    robot->tick_us = now_us;
     watch_button(robot, now_us);
     watch_battery(robot, now_us);
     watch_ttl(robot, now_us);
@@ -368,8 +407,9 @@ static void scale_steps(struct t3_robot *robot)
 {
     robot->microsteps = robot->settings.now.microsteps;
     robot->parameters.values[T3_MICROSTEPS] = robot->microsteps;
-    const uint32_t steps_per_rev = (uint32_t)parameter(robot, T3_STEPS_PER_REV);
-    t3_steps_scale(&robot->steps, steps_per_rev * robot->microsteps);
+    const uint32_t steps_per_turn = robot->settings.now.steps_per_turn;
+    robot->parameters.values[T3_STEPS_PER_REV] = (int32_t)steps_per_turn;
+    t3_steps_scale(&robot->steps, steps_per_turn * robot->microsteps);
     robot->top_speed = (int32_t)(robot->steps.top_speed / 1000u);
 }
 
@@ -378,6 +418,23 @@ void t3_robot_use_settings(struct t3_robot *robot)
     robot->port->lock(robot->port->context);
     scale_steps(robot);
     robot->port->unlock(robot->port->context);
+    t3_robot_invert(robot);
+    robot->battery_sum = 0;  // in mV of another divider: not to be filtered with it
+}
+
+void t3_robot_invert(struct t3_robot *robot)
+{
+    robot->port->lock(robot->port->context);
+    robot->steps.inverted =
+        (uint8_t)(robot->settings.now.inverted ^ (uint8_t)parameter(robot, T3_INVERT_WHEELS));
+    robot->port->unlock(robot->port->context);
+}
+
+uint8_t t3_robot_records(const struct t3_robot *robot)
+{
+    if (t3_settings_usable(&robot->settings) && !t3_calibration_usable(&robot->calibration))
+        return T3_SETTINGS_CALIBRATION;
+    return robot->settings.copies.state;
 }
 
 void t3_robot_boot(struct t3_robot *robot, const struct t3_port *port, uint8_t reset_cause,
@@ -388,12 +445,14 @@ void t3_robot_boot(struct t3_robot *robot, const struct t3_port *port, uint8_t r
     port->drivers(port->context, false);
     robot->reset_cause = reset_cause;
     robot->settle_us = settle_us;
-    robot->period_us = robot->loaded_us = port->time_us(port->context);
+    robot->period_us = robot->loaded_us = robot->tick_us = port->time_us(port->context);
     robot->button_us = robot->battery_us = robot->loaded_us;
     t3_parameters_start(&robot->parameters);
-    measure_battery(robot);
     t3_settings_boot(&robot->settings, port);
+    t3_calibration_boot(&robot->calibration, port);
     scale_steps(robot);  // the step interrupt does not run yet
+    robot->steps.inverted = robot->settings.now.inverted;
+    measure_battery(robot);
     t3_session_boot(&robot->session, port);
     // The first packet fetches a state too.
     t3_answer_with(robot, T3_STATE, 0, 0, 0);

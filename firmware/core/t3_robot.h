@@ -9,7 +9,7 @@
 #ifndef T3_ROBOT_H
 #define T3_ROBOT_H
 
-#include "t3_stale_filter.h"
+#include "t3_calibration.h"
 #include "t3_parameters.h"
 #include "t3_port.h"
 #include "t3_protocol.h"
@@ -37,9 +37,14 @@
 // Silence that ends a session: after a longer one, 32-bit clocks are ambiguous.
 #define T3_SESSION_SILENCE_US UINT32_C(1800000000)
 
+// Age of an echo that takes nothing from the TTL of a CMD: a cycle of the host and its transmission.
+// With 0.1 s instead, a robot whose uplink fails would come to rest after 0.47 s, not 0.42 s.
+#define T3_ECHO_AGE_US UINT32_C(50000)
+
 // Kind of the frame to load next, and the request it replies to.
 struct t3_answer {
     uint8_t kind, seq, id, rc;
+    uint8_t version;  // of the request
 };
 
 struct t3_robot {
@@ -48,10 +53,14 @@ struct t3_robot {
     struct t3_ramp ramp;
     struct t3_session session;
     struct t3_settings settings;
-    struct t3_stale_filter stale_filter;
+    struct t3_calibration calibration;
     struct t3_parameters parameters;
     struct t3_counters counters;
+    uint8_t refusal;                  // enum t3_refusal of the newest refused payload
+    uint8_t refused[T3_HEADER_SIZE];  // its first bytes
     uint32_t period_us;  // start of the last period
+    uint32_t tick_us;    // last call of t3_robot_tick
+    uint16_t longest_us;  // longest time between two of them, 65535 at most
 
     bool enabled;   // commands may move the wheels
     bool estop;     // latched
@@ -72,7 +81,7 @@ struct t3_robot {
     bool seq_known, command_seen;
     uint8_t seq;              // of the last CMD
     uint32_t command_us;      // its reception
-    uint32_t heard_us;        // reception of the last frame of the session
+    uint32_t last_frame_us;        // reception of the last frame of the session
 
     bool action_done;
     uint8_t action_seq, action_verb, action_rc;
@@ -104,8 +113,14 @@ void t3_robot_tick(struct t3_robot *robot);
 // Return the filtered voltage of the battery, mV; 0 if it is not measured.
 uint16_t t3_robot_battery(const struct t3_robot *robot);
 
-// Apply settings that were written at rest: microsteps; counters continue.
+// Apply settings or a calibration that were written at rest; counters continue.
 void t3_robot_use_settings(struct t3_robot *robot);
+
+// Return the state of the records in INFO and PONG: of the settings, or T3_SETTINGS_CALIBRATION.
+uint8_t t3_robot_records(const struct t3_robot *robot);
+
+// Set the direction of the wheels: that of the settings, reversed by the parameter.
+void t3_robot_invert(struct t3_robot *robot);
 
 // Return whether the robot is disabled and stopped, and its drivers are off.
 bool t3_robot_rests(const struct t3_robot *robot);

@@ -105,19 +105,26 @@ void t3_session_derive_key(struct t3_session *session)
     }
 }
 
-enum t3_greeting t3_session_greet(struct t3_session *session, const struct t3_port *port,
-                                  const struct t3_packet *packet, const uint8_t *data)
+enum t3_refusal t3_session_greet(struct t3_session *session, const struct t3_port *port,
+                                 const struct t3_packet *packet, const uint8_t *data,
+                                 bool *repeated)
 {
-    // An unkeyed robot cannot check a signature, so it does not pretend to.
-    if (session->locked || session->keyed != (packet->tag != NULL))
-        return T3_GREETING_REFUSED;
+    *repeated = false;
+    if (session->locked)
+        return T3_REFUSED_KEY;
+    if (session->keyed && !packet->tag)
+        return T3_REFUSED_UNSIGNED;
+    // A robot without a key cannot verify a signature.
+    if (!session->keyed && packet->tag)
+        return T3_REFUSED_SIGNED;
     if (session->keyed) {
         uint8_t tag[T3_TAG_SIZE];
         hash(session, USE_HELLO, data, HELLO_SIGNED_SIZE, tag);
         if (!same(tag, packet->tag, T3_TAG_SIZE))
-            return T3_GREETING_REFUSED;
-        if (session->id && same(session->host_nonce, packet->nonce, T3_NONCE_SIZE))
-            return T3_GREETING_REPEATED;
+            return T3_REFUSED_TAG;
+        *repeated = session->id && same(session->host_nonce, packet->nonce, T3_NONCE_SIZE);
+        if (*repeated)
+            return T3_ADMITTED;
         memcpy(session->host_nonce, packet->nonce, T3_NONCE_SIZE);
         draw_nonce(session, port);
         t3_session_derive_key(session);
@@ -125,18 +132,20 @@ enum t3_greeting t3_session_greet(struct t3_session *session, const struct t3_po
         session->last_us = packet->host_us;
     }
     session->id = packet->session;
-    return T3_GREETING_NEW;
+    return T3_ADMITTED;
 }
 
-bool t3_session_admits(struct t3_session *session, const struct t3_packet *packet,
-                       const uint8_t *data, uint8_t size)
+enum t3_refusal t3_session_admit(struct t3_session *session, const struct t3_packet *packet,
+                                 const uint8_t *data, uint8_t size)
 {
     if (!session->id || packet->session != session->id)
-        return false;
+        return T3_REFUSED_SESSION;
     if (!session->keyed)
-        return packet->tag == NULL;
-    if (!packet->tag || packet->host_us == session->last_us)
-        return false;
+        return packet->tag ? T3_REFUSED_SIGNED : T3_ADMITTED;
+    if (!packet->tag)
+        return T3_REFUSED_UNSIGNED;
+    if (packet->host_us == session->last_us)
+        return T3_REFUSED_TAG;
     // A clock that reads less than before has wrapped; if it has not, the tag will not fit.
     const uint32_t epoch = session->epoch + (packet->host_us < session->last_us);
     uint8_t text[T3_RADIO_LIMIT + EPOCH_SIZE], tag[T3_TAG_SIZE];
@@ -145,10 +154,10 @@ bool t3_session_admits(struct t3_session *session, const struct t3_packet *packe
     t3_put32(text + body, epoch);
     t3_siphash(session->session_key, text, (uint8_t)(body + EPOCH_SIZE), tag);
     if (!same(tag, packet->tag, T3_TAG_SIZE))
-        return false;
+        return T3_REFUSED_TAG;
     session->epoch = epoch;
     session->last_us = packet->host_us;
-    return true;
+    return T3_ADMITTED;
 }
 
 void t3_session_store_key(const struct t3_port *port, const uint8_t *key)

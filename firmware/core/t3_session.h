@@ -28,8 +28,6 @@ struct t3_session {
     uint32_t boots, greetings;  // no pair repeats, so no nonce repeats
 };
 
-enum t3_greeting { T3_GREETING_REFUSED, T3_GREETING_NEW, T3_GREETING_REPEATED };
-
 // Read the key, if any; no session. With a damaged key the robot is locked and accepts only emergency
 // stops.
 void t3_session_boot(struct t3_session *session, const struct t3_port *port);
@@ -37,15 +35,14 @@ void t3_session_boot(struct t3_session *session, const struct t3_port *port);
 // End the session, and lock the robot until t3_session_boot.
 void t3_session_lock(struct t3_session *session);
 
-// Process a HELLO with the bytes `data`. A repeated one changes nothing.
-enum t3_greeting t3_session_greet(struct t3_session *session, const struct t3_port *port,
-                                  const struct t3_packet *packet, const uint8_t *data);
-
-// Return whether a frame of `size` bytes belongs to this session and, on a keyed link, is signed and
-// newer than all accepted frames; it then counts as accepted.
-bool t3_session_admits(struct t3_session *session, const struct t3_packet *packet,
-                       const uint8_t *data, uint8_t size);
-
+// Process a HELLO with the bytes `data`; return why it is refused. A repeated one changes nothing.
+enum t3_refusal t3_session_greet(struct t3_session *session, const struct t3_port *port,
+                                 const struct t3_packet *packet, const uint8_t *data,
+                                 bool *repeated);
+// Return T3_ADMITTED if a frame of `size` bytes belongs to this session and, on a keyed link, is signed
+// and newer than all accepted frames; it then counts as accepted.
+enum t3_refusal t3_session_admit(struct t3_session *session, const struct t3_packet *packet,
+                                 const uint8_t *data, uint8_t size);
 // Derive the session key from the long-term key and both nonces.
 void t3_session_derive_key(struct t3_session *session);
 

@@ -5,136 +5,116 @@
 #include <string.h>
 
 #include "t3_bytes.h"
-#include "t3_protocol.h"
 
-#define FORMAT 1u
-#define INVALID 0xFFu
-#define BODY_SIZE (T3_STORE_SETTINGS_SIZE - T3_CRC_SIZE)
+#define FORMAT 2u
 #define MICROSTEPS_LIMIT 256u
 #define CHANNEL_LIMIT 125u
+#define RATE_LIMIT 2u
+#define POWER_LIMIT 3u
+#define STEPS_LEAST 20u
+#define STEPS_LIMIT 10000u
+#define INVERTED_LIMIT 3u
+// Full scale of 65.5 V: voltages are 16 bits of mV.
+#define DIVIDER_LEAST 1000u
+#define DIVIDER_LIMIT 13000u
 
-bool t3_setup_valid(const struct t3_setup *setup)
+#define OLD_FORMAT 1u
+#define OLD_SIZE 9u  // without its CRC
+#define OLD_COPY (T3_STORE_SETTINGS + 16u)
+
+static bool sensors_valid(const uint8_t *sensors)
 {
+    for (uint8_t i = 0; i < T3_RANGES; i++)
+        if (sensors[i] >= T3_SENSORS)
+            return false;
+    return true;
+}
+
+static bool setup_valid(const struct t3_setup *setup)
+{
+    // The receiver takes noise for an address of equal bytes.
     bool differ = false;
     for (uint8_t i = 1; i < sizeof setup->address; i++)
         differ = differ || setup->address[i] != setup->address[0];
     const uint16_t microsteps = setup->microsteps;
     return differ && setup->channel <= CHANNEL_LIMIT && microsteps &&
-           microsteps <= MICROSTEPS_LIMIT && !(microsteps & (uint16_t)(microsteps - 1u));
+           microsteps <= MICROSTEPS_LIMIT && !(microsteps & (uint16_t)(microsteps - 1u)) &&
+           setup->rate <= RATE_LIMIT && setup->power <= POWER_LIMIT &&
+           setup->steps_per_turn >= STEPS_LEAST && setup->steps_per_turn <= STEPS_LIMIT &&
+           setup->inverted <= INVERTED_LIMIT && setup->divider >= DIVIDER_LEAST &&
+           setup->divider <= DIVIDER_LIMIT && sensors_valid(setup->sensors);
 }
 
-static void encode(const struct t3_setup *setup, uint8_t record[T3_STORE_SETTINGS_SIZE])
+bool t3_setup_valid(const uint8_t *body)
 {
-    uint8_t *to = t3_put8(record, FORMAT);
+    struct t3_setup setup;
+    t3_setup_decode(body, &setup);
+    return body[0] == FORMAT && setup_valid(&setup);
+}
+
+static const struct t3_copies_kind KIND = {T3_STORE_SETTINGS, T3_STORE_SETTINGS_COPY,
+                                           T3_STORE_SETTINGS_SIZE, FORMAT, t3_setup_valid};
+
+void t3_setup_encode(const struct t3_setup *setup, uint8_t *body)
+{
+    uint8_t *to = t3_put8(body, FORMAT);
     to = t3_put8(to, setup->channel);
     to = t3_put16(to, setup->microsteps);
     memcpy(to, setup->address, sizeof setup->address);
-    t3_put16(record + BODY_SIZE, t3_crc16(record, BODY_SIZE));
+    to = t3_put8(to + sizeof setup->address, setup->rate);
+    to = t3_put8(to, setup->power);
+    to = t3_put16(to, setup->steps_per_turn);
+    to = t3_put8(to, setup->inverted);
+    to = t3_put16(to, setup->divider);
+    memcpy(to, setup->sensors, sizeof setup->sensors);
 }
 
-static enum t3_record read_copy(const struct t3_port *port, uint8_t address,
-                                struct t3_setup *setup)
+void t3_setup_decode(const uint8_t *body, struct t3_setup *setup)
 {
-    uint8_t body[BODY_SIZE];
-    const enum t3_record found = t3_store_read(port, address, body, sizeof body);
-    if (found != T3_RECORD_GOOD)
-        return found;
     setup->channel = body[1];
     setup->microsteps = t3_get16(body + 2);
     memcpy(setup->address, body + 4, sizeof setup->address);
-    return body[0] == FORMAT && t3_setup_valid(setup) ? T3_RECORD_GOOD : T3_RECORD_DAMAGED;
+    setup->rate = body[9];
+    setup->power = body[10];
+    setup->steps_per_turn = t3_get16(body + 11);
+    setup->inverted = body[13];
+    setup->divider = t3_get16(body + 14);
+    memcpy(setup->sensors, body + 16, sizeof setup->sensors);
 }
 
-static void begin_copy(struct t3_settings *settings, const struct t3_port *port, uint8_t address)
+static bool is_old(const struct t3_port *port, uint16_t address)
 {
-    static const uint8_t invalid = INVALID;
-    settings->at = address;
-    settings->step = T3_SETTINGS_OPENED;
-    port->eeprom_write(port->context, address, &invalid, 1);
+    uint8_t body[OLD_SIZE];
+    return t3_store_read(port, address, body, sizeof body) == T3_RECORD_GOOD &&
+           body[0] == OLD_FORMAT;
 }
 
 void t3_settings_boot(struct t3_settings *settings, const struct t3_port *port)
 {
-    static const struct t3_radio_settings radio = T3_RADIO_DEFAULTS;
-    memset(settings, 0, sizeof *settings);
-    struct t3_setup first, second;
-    const enum t3_record one = read_copy(port, T3_STORE_SETTINGS, &first);
-    const enum t3_record two = read_copy(port, T3_STORE_SETTINGS_COPY, &second);
-    if (one != T3_RECORD_GOOD && two != T3_RECORD_GOOD) {
-        const bool blank = one == T3_RECORD_BLANK && two == T3_RECORD_BLANK;
-        settings->state = blank ? T3_SETTINGS_MISSING : T3_SETTINGS_DAMAGED;
-        settings->now.channel = radio.channel;
-        settings->now.microsteps = T3_DEFAULT_MICROSTEPS;
-        memcpy(settings->now.address, radio.address, sizeof radio.address);
-        return;
-    }
-    settings->now = one == T3_RECORD_GOOD ? first : second;
-    settings->state = T3_SETTINGS_GOOD;
-    uint8_t other[T3_STORE_SETTINGS_SIZE];
-    encode(&settings->now, settings->record);
-    const uint8_t repaired = one == T3_RECORD_GOOD ? T3_STORE_SETTINGS_COPY : T3_STORE_SETTINGS;
-    port->eeprom_read(port->context, repaired, other, sizeof other);
-    if (!memcmp(other, settings->record, sizeof other))
-        return;
-    settings->state = T3_SETTINGS_ONE_COPY;
-    settings->copies = 1;
-    begin_copy(settings, port, repaired);
+    static const struct t3_setup defaults = T3_SETUP_DEFAULTS;
+    settings->now = defaults;
+    if (t3_copies_boot(&settings->copies, &KIND, port))
+        t3_setup_decode(settings->copies.record, &settings->now);
+    else if (is_old(port, T3_STORE_SETTINGS) || is_old(port, OLD_COPY))
+        settings->copies.state = T3_SETTINGS_OLD;
 }
 
 bool t3_settings_usable(const struct t3_settings *settings)
 {
-    return settings->state <= T3_SETTINGS_ONE_COPY;
+    return settings->copies.state <= T3_SETTINGS_ONE_COPY;
 }
 
 void t3_settings_write(struct t3_settings *settings, const struct t3_port *port,
-                       const struct t3_setup *setup)
+                       const uint8_t *body)
 {
-    struct t3_setup stored;
-    const bool one = read_copy(port, T3_STORE_SETTINGS, &stored) == T3_RECORD_GOOD;
-    const bool two = read_copy(port, T3_STORE_SETTINGS_COPY, &stored) == T3_RECORD_GOOD;
-    settings->state = T3_SETTINGS_DAMAGED;
-    settings->copies = 2;
-    encode(setup, settings->record);
-    // The only valid copy is the last to change. Of two, the first is the one that counts at boot.
-    begin_copy(settings, port, one && !two ? T3_STORE_SETTINGS_COPY : T3_STORE_SETTINGS);
-}
-
-static enum t3_progress finish(struct t3_settings *settings, enum t3_progress how)
-{
-    settings->step = T3_SETTINGS_IDLE;
-    if (how == T3_PROGRESS_DONE) {
-        const uint8_t *from = settings->record;
-        settings->state = T3_SETTINGS_GOOD;
-        settings->now.channel = from[1];
-        settings->now.microsteps = t3_get16(from + 2);
-        memcpy(settings->now.address, from + 4, sizeof settings->now.address);
-    }
-    return how;
+    t3_copies_write(&settings->copies, port, body);
 }
 
 enum t3_progress t3_settings_tick(struct t3_settings *settings, const struct t3_port *port,
                                   const struct t3_console_port *console)
 {
-    if (settings->step == T3_SETTINGS_IDLE || !console->eeprom_settled(console->context))
-        return T3_PROGRESS_NONE;
-    if (!t3_store_verify(port, console, settings->at, T3_STORE_SETTINGS_SIZE))
-        return finish(settings, T3_PROGRESS_FAILED);
-    switch (settings->step) {
-    case T3_SETTINGS_OPENED:
-        settings->step = T3_SETTINGS_FILLED;
-        port->eeprom_write(port->context, (uint8_t)(settings->at + 1u), settings->record + 1,
-                           T3_STORE_SETTINGS_SIZE - 1u);
-        return T3_PROGRESS_NONE;
-    case T3_SETTINGS_FILLED:
-        settings->step = T3_SETTINGS_CLOSED;
-        port->eeprom_write(port->context, settings->at, settings->record, 1);
-        return T3_PROGRESS_NONE;
-    default:
-        break;
-    }
-    if (!--settings->copies)
-        return finish(settings, T3_PROGRESS_DONE);
-    begin_copy(settings, port,
-               settings->at == T3_STORE_SETTINGS ? T3_STORE_SETTINGS_COPY : T3_STORE_SETTINGS);
-    return T3_PROGRESS_NONE;
+    const enum t3_progress progress = t3_copies_tick(&settings->copies, port, console);
+    if (progress == T3_PROGRESS_DONE)
+        t3_setup_decode(settings->copies.record, &settings->now);
+    return progress;
 }

@@ -7,7 +7,7 @@
 #include "t3_bytes.h"
 #include "t3_protocol.h"
 
-#define ROOM (T3_STORE_RECORD_LIMIT + T3_CRC_SIZE)
+#define ROOM T3_STORE_RECORD_LIMIT
 
 static bool blank(const uint8_t *data, uint8_t size)
 {
@@ -17,7 +17,7 @@ static bool blank(const uint8_t *data, uint8_t size)
     return true;
 }
 
-enum t3_record t3_store_read(const struct t3_port *port, uint8_t address, uint8_t *data,
+enum t3_record t3_store_read(const struct t3_port *port, uint16_t address, uint8_t *data,
                              uint8_t size)
 {
     uint8_t record[ROOM];
@@ -30,7 +30,8 @@ enum t3_record t3_store_read(const struct t3_port *port, uint8_t address, uint8_
     return T3_RECORD_GOOD;
 }
 
-void t3_store_write(const struct t3_port *port, uint8_t address, const uint8_t *data, uint8_t size)
+void t3_store_write(const struct t3_port *port, uint16_t address, const uint8_t *data,
+                    uint8_t size)
 {
     uint8_t record[ROOM];
     memcpy(record, data, size);
@@ -38,7 +39,7 @@ void t3_store_write(const struct t3_port *port, uint8_t address, const uint8_t *
     port->eeprom_write(port->context, address, record, (uint8_t)(size + T3_CRC_SIZE));
 }
 
-void t3_store_erase(const struct t3_port *port, uint8_t address, uint8_t size)
+void t3_store_erase(const struct t3_port *port, uint16_t address, uint8_t size)
 {
     uint8_t record[ROOM];
     memset(record, 0xFF, sizeof record);
@@ -46,7 +47,7 @@ void t3_store_erase(const struct t3_port *port, uint8_t address, uint8_t size)
 }
 
 bool t3_store_verify(const struct t3_port *port, const struct t3_console_port *console,
-                     uint8_t address, uint8_t size)
+                     uint16_t address, uint8_t size)
 {
     uint8_t wanted[ROOM], found[ROOM];
     port->eeprom_read(port->context, address, wanted, size);

@@ -59,7 +59,7 @@ static uint16_t age(const struct t3_robot *robot, uint32_t now_us)
     return robot->command_seen && units < T3_AGE_NONE ? (uint16_t)units : T3_AGE_NONE;
 }
 
-static uint8_t tell_state(struct t3_robot *robot, uint32_t now_us, uint8_t *to)
+static uint8_t encode_state(struct t3_robot *robot, uint32_t now_us, uint8_t *to)
 {
     const struct t3_imu imu = sample_imu(robot);
     struct t3_state state = {
@@ -77,10 +77,10 @@ static uint8_t tell_state(struct t3_robot *robot, uint32_t now_us, uint8_t *to)
     return t3_encode_state(&state, to);
 }
 
-static uint8_t tell_aux(struct t3_robot *robot, uint32_t now_us, uint8_t *to)
+static uint8_t encode_aux(struct t3_robot *robot, uint8_t *to)
 {
     const struct t3_imu imu = sample_imu(robot);
-    const struct t3_aux aux = {
+    struct t3_aux aux = {
         .session = robot->session.id,
         .seq = robot->answer.seq,
         .status = t3_robot_status(robot),
@@ -89,15 +89,17 @@ static uint8_t tell_aux(struct t3_robot *robot, uint32_t now_us, uint8_t *to)
         .accel_z = imu.accel_z,
         .gyro_x = imu.gyro_x,
         .gyro_y = imu.gyro_y,
-        .time_us = now_us,
         .counters = robot->counters,
+        .refusal = robot->refusal,
     };
+    memcpy(aux.refused, robot->refused, T3_HEADER_SIZE);
     return t3_encode_aux(&aux, to);
 }
 
-static uint8_t tell_info(const struct t3_robot *robot, uint8_t *to)
+static uint8_t encode_info(const struct t3_robot *robot, uint8_t *to)
 {
     const struct t3_info info = {
+        .version = robot->answer.version,
         .session = robot->session.id,
         .seq = robot->answer.seq,
         .protocol = T3_VERSION,
@@ -107,8 +109,8 @@ static uint8_t tell_info(const struct t3_robot *robot, uint8_t *to)
         .parameters = T3_PARAMETERS,
         .steps_per_rev = (uint16_t)robot->parameters.values[T3_STEPS_PER_REV],
         .microsteps = robot->microsteps,
-        .status = t3_robot_status(robot),
-        .settings = robot->settings.state,
+        .refusal = robot->refusal,
+        .settings = t3_robot_records(robot),
         .channel = robot->settings.now.channel,
         .address = robot->settings.now.address,
         .build = T3_BUILD,
@@ -117,7 +119,7 @@ static uint8_t tell_info(const struct t3_robot *robot, uint8_t *to)
     return t3_encode_info(&info, to);
 }
 
-static uint8_t tell_param(const struct t3_robot *robot, uint8_t *to)
+static uint8_t encode_param(const struct t3_robot *robot, uint8_t *to)
 {
     const uint8_t id = robot->answer.id;
     const struct t3_bounds *bounds = t3_parameter_bounds(id);
@@ -140,14 +142,14 @@ uint8_t t3_telemetry(struct t3_robot *robot, uint32_t now_us, uint8_t *to)
     const struct t3_answer *answer = &robot->answer;
     switch (answer->kind) {
     case T3_AUX:
-        return tell_aux(robot, now_us, to);
+        return encode_aux(robot, to);
     case T3_INFO:
-        return tell_info(robot, to);
+        return encode_info(robot, to);
     case T3_PARAM:
-        return tell_param(robot, to);
+        return encode_param(robot, to);
     case T3_ACK:
         return t3_encode_ack(robot->session.id, answer->seq, answer->id, answer->rc, to);
     default:
-        return tell_state(robot, now_us, to);
+        return encode_state(robot, now_us, to);
     }
 }

@@ -59,8 +59,16 @@ struct t3_host_dongle *t3_host_dongle_new(uint8_t reset_cause)
     const struct t3_dongle_port port = {host, time_us, reply, send, configure};
     host->port = port;
     host->chip_ok = true;
-    t3_dongle_boot(&host->dongle, &host->port, reset_cause);
+    t3_host_dongle_boot(host, reset_cause);
     return host;
+}
+
+void t3_host_dongle_boot(struct t3_host_dongle *host, uint8_t reset_cause)
+{
+    host->time_us = 0;
+    host->sent_size = 0;
+    host->written_size = 0;
+    t3_dongle_boot(&host->dongle, &host->port, reset_cause);
 }
 
 void t3_host_dongle_free(struct t3_host_dongle *host)
@@ -83,6 +91,32 @@ void t3_host_dongle_run(struct t3_host_dongle *host, uint32_t us)
         us -= step;
         t3_dongle_tick(&host->dongle);
     }
+}
+
+void t3_host_dongle_tick(struct t3_host_dongle *host, uint32_t now_us)
+{
+    host->time_us = now_us;
+    t3_dongle_tick(&host->dongle);
+}
+
+uint32_t t3_host_dongle_idle_us(const struct t3_host_dongle *host)
+{
+    const struct t3_dongle *dongle = &host->dongle;
+    if (dongle->phase == T3_IDLE)
+        return UINT32_MAX;
+    const uint32_t whole =
+        dongle->phase == T3_GAP ? dongle->gap * T3_GAP_UNIT_US : T3_EXCHANGE_LIMIT_US;
+    const uint32_t elapsed = host->time_us - dongle->phase_us;
+    return elapsed < whole ? whole - elapsed : 0;
+}
+
+void t3_host_dongle_radio(const struct t3_host_dongle *host, uint8_t *ten)
+{
+    const struct t3_radio_settings *radio = &host->dongle.radio;
+    const uint8_t numbers[] = {radio->channel, radio->rate, radio->power, radio->retry_delay,
+                               radio->retries};
+    memcpy(ten, numbers, sizeof numbers);
+    memcpy(ten + sizeof numbers, radio->address, sizeof radio->address);
 }
 
 uint32_t t3_host_dongle_take(struct t3_host_dongle *host, uint8_t *to, uint32_t room)

@@ -34,16 +34,16 @@ uint32_t t3_host_time_us(uint32_t last_tick_us, uint8_t timer_us, bool tick_wait
     return t3_time_us(last_tick_us, timer_us, tick_waits);
 }
 
-uint8_t t3_host_decode(const uint8_t *data, uint8_t size, int64_t *eleven)
+uint8_t t3_host_decode(const uint8_t *data, uint8_t size, int64_t *twelve)
 {
     struct t3_packet packet;
-    const enum t3_fault fault = t3_decode(data, size, &packet);
-    const int64_t numbers[11] = {
+    const enum t3_refusal fault = t3_decode(data, size, &packet);
+    const int64_t numbers[12] = {
         packet.kind, packet.session, packet.seq,   packet.what,
         packet.ttl,  packet.left,    packet.right, packet.value,
-        packet.host_us, packet.nonce != NULL, packet.tag != NULL,
+        packet.echo_us, packet.host_us, packet.nonce != NULL, packet.tag != NULL,
     };
-    memcpy(eleven, numbers, sizeof numbers);
+    memcpy(twelve, numbers, sizeof numbers);
     return (uint8_t)fault;
 }
 
@@ -75,8 +75,8 @@ static uint8_t encode_info(const int64_t *f, bool with_nonce, uint8_t *to)
     for (unsigned i = 0; with_nonce && i < T3_NONCE_SIZE; i++)
         nonce[i] = (uint8_t)f[18 + i];
     const struct t3_info info = {
-        (uint8_t)f[0],  (uint8_t)f[1],  (uint8_t)f[2],  (uint8_t)f[3],  (uint8_t)f[4],
-        (uint8_t)f[5],  (uint8_t)f[6],  (uint16_t)f[7], (uint16_t)f[8], (uint8_t)f[9],
+        T3_VERSION,     (uint8_t)f[0],  (uint8_t)f[1],  (uint8_t)f[2],  (uint8_t)f[3],
+        (uint8_t)f[4],  (uint8_t)f[5],  (uint8_t)f[6],  (uint16_t)f[7], (uint16_t)f[8], (uint8_t)f[9],
         (uint8_t)f[10], (uint8_t)f[11], address,        (uint32_t)f[17], with_nonce ? nonce : NULL,
     };
     return t3_encode_info(&info, to);
@@ -86,9 +86,10 @@ static uint8_t encode_aux(const int64_t *f, uint8_t *to)
 {
     const struct t3_aux aux = {
         (uint8_t)f[0], (uint8_t)f[1], (uint8_t)f[2], (uint16_t)f[3], (int16_t)f[4],
-        (int16_t)f[5], (int16_t)f[6], (int16_t)f[7], (uint32_t)f[13],
+        (int16_t)f[5], (int16_t)f[6], (int16_t)f[7],
         {(uint16_t)f[8], (uint16_t)f[9], (uint16_t)f[10], (uint16_t)f[11], (uint16_t)f[12],
-         (uint16_t)f[14], (uint16_t)f[15]},
+         (uint16_t)f[13], (uint16_t)f[14]},
+        (uint8_t)f[15], {(uint8_t)f[16], (uint8_t)f[17], (uint8_t)f[18]},
     };
     return t3_encode_aux(&aux, to);
 }

@@ -11,30 +11,34 @@
 #define CHANNELS 9u
 #define NEVER 0xFFFFFFFFu
 #define USB_ROOM 4096u
+#define MICROSTEP 4294967296.0  // phase of the pulse generator
 
 struct t3_host_robot {
     struct t3_robot robot;
     struct t3_port port;
-    uint32_t time_us, since_tick_us, noise;
+    uint32_t time_us, since_tick_us, noise, first_noise;
     // The copy that the core reads and writes, and the cells that follow it one by one.
     uint8_t eeprom[T3_STORE_END], cells[T3_STORE_END];
     bool worn[T3_STORE_END];  // cells that keep what they hold
+    bool unsettled;  // cells may still be to be written
     uint32_t eeprom_writes, cell_us, since_cell_us;
     struct t3_console console;
     struct t3_console_port usb;
     bool chip_ok;
     uint8_t usb_output[USB_ROOM];
     uint32_t usb_output_size;
+    uint8_t levels;  // of LED and buzzer
     uint8_t ack[T3_RADIO_LIMIT], ack_size;
-    uint32_t loads;
+    uint32_t loads, setups;
     bool powered, pressed, imu_answers;
     struct t3_imu imu;
     uint16_t adc[CHANNELS];
     bool nonce_forced;
     uint8_t nonce[T3_NONCE_SIZE];
-    // Outside, what a driver sees of the pins.
+    // At the pins of the drivers.
     uint8_t pins;
     int32_t pulses[T3_WHEELS];
+    int64_t moved[T3_WHEELS];  // 2**32 per microstep
     uint32_t ticks, last_pulse[T3_WHEELS], closest, unpowered, hasty;
     int locked;
 };
@@ -83,9 +87,9 @@ static uint16_t adc(void *context, uint8_t channel)
 }
 
 // Return the first cell that is still to be written.
-static uint8_t unwritten(const struct t3_host_robot *host)
+static uint16_t unwritten(const struct t3_host_robot *host)
 {
-    uint8_t i = 0;
+    uint16_t i = 0;
     while (i < T3_STORE_END && (host->worn[i] || host->eeprom[i] == host->cells[i]))
         i++;
     return i;
@@ -93,7 +97,10 @@ static uint8_t unwritten(const struct t3_host_robot *host)
 
 static void work_eeprom(struct t3_host_robot *host, uint32_t passed_us)
 {
-    uint8_t next = unwritten(host);
+    if (!host->unsettled)
+        return;
+    uint16_t next = unwritten(host);
+    host->unsettled = next < T3_STORE_END;
     host->since_cell_us = next < T3_STORE_END ? host->since_cell_us + passed_us : 0;
     for (; next < T3_STORE_END && host->since_cell_us >= host->cell_us; next = unwritten(host)) {
         host->since_cell_us -= host->cell_us;
@@ -101,7 +108,7 @@ static void work_eeprom(struct t3_host_robot *host, uint32_t passed_us)
     }
 }
 
-static void eeprom_read(void *context, uint8_t address, uint8_t *data, uint8_t size)
+static void eeprom_read(void *context, uint16_t address, uint8_t *data, uint8_t size)
 {
     const struct t3_host_robot *host = context;
     if (address + size > (int)sizeof host->eeprom)
@@ -109,12 +116,13 @@ static void eeprom_read(void *context, uint8_t address, uint8_t *data, uint8_t s
     memcpy(data, host->eeprom + address, size);
 }
 
-static void eeprom_write(void *context, uint8_t address, const uint8_t *data, uint8_t size)
+static void eeprom_write(void *context, uint16_t address, const uint8_t *data, uint8_t size)
 {
     struct t3_host_robot *host = context;
     if (address + size > (int)sizeof host->eeprom)
         abort();
     memcpy(host->eeprom + address, data, size);
+    host->unsettled = true;
     host->eeprom_writes++;
     if (!host->cell_us)
         work_eeprom(host, 0);
@@ -137,12 +145,15 @@ static bool chip_ok(void *context)
 
 static bool eeprom_settled(void *context)
 {
-    return unwritten(context) == T3_STORE_END;
+    const struct t3_host_robot *host = context;
+    return !host->unsettled || unwritten(host) == T3_STORE_END;
 }
 
-static void eeprom_cells(void *context, uint8_t address, uint8_t *data, uint8_t size)
+static void eeprom_cells(void *context, uint16_t address, uint8_t *data, uint8_t size)
 {
     const struct t3_host_robot *host = context;
+    if (address + size > (int)sizeof host->cells)
+        abort();
     memcpy(data, host->cells + address, size);
 }
 
@@ -203,20 +214,37 @@ void t3_host_robot_store_key(struct t3_host_robot *host, const uint8_t *key)
     memcpy(host->cells, host->eeprom, sizeof host->cells);
 }
 
-void t3_host_robot_store_settings(struct t3_host_robot *host, uint8_t channel,
-                                  uint16_t microsteps, const uint8_t *address)
+static void store_setup(struct t3_host_robot *host, const struct t3_setup *setup)
 {
+    uint8_t body[T3_SETUP_BODY];
+    t3_setup_encode(setup, body);
     struct t3_settings settings;
-    struct t3_setup setup = {.channel = channel, .microsteps = microsteps};
     const uint32_t cell_us = host->cell_us;
-    memcpy(setup.address, address, sizeof setup.address);
     host->cell_us = 0;  // at once
     t3_settings_boot(&settings, &host->port);
-    t3_settings_write(&settings, &host->port, &setup);
+    t3_settings_write(&settings, &host->port, body);
     while (t3_settings_tick(&settings, &host->port, &host->usb) == T3_PROGRESS_NONE)
         ;
     host->cell_us = cell_us;
     host->eeprom_writes = 0;
+}
+
+void t3_host_robot_store_settings(struct t3_host_robot *host, uint8_t channel,
+                                  uint16_t microsteps, const uint8_t *address)
+{
+    struct t3_setup setup = T3_SETUP_DEFAULTS;
+    setup.channel = channel;
+    setup.microsteps = microsteps;
+    memcpy(setup.address, address, sizeof setup.address);
+    store_setup(host, &setup);
+}
+
+void t3_host_robot_store_rate(struct t3_host_robot *host, uint8_t rate)
+{
+    struct t3_settings settings;
+    t3_settings_boot(&settings, &host->port);
+    settings.now.rate = rate;
+    store_setup(host, &settings.now);
 }
 
 void t3_host_robot_erase(struct t3_host_robot *host)
@@ -225,29 +253,47 @@ void t3_host_robot_erase(struct t3_host_robot *host)
     memset(host->cells, 0xFF, sizeof host->cells);
 }
 
+static void follow_rate(struct t3_host_robot *host)
+{
+    const bool slow = !host->robot.settings.now.rate;
+    host->robot.settle_us = slow ? T3_SETTLE_SLOW_US : T3_SETTLE_US;
+}
+
 void t3_host_robot_boot(struct t3_host_robot *host, uint8_t reset_cause, uint32_t start_us)
 {
     host->time_us = start_us;
     host->since_tick_us = 0;
+    host->moved[T3_LEFT] = host->moved[T3_RIGHT] = 0;
     host->ack_size = 0;
-    host->noise = 0;  // a board without any: what hangs on it must still hold
+    host->noise = host->first_noise;  // 0 if not set: what hangs on it must still hold
     host->powered = true;  // pins float until the firmware drives them
     memcpy(host->eeprom, host->cells, sizeof host->eeprom);
     host->since_cell_us = 0;
     t3_robot_boot(&host->robot, &host->port, reset_cause, T3_SETTLE_US);
+    follow_rate(host);
     t3_console_boot(&host->console, &host->usb, &host->robot);
     host->robot.steps.time_us = start_us;
 }
 
-void t3_host_robot_packet(struct t3_host_robot *host, const uint8_t *data, uint8_t size)
+// Return how many payloads were refused, modulo 2**32.
+static uint32_t refused(const struct t3_host_robot *host)
 {
-    const uint32_t greetings = host->robot.session.greetings;
+    const struct t3_counters *counters = &host->robot.counters;
+    return (uint32_t)counters->bad_version + counters->malformed + counters->duplicates +
+           counters->stale + counters->bad_session;
+}
+
+bool t3_host_robot_packet(struct t3_host_robot *host, const uint8_t *data, uint8_t size)
+{
+    const uint32_t greetings = host->robot.session.greetings, before = refused(host);
     t3_robot_packet(&host->robot, data, size, host->time_us);
     if (host->nonce_forced && host->robot.session.greetings != greetings) {
         memcpy(host->robot.session.robot_nonce, host->nonce, T3_NONCE_SIZE);
         t3_session_derive_key(&host->robot.session);
         host->nonce_forced = false;
     }
+    const bool command = size && data[0] == (T3_VERSION << 4 | T3_CMD);
+    return command && refused(host) == before && host->robot.ttl_runs;
 }
 
 static void watch_wheel(struct t3_host_robot *host, uint8_t wheel, uint8_t pins, uint8_t step,
@@ -269,41 +315,90 @@ static void watch_wheel(struct t3_host_robot *host, uint8_t wheel, uint8_t pins,
 
 static void tick(struct t3_host_robot *host)
 {
-    const uint8_t pins = t3_steps_tick(&host->robot.steps);
+    struct t3_steps *steps = &host->robot.steps;
+    const uint32_t before[] = {steps->wheels[T3_LEFT].phase, steps->wheels[T3_RIGHT].phase};
+    const uint8_t pins = t3_steps_tick(steps);
     host->ticks++;
+    for (uint8_t i = 0; i < T3_WHEELS; i++) {
+        const int32_t turned = (int32_t)(steps->wheels[i].phase - before[i]);
+        host->moved[i] += steps->inverted >> i & 1 ? -(int64_t)turned : turned;
+    }
     watch_wheel(host, T3_LEFT, pins, T3_PIN_STEP_LEFT, T3_PIN_BACK_LEFT);
     watch_wheel(host, T3_RIGHT, pins, T3_PIN_STEP_RIGHT, T3_PIN_BACK_RIGHT);
     host->pins = pins;
 }
 
-static void pass(struct t3_host_robot *host, uint32_t us, bool stalled)
+static void come_round(struct t3_host_robot *host)
 {
-    while (us) {
+    const bool sets = host->console.sets;
+    t3_robot_tick(&host->robot);
+    t3_console_tick(&host->console);
+    host->levels = t3_console_watch(&host->console);
+    if (!sets || host->console.sets)
+        return;
+    host->setups++;
+    follow_rate(host);
+}
+
+// Whether the main loop has changed what moves the motors since `before` and `powered` were noted.
+static bool moves_otherwise(const struct t3_host_robot *host, const int32_t *before, bool powered)
+{
+    const struct t3_wheel *wheels = host->robot.steps.wheels;
+    return powered != host->powered || before[T3_LEFT] != wheels[T3_LEFT].increment ||
+           before[T3_RIGHT] != wheels[T3_RIGHT].increment;
+}
+
+// Return the time passed: `us`, or less if it ends with the first change of the motion.
+static uint32_t pass(struct t3_host_robot *host, uint32_t us, bool stalled, bool to_change)
+{
+    const struct t3_wheel *wheels = host->robot.steps.wheels;
+    uint32_t passed = 0;
+    while (passed < us) {
         // On to the next tick, 50 us after the last, whatever the clock reads.
         const uint32_t to_tick = T3_TICK_US - host->since_tick_us;
-        const uint32_t step = us < to_tick ? us : to_tick;
-        us -= step;
+        const uint32_t step = us - passed < to_tick ? us - passed : to_tick;
+        passed += step;
         host->time_us += step;
         host->since_tick_us = (host->since_tick_us + step) % T3_TICK_US;
         if (host->since_tick_us)
             continue;
         tick(host);
         work_eeprom(host, T3_TICK_US);
-        if (!stalled && host->ticks % (T3_HOST_LOOP_US / T3_TICK_US) == 0) {
-            t3_robot_tick(&host->robot);
-            t3_console_tick(&host->console);
-        }
+        if (stalled || host->ticks % (T3_HOST_LOOP_US / T3_TICK_US))
+            continue;
+        const int32_t before[] = {wheels[T3_LEFT].increment, wheels[T3_RIGHT].increment};
+        const bool powered = host->powered;
+        come_round(host);
+        if (to_change && moves_otherwise(host, before, powered))
+            break;
     }
+    return passed;
 }
 
 void t3_host_robot_run(struct t3_host_robot *host, uint32_t us)
 {
-    pass(host, us, false);
+    pass(host, us, false, false);
 }
 
 void t3_host_robot_stall(struct t3_host_robot *host, uint32_t us)
 {
-    pass(host, us, true);
+    pass(host, us, true, false);
+}
+
+uint32_t t3_host_robot_advance(struct t3_host_robot *host, uint32_t us,
+                               struct t3_host_motion *motion)
+{
+    const uint32_t passed = pass(host, us, false, true);
+    const struct t3_wheel *wheels = host->robot.steps.wheels;
+    motion->left = (double)host->moved[T3_LEFT] / MICROSTEP;
+    motion->right = (double)host->moved[T3_RIGHT] / MICROSTEP;
+    host->moved[T3_LEFT] = host->moved[T3_RIGHT] = 0;
+    motion->loads = host->loads;
+    motion->setups = host->setups;
+    motion->usb_size = host->usb_output_size;
+    motion->powered = host->powered;
+    motion->turning = wheels[T3_LEFT].increment || wheels[T3_RIGHT].increment;
+    return passed;
 }
 
 void t3_host_robot_poke_time(struct t3_host_robot *host, uint32_t to_us)
@@ -313,18 +408,18 @@ void t3_host_robot_poke_time(struct t3_host_robot *host, uint32_t to_us)
     host->time_us = to_us;
     robot->steps.time_us += by;
     robot->period_us += by;
+    robot->tick_us += by;
+    host->console.log.second_us += by;
+    host->console.signal.boot_us += by;
+    host->console.signal.step_us += by;
     robot->rest_us += by;
     robot->ttl_from_us += by;
     robot->command_us += by;
-    robot->heard_us += by;
+    robot->last_frame_us += by;
     robot->answer_from_us += by;
     robot->loaded_us += by;
     robot->button_us += by;
     robot->battery_us += by;
-    robot->stale_filter.window_start += by;
-    robot->stale_filter.previous_start += by;
-    robot->stale_filter.minimum += by;
-    robot->stale_filter.previous_minimum += by;
 }
 
 uint32_t t3_host_robot_time(const struct t3_host_robot *host)
@@ -346,6 +441,36 @@ uint32_t t3_host_robot_loads(const struct t3_host_robot *host)
 uint8_t t3_host_robot_status(const struct t3_host_robot *host)
 {
     return t3_robot_status(&host->robot);
+}
+
+uint8_t t3_host_robot_session(const struct t3_host_robot *host)
+{
+    return host->robot.session.id;
+}
+
+uint16_t t3_host_robot_stale(const struct t3_host_robot *host)
+{
+    return host->robot.counters.stale;
+}
+
+uint16_t t3_host_robot_microsteps(const struct t3_host_robot *host)
+{
+    return host->robot.microsteps;
+}
+
+uint8_t t3_host_robot_channel(const struct t3_host_robot *host)
+{
+    return host->robot.settings.now.channel;
+}
+
+uint8_t t3_host_robot_rate(const struct t3_host_robot *host)
+{
+    return host->robot.settings.now.rate;
+}
+
+void t3_host_robot_address(const struct t3_host_robot *host, uint8_t *five)
+{
+    memcpy(five, host->robot.settings.now.address, sizeof host->robot.settings.now.address);
 }
 
 bool t3_host_robot_powered(const struct t3_host_robot *host)
@@ -393,13 +518,13 @@ uint32_t t3_host_robot_eeprom_writes(const struct t3_host_robot *host)
     return host->eeprom_writes;
 }
 
-void t3_host_robot_poke_eeprom(struct t3_host_robot *host, uint8_t address, uint8_t value)
+void t3_host_robot_poke_eeprom(struct t3_host_robot *host, uint16_t address, uint8_t value)
 {
     if (address < sizeof host->eeprom)
         host->eeprom[address] = host->cells[address] = value;
 }
 
-uint8_t t3_host_robot_cell(const struct t3_host_robot *host, uint8_t address)
+uint8_t t3_host_robot_cell(const struct t3_host_robot *host, uint16_t address)
 {
     return address < sizeof host->cells ? host->cells[address] : 0;
 }
@@ -409,7 +534,7 @@ void t3_host_robot_set_cell_us(struct t3_host_robot *host, uint32_t us)
     host->cell_us = us;
 }
 
-void t3_host_robot_wear(struct t3_host_robot *host, uint8_t address, bool worn)
+void t3_host_robot_wear(struct t3_host_robot *host, uint16_t address, bool worn)
 {
     if (address < sizeof host->worn)
         host->worn[address] = worn;
@@ -445,6 +570,11 @@ void t3_host_robot_usb_overrun(struct t3_host_robot *host)
     t3_console_overrun(&host->console);
 }
 
+uint8_t t3_host_robot_levels(const struct t3_host_robot *host)
+{
+    return host->levels;
+}
+
 void t3_host_robot_set_chip(struct t3_host_robot *host, bool ok)
 {
     host->chip_ok = ok;
@@ -467,6 +597,21 @@ void t3_host_robot_set_adc(struct t3_host_robot *host, uint8_t channel, uint16_t
 {
     if (channel < CHANNELS)
         host->adc[channel] = count;
+}
+
+int16_t *t3_host_robot_imu(struct t3_host_robot *host)
+{
+    return &host->imu.accel_x;  // the first of seven of one type
+}
+
+uint16_t *t3_host_robot_adcs(struct t3_host_robot *host)
+{
+    return host->adc;
+}
+
+void t3_host_robot_set_noise(struct t3_host_robot *host, uint32_t noise)
+{
+    host->first_noise = noise;
 }
 
 void t3_host_robot_force_nonce(struct t3_host_robot *host, const uint8_t *nonce)

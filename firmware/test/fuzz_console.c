@@ -27,6 +27,30 @@ static uint32_t check_of(const uint8_t *key)
     return t3_get32(hash);
 }
 
+// Return the next of the frames that stage and store settings, mostly valid ones.
+static uint8_t make_setup(uint8_t *frame)
+{
+    static uint8_t body[2 * T3_PART_SIZE], step;
+    frame[2] = T3_RECORD_SETTINGS;
+    if (step == 0) {
+        struct t3_setup setup = T3_SETUP_DEFAULTS;
+        setup.channel = (uint8_t)fuzz_below(130);
+        setup.microsteps = (uint16_t)(1u << fuzz_below(10));
+        t3_setup_encode(&setup, body);
+    }
+    if (step < 2) {
+        frame[0] = T3_RECORD;
+        frame[3] = step;
+        memcpy(frame + 4, body + step * T3_PART_SIZE, T3_PART_SIZE);
+        step++;
+        return 20;
+    }
+    step = 0;
+    frame[0] = T3_STORE;
+    t3_put16(frame + 3, t3_crc16(body, T3_SETUP_BODY));
+    return 5;
+}
+
 static uint8_t make_frame(uint8_t *frame)
 {
     const uint8_t size = (uint8_t)(1 + fuzz_below(T3_FRAME_LIMIT));
@@ -49,24 +73,29 @@ static uint8_t make_frame(uint8_t *frame)
         frame[0] = T3_KEY;
         return size;
     case 5:
-        frame[0] = T3_SETTINGS;
-        frame[2] &= 0x7F;
-        t3_put16(frame + 3, (uint16_t)(1u << fuzz_below(10)));
-        return fuzz_below(4) ? 10 : size;
+        return make_setup(frame);
+    case 6:
+        frame[0] = (uint8_t)(T3_RECORD + fuzz_below(3));
+        frame[2] = (uint8_t)fuzz_below(3);
+        frame[3] = (uint8_t)fuzz_below(8);
+        if (frame[0] == T3_RECORD)
+            return fuzz_below(2) ? 20 : 4;
+        return fuzz_below(4) ? (frame[0] == T3_STORE ? 5 : 2) : size;
     default:
         return size;
     }
 }
+
+#define HEADER (T3_VERSION << 4)
 
 static void drive(struct t3_host_robot *robot, uint8_t session)
 {
     uint8_t data[T3_RADIO_LIMIT] = {0};
     data[1] = session;
     data[2] = fuzz_byte();
-    data[0] = (uint8_t)(0x10 | (fuzz_below(3) ? T3_CMD : T3_HELLO));
-    if (data[0] == (0x10 | T3_HELLO)) {
-        t3_put32(data + 4, t3_host_robot_time(robot));
-        t3_host_robot_packet(robot, data, 8);
+    data[0] = (uint8_t)(HEADER | (fuzz_below(3) ? T3_CMD : T3_HELLO));
+    if (data[0] == (HEADER | T3_HELLO)) {
+        t3_host_robot_packet(robot, data, 4);
         return;
     }
     data[3] = fuzz_below(3) ? T3_FLAG_ENABLE : 0;
@@ -102,9 +131,11 @@ static void read_console(struct t3_host_robot *robot, struct t3_splitter *splitt
         if (!got)
             continue;
         CHECK(frame[0] & 0x80);
-        if (frame[0] == T3_SETTINGS_ARE) {
-            CHECK(got == 12 && frame[3] <= T3_SETTINGS_DAMAGED && frame[4] <= 125);
-            set = (uint8_t)(set | (frame[2] == T3_RC_OK));
+        if (frame[0] == T3_RECORD_IS) {
+            const bool settings = frame[3] == T3_RECORD_SETTINGS && frame[6] == 0;
+            const uint8_t channel = frame[8];
+            CHECK(got == 23 && frame[4] <= T3_SETTINGS_OLD && (!settings || channel <= 125));
+            set = (uint8_t)(set | (settings && channel != T3_RADIO_CHANNEL));
         }
         if (frame[0] != T3_KEY_IS)
             continue;

@@ -14,6 +14,7 @@
 #include "t3_siphash.h"
 
 #define PACKETS 1000000ul
+#define HEADER (T3_VERSION << 4)
 
 static const uint8_t KEY[T3_KEY_SIZE] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
 
@@ -28,12 +29,12 @@ static uint8_t common_session(void)
 // A frame with everything in its place, and numbers that reach far into the rules.
 static uint8_t plausible(uint8_t *data, uint32_t now_us)
 {
-    static const uint8_t SIZES[2][7] = {{0, 14, 4, 8, 8, 4, 6}, {0, 22, 4, 20, 24, 4, 18}};
+    static const uint8_t SIZES[2][7] = {{0, 14, 4, 8, 4, 4, 6}, {0, 26, 4, 20, 24, 4, 18}};
     const uint8_t kind = (uint8_t)(1 + fuzz_below(6));
     const uint8_t size = SIZES[fuzz_below(4) == 0][kind];
     for (uint8_t i = 0; i < T3_RADIO_LIMIT; i++)
         data[i] = fuzz_byte();
-    data[0] = (uint8_t)(0x10 | kind);
+    data[0] = (uint8_t)(HEADER | kind);
     data[1] = common_session();
     data[2] = fuzz_below(10) ? ++seq : fuzz_byte();
     data[3] = (uint8_t)fuzz_below(kind == T3_CMD ? 8 : 12);
@@ -45,7 +46,6 @@ static uint8_t plausible(uint8_t *data, uint32_t now_us)
         t3_put32(data + 10, now_us - 1000 - fuzz_below(fuzz_below(10) ? 1000 : 1000000));
     } else if (kind == T3_HELLO) {
         data[3] = size == 24;
-        t3_put32(data + 4, now_us - 1000);
     } else if (kind == T3_ACTION) {
         t3_put16(data + 4, 0);
     } else if (kind == T3_PARAM_SET && fuzz_below(2)) {
@@ -59,20 +59,19 @@ static uint8_t earnest(uint8_t *data, uint8_t status, uint32_t now_us)
 {
     memset(data, 0, T3_RADIO_LIMIT);
     if (status & T3_STATUS_NO_SESSION) {
-        data[0] = 0x10 | T3_HELLO;
+        data[0] = HEADER | T3_HELLO;
         data[1] = (uint8_t)(1 + fuzz_below(255));
-        t3_put32(data + 4, now_us - 1000);
-        return 8;
+        return 4;
     }
     data[1] = session;
     data[2] = ++seq;
     if (fuzz_below(50) == 0) {
-        data[0] = 0x10 | T3_PARAM_SET;
+        data[0] = HEADER | T3_PARAM_SET;
         data[3] = (uint8_t)fuzz_below(4);
         t3_put32(data + 4, data[3] == T3_TTL_MAX ? 250 : 15000);
         return 8;
     }
-    data[0] = 0x10 | T3_CMD;
+    data[0] = HEADER | T3_CMD;
     t3_put32(data + 10, now_us - 1000);
     if (status & T3_STATUS_ESTOP) {
         data[3] = T3_FLAG_ESTOP_CLEAR;
@@ -90,7 +89,7 @@ static uint8_t any(uint8_t *data)
     for (uint8_t i = 0; i < 40; i++)
         data[i] = fuzz_byte();
     if (fuzz_below(2))
-        data[0] = (uint8_t)(0x10 | (data[0] & 7));
+        data[0] = (uint8_t)(HEADER | (data[0] & 7));
     return (uint8_t)fuzz_below(41);
 }
 
@@ -121,7 +120,8 @@ static void check_rules(struct t3_host_robot *robot, bool keyed)
         return;  // it has just started
     CHECK(size == T3_STATE_SIZE || size == T3_PARAM_SIZE || size == T3_ACK_SIZE ||
           size == T3_INFO_SIZE + (keyed ? T3_NONCE_SIZE : 0));
-    CHECK(ack[0] >> 4 == T3_VERSION);
+    // A host of another version is answered with INFO only, in its own version.
+    CHECK(ack[0] >> 4 == T3_VERSION || (ack[0] & 0x0F) == T3_INFO);
     session = ack[1];
     if (status & (T3_STATUS_NO_SESSION | T3_STATUS_ESTOP))
         CHECK(!(status & T3_STATUS_ENABLED));

@@ -9,7 +9,7 @@
 #include "fuzz.h"
 #include "t3_protocol.h"
 
-#define RANDOM_BYTES 10000000ul
+#define RANDOM_BYTES 20000000ul
 #define DAMAGED_FRAMES 200000ul
 
 struct counts {

@@ -100,7 +100,7 @@ static void say(const char *text, uint32_t number)
     put('\n');
 }
 
-// -- what it sees and does -----------------------------------------------------------------------
+// -- inputs and outputs --------------------------------------------------------------------------
 
 static uint32_t now_us = 0xFFF00000u;  // wraps within the story
 static uint32_t drawn = 1;
@@ -122,7 +122,7 @@ static void note(uint32_t number)
     checksum *= UINT32_C(0x9E3779B1);
 }
 
-static void note_bytes(const uint8_t *data, uint8_t size)
+static void note_bytes(const uint8_t *data, uint16_t size)
 {
     note(size);
     while (size--)
@@ -173,13 +173,13 @@ static uint16_t adc(void *context, uint8_t channel)
     return (uint16_t)((now_us / 16 + channel * 111u) % 1030u);
 }
 
-static void eeprom_read(void *context, uint8_t address, uint8_t *data, uint8_t size)
+static void eeprom_read(void *context, uint16_t address, uint8_t *data, uint8_t size)
 {
     (void)context;
     memcpy(data, eeprom + address, size);
 }
 
-static void eeprom_write(void *context, uint8_t address, const uint8_t *data, uint8_t size)
+static void eeprom_write(void *context, uint16_t address, const uint8_t *data, uint8_t size)
 {
     (void)context;
     memcpy(eeprom + address, data, size);
@@ -243,6 +243,8 @@ static struct t3_dongle dongle;
 static uint8_t seq;
 static uint32_t epoch, signed_us;
 
+#define HEADER (T3_VERSION << 4)
+
 static uint8_t sign(uint8_t *data, uint8_t size)
 {
     uint8_t text[T3_RADIO_LIMIT + 4];
@@ -256,15 +258,15 @@ static uint8_t sign(uint8_t *data, uint8_t size)
 
 static uint8_t hello(uint8_t *data)
 {
-    data[0] = 0x10 | T3_HELLO;
+    data[0] = HEADER | T3_HELLO;
     data[1] = SESSION;
     data[2] = ++seq;
     data[3] = robot.session.keyed;
-    t3_put32(data + 4, now_us);
     epoch = 0;
     signed_us = now_us;
     if (!robot.session.keyed)
-        return 8;
+        return 4;
+    t3_put32(data + 4, now_us);
     t3_put32(data + 8, draw());
     t3_put32(data + 12, draw());
     uint8_t text[17];
@@ -276,7 +278,7 @@ static uint8_t hello(uint8_t *data)
 
 static uint8_t command(uint8_t *data)
 {
-    data[0] = 0x10 | T3_CMD;
+    data[0] = HEADER | T3_CMD;
     data[1] = SESSION;
     data[2] = ++seq;
     data[3] = robot.estop ? T3_FLAG_ESTOP_CLEAR : T3_FLAG_ENABLE;
@@ -284,10 +286,11 @@ static uint8_t command(uint8_t *data)
     data[5] = 0;
     t3_put16(data + 6, robot.estop ? 0 : (uint16_t)draw());
     t3_put16(data + 8, robot.estop ? 0 : (uint16_t)draw());
-    t3_put32(data + 10, now_us);
+    t3_put32(data + 10, now_us - draw() % 300000);
     epoch += now_us < signed_us;
     signed_us = now_us;
-    return sign(data, T3_CMD_SIZE);
+    t3_put32(data + T3_CMD_SIZE, now_us);
+    return sign(data, robot.session.keyed ? T3_CMD_SIZE + 4 : T3_CMD_SIZE);
 }
 
 static uint8_t request(uint8_t *data)
@@ -296,7 +299,7 @@ static uint8_t request(uint8_t *data)
     static const uint8_t SIZES[] = {4, 8, 4, 6};
     const uint8_t which = (uint8_t)(draw() % 4);
     memset(data, 0, T3_RADIO_LIMIT);
-    data[0] = (uint8_t)(0x10 | KINDS[which]);
+    data[0] = (uint8_t)(HEADER | KINDS[which]);
     data[1] = SESSION;
     data[2] = ++seq;
     data[3] = (uint8_t)(draw() % (which == 2 ? 3 : 11));
@@ -309,7 +312,7 @@ static uint8_t nonsense(uint8_t *data)
 {
     for (uint8_t i = 0; i < T3_RADIO_LIMIT; i++)
         data[i] = (uint8_t)draw();
-    data[0] = (uint8_t)(0x10 | (data[0] & 7));
+    data[0] = (uint8_t)(HEADER | (data[0] & 7));
     return (uint8_t)(draw() % 33);
 }
 
@@ -336,10 +339,12 @@ static void pass(uint32_t us)
 
 static void store_settings(void)
 {
-    static const struct t3_setup setup = {82, 16, {'T', '3', 'M', 'P', 'C'}};
+    static const struct t3_setup setup = T3_SETUP_DEFAULTS;
+    uint8_t body[T3_SETUP_BODY];
+    t3_setup_encode(&setup, body);
     struct t3_settings settings;
     t3_settings_boot(&settings, &PORT);
-    t3_settings_write(&settings, &PORT, &setup);
+    t3_settings_write(&settings, &PORT, body);
     while (t3_settings_tick(&settings, &PORT, &CONSOLE_PORT) == T3_PROGRESS_NONE)
         ;
     note_bytes(eeprom, sizeof eeprom);
@@ -424,7 +429,7 @@ static void measure(void)
     pass(200000);
     measuring = true;
     start_clock();
-    t3_siphash(robot.session.key, data, T3_CMD_SIZE + 4, tag);
+    t3_siphash(robot.session.key, data, T3_CMD_SIZE + 8, tag);
     signing = cycles();
     const uint8_t size = command(data);
     start_clock();

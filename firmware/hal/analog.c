@@ -39,7 +39,9 @@ void analog_work(void)
     const uint16_t count = ADC;
     counts[channel] = count;
     mixture = (mixture << 1 | mixture >> 31) ^ count ^ (uint32_t)TCNT0 << 16;
-    channel = (uint8_t)((channel + 1u) % CHANNELS);
+    // A remainder is a loop of 200 cycles on the AVR, and this is called in each pass.
+    if (++channel == CHANNELS)
+        channel = 0;
     begin();
 }
 

@@ -43,10 +43,10 @@
 #define EN_ACK_PAY 0x02u
 #define PIPE_0 0x01u
 #define FIVE_BYTES 0x03u
-#define FLAGS (NRF24_RECEIVED | NRF24_SENT | NRF24_GAVE_UP)
+#define FLAGS (NRF24_RX_DR | NRF24_TX_DS | NRF24_MAX_RT)
 
 // Inline: the call would take longer than the byte.
-static inline __attribute__((always_inline)) uint8_t swap(uint8_t byte)
+static inline __attribute__((always_inline)) uint8_t spi_transfer(uint8_t byte)
 {
     SPDR = byte;
     while (!(SPSR & _BV(SPIF)))
@@ -54,17 +54,17 @@ static inline __attribute__((always_inline)) uint8_t swap(uint8_t byte)
     return SPDR;
 }
 
-static void select(void)
+static void spi_select(void)
 {
     SPI_PORT &= (uint8_t)~_BV(RADIO_CSN);
 }
 
-static void release(void)
+static void spi_deselect(void)
 {
     SPI_PORT |= _BV(RADIO_CSN);
 }
 
-static void enable(bool on)
+static void set_ce(bool on)
 {
     if (on)
         SPI_PORT |= _BV(RADIO_CE);
@@ -73,64 +73,64 @@ static void enable(bool on)
 }
 
 // Return the status register.
-static uint8_t command(uint8_t code)
+static uint8_t send_command(uint8_t code)
 {
-    select();
-    const uint8_t status = swap(code);
-    release();
+    spi_select();
+    const uint8_t status = spi_transfer(code);
+    spi_deselect();
     return status;
 }
 
-static uint8_t ask(uint8_t code)
+static uint8_t send_query(uint8_t code)
 {
-    select();
-    swap(code);
-    const uint8_t value = swap(NOP);
-    release();
+    spi_select();
+    spi_transfer(code);
+    const uint8_t value = spi_transfer(NOP);
+    spi_deselect();
     return value;
 }
 
 static void write_command(uint8_t code, const uint8_t *data, uint8_t size)
 {
-    select();
-    swap(code);
+    spi_select();
+    spi_transfer(code);
     while (size--)
-        swap(*data++);
-    release();
+        spi_transfer(*data++);
+    spi_deselect();
 }
 
-static void set(uint8_t reg, uint8_t value)
+static void write_register(uint8_t reg, uint8_t value)
 {
     write_command((uint8_t)(W_REGISTER | reg), &value, 1);
 }
 
-static uint8_t get(uint8_t reg)
+static uint8_t read_register(uint8_t reg)
 {
-    return ask((uint8_t)(R_REGISTER | reg));
+    return send_query((uint8_t)(R_REGISTER | reg));
 }
 
-static uint8_t config_of(enum nrf24_role role)
+static uint8_t config_for(enum nrf24_role role)
 {
     // The robot's IRQ means one thing: a packet came.
-    return role == NRF24_HOST ? EN_CRC | CRCO | PWR_UP
+    return role == NRF24_PTX ? EN_CRC | CRCO | PWR_UP
                               : MASK_TX_DS | MASK_MAX_RT | EN_CRC | CRCO | PWR_UP | PRIM_RX;
 }
 
-static uint8_t setup_of(const struct t3_radio_settings *settings)
+static uint8_t rf_setup_for(const struct t3_radio_settings *settings)
 {
     static const uint8_t RATES[] = {0x20, 0x00, 0x08};
     return (uint8_t)(RATES[settings->rate] | settings->power << 1);
 }
 
-static uint8_t retries_of(const struct t3_radio_settings *settings)
+static uint8_t setup_retr_for(const struct t3_radio_settings *settings)
 {
     return (uint8_t)(settings->retry_delay << 4 | settings->retries);
 }
 
 void nrf24_start(void)
 {
-    release();
-    enable(false);
+    spi_deselect();
+    set_ce(false);
     SPI_DDR |= _BV(SPI_SCK) | _BV(SPI_MOSI) | _BV(RADIO_CSN) | _BV(RADIO_CE);
     // 8 MHz; the chip takes 10. Mode 0, highest bit first.
     SPCR = _BV(SPE) | _BV(MSTR);
@@ -141,116 +141,116 @@ void nrf24_start(void)
 static void allow_features(void)
 {
     const uint8_t wanted = EN_DPL | EN_ACK_PAY;
-    set(FEATURE, wanted);
-    if (get(FEATURE) == wanted)
+    write_register(FEATURE, wanted);
+    if (read_register(FEATURE) == wanted)
         return;
     // On the chip without plus they are hidden until ACTIVATE; a second ACTIVATE hides them again.
     const uint8_t key = 0x73;
     write_command(ACTIVATE, &key, 1);
-    set(FEATURE, wanted);
+    write_register(FEATURE, wanted);
 }
 
 static bool holds_address(const uint8_t *address)
 {
     bool same = true;
-    select();
-    swap(R_REGISTER | TX_ADDR);
+    spi_select();
+    spi_transfer(R_REGISTER | TX_ADDR);
     for (uint8_t i = 0; i < 5; i++)
-        same = swap(NOP) == address[i] && same;
-    release();
+        same = spi_transfer(NOP) == address[i] && same;
+    spi_deselect();
     return same;
 }
 
 bool nrf24_configure(const struct t3_radio_settings *settings, enum nrf24_role role, bool *waking)
 {
-    enable(false);
-    *waking = !(get(CONFIG) & PWR_UP);
-    set(CONFIG, config_of(role));
-    set(EN_AA, PIPE_0);
-    set(EN_RXADDR, PIPE_0);
-    set(SETUP_AW, FIVE_BYTES);
-    set(SETUP_RETR, retries_of(settings));
-    set(RF_CH, settings->channel);
-    set(RF_SETUP, setup_of(settings));
+    set_ce(false);
+    *waking = !(read_register(CONFIG) & PWR_UP);
+    write_register(CONFIG, config_for(role));
+    write_register(EN_AA, PIPE_0);
+    write_register(EN_RXADDR, PIPE_0);
+    write_register(SETUP_AW, FIVE_BYTES);
+    write_register(SETUP_RETR, setup_retr_for(settings));
+    write_register(RF_CH, settings->channel);
+    write_register(RF_SETUP, rf_setup_for(settings));
     write_command(W_REGISTER | RX_ADDR_P0, settings->address, 5);
     write_command(W_REGISTER | TX_ADDR, settings->address, 5);
     allow_features();
-    set(DYNPD, PIPE_0);
-    command(FLUSH_TX);
-    command(FLUSH_RX);
-    set(STATUS, FLAGS);
+    write_register(DYNPD, PIPE_0);
+    send_command(FLUSH_TX);
+    send_command(FLUSH_RX);
+    write_register(STATUS, FLAGS);
     return nrf24_holds(settings, role);
 }
 
 bool nrf24_holds(const struct t3_radio_settings *settings, enum nrf24_role role)
 {
-    return get(CONFIG) == config_of(role) && get(EN_AA) == PIPE_0 &&
-           get(SETUP_RETR) == retries_of(settings) && get(RF_CH) == settings->channel &&
-           get(RF_SETUP) == setup_of(settings) && get(FEATURE) == (EN_DPL | EN_ACK_PAY) &&
-           get(DYNPD) == PIPE_0 && holds_address(settings->address);
+    return read_register(CONFIG) == config_for(role) && read_register(EN_AA) == PIPE_0 &&
+           read_register(SETUP_RETR) == setup_retr_for(settings) && read_register(RF_CH) == settings->channel &&
+           read_register(RF_SETUP) == rf_setup_for(settings) && read_register(FEATURE) == (EN_DPL | EN_ACK_PAY) &&
+           read_register(DYNPD) == PIPE_0 && holds_address(settings->address);
 }
 
 void nrf24_listen(void)
 {
-    enable(true);
+    set_ce(true);
 }
 
-uint8_t nrf24_flags(void)
+uint8_t nrf24_status(void)
 {
-    return command(NOP) & FLAGS;
+    return send_command(NOP) & FLAGS;
 }
 
-uint8_t nrf24_take_flags(void)
+uint8_t nrf24_clear_status(void)
 {
-    const uint8_t raised = nrf24_flags();
+    const uint8_t raised = nrf24_status();
     if (raised)
-        set(STATUS, raised);
+        write_register(STATUS, raised);
     return raised;
 }
 
-bool nrf24_waits(void)
+bool nrf24_rx_waiting(void)
 {
-    return !(get(FIFO_STATUS) & RX_EMPTY);
+    return !(read_register(FIFO_STATUS) & RX_EMPTY);
 }
 
 uint8_t nrf24_read(uint8_t payload[T3_RADIO_LIMIT])
 {
-    if (!nrf24_waits())
+    if (!nrf24_rx_waiting())
         return 0;
-    const uint8_t width = ask(R_RX_PL_WID);
+    const uint8_t width = send_query(R_RX_PL_WID);
     if (!width || width > T3_RADIO_LIMIT) {
-        command(FLUSH_RX);
+        send_command(FLUSH_RX);
         return width;
     }
-    select();
-    swap(R_RX_PAYLOAD);
+    spi_select();
+    spi_transfer(R_RX_PAYLOAD);
     for (uint8_t i = 0; i < width; i++)
-        payload[i] = swap(NOP);
-    release();
+        payload[i] = spi_transfer(NOP);
+    spi_deselect();
     return width;
 }
 
 void nrf24_send(const uint8_t *payload, uint8_t size)
 {
     write_command(W_TX_PAYLOAD, payload, size);
-    enable(true);  // until the exchange is over: 10 us would do
+    set_ce(true);  // until the exchange is over: 10 us would do
 }
 
 uint8_t nrf24_finish(void)
 {
-    const uint8_t retransmits = get(OBSERVE_TX) & 0x0F;
-    enable(false);
-    command(FLUSH_TX);
-    command(FLUSH_RX);
+    const uint8_t retransmits = read_register(OBSERVE_TX) & 0x0F;
+    set_ce(false);
+    send_command(FLUSH_TX);
+    send_command(FLUSH_RX);
     // Last: a chip that gave up begins anew when its flag is gone and a packet still waits.
-    set(STATUS, FLAGS);
+    write_register(STATUS, FLAGS);
     return retransmits;
 }
 
-void nrf24_answer(const uint8_t *payload, uint8_t size)
+void nrf24_load_ack(const uint8_t *payload, uint8_t size)
 {
     // The chip keeps a payload that was sent until a new packet confirms it, so without the flush
     // a second one queues up, and telemetry is late by one exchange for ever.
-    command(FLUSH_TX);
+    send_command(FLUSH_TX);
     write_command(W_ACK_PAYLOAD, payload, size);
 }

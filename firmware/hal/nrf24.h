@@ -11,15 +11,15 @@
 #include "t3_protocol.h"
 
 // Flags of the status register.
-#define NRF24_RECEIVED 0x40u
-#define NRF24_SENT 0x20u
-#define NRF24_GAVE_UP 0x10u
+#define NRF24_RX_DR 0x40u
+#define NRF24_TX_DS 0x20u
+#define NRF24_MAX_RT 0x10u
 
 #define NRF24_DEPTH 3u          // packets in a FIFO
 #define NRF24_POWER_ON_MS 100u  // from supply to the first register
 #define NRF24_WAKE_US 5000u     // from PWR_UP to CE, with the slowest crystal
 
-enum nrf24_role { NRF24_HOST, NRF24_ROBOT };
+enum nrf24_role { NRF24_PTX, NRF24_PRX };
 
 // Pins, SPI and the interrupt of the chip's IRQ.
 void nrf24_start(void);
@@ -35,10 +35,10 @@ bool nrf24_holds(const struct t3_radio_settings *settings, enum nrf24_role role)
 void nrf24_listen(void);
 
 // Return the raised flags and take them back.
-uint8_t nrf24_take_flags(void);
+uint8_t nrf24_clear_status(void);
 
 // Return whether a payload waits in the RX FIFO.
-bool nrf24_waits(void);
+bool nrf24_rx_waiting(void);
 
 // Read the next payload; return its width, 0 if there is none. A width over 32 is what the chip
 // claims of a packet that was meant to break it: nothing of it is read, the FIFO is emptied.
@@ -48,12 +48,12 @@ uint8_t nrf24_read(uint8_t payload[T3_RADIO_LIMIT]);
 void nrf24_send(const uint8_t *payload, uint8_t size);
 
 // Return the raised flags and leave them.
-uint8_t nrf24_flags(void);
+uint8_t nrf24_status(void);
 
 // CE low, both FIFOs empty, no flags; return how often the last packet was repeated.
 uint8_t nrf24_finish(void);
 
 // What the next packet fetches: exactly one payload waits.
-void nrf24_answer(const uint8_t *payload, uint8_t size);
+void nrf24_load_ack(const uint8_t *payload, uint8_t size);
 
 #endif

@@ -57,6 +57,12 @@
 #define ESTOP_PORT PORTE
 #define ESTOP_PRESSED (PINE & _BV(PE5))
 #define ESTOP_PULL_UP PE5
+// LED of the board at 13; an active buzzer, or nothing, at 11: on the port of the SPI, whose bits are set
+// one at a time.
+#define SIGNAL_DDR DDRB
+#define SIGNAL_PORT PORTB
+#define SIGNAL_LED PB7
+#define SIGNAL_BUZZER PB5
 // Distance sensors at A0 to A7, the battery's divider at A8. MPU6050 at 20 and 21.
 #define TWI_DDR DDRD
 #define TWI_PORT PORTD

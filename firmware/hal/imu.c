@@ -21,9 +21,9 @@
 // Status codes of the TWI.
 #define STARTED 0x08u
 #define STARTED_AGAIN 0x10u
-#define WRITE_HEARD 0x18u
-#define BYTE_HEARD 0x28u
-#define READ_HEARD 0x40u
+#define WRITE_ACKED 0x18u
+#define BYTE_ACKED 0x28u
+#define READ_ACKED 0x40u
 #define BYTE_CAME 0x50u
 #define LAST_BYTE_CAME 0x58u
 
@@ -74,10 +74,10 @@ ISR(TWI_vect)
     case STARTED:
         send(ADDRESS << 1);
         break;
-    case WRITE_HEARD:
+    case WRITE_ACKED:
         send(reg);
         break;
-    case BYTE_HEARD:
+    case BYTE_ACKED:
         if (to_read)
             TWCR = GO | _BV(TWSTA);
         else if (at++ == 0)
@@ -88,7 +88,7 @@ ISR(TWI_vect)
     case STARTED_AGAIN:
         send(ADDRESS << 1 | 1u);
         break;
-    case READ_HEARD:
+    case READ_ACKED:
         receive();
         break;
     case BYTE_CAME:

@@ -9,14 +9,14 @@
 #include <stdint.h>
 
 void memory_start(void);
-void memory_read(uint8_t address, uint8_t *data, uint8_t size);
-void memory_write(uint8_t address, const uint8_t *data, uint8_t size);
+void memory_read(uint16_t address, uint8_t *data, uint8_t size);
+void memory_write(uint16_t address, const uint8_t *data, uint8_t size);
 
 // Return whether all writes are complete.
 bool memory_settled(void);
 
 // Read the cells themselves. Waits if one is being written.
-void memory_cells(uint8_t address, uint8_t *data, uint8_t size);
+void memory_cells(uint16_t address, uint8_t *data, uint8_t size);
 
 // Write the next byte that differs, if there is one. Never waits.
 void memory_work(void);
