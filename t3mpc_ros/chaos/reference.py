@@ -25,7 +25,7 @@ from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parame
 class ReferenceParameters(Parameters):
     """Solution of system (85), and its conversion to wheel speeds."""
 
-    rate: float = parameter(100.0, 'samples per second', unit='Hz', low=1.0, high=10000.0)
+    rate: float = parameter(100.0, 'samples per second', 'Hz', (1.0, 10000.0))
     output: str = parameter(
         'wheels',
         'wheels: the two signals are the speeds of right and left wheel; '
@@ -36,8 +36,7 @@ class ReferenceParameters(Parameters):
     orders: tuple[float, ...] = parameter(
         (0.98, 0.98, 0.98, 0.98),
         'Caputo order q of each state',
-        low=0.5,
-        high=1.0,
+        bounds=(0.5, 1.0),
         source='paper (85)',
     )
     time_scale: float = parameter(
@@ -46,15 +45,14 @@ class ReferenceParameters(Parameters):
         'deviations per system second (measured at q = 0.98); with the default amplitudes 0.05 '
         'gives wheel accelerations of 3.5, 4.1, 4.3 and 1.5 rad/s² rms, and 99 % of the power '
         'below 0.7 Hz',
-        low=1e-4,
-        high=1.0,
+        bounds=(1e-4, 1.0),
     )
     amplitude: tuple[float, ...] = parameter(
         (0.26, 1.25, 3.0, 0.125),
         'wheel speed per unit of each state. Standard deviations measured at q = 0.98 over '
         '10 000 s: 10.6, 2.22, 0.937, 22.2; so each signal has 2.8 rad/s, peaks of 8 rad/s per '
         'minute and of 13 rad/s per day',
-        unit='rad/s',
+        'rad/s',
     )
     offset: tuple[float, ...] = parameter(
         (0.0, 0.0, 4.79, 0.0),
@@ -62,57 +60,46 @@ class ReferenceParameters(Parameters):
         'have mean 0 by the symmetry of (85)',
     )
     linear_scale: float = parameter(
-        0.025,
-        'output body: v per rad/s of the first signal',
-        unit='m',
-        low=-1.0,
-        high=1.0,
+        0.025, 'output body: v per rad/s of the first signal', 'm', (-1.0, 1.0)
     )
     angular_scale: float = parameter(
-        0.33, 'output body: omega per rad/s of the second signal', low=-20.0, high=20.0
+        0.33, 'output body: omega per rad/s of the second signal', bounds=(-20.0, 20.0)
     )
     initial: tuple[float, ...] = parameter(
-        (1.0, 1.0, 1.0, 1.0), 'initial state of (85)', low=-30.0, high=30.0
+        (1.0, 1.0, 1.0, 1.0), 'initial state of (85)', bounds=(-30.0, 30.0)
     )
     seed: int = parameter(
         0,
         'seed of the initial perturbation and of random switching; 0: no perturbation',
-        low=0,
+        bounds=(0, None),
     )
     perturbation: float = parameter(
-        0.5, 'maximum perturbation of each initial state', low=1e-9, high=5.0
+        0.5, 'maximum perturbation of each initial state', bounds=(1e-9, 5.0)
     )
     settle: float = parameter(
         20.0,
         'system time simulated before the first sample, to reach the attractor',
-        unit='s',
-        low=0.1,
-        high=10000.0,
+        's',
+        (0.1, 10000.0),
     )
     solver_step: float = parameter(
         1e-3,
         'maximum solver step in system time; one sample is a whole number of steps',
-        unit='s',
-        low=1e-6,
-        high=2e-3,
+        's',
+        (1e-6, 2e-3),
     )
     memory_horizon: float = parameter(
         1e5,
         'system time over which the memory kernel is within its tolerance; '
         'divided by the time scale, 23 days at the defaults',
-        unit='s',
-        low=10.0,
-        high=1e9,
+        's',
+        (10.0, 1e9),
     )
     memory_tolerance: float = parameter(
-        1e-8, 'relative error of the memory kernel', low=1e-12, high=1e-3
+        1e-8, 'relative error of the memory kernel', bounds=(1e-12, 1e-3)
     )
     ramp: float = parameter(
-        3.0,
-        'duration of the smooth increase from zero, for a robot at rest',
-        unit='s',
-        low=0.0,
-        high=600.0,
+        3.0, 'duration of the smooth increase from zero, for a robot at rest', 's', (0.0, 600.0)
     )
     switching: SwitchingParameters = group(SwitchingParameters)
 

@@ -166,8 +166,6 @@ class FractionalSolver:
         ]
         shape = (system.size, max(each.rates.size for each in kernels))
         self.step = step
-        self.kernel_error = max(each.error for each in kernels)
-        """Measured relative error of the memory kernel, the maximum over the states."""
         self._terms = system.terms()
         self._local = np.empty((5, system.size))
         self._decays = np.zeros(shape)
@@ -240,11 +238,6 @@ class FractionalSolver:
         At time zero a solution of order below 1 increases like t^q and has no derivative.
         """
         return np.array(self._vectors[2])
-
-    @property
-    def memory_bytes(self) -> int:
-        """Size of the solver's state in bytes, which does not grow with the steps."""
-        return self._modes.nbytes + self._vectors.nbytes
 
     def advance(self, steps: int = 1) -> NDArray[np.float64]:
         """Advance by ``steps`` steps and return a copy of the new state, shape (d,).

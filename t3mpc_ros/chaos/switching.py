@@ -25,29 +25,23 @@ class SwitchingParameters(Parameters):
     modes: tuple[int, ...] = parameter(
         (1, 2, 2, 3, 3, 4, 4, 1),
         'signal numbers in pairs, one pair per mode: the first drives the first output',
-        low=1,
-        high=4,
+        bounds=(1, 4),
     )
     times: tuple[float, ...] = parameter(
         (12.0, 24.0, 36.0, 48.0),
         'switch times of kind fixed, ascending; after the last one switching continues, modes in '
         'turn, with the last dwell time repeated; empty: no switching. The paper switches four '
         'times, at times that it does not state',
-        unit='s',
-        low=0.01,
+        's',
+        (0.01, None),
     )
-    shortest_dwell: float = parameter(
-        8.0, 'minimum dwell time, kind random', unit='s', low=0.1, high=86400.0
-    )
-    longest_dwell: float = parameter(
-        16.0, 'maximum dwell time, kind random', unit='s', low=0.1, high=86400.0
-    )
+    shortest_dwell: float = parameter(8.0, 'minimum dwell time, kind random', 's', (0.1, 86400.0))
+    longest_dwell: float = parameter(16.0, 'maximum dwell time, kind random', 's', (0.1, 86400.0))
     blend: float = parameter(
         0.0,
         'duration of the smooth transition between two modes; 0: sudden, as in the paper',
-        unit='s',
-        low=0.0,
-        high=3600.0,
+        's',
+        (0.0, 3600.0),
         source='paper: sudden changes',
     )
 

@@ -14,11 +14,9 @@ class WheelGeometry(Parameters):
     """Wheel radius and separation, which relate wheel speeds to the body twist."""
 
     wheel_radius: float = parameter(
-        0.035, 'wheel radius R', unit='m', low=0.005, high=1.0, source='paper: 7 cm wheels'
+        0.035, 'wheel radius R', 'm', (0.005, 1.0), source='paper: 7 cm wheels'
     )
-    wheel_separation: float = parameter(
-        0.147, 'distance between the wheels, 2b', unit='m', low=0.01, high=5.0
-    )
+    wheel_separation: float = parameter(0.147, 'distance between the wheels, 2b', 'm', (0.01, 5.0))
 
     @property
     def half_separation(self) -> float:

@@ -78,8 +78,6 @@ class SimulatedTime:
         Simulated seconds per second; 0: the clock is stopped, and :meth:`step` advances it.
     max_burst
         Maximum number of samples returned at once, so that other callbacks run in between.
-    start_ns
-        Start of the grid. Not 0, which in ROS means that the time is unknown.
     """
 
     def __init__(
@@ -87,14 +85,13 @@ class SimulatedTime:
         rate: float,
         real_time_factor: float,
         max_burst: int = 50,
-        start_ns: int = NANOSECONDS,
     ) -> None:
         self._period_ns = NANOSECONDS / rate
         self._slack_ns = round(0.2 * self._period_ns)
         self._max_burst = max_burst
-        self._start_ns = start_ns
+        self._start_ns = NANOSECONDS  # not 0, which in ROS means that the time is unknown
         self._next = 0
-        self._anchor = start_ns, 0
+        self._anchor = self._start_ns, 0
         """An instant of simulated time, and the steady clock's time of that instant."""
         self._anchored = False
         self._real_time_factor = real_time_factor

@@ -16,7 +16,6 @@ from t3mpc_ros.chaos.solver import (
     mode_weights,
     solve_full_memory,
 )
-from t3mpc_ros.chaos.sum_of_exponentials import fit_sum_of_exponentials
 from t3mpc_ros.chaos.system import QuadraticSystem, hyperchaotic_system, linear_decay_system
 
 ONE = np.ones(1)
@@ -242,8 +241,6 @@ def test_memory_size_does_not_depend_on_the_run_length():
     names, before = list(vars(solver)), size()
     solver.advance(200_000)
     assert (list(vars(solver)), size()) == (names, before)
-    modes = fit_sum_of_exponentials(0.98, 1e-3, 1e5, 1e-8).rates.size
-    assert solver.memory_bytes == 8 * 4 * (modes + 6)
 
 
 def test_many_steps_at_once_equal_single_steps():

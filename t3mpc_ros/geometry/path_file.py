@@ -1,0 +1,116 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Paths from files: CSV with x, y per line, or YAML with a list of points."""
+
+import csv
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.geometry.path_timing import PathError
+
+Array = NDArray[np.float64]
+
+MAX_FILE_SIZE = 20_000_000
+"""Bytes."""
+MAX_COORDINATE = 10_000.0
+"""m"""
+
+
+def load_path(file: str | Path) -> Array:
+    """Return the points (m) of a path file, shape (n, 2).
+
+    A file ``.csv`` has x and y in the columns of that name, or in the first two without a header;
+    other columns are ignored. A file ``.yaml`` has the key ``points`` with a list of [x, y], and
+    optionally ``closed: true``.
+
+    Raises
+    ------
+    PathError
+        The file cannot be read or is invalid; the text contains the file, the entry and the value.
+    """
+    path = Path(file)
+    try:
+        with path.open('rb') as stream:
+            content = stream.read(MAX_FILE_SIZE + 1)
+        if len(content) > MAX_FILE_SIZE:
+            raise PathError(f'{path} must have at most {MAX_FILE_SIZE} bytes: it has more')
+        text = content.decode('utf-8')
+    except OSError as error:
+        raise PathError(f'{path} cannot be read: {error.strerror}') from error
+    except UnicodeDecodeError as error:
+        raise PathError(f'{path} must be UTF-8 text: {error}') from error
+    readers = {'.csv': _csv_rows, '.yaml': _yaml_rows, '.yml': _yaml_rows}
+    if path.suffix.lower() not in readers:
+        raise PathError(f'{path} must end in .csv or .yaml: got {path.suffix or "no suffix"!r}')
+    try:
+        points = np.array(
+            [_point(where, row) for where, row in readers[path.suffix.lower()](text)]
+        ).reshape(-1, 2)
+        if len(points) < 2 or not np.ptp(points, axis=0).any():
+            raise PathError(f'two points that differ are needed: got {len(points)}')
+    except PathError as error:
+        raise PathError(f'{path}: {error}') from error.__cause__
+    return points
+
+
+def _csv_rows(text: str) -> list[tuple[str, object]]:
+    rows = [row for row in csv.reader(text.splitlines()) if row and not row[0].startswith('#')]
+    columns = (0, 1)
+    if rows and not _is_number(rows[0][0]):
+        header = [name.strip().lower() for name in rows.pop(0)]
+        if 'x' not in header or 'y' not in header:
+            raise PathError(f'the header must have x and y: got {", ".join(header)}')
+        columns = header.index('x'), header.index('y')
+    found: list[tuple[str, object]] = []
+    for number, row in enumerate(rows):
+        if len(row) <= max(columns):
+            raise PathError(f'point {number} must have x and y: got {row}')
+        found.append((f'point {number}', [row[column] for column in columns]))
+    return found
+
+
+def _yaml_rows(text: str) -> list[tuple[str, object]]:
+    import yaml
+
+    try:
+        content = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise PathError(f'not YAML: {error}') from error
+    if not isinstance(content, dict) or not isinstance(content.get('points'), list):
+        raise PathError('must have points: [[x, y], ...]')
+    if unknown := set(map(str, content)) - {'points', 'closed', 'name'}:
+        raise PathError(f'there is no entry {min(unknown)}; known are points, closed, name')
+    closed = content.get('closed', False)
+    if not isinstance(closed, bool):
+        raise PathError(f'closed must be true or false: got {closed!r}')
+    points = content['points']
+    return [(f'points[{n}]', point) for n, point in enumerate(points + points[:1] * closed)]
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _point(where: str, row: object) -> tuple[float, float]:
+    if not isinstance(row, list) or len(row) != 2:
+        raise PathError(f'{where} must be [x, y] in m: got {row!r}')
+    found = []
+    for name, value in zip('xy', row, strict=True):
+        try:
+            number = math.nan if isinstance(value, bool) else float(value)
+        except (TypeError, ValueError):
+            number = math.nan
+        if not abs(number) <= MAX_COORDINATE:
+            raise PathError(
+                f'{name} of {where} must be a number of at most {MAX_COORDINATE:g} m: '
+                f'got {value!r}'
+            )
+        found.append(number)
+    return found[0], found[1]

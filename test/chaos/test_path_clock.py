@@ -1,0 +1,71 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""A path waits for the robot, but not forever for one that cannot come."""
+
+import numpy as np
+
+from t3mpc_ros.chaos.path_source import PathClock, WaitParameters
+from t3mpc_ros.geometry.types import ORIGIN, Pose
+
+PERIOD_NS = 10_000_000
+WAIT = WaitParameters()
+AWAY = Pose(-1.0, 0.0, 0.0)
+
+
+def _rates(distances, parameters=WAIT, *, begin=AWAY, **options):
+    """Return the rate after each distance of a robot from its reference.
+
+    The robot comes from ``begin`` and is at the origin then.
+    """
+    clock, rates = PathClock(parameters, **options), []
+    clock.add_reference(0, begin)
+    clock.observe(0, begin)
+    for k, distance in enumerate(distances, 1):
+        clock.add_reference(k * PERIOD_NS, Pose(distance, 0.0, 0.0))
+        clock.observe(k * PERIOD_NS, ORIGIN)
+        rates.append(clock.rate)
+    return np.array(rates)
+
+
+def test_the_rate_falls_with_the_distance_without_a_step():
+    distances = np.linspace(0.0, 2.5 * WAIT.distance, 200)[1:]
+    rates = _rates(distances)
+    assert (rates[distances <= WAIT.distance] == 1.0).all()
+    assert (rates[distances >= 2.0 * WAIT.distance] == 0.0).all()
+    assert np.abs(np.diff(rates)).max() < 0.02
+    assert (_rates(distances, WaitParameters(distance=0.0)) == 1.0).all()
+
+
+def test_the_path_waits_for_a_robot_that_approaches_slowly():
+    """At 20 mm/s the way back takes much longer than the patience."""
+    distances = np.arange(1.0, 2.0 * WAIT.distance, -2e-4)
+    assert len(distances) * 0.01 > 10.0 * WAIT.patience
+    assert (_rates(distances) == 0.0).all()
+
+
+def test_the_path_leaves_an_obstacle_that_it_leads_through():
+    """A reference inside an obstacle would wait forever for a robot that goes round it."""
+    noise = np.random.default_rng(3).normal(0.0, 0.003, 6000)
+    rates = _rates(0.5 + noise)
+    assert set(rates) == {0.0, 1.0}
+    assert 0.45 < rates.mean() < 0.55
+    changes = np.flatnonzero(np.diff(rates)) * 0.01
+    assert np.diff(changes).min() > 0.9 * WAIT.patience
+
+
+def test_the_distance_is_that_at_the_stamp_of_the_odometry():
+    """The reference is published ahead: its newest sample is where the robot will be."""
+    clock = PathClock(WAIT, on_the_way=True)
+    for k in range(100):
+        clock.add_reference(k * PERIOD_NS, Pose(0.01 * k, 0.0, 0.0))
+    clock.observe(20 * PERIOD_NS, Pose(0.2, 0.0, 0.0))
+    assert clock.rate == 1.0
+    clock.observe(60 * PERIOD_NS, Pose(0.2, 0.0, 0.0))
+    assert clock.rate == 0.0
+
+
+def test_the_path_waits_as_long_as_the_robot_has_not_set_off():
+    """A controller that started 30 s later had to catch up with a path that was far away."""
+    assert (_rates(np.full(6000, 0.5), begin=ORIGIN) == 0.0).all()
+    assert (_rates(np.full(6000, 0.5), begin=ORIGIN, on_the_way=False) == 0.0).all()
+    assert (_rates(np.full(6000, 0.5), on_the_way=False) == 1.0).all()

@@ -1,0 +1,55 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Chaotic path: in the arena, evenly spread, without jumps, and a function of its seed alone."""
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.chaos.portrait import PortraitParameters, PortraitPath
+from t3mpc_ros.chaos.reference import ReferenceParameters
+from t3mpc_ros.parameters.table import ParameterError
+
+TRIANGLE = (0.0, 0.0, 3.0, 0.0, 1.0, 2.0)
+
+
+def _points(seed, length=60.0, **values):
+    path = PortraitPath(
+        ReferenceParameters(), PortraitParameters.from_dict(values), speed=0.25, seed=seed
+    )
+    return path, np.vstack([path.advance(5.0) for _ in range(round(length / 5.0))])
+
+
+@pytest.mark.parametrize('blend', [0.0, 2.0], ids=['abrupt', 'smooth'])
+@pytest.mark.parametrize('arena', [(-1.75, -1.25, 1.75, 1.25), TRIANGLE])
+def test_path_is_continuous_within_the_arena(arena, blend):
+    path, points = _points(3, **{'arena': arena, 'switching.blend': blend})
+    assert path.arena.contains(points, 1e-6).all()
+    assert np.hypot(*np.diff(points, axis=0).T).max() < 0.0101
+
+
+def test_path_spreads_evenly():
+    """Each quarter of each coordinate gets 15 to 35 % of a long path."""
+    _, points = _points(4, 250.0)
+    for column, size in zip(points.T, (3.5, 2.5), strict=True):
+        shares, _ = np.histogram(column, 4, (-0.5 * size, 0.5 * size))
+        assert (np.abs(shares / len(points) - 0.25) < 0.10).all()
+
+
+def test_equal_seeds_give_equal_paths_others_do_not():
+    one, again, other = (_points(seed, 10.0)[1] for seed in (2**100 + 1, 2**100 + 1, 2**100 + 2))
+    assert np.array_equal(one[: len(again)], again)
+    count = min(len(one), len(other))
+    assert np.abs(one[:count] - other[:count]).max() > 0.5
+
+
+def test_reseed_continues_without_a_jump():
+    """A patrol changes its seed on the way: the path goes on from where it is."""
+    path, before = _points(5, 5.0)
+    path.reseed(6)
+    after = np.vstack([before[-1:], path.advance(5.0)])
+    assert np.hypot(*np.diff(after, axis=0).T).max() < 0.0101
+
+
+def test_a_portrait_needs_two_states():
+    with pytest.raises(ParameterError, match='different states'):
+        PortraitParameters.from_dict({'switching.modes': (2, 3, 4, 4)})

@@ -1,0 +1,204 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Timing of paths: limits hold on any path, the motion is that of a unicycle, cusps included."""
+
+import math
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.geometry.path_timing import (
+    MotionLimits,
+    PathError,
+    PathTiming,
+    distance_to_path,
+    time_path,
+)
+from t3mpc_ros.geometry.types import Pose
+
+GEOMETRY = WheelGeometry()
+PERIOD = 0.01
+SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.0, 0.0]])
+
+
+def _eight():
+    along = np.linspace(0.0, 2.0 * np.pi, 400)
+    return np.column_stack([np.sin(along), 0.5 * np.sin(2.0 * along)])
+
+
+def _cusp():
+    along = np.linspace(-1.0, 1.0, 401)
+    return np.column_stack([along**2, along**3])
+
+
+def _random_corners(seed):
+    return np.random.default_rng(seed).uniform(-1.0, 1.0, (12, 2))
+
+
+def _random_curve(seed):
+    """Return a curve of random Fourier coefficients: of any curvature, also nearly cusps."""
+    generator = np.random.default_rng(seed)
+    along = np.linspace(0.0, 2.0 * np.pi, 800)
+    waves = np.array([[np.sin(k * along), np.cos(k * along)] for k in range(1, 6)])
+    return np.einsum('xkw,kwn->nx', generator.normal(0.0, 0.4, (2, 5, 2)), waves)
+
+
+PATHS = {
+    'line': np.array([[0.0, 0.0], [2.0, 0.0]]),
+    'square': SQUARE,
+    'eight': _eight(),
+    'cusp': _cusp(),
+    'turn back': np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]]),
+    **{f'corners {seed}': _random_corners(seed) for seed in (1, 2, 3)},
+    **{f'curve {seed}': _random_curve(seed) for seed in (1, 2, 3, 4, 5)},
+}
+
+
+@pytest.mark.parametrize('name', PATHS)
+@pytest.mark.parametrize(
+    'limits',
+    [MotionLimits(), MotionLimits(linear=0.6, angular=1.0, angular_acceleration=1.5)],
+    ids=['default', 'slow turns'],
+)
+def test_timing_keeps_every_limit(name, limits):
+    """Speeds, accelerations and those of both wheels, between any two samples."""
+    path = time_path(PATHS[name], limits, GEOMETRY, PERIOD)
+    wheels = (
+        path.linear + np.outer([1.0, -1.0], GEOMETRY.half_separation * path.angular)
+    ) / GEOMETRY.wheel_radius
+    for values, speed, acceleration in (
+        (path.linear, limits.linear, limits.linear_acceleration),
+        (path.angular, limits.angular, limits.angular_acceleration),
+        (wheels, limits.wheel_speed, limits.wheel_acceleration),
+    ):
+        assert np.abs(values).max() <= speed
+        assert np.abs(np.diff(values)).max() <= acceleration * PERIOD
+    assert (path.linear[[0, -1]] == 0.0).all()
+    assert (path.angular[[0, -1]] == 0.0).all()
+
+
+@pytest.mark.parametrize('name', PATHS)
+def test_a_path_that_waits_keeps_every_limit(name):
+    """The rate of its time changes at random, to a stop and back, also at cusps and corners."""
+    limits, generator = MotionLimits(), np.random.default_rng(8)
+    timing = PathTiming(limits, GEOMETRY, PERIOD)
+    timing.add_points(PATHS[name])
+    timing.finish()
+    rows, rates, wanted = [], [], 1.0
+    while not timing.finished:
+        if generator.random() < 0.03:
+            wanted = float(generator.choice([0.0, generator.uniform(), 1.0, 1.0]))
+        pose, twist = timing.advance(wanted)
+        rows.append((*pose, *twist))
+        rates.append(timing.rate)
+    x, y, yaw, linear, angular = np.array(rows).T
+    wheels = (
+        linear + np.outer([1.0, -1.0], GEOMETRY.half_separation * angular)
+    ) / GEOMETRY.wheel_radius
+    for values, acceleration in (
+        (linear, limits.linear_acceleration),
+        (angular, limits.angular_acceleration),
+        (wheels, limits.wheel_acceleration),
+    ):
+        assert np.abs(np.diff(values, prepend=0.0)).max() <= acceleration * PERIOD * (1 + 1e-9)
+    assert min(rates) == 0.0
+    assert max(rates) == 1.0
+    # The twists are those of the poses, and the curve is that of a path that does not wait.
+    whole = time_path(PATHS[name], limits, GEOMETRY, PERIOD)
+    curve = np.column_stack([whole.x, whole.y])
+    assert distance_to_path(np.column_stack([x, y])[::100], curve[::5]).max() < 2e-3
+    steps = np.diff(x) * np.cos(yaw[:-1]) + np.diff(y) * np.sin(yaw[:-1])
+    assert np.abs(steps - PERIOD * linear[:-1]).max() < 5e-5
+    assert len(rows) > 1.1 * len(whole.time)
+
+
+@pytest.mark.parametrize('name', PATHS)
+def test_poses_follow_path_and_twists(name):
+    """The poses lie on the path within 2 mm, and are the integral of the twists (2)."""
+    points = PATHS[name]
+    path = time_path(points, MotionLimits(), GEOMETRY, PERIOD)
+    poses = np.column_stack([path.x, path.y])
+    assert distance_to_path(poses, points).max() < 2e-3
+    assert distance_to_path(points, poses).max() < 2e-3
+    assert poses[-1] == pytest.approx(points[-1], abs=2e-3)
+    ahead = 0.5 * (path.linear[1:] + path.linear[:-1]) * PERIOD
+    yaw = 0.5 * (path.yaw[1:] + path.yaw[:-1])
+    steps = np.column_stack([ahead * np.cos(yaw), ahead * np.sin(yaw)])
+    assert np.abs(np.diff(poses, axis=0) - steps).max() < 2e-4
+    turned = 0.5 * (path.angular[1:] + path.angular[:-1]) * PERIOD
+    assert np.abs(np.diff(path.yaw) - turned).max() < 2e-3
+
+
+def test_straight_line_takes_the_least_time():
+    """A trapezoid of speed is the fastest motion: length / v + v / a, at the planned share."""
+    limits = MotionLimits()
+    speed, acceleration = 0.97 * limits.linear, 0.97 * limits.linear_acceleration
+    path = time_path(PATHS['line'], limits, GEOMETRY, PERIOD)
+    assert path.time[-1] == pytest.approx(2.0 / speed + speed / acceleration, abs=0.03)
+
+
+def test_robot_stops_and_turns_at_a_cusp():
+    """At the cusp of y² = x³ the robot turns by half a turn while it hardly moves."""
+    path = time_path(_cusp(), MotionLimits(), GEOMETRY, PERIOD)
+    near = np.hypot(path.x, path.y) < 2e-3
+    assert np.ptp(path.yaw[near]) > 0.8 * math.pi
+    assert path.linear[near].max() < 0.06
+
+
+def test_growing_path_gives_the_same_motion():
+    """Points may arrive while the robot drives: the motion is that of the known path."""
+    whole = time_path(_eight(), MotionLimits(), GEOMETRY, PERIOD)
+    timing = PathTiming(MotionLimits(), GEOMETRY, PERIOD)
+    points, rows = _eight(), []
+    while not timing.finished:
+        while timing.needs_points and len(points):
+            timing.add_points(points[:10])
+            points = points[10:]
+        if not len(points):
+            timing.finish()
+        pose, twist = timing.advance()
+        rows.append((*pose, *twist))
+    count = min(len(rows), len(whole.x))
+    assert abs(len(rows) - len(whole.x)) < 5
+    table = np.array(rows)[:count]
+    gap = np.hypot(table[:, 0] - whole.x[:count], table[:, 1] - whole.y[:count])
+    assert gap.max() < 2e-3
+
+
+def test_late_points_stop_the_robot_in_time():
+    """A path whose next point is late ends in a stop within the limits, and then goes on."""
+    limits = MotionLimits()
+    timing = PathTiming(limits, GEOMETRY, PERIOD)
+    timing.add_points(np.array([[0.0, 0.0], [1.0, 0.0]]))
+    timing.drive_to_last_point()
+    speeds = [timing.advance()[1].linear for _ in range(800)]
+    timing.add_points(np.array([[2.0, 0.0]]))
+    timing.finish()
+    while not timing.finished:
+        speeds.append(timing.advance()[1].linear)
+    assert speeds[799] == 0.0
+    assert max(speeds[:800]) > 0.9 * limits.linear
+    assert max(speeds[800:]) > 0.9 * limits.linear
+    assert np.abs(np.diff(speeds)).max() <= limits.linear_acceleration * PERIOD
+
+
+def test_start_pose_is_left_at_rest():
+    """From another pose the robot turns towards the path, and drives to it."""
+    start = Pose(-0.5, 0.2, 2.0)
+    path = time_path(SQUARE, MotionLimits(), GEOMETRY, PERIOD, start)
+    assert (path.x[0], path.y[0], path.yaw[0]) == pytest.approx(start, abs=1e-9)
+    assert path.linear[0] == path.angular[0] == 0.0
+
+
+@pytest.mark.parametrize(
+    ('points', 'words'),
+    [
+        ([[0.0, 0.0], [math.nan, 1.0]], 'point 1 is'),
+        ([[0.0, 0.0, 0.0]], 'shape'),
+        ([[1.0, 1.0], [1.0, 1.0005]], '2 mm'),
+    ],
+)
+def test_impossible_paths_are_rejected(points, words):
+    with pytest.raises(PathError, match=words):
+        time_path(np.array(points), MotionLimits(), GEOMETRY)
