@@ -7,14 +7,13 @@ from dataclasses import dataclass
 import math
 import random
 
-from t3mpc_ros.emulator.board.eeprom import Setup
-from t3mpc_ros.emulator.board.robot_board import LOOP_US, SETTLE_SLOW_US, SETTLE_US, RobotBoard
 from t3mpc_ros.emulator.event_queue import MICROSECOND, EventQueue
 from t3mpc_ros.emulator.fault_injection import Fault, FaultInjection
 from t3mpc_ros.emulator.link.dongle import Dongle
 from t3mpc_ros.emulator.link.radio_channel import RadioChannel, RadioParameters
 from t3mpc_ros.emulator.link.serial_line import SerialLine
 from t3mpc_ros.emulator.plant import Plant
+from t3mpc_ros.emulator.robot_board import RadioSettings, RobotBoard
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
 from t3mpc_ros.radio.protocol.frames import Command
@@ -24,6 +23,8 @@ _RATES = ('250k', '1M', '2M')
 _EXTERNAL_RESET, _BROWN_OUT_RESET = 2, 4
 """Reset flags as in the MCUSR register of an AVR."""
 _ROBOT_BOOT_LOADER_NS = NANOSECONDS
+_WRITING_PERIOD_US = 5_000.0
+"""Period at which the board is advanced while it writes its EEPROM, to reply when it is done."""
 
 
 @dataclass(frozen=True)
@@ -34,17 +35,16 @@ class EmulatorParameters(Parameters):
     robot_clock_error: float = parameter(
         0.0,
         'relative error of the clock of the robot board',
-        low=-0.02,
-        high=0.02,
+        bounds=(-0.02, 0.02),
         source='ceramic resonators: 0.5 %',
     )
     dongle_boot_time: float = parameter(
-        1.5, 'duration of the boot loader of the dongle', unit='s', low=0.0, high=10.0
+        1.5, 'duration of the boot loader of the dongle', 's', (0.0, 10.0)
     )
     channel: int = parameter(
-        82, 'channel in the settings of the robot: 2400 MHz plus this', unit='MHz', low=0, high=125
+        82, 'channel in the settings of the robot: 2400 MHz plus this', 'MHz', (0, 125)
     )
-    rate: str = parameter('1M', 'bit rate of the radio of the robot', choices=_RATES)
+    rate: str = parameter('1M', 'bit rate in the settings of the robot', choices=_RATES)
 
     def check_consistency(self) -> None:
         """Raise ParameterError if the plant does not suit the board."""
@@ -73,6 +73,11 @@ class Emulator:
         Start of virtual time: both boards have booted, the robot is at rest.
     erased
         The EEPROM of the robot is blank: it has neither settings nor a key.
+
+    Raises
+    ------
+    FirmwareLibraryError
+        The C core of the firmware cannot be compiled: no compiler, for example.
     """
 
     def __init__(
@@ -89,22 +94,25 @@ class Emulator:
         self.faults = FaultInjection(lambda: self._events.now_ns, seed)
         self._clock_rate = 1.0 + parameters.robot_clock_error
         self.plant = Plant(parameters.twin, self._clock_rate)
-        nonces = random.Random(f'nonces {seed}')
+        rate = _RATES.index(parameters.rate)
         self._channel = RadioChannel(
             self._events,
-            RadioParameters(channel=parameters.channel, rate=_RATES.index(parameters.rate)),
+            RadioParameters(channel=parameters.channel, rate=rate),
             self._advance_robot,
             lambda payload: self.board.receive(payload),
             self.faults,
             random.Random(f'air {seed}'),
         )
-        settle_us = SETTLE_SLOW_US if parameters.rate == '250k' else SETTLE_US
-        setup = None if erased else Setup(channel=parameters.channel)
         self.board = RobotBoard(
-            self.plant, key, nonces.randbytes, self._channel.load, settle_us, setup
+            self.plant,
+            key,
+            random.Random(f'nonces {seed}').getrandbits(32),
+            self._channel.load,
+            rate,
+            None if erased else parameters.channel,
         )
-        self.board.on_setup = self._follow_settings
-        self._follow_settings(self.board.settings_store.setup)
+        self.board.on_settings = self._follow_settings
+        self._follow_settings(self.board.radio_settings)
         self._boot_ns = now_ns
         self._robot_off = False
         """Whether the robot board is without power or in its boot loader."""
@@ -119,7 +127,7 @@ class Emulator:
         self._to_console = SerialLine(self._events, no_faults, self._deliver_to_console)
         self._from_console = SerialLine(self._events, no_faults, self._deliver_from_console)
         self._console_output: list[tuple[int, bytes]] = []
-        self.board.console.reply = self._from_console.send
+        self.board.on_console = self._from_console.send
         self.port_open = True
         """Whether the dongle is plugged in."""
         self.port_number = 0
@@ -183,17 +191,17 @@ class Emulator:
             )
 
     def _deliver_to_console(self, data: bytes) -> None:
-        if not self._advance_robot():
-            return
-        self.board.console.feed(data)
-        if (done_us := self.board.eeprom_done_us) is not None:
-            # One pass of the main loop later, on a clock that may be slow.
-            later_us = 1.02 * (done_us - self.board.now_us) + LOOP_US
+        if self._advance_robot():
+            self.board.feed_console(data)
+            self._await_eeprom()
 
-            def advance() -> None:
-                self._advance_robot()
+    def _await_eeprom(self) -> None:
+        def advance() -> None:
+            if self._advance_robot():
+                self._await_eeprom()
 
-            self._events.schedule_after(later_us, advance)
+        if self.board.writing:
+            self._events.schedule_after(_WRITING_PERIOD_US, advance)
 
     def _deliver_from_console(self, data: bytes) -> None:
         self._console_output.append((self._events.now_ns, data))
@@ -261,14 +269,14 @@ class Emulator:
     def _set_imu(self, present: bool) -> None:
         self._advance_robot()
         self.plant.imu_absent = not present
+        self.board.sense()
 
     def _press_button(self, pressed: bool) -> None:
         self._advance_robot()
         self.board.press_button(pressed)
 
-    def _follow_settings(self, setup: Setup) -> None:
-        radio = self._channel.robot
-        self._channel.robot = radio._replace(channel=setup.channel, address=setup.address)
+    def _follow_settings(self, settings: RadioSettings) -> None:
+        self._channel.robot = self._channel.robot._replace(**settings._asdict())
 
     def _chip_ok(self) -> bool:
         return not self.faults.active('radio_dead')
@@ -303,8 +311,7 @@ class Emulator:
         self._robot_off = True
         self._boot_ns = self._events.now_ns
         self._channel.clear()
-        self.plant.set_speeds(0, 0)
-        self.plant.set_power(False)
+        self.plant.set_motors(False, False)
 
     def _boot_robot(self, cause: int) -> None:
         if not self._robot_off:

@@ -9,6 +9,7 @@ import random
 from typing import NamedTuple
 
 from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.radio.protocol.frames import VERSION
 
 
 class FaultKind(NamedTuple):
@@ -186,6 +187,6 @@ class FaultInjection:
         """Return a radio payload; with another protocol version if ``wrong_version`` occurs."""
         if not payload or not self.occurs('wrong_version'):
             return payload
-        versions = [number for number in range(16) if number != 1]
+        versions = [number for number in range(16) if number != VERSION]
         version = self.generators['wrong_version'].choice(versions)
         return bytes([version << 4 | payload[0] & 0x0F]) + payload[1:]

@@ -2,25 +2,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plant of the emulated board: motors, body, world, sensors and battery of the digital twin.
 
+Step pulses go in, the counts of the board's converter and the registers of its IMU come out.
+
 Frames and board have the wheel order left, right; the digital twin has right, left.
 """
 
 from dataclasses import replace
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from t3mpc_ros.emulator.board.hardware import Registers
 from t3mpc_ros.geometry.types import Pose, WheelSpeeds
-from t3mpc_ros.robot.interface import RANGE_SENSORS, ZERO_WHEEL_SPEEDS
-from t3mpc_ros.robot.sensor_conversions import GRAVITY, encode_range
+from t3mpc_ros.robot.description import sensor_mounts
+from t3mpc_ros.robot.interface import RANGE_SENSORS
+from t3mpc_ros.robot.sensor_conversions import GRAVITY
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 from t3mpc_ros.simulation.plant.disturbances import Disturbance
 from t3mpc_ros.simulation.plant.drivetrain import Drivetrain
 from t3mpc_ros.simulation.plant.stepper_motor import StepperMotorParameters
 from t3mpc_ros.simulation.sensors.battery import SimulatedBattery
 from t3mpc_ros.simulation.sensors.imu import SimulatedImu
-from t3mpc_ros.simulation.sensors.range_sensor import SimulatedRangeSensors, sensor_mounts
+from t3mpc_ros.simulation.sensors.range_sensor import NOT_CONVERTED, SimulatedRangeSensors
 from t3mpc_ros.simulation.world import cast_rays, clearance, grip_at, load_world
 
 _SAMPLE_STEPS = 5
@@ -32,8 +35,20 @@ _TEMPERATURE = round((25.0 - 36.53) * 340.0)
 """Temperature register of the MPU6050 at 25 °C: register map RM-MPU-6000A, 4.18."""
 
 
+class Registers(NamedTuple):
+    """Newest sample of the MPU6050, as raw register values."""
+
+    accel_x: int = 0
+    accel_y: int = 0
+    accel_z: int = 0
+    temperature: int = 0
+    gyro_x: int = 0
+    gyro_y: int = 0
+    gyro_z: int = 0
+
+
 class Plant:
-    """The robot without its board: implements the hardware interface of the board.
+    """The robot without its board.
 
     Parameters
     ----------
@@ -53,6 +68,7 @@ class Plant:
         )
         self._disturbance = Disturbance(parameters.disturbance, disturbance)
         self._imu = SimulatedImu(parameters.imu, imu)
+        self._accel_z = min(round(GRAVITY / parameters.imu.acceleration_step), 32767)
         self._ranges = SimulatedRangeSensors(parameters.range_sensor, ranges)
         self._battery = SimulatedBattery(parameters.battery)
         self._world = load_world(parameters.world)
@@ -60,7 +76,8 @@ class Plant:
         self._distances = np.full(len(RANGE_SENSORS), math.inf)
         self._pending_steps = 0.0
         """Integration steps still to run, a fraction of one."""
-        self._wheels = ZERO_WHEEL_SPEEDS
+        self._issued = [0.0, 0.0]
+        """Pulses issued since boot with the fraction of the next, left first."""
         self._powered = False
         self._field_work = 0.0
         self._measured_at = 0
@@ -83,39 +100,56 @@ class Plant:
         self._drivetrain.load(motor, parameters.load_with_faults(parameters.faults))
         self._field_work = 0.0
 
-    # -- hardware interface -----------------------------------------------------------------------
+    # -- pins of the board ------------------------------------------------------------------------
 
-    def run(self, elapsed_us: int) -> None:
-        """Advance by a time on the clock of the board."""
+    @property
+    def until_sample_us(self) -> int:
+        """Time until the sensors measure, on the clock of the board; at least 1."""
+        steps = _SAMPLE_STEPS - self._drivetrain.steps_done % _SAMPLE_STEPS - self._pending_steps
+        return max(1, math.ceil(steps * self._drivetrain.step * 1e6 * self._clock_rate))
+
+    def run(self, elapsed_us: int, left: float = 0.0, right: float = 0.0) -> bool:
+        """Advance by a time on the clock of the board, in which it issues pulses evenly.
+
+        Return whether the sensors have measured. ``left`` and ``right`` are microsteps, signed by
+        the direction pins.
+        """
         seconds = elapsed_us / (1e6 * self._clock_rate)
         self.elapsed += seconds
-        self._pending_steps += seconds / self._drivetrain.step
+        before, passed = self._pending_steps, seconds / self._drivetrain.step
+        self._pending_steps += passed
         count = math.floor(self._pending_steps + 1e-9)
         self._pending_steps -= count
+        done, measured = -before, False
         while count:
             sampled = self._drivetrain.steps_done % _SAMPLE_STEPS
             part = min(count, _SAMPLE_STEPS - sampled)
-            volts = self._battery.voltage if self._powered else 0.0
-            self._drivetrain.run(self._wheels, 0.0, volts, self._disturbance, part)
             count -= part
+            done += part
+            # The fields turn to where they are at the end of these steps.
+            share = done / passed
+            phase_right, phase_left = self._drivetrain.phases
+            self._drivetrain.follow_pulses(
+                self._issued[1] + share * right - phase_right,
+                self._issued[0] + share * left - phase_left,
+                self._battery.voltage if self._powered else 0.0,
+                self._disturbance,
+                part,
+            )
             if self._drivetrain.steps_done % _SAMPLE_STEPS == 0:
                 self._measure()
+                measured = True
+        self._issued[0] += left
+        self._issued[1] += right
+        return measured
 
-    def set_speeds(self, left: int, right: int) -> None:
-        """Set the speed of both motors (urad/s)."""
-        if left or right:
+    def set_motors(self, powered: bool, turning: bool) -> None:
+        """Set whether the motor drivers have power, and whether pulses are being issued."""
+        self._powered = powered
+        if turning:
             self.stopped_at = None
         elif self.stopped_at is None:
             self.stopped_at = self.elapsed
-        scale = 1e-6 * self._clock_rate
-        limit = self._motor.top_speed
-        self._wheels = WheelSpeeds(
-            min(max(scale * right, -limit), limit), min(max(scale * left, -limit), limit)
-        )
-
-    def set_power(self, on: bool) -> None:
-        """Switch the power of both motor drivers."""
-        self._powered = on
 
     def boot(self, microsteps: int) -> None:
         """Reset both counters, and set the drivers to this number of microsteps per step.
@@ -125,16 +159,8 @@ class Plant:
         if microsteps != self._motor.microsteps:
             self._build_drivetrain(replace(self._motor, microsteps=microsteps), self._drivetrain)
         self._drivetrain.restart_board()
+        self._issued = [0.0, 0.0]
         self._imu.restart()
-
-    @property
-    def counters(self) -> tuple[int, int]:
-        """Pulses issued since boot, left first; interpolated within an integration step."""
-        right, left = self._drivetrain.counters
-        part = self._pending_steps * self._drivetrain.step / self._motor.microstep
-        speeds = self._drivetrain.pulse_speeds
-        # Truncated, so that the next integration step never counts backwards.
-        return left + int(part * speeds.left), right + int(part * speeds.right)
 
     @property
     def registers(self) -> Registers | None:
@@ -142,21 +168,15 @@ class Plant:
         if self.imu_absent or self._parameters.faults.gyro_dead:
             return None
         gyro_z, accel_x, accel_y = self._imu.counts
-        accel_z = round(GRAVITY / self._parameters.imu.acceleration_step)
-        return Registers(accel_x, accel_y, min(accel_z, 32767), _TEMPERATURE, 0, 0, gyro_z)
+        return Registers(accel_x, accel_y, self._accel_z, _TEMPERATURE, 0, 0, gyro_z)
 
     @property
-    def ranges(self) -> bytes:
-        """Range code of each of the eight range sensors."""
-        if self._parameters.faults.ranges_dead:
-            return bytes(len(RANGE_SENSORS))
-        return bytes(map(encode_range, self._ranges.readings))
-
-    @property
-    def battery(self) -> int:
-        """Battery voltage as measured by the converter, mV."""
+    def adc_counts(self) -> tuple[int, ...]:
+        """Counts of the converter: the eight range sensors, then the battery."""
+        dead = self._parameters.faults.ranges_dead
+        ranges = (NOT_CONVERTED,) * len(RANGE_SENSORS) if dead else self._ranges.counts
         count = int(1000.0 * self._battery.voltage * _ADC_COUNTS / _ADC_FULL_SCALE)
-        return min(count, _ADC_COUNTS - 1) * _ADC_FULL_SCALE // _ADC_COUNTS
+        return *ranges, min(count, _ADC_COUNTS - 1)
 
     # -- ground truth -----------------------------------------------------------------------------
 
@@ -190,8 +210,8 @@ class Plant:
         """Compile all kernels, so that the first packet does not wait for it."""
         plant = Plant(self._parameters)
         plant.boot(self._motor.microsteps)
-        plant.set_power(True)
-        plant.run(50_000)
+        plant.set_motors(True, True)
+        plant.run(50_000, 1.0, 1.0)
         room = load_world('room')
         clearance(0.0, 0.0, room.segments, room.circles)
         grip_at(0.0, 0.0, room.patches)

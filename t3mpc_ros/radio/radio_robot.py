@@ -18,6 +18,7 @@ from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.port_actions import LinkState, PortAction
 from t3mpc_ros.radio.link.statistics import LinkQuality
 from t3mpc_ros.radio.link.telemetry import Telemetry
+from t3mpc_ros.robot.calibration import CalibrationParameters
 from t3mpc_ros.robot.command_limiter import CommandLimiter, CommandLimiterParameters
 from t3mpc_ros.robot.gyro_odometry import GyroOdometry, GyroOdometryParameters
 from t3mpc_ros.robot.interface import (
@@ -44,12 +45,12 @@ class RadioRobotParameters(Parameters):
     limiter: CommandLimiterParameters = group(CommandLimiterParameters, inline=True)
     odometry: GyroOdometryParameters = group(GyroOdometryParameters)
     link: LinkParameters = group(LinkParameters)
+    calibration: CalibrationParameters = group(CalibrationParameters)
     slip_stop: float = parameter(
         1.0,
         'duration of a disagreement between gyro and steps after which the robot stops; 0: never',
-        unit='s',
-        low=0.0,
-        high=60.0,
+        's',
+        (0.0, 60.0),
         dynamic=True,
     )
 

@@ -7,7 +7,7 @@ import math
 from typing import NamedTuple
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
-from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, WheelSpeeds
+from t3mpc_ros.geometry.types import NANOSECONDS, WheelSpeeds
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, RobotCommand
@@ -23,57 +23,51 @@ class CommandLimiterParameters(Parameters):
     linear_speed: float = parameter(
         0.5,
         'largest forward velocity |v| of a command',
+        'm/s',
+        (0.0, 5.0),
         name='linear.x.max_velocity',
-        unit='m/s',
-        low=0.0,
-        high=5.0,
         dynamic=True,
     )
     angular_speed: float = parameter(
         8.0,
         'largest yaw rate |omega| of a command',
+        'rad/s',
+        (0.0, 50.0),
         name='angular.z.max_velocity',
-        unit='rad/s',
-        low=0.0,
-        high=50.0,
         dynamic=True,
     )
     wheel_speed: float = parameter(
         10.0,
         'largest wheel speed of a command; from here a robot without commands stops within '
         'max_stopping_time. The board steps at up to 19.6 rad/s (10 000 microsteps a second)',
+        'rad/s',
+        (0.0, 200.0),
         name='wheel.max_velocity',
-        unit='rad/s',
-        low=0.0,
-        high=200.0,
         dynamic=True,
     )
     acceleration: float = parameter(
         30.0,
         'largest acceleration of the faster changing wheel',
+        'rad/s²',
+        (0.1, 1e5),
         name='wheel.max_acceleration',
-        unit='rad/s²',
-        low=0.1,
-        high=1e5,
         dynamic=True,
     )
     stop_deceleration: float = parameter(
         60.0,
         'deceleration of the faster changing wheel in a stop, whatever its reason; an emergency '
         'stop uses at least 60 rad/s²',
+        'rad/s²',
+        (0.1, 1e5),
         name='wheel.stop_deceleration',
-        unit='rad/s²',
-        low=0.1,
-        high=1e5,
         dynamic=True,
     )
     command_timeout: float = parameter(
         0.25,
         'age at which a command expires (board level; the host has its own timeout)',
+        's',
+        (0.01, 0.5),
         name='cmd_vel_timeout',
-        unit='s',
-        low=0.01,
-        high=0.5,
         dynamic=True,
     )
 
@@ -82,9 +76,8 @@ class CommandLimiterParameters(Parameters):
         'longest time from the last command to rest that other parameters may lead to: '
         'cmd_vel_timeout plus the stop from wheel.max_velocity; a higher value weakens every stop '
         'but the emergency stop',
-        unit='s',
-        low=0.1,
-        high=10.0,
+        's',
+        (0.1, 10.0),
     )
 
     def check_stopping_time(self, silence: float, deceleration: float, names: str) -> None:
@@ -234,10 +227,6 @@ class CommandLimiter:
         """Return why a command is too old, empty when it is not."""
         age = (now_ns - command.stamp_ns) / NANOSECONDS
         return f'command is too old: {age:.3f} s' if age >= self.parameters.command_timeout else ''
-
-    def accept_twist(self, twist: BodyTwist, now_ns: int) -> str:
-        """Accept a body twist stamped now, or return why it is rejected."""
-        return self.accept(RobotCommand.from_twist(twist, self._geometry, now_ns), now_ns)
 
     def advance(self, now_ns: int, hold: float) -> LimitedCommand:
         """Return the wheel speeds to command from ``now_ns`` on, for ``hold`` seconds.

@@ -66,92 +66,87 @@ class GyroOdometryParameters(WheelOdometryParameters):
     gyro_noise: float = parameter(
         8.7e-5,
         'noise density of the gyro: a turn integrated over a time t has the variance noise² t',
-        unit='rad/s/√Hz',
-        low=1e-7,
-        high=1.0,
+        'rad/s/√Hz',
+        (1e-7, 1.0),
         dynamic=True,
         source=f'{DATA_SHEET}: 0.005 deg/s/√Hz',
+    )
+    gyro_scale: float = parameter(
+        1.0,
+        'true rate / rate by the data sheet, from t3mpc robot calibrate',
+        bounds=(0.8, 1.2),
+        dynamic=True,
     )
     gyro_scale_tolerance: float = parameter(
         0.001,
         'standard deviation of the relative scale error after a calibration over ten turns; 0.03 '
         'without calibration',
-        low=0.0,
-        high=0.5,
+        bounds=(0.0, 0.5),
         dynamic=True,
     )
     gyro_bias_limit: float = parameter(
         0.7,
         'largest accepted bias; half of it is the standard deviation of an unknown bias',
-        unit='rad/s',
-        low=1e-3,
-        high=10.0,
+        'rad/s',
+        (1e-3, 10.0),
         source=f'{DATA_SHEET}: ±20 deg/s, and ±20 over temperature',
     )
     gyro_bias_drift: float = parameter(
         5e-5,
         'random walk of the bias: standard deviation after one second; larger during warm-up',
-        unit='rad/s/√s',
-        low=0.0,
-        high=1.0,
+        'rad/s/√s',
+        (0.0, 1.0),
         dynamic=True,
     )
     gyro_delay: float = parameter(
         0.0048,
         'delay of the low-pass filter of the gyro, modelled as two equal poles (43 Hz)',
-        unit='s',
-        low=1e-4,
-        high=0.1,
+        's',
+        (1e-4, 0.1),
         dynamic=True,
         source='MPU-6000 register map RM-MPU-6000A r4.2: DLPF_CFG 3, 42 Hz',
     )
     gyro_hold: float = parameter(
         0.05,
         'longest time represented by one gyro sample; the rest of a longer gap uses the steps',
-        unit='s',
-        low=1e-3,
-        high=10.0,
+        's',
+        (1e-3, 10.0),
         dynamic=True,
     )
     slip_threshold: float = parameter(
         0.25,
         'yaw rate difference between gyro and steps that indicates slip, plus three times the '
         'scale tolerance',
-        unit='rad/s',
-        low=0.01,
-        high=10.0,
+        'rad/s',
+        (0.01, 10.0),
         dynamic=True,
     )
     slip_time: float = parameter(
         0.15,
         'time the difference must last; a third of it is the smoothing time constant',
-        unit='s',
-        low=0.0,
-        high=10.0,
+        's',
+        (0.0, 10.0),
         dynamic=True,
     )
     slip_inflation: float = parameter(
         3000.0,
         'factor on the variance of the wheel travel while gyro and steps disagree',
-        low=1.0,
-        high=1e6,
+        bounds=(1.0, 1e6),
         dynamic=True,
     )
     standstill_time: float = parameter(
         1.0,
         'standstill time over which the bias is averaged, repeatedly',
-        unit='s',
-        low=0.1,
-        high=60.0,
+        's',
+        (0.1, 60.0),
         dynamic=True,
     )
     standstill_spread: float = parameter(
         0.0035,
         'largest standard deviation of the gyro at a standstill; beyond it, or at a yaw rate of '
         'more than three times this value, the robot is being moved',
-        unit='rad/s',
-        low=1e-5,
-        high=1.0,
+        'rad/s',
+        (1e-5, 1.0),
         dynamic=True,
     )
 
@@ -292,8 +287,8 @@ class GyroOdometry:
             Angles (rad) by which the wheels turned since the last call, from the step counters;
             exactly zero without a step.
         gyro
-            Yaw rate (rad/s, counter-clockwise) sampled at the end of that time, bias included;
-            None when the sensor does not respond.
+            Yaw rate (rad/s, counter-clockwise) sampled at the end of that time, bias included,
+            without ``gyro_scale``; None when the sensor does not respond.
         dt
             Seconds since the last call.
         jitter
@@ -305,7 +300,7 @@ class GyroOdometry:
             A number is not finite, dt not positive, or jitter negative; the state is unchanged
             then.
         """
-        rate = 0.0 if gyro is None else float(gyro)
+        rate = 0.0 if gyro is None else self._parameters.gyro_scale * float(gyro)
         if not math.isfinite(right + left + rate + dt + jitter):
             raise ValueError(
                 'wheel angles, gyro, dt and jitter must be finite: '

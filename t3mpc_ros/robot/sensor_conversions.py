@@ -63,18 +63,16 @@ class ImuParameters(Parameters):
     gyro_noise: float = parameter(
         0.005,
         'noise density of the gyro',
-        unit='deg/s/√Hz',
-        low=0.0,
-        high=10.0,
+        'deg/s/√Hz',
+        (0.0, 10.0),
         dynamic=True,
         source=f'{IMU_DATA_SHEET} 6.1, at 10 Hz',
     )
     accel_noise: float = parameter(
         400.0,
         'noise density of the accelerometer',
-        unit='µg/√Hz',
-        low=0.0,
-        high=1e5,
+        'µg/√Hz',
+        (0.0, 1e5),
         dynamic=True,
         source=f'{IMU_DATA_SHEET} 6.2, at 10 Hz',
     )
@@ -116,7 +114,7 @@ RANGE_DATA_SHEET = 'Sharp E4-A00201EN'
 
 @dataclass(frozen=True)
 class RangeSensorParameters(Parameters):
-    """Type, measuring range and beam of the range sensors."""
+    """Type, measuring range, beam and mounting of the range sensors."""
 
     type: str = parameter(
         'GP2Y0A21YK0F', 'type of the sensors', choices=('GP2Y0A21YK0F',), source=RANGE_DATA_SHEET
@@ -124,32 +122,42 @@ class RangeSensorParameters(Parameters):
     minimum: float = parameter(
         0.10,
         'smallest distance; the board reports anything nearer as too near',
-        unit='m',
-        low=0.07,
-        high=0.5,
+        'm',
+        (0.07, 0.5),
         source=f'{RANGE_DATA_SHEET}, distance measuring range',
     )
     maximum: float = parameter(
         0.80,
         'largest distance; the board reports anything farther as no object',
-        unit='m',
-        low=0.2,
-        high=1.2,
+        'm',
+        (0.2, 1.2),
         source=f'{RANGE_DATA_SHEET}, distance measuring range',
     )
     field_of_view: float = parameter(
-        0.1,
-        'opening angle of the beam, which the data sheet does not give',
-        unit='rad',
-        low=0.0,
-        high=1.0,
+        0.1, 'opening angle of the beam, which the data sheet does not give', 'rad', (0.0, 1.0)
+    )
+
+    half_length: float = parameter(
+        0.10, 'distance from the axle to the front and rear sensor faces', 'm', (0.01, 1.0)
+    )
+    half_width: float = parameter(
+        0.09, 'distance from the centre line to the side sensor faces', 'm', (0.01, 1.0)
+    )
+    offset: float = parameter(
+        0.05, 'distance of the two sensors of a side from the middle of that side', 'm', (0.0, 1.0)
     )
 
     def check_consistency(self) -> None:
-        """Raise ParameterError when the measuring range is empty."""
+        """Raise ParameterError when the range is empty or a sensor is mounted beyond the body."""
         if self.maximum <= self.minimum:
             raise ParameterError(
                 f'maximum must be more than minimum ({self.minimum:g} m): got {self.maximum:g}'
+            )
+        side = min(self.half_length, self.half_width)
+        if self.offset > side:
+            raise ParameterError(
+                f'offset must be at most half_length and half_width ({side:g} m): '
+                f'got {self.offset:g}'
             )
 
 
@@ -190,5 +198,5 @@ def decode_range(code: int) -> float:
 class BatteryParameters(Parameters):
     """Cells and capacity of the battery."""
 
-    cells: int = parameter(3, 'number of Li-ion cells in series', low=1, high=12)
-    capacity: float = parameter(2.2, 'charge of the full battery', unit='Ah', low=0.01, high=100.0)
+    cells: int = parameter(3, 'number of Li-ion cells in series', bounds=(1, 12))
+    capacity: float = parameter(2.2, 'charge of the full battery', 'Ah', (0.01, 100.0))

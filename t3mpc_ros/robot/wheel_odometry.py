@@ -21,12 +21,7 @@ class WheelOdometryParameters(Parameters):
     """Error growth of the wheel odometry."""
 
     variance_per_metre: float = parameter(
-        1e-5,
-        'variance of the travel of a wheel per metre',
-        unit='m²/m',
-        low=0.0,
-        high=1.0,
-        dynamic=True,
+        1e-5, 'variance of the travel of a wheel per metre', 'm²/m', (0.0, 1.0), dynamic=True
     )
 
 

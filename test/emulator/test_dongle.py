@@ -186,7 +186,7 @@ def test_an_exchange_with_a_dead_chip_times_out():
     station.run(200_000)
     at, result = station.take_reply()
     assert result[1:3] == (0x04, 0x08)
-    assert at == pytest.approx(140 + 150_000 + 330)
+    assert at == pytest.approx(150_000 + 270)
 
 
 def test_a_booting_dongle_ignores_input_and_ends_its_transaction():

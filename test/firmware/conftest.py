@@ -4,21 +4,18 @@
 
 import json
 from pathlib import Path
-import shutil
 
 import pytest
 from support.avr_boards import booted
-from support.firmware_core import ACCELERATION, DECELERATION, KEY, OK, Robot, compile_core
+from support.firmware_core import ACCELERATION, DECELERATION, KEY, OK, Robot, load_core
 
 GOLDEN = Path(__file__).resolve().parents[1] / 'golden' / 'radio_vectors.json'
 
 
 @pytest.fixture(scope='session')
-def library(tmp_path_factory):
+def library():
     """Return the compiled core."""
-    if shutil.which('gcc') is None:
-        pytest.skip('needs gcc')
-    return compile_core(tmp_path_factory.mktemp('firmware') / 'libt3core.so')
+    return load_core()
 
 
 @pytest.fixture

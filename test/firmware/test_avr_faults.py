@@ -11,7 +11,7 @@ import math
 import random
 
 import pytest
-from support.avr_bench import AvrBoard, on_avr
+from support.avr_bench import on_avr
 from support.avr_boards import missing_tools
 from support.emulator_bench import MS, Bench, check_followed
 
@@ -152,14 +152,14 @@ def test_every_command_of_a_burst_held_for_a_second_is_stale(build, key):
     delayed = next_commands(bench, 15)
     bench.run(1.0)
     before, executed = bench.board.counters, len(bench.followed)
-    assert stale(bench) == 0
+    assert bench.board.stale == 0
     for wire in delayed:
         bench.emulator.feed(wire, bench.now_ns)
         bench.run(0.008)
     bench.run(0.2)
     assert bench.board.counters == before
     assert len(bench.followed) == executed
-    assert stale(bench) == 15
+    assert bench.board.stale == 15
 
 
 def next_commands(bench, count):
@@ -171,12 +171,6 @@ def next_commands(bench, count):
         poll = encode(Poll(session.number, command.seq, 0))
         frames.append(encode_frame(encode(Transmit(100 + index, 6, encode(command), poll))))
     return frames
-
-
-def stale(bench):
-    """Return the number of commands that the robot has rejected as stale."""
-    board = bench.board
-    return board.stale if isinstance(board, AvrBoard) else board.packet_counters['stale']
 
 
 # -- boards, radio, port --------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 """Faults that the firmware has to find by itself, in simavr: no error bit reports them."""
 
 import pytest
-from support.avr_boards import DONGLE, IMU, Boards, build, missing_tools
+from support.avr_boards import DONGLE, IMU, ROBOT, Boards, build, missing_tools, request
 from support.long_tests import few_of
 
 from t3mpc_ros.radio.protocol import codec
@@ -16,6 +16,9 @@ LINE_RATE = 50_000
 """Bytes per second."""
 TTL = 0.2
 """s"""
+MCUSR, WDTCSR = 0x54, 0x60
+"""Data addresses of both chips."""
+WATCHDOG_RESET = WATCHDOG_RUNS = 8
 
 
 def _drained(boards: Boards) -> int:
@@ -80,3 +83,20 @@ def test_a_reset_of_the_imu_is_flagged_and_repaired(boards: Boards) -> None:
     assert not state.status & StatusFlag.IMU_FAULT
     registers = [boards.call('imu_register', at) for at in (0x6B, 0x19, 0x1A, 0x1B, 0x1C)]
     assert registers == [0x01, 0x04, 0x03, 0x08, 0x00]
+
+
+@pytest.mark.parametrize('board', [DONGLE, ROBOT])
+def test_a_watchdog_that_still_runs_is_stopped_at_once(boards: Boards, board: int) -> None:
+    """After its reset it has 15 ms: a boot loader may have used up most of them."""
+    boards.start()
+    boards.rules_broken = True
+    boards.call('reset', board)
+    boards.call('poke', board, MCUSR, WATCHDOG_RESET)
+    boards.call('poke', board, WDTCSR, WATCHDOG_RUNS)
+    boards.run(20e-6)
+    assert boards.call('peek', board, MCUSR) == 0
+    assert boards.call('peek', board, WDTCSR) == 0
+    boards.run(0.2)
+    ping = Ping(1, b'ping')
+    reply = request(boards, ping)[0] if board == ROBOT else boards.ask(ping)
+    assert reply.reset_cause == WATCHDOG_RESET

@@ -20,27 +20,49 @@ from support.avr_boards import (
     request,
     settings_record,
 )
+from support.firmware_core import run_make
 from support.long_tests import few_of
 
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.frames import (
     OK,
+    PART_SIZE,
+    SETTINGS_RECORD,
     Configure,
     Info,
     Ping,
     Poll,
     Pong,
-    Settings,
-    SettingsState,
+    Record,
     StatusFlag,
+    Store,
 )
+from t3mpc_ros.radio.protocol.framing import crc16
+from t3mpc_ros.radio.tool.robot_records import RobotSettings, decode_settings, encode_settings
 
 pytestmark = pytest.mark.skipif(bool(missing_tools()), reason=f'not installed: {missing_tools()}')
 
-NEW = Settings(2, 100, 8, bytes.fromhex('c25a33a6e1'))
-STORED = SettingsState(2, OK, frames.SETTINGS_GOOD, *NEW[1:])
+NEW = RobotSettings(bytes.fromhex('c25a33a6e1'), 100, microsteps=8)
 WRITING = 0.3
-"""Sufficient time to write both copies, s: 24 cells of 3.4 ms, started in passes of 0.4 ms."""
+"""Sufficient time to write both copies, s: 56 cells of 3.4 ms, started in passes of 0.4 ms."""
+
+
+def store(boards: Boards, settings: RobotSettings, seconds: float = WRITING) -> list[Any]:
+    """Stage and store settings; return the answers to STORE within a time."""
+    body = encode_settings(settings)
+    for part, data in enumerate((body[:PART_SIZE], body[PART_SIZE:].ljust(PART_SIZE, b'\0'))):
+        assert request(boards, Record(2, SETTINGS_RECORD, part, data))[0].rc == OK
+    return request(boards, Store(2, SETTINGS_RECORD, crc16(body)), seconds)
+
+
+def read(boards: Boards) -> tuple[int, RobotSettings]:
+    """Return state and values of the settings."""
+    first, second = (request(boards, Record(1, SETTINGS_RECORD, part))[0] for part in (0, 1))
+    return first.state, decode_settings((first.data + second.data)[: first.size])
+
+
+def copy_of(settings: RobotSettings) -> bytes:
+    return settings_record(settings.channel, settings.microsteps, settings.address)
 
 
 def tune(boards: Boards, channel: int, address: bytes) -> None:
@@ -64,8 +86,9 @@ def test_an_erased_robot_moves_only_after_its_settings() -> None:
         assert read_info(boards).settings == frames.SETTINGS_MISSING
         (pong,) = request(boards, Ping(1, b'ping'))
         assert (pong.settings, pong.channel) == (frames.SETTINGS_MISSING, 82)
-        assert request(boards, NEW, WRITING) == [STORED]
-        copy = settings_record(*NEW[1:])
+        (stored,) = store(boards, NEW)
+        assert (stored.id, stored.rc, stored.state) == (2, OK, frames.SETTINGS_GOOD)
+        copy = copy_of(NEW)
         assert [boards.eeprom(at, len(copy)) for at in SETTINGS_ADDRESSES] == [copy, copy]
         # The radio follows at once: nothing answers at the old place.
         assert boards.request(Poll(0, 0, 0)) is None
@@ -84,7 +107,7 @@ def test_an_erased_robot_moves_only_after_its_settings() -> None:
 
 
 @pytest.mark.parametrize(
-    'cuts', few_of([[0.01, WRITING], [0.002, 0.01, 0.03, 0.05, 0.08, WRITING]])
+    'cuts', few_of([[0.002, WRITING], [0.001, 0.002, 0.003, 0.005, 0.008, 0.012, WRITING]])
 )
 def test_power_loss_during_a_write_leaves_no_mixture(cuts: list[float]) -> None:
     """Power fails at several times: the old settings or the new ones, in both places."""
@@ -93,18 +116,17 @@ def test_power_loss_during_a_write_leaves_no_mixture(cuts: list[float]) -> None:
     for cut in cuts:
         boards = Boards()
         boards.start()
-        request(boards, NEW, cut)
+        store(boards, NEW, cut)
         boards.call('reset', ROBOT)
         boards.run(0.15)
-        ((_, rc, state, *values),) = request(boards, Settings(1))
-        assert rc == OK
+        state, found = read(boards)
         assert state in (frames.SETTINGS_GOOD, frames.SETTINGS_ONE_COPY)
-        assert tuple(values) in ((82, 16, b'T3MPC'), NEW[1:])
-        seen.add(tuple(values))
-        tune(boards, values[0], values[2])
+        assert found in (RobotSettings(), NEW)
+        seen.add(found)
+        tune(boards, found.channel, found.address)
         assert boards.hello().session == boards.session
         boards.run(WRITING)
-        copy = settings_record(*values)
+        copy = copy_of(found)
         assert [boards.eeprom(at, len(copy)) for at in SETTINGS_ADDRESSES] == [copy, copy]
         boards.close()
     assert len(seen) == 2
@@ -128,8 +150,8 @@ def test_damaged_settings_lock_the_robot() -> None:
 
 def make(folder: Any, *options: str) -> tuple[str, dict[str, tuple[int, bytes]]]:
     """Build the firmware; return its id, and time and content of both programs."""
-    command = ['make', '-C', str(FIRMWARE), 'avr', f'BUILD={folder}', *options]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    done = run_make(folder, 'avr', *options)
+    done.check_returncode()
     (number,) = re.findall(r'^build ([0-9a-f]{8})$', done.stdout, re.MULTILINE)
     files = [folder / name for name in ('dongle.hex', 'robot.hex')]
     return number, {file.name: (file.stat().st_mtime_ns, file.read_bytes()) for file in files}

@@ -14,6 +14,7 @@ from support.firmware_core import (
     LATCHED,
     OK,
     SESSION,
+    UNKNOWN,
     Decoder,
     Dongle,
     Robot,
@@ -28,11 +29,11 @@ from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
 from t3mpc_ros.robot.sensor_conversions import encode_range
 from t3mpc_ros.simulation.sensors import range_sensor
 
-COMMAND = bytes.fromhex('115a0701140088133cf604030201')
-TX_WIRE = bytes.fromhex('0a012a060e115a0701140c88133cf604030201155a070398b400')
-STATE = bytes.fromhex('115a070315cd5b07e803000018fcffff7dffa40000004c00a0fe013c00145078')
+COMMAND = bytes.fromhex('215a0701140088133cf615cd5b07')
+TX_WIRE = bytes.fromhex('0a012a060e215a0701140c88133cf615cd5b07255a0703585400')
+STATE = bytes.fromhex('215a070315cd5b07e803000018fcffff7dffa40000004c00a0fe013c00145078')
 RESULT_WIRE = bytes.fromhex(
-    '05812a03130eca5b07115a070315cd5b07e803010818fcffff7dffa40101024c05a0fe013c06145078142300'
+    '05812a03130eca5b07215a070315cd5b07e803010818fcffff7dffa40101024c05a0fe013c061450787a7e00'
 )
 
 
@@ -138,7 +139,7 @@ def test_transaction_with_the_golden_result(library):
     dongle.run(1490)
     assert dongle.sent() == b''
     dongle.run(10)
-    assert dongle.sent() == b'\x15\x5a\x07\0'
+    assert dongle.sent() == b'\x25\x5a\x07\0'
     assert dongle.read() == b''
     dongle.reply(STATE, retransmits=1)
     assert dongle.read() == RESULT_WIRE
@@ -170,7 +171,7 @@ def test_golden_uplink_payloads_are_encoded(library, golden):
 
 
 def test_golden_malformed_frames_are_rejected(library, golden):
-    faults = {'version': 1, 'kind': 1, 'length': 2, 'value': 2}
+    faults = {'version': 1, 'kind': 2, 'length': 2, 'value': 2}
     for vector in golden['rejected']:
         data = bytes.fromhex(vector['bytes'])
         if vector['direction'] == 'down':
@@ -189,7 +190,7 @@ def test_golden_encodings_parameters_and_hashes(library, golden):
     robot = Robot(library)
     robot.hello()
     for row in golden['constants']['parameters']:
-        answer = robot.request(bytes([0x12, SESSION, 0, row['id']]))
+        answer = robot.request(bytes([0x22, SESSION, 0, row['id']]))
         value, low, high = struct.unpack_from('<iii', answer, 5)
         assert (answer[4], value, low, high) == (0, row['default'], row['low'], row['high'])
     room = ctypes.create_string_buffer(8)
@@ -215,7 +216,7 @@ def test_golden_session_of_a_keyed_robot(library, golden):
             or (stops and 'bad tag' in event['name'])
         )
         assert robot.counters()['bad_session'] == rejected, event['name']
-        info = robot.request(b'\x15\0\0\2')
+        info = robot.request(b'\x25\0\0\2')
         assert info[1] == event['session'], event['name']
         assert info[INFO_SIZE:].hex() == event['robot_nonce'], event['name']
 
@@ -234,7 +235,7 @@ def test_golden_emergency_stops_are_counted(library, golden):
         assert robot.counters()['bad_session'] == rejected, row['name']
         assert robot.status & LATCHED
         if row['counted']:
-            assert robot.request(b'\x15\0\0\0')[2] == data[2], row['name']
+            assert robot.request(b'\x25\0\0\0')[2] == data[2], row['name']
     assert 0 < rejected < len(stops['frames'])
 
 
@@ -247,6 +248,10 @@ def test_golden_console_frames(library, golden):
         assert c_encode_frame(library, frame).hex() == vector['wire']
         if frame[0] == 3:
             assert reply[:6] == b'\x83' + frame[1:]
+        elif frame[0] == 7:  # nothing is staged
+            assert reply[:3] == bytes([0x86, frame[1], UNKNOWN])
+        elif frame[0] == 8:
+            assert reply[:2] == bytes([0x88, frame[1]])
         else:
             assert reply[:3] == bytes([frame[0] | 0x80, frame[1], OK])
     for row in golden['key_checks']:

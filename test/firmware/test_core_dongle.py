@@ -117,7 +117,7 @@ def test_pong_reports_the_errors_of_the_line(library):
     (pong,) = dongle.frames()
     assert pong[:6] == b'\x83\x07ping'
     fields = struct.unpack('<IBBBBHHHBBB5sI', pong[6:])
-    assert fields == (5000, 1, 1, 1, 1, 1, 1, 1, 2, 0, 82, b'T3MPC', 0)
+    assert fields == (5000, 2, 2, 0, 1, 1, 1, 1, 2, 0, 82, b'T3MPC', 0)
     dongle.write(b'\x05')
     dongle.write(b'\x03\x07pin')
     dongle.write(b'\x01\x07\x00\x00')
@@ -130,7 +130,7 @@ def test_a_cycle_returns_the_state_after_its_own_command(library, robot):
     times = []
     for cycle in range(20):
         command = robot.command(2000, 2000)
-        dongle.write(tx(cycle, command, bytes([0x15, SESSION, robot.seq, 0])))
+        dongle.write(tx(cycle, command, bytes([0x25, SESSION, robot.seq, 0])))
         for _ in range(2):
             payload = dongle.sent()
             dongle.run(800)

@@ -253,7 +253,7 @@ def test_counters_wrap_at_32_bits(robot):
     robot.call('poke_steps', 0, (1 << 31) - 3)
     robot.call('poke_steps', 1, -(1 << 31) + 3)
     robot.drive(1000, -1000, 200_000)
-    state = robot.request(b'\x15\0\0\0')
+    state = robot.request(b'\x25\0\0\0')
     left, right = struct.unpack_from('<ii', state, 8)
     assert -(1 << 31) <= left < -(1 << 31) + 200
     assert (1 << 31) - 200 < right < 1 << 31

@@ -1,13 +1,13 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Fuzzers of the firmware core, and the core with a 16-bit int."""
+"""Fuzzers of the firmware core, the search over its sessions, and the core with a 16-bit int."""
 
 import re
 import shutil
 import subprocess
 
 import pytest
-from support.firmware_core import FIRMWARE
+from support.firmware_core import FIRMWARE, run_make
 
 pytestmark = pytest.mark.skipif(shutil.which('gcc') is None, reason='needs gcc')
 
@@ -15,14 +15,80 @@ pytestmark = pytest.mark.skipif(shutil.which('gcc') is None, reason='needs gcc')
 @pytest.mark.slow
 @pytest.mark.long
 def test_fuzzers_find_no_error(tmp_path):
-    """Ten million bytes and a million packets with sanitizers."""
+    """Ten million bytes and a million packets with sanitizers; all states of a session."""
     if shutil.which('make') is None:
         pytest.skip('needs make')
-    run = subprocess.run(
-        ['make', '-C', FIRMWARE, 'test', f'BUILD={tmp_path}'], capture_output=True, text=True
-    )
+    run = run_make(tmp_path, 'test')
     assert run.returncode == 0, run.stderr
     assert run.stdout.count('robot, ') == 2
+    assert run.stdout.count(' deep, all\n') == 2
+
+
+def search(folder, firmware=FIRMWARE, slots=2, depth=1000):
+    """Compile and run the search over the states of a session; return the process."""
+    program = folder / 'search'
+    sources = sorted(map(str, [*firmware.glob('core/*.c'), firmware / 'test/search_sessions.c']))
+    options = ['-std=c99', '-O2', f'-DT3_SLOTS={slots}']
+    folders = [f'-I{firmware / part}' for part in ('core', 'test')]
+    subprocess.run(['gcc', *options, *folders, '-o', program, *sources], check=True)
+    return subprocess.run([program, str(depth)], capture_output=True, text=True)
+
+
+def test_no_order_of_three_frames_breaks_a_session(tmp_path):
+    """Three made and delivered in every order, or fewer with time, resets, button and battery.
+
+    ``make test`` goes on with two frames until there is no new state.
+    """
+    run = search(tmp_path, slots=3, depth=6)
+    print(f'\n{run.stdout}')
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.count('6 deep') == 2
+
+
+ROBOT, SESSION = 't3_robot.c', 't3_session.c'
+MUTATIONS = {
+    'a sequence number counts twice': (ROBOT, '(ahead == 0 || ahead >= 0x80)', '(ahead >= 0x80)'),
+    'older numbers count': (ROBOT, '(ahead == 0 || ahead >= 0x80)', '(ahead == 0)'),
+    'the echo is not used': (ROBOT, 'ttl_us - excess_us : UINT32_MAX', 'ttl_us : ttl_us'),
+    'old echoes take nothing': (ROBOT, 'ttl_us - excess_us : UINT32_MAX', 'ttl_us : UINT32_MAX'),
+    'the TTL does not run': (ROBOT, 'robot->ttl_runs = ttl_us != 0;', ''),
+    'HELLO keeps the motion': (ROBOT, 'disable(robot); robot->expired =', 'robot->expired ='),
+    'HELLO keeps the number': (
+        ROBOT,
+        'robot->seq_known = robot->command_seen = robot->action_done = false; robot->seq = 0;',
+        'robot->command_seen = robot->action_done = false;',
+    ),
+    'ESTOP is not latched': (ROBOT, 'robot->estop = true;', ''),
+    'ESTOP does not stop': (ROBOT, 'robot->estop = true; disable(robot);', 'robot->estop = true;'),
+    'a pressed button is cleared': (ROBOT, '!robot->pressed && !button(robot)', 'true'),
+    'an empty battery drives': (ROBOT, 'robot->estop || robot->flat ||', 'robot->estop ||'),
+    'a late stop is ignored': (ROBOT, 'if (wants_to_stand(packet))', 'if (false)'),
+    'silence ends no session': (ROBOT, 't3_session_end(&robot->session); disable(robot);', ''),
+    'a session is not needed': (SESSION, 'if (!session->id || packet', 'if (packet'),
+    'any session will do': (SESSION, '|| packet->session != session->id)', ')'),
+    'a signed frame counts twice': (SESSION, 'packet->host_us == session->last_us', 'false'),
+    'older signed frames count': (SESSION, '(packet->host_us < session->last_us)', '0'),
+    'HELLO begins a session twice': (SESSION, 'if (*repeated) return', 'if (false) return'),
+    'the robot has no nonce': (SESSION, 'draw_nonce(session, port); t3', 't3'),
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize('name', MUTATIONS)
+def test_the_search_finds_each_broken_rule(tmp_path, name):
+    """Else the search would prove nothing."""
+    file, before, after = MUTATIONS[name]
+    for part in ('core', 'test'):
+        shutil.copytree(FIRMWARE / part, tmp_path / part)
+    path = tmp_path / 'core' / file
+    pattern = re.sub(r'(\\ )+', r'\\s+', re.escape(before))
+    text, count = re.subn(pattern, after, path.read_text())
+    assert count == 1
+    path.write_text(text)
+    run = search(tmp_path, tmp_path, depth=12)
+    print(f'\n{name}: {run.stderr}')
+    assert run.returncode == 1
+    assert 'not so' in run.stderr
 
 
 @pytest.mark.skipif(
@@ -31,12 +97,7 @@ def test_fuzzers_find_no_error(tmp_path):
 )
 def test_results_are_independent_of_the_int_width(tmp_path):
     """4500 packets through robot and dongle, on this machine and on a simulated ATmega2560."""
-    run = subprocess.run(
-        ['make', '-C', FIRMWARE, '-s', 'same', f'BUILD={tmp_path}'],
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
+    run = run_make(tmp_path, 'same')
     assert run.returncode == 0, run.stderr
     output = run.stdout + run.stderr  # the simulator prints the output of the board to stderr
     assert len(re.findall(r'moving, \w+ 1[0-9]{3}', output)) == 6

@@ -52,7 +52,7 @@ def test_parameters_keep_their_bounds(robot, number):
     for value in (low - 1, high + 1, -(1 << 31), (1 << 31) - 1):
         assert robot.set(number, value) == (RANGE, high)
     assert robot.get(number) == (OK, high)
-    reply = robot.request(bytes([0x12, SESSION, 44, number]))
+    reply = robot.request(bytes([0x22, SESSION, 44, number]))
     assert reply[2] == 44
     assert struct.unpack_from('<ii', reply, 9) == (low, high)
 
@@ -83,12 +83,12 @@ def test_boot_restores_the_parameter_defaults(robot):
 
 def test_odometry_is_reset_only_at_rest(robot):
     robot.drive(1000, 1000, 500_000)
-    assert robot.act(1, seq=1) == bytes([0x14, SESSION, 1, 1, BUSY])
+    assert robot.act(1, seq=1) == bytes([0x24, SESSION, 1, 1, BUSY])
     robot.drive(0, 0, 300_000)
     assert min(robot.steps) > 100
-    assert robot.act(1, seq=2) == bytes([0x14, SESSION, 2, 1, OK])
+    assert robot.act(1, seq=2) == bytes([0x24, SESSION, 2, 1, OK])
     assert robot.steps == (0, 0)
-    assert robot.act(3, seq=3) == bytes([0x14, SESSION, 3, 3, UNKNOWN])
+    assert robot.act(3, seq=3) == bytes([0x24, SESSION, 3, 3, UNKNOWN])
 
 
 def test_a_repeated_action_is_acknowledged_but_runs_once(robot):
@@ -112,17 +112,17 @@ def test_counters_are_cleared_by_the_action(robot):
 
 def test_reply_to_each_kind_of_packet(robot):
     kinds = {
-        'CMD': (robot.command(), 0x11),
-        'PARAM_GET': (bytes([0x12, SESSION, 1, 0]), 0x12),
-        'PARAM_SET': (struct.pack('<BBBBi', 0x13, SESSION, 1, 0, 1), 0x12),
-        'POLL state': (b'\x15\0\1\0', 0x11),
-        'POLL aux': (b'\x15\0\1\1', 0x15),
-        'POLL info': (b'\x15\0\1\2', 0x13),
-        'ACTION': (struct.pack('<BBBBH', 0x16, SESSION, 1, 2, 0), 0x14),
-        'HELLO': (struct.pack('<BBBBI', 0x14, SESSION, 1, 0, robot.host_us), 0x13),
-        'other session': (bytes([0x12, 3, 1, 0]), 0x11),
-        'other version': (b'\x25\0\1\1', 0x11),
-        'nothing': (b'', 0x11),
+        'CMD': (robot.command(), 0x21),
+        'PARAM_GET': (bytes([0x22, SESSION, 1, 0]), 0x22),
+        'PARAM_SET': (struct.pack('<BBBBi', 0x23, SESSION, 1, 0, 1), 0x22),
+        'POLL state': (b'\x25\0\1\0', 0x21),
+        'POLL aux': (b'\x25\0\1\1', 0x25),
+        'POLL info': (b'\x25\0\1\2', 0x23),
+        'ACTION': (struct.pack('<BBBBH', 0x26, SESSION, 1, 2, 0), 0x24),
+        'HELLO': (bytes([0x24, SESSION, 1, 0]), 0x23),
+        'other session': (bytes([0x22, 3, 1, 0]), 0x21),
+        'other version': (b'\x35\0\1\1', 0x21),
+        'nothing': (b'', 0x21),
     }
     for name, (data, head) in kinds.items():
         reply = robot.request(data)
@@ -150,14 +150,14 @@ def test_a_reply_is_loaded_after_the_acknowledgement_is_sent(robot):
 
 
 def test_the_age_is_none_when_it_does_not_fit(robot):
-    assert robot.request(b'\x15\0\0\0')[22:24] == b'\xff\xff'
+    assert robot.request(b'\x25\0\0\0')[22:24] == b'\xff\xff'
     robot.send(robot.command())
     robot.run(600_000)
-    assert struct.unpack_from('<H', robot.request(b'\x15\0\0\0'), 22)[0] == pytest.approx(
+    assert struct.unpack_from('<H', robot.request(b'\x25\0\0\0'), 22)[0] == pytest.approx(
         60_080, abs=40
     )
     robot.run(60_000)
-    assert robot.request(b'\x15\0\0\0')[22:24] == b'\xff\xff'
+    assert robot.request(b'\x25\0\0\0')[22:24] == b'\xff\xff'
 
 
 def test_state_contains_the_sensor_readings(robot):
@@ -166,7 +166,7 @@ def test_state_contains_the_sensor_readings(robot):
     for channel, count in enumerate((0xFFFF, 0xFFFE, 300, 150, 600, 60, 0, 1023)):
         robot.call('set_adc', channel, ctypes.c_uint16(count))
     robot.run(10_000)  # one channel per millisecond
-    state = robot.request(b'\x15\0\0\0')
+    state = robot.request(b'\x25\0\0\0')
     assert struct.unpack_from('<hhh', state, 16) == (-131, 164, -5)
     parameters = range_sensor.SimulatedRangeSensorParameters()
     middle = [
@@ -176,13 +176,13 @@ def test_state_contains_the_sensor_readings(robot):
     assert list(state[24:]) == [0, 255, *middle, 1, 254, 254, 255]
     robot.call('set_adc', 8, ctypes.c_uint16(522))
     robot.run(100_000)  # the first measurement
-    aux = robot.request(b'\x15\0\0\1')
+    aux = robot.request(b'\x25\0\0\1')
     assert struct.unpack_from('<Hhhhh', aux, 4) == (10_195, -4000, 8192, -12, 13)
     assert robot.status & LOW_BATTERY
     assert robot.set(BATTERY_LOW, 10_000)[0] == OK
     assert not robot.status & LOW_BATTERY
     robot.call('set_imu', ctypes.c_bool(False), seven)
-    state = robot.request(b'\x15\0\0\0')
+    state = robot.request(b'\x25\0\0\0')
     assert state[3] & IMU_FAULT
     assert state[16:22] == bytes(6)
 
@@ -193,22 +193,22 @@ def test_an_oversized_payload_is_ignored(robot):
         robot.send((robot.command(5000, 5000, ESTOP) + bytes(300))[:size])
     robot.run(20_000)
     assert robot.status == 0
-    assert robot.counters()['short'] == 223
+    assert robot.counters()['malformed'] == 223
 
 
 def test_malformed_packets_are_ignored_and_counted_by_kind(robot):
     good = robot.command(5000, 5000)
     for size in range(32):
-        if size not in (14, 22):
+        if size not in (14, 26):
             robot.send((good + bytes(32))[:size])
-    for version in (0, 2, 15):
+    for version in (0, 1, 3, 15):
         robot.send(bytes([version << 4 | 1]) + good[1:])
     for kind in (0, *range(7, 16)):
-        robot.send(bytes([0x10 | kind]) + good[1:])
+        robot.send(bytes([0x20 | kind]) + good[1:])
     robot.send(good[:3] + b'\x09' + good[4:])
     robot.send(good[:5] + b'\x01' + good[6:])
     counters = robot.counters()
-    assert counters['short'] == 30 + 2
-    assert counters['bad_version'] == 13
+    assert counters['malformed'] == 30 + 10 + 2
+    assert counters['bad_version'] == 4
     robot.run(20_000)
     assert robot.status == 0

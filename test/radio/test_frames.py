@@ -44,8 +44,20 @@ WAYS = {
     decode_uplink: (frames.State, frames.Param, frames.Info, frames.Ack, frames.Aux),
     decode_to_dongle: (frames.Transmit, frames.Configure, frames.Ping),
     decode_from_dongle: (frames.Result, frames.Configured, frames.Pong, frames.Refusal),
-    decode_to_board: (frames.Ping, frames.Key, frames.Settings),
-    decode_from_board: (frames.Pong, frames.KeyState, frames.SettingsState, frames.Refusal),
+    decode_to_board: (
+        frames.Ping,
+        frames.Key,
+        frames.Record,
+        frames.Store,
+        frames.Sense,
+    ),
+    decode_from_board: (
+        frames.Pong,
+        frames.KeyState,
+        frames.RecordPart,
+        frames.Samples,
+        frames.Refusal,
+    ),
 }
 KINDS = [(kind, decode) for decode, kinds in WAYS.items() for kind in kinds]
 
@@ -57,7 +69,7 @@ SHORTER = {
     frames.Info: 24,
     frames.Configure: 2,
     frames.Key: 2,
-    frames.Settings: 2,
+    frames.Record: 4,
 }
 
 
@@ -101,20 +113,20 @@ def some(kind, source, extreme=None):
 
 
 def test_frames_of_the_specification_byte_for_byte():
-    command = frames.Command(0x5A, 7, frames.CommandFlag.ENABLE, 20, 5000, -2500, 0x01020304)
+    command = frames.Command(0x5A, 7, frames.CommandFlag.ENABLE, 20, 5000, -2500, 123456789)
     data = encode(command)
-    assert data == bytes.fromhex('115a0701140088133cf604030201')
+    assert data == bytes.fromhex('215a0701140088133cf615cd5b07')
     sent = encode(frames.Transmit(0x2A, 6, data, encode(frames.Poll(0x5A, 7, frames.STATE))))
-    assert encode_frame(sent).hex() == '0a012a060e115a0701140c88133cf604030201155a070398b400'
+    assert encode_frame(sent).hex() == '0a012a060e215a0701140c88133cf615cd5b07255a0703585400'
     state = frames.State(
         0x5A, 7, 3, 123456789, 1000, -1000, -131, 164, 0, 76, bytes.fromhex('a0fe013c00145078')
     )
     assert encode(state).hex() == (
-        '115a070315cd5b07e803000018fcffff7dffa40000004c00a0fe013c00145078'
+        '215a070315cd5b07e803000018fcffff7dffa40000004c00a0fe013c00145078'
     )
     result = frames.Result(0x2A, 0x03, 0x13, 0x075BCA00, encode(state))
     assert encode_frame(encode(result)).hex() == (
-        '05812a03130eca5b07115a070315cd5b07e803010818fcffff7dffa40101024c05a0fe013c06145078142300'
+        '05812a03130eca5b07215a070315cd5b07e803010818fcffff7dffa40101024c05a0fe013c061450787a7e00'
     )
     assert codec.decode_exchange_status(0x13) == (True, True, False, False, 1)
 
@@ -198,7 +210,7 @@ def test_truncated_and_extended_frames_are_rejected(kind, decode):
             with pytest.raises(FrameError) as error:
                 decode(data[:size])
             # The flag of a HELLO shows whether it is signed.
-            flagged = kind is frames.Hello and size == 8
+            flagged = kind is frames.Hello and size == 4
             assert error.value.kind is (FrameErrorKind.VALUE if flagged else FrameErrorKind.LENGTH)
         if kind not in (frames.Transmit, frames.Result):
             with pytest.raises(FrameError):
@@ -247,7 +259,7 @@ def test_payloads_longer_than_32_bytes_are_rejected():
     """A payload width above 32 bytes is a known buffer overrun of the radio chip."""
     for size in range(33, 256):
         for decode in (decode_downlink, decode_uplink):
-            for head in (b'\x11', b'\x13', b'\x14'):
+            for head in (b'\x21', b'\x23', b'\x24'):
                 with pytest.raises(FrameError, match='1 to 32 bytes'):
                     decode(head + bytes(size - 1))
 
@@ -257,14 +269,14 @@ def test_wrong_version_and_wrong_kind_are_distinguished():
         for decode in (decode_downlink, decode_uplink):
             with pytest.raises(FrameError) as error:
                 decode(bytes([head, 0, 0]))
-            assert (error.value.kind is FrameErrorKind.VERSION) == (head >> 4 != 1)
+            assert (error.value.kind is FrameErrorKind.VERSION) == (head >> 4 != frames.VERSION)
 
 
 def test_a_field_of_signed_frames_is_not_dropped_silently():
     with pytest.raises(FrameError, match=r'PARAM_SET.host_us must be 0 without tag: got 5'):
         encode(frames.ParamSet(1, 2, 3, 4, host_us=5))
     with pytest.raises(FrameError, match=r'HELLO.nonce must be b.. without tag'):
-        encode(frames.Hello(1, 2, 3, nonce=bytes(8)))
+        encode(frames.Hello(1, 2, nonce=bytes(8)))
 
 
 def test_an_inconsistent_result_is_rejected():

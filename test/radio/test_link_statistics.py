@@ -30,7 +30,7 @@ def test_losses_and_round_trips_of_the_last_ten_seconds():
     trips = [0.001 * (1 + at % 100) for at in range(1000)]
     statistics = after(*[None] * 700, *trips)
     quality = statistics.quality(0.0, NOTHING)
-    assert (quality.cycles, quality.lost, quality.lost_in_a_row) == (1700, 700, 0)
+    assert (quality.cycles, quality.lost) == (1700, 700)
     assert quality.lost_share == 0.0
     assert abs(quality.round_trip_median - 0.050) < 0.002
     assert abs(quality.round_trip_p99 - 0.099) < 0.0015
@@ -42,7 +42,6 @@ def test_more_than_one_loss_in_twenty_is_a_warning():
     worse = after(*cycle * 10, None).quality(0.0, NOTHING)
     assert worse.level is DiagnosticLevel.WARN
     assert worse.text == '5.5 % of the cycles are lost'
-    assert worse.lost_in_a_row == 2
 
 
 def test_a_few_cycles_are_not_judged():

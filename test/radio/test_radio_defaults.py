@@ -7,10 +7,7 @@ import re
 
 import yaml
 
-from t3mpc_ros.emulator.board import console
-from t3mpc_ros.emulator.board.robot_board import SETTLE_SLOW_US, SETTLE_US
-from t3mpc_ros.emulator.emulator import EmulatorParameters
-from t3mpc_ros.emulator.link import dongle
+from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters
 from t3mpc_ros.emulator.link.radio_channel import RadioParameters
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 
@@ -28,7 +25,8 @@ def defined(header, name):
 def test_firmware_and_host_have_equal_radio_defaults():
     channel, rate = (int(defined('t3_port.h', f'T3_RADIO_{name}')) for name in ('CHANNEL', 'RATE'))
     delays = re.fullmatch(
-        r'\(T3_RADIO_RATE == 0 \? (\d+) : (\d+)\)', defined('t3_port.h', 'T3_RETRY_DELAY')
+        r'\(\(rate\) == 0 \? (\d+)u : (\d+)u\)',
+        defined('t3_port.h', r'T3_RETRY_DELAY_AT\(rate\)'),
     )
     slow, usual = map(int, delays.groups())
     assert (slow, usual) == tuple(
@@ -46,6 +44,7 @@ def test_firmware_and_host_have_equal_radio_defaults():
 
 def test_emulator_and_host_have_equal_radio_defaults():
     assert tuple(RadioParameters()) == HOST[1:]
+    assert Emulator(EmulatorParameters()).dongle.radio == RadioParameters()
     parameters = EmulatorParameters()
     assert (parameters.channel, parameters.rate) == (
         LinkParameters().channel,
@@ -71,13 +70,3 @@ def test_no_configuration_changes_one_end_alone():
             for name, value in link.items():
                 if name in ('channel', 'rate', 'address'):
                     assert value == getattr(LinkParameters(), name), path.name
-
-
-def test_emulated_boards_report_the_firmware_version():
-    number = [
-        int(defined('t3_protocol.h', f'T3_FIRMWARE_{name}')[:-1]) for name in ('MAJOR', 'MINOR')
-    ]
-    assert number == [console.FIRMWARE_MAJOR, console.FIRMWARE_MINOR]
-    assert number == [dongle.FIRMWARE_MAJOR, dongle.FIRMWARE_MINOR]
-    for name, value in (('T3_SETTLE_US', SETTLE_US), ('T3_SETTLE_SLOW_US', SETTLE_SLOW_US)):
-        assert int(defined('t3_robot.h', name)[:-1]) == value

@@ -88,7 +88,7 @@ def test_a_state_in_answer_to_hello_leads_to_info(key):
 
     def plain(data, now_ns):
         take(data, now_ns)
-        if data[0] == 0x14:
+        if data[0] == 0x24:
             bench.robot.answer = None
 
     bench.robot.receive = plain
@@ -297,7 +297,7 @@ def test_a_state_is_converted_to_si_units():
     assert bench.link.battery.voltage == 11.1
     assert math.isnan(bench.link.battery.charge)
     assert bench.link.quality(bench.now_ns).robot.bad_session == 3
-    assert bench.link.quality(bench.now_ns).dongle.protocol == 1
+    assert bench.link.quality(bench.now_ns).dongle.protocol == frames.VERSION
 
 
 def test_a_state_not_newer_than_the_last_is_dropped():
@@ -603,7 +603,7 @@ def test_another_host_on_the_robot_is_detected():
     bench.connect()
     ours = bench.robot.verifier.session
     theirs = ours % 255 + 1
-    bench.robot.receive(bytes([0x14, theirs, 0, 0, 0, 0, 0, 0]), bench.now_ns)
+    bench.robot.receive(bytes([0x24, theirs, 0, 0]), bench.now_ns)
     bench.run(0.05, lambda: not running(bench))
     assert bench.link.reason(bench.now_ns) == 'the robot has lost its session'
     bench.run(1.0, lambda: running(bench))
@@ -626,10 +626,21 @@ def test_a_session_with_a_replayed_hello_is_replaced():
     assert bench.run(3.0, lambda: moving(bench)) < 0.4
 
 
+def test_a_shutdown_after_a_pause_disables_the_drives(bench):
+    """The first command after the pause has an old echo: its refusal once ended the shutdown."""
+    bench.link.shut_down()
+    bench.run(0.05)
+    bench.now_ns += 600 * MS
+    bench.robot.run_to(bench.now_ns)
+    assert bench.robot.enabled
+    bench.run(1.0, lambda: bench.link.state is LinkState.DONE)
+    assert not bench.robot.enabled
+
+
 def test_rejected_commands_are_reported_and_end_the_session(bench):
     bench.robot.rejects_commands = True
     assert bench.run(2.0, lambda: not running(bench)) == pytest.approx(0.5, abs=0.1)
-    assert bench.link.reason(bench.now_ns) == reasons.COMMANDS_REJECTED
+    assert 'overtaken by newer' in bench.link.reason(bench.now_ns)
     bench.robot.rejects_commands = False
     assert bench.run(2.0, lambda: moving(bench)) < 0.4
 
@@ -663,8 +674,8 @@ def test_unplugged_and_plugged_in_again(bench):
         bench.unplug()
         closes = bench.closes
         opened = len(bench.opens)
-        bench.run(0.01)
-        # Immediately: while the dead device is open, it reappears under another name.
+        bench.run(0.02)
+        # With the next cycle: while the dead device is open, it reappears under another name.
         assert bench.closes == closes + 1
         bench.problem = ('dongle is not there', True)
         bench.run(away)
@@ -748,30 +759,14 @@ def test_only_commands_without_retransmission_time_the_clock(tries):
 # -- requests, shutdown, timing -------------------------------------------------------------------
 
 
-def test_an_action_is_repeated_until_answered(bench):
-    bench.link.request_action(frames.RESET_ODOMETRY)
-    assert bench.link.action_result(frames.RESET_ODOMETRY) is None
-    bench.run(0.2)
-    assert bench.link.action_result(frames.RESET_ODOMETRY) == 'refused while the robot moves'
-    bench.release_controls()
-    bench.run(0.5)
-    bench.dongle.loss = 0.5
-    bench.link.request_action(frames.RESET_ODOMETRY)
-    bench.run(2.0)
-    assert bench.link.action_result(frames.RESET_ODOMETRY) == ''
-    assert bench.robot.steps == [0.0, 0.0]
-
-
 def test_requests_are_sent_at_a_hundred_cycles_per_second():
     """Regression: requests starved, because a 10 ms period has no idle time."""
     bench = LinkBench(LinkParameters(cycle_rate=100.0))
     bench.connect()
     bench.drive(0.0, 0.0)
     bench.run(0.5)
-    bench.link.request_action(frames.CLEAR_COUNTERS)
     since = bench.now_ns
     bench.run(3.0)
-    assert bench.link.action_result(frames.CLEAR_COUNTERS) == ''
     quality = bench.link.quality(bench.now_ns)
     assert quality.robot is not None
     assert bench.now_ns / 1e3 - quality.dongle.time_us < 1.2e6
@@ -882,18 +877,16 @@ def test_session_numbers_are_random_and_never_repeated():
 def test_stamps_increase_strictly_with_a_stopped_clock():
     session = Session(KEY, random.Random(1).randbytes, 0, 5_000_000)
     stamps = [session.hello(5_000_000).host_us]
+    info = FakeRobot(KEY).info(0, 0)._replace(session=session.number)
+    assert session.accept(info) == ''
     for now_ns in (5_000_000, 5_000_000, 4_000_000, 5_000_400, 9_000_000):
         stamps.append(session.command(0, 0, 0, 0, now_ns).host_us)
     assert stamps == [5001, 5002, 5003, 5004, 5005, 9000]
 
 
-@pytest.mark.parametrize('key', [b'', KEY])
-def test_each_hello_has_a_new_stamp_and_the_same_nonce(key):
-    """Regression: a HELLO with a constant stamp gave the robot a clock 30 s behind after 30 s.
-
-    A first command with a delay of 2 s then counted as prompt.
-    """
-    bench = LinkBench(key=key)
+def test_each_signed_hello_has_a_new_stamp_and_the_same_nonce():
+    """The robot recognises a repetition by its nonce."""
+    bench = LinkBench(key=KEY)
     bench.dongle.loss = 1.0
     bench.run(5.0)
     sent = [(at, frame) for at, frame in bench.dongle.requests if isinstance(frame, frames.Hello)]
@@ -921,7 +914,6 @@ def test_requests_and_commands_are_numbered_separately():
     before = session.command(0, 0, 0, 0, 1000).seq
     numbers = {session.get(0).seq for _ in range(200)} | {session.set(0, 1, 2000).seq}
     assert len(numbers) == 201
-    assert session.action(1, 3000).seq == 202
     assert session.command(0, 0, 0, 0, 4000).seq == before + 1
 
 

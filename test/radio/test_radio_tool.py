@@ -16,6 +16,7 @@ from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import KeyFileError, key_check, read_key
 from t3mpc_ros.radio.protocol.codec import decode_from_dongle, encode
 from t3mpc_ros.radio.protocol.frames import Command, CommandFlag, Hello, StatusFlag
+from t3mpc_ros.radio.protocol.framing import FrameDecoder
 from t3mpc_ros.radio.tool import (
     channel_scan,
     jog,
@@ -24,10 +25,13 @@ from t3mpc_ros.radio.tool import (
     robot_info,
     robot_settings,
 )
-from t3mpc_ros.radio.tool.procedure import Procedure, ProcedureError
+from t3mpc_ros.radio.tool.procedure import ROBOT_BOARD, Procedure, ProcedureError
+from t3mpc_ros.radio.tool.robot_records import POWERS, RATES, SENSORS, RobotSettings
 
 KEY, OTHER = bytes(range(16)), bytes(range(1, 17))
 TURN = 3200
+KEY_ADDRESS = 8
+"""Of the key in the EEPROM."""
 
 
 # -- key ------------------------------------------------------------------------------------------
@@ -59,13 +63,13 @@ def test_a_key_is_written_over_usb_and_compared():
     assert f'{key_check(KEY):08x}' in key_provisioning.format_key_state(state)
     assert key_provisioning.holds_key(state, KEY)
     assert not key_provisioning.holds_key(state, OTHER)
-    assert bench.board.key_store.create_verifier().key == KEY
+    assert bench.board.read_eeprom(KEY_ADDRESS, 16) == KEY
     assert key_provisioning.holds_key(bench.at_robot(key_provisioning.write_key(OTHER)), OTHER)
     assert key_provisioning.holds_key(
         bench.at_robot(key_provisioning.write_key(key_provisioning.ERASE_KEY)),
         key_provisioning.ERASE_KEY,
     )
-    assert not bench.board.key_store.create_verifier().key
+    assert bench.board.read_eeprom(KEY_ADDRESS, 16) == b'\xff' * 16
 
 
 def test_a_board_reset_by_opening_its_port_has_time_to_start():
@@ -77,7 +81,7 @@ def test_a_board_reset_by_opening_its_port_has_time_to_start():
 
 def test_a_damaged_key_is_reported_and_replaced():
     bench = ToolBench(KEY)
-    bench.board.key_store._cells[3] ^= 1
+    bench.board.write_eeprom(KEY_ADDRESS + 3, bytes([KEY[3] ^ 1]))
     bench.emulator.restart_robot()
     assert 'damaged' in key_provisioning.format_key_state(
         bench.at_robot(key_provisioning.read_key_state())
@@ -88,10 +92,15 @@ def test_a_damaged_key_is_reported_and_replaced():
 def test_a_key_is_never_sent_to_the_dongle():
     bench = ToolBench()
     received = []
-    take = bench.emulator.dongle._process
-    bench.emulator.dongle._process = lambda data: (received.append(data), take(data))
+    feed = bench.emulator.feed
+
+    def record(data, now_ns):
+        received.extend(FrameDecoder().feed(data))
+        feed(data, now_ns)
+
+    bench.emulator.feed = record
     with pytest.raises(ProcedureError, match='this is the dongle'):
-        bench.at_dongle(key_provisioning.write_key(KEY))
+        bench.at_dongle(key_provisioning.write_key(KEY), ROBOT_BOARD)
     assert received
     assert not any(KEY in data for data in received)
 
@@ -99,9 +108,11 @@ def test_a_key_is_never_sent_to_the_dongle():
 def test_a_moving_robot_rejects_a_key_with_a_remedy():
     bench = ToolBench()
     bench.each = lambda bench: bench.board.receive(
-        bytes([0x14, 9, 0, 0]) + bytes(4)
+        bytes([0x24, 9, 0, 0])
         if bench.board.session != 9
-        else bytes([0x11, 9, bench.now_ns // 1000 & 0x7F, CommandFlag.ENABLE, 20]) + bytes(9)
+        else bytes([0x21, 9, bench.now_ns // 1000 & 0x7F, CommandFlag.ENABLE, 20])
+        + bytes(5)
+        + bench.board.now_us.to_bytes(4, 'little')
     )
     bench.emulator.run_to(START_NS + 1_000_000)
     bench.each(bench)
@@ -122,15 +133,19 @@ def test_a_silent_port_fails_with_a_remedy():
 
 
 def write(bench, seed=1, **changes):
-    script = robot_settings.write_settings(
-        robot_settings.Changes(**changes), random.Random(seed).randbytes
-    )
-    return bench.at_robot(script)
+    stored = bench.at_robot(robot_settings.read_settings())
+    entropy = random.Random(seed).randbytes
+    wanted = robot_settings.change_settings(stored, changes, entropy)
+    written = bench.at_robot(robot_settings.write_settings(wanted))
+    assert written == (frames.SETTINGS_GOOD, wanted)
+    return wanted
 
 
 def host_of(settings):
     """Return link parameters from the parameter file of a robot."""
     content = yaml.safe_load(robot_settings.parameter_file(settings))
+    # A node rejects what it does not know: settings of the board once ended radio_bridge.
+    assert set(content['/**']['ros__parameters']) == {'link'}
     return LinkParameters.from_dict(content['/**']['ros__parameters']['link'])
 
 
@@ -140,11 +155,11 @@ def test_a_new_robot_gets_a_random_address_and_keeps_it():
         bench = ToolBench(erased=True)
         assert bench.at_robot(robot_settings.read_settings()).state == frames.SETTINGS_MISSING
         settings = write(bench, seed)
-        assert settings[1:5] == (frames.OK, frames.SETTINGS_GOOD, 82, 16)
+        assert settings[1:] == RobotSettings()[1:]
         addresses.add(settings.address)
         changed = write(bench, seed + 100, channel=100, microsteps=8)
-        assert changed[3:] == (100, 8, settings.address)
-        assert bench.at_robot(robot_settings.read_settings())[2:] == changed[2:]
+        assert changed == settings._replace(channel=100, microsteps=8)
+        assert bench.at_robot(robot_settings.read_settings()).settings == changed
     assert len(addresses) == 20
 
 
@@ -162,26 +177,70 @@ def test_settings_survive_a_restart_of_the_robot():
     bench = ToolBench(erased=True)
     settings = write(bench)
     bench.emulator.restart_robot()
-    assert bench.at_robot(robot_settings.read_settings())[2:] == settings[2:]
+    assert bench.at_robot(robot_settings.read_settings()).settings == settings
 
 
 def test_settings_are_never_sent_to_the_dongle():
+    """The answer that identifies a dongle was dropped: it was taken for an old robot board."""
     bench = ToolBench()
-    entropy = random.Random(1).randbytes
-    writing = robot_settings.write_settings(robot_settings.Changes(), entropy)
+    writing = robot_settings.write_settings(RobotSettings())
     for script in (robot_settings.read_settings(), writing):
         with pytest.raises(ProcedureError, match='this is the dongle'):
-            bench.at_dongle(script)
+            bench.at_dongle(script, ROBOT_BOARD)
 
 
 def test_impossible_or_untimely_settings_have_a_remedy():
     bench = ToolBench()
-    with pytest.raises(ProcedureError, match='power of two'):
+    with pytest.raises(ValueError, match='power of two'):
         write(bench, microsteps=3)
-    bench.board.receive(encode(Hello(7, 0, 0)))
-    bench.board.receive(encode(Command(7, 1, CommandFlag.ENABLE, 20, 0, 0, 0)))
+    bench.board.receive(encode(Hello(7, 0)))
+    now_us = bench.board.now_us
+    bench.board.receive(encode(Command(7, 1, CommandFlag.ENABLE, 20, 0, 0, now_us)))
     with pytest.raises(ProcedureError, match='stop the bridge'):
         write(bench)
+
+
+def test_a_settings_file_holds_every_setting():
+    source = random.Random(4)
+    for _ in range(50):
+        settings = RobotSettings(
+            robot_settings.draw_address(source.randbytes),
+            source.randint(0, 125),
+            source.choice(RATES),
+            source.choice(POWERS),
+            1 << source.randint(0, 8),
+            source.randint(20, 10_000),
+            source.random() < 0.5,
+            source.random() < 0.5,
+            source.randint(1000, 13_000) / 1000,
+            tuple(source.choices(SENSORS, k=8)),
+        )
+        text = robot_settings.parameter_file(settings)
+        assert robot_settings.settings_of_file(yaml.safe_load(text)) == settings
+        assert host_of(settings).rate == settings.rate
+        other = settings._replace(divider=settings.divider + 1, channel=settings.channel + 1)
+        rows = robot_settings.differences(settings, other)
+        assert [row.name for row in rows] == ['channel', 'divider']
+
+
+@pytest.mark.parametrize(
+    'old, new, words',
+    [
+        ('channel: 82', 'channel: 126', 'channel must be from 0 to 125: got 126'),
+        ('channel: 82', 'channel: high', 'channel must be of type int'),
+        ('microsteps: 16', 'microsteps: true', 'microsteps must be of type int'),
+        ('microsteps: 16', '', 'lacks the settings: microsteps'),
+        ('microsteps: 16', 'microstep: 16', 'unknown settings: microstep'),
+        ("'GP2Y0A21', ", '', 'sensors must be 8'),
+        ('/**', 'robot', 'must be a file of t3mpc robot setup --save'),
+        ('link:', 'other:', 'must be a file of t3mpc robot setup --save'),
+    ],
+)
+def test_a_wrong_settings_file_is_rejected_by_name(old, new, words):
+    text = robot_settings.parameter_file(RobotSettings(bytes.fromhex('c25a33a6e1')))
+    assert old in text
+    with pytest.raises(robot_settings.SettingsFileError, match=words):
+        robot_settings.settings_of_file(yaml.safe_load(text.replace(old, new, 1)))
 
 
 def test_each_of_two_robots_follows_its_own_host_only():

@@ -228,7 +228,7 @@ def test_each_cause_is_reported_with_its_reason(name):
 class UnusualRobot(FakeRobot):
     """Reports configurable status bits and information."""
 
-    add, drop, protocol, accepts = StatusFlag(0), StatusFlag(0), 1, True
+    add, drop, protocol, accepts = StatusFlag(0), StatusFlag(0), frames.VERSION, True
 
     def status(self):
         return (super().status() | self.add) & ~self.drop
@@ -243,8 +243,8 @@ class UnusualRobot(FakeRobot):
     [
         ({'add': StatusFlag.TTL_EXPIRED}, reasons.TTL_EXPIRED),
         ({'drop': StatusFlag.ENABLED}, reasons.DRIVES_DISABLED),
-        ({'protocol': 2}, 'the robot must speak protocol 1: it speaks 2'),
-        ({'accepts': False}, reasons.HELLO_REJECTED),
+        ({'protocol': 3}, reasons.robot_version(3)),
+        ({'accepts': False}, reasons.refused('HELLO', 0)),
         ({'settings': frames.SETTINGS_DAMAGED, 'accepts': False}, reasons.SETTINGS_DAMAGED),
     ],
 )
@@ -258,6 +258,20 @@ def test_an_unusual_robot_is_reported(odd, reason):
     assert bench.link.reason(bench.now_ns) == reason
 
 
+def test_a_robot_of_version_1_is_reported():
+    """It answers everything of another version with its STATE."""
+    bench = LinkBench()
+    transact = bench.dongle.transact
+
+    def older(frame, now_ns):
+        at, answer = transact(frame, now_ns)
+        return at, answer._replace(payload=b'\x11' + bytes(31)) if answer.payload else answer
+
+    bench.dongle.transact = older
+    bench.run(1.0)
+    assert bench.link.reason(bench.now_ns) == reasons.robot_version(1)
+
+
 def test_a_dongle_with_another_protocol_is_reported():
     bench = LinkBench()
     reply = bench.dongle.reply
@@ -268,4 +282,4 @@ def test_a_dongle_with_another_protocol_is_reported():
 
     bench.dongle.reply = newer
     bench.run(1.0)
-    assert bench.link.reason(bench.now_ns) == 'the dongle must speak protocol 1: it speaks 3'
+    assert bench.link.reason(bench.now_ns) == 'the dongle must speak protocol 2: it speaks 3'

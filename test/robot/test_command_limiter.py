@@ -48,7 +48,7 @@ def test_command_within_limits_passes_unchanged_without_delay():
 
 def test_twist_and_wheel_speed_commands_are_equivalent():
     limiter = make_fast_limiter()
-    assert limiter.accept_twist(BodyTwist(0.2, 1.0), 0) == ''
+    assert limiter.accept(RobotCommand.from_twist(BodyTwist(0.2, 1.0), GEOMETRY, 0), 0) == ''
     twist = twist_from_wheels(limiter.advance(0, 0.01).wheels, GEOMETRY)
     assert twist == pytest.approx((0.2, 1.0))
 
@@ -65,7 +65,7 @@ def test_limits_scale_both_wheels_and_keep_curvature():
         )
         limiter = CommandLimiter(limits, GEOMETRY)
         wanted = BodyTwist(*(generator.uniform(-1.0, 1.0, 2) * 10.0 ** generator.uniform(-2, 6)))
-        limiter.accept_twist(wanted, 0)
+        limiter.accept(RobotCommand.from_twist(wanted, GEOMETRY, 0), 0)
         limited_command = limiter.advance(0, 1e4)
         twist = twist_from_wheels(limited_command.wheels, GEOMETRY)
         factor = twist.linear / wanted.linear
@@ -90,7 +90,9 @@ def test_non_finite_command_is_rejected_and_stops_the_robot(bad):
         limited_command = limiter.advance(0, 0.01)
         assert limited_command.target == (0.0, 0.0)
         assert 'not finite' in limited_command.reason
-    assert 'not finite' in limiter.accept_twist(BodyTwist(0.1, bad), 0)
+    assert 'not finite' in limiter.accept(
+        RobotCommand.from_twist(BodyTwist(0.1, bad), GEOMETRY, 0), 0
+    )
     assert limiter.accept(command(5.0, 5.0), 0) == ''
     assert limiter.advance(0, 0.01).reason == ''
 
@@ -98,7 +100,9 @@ def test_non_finite_command_is_rejected_and_stops_the_robot(bad):
 def test_overflowing_command_is_rejected_as_non_finite():
     limiter = make_fast_limiter()
     assert 'not finite' in limiter.accept(command(1.7e308, 1.7e308), 0)
-    assert 'not finite' in limiter.accept_twist(BodyTwist(1.7e308, 0.0), 0)
+    assert 'not finite' in limiter.accept(
+        RobotCommand.from_twist(BodyTwist(1.7e308, 0.0), GEOMETRY, 0), 0
+    )
     assert limiter.advance(0, 0.01).wheels == (0.0, 0.0)
 
 

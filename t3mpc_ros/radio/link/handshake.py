@@ -25,7 +25,6 @@ from t3mpc_ros.radio.protocol.authentication import (
 from t3mpc_ros.radio.protocol.frames import (
     BOARD_PARAMETERS,
     VERSION,
-    Action,
     Command,
     Downlink,
     Hello,
@@ -79,6 +78,8 @@ class Session:
         # Constant over all attempts, so that the robot recognises a repeated HELLO.
         self._nonce = entropy(NONCE_SIZE) if key else b''
         self._hello_us = self._last_us & _WORD
+        self.echo_us: int | None = None
+        """Robot time of the newest STATE; None before the first: the robot refuses every CMD."""
 
     @property
     def number(self) -> int:
@@ -86,65 +87,58 @@ class Session:
         return self._number
 
     def hello(self, now_ns: int) -> Hello:
-        """Return the HELLO of this session with the current time stamp.
-
-        The robot derives the age of commands from it: with the stamp of an earlier attempt, a
-        command of that age would count as prompt.
-        """
-        self._hello_us = host_us = self._stamp(now_ns)
+        """Return the HELLO of this session."""
         if not self._key:
-            return Hello(self._number, 0, host_us)
-        return sign_hello(self._key, self._number, 0, host_us, self._nonce)
+            return Hello(self._number, 0)
+        self._hello_us = self._stamp(now_ns)
+        return sign_hello(self._key, self._number, 0, self._hello_us, self._nonce)
 
     def accept(self, info: Info) -> str:
         """Start the session with the INFO of the robot; return the problem if there is one."""
         if info.protocol != VERSION:
-            return f'the robot must speak protocol {VERSION}: it speaks {info.protocol}'
+            return reasons.robot_version(info.protocol)
         if info.settings == frames.SETTINGS_MISSING:
             return reasons.SETTINGS_MISSING
         if info.settings == frames.SETTINGS_DAMAGED:
             return reasons.SETTINGS_DAMAGED
+        if info.settings == frames.SETTINGS_OLD:
+            return reasons.SETTINGS_OLD
+        if info.settings == frames.CALIBRATION_DAMAGED:
+            return reasons.CALIBRATION_DAMAGED
         if self._key and not info.nonce:
             return reasons.ROBOT_KEY_MISSING
         if info.nonce and not self._key:
             return reasons.HOST_KEY_MISSING
         if info.session != self._number:
-            return reasons.KEY_MISMATCH if self._key else reasons.HELLO_REJECTED
+            return reasons.refused('HELLO', info.refusal)
         if self._key:
             key = session_key(self._key, self._nonce, info.nonce)
             self._signer = Signer(key, self._hello_us)
         return ''
 
     def command(self, flags: int, ttl: int, left: int, right: int, now_ns: int) -> Command:
-        """Return the next CMD."""
+        """Return the next CMD; without an echo it can only be an emergency stop."""
         self._seq = self._seq + 1 & _BYTE
-        frame = Command(self._number, self._seq, flags, ttl, left, right, self._stamp(now_ns))
-        return self._sign(frame)
+        echo_us = 0 if self.echo_us is None else self.echo_us
+        frame = Command(self._number, self._seq, flags, ttl, left, right, echo_us)
+        return self._sign(frame, now_ns)
 
     def set(self, number: int, value: int, now_ns: int) -> ParamSet:
         """Return a PARAM_SET."""
-        frame = ParamSet(self._number, self._next_request(), number, value)
-        if self._signer is None:
-            return frame
-        return self._sign(frame._replace(host_us=self._stamp(now_ns)))
+        return self._sign(ParamSet(self._number, self._next_request(), number, value), now_ns)
 
     def get(self, number: int) -> ParamGet:
         """Return a PARAM_GET."""
         return ParamGet(self._number, self._next_request(), number)
 
-    def action(self, verb: int, now_ns: int) -> Action:
-        """Return an ACTION."""
-        frame = Action(self._number, self._next_request(), verb)
-        if self._signer is None:
-            return frame
-        return self._sign(frame._replace(host_us=self._stamp(now_ns)))
-
     def poll(self, what: int) -> Poll:
         """Return a POLL."""
         return Poll(self._number, self._seq, what)
 
-    def _sign(self, frame: AnySignedFrame) -> AnySignedFrame:
-        return frame if self._signer is None else self._signer.sign(frame)
+    def _sign(self, frame: AnySignedFrame, now_ns: int) -> AnySignedFrame:
+        if self._signer is None:
+            return frame
+        return self._signer.sign(frame._replace(host_us=self._stamp(now_ns)))
 
     def _next_request(self) -> int:
         # Separate from commands, which the robot would reject as old after 128 lost requests.
@@ -220,7 +214,11 @@ class Handshake:
             return self._handle_info(result.uplink)
         if result.uplink is None:
             self._state = LinkState.HELLO
-            self._reason = reasons.robot_absent(self._channel)
+            self._reason = (
+                reasons.robot_version(result.foreign_version)
+                if result.foreign_version
+                else reasons.robot_absent(self._channel)
+            )
             return _RETRY_NS
         self._state = LinkState.INFO
         return 0

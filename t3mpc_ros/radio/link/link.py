@@ -24,12 +24,12 @@ from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import decode_exchange_status
 from t3mpc_ros.radio.protocol.frames import (
     BOARD_PARAMETERS,
-    Action,
     Command,
     CommandFlag,
     Configured,
     Downlink,
     Info,
+    Poll,
     Refusal,
     Result,
     State,
@@ -62,7 +62,9 @@ _MIN_STOP_COMMANDS = 3
 """Standstill commands before the drives are disabled, if the robot then stands still."""
 _STOP_TIMEOUT_NS = NANOSECONDS
 """Time after which the drives are disabled in any case."""
-_DISABLE_COMMANDS = 3
+_DISABLE_COMMANDS = 5
+_REFUSAL_QUERY_NS = NANOSECONDS // 10
+"""Time without an accepted command after which AUX is requested for the reason, and again."""
 
 
 class PingRequest(NamedTuple):
@@ -146,28 +148,38 @@ class ActiveSession:
 
     def handle(self, result: TransactionResult) -> str:
         """Process a result; return the reason for a new handshake, empty if none is needed."""
+        if isinstance(result.uplink, State):
+            self._continue_cycles(result)
         if result.uplink is not None:
             self._answered_ns = result.returned_ns
-        if isinstance(result.request, Action):
-            self._arbiter.handle_action_result(result.request, result.uplink)
         if isinstance(result.request, Command):
             answered = isinstance(result.uplink, State)
             complete = answered and _is_own_state(result, result.request)
             self._statistics.add_cycle(result.round_trip if complete else None)
             self._lost = 0 if answered else self._lost + 1
             self._count_disable(result)
+        elif isinstance(result.request, Poll) and result.request.what == frames.STATE:
+            self._lost = 0 if isinstance(result.uplink, State) else self._lost + 1
         if isinstance(result.uplink, State):
             return self._check_state(result, result.uplink)
         if self._lost >= _MAX_LOST_CYCLES:
             return reasons.robot_absent(self._parameters.channel)
         return ''
 
+    def _continue_cycles(self, result: TransactionResult) -> None:
+        """Send the next command at once if this is the first STATE, or the first after a silence.
+
+        The robot refuses every command before it, for its echo.
+        """
+        if self.is_silent(result.returned_ns):
+            self._due_ns = self._accepted_ns = result.returned_ns
+        elif isinstance(result.request, Poll) and result.request.what == frames.STATE:
+            self._due_ns = result.returned_ns
+
     def _next_request(self, now_ns: int) -> Downlink | PingRequest | None:
         """Return the request that is due between cycles, if any."""
         if self._stops is not None:
             return None
-        if self._arbiter.pending_action is not None:
-            return self._session.action(self._arbiter.pending_action, now_ns)
         if now_ns >= self._aux_ns:
             self._aux_ns = now_ns + _AUX_PERIOD_NS
             return self._session.poll(frames.AUX)
@@ -182,7 +194,9 @@ class ActiveSession:
             disable = standing or now_ns >= self._stop_until_ns
             self._stops = min(self._stops - 1, -1 if disable else self._stops)
             flags = CommandFlag(0) if disable else CommandFlag.ENABLE
-            return self._session.command(flags, 0, 0, 0, now_ns)
+            return self._session.command(flags, self._parameters.ttl_units, 0, 0, now_ns)
+        if self._session.echo_us is None and not self._arbiter.estop:
+            return self._session.poll(frames.STATE)
         setpoint = self._arbiter.next_setpoint(
             bool(self._status & StatusFlag.ESTOP), now_ns, self.is_silent(now_ns)
         )
@@ -190,12 +204,15 @@ class ActiveSession:
         return self._session.command(flags, ttl, left, right, now_ns)
 
     def _count_disable(self, result: TransactionResult) -> None:
-        """Count commands that disable the drives; one acknowledgement completes the stop."""
+        """Count commands that disable the drives; a STATE with disabled drives completes the stop.
+
+        After a pause of the host, the first one is refused for its echo.
+        """
         if self._stops is None or not isinstance(result.request, Command) or result.request.flags:
             return
-        reply = result.reply
-        acknowledged = isinstance(reply, Result) and bool(reply.first & 1)
-        self._disable_attempts = 0 if acknowledged else self._disable_attempts - 1
+        state = result.uplink
+        disabled = isinstance(state, State) and not state.status & StatusFlag.ENABLED
+        self._disable_attempts = 0 if disabled else self._disable_attempts - 1
 
     def _check_state(self, result: TransactionResult, state: State) -> str:
         self._status = StatusFlag(state.status)
@@ -205,8 +222,13 @@ class ActiveSession:
             # ESTOP is always executed, whether or not the rest of the command is accepted.
             if state.seq == result.request.seq or result.request.flags & CommandFlag.ESTOP:
                 self._accepted_ns = result.returned_ns
-            elif result.returned_ns - self._accepted_ns > _REJECTED_TIMEOUT_NS:
-                return reasons.COMMANDS_REJECTED
+                return ''
+            refused_ns = result.returned_ns - self._accepted_ns
+            if refused_ns > _REJECTED_TIMEOUT_NS:
+                aux = self._statistics.robot
+                return reasons.refused('commands', aux.refusal if aux else 0)
+            if refused_ns > _REFUSAL_QUERY_NS:
+                self._aux_ns = min(self._aux_ns, self._accepted_ns + _REFUSAL_QUERY_NS)
         return ''
 
 
@@ -327,10 +349,6 @@ class Link:
         """
         return self._active is not None and self._active.is_silent(now_ns)
 
-    def action_result(self, verb: int) -> str | None:
-        """Return the result of the last request: None pending, empty done, else the error."""
-        return self._arbiter.action_results.get(verb)
-
     def quality(self, now_ns: int) -> LinkQuality:
         """Return the quality of the link."""
         return self._statistics.quality(self._age(now_ns), self._transactions.frame_counts)
@@ -375,10 +393,6 @@ class Link:
         """Release the emergency stop of host and robot; return why that is not needed."""
         robot_latched = self._telemetry is not None and self._telemetry.status.estop
         return self._arbiter.release(robot_latched, now_ns)
-
-    def request_action(self, verb: int) -> None:
-        """Request an action of the robot; :meth:`action_result` returns its result."""
-        self._arbiter.request_action(verb)
 
     def shut_down(self) -> None:
         """Stop the robot, disable its drives and close the port; the final state is DONE."""
@@ -511,6 +525,8 @@ class Link:
         telemetry = self._decoder.decode(state, result.returned_ns, timing)
         self._statistics.robot_resets += self._decoder.rebooted
         if telemetry is not None:
+            if self._session is not None:
+                self._session.echo_us = state.time_us
             self._telemetry = telemetry
             self._received_ns = result.returned_ns
 

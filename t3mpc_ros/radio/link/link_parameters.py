@@ -29,45 +29,38 @@ class RobotParameters(Parameters):
     max_speed: float = parameter(
         10.0,
         'maximum wheel speed; the faster wheel sets the scale of both',
-        unit='rad/s',
-        low=0.0,
-        high=19.6,
+        'rad/s',
+        (0.0, 19.6),
         source='10 000 microsteps per second at 16 microsteps are 19.6 rad/s',
     )
     acceleration: float = parameter(
         30.0,
         'maximum acceleration of the wheel whose speed changes faster',
-        unit='rad/s²',
-        low=0.1,
-        high=100.0,
+        'rad/s²',
+        (0.1, 100.0),
     )
     deceleration: float = parameter(
         60.0,
         'the same while stopping: from 10 rad/s to rest within 0.37 s of the last command',
-        unit='rad/s²',
-        low=0.1,
-        high=200.0,
+        'rad/s²',
+        (0.1, 200.0),
     )
-    ttl_max: float = parameter(
-        0.25, 'maximum time to live of a command', unit='s', low=0.02, high=0.5
-    )
+    ttl_max: float = parameter(0.25, 'maximum time to live of a command', 's', (0.02, 0.5))
     battery_low: float = parameter(
-        10.2, 'supply voltage below which the robot warns', unit='V', low=0.0, high=30.0
+        10.2, 'supply voltage below which the robot warns', 'V', (0.0, 30.0)
     )
     battery_cutoff: float = parameter(
         9.0,
         'supply voltage below which the robot stops, until it is above battery_low; 0: none',
-        unit='V',
-        low=0.0,
-        high=30.0,
+        'V',
+        (0.0, 30.0),
         source='3 V per Li-ion cell',
     )
     idle_off: float = parameter(
         0.0,
         'standstill after which the drivers switch off, without holding torque; 0: never',
-        unit='s',
-        low=0.0,
-        high=600.0,
+        's',
+        (0.0, 600.0),
     )
     invert_left: bool = parameter(False, 'the left motor is mounted or wired in reverse')
     invert_right: bool = parameter(False, 'the right motor is mounted or wired in reverse')
@@ -101,9 +94,8 @@ class LinkParameters(Parameters):
     channel: int = parameter(
         82,
         '2400 MHz plus this; 82 is in the band, above Bluetooth advertising, at the edge of Wi-Fi',
-        unit='MHz',
-        low=0,
-        high=125,
+        'MHz',
+        (0, 125),
         source='nRF24L01+ data sheet 1.0, 6.3',
     )
     rate: str = parameter(
@@ -113,22 +105,15 @@ class LinkParameters(Parameters):
     retries: int = parameter(
         4,
         'retransmissions without an acknowledgement, 0.7 ms each; late commands are worthless',
-        low=0,
-        high=15,
+        bounds=(0, 15),
     )
     address: str = parameter(
         '54334d5043',
         'address of the robot: 10 hexadecimal digits, last transmitted byte first; this is T3MPC',
     )
-    cycle_rate: float = parameter(
-        50.0, 'rate of commands and measurements', unit='Hz', low=1.0, high=100.0
-    )
+    cycle_rate: float = parameter(50.0, 'rate of commands and measurements', 'Hz', (1.0, 100.0))
     ttl: float = parameter(
-        0.2,
-        'time for which the robot follows a command without a newer one',
-        unit='s',
-        low=0.02,
-        high=0.5,
+        0.2, 'time for which the robot follows a command without a newer one', 's', (0.02, 0.5)
     )
     robot: RobotParameters = group(RobotParameters)
 

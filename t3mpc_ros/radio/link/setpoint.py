@@ -7,15 +7,13 @@ from typing import NamedTuple
 from t3mpc_ros.geometry.types import NANOSECONDS, WheelSpeeds
 from t3mpc_ros.radio.link import standstill_reasons as reasons
 from t3mpc_ros.radio.link.link_parameters import TTL_UNIT_NS, LinkParameters
-from t3mpc_ros.radio.protocol.frames import BUSY, OK, Ack, Action, CommandFlag, Uplink
+from t3mpc_ros.radio.protocol.frames import CommandFlag
 from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS
 
 _RELEASE_TIMEOUT_NS = NANOSECONDS
 """Maximum duration of ESTOP_CLEAR frames."""
 _MIN_RELEASE_FRAMES = 3
 """Minimum number of ESTOP_CLEAR frames: the last status may be older than the stop."""
-_MAX_ATTEMPTS = 20
-"""Attempts of one action request."""
 
 
 class Setpoint(NamedTuple):
@@ -49,10 +47,6 @@ class SetpointArbiter:
         self._release_frames = 0
         self._button_held = False
         self._sent_wheels = ZERO_WHEEL_SPEEDS
-        self._requests: list[int] = []
-        self._attempts = 0
-        self.action_results: dict[int, str] = {}
-        """Results of action requests by verb; empty means done."""
 
     @property
     def estop(self) -> str:
@@ -134,31 +128,3 @@ class SetpointArbiter:
         if robot_latched:
             return reasons.ESTOP_BUTTON_HELD if self._button_held else reasons.ROBOT_ESTOP
         return '' if self._wheels is not None else self._reason
-
-    @property
-    def pending_action(self) -> int | None:
-        """Verb of the next action to send."""
-        return self._requests[0] if self._requests else None
-
-    def request_action(self, verb: int) -> None:
-        """Request an action; it is repeated until answered."""
-        self.action_results.pop(verb, None)
-        if verb not in self._requests:
-            self._requests.append(verb)
-
-    def handle_action_result(self, action: Action, answer: Uplink | None) -> None:
-        """Process the answer to an action."""
-        if not self._requests or self._requests[0] != action.verb:
-            return
-        self._attempts += 1
-        if isinstance(answer, Ack) and (answer.verb, answer.seq) == (action.verb, action.seq):
-            reason = '' if answer.rc == OK else 'the robot does not support this action'
-            if answer.rc == BUSY:
-                reason = 'refused while the robot moves'
-        elif self._attempts >= _MAX_ATTEMPTS:
-            reason = 'the robot does not answer'
-        else:
-            return
-        self.action_results[action.verb] = reason
-        self._requests.pop(0)
-        self._attempts = 0

@@ -43,8 +43,6 @@ class LinkQuality(NamedTuple):
     """Since the port was first opened."""
     lost: int
     """Lost cycles since then."""
-    lost_in_a_row: int
-    """Current run of lost cycles."""
     lost_share: float
     """0 to 1; NaN before the first cycle, like the next two."""
     round_trip_median: float
@@ -88,7 +86,7 @@ class LinkStatistics:
         self._recent: deque[float | None] = deque(maxlen=_WINDOW_CYCLES)
         """Round trip of each cycle, None for a lost one."""
         self._retransmissions = [0] * RETRY_COUNTS
-        self._cycles = self._lost = self._lost_in_a_row = 0
+        self._cycles = self._lost = 0
         self.robot_resets = 0
         self.dongle_resets = 0
         self.sessions = 0
@@ -96,11 +94,6 @@ class LinkStatistics:
         self.malformed = 0
         self.dongle: Pong | None = None
         self.robot: Aux | None = None
-
-    @property
-    def lost_in_a_row(self) -> int:
-        """Current run of lost cycles."""
-        return self._lost_in_a_row
 
     def add_exchange(self, retransmissions: int) -> None:
         """Count one transmitted packet."""
@@ -112,9 +105,6 @@ class LinkStatistics:
         self._recent.append(round_trip)
         if round_trip is None:
             self._lost += 1
-            self._lost_in_a_row += 1
-        else:
-            self._lost_in_a_row = 0
 
     def quality(self, age: float, host: FrameCounts) -> LinkQuality:
         """Return the quality of the link at telemetry age ``age`` (s)."""
@@ -141,7 +131,6 @@ class LinkStatistics:
             text,
             self._cycles,
             self._lost,
-            self._lost_in_a_row,
             lost_share,
             median,
             slow,

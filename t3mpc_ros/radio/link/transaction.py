@@ -20,6 +20,7 @@ from t3mpc_ros.radio.protocol.frames import (
     Configured,
     Downlink,
     FrameError,
+    FrameErrorKind,
     FromDongle,
     Ping,
     Poll,
@@ -51,6 +52,8 @@ class TransactionResult(NamedTuple):
     timing: CommandTiming | None
     """Sample for the clock model; None if the first packet was retransmitted or unanswered."""
     dongle_restarted: bool
+    foreign_version: int = 0
+    """Version of the protocol of an answer that this host cannot read; 0 if there is none."""
 
     @property
     def round_trip(self) -> float:
@@ -169,7 +172,7 @@ class TransactionLayer:
     def _result(
         self, pending: _PendingRequest, reply: FromDongle, now_ns: int
     ) -> TransactionResult:
-        uplink, timing, restarted = None, None, False
+        uplink, timing, restarted, foreign_version = None, None, False, 0
         if isinstance(reply, Pong):
             restarted = self._detect_restart(reply.time_us, now_ns)
         elif isinstance(reply, Result):
@@ -182,14 +185,23 @@ class TransactionLayer:
             if reply.payload:
                 try:
                     uplink = decode_uplink(reply.payload)
-                except FrameError:
+                except FrameError as error:
                     self._statistics.malformed += 1
+                    if error.kind is FrameErrorKind.VERSION:
+                        foreign_version = reply.payload[0] >> 4
             prompt = not first.retransmissions and second.has_payload
             if isinstance(pending.request, Command) and prompt:
                 delay = forward_delay_ns(pending.wire_bytes, pending.payload_bytes)
                 timing = CommandTiming(pending.sent_ns, delay)
         return TransactionResult(
-            pending.request, reply, uplink, pending.sent_ns, now_ns, timing, restarted
+            pending.request,
+            reply,
+            uplink,
+            pending.sent_ns,
+            now_ns,
+            timing,
+            restarted,
+            foreign_version,
         )
 
     def _detect_restart(self, dongle_us: int, now_ns: int) -> bool:

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Authentication of commands: SipHash-2-4 tags, session keys, and the checks of the robot.
+"""Authentication of commands: SipHash-2-4 tags and session keys.
 
 The nRF24 has no protection of its own. With a 16-byte key at both ends, HELLO is signed under that
 key, both ends add a nonce, and every CMD, PARAM_SET and ACTION is signed under the session key.
@@ -12,14 +12,18 @@ SipHash-2-4: J.-P. Aumasson, D. J. Bernstein, SipHash: a fast short-input PRF, I
 DOI 10.1007/978-3-642-34931-7_28. Checked against the 64 published vectors of its 8-byte output.
 """
 
-import hmac
 import os
 from pathlib import Path
 import stat
 from typing import TypeVar
 
 from t3mpc_ros.radio.protocol.codec import encode
-from t3mpc_ros.radio.protocol.frames import Action, Command, CommandFlag, Hello, ParamSet
+from t3mpc_ros.radio.protocol.frames import (
+    Action,
+    Command,
+    Hello,
+    ParamSet,
+)
 
 KEY_SIZE = 16
 """bytes"""
@@ -108,17 +112,13 @@ def session_key(key: bytes, host_nonce: bytes, robot_nonce: bytes) -> bytes:
 
 def sign_hello(key: bytes, session: int, seq: int, host_us: int, nonce: bytes) -> Hello:
     """Return a HELLO signed under the long-term key."""
-    hello = Hello(session, seq, host_us, nonce, _EMPTY_TAG)
-    return hello._replace(tag=_hello_tag(key, hello))
+    hello = Hello(session, seq, host_us, nonce)
+    return hello._replace(tag=hello_tag(key, hello))
 
 
-def verify_hello(key: bytes, hello: Hello) -> bool:
-    """Return whether a HELLO carries the tag of the long-term key."""
-    return bool(hello.tag) and _tags_match(_hello_tag(key, hello), hello.tag)
-
-
-def _hello_tag(key: bytes, hello: Hello) -> bytes:
-    return siphash(key, _USE_HELLO + encode(hello)[:-TAG_SIZE])
+def hello_tag(key: bytes, hello: Hello) -> bytes:
+    """Return the tag of a HELLO under the long-term key; the tag in the frame is ignored."""
+    return siphash(key, _USE_HELLO + encode(hello._replace(tag=_EMPTY_TAG))[:-TAG_SIZE])
 
 
 def frame_tag(frame: SignedFrame, key: bytes, epoch: int) -> bytes:
@@ -165,113 +165,6 @@ class Signer:
             self._epoch += 1
         self._last = frame.host_us
         return frame._replace(tag=frame_tag(frame, self._key, self._epoch))
-
-
-class CommandVerifier:
-    """Robot end of a session: decides which frames are valid.
-
-    Its methods return the reason for a rejection, empty for a valid frame. Emulator and tests use
-    it; the firmware implements the same rules in C.
-
-    Parameters
-    ----------
-    key
-        Long-term key; empty for a robot without one.
-    locked
-        The key is damaged or about to change: no session starts, ESTOP stays valid.
-    """
-
-    def __init__(self, key: bytes = b'', locked: bool = False) -> None:
-        if key and len(key) != KEY_SIZE:
-            raise ValueError(f'key must be {KEY_SIZE} bytes long: got {len(key)}')
-        self._key = key
-        self._locked = locked
-        self._session = 0
-        self._session_key = b''
-        self._host_nonce = b''
-        self._robot_nonce = bytes(NONCE_SIZE) if key or locked else b''
-        self._last = (0, 0)
-
-    @property
-    def key(self) -> bytes:
-        """Long-term key; empty without a usable key."""
-        return self._key
-
-    @property
-    def locked(self) -> bool:
-        """Whether no session can start."""
-        return self._locked
-
-    @property
-    def session(self) -> int:
-        """Current session; 0 before the first HELLO."""
-        return self._session
-
-    @property
-    def nonce(self) -> bytes:
-        """Robot nonce for INFO: zeros before the first HELLO; empty without a key."""
-        return self._robot_nonce
-
-    def begin_session(self, hello: Hello, fresh_nonce: bytes) -> str:
-        """Start the session of a HELLO; return the reason for a rejection.
-
-        ``fresh_nonce`` (8 unpredictable bytes) becomes the robot nonce, unless this HELLO repeats
-        the last one because its answer was lost; then nothing changes.
-        """
-        if self._locked:
-            return 'the key is damaged'
-        if bool(self._key) != bool(hello.tag):
-            return 'no key to check the HELLO with' if hello.tag else 'HELLO is not signed'
-        if self._key:
-            if not verify_hello(self._key, hello):
-                return 'HELLO has a bad tag'
-            if hello.nonce == self._host_nonce:
-                return ''
-            self._session_key = session_key(self._key, hello.nonce, fresh_nonce)
-            self._host_nonce, self._robot_nonce = hello.nonce, fresh_nonce
-            self._last = (0, hello.host_us)
-        self._session = hello.session
-        return ''
-
-    def end_session(self) -> None:
-        """End the session; its HELLO may then start another one, with a new nonce."""
-        self._session = 0
-        self._host_nonce = b''
-
-    def verify(self, frame: SignedFrame) -> str:
-        """Return the reason for rejecting a frame; a valid one invalidates itself and older ones.
-
-        A CMD with ESTOP is always valid; its other fields count only if :meth:`accept` accepts it.
-        """
-        why = self.accept(frame)
-        return '' if isinstance(frame, Command) and frame.flags & CommandFlag.ESTOP else why
-
-    def accept(self, frame: SignedFrame) -> str:
-        """Return why a frame is not part of the session; a valid one advances the replay counter.
-
-        This includes a validly signed ESTOP, so that an ESTOP repeated for hours keeps the epoch.
-        An ESTOP with a bad tag does not change the counter.
-        """
-        if not self._session or frame.session != self._session:
-            return f'session is {self._session}: got {frame.session}'
-        if not self._key:
-            return 'no key to check the tag with' if frame.tag else ''
-        if not frame.tag:
-            return 'frame is not signed'
-        epoch, last = self._last
-        if frame.host_us == last:
-            return 'frame is a replay'
-        if frame.host_us < last:
-            epoch += 1
-        if not _tags_match(frame_tag(frame, self._session_key, epoch), frame.tag):
-            return 'frame has a bad tag, or is a replay'
-        self._last = (epoch, frame.host_us)
-        return ''
-
-
-def _tags_match(expected: bytes, got: bytes) -> bool:
-    # Constant time: the duration is independent of the number of equal bytes.
-    return hmac.compare_digest(expected, got)
 
 
 # -- SipHash-2-4 ----------------------------------------------------------------------------------

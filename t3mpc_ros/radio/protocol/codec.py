@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Encoding and decoding of every frame of protocol 1; the layouts are one table at the end.
+"""Encoding and decoding of every frame of protocol 2; the layouts are one table at the end.
 
 A frame is decoded completely or rejected, and a value that does not fit is not encoded: FrameError
 names the frame, the field, the bound and the value. All numbers are little endian.
@@ -16,7 +16,6 @@ from t3mpc_ros.radio.protocol.frames import (
     Action,
     Aux,
     Command,
-    CommandFlag,
     Configure,
     Configured,
     Downlink,
@@ -34,11 +33,14 @@ from t3mpc_ros.radio.protocol.frames import (
     Ping,
     Poll,
     Pong,
+    Record,
+    RecordPart,
     Refusal,
     Result,
-    Settings,
-    SettingsState,
+    Samples,
+    Sense,
     State,
+    Store,
     ToBoard,
     ToDongle,
     Transmit,
@@ -105,12 +107,6 @@ def encode(
 def decode_downlink(data: bytes) -> Downlink:
     """Return the radio payload from a host, or raise FrameError."""
     return _decode(data, _DOWNLINK)  # type: ignore[no-any-return]
-
-
-def is_estop_command(data: bytes) -> bool:
-    """Return whether this is a CMD with ESTOP, valid or not in its other fields."""
-    sizes = [form.size for form in _DOWNLINK[0x11].forms]
-    return len(data) in sizes and data[0] == 0x11 and bool(data[3] & CommandFlag.ESTOP)
 
 
 def decode_uplink(data: bytes) -> Uplink:
@@ -297,11 +293,12 @@ def _check_result_payload(frame: Result) -> None:
 # -- layouts --------------------------------------------------------------------------------------
 
 _LAYOUTS: dict[Any, _Layout] = {}
-_COMMAND = 'session B, seq B, flags B 0 7, ttl B, reserved B 0 0, left h, right h, host_us I'
+_COMMAND = 'session B, seq B, flags B 0 7, ttl B, reserved B 0 0, left h, right h, echo_us I'
 _PARAM_SET, _ACTION = 'session B, seq B, id B, value i', 'session B, seq B, verb B, reserved H 0 0'
 _INFO = (
     'session B, seq B, protocol B, major B, minor B, reset_cause B, parameters B, '
-    'steps_per_rev H, microsteps H, status B, settings B 0 3, channel B 0 125, address 5s, build I'
+    'steps_per_rev H, microsteps H, refusal B, settings B 0 5, channel B 0 125, address 5s, '
+    'build I'
 )
 _RADIO_SETUP = (
     'id B, channel B 0 125, rate B 0 2, power B 0 3, retry_delay B 0 15, retries B 0 15, '
@@ -310,39 +307,39 @@ _RADIO_SETUP = (
 _SIGNATURE = ', host_us I, tag 8s'
 
 _DOWNLINK = {
-    0x11: _layout(Command, 'CMD', 0x11, _COMMAND, _COMMAND + ', tag 8s'),
-    0x12: _layout(ParamGet, 'PARAM_GET', 0x12, 'session B, seq B, id B'),
-    0x13: _layout(ParamSet, 'PARAM_SET', 0x13, _PARAM_SET, _PARAM_SET + _SIGNATURE),
-    0x14: _layout(
+    0x21: _layout(Command, 'CMD', 0x21, _COMMAND, _COMMAND + _SIGNATURE),
+    0x22: _layout(ParamGet, 'PARAM_GET', 0x22, 'session B, seq B, id B'),
+    0x23: _layout(ParamSet, 'PARAM_SET', 0x23, _PARAM_SET, _PARAM_SET + _SIGNATURE),
+    0x24: _layout(
         Hello,
         'HELLO',
-        0x14,
-        'session B 1 255, seq B, flags B 0 0, host_us I',
+        0x24,
+        'session B 1 255, seq B, flags B 0 0',
         'session B 1 255, seq B, flags B 1 1, host_us I, nonce 8s, tag 8s',
     ),
-    0x15: _layout(Poll, 'POLL', 0x15, 'session B, seq B, what B 0 2'),
-    0x16: _layout(Action, 'ACTION', 0x16, _ACTION, _ACTION + _SIGNATURE),
+    0x25: _layout(Poll, 'POLL', 0x25, 'session B, seq B, what B 0 2'),
+    0x26: _layout(Action, 'ACTION', 0x26, _ACTION, _ACTION + _SIGNATURE),
 }
 _UPLINK = {
-    0x11: _layout(
+    0x21: _layout(
         State,
         'STATE',
-        0x11,
+        0x21,
         'session B, seq B, status B, time_us I, left i, right i, gyro_z h, accel_x h, '
         'accel_y h, age H, ranges 8s',
     ),
-    0x12: _layout(
-        Param, 'PARAM', 0x12, 'session B, seq B, id B, rc B 0 4, value i, low i, high i'
+    0x22: _layout(
+        Param, 'PARAM', 0x22, 'session B, seq B, id B, rc B 0 4, value i, low i, high i'
     ),
-    0x13: _layout(Info, 'INFO', 0x13, _INFO, _INFO + ', nonce 8s'),
-    0x14: _layout(Ack, 'ACK', 0x14, 'session B, seq B, verb B, rc B 0 4'),
-    0x15: _layout(
+    0x23: _layout(Info, 'INFO', 0x23, _INFO, _INFO + ', nonce 8s'),
+    0x24: _layout(Ack, 'ACK', 0x24, 'session B, seq B, verb B, rc B 0 4'),
+    0x25: _layout(
         Aux,
         'AUX',
-        0x15,
+        0x25,
         'session B, seq B, status B, battery H, temperature h, accel_z h, gyro_x h, gyro_y h, '
-        'received H, duplicates H, bad_session H, stale H, expired H, time_us I, '
-        'bad_version H, short H',
+        'received H, duplicates H, bad_session H, stale H, expired H, bad_version H, '
+        'malformed H, refusal B, refused 3s',
     ),
 }
 _TO_DONGLE = {
@@ -358,7 +355,7 @@ _FROM_DONGLE = {
         'PONG',
         0x83,
         'id B, echo 4s, time_us I, protocol B, major B, minor B, chip_ok B 0 1, '
-        'crc_errors H, frame_errors H, overruns H, reset_cause B, settings B 0 3, '
+        'crc_errors H, frame_errors H, overruns H, reset_cause B, settings B 0 5, '
         'channel B 0 125, address 5s, build I',
     ),
     0x8F: _layout(Refusal, 'ERR', 0x8F, 'code B 1 3, argument B'),
@@ -366,16 +363,27 @@ _FROM_DONGLE = {
 _TO_BOARD = {
     0x03: _TO_DONGLE[0x03],
     0x04: _layout(Key, 'KEY', 0x04, 'id B', 'id B, key 16s'),
-    0x05: _layout(Settings, 'SETTINGS', 0x05, 'id B', 'id B, channel B, microsteps H, address 5s'),
+    0x06: _layout(
+        Record, 'RECORD', 0x06, 'id B, record B, part B', 'id B, record B, part B, data 16s'
+    ),
+    0x07: _layout(Store, 'STORE', 0x07, 'id B, record B, crc H'),
+    0x08: _layout(Sense, 'SENSE', 0x08, 'id B'),
 }
 _FROM_BOARD = {
     0x83: _FROM_DONGLE[0x83],
     0x84: _layout(KeyState, 'KEY', 0x84, 'id B, rc B 0 5, state B 0 2, check I'),
-    0x85: _layout(
-        SettingsState,
-        'SETTINGS',
-        0x85,
-        'id B, rc B 0 5, state B 0 3, channel B 0 125, microsteps H, address 5s',
+    0x86: _layout(
+        RecordPart,
+        'RECORD',
+        0x86,
+        'id B, rc B 0 5, record B, state B 0 4, size B, part B, data 16s',
+    ),
+    0x88: _layout(
+        Samples,
+        'SENSE',
+        0x88,
+        'id B, ranges 16s, battery H, accel_x h, accel_y h, accel_z h, gyro_x h, gyro_y h, '
+        'gyro_z h',
     ),
     0x8F: _FROM_DONGLE[0x8F],
 }

@@ -1,15 +1,15 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Frames of protocol 1 as typed values: radio payloads and the USB frames around them.
+"""Frames of protocol 2 as typed values: radio payloads and the USB frames around them.
 
 Fields keep their integers from the wire; :mod:`t3mpc_ros.radio.protocol.codec` converts frames to
 bytes and back. docs/radio.md has the byte tables.
 """
 
-from enum import Enum, IntFlag
+from enum import Enum, IntEnum, IntFlag
 from typing import NamedTuple
 
-VERSION = 1
+VERSION = 2
 PAYLOAD_LIMIT = 32
 """Maximum radio payload, bytes; a longer one is rejected."""
 
@@ -52,16 +52,48 @@ class StatusFlag(IntFlag):
     LIMITED = 128
 
 
+class RefusalReason(IntEnum):
+    """Why the robot refuses a payload, in INFO and AUX."""
+
+    NONE = 0
+    VERSION = 1
+    """Another version of the protocol."""
+    FORM = 2
+    """Unknown kind, wrong length, or a value out of range."""
+    SETTINGS = 3
+    """HELLO: the robot has no valid settings."""
+    KEY = 4
+    """HELLO: the key of the robot is damaged, or being written."""
+    UNSIGNED = 5
+    """No tag, but the robot has a key."""
+    SIGNED = 6
+    """A tag, but the robot has no key."""
+    SESSION = 7
+    """No session, or not the current one."""
+    TAG = 8
+    """Bad tag, or a replay."""
+    SEQUENCE = 9
+    """CMD: repeated, or overtaken by a newer one."""
+    STALE = 10
+    """CMD: its echo is too old."""
+
+
 STATE, AUX, INFO = 0, 1, 2
 """Frame that a POLL fetches."""
 RESET_ODOMETRY, CLEAR_COUNTERS = 1, 2
 """Verbs of an ACTION; RESET_ODOMETRY is rejected while the robot moves."""
 OK, UNKNOWN, OUT_OF_RANGE, READ_ONLY, BUSY, FAILED = range(6)
-"""Result codes of PARAM, ACK, KEY and SETTINGS; FAILED only in the last two."""
+"""Result codes of PARAM, ACK, KEY and RECORD; FAILED not in the first two."""
 NO_KEY, KEY_HELD, KEY_DAMAGED = range(3)
 """State of the key in KEY from the robot."""
 SETTINGS_GOOD, SETTINGS_ONE_COPY, SETTINGS_MISSING, SETTINGS_DAMAGED = range(4)
-"""State of the settings of the robot; with the last two it accepts no session."""
+"""State of a record of the robot. Without valid settings it accepts no session."""
+SETTINGS_OLD, CALIBRATION_DAMAGED = 4, 5
+"""Settings of an older firmware; INFO and PONG: usable settings, but a damaged calibration."""
+SETTINGS_RECORD, CALIBRATION_RECORD, LOG_RECORD = range(3)
+"""Record of a RECORD or STORE; the log can only be read."""
+PART_SIZE = 16
+"""Bytes of a part of a record."""
 AGE_NONE = 0xFFFF
 """Age in a STATE before the first CMD of a session."""
 
@@ -81,8 +113,10 @@ class Command(NamedTuple):
     """mrad/s"""
     right: int
     """mrad/s"""
-    host_us: int
-    """Host time, us, modulo 2**32."""
+    echo_us: int
+    """Robot time of the newest STATE that the host has: ``State.time_us``."""
+    host_us: int = 0
+    """Host time, us, modulo 2**32; only on a keyed link, like that of the other frames."""
     tag: bytes = b''
     """8 bytes on a keyed link, otherwise empty."""
 
@@ -103,7 +137,6 @@ class ParamSet(NamedTuple):
     id: int
     value: int
     host_us: int = 0
-    """Only on a keyed link."""
     tag: bytes = b''
 
 
@@ -112,7 +145,7 @@ class Hello(NamedTuple):
 
     session: int
     seq: int
-    host_us: int
+    host_us: int = 0
     nonce: bytes = b''
     """8 bytes on a keyed link."""
     tag: bytes = b''
@@ -133,7 +166,6 @@ class Action(NamedTuple):
     seq: int
     verb: int
     host_us: int = 0
-    """Only on a keyed link."""
     tag: bytes = b''
 
 
@@ -188,7 +220,8 @@ class Info(NamedTuple):
     """Number of board parameters."""
     steps_per_rev: int
     microsteps: int
-    status: int
+    refusal: int
+    """RefusalReason of the newest refused payload."""
     settings: int
     """SETTINGS_GOOD, …"""
     channel: int
@@ -230,10 +263,13 @@ class Aux(NamedTuple):
     stale: int
     expired: int
     """Number of TTL expiries."""
-    time_us: int
     bad_version: int
-    short: int
-    """Frames of wrong length or with a value out of range."""
+    malformed: int
+    """Frames of unknown kind, of wrong length or with a value out of range."""
+    refusal: int
+    """RefusalReason of the newest refused payload."""
+    refused: bytes
+    """Its first 3 bytes: version and kind, session, seq."""
 
 
 # -- USB ------------------------------------------------------------------------------------------
@@ -352,38 +388,73 @@ class KeyState(NamedTuple):
     """``authentication.key_check`` of the stored key, else 0."""
 
 
-class Settings(NamedTuple):
-    """SETTINGS, host to the USB of the robot board: store settings; without an address, read."""
+class Record(NamedTuple):
+    """RECORD, host to the USB of the robot board: stage a part of a record; without data, read."""
 
     id: int
-    channel: int = 0
-    """2400 MHz plus this."""
-    microsteps: int = 0
-    """A power of two up to 256."""
-    address: bytes = b''
-    """5 bytes that are not all equal, last transmitted byte first."""
+    record: int
+    """SETTINGS_RECORD, CALIBRATION_RECORD or LOG_RECORD."""
+    part: int
+    """From 0, each 16 bytes."""
+    data: bytes = b''
+    """16 bytes; what lies behind the end of the record is ignored."""
 
 
-class SettingsState(NamedTuple):
-    """SETTINGS, robot board to host over its USB: result, state and values in effect."""
+class Store(NamedTuple):
+    """STORE, host to the USB of the robot board: write the staged record; RecordPart answers."""
+
+    id: int
+    record: int
+    crc: int
+    """Of the whole record."""
+
+
+class RecordPart(NamedTuple):
+    """RECORD, robot board to host over its USB: result, and a part of the record in effect."""
 
     id: int
     rc: int
-    """OK; OUT_OF_RANGE; BUSY: moving, drivers on, or writing; FAILED: the EEPROM did not hold."""
+    """OK; UNKNOWN: no such record or part, or other staged bytes; OUT_OF_RANGE; BUSY; FAILED."""
+    record: int
     state: int
     """SETTINGS_GOOD, …"""
-    channel: int
-    microsteps: int
-    address: bytes
+    size: int
+    """Bytes of the record."""
+    part: int
+    data: bytes
+    """16 bytes, filled with zeros."""
+
+
+class Sense(NamedTuple):
+    """SENSE, host to the USB of the robot board: read the newest samples."""
+
+    id: int
+
+
+class Samples(NamedTuple):
+    """SENSE, robot board to host over its USB: raw samples of the converter and the MPU6050."""
+
+    id: int
+    ranges: bytes
+    """16 bytes: u16 counts of the eight distance sensors; 0xFFFF: not measured."""
+    battery: int
+    """Count of the divider."""
+    accel_x: int
+    """MPU6050 register, like the next five; all zero while it does not answer."""
+    accel_y: int
+    accel_z: int
+    gyro_x: int
+    gyro_y: int
+    gyro_z: int
 
 
 Downlink = Command | ParamGet | ParamSet | Hello | Poll | Action
 Uplink = State | Param | Info | Ack | Aux
 ToDongle = Transmit | Configure | Ping
 FromDongle = Result | Configured | Pong | Refusal
-ToBoard = Ping | Key | Settings
+ToBoard = Ping | Key | Record | Store | Sense
 """Over the USB of the robot board, like the next."""
-FromBoard = Pong | KeyState | SettingsState | Refusal
+FromBoard = Pong | KeyState | RecordPart | Samples | Refusal
 
 
 # -- board parameters -----------------------------------------------------------------------------
@@ -406,12 +477,12 @@ BOARD_PARAMETERS = (
     BoardParameter('acceleration', 'mrad/s2', 30000, 100, 100000, 'of the faster changing wheel'),
     BoardParameter('deceleration', 'mrad/s2', 60000, 100, 200000, 'the same while stopping'),
     BoardParameter('ttl_max', 'ms', 250, 20, 500, 'maximum time to live of a command'),
-    BoardParameter('microsteps', '', 16, 1, 256, 'of the settings: t3mpc robot set', True),
-    BoardParameter('steps_per_rev', '', 200, 200, 200, 'full steps of the motor', True),
+    BoardParameter('microsteps', '', 16, 1, 256, 'of the settings: t3mpc robot setup', True),
+    BoardParameter('steps_per_rev', '', 200, 20, 10000, 'full steps; of the settings', True),
     BoardParameter('gyro_range', 'deg/s', 500, 500, 500, 'full scale of the gyro', True),
     BoardParameter('battery_low', 'mV', 10200, 0, 30000, 'status bit LOW_BATTERY below this'),
     BoardParameter('idle_off', 'ms', 0, 0, 600000, 'drivers off after this standstill; 0: never'),
-    BoardParameter('invert_wheels', 'bits', 0, 0, 3, '1: left, 2: right'),
+    BoardParameter('invert_wheels', 'bits', 0, 0, 3, '1: left, 2: right; against the settings'),
     BoardParameter('battery_cutoff', 'mV', 9000, 0, 30000, 'no driving below this; 0: no limit'),
 )
 """Board parameters by id."""

@@ -5,27 +5,20 @@
 from collections.abc import Callable
 import os
 from pathlib import Path
-from typing import NoReturn
 
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import KEY_SIZE, KeyFileError, key_check
-from t3mpc_ros.radio.protocol.frames import Key, KeyState, Refusal
+from t3mpc_ros.radio.protocol.frames import Key, KeyState
 from t3mpc_ros.radio.tool.procedure import (
     ProcedureError,
-    ReplyFrame,
     Request,
     Script,
+    request_reply,
     wait_for_board,
 )
 
-NO_BOARD = 'no robot board answers on this port: is it the USB port of the robot?'
-WRONG_BOARD = (
-    'this is the dongle: a key is written over the USB port of the robot board; '
-    'ls -l /dev/serial/by-id lists both'
-)
 ERASE_KEY = bytes(KEY_SIZE)
 """Key value that erases the stored key."""
-_REPLY_TIMEOUT = 0.3
 _WRITE_TIMEOUT = 1.0
 """s; 25 EEPROM cells of 3.4 ms, and the load of the radio"""
 _MAX_ATTEMPTS = 5
@@ -58,8 +51,8 @@ def create_key_file(path: Path, entropy: Callable[[int], bytes]) -> int:
 
 def read_key_state() -> Script[KeyState]:
     """Return the state of the key in the robot."""
-    yield from wait_for_board(NO_BOARD)
-    return (yield from _request_key_state())
+    yield from wait_for_board()
+    return (yield from request_reply(Key(0), KeyState))
 
 
 def write_key(key: bytes) -> Script[KeyState]:
@@ -67,12 +60,15 @@ def write_key(key: bytes) -> Script[KeyState]:
 
     A lost answer is harmless: the state of the key is read back.
     """
-    yield from wait_for_board(NO_BOARD)
-    yield from _request_key_state()  # rejects a dongle, before the key is sent
+    yield from wait_for_board()
+    yield from request_reply(Key(0), KeyState)  # rejects a dongle, before the key is sent
     for _ in range(_MAX_ATTEMPTS):
         response = yield Request(Key(0, key), _WRITE_TIMEOUT)
         reply = response.reply
-        key_state = reply if isinstance(reply, KeyState) else (yield from _request_key_state())
+        if isinstance(reply, KeyState):
+            key_state = reply
+        else:
+            key_state = yield from request_reply(Key(0), KeyState)
         if key_state.rc == frames.BUSY:
             raise ProcedureError(
                 'the robot stores no key while it moves or its drivers are on: stop the bridge, '
@@ -105,20 +101,3 @@ def format_key_state(key_state: KeyState) -> str:
             't3mpc robot key write (or key erase) replaces the key'
         )
     return 'the robot has no key: any nRF24 radio can drive it'
-
-
-def _request_key_state() -> Script[KeyState]:
-    for _ in range(_MAX_ATTEMPTS):
-        response = yield Request(Key(0), _REPLY_TIMEOUT)
-        if isinstance(response.reply, KeyState):
-            return response.reply
-        if isinstance(response.reply, Refusal):
-            _raise_refusal(response.reply)
-    raise ProcedureError('the board stopped answering: did it restart, is the cable good?')
-
-
-def _raise_refusal(refusal: ReplyFrame) -> NoReturn:
-    unknown = isinstance(refusal, Refusal) and refusal.code == 1
-    raise ProcedureError(
-        WRONG_BOARD if unknown else 'the board does not support keys: is its firmware old?'
-    )

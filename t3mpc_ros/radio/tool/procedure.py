@@ -16,7 +16,7 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.radio.link import standstill_reasons as reasons
 from t3mpc_ros.radio.link.port_actions import Close, Open, PortAction, Wait, Write
-from t3mpc_ros.radio.protocol.codec import encode
+from t3mpc_ros.radio.protocol.codec import decode_from_board, decode_from_dongle, encode
 from t3mpc_ros.radio.protocol.frames import (
     Configure,
     Configured,
@@ -27,22 +27,33 @@ from t3mpc_ros.radio.protocol.frames import (
     KeyState,
     Ping,
     Pong,
+    Record,
+    RecordPart,
     Refusal,
     Result,
-    Settings,
-    SettingsState,
+    Samples,
+    Sense,
+    Store,
     Transmit,
 )
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
 from t3mpc_ros.radio.serial_port import PortError, SerialPort
 
-RequestFrame = Ping | Configure | Transmit | Key | Settings
+RequestFrame = Ping | Configure | Transmit | Key | Record | Store | Sense
 ReplyFrame = FromDongle | FromBoard
 
+NO_BOARD = 'no robot board answers on this port: is it the USB port of the robot?'
+WRONG_BOARD = (
+    'this is the dongle: key, settings and calibration of the robot are read and written over '
+    'the USB port of the robot board; ls -l /dev/serial/by-id lists both'
+)
+OLD_FIRMWARE = 'the firmware of the robot does not know this request: make -C firmware flash'
 _PING_TIMEOUT = 0.1
 """Timeout of a PING, s."""
 _MAX_PINGS = 50
 """Five seconds; a board that was reset by opening its port starts within 2 s."""
+_REPLY_TIMEOUT = 0.3
+_MAX_ATTEMPTS = 5
 _BYTE = 0xFF
 _POLL_PERIOD = 0.05
 """Period at which the runner polls for an interruption, s."""
@@ -87,8 +98,21 @@ class Response(NamedTuple):
 
 
 Value = TypeVar('Value')
+Reply = TypeVar('Reply', KeyState, RecordPart, Samples)
 Script = Generator[Request | Pause, Response, Value]
 """A script; its return value is the result of the procedure."""
+
+
+class Board(NamedTuple):
+    """A kind of board on a port."""
+
+    name: str
+    decode: Callable[[bytes], ReplyFrame]
+    """Decodes its frames."""
+
+
+DONGLE = Board('the dongle', decode_from_dongle)
+ROBOT_BOARD = Board("the robot's board", decode_from_board)
 
 
 class PortTask(Protocol):
@@ -215,20 +239,42 @@ def _is_reply_to(reply: ReplyFrame, request: RequestFrame) -> bool:
         Configure: Configured,
         Transmit: Result,
         Key: KeyState,
-        Settings: SettingsState,
+        Record: RecordPart,
+        Store: RecordPart,
+        Sense: Samples,
     }
     if not isinstance(reply, kinds[type(request)]) or reply.id != request.id:
         return False
     return not isinstance(request, Ping) or getattr(reply, 'echo', b'') == request.echo
 
 
-def wait_for_board(absent: str) -> Script[Pong]:
+def wait_for_board(absent: str = NO_BOARD) -> Script[Pong]:
     """Wait for a board to start; return its PONG, or raise ProcedureError(absent)."""
     for _ in range(_MAX_PINGS):
         response = yield Request(Ping(0, b'look'), _PING_TIMEOUT)
         if isinstance(response.reply, Pong):
             return response.reply
     raise ProcedureError(absent)
+
+
+def request_reply(frame: RequestFrame, kind: type[Reply]) -> Script[Reply]:
+    """Return the reply of the robot board to a frame, which is sent again after a timeout.
+
+    Raises
+    ------
+    ProcedureError
+        The board is another one, its firmware does not know the frame, or it stopped answering.
+    """
+    for _ in range(_MAX_ATTEMPTS):
+        response = yield Request(frame, _REPLY_TIMEOUT)
+        if isinstance(response.reply, kind):
+            return response.reply
+        if isinstance(response.reply, Refusal):
+            # A robot board refuses this as well; the answer of a dongle is no frame of a robot.
+            configuration = yield Request(Configure(0), _REPLY_TIMEOUT)
+            is_robot = isinstance(configuration.reply, Refusal)
+            raise ProcedureError(OLD_FIRMWARE if is_robot else WRONG_BOARD)
+    raise ProcedureError('the board stopped answering: did it restart, is the cable good?')
 
 
 def wait_for_dongle() -> Script[Pong]:
@@ -263,8 +309,25 @@ def read_radio_setup() -> Script[Configure]:
     raise ProcedureError(reasons.DONGLE_TIMEOUT)
 
 
+def run_script(
+    script: Script[Value], path: str, interrupted: Callable[[], bool], board: Board
+) -> Value:
+    """Return the result of a script at the port ``path`` of a board.
+
+    Raises
+    ------
+    ProcedureError
+        The script failed or was interrupted, or the port cannot be used.
+    """
+    procedure = Procedure(script, board.decode)
+    run_at_port(procedure, path, interrupted, board.name)
+    if procedure.error or procedure.result is None:
+        raise ProcedureError(procedure.error or 'interrupted')
+    return procedure.result
+
+
 def run_at_port(
-    task: PortTask, path: str, interrupted: Callable[[], bool], device: str = 'the dongle'
+    task: PortTask, path: str, interrupted: Callable[[], bool], device: str = DONGLE.name
 ) -> None:
     """Run a task at the port ``path`` of a device; poll ``interrupted`` 20 times a second."""
     runner = _PortRunner(task, path, device)

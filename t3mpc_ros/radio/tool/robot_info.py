@@ -15,6 +15,7 @@ from t3mpc_ros.radio.protocol.frames import (
     VERSION,
     Downlink,
     FrameError,
+    FrameErrorKind,
     Info,
     Param,
     ParamGet,
@@ -74,7 +75,10 @@ def _transact(parameters: LinkParameters, first: Downlink, what: int) -> Script[
     if isinstance(response.reply, Result) and response.reply.payload:
         try:
             return decode_uplink(response.reply.payload)
-        except FrameError:
+        except FrameError as error:
+            if error.kind is FrameErrorKind.VERSION:
+                version = response.reply.payload[0] >> 4
+                raise ProcedureError(reasons.robot_version(version)) from error
             return None
     return None
 
@@ -84,15 +88,13 @@ def _request_info(parameters: LinkParameters) -> Script[Info]:
         answer = yield from _transact(parameters, Poll(0, 0, frames.INFO), frames.INFO)
         if isinstance(answer, Info):
             if answer.protocol != VERSION:
-                raise ProcedureError(
-                    f'the robot must speak protocol {VERSION}: it speaks {answer.protocol}'
-                )
+                raise ProcedureError(reasons.robot_version(answer.protocol))
             return answer
     raise ProcedureError(reasons.robot_absent(parameters.channel))
 
 
 def _start_session(parameters: LinkParameters, session: Session) -> Script[Info]:
-    problem = reasons.HELLO_REJECTED
+    problem = reasons.robot_absent(parameters.channel)
     for number in range(_MAX_ATTEMPTS):
         # An artificial clock, strictly increasing: no command is sent in this session.
         hello = session.hello(1000 * number)

@@ -1,41 +1,67 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of the robot (radio address, channel, microsteps), over the USB of its board."""
+"""Settings of the robot over the USB of its board: change, compare, save to and load from YAML."""
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 from t3mpc_ros.radio.protocol import frames
-from t3mpc_ros.radio.protocol.frames import Refusal, Settings, SettingsState
-from t3mpc_ros.radio.tool.procedure import ProcedureError, Request, Script, wait_for_board
-
-NO_BOARD = 'no robot board answers on this port: is it the USB port of the robot?'
-WRONG_BOARD = (
-    'this is the dongle: settings are written over the USB port of the robot board; '
-    'ls -l /dev/serial/by-id lists both'
+from t3mpc_ros.radio.protocol.frames import SETTINGS_RECORD
+from t3mpc_ros.radio.tool.procedure import Script
+from t3mpc_ros.radio.tool.robot_records import (
+    RobotSettings,
+    Stored,
+    check_settings,
+    decode_settings,
+    encode_settings,
+    is_valid,
+    read_record,
+    unknown_record,
+    write_record,
 )
+
 SETTINGS_TEXTS = (
     'settings stored in both copies',
-    'settings stored, one of their two copies is damaged: t3mpc robot set writes both',
-    'no settings: the robot does not move until t3mpc robot set',
-    'settings damaged: the robot does not move until t3mpc robot set',
+    'settings stored, one of their two copies is damaged: t3mpc robot setup writes both',
+    'no settings: the robot does not move until t3mpc robot setup',
+    'settings damaged: the robot does not move until t3mpc robot setup',
+    'settings of an older firmware: the robot does not move until t3mpc robot setup',
+    'calibration damaged: the robot does not move until it is written again',
 )
 """By state of the settings."""
 ADDRESS_SIZE = 5
-_REPLY_TIMEOUT = 0.3
-_WRITE_TIMEOUT = 1.0
-"""s; 24 EEPROM cells of 3.4 ms, and the load of the radio"""
-_MAX_ATTEMPTS = 5
 _CONFUSABLE = (0x00, 0x55, 0xAA, 0xFF)
 """Bytes that the receiver takes for noise or a preamble (nRF24L01+ data sheet 1.0, 7.3.2)."""
+_LINK = ('address', 'channel', 'rate')
+"""Settings that are link parameters of the host too."""
+_BOARD = '/robot_board'
+"""Name of no node: a node rejects parameters that it does not have."""
 
 
-class Changes(NamedTuple):
-    """Values to change; None keeps the stored value, or takes the default on a new board."""
+class SettingsFileError(Exception):
+    """A file of settings cannot be read or written; the text contains the reason."""
 
-    address: bytes | None = None
-    channel: int | None = None
-    microsteps: int | None = None
+
+class StoredSettings(NamedTuple):
+    """Settings of the robot."""
+
+    state: int
+    """SETTINGS_GOOD, …"""
+    settings: RobotSettings
+    """The defaults if the robot has none."""
+
+    @property
+    def valid(self) -> bool:
+        """Whether the robot holds them."""
+        return is_valid(self.state)
+
+
+class Difference(NamedTuple):
+    """A setting with two values."""
+
+    name: str
+    old: object
+    new: object
 
 
 def draw_address(entropy: Callable[[int], bytes]) -> bytes:
@@ -47,88 +73,147 @@ def draw_address(entropy: Callable[[int], bytes]) -> bytes:
             return address
 
 
-def read_settings() -> Script[SettingsState]:
+def read_settings() -> Script[StoredSettings]:
     """Return the settings of the robot."""
-    yield from wait_for_board(NO_BOARD)
-    return (yield from _request_settings())
+    return _decode((yield from read_record(SETTINGS_RECORD)))
 
 
-def write_settings(changes: Changes, entropy: Callable[[int], bytes]) -> Script[SettingsState]:
-    """Store settings in both copies; return the result.
+def change_settings(
+    stored: StoredSettings, changes: Mapping[str, object], entropy: Callable[[int], bytes]
+) -> RobotSettings:
+    """Return the settings with changes, by field name.
 
     A robot without settings gets a random address, so that two robots never obey one host by
-    accident. A lost answer is harmless: the settings are read back.
+    accident.
+
+    Raises
+    ------
+    ValueError
+        A value is impossible.
     """
-    yield from wait_for_board(NO_BOARD)
-    now = yield from _request_settings()
-    stored = now.state in (frames.SETTINGS_GOOD, frames.SETTINGS_ONE_COPY)
-    address = changes.address or (now.address if stored else draw_address(entropy))
-    wanted = Settings(
-        0,
-        now.channel if changes.channel is None else changes.channel,
-        now.microsteps if changes.microsteps is None else changes.microsteps,
-        address,
-    )
-    for _ in range(_MAX_ATTEMPTS):
-        response = yield Request(wanted, _WRITE_TIMEOUT)
-        reply = response.reply
-        if not isinstance(reply, SettingsState):
-            reply = yield from _request_settings()
-        if reply.rc in _REASONS:
-            raise ProcedureError(_REASONS[reply.rc])
-        if reply.state == frames.SETTINGS_GOOD and reply[3:] == wanted[1:]:
-            return reply
-    raise ProcedureError('the robot does not confirm the settings: is the cable good?')
+    settings = stored.settings._replace(**changes)  # type: ignore[arg-type]
+    if not stored.valid and 'address' not in changes:
+        settings = settings._replace(address=draw_address(entropy))
+    check_settings(settings)
+    return settings
 
 
-_REASONS = {
-    frames.OUT_OF_RANGE: (
-        'the robot rejects the settings: channel 0 to 125, microsteps a power of two up to 256, '
-        'an address of different bytes'
-    ),
-    frames.BUSY: (
-        'the robot stores no settings while it moves, its drivers are on, or it writes: stop the '
-        'bridge, or press the reset button of the board'
-    ),
-    frames.FAILED: (
-        'the EEPROM of the board did not store the settings: the robot is locked; try again; '
-        'if it fails repeatedly, the chip is worn out'
-    ),
-}
+def write_settings(settings: RobotSettings) -> Script[StoredSettings]:
+    """Store settings in both copies; return what the robot holds."""
+    body = yield from write_record(SETTINGS_RECORD, encode_settings(settings))
+    return _decode(Stored(frames.SETTINGS_GOOD, body))
 
 
-def format_settings(settings: SettingsState) -> str:
-    """Return the settings as text, with the parameters of the bridge that belong to them."""
-    text = (
-        f'{SETTINGS_TEXTS[settings.state]}: address {settings.address.hex()}, '
-        f'channel {settings.channel}, {settings.microsteps} microsteps'
-    )
-    if settings.state in (frames.SETTINGS_MISSING, frames.SETTINGS_DAMAGED):
-        return text
-    return (
-        f'{text}\nradio_bridge: -p link.address:={settings.address.hex()} '
-        f'-p link.channel:={settings.channel}'
-    )
+def differences(old: RobotSettings, new: RobotSettings) -> list[Difference]:
+    """Return the settings that differ; the sensors one by one."""
+    pairs = [(name, getattr(old, name), getattr(new, name)) for name in old._fields[:-1]]
+    pairs += [
+        (f'sensors[{number}]', before, after)
+        for number, (before, after) in enumerate(zip(old.sensors, new.sensors, strict=True))
+    ]
+    return [Difference(*pair) for pair in pairs if pair[1] != pair[2]]
 
 
-def parameter_file(settings: SettingsState) -> str:
-    """Return a ROS parameter file with which a host talks to this robot."""
-    # Quoted: 1234567890 would be a number.
-    return (
-        '# Radio of the robot, written by t3mpc robot set.\n'
-        '/**:\n'
-        '  ros__parameters:\n'
-        '    link:\n'
-        f"      address: '{settings.address.hex()}'\n"
-        f'      channel: {settings.channel}\n'
+def format_differences(rows: list[Difference]) -> str:
+    """Return one line for each difference."""
+    return '\n'.join(f'{row.name}: {_text(row.old)} -> {_text(row.new)}' for row in rows)
+
+
+def format_settings(stored: StoredSettings) -> str:
+    """Return the settings as text."""
+    lines = [SETTINGS_TEXTS[stored.state]]
+    if not stored.valid:
+        return lines[0]
+    settings = stored.settings
+    same = len(set(settings.sensors)) == 1
+    for name in settings._fields[:-1]:
+        lines.append(f'  {name:<15} {_text(getattr(settings, name))}')
+    sensors = settings.sensors[:1] if same else settings.sensors
+    lines.append(f'  {"sensors":<15} {"8 x " if same else ""}{", ".join(sensors)}')
+    return '\n'.join(lines)
+
+
+def parameter_file(settings: RobotSettings) -> str:
+    """Return a ROS parameter file: the link parameters of the host, and all other settings."""
+    link = [f'{name}: {_yaml(getattr(settings, name))}' for name in _LINK]
+    other = [
+        f'{name}: {_yaml(getattr(settings, name))}'
+        for name in settings._fields
+        if name not in _LINK
+    ]
+    return '\n'.join(
+        (
+            '# Settings of the robot, written by t3mpc robot setup.',
+            '/**:',
+            *_indent(['ros__parameters:', *_indent(['link:', *_indent(link)])]),
+            f'{_BOARD}:',
+            *_indent(['ros__parameters:', *_indent(other)]),
+            '',
+        )
     )
 
 
-def _request_settings() -> Script[SettingsState]:
-    for _ in range(_MAX_ATTEMPTS):
-        response = yield Request(Settings(0), _REPLY_TIMEOUT)
-        if isinstance(response.reply, SettingsState):
-            return response.reply
-        if isinstance(response.reply, Refusal):
-            raise ProcedureError(WRONG_BOARD)
-    raise ProcedureError('the board stopped answering: did it restart, is the cable good?')
+def settings_of_file(content: object) -> RobotSettings:
+    """Return the settings of a file of :func:`parameter_file`, parsed as YAML.
+
+    Raises
+    ------
+    SettingsFileError
+        It is no such file, a name is unknown or missing, or a value is impossible.
+    """
+    values: dict[str, Any] = {}
+    try:
+        link = content['/**']['ros__parameters']['link']  # type: ignore[index]
+        board = content[_BOARD]['ros__parameters']  # type: ignore[index]
+        values = {**link, **board}
+        values['address'] = bytes.fromhex(values['address'])
+        values['sensors'] = tuple(values['sensors'])
+    except (KeyError, TypeError, ValueError) as error:
+        raise SettingsFileError(
+            f'must be a file of t3mpc robot setup --save, with link below /**, and {_BOARD}'
+        ) from error
+    unknown, missing = (
+        set(values) - set(RobotSettings._fields),
+        set(RobotSettings._fields) - set(values),
+    )
+    if unknown or missing:
+        names = ', '.join(sorted(unknown or missing))
+        raise SettingsFileError(f'{"has unknown" if unknown else "lacks the"} settings: {names}')
+    settings = RobotSettings(**values)
+    for name, kind in RobotSettings.__annotations__.items():
+        value = getattr(settings, name)
+        if kind in (int, bool) and type(value) is not kind:
+            raise SettingsFileError(f'{name} must be of type {kind.__name__}: got {value!r}')
+    try:
+        check_settings(settings)
+    except (TypeError, ValueError) as error:
+        raise SettingsFileError(str(error)) from error
+    return settings
+
+
+def _decode(stored: Stored) -> StoredSettings:
+    try:
+        return StoredSettings(stored.state, decode_settings(stored.body))
+    except ValueError as error:
+        raise unknown_record(error) from error
+
+
+def _text(value: object) -> str:
+    if isinstance(value, bytes):
+        return value.hex()
+    if isinstance(value, bool):
+        return 'yes' if value else 'no'
+    return str(value)
+
+
+def _indent(lines: list[str]) -> list[str]:
+    return [f'  {line}' for line in lines]
+
+
+def _yaml(value: object) -> str:
+    if isinstance(value, tuple):
+        return f'[{", ".join(map(_yaml, value))}]'
+    if isinstance(value, bool):
+        return str(value).lower()
+    # Quoted: 1234567890 and 12e4567890 would be numbers.
+    return str(value) if isinstance(value, (int, float)) else f"'{_text(value)}'"

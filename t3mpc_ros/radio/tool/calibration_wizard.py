@@ -1,0 +1,426 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Calibration wizard: what to do, what is measured, and how sure the result is, step by step.
+
+The wizard asks and shows texts through two functions and measures through a
+:class:`CalibrationRobot`. A measurement that is refused, or that the link interrupts, can be
+repeated; a step that is left out keeps the values of the calibration at the start. Nothing moves
+the robot without a yes to the question before it.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+import math
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.radio.tool.procedure import ProcedureError
+from t3mpc_ros.robot import calibration
+from t3mpc_ros.robot.calibration import (
+    COVERAGE,
+    MARKS,
+    Calibration,
+    CalibrationError,
+    Estimate,
+    GyroTurn,
+    MarkUncertainty,
+    RangeReading,
+    Recording,
+    SharpCurve,
+    StraightRun,
+    VoltageReading,
+)
+from t3mpc_ros.robot.interface import RANGE_SENSORS, WheelAngles
+
+STEPS = ('rest', 'radius', 'track', 'hand', 'ranges', 'battery')
+_TITLES = {
+    'rest': 'bias of the gyro, at rest',
+    'radius': 'wheel radius, on a straight line',
+    'track': 'track and scale of the gyro, turning on the spot',
+    'hand': 'scale of the gyro, turning by hand',
+    'ranges': 'distance sensors',
+    'battery': 'divider of the battery',
+}
+_REST_TIME = 10.0
+_RESTS = (4.0, 4.0)
+"""Before and after a turn, s."""
+_HAND_TIMEOUT = 120.0
+_SAMPLES = 20
+"""Of the converter for each reading: one second, in which a distance sensor measures 26 times."""
+_SKIP, _YES = 'skip', ('y', 'yes')
+_SIDES = (('front', 0), ('left', 2), ('rear', 4), ('right', 6))
+"""Side, and the number of the first of its two sensors."""
+
+
+class CalibrationRobot(Protocol):
+    """Measurements on a robot; each raises ProcedureError with a reason and a remedy."""
+
+    has_usb: bool
+    """Whether the USB port of the robot board is connected: raw counts."""
+
+    def rest(self, seconds: float) -> Recording:
+        """Return a recording of the robot at rest."""
+
+    def drive(self, angles: WheelAngles, speed: float, rests: tuple[float, float]) -> Recording:
+        """Turn the wheels by angles (rad); return the recording with the rests around it."""
+
+    def turn_by_hand(self, timeout: float, rests: tuple[float, float]) -> Recording:
+        """Return the recording of a turn by hand between two rests."""
+
+    def counts(self, samples: int) -> Sequence[tuple[int, ...]]:
+        """Return raw counts: of the eight distance sensors and, last, of the battery."""
+
+    def divider(self) -> float:
+        """Return the nominal divider of the battery, as in the settings of the robot."""
+
+    def store(self, found: Calibration) -> None:
+        """Store a calibration in the robot, in place of the one that it has."""
+
+
+class WizardOptions(NamedTuple):
+    """What is measured, and how sure a person is of it."""
+
+    marks: MarkUncertainty = MARKS
+    geometry: WheelGeometry = WheelGeometry()
+    """Nominal wheels, which decide how far the robot drives."""
+    steps: tuple[str, ...] = STEPS
+    distance: float = 2.0
+    """Length of a straight run, m."""
+    turns: int = 10
+    """Whole turns on the spot, and by hand."""
+    speed: float = 4.0
+    """Of the wheels, rad/s."""
+    distances: tuple[float, ...] = (0.1, 0.15, 0.2, 0.3, 0.5, 0.8)
+    """From the distance sensors to the board, m."""
+
+
+class Skipped(Exception):
+    """A step is left out."""
+
+
+class CalibrationWizard:
+    """Runs the steps and collects their results.
+
+    Parameters
+    ----------
+    robot
+        Measures.
+    ask
+        Shows a question; returns the answer.
+    show
+        Shows a line.
+    options
+        Steps, ways and uncertainties.
+    start
+        Calibration whose values are kept where a step is left out.
+    """
+
+    def __init__(
+        self,
+        robot: CalibrationRobot,
+        ask: Callable[[str], str],
+        show: Callable[[str], None],
+        options: WizardOptions,
+        start: Calibration,
+    ) -> None:
+        self._robot = robot
+        self._ask = ask
+        self._show = show
+        self._options = options
+        self._turns: list[tuple[float, GyroTurn]] = []
+        self.calibration = start
+        """The values so far."""
+
+    def run(self) -> Calibration:
+        """Run the steps; return the calibration."""
+        steps = [step for step in STEPS if step in self._options.steps]
+        if not self._robot.has_usb:
+            steps = [step for step in steps if step not in ('ranges', 'battery')]
+        actions = {
+            'rest': self._measure_rest,
+            'radius': self._measure_radius,
+            'track': self._measure_track,
+            'hand': self._measure_hand,
+            'ranges': self._measure_ranges,
+            'battery': self._measure_battery,
+        }
+        for number, step in enumerate(steps):
+            self._show(f'Step {number + 1} of {len(steps)}: {_TITLES[step]}')
+            self._repeat(actions[step])
+            self._show('')
+        for line in summary(self.calibration):
+            self._show(line)
+        if self._robot.has_usb:
+            self._repeat(self._store)
+        return self.calibration
+
+    def _store(self) -> None:
+        if self._answer('Store these values in the robot? [yes/no] ') not in _YES:
+            self._show('The robot keeps the values that it had.')
+            return
+        self._robot.store(self.calibration)
+        self._show('Stored in both copies, and read back.')
+
+    def _repeat(self, action: Callable[[], None]) -> None:
+        """Run an action until it succeeds or is left out."""
+        while True:
+            try:
+                action()
+            except (CalibrationError, ProcedureError) as error:
+                self._show(f'  Refused: {error}')
+                if self._answer(f'  Enter to repeat, or {_SKIP}: ') in ('', *_YES):
+                    continue
+            except Skipped:
+                pass
+            else:
+                return
+            self._show('  Left out: the value stays as it was.')
+            return
+
+    # -- steps ------------------------------------------------------------------------------------
+
+    def _measure_rest(self) -> None:
+        self._do(f'Put the robot on the floor, and do not touch it for {_REST_TIME:g} s.')
+        self._wait_for_enter()
+        recording = self._robot.rest(_REST_TIME)
+        rates = recording.rates
+        self._see(
+            f'{len(rates)} samples in {recording.times[-1]:.1f} s, scatter '
+            f'{np.std(rates):.4f} rad/s'
+        )
+        bias = calibration.estimate_gyro_bias(recording)
+        self._keep(gyro_bias=bias)
+        self._result(f'bias of the gyro {_degrees(bias)} deg/s')
+
+    def _measure_radius(self) -> None:
+        options, radius = self._options, self._options.geometry.wheel_radius
+        angle = options.distance / radius
+        self._do(
+            f'Put the robot on the floor with {options.distance + 0.5:g} m free in front of it.'
+        )
+        runs: list[StraightRun] = []
+        for way, sign in (('forward', 1.0), ('back', -1.0)):
+            self._confirm(
+                f'Mark where a wheel touches the floor. The robot drives {options.distance:g} m '
+                f'{way} at {options.speed * radius:.2f} m/s; Ctrl-C stops it.'
+            )
+            angles = WheelAngles(sign * angle, sign * angle)
+            recording = self._robot.drive(angles, options.speed, (0.0, 1.0))
+            right, left = _travelled(recording)
+            self._see(
+                f'the wheels turned {math.degrees(right):.1f} (right) and '
+                f'{math.degrees(left):.1f} (left) degrees'
+            )
+            distance = self._number(
+                'Mark where it touches the floor now. Between both marks, in m: '
+            )
+            runs.append(StraightRun(distance, right, left))
+            # Refused now, not after the way back.
+            calibration.estimate_wheel_radius(runs, options.marks)
+        found = calibration.estimate_wheel_radius(runs, options.marks)
+        self._keep(wheel_radius=found)
+        self._result(f'wheel radius {_millimetres(found)} mm, nominal {1e3 * radius:.2f}')
+
+    def _measure_track(self) -> None:
+        options, geometry = self._options, self._options.geometry
+        radius = self.calibration.wheel_radius
+        if radius is None:
+            raise CalibrationError(
+                'the track needs a wheel radius: got none; run the step radius before'
+            )
+        self._do(
+            'Put the robot in the middle of a free circle of 1 m. Its direction is marked by two '
+            'points on the floor, as far apart as possible.'
+        )
+        measured = []
+        for way, sign in (('left', 1.0), ('right', -1.0)):
+            rate = options.speed * radius.value / geometry.half_separation
+            self._confirm(
+                f'Mark its direction anew. The robot turns {options.turns} times to the {way} at '
+                f'{math.degrees(rate):.0f} deg/s; Ctrl-C stops it.'
+            )
+            angle = sign * options.turns * math.tau * geometry.half_separation / radius.value
+            recording = self._robot.drive(WheelAngles(angle, -angle), options.speed, _RESTS)
+            measured.append(self._read_turn(recording))
+        track = calibration.estimate_track(measured, radius, options.marks)
+        self._turns += measured
+        scale = calibration.estimate_gyro_scale(self._turns, options.marks)
+        self._keep(track=track, gyro_scale=scale)
+        self._result(
+            f'track {_millimetres(track)} mm, nominal {1e3 * geometry.wheel_separation:.2f}'
+        )
+        self._result(f'scale of the gyro {_value(scale, 1.0, 5)}')
+
+    def _measure_hand(self) -> None:
+        options = self._options
+        self._do(
+            'The motors are off in this step. Mark the direction of the robot on the floor. After '
+            f'Enter, let it rest for {_RESTS[0]:g} s, turn it {options.turns} times to the left '
+            f'by hand, back to the mark, slower than {0.9 * _FULL_SCALE:.0f} deg/s, and let it '
+            f'rest again; {_HAND_TIMEOUT:g} s in all.'
+        )
+        self._wait_for_enter()
+        recording = self._robot.turn_by_hand(_HAND_TIMEOUT, _RESTS)
+        turn = self._read_turn(recording)
+        scale = calibration.estimate_gyro_scale([*self._turns, turn], options.marks)
+        self._turns.append(turn)
+        self._keep(gyro_scale=scale)
+        self._result(f'scale of the gyro {_value(scale, 1.0, 5)}, of {len(self._turns)} turns')
+
+    def _measure_ranges(self) -> None:
+        self._do(
+            'Use a white board, wider than the robot, parallel to one side after the other. '
+            'Distances are from the faces of the sensors.'
+        )
+        for side, first in _SIDES:
+            self._repeat(partial(self._measure_side, side, first))
+
+    def _measure_side(self, side: str, first: int) -> None:
+        readings: tuple[list[RangeReading], list[RangeReading]] = ([], [])
+        for nominal in self._options.distances:
+            distance = self._number(
+                f'{side}: put the board at {nominal:g} m. Enter, or its distance in m: ', nominal
+            )
+            counts = self._robot.counts(_SAMPLES)
+            for number in (0, 1):
+                of_sensor = tuple(each[first + number] for each in counts)
+                readings[number].append(RangeReading(distance, of_sensor))
+            seen = (
+                f'{RANGE_SENSORS[first + number]} {np.mean(readings[number][-1].counts):.1f}'
+                for number in (0, 1)
+            )
+            self._see(f'mean counts: {", ".join(seen)}')
+        curves = list(self.calibration.curves)
+        for number in (0, 1):
+            name = RANGE_SENSORS[first + number]
+            try:
+                curve = calibration.estimate_sharp_curve(readings[number], self._options.marks)
+            except CalibrationError as error:
+                raise CalibrationError(f'{name}: {error}') from error
+            curves[first + number] = curve
+            self._result(f'{name} {_curve(curve)}')
+        self._keep(curves=tuple(curves))
+
+    def _measure_battery(self) -> None:
+        marks, divider = self._options.marks, self._robot.divider()
+        self._do(
+            'Connect a meter to the battery, or a bench supply in its place. Measure a full and '
+            'an empty battery, at least 1 V apart.'
+        )
+        readings = []
+        for which in ('first', 'second'):
+            meter = self._number(f'Voltage of the meter, {which}, in V: ')
+            counts = float(np.mean([each[-1] for each in self._robot.counts(_SAMPLES)]))
+            nominal = calibration.nominal_battery_voltage(counts, divider)
+            self._see(f'mean count {counts:.1f}: {nominal:.3f} V without correction')
+            readings.append(VoltageReading(meter, nominal))
+        found = calibration.estimate_divider(readings, divider, marks)
+        self._keep(divider=found)
+        self._result(
+            f'battery voltage times {1.0 + found.gain:.4f}, plus {found.offset:+.3f} V, '
+            f'± {COVERAGE * found.uncertainty:.3f} V'
+        )
+
+    # -- questions --------------------------------------------------------------------------------
+
+    def _read_turn(self, recording: Recording) -> tuple[float, GyroTurn]:
+        """Return the yaw (rad) of a turn, by its mark, and what the gyro measured."""
+        turn = calibration.measure_turn(recording)
+        fastest = math.degrees(float(np.max(np.abs(recording.rates))))
+        self._see(
+            f'the gyro counted {turn.rotation / math.tau:+.3f} turns, at up to {fastest:.0f} deg/s'
+        )
+        beyond = math.radians(
+            self._number('Degrees from the mark to the robot, left positive: ', 0.0)
+        )
+        return calibration.whole_turns(turn, beyond) * math.tau + beyond, turn
+
+    def _number(self, question: str, default: float | None = None) -> float:
+        """Return a number, asking until it is one; raise Skipped for ``skip``."""
+        while True:
+            text = self._answer(f'  {question}').replace(',', '.')
+            if text == _SKIP:
+                raise Skipped
+            if not text and default is not None:
+                return default
+            try:
+                value = float(text)
+            except ValueError:
+                value = math.nan
+            if math.isfinite(value):
+                return value
+            self._show(f'  Refused: the answer must be a number, or {_SKIP}: got {text!r}')
+
+    def _confirm(self, motion: str) -> None:
+        """Return after a yes; anything else leaves the step out."""
+        if self._answer(f'  {motion} Move now? [yes/{_SKIP}] ') not in _YES:
+            raise Skipped
+
+    def _wait_for_enter(self) -> None:
+        if self._answer(f'  Enter to begin, or {_SKIP}: ') == _SKIP:
+            raise Skipped
+
+    def _answer(self, question: str) -> str:
+        return self._ask(question).strip().lower()
+
+    def _do(self, text: str) -> None:
+        self._show(f'  Do: {text}')
+
+    def _see(self, text: str) -> None:
+        self._show(f'  Measured: {text}')
+
+    def _result(self, text: str) -> None:
+        self._show(f'  Result: {text}')
+
+    def _keep(self, **values: object) -> None:
+        self.calibration = self.calibration._replace(**values)  # type: ignore[arg-type]
+
+
+_FULL_SCALE = math.degrees(calibration.GYRO_FULL_SCALE)
+
+
+def summary(found: Calibration) -> list[str]:
+    """Return the lines of a calibration: value and interval of 95 %."""
+    lines = ['Calibration, with intervals of 95 %:']
+    for name, text in (
+        ('wheel radius', found.wheel_radius and f'{_millimetres(found.wheel_radius)} mm'),
+        ('track', found.track and f'{_millimetres(found.track)} mm'),
+        ('scale of the gyro', found.gyro_scale and _value(found.gyro_scale, 1.0, 5)),
+        ('bias of the gyro', found.gyro_bias and f'{_degrees(found.gyro_bias)} deg/s'),
+        (
+            'battery voltage',
+            found.divider and f'± {COVERAGE * found.divider.uncertainty:.3f} V',
+        ),
+    ):
+        lines.append(f'  {name:<18}  {text or "not calibrated"}')
+    for name, curve in zip(RANGE_SENSORS, found.curves, strict=True):
+        lines.append(f'  {name:<18}  {_curve(curve) if curve else "not calibrated"}')
+    return lines
+
+
+def _travelled(recording: Recording) -> tuple[float, float]:
+    """Return the angles of both wheels, right first, rad."""
+    right, left = recording.right, recording.left
+    return float(right[-1] - right[0]), float(left[-1] - left[0])
+
+
+def _value(estimate: Estimate, factor: float, digits: int) -> str:
+    half = factor * COVERAGE * estimate.uncertainty
+    return f'{factor * estimate.value:.{digits}f} ± {half:.{digits}f}'
+
+
+def _millimetres(estimate: Estimate) -> str:
+    return _value(estimate, 1e3, 3)
+
+
+def _degrees(estimate: Estimate) -> str:
+    return _value(estimate, math.degrees(1.0), 3)
+
+
+def _curve(curve: SharpCurve) -> str:
+    return (
+        f'{curve.scale:.4f} V m / (d + {curve.shift:.4f} m) + {curve.offset:.4f} V, '
+        f'± {1e3 * COVERAGE * curve.uncertainty:.0f} mm or better'
+    )

@@ -1,0 +1,103 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Log of the robot, over the USB of its board: resets, faults, longest pass of its main loop."""
+
+from collections.abc import Iterable
+from enum import IntEnum
+import struct
+from typing import NamedTuple
+
+from t3mpc_ros.radio.protocol.frames import LOG_RECORD, Record
+from t3mpc_ros.radio.protocol.framing import crc16
+from t3mpc_ros.radio.tool.procedure import Script, wait_for_board
+from t3mpc_ros.radio.tool.robot_records import request_part
+from t3mpc_ros.radio.tool.robot_settings import SETTINGS_TEXTS
+
+_PLACES = 16
+_ENTRY = struct.Struct('<IBBIHHH')
+_WORD = 1 << 32
+_RESETS = ('power on', 'reset button or opened port', 'brown-out', 'watchdog', 'JTAG')
+"""By bit of the register MCUSR of the AVR."""
+
+
+class LogKind(IntEnum):
+    """Kind of an entry."""
+
+    BOOT = 1
+    ESTOP = 2
+    EXPIRED = 3
+    IMU = 4
+    RADIO = 5
+    BATTERY = 6
+    RECORDS = 7
+    LOOP = 8
+
+
+class LogEntry(NamedTuple):
+    """An entry of the log."""
+
+    number: int
+    """Counts all entries, modulo 2**32."""
+    kind: int
+    """A LogKind."""
+    uptime: int
+    """Time since the boot before, s."""
+    value: int
+    """Reset cause, millivolts, state or microseconds, by the kind."""
+
+
+def read_log() -> Script[tuple[LogEntry, ...]]:
+    """Return the entries of the log, oldest first."""
+    yield from wait_for_board()
+    places = []
+    for place in range(_PLACES):
+        places.append((yield from request_part(Record(0, LOG_RECORD, place))).data)
+    return decode_log(places)
+
+
+def decode_log(places: Iterable[bytes]) -> tuple[LogEntry, ...]:
+    """Return the valid entries of a ring, oldest first."""
+    entries = []
+    for data in places:
+        number, kind, _, uptime, value, _, crc = _ENTRY.unpack(data)
+        if crc == crc16(data[:-2]):
+            entries.append(LogEntry(number, kind, uptime, value))
+    if not entries:
+        return ()
+    # The numbers wrap: all lie within 16 before the newest.
+    first = entries[0].number
+    return tuple(sorted(entries, key=lambda entry: (entry.number - first + _WORD // 2) % _WORD))
+
+
+def format_log(entries: tuple[LogEntry, ...]) -> str:
+    """Return the log as text, one entry a line."""
+    if not entries:
+        return 'the log is empty'
+    return '\n'.join(
+        f'{entry.number:>6}  {entry.uptime:>7} s  {_describe(entry)}' for entry in entries
+    )
+
+
+def _describe(entry: LogEntry) -> str:
+    value = entry.value
+    match entry.kind:
+        case LogKind.BOOT:
+            causes = [text for bit, text in enumerate(_RESETS) if value >> bit & 1]
+            return f'boot: {", ".join(causes) or "started by a boot loader"}'
+        case LogKind.ESTOP:
+            return 'emergency stop'
+        case LogKind.EXPIRED:
+            return 'stopped by itself: no command in time'
+        case LogKind.IMU:
+            return 'the inertial sensor does not answer'
+        case LogKind.RADIO:
+            return 'the radio chip does not answer'
+        case LogKind.BATTERY:
+            return f'battery below its cut-off: {value / 1000:.1f} V'
+        case LogKind.RECORDS:
+            known = value < len(SETTINGS_TEXTS)
+            return SETTINGS_TEXTS[value] if known else f'records in state {value}'
+        case LogKind.LOOP:
+            return f'longest pass of the main loop: {value / 1000:.1f} ms'
+        case _:
+            return f'unknown entry {entry.kind}: {value}'

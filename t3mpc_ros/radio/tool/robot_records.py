@@ -1,0 +1,405 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Records in the EEPROM of the robot: settings and calibration, over the USB of its board.
+
+The robot holds each record in two copies with a CRC. A record is written completely or not at
+all: a loss of power at any cell leaves the old values, the new ones, or a robot that accepts no
+session.
+docs/radio.md has the layouts and units of the wire; this module has SI units.
+
+:func:`~t3mpc_ros.radio.tool.procedure.run_script` runs a script at a port::
+
+    stored = run_script(write_calibration(found), '/dev/ttyACM0', interrupted, ROBOT_BOARD)
+"""
+
+import math
+import struct
+from typing import Any, NamedTuple
+
+from t3mpc_ros.radio.protocol import frames
+from t3mpc_ros.radio.protocol.frames import (
+    CALIBRATION_RECORD,
+    PART_SIZE,
+    Record,
+    RecordPart,
+    Samples,
+    Sense,
+    Store,
+)
+from t3mpc_ros.radio.protocol.framing import crc16
+from t3mpc_ros.radio.tool.procedure import (
+    OLD_FIRMWARE,
+    Pause,
+    ProcedureError,
+    Request,
+    Script,
+    request_reply,
+    wait_for_board,
+)
+from t3mpc_ros.robot.calibration import Calibration, DividerCorrection, Estimate, SharpCurve
+
+RATES = ('250k', '1M', '2M')
+"""Air data rates, bit/s, by their number on the wire."""
+POWERS = ('-18', '-12', '-6', '0')
+"""Output powers, dBm."""
+SENSORS = ('none', 'GP2Y0A21', 'GP2Y0A41')
+"""Types of a distance sensor."""
+SENSOR_COUNT = 8
+NOT_MEASURED = 0xFFFF
+"""Count of a sensor that the converter has not measured."""
+_SAMPLE_PERIOD = 0.05
+"""s; a distance sensor measures every 38 ms"""
+_WRITE_TIMEOUT = 2.0
+"""s; at most 174 EEPROM cells of 3.4 ms, and the load of the radio"""
+_MAX_ATTEMPTS = 5
+_SETTINGS = struct.Struct('<BBH5sBBHBH8s')
+_SETTINGS_FORMAT, _CALIBRATION_FORMAT = 2, 1
+_CALIBRATION = struct.Struct('<BIHIHhHhHhhH')
+_CURVE = struct.Struct('<HhhB')
+_MILLIDEGREE = math.radians(1e-3)
+
+
+class RobotSettings(NamedTuple):
+    """Settings of the robot; the defaults are those of a robot that was never set up."""
+
+    address: bytes = b'T3MPC'
+    """5 bytes that are not all equal, last transmitted byte first."""
+    channel: int = 82
+    """2400 MHz plus this, 0 to 125."""
+    rate: str = '1M'
+    """One of :data:`RATES`."""
+    power: str = '0'
+    """One of :data:`POWERS`."""
+    microsteps: int = 16
+    """Per full step, a power of two up to 256."""
+    steps_per_turn: int = 200
+    """Full steps of a turn of the wheel, 20 to 10000."""
+    invert_left: bool = False
+    """The motor is mounted or wired in reverse."""
+    invert_right: bool = False
+    divider: float = 4.0
+    """Battery voltage / voltage at the converter, 1 to 13."""
+    sensors: tuple[str, ...] = SENSOR_COUNT * ('GP2Y0A21',)
+    """One of :data:`SENSORS` each, in the order of STATE."""
+
+
+def is_valid(state: int) -> bool:
+    """Return whether a robot with a record in this state holds it: in one copy at least."""
+    return state in (frames.SETTINGS_GOOD, frames.SETTINGS_ONE_COPY)
+
+
+class Stored(NamedTuple):
+    """A record of the robot."""
+
+    state: int
+    """SETTINGS_GOOD, …"""
+    body: bytes
+    """In effect; of the defaults unless ``state`` is SETTINGS_GOOD or SETTINGS_ONE_COPY."""
+
+    @property
+    def valid(self) -> bool:
+        """Whether the robot holds the record."""
+        return is_valid(self.state)
+
+
+# -- layouts --------------------------------------------------------------------------------------
+
+
+def encode_settings(settings: RobotSettings) -> bytes:
+    """Return the record of the settings.
+
+    Raises
+    ------
+    ValueError
+        A value is impossible; the text names field, bound and value.
+    """
+    check_settings(settings)
+    return _SETTINGS.pack(
+        _SETTINGS_FORMAT,
+        settings.channel,
+        settings.microsteps,
+        settings.address,
+        RATES.index(settings.rate),
+        POWERS.index(settings.power),
+        settings.steps_per_turn,
+        settings.invert_left + 2 * settings.invert_right,
+        round(1000.0 * settings.divider),
+        bytes(SENSORS.index(name) for name in settings.sensors),
+    )
+
+
+def check_settings(settings: RobotSettings) -> None:
+    """Raise ValueError for the first impossible value."""
+    bounds = (
+        (
+            'address',
+            len(settings.address) == 5 and len(set(settings.address)) > 1,
+            '5 bytes that are not all equal',
+        ),
+        ('channel', 0 <= settings.channel <= 125, 'from 0 to 125'),
+        ('rate', settings.rate in RATES, f'one of {", ".join(RATES)}'),
+        ('power', settings.power in POWERS, f'one of {", ".join(POWERS)} dBm'),
+        (
+            'microsteps',
+            settings.microsteps in [1 << power for power in range(9)],
+            'a power of two from 1 to 256',
+        ),
+        ('steps_per_turn', 20 <= settings.steps_per_turn <= 10_000, 'from 20 to 10000'),
+        ('divider', 1.0 <= settings.divider <= 13.0, 'from 1 to 13'),
+        (
+            'sensors',
+            len(settings.sensors) == SENSOR_COUNT and set(settings.sensors) <= set(SENSORS),
+            f'{SENSOR_COUNT} of {", ".join(SENSORS)}',
+        ),
+    )
+    for name, good, bound in bounds:
+        if not good:
+            raise ValueError(f'{name} must be {bound}: got {getattr(settings, name)!r}')
+
+
+def decode_settings(body: bytes) -> RobotSettings:
+    """Return the settings of a record of the robot; ValueError for another format."""
+    _, channel, microsteps, address, rate, power, steps, inverted, divider, sensors = _unpack(
+        'settings', _SETTINGS, _SETTINGS_FORMAT, body
+    )
+    settings = RobotSettings(
+        address,
+        channel,
+        _choice(RATES, rate),
+        _choice(POWERS, power),
+        microsteps,
+        steps,
+        bool(inverted & 1),
+        bool(inverted & 2),
+        divider / 1000.0,
+        tuple(_choice(SENSORS, number) for number in sensors),
+    )
+    check_settings(settings)
+    return settings
+
+
+def encode_calibration(calibration: Calibration) -> bytes:
+    """Return the record of a calibration.
+
+    Lengths are 1 mm to 10 m with an uncertainty of at most 6.5 mm, the scale of the gyro 0.8 to
+    1.2, its bias at most 0.57 rad/s, the gain of the divider at most 0.2.
+
+    Raises
+    ------
+    ValueError
+        A value does not fit; the text names field, bound and value.
+    """
+    if len(calibration.curves) != SENSOR_COUNT:
+        raise ValueError(f'curves must be {SENSOR_COUNT}: got {len(calibration.curves)}')
+    scale = calibration.gyro_scale
+    if scale is not None:
+        scale = scale._replace(value=scale.value - 1.0)
+    divider = calibration.divider or DividerCorrection(0.0, 0.0, 0.0)
+    head = _CALIBRATION.pack(
+        _CALIBRATION_FORMAT,
+        *_estimate('wheel_radius', calibration.wheel_radius, 1e-7, 10_000, 100_000_000),
+        *_estimate('track', calibration.track, 1e-7, 10_000, 100_000_000),
+        *_estimate('gyro_scale - 1', scale, 1e-5, -20_000, 20_000),
+        *_estimate('gyro_bias', calibration.gyro_bias, _MILLIDEGREE, -0x8000, 0x7FFF),
+        _steps('divider.gain', divider.gain, 1e-5, -20_000, 20_000),
+        _steps('divider.offset', divider.offset, 1e-3, -0x8000, 0x7FFF),
+        0
+        if calibration.divider is None
+        else _ceil('divider.uncertainty', divider.uncertainty, 1e-3, 0xFFFF),
+    )
+    return head + b''.join(
+        _encode_curve(f'curves[{number}]', curve)
+        for number, curve in enumerate(calibration.curves)
+    )
+
+
+def decode_calibration(body: bytes) -> Calibration:
+    """Return the calibration of a record of the robot; ValueError for another format."""
+    head = body[: _CALIBRATION.size]
+    if len(body) != _CALIBRATION.size + SENSOR_COUNT * _CURVE.size:
+        raise ValueError(f'calibration must be a known format: got {len(body)} bytes')
+    _, radius, d_radius, track, d_track, scale, d_scale, bias, d_bias, gain, offset, d_battery = (
+        _unpack('calibration', _CALIBRATION, _CALIBRATION_FORMAT, head)
+    )
+    curves = tuple(
+        SharpCurve(1e-4 * scale, 1e-4 * shift, 1e-4 * level, 1e-3 * error) if error else None
+        for scale, shift, level, error in _CURVE.iter_unpack(body[_CALIBRATION.size :])
+    )
+    return Calibration(
+        Estimate(1e-7 * radius, 1e-7 * d_radius) if d_radius else None,
+        Estimate(1e-7 * track, 1e-7 * d_track) if d_track else None,
+        Estimate(1.0 + 1e-5 * scale, 1e-5 * d_scale) if d_scale else None,
+        Estimate(_MILLIDEGREE * bias, _MILLIDEGREE * d_bias) if d_bias else None,
+        DividerCorrection(1e-5 * gain, 1e-3 * offset, 1e-3 * d_battery) if d_battery else None,
+        curves,
+    )
+
+
+def _unpack(name: str, layout: struct.Struct, number: int, body: bytes) -> tuple[Any, ...]:
+    if len(body) != layout.size or body[0] != number:
+        raise ValueError(
+            f'{name} must be of format {number}: got {len(body)} bytes, format {body[:1].hex()}'
+        )
+    return layout.unpack(body)
+
+
+def unknown_record(error: ValueError) -> ProcedureError:
+    """Return the error of a valid record that cannot be decoded: the firmware is newer."""
+    return ProcedureError(
+        f'the robot holds a record that this host does not know ({error}): update the host'
+    )
+
+
+def _choice(names: tuple[str, ...], number: int) -> str:
+    return names[number] if number < len(names) else f'number {number}'
+
+
+def _steps(name: str, value: float, unit: float, low: int, high: int) -> int:
+    steps = round(value / unit) if math.isfinite(value) else high + 1
+    if not low <= steps <= high:
+        raise ValueError(f'{name} must be from {low * unit:.6g} to {high * unit:.6g}: got {value}')
+    return steps
+
+
+def _ceil(name: str, value: float, unit: float, high: int) -> int:
+    """Return an uncertainty in units; never less than it is, and never 0."""
+    # Stored and read back it is the same, though 3e-4 / 1e-4 is above 3.
+    steps = math.ceil(value / unit - 1e-6) if 0.0 < value < math.inf else high + 1
+    if max(steps, 1) > high:
+        raise ValueError(f'{name} must be above 0, up to {high * unit:.6g}: got {value}')
+    return max(steps, 1)
+
+
+def _estimate(
+    name: str, estimate: Estimate | None, unit: float, low: int, high: int
+) -> tuple[int, int]:
+    if estimate is None:
+        return 0, 0
+    value = _steps(name, estimate.value, unit, low, high)
+    return value, _ceil(f'{name}.uncertainty', estimate.uncertainty, unit, 0xFFFF)
+
+
+def _encode_curve(name: str, curve: SharpCurve | None) -> bytes:
+    if curve is None:
+        return bytes(_CURVE.size)
+    return _CURVE.pack(
+        _steps(f'{name}.scale', curve.scale, 1e-4, 1, 10_485),
+        _steps(f'{name}.shift', curve.shift, 1e-4, -0x8000, 0x7FFF),
+        _steps(f'{name}.offset', curve.offset, 1e-4, -0x8000, 0x7FFF),
+        _ceil(f'{name}.uncertainty', curve.uncertainty, 1e-3, 0xFF),
+    )
+
+
+# -- scripts --------------------------------------------------------------------------------------
+
+
+def read_calibration() -> Script[Calibration]:
+    """Return the calibration of the robot, all None if it was never calibrated.
+
+    Raises
+    ------
+    ProcedureError
+        The calibration is damaged or of a newer firmware, or the port is not that of a robot.
+    """
+    stored = yield from read_record(CALIBRATION_RECORD)
+    if stored.state == frames.SETTINGS_DAMAGED:
+        raise ProcedureError(
+            'the calibration of the robot is damaged, so it accepts no session: write it again'
+        )
+    try:
+        return decode_calibration(stored.body)
+    except ValueError as error:
+        raise unknown_record(error) from error
+
+
+def write_calibration(calibration: Calibration) -> Script[Calibration]:
+    """Store a calibration in both copies; return what the robot now holds, rounded to its units.
+
+    It replaces the old one completely: to change a value, write ``read_calibration()`` with it
+    replaced. The session of the robot ends, and the values are in effect at once. The robot must
+    stand still, with its drivers off.
+
+    Raises
+    ------
+    ValueError
+        A value does not fit; raised before anything is sent.
+    ProcedureError
+        The robot moves, its EEPROM failed, or the port is not that of a robot.
+    """
+    body = encode_calibration(calibration)
+    return decode_calibration((yield from write_record(CALIBRATION_RECORD, body)))
+
+
+def read_samples() -> Script[Samples]:
+    """Return the newest raw samples of distance sensors, battery and inertial sensor."""
+    return (yield from request_reply(Sense(0), Samples))
+
+
+def range_counts(samples: Samples) -> tuple[int, ...]:
+    """Return the counts of the eight distance sensors, in the order of STATE."""
+    return struct.unpack('<8H', samples.ranges)
+
+
+def read_counts(samples: int) -> Script[list[tuple[int, ...]]]:
+    """Return samples of the raw counts: eight distance sensors and, last, the battery."""
+    yield from wait_for_board()
+    counts = []
+    for _ in range(samples):
+        sample = yield from read_samples()
+        counts.append((*range_counts(sample), sample.battery))
+        yield Pause(_SAMPLE_PERIOD)
+    return counts
+
+
+def read_record(record: int) -> Script[Stored]:
+    """Return a record, after the board has answered."""
+    yield from wait_for_board()
+    return (yield from _read_parts(record))
+
+
+def write_record(record: int, body: bytes) -> Script[bytes]:
+    """Stage and store a record; return its content. A lost answer is harmless: it is read back."""
+    yield from wait_for_board()
+    rc = frames.FAILED
+    for _ in range(_MAX_ATTEMPTS):
+        for part in range(-(-len(body) // PART_SIZE)):
+            data = body[part * PART_SIZE :][:PART_SIZE].ljust(PART_SIZE, b'\0')
+            yield from request_part(Record(0, record, part, data))
+        response = yield Request(Store(0, record, crc16(body)), _WRITE_TIMEOUT)
+        if isinstance(response.reply, RecordPart):
+            rc = response.reply.rc
+            if rc in _REASONS:
+                raise ProcedureError(_REASONS[rc])
+        stored = yield from _read_parts(record)
+        if stored.state == frames.SETTINGS_GOOD and stored.body == body:
+            return stored.body
+    raise ProcedureError('the robot does not confirm the record: is the cable good?')
+
+
+_REASONS = {
+    frames.OUT_OF_RANGE: 'the robot rejects the values: is its firmware older than this host?',
+    frames.BUSY: (
+        'the robot stores nothing while it moves, its drivers are on, or it writes: stop the '
+        'bridge, or press the reset button of the board'
+    ),
+    frames.FAILED: (
+        'the EEPROM of the board did not store the record: the robot is locked; try again; '
+        'if it fails repeatedly, the chip is worn out'
+    ),
+}
+
+
+def _read_parts(record: int) -> Script[Stored]:
+    first = yield from request_part(Record(0, record, 0))
+    body = first.data
+    for part in range(1, -(-first.size // PART_SIZE)):
+        body += (yield from request_part(Record(0, record, part))).data
+    return Stored(first.state, body[: first.size])
+
+
+def request_part(request: Record) -> Script[RecordPart]:
+    """Return the answer to a RECORD, or raise ProcedureError."""
+    reply = yield from request_reply(request, RecordPart)
+    if reply.rc != frames.OK:
+        raise ProcedureError(OLD_FIRMWARE)
+    return reply

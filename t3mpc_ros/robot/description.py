@@ -1,0 +1,195 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Where things are on the robot: faces of the range sensors, fixed frames, and the URDF.
+
+The origin of the base frame is on the floor below the middle of the axle, x forward, y to the
+left (REP 103), so that the pose of the odometry has no height. The description has simple shapes
+and no meshes; masses are those of the simulation and stand in its parameters.
+"""
+
+import math
+from typing import NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+import numpy.typing as npt
+
+from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.robot.interface import RANGE_SENSORS
+from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
+
+Array = npt.NDArray[np.float64]
+
+_TYRE_WIDTH = 0.02  # m
+_SENSOR_SIZE = '0.013 0.037 0.013'  # m: depth, width and height of the GP2Y0A21YK0F
+
+
+class FrameNames(NamedTuple):
+    """Names of the frames and wheel joints of a robot, without the prefix of its namespace."""
+
+    base: str = 'base_link'
+    imu: str = 'imu_link'
+    range_prefix: str = ''
+    """The frame of a range sensor is this, then ``<sensor>_range_link``."""
+    right_wheel_joint: str = 'right_wheel_joint'
+    left_wheel_joint: str = 'left_wheel_joint'
+
+    def range_sensor(self, sensor: str) -> str:
+        """Return the frame of a range sensor of :data:`RANGE_SENSORS`."""
+        return f'{self.range_prefix}{sensor}_range_link'
+
+
+class FixedFrame(NamedTuple):
+    """A frame that does not move in the base frame."""
+
+    name: str
+    x: float
+    """m, forward"""
+    y: float
+    """m, to the left"""
+    z: float
+    """m above the floor"""
+    yaw: float
+    """rad"""
+
+
+def sensor_mounts(parameters: RangeSensorParameters) -> Array:
+    """Return x, y (m) and direction (rad) of each sensor's face in the body frame, shape (8, 3).
+
+    x is forward and y to the left of the middle of the axle; in the order of RANGE_SENSORS.
+    """
+    ahead, aside, offset = parameters.half_length, parameters.half_width, parameters.offset
+    quarter = 0.5 * math.pi
+    return np.array(
+        [
+            [ahead, offset, 0.0],
+            [ahead, -offset, 0.0],
+            [offset, aside, quarter],
+            [-offset, aside, quarter],
+            [-ahead, offset, math.pi],
+            [-ahead, -offset, math.pi],
+            [offset, -aside, -quarter],
+            [-offset, -aside, -quarter],
+        ]
+    )
+
+
+def ray_ends(poses: Array, ranges: Array, mounts: Array) -> Array:
+    """Return where the rays of range sensors end, m, shape (n, k, 2).
+
+    Parameters
+    ----------
+    poses
+        x, y (m), yaw (rad) of the robot, shape (n, 3).
+    ranges
+        Reach of each ray, m, shape (n, k); 0 gives the faces of the sensors, and a reach that is
+        not finite NaN.
+    mounts
+        As :func:`sensor_mounts`, shape (k, 3).
+    """
+    x, y, yaw = (column[:, None] for column in poses.T)
+    ahead, left, direction = (column[None, :] for column in mounts.T)
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    reach = np.where(np.isfinite(ranges), ranges, math.nan)
+    return np.stack(
+        [
+            x + cosine * ahead - sine * left + reach * np.cos(yaw + direction),
+            y + sine * ahead + cosine * left + reach * np.sin(yaw + direction),
+        ],
+        axis=-1,
+    )
+
+
+def fixed_frames(
+    names: FrameNames, geometry: WheelGeometry, sensors: RangeSensorParameters
+) -> list[FixedFrame]:
+    """Return the frames of the IMU and of the eight range sensors, at the height of the axle.
+
+    The IMU lies on the middle of the axle with its axes parallel to those of the base. The x axis
+    of a range sensor is its beam, the origin its face.
+    """
+    height = geometry.wheel_radius
+    ranges = [
+        FixedFrame(names.range_sensor(sensor), float(x), float(y), height, float(direction))
+        for sensor, (x, y, direction) in zip(RANGE_SENSORS, sensor_mounts(sensors), strict=True)
+    ]
+    return [FixedFrame(names.imu, 0.0, 0.0, height, 0.0), *ranges]
+
+
+def urdf(names: FrameNames, geometry: WheelGeometry, sensors: RangeSensorParameters) -> str:
+    """Return the URDF of the robot: body, wheels, castor, IMU and range sensors.
+
+    Its joints are the two wheels, continuous and named as in ``joint_states``, and the fixed ones
+    of :func:`fixed_frames`.
+    """
+    robot = ElementTree.Element('robot', name='t3mpc_robot')
+    for colour, rgba in (('body', '0.85 0.87 0.9 1'), ('tyre', '0.15 0.15 0.15 1')):
+        material = ElementTree.SubElement(robot, 'material', name=colour)
+        ElementTree.SubElement(material, 'color', rgba=rgba)
+    radius, half = geometry.wheel_radius, geometry.half_separation
+    base = ElementTree.SubElement(robot, 'link', name=names.base)
+    # The body ends where the sensors begin; it and the castor leave the floor to the wheels.
+    width = 2.0 * min(sensors.half_width, half) - _TYRE_WIDTH
+    length = 2.0 * sensors.half_length
+    _add_shape(
+        base, 'box', 'body', (0.0, 0.0, 1.2 * radius), size=f'{length:g} {width:g} {radius:g}'
+    )
+    castor = 0.35 * radius
+    for end in (1.0, -1.0):
+        place = (end * (sensors.half_length - castor), 0.0, castor)
+        _add_shape(base, 'sphere', 'tyre', place, radius=f'{castor:.9g}')
+    for joint, side in ((names.right_wheel_joint, -half), (names.left_wheel_joint, half)):
+        name = f'{joint.removesuffix("_joint")}_link'
+        wheel = ElementTree.SubElement(robot, 'link', name=name)
+        upright = (0.5 * math.pi, 0.0, 0.0)
+        tyre = {'radius': f'{radius:.9g}', 'length': f'{_TYRE_WIDTH:g}'}
+        _add_shape(wheel, 'cylinder', 'tyre', (0.0, 0.0, 0.0), upright, **tyre)
+        found = _add_joint(robot, 'continuous', joint, names.base, name, (0.0, side, radius), 0.0)
+        ElementTree.SubElement(found, 'axis', xyz='0 1 0')
+    for frame in fixed_frames(names, geometry, sensors):
+        link = ElementTree.SubElement(robot, 'link', name=frame.name)
+        if frame.name != names.imu:
+            _add_shape(link, 'box', 'tyre', (-0.0065, 0.0, 0.0), size=_SENSOR_SIZE)
+        joint = f'{frame.name.removesuffix("_link")}_joint'
+        place = (frame.x, frame.y, frame.z)
+        _add_joint(robot, 'fixed', joint, names.base, frame.name, place, frame.yaw)
+    ElementTree.indent(robot)
+    return f'<?xml version="1.0"?>\n{ElementTree.tostring(robot, encoding="unicode")}\n'
+
+
+def _add_shape(
+    link: ElementTree.Element,
+    shape: str,
+    material: str,
+    place: tuple[float, float, float],
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    **size: str,
+) -> None:
+    """Add a shape to a link, to be seen and to collide; ``turn`` is roll, pitch, yaw (rad)."""
+    for purpose in ('visual', 'collision'):
+        element = ElementTree.SubElement(link, purpose)
+        ElementTree.SubElement(element, 'origin', xyz=_numbers(place), rpy=_numbers(turn))
+        geometry = ElementTree.SubElement(element, 'geometry')
+        ElementTree.SubElement(geometry, shape, size)
+        if purpose == 'visual':
+            ElementTree.SubElement(element, 'material', name=material)
+
+
+def _add_joint(
+    robot: ElementTree.Element,
+    kind: str,
+    name: str,
+    parent: str,
+    child: str,
+    place: tuple[float, float, float],
+    yaw: float,
+) -> ElementTree.Element:
+    joint = ElementTree.SubElement(robot, 'joint', name=name, type=kind)
+    ElementTree.SubElement(joint, 'parent', link=parent)
+    ElementTree.SubElement(joint, 'child', link=child)
+    ElementTree.SubElement(joint, 'origin', xyz=_numbers(place), rpy=_numbers((0.0, 0.0, yaw)))
+    return joint
+
+
+def _numbers(values: tuple[float, float, float]) -> str:
+    return ' '.join(f'{value:.9g}' for value in values)

@@ -1,0 +1,137 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``make flash``: the programmer is found, and avrdude gets the right command."""
+
+import importlib.util
+import os
+from pathlib import Path
+import subprocess
+import threading
+
+import pytest
+
+FIRMWARE = Path(__file__).resolve().parents[2] / 'firmware'
+
+
+def load():
+    spec = importlib.util.spec_from_file_location('flash', FIRMWARE / 'flash.py')
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+flash = load()
+
+
+@pytest.fixture
+def sysfs(tmp_path):
+    """Return the folder of a computer without USB devices, and a function that plugs one in."""
+    (tmp_path / 'bus/usb/devices').mkdir(parents=True)
+    (tmp_path / 'class/tty').mkdir(parents=True)
+
+    def plug(name, usb_id, tty=None):
+        device = tmp_path / 'devices' / name
+        device.mkdir(parents=True)
+        for file, text in zip(('idVendor', 'idProduct'), usb_id.split(':'), strict=True):
+            (device / file).write_text(f'{text}\n')
+        (tmp_path / 'bus/usb/devices' / name).symlink_to(device)
+        if tty is not None:
+            (device / f'{name}:1.0' / tty).mkdir(parents=True)
+            entry = tmp_path / 'class/tty' / tty
+            entry.mkdir()
+            (entry / 'device').symlink_to(device / f'{name}:1.0' / tty)
+
+    return tmp_path, plug
+
+
+def fail(port):
+    raise AssertionError(f'{port} must not be asked')
+
+
+def test_a_programmer_on_usb_is_preferred_and_writes_fuses(sysfs):
+    folder, plug = sysfs
+    plug('1-1', '16c0:05dc')
+    plug('1-2', '1a86:7523', 'ttyUSB0')
+    plug('1-3', '046d:c534')
+    programmer = flash.find_programmer(folder, None, fail)
+    words = flash.command(programmer, 'robot', Path('robot.hex'))
+    assert words[:5] == ['avrdude', '-c', 'usbasp', '-p', 'm2560']
+    assert sum(':w:0x' in word for word in words) == 3
+    assert words[-1] == 'flash:w:robot.hex:i'
+
+
+def test_only_serial_ports_of_arduinos_are_asked(sysfs):
+    folder, plug = sysfs
+    plug('1-1', '2341:0042', 'ttyACM0')
+    plug('1-2', '1a86:7523', 'ttyUSB0')
+    plug('1-3', '12d1:1506', 'ttyUSB1')  # a modem
+    asked = []
+
+    def ask(port):
+        asked.append(port)
+        return flash.boot_loader(port, 'wiring', 115200) if 'ACM' in port else None
+
+    programmer = flash.find_programmer(folder, None, ask)
+    assert asked == ['/dev/ttyACM0', '/dev/ttyUSB0']
+    words = flash.command(programmer, 'robot', Path('robot.hex'))
+    assert words[1:8] == ['-c', 'wiring', '-P', '/dev/ttyACM0', '-b', '115200', '-D']
+    assert not any('fuse' in word for word in words)
+
+
+def test_none_and_several_programmers_have_a_remedy(sysfs):
+    folder, plug = sysfs
+    with pytest.raises(flash.FlashError, match='plug in a USBasp'):
+        flash.find_programmer(folder, None, fail)
+    plug('1-1', '16c0:05dc')
+    plug('1-2', '1781:0c9f')
+    with pytest.raises(flash.FlashError, match=r'more than one(.|\n)*USBasp(.|\n)*USBtinyISP'):
+        flash.find_programmer(folder, None, fail)
+
+
+@pytest.mark.parametrize('name', flash.QUESTIONS)
+def test_programmers_at_a_port_are_distinguished(name, monkeypatch):
+    """Each answers its own protocol at its own baud rate, and nothing to the others."""
+    question = flash.QUESTIONS[name]
+    monkeypatch.setattr(flash, '_TIMEOUT', 0.1)
+    monkeypatch.setattr(flash.time, 'sleep', lambda seconds: None)
+    master, slave = os.openpty()
+    speeds, ended = [], threading.Event()
+    configure = flash._configure
+
+    def note_speed(handle, baud):
+        speeds.append(baud)
+        configure(handle, baud)
+
+    monkeypatch.setattr(flash, '_configure', note_speed)
+
+    def board():
+        while not ended.is_set():
+            data = os.read(master, 256)
+            if speeds[-1] == question.baud and data.startswith(question.request[:2]):
+                os.write(master, b'\x1b\x01\0\x0b\x0e\x01\0\x08' + question.answer)
+
+    thread = threading.Thread(target=board, daemon=True)
+    thread.start()
+    programmer = flash.ask_port(os.ttyname(slave))
+    ended.set()
+    os.write(slave, b'end')
+    thread.join(5.0)
+    os.close(master)
+    os.close(slave)
+    assert programmer == question.programmer(programmer.options[3])
+    assert programmer.options[5] == str(question.baud)
+    assert bool(programmer.warning) == (name.startswith('boot loader'))
+
+
+def test_make_prints_what_it_found_and_the_command(sysfs):
+    folder, plug = sysfs
+    plug('1-1', '16c0:05dc')
+    done = subprocess.run(
+        ['make', '-s', '-C', FIRMWARE, 'flash-dongle', 'DRY_RUN=1', f'FLASH=--sysfs {folder}'],
+        capture_output=True,
+        text=True,
+        env={**os.environ, 'MAKEFLAGS': '-o build/dongle.hex'},
+    )
+    assert done.returncode == 0, done.stderr
+    assert 'USBasp (USB 1-1): dongle' in done.stdout
+    assert 'avrdude -c usbasp -p m328p' in done.stdout

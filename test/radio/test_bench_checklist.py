@@ -1,0 +1,173 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Bench checklist: each defect of a robot fails its own line, and a good robot none."""
+
+import argparse
+import json
+
+import numpy as np
+import pytest
+from support.tool_bench import ToolBench
+
+from t3mpc_ros.cli import robot_doctor as cli
+from t3mpc_ros.radio.link.link_parameters import LinkParameters
+from t3mpc_ros.radio.protocol import frames
+from t3mpc_ros.radio.protocol.frames import Pong, Samples
+from t3mpc_ros.radio.tool import procedure
+from t3mpc_ros.radio.tool.bench_checklist import (
+    FAIL,
+    PASS,
+    SKIPPED,
+    BoardFindings,
+    check_board,
+    check_builds,
+)
+from t3mpc_ros.radio.tool.robot_log import LogEntry, LogKind
+from t3mpc_ros.radio.tool.robot_records import RobotSettings
+from t3mpc_ros.radio.tool.robot_settings import StoredSettings
+from t3mpc_ros.robot.calibration import Calibration, DividerCorrection
+
+PONG = Pong(1, b'ping', 0, 2, 2, 0, 1, 0, 0, 0, 1, 0, 82, b'T3MPC', 7)
+PARAMETERS = LinkParameters()
+
+
+def samples(**changes):
+    """Return samples of a good robot at rest, 12 V, nothing in front of its sensors."""
+    source = np.random.default_rng(1)
+    rows = []
+    for noise in source.normal(0.0, 3.0, (50, 6)).round().astype(int):
+        ranges = changes.get('ranges', 8 * [90])
+        values = np.array([164, -80, 16_400, 20, -30, 40]) + noise
+        values = np.array(changes.get('imu', values))
+        rows.append(
+            Samples(
+                1,
+                np.array(ranges, dtype='<u2').tobytes(),
+                changes.get('battery', 614),
+                *(int(value) for value in values),
+            )
+        )
+    return tuple(rows)
+
+
+def findings(**changes):
+    found = BoardFindings(
+        PONG,
+        StoredSettings(frames.SETTINGS_GOOD, RobotSettings()),
+        frames.SETTINGS_MISSING,
+        Calibration(),
+        (LogEntry(0, LogKind.BOOT, 0, 1), LogEntry(1, LogKind.BOOT, 0, 2)),
+        samples(),
+    )
+    return found._replace(**changes)
+
+
+def failed(found):
+    return [check.name for check in check_board(found, PARAMETERS) if check.verdict == FAIL]
+
+
+def test_a_good_robot_passes():
+    checks = check_board(findings(), PARAMETERS)
+    assert {check.verdict for check in checks} == {PASS}
+    assert all(check.remedy for check in checks)
+
+
+SETTINGS = RobotSettings()
+
+
+@pytest.mark.parametrize(
+    'changes, names',
+    [
+        ({'pong': PONG._replace(chip_ok=0)}, ['radio chip of the robot']),
+        (
+            {'settings': StoredSettings(frames.SETTINGS_MISSING, SETTINGS)},
+            ['settings stored'],
+        ),
+        (
+            {'settings': StoredSettings(0, SETTINGS._replace(rate='250k'))},
+            ['settings equal to those of the host'],
+        ),
+        ({'calibration_state': frames.SETTINGS_DAMAGED}, ['calibration']),
+        ({'log': (LogEntry(0, LogKind.BOOT, 0, 8),)}, ['resets in the log']),
+        ({'log': (LogEntry(0, LogKind.BOOT, 0, 4),)}, ['resets in the log']),
+        ({'samples': samples(battery=0)}, ['battery']),
+        ({'samples': samples(battery=480)}, ['battery']),
+        ({'calibration': Calibration(divider=DividerCorrection(-0.2, 0.0, 0.1))}, ['battery']),
+        ({'samples': samples(battery=0xFFFF)}, ['battery']),
+        ({'samples': samples(imu=6 * [0])}, ['inertial sensor']),
+        ({'samples': samples(imu=[0, 0, -16384, 0, 0, 1])}, ['gravity', 'noise of the rate']),
+        ({'samples': samples(imu=[0, 0, 13000, 1400, 0, 0])[:40]}, None),
+        ({'samples': samples(ranges=[90, 1023, *6 * [90]])}, ['distance sensors']),
+        ({'samples': samples(ranges=[*7 * [90], 0])}, ['distance sensors']),
+        ({'samples': samples(ranges=8 * [0xFFFF])}, ['distance sensors']),
+    ],
+)
+def test_each_defect_fails_its_own_line(changes, names):
+    expected = ['gravity', 'rate at rest', 'noise of the rate'] if names is None else names
+    assert failed(findings(**changes)) == expected
+
+
+def test_a_sensor_that_is_not_there_is_not_missed():
+    settings = SETTINGS._replace(sensors=('none', *7 * ('GP2Y0A21',)))
+    found = findings(settings=StoredSettings(0, settings), samples=samples(ranges=[0, *7 * [90]]))
+    assert failed(found) == []
+
+
+def test_builds_of_both_boards_are_compared():
+    assert check_builds(PONG, PONG).verdict == PASS
+    assert check_builds(PONG, PONG._replace(build=8)).verdict == FAIL
+    assert check_builds(None, PONG).verdict == SKIPPED
+
+
+@pytest.mark.parametrize('drive', [False, True])
+def test_the_checklist_on_the_emulated_robot(drive, tmp_path, monkeypatch, capsys):
+    """A wheel turns only with --drive and a confirmation; the report has every line."""
+    bench = ToolBench()
+
+    def run_at_port(task, path, interrupted, device=''):
+        bench.run(task, robot=path == 'robot')
+
+    monkeypatch.setattr(procedure, 'run_at_port', run_at_port)
+    options = argparse.Namespace(
+        port='dongle', robot_port='robot', count=50, drive=drive, report=tmp_path / 'r.html'
+    )
+    asked = []
+
+    def answer(question):
+        asked.append(question)
+        if 'RIGHT' in question:
+            return 'no'
+        return 'yes' if 'left wheel will' in question or 'LEFT' in question else 'skip'
+
+    checks = cli.run_doctor(options, PARAMETERS, b'', answer, lambda: False)
+    verdicts = {check.name: check.verdict for check in checks}
+    measured = [check for check in checks if check.verdict == FAIL]
+    assert not measured, measured
+    assert verdicts['left wheel'] == (PASS if drive else SKIPPED)
+    assert verdicts['right wheel'] == SKIPPED
+    left, right = bench.board.counters
+    assert (abs(left - 3200) < 5, right) == (drive, 0)
+    assert verdicts['build ids equal'] == verdicts['battery'] == verdicts['gravity'] == PASS
+    saved = json.loads((tmp_path / 'r.json').read_text())
+    assert [row['name'] for row in saved] == list(verdicts)
+    page = (tmp_path / 'r.html').read_text()
+    assert all(name in page for name in ('round trip to the robot', 'noise of the rate'))
+    assert 'checks were skipped' in capsys.readouterr().out
+
+
+def test_a_silent_robot_board_does_not_end_the_examination(tmp_path, monkeypatch):
+    bench = ToolBench()
+
+    def run_at_port(task, path, interrupted, device=''):
+        if path == 'robot':
+            task.port_failed('the port does not exist', True, bench.now_ns)
+            return
+        bench.run(task)
+
+    monkeypatch.setattr(procedure, 'run_at_port', run_at_port)
+    options = argparse.Namespace(
+        port='dongle', robot_port='robot', count=10, drive=False, report=tmp_path / 'r.html'
+    )
+    checks = cli.run_doctor(options, PARAMETERS, b'', lambda question: 'skip', lambda: False)
+    assert [check.name for check in checks if check.verdict == FAIL] == ['USB of the robot']
+    assert any(check.name == 'robot answers by radio' for check in checks)

@@ -1,0 +1,236 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The calibration wizard against the emulated boards, in virtual time."""
+
+import math
+from pathlib import Path
+import re
+import shlex
+import sys
+
+import pytest
+from support.calibration_bench import CalibrationBench, Person
+import yaml
+
+from t3mpc_ros.cli import calibrate as cli
+from t3mpc_ros.cli import robot as robot_cli
+from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.nodes.registry import parameter_class
+from t3mpc_ros.parameters.table import ParameterError
+from t3mpc_ros.radio.link.link_parameters import LinkParameters
+from t3mpc_ros.radio.tool import procedure, robot_records
+from t3mpc_ros.radio.tool.calibration_wizard import CalibrationWizard, WizardOptions
+from t3mpc_ros.robot.calibration import (
+    COVERAGE,
+    Calibration,
+    DividerCorrection,
+    Estimate,
+    SharpCurve,
+)
+from t3mpc_ros.robot.gyro_odometry import GyroOdometry, GyroOdometryParameters
+from t3mpc_ros.simulation.sensors.range_sensor import output_voltage
+
+RADIUS, TRACK = 1.02 * 0.035, 1.03 * 0.147
+ERRORS = {
+    'twin.right_wheel_radius_multiplier': 1.02,
+    'twin.left_wheel_radius_multiplier': 1.02,
+    'twin.wheel_separation_multiplier': 1.03,
+    'twin.imu.gyro_scale_error': 0.03,
+    # Without power the smooth friction of the twin lets any torque move the wheels.
+    'twin.disturbance.bound': 0.0,
+}
+
+
+@pytest.fixture
+def person(monkeypatch):
+    bench = CalibrationBench(**ERRORS)
+    monkeypatch.setattr(
+        procedure,
+        'run_at_port',
+        lambda task, path, stop, device='': bench.run(task, robot='ACM' in path, seconds=300.0),
+    )
+    return Person(bench)
+
+
+def wizard(person, *steps, start=None, robot_port='', **options):
+    robot = cli.LinkedRobot('dongle', robot_port, LinkParameters(), b'', lambda: False)
+    options = WizardOptions(steps=steps, **options)
+    return CalibrationWizard(robot, person.ask, person.show, options, start or Calibration())
+
+
+@pytest.mark.slow
+def test_a_whole_run_finds_the_errors_of_the_twin(person, monkeypatch, tmp_path):
+    """The command of docs/calibration.md: transcript, file, and record of the robot."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cli, '_asker', lambda stop: person.ask)
+    monkeypatch.setattr(cli, '_show', person.show)
+    monkeypatch.setattr(cli, '_today', lambda: '2026-11-22')
+    monkeypatch.setattr(sys.stdin, 'isatty', lambda: True)
+    person.answers = {f'{side}: put the board': ['skip'] for side in ('left', 'rear', 'right')}
+    for line in _transcript()[0].splitlines():
+        command = shlex.split(line.removeprefix('scripts/run t3mpc robot '))
+        assert robot_cli.main(command) == 0
+    assert _numberless(person.transcript) == _numberless(_transcript()[1])
+
+    found, _ = cli.read_parameter_file(tmp_path / 'calibration.yaml')
+    for estimate, true in (
+        (found.wheel_radius, RADIUS),
+        (found.track, TRACK),
+        (found.gyro_scale, 1.0 / (1.0 + 0.03 * person.plant._imu._scale)),
+    ):
+        assert abs(estimate.value - true) < 1.5 * COVERAGE * estimate.uncertainty
+        assert estimate.uncertainty < 1e-3 * estimate.value
+    for number in (0, 1):
+        curve = found.curves[number]
+        offset = person.plant._parameters.range_sensor.voltage_offset
+        volts = output_voltage(0.3) + offset * person.plant._ranges._offsets[number]
+        distance = curve.scale / (volts - curve.offset) - curve.shift
+        assert abs(distance - 0.3) < 1.5 * COVERAGE * curve.uncertainty
+    assert found.curves[2:] == 6 * (None,)
+    # The converter truncates: half a count of 20 mV.
+    volts = 11.0 - 0.0098
+    corrected = found.divider.voltage(volts)
+    assert abs(corrected - 11.0) < 1.5 * COVERAGE * found.divider.uncertainty
+
+    stored = person.bench.at_robot(robot_records.read_calibration())
+    for in_robot, in_file in zip(stored[:4], found[:4], strict=True):
+        assert in_robot.value == pytest.approx(in_file.value, abs=2e-5)
+    assert stored.curves[0][:3] == pytest.approx(found.curves[0][:3], abs=1e-4)
+
+
+def _transcript():
+    """Return the command of the page, and what it prints."""
+    text = (Path(__file__).resolve().parents[2] / 'docs' / 'calibration.md').read_text()
+    (command,) = re.findall(r'```sh\n(scripts/run t3mpc robot calibrate .*?)\n```', text)
+    (printed,) = re.findall(r'^```text\n(.*?)\n```', text, re.DOTALL | re.MULTILINE)
+    return command, printed
+
+
+def _numberless(text):
+    """Return the lines of a text without numbers, whose last digits depend on the processor."""
+    lines = [line.rstrip() for line in text.splitlines()]
+    return [re.sub(r'[-+]?\d+(\.\d+)?', '#', line) for line in lines]
+
+
+def test_nothing_moves_without_a_yes(person):
+    person.moves = False
+    person.answers = {'Enter to repeat': ['skip']}
+    found = wizard(person, 'radius', 'track').run()
+    assert found == Calibration()
+    assert person.plant.pulses == (0, 0)
+    assert person.transcript.count('Left out') == 2
+    assert 'the track needs a wheel radius' in person.transcript
+
+
+@pytest.mark.parametrize('fault', ['jam', 'silence', 'button', 'close_port', 'robot_reset'])
+def test_a_fault_stops_the_drive_for_good(person, fault):
+    """Whatever the link does afterwards, the wheels do not turn again."""
+    bench = person.bench
+    faults = []
+
+    def inject(bench):
+        if not faults and person.plant.pulses[0] > 800:
+            faults.append(bench.now_ns)
+            bench.emulator.inject(fault, 0.4)
+
+    bench.each = inject
+    person.answers = {'Enter to repeat': [_after(bench, 3.0)]}
+    found = wizard(person, 'radius').run()
+    assert found == Calibration()
+    assert 'Refused: ' in person.transcript
+    stopped = person.plant.stopped_at
+    # The time to live, and the ramp from 4 rad/s at 8 rad/s².
+    assert stopped - (faults[0] - bench.start_ns) / 1e9 < 0.25 + 0.5 + 0.2
+    assert bench.now_ns - faults[0] > 3e9
+
+
+def _after(bench, seconds):
+    def answer():
+        bench.wait(seconds)
+        return 'skip'
+
+    return answer
+
+
+def test_a_mark_distance_of_zero_is_refused_and_repeated(person):
+    person.answers = {'Between both marks': ['0', '0.5 m'], 'Enter to repeat': ['']}
+    found = wizard(person, 'radius', distance=0.5, speed=8.0).run()
+    assert 'at least 0.5 m: got 0' in person.transcript
+    assert "must be a number, or skip: got '0.5 m'" in person.transcript
+    assert found.wheel_radius.value == pytest.approx(RADIUS, rel=0.01)
+
+
+def test_what_is_left_out_keeps_its_value(person):
+    start = Calibration(Estimate(0.036, 1e-4), Estimate(0.15, 1e-3), None, Estimate(0.1, 1e-3))
+    person.answers = {'Enter to begin': ['skip']}
+    assert wizard(person, 'rest', start=start).run() == start
+    assert 'wheel radius        36.000 ± 0.196 mm' in person.transcript
+
+
+def test_raw_counts_need_the_usb_of_the_robot(person):
+    """Without it, both steps are not offered."""
+    assert wizard(person, 'ranges', 'battery').run() == Calibration()
+    assert 'Step' not in person.transcript
+
+
+# -- parameter file -------------------------------------------------------------------------------
+
+CURVE = SharpCurve(0.2793, 0.0261, 0.0553, 0.004)
+WHOLE = Calibration(
+    Estimate(0.0356, 2e-5),
+    Estimate(0.1514, 9e-5),
+    Estimate(0.9873, 3e-4),
+    Estimate(-0.021, 1.6e-4),
+    DividerCorrection(0.0123, -0.04, 0.03),
+    (CURVE, None, CURVE, *5 * (None,)),
+)
+
+
+@pytest.mark.parametrize('found', [WHOLE, Calibration(), WHOLE._replace(wheel_radius=None)])
+def test_the_parameter_file_holds_the_calibration(found, tmp_path):
+    path = tmp_path / 'calibration.yaml'
+    link = {'channel': 100, 'address': '12345e6789'}
+    path.write_text(cli.parameter_file(found, '2026-11-22', link))
+    assert cli.read_parameter_file(path) == (found, link)
+    assert "link.address: '12345e6789'" in path.read_text()
+    assert '&' not in path.read_text()  # the parser of ROS knows no aliases
+    for node, values in yaml.safe_load(path.read_text()).items():
+        name = node.removeprefix('/**/')
+        parameters = parameter_class(name).from_dict(values['ros__parameters']).to_dict()
+        if found.wheel_radius is not None:
+            assert parameters['wheel_radius'] == 0.0356
+
+
+@pytest.mark.parametrize(
+    'text, words',
+    [
+        ('a: [', 'must be a parameter file of t3mpc robot calibrate'),
+        ('/**:\n  ros__parameters: {}\n', 'must be a parameter file'),
+        (
+            '/**/radio_bridge:\n  ros__parameters: {wheel_radius: 3.5}\n',
+            'wheel_radius must be from 0.005 to 1 m: got 3.5',
+        ),
+    ],
+)
+def test_another_file_is_refused(text, words, tmp_path):
+    path = tmp_path / 'other.yaml'
+    path.write_text(text)
+    with pytest.raises(ParameterError, match=words):
+        cli.read_parameter_file(path)
+
+
+def test_the_bridge_corrects_the_gyro_by_its_scale():
+    """Ten turns of a gyro that reports 3 % too much end where the robot is."""
+    odometry = GyroOdometry(
+        GyroOdometryParameters(gyro_scale=1.0 / 1.03, gyro_scale_tolerance=3e-4), WheelGeometry()
+    )
+    for _ in range(150):
+        odometry.update(0.0, 0.0, 0.1, 0.02)  # the bias
+    turn = 2.0 * math.pi / 300.0
+    angle = turn * 0.147 / 2.0 / 0.035
+    for _ in range(3000):
+        odometry.update(angle, -angle, 1.03 * turn / 0.02 + 0.1, 0.02)
+    for _ in range(150):
+        odometry.update(0.0, 0.0, 0.1, 0.02)
+    assert odometry.pose.yaw == pytest.approx(0.0, abs=0.01)
+    assert not odometry.slipping

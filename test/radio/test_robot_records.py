@@ -1,0 +1,205 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Settings and calibration of the robot over its USB, against the console of the firmware core."""
+
+import ctypes
+from dataclasses import dataclass, field
+import json
+from pathlib import Path
+import random
+
+import pytest
+from support.firmware_core import Robot, load_core
+
+from t3mpc_ros.radio.link.port_actions import Write
+from t3mpc_ros.radio.protocol import frames
+from t3mpc_ros.radio.protocol.codec import decode_from_board, encode
+from t3mpc_ros.radio.protocol.frames import Configured, Pong, Refusal
+from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
+from t3mpc_ros.radio.tool.procedure import Procedure
+from t3mpc_ros.radio.tool.robot_records import (
+    Calibration,
+    DividerCorrection,
+    Estimate,
+    RobotSettings,
+    SharpCurve,
+    decode_calibration,
+    decode_settings,
+    encode_calibration,
+    encode_settings,
+    range_counts,
+    read_calibration,
+    read_record,
+    read_samples,
+    write_calibration,
+    write_record,
+)
+
+VECTORS = json.loads((Path(__file__).parents[1] / 'golden' / 'radio_vectors.json').read_text())
+CURVES = (SharpCurve(0.28, 0.02, 0.05, 0.003), *7 * (None,))
+CALIBRATION = Calibration(
+    Estimate(0.03512, 2e-5),
+    Estimate(0.2012, 1.3e-4),
+    Estimate(1.0123, 2e-4),
+    Estimate(-0.01, 1e-4),
+    DividerCorrection(-0.013, 0.02, 0.01),
+    CURVES,
+)
+
+
+@pytest.fixture(scope='module')
+def library():
+    return load_core()
+
+
+@dataclass
+class Cable:
+    """Runs scripts at the console of a robot; each frame is lost with some probability."""
+
+    robot: Robot
+    loss: float = 0.0
+    source: random.Random = field(default_factory=lambda: random.Random(2))
+
+    def run(self, script):
+        """Return the result of a script, or its error text."""
+        task = Procedure(script, decode_from_board)
+        now_ns, received = 0, b''
+        task.port_opened(0)
+        while not task.done:
+            *actions, wait = task.step(now_ns, received)
+            received = b''
+            for action in actions:
+                if isinstance(action, Write) and self.source.random() >= self.loss:
+                    self.robot.call('usb', action.data, ctypes.c_uint32(len(action.data)))
+            while now_ns < wait.until_ns and not received:
+                self.robot.run(1000)
+                now_ns += 1_000_000
+                room = ctypes.create_string_buffer(4096)
+                size = self.robot.call('usb_take', room, ctypes.c_uint32(4096))
+                received = room.raw[:size] if self.source.random() >= self.loss else b''
+        return task.error or task.result
+
+
+def test_records_of_the_specification_byte_for_byte():
+    golden = dict(VECTORS['records']['settings'])
+    body = bytes.fromhex(golden.pop('bytes'))
+    golden |= {'address': bytes.fromhex(golden['address']), 'sensors': tuple(golden['sensors'])}
+    assert encode_settings(RobotSettings(**golden)) == body
+    assert decode_settings(body) == RobotSettings(**golden)
+    golden = VECTORS['records']['calibration']
+    body = bytes.fromhex(golden['bytes'])
+    names = 'wheel_radius', 'track', 'gyro_scale', 'gyro_bias'
+    calibration = Calibration(
+        *(Estimate(*golden[name]) for name in names),
+        DividerCorrection(*golden['divider']),
+        tuple(curve and SharpCurve(*curve) for curve in golden['curves']),
+    )
+    assert calibration == CALIBRATION
+    assert encode_calibration(calibration) == body
+    # What is read and written again does not drift, and no uncertainty shrinks.
+    again = decode_calibration(body)
+    assert encode_calibration(again) == body
+    assert again.gyro_bias.uncertainty >= CALIBRATION.gyro_bias.uncertainty
+
+
+def test_uncertainties_are_never_stored_as_smaller_or_as_none():
+    source = random.Random(3)
+    for _ in range(500):
+        uncertainty = 10 ** source.uniform(-12, -3)
+        estimate = Estimate(source.uniform(0.02, 0.05), uncertainty)
+        stored = decode_calibration(encode_calibration(Calibration(wheel_radius=estimate)))
+        assert stored.wheel_radius.value == pytest.approx(estimate.value, abs=5.1e-8)
+        assert uncertainty * (1 - 1e-6) <= stored.wheel_radius.uncertainty <= uncertainty + 1e-7
+
+
+@pytest.mark.parametrize(
+    'change, words',
+    [
+        ({'wheel_radius': Estimate(0.0, 1e-5)}, r'wheel_radius must be from 0\.001 to 10'),
+        ({'wheel_radius': Estimate(float('nan'), 1e-5)}, 'wheel_radius must be'),
+        ({'track': Estimate(0.2, 0.0)}, r'track\.uncertainty must be above 0'),
+        ({'track': Estimate(0.2, 0.1)}, r'track\.uncertainty must be above 0'),
+        ({'gyro_scale': Estimate(1.3, 1e-3)}, 'gyro_scale - 1 must be'),
+        ({'gyro_bias': Estimate(1.0, 1e-3)}, 'gyro_bias must be'),
+        ({'divider': DividerCorrection(0.0, 40.0, 0.1)}, r'divider\.offset must be'),
+        ({'curves': ()}, 'curves must be 8'),
+        ({'curves': (*CURVES[:7], SharpCurve(2.0, 0.0, 0.0, 0.01))}, r'curves\[7\]\.scale'),
+    ],
+)
+def test_values_that_do_not_fit_are_rejected_before_sending(change, words):
+    with pytest.raises(ValueError, match=words):
+        next(write_calibration(CALIBRATION._replace(**change)))
+
+
+@pytest.mark.parametrize('loss', [0.0, 0.1])
+def test_calibration_survives_reset_and_lost_frames(library, loss):
+    robot = Robot(library)
+    robot.call('set_cell_us', ctypes.c_uint32(3400))
+    cable = Cable(robot, loss)
+    assert cable.run(read_calibration()) == Calibration()
+    stored = cable.run(write_calibration(CALIBRATION))
+    assert encode_calibration(stored) == encode_calibration(CALIBRATION)
+    robot.call('boot', 4, ctypes.c_uint32(0))
+    assert cable.run(read_calibration()) == stored
+    # A value is changed with the others kept.
+    changed = stored._replace(gyro_bias=None)
+    assert cable.run(write_calibration(changed)) == changed
+    settings = RobotSettings(channel=100, sensors=8 * ('none',))
+    body = encode_settings(settings)
+    assert cable.run(write_record(frames.SETTINGS_RECORD, body)) == body
+    record = cable.run(read_record(frames.SETTINGS_RECORD))
+    assert (record.valid, decode_settings(record.body)) == (True, settings)
+
+
+def test_damage_and_bad_timing_have_a_remedy(library):
+    robot = Robot(library)
+    cable = Cable(robot)
+    robot.hello()
+    robot.drive(1000, 1000, 40_000)
+    assert 'stop the bridge' in cable.run(write_calibration(CALIBRATION))
+    robot.run(1_000_000)
+    for copy in (104, 192):
+        robot.call('poke_eeprom', ctypes.c_uint16(copy + 3), ctypes.c_uint8(0))
+    robot.call('boot', 4, ctypes.c_uint32(0))
+    assert 'damaged' in cable.run(read_calibration())
+    robot.call('wear', ctypes.c_uint16(110), ctypes.c_bool(True))
+    assert 'worn out' in cable.run(write_calibration(CALIBRATION))
+
+
+def test_raw_samples(library):
+    robot = Robot(library)
+    for channel in range(9):
+        robot.call('set_adc', ctypes.c_uint8(channel), ctypes.c_uint16(100 * channel))
+    registers = (ctypes.c_int16 * 7)(1, -2, 16384, 0, 4, 5, -6)
+    robot.call('set_imu', ctypes.c_bool(True), registers)
+    cable = Cable(robot)
+    samples = cable.run(read_samples())
+    assert range_counts(samples) == tuple(range(0, 800, 100))
+    assert samples[2:] == (800, 1, -2, 16384, 4, 5, -6)
+    robot.call('set_imu', ctypes.c_bool(False), registers)
+    assert cable.run(read_samples())[3:] == (0, 0, 0, 0, 0, 0)
+
+
+@pytest.mark.parametrize('dongle', [True, False])
+def test_dongle_and_old_firmware_are_distinguished(dongle):
+    task = Procedure(read_calibration(), decode_from_board)
+    task.port_opened(0)
+    decoder = FrameDecoder()
+    received = b''
+    for now_ns in range(0, 10_000_000_000, 10_000_000):
+        for action in task.step(now_ns, received):
+            if isinstance(action, Write):
+                (data,) = decoder.feed(action.data)
+                received = encode_frame(encode(_answer(data, dongle)))
+        if task.done:
+            break
+    expected = 'this is the dongle' if dongle else 'make -C firmware flash'
+    assert expected in task.error
+
+
+def _answer(data, dongle):
+    if data[0] == 3:
+        return Pong(data[1], data[2:], 0, 2, 2, 0, 1, 0, 0, 0, 1, 0, 82, b'T3MPC', 0)
+    if data[0] == 2 and dongle:
+        return Configured(data[1], 82, 1, 3, 1, 4, b'T3MPC', 1)
+    return Refusal(1, data[0])

@@ -1,0 +1,382 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Estimates of a calibration: coverage of their uncertainty, and refusals.
+
+Each quantity is estimated 100 times from measurements with the noise of the simulated sensors and
+of the marks. If the intervals hold 95 % of the true values, their number in 100 is binomial, and
+the sum of the squared normalised errors has a chi-squared distribution: a smaller uncertainty
+fails the first check, a larger one the second.
+"""
+
+import math
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.robot import calibration
+from t3mpc_ros.robot.calibration import (
+    COVERAGE,
+    CalibrationError,
+    Estimate,
+    GyroTurn,
+    MarkUncertainty,
+    RangeReading,
+    Recording,
+    SharpCurve,
+    StraightRun,
+    VoltageReading,
+)
+from t3mpc_ros.simulation.sensors.imu import SimulatedImu, SimulatedImuParameters
+from t3mpc_ros.simulation.sensors.range_sensor import SimulatedRangeSensorParameters
+
+TRIALS = 100
+MARKS = MarkUncertainty()
+RADIUS, TRACK = 0.035, 0.147
+PERIOD = 0.02
+"""s between two samples of the telemetry."""
+_FEWEST = 87
+"""P(fewer of 100 | 95 %) = 0.0004."""
+_CHI_SQUARED = 58.0, 154.0
+"""100 degrees of freedom: 0.0002 on each side."""
+
+
+def assert_coverage(errors, uncertainties):
+    """Fail if 1.96 standard uncertainties are not an interval of 95 %."""
+    normalised = np.abs(np.array(errors)) / np.array(uncertainties)
+    assert len(normalised) == TRIALS
+    assert np.count_nonzero(normalised <= COVERAGE) >= _FEWEST
+    assert _CHI_SQUARED[0] < np.sum(normalised**2) < _CHI_SQUARED[1]
+
+
+# -- simulated measurements -----------------------------------------------------------------------
+
+
+def straight_runs(generator, radius, count=2, distance=2.0):
+    tape = (3e-4 + 2e-4 * distance) / distance / math.sqrt(3.0) * generator.standard_normal()
+    runs = []
+    for _ in range(count):
+        true = distance / RADIUS + calibration.STEP_ANGLE * generator.standard_normal((2, 2))
+        right, left = distance / RADIUS + np.zeros(2)
+        travelled = radius * float(np.mean(true[0] - true[1] + right))
+        marks = math.sqrt(2.0) * MARKS.distance * generator.standard_normal()
+        runs.append(StraightRun((travelled + marks) * (1.0 + tape), right, left))
+    return runs
+
+
+def sample(imu, rate):
+    """Return the rate that a gyro reports at a true rate."""
+    return imu.measure(np.array([[0.0, rate], [0.0, 0.0], [0.0, 0.0]]), PERIOD).angular
+
+
+def recorded_turn(generator, imu, yaw, rate=4.0, rest=4.0):
+    """Return a recording of a turn by ``yaw``, and the yaw that a person reads from the mark."""
+    duration = abs(yaw) / rate
+    samples = round((2.0 * rest + duration) / PERIOD)
+    begin, end = round(rest / PERIOD), round((rest + duration) / PERIOD)
+    speed = yaw / ((end - begin) * PERIOD)
+    rates = np.empty(samples)
+    for number in range(samples):
+        # A linear start and end, over one sample each.
+        true = speed if begin < number < end else 0.5 * speed * (number in (begin, end))
+        rates[number] = sample(imu, true)
+    travel = np.clip((np.arange(samples) - begin) / (end - begin), 0.0, 1.0)
+    angle = 0.5 * TRACK * yaw / RADIUS * travel
+    recording = Recording(PERIOD * np.arange(samples), angle, -angle, rates, begin, end + 1)
+    marks = math.sqrt(2.0) * MARKS.angle * generator.standard_normal()
+    return recording, yaw + marks
+
+
+# -- coverage -------------------------------------------------------------------------------------
+
+
+def test_wheel_radius_has_its_stated_uncertainty():
+    generator = np.random.default_rng(1)
+    errors, uncertainties = [], []
+    for _ in range(TRIALS):
+        radius = RADIUS * (1.0 + 0.03 * generator.standard_normal())
+        found = calibration.estimate_wheel_radius(straight_runs(generator, radius))
+        errors.append(found.value - radius)
+        uncertainties.append(found.uncertainty)
+    assert_coverage(errors, uncertainties)
+    assert np.mean(uncertainties) < 1e-3 * RADIUS
+
+
+def test_track_gyro_scale_and_bias_have_their_stated_uncertainty():
+    generator = np.random.default_rng(2)
+    parameters = SimulatedImuParameters(gyro_scale_error=0.03)
+    errors, uncertainties = {}, {}
+    for trial in range(TRIALS):
+        imu = SimulatedImu(parameters, np.random.default_rng(1000 + trial))
+        radius = Estimate(RADIUS, 1e-5)
+        true_radius = radius.value + radius.uncertainty * generator.standard_normal()
+        track = TRACK * (1.0 + 0.03 * generator.standard_normal())
+        turns, found = [], {}
+        for turned in (10.0, -10.0):
+            # The steps turn the robot by what its true wheels make of them.
+            true = turned * math.tau * true_radius / RADIUS * TRACK / track
+            recording, read = recorded_turn(generator, imu, true)
+            scale = turned * math.tau / true
+            recording = recording._replace(
+                right=recording.right * scale, left=recording.left * scale
+            )
+            if turned > 0.0:
+                found['bias'] = calibration.estimate_gyro_bias(recording)
+            turns.append((read, calibration.measure_turn(recording)))
+        found['track'] = calibration.estimate_track(turns, radius)
+        found['scale'] = calibration.estimate_gyro_scale(turns)
+        truth = {'track': track, 'scale': 1.0 / (1.0 + 0.03 * imu._scale)}
+        for name, value in truth.items():
+            errors.setdefault(name, []).append(found[name].value - value)
+            uncertainties.setdefault(name, []).append(found[name].uncertainty)
+    for name, values in errors.items():
+        assert_coverage(values, uncertainties[name])
+    assert np.mean(uncertainties['scale']) < 5e-4
+    assert np.mean(uncertainties['track']) < 1e-3 * TRACK
+
+
+def test_gyro_bias_has_its_stated_uncertainty():
+    errors, uncertainties = [], []
+    for trial in range(TRIALS):
+        imu = SimulatedImu(SimulatedImuParameters(), np.random.default_rng(trial))
+        rates = np.array([sample(imu, 0.0) for _ in range(500)])
+        found = calibration.estimate_gyro_bias(rest(rates))
+        errors.append(found.value - imu.bias)
+        uncertainties.append(found.uncertainty)
+    assert_coverage(errors, uncertainties)
+
+
+def test_divider_has_its_stated_uncertainty():
+    """At the battery voltage with the largest one."""
+    generator = np.random.default_rng(4)
+    errors, uncertainties = [], []
+    for _ in range(TRIALS):
+        divider = 4.0 * (1.0 + 0.03 * generator.standard_normal())
+        readings = []
+        for voltage in generator.uniform((9.2, 11.8), (10.0, 12.6)):
+            meter = voltage + MARKS.voltage * generator.standard_normal()
+            nominal = np.mean([board_voltage(voltage, divider, generator) for _ in range(20)])
+            readings.append(VoltageReading(meter, nominal))
+        found = calibration.estimate_divider(readings)
+        true = 9.0 if readings[0].nominal > 9.8 else 12.6
+        nominal = np.mean([board_voltage(true, divider, generator) for _ in range(400)])
+        errors.append(found.voltage(nominal) - true)
+        uncertainties.append(found.uncertainty)
+    normalised = np.abs(np.array(errors)) / np.array(uncertainties)
+    # The stated one is the largest of both ends of the range.
+    assert np.count_nonzero(normalised <= COVERAGE) >= _FEWEST
+    assert np.sum(normalised**2) > 0.5 * _CHI_SQUARED[0]
+
+
+def board_voltage(voltage, divider, generator):
+    """Return the battery voltage that the board computes, with noise of half a count."""
+    counts = voltage / divider * 1024.0 / 5.0 + 0.5 * generator.standard_normal()
+    return calibration.nominal_battery_voltage(math.floor(counts), 4.0)
+
+
+def test_sharp_curves_have_their_stated_uncertainty():
+    """At 10, 30 and 80 cm: the distance that the curve gives for the true voltage there."""
+    generator = np.random.default_rng(5)
+    adc = SimulatedRangeSensorParameters()
+    errors = {distance: [] for distance in (0.1, 0.3, 0.8)}
+    uncertainties = {distance: [] for distance in errors}
+    for _ in range(TRIALS):
+        scale = 0.282 * (1.0 + 0.05 * generator.standard_normal())
+        shift = 0.0257 * (1.0 + 0.05 * generator.standard_normal())
+        true = SharpCurve(scale, shift, 0.061 + 0.03 * generator.standard_normal(), 0.0)
+        readings = sharp_readings(generator, true, adc)
+        found = calibration.estimate_sharp_curve(readings)
+        for distance in errors:
+            volts = true.voltage(distance)
+            errors[distance].append(found.scale / (volts - found.offset) - found.shift - distance)
+            (uncertainty,) = calibration.range_uncertainties(readings, found, [distance])
+            uncertainties[distance].append(uncertainty)
+        assert found.uncertainty >= max(uncertainties[each][-1] for each in errors) * 0.999
+    for distance, values in errors.items():
+        assert_coverage(values, uncertainties[distance])
+    assert np.mean(uncertainties[0.3]) < 0.005
+
+
+def sharp_readings(generator, curve, adc, distances=(0.1, 0.15, 0.2, 0.3, 0.5, 0.8)):
+    readings = []
+    for distance in distances:
+        placed = distance + MARKS.range * generator.standard_normal()
+        volts = curve.voltage(placed) + adc.voltage_noise * generator.standard_normal(20)
+        readings.append(RangeReading(distance, tuple(adc.count(each) for each in volts)))
+    return readings
+
+
+# -- properties -----------------------------------------------------------------------------------
+
+
+def test_runs_that_scatter_too_much_enlarge_the_uncertainty():
+    run = StraightRun(2.0, 2.0 / RADIUS, 2.0 / RADIUS)
+    alike = calibration.estimate_wheel_radius([run, run._replace(distance=2.001)])
+    apart = calibration.estimate_wheel_radius([run, run._replace(distance=2.02)])
+    assert apart.value == pytest.approx(2.01 / run.right)
+    # Half the difference of both runs, and what the tape adds.
+    assert apart.uncertainty == pytest.approx(0.01 / 2.0 * RADIUS, rel=0.01)
+    assert alike.uncertainty < 0.2 * apart.uncertainty
+
+
+def test_the_uncertainty_falls_with_the_number_of_turns():
+    turn = GyroTurn(20.0 * math.pi, 0.001, 132.0, -132.0)
+    one = calibration.estimate_gyro_scale([(20.0 * math.pi, turn)])
+    half = turn._replace(rotation=10.0 * math.pi, right=66.0, left=-66.0)
+    five = calibration.estimate_gyro_scale([(10.0 * math.pi, half)])
+    assert one.uncertainty == pytest.approx(math.sqrt(2.0) * MARKS.angle / (20.0 * math.pi), 0.01)
+    assert five.uncertainty == pytest.approx(2.0 * one.uncertainty, 0.01)
+
+
+def test_the_gyro_counts_the_turns():
+    turn = GyroTurn(10.2 * math.tau, 0.001, 0.0, 0.0)
+    assert calibration.whole_turns(turn, 0.0) == 10
+    assert calibration.whole_turns(turn, -0.7 * math.tau) == 11
+    assert calibration.whole_turns(turn._replace(rotation=-9.9 * math.tau), 0.0) == -10
+
+
+# -- refusals -------------------------------------------------------------------------------------
+
+
+def rest(rates):
+    """Return a recording of a robot that never moves."""
+    count = len(rates)
+    still = np.zeros(count)
+    return Recording(PERIOD * np.arange(count), still, still, np.asarray(rates), count, count)
+
+
+def turned(**changes):
+    """Return an ideal recording of two turns at 1 rad/s between rests of 3 s."""
+    count, begin, end = 928, 150, 778
+    rates = np.zeros(count)
+    rates[begin:end] = 1.0
+    angles = 2.1 * np.clip(PERIOD * (np.arange(count) - begin), 0.0, 12.56)
+    recording = Recording(PERIOD * np.arange(count), angles, -angles, rates, begin, end)
+    return recording._replace(**changes)
+
+
+TURN = GyroTurn(10.0 * math.tau, 0.001, 132.0, -132.0)
+CURVE = SharpCurve(0.282, 0.0257, 0.061, 0.0)
+
+
+def exact_readings(distances):
+    return [
+        RangeReading(distance, 2 * (round(CURVE.voltage(distance) * 204.8 - 0.5),))
+        for distance in distances
+    ]
+
+
+def with_rates(values):
+    recording = turned()
+    rates = recording.rates.copy()
+    for place, value in values.items():
+        rates[place] = value
+    return recording._replace(rates=rates)
+
+
+def spaced(step):
+    recording = turned()
+    times = recording.times.copy()
+    times[400:] += step
+    return recording._replace(times=times)
+
+
+REFUSALS = {
+    'no run': (lambda: calibration.estimate_wheel_radius([]), r'at least 1: got 0'),
+    'marks together': (
+        lambda: calibration.estimate_wheel_radius([StraightRun(0.0, 57.0, 57.0)]),
+        r'distance between the marks must be at least 0.5 m: got 0; .* drive 2 m',
+    ),
+    'millimetres': (
+        lambda: calibration.estimate_wheel_radius([StraightRun(math.nan, 57.0, 57.0)]),
+        r'at least 0.5 m: got nan',
+    ),
+    'curve': (
+        lambda: calibration.estimate_wheel_radius([StraightRun(2.0, 57.0, 50.0)]),
+        r'agree within 2 %: got 57.000 and 50.000 rad; drive straight',
+    ),
+    'one turn': (
+        lambda: calibration.estimate_gyro_scale([(math.tau, TURN)]),
+        r'at least 2 whole turns: got 1.00; ten are better',
+    ),
+    'too few turns for the track': (
+        lambda: calibration.estimate_track([(0.0, TURN)], Estimate(RADIUS, 1e-5)),
+        r'at least 2 whole turns: got 0.00',
+    ),
+    'wrong way': (
+        lambda: calibration.estimate_track([(-20.0 * math.pi, TURN)], Estimate(RADIUS, 1e-5)),
+        r'left is positive, check invert_left',
+    ),
+    'turns miscounted': (
+        lambda: calibration.estimate_gyro_scale([(7.0 * math.tau, TURN)]),
+        r'from 0.8 to 1.2: got 0.700; count the turns',
+    ),
+    'saturated': (
+        lambda: calibration.measure_turn(with_rates({400: 8.72})),
+        r'below 490 deg/s: got 500, saturated; turn more slowly',
+    ),
+    'moved before': (
+        lambda: calibration.measure_turn(with_rates(dict.fromkeys(range(50, 60), 0.1))),
+        r'at most 0.0035 rad/s: got 0.0\d+ before the motion; the robot was moved',
+    ),
+    'moved after': (
+        lambda: calibration.measure_turn(with_rates(dict.fromkeys(range(800, 830), 0.02))),
+        r'got 0.0\d+ after the motion',
+    ),
+    'pushed slowly and evenly': (
+        lambda: calibration.estimate_gyro_bias(rest(np.linspace(0.0, 0.01, 500))),
+        r'at most 0.0035 rad/s',
+    ),
+    'short rest': (
+        lambda: calibration.estimate_gyro_bias(rest(np.zeros(50))),
+        r'must last at least 2 s: got 1.0; do not touch',
+    ),
+    'driven at rest': (
+        lambda: calibration.measure_turn(turned(begin=400)),
+        r'at most 0.0035|must rest before the motion: got steps',
+    ),
+    'no motion': (
+        lambda: calibration.measure_turn(rest(np.zeros(500))),
+        r'must turn between two rests: got no motion',
+    ),
+    'samples missing': (
+        lambda: calibration.measure_turn(spaced(0.3)),
+        r'at most 0.1 s apart: got 0.32; t3mpc robot ping',
+    ),
+    'one voltage': (
+        lambda: calibration.estimate_divider([VoltageReading(12.0, 11.9)]),
+        r'at least 2: got 1; measure a full and an empty battery',
+    ),
+    'same voltage twice': (
+        lambda: calibration.estimate_divider(
+            [VoltageReading(12.0, 11.9), VoltageReading(11.5, 11.4)]
+        ),
+        r'at least 1 V apart: got 0.50',
+    ),
+    'three distances': (
+        lambda: calibration.estimate_sharp_curve(exact_readings((0.1, 0.2, 0.4))),
+        r'distances must be at least 4: got 3; 0.1, 0.15',
+    ),
+    'similar distances': (
+        lambda: calibration.estimate_sharp_curve(exact_readings((0.3, 0.35, 0.4, 0.45))),
+        r'at least 2 times the smallest: got 0.3 and 0.45 m',
+    ),
+    'too near': (
+        lambda: calibration.estimate_sharp_curve(
+            [RangeReading(0.03, (300, 301)), *exact_readings((0.1, 0.2, 0.4))]
+        ),
+        r'must fall with the distance: got 1.47 V at 0.03 m, 2.30 V at 0.10 m.*below 0.1 m',
+    ),
+    'loose wire': (
+        lambda: calibration.estimate_sharp_curve(
+            [RangeReading(0.1, (1023, 1023)), *exact_readings((0.2, 0.4, 0.8))]
+        ),
+        r'from 12 to 983: got 1023 at 0.1 m, saturated; check the wires',
+    ),
+}
+
+
+@pytest.mark.parametrize('name', REFUSALS)
+def test_bad_measurements_are_refused_with_a_remedy(name):
+    estimate, words = REFUSALS[name]
+    with pytest.raises(CalibrationError, match=words):
+        estimate()
