@@ -1,5 +1,123 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Type-3 fuzzy, Boltzmann-machine predictive control along chaotic references."""
+"""Type-3 fuzzy, Boltzmann-machine predictive control along chaotic references.
+
+The names of :data:`__all__` are the scripting interface, ``import t3mpc_ros as t3``. Each is
+imported from :mod:`t3mpc_ros.scripting` when it is first used: the import of the package alone
+imports no library and compiles nothing.
+"""
+
+from importlib import import_module
+import sys
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
+    from t3mpc_ros.evaluation.link_faults import LinkFaults
+    from t3mpc_ros.scripting.bag_columns import BagColumns, read_bag
+    from t3mpc_ros.scripting.chaos_generator import ChaosSolution, chaos
+    from t3mpc_ros.scripting.comparison_runs import Comparison, compare
+    from t3mpc_ros.scripting.controllers import Controller
+    from t3mpc_ros.scripting.fuzzy_system import FuzzySystem, fuzzy
+    from t3mpc_ros.scripting.parameter_sweep import Sweep, sweep
+    from t3mpc_ros.scripting.plants import NoiseLaw, OdePlant, Robot, StateSpace
+    from t3mpc_ros.scripting.references import Waypoints
+    from t3mpc_ros.scripting.script_error import ScriptError
+    from t3mpc_ros.scripting.single_run import RunResult, simulate
+    from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule
 
 __version__ = '0.1.0'
+__all__ = [
+    'BagColumns',
+    'ChaosSolution',
+    'Comparison',
+    'Controller',
+    'FaultEvent',
+    'FaultSchedule',
+    'FuzzySystem',
+    'LinkFaults',
+    'NoiseLaw',
+    'NominalModel',
+    'Observation',
+    'OdePlant',
+    'Robot',
+    'RunResult',
+    'ScriptError',
+    'StateSpace',
+    'Sweep',
+    'Waypoints',
+    'chaos',
+    'compare',
+    'fuzzy',
+    'read_bag',
+    'simulate',
+    'sweep',
+]
+
+_BASELINE = 'evaluation.baselines.baseline_controller'
+_HOMES = {
+    'scripting.bag_columns': ('BagColumns', 'read_bag'),
+    'scripting.chaos_generator': ('ChaosSolution', 'chaos'),
+    'scripting.comparison_runs': ('Comparison', 'compare'),
+    'scripting.controllers': ('Controller',),
+    'scripting.fuzzy_system': ('FuzzySystem', 'fuzzy'),
+    'scripting.parameter_sweep': ('Sweep', 'sweep'),
+    'scripting.plants': ('NoiseLaw', 'OdePlant', 'Robot', 'StateSpace'),
+    'scripting.references': ('Waypoints',),
+    'scripting.script_error': ('ScriptError',),
+    'scripting.single_run': ('RunResult', 'simulate'),
+    'evaluation.link_faults': ('LinkFaults',),
+    'simulation.fault_injection': ('FaultEvent', 'FaultSchedule'),
+    _BASELINE: ('NominalModel', 'Observation'),
+}
+_MODULE = {name: module for module, names in _HOMES.items() for name in names}
+_CALLABLE = ('chaos', 'fuzzy')
+"""Packages that are functions of the interface, too."""
+
+
+def _public(name: str) -> Any:
+    return getattr(import_module(f'{__name__}.{_MODULE[name]}'), name)
+
+
+class _CallablePackage(ModuleType):
+    """A package that can be called as the function of its name."""
+
+    def __call__(self, *arguments: Any, **options: Any) -> Any:
+        return self._function(*arguments, **options)
+
+    @property
+    def _function(self) -> Any:
+        return _public(self.__name__.rpartition('.')[2])
+
+    @property
+    def __signature__(self) -> Any:
+        from inspect import signature
+
+        return signature(self._function)
+
+
+class _Package(ModuleType):
+    """The package itself: an import that binds one of its callable packages makes it callable."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in _CALLABLE and type(value) is ModuleType:
+            value.__class__ = _CallablePackage
+        super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
+
+
+def __getattr__(name: str) -> Any:
+    if name in _CALLABLE:
+        return import_module(f'{__name__}.{name}')
+    if name not in _MODULE:
+        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+    value = _public(name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

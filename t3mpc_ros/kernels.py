@@ -45,7 +45,17 @@ def cache_directory(environment: Mapping[str, str], sources: Path = PACKAGE_DIRE
     OSError
         No candidate is writable; the message names them all.
     """
-    leaf = source_fingerprint(sources)
+    return writable_directory(environment, source_fingerprint(sources))
+
+
+def writable_directory(environment: Mapping[str, str], leaf: str) -> Path:
+    """Return a writable folder named ``leaf`` for compiled code: see :func:`cache_directory`.
+
+    Raises
+    ------
+    OSError
+        No candidate is writable; the message names them all.
+    """
     tried = []
     for base in _base_directories(environment):
         folder = base / leaf
@@ -56,7 +66,7 @@ def cache_directory(environment: Mapping[str, str], sources: Path = PACKAGE_DIRE
         except OSError as error:
             tried.append(f'{folder} ({error.strerror})')
     raise OSError(
-        'no writable folder for compiled kernels; set T3MPC_CACHE_DIR to one. Tried: '
+        'no writable folder for compiled code; set T3MPC_CACHE_DIR to one. Tried: '
         + ', '.join(tried)
     )
 

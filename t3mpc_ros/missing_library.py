@@ -14,11 +14,14 @@ REQUIREMENTS = {
     'yaml': 'PyYAML>=6.0',
     'serial': 'pyserial>=3.5',
     'matplotlib': 'matplotlib>=3.8',
+    'PIL': 'pillow>=10.1',
     'cma': 'cma>=4.0',
     'daqp': 'daqp>=0.11',
     'jinja2': 'jinja2>=3.1',
     'tqdm': 'tqdm>=4.66',
     'casadi': 'casadi>=3.6',
+    'pyarrow': 'pyarrow>=15',
+    'distributed': 'distributed>=2024.5',
 }
 """Requirement of each imported library, as in the requirements files."""
 

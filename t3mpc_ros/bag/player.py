@@ -53,15 +53,14 @@ class PlaybackParameters(Parameters):
     bag_offsets: tuple[float, ...] = parameter(
         (),
         'time offset of each bag, after the alignment; empty = none',
+        's',
         name='play.bag_offsets',
-        unit='s',
     )
     rate: float = parameter(
         1.0,
         'playback rate: seconds of the bag per second',
         name='play.rate',
-        low=0.01,
-        high=100.0,
+        bounds=(0.01, 100.0),
         dynamic=True,
     )
     loop: bool = parameter(False, 'restart at the end', name='play.loop')
@@ -69,23 +68,23 @@ class PlaybackParameters(Parameters):
         0.0,
         'start of the playback, after the first message; transient-local messages from before it '
         'are published first',
+        's',
+        (0.0, None),
         name='play.start_offset',
-        unit='s',
-        low=0.0,
     )
     playback_duration: float = parameter(
         0.0,
         'duration of the playback in bag time; 0 = to the end',
+        's',
+        (0.0, None),
         name='play.playback_duration',
-        unit='s',
-        low=0.0,
     )
     playback_until: float = parameter(
         0.0,
         'end of the playback, after the first message; 0 = the end of the bag',
+        's',
+        (0.0, None),
         name='play.playback_until',
-        unit='s',
-        low=0.0,
     )
     topics: tuple[str, ...] = parameter(
         (),
@@ -111,10 +110,9 @@ class PlaybackParameters(Parameters):
     clock_publish_frequency: float = parameter(
         0.0,
         'rate of /clock; 0 = no /clock',
+        'Hz',
+        (0.0, 1000.0),
         name='play.clock_publish_frequency',
-        unit='Hz',
-        low=0.0,
-        high=1000.0,
     )
     clock_publish_on_topic_publish: bool = parameter(
         False,
@@ -129,25 +127,23 @@ class PlaybackParameters(Parameters):
     seek_time: float = parameter(
         0.0,
         'target of ~/seek, after the first message',
+        's',
+        (0.0, None),
         name='play.seek_time',
-        unit='s',
-        low=0.0,
         dynamic=True,
     )
     play_next_count: int = parameter(
         1,
         'number of messages that ~/play_next plays',
         name='play.play_next_count',
-        low=1,
-        high=1_000_000,
+        bounds=(1, 1_000_000),
         dynamic=True,
     )
     read_ahead_queue_size: int = parameter(
         1000,
         'number of messages read ahead',
         name='play.read_ahead_queue_size',
-        low=1,
-        high=1_000_000,
+        bounds=(1, 1_000_000),
     )
 
     def check_consistency(self) -> None:

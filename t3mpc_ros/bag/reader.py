@@ -37,6 +37,8 @@ from t3mpc_ros.geometry.types import NANOSECONDS
 Array = NDArray[np.float64]
 
 SQLITE_SUFFIX, ROS1_SUFFIX = '.db3', '.bag'
+_RUN_BAG = 'bag'
+"""Folder of the bag in the folder of a run, beside its logs and its report."""
 
 _STORAGES = {MCAP_SUFFIX: 'mcap', SQLITE_SUFFIX: 'sqlite3', ROS1_SUFFIX: 'ROS 1'}
 _COMPRESSION = re.compile(r'^\s*compression_format:\s*[\'"]?\w', re.MULTILINE)
@@ -268,7 +270,7 @@ def open_bag(path: Path | str) -> BagReader:
 
     All complete MCAP files of a folder are read, independently of ``metadata.yaml``, which is
     outdated if the recorder was killed. Bags that rosbag2 compressed, by file or by message, are
-    read through their ``metadata.yaml``.
+    read through their ``metadata.yaml``. Of the folder of a run, its bag is opened.
 
     Raises
     ------
@@ -288,6 +290,8 @@ def open_bag(path: Path | str) -> BagReader:
             complete, incomplete = find_files(path)
             files.extend(complete)
             others = sorted(path.glob(f'*{SQLITE_SUFFIX}'))
+    elif not path.stat().st_size:
+        raise BagError(f'{path} is empty: it has no byte')
     elif path.suffix == MCAP_SUFFIX or has_mcap_magic(path):
         if (file := read_mcap_file(path)) is not None:
             files.append(file)
@@ -298,6 +302,8 @@ def open_bag(path: Path | str) -> BagReader:
     else:
         raise BagError(f'{path} is no MCAP file and no sqlite3 bag')
     files += [RosbagsFile(each) for each in others]
+    if not files and not incomplete and (path / _RUN_BAG).is_dir():
+        return open_bag(path / _RUN_BAG)
     if not files:
         advice = (
             f'; incomplete: {", ".join(incomplete)}: `t3mpc bag recover {path}` writes their '

@@ -33,6 +33,9 @@ from t3mpc_ros.parameters.table import Parameters, parameter
 
 Array = NDArray[np.float64]
 
+REST_FACTOR = 5.0
+"""A wheel within this multiple of the standard deviation of its measurement may be at rest."""
+
 
 @dataclass(frozen=True)
 class LimitParameters(Parameters):
@@ -41,55 +44,49 @@ class LimitParameters(Parameters):
     linear: float = parameter(
         0.35,
         'maximum forward speed |v|',
+        'm/s',
+        (0.01, 5.0),
         name='linear.x.max_velocity',
-        unit='m/s',
-        low=0.01,
-        high=5.0,
         dynamic=True,
     )
     angular: float = parameter(
         4.5,
         'maximum yaw rate |omega|',
+        'rad/s',
+        (0.05, 50.0),
         name='angular.z.max_velocity',
-        unit='rad/s',
-        low=0.05,
-        high=50.0,
         dynamic=True,
     )
     wheel_speed: float = parameter(
         10.0,
         'maximum wheel speed; from this speed a robot without commands stops within 0.5 s',
+        'rad/s',
+        (0.1, 200.0),
         name='wheel.max_velocity',
-        unit='rad/s',
-        low=0.1,
-        high=200.0,
         dynamic=True,
     )
     linear_acceleration: float = parameter(
         1.0,
         'maximum |dv/dt|',
+        'm/s²',
+        (0.01, 50.0),
         name='linear.x.max_acceleration',
-        unit='m/s²',
-        low=0.01,
-        high=50.0,
         dynamic=True,
     )
     angular_acceleration: float = parameter(
         14.0,
         'maximum |d omega/dt|',
+        'rad/s²',
+        (0.05, 500.0),
         name='angular.z.max_acceleration',
-        unit='rad/s²',
-        low=0.05,
-        high=500.0,
         dynamic=True,
     )
     wheel_acceleration: float = parameter(
         30.0,
         'maximum acceleration of a wheel, at most the limit of the robot itself',
+        'rad/s²',
+        (0.1, 1e4),
         name='wheel.max_acceleration',
-        unit='rad/s²',
-        low=0.1,
-        high=1e4,
         dynamic=True,
     )
 
@@ -130,6 +127,7 @@ class VelocityActuation:
         self._lengths = geometry.wheel_radius, geometry.half_separation
         self._velocity = drive == 'velocity'
         self._period = period
+        self._rest_speed = REST_FACTOR * math.sqrt(filter_parameters.noise_variance)
         lag = filter_parameters.lag
         self._servo_step = 1.0 - math.exp(-period / lag)
         self._disturbance_gain = self._servo_step * lag / period if self._velocity else 1.0
@@ -182,15 +180,32 @@ class VelocityActuation:
         """Use new limits from the next command on."""
         self._limits = wheel_limits(limits, self._geometry)
 
-    def reset(self, speeds: Array) -> None:
-        """Restart at measured wheel speeds (rad/s), which also become the last command."""
+    def reset(self, speeds: Array, last_command: Array | None = None) -> None:
+        """Restart at measured wheel speeds.
+
+        The next command is within the acceleration limits of the last one. A robot that moves is
+        taken over at its speed. One that may as well stand starts from standstill: its first
+        command would otherwise be a step to the noise of one measurement.
+
+        Parameters
+        ----------
+        speeds
+            Measured wheel speeds, rad/s, shape (2,).
+        last_command
+            Wheel speeds that were commanded last, rad/s, shape (2,); without them the robot
+            was commanded to stop, or by others.
+        """
+        if self._velocity and np.abs(speeds).max() <= self._rest_speed:
+            speeds = np.zeros(2)
         self._filter.reset(speeds)
         self.applied[:] = 0.0
         self._sent = False
         self.limited = False
         """Whether a limit changed the last command."""
         self.command[:] = 0.0
-        if self._velocity:
+        if last_command is not None:
+            self.command[:] = last_command
+        elif self._velocity:
             right, left = speeds.tolist()
             self.command[:] = speeds * limit_scale(right, left, self._limits[0])
 

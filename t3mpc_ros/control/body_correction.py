@@ -72,41 +72,29 @@ class BodyCorrectionParameters(Parameters):
     learning_rate: float = parameter(
         2.0,
         'gamma |Phi|²: rate at which the map approaches the present yaw rate',
-        unit='1/s',
-        low=0.0,
-        high=50.0,
+        '1/s',
+        (0.0, 50.0),
         dynamic=True,
     )
-    skill_time: float = parameter(
-        5.0, 'time constant of the measured skill', unit='s', low=0.5, high=600.0
-    )
+    skill_time: float = parameter(5.0, 'time constant of the measured skill', 's', (0.5, 600.0))
     dead_zone: float = parameter(
         0.015,
         'error of a wheel that is not worth correcting: noise of the gyro, averaged over 0.25 s, '
         'and errors of the assumed delay',
-        unit='rad/s',
-        low=0.0,
-        high=10.0,
+        'rad/s',
+        (0.0, 10.0),
         dynamic=True,
     )
-    yaw_gain: float = parameter(
-        0.3, 'gain k of the yaw error', unit='1/s', low=0.0, high=20.0, dynamic=True
-    )
+    yaw_gain: float = parameter(0.15, 'gain k of the yaw error', '1/s', (0.0, 20.0), dynamic=True)
     max_correction: float = parameter(
-        1.0,
-        'bound of the correction of a wheel by the map',
-        unit='rad/s',
-        low=0.0,
-        high=10.0,
-        dynamic=True,
+        1.0, 'bound of the correction of a wheel by the map', 'rad/s', (0.0, 10.0), dynamic=True
     )
     max_yaw_correction: float = parameter(
-        0.1,
+        0.06,
         'v-bar: bound of the correction of a wheel by the yaw error, so that a robot that was '
         'turned by a slide turns back slowly: its error is the less',
-        unit='rad/s',
-        low=0.0,
-        high=10.0,
+        'rad/s',
+        (0.0, 10.0),
         dynamic=True,
     )
     fuzzy: FuzzyParameters = group(

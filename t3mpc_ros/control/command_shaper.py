@@ -36,17 +36,15 @@ class CommandShaperParameters(Parameters):
         14.6,
         'frequency at which the robot oscillates along its path, sqrt(k/J)/(2 pi) with the '
         'stiffness k of a motor and the inertia J that it accelerates; 0: none',
-        unit='Hz',
-        low=0.0,
-        high=1000.0,
+        'Hz',
+        (0.0, 1000.0),
         source='motor and body of the default robot',
     )
     turning_frequency: float = parameter(
         9.1,
         'frequency at which the robot oscillates in yaw; 0: none',
-        unit='Hz',
-        low=0.0,
-        high=1000.0,
+        'Hz',
+        (0.0, 1000.0),
         source='motor and body of the default robot',
     )
 

@@ -41,9 +41,8 @@ class LawParameters(Parameters):
         'feedback gain K of the tracking error (66)-(67); 0: by the drive, such that K plus the '
         'slope of the compensator, (omega-bar + v_p-bar)/epsilon, is (1 - exp(-T/lag))/T, at '
         'which measurement noise cancels in the command. 15.2 is tuned for a lag of 0.02 s',
-        unit='1/s',
-        low=0.0,
-        high=100.0,
+        '1/s',
+        (0.0, 100.0),
         dynamic=True,
     )
     compensator: bool = parameter(
@@ -52,18 +51,16 @@ class LawParameters(Parameters):
     error_bound: float = parameter(
         6.0,
         'bound omega-bar (80) of the estimation error of a wheel that the compensator outweighs',
-        unit='rad/s²',
-        low=0.0,
-        high=100.0,
+        'rad/s²',
+        (0.0, 100.0),
         dynamic=True,
     )
     smoothing: float = parameter(
         0.62,
         'width epsilon of the compensator tanh(delta/epsilon): the error bound E14 grows with '
         '0.2785 epsilon, small values chatter with noise',
-        unit='rad/s',
-        low=1e-3,
-        high=100.0,
+        'rad/s',
+        (1e-3, 100.0),
         dynamic=True,
     )
 
@@ -72,7 +69,7 @@ class LawParameters(Parameters):
 class Nt3fsMpcParameters(Parameters):
     """The law and its parts, each of which can be disabled."""
 
-    rate: float = parameter(100.0, 'control rate', unit='Hz', low=5.0, high=1000.0)
+    rate: float = parameter(100.0, 'control rate', 'Hz', (5.0, 1000.0))
     use_fuzzy: bool = parameter(
         True, 'whether the fuzzy estimate g is adapted and cancelled (NT3FS)', dynamic=True
     )
@@ -80,9 +77,8 @@ class Nt3fsMpcParameters(Parameters):
         0.025,
         'transfer of a persistent v_p to the fuzzy systems, which learn from '
         'delta - integral_transfer v_p; 0 gives (77)-(78) as printed',
-        unit='s',
-        low=0.0,
-        high=10.0,
+        's',
+        (0.0, 10.0),
         dynamic=True,
     )
     law: LawParameters = group(LawParameters)

@@ -24,11 +24,19 @@ from t3mpc_ros.control.control_law import (
     fitting_gain,
 )
 from t3mpc_ros.control.dead_time_estimator import DeadTimeEstimator
-from t3mpc_ros.control.jump_transition import JumpTransition
+from t3mpc_ros.control.jump_transition import JumpTransition, MotorLimit
+from t3mpc_ros.control.keep_out import KeepOut, KeepOutParameters
+from t3mpc_ros.control.pose_controller import PoseController, PoseLoopParameters, PoseReference
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.control.watchdog import InputWatchdog, Reason, ResponseMonitor, WatchdogParameters
 from t3mpc_ros.geometry import kinematics
-from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
+from t3mpc_ros.geometry.arena import Obstacles
+from t3mpc_ros.geometry.kinematics import (
+    WheelGeometry,
+    advance_pose,
+    twist_from_wheels,
+    wheels_from_twist,
+)
 from t3mpc_ros.geometry.trajectory import (
     Jump,
     ReferenceTrajectory,
@@ -97,10 +105,17 @@ class ControllerParameters(Nt3fsMpcParameters):
         CommandShaperParameters, straight_frequency=0.0, turning_frequency=0.0
     )
     body: BodyCorrectionParameters = group(BodyCorrectionParameters)
+    pose: PoseLoopParameters = group(PoseLoopParameters)
+    keep_out: KeepOutParameters = group(KeepOutParameters)
 
     def check_consistency(self) -> None:
         """Raise :class:`ParameterError` if the composition cannot treat jumps so."""
         super().check_consistency()
+        if self.keep_out.enabled and not self.pose.enabled:
+            raise ParameterError(
+                'pose.enabled must be true with keep_out.enabled: after a detour the robot must '
+                'find back to its path'
+            )
         if self.composition == 'body' and self.jump_transition.method == 'predictive':
             raise ParameterError(
                 'jump_transition.method must be ramp with composition body, which has no '
@@ -186,10 +201,28 @@ class Controller:
     """Tracks a stamped reference with one robot, one step per odometry message.
 
     The output is a function of the messages in their order; the controller reads no clock.
+
+    Parameters
+    ----------
+    parameters
+        Replaceable at run time, see :meth:`configure`.
+    obstacles
+        Known walls and pillars in the frame of the odometry, for the keep-out.
     """
 
-    def __init__(self, parameters: ControllerParameters) -> None:
+    def __init__(
+        self, parameters: ControllerParameters, obstacles: Obstacles | None = None
+    ) -> None:
         self.parameters = parameters
+        self._pose_reference = PoseReference()
+        self._pose = PoseController(parameters.pose)
+        largest = BodyTwist(parameters.limits.linear, parameters.limits.angular)
+        self._keep_out = (
+            KeepOut(parameters.keep_out, largest, obstacles)
+            if parameters.keep_out.enabled
+            else None
+        )
+        self._place = ORIGIN
         self._tracker = SwitchingTracker(parameters.resolved(), 'velocity')
         self._period = 1.0 / parameters.rate
         self._period_ns = round(self._period * NANOSECONDS)
@@ -253,6 +286,16 @@ class Controller:
         return self._disturbed
 
     @property
+    def pose_controller(self) -> PoseController:
+        """The pose loop."""
+        return self._pose
+
+    @property
+    def keep_out(self) -> KeepOut | None:
+        """The keep-out, None unless it is enabled."""
+        return self._keep_out
+
+    @property
     def gain(self) -> float:
         """Feedback gain K in use, 1/s."""
         return self._tracker.parameters.law.gain
@@ -297,6 +340,7 @@ class Controller:
         self.parameters = parameters
         self._tracker.configure(parameters.resolved())
         self._body.configure(parameters.body)
+        self._pose.parameters = parameters.pose
         self._actuation.configure(parameters.limits)
         self._sampling = Sampling.of(parameters)
 
@@ -319,6 +363,13 @@ class Controller:
         self._set_dead_time(self.parameters.speed_filter.dead_time)
         self._stop()
         self._last_stamp_ns = None
+        if self._keep_out is not None:
+            self._keep_out.reset()
+
+    def add_range(self, sensor: int, reading: float) -> None:
+        """Add a range reading (m, REP 117) of a sensor, taken at the pose of the last odometry."""
+        if self._keep_out is not None and self._last_stamp_ns is not None:
+            self._keep_out.add_reading(sensor, reading, self._place)
 
     def add_reference(self, reference: State) -> bool:
         """Store a reference sample; return False if it is not finite and therefore ignored."""
@@ -330,6 +381,8 @@ class Controller:
             # The source has restarted: its samples replace those with later stamps.
             self._jumps = [jump for jump in self._jumps if jump.stamp_ns < reference.stamp_ns]
             self._tracker.transition.withdraw(reference.stamp_ns)
+        if self.parameters.pose.enabled:
+            self._pose_reference.add(reference)
         if trajectory.has_jumps:
             self._jumps += trajectory.pop_jumps()
         self._watchdog.reference_received()
@@ -353,6 +406,8 @@ class Controller:
         elapsed = self._watchdog.elapsed(stamp)
         if restarted:
             self._clear_reference()
+            if self._keep_out is not None:
+                self._keep_out.reset()
 
         finite = odometry.is_finite()
         effect_ns = stamp + self._dead_time_ns
@@ -386,10 +441,10 @@ class Controller:
             self._response.reset()
             self._snapshots.clear()
         elif not self._response.update(*speeds.tolist()):
-            return self._command_unresponsive(stamp)
+            return self._command_unresponsive(odometry, elapsed or self._period)
         elif self.status.reason is Reason.NOT_FOLLOWING:
             restart = True
-            self._actuation.reset(speeds)
+            self._actuation.reset(speeds, self._actuation.command.copy())
         actuation = self._actuation
         actuation.observe(speeds, elapsed or self._period)
         if restart:
@@ -397,6 +452,10 @@ class Controller:
             self._disturbed, self._before_disturbance = False, None
         else:
             self._update_dead_time(speeds, elapsed or self._period)
+        if self.parameters.pose.enabled:
+            if restart:
+                self._pose.reset()
+            self._follow_pose(odometry, begin, end, elapsed or self._period)
         if restart:
             self._tracker.begin(plan_ns, actuation.predicted, begin)
             self._shaper.reset(actuation.predicted)
@@ -442,6 +501,30 @@ class Controller:
             planned = planned + np.array([correction, -correction])
         return self.law.step(speeds, planned, rate, elapsed)
 
+    def _follow_pose(self, odometry: State, begin: Array, end: Array, elapsed: float) -> None:
+        """Change the plan from ``begin`` to ``end`` (rad/s) by pose loop and keep-out."""
+        parameters, geometry = self.parameters, self.parameters.geometry
+        horizon = self._actuation.dead_time + parameters.speed_filter.lag
+        self._place = odometry.pose
+        reference = self._pose_reference.at(odometry.stamp_ns + round(horizon * NANOSECONDS))
+        if reference is None:
+            return
+        # The commands of the dead time are on their way: the robot will be there.
+        command = WheelSpeeds(*self._actuation.command.tolist())
+        pose = advance_pose(odometry.pose, twist_from_wheels(command, geometry), horizon)
+        planned = twist_from_wheels(WheelSpeeds(*begin.tolist()), geometry)
+        twist, keep_out = self._pose.step(reference, pose, planned), self._keep_out
+        if keep_out is not None:
+            if self._pose.rejoining:
+                velocity = keep_out.guide(self._pose.closing_velocity(planned), pose)
+                twist = self._pose.drive_along(velocity)
+            twist = keep_out.step(twist, pose, elapsed)
+        change = np.zeros(2)
+        if not (self._pose.rejoining or (keep_out is not None and keep_out.changed)):
+            change = end - begin
+        begin[:] = wheels_from_twist(twist, geometry)
+        end[:] = begin + change
+
     @property
     def _corrects_body(self) -> bool:
         parameters = self.parameters
@@ -468,7 +551,7 @@ class Controller:
         )
         return True
 
-    def _command_unresponsive(self, stamp_ns: int) -> tuple[BodyTwist, Status]:
+    def _command_unresponsive(self, odometry: State, elapsed: float) -> tuple[BodyTwist, Status]:
         """Command the reference to a robot that does not follow commands; adaptation pauses.
 
         A stop would be permanent, because a restarted board needs commands to start. The weights
@@ -480,10 +563,15 @@ class Controller:
             if self._snapshots:
                 self._rollback(self._snapshots[0])
                 self._snapshots.clear()
-        self._actuation.send_speeds(self._sampled.reference)
+        speeds, reference, begin, end = self._sampled
+        if self.parameters.pose.enabled:
+            self._follow_pose(odometry, begin, end, elapsed)
+            self._actuation.send_speeds(begin)
+        else:
+            self._actuation.send_speeds(reference)
         self._response.add_command(*self._actuation.command.tolist())
-        error = self._sampled.speeds - self._sampled.reference
-        self.status = self._make_status(stamp_ns, Reason.NOT_FOLLOWING, error)
+        error = speeds - reference
+        self.status = self._make_status(odometry.stamp_ns, Reason.NOT_FOLLOWING, error)
         return self._actuation.twist, self.status
 
     def _update_dead_time(self, speeds: Array, elapsed: float) -> None:
@@ -559,6 +647,7 @@ class Controller:
 
     def _clear_reference(self) -> None:
         self._trajectory.clear()
+        self._pose_reference.clear()
         self._jumps.clear()
 
     def _stop(self) -> None:
@@ -595,14 +684,20 @@ class SwitchingTracker:
         Control law and treatment of jumps.
     drive
         ``'velocity'`` or ``'torque'``; with ``'velocity'`` the transition includes the servo lag.
+    motor_limit
+        Of a torque drive, if it is known.
     """
 
-    def __init__(self, parameters: Nt3fsMpcParameters, drive: str) -> None:
+    def __init__(
+        self, parameters: Nt3fsMpcParameters, drive: str, motor_limit: MotorLimit | None = None
+    ) -> None:
         self.parameters = parameters
         self._period = 1.0 / parameters.rate
         self.law = Nt3fsMpcController(parameters)
         lag = parameters.speed_filter.lag if drive == 'velocity' else 0.0
-        self.transition = JumpTransition(parameters.jump_transition, lag, self._period)
+        self.transition = JumpTransition(
+            parameters.jump_transition, lag, self._period, motor_limit
+        )
 
     def configure(self, parameters: Nt3fsMpcParameters) -> None:
         """Use new values of the dynamic parameters from the next step on."""

@@ -37,13 +37,39 @@ class JumpTransitionParameters(Parameters):
     )
     acceleration: float = parameter(
         30.0,
-        'acceleration of the ramp: at most the acceleration limit of a wheel; the evaluation uses '
-        'a larger value for the torque drive, which has no such limit',
-        unit='rad/s²',
-        low=0.1,
-        high=1e4,
+        'acceleration of the ramp: at most the acceleration limit of a wheel; a torque drive '
+        'crosses with what its motors have for the direction of the jump instead',
+        'rad/s²',
+        (0.1, 1e4),
         dynamic=True,
     )
+
+
+class MotorLimit(NamedTuple):
+    """What the motors of a torque drive have for a jump."""
+
+    inertia: Array
+    """theta_bar of (11), kg m², shape (2, 2)."""
+    torque: float
+    """Largest torque of a wheel, N m."""
+
+    def accelerations(self, jump: Array) -> Array:
+        r"""Return the largest accelerations for a jump (rad/s), rad/s², shape (2,), positive.
+
+        Both wheels cross in the same time t, so that the body keeps one direction:
+
+        .. math:: t = \max_i |(\bar\theta J)_i| / \tau, \qquad a_i = |J_i| / t
+
+        Two wheels that turn the body need more torque for the same acceleration than two that
+        push it. A wheel that hardly jumps may be a little faster than that, since it is soon
+        across.
+        """
+        needed = float(np.max(np.abs(self.inertia @ jump))) / self.torque
+        if needed == 0.0:
+            return np.full(2, math.nan)
+        alike = np.abs(jump) / needed
+        found: Array = np.maximum(alike, 0.25 * alike.max())
+        return found
 
 
 class JumpTransition:
@@ -74,16 +100,25 @@ class JumpTransition:
         Time constant of the servo, s; 0 for a torque drive.
     period
         Control period, s.
+    motor_limit
+        Of a torque drive, whose ramps it determines; None: the parameters do.
     """
 
-    def __init__(self, parameters: JumpTransitionParameters, lag: float, period: float) -> None:
+    def __init__(
+        self,
+        parameters: JumpTransitionParameters,
+        lag: float,
+        period: float,
+        motor_limit: MotorLimit | None = None,
+    ) -> None:
         self._parameters = parameters
+        self._motor_limit = motor_limit
         self._lag = lag
         self._period = period
         self.count = 0
         """Number of unfinished transitions."""
         self._transitions = Transitions(
-            np.zeros((8, 3, 2)), np.zeros(8, dtype=np.int64), np.zeros(8, dtype=np.bool_)
+            np.zeros((8, 4, 2)), np.zeros(8, dtype=np.int64), np.zeros(8, dtype=np.bool_)
         )
         self._plan = Plan(np.zeros(2), np.zeros(2), np.zeros((4, 2)))
 
@@ -165,7 +200,9 @@ class JumpTransition:
             longer = (np.concatenate((rows, np.zeros_like(rows))) for rows in self._transitions)
             self._transitions = Transitions._make(longer)
         ramps, instants, passed = self._transitions
-        ramps[k] = (jump, slope_after, (0.0, 0.0))
+        limit = self._motor_limit
+        known = (math.nan, math.nan) if limit is None else limit.accelerations(jump)
+        ramps[k] = (jump, slope_after, (0.0, 0.0), known)
         instants[k] = instant_ns
         passed[k] = False
         self.count += 1
@@ -202,8 +239,9 @@ class JumpTransition:
         )
 
 
-JUMP, SLOPE_AFTER, COVERED = range(3)
-"""Rows of a transition: jump (rad/s), r' after it (rad/s²), commanded part of the jump (rad/s)."""
+JUMP, SLOPE_AFTER, COVERED, ACCELERATION = range(4)
+"""Rows of a transition: jump (rad/s), r' after it (rad/s²), commanded part of the jump (rad/s),
+acceleration of a torque drive, or NaN (rad/s²)."""
 RESPONSE, PASSED, OFFSET, OFFSET_NEXT = range(4)
 """Rows of the sums over all transitions (rad/s): servo response to the commanded parts, jumps
 that r has made, and h now and one period later."""
@@ -213,7 +251,7 @@ class Transitions(NamedTuple):
     """Jumps that are known, for kernels; the first ``count`` rows are valid."""
 
     ramps: Array
-    """Rows JUMP, SLOPE_AFTER and COVERED of each, shape (n, 3, 2)."""
+    """Rows JUMP to ACCELERATION of each, shape (n, 4, 2)."""
     instants: Stamps
     """When r jumps, ns, shape (n,)."""
     passed: Flags
@@ -311,17 +349,19 @@ def advance(
 ) -> None:
     """Advance the ramp of wheel ``i`` by one period after its start.
 
-    transition   : shape (3, 2), rows JUMP, SLOPE_AFTER, COVERED
+    transition   : shape (4, 2), rows JUMP to ACCELERATION
     passed       : whether r has jumped
     left         : time until the jump, less the lead of the command, s
     slope        : r' without the jump, rad/s²
-    acceleration : of the ramp, rad/s²
+    acceleration : of the ramp, unless the transition has its own, rad/s²
     """
     size = abs(transition[JUMP, i])
     rest = transition[JUMP, i] - transition[COVERED, i]
     if rest == 0.0:
         return
     sign = math.copysign(1.0, rest)
+    if not math.isnan(transition[ACCELERATION, i]):
+        acceleration = transition[ACCELERATION, i]
     after = max(acceleration - sign * transition[SLOPE_AFTER, i], 0.2 * acceleration)
     before = after
     if not passed:
@@ -347,7 +387,7 @@ def remove_finished(transitions: Transitions, count: int, sums: Array, over_ns: 
                 sums[RESPONSE, i] -= ramps[k, JUMP, i]
                 sums[PASSED, i] -= ramps[k, JUMP, i]
         else:
-            for row in range(3):
+            for row in range(4):
                 for i in range(2):
                     ramps[kept, row, i] = ramps[k, row, i]
             instants[kept] = instants[k]

@@ -24,24 +24,18 @@ class SpeedFilterParameters(Parameters):
     noise_variance: float = parameter(
         0.04,
         'variance of the measured wheel speeds; 0: the measurement is exact',
-        unit='(rad/s)²',
-        low=0.0,
-        high=100.0,
+        '(rad/s)²',
+        (0.0, 100.0),
         source='paper: noise of the simulations',
     )
     disturbance: float = parameter(
         15.0,
         'square root of the spectral density of the random walk of the disturbance acceleration',
-        unit='rad/s²/√s',
-        low=1e-3,
-        high=1e4,
+        'rad/s²/√s',
+        (1e-3, 1e4),
     )
-    lag: float = parameter(
-        0.02, 'first-order lag of the velocity drive', unit='s', low=0.001, high=1.0
-    )
-    dead_time: float = parameter(
-        0.01, 'dead time of the velocity drive', unit='s', low=0.0, high=0.5
-    )
+    lag: float = parameter(0.02, 'first-order lag of the velocity drive', 's', (0.001, 1.0))
+    dead_time: float = parameter(0.01, 'dead time of the velocity drive', 's', (0.0, 0.5))
 
 
 SPEEDS, DISTURBANCE, PREDICTED = range(3)

@@ -20,56 +20,36 @@ class WatchdogParameters(Parameters):
     """Time-outs of the inputs and bounds of a plausible state."""
 
     reference_timeout: float = parameter(
-        0.15,
-        'maximum age of the reference, measured with the odometry stamps',
-        unit='s',
-        low=0.01,
-        high=5.0,
+        0.15, 'maximum age of the reference, measured with the odometry stamps', 's', (0.01, 5.0)
     )
     odometry_timeout: float = parameter(
-        0.2,
-        'maximum gap in the odometry; the robot stops after a longer gap',
-        unit='s',
-        low=0.02,
-        high=5.0,
+        0.2, 'maximum gap in the odometry; the robot stops after a longer gap', 's', (0.02, 5.0)
     )
     speed_bound: float = parameter(
-        40.0, 'measured wheel speed above which the state is diverging', unit='rad/s', low=1.0,
-        high=1000.0,
-    )  # fmt: skip
+        40.0, 'measured wheel speed above which the state is diverging', 'rad/s', (1.0, 1000.0)
+    )
     error_bound: float = parameter(
-        25.0, 'tracking error above which the state is diverging', unit='rad/s', low=0.5,
-        high=1000.0,
-    )  # fmt: skip
+        25.0, 'tracking error above which the state is diverging', 'rad/s', (0.5, 1000.0)
+    )
     hold_time: float = parameter(
-        0.5,
-        'duration of the stop after a diverging state',
-        unit='s',
-        low=0.0,
-        high=60.0,
+        0.5, 'duration of the stop after a diverging state', 's', (0.0, 60.0)
     )
 
     response_bound: float = parameter(
         1.5,
         'distance of a measured wheel speed from the range of the commands in response_window '
         'above which the robot does not follow commands; 0 disables the check',
-        unit='rad/s',
-        low=0.0,
-        high=100.0,
+        'rad/s',
+        (0.0, 100.0),
     )
     response_window: float = parameter(
-        0.15,
-        'maximum delay between a command and its effect in the odometry',
-        unit='s',
-        low=0.01,
-        high=2.0,
+        0.15, 'maximum delay between a command and its effect in the odometry', 's', (0.01, 2.0)
     )
     response_timeout: float = parameter(
         0.1,
         'duration of a missing or restored response before the decision changes',
-        unit='s',
-        low=0.0,
-        high=5.0,
+        's',
+        (0.0, 5.0),
     )
 
 
@@ -167,16 +147,6 @@ class InputWatchdog:
             return Reason.DIVERGING
         self._hold_until_ns = None
         return Reason.TRACKING
-
-    @property
-    def holding(self) -> bool:
-        """Whether the robot is stopped by request or after a diverging state."""
-        return not self.enabled or self._hold_until_ns is not None
-
-    @property
-    def last_reference(self) -> tuple[int | None, bool]:
-        """Odometry stamp of the last reference (ns), and whether a newer reference is pending."""
-        return self._reference_ns, self._reference_pending
 
     def odometry_timed_out(self, last_received_ns: int | None, now_ns: int) -> bool:
         """Whether the odometry is older than the time-out; both times are from one clock."""

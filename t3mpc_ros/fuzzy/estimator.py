@@ -27,9 +27,8 @@ class AdaptationParameters(Parameters):
         'the dynamics of the error: s² + K s + gamma |Phi|² = 0. With the default type-3 sets '
         '|Phi|² is 0.015 to 0.14, so 240 gives about 15; with type1 or interval_type2 it is about '
         'three times larger, so a third of gamma gives the same dynamics',
-        unit='1/s²',
-        low=0.0,
-        high=1e6,
+        '1/s²',
+        (0.0, 1e6),
         dynamic=True,
     )
     radius: float = parameter(
@@ -37,18 +36,16 @@ class AdaptationParameters(Parameters):
         'radius of the ball that the coefficients of an output are projected onto, as a root mean '
         'square: |alpha| <= radius sqrt(2 r lambda), so the largest constant estimate is radius '
         'for any number of rules',
-        unit='rad/s²',
-        low=0.0,
-        high=1e4,
+        'rad/s²',
+        (0.0, 1e4),
         dynamic=True,
     )
     sigma_modification: float = parameter(
         0.0,
         'rate of the leakage of the coefficients towards zero (gamma times the usual sigma); '
         'bounds them without a known ball, but biases them',
-        unit='1/s',
-        low=0.0,
-        high=10.0,
+        '1/s',
+        (0.0, 10.0),
         dynamic=True,
     )
     dead_zone: float = parameter(
@@ -56,18 +53,16 @@ class AdaptationParameters(Parameters):
         'error below which the coefficients do not adapt. It should be at least the disturbance '
         'that the coefficients cannot represent, divided by K; even noise of about this size '
         'causes little drift',
-        unit='rad/s',
-        low=0.0,
-        high=10.0,
+        'rad/s',
+        (0.0, 10.0),
         dynamic=True,
     )
     step_limit: float = parameter(
         2.0,
         'maximum of gamma |Phi|² dt per step, above which gamma is reduced; the sampled loop is '
         'stable only below K',
-        unit='1/s',
-        low=0.001,
-        high=1000.0,
+        '1/s',
+        (0.001, 1000.0),
         dynamic=True,
     )
 
@@ -334,28 +329,16 @@ class FuzzyEstimator:
             )
 
 
-def gamma_for(
-    parameters: FuzzyParameters, normalised_gain: float, inputs: int = 2, samples: int = 400
-) -> float:
+def gamma_for(parameters: FuzzyParameters, normalised_gain: float) -> float:
     """Return the gamma (1/s²) of a given mean normalised gain gamma |Phi|².
 
     |Phi|² depends on the kind and the number of the sets: at the same gamma, fuzzy systems adapt
-    at different rates, which would dominate their comparison.
-
-    Parameters
-    ----------
-    parameters
-        Fuzzy sets.
-    normalised_gain
-        Mean of gamma |Phi|², 1/s².
-    inputs
-        Number of inputs.
-    samples
-        Number of inputs in the mean, uniform between first and last centre, from a fixed seed.
+    at different rates, which would dominate their comparison. The mean is over 400 pairs of
+    inputs, uniform between first and last centre, from a fixed seed.
     """
-    sets = build_sets(parameters, inputs)
+    sets = build_sets(parameters, 2)
     drawn = np.random.default_rng(0).uniform(
-        parameters.centre_low, parameters.centre_high, (samples, inputs)
+        parameters.centre_low, parameters.centre_high, (400, 2)
     )
     power = np.mean([np.sum(compute_basis(point, sets) ** 2) for point in drawn])
     return float(normalised_gain / power)

@@ -34,46 +34,39 @@ class FuzzyParameters(Parameters):
         choices=('type3', 'interval_type2', 'type1'),
         source='paper: NT3FS, compared with the others',
     )
-    sets: int = parameter(7, 'Gaussian sets per input, M', low=1, high=15)
-    centre_low: float = parameter(
-        -10.0, 'centre of the first set', unit='rad/s', low=-1000.0, high=1000.0
-    )
+    sets: int = parameter(7, 'Gaussian sets per input, M', bounds=(1, 15))
+    centre_low: float = parameter(-10.0, 'centre of the first set', 'rad/s', (-1000.0, 1000.0))
     centre_high: float = parameter(
         10.0,
         'centre of the last set; the others are evenly spaced between',
-        unit='rad/s',
-        low=-1000.0,
-        high=1000.0,
+        'rad/s',
+        (-1000.0, 1000.0),
     )
     centre_exponent: float = parameter(
         2.0,
         'exponent of the centre positions in [-1, 1]: above 1 the centres are denser in the '
         'middle, where Coulomb friction changes its sign; 1: evenly spaced',
-        low=0.2,
-        high=5.0,
+        bounds=(0.2, 5.0),
     )
     spread: float = parameter(
         0.6,
         'width sigma of the sets as a fraction of the centre spacing, in exp(-((x - o)/sigma)²); '
         'at 0.6 adjacent sets cross at grade one half (the spacing of a single set is the range)',
-        low=0.05,
-        high=10.0,
+        bounds=(0.05, 10.0),
     )
-    slices: int = parameter(4, 'number of slices lambda of the type-3 sets', low=1, high=32)
+    slices: int = parameter(4, 'number of slices lambda of the type-3 sets', bounds=(1, 32))
     footprint_of_uncertainty: float = parameter(
         0.23,
         'interval_type2 only: widths are (1 - f) sigma and (1 + f) sigma; 0.23 is the mean of the '
         'type-3 default, weighted by level',
-        low=0.0,
-        high=0.95,
+        bounds=(0.0, 0.95),
     )
     input_fuzziness: float = parameter(
         0.283,
         'fuzziness of the inputs beta_U, in exp(-((x - U)/beta_U)²): sqrt(2) times the standard '
         'deviation of the noise (0.2 rad/s); 0: singleton fuzzifier',
-        unit='rad/s',
-        low=0.0,
-        high=100.0,
+        'rad/s',
+        (0.0, 100.0),
         source='paper: noise variance 0.04',
     )
 

@@ -53,104 +53,80 @@ class PredictiveParameters(Parameters):
         True, 'whether v_p is applied; the machine learns in either case', dynamic=True
     )
     decimation: int = parameter(
-        5, 'control periods per predictive period T; n_p T should reach 3/K', low=1, high=100
+        5, 'control periods per predictive period T; n_p T should reach 3/K', bounds=(1, 100)
     )
     average: int = parameter(
-        5, 'newest errors in the mean of one sample, at most decimation', low=1, high=100
+        5, 'newest errors in the mean of one sample, at most decimation', bounds=(1, 100)
     )
-    horizon: int = parameter(10, 'prediction horizon n_p, in periods T', low=1, high=50)
+    horizon: int = parameter(10, 'prediction horizon n_p, in periods T', bounds=(1, 50))
     control_horizon: int = parameter(
-        5, 'control horizon n_c: later changes of v_p are zero', low=1, high=50
+        5, 'control horizon n_c: later changes of v_p are zero', bounds=(1, 50)
     )
-    error_weight: float = parameter(
-        1.0, 'mu of (60)', unit='s²/rad²', low=0.0, high=1e6, dynamic=True
-    )
-    move_weight: float = parameter(
-        0.029, 'pi of (60)', unit='s⁴/rad²', low=1e-9, high=1e6, dynamic=True
-    )
+    error_weight: float = parameter(1.0, 'mu of (60)', 's²/rad²', (0.0, 1e6), dynamic=True)
+    move_weight: float = parameter(0.029, 'pi of (60)', 's⁴/rad²', (1e-9, 1e6), dynamic=True)
     v_max: float = parameter(
-        10.0, 'bound of v_p, v_p-bar of (80)', unit='rad/s²', low=0.0, high=1e4, dynamic=True
+        10.0, 'bound of v_p, v_p-bar of (80)', 'rad/s²', (0.0, 1e4), dynamic=True
     )
     dv_max: float = parameter(
-        4.0,
-        'bound of the change of v_p in a period T',
-        unit='rad/s²',
-        low=0.0,
-        high=1e4,
-        dynamic=True,
+        4.0, 'bound of the change of v_p in a period T', 'rad/s²', (0.0, 1e4), dynamic=True
     )
     dither: float = parameter(
         0.0,
         'maximum random level added to v_p, a new one each period. Use it to record bags for '
         'training: with feedback alone v_p varies too little to identify its effect',
-        unit='rad/s²',
-        low=0.0,
-        high=1e3,
+        'rad/s²',
+        (0.0, 1e3),
         dynamic=True,
     )
-    probe: float = parameter(
-        1.0, 'step dv of the step response (48), (51)', unit='rad/s²', low=1e-3, high=1e3
-    )
-    delta_lags: int = parameter(4, 'past errors in the visible layer, tau of (35)', low=1, high=50)
+    probe: float = parameter(1.0, 'step dv of the step response (48), (51)', 'rad/s²', (1e-3, 1e3))
+    delta_lags: int = parameter(4, 'past errors in the visible layer, tau of (35)', bounds=(1, 50))
     move_lags: int = parameter(
-        4, 'past v_p in the visible layer; they must cover the dead time', low=1, high=50
+        4, 'past v_p in the visible layer; they must cover the dead time', bounds=(1, 50)
     )
     hidden: int = parameter(
-        12, 'number of hidden units, at least that of the lags', low=2, high=200
+        12, 'number of hidden units, at least that of the lags', bounds=(2, 200)
     )
-    spread: float = parameter(1.0, 'length of each row of the initial X_v', low=1e-3, high=2.0)
-    delta_scale: float = parameter(
-        3.0, 'error that is 1 inside the machine', unit='rad/s', low=1e-3, high=1e3
-    )
-    move_scale: float = parameter(
-        20.0, 'v_p that is 1 inside the machine', unit='rad/s²', low=1e-3, high=1e4
-    )
+    spread: float = parameter(1.0, 'length of each row of the initial X_v', bounds=(1e-3, 2.0))
+    delta_scale: float = parameter(3.0, 'error that is 1 inside the machine', 'rad/s', (1e-3, 1e3))
+    move_scale: float = parameter(20.0, 'v_p that is 1 inside the machine', 'rad/s²', (1e-3, 1e4))
     learning: bool = parameter(True, 'whether the machine learns online', dynamic=True)
     algorithm: str = parameter(
         'recursive',
         'learning of the output layer: recursive least squares, or the normalised gradient (44)',
         choices=('recursive', 'gradient'),
     )
-    memory: float = parameter(20.0, 'time constant of forgetting', unit='s', low=0.1, high=1e4)
+    memory: float = parameter(20.0, 'time constant of forgetting', 's', (0.1, 1e4))
     trust: float = parameter(
-        30.0,
-        'weight of the pretraining, as a duration of online learning',
-        unit='s',
-        low=0.01,
-        high=1e5,
+        30.0, 'weight of the pretraining, as a duration of online learning', 's', (0.01, 1e5)
     )
-    output_rate: float = parameter(0.05, 'gamma of (44), normalised', low=0.0, high=1.0)
-    contrast_rate: float = parameter(1e-4, 'gamma of (43) online', low=0.0, high=1.0)
+    output_rate: float = parameter(0.05, 'gamma of (44), normalised', bounds=(0.0, 1.0))
+    contrast_rate: float = parameter(1e-4, 'gamma of (43) online', bounds=(0.0, 1.0))
     offset_gain: float = parameter(
-        0.0032, 'gain of the offset e on the last prediction error', low=0.0, high=1.0
+        0.0032, 'gain of the offset e on the last prediction error', bounds=(0.0, 1.0)
     )
     noise: float = parameter(
-        0.05,
-        'standard deviation of the noise of a sample of the error',
-        unit='rad/s',
-        low=1e-9,
-        high=10.0,
+        0.05, 'standard deviation of the noise of a sample of the error', 'rad/s', (1e-9, 10.0)
     )
-    skill_memory: float = parameter(5.0, 'time constant of the skill', unit='s', low=0.1, high=1e4)
+    skill_memory: float = parameter(5.0, 'time constant of the skill', 's', (0.1, 1e4))
     skill_low: float = parameter(
-        -1.0, 'skill up to which the authority of v_p is 0', low=-100.0, high=1.0
+        -1.0, 'skill up to which the authority of v_p is 0', bounds=(-100.0, 1.0)
     )
     skill_high: float = parameter(
         0.0,
         'skill from which the authority of v_p is 1; 0 is as good as persistence',
-        low=-100.0,
-        high=1.0,
+        bounds=(-100.0, 1.0),
     )
     gain_low: float = parameter(
         0.2,
         'step response over the nominal one up to which the authority is 0',
-        low=-1.0,
-        high=1.0,
+        bounds=(-1.0, 1.0),
     )
     gain_high: float = parameter(
-        0.5, 'step response over the nominal one from which it is 1', low=-1.0, high=1.0
+        0.5, 'step response over the nominal one from which it is 1', bounds=(-1.0, 1.0)
     )
-    seed: int = parameter(1, 'seed of the initial weights and of the simulated run', low=0)
+    seed: int = parameter(
+        1, 'seed of the initial weights and of the simulated run', bounds=(0, None)
+    )
     nominal: NominalLoopParameters = group(NominalLoopParameters)
     excitation: ExcitationParameters = group(ExcitationParameters)
 
@@ -528,11 +504,6 @@ class PredictiveController:
         return skill
 
     @property
-    def one_step_skill(self) -> Array:
-        """Skill against persistence one step ahead, shape (outputs,)."""
-        return np.array([skill_score(wheel.history, 0) for wheel in self._predictors])
-
-    @property
     def authority(self) -> Array:
         """Fraction of the bound of v_p in use, in [0, 1], shape (outputs,)."""
         return self.signals.authorities.copy()
@@ -559,13 +530,7 @@ class PredictiveController:
         ValueError
             ``feedback_gain`` is not positive.
         """
-        now, new = self.parameters.to_dict(), parameters.to_dict()
-        for spec in parameters.specs():
-            name = spec.name
-            if not spec.dynamic and new[name] != now[name]:
-                raise ParameterError(
-                    f'{name} is read-only with value {now[name]}: got {new[name]}'
-                )
+        self.parameters.check_read_only(parameters)
         if feedback_gain is not None:
             if not feedback_gain > 0.0:
                 raise ValueError(f'feedback_gain must be positive: got {feedback_gain}')

@@ -30,49 +30,39 @@ class NominalLoopParameters(Parameters):
     """
 
     feedback_gain: float = parameter(
-        8.0,
-        'feedback K; the controller replaces it by its own',
-        unit='1/s',
-        low=0.1,
-        high=100.0,
+        8.0, 'feedback K; the controller replaces it by its own', '1/s', (0.1, 100.0)
     )
-    lag: float = parameter(
-        0.02, 'time constant from v_p to acceleration', unit='s', low=1e-3, high=1.0
-    )
-    dead_time: float = parameter(0.01, 'dead time of v_p', unit='s', low=0.0, high=1.0)
+    lag: float = parameter(0.02, 'time constant from v_p to acceleration', 's', (1e-3, 1.0))
+    dead_time: float = parameter(0.01, 'dead time of v_p', 's', (0.0, 1.0))
 
 
 @dataclass(frozen=True)
 class ExcitationParameters(Parameters):
     """Simulated run of the pretraining, and the learning from it."""
 
-    duration: float = parameter(240.0, 'length of the run', unit='s', low=10.0, high=3600.0)
+    duration: float = parameter(240.0, 'length of the run', 's', (10.0, 3600.0))
     move: float = parameter(
-        0.5, 'maximum v_p of the random levels, as a fraction of its scale', low=0.01, high=2.0
+        0.5, 'maximum v_p of the random levels, as a fraction of its scale', bounds=(0.01, 2.0)
     )
-    move_hold: float = parameter(
-        0.3, 'mean duration of a level of v_p', unit='s', low=0.01, high=100.0
-    )
+    move_hold: float = parameter(0.3, 'mean duration of a level of v_p', 's', (0.01, 100.0))
     disturbance: float = parameter(
-        2.0, 'standard deviation of the disturbance w', unit='rad/s²', low=0.0, high=1000.0
+        2.0, 'standard deviation of the disturbance w', 'rad/s²', (0.0, 1000.0)
     )
     disturbance_hold: float = parameter(
         2.0,
         'mean duration of a level of w, which the machine learns to expect',
-        unit='s',
-        low=0.01,
-        high=1000.0,
+        's',
+        (0.01, 1000.0),
     )
     noise: float = parameter(
-        0.15, 'standard deviation of the measured error', unit='rad/s', low=0.0, high=10.0
+        0.15, 'standard deviation of the measured error', 'rad/s', (0.0, 10.0)
     )
-    epochs: int = parameter(2, 'epochs of CD-1 (43) over the run', low=0, high=100)
-    contrast_rate: float = parameter(0.002, 'gamma of (43) in pretraining', low=0.0, high=1.0)
+    epochs: int = parameter(2, 'epochs of CD-1 (43) over the run', bounds=(0, 100))
+    contrast_rate: float = parameter(0.002, 'gamma of (43) in pretraining', bounds=(0.0, 1.0))
     ridge: float = parameter(
         1e-6,
         'ridge penalty, as a fraction of the mean square of the features',
-        low=1e-12,
-        high=1.0,
+        bounds=(1e-12, 1.0),
     )
 
 
@@ -195,22 +185,26 @@ class SampleTiming(NamedTuple):
 def nominal_transition(loop: NominalLoopParameters, duration: float) -> Array:
     """Return the exact map of (delta, a, v_p, w, noise) to (delta, a) after ``duration`` s.
 
-    Rows (delta, a), shape (2, 5). The matrix exponential is computed by scaling and squaring of
-    a Taylor series.
+    Rows (delta, a), shape (2, 5).
     """
     gain, lag = loop.feedback_gain, loop.lag
     rates = np.zeros((5, 5))
     rates[0] = (-gain, 1.0, 0.0, 1.0, -gain)
     rates[1] = (0.0, -1.0 / lag, 1.0 / lag, 0.0, 0.0)
-    halvings = max(0, math.ceil(math.log2(max(np.abs(rates).sum() * duration, 1e-9))) + 2)
-    small = rates * (duration / 2.0**halvings)
-    total, term = np.eye(5), np.eye(5)
+    return np.ascontiguousarray(matrix_exponential(rates * duration)[:2])
+
+
+def matrix_exponential(matrix: Array) -> Array:
+    """Return exp of a square matrix by scaling, a Taylor series of 15 terms, and squaring."""
+    halvings = max(0, math.ceil(math.log2(max(np.abs(matrix).sum(), 1e-9))) + 2)
+    small = matrix / 2.0**halvings
+    total, term = np.eye(len(matrix)), np.eye(len(matrix))
     for order in range(1, 16):
         term = term @ small / order
         total = total + term
     for _ in range(halvings):
         total = total @ total
-    return np.ascontiguousarray(total[:2])
+    return total
 
 
 @kernel

@@ -313,53 +313,6 @@ def bound(row: int, side: float, n: int, v_previous: float, dv_max: float, v_max
 
 
 @kernel
-def kkt_residuals(
-    work: Workspace, v_previous: float, dv_max: float, v_max: float, out: Array
-) -> float:
-    """Return the largest of the four Karush-Kuhn-Tucker residuals of the solution in ``work``.
-
-    All are relative, so one tolerance is valid for every scale of weights and bounds. With g the
-    larger of |mu SᵀPsi_free| and |H||dv|, and w the larger of the two bounds:
-
-    out[0] stationarity    : |H dv + mu SᵀPsi_free + A'(upper - lower multipliers)| / g
-    out[1] primal          : distance outside the bounds / w
-    out[2] dual            : most negative multiplier / g
-    out[3] complementarity : largest |multiplier * distance to its bound| / (g w)
-    """
-    n = work.gradient.size
-    size, steepest, largest = 0.0, 0.0, 0.0
-    for i in range(n):
-        size = max(size, abs(work.changes[i]))
-        steepest = max(steepest, abs(work.gradient[i]))
-        for k in range(n):
-            largest = max(largest, abs(work.hessian[i, k]))
-    steepest = max(steepest, largest * size)
-    widest = max(dv_max, v_max)
-    gradient_scale = steepest if steepest > 0.0 else 1.0
-    width_scale = widest if widest > 0.0 else 1.0
-    out[:] = 0.0
-    for i in range(n):
-        total = work.gradient[i]
-        for k in range(n):
-            total += work.hessian[i, k] * work.changes[k]
-        for row in range(2 * n):
-            if row == i or row - n >= i:
-                total += work.multipliers[1, row] - work.multipliers[0, row]
-        out[0] = max(out[0], abs(total) / gradient_scale)
-    for row in range(2 * n):
-        value = row_value(row, work.changes)
-        for upper in range(2):
-            side = 1.0 if upper == 1 else -1.0
-            beyond = side * value - bound(row, side, n, v_previous, dv_max, v_max)
-            multiplier = work.multipliers[upper, row]
-            out[1] = max(out[1], beyond / width_scale)
-            out[2] = max(out[2], -multiplier / gradient_scale)
-            out[3] = max(out[3], abs(multiplier * beyond) / (gradient_scale * width_scale))
-    worst: float = max(max(out[0], out[1]), max(out[2], out[3]))
-    return worst
-
-
-@kernel
 def row_normal(row: int, side: float, lower: Array, out: Array) -> None:
     """Write L⁻¹ times the outward normal of a row's bound into ``out``, shape (n,)."""
     n = out.size

@@ -32,11 +32,11 @@ def parse_assignments(table: type[Parameters], texts: Iterable[str]) -> dict[str
         name, sign, value = text.partition('=')
         if not sign or not name:
             raise ParameterError(f'--set must be NAME=VALUE: got {text!r}')
-        values[name] = value if name in text_parameters else _parse_value(value)
+        values[name] = value if name in text_parameters else parsed_value(value)
     return values
 
 
-def _parse_value(text: str) -> object:
+def parsed_value(text: str) -> object:
     """Return the Python literal that ``text`` spells, else ``text``."""
     try:
         return ast.literal_eval(_BOOLEANS.get(text, text))

@@ -67,7 +67,7 @@ class ParameterSpec:
             return tuple(self._check_one(item) for item in value)  # type: ignore[return-value]
         return self._check_one(value)
 
-    def bounds(self) -> str:
+    def bounds_text(self) -> str:
         """Return the range as text, empty when every value of the type is valid."""
         if self.choices:
             return 'one of ' + ', '.join(self.choices)
@@ -88,11 +88,11 @@ class ParameterSpec:
         if isinstance(value, float) and not math.isfinite(value):
             raise ParameterError(f'{self.name} must be finite: got {value}')
         if self.choices and value not in self.choices:
-            raise ParameterError(f'{self.name} must be {self.bounds()}: got {value!r}')
+            raise ParameterError(f'{self.name} must be {self.bounds_text()}: got {value!r}')
         if isinstance(value, int | float) and not (
             (self.low is None or value >= self.low) and (self.high is None or value <= self.high)
         ):
-            raise ParameterError(f'{self.name} must be {self.bounds()}: got {value:g}')
+            raise ParameterError(f'{self.name} must be {self.bounds_text()}: got {value:g}')
         assert isinstance(value, bool | int | float | str)
         return value
 
@@ -103,11 +103,10 @@ _TYPE_NAMES = {bool: 'true or false', int: 'a whole number', float: 'a number', 
 def parameter(
     default: Value,
     text: str,
+    unit: str = '',
+    bounds: tuple[float | None, float | None] = (None, None),
     *,
     name: str = '',
-    unit: str = '',
-    low: float | None = None,
-    high: float | None = None,
     choices: tuple[str, ...] = (),
     dynamic: bool = False,
     source: str = 'assumed',
@@ -115,12 +114,13 @@ def parameter(
     """Return a dataclass field that is one parameter of its table.
 
     ``name`` is the ROS name within the table, which may contain dots; without it the attribute
-    gives the name. Bounds are inclusive; for a tuple they apply to each element.
+    gives the name. Lower and upper bound are inclusive, None is none; for a tuple they apply to
+    each element.
     """
     details = {
         'unit': unit,
-        'low': low,
-        'high': high,
+        'low': bounds[0],
+        'high': bounds[1],
         'choices': choices,
         'dynamic': dynamic,
         'text': text,
@@ -195,6 +195,15 @@ class Parameters:
             # Checked before the group checks itself, so that the error contains the full name.
             checked[known[name].path] = known[name].spec.check(value)
         return self._replace(checked)
+
+    def check_read_only(self, after: Self) -> None:
+        """Raise :class:`ParameterError` when a read-only value differs in ``after``."""
+        old, new = self.to_dict(), after.to_dict()
+        for spec in self.specs():
+            if not spec.dynamic and old[spec.name] != new[spec.name]:
+                raise ParameterError(
+                    f'{spec.name} is read-only (it is {old[spec.name]}): got {new[spec.name]}'
+                )
 
     def to_dict(self) -> dict[str, Value]:
         """Return every value by ROS name."""

@@ -11,6 +11,7 @@ from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
 from t3mpc_ros.geometry.types import Pose, State, WheelSpeeds, check_pose
 from t3mpc_ros.parameters.table import ParameterError, group, parameter
 from t3mpc_ros.robot.command_limiter import CommandLimiter
+from t3mpc_ros.robot.description import sensor_mounts
 from t3mpc_ros.robot.gyro_odometry import GyroOdometry, GyroOdometryParameters
 from t3mpc_ros.robot.interface import (
     RANGE_SENSORS,
@@ -30,7 +31,7 @@ from t3mpc_ros.simulation.fault_injection import (
 )
 from t3mpc_ros.simulation.fixed_step import FixedStepRobot
 from t3mpc_ros.simulation.plant.contact import BumperParameters
-from t3mpc_ros.simulation.plant.disturbances import Disturbance, SpeedNoise
+from t3mpc_ros.simulation.plant.disturbances import Disturbance, MeasurementNoise, SpeedNoise
 from t3mpc_ros.simulation.plant.drivetrain import Drivetrain, Load, TyreParameters, max_rate
 from t3mpc_ros.simulation.plant.dynamics import BodyParameters
 from t3mpc_ros.simulation.plant.paper_plant import (
@@ -45,7 +46,6 @@ from t3mpc_ros.simulation.sensors.imu import SimulatedImu, SimulatedImuParameter
 from t3mpc_ros.simulation.sensors.range_sensor import (
     SimulatedRangeSensorParameters,
     SimulatedRangeSensors,
-    sensor_mounts,
 )
 from t3mpc_ros.simulation.transport_delay import TransportDelay
 from t3mpc_ros.simulation.world import cast_rays, clearance, grip_at, load_world
@@ -75,24 +75,23 @@ class DigitalTwinParameters(PaperRobotParameters):
         '', 'world: name of a bundled world, or path of a YAML file; empty = endless plain'
     )
     right_wheel_radius_multiplier: float = parameter(
-        1.0, 'true over nominal radius of the right wheel', low=0.8, high=1.25
+        1.0, 'true over nominal radius of the right wheel', bounds=(0.8, 1.25)
     )
     left_wheel_radius_multiplier: float = parameter(
-        1.0, 'true over nominal radius of the left wheel', low=0.8, high=1.25
+        1.0, 'true over nominal radius of the left wheel', bounds=(0.8, 1.25)
     )
     wheel_separation_multiplier: float = parameter(
-        1.0, 'true over nominal wheel separation', low=0.8, high=1.25
+        1.0, 'true over nominal wheel separation', bounds=(0.8, 1.25)
     )
     boot_time: float = parameter(
-        0.5, 'restart time of the board after a power loss', unit='s', low=0.0, high=10.0
+        0.5, 'restart time of the board after a power loss', 's', (0.0, 10.0)
     )
     slip_stop: float = parameter(
         1.0,
         'longest disagreement of gyro and steps; beyond it the robot stops until no motion is '
         'commanded for 0.5 s; 0 = no slip stop',
-        unit='s',
-        low=0.0,
-        high=60.0,
+        's',
+        (0.0, 60.0),
         dynamic=True,
     )
 
@@ -182,10 +181,15 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
         The dynamic ones are replaceable at run time.
     schedule
         Schedule of faults; by default the one that ``faults.schedule`` names.
+    speed_noise
+        Noise of the wheel speeds; by default white with the variance ``noise.variance``.
     """
 
     def __init__(
-        self, parameters: DigitalTwinParameters, schedule: FaultSchedule | None = None
+        self,
+        parameters: DigitalTwinParameters,
+        schedule: FaultSchedule | None = None,
+        speed_noise: MeasurementNoise | None = None,
     ) -> None:
         limiter = CommandLimiter(parameters.limiter, parameters.geometry)
         super().__init__(
@@ -200,7 +204,8 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
             for part in np.random.SeedSequence(parameters.seed).spawn(5)
         )
         self._disturbance = Disturbance(parameters.disturbance, disturbance)
-        self._noise = SpeedNoise(parameters.noise, noise)
+        self._white_noise = SpeedNoise(parameters.noise, noise)
+        self._noise: MeasurementNoise = speed_noise or self._white_noise
         self._imu = SimulatedImu(parameters.imu, imu)
         self._ranges = SimulatedRangeSensors(parameters.range_sensor, ranges)
         self._channel = TransportDelay(channel)
@@ -326,7 +331,7 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
         self._limiter.parameters = parameters.limiter
         self._odometry.parameters = parameters.odometry
         self._disturbance.parameters = parameters.disturbance
-        self._noise.parameters = parameters.noise
+        self._white_noise.parameters = parameters.noise
         self._imu.parameters = parameters.imu
         self._update_faults()
         self._update_load()
@@ -413,7 +418,8 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
         if dt > 0.0:
             gyro = None if absent else sample.angular
             self._odometry.update(turned.right, turned.left, gyro, dt)
-            self._measured = self._noise.measure(WheelSpeeds(turned.right / dt, turned.left / dt))
+            speeds = WheelSpeeds(turned.right / dt, turned.left / dt)
+            self._measured = self._noise.measure(speeds, self._elapsed)
         slipping_for = self._odometry.slipping_for
         if self._slip_monitor.update(slipping_for, self._parameters.slip_stop, self._elapsed):
             self._limiter.stop(SLIP_STOP_REASON, self._now_ns())

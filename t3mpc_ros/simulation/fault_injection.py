@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import math
 import os
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import yaml
 
@@ -38,53 +38,42 @@ class FaultParameters(Parameters):
     """Faults that are active now; a parameter at its default is no fault."""
 
     command_delay: float = parameter(
-        0.0,
-        'additional delay of every command',
-        unit='s',
-        low=0.0,
-        high=2.0,
-        dynamic=True,
+        0.0, 'additional delay of every command', 's', (0.0, 2.0), dynamic=True
     )
     command_jitter: float = parameter(
         0.0,
         'random additional delay of each command, uniform up to this value; commands may overtake',
-        unit='s',
-        low=0.0,
-        high=2.0,
+        's',
+        (0.0, 2.0),
         dynamic=True,
     )
     command_loss: float = parameter(
-        0.0, 'fraction of the commands that is lost', low=0.0, high=1.0, dynamic=True
+        0.0, 'fraction of the commands that is lost', bounds=(0.0, 1.0), dynamic=True
     )
     gyro_bias_jump: float = parameter(
         0.0,
         'offset added to the gyro; an MPU6050 may have 0.35 rad/s (20 deg/s)',
-        unit='rad/s',
-        low=-10.0,
-        high=10.0,
+        'rad/s',
+        (-10.0, 10.0),
         dynamic=True,
     )
     gyro_dead: bool = parameter(False, 'the IMU does not respond', dynamic=True)
     ranges_dead: bool = parameter(False, 'no range sensor is measured', dynamic=True)
     wheel_blocked: str = parameter(
-        'none',
-        'blocked wheel',
-        choices=('none', 'right', 'left', 'both'),
-        dynamic=True,
+        'none', 'blocked wheel', choices=('none', 'right', 'left', 'both'), dynamic=True
     )
     load_change: float = parameter(
         0.0,
         'mass added to the body, unknown to the controller; negative: removed',
-        unit='kg',
-        low=-1.0,
-        high=5.0,
+        'kg',
+        (-1.0, 5.0),
         dynamic=True,
     )
     slippery: float = parameter(
-        1.0, 'factor on the grip of the tyres, everywhere', low=0.0, high=1.0, dynamic=True
+        1.0, 'factor on the grip of the tyres, everywhere', bounds=(0.0, 1.0), dynamic=True
     )
     supply_sag: float = parameter(
-        0.0, 'voltage drop of the battery cells', unit='V', low=0.0, high=20.0, dynamic=True
+        0.0, 'voltage drop of the battery cells', 'V', (0.0, 20.0), dynamic=True
     )
     brown_out: bool = parameter(False, 'the board restarts when this becomes true', dynamic=True)
     schedule: str = parameter(
@@ -94,25 +83,16 @@ class FaultParameters(Parameters):
     )
 
 
-class Fault(NamedTuple):
-    """One fault that can be set and scheduled."""
-
-    name: str
-    text: str
-    """Effect, in one line."""
-
-
-_SPECS: Mapping[str, ParameterSpec] = {
+FAULTS: Mapping[str, ParameterSpec] = {
     spec.name: spec for spec in FaultParameters.specs() if spec.dynamic
 }
-FAULTS = tuple(Fault(spec.name, spec.text) for spec in _SPECS.values())
 """All faults: the dynamic parameters of :class:`FaultParameters`, in their order."""
 
 
 def active_faults(parameters: FaultParameters) -> tuple[str, ...]:
     """Return the active faults as text, for example ``command_delay 0.1 s``."""
     texts = []
-    for name, spec in _SPECS.items():
+    for name, spec in FAULTS.items():
         value = getattr(parameters, name)
         if value == spec.default:
             continue
@@ -149,19 +129,19 @@ class FaultEvent:
         object.__setattr__(self, 'at', _seconds('at', self.at, 0.0))
         if self.duration != math.inf:
             object.__setattr__(self, 'duration', _seconds('for', self.duration, MIN_DURATION))
-        if not isinstance(self.fault, str) or self.fault not in _SPECS:
+        if not isinstance(self.fault, str) or self.fault not in FAULTS:
             raise ScheduleError(
-                f'fault must be one of {", ".join(_SPECS)}: '
-                f'got {_shortened(self.fault)}{nearest_hint(str(self.fault), _SPECS)}'
+                f'fault must be one of {", ".join(FAULTS)}: '
+                f'got {_shortened(self.fault)}{nearest_hint(str(self.fault), FAULTS)}'
             )
-        spec = _SPECS[self.fault]
+        spec = FAULTS[self.fault]
         try:
             object.__setattr__(self, 'value', spec.check(self.value))
         except ParameterError as error:
             hint = _number_hint(self.value) if spec.kind is float else ''
             raise ScheduleError(f'value: {error}{hint}') from None
         except OverflowError:  # an integer too large for a float
-            raise ScheduleError(f'value: {self.fault} must be {spec.bounds()}') from None
+            raise ScheduleError(f'value: {self.fault} must be {spec.bounds_text()}') from None
 
     @property
     def until(self) -> float:
@@ -216,11 +196,6 @@ class FaultSchedule:
             self._result = dynamic.with_values(self._scripted) if self._scripted else dynamic
             self._dynamic = dynamic
         return self._result
-
-    def active_names(self, elapsed: float) -> tuple[str, ...]:
-        """Return the names of the faults set by the schedule at ``elapsed`` seconds."""
-        scripted = self._scripted_at(elapsed)
-        return tuple(name for name in _SPECS if name in scripted)
 
     def _evaluate(self, elapsed: float) -> None:
         if not math.isfinite(elapsed):

@@ -8,22 +8,11 @@ from fractions import Fraction
 from typing import Generic, TypeVar
 
 from t3mpc_ros.geometry.types import NANOSECONDS, WheelSpeeds
-from t3mpc_ros.parameters.table import ParameterError, Parameters
+from t3mpc_ros.parameters.table import Parameters
 from t3mpc_ros.robot.command_limiter import CLOCK_JUMPED_BACK, CommandLimiter
 from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, RobotCommand, RobotInterface, RobotState
 
 S = TypeVar('S', bound=Parameters)
-
-
-def check_read_only(before: Parameters, after: Parameters) -> None:
-    """Raise ParameterError when a read-only parameter differs."""
-    old, new = before.to_dict(), after.to_dict()
-    for spec in before.specs():
-        if not spec.dynamic and old[spec.name] != new[spec.name]:
-            raise ParameterError(
-                f'{spec.name} is read-only while the robot runs '
-                f'(it is {old[spec.name]}): got {new[spec.name]}'
-            )
 
 
 class FixedStepRobot(RobotInterface, ABC, Generic[S]):
@@ -145,7 +134,7 @@ class FixedStepRobot(RobotInterface, ABC, Generic[S]):
         ParameterError
             A read-only parameter differs.
         """
-        check_read_only(self._parameters, parameters)
+        self._parameters.check_read_only(parameters)
         self._parameters = parameters
         self._apply_parameters()
 

@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
+from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import nearest_hint
 
@@ -76,6 +77,11 @@ class World:
     boxes: Array
     """Interior of the boxes, shape (b, 5): x, y, length, width (m), yaw of the length (rad)."""
 
+    @property
+    def obstacles(self) -> Obstacles:
+        """What a robot must not touch."""
+        return Obstacles(self.segments, self.circles)
+
     def is_free(self, x: float, y: float, radius: float) -> bool:
         """Decide whether a disc at (x, y) touches no wall and is in no box or circle, all in m.
 
@@ -113,15 +119,23 @@ class World:
         return BoundingBox(*points.min(axis=0).tolist(), *points.max(axis=0).tolist())
 
 
-def world_outline(name: str) -> dict[str, list[list[float]]] | None:
-    """Return segments, circles and patches of a world as lists, for a picture.
+def recorded_world(name: str) -> World | None:
+    """Return the world that a bag names.
 
     None for an empty name, and for a file that is not here: it belongs to another machine.
     """
     try:
-        world = load_world(name) if name else None
-    except (OSError, WorldError):
-        world = None
+        return load_world(name) if name else None
+    except WorldError:
+        return None
+
+
+def world_outline(name: str) -> dict[str, list[list[float]]] | None:
+    """Return segments, circles and patches of a recorded world as lists, for a picture.
+
+    None as for :func:`recorded_world`.
+    """
+    world = recorded_world(name)
     if world is None:
         return None
     return {

@@ -221,6 +221,14 @@ def test_path_without_a_bag_is_rejected(tmp_path):
             open_bag(tmp_path / path)
 
 
+def test_the_folder_of_a_run_is_its_bag(tmp_path):
+    """``t3mpc bag report runs/latest`` said that there was no complete bag file."""
+    write_mcap(tmp_path / 'run' / 'bag', ticks())
+    (tmp_path / 'run' / 'log').mkdir()
+    with open_bag(tmp_path / 'run') as bag:
+        assert bag.folder == tmp_path / 'run' / 'bag'
+
+
 def test_a_damaged_chunk_is_skipped_and_counted(tape, tmp_path):
     folder = write_mcap(tmp_path / 'bag', ticks())
     (file,) = folder.glob('*.mcap')

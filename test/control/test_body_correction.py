@@ -125,7 +125,7 @@ def basis(body, right, left):
 
 
 def test_yaw_error_from_a_push_is_removed():
-    body = Body(miscalibrated, noise=0.01, yaw_gain=1.0)
+    body = Body(miscalibrated, noise=0.01, yaw_gain=1.0, max_yaw_correction=0.1)
     body.run(20.0)
     body.yaw += 0.2
     body.run(6.0)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from t3mpc_ros.control.jump_transition import JumpTransition, JumpTransitionParameters
+from t3mpc_ros.control.jump_transition import JumpTransition, JumpTransitionParameters, MotorLimit
 
 T = 0.01
 NS = 10_000_000
@@ -68,6 +68,36 @@ def test_no_reachable_path_has_a_smaller_squared_error(slopes):
     ours = np.sum((reachable - r)[:, 0] ** 2)
     assert least <= ours * (1.0 + 1e-6)
     assert ours <= 1.04 * least
+
+
+@pytest.mark.parametrize(
+    'jump', [(30.0, 30.0), (12.0, -12.0), (20.0, 0.1), (-6.0, 21.0), (-30.0, -12.0)]
+)
+def test_a_torque_drive_crosses_with_the_torque_of_its_motors(jump):
+    """A fixed 200 rad/s² was 1.2 times the torque for a turn, 0.5 of it for a push."""
+    from scipy.optimize import lsq_linear
+
+    inertia, torque = np.array([[0.0017, -0.00075], [-0.00075, 0.0017]]), 0.4
+    limit = MotorLimit(inertia, torque)
+    transition = JumpTransition(JumpTransitionParameters(acceleration=1.0), 0.0, T, limit)
+    at, steps = 40, 80
+    r = np.where(np.arange(steps + 1)[:, None] < at, 0.0, np.array(jump))
+    transition.announce(at * NS, np.array(jump), np.zeros(2))
+    reachable = np.empty((steps, 2))
+    for n in range(steps):
+        transition.step(n * NS, r[n], r[n + 1])
+        reachable[n] = transition.reachable
+    assert not transition.active
+    needed = np.abs(np.diff(reachable, axis=0) / T @ inertia)
+    assert needed.max() <= 1.01 * torque
+    assert needed.max() >= 0.95 * torque
+    # The best that any torques within the limit can do, by a bounded least-squares program.
+    sums = np.kron(np.tril(np.ones((steps, steps)), -1) * T, np.linalg.inv(inertia))
+    best = lsq_linear(sums, r[:-1].ravel(), bounds=(-torque, torque), tol=1e-12)
+    least, ours = 2.0 * best.cost, np.sum((reachable - r[:-1]) ** 2)
+    assert least <= ours * (1.0 + 1e-6)
+    # Exactly the best for a push or a turn; unequal jumps leave torque of one motor unused.
+    assert ours <= (1.0 + 1e-9 if abs(jump[0]) == abs(jump[1]) else 1.5) * least
 
 
 def test_with_servo_lag_the_command_respects_the_acceleration():

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 import pytest
+from support.control_loops import GEOMETRY, PERIOD, ServoLoop
 
-from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.control.watchdog import (
     EVIDENCE_WEIGHT,
     InputWatchdog,
@@ -15,13 +15,10 @@ from t3mpc_ros.control.watchdog import (
     ResponseMonitor,
     WatchdogParameters,
 )
-from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
-from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, State, WheelSpeeds
+from t3mpc_ros.geometry.kinematics import wheels_from_twist
+from t3mpc_ros.geometry.types import BodyTwist
 
 MS = 1_000_000
-PERIOD = 0.01
-STEP = 10_000_000
-GEOMETRY = WheelGeometry()
 
 
 def _decide(watchdog, stamp_ms, **changes):
@@ -76,7 +73,7 @@ def test_the_odometry_timeout_is_measured_with_one_clock():
 
 
 def response_monitor(**changes):
-    return ResponseMonitor(WatchdogParameters(**changes), PERIOD)
+    return ResponseMonitor(WatchdogParameters(**changes), 0.01)
 
 
 @pytest.mark.parametrize('delay', [0, 1, 5, 12])
@@ -84,7 +81,7 @@ def test_a_delayed_and_noisy_robot_is_responsive(delay):
     """A delay of 0.12 s and noise of variance 0.1 are within the window and the bound."""
     generator = np.random.default_rng(delay)
     monitor = response_monitor()
-    time = PERIOD * np.arange(4000)
+    time = 0.01 * np.arange(4000)
     command = 4.0 * np.sin(np.outer(2.0 * np.pi * time, (0.4, 0.27)))
     for k in range(len(time)):
         monitor.add_command(*command[k])
@@ -99,7 +96,7 @@ def test_a_standing_robot_is_unresponsive_after_the_timeout():
         monitor.add_command(3.0, -3.0)
         monitor.update(0.0, 0.0)
         steps += 1
-    assert steps * PERIOD == pytest.approx(0.15 + 0.1, abs=0.03)
+    assert steps * 0.01 == pytest.approx(0.15 + 0.1, abs=0.03)
 
 
 def test_one_unresponsive_wheel_is_enough():
@@ -140,40 +137,27 @@ def test_a_bound_of_zero_disables_the_check():
         assert monitor.update(-9.0, 0.0)
 
 
-class ServoLoop:
+def varying_twist(time):
+    return 0.12 + 0.05 * math.sin(0.9 * time), 1.2 * math.sin(0.7 * time)
+
+
+class StoppingRobot(ServoLoop):
     """A closed loop with a servo robot that can stop responding to commands."""
 
     def __init__(self, **changes):
-        self.controller = Controller(
-            ControllerParameters.from_dict({'speed_filter.noise_variance': 0.0} | changes)
-        )
-        self.speeds = np.zeros(2)
-        self.delayed = BodyTwist(0.0, 0.0)
-        self.now = 0
+        super().__init__(varying_twist, **changes)
         self.reasons = []
 
-    def reference(self, stamp_ns):
-        time = stamp_ns / 1e9
-        return BodyTwist(0.12 + 0.05 * math.sin(0.9 * time), 1.2 * math.sin(0.7 * time))
+    def wanted(self, stamp_ns):
+        return np.array(wheels_from_twist(BodyTwist(*varying_twist(stamp_ns / 1e9)), GEOMETRY))
 
     def run(self, seconds, unresponsive=False):
         """Return the errors of the wheels, shape (n, 2)."""
+        self.responsive = not unresponsive
         errors = []
-        for _ in range(round(seconds / PERIOD)):
-            stamp = self.now + 40 * STEP
-            self.controller.add_reference(State(stamp, ORIGIN, self.reference(stamp)))
-            twist = twist_from_wheels(WheelSpeeds(*self.speeds.tolist()), GEOMETRY)
-            errors.append(self.speeds - wheels_from_twist(self.reference(self.now), GEOMETRY))
-            sent, status = self.controller.step(State(self.now, ORIGIN, twist))
-            self.reasons.append(status.reason)
-            command = (
-                np.zeros(2)
-                if unresponsive
-                else np.array(wheels_from_twist(self.delayed, GEOMETRY))
-            )
-            self.speeds = command + math.exp(-0.5) * (self.speeds - command)
-            self.delayed = sent
-            self.now += STEP
+        for _ in range(round(100 * seconds)):
+            errors.append(self.speeds - self.wanted(self.now))
+            self.reasons.append(self.step().reason)
         return np.array(errors)
 
 
@@ -185,7 +169,7 @@ def test_after_5_s_without_response_the_error_is_as_before():
     """Without the response monitor, the adaptation increases the error for 30 s."""
     errors = {}
     for name, changes in (('monitored', {}), ('unmonitored', {'watchdog.response_bound': 0.0})):
-        robot = ServoLoop(**changes)
+        robot = StoppingRobot(**changes)
         robot.run(8.0)
         before = settled(robot)
         robot.run(5.0, unresponsive=True)
@@ -198,7 +182,7 @@ def test_after_5_s_without_response_the_error_is_as_before():
 
 
 def test_an_unresponsive_robot_gets_the_reference_as_command():
-    robot = ServoLoop()
+    robot = StoppingRobot()
     robot.run(5.0)
     robot.run(1.0, unresponsive=True)
     assert robot.controller.status.reason is Reason.NOT_FOLLOWING
@@ -208,8 +192,22 @@ def test_an_unresponsive_robot_gets_the_reference_as_command():
     for name, value in robot.controller.law.get_weights().items():
         np.testing.assert_array_equal(value, weights[name])
     sent = wheels_from_twist(robot.delayed, GEOMETRY)
-    reference = wheels_from_twist(robot.reference(robot.now - STEP), GEOMETRY)
-    assert sent == pytest.approx(reference, abs=0.05)
+    assert sent == pytest.approx(robot.wanted(robot.now - PERIOD), abs=0.05)
+
+
+def test_a_robot_that_follows_again_gets_no_step_of_the_command():
+    """The law starts again from the last command, not from a measured speed."""
+    robot, sent = StoppingRobot(), []
+    robot.run(5.0)
+    for unresponsive in (True, False):
+        for _ in range(200):
+            robot.run(0.01, unresponsive)
+            sent.append(wheels_from_twist(robot.delayed, GEOMETRY))
+    reasons = robot.reasons[-200:]
+    assert reasons[0] is Reason.NOT_FOLLOWING
+    assert reasons[-1] is Reason.TRACKING
+    limit = robot.controller.parameters.limits.wheel_acceleration
+    assert np.abs(np.diff(sent, axis=0)).max() <= limit * 0.01 * (1 + 1e-9)
 
 
 def test_the_shortcut_for_the_last_command_keeps_the_decision():

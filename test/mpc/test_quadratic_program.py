@@ -4,7 +4,7 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import LinearConstraint, lsq_linear, minimize
+from scipy.optimize import lsq_linear
 from support.long_tests import few_of
 
 from t3mpc_ros.mpc.prediction import toeplitz
@@ -16,7 +16,6 @@ from t3mpc_ros.mpc.quadratic_program import (
     cholesky,
     cost,
     is_dependent,
-    kkt_residuals,
     make_workspace,
     normal_equations,
     solve_quadratic_program,
@@ -59,7 +58,7 @@ def _random(generator):
 
 
 def _kkt(matrix, free, mu, pi, v_previous, dv_max, v_max, work):
-    """Return the four residuals from their definition, independently."""
+    """Return the four relative residuals of the conditions, by their definition."""
     moves = matrix.shape[1]
     rows = np.vstack((np.eye(moves), np.tril(np.ones((moves, moves)))))
     upper = np.r_[np.full(moves, dv_max), np.full(moves, v_max - v_previous)]
@@ -83,71 +82,13 @@ def _kkt(matrix, free, mu, pi, v_previous, dv_max, v_max, work):
 def test_random_programs_satisfy_karush_kuhn_tucker(count):
     """Zero bounds, and optima 10⁶ times the bounds, may cycle because of rounding."""
     generator = np.random.default_rng(20)
-    out = np.zeros(4)
     worst = 0.0
     for _ in range(count):
         program = _random(generator)
         work = make_workspace(program[0].shape[1])
         assert solve_quadratic_program(*program, 50 * work.gradient.size, work) == OPTIMAL
-        ours = kkt_residuals(work, *program[4:], out)
-        worst = max(worst, ours, *_kkt(*program, work))
+        worst = max(worst, *_kkt(*program, work))
     assert worst < 1e-10
-
-
-def test_residuals_detect_every_kind_of_error():
-    matrix, free = _matrix(np.linspace(0.1, 0.5, 6), 3), np.ones(6)
-    work, out = make_workspace(3), np.zeros(4)
-    problem = (0.0, 0.2, 0.3)
-    assert solve_quadratic_program(matrix, free, 1.0, 0.01, *problem, 100, work) == OPTIMAL
-    assert kkt_residuals(work, *problem, out) < 1e-12
-    right = work.changes.copy(), work.multipliers.copy()
-    work.changes[1] += 0.05
-    kkt_residuals(work, *problem, out)
-    assert out[0] > 1e-3
-    work.changes[:] = right[0]
-    work.changes[0] -= 1.0
-    kkt_residuals(work, *problem, out)
-    assert out[1] > 0.1
-    work.changes[:] = right[0]
-    work.multipliers[0, 0] -= 2.0 * work.multipliers[0].max()
-    kkt_residuals(work, *problem, out)
-    assert out[2] > 0.1
-    work.multipliers[:] = right[1]
-    work.multipliers[1, 2] += 1.0
-    kkt_residuals(work, *problem, out)
-    assert out[3] > 0.01
-
-
-def test_forty_programs_agree_with_an_independent_solver():
-    generator = np.random.default_rng(3)
-    compared = agreed = 0
-    while compared < 40:
-        matrix, free, mu, pi, v_previous, dv_max, v_max = _random(generator)
-        moves = matrix.shape[1]
-        if moves > 8 or min(dv_max, v_max) < 0.05 or np.abs(free).max() > 20.0 or pi < 1e-3:
-            continue
-        work = make_workspace(moves)
-        solve_quadratic_program(matrix, free, mu, pi, v_previous, dv_max, v_max, 500, work)
-        hessian = mu * matrix.T @ matrix + pi * np.eye(moves)
-        scale = max(mu * np.abs(matrix.T @ free).max(), 1e-9)
-        sums = np.tril(np.ones((moves, moves)))
-        found = minimize(
-            lambda x, h=hessian, f=matrix.T @ free * mu, s=scale: (0.5 * x @ h @ x + f @ x) / s,
-            np.zeros(moves),
-            jac=lambda x, h=hessian, f=matrix.T @ free * mu, s=scale: (h @ x + f) / s,
-            method='SLSQP',
-            bounds=[(-dv_max, dv_max)] * moves,
-            constraints=LinearConstraint(sums, -v_max - v_previous, v_max - v_previous),
-            options={'ftol': 1e-15, 'maxiter': 1000},
-        )
-        ours = cost(matrix, free, work.changes, mu, pi)
-        theirs = cost(matrix, free, found.x, mu, pi)
-        assert ours <= theirs + 1e-9 * abs(theirs)
-        if found.success:
-            assert ours == pytest.approx(theirs, rel=1e-5)
-            agreed += 1
-        compared += 1
-    assert agreed > 30
 
 
 def test_with_bounds_on_changes_it_is_bounded_least_squares():
@@ -259,7 +200,8 @@ def test_every_failure_status_gives_zero_changes():
 
 def test_v_slightly_outside_its_bound_is_brought_back():
     matrix, free = _matrix(np.linspace(0.1, 0.5, 6), 3), np.zeros(6)
-    work, out = make_workspace(3), np.zeros(4)
-    assert solve_quadratic_program(matrix, free, 1.0, 0.01, 1.05, 0.1, 1.0, 100, work) == OPTIMAL
+    work = make_workspace(3)
+    program = (matrix, free, 1.0, 0.01, 1.05, 0.1, 1.0)
+    assert solve_quadratic_program(*program, 100, work) == OPTIMAL
     assert work.changes[0] == pytest.approx(-0.05)
-    assert kkt_residuals(work, 1.05, 0.1, 1.0, out) < 1e-10
+    assert max(_kkt(*program, work)) < 1e-10

@@ -29,7 +29,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / 'docs' / 'faults.md').read_text()
 NO_FAULT = FaultParameters()
 SPECS = {spec.name: spec for spec in FaultParameters.specs()}
-NAMES = [fault.name for fault in FAULTS]
+NAMES = list(FAULTS)
 
 
 def some_value(name: str, generator: np.random.Generator) -> object:
@@ -61,10 +61,7 @@ def write(folder: Path, text: str) -> Path:
 
 def test_faults_are_the_dynamic_parameters():
     assert [spec.name for spec in FaultParameters.specs() if not spec.dynamic] == ['schedule']
-    assert [(spec.name, spec.text) for spec in FaultParameters.specs() if spec.dynamic] == list(
-        FAULTS
-    )
-    assert all('\n' not in fault.text for fault in FAULTS)
+    assert all('\n' not in fault.text for fault in FAULTS.values())
 
 
 @pytest.mark.parametrize('name', NAMES)
@@ -94,10 +91,8 @@ def test_every_fault_can_be_scheduled_and_ends(name):
     schedule = FaultSchedule([FaultEvent(1.0, name, value, 2.0)])
     for elapsed in (-1.0, 0.0, 0.999, 3.0, 1e5):
         assert schedule.at(elapsed, NO_FAULT) == NO_FAULT
-        assert schedule.active_names(elapsed) == ()
     for elapsed in (1.0, 2.0, 2.999):
         assert schedule.at(elapsed, NO_FAULT) == replace(NO_FAULT, **{name: value})
-        assert schedule.active_names(elapsed) == (name,)
 
 
 def test_fault_without_duration_persists():
@@ -127,10 +122,6 @@ def test_events_of_different_faults_are_independent():
     schedule = FaultSchedule(
         [FaultEvent(0.0, 'gyro_dead', True, 5.0), FaultEvent(1.0, 'command_loss', 0.5, 1.0)]
     )
-    assert schedule.active_names(1.5) == (
-        'command_loss',
-        'gyro_dead',
-    )  # in the order of the parameters
     assert active_faults(schedule.at(1.5, NO_FAULT)) == ('command_loss 0.5', 'gyro_dead')
 
 
@@ -373,7 +364,7 @@ def test_documented_example_is_a_valid_schedule(tmp_path):
     schedule = load_schedule(write(tmp_path, text))
     delays = [schedule.at(time, NO_FAULT).command_delay for time in (4.9, 5.0, 6.0, 7.0, 9.0)]
     assert delays == [0.0, 0.1, 0.3, 0.1, 0.0]
-    assert schedule.active_names(6.5) == ('command_delay', 'command_loss')
+    assert active_faults(schedule.at(6.5, NO_FAULT)) == ('command_delay 0.3 s', 'command_loss 0.2')
     assert schedule.at(12.05, NO_FAULT).brown_out
     assert not schedule.at(12.1, NO_FAULT).brown_out
     assert schedule.at(3600.0, NO_FAULT) == FaultParameters(load_change=0.5)
@@ -394,6 +385,6 @@ def test_documentation_lists_every_fault():
         if spec.dynamic:
             default = f'{spec.default:g}' if spec.kind is float else str(spec.default).lower()
             first = f'`{spec.name}` | {default} {spec.unit}'.rstrip()
-            middle = f'{spec.bounds()} ' if spec.bounds() else ''
+            middle = f'{spec.bounds_text()} ' if spec.bounds_text() else ''
             lines.append(f'| {first} | {middle}| {spec.text} |')
     assert '\n'.join(lines) + '\n\n' in PAGE

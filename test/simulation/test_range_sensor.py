@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from t3mpc_ros.parameters.table import ParameterError
+from t3mpc_ros.robot.description import sensor_mounts
 from t3mpc_ros.robot.interface import RANGE_SENSORS
 from t3mpc_ros.robot.sensor_conversions import (
     BEYOND,
@@ -22,7 +23,6 @@ from t3mpc_ros.simulation.sensors.range_sensor import (
     SimulatedRangeSensors,
     distance_from_voltage,
     output_voltage,
-    sensor_mounts,
 )
 
 # Values of the curve of figure 2 of sheet E4-A00201EN (white paper, 90 %): cm and V. The values at

@@ -66,41 +66,38 @@ class RecordingParameters(Parameters):
     chunk_size: int = parameter(
         262_144,
         'size at which a chunk is compressed and written',
+        'B',
+        (1024, 2**26),
         name='storage.chunk_size',
-        unit='B',
-        low=1024,
-        high=2**26,
     )
     chunk_duration: float = parameter(
         0.5,
         'age of the oldest message at which a chunk is compressed and written; a killed recorder '
         'loses the messages of this time plus at most 0.1 s',
+        's',
+        (0.05, 60.0),
         name='storage.chunk_duration',
-        unit='s',
-        low=0.05,
-        high=60.0,
     )
     max_bagfile_size: int = parameter(
         0,
         'size at which the next file of the bag begins; 0 = never',
+        'B',
+        (0, None),
         name='storage.max_bagfile_size',
-        unit='B',
-        low=0,
     )
     max_bagfile_duration: float = parameter(
         0.0,
         'duration at which the next file of the bag begins; 0 = never',
+        's',
+        (0.0, None),
         name='storage.max_bagfile_duration',
-        unit='s',
-        low=0.0,
     )
     max_cache_size: int = parameter(
         64 * MEBIBYTE,
         'maximum memory of the write queue; further messages are dropped, counted and reported',
+        'B',
+        (65_536, 2**34),
         name='storage.max_cache_size',
-        unit='B',
-        low=65_536,
-        high=2**34,
     )
     snapshot_mode: bool = parameter(
         False,
@@ -111,18 +108,16 @@ class RecordingParameters(Parameters):
         30.0,
         'time that a snapshot covers: ~/snapshot or a fault writes the messages received in this '
         'time to a bag in the folder snapshots; 0 = no snapshots',
+        's',
+        (0.0, 3600.0),
         name='storage.snapshot_duration',
-        unit='s',
-        low=0.0,
-        high=3600.0,
     )
     snapshot_cache_size: int = parameter(
         128 * MEBIBYTE,
         'maximum memory of the messages of a snapshot; at this limit a snapshot covers less time',
+        'B',
+        (65_536, 2**34),
         name='storage.snapshot_cache_size',
-        unit='B',
-        low=65_536,
-        high=2**34,
     )
     monitored_nodes: tuple[str, ...] = parameter(
         ('controller', 'sim_robot', 'radio_bridge'),
@@ -134,17 +129,15 @@ class RecordingParameters(Parameters):
     snapshot_min_interval: float = parameter(
         10.0,
         'minimum time between two automatic snapshots',
+        's',
+        (0.0, 86_400.0),
         name='snapshot.min_interval',
-        unit='s',
-        low=0.0,
-        high=86_400.0,
     )
     snapshot_max_count: int = parameter(
         50,
         'maximum number of automatic snapshots per run',
         name='snapshot.max_count',
-        low=0,
-        high=100_000,
+        bounds=(0, 100_000),
     )
     attachments: tuple[str, ...] = parameter(
         (),
@@ -160,10 +153,9 @@ class RecordingParameters(Parameters):
     max_attachment_size: int = parameter(
         16 * MEBIBYTE,
         'maximum size of an attached file',
+        'B',
+        (1, 2**30),
         name='record.max_attachment_size',
-        unit='B',
-        low=1,
-        high=2**30,
     )
 
     def check_consistency(self) -> None:

@@ -11,6 +11,7 @@ from array import array
 from collections.abc import Mapping
 import enum
 import json
+import struct
 
 from t3mpc_ros.parameters.table import Value
 
@@ -22,7 +23,8 @@ number
 event
     An :class:`Event`.
 stamp_ns
-    Stamp of the odometry message of a STEP, or of the last one before an ODOMETRY_TIMEOUT; else 0.
+    Stamp of the odometry message of a STEP, or of the last one before an ODOMETRY_TIMEOUT; the
+    sensor of a RANGE; else 0.
 references
     Number of reference messages that the controller received since the start of the node.
 value
@@ -48,6 +50,9 @@ class Event(enum.IntEnum):
     """A model file was loaded at the start; value: CRC-32 of the file."""
     FINISH = 6
     """The node shut down and commanded a stop."""
+    RANGE = 7
+    """A range reading was used by the keep-out; stamp_ns: number of the sensor from 0; value: the
+    bits of the reading as a 64-bit float."""
 
 
 COMMAND_EVENTS = (Event.STEP, Event.ODOMETRY_TIMEOUT, Event.FINISH)
@@ -98,6 +103,11 @@ class Journal:
         """Return the row of a loaded model file with its CRC-32."""
         return self._append(Event.MODEL, 0, checksum)
 
+    def range(self, sensor: int, reading: float) -> 'array[int]':
+        """Return the row of a range reading, m."""
+        bits = struct.unpack('<q', struct.pack('<d', reading))[0]
+        return self._append(Event.RANGE, sensor, bits)
+
     def finish(self) -> 'array[int]':
         """Return the row of the shutdown."""
         return self._append(Event.FINISH, 0, 0)
@@ -108,6 +118,12 @@ class Journal:
         row[3], row[4] = self._references, value
         self._number += 1
         return row
+
+
+def reading_from_value(value: int) -> float:
+    """Return the reading (m) of the value of a :attr:`Event.RANGE` row."""
+    reading: float = struct.unpack('<d', struct.pack('<q', value))[0]
+    return reading
 
 
 def parameters_to_json(revision: int, parameters: Mapping[str, Value]) -> str:

@@ -41,16 +41,15 @@ class Bumper(NamedTuple):
 class BumperParameters(Parameters):
     """Circular bumper around the pose of the robot."""
 
-    radius: float = parameter(0.11, 'radius of the bumper', unit='m', low=0.01, high=1.0)
+    radius: float = parameter(0.11, 'radius of the bumper', 'm', (0.01, 1.0))
     stiffness: float = parameter(
         2e4,
         'force per depth. Without damping a robot of 1.5 kg at 0.5 m/s reaches a depth of 4.3 mm '
         'and leaves the wall after 27 ms',
-        unit='N/m',
-        low=1e3,
-        high=1e6,
+        'N/m',
+        (1e3, 1e6),
     )
-    damping: float = parameter(100.0, 'force per closing speed', unit='N s/m', low=0.0, high=1e4)
+    damping: float = parameter(100.0, 'force per closing speed', 'N s/m', (0.0, 1e4))
 
     def constants(self) -> Bumper:
         """Return the argument of :func:`contact_force`."""

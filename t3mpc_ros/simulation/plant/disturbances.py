@@ -4,7 +4,7 @@
 
 from dataclasses import dataclass
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -21,27 +21,14 @@ class FrictionParameters(Parameters):
     """Friction of each wheel: f of (10), which the paper includes in the disturbance."""
 
     viscous: float = parameter(
-        2e-4,
-        'viscous friction torque per wheel speed',
-        unit='N m s/rad',
-        low=0.0,
-        high=10.0,
-        dynamic=True,
+        2e-4, 'viscous friction torque per wheel speed', 'N m s/rad', (0.0, 10.0), dynamic=True
     )
-    coulomb: float = parameter(
-        0.004,
-        'Coulomb friction torque',
-        unit='N m',
-        low=0.0,
-        high=10.0,
-        dynamic=True,
-    )
+    coulomb: float = parameter(0.004, 'Coulomb friction torque', 'N m', (0.0, 10.0), dynamic=True)
     coulomb_width: float = parameter(
         0.2,
         'wheel speed within which the Coulomb torque changes sign (76 % of it at the width)',
-        unit='rad/s',
-        low=1e-3,
-        high=100.0,
+        'rad/s',
+        (1e-3, 100.0),
         dynamic=True,
     )
 
@@ -51,29 +38,22 @@ class DisturbanceParameters(Parameters):
     """A bounded torque on each wheel, tau_d of (10): assumption 2 of the paper."""
 
     bound: float = parameter(
-        0.002,
-        'largest disturbance torque of a wheel',
-        unit='N m',
-        low=0.0,
-        high=10.0,
-        dynamic=True,
+        0.002, 'largest disturbance torque of a wheel', 'N m', (0.0, 10.0), dynamic=True
     )
     frequencies: tuple[float, ...] = parameter(
         (0.11, 0.37, 1.3),
         'frequencies of the sines, which have equal amplitudes',
-        unit='Hz',
-        low=0.0,
-        high=100.0,
+        'Hz',
+        (0.0, 100.0),
     )
     walk_share: float = parameter(
-        0.3, 'part of the bound used by a random walk', low=0.0, high=1.0, dynamic=True
+        0.3, 'part of the bound used by a random walk', bounds=(0.0, 1.0), dynamic=True
     )
     walk_rate: float = parameter(
         0.5,
         'standard deviation of the walk after one second, relative to its part of the bound',
-        unit='1/√s',
-        low=0.0,
-        high=100.0,
+        '1/√s',
+        (0.0, 100.0),
         dynamic=True,
     )
 
@@ -85,9 +65,8 @@ class NoiseParameters(Parameters):
     variance: float = parameter(
         0.0,
         'variance of a measured wheel speed; the paper adds 0.04 and sweeps 0 to 0.1',
-        unit='(rad/s)²',
-        low=0.0,
-        high=100.0,
+        '(rad/s)²',
+        (0.0, 100.0),
         dynamic=True,
     )
 
@@ -212,6 +191,13 @@ def reflect(value: float) -> float:
     return 1.0 - abs(unfolded - 2.0)
 
 
+class MeasurementNoise(Protocol):
+    """Noise of measured wheel speeds; :class:`SpeedNoise` is one."""
+
+    def measure(self, wheels: WheelSpeeds, time: float) -> WheelSpeeds:
+        """Return wheel speeds (rad/s) with noise at a time (s)."""
+
+
 class SpeedNoise:
     """White noise of measured wheel speeds; same arguments as :class:`Disturbance`."""
 
@@ -220,7 +206,7 @@ class SpeedNoise:
         self._generator = generator
         self._drawn: Array = np.zeros(2)
 
-    def measure(self, wheels: WheelSpeeds) -> WheelSpeeds:
+    def measure(self, wheels: WheelSpeeds, time: float = 0.0) -> WheelSpeeds:
         """Return ``wheels`` with noise. Two numbers are drawn, even at zero variance."""
         self._generator.standard_normal(out=self._drawn)
         spread = math.sqrt(self.parameters.variance)

@@ -65,10 +65,10 @@ class TyreParameters(Parameters):
     """Grip of the tyres."""
 
     grip: float = parameter(
-        0.6, 'coefficient of friction between tyre and floor', low=0.0, high=5.0, dynamic=True
+        0.6, 'coefficient of friction between tyre and floor', bounds=(0.0, 5.0), dynamic=True
     )
     load_share: float = parameter(
-        0.8, 'part of the weight on the driven axle; the rest is on the caster', low=0.0, high=1.0
+        0.8, 'part of the weight on the driven axle; the rest is on the caster', bounds=(0.0, 1.0)
     )
 
 
@@ -164,6 +164,11 @@ class Drivetrain:
     def counters(self) -> tuple[int, int]:
         """Pulses issued since the start of the board, right first."""
         return math.floor(self._pulses[0]), math.floor(self._pulses[1])
+
+    @property
+    def phases(self) -> tuple[float, float]:
+        """Pulses since the start of the board, with the fraction of the next, right first."""
+        return self._pulses[0], self._pulses[1]
 
     @property
     def pulse_speeds(self) -> WheelSpeeds:
@@ -264,6 +269,19 @@ class Drivetrain:
         gap = max(abs(wheels.right - now.right), abs(wheels.left - now.left))
         even = max(gap / (count * self.step), 1e-6)
         reach = min(even, acceleration) if acceleration > 0.0 else even
+        right, left = wheels.right / self._microstep, wheels.left / self._microstep
+        self._integrate(right, left, reach / self._microstep, volts, disturbance, count)
+
+    def _integrate(
+        self,
+        right: float,
+        left: float,
+        reach: float,
+        volts: float,
+        disturbance: Disturbance,
+        count: int,
+    ) -> None:
+        """Integrate ``count`` steps; targets and ``reach`` as in integrate_drivetrain."""
         x, y = self._now[0], self._now[1]
         world = self._world
         segments, circles = _NO_SEGMENTS, _NO_CIRCLES
@@ -275,9 +293,9 @@ class Drivetrain:
             self._tyres[2:] = self._grip * grip_at(x, y, world.patches)
         integrate_drivetrain(
             self._arrays,
-            wheels.right / self._microstep,
-            wheels.left / self._microstep,
-            reach / self._microstep,
+            right,
+            left,
+            reach,
             volts,
             self._constants,
             self._tyres,
@@ -289,6 +307,16 @@ class Drivetrain:
         )
         self._read()
         self.steps_done += count
+
+    def follow_pulses(
+        self, right: float, left: float, volts: float, disturbance: Disturbance, count: int
+    ) -> None:
+        """Integrate ``count`` steps during which the fields turn evenly by these pulses."""
+        time = count * self.step
+        right, left = right / time, left / time
+        if right != self._pulses[2] or left != self._pulses[3]:
+            self._field[2], self._field[3] = right, left
+        self._integrate(right, left, 1.0, volts, disturbance, count)  # nothing to reach
 
     def _block(self, wheel: int) -> None:
         """Stop a wheel at once; its tyre slides until the body has stopped too."""

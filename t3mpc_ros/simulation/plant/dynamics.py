@@ -30,29 +30,22 @@ Array = npt.NDArray[np.float64]
 class BodyParameters(Parameters):
     """Masses and inertias of (14)."""
 
-    body_mass: float = parameter(
-        1.3, 'mass of the body without wheels, m_c', unit='kg', low=0.01, high=1000.0
-    )
-    wheel_mass: float = parameter(0.10, 'mass of one wheel, m_w', unit='kg', low=0.0, high=100.0)
+    body_mass: float = parameter(1.3, 'mass of the body without wheels, m_c', 'kg', (0.01, 1000.0))
+    wheel_mass: float = parameter(0.10, 'mass of one wheel, m_w', 'kg', (0.0, 100.0))
     body_inertia: float = parameter(
         0.02,
         'inertia of the body about the vertical through its centre of mass, I_c',
-        unit='kg m²',
-        low=1e-6,
-        high=1000.0,
+        'kg m²',
+        (1e-6, 1000.0),
     )
     wheel_inertia: float = parameter(
-        6e-5, 'inertia of one wheel about its axle, I_w', unit='kg m²', low=1e-8, high=10.0
+        6e-5, 'inertia of one wheel about its axle, I_w', 'kg m²', (1e-8, 10.0)
     )
     wheel_turn_inertia: float = parameter(
-        3e-5, 'inertia of one wheel about its diameter, I_m', unit='kg m²', low=0.0, high=10.0
+        3e-5, 'inertia of one wheel about its diameter, I_m', 'kg m²', (0.0, 10.0)
     )
     com_offset: float = parameter(
-        0.02,
-        'distance of the centre of mass of the body ahead of the axle, d',
-        unit='m',
-        low=-1.0,
-        high=1.0,
+        0.02, 'distance of the centre of mass of the body ahead of the axle, d', 'm', (-1.0, 1.0)
     )
 
     @property

@@ -60,41 +60,36 @@ class DriveParameters(Parameters):
     dead_time: float = parameter(
         0.010,
         'time before a velocity command reaches the wheels (radio, decoding)',
-        unit='s',
-        low=0.0,
-        high=1.0,
+        's',
+        (0.0, 1.0),
     )
     acceleration: float = parameter(
         60.0,
         'largest wheel acceleration of the drive; 0 = no limit',
-        unit='rad/s²',
-        low=0.0,
-        high=1e5,
+        'rad/s²',
+        (0.0, 1e5),
         dynamic=True,
     )
     lag: float = parameter(
         0.020,
         'time constant of the wheel speed servo with the nominal body',
-        unit='s',
-        low=1e-3,
-        high=2.0,
+        's',
+        (1e-3, 2.0),
         dynamic=True,
     )
     torque_limit: float = parameter(
         0.4,
         'largest torque on one wheel',
-        unit='N m',
-        low=1e-3,
-        high=100.0,
+        'N m',
+        (1e-3, 100.0),
         dynamic=True,
         source='holding torque of a common NEMA 17 stepper',
     )
     speed_ceiling: float = parameter(
         39.6,
         'largest wheel speed of the motors, whatever the torque',
-        unit='rad/s',
-        low=1.0,
-        high=1000.0,
+        'rad/s',
+        (1.0, 1000.0),
         dynamic=True,
         source='stepper, V/(2 L I steps) with 12 V, 2.8 mH, 1.7 A, 200 steps per turn',
     )
@@ -119,39 +114,32 @@ class PaperRobotParameters(Parameters):
     mass_factor: float = parameter(
         1.0,
         'true over nominal body mass; the drive uses the nominal mass',
-        low=0.1,
-        high=10.0,
+        bounds=(0.1, 10.0),
         dynamic=True,
     )
     inertia_factor: float = parameter(
-        1.0, 'true over nominal body inertia', low=0.1, high=10.0, dynamic=True
+        1.0, 'true over nominal body inertia', bounds=(0.1, 10.0), dynamic=True
     )
     friction_factor: float = parameter(
-        1.0, 'true over nominal friction, both kinds', low=0.0, high=10.0, dynamic=True
+        1.0, 'true over nominal friction, both kinds', bounds=(0.0, 10.0), dynamic=True
     )
-    rate: float = parameter(100.0, 'rate of the reported states', unit='Hz', low=50.0, high=1e3)
+    rate: float = parameter(100.0, 'rate of the reported states', 'Hz', (50.0, 1e3))
     substep: float = parameter(
         0.001,
         'longest integration step; a control period is divided into equal steps',
-        unit='s',
-        low=1e-5,
-        high=0.01,
+        's',
+        (1e-5, 0.01),
     )
     standstill_speed: float = parameter(
-        0.1,
-        'true wheel speed below which the robot is at standstill',
-        unit='rad/s',
-        low=0.0,
-        high=1.0,
+        0.1, 'true wheel speed below which the robot is at standstill', 'rad/s', (0.0, 1.0)
     )
     max_catch_up_time: float = parameter(
         1.0,
         'longest time simulated after a gap between requests; the rest of the gap is skipped',
-        unit='s',
-        low=0.5,
-        high=60.0,
+        's',
+        (0.5, 60.0),
     )
-    seed: int = parameter(1, 'seed of disturbance and noise', low=0)
+    seed: int = parameter(1, 'seed of disturbance and noise', bounds=(0, None))
 
     @property
     def substeps(self) -> int:
@@ -342,6 +330,11 @@ class DisturbedPlant:
         self._disturbance = Disturbance(parameters.disturbance, for_disturbance)
         self._noise = SpeedNoise(parameters.noise, for_noise)
         self.configure(parameters)
+
+    @property
+    def wheels(self) -> WheelSpeeds:
+        """True wheel speeds chi."""
+        return self.plant.wheels
 
     def configure(self, parameters: PaperRobotParameters) -> None:
         """Continue with other dynamic parameters."""

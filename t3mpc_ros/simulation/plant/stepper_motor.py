@@ -42,53 +42,47 @@ class StepperMotorParameters(Parameters):
     """Motor, driver and pulse generator of one wheel; both wheels have the same."""
 
     full_steps: int = parameter(
-        200, 'full steps per turn', low=4, high=1000, source='paper: 1.8 degrees'
+        200, 'full steps per turn', bounds=(4, 1000), source='paper: 1.8 degrees'
     )
-    microsteps: int = parameter(16, 'microsteps per full step', low=1, high=256)
+    microsteps: int = parameter(16, 'microsteps per full step', bounds=(1, 256))
     holding_torque: float = parameter(
         0.40,
         'torque at standstill with both phases at rated current',
-        unit='N m',
-        low=1e-3,
-        high=100.0,
+        'N m',
+        (1e-3, 100.0),
         source=_MOTOR,
     )
     rated_current: float = parameter(
-        1.7, 'rated current of a phase', unit='A', low=0.01, high=50.0, source=_MOTOR
+        1.7, 'rated current of a phase', 'A', (0.01, 50.0), source=_MOTOR
     )
     resistance: float = parameter(
-        1.5, 'resistance of a phase', unit='Ohm', low=0.01, high=1000.0, source=_MOTOR
+        1.5, 'resistance of a phase', 'Ohm', (0.01, 1000.0), source=_MOTOR
     )
-    inductance: float = parameter(
-        2.8e-3, 'inductance of a phase', unit='H', low=1e-6, high=1.0, source=_MOTOR
-    )
+    inductance: float = parameter(2.8e-3, 'inductance of a phase', 'H', (1e-6, 1.0), source=_MOTOR)
     rotor_inertia: float = parameter(
-        5.4e-6, 'inertia of the rotor', unit='kg m²', low=1e-9, high=1.0, source=_MOTOR
+        5.4e-6, 'inertia of the rotor', 'kg m²', (1e-9, 1.0), source=_MOTOR
     )
     phase_current: float = parameter(
-        1.0, 'peak current set in the driver', unit='A', low=0.01, high=50.0, dynamic=True
+        1.0, 'peak current set in the driver', 'A', (0.01, 50.0), dynamic=True
     )
     damping: float = parameter(
         0.01,
         'torque per speed of the rotor against its field, near synchronism',
-        unit='N m s/rad',
-        low=0.0,
-        high=1.0,
+        'N m s/rad',
+        (0.0, 1.0),
     )
     damping_width: float = parameter(
         2.0,
         'speed relative to the field at which the damping has fallen to a quarter: an unlocked '
         'rotor is not dragged along',
-        unit='rad/s',
-        low=0.01,
-        high=1000.0,
+        'rad/s',
+        (0.01, 1000.0),
     )
     step_rate: float = parameter(
         10_000.0,
         'largest pulse rate of a wheel',
-        unit='1/s',
-        low=1.0,
-        high=1e6,
+        '1/s',
+        (1.0, 1e6),
         source='one step for two ticks of a 20 kHz interrupt',
     )
 

@@ -23,43 +23,31 @@ class SimulatedBatteryParameters(BatteryParameters):
     """Resistance, idle load, thresholds and initial charge of the simulated battery."""
 
     resistance: float = parameter(
-        0.15, 'resistance of cells and wires', unit='ohm', low=1e-3, high=10.0, dynamic=True
+        0.15, 'resistance of cells and wires', 'ohm', (1e-3, 10.0), dynamic=True
     )
     idle_current: float = parameter(
         0.3,
         'current besides the motors: eight range sensors at 30 mA and the board behind a linear '
         'regulator',
-        unit='A',
-        low=0.0,
-        high=10.0,
+        'A',
+        (0.0, 10.0),
         dynamic=True,
         source='Sharp E4-A00201EN: 30 mA each; the remaining 60 mA assumed',
     )
     low_voltage: float = parameter(
-        10.2,
-        'voltage below which the robot reports a low battery',
-        unit='V',
-        low=0.0,
-        high=60.0,
-        dynamic=True,
+        10.2, 'voltage below which the robot reports a low battery', 'V', (0.0, 60.0), dynamic=True
     )
     brown_out: float = parameter(
-        8.0,
-        'voltage below which motor drivers and board fail',
-        unit='V',
-        low=0.0,
-        high=60.0,
-        dynamic=True,
+        8.0, 'voltage below which motor drivers and board fail', 'V', (0.0, 60.0), dynamic=True
     )
     hysteresis: float = parameter(
         0.3,
         'voltage above either threshold at which its condition ends',
-        unit='V',
-        low=0.0,
-        high=5.0,
+        'V',
+        (0.0, 5.0),
         dynamic=True,
     )
-    charge: float = parameter(1.0, 'initial charge, 0 to 1', low=0.0, high=1.0)
+    charge: float = parameter(1.0, 'initial charge, 0 to 1', bounds=(0.0, 1.0))
 
     def check_consistency(self) -> None:
         """Raise ParameterError when the low-battery report would be late, or would never end."""

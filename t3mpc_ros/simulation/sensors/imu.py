@@ -26,9 +26,8 @@ class SimulatedImuParameters(ImuParameters):
     gyro_offset: float = parameter(
         20.0,
         'bound of the zero-rate offset, which is drawn at each power-up',
-        unit='deg/s',
-        low=0.0,
-        high=250.0,
+        'deg/s',
+        (0.0, 250.0),
         dynamic=True,
         source=f'{IMU_DATA_SHEET} 6.1, initial ZRO tolerance',
     )
@@ -36,25 +35,22 @@ class SimulatedImuParameters(ImuParameters):
         0.005,
         'random walk of the bias: standard deviation after one second (0.12 deg/s after ten '
         'minutes)',
-        unit='deg/s/√s',
-        low=0.0,
-        high=10.0,
+        'deg/s/√s',
+        (0.0, 10.0),
         dynamic=True,
     )
     gyro_scale_error: float = parameter(
         0.001,
         'bound of the scale error, which is drawn for each sensor; the residual of a calibration '
         'over ten turns read to 3 degrees (data sheet: 0.03 without calibration)',
-        low=0.0,
-        high=0.5,
+        bounds=(0.0, 0.5),
         dynamic=True,
     )
     accel_offset: float = parameter(
         50.0,
         'bound of the zero-g offset, which is drawn for each sensor and axis',
-        unit='mg',
-        low=0.0,
-        high=1000.0,
+        'mg',
+        (0.0, 1000.0),
         dynamic=True,
         source=f'{IMU_DATA_SHEET} 6.2, x and y axes',
     )

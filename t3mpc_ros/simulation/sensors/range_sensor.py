@@ -34,73 +34,44 @@ Array = npt.NDArray[np.float64]
 
 # Least squares through figure 2, in relative errors.
 _SLOPE, _SHIFT, _FLOOR = 0.282, 0.0257, 0.061  # V m, m, V: from 10 to 80 cm
+NOT_CONVERTED = 0xFFFF
+"""In place of a count of the converter."""
 _EDGE, _POWER, _SHARPNESS = 0.0558, 1.63, 7.0  # m, 1, 1: from 1 to 8 cm
 
 
 @dataclass(frozen=True)
 class SimulatedRangeSensorParameters(RangeSensorParameters):
-    """Timing, errors and mounting of the simulated range sensors; converter of the board."""
+    """Timing and errors of the simulated range sensors; converter of the board."""
 
     update_period: float = parameter(
         0.0383,
         'mean time of a measurement; the sensors are not synchronised',
-        unit='s',
-        low=0.001,
-        high=1.0,
+        's',
+        (0.001, 1.0),
         source=f'{RANGE_DATA_SHEET}, figure 1',
     )
     period_spread: float = parameter(
         0.0096,
         'largest deviation of the period of a sensor from the mean',
-        unit='s',
-        low=0.0,
-        high=0.5,
+        's',
+        (0.0, 0.5),
         source=f'{RANGE_DATA_SHEET}, figure 1',
     )
     voltage_noise: float = parameter(
-        0.01,
-        'standard deviation of the converted voltage',
-        unit='V',
-        low=0.0,
-        high=1.0,
-        dynamic=True,
+        0.01, 'standard deviation of the converted voltage', 'V', (0.0, 1.0), dynamic=True
     )
     voltage_offset: float = parameter(
         0.01,
         'bound of the voltage offset, which is drawn for each sensor; the residual of a '
         'calibration (data sheet: 0.15 V at 80 cm without calibration)',
-        unit='V',
-        low=0.0,
-        high=0.5,
+        'V',
+        (0.0, 0.5),
         dynamic=True,
     )
     adc_bits: int = parameter(
-        10, 'resolution of the converter', unit='bit', low=6, high=16, source='ATmega: 10 bit'
+        10, 'resolution of the converter', 'bit', (6, 16), source='ATmega: 10 bit'
     )
-    adc_reference: float = parameter(
-        5.0, 'full-scale voltage of the converter', unit='V', low=1.0, high=10.0
-    )
-    half_length: float = parameter(
-        0.10,
-        'distance from the axle to the front and rear sensor faces',
-        unit='m',
-        low=0.01,
-        high=1.0,
-    )
-    half_width: float = parameter(
-        0.09,
-        'distance from the centre line to the side sensor faces',
-        unit='m',
-        low=0.01,
-        high=1.0,
-    )
-    offset: float = parameter(
-        0.05,
-        'distance of the two sensors of a side from the middle of that side',
-        unit='m',
-        low=0.0,
-        high=1.0,
-    )
+    adc_reference: float = parameter(5.0, 'full-scale voltage of the converter', 'V', (1.0, 10.0))
 
     def check_consistency(self) -> None:
         """Raise ParameterError when bounds cross or a sensor is mounted beyond the body."""
@@ -109,12 +80,6 @@ class SimulatedRangeSensorParameters(RangeSensorParameters):
             raise ParameterError(
                 f'period_spread must be less than update_period ({self.update_period:g} s): '
                 f'got {self.period_spread:g}'
-            )
-        side = min(self.half_length, self.half_width)
-        if self.offset > side:
-            raise ParameterError(
-                f'offset must be at most half_length and half_width ({side:g} m): '
-                f'got {self.offset:g}'
             )
 
     @property
@@ -164,27 +129,6 @@ def distance_from_voltage(volts: float, minimum: float = 0.10, maximum: float = 
 _READINGS = tuple(map(decode_range, range(256)))
 
 
-def sensor_mounts(parameters: SimulatedRangeSensorParameters) -> Array:
-    """Return x, y (m) and direction (rad) of each sensor's face in the body frame, shape (8, 3).
-
-    x is forward and y to the left of the middle of the axle; in the order of RANGE_SENSORS.
-    """
-    ahead, aside, offset = parameters.half_length, parameters.half_width, parameters.offset
-    quarter = 0.5 * math.pi
-    return np.array(
-        [
-            [ahead, offset, 0.0],
-            [ahead, -offset, 0.0],
-            [offset, aside, quarter],
-            [-offset, aside, quarter],
-            [-ahead, offset, math.pi],
-            [-ahead, -offset, math.pi],
-            [offset, -aside, -quarter],
-            [-offset, -aside, -quarter],
-        ]
-    )
-
-
 class SimulatedRangeSensors:
     """Timing and last reading of each of the eight sensors.
 
@@ -212,6 +156,7 @@ class SimulatedRangeSensors:
             for drawn, period in zip(phases, self._periods, strict=True)
         ]
         self._readings = [math.nan] * len(RANGE_SENSORS)
+        self._counts = [NOT_CONVERTED] * len(RANGE_SENSORS)
 
     @property
     def parameters(self) -> SimulatedRangeSensorParameters:
@@ -232,6 +177,11 @@ class SimulatedRangeSensors:
     def readings(self) -> tuple[float, ...]:
         """Last readings, m, rounded as in a radio frame (REP 117); NaN before the first."""
         return tuple(self._readings)
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Counts of the converter at the last measurements; NOT_CONVERTED before the first."""
+        return tuple(self._counts)
 
     def due(self, elapsed: float) -> Sequence[int]:
         """Return the sensors that finished a measurement within the last ``elapsed`` seconds.
@@ -256,7 +206,8 @@ class SimulatedRangeSensors:
         parameters = self._parameters
         volts = output_voltage(true_distance) + parameters.voltage_offset * self._offsets[index]
         volts += parameters.voltage_noise * self._generator.standard_normal()
-        self._readings[index] = self._table[parameters.count(volts)]
+        self._counts[index] = count = parameters.count(volts)
+        self._readings[index] = self._table[count]
 
     def _reading_per_count(self) -> list[float]:
         """Return the reading (m) of the board for every count of its converter."""

@@ -1,0 +1,466 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+r"""Keep-out: reshapes twists as little as possible so that the robot touches nothing.
+
+For each nearest unsafe cell *o* of the map in a sector around the robot, the distances
+:math:`h_c = |o - c| - d` of the centre *c* and of a point *q* at :math:`l` ahead of it must obey
+the discrete-time barrier condition :math:`h(t + T) \ge (1 - \lambda T)\,h(t)` (Agrawal and
+Sreenath, RSS 2017, doi 10.15607/RSS.2017.XIII.073). To first order in T this is linear in the
+twist,
+
+.. math:: n_c^\top (1, 0)^\top v \le \lambda h_c, \qquad
+          n_q^\top \begin{pmatrix} 1 & 0 \\ 0 & l \end{pmatrix}
+          \begin{pmatrix} v \\ \omega \end{pmatrix} \le \lambda h_q,
+
+with n the direction to *o* in the frame of the robot, so the twist nearest to the wanted one is
+the solution of a quadratic program in two unknowns (Ames et al., IEEE Trans. Automatic Control 62,
+2017, doi 10.1109/TAC.2016.2638961), solved exactly. The centre alone cannot steer, because omega
+does not move it; the point ahead can (Glotfelter et al., IEEE Robotics and Automation Letters 4,
+2019, doi 10.1109/LRA.2019.2895125). Standstill satisfies every condition, so a solution always
+exists, and a robot that slows down with :math:`\dot v = -\lambda v` stays within its deceleration.
+
+Why a program over cells and not a potential field or a dynamic window: it changes nothing where
+nothing is near, it has one meaning (the nearest permitted twist), and its conditions can be
+checked on each command.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+import enum
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.control.free_space_map import (
+    FREE,
+    UNKNOWN,
+    FreeSpaceMap,
+    FreeSpaceMapParameters,
+    MapGrid,
+)
+from t3mpc_ros.geometry.arena import Obstacles
+from t3mpc_ros.geometry.types import STANDSTILL, BodyTwist, Pose, wrap_angle
+from t3mpc_ros.kernels import kernel
+from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
+
+Array = NDArray[np.float64]
+
+DIRECTIONS = 48
+"""Directions among which a detour is chosen."""
+TURNING_SPEED = 0.02
+"""Speed below which the robot may turn in any direction, m/s."""
+SECTORS = 16
+"""Sectors around the robot, each with its nearest unsafe cell."""
+SEARCH_RADIUS = 0.5
+"""Distance from the centre up to which cells are considered, m."""
+DRIVE_TIMEOUT, DRIVE_PAUSE = 2.0, 0.8
+"""Time for which commands may fail to move the robot, and standstill after it, s: a robot that has
+stopped because of slip drives again after half a second without a command."""
+TURN_WEIGHT = 0.12
+"""Change of v (m/s) that is as bad as a change of omega by 1 rad/s: turning is preferred."""
+
+
+@dataclass(frozen=True)
+class KeepOutParameters(Parameters):
+    """Distances and times of the keep-out."""
+
+    enabled: bool = parameter(
+        False, 'whether twists are reshaped so that the robot touches nothing'
+    )
+    distance: float = parameter(
+        0.165,
+        'least distance of the centre from unsafe floor: radius of the robot, 0.11 m, half a '
+        'beam, and the errors of pose and map',
+        'm',
+        (0.02, 2.0),
+    )
+    ahead: float = parameter(0.05, 'l: distance of the point ahead', 'm', (0.005, 0.5))
+    rate: float = parameter(
+        2.0,
+        'lambda: speed of the approach per distance; times the speed at most the deceleration',
+        '1/s',
+        (0.1, 20.0),
+    )
+    scan_rate: float = parameter(
+        1.2, 'yaw rate at which the robot looks around', 'rad/s', (0.1, 5.0)
+    )
+    scan_angle: float = parameter(
+        1.2,
+        'angle to both sides by which the robot looks around before floor that it has not seen',
+        'rad',
+        (0.1, 3.2),
+    )
+    stuck_time: float = parameter(
+        6.0, 'time without progress after which the robot is stuck', 's', (0.5, 600.0)
+    )
+    stuck_distance: float = parameter(0.05, 'motion that is progress', 'm', (0.001, 1.0))
+    world: str = parameter(
+        '',
+        'known walls and pillars: name of a bundled world, or path of a YAML file, in the frame '
+        'of the odometry; empty: none',
+    )
+    mounts: tuple[float, ...] = parameter(
+        (
+            *(0.10, 0.05, 0.0, 0.10, -0.05, 0.0),
+            *(0.05, 0.09, 0.5 * math.pi, -0.05, 0.09, 0.5 * math.pi),
+            *(-0.10, 0.05, math.pi, -0.10, -0.05, math.pi),
+            *(0.05, -0.09, -0.5 * math.pi, -0.05, -0.09, -0.5 * math.pi),
+        ),
+        'x (m), y (m) and direction (rad) of the face of each range sensor in the frame of the '
+        'robot, in the order of the sensors',
+        bounds=(-10.0, 10.0),
+    )
+    map: FreeSpaceMapParameters = group(FreeSpaceMapParameters)
+
+    def check_consistency(self) -> None:
+        """Raise :class:`ParameterError` unless each sensor has three numbers."""
+        if len(self.mounts) % 3:
+            raise ParameterError(
+                f'mounts must have x, y, direction of each sensor: got {len(self.mounts)} numbers'
+            )
+
+
+class Activity(enum.Enum):
+    """What the keep-out does, in words for the diagnostics."""
+
+    FREE = 'the path is free'
+    AVOIDING = 'avoiding an obstacle'
+    LOOKING = 'looking around before floor that has not been seen'
+    STUCK_OBSTACLE = 'stuck: obstacles block the way to the path'
+    STUCK_UNSEEN = 'stuck: floor that cannot be seen blocks the way to the path'
+    STUCK_DRIVE = 'stuck: commands do not move the robot'
+
+    @property
+    def stuck(self) -> bool:
+        """Whether the robot makes no progress."""
+        return self.value.startswith('stuck')
+
+
+class KeepOut:
+    """Reshapes twists by the map that it builds from the range readings.
+
+    Parameters
+    ----------
+    parameters
+        Distances and times.
+    limits
+        Largest |v| (m/s) and |omega| (rad/s).
+    obstacles
+        Known walls and pillars.
+    """
+
+    def __init__(
+        self,
+        parameters: KeepOutParameters,
+        limits: BodyTwist,
+        obstacles: Obstacles | None = None,
+    ) -> None:
+        self.parameters = parameters
+        known = Obstacles() if obstacles is None else obstacles
+        mounts = np.array(parameters.mounts).reshape(-1, 3)
+        self.map = FreeSpaceMap(parameters.map, mounts, known.segments, known.circles)
+        """What is known of the floor."""
+        self._limits = limits
+        self._nearest = np.zeros((SECTORS, 4))
+        self._rows = np.zeros((2 * SECTORS + 4, 3))
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin at a new place: the robot looks around first."""
+        self.map.clear()
+        self.activity = Activity.FREE
+        """What it does."""
+        self.changed = False
+        """Whether the last twist was changed."""
+        self._standing_room = False
+        self._targets: deque[float] = deque()
+        self._seen_from: Pose | None = None
+        self._blocked_for = 0.0
+        self._detour: float | None = None
+        self._progress: Pose | None = None
+        self._waited = 0.0
+        self._anchor: Pose | None = None
+        self._driven = 0.0
+        self._pause = 0.0
+
+    def add_reading(self, sensor: int, reading: float, pose: Pose) -> None:
+        """Add a range reading (m, REP 117) taken at ``pose``."""
+        self.map.add_reading(sensor, reading, pose)
+
+    def step(self, wanted: BodyTwist, pose: Pose, elapsed: float) -> BodyTwist:
+        """Return the permitted twist nearest to ``wanted``, or one that looks around.
+
+        Parameters
+        ----------
+        wanted
+            Twist that follows the path.
+        pose
+            Predicted pose at the instant at which the twist takes effect.
+        elapsed
+            Time since the last step, s.
+        """
+        if not self._standing_room:
+            # The robot stands where it stands; and it looks around once.
+            self._standing_room = True
+            room = self.parameters.distance + self.parameters.ahead + 0.06
+            self.map.mark_free(pose.x, pose.y, room)
+            self._look_around(pose, math.pi)
+        if self._stands_still(elapsed):
+            return STANDSTILL
+        permitted = self._reshaped(wanted, pose, elapsed)
+        self._watch_drive(permitted, pose, elapsed)
+        return permitted
+
+    def _stands_still(self, elapsed: float) -> bool:
+        """Whether the robot must not be commanded, because commands have not moved it."""
+        if self._pause <= 0.0:
+            return False
+        self._pause -= elapsed
+        self.changed, self.activity = True, Activity.STUCK_DRIVE
+        return True
+
+    def _watch_drive(self, twist: BodyTwist, pose: Pose, elapsed: float) -> None:
+        """Pause the commands when they have not moved the robot for DRIVE_TIMEOUT."""
+        anchor = self._anchor
+        moved = anchor is None or (
+            math.hypot(pose.x - anchor.x, pose.y - anchor.y) > 0.03
+            or abs(wrap_angle(pose.yaw - anchor.yaw)) > 0.15
+        )
+        if moved or (abs(twist.linear) < 0.05 and abs(twist.angular) < 0.3):
+            self._anchor, self._driven = pose, 0.0
+            return
+        self._driven += elapsed
+        if self._driven > DRIVE_TIMEOUT:
+            self._driven, self._pause = 0.0, DRIVE_PAUSE
+
+    def _reshaped(self, wanted: BodyTwist, pose: Pose, elapsed: float) -> BodyTwist:
+        """Return the permitted twist, or one that looks around."""
+        find_nearest(self.map.grid, pose.x, pose.y, pose.yaw, self._nearest)
+        if self._targets:
+            self.changed = True
+            self.activity = Activity.LOOKING
+            return self._look(pose)  # a round robot may turn anywhere
+        permitted = self._permitted(wanted)
+        if abs(permitted.linear) < TURNING_SPEED:
+            # The point ahead is a means to steer; a round robot that stands may turn anywhere.
+            limit = self.parameters.scan_rate
+            turn = min(max(wanted.angular, -limit), limit)
+            permitted = BodyTwist(permitted.linear, turn)
+        change = abs(permitted.linear - wanted.linear) + TURN_WEIGHT * abs(
+            permitted.angular - wanted.angular
+        )
+        self.changed = change > 0.01
+        self._decide_activity(wanted, permitted, pose, elapsed)
+        return permitted
+
+    def guide(self, velocity: tuple[float, float], pose: Pose) -> tuple[float, float]:
+        """Return a velocity (m/s, frame of the robot) turned to the nearest free direction.
+
+        A direction is free if a robot that drives straight on passes every unsafe cell nearby.
+        The direction last taken is preferred, so that the robot does not turn to and fro between
+        the two ways round an obstacle. Where none is free the velocity is unchanged.
+        """
+        ahead, left = velocity
+        speed, wanted = math.hypot(ahead, left), math.atan2(left, ahead)
+        angles = np.append(wanted, np.arange(DIRECTIONS) * (math.tau / DIRECTIONS))
+        free = angles[self._is_free(angles)]
+        if speed < 1e-6 or not free.size or free[0] == wanted:
+            self._detour = None
+            return velocity
+        cost = np.abs(np.remainder(free - wanted + math.pi, math.tau) - math.pi)
+        if self._detour is not None:
+            last = self._detour - pose.yaw
+            cost += 1.5 * np.abs(np.remainder(free - last + math.pi, math.tau) - math.pi)
+        chosen = float(free[int(np.argmin(cost))])
+        self._detour = pose.yaw + chosen
+        return speed * math.cos(chosen), speed * math.sin(chosen)
+
+    def _is_free(self, angles: Array) -> NDArray[np.bool_]:
+        """Return which directions (rad, frame of the robot), shape (k,), are free."""
+        rows = self._nearest[np.isfinite(self._nearest[:, 3])]
+        cosine, sine = np.cos(angles)[:, None], np.sin(angles)[:, None]
+        along = (rows[:, 0] * cosine + rows[:, 1] * sine) * rows[:, 3]
+        aside = np.abs(rows[:, 1] * cosine - rows[:, 0] * sine) * rows[:, 3]
+        # A cell that is already nearer than the distance blocks only what approaches it.
+        reach = np.minimum(self.parameters.distance, rows[:, 3] - 0.01)
+        blocked = (along > 0.0) & (aside < reach) & (along < self.parameters.distance + 0.12)
+        free: NDArray[np.bool_] = np.logical_not(blocked.any(axis=1))
+        return free
+
+    def _permitted(self, wanted: BodyTwist) -> BodyTwist:
+        """Return the permitted twist nearest to ``wanted``."""
+        parameters = self.parameters
+        count = write_conditions(
+            self._nearest, parameters.distance, parameters.ahead, parameters.rate, self._rows
+        )
+        limits = self._limits
+        for sign in (1.0, -1.0):
+            self._rows[count] = sign, 0.0, limits.linear
+            self._rows[count + 1] = 0.0, sign / TURN_WEIGHT, limits.angular
+            count += 2
+        v, turn = nearest_permitted(
+            self._rows[:count], wanted.linear, TURN_WEIGHT * wanted.angular
+        )
+        return BodyTwist(v, turn / TURN_WEIGHT)
+
+    def _look_around(self, pose: Pose, angle: float) -> None:
+        """Begin to look around, by an angle to both sides."""
+        half = [pose.yaw + angle * share for share in (0.5, 1.0, 0.5, 0.0, -0.5, -1.0, -0.5, 0.0)]
+        if angle >= math.pi:
+            half = [pose.yaw + math.tau * share for share in (0.25, 0.5, 0.75, 1.0)]
+        self._targets = deque(map(wrap_angle, half))
+        self._seen_from = pose
+
+    def _look(self, pose: Pose) -> BodyTwist:
+        """Return the turn towards the next direction."""
+        gap = wrap_angle(self._targets[0] - pose.yaw)
+        if abs(gap) < 0.08:
+            self._targets.popleft()
+        limit = self.parameters.scan_rate
+        return BodyTwist(0.0, min(max(4.0 * gap, -limit), limit))
+
+    def _decide_activity(
+        self, wanted: BodyTwist, permitted: BodyTwist, pose: Pose, elapsed: float
+    ) -> None:
+        """Decide what blocks the robot, and whether it must look around or is stuck."""
+        speed = abs(wanted.linear)
+        blocked = self.changed and speed > 0.05 and abs(permitted.linear) < 0.3 * speed
+        self._blocked_for = self._blocked_for + elapsed if blocked else 0.0
+        self.activity = Activity.AVOIDING if self.changed else Activity.FREE
+        unseen = self._blocked_by_unseen()
+        if self._blocked_for > 0.2 and unseen and self._has_moved_since_look(pose):
+            self._blocked_for = 0.0
+            self._look_around(pose, self.parameters.scan_angle)
+            return
+        self._update_stuck(wanted, blocked, unseen, pose, elapsed)
+
+    def _has_moved_since_look(self, pose: Pose) -> bool:
+        seen = self._seen_from
+        if seen is None:
+            return True
+        moved = math.hypot(pose.x - seen.x, pose.y - seen.y)
+        return moved > 0.04 or abs(wrap_angle(pose.yaw - seen.yaw)) > 0.6
+
+    def _blocked_by_unseen(self) -> bool:
+        """Whether the nearest cell ahead is one that has not been seen."""
+        ahead = self._nearest[:, 0] > 0.3
+        if not ahead.any():
+            return False
+        rows = self._nearest[ahead]
+        return bool(rows[int(np.argmin(rows[:, 3])), 2] == UNKNOWN)
+
+    def _update_stuck(
+        self, wanted: BodyTwist, blocked: bool, unseen: bool, pose: Pose, elapsed: float
+    ) -> None:
+        """Count the time without progress of a robot that wants to move."""
+        parameters = self.parameters
+        start = self._progress
+        moved = start is None or (
+            math.hypot(pose.x - start.x, pose.y - start.y) > parameters.stuck_distance
+            or abs(wrap_angle(pose.yaw - start.yaw)) > 1.0
+        )
+        if moved or abs(wanted.linear) < 0.02:
+            self._progress, self._waited = pose, 0.0
+            return
+        self._waited += elapsed
+        if self._waited < parameters.stuck_time:
+            return
+        if not self.changed:
+            self.activity = Activity.STUCK_DRIVE
+        else:
+            self.activity = Activity.STUCK_UNSEEN if unseen else Activity.STUCK_OBSTACLE
+        if self._waited % parameters.stuck_time < elapsed:
+            self._detour = None
+            self._look_around(pose, self.parameters.scan_angle)
+
+
+@kernel
+def find_nearest(grid: MapGrid, x: float, y: float, yaw: float, nearest: Array) -> None:
+    """Write the nearest unsafe cell of each sector.
+
+    nearest : shape (SECTORS, 4), overwritten: direction to the cell in the frame of the robot
+        (2 numbers), its state, its distance in m; a distance of inf without one
+    """
+    low, size = grid.numbers[0], grid.numbers[1]
+    count = grid.cells.shape[0]
+    nearest[:, 3] = math.inf
+    nearest[:, :3] = 0.0
+    reach = int(SEARCH_RADIUS / size) + 1
+    column0, row0 = int(math.floor((x - low) / size)), int(math.floor((y - low) / size))
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    for row in range(row0 - reach, row0 + reach + 1):
+        for column in range(column0 - reach, column0 + reach + 1):
+            outside = row < 0 or column < 0 or row >= count or column >= count
+            state = UNKNOWN if outside else int(grid.cells[row, column])
+            if state == FREE:
+                continue
+            away_x, away_y = low + (column + 0.5) * size - x, low + (row + 0.5) * size - y
+            square = away_x * away_x + away_y * away_y
+            if square > SEARCH_RADIUS * SEARCH_RADIUS or square == 0.0:
+                continue
+            ahead, left = cosine * away_x + sine * away_y, cosine * away_y - sine * away_x
+            sector = int((math.atan2(left, ahead) / math.tau + 1.0) * SECTORS) % SECTORS
+            distance = math.sqrt(square)
+            if distance < nearest[sector, 3]:
+                nearest[sector, 0], nearest[sector, 1] = ahead / distance, left / distance
+                nearest[sector, 2], nearest[sector, 3] = state, distance
+
+
+@kernel
+def write_conditions(
+    nearest: Array, distance: float, ahead: float, rate: float, rows: Array
+) -> int:
+    """Write the barrier conditions as rows (a, b, c) of a v + b (TURN_WEIGHT omega) <= c.
+
+    Return their number. A cell that is too near already permits no approach.
+    """
+    count = 0
+    for sector in range(nearest.shape[0]):
+        reach = nearest[sector, 3]
+        if reach == math.inf:
+            continue
+        x, y = nearest[sector, 0] * reach, nearest[sector, 1] * reach
+        rows[count, 0], rows[count, 1] = nearest[sector, 0], 0.0
+        rows[count, 2] = rate * max(reach - distance, 0.0)
+        count += 1
+        away_x = x - ahead
+        gap = math.sqrt(away_x * away_x + y * y)
+        if gap > 1e-6:
+            rows[count, 0] = away_x / gap
+            rows[count, 1] = ahead * y / gap / TURN_WEIGHT
+            rows[count, 2] = rate * max(gap - distance, 0.0)
+            count += 1
+    return count
+
+
+@kernel
+def nearest_permitted(rows: Array, first: float, second: float) -> tuple[float, float]:
+    """Return the point nearest to (first, second) with a x + b y <= c for each row, c >= 0.
+
+    Incremental: a row that the best point so far violates is active at the optimum of all rows up
+    to it, which then is the nearest permitted point of its line. (0, 0) satisfies every row.
+    """
+    x, y = first, second
+    for i in range(rows.shape[0]):
+        a, b, c = rows[i, 0], rows[i, 1], rows[i, 2]
+        if a * x + b * y <= c + 1e-12:
+            continue
+        norm = a * a + b * b
+        if norm < 1e-18:
+            continue
+        excess = (a * first + b * second - c) / norm
+        base_x, base_y = first - excess * a, second - excess * b
+        lowest, highest = -math.inf, math.inf
+        for j in range(i):
+            slope = rows[j, 1] * a - rows[j, 0] * b
+            room = rows[j, 2] - rows[j, 0] * base_x - rows[j, 1] * base_y
+            if slope > 1e-12:
+                highest = min(highest, room / slope)
+            elif slope < -1e-12:
+                lowest = max(lowest, room / slope)
+        if lowest > highest:
+            return 0.0, 0.0
+        along = min(max(0.0, lowest), highest)
+        x, y = base_x - along * b, base_y + along * a
+    return x, y

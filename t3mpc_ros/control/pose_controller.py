@@ -1,0 +1,220 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+r"""Pose loop: from the error of the pose to the twist that the control law of section 6 tracks.
+
+With the error of the reference pose in the frame of the robot, :math:`x_e` along, :math:`y_e`
+across and :math:`\theta_e` in yaw, and the reference twist :math:`(v_r, \omega_r)`, E22 is
+
+.. math::
+
+    v = v_r \cos\theta_e + k_x x_e, \qquad
+    \omega = \omega_r + k_y v_r \frac{\sin\theta_e}{\theta_e} y_e + k_\theta \theta_e
+
+(Morin and Samson, Springer Handbook of Robotics, 2008, chapter 34, doi
+10.1007/978-3-540-30301-5_35; after Kanayama et al., ICRA 1990, doi 10.1109/ROBOT.1990.126006,
+whose :math:`\sin\theta_e` in place of the last term has a second equilibrium at half a turn).
+With :math:`V = \frac12 (x_e^2 + y_e^2 + \theta_e^2/k_y)` it gives
+:math:`\dot V = -k_x x_e^2 - (k_\theta/k_y)\,\theta_e^2 \le 0` for any reference twist.
+
+Far from its reference, after a detour, the robot drives to it (*rejoining*): it turns towards the
+velocity that closes the gap, and drives on as far as it faces it.
+"""
+
+from dataclasses import dataclass
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, Pose, State, wrap_angle
+from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PoseLoopParameters(Parameters):
+    """Gains of the pose loop."""
+
+    enabled: bool = parameter(
+        False,
+        'whether the pose of the reference is followed, and not only its twist: for paths. The '
+        'pose of odom and that of reference must be in one frame',
+    )
+    gain_along: float = parameter(
+        2.5, 'k_x: speed per error along the robot', '1/s', (0.0, 50.0), dynamic=True
+    )
+    gain_across: float = parameter(
+        60.0,
+        'k_y: yaw rate per speed and error across; at a speed v the error oscillates with '
+        'v sqrt(k_y)',
+        '1/m²',
+        (0.0, 2000.0),
+        dynamic=True,
+    )
+    gain_yaw: float = parameter(
+        4.0, 'k_theta: yaw rate per error of yaw', '1/s', (0.0, 50.0), dynamic=True
+    )
+    rejoin_distance: float = parameter(
+        0.15,
+        'distance from the reference at which the robot leaves it, and drives to where it is',
+        'm',
+        (0.02, 10.0),
+        dynamic=True,
+    )
+    rejoined_distance: float = parameter(
+        0.06, 'distance at which it follows again', 'm', (0.005, 10.0), dynamic=True
+    )
+    rejoin_speed: float = parameter(
+        0.33,
+        'largest speed on the way to the reference; above that of the reference, or the robot '
+        'never reaches it',
+        'm/s',
+        (0.01, 5.0),
+        dynamic=True,
+    )
+
+    def check_consistency(self) -> None:
+        """Raise :class:`ParameterError` if following begins where it ends."""
+        if self.rejoined_distance >= self.rejoin_distance:
+            raise ParameterError(
+                f'rejoined_distance must be less than rejoin_distance, {self.rejoin_distance:g} '
+                f'm: got {self.rejoined_distance:g}'
+            )
+
+
+class PoseError(NamedTuple):
+    """Reference pose in the frame of the robot."""
+
+    along: float
+    """m, positive if the reference is ahead"""
+    across: float
+    """m, positive if it is to the left"""
+    yaw: float
+    """rad"""
+
+    @property
+    def distance(self) -> float:
+        """M."""
+        return math.hypot(self.along, self.across)
+
+
+def pose_error(reference: Pose, pose: Pose) -> PoseError:
+    """Return the reference pose in the frame of the robot."""
+    x, y = reference.x - pose.x, reference.y - pose.y
+    cosine, sine = math.cos(pose.yaw), math.sin(pose.yaw)
+    return PoseError(
+        cosine * x + sine * y, cosine * y - sine * x, wrap_angle(reference.yaw - pose.yaw)
+    )
+
+
+def follow_pose(error: PoseError, twist: BodyTwist, parameters: PoseLoopParameters) -> BodyTwist:
+    """Return the twist E22 for an error and the twist of the reference."""
+    sinc = math.sin(error.yaw) / error.yaw if abs(error.yaw) > 1e-6 else 1.0
+    return BodyTwist(
+        twist.linear * math.cos(error.yaw) + parameters.gain_along * error.along,
+        twist.angular
+        + parameters.gain_across * twist.linear * sinc * error.across
+        + parameters.gain_yaw * error.yaw,
+    )
+
+
+class PoseReference:
+    """Poses of the reference at their stamps, interpolated; the newest ones are kept."""
+
+    def __init__(self, capacity: int = 512) -> None:
+        self._stamps: NDArray[np.int64] = np.zeros(2 * capacity, dtype=np.int64)
+        self._poses: Array = np.zeros((2 * capacity, 3))
+        self._capacity = capacity
+        self.clear()
+
+    def clear(self) -> None:
+        """Remove every pose."""
+        self._first = self._end = 0
+
+    def add(self, reference: State) -> None:
+        """Add the pose of a sample; poses from its stamp on are removed first."""
+        while self._end > self._first and self._stamps[self._end - 1] >= reference.stamp_ns:
+            self._end -= 1
+        if self._end == len(self._stamps):
+            kept = self._end - self._first
+            self._stamps[:kept] = self._stamps[self._first : self._end]
+            self._poses[:kept] = self._poses[self._first : self._end]
+            self._first, self._end = 0, kept
+        self._stamps[self._end] = reference.stamp_ns
+        self._poses[self._end] = reference.pose
+        self._end += 1
+        self._first = max(self._first, self._end - self._capacity)
+
+    def at(self, stamp_ns: int) -> Pose | None:
+        """Return the pose at a stamp, before the first and after the last one that; or None."""
+        if self._first == self._end:
+            return None
+        stamps = self._stamps[self._first : self._end]
+        poses = self._poses[self._first : self._end]
+        after = int(np.searchsorted(stamps, stamp_ns, side='right'))
+        if after in (0, len(stamps)):
+            return Pose(*poses[min(after, len(stamps) - 1)].tolist())
+        begin, end = int(stamps[after - 1]), int(stamps[after])
+        share = (stamp_ns - begin) / (end - begin)
+        (x0, y0, yaw0), (x1, y1, yaw1) = poses[after - 1].tolist(), poses[after].tolist()
+        return Pose(
+            x0 + share * (x1 - x0),
+            y0 + share * (y1 - y0),
+            wrap_angle(yaw0 + share * wrap_angle(yaw1 - yaw0)),
+        )
+
+
+class PoseController:
+    """Follows the pose of the reference, and returns to it after a detour.
+
+    Parameters
+    ----------
+    parameters
+        Replaceable at run time.
+    """
+
+    def __init__(self, parameters: PoseLoopParameters) -> None:
+        self.parameters = parameters
+        self.reset()
+
+    def reset(self) -> None:
+        """Follow again from the next step on."""
+        self.rejoining = False
+        """Whether the robot is on its way to the reference."""
+        self.error = PoseError(*ORIGIN)
+        """Error of the last step."""
+
+    def step(self, reference: Pose, pose: Pose, twist: BodyTwist) -> BodyTwist:
+        """Return the twist to track.
+
+        Parameters
+        ----------
+        reference, twist
+            Pose and twist of the reference at the instant at which the result takes effect.
+        pose
+            Predicted pose of the robot at that instant.
+        """
+        parameters = self.parameters
+        self.error = error = pose_error(reference, pose)
+        if error.distance > parameters.rejoin_distance:
+            self.rejoining = True
+        elif error.distance < parameters.rejoined_distance:
+            self.rejoining = False
+        if not self.rejoining:
+            return follow_pose(error, twist, parameters)
+        return self.drive_along(self.closing_velocity(twist))
+
+    def closing_velocity(self, twist: BodyTwist) -> tuple[float, float]:
+        """Return the velocity (m/s) in the frame of the robot that closes the gap."""
+        error, parameters = self.error, self.parameters
+        ahead = twist.linear * math.cos(error.yaw) + parameters.gain_along * error.along
+        left = twist.linear * math.sin(error.yaw) + parameters.gain_along * error.across
+        scale = min(1.0, parameters.rejoin_speed / max(math.hypot(ahead, left), 1e-9))
+        return scale * ahead, scale * left
+
+    def drive_along(self, velocity: tuple[float, float]) -> BodyTwist:
+        """Return the twist that turns towards a velocity in the frame of the robot."""
+        ahead, left = velocity
+        return BodyTwist(max(ahead, 0.0), self.parameters.gain_yaw * math.atan2(left, ahead))

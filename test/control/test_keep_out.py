@@ -1,0 +1,127 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Keep-out: the nearest permitted twist, conditions that hold, floor that must be seen first."""
+
+import math
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.control.free_space_map import FREE, OCCUPIED, UNKNOWN
+from t3mpc_ros.control.keep_out import (
+    Activity,
+    KeepOut,
+    KeepOutParameters,
+    nearest_permitted,
+)
+from t3mpc_ros.geometry.arena import Obstacles
+from t3mpc_ros.geometry.kinematics import advance_pose
+from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, Pose
+
+LIMITS = BodyTwist(0.35, 4.5)
+PERIOD = 0.01
+PARAMETERS = KeepOutParameters(enabled=True)
+WALL = np.array([[1.0, -3.0, 1.0, 3.0]])
+
+
+def _seen(obstacles=None):
+    """Return a keep-out that has looked around and knows all floor but the given obstacles."""
+    keep_out = KeepOut(PARAMETERS, LIMITS, obstacles)
+    keep_out.step(BodyTwist(0.0, 0.0), ORIGIN, PERIOD)
+    keep_out._targets.clear()
+    cells = keep_out.map.grid.cells
+    cells[cells == UNKNOWN] = FREE
+    return keep_out
+
+
+@pytest.mark.parametrize('seed', range(30))
+def test_permitted_twist_is_the_nearest_one(seed):
+    """Against a fine grid of all twists: permitted, and no permitted one is nearer."""
+    generator = np.random.default_rng(seed)
+    rows = np.column_stack([generator.normal(size=(6, 2)), generator.uniform(0.0, 1.0, 6)])
+    wanted = generator.uniform(-2.0, 2.0, 2)
+    found = np.array(nearest_permitted(rows, *wanted.tolist()))
+    assert (rows[:, :2] @ found <= rows[:, 2] + 1e-9).all()
+    axis = np.linspace(-3.0, 3.0, 601)
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    permitted = grid[(grid @ rows[:, :2].T <= rows[:, 2] + 1e-9).all(axis=1)]
+    best = np.hypot(*(permitted - wanted).T).min()
+    assert np.hypot(*(found - wanted)) <= best + 1e-9
+
+
+def test_nothing_near_changes_nothing():
+    keep_out = _seen()
+    wanted = BodyTwist(0.31, -1.7)
+    assert keep_out.step(wanted, ORIGIN, PERIOD) == pytest.approx(wanted)
+    assert not keep_out.changed
+    assert keep_out.activity is Activity.FREE
+
+
+@pytest.mark.parametrize('direction', np.linspace(-1.4, 1.4, 5).tolist())
+@pytest.mark.parametrize('turn', [-1.0, 0.0, 1.0])
+@pytest.mark.parametrize('speed', [0.35, -0.35])
+def test_robot_never_enters_the_distance(direction, turn, speed):
+    """Towards a wall at any angle, ahead or astern: the centre keeps its distance.
+
+    Less half a cell. Astern only the condition of the centre protects it: no test failed when
+    that condition ignored the distance.
+    """
+    keep_out = _seen(Obstacles(segments=WALL))
+    pose = Pose(0.4, 0.0, direction if speed > 0.0 else direction + math.pi)
+    for _ in range(800):
+        wanted = BodyTwist(speed, turn)
+        pose = advance_pose(pose, keep_out.step(wanted, pose, PERIOD), PERIOD)
+        assert 1.0 - pose.x > PARAMETERS.distance - 0.02
+
+
+def test_approach_slows_down_within_the_deceleration():
+    """The barrier lets the distance shrink so slowly that less than 1 m/s² is needed."""
+    keep_out = _seen(Obstacles(segments=WALL))
+    pose, speeds = Pose(0.0, 0.0, 0.0), []
+    for _ in range(600):
+        twist = keep_out.step(BodyTwist(0.35, 0.0), pose, PERIOD)
+        speeds.append(twist.linear)
+        pose = advance_pose(pose, twist, PERIOD)
+    assert np.diff(speeds).min() > -1.0 * PERIOD
+    assert speeds[-1] < 0.01
+
+
+def test_robot_looks_before_it_enters_unseen_floor():
+    """The robot stops before floor that no ray has crossed, and turns to look."""
+    keep_out = KeepOut(PARAMETERS, LIMITS)
+    pose, looked = ORIGIN, False
+    for _ in range(3000):
+        twist = keep_out.step(BodyTwist(0.3, 0.0), pose, PERIOD)
+        looked |= keep_out.activity is Activity.LOOKING and pose.x > 0.01
+        pose = advance_pose(pose, twist, PERIOD)
+    assert math.hypot(pose.x, pose.y) < 0.15  # no reading ever came
+    assert looked
+    assert keep_out.activity.stuck or keep_out.activity is Activity.LOOKING
+
+
+def test_rays_clear_and_mark():
+    """Floor up to a hit is free, the hit is occupied, and later rays beyond it clear it."""
+    keep_out = KeepOut(PARAMETERS, LIMITS)
+    grid = keep_out.map.grid
+
+    def state(x, y):
+        low, size = grid.numbers
+        return grid.cells[math.floor((y - low) / size), math.floor((x - low) / size)]
+
+    keep_out.add_reading(0, 0.5, ORIGIN)
+    assert state(0.3, 0.05) == FREE
+    assert state(0.601, 0.051) == OCCUPIED
+    assert state(0.7, 0.05) == UNKNOWN
+    for _ in range(6):
+        keep_out.add_reading(0, math.inf, ORIGIN)
+    assert state(0.601, 0.051) == FREE
+    keep_out.add_reading(0, math.nan, ORIGIN)
+
+
+def test_drive_that_does_not_answer_is_paused():
+    """A robot stopped by slip drives again after half a second without a command."""
+    keep_out = _seen()
+    twists = [keep_out.step(BodyTwist(0.2, 0.0), ORIGIN, PERIOD) for _ in range(280)]
+    assert twists[100].linear == pytest.approx(0.2)
+    assert [each for each in twists[205:275] if each != (0.0, 0.0)] == []
+    assert keep_out.activity is Activity.STUCK_DRIVE

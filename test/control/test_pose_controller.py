@@ -1,0 +1,87 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Pose loop E22: the Lyapunov function decreases, from any pose and on any reference."""
+
+import math
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.control.pose_controller import (
+    PoseController,
+    PoseLoopParameters,
+    PoseReference,
+    follow_pose,
+    pose_error,
+)
+from t3mpc_ros.geometry.kinematics import advance_pose
+from t3mpc_ros.geometry.types import STANDSTILL, BodyTwist, Pose, State, wrap_angle
+
+PARAMETERS = PoseLoopParameters(enabled=True)
+DT = 0.002
+
+
+def _lyapunov(error):
+    return 0.5 * (error.along**2 + error.across**2 + error.yaw**2 / PARAMETERS.gain_across)
+
+
+def _reference_twist(kind, time):
+    return {
+        'straight': BodyTwist(0.2, 0.0),
+        'arc': BodyTwist(0.2, 1.0),
+        'backwards': BodyTwist(-0.2, 0.3),
+        'varying': BodyTwist(0.15 + 0.1 * math.sin(time), 2.0 * math.cos(1.7 * time)),
+    }[kind]
+
+
+@pytest.mark.parametrize('kind', ['straight', 'arc', 'backwards', 'varying'])
+@pytest.mark.parametrize('seed', range(5))
+def test_errors_vanish_and_never_grow(kind, seed):
+    """V decreases along every motion, whatever the pose at its start; the error vanishes."""
+    generator = np.random.default_rng(seed)
+    pose = Pose(*generator.uniform(-1.0, 1.0, 2).tolist(), float(generator.uniform(-3.1, 3.1)))
+    reference = Pose(0.0, 0.0, 0.0)
+    values = []
+    for step in range(round(30.0 / DT)):
+        twist = _reference_twist(kind, step * DT)
+        error = pose_error(reference, pose)
+        values.append(_lyapunov(error))
+        pose = advance_pose(pose, follow_pose(error, twist, PARAMETERS), DT)
+        reference = advance_pose(reference, twist, DT)
+    assert np.diff(values).max() < 1e-6
+    assert values[-1] < 1e-6 * values[0] + 1e-12
+
+
+@pytest.mark.parametrize('distance', [0.5, 2.0])
+@pytest.mark.parametrize('bearing', [0.0, 1.5, 3.0])
+def test_robot_rejoins_a_moving_reference(distance, bearing):
+    """From far away, in any direction, the robot reaches a reference that drives on."""
+    controller = PoseController(PARAMETERS)
+    reference = Pose(0.0, 0.0, 0.0)
+    pose = Pose(distance * math.cos(bearing), distance * math.sin(bearing), 2.0)
+    for _ in range(round(40.0 / DT)):
+        twist = BodyTwist(0.2, 0.5)
+        command = controller.step(reference, pose, twist)
+        assert not controller.rejoining or 0.0 <= command.linear <= PARAMETERS.rejoin_speed + 1e-9
+        pose = advance_pose(pose, command, DT)
+        reference = advance_pose(reference, twist, DT)
+    assert not controller.rejoining
+    assert controller.error.distance < 1e-3
+
+
+def test_at_rest_on_the_reference_nothing_moves():
+    assert follow_pose(pose_error(Pose(1.0, 2.0, 3.0), Pose(1.0, 2.0, 3.0)), STANDSTILL,
+                       PARAMETERS) == pytest.approx((0.0, 0.0))  # fmt: skip
+
+
+def test_reference_poses_are_interpolated_the_short_way_round():
+    """Between yaws of 3 and -3 rad lies half a turn, not 0; a restart replaces later poses."""
+    poses = PoseReference(capacity=4)
+    assert poses.at(0) is None
+    for k in range(20):
+        poses.add(State(k * 10, Pose(float(k), 0.0, 3.0 if k % 2 else -3.0), STANDSTILL))
+    assert poses.at(185).x == pytest.approx(18.5)
+    assert abs(wrap_angle(poses.at(185).yaw - math.pi)) < 1e-9
+    assert poses.at(1000).x == 19.0
+    poses.add(State(170, Pose(-1.0, 0.0, 0.0), STANDSTILL))
+    assert poses.at(1000).x == -1.0
