@@ -20,6 +20,10 @@ class NodeReport(NamedTuple):
     condition: Condition = 'normal'
 
 
+PAUSED = NodeReport('paused')
+"""Report of a reference generator that was paused."""
+
+
 class Banner(NamedTuple):
     """One line in large letters, and the reason for it."""
 
@@ -47,6 +51,8 @@ def banner(reports: Mapping[str, NodeReport], odometry_age: float | None) -> Ban
         return Banner('lost', 'Connection lost', f'no odometry for {odometry_age:.0f} s')
     if any(each.text.startswith(ESTOP) for each in stops.values()):
         return Banner('stopped', 'E-STOP', detail)
+    if reports.get('reference_generator') == PAUSED:
+        return Banner('warning', 'Reference paused', detail)
     if stops:
         return Banner('stopped', 'Stopped', detail)
     if worse:

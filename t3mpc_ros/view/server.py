@@ -20,6 +20,7 @@ from threading import BoundedSemaphore, Event, Thread
 from typing import Any, Self
 from urllib.parse import parse_qs, urlsplit
 
+from t3mpc_ros.page.page_files import PAGE_FILES, page_file
 from t3mpc_ros.view.live_data import Json, LiveData
 
 ADDRESS = '127.0.0.1'
@@ -33,7 +34,7 @@ MAX_BODY = 4096
 """Largest command, bytes."""
 
 _TYPES = {'.html': 'text/html', '.js': 'text/javascript', '.css': 'text/css'}
-_PAGE = ('view.html', 'view.js', 'charts.js', 'view.css', 'uplot.js', 'uplot.css')
+_PAGE = ('view.html', 'view.js', 'view.css', *PAGE_FILES)
 _HEADERS = {
     'Cache-Control': 'no-store',
     'Content-Security-Policy': "default-src 'none'; script-src 'self'; style-src 'self'; "
@@ -266,4 +267,6 @@ class _Handler(BaseHTTPRequestHandler):
 
 @cache
 def _file(name: str) -> str:
+    if name in PAGE_FILES:
+        return page_file(name)
     return (files('t3mpc_ros.view') / 'page' / name).read_text(encoding='utf-8')

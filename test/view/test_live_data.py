@@ -98,6 +98,19 @@ ESTOP = NodeReport('emergency stop: requested by service e_stop', 'stopped')
         ({}, None, ('lost', 'Waiting for a robot', 'no odometry on the graph yet')),
         ({}, 0.1, ('good', 'Receiving odometry', '')),
         (TRACKING, 0.1, ('good', 'Tracking the reference', '')),
+        (
+            {
+                'reference_generator': NodeReport('paused'),
+                'controller': NodeReport('no reference', 'stopped'),
+            },
+            0.1,
+            ('warning', 'Reference paused', 'controller: no reference'),
+        ),
+        (
+            {'reference_generator': NodeReport('paused'), 'sim_robot': ESTOP},
+            0.1,
+            ('stopped', 'E-STOP', f'sim_robot: {ESTOP.text}'),
+        ),
         (TRACKING, LOST + 1.6, ('lost', 'Connection lost', 'no odometry for 3 s')),
         (
             {**TRACKING, 'sim_robot': NodeReport('the battery is low', 'warning')},

@@ -50,11 +50,13 @@ function interpolate(times, values, at) {
 // Charts over one time axis: a cursor, a selected span and the colours are common to all.
 class ChartGroup {
   // place: element that gets the charts; moved(time or null): called when the cursor moves;
-  // selected(from, to): called when a span is selected with the mouse, (null) to undo it.
-  constructor(place, { moved = () => {}, selected = () => {} } = {}) {
+  // selected(from, to): called when a span is selected, (null) to undo it; spanGaps: whether a
+  // null is skipped, or seen as a gap.
+  constructor(place, { moved = () => {}, selected = () => {}, spanGaps = true } = {}) {
     this.place = place;
     this.moved = moved;
     this.selected = selected;
+    this.spanGaps = spanGaps;
     this.charts = [];
     this.key = `t3mpc-${Math.random()}`;
     this.marks = [];
@@ -62,19 +64,25 @@ class ChartGroup {
     theme.addEventListener('change', () => this.rebuild());
   }
 
-  // series: [{label, colour, dash}], title and unit in words.
-  add(title, unit, series) {
-    const box = element('figure', { className: 'chart' });
+  // series: [{label, colour, dash, style}], title and unit in words; box: a figure with a title,
+  // which gets the chart, and summary: what is seen in it.
+  add(title, unit, series, { box, summary } = {}) {
     const legend = element('div', { className: 'chart-legend' });
-    const plot = element('div', { role: 'img', ariaLabel: `${title}, ${unit}, over time` });
-    box.append(element('h3', { textContent: `${title} (${unit})` }), plot, legend);
-    this.place.append(box);
+    const plot = element('div', { role: 'img', tabIndex: 0,
+      ariaLabel: summary || `${title}, ${unit}, over time` });
+    if (box) {
+      box.querySelector('h3').after(plot, legend);
+    } else {
+      this.place.append(element('figure', { className: 'chart' },
+        element('h3', { textContent: `${title} (${unit})` }), plot, legend));
+    }
     const chart = { title, unit, series, plot, legend, data: [[], ...series.map(() => [])] };
     chart.values = series.map((each) => {
       const value = element('b', { textContent: '–' });
       legend.append(element('span', {}, sample(each.colour, each.dash), `${each.label} `, value));
       return value;
     });
+    plot.addEventListener('keydown', (key) => this.press(chart, key));
     this.charts.push(chart);
     this.build(chart);
     return chart;
@@ -85,13 +93,14 @@ class ChartGroup {
     const axis = { stroke: colour('ink'), grid: { stroke: colour('line'), width: 1 },
       ticks: { stroke: colour('line') }, font: '12px system-ui, sans-serif' };
     chart.uplot = new uPlot({
-      width: Math.max(200, this.place.clientWidth), height: 160,
-      cursor: { sync: { key: this.key }, drag: { x: true, y: false }, points: { size: 6 } },
+      width: Math.max(200, chart.plot.clientWidth), height: 160,
+      legend: { show: false }, cursor: { sync: { key: this.key }, y: false, drag: { x: true, y: false }, points: { size: 6 } },
       scales: { x: { time: false, range: (u, low, high) => this.range || [low, high] } },
       axes: [{ ...axis, size: 30, values: (u, ticks) => ticks.map((each) => `${+each.toFixed(2)} s`) },
         { ...axis, size: 52 }],
       series: [{}, ...chart.series.map((each) => ({ label: each.label, stroke: colour(each.colour),
-        dash: each.dash, width: 1.6, spanGaps: true, points: { show: false } }))],
+        dash: each.dash, width: 1.6, spanGaps: this.spanGaps, points: { show: false },
+        ...style(each.style, colour(each.colour)) }))],
       hooks: {
         setCursor: [(u) => this.showCursor(chart, u)],
         setSelect: [(u) => {
@@ -157,9 +166,29 @@ class ChartGroup {
     });
   }
 
-  resize() {
+  // Put the cursor of all charts at an instant.
+  moveTo(time) {
     for (const { uplot } of this.charts) {
-      uplot.setSize({ width: Math.max(200, this.place.clientWidth), height: 160 });
+      uplot.setCursor({ left: uplot.valToPos(time, 'x'), top: 0 });
+    }
+  }
+
+  // Arrows move the cursor, + and - zoom about it, 0 shows everything.
+  press(chart, key) {
+    const { cursor, scales: { x: { min, max } } } = chart.uplot;
+    const at = cursor.left >= 0 ? chart.uplot.posToVal(cursor.left, 'x') : 0.5 * (min + max);
+    const step = { ArrowLeft: -0.01, ArrowRight: 0.01 }[key.key];
+    const zoom = { '+': 0.5, '-': 2 }[key.key];
+    if (step) this.moveTo(Math.min(max, Math.max(min, at + step * (max - min))));
+    else if (zoom) this.selected(at - zoom * (at - min), at + zoom * (max - at));
+    else if (key.key === '0') this.selected(null);
+    else return;
+    key.preventDefault();
+  }
+
+  resize() {
+    for (const { uplot, plot } of this.charts) {
+      uplot.setSize({ width: Math.max(200, plot.clientWidth), height: 160 });
     }
   }
 
@@ -167,6 +196,13 @@ class ChartGroup {
     for (const chart of this.charts) this.build(chart);
     this.draw(this.range);
   }
+}
+
+// How a line is drawn: joined by straight lines if nothing else is said.
+function style(name, stroke) {
+  if (name === 'steps') return { paths: uPlot.paths.stepped({ align: 1 }) };
+  if (name === 'points') return { paths: () => null, points: { show: true, size: 3, width: 0, fill: stroke } };
+  return {};
 }
 
 // The last value up to a row: joined streams have rows without a value.
@@ -188,15 +224,17 @@ function inverse([x, y, yaw]) {
   return [-c * x - s * y, s * x - c * y, -yaw];
 }
 
-// Map of the floor: walls, paths, range rays and robot, in metres, x to the right and y up.
+// Map of a plane, x to the right and y up: of the floor in metres, with walls and robot, or of two
+// quantities with one unit.
 class Floor {
-  constructor(canvas) {
+  constructor(canvas, unit = 'm') {
     this.canvas = canvas;
+    this.unit = unit;
     this.view = null;
   }
 
-  // scene: {world, paths: [{x, y, colour, dash}], robot: [x, y, yaw] or null, mounts, ranges,
-  // track (m)}
+  // scene: {world, paths: [{x, y, colour, dash}], marks: [[x, y, colour]], robot: [x, y, yaw] or
+  // null, mounts, ranges, track (m)}; NaN interrupts a path
   draw(scene) {
     const canvas = this.canvas;
     const ratio = window.devicePixelRatio || 1;
@@ -216,16 +254,26 @@ class Floor {
       context.lineWidth = 1.8 * ratio;
       context.setLineDash((path.dash || []).map((each) => each * ratio));
       context.beginPath();
-      path.x.forEach((x, i) => context.lineTo(...at(x, path.y[i])));
+      let drawn = false;
+      path.x.forEach((x, i) => {
+        const known = Number.isFinite(x);
+        if (known) context[drawn ? 'lineTo' : 'moveTo'](...at(x, path.y[i]));
+        drawn = known;
+      });
       context.stroke();
     }
     context.setLineDash([]);
+    for (const [x, y, name] of scene.marks || []) {
+      context.fillStyle = colour(name);
+      disc(context, ...at(x, y), 4.5 * ratio);
+    }
     if (scene.robot) this.robot(context, scene, at, scale, ratio);
   }
 
   fit(scene) {
     let [left, right, bottom, top] = [Infinity, -Infinity, Infinity, -Infinity];
     const include = (x, y) => {
+      if (!Number.isFinite(x)) return;
       left = Math.min(left, x); right = Math.max(right, x);
       bottom = Math.min(bottom, y); top = Math.max(top, y);
     };
@@ -242,7 +290,9 @@ class Floor {
 
   grid(context, at, ratio) {
     const [cx, cy, half] = this.view;
-    const step = [0.1, 0.25, 0.5, 1, 2, 5, 10, 50, 100].find((each) => each * this.canvas.width > 110 * ratio * half) || 1000;
+    const least = (110 * ratio * half) / this.canvas.width;
+    const decade = 10 ** Math.floor(Math.log10(least));
+    const step = decade * [1, 2, 5, 10].find((each) => each * decade >= least);
     context.strokeStyle = colour('line');
     context.fillStyle = colour('soft');
     context.lineWidth = ratio;
@@ -250,7 +300,7 @@ class Floor {
     for (let k = Math.ceil((cx - half) / step); k * step <= cx + half; k++) {
       const [x] = at(k * step, cy);
       line(context, x, 0, x, this.canvas.height);
-      context.fillText(`${+(k * step).toFixed(2)} m`, x + 3 * ratio, this.canvas.height - 4 * ratio);
+      context.fillText(`${+(k * step).toFixed(2)} ${this.unit}`, x + 3 * ratio, this.canvas.height - 4 * ratio);
     }
     for (let k = Math.ceil((cy - half) / step); k * step <= cy + half; k++) {
       const [, y] = at(cx, k * step);
