@@ -6,10 +6,10 @@ Worker processes import the main module again: a script that uses more than one 
 work by ``if __name__ == '__main__':``.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 from contextlib import nullcontext
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache, partial
 import math
 import multiprocessing
@@ -27,6 +27,7 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import (
 )
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.link_faults import PeriodicLinks
+from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.scenario import (
     DRIVES,
     PRETRAINING_DURATION,
@@ -35,6 +36,7 @@ from t3mpc_ros.evaluation.scenario import (
     RATE,
     SampledReference,
     Scenario,
+    complete_rows,
     settled_rows,
     switch_times,
 )
@@ -50,8 +52,8 @@ class LoopRecord:
     """Record of one run, one row per control period, right wheel first.
 
     Row k holds what was known and decided at ``time[k]``, and the state of the robot then. From
-    a row on at which the method answered with a number that is not finite, all is NaN but time,
-    reference and mode: the run ended there.
+    a row on at which the method answered with a number that is not finite, or the robot has such
+    a speed, all is NaN but time, reference and mode: the run ended there.
     """
 
     time: Array
@@ -80,6 +82,8 @@ class LoopRecord:
     has none. The fuzzy estimate is the first one negated."""
     modes: NDArray[np.int64]
     """Active switching mode, shape (n,)"""
+    switches: Array
+    """Instants of the switches, also of those after the end that preview reaches, s."""
 
     @classmethod
     def empty(cls, steps: int) -> Self:
@@ -90,6 +94,7 @@ class LoopRecord:
             'limited': np.zeros(steps, dtype=np.bool_),
             'terms': np.zeros((steps, len(TERM_NAMES), 2)),
             'modes': np.zeros(steps, dtype=np.int64),
+            'switches': np.zeros(0),
         }
         return cls(**arrays)
 
@@ -118,8 +123,9 @@ class LoopRecord:
         return total_variation(self.time, self.effort)
 
     def _counted(self, after: float, cut: float) -> NDArray[np.bool_]:
-        switches = switch_times(self.time, self.modes)
-        return settled_rows(self.time, switches, after, (0.4 * cut, 0.6 * cut))
+        margins = 0.4 * cut, 0.6 * cut
+        rows = settled_rows(self.time, self.switches, after, margins)
+        return rows & complete_rows(self.time, self.switches)
 
 
 def total_variation(time: Array, signal: Array) -> float:
@@ -229,7 +235,7 @@ def run(
     controller = method(nominal_model)
     seam = drive_for(scenario) if drive is None else drive
     robot = scenario.robot()
-    plant = DisturbedPlant(robot)
+    plant = scenario.plant()
     measured_now = np.array(plant.measure(0.0))
     seam.reset(measured_now)
     changed_robot, change_step = scenario.changed_robot(), scenario.change_step
@@ -253,7 +259,10 @@ def run(
         if k == change_step and changed_robot is not None:
             plant.configure(changed_robot)
         record.measured[k] = measured_now
-        record.speeds[k] = plant.plant.wheels
+        record.speeds[k] = speeds = plant.wheels
+        if not (math.isfinite(speeds[0]) and math.isfinite(speeds[1])):
+            _break_off(record, k)
+            return record
         if k > 0:  # unless a measurement arrives, all that it decides stays as it is
             for kept in (record.command, record.sent, record.limited):
                 kept[k] = kept[k - 1]
@@ -301,7 +310,9 @@ def run(
 
 def _prepare(scenario: Scenario) -> LoopRecord:
     """Return a record with all that is known before the run."""
-    record, reference = LoopRecord.empty(scenario.steps), scenario.reference()
+    reference = scenario.reference()
+    switches = switch_times(reference.time, reference.modes)
+    record = replace(LoopRecord.empty(scenario.steps), switches=switches)
     record.time[:] = reference.time[: scenario.steps]
     record.reference[:] = reference.speeds[: scenario.steps]
     record.modes[:] = reference.modes[: scenario.steps]
@@ -391,7 +402,7 @@ class MethodLoop:
 
 def _break_off(record: LoopRecord, k: int) -> None:
     """Mark rows from ``k`` on as never run."""
-    kept = 'time', 'reference', 'modes', 'limited'
+    kept = 'time', 'reference', 'modes', 'limited', 'switches'
     for each in fields(record):
         if each.name not in kept:
             getattr(record, each.name)[k:] = math.nan
@@ -409,30 +420,37 @@ def warm_up() -> None:
 
 
 class WorkerPool:
-    """Processes that run jobs, kept warm from one batch to the next.
+    """Executor that runs jobs, kept warm from one batch to the next.
 
-    Jobs share nothing, so results do not depend on how many workers there are. One worker is
-    this process itself. To be used in a ``with`` statement.
+    Jobs share nothing, so results do not depend on who works. To be used in a ``with`` statement.
+
+    Parameters
+    ----------
+    workers
+        How many processes of this machine; one is this process itself. Or an executor, here or on
+        other machines, which the caller ends.
     """
 
-    def __init__(self, count: int) -> None:
-        if count < 1:
-            raise ValueError(f'workers must be at least 1: got {count}')
-        self._count = count
-        self._pool: ProcessPoolExecutor | None = None
+    def __init__(self, workers: int | Executor) -> None:
+        if isinstance(workers, int) and workers < 1:
+            raise ValueError(f'workers must be at least 1: got {workers}')
+        self._workers = workers
+        self._pool: Executor | None = None
 
     def __enter__(self) -> Self:
-        if self._count > 1:
+        if isinstance(self._workers, Executor):
+            self._pool = self._workers
+        elif self._workers > 1:
             # Spawned, not forked: a fork would copy whatever threads and locks this process has.
             self._pool = ProcessPoolExecutor(
-                self._count, multiprocessing.get_context('spawn'), initializer=warm_up
+                self._workers, multiprocessing.get_context('spawn'), initializer=warm_up
             )
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._pool is not None:
+        if self._pool is not None and self._pool is not self._workers:
             self._pool.shutdown(cancel_futures=True)
-            self._pool = None
+        self._pool = None
 
     def run(
         self, jobs: Iterable[Job], measure: Callable[[LoopRecord], T]
@@ -447,7 +465,7 @@ class WorkerPool:
     def map(self, task: Callable[[J], T], jobs: Iterable[J]) -> Iterator[tuple[int, T]]:
         """Yield (index of the job, ``task`` of it) as the jobs are finished.
 
-        ``task`` is a function of a module; jobs are taken only as workers become free.
+        ``task`` is a function of a module.
 
         Raises
         ------
@@ -462,24 +480,36 @@ class WorkerPool:
                     raise _job_error(job, error) from error
                 yield index, result
             return
-        waiting = iter(enumerate(jobs))
         begun: dict[Future[T], tuple[int, J]] = {}
         try:
-            while True:
-                while len(begun) < 2 * self._count and (entry := next(waiting, None)):
-                    begun[self._pool.submit(task, entry[1])] = entry
-                if not begun:
-                    return
-                finished, _ = wait(begun, return_when=FIRST_COMPLETED)
-                for future in sorted(finished, key=lambda each: begun[each][0]):
-                    index, job = begun.pop(future)
-                    failure = future.exception()
-                    if failure is not None:
-                        raise _job_error(job, failure) from failure
-                    yield index, future.result()
+            for index, job in enumerate(jobs):
+                begun[self._pool.submit(task, job)] = index, job
+            for future in as_completed(begun):
+                index, job = begun.pop(future)
+                failure = future.exception()
+                if failure is not None:
+                    raise _job_error(job, failure) from failure
+                yield index, future.result()
         finally:
             for future in begun:
                 future.cancel()
+
+
+def map_jobs(
+    task: Callable[[J], T],
+    jobs: Sequence[J],
+    workers: int | Executor = 1,
+    unit: str = 'runs',
+    *,
+    progress: bool = False,
+) -> list[T]:
+    """Return ``task`` of every job in their order; ``workers`` as for :class:`WorkerPool`."""
+    found: dict[int, T] = {}
+    with WorkerPool(workers) as pool, progress_bar(len(jobs), unit, show=progress) as bar:
+        for index, result in pool.map(task, jobs):
+            found[index] = result
+            bar.update()
+    return [found[index] for index in range(len(jobs))]
 
 
 def measure_many(
@@ -487,7 +517,7 @@ def measure_many(
 ) -> Iterator[tuple[int, T]]:
     """Yield (index of the job, measure of its record) as the jobs are finished.
 
-    ``workers`` is how many processes, for this batch alone, or :class:`Workers` that are running.
+    ``workers`` is how many processes, for this batch alone, or a :class:`WorkerPool` that runs.
     """
     team = nullcontext(workers) if isinstance(workers, WorkerPool) else WorkerPool(workers)
     with team as running:

@@ -4,24 +4,26 @@
 
 from collections.abc import Callable, Iterable
 import io
+import math
 from pathlib import Path
-from typing import Any, Protocol, TypeGuard, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Rectangle
 from matplotlib.ticker import MaxNLocator
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.control.controller import WHEELS
-from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
 from t3mpc_ros.evaluation.bag_report.topic_roles import (
     COMMAND,
     ODOMETRY,
     REFERENCE,
     TRUTH,
 )
+from t3mpc_ros.simulation.world import World
 
 Array = NDArray[np.float64]
 Subject = TypeVar('Subject')
@@ -45,21 +47,11 @@ COLOURS = {
     'predictive': '#db2777',
     'applied': '#0f766e',
     'value': '#4338ca',
-    'margin': '#0891b2',
-    'skill': '#db2777',
-    'latency': '#4338ca',
-    'fit': '#ea580c',
-    'answered': '#0f766e',
-    'round trip': '#4338ca',
-    'resets': '#be123c',
     'switch': '#d97706',
 }
 """Colours by quantity, the same in every figure."""
-LABELS = {TRUTH: 'robot (ground truth)', ODOMETRY: 'robot (odometry)', REFERENCE: 'reference'}
-STRENGTH = dict(zip(WHEELS, (1.0, 0.45), strict=True))
-"""Opacity by wheel: where both share a panel, the left one is paler."""
 
-_STYLE = {
+STYLE = {
     'font.size': 9,
     'axes.titlesize': 9,
     'axes.titlelocation': 'left',
@@ -79,7 +71,7 @@ _STYLE = {
 
 def png_of(draw: Callable[[Subject], Any], subject: Subject) -> bytes | None:
     """Return the PNG of what ``draw`` returns for ``subject``; None when it returns None."""
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure = draw(subject)
         if figure is None:
             return None
@@ -104,6 +96,14 @@ class Drawing(Protocol[Subject_contra]):
         """Return the figure of a subject; None when there is nothing to draw."""
 
 
+class TitledDrawing(NamedTuple, Generic[Subject]):
+    """A figure with its title."""
+
+    stem: str
+    title: str
+    draw: Callable[[Subject], Any]
+
+
 def write_pictures(
     drawings: Iterable[Drawing[Subject]], subject: Subject, folder: Path
 ) -> dict[str, bytes]:
@@ -117,6 +117,29 @@ def write_pictures(
     return found
 
 
+def draw_world(axis: Any, world: World) -> None:
+    """Draw walls, boxes, pillars and slippery floor of a world, in m."""
+    for x, y, radius, _ in world.patches.tolist():
+        axis.add_patch(Circle((x, y), radius, color='#fef3c7', lw=0.0))
+    for x, y, radius in world.circles.tolist():
+        axis.add_patch(Circle((x, y), radius, fc='#d1d5db', ec='#374151', lw=1.4))
+    for x, y, length, width, yaw in world.boxes.tolist():
+        left, bottom = x - 0.5 * length, y - 0.5 * width
+        axis.add_patch(
+            Rectangle(
+                (left, bottom),
+                length,
+                width,
+                angle=math.degrees(yaw),
+                rotation_point='center',
+                color='#d1d5db',
+                lw=0.0,
+            )
+        )
+    walls = list(world.segments.reshape(-1, 2, 2))
+    axis.add_collection(LineCollection(walls, colors='#374151', linewidths=1.4))
+
+
 def new_figure(height: float) -> Any:
     """Return an empty figure of ``height`` inches, independent of pyplot."""
     figure = Figure(figsize=(WIDTH, height), layout='constrained')
@@ -124,37 +147,25 @@ def new_figure(height: float) -> Any:
     return figure
 
 
-def new_panels(count: int, height: float, *, shared: bool = True) -> tuple[Any, list[Any]]:
-    """Return a figure and ``count`` panels below each other, each ``height`` inches.
-
-    ``shared`` selects one common time axis.
-    """
+def new_panels(count: int, height: float) -> tuple[Any, list[Any]]:
+    """Return a figure and ``count`` panels of ``height`` inches with one common time axis."""
     figure = new_figure(0.7 + height * count)
-    return figure, list(figure.subplots(count, 1, sharex=shared, squeeze=False)[:, 0])
+    return figure, list(figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0])
 
 
-def over_time(figure: Any, axes: list[Any], run: Run) -> Any:
-    """Return ``figure`` with switches marked, the time axis labelled and one legend on top."""
-    for axis in axes:
-        mark_switches(axis, run.switches, 'switch')
-    name_time(axes)
-    add_legend(axes[0])
-    return figure
-
-
-def mark_switches(axis: Any, times: Array, label: str | None = None) -> None:
-    """Mark the switches with dashed lines, of which the first one has the label."""
+def mark_switches(axis: Any, times: Array) -> None:
+    """Mark the switches with dashed lines."""
     style = {'color': COLOURS['switch'], 'linewidth': 0.8, 'linestyle': (0, (4, 3))}
-    for i, switch in enumerate(times):
-        axis.axvline(switch, label=None if i else label, zorder=1.5, **style)
+    for switch in times:
+        axis.axvline(switch, zorder=1.5, **style)
 
 
-def name_time(axes: list[Any], name: str = 'time') -> None:
+def name_time(axes: list[Any]) -> None:
     """Label the common time axis, with ticks at round numbers."""
     for axis in axes:
         axis.margins(x=0.01)
         axis.xaxis.set_major_locator(MaxNLocator(steps=(1, 2, 5, 10)))
-    axes[-1].set_xlabel(f'{name} / s')
+    axes[-1].set_xlabel('time / s')
 
 
 def add_legend(axis: Any) -> None:
@@ -174,38 +185,3 @@ def legend_above(figure: Any, *axes: Any, columns: int = 5) -> None:
             entries.setdefault(label, handle)
     columns = min(columns, len(entries))
     figure.legend(entries.values(), entries.keys(), loc='outside upper center', ncols=columns)
-
-
-def draw_line(
-    axis: Any,
-    series: Series,
-    name: str,
-    colour: str,
-    label: str | None = None,
-    *,
-    width: float = 1.1,
-    strength: float = 1.0,
-) -> None:
-    """Draw one quantity over time."""
-    time, value = thinned(series.time, series[name])
-    axis.plot(time, value, color=colour, label=label, linewidth=width, alpha=strength)
-
-
-def thinned(time: Array, value: Array, most: int = 6000) -> tuple[Array, Array]:
-    """Return the extremes of segments of a long line: the same picture from fewer points."""
-    if time.size <= most:
-        return time, value
-    stretch = -(-time.size // (most // 2))
-    starts = np.arange(0, time.size, stretch)
-    low, high = np.fmin.reduceat(value, starts), np.fmax.reduceat(value, starts)
-    return np.repeat(time[starts], 2), np.column_stack([low, high]).ravel()
-
-
-def every_nth(values: Array, most: int = 20_000) -> Array:
-    """Return a thinned line in the plane."""
-    return values[:: max(1, -(-values.size // most))]
-
-
-def is_long(series: Series | None) -> TypeGuard[Series]:
-    """Return whether there is more than one point."""
-    return series is not None and len(series) > 1

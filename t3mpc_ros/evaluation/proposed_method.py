@@ -13,18 +13,17 @@ from numpy.typing import NDArray
 from t3mpc_ros.control.control_law import Nt3fsMpcParameters
 from t3mpc_ros.control.controller import SwitchingTracker
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
+    JUMP,
     BaselineController,
     NominalModel,
     Observation,
+    future_jump,
 )
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.parameters.table import Parameters, parameter
 
 Array = NDArray[np.float64]
-
-JUMP = 0.3
-"""A change of r in one period (rad/s), beyond its slope, that is taken as a switch."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +38,9 @@ class ProposedParameters(Nt3fsMpcParameters):
 
 
 @lru_cache(maxsize=8)
-def _template(parameters: ProposedParameters, drive: str) -> SwitchingTracker:
+def _template(parameters: ProposedParameters, nominal_model: NominalModel) -> SwitchingTracker:
     """Return a controller to be copied: teaching its predictor takes a tenth of a second."""
-    return SwitchingTracker(parameters, drive)
+    return SwitchingTracker(parameters, nominal_model.drive, nominal_model.motor_limit)
 
 
 class ProposedController(BaselineController):
@@ -55,7 +54,7 @@ class ProposedController(BaselineController):
         self.preview: bool = table.jump_transition.preview  # type: ignore[misc]
         self._period = nominal_model.period
         self._period_ns = round(nominal_model.period * NANOSECONDS)
-        self._tracker = deepcopy(_template(table, nominal_model.drive))
+        self._tracker = deepcopy(_template(table, nominal_model))
         self._random = table.predictive.seed if table.random_predictor else None
         if self._random is not None:
             self._randomize_predictor(self._random)
@@ -110,18 +109,8 @@ class ProposedController(BaselineController):
 
     def _announce_future_jump(self, instant_ns: int, future: Array, j: int) -> None:
         """Announce a jump at row j of the future, seen by the rows around it."""
-        for i in range(2):
-            here, was = float(future[j, i]), float(future[j - 1, i])
-            slope = was - float(future[j - 2, i]) if j > 1 else 0.0
-            if abs(here - was - slope) > JUMP and abs(slope) <= JUMP:
-                break
-        else:
-            return
-        before = future[j - 1] - future[j - 2] if j > 1 else np.zeros(2)
-        if np.max(np.abs(before)) <= JUMP:
-            jump = future[j] - future[j - 1] - before
-            after = (future[j + 1] - future[j]) / self._period
-            self._tracker.transition.announce(instant_ns, jump, after)
+        if found := future_jump(future, j, self._period):
+            self._tracker.transition.announce(instant_ns, *found)
 
     def _announce_current_jump(self, now_ns: int, observation: Observation) -> None:
         """Announce a jump that has just happened."""

@@ -3,17 +3,21 @@
 """Shared parts of all reports: page, table, progress line, JSON and number formats."""
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 import json
 import math
 from pathlib import Path
+import re
 import sys
 from typing import ClassVar, NamedTuple
 
 import jinja2
 from tqdm import tqdm
+
+from t3mpc_ros.evaluation.charts import Chart, PageData, Plane, Timeline
+from t3mpc_ros.page.page_files import page_file
 
 EMPTY_CELL = '–'
 
@@ -61,11 +65,30 @@ class Heading:
 
 @dataclass(frozen=True, slots=True)
 class Paragraph:
-    """A paragraph; its kind is '', ``quiet``, or ``verdict`` with ``yes`` or ``no``."""
+    """A paragraph; its kind is '' or ``quiet``."""
 
     show: ClassVar[str] = 'paragraph'
     text: str
     kind: str = ''
+
+
+@dataclass(frozen=True, slots=True)
+class VerdictBox:
+    """What a page says first; its kind is ``good``, ``open`` or ``bad``."""
+
+    show: ClassVar[str] = 'verdict'
+    headline: str
+    reasons: Sequence[str]
+    kind: str
+    subject: str = ''
+    """What it is about, where a page has several verdicts."""
+
+
+@dataclass(frozen=True, slots=True)
+class Contents:
+    """Links to the headings of the page, then what the cursor of its charts shows."""
+
+    show: ClassVar[str] = 'contents'
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,18 +144,75 @@ class Group:
     kind: str = ''
 
 
-Block = Table | Heading | Paragraph | Tiles | Items | Picture | Details | Group
+Block = (
+    Table
+    | Heading
+    | Paragraph
+    | VerdictBox
+    | Contents
+    | Tiles
+    | Items
+    | Picture
+    | Details
+    | Group
+    | Chart
+    | Plane
+    | Timeline
+)
 
 
 def html_page(title: str, blocks: Sequence[Block]) -> str:
     """Return a page that loads nothing from anywhere."""
-    return _template().render(title=title, blocks=blocks)
+    every = list(_all_blocks(blocks))
+    headings = [each for each in every if isinstance(each, Heading)]
+    anchors = {id(each): f'{_slug(each.text)}-{i}' for i, each in enumerate(headings, 1)}
+    found = PageData()
+    content: dict[str, dict[str, object]] = {'charts': {}, 'planes': {}}
+    for i, each in enumerate(every, 1):
+        if isinstance(each, Chart):
+            anchors[id(each)] = f'chart-{i}'
+            content['charts'][f'chart-{i}'] = found.chart(each)
+        elif isinstance(each, Plane):
+            anchors[id(each)] = f'plane-{i}'
+            content['planes'][f'plane-{i}'] = found.plane(each)
+    events = [event for each in every if isinstance(each, Timeline) for event in each.events]
+    data = {**content, 'columns': found.columns, 'events': events, 'packed': found.packed()}
+    drawn = any(content.values())
+    return _template().render(
+        title=title,
+        blocks=blocks,
+        headings=headings,
+        anchor=lambda block: anchors[id(block)],
+        files=page_file,
+        # A closing tag in a string would end the script.
+        data=json.dumps(finite(data), separators=(',', ':')).replace('<', '\\u003c')
+        if drawn
+        else '',
+    )
+
+
+def _all_blocks(blocks: Sequence[Block]) -> Iterator[Block]:
+    for block in blocks:
+        yield block
+        if isinstance(block, Details | Group):
+            yield from _all_blocks(block.blocks)
+
+
+def _slug(text: str) -> str:
+    return re.sub(r'[^a-z0-9]+', '-', text.lower()).strip('-')
 
 
 @cache
 def _template() -> jinja2.Template:
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    return jinja2.Environment(loader=loader, autoescape=True).get_template('report_page.html')
+    environment = jinja2.Environment(loader=loader, autoescape=True)
+    environment.globals['own'] = _own_file
+    return environment.get_template('report_page.html')
+
+
+@cache
+def _own_file(name: str) -> str:
+    return (Path(__file__).parent / name).read_text(encoding='utf-8')
 
 
 def progress_bar(

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 import math
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ from t3mpc_ros.evaluation.link_faults import (
 )
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.simulation.plant.disturbances import DisturbanceParameters
-from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
+from t3mpc_ros.simulation.plant.paper_plant import DisturbedPlant, PaperRobotParameters
 
 Array = NDArray[np.float64]
 
@@ -48,6 +48,8 @@ REFERENCE_DEVIATION = 3.0
 """Standard deviation of every signal of the reference, rad/s."""
 STATE_DEVIATIONS = (10.6, 2.22, 0.937, 22.2)
 """Standard deviations of the raw states of (85), measured at q = 0.98 over 10 000 s."""
+CROSSING = (0.5, 0.5)
+"""Time before and after a switch within which methods cross from one reference to the other, s."""
 LONGEST_DEAD_TIME = 0.06
 """Dead time up to which a reference is computed beyond the end of a run, s."""
 _ROBOT_SEEDS = 10_000  # robot seeds start here: no reference has one of them by accident
@@ -142,6 +144,27 @@ class SampledReference:
     """Whether this is the first sample of a new mode, shape (n + m,)"""
 
 
+class LoopPlant(Protocol):
+    """What a closed loop controls: wheels that obey torques (N m) or wheel speeds (rad/s)."""
+
+    @property
+    def wheels(self) -> tuple[float, float]:
+        """True wheel speeds chi, rad/s, right first; not finite when the plant has diverged."""
+        ...
+
+    def configure(self, parameters: PaperRobotParameters) -> None:
+        """Continue with other parameters of the robot."""
+        ...
+
+    def run(self, command: tuple[float, float], count: int) -> None:
+        """Integrate ``count`` steps under one command."""
+        ...
+
+    def measure(self, dt: float) -> tuple[float, float]:
+        """Return the measured wheel speeds, ``dt`` seconds after the last time."""
+        ...
+
+
 @dataclass(frozen=True)
 class Scenario:
     """One run without its method.
@@ -221,6 +244,10 @@ class Scenario:
                 **CASES[self.case].changes,
             }
         )
+
+    def plant(self) -> LoopPlant:
+        """Return the plant of a new run."""
+        return DisturbedPlant(self.robot())
 
     def changed_robot(self) -> PaperRobotParameters | None:
         """Return the true robot from :attr:`change_step` on; None if it does not change."""
@@ -314,6 +341,19 @@ def settled_rows(
             f'got {after:g} s, {before:g} s and {behind:g} s'
         )
     return counted
+
+
+def complete_rows(time: Array, switches: Array) -> NDArray[np.bool_]:
+    """Return which rows of a run come before a crossing that the run does not contain whole.
+
+    A method with preview leaves the old reference before a switch, to be sooner at the new one
+    after it. Where the run ends at the switch, only what this costs would count, and against the
+    methods without preview that stay where they are.
+    """
+    before, after = CROSSING
+    cut = switches[switches + after > time[-1]]
+    rows: NDArray[np.bool_] = time < (cut.min() - before if cut.size else math.inf)
+    return rows
 
 
 def switch_times(time: Array, modes: NDArray[np.int64]) -> Array:

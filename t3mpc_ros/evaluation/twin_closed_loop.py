@@ -29,6 +29,7 @@ from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, RobotCommand, RobotState, RobotStatus
 from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
 from t3mpc_ros.simulation.fault_injection import FaultSchedule
+from t3mpc_ros.simulation.plant.disturbances import MeasurementNoise
 
 Array = NDArray[np.float64]
 
@@ -49,12 +50,9 @@ def chaotic_course(duration: float, seed: int = 1) -> Array:
     return scenario.reference().speeds
 
 
-def straight_course(duration: float, speed: float = 0.2, turn: float = 0.0) -> Array:
-    """Return wheel speeds (rad/s) of a drive at ``speed`` (m/s), shape (n, 2).
-
-    It is straight, or an arc with ``turn`` rad/s.
-    """
-    wheels = wheels_from_twist(BodyTwist(speed, turn), WheelGeometry())
+def straight_course(duration: float, turn: float = 0.0) -> Array:
+    """Return wheel speeds (rad/s) at 0.2 m/s straight ahead or turning (rad/s), shape (n, 2)."""
+    wheels = wheels_from_twist(BodyTwist(0.2, turn), WheelGeometry())
     return np.tile(wheels, (round((duration + LEAD) * RATE) + 1, 1))
 
 
@@ -177,6 +175,7 @@ def drive_twin(
     schedule: FaultSchedule | None = None,
     pauses: Sequence[tuple[float, float]] = (),
     links: LinkFaults = NO_FAULTS,
+    speed_noise: MeasurementNoise | None = None,
 ) -> TwinRecord:
     """Return the record of any controller driving the twin.
 
@@ -198,6 +197,8 @@ def drive_twin(
         Times at which a person disables and re-enables the controller, s.
     links
         Faults of the reports on their way to the controller, with the seed of the robot.
+    speed_noise
+        Noise of the wheel speeds in place of the white one of the robot's parameters.
     """
     if robot_parameters.drive.kind != 'stepper':
         raise ParameterError(f'drive.kind must be stepper: got {robot_parameters.drive.kind}')
@@ -208,7 +209,7 @@ def drive_twin(
             f'course must have the shape (at least {count + lead}, 2): got {course.shape}'
         )
     geometry = robot_parameters.geometry
-    robot = DigitalTwin(robot_parameters, schedule)
+    robot = DigitalTwin(robot_parameters, schedule, speed_noise)
     reports: OrderedLink[State] = OrderedLink()
     generator = np.random.default_rng((robot_parameters.seed, 3))
     faults_begin, faults_end = links.span(duration)

@@ -10,7 +10,7 @@ import sqlite3
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores, get_typestore
 from support.bag_messages import (
     START,
@@ -20,14 +20,15 @@ from support.bag_messages import (
     odometry_message,
     twist_message,
 )
-from support.unrendered import RENDERED, unrendered  # noqa: F401 - a fixture
+from support.robot_bags import following_rows, write
 import yaml
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.bag import main as bag_main
 from t3mpc_ros.cli.main import main as t3mpc
-from t3mpc_ros.evaluation import plotting
+from t3mpc_ros.evaluation.bag_report.continuity import continuity_notes, parts
 from t3mpc_ros.evaluation.bag_report.link_history import link_metrics
+from t3mpc_ros.evaluation.bag_report.report_charts import SECTIONS
 from t3mpc_ros.evaluation.bag_report.report_page import write_report
 from t3mpc_ros.evaluation.bag_report.response import (
     fit_response,
@@ -40,9 +41,7 @@ from t3mpc_ros.evaluation.bag_report.run_data import (
     BY_BODY,
     BY_WHEEL,
     Series,
-    continuity_notes,
     load_run,
-    parts,
 )
 from t3mpc_ros.evaluation.bag_report.topic_roles import (
     COMMAND,
@@ -51,9 +50,6 @@ from t3mpc_ros.evaluation.bag_report.topic_roles import (
     ReportError,
     ReportOptions,
 )
-from t3mpc_ros.evaluation.plotting import every_nth
-
-pytestmark = pytest.mark.usefixtures('unrendered')
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 ODOM, TWIST = 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/Twist'
@@ -104,20 +100,6 @@ def rows_of(names=('/odom', '/cmd_vel'), stamped=False, space='', **given):
             message = TYPES[STAMPED](header(START + round(t * 1e9), 'base_link'), message)
         rows.append((t, space + names[1], message))
     return sorted(rows, key=lambda row: row[0])
-
-
-def write(folder, rows, plugin=StoragePlugin.MCAP):
-    writer = Writer(folder, version=8, storage_plugin=plugin)
-    writer.open()
-    connections = {}
-    for received, topic, message in rows:
-        kind = message.__msgtype__
-        if topic not in connections:
-            connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
-        data = STORE.serialize_cdr(message, kind)
-        writer.write(connections[topic], START + round(received * 1e9), data)
-    writer.close()
-    return folder
 
 
 def humble(folder, rows):
@@ -190,6 +172,12 @@ def run_of(folder, wanted=None):
         return load_run(recording, wanted)
 
 
+def titles_of(page):
+    """Return the names of the sections with charts."""
+    found = re.findall(r'<h2[^>]*>([^<]*)</h2>\n<div class="charts">', page)
+    return {section.draw.__name__ for section in SECTIONS if section.title in found}
+
+
 def text_of(folder, capsys, *options):
     """Return what the program prints and the page says."""
     assert bag_main(['report', str(folder), '--output', str(folder.parent / 'out'), *options]) == 0
@@ -216,22 +204,20 @@ def test_a_bag_of_another_robot_has_a_report(rows, tmp_path, capsys, kind):
     said, page = text_of(folder, capsys)
     assert 'RMSE forward/turning while driven not measured' in said
     assert re.search(r'responds after forward (29|30|31)\d ms, turning (29|30|31)\d ms;', said)
-    found = {path.stem for path in (tmp_path / 'out' / 'figures').iterdir()}
-    assert found == {'control', 'response', 'acceleration', 'path', 'timing'}
+    assert titles_of(page) == {'control', 'response', 'acceleration', 'path', 'timing'}
     assert 'holds no wheel' in page
     assert 'Not in the bag, or without a message: reference.' in page
     assert 'controller/' not in page
-    assert 'wheel' not in page.split('<h2>From command')[1].split('<figure>')[0]
+    assert 'wheel' not in page.split('>From command to motion</h2>')[1].split('<figure')[0]
 
 
-def test_one_file_is_a_bag_too(rows, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(plotting, 'png_of', RENDERED)
+def test_one_file_is_a_bag_too(rows, tmp_path, capsys):
     folder = write(tmp_path / 'bag', rows[:300])
     (file,) = folder.glob('*.mcap')
     assert bag_main(['report', str(file), '--output', str(tmp_path / 'out')]) == 0
     printed = capsys.readouterr()
     assert 'out/report.html' in printed.out
-    assert 'drawing its figures' in printed.err, 'the wait of some seconds is named'
+    assert 'reading the bag' in printed.err, 'the wait of some seconds is named'
 
 
 def test_dead_time_lag_and_gain_of_the_robot_are_found(rows, tmp_path):
@@ -309,9 +295,7 @@ def test_a_reference_may_be_named(rows, tmp_path, capsys):
     folder = write(tmp_path / 'bag', sorted([*rows, *wanted], key=lambda row: row[0]))
     said, page = text_of(folder, capsys, '--cmd-vel', '/cmd_vel', '--reference', '/plan/twist')
     assert 'forward/turning while driven 0.' in said
-    assert {'tracking.png', 'error.png', 'portrait.png'} <= {
-        path.name for path in (tmp_path / 'out' / 'figures').iterdir()
-    }
+    assert {'tracking', 'error', 'portrait'} <= titles_of(page)
     run = run_of(folder, ReportOptions(reference='/plan/twist'))
     np.testing.assert_allclose(
         run.motions[REFERENCE]['linear'], run.motions[COMMAND]['linear'], atol=1e-12
@@ -529,19 +513,12 @@ def test_the_link_s_figures_come_from_its_diagnostics(rows, tmp_path, capsys):
     np.testing.assert_allclose(np.delete(share, [0, 25]), 0.94)
     printed, page = text_of(folder, capsys)
     assert 'radio_bridge: 94.0 % of cycles answered' in printed
-    assert '<h2>Radio link</h2>' in page
-    assert (tmp_path / 'out' / 'figures' / 'link.png').is_file()
+    assert '>Radio link</h2>' in page
+    assert 'link' in titles_of(page)
+    assert 'Least share of a report: 94.0 %.' in page
 
 
 # -- long runs ----------------------------------------------------------------------------------
-
-
-def test_lines_in_the_plane_are_drawn_from_few_points():
-    values = np.arange(1_000_001.0)
-    few = every_nth(values)
-    assert few.size <= 20_000
-    assert few[0] == 0.0
-    assert every_nth(values[:100]).size == 100
 
 
 def test_the_fit_of_a_long_run_is_made_on_its_liveliest_part():
@@ -562,3 +539,55 @@ def test_the_fit_of_a_long_run_is_made_on_its_liveliest_part():
 
 def test_nothing_to_report_is_an_error_of_its_own():
     assert issubclass(ReportError, RuntimeError)
+
+
+# -- several runs -------------------------------------------------------------------------------
+
+
+def uneven(t):
+    """Return an error whose mean square over a run is nearly 0.02² m²/s², in blocks of 5 s."""
+    return 0.032 if 6.0 < t < 11.0 else 0.01
+
+
+@pytest.mark.parametrize(
+    ('offset', 'verdict', 'words'),
+    [
+        (0.03, 'Larger settled error', 'mean squared error +0.408 ± '),
+        (0.01, 'Smaller settled error', 'mean squared error -0.245 ± '),
+        (uneven, 'Inconclusive', 'inconclusive'),
+    ],
+)
+def test_runs_are_compared_with_the_first(offset, verdict, words, tmp_path, capsys):
+    """A verdict needs a difference beyond what the run itself varies by."""
+    folders = [
+        write(tmp_path / 'one', following_rows()),
+        write(tmp_path / 'two', following_rows(offset=offset)),
+    ]
+    text = [*map(str, folders), '--output', str(tmp_path / 'out')]
+    assert bag_main(['report', *text]) == 0
+    printed = capsys.readouterr().out
+    assert f'B, two against A, one: {verdict}: right wheel: ' in printed
+    assert words in printed
+    page = (tmp_path / 'out' / 'comparison.html').read_text(encoding='utf-8')
+    assert page.index(verdict) < page.index('Good run') < page.index('RMSE settled')
+    shown = ['error', 'speeds', 'commands']
+    titles = [name for name in shown for _ in re.findall(f'<h3>{name.capitalize()}, ', page)]
+    assert titles == [name for name in shown for _ in range(2)]
+
+
+def test_runs_that_cannot_be_compared_get_no_verdict(rows, tmp_path, capsys):
+    drive = following_rows()
+    stopped = [
+        (t, topic, twist_message((0.0, 0.0)) if topic == '/cmd_vel' and 5 < t < 7 else message)
+        for t, topic, message in drive
+    ]
+    other_task = [(t + 3.0, *row) for t, *row in following_rows(duration=20.0) if t > 3.0]
+    made = {'one': drive, 'stopped': stopped, 'other': other_task, 'turtlebot': rows}
+    folders = [str(write(tmp_path / name, each)) for name, each in made.items()]
+    assert bag_main(['report', *folders, '--output', str(tmp_path / 'out')]) == 0
+    printed = capsys.readouterr().out
+    assert 'B, stopped against A, one: Not comparable: B, stopped: stopped once.' in printed
+    assert 'C, other against A, one: Not comparable: The references differ' in printed
+    assert 'D, turtlebot against A, one: Not comparable: D, turtlebot: data missing' in printed
+    assert bag_main(['report', *folders[:1] * 9, '--output', str(tmp_path / 'no')]) == 1
+    assert 'a comparison must have 2 to 6 bags: got 9' in capsys.readouterr().err

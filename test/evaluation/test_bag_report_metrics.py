@@ -5,7 +5,9 @@
 import base64
 from dataclasses import astuple, replace
 from html.parser import HTMLParser
+import json
 import re
+import zlib
 
 import numpy as np
 import pytest
@@ -20,17 +22,16 @@ from support.bag_messages import (
     twist_message,
 )
 from support.long_tests import few_of
-from support.unrendered import RENDERED, unrendered  # noqa: F401 - a fixture
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.control.controller import WHEELS
-from t3mpc_ros.evaluation import plotting
 from t3mpc_ros.evaluation.bag_report.metrics import (
     SETTLING,
     WINDOW,
     ReportMetrics,
+    compute_metrics,
     driven,
     driving,
     errors_of,
@@ -43,7 +44,7 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
     tracking_error,
     variation,
 )
-from t3mpc_ros.evaluation.bag_report.report_figures import REPORT_FIGURES
+from t3mpc_ros.evaluation.bag_report.report_charts import SECTIONS
 from t3mpc_ros.evaluation.bag_report.report_page import write_report
 from t3mpc_ros.evaluation.bag_report.run_data import Series, load_run
 from t3mpc_ros.evaluation.bag_report.topic_roles import (
@@ -55,11 +56,9 @@ from t3mpc_ros.evaluation.bag_report.topic_roles import (
     ReportOptions,
     find_topics,
 )
-from t3mpc_ros.evaluation.plotting import thinned
+from t3mpc_ros.evaluation.charts import MAX_POINTS, PageData, thinned
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, twist_from_wheels
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, Pose, WheelSpeeds
-
-pytestmark = pytest.mark.usefixtures('unrendered')  # but for the report of the module
 
 GEOMETRY = WheelGeometry(wheel_radius=0.04, wheel_separation=0.16)
 LEAD = 0.2
@@ -257,26 +256,33 @@ class Page(HTMLParser):
 
     def __init__(self, text):
         super().__init__()
-        self.stack, self.images, self.texts, self.external = [], [], [], []
+        self.stack, self.charts, self.texts, self.external = [], [], [], []
         self.feed(text)
 
     def handle_starttag(self, tag, attrs):
         attrs = dict(attrs)
-        if tag not in ('meta', 'img'):
+        if tag != 'meta':
             self.stack.append(tag)
-        if tag == 'img':
-            assert attrs['alt']
-            self.images.append(attrs['src'])
+        if 'chart' in attrs.get('class', '').split():
+            self.charts.append(attrs['id'])
         self.external += [attrs[key] for key in ('href', 'src') if key in attrs]
 
     def handle_endtag(self, tag):
         assert self.stack.pop() == tag
 
     def handle_data(self, data):
-        self.texts.append(data)
+        if self.stack[-1:] not in (['script'], ['style']):
+            self.texts.append(data)
 
     def text(self):
         return ' '.join(' '.join(self.texts).split())
+
+
+def sections_of(figures):
+    """Return the names of the sections with charts."""
+    page = figures.report.read_text(encoding='utf-8')
+    found = re.findall(r'<h2[^>]*>([^<]*)</h2>\n<div class="charts">', page)
+    return [section.draw.__name__ for section in SECTIONS if section.title in found]
 
 
 def page_of(figures):
@@ -476,8 +482,33 @@ def test_a_stopped_robot_gives_no_valid_measurement(rows, report, tmp_path):
     assert not figures.verdict.sound
     assert figures.verdict.stopped == pytest.approx(3.0, abs=0.03)
     page = page_of(figures).text()
-    assert 'NO VALID MEASUREMENT: the robot was stopped for 3.0 of' in page
-    assert page.index('NO VALID') < page.index('RMSE')
+    assert 'NO VALID MEASUREMENT: the robot was stopped for 3.0 of' in figures.verdict.text()
+    assert 'Stopped once The robot was stopped for 3.0 of' in page
+    assert page.index('Stopped once') < page.index('RMSE')
+    assert 'At 5.7 s for 3.00 s: the bag holds no diagnostics of that time.' in page
+
+
+def test_a_path_is_judged_by_the_distance_from_it(run):
+    """A patrol leaves its path at obstacles: its speeds had *no valid measurement*."""
+    pose = run.motions[run.measured]
+    reference = replace(pose, values={**pose.values, 'x': pose['x'] + 0.02})
+    beside = {**run.motions, REFERENCE: reference}
+    followed = replace(run, motions=beside, follows_path=True)
+    verdict = compute_metrics(followed, None, 0).verdict
+    assert verdict.sound
+    assert verdict.on_path == 1.0
+    assert (verdict.headline, verdict.kind) == ('Good run', 'good')
+    detour = pose.time > np.quantile(pose.time, 0.4)
+    wide = replace(pose, values={**pose.values, 'x': pose['x'] + np.where(detour, 0.3, 0.02)})
+    half = replace(followed, motions={**run.motions, REFERENCE: wide})
+    verdict = compute_metrics(half, None, 0).verdict
+    assert verdict.sound
+    assert 0.3 < verdict.on_path < 0.5
+    assert (verdict.headline, verdict.kind) == ('Mostly off its path', 'open')
+    assert 'within 50 mm of it, for' in verdict.text()
+    away = replace(pose, values={**pose.values, 'x': pose['x'] + 0.3})
+    lost = replace(followed, motions={**run.motions, REFERENCE: away})
+    assert 'for only 0 % of the drive' in compute_metrics(lost, None, 0).verdict.text()
 
 
 @pytest.mark.parametrize('command', [True, False])
@@ -564,7 +595,7 @@ def test_where_nothing_is_left_to_count_no_number_is_given(rows, tmp_path, why):
             assert np.isnan(part.rmse)
     text = page_of(figures).text()
     assert 'RMSE right/left while driven not measured, settled not measured;' in figures.summary()
-    assert text.count('not measured') == 2 + 3 * 8  # two tiles; three cells of eight rows
+    assert text.count('not measured') == 2 + 3 * 8 + 4  # tiles, cells of eight rows, four charts
     assert ('Every command was zero' in text) == idle
 
 
@@ -583,8 +614,7 @@ def test_a_foreign_bag_with_odometry_and_commands_has_a_report(rows, tmp_path):
     sheet.rows = [row for row in sheet.rows if row[1] in ('/odom', '/cmd_vel')]
     sheet.topics = {name: sheet.topics[name] for name in ('/odom', '/cmd_vel')}
     figures = write_report(sheet.write(tmp_path / 'bag'))
-    stems = {'control', 'response', 'acceleration', 'path', 'timing'}
-    assert {path.stem for path in figures.pictures} == stems
+    assert set(sections_of(figures)) == {'control', 'response', 'acceleration', 'path', 'timing'}
     assert 'RMSE right/left while driven not measured' in figures.summary()
     text = page_of(figures).text()
     assert 'The bag lacks a reference, or odometry to compare with it.' in text
@@ -596,9 +626,27 @@ def test_a_long_line_keeps_its_extremes():
     time, value = np.arange(1e5), generator.normal(size=100_000)
     value[12_345], value[500:800] = 99.0, np.nan
     few, thin = thinned(time, value)
-    assert few.size <= 6000
+    assert few.size <= MAX_POINTS
     assert np.nanmax(thin) == 99.0
     assert np.nanmin(thin) == np.nanmin(value)
+
+
+def test_a_page_contains_the_data_that_it_shows():
+    """Unpacked as its script does it: times within 5 µs also after a month, values to 3e-5."""
+    generator = np.random.default_rng(4)
+    month = 30 * 86_400.0
+    time = np.cumsum(generator.uniform(0.005, 0.02, 1000)) + np.repeat([0.0, month], 500)
+    value = generator.normal(size=1000) * 10.0 ** generator.uniform(-6.0, 9.0, 1000)
+    value[7] = np.nan
+    data = PageData()
+    assert [data.add('t', time), data.add('f', value), data.add('t', time)] == [0, 1, 0]
+    assert data.columns == [('t', 1000), ('f', 1000)]
+    content = np.frombuffer(zlib.decompress(base64.b64decode(data.packed())), np.uint8)
+    steps = content[:8000].reshape(8, 1000).T.copy().view('<f8')[:, 0]
+    np.testing.assert_allclose(np.cumsum(steps) * 1e-5, time, rtol=0.0, atol=5.1e-6)
+    values = content[8000:].reshape(4, 1000).T.copy().view('<f4')[:, 0]
+    assert np.isnan(values[7])
+    np.testing.assert_allclose(np.delete(values, 7), np.delete(value, 7), rtol=3.1e-5)
 
 
 # -- names and clocks ---------------------------------------------------------------------------
@@ -649,7 +697,7 @@ def test_simulated_time_gives_the_same_report(rows, report, tmp_path):
         assert one.count - 4 <= other.count <= one.count
         assert other.rmse == pytest.approx(one.rmse, rel=5e-3)
     assert 'another clock' in page_of(figures).text()
-    assert len(figures.pictures) == len(REPORT_FIGURES)
+    assert len(sections_of(figures)) == len(SECTIONS)
 
 
 def test_a_stamped_command_is_read_too(rows, tmp_path):
@@ -702,21 +750,19 @@ def test_the_robot_s_own_word_on_its_wheels_comes_first(rows, tmp_path):
 
 def test_the_page_is_whole_and_needs_nothing_from_outside(report):
     page = page_of(report)
-    assert len(page.images) == len(report.pictures) == len(REPORT_FIGURES)
-    assert page.external == page.images
-    for source, path in zip(page.images, report.pictures, strict=True):
-        kind, data = source.split(',')
-        assert kind == 'data:image/png;base64'
-        assert base64.b64decode(data) == path.read_bytes()
-        assert path.read_bytes().startswith(b'\x89PNG')
+    assert len(sections_of(report)) == len(SECTIONS)
     text = report.report.read_text()
+    data = json.loads(re.search(r'id="data">(.*?)</script>', text)[1])
+    assert {*data['charts'], *data['planes']} == set(page.charts)
+    assert {each for each in page.external if not each.startswith('#')} == set()
     assert 'width=device-width' in text
-    assert not re.search(r'url\(|@import|https?:', text)
+    assert not re.search(r'url\(|@import|https?:', text.partition('<script>')[0])
+    assert not re.search(r'fetch\(|XMLHttp|import\(|WebSocket|EventSource', text)
 
 
 def test_words_from_the_bag_cannot_become_markup(report):
     text = report.report.read_text()
-    assert '<script' not in text
+    assert '<script>alert' not in text
     assert '&lt;script&gt;alert(1)&lt;/script&gt;' in text
     assert 'late &lt;b&gt;&amp; later&lt;/b&gt;' in text
 
@@ -742,7 +788,7 @@ def test_the_report_goes_beside_the_bag_unless_told_otherwise(tmp_path):
     bag = sheet.write(tmp_path / 'bag')
     figures = write_report(bag)
     assert figures.report == tmp_path / 'report.html'
-    assert figures.pictures == (tmp_path / 'figures' / 'switching.png',)
+    assert sections_of(figures) == ['switching']
     other = write_report(str(bag), str(tmp_path / 'deep' / 'er'))
     assert other.report == tmp_path / 'deep' / 'er' / 'report.html'
     assert other.report.is_file()
@@ -753,9 +799,8 @@ def test_the_report_goes_beside_the_bag_unless_told_otherwise(tmp_path):
 
 def test_an_absent_topic_leaves_out_its_figures_and_is_named(rows, tmp_path):
     figures = write_report(sheet_of(rows[:300], announce='', terms=False).write(tmp_path / 'bag'))
-    stems = {path.stem for path in figures.pictures}
     own = {'tracking', 'error', 'control', 'portrait', 'path', 'timing'}
-    assert stems == {*own, 'response', 'acceleration'}
+    assert set(sections_of(figures)) == {*own, 'response', 'acceleration'}
     assert 'controller/estimate/right' in figures.absent
     text = page_of(figures).text()
     assert 'Not in the bag, or without a message: reference/signals, controller/' in text
@@ -788,9 +833,8 @@ def test_an_empty_topic_counts_as_absent(rows, tmp_path):
 
 
 @pytest.mark.parametrize('count', few_of([2, 1, 3]))
-def test_a_handful_of_messages_does_no_harm(rows, tmp_path, monkeypatch, count):
+def test_a_handful_of_messages_does_no_harm(rows, tmp_path, count):
     """Every series has ``count`` samples: no line, no median, no percentile may need more."""
-    monkeypatch.setattr(plotting, 'png_of', RENDERED)
     sheet = sheet_of(rows[:20])
     seen = dict.fromkeys(sheet.topics, 0)
     few = []
@@ -830,7 +874,7 @@ def test_only_nonsense_is_reported_as_nothing(rows, tmp_path):
         if topic in ('/odom', '/ground_truth/odom', '/reference'):
             message.twist.twist.angular.z = float('nan')
     figures = write_report(sheet.write(tmp_path / 'bag'))
-    assert [path.stem for path in figures.pictures] == ['switching', 'control']
+    assert sections_of(figures) == ['control', 'switching']
     page_of(figures)
 
 

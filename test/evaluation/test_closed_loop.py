@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The closed loop at kernel speed: same physics, same runs, honest cases and statistics."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 import math
 from operator import methodcaller
@@ -44,7 +44,7 @@ from t3mpc_ros.simulation.plant.paper_plant import DisturbedPlant, PaperRobot, P
 
 @dataclass(frozen=True)
 class ProportionalParameters(Parameters):
-    gain: float = parameter(8.0, 'feedback gain', unit='1/s')
+    gain: float = parameter(8.0, 'feedback gain', '1/s')
     broken_from: int = parameter(-1, 'step from which the answer is not a number')
     fails: bool = parameter(False, 'whether it raises an exception')
 
@@ -580,9 +580,8 @@ def test_many_runs_are_the_same_in_one_process_and_in_two():
 
 
 def test_rmse_leaves_out_the_start_and_what_follows_a_switch():
-    record = LoopRecord.empty(10)
+    record = replace(LoopRecord.empty(10), switches=np.array([6.0]))
     record.time[:] = np.arange(10.0)
-    record.modes[6:] = 1
     record.speeds[:, 0] = [9, 9, 9, 1, 1, 1, 7, 7, 1, 1]
     record.reference[:, 1] = [9, 9, 9, 1, 1, 1, 7, 7, 1, 1]
     assert record.rmse(cut=2.0) == 1.0
@@ -591,6 +590,18 @@ def test_rmse_leaves_out_the_start_and_what_follows_a_switch():
     assert record.largest_error(0.0) == 9.0
     with pytest.raises(ValueError, match='must leave rows of a run that ends at 9 s: got 20 s'):
         record.rmse(20.0)
+
+
+@pytest.mark.parametrize('switch', [8.9, 9.1, 9.5, 9.8])
+def test_a_crossing_counts_whole_or_not_at_all(switch):
+    """A run of 60 s ended at the switch at 60 s, and preview paid for the half before it."""
+    record = replace(LoopRecord.empty(96), switches=np.array([5.0, switch]))
+    record.time[:] = np.arange(96) / 10.0
+    record.speeds[:] = 1.0
+    record.speeds[record.time > switch - 0.5] = 100.0
+    counted = 1.0 if switch + 0.5 > 9.5 else 100.0
+    assert record.largest_error(3.0) == counted
+    assert (record.rmse() == 1.0) == (counted == 1.0)
 
 
 def test_chatter_is_effort_variation_per_second_and_wheel():

@@ -152,7 +152,7 @@ def test_the_loop_stays_bounded_or_stops_with_a_reason(name):
 
 
 def test_every_fault_is_among_those_expected():
-    assert [name.split()[0] for name in EXPECTED] == [fault.name for fault in FAULTS]
+    assert [name.split()[0] for name in EXPECTED] == list(FAULTS)
 
 
 @pytest.mark.parametrize(
@@ -180,7 +180,7 @@ def test_undetected_faults_are_named(course, name):
 def test_the_page_has_a_row_for_every_trial_and_no_other():
     assert list(page_rows()) == [(one.course, one.name) for one in FAULT_RUNS]
     names = {name.split()[0] for _, name in page_rows()}
-    assert names >= {fault.name for fault in FAULTS}
+    assert names >= {*FAULTS}
     assert page_section([]).partition('\n###')[0].split(END_MARK)[0].strip() in PAGE.read_text()
 
 
@@ -277,7 +277,9 @@ def two(monkeypatch):
 def test_command_writes_the_table_between_the_marks(two, tmp_path, capsys):
     page, numbers = tmp_path / 'page.md', tmp_path / 'numbers.json'
     page.write_text(f'before\n{BEGIN_MARK}\nold\n{END_MARK}\nafter\n')
-    assert main(['faults', '--output', str(page), '--json', str(numbers)]) == 0
+    html = tmp_path / 'faults.html'
+    files = ['--output', str(page), '--json', str(numbers), '--html', str(html)]
+    assert main(['faults', *files]) == 0
     shown = capsys.readouterr()
     assert 'gyro_dead' in shown.out
     assert '2/2 [' in shown.err
@@ -286,6 +288,9 @@ def test_command_writes_the_table_between_the_marks(two, tmp_path, capsys):
     assert text.endswith(f'{END_MARK}\nafter\n')
     assert 'old' not in text
     assert text.count('| `gyro_dead` |') == 2
+    shown = html.read_text(encoding='utf-8')
+    assert shown.index('Every fault stays bounded') < shown.index('<img') < shown.index('<nav')
+    assert shown.count('<td class="text">gyro_dead</td>') == 2
     assert [one['course'] for one in json.loads(numbers.read_text())] == ['chaotic', 'straight']
 
 

@@ -9,8 +9,8 @@ import re
 import numpy as np
 import pytest
 
-from t3mpc_ros.cli.compare import ROBOTS, seed_range
 from t3mpc_ros.cli.main import main
+from t3mpc_ros.cli.run_options import ROBOTS, seed_range
 from t3mpc_ros.control.controller import Controller
 from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
 from t3mpc_ros.evaluation.baselines.feed_forward import FeedForward, FeedForwardParameters
@@ -382,6 +382,7 @@ def test_the_command_writes_tables_json_and_page(tmp_path, capsys):
     assert re.search(rf'\| {re.escape(PI)} \| {mean:.4f} ', text.out)
     page = files[1].read_text()
     assert page.count('<img ') == 2
+    assert page.index('<img ') < page.index('<nav') < page.index('<table')
     assert 'http' not in page.replace('http-equiv', '')
     assert 'What each method knows' in page
 

@@ -103,7 +103,7 @@ def fake_run(scenario, method):
     """Return a record whose error is white, of the size the settings say, plus the noise."""
     generator = np.random.default_rng((scenario.seed, len(scenario.case)))
     n = round(100 * scenario.duration)
-    run = LoopRecord.empty(n)
+    run = replace(LoopRecord.empty(n), switches=np.arange(12.0, scenario.duration, 12.0))
     time = run.time
     time[:] = np.arange(n) / 100.0
     modes = np.minimum(time // 12.0, 4.0)
@@ -807,12 +807,14 @@ def test_the_page_is_self_contained_and_shows_everything(folder):
     text = (folder / 'paper.html').read_text()
     page = Loads()
     page.feed(text)
-    assert all(value.startswith('data:image/png;base64,') for value in page.found)
+    inside = ('data:image/png;base64,', '#')
+    assert all(value.startswith(inside) for value in page.found)
     assert not {'script', 'link', 'iframe'} & set(page.tags)
     assert 'url(' not in text
     assert '@import' not in text
     assert page.tags.count('img') == sum(exhibit.draw is not None for exhibit in EXHIBITS)
     assert page.tags.count('section') == len(EXHIBITS)
+    assert page.tags.index('img') < page.tags.index('nav') < page.tags.index('details')
     for mark in ('held', 'not held', 'inconclusive', 'not measured', 'not comparable'):
         assert f'">{mark}</span>' in text
     for claim in json.loads((folder / 'results.json').read_text())['claims']:

@@ -208,10 +208,14 @@ def test_equal_recipes_give_equal_bags(tmp_path):
 
 def test_a_file_that_breaks_off_in_its_summary_is_refused(bag, tmp_path):
     whole = bag.read_bytes()
-    for name, content in {'end': whole[:-1], 'magic': b'x' + whole[1:], 'short': b''}.items():
+    for name, content, words in (
+        ('end', whole[:-1], 'incomplete: end.mcap'),
+        ('magic', b'x' + whole[1:], 'incomplete: magic.mcap'),
+        ('short', b'', 'short.mcap is empty'),
+    ):
         copy = tmp_path / f'{name}.mcap'
         copy.write_bytes(content)
-        with pytest.raises(BagError, match=f'incomplete: {name}.mcap'):
+        with pytest.raises(BagError, match=words):
             open_bag(copy)
 
 

@@ -48,25 +48,25 @@ from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parame
 
 @dataclass(frozen=True)
 class Inner(Parameters):
-    weight: float = parameter(1.0, 'weight', unit='s', low=1e-6, high=1e6)
+    weight: float = parameter(1.0, 'weight', 's', (1e-6, 1e6))
 
 
 @dataclass(frozen=True)
 class Gains(Parameters):
     """Settings of every kind, for searches of every size."""
 
-    a: float = parameter(2.0, 'a', unit='1/s', low=0.0, high=1e3)
-    b: float = parameter(2.0, 'b', low=-5.0, high=1e3)
-    c: float = parameter(2.0, 'c', low=0.0, high=1e3)
-    d: float = parameter(2.0, 'd', low=0.0, high=1e3)
-    e: float = parameter(2.0, 'e', low=0.0, high=1e3)
-    f: float = parameter(2.0, 'f', low=0.0, high=1e3)
-    g: float = parameter(2.0, 'g', low=0.0, high=1e3)
-    h: float = parameter(2.0, 'h', low=0.0, high=1e3)
-    count: int = parameter(10, 'count', low=1, high=40)
+    a: float = parameter(2.0, 'a', '1/s', (0.0, 1e3))
+    b: float = parameter(2.0, 'b', bounds=(-5.0, 1e3))
+    c: float = parameter(2.0, 'c', bounds=(0.0, 1e3))
+    d: float = parameter(2.0, 'd', bounds=(0.0, 1e3))
+    e: float = parameter(2.0, 'e', bounds=(0.0, 1e3))
+    f: float = parameter(2.0, 'f', bounds=(0.0, 1e3))
+    g: float = parameter(2.0, 'g', bounds=(0.0, 1e3))
+    h: float = parameter(2.0, 'h', bounds=(0.0, 1e3))
+    count: int = parameter(10, 'count', bounds=(1, 40))
     on: bool = parameter(True, 'on')
     kind: str = parameter('x', 'kind', choices=('x', 'y'))
-    levels: tuple[float, ...] = parameter((0.1, 0.2), 'levels', low=0.0)
+    levels: tuple[float, ...] = parameter((0.1, 0.2), 'levels', bounds=(0.0, None))
     inner: Inner = group(Inner)
 
     def check_consistency(self) -> None:
@@ -505,8 +505,8 @@ def test_mean_objective_is_independent_of_run_order():
 
 @dataclass(frozen=True)
 class FeedbackParameters(Parameters):
-    gain: float = parameter(5.0, 'gain', unit='1/s', low=0.0, high=1e3)
-    fault: float = parameter(0.0, 'above 0 it fails', low=0.0, high=1.0)
+    gain: float = parameter(5.0, 'gain', '1/s', (0.0, 1e3))
+    fault: float = parameter(0.0, 'above 0 it fails', bounds=(0.0, 1.0))
 
 
 class Feedback(BaselineController):
@@ -581,8 +581,8 @@ def lag_plant(method, drive, candidates):
 
 @dataclass(frozen=True)
 class PlantParameters(FeedbackParameters):
-    other: float = parameter(1.0, 'no effect', low=0.1, high=10.0)
-    third: float = parameter(1.0, 'no effect', low=0.1, high=10.0)
+    other: float = parameter(1.0, 'no effect', bounds=(0.1, 10.0))
+    third: float = parameter(1.0, 'no effect', bounds=(0.1, 10.0))
 
 
 class Wider(Feedback):

@@ -5,7 +5,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,18 @@ _LEVELS = {1: 'warning', 2: 'error', 3: 'stale'}
 
 DiagnosticEvent = tuple[float, str, str, str]
 """Time of the first message, level, node, text."""
+MAX_CHANGES = 1000
+"""Changes of the state of nodes that are kept."""
+
+
+class Diagnostics(NamedTuple):
+    """What the nodes reported about themselves."""
+
+    complaints: tuple[DiagnosticEvent, ...]
+    """Each distinct warning or error with its first time, in order."""
+    changes: tuple[DiagnosticEvent, ...]
+    """Each warning or error that follows another state of the same node, in order."""
+    links: 'tuple[LinkHistory, ...]'
 
 
 @dataclass(frozen=True)
@@ -119,14 +131,14 @@ def _over(measure: Callable[[Array], Any], values: Array) -> float:
     return float(measure(values)) if np.isfinite(values).any() else math.nan
 
 
-def read_diagnostics(
-    recording: BagReader, namespace: str
-) -> tuple[tuple[DiagnosticEvent, ...], tuple[LinkHistory, ...]]:
-    """Return each distinct warning or error with its first time, and all links of the bag.
+def read_diagnostics(recording: BagReader, namespace: str) -> Diagnostics:
+    """Return the warnings and errors of all nodes, and all links of the bag.
 
     ``/diagnostics`` is read for the whole bag, and below the namespace for that robot.
     """
     found: dict[tuple[str, str, str], float] = {}
+    changes: list[DiagnosticEvent] = []
+    state: dict[str, tuple[int, str]] = {}
     rows: dict[str, list[tuple[float, dict[str, float]]]] = {}
     for topic in sorted({'/diagnostics', f'{namespace}/diagnostics'} & set(recording.topics)):
         if not recording.topics[topic].type_name.endswith('DiagnosticArray'):
@@ -137,6 +149,9 @@ def read_diagnostics(
                 if level:
                     word = _LEVELS.get(level, str(level))
                     found.setdefault((word, status.name, status.message), received)
+                    if state.get(status.name) != (level, status.message):
+                        changes.append((received, word, status.name, status.message))
+                state[status.name] = level, status.message
                 if numbers := _numbers(status):
                     rows.setdefault(status.name, []).append((received, numbers))
     links = []
@@ -153,7 +168,11 @@ def read_diagnostics(
             )
         )
     complaints = sorted(found.items(), key=lambda item: item[1])
-    return tuple((when, *key) for key, when in complaints), tuple(links)
+    return Diagnostics(
+        tuple((when, *key) for key, when in complaints),
+        tuple(sorted(changes)[:MAX_CHANGES]),
+        tuple(links),
+    )
 
 
 def _numbers(status: Any) -> dict[str, float]:

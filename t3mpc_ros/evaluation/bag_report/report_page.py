@@ -3,12 +3,14 @@
 """HTML report of a recorded run."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 import math
 from pathlib import Path
 
 from t3mpc_ros.bag.reader import BagReader, open_bag
-from t3mpc_ros.bag.recording.message_losses import message_loss_notes
+from t3mpc_ros.bag.recording.message_losses import LOSS_CAUSES, LOSSES
+from t3mpc_ros.evaluation.bag_report.continuity import gaps, parts
 from t3mpc_ros.evaluation.bag_report.link_history import LinkMetrics
 from t3mpc_ros.evaluation.bag_report.metrics import (
     SETTLING,
@@ -22,31 +24,48 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
     format_number,
     preview_before_switch,
 )
-from t3mpc_ros.evaluation.bag_report.report_figures import PACKAGE_FIGURES, REPORT_FIGURES
-from t3mpc_ros.evaluation.bag_report.response import ResponseFit, motion_summary, roughness
+from t3mpc_ros.evaluation.bag_report.patrol_section import patrol_blocks
+from t3mpc_ros.evaluation.bag_report.report_charts import LABELS, SECTIONS
+from t3mpc_ros.evaluation.bag_report.response import (
+    ResponseFit,
+    motion_summary,
+    responses,
+    roughness,
+)
 from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, load_run
 from t3mpc_ros.evaluation.bag_report.topic_roles import (
     COMMAND,
     ODOMETRY,
     REFERENCE,
+    SCALARS,
     TRUTH,
     ReportOptions,
     bag_display_name,
 )
-from t3mpc_ros.evaluation.plotting import LABELS, write_pictures
+from t3mpc_ros.evaluation.bag_report.verdict import Verdict
+from t3mpc_ros.evaluation.charts import Timeline
 from t3mpc_ros.evaluation.reporting import (
     EMPTY_CELL,
     Block,
+    Contents,
     Details,
+    Group,
     Heading,
     Items,
     Paragraph,
-    Picture,
     Table,
     Tiles,
+    VerdictBox,
     html_page,
 )
 from t3mpc_ros.geometry.types import NANOSECONDS
+
+FIRST = ('tracking', 'error', 'path')
+"""Sections before the events and tables."""
+MAX_EVENTS = 300
+"""Events that a page lists."""
+MAX_SEGMENTS = 12
+"""Parts of a torn recording that are listed."""
 
 
 def response_table(run: Run, fits: Mapping[str, ResponseFit]) -> Table:
@@ -134,12 +153,12 @@ def _whole(value: float) -> str:
 def write_report(
     folder: Path | str, output: Path | str | None = None, wanted: ReportOptions | None = None
 ) -> ReportMetrics:
-    """Write ``report.html`` and its pictures, and return the summary metrics of a bag.
+    """Write ``report.html``, and return the summary metrics of a bag.
 
     Parameters
     ----------
     output
-        Folder of ``report.html`` and ``figures/*.png``; beside the bag by default.
+        Folder of ``report.html``; beside the bag by default.
     wanted
         Namespace, topics and wheel geometry; by default found in the bag.
 
@@ -154,29 +173,40 @@ def write_report(
     output = folder.parent if output is None else Path(output)
     with open_bag(folder) as recording:
         run = load_run(recording, wanted)
-        pictures = write_pictures(REPORT_FIGURES, run, output / 'figures')
-        paths = tuple(output / 'figures' / f'{stem}.png' for stem in pictures)
-        figures = compute_metrics(run, output / 'report.html', paths, recording.message_count)
-        page = _page(recording, run, figures, pictures)
+        figures = compute_metrics(run, output / 'report.html', recording.message_count)
+        page = _page(recording, run, figures)
+        output.mkdir(parents=True, exist_ok=True)
         figures.report.write_text(page, encoding='utf-8')
     return figures
 
 
-def _page(
-    recording: BagReader, run: Run, figures: ReportMetrics, pictures: Mapping[str, bytes]
-) -> str:
-    blocks: list[Block] = [Paragraph(_origin(recording, run), 'quiet')]
-    if verdict := figures.verdict:
-        blocks.append(Paragraph(verdict.text(), f'verdict {"yes" if verdict.sound else "no"}'))
+def _page(recording: BagReader, run: Run, figures: ReportMetrics) -> str:
+    blocks: list[Block] = [
+        Paragraph(_origin(recording, run), 'quiet'),
+        verdict_box(figures.verdict),
+    ]
+    if oddities := [*run.oddities, *_losses(recording)]:
+        blocks.append(Items([[each] for each in oddities], title='Unusual in this bag'))
     blocks.append(Tiles(_tiles(figures)))
-    if notes := _notes(recording, run):
-        blocks.append(Items([[note] for note in notes]))
+    if remarks := _remarks(run):
+        blocks.append(Items([[each] for each in remarks], 'side'))
+    blocks.append(Contents())
+    blocks += _sections(run, figures, first=True)
+    blocks += [Heading('Events'), _timeline(run, figures)]
     if run.ours or figures.measured:
         blocks += [Heading('Tracking error'), *_errors(run)]
-    blocks += [*_response(run, figures), *_pictures(run, pictures)]
+    blocks += _segments(run)
+    blocks += _response(run, figures)
+    blocks += _sections(run, figures, first=False)
+    blocks += patrol_blocks(run)
     blocks += [Heading('Timing by topic'), *_timing(run), *_complaints(run)]
     blocks += [Heading('Contents of the bag'), *_contents(recording)]
     return html_page(bag_display_name(recording.folder), blocks)
+
+
+def verdict_box(verdict: Verdict, subject: str = '') -> VerdictBox:
+    """Return the verdict as a page says it first."""
+    return VerdictBox(verdict.headline, verdict.reasons(), verdict.kind, subject)
 
 
 def _origin(recording: BagReader, run: Run) -> str:
@@ -216,7 +246,7 @@ def _tiles(figures: ReportMetrics) -> list[tuple[str, str]]:
                 f'RMSE settled, away from switches; {right.settled.seconds:.1f} s counted',
             ),
         ]
-    if figures.verdict is not None:
+    if figures.verdict.judged:
         stopped = f'{figures.verdict.stopped:.1f} s'
         tiles.append((stopped, 'stopped between the first and the last command to move'))
     fits = [figures.responses.get(each.name) for each in channels]
@@ -256,16 +286,93 @@ def _tiles(figures: ReportMetrics) -> list[tuple[str, str]]:
     return tiles
 
 
-def _notes(recording: BagReader, run: Run) -> list[str]:
-    notes = [*message_loss_notes(recording.metadata_records), *run.notes]
+def _losses(recording: BagReader) -> list[str]:
+    """Return a sentence for each cause of missing messages."""
+    found = []
+    record = recording.metadata_records.get(LOSSES, {})
+    for cause, text in LOSS_CAUSES.items():
+        topics = {
+            key.partition(' ')[2]: int(count)
+            for key, count in record.items()
+            if key.startswith(f'{cause} ') and count.isdecimal()
+        }
+        if topics:
+            most = max(topics, key=lambda name: topics[name])
+            also = (
+                f', of {len(topics)} topics, most of {most}' if len(topics) > 1 else f' of {most}'
+            )
+            found.append(f'{sum(topics.values())} messages{also} are missing: {text}.')
+    return found
+
+
+def _remarks(run: Run) -> list[str]:
+    """Return sentences on where the data come from."""
+    notes = list(run.remarks)
     if run.absent:
-        notes.append(f'Not in the bag, or without a message: {", ".join(run.absent)}.')
-    if recording.incomplete_files:
-        notes.append(f'Unfinished files, not read: {", ".join(recording.incomplete_files)}.')
-    if len(run.namespaces) > 1:
-        others = ', '.join(space or '/' for space in run.namespaces[1:])
-        notes.append(f'The bag also holds topics of {others}.')
+        scalars = [name for name in run.absent if name in SCALARS]
+        names = [name for name in run.absent if name not in SCALARS or len(scalars) < len(SCALARS)]
+        if len(names) < len(run.absent):
+            names.append(f'controller/* ({len(scalars)} topics)')
+        notes.append(f'Not in the bag, or without a message: {", ".join(names)}.')
     return notes
+
+
+def _timeline(run: Run, figures: ReportMetrics) -> Block:
+    events = _events(run, figures)
+    return Timeline(events) if events else Paragraph('No switch, no stop, no warning.', 'quiet')
+
+
+def _events(run: Run, figures: ReportMetrics) -> list[tuple[float, str, str]]:
+    """Return switches, stops, gaps and changes of the state of nodes, in order."""
+    found = [(time, 'switch', 'the reference switches') for time in run.switches.tolist()]
+    for stop in figures.verdict.stops:
+        why = f': {stop.reason}' if stop.reason else ''
+        found.append((stop.start, 'stop', f'for {stop.end - stop.start:.2f} s{why}'))
+    for name in (REFERENCE, ODOMETRY, TRUTH, COMMAND):
+        if name in run.motions:
+            found += [
+                (low, 'gap', f'no {name} for {high - low:.1f} s')
+                for low, high in gaps(run.motions[name].time)
+            ]
+    found += [
+        (time, 'note', f'{node}: {text} ({level})') for time, level, node, text in run.changes
+    ]
+    return sorted(found)[:MAX_EVENTS]
+
+
+def _segments(run: Run) -> list[Block]:
+    """Return the numbers of each part of a recording that has gaps, fitted by itself."""
+    names = [name for name in (run.measured, COMMAND, REFERENCE) if name in run.motions]
+    if not run.measured or not any(gaps(run.motions[name].time) for name in names):
+        return []
+    spans = parts(*(run.motions[name].time for name in names))
+    head = ['from / s', 'to / s', 'samples']
+    for channel in run.channels:
+        head += [
+            f'settled RMSE {channel.short} / {channel.unit}',
+            f'responds {channel.short} / ms',
+        ]
+    rows = []
+    for low, high in spans[:MAX_SEGMENTS]:
+        part = replace(
+            run,
+            motions={
+                name: motion.between(low, high)
+                for name, motion in run.motions.items()
+                if motion.between(low, high).time.size
+            },
+        )
+        errors, fits = errors_of(part, run.measured), responses(part)
+        row = [f'{low:.1f}', f'{high:.1f}', str(len(run.motions[run.measured].between(low, high)))]
+        for channel in run.channels:
+            fit = fits.get(channel.name)
+            late = f'{1e3 * (fit.dead_time + fit.lag):.0f}' if fit and fit.clear else EMPTY_CELL
+            row += [format_number(errors[channel.name][1].rmse), late]
+        rows.append(row)
+    blocks: list[Block] = [Heading('Parts between gaps'), Table('', head, rows, text=0)]
+    if len(spans) > MAX_SEGMENTS:
+        blocks.append(Paragraph(f'The first {MAX_SEGMENTS} of {len(spans)} parts.', 'quiet'))
+    return blocks
 
 
 def _errors(run: Run) -> list[Block]:
@@ -334,18 +441,20 @@ def _response(run: Run, figures: ReportMetrics) -> Iterator[Block]:
             yield table
 
 
-def _pictures(run: Run, pictures: Mapping[str, bytes]) -> Iterator[Block]:
-    for item in REPORT_FIGURES:
-        png = pictures.get(item.stem)
-        if png is None and item.stem in PACKAGE_FIGURES and not run.ours:
+def _sections(run: Run, figures: ReportMetrics, *, first: bool) -> Iterator[Block]:
+    """Yield the charts of the first sections, or of all others."""
+    for section in SECTIONS:
+        if (section.draw.__name__ in FIRST) != first:
+            continue
+        charts = list(section.draw(run, figures))
+        if not charts and (not section.needs or (section.ours and not run.ours)):
             continue  # only bags of this package hold them
-        if png is None and item.stem == 'link' and not run.links:
+        yield Heading(section.title)
+        if charts:
+            yield Group(charts, 'div', 'charts')
+            yield Paragraph(section.caption, 'quiet')
             continue
-        yield Heading(item.title)
-        if png is not None:
-            yield Picture(item.title, png, item.caption)
-            continue
-        lacking = ', '.join(name for name in item.needs if name in run.absent)
+        lacking = ', '.join(name for name in section.needs if name in run.absent)
         why = f'the bag lacks {lacking}' if lacking else 'there are too few messages'
         yield Paragraph(f'Left out: {why}.', 'quiet')
 

@@ -14,6 +14,11 @@ from t3mpc_ros.bag.columns import CDR_LAYOUTS, TopicColumns, read_columns
 from t3mpc_ros.bag.reader import BagReader, missing_sample_ratio
 from t3mpc_ros.bag.schema import DataError
 from t3mpc_ros.control.controller import WHEELS
+from t3mpc_ros.evaluation.bag_report.continuity import (
+    continuity_notes,
+    only_one_robot,
+    rate_notes,
+)
 from t3mpc_ros.evaluation.bag_report.link_history import (
     DiagnosticEvent,
     LinkHistory,
@@ -22,6 +27,7 @@ from t3mpc_ros.evaluation.bag_report.link_history import (
 from t3mpc_ros.evaluation.bag_report.topic_roles import (
     COMMAND,
     JOURNAL,
+    KINDS,
     NAMES,
     NUMBERS,
     ODOMETRY,
@@ -39,78 +45,6 @@ from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist
 from t3mpc_ros.parameters.table import ParameterError
 
 Array = NDArray[np.float64]
-
-MIN_GAP = 2.0
-"""Least time without a message that is a gap, s."""
-GAP_PERIODS = 20.0
-"""Least gap, in median intervals of the messages."""
-POSE_JUMP = 1.0
-"""Least displacement between two messages, m, beyond that by the speed, which is a jump."""
-SPEED_MARGIN = 3.0
-"""Displacement that counts as explained by the speed, in multiples of speed times interval."""
-_MAX_LISTED = 5
-
-
-def gaps(time: Array) -> list[tuple[float, float]]:
-    """Return start and end of each gap between sorted times, s."""
-    steps = np.diff(time)
-    if not steps.size:
-        return []
-    least = max(MIN_GAP, GAP_PERIODS * float(np.median(steps)))
-    return [(float(time[k]), float(time[k + 1])) for k in np.flatnonzero(steps > least).tolist()]
-
-
-def parts(*times: Array) -> list[tuple[float, float]]:
-    """Return start and end of each part in which none of the sorted series has a gap, s."""
-    start = max(float(time[0]) for time in times)
-    end = min(float(time[-1]) for time in times)
-    found = []
-    for low, high in sorted(gap for time in times for gap in gaps(time)):
-        if low > start:
-            found.append((start, min(low, end)))
-        start = max(start, high)
-    found.append((start, end))
-    return [(low, high) for low, high in found if high > low]
-
-
-def within_gaps(time: Array, series: Array) -> NDArray[np.bool_]:
-    """Return which of ``time`` lie in a gap of the sorted ``series``, shape (n,)."""
-    inside = np.zeros(time.size, dtype=np.bool_)
-    for low, high in gaps(series):
-        inside |= (time > low) & (time < high)
-    return inside
-
-
-def continuity_notes(
-    topic: str, received: Array, stamps: Array, positions: Array, speeds: Array
-) -> list[str]:
-    """Return sentences on gaps, jumps of the pose and disorder of an odometry topic.
-
-    Times (s), positions (m, shape (n, 2)) and forward speeds (m/s) are in the order of the bag.
-    """
-    notes = [
-        f'No message of {topic} for {high - low:.1f} s from {low:.1f} s on.'
-        for low, high in gaps(np.sort(received))
-    ]
-    away = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    fastest = np.maximum(np.abs(speeds[1:]), np.abs(speeds[:-1]))
-    explained = SPEED_MARGIN * fastest * np.abs(np.diff(stamps))
-    notes = _shortened(notes, 'gaps')
-    jumps = [
-        f'The position of {topic} jumps by {away[k]:.4g} m at {received[k + 1]:.1f} s.'
-        for k in np.flatnonzero(away > POSE_JUMP + explained).tolist()
-    ]
-    notes += _shortened(jumps, 'jumps of the position')
-    if back := int(np.count_nonzero(np.diff(received) < 0.0)):
-        notes.append(f'{back} messages of {topic} are in the bag before earlier ones.')
-    return notes
-
-
-def _shortened(notes: list[str], what: str) -> list[str]:
-    if len(notes) > _MAX_LISTED:
-        return [*notes[:_MAX_LISTED], f'There are {len(notes) - _MAX_LISTED} more {what}.']
-    return notes
-
 
 _ODOMETRY_FIELDS = {
     'x': 'pose.pose.position.x',
@@ -161,6 +95,11 @@ class Series:
     def __len__(self) -> int:
         return int(self.time.size)
 
+    def between(self, low: float, high: float) -> 'Series':
+        """Return the samples from ``low`` to ``high``, s."""
+        part = slice(*np.searchsorted(self.time, [low, np.nextafter(high, np.inf)]).tolist())
+        return Series(self.time[part], {name: each[part] for name, each in self.values.items()})
+
 
 @dataclass(frozen=True)
 class Timing:
@@ -206,9 +145,25 @@ class Run:
     """Median lead (s) of the reference stamps over their receive times."""
     complaints: tuple[DiagnosticEvent, ...]
     """From diagnostics: first time, level, node, text."""
+    changes: tuple[DiagnosticEvent, ...]
+    """Likewise, each time that a node got worse."""
     links: tuple[LinkHistory, ...]
     """Radio links in the diagnostics."""
-    notes: tuple[str, ...]
+    oddities: tuple[str, ...]
+    """Sentences on what is unusual in the bag, and what was done about it."""
+    remarks: tuple[str, ...]
+    """Sentences on where the data come from."""
+    damage: tuple[str, ...] = ()
+    """Oddities because of which the numbers cannot be trusted, in short."""
+    world: str = ''
+    """Name of the simulated world; empty if unknown."""
+    follows_path: bool = False
+    """Whether the controller follows the poses of the reference, not its speeds."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """All sentences on the bag."""
+        return self.oddities + self.remarks
 
     @property
     def measured(self) -> str:
@@ -228,14 +183,16 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
     choice = choose_topics(recording, wanted)
     topics = choice.topics
     notes = [*choice.notes]
+    oddities, damage = _oddities_of_bag(recording, choice)
     geometry = _geometry(recording.metadata_records, wanted, choice.ours, notes)
     columns = _columns(recording, topics.values())
-    raw = {
-        name: _read(recording, name, topic, columns.get(topic), notes)
-        for name, topic in topics.items()
-    }
+    raw = {}
+    for name, topic in topics.items():
+        raw[name], mixed = _read(recording, name, topic, columns.get(topic), oddities)
+        if mixed:
+            damage.append(f'{topic} mixes several robots')
     raw = {name: table for name, table in raw.items() if table['stamp'].size}
-    clock = _Clock(raw, notes)
+    clock = _Clock(raw, oddities)
     scalars = _recomputed_scalars(recording, choice, notes)
     motions, numbers = {}, {}
     for name, table in {**raw, **scalars}.items():
@@ -251,7 +208,8 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
             motions[name] = _motion(clock.local(table['received']), table, geometry)
         else:
             motions[name] = _motion(table['stamp'] - clock.origin, table, geometry)
-    complaints, links = read_diagnostics(recording, choice.namespaces[0])
+    oddities += _oddities_of_motions(topics, raw)
+    diagnostics = read_diagnostics(recording, choice.namespaces[0])
     return Run(
         duration=recording.duration,
         topics=topics,
@@ -270,10 +228,68 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
         },
         switches=_switches(numbers, motions.get(REFERENCE)),
         lead=clock.lead,
-        complaints=complaints,
-        links=links,
-        notes=tuple(notes),
+        complaints=diagnostics.complaints,
+        changes=diagnostics.changes,
+        links=diagnostics.links,
+        oddities=tuple(dict.fromkeys(oddities)),
+        remarks=tuple(notes),
+        damage=tuple(damage),
+        world=recording.metadata_records.get('sim_robot', {}).get('world', ''),
+        follows_path=recorded_flag(recording, 'controller', 'pose.enabled'),
     )
+
+
+def _oddities_of_bag(recording: BagReader, choice: TopicChoice) -> tuple[list[str], list[str]]:
+    """Return sentences on the bag as a whole, and damage in short."""
+    found, damage = [], []
+    if recording.incomplete_files:
+        listed = ', '.join(recording.incomplete_files)
+        found.append(
+            f'Truncated or unfinished files, not read: {listed} (t3mpc bag recover writes their '
+            'messages to a new bag).'
+        )
+        damage.append('files of the bag are truncated')
+    if recording.storage == 'ROS 1':
+        found.append('This is a bag of ROS 1: it holds no quality of service.')
+    if len(choice.namespaces) > 1:
+        others = ', '.join(space or '/' for space in choice.namespaces[1:])
+        found.append(
+            f'The bag also holds topics of {others}: another robot, or a part of this one in '
+            'another namespace (--namespace chooses).'
+        )
+    space = choice.namespaces[0]
+    for name in (ODOMETRY, TRUTH, REFERENCE, COMMAND):
+        topic = recording.topics.get(f'{space}/{name}')
+        if topic is None or topic.name in choice.topics.values() or not topic.message_count:
+            continue
+        if topic.type_name not in KINDS[name]:
+            wanted = ' or '.join(KINDS[name])
+            found.append(f'{topic.name} is {topic.type_name}, not {wanted}: it is not used.')
+    for topic_name in choice.topics.values():
+        count = len(recording.topics[topic_name].offered_qos_profiles)
+        if count > 1:
+            found.append(f'{topic_name} has {count} publishers.')
+    return found, damage
+
+
+def _oddities_of_motions(
+    topics: Mapping[str, str], raw: Mapping[str, Mapping[str, Array]]
+) -> list[str]:
+    """Return sentences on motions that are constant, or of one message."""
+    found = []
+    for name, table in raw.items():
+        if name not in (ODOMETRY, TRUTH, COMMAND, REFERENCE):
+            continue
+        count = table['stamp'].size
+        if count == 1:
+            found.append(f'{topics[name]} has a single message: nothing follows from it.')
+        elif not any(table[key].any() for key in ('linear', 'angular')):
+            found.append(
+                f'Every speed of {topics[name]} is zero in all {count} messages: the robot stood, '
+                'or it is not connected.'
+            )
+        found += rate_notes(topics[name], table['stamp'])
+    return found
 
 
 def _recomputed_scalars(
@@ -352,8 +368,11 @@ def _columns(recording: BagReader, topics: Iterable[str]) -> Mapping[str, TopicC
 
 def _read(
     recording: BagReader, name: str, topic: str, column: TopicColumns | None, notes: list[str]
-) -> dict[str, Array]:
-    """Return the arrays of one topic, without the rows that are not finite."""
+) -> tuple[dict[str, Array], bool]:
+    """Return the arrays of one topic, and whether it mixed several robots.
+
+    Rows that are not finite, that repeat the one before or are of another robot are left out.
+    """
     kind = recording.topics[topic].type_name
     if kind.endswith(('/Twist', '/TwistStamped')):
         inner = 'twist.' if kind.endswith('Stamped') else ''
@@ -372,17 +391,21 @@ def _read(
         if fields is _ODOMETRY_FIELDS:  # without the orientation about the other axes
             numbers = np.delete(numbers, (2, 3), axis=0)
         table |= dict(zip(fields, numbers, strict=True))
-    sound = np.all([np.isfinite(column) for column in table.values()], axis=0)
+    sound = np.all([np.isfinite(values) for values in table.values()], axis=0)
     if not sound.all():
         notes.append(f'{np.count_nonzero(~sound)} messages of {topic} hold a number that is not '
                      'finite; they are excluded.')  # fmt: skip
-    table = {key: column[sound] for key, column in table.items()}
+    table = {key: values[sound] for key, values in table.items()}
+    mixed = False
     if fields is _ODOMETRY_FIELDS:
+        frames = () if column is None else column.frames
+        frame_of = np.empty(0, dtype=np.int64) if column is None else column.frame_of[sound]
+        table, mixed = only_one_robot(table, topic, frames, frame_of, notes)
         places = np.stack([table['x'], table['y']], axis=1)
         times = table['received'], table['stamp']
         notes += continuity_notes(topic, *times, places, table['linear'])
         _mend_stamps(table, topic, notes)
-    return table
+    return table, mixed
 
 
 def _mend_stamps(table: dict[str, Array], topic: str, notes: list[str]) -> None:
@@ -460,6 +483,11 @@ def _switches(numbers: Mapping[str, Series], reference: Series | None) -> Array:
                 time = float(reference.time[1:][near[np.argmax(step)]])
         found.add(time)
     return np.array(sorted(found), dtype=np.float64)
+
+
+def recorded_flag(recording: BagReader, node: str, name: str) -> bool:
+    """Return whether a recorded parameter of a node is true; False if it is not recorded."""
+    return recording.metadata_records.get(node, {}).get(name, '').lower() == 'true'
 
 
 def _geometry(

@@ -139,10 +139,13 @@ def _requested_topic(recording: BagReader, name: str, full: str) -> str:
     return topic.name
 
 
-def _listing(recording: BagReader, most: int = 20) -> str:
+_MAX_LISTED = 20  # further topics are only counted
+
+
+def _listing(recording: BagReader) -> str:
     topics = list(recording.topics.values())
-    words = [f'{t.name} ({t.type_name}, {t.message_count} messages)' for t in topics[:most]]
-    more = [f'{len(topics) - most} more'] if len(topics) > most else []
+    words = [f'{t.name} ({t.type_name}, {t.message_count} messages)' for t in topics[:_MAX_LISTED]]
+    more = [f'{len(topics) - _MAX_LISTED} more'] if len(topics) > _MAX_LISTED else []
     return ', '.join(words + more) or 'no topic at all'
 
 

@@ -23,43 +23,36 @@ Array = NDArray[np.float64]
 class AdaptiveParameters(FeedbackParameters):
     """What both adaptive fuzzy controllers have; the sets cover -10 to 10 rad/s."""
 
-    gain: float = parameter(30.0, 'feedback K on the error', unit='1/s', low=0.5, high=100.0)
+    gain: float = parameter(30.0, 'feedback K on the error', '1/s', (0.5, 100.0))
     normalised_gain: float = parameter(
         100.0,
         'adaptation gain gamma |Phi|², averaged over the inputs: the error obeys '
         's² + K s + gamma |Phi|² = 0',
-        unit='1/s²',
-        low=0.1,
-        high=5000.0,
+        '1/s²',
+        (0.1, 5000.0),
     )
     dead_zone: float = parameter(
         0.01,
         'error from which on coefficients adapt; a smaller one counts as noise',
-        unit='rad/s',
-        low=0.0,
-        high=2.0,
+        'rad/s',
+        (0.0, 2.0),
     )
     error_bound: float = parameter(
         0.5,
         'bound of what the fuzzy system cannot explain, outweighed by the robust term; 0 leaves '
         'the term out',
-        unit='rad/s²',
-        low=0.0,
-        high=30.0,
+        'rad/s²',
+        (0.0, 30.0),
     )
     smoothing: float = parameter(
-        0.5,
-        'width of the robust term, epsilon in tanh(e/epsilon)',
-        unit='rad/s',
-        low=0.01,
-        high=10.0,
+        0.5, 'width of the robust term, epsilon in tanh(e/epsilon)', 'rad/s', (0.01, 10.0)
     )
-    sets: int = parameter(7, 'Gaussian sets per input', low=2, high=9)
+    sets: int = parameter(7, 'Gaussian sets per input', bounds=(2, 9))
     spread: float = parameter(
-        0.6, 'width of the sets as a fraction of their spacing', low=0.2, high=3.0
+        0.6, 'width of the sets as a fraction of their spacing', bounds=(0.2, 3.0)
     )
     centre_exponent: float = parameter(
-        2.0, 'how much closer together the centres are in the middle', low=0.2, high=5.0
+        2.0, 'how much closer together the centres are in the middle', bounds=(0.2, 5.0)
     )
 
     def fuzzy(self) -> FuzzyParameters:
@@ -85,8 +78,7 @@ class AdaptiveIntervalType2Parameters(AdaptiveParameters):
     footprint_of_uncertainty: float = parameter(
         0.23,
         'uncertainty of the sets: widths are (1 - footprint) and (1 + footprint) times the middle',
-        low=0.0,
-        high=0.9,
+        bounds=(0.0, 0.9),
     )
 
     def fuzzy(self) -> FuzzyParameters:

@@ -21,10 +21,16 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.control.jump_transition import MotorLimit
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import Parameters
 from t3mpc_ros.simulation.plant.disturbances import friction_torque
-from t3mpc_ros.simulation.plant.dynamics import BodyParameters, dynamics_vector, wheel_acceleration
+from t3mpc_ros.simulation.plant.dynamics import (
+    BodyParameters,
+    dynamics_vector,
+    wheel_acceleration,
+    wheel_inertia,
+)
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
 
 Array = NDArray[np.float64]
@@ -50,6 +56,14 @@ class NominalModel:
         """1 - exp(-T/lag): step response of the servo after one period T."""
         return 1.0 - math.exp(-self.period / self.lag)
 
+    @property
+    def motor_limit(self) -> MotorLimit | None:
+        """What the motors of a torque drive have for a jump; None with a velocity drive."""
+        if self.drive != 'torque':
+            return None
+        inertia = wheel_inertia(self.robot.body, self.robot.geometry)
+        return MotorLimit(inertia, self.robot.drive.torque_limit)
+
     def acceleration_for(self, command: Array, speeds: Array) -> Array:
         """Return the u (rad/s²) that a wheel speed command (rad/s) means at these speeds.
 
@@ -57,6 +71,26 @@ class NominalModel:
         """
         u: Array = (command - speeds) * (self.share / self.period)
         return u
+
+
+JUMP = 0.3
+"""A change of r in one period (rad/s), beyond the change before it, that is a jump."""
+
+
+def future_jump(future: Array, j: int, period: float) -> tuple[Array, Array] | None:
+    """Return the jump before row ``j`` of a known future and the slope after it, if there is one.
+
+    future : r at the control periods, rad/s, shape (n, 2); 0 < j < n - 1
+    period : s
+
+    The jump (rad/s) is what exceeds the change before it, the slope is in rad/s²; shape (2,) each.
+    After a change that exceeds :data:`JUMP` itself nothing is a jump.
+    """
+    before = future[j - 1] - future[j - 2] if j > 1 else np.zeros(2)
+    jump = future[j] - future[j - 1] - before
+    if np.max(np.abs(jump)) <= JUMP or np.max(np.abs(before)) > JUMP:
+        return None
+    return jump, (future[j + 1] - future[j]) / period
 
 
 class WheelLoads:

@@ -58,27 +58,21 @@ class DynamicMatrixPreviewParameters(PredictiveParameters):
     """Parameters of dynamic matrix control with preview."""
 
     moves: int = parameter(
-        40, 'M, moves planned; the command stays where they lead', low=1, high=200
+        40, 'M, moves planned; the command stays where they lead', bounds=(1, 200)
     )
     bias_time: float = parameter(
         0.3,
         'time constant of the bias b; the least makes it the latest miss, as first published',
-        unit='s',
-        low=0.001,
-        high=20.0,
+        's',
+        (0.001, 20.0),
     )
     load_share: float = parameter(
         1.0,
         'share compensated of what friction and turning of the nominal robot do at the reference',
-        low=0.0,
-        high=2.0,
+        bounds=(0.0, 2.0),
     )
     inner_gain: float = parameter(
-        30.0,
-        'K0 of the loop around the wheel, torque drive only',
-        unit='1/s',
-        low=2.0,
-        high=80.0,
+        30.0, 'K0 of the loop around the wheel, torque drive only', '1/s', (2.0, 80.0)
     )
 
     def check_consistency(self) -> None:

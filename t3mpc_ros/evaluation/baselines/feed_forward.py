@@ -21,14 +21,12 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import (
     BaselineController,
     NominalModel,
     Observation,
+    future_jump,
 )
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.parameters.table import Parameters, group, parameter
 
 Array = NDArray[np.float64]
-
-JUMP = 0.3
-"""A change of r in one period (rad/s), beyond the change before it, that is taken as a jump."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +37,8 @@ class FeedForwardParameters(Parameters):
         0.0,
         'time beyond the dead time by which the command is ahead of the reference; 0: lag of the '
         'drive and half a period',
-        unit='s',
-        low=0.0,
-        high=0.2,
+        's',
+        (0.0, 0.2),
     )
     jump_transition: JumpTransitionParameters = group(JumpTransitionParameters)
 
@@ -61,15 +58,12 @@ class FeedForward(BaselineController):
         advance = table.advance or nominal_model.lag + 0.5 * period
         self._whole, self._part = divmod(0.0 if self._torque else advance / period, 1.0)
         # Without a lag: the advance already contains that of the drive.
-        self._transition = JumpTransition(table.jump_transition, 0.0, period)
+        self._transition = JumpTransition(
+            table.jump_transition, 0.0, period, nominal_model.motor_limit
+        )
         self._index = 0
         """Period of the last observation, counted from the first one."""
         self._future: Array = np.zeros((0, 2))
-
-    @property
-    def advance_periods(self) -> float:
-        """How far beyond the dead time the command is ahead of the reference, in periods."""
-        return self._whole + self._part
 
     def step(self, observation: Observation) -> Array:
         """Return u, rad/s², shape (2,)."""
@@ -100,10 +94,5 @@ class FeedForward(BaselineController):
 
     def _announce(self, j: int) -> None:
         """Announce a jump between rows ``j`` - 1 and ``j`` of the future, if there is one."""
-        future = self._future
-        before = future[j - 1] - future[j - 2]
-        jump = future[j] - future[j - 1] - before
-        if np.max(np.abs(jump)) <= JUMP or np.max(np.abs(before)) > JUMP:
-            return
-        slope = (future[j + 1] - future[j]) / self._nominal_model.period
-        self._transition.announce((self._index + j) * self._period_ns, jump, slope)
+        if found := future_jump(self._future, j, self._nominal_model.period):
+            self._transition.announce((self._index + j) * self._period_ns, *found)

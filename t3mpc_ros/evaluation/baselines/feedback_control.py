@@ -49,17 +49,15 @@ class JumpTransientParameters(Parameters):
     rate: float = parameter(
         100.0,
         'rate at which the error closes that a jump of the reference or a limit has made',
-        unit='1/s',
-        low=1.0,
-        high=500.0,
+        '1/s',
+        (1.0, 500.0),
     )
     acceleration: float = parameter(
         200.0,
         'largest acceleration requested for it; a torque limit is not reported back, so that with '
         'a torque drive this should be what the motors can do',
-        unit='rad/s²',
-        low=1.0,
-        high=1000.0,
+        'rad/s²',
+        (1.0, 1000.0),
     )
 
 
@@ -132,15 +130,9 @@ class FeedbackBaseline(BaselineController, Generic[Table]):
 class ProportionalIntegralParameters(FeedbackParameters):
     """Gains of the PI controller."""
 
-    gain: float = parameter(
-        30.0, 'proportional gain K on the error', unit='1/s', low=0.5, high=100.0
-    )
+    gain: float = parameter(30.0, 'proportional gain K on the error', '1/s', (0.5, 100.0))
     integral: float = parameter(
-        200.0,
-        'integral gain; K²/4 is critical damping in continuous time',
-        unit='1/s²',
-        low=0.1,
-        high=5000.0,
+        200.0, 'integral gain; K²/4 is critical damping in continuous time', '1/s²', (0.1, 5000.0)
     )
 
 
@@ -172,31 +164,26 @@ class ProportionalIntegral(FeedbackBaseline[ProportionalIntegralParameters]):
 class DisturbanceRejectionParameters(FeedbackParameters):
     """Gains of active disturbance rejection."""
 
-    gain: float = parameter(
-        30.0, 'bandwidth of the controller, k', unit='1/s', low=0.5, high=100.0
-    )
+    gain: float = parameter(30.0, 'bandwidth of the controller, k', '1/s', (0.5, 100.0))
     observer_bandwidth: float = parameter(
         30.0,
         'bandwidth of the extended state observer, omega_o: both poles at exp(-omega_o T)',
-        unit='1/s',
-        low=0.5,
-        high=300.0,
+        '1/s',
+        (0.5, 300.0),
     )
     input_gain: float = parameter(
-        1.0, 'what an acceleration that is asked for brings about, b_0', low=0.3, high=3.0
+        1.0, 'what an acceleration that is asked for brings about, b_0', bounds=(0.3, 3.0)
     )
     shared_disturbance: float = parameter(
         0.0,
         "share of the filter's unexplained acceleration, common to all methods, in what is "
         "cancelled; the rest is the observer's own",
-        low=0.0,
-        high=1.0,
+        bounds=(0.0, 1.0),
     )
     shared_speed: float = parameter(
         0.0,
         "share of the filter's speed in the feedback; the rest is the observer's own",
-        low=0.0,
-        high=1.0,
+        bounds=(0.0, 1.0),
     )
 
 
@@ -261,33 +248,21 @@ class SlidingModeParameters(FeedbackParameters):
     surface: float = parameter(
         8.0,
         'slope lambda of the surface s = e + lambda ∫e: the rate of the error on it',
-        unit='1/s',
-        low=0.1,
-        high=100.0,
+        '1/s',
+        (0.1, 100.0),
     )
-    reaching: float = parameter(
-        8.0, 'linear term of the reaching law, k', unit='1/s', low=0.1, high=100.0
-    )
+    reaching: float = parameter(8.0, 'linear term of the reaching law, k', '1/s', (0.1, 100.0))
     switching: float = parameter(
-        6.0,
-        'switching gain eta: outweighs any disturbance that is smaller',
-        unit='rad/s²',
-        low=0.1,
-        high=40.0,
+        6.0, 'switching gain eta: outweighs any disturbance that is smaller', 'rad/s²', (0.1, 40.0)
     )
     boundary: float = parameter(
-        0.5,
-        'boundary layer phi, within which the switching term is linear',
-        unit='rad/s',
-        low=0.02,
-        high=5.0,
+        0.5, 'boundary layer phi, within which the switching term is linear', 'rad/s', (0.02, 5.0)
     )
     shared_disturbance: float = parameter(
         0.0,
         "share of the filter's unexplained acceleration, common to all methods, in the "
         'equivalent control; what is left is for the switching gain to outweigh',
-        low=0.0,
-        high=1.0,
+        bounds=(0.0, 1.0),
     )
 
 
@@ -332,21 +307,16 @@ class ComputedTorqueParameters(ProportionalIntegralParameters):
     """Gains of computed torque, and where and how far its model is believed."""
 
     integral: float = parameter(
-        20.0,
-        'integral gain, for what the model does not know',
-        unit='1/s²',
-        low=0.1,
-        high=5000.0,
+        20.0, 'integral gain, for what the model does not know', '1/s²', (0.1, 5000.0)
     )
     belief: float = parameter(
-        1.0, "share of the model's forces that is cancelled", low=0.0, high=1.5
+        1.0, "share of the model's forces that is cancelled", bounds=(0.0, 1.5)
     )
     measured: float = parameter(
         0.5,
         'where the model is evaluated: 1 at the estimated speeds, which are noisy, 0 at the '
         'followed ones r + h, which the wheels may not have',
-        low=0.0,
-        high=1.0,
+        bounds=(0.0, 1.0),
     )
 
 

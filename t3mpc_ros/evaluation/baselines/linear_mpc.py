@@ -53,8 +53,7 @@ class LinearMpcPreviewParameters(ObserverParameters, PredictiveParameters):
     load_share: float = parameter(
         1.0,
         'share taken of what friction and turning of the nominal robot do along the reference',
-        low=0.0,
-        high=2.0,
+        bounds=(0.0, 2.0),
     )
 
 

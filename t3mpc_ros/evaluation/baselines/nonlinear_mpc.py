@@ -51,16 +51,14 @@ class CasadiNmpcParameters(ObserverParameters, PredictiveParameters):
     model_error: float = parameter(
         1.0,
         'mass and inertia of the body that the model believes in over the nominal ones',
-        low=0.1,
-        high=10.0,
+        bounds=(0.1, 10.0),
     )
-    horizon: int = parameter(40, 'N, periods looked ahead and free moves', low=2, high=100)
-    iterations: int = parameter(1, 'linearisations per step', low=1, high=20)
+    horizon: int = parameter(40, 'N, periods looked ahead and free moves', bounds=(2, 100))
+    iterations: int = parameter(1, 'linearisations per step', bounds=(1, 20))
     disturbance_share: float = parameter(
         0.3,
         'share taken of the part of the disturbance estimate that the model does not explain',
-        low=0.01,
-        high=2.0,
+        bounds=(0.01, 2.0),
     )
 
 

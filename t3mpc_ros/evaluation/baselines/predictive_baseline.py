@@ -34,19 +34,18 @@ class PredictiveParameters(Parameters):
     """Parameters of every predictive baseline."""
 
     model_error: float = parameter(
-        1.0, 'inertia that the model believes in over the nominal one', low=0.1, high=10.0
+        1.0, 'inertia that the model believes in over the nominal one', bounds=(0.1, 10.0)
     )
-    horizon: int = parameter(40, 'N, periods looked ahead', low=2, high=200)
+    horizon: int = parameter(40, 'N, periods looked ahead', bounds=(2, 200))
     move_time: float = parameter(
         0.01,
         'time over which it smooths, about; the weight of a move is (move_time/T)², but '
         '(move_time²/T)² where the moves are those of a torque',
-        unit='s',
-        low=0.001,
-        high=0.5,
+        's',
+        (0.001, 0.5),
     )
     disturbance_share: float = parameter(
-        0.3, 'share taken of the shared disturbance estimate', low=0.01, high=2.0
+        0.3, 'share taken of the shared disturbance estimate', bounds=(0.01, 2.0)
     )
 
 
@@ -57,17 +56,15 @@ class ObserverParameters(Parameters):
     integral_time: float = parameter(
         1.0,
         'time constant with which its own prediction errors become part of the disturbance',
-        unit='s',
-        low=0.02,
-        high=50.0,
+        's',
+        (0.02, 50.0),
     )
     filter_time: float = parameter(
         0.1,
         'time constant with which its own prediction of the speed is drawn to the estimate; the '
         'least takes the estimate as it is',
-        unit='s',
-        low=0.001,
-        high=5.0,
+        's',
+        (0.001, 5.0),
     )
 
 
@@ -78,9 +75,8 @@ class ExtrapolationParameters(Parameters):
     slope_time: float = parameter(
         0.2,
         'time constant with which the slope of the reference is expected to die away',
-        unit='s',
-        low=0.002,
-        high=10.0,
+        's',
+        (0.002, 10.0),
     )
 
 

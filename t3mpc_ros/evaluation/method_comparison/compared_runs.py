@@ -6,20 +6,23 @@ A robot is the digital twin with stepper motors (``twin``), or the paper's plant
 drive (``servo``) or torque drive (``torque``).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cache
 import math
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.control.controller import Controller
+from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController, NominalModel
 from t3mpc_ros.evaluation.baselines.feed_forward import FeedForward, FeedForwardParameters
 from t3mpc_ros.evaluation.closed_loop import (
     LoopRecord,
     MethodSpec,
-    WorkerPool,
+    map_jobs,
     run,
     total_variation,
 )
@@ -39,9 +42,8 @@ from t3mpc_ros.evaluation.methods import (
     methods,
 )
 from t3mpc_ros.evaluation.paper.experiment_runs import SETTLING as PAPER_SETTLING
-from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.scenario import CASES as PAPER_CASES
-from t3mpc_ros.evaluation.scenario import RATE, Scenario, settled_rows, switch_times
+from t3mpc_ros.evaluation.scenario import RATE, Scenario, complete_rows, settled_rows, switch_times
 from t3mpc_ros.evaluation.tuning.tuned_parameters import TunedParameters
 from t3mpc_ros.evaluation.twin_closed_loop import (
     INITIAL_STANDSTILL,
@@ -57,6 +59,12 @@ Array = NDArray[np.float64]
 
 DRIVES: Mapping[str, str] = {'twin': 'velocity', 'servo': 'velocity', 'torque': 'torque'}
 """Robots, and the drive of each."""
+ROBOT_TEXTS: Mapping[str, str] = {
+    'twin': 'Digital twin',
+    'servo': "The paper's plant with velocity drive",
+    'torque': "The paper's plant with torque drive",
+}
+"""Robots in words."""
 TUNED_FOR: Mapping[str, str] = {**DRIVES, 'twin': 'twin'}
 """Robots, and the drive under which the parameters tuned for them are stored."""
 FEED_FORWARD = 'feed-forward'
@@ -130,7 +138,7 @@ class TwinMethod:
     name: str
     changes: Mapping[str, object] | None = None
     """Changes of the node's parameters; None for a baseline."""
-    baseline: MethodSpec | None = None
+    baseline: Callable[[NominalModel], BaselineController] | None = None
 
     def controller(self, scenario: TwinScenario) -> LoopController:
         """Return a new controller for a run."""
@@ -141,8 +149,21 @@ class TwinMethod:
         return controller
 
 
+class PlantMethod(Protocol):
+    """A method on the paper's plant; :class:`MethodSpec` is one."""
+
+    @property
+    def name(self) -> str:
+        """Name in tables and errors."""
+        ...
+
+    def __call__(self, nominal_model: NominalModel) -> BaselineController:
+        """Return a new controller."""
+        ...
+
+
 AnyScenario = TwinScenario | Scenario
-AnyMethod = TwinMethod | MethodSpec
+AnyMethod = TwinMethod | PlantMethod
 Job = tuple[AnyScenario, AnyMethod]
 
 
@@ -235,9 +256,28 @@ class ComparisonPlan:
     noise: float = 0.04
     gyro: bool = False
 
+    @property
+    def against(self) -> str:
+        """The method with which every other is compared."""
+        return FEED_FORWARD
+
+    @property
+    def robot_text(self) -> str:
+        """What the robot is, in words."""
+        return ROBOT_TEXTS[self.robot]
+
+    @property
+    def additional_knowledge(self) -> Mapping[str, str]:
+        """What methods know that are no method of the robot, for the table of the page."""
+        return {}
+
+    def known_methods(self) -> Mapping[str, AnyMethod]:
+        """Return every method that can be compared, by name."""
+        return methods_for(self.robot)
+
     def __post_init__(self) -> None:
         check_name('robot', self.robot, DRIVES)
-        known = methods_for(self.robot)
+        known = self.known_methods()
         for case in self.cases:
             check_name('case', case, dict.fromkeys(cases_for(self.robot)))
         for method in self.methods:
@@ -263,7 +303,7 @@ class ComparisonPlan:
 
     def job(self, case: str, method: str, seed: int) -> Job:
         """Return scenario and method of a run."""
-        found = methods_for(self.robot)[method]
+        found = self.known_methods()[method]
         if self.robot == 'twin':
             return TwinScenario(case, seed, self.duration, self.noise, self.gyro), found
         return Scenario(DRIVES[self.robot], self.noise, case, seed, self.duration), found
@@ -275,14 +315,13 @@ Results = Mapping[tuple[str, str], Sequence[Numbers]]
 """Metrics by case and method, one entry for each seed in the order of the plan."""
 
 
-def compare(plan: ComparisonPlan, workers: int = 1, *, progress: bool = False) -> Results:
-    """Return the metrics of every run of a plan."""
+def compare(
+    plan: ComparisonPlan, workers: int | Executor = 1, *, progress: bool = False
+) -> Results:
+    """Return the metrics of every run of a plan; ``workers`` as for :class:`WorkerPool`."""
     keys = plan.jobs()
-    numbers: dict[tuple[str, str, int], Numbers] = {}
-    with WorkerPool(workers) as pool, progress_bar(len(keys), show=progress) as bar:
-        for index, found in pool.map(measured_run, (plan.job(*key) for key in keys)):
-            numbers[keys[index]] = found
-            bar.update()
+    found = map_jobs(measured_run, [plan.job(*key) for key in keys], workers, progress=progress)
+    numbers = dict(zip(keys, found, strict=True))
     return {
         (case, method): [numbers[case, method, seed] for seed in plan.seeds]
         for case in plan.cases
@@ -295,7 +334,7 @@ def measured_run(job: Job) -> Numbers:
     scenario, method = job
     if isinstance(scenario, TwinScenario) and isinstance(method, TwinMethod):
         return twin_numbers(scenario, twin_run(scenario, method))
-    if isinstance(scenario, Scenario) and isinstance(method, MethodSpec):
+    if isinstance(scenario, Scenario) and not isinstance(method, TwinMethod):
         return paper_numbers(run(scenario, method))
     raise ValueError(f'{method.name} is no method of the robot of {scenario}')
 
@@ -309,6 +348,7 @@ def twin_run(scenario: TwinScenario, method: TwinMethod) -> TwinRecord:
         scenario.duration,
         scenario.schedule(),
         links=scenario.links,
+        speed_noise=scenario.speed_noise(),
     )
 
 
@@ -329,10 +369,11 @@ def twin_numbers(scenario: TwinScenario, record: TwinRecord) -> Numbers:
     time, reference = record.time, scenario.reference()
     driven = float(time[-1]) - INITIAL_STANDSTILL
     start = INITIAL_STANDSTILL + min(START, 0.5 * driven)
-    counted = time >= start
     # With the switches soon after the end: preview leaves the reference before them.
     switches = switch_times(reference.time, reference.modes)
-    settled = settled_rows(time, switches, start, SETTLING)
+    complete = complete_rows(time, switches)
+    counted = complete & (time >= start)
+    settled = complete & settled_rows(time, switches, start, SETTLING)
     effort = np.diff(record.requested, axis=0) * RATE
     error = record.rotors - record.reference
     geometry = WheelGeometry()

@@ -27,7 +27,6 @@ from t3mpc_ros.evaluation.method_comparison.compared_runs import (
     Metric,
     Results,
     case_texts,
-    methods_for,
 )
 from t3mpc_ros.evaluation.method_comparison.twin_scenario import CASES as TWIN_CASES
 from t3mpc_ros.evaluation.method_comparison.twin_scenario import TwinScenario
@@ -37,6 +36,7 @@ from t3mpc_ros.evaluation.plotting import new_figure, png_of
 from t3mpc_ros.evaluation.reporting import (
     EMPTY_CELL,
     Block,
+    Contents,
     Heading,
     Paragraph,
     Picture,
@@ -56,12 +56,14 @@ def values(results: Results, case: str, method: str, metric: Metric) -> list[flo
     return [run[metric.name] for run in runs] if metric.name in runs[0] else []
 
 
-def difference(results: Results, case: str, method: str, metric: Metric) -> Difference | None:
-    """Return the paired difference from feed-forward; None for itself or without it."""
-    if method == FEED_FORWARD or (case, FEED_FORWARD) not in results:
+def difference(
+    results: Results, case: str, method: str, metric: Metric, against: str = FEED_FORWARD
+) -> Difference | None:
+    """Return the paired difference from another method; None for itself or without it."""
+    if method == against or (case, against) not in results:
         return None
     mine = values(results, case, method, metric)
-    other = values(results, case, FEED_FORWARD, metric)
+    other = values(results, case, against, metric)
     return paired(mine, other) if mine and other else None
 
 
@@ -88,7 +90,7 @@ def summary_table(plan: ComparisonPlan, results: Results) -> Table:
         cells = [method]
         for case in plan.cases:
             metric = judged_metrics(plan.robot, case)[0]
-            found = difference(results, case, method, metric)
+            found = difference(results, case, method, metric, plan.against)
             average = mean(values(results, case, method, metric))
             text = 'diverged' if math.isnan(average) else f'{average:.{metric.digits}f}'
             cells.append(text if found is None else f'{text} {verdict(found)}')
@@ -97,7 +99,7 @@ def summary_table(plan: ComparisonPlan, results: Results) -> Table:
     title = 'Settled RMSE of the wheel speeds, rad/s'
     if body:
         title += f' ({", ".join(body)}: of the yaw rate of the body)'
-    title += f'; verdict against {FEED_FORWARD}'
+    title += f'; verdict against {plan.against}'
     return Table(title, ('method', *plan.cases), rows, (FULL,), wrap=True)
 
 
@@ -112,10 +114,10 @@ def case_table(plan: ComparisonPlan, results: Results, case: str) -> Table:
     ]
     judged = judged_metrics(plan.robot, case)
     head = ['method', *(f'{metric.heading}, {metric.unit}' for metric in metrics)]
-    compared = FEED_FORWARD in plan.methods and len(plan.methods) > 1
+    compared = plan.against in plan.methods and len(plan.methods) > 1
     if compared:
         for metric in judged:
-            head += [f'{metric.heading} − {FEED_FORWARD}', 'verdict']
+            head += [f'{metric.heading} − {plan.against}', 'verdict']
     rows = []
     for method in plan.methods:
         cells = [method]
@@ -123,7 +125,7 @@ def case_table(plan: ComparisonPlan, results: Results, case: str) -> Table:
             numbers = values(results, case, method, metric)
             cells.append(format_interval(mean(numbers), interval(numbers), '', metric.digits))
         for metric in judged if compared else ():
-            found = difference(results, case, method, metric)
+            found = difference(results, case, method, metric, plan.against)
             if found is None:
                 cells += [EMPTY_CELL, EMPTY_CELL]
             else:
@@ -172,6 +174,7 @@ def knowledge_table(plan: ComparisonPlan) -> Table:
             'baselines': 'the tuned parameters of this drive, with equal effort; adaptive ones '
             'start with the weights of the same practice runs',
         }
+    rows |= plan.additional_knowledge
     return Table(
         'What each method knows', ('method', 'knows'), list(rows.items()), text=2, wrap=True
     )
@@ -179,15 +182,10 @@ def knowledge_table(plan: ComparisonPlan) -> Table:
 
 def description(plan: ComparisonPlan) -> str:
     """Return in one paragraph what was run and how it is counted."""
-    names = {
-        'twin': 'Digital twin',
-        'servo': "The paper's plant with velocity drive",
-        'torque': "The paper's plant with torque drive",
-    }
     seeds = ', '.join(map(str, plan.seeds))
     outside = ' (none is used for tuning or in another table)' if _are_outside(plan.seeds) else ''
     text = (
-        f'{names[plan.robot]}, {plan.duration:g} s, noise variance {plan.noise:g} (rad/s)², '
+        f'{plan.robot_text}, {plan.duration:g} s, noise variance {plan.noise:g} (rad/s)², '
         f'seeds {seeds}{outside}. '
         'True wheel speeds against the reference; mean ± half the 95 % interval over the seeds. '
     )
@@ -204,7 +202,7 @@ def description(plan: ComparisonPlan) -> str:
         )
     return text + (
         'Variation: total variation of the commanded acceleration per second and wheel. '
-        f'Differences from {FEED_FORWARD} are paired by seed; better or worse: their 95 % '
+        f'Differences from {plan.against} are paired by seed; better or worse: their 95 % '
         'interval excludes zero.'
     )
 
@@ -225,18 +223,17 @@ def markdown(plan: ComparisonPlan, results: Results) -> str:
 
 def page(plan: ComparisonPlan, results: Results) -> str:
     """Return the page as self-contained HTML."""
-    blocks: list[Block] = [
-        Paragraph(description(plan)),
-        knowledge_table(plan),
-        summary_table(plan, results),
-    ]
-    caption = f'Difference from {FEED_FORWARD}, with 95 % interval'
+    blocks: list[Block] = []
+    caption = f'Difference from {plan.against}, with 95 % interval'
     for case in plan.cases:
         blocks.append(Heading(case))
         if picture := png_of(lambda of: _draw_differences(plan, results, of), case):
-            blocks.append(Picture(caption, picture, caption))
+            blocks.append(Picture(f'{caption}: {case}', picture, caption))
+        if case == plan.cases[0]:
+            blocks += [Contents(), Paragraph(description(plan)), summary_table(plan, results)]
         blocks.append(case_table(plan, results, case))
-    return html_page(f'Comparison of all methods: {plan.robot}', blocks)
+    blocks += [Heading('What each method knows'), knowledge_table(plan)]
+    return html_page(f'Comparison of methods: {plan.robot}', blocks)
 
 
 def record(plan: ComparisonPlan, results: Results) -> dict[str, Any]:
@@ -244,7 +241,7 @@ def record(plan: ComparisonPlan, results: Results) -> dict[str, Any]:
     cases: dict[str, Any] = {}
     for case, text in case_texts(plan.robot).items():
         if case in plan.cases:
-            found = {name: _method_record(results, case, name) for name in plan.methods}
+            found = {name: _method_record(plan, results, case, name) for name in plan.methods}
             cases[case] = {'text': text, 'methods': found}
     return {
         'format': 1,
@@ -262,7 +259,7 @@ def record(plan: ComparisonPlan, results: Results) -> dict[str, Any]:
 
 
 def _parameters(plan: ComparisonPlan, name: str) -> Mapping[str, object]:
-    method = methods_for(plan.robot)[name]
+    method = plan.known_methods()[name]
     parameters = getattr(method, 'parameters', None)
     if parameters is None:
         baseline = getattr(method, 'baseline', None)
@@ -274,11 +271,13 @@ def _parameters(plan: ComparisonPlan, name: str) -> Mapping[str, object]:
     return dict(parameters.to_dict())
 
 
-def _method_record(results: Results, case: str, method: str) -> dict[str, Any]:
+def _method_record(
+    plan: ComparisonPlan, results: Results, case: str, method: str
+) -> dict[str, Any]:
     runs = results[case, method]
     differences = {}
     for metric in METRICS:
-        found = difference(results, case, method, metric)
+        found = difference(results, case, method, metric, plan.against)
         if found is not None:
             differences[metric.name] = {
                 'mean': found.mean,
@@ -288,7 +287,7 @@ def _method_record(results: Results, case: str, method: str) -> dict[str, Any]:
     return {
         'mean': {name: mean([run[name] for run in runs]) for name in runs[0]},
         'runs': [dict(run) for run in runs],
-        f'difference_from_{FEED_FORWARD.replace("-", "_")}': differences,
+        f'difference_from_{plan.against.replace("-", "_")}': differences,
     }
 
 
@@ -302,7 +301,8 @@ def _draw_differences(plan: ComparisonPlan, results: Results, case: str) -> Any:
     rows: Sequence[tuple[str, Difference]] = [
         (method, found)
         for method in plan.methods
-        if (found := difference(results, case, method, metric)) and math.isfinite(found.mean)
+        if (found := difference(results, case, method, metric, plan.against))
+        and math.isfinite(found.mean)
     ]
     if not rows:
         return None

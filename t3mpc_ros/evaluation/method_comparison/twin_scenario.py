@@ -38,7 +38,7 @@ from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist, State, 
 from t3mpc_ros.parameters.table import nearest_hint
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule
-from t3mpc_ros.simulation.plant.disturbances import DisturbanceParameters
+from t3mpc_ros.simulation.plant.disturbances import DisturbanceParameters, MeasurementNoise
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
 
 SHORTEST, LONGEST = 2.0, 3600.0
@@ -152,7 +152,7 @@ class TwinScenario:
         case = CASES[self.case]
         if case.load_change:
             return 0.5 * self.duration, math.inf
-        return case.links.span(self.duration) if case.links.begin else None
+        return self.links.span(self.duration) if self.links.begin else None
 
     @property
     def links(self) -> LinkFaults:
@@ -175,9 +175,13 @@ class TwinScenario:
             {'noise.variance': float(self.noise), **CASES[self.case].robot}
         )
 
+    def speed_noise(self) -> MeasurementNoise | None:
+        """Return the noise of the wheel speeds; None for white noise."""
+        return None
+
     def schedule(self) -> FaultSchedule:
         """Return the faults of robot and command link."""
-        case, links = CASES[self.case], CASES[self.case].links
+        case, links = CASES[self.case], self.links
         begin, _ = links.span(self.duration)
         least, most = links.command_delay
         values = {

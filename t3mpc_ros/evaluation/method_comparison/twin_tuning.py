@@ -7,6 +7,7 @@ the baselines have the gyro.
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Executor
 from dataclasses import replace
 import math
 from pathlib import Path
@@ -159,7 +160,7 @@ def kept_start(method: MethodDefinition, tuned: TunedEntry) -> TunedEntry:
 def tune_twin(
     selected: Sequence[MethodDefinition],
     evaluations: int,
-    workers: int,
+    workers: int | Executor,
     path: Path,
     report: Callable[[str], None],
     *,

@@ -3,16 +3,14 @@
 """Experiments of the paper: which are needed, and the finished runs in a JSON lines file."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-import contextlib
+from concurrent.futures import Executor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, fields, is_dataclass
-import fcntl
 import hashlib
-from io import TextIOWrapper
 import json
 import math
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +18,8 @@ import t3mpc_ros
 from t3mpc_ros.evaluation.closed_loop import LoopRecord
 from t3mpc_ros.evaluation.methods import FULL, ComparedMethod
 from t3mpc_ros.evaluation.methods import STAGES as METHOD_STAGES
-from t3mpc_ros.evaluation.reporting import finite, progress_bar
+from t3mpc_ros.evaluation.reporting import finite
+from t3mpc_ros.evaluation.result_file import ResultFile, run_missing_jobs
 from t3mpc_ros.evaluation.scenario import DRIVES
 from t3mpc_ros.parameters.provenance import PACKAGE_DIRECTORY
 
@@ -67,8 +66,9 @@ class ExperimentSetup:
     """Every case there is, :data:`NOMINAL` first."""
     seeds: tuple[int, ...]
     """Held-out seeds, none of which has tuned anything."""
-    team: Callable[[int], AbstractContextManager[Any]] = nullcontext
-    """Called with how many processes; what it enters is the team. By default the number itself."""
+    team: Callable[[int | Executor], AbstractContextManager[Any]] = nullcontext
+    """Called with how many processes, or an executor; what it enters is the team. By default the
+    argument itself."""
 
 
 DURATION = 59.5
@@ -195,7 +195,8 @@ START = 3.0
 # Sources that cannot change the result of a run with given method parameters. All others
 # invalidate stored runs: a needless repetition is better than an outdated result.
 _IRRELEVANT_SOURCES = (
-    'nodes/', 'bag/', 'radio/', 'emulator/', 'cli/', 'evaluation/bag_report/',
+    'nodes/', 'bag/', 'radio/', 'emulator/', 'cli/', 'scripting/', 'evaluation/bag_report/',
+    'evaluation/result_file.py',
     'evaluation/process_replay/', 'evaluation/paper/', 'evaluation/tuning/',
     'evaluation/method_comparison/', 'evaluation/baselines/feed_forward.py',
     'evaluation/plotting.py', 'evaluation/reporting.py', 'evaluation/lyapunov_exponents.py',
@@ -287,68 +288,11 @@ class RunKey:
     fingerprint: str
 
 
-class RunFile:
-    """Finished runs in a file of JSON lines; a context that one set of runs has at a time.
-
-    A line is written as a whole and flushed. Should a writer be killed within one, what is torn
-    is that line alone: reading skips it, and the next writer begins on a line of its own. With
-    ``fresh``, what the file holds is thrown away on first entry.
-    """
+class RunFile(ResultFile[RunKey, RunNumbers]):
+    """Finished runs of the paper, see :class:`ResultFile`."""
 
     def __init__(self, path: Path, *, fresh: bool = False) -> None:
-        self.path = path
-        self._fresh = fresh
-        self.unreadable = 0
-        """Lines of the last reading that were torn or of another kind."""
-        self._stream: TextIOWrapper | None = None
-
-    def read(self) -> dict[RunKey, RunNumbers]:
-        """Return every run the file holds, of whatever version; empty when there is no file."""
-        self.unreadable = 0
-        found: dict[RunKey, RunNumbers] = {}
-        text = ''
-        with contextlib.suppress(FileNotFoundError):
-            text = self.path.read_text(encoding='utf-8', errors='replace')
-        for line in text.split('\n'):
-            if not line.strip():
-                continue
-            try:
-                key, numbers = _decode(line)
-            except (ValueError, KeyError, TypeError):
-                self.unreadable += 1
-                continue
-            found[key] = numbers
-        return found
-
-    def add(self, key: RunKey, numbers: RunNumbers) -> None:
-        """Append a finished run."""
-        if self._stream is None:
-            raise RuntimeError('the file must be entered before runs are added')
-        self._stream.write(_encode(key, numbers) + '\n')
-        self._stream.flush()
-
-    def __enter__(self) -> Self:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        stream = self.path.open('a+', encoding='utf-8', errors='replace')
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            stream.close()
-            raise RuntimeError(f'another campaign is writing to {self.path}') from None
-        if self._fresh:
-            stream.truncate(0)
-            self._fresh = False
-        content = self.path.read_bytes()
-        if content and not content.endswith(b'\n'):
-            stream.write('\n')
-            stream.flush()
-        self._stream = stream
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._stream is not None:
-            self._stream.close()
-            self._stream = None
+        super().__init__(path, _encode, _decode, fresh=fresh)
 
 
 def _encode(key: RunKey, numbers: RunNumbers) -> str:
@@ -411,43 +355,22 @@ def run_missing(
         for seed in grid.seeds
         for experiment in needed
     ]
-    with file:
-        known = file.read()
-        found = {key: known[key] for key in keys if key in known}
-        missing = [key for key in keys if key not in found]
-        write = report or (lambda text: None)
-        write(_resume_message(file, len(keys), len(found), len(known) - len(found)))
-        jobs = [
-            (
-                setup.scenario(
-                    drive=key.experiment.drive,
-                    noise=key.experiment.noise,
-                    case=key.experiment.case,
-                    seed=key.seed,
-                    duration=key.duration,
-                ),
-                methods[key.experiment.drive][key.experiment.method],
-            )
-            for key in missing
-        ]
-        try:
-            with contextlib.ExitStack() as stack:
-                bar = stack.enter_context(progress_bar(len(missing), show=report is not None))
-                runs = setup.measure_many(jobs, measure, team) if jobs else ()
-                if close := getattr(runs, 'close', None):
-                    stack.callback(close)  # its processes end with this loop, however it ends
-                for index, numbers in runs:
-                    file.add(missing[index], numbers)
-                    found[missing[index]] = numbers
-                    bar.update()
-        except BaseException:
-            write(
-                f'{len(found)} of {len(keys)} runs are kept in {file.path}: '
-                'the same command goes on from there'
-            )
-            raise
-    if len(found) != len(keys):
-        raise RuntimeError(f'{len(keys) - len(found)} runs never came back')
+    jobs = {
+        key: (
+            setup.scenario(
+                drive=key.experiment.drive,
+                noise=key.experiment.noise,
+                case=key.experiment.case,
+                seed=key.seed,
+                duration=key.duration,
+            ),
+            methods[key.experiment.drive][key.experiment.method],
+        )
+        for key in keys
+    }
+    found = run_missing_jobs(
+        file, jobs, lambda missing: setup.measure_many(missing, measure, team), report
+    )
     return {
         experiment: tuple(
             found[
@@ -459,12 +382,3 @@ def run_missing(
         )
         for experiment in needed
     }
-
-
-def _resume_message(file: RunFile, total: int, found: int, others: int) -> str:
-    text = f'{total} runs; {found} are there already, {total - found} to do'
-    if others:
-        text += f'; {others} of other versions, settings or extents are left alone'
-    if file.unreadable:
-        text += f'; {file.unreadable} torn lines are skipped'
-    return text

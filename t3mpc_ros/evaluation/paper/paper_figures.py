@@ -17,6 +17,7 @@ from t3mpc_ros.evaluation.bag_report.topic_roles import (
     REFERENCE,
     TRUTH,
 )
+from t3mpc_ros.evaluation.charts import thinned
 from t3mpc_ros.evaluation.closed_loop import LoopRecord
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.methods import FULL
@@ -45,7 +46,6 @@ from t3mpc_ros.evaluation.plotting import (
     mark_switches,
     new_figure,
     new_panels,
-    thinned,
 )
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, twist_from_wheels
 from t3mpc_ros.geometry.types import ORIGIN, WheelSpeeds

@@ -13,6 +13,7 @@ from t3mpc_ros.evaluation.paper.figure_runs import FigureRuns
 from t3mpc_ros.evaluation.paper.results import Results
 from t3mpc_ros.evaluation.reporting import (
     Block,
+    Contents,
     Details,
     Group,
     Heading,
@@ -215,6 +216,10 @@ EXHIBITS = (
 """In the order of the page."""
 
 
+HEADLINE = 'table3_rmse'
+"""Stem of the exhibit that the page shows first."""
+
+
 def findings(material: ExhibitData) -> dict[str, str]:
     """Return what was found where there is no claim to decide, by the exhibits' stems."""
     return {
@@ -246,14 +251,18 @@ def page(
     ``origin`` says where the numbers come from; tables are by heading, pictures (PNG) and findings
     by the stem of their exhibit.
     """
+    first = [each for each in EXHIBITS if each.stem == HEADLINE]
+    others = [each for each in EXHIBITS if each.stem != HEADLINE]
     return html_page(
         title,
         [
             Paragraph(origin, 'quiet'),
+            *(_exhibit(exhibit, claims, tables, pictures, findings) for exhibit in first),
+            Contents(),
             Heading('Claims'),
             _claims('What this project claims', [c for c in claims if c.origin == 'ours']),
             _claims('What the paper claims', [c for c in claims if c.origin == 'paper']),
-            *(_exhibit(exhibit, claims, tables, pictures, findings) for exhibit in EXHIBITS),
+            *(_exhibit(exhibit, claims, tables, pictures, findings) for exhibit in others),
         ],
     )
 

@@ -3,6 +3,7 @@
 """Reproduction of the paper: runs experiments, writes results, tables, figures and the page."""
 
 from collections.abc import Callable, Mapping
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,7 +44,8 @@ class PaperOptions:
     """Held-out seeds of each experiment; None for all, or three when quick."""
     estimation_seeds: int | None = None
     """The same of the comparison (86)."""
-    workers: int = 1
+    workers: int | Executor = 1
+    """As for :class:`WorkerPool`."""
     json: Path | None = None
     """Path of a second copy of the results."""
     fresh: bool = False

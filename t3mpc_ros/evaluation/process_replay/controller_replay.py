@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.bag.reader import BagReader
-from t3mpc_ros.bag.run.journal import Event
+from t3mpc_ros.bag.run.journal import Event, reading_from_value
 from t3mpc_ros.control.controller import SCALAR_NAMES, Controller, ControllerParameters, Status
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation.process_replay.controller_inputs import (
@@ -23,7 +23,9 @@ from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     inputs_of,
     motions,
 )
+from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist, StateArray
+from t3mpc_ros.simulation.world import WorldError, load_world
 
 Array = NDArray[np.float64]
 
@@ -97,12 +99,29 @@ def make_controllers(
     """Return one compiled controller for each recorded life, initialised as its node did."""
     controllers = []
     for life in inputs.lives:
-        controller = Controller(life.parameters[life.start].with_values(changes or {}))
+        parameters = life.parameters[life.start].with_values(changes or {})
+        controller = Controller(parameters, _obstacles(parameters))
         controller.warm_up()
         if life.model is not None:
             controller.set_weights(life.model)
         controllers.append(controller)
     return controllers
+
+
+def _obstacles(parameters: ControllerParameters) -> Obstacles:
+    """Return the known obstacles of a keep-out.
+
+    Raises
+    ------
+    ReplayError
+        The world is not here.
+    """
+    if not parameters.keep_out.enabled:
+        return Obstacles()
+    try:
+        return load_world(parameters.keep_out.world).obstacles
+    except WorldError as error:
+        raise ReplayError(f'keep_out.world: {error}') from error
 
 
 def recompute_scalars(
@@ -153,6 +172,8 @@ def _session_steps(
         if event == _STEP:
             if received >= 0:
                 yield row, *controller.step(odometry[received])
+        elif event == Event.RANGE:
+            controller.add_range(int(life.rows[row - life.first, 2]), reading_from_value(value))
         elif event in (Event.ODOMETRY_TIMEOUT, Event.FINISH):
             if event == Event.ODOMETRY_TIMEOUT:
                 controller.check_odometry(None, 0)

@@ -3,7 +3,7 @@
 """Tunes many methods with an equal budget: mean RMSE and chatter of closed-loop runs."""
 
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import BrokenExecutor
+from concurrent.futures import BrokenExecutor, Executor
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -98,7 +98,10 @@ class ClosedLoopObjective:
     """
 
     def __init__(
-        self, training: TuningScenarios, workers: int, report: Callable[[str], None] | None = None
+        self,
+        training: TuningScenarios,
+        workers: int | Executor,
+        report: Callable[[str], None] | None = None,
     ) -> None:
         self.training = training
         self.workers = WorkerPool(workers)
@@ -190,7 +193,7 @@ def tune_methods(
     methods: Sequence[MethodDefinition],
     drives: Sequence[str],
     evaluations: int,
-    workers: int,
+    workers: int | Executor,
     path: Path,
     report: Callable[[str], None] | None = None,
     *,

@@ -262,7 +262,11 @@ def _decoded(kind: Any, content: Any, where: str) -> Any:
         if not (math.isfinite(content) and content >= 0):
             raise StoreError(f'{where} must be at least 0 and finite: got {content}')
         return kind(content)
-    return MappingProxyType(_object(content, where))
+    # JSON has no tuples, and a parameter of many values is one.
+    values = _object(content, where).items()
+    return MappingProxyType(
+        {name: tuple(value) if isinstance(value, list) else value for name, value in values}
+    )
 
 
 def _object(content: object, where: str, names: set[str] | None = None) -> dict[str, Any]:

@@ -132,12 +132,11 @@ def breaking_acceleration(parameters: DigitalTwinParameters) -> float:
     return float(pull / (inertia[0, 0] + inertia[0, 1] + motor.rotor_inertia))
 
 
-def ramp(
-    parameters: DigitalTwinParameters, acceleration: float, speed: float, volts: float = 12.0
-) -> Ramp:
+def ramp(parameters: DigitalTwinParameters, acceleration: float, speed: float) -> Ramp:
     """Return a drive straight ahead: up to ``speed`` (rad/s), 0.4 s there, down, 0.2 s of rest.
 
-    The tyres hold whatever comes, so that only the motors can fail; nothing disturbs.
+    The supply has 12 V. The tyres hold whatever comes, so that only the motors can fail; nothing
+    disturbs.
     """
     gripping = parameters.with_values({'tyres.grip': 5.0})
     calm = replace(parameters.disturbance, bound=0.0)
@@ -151,7 +150,7 @@ def ramp(
     rows = []
     for index in range(round((2.0 * up + 0.6) / step)):
         target = speed if index * step < up + 0.4 else 0.0
-        drivetrain.run(WheelSpeeds(target, target), acceleration, volts, disturbance, 1)
+        drivetrain.run(WheelSpeeds(target, target), acceleration, 12.0, disturbance, 1)
         rows.append(
             (
                 drivetrain.pulse_speeds.right,
@@ -192,8 +191,9 @@ def sharp_deviation() -> float:
     return max(abs(output_voltage(far) / volts - 1.0) for far, volts in within)
 
 
-def low_pass_response(setting: int, step: float = 1e-4, length: int = 8192) -> LowPass:
-    """Return the response of low-pass ``setting`` (DLPF_CFG) to a pulse of one ``step`` (s)."""
+def low_pass_response(setting: int) -> LowPass:
+    """Return the response of low-pass ``setting`` (DLPF_CFG) to a pulse of 0.1 ms."""
+    step, length = 1e-4, 8192
     share = SimulatedImuParameters(low_pass=str(setting)).share(step)
     filtered = np.zeros((3, 2))
     answer = np.empty(length)

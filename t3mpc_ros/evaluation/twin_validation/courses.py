@@ -170,16 +170,15 @@ def gyro_limit(parameters: DigitalTwinParameters, course: Course) -> float:
     return scale + 3.0 * math.radians(math.hypot(wandered, unsure))
 
 
-def patrol(
-    parameters: DigitalTwinParameters, blind_from: float, longest: float, speed: float = 6.0
-) -> Patrol:
+def patrol(parameters: DigitalTwinParameters, blind_from: float, longest: float) -> Patrol:
     """Return a drive through the world of ``parameters`` that turns away from obstacles.
 
     It turns to the freer side when something is nearer than 0.3 m in front or 0.15 m beside it,
     until that is 0.4 or 0.2 m away. From ``blind_from`` (s) on no sensor answers, and it drives
-    straight on, until it has been at a wall for a second, or for ``longest`` seconds. ``speed`` is
-    that of the wheels, rad/s.
+    straight on, until it has been at a wall for a second, or for ``longest`` seconds. The wheels
+    turn at 6 rad/s.
     """
+    speed = 6.0
     log = _Log('patrol', parameters, [FaultEvent(blind_from, 'ranges_dead', True)])
     world, radius = load_world(parameters.world), parameters.bumper.radius
     ranges = []

@@ -8,16 +8,23 @@ import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from matplotlib.patches import Circle, Polygon
+from matplotlib.patches import Circle
 import numpy as np
 import numpy.typing as npt
 
 from t3mpc_ros.evaluation.bag_report.topic_roles import REFERENCE, TRUTH
 from t3mpc_ros.evaluation.confidence_intervals import rms
-from t3mpc_ros.evaluation.plotting import COLOURS, legend_above, new_figure, write_pictures
+from t3mpc_ros.evaluation.plotting import (
+    COLOURS,
+    draw_world,
+    legend_above,
+    new_figure,
+    write_pictures,
+)
 from t3mpc_ros.evaluation.reporting import (
     EMPTY_CELL,
     Block,
+    Contents,
     Heading,
     Paragraph,
     Picture,
@@ -43,10 +50,10 @@ from t3mpc_ros.evaluation.twin_validation.courses import (
     holds_from,
     select_drifts,
 )
+from t3mpc_ros.robot.description import sensor_mounts
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 from t3mpc_ros.simulation.fault_injection import FaultEvent
-from t3mpc_ros.simulation.sensors.range_sensor import sensor_mounts
-from t3mpc_ros.simulation.world import World, load_world
+from t3mpc_ros.simulation.world import load_world
 
 Array = npt.NDArray[np.float64]
 
@@ -144,7 +151,7 @@ def room(patrol: Patrol, parameters: DigitalTwinParameters) -> Any:
     axis = figure.subplots()
     axis.set_axisbelow(True)
     world = load_world(parameters.world)
-    _draw_world(axis, world)
+    draw_world(axis, world)
     faces = sensor_mounts(parameters.range_sensor)
     blind = int(np.searchsorted(course.time, patrol.blind_from))
     moments = np.linspace(blind // 6, blind - 1, 5).astype(int)
@@ -171,20 +178,6 @@ def room(patrol: Patrol, parameters: DigitalTwinParameters) -> Any:
     axis.set(xlabel='x / m', ylabel='y / m')
     legend_above(figure, axis, columns=4)
     return figure
-
-
-def _draw_world(axis: Any, world: World) -> None:
-    for x, y, radius, _ in world.patches:
-        axis.add_patch(Circle((x, y), radius, color='#fde68a', lw=0.0))
-    for x, y, radius in world.circles:
-        axis.add_patch(Circle((x, y), radius, fc='#d1d5db', ec='#374151', lw=1.5))
-    for x, y, length, width, yaw in world.boxes:
-        corners = 0.5 * np.array([(length, width), (-length, width), (-length, -width),
-                                  (length, -width)])  # fmt: skip
-        turned = corners @ _rotation(yaw).T
-        axis.add_patch(Polygon(turned + (x, y), color='#d1d5db'))
-    for ax, ay, bx, by in world.segments:
-        axis.plot((ax, bx), (ay, by), color='#374151', lw=1.5)
 
 
 def _draw_robot(axis: Any, pose: Array, parameters: DigitalTwinParameters, colour: str) -> None:
@@ -484,7 +477,7 @@ VALIDATION_FIGURES = (
         overview,
     ),
 )
-"""In the order of the page; the last, four of them in one, is for other pages."""
+"""In the order of the page; the last, four of them in one, comes first there."""
 
 
 PAGE = 'twin.html'
@@ -518,8 +511,17 @@ def write_validation(
     if amount == QUICK:
         origin = f'a quick look, {origin}'
     findings = _findings(evidence)
-    blocks: list[Block] = [Paragraph(origin, 'quiet'), *map(Paragraph, findings), *tables]
-    for drawing in VALIDATION_FIGURES[:-1]:
+    *others, overview_figure = VALIDATION_FIGURES
+    overview_picture = pictures[overview_figure.stem]
+    blocks: list[Block] = [
+        Paragraph(origin, 'quiet'),
+        Picture(overview_figure.title, overview_picture, overview_figure.caption),
+        Contents(),
+        Heading('Findings'),
+        *map(Paragraph, findings),
+        *tables,
+    ]
+    for drawing in others:
         picture = Picture(drawing.title, pictures[drawing.stem], drawing.caption)
         blocks += [Heading(drawing.title), picture]
     (output / PAGE).write_text(html_page(TITLE, blocks), encoding='utf-8')

@@ -1,0 +1,132 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Section of a report on where the robot was: coverage, evenness, predictability."""
+
+from collections.abc import Iterator
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.evaluation.bag_report.continuity import gaps
+from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
+from t3mpc_ros.evaluation.bag_report.topic_roles import REFERENCE, TRUTH
+from t3mpc_ros.evaluation.charts import Chart, Line
+from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid, coverage_at
+from t3mpc_ros.evaluation.patrol.patrol_metrics import SHARES, SHORTEST, patrol_metrics
+from t3mpc_ros.evaluation.reporting import Block, Heading, Paragraph, Table
+from t3mpc_ros.simulation.world import recorded_world
+
+Array = NDArray[np.float64]
+
+LEAST_DISTANCE, LEAST_SIZE = 2.0, 0.5
+"""Length of the path, and of a side of its bounding box, from which on there is a section, m."""
+CLOSE = 0.1
+"""Distance from the recorded pose of the reference that a robot which follows it keeps, m."""
+FOLLOWED = 0.9
+"""Share of the time in which it does."""
+BODY = 0.11
+"""Radius of the robot, m: cells whose centre it cannot reach do not count."""
+_SAMPLE = 0.05
+
+
+def followed_reference(run: Run) -> Series | None:
+    """Return the reference if the robot follows its positions; None if it tracks speeds alone.
+
+    The recorded parameters decide. Without them, in a bag of another robot, the distance does.
+    """
+    reference, motion = run.motions.get(REFERENCE), run.motions.get(run.measured)
+    if motion is None or reference is None or 'x' not in reference.values or len(reference) < 2:
+        return None
+    inside = (motion.time >= reference.time[0]) & (motion.time <= reference.time[-1])
+    if not inside.any() or not np.ptp(reference['x']) + np.ptp(reference['y']) > 0.0:
+        return None
+    if run.follows_path:
+        return reference
+    away = [
+        motion[axis][inside] - np.interp(motion.time[inside], reference.time, reference[axis])
+        for axis in 'xy'
+    ]
+    return reference if float(np.quantile(np.hypot(*away), FOLLOWED)) < CLOSE else None
+
+
+def patrol_blocks(run: Run) -> Iterator[Block]:
+    """Yield the section; nothing for a robot that hardly left its place."""
+    motion = run.motions.get(run.measured)
+    if motion is None or len(motion) < 2:
+        return
+    time, x, y = _thinned(motion)
+    distance = float(np.hypot(np.diff(x), np.diff(y)).sum())
+    if time.size < 2 or distance < LEAST_DISTANCE or max(np.ptp(x), np.ptp(y)) < LEAST_SIZE:
+        return
+    grid, where = _grid(run, x, y)
+    reference = followed_reference(run)
+    wanted = None
+    if reference is not None:
+        inside = (time >= reference.time[0]) & (time <= reference.time[-1])
+        wanted = np.column_stack(
+            [np.interp(time, reference.time, reference[axis]) for axis in 'xy']
+        )
+        wanted[~inside] = math.nan
+    torn = bool(gaps(motion.time))
+    found = patrol_metrics(time, x, y, grid, wanted, whole=not torn)
+    rows = [['cells entered', f'{100.0 * found.coverage:.1f} %']]
+    for share in SHARES:
+        needed = found.times[share]
+        text = f'after {needed:.1f} s' if math.isfinite(needed) else 'not reached'
+        rows.append([f'{100.0 * share:g} % of the cells', text])
+    rows.append(['evenness of the time in the cells', f'{found.evenness:.3f}'])
+    if math.isfinite(found.path_error):
+        rows.append(['path error, root mean square', f'{1e3 * found.path_error:.1f} mm'])
+    for skill in found.skills:
+        rows.append(
+            [
+                f'skill of an observer, {skill.horizon:g} s ahead',
+                f'{skill.best:.3f} ({skill.predictor})',
+            ]
+        )
+    for name, value, unit in (
+        ('permutation entropy', found.permutation_entropy, ''),
+        ('spectral entropy', found.spectral_entropy, ''),
+        ('largest Lyapunov exponent of the path', found.exponent, ' 1/s'),
+    ):
+        if math.isfinite(value):
+            rows.append([name, f'{value:.3f}{unit}'])
+    yield Heading('Coverage and predictability')
+    yield Table('', ['quantity', 'value'], rows)
+    assert found.visits is not None
+    curve = 100.0 * coverage_at(found.visits, grid, time - time[0])
+    seen = f'{100.0 * found.coverage:.1f} % of the cells were entered.'
+    yield Chart('Coverage', '%', [Line('cells entered', 'c1', time, curve)], seen)
+    short = (
+        f' Predictability, entropies and exponent need {SHORTEST:g} s without a gap.'
+        if not found.skills
+        else ' Skill: an observer learns from the first half of the path and predicts the '
+        'second; 1 exact, 0 no better than the mean position.'
+    )
+    yield Paragraph(
+        f'A grid of 20 × 20 cells over {where}; evenness 1: the same time in each.{short}', 'quiet'
+    )
+
+
+def _thinned(motion: Series) -> tuple[Array, Array, Array]:
+    """Return time (s) and position (m), at most every :data:`_SAMPLE` seconds."""
+    ticks = np.floor(motion.time / _SAMPLE)
+    rows = np.concatenate([[True], np.diff(ticks) > 0.0])
+    return motion.time[rows], motion['x'][rows], motion['y'][rows]
+
+
+def _grid(run: Run, x: Array, y: Array) -> tuple[CoverageGrid, str]:
+    """Return the grid over the known room, else over what the robot drove, and which it is."""
+    world = recorded_world(run.world) if run.measured == TRUTH else None
+    if world is not None and len(world.segments):
+        box = world.bounding_box
+        grid = CoverageGrid((box.left, box.bottom), (box.right, box.top))
+        centres = grid.centres().tolist()
+        blocked = np.array([[not world.is_free(a, b, BODY) for a, b in row] for row in centres])
+        if not blocked.all():
+            cells = CoverageGrid(grid.low, grid.high, blocked=blocked)
+            return cells, f'the room {world.name}, without those that the robot cannot reach'
+    low = float(x.min()) - 1e-6, float(y.min()) - 1e-6
+    high = float(x.max()) + 1e-6, float(y.max()) + 1e-6
+    return CoverageGrid(low, high), 'the bounding box of the path'

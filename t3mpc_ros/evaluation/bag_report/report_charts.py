@@ -1,0 +1,584 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Charts of the bag report in page order, each with a sentence on what is seen in it."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, TypeGuard
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.control.control_law import TERM_NAMES
+from t3mpc_ros.control.controller import WHEELS
+from t3mpc_ros.evaluation.bag_report.continuity import POSE_JUMP, gaps, pose_jumps
+from t3mpc_ros.evaluation.bag_report.metrics import (
+    UNMEASURED,
+    WINDOW,
+    ReportMetrics,
+    driven,
+    estimation_target,
+    format_number,
+    latencies,
+    path_of,
+    tracking_error,
+)
+from t3mpc_ros.evaluation.bag_report.response import ResponseFit, busiest, predicted, smooth
+from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
+from t3mpc_ros.evaluation.bag_report.topic_roles import (
+    COMMAND,
+    ODOMETRY,
+    REFERENCE,
+    SIGNALS,
+    TRUTH,
+)
+from t3mpc_ros.evaluation.charts import Chart, Curve, Line, Plane, thinned
+from t3mpc_ros.simulation.world import world_outline
+
+Array = NDArray[np.float64]
+Shown = Iterator[Chart | Plane]
+
+LABELS = {
+    TRUTH: 'robot (ground truth)',
+    ODOMETRY: 'robot (odometry)',
+    REFERENCE: 'reference',
+    COMMAND: 'command',
+}
+COLOURS = {TRUTH: 'truth', ODOMETRY: 'right', REFERENCE: 'reference', COMMAND: 'left'}
+"""Variables of the style sheet by motion, the same in every chart."""
+DASHES = {REFERENCE: (6, 4), COMMAND: (2, 3)}
+TERM_DASHES = ((), (6, 3), (2, 3), (8, 3, 2, 3), (1, 4), (4, 2))
+DETAIL = 4.0
+"""Time in which the fitted response is shown, s: where the command varies most."""
+
+
+def line(
+    label: str, colour: str, series: Series, name: str = 'value', *, style: str = 'line',
+    dash: tuple[int, ...] = (), scale: float = 1.0,
+) -> Line:  # fmt: skip
+    """Return one quantity of a series, interrupted at its gaps."""
+    time, value = thinned(series.time, scale * series[name])
+    found = gaps(series.time)
+    if found:
+        middles = np.array([0.5 * (low + high) for low, high in found])
+        rows = np.searchsorted(time, middles)
+        time, value = np.insert(time, rows, middles), np.insert(value, rows, np.nan)
+    kind: dict[str, Any] = {'style': style}
+    return Line(label, colour, time, value, dash, **kind)
+
+
+def is_long(series: Series | None) -> TypeGuard[Series]:
+    """Return whether there is more than one point."""
+    return series is not None and len(series) > 1
+
+
+def _extent(values: Array, unit: str) -> str:
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return 'unknown'
+    return f'from {format_number(known.min())} to {format_number(known.max())} {unit}'
+
+
+def _largest(series: Series, name: str, mask: NDArray[np.bool_], unit: str) -> str:
+    """Return the largest size of a quantity where ``mask`` is true, and its time."""
+    size = np.where(mask & np.isfinite(series[name]), np.abs(series[name]), -1.0)
+    row = int(np.argmax(size))
+    return f'{format_number(size[row])} {unit} at {series.time[row]:.1f} s'
+
+
+def tracking(run: Run, metrics: ReportMetrics) -> Shown:
+    """Yield the reference and the speed of both channels over time, the paper's Fig. 11."""
+    reference, measured = run.motions.get(REFERENCE), _motions(run, ODOMETRY, TRUTH)
+    if not is_long(reference) or not measured:
+        return
+    for name, title, _, unit in run.channels:
+        lines = [line(LABELS[k], COLOURS[k], each, name) for k, each in measured.items()]
+        dash = DASHES[REFERENCE]
+        lines.append(line(LABELS[REFERENCE], COLOURS[REFERENCE], reference, name, dash=dash))
+        settled = metrics.wheels[name].settled
+        follows = (
+            f'the {LABELS[run.measured]} follows it with a settled RMSE of '
+            f'{format_number(settled.rmse)} {unit}'
+            if settled.count
+            else f'the settled error is {UNMEASURED}'
+        )
+        seen = f'The reference runs {_extent(reference[name], unit)}; {follows}.'
+        yield Chart(title, unit, lines, seen)
+
+
+def error(run: Run, metrics: ReportMetrics) -> Shown:
+    """Yield the tracking error of both channels over time."""
+    series = tracking_error(run, run.measured)
+    if not is_long(series):
+        return
+    moving = driven(series.time, run)
+    lines: list[Line] = []
+    seen: list[str] = []
+    for colour, (name, title, _, unit) in zip(('right', 'left'), run.channels, strict=True):
+        dash = (6, 3) if colour == 'left' else ()
+        found = metrics.wheels[name]
+        if moving.any():
+            text = (
+                f'{title.capitalize()}: RMSE {format_number(found.overall.rmse)} {unit} while '
+                f'driven, {format_number(found.settled.rmse)} {unit} settled; the largest error '
+                f'is {_largest(series, name, moving, unit)}.'
+            )
+        else:
+            text = f'{title.capitalize()}: {UNMEASURED}.'
+        lines.append(line(title, colour, series, name, dash=dash))
+        seen.append(text)
+    if run.channels[0].unit == run.channels[1].unit:
+        yield Chart('Error', run.channels[0].unit, lines, ' '.join(seen))
+        return
+    for each, channel, text in zip(lines, run.channels, seen, strict=True):
+        yield Chart(f'Error, {channel.title}', channel.unit, [each], text)
+
+
+def switching(run: Run, metrics: ReportMetrics) -> Shown:
+    """Yield the active mode and the chaotic signals of the wheels, the paper's Fig. 10."""
+    titles = dict(zip(SIGNALS, ('active mode', 'right wheel', 'left wheel'), strict=True))
+    lines = []
+    for (name, title), colour, dash in zip(
+        titles.items(), ('c4', 'right', 'left'), ((), (6, 3), (2, 3)), strict=True
+    ):
+        if series := run.numbers.get(name):
+            end = max(run.duration, float(series.time[-1]))
+            held = Series(
+                np.append(series.time, end),
+                {'value': np.append(series['value'], series['value'][-1])},
+            )
+            time, value = held.time, held['value']
+            lines.append(Line(title, colour, time, value, dash, 'steps'))
+    if lines:
+        count = run.switches.size
+        times = ', '.join(f'{each:.1f}' for each in run.switches[:8])
+        seen = f'The reference switches {count} times' + (f', at {times} s' if count else '')
+        yield Chart('Active mode and chaotic signals', 'number', lines, f'{seen}.')
+
+
+def control(run: Run, metrics: ReportMetrics) -> Shown:
+    """Yield commanded speeds and applied accelerations, the paper's Fig. 12."""
+    command = run.motions.get(COMMAND)
+    if not is_long(command):
+        return
+    for name, title, _, unit in run.channels:
+        shown = line('command', COLOURS[COMMAND], command, name, style='steps')
+        found = metrics.wheels[name]
+        seen = (
+            f'The command runs {_extent(command[name], unit)} and varies by '
+            f'{format_number(found.chatter)} {unit} per second'
+        )
+        if np.isfinite(found.demand):
+            seen += f'; the reference varies by {format_number(found.demand)}'
+        yield Chart(f'Command, {title}', unit, [shown], f'{seen}.')
+    applied = {
+        wheel: series for wheel in WHEELS if is_long(series := _term(run, 'applied', wheel))
+    }
+    if applied:
+        lines = [
+            line(f'{wheel} wheel', wheel, series, dash=() if wheel == 'right' else (6, 3))
+            for wheel, series in applied.items()
+        ]
+        values = np.concatenate([series['value'] for series in applied.values()])
+        seen = f'The acceleration u after all limits is {_extent(values, "rad/s²")}.'
+        yield Chart('Acceleration u applied', 'rad/s²', lines, seen)
+
+
+def response(run: Run, metrics: ReportMetrics) -> Shown:
+    """Yield command and measured speed of both channels with the fit."""
+    command, motion = run.motions.get(COMMAND), run.motions.get(run.measured)
+    if not is_long(command) or not is_long(motion):
+        return
+    for name, title, _, unit in run.channels:
+        lines = [
+            line(LABELS[run.measured], COLOURS[run.measured], motion, name),
+            line('command', COLOURS[COMMAND], command, name, style='steps', dash=DASHES[COMMAND]),
+        ]
+        fit = metrics.responses.get(name)
+        seen = 'No clear response of the speed to the command was found.'
+        if fit is not None and fit.clear:
+            start, end = busiest(command, motion, name, DETAIL)
+            lines.append(_fitted(fit, command, name, start, end))
+            seen = (
+                f'The robot responds {1e3 * (fit.dead_time + fit.lag):.0f} ms late: dead time '
+                f'{1e3 * fit.dead_time:.0f} ms, lag {1e3 * fit.lag:.0f} ms, gain {fit.gain:.3g}. '
+                f'The fit is drawn from {start:.1f} to {end:.1f} s, where the command varies most.'
+            )
+        yield Chart(f'Response, {title}', unit, lines, seen)
+
+
+def _fitted(fit: ResponseFit, command: Series, name: str, start: float, end: float) -> Line:
+    time = np.arange(max(start - 10.0, command.time[0]), end, 0.005)
+    value = predicted(fit, command, name, time) if time.size > 1 else np.zeros(time.size)
+    near = time >= start
+    return Line('fit', 'c4', time[near], value[near], (4, 2))
+
+
+def acceleration(run: Run, metrics: ReportMetrics) -> Shown:
+    """Yield acceleration and jerk of the measured speeds."""
+    motion = run.motions.get(run.measured)
+    if not is_long(motion):
+        return
+    for name, title, _, unit in run.channels:
+        time, _, rate, bend = smooth(motion, name)
+        if not np.isfinite(rate).any():
+            continue
+        for values, what, power in ((rate, 'acceleration', '²'), (bend, 'jerk', '³')):
+            few, some = thinned(time, values, 4000)
+            lines = [Line(what, COLOURS[run.measured], few, some)]
+            seen = f'The {what} runs {_extent(values, unit + power)}.'
+            yield Chart(f'{title.capitalize()}: {what}', f'{unit}{power}', lines, seen)
+
+
+def terms(run: Run, metrics: ReportMetrics) -> Shown:
+    """Yield the terms of the control law, (66)-(67), by wheel."""
+    names = (*TERM_NAMES, 'applied')
+    colours = ('c1', 'c2', 'c3', 'c4', 'c5', 'ink')
+    symbols = ('−g', '−Kδ', 'ṙ', 'v_c', 'v_p', 'u')
+    for wheel in WHEELS:
+        lines, sizes = [], []
+        for name, symbol, colour, dash in zip(names, symbols, colours, TERM_DASHES, strict=True):
+            if is_long(series := _term(run, name, wheel)):
+                lines.append(line(f'{name} {symbol}', colour, series, dash=dash))
+                size = float(np.sqrt(np.nanmean(series['value'] ** 2)))
+                sizes.append(f'{name} {format_number(size)}')
+        if lines:
+            seen = f'Root mean squares: {", ".join(sizes)} rad/s².'
+            yield Chart(f'Terms, {wheel} wheel', 'rad/s²', lines, seen)
+
+
+def estimates(run: Run, metrics: ReportMetrics) -> Shown:
+    """Yield the estimates of the unknown dynamics and their targets, the paper's Fig. 13."""
+    for wheel in WHEELS:
+        series = run.numbers.get(f'controller/estimate/{wheel}')
+        if not is_long(series):
+            continue
+        lines = []
+        seen = f'The estimate runs {_extent(series["value"], "rad/s²")}'
+        target = estimation_target(run, wheel)
+        if target is not None:
+            lines.append(line('target', 'reference', target))
+            apart = target['value'] - np.interp(target.time, series.time, series['value'])
+            if np.isfinite(apart).any():
+                rmse = float(np.sqrt(np.nanmean(apart**2)))
+                seen += f'; its RMSE against the target is {format_number(rmse)} rad/s²'
+        lines.append(line('estimate g', 'c4', series))
+        yield Chart(f'Estimate, {wheel} wheel', 'rad/s²', lines, f'{seen}.')
+
+
+def portrait(run: Run, metrics: ReportMetrics) -> Shown:
+    """Yield one channel over the other, reference and measured, the paper's Figs. 9 and 14."""
+    shown = _motions(run, REFERENCE, run.measured)
+    if len(shown) < 2:
+        return
+    curves = []
+    for name, motion in shown.items():
+        right, left = (motion[each.name] for each in run.channels)
+        breaks = np.flatnonzero(np.isin(motion.time, run.switches)) if name == REFERENCE else ()
+        curves.append(_curve(name, motion, left, right, breaks))
+    upwards, rightwards = (each.title for each in run.channels)
+    units = ' and '.join(dict.fromkeys(each.unit for each in run.channels))
+    seen = (
+        f'The {upwards} upwards over the {rightwards}; the closer the curves, the better the '
+        'tracking.'
+    )
+    yield Plane(f'{upwards.capitalize()} over {rightwards}', units, curves, seen)
+
+
+def path(run: Run, metrics: ReportMetrics) -> Shown:
+    """Yield the paths on the floor: measured, and integrated from the reference."""
+    shown = _motions(run, ODOMETRY, TRUTH)
+    if not shown:
+        return
+    base, curves, marks = run.motions[run.measured], [], []
+    frame = _odometry_frame(run)
+    for name, motion in shown.items():
+        x, y = motion['x'], motion['y']
+        if name == ODOMETRY:
+            x, y = _moved(frame, x, y)
+        positions = np.stack([x, y], axis=1)
+        breaks = pose_jumps(motion.time, positions, motion['linear'], POSE_JUMP)
+        curves.append(_curve(name, motion, x, y, breaks))
+    measured = curves[-1]
+    reference = run.motions.get(REFERENCE)
+    if is_long(reference):
+        first = min(int(np.searchsorted(base.time, reference.time[0])), len(base) - 1)
+        x, y = path_of(reference, (base['x'][first], base['y'][first], base['yaw'][first]))
+        curves.insert(0, _curve(REFERENCE, reference, x, y, ()))
+    for times, colour in (
+        (run.switches, 'reference'),
+        (np.array([stop.start for stop in metrics.verdict.stops]), 'stopped'),
+    ):
+        rows = np.searchsorted(measured.time, times[:200])
+        rows = rows[rows < measured.time.size]
+        marks += [(float(measured.x[k]), float(measured.y[k]), colour) for k in rows]
+    marks = [mark for mark in marks if np.isfinite(mark[:2]).all()]
+    x, y = measured.x[np.isfinite(measured.x)], measured.y[np.isfinite(measured.y)]
+    seen = (
+        f'The robot moved in x {_extent(x, "m")} and in y {_extent(y, "m")}, and ended '
+        f'{format_number(float(np.hypot(x[-1] - x[0], y[-1] - y[0])))} m from its start.'
+    )
+    if run.switches.size:
+        seen += ' Grey points: switches of the reference.'
+    if metrics.verdict.stops:
+        seen += ' Red points: stops.'
+    yield Plane('Floor', 'm', curves, seen, world_outline(run.world), marks)
+
+
+def _curve(
+    name: str, motion: Series, x: Array, y: Array, breaks: NDArray[np.int64] | tuple[()]
+) -> Curve:
+    """Return a curve, interrupted before the rows ``breaks`` and at the gaps of the motion."""
+    torn = [int(np.searchsorted(motion.time, high)) for _, high in gaps(motion.time)]
+    rows = np.unique(np.array([*breaks, *torn], dtype=np.int64))
+    time = np.insert(motion.time, rows, motion.time[rows])
+    x, y = np.insert(x, rows, np.nan), np.insert(y, rows, np.nan)
+    return Curve(LABELS[name], COLOURS[name], time, x, y, DASHES.get(name, ()))
+
+
+def _odometry_frame(run: Run) -> tuple[float, float, float]:
+    """Return the pose of the odometry frame on the floor.
+
+    It is laid on the true pose at the first common instant: later, their distance is the drift.
+    """
+    odometry, truth = run.motions.get(ODOMETRY), run.motions.get(TRUTH)
+    if odometry is None or truth is None:
+        return 0.0, 0.0, 0.0
+    start = max(odometry.time[0], truth.time[0])
+    i = min(int(np.searchsorted(odometry.time, start)), len(odometry) - 1)
+    k = min(int(np.searchsorted(truth.time, start)), len(truth) - 1)
+    turn = float(truth['yaw'][k] - odometry['yaw'][i])
+    x, y = _moved((0.0, 0.0, turn), odometry['x'][i], odometry['y'][i])
+    return float(truth['x'][k] - x), float(truth['y'][k] - y), turn
+
+
+def _moved(frame: tuple[float, float, float], x: Any, y: Any) -> tuple[Any, Any]:
+    c, s = np.cos(frame[2]), np.sin(frame[2])
+    return frame[0] + c * x - s * y, frame[1] + s * x + c * y
+
+
+def certificate(run: Run, metrics: ReportMetrics) -> Shown:
+    """Yield the run-time certificate, (83) with E14, and the predictor's skill."""
+    value, margin = (run.numbers.get(f'controller/lyapunov/{n}') for n in ('value', 'margin'))
+    if is_long(value):
+        seen = f'V runs {_extent(value["value"], "rad²/s²")}.'
+        yield Chart('V, half the squared error', 'rad²/s²', [line('V', 'c1', value)], seen)
+    if is_long(margin):
+        below = 100.0 * float(np.mean(margin['value'] < 0.0))
+        seen = f'The margin is below zero {below:.1f} % of the time.'
+        lines = [line('margin', 'c5', margin)]
+        yield Chart('Margin of the guaranteed decrease', 'rad²/s³', lines, seen)
+    skill = {
+        w: series for w in WHEELS if is_long(series := run.numbers.get(f'controller/skill/{w}'))
+    }
+    if skill:
+        lines = [
+            line(f'{wheel} wheel', wheel, series, dash=() if wheel == 'right' else (6, 3))
+            for wheel, series in skill.items()
+        ]
+        means = ', '.join(
+            f'{format_number(float(np.nanmean(series["value"])))} of the {wheel} wheel'
+            for wheel, series in skill.items()
+        )
+        yield Chart('Skill of the predictor', 'share', lines, f'Mean: {means}.')
+
+
+COUNTED = {
+    'robot_resets': 'resets of the robot board',
+    'dongle_resets': 'resets of the dongle',
+    'port_failures': 'port failures',
+    'crc_errors': 'wrong checksums',
+    'frame_errors': 'malformed frames',
+}
+
+
+def link(run: Run, metrics: ReportMetrics) -> Shown:
+    """Yield answered cycles, round trips and counters of faults."""
+    if not run.links or run.links[0].time.size < 2:
+        return
+    shown = run.links[0]
+    values, answered = shown.values, shown.answered()
+    if np.isfinite(answered).any():
+        series = Series(shown.time, {'value': 100.0 * answered})
+        seen = f'Least share of a report: {100.0 * float(np.nanmin(answered)):.1f} %.'
+        lines = [line('answered', 'c3', series, style='steps')]
+        yield Chart(f'{shown.name}: cycles answered since the report before', '%', lines, seen)
+    trips = [key for key in ('round_trip_median_ms', 'round_trip_p99_ms') if key in values]
+    if trips:
+        lines = [
+            line(
+                'median' if 'median' in key else '99 % below',
+                colour,
+                Series(shown.time, values),
+                key,
+            )
+            for key, colour in zip(trips, ('c1', 'c2'), strict=False)
+        ]
+        seen = (
+            f'The round trip is {_extent(np.concatenate([values[key] for key in trips]), "ms")}.'
+        )
+        yield Chart('Round trip', 'ms', lines, seen)
+    counted = [key for key in COUNTED if np.isfinite(values.get(key, np.array([np.nan]))).any()]
+    if counted:
+        lines = []
+        grown = []
+        for key, dash, colour in zip(
+            counted, TERM_DASHES, ('c1', 'c2', 'c3', 'c4', 'c5'), strict=False
+        ):
+            since = values[key] - values[key][np.isfinite(values[key])][0]
+            series = Series(shown.time, {'value': since})
+            lines.append(line(COUNTED[key], colour, series, style='steps', dash=dash))
+            grown.append(f'{COUNTED[key]} {np.nanmax(since):.0f}')
+        yield Chart('Faults since the first report', 'number', lines, f'{", ".join(grown)}.')
+
+
+def timing(run: Run, metrics: ReportMetrics) -> Shown:
+    """Yield the loop latency and the regularity of odometry and commands."""
+    delay = latencies(run)
+    if not is_long(delay):
+        return
+    seen = (
+        f'Median {format_number(1e3 * metrics.latency)} ms, 99 % below '
+        f'{format_number(1e3 * metrics.latency_99)} ms, largest '
+        f'{format_number(1e3 * float(delay["value"].max()))} ms.'
+    )
+    lines = [line('latency', 'c1', delay, style='points', scale=1e3)]
+    yield Chart('From odometry to command', 'ms', lines, seen)
+    for name in (ODOMETRY, COMMAND):
+        received = run.receipts[name]
+        steps = 1e3 * np.diff(received)
+        if steps.size < 1:
+            continue
+        row = int(np.argmax(steps))
+        seen = (
+            f'Median {format_number(float(np.median(steps)))} ms; the largest, '
+            f'{format_number(float(steps[row]))} ms, ends at {received[row + 1]:.1f} s.'
+        )
+        lines = [Line(name, COLOURS[name], *thinned(received[1:], steps), (), 'points')]
+        yield Chart(f'Between two messages of {name}', 'ms', lines, seen)
+
+
+def _motions(run: Run, *names: str) -> dict[str, Series]:
+    return {name: motion for name in names if is_long(motion := run.motions.get(name))}
+
+
+def _term(run: Run, name: str, wheel: str) -> Series | None:
+    return run.numbers.get(f'controller/terms/{name}/{wheel}')
+
+
+@dataclass(frozen=True)
+class Section:
+    """Charts below a heading, with a caption."""
+
+    title: str
+    caption: str
+    draw: Callable[[Run, ReportMetrics], Shown]
+    needs: tuple[str, ...]
+    """Relative names of the topics it needs; empty: it is left out without a word."""
+    ours: bool = False
+    """Whether it needs topics of this package's nodes."""
+
+
+SECTIONS = (
+    Section(
+        'Speeds and their references (Fig. 11)',
+        'Wheel speeds are computed from the body twists by (1). Dashed vertical lines: switches.',
+        tracking,
+        (REFERENCE, ODOMETRY, TRUTH),
+        True,
+    ),
+    Section(
+        'Tracking error over time',
+        'Speed minus reference at the stamps of the measurement, over the whole recording; the '
+        'metrics count only the time in which the robot was driven.',
+        error,
+        (REFERENCE, ODOMETRY, TRUTH),
+        True,
+    ),
+    Section(
+        'Path on the floor',
+        'The reference is integrated from the initial pose of the robot. Speeds are tracked, not '
+        'positions, so the paths diverge. With ground truth, the frame of the odometry is laid on '
+        'the first true pose: later, their distance is the drift.',
+        path,
+        (ODOMETRY, TRUTH),
+    ),
+    Section(
+        'Terms of the control law (Fig. 12)',
+        'The terms of (66)-(67) with E12, and the applied acceleration.',
+        terms,
+        tuple(f'controller/terms/{name}/{w}' for name in (*TERM_NAMES, 'applied') for w in WHEELS),
+        True,
+    ),
+    Section(
+        'Commands (Fig. 12)',
+        'The command is published as a body twist; u is the acceleration after all limits.',
+        control,
+        (COMMAND, *(f'controller/terms/applied/{wheel}' for wheel in WHEELS)),
+    ),
+    Section(
+        'Response of the robot to its commands',
+        'The fit is the command with a dead time, a first-order lag and a gain that together '
+        'explain most of the measured speed. Commands are placed by receive time, odometry by '
+        'its stamps, so the delay is the one observed at the recorder.',
+        response,
+        (COMMAND, ODOMETRY),
+    ),
+    Section(
+        'Switching modes and chaotic signals (Fig. 10)',
+        'As published by the reference node, at the time for which it is valid.',
+        switching,
+        ('reference/signals', *SIGNALS),
+        True,
+    ),
+    Section(
+        'Estimates of the unknown dynamics and their targets (Fig. 13)',
+        'The target is the measured acceleration of the wheel minus the applied one, both '
+        f'smoothed over {WINDOW:g} s by a local straight line; it is undefined at switches, where '
+        'the applied one jumps between two of its samples.',
+        estimates,
+        tuple(f'controller/estimate/{wheel}' for wheel in WHEELS),
+        True,
+    ),
+    Section(
+        'Phase portrait, one speed against the other (Figs. 9 and 14)',
+        'Both curves have the same axes.',
+        portrait,
+        (REFERENCE, ODOMETRY, TRUTH),
+        True,
+    ),
+    Section(
+        'Run-time certificate and skill of the predictor',
+        'The margin is the largest rate of V by E14 minus its actual rate: it is negative when '
+        'the disturbance is larger than assumed, or just after a jump of the reference. '
+        'Skill is 1 for perfect prediction and 0 for no better than persistence.',
+        certificate,
+        (
+            'controller/lyapunov/value',
+            'controller/lyapunov/margin',
+            *(f'controller/skill/{wheel}' for wheel in WHEELS),
+        ),
+        True,
+    ),
+    Section(
+        'Acceleration and jerk over time',
+        'Derivatives of the measured speeds, of parabolas fitted to short windows.',
+        acceleration,
+        (ODOMETRY, TRUTH),
+    ),
+    Section(
+        'The radio link',
+        'From the diagnostics of the bridge. A cycle is a command with a request for telemetry; '
+        'it is answered when a measurement is received. Round trips are over the last '
+        '500 cycles.',
+        link,
+        (),
+    ),
+    Section(
+        'Punctuality of the loop',
+        'By receive times at the recorder.',
+        timing,
+        (ODOMETRY, COMMAND),
+    ),
+)
+"""In the order of the report."""

@@ -1,0 +1,342 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""HTML page that compares recorded runs: which has the smaller error, charts overlaid, tables."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.evaluation.bag_report.metrics import (
+    ChannelMetrics,
+    ReportMetrics,
+    compute_metrics,
+    driven,
+    driving,
+    format_number,
+    preview_before_switch,
+    settled,
+    tracking_error,
+)
+from t3mpc_ros.evaluation.bag_report.report_charts import TERM_DASHES, is_long, line
+from t3mpc_ros.evaluation.bag_report.report_page import verdict_box
+from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series, load_run
+from t3mpc_ros.evaluation.bag_report.topic_roles import (
+    COMMAND,
+    ODOMETRY,
+    REFERENCE,
+    ReportError,
+    ReportOptions,
+    bag_display_name,
+)
+from t3mpc_ros.evaluation.charts import Chart, Curve, Plane
+from t3mpc_ros.evaluation.confidence_intervals import interval, rms
+from t3mpc_ros.evaluation.reporting import (
+    EMPTY_CELL,
+    Block,
+    Contents,
+    Group,
+    Heading,
+    Items,
+    Paragraph,
+    Table,
+    VerdictBox,
+    html_page,
+)
+
+Array = NDArray[np.float64]
+
+PAGE = 'comparison.html'
+BLOCK = 5.0
+"""Time over which errors are averaged to one value of the confidence interval, s: far longer than
+the error is correlated."""
+SAME_REFERENCE = 0.05
+"""Largest difference of two equal references, as a share of their root mean square."""
+COLOURS = ('c1', 'c2', 'c3', 'c4', 'c5', 'ink')
+MAX_RUNS = len(COLOURS)
+"""Runs that a page compares."""
+BETTER, WORSE, INCONCLUSIVE = 'smaller error', 'larger error', 'inconclusive'
+
+
+@dataclass(frozen=True)
+class ComparedRun:
+    """A run of a comparison, with its metrics."""
+
+    label: str
+    run: Run
+    metrics: ReportMetrics
+    start: float
+    """Time of its first command to move, s: the charts count from there."""
+    parameters: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class ErrorDifference:
+    """How much the mean squared settled error of a run differs from that of the first."""
+
+    channel: Channel
+    difference: float
+    """In the square of the channel's unit."""
+    half: float
+    """Half the 95 % interval; infinite for less than two blocks of :data:`BLOCK`."""
+
+    @property
+    def verdict(self) -> str:
+        """Whether the error is smaller or larger; inconclusive if the interval spans zero."""
+        if not abs(self.difference) > self.half:
+            return INCONCLUSIVE
+        return BETTER if self.difference < 0.0 else WORSE
+
+    def text(self) -> str:
+        """Return the difference and its verdict in words."""
+        unit = f'({self.channel.unit})²'
+        half = format_number(self.half) if math.isfinite(self.half) else 'unknown'
+        difference = f'{self.difference:+.3g}' if math.isfinite(self.difference) else 'unknown'
+        return (
+            f'{self.channel.title}: mean squared error {difference} ± {half} {unit}, '
+            f'{self.verdict}'
+        )
+
+
+def block_errors(run: Run, name: str) -> list[float]:
+    """Return the mean squared settled error of each :data:`BLOCK` seconds of one channel."""
+    error = tracking_error(run, run.measured)
+    if error is None or len(error) < 2:
+        return []
+    counted = driven(error.time, run)
+    counted &= settled(error.time, run.switches, preview_before_switch(run))
+    squares = error[name][counted & np.isfinite(error[name])] ** 2
+    size = max(1, round(BLOCK / float(np.median(np.diff(error.time)))))
+    count = squares.size // size
+    means: list[float] = squares[: count * size].reshape(count, size).mean(axis=1).tolist()
+    return means
+
+
+def error_differences(first: Run, other: Run) -> list[ErrorDifference]:
+    """Return how the settled error of ``other`` differs from that of ``first``, by channel."""
+    found = []
+    for channel in other.channels:
+        a, b = block_errors(first, channel.name), block_errors(other, channel.name)
+        if min(len(a), len(b)) < 1:
+            found.append(ErrorDifference(channel, math.nan, math.inf))
+            continue
+        # Independent intervals, with the fewer degrees of freedom in each.
+        half = math.hypot(interval(a), interval(b))
+        found.append(ErrorDifference(channel, float(np.mean(b) - np.mean(a)), half))
+    return found
+
+
+def why_not_comparable(first: ComparedRun, other: ComparedRun) -> str:
+    """Return why two errors cannot be compared; empty if they can."""
+    for each in (first, other):
+        if not each.metrics.verdict.sound:
+            return f'{each.label}: {each.metrics.verdict.headline.lower()}'
+    if first.run.channels != other.run.channels:
+        return 'the wheels of one robot are unknown'
+    one, two = (each.run.motions[REFERENCE] for each in (first, other))
+    span = min(one.time[-1] - first.start, two.time[-1] - other.start)
+    time = np.arange(1.0, span, 0.05)
+    for channel in first.run.channels:
+        a = np.interp(time + first.start, one.time, one[channel.name])
+        b = np.interp(time + other.start, two.time, two[channel.name])
+        if time.size and rms(a - b) > SAME_REFERENCE * rms(a):
+            return (
+                'the references differ, so the runs had different tasks '
+                f'({channel.title}: by {format_number(rms(a - b))} {channel.unit} RMS)'
+            )
+    return ''
+
+
+def write_comparison(
+    folders: Sequence[Path], output: Path, wanted: ReportOptions | None = None
+) -> tuple[Path, str]:
+    """Write ``comparison.html``, and return its path and the verdicts as text.
+
+    Parameters
+    ----------
+    folders
+        Bags, at least two; each is compared with the first.
+    output
+        Folder of the page.
+    wanted
+        Namespace, topics and wheel geometry of all bags.
+
+    Raises
+    ------
+    BagError
+        A bag is missing or cannot be read.
+    ReportError
+        A bag holds nothing to report, or there are too many.
+    """
+    if not 2 <= len(folders) <= MAX_RUNS:
+        raise ReportError(f'a comparison must have 2 to {MAX_RUNS} bags: got {len(folders)}')
+    path = output / PAGE
+    runs = [_load(i, folder, path, wanted) for i, folder in enumerate(folders)]
+    verdicts = [_verdict(runs[0], each) for each in runs[1:]]
+    blocks: list[Block] = [*verdicts]
+    for each in runs:
+        blocks.append(verdict_box(each.metrics.verdict, each.label))
+        if each.run.oddities:
+            title = f'Unusual in {each.label}'
+            blocks.append(Items([[text] for text in each.run.oddities], title=title))
+    blocks += [_metrics_table(runs), Contents(), *_charts(runs), *_parameters(runs)]
+    output.mkdir(parents=True, exist_ok=True)
+    title = f'Comparison of {len(runs)} runs'
+    path.write_text(html_page(title, blocks), encoding='utf-8')
+    lines = [f'{each.label}: {each.metrics.verdict.text()}' for each in runs]
+    lines += [f'{each.subject}: {each.headline}: {"; ".join(each.reasons)}' for each in verdicts]
+    return path, '\n'.join(lines)
+
+
+def _load(number: int, folder: Path, path: Path, wanted: ReportOptions | None) -> ComparedRun:
+    with open_bag(folder) as recording:
+        run = load_run(recording, wanted)
+        metrics = compute_metrics(run, path, recording.message_count)
+        records = recording.metadata_records
+    start = driving(run)[0]
+    if not math.isfinite(start):
+        start = min(float(each.time[0]) for each in run.motions.values())
+    parameters = {
+        f'{node} {name}': value
+        for node, table in records.items()
+        if node not in ('losses', 'provenance')
+        for name, value in table.items()
+    }
+    label = f'{chr(ord("A") + number)}, {bag_display_name(folder)}'
+    return ComparedRun(label, run, metrics, start, parameters)
+
+
+def _verdict(first: ComparedRun, other: ComparedRun) -> VerdictBox:
+    """Return which of two runs has the smaller settled error."""
+    subject = f'{other.label} against {first.label}'
+    if why := why_not_comparable(first, other):
+        return VerdictBox('Not comparable', [f'{why[0].upper()}{why[1:]}.'], 'open', subject)
+    found = error_differences(first.run, other.run)
+    verdicts = {each.verdict for each in found}
+    if verdicts in ({BETTER}, {BETTER, INCONCLUSIVE}):
+        headline, kind = 'Smaller settled error', 'good'
+    elif verdicts in ({WORSE}, {WORSE, INCONCLUSIVE}):
+        headline, kind = 'Larger settled error', 'bad'
+    else:
+        headline, kind = 'Inconclusive', 'open'
+    return VerdictBox(headline, [f'{each.text()}.' for each in found], kind, subject)
+
+
+def _metrics_table(runs: Sequence[ComparedRun]) -> Table:
+    """Return the main numbers of all runs side by side."""
+    channels = runs[0].run.channels
+    rows: list[tuple[str, Callable[[ComparedRun], float]]] = [
+        ('duration / s', lambda each: each.run.duration),
+        ('stopped / s', lambda each: each.metrics.verdict.stopped),
+        ('odometry to command, median / ms', lambda each: 1e3 * each.metrics.latency),
+        ('odometry to command, 99 % below / ms', lambda each: 1e3 * each.metrics.latency_99),
+        ('odometry missing / %', _missing),
+    ]
+    cells = [[text, *(format_number(measure(each)) for each in runs)] for text, measure in rows]
+    cells.insert(2, ['switches', *(str(each.metrics.switches) for each in runs)])
+    for channel in channels:
+        name, unit = channel.name, channel.unit
+        measures: list[tuple[str, Callable[[ChannelMetrics], float]]] = [
+            ('RMSE settled', lambda found: found.settled.rmse),
+            ('RMSE while driven', lambda found: found.overall.rmse),
+            ('largest error', lambda found: found.overall.largest),
+            ('variation of the command per second', lambda found: found.chatter),
+        ]
+        for text, value in measures:
+            numbers = [
+                format_number(value(each.metrics.wheels[name]))
+                if name in each.metrics.wheels
+                else EMPTY_CELL
+                for each in runs
+            ]
+            cells.append([f'{text}, {channel.title} / {unit}', *numbers])
+        late = []
+        for each in runs:
+            fit = each.metrics.responses.get(name)
+            delay = fit.dead_time + fit.lag if fit and fit.clear else math.nan
+            late.append(format_number(1e3 * delay))
+        cells.append([f'command to motion, {channel.title} / ms', *late])
+    return Table('', ['quantity', *(each.label for each in runs)], cells, wrap=True)
+
+
+def _missing(each: ComparedRun) -> float:
+    return 100.0 * each.metrics.missing.get(ODOMETRY, math.nan)
+
+
+def _shifted(each: ComparedRun, series: Series) -> Series:
+    return Series(series.time - each.start, series.values)
+
+
+def _charts(runs: Sequence[ComparedRun]) -> Iterator[Block]:
+    """Yield the overlaid charts, with the time since the first command to move."""
+    channels = [c for c in runs[0].run.channels if all(c in each.run.channels for each in runs)]
+    looks = list(zip(runs, COLOURS, TERM_DASHES, strict=False))
+    errors = [tracking_error(each.run, each.run.measured) for each in runs]
+    charts: list[Chart | Plane] = []
+    for channel in channels:
+        lines = [
+            line(each.label, colour, _shifted(each, found), channel.name, dash=dash)
+            for (each, colour, dash), found in zip(looks, errors, strict=True)
+            if is_long(found)
+        ]
+        if lines:
+            text = ', '.join(
+                f'{each.label} {format_number(each.metrics.wheels[channel.name].settled.rmse)}'
+                for each in runs
+            )
+            seen = f'Settled RMSE: {text} {channel.unit}.'
+            charts.append(Chart(f'Error, {channel.title}', channel.unit, lines, seen))
+    if charts:
+        yield from (Heading('Tracking errors'), Group(charts, 'div', 'charts'), _TIME)
+    for heading, pick in (
+        ('Speeds', lambda each: each.run.measured),
+        ('Commands', lambda each: COMMAND),
+    ):
+        charts = []
+        for channel in channels:
+            lines = [
+                line(each.label, colour, _shifted(each, motion), channel.name, dash=dash)
+                for each, colour, dash in looks
+                if is_long(motion := each.run.motions.get(pick(each)))
+            ]
+            reference = runs[0].run.motions.get(REFERENCE)
+            if is_long(reference):
+                shown = _shifted(runs[0], reference)
+                label = f'reference of {runs[0].label}'
+                lines.append(line(label, 'reference', shown, channel.name, dash=(6, 4)))
+            if lines:
+                seen = f'{channel.title.capitalize()} of {len(runs)} runs over each other.'
+                charts.append(Chart(f'{heading}, {channel.title}', channel.unit, lines, seen))
+        if charts:
+            yield from (Heading(heading), Group(charts, 'div', 'charts'), _TIME)
+    curves = [
+        Curve(each.label, colour, motion.time - each.start, motion['x'], motion['y'], dash)
+        for each, colour, dash in looks
+        if is_long(motion := each.run.motions.get(each.run.measured))
+    ]
+    if curves:
+        ends = ', '.join(f'{c.label} at {c.x[-1]:.2f}, {c.y[-1]:.2f} m' for c in curves)
+        yield from (Heading('Paths'), Plane('Floor', 'm', curves, f'Ends: {ends}.'))
+
+
+_TIME = Paragraph('Time since the first command to move of each run.', 'quiet')
+
+
+def _parameters(runs: Sequence[ComparedRun]) -> Iterator[Block]:
+    """Yield the recorded parameters in which the runs differ."""
+    names = sorted({name for each in runs for name in each.parameters})
+    rows = []
+    for name in names:
+        values = [each.parameters.get(name, EMPTY_CELL) for each in runs]
+        if len(set(values)) > 1:
+            rows.append([name, *values])
+    yield Heading('Parameters that differ')
+    if rows:
+        head = ['parameter', *(each.label for each in runs)]
+        yield Table('', head, rows, text=len(head), wrap=True)
+    else:
+        yield Paragraph('No recorded parameter differs.', 'quiet')

@@ -1,0 +1,144 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Coverage of an arena over time, and how evenly the time is spread over it."""
+
+from dataclasses import dataclass
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.evaluation.patrol.delay_embedding import check_path
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CoverageGrid:
+    """Cells of a rectangle, without those that the robot cannot enter."""
+
+    low: tuple[float, float]
+    """Smallest x and y, m."""
+    high: tuple[float, float]
+    """Largest x and y, m."""
+    columns: int = 20
+    rows: int = 20
+    blocked: NDArray[np.bool_] | None = None
+    """Cells that do not count, shape (rows, columns), row 0 at the smallest y."""
+
+    def __post_init__(self) -> None:
+        if not all(a < b for a, b in zip(self.low, self.high, strict=True)):
+            raise ValueError(f'low must be below high: got {self.low}, {self.high}')
+        if self.columns < 1 or self.rows < 1:
+            raise ValueError(f'columns and rows must be >= 1: got {self.columns}, {self.rows}')
+        if self.blocked is not None and self.blocked.shape != (self.rows, self.columns):
+            raise ValueError(
+                f'blocked must have shape ({self.rows}, {self.columns}): got {self.blocked.shape}'
+            )
+        if not self.free.any():
+            raise ValueError('blocked must leave at least one cell free')
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """Cells that count, shape (rows, columns)."""
+        if self.blocked is None:
+            return np.ones((self.rows, self.columns), dtype=np.bool_)
+        return ~self.blocked
+
+    @property
+    def cell(self) -> tuple[float, float]:
+        """Width and height of a cell, m."""
+        return (
+            (self.high[0] - self.low[0]) / self.columns,
+            (self.high[1] - self.low[1]) / self.rows,
+        )
+
+    def centres(self) -> Array:
+        """Return the centres of all cells (m), shape (rows, columns, 2)."""
+        width, height = self.cell
+        x = self.low[0] + width * (np.arange(self.columns) + 0.5)
+        y = self.low[1] + height * (np.arange(self.rows) + 0.5)
+        return np.stack(np.meshgrid(x, y), axis=-1)
+
+
+class Visits(NamedTuple):
+    """What the centre of a robot did in each cell, shapes (rows, columns)."""
+
+    first: Array
+    """Time of the first entry since the start, s; inf where there was none."""
+    dwell: Array
+    """Time spent, s."""
+    duration: float
+    """s"""
+
+
+def visits(t: Array, x: Array, y: Array, grid: CoverageGrid) -> Visits:
+    """Return first entry and dwell of each cell by the straight lines between the samples.
+
+    A line is divided into pieces of at most a quarter of a cell, so that fast motion skips none
+    but a corner. Time outside the grid or in blocked cells is not counted.
+    """
+    check_path(t, x, y)
+    width, height = grid.cell
+    u, v = (x - grid.low[0]) / width, (y - grid.low[1]) / height
+    length = np.hypot(np.diff(u), np.diff(v))
+    pieces = np.maximum(1, np.ceil(4.0 * length)).astype(np.int64)
+    row = np.repeat(np.arange(t.size - 1), pieces)
+    within = np.arange(row.size) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    share = (within + 0.5) / pieces[row]  # the middle of each piece
+    step = (np.diff(t) / pieces)[row]
+    column = np.floor(u[row] + share * np.diff(u)[row]).astype(np.int64)
+    line = np.floor(v[row] + share * np.diff(v)[row]).astype(np.int64)
+    entered = t[row] - t[0] + within / pieces[row] * np.diff(t)[row]
+    inside = (column >= 0) & (column < grid.columns) & (line >= 0) & (line < grid.rows)
+    place = line[inside] * grid.columns + column[inside]
+    count = grid.rows * grid.columns
+    first = np.full(count, math.inf)
+    np.minimum.at(first, place, entered[inside])
+    dwell = np.bincount(place, weights=step[inside], minlength=count)
+    shape = grid.rows, grid.columns
+    free = grid.free
+    return Visits(
+        np.where(free, first.reshape(shape), math.inf),
+        np.where(free, dwell.reshape(shape), 0.0),
+        float(t[-1] - t[0]),
+    )
+
+
+def coverage_at(found: Visits, grid: CoverageGrid, times: Array) -> Array:
+    """Return the share of free cells entered up to each time (s since the start), shape (n,)."""
+    order = np.sort(found.first[grid.free])
+    shares: Array = np.searchsorted(order, times, side='right') / order.size
+    return shares
+
+
+def time_to_cover(found: Visits, grid: CoverageGrid, share: float) -> float:
+    """Return the time until ``share`` of the free cells is entered, s; inf if it is not."""
+    if not 0.0 < share <= 1.0:
+        raise ValueError(f'share must be above 0 and at most 1: got {share}')
+    order = np.sort(found.first[grid.free])
+    return float(order[math.ceil(share * order.size - 1e-9) - 1])
+
+
+def evenness(found: Visits, grid: CoverageGrid) -> float:
+    r"""Return how evenly the time is spread: 1 the same in each free cell, 0 all in one.
+
+    Pielou's evenness (J. Theor. Biol. 13, 1966, doi 10.1016/0022-5193(66)90013-0), the Shannon
+    entropy of the shares p of time, relative to its largest value for S free cells:
+
+    .. math:: J = -\sum_i p_i \ln p_i / \ln S
+
+    NaN for a path that never enters a free cell or a grid of one cell.
+    """
+    dwell = found.dwell[grid.free]
+    total = dwell.sum()
+    if total <= 0.0 or dwell.size < 2:
+        return math.nan
+    return normalised_entropy(dwell / total)
+
+
+def normalised_entropy(shares: Array) -> float:
+    """Return the Shannon entropy of shares that add up to 1, relative to that of equal ones."""
+    held = shares[shares > 0.0]
+    return float(-(held * np.log(held)).sum() / math.log(shares.size)) + 0.0

@@ -1,0 +1,185 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+r"""Pure pursuit and regulated pure pursuit: the rivals of the pose loop.
+
+Pure pursuit drives the arc through a point of the path at the distance :math:`L`, the lookahead,
+which is at :math:`y` to the left of the robot; the arc has the curvature :math:`2 y/L^2`
+(Coulter, CMU-RI-TR-92-01, 1992). The regulated form (Macenski et al., Autonomous Robots 47, 2023,
+doi 10.1007/s10514-023-10097-6) has a lookahead proportional to the speed, and slows down where
+the arc is tighter than a radius :math:`r`, :math:`v' = v/(r |\kappa|)`. Before the goal both slow
+down: plain pure pursuit as late as a deceleration allows, the regulated one in proportion to the
+distance, as its implementation in Nav2 does. Its regulation near obstacles has no effect here,
+where there are none.
+"""
+
+from dataclasses import dataclass
+import math
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.control.actuation import LimitParameters, limit_command, wheel_limits
+from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
+from t3mpc_ros.geometry.path_timing import check_points, polyline_length, resample
+from t3mpc_ros.geometry.types import STANDSTILL, BodyTwist, Pose, WheelSpeeds
+
+Array = NDArray[np.float64]
+
+SPACING = 0.002
+"""Distance of the points at which the path is searched, m."""
+REACHED = 0.004
+"""Rest of the path at which the robot has reached the goal, m."""
+
+
+@dataclass(frozen=True)
+class PurePursuitParameters:
+    """Parameters of pure pursuit."""
+
+    lookahead: float = 0.1
+    """L, m"""
+    speed: float = 0.25
+    """m/s"""
+    deceleration: float = 0.5
+    """Before the goal, m/s²"""
+    slowest: float = 0.02
+    """Least speed before the goal, m/s"""
+
+    def target(self, speed: float) -> float:
+        """Return the lookahead (m) at a speed (m/s)."""
+        return self.lookahead
+
+    def regulated(self, curvature: float, remaining: float) -> float:
+        """Return the speed (m/s) on an arc of a curvature (1/m) with so much path (m) left."""
+        braking = math.sqrt(2.0 * self.deceleration * max(remaining, 0.0))
+        return min(self.speed, max(braking, self.slowest))
+
+
+@dataclass(frozen=True)
+class RegulatedParameters:
+    """Parameters of regulated pure pursuit."""
+
+    lookahead_time: float = 0.4
+    """Lookahead per speed, s"""
+    shortest: float = 0.03
+    """Least lookahead, m"""
+    longest: float = 0.5
+    """Largest lookahead, m"""
+    min_radius: float = 0.2
+    """Radius of the arc below which the robot slows down, m"""
+    speed: float = 0.25
+    """m/s"""
+    slowest: float = 0.05
+    """Least speed of the regulation, m/s"""
+    approach: float = 0.1
+    """Rest of the path below which the robot slows down, m"""
+
+    def target(self, speed: float) -> float:
+        """Return the lookahead (m) at a speed (m/s)."""
+        return min(max(self.lookahead_time * speed, self.shortest), self.longest)
+
+    def regulated(self, curvature: float, remaining: float) -> float:
+        """Return the speed (m/s) on an arc of a curvature (1/m) with so much path (m) left."""
+        tightness = self.min_radius * abs(curvature)
+        speed = self.speed / max(tightness, 1.0)
+        return max(speed * min(remaining / self.approach, 1.0), self.slowest)
+
+
+class PathTracker(Protocol):
+    """A law from the pose of the robot to its command, in place of the controller."""
+
+    def step(self, pose: Pose) -> BodyTwist:
+        """Return the commanded twist for a pose; called once per period."""
+
+
+def pursuit_curvature(pose: Pose, target: tuple[float, float]) -> float:
+    """Return the curvature 2 y/L² (1/m) of the arc from a pose through a point (m)."""
+    x, y = target[0] - pose.x, target[1] - pose.y
+    left = math.cos(pose.yaw) * y - math.sin(pose.yaw) * x
+    return 2.0 * left / max(x * x + y * y, 1e-12)
+
+
+class Pursuit:
+    """Pure pursuit of a path, plain or regulated by the kind of its parameters.
+
+    Parameters
+    ----------
+    points
+        Path, m, shape (n, 2).
+    parameters
+        :class:`PurePursuitParameters` or :class:`RegulatedParameters`.
+    limits, geometry, period
+        Every command keeps these limits, as those of the controller; the period is in s.
+
+    Raises
+    ------
+    PathError
+        The points are not finite.
+    """
+
+    def __init__(
+        self,
+        points: Array,
+        parameters: PurePursuitParameters | RegulatedParameters,
+        limits: LimitParameters | None = None,
+        geometry: WheelGeometry | None = None,
+        period: float = 0.01,
+    ) -> None:
+        check_points(points)
+        self._parameters = parameters
+        self._geometry = geometry or WheelGeometry()
+        self._limits = wheel_limits(limits or LimitParameters(), self._geometry)
+        self._period = period
+        path = resample(points, SPACING)
+        self._spacing = polyline_length(path) / (len(path) - 1)
+        self._goal = len(path) - 1
+        # The path goes on straight: a target exists also near the goal.
+        run = path[-1] - path[-2]
+        beyond = np.arange(1, round(1.0 / SPACING))[:, None] * (run / np.hypot(*run)) * SPACING
+        self._path = np.vstack([path, path[-1] + beyond])
+        self._place = 0
+        self._command: Array = np.zeros(2)
+        self._speed = 0.0
+
+    @property
+    def remaining(self) -> float:
+        """Length of the path that is left, m."""
+        return (self._goal - self._place) * self._spacing
+
+    def step(self, pose: Pose) -> BodyTwist:
+        """Return the commanded twist for a pose; called once per period."""
+        lookahead = self._parameters.target(self._speed)
+        self._advance(pose, lookahead)
+        wanted = STANDSTILL
+        if self.remaining > REACHED:
+            curvature = pursuit_curvature(pose, self._target(pose, lookahead))
+            speed = self._parameters.regulated(curvature, self.remaining)
+            wanted = BodyTwist(speed, speed * curvature)
+        wheels = wheels_from_twist(wanted, self._geometry)
+        limit_command(
+            wheels.right, wheels.left, self._command, self._limits, self._period, self._command
+        )
+        command = twist_from_wheels(WheelSpeeds(*self._command.tolist()), self._geometry)
+        self._speed = abs(command.linear)
+        return command
+
+    def _advance(self, pose: Pose, lookahead: float) -> None:
+        """Go on to the nearest point ahead, within the lookahead: paths may cross themselves."""
+        reach = self._place + 1 + math.ceil(lookahead / self._spacing)
+        ahead = self._path[self._place : min(reach, self._goal) + 1]
+        self._place += int(np.argmin(np.hypot(*(ahead - pose[:2]).T)))
+
+    def _target(self, pose: Pose, lookahead: float) -> tuple[float, float]:
+        """Return the first point from the nearest one on that is a lookahead away, m."""
+        distance = np.hypot(*(self._path[self._place :] - pose[:2]).T)
+        outside = np.flatnonzero(distance >= lookahead)
+        first = int(outside[0]) if outside.size else distance.size - 1
+        x, y = self._path[self._place + first].tolist()
+        if first == 0:
+            return x, y
+        # Between two points: where the distance is the lookahead.
+        before, after = distance[first - 1], distance[first]
+        share = float((lookahead - before) / max(after - before, 1e-12))
+        x0, y0 = self._path[self._place + first - 1].tolist()
+        share = min(max(share, 0.0), 1.0)
+        return x0 + share * (x - x0), y0 + share * (y - y0)

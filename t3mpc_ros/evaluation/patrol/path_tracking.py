@@ -1,0 +1,367 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Our path tracking, with and without each part, against pure pursuit on four paths.
+
+Every method drives the digital twin with noise, lag, slippery patches on the path and lost
+commands; dead time, wheel radius and wheel separation are drawn from the seed and are not those
+that the methods assume. All have the same place, the same top speed along the path and the same
+limits of the command. The gains of ours and the lookaheads of the rivals are the best of grids of
+equal size on a path that is not compared (:func:`tune_trackers`).
+"""
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.control.actuation import LimitParameters
+from t3mpc_ros.evaluation.closed_loop import map_jobs
+from t3mpc_ros.evaluation.confidence_intervals import mean, rms
+from t3mpc_ros.evaluation.patrol.path_trackers import (
+    PurePursuitParameters,
+    Pursuit,
+    RegulatedParameters,
+)
+from t3mpc_ros.evaluation.patrol.patrol_run import (
+    RATE,
+    PatrolRecord,
+    PatrolScenario,
+    run_patrol,
+    world_file,
+)
+from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.geometry.path_file import load_path
+from t3mpc_ros.geometry.path_timing import (
+    MotionLimits,
+    distance_to_path,
+    polyline_length,
+    resample,
+    time_path,
+)
+from t3mpc_ros.geometry.types import ORIGIN
+
+Array = NDArray[np.float64]
+
+RECORDED_PATH = Path(__file__).with_name('recorded_path.csv')
+"""Odometry of a robot that followed switching chaotic wheel speeds, thinned to 10 mm."""
+SPARE_TIME, SLOW_SPARE_TIME = 1.25, 3.0
+"""Time for a path as a multiple of that of its reference; for a rival that slows down."""
+ARRIVED = 0.05
+"""Distance from the goal (m) within which a robot that has arrived stays."""
+LAST_PIECE = 1.0
+"""Time for the rest of the path after the arrival, which counts, s."""
+PATCHES, PATCH_RADIUS, PATCH_GRIP = 2, 0.08, 0.25
+"""Slippery places on each path: number, radius (m), share of the grip."""
+TUNING_SEEDS = (901, 902)
+SPACING = 0.005
+"""Distance of the places at which errors are measured, m."""
+
+WITHOUT_SHAPER = {
+    'command_shaper.straight_frequency': 0.0,
+    'command_shaper.turning_frequency': 0.0,
+}
+WITHOUT_WHEEL_PARTS = {**WITHOUT_SHAPER, 'estimate_dead_time': False, 'body.enabled': False}
+
+
+@dataclass(frozen=True)
+class TrackingMethod:
+    """A way to follow a path."""
+
+    name: str
+    controller: Mapping[str, object] = field(default_factory=dict)
+    """Parameters of our controller that differ."""
+    pursuit: PurePursuitParameters | RegulatedParameters | None = None
+    """A rival in place of our controller."""
+
+    @property
+    def spare_time(self) -> float:
+        """Time for a path as a multiple of that of its reference."""
+        return SLOW_SPARE_TIME if isinstance(self.pursuit, RegulatedParameters) else SPARE_TIME
+
+
+TUNED_GAINS: Mapping[str, object] = {'pose.gain_across': 240.0, 'pose.gain_yaw': 8.0}
+"""The best of :func:`tune_trackers`, as the lookaheads of the rivals below."""
+OURS = 'ours'
+METHODS = {
+    method.name: method
+    for method in (
+        TrackingMethod(OURS, TUNED_GAINS),
+        TrackingMethod('with the default gains'),
+        TrackingMethod('without the pose loop', {'pose.enabled': False}),
+        TrackingMethod('without the command shaper', {**TUNED_GAINS, **WITHOUT_SHAPER}),
+        TrackingMethod(
+            'without the estimate of the dead time', {**TUNED_GAINS, 'estimate_dead_time': False}
+        ),
+        TrackingMethod('without the body correction', {**TUNED_GAINS, 'body.enabled': False}),
+        TrackingMethod(
+            'wheels by feed-forward only, with the pose loop',
+            {**TUNED_GAINS, **WITHOUT_WHEEL_PARTS},
+        ),
+        TrackingMethod(
+            'wheels by feed-forward only, without it',
+            {**WITHOUT_WHEEL_PARTS, 'pose.enabled': False},
+        ),
+        TrackingMethod('pure pursuit', pursuit=PurePursuitParameters(0.08)),
+        TrackingMethod(
+            'regulated pure pursuit',
+            pursuit=RegulatedParameters(lookahead_time=0.4, min_radius=0.9),
+        ),
+    )
+}
+
+
+def straight_line() -> Array:
+    """Return 2 m straight ahead, m, shape (2, 2)."""
+    return np.array([[0.0, 0.0], [2.0, 0.0]])
+
+
+def square() -> Array:
+    """Return a closed square with sides of 1 m, shape (5, 2)."""
+    return np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.0, 0.0]])
+
+
+def figure_of_eight() -> Array:
+    """Return the lemniscate of Gerono, half a length of 0.6 m, which begins along x, m."""
+    angle = np.linspace(0.0, math.tau, 721)
+    points = 0.6 * np.column_stack([np.sin(angle), np.sin(angle) * np.cos(angle)])
+    turn = math.sqrt(0.5) * np.array([[1.0, -1.0], [1.0, 1.0]])
+    turned: Array = points @ turn
+    return turned
+
+
+def recorded_path() -> Array:
+    """Return a path that a robot has driven, m, shape (n, 2)."""
+    return load_path(RECORDED_PATH)
+
+
+def hook() -> Array:
+    """Return the path of the tuning: straight, an arc, straight, a sharp corner, straight."""
+    angle = np.linspace(0.0, 0.5 * math.pi, 91)
+    arc = np.array([0.5, 0.2]) + 0.2 * np.column_stack([np.sin(angle), -np.cos(angle)])
+    corner = np.array([0.7, 0.6])
+    way = 0.5 * np.array([math.sqrt(0.75), -0.5])
+    return np.vstack([[[0.0, 0.0]], arc, [corner], [corner + way]])
+
+
+TRACKED_PATHS = {
+    'straight line': straight_line,
+    'square': square,
+    'figure of eight': figure_of_eight,
+    'recorded path': recorded_path,
+}
+
+
+@dataclass(frozen=True)
+class TrackingPlan:
+    """What is compared."""
+
+    paths: Sequence[str] = tuple(TRACKED_PATHS)
+    seeds: Sequence[int] = (101, 102, 103, 104, 105)
+    methods: Sequence[str] = tuple(METHODS)
+    limits: MotionLimits = MotionLimits()
+
+    def __post_init__(self) -> None:
+        for name in self.paths:
+            if name not in TRACKED_PATHS:
+                raise ValueError(f'path must be one of {", ".join(TRACKED_PATHS)}: got {name}')
+        for name in self.methods:
+            if name not in METHODS:
+                raise ValueError(f'method must be one of {", ".join(METHODS)}: got {name}')
+        if not self.paths or not self.seeds or not self.methods:
+            raise ValueError('at least one path, one seed and one method must be given')
+
+
+class TrackingRun(NamedTuple):
+    """Errors of one drive along a path."""
+
+    cross_track: float
+    """Root mean square distance from the path, each piece of the drive counted by its length, m"""
+    largest: float
+    """Largest distance of the drive from the path, or of the path from the drive, m"""
+    timed: float
+    """Root mean square distance from the reference at the same time, m; NaN for a rival."""
+    time: float
+    """Until the robot stays within 50 mm of the goal, s; NaN if it never does."""
+    speed: tuple[float, float]
+    """Largest commanded |v| (m/s) and |omega| (rad/s)."""
+    acceleration: tuple[float, float]
+    """Largest |dv/dt| (m/s²) and |d omega/dt| (rad/s²) from one command to the next."""
+    track: Array
+    """True positions, m, shape (n, 2)."""
+
+    @property
+    def within_limits(self) -> bool:
+        """Whether every command is within the limits of the controller."""
+        limits = LimitParameters()
+        bounds = (
+            limits.linear,
+            limits.angular,
+            limits.linear_acceleration,
+            limits.angular_acceleration,
+        )
+        values = (*self.speed, *self.acceleration)
+        return all(v <= b * (1.0 + 1e-9) for v, b in zip(values, bounds, strict=True))
+
+
+TrackingResults = Mapping[str, Mapping[str, Sequence[TrackingRun]]]
+"""Runs by path and method, in the order of the seeds."""
+
+
+class TrackingJob(NamedTuple):
+    """A path, its points and a seed."""
+
+    path: str
+    points: Array
+    seed: int
+    limits: MotionLimits
+
+    def __str__(self) -> str:
+        return f'{self.path}, seed {self.seed}'
+
+
+def compare_trackers(
+    plan: TrackingPlan, workers: int | Executor = 1, *, progress: bool = False
+) -> TrackingResults:
+    """Return the runs of every path, method and seed of a plan."""
+    keys = [(p, m, s) for s in plan.seeds for p in plan.paths for m in plan.methods]
+    jobs = [
+        (TrackingJob(path, TRACKED_PATHS[path](), seed, plan.limits), METHODS[method])
+        for path, method, seed in keys
+    ]
+    runs = map_jobs(measured_drive, jobs, workers, 'drives', progress=progress)
+    found = dict(zip(keys, runs, strict=True))
+    return {
+        path: {
+            method: [found[path, method, seed] for seed in plan.seeds] for method in plan.methods
+        }
+        for path in plan.paths
+    }
+
+
+def measured_drive(job: tuple[TrackingJob, TrackingMethod]) -> TrackingRun:
+    """Return the errors of a method on a path."""
+    (_, points, _, _), method = job
+    return errors_of(drive(job), points, timed=method.pursuit is None)
+
+
+def drive(job: tuple[TrackingJob, TrackingMethod]) -> PatrolRecord:
+    """Return the record of a method on a path; equal arguments give equal records."""
+    (_, points, seed, limits), method = job
+    generator = np.random.default_rng((seed, 31))
+    late, radius, separation = generator.uniform([0.0, -0.005, -0.01], [0.03, 0.005, 0.01])
+    robot: dict[str, object] = {
+        'drive.dead_time': 0.01 + float(late),
+        'right_wheel_radius_multiplier': 1.0 + float(radius),
+        'wheel_separation_multiplier': 1.0 + float(separation),
+    }
+    least = float(time_path(points, limits, WheelGeometry(), 1.0 / RATE, ORIGIN).time[-1])
+    tracker = None if method.pursuit is None else Pursuit(points, method.pursuit)
+    with world_file(slippery_floor(points, generator)) as world:
+        scenario = PatrolScenario(
+            seed=seed,
+            duration=math.ceil(method.spare_time * least) + 2.0,
+            world=world,
+            limits=limits,
+            keep_out=False,
+            robot=robot,
+            controller=method.controller,
+        )
+        return run_patrol(iter([points]), scenario, tracker=tracker)
+
+
+def slippery_floor(points: Array, generator: np.random.Generator) -> str:
+    """Return the YAML text of a world whose slippery patches are on a path (m)."""
+    along = resample(points, SPACING)
+    places = along[generator.integers(0, len(along), PATCHES)]
+    lines = ['name: slippery_floor', 'patches:']
+    for x, y in places.tolist():
+        lines.append(
+            f'  - {{center: [{x:.4f}, {y:.4f}], radius: {PATCH_RADIUS}, grip: {PATCH_GRIP}}}'
+        )
+    return '\n'.join(lines) + '\n'
+
+
+def errors_of(record: PatrolRecord, points: Array, *, timed: bool) -> TrackingRun:
+    """Return the errors of a drive along a path (m), shape (n, 2)."""
+    away = np.hypot(*(record.truth[:, :2] - points[-1]).T) > ARRIVED
+    arrival = int(np.flatnonzero(away)[-1]) + 1 if away.any() else 0
+    arrived = arrival < record.time.size
+    track = record.truth[: arrival + round(LAST_PIECE * RATE), :2]
+    driven = resample(track, SPACING) if polyline_length(track) > SPACING else track[[0, -1]]
+    path = resample(points, SPACING)
+    distance = distance_to_path(driven, path)
+    changes = np.abs(np.diff(record.command, axis=0, prepend=0.0)) * RATE
+    error = record.error[: len(track)]
+    return TrackingRun(
+        rms(distance),
+        float(max(distance.max(), distance_to_path(path, driven).max())),
+        rms(error) if timed else math.nan,
+        float(record.time[arrival]) if arrived else math.nan,
+        _pair(np.abs(record.command).max(axis=0)),
+        _pair(changes.max(axis=0)),
+        track,
+    )
+
+
+def _pair(values: Array) -> tuple[float, float]:
+    first, second = values.tolist()
+    return first, second
+
+
+def tuning_grids() -> Mapping[str, Sequence[TrackingMethod]]:
+    """Return the methods to choose from, equally many for ours and each rival."""
+    ours = [
+        TrackingMethod(f'k_y {across:g}, k_theta {yaw:g}', {'pose.gain_across': across,
+                                                            'pose.gain_yaw': yaw})
+        for across in (30.0, 60.0, 120.0, 240.0)
+        for yaw in (4.0, 8.0, 16.0)
+    ]  # fmt: skip
+    plain = [
+        TrackingMethod(f'lookahead {1e3 * each:g} mm', pursuit=PurePursuitParameters(each))
+        for each in (0.03, 0.04, 0.05, 0.065, 0.08, 0.09, 0.1, 0.11, 0.12, 0.14, 0.17, 0.2)
+    ]
+    regulated = [
+        TrackingMethod(
+            f'lookahead {time:g} s, radius {1e3 * radius:g} mm',
+            pursuit=RegulatedParameters(lookahead_time=time, min_radius=radius),
+        )
+        for time in (0.15, 0.25, 0.4)
+        for radius in (0.15, 0.3, 0.6, 0.9)
+    ]
+    return {OURS: ours, 'pure pursuit': plain, 'regulated pure pursuit': regulated}
+
+
+def tune_trackers(
+    workers: int | Executor = 1, *, progress: bool = False
+) -> Mapping[str, Sequence[tuple[str, float]]]:
+    """Return by method each choice with its mean cross-track error (m) on the hook, best first.
+
+    The error of a choice that does not arrive in time is infinite.
+    """
+    grids, points = tuning_grids(), hook()
+    jobs = [
+        (TrackingJob('hook', points, seed, MotionLimits()), choice)
+        for grid in grids.values()
+        for choice in grid
+        for seed in TUNING_SEEDS
+    ]
+    runs = iter(map_jobs(measured_drive, jobs, workers, 'drives', progress=progress))
+    return {
+        name: sorted(
+            (
+                (each.name, mean([_tuning_error(next(runs)) for _ in TUNING_SEEDS]))
+                for each in grid
+            ),
+            key=lambda choice: choice[1],
+        )
+        for name, grid in grids.items()
+    }
+
+
+def _tuning_error(run: TrackingRun) -> float:
+    return run.cross_track if math.isfinite(run.time) else math.inf

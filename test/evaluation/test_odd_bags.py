@@ -1,0 +1,373 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Reports of odd bags: each oddity is named before the first number, and no number is wrong.
+
+All bags are of a robot that is 0.02 m/s faster than its reference: a report says that, or that it
+cannot be measured.
+"""
+
+from html import unescape
+import re
+
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.typesys import Stores, get_typestore
+from support.bag_messages import (
+    START,
+    STORE,
+    TYPES,
+    diagnostics,
+    odometry_message,
+    twist_message,
+)
+from support.robot_bags import following_rows, write
+
+from t3mpc_ros.cli.main import main as t3mpc
+from t3mpc_ros.evaluation.bag_report.report_page import write_report
+
+OFFSET = 0.02 / 0.035
+"""Error of both wheels, rad/s, by the wheel radius that is assumed."""
+MONTH = 30 * 86_400.0
+ROWS = following_rows()
+OVERLOADED = [(5.0, '/diagnostics', diagnostics(START, 'sim_robot', 1, 'processor overloaded'))]
+TEXT = TYPES['std_msgs/msg/String']('hello')
+
+
+def copied(message):
+    kind = message.__msgtype__
+    return STORE.deserialize_cdr(STORE.serialize_cdr(message, kind), kind)
+
+
+def changed(topic, change, rows=None):
+    """Return the rows with ``change(number, seconds, message)`` applied to a topic's messages."""
+    made, count = [], 0
+    for received, name, message in ROWS if rows is None else rows:
+        if name == topic:
+            message = copied(message)
+            change(count, received, message)
+            count += 1
+        made.append((received, name, message))
+    return made
+
+
+def only(*topics):
+    return [row for row in ROWS if row[1] in topics]
+
+
+def by_time(*rows):
+    return sorted((row for part in rows for row in part), key=lambda row: row[0])
+
+
+def restamped(message, seconds):
+    stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec + round(seconds * 1e9)
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
+
+
+def month_later():
+    later = []
+    for received, topic, message in ROWS:
+        if received > 8.0:
+            message = copied(message)
+            if topic != '/cmd_vel':
+                restamped(message, MONTH)
+            received += MONTH
+        later.append((received, topic, message))
+    return later
+
+
+def moved_away(i, t, message):
+    message.pose.pose.position.x += 1e6 * (t > 8.0)
+
+
+def set_speed(value):
+    def change(i, t, message):
+        if 100 <= i < 107:
+            message.twist.twist.linear.x = value
+
+    return change
+
+
+def stand(i, t, message):
+    message.twist.twist.linear.x = message.twist.twist.angular.z = 0.0
+
+
+def second_robot(pose=(0.0, 0.0, 0.0), frame='base_link'):
+    """Return odometry of another robot that publishes to the same topic, more slowly."""
+    rows = []
+    for t in np.arange(100, 750) / 50.0:
+        x, y, yaw = pose
+        place = (x, y - 0.1 * (t - 2.0), yaw)
+        stamp = START + round(t * 1e9) + 7_000_000
+        rows.append((t + 0.008, '/odom', odometry_message(stamp, (0.1, 0.0), place, frame)))
+    return rows[::2]
+
+
+def in_namespace(space, rows):
+    return [(received, space + topic, message) for received, topic, message in rows]
+
+
+def thinned_after(second, every):
+    """Return the rows with every n-th odometry after a time."""
+    odometry = [row for row in ROWS if row[1] == '/odom']
+    late = [row for row in odometry if row[0] > second]
+    return by_time(only('/cmd_vel', '/reference'), odometry[: -len(late)], late[::every])
+
+
+ODD_BAGS = {
+    # rows, headline, words, whether the error is measured (None: as another one)
+    'whole': (lambda: ROWS, 'Good run', (), True),
+    'gap of a month': (month_later, 'Data missing', ('No message of /odom for 2592000.',), True),
+    'jump of the pose': (
+        lambda: changed('/odom', moved_away),
+        'Good run',
+        ('The position of /odom jumps by 1e+06 m at 8.0',),
+        True,
+    ),
+    'two robots far apart': (
+        lambda: by_time(ROWS, second_robot((5.0, 0.0, 0.0))),
+        'Damaged recording',
+        ('Several robots: the position of /odom alternates between 2 paths (799, 325 messages)',),
+        True,
+    ),
+    'two robots from one place': (
+        lambda: by_time(ROWS, second_robot()),
+        'Damaged recording',
+        ('Several robots: the position of /odom alternates',),
+        True,
+    ),
+    'two base frames': (
+        lambda: by_time(ROWS, second_robot((5.0, 0.0, 0.0), 'base_two')),
+        'Damaged recording',
+        ('/odom are of 2 frames: base_link (799), base_two (325); those of base_link are used',),
+        True,
+    ),
+    'two namespaces': (
+        lambda: by_time(in_namespace('/one', ROWS), in_namespace('/two', only('/odom'))),
+        'Good run',
+        ('also holds topics of /two: another robot',),
+        True,
+    ),
+    'odometry in another namespace': (
+        lambda: by_time(only('/cmd_vel', '/reference'), in_namespace('/base', only('/odom'))),
+        'Good run',
+        ('Odometry is taken from /base/odom', 'also holds topics of /base'),
+        True,
+    ),
+    'foreign types': (
+        lambda: by_time(
+            only('/odom', '/reference'), [(1.0 + i, '/cmd_vel', TEXT) for i in range(9)]
+        ),
+        'Data missing',
+        ('/cmd_vel is std_msgs/msg/String, not geometry_msgs/msg/Twist',),
+        True,
+    ),
+    'not a number': (
+        lambda: changed('/odom', set_speed(np.nan)),
+        'Good run',
+        ('7 messages of /odom hold a number that is not finite',),
+        True,
+    ),
+    'infinite': (
+        lambda: changed('/reference', set_speed(np.inf)),
+        'Good run',
+        ('7 messages of /reference hold a number that is not finite',),
+        True,
+    ),
+    'only commands': (
+        lambda: only('/cmd_vel'),
+        'Data missing',
+        ('The bag lacks reference, odom', 'without a message: reference, odom'),
+        False,
+    ),
+    'no reference': (
+        lambda: only('/odom', '/cmd_vel'),
+        'Data missing',
+        ('The bag lacks reference',),
+        False,
+    ),
+    'no command': (
+        lambda: only('/odom', '/reference'),
+        'Data missing',
+        ('The bag lacks cmd_vel',),
+        True,
+    ),
+    'robot clock set back': (
+        lambda: changed('/odom', lambda i, t, m: restamped(m, -100.0 * (t > 8.0))),
+        'Good run',
+        ('The stamps of /odom leap 1 times, first by -100.0 s at 8.0',),
+        True,
+    ),
+    'receipt out of order': (
+        lambda: [(t - 3.0 * (i % 60 == 7), *row) for i, (t, *row) in enumerate(ROWS)],
+        'Good run',
+        ('messages of /odom were out of order; they were sorted',),
+        True,
+    ),
+    'messages twice': (
+        lambda: by_time(ROWS, [(t + 0.0001, *row) for t, *row in only('/odom')]),
+        'Good run',
+        ('799 messages of /odom are repetitions; each counts once',),
+        True,
+    ),
+    'robot at rest': (
+        lambda: changed('/odom', stand),
+        'No valid measurement',
+        ('Every speed of /odom is zero in all 799 messages', 'Settled RMSE'),
+        None,
+    ),
+    'commands of zero': (
+        lambda: [
+            (t, topic, twist_message((0.0, 0.0)) if topic == '/cmd_vel' else message)
+            for t, topic, message in ROWS
+        ],
+        'No valid measurement',
+        ('The robot was never driven', 'Every speed of /cmd_vel is zero'),
+        False,
+    ),
+    'one message': (
+        lambda: only('/odom')[:1],
+        'Data missing',
+        ('/odom has a single message: nothing follows from it',),
+        False,
+    ),
+    'two rates': (
+        lambda: thinned_after(8.0, 10),
+        'Data missing',
+        ('The rate of /odom changes between 5 and 50 Hz',),
+        True,
+    ),
+    'reference at once': (
+        lambda: [
+            (t if topic != '/reference' or t > 1.0 else 0.0, topic, m) for t, topic, m in ROWS
+        ],
+        'Good run',
+        (),
+        True,
+    ),
+    'stopped': (
+        lambda: [
+            (t, topic, twist_message((0.0, 0.0)) if topic == '/cmd_vel' and 5 < t < 7 else message)
+            for t, topic, message in ROWS
+        ],
+        'Stopped once',
+        ('At 5.0 s for 2.00 s: the bag holds no diagnostics of that time',),
+        True,
+    ),
+    'slow machine': (
+        lambda: by_time(
+            [row for row in ROWS if row[1] != '/odom' or row[0] % 1 > 0.3], OVERLOADED
+        ),
+        'Machine too slow',
+        ('The machine was too slow', 'of odom is missing'),
+        True,
+    ),
+    'slow machine without harm': (
+        lambda: by_time(ROWS, OVERLOADED),
+        'Good run, on a slow machine',
+        ('The machine was too slow at times',),
+        True,
+    ),
+}
+
+
+NAMED = ODD_BAGS.keys() - {
+    'whole', 'reference at once', 'only commands', 'no reference', 'no command', 'stopped',
+    'slow machine', 'slow machine without harm',
+}  # fmt: skip
+"""Bags with an oddity beside the verdict."""
+
+
+def first_screen(figures):
+    """Return the text of the page before its contents."""
+    page = figures.report.read_text(encoding='utf-8').partition('<main>')[2].partition('<nav')[0]
+    return ' '.join(unescape(re.sub(r'<[^>]*>', ' ', page)).split())
+
+
+@pytest.mark.parametrize('name', ODD_BAGS)
+def test_an_odd_bag_is_named_first(name, tmp_path):
+    make, headline, words, measured = ODD_BAGS[name]
+    figures = write_report(write(tmp_path / 'bag', make()))
+    screen = first_screen(figures)
+    assert figures.verdict.headline.startswith(headline), figures.verdict
+    assert figures.verdict.headline in screen
+    for each in words:
+        assert each in screen
+    assert ('Unusual in this bag' in screen) == (name in NAMED), screen
+    errors = [figures.wheels[each.name].settled for each in figures.channels]
+    if measured:
+        assert [each.rmse for each in errors] == pytest.approx([OFFSET] * 2, rel=1e-3)
+    elif measured is False:
+        assert [each.count for each in errors] == [0, 0]
+        assert 'not measured' in figures.summary()
+
+
+def truncated(folder):
+    """Cut the second half of the second file of a bag."""
+    half = len(ROWS) // 2
+    write(folder, ROWS[:half])
+    (rest,) = write(folder.parent / 'rest', ROWS[half:]).glob('*.mcap')
+    data = rest.read_bytes()
+    (folder / 'bag_1.mcap').write_bytes(data[: len(data) // 2])
+
+
+def broken_metadata(folder):
+    write(folder, ROWS)
+    (folder / 'metadata.yaml').write_text('rosbag2_bagfile_information: [\x00')
+
+
+def ros1(folder):
+    store = get_typestore(Stores.ROS1_NOETIC)
+    folder.mkdir()
+    with Ros1Writer(folder / 'run.bag') as writer:
+        connections = {}
+        for i, (received, topic, message) in enumerate(ROWS):
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=store)
+            values = STORE.serialize_cdr(message, kind)
+            if topic != '/cmd_vel':
+                head = store.types['std_msgs/msg/Header']
+                time = store.types['builtin_interfaces/msg/Time']
+                stamp = message.header.stamp
+                made = store.types[kind](
+                    head(i, time(stamp.sec, stamp.nanosec), 'odom'),
+                    'base_link',
+                    message.pose,
+                    message.twist,
+                )
+            else:
+                made = store.deserialize_cdr(values, kind)
+            data = store.serialize_ros1(made, kind)
+            writer.write(connections[topic], START + round(received * 1e9), data)
+
+
+DAMAGED_BAGS = {
+    'truncated file': (truncated, '', 'Truncated or unfinished files, not read: bag_1.mcap'),
+    'broken metadata': (broken_metadata, '', 'Good run'),
+    'ROS 1': (ros1, 'run.bag', 'This is a bag of ROS 1'),
+}
+
+
+@pytest.mark.parametrize('name', DAMAGED_BAGS)
+def test_a_damaged_bag_has_a_report_that_says_so(name, tmp_path):
+    make, file, words = DAMAGED_BAGS[name]
+    make(tmp_path / 'bag')
+    figures = write_report(tmp_path / 'bag' / file if file else tmp_path / 'bag', tmp_path)
+    assert words in first_screen(figures)
+    assert figures.verdict.sound == (name != 'truncated file')
+    errors = [figures.wheels[each.name].settled.rmse for each in figures.channels]
+    assert errors == pytest.approx([OFFSET] * 2, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ('content', 'words'),
+    [(b'', 'empty'), (b'\x89MCAP0\r\n', 'recover'), (b'GIF89a', 'no MCAP file')],
+    ids=['zero bytes', 'without an end', 'no bag'],
+)
+def test_what_cannot_be_read_is_an_error_that_says_why(content, words, tmp_path, capsys):
+    file = tmp_path / ('run.gif' if content.startswith(b'GIF') else 'run.mcap')
+    file.write_bytes(content)
+    assert t3mpc(['bag', 'report', str(file), '--output', str(tmp_path / 'out')]) == 1
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / 'out').exists()

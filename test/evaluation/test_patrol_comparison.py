@@ -1,0 +1,144 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``t3mpc patrol``: runs, claims, tables, page."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from support.unrendered import unrendered  # noqa: F401 - a fixture
+
+from t3mpc_ros.cli.main import main
+from t3mpc_ros.evaluation.patrol import patrol_page
+from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid
+from t3mpc_ros.evaluation.patrol.patrol_comparison import (
+    CLEARANCE,
+    OURS,
+    PATHS,
+    PatrolPlan,
+    PatrolResult,
+    free_cells,
+    patrol_track,
+)
+from t3mpc_ros.evaluation.patrol.patrol_metrics import PatrolMetrics
+from t3mpc_ros.evaluation.patrol.predictability import Skill
+from t3mpc_ros.simulation.world import clearance, load_world
+
+
+@pytest.mark.parametrize('name', PATHS)
+def test_every_path_is_driven_within_arena_and_limits(name):
+    plan = PatrolPlan(duration=40.0)
+    track = patrol_track(plan, name, 101)
+    left, bottom, right, top = plan.arena
+    assert (track.position >= np.array([left, bottom]) - 1e-6).all()
+    assert (track.position <= np.array([right, top]) + 1e-6).all()
+    speed = np.hypot(*np.diff(track.position, axis=0).T) / np.diff(track.time)
+    assert speed.max() <= plan.limits.linear
+    assert np.array_equal(track.position[0], [0.0, 0.0])
+    assert track.time[-1] == pytest.approx(plan.duration)
+
+
+def test_cells_near_walls_and_boxes_do_not_count():
+    world = load_world('room')
+    grid = free_cells(PatrolPlan(arena=(-2.0, -1.5, 2.0, 1.5)), world)
+    centres = grid.centres()[grid.free]
+    assert 0 < centres.shape[0] < 400
+    assert all(world.is_free(x, y, CLEARANCE) for x, y in centres)
+    assert free_cells(PatrolPlan(), None).free.all()
+
+
+def _result(time_to_90, skill, coverage=0.95, spread=1.0):
+    error = math.sqrt((1.0 - skill) * spread)
+    skills = tuple(Skill(h, skill, 'linear', {}, error) for h in (1.0, 2.0, 5.0, 10.0))
+    times = {0.5: 100.0, 0.9: time_to_90, 0.95: math.inf}
+    metrics = PatrolMetrics(900.0, 200.0, coverage, times, 0.9, 0.1, 0.5, 0.6, skills)
+    return PatrolResult(metrics, np.zeros(5), 0, 0.0, None)
+
+
+@pytest.mark.parametrize(
+    'own, verdict',
+    [
+        ([700.0, 720.0, 710.0], 'holds'),
+        ([990.0, 1010.0, 1000.0], 'does not hold'),
+        ([600.0, 1200.0, 800.0], 'inconclusive'),
+        ([700.0, 720.0, math.inf], 'inconclusive'),  # how long it takes is not known
+    ],
+)
+def test_verdict_on_coverage_needs_its_interval(own, verdict):
+    results = {
+        OURS: [_result(time, 0.5) for time in own],
+        'boustrophedon': [_result(time, 1.0) for time in (300.0, 301.0, 299.0)],
+    }
+    (claim,) = patrol_page.claims(PatrolPlan(seeds=(1, 2, 3), duration=1300.0), results)
+    assert claim.verdict == verdict
+
+
+@pytest.mark.parametrize(
+    'own, verdict',
+    [
+        ([0.51, 0.50, 0.52], 'holds'),
+        ([0.60, 0.61, 0.59], 'does not hold'),
+        ([0.40, 0.60, 0.55], 'inconclusive'),
+    ],
+)
+def test_verdict_on_skill_is_relative_to_the_random_walk(own, verdict):
+    results = {
+        OURS: [_result(700.0, skill) for skill in own],
+        'random walk': [_result(700.0, skill) for skill in (0.50, 0.51, 0.52)],
+    }
+    _, claim = patrol_page.claims(PatrolPlan(seeds=(1, 2, 3)), results)
+    assert claim.verdict == verdict
+
+
+def test_a_path_that_spreads_more_may_have_a_higher_skill():
+    """A path that surprised by as many metres was refused for covering more of the room."""
+    results = {
+        OURS: [_result(700.0, skill, spread=1.5) for skill in (0.66, 0.67, 0.68)],
+        'random walk': [_result(700.0, skill) for skill in (0.50, 0.51, 0.52)],
+    }
+    error, skill = patrol_page.claims(PatrolPlan(seeds=(1, 2, 3)), results)
+    assert error.verdict == 'holds'
+    assert skill.verdict == 'does not hold'
+
+
+@pytest.mark.usefixtures('unrendered')
+def test_the_command_writes_page_pictures_and_numbers(tmp_path, capsys):
+    words = ['--seeds', '101', '--minutes', '2.2', '--workers', '1']
+    words += ['--paths', 'boustrophedon', 'random-walk', '--output', str(tmp_path)]
+    assert main(['patrol', *words]) == 0
+    printed = capsys.readouterr().out
+    assert '| random walk |' in printed
+    page = (tmp_path / 'patrol.html').read_text()
+    assert 'Predictability' in page
+    numbers = json.loads((tmp_path / 'patrol.json').read_text())
+    assert set(numbers['paths']) == {'random walk', 'boustrophedon'}
+    run = numbers['paths']['boustrophedon']['runs'][0]
+    assert run['skill_5'] > 0.9
+    assert run['time_to_90'] is None  # not within two minutes
+    assert {path.stem for path in (tmp_path / 'figures').iterdir()} == {
+        'coverage',
+        'heat_maps',
+        'paths',
+        'predictability',
+    }
+
+
+def test_a_wrong_plan_is_refused(capsys, tmp_path):
+    assert main(['patrol', '--paths', 'Lorentz', '--output', str(tmp_path)]) == 1
+    assert 'did you mean Lorenz?' in capsys.readouterr().err
+    with pytest.raises(ValueError, match=r'arena must contain the start'):
+        PatrolPlan(arena=(0.5, -1.0, 2.0, 1.0))
+    with pytest.raises(ValueError, match='blocked must leave at least one cell free'):
+        CoverageGrid((0.0, 0.0), (1.0, 1.0), 1, 1, np.ones((1, 1), dtype=bool))
+
+
+def test_the_twin_drives_among_unknown_boxes_and_sees_them():
+    plan = PatrolPlan(duration=20.0, robot='twin')
+    track = patrol_track(plan, 'random waypoints', 101)
+    assert track.contacts == 0
+    assert track.grid.free.sum() < 400
+    # Rays end at walls or boxes, within the errors of the sensors.
+    assert len(track.hits)
+    distance = [clearance(x, y, track.world.segments, track.world.circles) for x, y in track.hits]
+    assert np.median(distance) < 0.03

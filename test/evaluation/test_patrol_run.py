@@ -1,0 +1,44 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Patrols of the twin: repeatable with a seed, within the limits, without contact."""
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.control.actuation import LimitParameters
+from t3mpc_ros.evaluation.patrol.patrol_run import (
+    RATE,
+    PatrolScenario,
+    portrait_points,
+    room_with_boxes,
+    run_patrol,
+    world_file,
+)
+
+
+def _run(seed, duration):
+    with world_file(room_with_boxes(seed)) as world:
+        scenario = PatrolScenario(seed=seed, duration=duration, world=world)
+        return run_patrol(portrait_points(seed, scenario.limits), scenario)
+
+
+@pytest.mark.slow
+def test_a_patrol_with_a_seed_is_repeatable():
+    """Every number is equal, bit for bit; another seed gives another path."""
+    one, again, other = _run(5, 4.0), _run(5, 4.0), _run(6, 4.0)
+    for name in one.__slots__:
+        assert np.array_equal(getattr(one, name), getattr(again, name), equal_nan=True)
+    assert not np.array_equal(one.reference, other.reference)
+
+
+def test_a_patrol_keeps_limits_and_touches_nothing():
+    """The robot looks around, drives off and reaches its path, with 10 % of commands lost."""
+    record, limits = _run(3, 15.0), LimitParameters()
+    assert record.contacts == 0
+    largest = np.abs(record.command).max(axis=0)
+    sent = np.vstack([np.zeros(2), record.command])  # the robot stands before
+    change = np.abs(np.diff(sent, axis=0)).max(axis=0) * RATE
+    assert (largest <= np.array([limits.linear, limits.angular]) + 1e-9).all()
+    accelerations = np.array([limits.linear_acceleration, limits.angular_acceleration])
+    assert (change <= accelerations * (1.0 + 1e-9)).all()
+    assert np.hypot(*(record.truth[-1] - record.truth[0])[:2]) > 0.2
