@@ -1,0 +1,26 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The chaotic generator alone: the attractor of (85), and how fast two neighbours separate."""
+
+from pathlib import Path
+
+import numpy as np
+
+import t3mpc_ros as t3
+
+
+def main(folder=Path('runs/examples'), duration=20.0):
+    """Draw the attractor, and print the distance of two solutions that begin almost alike."""
+    solution = t3.chaos(alpha=0.98, tspan=(0.0, duration), dt=0.001, every=2)
+    solution.plot(folder / 'generator.png', plane=True)
+    solution.to_csv(folder / 'generator.csv')
+    start = np.array([1.0, 1.0, 1.0, 1.0])
+    pair = [t3.chaos(alpha=0.98, tspan=(0.0, 2.0), y0=start + change) for change in (0.0, 1e-9)]
+    distance = np.linalg.norm(pair[1].y - pair[0].y, axis=1)
+    for time in (0.0, 0.5, 1.0, 2.0):
+        print(f'{time:g} s: {np.interp(time, pair[0].t, distance):.2g}')
+    return solution, distance
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,32 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Read a bag without ROS, and plot commanded and measured speeds."""
+
+from pathlib import Path
+import sys
+
+import t3mpc_ros as t3
+
+
+def main(path='runs/latest/bag', folder=Path('runs/examples')):
+    """Print what the bag holds, and draw its odometry against the commands."""
+    import matplotlib.figure
+
+    bag = t3.read_bag(path)
+    for topic, kind in bag.types.items():
+        print(f'{topic} ({kind}): {len(bag[topic].get("received", ()))} messages')
+    odometry, command = bag['/odom'], bag['/cmd_vel']
+    figure = matplotlib.figure.Figure(figsize=(6.2, 3.0), layout='constrained')
+    axis = figure.subplots()
+    axis.plot(odometry['stamp'], odometry['twist.twist.linear.x'], label='odom')
+    axis.plot(command['received'], command['linear.x'], label='cmd_vel')
+    axis.set_xlabel('time / s')
+    axis.set_ylabel('m/s')
+    axis.legend()
+    folder.mkdir(parents=True, exist_ok=True)
+    figure.savefig(folder / 'read_bag.png', dpi=150)
+    return bag
+
+
+if __name__ == '__main__':
+    main(*sys.argv[1:])

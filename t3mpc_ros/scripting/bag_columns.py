@@ -1,0 +1,131 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The columns of a bag: ``read_bag``."""
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import fields, is_dataclass
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.parameters.table import nearest_hint
+from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
+
+Array = NDArray[Any]
+RECEIVED, STAMP = 'received', 'stamp'
+
+
+class BagColumns(Mapping[str, Mapping[str, Array]]):
+    """Columns by topic and field: ``bag['/odom']['twist.twist.linear.x']``.
+
+    A column has one entry for each message, in order of receipt. Each topic also has the columns
+    ``received``, and ``stamp`` where its type has a header, in s since the first message of the
+    bag. Numbers and truth values are NumPy arrays, texts arrays of objects. An array field of
+    constant length has one column for each element, ``field[0]``; one of varying length is left
+    out. A topic is read when it is first used.
+
+    Parameters
+    ----------
+    path
+        The bag: a folder, or a file.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path).expanduser()
+        """The bag."""
+        with open_bag(self.path) as bag:
+            self.types = {name: topic.type_name for name, topic in bag.topics.items()}
+            """Type of each topic by name."""
+            self.duration = bag.duration
+            """s between the first and the last message."""
+        self._columns: dict[str, dict[str, Array]] = {}
+
+    @one_sentence
+    def __getitem__(self, topic: str) -> Mapping[str, Array]:
+        """Return the columns of a topic by field."""
+        if topic not in self.types:
+            hint = nearest_hint(topic, self.types)
+            raise ScriptError(f'{topic} is not in {self.path}{hint}; its topics: {self._names()}')
+        if topic not in self._columns:
+            self._columns[topic] = FieldColumns(topic, _read(self.path, topic))
+        return self._columns[topic]
+
+    def __contains__(self, topic: object) -> bool:
+        return topic in self.types
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.types)
+
+    def __len__(self) -> int:
+        return len(self.types)
+
+    def __repr__(self) -> str:
+        return f'BagColumns({str(self.path)!r}: {self._names()})'
+
+    def _names(self) -> str:
+        return ', '.join(self.types) or 'none'
+
+
+class FieldColumns(dict[str, Array]):
+    """Columns of one topic by field; an unknown field is an error that names the nearest one."""
+
+    def __init__(self, topic: str, columns: Mapping[str, Array]) -> None:
+        super().__init__(columns)
+        self._topic = topic
+
+    def __missing__(self, field: str) -> Array:
+        hint = nearest_hint(field, self)
+        raise ScriptError(f'{self._topic} has no field {field}{hint}')
+
+
+def _read(path: Path, topic: str) -> dict[str, Array]:
+    rows: list[dict[str, Any]] = []
+    with open_bag(path) as bag:
+        for received, message in bag.messages(topic):
+            row: dict[str, Any] = {RECEIVED: received}
+            header = getattr(message, 'header', None)
+            if header is not None:
+                stamp_ns = header.stamp.sec * NANOSECONDS + header.stamp.nanosec
+                row[STAMP] = (stamp_ns - bag.start_ns) / NANOSECONDS
+            _flatten(message, '', row)
+            rows.append(row)
+    # A field that is not in every message is an array of varying length.
+    names: Collection[str] = rows[0] if rows else ()
+    kept = [name for name in names if all(name in row for row in rows)]
+    return {name: _column([row[name] for row in rows]) for name in kept}
+
+
+def _column(values: list[Any]) -> Array:
+    return np.array(values, dtype=object if isinstance(values[0], str) else None)
+
+
+def _flatten(value: Any, name: str, row: dict[str, Any]) -> None:
+    """Write the numbers and texts of a message into a row, by their paths."""
+    if is_dataclass(value):
+        for each in fields(value):
+            if not each.name.startswith('_'):
+                _flatten(getattr(value, each.name), f'{name}.{each.name}'.lstrip('.'), row)
+    elif isinstance(value, np.ndarray | list | tuple):
+        for i, item in enumerate(value):
+            _flatten(item, f'{name}[{i}]', row)
+    elif isinstance(value, bool | int | float | str | np.generic):
+        row[name] = value
+
+
+@one_sentence
+def read_bag(path: str | os.PathLike[str]) -> BagColumns:
+    """Return the columns of a bag by topic and field, without ROS.
+
+    MCAP, sqlite3 and ROS 1 files are read.
+
+    Raises
+    ------
+    ScriptError
+        There is no bag, or it is damaged.
+    """
+    return BagColumns(path)

@@ -1,0 +1,266 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Controllers side by side over seeds and cases: ``compare`` and its result."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
+import os
+from pathlib import Path
+from typing import Any
+
+from t3mpc_ros.evaluation.confidence_intervals import Difference
+from t3mpc_ros.evaluation.link_faults import LinkFaults
+from t3mpc_ros.evaluation.method_comparison.compared_runs import (
+    METRICS,
+    QUICK_SEEDS,
+    AnyMethod,
+    AnyScenario,
+    ComparisonPlan,
+    Job,
+    Metric,
+    Results,
+)
+from t3mpc_ros.evaluation.method_comparison.compared_runs import compare as run_plan
+from t3mpc_ros.evaluation.tuning.search_space import find_names
+from t3mpc_ros.parameters.provenance import provenance
+from t3mpc_ros.scripting.controllers import OwnMethod, as_controllers
+from t3mpc_ros.scripting.executors import workers_for
+from t3mpc_ros.scripting.plants import NoiseLaw
+from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
+from t3mpc_ros.scripting.setting import NOMINAL, Setting
+from t3mpc_ros.scripting.table_files import columns_of, write_csv, write_parquet
+from t3mpc_ros.simulation.fault_injection import FaultSchedule
+
+OWN_KNOWLEDGE = (
+    'the Observation of each step: estimated speeds and disturbance, reference, and with preview '
+    'the reference 0.4 s ahead; a class with an argument model: the nominal model'
+)
+
+
+@dataclass(frozen=True)
+class ScriptedPlan(ComparisonPlan):
+    """What a script compares."""
+
+    setting: Setting = field(default_factory=Setting)
+    controllers: Mapping[str, AnyMethod] = field(default_factory=dict)
+    reference_name: str = ''
+    """The method with which every other is compared; by default the first one."""
+
+    @property
+    def against(self) -> str:
+        """The method with which every other is compared."""
+        return self.reference_name or self.methods[0]
+
+    @property
+    def robot_text(self) -> str:
+        """What the robot is, in words."""
+        return self.setting.robot_text
+
+    @property
+    def additional_knowledge(self) -> Mapping[str, str]:
+        """What controllers of one's own know."""
+        own = [
+            name
+            for name, method in self.controllers.items()
+            if isinstance(method, OwnMethod)
+            or isinstance(getattr(method, 'baseline', None), OwnMethod)
+        ]
+        return {', '.join(own): OWN_KNOWLEDGE} if own else {}
+
+    def known_methods(self) -> Mapping[str, AnyMethod]:
+        """Return the compared methods by name."""
+        return self.controllers
+
+    def scenario(self, case: str, seed: int) -> AnyScenario:
+        """Return one run without its method."""
+        return self.setting.scenario(case, seed)
+
+    def job(self, case: str, method: str, seed: int) -> Job:
+        """Return scenario and method of a run."""
+        return self.scenario(case, seed), self.controllers[method]
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Result of a comparison: the metrics of every run, and what is made of them."""
+
+    plan: ScriptedPlan
+    results: Results
+    """Metrics by (case, controller), one entry for each seed."""
+
+    def table(self, case: str | None = None) -> str:
+        """Return the metrics of a case in Markdown: means over the seeds with 95 % intervals.
+
+        Differences are paired by seed, with the verdict ``better``, ``worse`` or
+        ``inconclusive``. Without a case: of all of them, one below the other.
+        """
+        from t3mpc_ros.evaluation.method_comparison.comparison_page import case_table
+
+        cases = self.plan.cases if case is None else find_names('case', [case], self.plan.cases)
+        tables = [case_table(self.plan, self.results, each).markdown() for each in cases]
+        return '\n\n'.join(tables)
+
+    def __str__(self) -> str:
+        return self.table()
+
+    @one_sentence
+    def values(self, controller: str, metric: str = 'overall', case: str = '') -> list[float]:
+        """Return a metric of a controller, one number for each seed."""
+        from t3mpc_ros.evaluation.method_comparison.comparison_page import values
+
+        return values(self.results, *self._chosen(controller, case), _metric(metric))
+
+    @one_sentence
+    def difference(
+        self, controller: str, metric: str = 'overall', case: str = ''
+    ) -> Difference | None:
+        """Return the paired difference of a metric from the first controller, with its interval.
+
+        None for the first controller itself.
+        """
+        from t3mpc_ros.evaluation.method_comparison.comparison_page import difference
+
+        run = self._chosen(controller, case)
+        return difference(self.results, *run, _metric(metric), self.plan.against)
+
+    def _chosen(self, controller: str, case: str) -> tuple[str, str]:
+        """Return case and controller by their names, or parts of them."""
+        (name,) = find_names('controller', [controller], self.plan.methods)
+        (chosen,) = find_names('case', [case or self.plan.cases[0]], self.plan.cases)
+        return chosen, name
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return one row for each run: controller, case, seed, setting, metrics, provenance."""
+        plan, origin = self.plan, provenance()
+        return [
+            {
+                'controller': method,
+                'robot': plan.robot,
+                'case': case,
+                'seed': seed,
+                'noise': plan.noise,
+                'duration': plan.duration,
+                **numbers,
+                **origin,
+            }
+            for (case, method), runs in self.results.items()
+            for seed, numbers in zip(plan.seeds, runs, strict=True)
+        ]
+
+    @one_sentence
+    def to_csv(self, path: str | os.PathLike[str]) -> Path:
+        """Write one row for each run as CSV and return the path."""
+        return write_csv(path, columns_of(self.rows()))
+
+    @one_sentence
+    def to_parquet(self, path: str | os.PathLike[str]) -> Path:
+        """Write one row for each run as Parquet; needs the extra ``[compare]``."""
+        return write_parquet(path, columns_of(self.rows()))
+
+    @one_sentence
+    def to_html(self, path: str | os.PathLike[str]) -> Path:
+        """Write tables and figures as one page and return the path."""
+        from t3mpc_ros.evaluation.method_comparison.comparison_page import page
+
+        target = Path(path).expanduser()
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(page(self.plan, self.results), encoding='utf-8')
+        return target
+
+
+@one_sentence
+def compare(
+    controllers: Any,
+    *,
+    seeds: Iterable[int] = QUICK_SEEDS,
+    cases: Sequence[str] = (NOMINAL,),
+    reference: Any = None,
+    plant: Any = 'twin',
+    noise: float | NoiseLaw = 0.04,
+    faults: LinkFaults | FaultSchedule | str | None = None,
+    duration: float = 60.0,
+    executor: Executor | int | None = None,
+    progress: bool = False,
+) -> Comparison:
+    """Return the comparison of controllers, all on the same references, noise and disturbances.
+
+    Differences are those from the first controller, paired by seed.
+
+    Parameters
+    ----------
+    controllers
+        One or more of what :func:`simulate` takes as a controller.
+    seeds
+        Whole numbers; no default one was used to tune a controller of the package.
+    cases
+        Names of cases: what differs from the nominal robot.
+    reference, plant, noise, faults, duration
+        As for :func:`simulate`.
+    executor
+        None: a process for each processor; a number of processes, 1 for this one; or an
+        :class:`concurrent.futures.Executor` or a Dask client.
+    progress
+        Whether a line on standard error shows progress and the time left.
+
+    Raises
+    ------
+    ScriptError
+        As for :func:`simulate`.
+    """
+    plan = make_plan(controllers, seeds, cases, Setting(plant, reference, noise, faults, duration))
+    jobs = [plan.job(*key) for key in plan.jobs()]
+    return Comparison(plan, run_plan(plan, workers_for(executor, jobs), progress=progress))
+
+
+def make_plan(
+    controllers: Any, seeds: Iterable[int], cases: Sequence[str], setting: Setting
+) -> ScriptedPlan:
+    """Return what is compared.
+
+    Raises
+    ------
+    ValueError
+        An unknown name, a bad seed, or two controllers of one name.
+    """
+    methods = [each.method(setting.robot) for each in as_controllers(controllers)]
+    names = [method.name for method in methods]
+    if repeated := sorted({name for name in names if names.count(name) > 1}):
+        raise ScriptError(
+            f'controllers must have different names, see Controller(name=…): got {repeated[0]} '
+            'more than once'
+        )
+    chosen = checked_seeds(seeds)
+    plan = ScriptedPlan(
+        setting.robot,
+        setting.chosen_cases(cases),
+        tuple(names),
+        chosen,
+        setting.duration,
+        setting.variance,
+        setting=setting,
+        controllers=dict(zip(names, methods, strict=True)),
+    )
+    for case in plan.cases:
+        setting.scenario(case, chosen[0])
+    return plan
+
+
+def checked_seeds(seeds: Any) -> tuple[int, ...]:
+    """Return seeds as a tuple, or raise :class:`ScriptError`."""
+    try:
+        found = tuple([seeds] if isinstance(seeds, int) else seeds)
+    except TypeError:
+        found = (seeds,)
+    for seed in found:
+        if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+            raise ScriptError(f'seeds must be whole numbers of at least 0: got {seed!r}')
+    if not found or len({*found}) < len(found):
+        raise ScriptError(f'seeds must be one or more, each once: got {list(found)}')
+    return found
+
+
+def _metric(name: str) -> Metric:
+    known = {metric.name: metric for metric in METRICS}
+    (found,) = find_names('metric', [name], known)
+    return known[found]

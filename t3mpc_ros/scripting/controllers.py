@@ -1,0 +1,346 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Controllers of a script: one's own class or function, or a method of the package by name."""
+
+from collections.abc import Callable, Mapping
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
+import hashlib
+import importlib.util
+import inspect
+from pathlib import Path
+import sys
+import traceback
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.evaluation.baselines.baseline_controller import (
+    BaselineController,
+    NominalModel,
+    Observation,
+)
+from t3mpc_ros.evaluation.closed_loop import MethodSpec
+from t3mpc_ros.evaluation.method_comparison.compared_runs import (
+    AnyMethod,
+    TwinMethod,
+    methods_for,
+)
+from t3mpc_ros.evaluation.methods import require_libraries
+from t3mpc_ros.evaluation.tuning.search_space import find_names
+from t3mpc_ros.parameters.table import Parameters
+from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
+
+Array = NDArray[np.float64]
+Settings = Mapping[str, Any]
+FILE_SEPARATOR = '.py:'
+MODEL = 'model'
+"""Name of the argument of a class that gets the :class:`NominalModel`."""
+
+
+@dataclass(frozen=True)
+class Controller:
+    """A controller with a name in the tables, and with values other than its defaults.
+
+    Parameters
+    ----------
+    source
+        The name of a method of the package, such as ``'full'`` or ``'PI + feed-forward'``;
+        ``'file.py:Name'``; a class with a method ``step``; an object of one; or a function. A
+        run makes its own controller: an object is copied. ``step``, or the function, gets an
+        :class:`Observation` once in each control period and returns the accelerations of the right
+        and the left wheel, rad/s², a numpy array of shape (2,). A class with an argument
+        ``model`` gets the :class:`NominalModel`.
+    settings
+        Parameters of a method by name, or keyword arguments of a class or a function.
+    name
+        In tables and errors; by default that of the source, with the settings.
+    """
+
+    source: Any
+    settings: Settings = field(default_factory=dict)
+    name: str = ''
+
+    @one_sentence
+    def __post_init__(self) -> None:
+        if not isinstance(self.settings, Mapping):
+            raise ScriptError(
+                f'settings must be a mapping of names to values: got {self.settings!r}'
+            )
+        if not self.name:
+            values = ', '.join(f'{name} {value}' for name, value in self.settings.items())
+            plain = _plain_name(self.source)
+            object.__setattr__(self, 'name', f'{plain}, {values}' if values else plain)
+
+    def method(self, robot: str) -> AnyMethod:
+        """Return it as a method of a robot: ``twin``, ``servo`` or ``torque``."""
+        if isinstance(self.source, str) and FILE_SEPARATOR not in self.source:
+            return self._packaged(robot, self.source)
+        own = OwnMethod(self.name, checked_source(self.source), tuple(self.settings.items()))
+        return TwinMethod(self.name, baseline=own) if robot == 'twin' else own
+
+    def _packaged(self, robot: str, wanted: str) -> AnyMethod:
+        known = methods_for(robot)
+        (found,) = find_names('controller', [wanted], known)
+        require_libraries([found])
+        method = known[found]
+        name = found if self.name == wanted else self.name
+        if isinstance(method, TwinMethod):
+            if method.baseline is None:
+                return replace(
+                    method, name=name, changes={**(method.changes or {}), **self.settings}
+                )
+            assert isinstance(method.baseline, MethodSpec)
+            return replace(method, name=name, baseline=self._changed(method.baseline))
+        assert isinstance(method, MethodSpec)
+        return replace(self._changed(method), name=name)
+
+    def _changed(self, spec: MethodSpec) -> MethodSpec:
+        return replace(spec, parameters=spec.parameters.with_values(self.settings))
+
+
+def loaded(spec: str) -> Any:
+    """Return the class, function or object that ``file.py:Name`` is.
+
+    Raises
+    ------
+    ScriptError
+        There is no such file or name, or the file cannot be run.
+    """
+    if FILE_SEPARATOR not in spec:
+        raise ScriptError(f'must be FILE.py:NAME: got {spec}')
+    return FileController.load(spec).resolve()
+
+
+def as_controllers(given: Any) -> list[Controller]:
+    """Return one controller, or each of a list or tuple, by :func:`as_controller`."""
+    return [
+        as_controller(each) for each in (given if isinstance(given, list | tuple) else [given])
+    ]
+
+
+def as_controller(given: Any) -> Controller:
+    """Return what a caller gave as a :class:`Controller`."""
+    return given if isinstance(given, Controller) else Controller(given)
+
+
+def _plain_name(source: Any) -> str:
+    if isinstance(source, str):
+        return source.rpartition(FILE_SEPARATOR)[2]
+    return str(getattr(source, '__name__', type(source).__name__))
+
+
+# -- controllers of one's own ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class FileController:
+    """A class or function of a Python file, with the text of the file.
+
+    It can be sent to other machines: they need the file's imports, not the file.
+    """
+
+    path: str
+    text: str
+    name: str
+
+    @classmethod
+    def load(cls, spec: str) -> 'FileController':
+        """Return that of ``file.py:Name``, after running the file."""
+        stem, _, name = spec.rpartition(FILE_SEPARATOR)
+        path = Path(f'{stem}.py').expanduser()
+        if not path.is_file():
+            raise ScriptError(f'there is no file {path}')
+        found = cls(str(path), path.read_text(encoding='utf-8'), name)
+        found.resolve()
+        return found
+
+    def resolve(self) -> Any:
+        """Return the class, function or object itself."""
+        content = vars(self._module())
+        if self.name not in content:
+            names = [
+                name
+                for name, value in content.items()
+                if not name.startswith('_') and getattr(value, '__module__', '') == self._key
+            ]
+            raise ScriptError(
+                f'{self.path} must define {self.name}: it defines {", ".join(names) or "nothing"}'
+            )
+        return content[self.name]
+
+    @property
+    def _key(self) -> str:
+        digest = hashlib.sha256(self.text.encode()).hexdigest()[:12]
+        return f'{Path(self.path).stem}_{digest}'
+
+    def _module(self) -> ModuleType:
+        """Return the module of the file, run once in each process."""
+        if self._key in sys.modules:
+            return sys.modules[self._key]
+        spec = importlib.util.spec_from_loader(self._key, None, origin=self.path)
+        assert spec is not None
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[self._key] = module
+        folder = str(Path(self.path).resolve().parent)
+        sys.path.insert(0, folder)  # as when the file is run as a program
+        try:
+            exec(compile(self.text, self.path, 'exec'), vars(module))
+        except Exception as error:
+            del sys.modules[self._key]
+            raise ScriptError(
+                f'{self.path} cannot be run: {described(error, self.path)}'
+            ) from None
+        finally:
+            sys.path.remove(folder)
+        return module
+
+
+def checked_source(source: Any) -> Any:
+    """Return a source that makes controllers, or raise :class:`ScriptError`."""
+    if isinstance(source, str):
+        source = FileController.load(source)
+    found = source.resolve() if isinstance(source, FileController) else source
+    if isinstance(found, type):
+        if not callable(getattr(found, 'step', None)):
+            raise ScriptError(f'class {found.__name__} must have a method step(observation)')
+    elif not (callable(getattr(found, 'step', None)) or callable(found)):
+        raise ScriptError(
+            'controller must be a name, a class with step(observation), an object of one, or a '
+            f'function of the observation: got {type(found).__name__} {found!r}'
+        )
+    return source
+
+
+@dataclass(frozen=True)
+class OwnMethod:
+    """A controller of one's own as a method of the closed loop."""
+
+    name: str
+    source: Any
+    settings: tuple[tuple[str, Any], ...] = ()
+
+    def __call__(self, nominal_model: NominalModel) -> BaselineController:
+        """Return a new controller for a run."""
+        source, settings = self.source, dict(self.settings)
+        if isinstance(source, FileController):
+            source = source.resolve()
+        if isinstance(source, type):
+            step, made = self._instance(source, settings, nominal_model)
+        elif callable(getattr(source, 'step', None)):
+            if settings:
+                raise ScriptError(
+                    f'settings of {self.name} must be given to its class: it is an object already'
+                )
+            made = deepcopy(source)
+            step = made.step
+        else:
+            made, step = source, _with_settings(source, settings)
+        return OwnController(self.name, step, made, nominal_model)
+
+    def _instance(
+        self, kind: type, settings: dict[str, Any], nominal_model: NominalModel
+    ) -> tuple[Callable[[Observation], Any], Any]:
+        try:
+            if issubclass(kind, BaselineController):
+                table = kind.parameters_type().with_values(settings)
+                made: Any = kind(table, nominal_model)
+            else:
+                if MODEL in inspect.signature(kind).parameters:
+                    settings = {MODEL: nominal_model, **settings}
+                made = kind(**settings)
+        except ScriptError:
+            raise
+        except Exception as error:
+            raise ScriptError(f'{self.name} cannot be made: {described(error)}') from None
+        return made.step, made
+
+
+def _with_settings(function: Callable[..., Any], settings: dict[str, Any]) -> Any:
+    return lambda observation: function(observation, **settings)
+
+
+@dataclass(frozen=True)
+class NoParameters(Parameters):
+    """The parameters of a controller of one's own are its settings."""
+
+
+class OwnController(BaselineController):
+    """Runs a step of one's own, and checks what it returns.
+
+    It cuts nothing: the limits of the robot are in the loop.
+    """
+
+    parameters_type = NoParameters
+
+    def __init__(
+        self,
+        name: str,
+        step: Callable[[Observation], Any],
+        made: Any,
+        nominal_model: NominalModel,
+    ) -> None:
+        super().__init__(NoParameters(), nominal_model)
+        self.preview = bool(getattr(made, 'preview', False))  # type: ignore[misc]
+        self._name, self._step = name, step
+        self._applied = getattr(made, 'applied', None)
+        self._period = nominal_model.period
+        self._steps = 0
+
+    def step(self, observation: Observation) -> Array:
+        """Return u, rad/s², shape (2,).
+
+        Raises
+        ------
+        ScriptError
+            The step raised an error, or returned something else.
+        """
+        try:
+            asked = self._step(observation)
+        except Exception as error:
+            text = f'{self._name} raised {described(error)}, at {self._time():.2f} s'
+            raise ScriptError(text) from None
+        if not (
+            isinstance(asked, np.ndarray) and asked.shape == (2,) and asked.dtype.kind in 'fiu'
+        ):
+            what = f'shape {asked.shape}' if isinstance(asked, np.ndarray) else repr(asked)
+            raise ScriptError(
+                f'{self._name} must return a numpy array of shape (2,), the accelerations of the '
+                f'right and the left wheel in rad/s²: got {what} at {self._time():.2f} s'
+            )
+        if not np.isfinite(asked).all():
+            raise ScriptError(
+                f'{self._name} must return finite accelerations: got {asked.tolist()} at '
+                f'{self._time():.2f} s'
+            )
+        self._steps += observation.elapsed
+        return asked.astype(np.float64)
+
+    def applied(self, acceleration: Array, *, limited: bool) -> None:
+        """Pass on the u that the limits let through, where the controller has ``applied``."""
+        if self._applied is not None:
+            self._applied(acceleration, limited=limited)
+
+    def _time(self) -> float:
+        return self._steps * self._period
+
+
+def described(error: BaseException, file: str = '') -> str:
+    """Return an error with its place: the last line of one's own code, in one sentence."""
+    if isinstance(error, SyntaxError):
+        return f'SyntaxError in line {error.lineno}: {error.msg}'
+    frames = traceback.extract_tb(error.__traceback__)
+    package = str(Path(__file__).resolve().parent.parent)
+    own = [
+        frame
+        for frame in frames
+        if not str(Path(frame.filename).resolve()).startswith(package)
+        and 'site-packages' not in frame.filename
+        and (not file or frame.filename == file)
+    ]
+    text = f'{type(error).__name__} ({error})' if str(error) else type(error).__name__
+    if own:
+        text += f' in {own[-1].name}(), {Path(own[-1].filename).name} line {own[-1].lineno}'
+    return text

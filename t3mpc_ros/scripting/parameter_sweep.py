@@ -1,0 +1,420 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Runs over parameters × seeds × cases × controllers: ``sweep`` and its result."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, Executor
+from dataclasses import dataclass, replace
+import hashlib
+import inspect
+import itertools
+import json
+import math
+import os
+from pathlib import Path
+import pickle
+import sys
+from typing import Any
+
+import numpy as np
+
+from t3mpc_ros.evaluation.closed_loop import JobError, WorkerPool
+from t3mpc_ros.evaluation.confidence_intervals import interval, mean
+from t3mpc_ros.evaluation.link_faults import LinkFaults
+from t3mpc_ros.evaluation.method_comparison.compared_runs import (
+    METRICS,
+    Job,
+    measured_run,
+)
+from t3mpc_ros.evaluation.paper.experiment_runs import source_digest
+from t3mpc_ros.evaluation.reporting import Table, finite, format_interval
+from t3mpc_ros.evaluation.result_file import ResultFile, run_missing_jobs
+from t3mpc_ros.evaluation.tuning.search_space import find_names
+from t3mpc_ros.parameters.provenance import provenance
+from t3mpc_ros.scripting.comparison_runs import checked_seeds
+from t3mpc_ros.scripting.controllers import Controller, FileController, as_controllers
+from t3mpc_ros.scripting.executors import workers_for
+from t3mpc_ros.scripting.plants import NoiseLaw
+from t3mpc_ros.scripting.script_error import ScriptError, one_sentence, sentence
+from t3mpc_ros.scripting.setting import NOMINAL, Setting
+from t3mpc_ros.scripting.table_files import columns_of, write_csv, write_parquet
+from t3mpc_ros.simulation.fault_injection import FaultSchedule
+
+ROBOT = 'robot.'
+"""Prefix of a parameter of the true robot."""
+OF_SETTING = ('noise', 'duration')
+RUN, ERROR = 'run', 'error'
+"""Columns: digest of all that determines a run, and why it has no numbers; '' with them."""
+SUFFIX = '.parquet'
+RESTARTS = 3
+"""How often a pool of processes that lost one is started anew."""
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """Result of a sweep: one row for each run.
+
+    A row holds ``controller``, the swept parameters by name, ``robot``, ``reference``, ``case``,
+    ``seed``, ``noise``, ``duration``, the metrics of the comparison, ``error``, ``version``,
+    ``commit``, ``python``, and ``run``, a digest of all that determines its numbers.
+    """
+
+    rows: Sequence[Row]
+    parameters: tuple[str, ...]
+    """Names of the swept parameters."""
+    path: Path | None = None
+    """The Parquet file."""
+
+    @property
+    def columns(self) -> dict[str, list[Any]]:
+        """The rows as columns."""
+        return columns_of(self.rows)
+
+    @one_sentence
+    def table(self, metric: str = 'overall') -> str:
+        """Return a metric in Markdown: mean and 95 % interval over the seeds of each cell."""
+        known = {each.name: each for each in METRICS}
+        (name,) = find_names('metric', [metric], known)
+        names = ('controller', *self.parameters, 'case')
+        cells: dict[tuple[Any, ...], list[float]] = {}
+        for row in self.rows:
+            cells.setdefault(tuple(row[n] for n in names), []).append(row.get(name, math.nan))
+        chosen = known[name]
+        lines = [
+            (
+                *(str(value) for value in cell),
+                str(len(values)),
+                format_interval(mean(values), interval(values), '', chosen.digits),
+            )
+            for cell, values in cells.items()
+        ]
+        head = (*names, 'seeds', f'{chosen.heading}, {chosen.unit}')
+        return Table('', head, lines, text=1 + len(self.parameters) + 1).markdown()
+
+    def __str__(self) -> str:
+        return self.table()
+
+    @one_sentence
+    def plot(
+        self, parameter: str, metric: str = 'overall', path: str | os.PathLike[str] | None = None
+    ) -> Any:
+        """Return a Matplotlib figure of a metric over a swept parameter, a line per controller.
+
+        Means over all else, with 95 % intervals; written to ``path`` (.png) if one is given.
+        """
+        from t3mpc_ros.scripting.figures import drawn, sweep_figure
+
+        (name,) = find_names('parameter', [parameter], self.parameters)
+        known = {each.name: each for each in METRICS}
+        (wanted,) = find_names('metric', [metric], known)
+        lines: dict[str, dict[float, list[float]]] = {}
+        for row in self.rows:
+            line = lines.setdefault(str(row['controller']), {})
+            line.setdefault(row[name], []).append(row.get(wanted, math.nan))
+        label = f'{known[wanted].heading} / ({known[wanted].unit})'
+        return drawn(lambda: sweep_figure(lines, name, label), path)
+
+    @one_sentence
+    def to_csv(self, path: str | os.PathLike[str]) -> Path:
+        """Write one row for each run as CSV and return the path."""
+        return write_csv(path, self.columns)
+
+    @one_sentence
+    def to_parquet(self, path: str | os.PathLike[str]) -> Path:
+        """Write one row for each run as Parquet; needs the extra ``[compare]``."""
+        return write_parquet(path, self.columns)
+
+
+@one_sentence
+def sweep(
+    controllers: Any,
+    parameters: Mapping[str, Sequence[Any]],
+    *,
+    seeds: Iterable[int] = (1, 2, 3, 4, 5),
+    cases: Sequence[str] = (NOMINAL,),
+    reference: Any = None,
+    plant: Any = 'twin',
+    noise: float | NoiseLaw = 0.04,
+    faults: LinkFaults | FaultSchedule | str | None = None,
+    duration: float = 60.0,
+    output: str | os.PathLike[str] | None = None,
+    executor: Executor | int | None = None,
+    progress: bool = False,
+) -> Sweep:
+    """Return the metrics of every combination of parameters, seeds, cases and controllers.
+
+    A run that fails, or diverges, is a row with a reason and without numbers. A sweep with a file
+    that is interrupted goes on where it was when it is started again.
+
+    Parameters
+    ----------
+    controllers
+        One or more of what :func:`simulate` takes as a controller.
+    parameters
+        Values by name: parameters of the controllers or keyword arguments of their classes;
+        ``noise`` and ``duration``; and ``robot.NAME`` of the true robot, unknown to controllers.
+    seeds, cases, reference, plant, noise, faults, duration
+        As for :func:`compare`.
+    output
+        Parquet file; needs the extra ``[compare]``. Rows that it holds of other sweeps stay.
+    executor
+        None: a process for each processor; a number of processes, 1 for this one; or an
+        :class:`concurrent.futures.Executor` or a Dask client. The numbers are the same.
+    progress
+        Whether lines on standard error show progress and the time left.
+
+    Raises
+    ------
+    ScriptError
+        As for :func:`simulate`, or because every run failed.
+    """
+    setting = Setting(plant, reference, noise, faults, duration)
+    cells = make_cells(controllers, parameters, checked_seeds(seeds), cases, setting)
+    path = _checked_path(output)
+    workers = workers_for(executor, [cell.job for cell in cells.values()])
+    names = tuple(parameters)
+    report = _print if progress else None
+    if path is None:
+        with WorkerPool(workers) as pool:
+            found = dict(pool.map(cell_numbers, [cell.job for cell in cells.values()]))
+        numbers = {key: found[i] for i, key in enumerate(cells)}
+        return _checked(Sweep(_rows(cells, numbers), names))
+    result = _to_file(path, cells, workers, report, names)
+    return _checked(result)
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """One run of a sweep."""
+
+    job: Job
+    values: Row
+    """The row without metrics."""
+
+
+def make_cells(
+    controllers: Any,
+    parameters: Mapping[str, Sequence[Any]],
+    seeds: Sequence[int],
+    cases: Sequence[str],
+    setting: Setting,
+) -> dict[str, Cell]:
+    """Return the runs of a sweep by the digest of all that determines them.
+
+    Seed by seed, so that an estimate of the time left holds.
+    """
+    chosen = setting.chosen_cases(cases)
+    combinations = _combinations(parameters)
+    origin, sources = provenance(), source_digest()
+    prepared = []
+    for controller in as_controllers(controllers):
+        for values in combinations:
+            own = {k: v for k, v in values.items() if not (k in OF_SETTING or k.startswith(ROBOT))}
+            changed = replace(
+                setting,
+                **{name: values[name] for name in OF_SETTING if name in values},
+                robot_parameters=_robot_values(setting, values),
+            )
+            source = replace(controller, settings={**controller.settings, **own})
+            digest = _digest((sources, origin['python'], _content(source), _content(changed)))
+            prepared.append(
+                (controller.name, values, source.method(setting.robot), changed, digest)
+            )
+    cells: dict[str, Cell] = {}
+    for seed in seeds:
+        for case in chosen:
+            for name, values, method, changed, digest in prepared:
+                row = {
+                    'controller': name,
+                    **values,
+                    'robot': changed.robot,
+                    'reference': changed.reference_text,
+                    'case': case,
+                    'seed': seed,
+                    'noise': changed.variance,
+                    'duration': float(changed.duration),
+                }
+                cell = Cell((changed.scenario(case, seed), method), row | origin)
+                cells[_digest((digest, name, case, seed))] = cell
+    if len(cells) != len(seeds) * len(chosen) * len(prepared):
+        raise ScriptError('controllers and values must differ: got two runs that are the same')
+    return cells
+
+
+def _combinations(parameters: Mapping[str, Sequence[Any]]) -> list[Row]:
+    if not isinstance(parameters, Mapping):
+        raise ScriptError(f'parameters must map names to lists of values: got {parameters!r}')
+    for name, values in parameters.items():
+        if isinstance(values, str) or not hasattr(values, '__iter__'):
+            raise ScriptError(f'{name} must be a list of values: got {values!r}')
+    # NumPy's numbers are no parameter values, and no JSON.
+    lists = [[_plain(value) for value in values] for values in parameters.values()]
+    if not all(lists):
+        raise ScriptError('each parameter must have one or more values')
+    return [dict(zip(parameters, each, strict=True)) for each in itertools.product(*lists)]
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _robot_values(setting: Setting, values: Row) -> Row:
+    own = {k.removeprefix(ROBOT): v for k, v in values.items() if k.startswith(ROBOT)}
+    return {**setting.robot_parameters, **own}
+
+
+def cell_numbers(job: Job) -> Row:
+    """Return the metrics of one run, or its error.
+
+    Errors that say nothing about the run itself, such as a missing library, are raised.
+    """
+    try:
+        return {**measured_run(job), ERROR: ''}
+    except (ValueError, ArithmeticError) as error:
+        return {ERROR: sentence(error)}
+
+
+def _rows(cells: Mapping[str, Cell], numbers: Mapping[str, Row]) -> list[Row]:
+    return [{**cell.values, **numbers[key], RUN: key} for key, cell in cells.items()]
+
+
+def _checked(result: Sweep) -> Sweep:
+    errors = [row[ERROR] for row in result.rows]
+    if all(errors):
+        raise ScriptError(f'every run failed: {errors[0]}')
+    return result
+
+
+# -- file -----------------------------------------------------------------------------------------
+
+
+def _checked_path(output: str | os.PathLike[str] | None) -> Path | None:
+    """Return the path; a missing library is an error before the runs, not after them."""
+    if output is None:
+        return None
+    path = Path(output).expanduser()
+    if path.suffix != SUFFIX:
+        raise ScriptError(f'output must end in {SUFFIX}: got {path}')
+    import pyarrow.parquet  # noqa: F401
+
+    return path
+
+
+def _to_file(
+    path: Path,
+    cells: Mapping[str, Cell],
+    workers: int | Executor,
+    report: Callable[[str], None] | None,
+    names: tuple[str, ...],
+) -> Sweep:
+    """Run what the file and its journal lack, write the file, and remove the journal."""
+    stored = _read(path)
+    wanted = {key: cell for key, cell in cells.items() if key not in stored}
+    if stored and report is not None:
+        report(f'{path} holds {len(cells) - len(wanted)} of {len(cells)} runs')
+    journal: ResultFile[str, Row] = ResultFile(
+        path.with_name(f'{path.name}.runs.jsonl'), _encoded, _decoded
+    )
+    jobs = {key: cell.job for key, cell in wanted.items()}
+
+    def run(missing: Sequence[Job]) -> Iterator[tuple[int, Row]]:
+        with WorkerPool(workers) as pool:
+            yield from pool.map(cell_numbers, missing)
+
+    for left in reversed(range(RESTARTS + 1)):
+        try:
+            numbers = run_missing_jobs(journal, jobs, run, report)
+        except JobError as error:
+            if not (left and isinstance(error.__cause__, BrokenExecutor)):
+                raise
+            if report is not None:
+                report('a worker process was lost; its runs are begun again')
+        else:
+            break
+    fresh = {row[RUN]: row for row in _rows(wanted, numbers)}
+    rows = [fresh.get(key) or stored[key] for key in cells]
+    others = [row for key, row in stored.items() if key not in cells]
+    write_parquet(path, columns_of([*rows, *others]))
+    journal.path.unlink(missing_ok=True)
+    return Sweep(rows, names, path)
+
+
+def _read(path: Path) -> dict[str, Row]:
+    """Return the rows of a file by their digest."""
+    if not path.exists():
+        return {}
+    import pyarrow
+    import pyarrow.parquet
+
+    try:
+        rows = pyarrow.parquet.read_table(path).to_pylist()
+    except (pyarrow.ArrowException, OSError) as error:
+        raise ScriptError(f'{path} is no Parquet file: {error}') from None
+    if any(RUN not in row for row in rows):
+        raise ScriptError(f'{path} is no file of a sweep: its rows have no column {RUN}')
+    return {row[RUN]: row for row in rows}
+
+
+def _encoded(key: str, value: Row) -> str:
+    return json.dumps({RUN: key, **dict(finite(value).items())}, ensure_ascii=False)  # type: ignore[attr-defined]
+
+
+def _decoded(line: str) -> tuple[str, Row]:
+    row = json.loads(line)
+    key = row.pop(RUN)
+    return key, {name: math.nan if value is None else value for name, value in row.items()}
+
+
+def _print(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
+# -- what determines a run ------------------------------------------------------------------------
+
+
+def _digest(content: object) -> str:
+    return hashlib.sha256(repr(content).encode()).hexdigest()[:16]
+
+
+def _content(value: Any) -> object:
+    """Return what a value is, as text and numbers: functions and classes by their source."""
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
+    if isinstance(value, Controller):
+        source = value.source
+        if isinstance(source, str) and '.py:' in source:
+            source = FileController.load(source)
+        return value.name, _content(source), _content(value.settings)
+    if isinstance(value, Setting):
+        reference = value.own_reference
+        speeds = None if reference is None else reference.speeds
+        parts = value.plant, value.noise, value.faults, value.duration, value.robot_parameters
+        return *(_content(part) for part in parts), _content(speeds)
+    if isinstance(value, np.ndarray):
+        return value.shape, hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
+    if isinstance(value, Mapping):
+        return [(str(key), _content(item)) for key, item in value.items()]
+    if isinstance(value, list | tuple):
+        return [_content(item) for item in value]
+    if isinstance(value, os.PathLike):
+        return Path(value).expanduser().read_text(encoding='utf-8')
+    if hasattr(value, '__dataclass_fields__'):
+        names = value.__dataclass_fields__
+        return type(value).__name__, [_content(getattr(value, name)) for name in names]
+    return _code(value)
+
+
+def _code(value: Any) -> object:
+    """Return the source of a function or class, or of the class of an object and its state."""
+    name = getattr(value, '__qualname__', type(value).__qualname__)
+    try:
+        source = inspect.getsource(value if hasattr(value, '__qualname__') else type(value))
+    except (OSError, TypeError):
+        source = ''  # made in an interactive session: its name is all that is known
+    if hasattr(value, '__qualname__'):
+        return name, source
+    try:
+        return name, source, hashlib.sha256(pickle.dumps(value)).hexdigest()
+    except (pickle.PicklingError, AttributeError, TypeError):
+        return name, source

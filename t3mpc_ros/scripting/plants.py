@@ -1,0 +1,436 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Robots, plants and noise of a script."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from t3mpc_ros.control.actuation import LimitParameters
+from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.mpc.pretraining import matrix_exponential
+from t3mpc_ros.scripting.controllers import described
+from t3mpc_ros.scripting.references import numbers
+from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
+from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
+
+Array = NDArray[np.float64]
+DRIVES = ('velocity', 'torque')
+LONGEST_DEAD_TIME = 0.4
+"""Upper bound of a dead time, s."""
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A differential-drive robot by its geometry, lag and limits: the servo plant (10) with them.
+
+    Parameters
+    ----------
+    wheel_radius, wheel_separation
+        m
+    lag, dead_time
+        Time constant of the wheel speed servo, and time before a command reaches it, s. The dead
+        time is whole control periods.
+    linear_velocity, angular_velocity, wheel_velocity
+        Limits of the command, m/s, rad/s and rad/s of a wheel; None for those of the package's
+        robot.
+    linear_acceleration, angular_acceleration, wheel_acceleration
+        The same in m/s², rad/s² and rad/s².
+    parameters
+        Other parameters of the plant by name, such as ``{'friction.coulomb': 0.01}``.
+    """
+
+    wheel_radius: float = 0.035
+    wheel_separation: float = 0.147
+    lag: float = 0.02
+    dead_time: float = 0.01
+    linear_velocity: float | None = None
+    angular_velocity: float | None = None
+    wheel_velocity: float | None = None
+    linear_acceleration: float | None = None
+    angular_acceleration: float | None = None
+    wheel_acceleration: float | None = None
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+
+    @one_sentence
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.dead_time <= LONGEST_DEAD_TIME:
+            raise ScriptError(
+                f'dead_time must be from 0 to {LONGEST_DEAD_TIME:g} s: got {self.dead_time}'
+            )
+        self.plant_parameters()
+        self.limits()
+
+    def plant_parameters(self, drive: str = 'velocity') -> PaperRobotParameters:
+        """Return the parameters of the plant."""
+        own = {
+            'drive.kind': drive,
+            'wheel_radius': self.wheel_radius,
+            'wheel_separation': self.wheel_separation,
+            'drive.lag': self.lag,
+            'drive.dead_time': self.dead_time,
+        }
+        return PaperRobotParameters.from_dict({**own, **self.parameters})
+
+    def limits(self) -> LimitParameters:
+        """Return the limits of the command."""
+        given = {
+            'linear.x.max_velocity': self.linear_velocity,
+            'angular.z.max_velocity': self.angular_velocity,
+            'wheel.max_velocity': self.wheel_velocity,
+            'linear.x.max_acceleration': self.linear_acceleration,
+            'angular.z.max_acceleration': self.angular_acceleration,
+            'wheel.max_acceleration': self.wheel_acceleration,
+        }
+        return LimitParameters.from_dict({k: v for k, v in given.items() if v is not None})
+
+
+@dataclass(frozen=True, eq=False)
+class OdePlant:
+    """A plant of one's own as an ordinary differential equation x' = f(t, x, u).
+
+    It is integrated by the classical Runge-Kutta method with steps of 1 ms, u constant in each.
+
+    Parameters
+    ----------
+    right_hand_side
+        f: gets t (s), x, shape (states,), and u, shape (2,); returns x', shape (states,).
+    states
+        Number of states.
+    output
+        Wheel speeds (rad/s), right first, of a state; by default its first two entries.
+    drive
+        What u is: ``'velocity'``, commanded wheel speeds (rad/s), or ``'torque'``, torques
+        (N m) that the nominal inertia of ``robot`` makes of accelerations.
+    initial
+        x at the start; zeros by default.
+    robot
+        What the controllers assume: geometry, lag, limits and dead time. The dead time is that of
+        the plant too.
+    """
+
+    right_hand_side: Callable[[float, Array, Array], Any]
+    states: int = 2
+    output: Callable[[Array], Any] | None = None
+    drive: str = 'velocity'
+    initial: ArrayLike | None = None
+    robot: Robot = field(default_factory=Robot)
+
+    @one_sentence
+    def __post_init__(self) -> None:
+        check_drive(self.drive)
+        if isinstance(self.states, bool) or not (
+            isinstance(self.states, int) and self.states >= 1
+        ):
+            raise ScriptError(f'states must be a whole number, at least 1: got {self.states!r}')
+        if self.output is None and self.states < 2:
+            raise ScriptError('output must be given for a plant of one state: got None')
+        self.simulation()
+
+    @property
+    def name(self) -> str:
+        """Name in errors."""
+        return str(getattr(self.right_hand_side, '__name__', 'right_hand_side'))
+
+    def simulation(self) -> 'OdeSimulation':
+        """Return the plant at its start, after one call of each function."""
+        start = np.zeros(self.states)
+        if self.initial is not None:
+            start = numbers('initial', self.initial, f'({self.states},)')
+        if start.shape != (self.states,):
+            raise ScriptError(f'initial must have the shape ({self.states},): got {start.shape}')
+        return OdeSimulation(self, start)
+
+
+@dataclass(frozen=True, eq=False)
+class StateSpace:
+    """A linear plant of one's own: x' = A x + B u, wheel speeds = C x.
+
+    It is exact at the control periods: u is constant in each.
+
+    Parameters
+    ----------
+    A, B, C
+        Shapes (n, n), (n, 2) and (2, n), in units of s; the wheel speeds are in rad/s.
+    drive, initial, robot
+        As for :class:`OdePlant`.
+    """
+
+    A: ArrayLike
+    B: ArrayLike
+    C: ArrayLike
+    drive: str = 'velocity'
+    initial: ArrayLike | None = None
+    robot: Robot = field(default_factory=Robot)
+
+    @one_sentence
+    def __post_init__(self) -> None:
+        check_drive(self.drive)
+        size = self.matrices()[0].shape[0]
+        for name, shape in (('A', (size, size)), ('B', (size, 2)), ('C', (2, size))):
+            found = np.shape(getattr(self, name))
+            if found != shape:
+                raise ScriptError(f'{name} must have the shape {shape}: got {found}')
+        self.simulation()
+
+    def matrices(self) -> tuple[Array, Array, Array]:
+        """Return A, B and C as arrays of two dimensions."""
+        found = tuple(
+            numbers(name, getattr(self, name), 'of a matrix') for name in ('A', 'B', 'C')
+        )
+        for name, matrix in zip('ABC', found, strict=True):
+            if matrix.ndim != 2:
+                raise ScriptError(f'{name} must be a matrix: got the shape {matrix.shape}')
+        return found[0], found[1], found[2]
+
+    @property
+    def name(self) -> str:
+        """Name in errors."""
+        return 'state space'
+
+    def simulation(self) -> 'LinearSimulation':
+        """Return the plant at its start."""
+        start = np.zeros(np.shape(self.A)[0])
+        if self.initial is not None:
+            start = numbers('initial', self.initial, f'{start.shape}')
+        if start.shape != np.shape(self.A)[:1]:
+            raise ScriptError(
+                f'initial must have the shape {np.shape(self.A)[:1]}: got {start.shape}'
+            )
+        return LinearSimulation(self, start)
+
+
+def check_drive(drive: str) -> None:
+    """Raise :class:`ScriptError` for an unknown drive."""
+    if drive not in DRIVES:
+        raise ScriptError(f'drive must be one of {", ".join(DRIVES)}: got {drive!r}')
+
+
+class OwnSimulation:
+    """State of a plant of one's own, behind its dead time."""
+
+    def __init__(self, robot: Robot, drive: str, start: Array) -> None:
+        self.state = start.copy()
+        parameters = robot.plant_parameters(drive)
+        self.step = parameters.step
+        delay = parameters.drive.dead_time if drive == 'velocity' else 0.0
+        self._waiting = [np.zeros(2)] * round(delay / self.step)
+        self._steps = 0
+
+    @property
+    def time(self) -> float:
+        """Time since the start, s."""
+        return self._steps * self.step
+
+    @property
+    def wheels(self) -> tuple[float, float]:
+        """Wheel speeds, rad/s, right first; NaN once the state is not finite."""
+        if not np.isfinite(self.state).all():
+            return math.nan, math.nan
+        return self._wheels()
+
+    def configure(self, parameters: PaperRobotParameters) -> None:
+        """Keep the plant: it has no parameters of the package's robot."""
+
+    def run(self, command: tuple[float, float], count: int) -> None:
+        """Integrate ``count`` steps under one command, which acts after the dead time."""
+        sent = np.array(command)
+        with np.errstate(all='ignore'):  # a plant that diverges ends the run
+            for _ in range(count):
+                self._waiting.append(sent)
+                if np.isfinite(self.state).all():
+                    self.state = self._advanced(self._waiting[0])
+                del self._waiting[0]
+                self._steps += 1
+
+    def measure(self, dt: float) -> tuple[float, float]:
+        """Return the wheel speeds, rad/s: the noise is added outside."""
+        return self.wheels
+
+    def _wheels(self) -> tuple[float, float]:
+        raise NotImplementedError
+
+    def _advanced(self, u: Array) -> Array:
+        raise NotImplementedError
+
+
+class OdeSimulation(OwnSimulation):
+    """State of an :class:`OdePlant`."""
+
+    def __init__(self, plant: OdePlant, start: Array) -> None:
+        super().__init__(plant.robot, plant.drive, start)
+        self._plant = plant
+        self._slope(0.0, start, np.zeros(2))
+        self._wheels()
+
+    def _advanced(self, u: Array) -> Array:
+        t, h, x = self.time, self.step, self.state
+        first = self._slope(t, x, u)
+        second = self._slope(t + 0.5 * h, x + 0.5 * h * first, u)
+        third = self._slope(t + 0.5 * h, x + 0.5 * h * second, u)
+        fourth = self._slope(t + h, x + h * third, u)
+        found: Array = x + h / 6.0 * (first + 2.0 * (second + third) + fourth)
+        return found
+
+    def _slope(self, time: float, state: Array, u: Array) -> Array:
+        found = self._called('right_hand_side', self._plant.right_hand_side, time, state, u)
+        if found.shape != state.shape:
+            raise ScriptError(
+                f'{self._plant.name} must return {state.size} numbers, one for each state: got '
+                f'the shape {found.shape}'
+            )
+        return found
+
+    def _wheels(self) -> tuple[float, float]:
+        if self._plant.output is None:
+            right, left = self.state[:2].tolist()
+            return right, left
+        found = self._called('output', self._plant.output, self.state)
+        if found.shape != (2,):
+            raise ScriptError(f'output must return two wheel speeds: got the shape {found.shape}')
+        return float(found[0]), float(found[1])
+
+    def _called(self, what: str, function: Callable[..., Any], *arguments: Any) -> Array:
+        try:
+            return np.asarray(function(*arguments), dtype=np.float64)
+        except Exception as error:
+            raise ScriptError(
+                f'{what} of the plant raised {described(error)}, at {self.time:.3f} s'
+            ) from None
+
+
+class LinearSimulation(OwnSimulation):
+    """State of a :class:`StateSpace` plant."""
+
+    def __init__(self, plant: StateSpace, start: Array) -> None:
+        super().__init__(plant.robot, plant.drive, start)
+        a, b, self._output = plant.matrices()
+        size = len(a)
+        both = np.zeros((size + 2, size + 2))
+        both[:size] = np.hstack([a, b]) * self.step
+        held = matrix_exponential(both)
+        self._transition, self._input = held[:size, :size], held[:size, size:]
+
+    def _advanced(self, u: Array) -> Array:
+        found: Array = self._transition @ self.state + self._input @ u
+        return found
+
+    def _wheels(self) -> tuple[float, float]:
+        right, left = (self._output @ self.state).tolist()
+        return right, left
+
+
+@dataclass(frozen=True)
+class NoiseLaw:
+    """Noise of the measured wheel speeds by a law of one's own.
+
+    Parameters
+    ----------
+    draw
+        Gets a generator (:class:`numpy.random.Generator`), the time (s) and the true wheel speeds
+        (rad/s, shape (2,)); returns what is added to them, shape (2,).
+    variance
+        What the estimator of every method assumes, (rad/s)².
+    """
+
+    draw: Callable[[np.random.Generator, float, Array], Any]
+    variance: float
+
+    @one_sentence
+    def __post_init__(self) -> None:
+        if not callable(self.draw):
+            raise ScriptError(
+                f'draw must be a function of generator, time and speeds: got {self.draw!r}'
+            )
+        if not (isinstance(self.variance, int | float) and 0.0 <= self.variance <= 100.0):
+            raise ScriptError(f'variance must be from 0 to 100 (rad/s)²: got {self.variance!r}')
+
+
+class LawNoise:
+    """Noise drawn by a law.
+
+    Parameters
+    ----------
+    law, seed
+        The law, and the seed of its generator.
+    """
+
+    def __init__(self, law: NoiseLaw, seed: int) -> None:
+        self._law = law
+        self._generator = np.random.default_rng((seed, 5))
+
+    def measure(self, wheels: WheelSpeeds, time: float) -> WheelSpeeds:
+        """Return wheel speeds (rad/s) with noise at a time (s).
+
+        Raises
+        ------
+        ScriptError
+            The law raised an exception, or returned something else than two finite numbers.
+        """
+        time, true = round(time, 9), np.array(wheels)  # a law may compare the time
+        try:
+            noise = np.asarray(self._law.draw(self._generator, time, true), dtype=np.float64)
+        except Exception as error:
+            raise ScriptError(
+                f'the noise law raised {described(error)}, at {time:.2f} s'
+            ) from None
+        if noise.shape != (2,) or not np.isfinite(noise).all():
+            raise ScriptError(
+                f'the noise law must return two finite numbers: got {noise} at {time:.2f} s'
+            )
+        return WheelSpeeds(*(true + noise).tolist())
+
+
+class NoisyPlant:
+    """A plant whose wheel speeds are measured with noise of a law.
+
+    Parameters
+    ----------
+    plant
+        The plant, without noise of its own.
+    noise
+        The noise.
+    """
+
+    def __init__(self, plant: Any, noise: LawNoise) -> None:
+        self._plant, self._noise = plant, noise
+        self._time = 0.0
+
+    @property
+    def wheels(self) -> tuple[float, float]:
+        """True wheel speeds, rad/s."""
+        right, left = self._plant.wheels
+        return right, left
+
+    def configure(self, parameters: PaperRobotParameters) -> None:
+        """Continue with other parameters of the robot."""
+        self._plant.configure(parameters)
+
+    def run(self, command: tuple[float, float], count: int) -> None:
+        """Integrate ``count`` steps under one command."""
+        self._plant.run(command, count)
+
+    def measure(self, dt: float) -> tuple[float, float]:
+        """Return the wheel speeds with noise, ``dt`` seconds after the last time."""
+        self._time += dt
+        right, left = self._plant.measure(dt)
+        if not (math.isfinite(right) and math.isfinite(left)):
+            return math.nan, math.nan
+        return self._noise.measure(WheelSpeeds(right, left), self._time)
+
+
+def gaussian_noise(variance: float) -> NoiseLaw:
+    """Return the law of white noise with a variance in (rad/s)²."""
+    return NoiseLaw(_Gaussian(math.sqrt(variance)), variance)
+
+
+@dataclass(frozen=True)
+class _Gaussian:
+    deviation: float
+
+    def __call__(self, generator: np.random.Generator, time: float, speeds: Array) -> Array:
+        return self.deviation * generator.standard_normal(2)

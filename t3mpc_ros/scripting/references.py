@@ -1,0 +1,239 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""References of a script: an array, a CSV file, way points, or a function of time."""
+
+from collections.abc import Callable
+import csv
+from dataclasses import dataclass
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from t3mpc_ros.evaluation.baselines.baseline_controller import JUMP
+from t3mpc_ros.evaluation.scenario import RATE, SampledReference
+from t3mpc_ros.geometry.kinematics import WheelGeometry, wheel_speeds
+from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
+
+Array = NDArray[np.float64]
+TIME = 'time'
+WHEELS, TWIST = ('right', 'left'), ('linear', 'angular')
+"""Columns of a CSV file beside the time: wheel speeds (rad/s), or m/s and rad/s of the body."""
+
+
+@dataclass(frozen=True, eq=False)
+class Waypoints:
+    """A smooth path through points of the plane, driven at a constant speed from its first point.
+
+    The path is a natural cubic spline over the length of the chords. The robot starts with the
+    direction of the path, gains speed and brakes before the end with constant acceleration, and
+    stands there.
+
+    Parameters
+    ----------
+    points
+        x and y, m, shape (n, 2), n >= 2; neighbours differ.
+    speed, acceleration
+        m/s and m/s², along the path.
+    """
+
+    points: ArrayLike
+    speed: float = 0.2
+    acceleration: float = 0.3
+
+    @one_sentence
+    def __post_init__(self) -> None:
+        points = numbers('points', self.points, '(n, 2), x and y in m')
+        if points.ndim != 2 or points.shape[1] != 2 or len(points) < 2:
+            raise ScriptError(f'points must have the shape (n, 2), n >= 2: got {points.shape}')
+        if not np.hypot(*np.diff(points, axis=0).T).all():
+            raise ScriptError('points must differ from their neighbours: got two that are equal')
+        for name in ('speed', 'acceleration'):
+            value = getattr(self, name)
+            if not (isinstance(value, int | float) and 0.0 < value < math.inf):
+                raise ScriptError(f'{name} must be a positive number: got {value!r}')
+        object.__setattr__(self, 'points', points)
+
+    def twists(self, times: Array) -> Array:
+        """Return linear (m/s) and angular speed (rad/s) at times (s), shape (n, 2)."""
+        points = np.asarray(self.points, dtype=np.float64)
+        knots = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
+        fine = np.linspace(0.0, knots[-1], 200 * (len(knots) - 1) + 1)
+        x, y = (_natural_spline(knots, column, fine) for column in points.T)
+        length = np.append(0.0, np.cumsum(np.hypot(np.diff(x), np.diff(y))))
+        dx, dy = np.gradient(x, length), np.gradient(y, length)
+        curvature = dx * np.gradient(dy, length) - dy * np.gradient(dx, length)
+        driven, speed = self._progress(times, float(length[-1]))
+        return np.column_stack([speed, speed * np.interp(driven, length, curvature)])
+
+    def _progress(self, times: Array, length: float) -> tuple[Array, Array]:
+        """Return the length driven (m) and the speed (m/s) at times: a trapezoid of speed."""
+        top = min(self.speed, math.sqrt(self.acceleration * length))
+        ramp = top / self.acceleration
+        end = length / top + ramp
+        speed = np.clip(self.acceleration * np.minimum(times, end - times), 0.0, top)
+        rising = 0.5 * self.acceleration * np.minimum(times, ramp) ** 2
+        even = top * np.clip(times - ramp, 0.0, end - 2.0 * ramp)
+        left = np.clip(end - times, 0.0, ramp)
+        falling = 0.5 * self.acceleration * (ramp**2 - left**2)
+        return rising + even + falling, speed
+
+
+def _natural_spline(knots: Array, values: Array, at: Array) -> Array:
+    """Return the natural cubic spline through ``values`` at some places."""
+    count, step = len(knots), np.diff(knots)
+    matrix, right = np.eye(count), np.zeros(count)
+    for i in range(1, count - 1):
+        matrix[i, i - 1 : i + 2] = step[i - 1], 2.0 * (step[i - 1] + step[i]), step[i]
+        slopes = (values[i + 1] - values[i]) / step[i], (values[i] - values[i - 1]) / step[i - 1]
+        right[i] = 6.0 * (slopes[0] - slopes[1])
+    second = np.linalg.solve(matrix, right)
+    k = np.clip(np.searchsorted(knots, at, side='right') - 1, 0, count - 2)
+    h, before, behind = step[k], at - knots[k], knots[k + 1] - at
+    found: Array = (
+        (second[k] * behind**3 + second[k + 1] * before**3) / (6.0 * h)
+        + (values[k] / h - second[k] * h / 6.0) * behind
+        + (values[k + 1] / h - second[k + 1] * h / 6.0) * before
+    )
+    return found
+
+
+Source = ArrayLike | str | os.PathLike[str] | Waypoints | Callable[[float], Any]
+"""What can be given as a reference."""
+
+
+def sampled(source: Any, duration: float, geometry: WheelGeometry) -> SampledReference:
+    """Return a reference of one's own, sampled for ``duration`` seconds and one more.
+
+    Raises
+    ------
+    ScriptError
+        It has another shape, or a number that is not finite.
+    """
+    rows = round(duration * RATE) + round(RATE)
+    time = np.arange(rows) / RATE
+    if isinstance(source, Waypoints):
+        speeds = _wheels(source.twists(time), geometry)
+    elif isinstance(source, str | os.PathLike):
+        speeds = read_csv(Path(source), time, geometry)
+    elif callable(source):
+        speeds = np.array([_row(source, t) for t in time.tolist()])
+    else:
+        speeds = _held(numbers('reference', source, '(n, 2)'), rows)
+    switched = jumps(speeds)
+    modes = np.cumsum(switched, dtype=np.int64)
+    found = SampledReference(time, speeds, _slopes(speeds, switched), modes, switched)
+    for values in (found.time, found.speeds, found.rate, found.modes, found.switched):
+        values.setflags(write=False)
+    return found
+
+
+def numbers(name: str, given: Any, shape: str) -> Array:
+    """Return finite numbers as an array, or raise :class:`ScriptError` with the name."""
+    try:
+        found = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ScriptError(
+            f'{name} must be numbers of the shape {shape}: got {type(given).__name__} '
+            f'{_short(given)}'
+        ) from None
+    if not np.isfinite(found).all():
+        place = tuple(int(i) for i in np.argwhere(~np.isfinite(found))[0])
+        raise ScriptError(f'{name} must be finite: got {found[place]} at {list(place)}')
+    return found
+
+
+def _short(given: Any) -> str:
+    text = repr(given)
+    return text if len(text) <= 60 else f'{text[:57]}...'
+
+
+def _held(speeds: Array, rows: int) -> Array:
+    """Return an array of wheel speeds, with its last row repeated to the end."""
+    if speeds.ndim != 2 or speeds.shape[1] != 2 or len(speeds) < 2:
+        raise ScriptError(
+            'reference must have the shape (n, 2), n >= 2: right and left wheel speed in rad/s, '
+            f'{RATE:g} rows a second: got {speeds.shape}'
+        )
+    found = np.empty((rows, 2))
+    given = min(rows, len(speeds))
+    found[:given], found[given:] = speeds[:given], speeds[given - 1]
+    return found
+
+
+def _row(function: Callable[[float], Any], time: float) -> Array:
+    try:
+        given = function(time)
+    except Exception as error:
+        raise ScriptError(
+            f'reference raised {type(error).__name__} ({error}) at {time:g} s'
+        ) from None
+    found = numbers(f'reference({time:g})', given, '(2,)')
+    if found.shape != (2,):
+        raise ScriptError(
+            f'reference({time:g}) must be two numbers, the speeds of the right and the left wheel '
+            f'in rad/s: got {_short(given)}'
+        )
+    return found
+
+
+def read_csv(path: Path, time: Array, geometry: WheelGeometry) -> Array:
+    """Return wheel speeds (rad/s) at some times from a CSV file, interpolated, shape (n, 2).
+
+    Its first line names the columns: ``time`` (s) with ``right`` and ``left`` (rad/s), or with
+    ``linear`` (m/s) and ``angular`` (rad/s). The first and the last row are held.
+    """
+    try:
+        with path.expanduser().open(newline='', encoding='utf-8-sig') as stream:
+            head, *rows = [row for row in csv.reader(stream) if row] or [[]]
+    except OSError as error:
+        raise ScriptError(f'{path} cannot be read: {error.strerror}') from None
+    names = [name.strip() for name in head]
+    kind = next((pair for pair in (WHEELS, TWIST) if {TIME, *pair} <= {*names}), None)
+    if kind is None:
+        raise ScriptError(
+            f'{path} must have the columns time,right,left (s, rad/s) or time,linear,angular '
+            f'(s, m/s, rad/s) in its first line: got {",".join(names)}'
+        )
+    places = [names.index(name) for name in (TIME, *kind)]
+    try:
+        table = np.array([[float(row[i]) for i in places] for row in rows]).reshape(-1, 3)
+    except (IndexError, ValueError) as error:
+        raise ScriptError(f'{path} must hold a number in each cell: {error}') from None
+    table = numbers(str(path), table, '(n, 3)')
+    if len(table) < 2 or not (np.diff(table[:, 0]) > 0.0).all():
+        raise ScriptError(f'{path} must have two rows or more, with ascending times')
+    found = np.column_stack([np.interp(time, table[:, 0], table[:, i]) for i in (1, 2)])
+    return found if kind == WHEELS else _wheels(found, geometry)
+
+
+def _wheels(twists: Array, geometry: WheelGeometry) -> Array:
+    """Return wheel speeds (rad/s) of rows of linear and angular speed, shape (n, 2)."""
+    linear, angular = twists.T
+    half = geometry.half_separation
+    return np.column_stack(wheel_speeds(linear, angular, geometry.wheel_radius, half))
+
+
+def jumps(speeds: Array) -> NDArray[np.bool_]:
+    """Return which rows jump: they leave the line of the two rows before by a switch's change."""
+    change = np.zeros_like(speeds)
+    change[2:] = speeds[2:] - 2.0 * speeds[1:-1] + speeds[:-2]
+    found: NDArray[np.bool_] = np.max(np.abs(change), axis=1) > JUMP
+    found[1:] &= ~found[:-1]  # the row after a jump leaves the line of the jump
+    return found
+
+
+def _slopes(speeds: Array, switched: NDArray[np.bool_]) -> Array:
+    """Return r' (rad/s²) from the rows up to each one: a method without preview gets no future.
+
+    At the start and at a jump, where there are none, it is that of the row after.
+    """
+    backward = np.zeros_like(speeds)
+    backward[1:] = np.diff(speeds, axis=0)
+    first = switched.copy()
+    first[0] = True
+    backward[first] = np.roll(backward, -1, axis=0)[first]
+    return backward * RATE

@@ -1,0 +1,53 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The error of the scripting interface, and what makes it one sentence."""
+
+from collections.abc import Callable
+from concurrent.futures import BrokenExecutor
+from functools import wraps
+from typing import ParamSpec, TypeVar
+
+from t3mpc_ros.missing_library import remedy
+
+P = ParamSpec('P')
+R = TypeVar('R')
+
+
+class ScriptError(ValueError):
+    """Wrong use, or a failure of a controller or plant of one's own; the text says what and where.
+
+    It is raised at the function that was called, without the calls inside of it.
+    """
+
+
+LOST_PROCESS = (
+    'a worker process ended before its work was done; a script that uses several processes must '
+    "begin its work with: if __name__ == '__main__':"
+)
+
+
+def one_sentence(function: Callable[P, R]) -> Callable[P, R]:
+    """Return the function with its errors as :class:`ScriptError`, of one sentence each."""
+
+    @wraps(function)
+    def public(*arguments: P.args, **options: P.kwargs) -> R:
+        try:
+            return function(*arguments, **options)
+        except ModuleNotFoundError as error:
+            if not (text := remedy(error)):
+                raise
+        except (ValueError, OSError, RuntimeError, ArithmeticError) as error:
+            text = sentence(error)
+        raise ScriptError(text)
+
+    return public
+
+
+def sentence(error: BaseException) -> str:
+    """Return what went wrong in one sentence: the text of the error, or that of its origin."""
+    cause = error.__cause__
+    if isinstance(cause, BrokenExecutor) or isinstance(error, BrokenExecutor):
+        return LOST_PROCESS
+    if isinstance(cause, ScriptError):
+        return str(cause)
+    return str(error) or repr(error)

@@ -1,0 +1,224 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""One simulated run of a controller: ``simulate`` and its result."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.evaluation.closed_loop import LoopRecord, run
+from t3mpc_ros.evaluation.confidence_intervals import rms
+from t3mpc_ros.evaluation.link_faults import LinkFaults
+from t3mpc_ros.evaluation.method_comparison.compared_runs import (
+    METRICS,
+    START,
+    AnyMethod,
+    AnyScenario,
+    Numbers,
+    TwinMethod,
+    paper_numbers,
+    twin_numbers,
+    twin_run,
+)
+from t3mpc_ros.evaluation.method_comparison.twin_scenario import TwinScenario
+from t3mpc_ros.evaluation.reporting import Table
+from t3mpc_ros.evaluation.scenario import Scenario, settled_rows
+from t3mpc_ros.evaluation.twin_closed_loop import INITIAL_STANDSTILL, TwinRecord
+from t3mpc_ros.scripting.controllers import as_controller
+from t3mpc_ros.scripting.plants import NoiseLaw
+from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
+from t3mpc_ros.scripting.setting import NOMINAL, Setting
+from t3mpc_ros.scripting.table_files import write_csv, write_parquet
+from t3mpc_ros.simulation.fault_injection import FaultSchedule
+
+Array = NDArray[np.float64]
+SIDES = ('right', 'left')
+
+
+@dataclass(frozen=True, eq=False)
+class RunResult:
+    """Result of one run.
+
+    ``columns`` holds one array per name, a row for each control period: ``time`` (s);
+    ``reference``, ``measured`` and ``speed`` (the true one) of each wheel, as in
+    ``reference_right``, rad/s; ``command`` of each wheel: wheel speeds (rad/s) sent to the robot,
+    or torques (N m) with a torque drive; on the twin also the true pose ``x``, ``y`` (m) and
+    ``yaw`` (rad).
+    """
+
+    controller: str
+    """Name of the controller."""
+    scenario: AnyScenario
+    record: LoopRecord | TwinRecord
+    """Everything that was recorded."""
+    columns: Mapping[str, Array]
+    metrics: Numbers
+    """Numbers of the run by name: those of the comparison, with their units in :meth:`table`."""
+
+    def __getitem__(self, name: str) -> Array:
+        """Return a column."""
+        if name not in self.columns:
+            raise ScriptError(f'column must be one of {", ".join(self.columns)}: got {name!r}')
+        return self.columns[name]
+
+    @property
+    def error(self) -> Array:
+        """True wheel speeds less the reference, rad/s, shape (n, 2)."""
+        return _pair(self.columns, 'speed') - _pair(self.columns, 'reference')
+
+    @one_sentence
+    def rmse(self, after: float = START) -> float:
+        """Return the RMSE of the true wheel speeds (rad/s), ``after`` s from the start on.
+
+        On the twin the time counts from the end of its standstill of 1.5 s.
+        """
+        begin = after + (INITIAL_STANDSTILL if 'yaw' in self.columns else 0.0)
+        none: Array = np.zeros(0)
+        return rms(self.error[settled_rows(self.columns['time'], none, begin, (0.0, 0.0))])
+
+    def table(self) -> str:
+        """Return the metrics as a Markdown table."""
+        rows = [
+            (metric.heading, f'{self.metrics[metric.name]:.{metric.digits}f}', metric.unit)
+            for metric in METRICS
+            if metric.name in self.metrics
+        ]
+        return Table(
+            f'{self.controller}: {self.scenario}', ('metric', 'value', 'unit'), rows
+        ).markdown()
+
+    def __str__(self) -> str:
+        return self.table()
+
+    @one_sentence
+    def plot(self, path: str | os.PathLike[str] | None = None) -> Any:
+        """Return a Matplotlib figure of speeds and error; write it to ``path`` if one is given."""
+        from t3mpc_ros.scripting.figures import drawn, run_figure
+
+        return drawn(lambda: run_figure(self.controller, self.columns), path)
+
+    @one_sentence
+    def to_csv(self, path: str | os.PathLike[str]) -> Path:
+        """Write the columns as CSV and return the path."""
+        return write_csv(path, self.columns)
+
+    @one_sentence
+    def to_parquet(self, path: str | os.PathLike[str]) -> Path:
+        """Write the columns as Parquet and return the path; needs the extra ``[compare]``."""
+        details = {'controller': self.controller, 'scenario': str(self.scenario)}
+        return write_parquet(path, self.columns, details)
+
+
+@one_sentence
+def simulate(
+    controller: Any = 'full',
+    *,
+    reference: Any = None,
+    plant: Any = 'twin',
+    noise: float | NoiseLaw = 0.04,
+    faults: LinkFaults | FaultSchedule | str | None = None,
+    case: str = NOMINAL,
+    seed: int = 1,
+    duration: float = 60.0,
+) -> RunResult:
+    """Return the result of one run of a controller in closed loop.
+
+    Equal arguments give equal results, to the last bit.
+
+    Parameters
+    ----------
+    controller
+        A name of the package, such as ``'full'`` or ``'PI + feed-forward'``; a class with
+        ``step(observation)``; a function of the observation; or a :class:`Controller`.
+    reference
+        None: the chaotic reference of the seed. Wheel speeds (rad/s), right first, 100 rows a
+        second, shape (n, 2); a function of the time (s) that returns two of them; a CSV file with
+        the columns time,right,left or time,linear,angular; or :class:`Waypoints`.
+    plant
+        ``'twin'``, ``'servo'``, ``'torque'``; a :class:`Robot`, :class:`OdePlant` or
+        :class:`StateSpace`.
+    noise
+        Variance of the measured wheel speeds, (rad/s)², or a :class:`NoiseLaw`.
+    faults
+        :class:`LinkFaults`; on the twin also a :class:`FaultSchedule`, the name of a bundled one,
+        or a YAML file.
+    case
+        Name of a case of the comparison: what differs from the nominal robot.
+    seed
+        Of reference, disturbance and noise.
+    duration
+        s
+
+    Raises
+    ------
+    ScriptError
+        Wrong use, or a controller or plant that failed; the text says what and where.
+    """
+    setting = Setting(plant, reference, noise, faults, duration)
+    scenario = setting.scenario(case, seed)
+    return run_once(scenario, as_controller(controller).method(setting.robot))
+
+
+def run_once(scenario: AnyScenario, method: AnyMethod) -> RunResult:
+    """Return the result of one run.
+
+    Raises
+    ------
+    ScriptError
+        The run diverged.
+    """
+    if isinstance(scenario, TwinScenario) and isinstance(method, TwinMethod):
+        twin = twin_run(scenario, method)
+        numbers = twin_numbers(scenario, twin)
+        return RunResult(method.name, scenario, twin, _twin_columns(twin), numbers)
+    assert isinstance(scenario, Scenario)
+    assert not isinstance(method, TwinMethod)
+    record = run(scenario, method)
+    if not record.finite:
+        k = int(np.argmax(~np.isfinite(record.speeds).all(axis=1)))
+        last = record.speeds[max(k - 1, 0)]
+        raise ScriptError(
+            f'the run of {method.name} diverged at {record.time[k]:.2f} s: the last finite wheel '
+            f'speeds were {last[0]:.4g} and {last[1]:.4g} rad/s'
+        )
+    return RunResult(method.name, scenario, record, _columns(record), paper_numbers(record))
+
+
+def _columns(record: LoopRecord) -> dict[str, Array]:
+    found = {'time': record.time}
+    arrays = {
+        'reference': record.reference,
+        'measured': record.measured,
+        'speed': record.speeds,
+        'command': record.sent,
+    }
+    return found | _sides(arrays)
+
+
+def _twin_columns(record: TwinRecord) -> dict[str, Array]:
+    found = {'time': record.time}
+    arrays = {
+        'reference': record.reference,
+        'measured': record.measured,
+        'speed': record.rotors,
+        'command': record.requested,
+    }
+    found |= _sides(arrays)
+    return found | {name: record.truth[:, i] for i, name in enumerate(('x', 'y', 'yaw'))}
+
+
+def _sides(arrays: Mapping[str, Array]) -> dict[str, Array]:
+    return {
+        f'{name}_{side}': values[:, i]
+        for name, values in arrays.items()
+        for i, side in enumerate(SIDES)
+    }
+
+
+def _pair(columns: Mapping[str, Array], name: str) -> Array:
+    return np.column_stack([columns[f'{name}_{side}'] for side in SIDES])

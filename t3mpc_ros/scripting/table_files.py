@@ -1,0 +1,67 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of a script as CSV and Parquet files."""
+
+from collections.abc import Mapping, Sequence
+import csv
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from t3mpc_ros.parameters.provenance import provenance
+from t3mpc_ros.scripting.script_error import ScriptError
+
+Columns = Mapping[str, Sequence[Any] | np.ndarray[Any, Any]]
+
+
+def columns_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """Return rows as columns; None where a row does not have a column of another one."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    return {name: [row.get(name) for row in rows] for name in names}
+
+
+def write_csv(path: str | os.PathLike[str], columns: Columns) -> Path:
+    """Write columns as CSV with one line of names, numbers with all their digits."""
+    target = _prepared(path)
+    with target.open('w', newline='', encoding='utf-8') as stream:
+        writer = csv.writer(stream)
+        writer.writerow(columns)
+        values = [
+            each.tolist() if isinstance(each, np.ndarray) else each for each in columns.values()
+        ]
+        writer.writerows(zip(*values, strict=True))
+    return target
+
+
+def write_parquet(
+    path: str | os.PathLike[str], columns: Columns, details: Mapping[str, str] | None = None
+) -> Path:
+    """Write columns as one Parquet file, with version, commit and ``details`` in its metadata.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        pyarrow is not installed.
+    """
+    import pyarrow
+    import pyarrow.parquet
+
+    target = _prepared(path)
+    table = pyarrow.table({name: pyarrow.array(values) for name, values in columns.items()})
+    texts = {**provenance(), **(details or {})}
+    table = table.replace_schema_metadata({name: str(text) for name, text in texts.items()})
+    # A reader of an interrupted write finds the old file or none, never half of one.
+    part = target.with_name(f'{target.name}.part')
+    pyarrow.parquet.write_table(table, part)
+    part.replace(target)
+    return target
+
+
+def _prepared(path: str | os.PathLike[str]) -> Path:
+    target = Path(path).expanduser()
+    if target.is_dir():
+        raise ScriptError(f'path must be a file: got the folder {target}')
+    target.parent.mkdir(parents=True, exist_ok=True)
+    return target

@@ -1,0 +1,72 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Generator, fuzzy system and bags alone: the same numbers as inside of the package."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import t3mpc_ros as t3
+from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.chaos.solver import solve_full_memory
+from t3mpc_ros.chaos.system import linear_decay_system
+from t3mpc_ros.fuzzy.inference import output_by_double_sum
+
+BAG = Path(__file__).resolve().parents[1] / 'golden' / 'stops.mcap'
+
+
+def test_the_solution_is_that_of_the_full_memory():
+    solution = t3.chaos((0.9, 0.95, 0.98, 1.0), tspan=(2.0, 2.5), y0=np.ones(4), every=1)
+    full = solve_full_memory(solution.system, 0.001, np.ones(4), 500)
+    assert solution.t[[0, -1]].tolist() == pytest.approx([2.0, 2.5])
+    np.testing.assert_allclose(solution.y, full, rtol=1e-5)
+
+
+def test_another_system_is_solved_from_ones():
+    solution = t3.chaos(system=linear_decay_system(1.0), tspan=(0.0, 3.0))
+    np.testing.assert_allclose(solution.y[:, 0], np.exp(-solution.t), atol=1e-6)
+
+
+def test_rules_are_those_of_the_equations():
+    """(32) has all lower levels first: rules by hand meet the literal double sum (29)."""
+    system = t3.fuzzy('x', 'y', sets=3, input_fuzziness=0.2)
+    generator = np.random.default_rng(3)
+    values = generator.normal(size=(3, 3))
+    for i in range(3):
+        for j in range(3):
+            system.add_rule([('x', i), ('y', j)], values[i, j])
+    alpha = np.repeat(values.reshape(-1, 1), system.sets.slices, axis=1)
+    for point in generator.uniform(-1.2, 1.2, (5, 2)):
+        expected = output_by_double_sum(point, system.sets, alpha, alpha)
+        assert system.evaluate(point) == pytest.approx(expected, abs=1e-12)
+        assert system.evaluate({'y': point[1], 'x': point[0]}) == system.evaluate(point)
+    system.add_rule([], 2.5)  # every rule: a convex combination of one number is that number
+    np.testing.assert_allclose(system.evaluate(np.zeros((4, 2))), 2.5)
+
+
+def test_a_fit_meets_a_function_that_the_system_can_be():
+    source = t3.fuzzy('x', sets=5)
+    for index, value in enumerate((1.0, -2.0, 0.5, 3.0, 0.0)):
+        source.add_rule([('x', index)], value)
+    points = np.linspace(-1.0, 1.0, 60)[:, None]
+    fitted = t3.fuzzy('x', sets=5).fit(points, source.evaluate(points), ridge=1e-10)
+    between = np.linspace(-0.97, 0.97, 31)[:, None]
+    np.testing.assert_allclose(fitted.evaluate(between), source.evaluate(between), atol=1e-3)
+
+
+def test_columns_of_a_bag_are_its_messages():
+    bag = t3.read_bag(BAG)
+    with open_bag(BAG) as reader:
+        fields = {'x': 'pose.pose.position.x', 'variance': 'pose.covariance[7]'}
+        expected = reader.series('/odom', fields)
+        assert {*bag} == {*reader.topics}
+    odometry = bag['/odom']
+    assert np.array_equal(odometry['pose.pose.position.x'], expected['x'])
+    assert np.array_equal(odometry['pose.covariance[7]'], expected['variance'])
+    assert np.array_equal(odometry['stamp'], expected['stamp'])
+    assert '/no_topic' not in bag
+    with pytest.raises(t3.ScriptError, match='/odm is not in .* did you mean /odom'):
+        bag['/odm']
+    with pytest.raises(t3.ScriptError, match='no field twist.linear; did you mean'):
+        odometry['twist.linear']

@@ -1,0 +1,210 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Sweeps: complete rows, resumption, and the same numbers wherever they are computed."""
+
+import math
+import os
+import signal
+import time
+
+import numpy as np
+import pytest
+
+import t3mpc_ros as t3
+from t3mpc_ros.cli.main import main
+from t3mpc_ros.scripting import parameter_sweep
+
+SHORT = {'plant': 'servo', 'duration': 2.0}
+GAINS = {'gain': [10.0, 20.0]}
+
+
+class Proportional:
+    def __init__(self, model, gain=20.0):
+        self.period, self.gain = model.period, gain
+
+    def step(self, observation):
+        if self.gain > 1000.0:
+            raise ArithmeticError('the gain is too large')
+        slope = (observation.next_reference - observation.reference) / self.period
+        return slope - self.gain * (observation.speeds - observation.reference)
+
+
+def _numbers(found):
+    names = ('controller', 'gain', 'seed', 'settled', 'overall', 'variation', 'run')
+    return [tuple(row[name] for name in names) for row in found.rows]
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """Return the list of the runs that are computed in this process."""
+    runs = []
+    measured = parameter_sweep.measured_run
+    monkeypatch.setattr(
+        parameter_sweep, 'measured_run', lambda job: runs.append(job) or measured(job)
+    )
+    return runs
+
+
+def test_a_row_holds_all_that_was_run():
+    found = t3.sweep(
+        [Proportional, 'ADRC'],
+        {'gain': np.array([10.0, 20.0]), 'robot.friction_factor': [1.0, 3.0], 'noise': [0.0]},
+        seeds=[1, 2],
+        cases=['nominal', 'mass +30 %'],
+        executor=1,
+        **SHORT,
+    )
+    assert len(found.rows) == 2 * 2 * 2 * 2 * 2
+    row = found.rows[0]
+    assert row['version'] == t3.__version__
+    assert {'commit', 'python', 'reference', 'case', 'duration', 'robot', 'run'} <= {*row}
+    assert len({row['run'] for row in found.rows}) == len(found.rows)
+    assert all(row['noise'] == 0.0 and row['error'] == '' for row in found.rows)
+    one = t3.compare(t3.Controller('ADRC', {'gain': 20.0}), seeds=[2], noise=0.0, **SHORT)
+    wanted = {'controller': 'ADRC', 'gain': 20.0, 'robot.friction_factor': 1.0, 'seed': 2}
+    wanted |= {'case': 'nominal'}
+    (same,) = [each for each in found.rows if wanted.items() <= each.items()]
+    assert same['overall'] == one.rows()[0]['overall']
+    assert found.table().count('\n') == 1 + 2 * 2 * 2 * 2
+    assert found.plot('gain').axes
+
+
+def test_a_run_that_fails_is_a_row_with_its_reason():
+    """A sweep of a night must not end at its worst corner."""
+    found = t3.sweep(Proportional, {'gain': [10.0, 2000.0]}, seeds=[1], executor=1, **SHORT)
+    good, bad = found.rows
+    assert good['error'] == ''
+    assert 'raised ArithmeticError (the gain is too large)' in bad['error']
+    assert 'overall' not in bad
+    assert 'diverged' in found.table()
+    with pytest.raises(t3.ScriptError, match='every run failed: .*the gain is too large'):
+        t3.sweep(Proportional, {'gain': [2000.0]}, seeds=[1], executor=1, **SHORT)
+
+
+def test_an_interrupted_sweep_goes_on_where_it_was(tmp_path, counted, monkeypatch):
+    pytest.importorskip('pyarrow')
+    path = tmp_path / 'new' / 'sweep.parquet'
+    whole = t3.sweep(Proportional, GAINS, seeds=[1, 2], executor=1, **SHORT)
+    counted.clear()
+    measured = parameter_sweep.measured_run
+
+    def stops(job):
+        if len(counted) == 3:
+            raise KeyboardInterrupt
+        return measured(job)
+
+    monkeypatch.setattr(parameter_sweep, 'measured_run', stops)
+    with pytest.raises(KeyboardInterrupt):
+        t3.sweep(Proportional, GAINS, seeds=[1, 2], executor=1, output=path, **SHORT)
+    assert not path.exists()
+    monkeypatch.setattr(parameter_sweep, 'measured_run', measured)
+    again = t3.sweep(Proportional, GAINS, seeds=[1, 2], executor=1, output=path, **SHORT)
+    assert len(counted) == 4
+    assert _numbers(again) == _numbers(whole)
+    assert [each.name for each in path.parent.iterdir()] == ['sweep.parquet']
+
+
+def test_a_sweep_with_more_values_runs_only_these(tmp_path, counted):
+    parquet = pytest.importorskip('pyarrow.parquet')
+    path = tmp_path / 'sweep.parquet'
+    t3.sweep(Proportional, GAINS, seeds=[1], executor=1, output=path, **SHORT)
+    more = {'gain': [10.0, 20.0, 30.0]}
+    found = t3.sweep(Proportional, more, seeds=[1], executor=1, output=path, **SHORT)
+    assert len(counted) == 3
+    assert [row['gain'] for row in found.rows] == [10.0, 20.0, 30.0]
+    t3.sweep('ADRC', {}, seeds=[1], executor=1, output=path, **SHORT)
+    table = parquet.read_table(path)
+    assert sorted(table['controller'].to_pylist()) == ['ADRC', *['Proportional'] * 3]
+    assert table.schema.metadata[b'version'] == t3.__version__.encode()
+
+
+def test_another_controller_of_the_same_name_is_run_anew(tmp_path, counted):
+    pytest.importorskip('pyarrow')
+    path, script = tmp_path / 'sweep.parquet', tmp_path / 'mine.py'
+    text = 'import numpy as np\ndef step(observation):\n    return np.full(2, GAIN)\n'
+    for gain in ('1.0', '2.0', '1.0'):
+        script.write_text(text.replace('GAIN', gain))
+        t3.sweep(f'{script}:step', {}, seeds=[1], executor=1, output=path, **SHORT)
+    assert len(counted) == 2
+
+
+@pytest.mark.parametrize(
+    'arguments, text',
+    [
+        ((Proportional, [1.0]), 'parameters must map names to lists of values'),
+        ((Proportional, {'gain': 3.0}), 'gain must be a list of values: got 3.0'),
+        ((Proportional, {'gain': []}), 'each parameter must have one or more values'),
+        ((Proportional, {'gain': [1.0, 1.0]}), 'values must differ'),
+        (('full', {'law.gian': [1.0]}), 'did you mean law.gain'),
+        ((Proportional, {'robot.frction_factor': [1.0]}), 'did you mean friction_factor'),
+    ],
+)
+def test_wrong_use_of_a_sweep_is_a_sentence(arguments, text):
+    with pytest.raises(t3.ScriptError, match=text):
+        t3.sweep(*arguments, executor=1, seeds=[1], **SHORT)
+
+
+def test_a_file_of_another_kind_is_left_alone(tmp_path):
+    pytest.importorskip('pyarrow')
+    path = tmp_path / 'sweep.parquet'
+    with pytest.raises(t3.ScriptError, match='output must end in .parquet: got x.csv'):
+        t3.sweep(Proportional, GAINS, executor=1, output='x.csv', **SHORT)
+    t3.simulate(Proportional, **SHORT).to_parquet(path)
+    content = path.read_bytes()
+    with pytest.raises(t3.ScriptError, match='is no file of a sweep'):
+        t3.sweep(Proportional, GAINS, executor=1, output=path, **SHORT)
+    assert path.read_bytes() == content
+
+
+def test_the_command_writes_the_same_rows(tmp_path, capsys):
+    parquet = pytest.importorskip('pyarrow.parquet')
+    path = tmp_path / 'sweep.parquet'
+    words = ['--set', 'gain=10.0,20.0', '--robot', 'servo', '--duration', '2', '--seeds', '1-2']
+    code = main(['sweep', 'ADRC', *words, '--workers', '1', '--output', str(path)])
+    assert code == 0
+    found = t3.sweep('ADRC', GAINS, seeds=[1, 2], executor=1, **SHORT)
+    assert found.table() in capsys.readouterr().out
+    assert parquet.read_table(path)['overall'].to_pylist() == found.columns['overall']
+
+
+# -- clusters -----------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_cluster_and_a_lost_worker_give_the_same_numbers(tmp_path, capsys):
+    """A worker that is killed in mid-run loses nothing: its runs are begun again elsewhere."""
+    distributed = pytest.importorskip('distributed')
+    pytest.importorskip('pyarrow')
+    alone = t3.sweep(Proportional, GAINS, seeds=range(1, 5), executor=1, **SHORT)
+    options = {'n_workers': 2, 'threads_per_worker': 1, 'dashboard_address': None}
+    with (
+        distributed.LocalCluster(**options, host='127.0.0.1') as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        together = t3.sweep(Proportional, GAINS, seeds=range(1, 5), executor=client, **SHORT)
+        assert _numbers(together) == _numbers(alone)
+        victim = client.run(os.getpid)
+        assert len(victim) == 2
+
+        path = tmp_path / 'lost.parquet'
+        executor = client.get_executor(pure=False)
+        first = next(iter(victim))
+        client.submit(_kill_later, workers=[first], allow_other_workers=False, pure=False)
+        lost = t3.sweep(
+            Proportional, GAINS, seeds=range(1, 9), executor=executor, output=path, **SHORT
+        )
+        assert len(lost.rows) == 16
+        assert _numbers(lost)[:4] == _numbers(alone)[:4]
+        assert not any(math.isnan(row['overall']) for row in lost.rows)
+        address = cluster.scheduler_address
+        words = ['--set', 'gain=10.0,20.0', '--robot', 'servo', '--duration', '2']
+        output = ['--seeds', '1-2', '--output', str(tmp_path / 'shell.parquet')]
+        assert main(['sweep', 'ADRC', *words, *output, '--scheduler', address]) == 0
+    found = t3.sweep('ADRC', GAINS, seeds=[1, 2], executor=1, **SHORT)
+    assert found.table() in capsys.readouterr().out
+
+
+def _kill_later():
+    """End the process of the worker, as the kernel does when there is no memory left."""
+    time.sleep(0.1)
+    os.kill(os.getpid(), signal.SIGKILL)

@@ -1,0 +1,153 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Wrong use is one sentence: it names the thing, the bound, the value, and what to do next."""
+
+import subprocess
+import sys
+import traceback
+
+import numpy as np
+import pytest
+
+import t3mpc_ros as t3
+
+SHORT = {'plant': 'servo', 'duration': 1.0}
+
+
+def returns_list(observation):
+    return [1.0, 2.0]
+
+
+def returns_three(observation):
+    return np.zeros(3)
+
+
+def returns_nan(observation):
+    return np.full(2, np.nan)
+
+
+def raises(observation):
+    return 1 / (observation.elapsed - 1)
+
+
+def unstable(time, state, command):
+    return 1e3 * state * abs(state) + command
+
+
+def wrong_states(time, state, command):
+    return np.zeros(3)
+
+
+class NoStep:
+    pass
+
+
+class WrongArguments:
+    def __init__(self, gain):
+        self.gain = gain
+
+    def step(self, observation):
+        return np.zeros(2)
+
+
+WRONG = {
+    'list for array': (
+        lambda: t3.simulate(returns_list, **SHORT),
+        r'returns_list must return a numpy array of shape \(2,\), .* got \[1.0, 2.0\] at 0.00 s',
+    ),
+    'wrong shape': (
+        lambda: t3.simulate(returns_three, **SHORT),
+        r'must return a numpy array of shape \(2,\), .* got shape \(3,\)',
+    ),
+    'NaN': (
+        lambda: t3.simulate(returns_nan, **SHORT),
+        r'returns_nan must return finite accelerations: got \[nan, nan\] at 0.00 s',
+    ),
+    'a controller that raises': (
+        lambda: t3.simulate(raises, **SHORT),
+        r'raises raised ZeroDivisionError \(.*zero\) in raises\(\), test_wrong_use.py line \d+',
+    ),
+    'a plant that diverges': (
+        lambda: t3.simulate(
+            'PI + feed-forward', plant=t3.OdePlant(unstable, initial=[1.0, 1.0]), duration=1.0
+        ),
+        r'run of PI \+ feed-forward diverged at 0.0\d s: the last finite wheel speeds were',
+    ),
+    'a plant of wrong shape': (
+        lambda: t3.OdePlant(wrong_states),
+        r'wrong_states must return 2 numbers, one for each state: got the shape \(3,\)',
+    ),
+    'unknown controller': (lambda: t3.simulate('ful'), 'did you mean full'),
+    'unknown plant': (lambda: t3.simulate(plant='twn'), 'plant must be .* did you mean twin'),
+    'unknown case': (lambda: t3.simulate(case='nominl'), 'did you mean nominal'),
+    'unknown parameter': (
+        lambda: t3.simulate(t3.Controller('full', {'law.gian': 2.0}), **SHORT),
+        'did you mean law.gain',
+    ),
+    'no step': (lambda: t3.simulate(NoStep, **SHORT), 'class NoStep must have a method step'),
+    'no controller': (lambda: t3.simulate(3, **SHORT), 'controller must be a name, .* got int 3'),
+    'arguments of a class': (
+        lambda: t3.simulate(WrongArguments, **SHORT),
+        "WrongArguments cannot be made: TypeError .*missing 1 required .*'gain'",
+    ),
+    'reference of wrong shape': (
+        lambda: t3.simulate(reference=np.zeros((2, 50)), **SHORT),
+        r'reference must have the shape \(n, 2\), .* got \(2, 50\)',
+    ),
+    'ragged reference': (
+        lambda: t3.simulate(reference=[[1.0, 2.0], [3.0]], **SHORT),
+        r'reference must be numbers of the shape \(n, 2\): got list',
+    ),
+    'reference with NaN': (
+        lambda: t3.simulate(reference=np.full((50, 2), np.nan), **SHORT),
+        r'reference must be finite: got nan at \[0, 0\]',
+    ),
+    'missing file': (
+        lambda: t3.simulate(reference='no.csv', **SHORT),
+        'no.csv cannot be read: No such file',
+    ),
+    'noise': (lambda: t3.simulate(noise='0.1'), 'noise must be a variance .* got str'),
+    'seed': (lambda: t3.simulate(seed=1.5), 'seed must be a whole number .* got 1.5'),
+    'duration': (lambda: t3.simulate(duration='1'), "duration must be a number .* got '1'"),
+    'two controllers of one name': (
+        lambda: t3.compare(['full', 'full'], seeds=[1]),
+        r'different names, see Controller\(name=…\): got full',
+    ),
+    'function that cannot be sent': (
+        lambda: t3.compare(lambda o: np.zeros(2), seeds=[1, 2], executor=2, **SHORT),
+        'top level of a file to be sent to other processes; use executor=1',
+    ),
+    'executor': (lambda: t3.compare('full', seeds=[1], executor='x'), 'executor must be None'),
+    'missing bag': (lambda: t3.read_bag('no_bag'), 'there is no bag no_bag'),
+    'order of the derivatives': (lambda: t3.chaos(1.2), 'orders must be above 0 and at most 1'),
+    'fuzzy input': (
+        lambda: t3.fuzzy('x').evaluate({'y': 1.0}),
+        'inputs must be x: got y',
+    ),
+}
+
+
+@pytest.mark.parametrize('call, text', WRONG.values(), ids=WRONG)
+def test_wrong_use_is_one_sentence(call, text):
+    with pytest.raises(t3.ScriptError, match=text) as caught:
+        call()
+    assert '\n' not in str(caught.value)
+    # Nothing from inside: the last call shown is the one of the interface.
+    assert caught.value.__cause__ is None
+    assert caught.value.__context__ is None
+    inside = [
+        frame for frame in traceback.extract_tb(caught.tb) if '/t3mpc_ros/' in frame.filename
+    ]
+    assert len(inside) <= 2
+
+
+def test_a_script_without_a_guard_gets_a_sentence(tmp_path):
+    """Worker processes run the script again: without its guard they would start workers."""
+    script = tmp_path / 'script.py'
+    script.write_text(
+        'import t3mpc_ros as t3\n'
+        "print(t3.compare('ADRC', seeds=[1, 2], plant='servo', duration=4.0, executor=2))\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "begin its work with: if __name__ == '__main__':" in done.stderr.splitlines()[-1]

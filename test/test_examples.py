@@ -1,0 +1,94 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Every program of ``examples/`` runs, and shows what its docstring says."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+EXAMPLES = sorted((ROOT / 'examples').glob('*.py'))
+BAG = ROOT / 'test' / 'golden' / 'stops.mcap'
+
+
+def load(name):
+    """Return a program as a module, with its main part not run."""
+    spec = importlib.util.spec_from_file_location(f'example_{name}', ROOT / f'examples/{name}.py')
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def _own_controller(module, folder):
+    table = module.main(folder, 3.0, executor=1)
+    assert table.plan.methods == ('full', 'Pi', 'Pi, gain 40.0, integral 400.0')
+    assert 'own_controller' in {path.stem for path in folder.iterdir()}
+
+
+def _own_reference(module, folder):
+    runs = module.main(folder, 6.0)
+    assert max(run.rmse(1.0) for run in runs.values()) < 0.1
+
+
+def _own_robot(module, folder):
+    assert len(module.main(folder, 4.0, executor=1).rows()) == 15
+
+
+def _own_plant(module, folder):
+    runs = module.main(folder, 6.0)
+    assert runs['rigid', 'full'].rmse(2.0) < runs['flexible', 'full'].rmse(2.0)
+
+
+def _own_noise(module, folder):
+    runs = module.main(6.0)
+    assert runs['outliers'].rmse(1.0) > 0.0
+    assert np.abs(runs['blocked wheel'].error).max() > 1.0
+
+
+def _read_bag(module, folder):
+    assert module.main(BAG, folder)['/odom']['stamp'].size > 100
+
+
+def _sweep_gain(module, folder):
+    pytest.importorskip('pyarrow')
+    found = module.main(folder, 2.0, executor=1)
+    assert len(found.rows) == 2 * 4 * 2 * 3
+
+
+def _generator(module, folder):
+    solution, distance = module.main(folder, 5.0)
+    assert solution.y.shape == (2501, 4)
+    assert distance[-1] > 1e3 * distance[0]  # chaos: neighbours separate
+
+
+def _fuzzy_system(module, folder):
+    heating, errors = module.main()
+    assert heating.evaluate({'temperature': 5.0}) > 60.0 > heating.evaluate({'temperature': 35.0})
+    assert max(errors.values()) < 0.1
+
+
+CHECKS = {
+    name.removeprefix('_'): check
+    for name, check in globals().copy().items()
+    if name.removeprefix('_') in {path.stem for path in EXAMPLES}
+}
+
+
+@pytest.mark.parametrize('name', [path.stem for path in EXAMPLES])
+def test_an_example_runs_and_shows_what_it_says(name, tmp_path):
+    CHECKS[name](load(name), tmp_path)
+
+
+def test_the_tutorial_shows_the_controller_of_the_example():
+    """One text in two places: the page shows what this test runs."""
+    block = (ROOT / 'docs/tutorial.md').read_text().split('```python\n')[1].split('```')[0]
+    example = (ROOT / 'examples/own_controller.py').read_text()
+
+    def body(text):
+        lines = text[text.index('class Pi:') :].splitlines()
+        code = lines[: next(i for i, line in enumerate(lines[1:], 1) if line[:1].strip())]
+        return [line for line in code if line.strip() and 'Return the acc' not in line]
+
+    assert body(block) == body(example)
