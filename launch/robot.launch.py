@@ -7,12 +7,12 @@
 
 from launch.actions import DeclareLaunchArgument
 
-from t3mpc_ros.nodes.launch_files import RECORD, SEED, describe, params_file
+from t3mpc_ros.nodes.launch_files import RECORD, ROBOT_DESCRIPTION, SEED, describe, params_file
 
 
 def nodes(launched):
     loop = [
-        launched.node('radio_bridge', {**launched.given('port'), **launched.given('key_file')}),
+        *launched.robot('radio_bridge', {**launched.given('port'), **launched.given('key_file')}),
         # The radio link carries 50 commands and 50 measurements per second; a command is sent
         # one cycle after the measurement that it is computed from.
         launched.node('controller', defaults={'rate': 50.0, 'speed_filter.dead_time': 0.02}),
@@ -33,4 +33,4 @@ def generate_launch_description():
         default_value='',
         description='key of the robot; empty: that of the parameter files, or no key',
     )
-    return describe(nodes, params_file(), port, key_file, SEED, RECORD)
+    return describe(nodes, params_file(), ROBOT_DESCRIPTION, port, key_file, SEED, RECORD)

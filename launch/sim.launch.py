@@ -4,7 +4,14 @@
 
 from launch.actions import DeclareLaunchArgument
 
-from t3mpc_ros.nodes.launch_files import RECORD, SEED, USE_SIM_TIME, describe, params_file
+from t3mpc_ros.nodes.launch_files import (
+    RECORD,
+    ROBOT_DESCRIPTION,
+    SEED,
+    USE_SIM_TIME,
+    describe,
+    params_file,
+)
 
 
 def nodes(launched):
@@ -12,7 +19,7 @@ def nodes(launched):
     # The simulated robot is the source of the simulated time.
     clock = {'publish_clock': launched.flag('use_sim_time')}
     loop = [
-        launched.node('sim_robot', {**launched.given('world'), **seed}, defaults=clock),
+        *launched.robot('sim_robot', {**launched.given('world'), **seed}, defaults=clock),
         launched.node('controller'),
         launched.node('reference_generator', seed),
     ]
@@ -25,4 +32,4 @@ def generate_launch_description():
         default_value='',
         description='room, corridor, or a YAML file; empty: that of the parameter files',
     )
-    return describe(nodes, params_file(), world, SEED, USE_SIM_TIME, RECORD)
+    return describe(nodes, params_file(), ROBOT_DESCRIPTION, world, SEED, USE_SIM_TIME, RECORD)

@@ -9,7 +9,13 @@ walls of the world.
 
 from launch.actions import DeclareLaunchArgument
 
-from t3mpc_ros.nodes.launch_files import SEED, USE_SIM_TIME, describe, params_file
+from t3mpc_ros.nodes.launch_files import (
+    ROBOT_DESCRIPTION,
+    SEED,
+    USE_SIM_TIME,
+    describe,
+    params_file,
+)
 
 ROBOTS = {
     'robot_1': {'initial_pose.x': -0.5, 'initial_pose.y': 0.0, 'initial_pose.yaw': 0.0},
@@ -25,7 +31,7 @@ def nodes(launched):
         defaults = {'seed': 1 + number}
         given = {key: seed + number for key, seed in first_seed.items()}
         made += [
-            launched.node(
+            *launched.robot(
                 'sim_robot',
                 {**launched.given('world'), **given},
                 defaults={'world': 'room', **defaults, **pose, **clock},
@@ -44,4 +50,4 @@ def generate_launch_description():
         description='world of both robots: room, corridor, or a YAML file; empty: that of '
         'params_file, or room',
     )
-    return describe(nodes, params_file(), world, SEED, USE_SIM_TIME)
+    return describe(nodes, params_file(), ROBOT_DESCRIPTION, world, SEED, USE_SIM_TIME)

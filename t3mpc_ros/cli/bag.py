@@ -1,11 +1,12 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""``t3mpc bag``: info, recover, report, replay, compare and train."""
+"""``t3mpc bag``: info, recover, report, animate, replay, compare and train."""
 
 import argparse
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 import json
+import math
 from pathlib import Path
 import sys
 import time
@@ -18,14 +19,13 @@ from t3mpc_ros.bag.recording.message_losses import message_loss_notes
 from t3mpc_ros.bag.recovery.recover_bag import RecoveryOutputError, default_output, recover_bag
 from t3mpc_ros.bag.recovery.result import Damage, FileResult, RecoveryResult
 from t3mpc_ros.cli.command import ArgumentParser, run_command
+from t3mpc_ros.cli.run_options import add_topic_options, report_options
+from t3mpc_ros.cli.train import add_bag_options, run_bags
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.parameters.command_line import parse_assignments
 
 if TYPE_CHECKING:
     from t3mpc_ros.evaluation.process_replay.comparison import Tolerances
-
-
-from t3mpc_ros.cli.train import add_bag_options, run_bags
 
 
 def columns(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
@@ -137,6 +137,7 @@ def _info_text(bag: BagReader) -> str:
             topics.append((name, topic['type_name'], count, f'{held["rates"][name]:.2f}', quality))
         parts.append(columns(topics, right=(2, 3)))
     parts += [_info_table(title, table) for title, table in bag.metadata_records.items()]
+    parts += _calibrations(bag.metadata_records)
     if held['attachments']:
         items = [(e['name'], e['media_type'], size_text(e['size'])) for e in held['attachments']]
         parts.append('attachments\n' + columns(items, right=(2,)))
@@ -164,6 +165,21 @@ def _info_table(title: str, table: Mapping[str, str]) -> str:
     if len(table) > _MAX_LISTED_ENTRIES:
         return f'{title}: {len(table)} entries (--json shows them)'
     return f'{title}\n' + columns([(f'  {key}', value) for key, value in table.items()])
+
+
+def _calibrations(records: Mapping[str, Mapping[str, str]]) -> list[str]:
+    """Return the values and uncertainties of each calibrated robot."""
+    texts = []
+    for node, table in records.items():
+        if not table.get('calibration.date', ''):
+            continue
+        names = [name for name in table if name.startswith(_CALIBRATED)]
+        rows = [(f'  {name}', table[name]) for name in names]
+        texts.append(f'calibration of {node}\n' + columns(rows))
+    return texts
+
+
+_CALIBRATED = ('calibration.', 'odometry.gyro_scale', 'wheel_radius', 'wheel_separation')
 
 
 def _date(time_ns: int) -> str:
@@ -285,30 +301,22 @@ def add_report_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPar
     """Add ``report`` to the commands of ``bag``."""
     parser = commands.add_parser(
         'report',
-        help='draw the report of a bag',
-        description='Writes report.html and its pictures. The bag may be of any robot: MCAP or '
-        'sqlite3, with a topic of odometry (nav_msgs/Odometry), of commands (geometry_msgs/Twist '
-        'or TwistStamped), or both; they are found by name, else by type.',
+        help='draw the report of a bag, or compare several',
+        description='Writes report.html, one file with verdict, charts and tables. The bag may be '
+        'of any robot: MCAP or sqlite3, with a topic of odometry (nav_msgs/Odometry), of commands '
+        '(geometry_msgs/Twist or TwistStamped), or both; they are found by name, else by type. '
+        'Several bags are compared with the first in comparison.html.',
     )
-    parser.add_argument('bag', type=Path, metavar='BAG', help='folder of the bag, or its one file')
+    parser.add_argument(
+        'bags', type=Path, nargs='+', metavar='BAG', help='folder of a bag, or its one file'
+    )
     parser.add_argument('--output', type=Path, help='folder for the report (default: beside it)')
-    parser.add_argument('--namespace', help='whose topics (default: those of most known topics)')
-    parser.add_argument('--odom', default='', metavar='TOPIC', help='odometry')
-    parser.add_argument('--cmd-vel', default='', metavar='TOPIC', help='commands')
+    add_topic_options(parser)
     parser.add_argument(
         '--reference',
         default='',
         metavar='TOPIC',
         help='what the robot was to follow: odometry or a twist',
-    )
-    parser.add_argument(
-        '--wheel-radius',
-        type=float,
-        metavar='M',
-        help='radius of the wheels in m (default: as recorded), to show speeds of wheels',
-    )
-    parser.add_argument(
-        '--track', type=float, metavar='M', help='distance between the wheels in m, likewise'
     )
     parser.set_defaults(run=run_report)
 
@@ -328,24 +336,77 @@ def run_report(options: argparse.Namespace) -> int:
         Wheel radius without separation or the reverse, or an invalid one.
     """
     from t3mpc_ros.evaluation.bag_report.report_page import write_report
+
+    wanted = report_options(options)
+    output = options.output or options.bags[0].resolve().parent
+    print('reading the bag', file=sys.stderr, flush=True)
+    if len(options.bags) > 1:
+        from t3mpc_ros.evaluation.bag_report.run_comparison import write_comparison
+
+        path, text = write_comparison(options.bags, output, wanted)
+        print(f'{text}\n{path}')
+        return 0
+    figures = write_report(options.bags[0], output, wanted)
+    print(figures.verdict.text())
+    print(figures.summary())
+    return 0
+
+
+def add_animate_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
+    """Add ``animate`` to the commands of ``bag``."""
+    parser = commands.add_parser(
+        'animate',
+        help='draw the animation of a bag as GIF',
+        description='Draws the floor with the path of the robot, the reference, walls and range '
+        'rays where they are known, and beside it the speeds against their references with the '
+        'errors below. The bag may be of any robot with odometry.',
+    )
+    parser.add_argument('bag', type=Path, metavar='BAG', help='folder of the bag, or its one file')
+    parser.add_argument('--output', type=Path, required=True, metavar='FILE', help='a .gif')
+    parser.add_argument(
+        '--start', type=float, default=0.0, metavar='S', help='start, s (default 0)'
+    )
+    parser.add_argument(
+        '--duration', type=float, default=math.inf, metavar='S', help='s (default: to the end)'
+    )
+    parser.add_argument(
+        '--speed',
+        type=float,
+        default=1.0,
+        metavar='X',
+        help='seconds of the run in a second of the animation (default 1)',
+    )
+    parser.add_argument(
+        '--rate', type=float, default=10.0, metavar='HZ', help='frames per second (default 10)'
+    )
+    parser.add_argument(
+        '--width', type=int, default=760, metavar='PIXELS', help='of the picture (default 760)'
+    )
+    parser.add_argument('--namespace', help='of the robot, where the bag holds several')
+    parser.set_defaults(run=run_animate)
+
+
+def run_animate(options: argparse.Namespace) -> int:
+    """Write the animation and return 0.
+
+    Raises
+    ------
+    BagError
+        The bag is missing or cannot be read.
+    ReportError
+        The bag holds no pose, or none in the part.
+    ValueError
+        An option is outside its bounds.
+    """
+    from t3mpc_ros.evaluation.bag_report.animation import AnimationOptions, animate_bag
     from t3mpc_ros.evaluation.bag_report.topic_roles import ReportOptions
 
-    if (options.wheel_radius is None) != (options.track is None):
-        raise ValueError('--wheel-radius and --track must be given together')
-    wanted = ReportOptions(
-        namespace=options.namespace,
-        odom=options.odom,
-        cmd_vel=options.cmd_vel,
-        reference=options.reference,
-        wheel_radius=options.wheel_radius,
-        track=options.track,
+    chosen = AnimationOptions(
+        options.start, options.duration, options.speed, options.rate, options.width
     )
-    output = options.output or options.bag.resolve().parent
-    print('reading the bag and drawing its figures', file=sys.stderr, flush=True)
-    figures = write_report(options.bag, output, wanted)
-    if figures.verdict is not None:
-        print(figures.verdict.text())
-    print(figures.summary())
+    wanted = ReportOptions(namespace=options.namespace)
+    written = animate_bag(options.bag, options.output, chosen, wanted, progress=True)
+    print(f'{written}: {size_text(written.stat().st_size)}')
     return 0
 
 
@@ -588,6 +649,7 @@ def _bag_parser() -> argparse.ArgumentParser:
     add_info_parser(commands)
     add_recover_parser(commands)
     add_report_parser(commands)
+    add_animate_parser(commands)
     add_replay_parser(commands)
     add_compare_parser(commands)
     add_train_parser(commands)

@@ -1,13 +1,17 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Parser of the program and its subcommands; runs one and converts errors into exit codes."""
+"""Parser, exit codes and questions of the program and its subcommands."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+import os
+from pathlib import Path
+import select
 import sys
 from typing import Any
 
 import t3mpc_ros
+from t3mpc_ros.parameters.table import ParameterError
 
 
 class ArgumentParser(argparse.ArgumentParser):
@@ -44,3 +48,20 @@ def run_command(parser: argparse.ArgumentParser, arguments: Sequence[str] | None
         print(f'error: {error}', file=sys.stderr)
         return 1
     return code
+
+
+def ask_line(question: str, stop: Callable[[], bool]) -> str:
+    """Show a question; return the line that answers it, '' at the end of the input or a stop."""
+    print(question, end='', flush=True)
+    while not stop():
+        # readline alone would continue after Ctrl-C.
+        ready, _, _ = select.select([sys.stdin], [], [], 0.1)
+        if ready:
+            return sys.stdin.readline()
+    return ''
+
+
+def check_writable(path: Path) -> None:
+    """Raise ParameterError if a file cannot be written: before the work whose result it takes."""
+    if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise ParameterError(f'{path} cannot be written: give a file in a folder that exists')

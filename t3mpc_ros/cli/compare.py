@@ -3,38 +3,53 @@
 """``t3mpc compare``: the controller and every baseline on one robot, case by case."""
 
 import argparse
-import os
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from t3mpc_ros.parameters.command_line import bounded_float, bounded_int
+from t3mpc_ros.cli.run_options import (
+    FULL,
+    NOMINAL,
+    ROBOTS,
+    add_seeds,
+    add_setting,
+    add_workers,
+    executor_of,
+)
 
-ROBOTS = ('twin', 'servo', 'torque')
+if TYPE_CHECKING:
+    from t3mpc_ros.evaluation.method_comparison.compared_runs import ComparisonPlan
+
 DEFAULT_SEEDS = '201-206'
 
 
 def add_parser(commands: Any) -> argparse.ArgumentParser:
     """Return the parser of ``compare``, added to the sub-parsers of a program."""
     parser: argparse.ArgumentParser = commands.add_parser(
-        'compare', help='the controller and every baseline on one robot, case by case'
+        'compare',
+        help='the controller, every baseline and your own on one robot, case by case',
+        description='Compares the controller with every baseline; with your own controllers, '
+        'compares them with the full controller in the nominal case.',
     )
     parser.add_argument(
-        '--robot',
-        choices=ROBOTS,
-        default='twin',
-        help='twin: the stepper robot, ground truth of its body included (default); servo, '
-        "torque: the paper's plant with that drive",
+        'own',
+        nargs='*',
+        metavar='FILE.py:NAME',
+        help='a controller of your own: a class with step(observation), or a function of the '
+        'observation',
+    )
+    add_setting(parser)
+    add_seeds(
+        parser,
+        DEFAULT_SEEDS,
+        'reference and robot; none of the default ones, a quick look, was used for tuning or is '
+        'in another table',
     )
     parser.add_argument(
-        '--seeds',
-        type=seed_range,
-        default=seed_range(DEFAULT_SEEDS),
-        metavar='A-B',
-        help=f'seeds of reference and robot (default {DEFAULT_SEEDS}, a quick look; none of them '
-        'was used for tuning or is in another table)',
-    )
-    parser.add_argument(
-        '--cases', nargs='+', default=(), metavar='CASE', help='by name (default: all)'
+        '--cases',
+        nargs='+',
+        default=(),
+        metavar='CASE',
+        help='by name (default: all; with your own controllers: nominal)',
     )
     parser.add_argument(
         '--methods',
@@ -42,19 +57,7 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
         default=(),
         metavar='METHOD',
         help='by name; all: with stages and ablations of the controller (default: the full '
-        'controller and every baseline)',
-    )
-    parser.add_argument(
-        '--duration',
-        type=bounded_float(2.0, 3600.0, 's'),
-        default=60.0,
-        help='of each run, s (default 60)',
-    )
-    parser.add_argument(
-        '--noise',
-        type=bounded_float(0.0, 100.0, '(rad/s)²'),
-        default=0.04,
-        help='variance of the measured wheel speeds, (rad/s)² (default 0.04)',
+        'controller and every baseline; with your own controllers: the full controller)',
     )
     parser.add_argument(
         '--gyro',
@@ -62,12 +65,7 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
         help='twin: baselines take the yaw rate from the gyro in every case, not only where the '
         'robot is miscalibrated',
     )
-    parser.add_argument(
-        '--workers',
-        type=bounded_int(1, 10_000),
-        default=max(1, len(os.sched_getaffinity(0))),
-        help='processes (default: processors)',
-    )
+    add_workers(parser)
     parser.add_argument('--json', type=Path, help='write every number to this file')
     parser.add_argument('--html', type=Path, help='write one page to this file')
     parser.set_defaults(run=run)
@@ -84,18 +82,17 @@ def run(options: argparse.Namespace) -> int:
     ModuleNotFoundError
         A method needs a library that is not installed.
     """
-    from t3mpc_ros.evaluation.method_comparison import comparison_page
     from t3mpc_ros.evaluation.method_comparison.compared_runs import (
         ComparisonPlan,
         cases_for,
-        compare,
         default_methods,
         methods_for,
     )
     from t3mpc_ros.evaluation.methods import require_libraries
-    from t3mpc_ros.evaluation.reporting import strict_json
     from t3mpc_ros.evaluation.tuning.search_space import find_names
 
+    if options.own or options.reference or options.robot not in ROBOTS:
+        return _run_own(options)
     known = methods_for(options.robot)
     wanted = list(known) if options.methods == ['all'] else options.methods
     names = find_names('method', wanted, known)
@@ -109,10 +106,42 @@ def run(options: argparse.Namespace) -> int:
         options.gyro,
     )
     require_libraries(plan.methods)
+    return _compare_and_write(options, plan)
+
+
+def _run_own(options: argparse.Namespace) -> int:
+    """Compare controllers, or on a robot or reference, of one's own; errors are one sentence."""
+    from t3mpc_ros.scripting.script_error import one_sentence
+
+    return one_sentence(_compare_own)(options)
+
+
+def _compare_own(options: argparse.Namespace) -> int:
+    from t3mpc_ros.scripting.comparison_runs import make_plan
+    from t3mpc_ros.scripting.controllers import loaded
+    from t3mpc_ros.scripting.setting import Setting
+
+    if options.gyro:
+        raise ValueError('--gyro is for the methods of the package: got your own')
+    plant = options.robot if options.robot in ROBOTS else loaded(options.robot)
+    setting = Setting(plant, options.reference, options.noise, duration=options.duration)
+    chosen = [*(options.methods or [FULL]), *options.own]
+    plan = make_plan(chosen, options.seeds, options.cases or (NOMINAL,), setting)
+    return _compare_and_write(options, plan)
+
+
+def _compare_and_write(options: argparse.Namespace, plan: 'ComparisonPlan') -> int:
+    from t3mpc_ros.evaluation.method_comparison import comparison_page
+    from t3mpc_ros.evaluation.method_comparison.compared_runs import compare
+    from t3mpc_ros.evaluation.reporting import strict_json
+    from t3mpc_ros.scripting.executors import workers_for
+
     for path in (options.json, options.html):
         if path:  # a folder that cannot be made is an error before the runs, not after them
             path.parent.mkdir(parents=True, exist_ok=True)
-    results = compare(plan, options.workers, progress=True)
+    jobs = [plan.job(*key) for key in plan.jobs()]
+    with executor_of(options) as executor:
+        results = compare(plan, workers_for(executor, jobs), progress=True)
     print(comparison_page.markdown(plan, results))
     if options.json:
         content = comparison_page.record(plan, results)
@@ -120,18 +149,3 @@ def run(options: argparse.Namespace) -> int:
     if options.html:
         options.html.write_text(comparison_page.page(plan, results), encoding='utf-8')
     return 0
-
-
-def seed_range(text: str) -> tuple[int, ...]:
-    """Return the seeds of ``A-B``, both included, or of ``A``; an argparse type."""
-    first, dash, last = text.partition('-')
-    try:
-        low = int(first)
-        high = int(last) if dash else low
-    except ValueError:
-        raise argparse.ArgumentTypeError(f'must be A-B, as in 201-206: got {text}') from None
-    if not 0 <= low <= high or high - low >= 10_000:
-        raise argparse.ArgumentTypeError(
-            f'must be A-B with 0 <= A <= B and at most 10000 seeds: got {text}'
-        )
-    return tuple(range(low, high + 1))

@@ -68,6 +68,8 @@ class DemoOptions:
     """Share of lost radio packets in each direction; for the emulator only."""
     view: bool = False
     """Whether the run is shown on a live page."""
+    patrol: bool = False
+    """Whether the robot patrols the world ``room``; without ``seed`` on a secret path."""
 
     @property
     def robot_node(self) -> str:
@@ -93,6 +95,11 @@ class DemoOptions:
             given['radio_bridge']['port'] = str(self.port)
         else:
             given['sim_robot']['noise.variance'] = PAPER_NOISE
+        if self.patrol:
+            given['controller'] |= {'pose.enabled': True, 'keep_out.enabled': True}
+            # Without a seed it is a secret one from the operating system.
+            given['reference_generator'] |= {'source': 'portrait', 'seed': 0}
+            given['sim_robot']['world'] = 'room'
         if self.seed is not None:
             given['reference_generator']['seed'] = self.seed
             if self.robot != 'emulator':

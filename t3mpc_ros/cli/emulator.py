@@ -13,6 +13,7 @@ import sys
 from t3mpc_ros.cli.command import ArgumentParser
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters, StopTimeMonitor
 from t3mpc_ros.emulator.fault_injection import FAULT_KINDS, Fault, FaultError, parse_fault
+from t3mpc_ros.emulator.firmware_library import FirmwareLibraryError
 from t3mpc_ros.emulator.pty_port import PtyPort, PtyPortError, serve
 from t3mpc_ros.parameters.command_line import bounded_float, parse_assignments
 from t3mpc_ros.parameters.table import ParameterError
@@ -31,7 +32,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             emulator.schedule_fault(Fault('loss', 0.0, math.inf, options.loss))
         for text in options.fault:
             emulator.schedule_fault(parse_fault(text))
-    except (FaultError, KeyFileError, ParameterError, WorldError) as error:
+    except (
+        FaultError,
+        FirmwareLibraryError,
+        KeyFileError,
+        ParameterError,
+        WorldError,
+    ) as error:
         return _fail(error)
     with StopSignal() as stop:
         _print('starting')

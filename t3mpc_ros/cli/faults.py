@@ -18,12 +18,14 @@ def add_outcomes_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentP
     parser.add_argument(
         '--output', type=Path, help='page whose table is to be replaced, docs/faults.md say'
     )
+    parser.add_argument('--html', type=Path, help='write one page to this file')
     parser.add_argument('--json', type=Path, help='also write the numbers to this file')
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     """Print the outcome of each fault; return 0 when every loop stayed bounded, else 1."""
+    from t3mpc_ros.evaluation import fault_page
     from t3mpc_ros.evaluation.fault_study import (
         FAULT_RUNS,
         console_text,
@@ -47,6 +49,8 @@ def run(options: argparse.Namespace) -> int:
     print(console_text(results))
     if options.output:
         update_page(options.output, results)
+    if options.html:
+        options.html.write_text(fault_page.page(results), encoding='utf-8')
     if options.json:
         text = strict_json([asdict(one) for one in results])
         options.json.write_text(text, encoding='utf-8')

@@ -16,6 +16,8 @@ from t3mpc_ros.cli.compare import add_parser as add_compare
 from t3mpc_ros.cli.faults import add_outcomes_parser
 from t3mpc_ros.cli.graph import add_parsers as add_graph_parsers
 from t3mpc_ros.cli.paper import add_parser as add_paper
+from t3mpc_ros.cli.patrol import add_parser as add_patrol
+from t3mpc_ros.cli.sweep import add_parser as add_sweep
 from t3mpc_ros.cli.train import add_parser as add_train
 from t3mpc_ros.cli.tune import add_parser as add_tune
 from t3mpc_ros.cli.twin import add_parser as add_twin
@@ -33,8 +35,8 @@ UNSOUND = 3
 """Exit code of a demo that was recorded but is no valid measurement."""
 
 PROGRAMS = {
-    'bag': 'inspect, report, recover, replay, compare bags, and train from them',
-    'robot': 'key, link test, channel scan, wheel jog, parameters of the real robot',
+    'bag': 'inspect, report, animate, recover, replay, compare bags, and train from them',
+    'robot': 'settings, key, log, link test, channel scan, wheel jog of the real robot',
     'emulator': 'emulated dongle and robot board behind a serial port',
 }
 """Subcommands with their own parser, in the module of the same name."""
@@ -63,6 +65,9 @@ def _run(words: Sequence[str]) -> int:
 def _demo(options: argparse.Namespace) -> int:
     from t3mpc_ros.cli.demo import DemoInterruptedError, DemoOptions, run_demo
 
+    if options.patrol and options.robot != 'twin':
+        print(f'error: --patrol needs --robot twin: got {options.robot}', file=sys.stderr)
+        return 2
     output = options.output or _new_run(Path('runs'))
     try:
         figures = run_demo(
@@ -74,18 +79,17 @@ def _demo(options: argparse.Namespace) -> int:
                 options.robot,
                 options.loss,
                 options.view,
+                options.patrol,
             )
         )
     except DemoInterruptedError as interruption:
         print(interruption, file=sys.stderr)
         return 128 + interruption.number
-    verdict = figures.verdict
-    if verdict is not None:
-        print(verdict.text())
+    print(figures.verdict.text())
     print(figures.summary())
     if not options.headless:
         webbrowser.open(figures.report.resolve().as_uri())
-    return 0 if verdict is not None and verdict.sound else UNSOUND
+    return 0 if figures.verdict.sound else UNSOUND
 
 
 def _new_run(folder: Path) -> Path:
@@ -188,6 +192,11 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument('--view', action='store_true', help='show the run on a live page')
     demo.add_argument('--seed', type=int, help='seed of reference and robot')
     demo.add_argument(
+        '--patrol',
+        action='store_true',
+        help='patrol the world room on a chaotic path; without --seed it is unpredictable',
+    )
+    demo.add_argument(
         '--robot',
         choices=('twin', 'servo', 'emulator'),
         default='twin',
@@ -227,6 +236,8 @@ def _parser() -> argparse.ArgumentParser:
 
     add_paper(commands)
     add_compare(commands)
+    add_sweep(commands)
+    add_patrol(commands)
     add_tune(commands, _method_definitions)
     add_train(commands)
     add_twin(commands)

@@ -3,11 +3,12 @@
 """``t3mpc paper``: reproduces figures, tables and claims of the paper."""
 
 import argparse
-import os
+from dataclasses import replace
 from pathlib import Path
 import sys
 from typing import Any
 
+from t3mpc_ros.cli.run_options import add_workers, executor_of
 from t3mpc_ros.parameters.command_line import bounded_int
 
 
@@ -27,12 +28,7 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
         type=bounded_int(1, 10_000),
         help='of the comparison without a controller (86)',
     )
-    parser.add_argument(
-        '--workers',
-        type=bounded_int(1, 10_000),
-        default=_processors(),
-        help='processes (default: processors)',
-    )
+    add_workers(parser)
     parser.add_argument(
         '--output', type=Path, help='folder (default runs/paper, or runs/paper-quick)'
     )
@@ -62,17 +58,13 @@ def run(options: argparse.Namespace) -> int:
         quick=options.quick,
         seeds=options.seeds,
         estimation_seeds=options.estimation_seeds,
-        workers=options.workers,
         json=options.json,
         fresh=options.fresh,
     )
-    print(reproduce(default_setup(), chosen, _report))
+    with executor_of(options) as executor:
+        print(reproduce(default_setup(), replace(chosen, workers=executor), _report))
     return 0
 
 
 def _report(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
-
-
-def _processors() -> int:
-    return max(1, len(os.sched_getaffinity(0)))

@@ -10,6 +10,7 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
+import sysconfig
 import time
 
 READY_TIMEOUT = 1200.0
@@ -27,14 +28,20 @@ class StopRequestedError(ProcessError):
 
 
 def executable(name: str) -> Path:
-    """Return the file that ``ros2 run t3mpc_ros NAME`` would start.
+    """Return the file that ``ros2 run t3mpc_ros NAME`` would start, or that pip has installed.
 
     Raises
     ------
     ProcessError
         It is not installed; the text gives the remedy.
     """
-    return installed_file(Path('lib') / 't3mpc_ros' / name)
+    by_pip = Path(sysconfig.get_path('scripts')) / name
+    try:
+        return installed_file(Path('lib') / 't3mpc_ros' / name)
+    except ProcessError:
+        if by_pip.exists():
+            return by_pip
+        raise
 
 
 def _prefixes() -> list[Path]:

@@ -25,8 +25,7 @@ def recorded_run(bag: Path) -> LiveData:
     data = LiveData(math.inf, STEP)
     with open_bag(bag) as recording:
         run = load_run(recording)
-        verdict = compute_metrics(run, Path(), (), recording.message_count).verdict
-        world = recording.metadata_records.get('sim_robot', {}).get('world', '')
+        verdict = compute_metrics(run, Path(), recording.message_count).verdict
     if run.geometry is None:
         raise ValueError(
             f'{bag} has no parameters of a robot: its wheel radius and separation are not known '
@@ -67,14 +66,13 @@ def recorded_run(bag: Path) -> LiveData:
             'wheel_separation': 2.0 * run.geometry.half_separation,
         },
     )
-    data.set('world', world_outline(world))
-    good = verdict is not None and verdict.sound
+    data.set('world', world_outline(run.world))
     data.set(
         'banner',
         {
-            'kind': 'good' if good else 'warning',
+            'kind': 'good' if verdict.sound else 'warning',
             'headline': f'Recording {bag_display_name(bag)}, {run.duration:.1f} s',
-            'detail': '' if verdict is None else verdict.text(),
+            'detail': verdict.text(),
         },
     )
     data.set('recording', {'duration': run.duration})

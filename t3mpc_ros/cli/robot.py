@@ -1,38 +1,56 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""``t3mpc robot``: settings, key, link test, channel scan, wheel jog of the real robot."""
+"""``t3mpc robot``: settings, key, link test, scan, jog and calibration of the real robot."""
 
 import argparse
 from collections.abc import Iterator, Sequence
 import math
 import os
 from pathlib import Path
-import select
 import sys
 from typing import TypeVar
 
 import yaml
 
-from t3mpc_ros.cli.command import ArgumentParser
+from t3mpc_ros.cli import calibrate
+from t3mpc_ros.cli.command import ArgumentParser, ask_line, check_writable
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, parse_assignments
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import KeyFileError, key_check, read_key
-from t3mpc_ros.radio.protocol.codec import decode_from_board, decode_from_dongle
 from t3mpc_ros.radio.tool import (
     channel_scan,
     jog,
     key_provisioning,
     link_test,
+    procedure,
     robot_info,
+    robot_log,
     robot_settings,
 )
-from t3mpc_ros.radio.tool.procedure import Procedure, ProcedureError, Script, run_at_port
+from t3mpc_ros.radio.tool.procedure import DONGLE, ROBOT_BOARD, ProcedureError, Script
+from t3mpc_ros.radio.tool.robot_records import (
+    POWERS,
+    RATES,
+    SENSOR_COUNT,
+    SENSORS,
+    RobotSettings,
+)
+from t3mpc_ros.radio.tool.robot_settings import SettingsFileError, StoredSettings
 from t3mpc_ros.stop_signal import StopSignal
 
 EXIT_OK, EXIT_POOR, EXIT_FAILED, EXIT_INTERRUPTED = 0, 1, 2, 130
-_RATES = ('250k', '1M', '2M')
+_SETTINGS = (
+    'address',
+    'rate',
+    'power',
+    'microsteps',
+    'steps_per_turn',
+    'divider',
+    'sensors',
+)
+"""Settings with an option of their name; none of them can be 0 or empty."""
 Value = TypeVar('Value')
 
 
@@ -96,23 +114,72 @@ def _show_key_state(options: argparse.Namespace, stop: StopSignal) -> int:
 # -- the link -------------------------------------------------------------------------------------
 
 
-def _set(options: argparse.Namespace, stop: StopSignal) -> int:
-    changes = robot_settings.Changes(options.address, options.channel, options.microsteps)
-    settings = _run_at_board(robot_settings.write_settings(changes, os.urandom), options, stop)
-    print(robot_settings.format_settings(settings))
+def _setup(options: argparse.Namespace, stop: StopSignal) -> int:
+    """Show the settings; change, compare, save them by the options."""
+    changes = {name: getattr(options, name) for name in _SETTINGS if getattr(options, name)}
+    if options.channel is not None:
+        changes['channel'] = options.channel
+    if options.invert is not None:
+        changes['invert_left'] = options.invert in ('left', 'both')
+        changes['invert_right'] = options.invert in ('right', 'both')
+    loaded = _load_settings(options.load) if options.load is not None else None
+    compared = _load_settings(options.diff) if options.diff is not None else None
     if options.save is not None:
-        options.save.write_text(robot_settings.parameter_file(settings))
+        check_writable(options.save)
+    stored = _run_at_board(robot_settings.read_settings(), options, stop)
+    if loaded is not None or changes:
+        base = loaded._asdict() if loaded is not None else {}
+        wanted = robot_settings.change_settings(stored, {**base, **changes}, os.urandom)
+        stored = _store_settings(stored, wanted, options, stop)
+    print(robot_settings.format_settings(stored))
+    if options.save is not None:
+        if not stored.valid:
+            raise ProcedureError('there are no settings to save: give the microsteps, or --load')
+        options.save.write_text(robot_settings.parameter_file(stored.settings))
         print(
             f'{options.save}: radio_bridge --ros-args --params-file {options.save}, '
             f't3mpc robot ping --params-file {options.save}'
         )
+    if compared is not None:
+        rows = robot_settings.differences(stored.settings, compared)
+        print(robot_settings.format_differences(rows) or f'equal to {options.diff}')
+        if rows:
+            return EXIT_POOR
+    return EXIT_OK if stored.state == frames.SETTINGS_GOOD else EXIT_POOR
+
+
+def _store_settings(
+    stored: StoredSettings,
+    wanted: RobotSettings,
+    options: argparse.Namespace,
+    stop: StopSignal,
+) -> StoredSettings:
+    rows = robot_settings.differences(stored.settings, wanted)
+    if stored.state == frames.SETTINGS_GOOD and not rows:
+        return stored
+    if stored.valid:
+        print(robot_settings.format_differences(rows))
+    else:
+        print(robot_settings.SETTINGS_TEXTS[stored.state])
+    if not options.yes and not _ask('Write this to the robot?', stop):
+        raise ProcedureError('nothing was written')
+    return _run_at_board(robot_settings.write_settings(wanted), options, stop)
+
+
+def _show_log(options: argparse.Namespace, stop: StopSignal) -> int:
+    print(robot_log.format_log(_run_at_board(robot_log.read_log(), options, stop)))
     return EXIT_OK
 
 
-def _show_settings(options: argparse.Namespace, stop: StopSignal) -> int:
-    settings = _run_at_board(robot_settings.read_settings(), options, stop)
-    print(robot_settings.format_settings(settings))
-    return EXIT_OK if settings.state == frames.SETTINGS_GOOD else EXIT_POOR
+def _load_settings(path: Path) -> RobotSettings:
+    try:
+        return robot_settings.settings_of_file(yaml.safe_load(path.read_text()))
+    except OSError as error:
+        raise ParameterError(f'{path} cannot be read: {error.strerror}') from error
+    except yaml.YAMLError as error:
+        raise ParameterError(f'{path} must be a YAML file: {error}') from error
+    except SettingsFileError as error:
+        raise ParameterError(f'{path} {error}') from error
 
 
 def _ping(options: argparse.Namespace, stop: StopSignal) -> int:
@@ -125,7 +192,7 @@ def _ping(options: argparse.Namespace, stop: StopSignal) -> int:
 
 def _scan(options: argparse.Namespace, stop: StopSignal) -> int:
     parameters = _link_parameters(options)
-    rates = _RATES if options.all_rates else (parameters.rate,)
+    rates = RATES if options.all_rates else (parameters.rate,)
     interactive = sys.stderr.isatty()
 
     def progress(done: int, total: int, result: str) -> None:
@@ -165,12 +232,33 @@ def _jog(options: argparse.Namespace, stop: StopSignal) -> int:
         options.speed,
         lambda text: print(f't3mpc robot: {text}', file=sys.stderr),
     )
-    run_at_port(task, options.port, stop)
+    procedure.run_at_port(task, options.port, stop)
     if task.result is not None:
         print(jog.format_result(task.result, options.wheel, options.revolutions))
     if task.error:
         raise ProcedureError(task.error)
     return EXIT_OK
+
+
+def _calibrate(options: argparse.Namespace, stop: StopSignal) -> int:
+    return calibrate.calibrate(options, _link_parameters(options), _key_option(options), stop)
+
+
+def _doctor(options: argparse.Namespace, stop: StopSignal) -> int:
+    # Imported here: the other commands need no page.
+    from t3mpc_ros.cli import robot_doctor
+    from t3mpc_ros.radio.tool.bench_checklist import FAIL
+
+    check_writable(options.report)
+    if not options.no_questions and not sys.stdin.isatty():
+        raise ProcedureError('the checklist asks questions at a terminal: or use --no-questions')
+
+    def answer(question: str) -> str:
+        return 'skip' if options.no_questions else _choose(question, ('yes', 'no', 'skip'), stop)
+
+    parameters, key = _link_parameters(options), _key_option(options)
+    checks = robot_doctor.run_doctor(options, parameters, key, answer, stop)
+    return EXIT_POOR if any(check.verdict == FAIL for check in checks) else EXIT_OK
 
 
 def _confirmed(options: argparse.Namespace, stop: StopSignal) -> bool:
@@ -182,30 +270,28 @@ def _confirmed(options: argparse.Namespace, stop: StopSignal) -> bool:
         f'{options.speed:g} rad/s. Both wheels must be in the air, hands and cables away; Ctrl-C '
         'stops.'
     )
-    print('Continue? [yes/no] ', end='', flush=True)
-    while not stop():
-        # readline alone would continue after Ctrl-C.
-        ready, _, _ = select.select([sys.stdin], [], [], 0.1)
-        if ready:
-            return sys.stdin.readline().strip().lower() in ('y', 'yes')
-    return False
+    return _ask('Continue?', stop)
+
+
+def _ask(question: str, stop: StopSignal) -> bool:
+    """Return whether the user answers yes at a terminal."""
+    if not sys.stdin.isatty():
+        raise ProcedureError('this needs a confirmation at a terminal, or --yes')
+    return _choose(question, ('yes', 'no'), stop) == 'yes'
+
+
+def _choose(question: str, choices: tuple[str, ...], stop: StopSignal) -> str:
+    """Return one of the choices, or of their first letters; the last one otherwise."""
+    word = ask_line(f'{question} [{"/".join(choices)}] ', stop).strip().lower()
+    return next((each for each in choices if word in (each, each[0])), choices[-1])
 
 
 def _run_at_dongle(script: Script[Value], options: argparse.Namespace, stop: StopSignal) -> Value:
-    return _run(Procedure(script, decode_from_dongle), options, stop, 'the dongle')
+    return procedure.run_script(script, options.port, stop, DONGLE)
 
 
 def _run_at_board(script: Script[Value], options: argparse.Namespace, stop: StopSignal) -> Value:
-    return _run(Procedure(script, decode_from_board), options, stop, "the robot's board")
-
-
-def _run(
-    procedure: Procedure[Value], options: argparse.Namespace, stop: StopSignal, device: str
-) -> Value:
-    run_at_port(procedure, options.port, stop, device)
-    if procedure.error or procedure.result is None:
-        raise ProcedureError(procedure.error or 'interrupted')
-    return procedure.result
+    return procedure.run_script(script, options.port, stop, ROBOT_BOARD)
 
 
 # -- arguments ------------------------------------------------------------------------------------
@@ -233,7 +319,7 @@ def _read_link_parameters(path: Path) -> dict[str, object]:
         raise ParameterError(f'{path} cannot be read: {error.strerror}') from error
     except (yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
         raise ParameterError(
-            f'{path} must be a parameter file of t3mpc robot set, with link below /**'
+            f'{path} must be a parameter file of t3mpc robot setup, with link below /**'
         ) from error
 
 
@@ -259,6 +345,16 @@ def _microsteps(text: str) -> int:
     if value not in [1 << power for power in range(9)]:
         raise argparse.ArgumentTypeError(f'must be a power of two from 1 to 256: got {text}')
     return value
+
+
+def _sensors(text: str) -> tuple[str, ...]:
+    names = tuple(text.split(','))
+    names = SENSOR_COUNT * names if len(names) == 1 else names
+    if len(names) != SENSOR_COUNT or not set(names) <= set(SENSORS):
+        raise argparse.ArgumentTypeError(
+            f'must be one or {SENSOR_COUNT} of {", ".join(SENSORS)}: got {text}'
+        )
+    return names
 
 
 def _revolutions(text: str) -> float:
@@ -296,7 +392,38 @@ def _parser() -> argparse.ArgumentParser:
         '--yes', action='store_true', help='do not ask whether the wheels are in the air'
     )
     table = commands.add_parser('parameters', help='list the board parameters')
-    for command, run in ((ping, _ping), (scan, _scan), (jogging, _jog), (table, _show_parameters)):
+    calibrating = commands.add_parser(
+        'calibrate', help='measure wheels, track, gyro, distance sensors and battery, step by step'
+    )
+    calibrate.add_arguments(calibrating)
+    examining = commands.add_parser(
+        'doctor', help='go through the bench checklist: measure, ask, write a report'
+    )
+    examining.add_argument('--robot-port', required=True, help='USB port of the robot board')
+    examining.add_argument(
+        '--count', type=bounded_int(10, 100_000), default=200, help='requests of the link test'
+    )
+    examining.add_argument(
+        '--drive', action='store_true', help='turn each wheel once, after a confirmation'
+    )
+    examining.add_argument(
+        '--no-questions', action='store_true', help='skip what only a person can judge'
+    )
+    examining.add_argument(
+        '--report',
+        type=Path,
+        default=Path('doctor.html'),
+        metavar='FILE',
+        help='HTML file; the same as JSON beside it',
+    )
+    for command, run in (
+        (ping, _ping),
+        (scan, _scan),
+        (jogging, _jog),
+        (table, _show_parameters),
+        (calibrating, _calibrate),
+        (examining, _doctor),
+    ):
         command.set_defaults(run=run)
         command.add_argument('--port', required=True, help='port of the dongle, /dev/…')
         command.add_argument(
@@ -312,7 +439,7 @@ def _parser() -> argparse.ArgumentParser:
             metavar='NAME=VALUE',
             help='link parameter, e.g. channel=100 or robot.invert_left=true',
         )
-    for command in (jogging, table):
+    for command in (jogging, table, calibrating, examining):
         command.add_argument('--key', type=Path, help='file with the key of the robot')
     return parser
 
@@ -320,10 +447,12 @@ def _parser() -> argparse.ArgumentParser:
 def _add_settings_commands(
     commands: 'argparse._SubParsersAction[argparse.ArgumentParser]',
 ) -> None:
-    setting = commands.add_parser(
-        'set', help='store address, channel and microsteps in the robot, over its own USB'
+    command = commands.add_parser(
+        'setup', help='show, change, save, load the settings of the robot, over its own USB'
     )
-    add = setting.add_argument
+    command.set_defaults(run=_setup)
+    add = command.add_argument
+    add('--port', required=True, help='USB port of the robot board')
     add(
         '--address',
         type=_address,
@@ -331,12 +460,25 @@ def _add_settings_commands(
         help='10 hexadecimal digits; default: as stored, on a new board random',
     )
     add('--channel', type=bounded_int(0, 125), help='2400 MHz plus this')
+    add('--rate', choices=RATES, help='bit/s; 250k only with nRF24L01+ chips')
+    add('--power', choices=POWERS, help='of the transmitter of the robot, dBm')
     add('--microsteps', type=_microsteps, help='as set by the jumpers of the drivers')
-    add('--save', type=Path, metavar='FILE', help='write a parameter file for the host')
-    showing = commands.add_parser('settings', help='print the settings of the robot')
-    for command, run in ((setting, _set), (showing, _show_settings)):
-        command.set_defaults(run=run)
-        command.add_argument('--port', required=True, help='USB port of the robot board')
+    add('--steps-per-turn', type=bounded_int(20, 10_000), help='full steps of a turn of the wheel')
+    add('--invert', choices=('none', 'left', 'right', 'both'), help='wheels that turn backward')
+    add('--divider', type=bounded_float(1.0, 13.0), help='of the battery voltage, 4: 1/4 of it')
+    add(
+        '--sensors',
+        type=_sensors,
+        metavar='TYPE[,…]',
+        help=f'distance sensors, one type or {SENSOR_COUNT}: {", ".join(SENSORS)}',
+    )
+    add('--diff', type=Path, metavar='FILE', help='compare with a file; exit code 1 if different')
+    add('--load', type=Path, metavar='FILE', help='write the settings of a file')
+    add('--save', type=Path, metavar='FILE', help='write a parameter file, for the host as well')
+    add('--yes', action='store_true', help='do not ask before writing')
+    command = commands.add_parser('log', help='print resets and faults that the robot has logged')
+    command.set_defaults(run=_show_log)
+    command.add_argument('--port', required=True, help='USB port of the robot board')
 
 
 def _add_key_commands(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:

@@ -4,15 +4,23 @@
 
 import argparse
 from collections.abc import Callable, Sequence
-import os
 from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
+from t3mpc_ros.cli.run_options import (
+    add_topic_options,
+    add_workers,
+    executor_of,
+    report_options,
+)
 from t3mpc_ros.parameters.command_line import bounded_int
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition
+    from t3mpc_ros.evaluation.tuning.tuned_parameters import TunedParameters
 
 
 DRIVES = {'torque': 'torque', 'servo': 'velocity'}
@@ -50,12 +58,7 @@ def add_parser(
         type=bounded_int(1, 100_000),
         help=f'of each method with each robot (default {EVALUATIONS}; twin {TWIN_EVALUATIONS})',
     )
-    parser.add_argument(
-        '--workers',
-        type=bounded_int(1, 100_000),
-        default=os.cpu_count() or 1,
-        help='processes (default all cores)',
-    )
+    add_workers(parser)
     parser.add_argument(
         '--output',
         type=Path,
@@ -64,14 +67,7 @@ def add_parser(
     parser.add_argument(
         '--resume', action='store_true', help='go on where the last tuning was interrupted'
     )
-    bag = parser.add_argument_group('with a bag')
-    bag.add_argument('--namespace', help='whose topics (default: those of most known topics)')
-    bag.add_argument('--odom', default='', metavar='TOPIC', help='odometry')
-    bag.add_argument('--cmd-vel', default='', metavar='TOPIC', help='commands')
-    bag.add_argument('--wheel-radius', type=float, metavar='M', help='in m (default: as recorded)')
-    bag.add_argument(
-        '--track', type=float, metavar='M', help='distance between the wheels in m, likewise'
-    )
+    add_topic_options(parser.add_argument_group('with a bag'))
     parser.set_defaults(run=run, table=table)
 
 
@@ -100,38 +96,45 @@ def run(options: argparse.Namespace) -> int:
     names = find_names('method', options.methods, [method.name for method in known])
     methods = [method for method in known if method.name in names or not names]
     require_libraries(method.name for method in methods)
-    output = options.output or OUTPUT
-    if options.robot == TWIN:
-        from t3mpc_ros.evaluation.method_comparison.twin_tuning import tune_twin, twin_definitions
-
-        store = tune_twin(
-            twin_definitions(methods),
-            options.evaluations or TWIN_EVALUATIONS,
-            options.workers,
-            output,
-            _print_progress,
-            resume=options.resume,
-        )
-    else:
-        from t3mpc_ros.evaluation.tuning.tune_methods import tune_methods
-
-        drives = [DRIVES[options.robot]] if options.robot else list(DRIVES.values())
-        store = tune_methods(
-            methods,
-            [drive for drive in drives if options.robot or any(drive in m.start for m in methods)],
-            options.evaluations or EVALUATIONS,
-            options.workers,
-            output,
-            _print_progress,
-            resume=options.resume,
-        )
+    with executor_of(options) as executor:
+        store = _tuned(options, methods, executor)
     print(store.table())
     return 0
 
 
+def _tuned(
+    options: argparse.Namespace, methods: 'Sequence[MethodDefinition]', executor: 'int | Executor'
+) -> 'TunedParameters':
+    """Return the parameters after tuning on the chosen robots."""
+    output = options.output or OUTPUT
+    if options.robot == TWIN:
+        from t3mpc_ros.evaluation.method_comparison.twin_tuning import tune_twin, twin_definitions
+
+        return tune_twin(
+            twin_definitions(methods),
+            options.evaluations or TWIN_EVALUATIONS,
+            executor,
+            output,
+            _print_progress,
+            resume=options.resume,
+        )
+    from t3mpc_ros.evaluation.tuning.tune_methods import tune_methods
+
+    drives = [DRIVES[options.robot]] if options.robot else list(DRIVES.values())
+    return tune_methods(
+        methods,
+        [drive for drive in drives if options.robot or any(drive in m.start for m in methods)],
+        options.evaluations or EVALUATIONS,
+        executor,
+        output,
+        _print_progress,
+        resume=options.resume,
+    )
+
+
 def _identify(options: argparse.Namespace) -> int:
     """Print the parameter file for the robot in the bag ``options.robot`` and return 0."""
-    from t3mpc_ros.evaluation.bag_report.topic_roles import ReportOptions, bag_display_name
+    from t3mpc_ros.evaluation.bag_report.topic_roles import bag_display_name
     from t3mpc_ros.evaluation.tuning.drive_identification import identify_bag, parameter_file
 
     bag = Path(options.robot)
@@ -141,16 +144,8 @@ def _identify(options: argparse.Namespace) -> int:
         )
     if options.methods or options.evaluations or options.resume:
         raise ValueError('methods, --evaluations and --resume are for simulated robots: got a bag')
-    if (options.wheel_radius is None) != (options.track is None):
-        raise ValueError('--wheel-radius and --track must be given together')
-    wanted = ReportOptions(
-        namespace=options.namespace,
-        odom=options.odom,
-        cmd_vel=options.cmd_vel,
-        wheel_radius=options.wheel_radius,
-        track=options.track,
-    )
-    text = parameter_file(*identify_bag(bag, wanted), bag_display_name(bag))
+    found = identify_bag(bag, report_options(options))
+    text = parameter_file(*found, bag_display_name(bag))
     print(text)
     if options.output:
         options.output.parent.mkdir(parents=True, exist_ok=True)

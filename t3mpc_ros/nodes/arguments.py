@@ -87,7 +87,7 @@ def help_text(node: str) -> str:
         default = ', '.join(map(str, spec.default)) if spec.many else spec.default  # type: ignore[arg-type]
         unit = f' {spec.unit}' if spec.unit else ''
         facts = f'{default}{unit}' if default != '' else '(empty)'
-        bounds = f', {spec.bounds()}' if spec.bounds() else ''
+        bounds = f', {spec.bounds_text()}' if spec.bounds_text() else ''
         mark = '*' if spec.dynamic else ' '
         lines += [
             *_wrapped(f'{mark} {spec.name} = ', facts + bounds),
@@ -139,7 +139,8 @@ def unmatched_files(argv: Sequence[str], nodes: Sequence[str]) -> list[str]:
     names = [name.rpartition('/')[2] for name in nodes]
     problems = []
     for file in _parameter_files(argv):
-        keys = list(_node_keys(yaml.safe_load(Path(file).read_text(encoding='utf-8')), ''))
+        content = yaml.safe_load(Path(file).read_text(encoding='utf-8'))
+        keys = [key for key, _ in _node_entries(content, '')]
         matched = any(_key_pattern(key).fullmatch(node) for key in keys for node in nodes)
         others = set(NODES) - set(names)
         if matched or (keys and all(key.rpartition('/')[2] in others for key in keys)):
@@ -157,15 +158,44 @@ def _parameter_files(argv: Sequence[str]) -> list[str]:
     ]
 
 
-def _node_keys(tree: object, prefix: str) -> Iterator[str]:
-    """Yield the node names of a parameter file, whose namespaces may be nested keys."""
+def file_values(file: str, node: str) -> dict[str, object]:
+    """Return the parameters by name that a parameter file sets at a node.
+
+    Parameters
+    ----------
+    file
+        A valid parameter file.
+    node
+        Full name of the node, ``/namespace/name``.
+    """
+    import yaml
+
+    content = yaml.safe_load(Path(file).read_text(encoding='utf-8'))
+    values: dict[str, object] = {}
+    for key, tree in _node_entries(content, ''):
+        if _key_pattern(key).fullmatch(node):
+            values.update(_leaves(tree, ''))
+    return values
+
+
+def _leaves(tree: object, prefix: str) -> Iterator[tuple[str, object]]:
+    """Yield the values below nested keys, by names with dots."""
+    if not isinstance(tree, dict):
+        yield prefix, tree
+        return
+    for key, value in tree.items():
+        yield from _leaves(value, f'{prefix}.{key}' if prefix else str(key))
+
+
+def _node_entries(tree: object, prefix: str) -> Iterator[tuple[str, object]]:
+    """Yield node names and parameters of a file, whose namespaces may be nested keys."""
     if not isinstance(tree, dict):
         return
     for key, value in tree.items():
         if key == 'ros__parameters':
-            yield prefix
+            yield prefix, value
         else:
-            yield from _node_keys(value, f'{prefix}/{str(key).strip("/")}')
+            yield from _node_entries(value, f'{prefix}/{str(key).strip("/")}')
 
 
 def _key_pattern(key: str) -> 're.Pattern[str]':

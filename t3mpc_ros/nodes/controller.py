@@ -13,6 +13,7 @@ import zlib
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.publisher import Publisher
+from sensor_msgs.msg import Range
 from std_msgs.msg import Float64, Int64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
@@ -26,6 +27,7 @@ from t3mpc_ros.control.controller import (
 )
 from t3mpc_ros.control.input_monitor import InputMonitor
 from t3mpc_ros.control.watchdog import Reason
+from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist
 from t3mpc_ros.nodes.common import conversions, graph_introspection, qos
 from t3mpc_ros.nodes.common.base_node import (
@@ -38,7 +40,8 @@ from t3mpc_ros.nodes.common.base_node import (
 )
 from t3mpc_ros.nodes.common.command_subscription import age_problem, message_age_ns
 from t3mpc_ros.nodes.common.frame_prefix import FrameParameters
-from t3mpc_ros.parameters.table import group, parameter
+from t3mpc_ros.parameters.table import ParameterError, group, parameter
+from t3mpc_ros.robot.interface import RANGE_SENSORS
 
 CONFIGURATION_ERRORS = (ModelError,)
 """Errors of :func:`make` other than :class:`ParameterError`."""
@@ -67,9 +70,8 @@ class ControllerNodeParameters(StepperControllerParameters):
         20.0,
         'rate of the scalar topics (~/error, ~/estimate, ~/terms, ~/lyapunov, ~/skill), which '
         'are published only while they have subscribers; 0 = none',
-        unit='Hz',
-        low=0.0,
-        high=1000.0,
+        'Hz',
+        (0.0, 1000.0),
     )
     model: str = parameter(
         '',
@@ -121,7 +123,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
     def __init__(self, **options: Any) -> None:
         super().__init__('controller', ControllerNodeParameters, **options)
         self.get_logger().info('initialising (the first start compiles the kernels, about 30 s)')
-        self._controller = Controller(self.parameters)
+        self._controller = Controller(self.parameters, _obstacles(self.parameters))
         self._controller.warm_up()  # compile and pre-train here, not within a step
         self._journal = Journal()
         self._journal_publisher = self.create_publisher(Int64MultiArray, '~/journal', qos.JOURNAL)
@@ -150,10 +152,20 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self._initial_reference = InitialInputs(self, 'reference')
         self._initial_odometry = InitialInputs(self, 'odom')
         self._references = self.create_matching_subscription(
-            Odometry, 'reference', self._on_reference, qos.STREAM, raw=True
+            Odometry, 'reference', None, qos.STREAM, raw=True
         )
         self._odometry = self.create_matching_subscription(
             Odometry, 'odom', self._on_odometry, qos.STREAM, raw=True
+        )
+        # Like references, ranges are taken before a step: a wait of the executor costs more than
+        # a step, and they come 160 times a second.
+        self._ranges = (
+            [
+                self.create_matching_subscription(Range, f'range/{name}', None, qos.SCALARS)
+                for name in RANGE_SENSORS
+            ]
+            if self.parameters.keep_out.enabled
+            else []
         )
         self.create_service(SetBool, '~/enable', self._on_enable)
         self.create_service(Trigger, '~/reset', self._on_reset)
@@ -188,13 +200,19 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self._journal_message.data = row
         self._journal_publisher.publish(self._journal_message)
 
-    def _on_reference(self, message: bytes) -> None:
-        for each in (message, *self._references.take_waiting()):
-            state = conversions.state_from_odometry(each)
+    def _take_references(self) -> None:
+        for message in self._references.take_waiting():
+            state = conversions.state_from_odometry(message)
             self._journal.count_reference(state.stamp_ns)
             if not self._controller.add_reference(state):
                 self._rejected_references += 1
-            self._initial_reference.republish(each)
+            self._initial_reference.republish(message)
+
+    def _take_ranges(self) -> None:
+        for sensor, subscription in enumerate(self._ranges):
+            for message in subscription.take_waiting():
+                self._controller.add_range(sensor, message.range)
+                self._publish_journal(self._journal.range(sensor, message.range))
 
     def _on_odometry(self, message: bytes, info: dict[str, Any]) -> None:
         # Without a step, the watchdog stops the robot and the journal has no row.
@@ -204,6 +222,8 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             self._rejected_odometry += 1 + len(self._odometry.take_waiting())
             return
         self._last_odometry_ns = self.steady_ns()
+        self._take_references()
+        self._take_ranges()
         measured = conversions.state_from_odometry(message)
         command, status = self._controller.step(measured)
         self._publish_command(command, status.stamp_ns)
@@ -238,6 +258,8 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self.get_logger().info(f'the robot expects {graph_introspection.type_name(other)}')
 
     def _on_watchdog(self) -> None:
+        self._take_references()
+        self._take_ranges()
         if self._last_odometry_ns is None:
             return
         if self._controller.check_odometry(self._last_odometry_ns, self.steady_ns()):
@@ -304,7 +326,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
     def produce_diagnostics(self) -> tuple[bytes, str, Mapping[str, object]]:
         """Return whether the controller tracks the reference, or the reason of the stop."""
         status = self._controller.status
-        values = {
+        values: dict[str, object] = {
             'reason': status.reason.value,
             'steps': self._steps,
             'limited': status.limited,
@@ -322,6 +344,11 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             'references_rejected': self._rejected_references,
             'odometry_rejected': self._rejected_odometry,
         }
+        if self.parameters.pose.enabled:
+            values['path_error_m'] = self._controller.pose_controller.error.distance
+            values['rejoining'] = self._controller.pose_controller.rejoining
+        if self._controller.keep_out is not None:
+            values['keep_out'] = self._controller.keep_out.activity.value
         if self._odometry_problem:
             return ERROR, f'stopped: odom {self._odometry_problem}', values
         waiting = self._steps == 0
@@ -336,6 +363,9 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             return WARN, stopped, values
         if status.reason is Reason.NOT_FOLLOWING:
             return WARN, status.reason.value, values
+        keep_out = self._controller.keep_out
+        if keep_out is not None and keep_out.activity.stuck:
+            return WARN, keep_out.activity.value, values
         if self._rejected_references:
             return WARN, 'reference messages with non-finite values were ignored', values
         return OK, status.reason.value, values
@@ -351,6 +381,18 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         publish_and_wait_for_acked(self._command_publisher, stop)
         self._journal_message.data = self._journal.finish()
         publish_and_wait_for_acked(self._journal_publisher, self._journal_message)
+
+
+def _obstacles(parameters: ControllerNodeParameters) -> Obstacles:
+    """Return the obstacles that the keep-out knows."""
+    if not parameters.keep_out.world:
+        return Obstacles()
+    from t3mpc_ros.simulation.world import WorldError, load_world
+
+    try:
+        return load_world(parameters.keep_out.world).obstacles
+    except WorldError as error:
+        raise ParameterError(f'keep_out.world: {error}') from error
 
 
 def make() -> list[ControllerNode]:

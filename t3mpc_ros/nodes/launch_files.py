@@ -7,15 +7,19 @@ Parameters of a node come from, the later the stronger: its file in ``config/``,
 """
 
 from collections.abc import Callable, Mapping, Sequence
+import logging
 from pathlib import Path
 from typing import Any
 
-from ament_index_python.packages import get_package_share_directory
+from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
 from launch import LaunchContext, LaunchDescription
+from t3mpc_ros.nodes.arguments import file_values
+from t3mpc_ros.nodes.registry import parameter_class
+from t3mpc_ros.robot.description import urdf
 
 PACKAGE = 't3mpc_ros'
 FLAG = ('true', 'false', 'True', 'False')
@@ -39,6 +43,12 @@ USE_SIM_TIME = DeclareLaunchArgument(
 )
 RECORD = DeclareLaunchArgument(
     'record', default_value='true', choices=FLAG, description='record a bag'
+)
+ROBOT_DESCRIPTION = DeclareLaunchArgument(
+    'robot_description',
+    default_value='false',
+    choices=FLAG,
+    description='start robot_state_publisher, if it is installed, with the URDF of the robot',
 )
 
 
@@ -110,24 +120,84 @@ class PackageNodes:
         remappings
             Pairs of a topic and its new name.
         """
-        parts = (self.text('namespace').strip('/'), namespace)
-        simulated = 'use_sim_time' in self._arguments and self.flag('use_sim_time')
-        levels = [
-            str(self._config / f'{name}.yaml'),
-            {'use_sim_time': simulated} | _typed(defaults or {}),
-            *self._params_files(),
-            _typed(given or {}),
-        ]
+        levels = self._levels(name, given, defaults)
         return Node(
             package=PACKAGE,
             executable=name,
             name=name,
-            namespace='/'.join(part for part in parts if part),
+            namespace=self._namespace(namespace),
             output='screen',
-            parameters=[level for level in levels if level],
+            parameters=[_typed(level) if isinstance(level, dict) else level for level in levels],
             remappings=list(remappings),
             ros_arguments=['--log-level', self.text('log_level')],
         )
+
+    def robot(
+        self,
+        name: str,
+        given: Mapping[str, Any] | None = None,
+        *,
+        defaults: Mapping[str, Any] | None = None,
+        namespace: str = '',
+    ) -> list[Node]:
+        """Return the node of a robot, and with ``robot_description`` its robot_state_publisher.
+
+        The URDF is that of the parameters of the node; robot_state_publisher then publishes the
+        fixed transforms in its place. Parameters as of :meth:`node`.
+        """
+        if not self.flag('robot_description') or not _is_installed('robot_state_publisher'):
+            return [self.node(name, given, defaults=defaults, namespace=namespace)]
+        place = self._namespace(namespace)
+        values: dict[str, Any] = {}
+        for level in self._levels(name, given, defaults):
+            full = f'/{place}/{name}' if place else f'/{name}'
+            values |= level if isinstance(level, dict) else file_values(level, full)
+        kind = parameter_class(name)
+        # A file for all nodes also holds names of other nodes.
+        known = {spec.name for spec in kind.specs()}
+        parameters = kind.from_dict({key: values[key] for key in values if key in known})
+        base = parameters.base_frame_id
+        publisher = Node(
+            package='robot_state_publisher',
+            executable='robot_state_publisher',
+            name='robot_state_publisher',
+            namespace=place,
+            output='screen',
+            parameters=[
+                _typed(
+                    {
+                        'robot_description': urdf(
+                            parameters.frame_names, parameters.geometry, parameters.range_sensor
+                        ),
+                        'frame_prefix': parameters.prefixed(base, f'/{place}').removesuffix(base),
+                        'use_sim_time': self._simulated,
+                    }
+                )
+            ],
+            ros_arguments=['--log-level', self.text('log_level')],
+        )
+        given = {**(given or {}), 'enable_static_tf': False}
+        return [self.node(name, given, defaults=defaults, namespace=namespace), publisher]
+
+    @property
+    def _simulated(self) -> bool:
+        return 'use_sim_time' in self._arguments and self.flag('use_sim_time')
+
+    def _namespace(self, below: str) -> str:
+        parts = (self.text('namespace').strip('/'), below)
+        return '/'.join(part for part in parts if part)
+
+    def _levels(
+        self, name: str, given: Mapping[str, Any] | None, defaults: Mapping[str, Any] | None
+    ) -> list[str | dict[str, Any]]:
+        """Return files and values of the parameters of a node, later ones stronger."""
+        levels = [
+            str(self._config / f'{name}.yaml'),
+            {'use_sim_time': self._simulated, **(defaults or {})},
+            *self._params_files(),
+            dict(given or {}),
+        ]
+        return [level for level in levels if level]
 
     def _params_files(self) -> list[str]:
         name = self.text('params_file')
@@ -138,6 +208,19 @@ class PackageNodes:
                 return [str(path)]
         # Without the check, launch continues with a warning and the defaults.
         raise FileNotFoundError(f'params_file is neither a file nor one in {self._config}: {name}')
+
+
+def _is_installed(package: str) -> bool:
+    try:
+        get_package_share_directory(package)
+    except PackageNotFoundError:
+        logging.getLogger(PACKAGE).warning(
+            '%s is not installed: no robot_description; sudo apt install ros-jazzy-%s',
+            package,
+            package.replace('_', '-'),
+        )
+        return False
+    return True
 
 
 def _typed(parameters: Mapping[str, Any]) -> dict[str, Any]:

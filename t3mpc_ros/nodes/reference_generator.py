@@ -1,27 +1,39 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""``ros2 run t3mpc_ros reference_generator``: publishes the chaotic reference."""
+"""``ros2 run t3mpc_ros reference_generator``: publishes the reference, chaotic or given."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 import secrets
 from typing import Any
 
+from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry, Path
+import numpy as np
 from std_msgs.msg import Int32MultiArray
 from std_srvs.srv import SetBool, Trigger
 
-from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceParameters
+from t3mpc_ros.chaos.path_source import (
+    GivenPathSource,
+    PathClock,
+    PathReferenceParameters,
+    PathSource,
+    PortraitSource,
+    TwistSource,
+)
+from t3mpc_ros.chaos.reference import ChaoticReference
 from t3mpc_ros.chaos.seed_fingerprint import FINGERPRINT_KEY, SALT_BYTES, fingerprint_seed
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose
+from t3mpc_ros.geometry.path_file import load_path
+from t3mpc_ros.geometry.path_timing import PathError, check_points
 from t3mpc_ros.geometry.timing import SampleScheduler
-from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, STANDSTILL, State
+from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, STANDSTILL, BodyTwist, Pose, State
 from t3mpc_ros.nodes.common import conversions, qos
 from t3mpc_ros.nodes.common.base_node import ACK_TIMEOUT, NO_CLOCK, OK, WARN, BaseNode
 from t3mpc_ros.nodes.common.frame_prefix import FrameParameters
 from t3mpc_ros.parameters.table import ParameterError, group, parameter
 
-CONFIGURATION_ERRORS: tuple[type[Exception], ...] = ()
+CONFIGURATION_ERRORS: tuple[type[Exception], ...] = (PathError,)
 """Errors of :func:`make` other than :class:`ParameterError`."""
 
 PATH_PERIOD = 0.1
@@ -31,21 +43,21 @@ SEED_BITS = 128
 
 
 @dataclass(frozen=True)
-class ReferenceGeneratorParameters(ReferenceParameters):
+class ReferenceGeneratorParameters(PathReferenceParameters):
     """Parameters of the reference generator node."""
 
     lead: float = parameter(
         0.4,
         'lead time: how far in the future the reference is stamped, so that its value at the '
         'present time does not depend on message delays',
-        unit='s',
-        low=0.0,
-        high=10.0,
+        's',
+        (0.0, 10.0),
     )
     secret_seed: bool = parameter(
         False,
         'draw the seed from the operating system, so that the path of the robot is not '
-        'predictable; only a fingerprint of the seed is published',
+        'predictable; only a fingerprint of the seed is published. Source portrait does so '
+        'whenever seed is 0',
     )
     frame_id: str = parameter('odom', 'frame of the reference pose')
     child_frame_id: str = parameter('base_link', 'frame of the reference twist')
@@ -53,10 +65,17 @@ class ReferenceGeneratorParameters(ReferenceParameters):
     path_points: int = parameter(
         600,
         'maximum number of poses in reference/path (one every 0.1 s); 0 = no path',
-        low=0,
-        high=100_000,
+        bounds=(0, 100_000),
+    )
+    enable_stamped_target_twist: bool = parameter(
+        False, 'source twist: subscribe to target_twist as TwistStamped instead of Twist'
     )
     geometry: WheelGeometry = group(WheelGeometry, inline=True)
+
+    @property
+    def draws_seed(self) -> bool:
+        """Whether the seed comes from the operating system."""
+        return self.secret_seed or (self.source == 'portrait' and self.seed == 0)
 
     def check_consistency(self) -> None:
         """Raise :class:`ParameterError` if both a secret and a public seed are set."""
@@ -73,15 +92,27 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         parameters = self.parameters
         # A secret seed is never a parameter value, log text or diagnostic value: it determines
         # the path of the robot. The diagnostics hold its fingerprint, which the recorder stores.
-        self._seed = _random_seed() if parameters.secret_seed else parameters.seed
+        self._seed = _random_seed() if parameters.draws_seed else parameters.seed
         self._fingerprint = fingerprint_seed(self._seed, secrets.token_bytes(SALT_BYTES))
-        self._generator = ChaoticReference(parameters, parameters.geometry)
-        self._generator.advance()  # compile here, not within a step
-        self._generator.reset(self._seed)
+        self._points = load_path(parameters.path_file) if parameters.path_file else None
+        self._source: PathSource | None = None
+        """Source of the pose, once the robot has reported where it is."""
+        # A patrol is to cover its room: a portrait that waited would leave out much of it.
+        on_the_way = parameters.source != 'portrait'
+        self._path_clock = PathClock(parameters.wait, on_the_way=on_the_way)
+        self._rejected = 0
+        if parameters.source == 'signals':
+            self._generator = ChaoticReference(parameters, parameters.geometry)
+            self._generator.advance()  # compile here, not within a step
+            self._generator.reset(self._seed)
+        else:
+            self._make_source(ORIGIN).advance()
+            self._subscribe()
         self._scheduler = SampleScheduler(parameters.rate, slack=0.2 / parameters.rate)
         self._lead_ns = round(parameters.lead * NANOSECONDS)
         self._paused = False
         self._pose = ORIGIN
+        self._samples = 0
         self._path = Path()
         frame, child = (
             parameters.frames.prefixed(name, self.get_namespace())
@@ -102,14 +133,84 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         self.create_steady_timer(1.0 / parameters.rate, self._on_timer)
         self.create_steady_timer(1.0, self._publish_path)
 
+    def _make_source(self, start: Pose) -> PathSource:
+        """Return the source of the parameters for a robot at rest."""
+        parameters, geometry = self.parameters, self.parameters.geometry
+        if parameters.source == 'portrait':
+            return PortraitSource(parameters, geometry, start, self._seed, self._next_seed)
+        if parameters.source == 'twist':
+            return TwistSource(parameters, start)
+        return GivenPathSource(parameters, geometry, start, self._points, parameters.repeat)
+
+    def _subscribe(self) -> None:
+        """Subscribe to the pose at which the robot starts, and to what it shall follow."""
+        parameters = self.parameters
+        # Taken before a sample: the executor need not wake for it.
+        self._odometry = self.create_matching_subscription(
+            Odometry, 'odom', None, qos.STREAM, raw=True
+        )
+        if parameters.source == 'topic':
+            self.create_matching_subscription(Path, 'path', self._on_path, qos.LATCHED)
+        elif parameters.source == 'twist':
+            kind = TwistStamped if parameters.enable_stamped_target_twist else Twist
+            self.create_matching_subscription(kind, 'target_twist', self._on_twist, qos.COMMAND)
+
+    def _take_odometry(self) -> None:
+        """Make the source where the robot is, once it has reported that; then wait for it."""
+        for message in self._odometry.take_waiting()[-1:]:
+            state = conversions.state_from_odometry(message)
+            if not state.is_finite():
+                continue
+            if self._source is None:
+                self._source = self._make_source(state.pose)
+                self._pose = state.pose
+            self._path_clock.observe(state.stamp_ns, state.pose)
+
+    def _on_path(self, message: Path) -> None:
+        places = [(each.pose.position.x, each.pose.position.y) for each in message.poses]
+        points = np.array(places, dtype=np.float64).reshape(-1, 2)
+        try:
+            check_points(points)
+        except PathError as error:
+            self._rejected += 1
+            self.get_logger().warning(f'path is ignored: {error}')
+            return
+        if isinstance(self._source, GivenPathSource):
+            self._source.add_points(points)
+        else:  # the robot has not reported where it is
+            self._points = points
+
+    def _on_twist(self, message: Twist | TwistStamped) -> None:
+        twist = message.twist if isinstance(message, TwistStamped) else message
+        if isinstance(self._source, TwistSource) and not self._source.set_target(
+            BodyTwist(twist.linear.x, twist.angular.z)
+        ):
+            self._rejected += 1
+
+    def _next_seed(self) -> int:
+        """Return another seed, and replace the fingerprint."""
+        self._seed = _random_seed() if self.parameters.draws_seed else self._seed + 1
+        self._fingerprint = fingerprint_seed(self._seed, secrets.token_bytes(SALT_BYTES))
+        return self._seed
+
     def _on_timer(self) -> None:
         if not self.clock_started():
             return
+        if self.parameters.source != 'signals':
+            self._take_odometry()
+            if self._source is None:
+                return
         for stamp_ns in self._scheduler.due(self.now_ns()):
             self._publish(stamp_ns + self._lead_ns)
 
     def _publish(self, stamp_ns: int) -> None:
         twist = STANDSTILL
+        if self._source is not None:
+            if not self._paused:
+                self._pose, twist = self._source.advance(self._path_clock.rate)
+            self._path_clock.add_reference(stamp_ns, self._pose)
+            self._publish_state(State(stamp_ns, self._pose, twist))
+            return
         if not self._paused:
             sample = self._generator.advance()
             twist = sample.twist
@@ -119,6 +220,13 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         state = State(stamp_ns, self._pose, twist)
         self._reference_publisher.publish(self._serialized.with_state(state))
         self._pose = advance_pose(self._pose, twist, 1.0 / self.parameters.rate)
+
+    def _publish_state(self, state: State) -> None:
+        """Publish a sample of a path, and keep some as the path driven so far."""
+        self._reference_publisher.publish(self._serialized.with_state(state))
+        self._samples += 1
+        if self._samples % max(1, round(PATH_PERIOD * self.parameters.rate)) == 0:
+            self._append_to_path(state)
 
     def _publish_signals(self, signals: tuple[int, ...]) -> None:
         """Publish the mode and the numbers of its two signals when they change."""
@@ -137,11 +245,17 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             self._path_publisher.publish(self._path)
 
     def _on_reseed(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._seed = _random_seed() if self.parameters.secret_seed else self._seed + 1
-        self._fingerprint = fingerprint_seed(self._seed, secrets.token_bytes(SALT_BYTES))
-        self._generator.reset(self._seed)
+        if self.parameters.source not in ('signals', 'portrait'):
+            response.message = f'source {self.parameters.source} has no seed'
+            return response
+        seed = self._next_seed()
         response.success = True
         response.message = 'the reference restarts with another seed'
+        if isinstance(self._source, PortraitSource):
+            self._source.reseed(seed)
+            response.message = 'the path continues with another seed'
+        elif self.parameters.source == 'signals':
+            self._generator.reset(seed)
         return response
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
@@ -152,7 +266,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
 
     def produce_diagnostics(self) -> tuple[bytes, str, Mapping[str, object]]:
         """Return the state of the reference; a warning if samples were skipped."""
-        values = {
+        values: dict[str, object] = {
             'lateness_s': self._scheduler.lateness(self.now_ns()),
             'skipped_samples': self._scheduler.skipped,
             'mode': self._signals[0] if self._signals else 'none',
@@ -160,8 +274,15 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         }
         if not self.clock_started():
             return WARN, NO_CLOCK, values
+        if self.parameters.source != 'signals':
+            values['rejected_inputs'] = self._rejected
+            values['path_rate'] = self._path_clock.rate
+            if self._source is None:
+                return WARN, 'no odom yet: the path begins where the robot is', values
         if self._scheduler.skipped:
             return WARN, 'processor overloaded: samples were skipped', values
+        if self._path_clock.rate == 0.0:
+            return OK, 'waiting for the robot', values
         return OK, 'paused' if self._paused else 'running', values
 
     def on_shutdown(self) -> None:

@@ -43,13 +43,14 @@ _ROBOT_SERVICES = ('reset_odometry', 'e_stop')
 
 INTERFACES = {
     'reference_generator': NodeInterface(
-        'Publishes the chaotic reference.',
+        'Publishes the reference: chaotic signals, a chaotic path, or a given path or twist.',
+        subscribes=('odom', 'path', 'target_twist'),
         publishes=('reference', 'reference/path', 'reference/signals', '/diagnostics'),
         services=('~/reseed', '~/pause'),
     ),
     'controller': NodeInterface(
         'Tracks the reference with the odometry of a robot and publishes its velocity commands.',
-        subscribes=('reference', 'odom'),
+        subscribes=('reference', 'odom', 'range/*'),
         publishes=(
             'cmd_vel',
             '~/error/*',
@@ -137,7 +138,7 @@ def parameters_section() -> str:
             cells = (
                 f'`{spec.name}`',
                 f'{default}{unit}' if default else '*(empty)*',
-                spec.bounds(),
+                spec.bounds_text(),
                 'dynamic' if spec.dynamic else '',
                 spec.text,
                 spec.source,

@@ -46,14 +46,10 @@ MIN_REAL_TIME_SHARE = 0.9
 class InitialPoseParameters(Parameters):
     """Pose in the world at start, and after ``~/set_pose``."""
 
-    x: float = parameter(
-        0.0, 'x of the robot at start and after ~/set_pose', unit='m', dynamic=True
-    )
-    y: float = parameter(
-        0.0, 'y of the robot at start and after ~/set_pose', unit='m', dynamic=True
-    )
+    x: float = parameter(0.0, 'x of the robot at start and after ~/set_pose', 'm', dynamic=True)
+    y: float = parameter(0.0, 'y of the robot at start and after ~/set_pose', 'm', dynamic=True)
     yaw: float = parameter(
-        0.0, 'yaw of the robot at start and after ~/set_pose', unit='rad', dynamic=True
+        0.0, 'yaw of the robot at start and after ~/set_pose', 'rad', dynamic=True
     )
 
 
@@ -69,17 +65,15 @@ class SimRobotParameters(RobotTopicParameters, DigitalTwinParameters):
         1.0,
         'simulated seconds per second; 0 = paused, ~/step advances the time. Values other than 1 '
         'need publish_clock',
-        low=0.0,
-        high=100.0,
+        bounds=(0.0, 100.0),
         dynamic=True,
     )
+    # Subscription queues hold the messages of at most the highest step time.
     step_time: float = parameter(
         0.01,
         'simulated time that ~/step advances: whole periods, at least one',
-        unit='s',
-        low=0.001,
-        # Subscription queues hold the messages of at most this time.
-        high=0.5,
+        's',
+        (0.001, 0.5),
         dynamic=True,
     )
     initial_pose: InitialPoseParameters = group(InitialPoseParameters)

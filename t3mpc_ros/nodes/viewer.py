@@ -41,11 +41,9 @@ from t3mpc_ros.geometry.types import NANOSECONDS, State
 from t3mpc_ros.nodes.common import conversions
 from t3mpc_ros.nodes.common.endpoints import PolledCallbackGroup
 from t3mpc_ros.nodes.common.remote_parameters import RemoteParameters, plain_value
+from t3mpc_ros.robot.description import sensor_mounts
 from t3mpc_ros.robot.interface import RANGE_SENSORS
-from t3mpc_ros.simulation.sensors.range_sensor import (
-    SimulatedRangeSensorParameters,
-    sensor_mounts,
-)
+from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
 from t3mpc_ros.simulation.world import world_outline
 
 Condition = Literal['normal', 'warning', 'stopped']
@@ -147,7 +145,7 @@ class ViewNode(Node):
         self._sources: dict[str, _Source] = {}
         self._subscribe_all()
         sink.set('terms', list(TERM_NAMES))
-        sink.set('mounts', sensor_mounts(SimulatedRangeSensorParameters()).tolist())
+        sink.set('mounts', sensor_mounts(RangeSensorParameters()).tolist())
 
     # -- loop -------------------------------------------------------------------------------------
 

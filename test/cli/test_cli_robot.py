@@ -9,11 +9,15 @@ import sys
 import threading
 import time
 
+import numpy as np
 import pytest
 
+from t3mpc_ros.cli import calibrate
 from t3mpc_ros.cli import robot as cli
 from t3mpc_ros.radio.protocol.authentication import key_check, read_key
 from t3mpc_ros.radio.serial_port import SerialPort
+from t3mpc_ros.radio.tool import procedure
+from t3mpc_ros.robot.calibration import Recording
 
 
 @pytest.fixture
@@ -105,6 +109,12 @@ def test_port_errors_contain_a_remedy(tmp_path, capsys):
         (['jog', 'left', '1', '--port', 'x', '--key', 'no/such/file', '--yes'], 'no/such/file'),
         (['jog', 'left', '1', '--port', 'x'], '--yes'),
         (['key', 'check', 'no/such/file'], 'no/such/file'),
+        (['setup', '--port', 'x', '--save', 'no/such/file'], 'no/such/file cannot be written'),
+        (['calibrate', '--port', 'x', '--save', '/'], '/ cannot be written'),
+        (
+            ['doctor', '--port', 'x', '--robot-port', 'x', '--report', 'no/such/file'],
+            'no/such/file cannot be written',
+        ),
     ],
 )
 def test_invalid_input_is_reported_before_the_port_opens(arguments, words, capsys, monkeypatch):
@@ -118,7 +128,7 @@ def test_invalid_input_is_reported_before_the_port_opens(arguments, words, capsy
 def test_jog_requires_a_confirmation(answer, capsys, monkeypatch):
     """Readline continues after a signal, so the prompt has to poll for Ctrl-C."""
     opened = []
-    monkeypatch.setattr(cli, 'run_at_port', lambda *arguments: opened.append(arguments))
+    monkeypatch.setattr(procedure, 'run_at_port', lambda *arguments: opened.append(arguments))
     master, slave = os.openpty()
     with open(slave) as terminal:
         monkeypatch.setattr(sys, 'stdin', terminal)
@@ -163,3 +173,101 @@ def test_wrong_arguments_are_usage_errors(arguments, capsys):
         cli.main(arguments)
     assert ended.value.code == 2
     capsys.readouterr()
+
+
+def test_calibrating_needs_a_person_at_a_terminal(capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    with open(os.devnull) as empty:
+        monkeypatch.setattr(sys, 'stdin', empty)
+        assert cli.main(['calibrate', '--port', 'x']) == 2
+    assert 'run it at a terminal' in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    'arguments, words',
+    [
+        (['--steps', 'rest,raduis'], 'must be of rest, radius'),
+        (['--distances', '0.1,0.2,0.3'], 'at least 4, from 0.05 to 1 m'),
+        (['--turns', '1'], 'from 2 to 15: got 1'),
+        (['--mark-distance', '0'], 'from 0.001 to 100: got 0'),
+    ],
+)
+def test_arguments_of_a_calibration_are_checked(arguments, words, capsys):
+    with pytest.raises(SystemExit):
+        cli.main(['calibrate', '--port', 'x', *arguments])
+    assert words in capsys.readouterr().err
+
+
+def test_an_interrupted_calibration_keeps_what_it_found(capsys, monkeypatch, tmp_path):
+    """Ctrl-C at the second step: the bias of the first one is saved."""
+    rates = 0.01 + 5e-4 * np.random.default_rng(1).standard_normal(500)
+    still = np.zeros(500)
+    recording = Recording(0.02 * np.arange(500), still, still, rates, 500, 500)
+    monkeypatch.setattr(calibrate.LinkedRobot, 'rest', lambda robot, seconds: recording)
+    read, write = os.pipe()
+    path = tmp_path / 'found.yaml'
+    with os.fdopen(read) as terminal:
+        monkeypatch.setattr(sys, 'stdin', Terminal(terminal))
+        os.write(write, b'\n')
+        code = cli.main(
+            ['calibrate', '--port', 'x', '--steps', 'rest,radius', '--save', str(path)]
+        )
+    os.close(write)
+    assert code == 130
+    output = capsys.readouterr()
+    assert 'bias of the gyro 0.57' in output.out
+    assert 'interrupted' in output.err
+    bias = calibrate.read_parameter_file(path)[0].gyro_bias
+    assert bias.value == pytest.approx(0.01, abs=1e-4)
+
+
+class Terminal:
+    """A pipe that claims to be a terminal; Ctrl-C follows the first line."""
+
+    def __init__(self, pipe):
+        self._pipe, self.fileno = pipe, pipe.fileno
+
+    def isatty(self):
+        return True
+
+    def readline(self):
+        line = self._pipe.readline()
+        signal.raise_signal(signal.SIGINT)
+        return line
+
+
+@pytest.mark.slow
+def test_setup_shows_asks_and_restores(ports, tmp_path, capsys, monkeypatch):
+    """Nothing is written without a question or --yes; a file restores every setting."""
+    _, robot = ports
+    saved = tmp_path / 'robot.yaml'
+
+    def run(*arguments):
+        code = cli.main(['setup', '--port', robot, *arguments])
+        output = capsys.readouterr()
+        return code, output.out + output.err
+
+    assert run('--save', str(saved))[0] == 0
+    with open(os.devnull) as empty:
+        monkeypatch.setattr(sys, 'stdin', empty)
+        code, output = run('--channel', '100')
+    assert (code, 'channel: 82 -> 100' in output, '--yes' in output) == (2, True, True)
+    code, output = run('--diff', str(saved))
+    assert (code, 'equal to' in output) == (0, True)
+    changes = ['--channel', '100', '--invert', 'left', '--divider', '3.5', '--sensors', 'none']
+    code, output = run(*changes, '--yes', '--diff', str(saved))
+    assert (code, 'divider: 3.5 -> 4.0' in output, '8 x none' in output) == (1, True, True)
+    code, output = run('--load', str(saved), '--yes')
+    assert (code, 'invert_left: yes -> no' in output) == (0, True)
+    assert run('--diff', str(saved))[0] == 0
+    saved.write_text(saved.read_text().replace('channel: 82', 'channel: 126'))
+    code, output = run('--load', str(saved))
+    assert (code, 'channel must be from 0 to 125: got 126' in output) == (2, True)
+
+
+def test_the_doctor_asks_only_at_a_terminal(capsys, monkeypatch):
+    with open(os.devnull) as empty:
+        monkeypatch.setattr(sys, 'stdin', empty)
+        assert cli.main(['doctor', '--port', 'x', '--robot-port', 'y']) == 2
+    assert '--no-questions' in capsys.readouterr().err

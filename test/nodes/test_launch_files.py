@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from t3mpc_ros.bag.run.model_file import find_model, load_model, read_model_head
 from t3mpc_ros.cli.bag import main as bag_main
 from t3mpc_ros.cli.process_group import installed_file
 from t3mpc_ros.control.controller import Controller
+from t3mpc_ros.geometry.path_timing import distance_to_path, resample
 from t3mpc_ros.nodes.registry import parameter_class
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
 
@@ -101,6 +103,28 @@ def test_texts_of_arguments_stay_texts():
     """Launch takes 12345 as a number, which is no valid port and no valid file."""
     bridge = only(launched('robot.launch.py', port='12345', key_file='99'), 'radio_bridge')
     assert (bridge.values['port'], bridge.values['key_file']) == ('12345', '99')
+
+
+@pytest.mark.parametrize('file', ['sim.launch.py', 'robot.launch.py', 'two_robots.launch.py'])
+def test_the_robot_description_follows_the_parameters(file, tmp_path):
+    path = tmp_path / 'mine.yaml'
+    path.write_text(
+        '/**: {ros__parameters: {wheel_radius: 0.05, imu_frame_id: gyro, horizon: 3}}\n'
+        '/other/sim_robot: {ros__parameters: {imu_frame_id: wrong}}\n'
+    )
+    given = {'params_file': str(path), 'robot_description': 'true', 'namespace': 'east'}
+    nodes = launched(file, **given)
+    assert len(nodes) > len(launched(file, params_file=str(path)))
+    robots = [node for node in nodes if node.executable in ('sim_robot', 'radio_bridge')]
+    publishers = [node for node in nodes if node.executable == 'robot_state_publisher']
+    assert len(robots) == len(publishers)
+    for robot, publisher in zip(robots, publishers, strict=True):
+        assert robot.values['enable_static_tf'] is False, 'not published twice'
+        assert publisher.namespace == robot.namespace
+        assert publisher.values['frame_prefix'] == f'{robot.namespace}/'
+        tree = ElementTree.fromstring(publisher.values['robot_description'])
+        assert {tyre.get('radius') for tyre in tree.iter('cylinder')} == {'0.05'}
+        assert tree.find("link[@name='gyro']") is not None
 
 
 @pytest.mark.parametrize('file', ['turtlebot3.yaml', 'generic.yaml'])
@@ -295,6 +319,63 @@ def test_sim_starts_tracks_and_ends_with_ctrl_c(to_group, start, tmp_path):
     error, reference = tracking_error(bag, 0.035, 0.147, *topics)
     assert reference > 1.0
     assert error < 0.25 * reference
+
+
+@pytest.mark.slow
+@pytest.mark.alone
+@pytest.mark.ros
+@pytest.mark.long
+def test_patrol_drives_its_path_and_keeps_its_seed(tmp_path, monkeypatch, request):
+    """All that the launch file starts; the processes write the secrets they draw to a file."""
+    drawn = tmp_path / 'drawn.txt'
+    (tmp_path / 'sitecustomize.py').write_text(
+        'import secrets, sys\n'
+        'def randbits(count, draw=secrets.randbits):\n'
+        '    value = draw(count)\n'
+        f'    print(sys.argv[0], value, file=open({str(drawn)!r}, "a"))\n'
+        '    return value\n'
+        'secrets.randbits = randbits\n'
+    )
+    monkeypatch.setenv('PYTHONPATH', str(tmp_path))
+    start = request.getfixturevalue('start')  # reads the environment
+    slow = tmp_path / 'slow.yaml'  # half the load
+    nodes = ('sim_robot', 'controller', 'reference_generator')
+    slow.write_text(
+        yaml.safe_dump({f'/**/{name}': {'ros__parameters': {'rate': 50.0}} for name in nodes})
+    )
+    file, given = 'patrol.launch.py', {'localised': 'true', 'params_file': str(slow)}
+    words = [launch_file(file), *(f'{name}:={value}' for name, value in given.items())]
+    with start('launch_files', *words) as launch:
+        launch.wait_for('tracking')
+        time.sleep(15.0)
+        assert not launch.ends(), launch.output()
+        codes = end(launch)
+    assert codes == dict.fromkeys((*nodes, 'recorder'), 0)
+    bag = only_bag(tmp_path)
+    with open_bag(bag) as recording:
+        for node in launched(file, **given):
+            values = recording.metadata_records.get(node.name, {})
+            for name in node.values:
+                assert name == 'use_sim_time' or node.name == 'recorder' or name in values
+        names = {'x': 'pose.pose.position.x', 'y': 'pose.pose.position.y'}
+        reference = recording.series('/reference', names)
+        truth = recording.series('/ground_truth/odom', names)
+    driven = np.cumsum(np.hypot(np.diff(truth['x']), np.diff(truth['y'])))
+    assert driven[-1] > 0.3
+    path, track = (np.column_stack([each['x'], each['y']]) for each in (reference, truth))
+    first = track[: np.searchsorted(driven, 0.2)]
+    assert distance_to_path(first, resample(path, 0.005)).max() < 0.05
+    lines = [line.split() for line in drawn.read_text().splitlines()]  # NumPy draws some, too
+    seeds = {int(value) for name, value in lines if name.endswith('reference_generator')}
+    assert seeds
+    texts = [launch.output().encode(), *(path.read_bytes() for path in sorted(bag.glob('*')))]
+    with open_bag(bag) as recording:
+        texts += [message.data for message in recording.serialized_messages()]
+        texts.append(repr(recording.metadata_records).encode())
+    for seed in seeds:
+        forms = [form.encode() for form in (str(seed), f'{seed:x}', f'{seed:X}')]
+        forms += [seed.to_bytes(16, 'little'), seed.to_bytes(16, 'big')]
+        assert not any(form in text for form in forms for text in texts)
 
 
 @pytest.mark.slow

@@ -2,79 +2,31 @@
 # SPDX-License-Identifier: Apache-2.0
 """The live page of a running graph in a headless browser, as a person uses it."""
 
-import json
 from pathlib import Path
-import shutil
-import time
 
 import pytest
+from support.browser import SIZES, Browser
 
 from t3mpc_ros.cli.view import PAGE_AT
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.alone]
 
-WAIT = 60.0
-"""Longest wait for a change of the page on a busy machine, s."""
 ROBOT = {'world': 'room', 'noise.variance': 0.04}
-SIZES = {360: 800, 768: 1024, 1440: 1000}
 
 
-class Browser:
-    """Chromium with the page, and waits for what it shows."""
-
-    def __init__(self):
-        chromedriver, chromium = map(shutil.which, ('chromedriver', 'chromium'))
-        if not chromedriver or not chromium:
-            pytest.skip('chromium and chromedriver are not installed')
-        from selenium import webdriver
-
-        options = webdriver.ChromeOptions()
-        options.binary_location = chromium
-        for word in ('headless=new', 'no-sandbox', 'disable-gpu', 'disable-dev-shm-usage'):
-            options.add_argument(f'--{word}')
-        options.set_capability('goog:loggingPrefs', {'browser': 'ALL', 'performance': 'ALL'})
-        service = webdriver.ChromeService(chromedriver)
-        self.driver = webdriver.Chrome(options=options, service=service)
-
-    def text(self, name):
-        return self.find(name).text
-
-    def find(self, name):
-        return self.driver.find_element('id', name)
-
-    def run(self, script, *values):
-        return self.driver.execute_script(script, *values)
-
-    def wait(self, condition, what):
-        deadline = time.monotonic() + WAIT
-        while not condition():
-            assert time.monotonic() < deadline, f'{what}; the banner: {self.text("headline")}'
-            time.sleep(0.1)
+class LivePage(Browser):
+    """The live page in Chromium."""
 
     def wait_for_headline(self, *words):
-        self.wait(lambda: self.text('headline').startswith(words), f'no headline {words}')
-
-    def show_as(self, width, height, scheme='light'):
-        metrics = {'width': width, 'height': height, 'deviceScaleFactor': 1, 'mobile': width < 500}
-        self.driver.execute_cdp_cmd('Emulation.setDeviceMetricsOverride', metrics)
-        feature = {'name': 'prefers-color-scheme', 'value': scheme}
-        self.driver.execute_cdp_cmd('Emulation.setEmulatedMedia', {'features': [feature]})
-
-    def requests(self):
-        """Return the addresses of all requests so far."""
-        messages = [
-            json.loads(entry['message'])['message'] for entry in self.driver.get_log('performance')
-        ]
-        return [
-            message['params']['request']['url']
-            for message in messages
-            if message['method'] == 'Network.requestWillBeSent'
-        ]
+        self.wait(
+            lambda: self.text('headline').startswith(words),
+            lambda: f'no headline {words}: {self.text("headline")}',
+        )
 
 
 @pytest.fixture
 def browser():
-    browser = Browser()
+    browser = LivePage()
     yield browser
     browser.driver.quit()
 
@@ -99,26 +51,6 @@ def newest(browser, stream='odometry'):
     return browser.run(f'return streams.{stream}.time.at(-1)')
 
 
-# WCAG 2: relative luminance of a colour, contrast ratio of text and background.
-CONTRAST = """
-const weights = [0.2126, 0.7152, 0.0722];
-const linear = (c) => (c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4);
-const light = (text) => text.match(/[\\d.]+/g).slice(0, 3)
-  .reduce((sum, each, i) => sum + weights[i] * linear(each / 255), 0);
-let box = arguments[0];
-const ink = light(getComputedStyle(box).color);
-const paper = () => getComputedStyle(box).backgroundColor;
-while (paper() === 'rgba(0, 0, 0, 0)') box = box.parentElement;
-const [a, b] = [ink, light(paper())].sort((x, y) => y - x);
-return (a + 0.05) / (b + 0.05);
-"""
-
-
-def contrast(browser, name):
-    """Return the contrast ratio of an element's text."""
-    return browser.run(CONTRAST, browser.find(name))
-
-
 def test_a_person_watches_and_commands_a_robot(page, browser, processes, tmp_path):
     from selenium.webdriver import ActionChains, Keys
 
@@ -138,10 +70,8 @@ def test_a_person_watches_and_commands_a_robot(page, browser, processes, tmp_pat
     drag = ActionChains(browser.driver).move_to_element(charts[1]).click_and_hold()
     drag.move_by_offset(80, 0).release().perform()
     browser.wait(lambda: browser.text('hold') == 'Follow', 'no zoom')
-    low, high = browser.run(
-        'const {min, max} = charts.charts[0].uplot.scales.x; return [min, max]'
-    )
-    assert 0.0 < high - low < 25.0
+    shown = 'const {min, max} = charts.charts[0].uplot.scales.x; return max - min'
+    browser.wait(lambda: 0.0 < browser.run(shown) < 25.0, 'the span is not shown')
     ActionChains(browser.driver).double_click(charts[1]).perform()
     browser.wait(lambda: browser.text('hold') == 'Hold', 'zoom not undone')
 
@@ -184,7 +114,7 @@ def test_a_person_watches_and_commands_a_robot(page, browser, processes, tmp_pat
             browser.show_as(width, height, scheme)
             assert browser.run('return document.documentElement.scrollWidth') <= width
             for part in ('headline', 'e-stop', 'floor-title', 'pose', 'answer', 'hold'):
-                assert contrast(browser, part) >= 4.5, (part, scheme)
+                assert browser.contrast(browser.find(part)) >= 4.5, (part, scheme)
 
     # The graph stops and starts again.
     for node in ('controller', 'reference_generator', 'sim_robot'):
@@ -203,8 +133,7 @@ def test_a_person_watches_and_commands_a_robot(page, browser, processes, tmp_pat
     processes.start('view', 'view', '--headless', '--port', port, program='t3mpc')
     browser.wait_for_headline('Tracking', 'Driving')
 
-    severe = [entry for entry in browser.driver.get_log('browser') if entry['level'] == 'SEVERE']
-    assert [entry for entry in severe if 'ERR_CONNECTION_REFUSED' not in entry['message']] == []
+    assert [text for text in browser.errors() if 'ERR_CONNECTION_REFUSED' not in text] == []
     assert {url for url in browser.requests() if not url.startswith((page, 'data:'))} == set()
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
-from support.ros_graph import ControllerHarness, odometry, reason
+from support.ros_graph import ControllerHarness, diagnostic, odometry, reason
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recording.recording_parameters import RecordingParameters
@@ -21,7 +21,10 @@ from t3mpc_ros.evaluation.process_replay.controller_replay import (
     replay_controller,
 )
 from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.recorder.node import RecorderNode
+from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
+from t3mpc_ros.nodes.sim_robot import SimRobotNode
 
 pytestmark = pytest.mark.ros
 
@@ -99,7 +102,8 @@ def test_a_recorded_controller_replays_bit_for_bit(late, harness, tmp_path):
     assert inputs.journalled
     [life] = inputs.lives
     assert life.rows[0, 0] == 0, 'the journal begins with the first event'
-    assert {Event(value) for value in life.events.tolist()} == set(Event)
+    # Ranges are journalled with the keep-out only.
+    assert {Event(value) for value in life.events.tolist()} == set(Event) - {Event.RANGE}
     assert life.exact.all(), inputs.notes
     again = replay_controller(inputs)
     reasons = set(again.reasons)
@@ -127,3 +131,26 @@ def test_a_recorded_controller_replays_bit_for_bit(late, harness, tmp_path):
             recorded = recording.series(f'/{name}', {'value': 'data'})['value']
             assert recorded.size > 200
             assert recorded.tolist() == scalars[name]['value'][-recorded.size :].tolist()
+
+
+def test_a_patrol_replays_bit_for_bit(harness, tmp_path):
+    """Its commands depend on the range sensors, too, whose readings are in the journal."""
+    bag = tmp_path / 'bag'
+    recorder = start_recorder(harness, bag)
+    controller = harness.add(ControllerNode, pose__enabled=True, keep_out__enabled=True)
+    harness.spin_until(lambda: recorder.count_publishers('controller/journal') > 0)
+    harness.add(SimRobotNode, world='room')
+    harness.add(ReferenceGeneratorNode, source='portrait', seed=7)
+    harness.spin_until(lambda: diagnostic(controller, 'steps') > 400)
+    harness.remove(controller)
+    harness.remove(recorder)
+    inputs = load_inputs(bag)
+    (life,) = inputs.lives
+    assert np.count_nonzero(life.events == Event.RANGE) > 100
+    again = replay_controller(inputs)
+    outcome = compare(inputs, again, Tolerances(absolute=0.0, relative=0.0))
+    assert outcome.same, outcome.table()
+    held = np.isfinite(inputs.recorded['cmd_vel.linear.x'])
+    compared = inputs.commanding & inputs.exact & held
+    assert np.count_nonzero(compared) > 200
+    assert np.ptp(inputs.recorded['cmd_vel.angular.z'][compared]) > 0.0, 'the robot moved'

@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What consumers of the messages rely on: frames, gravity, covariances, hardware names."""
 
+import sys
+import types
+
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry, Path
 import numpy as np
@@ -60,6 +63,40 @@ def test_the_frames_of_a_namespace_have_its_prefix(harness):
         if kind is Odometry:
             assert message.child_frame_id == 'one/base_link', name
     assert {paths[-1].header.frame_id, paths[-1].poses[-1].header.frame_id} == {'one/odom'}
+
+
+@pytest.mark.ros
+def test_fixed_frames_have_the_names_of_the_messages(harness, monkeypatch):
+    """Ranges and accelerations came in frames that no transform led to."""
+    sent = []
+
+    class Broadcaster:
+        def __init__(self, node):
+            pass
+
+        def sendTransform(self, transforms):
+            sent.append(transforms)
+
+    tf2_ros = types.SimpleNamespace(
+        StaticTransformBroadcaster=Broadcaster, TransformBroadcaster=Broadcaster
+    )
+    monkeypatch.setitem(sys.modules, 'tf2_ros', tf2_ros)
+    mounted = {'range_sensor.half_length': 0.2, 'range_frame_prefix': 'sharp_'}
+    harness.add(SimRobotNode, namespace='one', enable_odom_tf=False, **mounted)
+    ranges = harness.subscribe(Range, 'one/range/rear_left')
+    imu = harness.subscribe(Imu, 'one/imu/data_raw')
+    harness.spin_until(lambda: ranges and imu)
+    (transforms,) = sent
+    found = {transform.child_frame_id: transform for transform in transforms}
+    assert {transform.header.frame_id for transform in transforms} == {'one/base_link'}
+    assert len(found) == 9
+    assert imu[-1].header.frame_id in found
+    rear = found[ranges[-1].header.frame_id].transform
+    assert rear.translation.x == -0.2
+    assert abs(rear.rotation.z) == pytest.approx(1.0), 'it looks backwards'
+    sent.clear()
+    harness.add(SimRobotNode, namespace='two', enable_odom_tf=False, enable_static_tf=False)
+    assert not sent
 
 
 @pytest.mark.ros

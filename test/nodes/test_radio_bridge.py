@@ -13,7 +13,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 import pytest
 from sensor_msgs.msg import BatteryState, Imu, JointState, Range
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import SetBool
 from support.radio_bench import FakeDongle, FakeRobot
 from support.ros_graph import CommandSource, diagnostic, diagnostic_level, reason, twist
 
@@ -127,19 +127,6 @@ def test_a_missing_dongle_is_reported_and_used_once_plugged_in(harness, plug):
     harness.spin_until(lambda: diagnostic(node, 'link') == 'running', 'the link')
 
 
-def test_a_dongle_unplugged_while_driving_is_found_again(harness, plug):
-    node, _, odom = driving(harness, plug)
-    plug.pull_out()
-    harness.spin_until(
-        lambda: 'is the dongle plugged in?' in reason(node), 'the reason in the diagnostics'
-    )
-    plug.put_in()
-    before = len(odom)
-    harness.spin_until(lambda: len(odom) > before + 20, 'odometry')
-    harness.spin_until(lambda: odom[-1].twist.twist.linear.x > 0.09, 'the robot drives again')
-    assert diagnostic(node, 'port_failures') == 1
-
-
 def test_timeout_and_e_stop_stop_the_robot(harness, plug):
     node, source, _ = driving(harness, plug)
     source.message = None
@@ -154,15 +141,6 @@ def test_timeout_and_e_stop_stop_the_robot(harness, plug):
     assert plug.robot.speeds == (0.0, 0.0)
     assert harness.call(SetBool, 'e_stop', data=False).success
     harness.spin_until(lambda: max(plug.robot.speeds) > 2.0, 'the robot drives again')
-
-
-def test_odometry_is_reset_at_rest_only(harness, plug):
-    _, source, odom = driving(harness, plug)
-    assert not harness.call(Trigger, 'reset_odometry').success
-    source.message = twist(0.0)
-    harness.spin_until(lambda: odom[-1].twist.twist.linear.x == 0.0, 'standstill')
-    harness.spin_until(lambda: harness.call(Trigger, 'reset_odometry').success, 'the reset')
-    harness.spin_until(lambda: abs(odom[-1].pose.pose.position.x) < 1e-6, 'the origin')
 
 
 def test_shutdown_stops_the_robot_and_disables_its_drives(harness, plug):

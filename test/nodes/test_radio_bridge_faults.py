@@ -153,7 +153,8 @@ def test_a_replugged_dongle_drives_within_a_second(harness, served):
     first = next(now_ns for now_ns, _ in board.followed if now_ns > board.back_ns)
     took = (first - board.back_ns) / 1e9
     print(f'\nfollows commands {took:.2f} s after the port is back')
-    assert took <= 2.0  # 0.2 s in virtual time: see test_firmware_avr_faults.py
+    assert took <= 2.0  # 0.2 s in virtual time: see firmware/test_avr_faults.py
+    assert diagnostic(node, 'port_failures') == 1
     harness.spin_until(lambda: follows_commands(node), 'status OK')
 
 

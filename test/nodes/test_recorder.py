@@ -10,6 +10,7 @@ import time
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from mcap.reader import make_reader
+from nav_msgs.msg import Odometry
 import pytest
 from rcl_interfaces.msg import Log
 from rclpy.duration import Duration
@@ -411,14 +412,37 @@ def all_bytes(folder):
     return b'\n'.join(found)
 
 
-def test_a_bag_holds_the_fingerprint_of_a_secret_seed_only(harness, tmp_path):
+def forms(seed):
+    """Return how a seed of 128 bits may be written: decimal, hexadecimal, halves in memory."""
+    halves = seed % 2**64, seed >> 64
+    packed = [struct.pack(order, half) for half in halves for order in ('<Q', '>Q')]
+    return [str(seed).encode(), f'{seed:x}'.encode(), f'{seed:X}'.encode(), *packed]
+
+
+class RobotAt:
+    """Publishes where the robot is, so that a path begins there."""
+
+    def __init__(self, harness):
+        self._publisher = harness.create_publisher(Odometry, 'odom')
+        self._message = Odometry()
+        self._message.pose.pose.orientation.w = 1.0
+
+    def report(self):
+        self._publisher.publish(self._message)
+        return True
+
+
+@pytest.mark.parametrize('source', ['signals', 'portrait'])
+def test_a_bag_holds_the_fingerprint_of_a_secret_seed_only(harness, tmp_path, source):
     topics = 'reference', 'reference/*', '/diagnostics', '/rosout', '/parameter_events'
     recorder = record(harness, tmp_path, *topics)
-    reference = harness.add(ReferenceGeneratorNode, secret_seed=True)
+    chosen = {'source': source} if source == 'portrait' else {'secret_seed': True}
+    reference, robot = harness.add(ReferenceGeneratorNode, **chosen), RobotAt(harness)
     seeds = [reference._seed]
     harness.spin_until(
         lambda: (
-            SEED_RECORD in recorder._metadata.records
+            robot.report()
+            and SEED_RECORD in recorder._metadata.records
             and 'reference_generator' in recorder._metadata.records
         )
     )
@@ -428,24 +452,45 @@ def test_a_bag_holds_the_fingerprint_of_a_secret_seed_only(harness, tmp_path):
     harness.spin_until(
         lambda: recorder._metadata.records[SEED_RECORD]['reference_generator'] != first
     )
-    harness.spin_until(lambda: values(recorder)['messages'] > 100)
+    harness.spin_until(lambda: robot.report() and values(recorder)['messages'] > 100)
     harness.remove(recorder)
     assert all(seed.bit_length() > 64 for seed in seeds)
     assert seeds[0] != seeds[1]
     with open_bag(tmp_path) as recording:
         text = recording.metadata_records[SEED_RECORD]['reference_generator']
         assert recording.metadata_records['reference_generator']['seed'] == '0'
-        assert recording.metadata_records['reference_generator']['secret_seed'] == 'True'
+        assert recording.topics['/reference'].message_count
     assert matches_fingerprint(first, seeds[0])
     assert matches_fingerprint(text, seeds[1])
     assert not matches_fingerprint(text, seeds[0])
     content = all_bytes(tmp_path)
     assert text.encode() in content, 'the search finds text that is present'
-    for seed in seeds:
-        low = struct.pack('<Q', seed % 2**64), struct.pack('>Q', seed % 2**64)
-        high = struct.pack('<Q', seed >> 64), struct.pack('>Q', seed >> 64)
-        for form in (str(seed).encode(), f'{seed:x}'.encode(), *low, *high):
-            assert form not in content
+    assert not [form for seed in seeds for form in forms(seed) if form in content]
+
+
+@pytest.mark.long
+def test_a_hundred_patrols_differ_and_no_bag_has_a_seed(harness, tmp_path):
+    topics = 'reference', 'reference/*', '/diagnostics', '/rosout', '/parameter_events'
+    robot, seeds, places = RobotAt(harness), set(), set()
+    for number in range(100):
+        folder = tmp_path / str(number)
+        recorder = record(harness, folder, *topics)
+        reference = harness.add(ReferenceGeneratorNode, source='portrait')
+        harness.spin_until(
+            lambda recorder=recorder: (
+                robot.report()
+                and SEED_RECORD in recorder._metadata.records
+                and values(recorder)['messages'] > 50
+            )
+        )
+        seed = reference._seed
+        harness.remove(reference)
+        harness.remove(recorder)
+        content = all_bytes(folder)
+        assert not [form for form in forms(seed) if form in content]
+        seeds.add(seed)
+        places.add([reference._source.advance()[0][:2] for _ in range(500)][-1])
+    assert len(seeds) == len(places) == 100
 
 
 def test_secret_seed_excludes_a_given_seed(harness):

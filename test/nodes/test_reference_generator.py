@@ -2,6 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Grid, latched topics, pause and seeds of the reference generator node."""
 
+import secrets
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import Odometry, Path
 import numpy as np
 import pytest
@@ -104,3 +108,127 @@ def test_reseed_changes_the_reference_and_hides_the_seed(harness):
     assert min(speed(message) for message in received[140:]) < 1e-3
     assert on_grid(received, 100)
     assert reference.get_parameter('seed').value == seed
+
+
+PATH_LIMIT = 0.25
+
+
+def _odometry(x=0.5, y=-0.2):
+    message = Odometry()
+    message.pose.pose.position.x, message.pose.pose.position.y = x, y
+    message.pose.pose.orientation.w = 1.0
+    return message
+
+
+def _drive(harness, topic, message, until, **parameters):
+    """Return the references of a generator that gets an odometry and, on ``topic``, a message."""
+    reference = harness.add(ReferenceGeneratorNode, **parameters)
+    received = harness.subscribe(Odometry, 'reference')
+    places = harness.create_publisher(Odometry, 'odom')
+    inputs = None
+    if isinstance(message, Path):
+        harness.create_publisher(Path, topic, LATCHED).publish(message)
+    elif topic:
+        inputs = harness.create_publisher(type(message), topic)
+    harness.spin_until(lambda: places.get_subscription_count() > 0)
+
+    def done():
+        # The robot is where its reference is.
+        places.publish(received[-1] if received else _odometry())
+        if inputs is not None and received:
+            inputs.publish(message)
+        return received and until(received[-1])
+
+    harness.spin_until(done)
+    return reference, received
+
+
+@pytest.mark.parametrize('source', ['portrait', 'file'])
+def test_a_path_begins_where_the_robot_is(harness, tmp_path, source):
+    """The first sample is the pose of odom, at rest; speeds stay within the limits."""
+    (tmp_path / 'path.csv').write_text('0,0\n3,0\n')
+    given = {'path_file': str(tmp_path / 'path.csv')} if source == 'file' else {}
+    _, received = _drive(harness, '', None, lambda m: speed(m) > 0.1, source=source, **given)
+    first = received[0].pose.pose.position
+    assert (first.x, first.y) == pytest.approx((0.5, -0.2), abs=1e-9)
+    assert speed(received[0]) == 0.0
+    assert max(map(speed, received)) <= PATH_LIMIT
+
+
+@pytest.mark.parametrize('source', ['portrait', 'twist'])
+def test_a_path_waits_for_a_robot_that_stands(harness, source):
+    """A controller that starts later finds the path where the robot is."""
+    reference = harness.add(ReferenceGeneratorNode, source=source)
+    received = harness.subscribe(Odometry, 'reference')
+    places = harness.create_publisher(Odometry, 'odom')
+    twists = harness.create_publisher(Twist, 'target_twist')
+    twist, began = Twist(), []
+    twist.linear.x = 0.2
+
+    def waits():
+        message = _odometry()
+        message.header.stamp = reference.get_clock().now().to_msg()
+        places.publish(message)
+        twists.publish(twist)
+        began.extend(each for each in received[-1:] if speed(each) > 0.05)
+        return began and speed(received[-1]) == 0.0
+
+    harness.spin_until(waits)
+    at = received[-1].pose.pose.position
+    assert np.hypot(at.x - 0.5, at.y + 0.2) < 0.35  # twice the distance, and the lead
+    assert reason(reference) == 'waiting for the robot'
+
+
+def test_a_path_message_is_followed(harness):
+    path = Path()
+    for x in (0.5, 1.5):
+        pose = PoseStamped()
+        pose.pose.position.x, pose.pose.position.y = x, -0.2
+        path.poses.append(pose)
+    _, received = _drive(harness, 'path', path, lambda m: speed(m) > 0.2, source='topic')
+    assert received[-1].pose.pose.position.x > 0.5
+    assert received[-1].pose.pose.position.y == pytest.approx(-0.2, abs=1e-6)
+
+
+def test_a_twist_message_is_followed_until_it_expires(harness):
+    twist = Twist()
+    twist.linear.x, twist.angular.z = 0.2, 0.4
+    _, received = _drive(harness, 'target_twist', twist, lambda m: speed(m) > 0.19, source='twist')
+    assert received[-1].twist.twist.angular.z == pytest.approx(0.4, abs=0.02)
+    harness.spin_until(lambda: speed(received[-1]) == 0.0)  # no more messages
+
+
+def test_a_patrol_keeps_its_seed_and_its_future(harness, monkeypatch):
+    """No parameter, topic, log line or service answer has a seed; no path is ahead of the lead.
+
+    Each further seed, by service or at random times, is as secret as the first.
+    """
+    seeds = []
+
+    def random_seed():
+        seeds.append(secrets.randbits(128))
+        return seeds[-1]
+
+    monkeypatch.setattr('t3mpc_ros.nodes.reference_generator._random_seed', random_seed)
+    logs = harness.subscribe(Log, '/rosout')
+    status = harness.subscribe(DiagnosticArray, '/diagnostics')
+    path = harness.subscribe(Path, 'reference/path', LATCHED)
+    reference, received = _drive(
+        harness,
+        '',
+        None,
+        lambda m: len(seeds) > 2 and path,
+        source='portrait',
+        reseed__shortest=0.3,
+        reseed__longest=0.6,
+    )
+    answer = harness.call(Trigger, 'reference_generator/reseed').message
+    texts = [repr(each) for each in (*logs, *status, *path, *received, answer)]
+    texts.append(repr(reference.parameters.to_dict()))
+    texts.append(repr([p.get_parameter_value() for p in reference._parameters.values()]))
+    assert len(seeds) >= 4
+    for seed in seeds:
+        for form in (str(seed), f'{seed:x}', f'{seed:X}'):
+            assert not [text for text in texts if form in text]
+    newest = max(stamp(pose) for pose in path[-1].poses)
+    assert newest <= reference.now_ns() + round(reference.parameters.lead * NANOSECONDS)

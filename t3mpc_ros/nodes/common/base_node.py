@@ -133,12 +133,15 @@ class BaseNode(Node, Generic[P]):
         self,
         msg_type: type,
         topic: str,
-        callback: Callable[..., None],
+        callback: Callable[..., None] | None,
         profile: QoSProfile,
         *,
         raw: bool = False,
     ) -> endpoints.MatchingSubscription:
-        """Return a subscription whose request follows the offers of the publishers."""
+        """Return a subscription whose request follows the offers of the publishers.
+
+        Without a callback the node takes the messages itself.
+        """
         made = endpoints.MatchingSubscription(self, msg_type, topic, callback, profile, raw=raw)
         self._matching.append(made)
         return made
@@ -282,7 +285,7 @@ def parameter_descriptor(spec: ParameterSpec) -> ParameterDescriptor:
         name=spec.name,
         type=_PARAMETER_TYPES[spec.kind, spec.many].value,
         description=f'{spec.text}{unit}{source}',
-        additional_constraints=spec.bounds(),
+        additional_constraints=spec.bounds_text(),
         read_only=not spec.dynamic,
     )
     if spec.many or (spec.low is None and spec.high is None):

@@ -84,6 +84,10 @@ class PolledCallbackGroup(CallbackGroup):
         """Do nothing: no entity is executed."""
 
 
+def unused_callback(message: object) -> None:
+    """Fill the mandatory callback argument of rclpy in a :class:`PolledCallbackGroup`."""
+
+
 class MatchingSubscription:
     """A subscription that requests what all publishers of its topic offer.
 
@@ -100,7 +104,9 @@ class MatchingSubscription:
     topic
         Topic name.
     callback
-        Called with each message.
+        Called with each message; None: the executor never waits for them, and the node takes them
+        with :meth:`take_waiting`. Each wait of the executor costs more than a step of the
+        controller, so a node with two streams waits for one of them.
     profile
         Request while all publishers offer it.
     raw
@@ -112,17 +118,23 @@ class MatchingSubscription:
         node: Node,
         message: type,
         topic: str,
-        callback: Callable[..., None],
+        callback: Callable[..., None] | None,
         profile: QoSProfile,
         *,
         raw: bool = False,
     ) -> None:
         self._node = node
-        self._arguments = message, topic, callback
+        self._arguments = message, topic, callback or unused_callback
+        self._group = None if callback else PolledCallbackGroup()
         self._raw = raw
         self._overridden = overriding_options(node, topic, 'subscription') is not None
-        self.held: Subscription = node.create_subscription(*self._arguments, profile, raw=raw)
+        self.held: Subscription = self._subscribe(profile)
         """The present subscription."""
+
+    def _subscribe(self, profile: QoSProfile) -> Subscription:
+        return self._node.create_subscription(
+            *self._arguments, profile, callback_group=self._group, raw=self._raw
+        )
 
     def adapt(self) -> None:
         """Subscribe again if a publisher does not offer what is requested."""
@@ -137,7 +149,7 @@ class MatchingSubscription:
         if profile.reliability == held.qos_profile.reliability:
             return  # the mismatch is another one, which the diagnostics name
         self._node.destroy_subscription(held)
-        self.held = self._node.create_subscription(*self._arguments, profile, raw=self._raw)
+        self.held = self._subscribe(profile)
         self._node.get_logger().info(f'{name} is published best effort')
 
     def take_waiting(self) -> list[Any]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import math
 from typing import Any, NamedTuple
 
+from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from sensor_msgs.msg import BatteryState, Imu, JointState, Range
@@ -14,6 +15,7 @@ from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.nodes.common import conversions, qos, sensor_messages
 from t3mpc_ros.nodes.common.frame_prefix import FrameParameters
 from t3mpc_ros.parameters.table import parameter
+from t3mpc_ros.robot.description import FixedFrame, FrameNames, fixed_frames
 from t3mpc_ros.robot.interface import RANGE_SENSORS, RobotState
 from t3mpc_ros.robot.sensor_conversions import (
     BatteryParameters,
@@ -42,11 +44,9 @@ class RobotTopicParameters(FrameParameters):
         'right_wheel_joint', 'name of the right wheel in joint_states'
     )
     left_wheel_name: str = parameter('left_wheel_joint', 'name of the left wheel in joint_states')
-    joint_rate: float = parameter(
-        20.0, 'rate of joint_states; 0 = never', unit='Hz', low=0.0, high=1000.0
-    )
+    joint_rate: float = parameter(20.0, 'rate of joint_states; 0 = never', 'Hz', (0.0, 1000.0))
     range_rate: float = parameter(
-        20.0, 'rate of each topic range/*; 0 = never', unit='Hz', low=0.0, high=1000.0
+        20.0, 'rate of each topic range/*; 0 = never', 'Hz', (0.0, 1000.0)
     )
     range_infinity: bool = parameter(
         True,
@@ -57,6 +57,22 @@ class RobotTopicParameters(FrameParameters):
     enable_odom_tf: bool = parameter(
         True, 'publish the transform from odom_frame_id to base_frame_id, if tf2_ros is installed'
     )
+    enable_static_tf: bool = parameter(
+        True,
+        'publish the fixed transforms of imu_frame_id and of the range sensors, if tf2_ros is '
+        'installed; false where robot_state_publisher does',
+    )
+
+    @property
+    def frame_names(self) -> FrameNames:
+        """Names of the frames and wheel joints, without prefix."""
+        return FrameNames(
+            self.base_frame_id,
+            self.imu_frame_id,
+            self.range_frame_prefix,
+            self.right_wheel_name,
+            self.left_wheel_name,
+        )
 
 
 class RobotDescription(NamedTuple):
@@ -104,7 +120,9 @@ class RobotPublishers:
                 Odometry, 'ground_truth/odom', qos.STREAM
             )
         self._joint_publisher = node.create_publisher(JointState, 'joint_states', qos.SCALARS)
-        self._broadcaster = self._make_broadcaster() if parameters.enable_odom_tf else None
+        self._broadcaster = (
+            self._make_broadcaster('TransformBroadcaster') if parameters.enable_odom_tf else None
+        )
         self._has_sensors = robot.sensors is not None
         if robot.sensors is not None:
             imu, range_sensor, battery = robot.sensors
@@ -118,11 +136,13 @@ class RobotPublishers:
                     node.create_publisher(Range, f'range/{name}', qos.SCALARS),
                     sensor_messages.range_message(
                         range_sensor,
-                        self._frame(f'{parameters.range_frame_prefix}{name}_range_link'),
+                        self._frame(parameters.frame_names.range_sensor(name)),
                     ),
                 )
                 for name in (RANGE_SENSORS if parameters.range_rate else ())
             ]
+            if parameters.enable_static_tf:
+                self._publish_fixed_frames(robot.geometry, range_sensor)
         self.configure(parameters, robot)
 
     def configure(self, parameters: RobotTopicParameters, robot: RobotDescription) -> None:
@@ -194,16 +214,47 @@ class RobotPublishers:
         """Return whether a topic of ``rate`` (Hz) is published with the present state."""
         return rate > 0.0 and self._published % max(1, round(self._rate / rate)) == 0
 
-    def _make_broadcaster(self) -> Any:
+    def _publish_fixed_frames(
+        self, geometry: WheelGeometry, range_sensor: RangeSensorParameters
+    ) -> None:
+        """Publish the transforms of the sensors once; the topic is latched."""
+        self._static_broadcaster = self._make_broadcaster('StaticTransformBroadcaster')
+        if self._static_broadcaster is None:
+            return
+        names = self._topic_parameters.frame_names
+        base = self._frame(names.base)
+        stamp_ns = self._node.get_clock().now().nanoseconds
+        self._static_broadcaster.sendTransform(
+            [
+                _fixed_transform(frame, base, self._frame(frame.name), stamp_ns)
+                for frame in fixed_frames(names, geometry, range_sensor)
+            ]
+        )
+
+    def _make_broadcaster(self, kind: str) -> Any:
         try:
-            from tf2_ros import TransformBroadcaster
+            import tf2_ros
         except ImportError:
-            self._node.get_logger().info('tf2_ros is not installed: no transform is published')
+            self._node.get_logger().info(
+                'tf2_ros is not installed: no transform is published', once=True
+            )
             return None
-        return TransformBroadcaster(self._node)
+        return getattr(tf2_ros, kind)(self._node)
 
 
 def _odometry_message(frame: str, child: str) -> Odometry:
     message = Odometry(child_frame_id=child)
     message.header.frame_id = frame
+    return message
+
+
+def _fixed_transform(fixed: FixedFrame, frame: str, child: str, stamp_ns: int) -> TransformStamped:
+    message = TransformStamped()
+    message.header.stamp = conversions.time_from_ns(stamp_ns)
+    message.header.frame_id = frame
+    message.child_frame_id = child
+    message.transform.translation.x = fixed.x
+    message.transform.translation.y = fixed.y
+    message.transform.translation.z = fixed.z
+    message.transform.rotation = conversions.quaternion_from_yaw(fixed.yaw)
     return message

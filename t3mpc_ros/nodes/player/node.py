@@ -61,19 +61,18 @@ class PlayerParameters(PlaybackParameters):
     subscriber_timeout: float = parameter(
         0.5,
         'maximum wait for a subscriber to every topic before playing',
-        unit='s',
-        low=0.0,
+        's',
+        (0.0, None),
         name='play.subscriber_timeout',
     )
     delay: float = parameter(
-        0.0, 'minimum wait before playing', unit='s', low=0.0, name='play.delay'
+        0.0, 'minimum wait before playing', 's', (0.0, None), name='play.delay'
     )
     realtime_priority: int = parameter(
         0,
         'real-time priority (SCHED_FIFO) of the thread that publishes; 0 = none. Needs the '
         'permission rtprio in limits.conf',
-        low=0,
-        high=99,
+        bounds=(0, 99),
         name='play.realtime_priority',
     )
     enable_keyboard_controls: bool = parameter(

@@ -37,7 +37,7 @@ from t3mpc_ros.bag.metadata import TopicInformation
 from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.topic_filter import TopicFilter
 from t3mpc_ros.nodes.common import graph_introspection, qos
-from t3mpc_ros.nodes.common.endpoints import PolledCallbackGroup
+from t3mpc_ros.nodes.common.endpoints import PolledCallbackGroup, unused_callback
 
 EXPECTED_TOPICS = {
     'reference': 'nav_msgs/msg/Odometry',
@@ -127,7 +127,7 @@ class RawSubscriptions:
         subscription = self._node.create_subscription(
             message,
             topic,
-            _unused_callback,
+            unused_callback,
             profile,
             callback_group=self._group,
             # Topic discovery finds incompatible offers in the graph and adapts the profile.
@@ -336,7 +336,3 @@ def _lost_event(subscription: Subscription) -> Any:
             )
     except UnsupportedEventTypeError:
         return None
-
-
-def _unused_callback(data: bytes) -> None:
-    """Fill the mandatory callback argument of rclpy; it is never called."""

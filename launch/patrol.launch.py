@@ -1,0 +1,76 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Patrol of the simulated robot: ``ros2 launch t3mpc_ros patrol.launch.py``.
+
+With ``robot:=false`` only generator, controller and recorder start, for a robot that runs already
+and publishes ``odom`` and ``range/*``. See docs/patrol.md.
+"""
+
+from launch.actions import DeclareLaunchArgument
+
+from t3mpc_ros.nodes.launch_files import (
+    FLAG,
+    RECORD,
+    USE_SIM_TIME,
+    describe,
+    params_file,
+)
+
+
+def nodes(launched):
+    seed = launched.given('seed', int)
+    known = launched.text('known_world')
+    known = {'keep_out.world': known} if known else {}
+    # With a given place, the pose of both nodes is that of the simulator.
+    place = [('odom', 'ground_truth/odom')] if launched.flag('localised') else []
+    path = {'pose.enabled': True, 'keep_out.enabled': True}
+    # Seed 0 of a portrait is a secret one.
+    source = {'source': 'portrait', 'seed': 0}
+    made = [
+        launched.node('controller', known, defaults=path, remappings=place),
+        launched.node('reference_generator', seed, defaults=source, remappings=place),
+    ]
+    if launched.flag('robot'):
+        robot = {
+            'world': 'room',
+            'noise.variance': 0.04,
+            'publish_clock': launched.flag('use_sim_time'),
+        }
+        given = {**launched.given('world'), **seed}
+        made.insert(0, launched.node('sim_robot', given, defaults=robot))
+    return [*made, launched.node('recorder')] if launched.flag('record') else made
+
+
+def generate_launch_description():
+    return describe(
+        nodes,
+        params_file(),
+        DeclareLaunchArgument(
+            'world',
+            default_value='',
+            description='world of the simulated robot: room, corridor, or a YAML file; empty: '
+            'that of params_file, else room',
+        ),
+        DeclareLaunchArgument(
+            'known_world',
+            default_value='',
+            description='walls that the keep-out knows, as world; empty: none, it sees them',
+        ),
+        DeclareLaunchArgument(
+            'seed',
+            default_value='',
+            description='seed of an experiment that can be repeated; empty: that of params_file, '
+            'else a secret one from the operating system',
+        ),
+        DeclareLaunchArgument(
+            'localised',
+            default_value='false',
+            choices=FLAG,
+            description='use the true pose of the simulator in place of the odometry',
+        ),
+        DeclareLaunchArgument(
+            'robot', default_value='true', choices=FLAG, description='start the simulated robot'
+        ),
+        USE_SIM_TIME,
+        RECORD,
+    )

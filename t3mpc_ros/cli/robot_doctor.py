@@ -1,0 +1,155 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``t3mpc robot doctor``: the bench checklist, measured and asked, with a report."""
+
+import argparse
+from collections.abc import Callable, Sequence
+import os
+from pathlib import Path
+from typing import TypeVar
+
+from t3mpc_ros.evaluation.reporting import (
+    Block,
+    Mark,
+    Table,
+    Tiles,
+    VerdictBox,
+    html_page,
+    strict_json,
+)
+from t3mpc_ros.radio.link.link_parameters import LinkParameters
+from t3mpc_ros.radio.tool import jog, link_test, procedure
+from t3mpc_ros.radio.tool.bench_checklist import (
+    DRIVEN,
+    FAIL,
+    PASS,
+    QUESTIONS,
+    SKIPPED,
+    Check,
+    Question,
+    check_board,
+    check_builds,
+    check_link,
+    examine_board,
+    read_pong,
+)
+from t3mpc_ros.radio.tool.procedure import DONGLE, ROBOT_BOARD, Board, ProcedureError, Script
+
+Value = TypeVar('Value')
+Answer = Callable[[str], str]
+"""Asks a question; returns ``yes``, ``no`` or ``skip``."""
+_MARKS = {PASS: 'yes', FAIL: 'no', SKIPPED: 'open'}
+_SPEED = 2.0
+"""rad/s, of the wheels in the air"""
+
+
+def run_doctor(
+    options: argparse.Namespace,
+    parameters: LinkParameters,
+    key: bytes,
+    answer: Answer,
+    interrupted: Callable[[], bool],
+) -> list[Check]:
+    """Go through the checklist; print each line, write the report, return all lines."""
+    checks: list[Check] = []
+
+    def add(new: Sequence[Check]) -> None:
+        for check in new:
+            checks.append(check)
+            print(format_check(check), flush=True)
+
+    def run(script: Script[Value], name: str, board: Board) -> Value | None:
+        port = options.robot_port if board is ROBOT_BOARD else options.port
+        try:
+            return procedure.run_script(script, port, interrupted, board)
+        except ProcedureError as error:
+            if interrupted():
+                raise
+            add([Check(2, name, FAIL, 'no result', str(error))])
+            return None
+
+    board = run(examine_board(), 'USB of the robot', ROBOT_BOARD)
+    if board is not None:
+        add(check_board(board, parameters))
+    dongle = run(read_pong(), 'dongle', DONGLE)
+    add([check_builds(dongle, board.pong if board is not None else None)])
+    if dongle is not None:
+        result = run(link_test.run_link_test(parameters, options.count), 'link', DONGLE)
+        if result is not None:
+            add(check_link(result, parameters))
+    if options.drive:
+        _drive(options, parameters, key, answer, interrupted, add)
+    else:
+        add([_skip(question, 'needs --drive') for question in DRIVEN])
+    for question in QUESTIONS:
+        add([_judge(question, answer(question.text))])
+    _write(checks, options.report)
+    return checks
+
+
+def format_check(check: Check) -> str:
+    """Return a line of the output, with the remedy after a failure."""
+    step = f'{check.step:>2}' if check.step else '  '
+    text = f'{step}  {check.verdict:<7}  {check.name}: {check.value}'
+    return f'{text}\n             try: {check.remedy}' if check.verdict == FAIL else text
+
+
+def _drive(
+    options: argparse.Namespace,
+    parameters: LinkParameters,
+    key: bytes,
+    answer: Answer,
+    interrupted: Callable[[], bool],
+    add: Callable[[Sequence[Check]], None],
+) -> None:
+    for question, wheel in zip(DRIVEN, (jog.LEFT, jog.RIGHT), strict=True):
+        ready = f'The {wheel} wheel will make one turn. Both wheels in the air, hands away?'
+        if answer(ready) != 'yes':
+            add([_skip(question, 'not confirmed')])
+            continue
+        task = jog.Jog(parameters, key, os.urandom, wheel, 1.0, _SPEED, print)
+        procedure.run_at_port(task, options.port, interrupted)
+        if task.error:
+            add([Check(question.step, question.name, FAIL, 'did not turn', task.error)])
+        else:
+            add([_judge(question, answer(question.text))])
+
+
+def _skip(question: Question, why: str) -> Check:
+    return Check(question.step, question.name, SKIPPED, why, question.remedy)
+
+
+def _judge(question: Question, answer: str) -> Check:
+    verdict = {'yes': PASS, 'no': FAIL}.get(answer, SKIPPED)
+    value = 'not answered' if verdict == SKIPPED else answer
+    return Check(question.step, question.name, verdict, value, question.remedy)
+
+
+def _write(checks: Sequence[Check], path: Path) -> None:
+    counts = {verdict: sum(c.verdict == verdict for c in checks) for verdict in _MARKS}
+    failed = [f'{check.name}: {check.remedy}' for check in checks if check.verdict == FAIL]
+    kind = 'bad' if failed else 'open' if counts[SKIPPED] else 'good'
+    headline = {
+        'bad': f'{counts[FAIL]} of {len(checks)} checks failed',
+        'open': f'nothing failed; {counts[SKIPPED]} checks were skipped',
+        'good': 'all checks passed',
+    }[kind]
+    rows: list[list[str | Mark]] = [
+        [
+            check.name,
+            Mark(check.verdict, _MARKS[check.verdict]),
+            str(check.step or ''),
+            check.value,
+            check.remedy if check.verdict == FAIL else '',
+        ]
+        for check in checks
+    ]
+    blocks: list[Block] = [
+        VerdictBox(headline, failed, kind),
+        Tiles([(str(count), verdict) for verdict, count in counts.items()]),
+        Table('', ['check', 'verdict', 'step', 'found', 'remedy'], rows, text=5, wrap=True),
+    ]
+    path.write_text(html_page('Bench checklist of the robot', blocks), encoding='utf-8')
+    data = path.with_suffix('.json')
+    data.write_text(strict_json([check._asdict() for check in checks]), encoding='utf-8')
+    print(f'{path}, {data}: {headline}')

@@ -1,0 +1,143 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Options that several commands share: robot, seeds, noise, who computes, topics of a bag."""
+
+import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from t3mpc_ros.parameters.command_line import bounded_float, bounded_int
+
+if TYPE_CHECKING:
+    from t3mpc_ros.evaluation.bag_report.topic_roles import ReportOptions
+
+ROBOTS = ('twin', 'servo', 'torque')
+FULL, NOMINAL = 'full', 'nominal'
+
+
+def add_setting(parser: argparse.ArgumentParser) -> None:
+    """Add robot, reference, noise and duration of the runs."""
+    parser.add_argument(
+        '--robot',
+        default='twin',
+        metavar='twin|servo|torque|FILE.py:NAME',
+        help='twin: the stepper robot, ground truth of its body included (default); servo, '
+        "torque: the paper's plant with that drive; or your own Robot, OdePlant or StateSpace",
+    )
+    parser.add_argument(
+        '--reference',
+        type=Path,
+        metavar='CSV',
+        help='columns time,right,left (s, rad/s) or time,linear,angular (s, m/s, rad/s) in place '
+        'of the chaotic reference',
+    )
+    parser.add_argument(
+        '--noise',
+        type=bounded_float(0.0, 100.0, '(rad/s)²'),
+        default=0.04,
+        help='variance of the measured wheel speeds, (rad/s)² (default 0.04)',
+    )
+    parser.add_argument(
+        '--duration',
+        type=bounded_float(2.0, 3600.0, 's'),
+        default=60.0,
+        help='of each run, s (default 60)',
+    )
+
+
+def add_seeds(parser: argparse.ArgumentParser, default: str, of: str) -> None:
+    """Add the seeds ``A-B``; the help says what they are the seeds ``of``."""
+    parser.add_argument(
+        '--seeds',
+        type=seed_range,
+        default=seed_range(default),
+        metavar='A-B',
+        help=f'seeds of {of} (default {default})',
+    )
+
+
+def add_workers(parser: argparse.ArgumentParser) -> None:
+    """Add who computes: processes here, or the workers of a cluster."""
+    parser.add_argument(
+        '--workers',
+        type=bounded_int(1, 10_000),
+        default=max(1, len(os.sched_getaffinity(0))),
+        help='processes (default: processors)',
+    )
+    parser.add_argument(
+        '--scheduler',
+        metavar='ADDRESS',
+        help='compute on the workers of this Dask scheduler, tcp://HOST:8786, in place of '
+        'processes here',
+    )
+
+
+def add_topic_options(parser: argparse._ActionsContainer) -> None:
+    """Add which topics of a bag are whose, and the wheel geometry that it may lack."""
+    parser.add_argument('--namespace', help='whose topics (default: those of most known topics)')
+    parser.add_argument('--odom', default='', metavar='TOPIC', help='odometry')
+    parser.add_argument('--cmd-vel', default='', metavar='TOPIC', help='commands')
+    parser.add_argument(
+        '--wheel-radius',
+        type=float,
+        metavar='M',
+        help='radius of the wheels in m (default: as recorded)',
+    )
+    parser.add_argument(
+        '--track', type=float, metavar='M', help='distance between the wheels in m, likewise'
+    )
+
+
+def report_options(options: argparse.Namespace) -> 'ReportOptions':
+    """Return what :func:`add_topic_options` added, and the ``--reference`` of a report.
+
+    Raises
+    ------
+    ValueError
+        Wheel radius without separation or the reverse.
+    """
+    from t3mpc_ros.evaluation.bag_report.topic_roles import ReportOptions
+
+    if (options.wheel_radius is None) != (options.track is None):
+        raise ValueError('--wheel-radius and --track must be given together')
+    names = {item.name for item in fields(ReportOptions)}
+    return ReportOptions(**{name: value for name, value in vars(options).items() if name in names})
+
+
+@contextmanager
+def executor_of(options: argparse.Namespace) -> Iterator[Any]:
+    """Enter who computes: the workers of ``--scheduler``, or the number of ``--workers``.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        dask.distributed is not installed.
+    ValueError
+        No scheduler answers at the address.
+    """
+    if not options.scheduler:
+        yield options.workers
+        return
+    from t3mpc_ros.scripting.executors import cluster
+
+    with cluster(options.scheduler) as executor:
+        yield executor
+
+
+def seed_range(text: str) -> tuple[int, ...]:
+    """Return the seeds of ``A-B``, both included, or of ``A``; an argparse type."""
+    first, dash, last = text.partition('-')
+    try:
+        low = int(first)
+        high = int(last) if dash else low
+    except ValueError:
+        raise argparse.ArgumentTypeError(f'must be A-B, as in 201-206: got {text}') from None
+    if not 0 <= low <= high or high - low >= 10_000:
+        raise argparse.ArgumentTypeError(
+            f'must be A-B with 0 <= A <= B and at most 10000 seeds: got {text}'
+        )
+    return tuple(range(low, high + 1))

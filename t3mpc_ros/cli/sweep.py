@@ -1,0 +1,95 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``t3mpc sweep``: runs over parameters × seeds × cases × controllers into one Parquet file."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from t3mpc_ros.cli.run_options import (
+    FULL,
+    NOMINAL,
+    ROBOTS,
+    add_seeds,
+    add_setting,
+    add_workers,
+    executor_of,
+)
+from t3mpc_ros.parameters.command_line import parsed_value
+
+OUTPUT = Path('runs') / 'sweep.parquet'
+
+
+def add_parser(commands: Any) -> argparse.ArgumentParser:
+    """Return the parser of ``sweep``, added to the sub-parsers of a program."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        'sweep',
+        help='parameters × seeds × cases × controllers, on all processors or a cluster',
+        description='Runs every combination and writes one row for each run. Started again after '
+        'an interruption, or with more values, it runs only what the file lacks.',
+    )
+    parser.add_argument(
+        'controllers',
+        nargs='*',
+        default=[FULL],
+        metavar='CONTROLLER',
+        help='name of a method, or FILE.py:NAME (default full)',
+    )
+    parser.add_argument(
+        '--set',
+        nargs='+',
+        action='extend',
+        default=[],
+        type=_values,
+        metavar='NAME=V,V,…',
+        help='values of a parameter of the controller, of noise or duration, or of robot.NAME',
+    )
+    add_setting(parser)
+    add_seeds(parser, '1-5', 'reference and robot')
+    parser.add_argument(
+        '--cases', nargs='+', default=(NOMINAL,), metavar='CASE', help='by name (default nominal)'
+    )
+    parser.add_argument(
+        '--output', type=Path, default=OUTPUT, help=f'Parquet file (default {OUTPUT})'
+    )
+    add_workers(parser)
+    parser.set_defaults(run=run)
+    return parser
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the sweep, print its table and return 0.
+
+    Raises
+    ------
+    ScriptError
+        Wrong use, or every run failed.
+    """
+    from t3mpc_ros.scripting.controllers import loaded
+    from t3mpc_ros.scripting.parameter_sweep import sweep
+
+    with executor_of(options) as executor:
+        found = sweep(
+            options.controllers,
+            dict(options.set),
+            seeds=options.seeds,
+            cases=options.cases,
+            reference=options.reference,
+            plant=options.robot if options.robot in ROBOTS else loaded(options.robot),
+            noise=options.noise,
+            duration=options.duration,
+            output=options.output,
+            executor=executor,
+            progress=True,
+        )
+    print(found.table())
+    print(f'{len(found.rows)} runs: {options.output}')
+    return 0
+
+
+def _values(text: str) -> tuple[str, list[object]]:
+    """Return name and values of ``NAME=V,V``; an argparse type."""
+    name, sign, values = text.partition('=')
+    if not (name and sign and values):
+        raise argparse.ArgumentTypeError(f'must be NAME=V,V,…: got {text}')
+    return name, [parsed_value(value) for value in values.split(',')]
