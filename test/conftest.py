@@ -8,6 +8,7 @@ import itertools
 import os
 from pathlib import Path
 import re
+import signal
 
 import pytest
 from support.processor_wait import ProcessorWait
@@ -30,6 +31,12 @@ def pytest_addoption(parser):
     parser.addoption(
         '--part', type=_part, metavar='K/N', help='run part K of N of the selected tests'
     )
+
+
+def pytest_configure(config):
+    """End as with Ctrl-C at SIGTERM: fixtures then end the nodes that they have started."""
+    # A run that a time limit had ended left graphs of nodes behind, which ran for ever.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 def _part(text):
@@ -103,8 +110,25 @@ def _keep(config, items, kept):
     items[:] = kept
 
 
+@pytest.hookimpl(wrapper=True)
 def pytest_runtest_setup(item):
     item.stash[WAIT] = ProcessorWait()
+    return (yield from _skip_without_compiler())
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call():
+    return (yield from _skip_without_compiler())
+
+
+def _skip_without_compiler():
+    """Skip what needs emulated boards, whose rules are in C; scripted ones need no compiler."""
+    try:
+        return (yield)
+    except Exception as error:
+        if type(error).__name__ == 'CompilerMissingError':
+            pytest.skip(str(error))
+        raise
 
 
 @pytest.hookimpl(wrapper=True)

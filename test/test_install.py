@@ -157,6 +157,21 @@ def test_a_workspace_contains_all_files_that_ros_needs(tree):
         assert path.resolve().is_relative_to(tree.source.resolve()) == tree.symlinked
 
 
+def code_below(package):
+    """Return the modules of a package, and the C files its emulator compiles, as relative paths.
+
+    Flashing and the drivers of the boards belong to a checkout, not to an installation.
+    """
+    files = {
+        path.relative_to(package)
+        for path in package.rglob('*')
+        if path.suffix in ('.py', '.c', '.h')
+    }
+    board = Path('emulator/firmware')
+    compiled = (board / 'core', board / 'host')
+    return {path for path in files if board not in path.parents or path.parent in compiled}
+
+
 def test_a_sourced_workspace_runs_its_own_complete_code(tree):
     """``packages=[name]`` in setup.py would omit the sub-packages, which .venv would hide."""
     code = 'import t3mpc_ros; print(t3mpc_ros.__path__[0])'
@@ -166,9 +181,9 @@ def test_a_sourced_workspace_runs_its_own_complete_code(tree):
     installed = Path(output.strip())
     assert installed.is_relative_to(tree.prefix.parent.parent)
     source = tree.source / 't3mpc_ros'
-    assert {path.relative_to(installed) for path in installed.rglob('*.py')} == {
-        path.relative_to(source) for path in source.rglob('*.py')
-    }
+    assert code_below(installed) == code_below(source)
+    core = Path('emulator/firmware/core')
+    assert core / 't3_robot.c' in code_below(installed)
     prefixes = tree.environment['AMENT_PREFIX_PATH'].split(os.pathsep)
     assert prefixes == [str(tree.prefix), sys.prefix]
 

@@ -35,11 +35,16 @@ BOARDS = 'scripts/run t3mpc emulator --link dongle --robot-link robot_usb --eras
 
 # For each command: the additional arguments, and whether it runs until it is stopped.
 PARAMETERS, KEY_FILE = '--params-file robot.yaml', '-p key_file:=robot.key'
-SET = 'scripts/run t3mpc robot set --port robot_usb --save robot.yaml'
+SET = 'scripts/run t3mpc robot setup --port robot_usb --microsteps 16 --save robot.yaml --yes'
 EMULATOR = 'scripts/run t3mpc emulator --link dongle'
 BRIDGE = 'scripts/run radio_bridge --ros-args -p port:=dongle'
 CHANGES = '--set twin.faults.load_change=1.5 --set robot_clock_error=0.005'
 FAULTS = '--fault jam:10:1 --fault robot_reset:20 --fault loss:30:10:0.3'
+OWN = 'scripts/run t3mpc compare my_controller.py:Pi --robot twin --seeds 1-5 --html pi.html'
+SWEEP = (
+    'scripts/run t3mpc sweep my_controller.py:Pi --set gain=10,20,40 --robot servo --seeds 1-5 '
+    '--output gains.parquet'
+)
 SHORTENED = {
     DEMO: (['--duration', '8', '--headless', '--output', 'OUTPUT/run'], False),
     'scripts/check': ([], False),
@@ -48,6 +53,10 @@ SHORTENED = {
     'scripts/run t3mpc --help': ([], False),
     'scripts/run t3mpc twin --quick': (['--output', 'OUTPUT/twin'], False),
     'scripts/run t3mpc faults': (['brown_out', 'collision'], False),
+    'scripts/demo --patrol': (
+        ['--duration', '5', '--headless', '--output', 'OUTPUT/patrol'],
+        False,
+    ),
     'scripts/demo --robot servo': (
         ['--duration', '5', '--headless', '--output', 'OUTPUT/servo'],
         False,
@@ -62,11 +71,21 @@ SHORTENED = {
     'scripts/demo --view': (['--duration', '2', '--headless', '--output', 'OUTPUT/view'], False),
     'scripts/run t3mpc view': (['--headless', '--port', '0'], True),
     'scripts/run t3mpc view --bag runs/latest/bag': (['--headless', '--port', '0'], True),
+    'scripts/run t3mpc patrol': (
+        ['--seeds', '101', '--minutes', '2.2', '--paths', 'Chen', '--output', 'OUTPUT/patrol'],
+        False,
+    ),
+    'scripts/run t3mpc patrol --tracking': (
+        ['--seeds', '101', '--paths', 'recorded-path', '--output', 'OUTPUT/tracking'],
+        False,
+    ),
     'scripts/run t3mpc paper --quick': (['--seeds', '1', '--output', 'OUTPUT/paper'], False),
     'scripts/run t3mpc compare': (
         ['--seeds', '201', '--duration', '3', '--methods', 'full', '--cases', 'nominal'],
         False,
     ),
+    OWN: (['--seeds', '1', '--duration', '3'], False),
+    SWEEP: (['--seeds', '1', '--duration', '3'], False),
     'scripts/run t3mpc tune': (
         ['PI + feed-forward', '--evaluations', '2', '--output', 'OUTPUT/tuned.json'],
         False,
@@ -76,6 +95,9 @@ SHORTENED = {
     'scripts/run t3mpc estimation': (['--seeds', '2'], False),
     BOARDS: ([], True),
     SET: ([], False),
+    'scripts/run t3mpc robot setup --port robot_usb --diff robot.yaml': ([], False),
+    f'scripts/run t3mpc robot doctor --port dongle --robot-port robot_usb {PARAMETERS} '
+    '--no-questions': (['--count', '20', '--report', 'OUTPUT/doctor.html'], False),
     'scripts/run t3mpc robot key create robot.key': ([], False),
     'scripts/run t3mpc robot key write robot.key --port robot_usb': ([], False),
     'scripts/run t3mpc robot ping --port dongle --params-file robot.yaml': ([], False),
@@ -86,6 +108,7 @@ SHORTENED = {
     f'scripts/run radio_bridge --ros-args {PARAMETERS} -p port:=dongle {KEY_FILE}': ([], True),
     'scripts/run t3mpc bag info runs/latest/bag': ([], False),
     'scripts/run t3mpc bag report runs/latest/bag': (['--output', 'OUTPUT/report'], False),
+    'scripts/run t3mpc bag animate runs/latest/bag --output run.gif': (['--duration', '2'], False),
     'scripts/run t3mpc bag replay runs/latest/bag': ([], False),
     'scripts/run t3mpc bag replay runs/latest/bag --set law.gain=20.0': ([], False),
     'scripts/run t3mpc bag compare runs/latest/bag --picture divergence.png': ([], False),
@@ -152,6 +175,12 @@ PLACEHOLDERS = {
     'REVOLUTIONS': '1',
     'RAD/S': '1',
     'HEX': '0102030405',
+    'R': '1M',
+    'DBM': '0',
+    'WHEELS': 'left',
+    'X': '4',
+    'TYPES': 'GP2Y0A21',
+    'STEPS': '200',
     '…': 'X',
     '...': 'X',
 }
@@ -278,18 +307,22 @@ def test_the_readme_is_short():
     assert len((ROOT / 'README.md').read_bytes()) <= 6000
 
 
-def test_the_controller_of_the_tutorial_runs(tmp_path):
-    """The Python block of the tutorial runs in the local environment."""
+def _own_controller():
+    """Return the Python block of the tutorial."""
     [code] = re.findall(r'```python\n(.*?)```', (ROOT / 'docs/tutorial.md').read_text(), re.DOTALL)
-    script = tmp_path / 'mine.py'
-    script.write_text(code)
+    return code
+
+
+def test_the_controller_of_the_tutorial_runs(tmp_path):
+    """Its table comes from the command of the tutorial, which another test runs."""
+    script = tmp_path / 'my_controller.py'
+    script.write_text(_own_controller())
     done = subprocess.run(
         [sys.executable, script], capture_output=True, text=True, timeout=240, check=False
     )
     assert done.returncode == 0, done.stderr
-    found = dict(re.findall(r'^(.+): RMSE ([0-9.]+) rad/s$', done.stdout, re.MULTILINE))
-    assert set(found) == {'mine', 'PI + feed-forward'}
-    assert float(found['mine']) < 0.5
+    (error,) = re.findall(r'^\| with switches \| ([0-9.]+) \| rad/s \|$', done.stdout, re.M)
+    assert float(error) < 0.5
 
 
 @pytest.fixture(scope='module')
@@ -378,6 +411,8 @@ def _prepare_bags(command, output):
     for name in ('run1', 'run2', 'turtlebot_bag'):
         if name in command and not (output / name).exists():
             (output / name).symlink_to(output / 'run' / 'bag')
+    if command in (OWN, SWEEP):
+        (output / 'my_controller.py').write_text(_own_controller())
     if 'broken.mcap' in command:
         [whole] = (output / 'run' / 'bag').glob('*.mcap')
         (output / 'broken.mcap').write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])

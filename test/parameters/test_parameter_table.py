@@ -15,7 +15,7 @@ from t3mpc_ros.radio.link.link_parameters import LinkParameters
 
 @dataclass(frozen=True)
 class Inner(Parameters):
-    gain: float = parameter(8.0, 'gain', unit='1/s', low=0.1, high=100.0, dynamic=True)
+    gain: float = parameter(8.0, 'gain', '1/s', (0.1, 100.0), dynamic=True)
     kind: str = parameter('a', 'kind', choices=('a', 'b'))
 
 
@@ -23,8 +23,8 @@ class Inner(Parameters):
 class Outer(Parameters):
     low: float = parameter(1.0, 'lower end')
     high: float = parameter(2.0, 'upper end')
-    count: int = parameter(3, 'how many', low=1)
-    levels: tuple[float, ...] = parameter((0.1, 0.2), 'levels', low=0.0)
+    count: int = parameter(3, 'how many', bounds=(1, None))
+    levels: tuple[float, ...] = parameter((0.1, 0.2), 'levels', bounds=(0.0, None))
     on: bool = parameter(True, 'switch')
     inner: Inner = group(Inner)
 
@@ -40,9 +40,9 @@ def test_specs_contain_type_default_unit_and_range():
     assert (gain.kind, gain.many, gain.default, gain.unit, gain.dynamic) == (
         float, False, 8.0, '1/s', True,
     )  # fmt: skip
-    assert gain.bounds() == 'from 0.1 to 100 1/s'
-    assert specs['inner.kind'].bounds() == 'one of a, b'
-    assert specs['count'].bounds() == 'at least 1'
+    assert gain.bounds_text() == 'from 0.1 to 100 1/s'
+    assert specs['inner.kind'].bounds_text() == 'one of a, b'
+    assert specs['count'].bounds_text() == 'at least 1'
 
 
 def test_to_dict_and_from_dict_are_inverse():
@@ -77,13 +77,13 @@ def test_invalid_values_are_rejected_with_name_bound_and_value(values, words):
 
 @dataclass(frozen=True)
 class Limits(Parameters):
-    speed: float = parameter(1.0, 'speed', name='linear.x.max_velocity', low=0.0)
-    rate: float = parameter(2.0, 'rate', low=0.0)
+    speed: float = parameter(1.0, 'speed', name='linear.x.max_velocity', bounds=(0.0, None))
+    rate: float = parameter(2.0, 'rate', bounds=(0.0, None))
 
 
 @dataclass(frozen=True)
 class Robot(Parameters):
-    size: float = parameter(0.5, 'size', low=0.0)
+    size: float = parameter(0.5, 'size', bounds=(0.0, None))
     limits: Limits = group(Limits, inline=True, rate=3.0)
     spare: Limits = group(Limits)
 

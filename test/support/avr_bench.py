@@ -17,17 +17,17 @@ import numpy as np
 
 from support.avr_boards import DONGLE, FIRMWARE, ROBOT, booted
 from support.emulator_bench import Bench
-from t3mpc_ros.emulator.board.hardware import Registers
 from t3mpc_ros.emulator.emulator import EmulatorParameters
 from t3mpc_ros.emulator.event_queue import EventQueue
 from t3mpc_ros.emulator.fault_injection import Fault, FaultInjection
 from t3mpc_ros.emulator.link.serial_line import SerialLine
-from t3mpc_ros.emulator.plant import Plant
+from t3mpc_ros.emulator.plant import Plant, Registers
 from t3mpc_ros.radio.protocol.codec import decode_downlink
 from t3mpc_ros.radio.protocol.frames import Command
 from t3mpc_ros.radio.protocol.framing import crc16
+from t3mpc_ros.robot.description import sensor_mounts
 from t3mpc_ros.robot.interface import RANGE_SENSORS
-from t3mpc_ros.simulation.sensors.range_sensor import output_voltage, sensor_mounts
+from t3mpc_ros.simulation.sensors.range_sensor import output_voltage
 from t3mpc_ros.simulation.world import cast_rays, load_world
 
 START_NS = 5_000_000_000
@@ -37,8 +37,6 @@ SLICE_US = 200.0
 """Period at which the boards are polled."""
 PLANT_US = 5000.0
 """Period of the plant and of its sensors."""
-DIVIDER = 4
-"""Voltage divider of the battery measurement."""
 FIELDS = (
     'seq',
     'ttl_from_us',
@@ -48,7 +46,6 @@ FIELDS = (
     'ramp.target',
     'loaded_us',
 )
-STEP = math.tau / 3200
 
 
 @cache
@@ -108,7 +105,7 @@ class Ram:
 
 
 class AvrBoard:
-    """The robot firmware, with the interface of the emulated ``RobotBoard``."""
+    """The robot firmware, with the interface of ``RobotBoard``."""
 
     def __init__(self, boards):
         self._boards = boards
@@ -262,16 +259,15 @@ class AvrEmulator:
         pulses = boards.pulses()
         if elapsed_us:
             left, right = (
-                round((after - before) * STEP * 1e12 / elapsed_us)
-                for before, after in zip(self._pulses, pulses, strict=True)
+                float(after - before) for before, after in zip(self._pulses, pulses, strict=True)
             )
-            plant.set_power(self.powered)
-            plant.set_speeds(left, right)
-            plant.run(round(elapsed_us))
+            plant.set_motors(self.powered, left != 0.0 or right != 0.0)
+            plant.run(round(elapsed_us), left, right)
         self._pulses = pulses
         registers = plant.registers
         boards.imu(registers is not None, registers or Registers())
-        boards.call('millivolts', len(RANGE_SENSORS), plant.battery // DIVIDER)
+        battery = plant.adc_counts[-1] * 5000 // 1024
+        boards.call('millivolts', len(RANGE_SENSORS), battery)
         if self._world.segments.size or self._world.circles.size:
             sensors = np.arange(len(RANGE_SENSORS))
             walls = self._world.segments, self._world.circles

@@ -18,6 +18,7 @@ from ctypes import (
     c_uint64,
     c_void_p,
 )
+import fcntl
 from functools import cache
 from pathlib import Path
 import shutil
@@ -25,8 +26,9 @@ import subprocess
 from typing import Any, NamedTuple
 
 from t3mpc_ros.radio.protocol import codec
-from t3mpc_ros.radio.protocol.frames import Command, Hello, Poll, Result, Transmit
+from t3mpc_ros.radio.protocol.frames import Command, Hello, Poll, Result, State, Transmit
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, crc16, encode_frame
+from t3mpc_ros.radio.tool.robot_records import RobotSettings, encode_settings
 
 FIRMWARE = Path(__file__).parents[2] / 'firmware'
 BUILD = FIRMWARE / 'build'
@@ -36,7 +38,7 @@ GAP = 6
 """Gap between the exchanges of a transaction, in 250 us."""
 BATTERY, DIVIDER = 12_000, 4
 """Supply, mV, and the divider before the converter."""
-SETTINGS_ADDRESSES = (40, 56)
+SETTINGS_ADDRESSES = (40, 72)
 """Cells of both copies."""
 IMU = (100, 200, 16384, 3000, 10, 20, -131)
 """accel x, y, z, temperature, gyro x, y, z"""
@@ -91,10 +93,17 @@ def missing_tools() -> str:
 
 @cache
 def build() -> str:
-    """Build both programs and the simulator; return the table of their sizes."""
-    done = subprocess.run(
-        ['make', '-C', str(FIRMWARE), 'avr', 'simavr'], capture_output=True, text=True
-    )
+    """Build both programs and the simulator; return the table of their sizes.
+
+    Of several processes that start together one builds and the others wait: one of them once
+    loaded a library of which another had written the first half.
+    """
+    BUILD.mkdir(exist_ok=True)
+    with (BUILD / 'lock').open('w') as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        done = subprocess.run(
+            ['make', '-C', str(FIRMWARE), 'avr', 'simavr'], capture_output=True, text=True
+        )
     if done.returncode:
         raise RuntimeError(f'make avr simavr must succeed: got\n{done.stdout}{done.stderr}')
     sizes = subprocess.run(
@@ -107,9 +116,12 @@ def build() -> str:
     return sizes.stdout
 
 
-def settings_record(channel: int = 82, microsteps: int = 16, address: bytes = b'T3MPC') -> bytes:
+def settings_record(
+    channel: int = 82, microsteps: int = 16, address: bytes = b'T3MPC', rate: str = '1M'
+) -> bytes:
     """Return a copy of the settings as it stands in EEPROM."""
-    body = bytes([1, channel, *microsteps.to_bytes(2, 'little'), *address])
+    settings = RobotSettings(address, channel, rate, microsteps=microsteps)
+    body = encode_settings(settings)
     return body + crc16(body).to_bytes(2, 'little')
 
 
@@ -155,6 +167,7 @@ class Boards:
             raise RuntimeError('simavr must know both chips and read both programs')
         self.splitter = FrameDecoder()
         self.session = 0x5A
+        self.echo_us = 0
         self.seq = 0
         self.id = 0
         self.rules_broken = False  # the test itself violated the data sheet of the radio
@@ -231,6 +244,9 @@ class Boards:
         result = self.ask(frame, 60000.0)
         assert isinstance(result, Result), result
         assert result.id == self.id
+        uplink = codec.decode_uplink(result.payload) if result.payload else None
+        if isinstance(uplink, State):
+            self.echo_us = uplink.time_us
         return result
 
     def request(self, first: Any, second: Any = None, gap: int = GAP) -> Any:
@@ -244,8 +260,7 @@ class Boards:
         """Return the next CMD."""
         self.seq = (self.seq + 1) % 256
         session = self.session if session < 0 else session
-        host_us = round(self.now_us) % 2**32
-        return Command(session, self.seq, flags, ttl, left, right, host_us)
+        return Command(session, self.seq, flags, ttl, left, right, self.echo_us)
 
     def drive(self, left: int = 0, right: int = 0, flags: int = 1, ttl: int = 20) -> Any:
         """Return the state after one command, None if it was lost."""
@@ -254,9 +269,9 @@ class Boards:
     def hello(self) -> Any:
         """Start a session; return the INFO."""
         self.seq = 0
-        return self.request(
-            Hello(self.session, 0, round(self.now_us) % 2**32), Poll(self.session, 1, 2)
-        )
+        info = self.request(Hello(self.session, 0), Poll(self.session, 1, 2))
+        self.request(Poll(self.session, 0, 0))  # for its time: the first echo
+        return info
 
     def start(self) -> Any:
         """Boot both boards and start a session; return the INFO."""

@@ -12,8 +12,12 @@ from pathlib import Path
 import struct
 import subprocess
 
+from t3mpc_ros.emulator.firmware_library import compile_library
 from t3mpc_ros.radio.protocol.authentication import siphash
-from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
+from t3mpc_ros.radio.protocol.codec import encode
+from t3mpc_ros.radio.protocol.frames import SETTINGS_RECORD, Command, RefusalReason
+from t3mpc_ros.radio.protocol.framing import FrameDecoder, crc16, encode_frame
+from t3mpc_ros.radio.tool.robot_records import RobotSettings, encode_settings
 
 FIRMWARE = Path(__file__).resolve().parents[2] / 'firmware'
 KEY = bytes(range(0x80, 0x90))
@@ -24,8 +28,17 @@ ENABLED, MOVING, LATCHED, EXPIRED, IMU_FAULT, LOW_BATTERY, NO_SESSION, LIMITED =
 OK, UNKNOWN, RANGE, READ_ONLY, BUSY, FAILED = range(6)
 MAX_SPEED, ACCELERATION, DECELERATION, TTL_MAX, MICROSTEPS = range(5)
 STEPS_PER_REV, GYRO_RANGE, BATTERY_LOW, IDLE_OFF, INVERT, CUTOFF = range(5, 11)
-COUNTERS = ('received', 'duplicates', 'bad_session', 'stale', 'expired', 'bad_version', 'short')
-PACKET = ('kind', 'session', 'seq', 'what', 'ttl', 'left', 'right', 'value', 'host_us')
+COUNTERS = (
+    'received',
+    'duplicates',
+    'bad_session',
+    'stale',
+    'expired',
+    'bad_version',
+    'malformed',
+)
+PACKET = ('kind', 'session', 'seq', 'what', 'ttl', 'left', 'right', 'value')
+PACKET += ('echo_us', 'host_us')
 STEP = math.tau / 3200
 SESSION = 0x5A
 INFO_SIZE = 24
@@ -34,13 +47,15 @@ USE_HELLO, USE_SESSION_KEY = b'\1', b'\2'
 ADDRESS = b'T3MPC'
 
 
-def compile_core(target):
-    """Compile the core like ``make host``, but to ``target``; return the library."""
-    flags = ['-std=c99', '-pedantic', '-Wall', '-Wextra', '-Werror', '-O2', '-fPIC', '-shared']
-    sources = sorted(map(str, [*FIRMWARE.glob('core/*.c'), *FIRMWARE.glob('host/*.c')]))
-    folders = [f'-I{FIRMWARE / "core"}', f'-I{FIRMWARE / "host"}']
-    subprocess.run(['gcc', *flags, *folders, '-o', target, *sources], check=True)
-    core = ctypes.CDLL(str(target))
+def run_make(folder, *words):
+    """Run make for the firmware, with a build folder; return the process."""
+    command = ['make', '-s', '-C', FIRMWARE, f'BUILD={folder}', *words]
+    return subprocess.run(command, capture_output=True, text=True)
+
+
+def load_core():
+    """Return the library of the emulator, with the functions that only tests use."""
+    core = ctypes.CDLL(str(compile_library()))
     for name in ('robot_new', 'dongle_new', 'splitter_new'):
         getattr(core, f't3_host_{name}').restype = ctypes.c_void_p
     for name in ('robot_pulses', 'robot_steps', 'robot_speed'):
@@ -60,7 +75,16 @@ def compile_core(target):
         'time_us',
     ):
         getattr(core, f't3_host_{name}').restype = ctypes.c_uint32
-    for name in ('robot_ack', 'robot_status', 'dongle_sent', 'to_wire', 'range_code', 'decode'):
+    for name in (
+        'robot_ack',
+        'robot_status',
+        'robot_levels',
+        'robot_session',
+        'dongle_sent',
+        'to_wire',
+        'range_code',
+        'decode',
+    ):
         getattr(core, f't3_host_{name}').restype = ctypes.c_uint8
     core.t3_host_encode.restype = ctypes.c_uint8
     core.t3_host_crc16.restype = ctypes.c_uint16
@@ -106,6 +130,7 @@ class Robot(Part):
         self.session_key = b''
         self.seq = 0
         self.delay = 1000  # us from the stamp of the host to reception
+        self.echo_age = 1000  # us from the newest STATE of the host to reception
         if key:
             self.call('store_key', key)
         self.call('boot', 4, ctypes.c_uint32(time))
@@ -138,6 +163,16 @@ class Robot(Part):
     def run(self, us):
         self.call('run', ctypes.c_uint32(us))
 
+    def reset(self, cell_us=0):
+        """Reset the board; then its EEPROM takes a time for a cell."""
+        self.call('set_cell_us', ctypes.c_uint32(cell_us))
+        self.call('boot', 4, ctypes.c_uint32(0))
+        self.run(1000)
+
+    def poke_eeprom(self, address, data):
+        for at, value in enumerate(data, address):
+            self.call('poke_eeprom', ctypes.c_uint16(at), ctypes.c_uint8(value))
+
     def poke(self, time):
         """Shift the clock of the robot and all its time stamps, not the clock of the host."""
         self.delay += time - self.now
@@ -160,19 +195,25 @@ class Robot(Part):
 
     def counters(self):
         """Return the seven counters of AUX."""
-        aux = self.request(bytes([0x15, 0, 0, 1]))
-        counts = struct.unpack_from('<5H', aux, 14) + struct.unpack_from('<2H', aux, 28)
+        aux = self.request(bytes([0x25, 0, 0, 1]))
+        counts = struct.unpack_from('<7H', aux, 14)
         return dict(zip(COUNTERS, counts, strict=True))
 
-    def sign(self, body, epoch=0):
+    def refusal(self):
+        """Return why the newest refused payload was refused, and its first bytes."""
+        aux = self.request(bytes([0x25, 0, 0, 1]))
+        return RefusalReason(aux[28]), aux[29:]
+
+    def sign(self, body, epoch=0, host_us=None):
         if not self.session_key:
             return body
+        body += struct.pack('<I', self.host_us if host_us is None else host_us)
         return body + siphash(self.session_key, body + epoch.to_bytes(4, 'little'))
 
     def hello(self, session=SESSION, nonce=b'\1\2\3\4\5\6\7\x08'):
-        head = struct.pack('<BBBBI', 0x14, session, 0, bool(self.key), self.host_us)
+        head = struct.pack('<BBBB', 0x24, session, 0, bool(self.key))
         if self.key:
-            head += nonce
+            head += struct.pack('<I', self.host_us) + nonce
             head += siphash(self.key, USE_HELLO + head)
         info = self.request(head)
         if self.key:
@@ -183,11 +224,11 @@ class Robot(Part):
     def command(self, left=0, right=0, flags=ENABLE, ttl=20, seq=None, session=SESSION, **other):
         if seq is None:
             self.seq = seq = (self.seq + 1) % 256
-        host_us = other.get('host_us', self.host_us)
+        echo_us = other.get('echo_us', (self.now - self.echo_age) % (1 << 32))
         body = struct.pack(
-            '<BBBBBBhhI', 0x11, session, seq, flags, ttl, 0, round(left), round(right), host_us
+            '<BBBBBBhhI', 0x21, session, seq, flags, ttl, 0, round(left), round(right), echo_us
         )
-        return self.sign(body, other.get('epoch', 0))
+        return self.sign(body, other.get('epoch', 0), other.get('host_us'))
 
     def drive(self, left, right, us, period=20_000, **other):
         """Send a command each ``period`` for a time."""
@@ -195,18 +236,32 @@ class Robot(Part):
             self.send(self.command(left, right, **other))
             self.run(min(period, us - begun))
 
+    def moves(self):
+        """Return whether the robot accepts a session and follows a command."""
+        self.hello()
+        self.drive(3000, 3000, 100_000)
+        moving = self.status & MOVING
+        self.drive(0, 0, 300_000)
+        self.send(self.command(flags=0))
+        self.run(2000)
+        return bool(moving)
+
+    def identity(self):
+        """Return state of the records, channel, microsteps and address in INFO."""
+        info = self.request(b'\x25\0\0\2')
+        microsteps, state, channel, address = struct.unpack_from('<HxBB5s', info, 10)
+        return state, channel, microsteps, address
+
     def set(self, number, value, session=SESSION):
         """Write a parameter; return (rc, value)."""
-        body = struct.pack('<BBBBi', 0x13, session, 9, number, value)
-        if self.session_key:
-            body = self.sign(body + struct.pack('<I', self.host_us))
-        return self.parameter(self.request(body))
+        body = struct.pack('<BBBBi', 0x23, session, 9, number, value)
+        return self.parameter(self.request(self.sign(body)))
 
     def get(self, number):
-        return self.parameter(self.request(bytes([0x12, SESSION, 9, number])))
+        return self.parameter(self.request(bytes([0x22, SESSION, 9, number])))
 
     def parameter(self, reply):
-        assert reply[0] == 0x12
+        assert reply[0] == 0x22
         assert len(reply) == 17
         return reply[4], struct.unpack_from('<i', reply, 5)[0]
 
@@ -219,26 +274,89 @@ class Robot(Part):
         size = self.call('usb_take', room, ctypes.c_uint32(4096))
         return FrameDecoder().feed(room.raw[:size])
 
-    def settings(self, channel=None, microsteps=16, address=ADDRESS, us=200_000):
-        """Store settings over USB, or read them.
+    def settings(self, channel=None, microsteps=16, address=ADDRESS, us=700_000):
+        """Store settings over USB, other values the defaults, or read them.
 
         Return result, state, channel, microsteps and address.
         """
-        frame = b'\x05\x09'
+        rc = OK
         if channel is not None:
-            frame += struct.pack('<BH', channel, microsteps) + address
-        replies = self.console(frame, us)
-        if not replies:
-            return None
-        kind, number, *values = struct.unpack('<BBBBBH5s', replies[0])
-        assert (kind, number) == (0x85, 9)
-        return tuple(values)
+            body = bytearray(encode_settings(RobotSettings()))
+            struct.pack_into('<BH5s', body, 1, channel, microsteps, address)
+            rc = self.store(SETTINGS_RECORD, bytes(body), us)
+        state, body = self.record(SETTINGS_RECORD)
+        return rc, state, *struct.unpack_from('<BH5s', body, 1)
+
+    def record(self, record):
+        """Return state and content of a record."""
+        state, size, body, parts = 0, 1, b'', 0
+        while len(body) < size:
+            (frame,) = self.console(bytes([6, 9, record, parts]))
+            kind, number, rc, which, state, size, part = frame[:7]
+            assert (kind, number, rc, which, part) == (0x86, 9, OK, record, parts)
+            body, parts = body + frame[7:], parts + 1
+        return state, body[:size]
+
+    def stage(self, record, body):
+        """Send the parts of a record."""
+        for part in range(-(-len(body) // 16)):
+            data = body[16 * part :][:16].ljust(16, b'\0')
+            (frame,) = self.console(bytes([6, 9, record, part]) + data)
+            assert frame[2] == OK
+
+    def store(self, record, body, us=700_000):
+        """Stage and store a record; return the result, None within less time than it takes."""
+        self.stage(record, body)
+        replies = self.console(struct.pack('<BBBH', 7, 9, record, crc16(body)), us)
+        return replies[0][2] if replies else None
 
     def act(self, verb, seq, session=SESSION):
-        body = struct.pack('<BBBBH', 0x16, session, seq, verb, 0)
-        if self.session_key:
-            body = self.sign(body + struct.pack('<I', self.host_us))
-        return self.request(body)
+        return self.request(self.sign(struct.pack('<BBBBH', 0x26, session, seq, verb, 0)))
+
+
+class CoreVerifier:
+    """The rules of a session in the core, with the interface of ``CommandVerifier``."""
+
+    def __init__(self, key=b'', locked=False):
+        self._robot = Robot(load_core(), key or (KEY if locked else b''))
+        if locked:
+            self._robot.call('poke_eeprom', ctypes.c_uint8(8), ctypes.c_uint8(0x55))
+            self._robot.call('boot', 1, 0)
+        self._robot.run(1000)
+
+    @property
+    def session(self):
+        return self._robot.call('session')
+
+    @property
+    def nonce(self):
+        return self._robot.request(b'\x25\0\0\2')[INFO_SIZE:]
+
+    def receive(self, data):
+        """Return why the robot refuses a payload, NONE if it does not."""
+        before = self._refusals()
+        self._robot.send(data)
+        refused = self._refusals() != before
+        return self._robot.refusal()[0] if refused else RefusalReason.NONE
+
+    def begin_session(self, hello, fresh_nonce):
+        self._robot.call('force_nonce', fresh_nonce)
+        return self.receive(encode(hello))
+
+    def accept(self, frame):
+        why = self.receive(encode(frame))
+        # The session is checked first.
+        late = (RefusalReason.SEQUENCE, RefusalReason.STALE)
+        return RefusalReason.NONE if why in late else why
+
+    def verify(self, frame):
+        why = self.accept(frame)
+        estop = isinstance(frame, Command) and frame.flags & ESTOP
+        return RefusalReason.NONE if estop else why
+
+    def _refusals(self):
+        counts = self._robot.counters()
+        return [counts[name] for name in COUNTERS if name not in ('received', 'expired')]
 
 
 class Dongle(Part):
@@ -301,7 +419,7 @@ def c_encode_frame(library, frame):
 
 
 def c_decode(library, data):
-    numbers = (ctypes.c_int64 * 11)()
+    numbers = (ctypes.c_int64 * 12)()
     fault = library.t3_host_decode(data, ctypes.c_uint8(len(data)), numbers)
     return fault, dict(zip((*PACKET, 'nonce', 'tag'), numbers, strict=True))
 

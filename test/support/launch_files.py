@@ -166,7 +166,8 @@ def nodes_of(file, given=None, share=None):
             for node in item.named['function'](context)
         ]
     for node in made:
-        assert node.named['package'] == 't3mpc_ros'
+        own = 'robot_state_publisher' if 'state' in node.named['executable'] else 't3mpc_ros'
+        assert node.named['package'] == own
     return [
         LaunchedNode(
             node.named['executable'],
@@ -178,7 +179,7 @@ def nodes_of(file, given=None, share=None):
                 else level
                 for level in node.named['parameters']
             ],
-            node.named['remappings'],
+            node.named.get('remappings', []),
             node.named['ros_arguments'],
         )
         for node in made

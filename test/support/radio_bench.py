@@ -5,11 +5,16 @@
 import math
 import random
 
+from support.command_verifier import CommandVerifier
 from support.emulator_bench import MS, START_NS, Bench
 from t3mpc_ros.radio.protocol import frames
-from t3mpc_ros.radio.protocol.authentication import CommandVerifier
 from t3mpc_ros.radio.protocol.codec import decode_downlink, decode_to_dongle, encode
-from t3mpc_ros.radio.protocol.frames import BOARD_PARAMETERS, CommandFlag, StatusFlag
+from t3mpc_ros.radio.protocol.frames import (
+    BOARD_PARAMETERS,
+    CommandFlag,
+    RefusalReason,
+    StatusFlag,
+)
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
 
 COMMAND_TIME = 250 * MS
@@ -48,6 +53,7 @@ class FakeRobot:
         self.command_ns, self.until_ns = None, None
         self.reached_ns = now_ns
         self.answer = None
+        self.refusal = RefusalReason.NONE
         self.log = []
 
     def time_us(self, now_ns):
@@ -108,20 +114,28 @@ class FakeRobot:
         self.answer = None
         if isinstance(frame, frames.Hello):
             nonce = self.boots.to_bytes(4, 'little') + self.time_us(now_ns).to_bytes(4, 'little')
-            if not self.verifier.begin_session(frame, nonce):
+            self.refusal = self.verifier.begin_session(frame, nonce)
+            if not self.refusal:
                 self.last_seq, self.seq, self.speeds, self.enabled = None, 0, (0.0, 0.0), False
             self.answer = self.info(frame.seq, now_ns)
         elif isinstance(frame, frames.Poll):
             if frame.what == frames.INFO:
                 self.answer = self.info(frame.seq, now_ns)
             elif frame.what == frames.AUX:
-                counters = (1, 2, 3, 4, 5)
+                counters = (1, 2, 3, 4, 5, 6, 7)
+                readings = (11100, 0, 0, 0, 0)
                 self.answer = frames.Aux(
-                    self.verifier.session, 0, self.status(), 11100, 0, 0, 0, 0, *counters, 0, 6, 7
+                    self.verifier.session,
+                    0,
+                    self.status(),
+                    *readings,
+                    *counters,
+                    self.refusal,
+                    bytes(3),
                 )
         elif isinstance(frame, frames.ParamGet):
             self.answer = self.parameter(frame, frames.OK)
-        elif self.verifier.verify(frame) == '':
+        elif not (refusal := self.verifier.verify(frame)):
             if isinstance(frame, frames.Command):
                 self.follow(frame, now_ns)
             elif isinstance(frame, frames.ParamSet):
@@ -132,19 +146,21 @@ class FakeRobot:
                 if frame.verb == frames.RESET_ODOMETRY and not busy:
                     self.steps = [0.0, 0.0]
                 self.answer = frames.Ack(self.verifier.session, frame.seq, frame.verb, rc)
+        else:
+            self.refusal = refusal
 
     def info(self, seq, now_ns):
         return frames.Info(
             self.verifier.session,
             seq,
-            1,
-            1,
+            frames.VERSION,
+            2,
             0,
             2,
             len(BOARD_PARAMETERS),
             200,
             16,
-            self.status(),
+            self.refusal,
             self.settings,
             82,
             b'T3MPC',
@@ -170,6 +186,11 @@ class FakeRobot:
             self.estop, self.enabled, self.speeds = True, False, (0.0, 0.0)
             return
         if self.rejects_commands:
+            self.refusal = RefusalReason.SEQUENCE
+            return
+        ttl_ms = min(10 * frame.ttl, self.parameters[3])
+        if (self.time_us(now_ns) - frame.echo_us) % WRAP >= 1000 * ttl_ms + 50_000:
+            self.refusal = RefusalReason.STALE
             return
         if self.last_seq is not None and not 0 < (frame.seq - self.last_seq) % 256 < 128:
             return
@@ -179,7 +200,6 @@ class FakeRobot:
             self.estop = False
         self.expired = False
         self.enabled = bool(frame.flags & CommandFlag.ENABLE) and not self.estop
-        ttl_ms = min(10 * frame.ttl, self.parameters[3])
         wanted = (frame.left / 1000.0, frame.right / 1000.0) if self.enabled and ttl_ms else (0, 0)
         self.speeds = (float(wanted[0]), float(wanted[1]))
         self.until_ns = now_ns + ttl_ms * MS
@@ -196,6 +216,7 @@ class FakeDongle:
         self.source = random.Random(seed)
         self.parameters = None
         self.chip_ok = True
+        self.version = frames.VERSION
         self.loss = 0.0
         self.jam_until_ns = 0
         self.drop_replies = 0
@@ -259,7 +280,20 @@ class FakeDongle:
             clock = self.time_us(now_ns)
             counts = self.decoder.counts[1:]
             pong = frames.Pong(
-                frame.id, frame.echo, clock, 1, 1, 0, chip, *counts, 0, 2, 0, 82, b'T3MPC', 0
+                frame.id,
+                frame.echo,
+                clock,
+                self.version,
+                2,
+                0,
+                chip,
+                *counts,
+                0,
+                2,
+                0,
+                82,
+                b'T3MPC',
+                0,
             )
             return now_ns + MS, pong
         if isinstance(frame, frames.Configure):

@@ -194,8 +194,15 @@ def way(samples):
     return math.hypot(samples[-1].x - samples[0].x, samples[-1].y - samples[0].y)
 
 
+def check_speed(samples):
+    """Raise Disturbed if the robot was slowing down before the fault: nothing was published."""
+    if samples[0].speed < 9.9:
+        raise Disturbed(f'the robot was at {samples[0].speed:.1f} rad/s')
+
+
 def first_rest(samples):
     """Return the time to the first rest and the distance until then; None if there is none."""
+    check_speed(samples)
     for count, sample in enumerate(samples):
         if not sample.speed:
             # The rotors settle within a tenth of a second.
@@ -206,6 +213,7 @@ def first_rest(samples):
 
 def last_rest(samples):
     """Return the time to the last motion and the whole distance."""
+    check_speed(samples)
     moving = [sample for sample in samples if sample.speed]
     return (moving[-1].time - samples[0].time if moving else 0.0), way(samples)
 

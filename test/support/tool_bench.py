@@ -7,9 +7,8 @@ import random
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.port_actions import Close, Open, Wait, Write
-from t3mpc_ros.radio.protocol.codec import decode_from_board, decode_from_dongle
 from t3mpc_ros.radio.tool import jog
-from t3mpc_ros.radio.tool.procedure import Procedure, ProcedureError
+from t3mpc_ros.radio.tool.procedure import DONGLE, ROBOT_BOARD, Procedure, ProcedureError
 
 START_NS = 5_000_000_000
 
@@ -70,13 +69,13 @@ class ToolBench:
                 self.is_open = False
         return wake
 
-    def at_dongle(self, script):
-        """Return the result of a script at the port of the dongle."""
-        return self._result(self.run(Procedure(script, decode_from_dongle)))
+    def at_dongle(self, script, board=DONGLE):
+        """Return the result of a script, for this board or another, at the port of the dongle."""
+        return self._result(self.run(Procedure(script, board.decode)))
 
     def at_robot(self, script):
         """Return the result of a script at the USB port of the robot board."""
-        return self._result(self.run(Procedure(script, decode_from_board), robot=True))
+        return self._result(self.run(Procedure(script, ROBOT_BOARD.decode), robot=True))
 
     def _result(self, procedure):
         if procedure.error:

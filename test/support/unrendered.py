@@ -1,13 +1,10 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Reports whose figures are drawn, but not rendered: that takes most of the time of a report."""
+"""Pages whose figures are drawn, but not rendered: that takes most of their time."""
 
 import pytest
 
 from t3mpc_ros.evaluation import plotting
-
-RENDERED = plotting.png_of
-"""What a test restores that is about rendering."""
 
 
 def draw_only(draw, subject):

@@ -1,0 +1,89 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Headless Chromium, driven as a person does."""
+
+import json
+import shutil
+import time
+
+import pytest
+
+WAIT = 60.0
+"""Longest wait for a change of the page on a busy machine, s."""
+SIZES = {360: 800, 768: 1024, 1440: 1000}
+
+# WCAG 2: relative luminance of a colour, contrast ratio of text and background.
+CONTRAST = """
+const weights = [0.2126, 0.7152, 0.0722];
+const linear = (c) => (c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4);
+const light = (text) => text.match(/[\\d.]+/g).slice(0, 3)
+  .reduce((sum, each, i) => sum + weights[i] * linear(each / 255), 0);
+let box = arguments[0];
+const ink = light(getComputedStyle(box).color);
+const paper = () => getComputedStyle(box).backgroundColor;
+while (paper() === 'rgba(0, 0, 0, 0)') box = box.parentElement;
+const [a, b] = [ink, light(paper())].sort((x, y) => y - x);
+return (a + 0.05) / (b + 0.05);
+"""
+
+
+class Browser:
+    """Chromium with a page, and waits for what it shows."""
+
+    def __init__(self):
+        chromedriver, chromium = map(shutil.which, ('chromedriver', 'chromium'))
+        if not chromedriver or not chromium:
+            pytest.skip('chromium and chromedriver are not installed')
+        from selenium import webdriver
+
+        options = webdriver.ChromeOptions()
+        options.binary_location = chromium
+        for word in ('headless=new', 'no-sandbox', 'disable-gpu', 'disable-dev-shm-usage'):
+            options.add_argument(f'--{word}')
+        options.set_capability('goog:loggingPrefs', {'browser': 'ALL', 'performance': 'ALL'})
+        service = webdriver.ChromeService(chromedriver)
+        self.driver = webdriver.Chrome(options=options, service=service)
+
+    def text(self, name):
+        return self.find(name).text
+
+    def find(self, name):
+        return self.driver.find_element('id', name)
+
+    def select(self, selector):
+        return self.driver.find_element('css selector', selector)
+
+    def run(self, script, *values):
+        return self.driver.execute_script(script, *values)
+
+    def wait(self, condition, what):
+        deadline = time.monotonic() + WAIT
+        while not condition():
+            assert time.monotonic() < deadline, what() if callable(what) else what
+            time.sleep(0.1)
+
+    def show_as(self, width, height, scheme='light'):
+        metrics = {'width': width, 'height': height, 'deviceScaleFactor': 1, 'mobile': width < 500}
+        self.driver.execute_cdp_cmd('Emulation.setDeviceMetricsOverride', metrics)
+        feature = {'name': 'prefers-color-scheme', 'value': scheme}
+        self.driver.execute_cdp_cmd('Emulation.setEmulatedMedia', {'features': [feature]})
+
+    def contrast(self, element):
+        """Return the contrast ratio of an element's text."""
+        return self.run(CONTRAST, element)
+
+    def errors(self):
+        """Return the errors of the console so far."""
+        log = self.driver.get_log('browser')
+        return [entry['message'] for entry in log if entry['level'] == 'SEVERE']
+
+    def requests(self):
+        """Return the addresses of all requests so far."""
+        messages = [
+            json.loads(entry['message'])['message'] for entry in self.driver.get_log('performance')
+        ]
+        return [
+            message['params']['request']['url']
+            for message in messages
+            if message['method'] == 'Network.requestWillBeSent'
+        ]
