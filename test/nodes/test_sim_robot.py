@@ -31,6 +31,7 @@ from support.ros_graph import (
 from t3mpc_ros.cli.demo import DemoOptions
 from t3mpc_ros.cli.main import _parser
 from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.nodes.common import conversions
 from t3mpc_ros.nodes.common.base_node import OK, WARN
 from t3mpc_ros.nodes.recorder.node import RecorderNode
 from t3mpc_ros.nodes.registry import parameter_class
@@ -205,9 +206,10 @@ def test_twist_covariance_matches_the_noise(harness):
     assert linear == pytest.approx(covariance[0, 0], rel=0.5)
     assert angular == pytest.approx(covariance[5, 5], rel=0.5)
     assert change(harness, robot, noise__variance=0.0)[0].successful
-    count = len(odom)
-    harness.spin_until(lambda: len(odom) > count + 5)
-    assert odom[-1].twist.covariance[0] < 0.2 * covariance[0, 0]
+    harness.spin_until(
+        lambda: odom[-1].twist.covariance[0] < 0.2 * covariance[0, 0],
+        'the covariance follows the noise',
+    )
 
 
 # -- faults ---------------------------------------------------------------------------------------
@@ -224,10 +226,10 @@ def test_a_dead_gyro_is_a_warning_until_it_recovers(harness):
     )
     assert change(harness, robot, faults__gyro_dead=True)[0].successful
     status = harness.next_status('sim_robot')
-    harness.spin_until(lambda: len(odom) > 0)
-    silent, before = len(imu), len(odom)
-    harness.spin_until(lambda: len(odom) > before + 30)
-    assert len(imu) == silent
+    # By the stamps: on a busy machine, earlier messages still wait in the queue of the probe.
+    silent_ns = robot.now_ns()
+    harness.spin_until(lambda: odom and stamp(odom[-1]) > silent_ns + 300_000_000)
+    assert max(map(stamp, imu)) <= silent_ns
     assert status.level == WARN
     assert 'inertial sensor does not answer' in status.message
     assert 'faults: gyro_dead' in status.message
@@ -235,7 +237,7 @@ def test_a_dead_gyro_is_a_warning_until_it_recovers(harness):
     assert values['faults'] == 'gyro_dead'
     assert values['imu_fault'] == 'True'
     assert change(harness, robot, faults__gyro_dead=False)[0].successful
-    harness.spin_until(lambda: len(imu) > silent + 5)
+    harness.spin_until(lambda: stamp(imu[-1]) > silent_ns)
     harness.spin_until(
         lambda: (diagnostic_level(robot), reason(robot)) == (OK, 'following commands')
     )
@@ -346,9 +348,11 @@ def test_paused_time_advances_by_steps_only(harness):
     assert not response.success
     assert 'real_time_factor must be 0' in response.message
     assert change(harness, robot, real_time_factor=0.0)[0].successful
+    held = conversions.time_from_ns(states[-1].stamp_ns)
+    harness.spin_until(lambda: clock[-1].clock == held, 'the held time is published')
     count = len(clock)
     harness.spin_until(lambda: len(clock) > count + 5)
-    assert clock[-1] == clock[-5]
+    assert all(message.clock == held for message in clock[count:])
     assert all(np.diff([state.stamp_ns for state in states]) == 10_000_000)
 
 
