@@ -121,7 +121,7 @@ static uint8_t record_size(uint8_t record)
 }
 
 static void send_part(struct t3_console *console, uint8_t id, uint8_t record, uint8_t part,
-                        uint8_t rc)
+                      uint8_t rc)
 {
     uint8_t body[T3_PARTS * T3_PART_SIZE] = {0};
     uint8_t frame[RECORD_IS_SIZE];

@@ -81,7 +81,7 @@ struct t3_robot {
     bool seq_known, command_seen;
     uint8_t seq;              // of the last CMD
     uint32_t command_us;      // its reception
-    uint32_t last_frame_us;        // reception of the last frame of the session
+    uint32_t last_frame_us;   // reception of the last frame of the session
 
     bool action_done;
     uint8_t action_seq, action_verb, action_rc;

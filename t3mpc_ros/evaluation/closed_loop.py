@@ -36,8 +36,7 @@ from t3mpc_ros.evaluation.scenario import (
     RATE,
     SampledReference,
     Scenario,
-    complete_rows,
-    settled_rows,
+    counted_rows,
     switch_times,
 )
 from t3mpc_ros.parameters.table import Parameters
@@ -123,9 +122,7 @@ class LoopRecord:
         return total_variation(self.time, self.effort)
 
     def _counted(self, after: float, cut: float) -> NDArray[np.bool_]:
-        margins = 0.4 * cut, 0.6 * cut
-        rows = settled_rows(self.time, self.switches, after, margins)
-        return rows & complete_rows(self.time, self.switches)
+        return counted_rows(self.time, self.switches, after, (0.4 * cut, 0.6 * cut))
 
 
 def total_variation(time: Array, signal: Array) -> float:

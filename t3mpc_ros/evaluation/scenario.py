@@ -322,17 +322,22 @@ def sample_reference(parameters: ReferenceParameters, rows: int) -> SampledRefer
     return run
 
 
-def settled_rows(
-    time: Array, switches: Array, after: float, margins: tuple[float, float]
+def counted_rows(
+    time: Array, switches: Array, after: float, margins: tuple[float, float] = (0.0, 0.0)
 ) -> NDArray[np.bool_]:
-    """Return which rows of a run count: from ``after`` on, without those about a switch.
+    """Return which rows of a run count: from ``after`` on, without ``margins`` about a switch.
 
-    All in s; ``margins`` are left out before each switch, where methods with preview have already
-    left the old reference, and after it.
+    All in s. Margins are before a switch, where methods with preview have already left the old
+    reference, and after it. Rows from a switch on whose crossing the run does not contain whole
+    never count, nor those before it in which preview leaves the old reference: what that costs
+    would count, and not what it gains.
     """
     counted: NDArray[np.bool_] = time >= after
     before, behind = margins
+    leaving, crossed = CROSSING
     for switch in switches.tolist():
+        if time.size and switch + crossed > time[-1]:
+            counted &= time < switch - leaving
         counted &= (time < switch - before) | (time >= switch + behind)
     if not counted.any():
         end = time[-1] if time.size else 0.0
@@ -341,19 +346,6 @@ def settled_rows(
             f'got {after:g} s, {before:g} s and {behind:g} s'
         )
     return counted
-
-
-def complete_rows(time: Array, switches: Array) -> NDArray[np.bool_]:
-    """Return which rows of a run come before a crossing that the run does not contain whole.
-
-    A method with preview leaves the old reference before a switch, to be sooner at the new one
-    after it. Where the run ends at the switch, only what this costs would count, and against the
-    methods without preview that stay where they are.
-    """
-    before, after = CROSSING
-    cut = switches[switches + after > time[-1]]
-    rows: NDArray[np.bool_] = time < (cut.min() - before if cut.size else math.inf)
-    return rows
 
 
 def switch_times(time: Array, modes: NDArray[np.int64]) -> Array:

@@ -27,7 +27,7 @@ from t3mpc_ros.evaluation.method_comparison.compared_runs import (
 )
 from t3mpc_ros.evaluation.method_comparison.twin_scenario import TwinScenario
 from t3mpc_ros.evaluation.reporting import Table
-from t3mpc_ros.evaluation.scenario import Scenario, settled_rows
+from t3mpc_ros.evaluation.scenario import Scenario, counted_rows
 from t3mpc_ros.evaluation.twin_closed_loop import INITIAL_STANDSTILL, TwinRecord
 from t3mpc_ros.scripting.controllers import as_controller
 from t3mpc_ros.scripting.plants import NoiseLaw
@@ -79,7 +79,7 @@ class RunResult:
         """
         begin = after + (INITIAL_STANDSTILL if 'yaw' in self.columns else 0.0)
         none: Array = np.zeros(0)
-        return rms(self.error[settled_rows(self.columns['time'], none, begin, (0.0, 0.0))])
+        return rms(self.error[counted_rows(self.columns['time'], none, begin)])
 
     def table(self) -> str:
         """Return the metrics as a Markdown table."""

@@ -43,7 +43,7 @@ from t3mpc_ros.evaluation.methods import (
 )
 from t3mpc_ros.evaluation.paper.experiment_runs import SETTLING as PAPER_SETTLING
 from t3mpc_ros.evaluation.scenario import CASES as PAPER_CASES
-from t3mpc_ros.evaluation.scenario import RATE, Scenario, complete_rows, settled_rows, switch_times
+from t3mpc_ros.evaluation.scenario import RATE, Scenario, counted_rows, switch_times
 from t3mpc_ros.evaluation.tuning.tuned_parameters import TunedParameters
 from t3mpc_ros.evaluation.twin_closed_loop import (
     INITIAL_STANDSTILL,
@@ -371,9 +371,8 @@ def twin_numbers(scenario: TwinScenario, record: TwinRecord) -> Numbers:
     start = INITIAL_STANDSTILL + min(START, 0.5 * driven)
     # With the switches soon after the end: preview leaves the reference before them.
     switches = switch_times(reference.time, reference.modes)
-    complete = complete_rows(time, switches)
-    counted = complete & (time >= start)
-    settled = complete & settled_rows(time, switches, start, SETTLING)
+    counted = counted_rows(time, switches, start)
+    settled = counted_rows(time, switches, start, SETTLING)
     effort = np.diff(record.requested, axis=0) * RATE
     error = record.rotors - record.reference
     geometry = WheelGeometry()
