@@ -72,8 +72,8 @@ class Plane:
     """What is seen, in words."""
     world: Mapping[str, Any] | None = None
     """Walls, as of :func:`.world_outline`."""
-    marks: Sequence[tuple[float, float, str]] = ()
-    """Points, each with its colour."""
+    marks: Sequence[tuple[float, float, float, str]] = ()
+    """Points, each with its time (s), place and colour."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +122,7 @@ class PageData:
             rows = {'x': self.add('f', curve.x[few]), 'y': self.add('f', curve.y[few])}
             look = {'label': curve.label, 'colour': curve.colour, 'dash': list(curve.dash)}
             curves.append({**look, 'time': self.add('t', curve.time[few]), **rows})
-        marks = [[round(x, 4), round(y, 4), colour] for x, y, colour in shown.marks]
+        marks = [[*(round(each, 4) for each in at), colour] for *at, colour in shown.marks]
         named = {'title': shown.title, 'unit': shown.unit, 'summary': shown.summary}
         return {**named, 'curves': curves, 'world': shown.world, 'marks': marks}
 

@@ -101,8 +101,10 @@ function drawPlanes(cursor) {
       if (row >= 0 && Number.isFinite(x[row])) points.push([x[row], y[row], look.colour]);
       return { ...look, x: x.slice(first, last + 1), y: y.slice(first, last + 1) };
     });
+    const marked = marks.filter(([time]) => time >= from && time <= to)
+      .map(([, ...mark]) => mark);
     floor.view = null;
-    floor.draw({ world, paths, marks: [...marks, ...points] });
+    floor.draw({ world, paths, marks: [...marked, ...points] });
   }
 }
 

@@ -118,6 +118,17 @@ def test_a_person_looks_closely_at_a_run(report, browser, tmp_path):
     assert shown(browser)[0] == pytest.approx([3.0, 9.0], abs=0.1)
     assert re.search(r'cursor at (5\.9|6\.0)', browser.text('range'))
 
+    # The floor shows the path and the points of that part; all points stood where no path was.
+    browser.run("""
+        const draw = Floor.prototype.draw;
+        Floor.prototype.draw = function (scene) { window.drawn = scene; draw.call(this, scene); };
+        planes.at(-1).marks = [[4, 0, 0, 'stopped'], [9.5, 1, 1, 'stopped']];
+    """)
+    for button, points in ((browser.find('all'), 2), (event, 1)):
+        button.click()
+        browser.run('drawPlanes(null)')
+        assert len(browser.run('return drawn.marks')) == points
+
     # Legible in every size and scheme, with something drawn.
     for scheme in ('light', 'dark'):
         for width, height in SIZES.items():

@@ -311,8 +311,8 @@ def path(run: Run, metrics: ReportMetrics) -> Shown:
     ):
         rows = np.searchsorted(measured.time, times[:200])
         rows = rows[rows < measured.time.size]
-        marks += [(float(measured.x[k]), float(measured.y[k]), colour) for k in rows]
-    marks = [mark for mark in marks if np.isfinite(mark[:2]).all()]
+        columns = np.stack([measured.time, measured.x, measured.y], axis=1)[rows]
+        marks += [(*mark, colour) for mark in columns[np.isfinite(columns).all(axis=1)].tolist()]
     x, y = measured.x[np.isfinite(measured.x)], measured.y[np.isfinite(measured.y)]
     seen = (
         f'The robot moved in x {_extent(x, "m")} and in y {_extent(y, "m")}, and ended '
