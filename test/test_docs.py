@@ -120,7 +120,6 @@ def _imported(path):
     return {file for file in found if (ROOT / file).exists()}
 
 
-@pytest.mark.slow
 def test_a_star_marks_exactly_the_unused_functions():
     marked = {(path, name) for path, name, star in FUNCTIONS if star}
     plain = {(path, name) for path, name, star in FUNCTIONS if not star}
@@ -135,29 +134,31 @@ def test_a_star_marks_exactly_the_unused_functions():
 def _called(path, name, marked):
     """Return whether the package uses a function outside itself and the marked functions."""
     module = path.removesuffix('.py').replace('/', '.')
+    return any(
+        name in read
+        for file, (imported, parts) in _uses().items()
+        if file == path or (module, name) in imported
+        for own, read in parts
+        if (file, own) not in marked and (file, own) != (path, name)
+    )
+
+
+@cache
+def _uses():
+    """Return, for each file, what it imports, and the names that each of its parts reads."""
+    uses = {}
     for source in (ROOT / 't3mpc_ros').rglob('*.py'):
         file = str(source.relative_to(ROOT))
-        tree = _tree(file)
-        imported = file == path or any(
-            isinstance(node, ast.ImportFrom)
-            and node.module == module
-            and name in {one.name for one in node.names}
-            for node in ast.walk(tree)
-        )
-        if not imported:
-            continue
-        for top in tree.body:
-            own = getattr(top, 'name', None)
-            if (file, own) in marked or (file == path and own == name):
-                continue
-            for node in ast.walk(top):
-                if isinstance(node, ast.Name) and node.id == name and _is_read(node):
-                    return True
-    return False
-
-
-def _is_read(node):
-    return isinstance(node.ctx, ast.Load)
+        imported, parts = set(), []
+        for top in _tree(file).body:
+            nodes = list(ast.walk(top))
+            froms = [node for node in nodes if isinstance(node, ast.ImportFrom)]
+            imported |= {(each.module, one.name) for each in froms for one in each.names}
+            names = [node for node in nodes if isinstance(node, ast.Name)]
+            read = {node.id for node in names if isinstance(node.ctx, ast.Load)}
+            parts.append((getattr(top, 'name', None), read))
+        uses[file] = imported, parts
+    return uses
 
 
 def test_the_page_of_parameters_is_up_to_date():

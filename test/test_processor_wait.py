@@ -34,8 +34,8 @@ BUSY = 'import time\nwhile True: time.monotonic()'
 
 @pytest.fixture
 def busy():
-    """Keep every processor busy four times."""
-    count = 4 * len(os.sched_getaffinity(0))
+    """Keep every processor busy twice."""
+    count = 2 * len(os.sched_getaffinity(0))
     started = [subprocess.Popen([sys.executable, '-c', BUSY]) for _ in range(count)]
     yield {process.pid for process in started}
     for process in started:

@@ -63,7 +63,14 @@ def install_npm(folder):
     return ['node', 'check.mjs']
 
 
-@pytest.fixture(scope='module', params=[build_go, install_npm], ids=['go', 'javascript'])
+# The Go program takes a minute to compile.
+READERS = [
+    pytest.param(build_go, id='go', marks=pytest.mark.long),
+    pytest.param(install_npm, id='javascript'),
+]
+
+
+@pytest.fixture(scope='module', params=READERS)
 def check(request, tmp_path_factory):
     """Return a function that runs a program on files."""
     folder = tmp_path_factory.mktemp('mcap_check')
