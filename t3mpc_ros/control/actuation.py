@@ -162,6 +162,11 @@ class VelocityActuation:
         return self._filter
 
     @property
+    def takes_speeds(self) -> bool:
+        """Whether the drive takes wheel speeds, not torques."""
+        return self._velocity
+
+    @property
     def dead_time(self) -> float:
         """Time until the next command takes effect, s."""
         return self._filter.dead_time

@@ -8,6 +8,10 @@ squared errors of this model are summed, divided by their variance; a parabola t
 smallest sum gives the maximum-likelihood estimate, and its curvature the Fisher information,
 sum (dchi/dt)^2/variance. The prior is a parabola around the configured dead time.
 
+Coulomb friction, by which a servo is slower than commanded, changes with the direction of motion
+and would count as a delay. If there may be friction, every dead time of the grid is therefore
+fitted together with the friction of both wheels, by recursive least squares.
+
 For smooth commands only dead time + lag is identifiable: a lag that is wrong by some
 milliseconds moves the estimate by as much in the other direction, and their sum, which the
 preview of the reference needs, is unchanged. Between two periods the response is interpolated
@@ -44,6 +48,9 @@ PRIOR_DEVIATION = 0.03
 """Standard deviation of the configured dead time, s."""
 IDENTIFIED_DEVIATION = 0.005
 """Standard deviation at and below which the dead time is identified, s."""
+USED_DIFFERENCE, USED_DEVIATIONS = 0.004, 3.0
+"""Difference (s), and its multiple of the standard deviation, up to which the configured dead time
+is kept: so much the estimate is off if the drive responds otherwise than the lag describes."""
 MIN_DEVIATION = 0.0005
 """Standard deviation at which older data is forgotten as newer data is accepted, s."""
 UNCERTAINTY_FACTOR = 2.0
@@ -54,6 +61,18 @@ RATE_TOLERANCE = 0.02
 """Model error of fast changes: a ramp limit of the robot and its oscillation add to the delay, s.
 
 It is the same for all measurements of one change, so it must not be averaged out."""
+
+FRICTION_WIDTH = 0.3
+"""Filtered wheel speed at which the Coulomb friction of the model has 76 % of its value, rad/s."""
+FRICTION_DEVIATION = 15.0
+"""Prior standard deviation of the acceleration by friction, rad/s²; a servo turns it into the
+speed that it has times the lag."""
+FRICTION_WALK = 0.5
+"""Standard deviation of its change in a second, rad/s²."""
+SERVO_DISTURBANCE = 10.0
+"""Acceleration by disturbances, rad/s²: times the lag, the least standard deviation of the speeds
+of a servo. Disturbances last for many periods, so as white noise they count for more than their
+size."""
 
 OFFSET_TIME = 1.0
 """Time constant of the offset between measurement and model, which is no delay, s."""
@@ -102,7 +121,15 @@ OFFSET, ERROR = 4, 6
 WINDOW, BLOCK, PENDING, ACCEPTED, RECENT, REJECTED = range(8, 14)
 """Rows of data: the sum of squared errors of each dead time of the grid, then the columns
 :data:`DURATION` to :data:`NIS`."""
-ROWS = 14
+COEFFICIENTS = 14
+"""Four rows: shares of the friction of right and left wheel in the error of the right wheel, and
+in that of the left one, of each dead time of the grid, rad/s."""
+FRICTION = 18
+"""Row of the regressor of friction, columns :data:`FILTERED` to :data:`COVARIANCE`."""
+ROWS = 19
+FILTERED, MEAN, COVARIANCE = 0, 2, 4
+"""Columns: filtered speeds (rad/s) and means of their signs, two each, and the covariance of the
+coefficients: right, mixed, left ((rad/s)²)."""
 DURATION, COUNT, INFORMATION, NIS = range(GRID_SIZE, GRID_SIZE + 4)
 """Columns: s, number of speeds, Fisher information (1/s²), normalised innovation squared."""
 COLUMNS = GRID_SIZE + 4
@@ -136,6 +163,9 @@ class DeadTimeEstimator:
     mean_speeds
         Whether the measured speeds are means over a period, as those from counters of steps or
         encoder pulses, or the speeds at the stamp.
+    friction
+        Whether friction and disturbances move the wheels, as with a servo; a stepper motor follows
+        exactly.
 
     Raises
     ------
@@ -144,14 +174,21 @@ class DeadTimeEstimator:
     """
 
     def __init__(
-        self, parameters: SpeedFilterParameters, period: float, *, mean_speeds: bool = True
+        self,
+        parameters: SpeedFilterParameters,
+        period: float,
+        *,
+        mean_speeds: bool = True,
+        friction: bool = False,
     ) -> None:
         if not period > 0.0:
             raise ValueError(f'period must be positive: got {period} s')
         self._period = period
-        self._mean_speeds = mean_speeds
+        self._mean_speeds, self._friction = mean_speeds, friction
         self._lag = parameters.lag
-        self._noise_variance = max(parameters.noise_variance, MIN_NOISE_VARIANCE)
+        self._configured = parameters.dead_time
+        least = (SERVO_DISTURBANCE * parameters.lag) ** 2 if friction else MIN_NOISE_VARIANCE
+        self._noise_variance = max(parameters.noise_variance, least)
         history = math.ceil(1.25 * MAX_DEAD_TIME / period) + 2
         self.state: Array = np.zeros((ROWS, max(COLUMNS, history)))
         """All that changes: a copy, written back, continues bit-equal."""
@@ -163,12 +200,22 @@ class DeadTimeEstimator:
         grid = GRID_STEP * np.arange(GRID_SIZE)
         costs = NOISE_PRIOR_RATIO * ((grid - prior) / PRIOR_DEVIATION) ** 2
         self.state[ACCEPTED, :GRID_SIZE] = costs
+        self.state[FRICTION, [COVARIANCE, COVARIANCE + 2]] = (
+            FRICTION_DEVIATION * parameters.lag
+        ) ** 2
         self.reset(np.zeros(2))
 
     @property
     def dead_time(self) -> float:
         """Estimate, from 0 to :data:`MAX_DEAD_TIME`, s."""
         return float(self.state[SCALARS, DEAD_TIME])
+
+    @property
+    def dead_time_in_use(self) -> float:
+        """The configured dead time, or the estimate where it clearly differs, s."""
+        difference = abs(self.dead_time - self._configured)
+        clear = max(USED_DIFFERENCE, USED_DEVIATIONS * self.standard_deviation)
+        return self.dead_time if difference > clear else self._configured
 
     @property
     def standard_deviation(self) -> float:
@@ -203,6 +250,8 @@ class DeadTimeEstimator:
         state[AGE] = self._period * np.arange(state.shape[1])
         state[UNDELAYED : UNDELAYED + 2] = speeds[:, np.newaxis]
         state[SCALARS, RESPONSE : RESPONSE + 2] = speeds
+        state[FRICTION, FILTERED : FILTERED + 2] = speeds
+        state[FRICTION, MEAN : MEAN + 2] = np.tanh(speeds / FRICTION_WIDTH)
 
     def step(self, measured: Array, command: Array, dt: float) -> bool:
         """Update the estimate with one measurement; return whether the response is disturbed.
@@ -224,6 +273,7 @@ class DeadTimeEstimator:
             self._period,
             self._noise_variance,
             self._mean_speeds,
+            self._friction,
             measured,
             command,
             dt,
@@ -237,6 +287,7 @@ def update_dead_time(
     period: float,
     noise_variance: float,
     mean_speeds: bool,
+    friction: bool,
     measured: Array,
     command: Array,
     dt: float,
@@ -278,6 +329,7 @@ def update_dead_time(
             error = measured[i] - newer - weight * (older - newer) - state[OFFSET + i, g]
             state[ERROR + i, g] = error
             state[OFFSET + i, g] += share * error
+    spread = remove_friction(state, lag, noise_variance, measured, dt) if friction else 0.0
 
     # Variances. After an acceleration the drive oscillates: the rate is held.
     g = min(int(scalars[DEAD_TIME] / GRID_STEP), GRID_SIZE - 2)
@@ -289,9 +341,9 @@ def update_dead_time(
         squared_slope += slope**2
         rate = max(rate, abs(slope))
     scalars[RATE] = rate
-    variance = noise_variance + (RATE_TOLERANCE * rate) ** 2
+    variance = noise_variance + spread + (RATE_TOLERANCE * rate) ** 2
     uncertainty = estimate_uncertainty(scalars)
-    innovation_variance = noise_variance + uncertainty * rate**2
+    innovation_variance = noise_variance + spread + uncertainty * rate**2
     clip = CLIP * scalars[NOISE_RATIO]
     nis = 0.0
     for i in range(2):
@@ -334,6 +386,48 @@ def update_dead_time(
     if enough and duration >= BLOCK_TIME:
         assess_block(state)
     return bool(scalars[DISTURBED] > 0.0)
+
+
+@kernel
+def remove_friction(
+    state: Array, lag: float, noise_variance: float, measured: Array, dt: float
+) -> float:
+    """Remove the friction from the errors; return the variance ((rad/s)²) that this adds.
+
+    Coulomb friction of the two wheels, which the body couples, takes a speed of
+    A tanh(chi/width) from them, with the offset's mean removed. Each dead time of the grid has
+    its own A, by recursive least squares: dead times are compared by what friction cannot
+    explain. The regressor and hence the covariance are the same for all.
+
+    state : see :func:`update_dead_time`
+    """
+    row = state[FRICTION]
+    share = min(1.0, dt / OFFSET_TIME)
+    right = math.tanh(row[FILTERED] / FRICTION_WIDTH) - row[MEAN]
+    left = math.tanh(row[FILTERED + 1] / FRICTION_WIDTH) - row[MEAN + 1]
+    row[MEAN] += share * right
+    row[MEAN + 1] += share * left
+    # Friction acts through the lag of the drive, so the speed is filtered alike. It is that
+    # before this measurement, whose noise is in the errors.
+    for i in range(2):
+        row[FILTERED + i] += (1.0 - math.exp(-dt / lag)) * (measured[i] - row[FILTERED + i])
+    own, mixed, other = row[COVARIANCE], row[COVARIANCE + 1], row[COVARIANCE + 2]
+    gain_right = own * right + mixed * left
+    gain_left = mixed * right + other * left
+    spread = right * gain_right + left * gain_left
+    total = noise_variance + spread
+    for g in range(GRID_SIZE):
+        for i in range(2):
+            first, second = COEFFICIENTS + 2 * i, COEFFICIENTS + 2 * i + 1
+            state[ERROR + i, g] -= state[first, g] * right + state[second, g] * left
+            state[first, g] += gain_right / total * state[ERROR + i, g]
+            state[second, g] += gain_left / total * state[ERROR + i, g]
+    walk = (FRICTION_WALK * lag) ** 2 * dt
+    limit = (FRICTION_DEVIATION * lag) ** 2
+    row[COVARIANCE] = min(own - gain_right * gain_right / total + walk, limit)
+    row[COVARIANCE + 1] = mixed - gain_right * gain_left / total
+    row[COVARIANCE + 2] = min(other - gain_left * gain_left / total + walk, limit)
+    return float(spread)
 
 
 @kernel

@@ -95,6 +95,11 @@ class SpeedKalmanFilter:
         return row
 
     @property
+    def parameters(self) -> SpeedFilterParameters:
+        """Noise model, lag and configured dead time."""
+        return self._parameters
+
+    @property
     def gain(self) -> Array:
         """Stationary Kalman gain of chi (1) and of d (1/s)."""
         return self._gain

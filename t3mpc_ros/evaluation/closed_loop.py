@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.control.actuation import VelocityActuation
 from t3mpc_ros.control.control_law import TERM_NAMES
+from t3mpc_ros.control.dead_time_estimator import DeadTimeEstimator
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
     BaselineController,
     NominalModel,
@@ -317,14 +318,31 @@ def _prepare(scenario: Scenario) -> LoopRecord:
 
 
 class ObservedReference(NamedTuple):
-    """Reference as a method observes it in each period, rad/s."""
+    """Reference as a method observes it in each period.
 
-    now: Array
-    """r when the answer takes effect, shape (n, 2)."""
-    following: Array
-    """r one period later, shape (n, 2)."""
+    With preview of ``rows`` periods these are rows of the reference after the dead time, and go on
+    beyond the run. Without, r is extrapolated over the dead time by the slope it has now: a switch
+    is seen when it happens, and not before.
+    """
+
+    speeds: Array
+    """r, rad/s, shape (n, 2)."""
+    slope: Array
+    """Its change in a period, rad/s, shape (n, 2)."""
     rows: int
-    """Rows of ``now`` that preview gives; 0 without preview."""
+    """Rows that preview gives; 0 without preview."""
+    late: int
+    """Configured dead time, in periods."""
+    latest: int
+    """Largest dead time for which it is known, in periods."""
+
+    def at(self, k: int, late: int) -> tuple[Array, Array, Array | None]:
+        """Return r ``late`` periods after period ``k``, one period later, and the preview."""
+        if self.rows:
+            row = k + late
+            return self.speeds[row], self.speeds[row + 1], self.speeds[row : row + self.rows]
+        now = self.speeds[k] + late * self.slope[k]
+        return now, self.speeds[k] + (late + 1) * self.slope[k], None
 
 
 def observed_reference(
@@ -332,10 +350,7 @@ def observed_reference(
 ) -> ObservedReference:
     """Return what a method observes of a reference over a run of ``steps`` periods.
 
-    With preview of ``rows`` periods these are rows of the reference after the dead time, and go on
-    beyond the run. Without, r is extrapolated over the dead time by the slope it has now: a switch
-    is seen when it happens, and not before. These are copies that can be written to, because
-    compiled functions take an array that cannot for another type.
+    The arrays can be written to, because compiled functions take one that cannot for another type.
     """
     late = round(dead_time * RATE)
     if not math.isclose(dead_time * RATE, late, abs_tol=1e-6):
@@ -345,16 +360,20 @@ def observed_reference(
             f'dead time must be at most {(sampled.time.size - steps - rows) / RATE:g} s, '
             f'as far as the reference reaches: got {dead_time} s'
         )
-    speeds, slope = sampled.speeds, sampled.rate / RATE
-    if preview:
-        return ObservedReference(speeds[late:].copy(), speeds[late + 1 :].copy(), rows)
-    return ObservedReference(speeds + late * slope, speeds + (late + 1) * slope, 0)
+    latest = sampled.time.size - steps - rows
+    rate = sampled.rate / RATE
+    return ObservedReference(sampled.speeds.copy(), rate, rows if preview else 0, late, latest)
+
+
+DEAD_TIME_HYSTERESIS = 0.75
+"""Difference of estimate and dead time in use, in periods, at which the latter changes."""
 
 
 class MethodLoop:
     """A method between the state estimate and the limits that all methods share.
 
-    The estimator of ``actuation`` was reset to the first measurement.
+    The estimator of ``actuation`` was reset to the first measurement. A method that estimates the
+    dead time gets the state estimate and the reference for the estimated one, in whole periods.
     """
 
     def __init__(
@@ -368,24 +387,44 @@ class MethodLoop:
         self._reference = reference
         self._observed = -1
         """Period of the last measurement."""
+        self._late = reference.late
+        self._dead_time: DeadTimeEstimator | None = None
+        if controller.estimate_dead_time and actuation.takes_speeds:
+            known = actuation.speed_filter.parameters
+            self._dead_time = DeadTimeEstimator(known, period, mean_speeds=False, friction=True)
 
     def step(self, k: int, measured: Array) -> Array:
         """Return the answer (rad/s²) to the speeds (rad/s) measured in period ``k``."""
         elapsed = k - self._observed if self._observed >= 0 else 1
+        actuation = self._actuation
+        if self._dead_time is not None:
+            self._update_dead_time(self._dead_time, measured, elapsed * self._period)
         self._observed = k
-        actuation, (now, following, rows) = self._actuation, self._reference
         actuation.observe(measured, elapsed * self._period)
+        now, following, future = self._reference.at(k, self._late)
         return self._controller.step(
             Observation(
                 actuation.predicted,
                 actuation.disturbance,
-                now[k],
-                following[k],
+                now,
+                following,
                 actuation.command,
-                now[k : k + rows] if rows else None,
+                future,
                 elapsed,
+                self._late,
             )
         )
+
+    def _update_dead_time(self, estimator: DeadTimeEstimator, measured: Array, dt: float) -> None:
+        """Update the dead time in use with a measurement (rad/s), ``dt`` s after the last one."""
+        if self._observed < 0:
+            estimator.reset(measured)
+            return
+        estimator.step(measured, self._actuation.command, dt)
+        periods = min(estimator.dead_time_in_use / self._period, float(self._reference.latest))
+        if abs(periods - self._late) > DEAD_TIME_HYSTERESIS:
+            self._late = round(periods)
+            self._actuation.set_dead_time(self._late * self._period)
 
     def send(self, asked: Array, *, cut: bool = False) -> Array:
         """Return the acceleration (rad/s²) that the limits let through of an answer.

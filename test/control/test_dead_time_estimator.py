@@ -11,8 +11,12 @@ from support.long_tests import few_of
 
 from t3mpc_ros.control.dead_time_estimator import (
     ADOPTION_TIME,
+    DEAD_TIME,
+    DEVIATION,
     MAX_DEAD_TIME,
     PRIOR_DEVIATION,
+    SCALARS,
+    USED_DIFFERENCE,
     DeadTimeEstimator,
 )
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
@@ -252,6 +256,104 @@ def test_the_stepper_twin_with_an_unknown_dead_time():
     # The motors respond some milliseconds later than the lag of the model.
     assert 0.058 < estimator.dead_time < 0.066
     assert not trace[:, 2].any()
+
+
+SERVO_LAG = 0.02
+FRICTION = np.array([[3.1, 1.3], [1.3, 3.1]])
+"""Accelerations (rad/s²) by the Coulomb friction of each wheel of the paper's robot."""
+
+
+def servo(
+    dead_time: float,
+    seed: int,
+    *,
+    friction: float = 1.0,
+    lag: float = SERVO_LAG,
+    noise_variance: float = NOISE_VARIANCE,
+    duration: float = 30.0,
+) -> Drive:
+    """Return the response of servos with ``friction`` times the friction; speeds at the stamp."""
+    command = smooth_commands(duration, seed)
+    step, late = PERIOD / 5, round(dead_time / PERIOD)
+    speeds = np.zeros((len(command), 2))
+    for k in range(1, len(command)):
+        chi = speeds[k - 1]
+        active = command[k - 1 - late] if k > late else np.zeros(2)
+        for _ in range(5):
+            load = friction * FRICTION @ np.tanh(chi / 0.2)
+            chi = chi + step * ((active - chi) / lag - load)
+        speeds[k] = chi
+    noise = np.random.default_rng(2000 + seed).normal(size=speeds.shape)
+    return Drive(command, speeds + np.sqrt(noise_variance) * noise)
+
+
+def run_servo(
+    drive: Drive, *, friction: bool = True, noise_variance: float = NOISE_VARIANCE
+) -> np.ndarray:
+    """Return estimate and dead time in use (s) of each row; 10 ms are configured."""
+    estimator = DeadTimeEstimator(
+        SpeedFilterParameters(lag=SERVO_LAG, dead_time=0.01, noise_variance=noise_variance),
+        PERIOD,
+        mean_speeds=False,
+        friction=friction,
+    )
+    record = np.full((len(drive.command), 2), 0.01)
+    for k in range(1, len(record)):
+        estimator.step(drive.measured[k], drive.command[k - 1], PERIOD)
+        record[k] = estimator.dead_time, estimator.dead_time_in_use
+        assert 0.0 <= estimator.dead_time <= MAX_DEAD_TIME
+    return record
+
+
+@pytest.mark.parametrize('friction', few_of([4.0, 0.0, 1.0, 3.0], 2))
+@pytest.mark.parametrize('dead_time', few_of([0.03, 0.06], 2))
+def test_dead_time_of_a_servo_is_found_with_friction(dead_time, friction):
+    for seed in range(3):
+        record = run_servo(servo(dead_time, seed, friction=friction))
+        assert np.abs(record[at(10.0) :] - dead_time).max() < 0.006
+        assert np.abs(record[at(25.0) :] - dead_time).max() < 0.004
+
+
+@pytest.mark.parametrize('friction', few_of([4.0, 0.0, 1.0, 3.0], 2))
+@pytest.mark.parametrize('noise_variance', few_of([0.04, 0.0, 0.1]))
+def test_friction_is_not_taken_for_dead_time(friction, noise_variance):
+    """With offsets alone, friction of 12 rad/s² was a delay of some 30 ms for many seconds."""
+    for seed in range(4):
+        drive = servo(0.01, seed, friction=friction, noise_variance=noise_variance)
+        record = run_servo(drive, noise_variance=noise_variance)
+        np.testing.assert_array_equal(record[:, 1], 0.01)
+
+
+def test_the_friction_model_halves_the_error_by_friction():
+    errors = {True: [], False: []}
+    for seed in range(4):
+        drive = servo(0.01, seed, friction=4.0)
+        for model in errors:
+            record = run_servo(drive, friction=model)
+            errors[model].append(np.abs(record[at(20.0) :, 0] - 0.01).mean())
+    assert np.mean(errors[True]) < 0.5 * np.mean(errors[False])
+
+
+@pytest.mark.parametrize('mass', [0.7, 1.3])
+def test_another_mass_moves_the_estimate_by_its_lag(mass):
+    """Dead time and lag are one sum: 30 % of the lag are 6 ms."""
+    for seed in range(3):
+        record = run_servo(servo(0.01, seed, lag=mass * SERVO_LAG))
+        expected = 0.01 + (mass - 1.0) * SERVO_LAG
+        assert np.abs(record[at(20.0) :, 0] - expected).max() < 0.004
+        assert np.abs(record[:, 1] - 0.01).max() < 0.01
+
+
+def test_small_differences_keep_the_configured_dead_time():
+    estimator = DeadTimeEstimator(SpeedFilterParameters(lag=LAG, dead_time=0.03), PERIOD)
+    for difference, deviation, used in (
+        (0.9 * USED_DIFFERENCE, 1e-4, 0.03),
+        (1.1 * USED_DIFFERENCE, 1e-4, 0.03 + 1.1 * USED_DIFFERENCE),
+        (0.02, 0.008, 0.03),
+        (0.02, 0.006, 0.05),
+    ):
+        estimator.state[SCALARS, [DEAD_TIME, DEVIATION]] = 0.03 + difference, deviation
+        assert estimator.dead_time_in_use == pytest.approx(used, abs=1e-12)
 
 
 def test_a_period_that_is_not_positive_is_rejected():

@@ -161,6 +161,8 @@ class Observation:
     None for a method without preview."""
     elapsed: int = 1
     """Control periods since the observation before; more than 1 after lost measurements."""
+    late: int = 0
+    """Control periods until that instant: the dead time in use."""
 
 
 class BaselineController(ABC):
@@ -169,6 +171,8 @@ class BaselineController(ABC):
     parameters_type: ClassVar[type[Parameters]]
     preview: ClassVar[bool] = False
     """Whether it uses :attr:`Observation.future`."""
+    estimate_dead_time: bool = False
+    """Whether it estimates the dead time of a velocity drive; the configured one otherwise."""
 
     def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None:
         if type(parameters) is not self.parameters_type:
