@@ -31,6 +31,7 @@ ROBOTS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
             'composition': 'paper',
             'speed_filter.lag': 0.02,
             'mean_speeds': False,
+            'friction.gamma': 10.0,
             'command_shaper.straight_frequency': 0.0,
             'command_shaper.turning_frequency': 0.0,
         },

@@ -10,6 +10,11 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.control.friction_term import (
+    FrictionTables,
+    FrictionTermParameters,
+    add_friction,
+)
 from t3mpc_ros.control.jump_transition import JumpTransitionParameters
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, adapt, estimate
@@ -27,6 +32,9 @@ Array = NDArray[np.float64]
 
 TERM_NAMES = ('fuzzy', 'feedback', 'feedforward', 'compensator', 'predictive')
 """Summands of the law, in the order of the rows of ``terms``."""
+
+FRICTION_WEIGHTS = 'friction.coefficients'
+"""Name of the weights of the friction term."""
 
 TANH_GAP = 0.2785
 """E14: the maximum of |x| - x tanh(x), rounded up (0.27846, at x = 0.6392)."""
@@ -86,6 +94,7 @@ class Nt3fsMpcParameters(Parameters):
     speed_filter: SpeedFilterParameters = group(SpeedFilterParameters)
     fuzzy: FuzzyParameters = group(FuzzyParameters)
     adaptation: AdaptationParameters = group(AdaptationParameters)
+    friction: FrictionTermParameters = group(FrictionTermParameters)
     predictive: PredictiveParameters = group(PredictiveParameters)
 
     @property
@@ -370,6 +379,7 @@ class Nt3fsMpcController:
         self._parameters = parameters
         self._period = 1.0 / parameters.rate
         self.fuzzy = FuzzyEstimator(parameters.fuzzy, parameters.adaptation, outputs=2)
+        self._friction = FrictionTables.of(wheels=2)
         self.predictive = PredictiveController(
             parameters.predictive, self._period, parameters.law.gain, outputs=2
         )
@@ -390,11 +400,11 @@ class Nt3fsMpcController:
         """Compile every kernel and pretrain the predictor, so that no step has to."""
         self.fuzzy.warm_up()
         self.predictive.warm_up()
-        coefficients = self.fuzzy.coefficients
+        coefficients, friction = self.fuzzy.coefficients, self.friction.copy()
         self.step(np.zeros(2), np.zeros(2), np.zeros(2), self._period)
         self.set_applied(self.command, saturated=True)
         self.fuzzy.reset()
-        self.fuzzy.coefficients = coefficients
+        self.fuzzy.coefficients, self.friction[:] = coefficients, friction
         self.reset()
         self.terms[:] = 0.0
         self.command[:] = 0.0
@@ -407,14 +417,15 @@ class Nt3fsMpcController:
         self._gains = self._law_gains()
 
     def get_weights(self) -> dict[str, Array]:
-        """Return all adapted arrays by name: fuzzy coefficients and predictor weights."""
+        """Return all adapted arrays by name: coefficients of g, and predictor weights."""
         weights = self.predictive.get_weights()
-        return {'fuzzy.coefficients': self.fuzzy.coefficients.copy()} | {
-            f'predictive.{name}': value for name, value in weights.items()
-        }
+        return {
+            'fuzzy.coefficients': self.fuzzy.coefficients,
+            FRICTION_WEIGHTS: self.friction.copy(),
+        } | {f'predictive.{name}': value for name, value in weights.items()}
 
     def set_weights(self, weights: Mapping[str, Array]) -> None:
-        """Use weights as returned by :meth:`get_weights`.
+        """Use weights as returned by :meth:`get_weights`; those of the friction may be missing.
 
         Raises
         ------
@@ -429,14 +440,31 @@ class Nt3fsMpcController:
         }
         if 'fuzzy.coefficients' not in weights:
             raise ValueError('fuzzy.coefficients are missing')
+        friction = np.asarray(weights.get(FRICTION_WEIGHTS, np.zeros((2, 2))), dtype=np.float64)
+        if friction.shape != self.friction.shape or not np.isfinite(friction).all():
+            raise ValueError(
+                f'{FRICTION_WEIGHTS} must be finite, of shape {self.friction.shape}: '
+                f'got shape {friction.shape}'
+            )
         self.fuzzy.coefficients = weights['fuzzy.coefficients']
         self.predictive.set_weights(predictive)
+        self.friction[:] = friction
+
+    def reset_estimate(self) -> None:
+        """Discard what is known of the estimate g."""
+        self.fuzzy.reset()
+        self.friction[:] = 0.0
 
     def reset(self) -> None:
         """Start a new run; the weights are kept."""
         self.predictive.reset()
         self._certificate.reset()
         self.saturated = False
+
+    @property
+    def friction(self) -> Array:
+        """Coefficients of the Coulomb friction in g (E23), rad/s², shape (2, 2)."""
+        return self._friction.coefficients
 
     @property
     def terms(self) -> Array:
@@ -496,6 +524,7 @@ class Nt3fsMpcController:
             self._gains,
             self.predictive.signals,
             self.fuzzy.tables,
+            self._friction,
             self._output,
         ):
             raise ValueError(f'speeds must be finite: got {speeds}')
@@ -532,6 +561,9 @@ class Nt3fsMpcController:
             leakage=adaptation.sigma_modification,
             dead_zone=adaptation.dead_zone,
             step_limit=adaptation.step_limit,
+            friction_gamma=parameters.friction.gamma,
+            friction_width=parameters.friction.width,
+            friction_radius=math.sqrt(2.0) * adaptation.radius,
         )
 
     def _bound(self) -> float:
@@ -554,6 +586,9 @@ class LawGains(NamedTuple):
     leakage: float
     dead_zone: float
     step_limit: float
+    friction_gamma: float
+    friction_width: float
+    friction_radius: float
 
 
 class LawOutput(NamedTuple):
@@ -581,6 +616,7 @@ def step_law(
     gains: LawGains,
     predictive: Signals,
     fuzzy: FuzzyTables,
+    friction: FrictionTables,
     output: LawOutput,
 ) -> bool:
     """Write terms and command of the law, adapt the fuzzy systems, update the certificate.
@@ -591,12 +627,16 @@ def step_law(
     dt         : time since the last step, s
     saturated  : whether a limit changed the last command
     predictive : signals of the predictive term
+    fuzzy, friction : parts of the estimate g by (31) and E23, adapted
     output     : overwritten
     """
     fuzzy_estimate, adaptation_error = output.estimate, output.adaptation_error
     fuzzy_estimate[:] = 0.0
     if gains.use_fuzzy and not estimate(speeds, fuzzy, fuzzy_estimate):
         return False
+    has_friction = gains.use_fuzzy and gains.friction_gamma > 0.0
+    if has_friction:
+        add_friction(reference, gains.friction_width, friction, fuzzy_estimate)
     law_terms(
         speeds,
         reference,
@@ -626,6 +666,18 @@ def step_law(
             gains.dead_zone,
             gains.step_limit,
         )
+        if has_friction:
+            adapt(
+                friction.coefficients,
+                friction.basis,
+                adaptation_error,
+                dt,
+                gains.friction_gamma,
+                gains.friction_radius,
+                gains.leakage,
+                gains.dead_zone,
+                gains.step_limit,
+            )
     update_certificate(
         predictive.errors,
         gains.gain,

@@ -24,6 +24,7 @@ from t3mpc_ros.control.control_law import (
     fitting_gain,
 )
 from t3mpc_ros.control.dead_time_estimator import DeadTimeEstimator
+from t3mpc_ros.control.friction_term import FrictionTermParameters
 from t3mpc_ros.control.jump_transition import JumpTransition, MotorLimit
 from t3mpc_ros.control.keep_out import KeepOut, KeepOutParameters
 from t3mpc_ros.control.pose_controller import PoseController, PoseLoopParameters, PoseReference
@@ -62,10 +63,6 @@ JUMP_DETECTION_FACTOR = 2.2
 BODY_WEIGHTS = 'body.coefficients'
 """Name of the weights of the body correction."""
 
-DEAD_TIME_TOLERANCE = 0.004
-"""Difference (s) up to which the configured dead time is kept: so much the estimate is off if the
-drive responds otherwise than the lag describes."""
-
 MIN_DEAD_TIME_CHANGE = 0.0005
 """Smallest change (s) of the dead time in use."""
 
@@ -101,6 +98,8 @@ class ControllerParameters(Nt3fsMpcParameters):
     geometry: WheelGeometry = group(WheelGeometry, inline=True)
     limits: LimitParameters = group(LimitParameters, inline=True)
     watchdog: WatchdogParameters = group(WatchdogParameters)
+    # Wheels of steppers follow whatever the friction; bags without the parameter had no such term.
+    friction: FrictionTermParameters = group(FrictionTermParameters, gamma=0.0)
     command_shaper: CommandShaperParameters = group(
         CommandShaperParameters, straight_frequency=0.0, turning_frequency=0.0
     )
@@ -354,7 +353,7 @@ class Controller:
         self._watchdog.reset()
         self._watchdog.enabled = enabled
         self._clear_reference()
-        self.law.fuzzy.reset()
+        self.law.reset_estimate()
         self.law.predictive.pretrain()
         self._body.reset()
         self._dead_time = self._make_dead_time_estimator()
@@ -580,9 +579,7 @@ class Controller:
         dead_time, self._disturbed = self.parameters.speed_filter.dead_time, False
         if self.parameters.estimate_dead_time:
             self._disturbed = estimator.step(speeds, actuation.command, elapsed)
-            difference = abs(estimator.dead_time - dead_time)
-            if difference > max(DEAD_TIME_TOLERANCE, 3.0 * estimator.standard_deviation):
-                dead_time = estimator.dead_time
+            dead_time = estimator.dead_time_in_use
         if self._disturbed and self._before_disturbance is None and self._snapshots:
             self._before_disturbance = self._snapshots[0]
             self._snapshots.clear()
@@ -603,6 +600,7 @@ class Controller:
             replace(filtered, lag=max(filtered.lag, 0.5 * self._period)),
             self._period,
             mean_speeds=self.parameters.mean_speeds,
+            friction=self.parameters.composition == 'paper',
         )
 
     def _rollback(self, snapshot: tuple[Any, Any]) -> None:

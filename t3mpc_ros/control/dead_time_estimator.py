@@ -64,15 +64,13 @@ It is the same for all measurements of one change, so it must not be averaged ou
 
 FRICTION_WIDTH = 0.3
 """Filtered wheel speed at which the Coulomb friction of the model has 76 % of its value, rad/s."""
-FRICTION_DEVIATION = 15.0
-"""Prior standard deviation of the acceleration by friction, rad/s²; a servo turns it into the
-speed that it has times the lag."""
-FRICTION_WALK = 0.5
-"""Standard deviation of its change in a second, rad/s²."""
-SERVO_DISTURBANCE = 10.0
-"""Acceleration by disturbances, rad/s²: times the lag, the least standard deviation of the speeds
-of a servo. Disturbances last for many periods, so as white noise they count for more than their
-size."""
+FRICTION_DEVIATION = 0.3
+"""Prior standard deviation of the speed that friction takes from a wheel, rad/s."""
+FRICTION_WALK = 0.01
+"""Standard deviation of its change in a second, rad/s."""
+SERVO_VARIANCE = 0.04
+"""Least variance of the speeds of a servo, (rad/s)². Disturbances move it for many periods, so as
+white noise they count for more than their size."""
 
 OFFSET_TIME = 1.0
 """Time constant of the offset between measurement and model, which is no delay, s."""
@@ -187,7 +185,7 @@ class DeadTimeEstimator:
         self._mean_speeds, self._friction = mean_speeds, friction
         self._lag = parameters.lag
         self._configured = parameters.dead_time
-        least = (SERVO_DISTURBANCE * parameters.lag) ** 2 if friction else MIN_NOISE_VARIANCE
+        least = SERVO_VARIANCE if friction else MIN_NOISE_VARIANCE
         self._noise_variance = max(parameters.noise_variance, least)
         history = math.ceil(1.25 * MAX_DEAD_TIME / period) + 2
         self.state: Array = np.zeros((ROWS, max(COLUMNS, history)))
@@ -200,9 +198,7 @@ class DeadTimeEstimator:
         grid = GRID_STEP * np.arange(GRID_SIZE)
         costs = NOISE_PRIOR_RATIO * ((grid - prior) / PRIOR_DEVIATION) ** 2
         self.state[ACCEPTED, :GRID_SIZE] = costs
-        self.state[FRICTION, [COVARIANCE, COVARIANCE + 2]] = (
-            FRICTION_DEVIATION * parameters.lag
-        ) ** 2
+        self.state[FRICTION, [COVARIANCE, COVARIANCE + 2]] = FRICTION_DEVIATION**2
         self.reset(np.zeros(2))
 
     @property
@@ -422,8 +418,7 @@ def remove_friction(
             state[ERROR + i, g] -= state[first, g] * right + state[second, g] * left
             state[first, g] += gain_right / total * state[ERROR + i, g]
             state[second, g] += gain_left / total * state[ERROR + i, g]
-    walk = (FRICTION_WALK * lag) ** 2 * dt
-    limit = (FRICTION_DEVIATION * lag) ** 2
+    walk, limit = FRICTION_WALK**2 * dt, FRICTION_DEVIATION**2
     row[COVARIANCE] = min(own - gain_right * gain_right / total + walk, limit)
     row[COVARIANCE + 1] = mixed - gain_right * gain_left / total
     row[COVARIANCE + 2] = min(other - gain_left * gain_left / total + walk, limit)

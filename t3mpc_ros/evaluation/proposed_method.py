@@ -28,8 +28,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ProposedParameters(Nt3fsMpcParameters):
-    """Parameters of the controller, and an option of the ablation study."""
+    """Parameters of the controller, and options of the comparison."""
 
+    estimate_dead_time: bool = parameter(
+        True, 'whether the dead time of a velocity drive is estimated, and the estimate used'
+    )
     random_predictor: bool = parameter(
         False,
         'replace what the predictor was taught by random output weights, and let it not learn: '
@@ -58,7 +61,12 @@ class ProposedController(BaselineController):
         self._random = table.predictive.seed if table.random_predictor else None
         if self._random is not None:
             self._randomize_predictor(self._random)
+        self.estimate_dead_time = table.estimate_dead_time
+        self._begun = False
         self._steps = 0
+        """Control periods since the first observation."""
+        self._announced = 0
+        """Instant up to which the jumps of the known future are announced, in periods."""
         self._expected: Array = np.zeros(2)
         self._slope: Array = np.zeros(2)
         self.terms = self._tracker.law.terms
@@ -81,20 +89,23 @@ class ProposedController(BaselineController):
 
     def step(self, observation: Observation) -> Array:
         """Return u (rad/s²) of (66)-(67) on the reference with its switches crossed."""
-        now_ns = self._steps * self._period_ns
-        if self._steps == 0:
+        if self._begun:
+            self._steps += observation.elapsed
+        effect = self._steps + observation.late
+        now_ns, future = effect * self._period_ns, observation.future
+        if not self._begun:
+            self._begun, self._announced = True, effect
             self._tracker.begin(now_ns, observation.speeds, observation.reference)
-            if observation.future is not None:
-                for j in range(1, len(observation.future) - 1):
-                    self._announce_future_jump(now_ns + j * self._period_ns, observation.future, j)
-        elif observation.future is None:
+        elif future is None:
             self._announce_current_jump(now_ns, observation)
-        else:
-            j = len(observation.future) - 2
-            self._announce_future_jump(now_ns + j * self._period_ns, observation.future, j)
+        if future is not None:
+            # Lost measurements or a longer dead time reveal several periods at once.
+            last = effect + len(future) - 2
+            for instant in range(max(self._announced, effect) + 1, last + 1):
+                self._announce_future_jump(instant * self._period_ns, future, instant - effect)
+            self._announced = max(self._announced, last)
         self._expected = observation.next_reference.copy()
         self._slope = (observation.next_reference - observation.reference) / self._period
-        self._steps += 1
         return self._tracker.step(
             now_ns,
             observation.speeds,

@@ -10,6 +10,8 @@ import pytest
 from support.long_tests import few_of
 
 from t3mpc_ros.control.controller import Controller, ControllerParameters
+from t3mpc_ros.control.friction_term import FrictionTermParameters
+from t3mpc_ros.evaluation.baselines.baseline_controller import Observation
 from t3mpc_ros.evaluation.closed_loop import MethodSpec, run
 from t3mpc_ros.evaluation.confidence_intervals import paired
 from t3mpc_ros.evaluation.methods import methods
@@ -27,12 +29,19 @@ def _spec(**changes):
     return MethodSpec('full', ProposedController, ProposedParameters.from_dict(changes))
 
 
-def _as_the_nodes_close_it(scenario):
+def _as_the_nodes_close_it(scenario, **changes):
     """Return the wheel speeds of the loop of stamped motions in and limited twists out."""
     robot = PaperRobot(scenario.robot())
     geometry = scenario.robot().geometry
     controller = Controller(
-        ControllerParameters.from_dict({'speed_filter.noise_variance': scenario.noise})
+        ControllerParameters.from_dict(
+            {
+                'speed_filter.noise_variance': scenario.noise,
+                'mean_speeds': False,
+                'friction.gamma': FrictionTermParameters().gamma,
+            }
+            | changes
+        )
     )
     controller.warm_up()
     reference = scenario.reference().speeds
@@ -62,6 +71,96 @@ def test_the_offline_loop_is_the_loop_of_the_nodes(noise):
     record = run(scenario, _spec(**{'speed_filter.noise_variance': noise}))
     assert np.abs(np.diff(record.reference, axis=0)).max() > 2.0  # there is a real jump in it
     np.testing.assert_allclose(record.speeds, _as_the_nodes_close_it(scenario), atol=1e-6)
+
+
+class NotedDeadTimes(ProposedController):
+    """Notes the dead time in use, in periods."""
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.late = []
+
+    def step(self, observation):
+        self.late.append(observation.late)
+        return super().step(observation)
+
+
+def _dead_times(scenario):
+    """Return record and dead time in use of each period of the full controller."""
+    made = []
+
+    def method(nominal_model):
+        parameters = ProposedParameters.from_dict({'speed_filter.noise_variance': scenario.noise})
+        made.append(NotedDeadTimes(parameters, nominal_model))
+        return made[0]
+
+    return run(scenario, method), np.array(made[0].late)
+
+
+@pytest.mark.parametrize('case', few_of(['friction x3', 'nominal', 'disturbance', 'load change']))
+@pytest.mark.parametrize('noise', [0.0, 0.04])
+def test_known_dead_time_is_kept_with_friction_and_disturbances(case, noise):
+    """Offsets alone took the friction for 20 to 110 ms in the first seconds of a run."""
+    for seed in (1, 2, 3):
+        _, late = _dead_times(Scenario('velocity', noise, case, seed, 20.0))
+        np.testing.assert_array_equal(late, 1)
+
+
+@pytest.mark.parametrize('noise', [0.04, 0.0])
+@pytest.mark.parametrize(('case', 'periods'), [('', 3), (' 60 ms', 6)])
+def test_unknown_dead_time_is_found_and_used(case, periods, noise):
+    for seed in (1, 2):
+        record, late = _dead_times(Scenario('velocity', noise, f'unknown dead time{case}', seed))
+        found = 100 * 13
+        np.testing.assert_array_equal(late[found:], periods)
+        known = run(Scenario('velocity', noise, f'dead time{case}', seed), _spec())
+        assert record.rmse(14.0) < 1.02 * known.rmse(14.0)
+        assert record.rmse() < 1.1 * known.rmse()
+
+
+def test_a_torque_drive_has_no_dead_time_to_find():
+    _, late = _dead_times(Scenario('torque', 0.04, 'nominal', 1, 5.0))
+    np.testing.assert_array_equal(late, 0)
+
+
+def test_the_node_finds_an_unknown_dead_time_alike():
+    scenario = Scenario('velocity', 0.04, 'unknown dead time 60 ms', 2, 30.0)
+    settled = slice(1500, None)
+    error = scenario.reference().speeds[: scenario.steps]
+    by_node, ignored = (
+        np.sqrt(
+            np.mean(
+                (_as_the_nodes_close_it(scenario, estimate_dead_time=on) - error)[settled] ** 2
+            )
+        )
+        for on in (True, False)
+    )
+    offline = run(scenario, _spec()).rmse(15.0)
+    assert by_node < 1.05 * offline
+    assert ignored > 1.5 * by_node
+
+
+def test_jumps_seen_behind_lost_measurements_are_announced():
+    """The preview moves on by several periods: a jump in any of them was missed, or late."""
+    scenario = Scenario('velocity', 0.0, 'nominal', 1)
+    rows, jump, lost = 40, 60, 5
+    reference = np.zeros((200, 2))
+    reference[jump:] = 2.0
+    method = ProposedController(ProposedParameters(), scenario.nominal_model())
+    k = 0
+    for elapsed in (1,) * 19 + (lost,) + (1,) * 10:
+        k += elapsed
+        future = reference[k : k + rows]
+        method.step(
+            Observation(
+                *(np.zeros(2) for _ in range(2)), *future[:2], np.zeros(2), future, elapsed
+            )
+        )
+    announced = method._tracker.transition.future_jumps((k - 1) * NS, 0.01, rows)
+    # Time counts from the first observation.
+    expected = np.zeros((rows, 2))
+    expected[jump - k - 1] = -2.0
+    np.testing.assert_array_equal(announced, expected)
 
 
 SEEDS = (1, 2, 3, 4, 5)
