@@ -200,7 +200,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _cursor(self, query: str) -> int:
         """Return the number up to which the page has read; 0 for a page of an earlier start."""
         last = self.headers.get('Last-Event-ID') or parse_qs(query).get('last', [''])[0]
-        start, _, number = last.partition('-')
+        start, _, number = last.rpartition('-')  # the start may contain a hyphen, too
         return int(number) if start == self.server.page.token[:8] and number.isdecimal() else 0
 
     def _post(self) -> None:

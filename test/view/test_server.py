@@ -125,7 +125,10 @@ def test_a_read_only_page_has_no_token_and_takes_no_command():
         assert (status, '--read-only' in answer['error']) == (403, True)
 
 
-def test_events_go_on_where_a_page_has_stopped(page):
+@pytest.mark.parametrize('token', ['0123456789', 'x-y_-z0-9-'])
+def test_events_go_on_where_a_page_has_stopped(page, token):
+    """With a hyphen in the token, as in one of eight, all events came again."""
+    page.server.token = token
     data = page.server.data
     data.add('a', 0.0, [1.0])
     last, content = next(page.events())
