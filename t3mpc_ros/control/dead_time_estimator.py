@@ -311,8 +311,8 @@ def update_dead_time(
             state[UNDELAYED + i, 0] = command[i] + mean_decay * difference
             scalars[RESPONSE + i] = command[i] + decay * difference
 
-    # Errors of each dead time of the grid. Each has its own offset, so that neither a constant
-    # load nor friction counts as a delay.
+    # Errors of each dead time of the grid. Each has its own offset, so that a constant load counts
+    # as no delay.
     j = 0
     share = min(1.0, dt / OFFSET_TIME)
     for g in range(GRID_SIZE):

@@ -131,8 +131,8 @@ def only_one_robot(
 ) -> OneRobot:
     """Return the messages of one robot, each once, and add what was left out to ``notes``.
 
-    Robots are told apart by their base frame, else by positions that alternate between tracks of
-    which each is continuous.
+    Robots are distinguished by their base frame, else by positions that alternate between
+    tracks of which each is continuous.
 
     Parameters
     ----------
