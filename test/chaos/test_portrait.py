@@ -5,8 +5,11 @@
 import numpy as np
 import pytest
 
+from t3mpc_ros.chaos.path_source import PathReferenceParameters, PortraitSource
 from t3mpc_ros.chaos.portrait import PortraitParameters, PortraitPath
 from t3mpc_ros.chaos.reference import ReferenceParameters
+from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.geometry.types import ORIGIN
 from t3mpc_ros.parameters.table import ParameterError
 
 TRIANGLE = (0.0, 0.0, 3.0, 0.0, 1.0, 2.0)
@@ -48,6 +51,29 @@ def test_reseed_continues_without_a_jump():
     path.reseed(6)
     after = np.vstack([before[-1:], path.advance(5.0)])
     assert np.hypot(*np.diff(after, axis=0).T).max() < 0.0101
+
+
+def test_a_robot_that_is_held_up_does_not_change_the_path():
+    """The next seed comes at a place of the path: the time until it waits with the path."""
+    values = {'reseed.shortest': 3.0, 'reseed.longest': 3.0}
+    places = []
+    for wait in (0, 1000):
+        seeds = []
+        source = PortraitSource(
+            PathReferenceParameters.from_dict(values),
+            WheelGeometry(),
+            ORIGIN,
+            1,
+            lambda seeds=seeds: seeds.append(2) or 2,
+        )
+        for rate, count in ((1.0, 200), (0.0, wait)):
+            for _ in range(count):
+                source.advance(rate)
+        assert not seeds
+        while not seeds:
+            pose, _ = source.advance()
+        places.append((pose.x, pose.y))
+    assert places[1] == pytest.approx(places[0], abs=0.01)
 
 
 def test_a_portrait_needs_two_states():

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from t3mpc_ros.control.free_space_map import FREE, OCCUPIED, UNKNOWN
+from t3mpc_ros.control.free_space_map import CLEARINGS, FREE, OCCUPIED, UNKNOWN
 from t3mpc_ros.control.keep_out import (
     Activity,
     KeepOut,
@@ -32,6 +32,13 @@ def _seen(obstacles=None):
     cells = keep_out.map.grid.cells
     cells[cells == UNKNOWN] = FREE
     return keep_out
+
+
+def _state(keep_out, x, y):
+    """Return the state of the cell at a place (m)."""
+    grid = keep_out.map.grid
+    low, size = grid.numbers
+    return grid.cells[math.floor((y - low) / size), math.floor((x - low) / size)]
 
 
 @pytest.mark.parametrize('seed', range(30))
@@ -102,20 +109,27 @@ def test_robot_looks_before_it_enters_unseen_floor():
 def test_rays_clear_and_mark():
     """Floor up to a hit is free, the hit is occupied, and later rays beyond it clear it."""
     keep_out = KeepOut(PARAMETERS, LIMITS)
-    grid = keep_out.map.grid
-
-    def state(x, y):
-        low, size = grid.numbers
-        return grid.cells[math.floor((y - low) / size), math.floor((x - low) / size)]
-
     keep_out.add_reading(0, 0.5, ORIGIN)
-    assert state(0.3, 0.05) == FREE
-    assert state(0.601, 0.051) == OCCUPIED
-    assert state(0.7, 0.05) == UNKNOWN
+    assert _state(keep_out, 0.3, 0.05) == FREE
+    assert _state(keep_out, 0.601, 0.051) == OCCUPIED
+    assert _state(keep_out, 0.7, 0.05) == UNKNOWN
     for _ in range(6):
         keep_out.add_reading(0, math.inf, ORIGIN)
-    assert state(0.601, 0.051) == FREE
+    assert _state(keep_out, 0.601, 0.051) == FREE
     keep_out.add_reading(0, math.nan, ORIGIN)
+
+
+def test_an_obstacle_seen_again_must_be_cleared_anew():
+    """Misses from before it was last seen do not count: the robot would drive into it."""
+    keep_out = KeepOut(PARAMETERS, LIMITS)
+    pose = Pose(0.005, 0.0, 0.0)  # each ray passes once over the cell
+    for _ in range(3):
+        keep_out.add_reading(0, 0.5, pose)
+        for _ in range(CLEARINGS - 1):
+            keep_out.add_reading(0, math.inf, pose)
+            assert _state(keep_out, 0.605, 0.05) == OCCUPIED
+    keep_out.add_reading(0, math.inf, pose)
+    assert _state(keep_out, 0.605, 0.05) == FREE
 
 
 def test_drive_that_does_not_answer_is_paused():

@@ -418,6 +418,14 @@ def test_a_jump_of_the_pose_and_disorder_are_listed():
     assert parts(time, np.delete(time, np.s_[20:60])) == [(0.0, time[19]), (time[60], time[99])]
 
 
+@pytest.mark.parametrize('speed', [2.0, -2.0])
+def test_a_fast_robot_with_rare_messages_does_not_jump(speed):
+    """Also astern: the report of a robot that backs out of a dock lists no jump."""
+    time = np.arange(20.0)
+    places = np.stack([speed * time, np.zeros(20)], axis=1)
+    assert continuity_notes('/odom', time, time, places, np.full(20, speed)) == []
+
+
 def test_a_recorder_whose_clock_was_set_is_told(rows, tmp_path):
     later = [(t + (3600.0 if t > 20.0 else 0.0), topic, message) for t, topic, message in rows]
     figures = write_report(write(tmp_path / 'bag', later), tmp_path / 'out')

@@ -87,6 +87,17 @@ def test_a_fault_flashes_and_beeps_its_number(library, count):
     assert flashes(robot) == (count, 0)
 
 
+def test_every_fault_beeps_however_long_the_robot_has_stood(library):
+    """The beeps of a fault count from its beginning, not from that of the state before it."""
+    robot = Robot(library)
+    for _ in range(2):
+        robot.hello()
+        robot.run(10 * BOOT_US)
+        robot.send(robot.command(flags=2))
+        assert flashes(robot) == (2, 2)
+        robot.send(robot.command(flags=4))
+
+
 def test_a_low_battery_beeps_again(library):
     robot = Robot(library)
     robot.hello()

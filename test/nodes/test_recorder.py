@@ -25,7 +25,7 @@ from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.chaos.seed_fingerprint import matches_fingerprint
 from t3mpc_ros.nodes.common.base_node import ERROR, OK, WARN
 from t3mpc_ros.nodes.controller import ControllerNode
-from t3mpc_ros.nodes.recorder.metadata import SEED_RECORD
+from t3mpc_ros.nodes.recorder.metadata import SEED_RECORD, RecordingMetadata
 from t3mpc_ros.nodes.recorder.node import RecorderNode
 from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
@@ -384,6 +384,20 @@ def test_model_files_are_attached_to_every_file(harness, tmp_path):
     assert files(two) == files(one) | {'controller/saved_learnt.npz': output.read_bytes()}
     (tmp_path / 'again.npz').write_bytes(files(two)['controller/saved_learnt.npz'])
     assert load_model(tmp_path / 'again.npz').keys() == load_model(model).keys()
+
+
+def test_a_model_is_attached_only_if_this_run_has_saved_it(tmp_path):
+    """What an earlier run left in its place is not what this controller has learnt."""
+    output = tmp_path / 'learnt.npz'
+    output.write_bytes(b'weights')
+    metadata = RecordingMetadata([], 1000, True, 2_000_000_000)
+    metadata.add_parameters('controller', 'controller', {'model_output': str(output)}, 0)
+    os.utime(output, (1, 1))
+    assert metadata.saved_models(3_000_000_000) == []
+    os.utime(output, (3, 3))
+    assert [item.name for item in metadata.saved_models(4_000_000_000)] == [
+        'controller/saved_learnt.npz'
+    ]
 
 
 def test_parameters_of_a_restarted_node_are_recorded_again(harness, tmp_path):

@@ -18,7 +18,7 @@ from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.port_actions import LinkState
 from t3mpc_ros.radio.link.setpoint import SetpointArbiter
 from t3mpc_ros.radio.link.statistics import DiagnosticLevel, LinkStatistics
-from t3mpc_ros.radio.link.telemetry import TelemetryDecoder
+from t3mpc_ros.radio.link.telemetry import CommandTiming, TelemetryDecoder
 from t3mpc_ros.radio.link.transaction import TransactionLayer
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import encode
@@ -309,6 +309,13 @@ def test_a_state_not_newer_than_the_last_is_dropped():
     assert decoder.decode(new, 61 * MS) is None
     assert decoder.decode(robot.state(80 * MS), 81 * MS) is not None
     assert not decoder.rebooted
+
+
+def test_a_sample_is_stamped_by_its_age_since_the_command():
+    """The age counts in 10 us from the reception of the CMD, sent at 20 ms and 1 ms on its way."""
+    state = FakeRobot().state(25 * MS)._replace(age=400)
+    telemetry = TelemetryDecoder().decode(state, 30 * MS, CommandTiming(20 * MS, MS))
+    assert telemetry.stamp_ns == 25 * MS
 
 
 @pytest.mark.parametrize('skew', few_of([0.005, -0.005]))

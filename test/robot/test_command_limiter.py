@@ -326,6 +326,18 @@ def test_ramp_does_not_jump_after_a_long_pause():
     assert limiter.advance(60_000 * MS, 0.01).wheels.right == pytest.approx(0.6)
 
 
+def test_a_robot_that_stopped_by_itself_starts_from_standstill():
+    """A bridge that was suspended must not send a standing robot the speed from before."""
+    limiter = make_limiter()
+    for now in range(0, 250, 10):
+        limiter.accept(command(5.0, 5.0, now), now * MS)
+        before = limiter.advance(now * MS, 0.01)
+    assert before.wheels.right == pytest.approx(5.0)
+    limiter.assume_standstill()
+    limiter.accept(command(5.0, 5.0, 2000), 2000 * MS)
+    assert limiter.advance(2000 * MS, 0.01).wheels.right == pytest.approx(0.3)
+
+
 def test_limits_change_while_running():
     limiter = make_fast_limiter()
     limiter.accept(command(10.0, 10.0), 0)

@@ -153,6 +153,18 @@ def test_one_page_too_many_is_refused(page):
     assert (status, 'close one' in text) == (503, True)
 
 
+def test_a_closed_page_makes_room_for_another(page):
+    """A page that is loaded again and again must not be refused after the eighth time."""
+    for _ in range(MAX_READERS):
+        stream = page.events()
+        page.server.data.set('page', id(stream))
+        next(stream)
+        stream.close()
+    # The server notices a closed connection when it writes to it, once a second at least.
+    for _ in range(MAX_READERS):
+        assert page.server.readers.acquire(timeout=20.0)
+
+
 def test_a_port_in_use_is_an_error_with_a_remedy(page):
     with pytest.raises(OSError, match=r'port \d+ of 127.0.0.1 is not free .*--port'):
         PageServer(LiveData(), None, page.server.port)
