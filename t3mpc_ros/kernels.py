@@ -4,10 +4,11 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 import hashlib
+from importlib import import_module
 import os
 from pathlib import Path
 import tempfile
-from typing import Any, ParamSpec, Self, TypeVar, cast
+from typing import Any, Generic, ParamSpec, Self, TypeVar, cast
 
 import numba
 from numba.core import caching, config
@@ -17,6 +18,8 @@ from numba.core.dispatcher import _FunctionCompiler  # type: ignore[attr-defined
 from numba.core.registry import CPUDispatcher
 from numba.core.types.misc import unliteral
 from numba.core.typing import make_concrete_template
+import numpy as np
+from numpy.typing import NDArray
 
 P = ParamSpec('P')
 R = TypeVar('R')
@@ -227,3 +230,46 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     compiled = _Kernel(function)
     compiled.enable_caching()
     return cast('Callable[P, R]', compiled)
+
+
+class TypedKernel(Generic[P, R]):
+    """A kernel that is always called with arguments of the same types.
+
+    A kernel examines its arguments at every call, each array of a named tuple by itself, which
+    takes longer than most kernels run. This one examines those of its first call only: later ones
+    must have the same types, and arrays the same layout.
+    """
+
+    def __init__(self, function: Callable[P, R]) -> None:
+        self._function = function
+        self._code: Callable[P, R] | None = None
+
+    def __call__(self, *arguments: P.args, **none: P.kwargs) -> R:
+        """Return what the kernel returns; all arguments are positional."""
+        code = self._code or self._compile(arguments)
+        return code(*arguments, **none)
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Return how it is copied and pickled: by the name of the kernel, without the code."""
+        return _typed_kernel, (self._function.__module__, self._function.__name__)
+
+    def _compile(self, arguments: Sequence[object]) -> Callable[P, R]:
+        compiled = cast('_Kernel', self._function)
+        # The first call may have an integer where later ones have a float.
+        hints = compiled.py_func.__annotations__.values()
+        types = tuple(
+            numba.float64 if hint is float else numba.typeof(argument)
+            for hint, argument in zip(hints, arguments, strict=False)
+        )
+        code: Callable[P, R] = compiled.compile(types)
+        self._code = code
+        return code
+
+
+def contiguous(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return ``values`` as a :class:`TypedKernel` needs them; itself, if it is so."""
+    return np.ascontiguousarray(values, dtype=np.float64)
+
+
+def _typed_kernel(module: str, name: str) -> TypedKernel[..., object]:
+    return TypedKernel(getattr(import_module(module), name))

@@ -2,8 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kernel decorator: floating-point behaviour, and a cache that is writable and up to date."""
 
+from copy import deepcopy
 import os
 from pathlib import Path
+import pickle
 import shutil
 import subprocess
 import sys
@@ -12,7 +14,8 @@ from numba.core.errors import TypingError
 import numpy as np
 import pytest
 
-from t3mpc_ros.kernels import cache_directory, kernel, source_fingerprint
+from t3mpc_ros.control.command_shaper import row_at
+from t3mpc_ros.kernels import TypedKernel, cache_directory, kernel, source_fingerprint
 
 
 def test_division_by_zero_gives_infinity_not_an_exception():
@@ -38,6 +41,26 @@ def test_a_kernel_that_others_call_is_compiled_with_them():
     assert not square.signatures
     assert square(3) == 9
     assert len(square.signatures) == 1
+
+
+def test_a_typed_kernel_takes_a_fraction_after_an_integer():
+    """The types are those of its first arguments: 0.5 s after 1 s would have been 0 s."""
+
+    @kernel
+    def half(duration: float) -> float:
+        return 0.5 * duration
+
+    typed = TypedKernel(half)
+    assert [typed(1), typed(0.5)] == [0.5, 0.25]
+
+
+def test_a_typed_kernel_is_copied_and_pickled_after_a_call():
+    """Studies copy controllers, and send them to other processes; compiled code cannot be sent."""
+    typed = TypedKernel(row_at)
+    rows = np.array([[1.0], [3.0]])
+    assert typed(rows, 0, 0.5) == 2.0
+    for other in (deepcopy(typed), pickle.loads(pickle.dumps(typed))):
+        assert other(rows, 0, 0.25) == 1.5
 
 
 def test_a_kernel_that_allocates_an_array_is_rejected():

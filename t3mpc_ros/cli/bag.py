@@ -468,8 +468,6 @@ def run_replay(options: argparse.Namespace) -> int:
         make_controllers,
         replay_controller,
     )
-    from t3mpc_ros.evaluation.process_replay.golden_bags import write_replay
-    from t3mpc_ros.evaluation.process_replay.method_replay import replay_method
 
     changes = parse_assignments(ControllerParameters, options.parameters)
     model = load_model(options.model) if options.model else None
@@ -477,6 +475,8 @@ def run_replay(options: argparse.Namespace) -> int:
     inputs = load_inputs(options.bag, options.namespace, model)
     read = time.perf_counter()
     if options.method:
+        from t3mpc_ros.evaluation.process_replay.method_replay import replay_method
+
         ready = read
         again = replay_method(inputs, options.method, changes)
     else:
@@ -496,6 +496,8 @@ def run_replay(options: argparse.Namespace) -> int:
     if options.method or changes or options.model:
         print(OPEN_LOOP)
     if options.output:
+        from t3mpc_ros.evaluation.process_replay.golden_bags import write_replay
+
         print(f'written to {write_replay(inputs, again, options.output)}')
     return 0
 

@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, estimate
 from t3mpc_ros.fuzzy.inference import FuzzyTables
 from t3mpc_ros.fuzzy.sets import FuzzyParameters
-from t3mpc_ros.kernels import kernel
+from t3mpc_ros.kernels import TypedKernel, kernel
 from t3mpc_ros.parameters.table import Parameters, group, parameter
 
 Array = NDArray[np.float64]
@@ -172,6 +172,7 @@ class BodyCorrection:
             np.zeros(ERROR_POWER + 1), np.zeros((HISTORY, 2)), np.zeros(2), np.zeros(1)
         )
         self._memory = self._state.sums
+        self._correct_body = TypedKernel(correct_body)
         self.configure(parameters)
 
     def configure(self, parameters: BodyCorrectionParameters) -> None:
@@ -260,19 +261,17 @@ class BodyCorrection:
         learn
             Whether the map adapts.
         """
-        return float(
-            correct_body(
-                yaw,
-                elapsed,
-                reference,
-                planned,
-                sent,
-                delay,
-                learn,
-                self._constants,
-                self._state,
-                self.fuzzy.tables,
-            )
+        return self._correct_body(
+            yaw,
+            elapsed,
+            reference,
+            planned,
+            sent,
+            delay,
+            learn,
+            self._constants,
+            self._state,
+            self.fuzzy.tables,
         )
 
 

@@ -106,8 +106,16 @@ class CommandShaper:
             Time since the last step (s); over a gap the reference is interpolated.
         """
         count = min(max(round(elapsed / self._period), 1), len(self._planned))
-        shape(self._planned, planned, count, self._ahead, self._delays, self.reference, self.rate)
-        self.rate /= self._period
+        shape(
+            self._planned,
+            planned,
+            count,
+            self._ahead,
+            self._delays,
+            self._period,
+            self.reference,
+            self.rate,
+        )
 
 
 @kernel
@@ -117,17 +125,19 @@ def shape(
     count: int,
     ahead: int,
     delays: Array,
+    period: float,
     reference: Array,
-    change: Array,
+    rate: Array,
 ) -> None:
-    """Append a row, and write the shaped reference and its change in one period.
+    """Append a row, and write the shaped reference and its rate of change.
 
     rows      : shape (2 ahead + 2, 2), newest first: mean of the wheels, half their difference
     planned   : shape (2,), newest reference, right wheel first, rad/s
     count     : number of periods since the last row; rows between are interpolated
     ahead     : number of periods by which the newest row is ahead of the instant
     delays    : shape (2,), d of both columns in periods
-    reference, change : shape (2,), overwritten, right wheel first, rad/s
+    period    : s
+    reference, rate : shape (2,), overwritten, right wheel first, rad/s and rad/s²
     """
     newest = (0.5 * (planned[0] + planned[1]), 0.5 * (planned[0] - planned[1]))
     for i in range(2):
@@ -139,8 +149,8 @@ def shape(
     mean, half = shaped_row(rows, float(ahead), delays)
     reference[0], reference[1] = mean + half, mean - half
     mean, half = shaped_row(rows, ahead - 1.0, delays)
-    change[0] = mean + half - reference[0]
-    change[1] = mean - half - reference[1]
+    rate[0] = (mean + half - reference[0]) / period
+    rate[1] = (mean - half - reference[1]) / period
 
 
 @kernel

@@ -20,7 +20,7 @@ from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, adapt, estimate
 from t3mpc_ros.fuzzy.inference import FuzzyTables
 from t3mpc_ros.fuzzy.sets import FuzzyParameters
-from t3mpc_ros.kernels import kernel
+from t3mpc_ros.kernels import TypedKernel, contiguous, kernel
 from t3mpc_ros.mpc.predictive_controller import (
     PredictiveController,
     PredictiveParameters,
@@ -393,6 +393,8 @@ class Nt3fsMpcController:
         )
         self.saturated = False
         """Whether a limit changed the last command."""
+        self._step_law = TypedKernel(step_law)
+        self._set_applied_term = TypedKernel(set_applied_term)
         self._gains = self._law_gains()
         self.reset()
 
@@ -514,11 +516,12 @@ class Nt3fsMpcController:
         future_jumps
             Future jumps of the error, see :meth:`PredictiveController.step`.
         """
+        speeds, reference = contiguous(speeds), contiguous(reference)
         self.predictive.advance(speeds, reference, future_jumps)
-        if not step_law(
+        if not self._step_law(
             speeds,
             reference,
-            reference_rate,
+            contiguous(reference_rate),
             dt,
             self.saturated,
             self._gains,
@@ -542,7 +545,9 @@ class Nt3fsMpcController:
             not an estimation error, and the predictor uses the applied part of v_p.
         """
         self.saturated = saturated
-        if saturated and not set_applied_term(acceleration, self._output, self.predictive.signals):
+        if saturated and not self._set_applied_term(
+            contiguous(acceleration), self._output, self.predictive.signals
+        ):
             raise ValueError(f'acceleration must be finite: got {acceleration}')
 
     def _law_gains(self) -> 'LawGains':

@@ -52,7 +52,7 @@ from t3mpc_ros.geometry.types import (
     State,
     WheelSpeeds,
 )
-from t3mpc_ros.kernels import kernel
+from t3mpc_ros.kernels import TypedKernel, kernel
 from t3mpc_ros.parameters.table import ParameterError, group, parameter, with_default
 
 Array = NDArray[np.float64]
@@ -191,9 +191,9 @@ class Status(NamedTuple):
     @property
     def scalars(self) -> list[float]:
         """Values of the :data:`SCALAR_NAMES`; NaN where there is none."""
-        pairs = self.error, self.estimate, self.skill, *self.terms, self.applied
-        certificate = self.certificate
-        return [*np.concatenate(pairs).tolist(), certificate.value, certificate.margin]
+        pairs = self.error, self.estimate, self.skill, self.terms.ravel(), self.applied
+        value, rate, bound, _ = self.certificate_state.tolist()
+        return [*np.concatenate(pairs).tolist(), value, bound - rate]
 
 
 class Controller:
@@ -245,6 +245,7 @@ class Controller:
         """Time by which the plan is ahead of the command, ns; 0 without a known future."""
         self._sampling = Sampling.of(parameters)
         self._sampled = SampledReference(*np.zeros((4, 2)))
+        self._sample_reference = TypedKernel(sample_reference)
         self._watchdog = InputWatchdog(parameters.watchdog)
         self._response = ResponseMonitor(parameters.watchdog, self._period)
         limits = parameters.limits
@@ -415,7 +416,7 @@ class Controller:
         plan_ns = effect_ns + self._ahead_ns
         speeds, reference, begin, end = self._sampled
         twist = odometry.twist
-        known, speed, error = sample_reference(
+        known, speed, error = self._sample_reference(
             self._trajectory.buffer,
             stamp,
             plan_ns,
@@ -480,13 +481,14 @@ class Controller:
     ) -> Array:
         """Return u (rad/s²), shape (2,), for the plan from ``begin`` to ``end`` (rad/s)."""
         tracker, speeds = self._tracker, self._actuation.predicted
-        if self._ahead_ns == 0 and not self._corrects_body:
+        corrects_body = self.parameters.composition == 'body' and self.parameters.body.enabled
+        if self._ahead_ns == 0 and not corrects_body:
             return tracker.step(plan_ns, speeds, begin, end, elapsed)
         planned, rate = tracker.plan(plan_ns, begin, end)
         if self._ahead_ns > 0:
             self._shaper.step(planned, elapsed)
             planned, rate = self._shaper.reference, self._shaper.rate
-        if self._corrects_body:
+        if corrects_body:
             filtered = self.parameters.speed_filter
             correction = self._body.step(
                 yaw,
@@ -523,11 +525,6 @@ class Controller:
             change = end - begin
         begin[:] = wheels_from_twist(twist, geometry)
         end[:] = begin + change
-
-    @property
-    def _corrects_body(self) -> bool:
-        parameters = self.parameters
-        return parameters.composition == 'body' and parameters.body.enabled
 
     def _plan_ahead(self, effect_ns: int) -> int:
         """Return the lead of the shaper, ns; 0 if the reference is not known that far ahead."""
@@ -606,7 +603,7 @@ class Controller:
     def _rollback(self, snapshot: tuple[Any, Any]) -> None:
         """Restore the weights of a snapshot."""
         weights, body = snapshot
-        if self.parameters.composition == 'paper':
+        if weights:
             self.law.set_weights(weights)
         self._body.rollback(body)
 
@@ -617,7 +614,8 @@ class Controller:
         self._steps_since_snapshot += 1
         if self._steps_since_snapshot >= self._snapshot_steps:
             self._steps_since_snapshot = 0
-            self._snapshots.append((self.law.get_weights(), self._body.snapshot()))
+            learnt = self.law.get_weights() if self.parameters.composition == 'paper' else {}
+            self._snapshots.append((learnt, self._body.snapshot()))
 
     def _announce_jumps(self, stamp_ns: int, effect_ns: int) -> None:
         """Announce jumps to the transition: in advance with preview, else when they occur."""

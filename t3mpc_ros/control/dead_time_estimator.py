@@ -209,9 +209,9 @@ class DeadTimeEstimator:
     @property
     def dead_time_in_use(self) -> float:
         """The configured dead time, or the estimate where it clearly differs, s."""
-        difference = abs(self.dead_time - self._configured)
-        clear = max(USED_DIFFERENCE, USED_DEVIATIONS * self.standard_deviation)
-        return self.dead_time if difference > clear else self._configured
+        dead_time, deviation = self.state[SCALARS, : DEVIATION + 1].tolist()
+        clear = max(USED_DIFFERENCE, USED_DEVIATIONS * deviation)
+        return dead_time if abs(dead_time - self._configured) > clear else self._configured
 
     @property
     def standard_deviation(self) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.geometry.types import Pose
-from t3mpc_ros.kernels import kernel
+from t3mpc_ros.kernels import TypedKernel, kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
 
 Array = NDArray[np.float64]
@@ -104,6 +104,7 @@ class FreeSpaceMap:
             np.array([low, parameters.resolution]),
         )
         """The cells."""
+        self._add_ray = TypedKernel(add_ray)
         self.clear()
 
     def clear(self) -> None:
@@ -144,7 +145,7 @@ class FreeSpaceMap:
         near = reading == -math.inf
         hit = 0.0 if near else min(reading, limit)
         error = parameters.error_floor + parameters.error_growth * hit * hit
-        add_ray(
+        self._add_ray(
             self.grid,
             pose.x + cosine * ahead - sine * aside,
             pose.y + sine * ahead + cosine * aside,

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.kernels import kernel
+from t3mpc_ros.kernels import TypedKernel, contiguous, kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
 
 Array = NDArray[np.float64]
@@ -121,6 +121,7 @@ class JumpTransition:
             np.zeros((8, 4, 2)), np.zeros(8, dtype=np.int64), np.zeros(8, dtype=np.bool_)
         )
         self._plan = Plan(np.zeros(2), np.zeros(2), np.zeros((4, 2)))
+        self._step_transitions = TypedKernel(step_transitions)
 
     @property
     def reachable(self) -> Array:
@@ -226,12 +227,12 @@ class JumpTransition:
         reference, reference_next
             r at that instant and one period later, including its jumps, rad/s, shape (2,).
         """
-        self.count = step_transitions(
+        self.count = self._step_transitions(
             self._transitions,
             self.count,
             now_ns,
-            reference,
-            reference_next,
+            contiguous(reference),
+            contiguous(reference_next),
             self._period,
             self._lag,
             self._parameters.acceleration,

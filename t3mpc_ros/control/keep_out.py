@@ -41,7 +41,7 @@ from t3mpc_ros.control.free_space_map import (
 )
 from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.types import STANDSTILL, BodyTwist, Pose, wrap_angle
-from t3mpc_ros.kernels import kernel
+from t3mpc_ros.kernels import TypedKernel, kernel
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
 
 Array = NDArray[np.float64]
@@ -164,6 +164,7 @@ class KeepOut:
         self._limits = limits
         self._nearest = np.zeros((SECTORS, 4))
         self._rows = np.zeros((2 * SECTORS + 4, 3))
+        self._find_nearest = TypedKernel(find_nearest)
         self.reset()
 
     def reset(self) -> None:
@@ -236,7 +237,7 @@ class KeepOut:
 
     def _reshaped(self, wanted: BodyTwist, pose: Pose, elapsed: float) -> BodyTwist:
         """Return the permitted twist, or one that looks around."""
-        find_nearest(self.map.grid, pose.x, pose.y, pose.yaw, self._nearest)
+        self._find_nearest(self.map.grid, pose.x, pose.y, pose.yaw, self._nearest)
         if self._targets:
             self.changed = True
             self.activity = Activity.LOOKING

@@ -20,17 +20,13 @@ Far from its reference, after a detour, the robot drives to it (*rejoining*): it
 velocity that closes the gap, and drives on as far as it faces it.
 """
 
+from bisect import bisect_right
 from dataclasses import dataclass
 import math
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, Pose, State, wrap_angle
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -124,41 +120,36 @@ class PoseReference:
     """Poses of the reference at their stamps, interpolated; the newest ones are kept."""
 
     def __init__(self, capacity: int = 512) -> None:
-        self._stamps: NDArray[np.int64] = np.zeros(2 * capacity, dtype=np.int64)
-        self._poses: Array = np.zeros((2 * capacity, 3))
         self._capacity = capacity
-        self.clear()
+        self._stamps: list[int] = []
+        self._poses: list[Pose] = []
 
     def clear(self) -> None:
         """Remove every pose."""
-        self._first = self._end = 0
+        self._stamps.clear()
+        self._poses.clear()
 
     def add(self, reference: State) -> None:
         """Add the pose of a sample; poses from its stamp on are removed first."""
-        while self._end > self._first and self._stamps[self._end - 1] >= reference.stamp_ns:
-            self._end -= 1
-        if self._end == len(self._stamps):
-            kept = self._end - self._first
-            self._stamps[:kept] = self._stamps[self._first : self._end]
-            self._poses[:kept] = self._poses[self._first : self._end]
-            self._first, self._end = 0, kept
-        self._stamps[self._end] = reference.stamp_ns
-        self._poses[self._end] = reference.pose
-        self._end += 1
-        self._first = max(self._first, self._end - self._capacity)
+        stamps, poses = self._stamps, self._poses
+        while stamps and stamps[-1] >= reference.stamp_ns:
+            del stamps[-1], poses[-1]
+        stamps.append(reference.stamp_ns)
+        poses.append(reference.pose)
+        if len(stamps) > self._capacity:
+            del stamps[0], poses[0]
 
     def at(self, stamp_ns: int) -> Pose | None:
         """Return the pose at a stamp, before the first and after the last one that; or None."""
-        if self._first == self._end:
+        stamps, poses = self._stamps, self._poses
+        if not stamps:
             return None
-        stamps = self._stamps[self._first : self._end]
-        poses = self._poses[self._first : self._end]
-        after = int(np.searchsorted(stamps, stamp_ns, side='right'))
+        after = bisect_right(stamps, stamp_ns)
         if after in (0, len(stamps)):
-            return Pose(*poses[min(after, len(stamps) - 1)].tolist())
-        begin, end = int(stamps[after - 1]), int(stamps[after])
+            return poses[min(after, len(stamps) - 1)]
+        begin, end = stamps[after - 1 : after + 1]
         share = (stamp_ns - begin) / (end - begin)
-        (x0, y0, yaw0), (x1, y1, yaw1) = poses[after - 1].tolist(), poses[after].tolist()
+        (x0, y0, yaw0), (x1, y1, yaw1) = poses[after - 1 : after + 1]
         return Pose(
             x0 + share * (x1 - x0),
             y0 + share * (y1 - y0),

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, State
-from t3mpc_ros.kernels import kernel
+from t3mpc_ros.kernels import TypedKernel, kernel
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
@@ -61,6 +61,7 @@ class ReferenceTrajectory:
 
     def __init__(self, jump: BodyTwist, capacity: int = 512) -> None:
         self._capacity = capacity
+        self._write_sample = TypedKernel(write_sample)
         # Twice as long as needed: every ``capacity`` samples the newest ones move to the front.
         self.buffer = TrajectorySamples(
             np.zeros(2 * capacity, dtype=np.int64),
@@ -99,7 +100,7 @@ class ReferenceTrajectory:
         bounds[:] = first, last + 1
         self.newest_ns = stamp_ns
         twist = sample.twist
-        if write_sample(self.buffer, stamp_ns, twist.linear, twist.angular):
+        if self._write_sample(self.buffer, stamp_ns, twist.linear, twist.angular):
             self._add_jump(last)
         return True
 

@@ -10,7 +10,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.kernels import kernel
+from t3mpc_ros.kernels import TypedKernel, kernel
 from t3mpc_ros.mpc.boltzmann_machine import (
     LayerSizes,
     make_machine,
@@ -488,6 +488,8 @@ class PredictiveController:
             make_workspace(moves),
             np.zeros(outputs, dtype=np.int64),
         )
+        self._accumulate_sample = TypedKernel(accumulate_sample)
+        self._step_kernel = TypedKernel(predictive_step)
         self.parameters = parameters
         self.configure(parameters, feedback_gain)
         self.pretrain()
@@ -682,7 +684,7 @@ class PredictiveController:
         ValueError
             A shape is wrong or an error is not finite; nothing is changed.
         """
-        errors = np.asarray(errors, dtype=np.float64)
+        errors = np.ascontiguousarray(errors, dtype=np.float64)
         if errors.shape != self.status.shape:
             raise ValueError(f'errors must have shape {self.status.shape}: got {errors.shape}')
         if self.due and known_change is not None:
@@ -691,7 +693,7 @@ class PredictiveController:
                 raise ValueError(
                     f'known_change must be {rows} by {columns} finite numbers: got {known_change}'
                 )
-            known_change = np.asarray(known_change, dtype=np.float64)
+            known_change = np.ascontiguousarray(known_change, dtype=np.float64)
         self.advance(errors, self._zeros, known_change)
         return self.signals.v.copy()
 
@@ -699,7 +701,7 @@ class PredictiveController:
         """Update ``signals`` like :meth:`step`, without shape checks."""
         timing, phase = self._timing, self.phase
         sampled = phase == 0 or phase > timing.decimation - timing.average
-        if not accumulate_sample(
+        if not self._accumulate_sample(
             speeds, reference, sampled, phase == 0, self._constants.decay, self.signals
         ):
             raise ValueError(f'errors must be finite: got {speeds - reference}')
@@ -727,7 +729,7 @@ class PredictiveController:
         if self._constants.dithered:
             next_dither = self._generator.uniform(-1.0, 1.0, self.status.size)
             self.signals.next_dither[:] = self.parameters.dither * next_dither
-        predictive_step(
+        self._step_kernel(
             self._wheels,
             self.signals,
             self._responses,

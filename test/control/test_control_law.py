@@ -13,12 +13,14 @@ from t3mpc_ros.control.control_law import (
     TANH_GAP,
     Certificate,
     LawParameters,
+    Nt3fsMpcController,
     Nt3fsMpcParameters,
     compensator,
     law_terms,
     lyapunov_rate_bound,
     lyapunov_value,
 )
+from t3mpc_ros.control.jump_transition import JumpTransition, JumpTransitionParameters
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator
 from t3mpc_ros.fuzzy.sets import FuzzyParameters
 from t3mpc_ros.geometry.kinematics import WheelGeometry
@@ -274,3 +276,27 @@ def test_certificate_holds_for_a_decaying_error_only():
         reading = watch.update(np.array([1.0, 1.0]) * (1.0 + 0.05 * k), law, 0.0, 0.01)
     assert not reading.holds
     assert reading.margin < 0.0
+
+
+def test_the_law_takes_columns_and_integers_after_plain_arrays():
+    """Its kernels keep the types of their first arguments and would misread other arrays."""
+    numbers = np.random.default_rng(1).integers(-9, 9, (6, 3, 2))
+    forms = [
+        lambda values: values.astype(np.float64),
+        lambda values: np.stack([values, values + 1.0], axis=1)[:, 0],
+        lambda values: values,
+    ]
+
+    def run(forms):
+        law = Nt3fsMpcController(Nt3fsMpcParameters())
+        transition = JumpTransition(JumpTransitionParameters(), 0.02, 0.01)
+        outputs = []
+        for k, triple in enumerate(numbers):
+            speeds, now, later = map(forms[k % len(forms)], triple)
+            transition.step(k * 10_000_000, now, later)
+            u = law.step(speeds, now, later, 0.01).copy()
+            law.set_applied(now, saturated=True)
+            outputs.append([u, transition.rate.copy(), law.predictive.signals.applied.copy()])
+        return np.array(outputs)
+
+    np.testing.assert_array_equal(run(forms), run(forms[:1]))

@@ -24,7 +24,7 @@ from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     motions,
 )
 from t3mpc_ros.geometry.arena import Obstacles
-from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist, StateArray
+from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist, State
 from t3mpc_ros.simulation.world import WorldError, load_world
 
 Array = NDArray[np.float64]
@@ -81,7 +81,7 @@ def replay_controller(
     controllers = make_controllers(inputs, changes) if controllers is None else controllers
     answers = np.full((inputs.events.size, len(FIELDS)), math.nan)
     reasons: list[Reason | None] = [None] * len(answers)
-    odometry, references = motions(inputs.odometry), motions(inputs.references)
+    odometry, references = [*motions(inputs.odometry)], [*motions(inputs.references)]
     parameters = ControllerParameters()
     for life, controller in zip(inputs.lives, controllers, strict=True):
         for row, twist, status in _session_steps(controller, life, changes, odometry, references):
@@ -159,16 +159,16 @@ def _session_steps(
     controller: Controller,
     life: ControllerSession,
     changes: Mapping[str, object],
-    odometry: StateArray,
-    references: StateArray,
+    odometry: Sequence[State],
+    references: Sequence[State],
 ) -> Iterator[tuple[int, BodyTwist, Status]]:
     """Process the events of one life in their order; yield row, command and status of each."""
     taken = life.taken
     inputs = np.stack([taken.odometry, taken.begin, taken.end], axis=1).tolist()
     rows = zip(life.events.tolist(), life.rows[:, 4].tolist(), inputs, strict=True)
     for row, (event, value, (received, begin, end)) in enumerate(rows, life.first):
-        for j in range(begin, end):
-            controller.add_reference(references[j])
+        for reference in references[begin:end]:
+            controller.add_reference(reference)
         if event == _STEP:
             if received >= 0:
                 yield row, *controller.step(odometry[received])
