@@ -7,11 +7,11 @@ import time
 import numpy as np
 import pytest
 import rclpy
-from rclpy.executors import SingleThreadedExecutor
 from support.ros_graph import TIMEOUT, diagnostic, is_ok
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.nodes import composed
+from t3mpc_ros.nodes.common.entry_point import make_executor
 from t3mpc_ros.nodes.registry import NODES
 from t3mpc_ros.parameters.table import ParameterError
 
@@ -49,7 +49,7 @@ def test_composed_runs_with_stamped_commands_in_any_order(order, compose, tmp_pa
 
     nodes = compose('enable_stamped_cmd_vel:=true', *filter(None, [order]))
     assert nodes.keys() == set(NODES) - {'radio_bridge', 'player'}
-    executor = SingleThreadedExecutor()
+    executor = make_executor()
     for node in nodes.values():
         executor.add_node(node)
     deadline = time.monotonic() + TIMEOUT

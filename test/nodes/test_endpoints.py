@@ -2,19 +2,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """QoS of the endpoints: best-effort robots, overrides, mismatches in the diagnostics."""
 
+import sys
+
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 import pytest
 from rcl_interfaces.msg import Log
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from support.ros_graph import LATCHED, diagnostic, odometry, reason, twist
 
 from t3mpc_ros.nodes.common import qos
-from t3mpc_ros.nodes.common.base_node import WARN
+from t3mpc_ros.nodes.common.base_node import WARN, BaseNode
+from t3mpc_ros.nodes.common.entry_point import make_executor
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
-from t3mpc_ros.parameters.table import ParameterError
+from t3mpc_ros.parameters.table import ParameterError, Parameters
 
 pytestmark = pytest.mark.ros
 
@@ -119,6 +123,36 @@ def test_the_command_has_the_type_that_the_robot_expects(expected, harness):
         'the type has not changed',
     )
     assert reason(controller) == 'stopped: no odometry'
+
+
+@pytest.mark.parametrize('events', [True, False])
+def test_each_executor_serves_callbacks_and_leaves_polled_messages(events, harness, monkeypatch):
+    """Executors differ: one passes message and information as a tuple and asks no group."""
+    if not events:  # rclpy before 7.1.4
+        monkeypatch.setitem(sys.modules, 'rclpy.experimental', None)
+    executor = make_executor()
+    assert isinstance(executor, SingleThreadedExecutor) != events
+    node = BaseNode('listener', Parameters)
+    received = []
+    node.create_matching_subscription(
+        Twist, 'called', lambda *arguments: received.append(arguments), qos.STREAM
+    )
+    polled = node.create_matching_subscription(Twist, 'polled', None, qos.STREAM)
+    executor.add_node(node)
+    try:
+        for topic in ('polled', 'called'):
+            harness.connected_publisher(Twist, topic).publish(twist(0.25))
+        while not received:
+            executor.spin_once(timeout_sec=0.05)
+        ((message, info),) = received
+        assert message.linear.x == 0.25
+        assert info['source_timestamp'] > 0
+        assert [each.linear.x for each in polled.take_waiting()] == [0.25]
+        assert polled.held.topic_name not in {each.topic_name for each in node.subscriptions}
+    finally:
+        executor.remove_node(node)
+        executor.shutdown()
+        node.destroy_node()
 
 
 def test_the_type_is_kept_while_another_robot_expects_it(harness):

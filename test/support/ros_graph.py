@@ -10,7 +10,6 @@ from nav_msgs.msg import Odometry
 import numpy as np
 import rclpy
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -18,6 +17,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.common import conversions
 from t3mpc_ros.nodes.common.base_node import OK
+from t3mpc_ros.nodes.common.entry_point import make_executor
 from t3mpc_ros.nodes.composed import ComposedNode
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.player.node import PlayerNode
@@ -51,7 +51,7 @@ class NodeHarness:
     """Nodes in one executor, and a probe node that publishes, subscribes and calls services."""
 
     def __init__(self):
-        self._executor = SingleThreadedExecutor()
+        self._executor = make_executor()
         self._nodes = []
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._foreign_nodes = []

@@ -108,8 +108,8 @@ class BaseNode(Node, Generic[P]):
     ) -> Publisher:
         """Return a publisher with the QoS overrides of the user.
 
-        The event callbacks of rclpy are left out: the executor would examine all of them in every
-        cycle, which takes longer than a control step. The diagnostics name QoS mismatches.
+        The event callbacks of rclpy are left out: an executor with a wait set examines all of them
+        in every cycle, which takes longer than a control step. Diagnostics name QoS mismatches.
         """
         options.setdefault('event_callbacks', _NO_PUBLISHER_EVENTS)
         return super().create_publisher(
@@ -129,11 +129,18 @@ class BaseNode(Node, Generic[P]):
             **options,
         )
 
+    @property
+    def subscriptions(self) -> Iterator[Subscription]:
+        """The subscriptions that an executor waits for."""
+        for each in super().subscriptions:
+            if not isinstance(each.callback_group, endpoints.PolledCallbackGroup):
+                yield each
+
     def create_matching_subscription(
         self,
         msg_type: type,
         topic: str,
-        callback: Callable[..., None] | None,
+        callback: Callable[[Any, dict[str, Any]], None] | None,
         profile: QoSProfile,
         *,
         raw: bool = False,

@@ -4,6 +4,7 @@
 
 from collections.abc import Callable, Iterable
 import copy
+import inspect
 from typing import Any, Literal
 
 from rclpy.callback_groups import CallbackGroup
@@ -70,7 +71,10 @@ def unused_overrides(node: Node) -> list[str]:
 
 
 class PolledCallbackGroup(CallbackGroup):
-    """A callback group whose entities the executor never waits for."""
+    """A callback group whose entities no executor waits for.
+
+    The events executor asks no callback group: a node leaves them out of its subscriptions.
+    """
 
     def can_execute(self, entity: object) -> bool:
         """Return False: the executor does not wait for the entity."""
@@ -86,6 +90,23 @@ class PolledCallbackGroup(CallbackGroup):
 
 def unused_callback(message: object) -> None:
     """Fill the mandatory callback argument of rclpy in a :class:`PolledCallbackGroup`."""
+
+
+class CallbackWithInfo:
+    """A callback that gets a message and its information, whichever executor calls it.
+
+    The events executor of rclpy 7.1 passes both as one tuple, the others as two arguments.
+    """
+
+    __signature__ = inspect.signature(lambda message, info: None)
+
+    def __init__(self, callback: Callable[[Any, dict[str, Any]], None]) -> None:
+        self._callback = callback
+
+    def __call__(self, *received: Any) -> None:
+        """Pass message and information on."""
+        message, info = received if len(received) == 2 else received[0]
+        self._callback(message, info)
 
 
 class MatchingSubscription:
@@ -104,8 +125,8 @@ class MatchingSubscription:
     topic
         Topic name.
     callback
-        Called with each message; None: the executor never waits for them, and the node takes them
-        with :meth:`take_waiting`. Each wait of the executor costs more than a step of the
+        Called with each message and its information; None: no executor waits for them, and the
+        node takes them with :meth:`take_waiting`. To be woken costs more than a step of the
         controller, so a node with two streams waits for one of them.
     profile
         Request while all publishers offer it.
@@ -118,13 +139,14 @@ class MatchingSubscription:
         node: Node,
         message: type,
         topic: str,
-        callback: Callable[..., None] | None,
+        callback: Callable[[Any, dict[str, Any]], None] | None,
         profile: QoSProfile,
         *,
         raw: bool = False,
     ) -> None:
         self._node = node
-        self._arguments = message, topic, callback or unused_callback
+        called = CallbackWithInfo(callback) if callback else unused_callback
+        self._arguments = message, topic, called
         self._group = None if callback else PolledCallbackGroup()
         self._raw = raw
         self._overridden = overriding_options(node, topic, 'subscription') is not None

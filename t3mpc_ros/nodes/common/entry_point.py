@@ -23,6 +23,8 @@ from t3mpc_ros.nodes.registry import node_module
 from t3mpc_ros.stop_signal import StopSignal
 
 if TYPE_CHECKING:
+    from rclpy.executors import Executor
+
     from t3mpc_ros.nodes.common.base_node import BaseNode
 
 USAGE_ERROR = 2
@@ -140,15 +142,29 @@ def run(name: str, stop: StopSignal, argv: Sequence[str]) -> int:
     return max((node.exit_code for node in nodes), default=0)
 
 
-def _spin(nodes: Sequence['BaseNode'], stop: StopSignal) -> None:
-    from rclpy.executors import SingleThreadedExecutor
+def make_executor() -> 'Executor':
+    """Return the executor that takes the least processor time: events, as of rclpy 7.1.4.
 
-    executor = SingleThreadedExecutor()
+    A wait set is built anew for every message: a node that only echoes 100 messages a second takes
+    twice the time with it.
+    """
+    try:
+        from rclpy.experimental import EventsExecutor
+    except ImportError:
+        from rclpy.executors import SingleThreadedExecutor
+
+        return SingleThreadedExecutor()
+    return EventsExecutor()
+
+
+def _spin(nodes: Sequence['BaseNode'], stop: StopSignal) -> None:
+    executor = make_executor()
     for node in nodes:
         executor.add_node(node)
         node.get_logger().info(f'{node.get_name()} ready')
     try:
-        # A Python signal handler runs only between two calls of the executor.
+        # A Python signal handler runs only between two calls of the executor. Without a limit of
+        # time, the events executor of rclpy 7.1 does not wait but takes a whole core.
         while not stop() and not any(node.exit_code or node.exit_requested for node in nodes):
             executor.spin_once(timeout_sec=0.1)
     finally:
