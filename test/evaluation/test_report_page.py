@@ -133,7 +133,6 @@ def test_a_person_looks_closely_at_a_run(report, browser, tmp_path):
     for scheme in ('light', 'dark'):
         for width, height in SIZES.items():
             browser.show_as(width, height, scheme)
-            assert browser.run('return document.documentElement.scrollWidth') <= width
             for part in ('.headline', '.notes li', '.tiles span', 'nav a', 'figcaption', '#all',
                          'th', '.chart h3 button', '.timeline .note', '.quiet'):  # fmt: skip
                 for element in browser.driver.find_elements('css selector', part)[:1]:
@@ -169,5 +168,4 @@ def test_a_comparison_is_drawn(browser, tmp_path):
         3,
     }
     browser.show_as(360, 800)
-    assert browser.run('return document.documentElement.scrollWidth') <= 360
     assert browser.errors() == []

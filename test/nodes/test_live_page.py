@@ -112,7 +112,6 @@ def test_a_person_watches_and_commands_a_robot(page, browser, processes, tmp_pat
     for scheme in ('light', 'dark'):
         for width, height in SIZES.items():
             browser.show_as(width, height, scheme)
-            assert browser.run('return document.documentElement.scrollWidth') <= width
             for part in ('headline', 'e-stop', 'floor-title', 'pose', 'answer', 'hold'):
                 assert browser.contrast(browser.find(part)) >= 4.5, (part, scheme)
 

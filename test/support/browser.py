@@ -10,6 +10,7 @@ import pytest
 
 WAIT = 60.0
 """Longest wait for a change of the page on a busy machine, s."""
+WIDTHS = 'return document.documentElement.scrollWidth'
 SIZES = {360: 800, 768: 1024, 1440: 1000}
 
 # WCAG 2: relative luminance of a colour, contrast ratio of text and background.
@@ -63,10 +64,22 @@ class Browser:
             time.sleep(0.1)
 
     def show_as(self, width, height, scheme='light'):
+        """Show the page in a window of that size, and wait until its parts fit into it.
+
+        Charts take their new width in a later frame than the window.
+        """
         metrics = {'width': width, 'height': height, 'deviceScaleFactor': 1, 'mobile': width < 500}
         self.driver.execute_cdp_cmd('Emulation.setDeviceMetricsOverride', metrics)
         feature = {'name': 'prefers-color-scheme', 'value': scheme}
         self.driver.execute_cdp_cmd('Emulation.setEmulatedMedia', {'features': [feature]})
+        self.wait(
+            lambda: self.run(
+                'return innerWidth === arguments[0] &&'
+                ' document.documentElement.scrollWidth <= innerWidth',
+                width,
+            ),
+            lambda: f'the page is {self.run(WIDTHS)} px wide in a window of {width} px',
+        )
 
     def contrast(self, element):
         """Return the contrast ratio of an element's text."""
