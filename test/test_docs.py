@@ -120,6 +120,7 @@ def _imported(path):
     return {file for file in found if (ROOT / file).exists()}
 
 
+@pytest.mark.slow
 def test_a_star_marks_exactly_the_unused_functions():
     marked = {(path, name) for path, name, star in FUNCTIONS if star}
     plain = {(path, name) for path, name, star in FUNCTIONS if not star}

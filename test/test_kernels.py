@@ -84,6 +84,7 @@ def test_fingerprint_depends_on_files_with_kernels_only(tmp_path):
     assert source_fingerprint(tmp_path) != before
 
 
+@pytest.mark.slow
 def test_equal_sources_share_compiled_code_wherever_they_are(tmp_path):
     """The compiler's cache is by path: each clone and each workspace compiled everything again."""
     package = Path(__file__).resolve().parent.parent / 't3mpc_ros'
@@ -131,6 +132,7 @@ def test_error_without_a_writable_folder_names_all_candidates(tmp_path, monkeypa
     assert str(blocked) in str(caught.value)
 
 
+@pytest.mark.slow
 def test_a_read_only_package_still_compiles_and_caches(tmp_path):
     """Numba's default cache beside the source fails for a read-only package.
 

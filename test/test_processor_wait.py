@@ -16,6 +16,8 @@ STARVED = """
 import time
 import pytest
 
+pytestmark = pytest.mark.slow
+
 def fail_slowly():
     end = time.monotonic() + 1.0
     while time.monotonic() < end:
@@ -34,8 +36,8 @@ BUSY = 'import time\nwhile True: time.monotonic()'
 
 @pytest.fixture
 def busy():
-    """Keep every processor busy twice."""
-    count = 2 * len(os.sched_getaffinity(0))
+    """Leave a further process half a processor."""
+    count = -(-3 * len(os.sched_getaffinity(0)) // 2)
     started = [subprocess.Popen([sys.executable, '-c', BUSY]) for _ in range(count)]
     yield {process.pid for process in started}
     for process in started:

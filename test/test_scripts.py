@@ -186,8 +186,8 @@ def test_a_stale_environment_is_updated(checkout):
             text.write('# changed\n')
         assert checkout.run('t3mpc').returncode == 0
         assert checkout.done() == UPDATE, name
-        checkout.run('t3mpc')
-        assert checkout.done() == [], name
+    checkout.run('t3mpc')
+    assert checkout.done() == []
 
 
 def test_compiled_files_beside_the_launch_file_are_ignored(checkout):
@@ -326,7 +326,7 @@ def test_check_runs_what_is_asked_for(checkout):
         found = [re.fullmatch(r'-m (.*?)(?: --ignore-glob .*| -n .*)?', test) for test in tests]
         assert [match.group(1) for match in found] == selected
     assert checkout.run('-k', 'name', script=check).returncode == 0
-    assert checkout.report('checks')[-1] == '-m pytest -k name'
+    assert '-m pytest -k name' in checkout.report('checks')
 
 
 def test_the_installer_is_uv_and_without_it_pip(checkout):

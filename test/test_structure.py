@@ -129,6 +129,7 @@ def _closure(module: str) -> set[str]:
 
 
 @pytest.mark.parametrize('path', SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
+@pytest.mark.slow
 def test_imports_follow_the_direction_of_the_packages(path):
     import sys
 
@@ -146,6 +147,7 @@ def test_imports_follow_the_direction_of_the_packages(path):
             assert top in allowed, f'{path} imports {name}'
 
 
+@pytest.mark.slow
 def test_only_the_serial_port_of_the_radio_imports_pyserial():
     users = [path for path in SOURCES if 'serial' in _imports(path)]
     assert users == [PACKAGE / 'radio' / 'serial_port.py']
@@ -190,6 +192,7 @@ def test_tests_mirror_the_packages():
     assert len(names) == len(set(names))
 
 
+@pytest.mark.slow
 def test_no_test_imports_another_test():
     for path in TESTS.rglob('*.py'):
         for name in _imports(path):
@@ -202,6 +205,7 @@ def test_names_of_tests_have_at_most_60_characters():
             assert len(name) <= 60, f'{path}: {name}'
 
 
+@pytest.mark.slow
 def test_functions_have_at_most_12_parameters():
     for path in SOURCES:
         for node in ast.walk(ast.parse(path.read_text())):
@@ -223,6 +227,7 @@ def test_version_is_the_same_everywhere():
     assert f'\n{t3mpc_ros.__version__} (' in (ROOT / 'CHANGELOG.rst').read_text()
 
 
+@pytest.mark.slow
 def test_package_xml_names_every_ros_package_that_is_imported():
     declared = {
         element.text
@@ -303,6 +308,7 @@ def _flat(tree: dict, prefix: str = '') -> dict:
     return result
 
 
+@pytest.mark.slow
 def test_no_file_carries_a_path_of_a_machine_or_a_registry_host():
     words = re.compile(
         r'/(work|root|home|farm|tmp)/[a-z]|https?://[^\s]*(pypi|pythonhosted|npmjs|crates)'

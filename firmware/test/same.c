@@ -14,7 +14,7 @@
 #include "t3_sensors.h"
 #include "t3_store.h"
 
-#define PACKETS 1500u
+#define PACKETS 750u
 #define SESSION 0x5Au
 
 // -- where it runs -------------------------------------------------------------------------------

@@ -142,6 +142,7 @@ def digest(kind, numbers):
     return value
 
 
+@pytest.mark.slow
 def test_everything_that_was_written_is_read(tmp_path, check):
     path = write(tmp_path / 'run', 600, chunk_bytes=32 * 1024)
     (found,) = found_by(check, path)

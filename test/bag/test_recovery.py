@@ -153,6 +153,7 @@ def own(tmp_path_factory):
 
 
 @pytest.mark.parametrize('places', few_of([150, 1000]))
+@pytest.mark.slow
 def test_a_truncated_bag_keeps_its_complete_chunks_only(places, own):
     whole, ends, end = inside(own).items, chunk_ends(own), end_of_data(own)
     assert len(ends) > 30
@@ -244,6 +245,7 @@ def is_subsequence(part, whole):
 
 
 @pytest.mark.parametrize('kind', ['own', 'lz4', 'none'])
+@pytest.mark.slow
 def test_flipped_bits_never_change_a_checksummed_message(own, kind):
     compression = CompressionType.LZ4 if kind == 'lz4' else CompressionType.NONE
     content = own if kind == 'own' else foreign_file(extras=False, compression=compression)
@@ -260,6 +262,7 @@ def test_flipped_bits_never_change_a_checksummed_message(own, kind):
         assert lost == 0 or not outcome.clean
 
 
+@pytest.mark.slow
 def test_many_flipped_bits_never_crash_the_recovery(own):
     rng = random.Random(9)
     unchunked = foreign_file(use_chunking=False)
@@ -357,6 +360,7 @@ def test_resynchronization_without_chunks_or_checksums():
                 assert len([item for item in kept if item not in whole]) <= 1, place
 
 
+@pytest.mark.slow
 def test_chunk_length_into_the_summary_keeps_records_in_between(own):
     """Bytes at the wrong position may look like the head of a truncated record."""
     place = make_reader(io.BytesIO(own)).get_summary().chunk_indexes[-3].chunk_start_offset

@@ -24,6 +24,8 @@ TIMEOUT = 30.0
 
 STAND_IN = """#!{python}
 import os, pathlib, signal, sys, time
+
+pytestmark = pytest.mark.slow
 name = pathlib.Path(sys.argv[0]).name
 pathlib.Path('{folder}', name + '.pid').write_text(str(os.getpid()))
 pathlib.Path('{folder}', name + '.domain').write_text(os.environ.get('ROS_DOMAIN_ID', ''))
@@ -260,7 +262,6 @@ def test_a_domain_with_a_participant_is_left_out():
 
 
 @pytest.mark.ros
-@pytest.mark.slow
 @pytest.mark.long
 def test_two_demos_at_once_do_not_meet(graph, tmp_path):
     demos = []

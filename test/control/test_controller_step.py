@@ -55,6 +55,7 @@ def test_the_command_never_exceeds_the_limits():
 
 
 @pytest.mark.parametrize('composition', ['body', 'paper'])
+@pytest.mark.slow
 def test_the_first_command_is_within_the_acceleration_limits(composition):
     """A standing robot with noise of 0.2 rad/s was commanded a step to the noise at once."""
     generator = np.random.default_rng(4)
@@ -474,6 +475,7 @@ print({name for name in after if after[name] != before[name]} or 'nothing')
 
 
 @pytest.mark.parametrize('parameters', ['ControllerParameters', 'StepperControllerParameters'])
+@pytest.mark.slow
 def test_after_the_warm_up_no_step_compiles(parameters):
     """A separate process, because other tests compile in this one."""
     done = subprocess.run(

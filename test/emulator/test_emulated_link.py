@@ -14,6 +14,8 @@ from t3mpc_ros.emulator.fault_injection import FAULT_KINDS
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.port_actions import LinkState
 
+pytestmark = pytest.mark.slow
+
 KEY = bytes(range(16))
 STEP = math.tau / 3200
 

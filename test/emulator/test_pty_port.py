@@ -4,7 +4,6 @@
 
 import os
 from pathlib import Path
-import re
 import select
 import signal
 import subprocess
@@ -60,7 +59,7 @@ def start():
 
 
 @pytest.mark.slow
-def test_a_command_drives_the_process_over_a_pty_with_a_key(start, tmp_path, capsys):
+def test_a_command_reaches_the_process_over_a_pty_with_a_key(start, tmp_path, capsys):
     key_file = tmp_path / 'key'
     key_file.write_text(KEY.hex())
     key_file.chmod(0o600)
@@ -69,22 +68,18 @@ def test_a_command_drives_the_process_over_a_pty_with_a_key(start, tmp_path, cap
     ready = process.ready()
     assert str(path) in ready
     assert f'kill {process.child.pid}' in ready
-    jog = ['jog', 'left', '0.2', '--port', str(path), '--yes']
-    assert robot.main(jog) == 2
-    assert 'give the host the key' in capsys.readouterr().err
-    # A process that gets no processor for 0.3 s looks like a dongle that restarted.
+    read = ['parameters', '--port', str(path), '--key', str(key_file)]
+    # A process that gets no processor for 0.3 s looks like a dongle that restarted, and the jam of
+    # the start like a robot out of range.
     for _ in range(5):
-        if robot.main([*jog, '--key', str(key_file)]) == 0:
+        if robot.main(read) == 0:
             break
-        assert 'the dongle stopped answering' in capsys.readouterr().err
+        errors = capsys.readouterr().err
+        assert 'the dongle stopped answering' in errors or 'the robot does not answer' in errors
     else:
-        pytest.fail('the wheel was never turned')
-    code, output = process.stop(signal.SIGTERM)
-    assert code == 0
-    *reports, last = output.splitlines()
-    assert last == 't3mpc emulator: stopped'
-    times = [re.search('at rest ([0-9.]+) s after the last command', line)[1] for line in reports]
-    assert max(map(float, times), default=0.0) <= 0.45
+        pytest.fail('the parameters were never read')
+    assert 'ttl_max' in capsys.readouterr().out
+    assert process.stop(signal.SIGTERM) == (0, 't3mpc emulator: stopped\n')
     assert not path.is_symlink()
 
 

@@ -583,6 +583,7 @@ def test_runs_are_compared_with_the_first(offset, verdict, words, tmp_path, caps
     assert titles == [name for name in shown for _ in range(2)]
 
 
+@pytest.mark.slow
 def test_runs_that_cannot_be_compared_get_no_verdict(rows, tmp_path, capsys):
     drive = following_rows()
     stopped = [

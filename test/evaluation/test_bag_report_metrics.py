@@ -60,6 +60,8 @@ from t3mpc_ros.evaluation.charts import MAX_POINTS, PageData, thinned
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, twist_from_wheels
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, Pose, WheelSpeeds
 
+pytestmark = pytest.mark.slow
+
 GEOMETRY = WheelGeometry(wheel_radius=0.04, wheel_separation=0.16)
 LEAD = 0.2
 SWITCHES = (4.0, 8.0, 12.0, 16.0)

@@ -43,6 +43,8 @@ from t3mpc_ros.simulation.plant.disturbances import Disturbance, DisturbancePara
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
 from t3mpc_ros.simulation.plant.paper_plant import PaperPlant, PaperRobotParameters
 
+pytestmark = pytest.mark.slow
+
 PERIOD, LAG, REACH = 0.01, 0.02, 28.0
 KEPT = math.exp(-PERIOD / LAG)
 AHEAD = 40

@@ -39,6 +39,8 @@ from t3mpc_ros.parameters.table import Parameters, parameter
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
 from t3mpc_ros.simulation.plant.paper_plant import DisturbedPlant, PaperRobot, PaperRobotParameters
 
+pytestmark = pytest.mark.slow
+
 # -- methods to run ---------------------------------------------------------------------------
 
 

@@ -28,6 +28,8 @@ from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, State, WheelSpeeds
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobot, PaperRobotParameters
 
+pytestmark = pytest.mark.slow
+
 GEOMETRY = WheelGeometry()
 RATE = 100.0
 METADATA = {

@@ -43,6 +43,8 @@ from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON
 from t3mpc_ros.simulation.digital_twin import BROWN_OUT_REASON
 from t3mpc_ros.simulation.fault_injection import FAULTS, FaultEvent, FaultSchedule
 
+pytestmark = pytest.mark.slow
+
 PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'faults.md'
 NUMBER = re.compile(r'(?<![\w.])\d+(?:\.\d+)?')
 

@@ -285,6 +285,7 @@ def first_screen(figures):
 
 
 @pytest.mark.parametrize('name', ODD_BAGS)
+@pytest.mark.slow
 def test_an_odd_bag_is_named_first(name, tmp_path):
     make, headline, words, measured = ODD_BAGS[name]
     figures = write_report(write(tmp_path / 'bag', make()))

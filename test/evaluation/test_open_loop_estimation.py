@@ -31,6 +31,8 @@ from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.simulation.plant.disturbances import friction_torque
 from t3mpc_ros.simulation.plant.dynamics import wheel_coriolis, wheel_inertia
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope='module')
 def results():

@@ -57,6 +57,8 @@ from t3mpc_ros.evaluation.paper.results import Results, all_tables, results_of
 from t3mpc_ros.evaluation.reporting import finite, progress_bar
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 
+pytestmark = pytest.mark.slow
+
 CASES = (
     'nominal', 'mass +30 %', 'mass -30 %', 'friction x3', 'load change', 'disturbance',
     'dead time',

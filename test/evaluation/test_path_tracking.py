@@ -158,6 +158,7 @@ def test_grids_are_equally_large_and_contain_what_is_compared():
     assert not any(np.array_equal(hook(), path()) for path in TRACKED_PATHS.values())
 
 
+@pytest.mark.slow
 def test_a_drive_is_repeatable_and_the_pose_loop_pays():
     """Off by a wheel of another radius, speeds alone leave the path; the pose loop does not."""
     limits = MotionLimits()

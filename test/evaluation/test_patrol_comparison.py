@@ -103,6 +103,7 @@ def test_a_path_that_spreads_more_may_have_a_higher_skill():
 
 
 @pytest.mark.usefixtures('unrendered')
+@pytest.mark.slow
 def test_the_command_writes_page_pictures_and_numbers(tmp_path, capsys):
     words = ['--seeds', '101', '--minutes', '2.2', '--workers', '1']
     words += ['--paths', 'boustrophedon', 'random-walk', '--output', str(tmp_path)]
@@ -133,6 +134,7 @@ def test_a_wrong_plan_is_refused(capsys, tmp_path):
         CoverageGrid((0.0, 0.0), (1.0, 1.0), 1, 1, np.ones((1, 1), dtype=bool))
 
 
+@pytest.mark.slow
 def test_the_twin_drives_among_unknown_boxes_and_sees_them():
     plan = PatrolPlan(duration=20.0, robot='twin')
     track = patrol_track(plan, 'random waypoints', 101)

@@ -190,6 +190,7 @@ def test_noise_is_not_predicted_beyond_its_correlation():
     assert skills[1:] == pytest.approx([0.0, 0.0, 0.0], abs=0.02)
 
 
+@pytest.mark.slow
 def test_skill_of_a_gauss_markov_process_is_its_correlation():
     """The best predictor of a Gauss-Markov process has the skill exp(-2 h / T)."""
     generator = np.random.default_rng(4)

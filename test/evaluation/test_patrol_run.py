@@ -31,6 +31,7 @@ def test_a_patrol_with_a_seed_is_repeatable():
     assert not np.array_equal(one.reference, other.reference)
 
 
+@pytest.mark.slow
 def test_a_patrol_keeps_limits_and_touches_nothing():
     """The robot looks around, drives off and reaches its path, with 10 % of commands lost."""
     record, limits = _run(3, 15.0), LimitParameters()

@@ -53,6 +53,8 @@ from t3mpc_ros.evaluation.twin_closed_loop import loop_controller
 from t3mpc_ros.geometry.types import BodyTwist, Pose, State
 from t3mpc_ros.parameters.table import ParameterError
 
+pytestmark = pytest.mark.slow
+
 GOLDEN = sorted((Path(__file__).parents[1] / 'golden').glob('*.mcap'))
 JOURNAL = '/controller/journal'
 STORE = get_typestore(Stores.ROS2_JAZZY)

@@ -22,6 +22,8 @@ from t3mpc_ros.geometry.kinematics import twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import ORIGIN, State, WheelSpeeds
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobot
 
+pytestmark = pytest.mark.slow
+
 NS = 10_000_000
 
 

@@ -28,6 +28,8 @@ from t3mpc_ros.evaluation.training.recorded_runs import fit_bags, mean_and_sprea
 from t3mpc_ros.evaluation.training.simulated_runs import full_parameters, training_data_of
 from t3mpc_ros.evaluation.training.training_data import TrainingData
 
+pytestmark = pytest.mark.slow
+
 SECONDS, DITHER = 30.0, 4.0
 RECORDED = (21, 22, 23)
 

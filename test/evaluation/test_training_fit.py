@@ -63,6 +63,8 @@ from t3mpc_ros.simulation.plant.disturbances import friction_torque
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
 
+pytestmark = pytest.mark.slow
+
 # -- runs and their bags ----------------------------------------------------------------------
 
 

@@ -17,6 +17,8 @@ from t3mpc_ros.evaluation.twin_validation.validation_page import VALIDATION_FIGU
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 from t3mpc_ros.simulation.sensors.range_sensor import SimulatedRangeSensorParameters
 
+pytestmark = pytest.mark.slow
+
 SEEDS = (1, 2, 3, 4)
 GRIPS = courses.SLIPS[:3]
 MIDDLE, STRONG, HELD = courses.SLIPS[1], courses.SLIPS[2], courses.SLIPS[5]

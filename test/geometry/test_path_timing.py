@@ -61,6 +61,7 @@ PATHS = {
     [MotionLimits(), MotionLimits(linear=0.6, angular=1.0, angular_acceleration=1.5)],
     ids=['default', 'slow turns'],
 )
+@pytest.mark.slow
 def test_timing_keeps_every_limit(name, limits):
     """Speeds, accelerations and those of both wheels, between any two samples."""
     path = time_path(PATHS[name], limits, GEOMETRY, PERIOD)
@@ -79,6 +80,7 @@ def test_timing_keeps_every_limit(name, limits):
 
 
 @pytest.mark.parametrize('name', PATHS)
+@pytest.mark.slow
 def test_a_path_that_waits_keeps_every_limit(name):
     """The rate of its time changes at random, to a stop and back, also at cusps and corners."""
     limits, generator = MotionLimits(), np.random.default_rng(8)
@@ -114,6 +116,7 @@ def test_a_path_that_waits_keeps_every_limit(name):
 
 
 @pytest.mark.parametrize('name', PATHS)
+@pytest.mark.slow
 def test_poses_follow_path_and_twists(name):
     """The poses lie on the path within 2 mm, and are the integral of the twists (2)."""
     points = PATHS[name]

@@ -156,6 +156,7 @@ def test_the_skill_is_high_on_unseen_data():
     assert np.all(controller.skill > 0.8)
 
 
+@pytest.mark.slow
 def test_random_weights_get_no_authority():
     """With the skill half a horizon ahead alone, a third would get authority."""
     controller = PredictiveController(DEFAULT.with_values({'learning': False}), PERIOD, GAIN)

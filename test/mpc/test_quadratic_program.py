@@ -79,6 +79,7 @@ def _kkt(matrix, free, mu, pi, v_previous, dv_max, v_max, work):
 
 
 @pytest.mark.parametrize('count', few_of([2000, 10_000]))
+@pytest.mark.slow
 def test_random_programs_satisfy_karush_kuhn_tucker(count):
     """Zero bounds, and optima 10⁶ times the bounds, may cycle because of rounding."""
     generator = np.random.default_rng(20)

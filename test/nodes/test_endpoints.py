@@ -126,7 +126,7 @@ def test_the_command_has_the_type_that_the_robot_expects(expected, harness):
 
 
 @pytest.mark.parametrize('events', [True, False])
-def test_each_executor_serves_callbacks_and_leaves_polled_messages(events, harness, monkeypatch):
+def test_each_executor_calls_back_and_leaves_polled_messages(events, harness, monkeypatch):
     """Executors differ: one passes message and information as a tuple and asks no group."""
     if not events:  # rclpy before 7.1.4
         monkeypatch.setitem(sys.modules, 'rclpy.experimental', None)

@@ -214,6 +214,7 @@ def driving_with_complaints(bench):
 
 
 @pytest.mark.parametrize('name', CAUSES)
+@pytest.mark.slow
 def test_each_cause_is_reported_with_its_reason(name):
     reason, given, provoke = CAUSES[name]
     bench = RobotBench(**given)

@@ -220,6 +220,7 @@ def slip_in_bursts(speeds):
 
 
 @pytest.mark.parametrize('course', few_of([ten_turns, square]))
+@pytest.mark.slow
 def test_gyro_reduces_slip_yaw_error_to_a_fifth(course):
     """Both directions; the scale error of 0.1 % is the remaining error of the turns."""
     speeds = np.stack([course(1.0), course(-1.0)], axis=-1)
@@ -238,6 +239,7 @@ def test_gyro_reduces_slip_yaw_error_to_a_fifth(course):
     assert np.all(errors[0] < 0.2 * errors[1])
 
 
+@pytest.mark.slow
 def test_yaw_variance_of_ten_turns_cancels_when_turning_back():
     tolerance = 0.003
     robots, odometries = Robots(1, 6), make_odometries(gyro_scale_tolerance=tolerance)
@@ -456,6 +458,7 @@ def test_scale_error_within_tolerance_is_not_slip(tolerance):
 
 
 @pytest.mark.parametrize('period', few_of([0.01, 0.02]))
+@pytest.mark.slow
 def test_short_turns_include_the_gyro_delay(period):
     """The gyro outputs the end of a turn after the last step; ignored, each cost 0.2 mrad."""
     robots, odometries = Robots(1, 23), make_odometries()

@@ -83,6 +83,7 @@ def _wave(time):
     return 3.0 * math.sin(time), 2.0 * math.cos(time)
 
 
+@pytest.mark.slow
 def test_array_function_and_csv_are_the_same_reference(tmp_path):
     time = np.arange(500) * PERIOD
     table = np.array([_wave(t) for t in time])

@@ -141,6 +141,7 @@ def test_wrong_use_is_one_sentence(call, text):
     assert len(inside) <= 2
 
 
+@pytest.mark.slow
 def test_a_script_without_a_guard_gets_a_sentence(tmp_path):
     """Worker processes run the script again: without its guard they would start workers."""
     script = tmp_path / 'script.py'

@@ -294,6 +294,7 @@ BAD = {
 
 
 @pytest.mark.parametrize('text, words', BAD.values(), ids=BAD)
+@pytest.mark.slow
 def test_invalid_file_error_names_file_entry_bound_and_value(text, words, tmp_path):
     path = write(tmp_path, text)
     with pytest.raises(ScheduleError) as caught:

@@ -269,6 +269,7 @@ BAD = {
 
 
 @pytest.mark.parametrize('text', BAD, ids=lambda text: text[:60])
+@pytest.mark.slow
 def test_invalid_file_error_names_entry_bound_and_value(text):
     with pytest.raises(WorldError) as caught:
         parse_world(text, 'yard.yaml')
@@ -278,6 +279,7 @@ def test_invalid_file_error_names_entry_bound_and_value(text):
     assert len(message) < 250
 
 
+@pytest.mark.slow
 def test_list_lengths_and_segment_count_are_bounded():
     def refused(text, words):
         with pytest.raises(WorldError, match=re.escape(words)):

@@ -139,6 +139,7 @@ def test_events_go_on_where_a_page_has_stopped(page, token):
     assert next(page.events('other-7'))[1]['streams']['a']['values'] == [[1.0, 2.0]]
 
 
+@pytest.mark.slow
 def test_an_idle_stream_has_a_heartbeat(page):
     events = page.events()
     assert [next(events)[1] for _ in range(2)] == [{}, {}]
