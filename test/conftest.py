@@ -47,7 +47,7 @@ def _part(text):
     return int(number), int(count)
 
 
-MARKS = ('ros', 'alone', 'slow', 'long')
+MARKS = ('ros', 'timed', 'slow', 'long')
 """Marks by which a run selects."""
 
 

@@ -364,6 +364,7 @@ def _commands_by_page():
     return {page: commands for page, commands in found.items() if commands}
 
 
+@pytest.mark.timed
 @pytest.mark.parametrize(
     'page, commands',
     [

@@ -312,7 +312,7 @@ def test_each_part_of_the_environment_is_installed_when_needed(checkout):
 
 def test_check_runs_what_is_asked_for(checkout):
     check = checkout.root / 'scripts' / 'check'
-    usual = ['not (ros or long)', 'ros and not (alone or long)', 'ros and alone and not long']
+    usual = ['not (ros or long)', 'ros and not (timed or long)', 'ros and timed and not long']
     for arguments, linted, selected in (
         ((), True, usual),
         (('--quick',), True, ['not (ros or slow or long)']),

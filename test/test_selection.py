@@ -40,7 +40,7 @@ def test_the_runs_of_check_select_every_test_once():
     """A test that no marker expression matches would run nowhere."""
     quick, *runs = re.findall(r"-m '([^']+)'", (ROOT / 'scripts' / 'check').read_text())
     for marks in itertools.product((False, True), repeat=4):
-        values = dict(zip(('ros', 'alone', 'slow', 'long'), marks, strict=True))
+        values = dict(zip(('ros', 'timed', 'slow', 'long'), marks, strict=True))
         matches = [eval(expression, {}, values) for expression in (*runs, 'long')]
         assert sum(matches) == 1
         assert matches[0] or not eval(quick, {}, values)

@@ -290,7 +290,7 @@ def only_bag(folder):
 
 
 @pytest.mark.slow
-@pytest.mark.alone
+@pytest.mark.timed
 @pytest.mark.ros
 @pytest.mark.parametrize(
     'to_group',
@@ -322,7 +322,7 @@ def test_sim_starts_tracks_and_ends_with_ctrl_c(to_group, start, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.alone
+@pytest.mark.timed
 @pytest.mark.ros
 @pytest.mark.long
 def test_patrol_drives_its_path_and_keeps_its_seed(tmp_path, monkeypatch, request):
@@ -379,7 +379,7 @@ def test_patrol_drives_its_path_and_keeps_its_seed(tmp_path, monkeypatch, reques
 
 
 @pytest.mark.slow
-@pytest.mark.alone
+@pytest.mark.timed
 @pytest.mark.ros
 def test_a_robot_of_another_make_follows_the_reference(start, tmp_path, capsys):
     """TurtleBot3 figures: 30 Hz best-effort odometry, stamped commands, own topic names."""

@@ -9,7 +9,7 @@ from support.browser import SIZES, Browser
 
 from t3mpc_ros.cli.view import PAGE_AT
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.alone]
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timed]
 
 ROBOT = {'world': 'room', 'noise.variance': 0.04}
 

@@ -31,7 +31,7 @@ from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
 from t3mpc_ros.radio.link.port_actions import Write
 
-pytestmark = [pytest.mark.ros, pytest.mark.alone]
+pytestmark = [pytest.mark.ros, pytest.mark.timed]
 
 SUSPENDED = 0.4
 """Longer than the command timeout of 0.25 s and the odometry timeout of the test, s."""

@@ -174,7 +174,7 @@ def run(tmp_path_factory):
                 processes.kill(name)
 
 
-@pytest.mark.alone
+@pytest.mark.timed
 def test_the_loop_runs_at_100_hz_in_four_processes(run):
     assert set(run.codes) == {0}
     with open_bag(run.bag) as recording:
@@ -196,7 +196,7 @@ def test_the_loop_runs_at_100_hz_in_four_processes(run):
     assert commands['v'][-1] == commands['w'][-1] == 0.0
 
 
-@pytest.mark.alone
+@pytest.mark.timed
 def test_each_controller_of_the_run_replays_bit_for_bit(run):
     """Before the kill and after it; its first inputs reached the late recorder."""
     inputs = load_inputs(run.bag)
@@ -226,7 +226,7 @@ def _during(stamps, values, start_ns, begin, end):
     return values[chosen]
 
 
-@pytest.mark.alone
+@pytest.mark.timed
 @pytest.mark.parametrize('victim', ['reference_generator', 'controller'])
 def test_killed_source_stops_robot_in_half_a_second(victim, run):
     killed_ns = run.killed_ns[victim]
@@ -239,7 +239,7 @@ def test_killed_source_stops_robot_in_half_a_second(victim, run):
     assert pulses.max() < MOVING, 'the motors still turned half a second after the kill'
 
 
-@pytest.mark.alone
+@pytest.mark.timed
 def test_a_killed_robot_zeroes_commands_until_its_restart(run):
     with open_bag(run.bag) as recording:
         commands = recording.series('/cmd_vel', {'v': 'linear.x', 'w': 'angular.z'})
@@ -250,7 +250,7 @@ def test_a_killed_robot_zeroes_commands_until_its_restart(run):
         assert not silent.any()
 
 
-@pytest.mark.alone
+@pytest.mark.timed
 def test_a_restarted_recorder_continues_the_bag(run):
     assert len(list(run.last_bag.glob('*.mcap'))) == 2
     stamps, speeds = _speeds(run.last_bag)

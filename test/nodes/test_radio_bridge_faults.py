@@ -23,7 +23,7 @@ from t3mpc_ros.radio.protocol.codec import encode
 from t3mpc_ros.radio.protocol.frames import Command, Poll, Transmit
 from t3mpc_ros.radio.protocol.framing import encode_frame
 
-pytestmark = [pytest.mark.ros, pytest.mark.alone]
+pytestmark = [pytest.mark.ros, pytest.mark.timed]
 
 REST = 0.45
 """Maximum time to standstill after the last executed command, s."""

@@ -22,7 +22,7 @@ from t3mpc_ros.cli.process_group import ProcessGroup
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.common import qos
 
-pytestmark = [pytest.mark.ros, pytest.mark.alone, pytest.mark.slow]
+pytestmark = [pytest.mark.ros, pytest.mark.timed, pytest.mark.slow]
 
 RATE = 100.0
 SLOTS = 5

@@ -19,7 +19,7 @@ from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recovery.finalize_file import finalize_file
 from t3mpc_ros.cli.process_group import ProcessError
 
-pytestmark = [pytest.mark.ros, pytest.mark.alone]
+pytestmark = [pytest.mark.ros, pytest.mark.timed]
 
 DEEP = QoSProfile(depth=5000)
 

@@ -6,7 +6,7 @@ import pytest
 from support import stopping_bench
 from support.long_tests import few_of
 
-pytestmark = [pytest.mark.ros, pytest.mark.alone, pytest.mark.slow]
+pytestmark = [pytest.mark.ros, pytest.mark.timed, pytest.mark.slow]
 
 
 @pytest.mark.parametrize(
