@@ -4,6 +4,7 @@
 
 import ast
 from collections import defaultdict
+from functools import cache
 from pathlib import Path
 import re
 import xml.etree.ElementTree as ElementTree
@@ -76,10 +77,16 @@ MAX_CLOSURE = 51
 """Maximum number of modules of the package that the controller node imports."""
 
 
-def _imports(path: Path, *, lazy: bool = True) -> set[str]:
+@cache
+def _tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
+@cache
+def _imports(path: Path, *, lazy: bool = True) -> frozenset[str]:
     """Return the imported modules; without ``lazy`` only those imported at import time."""
     found = set()
-    pending: list[ast.AST] = [ast.parse(path.read_text())]
+    pending: list[ast.AST] = [_tree(path)]
     while pending:
         node = pending.pop()
         if not lazy and (
@@ -94,7 +101,7 @@ def _imports(path: Path, *, lazy: bool = True) -> set[str]:
             found.add(node.module or '')
             if (node.module or '').split('.')[0] == 't3mpc_ros':
                 found |= {f'{node.module}.{name.name}' for name in node.names}
-    return found
+    return frozenset(found)
 
 
 def _is_type_checking(node: ast.AST) -> bool:
@@ -129,7 +136,6 @@ def _closure(module: str) -> set[str]:
 
 
 @pytest.mark.parametrize('path', SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
-@pytest.mark.slow
 def test_imports_follow_the_direction_of_the_packages(path):
     import sys
 
@@ -147,7 +153,6 @@ def test_imports_follow_the_direction_of_the_packages(path):
             assert top in allowed, f'{path} imports {name}'
 
 
-@pytest.mark.slow
 def test_only_the_serial_port_of_the_radio_imports_pyserial():
     users = [path for path in SOURCES if 'serial' in _imports(path)]
     assert users == [PACKAGE / 'radio' / 'serial_port.py']
@@ -178,7 +183,7 @@ def test_a_module_basename_has_one_meaning():
 def test_package_init_files_hold_a_docstring_only():
     for path in SOURCES:
         if path.name == '__init__.py' and path.parent != PACKAGE:
-            body = ast.parse(path.read_text()).body
+            body = _tree(path).body
             assert len(body) == 1, path
             assert isinstance(body[0], ast.Expr), path
 
@@ -192,7 +197,6 @@ def test_tests_mirror_the_packages():
     assert len(names) == len(set(names))
 
 
-@pytest.mark.slow
 def test_no_test_imports_another_test():
     for path in TESTS.rglob('*.py'):
         for name in _imports(path):
@@ -205,10 +209,9 @@ def test_names_of_tests_have_at_most_60_characters():
             assert len(name) <= 60, f'{path}: {name}'
 
 
-@pytest.mark.slow
 def test_functions_have_at_most_12_parameters():
     for path in SOURCES:
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(_tree(path)):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 names = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
                 assert len(names) <= 12, f'{path}: {node.name} has {len(names)} parameters'
@@ -227,7 +230,6 @@ def test_version_is_the_same_everywhere():
     assert f'\n{t3mpc_ros.__version__} (' in (ROOT / 'CHANGELOG.rst').read_text()
 
 
-@pytest.mark.slow
 def test_package_xml_names_every_ros_package_that_is_imported():
     declared = {
         element.text
@@ -308,7 +310,6 @@ def _flat(tree: dict, prefix: str = '') -> dict:
     return result
 
 
-@pytest.mark.slow
 def test_no_file_carries_a_path_of_a_machine_or_a_registry_host():
     words = re.compile(
         r'/(work|root|home|farm|tmp)/[a-z]|https?://[^\s]*(pypi|pythonhosted|npmjs|crates)'
