@@ -1,0 +1,111 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Benchmark of the nodes: processor time and latency beside a bare echo node of rclpy.
+
+    PYTHONPATH=.:test .venv/bin/python test/support/node_cost_bench.py [--seconds 40] [--runs 3]
+
+Generator, controller, simulated robot and recorder at 100 Hz, as the demo starts them, and in the
+same graph a node that answers each odometry message with a Twist and does nothing else. A first
+half of a run counts processor time; in the second, an observer takes the time from each odometry
+message to the command of the controller and to the answer of the echo.
+"""
+
+import argparse
+from pathlib import Path
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+
+from support.recorder_bench import processor_time
+from t3mpc_ros.cli.private_graph import PrivateGraph
+from t3mpc_ros.cli.process_group import ProcessGroup
+
+NODES = ('sim_robot', 'reference_generator', 'controller', 'recorder')
+ECHO = """
+import rclpy
+from geometry_msgs.msg import Twist
+from nav_msgs.msg import Odometry
+rclpy.init()
+node = rclpy.create_node('echo')
+answers = node.create_publisher(Twist, 'answer', 1)
+answer = Twist()
+node.create_subscription(Odometry, 'odom', lambda message: answers.publish(answer), 1)
+rclpy.spin(node)
+"""
+OBSERVER = """
+import statistics, sys, time
+import rclpy
+from geometry_msgs.msg import Twist
+from nav_msgs.msg import Odometry
+rclpy.init()
+node = rclpy.create_node('observer')
+begin, taken = [0.0], {'cmd_vel': [], 'answer': []}
+def start(message):
+    begin[0] = time.monotonic()
+node.create_subscription(Odometry, 'odom', start, 1, raw=True)
+for topic, times in taken.items():
+    node.create_subscription(
+        Twist, topic, lambda message, t=times: t.append(time.monotonic() - begin[0]), 1, raw=True
+    )
+end = time.monotonic() + float(sys.argv[1])
+while time.monotonic() < end:
+    rclpy.spin_once(node, timeout_sec=0.1)
+print(*(1e3 * statistics.median(times) for times in taken.values()))
+"""
+
+
+def run(folder: Path, seconds: float) -> dict[str, float]:
+    """Return the shares of a core, and the median latencies in ms, of one run."""
+    with PrivateGraph() as graph:
+        environment = graph.environment()
+        processes = ProcessGroup(folder / 'log', environment)
+        program = [sys.executable, '-c']
+        echo = subprocess.Popen([*program, ECHO], env=environment)
+        try:
+            for name in NODES:
+                storage = {'storage.uri': str(folder / 'bag')} if name == 'recorder' else None
+                processes.start(name, parameters=storage)
+            for name in NODES:
+                processes.wait_ready(name)
+            time.sleep(5.0)  # discovery, first seconds of the run
+            pids = {'echo': echo.pid} | {name: processes.pid(name) for name in NODES}
+            begin, before = time.monotonic(), {n: processor_time(p) for n, p in pids.items()}
+            time.sleep(seconds / 2)
+            elapsed = time.monotonic() - begin
+            found = {n: (processor_time(p) - before[n]) / elapsed for n, p in pids.items()}
+            done = subprocess.run(
+                [*program, OBSERVER, str(seconds / 2)],
+                env=environment,
+                check=True,
+                capture_output=True,
+                text=True,
+            )
+            times = map(float, done.stdout.split())
+            return found | dict(zip(('command_ms', 'answer_ms'), times, strict=True))
+        finally:
+            processes.stop_all()
+            echo.kill()
+            echo.wait()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
+    parser.add_argument('--seconds', type=float, default=40.0)
+    parser.add_argument('--runs', type=int, default=3)
+    options = parser.parse_args()
+    results = []
+    for number in range(options.runs):
+        with tempfile.TemporaryDirectory() as folder:
+            results.append(run(Path(folder), options.seconds))
+        print(number + 1, {key: round(value, 4) for key, value in results[-1].items()})
+    found = {key: statistics.median(each[key] for each in results) for key in results[0]}
+    for name in ('echo', *NODES):
+        print(f'{name:20} {found[name]:6.1%} of a core, {found[name] / found["echo"]:.2f} x echo')
+    ratio = found['command_ms'] / found['answer_ms']
+    print(f'odom to command      {found["command_ms"]:.2f} ms, {ratio:.2f} x echo')
+
+
+if __name__ == '__main__':
+    main()
