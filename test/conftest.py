@@ -22,6 +22,8 @@ DEFAULT = ('geometry', 'parameters', 'robot', 'fuzzy', 'test_launch_files.py')
 
 MAX_WAIT = 0.3
 """Largest share of the time with work to do that the nodes of a test may wait for a processor."""
+PROGRAM_ERRORS = TypeError, AttributeError, NameError, ImportError, SystemError
+"""What no lack of processor time can raise."""
 WAIT = pytest.StashKey[ProcessorWait]()
 INCONCLUSIVE = 'inconclusive'
 """Title of the section of a report that holds the failure."""
@@ -132,10 +134,13 @@ def _skip_without_compiler():
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport(item):
+def pytest_runtest_makereport(item, call):
     """A failure of nodes that had no processor is inconclusive: their time is that of the wall."""
     report = yield
-    share = item.stash[WAIT].share() if report.failed and item.get_closest_marker('ros') else 0.0
+    timely = item.get_closest_marker('ros') and not isinstance(
+        call.excinfo and call.excinfo.value, PROGRAM_ERRORS
+    )
+    share = item.stash[WAIT].share() if report.failed and timely else 0.0
     if share > MAX_WAIT:
         text = f'its nodes waited for a processor for {share:.0%} of their time'
         failure = f'{item.nodeid}: {text}\n{report.longreprtext}'

@@ -166,7 +166,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
                 self._pose = state.pose
             self._path_clock.observe(state.stamp_ns, state.pose)
 
-    def _on_path(self, message: Path) -> None:
+    def _on_path(self, message: Path, info: dict[str, Any]) -> None:
         places = [(each.pose.position.x, each.pose.position.y) for each in message.poses]
         points = np.array(places, dtype=np.float64).reshape(-1, 2)
         try:
@@ -180,7 +180,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         else:  # the robot has not reported where it is
             self._points = points
 
-    def _on_twist(self, message: Twist | TwistStamped) -> None:
+    def _on_twist(self, message: Twist | TwistStamped, info: dict[str, Any]) -> None:
         twist = message.twist if isinstance(message, TwistStamped) else message
         if isinstance(self._source, TwistSource) and not self._source.set_target(
             BodyTwist(twist.linear.x, twist.angular.z)

@@ -19,13 +19,13 @@ from t3mpc_ros.cli import process_group
 from t3mpc_ros.cli.main import _new_run
 from t3mpc_ros.cli.private_graph import DOMAINS, NoDomainError, PrivateGraph, used_domains
 
+pytestmark = pytest.mark.slow
+
 NODES = ('recorder', 'controller', 'sim_robot', 'reference_generator')
 TIMEOUT = 30.0
 
 STAND_IN = """#!{python}
 import os, pathlib, signal, sys, time
-
-pytestmark = pytest.mark.slow
 name = pathlib.Path(sys.argv[0]).name
 pathlib.Path('{folder}', name + '.pid').write_text(str(os.getpid()))
 pathlib.Path('{folder}', name + '.domain').write_text(os.environ.get('ROS_DOMAIN_ID', ''))
