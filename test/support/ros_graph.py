@@ -75,8 +75,11 @@ class NodeHarness:
 
     def remove(self, node):
         """Shut one node down as its process does."""
-        node.on_shutdown()
         self._executor.remove_node(node)
+        # The events executor still runs what happened before.
+        left = self._executor.create_task(lambda: None)
+        self.spin_until(left.done)
+        node.on_shutdown()
         self._nodes.remove(node)
         node.destroy_node()
 
