@@ -583,6 +583,16 @@ def test_runs_are_compared_with_the_first(offset, verdict, words, tmp_path, caps
     assert titles == [name for name in shown for _ in range(2)]
 
 
+def test_runs_of_one_reference_may_begin_at_different_places(tmp_path, capsys):
+    """Nodes discover each other sooner or later: two demos of one seed were not comparable."""
+    late = [row for row in following_rows(offset=0.03) if row[1] != '/cmd_vel' or row[0] > 0.7]
+    folders = [write(tmp_path / 'one', following_rows()), write(tmp_path / 'late', late)]
+    for pair in (folders, folders[::-1]):
+        words = [*map(str, pair), '--output', str(tmp_path / 'out')]
+        assert bag_main(['report', *words]) == 0
+        assert 'er settled error: right wheel: ' in capsys.readouterr().out
+
+
 @pytest.mark.slow
 def test_runs_that_cannot_be_compared_get_no_verdict(rows, tmp_path, capsys):
     drive = following_rows()

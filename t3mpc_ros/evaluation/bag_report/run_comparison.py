@@ -3,7 +3,7 @@
 """HTML page that compares recorded runs: which has the smaller error, charts overlaid, tables."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from pathlib import Path
 
@@ -56,6 +56,8 @@ BLOCK = 5.0
 the error is correlated."""
 SAME_REFERENCE = 0.05
 """Largest difference of two equal references, as a share of their root mean square."""
+MAX_SHIFT = 2.0
+"""Largest difference of the places of the first commands in one reference, s."""
 COLOURS = ('c1', 'c2', 'c3', 'c4', 'c5', 'ink')
 MAX_RUNS = len(COLOURS)
 """Runs that a page compares."""
@@ -70,7 +72,8 @@ class ComparedRun:
     run: Run
     metrics: ReportMetrics
     start: float
-    """Time of its first command to move, s: the charts count from there."""
+    """Time that the charts count from, s: that of its first command to move, or the place of the
+    first run's in a reference that both have."""
     parameters: Mapping[str, str]
 
 
@@ -130,6 +133,43 @@ def error_differences(first: Run, other: Run) -> list[ErrorDifference]:
     return found
 
 
+def aligned(first: ComparedRun, other: ComparedRun) -> ComparedRun:
+    """Return ``other`` counted from where ``first`` starts in the reference that both follow.
+
+    Nodes discover each other sooner or later: the first command of two runs with one seed comes at
+    different places of the reference. A run with another reference is unchanged.
+    """
+    channels = first.run.channels
+    one, two = (each.run.motions.get(REFERENCE) for each in (first, other))
+    if one is None or two is None or channels != other.run.channels or len(one) < 2:
+        return other
+    period = float(np.median(np.diff(one.time)))
+    # A clock that was set, or a sparse reference, would be a grid of any size.
+    if any(np.ptp(each.time) >= 10.0 * period * len(each) for each in (one, two)):
+        return other
+    a, b = (
+        np.column_stack([np.interp(grid, motion.time, motion[each.name]) for each in channels])
+        for motion in (one, two)
+        for grid in [np.arange(motion.time[0], motion.time[-1], period)]
+    )
+    least = 0.5 * min(len(a), len(b))
+    begin = first.start - one.time[0]
+    expected = round((other.start - two.time[0] - begin) / period)
+    reach = round(MAX_SHIFT / period)
+    best, miss = expected, math.inf
+    for lag in sorted(
+        range(expected - reach, expected + reach + 1), key=lambda k: abs(k - expected)
+    ):
+        low, high = max(0, -lag), min(len(a), len(b) - lag)
+        if high - low > least:
+            found = rms(a[low:high] - b[low + lag : high + lag])
+            if found < 0.99 * miss:  # among equal ones the nearest
+                best, miss = lag, found
+    if not miss <= SAME_REFERENCE * rms(a):
+        return other
+    return replace(other, start=float(two.time[0] + best * period + begin))
+
+
 def why_not_comparable(first: ComparedRun, other: ComparedRun) -> str:
     """Return why two errors cannot be compared; empty if they can."""
     for each in (first, other):
@@ -139,7 +179,8 @@ def why_not_comparable(first: ComparedRun, other: ComparedRun) -> str:
         return 'the wheels of one robot are unknown'
     one, two = (each.run.motions[REFERENCE] for each in (first, other))
     span = min(one.time[-1] - first.start, two.time[-1] - other.start)
-    time = np.arange(1.0, span, 0.05)
+    begin = max(1.0, one.time[0] - first.start, two.time[0] - other.start)
+    time = np.arange(begin, span, 0.05)
     for channel in first.run.channels:
         a = np.interp(time + first.start, one.time, one[channel.name])
         b = np.interp(time + other.start, two.time, two[channel.name])
@@ -175,7 +216,8 @@ def write_comparison(
     if not 2 <= len(folders) <= MAX_RUNS:
         raise ReportError(f'a comparison must have 2 to {MAX_RUNS} bags: got {len(folders)}')
     path = output / PAGE
-    runs = [_load(i, folder, path, wanted) for i, folder in enumerate(folders)]
+    first, *others = (_load(i, folder, path, wanted) for i, folder in enumerate(folders))
+    runs = [first, *(aligned(first, each) for each in others)]
     verdicts = [_verdict(runs[0], each) for each in runs[1:]]
     blocks: list[Block] = [*verdicts]
     for each in runs:
@@ -323,7 +365,11 @@ def _charts(runs: Sequence[ComparedRun]) -> Iterator[Block]:
         yield from (Heading('Paths'), Plane('Floor', 'm', curves, f'Ends: {ends}.'))
 
 
-_TIME = Paragraph('Time since the first command to move of each run.', 'quiet')
+_TIME = Paragraph(
+    'Time since the first command to move; runs with the reference of the first one are shown at '
+    'the same place of it.',
+    'quiet',
+)
 
 
 def _parameters(runs: Sequence[ComparedRun]) -> Iterator[Block]:
