@@ -191,9 +191,17 @@ class Status(NamedTuple):
     @property
     def scalars(self) -> list[float]:
         """Values of the :data:`SCALAR_NAMES`; NaN where there is none."""
-        pairs = self.error, self.estimate, self.skill, self.terms.ravel(), self.applied
+        terms = self.terms.ravel().tolist()
         value, rate, bound, _ = self.certificate_state.tolist()
-        return [*np.concatenate(pairs).tolist(), value, bound - rate]
+        return [
+            *self.error.tolist(),
+            *(0.0 - term for term in terms[:2]),
+            *self.skill.tolist(),
+            *terms,
+            *self.applied.tolist(),
+            value,
+            bound - rate,
+        ]
 
 
 class Controller:
@@ -513,18 +521,20 @@ class Controller:
         # The commands of the dead time are on their way: the robot will be there.
         command = WheelSpeeds(*self._actuation.command.tolist())
         pose = advance_pose(odometry.pose, twist_from_wheels(command, geometry), horizon)
-        planned = twist_from_wheels(WheelSpeeds(*begin.tolist()), geometry)
+        now, later = WheelSpeeds(*begin.tolist()), WheelSpeeds(*end.tolist())
+        planned = twist_from_wheels(now, geometry)
         twist, keep_out = self._pose.step(reference, pose, planned), self._keep_out
         if keep_out is not None:
             if self._pose.rejoining:
                 velocity = keep_out.guide(self._pose.closing_velocity(planned), pose)
                 twist = self._pose.drive_along(velocity)
             twist = keep_out.step(twist, pose, elapsed)
-        change = np.zeros(2)
-        if not (self._pose.rejoining or (keep_out is not None and keep_out.changed)):
-            change = end - begin
-        begin[:] = wheels_from_twist(twist, geometry)
-        end[:] = begin + change
+        if self._pose.rejoining or (keep_out is not None and keep_out.changed):
+            later = now
+        wheels = wheels_from_twist(twist, geometry)
+        for i in range(2):
+            begin[i] = wheels[i]
+            end[i] = wheels[i] + (later[i] - now[i])
 
     def _plan_ahead(self, effect_ns: int) -> int:
         """Return the lead of the shaper, ns; 0 if the reference is not known that far ahead."""
