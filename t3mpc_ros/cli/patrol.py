@@ -3,6 +3,7 @@
 """``t3mpc patrol``: how good a patrol our path is, against other paths."""
 
 import argparse
+from functools import partial
 from pathlib import Path
 import sys
 from typing import Any, NamedTuple
@@ -12,6 +13,8 @@ from t3mpc_ros.parameters.command_line import bounded_float
 
 DEFAULT_SEEDS = '101-105'
 OUTPUT = Path('runs') / 'patrol'
+RUNS = '.runs.jsonl'
+"""End of the name of the file with the finished runs of an interrupted study."""
 
 
 def add_parser(commands: Any) -> argparse.ArgumentParser:
@@ -89,6 +92,7 @@ def run(options: argparse.Namespace) -> int:
     (options.output / f'{study.name}.json').write_text(numbers, encoding='utf-8')
     written = options.output / f'{study.name}.html'
     written.write_text(page.page(plan, results, drawn), encoding='utf-8')
+    (options.output / f'{study.name}{RUNS}').unlink(missing_ok=True)
     print(f'written to {written}', file=sys.stderr)
     return 0
 
@@ -141,5 +145,6 @@ def _patrols(options: argparse.Namespace, executor: Any) -> _Study:
         robot=options.robot,
         arena=tuple(options.arena),
     )
-    results = compare_patrols(plan, executor, progress=True)
+    file = options.output / f'patrol{RUNS}'
+    results = compare_patrols(plan, file, executor, partial(print, file=sys.stderr, flush=True))
     return _Study('patrol', patrol_page, plan, results, Comparison(plan, results))

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """``t3mpc patrol``: runs, claims, tables, page."""
 
+import contextlib
+from dataclasses import replace
 import json
 import math
 
@@ -10,7 +12,7 @@ import pytest
 from support.unrendered import unrendered  # noqa: F401 - a fixture
 
 from t3mpc_ros.cli.main import main
-from t3mpc_ros.evaluation.patrol import patrol_page
+from t3mpc_ros.evaluation.patrol import patrol_comparison, patrol_page
 from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid
 from t3mpc_ros.evaluation.patrol.patrol_comparison import (
     CLEARANCE,
@@ -18,7 +20,9 @@ from t3mpc_ros.evaluation.patrol.patrol_comparison import (
     PATHS,
     PatrolPlan,
     PatrolResult,
+    compare_patrols,
     free_cells,
+    measured_patrol,
     patrol_track,
 )
 from t3mpc_ros.evaluation.patrol.patrol_metrics import PatrolMetrics
@@ -123,6 +127,47 @@ def test_the_command_writes_page_pictures_and_numbers(tmp_path, capsys):
         'paths',
         'predictability',
     }
+
+
+@pytest.mark.parametrize('robot', ['exact', 'twin'])
+def test_an_interrupted_study_goes_on_with_equal_results(tmp_path, monkeypatch, robot):
+    """Only the patrols that are missing are run; those in the file are equal to the last bit."""
+    plan = PatrolPlan(('boustrophedon', 'random walk'), (102, 101), 5.0, robot)
+    whole = compare_patrols(plan, tmp_path / 'whole.jsonl')
+    done = []
+
+    def until(last):
+        def measured(job):
+            if len(done) == last:
+                raise KeyboardInterrupt
+            done.append(job)
+            return measured_patrol(job)
+
+        return measured
+
+    file, said = tmp_path / 'runs.jsonl', []
+    for last in (3, 4):
+        monkeypatch.setattr(patrol_comparison, 'measured_patrol', until(last))
+        with contextlib.suppress(KeyboardInterrupt):
+            resumed = compare_patrols(plan, file, report=said.append)
+    assert len(done) == 4
+    assert '3 are there already, 1 to do' in said[-1]
+    for name in plan.paths:
+        for one, other in zip(whole[name], resumed[name], strict=True):
+            np.testing.assert_equal(_numbers(one), _numbers(other))
+    # A longer patrol is another one.
+    monkeypatch.setattr(patrol_comparison, 'measured_patrol', measured_patrol)
+    compare_patrols(replace(plan, duration=6.0), file, report=said.append)
+    assert '0 are there already, 4 to do' in said[-1]
+
+
+def _numbers(result):
+    """Return a result with its world, which has no equality, by its walls."""
+    track = result.track
+    if track is not None:
+        world = None if track.world is None else track.world.segments
+        track = track._replace(grid=vars(track.grid), world=world)._asdict()
+    return {**vars(result.metrics), **result._replace(metrics=None, track=None)._asdict()}, track
 
 
 def test_a_wrong_plan_is_refused(capsys, tmp_path):

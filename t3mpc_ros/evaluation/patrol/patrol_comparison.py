@@ -8,18 +8,24 @@ the reference is, in an empty room; ``twin`` is the digital twin with noise, lag
 commands, among boxes that it does not know, with the controller of the nodes and its keep-out.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
+import hashlib
+import json
 import math
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+import t3mpc_ros
 from t3mpc_ros.chaos.portrait import PortraitParameters
-from t3mpc_ros.evaluation.closed_loop import map_jobs
-from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid, coverage_at
+from t3mpc_ros.evaluation.closed_loop import WorkerPool
+from t3mpc_ros.evaluation.paper.experiment_runs import source_digest
+from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid, Visits, coverage_at
 from t3mpc_ros.evaluation.patrol.patrol_metrics import PatrolMetrics, patrol_metrics
 from t3mpc_ros.evaluation.patrol.patrol_run import (
     PatrolRecord,
@@ -29,7 +35,9 @@ from t3mpc_ros.evaluation.patrol.patrol_run import (
     run_patrol,
     world_file,
 )
+from t3mpc_ros.evaluation.patrol.predictability import Skill
 from t3mpc_ros.evaluation.patrol.rival_paths import RIVALS, Rectangle
+from t3mpc_ros.evaluation.result_file import ResultFile, run_missing_jobs
 from t3mpc_ros.geometry.arena import Arena
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_timing import MotionLimits, PathTiming
@@ -131,14 +139,64 @@ Results = Mapping[str, Sequence[PatrolResult]]
 
 
 def compare_patrols(
-    plan: PatrolPlan, workers: int | Executor = 1, *, progress: bool = False
+    plan: PatrolPlan,
+    file: Path,
+    workers: int | Executor = 1,
+    report: Callable[[str], None] | None = None,
 ) -> Results:
-    """Return the results of every path and seed of a plan."""
-    keys = [(name, seed) for seed in plan.seeds for name in plan.paths]
-    jobs = [((plan, seed), NamedPath(name)) for name, seed in keys]
-    results = map_jobs(measured_patrol, jobs, workers, 'patrols', progress=progress)
-    found = dict(zip(keys, results, strict=True))
-    return {name: [found[name, seed] for seed in plan.seeds] for name in plan.paths}
+    """Return the results of every path and seed of a plan.
+
+    Finished patrols are kept in ``file``, and those that it holds are not run again.
+    ``report`` receives messages; with None there is no progress line either.
+    """
+    keys = {(name, seed): _run_key(plan, name, seed) for seed in plan.seeds for name in plan.paths}
+    jobs = {key: ((plan, seed), NamedPath(name)) for (name, seed), key in keys.items()}
+
+    def run(missing: 'Sequence[_Job]') -> Iterator[tuple[int, PatrolResult]]:
+        with WorkerPool(workers) as pool:
+            yield from pool.map(measured_patrol, missing)
+
+    kept = ResultFile(file, _encoded, partial(_decoded, plan))
+    found = run_missing_jobs(kept, jobs, run, report)
+    return {name: [found[keys[name, seed]] for seed in plan.seeds] for name in plan.paths}
+
+
+def _run_key(plan: PatrolPlan, name: str, seed: int) -> str:
+    """Return a digest of all that determines a result; that of the first seed has a track."""
+    run = replace(plan, paths=(name,), seeds=(seed,)), seed == plan.seeds[0]
+    content = repr((t3mpc_ros.__version__, source_digest(), run))
+    return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+
+def _encoded(key: str, result: PatrolResult) -> str:
+    metrics, curve, contacts, avoiding, track = result
+    row = {
+        'run': key,
+        'metrics': {**vars(metrics), 'times': [*metrics.times.items()]},
+        'curve': curve,
+        'contacts': contacts,
+        'avoiding': avoiding,
+        'track': track and (*track[:4], track.hits, track.contacts),
+    }
+    return json.dumps(row, default=np.ndarray.tolist)
+
+
+def _decoded(plan: PatrolPlan, line: str) -> tuple[str, PatrolResult]:
+    row = json.loads(line)
+    metrics, track = row['metrics'], row['track']
+    first, dwell, duration = metrics['visits']
+    metrics['visits'] = Visits(np.array(first), np.array(dwell), duration)
+    metrics['times'] = dict(metrics['times'])
+    metrics['skills'] = tuple(Skill(*each) for each in metrics['skills'])
+    if track is not None:
+        *rows, contacts = track
+        time, position, reference, counted, hits = map(np.array, rows)
+        twin = plan.robot == 'twin'
+        world = parse_world(plan_world(plan, plan.seeds[0]), 'room') if twin else None
+        cells, hits = free_cells(plan, world), hits.reshape(-1, 2)
+        track = PatrolTrack(time, position, reference, counted, cells, world, hits, contacts)
+    curve, contacts, avoiding = np.array(row['curve']), row['contacts'], row['avoiding']
+    return row['run'], PatrolResult(PatrolMetrics(**metrics), curve, contacts, avoiding, track)
 
 
 class NamedPath(NamedTuple):
@@ -147,7 +205,10 @@ class NamedPath(NamedTuple):
     name: str
 
 
-def measured_patrol(job: tuple[tuple[PatrolPlan, int], NamedPath]) -> PatrolResult:
+_Job = tuple[tuple[PatrolPlan, int], NamedPath]
+
+
+def measured_patrol(job: _Job) -> PatrolResult:
     """Return the result of a plan's seed and a path."""
     (plan, seed), path = job
     track = patrol_track(plan, path.name, seed)
