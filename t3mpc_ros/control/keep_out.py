@@ -279,14 +279,9 @@ class KeepOut:
 
     def _is_free(self, angles: Array) -> NDArray[np.bool_]:
         """Return which directions (rad, frame of the robot), shape (k,), are free."""
-        rows = self._nearest[np.isfinite(self._nearest[:, 3])]
-        cosine, sine = np.cos(angles)[:, None], np.sin(angles)[:, None]
-        along = (rows[:, 0] * cosine + rows[:, 1] * sine) * rows[:, 3]
-        aside = np.abs(rows[:, 1] * cosine - rows[:, 0] * sine) * rows[:, 3]
-        # A cell that is already nearer than the distance blocks only what approaches it.
-        reach = np.minimum(self.parameters.distance, rows[:, 3] - 0.01)
-        blocked = (along > 0.0) & (aside < reach) & (along < self.parameters.distance + 0.12)
-        free: NDArray[np.bool_] = np.logical_not(blocked.any(axis=1))
+        free = np.empty(angles.size, dtype=np.bool_)
+        distance = self.parameters.distance
+        find_free(self._nearest, np.cos(angles), np.sin(angles), distance, free)
         return free
 
     def _permitted(self, wanted: BodyTwist) -> BodyTwist:
@@ -329,12 +324,15 @@ class KeepOut:
         blocked = self.changed and speed > 0.05 and abs(permitted.linear) < 0.3 * speed
         self._blocked_for = self._blocked_for + elapsed if blocked else 0.0
         self.activity = Activity.AVOIDING if self.changed else Activity.FREE
-        unseen = self._blocked_by_unseen()
-        if self._blocked_for > 0.2 and unseen and self._has_moved_since_look(pose):
+        if (
+            self._blocked_for > 0.2
+            and self._blocked_by_unseen()
+            and self._has_moved_since_look(pose)
+        ):
             self._blocked_for = 0.0
             self._look_around(pose, self.parameters.scan_angle)
             return
-        self._update_stuck(wanted, blocked, unseen, pose, elapsed)
+        self._update_stuck(wanted, pose, elapsed)
 
     def _has_moved_since_look(self, pose: Pose) -> bool:
         seen = self._seen_from
@@ -351,9 +349,7 @@ class KeepOut:
         rows = self._nearest[ahead]
         return bool(rows[int(np.argmin(rows[:, 3])), 2] == UNKNOWN)
 
-    def _update_stuck(
-        self, wanted: BodyTwist, blocked: bool, unseen: bool, pose: Pose, elapsed: float
-    ) -> None:
+    def _update_stuck(self, wanted: BodyTwist, pose: Pose, elapsed: float) -> None:
         """Count the time without progress of a robot that wants to move."""
         parameters = self.parameters
         start = self._progress
@@ -369,8 +365,10 @@ class KeepOut:
             return
         if not self.changed:
             self.activity = Activity.STUCK_DRIVE
+        elif self._blocked_by_unseen():
+            self.activity = Activity.STUCK_UNSEEN
         else:
-            self.activity = Activity.STUCK_UNSEEN if unseen else Activity.STUCK_OBSTACLE
+            self.activity = Activity.STUCK_OBSTACLE
         if self._waited % parameters.stuck_time < elapsed:
             self._detour = None
             self._look_around(pose, self.parameters.scan_angle)
@@ -406,6 +404,29 @@ def find_nearest(grid: MapGrid, x: float, y: float, yaw: float, nearest: Array) 
             if distance < nearest[sector, 3]:
                 nearest[sector, 0], nearest[sector, 1] = ahead / distance, left / distance
                 nearest[sector, 2], nearest[sector, 3] = state, distance
+
+
+@kernel
+def find_free(
+    nearest: Array, cosine: Array, sine: Array, distance: float, free: NDArray[np.bool_]
+) -> None:
+    """Write which directions are free, shape (k,), given their cosines and sines.
+
+    nearest : see :func:`find_nearest`
+    """
+    for k in range(cosine.size):
+        free[k] = True
+        for sector in range(nearest.shape[0]):
+            reach = nearest[sector, 3]
+            if reach == math.inf:
+                continue
+            ahead, left = nearest[sector, 0], nearest[sector, 1]
+            along = (ahead * cosine[k] + left * sine[k]) * reach
+            aside = abs(left * cosine[k] - ahead * sine[k]) * reach
+            # A cell that is already nearer than the distance blocks only what approaches it.
+            near = aside < min(distance, reach - 0.01) and along < distance + 0.12
+            if along > 0.0 and near:
+                free[k] = False
 
 
 @kernel
