@@ -190,7 +190,8 @@ function showParameter(node, row, group) {
   const send = () => {
     const value = read();
     if (value !== undefined && JSON.stringify(value) !== JSON.stringify(box.value)) {
-      command('set', { node, name: row.name, value }).then((done) => { if (!done) write(box.value); });
+      command('set', { node, name: row.name, value })
+        .then((done) => { if (done) box.value = value; else write(box.value); });
     }
   };
   const unit = row.unit ? ` ${row.unit}` : '';
