@@ -80,7 +80,7 @@ def test_a_person_watches_and_commands_a_robot(page, browser, processes, tmp_pat
     browser.wait(lambda: browser.run('return Boolean(place(arguments[0]))', name), 'no parameter')
     browser.find('search').send_keys('command_loss')
     entry = browser.find(name).find_element('css selector', 'input')
-    # Over what is selected: after a clear() the input has lost the focus, and shows the value anew.
+    # Over what is selected: a clear() takes the focus, and the page shows the value anew.
     entry.send_keys(Keys.CONTROL, 'a', Keys.NULL, '0.2', Keys.ENTER)
     browser.wait(lambda: 'is set' in browser.text('answer'), 'not set')
     entry.send_keys(Keys.CONTROL, 'a', Keys.NULL, '7', Keys.ENTER)
