@@ -7,7 +7,6 @@ import math
 import struct
 
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Pose as PoseMessage
 from geometry_msgs.msg import PoseStamped, Quaternion, TransformStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.serialization import serialize_message
@@ -191,16 +190,6 @@ def pose_stamped(state: State, frame: str) -> PoseStamped:
     message.pose.position.y = state.pose.y
     message.pose.orientation = quaternion_from_yaw(state.pose.yaw)
     return message
-
-
-def pose_from_message(message: PoseMessage) -> Pose:
-    """Return the planar pose of a Pose message."""
-    turn = message.orientation
-    return Pose(
-        message.position.x,
-        message.position.y,
-        yaw_from_quaternion(turn.x, turn.y, turn.z, turn.w),
-    )
 
 
 def transform(state: State, frame: str, child: str) -> TransformStamped:
