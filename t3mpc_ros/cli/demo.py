@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """``t3mpc demo``: runs the nodes as processes, records them and writes the report."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 import signal
 import sys
@@ -14,6 +14,8 @@ import webbrowser
 from t3mpc_ros.cli.private_graph import PrivateGraph
 from t3mpc_ros.cli.process_group import ProcessError, ProcessGroup, StopRequestedError
 from t3mpc_ros.cli.view import PAGE_AT
+from t3mpc_ros.parameters.command_line import parse_assignments
+from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.stop_signal import StopSignal
 
 if TYPE_CHECKING:
@@ -71,6 +73,8 @@ class DemoOptions:
     """Whether the run is shown on a live page."""
     patrol: bool = False
     """Whether the robot patrols the world ``room``; without ``seed`` on a secret path."""
+    settings: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
+    """Further parameters by node, as of :func:`parse_settings`."""
 
     @property
     def robot_node(self) -> str:
@@ -105,6 +109,8 @@ class DemoOptions:
             given['reference_generator']['seed'] = self.seed
             if self.robot != 'emulator':
                 given['sim_robot']['seed'] = self.seed
+        for name, values in self.settings.items():
+            given[name] |= values
         return given
 
     def board(self) -> tuple[str, ...]:
@@ -113,6 +119,31 @@ class DemoOptions:
             return ()
         words = ['--link', str(self.port), '--loss', str(self.loss)]
         return tuple(words if self.seed is None else [*words, '--seed', str(self.seed)])
+
+
+def parse_settings(
+    options: DemoOptions, texts: Iterable[str]
+) -> Mapping[str, Mapping[str, object]]:
+    """Return parameters by node and name from texts like ``controller.law.gain=30``.
+
+    Raises
+    ------
+    ParameterError
+        The demo has no such node, the node no such parameter, or the parameter not that value.
+    """
+    from t3mpc_ros.nodes.registry import parameter_class  # takes a second
+
+    found: dict[str, Mapping[str, object]] = {}
+    for text in texts:
+        name, _, assignment = text.partition('.')
+        if name not in options.nodes:
+            raise ParameterError(
+                f'--set must begin with one of {", ".join(options.nodes)} and a dot: got {text!r}'
+            )
+        table = parameter_class(name)
+        found[name] = {**found.get(name, {}), **parse_assignments(table, [assignment])}
+        table.from_dict({**options.parameters()[name], **found[name]})
+    return found
 
 
 class DemoInterruptedError(RuntimeError):

@@ -4,6 +4,7 @@
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import datetime
 from importlib import import_module
 from pathlib import Path
@@ -63,25 +64,30 @@ def _run(words: Sequence[str]) -> int:
 
 
 def _demo(options: argparse.Namespace) -> int:
-    from t3mpc_ros.cli.demo import DemoInterruptedError, DemoOptions, run_demo
+    from t3mpc_ros.cli.demo import (
+        DemoInterruptedError,
+        DemoOptions,
+        parse_settings,
+        run_demo,
+    )
 
     if options.patrol and options.robot != 'twin':
         print(f'error: --patrol needs --robot twin: got {options.robot}', file=sys.stderr)
         return 2
-    output = options.output or _new_run(Path('runs'))
+    wanted = DemoOptions(
+        duration=options.duration,
+        headless=options.headless,
+        seed=options.seed,
+        robot=options.robot,
+        loss=options.loss,
+        view=options.view,
+        patrol=options.patrol,
+    )
+    if options.settings:
+        wanted = replace(wanted, settings=parse_settings(wanted, options.settings))
+    wanted = replace(wanted, output=options.output or _new_run(Path('runs')))
     try:
-        figures = run_demo(
-            DemoOptions(
-                options.duration,
-                output,
-                options.headless,
-                options.seed,
-                options.robot,
-                options.loss,
-                options.view,
-                options.patrol,
-            )
-        )
+        figures = run_demo(wanted)
     except DemoInterruptedError as interruption:
         print(interruption, file=sys.stderr)
         return 128 + interruption.number
@@ -208,6 +214,14 @@ def _parser() -> argparse.ArgumentParser:
         type=_share,
         default=0.0,
         help='share of radio packets lost each way, with --robot emulator (default 0)',
+    )
+    demo.add_argument(
+        '--set',
+        dest='settings',
+        action='append',
+        default=[],
+        metavar='NODE.NAME=VALUE',
+        help='parameter of a node, such as controller.law.gain=30; may be given again',
     )
     demo.set_defaults(run=_demo)
 

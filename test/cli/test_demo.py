@@ -3,6 +3,7 @@
 """``t3mpc demo``: signals end everything at every phase; private graphs never meet."""
 
 from contextlib import ExitStack, suppress
+import dataclasses
 import os
 from pathlib import Path
 import re
@@ -16,7 +17,8 @@ import pytest
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli import process_group
-from t3mpc_ros.cli.main import _new_run
+from t3mpc_ros.cli.demo import DemoOptions, parse_settings
+from t3mpc_ros.cli.main import _new_run, main
 from t3mpc_ros.cli.private_graph import DOMAINS, NoDomainError, PrivateGraph, used_domains
 
 pytestmark = pytest.mark.slow
@@ -281,3 +283,33 @@ def test_two_demos_at_once_do_not_meet(graph, tmp_path):
             assert (times[1:] > times[:-1]).all()
             stamps.append(set(times + recording.start_ns * 1e-9))
     assert not stamps[0] & stamps[1]
+
+
+def test_parameters_of_each_node_are_set(tmp_path):
+    options = DemoOptions(robot='servo', seed=3)
+    texts = 'controller.law.gain=30', 'controller.adaptation.enabled=false', 'sim_robot.seed=4'
+    set_options = dataclasses.replace(options, settings=parse_settings(options, texts))
+    before, after = options.parameters(), set_options.parameters()
+    assert after['controller'] == before['controller'] | {
+        'law.gain': 30,
+        'adaptation.enabled': False,
+    }
+    assert after['sim_robot'] == before['sim_robot'] | {'seed': 4}
+    assert after['reference_generator'] == before['reference_generator']
+
+
+@pytest.mark.parametrize(
+    ('text', 'words'),
+    [
+        ('law.gain=30', 'one of recorder, controller, sim_robot, reference_generator'),
+        ('controller.law.gian=30', 'did you mean law.gain'),
+        ('controller.law.gain=-1', 'law.gain must be'),
+        ('controller.law.gain', 'NAME=VALUE'),
+        ('radio_bridge.port=x', 'one of recorder'),
+    ],
+)
+def test_a_wrong_setting_starts_nothing(text, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(['demo', '--headless', '--set', text]) == 1
+    assert words in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
