@@ -453,6 +453,23 @@ def test_two_latched_publishers_keep_a_message_each(tape, tmp_path):
     assert [m.data for m in kept] == [text('1'), text('2')]
 
 
+def test_a_shifted_bag_restores_its_own_map(tape, tmp_path):
+    """Two runs of different days are played together from their middle.
+
+    Of the second one the map is due as well: its stamps are moved to the first run, and so must be
+    the time before which it is searched.
+    """
+    day = 86_400 * SECOND
+    one = write_mcap(tmp_path / 'one', [('/a', START + i * SECOND) for i in range(5)])
+    two = [('/map', START + SECOND), ('/b', START + 2 * SECOND), ('/map', START + 3 * SECOND)]
+    for shift in (day, -day):
+        late = [(topic, stamp_ns - shift) for topic, stamp_ns in two]
+        other = write_mcap(tmp_path / f'two{shift}', late)
+        made = tape(one, other, offsets_ns=[0, shift])
+        (kept,) = made.latched_messages_before(START + 2 * SECOND)
+        assert (kept.topic, kept.received_ns) == ('/map', START + SECOND)
+
+
 # -- playing --------------------------------------------------------------------------------------
 
 

@@ -29,12 +29,13 @@ from t3mpc_ros.bag.recording.message_queue import MessageQueue
 from t3mpc_ros.bag.recording.recording_parameters import RecordingParameters
 from t3mpc_ros.bag.recording.snapshot import (
     CircularMessageCache,
+    SnapshotWriter,
     snapshot_folder_name,
     unused_folder,
     write_snapshot,
 )
 from t3mpc_ros.bag.recovery.finalize_file import finalize_file
-from t3mpc_ros.bag.schema import BagError
+from t3mpc_ros.bag.schema import BagError, MessageDefinitions
 from t3mpc_ros.bag.topic_filter import PlayTopicFilter, TopicFilter, TopicFilterError
 from t3mpc_ros.bag.writer import (
     AttachmentError,
@@ -527,6 +528,31 @@ def test_snapshot_is_a_bag_with_its_reason(tmp_path):
     with open_bag(tmp_path / 'snap') as reader:
         assert reader.message_count == 450
         assert reader.metadata_records['snapshot'] == {'reason': 'link lost'}
+        assert list(reader.topics) == ['/n']
+
+
+def test_a_topic_that_appears_meanwhile_is_not_in_the_snapshot(tmp_path):
+    """The thread that writes a snapshot reads the topics while the recorder discovers others.
+
+    Without its own table a new topic could end the snapshot of a fault: a dictionary must not
+    grow while it is read.
+    """
+    cache = CircularMessageCache(10 * SECOND, 10**6)
+    writer = SnapshotWriter(tmp_path, cache, MessageDefinitions())
+    writer.add_topic(TopicInformation('/n', NUMBER), 0)
+    writer.add([message('/n', i) for i in range(5)] + [message('/late', 5)])
+    done = []
+
+    def attachments():
+        writer.add_topic(TopicInformation('/late', NUMBER), 0)
+        yield Attachment('a', 'text/plain', b'x'), START
+
+    folder = writer.start(
+        'fault', START + 6 * SECOND, {}, attachments(), lambda *result: done.append(result)
+    )
+    writer.close(30.0)
+    assert done == [(True, f'snapshot of "fault": 5 messages in {folder}')]
+    with open_bag(folder) as reader:
         assert list(reader.topics) == ['/n']
 
 

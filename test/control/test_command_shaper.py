@@ -108,6 +108,20 @@ def test_a_lost_step_is_bridged():
     np.testing.assert_allclose(bridged[known], whole[known], atol=2e-3)
 
 
+@pytest.mark.parametrize('speeds', [(3.0, 3.0), (2.0, -1.0), (-1.0, 2.5)])
+def test_a_start_in_motion_is_no_step(speeds):
+    """The controller is enabled while the robot drives a curve: the curve goes on.
+
+    Started with the wheels exchanged, the shaper would have turned the robot the other way first.
+    """
+    shaper = CommandShaper(PARAMETERS, PERIOD)
+    shaper.reset(np.array(speeds))
+    for _ in range(30):
+        shaper.step(np.array(speeds), PERIOD)
+        np.testing.assert_allclose(shaper.reference, speeds, atol=1e-12)
+        np.testing.assert_allclose(shaper.rate, 0.0, atol=1e-9)
+
+
 def test_without_frequencies_nothing_changes():
     none = CommandShaperParameters(straight_frequency=0.0, turning_frequency=0.0)
     shaper = CommandShaper(none, PERIOD)

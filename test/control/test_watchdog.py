@@ -65,6 +65,23 @@ def test_elapsed_is_none_for_first_messages_gaps_and_restarts():
     assert watchdog.elapsed(500 * MS) is None
 
 
+def test_a_clock_that_starts_again_ends_the_hold():
+    """A simulation was restarted while the state diverged.
+
+    The end of the hold was a stamp of the old clock: after a run of ten minutes the robot would
+    have stood still for the next ten.
+    """
+    watchdog = InputWatchdog(WatchdogParameters())
+    for stamp_ms in (600_000, 600_010):
+        watchdog.elapsed(stamp_ms * MS)
+    watchdog.reference_received()
+    assert _decide(watchdog, 600_010, speed=41.0) is Reason.DIVERGING
+    assert watchdog.elapsed(0) is None
+    assert _decide(watchdog, 0) is Reason.NO_REFERENCE
+    watchdog.reference_received()
+    assert _decide(watchdog, 10) is Reason.TRACKING
+
+
 def test_the_odometry_timeout_is_measured_with_one_clock():
     watchdog = InputWatchdog(WatchdogParameters(odometry_timeout=0.2))
     assert watchdog.odometry_timed_out(None, 0)

@@ -8,6 +8,7 @@ from t3mpc_ros.emulator.fault_injection import (
     FAULT_KINDS,
     Fault,
     FaultError,
+    FaultInjection,
     check_fault,
     parse_fault,
 )
@@ -42,3 +43,16 @@ def test_every_fault_has_valid_defaults():
     for kind in FAULT_KINDS:
         fault = check_fault(Fault(kind.name, 0.0))
         assert fault.duration > 0.0
+
+
+def test_of_two_faults_of_a_kind_the_later_one_holds():
+    """A link that always loses a little gets much worse for a second, then is as before."""
+    now_ns = 0
+    faults = FaultInjection(lambda: now_ns, seed=1)
+    for text in ('loss:1:10:0.1', 'loss:3:1:0.9', 'loss:20:1:0.5'):
+        faults.add(parse_fault(text), 0)
+    values = []
+    for seconds in (0, 1, 2, 3, 3.5, 4, 5, 11, 20.5):
+        now_ns = round(seconds * 1e9)
+        values.append(faults.value('loss'))
+    assert values == [0.0, 0.1, 0.1, 0.9, 0.9, 0.1, 0.1, 0.0, 0.5]

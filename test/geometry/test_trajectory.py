@@ -102,6 +102,22 @@ def test_a_restarted_source_replaces_later_samples():
     assert trajectory.at(30 * MS) is None
 
 
+def test_a_replaced_jump_is_no_longer_reported():
+    """The source planned a step, then started again and took it back.
+
+    The controller prepares for a reported jump: it would have slowed down for one that never
+    comes.
+    """
+    speeds = (0.0, 0.0, 0.3, 0.0)
+    trajectory = filled(*(sample(10.0 * n, speed) for n, speed in enumerate(speeds)))
+    trajectory.add(sample(30.0, 0.3))
+    (kept,) = trajectory.pop_jumps()
+    assert (kept.stamp_ns, kept.change.linear) == (20 * MS, pytest.approx(0.3))
+    trajectory.add(sample(40.0, 0.0))
+    trajectory.add(sample(40.0, 0.3))
+    assert not trajectory.has_jumps
+
+
 def test_a_repeated_sample_replaces_the_previous_one():
     trajectory = filled(sample(0.0, 0.1), sample(10.0, 0.1), sample(20.0, 0.1), capacity=4)
     for speed in (0.11, 0.12, 0.13, 0.12):

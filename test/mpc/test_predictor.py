@@ -138,6 +138,24 @@ def test_residuals_compare_predictions_with_measurements():
     assert np.mean(np.square(missed)) < 0.05 * np.mean(np.square(stayed))
 
 
+def test_a_prediction_uses_the_offset_of_its_time():
+    """The offset e follows a disturbance; a prediction was made with the e of that time.
+
+    With the newest e a prediction over half a horizon would know the disturbance that came later,
+    and its skill, which gives the machine its authority, would be flattered.
+    """
+    predictor, (errors, moves) = _predictor()
+    history, newest = predictor.history, []
+    for i in range(30, -1, -1):
+        observe(
+            predictor.machine, predictor.rls, history, errors[i], moves[i + 1], True, False, HOW
+        )
+        newest.insert(0, history.offsets[0])
+    count = history.offsets.size
+    assert len(set(newest[:count])) == count
+    np.testing.assert_array_equal(history.offsets, newest[:count])
+
+
 def test_an_error_beyond_the_range_is_not_learned():
     predictor, run = _predictor()
     predictor.fit(*run, ExcitationParameters(), 600.0, HOW)

@@ -474,6 +474,21 @@ def test_nothing_is_commanded_while_the_robot_is_latched():
     assert arbiter.next_setpoint(False, MS) == (CommandFlag.ENABLE, 2000, 1000, 20)
 
 
+def test_a_setpoint_ends_with_its_command():
+    """The host may die after any setpoint: the robot must not drive on longer than it was told.
+
+    The time to live is in units of 10 ms. A part of a unit is not rounded up; only the last
+    setpoint of a command has one unit, the least there is.
+    """
+    arbiter = SetpointArbiter(LinkParameters())
+    until_ns = 1000 * MS
+    arbiter.command(WheelSpeeds(1.0, 2.0), until_ns)
+    left = {200: 20, 199: 19, 105: 10, 100: 10, 99: 9, 20: 2, 19: 1, 10: 1, 3: 1}
+    found = {ms: arbiter.next_setpoint(False, until_ns - ms * MS).ttl for ms in left}
+    assert found == left
+    assert arbiter.next_setpoint(False, until_ns)[1:3] == (0, 0)
+
+
 def test_an_emergency_stop_survives_a_jammed_link(bench):
     bench.dongle.jam_until_ns = bench.now_ns + 300 * MS
     bench.link.latch_estop('asked for')
