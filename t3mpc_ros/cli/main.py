@@ -83,8 +83,8 @@ def _demo(options: argparse.Namespace) -> int:
         view=options.view,
         patrol=options.patrol,
     )
-    if options.settings:
-        wanted = replace(wanted, settings=parse_settings(wanted, options.settings))
+    if options.set:
+        wanted = replace(wanted, settings=parse_settings(wanted, options.set))
     wanted = replace(wanted, output=options.output or _new_run(Path('runs')))
     try:
         figures = run_demo(wanted)
@@ -217,7 +217,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     demo.add_argument(
         '--set',
-        dest='settings',
         action='append',
         default=[],
         metavar='NODE.NAME=VALUE',

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 import pytest
+from support.long_tests import few_of
 from support.unrendered import unrendered  # noqa: F401 - a fixture
 
 from t3mpc_ros.cli.main import main
@@ -129,7 +130,7 @@ def test_the_command_writes_page_pictures_and_numbers(tmp_path, capsys):
     }
 
 
-@pytest.mark.parametrize('robot', ['exact', 'twin'])
+@pytest.mark.parametrize('robot', few_of(['exact', 'twin'], 1))
 def test_an_interrupted_study_goes_on_with_equal_results(tmp_path, monkeypatch, robot):
     """Only the patrols that are missing are run; those in the file are equal to the last bit."""
     plan = PatrolPlan(('boustrophedon', 'random walk'), (102, 101), 5.0, robot)
