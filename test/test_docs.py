@@ -96,11 +96,13 @@ def test_each_number_is_in_a_docstring_below_module_level():
 
 
 @pytest.mark.parametrize('path, name', TESTS, ids=lambda value: value.split('/')[-1])
+@pytest.mark.slow
 def test_every_test_named_exists(path, name):
     assert name in {node.name for node in _tree(path).body if isinstance(node, ast.FunctionDef)}
 
 
 @pytest.mark.parametrize('row', ROWS, ids=lambda row: row[0][:30])
+@pytest.mark.slow
 def test_a_test_of_each_row_reaches_a_function_of_that_row(row):
     """The test's file imports the function's module, or a module that imports it."""
     reached = set()

@@ -136,6 +136,7 @@ def _texts(path):
 
 
 @pytest.mark.parametrize('sheet', SHEETS)
+@pytest.mark.slow
 def test_the_pictures_are_drawn_from_their_source(schematic, sheet, tmp_path):
     """Compared by their texts: another release of the library may place a line elsewhere."""
     pytest.importorskip('schemdraw')

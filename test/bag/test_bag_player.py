@@ -655,6 +655,7 @@ def test_seek_cancels_pending_steps(bag):
 
 
 @pytest.mark.parametrize('seed', range(40))
+@pytest.mark.slow
 def test_no_sequence_of_commands_skips_or_repeats_a_message(bag, seed):
     """Between seeks the order is that of the bag, for any commands and delays of the caller."""
     rng = random.Random(seed)

@@ -175,6 +175,7 @@ def test_everything_that_was_written_is_read(tmp_path, check):
     assert last['twist']['twist']['angular']['z'] == -0.2 * 597
 
 
+@pytest.mark.slow
 def test_every_file_of_a_bag_is_read(tmp_path, check):
     paths = [write(tmp_path / 'run', 60, 60 * part) for part in range(3)]
     every = found_by(check, *paths)
@@ -187,6 +188,7 @@ def test_every_file_of_a_bag_is_read(tmp_path, check):
         assert [each['last']['/number']['data'] for each in every] == [59, 119, 179]
 
 
+@pytest.mark.slow
 def test_a_finalized_file_is_read(tmp_path, check):
     path = write(tmp_path / 'run', 600, chunk_bytes=32 * 1024)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
@@ -196,6 +198,7 @@ def test_a_finalized_file_is_read(tmp_path, check):
     assert found['metadata']['settings'] == DETAILS['settings']
 
 
+@pytest.mark.slow
 def test_attachments_are_read_and_their_checksums_verified(tmp_path, check):
     content = b'a model file \x00\xff' * 50
     item = Attachment('model.npz', 'application/zip', content, START)
@@ -213,6 +216,7 @@ def test_attachments_are_read_and_their_checksums_verified(tmp_path, check):
 
 
 @pytest.mark.parametrize('part', ['chunk', 'summary', 'cut'])
+@pytest.mark.slow
 def test_the_programs_notice_damage(tmp_path, check, part):
     path = write(tmp_path / 'run', 200)
     content = bytearray(path.read_bytes())

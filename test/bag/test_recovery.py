@@ -179,6 +179,7 @@ def test_a_truncated_bag_keeps_its_complete_chunks_only(places, own):
     ],
     ids=['lz4', 'none', 'unchunked', 'no_checksum'],
 )
+@pytest.mark.slow
 def test_truncated_file_of_another_writer_keeps_whole_records(options):
     content = foreign_file(**options)
     whole, end = inside(content).items, end_of_data(content)
@@ -342,6 +343,7 @@ def test_a_file_without_header_or_mark_is_read(own):
         assert inside(result).items == inside(own).items
 
 
+@pytest.mark.slow
 def test_resynchronization_without_chunks_or_checksums():
     for options in ({'use_chunking': False}, {'enable_crcs': False}):
         content = foreign_file(extras=False, **options)

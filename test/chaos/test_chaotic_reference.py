@@ -38,6 +38,7 @@ def derivative(values, rate):
     return inner * rate / 12.0
 
 
+@pytest.mark.slow
 def test_samples_are_on_the_grid_and_start_from_rest():
     run = samples(400)
     assert [sample.index for sample in run] == list(range(400))
@@ -48,6 +49,7 @@ def test_samples_are_on_the_grid_and_start_from_rest():
     assert np.abs(wheels_of(run)[:30]).max() < 0.3
 
 
+@pytest.mark.slow
 def test_wheels_are_the_selected_scaled_states():
     parameters = ReferenceParameters(ramp=0.0)
     for sample in samples(2600, ramp=0.0):
@@ -59,6 +61,7 @@ def test_wheels_are_the_selected_scaled_states():
 
 @pytest.mark.parametrize('output', ['wheels', 'body'])
 @pytest.mark.parametrize('blend', [0.0, 4.0])
+@pytest.mark.slow
 def test_rate_is_the_derivative_of_the_wheels_away_from_jumps(output, blend):
     """Finite differences over 60 s with ramp, transitions and constant modes, without jumps."""
     run = samples(6000, **{'output': output, 'switching.blend': blend})
@@ -90,6 +93,7 @@ def test_rate_has_no_impulse_at_a_sudden_jump():
         np.testing.assert_allclose(rates[jump], slope[np.array(run[jump].selected) - 1], atol=0.1)
 
 
+@pytest.mark.slow
 def test_defaults_are_what_a_small_robot_can_follow():
     """Standard deviation near 3 rad/s, accelerations of 1 to 6 rad/s², peaks near 10 rad/s."""
     run = samples(20_000)
@@ -166,6 +170,7 @@ def test_switch_times_do_not_reveal_the_perturbation():
     assert left.var() > 0.8 * centred.var()
 
 
+@pytest.mark.slow
 def test_reset_repeats_a_run_and_another_seed_gives_another_one():
     reference = ChaoticReference(
         ReferenceParameters.from_dict({'seed': 7, 'switching.kind': 'random'}), GEOMETRY

@@ -24,12 +24,14 @@ def _points(seed, length=60.0, **values):
 
 @pytest.mark.parametrize('blend', [0.0, 2.0], ids=['abrupt', 'smooth'])
 @pytest.mark.parametrize('arena', [(-1.75, -1.25, 1.75, 1.25), TRIANGLE])
+@pytest.mark.slow
 def test_path_is_continuous_within_the_arena(arena, blend):
     path, points = _points(3, **{'arena': arena, 'switching.blend': blend})
     assert path.arena.contains(points, 1e-6).all()
     assert np.hypot(*np.diff(points, axis=0).T).max() < 0.0101
 
 
+@pytest.mark.slow
 def test_path_spreads_evenly():
     """Each quarter of each coordinate gets 15 to 35 % of a long path."""
     _, points = _points(4, 250.0)
@@ -38,6 +40,7 @@ def test_path_spreads_evenly():
         assert (np.abs(shares / len(points) - 0.25) < 0.10).all()
 
 
+@pytest.mark.slow
 def test_equal_seeds_give_equal_paths_others_do_not():
     one, again, other = (_points(seed, 10.0)[1] for seed in (2**100 + 1, 2**100 + 1, 2**100 + 2))
     assert np.array_equal(one[: len(again)], again)

@@ -125,6 +125,7 @@ def test_invalid_input_is_reported_before_the_port_opens(arguments, words, capsy
 
 
 @pytest.mark.parametrize('answer', ['no', '', 'yeah', 'ctrl-c'])
+@pytest.mark.slow
 def test_jog_requires_a_confirmation(answer, capsys, monkeypatch):
     """Readline continues after a signal, so the prompt has to poll for Ctrl-C."""
     opened = []

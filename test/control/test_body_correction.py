@@ -86,6 +86,7 @@ def test_wrong_radii_and_separation_are_learnt():
     assert after < 0.35 * before
 
 
+@pytest.mark.slow
 def test_a_robot_that_is_exact_is_left_alone():
     """Noise of the gyro must not turn a good robot into a worse one."""
     for seed in range(3):

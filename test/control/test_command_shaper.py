@@ -48,6 +48,7 @@ def test_default_frequencies_are_those_of_the_default_robot():
 
 
 @pytest.mark.parametrize('sign', [1.0, -1.0])
+@pytest.mark.slow
 def test_the_frequency_of_a_mode_is_cancelled(sign):
     frequency = PARAMETERS.straight_frequency if sign > 0.0 else PARAMETERS.turning_frequency
 

@@ -202,6 +202,7 @@ def test_the_compensated_bound_is_the_smallest_that_80_permits():
 
 
 @pytest.mark.parametrize('seed', few_of(range(4)))
+@pytest.mark.slow
 def test_e17_the_integral_of_84_holds_with_the_initial_v_only(seed):
     """V(t) - V(0) is at most the integral of the bound; the printed (84) omits V(0).
 

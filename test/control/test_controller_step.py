@@ -30,6 +30,7 @@ def tracking():
     return loop, statuses
 
 
+@pytest.mark.slow
 def test_the_controller_waits_for_a_reference_and_tracks_it(tracking):
     loop, statuses = tracking
     assert statuses[0].reason is Reason.NO_REFERENCE
@@ -367,6 +368,7 @@ def test_the_source_may_restart_while_a_jump_is_announced():
     assert np.min(speeds) > 0.0  # no transition of the withdrawn jump
 
 
+@pytest.mark.slow
 def test_a_constant_disturbance_moves_to_the_fuzzy_estimate():
     """Adaptation and MPC both integrate: without the transfer, g and v_p share a disturbance.
 

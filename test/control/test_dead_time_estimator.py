@@ -308,6 +308,7 @@ def run_servo(
 
 @pytest.mark.parametrize('friction', few_of([4.0, 0.0, 1.0, 3.0], 2))
 @pytest.mark.parametrize('dead_time', few_of([0.03, 0.06], 2))
+@pytest.mark.slow
 def test_dead_time_of_a_servo_is_found_with_friction(dead_time, friction):
     for seed in range(3):
         record = run_servo(servo(dead_time, seed, friction=friction))
@@ -317,6 +318,7 @@ def test_dead_time_of_a_servo_is_found_with_friction(dead_time, friction):
 
 @pytest.mark.parametrize('friction', few_of([4.0, 0.0, 1.0, 3.0], 2))
 @pytest.mark.parametrize('noise_variance', few_of([0.04, 0.0, 0.1]))
+@pytest.mark.slow
 def test_friction_is_not_taken_for_dead_time(friction, noise_variance):
     """With offsets alone, friction of 12 rad/s² was a delay of some 30 ms for many seconds."""
     for seed in range(4):
@@ -325,6 +327,7 @@ def test_friction_is_not_taken_for_dead_time(friction, noise_variance):
         np.testing.assert_array_equal(record[:, 1], 0.01)
 
 
+@pytest.mark.slow
 def test_the_friction_model_halves_the_error_by_friction():
     errors = {True: [], False: []}
     for seed in range(4):
@@ -336,6 +339,7 @@ def test_the_friction_model_halves_the_error_by_friction():
 
 
 @pytest.mark.parametrize('mass', [0.7, 1.3])
+@pytest.mark.slow
 def test_another_mass_moves_the_estimate_by_its_lag(mass):
     """Dead time and lag are one sum: 30 % of the lag are 6 ms."""
     for seed in range(3):

@@ -73,6 +73,7 @@ def test_no_reachable_path_has_a_smaller_squared_error(slopes):
 @pytest.mark.parametrize(
     'jump', [(30.0, 30.0), (12.0, -12.0), (20.0, 0.1), (-6.0, 21.0), (-30.0, -12.0)]
 )
+@pytest.mark.slow
 def test_a_torque_drive_crosses_with_the_torque_of_its_motors(jump):
     """A fixed 200 rad/s² was 1.2 times the torque for a turn, 0.5 of it for a push."""
     from scipy.optimize import lsq_linear

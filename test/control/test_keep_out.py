@@ -42,6 +42,7 @@ def _state(keep_out, x, y):
 
 
 @pytest.mark.parametrize('seed', range(30))
+@pytest.mark.slow
 def test_permitted_twist_is_the_nearest_one(seed):
     """Against a fine grid of all twists: permitted, and no permitted one is nearer."""
     generator = np.random.default_rng(seed)

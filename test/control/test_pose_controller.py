@@ -36,6 +36,7 @@ def _reference_twist(kind, time):
 
 @pytest.mark.parametrize('kind', ['straight', 'arc', 'backwards', 'varying'])
 @pytest.mark.parametrize('seed', range(5))
+@pytest.mark.slow
 def test_errors_vanish_and_never_grow(kind, seed):
     """V decreases along every motion, whatever the pose at its start; the error vanishes."""
     generator = np.random.default_rng(seed)

@@ -83,6 +83,7 @@ def follow(file, rate, lag, dead_time):
         3,
     ),
 )
+@pytest.mark.slow
 def test_another_robot_follows_without_exact_time_constants(file, rate, lag, dead_time):
     error, reference, reasons, warnings = follow(file, rate, lag, dead_time)
     assert reasons == {Reason.NO_REFERENCE, Reason.TRACKING}

@@ -15,6 +15,7 @@ from t3mpc_ros.evaluation.bag_report.animation import AnimationOptions, RangeRea
 GOLDEN = Path(__file__).parents[1] / 'golden' / 'switches.mcap'
 
 
+@pytest.mark.slow
 def test_an_animation_has_its_frames_rate_and_size(tmp_path, capsys):
     output = tmp_path / 'new' / 'run.gif'
     words = ['--start', '4', '--duration', '2', '--rate', '5', '--speed', '0.5', '--width', '300']

@@ -189,6 +189,7 @@ def text_of(folder, capsys, *options):
 
 
 @pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'humble', 'humble mcap'])
+@pytest.mark.slow
 def test_a_bag_of_another_robot_has_a_report(rows, tmp_path, capsys, kind):
     """As a TurtleBot's: m/s and rad/s, since nobody says how large its wheels are."""
     folder = tmp_path / 'bag'
@@ -565,6 +566,7 @@ def uneven(t):
         (uneven, 'Inconclusive', 'inconclusive'),
     ],
 )
+@pytest.mark.slow
 def test_runs_are_compared_with_the_first(offset, verdict, words, tmp_path, capsys):
     """A verdict needs a difference beyond what the run itself varies by."""
     folders = [

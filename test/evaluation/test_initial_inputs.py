@@ -66,6 +66,7 @@ def same_columns(one, other):
 
 
 @pytest.mark.parametrize('lost, republished', [(0, 200), (150, 200), (150, 150)])
+@pytest.mark.slow
 def test_initial_inputs_complete_a_late_recording(lost, republished, complete, tmp_path):
     inputs = load_inputs(record_late(tmp_path / 'bag', lost, republished))
     assert same_columns(inputs.odometry, complete.odometry)

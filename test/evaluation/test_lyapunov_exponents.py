@@ -11,6 +11,7 @@ from t3mpc_ros.evaluation.lyapunov_exponents import lyapunov_exponents
 ORDINARY = (1.0, 1.0, 1.0, 1.0)
 
 
+@pytest.mark.slow
 def test_equation_85_with_e6_has_two_positive_exponents():
     found = lyapunov_exponents(hyperchaotic_system(orders=ORDINARY), duration=400.0)
     assert found[0] == pytest.approx(2.3, abs=0.3)

@@ -185,6 +185,7 @@ def test_feed_forward_needs_a_future():
 # --- the loop on the twin -----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_loop_of_a_controller_is_that_of_run_twin():
     scenario = TwinScenario('nominal', 201, 3.0)
     mine = twin_run(scenario, methods_for('twin')[FULL])
@@ -196,12 +197,14 @@ def test_the_loop_of_a_controller_is_that_of_run_twin():
 
 @pytest.mark.parametrize('method', [FULL, PI])
 @pytest.mark.parametrize('case', ['miscalibrated', 'overload', 'dropouts'])
+@pytest.mark.slow
 def test_equal_seeds_give_equal_runs(case, method):
     (_, first), (_, second) = (twin(case, method, duration=3.0) for _ in range(2))
     assert np.array_equal(first.requested, second.requested)
     assert np.array_equal(first.rotors, second.rotors)
 
 
+@pytest.mark.slow
 def test_methods_are_paired():
     """Reference, noise and lost messages are the same for every method of a seed."""
     (scenario, mine), (_, other) = (twin('dropouts', method) for method in (FEED_FORWARD, PI))
@@ -367,6 +370,7 @@ def test_the_plant_of_the_paper_is_compared_too(robot):
     assert all(math.isfinite(value) for value in results['nominal', PI][0].values())
 
 
+@pytest.mark.slow
 def test_the_command_writes_tables_json_and_page(tmp_path, capsys):
     files = tmp_path / 'new' / 'c.json', tmp_path / 'new' / 'c.html'
     words = 'compare --robot twin --seeds 201-202 --duration 2 --workers 1'

@@ -32,6 +32,7 @@ from t3mpc_ros.simulation.world import clearance, load_world
 
 
 @pytest.mark.parametrize('name', PATHS)
+@pytest.mark.slow
 def test_every_path_is_driven_within_arena_and_limits(name):
     plan = PatrolPlan(duration=40.0)
     track = patrol_track(plan, name, 101)

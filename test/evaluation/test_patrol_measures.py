@@ -155,6 +155,7 @@ def test_exponents_of_maps_are_those_of_the_literature():
     assert divergence(points, 1.0, 1, 40).exponent == pytest.approx(0.419, rel=0.05)
 
 
+@pytest.mark.slow
 def test_exponent_of_the_lorenz_system_from_two_coordinates():
     states = _runge_kutta(_lorenz_rate, np.array([1.0, 1.0, 20.0]), 0.02, 5000, 4)[500:]
     points = delay_vectors(states[:, :2], (0, 10))
@@ -181,6 +182,7 @@ def test_a_closed_curve_is_predicted_exactly():
     assert min(each.best for each in skills) > 0.999
 
 
+@pytest.mark.slow
 def test_noise_is_not_predicted_beyond_its_correlation():
     """An observer with a glance at the second half would have a skill here."""
     generator = np.random.default_rng(3)

@@ -276,6 +276,7 @@ def test_the_last_point_is_where_the_search_believes_the_optimum():
     assert better >= 18
 
 
+@pytest.mark.slow
 def test_a_search_that_converged_begins_again_and_leaves_a_trap():
     """Two basins of equal size; the start is beside the bottom of the lesser one."""
 
@@ -468,6 +469,7 @@ def test_a_thousand_of_chatter_costs_a_hundredth():
         assert objective(broken) == math.inf
 
 
+@pytest.mark.slow
 def test_tuning_mixes_noises_and_excludes_held_out_seeds():
     training = TuningScenarios()
     assert not set(training.seeds) & set(HELD_OUT_SEEDS)

@@ -60,6 +60,7 @@ def test_no_seed_of_the_tuning_is_reported():
     assert [case for _, _, case in TRAINING.runs()] == list(CASES)
 
 
+@pytest.mark.slow
 def test_the_body_counts_where_baselines_have_the_gyro(definitions, monkeypatch):
     method = twin_method(definitions[PI], definitions[PI].start[TWIN])
     for case, body in (('nominal', False), ('miscalibrated', True)):

@@ -80,6 +80,7 @@ SECOND = 1000 * MS
 
 
 @pytest.mark.parametrize('speed', [0.1, 1.0, 3.0, 10.0, 37.5])
+@pytest.mark.slow
 def test_simulated_time_follows_its_factor_without_gaps(speed):
     time = SimulatedTime(100.0, speed)
     rng = np.random.default_rng(4)

@@ -99,10 +99,12 @@ def test_it_removes_most_of_a_slowly_varying_disturbance():
     assert _gain(_waves(3000)) < 0.35
 
 
+@pytest.mark.slow
 def test_it_helps_with_noise_of_variance_0_04():
     assert _gain(_levels(3000, 1), noise=0.2) < 0.55
 
 
+@pytest.mark.slow
 def test_with_noise_alone_it_costs_a_few_per_cent():
     """With only noise to predict, the effect of v_p must be negligible."""
     controller = PredictiveController(DEFAULT, PERIOD, GAIN)
@@ -129,6 +131,7 @@ def test_with_noise_alone_it_costs_a_few_per_cent():
     ),
     ids=str,
 )
+@pytest.mark.slow
 def test_it_helps_a_robot_other_than_the_nominal_one(plant):
     assert _gain(_levels(3000, 2), noise=0.05, **plant) < 0.65
 
@@ -292,6 +295,7 @@ def _jumping(known, preview):
     return errors, controller
 
 
+@pytest.mark.slow
 def test_a_known_jump_is_not_learned_and_preview_helps():
     """Unknown jumps look like dynamics of the robot, so a wrong gain is learned."""
     unknown, unaware = _jumping(known=False, preview=False)
@@ -324,6 +328,7 @@ def test_a_known_jump_decays_in_the_prediction_with_the_feedback():
     np.testing.assert_allclose(controller.prediction[1], 0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_it_learns_from_the_applied_v_p():
     """When a limit suppresses v_p, the machine must not learn that v_p has no effect."""
     disturbance = _levels(4000, 9)
@@ -389,6 +394,7 @@ def test_it_is_deterministic_and_weights_can_be_restored():
     assert np.all(copy.get_weights()['output_weights'] != 7.0)
 
 
+@pytest.mark.slow
 def test_a_recorded_run_improves_on_the_nominal_loop():
     """The recorded run is that of a robot three times as slow as the nominal one."""
     parameters = DEFAULT.with_values({'learning': False})

@@ -152,6 +152,7 @@ def test_cd_epochs_reduce_the_reconstruction_error():
     assert figures[-1] < 0.7 * figures[0]
 
 
+@pytest.mark.slow
 def test_cd_weights_remain_bounded():
     """Data outside [-1, 1] cannot be reconstructed; without the limit X_v diverges."""
     machine = _machine()

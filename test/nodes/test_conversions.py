@@ -62,6 +62,7 @@ def test_a_stamp_survives_to_the_nanosecond(stamp_ns):
     assert conversions.ns_from_time(stamp) == stamp_ns
 
 
+@pytest.mark.slow
 def test_a_state_survives_a_reused_odometry_message():
     message = Odometry()
     for motion in motions():
@@ -304,6 +305,7 @@ def test_a_discharging_battery_has_a_negative_current():
     assert np.isnan([message.current, message.charge, message.percentage]).all()
 
 
+@pytest.mark.slow
 def test_the_covariance_of_a_twist_is_that_of_its_wheels():
     geometry, variance = WheelGeometry(), 0.04
     rng = np.random.default_rng(9)

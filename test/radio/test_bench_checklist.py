@@ -120,6 +120,7 @@ def test_builds_of_both_boards_are_compared():
 
 
 @pytest.mark.parametrize('drive', [False, True])
+@pytest.mark.slow
 def test_the_checklist_on_the_emulated_robot(drive, tmp_path, monkeypatch, capsys):
     """A wheel turns only with --drive and a confirmation; the report has every line."""
     bench = ToolBench()

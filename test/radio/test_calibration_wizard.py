@@ -152,6 +152,7 @@ def _after(bench, seconds):
     return answer
 
 
+@pytest.mark.slow
 def test_a_mark_distance_of_zero_is_refused_and_repeated(person):
     person.answers = {'Between both marks': ['0', '0.5 m'], 'Enter to repeat': ['']}
     found = wizard(person, 'radius', distance=0.5, speed=8.0).run()

@@ -49,6 +49,7 @@ def rms(errors):
 
 @pytest.mark.parametrize('seed', few_of(range(4)))
 @pytest.mark.parametrize('skew', [0.005, -0.005])
+@pytest.mark.slow
 def test_clock_error_of_half_a_percent_with_a_jittery_port(skew, seed):
     errors, arrival = drive(60.0, skew, 1e-3, 0.05, seed)
     assert rms(errors) < 0.13e-3
@@ -69,6 +70,7 @@ def test_without_jitter_the_error_is_the_age_resolution():
     assert np.abs(errors[25:]).max() < 20e-6
 
 
+@pytest.mark.slow
 def test_the_wrap_of_the_robot_clock_has_no_effect():
     near = 2**32 - 15_000_000
     errors, _ = drive(20.0, 0.005, 1e-3, 0.05, boot_us=near)
@@ -99,6 +101,7 @@ def test_slow_transactions_do_not_bias_the_fit():
     assert worst < 20_000
 
 
+@pytest.mark.slow
 def test_a_drifting_resonator_is_tracked():
     """Samples older than ten seconds, with another rate, are dropped."""
     model, robot_us = ClockModel(), 0

@@ -54,6 +54,7 @@ EXTREMES = [(1.0, 0.0, 0.0), (8.0, 1.0, 0.1)]
 @pytest.mark.parametrize(
     'thinking, lateness, loss', few_of([*EXTREMES, *(c for c in CASES if c not in EXTREMES)], 2)
 )
+@pytest.mark.slow
 def test_a_command_is_executed_one_cycle_after_its_state(thinking, lateness, loss):
     """Regression: the limiter had a period of its own, independent of the link cycle.
 

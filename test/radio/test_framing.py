@@ -154,6 +154,7 @@ def test_every_single_bit_flip_is_detected():
             assert FrameDecoder().feed(bytes(flipped) + b'\0') == []
 
 
+@pytest.mark.slow
 def test_damaged_frames_never_pass_and_the_decoder_recovers():
     """A damaged frame may destroy the next one (lost zero), never the one after that."""
     source = random.Random(7)

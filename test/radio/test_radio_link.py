@@ -319,6 +319,7 @@ def test_a_sample_is_stamped_by_its_age_since_the_command():
 
 
 @pytest.mark.parametrize('skew', few_of([0.005, -0.005]))
+@pytest.mark.slow
 def test_angles_match_their_stamps_over_a_jittery_lossy_link(skew):
     bench = LinkBench()
     bench.robot.skew = skew
@@ -557,6 +558,7 @@ def test_lost_packets_cost_their_own_cycle_only(bench, loss):
     assert bench.link.telemetry.angles.right == pytest.approx(bench.robot.angles[0], abs=0.15)
 
 
+@pytest.mark.slow
 def test_frames_damaged_on_the_serial_line_are_counted(bench):
     source = random.Random(5)
     take = bench.dongle.receive
@@ -595,6 +597,7 @@ def test_a_robot_restart_starts_a_session_and_keeps_angles(bench):
     assert LinkState.CLOSED not in bench.link_states[1:]
 
 
+@pytest.mark.slow
 def test_a_restart_out_of_range_is_detected_by_the_clock(bench):
     bench.run(3.0)
     before = bench.link.telemetry.angles
@@ -860,6 +863,7 @@ def test_shutdown_before_the_session(seconds):
     assert not bench.is_open
 
 
+@pytest.mark.slow
 def test_the_link_does_not_poll_busily(bench):
     calls = 0
     step = bench.link.step
@@ -880,6 +884,7 @@ def test_the_link_does_not_poll_busily(bench):
     assert calls < 10 * 5 * 4
 
 
+@pytest.mark.slow
 def test_session_numbers_are_random_and_never_repeated():
     numbers = []
     bench = LinkBench(robot=FakeRobot(), seed=9)

@@ -149,6 +149,7 @@ def host_of(settings):
     return LinkParameters.from_dict(content['/**']['ros__parameters']['link'])
 
 
+@pytest.mark.slow
 def test_a_new_robot_gets_a_random_address_and_keeps_it():
     addresses = set()
     for seed in range(20):
@@ -243,6 +244,7 @@ def test_a_wrong_settings_file_is_rejected_by_name(old, new, words):
         robot_settings.settings_of_file(yaml.safe_load(text.replace(old, new, 1)))
 
 
+@pytest.mark.slow
 def test_each_of_two_robots_follows_its_own_host_only():
     """Both receive every packet of the dongle; before they are set up, neither moves."""
     benches = [ToolBench(erased=True) for _ in range(2)]
@@ -299,6 +301,7 @@ def test_an_absent_robot_leads_to_the_channel_scan():
     assert not link_test.is_usable(rows)
 
 
+@pytest.mark.slow
 def test_slow_and_damaged_cables_are_detected():
     bench = ToolBench()
     bench.emulator.inject('delay', math.inf, 0.016)
@@ -328,6 +331,7 @@ def test_the_wrong_port_and_a_dead_chip_are_reported():
 
 
 @pytest.mark.parametrize('channel, rate', [(0, '1M'), (100, '250k'), (125, '2M')])
+@pytest.mark.slow
 def test_the_scan_finds_the_robot_and_restores_the_radio(channel, rate):
     bench = ToolBench(channel=channel, rate=rate)
     before, seen = bench.radio(), []

@@ -135,6 +135,7 @@ def test_track_gyro_scale_and_bias_have_their_stated_uncertainty():
     assert np.mean(uncertainties['track']) < 1e-3 * TRACK
 
 
+@pytest.mark.slow
 def test_gyro_bias_has_its_stated_uncertainty():
     errors, uncertainties = [], []
     for trial in range(TRIALS):

@@ -251,6 +251,7 @@ def stop_time(limiter, now, begin):
     return (now - begin) / 1e3
 
 
+@pytest.mark.slow
 def test_settings_that_stop_too_late_are_rejected():
     """Silence and ramp were bounded one by one: 0.5 s and 3.3 s were possible together."""
     for changes in (

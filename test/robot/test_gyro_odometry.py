@@ -118,6 +118,7 @@ def nees(robots, odometries):
     return float(np.mean(values))
 
 
+@pytest.mark.slow
 def test_normalized_estimation_error_matches_the_covariance():
     count = 80
     robots, odometries = Robots(count, 1), make_odometries(count)
@@ -140,6 +141,7 @@ def test_normalized_estimation_error_matches_the_covariance():
     assert not any(odometry.slipping for odometry in odometries)
 
 
+@pytest.mark.slow
 def test_standstill_corrects_half_of_the_yaw_drift():
     count = 40
     changes = {'gyro_scale_tolerance': 0.0, 'gyro_bias_drift': 5e-4}
@@ -178,6 +180,7 @@ def test_without_calibrated_gyro_equals_wheel_odometry(gyro_state):
     assert not odometry.slipping
 
 
+@pytest.mark.slow
 def test_uncalibrated_gyro_bias_does_not_affect_yaw():
     robots, odometries = Robots(1, 4), make_odometries()
     robots.bias[:] = 20.0 * DEGREE
@@ -275,6 +278,7 @@ def test_bias_is_estimated_at_standstill_and_again_after_a_jump():
 
 
 @pytest.mark.parametrize('part', few_of([0.25, 0.5, 0.75]))
+@pytest.mark.slow
 def test_bias_jump_in_motion_is_half_corrected_at_standstill(part):
     """A jump of 1 deg/s is not flagged; the next standstill measures it, but not its time."""
     robots, odometries = Robots(1, 8), make_odometries()
@@ -332,6 +336,7 @@ def reversals(acceleration=200.0, top=8.0):
 
 
 @pytest.mark.parametrize('period, error', few_of([(0.01, 0.001), (0.005, 0.001), (0.02, 0.015)]))
+@pytest.mark.slow
 def test_fast_reversals_are_not_detected_as_slip(period, error):
     """The gyro lags by 4.8 ms: 1 rad/s at 200 rad/s², which without delay would indicate slip.
 
@@ -447,6 +452,7 @@ def test_slip_detection_has_hysteresis():
 
 
 @pytest.mark.parametrize('tolerance', [0.003, 0.03])
+@pytest.mark.slow
 def test_scale_error_within_tolerance_is_not_slip(tolerance):
     robots, odometries = Robots(1, 22), make_odometries(gyro_scale_tolerance=tolerance)
     robots.scale[:] = 0.05
@@ -469,6 +475,7 @@ def test_short_turns_include_the_gyro_delay(period):
     assert abs(robots.yaw_errors(odometries)[0]) < 60 * 1e-4
 
 
+@pytest.mark.slow
 def test_covariance_stays_symmetric_and_positive_definite():
     generator = np.random.default_rng(15)
     for _ in range(20):

@@ -55,6 +55,7 @@ def test_a_fit_meets_a_function_that_the_system_can_be():
     np.testing.assert_allclose(fitted.evaluate(between), source.evaluate(between), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_columns_of_a_bag_are_its_messages():
     bag = t3.read_bag(BAG)
     with open_bag(BAG) as reader:

@@ -122,6 +122,7 @@ def test_no_slope_of_a_reference_looks_ahead():
     assert not found.rate.any()
 
 
+@pytest.mark.slow
 def test_the_wheels_of_waypoints_drive_through_the_points():
     points = np.array([[0.0, 0.0], [0.6, 0.0], [1.0, 0.5], [0.6, 1.0]])
     path = t3.Waypoints(points, speed=0.2, acceleration=0.4)
@@ -221,6 +222,7 @@ def test_the_twin_takes_reference_controller_and_faults():
 # -- files --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_files_hold_every_digit(tmp_path):
     run = t3.simulate(proportional, **SHORT)
     head, *rows = csv.reader(run.to_csv(tmp_path / 'new' / 'run.csv').open())

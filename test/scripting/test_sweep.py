@@ -45,6 +45,7 @@ def counted(monkeypatch):
     return runs
 
 
+@pytest.mark.slow
 def test_a_row_holds_all_that_was_run():
     found = t3.sweep(
         [Proportional, 'ADRC'],
@@ -156,6 +157,7 @@ def test_a_file_of_another_kind_is_left_alone(tmp_path):
     assert path.read_bytes() == content
 
 
+@pytest.mark.slow
 def test_the_command_writes_the_same_rows(tmp_path, capsys):
     parquet = pytest.importorskip('pyarrow.parquet')
     path = tmp_path / 'sweep.parquet'

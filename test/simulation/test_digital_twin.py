@@ -134,6 +134,7 @@ def test_halving_the_step_changes_a_minute_by_less_than_10_um():
 # -- odometry errors from lost steps and sliding tyres --------------------------------------------
 
 
+@pytest.mark.slow
 def test_counters_give_the_path_without_lost_steps_or_slip():
     robot = DigitalTwin(parameters(odometry__use_gyro=False))
     for state in drive(robot, course(5, 3000)):
@@ -329,6 +330,7 @@ def test_read_only_parameters_cannot_change_at_run_time():
 # -- documentation --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_documented_twin_example_runs(capsys):
     page = (Path(__file__).resolve().parents[2] / 'docs' / 'simulation.md').read_text()
     (example,) = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
@@ -366,6 +368,7 @@ def test_odometry_assumes_the_nominal_geometry():
     assert state.odometry.pose.yaw / state.truth.pose.yaw == pytest.approx(1.05, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_wrong_radii_lose_no_steps():
     state = drive(DigitalTwin(parameters(right_wheel_radius_multiplier=1.1)), course(3, 1000))[-1]
     assert state.lost_steps == (0, 0)

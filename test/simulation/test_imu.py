@@ -201,6 +201,7 @@ def test_allan_deviation_matches_the_noise_density(setting, dt):
     assert found == pytest.approx(0.005 * math.sqrt(0.5 * folded), rel=0.15)
 
 
+@pytest.mark.slow
 def test_allan_deviation_rises_with_bias_drift():
     """K sqrt(tau/3) for a random walk K, far above the remaining noise."""
     imu = sensor(seed=3, gyro_drift=0.05, gyro_offset=0.0)

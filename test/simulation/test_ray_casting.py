@@ -51,6 +51,7 @@ def algebraic_distance(x, y, direction, segments, circles):
     return min(hits)
 
 
+@pytest.mark.slow
 def test_ray_length_matches_an_algebraic_solution():
     generator = np.random.default_rng(1)
     seen = 0

@@ -156,6 +156,7 @@ def test_backward_time_jump_clears_the_queue():
         assert transport.arrived(60) == [command(3)]
 
 
+@pytest.mark.slow
 def test_full_queue_drops_and_counts_the_oldest():
     transport = make_transport(6)
     for number in range(3 * CAPACITY):

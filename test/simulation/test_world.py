@@ -298,6 +298,7 @@ def test_list_lengths_and_segment_count_are_bounded():
     refused(wall.replace('points: [', 'points: [[5, 5], '), 'from 2 to 2001 entries: got 2002')
 
 
+@pytest.mark.slow
 def test_splitting_walls_respects_the_segment_limit():
     feet = ', '.join(f'{{points: [[{0.1 * i:g}, 0], [{0.1 * i:g}, 1]]}}' for i in range(1500))
     text = f'walls: [{{points: [[-1, 0], [999, 0]]}}, {feet}]'
@@ -326,6 +327,7 @@ def test_unreadable_file_is_rejected_by_name(tmp_path):
         load_world(broken)
 
 
+@pytest.mark.slow
 def test_damaged_file_is_parsed_or_rejected():
     generator = np.random.default_rng(4)
     read = 0

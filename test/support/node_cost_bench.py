@@ -5,13 +5,16 @@
     PYTHONPATH=.:test .venv/bin/python test/support/node_cost_bench.py [--seconds 40] [--runs 3]
 
 Generator, controller, simulated robot and recorder at 100 Hz, as the demo starts them, and in the
-same graph a node that answers each odometry message with a Twist and does nothing else. A first
-half of a run counts processor time; in the second, an observer takes the time from each odometry
-message to the command of the controller and to the answer of the echo.
+same graph a node that answers each odometry message with a Twist and does nothing else. The first
+half of a run counts processor time. Then an observer takes the time from each odometry message to
+the command of the controller while the echo is suspended, and to the answer of the echo while the
+controller is: both wake at once, and the second of them would wait for the first.
 """
 
 import argparse
+import os
 from pathlib import Path
+import signal
 import statistics
 import subprocess
 import sys
@@ -41,18 +44,18 @@ from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 rclpy.init()
 node = rclpy.create_node('observer')
-begin, taken = [0.0], {'cmd_vel': [], 'answer': []}
+begin, times = [], []
 def start(message):
-    begin[0] = time.monotonic()
+    begin[:] = [time.monotonic()]
+def end(message):
+    times.extend(time.monotonic() - each for each in begin)
+    begin.clear()
 node.create_subscription(Odometry, 'odom', start, 1, raw=True)
-for topic, times in taken.items():
-    node.create_subscription(
-        Twist, topic, lambda message, t=times: t.append(time.monotonic() - begin[0]), 1, raw=True
-    )
-end = time.monotonic() + float(sys.argv[1])
-while time.monotonic() < end:
+node.create_subscription(Twist, sys.argv[1], end, 1, raw=True)
+last = time.monotonic() + float(sys.argv[2])
+while time.monotonic() < last:
     rclpy.spin_once(node, timeout_sec=0.1)
-print(*(1e3 * statistics.median(times) for times in taken.values()))
+print(1e3 * statistics.median(times))
 """
 
 
@@ -75,15 +78,15 @@ def run(folder: Path, seconds: float) -> dict[str, float]:
             time.sleep(seconds / 2)
             elapsed = time.monotonic() - begin
             found = {n: (processor_time(p) - before[n]) / elapsed for n, p in pids.items()}
-            done = subprocess.run(
-                [*program, OBSERVER, str(seconds / 2)],
-                env=environment,
-                check=True,
-                capture_output=True,
-                text=True,
-            )
-            times = map(float, done.stdout.split())
-            return found | dict(zip(('command_ms', 'answer_ms'), times, strict=True))
+            for name, topic, other in (
+                ('command_ms', 'cmd_vel', 'echo'),
+                ('answer_ms', 'answer', 'controller'),
+            ):
+                os.kill(pids[other], signal.SIGSTOP)
+                arguments = [*program, OBSERVER, topic, str(seconds / 4)]
+                found[name] = float(subprocess.check_output(arguments, env=environment))
+                os.kill(pids[other], signal.SIGCONT)
+            return found
         finally:
             processes.stop_all()
             echo.kill()
