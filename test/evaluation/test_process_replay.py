@@ -46,7 +46,7 @@ from t3mpc_ros.evaluation.process_replay.golden_bags import (
     RecordedController,
     run_golden_scenario,
 )
-from t3mpc_ros.evaluation.process_replay.journal_alignment import match
+from t3mpc_ros.evaluation.process_replay.journal_alignment import commands_of, match
 from t3mpc_ros.evaluation.process_replay.method_replay import replay_method
 from t3mpc_ros.evaluation.training.training_data import load_training_data
 from t3mpc_ros.evaluation.twin_closed_loop import loop_controller
@@ -492,6 +492,17 @@ def test_a_model_is_found_by_its_checksum_or_missed_and_said(tmp_path):
     given = load_inputs(folder, model=learnt)
     assert given.exact.all()
     assert compare(given, replay_controller(given)).same
+
+
+def test_a_command_before_a_kill_is_not_that_of_the_next_process():
+    """Killed between a command and its row; the first command of the next one was not recorded."""
+    second, step = 1_000_000_000, 10_000_000
+    steps = step * np.arange(1, 4)
+    rows = np.zeros((6, 5), dtype=np.int64)
+    rows[:, 0] = [0, 1, 2, 0, 1, 2]
+    published = np.concatenate([steps, 3 * second + steps])
+    sent = np.concatenate([steps, [4 * step], 3 * second + steps[1:]]) - 100_000
+    assert commands_of(rows, published, sent).tolist() == [0, 1, 2, -1, 4, 5]
 
 
 def test_a_node_that_was_started_again_is_another_life(tmp_path):

@@ -130,16 +130,19 @@ def commands_of(rows: Integers, published: Integers, sent: Integers) -> Integers
     """Return the recorded command of each row of the journal, -1 without one, shape (n,).
 
     The controller publishes a command and then its journal row: ``published`` and ``sent`` are
-    these times by its clock, ns.
+    these times by its clock, ns. A process that is killed in between leaves a command without a
+    row, which is none of the first row of the next process, more than a second later.
     """
     found = np.full(len(rows), -1, dtype=np.int64)
     commanding = np.isin(rows[:, 1], COMMAND_EVENTS)
     last = np.searchsorted(sent, published, side='right') - 1
     before = np.concatenate([[np.iinfo(np.int64).min], published[:-1]])
+    begins = np.concatenate([[False], np.diff(rows[:, 0]) < 0])
+    before[begins] = published[begins] - NANOSECONDS
     fits = commanding & (last >= 0)
     fits[fits] = sent[last[fits]] > before[fits]
     found[fits] = last[fits]
-    if np.count_nonzero(fits) < np.count_nonzero(commanding) == sent.size:
+    if np.count_nonzero(fits) < np.count_nonzero(commanding) == sent.size and not begins.any():
         # Publication times are unknown: without losses the order suffices.
         found[commanding] = np.arange(sent.size)
     return found
