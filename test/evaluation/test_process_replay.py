@@ -503,6 +503,10 @@ def test_a_command_before_a_kill_is_not_that_of_the_next_process():
     published = np.concatenate([steps, 3 * second + steps])
     sent = np.concatenate([steps, [4 * step], 3 * second + steps[1:]]) - 100_000
     assert commands_of(rows, published, sent).tolist() == [0, 1, 2, -1, 4, 5]
+    # A command has one row, also if the next process begins within the second.
+    published = np.concatenate([steps, step + steps[-1] + steps])
+    sent = np.delete(published, 3) - 100_000
+    assert commands_of(rows, published, sent).tolist() == [0, 1, 2, -1, 3, 4]
 
 
 def test_a_node_that_was_started_again_is_another_life(tmp_path):

@@ -131,14 +131,14 @@ def commands_of(rows: Integers, published: Integers, sent: Integers) -> Integers
 
     The controller publishes a command and then its journal row: ``published`` and ``sent`` are
     these times by its clock, ns. A process that is killed in between leaves a command without a
-    row, which is none of the first row of the next process, more than a second later.
+    row, which is none of the first row of the next process if that is more than a second later.
     """
     found = np.full(len(rows), -1, dtype=np.int64)
     commanding = np.isin(rows[:, 1], COMMAND_EVENTS)
     last = np.searchsorted(sent, published, side='right') - 1
     before = np.concatenate([[np.iinfo(np.int64).min], published[:-1]])
     begins = np.concatenate([[False], np.diff(rows[:, 0]) < 0])
-    before[begins] = published[begins] - NANOSECONDS
+    before[begins] = np.maximum(before, published - NANOSECONDS)[begins]
     fits = commanding & (last >= 0)
     fits[fits] = sent[last[fits]] > before[fits]
     found[fits] = last[fits]
