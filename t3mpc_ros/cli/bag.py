@@ -204,7 +204,7 @@ def add_recover_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPa
         'a new folder, with index and metadata.yaml, and reports what was kept and lost. The '
         'input is only read. Exit code 0: nothing was lost; 3: something was, or a file has no '
         'end, so that its writer may have held more; 1: nothing can be read, or the output '
-        'cannot be written.',
+        'cannot be written; 2: the output is no new or empty folder, or in the input.',
     )
     parser.add_argument('bag', type=Path, metavar='FILE', help='an MCAP file, or a folder of such')
     parser.add_argument(

@@ -328,14 +328,16 @@ def _wizard_options(options: argparse.Namespace) -> WizardOptions:
 def add_arguments(command: argparse.ArgumentParser) -> None:
     """Add the arguments of the command, besides those of the link."""
     add = command.add_argument
-    geometry = WheelGeometry()
+    usual = WizardOptions()
+    geometry = usual.geometry
     add('--robot-port', default='', help='USB port of the robot board, for ranges and battery')
     add(
         '--save',
         type=Path,
         default=Path('calibration.yaml'),
         metavar='FILE',
-        help='parameter file of the result; its values are kept where a step is left out',
+        help='parameter file of the result (default calibration.yaml); its values are kept where a '
+        'step is left out',
     )
     add(
         '--steps',
@@ -344,22 +346,21 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         metavar='STEP,…',
         help=f'some of {", ".join(STEPS)}; default: all',
     )
-    add('--wheel-radius', type=bounded_float(0.005, 1.0), default=geometry.wheel_radius)
-    add(
-        '--wheel-separation',
-        type=bounded_float(0.01, 5.0),
-        default=geometry.wheel_separation,
-        help='nominal wheels, m',
-    )
-    add('--distance', type=bounded_float(0.5, 20.0), default=2.0, help='straight run, m')
-    add('--turns', type=bounded_int(2, 15), default=10, help='turns on the spot')
-    add('--speed', type=bounded_float(0.2, 8.0), default=4.0, help='wheel speed, rad/s')
+    for flag, kind, default, text in (
+        ('--wheel-radius', bounded_float(0.005, 1.0), geometry.wheel_radius, 'nominal, m'),
+        ('--wheel-separation', bounded_float(0.01, 5.0), geometry.wheel_separation, 'nominal, m'),
+        ('--distance', bounded_float(0.5, 20.0), usual.distance, 'straight run, m'),
+        ('--turns', bounded_int(2, 15), usual.turns, 'turns on the spot'),
+        ('--speed', bounded_float(0.2, 8.0), usual.speed, 'wheel speed, rad/s'),
+    ):
+        add(flag, type=kind, default=default, help=f'{text} (default {default:g})')
     add(
         '--distances',
         type=_distances,
-        default=WizardOptions().distances,
+        default=usual.distances,
         metavar='M,…',
-        help='from the distance sensors to the board, m',
+        help='from the distance sensors to the board, m (default '
+        f'{",".join(map(str, usual.distances))})',
     )
     for name, value, unit, text in (
         ('distance', 1e3 * MARKS.distance, 'mm', 'of a mark on the floor'),
@@ -371,7 +372,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
             f'--mark-{name}',
             type=bounded_float(1e-3, 100.0),
             default=value,
-            help=f'standard uncertainty {text}, {unit}; default: {value:g}',
+            help=f'standard uncertainty {text}, {unit} (default {value:g})',
         )
 
 

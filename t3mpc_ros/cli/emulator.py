@@ -113,7 +113,7 @@ def _parser() -> argparse.ArgumentParser:
         '--loss',
         type=bounded_float(0.0, 1.0),
         default=0.0,
-        help='share of lost radio packets, each way',
+        help='share of lost radio packets, each way (default 0)',
     )
     add(
         '--fault',
@@ -124,12 +124,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     add('--key', type=Path, help='file with the key of the robot; default: open link')
     add('--erased', action='store_true', help='new board: no settings, so it does not move yet')
-    add('--seed', type=int, default=1, help='seed of all random generators')
+    add('--seed', type=int, default=1, help='seed of all random generators (default 1)')
     add(
         '--real-time-factor',
         type=bounded_float(0.01, 100.0),
         default=1.0,
-        help='virtual seconds per second',
+        help='virtual seconds per second (default 1)',
     )
     add(
         '--restart-on-open',

@@ -376,7 +376,10 @@ def _parser() -> argparse.ArgumentParser:
 
     ping = commands.add_parser('ping', help='test the link to dongle and robot')
     ping.add_argument(
-        '--count', type=bounded_int(1, 100_000), default=200, help='number of requests to each'
+        '--count',
+        type=bounded_int(1, 100_000),
+        default=200,
+        help='number of requests to each (default 200)',
     )
     scan = commands.add_parser('scan', help='list the channels on which the robot answers')
     scan.add_argument('--all-rates', action='store_true', help='at 250k, 1M and 2M')
@@ -386,7 +389,7 @@ def _parser() -> argparse.ArgumentParser:
         'revolutions', type=_revolutions, metavar='REVOLUTIONS', help='negative: backward'
     )
     jogging.add_argument(
-        '--speed', type=bounded_float(0.2, 10.0), default=2.0, help='wheel speed, rad/s'
+        '--speed', type=bounded_float(0.2, 10.0), default=2.0, help='wheel speed, rad/s (default 2)'
     )
     jogging.add_argument(
         '--yes', action='store_true', help='do not ask whether the wheels are in the air'
@@ -401,7 +404,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     examining.add_argument('--robot-port', required=True, help='USB port of the robot board')
     examining.add_argument(
-        '--count', type=bounded_int(10, 100_000), default=200, help='requests of the link test'
+        '--count',
+        type=bounded_int(10, 100_000),
+        default=200,
+        help='requests of the link test (default 200)',
     )
     examining.add_argument(
         '--drive', action='store_true', help='turn each wheel once, after a confirmation'
@@ -414,7 +420,7 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         default=Path('doctor.html'),
         metavar='FILE',
-        help='HTML file; the same as JSON beside it',
+        help='HTML file (default doctor.html); the same as JSON beside it',
     )
     for command, run in (
         (ping, _ping),

@@ -1,0 +1,126 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Options of every command: what the help says is what the parser and the code behind it do."""
+
+from dataclasses import asdict
+from inspect import signature
+import math
+import re
+import subprocess
+
+import pytest
+from support.checkout import ROOT
+from support.parsers import commands, options
+
+from t3mpc_ros.cli import tune
+from t3mpc_ros.cli.demo import DemoOptions
+from t3mpc_ros.evaluation.bag_report.animation import AnimationOptions
+from t3mpc_ros.evaluation.open_loop_estimation import compare as compare_estimators
+from t3mpc_ros.evaluation.paper.experiment_runs import make_grid
+from t3mpc_ros.evaluation.paper.reproduce import default_setup
+from t3mpc_ros.evaluation.patrol.patrol_comparison import PatrolPlan
+from t3mpc_ros.evaluation.process_replay import comparison
+from t3mpc_ros.evaluation.process_replay.comparison import Tolerances
+from t3mpc_ros.evaluation.training.recorded_runs import fit_bags
+from t3mpc_ros.radio.tool.calibration_wizard import WizardOptions
+from t3mpc_ros.robot.calibration import MARKS
+from t3mpc_ros.scripting.comparison_runs import compare
+from t3mpc_ros.scripting.parameter_sweep import sweep
+
+UNIT = re.compile(
+    r'\b(s|seconds?|m|M|mm|rad/s|1/s²|Hz|V|degrees|minutes|frames per second|share|SI units)\b'
+    r'|\(rad/s\)²|: 1/4 of it'
+)
+UNSTATED = ('workers', 'steps')
+"""As many as there are: the help says so."""
+ELSEWHERE = {
+    ('bag compare', 'abs'): [Tolerances().absolute, comparison.ELSEWHERE],
+    ('bag compare', 'rel'): [Tolerances().relative],
+    ('paper', 'seeds'): [len(make_grid(default_setup(), quick=True).seeds)],
+    ('tune', 'evaluations'): [tune.EVALUATIONS, tune.TWIN_EVALUATIONS],
+}
+"""Defaults that are numbers of the code behind a command, not of its parser."""
+
+
+def shown(value):
+    """Return a default as a help text gives it."""
+    if isinstance(value, float):
+        return f'{value:g}'
+    if isinstance(value, list | tuple) and all(isinstance(each, int) for each in value):
+        assert list(value) == list(range(value[0], value[-1] + 1))
+        return f'{value[0]}-{value[-1]}'
+    if isinstance(value, list | tuple):
+        return (' ' if isinstance(value, list) else ',').join(map(shown, value))
+    return str(value)
+
+
+@pytest.mark.parametrize('command', commands())
+def test_the_help_gives_defaults_and_units(command):
+    """A default of the parser is in the help, and a default in the help is that of the parser."""
+    for name, option in options(commands()[command]).items():
+        text, value = option.help or '', option.default
+        if option.option_strings:
+            assert text, f'{name} must have a help text'
+        if isinstance(value, float) or 'float' in getattr(option.type, '__qualname__', ''):
+            assert UNIT.search(f'{text} {name}'), f'{name} must have a unit: {text}'
+        (given,) = re.findall(r'(?:(\w+): [^;]*)?\(default:?(?: ([^)]+))?', text) or [('', '')]
+        if isinstance(value, bool) or value in (None, '', [], (), '{}', math.inf):
+            numbers = [float(each) for each in re.findall(r'\b\d[\d.e-]*', given[1])]
+            assert numbers == ELSEWHERE.get((command, name), []), f'{name}: {text}'
+        elif name not in UNSTATED:
+            stated = re.split(r'; |, ', given[1])[0] or given[0]
+            assert stated == shown(value), f'{name} is {shown(value)} by default: {text}'
+
+
+def default_of(function, name):
+    return signature(function).parameters[name].default
+
+
+SIMULATED = ('noise', 'duration', 'seeds', 'cases')
+"""Options of a command that are arguments of its function in Python."""
+IN_CODE = {
+    'demo': {name: getattr(DemoOptions(), name) for name in ('duration', 'robot', 'loss', 'seed')},
+    'estimation': {
+        'seeds': default_of(compare_estimators, 'seeds'),
+        'duration': default_of(compare_estimators, 'duration'),
+        'gain': default_of(compare_estimators, 'normalised_gain'),
+    },
+    'sweep': {name: default_of(sweep, name) for name in SIMULATED} | {'robot': 'twin'},
+    'compare': {name: default_of(compare, name) for name in SIMULATED[:2]} | {'robot': 'twin'},
+    'patrol': {'robot': PatrolPlan().robot, 'arena': list(PatrolPlan().arena)},
+    'bag train': {'folds': default_of(fit_bags, 'count')},
+    'bag animate': asdict(AnimationOptions()),
+    'robot calibrate': {
+        name: getattr(WizardOptions(), name)
+        for name in ('steps', 'distance', 'turns', 'speed', 'distances')
+    }
+    | asdict(WizardOptions().geometry)
+    | {
+        'mark_distance': 1e3 * MARKS.distance,
+        'mark_angle': math.degrees(MARKS.angle),
+        'mark_range': 1e3 * MARKS.range,
+        'mark_voltage': MARKS.voltage,
+    },
+}
+"""Defaults of what the options of a command are passed on to."""
+
+
+@pytest.mark.parametrize('command', IN_CODE)
+def test_the_defaults_are_those_of_the_code(command):
+    for name, value in IN_CODE[command].items():
+        assert commands()[command].get_default(name) == value, name
+
+
+def test_the_help_that_needs_no_environment_is_that_of_the_parser():
+    """``scripts/demo --help`` is a text of its own."""
+    text = subprocess.run(
+        [ROOT / 'scripts' / 'demo', '--help'], capture_output=True, text=True, check=True
+    ).stdout
+    rows = re.findall(r'^  (--\w+)(?: [A-Z.=]+)?\s+(.*(?:\n {18}.*)*)', text, re.MULTILINE)
+    assert {name: ' '.join(line.split()) for name, line in rows} == {
+        option.option_strings[0]: option.help.replace(
+            '<time>)', '<time>; runs/latest links to it)'
+        )
+        for option in options(commands()['demo']).values()
+    }
+    assert {*re.findall(r'--\w+', text.partition('Runs all')[0])} == {name for name, _ in rows}
