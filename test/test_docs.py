@@ -11,8 +11,11 @@ import re
 
 import pytest
 
+from t3mpc_ros.emulator.emulator import EmulatorParameters
 from t3mpc_ros.emulator.fault_injection import FAULT_KINDS
-from t3mpc_ros.nodes.registry import with_parameters
+from t3mpc_ros.nodes.registry import NODES, parameter_class, with_parameters
+from t3mpc_ros.radio.link.link_parameters import LinkParameters
+from t3mpc_ros.radio.tool.robot_records import RobotSettings
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / 'docs' / 'equations.md'
@@ -179,6 +182,69 @@ def test_every_fault_of_the_emulator_is_documented():
     for kind in FAULT_KINDS:
         value = '' if math.isnan(kind.value) else f'{kind.value:g}'
         assert rows[kind.name] == f'{kind.text} | {value}'
+
+
+DEFAULT = re.compile(
+    r'(?P<before>[\d.]+) (?P<unit>[^\s(|]+) \(`(?P<name>[a-z_.]+)`\)'
+    r'|`(?P<name_before>[a-z_.]+)` \((?P<after>[\d.]+) (?P<unit_after>[^\s)|,;]+)'
+)
+"""A value beside the name of its parameter: 0.2 s (`link.ttl`), or `link.ttl` (0.2 s)."""
+
+
+def test_defaults_in_the_pages_are_those_of_the_parameters():
+    specs = {}
+    for table in (*map(parameter_class, NODES), EmulatorParameters):
+        for spec in table.specs():
+            specs.setdefault(spec.name, []).append(spec)
+    found = set()
+    for page in PAGES:
+        if page.name == 'nodes.md':  # generated
+            continue
+        for match in DEFAULT.finditer(page.read_text()):
+            name = match['name'] or match['name_before']
+            number, unit = (
+                match['before'] or match['after'],
+                match['unit'] or match['unit_after'],
+            )
+            factor = {'KiB': 2**10, 'MiB': 2**20}.get(unit, 1)
+            for spec in specs.get(name, ()):
+                found.add(name)
+                assert float(number) * factor == spec.default, f'{page.name}: {match[0]}'
+                assert factor > 1 or unit == spec.unit, f'{page.name}: {match[0]}'
+    assert len(found) >= 12
+
+
+def _table(page, head):
+    """Return the rows of the table of a page that begins with a line, first cell first."""
+    lines = (ROOT / 'docs' / page).read_text().partition(f'\n{head}\n')[2].partition('\n\n')[0]
+    return {
+        cells[0].strip('` '): [cell.strip() for cell in cells[1:]]
+        for cells in (line.strip('|').split('|') for line in lines.splitlines()[1:])
+    }
+
+
+def test_defaults_of_the_robot_in_its_pages():
+    """Those of ``t3mpc robot setup``, and of the parameters that a host writes to the board."""
+    settings = RobotSettings()
+    rows = _table('robot.md', '| option | default | when it differs |')
+    shown = {name.strip('-').replace('-', '_'): cells[0] for name, cells in rows.items()}
+    assert shown.pop('invert') == 'none'
+    assert (settings.invert_left, settings.invert_right) == (False, False)
+    assert shown.pop('power') == f'{settings.power} dBm'
+    assert {shown.pop('sensors')} == {*settings.sensors}
+    assert shown == {name: f'{getattr(settings, name)}'.removesuffix('.0') for name in shown}
+    host = LinkParameters().robot
+    page = _table('radio.md', '| id | name | unit | default | range |')
+    source = (ROOT / 'firmware' / 'core' / 't3_parameters.c').read_text()
+    source = source.replace('T3_DEFAULT_MICROSTEPS', str(settings.microsteps))
+    board = re.findall(r'\[T3_(\w+)\] = \{(\d+), (\d+), (\d+), (\w+)', source)
+    assert [cells[0] for cells in page.values()] == [name.lower() for name, *_ in board]
+    for (name, default, low, high, read_only), cells in zip(board, page.values(), strict=True):
+        assert cells[2] == default, name
+        wanted = 'read-only' if read_only == 'true' else f'{low} to {high}'
+        assert cells[3].startswith(wanted) or cells[1] == 'bits', name
+        if cells[1].startswith('m'):  # a thousandth of the unit of the host
+            assert float(default) == pytest.approx(1e3 * getattr(host, name.lower()))
 
 
 # -- links ----------------------------------------------------------------------------------------
