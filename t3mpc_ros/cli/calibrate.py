@@ -336,8 +336,8 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         type=Path,
         default=Path('calibration.yaml'),
         metavar='FILE',
-        help='parameter file of the result (default calibration.yaml); its values are kept where a '
-        'step is left out',
+        help='parameter file of the result (default calibration.yaml); its values are kept where '
+        'a step is left out',
     )
     add(
         '--steps',

@@ -244,7 +244,9 @@ def _parser() -> argparse.ArgumentParser:
     estimation.set_defaults(run=_estimation)
 
     exponents = commands.add_parser('exponents', help='Lyapunov exponents of the generator')
-    exponents.add_argument('--duration', type=SECONDS, default=200.0, help='system seconds (default 200)')
+    exponents.add_argument(
+        '--duration', type=SECONDS, default=200.0, help='system seconds (default 200)'
+    )
     exponents.set_defaults(run=_exponents)
 
     add_paper(commands)

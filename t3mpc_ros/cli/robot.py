@@ -389,7 +389,10 @@ def _parser() -> argparse.ArgumentParser:
         'revolutions', type=_revolutions, metavar='REVOLUTIONS', help='negative: backward'
     )
     jogging.add_argument(
-        '--speed', type=bounded_float(0.2, 10.0), default=2.0, help='wheel speed, rad/s (default 2)'
+        '--speed',
+        type=bounded_float(0.2, 10.0),
+        default=2.0,
+        help='wheel speed, rad/s (default 2)',
     )
     jogging.add_argument(
         '--yes', action='store_true', help='do not ask whether the wheels are in the air'
