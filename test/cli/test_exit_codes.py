@@ -1,0 +1,279 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Every exit code that help or documentation names, produced once by every command that has it."""
+
+from contextlib import nullcontext
+import os
+from pathlib import Path
+import signal
+import sys
+from types import SimpleNamespace
+from unittest.mock import MagicMock
+
+import pytest
+
+from t3mpc_ros.bag.recovery.recover_bag import RecoveryOutputError
+from t3mpc_ros.bag.recovery.result import Damage, FileResult, RecoveryResult
+from t3mpc_ros.bag.schema import BagError
+from t3mpc_ros.cli import calibrate, process_group
+from t3mpc_ros.cli.main import main
+from t3mpc_ros.cli.process_group import ProcessError, ProcessGroup
+from t3mpc_ros.emulator.fault_injection import FaultError
+from t3mpc_ros.radio.protocol import frames
+from t3mpc_ros.radio.tool.bench_checklist import FAIL, PASS, SKIPPED, Check
+from t3mpc_ros.radio.tool.link_test import BAD, GOOD, POOR, ReportRow
+from t3mpc_ros.radio.tool.procedure import ProcedureError
+from t3mpc_ros.radio.tool.robot_records import RobotSettings
+from t3mpc_ros.radio.tool.robot_settings import StoredSettings, parameter_file
+from t3mpc_ros.robot.calibration import Calibration
+
+RUN = 'radio.tool.procedure.run_script'
+
+
+class Interruption:
+    """Ctrl-C while a procedure runs, which then ends."""
+
+    def __call__(self, *_):
+        signal.raise_signal(signal.SIGINT)
+        raise ProcedureError('interrupted')
+
+
+def stored(state=frames.SETTINGS_GOOD, **changes):
+    return {RUN: StoredSettings(state, RobotSettings()._replace(**changes))}
+
+
+def rated(*verdicts):
+    rows = [ReportRow('a', '1', verdict, 'remedy') for verdict in verdicts]
+    return {RUN: 'result', 'radio.tool.link_test.evaluate': rows}
+
+
+def checked(*verdicts):
+    return {'cli.robot_doctor.run_doctor': [Check(0, 'a', each, '') for each in verdicts]}
+
+
+def answered(good):
+    return {RUN: 'result', 'radio.tool.channel_scan.recommend': (good, 'advice')}
+
+
+def jogged(error=''):
+    task = SimpleNamespace(result=None, error=error)
+    return {'radio.tool.jog.Jog': task, 'radio.tool.procedure.run_at_port': None}
+
+
+def recovered(ended, *damages):
+    file = FileResult('x', 1, ended=ended, damages=list(damages))
+    return {'cli.bag.recover_bag': RecoveryResult(Path('new'), (file,))}
+
+
+def compared(same):
+    module = 'evaluation.process_replay.'
+    outcome = SimpleNamespace(table=lambda: '', same=same)
+    return {
+        f'{module}controller_inputs.load_inputs': None,
+        f'{module}controller_replay.replay_controller': None,
+        f'{module}comparison.compare': outcome,
+    }
+
+
+def graph(**answers):
+    return {'nodes.graph_tools.graph': nullcontext(MagicMock(**answers))}
+
+
+def studied(*verdicts):
+    return {
+        'evaluation.fault_study.study_faults': [SimpleNamespace(verdict=v) for v in verdicts],
+        'evaluation.fault_study.console_text': '',
+    }
+
+
+EXPONENTS = 'evaluation.lyapunov_exponents.lyapunov_exponents'
+KEY = frames.KeyState(0, 0, frames.KEY_HELD, 1)
+LOSS, DOUBLE = Damage(0, 9, 'torn', messages=2), Damage(0, 9, 'torn', harmless=True)
+ROBOT = {
+    'ping --port p': 'answers',
+    'scan --port p': 'answers',
+    'parameters --port p': '',
+    'setup --port p': '',
+    'log --port p': '',
+    'key state --port p': '',
+    'key erase --port p': '',
+    'key write key --port p': '',
+}
+CASES = [
+    *((f'robot {words}', {RUN: ProcedureError('no board')}, 2, 'no board') for words in ROBOT),
+    *((f'robot {words}', {RUN: Interruption()}, 130, 'interrupted') for words in ROBOT),
+    ('robot ping --port p', rated(GOOD), 0, 'good'),
+    ('robot ping --port p', rated(GOOD, POOR), 0, 'try: remedy'),
+    ('robot ping --port p', rated(GOOD, BAD), 1, 'BAD'),
+    ('robot scan --port p', answered(True), 0, 'advice'),
+    ('robot scan --port p', answered(False), 1, 'advice'),
+    ('robot setup --port p', stored(), 0, 'settings stored in both copies'),
+    ('robot setup --port p', stored(frames.SETTINGS_ONE_COPY), 1, 'one of their two copies'),
+    ('robot setup --port p', stored(frames.SETTINGS_MISSING), 1, 'no settings'),
+    ('robot setup --port p --diff robot.yaml', stored(), 0, 'equal to robot.yaml'),
+    ('robot setup --port p --diff robot.yaml', stored(channel=9), 1, 'channel: 9 -> 82'),
+    ('robot setup --port p --save new.yaml', stored(frames.SETTINGS_MISSING), 2, 'no settings to'),
+    ('robot key state --port p', {RUN: KEY}, 0, 'the robot has a key, check value 00000001'),
+    ('robot key state --port p --key key', {RUN: KEY}, 1, 'different from the file'),
+    ('robot key create key', {}, 2, 'key exists: a key is never overwritten'),
+    ('robot key create new', {}, 0, 'new: new key'),
+    ('robot key check key', {}, 0, 'key: a key, check value'),
+    ('robot jog left 1 --port p --yes', jogged(), 0, ''),
+    ('robot jog left 1 --port p --yes', jogged('blocked'), 2, 'blocked'),
+    ('robot doctor --port p --robot-port r --no-questions', checked(PASS, SKIPPED), 0, ''),
+    ('robot doctor --port p --robot-port r --no-questions', checked(PASS, FAIL), 1, ''),
+    ('emulator --link l', {'cli.emulator.Emulator': FaultError('no such fault')}, 2, 'no such'),
+    ('emulator --link l --key none', {}, 2, 'none'),
+    ('bag info none', {}, 1, 'none'),
+    ('bag recover bag', recovered(True), 0, 'nothing is lost'),
+    ('bag recover bag', recovered(True, DOUBLE), 0, 'nothing is lost with it'),
+    ('bag recover bag', recovered(True, LOSS), 3, '2 messages lost'),
+    ('bag recover bag', recovered(False), 3, ''),
+    ('bag recover bag', {'cli.bag.recover_bag': RecoveryOutputError('not empty')}, 2, 'not empty'),
+    ('bag recover bag', {'cli.bag.recover_bag': BagError('no message')}, 1, 'no message'),
+    ('bag compare bag', compared(True), 0, ''),
+    ('bag compare bag', compared(False), 3, ''),
+    ('bag compare', {}, 1, 'BAG must be given, or --update-golden'),
+    ('bag compare bag --abs -1', {}, 1, 'tolerance absolute must be from 0'),
+    ('bag compare a b --set law.gain=1', compared(True), 1, 'give one bag only'),
+    ('param set /n a 1', graph(**{'set_parameter.return_value': ''}), 0, 'successful'),
+    ('param set /n a 1', graph(**{'set_parameter.return_value': 'read-only'}), 1, 'read-only'),
+    ('call /s [1]', graph(), 1, 'the fields must be a YAML mapping'),
+    ('stop', graph(**{'stop_robots.return_value': {'a': '', 'b': ''}}), 0, 'a: latched\nb: lat'),
+    ('stop', graph(**{'stop_robots.return_value': {'a': '', 'b': 'no answer'}}), 1, 'b: no answe'),
+    ('stop', graph(**{'stop_robots.return_value': {}}), 1, 'ROS_DOMAIN_ID'),
+    ('faults', studied('bounded', 'stops', 'impaired'), 0, ''),
+    ('faults', studied('bounded', 'unbounded'), 1, ''),
+    ('faults no_fault', {}, 1, 'FAULT must be one of'),
+    ('faults brown_out --output x', {}, 1, 'give no FAULT with it'),
+    ('demo --patrol --robot servo', {}, 2, '--patrol needs --robot twin: got servo'),
+    ('exponents', {EXPONENTS: (1.0, 0.5, -2.0)}, 0, '1.000, 0.500, -2.000\ntheir sum: -0.500'),
+    ('exponents', {EXPONENTS: OSError('no file')}, 1, 'error: no file'),
+    ('exponents', {EXPONENTS: RuntimeError('broken')}, 1, 'error: broken'),
+    ('exponents', {EXPONENTS: ValueError('wrong')}, 1, 'error: wrong'),
+    ('exponents', {EXPONENTS: KeyboardInterrupt()}, 130, 'stopped'),
+    ('exponents', {EXPONENTS: ModuleNotFoundError('x', name='pyarrow')}, 1, 'pyarrow'),
+    ('train bag --robot torque', {}, 1, 'robot must be servo for bags: got torque'),
+    ('train --keep-predictor', {}, 1, '--keep-predictor is for bags'),
+    ('train --seeds 0', {}, 1, 'seeds must be from 1 to'),
+    ('tune --robot none', {}, 1, 'robot must be twin, servo, torque or an existing bag: got none'),
+    ('tune --robot key --resume', {}, 1, 'are for simulated robots: got a bag'),
+    ('compare --methods nothing', {}, 1, 'method must be one of'),
+    ('compare --cases nothing', {}, 1, 'case must be one of'),
+    ('compare --gyro --reference x.csv', {}, 1, '--gyro is for the methods of the package'),
+    ('patrol --paths nothing', {}, 1, 'path must be one of'),
+    ('patrol --arena 1 1 2 2', {}, 1, 'arena must contain the start'),
+    ('bag report bag --track 1', {}, 1, '--wheel-radius and --track must be given together'),
+    ('bag animate bag --output x.mp4', {}, 1, 'output must end in .gif'),
+    ('bag animate bag --output x.gif --rate 99', {}, 1, 'rate must be above 0 and at most 50'),
+    *(
+        (words, {}, 2, text)
+        for words, text in {
+            'demo --duration 0': 'must be from 1 to 86400 seconds: got 0',
+            'demo --loss 1': 'must be from 0 to below 1: got 1',
+            'demo --robot mine': 'invalid choice',
+            'estimation --gain x': "invalid number value: 'x'",
+            'compare --seeds 3-1': 'must be A-B with 0 <= A <= B',
+            'compare --noise -1': 'must be from 0 to 100 (rad/s)²',
+            'sweep --set gain': 'must be NAME=V,V,…: got gain',
+            'patrol --minutes 0': 'must be from 0.1 to 1440 min',
+            'view --port 70000': 'must be from 0 to 65535',
+            'robot setup --port p --address 11': 'must be 10 hexadecimal digits',
+            'robot setup --port p --microsteps 3': 'must be a power of two',
+            'robot setup --port p --sensors x': 'must be one or 8 of none',
+            'robot jog left 0 --port p': 'must be from 0.01 to 100, or negative',
+            'emulator': 'required: --link',
+            'emulator --link l --loss 2': 'must be from 0 to 1: got 2',
+            'topic': 'required',
+            'nothing': 'invalid choice',
+            '': 'required: COMMAND',
+        }.items()
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ('words', 'instead', 'code', 'text'),
+    CASES,
+    ids=[f'{words} {code} {text}'[:60] for words, _, code, text in CASES],
+)
+def test_the_exit_code_says_how_it_ended(
+    words, instead, code, text, monkeypatch, tmp_path, capsys
+):
+    (tmp_path / 'key').write_text('01' * 16)
+    (tmp_path / 'key').chmod(0o600)
+    (tmp_path / 'robot.yaml').write_text(parameter_file(RobotSettings()))
+    monkeypatch.chdir(tmp_path)
+    for name, result in instead.items():
+        replace(monkeypatch, f't3mpc_ros.{name}', result)
+    try:
+        found = main(words.split())
+    except SystemExit as end:
+        found = end.code
+    shown = capsys.readouterr()
+    assert found == code
+    assert text in shown.out + shown.err
+    assert 'Traceback' not in shown.err
+
+
+def replace(monkeypatch, target, result):
+    """Let a function return something, or raise it."""
+
+    def instead(*arguments, **named):
+        if isinstance(result, BaseException):
+            raise result
+        return result(*arguments) if isinstance(result, Interruption) else result
+
+    monkeypatch.setattr(target, instead)
+
+
+def test_an_interrupted_calibration_ends_with_130(monkeypatch, tmp_path, capsys):
+    def run(wizard):
+        raise calibrate.Interrupted
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, 'stdin', SimpleNamespace(isatty=lambda: True))
+    monkeypatch.setattr(calibrate.CalibrationWizard, 'run', run)
+    assert main(['robot', 'calibrate', '--port', 'p']) == 130
+    monkeypatch.setattr(calibrate.CalibrationWizard, 'run', lambda wizard: Calibration())
+    assert main(['robot', 'calibrate', '--port', 'p']) == 0
+    assert not list(tmp_path.iterdir())
+
+
+# -- processes of others --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ('end', 'code'),
+    [
+        ('sys.exit(0)', 0),
+        ('sys.exit(3)', 3),
+        ('os.kill(os.getpid(), signal.SIGKILL)', -signal.SIGKILL),
+        ('os.kill(os.getpid(), signal.SIGTERM)', -signal.SIGTERM),
+    ],
+)
+def test_the_code_of_a_process_is_how_it_ended(end, code, tmp_path, monkeypatch):
+    """A node that a signal has killed has a negative code: it did not end cleanly."""
+    program = tmp_path / 'node'
+    program.write_text(
+        f'#!{sys.executable}\nimport os, signal, sys\nprint("here", flush=True)\n'
+        f'signal.signal(2, lambda *_: None)\nsignal.sigwait([2]) if not sys.argv[1:] else None\n'
+        f'{end}\n'
+    )
+    program.chmod(0o755)
+    monkeypatch.setattr(process_group, 'executable', lambda name: program)
+
+    def started(*arguments):
+        group = ProcessGroup(tmp_path / 'log', os.environ)
+        previous = signal.pthread_sigmask(signal.SIG_BLOCK, [2])  # inherited: for sigwait
+        group.start('node', *arguments)
+        signal.pthread_sigmask(signal.SIG_SETMASK, previous)
+        group.wait_for('node', 'here')
+        return group
+
+    assert started().stop_all() == {'node': code}
+    group = started('now')
+    with pytest.raises(ProcessError, match=f'node ended with code {code} before'):
+        group.wait_for('node', 'never')
+    with pytest.raises(ProcessError, match=f'node ended with code {code} during the run'):
+        group.check()
