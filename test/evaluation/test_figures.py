@@ -1,0 +1,541 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Figures: what their lines, error bars, colours and labels show, read from the drawn artists.
+
+Every quantity of the runs has a value of its own, so that any two that are exchanged are seen.
+"""
+
+from dataclasses import fields, replace
+import math
+from types import SimpleNamespace
+
+from matplotlib.colors import to_hex
+import numpy as np
+import pytest
+
+from t3mpc_ros.control.control_law import TERM_NAMES
+from t3mpc_ros.evaluation import fault_page
+from t3mpc_ros.evaluation.closed_loop import LoopRecord
+from t3mpc_ros.evaluation.confidence_intervals import interval
+from t3mpc_ros.evaluation.fault_study import Outcome
+from t3mpc_ros.evaluation.method_comparison import comparison_page
+from t3mpc_ros.evaluation.method_comparison.compared_runs import METRICS, ComparisonPlan
+from t3mpc_ros.evaluation.methods import FULL
+from t3mpc_ros.evaluation.paper import paper_figures
+from t3mpc_ros.evaluation.paper.experiment_runs import STAGES, WITHOUT, Experiment, RunNumbers
+from t3mpc_ros.evaluation.paper.figure_runs import FigureRuns
+from t3mpc_ros.evaluation.paper.results import Results
+from t3mpc_ros.evaluation.patrol import patrol_figures
+from t3mpc_ros.evaluation.patrol.patrol_comparison import OURS, PatrolPlan, PatrolResult
+from t3mpc_ros.evaluation.process_replay import divergence_figure
+from t3mpc_ros.evaluation.process_replay.comparison import Comparison, FieldComparison, Tolerances
+from t3mpc_ros.evaluation.twin_validation import validation_page
+from t3mpc_ros.evaluation.twin_validation.courses import Course, Drift
+from t3mpc_ros.scripting.parameter_sweep import Sweep
+from t3mpc_ros.scripting.single_run import RunResult
+
+GREEN, RED, GREY, COMMAND = '#15803d', '#be123c', '#6b7280', '#0f766e'
+
+
+def lines(axis):
+    """Return the named lines of an axis, as columns."""
+    return {
+        line.get_label(): np.asarray(line.get_xydata()).T
+        for line in axis.lines
+        if not line.get_label().startswith('_')
+    }
+
+
+def bars(container):
+    """Return the ends of each error bar of a container, in order."""
+    (segments,) = (
+        container.lines[2] if hasattr(container, 'lines') else container.errorbar.lines[2]
+    )
+    return np.array(segments.get_segments())
+
+
+def halves(container, axis):
+    """Return middles and half lengths of the error bars along an axis: 0 for x, 1 for y."""
+    ends = bars(container)[:, :, axis]
+    return ends.mean(axis=1), 0.5 * np.diff(ends, axis=1)[:, 0]
+
+
+def title(axis):
+    return axis.get_title(loc='left') or axis.get_title()
+
+
+def texts(axis):
+    return title(axis), axis.get_xlabel(), axis.get_ylabel()
+
+
+# -- runs -----------------------------------------------------------------------------------------
+
+TIME = 0.1 * np.arange(300)
+
+
+def loop_record(shift=0.0):
+    """Return a run whose columns all differ, with a switch at 15 s."""
+    record = LoopRecord.empty(TIME.size)
+    columns = {
+        each.name: np.outer(np.sin(0.3 * TIME + k), (1.0, 1.0)) + (10.0 * k + shift, 10.0 * k + 5)
+        for k, each in enumerate(fields(LoopRecord), 1)
+        if getattr(record, each.name).shape == (TIME.size, 2)
+    }
+    modes = (TIME >= 15.0).astype(np.int64)
+    columns['reference'] += 3.0 * modes[:, None]
+    terms = np.stack([columns['speeds'] * (k + 2) for k in range(len(TERM_NAMES))], axis=1)
+    return replace(
+        record, time=TIME, modes=modes, terms=terms, switches=np.array([15.0]), **columns
+    )
+
+
+RUN, SERVO, BLIND, OTHER = map(loop_record, (0.0, 100.0, 200.0, 300.0))
+SHOWCASE = FigureRuns(
+    1, RUN, SERVO, BLIND, {FULL: RUN, 'PI': OTHER}, ((1, 2), (3, 4)),
+    RUN.speeds, {'type3': RUN.speeds + 0.5, 'type1': OTHER.speeds},
+)  # fmt: skip
+SIDES = ('right', 'left')
+
+
+@pytest.mark.parametrize(
+    ('draw', 'unit', 'shown'),
+    [
+        (paper_figures.outputs, 'speed / rad/s', {'reference': 'reference', 'robot': 'speeds'}),
+        (paper_figures.control, 'u / rad/s²', {'_child': 'command'}),
+        (paper_figures.estimates, 'rad/s²', {'estimate g': 'terms'}),
+    ],
+)
+def test_a_run_and_its_switch(draw, unit, shown):
+    axes = np.array(draw(SHOWCASE).axes).reshape(2, 2)
+    for i, row in enumerate(axes):
+        assert row[0].get_ylabel() == unit
+        assert title(row[0]).startswith(f'{SIDES[i]} wheel')
+        for axis in row:
+            found = {each.get_label(): each for each in axis.lines if len(each.get_xdata()) > 2}
+            for label, name in shown.items():
+                (line,) = (each for key, each in found.items() if key.startswith(label))
+                values = getattr(RUN, name)
+                values = -values[:, 0] if name == 'terms' else values
+                rows = np.searchsorted(TIME, line.get_xdata() - 1e-6)
+                assert line.get_ydata() == pytest.approx(values[rows, i])
+    assert {axis.get_xlabel() for axis in axes[-1]} == {'time / s'}
+    # The largest switch is in the middle of the second column.
+    low, high = axes[0, 1].get_xlim()
+    assert low < 15.0 < high < 20.0
+    assert {*axes[0, 1].lines[0].get_xdata()} == {15.0}
+
+
+def test_measured_samples_and_the_true_unknown():
+    axes = np.array(paper_figures.outputs(SHOWCASE).axes).reshape(2, 2)
+    for i, axis in enumerate(axes[:, 1]):
+        time, values = lines(axis)['measured']
+        assert values == pytest.approx(RUN.measured[np.searchsorted(TIME, time - 1e-6), i])
+    axes = np.array(paper_figures.estimates(SHOWCASE).axes).reshape(2, 2)
+    for i, axis in enumerate(axes[:, 0]):
+        time, values = lines(axis)['unknown, $\\dot\\chi - u$']
+        slope = np.diff(RUN.speeds[:, i]) / 0.1
+        assert values == pytest.approx(slope - RUN.command[:-1, i])
+        counted = time >= 3.0
+        miss = values + RUN.terms[:-1, 0, i]
+        share = 1.0 - np.mean(miss[counted] ** 2) / np.var(values[counted])
+        assert f'{100 * share:.0f} % of the variance' in title(axis)
+
+
+def test_the_variation_of_u_is_that_of_its_wheel():
+    run = replace(RUN, command=np.cumsum(np.ones((TIME.size, 2)) * (1.0, 3.0), axis=0))
+    axes = np.array(paper_figures.control(replace(SHOWCASE, torque=run)).axes).reshape(2, 2)
+    for axis, rate in zip(axes[:, 0], (10, 30), strict=True):
+        assert f'varies by {rate} rad/s² a second' in title(axis)
+
+
+@pytest.mark.parametrize(
+    ('draw', 'drawn'),
+    [
+        (paper_figures.portrait, (RUN.reference, RUN.speeds)),
+        (paper_figures.robot_portrait, (SERVO.reference, SERVO.speeds)),
+    ],
+)
+def test_portraits_have_the_left_wheel_to_the_right(draw, drawn):
+    for axis, values, name in zip(draw(SHOWCASE).axes, drawn, ('reference', 'robot'), strict=True):
+        x, y = axis.lines[0].get_xydata()[0]
+        assert (x, y) == (values[0, 1], values[0, 0])
+        assert axis.get_xlabel() == 'left wheel / rad/s'
+        assert title(axis) == name
+    assert draw(SHOWCASE).axes[0].get_ylabel() == 'right wheel / rad/s'
+
+
+def test_portraits_of_methods_name_the_run_and_its_rmse():
+    results = results_of()
+    for axis, (name, run) in zip(
+        paper_figures.portraits(SHOWCASE, results).axes, SHOWCASE.portraits.items(), strict=False
+    ):
+        reference, driven = (each.get_xydata() for each in axis.lines)
+        assert (*reference[0],) == (run.reference[0, 1], run.reference[0, 0])
+        assert (*driven[0],) == (run.speeds[30, 1], run.speeds[30, 0])
+        error = (run.speeds - run.reference)[30:]
+        rmse = np.sqrt(np.mean(error**2))
+        assert title(axis).startswith(f'{name}\nRMSE {rmse:.3f}, settled ')
+    first, second = paper_figures.estimation_portraits(SHOWCASE).axes
+    assert title(first) == 'type 3\nRMSE 0.500 rad/s'
+    shown = lines(first)
+    assert shown['estimated'][:, 0] == pytest.approx(RUN.speeds[0, ::-1] + 0.5)
+    assert shown['true'][:, 0] == pytest.approx(RUN.speeds[0, ::-1])
+
+
+def test_preview_is_compared_about_the_switch():
+    for i, axis in enumerate(paper_figures.preview(SHOWCASE).axes):
+        shown = lines(axis)
+        for label, values in (
+            ('reference', SERVO.reference),
+            ('with preview', SERVO.speeds),
+            ('without preview', BLIND.speeds),
+        ):
+            time, drawn = shown[label]
+            assert drawn == pytest.approx(values[np.searchsorted(TIME, time + 15.0 - 1e-6), i])
+        assert title(axis) == f'{SIDES[i]} wheel'
+
+
+def test_modes_show_which_signal_drives_which_wheel():
+    for i, axis in enumerate(paper_figures.modes(SHOWCASE).axes):
+        time, signal = axis.lines[-1].get_xydata().T
+        assert {*signal[time < 14.9]} == {SHOWCASE.pairs[0][i]}
+        assert {*signal[time > 15.1]} == {SHOWCASE.pairs[1][i]}
+        assert title(axis) == f'signal that drives the {SIDES[i]} wheel'
+
+
+def test_the_path_on_the_floor_is_that_of_its_label():
+    (axis,) = paper_figures.path(SHOWCASE).axes
+    shown = lines(axis)
+    for label, speeds in (('reference', SERVO.reference), ('driven', SERVO.speeds)):
+        assert pytest.approx(paper_figures.floor_path(speeds, TIME)) == shown[label].T
+    assert shown['start'][:, 0] == pytest.approx([0.0, 0.0])
+    assert texts(axis)[1:] == ('x / m', 'y / m')
+
+
+def test_a_quantity_has_its_colour_in_every_figure():
+    colours = {
+        'reference': '#1f2937', 'robot': '#0284c7', 'driven': '#0284c7', 'with preview': '#0284c7',
+        'measured': '#7dd3fc', 'estimate g': '#7c3aed', 'switch': '#d97706', 'true': '#1f2937',
+    }  # fmt: skip
+    seen = set()
+    for draw in (paper_figures.outputs, paper_figures.estimates, paper_figures.preview,
+                 paper_figures.path, paper_figures.estimation_portraits):  # fmt: skip
+        for axis in draw(SHOWCASE).axes:
+            for line in axis.lines:
+                if (name := line.get_label()) in colours:
+                    seen.add(name)
+                    assert to_hex(line.get_color()) == colours[name], name
+    assert seen == colours.keys()
+
+
+def test_a_run_of_a_script():
+    columns = {'time': TIME}
+    for k, name in enumerate(('reference', 'speed')):
+        columns |= {f'{name}_{s}': np.sin(TIME) + 10 * k + 3 * i for i, s in enumerate(SIDES)}
+    result = RunResult('mine', None, None, columns, {'settled': 0.25, 'overall': 0.5})
+    *wheels, error = result.plot().axes
+    for axis, side in zip(wheels, SIDES, strict=True):
+        shown = lines(axis)
+        assert shown['mine'][1] == pytest.approx(columns[f'speed_{side}'])
+        assert shown['reference'][1] == pytest.approx(columns[f'reference_{side}'])
+        assert lines(error)[f'{side} wheel'][1] == pytest.approx(10.0)
+        assert texts(axis)[::2] == (f'{side} wheel', 'rad/s')
+    assert texts(error) == ('error', 'time / s', 'rad/s')
+    table = result.table()
+    assert '| settled | 0.2500 | rad/s |' in table
+    assert '| with switches | 0.5000 | rad/s |' in table
+
+
+# -- error bars -----------------------------------------------------------------------------------
+
+VALUES = {1.0: [0.1, 0.2, 0.4], 2.0: [0.7, 0.8, 1.0, 1.5], 3.0: [0.3]}
+
+
+def test_a_sweep_shows_means_and_their_intervals():
+    rows = [
+        {'controller': name, 'gain': gain, 'case': 'nominal', metric.name: factor * value}
+        for factor, name in ((1.0, 'a'), (10.0, 'b'))
+        for gain, values in VALUES.items()
+        for value in values
+        for metric in METRICS[:1]
+    ]
+    metric = METRICS[0]
+    sweep = Sweep(rows, ('gain',))
+    (axis,) = sweep.plot('gain', metric.name).axes
+    for factor, container in zip((1.0, 10.0), axis.containers, strict=True):
+        middles, half = halves(container, 1)
+        assert middles == pytest.approx([factor * np.mean(v) for v in VALUES.values()])
+        assert half[:2] == pytest.approx([factor * interval(VALUES[k]) for k in (1.0, 2.0)])
+        assert half[2] == 0.0  # a single run has none
+    assert [each.get_label() for each in axis.containers] == ['a', 'b']
+    assert texts(axis)[1:] == ('gain', f'{metric.heading} / ({metric.unit})')
+    d = metric.digits
+    cell = f'{np.mean(VALUES[1.0]):.{d}f} ± {interval(VALUES[1.0]):.{d}f}'
+    assert f'| a | 1.0 | nominal | 3 | {cell} |' in sweep.table(metric.name)
+
+
+METHODS = {FULL: (False, True), **dict.fromkeys(STAGES, (False, False))}
+METHODS |= dict.fromkeys(WITHOUT.values(), (False, True))
+METHODS = {'PI': (True, False), 'MPC': (True, True)} | METHODS
+
+
+def results_of():
+    """Return results in which each method, drive, noise and case has numbers of its own."""
+    numbers = {}
+    generator = np.random.default_rng(1)
+    for name in METHODS:
+        for drive in ('torque', 'velocity'):
+            for noise in (0.0, 0.04):
+                for case in ('nominal', 'mass +30 %'):
+                    runs = 0.5 + generator.random(4)
+                    numbers[Experiment(name, drive, noise, case)] = [
+                        RunNumbers(each, 0.5 * each, 9.0, 2.0, True) for each in runs
+                    ]
+    return Results(METHODS, numbers, 59.5)
+
+
+def rmse_of(results, *experiment):
+    return [run.rmse for run in results.runs(Experiment(*experiment))]
+
+
+def test_bars_of_the_methods_have_means_intervals_and_names():
+    results = results_of()
+    for axis, drive in zip(paper_figures.rmse_bars(results).axes, results.drives, strict=True):
+        names = [tick.get_text().removesuffix(' (preview)') for tick in axis.get_yticklabels()]
+        assert {*names} == {'PI', 'MPC', FULL}
+        bar = next(each for each in axis.containers if hasattr(each, 'errorbar'))
+        middles, half = halves(bar, 0)
+        for k, name in enumerate(names):
+            runs = rmse_of(results, name, drive, 0.04, 'nominal')
+            assert bar.patches[k].get_width() == pytest.approx(np.mean(runs))
+            assert middles[k] == pytest.approx(np.mean(runs))
+            assert half[k] == pytest.approx(interval(runs))
+            assert (to_hex(bar.patches[k].get_facecolor()) == paper_figures.OURS) == (name == FULL)
+        assert drive in title(axis)
+    assert axis.get_xlabel() == 'RMSE / rad/s'
+
+
+def test_growth_with_noise_has_intervals_and_begins_at_zero():
+    results = results_of()
+    figure = paper_figures.noise_growth(results)
+    top, bottom = np.array(figure.axes).reshape(2, 2)
+    for axis, growth, drive in zip(top, bottom, results.drives, strict=True):
+        for container, line in zip(axis.containers, growth.lines, strict=True):
+            name = container.get_label().removesuffix(' (preview)')
+            runs = [rmse_of(results, name, drive, noise, 'nominal') for noise in (0.0, 0.04)]
+            middles, half = halves(container, 1)
+            assert middles == pytest.approx([np.mean(each) for each in runs])
+            assert half == pytest.approx([interval(each) for each in runs])
+            assert line.get_ydata() == pytest.approx(middles - middles[0])
+    assert top[0].get_ylabel() == 'RMSE / rad/s'
+    assert {axis.get_xlabel() for axis in bottom} == {'noise variance / (rad/s)²'}
+
+
+def test_stages_are_bars_by_case():
+    results = results_of()
+    for axis, drive in zip(paper_figures.ablation_bars(results).axes, results.drives, strict=True):
+        found = [each for each in axis.containers if hasattr(each, 'errorbar')]
+        assert [each.get_label().removesuffix(' (+preview)') for each in found] == [*STAGES]
+        for stage, bar in zip(STAGES, found, strict=True):
+            _, half = halves(bar, 1)
+            for k, case in enumerate(results.cases(drive)):
+                runs = rmse_of(results, stage, drive, 0.04, case)
+                assert bar.patches[k].get_height() == pytest.approx(np.mean(runs))
+                assert half[k] == pytest.approx(interval(runs))
+        assert axis.get_ylabel() == 'RMSE / rad/s'
+
+
+def test_parts_are_paired_differences_left_of_zero_if_better():
+    results = results_of()
+    figure = paper_figures.parts(results)
+    axes = np.array(figure.axes).reshape(len(results.drives), -1)
+    assert 'left of zero: better with it' in figure._supxlabel.get_text()
+    stages = list(STAGES)
+    for row, drive in zip(axes, results.drives, strict=True):
+        for axis in row:
+            part = title(axis)
+            after = paper_figures.PARTS.index(part) + 1
+            for container, (less, more) in zip(
+                axis.containers,
+                ((stages[after - 1], stages[after]), (WITHOUT[part], FULL)),
+                strict=True,
+            ):
+                middles, half = halves(container, 0)
+                for k, case in enumerate(results.cases(drive)):
+                    with_it = np.array(rmse_of(results, more, drive, 0.04, case))
+                    apart = with_it - rmse_of(results, less, drive, 0.04, case)
+                    assert middles[k] == pytest.approx(np.mean(apart))
+                    assert half[k] == pytest.approx(interval(apart))
+
+
+# -- pages ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def caught(monkeypatch):
+    """Return the figures of a page, which are not rendered."""
+    figures = []
+
+    def instead(draw, subject):
+        if (figure := draw(subject)) is not None:
+            figures.append(figure)
+
+    for module in (comparison_page, fault_page, divergence_figure):
+        monkeypatch.setattr(module, 'png_of', instead)
+    return figures
+
+
+def test_differences_of_methods_are_coloured_by_their_verdict(caught):
+    """Green is better, which is a smaller error; an interval about zero is grey."""
+    apart = {'DMC': -0.3, 'ADRC': 0.3, FULL: 0.0}
+    noise = np.array([-0.01, 0.0, 0.02])
+    plan = ComparisonPlan('servo', ('nominal',), ('feed-forward', *apart), (1, 2, 3), 60.0)
+
+    def runs(shift, spread=1.0):
+        return [{'settled': 1.0 + shift + spread * n, 'overall': 2.0} for n in noise]
+
+    results = {('nominal', 'feed-forward'): runs(0.0, 0.0)}
+    results |= {('nominal', name): runs(shift) for name, shift in apart.items()}
+    page = comparison_page.page(plan, results)
+    (axis,) = caught[0].axes
+    assert [tick.get_text() for tick in axis.get_yticklabels()] == [*apart]
+    for container, (name, shift), colour, verdict in zip(
+        axis.containers, apart.items(), (GREEN, RED, GREY),
+        ('better', 'worse', 'inconclusive'), strict=True,
+    ):  # fmt: skip
+        middles, half = halves(container, 0)
+        assert middles == pytest.approx(np.mean(noise) + shift)
+        assert half == pytest.approx(interval(noise))
+        assert to_hex(container.lines[0].get_color()) == colour
+        assert f'{1.0 + shift + np.mean(noise):.4f} {verdict}' in page
+        stored = comparison_page.record(plan, results)['cases']['nominal']['methods'][name]
+        assert stored['difference_from_feed_forward']['settled']['verdict'] == verdict
+    assert axis.get_xlabel() == 'settled / (rad/s)'
+
+
+OUTCOME = Outcome(
+    'gyro_dead', 'chaotic', 'bounded', '', 0.0, '', 0.1, 0.7, 0.2, 1.0, (0.0, 0.0), (0.0, 0.0),
+    ('imu',), '', (),
+)  # fmt: skip
+
+
+def test_errors_of_faults_are_named_and_the_verdict_is_that_of_the_worst(caught):
+    other = replace(OUTCOME, name='brown_out', before=0.3, during=0.9, after=None)
+    page = fault_page.page([OUTCOME, other])
+    (axis,) = caught[0].axes
+    shown = lines(axis)
+    assert {name: [*x] for name, (x, _) in shown.items()} == {
+        'before': [0.1, 0.3],
+        'during': [0.7, 0.9],
+        'after': [0.2],
+    }
+    names = [tick.get_text() for tick in axis.get_yticklabels()]
+    assert dict(zip(axis.get_yticks(), names, strict=True))[shown['after'][1][0]] == 'gyro_dead'
+    assert [to_hex(each.get_color()) for each in axis.lines] == [GREY, RED, COMMAND]
+    assert 'Every fault stays bounded' in page
+    assert '2 stay within the limits and recover.' in page
+    worse = fault_page.page([OUTCOME, replace(other, verdict='unbounded', undetected=('tilt',))])
+    assert 'Not every fault stays bounded' in worse
+    assert '1 exceed a limit.' in worse
+
+
+def test_the_first_divergence_shows_both_runs_and_the_tolerance(caught, tmp_path):
+    time = 0.1 * np.arange(50)
+    was, now = np.full(50, 2.0), np.full(50, 2.0) + 0.5 * (time > 2.45)
+    row = FieldComparison('speed', 50, 0.5, 0.25, 25, 2.5, 25)
+    outcome = Comparison(
+        (row,), Tolerances(0.01, 0.1), time, {'speed': was}, {'speed': now},
+        np.ones(50, dtype=bool), (), (),
+    )  # fmt: skip
+    divergence_figure.write_divergence_figure(outcome, tmp_path / 'x.png')
+    close, apart, _ = caught[0].axes
+    shown = {name: y for name, (_, y) in (lines(close) | lines(apart)).items()}
+    rows = (time >= 2.0) & (time <= 4.0)
+    assert shown['recorded'] == pytest.approx(was[rows])
+    assert shown['rerun'] == pytest.approx(now[rows])
+    assert shown['tolerance'] == pytest.approx(0.01 + 0.1 * 2.0)
+    assert shown['difference'][-1] == pytest.approx(0.5)
+    assert title(close) == 'speed'
+
+
+# -- patrols and the twin -------------------------------------------------------------------------
+
+
+def patrol(coverage, skills):
+    metrics = SimpleNamespace(
+        skills=[SimpleNamespace(horizon=h) for h in (1.0, 5.0)],
+        skill=dict(zip((1.0, 5.0), skills, strict=True)).get,
+    )
+    return PatrolResult(metrics, np.linspace(0.0, coverage, 11), 0, 0.0, None)
+
+
+PATROLS = {
+    OURS: [patrol(0.8, (0.9, 0.4)), patrol(0.6, (0.7, 0.1))],
+    'random walk': [patrol(0.5, (0.8, 0.3)), patrol(0.3, (0.2, 0.2))],
+}
+
+
+def test_coverage_is_the_mean_in_per_cent_over_minutes():
+    plan = PatrolPlan(tuple(PATROLS), (1, 2), duration=600.0)
+    (axis,) = patrol_figures.draw_coverage(patrol_figures.Comparison(plan, PATROLS)).axes
+    shown = lines(axis)
+    for name, last in ((OURS, 70.0), ('random walk', 40.0)):
+        time, share = shown[name]
+        assert (time[0], time[-1]) == (0.0, pytest.approx(10.0))
+        assert share == pytest.approx(np.linspace(0.0, last, 11))
+    assert texts(axis)[1:] == ('time / min', 'cells entered / %')
+
+
+def test_skills_have_their_intervals():
+    plan = PatrolPlan(tuple(PATROLS), (1, 2))
+    (axis,) = patrol_figures.draw_predictability(patrol_figures.Comparison(plan, PATROLS)).axes
+    for (name, each), container in zip(PATROLS.items(), axis.containers, strict=True):
+        assert container.get_label() == name
+        values = [[one.metrics.skill(h) for one in each] for h in (1.0, 5.0)]
+        middles, half = halves(container, 1)
+        assert middles == pytest.approx([np.mean(row) for row in values])
+        assert half == pytest.approx([interval(row) for row in values])
+    assert texts(axis)[1:] == ('horizon / s', 'skill of the observer')
+
+
+COURSE = Course('10 turns', TIME, *(np.outer(TIME, (k, 2 * k, 0.1 * k)) for k in (1.0, 2.0, 3.0)),
+                *((0.0, 0.0), (0, 0)), *[None] * (len(fields(Course)) - 7))  # fmt: skip
+
+
+def test_paths_and_yaw_errors_of_the_twin():
+    for axis in validation_page.squares([COURSE, COURSE]).axes:
+        shown = lines(axis)
+        for label, poses in (
+            ('where it was', COURSE.truth),
+            ('odometry with gyro', COURSE.odometry),
+            ('odometry, steps alone', COURSE.steps),
+        ):
+            assert pytest.approx(poses[:, :2]) == shown[label].T
+        assert axis.get_xlabel() == 'x / m'
+    (axis,) = validation_page.turns(COURSE, [], 'slip').axes
+    shown = lines(axis)
+    for label, poses in (('steps alone', COURSE.steps), ('with gyro', COURSE.odometry)):
+        assert shown[label][1] == pytest.approx(np.degrees(poses[:, 2] - COURSE.truth[:, 2]))
+    assert texts(axis)[1:] == ('time / s', 'yaw error / deg')
+
+
+def test_yaw_errors_at_the_end_are_root_mean_squares_in_degrees():
+    found = [
+        Drift(course, slip, seed, steps, fused, 0.1, 0.0, 0.0, 0.0, 0, 0.0)
+        for course in ('square', 'turns')
+        for slip, seed, steps, fused in (
+            ('none', 1, 0.01, 0.02), ('ice', 1, 0.5, 0.05), ('ice', 2, -0.3, 0.03),
+        )
+    ]  # fmt: skip
+    panel, _, below = validation_page.drift(found).axes
+    widths = [[bar.get_width() for bar in container] for container in panel.containers]
+    assert [each.get_label() for each in panel.containers] == ['steps alone', 'with gyro']
+    for shown, (still, ice) in zip(
+        widths, ((0.01, (0.5, 0.3)), (0.02, (0.05, 0.03))), strict=True
+    ):
+        assert shown == pytest.approx(np.degrees([still, math.sqrt(np.mean(np.square(ice)))]))
+    x, y = lines(below)['square']
+    assert sorted(x) == pytest.approx(np.degrees([0.3, 0.5]))
+    assert sorted(y) == pytest.approx(np.degrees([0.03, 0.05]))
+    assert np.argmax(x) == np.argmax(y)
+    assert (panel.get_xlabel(), below.get_ylabel()) == ('rms error / deg', 'with gyro / deg')
