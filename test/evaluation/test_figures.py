@@ -524,7 +524,8 @@ def test_yaw_errors_at_the_end_are_root_mean_squares_in_degrees():
         Drift(course, slip, seed, steps, fused, 0.1, 0.0, 0.0, 0.0, 0, 0.0)
         for course in ('square', 'turns')
         for slip, seed, steps, fused in (
-            ('none', 1, 0.01, 0.02), ('ice', 1, 0.5, 0.05), ('ice', 2, -0.3, 0.03),
+            (validation_page.NO_SLIP.name, 1, 0.01, 0.02),
+            ('ice', 1, 0.5, 0.05), ('ice', 2, -0.3, 0.03),
         )
     ]  # fmt: skip
     panel, _, below = validation_page.drift(found).axes

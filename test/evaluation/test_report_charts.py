@@ -1,0 +1,482 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Charts, numbers and sentences of a bag report; no two quantities of the run are equal."""
+
+from dataclasses import asdict, replace
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.control.control_law import TERM_NAMES
+from t3mpc_ros.evaluation.bag_report.link_history import LinkHistory, LinkMetrics
+from t3mpc_ros.evaluation.bag_report.metrics import (
+    ChannelMetrics,
+    ErrorStatistics,
+    ReportMetrics,
+    compute_metrics,
+    estimation_target,
+)
+from t3mpc_ros.evaluation.bag_report.report_charts import SECTIONS
+from t3mpc_ros.evaluation.bag_report.report_page import link_table, response_table
+from t3mpc_ros.evaluation.bag_report.response import ResponseFit
+from t3mpc_ros.evaluation.bag_report.run_comparison import ErrorDifference
+from t3mpc_ros.evaluation.bag_report.run_data import BY_BODY, BY_WHEEL, Run, Series, Timing
+from t3mpc_ros.evaluation.bag_report.topic_roles import (
+    COMMAND,
+    ODOMETRY,
+    REFERENCE,
+    SIGNALS,
+    TRUTH,
+)
+from t3mpc_ros.evaluation.bag_report.verdict import Stop, Verdict, judge
+from t3mpc_ros.evaluation.charts import Plane
+from t3mpc_ros.geometry.kinematics import WheelGeometry
+
+WHEELS = 'right', 'left'
+TIME = 0.01 * np.arange(2000)
+MOTIONS = 'linear', 'angular', 'right', 'left', 'x', 'y', 'yaw'
+NAMES = (
+    *(f'controller/terms/{name}/{wheel}' for name in (*TERM_NAMES, 'applied') for wheel in WHEELS),
+    *(f'controller/{name}/{wheel}' for name in ('estimate', 'skill') for wheel in WHEELS),
+    'controller/lyapunov/value',
+    'controller/lyapunov/margin',
+    *SIGNALS,
+)
+
+
+def wave(k):
+    """Return a quantity with a mean and a phase of its own."""
+    return k + 0.3 * np.sin(0.9 * TIME + k)
+
+
+NUMBERS = {name: Series(TIME, {'value': wave(40 + k)}) for k, name in enumerate(NAMES)}
+NUMBERS['controller/lyapunov/margin'] = Series(TIME, {'value': np.where(TIME < 5.0, -1.0, 2.0)})
+COMMANDED = {name: wave(30 + k) for k, name in enumerate(MOTIONS)}
+REPORTS = 10.0 * np.arange(2.0)
+LINK = {
+    'cycles': np.array([100.0, 300.0]),
+    'cycles_lost': np.array([0.0, 10.0]),
+    'round_trip_median_ms': np.array([6.0, 7.0]),
+    'round_trip_p99_ms': np.array([9.0, 11.0]),
+    'robot_resets': np.array([1.0, 3.0]),
+    'dongle_resets': np.array([1.0, 4.0]),
+    'port_failures': np.array([1.0, 5.0]),
+    'crc_errors': np.array([1.0, 6.0]),
+    'frame_errors': np.array([1.0, 8.0]),
+}
+RUN = Run(
+    duration=20.0, topics={}, absent=(), namespaces=('',), ours=True, geometry=WheelGeometry(),
+    channels=BY_WHEEL,
+    motions={
+        topic: Series(TIME, {name: wave(10 * j + k) for k, name in enumerate(MOTIONS)})
+        for j, topic in enumerate((REFERENCE, ODOMETRY, TRUTH))
+    } | {COMMAND: Series(TIME, COMMANDED)},
+    numbers=NUMBERS,
+    receipts={ODOMETRY: TIME, COMMAND: TIME[:-1] + 0.002 + 0.004 * (np.arange(1999) % 20 == 0)},
+    timing={ODOMETRY: Timing(2000, 0.01, 0.002, 0.05)},
+    switches=np.array([8.0]), lead=0.205, complaints=(), changes=(),
+    links=(LinkHistory('radio', REPORTS, LINK),), oddities=(), remarks=(),
+)  # fmt: skip
+METRICS = compute_metrics(RUN, Path('r.html'), 7)
+
+
+def motion(topic, name):
+    return RUN.motions[topic][name]
+
+
+def expected():
+    """Return unit and lines of every chart by its title."""
+    found = {}
+    for name, title, _, unit in BY_WHEEL:
+        truth = {'robot (ground truth)': motion(TRUTH, name)}
+        command = {'command': motion(COMMAND, name)}
+        both = {'robot (odometry)': motion(ODOMETRY, name), 'reference': motion(REFERENCE, name)}
+        found[title] = unit, truth | both
+        found[f'Command, {title}'] = unit, command
+        found[f'Response, {title}'] = unit, truth | command
+        found[f'Terms, {title}'] = (
+            'rad/s²',
+            {
+                f'{term} {symbol}': NUMBERS[f'controller/terms/{term}/{name}']['value']
+                for term, symbol in zip(
+                    (*TERM_NAMES, 'applied'), ('−g', '−Kδ', 'ṙ', 'v_c', 'v_p', 'u'), strict=True
+                )
+            },
+        )
+        found[f'Estimate, {title}'] = (
+            'rad/s²',
+            {
+                'estimate g': NUMBERS[f'controller/estimate/{name}']['value'],
+                'target': estimation_target(RUN, name)['value'],
+            },
+        )
+        rate = np.gradient(motion(TRUTH, name), TIME)
+        kind = title.capitalize()
+        found[f'{kind}: acceleration'] = 'rad/s²', {'acceleration': rate}
+        found[f'{kind}: jerk'] = 'rad/s³', {'jerk': np.gradient(rate, TIME)}
+
+    def of_wheels(name):
+        return {f'{w} wheel': NUMBERS[f'controller/{name}/{w}']['value'] for w in WHEELS}
+
+    errors = {f'{w} wheel': motion(TRUTH, w) - motion(REFERENCE, w) for w in WHEELS}
+    found['Error'] = 'rad/s', errors
+    found['Acceleration u applied'] = 'rad/s²', of_wheels('terms/applied')
+    found['Skill of the predictor'] = 'share', of_wheels('skill')
+    found['V, half the squared error'] = (
+        'rad²/s²',
+        {'V': NUMBERS['controller/lyapunov/value']['value']},
+    )
+    found['Margin of the guaranteed decrease'] = (
+        'rad²/s³',
+        {'margin': NUMBERS['controller/lyapunov/margin']['value']},
+    )
+    signals = [NUMBERS[name]['value'] for name in SIGNALS]
+    labels = ('active mode', 'right wheel', 'left wheel')
+    found['Active mode and chaotic signals'] = 'number', dict(zip(labels, signals, strict=True))
+    found['radio: cycles answered since the report before'] = (
+        '%',
+        {'answered': np.array([math.nan, 95.0])},
+    )
+    found['Round trip'] = 'ms', {'median': LINK['round_trip_median_ms'],
+                                 '99 % below': LINK['round_trip_p99_ms']}  # fmt: skip
+    found['Faults since the first report'] = (
+        'number',
+        {
+            label: LINK[key] - 1.0
+            for key, label in {
+                'robot_resets': 'resets of the robot board',
+                'dongle_resets': 'resets of the dongle',
+                'port_failures': 'port failures',
+                'crc_errors': 'wrong checksums',
+                'frame_errors': 'malformed frames',
+            }.items()
+        },
+    )
+    found['From odometry to command'] = 'ms', {'latency': 2.0 + 4.0 * (np.arange(1999) % 20 == 0)}
+    found['Between two messages of odom'] = 'ms', {'odom': np.full(1999, 10.0)}
+    received = RUN.receipts[COMMAND]
+    found['Between two messages of cmd_vel'] = 'ms', {'cmd_vel': 1e3 * np.diff(received)}
+    return found
+
+
+DRAWN = [each for section in SECTIONS for each in section.draw(RUN, METRICS)]
+CHARTS = {chart.title: chart for chart in DRAWN if not isinstance(chart, Plane)}
+
+
+@pytest.mark.parametrize('title', expected())
+def test_a_chart_shows_what_its_labels_say(title):
+    chart = CHARTS[title]
+    unit, lines = expected()[title]
+    assert chart.unit == unit
+    found = {line.label: line for line in chart.lines if line.label != 'fit'}
+    assert found.keys() == lines.keys()
+    for label, values in lines.items():
+        line = found[label]
+        if label in ('acceleration', 'jerk'):  # smoothed, and unknown at both ends
+            wanted = np.interp(line.time, TIME, values)[60:-60]
+            np.testing.assert_allclose(line.value[60:-60], wanted, atol=0.005)
+        else:  # a step is drawn to the end of the run
+            np.testing.assert_allclose(line.value[: values.size], values, atol=1e-9)
+
+
+def test_every_chart_is_known():
+    assert CHARTS.keys() == expected().keys()
+    colours = {line.label: line.colour for title in BY_WHEEL for line in CHARTS[title.title].lines}
+    assert colours == {
+        'robot (ground truth)': 'truth', 'robot (odometry)': 'right', 'reference': 'reference',
+    }  # fmt: skip
+    for title in ('Error', 'Acceleration u applied', 'Skill of the predictor'):
+        assert [line.colour for line in CHARTS[title].lines] == [*WHEELS]
+
+
+def test_planes_have_the_axes_of_their_titles():
+    stops = (Stop(3.0, 4.0, '', True),)
+    metrics = replace(METRICS, verdict=replace(METRICS.verdict, stops=stops))
+    planes = {
+        each.title: each
+        for section in SECTIONS
+        for each in section.draw(RUN, metrics)
+        if isinstance(each, Plane)
+    }
+    portrait, floor = planes['Right wheel over left wheel'], planes['Floor']
+    assert (portrait.unit, floor.unit) == ('rad/s', 'm')
+    for curve, topic in zip(portrait.curves, (REFERENCE, TRUTH), strict=True):
+        assert (curve.x[0], curve.y[0]) == (motion(topic, 'left')[0], motion(topic, 'right')[0])
+    assert portrait.summary.startswith('The right wheel upwards over the left wheel;')
+    truth = {curve.label: curve for curve in floor.curves}['robot (ground truth)']
+    assert np.isin(motion(TRUTH, 'x'), truth.x).all()
+    assert np.isin(motion(TRUTH, 'y'), truth.y).all()
+    places = {colour: (t, x, y) for t, x, y, colour in floor.marks}
+    assert places['reference'][0] == pytest.approx(8.0, abs=0.02)
+    assert places['stopped'][0] == pytest.approx(3.0, abs=0.02)
+    assert floor.summary.endswith('Grey points: switches of the reference. Red points: stops.')
+
+
+def test_sentences_give_the_numbers_of_their_charts():
+    def number(value):
+        return f'{value:#.3g}' if abs(value) < 99.95 else f'{value:.0f}'
+
+    error = motion(TRUTH, 'right') - motion(REFERENCE, 'right')
+    drive = TIME >= 1.0
+    calm = drive & ((TIME < 7.795) | (TIME >= 9.0))
+    said = CHARTS['Error'].summary
+    rmse, settled = (number(np.sqrt(np.mean(error[rows] ** 2))) for rows in (drive, calm))
+    assert f'Right wheel: RMSE {rmse} rad/s while driven, {settled} rad/s settled' in said
+    largest = np.argmax(np.where(drive, error, 0.0))
+    assert f'the largest error is {number(error[largest])} rad/s at {TIME[largest]:.1f} s' in said
+    wanted = motion(REFERENCE, 'right')
+    assert CHARTS['right wheel'].summary == (
+        f'The reference runs from {number(wanted.min())} to {number(wanted.max())} rad/s; the '
+        f'robot (ground truth) follows it with a settled RMSE of {settled} rad/s.'
+    )
+    varied, demand = (
+        number(np.abs(np.diff(values)).sum() / 19.99)
+        for values in (COMMANDED['right'], motion(REFERENCE, 'right'))
+    )
+    command = COMMANDED['right']
+    assert CHARTS['Command, right wheel'].summary == (
+        f'The command runs from {number(command.min())} to {number(command.max())} rad/s and '
+        f'varies by {varied} rad/s per second; the reference varies by {demand}.'
+    )
+    assert CHARTS['Active mode and chaotic signals'].summary == (
+        'The reference switches 1 times, at 8.0 s.'
+    )
+    margin = CHARTS['Margin of the guaranteed decrease'].summary
+    assert margin == 'The margin is below zero 25.0 % of the time.'
+    skills = [np.mean(NUMBERS[f'controller/skill/{wheel}']['value']) for wheel in WHEELS]
+    assert CHARTS['Skill of the predictor'].summary == (
+        f'Mean: {number(skills[0])} of the right wheel, {number(skills[1])} of the left wheel.'
+    )
+    assert CHARTS['Round trip'].summary == 'The round trip is from 6.00 to 11.0 ms.'
+    assert CHARTS['Faults since the first report'].summary == (
+        'resets of the robot board 2, resets of the dongle 3, port failures 4, '
+        'wrong checksums 5, malformed frames 7.'
+    )
+    assert CHARTS['From odometry to command'].summary == (
+        'Median 2.00 ms, 99 % below 6.00 ms, largest 6.00 ms.'
+    )
+    sizes = CHARTS['Terms, left wheel'].summary
+    for term in (*TERM_NAMES, 'applied'):
+        values = NUMBERS[f'controller/terms/{term}/left']['value']
+        assert f'{term} {number(np.sqrt(np.mean(values**2)))}' in sizes
+
+
+# -- metrics --------------------------------------------------------------------------------------
+
+
+def test_every_metric_has_its_quantity():
+    # One command in twenty is late: the median and the 99th percentile differ from the mean.
+    assert METRICS.latency == pytest.approx(0.002)
+    assert METRICS.latency_99 == pytest.approx(0.006)
+    one_in_fifty = np.arange(1999) % 50 == 0
+    rarer = replace(
+        RUN, receipts={**RUN.receipts, COMMAND: TIME[:-1] + 0.002 + 0.004 * one_in_fifty}
+    )
+    assert compute_metrics(rarer, Path(), 7).latency_99 == pytest.approx(0.006)
+    assert (METRICS.duration, METRICS.messages, METRICS.switches) == (20.0, 7, 1)
+    assert METRICS.measured == TRUTH
+    assert METRICS.missing == {ODOMETRY: 0.05}
+    for name in WHEELS:
+        found = METRICS.wheels[name]
+        error = np.abs(motion(TRUTH, name) - motion(REFERENCE, name))
+        drive = TIME >= 1.0
+        calm = drive & ((TIME < 7.795) | (TIME >= 9.0))
+        for part, rows in ((found.overall, drive), (found.settled, calm)):
+            some = error[rows]
+            values = np.sqrt(np.mean(some**2)), some.mean(), some.max(), some.size
+            assert (part.rmse, part.mae, part.largest, part.count) == pytest.approx(values)
+            assert part.seconds == pytest.approx(0.01 * some.size)
+        for value, topic in ((found.chatter, COMMAND), (found.demand, REFERENCE)):
+            assert value == pytest.approx(np.abs(np.diff(motion(topic, name))).sum() / 19.99)
+    assert asdict(METRICS.links['radio']) == pytest.approx(
+        {
+            'cycles': 200.0, 'lost': 10.0, 'answered': 0.95, 'round_trip': 0.0065,
+            'round_trip_99': 0.011, 'oldest': math.nan, 'resets': 2.0, 'dongle_resets': 3.0,
+            'port_failures': 4.0, 'sessions': math.nan, 'damaged': 12.0,
+        },
+        nan_ok=True,
+    )  # fmt: skip
+
+
+def statistics(rmse, seconds):
+    return ErrorStatistics(rmse, 0.0, 0.0, 9, seconds)
+
+
+FIT = ResponseFit(0.031, 0.012, 0.98, 0.994, 0.001)
+SOUND = Verdict((), stopped=0.3)
+GIVEN = ReportMetrics(
+    report=Path('r.html'), duration=61.26, messages=9, switches=4, measured=TRUTH,
+    wheels={
+        'right': ChannelMetrics(statistics(0.11, 58.0), statistics(0.13, 50.0), 21.0, 1.0),
+        'left': ChannelMetrics(statistics(0.12, 58.0), statistics(0.14, 50.0), 22.0, 1.0),
+    },
+    channels=BY_WHEEL, responses={'right': FIT, 'left': replace(FIT, lag=0.022)},
+    links={'radio': LinkMetrics(1000.0, 13.0, 0.987, 0.0065, 0.012, 0.4, 2.0, 3.0, 4.0, 5.0, 6.0)},
+    latency=0.0031, latency_99=0.0042, missing={ODOMETRY: 0.0234}, absent=(), verdict=SOUND,
+)  # fmt: skip
+
+
+def test_the_summary_in_full():
+    assert GIVEN.summary() == (
+        '61.3 s, 4 switches; RMSE right/left while driven 0.110/0.120 rad/s in 58.0 s, settled '
+        '0.130/0.140 rad/s in 50.0 s; command varies by 21.0/22.0 rad/s²; responds after right '
+        '43 ms, left 53 ms; radio: 98.7 % of cycles answered; loop 3.10 ms, 99 % below 4.20 ms; '
+        '2.34 % of odom missing: r.html'
+    )
+    body = {'linear': GIVEN.wheels['right'], 'angular': GIVEN.wheels['left']}
+    unknown = replace(GIVEN, channels=BY_BODY, wheels=body, responses={}, links={}, missing={})
+    assert 'RMSE forward/turning while driven 0.110 m/s/0.120 rad/s' in unknown.summary()
+    assert 'varies by 21.0 m/s²/22.0 rad/s²; loop' in unknown.summary()
+    assert '– % of odom missing' in unknown.summary()
+
+
+def test_tables_of_response_and_link_in_full():
+    run = replace(RUN, channels=BY_WHEEL)
+    rows = response_table(run, {'right': FIT}).rows
+    assert [*map(list, rows)] == [
+        ['right wheel', '31', '12', '43', '0.980', '99.4'],
+        ['left wheel', *5 * [rows[1][1]]],
+    ]
+    assert [row[1] for row in link_table(GIVEN.links).rows] == [
+        '1000', '13', '98.7 %', '6.50 ms', '12.0 ms', '0.400 s', '2', '3', '4', '5', '6',
+    ]  # fmt: skip
+
+
+# -- verdicts -------------------------------------------------------------------------------------
+
+STOPS = (Stop(2.0, 2.5, 'robot: e-stop', True), Stop(4.0, 7.0, '', False))
+MANY = (*STOPS, Stop(9.0, 9.1, 'a', True), Stop(10.0, 10.2, 'b', True))
+LONGEST = [
+    'At 2.0 s for 0.50 s: robot: e-stop.',
+    'At 4.0 s for 3.00 s: the bag holds no diagnostics of that time.',
+]
+FOLLOWED = 'The robot followed the reference, stopped for 0.3 s.'
+ON_PATH = (
+    'the robot was on its path, within 50 mm of it, for {} % of the drive, stopped for 0.3 s; '
+    'the rest were detours around obstacles and the ways back'
+)
+
+
+@pytest.mark.parametrize(
+    ('verdict', 'kind', 'headline', 'text', 'reasons'),
+    [
+        (
+            SOUND, 'good', 'Good run',
+            'sound run: the robot followed the reference, stopped for 0.3 s', [FOLLOWED],
+        ),
+        (
+            replace(SOUND, slow=True), 'good', 'Good run, on a slow machine',
+            'sound run: the robot followed the reference, stopped for 0.3 s',
+            ['The machine was too slow at times, which did not spoil the numbers.', FOLLOWED],
+        ),
+        (
+            replace(SOUND, on_path=0.8), 'good', 'Good run', f'sound run: {ON_PATH.format(80)}',
+            [f'T{ON_PATH.format(80)[1:]}.'],
+        ),
+        (
+            replace(SOUND, on_path=0.49), 'open', 'Mostly off its path',
+            f'sound run: {ON_PATH.format(49)}', [f'T{ON_PATH.format(49)[1:]}.'],
+        ),
+        (
+            Verdict((), judged=False, lacking=('reference', 'odom')), 'open',
+            'Data missing: tracking cannot be judged',
+            'NO VERDICT ON TRACKING: the bag lacks reference, odom',
+            ['The bag lacks reference, odom.'],
+        ),
+        (
+            Verdict(('a', 'b'), slow=True), 'bad', 'Machine too slow',
+            'NO VALID MEASUREMENT: a; b', ['A.', 'B.'],
+        ),
+        (
+            Verdict(('torn',), damage=('torn',)), 'bad', 'Damaged recording',
+            'NO VALID MEASUREMENT: torn', ['Torn.'],
+        ),
+        (
+            Verdict(('a',), missing=True, stops=STOPS[1:]), 'bad', 'Data missing',
+            'NO VALID MEASUREMENT: a', ['A.', LONGEST[1]],
+        ),
+        (
+            Verdict(('a',), missing=True, stops=STOPS), 'bad', 'Stopped 2 times',
+            'NO VALID MEASUREMENT: a', ['A.', *LONGEST],
+        ),
+        (
+            Verdict(('a',), stops=STOPS[:1]), 'bad', 'Stopped once',
+            'NO VALID MEASUREMENT: a', ['A.', LONGEST[0]],
+        ),
+        (
+            Verdict(('a',), stops=MANY), 'bad', 'Stopped 4 times', 'NO VALID MEASUREMENT: a',
+            ['A.', *LONGEST, 'At 10.0 s for 0.20 s: b.', '1 shorter stops: see the events.'],
+        ),
+        (
+            Verdict(('a',)), 'bad', 'No valid measurement', 'NO VALID MEASUREMENT: a', ['A.'],
+        ),
+    ],
+)  # fmt: skip
+def test_a_verdict_in_words(verdict, kind, headline, text, reasons):
+    assert (verdict.kind, verdict.headline, verdict.text()) == (kind, headline, text)
+    assert verdict.reasons() == reasons
+    assert verdict.sound == text.startswith('sound')
+
+
+JUDGED = {'drive': (0.0, 20.0), 'rmse': 0.1, 'counted': 19.0, 'missing': 0.0, 'latency_99': 0.001}
+STANDING = Series(
+    TIME, COMMANDED | {'linear': np.where(TIME < 2.0, 0.0, 1.0), 'angular': 0 * TIME}
+)
+SIZE = max(np.sqrt(np.mean(motion(REFERENCE, wheel) ** 2)) for wheel in WHEELS)
+
+
+@pytest.mark.parametrize(
+    ('run', 'given', 'problems'),
+    [
+        ({}, {}, ()),
+        ({}, {'missing': 0.02, 'counted': 10.0, 'latency_99': 0.02, 'rmse': 0.249 * SIZE}, ()),
+        ({}, {'missing': 0.031}, ('3.1 % of odom is missing',)),
+        ({}, {'counted': 9.9}, ('only 9.9 of 20.0 s count',)),
+        ({}, {'rmse': math.nan}, ('no settled motion was measured',)),
+        (
+            {}, {'rmse': 0.251 * SIZE},
+            (f'settled RMSE {0.251 * SIZE:.2g} rad/s on a reference of {SIZE:.2g} rad/s',),
+        ),
+        ({}, {'drive': (math.inf, -math.inf)}, ('the robot was never driven',)),
+        ({}, {'latency_99': 0.021}, ()),
+        (
+            {}, {'latency_99': 0.021, 'counted': 9.9},
+            ('the machine was too slow', 'only 9.9 of 20.0 s count'),
+        ),
+        (
+            {'complaints': ((1.0, 'warning', 'a', 'processor overloaded'),)}, {'counted': 9.9},
+            ('the machine was too slow', 'only 9.9 of 20.0 s count'),
+        ),
+        ({'damage': ('torn',)}, {}, ('torn',)),
+        (
+            {'motions': {**RUN.motions, COMMAND: STANDING}}, {},
+            ('the robot was stopped for 2.0 of 20.0 s',),
+        ),
+        (
+            {'follows_path': True}, {},
+            ('the robot was within 50 mm of its path for only 0 % of the drive',),
+        ),
+    ],
+)  # fmt: skip
+def test_each_problem_in_words_and_its_limit(run, given, problems):
+    verdict = judge(replace(RUN, **run), **(JUDGED | given))
+    assert verdict.problems == problems
+    assert verdict.slow == (
+        'the machine was too slow' in problems or given == {'latency_99': 0.021}
+    )
+
+
+@pytest.mark.parametrize(
+    ('difference', 'half', 'text'),
+    [
+        (-0.2, 0.1, 'right wheel: mean squared error -0.2 ± 0.100 (rad/s)², smaller error'),
+        (0.2, 0.1, 'right wheel: mean squared error +0.2 ± 0.100 (rad/s)², larger error'),
+        (0.1, 0.1, 'right wheel: mean squared error +0.1 ± 0.100 (rad/s)², inconclusive'),
+        (math.nan, math.inf,
+         'right wheel: mean squared error unknown ± unknown (rad/s)², inconclusive'),
+    ],
+)  # fmt: skip
+def test_a_difference_of_two_runs_in_words(difference, half, text):
+    assert ErrorDifference(BY_WHEEL[0], difference, half).text() == text
