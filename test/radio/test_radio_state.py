@@ -359,7 +359,7 @@ DYNAMIC = [spec for spec in RadioRobotParameters.specs() if spec.dynamic]
 
 
 @pytest.mark.parametrize('spec', DYNAMIC, ids=lambda spec: spec.name)
-def test_a_robot_configured_anew_is_as_one_built_with_the_parameters(spec):
+def test_a_robot_configured_anew_is_as_one_built_so(spec):
     before = RadioRobotParameters()
     after = with_other_value(before, spec)
     made, built = (RadioRobot(each, entropy=bytes) for each in (before, after))

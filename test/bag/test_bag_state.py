@@ -1,0 +1,538 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Bags over generated histories: as new after a change; player, queue and cache by a model."""
+
+from collections import deque
+import random
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+import pytest
+from support.object_state import differences, stateful_classes
+from support.properties import PROPERTY, STATEFUL
+
+from t3mpc_ros import bag
+from t3mpc_ros.bag.mcap_file import Attachment, SerializedMessage
+from t3mpc_ros.bag.merged_reader import MergedReader, ScheduledMessage
+from t3mpc_ros.bag.metadata import TopicInformation
+from t3mpc_ros.bag.player import PlaybackParameters, PlaybackTimeline
+from t3mpc_ros.bag.qos import QosProfile
+from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.bag.recording.diagnostics_monitor import (
+    REPORT_TIMEOUT_NS,
+    DiagnosticsMonitor,
+    SnapshotRateLimiter,
+)
+from t3mpc_ros.bag.recording.message_queue import MessageQueue
+from t3mpc_ros.bag.recording.snapshot import CircularMessageCache, SnapshotWriter
+from t3mpc_ros.bag.schema import BagError, MessageDefinitions, UnknownTypeError
+from t3mpc_ros.bag.topic_filter import PlayTopicFilter
+from t3mpc_ros.bag.writer import BagWriter
+
+SECOND, MS = 10**9, 10**6
+START = 1_700_000_000 * SECOND
+NUMBER = 'std_msgs/msg/Float64'
+LATCHED = QosProfile(durability='transient_local')
+DEFINITIONS = MessageDefinitions()
+
+
+def message(topic, at_ns, size=12):
+    return SerializedMessage(topic, START + at_ns, START + at_ns, b'\0\1\0\0' + bytes(size - 4))
+
+
+# -- as new ---------------------------------------------------------------------------------------
+
+
+def a_writer(source, folder):
+    """The next file of a split is that of a new writer with the same records and topics."""
+    options = {
+        'chunk_bytes': 100,
+        'chunk_ns': source.choice([SECOND // 10, SECOND]),
+        'max_file_bytes': source.choice([0, 10**6]),
+        'max_file_ns': source.choice([0, 100 * SECOND]),
+        'definitions': DEFINITIONS,
+    }
+    used = BagWriter(folder / 'used' / 'bag', metadata_records={'a': {'b': 'c'}}, **options)
+    for _ in range(source.randrange(30)):
+        _do_something(used, source)
+    used.split()
+    (folder / 'new' / 'bag').mkdir(parents=True)
+    for path in used.folder.glob('*_0.mcap'):
+        (folder / 'new' / 'bag' / path.name).write_bytes(path.read_bytes())
+    fresh = BagWriter(folder / 'new' / 'bag', metadata_records=used._metadata_records, **options)
+    for attachment, read_ns in used._attachments.values():
+        fresh.add_attachment(attachment, read_ns)
+    for topic in used._topics.values():
+        fresh.add_topic(topic.name, topic.type_name, topic.offered_qos_profiles, topic.type_hash)
+    # The disk is synchronized once a second, whatever the file.
+    yield used, fresh, ('_synced_ns', '_output._synced')
+    seed = source.random()
+    for each in (used, fresh):
+        each._synced_ns = 0
+        later = random.Random(seed)
+        for _ in range(10):
+            _do_something(each, later)
+        each.close()
+    yield used.path.read_bytes(), fresh.path.read_bytes(), ()
+
+
+def _do_something(writer, source):
+    action, at_ns = source.randrange(5), source.randrange(50 * SECOND)
+    topic = source.choice(['/a', '/b'])
+    if action == 0:
+        writer.add_metadata_record(topic, {'value': str(at_ns)})
+    elif action == 1:
+        writer.add_attachment(Attachment(topic, 'text/plain', source.randbytes(3)), at_ns)
+    elif action == 2:
+        writer.tick(at_ns)
+    else:
+        writer.add_topic(topic, NUMBER)
+        writer.write(*message(topic, at_ns))
+
+
+def _small_bag(folder, topics=('/a', '/b', '/map')):
+    with BagWriter(folder, metadata_records={}, chunk_bytes=200, definitions=DEFINITIONS) as made:
+        for topic in topics:
+            made.add_topic(topic, NUMBER, [LATCHED] if topic == '/map' else [])
+        for number in range(40):
+            made.write(*message(topics[number % len(topics)], number * 10 * MS))
+    return folder
+
+
+def a_bag(source, folder):
+    """Reading keeps nothing but decoders."""
+    path = _small_bag(folder / 'bag')
+    used, fresh = open_bag(path), open_bag(path)
+    for _ in range(source.randrange(4)):
+        stream = used.serialized_messages(source.choice([None, ['/a'], ['/missing']]))
+        [next(stream, None) for _ in range(source.randrange(60))]
+        used.series('/a', {'x': 'data'})
+    yield used, fresh, ('_decoders',)
+    yield [*used.serialized_messages()], [*fresh.serialized_messages()], ()
+
+
+def a_merged_reader(source, folder):
+    """An excluded topic leaves no trace."""
+    path = _small_bag(folder / 'bag')
+    used = MergedReader([open_bag(path)])
+    [*used.messages(START + source.randrange(SECOND))]
+    used.exclude_topic('/b')
+    fresh = MergedReader([open_bag(path)], (), PlayTopicFilter(exclude_topics=['/b']))
+    yield used, fresh, ()
+    yield [*used.messages(START)], [*fresh.messages(START)], ()
+
+
+def definitions(source, folder):
+    """Earlier questions do not change an answer."""
+    used, names = MessageDefinitions([]), [NUMBER, 'nav_msgs/msg/Odometry', 'no/msg/Type']
+    for name in source.choices(names, k=4):
+        try:
+            used.schema(name), used.type_hash(name)
+        except UnknownTypeError:
+            continue
+    for name in names[:2]:
+        yield used.schema(name), MessageDefinitions([]).schema(name), ()
+        yield used.type_hash(name), MessageDefinitions([]).type_hash(name), ()
+
+
+def a_diagnostics_monitor(source, folder):
+    """A node that waits again has no past."""
+    used, fresh = DiagnosticsMonitor(['a', 'b']), DiagnosticsMonitor(['a', 'b'])
+    now_ns = 0
+    for _ in range(source.randrange(10)):
+        now_ns += source.randrange(4 * SECOND)
+        used.update(source.choice('ab'), source.randrange(3), 'text', now_ns)
+        used.check_timeouts(now_ns)
+    for name in 'ab':
+        used.update(name, 1, 'stopped: no odometry yet', now_ns)
+    yield used, fresh, ()
+    yield used.check_timeouts(now_ns + 2 * REPORT_TIMEOUT_NS), [], ()
+
+
+def a_rate_limiter(source, folder):
+    """What is rejected is not counted."""
+    used, fresh = SnapshotRateLimiter(SECOND, 3), SnapshotRateLimiter(SECOND, 3)
+    now_ns, permitted = 10 * SECOND, []
+    for _ in range(20):
+        now_ns += source.randrange(SECOND)
+        if not used.acquire(now_ns):
+            permitted.append(now_ns)
+            yield fresh.acquire(now_ns), '', ()
+    assert len(permitted) <= 3
+    assert all(b - a >= SECOND for a, b in zip(permitted, permitted[1:], strict=False))
+    yield used, fresh, ()
+
+
+def a_message_queue(source, folder):
+    """An emptied queue keeps the number of dropped messages."""
+    used = MessageQueue(2000)
+    for _ in range(source.randrange(10)):
+        action = source.randrange(3)
+        if action == 0:
+            used.put([message('/a', 0, source.randrange(4, 900)) for _ in range(3)])
+        elif action == 1:
+            used.put_task(print)
+        else:
+            used.take()
+    used.take()
+    used.take()
+    yield used, MessageQueue(2000), ('_dropped',)
+
+
+def a_snapshot_writer(source, folder):
+    """A snapshot that is written ends the problem of the last one, and nothing else."""
+    used, fresh = (
+        SnapshotWriter(folder / name, CircularMessageCache(SECOND, 10**6), DEFINITIONS)
+        for name in ('used', 'new')
+    )
+    folder.joinpath('used').mkdir(parents=True)
+    for each in (used, fresh):
+        each.add_topic(TopicInformation('/a', NUMBER), 0)
+        each.add([message('/a', 0)])
+    (folder / 'used' / 'snapshots').write_text('in the way')
+    for _ in range(source.randrange(1, 3)):
+        yield _snapshot(used)[0], False, ()
+        assert used.problem.startswith('no snapshot of "why": ')
+    (folder / 'used' / 'snapshots').unlink()
+    yield _snapshot(used)[0], True, ()
+    yield _snapshot(fresh)[0], True, ()
+    yield used, fresh, ('_folder', 'completed')
+
+
+def _snapshot(writer):
+    results = []
+    writer.start('why', START, {}, [], lambda *result: results.append(result))
+    writer.close(60.0)
+    return results[0]
+
+
+def a_timeline(source, folder):
+    """``seek`` keeps rate, pause and the next tick of the clock."""
+    schedule = _schedule(source.random() < 0.5)
+    used, fresh = (PlaybackTimeline(schedule, START, END, clock_rate=10.0) for _ in range(2))
+    now_ns = 7 * SECOND
+    for _ in range(source.randrange(10)):
+        now_ns += source.randrange(400) * MS
+        action = source.randrange(6)
+        if action == 0:
+            used.pause(now_ns)
+        elif action == 1:
+            used.resume(now_ns)
+        elif action == 2:
+            used.set_rate(now_ns, source.choice([0.5, 2.0]))
+        elif action == 3:
+            used.play_next(now_ns, 3)
+        else:
+            used.due_messages(now_ns)
+    for each in (used, fresh):
+        each.set_rate(now_ns, 0.5)
+        each.pause(now_ns)
+        assert each.seek(now_ns, START + 300 * MS) == ''
+    yield used, fresh, ('_next_tick_ns',)
+
+
+TABLE = {
+    'BagWriter': a_writer,
+    'BagReader': a_bag,
+    'MergedReader': a_merged_reader,
+    'MessageDefinitions': definitions,
+    'DiagnosticsMonitor': a_diagnostics_monitor,
+    'SnapshotRateLimiter': a_rate_limiter,
+    'MessageQueue': a_message_queue,
+    'SnapshotWriter': a_snapshot_writer,
+    'PlaybackTimeline': a_timeline,
+}
+"""Each yields pairs that must be equal, but for what its docstring says is kept."""
+EXCEPTIONS = {
+    'CircularMessageCache': 'see TestCache',
+    'McapFile': 'the files of BagReader',
+    'RosbagsFile': 'the files of BagReader',
+    'ReadAheadQueue': 'one reading; see test_open_files.py',
+    'LatencyHistogram': 'counts since the start',
+    'Journal': 'counts since the start',
+    '_Output': 'one file of BagWriter',
+    '_PlainDumper': 'one text',
+    **dict.fromkeys(('TopicPatterns', 'TopicFilter', 'PlayTopicFilter'), 'never changed'),
+    **dict.fromkeys(('_Batches', 'FileWindow'), 'one reading'),
+    **dict.fromkeys(
+        ('_CompletePart', '_NullOutput', '_FileRecovery', 'RecoveredFileWriter', 'TopicResult',
+         'FileResult', 'Scanner'),
+        'one recovery',
+    ),
+}  # fmt: skip
+"""Classes without a change after which they are as new."""
+
+
+def test_every_stateful_class_is_in_the_table():
+    assert stateful_classes(bag) == TABLE.keys() | EXCEPTIONS.keys()
+    assert not TABLE.keys() & EXCEPTIONS.keys()
+
+
+@pytest.mark.parametrize('name', TABLE)
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(PROPERTY, max_examples=15)
+def test_after_a_change_an_object_is_as_new(name, tmp_path_factory, seed):
+    folder = tmp_path_factory.mktemp('state')
+    for used, fresh, kept in TABLE[name](random.Random(seed), folder):
+        assert differences(used, fresh, (*kept, 'folder', 'path')) == {}
+
+
+# -- player ---------------------------------------------------------------------------------------
+
+END = START + 1000 * MS
+STAMPS = [0, 0, 10, 20, 200, 210, 500, 500, 990, 1000]
+"""Times of the messages of a bag, ms; a latched one is at 20."""
+
+
+def _messages_from(from_ns):
+    """Return what is played from a time on: the latched message before it, then the others."""
+    named = [message(f'/{number}', at * MS) for number, at in enumerate(STAMPS)]
+    latched = [named[3]] if named[3].received_ns < from_ns else []
+    return latched, [each for each in named if each.received_ns >= from_ns]
+
+
+def _schedule(loop):
+    def schedule(from_ns):
+        begin_ns, loops = START, 0
+        while True:
+            before, rest = _messages_from(from_ns)
+            shift = loops * (END - begin_ns) - begin_ns
+            for each in before:
+                yield ScheduledMessage(from_ns + shift, from_ns, each, restored=True)
+            for each in rest:
+                yield ScheduledMessage(each.received_ns + shift, each.received_ns, each)
+            if not loop:
+                return
+            from_ns, loops = begin_ns, loops + 1
+
+    return schedule
+
+
+class Player(RuleBasedStateMachine):
+    """A timeline against its definition: position = rate x time while it plays."""
+
+    @initialize(loop=st.booleans(), paused=st.booleans(), rate=st.sampled_from([0.5, 1.0, 4.0]))
+    def start(self, loop, paused, rate):
+        self.loop, self.paused, self.rate = loop, paused, rate
+        self.now_ns, self.position = 7 * SECOND, 0
+        self.made = PlaybackTimeline(
+            _schedule(loop), START, END, rate=rate, loop=loop, paused=paused
+        )
+        self.restart(START)
+
+    def restart(self, stamp_ns):
+        self.entries, self.steps, self.finished = _schedule(self.loop)(stamp_ns), 0, False
+        self.position = stamp_ns - START
+        self.head = next(self.entries)
+        assert self.made.due_messages(self.now_ns) == ([], self.now_ns)
+        self.ask(0, 1)
+
+    @rule(elapsed=st.integers(0, 300), most=st.integers(1, 9))
+    def ask(self, elapsed, most):
+        self.now_ns += elapsed * MS
+        if not (self.paused or self.finished):
+            self.position += round(elapsed * MS * self.rate)
+        due, _ = self.made.due_messages(self.now_ns, most)
+        assert [each.message for each in due] == self.expected(most)
+        assert all(each.due_ns <= self.now_ns for each in due)
+
+    def expected(self, most):
+        found = []
+        while len(found) < most and self.head is not None:
+            at_once = self.head.restored and self.head.at_ns <= self.position
+            if self.paused and not at_once and not self.steps:
+                break
+            if not self.paused and self.head.at_ns > self.position:
+                break
+            if self.paused and not self.head.restored:
+                self.steps -= 1
+                self.position = max(self.position, self.head.at_ns)
+            found.append(self.head.message)
+            self.head = next(self.entries, None)
+        self.finished = self.head is None
+        return found
+
+    @rule()
+    def pause(self):
+        self.made.pause(self.now_ns)
+        self.paused = True
+
+    @rule()
+    def resume(self):
+        self.made.resume(self.now_ns)
+        self.paused, self.steps = False, 0
+
+    @rule(rate=st.sampled_from([0.5, 1.0, 4.0]))
+    def set_rate(self, rate):
+        self.made.set_rate(self.now_ns, rate)
+        self.rate = rate
+
+    @rule(count=st.integers(0, 4))
+    def step(self, count):
+        problem = self.made.play_next(self.now_ns, count)
+        assert bool(problem) == (not self.paused or self.finished or count < 1)
+        self.steps += 0 if problem else count
+
+    @rule(at=st.integers(-10, 1010))
+    def seek(self, at):
+        problem = self.made.seek(self.now_ns, START + at * MS)
+        assert bool(problem) == (not 0 <= at <= 1000)
+        if not problem:
+            self.restart(START + at * MS)
+
+    @invariant()
+    def position_and_state(self):
+        if not hasattr(self, 'made'):
+            return
+        made, now_ns, length = self.made, self.now_ns, END - START
+        where = self.position % length if self.loop else min(self.position, length)
+        assert made.bag_time_ns(now_ns) == START + where
+        assert made.remaining_ns(now_ns) == int((length - where) / self.rate)
+        assert made.loops(now_ns) == (self.position // length if self.loop else 0)
+        state = made.paused, made.finished, made.rate
+        assert state == (self.paused, self.finished, self.rate)
+
+
+TestPlayer = Player.TestCase
+TestPlayer.settings = STATEFUL
+
+
+@given(
+    start=st.integers(0, 1200), duration=st.integers(0, 1500), until=st.integers(0, 1500)
+)  # fmt: skip
+@PROPERTY
+def test_the_range_to_play_is_counted_from_the_first_message(start, duration, until):
+    class Reader:
+        start_ns, end_ns = START, END
+
+    if 0 < until <= start:
+        return  # refused by the parameters
+    made = PlaybackParameters(
+        start_offset=start / 1e3, playback_duration=duration / 1e3, playback_until=until / 1e3
+    )
+    if start > 1000:
+        with pytest.raises(ValueError, match='at most the length of the bag, 1.000 s'):
+            made.time_range_ns(Reader)
+        return
+    ends = [1000, start + duration if duration else 1000, until or 1000]
+    assert made.time_range_ns(Reader) == (START + start * MS, START + min(ends) * MS)
+
+
+# -- recorder -------------------------------------------------------------------------------------
+
+
+class Queue(RuleBasedStateMachine):
+    """First in, first out; what does not fit, and the rest of its batch, is dropped."""
+
+    LIMIT = 3000
+
+    def __init__(self):
+        super().__init__()
+        self.queue, self.waiting, self.taken = MessageQueue(self.LIMIT), [], []
+        self.dropped = {}
+
+    @rule(sizes=st.lists(st.integers(4, 1200), max_size=5))
+    def put(self, sizes):
+        messages = [message(f'/{size % 2}', 0, size) for size in sizes]
+        fits = []
+        for each in messages:
+            if self.memory(*fits, each) > self.LIMIT:
+                break
+            fits.append(each)
+        lost = {}
+        for each in messages[len(fits) :]:
+            lost[each.topic] = lost.get(each.topic, 0) + 1
+            self.dropped[each.topic] = self.dropped.get(each.topic, 0) + 1
+        assert self.queue.put(messages) == lost
+        self.waiting += fits
+
+    @rule()
+    def put_task(self):
+        self.waiting.append(lambda writer: None)
+        self.queue.put_task(self.waiting[-1])
+
+    @rule()
+    def take(self):
+        self.taken, self.waiting = self.waiting, []
+        assert self.queue.take() == self.taken
+
+    def memory(self, *more):
+        items = [*self.waiting, *self.taken, *more]
+        return sum(each.memory_size for each in items if isinstance(each, SerializedMessage))
+
+    @invariant()
+    def counts(self):
+        assert self.queue.bytes == self.memory() <= self.LIMIT
+        assert self.queue.dropped == self.dropped
+
+
+TestQueue = Queue.TestCase
+TestQueue.settings = STATEFUL
+
+
+class Cache(RuleBasedStateMachine):
+    """The last seconds within the memory, and the last latched messages before them."""
+
+    SPAN, LIMIT = 2 * SECOND, 4000
+
+    def __init__(self):
+        super().__init__()
+        self.cache = CircularMessageCache(self.SPAN, self.LIMIT)
+        self.cached, self.expired, self.latched = deque(), [], {}
+        self.newest_ns, self.number = 0, 0
+
+    @rule(count=st.integers(1, 3))
+    def keep_last(self, count):
+        self.cache.keep_last('/map', count)
+        if '/map' in self.latched:
+            self.expired = self.expired[-count:]
+        self.latched['/map'] = count
+
+    @rule(steps=st.lists(st.integers(-300, 900), min_size=1, max_size=6))
+    def add(self, steps):
+        messages = []
+        for step in steps:
+            self.number += 1
+            now_ns = max(self.newest_ns - START, 0) + step * MS  # a clock may be set back
+            topic = '/map' if self.number % 3 == 0 else '/a'
+            messages.append(message(topic, max(now_ns, 0), 8 + self.number))
+            self.newest_ns = max(self.newest_ns, messages[-1].received_ns)
+        self.cache.add(messages)
+        self.cached += messages
+        oldest_ns = self.newest_ns - self.SPAN
+        while self.cached and (self.bytes > self.LIMIT or self.cached[0].received_ns < oldest_ns):
+            gone = self.cached.popleft()
+            if gone.topic in self.latched:
+                self.expired = [*self.expired, gone][-self.latched['/map'] :]
+
+    @property
+    def bytes(self):
+        return sum(each.memory_size for each in self.cached)
+
+    @precondition(lambda self: self.newest_ns)
+    @rule(late=st.integers(0, 3000))
+    def read(self, late):
+        begin_ns = self.newest_ns + late * MS - self.SPAN
+        recent = [each for each in self.cached if each.received_ns >= begin_ns]
+        begin_ns = min((each.received_ns for each in recent), default=begin_ns)
+        older = [each for each in self.cached if each.received_ns < begin_ns]
+        maps = [*self.expired, *(each for each in older if each.topic in self.latched)]
+        first = [
+            each._replace(received_ns=begin_ns) for each in maps[-self.latched.get('/map', 1) :]
+        ]
+        assert self.cache.messages(self.newest_ns + late * MS) == [*first, *recent]
+
+    @invariant()
+    def memory(self):
+        assert self.cache.bytes == self.bytes <= self.LIMIT
+
+
+TestCache = Cache.TestCase
+TestCache.settings = STATEFUL
+
+
+def test_an_empty_cache_is_no_snapshot(tmp_path):
+    writer = SnapshotWriter(tmp_path, CircularMessageCache(SECOND, 10**6), DEFINITIONS)
+    with pytest.raises(BagError, match='no message was received within snapshot_time'):
+        writer.start('why', START, {}, [], print)
